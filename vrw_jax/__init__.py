@@ -1,0 +1,33 @@
+"""Differentiable, batched simulation of the passive viscoelastic-legged rimless wheel."""
+
+from vrw_jax.models import (
+    AbstractWheel,
+    EnergyLoss,
+    Indicators,
+    Margins,
+    RigidWheel,
+    StepResult,
+    ViscoelasticWheel,
+)
+from vrw_jax.options import Options
+from vrw_jax.outcomes import Outcome
+from vrw_jax.params import WheelParams
+from vrw_jax.return_map import Walk, paper_start, return_map, step, walk
+
+__all__ = [
+    "AbstractWheel",
+    "EnergyLoss",
+    "Indicators",
+    "Margins",
+    "Options",
+    "Outcome",
+    "RigidWheel",
+    "StepResult",
+    "ViscoelasticWheel",
+    "Walk",
+    "WheelParams",
+    "paper_start",
+    "return_map",
+    "step",
+    "walk",
+]

@@ -1,0 +1,23 @@
+"""The model ladder: one file per rung, one face."""
+
+from vrw_jax.models.base import (
+    AbstractWheel,
+    EnergyLoss,
+    Indicators,
+    Margins,
+    StepResult,
+    Trajectory,
+)
+from vrw_jax.models.rigid import RigidWheel
+from vrw_jax.models.viscoelastic import ViscoelasticWheel
+
+__all__ = [
+    "AbstractWheel",
+    "EnergyLoss",
+    "Indicators",
+    "Margins",
+    "RigidWheel",
+    "StepResult",
+    "Trajectory",
+    "ViscoelasticWheel",
+]

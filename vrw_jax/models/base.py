@@ -1,0 +1,154 @@
+"""The one face of every rung: what a step takes, and what it tells."""
+
+import abc
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from vrw_jax.options import Options
+from vrw_jax.params import Scalar, WheelParams
+
+SectionState = Float[Array, "3"]
+"""(theta-, dtheta-, dL1-) just before touchdown, in the labels of the step that ends: rad, rad/s,
+m/s. The length of Leg 1 follows from touchdown itself, Leg 2 is on its stopper."""
+
+
+class Indicators(eqx.Module):
+    """The double-limb-support indicators of Section 5.1, of the landing that opens the step."""
+
+    lambda_I4: Scalar  # normal impulse of the rear foot in the landing, both feet held, N s
+    lambda_2: Scalar  # normal force of the fore foot just after it, N
+    lambda_4: Scalar  # normal force of the rear foot just after it, N
+
+
+class EnergyLoss(eqx.Module):
+    """Mechanical energy lost in the step, J, each positive when lost."""
+
+    landing: Scalar
+    stopper: Scalar
+    damping: Scalar
+
+
+class Margins(eqx.Module):
+    """Premises of the paper's rung as signed margins over one step: negative means broken.
+
+    The model does not act on them. Forces and lengths are minima over the step, found to the
+    integrator's accuracy. What is zero by construction at a phase's start (a foot that leaves the
+    ground, Leg 1 that lands on its stopper) counts from its first later minimum on. Friction
+    margins are the model's `friction` less the coefficient needed; the rear foot's is taken just
+    after landing, since it grows without bound as the foot unloads. A phase that did not happen
+    does not count; a step that did not begin has margins zero.
+    """
+
+    fore_foot_force: Scalar  # lambda_2, N
+    clearance_sls1: Scalar  # height of foot 2 in SLS-I, m
+    clearance_sls2: Scalar  # height of foot 2 in SLS-II, m
+    locked_stopper_force: Float[Array, " n_locked"]  # of legs 3..n on their stoppers, N
+    rear_stopper_force: Scalar  # of Leg 2 on its stopper in SLS-II, N
+    contraction: Scalar  # L0 - L1 after landing, m
+    friction_fore: Scalar  # friction left at the fore foot
+    friction_rear: Scalar  # friction left at the rear foot just after landing
+    landing_stopper_impulse: Float[Array, " n_locked"]  # on legs 3..n at the landing, N s
+    hit_stopper_impulse: Float[Array, " n_locked"]  # on legs 3..n when Leg 2 hits its stopper, N s
+    hit_planted_impulse: Scalar  # normal impulse of the planted foot then, N s
+    landing_friction_fore: Scalar  # friction left at the fore foot in the landing impulse
+    landing_friction_rear: Scalar  # friction left at the rear foot in the landing impulse
+
+
+class StepResult(eqx.Module):
+    """One step from touchdown to touchdown. Batched under vmap: every field gains the axis.
+
+    Fields of a step whose outcome is not STEPPED are finite and describe how far it came; its
+    `section_state` is all zeros, which is no section state.
+    """
+
+    section_state: SectionState  # just before the next touchdown
+    post_impact: Float[Array, "2"]  # (theta, dtheta) just after the opening landing, rad, rad/s
+    durations: Float[Array, "3"]  # of DLS, SLS-I, SLS-II, s
+    step_length: Scalar  # distance between the feet at the opening landing, m
+    indicators: Indicators
+    monitors: Margins
+    energy: EnergyLoss
+    outcome: Int[Array, ""]  # an Outcome
+    solver_steps: Int[Array, ""]  # tried by the integrator
+
+    @property
+    def period(self) -> Array:
+        """Duration of the step, s."""
+        return jnp.sum(self.durations, axis=-1)
+
+    @property
+    def dls_fraction(self) -> Array:
+        """Share of the step spent in double support; 0 for a step without duration."""
+        period = self.period
+        return self.durations[..., 0] / jnp.where(period > 0.0, period, 1.0)
+
+    @property
+    def speed(self) -> Array:
+        """Step length over period, m/s; 0 for a step without duration."""
+        period = self.period
+        return jnp.where(period > 0.0, self.step_length / jnp.where(period > 0.0, period, 1.0), 0.0)
+
+
+class Advance(eqx.Module):
+    """The lean result of a step: what repeats."""
+
+    section_state: SectionState
+    durations: Float[Array, "3"]
+    outcome: Int[Array, ""]
+
+
+class Trajectory(eqx.Module):
+    """States of one step at equal times of each phase, with the forces that act there.
+
+    Axes: phase (DLS, SLS-I, SLS-II), sample. A phase that did not happen has duration 0 and repeats
+    its start. Coordinates are in the labels of this step; the origin is Leg 1's foot.
+    """
+
+    time: Float[Array, "3 n"]  # from the landing, s
+    state: Float[Array, "3 n 6"]  # theta, L1, L2 and their rates
+    forces: Float[Array, "3 n 4"]  # lambda_1 ... lambda_4, N
+    energy: Float[Array, "3 n 3"]  # kinetic, gravitational, elastic, J
+
+
+class AbstractWheel(eqx.Module):
+    """A rung of the model ladder. Rungs are final; the code above knows this face alone."""
+
+    @abc.abstractmethod
+    def advance(self, params: WheelParams, x: SectionState, options: Options) -> Advance:
+        """One step, told as leanly as possible. Differentiable in any mode, to any order."""
+
+    @abc.abstractmethod
+    def step(self, params: WheelParams, x: SectionState, options: Options) -> StepResult:
+        """One step with all indicators, monitors and energies. Differentiable in any mode."""
+
+    @abc.abstractmethod
+    def trace(
+        self, params: WheelParams, x: SectionState, options: Options, n_samples: int
+    ) -> Trajectory:
+        """The step's motion at `n_samples` equal times of each phase."""
+
+    @abc.abstractmethod
+    def start(self, params: WheelParams) -> SectionState:
+        """A section state from which a walk may begin."""
+
+
+def usable(params: WheelParams, x: SectionState) -> Array:
+    """Whether parameters and start are finite, in their domains and rolling forward."""
+    theta, dtheta = x[0], x[1]
+    upright = (jnp.abs(theta) < 0.5 * jnp.pi) & (jnp.abs(theta - params.leg_angle) < 0.5 * jnp.pi)
+    return params.in_domain() & jnp.all(jnp.isfinite(x)) & upright & (dtheta > 0.0)
+
+
+def replaced_where_bad(
+    good: Array, params: WheelParams, x: SectionState, safe_x: SectionState
+) -> tuple[WheelParams, SectionState]:
+    """Table 1 and a safe start in place of unusable input, so that no NaN is ever computed."""
+    safe = jax.tree.map(
+        lambda value, default: jnp.where(good, value, default.astype(value.dtype)),
+        params,
+        WheelParams(n_legs=params.n_legs),
+    )
+    return safe, jnp.where(good, x, safe_x.astype(x.dtype))

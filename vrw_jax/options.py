@@ -1,0 +1,59 @@
+"""Every numerical choice of the event-driven step in one visible object."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vrw_jax.params import Scalar, as_float_array
+
+
+class Options(eqx.Module):
+    """Numerical choices of an event-driven step. The tolerances may change without recompiling.
+
+    `solver` names any diffrax Runge-Kutta solver with an error estimate, explicit or implicit:
+    "Dopri8", "Tsit5", "Dopri5", "Bosh3", "Kvaerno3", "Kvaerno5", ...
+    """
+
+    solver: str = eqx.field(static=True, default="Dopri8")
+    rtol: Scalar = eqx.field(converter=as_float_array, default=1e-10)  # of each local step
+    atol: Scalar = eqx.field(converter=as_float_array, default=1e-10)  # m, rad, m/s, rad/s
+    max_phase_time: Scalar = eqx.field(converter=as_float_array, default=20.0)  # s
+    max_solver_steps: int = eqx.field(static=True, default=20_000)  # of one phase, tried steps
+    event_steps: int = eqx.field(static=True, default=7)  # Newton re-steps to locate an event
+    monitor_steps: int = eqx.field(static=True, default=5)  # secant re-steps to a monitor's minimum
+
+    def __check_init__(self) -> None:
+        for name in ("rtol", "atol", "max_phase_time"):
+            value = getattr(self, name)
+            if isinstance(value, jax.core.Tracer) or jnp.ndim(value) > 0:
+                continue
+            if not float(value) > 0.0:
+                raise ValueError(f"{name} is {float(value):g}, but it must be positive.")
+        for name in ("max_solver_steps", "event_steps", "monitor_steps"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}, but it must be at least 1.")
+
+    @classmethod
+    def tight(cls) -> "Options":
+        """The tightest useful tolerances in float64: a step is right to about 1e-12."""
+        return cls(rtol=1e-13, atol=1e-13)
+
+    def require_reachable(self, dtype: np.dtype) -> None:
+        """Refuse, in one sentence, a tolerance below what the number format can resolve."""
+        floor = 20.0 * float(jnp.finfo(dtype).eps)
+        for name in ("rtol", "atol"):
+            value = getattr(self, name)
+            if isinstance(value, jax.core.Tracer) or jnp.ndim(value) > 0:
+                continue
+            if float(value) < floor:
+                hint = (
+                    'call jax.config.update("jax_enable_x64", True) before making the parameters, '
+                    f"or ask for no less with Options(rtol={1e2 * floor:.0e}, atol={1e2 * floor:.0e})"
+                    if dtype == np.float32
+                    else f"ask for no less, as with Options(rtol={floor:.0e}, atol={floor:.0e})"
+                )
+                raise ValueError(
+                    f"{name} is {float(value):g}, but {np.dtype(dtype).name} numbers can't resolve "
+                    f"less than {floor:.0e}: {hint}."
+                )

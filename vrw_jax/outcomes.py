@@ -1,0 +1,41 @@
+"""How a step can end: one integer code per lane, with a name and a sentence."""
+
+import enum
+
+
+class Outcome(enum.IntEnum):
+    """How a step ended. Only STEPPED leaves a section state; the others end the walk."""
+
+    STEPPED = 0
+    TOUCHDOWN_BEFORE_STOPPER = 1
+    STOPPER_IN_DOUBLE_SUPPORT = 2
+    FELL_BACK = 3
+    COLLAPSED = 4
+    LEG_1_LIFTED_OFF = 5
+    NO_TOUCHDOWN_IN_TIME = 6
+    SOLVER_GAVE_UP = 7
+    BAD_INPUT = 8
+    NO_CYCLE_FOUND = 9
+
+    @property
+    def meaning(self) -> str:
+        """One sentence for a reader."""
+        return _MEANINGS[self]
+
+
+_MEANINGS = {
+    Outcome.STEPPED: "The wheel stepped from touchdown to touchdown in the paper's sequence.",
+    Outcome.TOUCHDOWN_BEFORE_STOPPER: (
+        "The next foot met the ground before Leg 2 was back at its stopper."
+    ),
+    Outcome.STOPPER_IN_DOUBLE_SUPPORT: (
+        "Leg 2 reached its stopper while its foot was still on the ground."
+    ),
+    Outcome.FELL_BACK: "The wheel stopped rolling forward and would fall back.",
+    Outcome.COLLAPSED: "A loaded leg collapsed to where its mass meets the hub: the wheel fell.",
+    Outcome.LEG_1_LIFTED_OFF: "The ground would have to pull on Leg 1's foot: it lifts off.",
+    Outcome.NO_TOUCHDOWN_IN_TIME: "No touchdown came within the allowed time of one phase.",
+    Outcome.SOLVER_GAVE_UP: "The integrator ran out of steps or could not locate an event.",
+    Outcome.BAD_INPUT: "A parameter or the start is not finite, or outside its domain.",
+    Outcome.NO_CYCLE_FOUND: "The search for a limit cycle did not converge to a valid one.",
+}

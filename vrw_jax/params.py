@@ -1,0 +1,164 @@
+"""What the wheel is made of: parameters with units and domains, and the paper's symbols."""
+
+import math
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+Scalar = Float[Array, ""]
+Elementwise = Float[Array, "..."]
+"""A quantity that may carry any leading axes: formulas below `scan` act element by element."""
+
+
+def as_float_array(value: object) -> Array:
+    """A strongly typed floating-point array; Python numbers take JAX's default float type."""
+    array = jnp.asarray(value)
+    if not jnp.issubdtype(array.dtype, jnp.floating):
+        array = array.astype(jnp.result_type(float))
+    return jax.lax.convert_element_type(array, np.dtype(array.dtype))
+
+
+class Domain(NamedTuple):
+    """Unit, symbol and allowed open/closed range of one parameter."""
+
+    symbol: str
+    unit: str
+    lower: float
+    upper: float
+    lower_is_allowed: bool
+    description: str
+
+    def contains(self, value: Array) -> Array:
+        """Whether value lies in the range; False for NaN."""
+        above = value >= self.lower if self.lower_is_allowed else value > self.lower
+        return above & (value < self.upper)
+
+    def __str__(self) -> str:
+        bracket = "[" if self.lower_is_allowed else "("
+        unit = f" {self.unit}" if self.unit else ""
+        return f"{bracket}{self.lower:g}, {self.upper:g}){unit}"
+
+
+DOMAINS: dict[str, Domain] = {
+    "hub_mass": Domain("m_H", "kg", 0.0, math.inf, True, "mass of the body frame"),
+    "leg_mass": Domain("m", "kg", 0.0, math.inf, False, "mass of one leg frame, a point"),
+    "leg_com": Domain("a", "m", 0.0, math.inf, True, "distance from foot to the leg's mass"),
+    "locked_length": Domain("L_0", "m", 0.0, math.inf, False, "length of a leg on its stopper"),
+    "natural_length": Domain("L*", "m", 0.0, math.inf, False, "length of the spring without load"),
+    "stiffness": Domain("k", "N/m", 0.0, math.inf, True, "spring constant of each leg"),
+    "damping": Domain("c", "N s/m", 0.0, math.inf, True, "viscous damping of each leg"),
+    "slope": Domain("phi", "rad", -math.pi / 2, math.pi / 2, False, "downhill slope"),
+    "gravity": Domain("g", "m/s^2", 0.0, math.inf, False, "gravitational acceleration"),
+}
+"""Every float parameter of `WheelParams`, in the order of its fields."""
+
+
+class Symbols(NamedTuple):
+    """The paper's symbols and the combinations that every formula needs, unpacked once."""
+
+    m: Elementwise
+    a: Elementwise
+    L0: Elementwise
+    Ls: Elementwise
+    k: Elementwise
+    c: Elementwise
+    g: Elementwise
+    sin_phi: Elementwise
+    cos_phi: Elementwise
+    Mh: Elementwise
+    """Mass that hangs on Leg 1: hub and n - 1 legs, kg."""
+    Mt: Elementwise
+    """Total mass, kg."""
+    c0: Elementwise
+    """Distance of a locked leg's mass from the hub, L0 - a, m."""
+    n: int
+    sin_alpha: float
+    cos_alpha: float
+    alpha: float
+
+
+class WheelParams(eqx.Module):
+    """Parameters of the viscoelastic-legged rimless wheel; the defaults are Table 1, slope 0.30.
+
+    All fields but `n_legs` are pytree leaves in SI units and may be swept and differentiated.
+    The paper does not print g; 9.81 m/s^2 reproduces its numbers. A number out of its domain is
+    refused here when it is a plain scalar; inside a batch it becomes `Outcome.BAD_INPUT`.
+    """
+
+    hub_mass: Scalar = eqx.field(converter=as_float_array, default=10.0)  # m_H, kg, >= 0
+    leg_mass: Scalar = eqx.field(converter=as_float_array, default=1.0)  # m, kg, > 0
+    leg_com: Scalar = eqx.field(converter=as_float_array, default=0.3)  # a, m, 0 <= a < L0
+    locked_length: Scalar = eqx.field(converter=as_float_array, default=1.0)  # L_0, m, > 0
+    natural_length: Scalar = eqx.field(converter=as_float_array, default=1.02)  # L*, m, > 0
+    stiffness: Scalar = eqx.field(converter=as_float_array, default=500.0)  # k, N/m, >= 0
+    damping: Scalar = eqx.field(converter=as_float_array, default=200.0)  # c, N s/m, >= 0
+    slope: Scalar = eqx.field(converter=as_float_array, default=0.30)  # phi, rad, |phi| < pi/2
+    gravity: Scalar = eqx.field(converter=as_float_array, default=9.81)  # g, m/s^2, > 0
+    n_legs: int = eqx.field(static=True, default=8)  # alpha = 2 pi / n_legs, >= 5
+
+    def __check_init__(self) -> None:
+        if not isinstance(self.n_legs, int) or self.n_legs < 5:
+            raise ValueError(
+                f"n_legs is {self.n_legs!r}, but the wheel needs a whole number of at least 5 legs "
+                "(with fewer the angle between legs is 90 degrees or more): choose 5 or more."
+            )
+        for name, domain in DOMAINS.items():
+            value = getattr(self, name)
+            if isinstance(value, jax.core.Tracer) or jnp.ndim(value) > 0:
+                continue
+            if not bool(domain.contains(value)):
+                raise ValueError(
+                    f"{name} is {float(value):g}, but {domain.description} must lie in {domain}: "
+                    "give a value in that range."
+                )
+        if not any(
+            isinstance(x, jax.core.Tracer) or jnp.ndim(x) > 0
+            for x in (self.leg_com, self.locked_length)
+        ) and not float(self.leg_com) < float(self.locked_length):
+            raise ValueError(
+                f"leg_com is {float(self.leg_com):g} m and locked_length {float(self.locked_length):g} "
+                "m, but a leg's mass must sit between foot and hub: give leg_com < locked_length."
+            )
+
+    @property
+    def leg_angle(self) -> float:
+        """Angle between neighbouring legs, alpha = 2 pi / n_legs, rad."""
+        return 2.0 * math.pi / self.n_legs
+
+    def in_domain(self) -> Bool[Array, "..."]:
+        """Whether every parameter is finite and in its domain, lane by lane."""
+        inside = self.leg_com < self.locked_length
+        for name, domain in DOMAINS.items():
+            value = getattr(self, name)
+            inside = inside & domain.contains(value) & jnp.isfinite(value)
+        return inside
+
+    def symbols(self) -> Symbols:
+        """The paper's symbols with the combinations shared by every formula."""
+        m, L0, a = self.leg_mass, self.locked_length, self.leg_com
+        alpha = self.leg_angle
+        return Symbols(
+            m=m,
+            a=a,
+            L0=L0,
+            Ls=self.natural_length,
+            k=self.stiffness,
+            c=self.damping,
+            g=self.gravity,
+            sin_phi=jnp.sin(self.slope),
+            cos_phi=jnp.cos(self.slope),
+            Mh=self.hub_mass + (self.n_legs - 1) * m,
+            Mt=self.hub_mass + self.n_legs * m,
+            c0=L0 - a,
+            n=self.n_legs,
+            sin_alpha=math.sin(alpha),
+            cos_alpha=math.cos(alpha),
+            alpha=alpha,
+        )
+
+
+PARAMETER_NAMES: tuple[str, ...] = tuple(DOMAINS)
