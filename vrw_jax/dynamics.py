@@ -9,6 +9,7 @@ constraints of eq. (2) hold by construction. Docs: docs/physics.md derives every
 
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -121,7 +122,7 @@ def double_support_acceleration(s: Symbols, distance: Elementwise, motion: Motio
     """DLS, one degree of freedom: the hub moves on a circle over both feet. Section 3.3.1."""
     M, f1, f2, f3 = terms(s, motion)
     circle = double_support_circle(s, distance, motion.sin, motion.cos)
-    tangent = (1.0, circle.G1, circle.G2)
+    tangent = (jnp.ones_like(circle.G1), circle.G1, circle.G2)
     row = M.times(tangent)
     centripetal = motion.dtheta * motion.dtheta
     force = f1 + circle.G1 * f2 + circle.G2 * f3
@@ -139,6 +140,13 @@ class FootForce(NamedTuple):
 
     tangential: Elementwise  # downhill positive: lambda_1 (fore) or lambda_3 (rear)
     normal: Elementwise  # pushing positive: lambda_2 (fore) or lambda_4 (rear)
+
+
+def friction_needed(force: FootForce) -> Elementwise:
+    """Tangential over normal force; 0 for a foot that is not pressed on the ground."""
+    pressed = force.normal > 0.0
+    ratio = jnp.abs(force.tangential) / jnp.where(pressed, force.normal, 1.0)
+    return jnp.where(pressed, ratio, 0.0)
 
 
 def foot_force_from_residual(

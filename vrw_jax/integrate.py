@@ -7,7 +7,7 @@ differentiated, hence first and second derivatives of event state and time hold 
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax
 import jax
@@ -55,7 +55,7 @@ class _Step(NamedTuple):
 
     time: Scalar
     state: State
-    solver_state: object
+    solver_state: Any
     values: Float[Array, " n_watched"]
     rates: Float[Array, " n_watched"]
 
@@ -73,7 +73,7 @@ class _Minimum(NamedTuple):
 class _Loop(NamedTuple):
     step: _Step
     length: Scalar  # of the next step to try, s
-    controller_state: object
+    controller_state: Any
     minimum: _Minimum
     running: Bool[Array, ""]
     bracketed: Bool[Array, ""]
@@ -93,7 +93,7 @@ class _Stepper(NamedTuple):
     controller: diffrax.PIDController
     term: diffrax.ODETerm
 
-    def start(self, state: State, options: Options) -> tuple[object, Scalar, object]:
+    def start(self, state: State, options: Options) -> tuple[Any, Scalar, Any]:
         """Solver state, length of the first step and controller state."""
         zero = jnp.zeros((), state.dtype)
         length, controller_state = self.controller.init(
@@ -107,16 +107,39 @@ class _Stepper(NamedTuple):
             self.solver.error_order(self.term),
         )
         solver_state = self.solver.init(self.term, zero, length, state, None)
-        return solver_state, lax.stop_gradient(length), controller_state
+        return solver_state, lax.stop_gradient(jnp.asarray(length)), controller_state
 
-    def step(self, state: State, solver_state: object, length: Scalar) -> tuple:
+    def step(self, state: State, solver_state: Any, length: Scalar) -> tuple[State, State, Any]:
         """State after `length`, its error estimate and the solver state there."""
         zero = jnp.zeros_like(length)
         end, error, _, solver_state, result = self.solver.step(
             self.term, zero, length, state, None, solver_state, jnp.asarray(False)
         )
+        if error is None:
+            raise ValueError(f"{type(self.solver).__name__} gives no error estimate.")
         error = jnp.where(result == diffrax.RESULTS.successful, error, jnp.inf)
         return end, error, solver_state
+
+    def judge(
+        self, start: State, end: State, error: State, length: Scalar, controller_state: Any
+    ) -> tuple[Bool[Array, ""], Scalar, Any]:
+        """Whether to keep the step, the length of the next, and the controller's state.
+
+        Nothing here is differentiated: derivatives are those of the steps taken.
+        """
+        start, end, error = lax.stop_gradient((start, end, error))
+        finite = jnp.all(jnp.isfinite(end))
+        keep, next_start, next_end, _, controller_state, _ = self.controller.adapt_step_size(
+            jnp.zeros_like(length),
+            length,
+            start,
+            jnp.where(finite, end, start),
+            None,
+            jnp.where(finite, error, jnp.inf),
+            self.solver.error_order(self.term),  # type: ignore[arg-type]
+            controller_state,
+        )
+        return jnp.asarray(keep), jnp.asarray(next_end - next_start), controller_state
 
 
 def solver_named(name: str, options: Options) -> diffrax.AbstractAdaptiveSolver:
@@ -130,11 +153,12 @@ def solver_named(name: str, options: Options) -> diffrax.AbstractAdaptiveSolver:
             "take 'Dopri8', 'Tsit5', 'Dopri5', 'Kvaerno3' or 'Kvaerno5'."
         )
     fields = getattr(solver_class, "__dataclass_fields__", {})
-    keywords: dict[str, object] = {}
+    keywords: dict[str, Any] = {}
     if "scan_kind" in fields:
         keywords["scan_kind"] = "lax"
     if "root_finder" in fields:
-        keywords["root_finder"] = diffrax.VeryChord(rtol=options.rtol, atol=options.atol)
+        tolerances: dict[str, Any] = {"rtol": options.rtol, "atol": options.atol}
+        keywords["root_finder"] = diffrax.VeryChord(**tolerances)
     return solver_class(**keywords)
 
 
@@ -218,19 +242,10 @@ def integrate_phase(
         here, length = loop.step, loop.length
         end, error, solver_state = stepper.step(here.state, here.solver_state, length)
         values, rates = watch(end)
-        finite = jnp.all(jnp.isfinite(end)) & jnp.all(jnp.isfinite(values))
-        still = lax.stop_gradient(here.state)
-        keep, next_start, next_end, _, controller_state, _ = stepper.controller.adapt_step_size(
-            jnp.zeros_like(length),
-            length,
-            still,
-            jnp.where(finite, lax.stop_gradient(end), still),
-            None,
-            jnp.where(finite, lax.stop_gradient(error), jnp.inf),
-            stepper.solver.error_order(stepper.term),
-            loop.controller_state,
+        error = jnp.where(jnp.all(jnp.isfinite(values)), error, jnp.inf)
+        keep, next_length, controller_state = stepper.judge(
+            here.state, end, error, length, loop.controller_state
         )
-        next_length = next_end - next_start
         crossing = values[:n_guards] <= 0.0
         crossed = keep & jnp.any(crossing)
         places, lows = _cubic_minimum(
@@ -302,7 +317,7 @@ def integrate_phase(
     )
 
 
-def _select(condition: Array, yes: object, no: object) -> object:
+def _select(condition: Any, yes: Any, no: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 
@@ -336,7 +351,7 @@ def _locate(
     )
 
     # First guess: where the cubic of each crossing guard passes zero.
-    def halve(_: int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+    def halve(_: object, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = ends
         middle = 0.5 * (low + high)
         positive = _cubic(middle, v0, r0, v1, r1) > 0.0
@@ -345,7 +360,7 @@ def _locate(
     low, high = lax.fori_loop(0, 20, halve, (jnp.zeros_like(v0), jnp.ones_like(v0)))
     guess = length * jnp.min(jnp.where(crossing, 0.5 * (low + high), 1.0))
 
-    def newton(carry: tuple, _: None) -> tuple:
+    def newton(carry: tuple, _iteration: None) -> tuple:
         offset, low, high, _ = carry
         state, _, _ = stepper.step(left.state, left.solver_state, offset)
         values, rates = watch(state)
@@ -423,11 +438,13 @@ def _settle(
     """
     found = jnp.isfinite(minimum.value)
 
-    def refine(index: Array, left: State, length: Scalar, offset: Scalar, rate_left: Scalar):
+    def refine(
+        index: Array, left: State, length: Scalar, offset: Scalar, rate_left: Scalar
+    ) -> Scalar:
         zero = jnp.zeros_like(length)
         solver_state = stepper.solver.init(stepper.term, zero, length, left, None)
 
-        def secant(carry: tuple, _: None) -> tuple:
+        def secant(carry: tuple, _iteration: None) -> tuple:
             offset, at, rate_at, _ = carry
             state, _, _ = stepper.step(left, solver_state, offset)
             values, rates = jax.jvp(watched.values, (state,), (stepper.field(state),))
@@ -467,7 +484,7 @@ def sample_phase(
     stepper = _stepper(field, options)
     interval = duration / (n_samples - 1)
 
-    def to_next(state: State, _: None) -> tuple[State, State]:
+    def to_next(state: State, _sample: None) -> tuple[State, State]:
         solver_state, length, controller_state = stepper.start(state, options)
         following = _march(
             stepper, state, solver_state, length, controller_state, interval, options
@@ -481,9 +498,9 @@ def sample_phase(
 def _march(
     stepper: _Stepper,
     state: State,
-    solver_state: object,
+    solver_state: Any,
     length: Scalar,
-    controller_state: object,
+    controller_state: Any,
     interval: Scalar,
     options: Options,
 ) -> State:
@@ -493,20 +510,13 @@ def _march(
         time, state, solver_state, length, controller_state, tried = carry
         step_length = jnp.minimum(length, interval - time)
         end, error, end_solver_state = stepper.step(state, solver_state, step_length)
-        keep, next_start, next_end, _, controller_state, _ = stepper.controller.adapt_step_size(
-            jnp.zeros_like(length),
-            step_length,
-            state,
-            end,
-            None,
-            error,
-            stepper.solver.error_order(stepper.term),
-            controller_state,
+        keep, next_length, controller_state = stepper.judge(
+            state, end, error, step_length, controller_state
         )
         last = keep & (step_length >= interval - time)
         time = jnp.where(last, interval, jnp.where(keep, time + step_length, time))
         state, solver_state = _select(keep, (end, end_solver_state), (state, solver_state))
-        return time, state, solver_state, next_end - next_start, controller_state, tried + 1
+        return time, state, solver_state, next_length, controller_state, tried + 1
 
     unfinished = lambda c: (c[0] < interval) & (c[-1] < options.max_solver_steps)
     zero = jnp.zeros_like(length)

@@ -37,23 +37,23 @@ class Options(eqx.Module):
     @classmethod
     def tight(cls) -> "Options":
         """The tightest useful tolerances in float64: a step is right to about 1e-12."""
-        return cls(rtol=1e-13, atol=1e-13)
+        return cls(rtol=as_float_array(1e-13), atol=as_float_array(1e-13))
 
     def require_reachable(self, dtype: np.dtype) -> None:
         """Refuse, in one sentence, a tolerance below what the number format can resolve."""
         floor = 20.0 * float(jnp.finfo(dtype).eps)
         for name in ("rtol", "atol"):
             value = getattr(self, name)
-            if isinstance(value, jax.core.Tracer) or jnp.ndim(value) > 0:
+            if isinstance(value, jax.core.Tracer) or jnp.ndim(value) > 0 or float(value) >= floor:
                 continue
-            if float(value) < floor:
+            enough = 1e2 * floor
+            hint = f"ask for no less, as with Options(rtol={enough:.0e}, atol={enough:.0e})"
+            if dtype == np.float32:
                 hint = (
-                    'call jax.config.update("jax_enable_x64", True) before making the parameters, '
-                    f"or ask for no less with Options(rtol={1e2 * floor:.0e}, atol={1e2 * floor:.0e})"
-                    if dtype == np.float32
-                    else f"ask for no less, as with Options(rtol={floor:.0e}, atol={floor:.0e})"
+                    'call jax.config.update("jax_enable_x64", True) before anything else, or '
+                    + hint
                 )
-                raise ValueError(
-                    f"{name} is {float(value):g}, but {np.dtype(dtype).name} numbers can't resolve "
-                    f"less than {floor:.0e}: {hint}."
-                )
+            raise ValueError(
+                f"{name} is {float(value):g}, but {np.dtype(dtype).name} numbers can't resolve "
+                f"less than {floor:.0e}: {hint}."
+            )

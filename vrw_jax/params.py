@@ -1,7 +1,7 @@
 """What the wheel is made of: parameters with units and domains, and the paper's symbols."""
 
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,7 +10,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 Scalar = Float[Array, ""]
-Elementwise = Float[Array, "..."]
+if TYPE_CHECKING:
+    Elementwise = Array
+else:
+    Elementwise = Float[Array, "..."] | float
 """A quantity that may carry any leading axes: formulas below `scan` act element by element."""
 
 
@@ -120,8 +123,9 @@ class WheelParams(eqx.Module):
             for x in (self.leg_com, self.locked_length)
         ) and not float(self.leg_com) < float(self.locked_length):
             raise ValueError(
-                f"leg_com is {float(self.leg_com):g} m and locked_length {float(self.locked_length):g} "
-                "m, but a leg's mass must sit between foot and hub: give leg_com < locked_length."
+                f"leg_com is {float(self.leg_com):g} m and locked_length "
+                f"{float(self.locked_length):g} m, but a leg's mass sits between foot and hub: "
+                "give leg_com < locked_length."
             )
 
     @property

@@ -135,6 +135,7 @@ def _walk(
         return (advance.section_state, outcome), advance
 
     carry = (x, jnp.int32(Outcome.STEPPED))
+    steps: Advance
     _, steps = lax.scan(one, carry, None, length=n_steps)
     return Walk(x, steps, jnp.sum(steps.outcome == Outcome.STEPPED))
 

@@ -81,7 +81,7 @@ def land(s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise) 
     # (A1) both feet held: the hub may only move on its circle.
     distance = foot_distance(s, theta_new)
     circle = double_support_circle(s, distance, sin, cos)
-    row = M.times((1.0, circle.G1, circle.G2))
+    row = M.times((jnp.ones_like(circle.G1), circle.G1, circle.G2))
     inertia = row[0] + circle.G1 * row[1] + circle.G2 * row[2]
     held = (p1 + circle.G1 * p2 + circle.G2 * p3) / inertia
     rear_impulse = foot_force_from_residual(

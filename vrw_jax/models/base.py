@@ -101,7 +101,7 @@ class Advance(eqx.Module):
 
 
 class Trajectory(eqx.Module):
-    """States of one step at equal times of each phase, with the forces that act there.
+    """States of one step at samples of each phase, both ends included, with the forces there.
 
     Axes: phase (DLS, SLS-I, SLS-II), sample. A phase that did not happen has duration 0 and repeats
     its start. Coordinates are in the labels of this step; the origin is Leg 1's foot.
@@ -128,7 +128,7 @@ class AbstractWheel(eqx.Module):
     def trace(
         self, params: WheelParams, x: SectionState, options: Options, n_samples: int
     ) -> Trajectory:
-        """The step's motion at `n_samples` equal times of each phase."""
+        """The step's motion at `n_samples` times of each phase."""
 
     @abc.abstractmethod
     def start(self, params: WheelParams) -> SectionState:

@@ -1,15 +1,324 @@
-from vrw_jax.models.base import AbstractWheel
+"""The lowest rung: all legs rigid. A step is a closed formula; nothing is integrated."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from vrw_jax import dynamics, transitions
+from vrw_jax.geometry import Motion, rear_foot_height
+from vrw_jax.models.base import (
+    AbstractWheel,
+    Advance,
+    EnergyLoss,
+    Indicators,
+    Margins,
+    SectionState,
+    StepResult,
+    Trajectory,
+    replaced_where_bad,
+    usable,
+)
+from vrw_jax.options import Options
+from vrw_jax.outcomes import Outcome
+from vrw_jax.params import Scalar, Symbols, WheelParams
+
+GRID = 65
+"""Angles at which a force is looked at before its minimum is polished: smooth over 45 degrees."""
 
 
 class RigidWheel(AbstractWheel):
-    def advance(self, params, x, options):
-        raise NotImplementedError
+    """Rimless wheel with rigid legs and leg masses; the springs, dampers and L* play no part.
 
-    def step(self, params, x, options):
-        raise NotImplementedError
+    The section state is (alpha/2, dtheta-, 0): only the rate is free, and what a start says
+    otherwise is ignored. The whole step counts as SLS-II. `held_landing` False is the classic
+    landing, whose rear foot leaves without an impulse (angular momentum about the new foot is
+    kept). True is the stiff limit of the paper's own landing (A4), whose rear foot is held during
+    the impulse: the limit of `ViscoelasticWheel` as docs/physics.md derives it.
+    """
 
-    def trace(self, params, x, options, n):
-        raise NotImplementedError
+    friction: float = eqx.field(static=True, default=1.0)
+    stop_at_lift_off: bool = eqx.field(static=True, default=True)
+    held_landing: bool = eqx.field(static=True, default=False)
 
-    def start(self, params):
-        raise NotImplementedError
+    def start(self, params: WheelParams) -> SectionState:
+        """The rolling fixed point's rate, where there is one; a brisk start where there is none."""
+        s = params.symbols()
+        keep = self._kept(s)
+        gained = 4.0 * _stiffness_of_gravity(s) * jnp.sin(0.5 * s.alpha) * s.sin_phi
+        rate = jnp.sqrt(jnp.maximum(gained, 0.1) / (1.0 - keep * keep))
+        return jnp.stack([0.5 * s.alpha + 0.0 * rate, rate, 0.0 * rate])
+
+    def advance(self, params: WheelParams, x: SectionState, options: Options) -> Advance:
+        result = self.step(params, x, options)
+        return Advance(result.section_state, result.durations, result.outcome)
+
+    def _kept(self, s: Symbols) -> Scalar:
+        """Rate after over rate before the landing."""
+        foot_inertia = _foot_inertia(s)
+        if not self.held_landing:
+            return (s.Mt * s.L0**2 * s.cos_alpha + _hub_inertia(s)) / foot_inertia
+        half = jnp.asarray(0.5 * s.alpha, s.L0.dtype)
+        m = transitions.land(s, half, jnp.ones_like(half), jnp.zeros_like(half)).motion
+        M = dynamics.mass_matrix(s, m.L1, m.L2)
+        return M.times((m.dtheta, m.dL1, m.dL2))[0] / foot_inertia
+
+    def step(self, params: WheelParams, x: SectionState, options: Options) -> StepResult:
+        x = jnp.stack([0.5 * params.leg_angle + 0.0 * x[0], x[1], 0.0 * x[2]])
+        good = usable(params, x)
+        safe_x = jnp.asarray([0.5 * params.leg_angle, 1.0, 0.0])
+        params, x = replaced_where_bad(good, params, x, safe_x)
+        s = params.symbols()
+        half = 0.5 * s.alpha
+        before = x[1]
+        rate = self._kept(s) * before
+        roll = _Roll(s, rate)
+
+        apex = jnp.where(s.sin_phi < jnp.sin(half), jnp.arcsin(-s.sin_phi), -half)
+        passes = roll.rate_squared(apex) > 0.0
+        angles = jnp.linspace(-half, half, GRID)
+        force = roll.lowest(lambda theta: roll.foot_force(theta).normal, angles)
+        lifts = (force <= 0.0) & passes & self.stop_at_lift_off
+        outcome = jnp.where(passes, Outcome.STEPPED, Outcome.FELL_BACK).astype(jnp.int32)
+        outcome = jnp.where(lifts, jnp.int32(Outcome.LEG_1_LIFTED_OFF), outcome)
+        outcome = jnp.where(good, outcome, jnp.int32(Outcome.BAD_INPUT))
+        stepped = outcome == Outcome.STEPPED
+        reach = _Roll(s, jnp.where(passes, rate, 10.0))
+        after = jnp.sqrt(reach.rate_squared(half))
+        duration = reach.time(half)
+
+        zero = jnp.zeros_like(before)
+        tell = lambda value: jnp.where(good, value, jnp.zeros_like(value))
+        walked = lambda value: jnp.where(stepped, value, jnp.zeros_like(value))
+        first = roll.motion(-half + zero)
+        landing = transitions.land(s, *x)
+        hub_jump = tuple(
+            a - b
+            for a, b in zip(
+                transitions.hub_velocity(first),
+                transitions.hub_velocity(transitions.motion_before_landing(s, *x)),
+                strict=True,
+            )
+        )
+        # Impulse at the fore foot: the jump of total momentum Mt v_hub (the mass centre).
+        rear = landing.rear if self.held_landing else dynamics.FootForce(zero, zero)
+        fore = dynamics.FootForce(
+            s.Mt * hub_jump[0] - rear.tangential, s.Mt * hub_jump[1] - rear.normal
+        )
+        locked = range(3, s.n + 1)
+        lowest = lambda quantity: walked(roll.lowest(quantity, angles))
+        needed = dynamics.friction_needed
+        foot_2 = lambda theta: rear_foot_height(s, roll.motion(theta))
+        return StepResult(
+            section_state=walked(jnp.stack([half + zero, after, zero])),
+            post_impact=tell(jnp.stack([-half + zero, rate])),
+            durations=walked(jnp.stack([zero, zero, duration])),
+            step_length=tell(2.0 * s.L0 * jnp.sin(half)),
+            indicators=Indicators(
+                lambda_I4=tell(rear.normal),
+                lambda_2=tell(roll.foot_force(-half + zero).normal),
+                lambda_4=zero,
+            ),
+            monitors=Margins(
+                fore_foot_force=walked(force),
+                clearance_sls1=zero,
+                clearance_sls2=walked(foot_2(half + zero)),
+                locked_stopper_force=lowest(lambda theta: roll.stopper_force(theta, locked)),
+                rear_stopper_force=lowest(lambda theta: roll.stopper_force(theta, range(2, 3)))[0],
+                contraction=zero,
+                friction_fore=walked(
+                    self.friction
+                    + roll.lowest(lambda theta: -needed(roll.foot_force(theta)), angles)
+                ),
+                friction_rear=tell(self.friction + zero),
+                landing_stopper_impulse=tell(
+                    transitions.locked_leg_impulses(s, first, hub_jump, locked)
+                ),
+                hit_stopper_impulse=jnp.zeros((s.n - 2,), zero.dtype),
+                hit_planted_impulse=zero,
+                landing_friction_fore=tell(self.friction - needed(fore)),
+                landing_friction_rear=tell(self.friction - needed(rear)),
+            ),
+            energy=EnergyLoss(
+                landing=tell(0.5 * _foot_inertia(s) * (before * before - rate * rate)),
+                stopper=zero,
+                damping=zero,
+            ),
+            outcome=outcome,
+            solver_steps=jnp.zeros((), jnp.int32),
+        )
+
+    def trace(
+        self, params: WheelParams, x: SectionState, options: Options, n_samples: int
+    ) -> Trajectory:
+        """Equal angles instead of equal times."""
+        result = self.step(params, x, options)
+        s = params.symbols()
+        roll = _Roll(s, result.post_impact[1])
+        stands = jnp.full((n_samples,), -0.5 * s.alpha)
+        rolls = jnp.where(
+            result.outcome == Outcome.STEPPED,
+            jnp.linspace(-0.5 * s.alpha, 0.5 * s.alpha, n_samples),
+            stands,
+        )
+        angles = jnp.stack([stands, stands, rolls])
+
+        def describe(theta: Scalar) -> tuple:
+            m = roll.motion(theta)
+            force = roll.foot_force(theta)
+            zero = 0.0 * theta
+            state = jnp.stack([theta, m.L1, m.L2, m.dtheta, m.dL1, m.dL2])
+            forces = jnp.stack([force.tangential, force.normal, zero, zero])
+            return roll.time(theta), state, forces, jnp.stack(dynamics.energy(s, m))
+
+        return Trajectory(*jax.vmap(jax.vmap(describe))(angles))
+
+
+class _Roll(eqx.Module):
+    """Rolling over one foot from theta = -alpha/2 with the given rate, by energy."""
+
+    s: Symbols
+    rate: Scalar  # at theta = -alpha/2, rad/s
+
+    def rate_squared(self, theta: Scalar) -> Scalar:
+        """Square of dtheta at theta; negative where the wheel does not get."""
+        s = self.s
+        fallen = _cos_sum(s, -0.5 * s.alpha) - _cos_sum(s, theta)
+        return self.rate**2 + 2.0 * _stiffness_of_gravity(s) * fallen
+
+    def time(self, theta: Scalar) -> Scalar:
+        """Time from theta = -alpha/2, s, by Carlson's R_F.
+
+        With t = sin^2 of half the angle from the vertical the rate is a square root of a linear
+        function of t, and time is the complete cubic form of the elliptic integral.
+        """
+        s = self.s
+        kappa = 2.0 * _stiffness_of_gravity(s)
+        phi = jnp.arcsin(s.sin_phi)
+        begin, end = 0.5 * (phi - 0.5 * s.alpha), 0.5 * (phi + theta)
+        least = self.rate**2 + kappa * (jnp.cos(2.0 * begin) - 1.0)  # rate^2 at the vertical
+        apart = begin * end < 0.0
+        from_vertical = jnp.zeros_like(end)
+        direct = _cubic_time(
+            jnp.where(apart, from_vertical, jnp.minimum(begin**2, end**2)),
+            jnp.where(apart, end**2, jnp.maximum(begin**2, end**2)),
+            least,
+            kappa,
+        )
+        first = _cubic_time(from_vertical, jnp.where(apart, begin**2, 0.0), least, kappa)
+        return direct + first
+
+    def motion(self, theta: Scalar) -> Motion:
+        """Posture and rates at theta."""
+        zero = 0.0 * theta
+        speed_squared = self.rate_squared(theta)
+        moving = speed_squared > 0.0
+        rate = jnp.where(moving, jnp.sqrt(jnp.where(moving, speed_squared, 1.0)), 0.0)
+        length = self.s.L0 + zero
+        return Motion.of(theta, length, length, rate, zero, zero)
+
+    def acceleration(self, theta: Scalar) -> dynamics.Acceleration:
+        """Angular acceleration under gravity; the legs don't move."""
+        zero = 0.0 * theta
+        sin_p = jnp.sin(theta) * self.s.cos_phi + jnp.cos(theta) * self.s.sin_phi
+        return dynamics.Acceleration(_stiffness_of_gravity(self.s) * sin_p, zero, zero)
+
+    def foot_force(self, theta: Scalar) -> dynamics.FootForce:
+        """Force of the ground on the standing foot, N."""
+        return dynamics.fore_foot_force(self.s, self.motion(theta), self.acceleration(theta))
+
+    def stopper_force(self, theta: Scalar, legs: range) -> Float[Array, " n"]:
+        """Force of the stoppers of `legs`, N."""
+        return dynamics.stopper_force(self.s, self.motion(theta), self.acceleration(theta), legs)
+
+    def lowest(self, quantity: Callable[[Scalar], Array], angles: Array) -> Array:
+        """Minimum of a smooth quantity over the given angles, polished by Newton's method."""
+        values = jax.vmap(quantity)(angles)
+        flat = values.reshape(values.shape[0], -1)
+        start = angles[jnp.argmin(flat, axis=0)]
+        pick = lambda theta, index: quantity(theta).reshape(-1)[index]
+        slope = jax.grad(pick)
+        spacing = angles[1] - angles[0]
+
+        def polish(theta: Scalar, index: Array) -> Scalar:
+            low = jnp.maximum(theta - spacing, angles[0])
+            high = jnp.minimum(theta + spacing, angles[-1])
+
+            def newton(_: object, at: Scalar) -> Scalar:
+                curvature = jax.grad(slope)(at, index)
+                bends = curvature > 0.0
+                change = slope(at, index) / jnp.where(bends, curvature, 1.0)
+                return jnp.clip(jnp.where(bends, at - change, at), low, high)
+
+            at = lax.fori_loop(0, 5, newton, theta)
+            return jnp.minimum(pick(lax.stop_gradient(at), index), pick(theta, index))
+
+        polished = jax.vmap(polish)(start, jnp.arange(flat.shape[1]))
+        return polished.reshape(values.shape[1:])
+
+
+def _hub_inertia(s: Symbols) -> Scalar:
+    """Moment of inertia of all leg masses about the hub, n m (L0 - a)^2, kg m^2."""
+    return s.n * s.m * s.c0**2
+
+
+def _foot_inertia(s: Symbols) -> Scalar:
+    """Moment of inertia of the wheel about a foot, kg m^2."""
+    return s.Mt * s.L0**2 + _hub_inertia(s)
+
+
+def _stiffness_of_gravity(s: Symbols) -> Scalar:
+    """Mt g L0 over the inertia about the foot, 1/s^2: g/l of a rimless wheel without leg masses."""
+    return s.Mt * s.g * s.L0 / _foot_inertia(s)
+
+
+def _cos_sum(s: Symbols, theta: Scalar | float) -> Scalar:
+    """Cosine of theta + phi."""
+    return jnp.cos(theta) * s.cos_phi - jnp.sin(theta) * s.sin_phi
+
+
+def _cubic_time(begin_squared: Scalar, end_squared: Scalar, least: Scalar, kappa: Scalar) -> Scalar:
+    """Time between two half-angles on one side of the vertical, given by their squares, s.
+
+    Integral of dt / sqrt(t (1 - t) (least + 2 kappa t)) over t = sin^2, as 2 R_F (DLMF 19.29.4);
+    zero where both ends coincide.
+    """
+    apart = end_squared > begin_squared
+    low = jnp.where(apart, begin_squared, 0.0)
+    high = jnp.where(apart, end_squared, 1.0)
+    at_foot = low > 0.0  # sqrt has no derivative at the vertical, where Y1 = 0
+    angle_low = jnp.where(at_foot, jnp.sqrt(jnp.where(at_foot, low, 1.0)), 0.0)
+    angle_high = jnp.sqrt(high)
+    y1, y2 = jnp.sin(angle_low), jnp.cos(angle_low)
+    x1, x2 = jnp.sin(angle_high), jnp.cos(angle_high)
+    y3 = jnp.sqrt(jnp.maximum(least + 2.0 * kappa * y1**2, 1e-300))
+    x3 = jnp.sqrt(jnp.maximum(least + 2.0 * kappa * x1**2, 1e-300))
+    gap = x1**2 - y1**2
+    u12 = (x1 * x2 * y3 + y1 * y2 * x3) / gap
+    u13 = (x1 * x3 * y2 + y1 * y3 * x2) / gap
+    u23 = (x2 * x3 * y1 + y2 * y3 * x1) / gap
+    return jnp.where(apart, 2.0 * carlson_rf(u12**2, u13**2, u23**2), 0.0)
+
+
+def carlson_rf(x: Scalar, y: Scalar, z: Scalar) -> Scalar:
+    """Carlson's symmetric elliptic integral R_F to round-off, by duplication (DLMF 19.36.1).
+
+    Each duplication brings the arguments four times closer; after 12 the fifth-order series is
+    exact in float64 for arguments within ten decades of each other.
+    """
+
+    def double(_: object, xyz: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        x, y, z = xyz
+        root_x, root_y, root_z = jnp.sqrt(x), jnp.sqrt(y), jnp.sqrt(z)
+        shift = root_x * root_y + root_y * root_z + root_z * root_x
+        return 0.25 * (x + shift), 0.25 * (y + shift), 0.25 * (z + shift)
+
+    x, y, z = lax.fori_loop(0, 12, double, (x, y, z))
+    mean = (x + y + z) / 3.0
+    dx, dy = 1.0 - x / mean, 1.0 - y / mean
+    dz = -dx - dy
+    e2, e3 = dx * dy - dz * dz, dx * dy * dz
+    return (1.0 - e2 / 10.0 + e3 / 14.0 + e2 * e2 / 24.0 - 3.0 * e2 * e3 / 44.0) / jnp.sqrt(mean)

@@ -86,7 +86,7 @@ class _Builder(NamedTuple):
         if not self.monitored:
             return []
         stoppers = dynamics.stopper_force(self.s, m, a, self.locked)
-        return [fore.normal, self.s.L0 - m.L1, -_friction_needed(fore), *stoppers]
+        return [fore.normal, self.s.L0 - m.L1, -dynamics.friction_needed(fore), *stoppers]
 
     def watch(
         self, values: Watch, n_own: int, contraction_at_start: bool, own: tuple[bool, ...] = ()
@@ -224,21 +224,23 @@ class ViscoelasticWheel(AbstractWheel):
 
     def advance(self, params: WheelParams, x: SectionState, options: Options) -> Advance:
         def lean(*leaves: Array) -> tuple:
-            walked = self._walk(*_unpack(leaves, structure), monitored=False)
+            params, x, options = jax.tree.unflatten(structure, leaves)
+            walked = self._walk(params, x, options, monitored=False)
             durations = jnp.stack([end.duration for end in walked.ends])
             return (_section_state(walked), durations), walked.outcome
 
-        leaves, structure = _pack(params, x, options)
+        leaves, structure = jax.tree.flatten((params, x, options))
         (section_state, durations), outcome = any_mode(lean)(*leaves)
         return Advance(section_state, durations, outcome)
 
     def step(self, params: WheelParams, x: SectionState, options: Options) -> StepResult:
         def full(*leaves: Array) -> tuple:
-            walked = self._walk(*_unpack(leaves, structure), monitored=True)
+            params, x, options = jax.tree.unflatten(structure, leaves)
+            walked = self._walk(params, x, options, monitored=True)
             result = _result(walked, self.friction)
             return eqx.partition(result, eqx.is_inexact_array)
 
-        leaves, structure = _pack(params, x, options)
+        leaves, structure = jax.tree.flatten((params, x, options))
         floats, integers = any_mode(full)(*leaves)
         return eqx.combine(floats, integers)
 
@@ -331,26 +333,10 @@ SAFE_SINGLE_SUPPORT = (-0.3, 0.9, 0.95, 1.0, 0.0, 0.0)
 """A harmless posture that stands in where a lane has already failed; it is never integrated."""
 
 
-def _pack(params: WheelParams, x: SectionState, options: Options) -> tuple[list[Array], object]:
-    return jax.tree.flatten((params, x, options))
-
-
-def _unpack(leaves: tuple[Array, ...], structure: object) -> tuple:
-    return jax.tree.unflatten(structure, leaves)
-
-
 def _section_state(walked: _Walked) -> SectionState:
     theta, _, dtheta, dL1 = walked.ends[2].state
     state = jnp.stack([theta, dtheta, dL1])
     return jnp.where(walked.outcome == Outcome.STEPPED, state, jnp.zeros_like(state))
-
-
-def _friction_needed(force: dynamics.FootForce) -> Array:
-    """Tangential over normal; 0 for a foot that is not pressed on the ground."""
-    pressed = force.normal > 0.0
-    return jnp.where(
-        pressed, jnp.abs(force.tangential) / jnp.where(pressed, force.normal, 1.0), 0.0
-    )
 
 
 def _result(walked: _Walked, friction: float) -> StepResult:
@@ -385,7 +371,7 @@ def _result(walked: _Walked, friction: float) -> StepResult:
         friction_fore=jnp.where(began, friction + over_step(2), 0.0),
         friction_rear=jnp.where(
             began,
-            friction - jnp.where(walked.happened[0], _friction_needed(rear_after), 0.0),
+            friction - jnp.where(walked.happened[0], dynamics.friction_needed(rear_after), 0.0),
             0.0,
         ),
         landing_stopper_impulse=jnp.where(
@@ -395,9 +381,9 @@ def _result(walked: _Walked, friction: float) -> StepResult:
             hits, transitions.locked_leg_impulses(s, hit.motion, hit.hub_jump, locked), 0.0
         ),
         hit_planted_impulse=jnp.where(hits, hit.planted.normal, 0.0),
-        landing_friction_fore=jnp.where(began, friction - _friction_needed(landing.fore), 0.0),
+        landing_friction_fore=jnp.where(began, friction - dynamics.friction_needed(landing.fore), 0.0),
         landing_friction_rear=jnp.where(
-            began, friction - jnp.where(held, _friction_needed(landing.rear), 0.0), 0.0
+            began, friction - jnp.where(held, dynamics.friction_needed(landing.rear), 0.0), 0.0
         ),
     )
     end = walked.phases[2].motion(walked.ends[2].state)
