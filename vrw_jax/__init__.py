@@ -13,6 +13,7 @@ from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
 from vrw_jax.params import WheelParams
 from vrw_jax.return_map import Walk, paper_start, return_map, step, walk
+from vrw_jax.simulate import simulate
 
 __all__ = [
     "AbstractWheel",
@@ -28,6 +29,7 @@ __all__ = [
     "WheelParams",
     "paper_start",
     "return_map",
+    "simulate",
     "step",
     "walk",
 ]
