@@ -1,0 +1,1 @@
+"""Independent oracle of the wheel: shares no code and no derivation with the library."""
