@@ -1,5 +1,7 @@
 """Differentiable, batched simulation of the passive viscoelastic-legged rimless wheel."""
 
+from vrw_jax.cycle_options import CycleOptions
+from vrw_jax.limit_cycle import LimitCycle, limit_cycle
 from vrw_jax.models import (
     AbstractWheel,
     EnergyLoss,
@@ -17,8 +19,10 @@ from vrw_jax.simulate import simulate
 
 __all__ = [
     "AbstractWheel",
+    "CycleOptions",
     "EnergyLoss",
     "Indicators",
+    "LimitCycle",
     "Margins",
     "Options",
     "Outcome",
@@ -27,6 +31,7 @@ __all__ = [
     "ViscoelasticWheel",
     "Walk",
     "WheelParams",
+    "limit_cycle",
     "paper_start",
     "return_map",
     "simulate",

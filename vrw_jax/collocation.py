@@ -1,0 +1,519 @@
+"""A limit cycle as one algebraic system: all phases, their durations and the section at once.
+
+Each phase is cut into steps of four Gauss nodes (order 8). Unknown are the section's numbers, the
+durations of the phases and the accelerations at all nodes; positions and rates follow from them
+explicitly. One `linearised_pass` walks through the steps once, carrying a few columns: the Newton
+correction, one column for each number of the section, one for each parameter that is asked for, and
+one for the duration of the running phase. A step's node equations are eliminated on the spot, a
+phase's duration at its event, the section's numbers at the closing of the cycle. So the monodromy
+matrix and the sensitivities of everything to the parameters are columns of the same pass.
+
+Arrays carry lanes (independent wheels) on their last axis; nothing branches. XLA on CPU computes
+cheap producers again for each consumer, which costs more than all arithmetic here; `lax.cond` on a
+predicate that is always true, but only known at run time, is the barrier that it can't remove.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+from numpy.polynomial import legendre
+
+from vrw_jax.params import Elementwise
+
+N_NODES = 4
+
+
+def _gauss_rule() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Nodes, integration matrix and weights of the Gauss collocation on [0, 1]."""
+    nodes = (legendre.leggauss(N_NODES)[0] + 1.0) / 2.0
+    powers = np.arange(N_NODES)
+    to_polynomial = np.linalg.inv(nodes[:, None] ** powers)
+    matrix = (nodes[:, None] ** (powers + 1) / (powers + 1)) @ to_polynomial
+    return nodes, matrix, (1.0 / (powers + 1)) @ to_polynomial
+
+
+NODES, ONCE, ENDS_ONCE = _gauss_rule()
+TWICE, ENDS_TWICE = ONCE @ ONCE, ENDS_ONCE @ ONCE
+"""Once and twice integrated from a step's start to its nodes, and to its end."""
+
+Constants = tuple[Elementwise, ...]
+Vector = tuple[Elementwise, ...]
+LaneArray = Float[Array, "*axes lanes"]
+
+
+class Point(NamedTuple):
+    """Where a phase is: what it holds constant, coordinates and rates."""
+
+    held: Vector
+    q: Vector
+    v: Vector
+
+
+class Phase(NamedTuple):
+    """One phase as data; every function is elementwise over the lanes.
+
+    `acceleration`, `event` (zero at the end, of order 1) and `guards` (positive inside) read
+    (constants, point); `reset` turns the phase's end into the next phase's start, and the last
+    one's into the section's numbers (in `q`).
+    """
+
+    name: str
+    dim: int
+    acceleration: Callable[[Constants, Point], Vector]
+    event: Callable[[Constants, Point], Elementwise]
+    reset: Callable[[Constants, Point], Point]
+    guards: Callable[[Constants, Point], Vector]
+
+
+class PhaseSequence(NamedTuple):
+    """The phases between two passages of the section, whose size is the number of unknowns there.
+
+    `start` turns the section's numbers into the first phase's start. `border_checks` reads the
+    passages of a step and which phases happened, and returns what must be positive there.
+    """
+
+    section_size: int
+    start: Callable[[Constants, Vector], Point]
+    phases: tuple[Phase, ...]
+    border_checks: Callable[[Constants, "tuple[Passage, ...]", Array], Vector]
+
+
+class Mesh(NamedTuple):
+    """Steps of one phase as fractions of its duration, growing by `growth` from first to last."""
+
+    n_steps: int
+    growth: float
+
+    @property
+    def fractions(self) -> np.ndarray:
+        places = np.linspace(0.0, 1.0, self.n_steps + 1)
+        rate = np.log(self.growth)
+        if abs(rate) > 1e-12:
+            places = np.expm1(rate * places) / np.expm1(rate)
+        return np.diff(places)
+
+
+class Solution(NamedTuple):
+    """The unknowns of a cycle of n steps, lanes last; a step is one passage of the sequence."""
+
+    section: LaneArray  # (section_size, lanes), at the start of the first step
+    durations: LaneArray  # (n, n_phases, lanes), s
+    accelerations: tuple[LaneArray, ...]  # by phase: (n, n_steps, N_NODES, dim, lanes)
+
+
+class Linearised(NamedTuple):
+    """What one pass finds out at a trial solution."""
+
+    correction: Solution  # of Newton's method
+    columns: Solution  # leading axis: derivatives with respect to each parameter asked for
+    monodromy: LaneArray  # (row, column, lanes): derivative of the return to the section
+
+
+Hold = Callable[[object], object]
+
+
+def fusion_barrier(lanes: Float[Array, "... lanes"]) -> Hold:
+    """A function that returns its argument and that XLA can't fuse across.
+
+    `lanes` must not hold NaN; that it does not is what XLA can't know.
+    """
+    always = ~jnp.isnan(jnp.max(lanes))
+
+    def hold(tree: object) -> object:
+        return lax.cond(always, lambda t: t, lambda t: jax.tree.map(jnp.zeros_like, t), tree)
+
+    return hold
+
+
+def _mix(matrix: np.ndarray, x: Array) -> Array:
+    """Matrix product over the leading axis as a sum of elementwise products."""
+    shape = (-1,) + (1,) * (x.ndim - 1)
+    terms = [matrix[:, j].astype(x.dtype).reshape(shape) * x[j] for j in range(matrix.shape[1])]
+    return sum(terms[1:], start=terms[0])
+
+
+def _weigh(weights: np.ndarray, x: Array) -> Array:
+    """Weighted sum over the leading axis."""
+    terms = [float(weights[j]) * x[j] for j in range(len(weights))]
+    return sum(terms[1:], start=terms[0])
+
+
+def _contract(left: Array, right: Array) -> Array:
+    """Sum over s of left[..., s, lanes] * right[s, ..., lanes], elementwise over lanes."""
+    gap = (slice(None),) * (left.ndim - 2) + (None,) * (right.ndim - 2)
+    terms = [left[..., s, :][(*gap, slice(None))] * right[s] for s in range(right.shape[0])]
+    return sum(terms[1:], start=terms[0])
+
+
+def inverse(matrix: Float[Array, "n n lanes"]) -> Float[Array, "n n lanes"]:
+    """Inverse of a 1x1, 2x2 or 3x3 matrix by cofactors."""
+    m = matrix
+    if m.shape[0] == 1:
+        return 1.0 / m
+    if m.shape[0] == 2:
+        determinant = m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]
+        adjugate = jnp.stack([jnp.stack([m[1, 1], -m[0, 1]]), jnp.stack([-m[1, 0], m[0, 0]])])
+        return adjugate / determinant
+    if m.shape[0] != 3:
+        raise ValueError(f"the matrix has {m.shape[0]} rows, but only 1, 2 or 3 are built.")
+    after, before = np.array([1, 2, 0]), np.array([2, 0, 1])
+    cofactors = (
+        m[after][:, after] * m[before][:, before] - m[after][:, before] * m[before][:, after]
+    )
+    determinant = _weigh(np.ones(3), m[0] * cofactors[0])
+    return jnp.swapaxes(cofactors, 0, 1) / determinant
+
+
+def _eliminate(
+    matrix: Float[Array, "nodes dim nodes dim lanes"],
+    right: Float[Array, "nodes dim columns lanes"],
+    hold: Hold,
+) -> Float[Array, "nodes dim columns lanes"]:
+    """Solve the node equations of one step, block by block without pivoting.
+
+    The matrix is the identity less terms of order h; its diagonal blocks stay regular.
+    """
+    n, dim = matrix.shape[:2]
+    rest = jnp.concatenate([matrix.reshape(n, dim, n * dim, -1), right], axis=2)
+    rows = []
+    for _ in range(n):
+        pivot = rest[0]
+        row = _contract(inverse(pivot[:, :dim]), pivot[:, dim:])
+        if len(rows) < n - 1:
+            row = hold(row)
+            rest = hold(rest[1:, :, dim:] - _contract(rest[1:, :, :dim], row))
+        rows.append(row)
+    solved = [rows[-1]]
+    for row in rows[-2::-1]:
+        known = jnp.concatenate(solved)
+        n_known = known.shape[0]
+        solved.insert(0, row[:, n_known:] - _contract(row[:, :n_known], known))
+    return jnp.stack(solved)
+
+
+def _push(function: Callable, primals: tuple, tangents: tuple) -> tuple:
+    """Value and derivatives of `function` along tangents with a leading axis of columns."""
+    columns = lambda *t: jax.jvp(function, primals, t)
+    return jax.vmap(columns, in_axes=0, out_axes=(None, 0))(*tangents)
+
+
+def _partials(function: Callable, arguments: Sequence[Array]) -> tuple[Vector, list[Vector]]:
+    """Value and partial derivative by each argument, each with its own structural zeros."""
+    partials = []
+    for i, argument in enumerate(arguments):
+
+        def along(x: Array, i: int = i) -> Vector:
+            return function(*arguments[:i], x, *arguments[i + 1 :])
+
+        value, partial = jax.jvp(along, (argument,), (jnp.ones_like(argument),))
+        partials.append(partial)
+    return value, partials
+
+
+class _Front(NamedTuple):
+    """Where the pass is, with the columns of everything there (leading axis: columns)."""
+
+    held: LaneArray
+    q: LaneArray
+    v: LaneArray
+    d_held: LaneArray
+    dq: LaneArray
+    dv: LaneArray
+
+
+def _with_column(front: _Front) -> _Front:
+    """One more column, zero so far, for the duration of the phase that begins."""
+    more = lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])])
+    return front._replace(d_held=more(front.d_held), dq=more(front.dq), dv=more(front.dv))
+
+
+def _pass_phase(
+    phase: Phase,
+    constants: Constants,
+    d_constants: tuple[Array, ...],
+    front: _Front,
+    duration: LaneArray,
+    accelerations: LaneArray,
+    mesh: Mesh,
+    hold: Hold,
+) -> tuple[_Front, LaneArray]:
+    """Through all steps of a phase; returns its end and the columns of its accelerations.
+
+    The columns are (correction, section, parameters, duration); the last is the phase's own.
+    """
+    dim, dtype = phase.dim, duration.dtype
+    n_columns = front.dq.shape[0]
+    n_parameters = d_constants[0].shape[0]
+    held = tuple(front.held)
+
+    def field(*moving: Array) -> Vector:
+        n_held = len(held)
+        point = Point(moving[2 * dim :], moving[:dim], moving[dim : 2 * dim])
+        assert len(point.held) == n_held
+        return phase.acceleration(constants, point)
+
+    def step(carry: tuple, inputs: tuple) -> tuple:
+        q, v, dq, dv = carry
+        a, fraction = inputs
+        h = fraction * duration
+        c = NODES.astype(dtype)[:, None, None]
+        a_once, a_twice = _mix(ONCE, a), _mix(TWICE, a)
+        Q = q + h * (c * v + h * a_twice)
+        V = v + h * a_once
+        dQ = dq[:, None] + (h * c) * dv[:, None]
+        dV = jnp.broadcast_to(dv[:, None], dQ.shape)
+        dQ = dQ.at[-1].add(fraction * (c * v + 2.0 * h * a_twice))
+        dV = dV.at[-1].add(fraction * a_once)
+        Q, V, dQ, dV = hold((Q, V, dQ, dV))
+
+        moving = [Q[:, i] for i in range(dim)] + [V[:, i] for i in range(dim)]
+        moving += [jnp.broadcast_to(x, Q[:, 0].shape) for x in held]
+        value, partials = _partials(field, moving)
+        jacobian = jnp.stack([jnp.stack(p, 1) for p in partials], 2)  # (node, row, argument, lane)
+        value = jnp.stack(value, 1)
+        forced = ()
+        if n_parameters:
+            here = Point(held, tuple(moving[:dim]), tuple(moving[dim : 2 * dim]))
+            _, forced = _push(lambda *c: phase.acceleration(c, here), constants, d_constants)
+            forced = jnp.stack(forced, 2)
+        value, jacobian, forced = hold((value, jacobian, forced))
+
+        d_moving = jnp.concatenate([dQ, dV], 2)  # (column, node, argument, lane)
+        right = sum(
+            jacobian[:, :, s] * d_moving[:, :, s, None] for s in range(2 * dim)
+        )
+        for s in range(len(held)):
+            right += jacobian[:, :, 2 * dim + s] * front.d_held[:, s, None, None]
+        right = right.at[0].add(value - a)
+        if n_parameters:
+            right = right.at[n_columns - 1 - n_parameters : -1].add(forced)
+        twice, once = (m.astype(dtype)[:, None, :, None, None] for m in (TWICE, ONCE))
+        J_q, J_v = jacobian[:, :, None, :dim], jacobian[:, :, None, dim : 2 * dim]
+        identity = np.eye(N_NODES * dim, dtype=dtype).reshape(N_NODES, dim, N_NODES, dim, 1)
+        matrix = identity - h * (h * twice * J_q + once * J_v)
+        matrix, right = hold((matrix, jnp.moveaxis(right, 0, 2)))
+        da = hold(_eliminate(matrix, right, hold))  # (node, row, column, lane)
+
+        by_column = jnp.moveaxis(da, 2, 0)
+        sum_once, sum_twice = _weigh(ENDS_ONCE, a), _weigh(ENDS_TWICE, a)
+        d_once = _weigh(ENDS_ONCE, da).swapaxes(0, 1)
+        d_twice = _weigh(ENDS_TWICE, da).swapaxes(0, 1)
+        dq = (dq + h * dv + h * h * d_twice).at[-1].add(fraction * (v + 2.0 * h * sum_twice))
+        dv = (dv + h * d_once).at[-1].add(fraction * sum_once)
+        q, v = q + h * v + h * h * sum_twice, v + h * sum_once
+        return (q, v, dq, dv), by_column
+
+    start = (front.q, front.v, front.dq, front.dv)
+    fractions = jnp.asarray(mesh.fractions, dtype)
+    (q, v, dq, dv), columns = lax.scan(step, start, (accelerations, fractions))
+    return front._replace(q=q, v=v, dq=dq, dv=dv), columns
+
+
+def _leave_phase(
+    phase: Phase,
+    constants: Constants,
+    d_constants: tuple[Array, ...],
+    front: _Front,
+    duration: LaneArray,
+    happens: Bool[Array, " lanes"],
+) -> tuple[_Front, LaneArray, Callable[[Array], Array]]:
+    """Eliminate the duration by the event and reset.
+
+    Returns the next phase's front, the columns of the duration, and the function that eliminates
+    the duration's column from other columns. A phase that does not happen has duration zero.
+    """
+    n_held, dim = front.held.shape[0], phase.dim
+    n_parameters = d_constants[0].shape[0]
+
+    def end(held: Array, q: Array, v: Array, *constants: Array) -> tuple:
+        point = Point(tuple(held), tuple(q), tuple(v))
+        after = phase.reset(constants, point)
+        stack = lambda x: jnp.stack(x) if x else jnp.zeros((0, *q.shape[1:]), q.dtype)
+        return phase.event(constants, point), tuple(stack(x) for x in after)
+
+    n_columns = front.dq.shape[0]
+    zeros_before = n_columns - 1 - n_parameters
+    padded = tuple(
+        jnp.concatenate([jnp.zeros((zeros_before, *x.shape[1:]), x.dtype), x, 0.0 * duration[None]])
+        for x in d_constants
+    )
+    (event, after), (d_event, d_after) = _push(
+        end,
+        (front.held, front.q, front.v, *constants),
+        (front.d_held, front.dq, front.dv, *padded),
+    )
+    del n_held, dim
+    own = jnp.zeros_like(d_event).at[-1].set(1.0)
+    event = jnp.where(happens, event, duration)
+    d_event = jnp.where(happens, d_event, own)
+    d_duration = -d_event[:-1].at[0].add(event) / d_event[-1]
+
+    def eliminate(columns: Array) -> Array:
+        factor = d_duration.reshape(d_duration.shape[:1] + (1,) * (columns.ndim - 2) + (-1,))
+        return columns[:-1] + factor * columns[-1:]
+
+    following = _Front(*after, *(eliminate(x) for x in d_after))
+    return following, d_duration, eliminate
+
+
+def linearised_pass(
+    sequence: PhaseSequence,
+    meshes: tuple[Mesh, ...],
+    constants_of: Callable[..., Constants],
+    parameters: LaneArray,
+    solution: Solution,
+    happens: Bool[Array, "n n_phases lanes"],
+    wanted: tuple[int, ...] = (),
+) -> Linearised:
+    """Newton's correction, monodromy and the columns of the parameters `wanted`, at `solution`.
+
+    `happens` says which phases take place: one that does not has duration zero and only resets.
+    """
+    hold = fusion_barrier(parameters)
+    size, n_wanted = sequence.section_size, len(wanted)
+    n_columns = 1 + size + n_wanted
+    lanes = parameters.shape[1:]
+    dtype = parameters.dtype
+    units = np.eye(parameters.shape[0], dtype=dtype)[list(wanted)]
+    d_parameters = tuple(jnp.broadcast_to(unit[:, None], (n_wanted, *lanes)) for unit in units.T)
+    if n_wanted:
+        constants, d_constants = _push(constants_of, tuple(parameters), d_parameters)
+    else:
+        constants = constants_of(*parameters)
+        d_constants = tuple(jnp.zeros((0, *lanes), dtype) for _ in constants)
+    full_d_constants = tuple(
+        jnp.concatenate([jnp.zeros((1 + size, *lanes), dtype), x]) for x in d_constants
+    )
+    section = solution.section
+    d_section = jnp.zeros((n_columns, size, *lanes), dtype)
+    d_section = d_section.at[1 + np.arange(size), np.arange(size)].set(1.0)
+
+    def start(section: Array, *constants: Array) -> tuple:
+        point = sequence.start(constants, tuple(section))
+        stack = lambda x: jnp.stack(x) if x else jnp.zeros((0, *section.shape[1:]), section.dtype)
+        return tuple(stack(x) for x in point)
+
+    def one_step(carry: tuple, inputs: tuple) -> tuple:
+        section, d_section = carry
+        durations, accelerations, happens = inputs
+        begin = _push(start, (section, *constants), (d_section, *full_d_constants))
+        front = _Front(*begin[0], *begin[1])
+        d_durations, d_accelerations = [], []
+        for i, phase in enumerate(sequence.phases):
+            front, columns = _pass_phase(
+                phase,
+                constants,
+                d_constants,
+                _with_column(front),
+                durations[i],
+                accelerations[i],
+                meshes[i],
+                hold,
+            )
+            front, d_duration, eliminate = _leave_phase(
+                phase, constants, d_constants, front, durations[i], happens[i]
+            )
+            d_durations.append(d_duration)
+            # Columns first, then steps: (column, step, node, row, lane).
+            d_accelerations.append(eliminate(jnp.swapaxes(columns, 0, 1)))
+            front = hold(front)
+        return (front.q, front.dq), (jnp.stack(d_durations, 1), tuple(d_accelerations))
+
+    if solution.durations.shape[0] == 1:
+        inputs = jax.tree.map(lambda x: x[0], (solution.durations, solution.accelerations, happens))
+        (back, d_back), traced = one_step((section, d_section), inputs)
+        traced = jax.tree.map(lambda x: x[None], traced)
+    else:
+        inputs = (solution.durations, solution.accelerations, happens)
+        (back, d_back), traced = lax.scan(one_step, (section, d_section), inputs)
+
+    monodromy = jnp.swapaxes(d_back[1 : 1 + size], 0, 1)
+    own = np.r_[0, 1 + size : n_columns]
+    right = d_back[own].at[0].add(back - section)
+    closing = inverse(np.eye(size, dtype=dtype)[:, :, None] - monodromy)
+    d_closed = jnp.swapaxes(_contract(closing, jnp.swapaxes(right, 0, 1)), 0, 1)
+
+    def close(columns: Array) -> Array:
+        """From (n, column, ...) to (own column, n, ...) with the section's columns eliminated."""
+        columns = jnp.swapaxes(columns, 0, 1)
+        by_section = [
+            d_closed[:, s].reshape((-1,) + (1,) * (columns.ndim - 2) + lanes) * columns[1 + s]
+            for s in range(size)
+        ]
+        return columns[own] + sum(by_section[1:], start=by_section[0])
+
+    d_durations, d_accelerations = traced
+    changes = Solution(d_closed, close(d_durations), tuple(close(x) for x in d_accelerations))
+    return Linearised(
+        correction=jax.tree.map(lambda x: x[0], changes),
+        columns=jax.tree.map(lambda x: x[1:], changes),
+        monodromy=monodromy,
+    )
+
+
+class Passage(NamedTuple):
+    """Points of one phase: its start, its end and all nodes (as a leading axis)."""
+
+    start: Point
+    nodes: Point
+    end: Point
+
+
+def _node_weights(mesh: Mesh) -> tuple[np.ndarray, ...]:
+    """Matrices from a phase's accelerations to rates and positions at its nodes and its end.
+
+    For a phase of duration 1 from rest at the origin, nodes in order; the end is the last row.
+    """
+    n = mesh.n_steps * N_NODES
+    rates, places = np.zeros((n + 1, n)), np.zeros((n + 1, n))
+    times = np.ones(n + 1)
+    rate, place, time = np.zeros(n), np.zeros(n), 0.0
+    for i, h in enumerate(mesh.fractions):
+        own = slice(i * N_NODES, (i + 1) * N_NODES)
+        rates[own], places[own] = rate, place + h * NODES[:, None] * rate
+        rates[own, own] += h * ONCE
+        places[own, own] += h * h * TWICE
+        times[own] = time + h * NODES
+        place = place + h * rate
+        place[own] += h * h * ENDS_TWICE
+        rate = rate.copy()
+        rate[own] += h * ENDS_ONCE
+        time += h
+    rates[n], places[n] = rate, place
+    return times, rates, places
+
+
+def walk_through(
+    sequence: PhaseSequence,
+    meshes: tuple[Mesh, ...],
+    constants: Constants,
+    section: Vector,
+    durations: Array,
+    accelerations: tuple[Array, ...],
+) -> tuple[Vector, tuple[Passage, ...]]:
+    """Through one step with known durations and accelerations: the section after it, its passages.
+
+    No equation is solved and nothing has lanes in particular: trailing axes go through.
+    """
+    point = sequence.start(constants, section)
+    passages = []
+    for i, phase in enumerate(sequence.phases):
+        times, rates, places = (w.astype(durations.dtype) for w in _node_weights(meshes[i]))
+        a, T = accelerations[i], durations[i]
+        a = a.reshape(-1, *a.shape[2:])
+        q, v = jnp.stack(point.q), jnp.stack(point.v)
+        times = times.reshape(-1, *(1,) * q.ndim)
+        Q = q + T * (times * v + T * jnp.tensordot(places, a, 1))
+        V = v + T * jnp.tensordot(rates, a, 1)
+        nodes = Point(
+            point.held, tuple(Q[:-1].swapaxes(0, 1)), tuple(V[:-1].swapaxes(0, 1))
+        )
+        end = Point(point.held, tuple(Q[-1]), tuple(V[-1]))
+        passages.append(Passage(point, nodes, end))
+        point = phase.reset(constants, end)
+    return point.q, tuple(passages)

@@ -1,0 +1,339 @@
+"""Finding limit cycles of many wheels at once: starts, Newton's method, sign checks, retries.
+
+Newton's method on the collocation system converges to formal solutions as gladly as to gaits, so a
+cycle counts as found only if every sign that its sequence of phases presumes holds at all nodes.
+Wheels still without a cycle after an attempt are packed together for the next one.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from vrw_jax import sequences, stored_gaits
+from vrw_jax.collocation import (
+    N_NODES,
+    LaneArray,
+    Linearised,
+    Mesh,
+    PhaseSequence,
+    Solution,
+    linearised_pass,
+    walk_through,
+)
+from vrw_jax.cycle_options import CycleOptions
+from vrw_jax.lanes import from_blocks, to_blocks
+from vrw_jax.params import PARAMETER_NAMES, WheelParams
+
+Parameters = Float[Array, "n_parameters lanes"]
+"""The float parameters in the order of PARAMETER_NAMES."""
+
+
+class Problem(NamedTuple):
+    """What is static in a search: which phases, how many steps, how finely cut."""
+
+    n_legs: int
+    period_n: int
+    options: CycleOptions
+
+    @property
+    def sequence(self) -> PhaseSequence:
+        return sequences.held_landing(self.n_legs)
+
+    @property
+    def meshes(self) -> tuple[Mesh, ...]:
+        dls, sls1, sls2 = self.options.steps
+        return Mesh(dls, 1.0), Mesh(sls1, self.options.growth), Mesh(sls2, 1.0)
+
+    @property
+    def constants_of(self) -> Callable:
+        return functools.partial(sequences.constants_of, self.n_legs)
+
+    def pass_at(
+        self, parameters: Parameters, located: "Located", wanted: tuple[int, ...] = ()
+    ) -> Linearised:
+        """The linearised pass at a located solution."""
+        return linearised_pass(
+            self.sequence,
+            self.meshes,
+            self.constants_of,
+            parameters,
+            located.solution,
+            located.happens > 0.5,
+            wanted,
+        )
+
+
+class Located(NamedTuple):
+    """A solution of the collocation system, with what selects it. Floats only, lanes last."""
+
+    solution: Solution
+    happens: LaneArray  # (n, n_phases, lanes): 1 where the phase takes place, else 0
+    found: LaneArray  # (lanes,): 1 for a limit cycle, 0 where there is none and values stand in
+
+
+class Finding(NamedTuple):
+    """The result of a search, lanes last."""
+
+    located: Located
+    monodromy: LaneArray  # (row, column, lanes)
+    residual: LaneArray  # size of Newton's last correction
+    passes: Int[Array, " lanes"]  # linearised passes spent
+
+
+def parameters_of(params: WheelParams) -> Array:
+    """The float parameters as one array, first axis in the order of PARAMETER_NAMES."""
+    return jnp.stack([getattr(params, name) for name in PARAMETER_NAMES])
+
+
+def wheel_of(parameters: Array, n_legs: int) -> WheelParams:
+    """The inverse of `parameters_of`."""
+    return WheelParams(**dict(zip(PARAMETER_NAMES, parameters, strict=True)), n_legs=n_legs)
+
+
+def stored_start(problem: Problem, parameters: Parameters, rank: Array, with_dls: Array) -> Located:
+    """The stored gait that is `rank`-th in nearness, scaled to this wheel's length and gravity."""
+    table = stored_gaits.TABLE.astype(parameters.dtype)
+    here = stored_gaits.coordinates(wheel_of(parameters, problem.n_legs))
+    n_places = len(here)
+    places, gaits = table[:, :n_places], table[:, n_places:]
+    distance = sum(
+        jnp.square((x - place[:, None]) / scale)
+        for x, place, scale in zip(here, places.T, stored_gaits.SPREAD, strict=True)
+    )
+    order = jnp.argsort(distance, axis=0)
+    nearest = jnp.take_along_axis(order, jnp.broadcast_to(rank, order[:1].shape), 0)[0]
+    gait = jnp.asarray(gaits)[nearest].T
+    L0, g = (parameters[PARAMETER_NAMES.index(n)] for n in ("locked_length", "gravity"))
+    pace = jnp.sqrt(L0 / g)
+    section = jnp.stack([gait[0], gait[1] / pace])
+    durations = gait[2:] * pace
+    whole = durations[0] + durations[1]
+    durations = jnp.stack(
+        [
+            jnp.where(with_dls, durations[0], 0.0),
+            jnp.where(with_dls, durations[1], whole),
+            durations[2],
+        ]
+    )
+    return start_from(problem, section, durations, with_dls)
+
+
+def start_from(problem: Problem, section: Array, durations: Array, with_dls: Array) -> Located:
+    """Section and durations of one step, repeated; accelerations zero."""
+    n, n_phases = problem.period_n, len(problem.sequence.phases)
+    lanes = section.shape[-1]
+    accelerations = tuple(
+        jnp.zeros((n, mesh.n_steps, N_NODES, phase.dim, lanes), section.dtype)
+        for phase, mesh in zip(problem.sequence.phases, problem.meshes, strict=True)
+    )
+    happens = jnp.ones((n, n_phases, lanes), section.dtype)
+    happens = happens.at[:, 0].set(jnp.where(with_dls, 1.0, 0.0))
+    durations = jnp.broadcast_to(durations, (n, n_phases, lanes))
+    solution = Solution(section, durations, accelerations)
+    return Located(solution, happens, jnp.zeros((lanes,), section.dtype))
+
+
+def correction_size(solution: Solution, correction: Solution) -> LaneArray:
+    """Largest entry of a correction, accelerations weighed by their effect on positions."""
+    largest = functools.partial(jnp.max, axis=0)
+    flat = lambda x: jnp.abs(x).reshape(-1, x.shape[-1])
+    size = jnp.maximum(largest(flat(correction.section)), largest(flat(correction.durations)))
+    for i, change in enumerate(correction.accelerations):
+        duration = jnp.max(jnp.abs(solution.durations[:, i]), axis=0)
+        size = jnp.maximum(size, largest(flat(change)) * duration**2)
+    return size
+
+
+def _limited(solution: Solution, correction: Solution) -> LaneArray:
+    """The share of a correction that moves no number of the section and no duration too far."""
+    step_time = jnp.sum(solution.durations, 1, keepdims=True)
+    room = jnp.concatenate(
+        [
+            0.15 * jnp.abs(solution.section) + 0.05,
+            (0.25 * jnp.abs(solution.durations) + 0.02 * jnp.abs(step_time)).reshape(
+                -1, solution.section.shape[-1]
+            ),
+        ]
+    )
+    change = jnp.concatenate(
+        [correction.section, correction.durations.reshape(-1, solution.section.shape[-1])]
+    )
+    tiny = jnp.finfo(change.dtype).tiny
+    return jnp.minimum(1.0, jnp.min(room / jnp.maximum(jnp.abs(change), tiny), axis=0))
+
+
+class _Iterate(NamedTuple):
+    count: Int[Array, ""]
+    solution: Solution
+    monodromy: LaneArray
+    residual: LaneArray
+    converged: Bool[Array, " lanes"]
+    running: Bool[Array, " lanes"]
+    passes: Int[Array, " lanes"]
+
+
+def newton(
+    problem: Problem,
+    parameters: Parameters,
+    start: Located,
+    origin: Parameters,
+    stages: Array,
+    pending: Bool[Array, " lanes"],
+) -> Finding:
+    """Newton's method with limited steps on the lanes that are `pending`.
+
+    During the first `stages` iterations the parameters move from `origin` to where they belong. A
+    lane that converged stands still, so that its result does not depend on its neighbours.
+    """
+    options = problem.options
+    size = problem.sequence.section_size
+    lanes = parameters.shape[-1]
+    floor = 1e3 * jnp.finfo(parameters.dtype).eps
+    tolerance = max(options.tolerance, float(floor))
+
+    def iterate(now: _Iterate) -> _Iterate:
+        share = jnp.minimum(1.0, (now.count + 1) / jnp.maximum(stages, 1)).astype(parameters.dtype)
+        arrived = share >= 1.0
+        here = jnp.where(arrived, parameters, origin + share * (parameters - origin))
+        passed = problem.pass_at(here, start._replace(solution=now.solution))
+        correction = passed.correction
+        step_size = correction_size(now.solution, correction)
+        sound = jnp.isfinite(step_size)
+        share_of_step = _limited(now.solution, correction)
+        moves = now.running & sound
+
+        def moved(x: Array, change: Array) -> Array:
+            return jnp.where(moves, x + share_of_step * jnp.where(moves, change, 0.0), x)
+
+        converged = moves & arrived & (step_size < tolerance)
+        return _Iterate(
+            count=now.count + 1,
+            solution=jax.tree.map(moved, now.solution, correction),
+            monodromy=jnp.where(moves, passed.monodromy, now.monodromy),
+            residual=jnp.where(moves, step_size, now.residual),
+            converged=now.converged | converged,
+            running=moves & ~converged,
+            passes=now.passes + now.running,
+        )
+
+    first = _Iterate(
+        count=jnp.zeros((), jnp.int32),
+        solution=start.solution,
+        monodromy=jnp.zeros((size, size, lanes), parameters.dtype),
+        residual=jnp.ones((lanes,), parameters.dtype),
+        converged=jnp.zeros((lanes,), bool),
+        running=pending,
+        passes=jnp.zeros((lanes,), jnp.int32),
+    )
+    going = lambda now: jnp.any(now.running) & (now.count < options.iterations + stages)
+    last = lax.while_loop(going, iterate, first)
+    located = Located(last.solution, start.happens, start.found)
+    found = last.converged & signs_hold(problem, parameters, located)
+    located = located._replace(found=found.astype(parameters.dtype))
+    return Finding(located, last.monodromy, last.residual, last.passes)
+
+
+def signs_hold(
+    problem: Problem, parameters: Parameters, located: Located
+) -> Bool[Array, " lanes"]:
+    """Whether durations, guards at all nodes and the checks at all borders are positive."""
+    sequence = problem.sequence
+    constants = problem.constants_of(*parameters)
+    solution = located.solution
+
+    def step(carry: tuple, inputs: tuple) -> tuple:
+        section, good = carry
+        durations, accelerations, happens = inputs
+        happens = happens > 0.5
+        following, passages = walk_through(
+            sequence, problem.meshes, constants, tuple(section), durations, accelerations
+        )
+        for i, (phase, passage) in enumerate(zip(sequence.phases, passages, strict=True)):
+            guards = phase.guards(constants, passage.nodes)
+            inside = functools.reduce(jnp.logical_and, [jnp.all(g > 0.0, 0) for g in guards])
+            good &= (inside & (durations[i] > 0.0)) | ~happens[i]
+        for check in sequence.border_checks(constants, passages, happens):
+            good &= check > 0.0
+        return (jnp.stack(following), good), None
+
+    inputs = (solution.durations, solution.accelerations, located.happens)
+    carry = (solution.section, jnp.ones(parameters.shape[-1:], bool))
+    (_, good), _ = lax.scan(step, carry, inputs)
+    return good
+
+
+def search(problem: Problem, parameters: Parameters, guess: Located | None) -> Finding:
+    """A limit cycle for each lane, from a guess or from stored gaits, several attempts in turn.
+
+    Parameters must be usable. The first attempt takes the guess or the nearest stored gait, the
+    following ones other gaits, then a homotopy from the nearest one, then cycles without DLS.
+    """
+    options = problem.options
+    n_lanes = parameters.shape[-1]
+    block = min(options.block, n_lanes)
+    gait_parameters = stored_gaits.parameters_of_table(parameters.dtype)
+
+    def start_of(attempt: Array, parameters: Parameters) -> tuple[Located, Array, Array]:
+        is_homotopy = attempt == options.attempts - 2
+        without_dls = (attempt == options.attempts - 1) & (options.attempts > 1)
+        rank = jnp.where(is_homotopy | without_dls, 0, attempt)
+        rank = jnp.minimum(rank, len(stored_gaits.TABLE) - 1)
+        lanes = parameters.shape[-1:]
+        with_dls = jnp.broadcast_to(~without_dls, lanes)
+        start = stored_start(problem, parameters, rank, with_dls)
+        # A homotopy leaves from the gait's own wheel, which Table 1 scales.
+        origin = jnp.broadcast_to(gait_parameters[:, None], parameters.shape)
+        home = stored_start(problem, origin, jnp.zeros_like(rank), with_dls)
+        start = jax.tree.map(lambda a, b: jnp.where(is_homotopy, a, b), home, start)
+        return start, origin, jnp.where(is_homotopy, HOMOTOPY_STAGES, 0)
+
+    def attempt_block(attempt: Array, parameters: Parameters, now: Finding, guess: object) -> Finding:
+        start, origin, stages = start_of(attempt, parameters)
+        if guess is not None:
+            start = jax.tree.map(lambda g, s: jnp.where(attempt < 0, g, s), guess, start)
+        pending = now.located.found < 0.5
+        tried = newton(problem, parameters, start, origin, stages, pending)
+        better = pending & ((tried.located.found > 0.5) | (tried.residual < now.residual))
+        chosen = jax.tree.map(lambda a, b: jnp.where(better, a, b), tried, now)
+        return chosen._replace(passes=now.passes + tried.passes)
+
+    def attempt_all(attempt: Array, now: Finding) -> Finding:
+        if n_lanes <= block:
+            return attempt_block(attempt, parameters, now, guess)
+        order = jnp.argsort(now.located.found, stable=True)
+        everything = jax.tree.map(lambda x: x[..., order], (parameters, now, guess))
+
+        def one(inputs: tuple) -> Finding:
+            parameters, now, guess = inputs
+            return lax.cond(
+                jnp.any(now.located.found < 0.5),
+                lambda: attempt_block(attempt, parameters, now, guess),
+                lambda: now,
+            )
+
+        after = from_blocks(lax.map(one, to_blocks(everything, block)), n_lanes)
+        back = jnp.argsort(order)
+        return jax.tree.map(lambda x: x[..., back], after)
+
+    first = jnp.asarray(0 if guess is None else -1, jnp.int32)
+    start, _, _ = start_of(jnp.asarray(0, jnp.int32), parameters)
+    size = problem.sequence.section_size
+    nothing = Finding(
+        start,
+        jnp.zeros((size, size, n_lanes), parameters.dtype),
+        jnp.full((n_lanes,), jnp.inf, parameters.dtype),
+        jnp.zeros((n_lanes,), jnp.int32),
+    )
+    more = lambda c: (c[0] < options.attempts) & jnp.any(c[1].located.found < 0.5)
+    _, finding = lax.while_loop(more, lambda c: (c[0] + 1, attempt_all(*c)), (first, nothing))
+    return finding
+
+
+HOMOTOPY_STAGES = np.int32(12)
+"""Newton iterations in which a homotopy's parameters move."""

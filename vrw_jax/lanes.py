@@ -1,0 +1,74 @@
+"""Functions over lanes, seen as functions of one wheel that `jax.vmap` maps onto the lanes.
+
+Code that carries independent wheels on the last axis runs several times faster than the same code
+for one wheel under `jax.vmap`. Here every `vmap`, nested ones included, is merged into that axis.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.custom_batching import custom_vmap
+from jaxtyping import Array, PyTree
+
+LaneFunction = Callable[..., PyTree[Array]]
+"""A function of arrays, all with lanes on their last axis."""
+
+
+def one_wheel(function: LaneFunction) -> LaneFunction:
+    """`function` for arrays without the lanes' axis; its `vmap` is `function` over lanes."""
+    over_lanes = custom_vmap(function)
+
+    @over_lanes.def_vmap
+    def merge_axis(axis_size: int, in_batched: PyTree, *arrays: PyTree) -> tuple:
+        def merge(x: Array, batched: bool) -> Array:
+            x = x if batched else jnp.broadcast_to(x, (axis_size, *x.shape))
+            moved = jnp.moveaxis(x, 0, -2)
+            return moved.reshape(*moved.shape[:-2], -1)
+
+        def split(x: Array) -> Array:
+            return jnp.moveaxis(x.reshape(*x.shape[:-1], axis_size, -1), -2, 0)
+
+        out = over_lanes(*jax.tree.map(merge, arrays, tuple(in_batched)))
+        return jax.tree.map(split, out), jax.tree.map(lambda _: True, out)
+
+    def single(*arrays: PyTree) -> PyTree:
+        out = over_lanes(*jax.tree.map(lambda x: jnp.asarray(x)[..., None], arrays))
+        return jax.tree.map(lambda x: x[..., 0], out)
+
+    return single
+
+
+def in_blocks(function: LaneFunction, block: int) -> LaneFunction:
+    """`function` applied to `block` lanes at a time, so that its arrays stay in cache."""
+
+    def blocked(*arrays: PyTree) -> PyTree:
+        n_lanes = jax.tree.leaves(arrays)[0].shape[-1]
+        if n_lanes <= block:
+            return function(*arrays)
+        out = lax.map(lambda some: function(*some), to_blocks(arrays, block))
+        return from_blocks(out, n_lanes)
+
+    return blocked
+
+
+def to_blocks(tree: PyTree, block: int) -> PyTree:
+    """Lanes cut into blocks along a new first axis; the last lane fills up the last block."""
+
+    def cut(x: Array) -> Array:
+        missing = -x.shape[-1] % block
+        filled = jnp.concatenate([x, jnp.repeat(x[..., -1:], missing, -1)], -1) if missing else x
+        return jnp.moveaxis(filled.reshape(*x.shape[:-1], -1, block), -2, 0)
+
+    return jax.tree.map(cut, tree)
+
+
+def from_blocks(tree: PyTree, n_lanes: int) -> PyTree:
+    """The inverse of `to_blocks`."""
+
+    def join(x: Array) -> Array:
+        moved = jnp.moveaxis(x, 0, -2)
+        return moved.reshape(*moved.shape[:-2], -1)[..., :n_lanes]
+
+    return jax.tree.map(join, tree)

@@ -1,0 +1,258 @@
+"""Limit cycles as differentiable functions of the parameters.
+
+The search (see cycle_search) carries no derivative. Derivatives come from the implicit function
+theorem: the columns of the linearised pass at the cycle. They hold on unstable cycles, in forward
+and reverse mode, and to any order.
+"""
+
+import functools
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Complex, Float, Int
+
+from vrw_jax import multipliers as floquet
+from vrw_jax import transitions
+from vrw_jax.collocation import Solution, walk_through
+from vrw_jax.cycle_options import CycleOptions
+from vrw_jax.cycle_search import (
+    Finding,
+    Located,
+    Parameters,
+    Problem,
+    parameters_of,
+    search,
+    wheel_of,
+)
+from vrw_jax.derivatives import on_branch, push, total_derivative, without_derivative
+from vrw_jax.lanes import one_wheel
+from vrw_jax.models.base import Indicators, SectionState
+from vrw_jax.outcomes import Outcome
+from vrw_jax.params import Scalar, WheelParams
+
+
+class LimitCycle(eqx.Module):
+    """A gait that repeats after `period_n` steps. Batched under vmap: every field gains the axis.
+
+    Where none was found, `outcome` says so and every other number is zero, as are its derivatives.
+    Fields with an axis over steps lack it for `period_n` = 1.
+    """
+
+    section_state: SectionState  # (theta-, dtheta-, dL1-) before touchdown, fixed under return_map
+    post_impact: Float[Array, "2"]  # (theta, dtheta) after the first landing, rad, rad/s
+    durations: Float[Array, "3"]  # of DLS, SLS-I, SLS-II, s; (n, 3) for period_n = n > 1
+    step_length: Scalar  # distance between the feet at the landing, m; (n,) for n > 1
+    indicators: Indicators  # of the landing; (n,) each for n > 1
+    outcome: Int[Array, ""]  # Outcome.STEPPED, NO_CYCLE_FOUND or BAD_INPUT
+    residual: Scalar  # last correction of Newton's method, rad, rad/s, s or m
+    passes: Int[Array, ""]  # linearised passes that the search took
+    parameters: Float[Array, " n_parameters"]  # in the order of params.PARAMETER_NAMES
+    located: Located  # the solution itself: a start for neighbours
+    matrix: Float[Array, "2 2"]  # value of the monodromy matrix, without derivative
+    problem: Problem = eqx.field(static=True)
+
+    @property
+    def _many(self) -> bool:
+        return self.problem.period_n > 1
+
+    @property
+    def period(self) -> Array:
+        """Duration of the whole cycle, s."""
+        return jnp.sum(self.durations, axis=(-2, -1) if self._many else -1)
+
+    @property
+    def dls_fraction(self) -> Array:
+        """Share of the period spent in double support."""
+        dls = self.durations[..., 0]
+        period = self.period
+        return (jnp.sum(dls, -1) if self._many else dls) / jnp.where(period > 0.0, period, 1.0)
+
+    @property
+    def speed(self) -> Array:
+        """Distance over period, m/s."""
+        period = self.period
+        distance = jnp.sum(self.step_length, -1) if self._many else self.step_length
+        return distance / jnp.where(period > 0.0, period, 1.0)
+
+    @property
+    def monodromy(self) -> Float[Array, "2 2"]:
+        """Derivative of the return to the section after the impact, over (theta+, dtheta+)."""
+        attach = functools.partial(_attach_monodromy, self.problem)
+        for _ in range(self.outcome.ndim):
+            attach = jax.vmap(attach)
+        return attach(self.matrix, self.parameters, self.located)
+
+    @property
+    def multipliers(self) -> Complex[Array, " n"]:
+        """Floquet multipliers, largest first; a third one, in the section before, is zero."""
+        return floquet.multipliers(self.monodromy)
+
+    @property
+    def spectral_radius(self) -> Array:
+        """Largest modulus of a multiplier: below 1 the gait is stable."""
+        return floquet.spectral_radius(self.monodromy)
+
+    @property
+    def stability_margin(self) -> Array:
+        """Smooth measure of stability, positive where stable: see multipliers.stability_margin."""
+        return jnp.where(self.found, floquet.stability_margin(self.monodromy), 0.0)
+
+    @property
+    def jury_margins(self) -> Array:
+        """Margins to fold, period doubling and Neimark-Sacker bifurcation: multipliers.jury_margins."""
+        return floquet.jury_margins(self.monodromy)
+
+    @property
+    def at_double_multiplier(self) -> Bool[Array, ""]:
+        """Whether the spectral radius is at a kink, because two multipliers tie."""
+        return floquet.at_double_multiplier(self.matrix) & self.found
+
+    @property
+    def condition(self) -> Array:
+        """Condition number of I - monodromy: how much the cycle magnifies a disturbance."""
+        matrix = jnp.eye(self.matrix.shape[-1]) - self.matrix
+        return jnp.where(self.found, jnp.linalg.cond(matrix), 0.0)
+
+    @property
+    def found(self) -> Bool[Array, ""]:
+        """Whether there is a cycle."""
+        return self.outcome == Outcome.STEPPED
+
+
+def _tangent_space(problem: Problem, parameters: Parameters, located: Located) -> Located:
+    """d located / d parameters over lanes, with a leading axis; zero where nothing was found."""
+    wanted = tuple(range(parameters.shape[0]))
+    found = located.found > 0.5
+    columns = problem.pass_at(parameters, located, wanted).columns
+    columns = jax.tree.map(lambda x: jnp.where(found, x, 0.0), columns)
+    flat = lambda x: jnp.zeros((len(wanted), *x.shape), x.dtype)
+    return Located(columns, flat(located.happens), flat(located.found))
+
+
+def _monodromy_over_lanes(problem: Problem, parameters: Parameters, located: Located) -> Array:
+    monodromy = problem.pass_at(parameters, located).monodromy
+    return jnp.where(located.found > 0.5, monodromy, 0.0)
+
+
+def _solve(problem: Problem, parameters: Array, guess: Located | None) -> tuple[Located, Finding]:
+    """Search for one wheel, differentiable in its parameters; the guess has no derivative."""
+    tangent_space = functools.partial(_tangent_space, problem)
+
+    if guess is None:
+        find = one_wheel(lambda parameters: search(problem, parameters, None))
+    else:
+        find = one_wheel(lambda parameters, guess: search(problem, parameters, guess))
+
+    @jax.custom_jvp
+    def solve(parameters: Array, *guess: Located) -> tuple[Located, tuple]:
+        finding = find(parameters, *guess)
+        return finding.located, (finding.monodromy, finding.residual, finding.passes)
+
+    def rule(primals: tuple, tangents: tuple) -> tuple:
+        located, other = solve(*primals)
+        columns = on_branch(tangent_space, tangent_space, problem.options.block)
+        tangent = push(columns(primals[0], located), tangents[0])
+        return (located, other), (tangent, without_derivative(other))
+
+    solve.defjvp(rule)
+    return solve(parameters, *(() if guess is None else (guess,)))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _attach_monodromy(
+    problem: Problem, matrix: Array, parameters: Array, located: Located
+) -> Array:
+    """`matrix`, whose derivative is that of the monodromy matrix along the branch."""
+    tangent_space = functools.partial(_tangent_space, problem)
+    monodromy = functools.partial(_monodromy_over_lanes, problem)
+
+    @jax.custom_jvp
+    def attach(matrix: Array, parameters: Array, located: Located) -> Array:
+        return matrix
+
+    def rule(primals: tuple, tangents: tuple) -> tuple:
+        derivative = on_branch(
+            total_derivative(monodromy, tangent_space), tangent_space, problem.options.block
+        )
+        return attach(*primals), push(derivative(*primals[1:]), tangents[1])
+
+    attach.defjvp(rule)
+    return attach(matrix, parameters, located)
+
+
+@eqx.filter_jit
+def _limit_cycle(params: WheelParams, problem: Problem, guess: Located | None) -> LimitCycle:
+    usable = params.in_domain()
+    table_1 = WheelParams(n_legs=problem.n_legs)
+    safe = jax.tree.map(lambda x, d: jnp.where(usable, x, d.astype(x.dtype)), params, table_1)
+    parameters = parameters_of(safe)
+    located, (matrix, residual, passes) = _solve(problem, parameters, guess)
+    found = usable & (located.found > 0.5)
+    # Zero measures and zero derivatives where there is no cycle: mask what goes in and comes out.
+    masked = lambda x: jnp.where(found, x, 0.0)
+    stand_in = lambda x, d: jnp.where(found, x, d)
+    parameters = jax.tree.map(stand_in, parameters, parameters_of(table_1).astype(parameters.dtype))
+
+    s = wheel_of(parameters, problem.n_legs).symbols()
+    constants = problem.constants_of(*parameters)
+    n = problem.period_n
+    section = tuple(located.solution.section)
+    sections, states, landings = [], [], []
+    for k in range(n):
+        sections.append(section)
+        durations, accelerations = jax.tree.map(
+            lambda x, k=k: x[k], (located.solution.durations, located.solution.accelerations)
+        )
+        section, passages = walk_through(
+            problem.sequence, problem.meshes, constants, section, durations, accelerations
+        )
+        end = passages[-1].end
+        states.append(jnp.stack([end.q[0], *end.v]))
+    # The landing that opens step k follows the state at the end of the step before.
+    landings = [transitions.land(s, *states[k - 1]) for k in range(n)]
+    forces = [transitions.landing_forces(s, landing) for landing in landings]
+
+    def over_steps(values: list[Array]) -> Array:
+        return masked(values[0] if n == 1 else jnp.stack(values))
+
+    durations = located.solution.durations
+    code = jnp.where(found, Outcome.STEPPED, Outcome.NO_CYCLE_FOUND)
+    return LimitCycle(
+        section_state=masked(states[-1]),
+        post_impact=masked(jnp.stack(sections[0])),
+        durations=masked(durations[0] if n == 1 else durations),
+        step_length=over_steps([landing.distance for landing in landings]),
+        indicators=Indicators(
+            lambda_I4=over_steps([landing.rear.normal for landing in landings]),
+            lambda_2=over_steps([fore.normal for fore, _ in forces]),
+            lambda_4=over_steps([rear.normal for _, rear in forces]),
+        ),
+        outcome=jnp.where(usable, code, Outcome.BAD_INPUT).astype(jnp.int32),
+        residual=jnp.where(jnp.isfinite(residual), residual, 1.0),
+        passes=passes,
+        parameters=parameters,
+        located=located,
+        matrix=masked(matrix),
+        problem=problem,
+    )
+
+
+def limit_cycle(
+    params: WheelParams,
+    *,
+    guess: LimitCycle | None = None,
+    period_n: int = 1,
+    options: CycleOptions | None = None,
+) -> LimitCycle:
+    """The limit cycle of this wheel: the gait that repeats after `period_n` steps.
+
+    Needs no start; `guess` (a neighbour's cycle) makes it quicker and picks the branch. Found
+    cycles satisfy the paper's sequence of phases at all nodes, stable or not. Errors at the default
+    options: 1e-9 relative in values, 1e-8 in first derivatives. Differentiable in every mode and
+    order; `jax.vmap` runs the wheels side by side.
+    """
+    options = CycleOptions() if options is None else options
+    problem = Problem(params.n_legs, period_n, options)
+    return _limit_cycle(params, problem, None if guess is None else guess.located)

@@ -1,0 +1,158 @@
+"""Floquet multipliers of small real maps in closed form: they differentiate, batch, run anywhere.
+
+Matrices are the derivative of a return map, shape (..., n, n) with n = 1, 2 or 3. Eigenvalues are
+not differentiable where two of them meet; the Jury margins, polynomials of the matrix, are.
+"""
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Complex, Float
+
+Matrix = Float[Array, "... n n"]
+
+SHARPNESS = 50.0
+"""Of the smooth minimum in `stability_margin`, which lies at most log(4)/SHARPNESS below."""
+
+
+def characteristic_polynomial(matrix: Matrix) -> tuple[Array, ...]:
+    """Coefficients (a_0, ..., a_{n-1}) of z^n + ... + a_1 z + a_0 = det(z - matrix)."""
+    m = lambda i, j: matrix[..., i, j]
+    n = matrix.shape[-1]
+    if matrix.shape[-2:] != (n, n) or n not in (1, 2, 3):
+        raise ValueError(
+            f"the matrix has shape {matrix.shape}, but multipliers are built for 1x1, 2x2 and 3x3."
+        )
+    if n == 1:
+        return (-m(0, 0),)
+    if n == 2:
+        return m(0, 0) * m(1, 1) - m(0, 1) * m(1, 0), -(m(0, 0) + m(1, 1))
+    minors = [m(i, i) * m(j, j) - m(i, j) * m(j, i) for i, j in ((0, 1), (0, 2), (1, 2))]
+    cofactors = [
+        m(1, 1) * m(2, 2) - m(1, 2) * m(2, 1),
+        m(1, 2) * m(2, 0) - m(1, 0) * m(2, 2),
+        m(1, 0) * m(2, 1) - m(1, 1) * m(2, 0),
+    ]
+    determinant = m(0, 0) * cofactors[0] + m(0, 1) * cofactors[1] + m(0, 2) * cofactors[2]
+    return -determinant, minors[0] + minors[1] + minors[2], -(m(0, 0) + m(1, 1) + m(2, 2))
+
+
+def _root(x: Array) -> Array:
+    """Square root of max(x, 0) with derivative zero where x <= 0."""
+    positive = x > 0.0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
+
+
+def _quadratic(a0: Array, a1: Array) -> tuple[Array, Array, Array]:
+    """Roots of z^2 + a1 z + a0: (mean +- split) if real, else mean +- i turn."""
+    mean = -0.5 * a1
+    discriminant = mean * mean - a0
+    return mean, _root(discriminant), _root(-discriminant)
+
+
+def _real_root_of_cubic(a0: Array, a1: Array, a2: Array) -> Array:
+    """The real root of z^3 + a2 z^2 + a1 z + a0 that lies farthest from the others.
+
+    Found without derivative; then Newton's method makes it exact, derivatives to order 3 included.
+    """
+    b0, b1, b2 = map(lax.stop_gradient, (a0, a1, a2))
+    shift = -b2 / 3.0
+    p = b1 - b2 * b2 / 3.0  # z = shift + y with y^3 + p y + q = 0
+    q = b0 + shift * (b1 + shift * (b2 + shift))
+    discriminant = 0.25 * q * q + p * p * p / 27.0
+    three = discriminant < 0.0
+    # One real root: the sum of cube roots without cancellation.
+    larger = jnp.cbrt(-0.5 * q - jnp.where(q >= 0.0, 1.0, -1.0) * _root(discriminant))
+    one_root = larger - jnp.where(larger == 0.0, 0.0, p / (3.0 * jnp.where(larger == 0, 1, larger)))
+    # Three: the extreme one on the side where it stands alone.
+    radius = 2.0 * _root(-p / 3.0)
+    cosine = -4.0 * q / jnp.where(radius == 0.0, 1.0, radius**3)
+    extreme = radius * jnp.cos(jnp.arccos(jnp.clip(jnp.abs(cosine), 0.0, 1.0)) / 3.0)
+    z = shift + jnp.where(three, jnp.where(cosine >= 0.0, extreme, -extreme), one_root)
+    for _ in range(3):
+        value = a0 + z * (a1 + z * (a2 + z))
+        slope = a1 + z * (2.0 * a2 + 3.0 * z)
+        z = z - jnp.where(slope == 0.0, 0.0, value / jnp.where(slope == 0.0, 1.0, slope))
+    return z
+
+
+def _parts(matrix: Matrix) -> tuple[list[Array], Array | None, Array | None, Array | None]:
+    """Isolated real eigenvalues, then mean, split and turn of the remaining pair."""
+    coefficients = characteristic_polynomial(matrix)
+    if len(coefficients) == 1:
+        return [-coefficients[0]], None, None, None
+    if len(coefficients) == 2:
+        return [], *_quadratic(*coefficients)
+    a0, a1, a2 = coefficients
+    alone = _real_root_of_cubic(a0, a1, a2)
+    slope = a2 + alone
+    return [alone], *_quadratic(a1 + alone * slope, slope)
+
+
+def multipliers(matrix: Matrix) -> Complex[Array, "... n"]:
+    """All eigenvalues, the one of largest modulus first."""
+    alone, mean, split, turn = _parts(matrix)
+    values = [lax.complex(x, jnp.zeros_like(x)) for x in alone]
+    if mean is not None and split is not None and turn is not None:
+        values += [lax.complex(mean + sign * split, sign * turn) for sign in (1.0, -1.0)]
+    stacked = jnp.stack(values, -1)
+    modulus = jnp.square(stacked.real) + jnp.square(stacked.imag)
+    order = jnp.argsort(-lax.stop_gradient(modulus), axis=-1)
+    return jnp.take_along_axis(stacked, order, -1)
+
+
+def spectral_radius(matrix: Matrix) -> Float[Array, "..."]:
+    """Largest modulus of an eigenvalue; where two meet its derivative is one-sided or zero."""
+    alone, mean, split, turn = _parts(matrix)
+    moduli = [jnp.abs(x) for x in alone]
+    if mean is not None and split is not None and turn is not None:
+        pair = mean * mean + turn * turn
+        moduli.append(jnp.where(turn > 0.0, _root(pair), jnp.abs(mean) + split))
+    largest = moduli[0]
+    for modulus in moduli[1:]:
+        largest = jnp.maximum(largest, modulus)
+    return largest
+
+
+def jury_margins(matrix: Matrix) -> Float[Array, "... n_margins"]:
+    """Polynomials of the matrix, all positive exactly where all multipliers are inside the circle.
+
+    The first vanishes at a fold (multiplier 1), the second at a period doubling (-1), the third,
+    for n > 1, where a pair crosses the circle; for n = 3 the fourth completes the criterion.
+    """
+    coefficients = characteristic_polynomial(matrix)
+    if len(coefficients) == 1:
+        (a0,) = coefficients
+        return jnp.stack([1.0 + a0, 1.0 - a0], -1)
+    if len(coefficients) == 2:
+        a0, a1 = coefficients
+        return jnp.stack([1.0 + a1 + a0, 1.0 - a1 + a0, 1.0 - a0], -1)
+    a0, a1, a2 = coefficients
+    pair = 1.0 - a0 * a0 - a1 + a0 * a2
+    return jnp.stack([1.0 + a2 + a1 + a0, 1.0 - a2 + a1 - a0, pair, 1.0 - a0 * a0], -1)
+
+
+def stability_margin(matrix: Matrix) -> Float[Array, "..."]:
+    """Smooth minimum of the Jury margins, never above the smallest: positive means stable."""
+    margins = SHARPNESS * jury_margins(matrix)
+    lowest = lax.stop_gradient(jnp.min(margins, -1))
+    excess = jnp.sum(jnp.exp(lowest[..., None] - margins), -1)
+    return (lowest - jnp.log(excess)) / SHARPNESS
+
+
+def at_double_multiplier(matrix: Matrix, tolerance: float = 1e-6) -> Bool[Array, "..."]:
+    """Whether two moduli tie at the top to `tolerance`: there the spectral radius has a kink.
+
+    A complex pair ties by nature and is smooth; it counts only where it is about to become real.
+    """
+    alone, mean, split, turn = _parts(matrix)
+    if mean is None or split is None or turn is None:
+        return jnp.zeros(matrix.shape[:-2], bool)
+    real = [*alone, mean + split, mean - split]
+    complex_pair = turn > 0.0
+    moduli = jnp.sort(jnp.abs(jnp.stack(real, -1)), -1)
+    tie_of_real = moduli[..., -1] - moduli[..., -2] <= tolerance
+    pair = _root(mean * mean + turn * turn)
+    tie = jnp.where(complex_pair, turn <= tolerance, tie_of_real)
+    for x in alone:
+        tie = tie | (complex_pair & (jnp.abs(jnp.abs(x) - pair) <= tolerance))
+    return tie

@@ -1,0 +1,228 @@
+"""The paper's phases as data for the collocation: what moves, what ends it, what jumps.
+
+`held_landing` has the plane section (theta+, dtheta+) just after an impact that ends with both feet
+on the ground; its double support may be left out (then the rear foot lifts at once, case B3).
+`freed_landing` has the section (theta-, dtheta-, dL1-) before an impact that throws the rear foot
+off (case A3); it begins with single support I.
+"""
+
+import functools
+import math
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from vrw_jax import dynamics, transitions
+from vrw_jax.collocation import Constants, Passage, Phase, PhaseSequence, Point, Vector
+from vrw_jax.geometry import (
+    Motion,
+    double_support_circle,
+    foot_distance,
+    landing_foot_height,
+    rear_direction,
+)
+from vrw_jax.params import PARAMETER_NAMES, Elementwise, Symbols, WheelParams
+
+N_CONSTANTS = 12
+"""Fields of `Symbols` that vary from lane to lane; the rest follows from the number of legs."""
+
+
+def constants_of(n_legs: int, *parameters: Elementwise) -> Constants:
+    """The combinations that every formula needs, from the parameters in their order."""
+    fields = dict(zip(PARAMETER_NAMES, parameters, strict=True))
+    return tuple(WheelParams(**fields, n_legs=n_legs).symbols()[:N_CONSTANTS])
+
+
+def _symbols(n_legs: int, constants: Constants) -> Symbols:
+    alpha = 2.0 * math.pi / n_legs
+    return Symbols(*constants, n_legs, math.sin(alpha), math.cos(alpha), alpha)
+
+
+_SINE = tuple((-1) ** k / math.factorial(2 * k + 1) for k in range(10))
+_COSINE = tuple((-1) ** k / math.factorial(2 * k) for k in range(11))
+
+
+@jax.custom_jvp
+def sine_cosine(angle: Elementwise) -> tuple[Elementwise, Elementwise]:
+    """Sine and cosine by their Taylor series, right to rounding for |angle| < 1.8 rad.
+
+    The standard functions are scalar calls in float64 on CPU; these are fused and vectorised.
+    """
+    square = angle * angle
+
+    def series(coefficients: tuple[float, ...]) -> Elementwise:
+        value = jnp.full_like(square, coefficients[-1])
+        for coefficient in coefficients[-2::-1]:
+            value = value * square + coefficient
+        return value
+
+    return angle * series(_SINE), series(_COSINE)
+
+
+@sine_cosine.defjvp
+def _sine_cosine_jvp(primals: tuple, tangents: tuple) -> tuple:
+    sin, cos = sine_cosine(*primals)
+    (moved,) = tangents
+    return (sin, cos), (cos * moved, -sin * moved)
+
+
+def _double_support(s: Symbols, point: Point) -> tuple[Elementwise, Motion]:
+    """Feet's distance and motion of DLS: held (distance,), coordinate (theta,)."""
+    (distance,), (theta,), (dtheta,) = point
+    sin, cos = sine_cosine(theta)
+    circle = double_support_circle(s, distance, sin, cos)
+    rates = (dtheta, circle.G1 * dtheta, circle.G2 * dtheta)
+    return distance, Motion(sin, cos, circle.L1, circle.L2, *rates)
+
+
+def _single_support_1(point: Point) -> Motion:
+    """Motion of SLS-I: coordinates (theta, L1, L2)."""
+    theta, L1, L2 = point.q
+    return Motion(*sine_cosine(theta), L1, L2, *point.v)
+
+
+def _single_support_2(s: Symbols, point: Point) -> Motion:
+    """Motion of SLS-II: coordinates (theta, L1)."""
+    theta, L1 = point.q
+    dtheta, dL1 = point.v
+    zero = 0.0 * L1
+    return Motion(*sine_cosine(theta), L1, s.L0 + zero, dtheta, dL1, zero)
+
+
+def _upright(s: Symbols, m: Motion, fore: dynamics.FootForce) -> Vector:
+    """What must be positive in every phase: rolling on, legs not collapsed, Leg 1 pushing."""
+    return m.dtheta, m.L1 - s.a, m.L2 - s.a, fore.normal
+
+
+def _phases(n_legs: int) -> tuple[Phase, Phase]:
+    """DLS and SLS-I, which every sequence shares."""
+    symbols = functools.partial(_symbols, n_legs)
+
+    def dls_acceleration(constants: Constants, point: Point) -> Vector:
+        s = symbols(constants)
+        distance, m = _double_support(s, point)
+        return (dynamics.double_support_acceleration(s, distance, m).ddtheta,)
+
+    def rear_force(constants: Constants, point: Point) -> dynamics.FootForce:
+        s = symbols(constants)
+        distance, m = _double_support(s, point)
+        acceleration = dynamics.double_support_acceleration(s, distance, m)
+        return dynamics.rear_foot_force(s, m, acceleration)
+
+    def lift_off(constants: Constants, point: Point) -> Elementwise:
+        s = symbols(constants)
+        return rear_force(constants, point).normal / (s.m * s.g)
+
+    def dls_reset(constants: Constants, point: Point) -> Point:
+        _, m = _double_support(symbols(constants), point)
+        return Point((), (point.q[0], m.L1, m.L2), (m.dtheta, m.dL1, m.dL2))
+
+    def dls_guards(constants: Constants, point: Point) -> Vector:
+        s = symbols(constants)
+        distance, m = _double_support(s, point)
+        acceleration = dynamics.double_support_acceleration(s, distance, m)
+        rear = dynamics.rear_foot_force(s, m, acceleration)
+        fore = dynamics.fore_foot_force(s, m, acceleration, rear)
+        return (rear.normal, s.L0 - m.L2, landing_foot_height(s, m), *_upright(s, m, fore))
+
+    def sls1_acceleration(constants: Constants, point: Point) -> Vector:
+        m = _single_support_1(point)
+        return tuple(dynamics.single_support_1_acceleration(symbols(constants), m))
+
+    def stopper_gap(constants: Constants, point: Point) -> Elementwise:
+        s = symbols(constants)
+        return point.q[2] / s.L0 - 1.0
+
+    def sls1_reset(constants: Constants, point: Point) -> Point:
+        m = transitions.hit_stopper(symbols(constants), _single_support_1(point)).motion
+        return Point((), (point.q[0], m.L1), (m.dtheta, m.dL1))
+
+    def sls1_guards(constants: Constants, point: Point) -> Vector:
+        s = symbols(constants)
+        m = _single_support_1(point)
+        acceleration = dynamics.single_support_1_acceleration(s, m)
+        fore = dynamics.fore_foot_force(s, m, acceleration)
+        return (s.L0 - m.L2, landing_foot_height(s, m), *_upright(s, m, fore))
+
+    return (
+        Phase("DLS", 1, dls_acceleration, lift_off, dls_reset, dls_guards),
+        Phase("SLS-I", 3, sls1_acceleration, stopper_gap, sls1_reset, sls1_guards),
+    )
+
+
+def _last_phase(n_legs: int, to_section: bool) -> Phase:
+    """SLS-II; its reset leads to the plane section after the impact, or to the one before it."""
+    symbols = functools.partial(_symbols, n_legs)
+
+    def acceleration(constants: Constants, point: Point) -> Vector:
+        s = symbols(constants)
+        found = dynamics.single_support_2_acceleration(s, _single_support_2(s, point))
+        return found.ddtheta, found.ddL1
+
+    def touchdown(constants: Constants, point: Point) -> Elementwise:
+        s = symbols(constants)
+        return landing_foot_height(s, _single_support_2(s, point)) / s.L0
+
+    def reset(constants: Constants, point: Point) -> Point:
+        s = symbols(constants)
+        (theta, L1), (dtheta, dL1) = point.q, point.v
+        before = (theta, dtheta, dL1)
+        if not to_section:
+            landing = transitions.land(s, *before)
+            before = (landing.theta, landing.motion.dtheta)
+        return Point((), before, ())
+
+    def guards(constants: Constants, point: Point) -> Vector:
+        s = symbols(constants)
+        m = _single_support_2(s, point)
+        found = dynamics.single_support_2_acceleration(s, m)
+        fore = dynamics.fore_foot_force(s, m, found)
+        return (landing_foot_height(s, m), *_upright(s, m, fore))
+
+    return Phase("SLS-II", 2, acceleration, touchdown, reset, guards)
+
+
+@functools.cache
+def held_landing(n_legs: int) -> PhaseSequence:
+    """DLS, SLS-I, SLS-II on the plane section (theta+, dtheta+) after the impact."""
+
+    def start(constants: Constants, section: Vector) -> Point:
+        s = _symbols(n_legs, constants)
+        sin, cos = sine_cosine(section[0])
+        distance = s.L0 * s.sin_alpha / rear_direction(s, sin, cos).cos
+        return Point((distance,), section[:1], section[1:])
+
+    def border_checks(constants: Constants, passages: tuple[Passage, ...], happens: Array) -> Vector:
+        s = _symbols(n_legs, constants)
+        dls, sls1, sls2 = passages
+        distance, m = _double_support(s, dls.start)
+        acceleration = dynamics.double_support_acceleration(s, distance, m)
+        rear = dynamics.rear_foot_force(s, m, acceleration).normal
+        (theta, _), (dtheta, dL1) = sls2.end.q, sls2.end.v
+        landing = transitions.land(s, theta, dtheta, dL1)
+        return jnp.where(happens[0], rear, -rear), landing.rear.normal, sls1.end.v[2]
+
+    phases = (*_phases(n_legs), _last_phase(n_legs, to_section=False))
+    return PhaseSequence(2, start, phases, border_checks)
+
+
+@functools.cache
+def freed_landing(n_legs: int) -> PhaseSequence:
+    """SLS-I, SLS-II on the section (theta-, dtheta-, dL1-) before an impact that frees Leg 2."""
+
+    def start(constants: Constants, section: Vector) -> Point:
+        landing = transitions.land(_symbols(n_legs, constants), *section)
+        m = landing.motion
+        return Point((), (landing.theta, m.L1, m.L2), (m.dtheta, m.dL1, m.dL2))
+
+    def border_checks(constants: Constants, passages: tuple[Passage, ...], happens: Array) -> Vector:
+        s = _symbols(n_legs, constants)
+        sls1, sls2 = passages
+        (theta, _), (dtheta, dL1) = sls2.end.q, sls2.end.v
+        landing = transitions.land(s, theta, dtheta, dL1)
+        return -landing.rear.normal, sls1.end.v[2]
+
+    _, single_support_1 = _phases(n_legs)
+    phases = (single_support_1, _last_phase(n_legs, to_section=True))
+    return PhaseSequence(3, start, phases, border_checks)
