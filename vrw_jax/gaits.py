@@ -5,7 +5,8 @@ it checks the Newton search independently.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -25,6 +26,9 @@ SETTLED = 1e-8
 """Largest change of the section state from step to step in a settled gait: ten times the error of
 a step at the default options."""
 
+LAST = 5
+"""Steps that must not change it: a gait of longer period may by chance repeat once."""
+
 
 def approach(
     params: WheelParams,
@@ -36,7 +40,8 @@ def approach(
 ) -> xr.Dataset:
     """Section states of a walk and how much each step still changes them.
 
-    `change` is the Euclidean distance to the section state before, over (rad, rad/s, m/s).
+    `change` is the Euclidean distance to the section state before, over (rad, rad/s, m/s); the
+    walk has `settled` into a period-1 gait when each of the last five is below `SETTLED`.
     """
     walked = walk(params, x, n_steps, model=model, options=options)
     params, x, model, options = checked(params, x, model, options)
@@ -45,15 +50,55 @@ def approach(
     change = np.full(stepped + 1, np.nan)
     change[1:] = np.linalg.norm(np.diff(states, axis=0), axis=1)
     outcome = Outcome(int(walked.outcome))
+    last = float(change[-LAST:].max()) if stepped >= LAST else math.inf
+    settled = outcome == Outcome.STEPPED and last < SETTLED
     return xr.Dataset(
         {
             "section_state": (("step", "component"), states),
             "change": ("step", change, {"units": "1", "long_name": "change since the step before"}),
         },
         {"component": ["theta", "dtheta", "dL1"]},
-        {"outcome": outcome.name, "outcome_meaning": outcome.meaning}
+        {
+            "outcome": outcome.name,
+            "outcome_meaning": outcome.meaning,
+            "last_change": last,
+            "settled": int(settled),
+        }
         | provenance(params, model, options),
     )
+
+
+def states_along(
+    params: WheelParams,
+    name: str,
+    values: Sequence[float],
+    x: SectionState,
+    n_steps: int,
+    *,
+    model: AbstractWheel | None = None,
+    options: Options | None = None,
+) -> Iterator[xr.Dataset]:
+    """The walks at each of `values` of the parameter `name`, each begun from its neighbour's gait.
+
+    The start is extrapolated from the last two settled gaits; a walk that fails or does not settle
+    leaves no start behind. See `approach`; `settled` is added to its attributes.
+    """
+    settled_values: list[float] = []
+    settled_states: list[np.ndarray] = []
+    for value in values:
+        start = _extrapolated(settled_values, settled_states, value, x)
+        wheel = changed(params, name, value)
+        walked = approach(wheel, start, n_steps, model=model, options=options)
+        if walked.settled:
+            settled_values.append(value)
+            settled_states.append(walked.section_state.values[-1])
+        yield walked
+
+
+def changed(params: WheelParams, name: str, value: float) -> WheelParams:
+    """The same wheel with one parameter changed."""
+    change: dict[str, Any] = {name: value}
+    return dataclasses.replace(params, **change)
 
 
 def along(
@@ -67,33 +112,25 @@ def along(
     options: Options | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> xr.Dataset:
-    """The gaits met by walking `n_steps` at each of `values`, each begun from its neighbour's.
+    """The gaits of `states_along` with all measures of one more step, over the parameter `name`.
 
-    A labelled set over the parameter `name`: section state, all measures of one more step, whether
-    the walk had settled into a period-1 gait, and the outcome. The next start is extrapolated from
-    the last two settled gaits; a walk that fails or does not settle leaves no start behind.
-    `progress` is told the share that is done.
+    `settled` says whether the walk had come to a period-1 gait, `change` how much its last steps
+    still changed it. `progress` is told the share that is done.
     """
-    settled_values: list[float] = []
-    settled_states: list[np.ndarray] = []
     rows: list[dict[str, np.ndarray]] = []
-    for index, value in enumerate(values):
-        changed: dict[str, Any] = {name: value}
-        wheel = dataclasses.replace(params, **changed)
-        start = _extrapolated(settled_values, settled_states, value, x)
-        walked = approach(wheel, start, n_steps, model=model, options=options)
-        state, change = walked.section_state.values[-1], walked.change.values[-1]
-        settled = walked.outcome == Outcome.STEPPED.name and change < SETTLED
-        if settled:
-            settled_values.append(value)
-            settled_states.append(state)
-        result = step(wheel, state, model=model, options=options)
+    walks = states_along(params, name, values, x, n_steps, model=model, options=options)
+    for value, walked in zip(values, walks, strict=True):
+        state = walked.section_state.values[-1]
+        result = step(changed(params, name, value), state, model=model, options=options)
         row = {key: np.asarray(values) for key, values in step_measures(result).items()}
         if walked.outcome != Outcome.STEPPED.name:
             row["outcome"] = np.asarray(int(Outcome[walked.outcome]))
-        rows.append(row | {"section_state": state, "change": change, "settled": settled})
+        row["section_state"] = state
+        row["change"] = np.asarray(walked.attrs["last_change"])
+        row["settled"] = np.asarray(bool(walked.settled))
+        rows.append(row)
         if progress is not None:
-            progress((index + 1) / len(values))
+            progress(len(rows) / len(values))
     return _table(params, name, values, rows, checked(params, x, model, options)[2:])
 
 
@@ -129,7 +166,9 @@ def _table(
         (name, "component"), columns["section_state"], {"long_name": "section state"}
     )
     data["change"] = xr.Variable(
-        name, columns["change"], {"units": "1", "long_name": "change of the last step"}
+        name,
+        columns["change"],
+        {"units": "1", "long_name": "largest change of the last five steps"},
     )
     data["settled"] = xr.Variable(
         name, columns["settled"], {"long_name": "whether the walk settled into a period-1 gait"}

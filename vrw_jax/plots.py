@@ -344,6 +344,7 @@ def walk_frames(
             now = {name: float(np.interp(t, time, step[name])) for name in names}
             push = {name: float(step[name][i]) for name in forces}
             figure = Figure(figsize=(3.6, 3.3), dpi=100)
+            figure.set_layout_engine("none")
             canvas = FigureCanvasAgg(figure)
             axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
             centre = float(step.hub_x[0]) + stride * t / period
