@@ -1,0 +1,377 @@
+"""Scans: the steady gait of every sample of a design, as one labelled dataset.
+
+A scan is cut into chunks, each computed by the same compiled function and, where a store is given,
+written at once: a scan that was interrupted goes on with the chunks that are missing.
+"""
+
+import contextlib
+import errno
+import hashlib
+import platform
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import numpy as np
+import xarray as xr
+
+from vrw_jax.cycle_options import CycleOptions
+from vrw_jax.designs import AbstractDesign, Columns
+from vrw_jax.measures import MARGINS, attrs_of
+from vrw_jax.models import ViscoelasticWheel
+from vrw_jax.options import Options
+from vrw_jax.outcomes import Outcome
+from vrw_jax.params import PARAMETER_NAMES, WheelParams
+from vrw_jax.scan_engine import LANES, Engine
+from vrw_jax.scan_measures import DEFAULT_MEASURES, check_measures, variable_attrs
+from vrw_jax.scan_store import (
+    MANIFEST,
+    PROVENANCE,
+    AbstractStore,
+    Layout,
+    MemoryStore,
+    Variable,
+    ZarrStore,
+    chunk_shape,
+    create,
+    first_difference,
+    stored_manifest,
+)
+from vrw_jax.simulate import provenance
+
+CHUNK = 4096
+"""Most samples of a chunk, unless asked for otherwise: what a killed scan can lose."""
+
+Evaluate = Callable[[Columns], Mapping[str, np.ndarray]]
+"""Results of a block of samples by variable, samples first."""
+Report = Callable[["Progress"], None]
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a scan is."""
+
+    samples: int  # to do in this run
+    done: int  # of them
+    failed: int  # of those, without a steady gait
+    kept: int  # samples that an earlier run had computed
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything about a scan that is known before it runs."""
+
+    design: AbstractDesign
+    measures: tuple[str, ...]
+    base: WheelParams
+    model: ViscoelasticWheel
+    options: Options
+    cycle_options: CycleOptions
+    layout: Layout
+    text: str = ""
+
+    @property
+    def settings(self) -> dict[str, object]:
+        """What a store must have been made with to be gone on with."""
+        swept = self.design.names
+        return {
+            "design": self.design.description(),
+            "wheel": {
+                name: float(getattr(self.base, name))
+                for name in PARAMETER_NAMES
+                if name not in swept
+            }
+            | {"n_legs": self.base.n_legs},
+            "measures": list(self.measures),
+            "model": _fields(self.model),
+            "options": _fields(self.options),
+            "cycle_options": _fields(self.cycle_options),
+            "dtype": str(self.base.damping.dtype),
+            "chunk": list(self.layout.chunk),
+        }
+
+    @property
+    def origin(self) -> dict[str, object]:
+        """Where the numbers come from: code, versions, device."""
+        told = provenance(self.base, self.model, self.options)
+        return {
+            "code": _code_digest(),
+            "versions": told["versions"],
+            "device": f"{jax.default_backend()}: {told['device']}, {platform.machine()}",
+        }
+
+    @property
+    def attrs(self) -> dict[str, object]:
+        """Attributes of the whole result."""
+        return {
+            "title": f"Steady gaits of the viscoelastic-legged rimless wheel over "
+            f"{', '.join(self.design.names)}",
+            "rule": "NaN, or -1 in an integer, where the outcome is not STEPPED.",
+            MANIFEST: self.settings,
+            PROVENANCE: self.origin,
+            "config": self.text,
+        }
+
+    def engine(self) -> Engine:
+        """The function that computes samples."""
+        return Engine(self.measures, self.base, self.model, self.options, self.cycle_options)
+
+
+def plan(
+    design: AbstractDesign,
+    measures: Iterable[str] = DEFAULT_MEASURES,
+    *,
+    base: WheelParams | None = None,
+    model: ViscoelasticWheel | None = None,
+    options: Options | None = None,
+    cycle_options: CycleOptions | None = None,
+    chunk: int | None = None,
+    text: str = "",
+) -> Plan:
+    """Check what is asked for and lay out the result, without computing anything."""
+    if not isinstance(design, AbstractDesign):
+        raise TypeError(
+            f"design is a {type(design).__name__}, but it must say which samples: write "
+            "vrw.grid(damping=[...]), vrw.samples({...}), vrw.sobol({...}, n) or vrw.uniform."
+        )
+    base = WheelParams() if base is None else base
+    if base.damping.ndim:
+        raise ValueError(
+            "base holds batches, but it is the one wheel whose parameters the design replaces: "
+            "give scalars, and what varies in the design."
+        )
+    options = Options() if options is None else options
+    options.require_reachable(np.dtype(base.damping.dtype))
+    if chunk is not None and chunk < 1:
+        raise ValueError(f"chunk is {chunk}, but it must be at least 1 sample.")
+    names = check_measures(measures)
+    return Plan(
+        design=design,
+        measures=names,
+        base=base,
+        model=ViscoelasticWheel() if model is None else model,
+        options=options,
+        cycle_options=CycleOptions() if cycle_options is None else cycle_options,
+        layout=_layout(design, names, base, CHUNK if chunk is None else chunk),
+        text=text,
+    )
+
+
+def scan(
+    design: AbstractDesign,
+    measures: Iterable[str] = DEFAULT_MEASURES,
+    *,
+    base: WheelParams | None = None,
+    model: ViscoelasticWheel | None = None,
+    options: Options | None = None,
+    cycle_options: CycleOptions | None = None,
+    store: str | Path | None = None,
+    chunk: int | None = None,
+    report: Report | None = None,
+) -> xr.Dataset:
+    """The steady gait of every sample, labelled, with outcome and premise margins of each.
+
+    `measures` are names (see `vrw_jax.scan_measures`), derivatives included as in
+    'd dls_fraction / d damping'. With `store` the result is kept there chunk by chunk: a scan that
+    was interrupted goes on where it stopped and ends with bitwise the same data, a finished one is
+    only opened. `report` is told the progress after each chunk. What a sample gives does not depend
+    on the others, nor on `chunk`.
+    """
+    planned = plan(
+        design,
+        measures,
+        base=base,
+        model=model,
+        options=options,
+        cycle_options=cycle_options,
+        chunk=chunk,
+    )
+    return run(planned, store, report=report)
+
+
+def run(
+    planned: Plan,
+    store: str | Path | None = None,
+    *,
+    report: Report | None = None,
+    evaluate: Evaluate | None = None,
+) -> xr.Dataset:
+    """Carry out a plan; `evaluate` stands in for the plan's own engine."""
+    kept: AbstractStore
+    if store is None:
+        kept = MemoryStore(planned.layout, planned.attrs)
+    else:
+        kept = open_store(planned, Path(store))
+    missing = kept.missing()
+    if not missing:
+        return kept.dataset()
+    evaluate = planned.engine() if evaluate is None else evaluate
+    sizes = [_size(planned.layout.region(index)) for index in missing]
+    total, done, failed = sum(sizes), 0, 0
+    if report is not None:
+        report(Progress(total, 0, 0, planned.design.size - total))
+    for index, size in zip(missing, sizes, strict=True):
+        region = planned.layout.region(index)
+        results = evaluate(planned.design.block(region))
+        with _disk_full_explained(store, planned.layout.n_chunks - len(kept.missing())):
+            kept.write(index, _shaped(results, region))
+        done += size
+        failed += int(np.count_nonzero(results["outcome"] != Outcome.STEPPED))
+        if report is not None:
+            report(Progress(total, done, failed, planned.design.size - total))
+    return kept.dataset()
+
+
+def open_store(planned: Plan, path: Path) -> ZarrStore:
+    """The store at `path`, made now if nothing is there; refused if it holds another scan."""
+    there = stored_manifest(path)
+    if there is None:
+        create(path, planned.layout, planned.attrs)
+        return ZarrStore(path, planned.layout)
+    name, old, new = first_difference(there[MANIFEST], planned.settings)
+    if name:
+        raise ValueError(
+            f"{path} holds a scan made with other settings: {_told(name, old, new)}. "
+            "Give another place for this scan, or go back to those settings, or delete the store."
+        )
+    kept = ZarrStore(path, planned.layout)
+    name, old, new = first_difference(there[PROVENANCE], planned.origin)
+    missing = len(kept.missing())
+    if name and missing:
+        raise ValueError(
+            f"{path} lacks {missing} of {planned.layout.n_chunks} chunks and was begun by other "
+            f"means, so that its last digits might not fit: {_told(name, old, new)}. "
+            "Go on with what it was begun with, or begin anew in another place."
+        )
+    kept.tidy()
+    return kept
+
+
+def _told(name: str, old: object, new: object) -> str:
+    if name == "design.digest":
+        return "the values of the swept parameters differ"
+    if name == "code":
+        return "the library's code differs"
+    return f"{name} is {old!r} there and {new!r} here"
+
+
+def _size(region: tuple[slice, ...]) -> int:
+    return int(np.prod([part.stop - part.start for part in region]))
+
+
+def _shaped(results: Mapping[str, np.ndarray], region: tuple[slice, ...]) -> dict[str, np.ndarray]:
+    shape = tuple(part.stop - part.start for part in region)
+    return {name: value.reshape(*shape, *value.shape[1:]) for name, value in results.items()}
+
+
+@contextlib.contextmanager
+def _disk_full_explained(store: str | Path | None, n_done: int) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        raise OSError(
+            error.errno,
+            f"no space is left for {store}, where {n_done} chunks are complete: make room and run "
+            "the same again, it goes on from there",
+        ) from error
+
+
+def _layout(
+    design: AbstractDesign, measures: tuple[str, ...], base: WheelParams, chunk: int
+) -> Layout:
+    dtype = str(base.damping.dtype)
+    legs = np.arange(3, base.n_legs + 1)
+
+    def variable(name: str) -> Variable:
+        attrs = variable_attrs(name)
+        if name == "outcome":
+            return Variable(name, "int8", -1, attrs)
+        if name == "solver_steps":
+            return Variable(name, "int32", -1, attrs)
+        if name in MARGINS and MARGINS[name].axis:
+            return Variable(name, dtype, np.nan, attrs, ("leg",), (len(legs),))
+        return Variable(name, dtype, np.nan, attrs)
+
+    coordinates = {
+        name: (dim, values, attrs_of(name) if name in PARAMETER_NAMES else {})
+        for name, (dim, values) in design.coordinates().items()
+    }
+    coordinates["leg"] = ("leg", legs, {"long_name": "locked leg", "units": "1"})
+    return Layout(
+        dims=design.dims,
+        shape=design.shape,
+        chunk=chunk_shape(design.shape, chunk),
+        variables=tuple(variable(name) for name in ("outcome", *measures, *MARGINS)),
+        coordinates=coordinates,
+    )
+
+
+def _fields(settings: object) -> dict[str, object]:
+    """The fields of a settings object as plain values."""
+    told: dict[str, object] = {"kind": type(settings).__name__}
+    for name in type(settings).__dataclass_fields__:  # type: ignore[attr-defined]
+        value = getattr(settings, name)
+        if isinstance(value, Options):
+            continue  # recorded by itself
+        if isinstance(value, bool | int | str):
+            told[name] = value
+        elif isinstance(value, tuple):
+            told[name] = list(value)
+        else:
+            told[name] = float(value)
+    return told
+
+
+def _code_digest() -> str:
+    """A digest of the library's source: other code may give other digits."""
+    digest = hashlib.sha256()
+    folder = Path(__file__).parent
+    for path in sorted(folder.rglob("*.py")):
+        digest.update(path.relative_to(folder).as_posix().encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def explained(planned: Plan, store: str | Path | None = None) -> dict[str, str]:
+    """Sizes, chunks, memory and time of a scan, as lines for a reader; computes nothing."""
+    layout, size = planned.layout, planned.design.size
+    missing = list(range(layout.n_chunks))
+    if store is not None and stored_manifest(Path(store)) is not None:
+        missing = open_store(planned, Path(store)).missing()
+    left = sum(_size(layout.region(index)) for index in missing)
+    chunk = int(np.prod(layout.chunk))
+    axes = " x ".join(f"{n} {name}" for name, n in zip(layout.dims, layout.shape, strict=True))
+    return {
+        "samples": f"{size:,} ({axes})",
+        "measures": ", ".join(planned.measures),
+        "always included": ", ".join(("outcome", *MARGINS)),
+        "chunks": f"{layout.n_chunks:,} of up to {chunk:,} samples, {len(missing):,} to compute",
+        "result": f"{_bytes(size * layout.bytes_per_sample)} before compression",
+        "memory": f"about {_bytes(MEMORY + chunk * 2 * layout.bytes_per_sample)}, "
+        + ("whatever the number of samples" if store is not None else "plus the result"),
+        "time": f"about {_seconds(left / RATE + (COMPILE if left else 0.0))}: "
+        f"{left:,} samples at {RATE:,.0f} per second, {COMPILE:.0f} s to compile the first time "
+        "(as measured on 2 cores; yours differ)",
+        "lanes": f"{LANES} wheels side by side",
+    }
+
+
+RATE, COMPILE, MEMORY = 500.0, 60.0, 1.2e9
+"""Samples per second, seconds to compile without a cache, bytes of compiler and code."""
+
+
+def _bytes(n: float) -> str:
+    for unit in ("B", "kB", "MB"):
+        if n < 1000:
+            return f"{n:.3g} {unit}"
+        n /= 1000
+    return f"{n:.3g} GB"
+
+
+def _seconds(t: float) -> str:
+    if t < 90:
+        return f"{t:.0f} s"
+    return f"{t / 60:.0f} min" if t < 5400 else f"{t / 3600:.1f} h"

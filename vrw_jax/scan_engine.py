@@ -1,0 +1,161 @@
+"""The steady gait of many wheels at once: one compiled function over a fixed number of lanes.
+
+A block of samples is cut into batches of LANES wheels, the last filled up, and every batch goes
+through the same compiled code: what a lane gives does not depend on where it stands, on its
+neighbours, or on how many samples a scan has.
+"""
+
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from vrw_jax.cycle_options import CycleOptions
+from vrw_jax.limit_cycle import LimitCycle, limit_cycle
+from vrw_jax.measures import MARGINS, step_measures
+from vrw_jax.models import ViscoelasticWheel
+from vrw_jax.options import Options
+from vrw_jax.outcomes import Outcome
+from vrw_jax.params import PARAMETER_NAMES, WheelParams
+from vrw_jax.scan_measures import OF_CYCLE, derivative
+
+LANES = 512
+"""Wheels that one call of the compiled function takes."""
+
+AGREEMENT = 1e-8
+"""Largest distance, rad, rad/s and m/s, between a cycle's section state and where the event-driven
+step takes it: the two are independent computations."""
+
+
+def cycle_measures(cycle: LimitCycle) -> dict[str, Array]:
+    """The measures of `OF_CYCLE` of one limit cycle."""
+    values = {
+        "dls_fraction": cycle.dls_fraction,
+        "period": cycle.period,
+        "speed": cycle.speed,
+        "step_length": cycle.step_length,
+        "duration_dls": cycle.durations[0],
+        "duration_sls1": cycle.durations[1],
+        "duration_sls2": cycle.durations[2],
+        "theta_post_impact": cycle.post_impact[0],
+        "dtheta_post_impact": cycle.post_impact[1],
+        "theta_touchdown": cycle.section_state[0],
+        "dtheta_touchdown": cycle.section_state[1],
+        "dL1_touchdown": cycle.section_state[2],
+        "lambda_I4": cycle.indicators.lambda_I4,
+        "lambda_2_plus": cycle.indicators.lambda_2,
+        "lambda_4_plus": cycle.indicators.lambda_4,
+        "spectral_radius": cycle.spectral_radius,
+        "stability_margin": cycle.stability_margin,
+    }
+    assert set(values) == set(OF_CYCLE)
+    return values
+
+
+Told = tuple[Array, Array, dict[str, Array]]
+"""Outcome, section state, and measures by name."""
+
+
+class Engine:
+    """Evaluates samples of one wheel for a fixed set of measures; compiled at the first call.
+
+    Two functions take turns: the limit cycle with the derivatives asked for, then one event-driven
+    step from it, for the margins and as a check. They are compiled side by side.
+    """
+
+    def __init__(
+        self,
+        measures: tuple[str, ...],
+        base: WheelParams,
+        model: ViscoelasticWheel,
+        options: Options,
+        cycle_options: CycleOptions,
+    ) -> None:
+        self._base, self._options = base, options
+        wanted = tuple(d for name in measures if (d := derivative(name)) is not None)
+        plain = tuple(name for name in measures if derivative(name) is None)
+        moved = tuple(dict.fromkeys(d.parameter for d in wanted))
+        indices = np.asarray([PARAMETER_NAMES.index(name) for name in moved], int)
+
+        def wheel(values: Array) -> WheelParams:
+            return WheelParams(
+                **dict(zip(PARAMETER_NAMES, values, strict=True)), n_legs=base.n_legs
+            )
+
+        def gait(values: Array) -> tuple[LimitCycle, dict[str, Array]]:
+            def along(some: Array) -> tuple[dict[str, Array], LimitCycle]:
+                cycle = limit_cycle(wheel(values.at[indices].set(some)), options=cycle_options)
+                told = cycle_measures(cycle)
+                return {d.measure: told[d.measure] for d in wanted}, cycle
+
+            if not wanted:
+                return along(values[indices])[1], {}
+            jacobian, cycle = jax.jacfwd(along, has_aux=True)(values[indices])
+            return cycle, {d.name: jacobian[d.measure][moved.index(d.parameter)] for d in wanted}
+
+        def told_by_cycle(values: Array) -> Told:
+            cycle, derivatives = gait(values)
+            measures = cycle_measures(cycle)
+            kept = {name: measures[name] for name in plain if name in measures}
+            return cycle.outcome, cycle.section_state, kept | derivatives
+
+        def told_by_step(values: Array, state: Array, options: Options) -> Told:
+            result = model.step(wheel(values), state, options)
+            measures = step_measures(result)
+            names = (*(name for name in plain if name not in OF_CYCLE), *MARGINS)
+            return result.outcome, result.section_state, {name: measures[name] for name in names}
+
+        self._cycle = jax.jit(jax.vmap(told_by_cycle))
+        self._step = jax.jit(jax.vmap(told_by_step, in_axes=(0, 0, None)))
+        self._compiled = False
+
+    def __call__(self, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Results of the samples in `columns` (one value per sample of each swept parameter)."""
+        n = len(next(iter(columns.values())))
+        parts = []
+        for begin in range(0, n, LANES):
+            n_used = min(LANES, n - begin)
+            told = self._batch({name: x[begin : begin + n_used] for name, x in columns.items()})
+            parts.append({name: value[:n_used] for name, value in told.items()})
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+    def _batch(self, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        values = np.empty((LANES, len(PARAMETER_NAMES)), np.dtype(self._base.damping.dtype))
+        for i, name in enumerate(PARAMETER_NAMES):
+            column = columns.get(name)
+            if column is None:
+                values[:, i] = float(getattr(self._base, name))
+            else:
+                values[:, i] = column[0]  # fills up what is left
+                values[: len(column), i] = column
+        if not self._compiled:
+            self._compile(jnp.asarray(values))
+        outcome, state, by_cycle = self._cycle(jnp.asarray(values))
+        walked, reached, by_step = self._step(jnp.asarray(values), state, self._options)
+        checked = _checked_outcome(*map(np.asarray, (outcome, state, walked, reached)))
+        failed = checked != Outcome.STEPPED
+        told = {name: np.array(value) for name, value in (by_cycle | by_step).items()}
+        for value in told.values():
+            value[failed] = np.nan if np.issubdtype(value.dtype, np.floating) else -1
+        return {"outcome": checked} | told
+
+    def _compile(self, values: Array) -> None:
+        state = jnp.zeros((LANES, 3), values.dtype)
+        with ThreadPoolExecutor(2) as pool:
+            cycle = pool.submit(lambda: self._cycle.lower(values).compile())
+            step = pool.submit(lambda: self._step.lower(values, state, self._options).compile())
+            self._cycle, self._step = cycle.result(), step.result()
+        self._compiled = True
+
+
+def _checked_outcome(
+    outcome: np.ndarray, state: np.ndarray, walked: np.ndarray, reached: np.ndarray
+) -> np.ndarray:
+    """The cycle's outcome, unless the event-driven step from it fails or ends elsewhere."""
+    agrees = np.max(np.abs(reached - state), axis=-1) <= AGREEMENT
+    step = np.where(agrees, Outcome.STEPPED, Outcome.NO_CYCLE_FOUND)
+    step = np.where(walked == Outcome.STEPPED, step, walked)
+    return np.where(outcome == Outcome.STEPPED, step, outcome).astype(np.int8)
