@@ -51,13 +51,25 @@ class PhaseEnd(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """The part of the loop's state that a rejected step leaves as it is."""
+    """The end of the last accepted step: what a rejected step leaves as it is."""
 
     time: Scalar
     state: State
     solver_state: Any
     values: Float[Array, " n_watched"]
     rates: Float[Array, " n_watched"]
+
+
+class _Search(NamedTuple):
+    """Newton's search for the earliest event inside a step that brackets one."""
+
+    on: Bool[Array, ""]
+    crossing: Bool[Array, " n_guards"]
+    low: Scalar  # bracket of the event, s from the step's start
+    high: Scalar
+    accuracy: Scalar  # of the event's time, s
+    tries: Int[Array, ""]
+    settled: Int[Array, ""]  # tries that no longer moved the event
 
 
 class _Minimum(NamedTuple):
@@ -74,14 +86,12 @@ class _Loop(NamedTuple):
     step: _Step
     length: Scalar  # of the next step to try, s
     controller_state: Any
+    search: _Search
     minimum: _Minimum
     running: Bool[Array, ""]
-    bracketed: Bool[Array, ""]
+    guard: Int[Array, ""]
     timed_out: Bool[Array, ""]
     gave_up: Bool[Array, ""]
-    crossing: Bool[Array, " n_guards"]
-    end_values: Float[Array, " n_watched"]
-    end_rates: Float[Array, " n_watched"]
     tried: Int[Array, ""]
 
 
@@ -93,21 +103,20 @@ class _Stepper(NamedTuple):
     controller: diffrax.PIDController
     term: diffrax.ODETerm
 
-    def start(self, state: State, options: Options) -> tuple[Any, Scalar, Any]:
-        """Solver state, length of the first step and controller state."""
+    def start(self, state: State, options: Options) -> tuple[Any, Any]:
+        """Solver state and controller state at the start of a phase."""
         zero = jnp.zeros((), state.dtype)
-        length, controller_state = self.controller.init(
+        _, controller_state = self.controller.init(
             self.term,
             zero,
-            options.max_phase_time.astype(state.dtype),
+            options.first_step,
             lax.stop_gradient(state),
-            None,
+            options.first_step,
             None,
             lambda terms, t, y, args: terms.vf(t, y, args),
             self.solver.error_order(self.term),
         )
-        solver_state = self.solver.init(self.term, zero, length, state, None)
-        return solver_state, lax.stop_gradient(jnp.asarray(length)), controller_state
+        return self.solver.init(self.term, zero, options.first_step, state, None), controller_state
 
     def step(self, state: State, solver_state: Any, length: Scalar) -> tuple[State, State, Any]:
         """State after `length`, its error estimate and the solver state there."""
@@ -214,180 +223,203 @@ def integrate_phase(
     """
     stepper = _stepper(field, options)
     n_guards = watched.n_guards
-
-    def watch(state: State) -> tuple[Array, Array]:
-        return jax.jvp(watched.values, (state,), (field(state),))
-
-    values, rates = watch(start)
-    past = (values < 0.0) | ((values == 0.0) & (rates <= 0.0))
-    past = past[:n_guards]
-    ended_at_once = active & jnp.any(past)
-    solver_state, length, controller_state = stepper.start(start, options)
+    zero = jnp.zeros((), start.dtype)
+    none = jnp.zeros((), jnp.int32)
+    nothing = jnp.zeros(jax.eval_shape(watched.values, start).shape, start.dtype)
+    no = jnp.asarray(False)
+    solver_state, controller_state = stepper.start(start, options)
     loop = _Loop(
-        step=_Step(jnp.zeros((), start.dtype), start, solver_state, values, rates),
-        length=length,
+        step=_Step(zero, start, solver_state, nothing, nothing),
+        length=zero,  # the first step has no length: it evaluates the start
         controller_state=controller_state,
+        search=_Search(no, jnp.zeros((n_guards,), bool), zero, zero, zero, none, none),
         minimum=_no_minimum(watched, start),
-        running=active & ~ended_at_once,
-        bracketed=jnp.asarray(False),
-        timed_out=jnp.asarray(False),
-        gave_up=jnp.asarray(False),
-        crossing=jnp.zeros((n_guards,), bool),
-        end_values=values,
-        end_rates=rates,
-        tried=jnp.zeros((), jnp.int32),
+        running=active,
+        guard=none - 1,
+        timed_out=no,
+        gave_up=no,
+        tried=none,
     )
 
     def advance(loop: _Loop) -> _Loop:
-        here, length = loop.step, loop.length
+        """Take one step and judge it: march on, begin or go on searching an event, or end.
+
+        One call of solver and watch serves the evaluation of the start, marching and searching:
+        code compiled once.
+        """
+        here, length, search = loop.step, loop.length, loop.search
         end, error, solver_state = stepper.step(here.state, here.solver_state, length)
-        values, rates = watch(end)
+        values, rates = jax.jvp(watched.values, (end,), (stepper.field(end),))
+        guards, guard_rates = values[:n_guards], rates[:n_guards]
+        starting, marching = loop.tried == 0, (loop.tried > 0) & ~search.on
+
+        # At the start: a guard that is past, or on its way, ends the phase at once.
+        past = (guards < 0.0) | ((guards == 0.0) & (guard_rates <= 0.0))
+        ends_at_once = starting & jnp.any(past)
+
+        # Marching: keep the step, or try another; look for crossings, and for dips within.
         error = jnp.where(jnp.all(jnp.isfinite(values)), error, jnp.inf)
-        keep, next_length, controller_state = stepper.judge(
-            here.state, end, error, length, loop.controller_state
+        keep, next_length, next_controller_state = stepper.judge(
+            here.state,
+            end,
+            error,
+            jnp.where(starting, options.first_step, length),
+            loop.controller_state,
         )
-        crossing = values[:n_guards] <= 0.0
-        crossed = keep & jnp.any(crossing)
-        places, lows = _cubic_minimum(
-            *map(
-                lax.stop_gradient,
-                (here.values, here.rates * length, values, rates * length),
-            )
-        )
-        # A dip: falling, then rising, and the cubic negative between. Step to the dip and look.
-        turning = (lax.stop_gradient(here.rates) < 0.0) & (lax.stop_gradient(rates) >= 0.0)
-        dips = (turning & (lows <= 0.0))[:n_guards] & ~crossing
-        to_dip = length * jnp.min(jnp.where(dips, places[:n_guards], 1.0))
+        keep = keep & marching
+        crossing = guards <= 0.0
+        places, dips = _dips(here, values, rates, length, n_guards)
+        to_dip = length * jnp.min(jnp.where(dips & ~crossing, places, 1.0))
         retry = keep & (to_dip < length)
-        crossed = crossed & ~retry
-        accepted = keep & ~crossed & ~retry
+        crossed = keep & jnp.any(crossing) & ~retry
+        accepted = starting | (keep & ~crossed & ~retry)
+
+        # Searching: Newton's next proposal from this one.
+        found = _searched(search, guards, guard_rates, length, crossed, crossing)
+        settles = search.on & (jnp.abs(found.length - length) <= search.accuracy)
+        settled = search.settled + settles
+        arrived = search.on & (settled >= SETTLED)
+
         time = here.time + length
+        step = _Step(time, end, solver_state, values, rates)
         timed_out = accepted & (time >= options.max_phase_time)
         tried = loop.tried + 1
-        stuck = (
-            ~crossed
-            & ~timed_out
+        stuck = (search.on & ~arrived & (search.tries >= options.event_steps)) | (
+            marching
+            & ~crossed
             & ((tried >= options.max_solver_steps) | (here.time + next_length == here.time))
         )
-        end_step = _Step(time, end, solver_state, values, rates)
+        guess = _first_guess(here, values, rates, length, n_guards, crossing)
+        following = jnp.where(starting, options.first_step, next_length)
+        following = jnp.where(retry, to_dip, following)
+        following = jnp.where(crossed, guess, following)
+        resolution = 1e3 * jnp.finfo(length.dtype).eps * time
         return _Loop(
-            step=_select(accepted, end_step, here),
-            length=jnp.where(crossed, length, jnp.where(retry, to_dip, next_length)),
-            controller_state=_select(retry, loop.controller_state, controller_state),
-            minimum=_lower(watched, loop.minimum, here, values, rates, length, accepted),
-            running=~(crossed | timed_out | stuck),
-            bracketed=crossed,
+            step=_select(accepted | arrived, step, here),
+            length=jnp.where(search.on, found.length, lax.stop_gradient(following)),
+            controller_state=_select(
+                marching & ~retry, next_controller_state, loop.controller_state
+            ),
+            search=_Search(
+                on=search.on | crossed,
+                crossing=jnp.where(crossed, crossing, search.crossing),
+                low=jnp.where(crossed, 0.0, found.low),
+                high=jnp.where(crossed, lax.stop_gradient(length), found.high),
+                accuracy=jnp.where(
+                    crossed,
+                    lax.stop_gradient(jnp.maximum(options.rtol * length, resolution)),
+                    search.accuracy,
+                ),
+                tries=search.tries + search.on,
+                settled=settled,
+            ),
+            minimum=_lower(
+                watched, loop.minimum, here, step, length, (accepted & marching) | arrived
+            ),
+            running=~(ends_at_once | arrived | timed_out | stuck),
+            guard=jnp.where(
+                ends_at_once,
+                jnp.argmax(past).astype(jnp.int32),
+                jnp.where(arrived, found.guard, loop.guard),
+            ),
             timed_out=timed_out,
             gave_up=stuck,
-            crossing=crossing & crossed,
-            end_values=values,
-            end_rates=rates,
             tried=tried,
         )
 
     loop = lax.while_loop(lambda loop: loop.running, advance, loop)
-    left, bracketed = loop.step, loop.bracketed
-    event = _locate(stepper, watch, loop, n_guards, options)
-    end_state = jnp.where(bracketed, event.state, left.state)
-    end_values = jnp.where(bracketed, event.values, left.values)
     minima = jnp.zeros((0,), start.dtype)
     if watched.count_start:
-        last = lax.stop_gradient(jnp.where(bracketed, event.offset, 0.0))
-        minimum = _lower(
-            watched, loop.minimum, left, event.values, event.rates, last, bracketed & (last > 0.0)
-        )
-        edges = jnp.minimum(
-            jnp.where(jnp.asarray(watched.count_start), values[n_guards:], jnp.inf),
-            end_values[n_guards:],
-        )
-        minima = jnp.minimum(_settle(stepper, watched, minimum, options), edges)
-    located = bracketed & event.converged
+        minima = _settle(stepper, watched, loop.minimum, start, loop.step, options)
     return PhaseEnd(
-        state=end_state,
-        duration=left.time + jnp.where(bracketed, event.offset, 0.0),
-        guard=jnp.where(
-            ended_at_once,
-            jnp.argmax(past).astype(jnp.int32),
-            jnp.where(located, event.guard, -1),
-        ),
+        state=loop.step.state,
+        duration=loop.step.time,
+        guard=loop.guard,
         timed_out=loop.timed_out,
-        gave_up=loop.gave_up | (bracketed & ~event.converged),
+        gave_up=loop.gave_up,
         solver_steps=loop.tried,
         minima=minima,
     )
+
+
+SETTLED = 3
+"""Tries at the located event before it counts: the first makes the event's time right to first
+order in its derivatives, the second to third order, the last evaluates the state there."""
 
 
 def _select(condition: Any, yes: Any, no: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 
-class _Event(NamedTuple):
-    """The earliest event inside the bracketing step."""
+def _dips(
+    here: _Step, values: Array, rates: Array, length: Scalar, n_guards: int
+) -> tuple[Array, Array]:
+    """Places in (0, 1) where a guard's cubic dips to zero between falling and rising, and whether.
 
-    state: State
-    offset: Scalar  # from the bracket's left end, s
-    guard: Int[Array, ""]
-    values: Float[Array, " n_watched"]
-    rates: Float[Array, " n_watched"]
-    converged: Bool[Array, ""]
-
-
-def _locate(
-    stepper: _Stepper, watch: Callable, loop: _Loop, n_guards: int, options: Options
-) -> _Event:
-    """The earliest event in the bracketing step, by Newton's method on the step's length.
-
-    Each iterate is a re-step from the bracket's left end, kept inside the shrinking bracket by
-    bisection. Every guard that crosses proposes its own time and the earliest is taken. The
-    iterates carry derivatives: after k of them in the quadratic regime, derivatives are right to
-    order 2^k - 1.
+    The step is then taken again up to the dip: either the guard has crossed there, or the march
+    goes on from its lowest point.
     """
-    left = loop.step
-    length = lax.stop_gradient(loop.length)
-    crossing = loop.bracketed & loop.crossing
-    v0, r0, v1, r1 = (
-        lax.stop_gradient(v)[:n_guards]
-        for v in (left.values, left.rates * length, loop.end_values, loop.end_rates * length)
-    )
+    v0, r0, v1, r1 = lax.stop_gradient((here.values, here.rates, values, rates))
+    v0, r0, v1, r1 = v0[:n_guards], r0[:n_guards], v1[:n_guards], r1[:n_guards]
+    length = lax.stop_gradient(length)
+    places, lows = _cubic_minimum(v0, r0 * length, v1, r1 * length)
+    return places, (r0 < 0.0) & (r1 >= 0.0) & (lows <= 0.0)
 
-    # First guess: where the cubic of each crossing guard passes zero.
-    def halve(_: object, ends: tuple[Array, Array]) -> tuple[Array, Array]:
-        low, high = ends
-        middle = 0.5 * (low + high)
-        positive = _cubic(middle, v0, r0, v1, r1) > 0.0
-        return jnp.where(positive, middle, low), jnp.where(positive, high, middle)
 
-    low, high = lax.fori_loop(0, 20, halve, (jnp.zeros_like(v0), jnp.ones_like(v0)))
-    guess = length * jnp.min(jnp.where(crossing, 0.5 * (low + high), 1.0))
+def _first_guess(
+    here: _Step, values: Array, rates: Array, length: Scalar, n_guards: int, crossing: Array
+) -> Scalar:
+    """Length to the earliest crossing by the guards' cubics: secant, then Newton's method."""
+    v0, r0, v1, r1 = lax.stop_gradient((here.values, here.rates * length, values, rates * length))
+    v0, r0, v1, r1 = v0[:n_guards], r0[:n_guards], v1[:n_guards], r1[:n_guards]
+    fall = jnp.where(crossing & (v0 > v1), v0 - v1, 1.0)
+    at = jnp.where(crossing, jnp.clip(v0 / fall, 0.0, 1.0), 1.0)
+    for _ in range(3):
+        slope = (
+            6.0 * at * (at - 1.0) * (v0 - v1)
+            + (1.0 - at) * (1.0 - 3.0 * at) * r0
+            + at * (3.0 * at - 2.0) * r1
+        )
+        falls = slope < 0.0
+        change = _cubic(at, v0, r0, v1, r1) / jnp.where(falls, slope, 1.0)
+        at = jnp.where(crossing & falls, jnp.clip(at - change, 0.0, 1.0), at)
+    return lax.stop_gradient(length) * jnp.min(jnp.where(crossing, at, 1.0))
 
-    def newton(carry: tuple, _iteration: None) -> tuple:
-        offset, low, high, _ = carry
-        state, _, _ = stepper.step(left.state, left.solver_state, offset)
-        values, rates = watch(state)
-        guards, guard_rates = values[:n_guards], rates[:n_guards]
-        falling = crossing & (guard_rates < 0.0)
-        change = -guards / jnp.where(falling, guard_rates, -1.0)
-        proposals = jnp.where(falling, offset + change, jnp.inf)
-        guard = jnp.argmin(proposals).astype(jnp.int32)
-        before = jnp.all(jnp.where(crossing, guards > 0.0, True))
-        low = jnp.where(before, lax.stop_gradient(offset), low)
-        high = jnp.where(before, high, lax.stop_gradient(offset))
-        proposal = proposals[guard]
-        # Within rounding of a collapsed bracket counts as inside: bisection has no derivative.
-        inside = (proposal >= low - accuracy) & (proposal <= high + accuracy)
-        following = jnp.where(inside, jnp.where(inside, proposal, 0.0), 0.5 * (low + high))
-        event = _Event(state, offset, guard, values, rates, jnp.abs(following - offset) <= accuracy)
-        return (following, low, high, event), None
 
-    resolution = 1e3 * jnp.finfo(length.dtype).eps * (left.time + length)
-    accuracy = lax.stop_gradient(jnp.maximum(options.rtol * length, resolution))
-    zero = jnp.zeros_like(guess)
-    nothing = _Event(
-        left.state, zero, jnp.zeros((), jnp.int32), left.values, left.rates, jnp.asarray(False)
-    )
-    carry = (guess, zero, length, nothing)
-    (_, _, _, event), _ = lax.scan(newton, carry, None, length=options.event_steps)
-    return event
+class _Found(NamedTuple):
+    """Newton's next proposal for an event's time, and the bracket that is left."""
+
+    length: Scalar
+    guard: Int[Array, ""]
+    low: Scalar
+    high: Scalar
+
+
+def _searched(
+    search: _Search,
+    guards: Array,
+    rates: Array,
+    length: Scalar,
+    crossed: Bool[Array, ""],
+    crossing: Bool[Array, " n_guards"],
+) -> _Found:
+    """Every guard that crosses proposes its own time and the earliest is taken.
+
+    Kept inside the shrinking bracket by bisection. The proposal carries derivatives: after k of
+    them in the quadratic regime, derivatives are right to order 2^k - 1.
+    """
+    falling = search.crossing & (rates < 0.0)
+    change = -guards / jnp.where(falling, rates, -1.0)
+    proposals = jnp.where(falling, length + change, jnp.inf)
+    guard = jnp.argmin(proposals).astype(jnp.int32)
+    before = jnp.all(jnp.where(search.crossing, guards > 0.0, True))
+    low = jnp.where(before, lax.stop_gradient(length), search.low)
+    high = jnp.where(before, search.high, lax.stop_gradient(length))
+    proposal = proposals[guard]
+    # Within rounding of a collapsed bracket counts as inside: bisection has no derivative.
+    inside = (proposal >= low - search.accuracy) & (proposal <= high + search.accuracy)
+    following = jnp.where(inside, jnp.where(inside, proposal, 0.0), 0.5 * (low + high))
+    return _Found(following, guard, low, high)
 
 
 def _no_minimum(watched: Watched, start: State) -> _Minimum:
@@ -400,8 +432,7 @@ def _lower(
     watched: Watched,
     minimum: _Minimum,
     left: _Step,
-    end_values: Array,
-    end_rates: Array,
+    right: _Step,
     length: Scalar,
     counts: Bool[Array, ""],
 ) -> _Minimum:
@@ -413,10 +444,11 @@ def _lower(
         return minimum
     v0, r0, v1, r1 = (
         lax.stop_gradient(v)[watched.n_guards :]
-        for v in (left.values, left.rates, end_values, end_rates)
+        for v in (left.values, left.rates, right.values, right.rates)
     )
     at_rest = (left.time == 0.0) & ~jnp.asarray(watched.count_start)
     r0 = jnp.where(at_rest, jnp.maximum(r0, 0.0), r0)
+    length = lax.stop_gradient(length)
     x, value = _cubic_minimum(v0, r0 * length, v1, r1 * length)
     value = jnp.where(jnp.isfinite(value), value, jnp.minimum(v0, v1))
     better = counts & (r0 < 0.0) & (r1 >= 0.0) & (value < minimum.value)
@@ -430,9 +462,14 @@ def _lower(
 
 
 def _settle(
-    stepper: _Stepper, watched: Watched, minimum: _Minimum, options: Options
+    stepper: _Stepper,
+    watched: Watched,
+    minimum: _Minimum,
+    start: State,
+    end: _Step,
+    options: Options,
 ) -> Float[Array, " n_monitors"]:
-    """Each monitor's lowest interior minimum to the integrator's accuracy; inf without one.
+    """Each monitor's minimum over the phase, to the integrator's accuracy.
 
     Secant steps on the rate, each a re-step from the left end of the step that holds the minimum.
     """
@@ -474,7 +511,10 @@ def _settle(
         jnp.where(found, offset, 0.0),
         rate_left,
     )
-    return jnp.where(found, values, jnp.inf)
+    at_start = watched.values(start)[watched.n_guards :]
+    at_start = jnp.where(jnp.asarray(watched.count_start), at_start, jnp.inf)
+    edges = jnp.minimum(at_start, end.values[watched.n_guards :])
+    return jnp.minimum(jnp.where(found, values, jnp.inf), edges)
 
 
 def sample_phase(
@@ -495,15 +535,7 @@ def sample_phase(
     return jnp.concatenate([start[None], states])
 
 
-def _march(
-    stepper: _Stepper,
-    state: State,
-    solver_state: Any,
-    length: Scalar,
-    controller_state: Any,
-    interval: Scalar,
-    options: Options,
-) -> State:
+def _march(stepper: _Stepper, state: State, interval: Scalar, options: Options) -> State:
     """State after `interval`, by adaptive steps of which the last ends exactly there."""
 
     def advance(carry: tuple) -> tuple:
@@ -519,6 +551,8 @@ def _march(
         return time, state, solver_state, next_length, controller_state, tried + 1
 
     unfinished = lambda c: (c[0] < interval) & (c[-1] < options.max_solver_steps)
-    zero = jnp.zeros_like(length)
-    carry = (zero, state, solver_state, length, controller_state, jnp.zeros((), jnp.int32))
+    none = jnp.zeros((), jnp.int32)
+    solver_state, controller_state = stepper.start(state, options)
+    zero = jnp.zeros_like(interval)
+    carry = (zero, state, solver_state, zero + options.first_step, controller_state, none)
     return lax.while_loop(unfinished, advance, carry)[1]

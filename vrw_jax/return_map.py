@@ -131,6 +131,7 @@ def _walk(
             advance.section_state,
             jnp.where(walking, advance.durations, 0.0),
             outcome,
+            jnp.where(walking, advance.solver_steps, 0),
         )
         return (advance.section_state, outcome), advance
 

@@ -96,8 +96,9 @@ class Advance(eqx.Module):
     """The lean result of a step: what repeats."""
 
     section_state: SectionState
-    durations: Float[Array, "3"]
-    outcome: Int[Array, ""]
+    durations: Float[Array, "3"]  # of DLS, SLS-I, SLS-II, s
+    outcome: Int[Array, ""]  # an Outcome
+    solver_steps: Int[Array, ""]  # tried by the integrator
 
 
 class Trajectory(eqx.Module):

@@ -54,7 +54,7 @@ class RigidWheel(AbstractWheel):
 
     def advance(self, params: WheelParams, x: SectionState, options: Options) -> Advance:
         result = self.step(params, x, options)
-        return Advance(result.section_state, result.durations, result.outcome)
+        return Advance(result.section_state, result.durations, result.outcome, result.solver_steps)
 
     def _kept(self, s: Symbols) -> Scalar:
         """Rate after over rate before the landing."""

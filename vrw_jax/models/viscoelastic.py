@@ -1,7 +1,8 @@
 """The paper's wheel: landing, double support, single support I, stopper, single support II."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -223,25 +224,34 @@ class ViscoelasticWheel(AbstractWheel):
         return jnp.asarray(PAPER_START, params.damping.dtype)
 
     def advance(self, params: WheelParams, x: SectionState, options: Options) -> Advance:
-        def lean(*leaves: Array) -> tuple:
-            params, x, options = jax.tree.unflatten(structure, leaves)
-            walked = self._walk(params, x, options, monitored=False)
+        def lean(walked: _Walked) -> Advance:
             durations = jnp.stack([end.duration for end in walked.ends])
-            return (_section_state(walked), durations), walked.outcome
+            return Advance(_section_state(walked), durations, walked.outcome, _tried(walked))
 
-        leaves, structure = jax.tree.flatten((params, x, options))
-        (section_state, durations), outcome = any_mode(lean)(*leaves)
-        return Advance(section_state, durations, outcome)
+        return self._differentiable(lean, params, x, options, monitored=False)
 
     def step(self, params: WheelParams, x: SectionState, options: Options) -> StepResult:
-        def full(*leaves: Array) -> tuple:
+        full = lambda walked: _result(walked, self.friction)
+        return self._differentiable(full, params, x, options, monitored=True)
+
+    def _differentiable(
+        self,
+        read: Callable[[_Walked], Any],
+        params: WheelParams,
+        x: SectionState,
+        options: Options,
+        monitored: bool,
+    ) -> Any:
+        """What `read` says of the step, with derivatives in any mode and to any order."""
+        leaves, structure = jax.tree.flatten((params, x, options))
+
+        def walk(tighten: bool, *leaves: Array) -> tuple:
             params, x, options = jax.tree.unflatten(structure, leaves)
-            walked = self._walk(params, x, options, monitored=True)
-            result = _result(walked, self.friction)
+            options = options.for_derivatives() if tighten else options
+            result = read(self._walk(params, x, options, monitored))
             return eqx.partition(result, eqx.is_inexact_array)
 
-        leaves, structure = jax.tree.flatten((params, x, options))
-        floats, integers = any_mode(full)(*leaves)
+        floats, integers = any_mode(partial(walk, False), partial(walk, True))(*leaves)
         return eqx.combine(floats, integers)
 
     def trace(
@@ -333,6 +343,11 @@ SAFE_SINGLE_SUPPORT = (-0.3, 0.9, 0.95, 1.0, 0.0, 0.0)
 """A harmless posture that stands in where a lane has already failed; it is never integrated."""
 
 
+def _tried(walked: _Walked) -> Int[Array, ""]:
+    """Solver steps of the whole step, accepted or not."""
+    return jnp.sum(jnp.stack([end.solver_steps for end in walked.ends]))
+
+
 def _section_state(walked: _Walked) -> SectionState:
     theta, _, dtheta, dL1 = walked.ends[2].state
     state = jnp.stack([theta, dtheta, dL1])
@@ -381,7 +396,9 @@ def _result(walked: _Walked, friction: float) -> StepResult:
             hits, transitions.locked_leg_impulses(s, hit.motion, hit.hub_jump, locked), 0.0
         ),
         hit_planted_impulse=jnp.where(hits, hit.planted.normal, 0.0),
-        landing_friction_fore=jnp.where(began, friction - dynamics.friction_needed(landing.fore), 0.0),
+        landing_friction_fore=jnp.where(
+            began, friction - dynamics.friction_needed(landing.fore), 0.0
+        ),
         landing_friction_rear=jnp.where(
             began, friction - jnp.where(held, dynamics.friction_needed(landing.rear), 0.0), 0.0
         ),
@@ -407,5 +424,5 @@ def _result(walked: _Walked, friction: float) -> StepResult:
             damping=jnp.where(stepped, begins - finishes - hit.energy_lost, 0.0),
         ),
         outcome=walked.outcome,
-        solver_steps=sum((end.solver_steps for end in walked.ends), jnp.zeros((), jnp.int32)),
+        solver_steps=_tried(walked),
     )
