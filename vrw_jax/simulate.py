@@ -9,25 +9,62 @@ import platform
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import xarray as xr
+from jaxtyping import Array
 
 from vrw_jax.dynamics import damping_power
 from vrw_jax.geometry import Motion, landing_direction, rear_direction
 from vrw_jax.measures import TRAJECTORY, attrs_of
 from vrw_jax.models import AbstractWheel
-from vrw_jax.models.base import SectionState, Trajectory
+from vrw_jax.models.base import SectionState
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
-from vrw_jax.params import PARAMETER_NAMES, Symbols, WheelParams
+from vrw_jax.params import PARAMETER_NAMES, WheelParams
 from vrw_jax.return_map import _advance, checked
 
 
 @eqx.filter_jit
-def _trace(
+def _columns(
     model: AbstractWheel, params: WheelParams, x: SectionState, options: Options, n_samples: int
-) -> Trajectory:
-    return model.trace(params, x, options, n_samples)
+) -> dict[str, Array]:
+    """One step by the names of `TRAJECTORY`, shape (phase, sample), Leg 1's foot at the origin.
+
+    `ahead` is added: where the landing leg stands or will stand, m.
+    """
+    s, moved = params.symbols(), model.trace(params, x, options, n_samples)
+    theta, L1, L2, dtheta, dL1, dL2 = jnp.moveaxis(moved.state, -1, 0)
+    kinetic, gravitational, elastic = jnp.moveaxis(moved.energy, -1, 0)
+    motion = Motion.of(theta, L1, L2, dtheta, dL1, dL2)
+    rear = rear_direction(s, motion.sin, motion.cos)
+    hub_x, hub_z, zero = L1 * motion.sin, L1 * motion.cos, jnp.zeros_like(L1)
+    return {
+        "time": moved.time,
+        "x": zero,
+        "z": zero,
+        "theta": theta,
+        "L1": L1,
+        "L2": L2,
+        "dx": zero,
+        "dz": zero,
+        "dtheta": dtheta,
+        "dL1": dL1,
+        "dL2": dL2,
+        **{f"lambda_{i + 1}": moved.forces[..., i] for i in range(4)},
+        "kinetic_energy": kinetic,
+        "gravitational_energy": gravitational,
+        "elastic_energy": elastic,
+        "total_energy": kinetic + gravitational + elastic,
+        "damping_power": damping_power(s, motion),
+        "foot_1_x": zero,
+        "foot_1_z": zero,
+        "foot_2_x": hub_x - L2 * rear.sin,
+        "foot_2_z": hub_z - L2 * rear.cos,
+        "hub_x": hub_x,
+        "hub_z": hub_z,
+        "ahead": hub_x - s.L0 * landing_direction(s, motion.sin, motion.cos).sin,
+    }
 
 
 def simulate(
@@ -50,26 +87,31 @@ def simulate(
     if not n_samples >= 2:
         raise ValueError(f"n_samples is {n_samples}, but a phase has two ends: give 2 or more.")
     params, x, model, options = checked(params, x, model, options)
-    s = jax.tree.map(np.asarray, params.symbols())
+    s = params.symbols()
+    weight_along = float(s.Mt * s.g * s.sin_phi)
     parts: list[dict[str, np.ndarray]] = []
     start, outcome, stepped, time, foot = x, Outcome.STEPPED, 0, 0.0, 0.0
     while outcome == Outcome.STEPPED and stepped < n_steps:
         advance = _advance(model, params, x, options)
-        trajectory = jax.tree.map(np.asarray, _trace(model, params, x, options, n_samples))
+        columns = jax.tree.map(np.asarray, _columns(model, params, x, options, n_samples))
         outcome = Outcome(int(advance.outcome))
         durations = np.asarray(advance.durations)
         for phase in np.flatnonzero(durations > 0.0):
-            columns = _columns(s, jax.tree.map(lambda leaf, i=phase: leaf[i], trajectory), foot)
-            columns["time"] = columns["time"] + time
-            columns["step"] = np.full(n_samples, stepped)
-            columns["phase"] = np.full(n_samples, phase)
-            parts.append(columns)
+            part = {name: values[phase].copy() for name, values in columns.items()}
+            for name in ("x", "foot_1_x", "foot_2_x", "hub_x", "ahead"):
+                part[name] += foot
+            for name in ("gravitational_energy", "total_energy"):
+                part[name] -= weight_along * foot
+            part["time"] += time
+            part["step"] = np.full(n_samples, stepped)
+            part["phase"] = np.full(n_samples, phase)
+            parts.append(part)
         if outcome == Outcome.STEPPED:
             stepped += 1
             time += float(durations.sum())
-            foot = _next_foot(s, parts[-1])
+            foot = float(parts[-1]["ahead"][-1])
             x = advance.section_state
-    columns = {
+    joined = {
         name: np.concatenate([part[name] for part in parts]) if parts else np.zeros(0)
         for name in TRAJECTORY
     }
@@ -83,7 +125,7 @@ def simulate(
         "outcome_meaning": outcome.meaning,
     }
     variables = {
-        name: xr.Variable("time", values, attrs_of(name)) for name, values in columns.items()
+        name: xr.Variable("time", values, attrs_of(name)) for name, values in joined.items()
     }
     labels = {name: variables.pop(name) for name in ("time", "step", "phase")}
     return xr.Dataset(variables, labels, attrs | provenance(params, model, options))
@@ -117,46 +159,3 @@ def _version(name: str) -> str:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
         return "not installed"
-
-
-def _columns(s: Symbols, phase: Trajectory, foot: float) -> dict[str, np.ndarray]:
-    """One phase by the names of `TRAJECTORY`, with Leg 1's foot at `foot`, m."""
-    theta, L1, L2, dtheta, dL1, dL2 = np.asarray(phase.state).T
-    kinetic, gravitational, elastic = np.asarray(phase.energy).T
-    gravitational = gravitational - s.Mt * s.g * s.sin_phi * foot
-    motion = Motion(np.sin(theta), np.cos(theta), L1, L2, dtheta, dL1, dL2)
-    rear = rear_direction(s, motion.sin, motion.cos)
-    hub_x, hub_z = foot + L1 * motion.sin, L1 * motion.cos
-    zero = np.zeros_like(L1)
-    return {
-        "time": np.asarray(phase.time),
-        "x": foot + zero,
-        "z": zero,
-        "theta": theta,
-        "L1": L1,
-        "L2": L2,
-        "dx": zero,
-        "dz": zero,
-        "dtheta": dtheta,
-        "dL1": dL1,
-        "dL2": dL2,
-        **{f"lambda_{i + 1}": force for i, force in enumerate(np.asarray(phase.forces).T)},
-        "kinetic_energy": kinetic,
-        "gravitational_energy": gravitational,
-        "elastic_energy": elastic,
-        "total_energy": kinetic + gravitational + elastic,
-        "damping_power": np.asarray(damping_power(s, motion)),
-        "foot_1_x": foot + zero,
-        "foot_1_z": zero,
-        "foot_2_x": hub_x - L2 * rear.sin,
-        "foot_2_z": hub_z - L2 * rear.cos,
-        "hub_x": hub_x,
-        "hub_z": hub_z,
-    }
-
-
-def _next_foot(s: Symbols, last: dict[str, np.ndarray]) -> float:
-    """Where the landing leg stands, m: one step length ahead of the present foot."""
-    theta = last["theta"][-1]
-    ahead = landing_direction(s, np.sin(theta), np.cos(theta))
-    return float(last["hub_x"][-1] - s.L0 * ahead.sin)

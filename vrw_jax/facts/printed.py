@@ -1,28 +1,25 @@
 """The paper's equations as printed beside their mended form, where numbers can tell them apart.
 
-Plain NumPy in the paper's five coordinates q = (x, z, theta, L1, L2): it shares only the mass
+In the paper's five coordinates q = (x, z, theta, L1, L2): it shares only the mass
 matrix and the momentum with the simulator.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import xarray as xr
+from jaxtyping import Array
 
 from vrw_jax.dynamics import mass_matrix, momentum
 from vrw_jax.geometry import Motion, length_at_touchdown
-from vrw_jax.params import Symbols, WheelParams
-
-
-def _number_symbols(params: WheelParams) -> Symbols:
-    return jax.tree.map(np.asarray, params.symbols())
+from vrw_jax.params import Scalar, Symbols, WheelParams
 
 
 def _reach(s: Symbols, theta: float) -> float:
     """Length of Leg 1 at touchdown, m."""
-    angle: Any = np.asarray(theta)
-    return float(length_at_touchdown(s, angle))
+    return float(length_at_touchdown(s, jnp.asarray(theta)))
 
 
 def double_support_jacobian(
@@ -64,7 +61,7 @@ class LandingByThePaper(NamedTuple):
 
 def landing(params: WheelParams, section_state: np.ndarray) -> LandingByThePaper:
     """Collision I from the section state (theta-, dtheta-, dL1-) in five coordinates."""
-    s = _number_symbols(params)
+    s = params.symbols()
     theta, dtheta, dL1 = (float(v) for v in section_state)
     reach = _reach(s, theta)
     foot = landing_foot_velocity(params, section_state, bare_rate=dL1)
@@ -72,7 +69,7 @@ def landing(params: WheelParams, section_state: np.ndarray) -> LandingByThePaper
     new = np.asarray(theta - s.alpha)
     ends = (new, np.asarray(s.L0), np.asarray(reach))
     J = double_support_jacobian(*ends, float(s.alpha), as_printed=False)
-    M = five_coordinate_mass_matrix(s, float(new), float(s.L0), reach)
+    M = np.asarray(five_coordinate_mass_matrix(s, jnp.asarray(new), s.L0, jnp.asarray(reach)))
     inverse = np.linalg.inv(M)
     X = J @ inverse @ J.T
     projector = np.eye(5) - inverse @ J.T @ np.linalg.solve(X, J)
@@ -81,24 +78,23 @@ def landing(params: WheelParams, section_state: np.ndarray) -> LandingByThePaper
     return LandingByThePaper(after, impulse, projector @ before, residual)
 
 
-def five_coordinate_mass_matrix(s: Symbols, theta: float, L1: float, L2: float) -> np.ndarray:
+@jax.jit
+def five_coordinate_mass_matrix(s: Symbols, theta: Scalar, L1: Scalar, L2: Scalar) -> Array:
     """M(q) of eq. (1): the planted wheel's, and the momentum that a moving foot adds."""
-    M = np.zeros((5, 5))
-    M[0, 0] = M[1, 1] = s.Mt
-    lengths: Any = (np.asarray(L1), np.asarray(L2))
-    planted = mass_matrix(s, *lengths)
-    for i, unit in enumerate(np.eye(3)):
-        M[2 + i, 2:] = planted.times(tuple(unit))
-        motion = Motion(np.sin(theta), np.cos(theta), *lengths, *unit)
-        M[:2, 2 + i] = M[2 + i, :2] = np.asarray(momentum(s, motion))
-    return M
+    planted = mass_matrix(s, L1, L2)
+    units = jnp.eye(3)
+    angular = jnp.stack([jnp.stack(planted.times(tuple(unit))) for unit in units])
+    moved = jnp.stack(
+        [jnp.stack(momentum(s, Motion.of(theta, L1, L2, *unit))) for unit in units], axis=-1
+    )
+    return jnp.block([[s.Mt * jnp.eye(2), moved], [moved.T, angular]])
 
 
 def landing_foot_velocity(
     params: WheelParams, section_state: np.ndarray, bare_rate: float
 ) -> np.ndarray:
     """Velocity of the landing foot by eqs (16), (17), with `bare_rate` for their bare L1 rate."""
-    s = _number_symbols(params)
+    s = params.symbols()
     theta, dtheta, _ = (float(v) for v in section_state)
     reach = _reach(s, theta)
     L0, alpha = float(s.L0), float(s.alpha)
@@ -111,7 +107,7 @@ def landing_foot_velocity_by_differences(
     params: WheelParams, section_state: np.ndarray, h: float = 1e-6
 ) -> np.ndarray:
     """The same from the foot's position a moment before and after; right to h^2, some 1e-11 m/s."""
-    s = _number_symbols(params)
+    s = params.symbols()
     theta, dtheta, dL1 = (float(v) for v in section_state)
     reach = _reach(s, theta)
 

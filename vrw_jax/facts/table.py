@@ -32,6 +32,11 @@ def facts(evidence: Evidence) -> list[Fact]:
     return [fact for group in GROUPS for fact in group(evidence)]
 
 
+def _cell(text: str) -> str:
+    """Text that a Markdown table can hold, with minus signs for hyphens before numbers."""
+    return re.sub(r"(?<![\w.])-(?=\d)", "−", text).replace("|", "\\|")
+
+
 def as_markdown(table: Sequence[Fact]) -> str:
     """The table for a reader."""
     missing = [fact for fact in table if not fact.holds]
@@ -58,16 +63,15 @@ def as_markdown(table: Sequence[Fact]) -> str:
                 "| fact | where | published | found | | tolerance |",
                 "|---|---|---|---|---|---|",
             ]
-        cells = (
+        cells = [
             fact.claim,
             fact.where,
             fact.published,
             fact.found,
             fact.verdict if fact.holds else f"**{fact.verdict}**",
             fact.reason,
-        )
-        cells = tuple(re.sub(r"(?<![\w.])-(?=\d)", "−", cell) for cell in cells)
-        lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+        ]
+        lines.append("| " + " | ".join(_cell(text) for text in cells) + " |")
     return "\n".join(lines) + "\n"
 
 

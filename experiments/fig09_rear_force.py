@@ -1,0 +1,25 @@
+"""The normal force on foot 2 just after landing approaches zero as the damping grows.
+
+Writes `fig09_rear_force.svg` and `.png` to `results/` or the folder given:
+`python experiments/fig09_rear_force.py [folder]`.
+"""
+
+import sys
+from pathlib import Path
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+from vrw_jax import plots, reproduce  # noqa: E402  the number format is chosen first
+
+DAMPINGS = (50.0, 100.0, 200.0)  # N s/m
+
+
+def main(folder: Path) -> None:
+    gaits = reproduce.gaits_at(DAMPINGS)
+    plots.save(plots.rear_force(gaits), folder, "fig09_rear_force")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "results"))
