@@ -57,14 +57,16 @@ class Point(NamedTuple):
 class Phase(NamedTuple):
     """One phase as data; every function is elementwise over the lanes.
 
-    `acceleration`, `event` (zero at the end, of order 1) and `guards` (positive inside) read
-    (constants, point); `reset` turns the phase's end into the next phase's start, and the last
-    one's into the section's numbers (in `q`).
+    `residual` is what the equations of motion leave over at (constants, point, acceleration),
+    linear in the acceleration: multiplied out it costs far less to differentiate than solved for.
+    `event` (zero at the end, of order 1) and `guards` (positive inside)
+    read (constants, point); `reset` turns the phase's end into the next phase's start, and the
+    last one's into the section's numbers (in `q`).
     """
 
     name: str
     dim: int
-    acceleration: Callable[[Constants, Point], Vector]
+    residual: Callable[[Constants, Point, Vector], Vector]
     event: Callable[[Constants, Point], Elementwise]
     reset: Callable[[Constants, Point], Point]
     guards: Callable[[Constants, Point], Vector]
@@ -161,12 +163,14 @@ def inverse(matrix: Float[Array, "n n lanes"]) -> Float[Array, "n n lanes"]:
         return adjugate / determinant
     if m.shape[0] != 3:
         raise ValueError(f"the matrix has {m.shape[0]} rows, but only 1, 2 or 3 are built.")
-    after, before = np.array([1, 2, 0]), np.array([2, 0, 1])
-    cofactors = (
-        m[after][:, after] * m[before][:, before] - m[after][:, before] * m[before][:, after]
-    )
-    determinant = _weigh(np.ones(3), m[0] * cofactors[0])
-    return jnp.swapaxes(cofactors, 0, 1) / determinant
+
+    def cofactor(i: int, j: int) -> Array:
+        (a, b), (c, d) = ((i + 1) % 3, (i + 2) % 3), ((j + 1) % 3, (j + 2) % 3)
+        return m[a, c] * m[b, d] - m[a, d] * m[b, c]
+
+    adjugate = [[cofactor(j, i) for j in range(3)] for i in range(3)]
+    determinant = m[0, 0] * adjugate[0][0] + m[0, 1] * adjugate[1][0] + m[0, 2] * adjugate[2][0]
+    return jnp.stack([jnp.stack(row) for row in adjugate]) / determinant
 
 
 def _eliminate(
@@ -176,7 +180,7 @@ def _eliminate(
 ) -> Float[Array, "nodes dim columns lanes"]:
     """Solve the node equations of one step, block by block without pivoting.
 
-    The matrix is the identity less terms of order h; its diagonal blocks stay regular.
+    The matrix is the mass matrix plus terms of order h; its diagonal blocks stay regular.
     """
     n, dim = matrix.shape[:2]
     rest = jnp.concatenate([matrix.reshape(n, dim, n * dim, -1), right], axis=2)
@@ -188,12 +192,12 @@ def _eliminate(
             row = hold(row)
             rest = hold(rest[1:, :, dim:] - _contract(rest[1:, :, :dim], row))
         rows.append(row)
-    solved = [rows[-1]]
+    solved = rows[-1]
     for row in rows[-2::-1]:
-        known = jnp.concatenate(solved)
-        n_known = known.shape[0]
-        solved.insert(0, row[:, n_known:] - _contract(row[:, :n_known], known))
-    return jnp.stack(solved)
+        n_known = solved.shape[0]
+        known = row[:, n_known:] - _contract(row[:, :n_known], solved)
+        solved = jnp.concatenate([known, solved])
+    return solved.reshape(n, dim, *solved.shape[1:])
 
 
 def _push(function: Callable, primals: tuple, tangents: tuple) -> tuple:
@@ -202,17 +206,19 @@ def _push(function: Callable, primals: tuple, tangents: tuple) -> tuple:
     return jax.vmap(columns, in_axes=0, out_axes=(None, 0))(*tangents)
 
 
-def _partials(function: Callable, arguments: Sequence[Array]) -> tuple[Vector, list[Vector]]:
-    """Value and partial derivative by each argument, each with its own structural zeros."""
-    partials = []
-    for i, argument in enumerate(arguments):
+def _partials(
+    function: Callable, arguments: Sequence[Array], chosen: Sequence[int]
+) -> tuple[Vector, list[Vector]]:
+    """Value and partial derivatives by each chosen argument, with their structural zeros."""
+    value, partials = function(*arguments), []
+    for i in chosen:
 
         def along(x: Array, i: int = i) -> Vector:
             return function(*arguments[:i], x, *arguments[i + 1 :])
 
-        value, partial = jax.jvp(along, (argument,), (jnp.ones_like(argument),))
-        partials.append(partial)
-    return value, partials
+        partials.append(jax.jvp(along, (arguments[i],), (jnp.ones_like(arguments[i]),))[1])
+    shape = value[0].shape
+    return value, [tuple(jnp.broadcast_to(x, shape) for x in partial) for partial in partials]
 
 
 class _Front(NamedTuple):
@@ -234,8 +240,10 @@ def _with_column(front: _Front) -> _Front:
 
 def _pass_phase(
     phase: Phase,
-    constants: Constants,
-    d_constants: tuple[Array, ...],
+    known_constants: Constants,
+    constants_of: Callable[..., Constants],
+    parameters: LaneArray,
+    wanted: tuple[int, ...],
     front: _Front,
     duration: LaneArray,
     accelerations: LaneArray,
@@ -247,15 +255,20 @@ def _pass_phase(
     The columns are (correction, section, parameters, duration); the last is the phase's own.
     """
     dim, dtype = phase.dim, duration.dtype
-    n_columns = front.dq.shape[0]
-    n_parameters = d_constants[0].shape[0]
-    held = tuple(front.held)
+    n_columns, n_wanted = front.dq.shape[0], len(wanted)
 
-    def field(*moving: Array) -> Vector:
-        n_held = len(held)
-        point = Point(moving[2 * dim :], moving[:dim], moving[dim : 2 * dim])
-        assert len(point.held) == n_held
-        return phase.acceleration(constants, point)
+    unit = np.eye(n_columns, dtype=dtype)[:, :, None, None, None]
+    first, last, for_wanted = unit[0], unit[-1], unit[n_columns - 1 - n_wanted : -1]
+
+    def left_over(*arguments: Array) -> Vector:
+        """The residual by (q, v, acceleration, held, parameters)."""
+        q, v, a, rest = (
+            *(arguments[i * dim : (i + 1) * dim] for i in range(3)),
+            arguments[3 * dim :],
+        )
+        held, parameters = rest[: front.held.shape[0]], rest[front.held.shape[0] :]
+        constants = constants_of(*parameters) if n_wanted else known_constants
+        return phase.residual(constants, Point(held, q, v), a)
 
     def step(carry: tuple, inputs: tuple) -> tuple:
         q, v, dq, dv = carry
@@ -265,46 +278,48 @@ def _pass_phase(
         a_once, a_twice = _mix(ONCE, a), _mix(TWICE, a)
         Q = q + h * (c * v + h * a_twice)
         V = v + h * a_once
-        dQ = dq[:, None] + (h * c) * dv[:, None]
-        dV = jnp.broadcast_to(dv[:, None], dQ.shape)
-        dQ = dQ.at[-1].add(fraction * (c * v + 2.0 * h * a_twice))
-        dV = dV.at[-1].add(fraction * a_once)
+        dQ = dq[:, None] + (h * c) * dv[:, None] + last * (fraction * (c * v + 2.0 * h * a_twice))
+        dV = dv[:, None] + last * (fraction * a_once)
         Q, V, dQ, dV = hold((Q, V, dQ, dV))
 
-        moving = [Q[:, i] for i in range(dim)] + [V[:, i] for i in range(dim)]
-        moving += [jnp.broadcast_to(x, Q[:, 0].shape) for x in held]
-        value, partials = _partials(field, moving)
-        jacobian = jnp.stack([jnp.stack(p, 1) for p in partials], 2)  # (node, row, argument, lane)
-        value = jnp.stack(value, 1)
-        forced = ()
-        if n_parameters:
-            here = Point(held, tuple(moving[:dim]), tuple(moving[dim : 2 * dim]))
-            _, forced = _push(lambda *c: phase.acceleration(c, here), constants, d_constants)
-            forced = jnp.stack(forced, 2)
-        value, jacobian, forced = hold((value, jacobian, forced))
+        arguments = [x[:, i] for x in (Q, V, a) for i in range(dim)]
+        arguments += [jnp.broadcast_to(x, Q[:, 0].shape) for x in front.held]
+        n_moving = len(arguments)
+        if n_wanted:
+            arguments += list(parameters)
+        chosen = (*range(n_moving), *(n_moving + i for i in wanted))
+        # As separate arrays first: each is a small kernel; stacking them is a copy.
+        value, partials = hold(_partials(left_over, arguments, chosen))
+        value, jacobian, forced = hold(
+            (
+                jnp.stack(value, 1),
+                jnp.stack([jnp.stack(p, 1) for p in partials[:n_moving]], 2),
+                jnp.stack([jnp.stack(p, 1) for p in partials[n_moving:]]) if n_wanted else (),
+            )
+        )
 
         d_moving = jnp.concatenate([dQ, dV], 2)  # (column, node, argument, lane)
-        right = sum(
-            jacobian[:, :, s] * d_moving[:, :, s, None] for s in range(2 * dim)
-        )
-        for s in range(len(held)):
-            right += jacobian[:, :, 2 * dim + s] * front.d_held[:, s, None, None]
-        right = right.at[0].add(value - a)
-        if n_parameters:
-            right = right.at[n_columns - 1 - n_parameters : -1].add(forced)
+        terms = [jacobian[:, :, s] * d_moving[:, :, s, None] for s in range(2 * dim)]
+        terms += [
+            jacobian[:, :, 3 * dim + s] * front.d_held[:, s, None, None]
+            for s in range(front.held.shape[0])
+        ]
+        if n_wanted:
+            terms += [for_wanted[i] * forced[i] for i in range(n_wanted)]
+        right = sum(terms, start=first * value)
         twice, once = (m.astype(dtype)[:, None, :, None, None] for m in (TWICE, ONCE))
-        J_q, J_v = jacobian[:, :, None, :dim], jacobian[:, :, None, dim : 2 * dim]
-        identity = np.eye(N_NODES * dim, dtype=dtype).reshape(N_NODES, dim, N_NODES, dim, 1)
-        matrix = identity - h * (h * twice * J_q + once * J_v)
-        matrix, right = hold((matrix, jnp.moveaxis(right, 0, 2)))
+        by_q, by_v, by_a = (jacobian[:, :, None, i * dim : (i + 1) * dim] for i in range(3))
+        own_node = np.eye(N_NODES, dtype=dtype)[:, None, :, None, None]
+        matrix = own_node * by_a + h * (h * twice * by_q + once * by_v)
+        matrix, right = hold((matrix, -jnp.moveaxis(right, 0, 2)))
         da = hold(_eliminate(matrix, right, hold))  # (node, row, column, lane)
 
         by_column = jnp.moveaxis(da, 2, 0)
         sum_once, sum_twice = _weigh(ENDS_ONCE, a), _weigh(ENDS_TWICE, a)
         d_once = _weigh(ENDS_ONCE, da).swapaxes(0, 1)
         d_twice = _weigh(ENDS_TWICE, da).swapaxes(0, 1)
-        dq = (dq + h * dv + h * h * d_twice).at[-1].add(fraction * (v + 2.0 * h * sum_twice))
-        dv = (dv + h * d_once).at[-1].add(fraction * sum_once)
+        dq = dq + h * dv + h * h * d_twice + last[:, 0] * (fraction * (v + 2.0 * h * sum_twice))
+        dv = dv + h * d_once + last[:, 0] * (fraction * sum_once)
         q, v = q + h * v + h * h * sum_twice, v + h * sum_once
         return (q, v, dq, dv), by_column
 
@@ -327,7 +342,6 @@ def _leave_phase(
     Returns the next phase's front, the columns of the duration, and the function that eliminates
     the duration's column from other columns. A phase that does not happen has duration zero.
     """
-    n_held, dim = front.held.shape[0], phase.dim
     n_parameters = d_constants[0].shape[0]
 
     def end(held: Array, q: Array, v: Array, *constants: Array) -> tuple:
@@ -347,11 +361,10 @@ def _leave_phase(
         (front.held, front.q, front.v, *constants),
         (front.d_held, front.dq, front.dv, *padded),
     )
-    del n_held, dim
-    own = jnp.zeros_like(d_event).at[-1].set(1.0)
+    unit = np.eye(n_columns, dtype=duration.dtype)[:, :, None]
     event = jnp.where(happens, event, duration)
-    d_event = jnp.where(happens, d_event, own)
-    d_duration = -d_event[:-1].at[0].add(event) / d_event[-1]
+    d_event = jnp.where(happens, d_event, unit[-1])
+    d_duration = -(d_event[:-1] + unit[0, :-1] * event) / d_event[-1]
 
     def eliminate(columns: Array) -> Array:
         factor = d_duration.reshape(d_duration.shape[:1] + (1,) * (columns.ndim - 2) + (-1,))
@@ -390,8 +403,8 @@ def linearised_pass(
         jnp.concatenate([jnp.zeros((1 + size, *lanes), dtype), x]) for x in d_constants
     )
     section = solution.section
-    d_section = jnp.zeros((n_columns, size, *lanes), dtype)
-    d_section = d_section.at[1 + np.arange(size), np.arange(size)].set(1.0)
+    d_section = np.eye(n_columns, dtype=dtype)[:, 1 : 1 + size, None]
+    d_section = jnp.broadcast_to(d_section, (n_columns, size, *lanes))
 
     def start(section: Array, *constants: Array) -> tuple:
         point = sequence.start(constants, tuple(section))
@@ -408,7 +421,9 @@ def linearised_pass(
             front, columns = _pass_phase(
                 phase,
                 constants,
-                d_constants,
+                constants_of,
+                parameters,
+                wanted,
                 _with_column(front),
                 durations[i],
                 accelerations[i],
@@ -434,7 +449,8 @@ def linearised_pass(
 
     monodromy = jnp.swapaxes(d_back[1 : 1 + size], 0, 1)
     own = np.r_[0, 1 + size : n_columns]
-    right = d_back[own].at[0].add(back - section)
+    first = np.eye(1 + n_wanted, dtype=dtype)[0][:, None, None]
+    right = d_back[own] + first * (back - section)
     closing = inverse(np.eye(size, dtype=dtype)[:, :, None] - monodromy)
     d_closed = jnp.swapaxes(_contract(closing, jnp.swapaxes(right, 0, 1)), 0, 1)
 
@@ -510,9 +526,7 @@ def walk_through(
         times = times.reshape(-1, *(1,) * q.ndim)
         Q = q + T * (times * v + T * jnp.tensordot(places, a, 1))
         V = v + T * jnp.tensordot(rates, a, 1)
-        nodes = Point(
-            point.held, tuple(Q[:-1].swapaxes(0, 1)), tuple(V[:-1].swapaxes(0, 1))
-        )
+        nodes = Point(point.held, tuple(Q[:-1].swapaxes(0, 1)), tuple(V[:-1].swapaxes(0, 1)))
         end = Point(point.held, tuple(Q[-1]), tuple(V[-1]))
         passages.append(Passage(point, nodes, end))
         point = phase.reset(constants, end)

@@ -99,10 +99,19 @@ def _phases(n_legs: int) -> tuple[Phase, Phase]:
     """DLS and SLS-I, which every sequence shares."""
     symbols = functools.partial(_symbols, n_legs)
 
-    def dls_acceleration(constants: Constants, point: Point) -> Vector:
+    def dls_residual(constants: Constants, point: Point, acceleration: Vector) -> Vector:
         s = symbols(constants)
         distance, m = _double_support(s, point)
-        return (dynamics.double_support_acceleration(s, distance, m).ddtheta,)
+        circle = double_support_circle(s, distance, m.sin, m.cos)
+        M, *forces = dynamics.terms(s, m)
+        centripetal = m.dtheta * m.dtheta
+        along_circle = (
+            acceleration[0],
+            circle.G1 * acceleration[0] - circle.L1 * centripetal,
+            circle.G2 * acceleration[0] - circle.L2 * centripetal,
+        )
+        rows = [needed - force for needed, force in zip(M.times(along_circle), forces, strict=True)]
+        return (rows[0] + circle.G1 * rows[1] + circle.G2 * rows[2],)
 
     def rear_force(constants: Constants, point: Point) -> dynamics.FootForce:
         s = symbols(constants)
@@ -126,9 +135,9 @@ def _phases(n_legs: int) -> tuple[Phase, Phase]:
         fore = dynamics.fore_foot_force(s, m, acceleration, rear)
         return (rear.normal, s.L0 - m.L2, landing_foot_height(s, m), *_upright(s, m, fore))
 
-    def sls1_acceleration(constants: Constants, point: Point) -> Vector:
-        m = _single_support_1(point)
-        return tuple(dynamics.single_support_1_acceleration(symbols(constants), m))
+    def sls1_residual(constants: Constants, point: Point, acceleration: Vector) -> Vector:
+        M, *forces = dynamics.terms(symbols(constants), _single_support_1(point))
+        return tuple(n - f for n, f in zip(M.times(acceleration), forces, strict=True))
 
     def stopper_gap(constants: Constants, point: Point) -> Elementwise:
         s = symbols(constants)
@@ -146,8 +155,8 @@ def _phases(n_legs: int) -> tuple[Phase, Phase]:
         return (s.L0 - m.L2, landing_foot_height(s, m), *_upright(s, m, fore))
 
     return (
-        Phase("DLS", 1, dls_acceleration, lift_off, dls_reset, dls_guards),
-        Phase("SLS-I", 3, sls1_acceleration, stopper_gap, sls1_reset, sls1_guards),
+        Phase("DLS", 1, dls_residual, lift_off, dls_reset, dls_guards),
+        Phase("SLS-I", 3, sls1_residual, stopper_gap, sls1_reset, sls1_guards),
     )
 
 
@@ -155,10 +164,10 @@ def _last_phase(n_legs: int, to_section: bool) -> Phase:
     """SLS-II; its reset leads to the plane section after the impact, or to the one before it."""
     symbols = functools.partial(_symbols, n_legs)
 
-    def acceleration(constants: Constants, point: Point) -> Vector:
+    def residual(constants: Constants, point: Point, acceleration: Vector) -> Vector:
         s = symbols(constants)
-        found = dynamics.single_support_2_acceleration(s, _single_support_2(s, point))
-        return found.ddtheta, found.ddL1
+        M, *forces = dynamics.terms(s, _single_support_2(s, point))
+        return M.M11 * acceleration[0] - forces[0], M.M22 * acceleration[1] - forces[1]
 
     def touchdown(constants: Constants, point: Point) -> Elementwise:
         s = symbols(constants)
@@ -180,7 +189,7 @@ def _last_phase(n_legs: int, to_section: bool) -> Phase:
         fore = dynamics.fore_foot_force(s, m, found)
         return (landing_foot_height(s, m), *_upright(s, m, fore))
 
-    return Phase("SLS-II", 2, acceleration, touchdown, reset, guards)
+    return Phase("SLS-II", 2, residual, touchdown, reset, guards)
 
 
 @functools.cache
@@ -193,7 +202,9 @@ def held_landing(n_legs: int) -> PhaseSequence:
         distance = s.L0 * s.sin_alpha / rear_direction(s, sin, cos).cos
         return Point((distance,), section[:1], section[1:])
 
-    def border_checks(constants: Constants, passages: tuple[Passage, ...], happens: Array) -> Vector:
+    def border_checks(
+        constants: Constants, passages: tuple[Passage, ...], happens: Array
+    ) -> Vector:
         s = _symbols(n_legs, constants)
         dls, sls1, sls2 = passages
         distance, m = _double_support(s, dls.start)
@@ -216,7 +227,9 @@ def freed_landing(n_legs: int) -> PhaseSequence:
         m = landing.motion
         return Point((), (landing.theta, m.L1, m.L2), (m.dtheta, m.dL1, m.dL2))
 
-    def border_checks(constants: Constants, passages: tuple[Passage, ...], happens: Array) -> Vector:
+    def border_checks(
+        constants: Constants, passages: tuple[Passage, ...], happens: Array
+    ) -> Vector:
         s = _symbols(n_legs, constants)
         sls1, sls2 = passages
         (theta, _), (dtheta, dL1) = sls2.end.q, sls2.end.v
