@@ -121,7 +121,9 @@ def along(
     walks = states_along(params, name, values, x, n_steps, model=model, options=options)
     for value, walked in zip(values, walks, strict=True):
         state = walked.section_state.values[-1]
-        result = step(changed(params, name, value), state, model=model, options=options)
+        result = step(
+            changed(params, name, value), jnp.asarray(state), model=model, options=options
+        )
         row = {key: np.asarray(values) for key, values in step_measures(result).items()}
         if walked.outcome != Outcome.STEPPED.name:
             row["outcome"] = np.asarray(int(Outcome[walked.outcome]))

@@ -48,7 +48,7 @@ def settle_at_table_1() -> xr.Dataset:
 
 def gait_at_table_1(n_steps: int = 3) -> xr.Dataset:
     """Trajectory of the gait of Table 1 at slope 0.30: figures 6 and 7."""
-    state = settle_at_table_1().section_state.values[-1]
+    state = jnp.asarray(settle_at_table_1().section_state.values[-1])
     return simulate(WheelParams(), state, n_steps, model=wheel())
 
 
@@ -57,7 +57,7 @@ def gaits_at(dampings: Sequence[float]) -> list[xr.Dataset]:
 
     Walked to from Table 1 in steps of at most 10 N s/m.
     """
-    start = settle_at_table_1().section_state.values[-1]
+    start = jnp.asarray(settle_at_table_1().section_state.values[-1])
     table_1, gaits = WheelParams(), []
     for damping in dampings:
         begin = float(table_1.damping)
@@ -66,7 +66,7 @@ def gaits_at(dampings: Sequence[float]) -> list[xr.Dataset]:
         *_, walked = states_along(table_1, "damping", path, start, N_STEPS, model=wheel())
         if not walked.settled:
             raise ValueError(f"No period-1 gait was met at damping {damping:g}: choose 1 to 219.")
-        state = walked.section_state.values[-1]
+        state = jnp.asarray(walked.section_state.values[-1])
         gaits.append(simulate(changed(table_1, "damping", damping), state, 1, model=wheel()))
     return gaits
 
@@ -74,7 +74,7 @@ def gaits_at(dampings: Sequence[float]) -> list[xr.Dataset]:
 def gaits_along_damping(progress: Callable[[float], None] | None = None) -> xr.Dataset:
     """The gaits at every whole c from 1 to 219, and the walks up to 224: figure 10."""
     params, model = WheelParams(), wheel()
-    start = settle_at_table_1().section_state.values[-1]
+    start = jnp.asarray(settle_at_table_1().section_state.values[-1])
     down = along(
         params, "damping", range(200, 0, -1), start, N_STEPS, model=model, progress=progress
     )
@@ -94,11 +94,11 @@ def collect(progress: Progress = silent) -> Evidence:
     branch = gaits_along_damping(lambda share: progress(0.1 + 0.5 * share, what))
 
     progress(0.65, "gaits at slope 0.10")
-    start = branch.section_state.sel(damping=100.0).values
+    start = jnp.asarray(branch.section_state.sel(damping=100.0).values)
     slopes = [0.01 * i for i in range(30, 9, -1)]
     medium, flat = changed(table_1, "damping", 100.0), changed(table_1, "slope", 0.10)
     gentler = along(medium, "slope", slopes, start, N_STEPS, model=model)
-    start = gentler.section_state.sel(slope=0.10, method="nearest").values
+    start = jnp.asarray(gentler.section_state.sel(slope=0.10, method="nearest").values)
     gentle = along(flat, "damping", range(100, 221, 10), start, N_STEPS, model=model)
     falling = [*range(100, 0, -10), 5, 4]
     gentle_low = along(flat, "damping", falling, start, N_STEPS, model=model)
