@@ -1,6 +1,7 @@
 """Differentiable, batched simulation of the passive viscoelastic-legged rimless wheel."""
 
 from vrw_jax.cycle_options import CycleOptions
+from vrw_jax.designs import grid, samples, sobol, uniform
 from vrw_jax.limit_cycle import LimitCycle, limit_cycle
 from vrw_jax.models import (
     AbstractWheel,
@@ -15,6 +16,8 @@ from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
 from vrw_jax.params import WheelParams
 from vrw_jax.return_map import Walk, paper_start, return_map, step, walk
+from vrw_jax.scan import scan
+from vrw_jax.scan_store import open_scan
 from vrw_jax.simulate import simulate
 
 __all__ = [
@@ -31,10 +34,16 @@ __all__ = [
     "ViscoelasticWheel",
     "Walk",
     "WheelParams",
+    "grid",
     "limit_cycle",
+    "open_scan",
     "paper_start",
     "return_map",
+    "samples",
+    "scan",
     "simulate",
+    "sobol",
     "step",
+    "uniform",
     "walk",
 ]

@@ -348,6 +348,8 @@ def _tell_scan(store: Path, folder: Path, picture: bool) -> None:
 
 
 def _tell_gait(settings: "Config", params: "WheelParams", n_steps: int) -> None:
+    import numpy as np
+
     import vrw_jax as vrw
     from vrw_jax.limit_cycle import limit_cycle
 
@@ -366,7 +368,7 @@ def _tell_gait(settings: "Config", params: "WheelParams", n_steps: int) -> None:
         cycle = limit_cycle(params)
     _tell_wheel(params)
     if outcome == vrw.Outcome.STEPPED:
-        change = float(abs(result.section_state - state).max())
+        change = float(np.abs(np.asarray(result.section_state) - np.asarray(state)).max())
         out.print(f"Walked {walked} steps; the last changed the section state by {change:.1e}.")
         _tell_step(result)
     else:

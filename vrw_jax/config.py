@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
+import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax import designs
@@ -143,7 +144,7 @@ def _config(tables: Mapping[str, object], text: str, name: str) -> Config:
         name=name,
     )
     config.params()
-    config.numerical_options()
+    _sentence(config.numerical_options().require_reachable, np.dtype(float))
     return config
 
 
@@ -295,7 +296,7 @@ def _range(name: str, value: object) -> tuple[float, float]:
 
 def _in_domain(name: str, value: object) -> float:
     number, domain = _number(value, name), DOMAINS[name]
-    if not bool(domain.contains(np.float64(number))):  # type: ignore[arg-type]
+    if not bool(domain.contains(jnp.asarray(number))):
         raise ConfigError(
             f"{name} is {number:g}, but {domain.description} must lie in {domain}: "
             "give a value in that range."
@@ -336,9 +337,9 @@ def _shown(value: object) -> str:
     return repr(value).replace("'", '"') if isinstance(value, str) else repr(value)
 
 
-def _sentence(make: Callable[..., T], **values: object) -> T:
+def _sentence(make: Callable[..., T], *arguments: object, **values: object) -> T:
     """`make(**values)`, whose own complaints are sentences already."""
     try:
-        return make(**values)
+        return make(*arguments, **values)
     except ValueError as error:
         raise ConfigError(str(error)) from error

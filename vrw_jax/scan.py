@@ -24,7 +24,7 @@ from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
 from vrw_jax.params import PARAMETER_NAMES, WheelParams
 from vrw_jax.scan_engine import LANES, Engine
-from vrw_jax.scan_measures import DEFAULT_MEASURES, check_measures, variable_attrs
+from vrw_jax.scan_measures import ALWAYS, DEFAULT_MEASURES, check_measures, variable_attrs
 from vrw_jax.scan_store import (
     MANIFEST,
     PROVENANCE,
@@ -304,7 +304,7 @@ def _layout(
         dims=design.dims,
         shape=design.shape,
         chunk=chunk_shape(design.shape, chunk),
-        variables=tuple(variable(name) for name in ("outcome", *measures, *MARGINS)),
+        variables=tuple(variable(name) for name in (*measures, *ALWAYS)),
         coordinates=coordinates,
     )
 
@@ -347,7 +347,7 @@ def explained(planned: Plan, store: str | Path | None = None) -> dict[str, str]:
     return {
         "samples": f"{size:,} ({axes})",
         "measures": ", ".join(planned.measures),
-        "always included": ", ".join(("outcome", *MARGINS)),
+        "always included": ", ".join(ALWAYS),
         "chunks": f"{layout.n_chunks:,} of up to {chunk:,} samples, {len(missing):,} to compute",
         "result": f"{_bytes(size * layout.bytes_per_sample)} before compression",
         "memory": f"about {_bytes(MEMORY + chunk * 2 * layout.bytes_per_sample)}, "

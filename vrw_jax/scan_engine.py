@@ -95,7 +95,8 @@ class Engine:
 
         def told_by_cycle(values: Array) -> Told:
             cycle, derivatives = gait(values)
-            kept = {name: CYCLE_MEASURES[name](cycle) for name in plain if name in OF_CYCLE}
+            names = (*(name for name in plain if name in OF_CYCLE), "spectral_radius")
+            kept = {name: CYCLE_MEASURES[name](cycle) for name in names}
             return cycle.outcome, cycle.section_state, kept | derivatives
 
         def told_by_step(values: Array, state: Array, options: Options) -> Told:

@@ -8,8 +8,8 @@ from vrw_jax.measures import CYCLE, MARGINS, MEASURES, STEP, attrs_of
 from vrw_jax.params import PARAMETER_NAMES
 from vrw_jax.wording import nearest
 
-ALWAYS = ("outcome", *MARGINS)
-"""In every scan, asked for or not."""
+ALWAYS = ("outcome", "spectral_radius", *MARGINS)
+"""In every scan, asked for or not: is there a cycle, is it stable, what does it break."""
 
 OF_CYCLE = (
     "dls_fraction",
@@ -44,7 +44,6 @@ DEFAULT_MEASURES = (
     "lambda_I4",
     "lambda_2_plus",
     "lambda_4_plus",
-    "spectral_radius",
 )
 
 _DERIVATIVE = re.compile(r"d[ _](\w+?)(?: */ *d |_d_)(\w+)")

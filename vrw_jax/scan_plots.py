@@ -1,6 +1,7 @@
 """Pictures of scans: DLS fraction, speed and outcome over two parameters, with premise borders."""
 
 from collections.abc import Mapping, Sequence
+from typing import Literal
 
 import numpy as np
 import xarray as xr
@@ -33,7 +34,9 @@ SYMBOLS = {
     "speed": "v",
 }
 
-BORDERS: dict[str, tuple[str, str, str]] = {
+Dash = Literal["-", "--", "-.", ":"]
+
+BORDERS: dict[str, tuple[str, str, Dash]] = {
     "fore_foot_force": ("fore foot pushes", "#000000", "-"),
     "clearance_sls1": ("swing foot clear", "#D55E00", "-"),
     "clearance_sls2": ("swing foot clear in SLS-II", "#D55E00", ":"),
@@ -47,7 +50,7 @@ BORDERS: dict[str, tuple[str, str, str]] = {
 """Premises whose borders are drawn: what holds on one side, colour and line."""
 
 OUTCOMES: dict[Outcome, tuple[str, str]] = {
-    Outcome.STEPPED: ("limit cycle", "#0072B2"),
+    Outcome.STEPPED: ("stable limit cycle", "#0072B2"),
     Outcome.TOUCHDOWN_BEFORE_STOPPER: ("touchdown before stopper", "#E69F00"),
     Outcome.STOPPER_IN_DOUBLE_SUPPORT: ("stopper in DLS", "#009E73"),
     Outcome.FELL_BACK: ("fell back", "#56B4E9"),
@@ -159,7 +162,7 @@ def sample_figure(scan: xr.Dataset, names: Sequence[str]) -> Figure:
             panels[-1].scatter(scan[x].values[there], scan[y].values[there], color=color, **dot)
         for axes in panels:
             axes.set_xlabel(_short_label(x))
-        panels[0].set_ylabel(_short_label(y) if y != "sample" else "sample")
+        panels[0].set_ylabel("sample" if y == "sample" else _short_label(y))
         _legend(figure, codes, {}, 3)
     return figure
 
@@ -176,8 +179,8 @@ def curve_figure(scan: xr.Dataset, x: str) -> Figure:
         for axes, name in zip(panels, rows, strict=True):
             axes.plot(scan[x].values, scan[name].values, marker=".", color="#0072B2")
             axes.set_ylabel(_bar_label(name) if name in SYMBOLS else name)
-            for left, right in zip(edges[:-1][failed], edges[1:][failed], strict=True):
-                axes.axvspan(left, right, color=MISSING, linewidth=0.0, zorder=0)
+            for cell in np.flatnonzero(failed):
+                axes.axvspan(edges[cell], edges[cell + 1], color=MISSING, linewidth=0.0, zorder=0)
         panels[-1].set_xlabel(axis_label(x))
     return figure
 

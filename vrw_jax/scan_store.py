@@ -12,7 +12,7 @@ import os
 import shutil
 import tempfile
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -242,7 +242,9 @@ def _umask() -> int:
 
 
 def _fill(path: Path, layout: Layout, attrs: Mapping[str, object]) -> None:
-    group = zarr.create_group(path, zarr_format=3, attributes=dict(attrs))
+    # The attribute tells xarray which arrays are coordinates; it takes it off again when it opens.
+    told = {**attrs, "coordinates": " ".join(layout.coordinates)}
+    group = zarr.create_group(path, zarr_format=3, attributes=told)
     compressors = [ZstdCodec(level=3), Crc32cCodec()]  # a damaged file is noticed when read
     for name, (dim, values, coordinate_attrs) in layout.coordinates.items():
         array = group.create_array(
@@ -275,8 +277,3 @@ def _fill(path: Path, layout: Layout, attrs: Mapping[str, object]) -> None:
         dimension_names=("chunk",),
         attributes={"description": "1 where a chunk's results are complete."},
     )
-
-
-def regions(layout: Layout) -> Iterator[Region]:
-    """All chunks in order."""
-    return (layout.region(index) for index in range(layout.n_chunks))
