@@ -141,7 +141,7 @@ def test_the_trajectory_passes_through_the_section_states_of_the_return_map(
 
 
 def test_a_failing_step_ends_the_trajectory_with_its_outcome() -> None:
-    fall = vrw.simulate(vrw.WheelParams(), jnp.array([0.1, 2.0, -0.1]), 5)
+    fall = vrw.simulate(vrw.WheelParams(), jnp.array([0.1, 2.0, -0.1]), 5, n_samples=N_SAMPLES)
     assert fall.attrs["outcome"] == vrw.Outcome.TOUCHDOWN_BEFORE_STOPPER.name
     assert fall.attrs["outcome_meaning"] == vrw.Outcome.TOUCHDOWN_BEFORE_STOPPER.meaning
     assert fall.attrs["n_steps"] == 0
@@ -150,7 +150,7 @@ def test_a_failing_step_ends_the_trajectory_with_its_outcome() -> None:
 
 
 def test_bad_input_gives_an_empty_trajectory_that_says_so() -> None:
-    empty = vrw.simulate(vrw.WheelParams(), jnp.array([0.1, jnp.nan, -0.1]), 5)
+    empty = vrw.simulate(vrw.WheelParams(), jnp.array([0.1, jnp.nan, -0.1]), 5, n_samples=N_SAMPLES)
     assert empty.attrs["outcome"] == vrw.Outcome.BAD_INPUT.name
     assert empty.sizes["time"] == 0
 
