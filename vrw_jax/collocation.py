@@ -531,3 +531,24 @@ def walk_through(
         passages.append(Passage(point, nodes, end))
         point = phase.reset(constants, end)
     return point.q, tuple(passages)
+
+
+def transfer_matrix(source: Mesh, target: Mesh) -> np.ndarray:
+    """From accelerations at the nodes of one mesh to those of another, (target, source) nodes.
+
+    Exact where the accelerations are cubic in each step of the source.
+    """
+
+    def ends(mesh: Mesh) -> np.ndarray:
+        return np.concatenate([[0.0], np.cumsum(mesh.fractions)])
+
+    borders = ends(source)
+    times = (ends(target)[:-1, None] + target.fractions[:, None] * NODES).ravel()
+    matrix = np.zeros((times.size, source.n_steps * N_NODES))
+    for row, time in enumerate(times):
+        step = int(np.clip(np.searchsorted(borders, time) - 1, 0, source.n_steps - 1))
+        place = (time - borders[step]) / source.fractions[step]
+        for node in range(N_NODES):
+            others = np.delete(NODES, node)
+            matrix[row, step * N_NODES + node] = np.prod((place - others) / (NODES[node] - others))
+    return matrix

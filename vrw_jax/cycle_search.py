@@ -11,11 +11,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from vrw_jax import sequences, stored_gaits
+from vrw_jax import gait_surface, sequences
 from vrw_jax.collocation import (
     N_NODES,
     LaneArray,
@@ -96,32 +95,19 @@ def wheel_of(parameters: Array, n_legs: int) -> WheelParams:
     return WheelParams(**dict(zip(PARAMETER_NAMES, parameters, strict=True)), n_legs=n_legs)
 
 
-def stored_start(problem: Problem, parameters: Parameters, rank: Array, with_dls: Array) -> Located:
-    """The stored gait that is `rank`-th in nearness, scaled to this wheel's length and gravity."""
-    table = stored_gaits.TABLE.astype(parameters.dtype)
-    here = stored_gaits.coordinates(wheel_of(parameters, problem.n_legs))
-    n_places = len(here)
-    places, gaits = table[:, :n_places], table[:, n_places:]
-    distance = sum(
-        jnp.square((x - place[:, None]) / scale)
-        for x, place, scale in zip(here, places.T, stored_gaits.SPREAD, strict=True)
-    )
-    order = jnp.argsort(distance, axis=0)
-    nearest = jnp.take_along_axis(order, jnp.broadcast_to(rank, order[:1].shape), 0)[0]
-    gait = jnp.asarray(gaits)[nearest].T
-    L0, g = (parameters[PARAMETER_NAMES.index(n)] for n in ("locked_length", "gravity"))
-    pace = jnp.sqrt(L0 / g)
-    section = jnp.stack([gait[0], gait[1] / pace])
-    durations = gait[2:] * pace
-    whole = durations[0] + durations[1]
+def surface_start(problem: Problem, parameters: Parameters, with_dls: Array) -> Located:
+    """The gait that the stored surface predicts; without DLS its duration goes to SLS-I."""
+    predicted = gait_surface.start(wheel_of(parameters, problem.n_legs), problem.meshes)
+    first, second, third = predicted.durations[0]
     durations = jnp.stack(
-        [
-            jnp.where(with_dls, durations[0], 0.0),
-            jnp.where(with_dls, durations[1], whole),
-            durations[2],
-        ]
+        [jnp.where(with_dls, first, 0.0), jnp.where(with_dls, second, first + second), third]
     )
-    return start_from(problem, section, durations, with_dls)
+    start = start_from(problem, predicted.section, durations, with_dls)
+    accelerations = tuple(
+        jnp.broadcast_to(jnp.where(with_dls, a, 0.0), like.shape)
+        for a, like in zip(predicted.accelerations, start.solution.accelerations, strict=True)
+    )
+    return start._replace(solution=start.solution._replace(accelerations=accelerations))
 
 
 def start_from(problem: Problem, section: Array, durations: Array, with_dls: Array) -> Located:
@@ -239,9 +225,7 @@ def newton(
     return Finding(located, last.monodromy, last.residual, last.passes)
 
 
-def signs_hold(
-    problem: Problem, parameters: Parameters, located: Located
-) -> Bool[Array, " lanes"]:
+def signs_hold(problem: Problem, parameters: Parameters, located: Located) -> Bool[Array, " lanes"]:
     """Whether durations, guards at all nodes and the checks at all borders are positive."""
     sequence = problem.sequence
     constants = problem.constants_of(*parameters)
@@ -255,9 +239,14 @@ def signs_hold(
             sequence, problem.meshes, constants, tuple(section), durations, accelerations
         )
         for i, (phase, passage) in enumerate(zip(sequence.phases, passages, strict=True)):
-            guards = phase.guards(constants, passage.nodes)
-            inside = functools.reduce(jnp.logical_and, [jnp.all(g > 0.0, 0) for g in guards])
-            good &= (inside & (durations[i] > 0.0)) | ~happens[i]
+            inside = durations[i] > 0.0
+            for guard in phase.guards(constants, passage.nodes):
+                inside &= jnp.all(guard > 0.0, 0)
+            for guard in phase.guards(constants, passage.start):
+                inside &= guard > 0.0
+            for guard in phase.guards(constants, passage.end):
+                inside &= guard > -ZERO_AT_EVENT
+            good &= inside | ~happens[i]
         for check in sequence.border_checks(constants, passages, happens):
             good &= check > 0.0
         return (jnp.stack(following), good), None
@@ -269,31 +258,27 @@ def signs_hold(
 
 
 def search(problem: Problem, parameters: Parameters, guess: Located | None) -> Finding:
-    """A limit cycle for each lane, from a guess or from stored gaits, several attempts in turn.
+    """A limit cycle for each lane, by several attempts in turn.
 
-    Parameters must be usable. The first attempt takes the guess or the nearest stored gait, the
-    following ones other gaits, then a homotopy from the nearest one, then cycles without DLS.
+    Parameters must be usable. After the guess, if any, come the gait that the stored surface
+    predicts, a homotopy from Table 1, and a cycle without double support.
     """
     options = problem.options
     n_lanes = parameters.shape[-1]
     block = min(options.block, n_lanes)
-    gait_parameters = stored_gaits.parameters_of_table(parameters.dtype)
+    table_1 = parameters_of(WheelParams(n_legs=problem.n_legs)).astype(parameters.dtype)
 
     def start_of(attempt: Array, parameters: Parameters) -> tuple[Located, Array, Array]:
-        is_homotopy = attempt == options.attempts - 2
-        without_dls = (attempt == options.attempts - 1) & (options.attempts > 1)
-        rank = jnp.where(is_homotopy | without_dls, 0, attempt)
-        rank = jnp.minimum(rank, len(stored_gaits.TABLE) - 1)
-        lanes = parameters.shape[-1:]
-        with_dls = jnp.broadcast_to(~without_dls, lanes)
-        start = stored_start(problem, parameters, rank, with_dls)
-        # A homotopy leaves from the gait's own wheel, which Table 1 scales.
-        origin = jnp.broadcast_to(gait_parameters[:, None], parameters.shape)
-        home = stored_start(problem, origin, jnp.zeros_like(rank), with_dls)
-        start = jax.tree.map(lambda a, b: jnp.where(is_homotopy, a, b), home, start)
-        return start, origin, jnp.where(is_homotopy, HOMOTOPY_STAGES, 0)
+        origin = jnp.broadcast_to(table_1[:, None], parameters.shape)
+        is_homotopy = attempt == HOMOTOPY
+        place = jnp.where(is_homotopy, origin, parameters)
+        with_dls = jnp.broadcast_to(attempt != WITHOUT_DLS, parameters.shape[-1:])
+        stages = jnp.where(is_homotopy, options.stages, 0)
+        return surface_start(problem, place, with_dls), origin, stages
 
-    def attempt_block(attempt: Array, parameters: Parameters, now: Finding, guess: object) -> Finding:
+    def attempt_block(
+        attempt: Array, parameters: Parameters, now: Finding, guess: object
+    ) -> Finding:
         start, origin, stages = start_of(attempt, parameters)
         if guess is not None:
             start = jax.tree.map(lambda g, s: jnp.where(attempt < 0, g, s), guess, start)
@@ -330,10 +315,13 @@ def search(problem: Problem, parameters: Parameters, guess: Located | None) -> F
         jnp.full((n_lanes,), jnp.inf, parameters.dtype),
         jnp.zeros((n_lanes,), jnp.int32),
     )
-    more = lambda c: (c[0] < options.attempts) & jnp.any(c[1].located.found < 0.5)
+    more = lambda c: (c[0] <= WITHOUT_DLS) & jnp.any(c[1].located.found < 0.5)
     _, finding = lax.while_loop(more, lambda c: (c[0] + 1, attempt_all(*c)), (first, nothing))
     return finding
 
 
-HOMOTOPY_STAGES = np.int32(12)
-"""Newton iterations in which a homotopy's parameters move."""
+ZERO_AT_EVENT = 1e-6
+"""How far below zero a guard may be at the end of the phase that it ends, N, m or rad/s."""
+
+HOMOTOPY, WITHOUT_DLS = 1, 2
+"""Numbers of the attempts after the first, which trusts the surface."""
