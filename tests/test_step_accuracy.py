@@ -1,31 +1,19 @@
 """One step against a truth of 27 digits, made from two other formulations in another library."""
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import truth
+from batched import full_steps, jacobians, lean_steps
+
 import vrw_jax as vrw
 
 STARTS = truth.table("step", "start")
 
 
-def told(vector, x, options):
-    """State and durations, and the solver's steps."""
-    result = vrw.ViscoelasticWheel().advance(truth.wheel(vector), x, options)
-    return jnp.concatenate([result.section_state, result.durations]), result.solver_steps
+def values(options):
+    """States and durations of all cases."""
+    return lean_steps(truth.PARAMETERS, STARTS, options)[0]
 
-
-values_and_steps = jax.jit(jax.vmap(told, (0, 0, None)))
-values = lambda *arguments: values_and_steps(*arguments)[0]
-_jacobian = jax.jacfwd(lambda *arguments: told(*arguments)[0], argnums=(0, 1))
-jacobians = jax.jit(jax.vmap(_jacobian, (0, 0, None)))
-full_steps = eqx.filter_jit(
-    lambda vectors, x, options: jax.vmap(
-        lambda v, x: vrw.ViscoelasticWheel().step(truth.wheel(v), x, options)
-    )(vectors, x)
-)
 
 VALUES = np.concatenate([truth.table("step", "section_state"), truth.table("step", "durations")], 1)
 BY_PARAMETER = np.concatenate(
@@ -41,15 +29,19 @@ BY_START = np.concatenate(
 
 
 @pytest.mark.parametrize(
-    ("options", "claimed"), [(vrw.Options(), 1e-9), (vrw.Options.tight(), 1e-12)], ids=str
+    ("options", "claimed"),
+    [(vrw.Options(), 1e-9), (vrw.Options.tight(), 1e-12)],
+    ids=["default", "tight"],
 )
 def test_state_and_durations_are_right_to_the_claimed_error(options, claimed):
-    found = values(truth.PARAMETERS, STARTS, options)
+    found = values(options)
     assert truth.scaled_error(found, VALUES) < claimed
 
 
 @pytest.mark.parametrize(
-    ("options", "claimed"), [(vrw.Options(), 1e-9), (vrw.Options.tight(), 1e-12)], ids=str
+    ("options", "claimed"),
+    [(vrw.Options(), 1e-9), (vrw.Options.tight(), 1e-12)],
+    ids=["default", "tight"],
 )
 def test_first_derivatives_are_right_to_the_claimed_error(options, claimed):
     by_parameter, by_start = jacobians(truth.PARAMETERS, STARTS, options)
@@ -61,7 +53,7 @@ def test_derivative_error_is_at_most_ten_times_the_value_error():
     # At tolerances where rounding (1e-13 in derivatives) plays no part.
     for tolerance in (1e-8, 1e-10):
         options = vrw.Options(rtol=tolerance, atol=tolerance)
-        of_values = truth.scaled_error(values(truth.PARAMETERS, STARTS, options), VALUES)
+        of_values = truth.scaled_error(values(options), VALUES)
         by_parameter, by_start = jacobians(truth.PARAMETERS, STARTS, options)
         of_derivatives = max(
             truth.scaled_error(by_parameter, BY_PARAMETER), truth.scaled_error(by_start, BY_START)
@@ -87,7 +79,7 @@ def test_indicators_impact_and_step_length_are_right():
 def test_any_solver_may_be_named_and_agrees(solver):
     # Kvaerno5's implicit stages stop at their own tolerance: ten times the explicit bound.
     options = vrw.Options(solver=solver, rtol=1e-9, atol=1e-9)
-    found = values(truth.PARAMETERS, STARTS, options)
+    found = values(options)
     assert truth.scaled_error(found, VALUES) < 1e-7
 
 
@@ -104,7 +96,7 @@ def test_work_falls_with_the_order_of_the_solver(solver, order):
         options = vrw.Options(
             solver=solver, rtol=tolerance, atol=tolerance, derivative_tightening=1.0
         )
-        found, tried = map(np.asarray, values_and_steps(truth.PARAMETERS, STARTS, options))
+        found, tried = map(np.asarray, lean_steps(truth.PARAMETERS, STARTS, options))
         steps.append(np.mean(tried))
         errors.append(np.sqrt(np.mean((found - VALUES) ** 2)))
         by_start = np.asarray(jacobians(truth.PARAMETERS, STARTS, options)[1])

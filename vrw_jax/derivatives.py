@@ -7,6 +7,7 @@ Jacobian itself is wrapped again, so that Hessians work in every combination of 
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, PyTree
 
-from vrw_jax.lanes import in_blocks, one_wheel
+from vrw_jax.lanes import LaneFunction, in_blocks, one_wheel
 
 Forward = Callable[..., tuple[PyTree[Array], PyTree[Array]]]
 """Maps float arrays to (float outputs, other outputs that carry no derivative)."""
@@ -48,11 +49,11 @@ def any_mode(function: Forward, to_differentiate: Forward | None = None) -> Forw
 def _jacobian(function: Forward, moved: tuple[int, ...]) -> Forward:
     """Float outputs (Jacobian by moved argument, value) of `function`, in one evaluation."""
 
-    def both(*arrays: Array) -> tuple[PyTree, PyTree]:
+    def both(*arrays: Any) -> tuple[PyTree, PyTree]:
         out, other = function(*arrays)
         return out, (out, other)
 
-    def jacobian(*arrays: Array) -> tuple[PyTree, PyTree]:
+    def jacobian(*arrays: Any) -> tuple[PyTree, PyTree]:
         parts, (out, other) = jax.jacfwd(both, argnums=moved, has_aux=True)(*arrays)
         by_argument = tuple(
             jax.tree.map(lambda _, part, k=k: part[k], out, parts) for k in range(len(moved))
@@ -74,7 +75,7 @@ def _no_tangent(tree: PyTree) -> PyTree:
     return jax.tree.map(lambda x: np.zeros(jnp.shape(x), jax.dtypes.float0), tree)
 
 
-def on_branch(function: Forward, tangent_space: Callable, block: int) -> Callable:
+def on_branch(function: LaneFunction, tangent_space: Callable, block: int) -> Callable:
     """`function(p, z)` of one wheel, differentiable along z = z(p) to any order and in any mode.
 
     `function(p, z)` and `tangent_space(p, z)` are over lanes; the latter is dz/dp with a leading
@@ -95,7 +96,7 @@ def on_branch(function: Forward, tangent_space: Callable, block: int) -> Callabl
     return wrapped
 
 
-def total_derivative(function: Forward, tangent_space: Callable) -> Callable:
+def total_derivative(function: LaneFunction, tangent_space: Callable) -> Callable:
     """d function(p, z(p)) / dp over lanes, with a leading axis over p."""
 
     def derivative(p: Array, z: PyTree) -> PyTree:

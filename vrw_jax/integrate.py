@@ -354,16 +354,20 @@ def _select(condition: Any, yes: Any, no: Any) -> Any:
 def _dips(
     here: _Step, values: Array, rates: Array, length: Scalar, n_guards: int
 ) -> tuple[Array, Array]:
-    """Places in (0, 1) where a guard's cubic dips to zero between falling and rising, and whether.
+    """Places in (0, 1) where a guard that falls and rises again is lowest, and whether to look.
 
-    The step is then taken again up to the dip: either the guard has crossed there, or the march
-    goes on from its lowest point.
+    Where the lowest point of the cubic through values and rates is near or below zero, compared
+    with the guard's change over the step (the cubic's own error is a small part of that), the step
+    is taken again up to that point: either the guard has crossed there, or the march goes on from
+    its lowest point. A point no lower than the step's start by 1 % of what is left is not new.
     """
     v0, r0, v1, r1 = lax.stop_gradient((here.values, here.rates, values, rates))
     v0, r0, v1, r1 = v0[:n_guards], r0[:n_guards], v1[:n_guards], r1[:n_guards]
     length = lax.stop_gradient(length)
     places, lows = _cubic_minimum(v0, r0 * length, v1, r1 * length)
-    return places, (r0 < 0.0) & (r1 >= 0.0) & (lows <= 0.0)
+    near = lows <= 0.25 * (jnp.maximum(v0, v1) - lows)
+    new = (v0 - lows > 0.01 * lows) & (here.time + places * length > here.time)
+    return places, (r0 < 0.0) & (r1 >= 0.0) & near & new
 
 
 def _first_guess(
@@ -525,10 +529,7 @@ def sample_phase(
     interval = duration / (n_samples - 1)
 
     def to_next(state: State, _sample: None) -> tuple[State, State]:
-        solver_state, length, controller_state = stepper.start(state, options)
-        following = _march(
-            stepper, state, solver_state, length, controller_state, interval, options
-        )
+        following = _march(stepper, state, interval, options)
         return following, following
 
     _, states = lax.scan(to_next, start, None, length=n_samples - 1)

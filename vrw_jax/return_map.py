@@ -4,9 +4,12 @@ These are the edges where code is compiled: everything below is pure and single-
 under `jit`, `vmap` and every mode of differentiation.
 """
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Int
 
@@ -15,6 +18,9 @@ from vrw_jax.models.base import Advance, SectionState
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
 from vrw_jax.params import WheelParams, as_float_array
+
+SectionLike = Array | np.ndarray | Sequence[float]
+"""A section state as given by a caller; `checked` makes it an array of shape (3,)."""
 
 
 def paper_start() -> SectionState:
@@ -72,7 +78,7 @@ def _advance(
 
 def step(
     params: WheelParams,
-    x: SectionState,
+    x: SectionLike,
     *,
     model: AbstractWheel | None = None,
     options: Options | None = None,
@@ -83,13 +89,13 @@ def step(
     its `outcome`; nothing is raised for a wheel that falls. Errors: below 1e-9 at the default
     options and 1e-12 at `Options.tight()`, for values and first derivatives.
     """
-    params, x, model, options = checked(params, x, model, options)
-    return _step(model, params, x, options)
+    params, state, model, options = checked(params, x, model, options)
+    return _step(model, params, state, options)
 
 
 def return_map(
     params: WheelParams,
-    x: SectionState,
+    x: SectionLike,
     *,
     model: AbstractWheel | None = None,
     options: Options | None = None,
@@ -98,8 +104,8 @@ def return_map(
 
     The lean path: no monitors are computed. Differentiable forwards and in reverse, to any order.
     """
-    params, x, model, options = checked(params, x, model, options)
-    return _advance(model, params, x, options).section_state
+    params, state, model, options = checked(params, x, model, options)
+    return _advance(model, params, state, options).section_state
 
 
 class Walk(eqx.Module):
@@ -143,7 +149,7 @@ def _walk(
 
 def walk(
     params: WheelParams,
-    x: SectionState,
+    x: SectionLike,
     n_steps: int,
     *,
     model: AbstractWheel | None = None,
@@ -152,5 +158,5 @@ def walk(
     """`n_steps` steps, or as many as it can; the steps after a failure repeat its outcome."""
     if not n_steps >= 1:
         raise ValueError(f"n_steps is {n_steps}, but a walk needs at least one step.")
-    params, x, model, options = checked(params, x, model, options)
-    return _walk(model, params, x, options, n_steps)
+    params, state, model, options = checked(params, x, model, options)
+    return _walk(model, params, state, options, n_steps)

@@ -183,13 +183,13 @@ class _Roll(eqx.Module):
     s: Symbols
     rate: Scalar  # at theta = -alpha/2, rad/s
 
-    def rate_squared(self, theta: Scalar) -> Scalar:
+    def rate_squared(self, theta: Scalar | float) -> Scalar:
         """Square of dtheta at theta; negative where the wheel does not get."""
         s = self.s
         fallen = _cos_sum(s, -0.5 * s.alpha) - _cos_sum(s, theta)
         return self.rate**2 + 2.0 * _stiffness_of_gravity(s) * fallen
 
-    def time(self, theta: Scalar) -> Scalar:
+    def time(self, theta: Scalar | float) -> Scalar:
         """Time from theta = -alpha/2, s, by Carlson's R_F.
 
         With t = sin^2 of half the angle from the vertical the rate is a square root of a linear
@@ -211,7 +211,7 @@ class _Roll(eqx.Module):
         first = _cubic_time(from_vertical, jnp.where(apart, begin**2, 0.0), least, kappa)
         return direct + first
 
-    def motion(self, theta: Scalar) -> Motion:
+    def motion(self, theta: Scalar | float) -> Motion:
         """Posture and rates at theta."""
         zero = 0.0 * theta
         speed_squared = self.rate_squared(theta)
@@ -220,13 +220,13 @@ class _Roll(eqx.Module):
         length = self.s.L0 + zero
         return Motion.of(theta, length, length, rate, zero, zero)
 
-    def acceleration(self, theta: Scalar) -> dynamics.Acceleration:
+    def acceleration(self, theta: Scalar | float) -> dynamics.Acceleration:
         """Angular acceleration under gravity; the legs don't move."""
         zero = 0.0 * theta
         sin_p = jnp.sin(theta) * self.s.cos_phi + jnp.cos(theta) * self.s.sin_phi
         return dynamics.Acceleration(_stiffness_of_gravity(self.s) * sin_p, zero, zero)
 
-    def foot_force(self, theta: Scalar) -> dynamics.FootForce:
+    def foot_force(self, theta: Scalar | float) -> dynamics.FootForce:
         """Force of the ground on the standing foot, N."""
         return dynamics.fore_foot_force(self.s, self.motion(theta), self.acceleration(theta))
 

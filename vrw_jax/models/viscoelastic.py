@@ -59,7 +59,7 @@ FALLS = (Outcome.FELL_BACK, Outcome.COLLAPSED, Outcome.LEG_1_LIFTED_OFF)
 """Ways to leave the paper's sequence that every phase shares, in the order of `_falls`."""
 
 
-class _Builder(NamedTuple):
+class PhaseBuilder(NamedTuple):
     """What all phases share: which guards and monitors are watched."""
 
     s: Symbols
@@ -100,7 +100,7 @@ class _Builder(NamedTuple):
         return Watched(values, n_guards, counts)
 
 
-def double_support(build: _Builder, distance: Scalar) -> Phase:
+def double_support(build: PhaseBuilder, distance: Scalar) -> Phase:
     """DLS over y = (theta, dtheta); ends when lambda_4 falls through zero. Section 3.3.1."""
     s = build.s
 
@@ -129,7 +129,7 @@ def double_support(build: _Builder, distance: Scalar) -> Phase:
     )
 
 
-def single_support_1(build: _Builder) -> Phase:
+def single_support_1(build: PhaseBuilder) -> Phase:
     """SLS-I over y = (theta, L1, L2 and rates); ends when Leg 2 is at L0. Section 3.3.2."""
     s = build.s
 
@@ -157,7 +157,7 @@ def single_support_1(build: _Builder) -> Phase:
     )
 
 
-def single_support_2(build: _Builder) -> Phase:
+def single_support_2(build: PhaseBuilder) -> Phase:
     """SLS-II over y = (theta, L1 and rates); ends at touchdown. Section 3.3.3."""
     s = build.s
 
@@ -297,7 +297,7 @@ class ViscoelasticWheel(AbstractWheel):
         params, x = replaced_where_bad(good, params, x, jnp.asarray(PAPER_START))
         s = params.symbols()
         landing = transitions.land(s, *x)
-        build = _Builder(s, self.stop_at_lift_off, monitored)
+        build = PhaseBuilder(s, self.stop_at_lift_off, monitored)
         dls = double_support(build, landing.distance)
         sls1, sls2 = single_support_1(build), single_support_2(build)
         stepped = jnp.int32(Outcome.STEPPED)
