@@ -222,12 +222,12 @@ def test_an_unfinished_scan_is_not_gone_on_with_by_other_code(
     store = tmp_path / "s.zarr"
     with pytest.raises(KeyboardInterrupt):
         run(planned(), store, evaluate=Counted(2))
-    monkeypatch.setattr("vrw_jax.scan._code_digest", lambda: "other")
+    monkeypatch.setattr(sys.modules["vrw_jax.scan"], "code_digest", lambda: "other")
     with pytest.raises(ValueError, match="the library's code differs"):
         run(planned(), store, evaluate=arithmetic)
     monkeypatch.undo()
     run(planned(), store, evaluate=arithmetic)
-    monkeypatch.setattr("vrw_jax.scan._code_digest", lambda: "other")
+    monkeypatch.setattr(sys.modules["vrw_jax.scan"], "code_digest", lambda: "other")
     run(planned(), store, evaluate=Counted(1))  # finished: nothing is computed, all is there
 
 
@@ -395,7 +395,7 @@ def test_a_cycle_that_the_step_does_not_confirm_is_told_so(
     engine: Engine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     engine({"damping": np.array([200.0])})
-    monkeypatch.setattr("vrw_jax.scan_engine.AGREEMENT", 0.0)
+    monkeypatch.setattr(sys.modules["vrw_jax.scan_engine"], "AGREEMENT", 0.0)
     told = engine({"damping": np.array([200.0])})
     assert told["outcome"] == Outcome.NO_CYCLE_FOUND
     assert np.isnan(told["speed"])

@@ -6,7 +6,6 @@ written at once: a scan that was interrupted goes on with the chunks that are mi
 
 import contextlib
 import errno
-import hashlib
 import platform
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -39,6 +38,7 @@ from vrw_jax.scan_store import (
     stored_manifest,
 )
 from vrw_jax.simulate import provenance
+from vrw_jax.traces import code_digest
 
 CHUNK = 4096
 """Most samples of a chunk, unless asked for otherwise: what a killed scan can lose."""
@@ -96,7 +96,7 @@ class Plan:
         """Where the numbers come from: code, versions, device."""
         told = provenance(self.base, self.model, self.options)
         return {
-            "code": _code_digest(),
+            "code": code_digest(),
             "versions": told["versions"],
             "device": f"{jax.default_backend()}: {told['device']}, {platform.machine()}",
         }
@@ -323,16 +323,6 @@ def _fields(settings: object) -> dict[str, object]:
         else:
             told[name] = float(value)
     return told
-
-
-def _code_digest() -> str:
-    """A digest of the library's source: other code may give other digits."""
-    digest = hashlib.sha256()
-    folder = Path(__file__).parent
-    for path in sorted(folder.rglob("*.py")):
-        digest.update(path.relative_to(folder).as_posix().encode())
-        digest.update(path.read_bytes())
-    return digest.hexdigest()
 
 
 def explained(planned: Plan, store: str | Path | None = None) -> dict[str, str]:

@@ -21,6 +21,7 @@ from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
 from vrw_jax.params import PARAMETER_NAMES, WheelParams
 from vrw_jax.scan_measures import OF_CYCLE, derivative
+from vrw_jax.traces import compiled
 
 LANES = 512
 """Wheels that one call of the compiled function takes."""
@@ -105,8 +106,9 @@ class Engine:
             names = (*(name for name in plain if name not in OF_CYCLE), *MARGINS)
             return result.outcome, result.section_state, {name: measures[name] for name in names}
 
-        self._cycle = jax.jit(jax.vmap(told_by_cycle))
-        self._step = jax.jit(jax.vmap(told_by_step, in_axes=(0, 0, None)))
+        self._cycle: Callable = jax.vmap(told_by_cycle)
+        self._step: Callable = jax.vmap(told_by_step, in_axes=(0, 0, None))
+        self._settings = (measures, base.n_legs, model, cycle_options)
         self._compiled = False
 
     def __call__(self, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -142,8 +144,10 @@ class Engine:
     def _compile(self, values: Array) -> None:
         state = jnp.zeros((LANES, 3), values.dtype)
         with ThreadPoolExecutor(2) as pool:
-            cycle = pool.submit(lambda: self._cycle.lower(values).compile())
-            step = pool.submit(lambda: self._step.lower(values, state, self._options).compile())
+            cycle = pool.submit(compiled, self._cycle, (values,), ("cycle", *self._settings))
+            step = pool.submit(
+                compiled, self._step, (values, state, self._options), ("step", *self._settings)
+            )
             self._cycle, self._step = cycle.result(), step.result()
         self._compiled = True
 

@@ -133,8 +133,8 @@ def slice_figure(scan: xr.Dataset, x: str, y: str, across: str | None = None) ->
             axes.set_ylabel(_short_label(y))
         _legend(figure, codes, drawn, len(columns))
         if cut:
-            places = ", ".join(_value(n, scan[n].values[i]) for n, i in cut.items())
-            figure.suptitle(f"at {places}", fontsize=9.0)
+            where = ", ".join(_value(n, scan[n].values[i]) for n, i in cut.items())
+            figure.suptitle(f"at {where}", fontsize=9.0)
     return figure
 
 

@@ -1,0 +1,79 @@
+"""Traced functions kept on disk beside JAX's compiled code, which saves Python's share of a start.
+
+JAX's persistent cache spares the compiler but not the tracing, which for a limit cycle with
+derivatives takes longer than a scan of thousands. Where that cache is on, its folder also keeps
+traces, by a key of everything that they depend on, the library's source included.
+"""
+
+import functools
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+from jax import export
+
+
+@functools.cache
+def code_digest() -> str:
+    """A digest of the library's source: other code may give other digits."""
+    digest = hashlib.sha256()
+    folder = Path(__file__).parent
+    for path in sorted(folder.rglob("*.py")):
+        digest.update(path.relative_to(folder).as_posix().encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def compiled(function: Callable, arguments: tuple, settings: object) -> Callable:
+    """`function` compiled for arguments like these; `settings` says by `repr` what it closes over.
+
+    The way leads through the exported trace whether or not it is kept, so that all runs compile the
+    same program.
+    """
+    leaves, structure = jax.tree.flatten(arguments)
+    shapes = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves]
+    told = (settings, str(structure), shapes, jax.__version__, jax.default_backend(), code_digest())
+    key = hashlib.sha256(repr(told).encode()).hexdigest()
+    exported = _kept(key)
+    if exported is None:
+        flat = jax.jit(lambda *leaves: function(*jax.tree.unflatten(structure, leaves)))
+        exported = export.export(flat)(*shapes)
+        _keep(key, exported)
+    program = jax.jit(exported.call).lower(*shapes).compile()
+    return lambda *arguments: program(*jax.tree.leaves(arguments))
+
+
+def _place(key: str) -> Path | None:
+    folder: Any = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+    return Path(folder) / f"vrw_trace_{key}" if folder else None
+
+
+def _kept(key: str) -> export.Exported | None:
+    place = _place(key)
+    if place is None or not place.exists():
+        return None
+    content = place.read_bytes()
+    digest, trace = content[:32], content[32:]
+    if hashlib.sha256(trace).digest() != digest:
+        return None  # damaged: trace again
+    return export.deserialize(bytearray(trace))
+
+
+def _keep(key: str, exported: export.Exported) -> None:
+    """Written beside its place and renamed; a cache that can't be written is no error."""
+    place = _place(key)
+    if place is None:
+        return
+    trace = bytes(exported.serialize())
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=place.parent)
+        with os.fdopen(handle, "wb") as file:
+            file.write(hashlib.sha256(trace).digest() + trace)
+        os.replace(name, place)
+    except OSError:
+        return
