@@ -1,0 +1,320 @@
+"""Branches of gaits along one parameter, stable or not, with every border on the way located.
+
+A border is where something changes its nature: a bifurcation, or a border collision, where an
+indicator or a monitor reaches zero. Each is solved for on the branch itself, again at every trial,
+so that it is as exact as the gaits are.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+from jaxtyping import Array
+
+from vrw_jax.arclength import ArclengthOptions, MapFollowed, Point
+from vrw_jax.branch import Branch
+from vrw_jax.branch_run import IN_SEQUENCE, MakeCycle, Read, Run, Strand, Table, run_all
+from vrw_jax.cycle_options import CycleOptions
+from vrw_jax.cycle_search import Problem
+from vrw_jax.followed_wheel import (
+    AbstractFollowedWheel,
+    CycleFollowed,
+    RungFollowed,
+    Wheel,
+    gait_measures,
+    with_parameter,
+)
+from vrw_jax.limit_cycle import LimitCycle, limit_cycle
+from vrw_jax.measures import CYCLE, MARGINS, STEP, attrs_of
+from vrw_jax.models import AbstractWheel, ViscoelasticWheel
+from vrw_jax.multipliers import multipliers
+from vrw_jax.options import Options
+from vrw_jax.outcomes import Outcome
+from vrw_jax.params import PARAMETER_NAMES, WheelParams
+from vrw_jax.return_map import walk
+from vrw_jax.simulate import provenance
+
+CLOSED = 1e-7
+"""Most by which the event-driven step may miss a cycle's section state: rad, rad/s, m/s."""
+
+N_WALKED = 60
+"""Steps towards a start, for rungs whose limit cycles are not solved for."""
+
+INDICATORS = ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
+ENDING = (*INDICATORS, "duration_dls", "duration_sls1", "duration_sls2")
+"""Where one of these reaches zero the order of events changes, and the branch ends."""
+
+EXACT = {"clearance_sls1": "takeoff_acceleration"}
+"""A monitor that vanishes like a cube, and the quantity that vanishes with it like a line: a foot
+that leaves the ground ever less steeply dips ever less deep, until it rises at once."""
+
+
+@eqx.filter_jit
+def _read_gaits(
+    followed: AbstractFollowedWheel,
+    model: AbstractWheel,
+    options: Options,
+    wheels: Wheel,
+    points: Point,
+) -> dict[str, Array]:
+    def one(wheel: Wheel, z: Any, p: Array) -> dict[str, Array]:
+        x, beyond = followed.read(wheel, z, p)
+        params = with_parameter(wheel.params, followed.name, p)
+        measures = gait_measures(model, params, x, options, followed.n_steps)
+        return measures | beyond | {"section_state": x}
+
+    return jax.vmap(one)(wheels, points.z, points.p)
+
+
+def _is_margin(name: str) -> bool:
+    return name in INDICATORS or name.partition("[")[0] in MARGINS
+
+
+def _name_of_loss(table: Table, place: int) -> str:
+    """What a step beyond the end of a branch says of it."""
+    outcome = Outcome(int(table["outcome"][place]))
+    return IN_SEQUENCE if outcome == Outcome.STEPPED else outcome.name.lower()
+
+
+def continue_branch(
+    params: WheelParams,
+    name: str,
+    bounds: tuple[float, float],
+    *,
+    cycle: LimitCycle | None = None,
+    period_n: int = 1,
+    model: AbstractWheel | None = None,
+    options: ArclengthOptions | None = None,
+    cycle_options: CycleOptions | None = None,
+    step_options: Options | None = None,
+) -> Branch:
+    """The branch of limit cycles through `params` along the parameter `name` within `bounds`.
+
+    Starts from the limit cycle at `params` (or from `cycle`, found before at the same parameters)
+    and goes both ways, through folds, on stable and unstable gaits alike, until the bounds or the
+    end of the branch. Every border on the way is located to 1e-9 in the parameter, if the step
+    between points (options.largest_step) does not hide it: two changes of sign within one step
+    cancel. Gaits are those of the cycle options, `CycleOptions.tight()` by default, and checked by
+    one event-driven step each, from which indicators and monitors come.
+    """
+    if params.damping.ndim != 0:
+        raise ValueError(
+            f"damping has shape {params.damping.shape}, but one branch is that of one wheel: use "
+            "continue_branches for a batch."
+        )
+    batch = jax.tree.map(lambda x: x[None], params)
+    cycle = None if cycle is None else jax.tree.map(lambda x: x[None], cycle)
+    (branch,) = continue_branches(
+        batch, name, bounds, cycle=cycle, period_n=period_n, model=model, options=options,
+        cycle_options=cycle_options, step_options=step_options,
+    )  # fmt: skip
+    return branch
+
+
+def continue_branches(
+    params: WheelParams,
+    name: str,
+    bounds: tuple[float, float],
+    *,
+    cycle: LimitCycle | None = None,
+    period_n: int = 1,
+    model: AbstractWheel | None = None,
+    options: ArclengthOptions | None = None,
+    cycle_options: CycleOptions | None = None,
+    step_options: Options | None = None,
+) -> tuple[Branch, ...]:
+    """`continue_branch` of a batch of wheels side by side; every parameter has one leading axis.
+
+    A wheel without a limit cycle to start from gets a branch without points, whose outcome says so.
+    """
+    if name not in PARAMETER_NAMES:
+        raise ValueError(f"{name!r} is no parameter: choose from {', '.join(PARAMETER_NAMES)}.")
+    low, high = (float(b) for b in bounds)
+    if not low < high:
+        raise ValueError(f"bounds are ({low:g}, {high:g}), but the lower must come first.")
+    model = ViscoelasticWheel() if model is None else model
+    options = ArclengthOptions() if options is None else options
+    step_options = Options.tight() if step_options is None else step_options
+    batch = np.broadcast_shapes(*(x.shape for x in jax.tree.leaves(params)))
+    if len(batch) != 1:
+        raise ValueError(f"the wheels' batch has shape {batch}, but it must have one axis.")
+    params = jax.tree.map(lambda x: jnp.broadcast_to(x, batch), params)
+    p = jnp.clip(getattr(params, name), low, high)
+    params = with_parameter(params, name, p)
+
+    make_cycle: MakeCycle
+    if isinstance(model, ViscoelasticWheel):
+        cycle_options = CycleOptions.tight() if cycle_options is None else cycle_options
+        start = cycle
+        if start is None:
+            find = functools.partial(limit_cycle, period_n=period_n, options=cycle_options)
+            start = jax.vmap(find)(params)
+        outcomes = np.asarray(start.outcome)
+        problem = Problem(params.n_legs, period_n, cycle_options)
+        followed: AbstractFollowedWheel = CycleFollowed(problem=problem, name=name)
+        z: Any = start.located.solution
+        wheels = Wheel(params, start.located.happens)
+
+        def make_cycle(owner: int, point: Point) -> Callable[[], LimitCycle]:
+            def find() -> LimitCycle:
+                guess = jax.tree.map(lambda x: x[owner], start)
+                located = guess.located._replace(solution=jax.tree.map(jnp.asarray, point.z))
+                guess = eqx.tree_at(lambda c: c.located, guess, located)
+                wheel = jax.tree.map(lambda x: x[owner], params)
+                wheel = with_parameter(wheel, name, jnp.asarray(point.p))
+                return limit_cycle(wheel, guess=guess, period_n=period_n, options=cycle_options)
+
+            return find
+    else:
+        followed = RungFollowed(model=model, options=step_options, name=name, period_n=period_n)
+        advance = functools.partial(walk, n_steps=N_WALKED, model=model, options=step_options)
+        walked = jax.vmap(advance)(params, jax.vmap(model.start)(params))
+        outcomes = np.asarray(walked.outcome)
+        z = walked.steps.section_state[:, -1]
+        wheels = Wheel(params, jnp.ones((*batch, 1, 1), p.dtype))
+        make_cycle = lambda owner, point: None
+
+    def read(wheels: Any, points: Point) -> Table:
+        return jax.tree.map(np.asarray, _read_gaits(followed, model, step_options, wheels, points))
+
+    def kept(table: Table) -> np.ndarray:
+        return (table["outcome"] == Outcome.STEPPED) & (table["closure"] < CLOSED)
+
+    legs = range(3, params.n_legs + 1)
+    run = Run(
+        followed,
+        options,
+        wheels,
+        np.array([low, high]),
+        functools.partial(_by_leg, read, legs),
+        kept,
+        _is_margin,
+        ENDING,
+        EXACT,
+        _name_of_loss,
+    )
+    found = outcomes == Outcome.STEPPED
+    strands = run_all(run, z, p, found, make_cycle)
+    one = lambda owner: jax.tree.map(lambda x: x[owner], params)
+    return tuple(
+        _branch_of_gaits(strand, one(owner), name, model, step_options, int(outcomes[owner]))
+        for owner, strand in enumerate(strands)
+    )
+
+
+def _by_leg(read: Read, legs: range, wheels: Any, points: Point) -> Table:
+    """The table of `read` with one more column for each leg of a margin that has several."""
+    table = read(wheels, points)
+    for name, margin in MARGINS.items():
+        if margin.axis:
+            table |= {f"{name}[{leg}]": table[name][:, i] for i, leg in enumerate(legs)}
+    return table
+
+
+def _branch_of_gaits(
+    strand: Strand | None,
+    params: WheelParams,
+    name: str,
+    model: AbstractWheel,
+    options: Options,
+    outcome: int,
+) -> Branch:
+    origin = provenance(params, model, options)
+    origin.pop(f"parameter_{name}")
+    attrs = {"title": f"Branch of limit cycles along {name}"} | origin
+    if strand is None:
+        code = Outcome(outcome)
+        code = Outcome.NO_CYCLE_FOUND if code == Outcome.STEPPED else code
+        empty = xr.Dataset(coords={name: ("point", np.zeros(0))}, attrs=attrs)
+        return Branch(name, empty, (), ("", ""), code)
+    skipped = ("outcome", "solver_steps")
+    data = {
+        key: xr.Variable(
+            ("point", "leg") if measure.axis else "point", strand.table[key], attrs_of(key)
+        )
+        for key, measure in (STEP | MARGINS).items()
+        if key not in skipped
+    }
+    data["section_state"] = xr.Variable(
+        ("point", "component"),
+        strand.table["section_state"],
+        {"long_name": "section state just before touchdown"},
+    )
+    data["closure"] = xr.Variable(
+        "point",
+        strand.table["closure"],
+        {"units": "1", "long_name": "miss of the section state after one event-driven period"},
+    )
+    labels = {
+        name: xr.Variable("point", strand.points.p, attrs_of(name)),
+        "component": ["theta", "dtheta", "dL1"],
+        "leg": xr.Variable("leg", np.arange(3, params.n_legs + 1), {"long_name": "locked leg"}),
+    }
+    dataset = xr.Dataset(data | _stability(np.asarray(strand.points.jacobian)), labels, attrs)
+    return Branch(name, dataset, strand.borders, strand.ends, Outcome.STEPPED)
+
+
+def _stability(jacobians: np.ndarray) -> dict[str, xr.Variable]:
+    """Multipliers and what follows from them, along the branch."""
+    values = np.asarray(multipliers(jnp.asarray(jacobians)))
+    radius = np.max(np.abs(values), -1)
+    names = {"multiplier_real": values.real, "multiplier_imag": values.imag}
+    return {
+        **{
+            key: xr.Variable(("point", "multiplier"), part, {"units": "1", "long_name": text})
+            for (key, part), text in zip(
+                names.items(), ("real part of a multiplier", "imaginary part"), strict=True
+            )
+        },
+        "spectral_radius": xr.Variable("point", radius, CYCLE["spectral_radius"].attrs),
+        "stability_margin": xr.Variable("point", 1.0 - radius, CYCLE["stability_margin"].attrs),
+    }
+
+
+def continue_map(
+    function: Callable[[Any, Array, Array], Array],
+    x: Array,
+    p: float,
+    bounds: tuple[float, float],
+    *,
+    constants: Any = (),
+    name: str = "parameter",
+    options: ArclengthOptions | None = None,
+) -> Branch:
+    """The branch of fixed points of any map x -> `function(constants, x, p)` through (x, p).
+
+    The map must be differentiable forwards, and NaN where it is not defined; up to three numbers.
+    Its bifurcations are located as for `continue_branch`.
+    """
+    low, high = (float(b) for b in bounds)
+    if not low <= p <= high:
+        raise ValueError(f"p is {p:g}, but the branch must start within ({low:g}, {high:g}).")
+    options = ArclengthOptions() if options is None else options
+    lead = lambda tree: jax.tree.map(lambda a: jnp.asarray(a, float)[None], tree)
+    run = Run(
+        MapFollowed(function),
+        options,
+        lead(constants),
+        np.array([low, high]),
+        lambda wheels, points: {"x": np.asarray(points.z)},
+        lambda table: np.asarray(np.isfinite(table["x"]).all(-1)),
+        lambda name: False,
+    )
+    (strand,) = run_all(
+        run, lead(jnp.asarray(x, float)), lead(p), np.array([True]), lambda owner, point: None
+    )
+    if strand is None:
+        empty = xr.Dataset(coords={name: ("point", np.zeros(0))})
+        return Branch(name, empty, (), ("", ""), Outcome.NO_CYCLE_FOUND)
+    dataset = xr.Dataset(
+        {"x": (("point", "component"), strand.table["x"])}
+        | _stability(np.asarray(strand.points.jacobian)),
+        {name: ("point", strand.points.p)},
+        {"title": f"Branch of fixed points along {name}"},
+    )
+    return Branch(name, dataset, strand.borders, strand.ends, Outcome.STEPPED)
