@@ -18,6 +18,8 @@ from vrw_jax.params import WheelParams
 from vrw_jax.return_map import Walk, paper_start, return_map, step, walk
 from vrw_jax.scan import scan
 from vrw_jax.scan_store import open_scan
+from vrw_jax.section_newton import SectionCycle, newton_cycle
+from vrw_jax.sensitivities import sensitivities
 from vrw_jax.simulate import simulate
 
 __all__ = [
@@ -30,17 +32,20 @@ __all__ = [
     "Options",
     "Outcome",
     "RigidWheel",
+    "SectionCycle",
     "StepResult",
     "ViscoelasticWheel",
     "Walk",
     "WheelParams",
     "grid",
     "limit_cycle",
+    "newton_cycle",
     "open_scan",
     "paper_start",
     "return_map",
     "samples",
     "scan",
+    "sensitivities",
     "simulate",
     "sobol",
     "step",

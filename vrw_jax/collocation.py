@@ -14,7 +14,7 @@ predicate that is always true, but only known at run time, is the barrier that i
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -43,7 +43,7 @@ TWICE, ENDS_TWICE = ONCE @ ONCE, ENDS_ONCE @ ONCE
 
 Constants = tuple[Elementwise, ...]
 Vector = tuple[Elementwise, ...]
-LaneArray = Float[Array, "*axes lanes"]
+LaneArray = Float[Array, "... lanes"]
 
 
 class Point(NamedTuple):
@@ -116,7 +116,7 @@ class Linearised(NamedTuple):
     monodromy: LaneArray  # (row, column, lanes): derivative of the return to the section
 
 
-Hold = Callable[[object], object]
+Hold = Callable[[Any], Any]
 
 
 def fusion_barrier(lanes: Float[Array, "... lanes"]) -> Hold:
@@ -126,7 +126,7 @@ def fusion_barrier(lanes: Float[Array, "... lanes"]) -> Hold:
     """
     always = ~jnp.isnan(jnp.max(lanes))
 
-    def hold(tree: object) -> object:
+    def hold(tree: Any) -> Any:
         return lax.cond(always, lambda t: t, lambda t: jax.tree.map(jnp.zeros_like, t), tree)
 
     return hold
@@ -135,7 +135,7 @@ def fusion_barrier(lanes: Float[Array, "... lanes"]) -> Hold:
 def _mix(matrix: np.ndarray, x: Array) -> Array:
     """Matrix product over the leading axis as a sum of elementwise products."""
     shape = (-1,) + (1,) * (x.ndim - 1)
-    terms = [matrix[:, j].astype(x.dtype).reshape(shape) * x[j] for j in range(matrix.shape[1])]
+    terms = [x[j] * matrix[:, j].astype(x.dtype).reshape(shape) for j in range(matrix.shape[1])]
     return sum(terms[1:], start=terms[0])
 
 
@@ -159,8 +159,8 @@ def inverse(matrix: Float[Array, "n n lanes"]) -> Float[Array, "n n lanes"]:
         return 1.0 / m
     if m.shape[0] == 2:
         determinant = m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]
-        adjugate = jnp.stack([jnp.stack([m[1, 1], -m[0, 1]]), jnp.stack([-m[1, 0], m[0, 0]])])
-        return adjugate / determinant
+        swapped = jnp.stack([jnp.stack([m[1, 1], -m[0, 1]]), jnp.stack([-m[1, 0], m[0, 0]])])
+        return swapped / determinant
     if m.shape[0] != 3:
         raise ValueError(f"the matrix has {m.shape[0]} rows, but only 1, 2 or 3 are built.")
 
@@ -184,7 +184,7 @@ def _eliminate(
     """
     n, dim = matrix.shape[:2]
     rest = jnp.concatenate([matrix.reshape(n, dim, n * dim, -1), right], axis=2)
-    rows = []
+    rows: list[Array] = []
     for _ in range(n):
         pivot = rest[0]
         row = _contract(inverse(pivot[:, :dim]), pivot[:, dim:])
@@ -270,7 +270,7 @@ def _pass_phase(
         constants = constants_of(*parameters) if n_wanted else known_constants
         return phase.residual(constants, Point(held, q, v), a)
 
-    def step(carry: tuple, inputs: tuple) -> tuple:
+    def step(carry: tuple, inputs: tuple) -> tuple[tuple, Array]:
         q, v, dq, dv = carry
         a, fraction = inputs
         h = fraction * duration
@@ -325,7 +325,8 @@ def _pass_phase(
 
     start = (front.q, front.v, front.dq, front.dv)
     fractions = jnp.asarray(mesh.fractions, dtype)
-    (q, v, dq, dv), columns = lax.scan(step, start, (accelerations, fractions))
+    last_point, columns = lax.scan(step, start, (accelerations, fractions))
+    q, v, dq, dv = last_point
     return front._replace(q=q, v=v, dq=dq, dv=dv), columns
 
 
@@ -403,8 +404,8 @@ def linearised_pass(
         jnp.concatenate([jnp.zeros((1 + size, *lanes), dtype), x]) for x in d_constants
     )
     section = solution.section
-    d_section = np.eye(n_columns, dtype=dtype)[:, 1 : 1 + size, None]
-    d_section = jnp.broadcast_to(d_section, (n_columns, size, *lanes))
+    own_unit = np.eye(n_columns, dtype=dtype)[:, 1 : 1 + size, None]
+    d_section = jnp.broadcast_to(own_unit, (n_columns, size, *lanes))
 
     def start(section: Array, *constants: Array) -> tuple:
         point = sequence.start(constants, tuple(section))
@@ -451,7 +452,7 @@ def linearised_pass(
     own = np.r_[0, 1 + size : n_columns]
     first = np.eye(1 + n_wanted, dtype=dtype)[0][:, None, None]
     right = d_back[own] + first * (back - section)
-    closing = inverse(np.eye(size, dtype=dtype)[:, :, None] - monodromy)
+    closing = inverse(jnp.eye(size, dtype=dtype)[:, :, None] - monodromy)
     d_closed = jnp.swapaxes(_contract(closing, jnp.swapaxes(right, 0, 1)), 0, 1)
 
     def close(columns: Array) -> Array:

@@ -155,7 +155,7 @@ def _limited(solution: Solution, correction: Solution) -> LaneArray:
 
 
 class _Iterate(NamedTuple):
-    count: Int[Array, ""]
+    iteration: Int[Array, ""]
     solution: Solution
     monodromy: LaneArray
     residual: LaneArray
@@ -184,7 +184,7 @@ def newton(
     tolerance = max(options.tolerance, float(floor))
 
     def iterate(now: _Iterate) -> _Iterate:
-        share = jnp.minimum(1.0, (now.count + 1) / jnp.maximum(stages, 1)).astype(parameters.dtype)
+        share = jnp.minimum(1.0, (now.iteration + 1) / jnp.maximum(stages, 1)).astype(parameters.dtype)
         arrived = share >= 1.0
         here = jnp.where(arrived, parameters, origin + share * (parameters - origin))
         passed = problem.pass_at(here, start._replace(solution=now.solution))
@@ -199,7 +199,7 @@ def newton(
 
         converged = moves & arrived & (step_size < tolerance)
         return _Iterate(
-            count=now.count + 1,
+            iteration=now.iteration + 1,
             solution=jax.tree.map(moved, now.solution, correction),
             monodromy=jnp.where(moves, passed.monodromy, now.monodromy),
             residual=jnp.where(moves, step_size, now.residual),
@@ -209,7 +209,7 @@ def newton(
         )
 
     first = _Iterate(
-        count=jnp.zeros((), jnp.int32),
+        iteration=jnp.zeros((), jnp.int32),
         solution=start.solution,
         monodromy=jnp.zeros((size, size, lanes), parameters.dtype),
         residual=jnp.ones((lanes,), parameters.dtype),
@@ -217,7 +217,7 @@ def newton(
         running=pending,
         passes=jnp.zeros((lanes,), jnp.int32),
     )
-    going = lambda now: jnp.any(now.running) & (now.count < options.iterations + stages)
+    going = lambda now: jnp.any(now.running) & (now.iteration < options.iterations + stages)
     last = lax.while_loop(going, iterate, first)
     located = Located(last.solution, start.happens, start.found)
     found = last.converged & signs_hold(problem, parameters, located)

@@ -6,6 +6,7 @@ tangent: linear in the tangent, so `jax.grad` transposes a small matrix instead 
 Jacobian itself is wrapped again, so that Hessians work in every combination of modes.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -27,17 +28,22 @@ def any_mode(function: Forward, to_differentiate: Forward | None = None) -> Forw
     `function(*arrays)` must take floating-point arrays only and be differentiable by `jax.jvp` to
     the order wanted. It must not close over values that are themselves differentiated. Where
     derivatives are asked for, `to_differentiate` (the same function computed more tightly, say)
-    takes its place.
+    takes its place. Function and Jacobians are compiled once each: outside of `jit`, forward mode,
+    reverse mode and single directions all call the same compiled Jacobian.
     """
     tighter = function if to_differentiate is None else to_differentiate
-    wrapped = jax.custom_jvp(function)
+    wrapped = jax.custom_jvp(jax.jit(function))
+
+    @functools.cache
+    def differentiated(moved: tuple[int, ...]) -> Forward:
+        return any_mode(_jacobian(tighter, moved))
 
     def rule(primals: tuple, tangents: tuple) -> tuple:
         moved = tuple(i for i, t in enumerate(tangents) if not isinstance(t, SymbolicZero))
         if not moved:
             out, other = wrapped(*primals)
             return (out, other), (jax.tree.map(jnp.zeros_like, out), _no_tangent(other))
-        (jacobian, out), other = any_mode(_jacobian(tighter, moved))(*primals)
+        (jacobian, out), other = differentiated(moved)(*primals)
         pushed = [_push(out, part, tangents[i]) for part, i in zip(jacobian, moved, strict=True)]
         tangent = jax.tree.map(lambda *parts: sum(parts[1:], start=parts[0]), *pushed)
         return (out, other), (tangent, _no_tangent(other))

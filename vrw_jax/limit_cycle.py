@@ -6,7 +6,6 @@ and reverse mode, and to any order.
 """
 
 import functools
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,10 +14,9 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from vrw_jax import multipliers as floquet
 from vrw_jax import transitions
-from vrw_jax.collocation import Solution, walk_through
+from vrw_jax.collocation import walk_through
 from vrw_jax.cycle_options import CycleOptions
 from vrw_jax.cycle_search import (
-    Finding,
     Located,
     Parameters,
     Problem,
@@ -28,9 +26,10 @@ from vrw_jax.cycle_search import (
 )
 from vrw_jax.derivatives import on_branch, push, total_derivative, without_derivative
 from vrw_jax.lanes import one_wheel
-from vrw_jax.models.base import Indicators, SectionState
+from vrw_jax.models.base import Indicators, Margins, SectionState
 from vrw_jax.outcomes import Outcome
 from vrw_jax.params import Scalar, WheelParams
+from vrw_jax.return_map import step
 
 
 class LimitCycle(eqx.Module):
@@ -42,8 +41,8 @@ class LimitCycle(eqx.Module):
 
     section_state: SectionState  # (theta-, dtheta-, dL1-) before touchdown, fixed under return_map
     post_impact: Float[Array, "2"]  # (theta, dtheta) after the first landing, rad, rad/s
-    durations: Float[Array, "3"]  # of DLS, SLS-I, SLS-II, s; (n, 3) for period_n = n > 1
-    step_length: Scalar  # distance between the feet at the landing, m; (n,) for n > 1
+    durations: Float[Array, "*n 3"]  # of DLS, SLS-I, SLS-II, s; (n, 3) for period_n = n > 1
+    step_length: Float[Array, "*n"]  # distance between the feet at the landing, m; (n,) for n > 1
     indicators: Indicators  # of the landing; (n,) each for n > 1
     outcome: Int[Array, ""]  # Outcome.STEPPED, NO_CYCLE_FOUND or BAD_INPUT
     residual: Scalar  # last correction of Newton's method, rad, rad/s, s or m
@@ -77,7 +76,7 @@ class LimitCycle(eqx.Module):
         return distance / jnp.where(period > 0.0, period, 1.0)
 
     @property
-    def monodromy(self) -> Float[Array, "2 2"]:
+    def monodromy(self) -> Float[Array, "... 2 2"]:
         """Derivative of the return to the section after the impact, over (theta+, dtheta+)."""
         attach = functools.partial(_attach_monodromy, self.problem)
         for _ in range(self.outcome.ndim):
@@ -85,7 +84,7 @@ class LimitCycle(eqx.Module):
         return attach(self.matrix, self.parameters, self.located)
 
     @property
-    def multipliers(self) -> Complex[Array, " n"]:
+    def multipliers(self) -> Complex[Array, "... n"]:
         """Floquet multipliers, largest first; a third one, in the section before, is zero."""
         return floquet.multipliers(self.monodromy)
 
@@ -101,11 +100,11 @@ class LimitCycle(eqx.Module):
 
     @property
     def jury_margins(self) -> Array:
-        """Margins to fold, period doubling and Neimark-Sacker bifurcation: multipliers.jury_margins."""
+        """Margins to fold, period doubling, Neimark-Sacker: see multipliers.jury_margins."""
         return floquet.jury_margins(self.monodromy)
 
     @property
-    def at_double_multiplier(self) -> Bool[Array, ""]:
+    def at_double_multiplier(self) -> Bool[Array, "..."]:
         """Whether the spectral radius is at a kink, because two multipliers tie."""
         return floquet.at_double_multiplier(self.matrix) & self.found
 
@@ -116,7 +115,19 @@ class LimitCycle(eqx.Module):
         return jnp.where(self.found, jnp.linalg.cond(matrix), 0.0)
 
     @property
-    def found(self) -> Bool[Array, ""]:
+    def monitors(self) -> Margins:
+        """The premises' margins over the (first) step, by walking it once event by event."""
+
+        def walk(parameters: Array, section_state: Array) -> Margins:
+            wheel = wheel_of(parameters, self.problem.n_legs)
+            return step(wheel, section_state).monitors
+
+        for _ in range(self.outcome.ndim):
+            walk = jax.vmap(walk)
+        return walk(self.parameters, self.section_state)
+
+    @property
+    def found(self) -> Bool[Array, "..."]:
         """Whether there is a cycle."""
         return self.outcome == Outcome.STEPPED
 
@@ -136,7 +147,7 @@ def _monodromy_over_lanes(problem: Problem, parameters: Parameters, located: Loc
     return jnp.where(located.found > 0.5, monodromy, 0.0)
 
 
-def _solve(problem: Problem, parameters: Array, guess: Located | None) -> tuple[Located, Finding]:
+def _solve(problem: Problem, parameters: Array, guess: Located | None) -> tuple[Located, tuple]:
     """Search for one wheel, differentiable in its parameters; the guess has no derivative."""
     tangent_space = functools.partial(_tangent_space, problem)
 

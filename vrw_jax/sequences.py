@@ -8,6 +8,7 @@ off (case A3); it begins with single support I.
 
 import functools
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +19,6 @@ from vrw_jax.collocation import Constants, Passage, Phase, PhaseSequence, Point,
 from vrw_jax.geometry import (
     Motion,
     double_support_circle,
-    foot_distance,
     landing_foot_height,
     rear_direction,
 )
@@ -31,12 +31,14 @@ N_CONSTANTS = 12
 def constants_of(n_legs: int, *parameters: Elementwise) -> Constants:
     """The combinations that every formula needs, from the parameters in their order."""
     fields = dict(zip(PARAMETER_NAMES, parameters, strict=True))
-    return tuple(WheelParams(**fields, n_legs=n_legs).symbols()[:N_CONSTANTS])
+    lane_fields: tuple[Any, ...] = WheelParams(**fields, n_legs=n_legs).symbols()
+    return lane_fields[:N_CONSTANTS]
 
 
 def _symbols(n_legs: int, constants: Constants) -> Symbols:
     alpha = 2.0 * math.pi / n_legs
-    return Symbols(*constants, n_legs, math.sin(alpha), math.cos(alpha), alpha)
+    fields: tuple[Any, ...] = (*constants, n_legs, math.sin(alpha), math.cos(alpha), alpha)
+    return Symbols(*fields)
 
 
 _SINE = tuple((-1) ** k / math.factorial(2 * k + 1) for k in range(10))
@@ -136,8 +138,9 @@ def _phases(n_legs: int) -> tuple[Phase, Phase]:
         return (rear.normal, s.L0 - m.L2, landing_foot_height(s, m), *_upright(s, m, fore))
 
     def sls1_residual(constants: Constants, point: Point, acceleration: Vector) -> Vector:
+        a1, a2, a3 = acceleration
         M, *forces = dynamics.terms(symbols(constants), _single_support_1(point))
-        return tuple(n - f for n, f in zip(M.times(acceleration), forces, strict=True))
+        return tuple(n - f for n, f in zip(M.times((a1, a2, a3)), forces, strict=True))
 
     def stopper_gap(constants: Constants, point: Point) -> Elementwise:
         s = symbols(constants)
@@ -175,12 +178,11 @@ def _last_phase(n_legs: int, to_section: bool) -> Phase:
 
     def reset(constants: Constants, point: Point) -> Point:
         s = symbols(constants)
-        (theta, L1), (dtheta, dL1) = point.q, point.v
-        before = (theta, dtheta, dL1)
-        if not to_section:
-            landing = transitions.land(s, *before)
-            before = (landing.theta, landing.motion.dtheta)
-        return Point((), before, ())
+        (theta, _), (dtheta, dL1) = point.q, point.v
+        if to_section:
+            return Point((), (theta, dtheta, dL1), ())
+        landing = transitions.land(s, theta, dtheta, dL1)
+        return Point((), (landing.theta, landing.motion.dtheta), ())
 
     def guards(constants: Constants, point: Point) -> Vector:
         s = symbols(constants)

@@ -1,0 +1,261 @@
+"""Limit cycles: against a truth of 27 digits, against walking, their derivatives, and failures."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import truth
+
+import vrw_jax as vrw
+from vrw_jax.cycle_search import wheel_of
+from vrw_jax.outcomes import Outcome
+from vrw_jax.params import PARAMETER_NAMES
+
+TIGHT = vrw.CycleOptions.tight()
+VALUES = ("section_state", "post_impact", "durations", "period", "dls_fraction", "speed")
+DIFFERENTIATED = ("post_impact", "durations", "period", "dls_fraction", "speed", "step_length")
+
+
+def measures(cycle, names):
+    return {name: getattr(cycle, name) for name in names}
+
+
+@functools.cache
+def compiled(options, names, transform):
+    """Cycles of a batch with the derivatives of some measures, compiled once for many tests."""
+
+    def one(vector):
+        cycle = vrw.limit_cycle(truth.wheel(vector), options=options)
+        values = measures(cycle, names)
+        return (values[names[0]] if transform is jax.grad else values), cycle
+
+    return jax.jit(jax.vmap(transform(one, has_aux=True)))
+
+
+def differentiated(rows, options=None, names=DIFFERENTIATED, transform=jax.jacfwd):
+    """(derivatives, cycles) of rows of parameters, in a batch of one size."""
+    rows = np.atleast_2d(np.asarray(rows, float))
+    full = np.concatenate([rows, np.tile(rows[-1], (len(truth.CASES) - len(rows), 1))])
+    found = compiled(options, names, transform)(jnp.asarray(full))
+    return jax.tree.map(lambda x: x[: len(rows)], found)
+
+
+@functools.cache
+def of_the_truth(options=None, names=DIFFERENTIATED):
+    return differentiated(truth.PARAMETERS, options, names)
+
+
+def cycles(options=None):
+    return of_the_truth(options)[1]
+
+
+def table_1(**changes):
+    row = truth.PARAMETERS[0].copy()
+    for name, value in changes.items():
+        row[PARAMETER_NAMES.index(name)] = value
+    return row
+
+
+def relative_error(found, expected):
+    scale = np.max(np.abs(expected), axis=tuple(range(1, expected.ndim)), keepdims=True)
+    return np.max(np.abs(np.asarray(found) - expected) / scale)
+
+
+@pytest.mark.parametrize(("options", "allowed"), [(None, 1e-9), (TIGHT, 1e-12)])
+def test_cycles_agree_with_the_truth(options, allowed):
+    found = cycles(options)
+    assert np.all(np.asarray(found.outcome) == Outcome.STEPPED)
+    for name in VALUES:
+        assert relative_error(getattr(found, name), truth.table("cycle", name)) < allowed, name
+    for own, name in (("lambda_I4", "lambda_impulse_4"), ("lambda_2", "lambda2_plus")):
+        indicator = getattr(found.indicators, own)
+        assert truth.scaled_error(indicator, truth.table("cycle", name)) < 10 * allowed
+
+
+@pytest.mark.parametrize(("options", "allowed"), [(None, 1e-8), (TIGHT, 1e-11)])
+def test_multipliers_agree_with_the_truth(options, allowed):
+    expected = truth.table("cycle", "multipliers")
+    found = np.asarray(cycles(options).multipliers)
+    expected = expected[..., 0] + 1j * expected[..., 1]
+    gap = np.abs(found[:, :, None] - expected[:, None, :])
+    assert gap.min(1).max() < allowed
+
+
+@pytest.mark.parametrize(("options", "allowed"), [(None, 1e-8), (TIGHT, 1e-10)])
+def test_first_derivatives_agree_with_the_truth(options, allowed):
+    found, _ = of_the_truth(options)
+    for name in DIFFERENTIATED:
+        expected = np.stack([truth.floats(case["cycle"]["d_params"][name]) for case in truth.CASES])
+        own = np.asarray(found[name]).reshape(expected.shape)
+        assert relative_error(own, expected) < allowed, name
+
+
+def test_derivatives_of_the_spectral_radius_agree_with_the_truth():
+    found = of_the_truth(None, ("spectral_radius",))[0]["spectral_radius"]
+    expected = np.stack(
+        [truth.floats(case["cycle"]["d_params"]["spectral_radius"]) for case in truth.CASES]
+    )
+    assert relative_error(found, expected) < 1e-7
+
+
+def test_reverse_mode_agrees_with_forward_mode():
+    reverse, _ = differentiated(truth.PARAMETERS, None, ("dls_fraction",), jax.grad)
+    np.testing.assert_allclose(reverse, of_the_truth()[0]["dls_fraction"], rtol=1e-10, atol=1e-13)
+
+
+def test_cycle_is_a_fixed_point_of_the_event_driven_map():
+    wheels = truth.wheels(truth.PARAMETERS[:6])
+    state = cycles().section_state[:6]
+    options = vrw.Options.tight()
+    walk = jax.jit(jax.vmap(lambda p, x: vrw.return_map(p, x, options=options)))
+    np.testing.assert_allclose(walk(wheels, state), state, rtol=0, atol=3e-9)
+
+
+def test_vmap_gives_what_single_wheels_give():
+    batch = cycles()
+    for index in (0, 3):
+        single = vrw.limit_cycle(truth.wheel(truth.PARAMETERS[index]))
+        np.testing.assert_allclose(
+            single.section_state, batch.section_state[index], rtol=1e-12, atol=1e-13
+        )
+
+
+def test_no_cycle_is_an_outcome_with_zeros_and_disturbs_no_neighbour():
+    rows = np.stack([table_1(), table_1(slope=0.02), table_1(damping=np.nan)])
+    for transform in (jax.jacfwd, jax.grad):
+        names = DIFFERENTIATED if transform is jax.jacfwd else ("dls_fraction",)
+        derivatives, cycle = differentiated(rows, None, names, transform)
+        expected = [Outcome.STEPPED, Outcome.NO_CYCLE_FOUND, Outcome.BAD_INPUT]
+        assert list(np.asarray(cycle.outcome)) == expected
+        assert np.all(np.asarray(cycle.section_state)[1:] == 0.0)
+        assert all(np.all(np.asarray(leaf)[1:] == 0.0) for leaf in jax.tree.leaves(derivatives))
+        assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(cycle))
+        np.testing.assert_allclose(cycle.durations[0], cycles().durations[0], rtol=1e-12)
+
+
+def test_gait_without_double_support_is_found_though_unstable():
+    row = table_1(
+        natural_length=1.03163159, stiffness=529.980645, damping=179.091443, slope=0.314288553
+    )
+    _, cycle = differentiated(row)
+    assert int(cycle.outcome[0]) == Outcome.STEPPED
+    assert float(cycle.durations[0, 0]) == 0.0
+    assert float(cycle.indicators.lambda_4[0]) < 0.0
+    assert float(vrw.multipliers.spectral_radius(cycle.matrix[0])) > 1.6
+    options = vrw.Options.tight()
+    back = vrw.return_map(truth.wheel(row), cycle.section_state[0], options=options)
+    np.testing.assert_allclose(back, cycle.section_state[0], atol=1e-8)
+
+
+def test_a_wheel_twice_as_large_takes_root_two_longer():
+    length = 2.0
+    large = table_1(
+        leg_com=0.3 * length,
+        locked_length=length,
+        natural_length=1.02 * length,
+        stiffness=500.0 / length,
+        damping=200.0 / np.sqrt(length),
+    )
+    _, cycle = differentiated(np.stack([table_1(), large]))
+    expected = np.sqrt(length) * cycle.durations[0]
+    np.testing.assert_allclose(cycle.durations[1], expected, rtol=1e-9)
+
+
+def test_neighbours_cycle_is_a_quicker_start():
+    first = vrw.limit_cycle(vrw.WheelParams())
+    second = vrw.limit_cycle(vrw.WheelParams(damping=202.0), guess=first)
+    assert int(second.outcome) == Outcome.STEPPED
+    assert int(second.passes) <= 4
+    cold = vrw.limit_cycle(vrw.WheelParams(damping=202.0))
+    np.testing.assert_allclose(second.section_state, cold.section_state, rtol=1e-11)
+
+
+def simplest_walker(slope):
+    """Garcia et al. 1998: the map just after heel strike, stance angle and rate."""
+
+    def field(y):
+        theta, phi, dtheta, dphi = y
+        ddtheta = jnp.sin(theta - slope)
+        ddphi = ddtheta + dtheta * dtheta * jnp.sin(phi) - jnp.cos(theta - slope) * jnp.sin(phi)
+        return jnp.stack([dtheta, dphi, ddtheta, ddphi])
+
+    def runge_kutta(y, h):
+        k1 = field(y)
+        k2 = field(y + 0.5 * h * k1)
+        k3 = field(y + 0.5 * h * k2)
+        k4 = field(y + h * k3)
+        return y + h / 6.0 * (k1 + 2 * k2 + 2 * k3 + k4)
+
+    def flow(y, time, n_steps=1200):
+        march = lambda y, _: (runge_kutta(y, time / n_steps), None)
+        return jax.lax.scan(march, y, None, length=n_steps)[0]
+
+    def step(x, time):
+        theta, dtheta = x
+        y = jnp.stack([theta, 2.0 * theta, dtheta, (1.0 - jnp.cos(2.0 * theta)) * dtheta])
+        for _ in range(6):  # heel strike: phi = 2 theta
+            end = flow(y, time)
+            gap, rate = end[1] - 2.0 * end[0], field(end)[1] - 2.0 * field(end)[0]
+            time = time - gap / rate
+        end = flow(y, time)
+        return jnp.stack([-end[0], jnp.cos(2.0 * end[0]) * end[2]])
+
+    return step
+
+
+@pytest.mark.parametrize(
+    ("x", "time", "multipliers"),
+    [
+        (
+            (0.200310900544, -0.199832473005),
+            3.88246375285,
+            (-0.19009984107 + 0.55759877668j, -0.19009984107 - 0.55759877668j),
+        ),
+        ((0.193937369810, -0.203866927442), 3.09610586808, (4.00386435893, 0.45958958980)),
+    ],
+)
+def test_section_newton_finds_the_simplest_walkers_published_cycles(x, time, multipliers):
+    step = simplest_walker(0.009)
+    start = jnp.asarray(x) * 1.002
+    cycle = jax.jit(lambda start: vrw.newton_cycle(lambda y: step(y, time), start))(start)
+    assert bool(cycle.converged)
+    np.testing.assert_allclose(cycle.x, x, atol=1e-9)
+    found = np.sort_complex(np.asarray(vrw.multipliers.multipliers(cycle.jacobian)))
+    np.testing.assert_allclose(found, np.sort_complex(np.asarray(multipliers)), atol=3e-9)
+
+
+def test_section_newton_agrees_with_the_collocation():
+    params = vrw.WheelParams()
+    exact = vrw.limit_cycle(params, options=TIGHT)
+    options = vrw.Options.tight()
+    step = lambda x: vrw.return_map(params, x, options=options)
+    start = exact.section_state * 1.01
+    cycle = jax.jit(lambda start: vrw.newton_cycle(step, start))(start)
+    np.testing.assert_allclose(cycle.x, exact.section_state, rtol=3e-12)
+    found = vrw.multipliers.multipliers(cycle.jacobian)
+    np.testing.assert_allclose(np.abs(found[:2]), np.abs(exact.multipliers), rtol=1e-9)
+    assert abs(found[2]) < 1e-9  # the section before touchdown adds a multiplier of zero
+
+
+def test_sensitivities_are_labelled_and_agree_with_the_truth():
+    table = vrw.sensitivities(vrw.WheelParams(), measures=("dls_fraction", "period"))
+    expected = truth.floats(truth.CASES[0]["cycle"]["d_params"]["dls_fraction"])
+    order = [list(PARAMETER_NAMES).index(str(name)) for name in table.parameter.values]
+    np.testing.assert_allclose(
+        table.derivative.sel(measure="dls_fraction"), expected[order], rtol=1e-8, atol=1e-10
+    )
+    share = float(table.value.sel(measure="dls_fraction"))
+    elasticity = table.elasticity.sel(measure="dls_fraction", parameter="damping")
+    np.testing.assert_allclose(elasticity, 1.14691014e-4 * 200.0 / share, rtol=1e-6)
+
+
+def test_unknown_measure_is_refused_in_one_sentence():
+    with pytest.raises(ValueError, match="choose among these"):
+        vrw.sensitivities(vrw.WheelParams(), measures=("dls_fractoin",))
+
+
+def test_wheel_of_is_the_inverse_of_parameters_of():
+    wheel = wheel_of(jnp.asarray(truth.PARAMETERS[1]), 8)
+    assert float(wheel.damping) == 100.0

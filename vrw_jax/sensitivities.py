@@ -1,0 +1,82 @@
+"""How every measure of a gait answers to every parameter, as a labelled table."""
+
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+from jaxtyping import Array
+
+from vrw_jax.cycle_options import CycleOptions
+from vrw_jax.cycle_search import parameters_of, wheel_of
+from vrw_jax.limit_cycle import LimitCycle, limit_cycle
+from vrw_jax.outcomes import Outcome
+from vrw_jax.params import DOMAINS, WheelParams
+
+MEASURES: dict[str, tuple[str, Callable[[LimitCycle], Array]]] = {
+    "dls_fraction": ("1", lambda cycle: cycle.dls_fraction),
+    "period": ("s", lambda cycle: cycle.period),
+    "speed": ("m/s", lambda cycle: cycle.speed),
+    "step_length": ("m", lambda cycle: cycle.step_length),
+    "duration_dls": ("s", lambda cycle: cycle.durations[0]),
+    "duration_sls1": ("s", lambda cycle: cycle.durations[1]),
+    "duration_sls2": ("s", lambda cycle: cycle.durations[2]),
+    "theta_post_impact": ("rad", lambda cycle: cycle.post_impact[0]),
+    "dtheta_post_impact": ("rad/s", lambda cycle: cycle.post_impact[1]),
+    "lambda_I4": ("N s", lambda cycle: cycle.indicators.lambda_I4),
+    "lambda_2": ("N", lambda cycle: cycle.indicators.lambda_2),
+    "lambda_4": ("N", lambda cycle: cycle.indicators.lambda_4),
+    "spectral_radius": ("1", lambda cycle: cycle.spectral_radius),
+    "stability_margin": ("1", lambda cycle: cycle.stability_margin),
+}
+"""Unit and definition of each measure; the last two are second derivatives of the motion."""
+
+
+def sensitivities(
+    params: WheelParams,
+    *,
+    measures: Sequence[str] = tuple(MEASURES),
+    guess: LimitCycle | None = None,
+    options: CycleOptions | None = None,
+) -> xr.Dataset:
+    """d(measure)/d(parameter) of one gait, plain and as elasticities, with the measures' values.
+
+    An elasticity is the relative change of the measure over that of the parameter; NaN where the
+    measure is zero. Leaving out the measures of stability saves most of the compile time.
+    """
+    unknown = sorted(set(measures) - set(MEASURES))
+    if unknown:
+        raise ValueError(
+            f"measures holds {', '.join(unknown)}, but the measures of a cycle are "
+            f"{', '.join(MEASURES)}: choose among these."
+        )
+
+    def evaluate(vector: Array) -> tuple[Array, tuple[Array, Array]]:
+        cycle = limit_cycle(wheel_of(vector, params.n_legs), guess=guess, options=options)
+        values = jnp.stack([MEASURES[name][1](cycle) for name in measures])
+        return values, (values, cycle.outcome)
+
+    vector = parameters_of(params)
+    jacobian, (values, outcome) = jax.jit(jax.jacfwd(evaluate, has_aux=True))(vector)
+    if int(outcome) != Outcome.STEPPED:
+        raise ValueError(f"there is no gait to differentiate: {Outcome(int(outcome)).meaning}")
+    derivative, value = np.asarray(jacobian), np.asarray(values)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        elasticity = derivative * np.asarray(vector) / value[:, None]
+    axes = ("measure", "parameter")
+    return xr.Dataset(
+        {
+            "value": ("measure", value),
+            "derivative": (axes, derivative, {"long_name": "d(measure)/d(parameter)"}),
+            "elasticity": (
+                axes,
+                np.where(np.isfinite(elasticity), elasticity, np.nan),
+                {"long_name": "relative change of measure per relative change of parameter"},
+            ),
+            "measure_unit": ("measure", [MEASURES[name][0] for name in measures]),
+            "parameter_unit": ("parameter", [domain.unit or "1" for domain in DOMAINS.values()]),
+            "parameter_value": ("parameter", np.asarray(vector)),
+        },
+        coords={"measure": list(measures), "parameter": list(DOMAINS)},
+    )
