@@ -21,7 +21,7 @@ from vrw_jax.scan_measures import check_measures
 from vrw_jax.wording import nearest
 
 DESIGNS = ("grid", "samples", "sobol", "uniform")
-TABLES = ("wheel", "model", "options", "gait", "scan", *DESIGNS)
+TABLES = ("wheel", "model", "options", "gait", "scan", "tune", *DESIGNS)
 _MODEL_KEYS = ("friction", "stop_at_lift_off")
 _OPTION_KEYS = tuple(Options.__dataclass_fields__)
 _AXIS_KEYS = ("from", "to", "count")
@@ -51,6 +51,16 @@ class GaitConfig:
 
 
 @dataclass(frozen=True)
+class TuneConfig:
+    """Table `[tune]`: what is sought, what moves within which bounds, what is to be kept."""
+
+    objective: str | Mapping[str, float] = "dls_fraction"
+    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # of free parameters
+    constraints: Mapping[str, float] | None = None  # None: every premise the rung can keep
+    evaluations: int = 200  # at most
+
+
+@dataclass(frozen=True)
 class Config:
     """A config as checked values, with the text that it was read from."""
 
@@ -59,6 +69,7 @@ class Config:
     options: Mapping[str, float | int | str] = field(default_factory=dict)
     scan: ScanConfig = ScanConfig()
     gait: GaitConfig = GaitConfig()
+    tune: TuneConfig | None = None
     design: designs.AbstractDesign | None = None
     text: str = ""
     name: str = ""
@@ -69,7 +80,7 @@ class Config:
 
     def wheel_model(self) -> ViscoelasticWheel:
         """The rung with the config's settings."""
-        return ViscoelasticWheel(**self.model)
+        return _sentence(ViscoelasticWheel, **self.model)
 
     def numerical_options(self) -> Options:
         """The defaults with the config's values."""
@@ -139,6 +150,7 @@ def _config(tables: Mapping[str, object], text: str, name: str) -> Config:
         options=_options(_table(tables, "options")),
         scan=_scan(_table(tables, "scan")),
         gait=_gait(_table(tables, "gait")),
+        tune=_tune(_table(tables, "tune")) if "tune" in tables else None,
         design=design,
         text=text,
         name=name,
@@ -236,6 +248,39 @@ def _gait(table: Mapping[str, object]) -> GaitConfig:
         )
     theta, dtheta, dL1 = (_number(value, "start") for value in start)
     return GaitConfig(steps, (theta, dtheta, dL1))
+
+
+def _tune(table: Mapping[str, object]) -> TuneConfig:
+    _only(table, TuneConfig.__dataclass_fields__, "[tune]", "settings")
+    objective = table.get("objective", TuneConfig.objective)
+    if isinstance(objective, dict):
+        objective = {name: _number(value, name) for name, value in objective.items()}
+    elif not isinstance(objective, str):
+        raise ConfigError(
+            f"objective is {_shown(objective)}, but it must be a measure or weights of several: "
+            'write objective = "dls_fraction" or objective = { dls_fraction = 1.0, speed = 0.1 }.'
+        )
+    bounds = table.get("bounds")
+    if not isinstance(bounds, dict) or not bounds:
+        raise ConfigError(
+            "[tune] lets no parameter move, but at least one must: add [tune.bounds] with lines "
+            "such as damping = [20.0, 215.0]."
+        )
+    _only(bounds, PARAMETER_NAMES, "[tune.bounds]", "parameters")
+    constraints = table.get("constraints")
+    if constraints is not None:
+        if not isinstance(constraints, dict):
+            raise ConfigError(
+                f"constraints is {_shown(constraints)}, but it must be a table: write "
+                "[tune.constraints] and below it lines such as clearance_sls1 = 0.001."
+            )
+        constraints = {name: _number(value, name) for name, value in constraints.items()}
+    return TuneConfig(
+        objective=objective,
+        bounds={name: _range(name, value) for name, value in bounds.items()},
+        constraints=constraints,
+        evaluations=_whole(table.get("evaluations", TuneConfig.evaluations), "evaluations", 1),
+    )
 
 
 def _design(kind: str, table: Mapping[str, object]) -> designs.AbstractDesign:

@@ -353,7 +353,7 @@ RATE, COMPILE, MEMORY = 500.0, 60.0, 1.2e9
 """Samples per second, seconds to compile without a cache, bytes of compiler and code."""
 
 
-def _bytes(n: float) -> str:
+def _bytes(n: int | float) -> str:
     for unit in ("B", "kB", "MB"):
         if n < 1000:
             return f"{n:.3g} {unit}"

@@ -15,6 +15,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -254,7 +255,7 @@ def _fill(path: Path, layout: Layout, attrs: Mapping[str, object]) -> None:
             dtype=values.dtype,
             dimension_names=(dim,),
             compressors=compressors,
-            attributes=dict(coordinate_attrs),
+            attributes=_json(coordinate_attrs),
         )
         array[:] = values
     for variable in layout.variables:
@@ -266,7 +267,7 @@ def _fill(path: Path, layout: Layout, attrs: Mapping[str, object]) -> None:
             fill_value=variable.missing,
             dimension_names=(*layout.dims, *variable.dims),
             compressors=compressors,
-            attributes=dict(variable.attrs),
+            attributes=_json(variable.attrs),
         )
     group.create_array(
         DONE,
@@ -277,3 +278,8 @@ def _fill(path: Path, layout: Layout, attrs: Mapping[str, object]) -> None:
         dimension_names=("chunk",),
         attributes={"description": "1 where a chunk's results are complete."},
     )
+
+
+def _json(attrs: Mapping[str, object]) -> dict[str, Any]:
+    """Attributes as Zarr takes them; all are plain values already."""
+    return dict(attrs)
