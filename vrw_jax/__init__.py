@@ -21,6 +21,7 @@ from vrw_jax.scan_store import open_scan
 from vrw_jax.section_newton import SectionCycle, newton_cycle
 from vrw_jax.sensitivities import sensitivities
 from vrw_jax.simulate import simulate
+from vrw_jax.tune import Tuned, tune
 
 __all__ = [
     "AbstractWheel",
@@ -34,6 +35,7 @@ __all__ = [
     "RigidWheel",
     "SectionCycle",
     "StepResult",
+    "Tuned",
     "ViscoelasticWheel",
     "Walk",
     "WheelParams",
@@ -49,6 +51,7 @@ __all__ = [
     "simulate",
     "sobol",
     "step",
+    "tune",
     "uniform",
     "walk",
 ]

@@ -24,8 +24,9 @@ if TYPE_CHECKING:
     from vrw_jax.models.base import StepResult
     from vrw_jax.params import WheelParams
     from vrw_jax.scan import Plan, Progress
+    from vrw_jax.tune import Tuned
 
-USER_ERROR, FACT_FAILED, INTERRUPTED = 2, 1, 130
+USER_ERROR, FACT_FAILED, NOT_CONVERGED, INTERRUPTED = 2, 1, 1, 130
 """Exit codes."""
 
 app = typer.Typer(
@@ -71,8 +72,11 @@ def root(
 
       [cyan]vrw scan configs/quickstart.toml[/cyan]      4,096 steady gaits, a dataset and a picture
 
+      [cyan]vrw tune configs/tune_dls.toml[/cyan]        the most double support without scuffing
+
     [bold]What is written[/bold]   gait: nothing. reproduce: figures and tables into its folder.
     scan: scan.zarr (open it with vrw_jax.open_scan or xarray.open_zarr) and pictures, PNG and SVG.
+    tune: path.zarr, a picture, summary.md, and wheel.toml, which vrw gait walks.
 
     The first run of a command compiles for a while; the code is kept in a cache folder of yours
     (JAX_COMPILATION_CACHE_DIR names another), and later runs start quickly. Angles are in rad, all
@@ -175,6 +179,69 @@ def scan(
     else:
         out.print(f"{store} is complete: nothing to compute.", highlight=False)
     _tell_scan(store, folder, picture)
+
+
+@app.command()
+def tune(
+    config: Annotated[Path, typer.Argument(help="TOML file with objective, bounds, constraints.")],
+    folder: Annotated[
+        Path | None,
+        typer.Option("--out", help="Folder for the result; results/NAME of the config by default."),
+    ] = None,
+    picture: Annotated[bool, typer.Option(help="Draw the result.")] = True,
+) -> None:
+    """Tune a wheel: the best gait within bounds that keeps its premises.
+
+    Climbs along the branch of gaits with exact gradients, then walks the tuned wheel. Writes
+    path.zarr (every gait evaluated), summary.md, wheel.toml (the tuned wheel) and pictures (PNG and
+    SVG) into the folder. Exit code 1 if it did not end at an optimum.
+
+    [bold]Examples[/bold]
+
+      vrw tune configs/tune_dls.toml
+
+      vrw tune configs/tune_stability.toml --out results/steady
+
+      vrw gait results/steady/wheel.toml
+    """
+    with _sentences():
+        settings = _config(config)
+        sought = settings.tune
+        if sought is None:
+            raise ValueError(
+                f"{settings.name} seeks nothing, but tuning needs an objective and bounds: add the "
+                "tables [tune] and [tune.bounds], as in configs/tune_dls.toml."
+            )
+        folder = Path("results") / config.stem if folder is None else folder
+        folder.mkdir(parents=True, exist_ok=True)
+        from vrw_jax.tune import tune as run
+
+        with err.status("tuning (the first time compiles for a while)"):
+            tuned = run(
+                settings.params(),
+                sought.objective,
+                tuple(sought.bounds),
+                sought.bounds,
+                sought.constraints,
+                model=settings.wheel_model(),
+                options=settings.numerical_options(),
+                max_evaluations=sought.evaluations,
+            )
+    _tell_tuned(tuned)
+    from vrw_jax.tune_report import write
+
+    with _sentences():
+        for path in write(tuned, folder, picture):
+            out.print(f"written: {path}", highlight=False, soft_wrap=True)
+    if not tuned.converged:
+        raise typer.Exit(NOT_CONVERGED)
+
+
+def _tell_tuned(tuned: "Tuned") -> None:
+    table = Table(title="Tuned gait", title_justify="left", show_header=False, box=None)
+    for name, text in tuned.lines().items():
+        table.add_row(f"[bold]{name}[/]", _escaped(text))
+    out.print(table)
 
 
 @contextlib.contextmanager
