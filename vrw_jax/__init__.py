@@ -1,5 +1,9 @@
 """Differentiable, batched simulation of the passive viscoelastic-legged rimless wheel."""
 
+from vrw_jax.arclength import ArclengthOptions
+from vrw_jax.basin import basin
+from vrw_jax.branch import Border, Branch
+from vrw_jax.continuation import continue_branch, continue_branches, continue_map
 from vrw_jax.cycle_options import CycleOptions
 from vrw_jax.designs import grid, samples, sobol, uniform
 from vrw_jax.limit_cycle import LimitCycle, limit_cycle
@@ -25,6 +29,9 @@ from vrw_jax.tune import Tuned, tune
 
 __all__ = [
     "AbstractWheel",
+    "ArclengthOptions",
+    "Border",
+    "Branch",
     "CycleOptions",
     "EnergyLoss",
     "Indicators",
@@ -39,6 +46,10 @@ __all__ = [
     "ViscoelasticWheel",
     "Walk",
     "WheelParams",
+    "basin",
+    "continue_branch",
+    "continue_branches",
+    "continue_map",
     "grid",
     "limit_cycle",
     "newton_cycle",
