@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import truth
+
 import vrw_jax as vrw
 
 SIZE = 16

@@ -1,7 +1,7 @@
 """What repeats: one step, the return map, a walk of many steps.
 
-These are the edges where code is compiled: everything below is pure and single-wheel, and works
-under `jit`, `vmap` and every mode of differentiation.
+Everything here is pure and single-wheel, and works under `jit`, `vmap` and every mode of
+differentiation. A model compiles its own step once.
 """
 
 from collections.abc import Sequence
@@ -62,20 +62,6 @@ def checked(
     return jax.tree.map(convert, params), convert(state), model, jax.tree.map(convert, options)
 
 
-@eqx.filter_jit
-def _step(
-    model: AbstractWheel, params: WheelParams, x: SectionState, options: Options
-) -> StepResult:
-    return model.step(params, x, options)
-
-
-@eqx.filter_jit
-def _advance(
-    model: AbstractWheel, params: WheelParams, x: SectionState, options: Options
-) -> Advance:
-    return model.advance(params, x, options)
-
-
 def step(
     params: WheelParams,
     x: SectionLike,
@@ -90,7 +76,7 @@ def step(
     options and 1e-12 at `Options.tight()`, for values and first derivatives.
     """
     params, state, model, options = checked(params, x, model, options)
-    return _step(model, params, state, options)
+    return model.step(params, state, options)
 
 
 def return_map(
@@ -105,7 +91,7 @@ def return_map(
     The lean path: no monitors are computed. Differentiable forwards and in reverse, to any order.
     """
     params, state, model, options = checked(params, x, model, options)
-    return _advance(model, params, state, options).section_state
+    return model.advance(params, state, options).section_state
 
 
 class Walk(eqx.Module):

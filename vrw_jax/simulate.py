@@ -22,7 +22,7 @@ from vrw_jax.models.base import SectionState
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
 from vrw_jax.params import PARAMETER_NAMES, WheelParams
-from vrw_jax.return_map import _advance, checked
+from vrw_jax.return_map import checked
 
 
 @eqx.filter_jit
@@ -92,7 +92,7 @@ def simulate(
     parts: list[dict[str, np.ndarray]] = []
     start, outcome, stepped, time, foot = x, Outcome.STEPPED, 0, 0.0, 0.0
     while outcome == Outcome.STEPPED and stepped < n_steps:
-        advance = _advance(model, params, x, options)
+        advance = model.advance(params, x, options)
         columns = jax.tree.map(np.asarray, _columns(model, params, x, options, n_samples))
         outcome = Outcome(int(advance.outcome))
         durations = np.asarray(advance.durations)

@@ -115,7 +115,10 @@ class Trajectory(eqx.Module):
 
 
 class AbstractWheel(eqx.Module):
-    """A rung of the model ladder. Rungs are final; the code above knows this face alone."""
+    """A rung of the model ladder. Rungs are final; the code above knows this face alone.
+
+    `advance` and `step` compile themselves, once for each structure of their arguments.
+    """
 
     @abc.abstractmethod
     def advance(self, params: WheelParams, x: SectionState, options: Options) -> Advance:

@@ -1,7 +1,5 @@
 """The lowest rung: all legs rigid. A step is a closed formula; nothing is integrated."""
 
-from collections.abc import Callable
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -26,8 +24,8 @@ from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
 from vrw_jax.params import Scalar, Symbols, WheelParams
 
-GRID = 65
-"""Angles at which a force is looked at before its minimum is polished: smooth over 45 degrees."""
+GRID = 33
+"""Angles in each zoom on a force's minimum: forces are smooth over the 45 degrees of a step."""
 
 
 class RigidWheel(AbstractWheel):
@@ -66,22 +64,22 @@ class RigidWheel(AbstractWheel):
         M = dynamics.mass_matrix(s, m.L1, m.L2)
         return M.times((m.dtheta, m.dL1, m.dL2))[0] / foot_inertia
 
+    @eqx.filter_jit
     def step(self, params: WheelParams, x: SectionState, options: Options) -> StepResult:
         x = jnp.stack([0.5 * params.leg_angle + 0.0 * x[0], x[1], 0.0 * x[2]])
         good = usable(params, x)
         safe_x = jnp.asarray([0.5 * params.leg_angle, 1.0, 0.0])
         params, x = replaced_where_bad(good, params, x, safe_x)
         s = params.symbols()
-        half = 0.5 * s.alpha
+        half = jnp.asarray(0.5 * s.alpha, x.dtype)
         before = x[1]
         rate = self._kept(s) * before
         roll = _Roll(s, rate)
 
         apex = jnp.where(s.sin_phi < jnp.sin(half), jnp.arcsin(-s.sin_phi), -half)
         passes = roll.rate_squared(apex) > 0.0
-        angles = jnp.linspace(-half, half, GRID)
-        force = roll.lowest(lambda theta: roll.foot_force(theta).normal, angles)
-        lifts = (force <= 0.0) & passes & self.stop_at_lift_off
+        lowest = roll.lowest_premises()
+        lifts = (lowest[0] <= 0.0) & passes & self.stop_at_lift_off
         outcome = jnp.where(passes, Outcome.STEPPED, Outcome.FELL_BACK).astype(jnp.int32)
         outcome = jnp.where(lifts, jnp.int32(Outcome.LEG_1_LIFTED_OFF), outcome)
         outcome = jnp.where(good, outcome, jnp.int32(Outcome.BAD_INPUT))
@@ -95,21 +93,15 @@ class RigidWheel(AbstractWheel):
         walked = lambda value: jnp.where(stepped, value, jnp.zeros_like(value))
         first = roll.motion(-half + zero)
         landing = transitions.land(s, *x)
-        hub_jump = tuple(
-            a - b
-            for a, b in zip(
-                transitions.hub_velocity(first),
-                transitions.hub_velocity(transitions.motion_before_landing(s, *x)),
-                strict=True,
-            )
-        )
+        hub_after = transitions.hub_velocity(first)
+        hub_before = transitions.hub_velocity(transitions.motion_before_landing(s, *x))
+        hub_jump = (hub_after[0] - hub_before[0], hub_after[1] - hub_before[1])
         # Impulse at the fore foot: the jump of total momentum Mt v_hub (the mass centre).
         rear = landing.rear if self.held_landing else dynamics.FootForce(zero, zero)
         fore = dynamics.FootForce(
             s.Mt * hub_jump[0] - rear.tangential, s.Mt * hub_jump[1] - rear.normal
         )
         locked = range(3, s.n + 1)
-        lowest = lambda quantity: walked(roll.lowest(quantity, angles))
         needed = dynamics.friction_needed
         foot_2 = lambda theta: rear_foot_height(s, roll.motion(theta))
         return StepResult(
@@ -123,16 +115,13 @@ class RigidWheel(AbstractWheel):
                 lambda_4=zero,
             ),
             monitors=Margins(
-                fore_foot_force=walked(force),
+                fore_foot_force=walked(lowest[0]),
                 clearance_sls1=zero,
                 clearance_sls2=walked(foot_2(half + zero)),
-                locked_stopper_force=lowest(lambda theta: roll.stopper_force(theta, locked)),
-                rear_stopper_force=lowest(lambda theta: roll.stopper_force(theta, range(2, 3)))[0],
+                locked_stopper_force=walked(lowest[3:]),
+                rear_stopper_force=walked(lowest[2]),
                 contraction=zero,
-                friction_fore=walked(
-                    self.friction
-                    + roll.lowest(lambda theta: -needed(roll.foot_force(theta)), angles)
-                ),
+                friction_fore=walked(self.friction + lowest[1]),
                 friction_rear=tell(self.friction + zero),
                 landing_stopper_impulse=tell(
                     transitions.locked_leg_impulses(s, first, hub_jump, locked)
@@ -183,13 +172,13 @@ class _Roll(eqx.Module):
     s: Symbols
     rate: Scalar  # at theta = -alpha/2, rad/s
 
-    def rate_squared(self, theta: Scalar | float) -> Scalar:
+    def rate_squared(self, theta: Scalar) -> Scalar:
         """Square of dtheta at theta; negative where the wheel does not get."""
         s = self.s
         fallen = _cos_sum(s, -0.5 * s.alpha) - _cos_sum(s, theta)
         return self.rate**2 + 2.0 * _stiffness_of_gravity(s) * fallen
 
-    def time(self, theta: Scalar | float) -> Scalar:
+    def time(self, theta: Scalar) -> Scalar:
         """Time from theta = -alpha/2, s, by Carlson's R_F.
 
         With t = sin^2 of half the angle from the vertical the rate is a square root of a linear
@@ -211,7 +200,7 @@ class _Roll(eqx.Module):
         first = _cubic_time(from_vertical, jnp.where(apart, begin**2, 0.0), least, kappa)
         return direct + first
 
-    def motion(self, theta: Scalar | float) -> Motion:
+    def motion(self, theta: Scalar) -> Motion:
         """Posture and rates at theta."""
         zero = 0.0 * theta
         speed_squared = self.rate_squared(theta)
@@ -220,13 +209,13 @@ class _Roll(eqx.Module):
         length = self.s.L0 + zero
         return Motion.of(theta, length, length, rate, zero, zero)
 
-    def acceleration(self, theta: Scalar | float) -> dynamics.Acceleration:
+    def acceleration(self, theta: Scalar) -> dynamics.Acceleration:
         """Angular acceleration under gravity; the legs don't move."""
         zero = 0.0 * theta
         sin_p = jnp.sin(theta) * self.s.cos_phi + jnp.cos(theta) * self.s.sin_phi
         return dynamics.Acceleration(_stiffness_of_gravity(self.s) * sin_p, zero, zero)
 
-    def foot_force(self, theta: Scalar | float) -> dynamics.FootForce:
+    def foot_force(self, theta: Scalar) -> dynamics.FootForce:
         """Force of the ground on the standing foot, N."""
         return dynamics.fore_foot_force(self.s, self.motion(theta), self.acceleration(theta))
 
@@ -234,30 +223,34 @@ class _Roll(eqx.Module):
         """Force of the stoppers of `legs`, N."""
         return dynamics.stopper_force(self.s, self.motion(theta), self.acceleration(theta), legs)
 
-    def lowest(self, quantity: Callable[[Scalar], Array], angles: Array) -> Array:
-        """Minimum of a smooth quantity over the given angles, polished by Newton's method."""
-        values = jax.vmap(quantity)(angles)
-        flat = values.reshape(values.shape[0], -1)
-        start = angles[jnp.argmin(flat, axis=0)]
-        pick = lambda theta, index: quantity(theta).reshape(-1)[index]
-        slope = jax.grad(pick)
-        spacing = angles[1] - angles[0]
+    def premises(self, theta: Scalar) -> Float[Array, " n_premises"]:
+        """Normal force, minus friction needed, stopper forces of legs 2..n at theta."""
+        force = self.foot_force(theta)
+        stoppers = self.stopper_force(theta, range(2, self.s.n + 1))
+        return jnp.concatenate(
+            [jnp.stack([force.normal, -dynamics.friction_needed(force)]), stoppers]
+        )
 
-        def polish(theta: Scalar, index: Array) -> Scalar:
-            low = jnp.maximum(theta - spacing, angles[0])
-            high = jnp.minimum(theta + spacing, angles[-1])
+    def lowest_premises(self) -> Array:
+        """Minima of `premises` from landing to landing, to round-off.
 
-            def newton(_: object, at: Scalar) -> Scalar:
-                curvature = jax.grad(slope)(at, index)
-                bends = curvature > 0.0
-                change = slope(at, index) / jnp.where(bends, curvature, 1.0)
-                return jnp.clip(jnp.where(bends, at - change, at), low, high)
+        Each is zoomed in on twice; what is left of the angle's error counts squared.
+        """
+        half = jnp.asarray(0.5 * self.s.alpha, self.rate.dtype)
+        spread = jnp.linspace(-1.0, 1.0, GRID)
 
-            at = lax.fori_loop(0, 5, newton, theta)
-            return jnp.minimum(pick(lax.stop_gradient(at), index), pick(theta, index))
+        def lowest(index: Array) -> Scalar:
+            def zoom(carry: tuple[Scalar, Scalar], _round: None) -> tuple:
+                center, width = carry
+                angles = jnp.clip(center + width * spread, -half, half)
+                values = jax.vmap(lambda theta: self.premises(theta)[index])(angles)
+                return (angles[jnp.argmin(values)], width * 2.5 / GRID), None
 
-        polished = jax.vmap(polish)(start, jnp.arange(flat.shape[1]))
-        return polished.reshape(values.shape[1:])
+            start = (0.0 * self.rate, half + 0.0 * self.rate)
+            (theta, _), _ = lax.scan(zoom, start, None, length=5)
+            return self.premises(lax.stop_gradient(theta))[index]
+
+        return jax.vmap(lowest)(jnp.arange(2 + self.s.n - 1))
 
 
 def _hub_inertia(s: Symbols) -> Scalar:

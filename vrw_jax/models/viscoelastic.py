@@ -1,5 +1,6 @@
 """The paper's wheel: landing, double support, single support I, stopper, single support II."""
 
+import functools
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax import dynamics, transitions
-from vrw_jax.derivatives import any_mode
+from vrw_jax.derivatives import Forward, any_mode
 from vrw_jax.geometry import (
     Motion,
     double_support_motion,
@@ -224,35 +225,12 @@ class ViscoelasticWheel(AbstractWheel):
         return jnp.asarray(PAPER_START, params.damping.dtype)
 
     def advance(self, params: WheelParams, x: SectionState, options: Options) -> Advance:
-        def lean(walked: _Walked) -> Advance:
-            durations = jnp.stack([end.duration for end in walked.ends])
-            return Advance(_section_state(walked), durations, walked.outcome, _tried(walked))
-
-        return self._differentiable(lean, params, x, options, monitored=False)
+        leaves, structure = jax.tree.flatten((params, x, options))
+        return eqx.combine(*_compiled(self, structure, False)(*leaves))
 
     def step(self, params: WheelParams, x: SectionState, options: Options) -> StepResult:
-        full = lambda walked: _result(walked, self.friction)
-        return self._differentiable(full, params, x, options, monitored=True)
-
-    def _differentiable(
-        self,
-        read: Callable[[_Walked], Any],
-        params: WheelParams,
-        x: SectionState,
-        options: Options,
-        monitored: bool,
-    ) -> Any:
-        """What `read` says of the step, with derivatives in any mode and to any order."""
         leaves, structure = jax.tree.flatten((params, x, options))
-
-        def walk(tighten: bool, *leaves: Array) -> tuple:
-            params, x, options = jax.tree.unflatten(structure, leaves)
-            options = options.for_derivatives() if tighten else options
-            result = read(self._walk(params, x, options, monitored))
-            return eqx.partition(result, eqx.is_inexact_array)
-
-        floats, integers = any_mode(partial(walk, False), partial(walk, True))(*leaves)
-        return eqx.combine(floats, integers)
+        return eqx.combine(*_compiled(self, structure, True)(*leaves))
 
     def trace(
         self, params: WheelParams, x: SectionState, options: Options, n_samples: int
@@ -341,6 +319,25 @@ class ViscoelasticWheel(AbstractWheel):
 
 SAFE_SINGLE_SUPPORT = (-0.3, 0.9, 0.95, 1.0, 0.0, 0.0)
 """A harmless posture that stands in where a lane has already failed; it is never integrated."""
+
+
+@functools.cache
+def _compiled(model: ViscoelasticWheel, structure: Any, full: bool) -> Forward:
+    """A step over the leaves of (params, x, options): compiled, and differentiable in any mode."""
+
+    def walk(tighten: bool, *leaves: Array) -> tuple:
+        params, x, options = jax.tree.unflatten(structure, leaves)
+        options = options.for_derivatives() if tighten else options
+        walked = model._walk(params, x, options, monitored=full)
+        result = _result(walked, model.friction) if full else _lean_result(walked)
+        return eqx.partition(result, eqx.is_inexact_array)
+
+    return any_mode(partial(walk, False), partial(walk, True))
+
+
+def _lean_result(walked: _Walked) -> Advance:
+    durations = jnp.stack([end.duration for end in walked.ends])
+    return Advance(_section_state(walked), durations, walked.outcome, _tried(walked))
 
 
 def _tried(walked: _Walked) -> Int[Array, ""]:
