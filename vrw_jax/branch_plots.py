@@ -26,9 +26,9 @@ COLOURS = {
 ENDS = "#D55E00"
 
 TEXTS = {
-    "lambda_I4": "λ_I4 = 0",
-    "lambda_2_plus": "λ2⁺ = 0: fore foot would pull",
-    "lambda_4_plus": "λ4⁺ = 0: rear foot lifts at once",
+    "lambda_I4": "$\\lambda_{I4}$ = 0: rear foot is freed by the landing",
+    "lambda_2_plus": "$\\lambda_2^+$ = 0: fore foot would pull",
+    "lambda_4_plus": "$\\lambda_4^+$ = 0: rear foot lifts at once",
     "clearance_sls1": "foot 2 scuffs as it takes off",
     "clearance_sls2": "foot 2 below ground at collision II",
     "fore_foot_force": "fore foot pulls",
@@ -98,7 +98,7 @@ def branch_figure(branch: Branch) -> Figure:
             axes.text(-0.12, 1.02, f"({letter})", transform=axes.transAxes, ha="right", va="bottom")
             for name, colour in series:
                 scale = 1e3 if name == "clearance_sls1" else 1.0
-                columns = [scale * data[name].values]
+                columns = [_broken(name, scale * data[name].values)]
                 if name == "spectral_radius":
                     columns = list(np.abs(branch.multipliers).T)
                 for column in columns:
@@ -112,8 +112,9 @@ def branch_figure(branch: Branch) -> Figure:
         panels[0, 1].set_ylim(0.0, None)
         panels[1, 0].axhline(0.0, color=GREY, linewidth=0.5)
         panels[1, 1].axhline(0.0, color=GREY, linewidth=0.5)
-        for (name, colour), place in zip(PANELS[2], ((0.6, 0.16), (0.6, 0.86)), strict=True):
-            panels[1, 0].text(*place, NAMES[name], color=colour, transform=panels[1, 0].transAxes)
+        for name, colour in PANELS[2]:
+            panels[1, 0].plot([], [], color=colour, label=NAMES[name])
+        panels[1, 0].legend(loc="center left")
         clearance = 1e3 * data.clearance_sls1.values
         panels[1, 1].set_yscale("symlog", linthresh=0.1)
         panels[1, 1].set_ylim(2.0 * min(clearance.min(), -0.1), 2.0 * max(clearance.max(), 0.1))
@@ -121,6 +122,14 @@ def branch_figure(branch: Branch) -> Figure:
             axes.set_xlabel(_axis(branch.parameter))
         _name_borders(figure, borders, _unit(branch.parameter))
     return figure
+
+
+def _broken(name: str, values: np.ndarray) -> np.ndarray:
+    """A clearance with a gap where it jumps: as the dip at take-off vanishes, the end counts."""
+    if name.startswith("clearance"):
+        values = values.copy()
+        values[1:][values[:-1] * values[1:] < 0.0] = np.nan
+    return values
 
 
 def _axis(name: str) -> str:

@@ -74,9 +74,12 @@ def root(
 
       [cyan]vrw tune configs/tune_dls.toml[/cyan]        the most double support without scuffing
 
+      [cyan]vrw continue configs/branch_damping.toml[/cyan]   a branch of gaits and its borders
+
     [bold]What is written[/bold]   gait: nothing. reproduce: figures and tables into its folder.
     scan: scan.zarr (open it with vrw_jax.open_scan or xarray.open_zarr) and pictures, PNG and SVG.
-    tune: path.zarr, a picture, summary.md, and wheel.toml, which vrw gait walks.
+    tune: path.zarr, a picture, summary.md, and wheel.toml, which vrw gait walks. continue:
+    branch.zarr, borders.csv, a picture and summary.md.
 
     The first run of a command compiles for a while; the code is kept in a cache folder of yours
     (JAX_COMPILATION_CACHE_DIR names another), and later runs start quickly. Angles are in rad, all
@@ -242,6 +245,62 @@ def _tell_tuned(tuned: "Tuned") -> None:
     for name, text in tuned.lines().items():
         table.add_row(f"[bold]{name}[/]", _escaped(text))
     out.print(table)
+
+
+@app.command("continue")
+def continue_(
+    config: Annotated[Path, typer.Argument(help="TOML file with a table [branch].")],
+    folder: Annotated[
+        Path | None,
+        typer.Option("--out", help="Folder for the result; results/NAME of the config by default."),
+    ] = None,
+    picture: Annotated[bool, typer.Option(help="Draw the result.")] = True,
+) -> None:
+    """Follow a branch of gaits along a parameter, stable or not, and locate every border on it.
+
+    Writes branch.zarr (open it with xarray.open_zarr), borders.csv, summary.md and pictures (PNG
+    and SVG) into the folder. Exit code 1 if there is no limit cycle to start from.
+
+    [bold]Examples[/bold]
+
+      vrw continue configs/branch_damping.toml
+
+      vrw continue configs/branch_damping.toml --out results/along_c --no-picture
+    """
+    with _sentences():
+        settings = _config(config)
+        asked = settings.branch
+        if asked is None:
+            raise ValueError(
+                f"{settings.name} names no branch, but continuation needs a parameter and bounds: "
+                "add a table [branch], as in configs/branch_damping.toml."
+            )
+        folder = Path("results") / config.stem if folder is None else folder
+        folder.mkdir(parents=True, exist_ok=True)
+        from vrw_jax.arclength import ArclengthOptions
+        from vrw_jax.continuation import continue_branch
+
+        options = ArclengthOptions()
+        if asked.largest_step is not None:
+            first = min(options.first_step, asked.largest_step)
+            options = ArclengthOptions(first_step=first, largest_step=asked.largest_step)
+        with err.status("following the branch (the first time compiles for a while)"):
+            branch = continue_branch(
+                settings.params(),
+                asked.parameter,
+                asked.bounds,
+                period_n=asked.period,
+                model=settings.wheel_model(),
+                options=options,
+            )
+    out.print(_escaped(str(branch)), highlight=False)
+    from vrw_jax.branch_report import write
+
+    with _sentences():
+        for path in write(branch, folder, picture):
+            out.print(f"written: {path}", highlight=False, soft_wrap=True)
+    if not branch.values.size:
+        raise typer.Exit(NOT_CONVERGED)
 
 
 @contextlib.contextmanager

@@ -21,7 +21,7 @@ from vrw_jax.scan_measures import check_measures
 from vrw_jax.wording import nearest
 
 DESIGNS = ("grid", "samples", "sobol", "uniform")
-TABLES = ("wheel", "model", "options", "gait", "scan", "tune", *DESIGNS)
+TABLES = ("wheel", "model", "options", "gait", "scan", "tune", "branch", *DESIGNS)
 _MODEL_KEYS = ("friction", "stop_at_lift_off")
 _OPTION_KEYS = tuple(Options.__dataclass_fields__)
 _AXIS_KEYS = ("from", "to", "count")
@@ -61,6 +61,16 @@ class TuneConfig:
 
 
 @dataclass(frozen=True)
+class BranchConfig:
+    """Table `[branch]`: along which parameter gaits are followed, and within what."""
+
+    parameter: str
+    bounds: tuple[float, float]
+    period: int = 1  # steps until the gait repeats
+    largest_step: float | None = None  # share of the range; None: the continuation's default
+
+
+@dataclass(frozen=True)
 class Config:
     """A config as checked values, with the text that it was read from."""
 
@@ -70,6 +80,7 @@ class Config:
     scan: ScanConfig = ScanConfig()
     gait: GaitConfig = GaitConfig()
     tune: TuneConfig | None = None
+    branch: BranchConfig | None = None
     design: designs.AbstractDesign | None = None
     text: str = ""
     name: str = ""
@@ -151,6 +162,7 @@ def _config(tables: Mapping[str, object], text: str, name: str) -> Config:
         scan=_scan(_table(tables, "scan")),
         gait=_gait(_table(tables, "gait")),
         tune=_tune(_table(tables, "tune")) if "tune" in tables else None,
+        branch=_branch(_table(tables, "branch")) if "branch" in tables else None,
         design=design,
         text=text,
         name=name,
@@ -283,6 +295,31 @@ def _tune(table: Mapping[str, object]) -> TuneConfig:
     )
 
 
+def _branch(table: Mapping[str, object]) -> BranchConfig:
+    _only(table, BranchConfig.__dataclass_fields__, "[branch]", "settings")
+    parameter = table.get("parameter")
+    if not isinstance(parameter, str) or parameter not in PARAMETER_NAMES:
+        near = nearest(parameter, PARAMETER_NAMES) if isinstance(parameter, str) else ""
+        raise ConfigError(
+            f"parameter is {_shown(parameter)}{near}, but a branch runs along one of "
+            f'{", ".join(PARAMETER_NAMES)}: write parameter = "damping".'
+        )
+    if "bounds" not in table:
+        raise ConfigError("[branch] has no bounds: write bounds = [4.0, 230.0], say.")
+    lower, upper = _range("bounds of " + parameter, table["bounds"], parameter)
+    if not lower < upper:
+        raise ConfigError(
+            f"bounds are [{lower:g}, {upper:g}], but the lower must come first: swap them."
+        )
+    step = table.get("largest_step")
+    return BranchConfig(
+        parameter=parameter,
+        bounds=(lower, upper),
+        period=_whole(table.get("period", BranchConfig.period), "period", 1),
+        largest_step=None if step is None else _number(step, "largest_step", positive=True),
+    )
+
+
 def _design(kind: str, table: Mapping[str, object]) -> designs.AbstractDesign:
     own = ("n", "seed") if kind in ("sobol", "uniform") else ()
     _only(table, (*own, *PARAMETER_NAMES), f"[{kind}]", "settings")
@@ -329,13 +366,14 @@ def _list(name: str, value: object, otherwise: str = "") -> np.ndarray:
     return np.asarray([_in_domain(name, item) for item in value])
 
 
-def _range(name: str, value: object) -> tuple[float, float]:
+def _range(name: str, value: object, parameter: str = "") -> tuple[float, float]:
+    """Two values in the domain of `parameter`, `name` itself if not given."""
     if not (isinstance(value, list) and len(value) == 2):
         raise ConfigError(
             f"{name} is {_shown(value)}, but it must be a range of two numbers: "
             f"write {name} = [lower, upper]."
         )
-    lower, upper = (_in_domain(name, item) for item in value)
+    lower, upper = (_in_domain(parameter or name, item) for item in value)
     return lower, upper
 
 
