@@ -46,16 +46,19 @@ class Domain(NamedTuple):
         return f"{bracket}{self.lower:g}, {self.upper:g}){unit}"
 
 
+SMALLEST, LARGEST = 1e-15, 1e9
+"""Where SI numbers of a wheel end: beyond them, products overflow instead of telling something."""
+
 DOMAINS: dict[str, Domain] = {
-    "hub_mass": Domain("m_H", "kg", 0.0, math.inf, True, "mass of the body frame"),
-    "leg_mass": Domain("m", "kg", 0.0, math.inf, False, "mass of one leg frame, a point"),
-    "leg_com": Domain("a", "m", 0.0, math.inf, True, "distance from foot to the leg's mass"),
-    "locked_length": Domain("L_0", "m", 0.0, math.inf, False, "length of a leg on its stopper"),
-    "natural_length": Domain("L*", "m", 0.0, math.inf, False, "length of the spring without load"),
-    "stiffness": Domain("k", "N/m", 0.0, math.inf, True, "spring constant of each leg"),
-    "damping": Domain("c", "N s/m", 0.0, math.inf, True, "viscous damping of each leg"),
+    "hub_mass": Domain("m_H", "kg", 0.0, LARGEST, True, "mass of the body frame"),
+    "leg_mass": Domain("m", "kg", SMALLEST, LARGEST, True, "mass of one leg frame, a point"),
+    "leg_com": Domain("a", "m", 0.0, LARGEST, True, "distance from foot to the leg's mass"),
+    "locked_length": Domain("L_0", "m", SMALLEST, LARGEST, True, "length of a leg on its stopper"),
+    "natural_length": Domain("L*", "m", SMALLEST, LARGEST, True, "length of the spring without load"),
+    "stiffness": Domain("k", "N/m", 0.0, LARGEST, True, "spring constant of each leg"),
+    "damping": Domain("c", "N s/m", 0.0, LARGEST, True, "viscous damping of each leg"),
     "slope": Domain("phi", "rad", -math.pi / 2, math.pi / 2, False, "downhill slope"),
-    "gravity": Domain("g", "m/s^2", 0.0, math.inf, False, "gravitational acceleration"),
+    "gravity": Domain("g", "m/s^2", SMALLEST, LARGEST, True, "gravitational acceleration"),
 }
 """Every float parameter of `WheelParams`, in the order of its fields."""
 

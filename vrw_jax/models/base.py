@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from vrw_jax.options import Options
-from vrw_jax.params import Scalar, WheelParams
+from vrw_jax.params import LARGEST, Scalar, WheelParams
 
 SectionState = Float[Array, "3"]
 """(theta-, dtheta-, dL1-) just before touchdown, in the labels of the step that ends: rad, rad/s,
@@ -143,7 +143,8 @@ def usable(params: WheelParams, x: SectionState) -> Array:
     """Whether parameters and start are finite, in their domains and rolling forward."""
     theta, dtheta = x[0], x[1]
     upright = (jnp.abs(theta) < 0.5 * jnp.pi) & (jnp.abs(theta - params.leg_angle) < 0.5 * jnp.pi)
-    return params.in_domain() & jnp.all(jnp.isfinite(x)) & upright & (dtheta > 0.0)
+    in_reach = jnp.all(jnp.abs(x) < LARGEST)  # False for NaN
+    return params.in_domain() & in_reach & upright & (dtheta > 0.0)
 
 
 def replaced_where_bad(
