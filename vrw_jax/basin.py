@@ -48,8 +48,8 @@ def basin(
     - `outcome`: STEPPED, or how it fell; BAD_INPUT where no landing leads to a state of `AFTER`;
     - `steps`: steps until it is within 1e-3 of the orbit for good, or until it fell.
 
-    The orbits stand in `orbit_state` over (attractor_index, orbit_step), the one with most starts first, with
-    their `orbit_period` in steps, DLS fraction and least margins.
+    The orbits stand in `orbit_state` over (attractor_index, orbit_step), the one with most starts
+    first, with their `orbit_period` in steps, DLS fraction and least margins.
     """
     model = ViscoelasticWheel() if model is None else model
     options = Options() if options is None else options

@@ -341,7 +341,7 @@ def run_all(
 
     def border(name: str, zero: _Zero, owner: int, ends_branch: bool) -> Border:
         beside = _taken(zero.beside, 0)
-        section = np.asarray(run.followed.section(beside.z))
+        section = np.asarray(run.followed.section(jax.tree.map(jnp.asarray, beside.z)))
         point = FixedPoint(section, float(beside.p), beside.jacobian)
         if name == IN_SEQUENCE:
             name = run.name_of_loss(pieces.table, zero.bracket[1])

@@ -35,7 +35,7 @@ from vrw_jax.models import AbstractWheel, ViscoelasticWheel
 from vrw_jax.multipliers import multipliers
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
-from vrw_jax.params import PARAMETER_NAMES, WheelParams
+from vrw_jax.params import PARAMETER_NAMES, WheelParams, as_float_array
 from vrw_jax.return_map import walk
 from vrw_jax.simulate import provenance
 
@@ -278,7 +278,7 @@ def _stability(jacobians: np.ndarray) -> dict[str, xr.Variable]:
 
 def continue_map(
     function: Callable[[Any, Array, Array], Array],
-    x: Array,
+    x: object,
     p: float,
     bounds: tuple[float, float],
     *,
@@ -306,7 +306,7 @@ def continue_map(
         lambda name: False,
     )
     (strand,) = run_all(
-        run, lead(jnp.asarray(x, float)), lead(p), np.array([True]), lambda owner, point: None
+        run, lead(as_float_array(x)), lead(p), np.array([True]), lambda owner, point: None
     )
     if strand is None:
         empty = xr.Dataset(coords={name: ("point", np.zeros(0))})

@@ -32,7 +32,7 @@ from vrw_jax.models import AbstractWheel
 from vrw_jax.models.base import SectionState
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
-from vrw_jax.params import PARAMETER_NAMES, Scalar, WheelParams
+from vrw_jax.params import PARAMETER_NAMES, Elementwise, Scalar, WheelParams
 
 
 class Wheel(NamedTuple):
@@ -176,7 +176,7 @@ class RungFollowed(AbstractFollowedWheel):
         return z, {}
 
 
-def with_parameter(params: WheelParams, name: str, value: Scalar) -> WheelParams:
+def with_parameter(params: WheelParams, name: str, value: Elementwise) -> WheelParams:
     """The same wheel with another value of one parameter; works on tracers."""
     return eqx.tree_at(lambda wheel: getattr(wheel, name), params, value)
 
