@@ -131,6 +131,18 @@ class LimitCycle(eqx.Module):
         """Whether there is a cycle."""
         return self.outcome == Outcome.STEPPED
 
+    def __repr__(self) -> str:
+        from vrw_jax import tables  # which imports this room
+
+        if not tables.is_concrete(self):
+            return eqx.tree_pformat(self)
+        return tables.as_text("LimitCycle", tables.cycle_rows(self))
+
+    def _repr_html_(self) -> str:
+        from vrw_jax import tables
+
+        return tables.as_html("Limit cycle", tables.cycle_rows(self))
+
 
 def _tangent_space(problem: Problem, parameters: Parameters, located: Located) -> Located:
     """d located / d parameters over lanes, with a leading axis; zero where nothing was found."""

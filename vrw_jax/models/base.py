@@ -91,6 +91,18 @@ class StepResult(eqx.Module):
         period = self.period
         return jnp.where(period > 0.0, self.step_length / jnp.where(period > 0.0, period, 1.0), 0.0)
 
+    def __repr__(self) -> str:
+        from vrw_jax import tables  # which imports this room
+
+        if not tables.is_concrete(self):
+            return eqx.tree_pformat(self)
+        return tables.as_text("StepResult", tables.step_rows(self))
+
+    def _repr_html_(self) -> str:
+        from vrw_jax import tables
+
+        return tables.as_html("Step", tables.step_rows(self))
+
 
 class Advance(eqx.Module):
     """The lean result of a step: what repeats."""
