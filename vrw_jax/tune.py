@@ -24,8 +24,7 @@ from vrw_jax.models import AbstractWheel, StepResult, ViscoelasticWheel
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
 from vrw_jax.params import DOMAINS, PARAMETER_NAMES, WheelParams
-from vrw_jax.premises import default_margins, measure
-from vrw_jax.return_map import step
+from vrw_jax.premises import TAKE_OFF, default_margins, measure
 from vrw_jax.simulate import provenance
 from vrw_jax.tune_engine import (
     READABLE,
@@ -37,7 +36,7 @@ from vrw_jax.tune_engine import (
     outcome_of,
     same_branch,
 )
-from vrw_jax.tune_search import Climb, Ending, Kind, Trial, climb, optimality, slack_scales
+from vrw_jax.tune_search import Climb, Ending, Kind, Trial, breach, climb, optimality, slack_scales
 from vrw_jax.wording import nearest
 
 Objective = str | Mapping[str, float] | Callable[..., Array]
@@ -62,7 +61,7 @@ class Walked(NamedTuple):
     kept: bool  # whether every step kept every constraint on a monitor, within 1e-3 of its scale
 
 
-DISPLACED, N_WALKED = 1e-5, 25
+DISPLACED, N_WALKED = 1e-5, 10
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,7 +137,7 @@ def tune(
     model: AbstractWheel | None = None,
     options: Options | None = None,
     cycle_options: CycleOptions | None = None,
-    tolerance: float = 1e-10,
+    tolerance: float = 1e-6,
     max_evaluations: int = 200,
 ) -> Tuned:
     """The wheel near `params` whose gait has the largest objective and keeps its constraints.
@@ -147,8 +146,9 @@ def tune(
     takes two arguments, of the StepResult from it); it is maximised. `free` parameters move within
     their `bounds`. `constraints`: least values of measures by name; names alone mean zero; the
     default is every premise that gaits of this rung can keep (`premises.default_margins`), {} is
-    none. `tolerance` is on the objective, relative to its gradient over the bounds. Local: it ends
-    at an optimum of the branch that `params` lies on.
+    none. `tolerance` is on the first-order condition, relative to the objective's gradient; a
+    constraint counts as kept within 1e-6 of what it changes over the bounds. Local: it ends at an
+    optimum of the branch that `params` lies on.
     """
     began = time.perf_counter()
     problem = tuning_problem(
@@ -307,7 +307,7 @@ class TuneProblem:
         cycle = np.array(gait.cycle.section_state)
         x, kept, outcome, walked = cycle * (1.0 + DISPLACED), True, Outcome.STEPPED, 0
         for _ in range(N_WALKED):
-            one = step(params, x, model=self.engine.model, options=self.engine.options)
+            one = self.engine.step(params, x)
             outcome = Outcome(int(one.outcome))
             if outcome != Outcome.STEPPED:
                 break
@@ -327,6 +327,7 @@ class TuneProblem:
         values = self.lower + u * self.widths
         least = self.least
         constraints = np.array([trial.slack + least for trial in done.trials])
+        scales = self.scales(done.trials[0])
         outcomes = [
             trial.outcome if trial.on_branch else Outcome.NO_CYCLE_FOUND for trial in done.trials
         ]
@@ -337,6 +338,11 @@ class TuneProblem:
             "objective": (along, [t.objective for t in done.trials], {"long_name": self.label}),
             "constraint_value": ((along, "constraint"), constraints.reshape(len(u), least.size)),
             "margin": ("constraint", least, {"long_name": "least value allowed"}),
+            "breach": (
+                along,
+                np.array([breach(trial, scales) for trial in done.trials]),
+                {"long_name": "largest breach of a constraint, in widths of the bounds"},
+            ),
             "kind": (along, np.array(done.kinds, int), flags(kind.name for kind in Kind)),
             "outcome": (along, np.array(outcomes, int), attrs_of("outcome")),
             "on_branch": (along, np.array([t.on_branch for t in done.trials])),
@@ -468,6 +474,8 @@ def _margins(params: WheelParams, constraints: Margins | None) -> dict[str, floa
     else:
         names = (constraints,) if isinstance(constraints, str) else constraints
         margins = dict.fromkeys(names, 0.0)
+    if "clearance_sls1" in margins:
+        margins.setdefault(TAKE_OFF.name, 0.0)  # which has a slope where the clearance has none
     for name, least in margins.items():
         _known(name, "a constraint")
         if not math.isfinite(least):

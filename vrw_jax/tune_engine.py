@@ -48,8 +48,18 @@ READABLE: tuple[str, ...] = (*OF_CYCLE, *OF_STEP)
 
 
 def read(name: str, cycle: LimitCycle, step: StepResult) -> Array:
-    """A measure by name; margins of the locked legs have one value for each leg."""
-    return OF_CYCLE[name](cycle) if name in OF_CYCLE else step_measures(step)[name]
+    """A measure by name; margins of the locked legs have one value for each leg.
+
+    The clearance in SLS-I is told as if a foot that scuffs at take-off rose: it would jump there
+    otherwise. Whoever reads it must look at `takeoff_acceleration` too.
+    """
+    if name in OF_CYCLE:
+        return OF_CYCLE[name](cycle)
+    measures = step_measures(step)
+    if name == "clearance_sls1":
+        scuffs = takeoff_acceleration(cycle) < 0.0
+        return jnp.where(scuffs, measures["clearance_sls2"], measures[name])
+    return measures[name]
 
 
 @dataclass(frozen=True)
@@ -196,6 +206,14 @@ class Engine:
         step, d_step = _step_and_columns(self.model, n_legs, parameters, x, dx, self.options)
         told = _values_and_columns(self.objective, self.constraints, cycle, d_cycle, step, d_step)
         return _gait(cycle, d_cycle, step, told)
+
+    def step(self, params: WheelParams, x: np.ndarray) -> StepResult:
+        """One step by the function that is compiled already, with its derivatives thrown away."""
+        parameters, start = parameters_of(params), jnp.asarray(x)
+        still = jnp.zeros((parameters.shape[0], start.shape[0]), start.dtype)
+        return _step_and_columns(self.model, params.n_legs, parameters, start, still, self.options)[
+            0
+        ]
 
     def batch(self, parameters: Array, guess: Located) -> Gait:
         """The gaits of many wheels side by side; every array gains a leading axis."""

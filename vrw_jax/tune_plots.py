@@ -7,10 +7,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from vrw_jax.measures import MEASURES
-from vrw_jax.plots import GREY, LIGHT, PAGE, label, style
+from vrw_jax.plots import GREY, LIGHT, PAGE, style
 from vrw_jax.premises import measure
 from vrw_jax.tune import Tuned
-from vrw_jax.tune_search import Kind
+from vrw_jax.tune_search import ACTIVE, Kind
 
 ROW = 0.19
 """Height of a constraint's row, inches."""
@@ -36,18 +36,12 @@ def tuning(tuned: Tuned) -> Figure:
     return figure
 
 
-def _kept(path: xr.Dataset) -> np.ndarray:
-    """Evaluations that keep every constraint, within a thousandth of its value."""
-    value, margin = path.constraint_value.values, path.margin.values
-    return np.all(value >= margin - 1e-3 * np.abs(margin) - 1e-6 * np.abs(value), axis=1)
-
-
 def _objective(axes: Axes, path: xr.Dataset) -> None:
     number, value = path.evaluation.values, path.objective.values
     lost = path.kind.values == Kind.LOST
     axes.plot(number[~lost], value[~lost], color=GREY, linewidth=0.7, zorder=1)
     for kept, fill in ((True, "#0072B2"), (False, "white")):
-        chosen = ~lost & (_kept(path) == kept)
+        chosen = ~lost & ((path.breach.values <= ACTIVE) == kept)
         axes.plot(
             number[chosen],
             value[chosen],
@@ -65,7 +59,10 @@ def _objective(axes: Axes, path: xr.Dataset) -> None:
                 label="gait lost, step shortened" if i == 0 else None,
             )  # fmt: skip
     name = path.objective.attrs["long_name"]
-    axes.set_ylabel(label(name) if name in MEASURES else name)
+    if name in MEASURES:
+        unit = MEASURES[name].unit
+        name = MEASURES[name].long_name + (f" [{unit}]" if unit != "1" else "")
+    axes.set_ylabel(name)
     axes.legend(loc="best", fontsize=7.0)
 
 
@@ -115,7 +112,8 @@ def _slack(axes: Axes, tuned: Tuned) -> None:
     texts = []
     for name in names:
         plain, _, leg = name.partition("[")
-        texts.append(f"{measure(plain).long_name}{', ' + leg[:-1] if leg else ''}")
+        long_name = measure(plain).long_name.replace("⁺", "$^+$")
+        texts.append(f"{long_name}{', ' + leg[:-1] if leg else ''}")
     axes.set_yticks(places, texts, fontsize=7.0)
     for tick, name in zip(axes.get_yticklabels(), names, strict=True):
         if name in held:

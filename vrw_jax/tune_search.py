@@ -84,8 +84,17 @@ class _SpentError(Exception):
     pass
 
 
-FIRST_RADIUS, SMALLEST_RADIUS = 0.3, 1e-7
-"""Half the side of the first box, and the one at which a border counts as reached."""
+class _ArrivedError(Exception):
+    def __init__(self, trial: Trial) -> None:
+        self.trial = trial
+
+
+WHOLE, SMALLEST_RADIUS = 1.0, 1e-7
+"""Half the side of a box that holds all bounds, and of one at which a border counts as reached."""
+
+LOOSE, STALLED = 1e-3, 1e-10
+"""Relative change of the objective at which SLSQP stops by itself: in a smaller box, whose optimum
+is only a place to go on from, and in the whole one, where gaits are known no better."""
 
 ACTIVE = 1e-6
 """Slack of an active constraint, in widths of the bounds."""
@@ -134,7 +143,13 @@ def climb(evaluate: Evaluate, start: Trial, *, tolerance: float, max_evaluations
     record = _Record(evaluate, start, max_evaluations)
     size = max(float(np.linalg.norm(start.gradient)), 1e-12)
     scales = slack_scales(start)
-    centre, radius = start, FIRST_RADIUS
+
+    def arrive(trial: Trial) -> Trial:
+        if breach(trial, scales) <= ACTIVE and optimality(trial).residual <= tolerance:
+            raise _ArrivedError(trial)
+        return trial
+
+    centre, radius = start, WHOLE
     ending = Ending.CONVERGED
     while True:
         low, high = np.maximum(centre.u - radius, 0.0), np.minimum(centre.u + radius, 1.0)
@@ -151,8 +166,8 @@ def climb(evaluate: Evaluate, start: Trial, *, tolerance: float, max_evaluations
                     "jac": lambda u: record.at(u).slopes / scales[:, None],
                 },
                 method="SLSQP",
-                options={"ftol": tolerance, "maxiter": 100},
-                callback=lambda u, seen=iterates: seen.append(record.iterate(u)),
+                options={"ftol": STALLED if radius >= WHOLE else LOOSE, "maxiter": 100},
+                callback=lambda u, seen=iterates: seen.append(arrive(record.iterate(u))),
             )
             reached = record.iterate(np.clip(result.x, low, high))
         except _LostError as lost:
@@ -162,18 +177,21 @@ def climb(evaluate: Evaluate, start: Trial, *, tolerance: float, max_evaluations
                 ending = Ending.AT_A_BORDER
                 break
             continue
+        except _ArrivedError as arrived:
+            centre = arrived.trial
+            break
         except _SpentError:
             ending = Ending.OUT_OF_EVALUATIONS
             break
         at_wall = (reached.u <= low + 1e-9) & (low > 0.0)
         at_wall |= (reached.u >= high - 1e-9) & (high < 1.0)
         centre = reached
-        if not at_wall.any() and (result.success or radius >= 1.0):
+        if radius >= WHOLE:
             break
-        radius = min(2.0 * radius, 1.0)
-    best = _best(record, scales, centre)
-    if _violation(best, scales) > ACTIVE:
-        ending = Ending.NO_FEASIBLE_GAIT if ending == Ending.CONVERGED else ending
+        radius = min(2.0 * radius, WHOLE) if at_wall.any() else WHOLE
+    best = centre if ending == Ending.CONVERGED else _best(record, scales, centre)
+    if ending == Ending.CONVERGED and breach(best, scales) > 10.0 * ACTIVE:
+        best, ending = _best(record, scales, centre), Ending.NO_FEASIBLE_GAIT
     return Climb(best, ending, record.trials, record.kinds)
 
 
@@ -184,18 +202,18 @@ def slack_scales(trial: Trial) -> np.ndarray:
     return np.maximum(np.linalg.norm(trial.slopes, axis=1), 1e-3 * np.abs(trial.slack) + 1e-12)
 
 
-def _violation(trial: Trial, scales: np.ndarray) -> float:
-    """Largest breach of a constraint, in widths of the bounds; 0 if all are kept."""
+def breach(trial: Trial, scales: np.ndarray) -> float:
+    """Largest breach of a constraint, in widths of the bounds; 0 if all are kept, NaN if lost."""
     return float(np.max(-trial.slack / scales, initial=0.0))
 
 
 def _best(record: _Record, scales: np.ndarray, last: Trial) -> Trial:
     """The best gait that keeps all constraints; else the one that comes nearest to it."""
     found = [trial for trial in record.trials if trial.found]
-    kept = [trial for trial in found if _violation(trial, scales) <= ACTIVE]
+    kept = [trial for trial in found if breach(trial, scales) <= ACTIVE]
     if not kept:
-        return min(found, key=lambda trial: _violation(trial, scales))
-    if _violation(last, scales) <= ACTIVE:
+        return min(found, key=lambda trial: breach(trial, scales))
+    if breach(last, scales) <= ACTIVE:
         kept.append(last)
     return max(kept, key=lambda trial: trial.objective)
 
