@@ -54,7 +54,7 @@ DOMAINS: dict[str, Domain] = {
     "leg_mass": Domain("m", "kg", SMALLEST, LARGEST, True, "mass of one leg frame, a point"),
     "leg_com": Domain("a", "m", 0.0, LARGEST, True, "distance from foot to the leg's mass"),
     "locked_length": Domain("L_0", "m", SMALLEST, LARGEST, True, "length of a leg on its stopper"),
-    "natural_length": Domain("L*", "m", SMALLEST, LARGEST, True, "length of the spring without load"),
+    "natural_length": Domain("L*", "m", SMALLEST, LARGEST, True, "length of the unloaded spring"),
     "stiffness": Domain("k", "N/m", 0.0, LARGEST, True, "spring constant of each leg"),
     "damping": Domain("c", "N s/m", 0.0, LARGEST, True, "viscous damping of each leg"),
     "slope": Domain("phi", "rad", -math.pi / 2, math.pi / 2, False, "downhill slope"),
