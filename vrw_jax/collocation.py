@@ -464,8 +464,9 @@ def linearised_pass(
         ]
         return columns[own] + sum(by_section[1:], start=by_section[0])
 
-    d_durations, d_accelerations = traced
+    d_durations, d_accelerations = hold(traced)
     changes = Solution(d_closed, close(d_durations), tuple(close(x) for x in d_accelerations))
+    changes = hold(changes)
     return Linearised(
         correction=jax.tree.map(lambda x: x[0], changes),
         columns=jax.tree.map(lambda x: x[1:], changes),

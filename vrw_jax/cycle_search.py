@@ -125,14 +125,23 @@ def start_from(problem: Problem, section: Array, durations: Array, with_dls: Arr
     return Located(solution, happens, jnp.zeros((lanes,), section.dtype))
 
 
+def over_rows(combine: Callable[[Array, Array], Array], x: Array) -> LaneArray:
+    """Reduction over all axes but the lanes, by halves: XLA's own runs along the wrong axis."""
+    rows = x.reshape(-1, x.shape[-1])
+    while rows.shape[0] > 1:
+        half = rows.shape[0] // 2
+        rest = rows[2 * half :]
+        rows = jnp.concatenate([combine(rows[:half], rows[half : 2 * half]), rest])
+    return rows[0]
+
+
 def correction_size(solution: Solution, correction: Solution) -> LaneArray:
     """Largest entry of a correction, accelerations weighed by their effect on positions."""
-    largest = functools.partial(jnp.max, axis=0)
-    flat = lambda x: jnp.abs(x).reshape(-1, x.shape[-1])
-    size = jnp.maximum(largest(flat(correction.section)), largest(flat(correction.durations)))
+    largest = functools.partial(over_rows, jnp.maximum)
+    size = jnp.maximum(largest(jnp.abs(correction.section)), largest(jnp.abs(correction.durations)))
     for i, change in enumerate(correction.accelerations):
-        duration = jnp.max(jnp.abs(solution.durations[:, i]), axis=0)
-        size = jnp.maximum(size, largest(flat(change)) * duration**2)
+        duration = largest(jnp.abs(solution.durations[:, i]))
+        size = jnp.maximum(size, largest(jnp.abs(change)) * duration**2)
     return size
 
 
@@ -151,7 +160,8 @@ def _limited(solution: Solution, correction: Solution) -> LaneArray:
         [correction.section, correction.durations.reshape(-1, solution.section.shape[-1])]
     )
     tiny = jnp.finfo(change.dtype).tiny
-    return jnp.minimum(1.0, jnp.min(room / jnp.maximum(jnp.abs(change), tiny), axis=0))
+    share = over_rows(jnp.minimum, room / jnp.maximum(jnp.abs(change), tiny))
+    return jnp.minimum(1.0, share)
 
 
 class _Iterate(NamedTuple):
@@ -184,7 +194,9 @@ def newton(
     tolerance = max(options.tolerance, float(floor))
 
     def iterate(now: _Iterate) -> _Iterate:
-        share = jnp.minimum(1.0, (now.iteration + 1) / jnp.maximum(stages, 1)).astype(parameters.dtype)
+        share = jnp.minimum(1.0, (now.iteration + 1) / jnp.maximum(stages, 1)).astype(
+            parameters.dtype
+        )
         arrived = share >= 1.0
         here = jnp.where(arrived, parameters, origin + share * (parameters - origin))
         passed = problem.pass_at(here, start._replace(solution=now.solution))
@@ -241,7 +253,7 @@ def signs_hold(problem: Problem, parameters: Parameters, located: Located) -> Bo
         for i, (phase, passage) in enumerate(zip(sequence.phases, passages, strict=True)):
             inside = durations[i] > 0.0
             for guard in phase.guards(constants, passage.nodes):
-                inside &= jnp.all(guard > 0.0, 0)
+                inside &= over_rows(jnp.minimum, guard) > 0.0
             for guard in phase.guards(constants, passage.start):
                 inside &= guard > 0.0
             for guard in phase.guards(constants, passage.end):

@@ -40,11 +40,16 @@ def newton_cycle(
             x = function(x)
         return x
 
-    def correction(x: Array) -> tuple[Array, Array]:
-        """Newton's change and the map's Jacobian."""
-        both = lambda y: (iterate(y), iterate(y))
-        jacobian, image = jax.jacfwd(both, has_aux=True)(x)
-        return jnp.linalg.solve(jnp.eye(x.size, dtype=x.dtype) - jacobian, image - x), jacobian
+    def correction(x: Array) -> tuple[Array, Array, Array]:
+        """Newton's change, the map's Jacobian, and by how much the map misses."""
+
+        def twice(y: Array) -> tuple[Array, Array]:
+            image = iterate(y)
+            return image, image
+
+        jacobian, image = jax.jacfwd(twice, has_aux=True)(x)
+        miss = image - x
+        return jnp.linalg.solve(jnp.eye(x.size, dtype=x.dtype) - jacobian, miss), jacobian, miss
 
     def going(state: tuple) -> Array:
         _, size, count = state
@@ -52,7 +57,7 @@ def newton_cycle(
 
     def step(state: tuple) -> tuple:
         x, _, count = state
-        change, _ = correction(x)
+        change, _, _ = correction(x)
         size = jnp.max(jnp.abs(change))
         return jnp.where(jnp.isfinite(size), x + change, x), size, count + 1
 
@@ -62,8 +67,12 @@ def newton_cycle(
     x, size = lax.stop_gradient((x, size))
     converged = size <= tolerance
     point = jnp.where(converged, x, lax.stop_gradient(start))
-    for _ in range(2):
-        change, jacobian = correction(point)
-        point = jnp.where(converged, point + jnp.where(converged, change, 0.0), start)
-    residual = jnp.max(jnp.abs(iterate(point) - point))
-    return SectionCycle(point, jacobian, residual, converged, count)
+
+    def polish(point: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
+        change, jacobian, miss = correction(point)
+        moved = point + jnp.where(converged, change, 0.0)
+        return moved, (jacobian, jnp.max(jnp.abs(miss)))
+
+    point, (jacobians, residuals) = lax.scan(polish, point, None, length=2)
+    point = jnp.where(converged, point, start)
+    return SectionCycle(point, jacobians[-1], residuals[-1], converged, count)
