@@ -415,7 +415,10 @@ def _compute(planned: "Plan", store: Path) -> None:
                 run(planned, store, report=report)
         except KeyboardInterrupt:
             bar.stop()
-            err.print(f"vrw: stopped; what is done stays in {store}, run the same to go on.")
+            err.print(
+                f"vrw: stopped; what is done stays in {store}, run the same to go on.",
+                soft_wrap=True,
+            )
             raise typer.Exit(INTERRUPTED) from None
 
 
