@@ -175,7 +175,9 @@ def _stepper(field: Field, options: Options) -> _Stepper:
     return _Stepper(
         field=field,
         solver=solver_named(options.solver, options),
-        controller=diffrax.PIDController(rtol=options.rtol, atol=options.atol),
+        controller=diffrax.PIDController(
+            rtol=options.rtol, atol=options.atol, factormax=STEP_GROWTH
+        ),
         term=diffrax.ODETerm(lambda t, y, args: field(y)),
     )
 
@@ -342,6 +344,10 @@ def integrate_phase(
     )
 
 
+STEP_GROWTH = 2.0
+"""Most that a step may outgrow the one before it. The error estimate of a step far shorter than
+needed is rounding, and so would be a length grown from it without bound: a lane would then differ
+from itself alone by 1e-12, more than a hundred times its round-off."""
 SETTLED = 3
 """Tries at the located event before it counts: the first makes the event's time right to first
 order in its derivatives, the second to third order, the last evaluates the state there."""

@@ -26,7 +26,7 @@ class Options(eqx.Module):
     derivative_tightening: Scalar = eqx.field(converter=as_float_array, default=100.0)
     max_phase_time: Scalar = eqx.field(converter=as_float_array, default=20.0)  # s
     max_solver_steps: int = eqx.field(static=True, default=20_000)  # of one phase, tried steps
-    first_step: Scalar = eqx.field(converter=as_float_array, default=1e-3)  # of each phase, s
+    first_step: Scalar = eqx.field(converter=as_float_array, default=5e-3)  # of each phase, s
     event_steps: int = eqx.field(static=True, default=30)  # at most, to locate an event
     monitor_steps: int = eqx.field(static=True, default=5)  # secant re-steps to a monitor's minimum
 
