@@ -10,6 +10,7 @@ from vrw_jax.border_search import locate
 from vrw_jax.branch_plots import branch_figure
 from vrw_jax.branch_report import write
 from vrw_jax.integrate import Watched, integrate_phase
+from vrw_jax.measures import step_measures
 
 RADIUS_AT_200 = 0.32861954  # Table 1: published for orientation beside the physics
 WITHIN = 1e-9
@@ -185,9 +186,33 @@ def test_simplest_walker_doubles_its_period_near_slope_0015(walker_branches):
 # The wheel ----------------------------------------------------------------------------------------
 
 
+WHEELS = vrw.WheelParams(
+    damping=jnp.asarray([200.0, 150.0, 100.0]),
+    natural_length=jnp.asarray([1.02, 1.03, 1.02]),
+    slope=jnp.asarray([0.30, 0.28, 0.02]),  # the last does not walk
+)
+
+
 @pytest.fixture(scope="module")
-def branch():
-    return vrw.continue_branch(vrw.WheelParams(), "damping", (4.0, 230.0))
+def branches():
+    return vrw.continue_branches(WHEELS, "damping", (4.0, 230.0))
+
+
+@pytest.fixture(scope="module")
+def branch(branches):
+    return branches[0]
+
+
+@pytest.fixture(scope="module")
+def gait_at(branch):
+    """The gait of Table 1's wheel at a damping, found again next to the branch."""
+    guess = branch.borders[-1].cycle
+
+    def find(damping):
+        params = vrw.WheelParams(damping=damping)
+        return params, vrw.limit_cycle(params, guess=guess, options=vrw.CycleOptions.tight())
+
+    return find
 
 
 def by_name(branch):
@@ -210,32 +235,26 @@ def test_every_gait_on_the_branch_repeats_when_walked(branch):
     assert branch.dataset.closure.max() < 1e-11
 
 
-def test_scuffing_begins_between_100_and_120(branch):
+def test_scuffing_begins_between_100_and_120(branch, gait_at):
     border = by_name(branch)["clearance_sls1"]
     assert 100.0 < border.value < 120.0
     for offset, scuffs in ((-1.0, True), (1.0, False)):
-        params = vrw.WheelParams(damping=border.value + offset)
-        gait = vrw.limit_cycle(params, options=vrw.CycleOptions.tight())
+        params, gait = gait_at(border.value + offset)
         clearance = vrw.step(params, gait.section_state, options=vrw.Options.tight())
         assert (float(clearance.monitors.clearance_sls1) < 0.0) == scuffs
 
 
-def quantity(border, damping):
-    """Indicator or monitor `border.name` at the cycle of that damping, solved for again."""
-    tight = vrw.CycleOptions.tight()
-    params = vrw.WheelParams(damping=damping)
-    gait = vrw.limit_cycle(params, options=tight)
-    if not bool(gait.found):
-        return -1.0
-    told = vrw.measures.step_measures(
-        vrw.step(params, gait.section_state, options=vrw.Options.tight())
-    )
-    return float(told[border.name])
+def test_each_border_is_located_to_1e_9(branch, gait_at):
+    def quantity(border, damping):
+        """Indicator or monitor `border.name` at that damping; negative where the gait is lost."""
+        params, gait = gait_at(damping)
+        if not bool(gait.found):
+            return -1.0
+        result = vrw.step(params, gait.section_state, options=vrw.Options.tight())
+        return float(step_measures(result)[border.name])
 
-
-def test_each_border_is_located_to_1e_9(branch):
     for border in branch.borders:
-        if border.name == "clearance_sls1":  # vanishes like a cube: see its own test
+        if border.name == "clearance_sls1":  # vanishes like a cube: see the test above
             continue
         below, above = (quantity(border, border.value + d) for d in (-WITHIN, WITHIN))
         assert below * above < 0.0, border
@@ -250,9 +269,9 @@ def test_the_cycle_at_a_border_is_a_limit_cycle_of_the_wheel(branch):
     )
 
 
-def test_the_map_before_touchdown_and_after_impact_have_the_same_multipliers():
-    params, options = vrw.WheelParams(), vrw.Options.tight()
-    gait = vrw.limit_cycle(params, options=vrw.CycleOptions.tight())
+def test_the_map_before_touchdown_and_after_impact_have_the_same_multipliers(gait_at):
+    options = vrw.Options.tight()
+    params, gait = gait_at(200.0)
     before = jax.jacfwd(lambda x: vrw.return_map(params, x, options=options))
     values = np.linalg.eigvals(np.asarray(before(gait.section_state)))
     values = values[np.argsort(-np.abs(values))]
@@ -261,11 +280,15 @@ def test_the_map_before_touchdown_and_after_impact_have_the_same_multipliers():
     assert abs(float(gait.spectral_radius) - RADIUS_AT_200) < 1e-8
 
 
-def test_wheels_side_by_side_have_the_branches_of_each_alone(branch):
-    two = vrw.WheelParams(damping=jnp.asarray([200.0, 120.0]), slope=jnp.asarray([0.30, 0.1]))
-    both = vrw.continue_branches(two, "damping", (150.0, 230.0))
-    assert abs(both[0].borders[-1].value - branch.borders[-1].value) < WITHIN
-    assert both[0].outcome == vrw.Outcome.STEPPED
+def test_wheels_side_by_side_have_each_their_own_branch(branches):
+    walks, lost = branches[1:]
+    i = int(np.argmin(np.abs(walks.values - 150.0)))
+    gait = vrw.limit_cycle(jax.tree.map(lambda x: jnp.broadcast_to(x, 3)[1], WHEELS))
+    assert walks.values[i] == 150.0
+    assert abs(walks.dataset.dls_fraction[i] - gait.dls_fraction) < 1e-8
+    assert lost.outcome == vrw.Outcome.NO_CYCLE_FOUND
+    assert not lost.values.size
+    assert "none" in str(lost)
 
 
 def test_a_rigid_wheel_is_followed_by_its_own_step():

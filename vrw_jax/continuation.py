@@ -27,6 +27,7 @@ from vrw_jax.followed_wheel import (
     RungFollowed,
     Wheel,
     gait_measures,
+    on_mesh,
     with_parameter,
 )
 from vrw_jax.limit_cycle import LimitCycle, limit_cycle
@@ -150,14 +151,14 @@ def continue_branches(
     make_cycle: MakeCycle
     if isinstance(model, ViscoelasticWheel):
         cycle_options = CycleOptions.tight() if cycle_options is None else cycle_options
+        # The start needs neither the mesh nor the accuracy of the branch.
         start = cycle
         if start is None:
-            find = functools.partial(limit_cycle, period_n=period_n, options=cycle_options)
-            start = jax.vmap(find)(params)
+            start = jax.vmap(functools.partial(limit_cycle, period_n=period_n))(params)
         outcomes = np.asarray(start.outcome)
         problem = Problem(params.n_legs, period_n, cycle_options)
         followed: AbstractFollowedWheel = CycleFollowed(problem=problem, name=name)
-        z: Any = start.located.solution
+        z: Any = jax.vmap(functools.partial(on_mesh, problem))(start)
         wheels = Wheel(params, start.located.happens)
 
         def make_cycle(owner: int, point: Point) -> Callable[[], LimitCycle]:

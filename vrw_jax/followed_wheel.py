@@ -6,27 +6,29 @@ and differentiated forwards.
 """
 
 import abc
+import functools
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from vrw_jax import dynamics
 from vrw_jax.arclength import AbstractFollowed, Linear, Section, Unknown
-from vrw_jax.collocation import Passage, Solution, walk_through
+from vrw_jax.collocation import N_NODES, NODES, Mesh, Passage, Solution, walk_through
 from vrw_jax.cycle_search import (
     Located,
     Problem,
     correction_size,
     parameters_of,
-    signs_hold,
     wheel_of,
 )
 from vrw_jax.geometry import Motion, rear_foot_height
 from vrw_jax.lanes import one_wheel
+from vrw_jax.limit_cycle import LimitCycle
 from vrw_jax.measures import MARGINS, step_measures
 from vrw_jax.models import AbstractWheel
 from vrw_jax.models.base import SectionState
@@ -60,7 +62,7 @@ class AbstractFollowedWheel(AbstractFollowed):
 class CycleFollowed(AbstractFollowedWheel):
     """Limit cycles by collocation; z is a `Solution`, without the axis over lanes.
 
-    Beyond an indicator's zero the formal solution goes on, but is no longer `valid`.
+    Beyond an indicator's zero the formal solution goes on; the step says that it is no gait.
     """
 
     problem: Problem = eqx.field(static=True)
@@ -74,12 +76,8 @@ class CycleFollowed(AbstractFollowedWheel):
         return parameters_of(with_parameter(wheel.params, self.name, p))
 
     def linearise(self, wheel: Wheel, z: Unknown, p: Scalar) -> Linear:
-        def over_lanes(parameters: Array, happens: Array, z: Solution) -> tuple:
-            located = Located(z, happens, parameters[0])
-            passed = self.problem.pass_at(parameters, located, (PARAMETER_NAMES.index(self.name),))
-            column = jax.tree.map(lambda x: x[0], passed.columns)
-            return passed.correction, column, passed.monodromy
-
+        index = PARAMETER_NAMES.index(self.name)
+        over_lanes = functools.partial(_linearised, self.problem, index)
         return Linear(*one_wheel(over_lanes)(self._moved(wheel, p), wheel.happens, z))
 
     def section(self, z: Unknown) -> Section:
@@ -89,10 +87,8 @@ class CycleFollowed(AbstractFollowedWheel):
         return one_wheel(correction_size)(z, correction)
 
     def valid(self, wheel: Wheel, z: Unknown, p: Scalar) -> Bool[Array, ""]:
-        def over_lanes(parameters: Array, happens: Array, z: Solution) -> Array:
-            return signs_hold(self.problem, parameters, Located(z, happens, parameters[0]))
-
-        return one_wheel(over_lanes)(self._moved(wheel, p), wheel.happens, z)
+        """Positive durations; the event-driven step is the judge of all else."""
+        return jnp.all((z.durations > 0.0) | (wheel.happens < 0.5))
 
     def read(self, wheel: Wheel, z: Unknown, p: Scalar) -> tuple[SectionState, dict[str, Array]]:
         """Beyond a border: durations, shortest over the steps, and `takeoff_acceleration`: with
@@ -121,6 +117,44 @@ class CycleFollowed(AbstractFollowedWheel):
             "takeoff_acceleration": jnp.min(jnp.stack(takeoffs)),
         }
         return jnp.stack([end.q[0], *end.v]), formal
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _linearised(
+    problem: Problem, index: int, parameters: Array, happens: Array, z: Solution
+) -> tuple[Solution, Solution, Array]:
+    """Correction, column of one parameter and monodromy, lanes last.
+
+    Jitted so that it is traced once, however often a loop over lanes looks at its body.
+    """
+    located = Located(z, happens, parameters[0])
+    passed = problem.pass_at(parameters, located, (index,))
+    return passed.correction, jax.tree.map(lambda x: x[0], passed.columns), passed.monodromy
+
+
+def on_mesh(problem: Problem, cycle: LimitCycle) -> Solution:
+    """A start on the mesh of `problem` from a cycle on any other.
+
+    Accelerations are interpolated over each phase, which is near enough for Newton's method.
+    """
+    found = cycle.located.solution
+    accelerations = []
+    for old, new, known in zip(
+        cycle.problem.meshes, problem.meshes, found.accelerations, strict=True
+    ):
+        n, _, _, dim = known.shape
+        rows = jnp.moveaxis(known.reshape(n, -1, dim), 1, -1)
+        at = jnp.asarray(_node_times(new))
+        over_time = lambda row, old=old, at=at: jnp.interp(at, jnp.asarray(_node_times(old)), row)
+        moved = jnp.moveaxis(jax.vmap(jax.vmap(over_time))(rows), -1, 1)
+        accelerations.append(moved.reshape(n, new.n_steps, N_NODES, dim))
+    return Solution(found.section, found.durations, tuple(accelerations))
+
+
+def _node_times(mesh: Mesh) -> np.ndarray:
+    """Times of all nodes of a phase, as fractions of its duration."""
+    begins = np.cumsum(mesh.fractions) - mesh.fractions
+    return (begins[:, None] + mesh.fractions[:, None] * NODES).ravel()
 
 
 def _takeoff_acceleration(s: Any, sls1: Passage) -> Scalar:
