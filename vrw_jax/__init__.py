@@ -6,6 +6,7 @@ from vrw_jax.branch import Border, Branch
 from vrw_jax.continuation import continue_branch, continue_branches, continue_map
 from vrw_jax.cycle_options import CycleOptions
 from vrw_jax.designs import grid, samples, sobol, uniform
+from vrw_jax.lane_batch import Steps, steps
 from vrw_jax.limit_cycle import LimitCycle, limit_cycle
 from vrw_jax.models import (
     AbstractWheel,
@@ -42,6 +43,7 @@ __all__ = [
     "RigidWheel",
     "SectionCycle",
     "StepResult",
+    "Steps",
     "Tuned",
     "ViscoelasticWheel",
     "Walk",
@@ -62,6 +64,7 @@ __all__ = [
     "simulate",
     "sobol",
     "step",
+    "steps",
     "tune",
     "uniform",
     "walk",

@@ -99,8 +99,13 @@ def terms(s: Symbols, motion: Motion) -> Terms:
 
 def single_support_1_acceleration(s: Symbols, motion: Motion) -> Acceleration:
     """SLS-I, three degrees of freedom: Leg 2 swings and telescopes freely. Section 3.3.2."""
-    M, f1, f2, f3 = terms(s, motion)
-    q = s.sin_alpha * motion.L1  # eliminates L2: its row of M is m (-q, -cos alpha, 1)
+    return free_acceleration(s, motion.L1, terms(s, motion))
+
+
+def free_acceleration(s: Symbols, L1: Elementwise, free: Terms) -> Acceleration:
+    """What the applied forces alone do with Leg 1's foot at rest: M q'' = f."""
+    M, f1, f2, f3 = free
+    q = s.sin_alpha * L1  # eliminates L2: its row of M is m (-q, -cos alpha, 1)
     A11 = M.M11 + M.M13 * q
     A12 = M.M12 + M.M13 * s.cos_alpha
     A22 = M.M22 + M.M23 * s.cos_alpha

@@ -1,0 +1,253 @@
+"""Gait steps of batches of wheels, by the engine that suits: one face, two engines.
+
+The lane engine always runs the same compiled program over the same number of lanes, cut into
+blocks, the last filled up with lanes that do nothing. So a lane's result is bitwise the same alone,
+among others, and in any order. Wheels of similar work share a block; a block does not wait for a
+few late lanes, which run again among their like. None of this reaches into a lane.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from vrw_jax.lane_engine import LaneStep, gait_step
+from vrw_jax.lane_phase import Patience
+from vrw_jax.models import AbstractWheel, ViscoelasticWheel
+from vrw_jax.options import Options
+from vrw_jax.outcomes import Outcome
+from vrw_jax.params import PARAMETER_NAMES, WheelParams
+from vrw_jax.runge_kutta import explicit_tableau
+
+EngineName = Literal["auto", "lanes", "diffrax"]
+
+BLOCK = 256
+"""Lanes that march side by side on CPU: they stay in cache, and few wait for the slowest."""
+BLOCKS = 8
+"""Blocks in one call of the compiled program, so that the call itself costs little."""
+LANES_ELSEWHERE = 32_768
+"""Lanes of the one block of a call on a GPU."""
+FEW = 8
+"""A block waits no longer than usual once less than one in `FEW` of its lanes is running."""
+
+
+class Steps(eqx.Module):
+    """Lean results of walks of some steps, leading axis: lanes; each tells of its last step."""
+
+    section_state: Float[Array, "lanes 3"]  # just before the next touchdown; zeros if it failed
+    durations: Float[Array, "lanes 3"]  # of DLS, SLS-I, SLS-II, s
+    outcome: Int[Array, " lanes"]  # an Outcome; the walk ends at the first that is not STEPPED
+    n_stepped: Int[Array, " lanes"]  # steps that ended in a touchdown
+    solver_steps: Int[Array, " lanes"]  # tried by the integrator, over all steps
+    engine: str = eqx.field(static=True)  # that computed it: "lanes" or "diffrax"
+
+
+def steps(
+    params: WheelParams,
+    states: Array | np.ndarray,
+    n_steps: int = 1,
+    *,
+    model: AbstractWheel | None = None,
+    options: Options | None = None,
+    engine: EngineName = "auto",
+) -> Steps:
+    """`n_steps` gait steps of many wheels, or as many as each can: values only, no derivatives.
+
+    `states` are section states, shape (lanes, 3), in rad, rad/s, m/s; fields of `params` are
+    scalars or have the lanes' axis. "lanes" is the fast engine, for the viscoelastic wheel and
+    explicit solvers; "diffrax" maps `model.advance` over the lanes and takes any solver; "auto"
+    takes the first wherever it can, whatever the number of lanes, and `Steps.engine` says which it
+    was. Both keep the errors of `options`, which count for each local step; between them lie some
+    ten times the tolerance. Not for use inside `jax.jit`: it compiles itself, once.
+    """
+    model = ViscoelasticWheel() if model is None else model
+    options = Options() if options is None else options
+    states = np.asarray(states)
+    if isinstance(params.damping, jax.core.Tracer):
+        raise TypeError(
+            "the parameters are traced, but vrw.steps compiles itself and has no derivatives: call "
+            "it outside of jit, vmap and grad, or map vrw.return_map over the lanes."
+        )
+    if states.ndim != 2 or states.shape[1] != 3:
+        raise ValueError(
+            f"states have shape {states.shape}, but they are section states, shape (lanes, 3): "
+            "write states[None] for a single one."
+        )
+    if n_steps < 1:
+        raise ValueError(f"n_steps is {n_steps}, but a walk needs at least one step.")
+    dtype = np.dtype(jnp.result_type(params.damping, states.dtype))
+    options.require_reachable(dtype)
+    columns = [getattr(params, name) for name in PARAMETER_NAMES]
+    wheels = np.empty((len(columns), len(states)), dtype)
+    for row, column in zip(wheels, columns, strict=True):
+        row[:] = np.asarray(column)
+    walked = _Walked.start(states.astype(dtype))
+    run = _chosen(engine, model, options, params.n_legs)
+    for _ in range(n_steps):
+        open_ = np.flatnonzero(walked.outcome == Outcome.STEPPED)
+        walked.take(open_, run(wheels[:, open_], walked.section_state[open_]))
+    return Steps(
+        jnp.asarray(walked.section_state),
+        jnp.asarray(walked.durations),
+        jnp.asarray(walked.outcome),
+        jnp.asarray(walked.n_stepped),
+        jnp.asarray(walked.solver_steps),
+        engine=run.name,
+    )
+
+
+class _Walked:
+    """Results so far, as numpy arrays."""
+
+    def __init__(self, states: np.ndarray, n: int) -> None:
+        self.section_state, self.durations = states, np.zeros_like(states)
+        self.outcome, self.n_stepped, self.solver_steps = (np.zeros(n, np.int32) for _ in range(3))
+
+    @classmethod
+    def start(cls, states: np.ndarray) -> "_Walked":
+        return cls(states.copy(), len(states))
+
+    def take(self, lanes: np.ndarray, told: tuple[np.ndarray, ...]) -> None:
+        state, durations, outcome, tried = told
+        self.section_state[lanes], self.durations[lanes] = state, durations
+        self.outcome[lanes] = outcome
+        self.n_stepped[lanes] += outcome == Outcome.STEPPED
+        self.solver_steps[lanes] += tried
+
+
+class _Engine(eqx.Module):
+    """One gait step of any number of lanes, numpy in and out."""
+
+    name: str = eqx.field(static=True)
+    call: Callable = eqx.field(static=True)
+
+    def __call__(self, wheels: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, ...]:
+        return self.call(wheels, states)
+
+
+def _chosen(engine: EngineName, model: AbstractWheel, options: Options, n_legs: int) -> _Engine:
+    if engine not in ("auto", "lanes", "diffrax"):
+        raise ValueError(f"engine is {engine!r}, but it is 'auto', 'lanes' or 'diffrax'.")
+    fits = isinstance(model, ViscoelasticWheel) and (
+        explicit_tableau(options.solver, options) is not None
+    )
+    if engine == "lanes" and not fits:
+        raise ValueError(
+            f"the lane engine can't run {type(model).__name__} with {options.solver}: it knows "
+            "the viscoelastic wheel and explicit Runge-Kutta solvers; take engine='diffrax'."
+        )
+    if engine == "diffrax" or not fits:
+        return _Engine("diffrax", functools.partial(_by_diffrax, model, options, n_legs))
+    assert isinstance(model, ViscoelasticWheel)
+    by_lanes = functools.partial(_by_lanes, model.stop_at_lift_off, options, n_legs)
+    return _Engine("lanes", by_lanes)
+
+
+def _by_lanes(
+    stop_at_lift_off: bool,
+    options: Options,
+    n_legs: int,
+    wheels: np.ndarray,
+    states: np.ndarray,
+) -> tuple[np.ndarray, ...]:
+    """By the lane engine: wheels of like work side by side, late lanes again among their like."""
+    dynamic, static = eqx.partition(options, eqx.is_array)
+    dynamic = jax.tree.map(lambda leaf: np.asarray(leaf, wheels.dtype), dynamic)
+    program = _lane_program(static, n_legs, stop_at_lift_off)
+    n, width = len(states), _width()
+    told = (np.empty((n, 3), wheels.dtype), np.empty((n, 3), wheels.dtype))
+    counts = (np.empty(n, np.int32), np.empty(n, np.int32))
+    # The airborne leg's fast rate, near c/m, sets the step where stability does.
+    damping, mass = (wheels[PARAMETER_NAMES.index(name)] for name in ("damping", "leg_mass"))
+    with np.errstate(all="ignore"):
+        open_ = np.argsort(damping / mass, kind="stable")
+    while len(open_) > 0:
+        few = width[1] // FEW if len(open_) > width[1] else 0
+        late = []
+        for begin in range(0, len(open_), width[0] * width[1]):
+            some = open_[begin : begin + width[0] * width[1]]
+            step = program(*_filled(wheels, states, some, width), dynamic, np.int32(few))
+            out = jax.tree.map(np.asarray, step)
+            kept = ~out.unfinished[: len(some)]
+            lanes = some[kept]
+            for to, rows in zip(told, (out.section_state, out.durations), strict=True):
+                to[lanes] = rows[: len(some)][kept]
+            for count, rows in zip(counts, (out.outcome, out.solver_steps), strict=True):
+                count[lanes] = rows[: len(some)][kept]
+            late.append(some[~kept])
+        open_ = np.concatenate(late)
+    return (*told, *counts)
+
+
+def _width() -> tuple[int, int]:
+    """Blocks of a call, and lanes of a block."""
+    return (BLOCKS, BLOCK) if jax.default_backend() == "cpu" else (1, LANES_ELSEWHERE)
+
+
+def _filled(
+    wheels: np.ndarray, states: np.ndarray, some: np.ndarray, width: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The chosen lanes, filled up to what the compiled program takes, and which are wanted."""
+    size = width[0] * width[1]
+    filled = np.concatenate([some, np.repeat(some[-1:], size - len(some))])
+    wanted = np.arange(size) < len(some)
+    return wheels[:, filled], states[filled].T.copy(), wanted
+
+
+@functools.cache
+def _lane_program(static: Options, n_legs: int, stop_at_lift_off: bool) -> Callable[..., LaneStep]:
+    """The compiled step of BLOCKS blocks: one program for every batch."""
+
+    def block(dynamic: Options, few: Array, given: tuple[Array, Array, Array]) -> LaneStep:
+        columns, x, wanted = given
+        params = WheelParams(**dict(zip(PARAMETER_NAMES, columns, strict=True)), n_legs=n_legs)
+        options = eqx.combine(dynamic, static)
+        tableau = explicit_tableau(options.solver, options)
+        assert tableau is not None  # `_chosen` looked
+        return gait_step(params, x.T, wanted, options, tableau, stop_at_lift_off, Patience(few))
+
+    def blocks(columns: Array, x: Array, wanted: Array, dynamic: Options, few: Array) -> LaneStep:
+        n = columns.shape[-1] // _width()[1]
+        to_blocks = lambda a: jnp.moveaxis(a.reshape(*a.shape[:-1], n, -1), -2, 0)
+        out = lax.map(
+            functools.partial(block, dynamic, few), jax.tree.map(to_blocks, (columns, x, wanted))
+        )
+        flat = lambda a: jnp.moveaxis(a, 1, -1).reshape(-1, *a.shape[1:-1])
+        return jax.tree.map(flat, out)
+
+    return jax.jit(blocks)
+
+
+def _by_diffrax(
+    model: AbstractWheel,
+    options: Options,
+    n_legs: int,
+    wheels: np.ndarray,
+    states: np.ndarray,
+) -> tuple[np.ndarray, ...]:
+    """By the model's own step under `jax.vmap`, as many lanes at a time as the lane engine."""
+    size = BLOCK
+    parts: list[Any] = []
+    for begin in range(0, len(states), size):
+        some = np.arange(begin, min(begin + size, len(states)))
+        columns, x, _ = _filled(wheels, states, some, (1, size))
+        out = _mapped(model, options, n_legs, columns, x)
+        used = slice(len(some))
+        parts.append(jax.tree.map(lambda leaf, used=used: np.asarray(leaf)[used], out))
+    advance = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    return advance.section_state, advance.durations, advance.outcome, advance.solver_steps
+
+
+@eqx.filter_jit
+def _mapped(model: AbstractWheel, options: Options, n_legs: int, columns: Any, x: Any) -> Any:
+    def one(values: Array, state: Array) -> Any:
+        params = WheelParams(**dict(zip(PARAMETER_NAMES, values, strict=True)), n_legs=n_legs)
+        return model.advance(params, state, options)
+
+    return jax.vmap(one, 1)(columns, x)

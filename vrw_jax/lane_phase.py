@@ -1,0 +1,374 @@
+"""One phase of many wheels at once, each with its own step size, to the earliest of its events.
+
+The lanes march side by side until every one has ended or holds a step that crosses a guard; then
+all locate their events together, taking that step again with its length corrected by Newton's
+method. What a lane gives never depends on its neighbours: a lane that has ended is left alone.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from vrw_jax.options import Options
+from vrw_jax.outcomes import Outcome
+from vrw_jax.runge_kutta import Cut, Evaluate, Place, Tableau, Taken, Vector, take_step
+
+
+class LanePhase(NamedTuple):
+    """A phase as data; functions are elementwise over lanes.
+
+    `guards` are positive inside the phase and watched on the way down; `outcomes` says what each
+    means. The earliest wins, of two at once the first in the list.
+    """
+
+    evaluate: Evaluate
+    guards: Callable[[Place], Vector]
+    outcomes: tuple[Outcome, ...]
+
+
+class LanePhaseEnd(NamedTuple):
+    """Where and how each lane ended; the start where it was not active."""
+
+    place: Place
+    duration: Array  # s
+    guard: Array  # index of the guard that ended it; -1 if none did: it gave up
+    timed_out: Array
+    unfinished: Array  # left for a run with its like, see `Patience`
+    tried: Array  # steps, accepted or not
+    next_step: Array  # length that the controller would try next, s
+
+
+class Patience(NamedTuple):
+    """When a block of lanes stops waiting for its last ones: few are left, and they take long.
+
+    They are marked unfinished, and run again from their start among their like.
+    """
+
+    few: Array | int  # lanes; 0: wait for all
+    factor: int = 2  # times the iterations after which half had finished
+
+
+class _March(NamedTuple):
+    here: Place
+    values: Vector  # guards here
+    h: Array
+    time: Array
+    verdict: Array  # on the last step tried
+    crossing: Array  # bits of the guards that crossed in it
+    tried: Array
+    left: Array  # lanes still running
+    half: Array  # iterations after which half of the lanes had finished
+    iterations: Array
+
+
+MARCHING, TIMED_OUT, GAVE_UP, CROSSED, IDLE = range(5)
+"""Verdicts: where a lane's march stands."""
+
+SAFETY, LEAST, MOST = 0.9, 0.2, 5.0
+"""Of the step-size controller: the usual safety factor, and the limits of a step's change."""
+
+
+def integrate_lanes(
+    phase: LanePhase,
+    tableau: Tableau,
+    q: Vector,
+    v: Vector,
+    active: Array,
+    first_step: Array,
+    options: Options,
+    cut: Cut,
+    patience: Patience,
+) -> LanePhaseEnd:
+    """Every active lane from (q, v) to the earliest of its guards. Errors: as `integrate_phase`."""
+    start = Place(q, v, phase.evaluate(q, v))
+    values, rates = _with_rates(phase, start)
+    past = tuple((g < 0.0) | ((g == 0.0) & (r <= 0.0)) for g, r in zip(values, rates, strict=True))
+    at_once = _first(past)
+    begins = active & (at_once < 0)
+
+    march = _march(phase, tableau, start, values, begins, first_step, options, cut, patience)
+    crossed = march.verdict == CROSSED
+    found = _locate(phase, tableau, march, options, cut)
+    lost = crossed & found.open
+    guard = jnp.where(active & (at_once >= 0), at_once, jnp.where(crossed, found.guard, -1))
+    return LanePhaseEnd(
+        place=_select(crossed, found.end, march.here),
+        duration=march.time + jnp.where(crossed, found.length, 0.0),
+        guard=jnp.where(lost, -1, guard),
+        timed_out=march.verdict == TIMED_OUT,
+        unfinished=march.verdict == MARCHING,
+        tried=march.tried + jnp.where(crossed, found.tried, 0),
+        next_step=march.h,
+    )
+
+
+def _march(
+    phase: LanePhase,
+    tableau: Tableau,
+    start: Place,
+    values: Vector,
+    begins: Array,
+    first_step: Array,
+    options: Options,
+    cut: Cut,
+    patience: Patience,
+) -> _March:
+    """Adaptive steps until each lane has crossed a guard, run out of time or given up."""
+
+    def waits(march: _March) -> Array:
+        late = march.iterations > patience.factor * march.half + 8
+        return (march.left > 0) & ~((march.left <= patience.few) & late)
+
+    def judge(march: _March, taken: Taken, inside: Vector, end: Vector) -> tuple[Array, Array]:
+        """Length to try next, in units of this one, and what becomes of the step."""
+        squared = cut(_squared_error, taken, march.here, end, options.rtol, options.atol)
+        to_dip = cut(partial(_to_earliest_dip, tableau), march.values, inside, end)
+        return cut(partial(_change, tableau.order), squared, to_dip)
+
+    def advance(march: _March) -> _March:
+        taken = take_step(tableau, phase.evaluate, march.here, march.h, cut)
+        inside, end = phase.guards(taken.inside), phase.guards(taken.end)
+        change, kept = judge(march, taken, inside, end)
+        verdict, crossing, accepted, time, h = cut(
+            partial(_verdict, options), march, change, kept, end
+        )
+        here, values = cut(_select, accepted, (taken.end, end), (march.here, march.values))
+        left = jnp.sum(verdict == MARCHING, dtype=jnp.int32)
+        half_left = 2 * left > first_step.shape[0]
+        return _March(
+            here=here,
+            values=values,
+            h=h,
+            time=time,
+            verdict=verdict,
+            crossing=crossing,
+            tried=march.tried + (march.verdict == MARCHING),
+            left=left,
+            half=jnp.where(half_left, march.iterations + 1, march.half),
+            iterations=march.iterations + 1,
+        )
+
+    none, count = jnp.zeros(first_step.shape, jnp.int32), jnp.zeros((), jnp.int32)
+    march = _March(
+        here=start,
+        values=values,
+        h=first_step,
+        time=jnp.zeros_like(first_step),
+        verdict=jnp.where(begins, MARCHING, IDLE).astype(jnp.int32),
+        crossing=none,
+        tried=none,
+        left=jnp.sum(begins, dtype=jnp.int32),
+        half=count,
+        iterations=count,
+    )
+    return lax.while_loop(waits, advance, march)
+
+
+def _change(order: int, squared: Array, to_dip: Array) -> tuple[Array, Array]:
+    """Length of the next try over this one's, and whether the step is kept (1) or retried (2)."""
+    # The controller's power needs no more than float32, which has a vectorised one.
+    single = jnp.clip(squared, 1e-20, 1e20).astype(jnp.float32)
+    power = jnp.exp(jnp.log(single) * (-0.5 / order)).astype(squared.dtype)
+    keep = squared <= 1.0
+    change = jnp.clip(SAFETY * power, LEAST, jnp.where(keep, MOST, 1.0))
+    retry = keep & (to_dip < 1.0)
+    kept = jnp.where(retry, 2, jnp.where(keep, 1, 0)).astype(jnp.int32)
+    return jnp.where(retry, to_dip, change), kept
+
+
+def _verdict(
+    options: Options, march: _March, change: Array, kept: Array, end: Vector
+) -> tuple[Array, Array, Array, Array, Array]:
+    """What becomes of each lane: verdict, crossing guards, accepted, time, length of its next try.
+
+    A dip that would not move the time on is no reason to stay.
+    """
+    running = march.verdict == MARCHING
+    keep = running & (kept == 1)
+    crossing = jnp.zeros_like(march.crossing)
+    for index, value in enumerate(end):
+        crossing = crossing | jnp.where(value <= 0.0, 1 << index, 0)
+    crossed = keep & (crossing > 0)
+    accepted = keep & ~crossed
+    time = jnp.where(accepted, march.time + march.h, march.time)
+    following = march.h * change
+    timed_out = accepted & (time >= options.max_phase_time)
+    stuck = (march.tried + 1 >= options.max_solver_steps) | (time + following == time)
+    verdict = jnp.where(stuck, GAVE_UP, MARCHING)
+    verdict = jnp.where(timed_out, TIMED_OUT, jnp.where(crossed, CROSSED, verdict))
+    return (
+        jnp.where(running, verdict, march.verdict).astype(jnp.int32),
+        jnp.where(running, crossing, march.crossing),
+        accepted,
+        time,
+        jnp.where(running & ~crossed, following, march.h),
+    )
+
+
+def _squared_error(taken: Taken, start: Place, guards: Vector, rtol: Array, atol: Array) -> Array:
+    """Mean square of the error over its tolerance; infinite where the step went nowhere."""
+    before, after = (*start.q, *start.v), (*taken.end.q, *taken.end.v)
+    total: Any = 0.0
+    for error, a, b in zip(taken.error, before, after, strict=True):
+        ratio = error / (atol + rtol * jnp.maximum(jnp.abs(a), jnp.abs(b)))
+        total = total + ratio * ratio
+    for value in guards:
+        total = total + 0.0 * value
+    return jnp.where(jnp.isfinite(total), total / len(before), jnp.inf)
+
+
+def _to_earliest_dip(tableau: Tableau, start: Vector, inside: Vector, end: Vector) -> Array:
+    """Share of the step up to where a guard that falls and rises again is lowest, if near zero.
+
+    From the parabola through the start, a stage inside and the end; 1 where there is nothing to
+    look at. A step is taken again up to that place: either the guard has crossed there, or the
+    march goes on from its lowest point. A point no lower than the start by 1 % is not new.
+    """
+    place = float(tableau.places[tableau.middle])
+    earliest = jnp.ones_like(start[0])
+    for g0, gm, g1 in zip(start, inside, end, strict=True):
+        bend = (g1 - g0 - (gm - g0) / place) / (1.0 - place)
+        slope = g1 - g0 - bend
+        falls_and_rises = (slope < 0.0) & (slope + 2.0 * bend > 0.0)
+        safe = jnp.where(falls_and_rises, bend, 1.0)
+        low = g0 - 0.25 * slope * slope / safe
+        near = low <= 0.25 * (jnp.maximum(g0, g1) - low)
+        new = g0 - low > 0.01 * low
+        dips = falls_and_rises & near & new & (g1 > 0.0)
+        earliest = jnp.where(dips, jnp.minimum(earliest, -0.5 * slope / safe), earliest)
+    return earliest
+
+
+class _Search(NamedTuple):
+    length: Array  # the next try; the event's, once found
+    low: Array
+    high: Array
+    open: Array
+    end: Place
+    guard: Array
+    tried: Array
+    tries: Array
+
+
+def _locate(
+    phase: LanePhase, tableau: Tableau, march: _March, options: Options, cut: Cut
+) -> _Search:
+    """The earliest event inside each crossing step, by Newton's method on the step's length.
+
+    The first try is the whole step, the second where the guards' parabolas cross. Every guard that
+    crossed proposes its own time and the earliest is taken, inside a bracket that bisection
+    shrinks. The last proposal moves the end along its slope; it is so short that what the next
+    order would add is a hundredth of the tolerance.
+    """
+    h = march.h
+    enough = 0.1 * jnp.sqrt(options.rtol) * h
+    bits = [(march.crossing >> i) & 1 == 1 for i in range(len(march.values))]
+
+    def propose(search: _Search, end: Place, inside: Place) -> tuple:
+        values, rates = _with_rates(phase, end)
+        within = phase.guards(inside)
+        change, guard = cut(_newton, values, rates, march.crossing)
+        at = cut(partial(_first_guess, tableau), march.values, within, values, march.crossing)
+        return cut(following, search, values, change, guard, at)
+
+    def following(search: _Search, values: Vector, change: Array, guard: Array, at: Array) -> tuple:
+        before = jnp.ones(h.shape, bool)
+        for g, crosses in zip(values, bits, strict=True):
+            before = before & ~(crosses & (g <= 0.0))
+        low = jnp.where(before, search.length, search.low)
+        high = jnp.where(before, search.high, search.length)
+        proposal = jnp.where(search.tries == 0, at * h, search.length + change)
+        inside = (proposal >= low - enough) & (proposal <= high + enough)
+        length = jnp.where(inside, proposal, 0.5 * (low + high))
+        arrived = inside & (jnp.abs(change) <= enough) & (search.tries > 0)
+        length = jnp.where(search.open, length, search.length)
+        return length, low, high, search.open & arrived, jnp.where(arrived, change, 0.0), guard
+
+    def improve(search: _Search) -> _Search:
+        taken = take_step(tableau, phase.evaluate, march.here, search.length, cut, False)
+        end = taken.end
+        length, low, high, arrived, shift, guard = propose(search, end, taken.inside)
+
+        def arrive(arrived: Array, shift: Array, end: Place, old: Place) -> Place:
+            q = tuple(x + shift * y for x, y in zip(end.q, end.v, strict=True))
+            v = tuple(x + shift * y for x, y in zip(end.v, end.slope.acceleration, strict=False))
+            return _select(arrived, end._replace(q=q, v=v), old)
+
+        return _Search(
+            length=length,
+            low=low,
+            high=high,
+            open=search.open & ~arrived,
+            end=cut(arrive, arrived, shift, end, search.end),
+            guard=jnp.where(arrived, guard, search.guard),
+            tried=search.tried + search.open,
+            tries=search.tries + 1,
+        )
+
+    none = jnp.zeros(h.shape, jnp.int32)
+    start = _Search(
+        h, jnp.zeros_like(h), h, march.verdict == CROSSED, march.here, none, none,
+        jnp.zeros((), jnp.int32),
+    )  # fmt: skip
+    unsettled = lambda search: jnp.any(search.open) & (search.tries < options.event_steps)
+    return lax.while_loop(unsettled, improve, start)
+
+
+def _newton(values: Vector, rates: Vector, crossing: Array) -> tuple[Array, Array]:
+    """Time to the earliest event by each crossing guard's own proposal, and which guard it is."""
+    change = jnp.full_like(values[0], jnp.inf)
+    guard = jnp.zeros_like(crossing)
+    for index, (g, rate) in enumerate(zip(values, rates, strict=True)):
+        falling = ((crossing >> index) & 1 == 1) & (rate < 0.0)
+        own = jnp.where(falling, -g / jnp.where(falling, rate, -1.0), jnp.inf)
+        guard = jnp.where(own < change, index, guard)
+        change = jnp.minimum(own, change)
+    return change, guard
+
+
+def _first_guess(
+    tableau: Tableau, start: Vector, inside: Vector, end: Vector, crossing: Array
+) -> Array:
+    """Share of the step to the earliest zero of the guards' parabolas: secant, then Newton."""
+    place = float(tableau.places[tableau.middle])
+    earliest = jnp.ones_like(start[0])
+    for index, (g0, gm, g1) in enumerate(zip(start, inside, end, strict=True)):
+        crosses = (crossing >> index) & 1 == 1
+        bend = (g1 - g0 - (gm - g0) / place) / (1.0 - place)
+        slope = g1 - g0 - bend
+        fall = jnp.where(crosses & (g0 > g1), g0 - g1, 1.0)
+        at = jnp.clip(g0 / fall, 0.0, 1.0)
+        for _ in range(3):
+            rate = slope + 2.0 * bend * at
+            falls = rate < 0.0
+            step = (g0 + at * (slope + bend * at)) / jnp.where(falls, rate, 1.0)
+            at = jnp.where(falls, jnp.clip(at - step, 0.0, 1.0), at)
+        earliest = jnp.where(crosses, jnp.minimum(earliest, at), earliest)
+    return earliest
+
+
+def _with_rates(phase: LanePhase, place: Place) -> tuple[Vector, Vector]:
+    """Guards and their derivatives in time along the motion."""
+    n = len(place.q)
+
+    def along(q: Vector, v: Vector) -> Vector:
+        return phase.guards(Place(q, v, phase.evaluate(q, v)))
+
+    return jax.jvp(along, (place.q, place.v), (place.v, place.slope.acceleration[:n]))
+
+
+def _first(conditions: Vector) -> Array:
+    """Index of the first condition that holds; -1 where none does."""
+    index = jnp.full(conditions[0].shape, -1, jnp.int32)
+    for i in range(len(conditions) - 1, -1, -1):
+        index = jnp.where(conditions[i], i, index)
+    return index
+
+
+def _select(condition: Array, yes: Any, no: Any) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)

@@ -1,0 +1,181 @@
+"""One explicit Runge-Kutta step of many wheels at once, lane by lane in separate arrays.
+
+The equations of motion are of second order, q'' = f(q, q'), so that a step keeps the accelerations
+of its stages alone: positions take the tableau's matrix twice, rates once. That is the same method
+with half of the stored slopes. Tableaus are diffrax's.
+
+XLA on CPU computes a producer again for each of its consumers, which in a Runge-Kutta step costs
+more than all arithmetic. A branch of `lax.cond` is a border that it can't fuse across; its
+predicate is always true, but only known at run time.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from vrw_jax.integrate import solver_named
+from vrw_jax.options import Options
+
+Lanes = Float[Array, " lanes"]
+Vector = tuple[Array, ...]
+"""One array of lanes for each component."""
+Cut = Callable[..., Any]
+"""`cut(function, *arrays)` is `function(*arrays)`, computed once whoever reads it."""
+
+
+class Tableau(NamedTuple):
+    """An explicit method whose last stage is the step's end, and so the next step's first."""
+
+    order: int
+    places: np.ndarray  # of the stages, in step lengths
+    once: np.ndarray  # the method's matrix: from accelerations to rates
+    twice: np.ndarray  # its square: from accelerations to positions
+    error_once: np.ndarray
+    error_twice: np.ndarray
+    middle: int
+    """A stage well inside the step, to look for guards that dip below zero and come back."""
+
+
+def explicit_tableau(name: str, options: Options) -> Tableau | None:
+    """diffrax's tableau of that name; None where the method is not explicit Runge-Kutta."""
+    solver: Any = solver_named(name, options)
+    given = getattr(solver, "tableau", None)
+    if given is None or not all(hasattr(given, part) for part in ("a_lower", "b_sol", "b_error")):
+        return None
+    if getattr(given, "a_diagonal", None) is not None and np.any(given.a_diagonal):
+        return None
+    n, ends_there = len(given.b_sol), bool(given.ssal)
+    once = np.zeros((n + (not ends_there), n + (not ends_there)))
+    for i, row in enumerate(given.a_lower):
+        once[i + 1, : i + 1] = row
+    error = np.zeros(len(once))
+    error[:n] = given.b_error
+    if not ends_there:
+        once[n, :n] = given.b_sol
+    places = once.sum(axis=1)
+    return Tableau(
+        order=int(solver.order(None)),
+        places=places,
+        once=once,
+        twice=_without_rounding(once @ once),
+        error_once=error,
+        error_twice=_without_rounding(error @ once),
+        middle=int(np.argmin(np.abs(places - 0.45))),
+    )
+
+
+def _without_rounding(x: np.ndarray) -> np.ndarray:
+    """Products of a tableau that vanish but for rounding, as zeros."""
+    return np.where(np.abs(x) < 1e-14 * np.max(np.abs(x)), 0.0, x)
+
+
+def cut_where(always: Bool[Array, ""]) -> Cut:
+    """Borders of fusion on CPU; `always` must be true, and only known at run time.
+
+    Elsewhere a branch would cost a round trip to the host, and fusion does not recompute.
+    """
+    if jax.default_backend() != "cpu":
+        return lambda function, *arrays: function(*arrays)
+
+    def cut(function: Callable, *arrays: Any) -> Any:
+        def nothing(*arrays: Any) -> Any:
+            shapes = jax.eval_shape(function, *arrays)
+            return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+
+        return lax.cond(always, function, nothing, *arrays)
+
+    return cut
+
+
+SINE = tuple((-1.0) ** i / math.factorial(2 * i + 1) for i in range(10))
+COSINE = tuple((-1.0) ** i / math.factorial(2 * i) for i in range(11))
+
+
+def sine_cosine(x: Array) -> tuple[Array, Array]:
+    """Sine and cosine by their series, right to round-off for |x| <= pi/2, a leg above ground.
+
+    XLA on CPU calls the scalar library for each float64 sine, at the price of a whole evaluation of
+    the equations of motion.
+    """
+    square = x * x
+    sine, cosine = SINE[-1] + 0.0 * square, COSINE[-1] + 0.0 * square
+    for coefficient in SINE[-2::-1]:
+        sine = sine * square + coefficient
+    for coefficient in COSINE[-2::-1]:
+        cosine = cosine * square + coefficient
+    return x * sine, cosine
+
+
+class Slope(NamedTuple):
+    """What the equations of motion say at one point."""
+
+    sin: Array  # of theta
+    cos: Array
+    acceleration: Vector  # of all three coordinates; the phase's own come first
+
+
+class Place(NamedTuple):
+    """Positions, rates and slope of one stage."""
+
+    q: Vector
+    v: Vector
+    slope: Slope
+
+
+class Taken(NamedTuple):
+    """A step: its end, a place inside and the error estimate."""
+
+    end: Place
+    inside: Place
+    error: Vector  # of positions, then rates
+
+
+Evaluate = Callable[[Vector, Vector], Slope]
+
+
+def take_step(
+    tableau: Tableau, evaluate: Evaluate, start: Place, h: Array, cut: Cut, with_error: bool = True
+) -> Taken:
+    """From `start` by `h` (lane by lane)."""
+    n = len(start.q)
+    places, slopes = [start], [start.slope.acceleration[:n]]
+    q0, v0 = start.q, start.v
+
+    def stage(i: int) -> Callable[..., tuple[Vector, Vector]]:
+        def position_and_rate(q: Vector, v: Vector, h: Array, slopes: list) -> tuple:
+            position, rate = [], []
+            for d in range(n):
+                known = [slope[d] for slope in slopes]
+                twice, once = _weigh(tableau.twice[i], known), _weigh(tableau.once[i], known)
+                drift = float(tableau.places[i]) * v[d]
+                position.append(q[d] + h * (drift if twice is None else drift + h * twice))
+                rate.append(v[d] + h * once)
+            return tuple(position), tuple(rate)
+
+        return position_and_rate
+
+    for i in range(1, len(tableau.places)):
+        q, v = cut(stage(i), q0, v0, h, slopes)
+        slope = evaluate(q, v)
+        places.append(Place(q, v, slope))
+        slopes.append(slope.acceleration[:n])
+
+    def estimate(h: Array, slopes: list) -> Vector:
+        known = [[slope[d] for slope in slopes] for d in range(n)]
+        of_position = [h * h * _weigh(tableau.error_twice, k) for k in known]
+        return tuple(of_position + [h * _weigh(tableau.error_once, k) for k in known])
+
+    error = estimate(h, slopes) if with_error else ()
+    return Taken(places[-1], places[tableau.middle], error)
+
+
+def _weigh(weights: np.ndarray, terms: list[Array]) -> Any:
+    """Weighted sum; None where all weights vanish."""
+    parts = [float(w) * x for w, x in zip(weights, terms, strict=False) if w != 0.0]
+    return sum(parts[1:], start=parts[0]) if parts else None
