@@ -10,7 +10,7 @@ import vrw_jax as vrw
 from vrw_jax.measures import MARGINS
 from vrw_jax.premises import PREMISES, default_margins
 from vrw_jax.tune import Tuned, TuneProblem, tune, tuning_problem
-from vrw_jax.tune_search import Ending, Kind
+from vrw_jax.tune_search import ACTIVE, Ending, Kind, breach, slack_scales
 
 BOX = {
     "damping": (20.0, 215.0),
@@ -60,7 +60,8 @@ def test_the_optimum_meets_the_first_order_condition_with_every_premise_kept(mos
     kept = problem_of("dls_fraction").trial(
         np.zeros(4), most_dls_gait(most_dls), vrw.Outcome.STEPPED, True
     )
-    assert np.all(kept.slack > -1e-6 * np.abs(kept.slack + 1.0))
+    # A constraint counts as kept within ACTIVE widths; the gait found afresh differs by 1e-9.
+    assert breach(kept, slack_scales(kept)) <= 1.01 * ACTIVE
 
 
 def most_dls_gait(tuned: Tuned):
@@ -150,7 +151,7 @@ def test_the_path_is_a_labelled_dataset_and_the_result_prints_itself(most_dls):
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"free": ["dampin"], "bounds": {"dampin": (1, 2)}}, r"did you mean 'damping'\?"),
+        ({"free": ["dampin"], "bounds": {"dampin": (1.0, 2.0)}}, r"did you mean 'damping'\?"),
         ({"free": [], "bounds": {}}, "at least one must move"),
         ({"free": ["damping"], "bounds": {}}, "damping is free but has no bounds"),
         ({"bounds": {"damping": (215.0, 20.0)}}, "which hold nothing"),
@@ -164,6 +165,7 @@ def test_the_path_is_a_labelled_dataset_and_the_result_prints_itself(most_dls):
         ({"params": vrw.WheelParams(damping=jnp.array([1.0, 2.0]))}, "one wheel"),
         ({"tolerance": 0.0}, "must be positive"),
         ({"max_evaluations": 0}, "at least 1"),
+        ({"n_starts": 0}, "at least one start"),
     ],
 )
 def test_bad_input_is_answered_in_one_sentence(changes, sentence):
@@ -177,6 +179,17 @@ def test_bad_input_is_answered_in_one_sentence(changes, sentence):
     with pytest.raises(ValueError, match=sentence) as caught:
         tune(**given)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.slow
+def test_many_starts_side_by_side_end_at_the_same_optimum(most_dls):
+    many = tune(vrw.WheelParams(damping=30.0), "dls_fraction", FREE, BOX, n_starts=8)
+    assert many.ending == Ending.CONVERGED
+    np.testing.assert_allclose(many.value, most_dls.value, rtol=1e-6)
+    walkers = np.isfinite(many.lanes.objective)
+    assert walkers.sum() >= 4
+    near = many.lanes.breach[walkers] < 0.05
+    assert np.median(many.lanes.objective[walkers][near]) > 0.7  # of 0.786 after 25 steps
 
 
 def test_a_start_without_a_gait_is_refused():

@@ -37,6 +37,7 @@ from vrw_jax.tune_engine import (
     same_branch,
 )
 from vrw_jax.tune_search import Climb, Ending, Kind, Trial, breach, climb, optimality, slack_scales
+from vrw_jax.tune_starts import Lanes, explore
 from vrw_jax.wording import nearest
 
 Objective = str | Mapping[str, float] | Callable[..., Array]
@@ -61,7 +62,7 @@ class Walked(NamedTuple):
     kept: bool  # whether every step kept every constraint on a monitor, within 1e-3 of its scale
 
 
-DISPLACED, N_WALKED = 1e-5, 10
+DISPLACED, N_WALKED, N_EXPLORED = 1e-5, 10, 25
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,7 +84,8 @@ class Tuned:
     evaluations: int  # limit cycles, each with one step
     shortened: int  # trials that lost the gait or its branch
     seconds: float  # of which `compile_seconds` went to compiling
-    compile_seconds: float
+    compile_seconds: float  # and to exploring, if there were many starts
+    lanes: Lanes | None = None  # where many starts got to before the climb
 
     @property
     def converged(self) -> bool:
@@ -96,7 +98,8 @@ class Tuned:
         wheel = [
             f"{n} {float(getattr(self.params, n)):.6g} {DOMAINS[n].unit}".strip() for n in free
         ]
-        kept = "keeps every constraint" if self.walked.kept else "breaks a constraint"
+        kept = "every constraint kept" if self.walked.kept else "a constraint broken"
+        kept = kept if self.path.sizes["constraint"] else "no constraint to keep"
         held = [f"{a.name} at {a.limit:.6g} {_plain(a.unit)}".strip() for a in self.active]
         return {
             "objective": f"{self.objective}: {self.start_value:.6g} at the start, {self.value:.6g}",
@@ -139,6 +142,8 @@ def tune(
     cycle_options: CycleOptions | None = None,
     tolerance: float = 1e-6,
     max_evaluations: int = 200,
+    n_starts: int = 1,
+    seed: int = 0,
 ) -> Tuned:
     """The wheel near `params` whose gait has the largest objective and keeps its constraints.
 
@@ -148,7 +153,9 @@ def tune(
     default is every premise that gaits of this rung can keep (`premises.default_margins`), {} is
     none. `tolerance` is on the first-order condition, relative to the objective's gradient; a
     constraint counts as kept within 1e-6 of what it changes over the bounds. Local: it ends at an
-    optimum of the branch that `params` lies on.
+    optimum of the branch that `params` lies on. With `n_starts` above 1 so many wheels, `params`
+    and random ones within the bounds, first take N_EXPLORED first-order steps side by side, and the
+    best is climbed from.
     """
     began = time.perf_counter()
     problem = tuning_problem(
@@ -165,11 +172,14 @@ def tune(
         raise ValueError(f"max_evaluations is {max_evaluations}, but it must be at least 1.")
     if not tolerance > 0.0:
         raise ValueError(f"tolerance is {tolerance:g}, but it must be positive.")
+    if not n_starts >= 1:
+        raise ValueError(f"n_starts is {n_starts}, but at least one start is needed.")
+    lanes = problem.explore(n_starts, seed) if n_starts > 1 else None
     problem.engine.compile(params)
-    start = problem.start()
+    start = problem.start() if lanes is None else problem.evaluate(lanes.u[lanes.best], None)
     compiled = time.perf_counter()
     done = climb(problem.evaluate, start, tolerance=tolerance, max_evaluations=max_evaluations)
-    return problem.result(done, began, compiled)
+    return problem.result(done, began, compiled, lanes)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -260,7 +270,39 @@ class TuneProblem:
             slopes[1:], gait,
         )  # fmt: skip
 
-    def result(self, done: Climb, began: float, compiled: float) -> Tuned:
+    def explore(self, n_starts: int, seed: int) -> Lanes:
+        """First-order steps of many starts side by side: this wheel, and random ones."""
+        others = np.random.default_rng(seed).uniform(size=(n_starts - 1, len(self.free)))
+        lanes = explore(
+            self._batch,
+            np.vstack([self.start_u, others]),
+            self._change,
+            [PARAMETER_NAMES.index(name) for name in self.free],
+            self.widths,
+            self.least,
+            N_EXPLORED,
+        )
+        if not np.isfinite(lanes.objective).any():
+            raise ValueError(
+                f"none of {n_starts} starts within the bounds has a gait: narrow the bounds around "
+                "wheels that walk, such as WheelParams()."
+            )
+        return lanes
+
+    def _batch(self, u: np.ndarray, near: Gait | None) -> Gait:
+        parameters = jnp.asarray([self.parameters(row) for row in u])
+        first = self.engine.first_guesses(parameters)
+        return self.engine.batch(parameters, first if near is None else near.cycle.located)
+
+    def _change(self, difference: np.ndarray) -> np.ndarray:
+        """Differences of all parameters by differences of u, row by row."""
+        change = np.zeros((difference.shape[0], len(PARAMETER_NAMES)))
+        change[:, [PARAMETER_NAMES.index(name) for name in self.free]] = difference * self.widths
+        return change
+
+    def result(
+        self, done: Climb, began: float, compiled: float, lanes: Lanes | None = None
+    ) -> Tuned:
         """The result of a climb, confirmed by walking."""
         best = done.best
         assert best.gait is not None
@@ -297,10 +339,11 @@ class TuneProblem:
             unkept=tuple(n for n, v in monitors.items() if n not in self.margins and v < 0.0),
             walked=walked,
             path=self._path(done),
-            evaluations=len(done.trials),
+            evaluations=len(done.trials) + (0 if lanes is None else lanes.gaits),
             shortened=sum(kind == Kind.LOST for kind in done.kinds),
             seconds=climbed - began,
             compile_seconds=compiled - began,
+            lanes=lanes,
         )
 
     def _walk(self, params: WheelParams, gait: Gait) -> Walked:

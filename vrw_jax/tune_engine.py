@@ -198,6 +198,11 @@ class Engine:
         lane = surface_start(self.problem, parameters[:, None], jnp.ones((1,), bool))
         return jax.tree.map(lambda x: x[..., 0], lane)
 
+    def first_guesses(self, parameters: Array) -> Located:
+        """The same for many wheels, one row of parameters for each."""
+        lanes = surface_start(self.problem, parameters.T, jnp.ones(parameters.shape[:1], bool))
+        return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), lanes)
+
     def __call__(self, parameters: Array, guess: Located) -> Gait:
         """The gait of one wheel near `guess`."""
         n_legs = self.problem.n_legs
@@ -257,19 +262,29 @@ def outcome_of(gait: Gait) -> Outcome:
     return Outcome.STEPPED if away <= AGREEMENT else Outcome.NO_CYCLE_FOUND
 
 
+Told = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""Posture, its columns, which phases happen, and the monodromy matrix of one gait."""
+
+
 def same_branch(here: Gait, there: Gait, change: np.ndarray) -> bool:
-    """Whether a branch leads from one gait to the other when the parameters change so.
+    """Whether a branch leads from one gait to the other when the parameters change so."""
+    told = [
+        (gait.posture, gait.posture_columns, gait.cycle.located.happens, gait.cycle.matrix)
+        for gait in (here, there)
+    ]
+    first, second = (tuple(np.asarray(x) for x in some) for some in told)
+    return is_same_branch(first, second, change)  # type: ignore[arg-type]
+
+
+def is_same_branch(here: Told, there: Told, change: np.ndarray) -> bool:
+    """See `same_branch`.
 
     The mean of both ends' slopes must account for most of the way between the gaits, the same
     phases must happen, and no multiplier may have passed through 1.
     """
-    moved = np.asarray(there.posture - here.posture)
-    slopes = 0.5 * np.asarray(here.posture_columns + there.posture_columns)
-    predicted = change @ slopes
-    missed = np.linalg.norm(moved - predicted)
+    predicted = change @ (0.5 * (here[1] + there[1]))
+    missed = np.linalg.norm(there[0] - here[0] - predicted)
     if missed > 0.5 * np.linalg.norm(predicted) + 1e-6:
         return False
-    if not np.array_equal(here.cycle.located.happens, there.cycle.located.happens):
-        return False
-    fold = lambda gait: np.linalg.det(np.eye(2) - np.asarray(gait.cycle.matrix))
-    return bool(fold(here) * fold(there) > 0.0)
+    fold = lambda told: np.linalg.det(np.eye(2) - told[3])
+    return bool(np.array_equal(here[2], there[2]) and fold(here) * fold(there) > 0.0)

@@ -149,9 +149,16 @@ def climb(evaluate: Evaluate, start: Trial, *, tolerance: float, max_evaluations
             raise _ArrivedError(trial)
         return trial
 
-    centre, radius = start, WHOLE
+    centre, radius, widest = start, WHOLE, WHOLE
     ending = Ending.CONVERGED
+    known = 0
     while True:
+        # A round that evaluated nothing new would only be repeated: the next one sees less.
+        widest = widest if len(record.trials) > known else 0.5 * widest
+        known, radius = len(record.trials), min(radius, widest)
+        if radius < SMALLEST_RADIUS:
+            ending = Ending.AT_A_BORDER
+            break
         low, high = np.maximum(centre.u - radius, 0.0), np.minimum(centre.u + radius, 1.0)
         iterates = [centre]
         try:
@@ -166,16 +173,13 @@ def climb(evaluate: Evaluate, start: Trial, *, tolerance: float, max_evaluations
                     "jac": lambda u: record.at(u).slopes / scales[:, None],
                 },
                 method="SLSQP",
-                options={"ftol": STALLED if radius >= WHOLE else LOOSE, "maxiter": 100},
+                options={"ftol": STALLED if radius >= widest else LOOSE, "maxiter": 100},
                 callback=lambda u, seen=iterates: seen.append(arrive(record.iterate(u))),
             )
             reached = record.iterate(np.clip(result.x, low, high))
         except _LostError as lost:
             centre = iterates[-1]
             radius = 0.5 * float(np.max(np.abs(lost.trial.u - centre.u)))
-            if radius < SMALLEST_RADIUS:
-                ending = Ending.AT_A_BORDER
-                break
             continue
         except _ArrivedError as arrived:
             centre = arrived.trial
