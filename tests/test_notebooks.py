@@ -1,0 +1,47 @@
+"""Every notebook runs from top to bottom, and what it shows in words is what it is stored with."""
+
+import os
+import re
+from pathlib import Path
+
+import jax
+import pytest
+
+nbclient = pytest.importorskip("nbclient")
+nbformat = pytest.importorskip("nbformat")
+
+FOLDER = Path(__file__).parents[1] / "docs" / "notebooks"
+NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
+LARGEST = 400_000
+"""Bytes of a stored notebook, pictures included."""
+
+
+def test_there_are_notebooks():
+    assert {path.stem for path in NOTEBOOKS} >= {"branch", "sensitivities", "tuning"}
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_is_stored_executed_and_small(path):
+    assert path.stat().st_size < LARGEST
+    cells = [c for c in nbformat.read(path, as_version=4).cells if c.cell_type == "code"]
+    assert all(cell.execution_count for cell in cells)
+    assert not re.search(r"/(home|root|work|tmp)/", path.read_text())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_runs_and_prints_what_it_is_stored_with(path, monkeypatch):
+    cache = jax.config.jax_compilation_cache_dir
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", os.environ.get("VRW_TEST_CACHE", cache))
+    stored = nbformat.read(path, as_version=4)
+    run = nbformat.read(path, as_version=4)
+    nbclient.NotebookClient(run, timeout=900, kernel_name="python3").execute()
+    for before, after in zip(stored.cells, run.cells, strict=True):
+        if before.cell_type == "code":
+            assert printed(after) == printed(before)
+
+
+def printed(cell: object) -> str:
+    """What a cell prints, numbers cut to three digits: pictures and reprs are not compared."""
+    text = "".join(o.text for o in cell.outputs if o.output_type == "stream" and o.name == "stdout")
+    return re.sub(r"-?\d+\.?\d*(e-?\d+)?", lambda m: f"{float(m[0]):.3g}", text)
