@@ -8,7 +8,7 @@ few late lanes, which run again among their like. None of this reaches into a la
 
 import functools
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -24,8 +24,6 @@ from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
 from vrw_jax.params import PARAMETER_NAMES, WheelParams
 from vrw_jax.runge_kutta import explicit_tableau
-
-EngineName = Literal["auto", "lanes", "diffrax"]
 
 BLOCK = 256
 """Lanes that march side by side on CPU: they stay in cache, and few wait for the slowest."""
@@ -55,7 +53,7 @@ def steps(
     *,
     model: AbstractWheel | None = None,
     options: Options | None = None,
-    engine: EngineName = "auto",
+    engine: str = "auto",
 ) -> Steps:
     """`n_steps` gait steps of many wheels, or as many as each can: values only, no derivatives.
 
@@ -131,7 +129,7 @@ class _Engine(eqx.Module):
         return self.call(wheels, states)
 
 
-def _chosen(engine: EngineName, model: AbstractWheel, options: Options, n_legs: int) -> _Engine:
+def _chosen(engine: str, model: AbstractWheel, options: Options, n_legs: int) -> _Engine:
     if engine not in ("auto", "lanes", "diffrax"):
         raise ValueError(f"engine is {engine!r}, but it is 'auto', 'lanes' or 'diffrax'.")
     fits = isinstance(model, ViscoelasticWheel) and (
@@ -159,8 +157,8 @@ def _by_lanes(
     """By the lane engine: wheels of like work side by side, late lanes again among their like."""
     dynamic, static = eqx.partition(options, eqx.is_array)
     dynamic = jax.tree.map(lambda leaf: np.asarray(leaf, wheels.dtype), dynamic)
-    program = _lane_program(static, n_legs, stop_at_lift_off)
     n, width = len(states), _width()
+    program = _lane_program(static, n_legs, stop_at_lift_off, width)
     told = (np.empty((n, 3), wheels.dtype), np.empty((n, 3), wheels.dtype))
     counts = (np.empty(n, np.int32), np.empty(n, np.int32))
     # The airborne leg's fast rate, near c/m, sets the step where stability does.
@@ -201,8 +199,10 @@ def _filled(
 
 
 @functools.cache
-def _lane_program(static: Options, n_legs: int, stop_at_lift_off: bool) -> Callable[..., LaneStep]:
-    """The compiled step of BLOCKS blocks: one program for every batch."""
+def _lane_program(
+    static: Options, n_legs: int, stop_at_lift_off: bool, width: tuple[int, int]
+) -> Callable[..., LaneStep]:
+    """The compiled step of some blocks of lanes: one program for every batch."""
 
     def block(dynamic: Options, few: Array, given: tuple[Array, Array, Array]) -> LaneStep:
         columns, x, wanted = given
@@ -213,8 +213,7 @@ def _lane_program(static: Options, n_legs: int, stop_at_lift_off: bool) -> Calla
         return gait_step(params, x.T, wanted, options, tableau, stop_at_lift_off, Patience(few))
 
     def blocks(columns: Array, x: Array, wanted: Array, dynamic: Options, few: Array) -> LaneStep:
-        n = columns.shape[-1] // _width()[1]
-        to_blocks = lambda a: jnp.moveaxis(a.reshape(*a.shape[:-1], n, -1), -2, 0)
+        to_blocks = lambda a: jnp.moveaxis(a.reshape(*a.shape[:-1], *width), -2, 0)
         out = lax.map(
             functools.partial(block, dynamic, few), jax.tree.map(to_blocks, (columns, x, wanted))
         )

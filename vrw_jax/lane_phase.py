@@ -172,8 +172,7 @@ def _march(
 def _change(order: int, squared: Array, to_dip: Array) -> tuple[Array, Array]:
     """Length of the next try over this one's, and whether the step is kept (1) or retried (2)."""
     # The controller's power needs no more than float32, which has a vectorised one.
-    single = jnp.clip(squared, 1e-20, 1e20).astype(jnp.float32)
-    power = jnp.exp(jnp.log(single) * (-0.5 / order)).astype(squared.dtype)
+    power = jnp.exp(jnp.log(jnp.clip(squared, 1e-20, 1e20)) * (-0.5 / order)).astype(to_dip.dtype)
     keep = squared <= 1.0
     change = jnp.clip(SAFETY * power, LEAST, jnp.where(keep, MOST, 1.0))
     retry = keep & (to_dip < 1.0)
@@ -211,14 +210,19 @@ def _verdict(
 
 
 def _squared_error(taken: Taken, start: Place, guards: Vector, rtol: Array, atol: Array) -> Array:
-    """Mean square of the error over its tolerance; infinite where the step went nowhere."""
+    """Mean square of the error over its tolerance; infinite where the step went nowhere.
+
+    float32 says enough about an error.
+    """
     before, after = (*start.q, *start.v), (*taken.end.q, *taken.end.v)
+    single = lambda x: x.astype(jnp.float32)
     total: Any = 0.0
     for error, a, b in zip(taken.error, before, after, strict=True):
-        ratio = error / (atol + rtol * jnp.maximum(jnp.abs(a), jnp.abs(b)))
+        allowed = atol + rtol * jnp.maximum(jnp.abs(a), jnp.abs(b))
+        ratio = single(error) / single(allowed)
         total = total + ratio * ratio
     for value in guards:
-        total = total + 0.0 * value
+        total = total + single(0.0 * value)
     return jnp.where(jnp.isfinite(total), total / len(before), jnp.inf)
 
 
@@ -230,18 +234,18 @@ def _to_earliest_dip(tableau: Tableau, start: Vector, inside: Vector, end: Vecto
     march goes on from its lowest point. A point no lower than the start by 1 % is not new.
     """
     place = float(tableau.places[tableau.middle])
-    earliest = jnp.ones_like(start[0])
+    over, under = jnp.ones_like(start[0]), jnp.ones_like(start[0])
     for g0, gm, g1 in zip(start, inside, end, strict=True):
         bend = (g1 - g0 - (gm - g0) / place) / (1.0 - place)
         slope = g1 - g0 - bend
         falls_and_rises = (slope < 0.0) & (slope + 2.0 * bend > 0.0)
-        safe = jnp.where(falls_and_rises, bend, 1.0)
-        low = g0 - 0.25 * slope * slope / safe
-        near = low <= 0.25 * (jnp.maximum(g0, g1) - low)
-        new = g0 - low > 0.01 * low
-        dips = falls_and_rises & near & new & (g1 > 0.0)
-        earliest = jnp.where(dips, jnp.minimum(earliest, -0.5 * slope / safe), earliest)
-    return earliest
+        low = 4.0 * bend * g0 - slope * slope  # the lowest value, times 4 bend > 0
+        near = 5.0 * low <= 4.0 * bend * jnp.maximum(g0, g1)
+        new = 4.0 * bend * g0 > 1.01 * low
+        earlier = -slope * under < over * 2.0 * bend
+        dips = falls_and_rises & near & new & earlier & (g1 > 0.0)
+        over, under = jnp.where(dips, -slope, over), jnp.where(dips, 2.0 * bend, under)
+    return over / under
 
 
 class _Search(NamedTuple):

@@ -1,0 +1,239 @@
+"""The lane engine gives what the diffrax engine gives, bitwise the same in any company."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import truth
+from batched import wheels_like
+
+import vrw_jax as vrw
+from vrw_jax import Outcome, lane_batch
+from vrw_jax.lane_phase import LanePhase, Patience, integrate_lanes
+from vrw_jax.runge_kutta import Place, Slope, cut_where, explicit_tableau, sine_cosine, take_step
+
+GAIT = truth.table("cycle", "section_state")[0]
+STARTS = truth.table("step", "start")
+VALUES = np.concatenate([truth.table("step", "section_state"), truth.table("step", "durations")], 1)
+
+FEW_STEPS = vrw.Options(solver="Bosh3", max_solver_steps=60)
+"""Too few for a gait at the default tolerances."""
+
+PROVOKED = {
+    Outcome.STEPPED: (wheels_like(), GAIT),
+    Outcome.TOUCHDOWN_BEFORE_STOPPER: (wheels_like(), [0.1027, 2.3, -0.109]),
+    Outcome.STOPPER_IN_DOUBLE_SUPPORT: (
+        wheels_like(damping=157.864, stiffness=464.623, natural_length=1.137, slope=0.315),
+        [0.298, 0.543, -0.589],
+    ),
+    Outcome.FELL_BACK: (wheels_like(slope=0.05), [0.1027, 1.0, -0.109]),
+    Outcome.COLLAPSED: (
+        wheels_like(damping=56.866, stiffness=78.927, natural_length=0.963, slope=0.5),
+        [-0.33, 5.4, -1.989],
+    ),
+    Outcome.LEG_1_LIFTED_OFF: (wheels_like(), [0.1027, 6.0, -0.109]),
+    Outcome.BAD_INPUT: (wheels_like(damping=np.nan), GAIT),
+}
+
+
+def told(vectors, states, options=None, **keywords):
+    """State and durations of each lane, and its outcome."""
+    options = vrw.Options() if options is None else options
+    found = vrw.steps(truth.wheels(vectors), states, options=options, **keywords)
+    return np.concatenate([found.section_state, found.durations], 1), np.asarray(found.outcome)
+
+
+def hard_starts(n):
+    """Wheels and starts of which most fail, some in every way."""
+    draw = np.random.default_rng(5).uniform
+    vectors = wheels_like(
+        damping=draw(20.0, 400.0, n),
+        stiffness=draw(50.0, 3000.0, n),
+        natural_length=draw(0.95, 1.15, n),
+        slope=draw(0.02, 0.5, n),
+    )
+    return vectors, np.stack([draw(-0.4, 0.4, n), draw(0.3, 6.0, n), draw(-2.0, 1.0, n)], 1)
+
+
+@pytest.mark.parametrize(
+    ("options", "claimed"),
+    [(vrw.Options(), 1e-9), (vrw.Options.tight(), 1e-12)],
+    ids=["default", "tight"],
+)
+def test_state_and_durations_are_right_to_the_claimed_error(options, claimed):
+    found, outcome = told(truth.PARAMETERS, STARTS, options)
+    assert np.all(outcome == Outcome.STEPPED)
+    assert truth.scaled_error(found, VALUES) < claimed
+
+
+def test_hard_starts_end_as_with_the_diffrax_engine():
+    vectors, states = hard_starts(512)
+    by_lanes, codes = told(vectors, states)
+    by_diffrax, expected = told(vectors, states, engine="diffrax")
+    np.testing.assert_array_equal(codes, expected)
+    assert set(codes) == {0, 1, 2, 3, 5}
+    # Both at 1e-10 for each local step.
+    np.testing.assert_allclose(by_lanes, by_diffrax, rtol=1e-8, atol=1e-8)
+    stepped = codes == Outcome.STEPPED
+    np.testing.assert_allclose(by_lanes[stepped], by_diffrax[stepped], rtol=5e-10, atol=5e-10)
+
+
+def test_each_outcome_is_provoked_side_by_side_and_stays_finite():
+    vectors = np.concatenate([v for v, _ in PROVOKED.values()])
+    states = np.stack([np.asarray(x) for _, x in PROVOKED.values()])
+    found, outcome = told(vectors, states)
+    assert [Outcome(code) for code in outcome] == list(PROVOKED)
+    assert np.all(np.isfinite(found))
+    assert np.all(found[outcome != Outcome.STEPPED, :3] == 0.0)
+
+
+def test_time_that_runs_out_is_a_code():
+    _, outcome = told(wheels_like(), GAIT[None], vrw.Options(max_phase_time=0.2))
+    assert outcome[0] == Outcome.NO_TOUCHDOWN_IN_TIME
+
+
+def test_a_solver_that_runs_out_of_steps_is_a_code():
+    assert told(wheels_like(), GAIT[None], FEW_STEPS)[1][0] == Outcome.SOLVER_GAVE_UP
+
+
+@pytest.fixture(scope="module")
+def crowd():
+    """65,536 lanes, the hard ones among them, and what each gives there."""
+    vectors, states = hard_starts(65_536)
+    vectors[::3], states[::3] = truth.PARAMETERS[0], GAIT
+    return vectors, states, *told(vectors, states)
+
+
+def test_a_lane_alone_is_bitwise_itself_in_a_crowd(crowd):
+    vectors, states, found, codes = crowd
+    for i in (0, 1, 4, 40_001, 65_534):
+        alone, code = told(vectors[i : i + 1], states[i : i + 1])
+        np.testing.assert_array_equal(alone[0], found[i])
+        assert code[0] == codes[i]
+
+
+def test_the_order_of_lanes_changes_no_bit(crowd):
+    vectors, states, found, codes = crowd
+    some = np.random.default_rng(0).permutation(len(states))[:9_000]
+    again, code = told(vectors[some], states[some])
+    np.testing.assert_array_equal(again, found[some])
+    np.testing.assert_array_equal(code, codes[some])
+
+
+def test_the_size_of_blocks_changes_no_bit(monkeypatch):
+    # A method of few stages: another size of block is another program to compile.
+    options = eqx.tree_at(lambda o: (o.rtol, o.atol), FEW_STEPS, (1e-4, 1e-4))
+    vectors, states = hard_starts(300)
+    found, codes = told(vectors, states, options)
+    monkeypatch.setattr(lane_batch, "BLOCK", 64)
+    again, code = told(vectors, states, options)
+    np.testing.assert_array_equal(again, found)
+    np.testing.assert_array_equal(code, codes)
+
+
+def test_late_lanes_run_again_and_change_no_bit(monkeypatch, crowd):
+    # Without patience every block leaves lanes behind; with all of it, none.
+    vectors, states, found, _ = crowd
+    monkeypatch.setattr(lane_batch, "FEW", 10**9)
+    patient, _ = told(vectors[:3000], states[:3000])
+    np.testing.assert_array_equal(patient, found[:3000])
+
+
+def test_a_walk_goes_as_the_single_wheel_walks_and_ends_at_its_first_failure():
+    vectors = wheels_like(slope=[0.30, 0.09], damping=[200.0, 100.0])
+    states = np.asarray([GAIT, [0.1027, 2.0, -0.109]])
+    found = vrw.steps(truth.wheels(vectors), states, 12)
+    assert list(map(Outcome, found.outcome)) == [Outcome.STEPPED, Outcome.FELL_BACK]
+    for i in (0, 1):
+        single = vrw.walk(truth.wheel(vectors[i]), states[i], 12)
+        assert int(found.n_stepped[i]) == int(single.n_stepped)
+    last = vrw.walk(truth.wheel(vectors[0]), states[0], 12).steps.section_state[-1]
+    np.testing.assert_allclose(found.section_state[0], last, atol=1e-8)
+
+
+def test_the_engine_is_chosen_by_model_and_solver_and_named():
+    params, states = truth.wheels(wheels_like()), GAIT[None]
+    assert vrw.steps(params, states).engine == "lanes"
+    assert vrw.steps(params, states, engine="diffrax").engine == "diffrax"
+    assert (
+        vrw.steps(params, np.asarray([[0.39, 1.2, 0.0]]), model=vrw.RigidWheel()).engine
+        == "diffrax"
+    )
+    with pytest.raises(ValueError, match="explicit"):
+        vrw.steps(params, states, options=vrw.Options(solver="Kvaerno5"), engine="lanes")
+
+
+def test_what_can_be_seen_to_be_wrong_is_said_in_one_sentence():
+    params = vrw.WheelParams()
+    with pytest.raises(ValueError, match=r"shape \(lanes, 3\)"):
+        vrw.steps(params, GAIT)
+    with pytest.raises(ValueError, match="at least one step"):
+        vrw.steps(params, GAIT[None], 0)
+    with pytest.raises(ValueError, match="'auto', 'lanes' or 'diffrax'"):
+        vrw.steps(params, GAIT[None], engine="fast")
+    with pytest.raises(TypeError, match="vmap"):
+        jax.jit(lambda c: vrw.steps(vrw.WheelParams(damping=c), GAIT[None]).outcome)(200.0)
+
+
+def test_sine_and_cosine_are_right_to_round_off_wherever_a_leg_stands():
+    x = jnp.linspace(-0.5 * np.pi, 0.5 * np.pi, 10_001)
+    sine, cosine = sine_cosine(x)
+    np.testing.assert_allclose(sine, np.sin(x), atol=4e-16)
+    np.testing.assert_allclose(cosine, np.cos(x), atol=4e-16)
+
+
+@pytest.mark.parametrize(("name", "order"), [("Bosh3", 3), ("Tsit5", 5), ("Dopri5", 5)])
+def test_a_step_has_the_order_of_its_tableau(name, order):
+    """A pendulum with damping: error over one unit of time against the number of steps."""
+    tableau = explicit_tableau(name, vrw.Options())
+    evaluate = lambda q, v: Slope(q[0], q[0], (-jnp.sin(q[0]) - 0.3 * v[0],))
+    cut = lambda function, *arrays: function(*arrays)
+
+    def end(n):
+        q, v = (jnp.ones(1),), (jnp.full(1, 0.5),)
+        place = Place(q, v, evaluate(q, v))
+        for _ in range(n):
+            place = take_step(tableau, evaluate, place, jnp.full(1, 1.0 / n), cut).end
+        return np.concatenate([*place.q, *place.v])
+
+    exact = end(160)
+    errors = [np.max(np.abs(end(n) - exact)) for n in (4, 8, 16)]
+    slope = -np.polyfit(np.log([4, 8, 16]), np.log(errors), 1)[0]
+    assert abs(slope - order) < 0.4
+
+
+def fall(height, options=None):
+    """A lane of free fall upwards: q(t) = (t - 1)^2 / 2 + height; the guard is q."""
+    options = vrw.Options() if options is None else options
+    zero, one = jnp.zeros(8), jnp.ones(8)
+    phase = LanePhase(
+        lambda q, v: Slope(q[0], q[0], (jnp.ones_like(q[0]),)),
+        lambda place: (place.q[0],),
+        (Outcome.STEPPED,),
+    )
+    end = integrate_lanes(
+        phase,
+        explicit_tableau("Dopri8", options),
+        (0.5 * one + height,),
+        (-one,),
+        one > 0.0,
+        zero + 5e-3,
+        options,
+        cut_where(jnp.asarray(True)),
+        Patience(0),
+    )
+    return end.guard[0], end.duration[0]
+
+
+def test_a_guard_that_dips_below_zero_within_one_step_is_found():
+    # The method is exact here, so that its steps grow until one jumps over the dip at t = 1.
+    guard, duration = fall(-1e-3)
+    assert int(guard) == 0
+    assert abs(float(duration) - (1.0 - np.sqrt(2e-3))) < 1e-9
+
+
+def test_a_guard_that_comes_close_and_turns_back_does_not_fire():
+    guard, duration = fall(1e-3, vrw.Options(max_phase_time=3.0))
+    assert int(guard) == -1
+    assert float(duration) >= 3.0
