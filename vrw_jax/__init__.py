@@ -15,6 +15,8 @@ from vrw_jax.models import (
     Margins,
     RigidWheel,
     StepResult,
+    UnilateralStep,
+    UnilateralWheel,
     ViscoelasticWheel,
 )
 from vrw_jax.options import Options
@@ -45,6 +47,8 @@ __all__ = [
     "StepResult",
     "Steps",
     "Tuned",
+    "UnilateralStep",
+    "UnilateralWheel",
     "ViscoelasticWheel",
     "Walk",
     "WheelParams",

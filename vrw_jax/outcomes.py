@@ -16,6 +16,9 @@ class Outcome(enum.IntEnum):
     SOLVER_GAVE_UP = 7
     BAD_INPUT = 8
     NO_CYCLE_FOUND = 9
+    TOO_MANY_EVENTS = 10
+    NO_ADMISSIBLE_CONTACT = 11
+    THREE_FEET_LOADED = 12
 
     @property
     def meaning(self) -> str:
@@ -38,4 +41,9 @@ _MEANINGS = {
     Outcome.SOLVER_GAVE_UP: "The integrator ran out of steps or could not locate an event.",
     Outcome.BAD_INPUT: "A parameter or the start is not finite, or outside its domain.",
     Outcome.NO_CYCLE_FOUND: "The search for a limit cycle did not converge to a valid one.",
+    Outcome.TOO_MANY_EVENTS: "Contacts and stoppers changed more often than one step may.",
+    Outcome.NO_ADMISSIBLE_CONTACT: (
+        "No combination of contact modes satisfies Coulomb's law (a Painlevé paradox)."
+    ),
+    Outcome.THREE_FEET_LOADED: "Three feet would have to carry load at once.",
 }

@@ -5,6 +5,7 @@ differentiation. A model compiles its own step once.
 """
 
 from collections.abc import Sequence
+from typing import overload
 
 import equinox as eqx
 import jax
@@ -13,7 +14,13 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Int
 
-from vrw_jax.models import AbstractWheel, StepResult, ViscoelasticWheel
+from vrw_jax.models import (
+    AbstractWheel,
+    StepResult,
+    UnilateralStep,
+    UnilateralWheel,
+    ViscoelasticWheel,
+)
 from vrw_jax.models.base import Advance, SectionState
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
@@ -42,14 +49,18 @@ def checked(
     if not isinstance(model, AbstractWheel):
         raise TypeError(
             f"model is {model!r}, but a rung of the ladder is needed: "
-            "give vrw.ViscoelasticWheel() or vrw.RigidWheel()."
+            "give vrw.ViscoelasticWheel(), vrw.RigidWheel() or vrw.UnilateralWheel()."
         )
     options = Options() if options is None else options
     state = as_float_array(x)
-    if state.shape != (3,):
+    size = model.section_size(params)
+    if state.shape == (3,) and size != 3:
+        state = model.full_section(params, state)
+    if state.shape != (size,):
         raise ValueError(
             f"the section state has shape {state.shape}, but it is (theta-, dtheta-, dL1-), shape "
-            "(3,): for batches map over it with jax.vmap."
+            f"(3,){'' if size == 3 else f', or this rung’s own of shape ({size},)'}: "
+            "for batches map over it with jax.vmap."
         )
     if params.damping.ndim != 0:
         raise ValueError(
@@ -62,13 +73,29 @@ def checked(
     return jax.tree.map(convert, params), convert(state), model, jax.tree.map(convert, options)
 
 
+@overload
+def step(  # type: ignore[overload-overlap]
+    params: WheelParams, x: SectionLike, *, model: UnilateralWheel, options: Options | None = None
+) -> UnilateralStep: ...
+
+
+@overload
 def step(
     params: WheelParams,
     x: SectionLike,
     *,
     model: AbstractWheel | None = None,
     options: Options | None = None,
-) -> StepResult:
+) -> StepResult: ...
+
+
+def step(
+    params: WheelParams,
+    x: SectionLike,
+    *,
+    model: AbstractWheel | None = None,
+    options: Options | None = None,
+) -> StepResult | UnilateralStep:
     """One step from touchdown to touchdown, with indicators, monitors and energies.
 
     `x` is (theta-, dtheta-, dL1-) just before touchdown, in rad, rad/s, m/s. How the step ended is
@@ -85,7 +112,7 @@ def return_map(
     *,
     model: AbstractWheel | None = None,
     options: Options | None = None,
-) -> SectionState:
+) -> Array:
     """The section state one step later; all zeros (no section state) where the step failed.
 
     The lean path: no monitors are computed. Differentiable forwards and in reverse, to any order.
@@ -97,7 +124,7 @@ def return_map(
 class Walk(eqx.Module):
     """Lean results of consecutive steps, with a leading axis over steps."""
 
-    start: SectionState
+    start: Array
     steps: Advance
     n_stepped: Int[Array, ""]  # steps before the first that failed
 

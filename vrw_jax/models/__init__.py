@@ -9,6 +9,7 @@ from vrw_jax.models.base import (
     Trajectory,
 )
 from vrw_jax.models.rigid import RigidWheel
+from vrw_jax.models.unilateral import UnilateralStep, UnilateralWheel
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
 
 __all__ = [
@@ -19,5 +20,7 @@ __all__ = [
     "RigidWheel",
     "StepResult",
     "Trajectory",
+    "UnilateralStep",
+    "UnilateralWheel",
     "ViscoelasticWheel",
 ]

@@ -1,6 +1,7 @@
 """The one face of every rung: what a step takes, and what it tells."""
 
 import abc
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -107,7 +108,7 @@ class StepResult(eqx.Module):
 class Advance(eqx.Module):
     """The lean result of a step: what repeats."""
 
-    section_state: SectionState
+    section_state: Float[Array, " section"]  # a SectionState, or the rung's own longer one
     durations: Float[Array, "3"]  # of DLS, SLS-I, SLS-II, s
     outcome: Int[Array, ""]  # an Outcome
     solver_steps: Int[Array, ""]  # tried by the integrator
@@ -137,18 +138,27 @@ class AbstractWheel(eqx.Module):
         """One step, told as leanly as possible. Differentiable in any mode, to any order."""
 
     @abc.abstractmethod
-    def step(self, params: WheelParams, x: SectionState, options: Options) -> StepResult:
-        """One step with all indicators, monitors and energies. Differentiable in any mode."""
+    def step(self, params: WheelParams, x: SectionState, options: Options) -> Any:
+        """One step with all indicators, monitors and energies. Differentiable in any mode.
+
+        A StepResult, or what the rung has in its place.
+        """
 
     @abc.abstractmethod
-    def trace(
-        self, params: WheelParams, x: SectionState, options: Options, n_samples: int
-    ) -> Trajectory:
-        """The step's motion at `n_samples` times of each phase."""
+    def trace(self, params: WheelParams, x: SectionState, options: Options, n_samples: int) -> Any:
+        """The step's motion at `n_samples` times of each phase: a Trajectory, or in its place."""
 
     @abc.abstractmethod
     def start(self, params: WheelParams) -> SectionState:
         """A section state from which a walk may begin."""
+
+    def section_size(self, params: WheelParams) -> int:
+        """Length of a section state."""
+        return 3
+
+    def full_section(self, params: WheelParams, x: Array) -> Array:
+        """The rung's section state of a paper's one; others are left as they are."""
+        return x
 
 
 def usable(params: WheelParams, x: SectionState) -> Array:
