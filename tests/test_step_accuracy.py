@@ -83,7 +83,9 @@ def test_any_solver_may_be_named_and_agrees(solver):
     assert truth.scaled_error(found, VALUES) < 1e-7
 
 
-@pytest.mark.parametrize(("solver", "order"), [("Tsit5", 5), ("Dopri8", 8)])
+@pytest.mark.parametrize(
+    ("solver", "order"), [pytest.param("Tsit5", 5, marks=pytest.mark.slow), ("Dopri8", 8)]
+)
 def test_work_falls_with_the_order_of_the_solver(solver, order):
     """Error against number of steps has the solver's order: state, event times and derivatives.
 

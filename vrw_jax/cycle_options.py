@@ -10,7 +10,7 @@ class CycleOptions:
     The defaults reach 1e-9 relative in values and 1e-8 in first derivatives.
     """
 
-    steps: tuple[int, int, int] = (8, 8, 2)  # of order 8 in DLS, SLS-I, SLS-II
+    steps: tuple[int, int, int] = (10, 8, 3)  # of order 8 in DLS, SLS-I, SLS-II
     growth: float = 2.0  # last over first step in SLS-I
     tolerance: float = 1e-10  # of Newton's last correction, rad, rad/s, s or m
     iterations: int = 12  # of Newton's method per attempt
@@ -27,7 +27,7 @@ class CycleOptions:
         if len(self.steps) != 3 or min(self.steps) < 1:
             raise ValueError(
                 f"steps is {self.steps}, but it counts the steps in DLS, SLS-I and SLS-II: "
-                "give three whole numbers of at least 1, as (8, 8, 2)."
+                "give three whole numbers of at least 1, as (10, 8, 3)."
             )
 
     @classmethod

@@ -225,16 +225,22 @@ def integrate_phase(
     """
     stepper = _stepper(field, options)
     n_guards = watched.n_guards
-    zero = jnp.zeros((), start.dtype)
-    none = jnp.zeros((), jnp.int32)
-    nothing = jnp.zeros(jax.eval_shape(watched.values, start).shape, start.dtype)
-    no = jnp.asarray(False)
+    # Every number that the loop carries is batched, and perturbed where it will be, from the start:
+    # JAX would otherwise trace the loop again for each round in which that spreads.
+    zero = 0.0 * start[0]
+    none = jnp.where(active, 0, 0).astype(jnp.int32)
+    nothing = jnp.zeros(jax.eval_shape(watched.values, start).shape, start.dtype) + zero
+    no = active & False
+    fixed = lax.stop_gradient(zero)
     solver_state, controller_state = stepper.start(start, options)
+    controller_state = jax.tree.map(lambda x: x + fixed, controller_state)
     loop = _Loop(
         step=_Step(zero, start, solver_state, nothing, nothing),
         length=zero,  # the first step has no length: it evaluates the start
         controller_state=controller_state,
-        search=_Search(no, jnp.zeros((n_guards,), bool), zero, zero, zero, none, none),
+        search=_Search(
+            no, jnp.zeros((n_guards,), bool) | no, fixed, fixed, fixed, none, none
+        ),
         minimum=_no_minimum(watched, start),
         running=active,
         guard=none - 1,

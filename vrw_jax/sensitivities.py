@@ -1,5 +1,6 @@
 """How every measure of a gait answers to every parameter, as a labelled table."""
 
+import functools
 from collections.abc import Callable, Sequence
 
 import jax
@@ -33,6 +34,24 @@ MEASURES: dict[str, tuple[str, Callable[[LimitCycle], Array]]] = {
 """Unit and definition of each measure; the last two are second derivatives of the motion."""
 
 
+@functools.partial(jax.jit, static_argnums=(2, 3, 4))
+def _jacobian(
+    vector: Array,
+    guess: LimitCycle | None,
+    n_legs: int,
+    measures: tuple[str, ...],
+    options: CycleOptions | None,
+) -> tuple[Array, tuple[Array, Array]]:
+    """d(measures)/d(parameters) with the measures and the outcome; compiled once."""
+
+    def evaluate(vector: Array) -> tuple[Array, tuple[Array, Array]]:
+        cycle = limit_cycle(wheel_of(vector, n_legs), guess=guess, options=options)
+        values = jnp.stack([MEASURES[name][1](cycle) for name in measures])
+        return values, (values, cycle.outcome)
+
+    return jax.jacfwd(evaluate, has_aux=True)(vector)
+
+
 def sensitivities(
     params: WheelParams,
     *,
@@ -52,13 +71,8 @@ def sensitivities(
             f"{', '.join(MEASURES)}: choose among these."
         )
 
-    def evaluate(vector: Array) -> tuple[Array, tuple[Array, Array]]:
-        cycle = limit_cycle(wheel_of(vector, params.n_legs), guess=guess, options=options)
-        values = jnp.stack([MEASURES[name][1](cycle) for name in measures])
-        return values, (values, cycle.outcome)
-
     vector = parameters_of(params)
-    jacobian, (values, outcome) = jax.jit(jax.jacfwd(evaluate, has_aux=True))(vector)
+    jacobian, (values, outcome) = _jacobian(vector, guess, params.n_legs, tuple(measures), options)
     if int(outcome) != Outcome.STEPPED:
         raise ValueError(f"there is no gait to differentiate: {Outcome(int(outcome)).meaning}")
     derivative, value = np.asarray(jacobian), np.asarray(values)
