@@ -139,7 +139,7 @@ class Walk(eqx.Module):
 
 @eqx.filter_jit
 def _walk(
-    model: AbstractWheel, params: WheelParams, x: SectionState, options: Options, n_steps: int
+    model: AbstractWheel, params: WheelParams, x: Array, options: Options, n_steps: int
 ) -> Walk:
     def one(carry: tuple, _: None) -> tuple:
         x, outcome = carry

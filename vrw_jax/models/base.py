@@ -161,7 +161,7 @@ class AbstractWheel(eqx.Module):
         return x
 
 
-def usable(params: WheelParams, x: SectionState) -> Array:
+def usable(params: WheelParams, x: Float[Array, " section"]) -> Array:
     """Whether parameters and start are finite, in their domains and rolling forward."""
     theta, dtheta = x[0], x[1]
     upright = (jnp.abs(theta) < 0.5 * jnp.pi) & (jnp.abs(theta - params.leg_angle) < 0.5 * jnp.pi)
@@ -170,8 +170,11 @@ def usable(params: WheelParams, x: SectionState) -> Array:
 
 
 def replaced_where_bad(
-    good: Array, params: WheelParams, x: SectionState, safe_x: SectionState
-) -> tuple[WheelParams, SectionState]:
+    good: Array,
+    params: WheelParams,
+    x: Float[Array, " section"],
+    safe_x: Float[Array, " section"],
+) -> tuple[WheelParams, Array]:
     """Table 1 and a safe start in place of unusable input, so that no NaN is ever computed."""
     safe = jax.tree.map(
         lambda value, default: jnp.where(good, value, default.astype(value.dtype)),

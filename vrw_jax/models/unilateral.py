@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.derivatives import Forward, any_mode
 from vrw_jax.integrate import PhaseEnd, Watched, integrate_phase, sample_phase
@@ -101,7 +101,7 @@ class UnilateralTrajectory(eqx.Module):
     time: Float[Array, "phases n"]  # from the landing, s
     state: Float[Array, "phases n dim"]  # see unilateral_motion.unpack
     contact: Int[Array, "phases legs"]  # mode of every foot
-    locked: Int[Array, "phases legs"]  # 1 on the stopper
+    locked: Bool[Array, "phases legs"]  # on the stopper
     tangential: Float[Array, "phases n legs"]  # force on every foot, N
     normal: Float[Array, "phases n legs"]
     duration: Float[Array, " phases"]  # s
@@ -189,7 +189,7 @@ class UnilateralWheel(AbstractWheel):
         def phase(inputs: tuple) -> tuple:
             state, contact, locked, duration, begin = inputs
             none = jnp.zeros((s.n,), bool)
-            flow = flow_of(s, self.friction, False, Stance(contact, locked > 0, none, none, none))
+            flow = flow_of(s, self.friction, False, Stance(contact, locked, none, none, none))
             states = sample_phase(partial(field, flow), state, duration, n_samples, options)
 
             def feet(y: State) -> tuple:
