@@ -11,7 +11,8 @@ from batched import wheels_like
 import vrw_jax as vrw
 from vrw_jax import Outcome, lane_batch
 from vrw_jax.lane_phase import LanePhase, Patience, integrate_lanes
-from vrw_jax.runge_kutta import Place, Slope, cut_where, explicit_tableau, sine_cosine, take_step
+from vrw_jax.runge_kutta import Place, Slope, cut_where, explicit_tableau, take_step
+from vrw_jax.sequences import sine_cosine
 
 GAIT = truth.table("cycle", "section_state")[0]
 STARTS = truth.table("step", "start")
@@ -170,7 +171,7 @@ def test_what_can_be_seen_to_be_wrong_is_said_in_one_sentence():
         vrw.steps(params, GAIT)
     with pytest.raises(ValueError, match="at least one step"):
         vrw.steps(params, GAIT[None], 0)
-    with pytest.raises(ValueError, match="'auto', 'lanes' or 'diffrax'"):
+    with pytest.raises(ValueError, match="'auto', 'lanes', 'diffrax' or 'collocation'"):
         vrw.steps(params, GAIT[None], engine="fast")
     with pytest.raises(TypeError, match="vmap"):
         jax.jit(lambda c: vrw.steps(vrw.WheelParams(damping=c), GAIT[None]).outcome)(200.0)
@@ -237,3 +238,46 @@ def test_a_guard_that_comes_close_and_turns_back_does_not_fire():
     guard, duration = fall(1e-3, vrw.Options(max_phase_time=3.0))
     assert int(guard) == -1
     assert float(duration) >= 3.0
+
+
+def test_collocation_is_right_near_known_durations_and_says_which_lanes_it_took():
+    near = VALUES[:, 3:] * np.random.default_rng(3).uniform(0.97, 1.03, (len(VALUES), 3))
+    params = truth.wheels(truth.PARAMETERS)
+    found = vrw.steps(params, STARTS, engine="collocation", durations=near)
+    assert found.engine == "collocation"
+    fixed = np.asarray(found.fixed)
+    assert np.mean(fixed) > 0.5
+    by_lanes = vrw.steps(params, STARTS)
+    both = np.concatenate([found.section_state, found.durations], 1)
+    adaptive = np.concatenate([by_lanes.section_state, by_lanes.durations], 1)
+    assert truth.scaled_error(both[fixed], VALUES[fixed]) < 1e-7
+    np.testing.assert_array_equal(both[~fixed], adaptive[~fixed])
+
+
+def test_collocation_leaves_what_it_cannot_trust_to_the_lane_engine(crowd):
+    vectors, states, found, codes = crowd
+    some = slice(0, 3000)
+    guessed = np.tile([0.4, 0.25, 0.06], (3000, 1))
+    params = truth.wheels(vectors[some])
+    told_by = vrw.steps(params, states[some], engine="collocation", durations=guessed)
+    np.testing.assert_array_equal(told_by.outcome, codes[some])
+    both = np.concatenate([told_by.section_state, told_by.durations], 1)
+    # Far from every gait that its limits were set by, a trusted lane is still right to 1e-6.
+    np.testing.assert_allclose(both, found[some], rtol=1e-6, atol=1e-6)
+
+
+def test_collocation_alone_is_bitwise_itself_among_others():
+    params, near = truth.wheels(truth.PARAMETERS), VALUES[:, 3:]
+    among = vrw.steps(params, STARTS, engine="collocation", durations=near)
+    for i in (0, 3, 9):
+        alone = vrw.steps(
+            truth.wheels(truth.PARAMETERS[i : i + 1]), STARTS[i : i + 1], engine="collocation",
+            durations=near[i : i + 1],
+        )  # fmt: skip
+        np.testing.assert_array_equal(alone.section_state[0], among.section_state[i])
+        np.testing.assert_array_equal(alone.durations[0], among.durations[i])
+
+
+def test_collocation_needs_durations():
+    with pytest.raises(ValueError, match="durations"):
+        vrw.steps(vrw.WheelParams(), GAIT[None], engine="collocation")

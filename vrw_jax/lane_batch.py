@@ -15,9 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.lane_engine import LaneStep, gait_step
+from vrw_jax.lane_fixed import FixedStep, fixed_gait_step
 from vrw_jax.lane_phase import Patience
 from vrw_jax.models import AbstractWheel, ViscoelasticWheel
 from vrw_jax.options import Options
@@ -43,7 +44,8 @@ class Steps(eqx.Module):
     outcome: Int[Array, " lanes"]  # an Outcome; the walk ends at the first that is not STEPPED
     n_stepped: Int[Array, " lanes"]  # steps that ended in a touchdown
     solver_steps: Int[Array, " lanes"]  # tried by the integrator, over all steps
-    engine: str = eqx.field(static=True)  # that computed it: "lanes" or "diffrax"
+    fixed: Bool[Array, " lanes"]  # whether the last step was taken in fixed work, by collocation
+    engine: str = eqx.field(static=True)  # that computed it: "lanes", "diffrax" or "collocation"
 
 
 def steps(
@@ -54,6 +56,7 @@ def steps(
     model: AbstractWheel | None = None,
     options: Options | None = None,
     engine: str = "auto",
+    durations: Array | np.ndarray | None = None,
 ) -> Steps:
     """`n_steps` gait steps of many wheels, or as many as each can: values only, no derivatives.
 
@@ -62,7 +65,15 @@ def steps(
     explicit solvers; "diffrax" maps `model.advance` over the lanes and takes any solver; "auto"
     takes the first wherever it can, whatever the number of lanes, and `Steps.engine` says which it
     was. Both keep the errors of `options`, which count for each local step; between them lie some
-    ten times the tolerance. Not for use inside `jax.jit`: it compiles itself, once.
+    ten times the tolerance.
+
+    "collocation" is faster still near a known gait: `durations`, shape (lanes, 3), s, are those of
+    DLS, SLS-I and SLS-II to some per cent, as of a limit cycle or a neighbour's step; later steps
+    take those of the step before. Its error is fixed, about 1e-8 for 99 lanes in 100, whatever
+    `options` say. Each lane checks itself, and one that fails is left to the lane engine; `fixed`
+    says which was which.
+
+    Not for use inside `jax.jit`: it compiles itself, once.
     """
     model = ViscoelasticWheel() if model is None else model
     options = Options() if options is None else options
@@ -87,17 +98,36 @@ def steps(
         row[:] = np.asarray(column)
     walked = _Walked.start(states.astype(dtype))
     run = _chosen(engine, model, options, params.n_legs)
+    if engine == "collocation":
+        walked.durations[:] = _expected(durations, states, dtype)
     for _ in range(n_steps):
         open_ = np.flatnonzero(walked.outcome == Outcome.STEPPED)
-        walked.take(open_, run(wheels[:, open_], walked.section_state[open_]))
+        fixed = np.zeros(len(open_), bool)
+        if engine == "collocation":
+            given = wheels[:, open_], walked.section_state[open_], walked.durations[open_]
+            fixed, told = _by_collocation(model, params.n_legs, *given)
+            walked.take(open_[fixed], tuple(part[fixed] for part in told), fixed=True)
+        open_ = open_[~fixed]
+        walked.take(open_, run(wheels[:, open_], walked.section_state[open_]), fixed=False)
     return Steps(
         jnp.asarray(walked.section_state),
         jnp.asarray(walked.durations),
         jnp.asarray(walked.outcome),
         jnp.asarray(walked.n_stepped),
         jnp.asarray(walked.solver_steps),
-        engine=run.name,
+        jnp.asarray(walked.fixed),
+        engine="collocation" if engine == "collocation" else run.name,
     )
+
+
+def _expected(durations: Any, states: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    if durations is None or np.shape(durations) != states.shape:
+        shape = None if durations is None else np.shape(durations)
+        raise ValueError(
+            f"durations have shape {shape}, but collocation needs those of DLS, SLS-I and SLS-II "
+            "to some per cent, shape (lanes, 3): give those of a limit cycle, or take 'lanes'."
+        )
+    return np.asarray(durations, dtype)
 
 
 class _Walked:
@@ -106,17 +136,19 @@ class _Walked:
     def __init__(self, states: np.ndarray, n: int) -> None:
         self.section_state, self.durations = states, np.zeros_like(states)
         self.outcome, self.n_stepped, self.solver_steps = (np.zeros(n, np.int32) for _ in range(3))
+        self.fixed = np.zeros(n, bool)
 
     @classmethod
     def start(cls, states: np.ndarray) -> "_Walked":
         return cls(states.copy(), len(states))
 
-    def take(self, lanes: np.ndarray, told: tuple[np.ndarray, ...]) -> None:
+    def take(self, lanes: np.ndarray, told: tuple[np.ndarray, ...], fixed: bool) -> None:
         state, durations, outcome, tried = told
         self.section_state[lanes], self.durations[lanes] = state, durations
         self.outcome[lanes] = outcome
         self.n_stepped[lanes] += outcome == Outcome.STEPPED
         self.solver_steps[lanes] += tried
+        self.fixed[lanes] = fixed
 
 
 class _Engine(eqx.Module):
@@ -130,12 +162,14 @@ class _Engine(eqx.Module):
 
 
 def _chosen(engine: str, model: AbstractWheel, options: Options, n_legs: int) -> _Engine:
-    if engine not in ("auto", "lanes", "diffrax"):
-        raise ValueError(f"engine is {engine!r}, but it is 'auto', 'lanes' or 'diffrax'.")
+    if engine not in ("auto", "lanes", "diffrax", "collocation"):
+        raise ValueError(
+            f"engine is {engine!r}, but it is 'auto', 'lanes', 'diffrax' or 'collocation'."
+        )
     fits = isinstance(model, ViscoelasticWheel) and (
         explicit_tableau(options.solver, options) is not None
     )
-    if engine == "lanes" and not fits:
+    if engine in ("lanes", "collocation") and not fits:
         raise ValueError(
             f"the lane engine can't run {type(model).__name__} with {options.solver}: it knows "
             "the viscoelastic wheel and explicit Runge-Kutta solvers; take engine='diffrax'."
@@ -213,14 +247,57 @@ def _lane_program(
         return gait_step(params, x.T, wanted, options, tableau, stop_at_lift_off, Patience(few))
 
     def blocks(columns: Array, x: Array, wanted: Array, dynamic: Options, few: Array) -> LaneStep:
-        to_blocks = lambda a: jnp.moveaxis(a.reshape(*a.shape[:-1], *width), -2, 0)
-        out = lax.map(
-            functools.partial(block, dynamic, few), jax.tree.map(to_blocks, (columns, x, wanted))
-        )
-        flat = lambda a: jnp.moveaxis(a, 1, -1).reshape(-1, *a.shape[1:-1])
-        return jax.tree.map(flat, out)
+        return _in_blocks(functools.partial(block, dynamic, few), (columns, x, wanted), width)
 
     return jax.jit(blocks)
+
+
+def _by_collocation(
+    model: AbstractWheel,
+    n_legs: int,
+    wheels: np.ndarray,
+    states: np.ndarray,
+    durations: np.ndarray,
+) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+    """Which lanes can be trusted, and their states, durations, outcomes and solver steps."""
+    assert isinstance(model, ViscoelasticWheel)  # `_chosen` looked
+    n, width = len(states), _width()
+    program = _fixed_program(n_legs, model.stop_at_lift_off, width)
+    found: list[FixedStep] = []
+    for begin in range(0, n, width[0] * width[1]):
+        some = np.arange(begin, min(begin + width[0] * width[1], n))
+        filled = _filled(wheels, states, some, width)
+        expected = durations[np.minimum(begin + np.arange(width[0] * width[1]), n - 1)].T.copy()
+        out = program(*filled, expected)
+        used = slice(len(some))
+        found.append(jax.tree.map(lambda x, used=used: np.asarray(x)[used], out))
+    none = np.zeros(n, np.int32)
+    if not found:
+        return np.zeros(0, bool), (states, durations, none, none)
+    step = jax.tree.map(lambda *parts: np.concatenate(parts), *found)
+    return step.trusted, (step.section_state, step.durations, none, none)
+
+
+@functools.cache
+def _fixed_program(
+    n_legs: int, stop_at_lift_off: bool, width: tuple[int, int]
+) -> Callable[..., FixedStep]:
+    """The compiled step by collocation of some blocks of lanes."""
+
+    def block(given: tuple[Array, Array, Array, Array]) -> FixedStep:
+        columns, x, wanted, expected = given
+        params = WheelParams(**dict(zip(PARAMETER_NAMES, columns, strict=True)), n_legs=n_legs)
+        return fixed_gait_step(params, x.T, wanted, expected.T, stop_at_lift_off)
+
+    return jax.jit(lambda *given: _in_blocks(block, given, width))
+
+
+def _in_blocks(block: Callable, given: Any, width: tuple[int, int]) -> Any:
+    """`block` on blocks of lanes, which are the last axis going in and the first coming out."""
+    to_blocks = lambda a: jnp.moveaxis(a.reshape(*a.shape[:-1], *width), -2, 0)
+    out = lax.map(block, jax.tree.map(to_blocks, given))
+    flat = lambda a: jnp.moveaxis(a, 1, -1).reshape(-1, *a.shape[1:-1])
+    return jax.tree.map(flat, out)
 
 
 def _by_diffrax(

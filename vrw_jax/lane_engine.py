@@ -26,8 +26,8 @@ from vrw_jax.runge_kutta import (
     Tableau,
     Vector,
     cut_where,
-    sine_cosine,
 )
+from vrw_jax.sequences import sine_cosine
 
 INTO_SINGLE_SUPPORT = 0.3
 """First step of SLS-I over the last of DLS: dropping the rear foot's force excites the airborne
@@ -44,7 +44,7 @@ class LaneStep(NamedTuple):
     unfinished: Array  # lanes that the block did not wait for: everything else there is void
 
 
-def _double_support(build: PhaseBuilder, distance: Array, cut: Cut) -> LanePhase:
+def double_support(build: PhaseBuilder, distance: Array, cut: Cut) -> LanePhase:
     """DLS over theta. Section 3.3.1."""
     s = build.s
 
@@ -79,7 +79,7 @@ def _double_support(build: PhaseBuilder, distance: Array, cut: Cut) -> LanePhase
     )
 
 
-def _single_support_1(build: PhaseBuilder, cut: Cut) -> LanePhase:
+def single_support_1(build: PhaseBuilder, cut: Cut) -> LanePhase:
     """SLS-I over (theta, L1, L2). Section 3.3.2."""
     s = build.s
 
@@ -107,7 +107,7 @@ def _single_support_1(build: PhaseBuilder, cut: Cut) -> LanePhase:
     )
 
 
-def _single_support_2(build: PhaseBuilder, cut: Cut) -> LanePhase:
+def single_support_2(build: PhaseBuilder, cut: Cut) -> LanePhase:
     """SLS-II over (theta, L1). Section 3.3.3."""
     s = build.s
 
@@ -168,7 +168,7 @@ def gait_step(
         end = integrate_lanes(phase, tableau, q, v, active, first, options, cut, patience)
         return end, jnp.where(active, _outcome(phase, end), stepped)
 
-    dls = _double_support(build, landing.distance, cut)
+    dls = double_support(build, landing.distance, cut)
     active1 = good & landing.stays
     end1, code1 = run(dls, (landing.theta,), (landing.motion.dtheta,), active1, first)
 
@@ -183,7 +183,7 @@ def gait_step(
         jnp.where(active2, jnp.where(landing.stays, held, free), harmless)
         for (held, free), harmless in zip(starts, safe, strict=True)
     ]
-    sls1 = _single_support_1(build, cut)
+    sls1 = single_support_1(build, cut)
     first2 = jnp.where(landing.stays, INTO_SINGLE_SUPPORT * end1.next_step, first)
     end2, code2 = run(sls1, tuple(begin[:3]), tuple(begin[3:]), active2, first2)
 
@@ -196,7 +196,7 @@ def gait_step(
         return hit.motion.L1, hit.motion.dtheta, hit.motion.dL1
 
     L1, dtheta, dL1 = cut(hit_stopper, *q, *v)
-    sls2 = _single_support_2(build, cut)
+    sls2 = single_support_2(build, cut)
     end3, code3 = run(sls2, (q[0], L1), (dtheta, dL1), active3, end2.next_step)
 
     code = jnp.where(active2, jnp.where(active3, code3, code2), code1)

@@ -9,7 +9,6 @@ more than all arithmetic. A branch of `lax.cond` is a border that it can't fuse 
 predicate is always true, but only known at run time.
 """
 
-import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -91,25 +90,6 @@ def cut_where(always: Bool[Array, ""]) -> Cut:
         return lax.cond(always, function, nothing, *arrays)
 
     return cut
-
-
-SINE = tuple((-1.0) ** i / math.factorial(2 * i + 1) for i in range(10))
-COSINE = tuple((-1.0) ** i / math.factorial(2 * i) for i in range(11))
-
-
-def sine_cosine(x: Array) -> tuple[Array, Array]:
-    """Sine and cosine by their series, right to round-off for |x| <= pi/2, a leg above ground.
-
-    XLA on CPU calls the scalar library for each float64 sine, at the price of a whole evaluation of
-    the equations of motion.
-    """
-    square = x * x
-    sine, cosine = SINE[-1] + 0.0 * square, COSINE[-1] + 0.0 * square
-    for coefficient in SINE[-2::-1]:
-        sine = sine * square + coefficient
-    for coefficient in COSINE[-2::-1]:
-        cosine = cosine * square + coefficient
-    return x * sine, cosine
 
 
 class Slope(NamedTuple):
