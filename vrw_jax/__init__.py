@@ -8,6 +8,7 @@ from vrw_jax.cycle_options import CycleOptions
 from vrw_jax.designs import grid, samples, sobol, uniform
 from vrw_jax.lane_batch import Steps, steps
 from vrw_jax.limit_cycle import LimitCycle, limit_cycle
+from vrw_jax.model_choice import ModelChoice, choose_model
 from vrw_jax.models import (
     AbstractWheel,
     EnergyLoss,
@@ -40,6 +41,7 @@ __all__ = [
     "Indicators",
     "LimitCycle",
     "Margins",
+    "ModelChoice",
     "Options",
     "Outcome",
     "RigidWheel",
@@ -53,6 +55,7 @@ __all__ = [
     "Walk",
     "WheelParams",
     "basin",
+    "choose_model",
     "continue_branch",
     "continue_branches",
     "continue_map",

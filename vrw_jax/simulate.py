@@ -17,12 +17,13 @@ from jaxtyping import Array
 from vrw_jax.dynamics import damping_power
 from vrw_jax.geometry import Motion, landing_direction, rear_direction
 from vrw_jax.measures import TRAJECTORY, attrs_of
-from vrw_jax.models import AbstractWheel
+from vrw_jax.models import AbstractWheel, UnilateralWheel
 from vrw_jax.models.base import SectionState
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
 from vrw_jax.params import PARAMETER_NAMES, WheelParams
-from vrw_jax.return_map import checked
+from vrw_jax.return_map import SectionLike, checked
+from vrw_jax.simulate_ground import simulate_ground
 
 
 @eqx.filter_jit
@@ -69,7 +70,7 @@ def _columns(
 
 def simulate(
     params: WheelParams,
-    x: SectionState,
+    x: SectionLike,
     n_steps: int = 10,
     *,
     model: AbstractWheel | None = None,
@@ -87,6 +88,11 @@ def simulate(
     if not n_samples >= 2:
         raise ValueError(f"n_samples is {n_samples}, but a phase has two ends: give 2 or more.")
     params, x, model, options = checked(params, x, model, options)
+    if isinstance(model, UnilateralWheel):
+        walked = simulate_ground(
+            params, x, n_steps, model=model, options=options, n_samples=n_samples
+        )
+        return walked.assign_attrs(provenance(params, model, options))
     s = params.symbols()
     weight_along = float(s.Mt * s.g * s.sin_phi)
     parts: list[dict[str, np.ndarray]] = []
