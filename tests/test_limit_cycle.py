@@ -174,6 +174,56 @@ def test_neighbours_cycle_is_a_quicker_start():
     np.testing.assert_allclose(second.section_state, cold.section_state, rtol=1e-11)
 
 
+def test_a_cycle_walked_twice_has_the_multipliers_squared():
+    once = vrw.limit_cycle(vrw.WheelParams())
+    twice = vrw.limit_cycle(vrw.WheelParams(), guess=once, period_n=2)
+    assert int(twice.outcome) == Outcome.STEPPED
+    np.testing.assert_allclose(twice.multipliers, once.multipliers**2, rtol=1e-10)
+    np.testing.assert_allclose(twice.durations, np.tile(once.durations, (2, 1)), rtol=1e-9)
+    np.testing.assert_allclose(twice.dls_fraction, once.dls_fraction, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_beyond_the_discontinuity_a_cycle_of_five_steps_is_found_from_a_walk():
+    # At c = 221 one step in five has no double support: found next to where a walk ends up.
+    params = vrw.WheelParams(damping=221.0)
+    walked = vrw.walk(params, vrw.paper_start(), 60)
+    end = walked.steps.section_state[-1]
+    five = vrw.limit_cycle(params, guess=end, period_n=5)
+    assert int(five.outcome) == Outcome.STEPPED
+    np.testing.assert_allclose(five.section_state, end, atol=1e-8)
+    assert np.sum(np.asarray(five.durations)[:, 0] == 0.0) == 1
+    x = five.section_state
+    for _ in range(5):
+        x = vrw.return_map(params, x, options=vrw.Options.tight())
+    np.testing.assert_allclose(x, five.section_state, atol=1e-9)
+    assert float(five.spectral_radius) < 1.0
+
+
+def test_another_rung_is_solved_on_its_own_return_map():
+    params, model = vrw.WheelParams(slope=0.1), vrw.RigidWheel()
+    cycle = vrw.limit_cycle(params, model=model)
+    assert int(cycle.outcome) == Outcome.STEPPED
+    back = vrw.return_map(params, cycle.section_state, model=model)
+    np.testing.assert_allclose(back, cycle.section_state, rtol=1e-12)
+    # Energy gained over a step is what the landing takes: the kept rate squared is the multiplier.
+    kept = cycle.post_impact[1] / cycle.section_state[1]
+    np.testing.assert_allclose(cycle.spectral_radius, kept**2, rtol=1e-10)
+    assert float(cycle.dls_fraction) == 0.0
+    lost = vrw.limit_cycle(vrw.WheelParams(slope=0.02), model=model)
+    assert int(lost.outcome) == Outcome.NO_CYCLE_FOUND
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(lost))
+
+
+def test_options_of_the_wrong_kind_are_answered_in_one_sentence():
+    with pytest.raises(TypeError, match="CycleOptions"):
+        vrw.limit_cycle(vrw.WheelParams(), options=vrw.Options())
+    with pytest.raises(TypeError, match="return map"):
+        vrw.limit_cycle(vrw.WheelParams(), model=vrw.RigidWheel(), options=TIGHT)
+    with pytest.raises(ValueError, match="1 step or more"):
+        vrw.limit_cycle(vrw.WheelParams(), period_n=0)
+
+
 def simplest_walker(slope):
     """Garcia et al. 1998: the map just after heel strike, stance angle and rate."""
 

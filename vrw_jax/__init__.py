@@ -30,6 +30,7 @@ from vrw_jax.section_newton import SectionCycle, newton_cycle
 from vrw_jax.sensitivities import sensitivities
 from vrw_jax.simulate import simulate
 from vrw_jax.tune import Tuned, tune
+from vrw_jax.walked_cycle import WalkedCycle
 
 __all__ = [
     "AbstractWheel",
@@ -53,6 +54,7 @@ __all__ = [
     "UnilateralWheel",
     "ViscoelasticWheel",
     "Walk",
+    "WalkedCycle",
     "WheelParams",
     "basin",
     "choose_model",

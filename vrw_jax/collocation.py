@@ -99,6 +99,12 @@ class Mesh(NamedTuple):
             places = np.expm1(rate * places) / np.expm1(rate)
         return np.diff(places)
 
+    @property
+    def node_times(self) -> np.ndarray:
+        """Times of all nodes, as fractions of the phase's duration."""
+        begins = np.cumsum(self.fractions) - self.fractions
+        return (begins[:, None] + self.fractions[:, None] * NODES).ravel()
+
 
 class Solution(NamedTuple):
     """The unknowns of a cycle of n steps, lanes last; a step is one passage of the sequence."""

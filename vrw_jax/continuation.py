@@ -5,6 +5,7 @@ indicator or a monitor reaches zero. Each is solved for on the branch itself, ag
 so that it is as exact as the gaits are.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -165,7 +166,7 @@ def continue_branches(
             def find() -> LimitCycle:
                 guess = jax.tree.map(lambda x: x[owner], start)
                 located = guess.located._replace(solution=jax.tree.map(jnp.asarray, point.z))
-                guess = eqx.tree_at(lambda c: c.located, guess, located)
+                guess = dataclasses.replace(guess, located=located, problem=problem)
                 wheel = jax.tree.map(lambda x: x[owner], params)
                 wheel = with_parameter(wheel, name, jnp.asarray(point.p))
                 return limit_cycle(wheel, guess=guess, period_n=period_n, options=cycle_options)

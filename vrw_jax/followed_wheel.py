@@ -12,13 +12,12 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from vrw_jax import dynamics
 from vrw_jax.arclength import AbstractFollowed, Linear, Section, Unknown
-from vrw_jax.collocation import N_NODES, NODES, Mesh, Passage, Solution, walk_through
+from vrw_jax.collocation import N_NODES, Passage, Solution, walk_through
 from vrw_jax.cycle_search import (
     Located,
     Problem,
@@ -144,17 +143,11 @@ def on_mesh(problem: Problem, cycle: LimitCycle) -> Solution:
     ):
         n, _, _, dim = known.shape
         rows = jnp.moveaxis(known.reshape(n, -1, dim), 1, -1)
-        at = jnp.asarray(_node_times(new))
-        over_time = lambda row, old=old, at=at: jnp.interp(at, jnp.asarray(_node_times(old)), row)
+        at = jnp.asarray(new.node_times)
+        over_time = lambda row, old=old, at=at: jnp.interp(at, jnp.asarray(old.node_times), row)
         moved = jnp.moveaxis(jax.vmap(jax.vmap(over_time))(rows), -1, 1)
         accelerations.append(moved.reshape(n, new.n_steps, N_NODES, dim))
     return Solution(found.section, found.durations, tuple(accelerations))
-
-
-def _node_times(mesh: Mesh) -> np.ndarray:
-    """Times of all nodes of a phase, as fractions of its duration."""
-    begins = np.cumsum(mesh.fractions) - mesh.fractions
-    return (begins[:, None] + mesh.fractions[:, None] * NODES).ravel()
 
 
 def _takeoff_acceleration(s: Any, sls1: Passage) -> Scalar:

@@ -238,9 +238,7 @@ def integrate_phase(
         step=_Step(zero, start, solver_state, nothing, nothing),
         length=zero,  # the first step has no length: it evaluates the start
         controller_state=controller_state,
-        search=_Search(
-            no, jnp.zeros((n_guards,), bool) | no, fixed, fixed, fixed, none, none
-        ),
+        search=_Search(no, jnp.zeros((n_guards,), bool) | no, fixed, fixed, fixed, none, none),
         minimum=_no_minimum(watched, start),
         running=active,
         guard=none - 1,

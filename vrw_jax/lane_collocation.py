@@ -11,7 +11,7 @@ last corrections, the mismatch of the collocation polynomial with the equations 
 step's start, where it was not asked to hold, and the least of all guards.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -165,14 +165,16 @@ def _solve(
     n = len(q)
     rounds, sweeps = rounds_of_sweeps
     a0 = phase.evaluate(q, v).acceleration[:n]
-    by_q, by_v, by_a = cut(partial(_partials, residual), *cut(_middle, q, v, a0, h), a0)
+    middle_q, middle_v = cut(_middle, q, v, a0, h)
+    by_q, by_v, by_a = cut(partial(_partials, residual), middle_q, middle_v, a0)
     inverses = [cut(partial(_factor, complex(value), cut), h, by_q, by_v, by_a) for value in VALUES]
 
     def sweep(step: _Step, _: None) -> tuple[_Step, None]:
         left = []
         for j in range(N_NODES):
             Q, V = cut(partial(_node, j), q, v, step.h, step.nodes)
-            left.append(residual(*cut(sine_cosine, Q[0]), Q, V, step.nodes[j]))
+            sin, cos = cut(sine_cosine, Q[0])
+            left.append(residual(sin, cos, Q, V, step.nodes[j]))
         pairs = [
             cut(_apply, inverse, cut(partial(_to_pair, weights), tuple(left)))
             for inverse, weights in zip(inverses, TO_PAIRS, strict=True)
@@ -220,7 +222,11 @@ def _end_shifted(
 
 def _partials(residual: Residual, q: Vector, v: Vector, a: Vector) -> tuple:
     """Columns of the residual's derivatives by q, v and a."""
-    whole = lambda q, v, a: residual(*sine_cosine(q[0]), q, v, a)
+
+    def whole(q: Vector, v: Vector, a: Vector) -> Vector:
+        sin, cos = sine_cosine(q[0])
+        return residual(sin, cos, q, v, a)
+
     arguments = (q, v, a)
 
     def column(which: int, d: int) -> Vector:
@@ -247,6 +253,14 @@ def _times(x: Complex, y: Complex) -> Complex:
 
 def _minus(x: Complex, y: Complex) -> Complex:
     return x[0] - y[0], x[1] - y[1]
+
+
+def _plus(terms: Sequence[Complex]) -> Complex:
+    first, *others = terms
+    real, imaginary = first
+    for term in others:
+        real, imaginary = real + term[0], imaginary + term[1]
+    return real, imaginary
 
 
 def _factor(value: complex, cut: Cut, h: Array, by_q: Any, by_v: Any, by_a: Any) -> Any:
@@ -290,7 +304,7 @@ def _adjugate(m: list[list[Complex]]) -> tuple[Any, Complex]:
 
     rows = [[cofactor(j, i) for j in range(3)] for i in range(3)]
     parts = [_times(m[0][k], rows[k][0]) for k in range(3)]
-    return rows, (sum(p[0] for p in parts), sum(p[1] for p in parts))
+    return rows, _plus(parts)
 
 
 def _to_pair(weights: np.ndarray, left: tuple[Vector, ...]) -> list[Complex]:
@@ -304,7 +318,7 @@ def _to_pair(weights: np.ndarray, left: tuple[Vector, ...]) -> list[Complex]:
 def _apply(inverse: Any, right: list[Complex]) -> list[Complex]:
     """Matrix times vector."""
     products = [[_times(entry, x) for entry, x in zip(row, right, strict=True)] for row in inverse]
-    return [(sum(p[0] for p in row), sum(p[1] for p in row)) for row in products]
+    return [_plus(row) for row in products]
 
 
 def _corrected(
@@ -334,6 +348,11 @@ def _to_event(phase: LanePhase, q: Vector, v: Vector) -> Array:
     return -value / jnp.where(rate < 0.0, rate, -jnp.inf)
 
 
+def _slope(angle: Array, acceleration: Vector, cut: Cut) -> Slope:
+    sin, cos = cut(sine_cosine, angle)
+    return Slope(sin, cos, acceleration)
+
+
 def _least(
     phase: LanePhase, q: Vector, v: Vector, solved: _Solved, skipped: int, cut: Cut
 ) -> Array:
@@ -345,9 +364,9 @@ def _least(
     step, places = solved.step, []
     for j in (0, 2):
         Q, V = cut(partial(_node, j), q, v, step.h, step.nodes)
-        places.append(Place(Q, V, Slope(*cut(sine_cosine, Q[0]), step.nodes[j])))
+        places.append(Place(Q, V, _slope(Q[0], step.nodes[j], cut)))
     at_end = tuple(_weigh(AT_END, step.nodes, d) for d in range(len(q)))
-    places.append(Place(*solved.end, Slope(*cut(sine_cosine, solved.end[0][0]), at_end)))
+    places.append(Place(*solved.end, _slope(solved.end[0][0], at_end, cut)))
     values = [phase.guards(place) for place in places]
 
     def lowest(values: list[Vector]) -> Array:

@@ -124,7 +124,8 @@ def single_support_2(build: PhaseBuilder, cut: Cut) -> LanePhase:
     def guards(place: Place) -> Vector:
         slope = place.slope
         m = motion(slope.sin, slope.cos, place.q[1], place.v)
-        a = dynamics.Acceleration(*slope.acceleration, 0.0 * m.L1)
+        ddtheta, ddL1 = slope.acceleration
+        a = dynamics.Acceleration(ddtheta, ddL1, 0.0 * m.L1)
         fore = cut(partial(dynamics.fore_foot_force, s), m, a)
         return (landing_foot_height(s, m), *build.falls(m, fore))
 

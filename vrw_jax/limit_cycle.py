@@ -6,15 +6,19 @@ and reverse mode, and to any order.
 """
 
 import functools
+from collections.abc import Sequence
+from typing import overload
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, Int
 
+from vrw_jax import dynamics, transitions
 from vrw_jax import multipliers as floquet
-from vrw_jax import transitions
-from vrw_jax.collocation import walk_through
+from vrw_jax.collocation import N_NODES, Solution, walk_through
 from vrw_jax.cycle_options import CycleOptions
 from vrw_jax.cycle_search import (
     Located,
@@ -25,11 +29,15 @@ from vrw_jax.cycle_search import (
     wheel_of,
 )
 from vrw_jax.derivatives import on_branch, push, total_derivative, without_derivative
+from vrw_jax.geometry import Motion
 from vrw_jax.lanes import one_wheel
+from vrw_jax.models import AbstractWheel, ViscoelasticWheel
 from vrw_jax.models.base import Indicators, Margins, SectionState
+from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
-from vrw_jax.params import Scalar, WheelParams
-from vrw_jax.return_map import step
+from vrw_jax.params import Scalar, Symbols, WheelParams
+from vrw_jax.return_map import checked, step
+from vrw_jax.walked_cycle import WalkedCycle, walked_cycle
 
 
 class LimitCycle(eqx.Module):
@@ -262,20 +270,120 @@ def _limit_cycle(params: WheelParams, problem: Problem, guess: Located | None) -
     )
 
 
+N_SAMPLES = 1025
+"""Points of each phase between which a walked guess is interpolated. With too few, 33 at c = 221,
+the fast start of a step without double support is lost, and Newton with it."""
+
+
+@eqx.filter_jit
+def _walked_guess(params: WheelParams, problem: Problem, x: SectionState) -> Located:
+    """The cycle's unknowns as `period_n` event-driven steps from a section state tell them."""
+    model, options, s = ViscoelasticWheel(), Options(), params.symbols()
+    landing = transitions.land(s, *x)
+    section = jnp.stack([landing.theta, landing.motion.dtheta])
+    durations, accelerations = [], []
+    for _ in range(problem.period_n):
+        distance = transitions.land(s, *x).distance
+        states = model.trace(params, x, options, N_SAMPLES).state
+        walked = model.advance(params, x, options)
+        x = walked.section_state
+        durations.append(walked.durations)
+        accelerations.append(_accelerations_along(problem, s, distance, states))
+    together = jnp.stack(durations)
+    by_phase = tuple(jnp.stack(steps) for steps in zip(*accelerations, strict=True))
+    happens = (together > 0.0).astype(section.dtype)
+    solution = Solution(section, together, by_phase)
+    return lax.stop_gradient(Located(solution, happens, jnp.zeros((), section.dtype)))
+
+
+def _accelerations_along(
+    problem: Problem, s: Symbols, distance: Scalar, states: Float[Array, "3 n_samples 6"]
+) -> tuple[Array, ...]:
+    """Accelerations at the nodes of each phase, (step, node, coordinate), of a sampled step."""
+    told = []
+    for i, (phase, mesh) in enumerate(zip(problem.sequence.phases, problem.meshes, strict=True)):
+        known, wanted = jnp.linspace(0.0, 1.0, states.shape[1]), jnp.asarray(mesh.node_times)
+        rows = [jnp.interp(wanted, known, states[i, :, j]) for j in range(states.shape[2])]
+        motion = Motion.of(*rows)
+        acceleration = (
+            dynamics.double_support_acceleration(s, distance, motion),
+            dynamics.single_support_1_acceleration(s, motion),
+            dynamics.single_support_2_acceleration(s, motion),
+        )[i]
+        nodes = jnp.stack(acceleration[: phase.dim], axis=-1)
+        told.append(nodes.reshape(mesh.n_steps, N_NODES, phase.dim))
+    return tuple(told)
+
+
+Guess = LimitCycle | WalkedCycle | Array | np.ndarray | Sequence[float]
+"""A neighbour's cycle, or a section state near the one that is wanted."""
+
+
+@overload
 def limit_cycle(
     params: WheelParams,
     *,
-    guess: LimitCycle | None = None,
+    guess: Guess | None = None,
     period_n: int = 1,
+    model: None = None,
     options: CycleOptions | None = None,
-) -> LimitCycle:
+) -> LimitCycle: ...
+
+
+@overload
+def limit_cycle(
+    params: WheelParams,
+    *,
+    guess: Guess | None = None,
+    period_n: int = 1,
+    model: AbstractWheel,
+    options: CycleOptions | Options | None = None,
+) -> LimitCycle | WalkedCycle: ...
+
+
+def limit_cycle(
+    params: WheelParams,
+    *,
+    guess: Guess | None = None,
+    period_n: int = 1,
+    model: AbstractWheel | None = None,
+    options: CycleOptions | Options | None = None,
+) -> LimitCycle | WalkedCycle:
     """The limit cycle of this wheel: the gait that repeats after `period_n` steps.
 
-    Needs no start; `guess` (a neighbour's cycle) makes it quicker and picks the branch. Found
-    cycles satisfy the paper's sequence of phases at all nodes, stable or not. Errors at the default
-    options: 1e-9 relative in values, 1e-8 in first derivatives. Differentiable in every mode and
-    order; `jax.vmap` runs the wheels side by side.
+    Needs no start for `period_n` 1. `guess`, a neighbour's cycle or a section state (theta-,
+    dtheta-, dL1-) near the gait, makes it quicker and picks the branch. Found cycles satisfy the
+    paper's sequence of phases at all nodes, stable or not. Errors at the default options: 1e-9
+    relative in values, 1e-8 in first derivatives. Differentiable in every mode and order;
+    `jax.vmap` runs the wheels side by side.
+
+    Any other rung as `model` is solved on its own return map, with `Options` of its step: a
+    `WalkedCycle`, to the step's errors.
     """
+    if period_n < 1:
+        raise ValueError(f"period_n is {period_n}, but a gait repeats after 1 step or more.")
+    if model is not None and not isinstance(model, ViscoelasticWheel):
+        if isinstance(options, CycleOptions):
+            raise TypeError(
+                f"options is a CycleOptions, but {type(model).__name__} is solved on its return "
+                "map: give the vrw.Options of its step."
+            )
+        start = guess.section_state if isinstance(guess, LimitCycle | WalkedCycle) else guess
+        return walked_cycle(params, model, start, period_n, options)
+    if isinstance(options, Options):
+        raise TypeError(
+            "options is an Options, but the paper's wheel is solved by collocation: "
+            "give vrw.CycleOptions(), or CycleOptions.tight()."
+        )
     options = CycleOptions() if options is None else options
     problem = Problem(params.n_legs, period_n, options)
-    return _limit_cycle(params, problem, None if guess is None else guess.located)
+    if guess is None:
+        located = None
+    elif isinstance(guess, LimitCycle) and guess.problem == problem:
+        located = guess.located
+    else:
+        known = isinstance(guess, LimitCycle | WalkedCycle)
+        x = guess.section_state if known else guess  # type: ignore[union-attr]
+        params, state, _, _ = checked(params, x, None, None)
+        located = _walked_guess(params, problem, state)
+    return _limit_cycle(params, problem, located)

@@ -19,9 +19,11 @@ m/s. The length of Leg 1 follows from touchdown itself, Leg 2 is on its stopper.
 class Indicators(eqx.Module):
     """The double-limb-support indicators of Section 5.1, of the landing that opens the step."""
 
-    lambda_I4: Scalar  # normal impulse of the rear foot in the landing, both feet held, N s
-    lambda_2: Scalar  # normal force of the fore foot just after it, N
-    lambda_4: Scalar  # normal force of the rear foot just after it, N
+    lambda_I4: Float[
+        Array, "*steps"
+    ]  # normal impulse of the rear foot in the landing, both feet held, N s
+    lambda_2: Float[Array, "*steps"]  # normal force of the fore foot just after it, N
+    lambda_4: Float[Array, "*steps"]  # normal force of the rear foot just after it, N
 
 
 class EnergyLoss(eqx.Module):
