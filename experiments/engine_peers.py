@@ -1,8 +1,9 @@
 """The same gait step by other integrators: numba, SciPy and heyoka, for engine_benchmark.py.
 
 Each starts just after the landing and ends at the next touchdown, watching the paper's own three
-events alone: a little less than what the library's engines do. The equations are those of
-docs/physics.md, written out for numbers and for heyoka's expressions alike.
+events alone: a little less than what the library's engines do. Each returns, lane by lane,
+(theta-, dtheta-, dL1-), the three durations and the number of evaluations. The equations are those
+of docs/physics.md, written out for numbers and for heyoka's expressions alike.
 """
 
 import math
@@ -146,10 +147,11 @@ def dormand_prince(phase, n, y, k, z, error, h, D, P):
 
 @numba.njit(error_model="numpy")
 def numba_phase(phase, n, y, h, D, P, tol, k, z, error):
-    """To the phase's guard, in place; returns its duration and the next step."""
+    """To the phase's guard, in place; returns its duration, the next step and steps tried."""
     before, _ = slope(phase, y, D, P, k[0])
-    time = 0.0
+    time, tried = 0.0, 0
     while True:
+        tried += 1
         after, _ = dormand_prince(phase, n, y, k, z, error, h, D, P)
         total = 0.0
         for i in range(n):
@@ -167,6 +169,7 @@ def numba_phase(phase, n, y, h, D, P, tol, k, z, error):
     x0, g0, d = 0.0, before, h * before / (before - after)
     low, high, change = 0.0, h, 0.0
     for _ in range(30):
+        tried += 1
         g, rate = dormand_prince(phase, n, y, k, z, error, d, D, P)
         if rate == 0.0:
             rate = (g - g0) / (d - x0)
@@ -181,13 +184,13 @@ def numba_phase(phase, n, y, h, D, P, tol, k, z, error):
         d = d + change if low < d + change < high else 0.5 * (low + high)
     for i in range(n):
         y[i] = z[i] + change * k[6, i]
-    return time + d + change, h
+    return time + d + change, h, tried
 
 
 @numba.njit
 def numba_steps(starts, parameters, tol):
-    """(theta, dtheta) just after landing to (theta-, dtheta-, dL1-) and durations."""
-    out = np.empty((len(starts), 6))
+    """Dormand-Prince 5(4) with adaptive steps."""
+    out = np.empty((len(starts), 7))
     k, z, error, y = np.empty((7, 6)), np.empty(6), np.empty(6), np.empty(6)
     for lane in range(len(starts)):
         P = parameters[lane]
@@ -195,13 +198,14 @@ def numba_steps(starts, parameters, tol):
         P = (P[0], P[1], P[2], P[3], P[4], P[5], P[6], P[7], P[8], P[9])
         D = P[2] * SA / (math.cos(theta) * CA - math.sin(theta) * SA)
         y[0], y[1] = theta, w
-        out[lane, 3], h = numba_phase(0, 2, y, 5e-3, D, P, tol, k, z, error)
+        out[lane, 3], h, tried_1 = numba_phase(0, 2, y, 5e-3, D, P, tol, k, z, error)
         _, _, L1, L2, dL1, dL2 = n_dls(math.sin(y[0]), math.cos(y[0]), y[1], D, P)
         y[3], y[1], y[2], y[4], y[5] = y[1], L1, L2, dL1, dL2
-        out[lane, 4], h = numba_phase(1, 6, y, 0.3 * h, D, P, tol, k, z, error)
+        out[lane, 4], h, tried_2 = numba_phase(1, 6, y, 0.3 * h, D, P, tol, k, z, error)
         hit_numba(y, P)
-        out[lane, 5], h = numba_phase(2, 4, y, h, D, P, tol, k, z, error)
+        out[lane, 5], h, tried_3 = numba_phase(2, 4, y, h, D, P, tol, k, z, error)
         out[lane, 0], out[lane, 1], out[lane, 2] = y[0], y[2], y[3]
+        out[lane, 6] = 6.0 * (tried_1 + tried_2 + tried_3) + 3.0
     return out
 
 
@@ -215,16 +219,17 @@ def hit(y, P):
 hit_numba = _compiled(hit)
 
 
-def scipy_steps(starts, parameters, tol):
-    """solve_ivp with DOP853, compiled right-hand side and its own events."""
-    out = np.empty((len(starts), 6))
+def scipy_steps(starts, parameters, tol, method="DOP853"):
+    """solve_ivp with compiled right-hand side and its own events; NaN where it failed."""
+    out = np.zeros((len(starts), 7))
     for lane, (theta, w) in enumerate(starts):
         P = tuple(parameters[lane])
         D = P[2] * SA / (math.cos(theta) * CA - math.sin(theta) * SA)
         y = np.array([theta, w])
         for phase in range(3):
 
-            def right(t, y, phase=phase, D=D, P=P):
+            def right(t, y, phase=phase, D=D, P=P, lane=lane):
+                out[lane, 6] += 1.0
                 dy = np.empty_like(y)
                 slope(phase, y, D, P, dy)
                 return dy
@@ -234,8 +239,11 @@ def scipy_steps(starts, parameters, tol):
 
             guard.terminal, guard.direction = True, -1.0
             found = solve_ivp(
-                right, (0.0, 20.0), y, method="DOP853", rtol=tol, atol=tol, events=guard
+                right, (0.0, 20.0), y, method=method, rtol=tol, atol=tol, events=guard
             )
+            if found.status != 1:
+                out[lane, :6] = np.nan
+                break
             y, out[lane, 3 + phase] = found.y[:, -1].copy(), found.t[-1]
             if phase == 0:
                 _, _, L1, L2, dL1, dL2 = n_dls(math.sin(y[0]), math.cos(y[0]), y[1], D, P)
@@ -243,7 +251,8 @@ def scipy_steps(starts, parameters, tol):
             elif phase == 1:
                 hit(y, P)
                 y = y[:4]
-        out[lane, :3] = y[0], y[2], y[3]
+            else:
+                out[lane, :3] = y[0], y[2], y[3]
     return out
 
 
@@ -269,7 +278,7 @@ class Heyoka:
         )
 
     def __call__(self, starts, parameters):
-        out = np.empty((len(starts), 6))
+        out = np.zeros((len(starts), 7))
         for lane, (theta, w) in enumerate(starts):
             P = tuple(parameters[lane])
             D = P[2] * SA / (math.cos(theta) * CA - math.sin(theta) * SA)
@@ -277,7 +286,8 @@ class Heyoka:
             for phase, ta in enumerate(self.phases):
                 ta.reset_cooldowns()
                 ta.time, ta.pars[:], ta.state[:] = 0.0, (*P, D)[: len(ta.pars)], y
-                ta.propagate_until(20.0)
+                taken = ta.propagate_until(20.0)[3]
+                out[lane, 6] += taken * (ta.order + 1)  # a Taylor coefficient each
                 y, out[lane, 3 + phase] = ta.state.copy(), ta.time
                 if phase == 0:
                     _, _, L1, L2, dL1, dL2 = n_dls(math.sin(y[0]), math.cos(y[0]), y[1], D, P)
