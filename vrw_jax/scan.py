@@ -98,7 +98,7 @@ class Plan:
         return {
             "code": code_digest(),
             "versions": told["versions"],
-            "device": f"{jax.default_backend()}: {told['device']}, {platform.machine()}",
+            "device": f"{jax.default_backend()}: {told['device']}, {_processor()}",
         }
 
     @property
@@ -214,7 +214,7 @@ def run(
     for index, size in zip(missing, sizes, strict=True):
         region = planned.layout.region(index)
         results = evaluate(planned.design.block(region))
-        with _disk_full_explained(store, planned.layout.n_chunks - len(kept.missing())):
+        with _disk_full_explained(store, kept, planned.layout.n_chunks):
             kept.write(index, _shaped(results, region))
         done += size
         failed += int(np.count_nonzero(results["outcome"] != Outcome.STEPPED))
@@ -248,6 +248,19 @@ def open_store(planned: Plan, path: Path) -> ZarrStore:
     return kept
 
 
+VECTOR_SETS = ("avx", "fma", "avx2", "avx512f", "avx512dq", "asimd", "sve")
+"""Instruction sets that decide which sums the compiler fuses, and so the last digits."""
+
+
+def _processor() -> str:
+    """The kind of processor, as far as last digits depend on it."""
+    try:
+        words = set(Path("/proc/cpuinfo").read_text().split())
+    except OSError:
+        words = set()
+    return " ".join([platform.machine(), *(name for name in VECTOR_SETS if name in words)])
+
+
 def _told(name: str, old: object, new: object) -> str:
     if name == "design.digest":
         return "the values of the swept parameters differ"
@@ -266,12 +279,15 @@ def _shaped(results: Mapping[str, np.ndarray], region: tuple[slice, ...]) -> dic
 
 
 @contextlib.contextmanager
-def _disk_full_explained(store: str | Path | None, n_done: int) -> Iterator[None]:
+def _disk_full_explained(
+    store: str | Path | None, kept: AbstractStore, n_chunks: int
+) -> Iterator[None]:
     try:
         yield
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise
+        n_done = n_chunks - len(kept.missing())
         raise OSError(
             error.errno,
             f"no space is left for {store}, where {n_done} chunks are complete: make room and run "

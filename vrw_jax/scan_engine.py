@@ -3,13 +3,17 @@
 A block of samples is cut into batches of LANES wheels, the last filled up, and every batch goes
 through the same compiled code: what a lane gives does not depend on where it stands, on its
 neighbours, or on how many samples a scan has.
+
+Batches run side by side: a thread for each core, all with one compiled program, or for each GPU.
 """
 
+import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from queue import SimpleQueue
+from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -109,47 +113,89 @@ class Engine:
         self._cycle: Callable = jax.vmap(told_by_cycle)
         self._step: Callable = jax.vmap(told_by_step, in_axes=(0, 0, None))
         self._settings = (measures, base.n_legs, model, cycle_options)
-        self._compiled = False
+        self._free: SimpleQueue[_Programs] = SimpleQueue()
+        self._workers = 0
 
     def __call__(self, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Results of the samples in `columns` (one value per sample of each swept parameter)."""
         n = len(next(iter(columns.values())))
-        parts = []
-        for begin in range(0, n, LANES):
-            n_used = min(LANES, n - begin)
-            told = self._batch({name: x[begin : begin + n_used] for name, x in columns.items()})
-            parts.append({name: value[:n_used] for name, value in told.items()})
+        batches = [slice(begin, min(begin + LANES, n)) for begin in range(0, n, LANES)]
+        if not self._workers:
+            self._compile()
+        with ThreadPoolExecutor(self._workers) as pool:
+            told = pool.map(
+                lambda batch: self._batch({name: x[batch] for name, x in columns.items()}), batches
+            )
+            parts = [
+                {name: value[: batch.stop - batch.start] for name, value in part.items()}
+                for batch, part in zip(batches, told, strict=True)
+            ]
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
     def _batch(self, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        values = np.empty((LANES, len(PARAMETER_NAMES)), np.dtype(self._base.damping.dtype))
+        filled = np.empty((LANES, len(PARAMETER_NAMES)), self._dtype)
         for i, name in enumerate(PARAMETER_NAMES):
             column = columns.get(name)
             if column is None:
-                values[:, i] = float(getattr(self._base, name))
+                filled[:, i] = float(getattr(self._base, name))
             else:
-                values[:, i] = column[0]  # fills up what is left
-                values[: len(column), i] = column
-        if not self._compiled:
-            self._compile(jnp.asarray(values))
-        outcome, state, by_cycle = self._cycle(jnp.asarray(values))
-        walked, reached, by_step = self._step(jnp.asarray(values), state, self._options)
-        checked = _checked_outcome(*map(np.asarray, (outcome, state, walked, reached)))
+                filled[:, i] = column[0]  # fills up what is left
+                filled[: len(column), i] = column
+        programs = self._free.get()
+        try:
+            values = jax.device_put(filled, programs.device)
+            outcome, state, by_cycle = programs.cycle(values)
+            options = jax.device_put(self._options, programs.device)
+            walked, reached, by_step = programs.step(values, state, options)
+            checked = _checked_outcome(*map(np.asarray, (outcome, state, walked, reached)))
+            told = {name: np.array(value) for name, value in (by_cycle | by_step).items()}
+        finally:
+            self._free.put(programs)
         failed = checked != Outcome.STEPPED
-        told = {name: np.array(value) for name, value in (by_cycle | by_step).items()}
         for value in told.values():
             value[failed] = np.nan if np.issubdtype(value.dtype, np.floating) else -1
         return {"outcome": checked} | told
 
-    def _compile(self, values: Array) -> None:
-        state = jnp.zeros((LANES, 3), values.dtype)
+    def _compile(self) -> None:
+        """Programs for each device, both kinds side by side; a CPU's serve all of its cores."""
+        devices = jax.local_devices()
+        values = jax.ShapeDtypeStruct((LANES, len(PARAMETER_NAMES)), self._dtype)
+        state = jax.ShapeDtypeStruct((LANES, 3), self._dtype)
+        settings = self._settings
         with ThreadPoolExecutor(2) as pool:
-            cycle = pool.submit(compiled, self._cycle, (values,), ("cycle", *self._settings))
-            step = pool.submit(
-                compiled, self._step, (values, state, self._options), ("step", *self._settings)
-            )
-            self._cycle, self._step = cycle.result(), step.result()
-        self._compiled = True
+            cycles = [
+                pool.submit(compiled, self._cycle, (values,), ("cycle", *settings), device)
+                for device in devices
+            ]
+            given = (values, state, self._options)
+            steps = [
+                pool.submit(compiled, self._step, given, ("step", *settings), device)
+                for device in devices
+            ]
+        for device, cycle, step in zip(devices, cycles, steps, strict=True):
+            n = n_cores() if device.platform == "cpu" and len(devices) == 1 else 1
+            for _ in range(n):
+                self._free.put(_Programs(device, cycle.result(), step.result()))
+            self._workers += n
+
+    @property
+    def _dtype(self) -> np.dtype:
+        return np.dtype(self._base.damping.dtype)
+
+
+class _Programs(NamedTuple):
+    """What a thread works with."""
+
+    device: jax.Device
+    cycle: Callable
+    step: Callable
+
+
+def n_cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def _checked_outcome(

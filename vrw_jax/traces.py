@@ -15,6 +15,7 @@ from typing import Any
 
 import jax
 from jax import export
+from jax.sharding import SingleDeviceSharding
 
 
 @functools.cache
@@ -28,8 +29,12 @@ def code_digest() -> str:
     return digest.hexdigest()
 
 
-def compiled(function: Callable, arguments: tuple, settings: object) -> Callable:
-    """`function` compiled for arguments like these; `settings` says by `repr` what it closes over.
+def compiled(
+    function: Callable, arguments: tuple, settings: object, device: jax.Device
+) -> Callable:
+    """`function` compiled for arguments like these, on `device`.
+
+    `settings` says by `repr` what the function closes over.
 
     The way leads through the exported trace whether or not it is kept, so that all runs compile the
     same program.
@@ -43,7 +48,9 @@ def compiled(function: Callable, arguments: tuple, settings: object) -> Callable
         flat = jax.jit(lambda *leaves: function(*jax.tree.unflatten(structure, leaves)))
         exported = export.export(flat)(*shapes)
         _keep(key, exported)
-    program = jax.jit(exported.call).lower(*shapes).compile()
+    there = SingleDeviceSharding(device)
+    placed = [jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=there) for x in shapes]
+    program = jax.jit(exported.call).lower(*placed).compile()
     return lambda *arguments: program(*jax.tree.leaves(arguments))
 
 
