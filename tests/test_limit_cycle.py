@@ -210,6 +210,14 @@ def test_another_rung_is_solved_on_its_own_return_map():
     kept = cycle.post_impact[1] / cycle.section_state[1]
     np.testing.assert_allclose(cycle.spectral_radius, kept**2, rtol=1e-10)
     assert float(cycle.dls_fraction) == 0.0
+    table = vrw.sensitivities(params, model=model, measures=("period", "speed"))
+    above, below = (
+        vrw.limit_cycle(vrw.WheelParams(slope=0.1 + h), model=model) for h in (1e-5, -1e-5)
+    )
+    for name in ("period", "speed"):
+        difference = (getattr(above, name) - getattr(below, name)) / 2e-5
+        found = table.derivative.sel(measure=name, parameter="slope")
+        np.testing.assert_allclose(found, difference, rtol=1e-7)  # error of differences: h squared
     lost = vrw.limit_cycle(vrw.WheelParams(slope=0.02), model=model)
     assert int(lost.outcome) == Outcome.NO_CYCLE_FOUND
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(lost))

@@ -326,7 +326,7 @@ def limit_cycle(
     guess: Guess | None = None,
     period_n: int = 1,
     model: None = None,
-    options: CycleOptions | None = None,
+    options: CycleOptions | Options | None = None,
 ) -> LimitCycle: ...
 
 

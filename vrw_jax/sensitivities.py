@@ -1,8 +1,8 @@
 """How every measure of a gait answers to every parameter, as a labelled table."""
 
-import functools
 from collections.abc import Callable, Sequence
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,11 +11,14 @@ from jaxtyping import Array
 
 from vrw_jax.cycle_options import CycleOptions
 from vrw_jax.cycle_search import parameters_of, wheel_of
-from vrw_jax.limit_cycle import LimitCycle, limit_cycle
+from vrw_jax.limit_cycle import Guess, LimitCycle, limit_cycle
+from vrw_jax.models import AbstractWheel, UnilateralWheel
+from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
 from vrw_jax.params import DOMAINS, WheelParams
+from vrw_jax.walked_cycle import WalkedCycle
 
-MEASURES: dict[str, tuple[str, Callable[[LimitCycle], Array]]] = {
+MEASURES: dict[str, tuple[str, Callable[[LimitCycle | WalkedCycle], Array]]] = {
     "dls_fraction": ("1", lambda cycle: cycle.dls_fraction),
     "period": ("s", lambda cycle: cycle.period),
     "speed": ("m/s", lambda cycle: cycle.speed),
@@ -34,18 +37,28 @@ MEASURES: dict[str, tuple[str, Callable[[LimitCycle], Array]]] = {
 """Unit and definition of each measure; the last two are second derivatives of the motion."""
 
 
-@functools.partial(jax.jit, static_argnums=(2, 3, 4))
+PAPER_ONLY = frozenset(("lambda_I4", "lambda_2", "lambda_4"))
+"""Measures of the paper's landing procedure, which real ground does not follow."""
+
+
+@eqx.filter_jit
 def _jacobian(
     vector: Array,
-    guess: LimitCycle | None,
+    guess: Guess | None,
     n_legs: int,
     measures: tuple[str, ...],
-    options: CycleOptions | None,
+    model: AbstractWheel | None,
+    options: CycleOptions | Options | None,
 ) -> tuple[Array, tuple[Array, Array]]:
     """d(measures)/d(parameters) with the measures and the outcome; compiled once."""
 
     def evaluate(vector: Array) -> tuple[Array, tuple[Array, Array]]:
-        cycle = limit_cycle(wheel_of(vector, n_legs), guess=guess, options=options)
+        wheel = wheel_of(vector, n_legs)
+        cycle: LimitCycle | WalkedCycle
+        if model is None:
+            cycle = limit_cycle(wheel, guess=guess, options=options)
+        else:
+            cycle = limit_cycle(wheel, guess=guess, model=model, options=options)
         values = jnp.stack([MEASURES[name][1](cycle) for name in measures])
         return values, (values, cycle.outcome)
 
@@ -55,24 +68,31 @@ def _jacobian(
 def sensitivities(
     params: WheelParams,
     *,
-    measures: Sequence[str] = tuple(MEASURES),
-    guess: LimitCycle | None = None,
-    options: CycleOptions | None = None,
+    measures: Sequence[str] | None = None,
+    guess: Guess | None = None,
+    model: AbstractWheel | None = None,
+    options: CycleOptions | Options | None = None,
 ) -> xr.Dataset:
     """d(measure)/d(parameter) of one gait, plain and as elasticities, with the measures' values.
 
     An elasticity is the relative change of the measure over that of the parameter; NaN where the
-    measure is zero. Leaving out the measures of stability saves most of the compile time.
+    measure is zero. Leaving out the measures of stability saves most of the compile time. `guess`,
+    `model` and `options` are those of `limit_cycle`.
     """
-    unknown = sorted(set(measures) - set(MEASURES))
+    without = PAPER_ONLY if isinstance(model, UnilateralWheel) else frozenset()
+    known = [name for name in MEASURES if name not in without]
+    measures = known if measures is None else measures
+    unknown = sorted(set(measures) - set(known))
     if unknown:
         raise ValueError(
             f"measures holds {', '.join(unknown)}, but the measures of a cycle are "
-            f"{', '.join(MEASURES)}: choose among these."
+            f"{', '.join(known)}: choose among these."
         )
 
     vector = parameters_of(params)
-    jacobian, (values, outcome) = _jacobian(vector, guess, params.n_legs, tuple(measures), options)
+    jacobian, (values, outcome) = _jacobian(
+        vector, guess, params.n_legs, tuple(measures), model, options
+    )
     if int(outcome) != Outcome.STEPPED:
         raise ValueError(f"there is no gait to differentiate: {Outcome(int(outcome)).meaning}")
     derivative, value = np.asarray(jacobian), np.asarray(values)

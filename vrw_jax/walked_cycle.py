@@ -22,7 +22,8 @@ from vrw_jax.section_newton import newton_cycle
 class WalkedCycle(eqx.Module):
     """A gait that repeats after `period_n` steps, told by walking it. Batched under vmap.
 
-    Where none was found, `outcome` says so and every other number is zero.
+    Differentiable in the parameters by the implicit function theorem, to second order. Where none
+    was found, `outcome` says so and every other number is zero.
     """
 
     section_state: Float[Array, " n_section"]  # fixed under `period_n` return maps
@@ -124,6 +125,13 @@ def walked_cycle(
     """The cycle next to `start` (the model's own start if None), stable or not."""
     begin = model.start(params) if start is None else start
     params, x, model, options = checked(params, begin, model, options)
+    return _walked_cycle(params, x, model, options, period_n)
+
+
+@eqx.filter_jit
+def _walked_cycle(
+    params: WheelParams, x: Array, model: AbstractWheel, options: Options, period_n: int
+) -> WalkedCycle:
     found = newton_cycle(
         lambda x: model.advance(params, x, options).section_state, x, period_n=period_n
     )
@@ -133,17 +141,14 @@ def walked_cycle(
         x = results[-1].section_state
     steps = jax.tree.map(lambda *leaves: jnp.stack(leaves), *results)
     # A step that fails returns zeros, which Newton's method may take for a fixed point.
-    walks = jnp.all(steps.outcome == Outcome.STEPPED)
-    good = found.converged & walks
-    bad_input = steps.outcome[0] == Outcome.BAD_INPUT
-    missing = jnp.where(bad_input & ~params.in_domain(), Outcome.BAD_INPUT, Outcome.NO_CYCLE_FOUND)
+    good = found.converged & jnp.all(steps.outcome == Outcome.STEPPED)
+    missing = jnp.where(params.in_domain(), Outcome.NO_CYCLE_FOUND, Outcome.BAD_INPUT)
     masked = lambda leaf: jnp.where(good, leaf, jnp.zeros_like(leaf))
-    outcome = jnp.where(good, Outcome.STEPPED, missing).astype(jnp.int32)
     return WalkedCycle(
         section_state=masked(found.x),
         steps=jax.tree.map(masked, steps),
         matrix=masked(found.jacobian),
-        outcome=outcome,
+        outcome=jnp.where(good, Outcome.STEPPED, missing).astype(jnp.int32),
         residual=found.residual,
         iterations=found.iterations,
     )
