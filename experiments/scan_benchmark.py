@@ -37,10 +37,10 @@ def planned(size: int):
 
     damping, stiffness, natural_length, slope = COUNTS[size]
     design = vrw.grid(
-        damping=np.linspace(100.0, 215.0, damping),
-        stiffness=np.linspace(400.0, 600.0, stiffness),
-        natural_length=np.linspace(1.01, 1.04, natural_length),
-        slope=np.linspace(0.28, 0.34, slope),
+        damping=np.linspace(100.0, 200.0, damping),
+        stiffness=np.linspace(420.0, 500.0, stiffness),
+        natural_length=np.linspace(1.015, 1.035, natural_length),
+        slope=np.linspace(0.27, 0.305, slope),
     )
     return plan(design, MEASURES)
 
@@ -52,9 +52,9 @@ def log(size: int) -> Path:
 def scan(size: int) -> None:
     """In a process of its own: every chunk's progress goes to the log, kill or no kill."""
     began = time.time()
-    from vrw_jax.cli import _start_jax
+    from vrw_jax.start import start_jax
 
-    _start_jax()
+    start_jax()
     from vrw_jax.scan import Progress, run
 
     def report(progress: Progress) -> None:
@@ -159,9 +159,9 @@ def compare(size: int) -> None:
 
 
 def main(largest: int) -> None:
-    from vrw_jax.cli import _start_jax
+    from vrw_jax.start import start_jax
 
-    _start_jax()
+    start_jax()
     STORES.mkdir(parents=True, exist_ok=True)
     sizes = [size for size in COUNTS if size <= largest]
     for size in sizes:

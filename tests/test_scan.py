@@ -5,10 +5,12 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 import xarray as xr
@@ -19,8 +21,9 @@ from vrw_jax.designs import Columns
 from vrw_jax.measures import MARGINS
 from vrw_jax.outcomes import Outcome
 from vrw_jax.params import PARAMETER_NAMES, WheelParams
-from vrw_jax.scan import Plan, Progress, plan, run
-from vrw_jax.scan_engine import Engine
+from vrw_jax.scan import Chunk, Plan, Progress, plan, run
+from vrw_jax.scan_dask import workers
+from vrw_jax.scan_engine import LANES, Engine
 from vrw_jax.scan_measures import ALWAYS
 from vrw_jax.scan_store import chunk_shape, first_difference, open_scan
 
@@ -309,7 +312,8 @@ def test_a_wrong_design_gets_one_sentence(make, expected: str) -> None:
 
 @pytest.fixture(scope="module")
 def engine() -> Engine:
-    return planned().engine()
+    of = planned()
+    return Engine(of.measures, of.base, of.model, of.options, of.cycle_options, threads=2)
 
 
 @pytest.fixture(scope="module")
@@ -405,3 +409,104 @@ def test_the_engine_is_traced_once(engine: Engine, monkeypatch: pytest.MonkeyPat
     engine({"damping": np.array([200.0])})
     monkeypatch.setattr(Engine, "_compile", lambda *_: pytest.fail("compiled again"))
     engine({"slope": np.array([0.29, 0.3]), "stiffness": np.array([480.0, 500.0])})
+
+
+# Many at work
+
+
+def test_batches_run_side_by_side_and_change_nothing(
+    engine: Engine, told: Mapping[str, np.ndarray]
+) -> None:
+    """Each of two batches waits until the other has begun: with turns none would ever go on."""
+    both = threading.Barrier(2, timeout=60.0)
+    programs = [engine._free.get(timeout=60.0) for _ in range(2)]
+
+    def met(program: Callable) -> Callable:
+        return lambda values: (both.wait(), program(values))[1]
+
+    for program in programs:
+        engine._free.put(program._replace(cycle=met(program.cycle)))
+    columns = GRID.block((slice(None), slice(None)))
+    size = LANES + GRID.size
+    together = engine({name: np.resize(column, size) for name, column in columns.items()})
+    for _ in programs:
+        engine._free.get()
+    for program in programs:
+        engine._free.put(program)
+    for name, value in told.items():
+        np.testing.assert_array_equal(together[name][: GRID.size], value, name)
+        np.testing.assert_array_equal(together[name][LANES:], np.roll(value, -12, 0), name)
+
+
+def test_a_cluster_that_loses_a_worker_gives_bitwise_the_serial_scan(
+    engine: Engine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two worker processes; the one at work on most chunks is killed with signal 9 in mid-scan."""
+    from distributed import Client, LocalCluster
+
+    alone, shared = tmp_path / "alone.zarr", tmp_path / "shared.zarr"
+    run(planned(2), alone, evaluate=engine)
+    cache = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", cache)  # workers start out with the suite's
+    told: list[Progress] = []
+    killed: list[int] = []
+    with (
+        LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
+        Client(cluster) as client,
+        workers(cluster.scheduler_address) as through,
+    ):
+        places = client.run(os.getpid)
+
+        def report(progress: Progress) -> None:
+            told.append(progress)
+            if progress.done and not killed:
+                busy = client.processing()
+                victim = max(places, key=lambda place: len(busy.get(place, ())))
+                assert busy[victim]
+                killed.append(places[victim])
+                os.kill(places[victim], signal.SIGKILL)
+
+        result = run(planned(2), shared, report=report, through=through)
+        assert killed[0] not in client.run(os.getpid).values()
+    assert told[-1].done == GRID.size
+    assert np.all(result.outcome.values != -1)
+    assert files(shared) == files(alone)
+
+
+def backwards(planned: Plan, missing: Sequence[int]) -> Iterator[Chunk]:
+    for index in reversed(missing):
+        yield index, arithmetic(planned.design.block(planned.layout.region(index)))
+
+
+def test_chunks_may_come_in_any_order(tmp_path: Path) -> None:
+    run(planned(), tmp_path / "whole.zarr", evaluate=arithmetic)
+    run(planned(), tmp_path / "backwards.zarr", through=backwards)
+    assert files(tmp_path / "backwards.zarr") == files(tmp_path / "whole.zarr")
+
+
+def test_workers_of_another_kind_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A cluster of threads in this process, which say that they run other code."""
+    from distributed import LocalCluster
+
+    scan_dask = sys.modules["vrw_jax.scan_dask"]
+    told = iter([{"code": "ours"}])
+    monkeypatch.setattr(scan_dask, "origin", lambda: next(told, {"code": "theirs"}))
+    monkeypatch.setattr(scan_dask, "_engine", lambda _: arithmetic)
+    with (
+        LocalCluster(n_workers=1, processes=False, dashboard_address=None) as cluster,
+        workers(cluster.scheduler_address) as through,
+        pytest.raises(ValueError, match="the library's code differs"),
+    ):
+        run(planned(), tmp_path / "s.zarr", through=through)
+    assert np.all(open_scan(tmp_path / "s.zarr").outcome.values == -1)
+
+
+def test_an_address_without_a_scheduler_gets_one_sentence(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(sys.modules["vrw_jax.scan_dask"], "ANSWER", "1s")
+    for address in ("nonsense://there", "tcp://127.0.0.1:9"):
+        with pytest.raises(ValueError, match="no dask scheduler answers"), workers(address):
+            pass

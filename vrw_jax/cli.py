@@ -6,8 +6,6 @@ is said in one sentence on stderr, with exit code 2.
 
 import contextlib
 import importlib.metadata
-import os
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -126,8 +124,10 @@ def reproduce(
 
     Exit code 1 if a fact does not hold.
     """
+    from vrw_jax.start import start_jax
+
     with _sentences():
-        _start_jax()
+        start_jax()
         folder.mkdir(parents=True, exist_ok=True)
     from vrw_jax.reproduce import reproduce as run
 
@@ -153,6 +153,13 @@ def scan(
     chunk: Annotated[
         int | None, typer.Option(min=1, help="Most samples that are written at a time.")
     ] = None,
+    dask: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help="Compute on the dask cluster at this address; 'local' starts one here.",
+        ),
+    ] = None,
     picture: Annotated[bool, typer.Option(help="Draw the result.")] = True,
 ) -> None:
     """Find the steady gait of every sample of a design, with outcome and premises of each.
@@ -166,6 +173,8 @@ def scan(
       vrw scan configs/quickstart.toml --explain
 
       vrw scan configs/quickstart.toml --out results/first
+
+      vrw scan configs/quickstart.toml --dask tcp://host:8786
     """
     with _sentences():
         planned, name = _planned(config, chunk)
@@ -178,7 +187,7 @@ def scan(
 
         missing = open_store(planned, store).missing()
     if missing:
-        _compute(planned, store)
+        _compute(planned, store, dask)
     else:
         out.print(f"{store} is complete: nothing to compute.", highlight=False)
     _tell_scan(store, folder, picture)
@@ -325,26 +334,10 @@ def _escaped(text: str) -> str:
     return escape(text)
 
 
-def _start_jax() -> None:
-    """64-bit numbers, and compiled code kept in the user's cache folder."""
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        jax.config.update("jax_compilation_cache_dir", str(_cache_folder() / "vrw_jax"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
-
-
-def _cache_folder() -> Path:
-    if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches"
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-
-
 def _config(path: Path | None) -> "Config":
-    _start_jax()
+    from vrw_jax.start import start_jax
+
+    start_jax()
     from vrw_jax.config import Config, load
 
     return Config() if path is None else load(path)
@@ -404,15 +397,15 @@ def _tell_plan(planned: "Plan", store: Path) -> None:
     out.print(table)
 
 
-def _compute(planned: "Plan", store: Path) -> None:
-    from vrw_jax.scan import run
+def _compute(planned: "Plan", store: Path, dask: str | None) -> None:
+    from vrw_jax.scan import carried, run
 
     with _bar("scan") as bar:
         task = bar.add_task("compiling", total=None, note="")
         report = _reporter(bar.update, task)
         try:
-            with _sentences():
-                run(planned, store, report=report)
+            with _sentences(), carried(dask) as through:
+                run(planned, store, report=report, through=through)
         except KeyboardInterrupt:
             bar.stop()
             err.print(

@@ -7,7 +7,7 @@ written at once: a scan that was interrupted goes on with the chunks that are mi
 import contextlib
 import errno
 import platform
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,6 +45,10 @@ CHUNK = 4096
 
 Evaluate = Callable[[Columns], Mapping[str, np.ndarray]]
 """Results of a block of samples by variable, samples first."""
+Chunk = tuple[int, Mapping[str, np.ndarray]]
+"""Number of a chunk and its results."""
+Through = Callable[["Plan", Sequence[int]], Iterator[Chunk]]
+"""Carries out chunks of a plan, by number, in any order."""
 Report = Callable[["Progress"], None]
 
 
@@ -92,16 +96,6 @@ class Plan:
         }
 
     @property
-    def origin(self) -> dict[str, object]:
-        """Where the numbers come from: code, versions, device."""
-        told = provenance(self.base, self.model, self.options)
-        return {
-            "code": code_digest(),
-            "versions": told["versions"],
-            "device": f"{jax.default_backend()}: {told['device']}, {_processor()}",
-        }
-
-    @property
     def attrs(self) -> dict[str, object]:
         """Attributes of the whole result."""
         return {
@@ -109,7 +103,7 @@ class Plan:
             f"{', '.join(self.design.names)}",
             "rule": "NaN, or -1 in an integer, where the outcome is not STEPPED.",
             MANIFEST: self.settings,
-            PROVENANCE: self.origin,
+            PROVENANCE: origin(),
             "config": self.text,
         }
 
@@ -169,6 +163,7 @@ def scan(
     store: str | Path | None = None,
     chunk: int | None = None,
     report: Report | None = None,
+    dask: str | None = None,
 ) -> xr.Dataset:
     """The steady gait of every sample, labelled, with outcome and premise margins of each.
 
@@ -176,7 +171,8 @@ def scan(
     'd dls_fraction / d damping'. With `store` the result is kept there chunk by chunk: a scan that
     was interrupted goes on where it stopped and ends with bitwise the same data, a finished one is
     only opened. `report` is told the progress after each chunk. What a sample gives does not depend
-    on the others, nor on `chunk`.
+    on the others, nor on `chunk`. `dask` is the address of a cluster that computes in this
+    process' stead, "local" for one started here.
     """
     planned = plan(
         design,
@@ -187,7 +183,27 @@ def scan(
         cycle_options=cycle_options,
         chunk=chunk,
     )
-    return run(planned, store, report=report)
+    with carried(dask) as through:
+        return run(planned, store, report=report, through=through)
+
+
+def carried(dask: str | None) -> contextlib.AbstractContextManager[Through | None]:
+    """The workers of a dask cluster; None where this process computes by itself."""
+    if dask is None:
+        return contextlib.nullcontext()
+    from vrw_jax.scan_dask import workers
+
+    return workers(dask)
+
+
+def origin() -> dict[str, object]:
+    """Where numbers of this process come from: code, versions, device."""
+    told = provenance(WheelParams(), ViscoelasticWheel(), Options())
+    return {
+        "code": code_digest(),
+        "versions": told["versions"],
+        "device": f"{jax.default_backend()}: {told['device']}, {_processor()}",
+    }
 
 
 def run(
@@ -196,8 +212,9 @@ def run(
     *,
     report: Report | None = None,
     evaluate: Evaluate | None = None,
+    through: Through | None = None,
 ) -> xr.Dataset:
-    """Carry out a plan; `evaluate` stands in for the plan's own engine."""
+    """Carry out a plan, here or `through` others; `evaluate` stands in for the plan's engine."""
     kept: AbstractStore
     if store is None:
         kept = MemoryStore(planned.layout, planned.attrs)
@@ -206,21 +223,28 @@ def run(
     missing = kept.missing()
     if not missing:
         return kept.dataset()
-    evaluate = planned.engine() if evaluate is None else evaluate
-    sizes = [_size(planned.layout.region(index)) for index in missing]
-    total, done, failed = sum(sizes), 0, 0
+    sizes = {index: _size(planned.layout.region(index)) for index in missing}
+    total, done, failed = sum(sizes.values()), 0, 0
     if report is not None:
         report(Progress(total, 0, 0, planned.design.size - total))
-    for index, size in zip(missing, sizes, strict=True):
-        region = planned.layout.region(index)
-        results = evaluate(planned.design.block(region))
+    through = _in_turn(evaluate) if through is None else through
+    for index, results in through(planned, missing):
         with _disk_full_explained(store, kept, planned.layout.n_chunks):
-            kept.write(index, _shaped(results, region))
-        done += size
+            kept.write(index, _shaped(results, planned.layout.region(index)))
+        done += sizes[index]
         failed += int(np.count_nonzero(results["outcome"] != Outcome.STEPPED))
         if report is not None:
             report(Progress(total, done, failed, planned.design.size - total))
     return kept.dataset()
+
+
+def _in_turn(evaluate: Evaluate | None) -> Through:
+    def through(planned: Plan, missing: Sequence[int]) -> Iterator[Chunk]:
+        engine = planned.engine() if evaluate is None else evaluate
+        for index in missing:
+            yield index, engine(planned.design.block(planned.layout.region(index)))
+
+    return through
 
 
 def open_store(planned: Plan, path: Path) -> ZarrStore:
@@ -229,19 +253,19 @@ def open_store(planned: Plan, path: Path) -> ZarrStore:
     if there is None:
         create(path, planned.layout, planned.attrs)
         return ZarrStore(path, planned.layout)
-    name, old, new = first_difference(there[MANIFEST], planned.settings)
-    if name:
+    other = difference(there[MANIFEST], planned.settings)
+    if other:
         raise ValueError(
-            f"{path} holds a scan made with other settings: {_told(name, old, new)}. "
+            f"{path} holds a scan made with other settings: {other}. "
             "Give another place for this scan, or go back to those settings, or delete the store."
         )
     kept = ZarrStore(path, planned.layout)
-    name, old, new = first_difference(there[PROVENANCE], planned.origin)
+    other = difference(there[PROVENANCE], origin())
     missing = len(kept.missing())
-    if name and missing:
+    if other and missing:
         raise ValueError(
             f"{path} lacks {missing} of {planned.layout.n_chunks} chunks and was begun by other "
-            f"means, so that its last digits might not fit: {_told(name, old, new)}. "
+            f"means, so that its last digits might not fit: {other}. "
             "Go on with what it was begun with, or begin anew in another place."
         )
     kept.tidy()
@@ -261,7 +285,11 @@ def _processor() -> str:
     return " ".join([platform.machine(), *(name for name in VECTOR_SETS if name in words)])
 
 
-def _told(name: str, old: object, new: object) -> str:
+def difference(there: object, here: object) -> str:
+    """The first setting that differs, in words; empty where none does."""
+    name, old, new = first_difference(there, here)
+    if not name:
+        return ""
     if name == "design.digest":
         return "the values of the swept parameters differ"
     if name == "code":

@@ -11,6 +11,7 @@ import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from queue import SimpleQueue
+from threading import Lock
 from typing import NamedTuple
 
 import jax
@@ -76,7 +77,9 @@ class Engine:
         model: ViscoelasticWheel,
         options: Options,
         cycle_options: CycleOptions,
+        threads: int | None = None,  # at work side by side on a CPU; None: one for each core
     ) -> None:
+        self._threads = n_cores() if threads is None else threads
         self._base, self._options = base, options
         wanted = tuple(d for name in measures if (d := derivative(name)) is not None)
         plain = tuple(name for name in measures if derivative(name) is None)
@@ -114,14 +117,15 @@ class Engine:
         self._step: Callable = jax.vmap(told_by_step, in_axes=(0, 0, None))
         self._settings = (measures, base.n_legs, model, cycle_options)
         self._free: SimpleQueue[_Programs] = SimpleQueue()
-        self._workers = 0
+        self._workers, self._compiling = 0, Lock()
 
     def __call__(self, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Results of the samples in `columns` (one value per sample of each swept parameter)."""
         n = len(next(iter(columns.values())))
         batches = [slice(begin, min(begin + LANES, n)) for begin in range(0, n, LANES)]
-        if not self._workers:
-            self._compile()
+        with self._compiling:
+            if not self._workers:
+                self._compile()
         with ThreadPoolExecutor(self._workers) as pool:
             told = pool.map(
                 lambda batch: self._batch({name: x[batch] for name, x in columns.items()}), batches
@@ -173,7 +177,7 @@ class Engine:
                 for device in devices
             ]
         for device, cycle, step in zip(devices, cycles, steps, strict=True):
-            n = n_cores() if device.platform == "cpu" and len(devices) == 1 else 1
+            n = self._threads if device.platform == "cpu" and len(devices) == 1 else 1
             for _ in range(n):
                 self._free.put(_Programs(device, cycle.result(), step.result()))
             self._workers += n
