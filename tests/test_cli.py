@@ -162,6 +162,17 @@ def test_every_kind_of_design_gets_a_picture(design: str, config: Path) -> None:
     assert (config.parent / "here" / "scan.png").stat().st_size > 5000
 
 
+def test_many_parameters_at_once_are_drawn_in_pairs_with_their_sobol_indices(config: Path) -> None:
+    config.write_text(
+        "[saltelli]\nn = 256\ndamping = [100.0, 101.0]\nslope = [0.29, 0.3]\n"
+        'stiffness = [500.0, 500.5]\n[scan]\nmeasures = ["dls_fraction", "speed"]\n'
+    )
+    told = vrw("scan", config, "--out", "here")
+    assert told.exit_code == 0, told.output
+    for name in ("scan_pairs.png", "sobol_indices.png"):
+        assert (config.parent / "here" / name).stat().st_size > 5000
+
+
 def test_a_gait_is_told_with_its_premises(config: Path) -> None:
     told = vrw("gait", "--steps", 2)
     assert told.exit_code == 0, told.output

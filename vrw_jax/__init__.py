@@ -5,7 +5,7 @@ from vrw_jax.basin import basin
 from vrw_jax.branch import Border, Branch
 from vrw_jax.continuation import continue_branch, continue_branches, continue_map
 from vrw_jax.cycle_options import CycleOptions
-from vrw_jax.designs import grid, samples, sobol, uniform
+from vrw_jax.designs import grid, saltelli, samples, sobol, uniform
 from vrw_jax.lane_batch import Steps, steps
 from vrw_jax.limit_cycle import LimitCycle, limit_cycle
 from vrw_jax.model_choice import ModelChoice, choose_model
@@ -30,6 +30,7 @@ from vrw_jax.section_newton import SectionCycle, newton_cycle
 from vrw_jax.sensitivities import sensitivities
 from vrw_jax.simulate import simulate
 from vrw_jax.tune import Tuned, tune
+from vrw_jax.variance import sobol_indices
 from vrw_jax.walked_cycle import WalkedCycle
 
 __all__ = [
@@ -67,11 +68,13 @@ __all__ = [
     "open_scan",
     "paper_start",
     "return_map",
+    "saltelli",
     "samples",
     "scan",
     "sensitivities",
     "simulate",
     "sobol",
+    "sobol_indices",
     "step",
     "steps",
     "tune",

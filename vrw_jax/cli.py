@@ -371,7 +371,7 @@ def _planned(path: Path, chunk: int | None) -> tuple["Plan", str]:
     if settings.design is None:
         raise ConfigError(
             f"{settings.name} has no samples, but a scan needs a design: add a table [grid], "
-            "[samples], [sobol] or [uniform], as in configs/quickstart.toml."
+            "[samples], [sobol], [uniform] or [saltelli], as in configs/quickstart.toml."
         )
     planned = plan(
         settings.design,

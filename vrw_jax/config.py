@@ -20,7 +20,8 @@ from vrw_jax.params import DOMAINS, PARAMETER_NAMES, WheelParams
 from vrw_jax.scan_measures import check_measures
 from vrw_jax.wording import nearest
 
-DESIGNS = ("grid", "samples", "sobol", "uniform")
+DRAWN = {"sobol": designs.sobol, "uniform": designs.uniform, "saltelli": designs.saltelli}
+DESIGNS = ("grid", "samples", *DRAWN)
 TABLES = ("wheel", "model", "options", "gait", "scan", "tune", "branch", *DESIGNS)
 _MODEL_KEYS = ("friction", "stop_at_lift_off")
 _OPTION_KEYS = tuple(Options.__dataclass_fields__)
@@ -321,7 +322,7 @@ def _branch(table: Mapping[str, object]) -> BranchConfig:
 
 
 def _design(kind: str, table: Mapping[str, object]) -> designs.AbstractDesign:
-    own = ("n", "seed") if kind in ("sobol", "uniform") else ()
+    own = ("n", "seed") if kind in DRAWN else ()
     _only(table, (*own, *PARAMETER_NAMES), f"[{kind}]", "settings")
     swept = {name: value for name, value in table.items() if name not in own}
     if not swept:
@@ -334,8 +335,7 @@ def _design(kind: str, table: Mapping[str, object]) -> designs.AbstractDesign:
             raise ConfigError(f"[{kind}] says not how many samples: write n = 4096, say.")
         n, seed = _whole(table["n"], "n", 1), _whole(table.get("seed", 0), "seed", 0)
         ranges = {name: _range(name, value) for name, value in swept.items()}
-        draw = designs.sobol if kind == "sobol" else designs.uniform
-        return draw(ranges, n, seed)
+        return DRAWN[kind](ranges, n, seed)
     if kind == "grid":
         return designs.grid(**{name: _axis(name, value) for name, value in swept.items()})
     return designs.samples({name: _list(name, value) for name, value in swept.items()})

@@ -14,6 +14,8 @@ from vrw_jax.wording import nearest
 Columns = dict[str, np.ndarray]
 """One value per sample of each parameter that is swept."""
 Range = tuple[float, float]
+SALTELLI = "saltelli"
+"""Kind of the samples that Sobol' indices are read off."""
 
 
 class AbstractDesign(abc.ABC):
@@ -152,6 +154,27 @@ def uniform(ranges: Mapping[str, Range], n: int, seed: int = 0) -> Samples:
     names, lower, upper = _box(ranges, n)
     points = np.random.default_rng(seed).random((n, len(names)))
     return _spread(names, lower, upper, points, "uniform")
+
+
+def saltelli(ranges: Mapping[str, Range], n: int, seed: int = 0) -> Samples:
+    """Samples for `variance.sobol_indices`: for d parameters, `n` rows of 2 + d, n a power of two.
+
+    A row holds two independent points of the box, A and B, and A with each coordinate in turn taken
+    from B. Samples are ordered A, B, then by parameter.
+    """
+    from scipy.stats import qmc  # only drawing needs it, and its import is slow
+
+    names, lower, upper = _box(ranges, n)
+    if n & (n - 1):
+        raise ValueError(
+            f"n is {n}, but the rows of a Sobol' sequence are balanced for powers of two: "
+            f"give n = {1 << n.bit_length()}, say."
+        )
+    d = len(names)
+    points = qmc.Sobol(2 * d, rng=np.random.default_rng(seed)).random_base2(n.bit_length() - 1)
+    a, b = points[:, :d], points[:, d:]
+    mixed = [np.where(np.arange(d) == i, b, a) for i in range(d)]
+    return _spread(names, lower, upper, np.concatenate([a, b, *mixed]), SALTELLI)
 
 
 def _spread(

@@ -12,10 +12,13 @@ from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from vrw_jax.designs import SALTELLI
 from vrw_jax.measures import MARGINS, MEASURES
 from vrw_jax.outcomes import Outcome
 from vrw_jax.params import PARAMETER_NAMES
 from vrw_jax.plots import COLUMN, PAGE, style
+from vrw_jax.scan_measures import OF_CYCLE
+from vrw_jax.variance import sobol_indices
 
 PREFERRED = ("damping", "slope", "stiffness", "natural_length", *PARAMETER_NAMES)
 """Which axes a picture takes first: across, then up, then side by side."""
@@ -64,7 +67,7 @@ OUTCOMES: dict[Outcome, tuple[str, str]] = {
 NOT_COMPUTED = ("not computed", "#FFFFFF")
 UNSTABLE = 100
 """Stands for a cycle whose spectral radius is 1 or more, beside the codes of `Outcome`."""
-MOST_COLUMNS = 4
+MOST_COLUMNS, MOST_PAIRED, MOST_DRAWN = 4, 6, 20_000
 MISSING = "#E9E9E9"
 
 
@@ -80,7 +83,14 @@ def scan_figures(scan: xr.Dataset) -> dict[str, Figure]:
     names = [name for name in PREFERRED if name in scan.coords]
     names = list(dict.fromkeys(names))
     if "sample" in scan.dims:
-        return {"scan": sample_figure(scan, names)}
+        swept = [name for name in names if np.ptp(scan[name].values) > 0.0] or names
+        if len(swept) < 3:
+            return {"scan": sample_figure(scan, swept)}
+        figures = {"scan_pairs": pairs_figure(scan, swept[:MOST_PAIRED])}
+        if scan.attrs.get("scan", {}).get("design", {}).get("kind") == SALTELLI:
+            measures = [n for n in OF_CYCLE if n in scan]
+            figures["sobol_indices"] = indices_figure(sobol_indices(scan, measures))
+        return figures
     long = [name for name in names if scan.sizes[name] > 1] or names
     if len(long) == 1:
         return {"scan": curve_figure(scan, long[0])}
@@ -164,6 +174,92 @@ def sample_figure(scan: xr.Dataset, names: Sequence[str]) -> Figure:
             axes.set_xlabel(_short_label(x))
         panels[0].set_ylabel("sample" if y == "sample" else _short_label(y))
         _legend(figure, codes, {}, 3)
+    return figure
+
+
+def pairs_figure(scan: xr.Dataset, names: Sequence[str]) -> Figure:
+    """Samples over each pair of parameters: DLS fraction below the diagonal, outcome above.
+
+    On the diagonal the share that walks on a stable cycle, along each parameter. Of large designs
+    the first MOST_DRAWN samples are drawn, which are as well spread as all.
+    """
+    shown = scan.isel(sample=slice(MOST_DRAWN))
+    value = next((name for name in ("dls_fraction", "speed") if name in scan), None)
+    codes, walks = _codes(shown).values, shown.outcome.values == Outcome.STEPPED
+    kinds, d = np.unique(codes), len(names)
+    size = float(np.clip(8000.0 / len(codes), 0.6, 8.0))
+    dot = {"s": size, "linewidths": 0.0, "rasterized": True}
+    with style():
+        figure = Figure(figsize=(PAGE, PAGE * 0.9))
+        panels = figure.subplots(d, d, sharex="col", squeeze=False)
+        points = None
+        for (i, j), axes in np.ndenumerate(panels):
+            x, y = shown[names[j]].values, shown[names[i]].values
+            if i == j:
+                _share_along(axes, x, codes == Outcome.STEPPED)
+            elif i < j:
+                axes.scatter(x, y, color=[_outcome_style(int(code))[1] for code in codes], **dot)
+            else:
+                axes.scatter(x[~walks], y[~walks], color=MISSING, **dot)
+                if value is not None:
+                    told = shown[value].values[walks]
+                    points = axes.scatter(x[walks], y[walks], c=told, **dot)
+            if i == d - 1:
+                axes.set_xlabel(_short_label(names[j]))
+            if j == 0 and i > 0:
+                axes.set_ylabel(_short_label(names[i]))
+            elif i != j:
+                axes.tick_params(labelleft=False)
+        panels[0, 0].set_ylabel("share that walks")
+        if value is not None and points is not None:
+            bar = figure.colorbar(points, ax=panels.ravel().tolist(), aspect=40, pad=0.01)
+            bar.set_label(_bar_label(value))
+        _legend(figure, kinds, {}, 3)
+    return figure
+
+
+def _share_along(axes: Axes, x: np.ndarray, walks: np.ndarray) -> None:
+    """The share of samples with a stable gait, along a parameter."""
+    edges = np.linspace(x.min(), x.max(), 13)
+    every, good = (np.histogram(some, edges)[0] for some in (x, x[walks]))
+    axes.stairs(good / np.maximum(every, 1), edges, fill=True, color=OUTCOMES[Outcome.STEPPED][1])
+    axes.set_ylim(0.0, 1.0)
+
+
+def indices_figure(indices: xr.Dataset) -> Figure:
+    """First-order and total Sobol' indices of each measure, with their intervals."""
+    measures, parameters = indices.measure.values, [str(p) for p in indices.parameter.values]
+    n_columns = min(len(measures), 3)
+    n_rows = -(-len(measures) // n_columns)
+    places = np.arange(len(parameters))
+    with style():
+        height = (0.26 * len(parameters) + 0.5) * n_rows + 0.6
+        figure = Figure(figsize=(PAGE, height))
+        panels = figure.subplots(n_rows, n_columns, sharex=True, sharey=True, squeeze=False)
+        for axes in panels.ravel()[len(measures) :]:
+            axes.set_axis_off()
+        for axes, name in zip(panels.ravel(), measures, strict=False):
+            told = indices.sel(measure=name)
+            for kind, label, shift, color in (
+                ("first_order", "by itself (first order)", -0.19, "#0072B2"),
+                ("total", "with all it meets (total)", 0.19, "#E69F00"),
+            ):
+                value = told[kind].values
+                low, high = told[f"{kind}_lower"].values, told[f"{kind}_upper"].values
+                away = np.maximum([value - low, high - value], 0.0)
+                bars = {"height": 0.36, "color": color, "label": label}
+                axes.barh(places + shift, value, xerr=away, error_kw={"elinewidth": 0.7}, **bars)
+            axes.set_title(MEASURES[str(name)].long_name)
+            axes.set_yticks(places, [f"${SYMBOLS[p]}$" for p in parameters])
+            axes.set_xlim(0.0, 1.05)
+        panels[0, 0].invert_yaxis()
+        for axes in panels[-1]:
+            axes.set_xlabel("share of the variance")
+        handles, labels = panels[0, 0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=2)
+        left_out = 100.0 * indices.attrs["left_out"]
+        note = f"{indices.attrs['rows']:,} rows; {left_out:.1f} % left out, without a gait"
+        figure.suptitle(note, fontsize=8.0)
     return figure
 
 
