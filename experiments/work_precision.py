@@ -1,0 +1,198 @@
+"""Work against precision for a hybrid system: every engine and its peers, every quantity, honestly.
+
+    python experiments/work_precision.py [--at-most N] [--only TEXT] [--redraw]
+
+256 wheels near their own limit cycles (see work_precision_truth.py) by each of METHODS of
+work_precision_methods.py. Error: largest over the parts of a quantity, against a truth of 20
+digits; p50, p99 and worst over lanes; lanes that fail are counted. Time: CPU time of one core per
+gait, median of repeats, scaled by a reference (numba's step) timed just before and after, because
+machines are shared. Results are kept method by method in a table: a run that was stopped goes on.
+Then charts and tables are drawn from it.
+"""
+
+import argparse
+import csv
+import time
+from pathlib import Path
+from typing import Any
+
+import engine_benchmark  # sets one core before JAX starts
+import jax
+import numpy as np
+import work_precision_charts as charts
+from rich.progress import track
+from work_precision_methods import (
+    BATCHES,
+    METHODS,
+    NUMBA,
+    VARIED,
+    Method,
+    Run,
+    by_peer,
+    landed,
+)
+from work_precision_truth import load
+
+TARGET = Path(__file__).parents[1] / "docs" / "figures"
+TABLE, BATCH_TABLE = TARGET / "work_precision.csv", TARGET / "work_precision_batch.csv"
+KEY = ("group", "family", "name", "precision", "setting", "lanes")
+SHARES = {"p50": 0.5, "p99": 0.99, "worst": 1.0}
+REFERENCE_TOLERANCE = 1e-8
+LEAST_SECONDS, MOST_REPEATS = 0.5, 5  # of repeats of one measurement
+
+
+def errors(group: str, told: np.ndarray, truth: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Error of each quantity by lane; NaN where the lane failed."""
+    n = len(told)
+    largest = lambda x: np.max(np.abs(x), 1)
+    if group == "step":
+        after = landed(engine_benchmark.wheels(truth["rows"][:n]), told[:, :3])
+        times = np.cumsum(told[:, 3:6] - truth["step"][:n, 3:], 1)
+        return {
+            "post_impact": largest(after - truth["post_impact"][:n]),
+            "event_times": largest(times),
+        }
+    exact = truth["cycle"][:n]
+    period = exact[:, 2:].sum(1)
+    if group == "cycle":
+        sorted_ = lambda matrices: -np.sort(-np.abs(np.linalg.eigvals(matrices)), 1)
+        good = np.isfinite(told[:, 0])
+        found = np.full((n, 2), np.nan)
+        found[good] = sorted_(told[good, 5:9].reshape(-1, 2, 2))
+        missed = told[:, 2:5].sum(1) - period
+        fraction = told[:, 2] / told[:, 2:5].sum(1) - exact[:, 2] / period
+        return {
+            "cycle": largest(np.column_stack([told[:, :2] - exact[:, :2], missed])),
+            "dls_fraction": np.abs(fraction),
+            "multipliers": largest(found - sorted_(truth["matrix"][:n])),
+        }
+    d_exact = truth["d_cycle"][:n, 2:]
+    d_period = d_exact.sum(1)
+    d_fraction = (d_exact[:, 0] - (exact[:, 2] / period)[:, None] * d_period) / period[:, None]
+    # A change of a parameter counts by its relative size.
+    scaled = lambda parts: parts * truth["rows"][:n]
+    miss, size = [], []
+    for part, right in ((told[:, :4], d_fraction), (told[:, 4:8], d_period)):
+        miss.append(np.linalg.norm(scaled(part - right), axis=1))
+        size.append(np.linalg.norm(scaled(right), axis=1))
+    return {"gradient": np.max(np.array(miss) / np.array(size), 0)}
+
+
+def seconds(run: Run) -> float:
+    """CPU time of one call: median of repeats."""
+    times: list[float] = []
+    while len(times) < MOST_REPEATS and (len(times) < 1 or sum(times) < LEAST_SECONDS):
+        begin = time.process_time()
+        run()
+        times.append(time.process_time() - begin)
+    return float(np.median(times))
+
+
+def measure(
+    method: Method,
+    setting: Any,
+    truth: dict[str, np.ndarray],
+    reference: Run,
+    compiling: float,
+) -> dict:
+    """One row of the table; `compiling` is what numba took before, s."""
+    n = method.lanes
+    rows, starts = (np.resize(truth[name], (n, truth[name].shape[1])) for name in ("rows", "start"))
+    before = seconds(reference)
+    begin = time.process_time()
+    run = method.make(setting, rows, starts)
+    told = run()
+    first = time.process_time() - begin
+    if method.family == NUMBA:
+        first += compiling
+    taken = seconds(run)
+    told = told[: len(truth["rows"])]
+    unit = 0.5 * (before + seconds(reference)) / len(truth["rows"]) * 1e6
+    found = errors(method.group, told, truth)
+    failed = ~np.isfinite(next(iter(found.values())))
+    with np.errstate(invalid="ignore"):
+        evaluations = np.nanmean(told[:, -1]) if not failed.all() else 0.0
+    row = named(method, setting) | {
+        "failed": int(failed.sum()),
+        "evaluations": f"{evaluations:.1f}",
+        "first_call_s": f"{first:.3g}",
+        "us_per_gait": f"{taken / n * 1e6:.4g}",
+        "reference_us": f"{unit:.4g}",
+    }
+    for name, values in found.items():
+        some = values[~failed] if not failed.all() else np.array([np.nan])
+        for label, share in SHARES.items():
+            row[f"{name}_{label}"] = f"{np.quantile(some, share):.3g}"
+    return row
+
+
+def kept(table: Path) -> list[dict[str, str]]:
+    """Rows measured so far."""
+    if not table.exists():
+        return []
+    with table.open() as file:
+        return list(csv.DictReader(file))
+
+
+def keep(table: Path, rows: list[dict]) -> None:
+    """Write all rows."""
+    fields = dict.fromkeys(name for row in rows for name in row)
+    with table.open("w", newline="") as file:
+        writer = csv.DictWriter(file, fields, restval="")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def named(method: Method, setting: Any) -> dict[str, Any]:
+    """The columns of KEY."""
+    return dict(zip(KEY, (*method[:4], str(setting), method.lanes), strict=True))
+
+
+def key(row: dict[str, Any]) -> tuple[str, ...]:
+    return tuple(str(row[name]) for name in KEY)
+
+
+def measure_all(chosen: argparse.Namespace) -> None:
+    """Fill both tables, method by method."""
+    truth = load()
+    reference = by_peer("numba")(REFERENCE_TOLERANCE, truth["rows"], truth["start"])
+    begin = time.process_time()
+    reference()
+    compiling = time.process_time() - begin
+    tables = {TABLE: kept(TABLE), BATCH_TABLE: kept(BATCH_TABLE)}
+    todo = []
+    for table, methods in ((TABLE, METHODS), (BATCH_TABLE, BATCHES)):
+        done = set(map(key, tables[table]))
+        for method in methods:
+            label = " ".join(map(str, (*method[:4], method.lanes)))
+            settings = [s for s in method.settings if key(named(method, s)) not in done]
+            if settings and chosen.only in label:
+                todo.append((table, method, settings))
+    last = None
+    for table, method, settings in track(todo[: chosen.at_most], "methods"):
+        if method[:4] != last:  # a first call compiles, whatever came before
+            jax.clear_caches()
+            last = method[:4]
+        for setting in settings:
+            row = measure(method, setting, truth, reference, compiling)
+            tables[table].append(row)
+            keep(table, tables[table])
+            print(*row.values(), flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--at-most", type=int, default=None, help="methods measured in this run")
+    parser.add_argument("--only", default="", help="methods whose label holds this text")
+    parser.add_argument("--redraw", action="store_true", help="measure nothing")
+    chosen = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    TARGET.mkdir(parents=True, exist_ok=True)
+    if not chosen.redraw:
+        measure_all(chosen)
+    charts.draw(kept(TABLE), kept(BATCH_TABLE), TARGET)
+
+
+assert set(VARIED) == set(engine_benchmark.BOX)
+if __name__ == "__main__":
+    main()
