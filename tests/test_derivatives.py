@@ -113,6 +113,7 @@ def test_the_saltation_formula_agrees(forward):
     np.testing.assert_allclose(product @ by_landing, forward[1], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_second_derivatives_agree_with_differences_of_first_ones():
     # The event location must not be frozen for these: a stopped gradient is wrong by far here.
     rate = lambda damping: vrw.return_map(vrw.WheelParams(damping=damping), START, options=TIGHT)[1]

@@ -174,6 +174,7 @@ def test_neighbours_cycle_is_a_quicker_start():
     np.testing.assert_allclose(second.section_state, cold.section_state, rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_a_cycle_walked_twice_has_the_multipliers_squared():
     once = vrw.limit_cycle(vrw.WheelParams())
     twice = vrw.limit_cycle(vrw.WheelParams(), guess=once, period_n=2)
