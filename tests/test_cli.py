@@ -11,8 +11,8 @@ import pytest
 from test_scan import Counted, arithmetic
 from typer.testing import CliRunner, Result
 
-from vrw_jax.cli import app
-from vrw_jax.scan import Plan
+from vrw_jax.cli import _reporter, app
+from vrw_jax.scan import Plan, Progress
 from vrw_jax.scan_store import open_scan
 
 SCAN = """
@@ -72,6 +72,7 @@ MISTAKES = {
     "out of its domain": (("gait", "--set", "damping=-3"), "must lie in"),
     "mass beyond the hub": (("gait", "--set", "leg_com=1.5"), "leg_com < locked_length"),
     "no folder": (("scan", "small.toml", "--out", "plain.toml"), "plain.toml"),
+    "no scheduler": (("scan", "small.toml", "--dask", "nowhere://"), "no dask scheduler answers"),
     "no scan there": (("scan", "small.toml", "--out", "occupied"), "no scan's store"),
 }
 
@@ -102,6 +103,21 @@ def test_explain_tells_the_size_and_computes_nothing(config: Path) -> None:
     ):
         assert word in told.stdout
     assert not (config.parent / "results").exists()
+
+
+def test_progress_tells_rate_failures_and_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first chunk's time is compiling too, and counts for nothing."""
+    clock = iter([0.0, 100.0, 110.0])
+    monkeypatch.setattr("time.monotonic", lambda: next(clock))
+    told: list[dict] = []
+    report = _reporter(lambda _, **shown: told.append(shown), 0)
+    for done, failed in ((0, 0), (1000, 100), (3000, 300)):
+        report(Progress(samples=100_000, done=done, failed=failed, kept=0))
+    assert [shown["description"] for shown in told] == ["compiling", "scanning", "scanning"]
+    assert told[1]["note"] == "10 % without a gait"
+    assert told[2]["note"] == "200 per s, 10 % without a gait, 8 min left"
+    assert told[2]["completed"] == 3000
+    assert told[2]["total"] == 100_000
 
 
 def test_a_scan_writes_data_and_pictures_where_it_says(config: Path) -> None:

@@ -400,24 +400,22 @@ def _tell_plan(planned: "Plan", store: Path) -> None:
 def _compute(planned: "Plan", store: Path, dask: str | None) -> None:
     from vrw_jax.scan import carried, run
 
-    with _bar("scan") as bar:
-        task = bar.add_task("compiling", total=None, note="")
-        report = _reporter(bar.update, task)
-        try:
-            with _sentences(), carried(dask) as through:
-                run(planned, store, report=report, through=through)
-        except KeyboardInterrupt:
-            bar.stop()
-            err.print(
-                f"vrw: stopped; what is done stays in {store}, run the same to go on.",
-                soft_wrap=True,
-            )
-            raise typer.Exit(INTERRUPTED) from None
+    try:
+        with _sentences(), carried(dask) as through, _bar("scan") as bar:
+            task = bar.add_task("compiling", total=None, note="")
+            run(planned, store, report=_reporter(bar.update, task), through=through)
+    except KeyboardInterrupt:
+        err.print(
+            f"vrw: stopped; what is done stays in {store}, run the same to go on.", soft_wrap=True
+        )
+        raise typer.Exit(INTERRUPTED) from None
 
 
 def _reporter(update: Callable, task: int) -> Callable[["Progress"], None]:
     """Shows rate, share without a gait and time left; the first chunk's time is compiling too."""
     import time
+
+    from vrw_jax.scan import in_words
 
     first: list[tuple[float, int]] = []
 
@@ -431,7 +429,7 @@ def _reporter(update: Callable, task: int) -> Callable[["Progress"], None]:
             if now > began:
                 rate = (done - before) / (now - began)
                 left = (progress.samples - done) / rate
-                note = f"{rate:,.0f} per s, {note}, {left:,.0f} s left"
+                note = f"{rate:,.0f} per s, {note}, {in_words(left)} left"
         update(
             task,
             total=progress.samples,
