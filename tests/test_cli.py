@@ -112,12 +112,12 @@ def test_progress_tells_rate_failures_and_time_left(monkeypatch: pytest.MonkeyPa
     told: list[dict] = []
     report = _reporter(lambda _, **shown: told.append(shown), 0)
     for done, failed in ((0, 0), (1000, 100), (3000, 300)):
-        report(Progress(samples=100_000, done=done, failed=failed, kept=0))
+        report(Progress(samples=6_000, done=done, failed=failed, kept=0))
     assert [shown["description"] for shown in told] == ["compiling", "scanning", "scanning"]
     assert told[1]["note"] == "10 % without a gait"
-    assert told[2]["note"] == "200 per s, 10 % without a gait, 8 min left"
+    assert told[2]["note"] == "200 per s, 10 % without a gait, 15 s left"
     assert told[2]["completed"] == 3000
-    assert told[2]["total"] == 100_000
+    assert told[2]["total"] == 6_000
 
 
 def test_a_scan_writes_data_and_pictures_where_it_says(config: Path) -> None:
