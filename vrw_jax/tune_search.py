@@ -11,7 +11,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize, nnls
 
 from vrw_jax.outcomes import Outcome
 from vrw_jax.tune_engine import Gait
@@ -140,6 +139,8 @@ class _Record:
 
 def climb(evaluate: Evaluate, start: Trial, *, tolerance: float, max_evaluations: int) -> Climb:
     """From `start` to a local maximum of the objective with every slack at least zero."""
+    from scipy.optimize import minimize  # only climbing needs it, and its import is slow
+
     record = _Record(evaluate, start, max_evaluations)
     size = max(float(np.linalg.norm(start.gradient)), 1e-12)
     scales = slack_scales(start)
@@ -235,6 +236,8 @@ class Optimality(NamedTuple):
 
 def optimality(trial: Trial) -> Optimality:
     """The first-order (Karush-Kuhn-Tucker) condition at a gait, by non-negative least squares."""
+    from scipy.optimize import nnls  # as above
+
     n = trial.u.size
     scales = slack_scales(trial)
     active = np.flatnonzero(np.abs(trial.slack) <= 10.0 * ACTIVE * scales)
