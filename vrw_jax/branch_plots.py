@@ -218,7 +218,7 @@ def orbit_figure(orbits: xr.Dataset, border: float | None = None) -> Figure:
             rates.text(0.5 * (left + right), 0.5, "falls", rotation=90, ha="center", va="center",
                        transform=rates.get_xaxis_transform(), color=GREY)  # fmt: skip
         if border is not None:
-            rates.text(border, 0.03, " $\\lambda_4^+ = 0$", color=ENDS,
+            rates.text(border, 0.4, " $\\lambda_4^+ = 0$", color=ENDS,
                        transform=rates.get_xaxis_transform())  # fmt: skip
         rates.set_ylabel("rate after landing, $\\dot\\theta^+$ [rad/s]")
         rates.legend(loc="lower left", fontsize=7.5)
