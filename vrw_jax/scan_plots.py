@@ -37,6 +37,13 @@ SYMBOLS = {
     "speed": "v",
 }
 
+INDICATORS = {
+    "lambda_I4": r"indicator $\lambda_{I4}$",
+    "lambda_2_plus": r"indicator $\lambda_2^+$",
+    "lambda_4_plus": r"indicator $\lambda_4^+$",
+}
+"""Titles whose letters the type of figures lacks."""
+
 Dash = Literal["-", "--", "-.", ":"]
 
 BORDERS: dict[str, tuple[str, str, Dash]] = {
@@ -249,12 +256,13 @@ def indices_figure(indices: xr.Dataset) -> Figure:
                 away = np.maximum([value - low, high - value], 0.0)
                 bars = {"height": 0.36, "color": color, "label": label}
                 axes.barh(places + shift, value, xerr=away, error_kw={"elinewidth": 0.7}, **bars)
-            axes.set_title(MEASURES[str(name)].long_name)
+            axes.set_title(INDICATORS.get(str(name), MEASURES[str(name)].long_name))
             axes.set_yticks(places, [f"${SYMBOLS[p]}$" for p in parameters])
             axes.set_xlim(0.0, 1.05)
         panels[0, 0].invert_yaxis()
-        for axes in panels[-1]:
+        for axes in panels.ravel()[max(len(measures) - n_columns, 0) : len(measures)]:
             axes.set_xlabel("share of the variance")
+            axes.tick_params(labelbottom=True)
         handles, labels = panels[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=2)
         left_out = 100.0 * indices.attrs["left_out"]
