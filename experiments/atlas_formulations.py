@@ -28,7 +28,7 @@ EXACT = np.array([float(v) for v in TRUTH["step"]["section_state"]])
 PERIOD = sum(float(v) for v in TRUTH["step"]["durations"])
 
 DRIFT_STEP = 5e-3  # s: the fast mode's rate times it is 1
-DRIFT_AT = (100, 300, 1000, 3000, 10_000, 20_000)  # steps
+DRIFT_AT = (100, 300, 1000, 3000, 10_000)  # steps
 BAUMGARTE = 50.0  # 1/s: both roots of the constraint's error
 
 
@@ -140,7 +140,7 @@ def drift() -> Iterator[dict[str, object]]:
                             "stabilised": stabilised,
                             "steps": count,
                             "gap_m": f"{height:.2e}",
-                            "dtheta_error": f"{abs(v[2]):.6g}",
+                            "dtheta": f"{v[2]:.6g}",
                             "us_per_step": f"{(time.process_time() - begin) / count * 1e6:.3g}",
                         }
                     if lost:

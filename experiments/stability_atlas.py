@@ -9,6 +9,7 @@ is kept, so that a run that was stopped goes on. docs/stability_atlas.md reads t
 import argparse
 import csv
 import functools
+import json
 import os
 import sys
 import time
@@ -36,6 +37,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from oracle import multiprecision
 from oracle.hub_form import HubForm
 
+ORACLE = Path(__file__).parents[1] / "tests" / "oracle"
 TARGET = Path(__file__).parents[1] / "docs" / "figures"
 Rows = Iterator[dict[str, object]]
 START = np.array([0.1, 1.6, -0.1])  # near the gait of Table 1
@@ -44,6 +46,11 @@ START = np.array([0.1, 1.6, -0.1])  # near the gait of Table 1
 
 STIFFNESS = np.logspace(2.0, 6.0, 9)  # c/m or k/m, 1/s or 1/s^2
 TOLERANCE = 1e-6
+LIBRARY = (
+    ("lanes", "Tsit5"),
+    ("lanes", "Dopri8"),
+    ("diffrax", "Kvaerno3"),
+)
 IMPLICIT_TOO = ("DOP853", "LSODA", "Radau")
 
 
@@ -66,50 +73,45 @@ def real_axis_limit(solver: str) -> float:
 
 
 def stiffness() -> Rows:
-    """Cost, error and outcome of one step by ten methods over c/m and k/m."""
-    library = [("lanes", "Tsit5", 64), ("lanes", "Dopri8", 64)]
-    library += [("diffrax", "Kvaerno3", 16), ("diffrax", "Kvaerno5", 16)]
-    for axis in ("c/m", "k/m"):
-        truths = {}
-        for value in STIFFNESS:
-            changes = stiff_wheel(axis, value)
-            params = vrw.WheelParams(**{name: np.full(1, x) for name, x in changes.items()})
-            landing = transitions.land(params.symbols(), *START)
-            y = np.stack([landing.theta + 0.0 * landing.motion.dtheta, landing.motion.dtheta], 1)
-            packed = peers.pack(params)
-            truths[value] = peers.Heyoka(1e-15)(y, packed)[0, :6]
-            loose = functools.partial(peers.scipy_steps, y, packed, TOLERANCE)
-            runs = {
-                "numba Dopri5": functools.partial(peers.numba_steps, y, packed, TOLERANCE),
-                "heyoka": functools.partial(peers.Heyoka(TOLERANCE), y, packed),
-                **{f"SciPy {name}": functools.partial(loose, name) for name in IMPLICIT_TOO},
-            }
-            for name, run in runs.items():
-                run()
-                begin = time.process_time()
-                told = run()[0]
-                taken = time.process_time() - begin
-                error = float(np.max(np.abs(told[:6] - truths[value])))
-                yield row_of(axis, value, name, taken, told[6], error, "STEPPED", told[4])
-        for engine, solver, lanes in library:
-            options = vrw.Options(solver=solver, rtol=TOLERANCE, atol=TOLERANCE)
-            for value in STIFFNESS:
-                params = vrw.WheelParams(**stiff_wheel(axis, value))
-                states = np.tile(START, (lanes, 1))
-                # Both engines fill up their blocks with equal lanes: that is what is timed.
-                width = 2048 if engine == "lanes" else 256
-                vrw.steps(params, states, options=options, engine=engine)
-                begin = time.process_time()
-                found = vrw.steps(params, states, options=options, engine=engine)
-                taken = (time.process_time() - begin) / width
-                told = np.concatenate([found.section_state[0], found.durations[0]])
-                error = float(np.max(np.abs(told - truths[value])))
-                outcome = vrw.Outcome(int(found.outcome[0])).name
-                count = int(found.solver_steps[0])
-                yield row_of(
-                    axis, value, f"{engine} {solver}", taken, count, error, outcome, told[4]
-                )
-            jax.clear_caches()
+    """Cost, error and outcome of one step by eight methods over c/m and k/m."""
+    places = [(axis, value) for axis in ("c/m", "k/m") for value in STIFFNESS]
+    truths = {}
+    for axis, value in places:
+        wheel = stiff_wheel(axis, value)
+        params = vrw.WheelParams(**{name: np.full(1, x) for name, x in wheel.items()})
+        landing = transitions.land(params.symbols(), *START)
+        y = np.stack([landing.theta + 0.0 * landing.motion.dtheta, landing.motion.dtheta], 1)
+        packed = peers.pack(params)
+        truths[axis, value] = peers.Heyoka(1e-15)(y, packed)[0, :6]
+        loose = functools.partial(peers.scipy_steps, y, packed, TOLERANCE)
+        runs = {
+            "numba Dopri5": functools.partial(peers.numba_steps, y, packed, TOLERANCE),
+            "heyoka": functools.partial(peers.Heyoka(TOLERANCE), y, packed),
+            **{f"SciPy {name}": functools.partial(loose, name) for name in IMPLICIT_TOO},
+        }
+        for name, run in runs.items():
+            run()
+            begin = time.process_time()
+            told = run()[0]
+            taken = time.process_time() - begin
+            error = float(np.max(np.abs(told[:6] - truths[axis, value])))
+            yield row_of(axis, value, name, taken, told[6], error, "STEPPED", told[4])
+    for engine, solver in LIBRARY:
+        options = vrw.Options(solver=solver, rtol=TOLERANCE, atol=TOLERANCE)
+        for axis, value in places:
+            params = vrw.WheelParams(**stiff_wheel(axis, value))
+            # Both engines fill up their blocks with equal lanes: that is what is timed.
+            width = 2048 if engine == "lanes" else 256
+            step = functools.partial(vrw.steps, params, START[None], options=options, engine=engine)
+            step()
+            begin = time.process_time()
+            found = step()
+            taken = (time.process_time() - begin) / width
+            told = np.concatenate([found.section_state[0], found.durations[0]])
+            error = float(np.max(np.abs(told - truths[axis, value])))
+            outcome = vrw.Outcome(int(found.outcome[0])).name
+            count, name = int(found.solver_steps[0]), f"{engine} {solver}"
+            yield row_of(axis, value, name, taken, count, error, outcome, told[4])
 
 
 def row_of(axis, value, method, taken, work, error, outcome, sls1) -> dict[str, object]:
@@ -130,24 +132,25 @@ def row_of(axis, value, method, taken, work, error, outcome, sls1) -> dict[str, 
 DISTANCES = np.logspace(-1.0, -9.0, 9)
 
 
-def parameters(damping: float) -> list:
-    wheel = vrw.WheelParams(damping=damping)
-    names = multiprecision.NAMES
-    return [mp.mpf(float(getattr(wheel, name))) for name in names] + [mp.mpf(8)]
+BORDERS = {  # wheel, and the start's rate on the other side, rad/s
+    "double support vanishes": ({"damping": 100.0, "slope": 0.30}, 3.2),
+    "λ4⁺ → 0": ({"damping": 150.0, "slope": 0.30}, 2.3),
+    "the wheel stops": ({"damping": 100.0, "slope": 0.10}, 0.05),
+}
 
 
-def outcome_of(damping: float, start: np.ndarray) -> vrw.Outcome:
-    found = vrw.steps(vrw.WheelParams(damping=damping), start[None], engine="diffrax")
-    return vrw.Outcome(int(found.outcome[0]))
+def start_with(rate: float) -> np.ndarray:
+    return np.array([START[0], rate, START[2]])
 
 
-def border(damping: float, start: np.ndarray, beyond: float) -> float:
-    """The start's rate at which the step's outcome changes, by bisection between two rates."""
-    good, bad = start[1], beyond
+def border(made: tuple, wheel: dict[str, float], beyond: float) -> float:
+    """The last rate from START's towards `beyond` with all three phases, by bisection."""
+    params = vrw.WheelParams(**{name: np.full(1, value) for name, value in wheel.items()})
+    good, bad = START[1], beyond
     for _ in range(60):
         middle = 0.5 * (good + bad)
-        moved = np.array([start[0], middle, start[2]])
-        if outcome_of(damping, moved) == vrw.Outcome.STEPPED:
+        (code,), (durations,) = events.isolated(made, params, start_with(middle)[None])
+        if code == vrw.Outcome.STEPPED and np.all(durations > 0.0):
             good = middle
         else:
             bad = middle
@@ -155,79 +158,74 @@ def border(damping: float, start: np.ndarray, beyond: float) -> float:
 
 
 def borders() -> Rows:
-    """Error of first derivatives by a start's rate over its distance to two borders."""
+    """Error of first derivatives by a start's rate over its distance to borders."""
     multiprecision.BITS, multiprecision.DIGITS, mp.mp.prec = 120, 35, 120
-    hub = HubForm()
-    derive = jax.jit(jax.jacfwd(lambda x, p: vrw.return_map(p, x)))
-    for name, damping, beyond in (("falls back", 200.0, 0.8), ("stopper too late", 200.0, 2.4)):
-        edge = border(damping, START, beyond)
-        params = vrw.WheelParams(damping=damping)
+    hub, made = HubForm(), events.phases()
+
+    def twice(x: jax.Array, params: vrw.WheelParams) -> tuple:
+        image = vrw.return_map(params, x)
+        return image, image
+
+    derive = jax.jit(jax.jacfwd(twice, has_aux=True))
+    for name, (wheel, beyond) in BORDERS.items():
+        edge = border(made, wheel, beyond)
+        params = vrw.WheelParams(**wheel)
+        batch = vrw.WheelParams(**{key: np.full(1, value) for key, value in wheel.items()})
+        p = [mp.mpf(float(getattr(params, n))) for n in multiprecision.NAMES] + [mp.mpf(8)]
         for distance in DISTANCES:
-            rate = edge * (1.0 + distance * np.sign(START[1] - edge))
-            start = np.array([START[0], rate, START[2]])
-            step = vrw.steps(params, start[None], options=vrw.Options.tight(), engine="diffrax")
-            if int(step.outcome[0]) != vrw.Outcome.STEPPED:
-                continue
-            about = np.asarray(step.durations[0])
-            ends = []
-            size = mp.mpf(distance) * mp.mpf("1e-8")
+            start = start_with(edge * (1.0 + distance * np.sign(START[1] - edge)))
+            _, (about,) = events.isolated(made, batch, start[None])
+            size, ends = mp.mpf(distance) * mp.mpf("1e-8"), []
             for sign in (1, -1):
                 x = [mp.mpf(float(v)) for v in start]
                 x[1] += sign * size
-                p = parameters(damping)
-                landed = hub.walk(hub.land(x, p)[0], p, about)
-                ends.append(landed.section_state)
+                ends.append(hub.walk(hub.land(x, p)[0], p, about).section_state)
             truth = np.array([float((a - b) / (2 * size)) for a, b in zip(*ends, strict=True)])
-            found = np.asarray(derive(jnp.asarray(start), params))[:, 1]
-            values = np.asarray(vrw.steps(params, start[None], engine="diffrax").section_state[0])
-            exact = np.array([float(0.5 * (a + b)) for a, b in zip(*ends, strict=True)])
+            exact = np.array([float((a + b) / 2) for a, b in zip(*ends, strict=True)])
+            jacobian, value = derive(jnp.asarray(start), params)
+            miss = np.max(np.abs(np.asarray(jacobian)[:, 1] - truth))
             yield {
                 "border": name,
-                "edge": f"{edge:.15g}",
-                "distance": f"{distance:.1e}",
-                "derivative": f"{np.max(np.abs(truth)):.6g}",
-                "derivative_error": f"{np.max(np.abs(found - truth)) / np.max(np.abs(truth)):.2e}",
-                "value_error": f"{np.max(np.abs(values - exact)):.2e}",
-                "durations": " ".join(f"{d:.3g}" for d in about),
+                "edge": f"{edge:.6g}",
+                "distance": f"{distance:.0e}",
+                "derivative": f"{np.max(np.abs(truth)):.4g}",
+                "derivative_error": f"{miss / max(np.max(np.abs(truth)), 1.0):.1e}",
+                "value_error": f"{np.max(np.abs(np.asarray(value) - exact)):.1e}",
+                "durations": " ".join(f"{d:.2g}" for d in about),
             }
 
 
 # --- Long walks.
 
 WALK, BLOCK = 100_000, 1000
+WALKED = (1000, 2000, 5000, 10_000, 20_000, 50_000, 100_000)
 
 
 def long_walk() -> Rows:
-    """Distance from the cycle and energy not accounted for, over many steps of Table 1's wheel."""
-    params = vrw.WheelParams()
-    cycle = vrw.limit_cycle(params, options=vrw.CycleOptions.tight())
-    x = cycle.section_state
-    s, model, options = params.symbols(), vrw.ViscoelasticWheel(), vrw.Options()
+    """Distance from the cycle over many steps of Table 1's wheel, one wheel, default options."""
+    params, model, options = vrw.WheelParams(), vrw.ViscoelasticWheel(), vrw.Options()
+    truth = json.loads((ORACLE / "truth.json").read_text())["cases"][0]["cycle"]
+    first = np.array([float(value) for value in truth["section_state"]])
+    period = float(truth["period"])
 
     def one(x: jax.Array, _: None) -> tuple:
-        found = model.step(params, x, options)
-        energy = found.energy
-        lost = energy.landing + energy.stopper + energy.damping
-        # Between two touchdowns kinetic and elastic energy change, and the slope gives its part.
-        return found.section_state, (found.outcome, lost, found.step_length)
+        found = model.advance(params, x, options)
+        return found.section_state, (found.outcome, jnp.sum(found.durations))
 
     block = jax.jit(lambda x: jax.lax.scan(one, x, None, length=BLOCK))
-    first, lost, gained, spread, failed = np.asarray(x), 0.0, 0.0, 0.0, 0
-    weight = float(s.Mt * s.g * s.sin_phi)
+    x, failed, largest, clock = jnp.asarray(first), 0, 0.0, 0.0
     for count in range(BLOCK, WALK + 1, BLOCK):
-        x, (outcome, losses, lengths) = block(x)
-        failed += int(np.sum(np.asarray(outcome) != 0))
-        lost += float(np.sum(losses))
-        gained += weight * float(np.sum(lengths))
-        spread = max(spread, float(np.max(np.abs(np.asarray(x) - first))))
-        if np.log10(count) % 1.0 == 0.0 or count % 20_000 == 0:
+        x, (outcome, periods) = block(x)
+        failed += int(np.sum(np.asarray(outcome) != vrw.Outcome.STEPPED))
+        distance = float(np.max(np.abs(np.asarray(x) - first)))
+        largest, clock = max(largest, distance), clock + float(np.sum(periods))
+        if count in WALKED:
             yield {
                 "steps": count,
                 "failed": failed,
-                "distance": f"{float(np.max(np.abs(np.asarray(x) - first))):.2e}",
-                "largest_distance": f"{spread:.2e}",
-                "energy_gained_J": f"{gained:.10g}",
-                "energy_missing": f"{abs(lost - gained) / gained:.2e}",
+                "distance": f"{distance:.2e}",
+                "largest_distance": f"{largest:.2e}",
+                "clock_error_s": f"{abs(clock - count * period):.2e}",
             }
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from vrw_jax.plots import PAGE, save, style
 
@@ -121,6 +122,7 @@ def draw_panel(axes: Axes, rows: list[Row], quantity: str, x_of) -> None:
             if named in DEFAULTS and row["precision"] == "float64":
                 axes.plot(a, b, "o", ms=9, mfc="none", mec="#444444", mew=0.8)
     axes.set(xscale="log", yscale="log")
+    axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_title(QUANTITIES[quantity][1])
     axes.grid(color="0.9", lw=0.4)
 
@@ -212,7 +214,8 @@ def table(rows: list[Row]) -> str:
             for some in (ours, rows):
                 row = best(some, group, alone, target)
                 if row is None:
-                    cells += ["none", "–"]
+                    tried = best(some, group, alone, math.inf) is not None
+                    cells += ["none" if tried else "not measured", "–"]
                 else:
                     cells += [f"{label_of(row)}, {row['setting']}", told_time(time_of(row, unit))]
             lines.append(f"| {' | '.join(cells)} |")
