@@ -2,8 +2,7 @@
 
 `held_landing` has the plane section (theta+, dtheta+) just after an impact that ends with both feet
 on the ground; its double support may be left out (then the rear foot lifts at once, case B3).
-`freed_landing` has the section (theta-, dtheta-, dL1-) before an impact that throws the rear foot
-off (case A3); it begins with single support I.
+An impact that throws the rear foot off (case A3) leaves that plane: such gaits are not found here.
 """
 
 import functools
@@ -163,8 +162,8 @@ def _phases(n_legs: int) -> tuple[Phase, Phase]:
     )
 
 
-def _last_phase(n_legs: int, to_section: bool) -> Phase:
-    """SLS-II; its reset leads to the plane section after the impact, or to the one before it."""
+def _last_phase(n_legs: int) -> Phase:
+    """SLS-II; its reset leads to the plane section after the impact."""
     symbols = functools.partial(_symbols, n_legs)
 
     def residual(constants: Constants, point: Point, acceleration: Vector) -> Vector:
@@ -179,8 +178,6 @@ def _last_phase(n_legs: int, to_section: bool) -> Phase:
     def reset(constants: Constants, point: Point) -> Point:
         s = symbols(constants)
         (theta, _), (dtheta, dL1) = point.q, point.v
-        if to_section:
-            return Point((), (theta, dtheta, dL1), ())
         landing = transitions.land(s, theta, dtheta, dL1)
         return Point((), (landing.theta, landing.motion.dtheta), ())
 
@@ -216,28 +213,5 @@ def held_landing(n_legs: int) -> PhaseSequence:
         landing = transitions.land(s, theta, dtheta, dL1)
         return jnp.where(happens[0], rear, -rear), landing.rear.normal, sls1.end.v[2]
 
-    phases = (*_phases(n_legs), _last_phase(n_legs, to_section=False))
+    phases = (*_phases(n_legs), _last_phase(n_legs))
     return PhaseSequence(2, start, phases, border_checks)
-
-
-@functools.cache
-def freed_landing(n_legs: int) -> PhaseSequence:
-    """SLS-I, SLS-II on the section (theta-, dtheta-, dL1-) before an impact that frees Leg 2."""
-
-    def start(constants: Constants, section: Vector) -> Point:
-        landing = transitions.land(_symbols(n_legs, constants), *section)
-        m = landing.motion
-        return Point((), (landing.theta, m.L1, m.L2), (m.dtheta, m.dL1, m.dL2))
-
-    def border_checks(
-        constants: Constants, passages: tuple[Passage, ...], happens: Array
-    ) -> Vector:
-        s = _symbols(n_legs, constants)
-        sls1, sls2 = passages
-        (theta, _), (dtheta, dL1) = sls2.end.q, sls2.end.v
-        landing = transitions.land(s, theta, dtheta, dL1)
-        return -landing.rear.normal, sls1.end.v[2]
-
-    _, single_support_1 = _phases(n_legs)
-    phases = (single_support_1, _last_phase(n_legs, to_section=True))
-    return PhaseSequence(3, start, phases, border_checks)
