@@ -50,7 +50,7 @@ def stiffness(rows: list[Row], limit: Callable[[str], float]) -> Figure:
                 y = np.nan_to_num(numbers(failed, name), nan=1.0)
                 axes.plot(numbers(failed, "value"), y, "x", color="#D00000", ms=6, zorder=5)
         grid[2, column].set_xlabel(AXES[axis])
-    stiff = [row for row in rows if row["axis"] == "c/m" and row["method"] == "lanes Tsit5"]
+    stiff = [row for row in rows if row["axis"] == "c/m" and row["method"] == "numba Dopri5"]
     value, time = numbers(stiff, "value"), numbers(stiff, "duration_sls1")
     for solver, line in (("Tsit5", "--"), ("Dopri8", ":")):
         steps = time * FAST * value / limit(solver)
@@ -136,7 +136,9 @@ def automatic(rows: list[Row]) -> str:
                     r for r in some if not ours or r["method"].split()[0] in ("lanes", "diffrax")
                 ]
                 best = min(fit, key=lambda r: float(r["us_per_gait"]), default=None)
-                cells += ["none", "–"] if best is None else [best["method"], best["us_per_gait"]]
+                cells += (
+                    ["not measured", "–"] if best is None else [best["method"], best["us_per_gait"]]
+                )
             lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 

@@ -45,6 +45,7 @@ START = np.array([0.1, 1.6, -0.1])  # near the gait of Table 1
 # --- Stiffness: a leg's mass goes to nothing, total mass and everything else stay.
 
 STIFFNESS = np.logspace(2.0, 6.0, 9)  # c/m or k/m, 1/s or 1/s^2
+HEAVIEST = 300.0  # k/m below which eight legs outweigh the wheel
 TOLERANCE = 1e-6
 LIBRARY = (
     ("lanes", "Tsit5"),
@@ -74,7 +75,8 @@ def real_axis_limit(solver: str) -> float:
 
 def stiffness() -> Rows:
     """Cost, error and outcome of one step by eight methods over c/m and k/m."""
-    places = [(axis, value) for axis in ("c/m", "k/m") for value in STIFFNESS]
+    places = [("c/m", value) for value in STIFFNESS]
+    places += [("k/m", value) for value in STIFFNESS if value > HEAVIEST]
     truths = {}
     for axis, value in places:
         wheel = stiff_wheel(axis, value)
@@ -197,8 +199,8 @@ def borders() -> Rows:
 
 # --- Long walks.
 
-WALK, BLOCK = 100_000, 1000
-WALKED = (1000, 2000, 5000, 10_000, 20_000, 50_000, 100_000)
+WALK, BLOCK = 50_000, 1000
+WALKED = (1000, 2000, 5000, 10_000, 20_000, 50_000)
 
 
 def long_walk() -> Rows:
