@@ -438,6 +438,7 @@ def test_batches_run_side_by_side_and_change_nothing(
         np.testing.assert_array_equal(together[name][LANES:], np.roll(value, -12, 0), name)
 
 
+@pytest.mark.slow
 def test_a_cluster_that_loses_a_worker_gives_bitwise_the_serial_scan(
     engine: Engine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
