@@ -2,6 +2,7 @@
 
 import errno
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -472,6 +473,14 @@ def test_a_cluster_that_loses_a_worker_gives_bitwise_the_serial_scan(
     assert told[-1].done == GRID.size
     assert np.all(result.outcome.values != -1)
     assert files(shared) == files(alone)
+
+
+def test_a_worker_names_its_traces_as_the_process_that_asked() -> None:
+    """Otherwise each would trace and compile what the cache holds."""
+    of = planned()
+    here = (of.measures, of.base, of.model, of.options, of.cycle_options)
+    there = pickle.loads(pickle.dumps(here))
+    assert repr(Engine(*here)._settings) == repr(Engine(*there)._settings)
 
 
 def backwards(planned: Plan, missing: Sequence[int]) -> Iterator[Chunk]:

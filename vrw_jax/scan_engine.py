@@ -115,7 +115,9 @@ class Engine:
 
         self._cycle: Callable = jax.vmap(told_by_cycle)
         self._step: Callable = jax.vmap(told_by_step, in_axes=(0, 0, None))
-        self._settings = (measures, base.n_legs, model, cycle_options)
+        # A model's own repr leaves out what is its default by identity, which pickling loses.
+        told = (type(model).__name__, *vars(model).items())
+        self._settings = (measures, base.n_legs, told, cycle_options)
         self._free: SimpleQueue[_Programs] = SimpleQueue()
         self._workers, self._compiling = 0, Lock()
 
