@@ -8,12 +8,15 @@ from vrw_jax.cycle_options import CycleOptions
 from vrw_jax.designs import grid, saltelli, samples, sobol, uniform
 from vrw_jax.lane_batch import Steps, steps
 from vrw_jax.limit_cycle import LimitCycle, limit_cycle
-from vrw_jax.model_choice import ModelChoice, choose_model
+from vrw_jax.model_choice import choose_model
 from vrw_jax.models import (
     AbstractWheel,
     EnergyLoss,
     Indicators,
+    LadderStep,
+    LadderWheel,
     Margins,
+    ModelChoice,
     RigidWheel,
     StepResult,
     UnilateralStep,
@@ -41,6 +44,8 @@ __all__ = [
     "CycleOptions",
     "EnergyLoss",
     "Indicators",
+    "LadderStep",
+    "LadderWheel",
     "LimitCycle",
     "Margins",
     "ModelChoice",

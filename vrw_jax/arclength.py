@@ -69,6 +69,10 @@ class AbstractFollowed(eqx.Module):
     def section(self, z: Unknown) -> Section:
         """The section's numbers, a part of z."""
 
+    def between(self, left: Unknown, right: Unknown, place: Scalar) -> Unknown:
+        """Where Newton's method starts for a point at `place` in [0, 1] between two others."""
+        return jax.tree.map(lambda a, b: a + place * (b - a), left, right)
+
     @abc.abstractmethod
     def size(self, z: Unknown, correction: Unknown) -> Scalar:
         """Size of a correction, to be compared with the tolerance."""

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.multipliers import jury_margins, multipliers
+from vrw_jax.multipliers import bifurcation_margins, multipliers
 
 BIFURCATIONS = ("fold", "period_doubling", "neimark_sacker")
 """Each vanishes where a multiplier is 1, where one is -1, where a pair of modulus 1 is."""
@@ -21,7 +21,7 @@ ON_CIRCLE = 1e-4
 
 def bifurcation_functions(jacobians: np.ndarray) -> np.ndarray:
     """`BIFURCATIONS` on the last axis, from Jacobians (..., n, n); NaN where n has none such."""
-    margins = np.asarray(jury_margins(jnp.asarray(jacobians)))
+    margins = np.asarray(bifurcation_margins(jnp.asarray(jacobians)))
     values = np.full((*margins.shape[:-1], len(BIFURCATIONS)), np.nan)
     n = min(margins.shape[-1], len(BIFURCATIONS))
     values[..., :n] = margins[..., :n]

@@ -109,7 +109,7 @@ def _solve_on(
     """Points of the branch between neighbours, at `places` in [0, 1] of the chord."""
 
     def one(wheel: Any, left: Point, right: Point, place: Array) -> tuple[Point, Array]:
-        z = jax.tree.map(lambda a, b: a + place * (b - a), left.z, right.z)
+        z = followed.between(left.z, right.z, place)
         scale = bounds[1] - bounds[0]
         row_x = followed.section(right.z) - followed.section(left.z)
         row_share = (right.p - left.p) / scale

@@ -28,18 +28,20 @@ from vrw_jax.followed_wheel import (
     RungFollowed,
     Wheel,
     gait_measures,
+    moved,
     on_mesh,
     with_parameter,
 )
 from vrw_jax.limit_cycle import LimitCycle, limit_cycle
-from vrw_jax.measures import CYCLE, MARGINS, STEP, attrs_of
-from vrw_jax.models import AbstractWheel, ViscoelasticWheel
+from vrw_jax.measures import CYCLE, GROUND, MARGINS, STEP, attrs_of
+from vrw_jax.models import AbstractWheel, LadderWheel, UnilateralWheel, ViscoelasticWheel
 from vrw_jax.multipliers import multipliers
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
-from vrw_jax.params import PARAMETER_NAMES, WheelParams, as_float_array
-from vrw_jax.return_map import walk
+from vrw_jax.params import FRICTION, PARAMETER_NAMES, WheelParams, as_float_array
+from vrw_jax.return_map import Walk, walk
 from vrw_jax.simulate import provenance
+from vrw_jax.walked_cycle import WalkedCycle
 
 CLOSED = 1e-7
 """Most by which the event-driven step may miss a cycle's section state: rad, rad/s, m/s."""
@@ -66,8 +68,8 @@ def _read_gaits(
 ) -> dict[str, Array]:
     def one(wheel: Wheel, z: Any, p: Array) -> dict[str, Array]:
         x, beyond = followed.read(wheel, z, p)
-        params = with_parameter(wheel.params, followed.name, p)
-        measures = gait_measures(model, params, x, options, followed.n_steps)
+        rung, params = moved(model, wheel.params, followed.name, p)
+        measures = gait_measures(rung, params, x, options, followed.n_steps)
         return measures | beyond | {"section_state": x}
 
     return jax.vmap(one)(wheels, points.z, points.p)
@@ -88,7 +90,7 @@ def continue_branch(
     name: str,
     bounds: tuple[float, float],
     *,
-    cycle: LimitCycle | None = None,
+    cycle: LimitCycle | WalkedCycle | None = None,
     period_n: int = 1,
     model: AbstractWheel | None = None,
     options: ArclengthOptions | None = None,
@@ -103,6 +105,10 @@ def continue_branch(
     between points (options.largest_step) does not hide it: two changes of sign within one step
     cancel. Gaits are those of the cycle options, `CycleOptions.tight()` by default, and checked by
     one event-driven step each, from which indicators and monitors come.
+
+    Other rungs' gaits are fixed points of their own return map, as exact as `step_options`. On real
+    ground `name` may be "friction" too, and the start is a `WalkedCycle` or, without one, where a
+    walk of N_WALKED steps ends; a branch goes on where the order of events changes, with a kink.
     """
     if params.damping.ndim != 0:
         raise ValueError(
@@ -123,7 +129,7 @@ def continue_branches(
     name: str,
     bounds: tuple[float, float],
     *,
-    cycle: LimitCycle | None = None,
+    cycle: LimitCycle | WalkedCycle | None = None,
     period_n: int = 1,
     model: AbstractWheel | None = None,
     options: ArclengthOptions | None = None,
@@ -134,20 +140,24 @@ def continue_branches(
 
     A wheel without a limit cycle to start from gets a branch without points, whose outcome says so.
     """
-    if name not in PARAMETER_NAMES:
-        raise ValueError(f"{name!r} is no parameter: choose from {', '.join(PARAMETER_NAMES)}.")
+    model = ViscoelasticWheel() if model is None else model
+    on_ground = isinstance(model, UnilateralWheel | LadderWheel)
+    names = (*PARAMETER_NAMES, FRICTION) if on_ground else PARAMETER_NAMES
+    if name not in names:
+        raise ValueError(f"{name!r} is no parameter: choose from {', '.join(names)}.")
     low, high = (float(b) for b in bounds)
     if not low < high:
         raise ValueError(f"bounds are ({low:g}, {high:g}), but the lower must come first.")
-    model = ViscoelasticWheel() if model is None else model
     options = ArclengthOptions() if options is None else options
     step_options = Options.tight() if step_options is None else step_options
     batch = np.broadcast_shapes(*(x.shape for x in jax.tree.leaves(params)))
     if len(batch) != 1:
         raise ValueError(f"the wheels' batch has shape {batch}, but it must have one axis.")
     params = jax.tree.map(lambda x: jnp.broadcast_to(x, batch), params)
-    p = jnp.clip(getattr(params, name), low, high)
-    params = with_parameter(params, name, p)
+    given = jnp.broadcast_to(getattr(model if name == FRICTION else params, name), batch)
+    p = jnp.clip(given, low, high)
+    if name != FRICTION:
+        params = with_parameter(params, name, p)
 
     make_cycle: MakeCycle
     if isinstance(model, ViscoelasticWheel):
@@ -156,6 +166,11 @@ def continue_branches(
         start = cycle
         if start is None:
             start = jax.vmap(functools.partial(limit_cycle, period_n=period_n))(params)
+        if not isinstance(start, LimitCycle):
+            raise TypeError(
+                f"cycle is a {type(start).__name__}, but the paper's branch starts from a "
+                "LimitCycle: give vrw.limit_cycle(params)."
+            )
         outcomes = np.asarray(start.outcome)
         problem = Problem(params.n_legs, period_n, cycle_options)
         followed: AbstractFollowedWheel = CycleFollowed(problem=problem, name=name)
@@ -173,11 +188,18 @@ def continue_branches(
 
             return find
     else:
-        followed = RungFollowed(model=model, options=step_options, name=name, period_n=period_n)
-        advance = functools.partial(walk, n_steps=N_WALKED, model=model, options=step_options)
-        walked = jax.vmap(advance)(params, jax.vmap(model.start)(params))
-        outcomes = np.asarray(walked.outcome)
-        z = walked.steps.section_state[:, -1]
+        followed = RungFollowed(
+            model=model,
+            options=step_options,
+            name=name,
+            period_n=period_n,
+            numbers=model.section_numbers(params),
+        )
+        if cycle is None:
+            walked = jax.vmap(functools.partial(_walked, model, step_options, name))(params, p)
+            outcomes, z = np.asarray(walked.outcome), walked.steps.section_state[:, -1]
+        else:
+            outcomes, z = np.asarray(cycle.outcome), cycle.section_state
         wheels = Wheel(params, jnp.ones((*batch, 1, 1), p.dtype))
         make_cycle = lambda owner, point: None
 
@@ -209,11 +231,19 @@ def continue_branches(
     )
 
 
+def _walked(
+    model: AbstractWheel, options: Options, name: str, params: WheelParams, p: Array
+) -> Walk:
+    """Towards a gait from the rung's own start."""
+    model, params = moved(model, params, name, p)
+    return walk(params, model.start(params), N_WALKED, model=model, options=options)
+
+
 def _by_leg(read: Read, legs: range, wheels: Any, points: Point) -> Table:
     """The table of `read` with one more column for each leg of a margin that has several."""
     table = read(wheels, points)
     for name, margin in MARGINS.items():
-        if margin.axis:
+        if margin.axis and name in table:
             table |= {f"{name}[{leg}]": table[name][:, i] for i, leg in enumerate(legs)}
     return table
 
@@ -227,7 +257,7 @@ def _branch_of_gaits(
     outcome: int,
 ) -> Branch:
     origin = provenance(params, model, options)
-    origin.pop(f"parameter_{name}")
+    origin.pop(f"parameter_{name}", None)
     attrs = {"title": f"Branch of limit cycles along {name}"} | origin
     if strand is None:
         code = Outcome(outcome)
@@ -239,8 +269,8 @@ def _branch_of_gaits(
         key: xr.Variable(
             ("point", "leg") if measure.axis else "point", strand.table[key], attrs_of(key)
         )
-        for key, measure in (STEP | MARGINS).items()
-        if key not in skipped
+        for key, measure in (STEP | MARGINS | GROUND).items()
+        if key in strand.table and key not in skipped
     }
     data["section_state"] = xr.Variable(
         ("point", "component"),
@@ -254,11 +284,19 @@ def _branch_of_gaits(
     )
     labels = {
         name: xr.Variable("point", strand.points.p, attrs_of(name)),
-        "component": ["theta", "dtheta", "dL1"],
+        "component": _components(strand.table["section_state"].shape[-1], params.n_legs),
         "leg": xr.Variable("leg", np.arange(3, params.n_legs + 1), {"long_name": "locked leg"}),
     }
     dataset = xr.Dataset(data | _stability(np.asarray(strand.points.jacobian)), labels, attrs)
     return Branch(name, dataset, strand.borders, strand.ends, Outcome.STEPPED)
+
+
+def _components(size: int, n: int) -> list[str]:
+    """Names of a section state's numbers: the paper's, or `unilateral_section.FullState`."""
+    if size == 3:
+        return ["theta", "dtheta", "dL1"]
+    legs = [f"{name}{leg}" for name in ("L", "dL", "code") for leg in range(1, n + 1)]
+    return ["theta", "dtheta", "vx", "vz", *legs]
 
 
 def _stability(jacobians: np.ndarray) -> dict[str, xr.Variable]:
@@ -290,8 +328,8 @@ def continue_map(
 ) -> Branch:
     """The branch of fixed points of any map x -> `function(constants, x, p)` through (x, p).
 
-    The map must be differentiable forwards, and NaN where it is not defined; up to three numbers.
-    Its bifurcations are located as for `continue_branch`.
+    The map must be differentiable forwards, and NaN where it is not defined. Its
+    bifurcations are located as for `continue_branch`.
     """
     low, high = (float(b) for b in bounds)
     if not low <= p <= high:

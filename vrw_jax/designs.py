@@ -8,11 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vrw_jax.params import DOMAINS, PARAMETER_NAMES
+from vrw_jax.params import FRICTION, PARAMETER_NAMES
 from vrw_jax.wording import nearest
 
 Columns = dict[str, np.ndarray]
 """One value per sample of each parameter that is swept."""
+SWEPT = (*PARAMETER_NAMES, FRICTION)
+"""What may be swept: the wheel's parameters, and the friction of a ground that has one."""
 Range = tuple[float, float]
 SALTELLI = "saltelli"
 """Kind of the samples that Sobol' indices are read off."""
@@ -202,13 +204,13 @@ def _known(values: Mapping[str, object]) -> Mapping:
     if not values:
         raise ValueError(
             "the design sweeps no parameter, but a scan needs at least one: "
-            f"choose from {', '.join(PARAMETER_NAMES)}."
+            f"choose from {', '.join(SWEPT)}."
         )
     for name in values:
-        if name not in DOMAINS:
+        if name not in SWEPT:
             raise ValueError(
-                f"{name!r} is no parameter that can be swept{nearest(name, PARAMETER_NAMES)}: "
-                f"choose from {', '.join(PARAMETER_NAMES)}."
+                f"{name!r} is no parameter that can be swept{nearest(name, SWEPT)}: "
+                f"choose from {', '.join(SWEPT)}."
             )
     return values
 

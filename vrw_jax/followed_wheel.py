@@ -28,12 +28,12 @@ from vrw_jax.cycle_search import (
 from vrw_jax.geometry import Motion, rear_foot_height
 from vrw_jax.lanes import one_wheel
 from vrw_jax.limit_cycle import LimitCycle
-from vrw_jax.measures import MARGINS, step_measures
+from vrw_jax.measures import MARGINS, measures_of
 from vrw_jax.models import AbstractWheel
 from vrw_jax.models.base import SectionState
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
-from vrw_jax.params import PARAMETER_NAMES, Elementwise, Scalar, WheelParams
+from vrw_jax.params import FRICTION, PARAMETER_NAMES, Elementwise, Scalar, WheelParams
 
 
 class Wheel(NamedTuple):
@@ -161,36 +161,50 @@ def _takeoff_acceleration(s: Any, sls1: Passage) -> Scalar:
 
 
 class RungFollowed(AbstractFollowedWheel):
-    """Fixed points of `period_n` steps of any rung; z is the section state."""
+    """Fixed points of `period_n` steps of any rung; z is the section state.
+
+    Codes at its end (`AbstractWheel.section_numbers`) are carried along: they are those of the
+    image of the last iteration, and Newton's method ends only where they agree.
+    """
 
     model: AbstractWheel
     options: Options
     name: str = eqx.field(static=True)
     period_n: int = eqx.field(static=True)
+    numbers: int = eqx.field(static=True)
 
     @property
     def n_steps(self) -> int:
         return self.period_n
 
     def _image(self, wheel: Wheel, z: Array, p: Scalar) -> Array:
-        params = with_parameter(wheel.params, self.name, p)
+        model, params = moved(self.model, wheel.params, self.name, p)
         for _ in range(self.period_n):
-            moved = self.model.advance(params, z, self.options)
-            z = jnp.where(moved.outcome == Outcome.STEPPED, moved.section_state, jnp.nan)
+            advance = model.advance(params, z, self.options)
+            z = jnp.where(advance.outcome == Outcome.STEPPED, advance.section_state, jnp.nan)
         return z
 
     def linearise(self, wheel: Wheel, z: Unknown, p: Scalar) -> Linear:
-        def both(z: Array, p: Array) -> tuple[Array, Array]:
-            image = self._image(wheel, z, p)
-            return image, image
+        n = self.numbers
 
-        (by_x, by_p), image = jax.jacfwd(both, argnums=(0, 1), has_aux=True)(z, p)
-        right = jnp.stack([image - z, by_p], -1)
-        solved = jnp.linalg.solve(jnp.eye(z.shape[0], dtype=z.dtype) - by_x, right)
-        return Linear(solved[:, 0], solved[:, 1], by_x)
+        def both(x: Array, p: Array) -> tuple[Array, Array]:
+            image = self._image(wheel, jnp.concatenate([x, z[n:]]), p)
+            return image[:n], image
+
+        (by_x, by_p), image = jax.jacfwd(both, argnums=(0, 1), has_aux=True)(z[:n], p)
+        right = jnp.stack([image[:n] - z[:n], by_p], -1)
+        solved = jnp.linalg.solve(jnp.eye(n, dtype=z.dtype) - by_x, right)
+        codes = image[n:] - z[n:]
+        correction = jnp.concatenate([solved[:, 0], codes])
+        return Linear(correction, jnp.concatenate([solved[:, 1], jnp.zeros_like(codes)]), by_x)
 
     def section(self, z: Unknown) -> Section:
-        return z
+        return z[: self.numbers]
+
+    def between(self, left: Unknown, right: Unknown, place: Scalar) -> Unknown:
+        """Codes are those of the nearer point."""
+        codes = jnp.where(place < 0.5, left, right)[self.numbers :]
+        return jnp.concatenate([(left + place * (right - left))[: self.numbers], codes])
 
     def size(self, z: Unknown, correction: Unknown) -> Scalar:
         return jnp.max(jnp.abs(correction))
@@ -208,6 +222,15 @@ def with_parameter(params: WheelParams, name: str, value: Elementwise) -> WheelP
     return eqx.tree_at(lambda wheel: getattr(wheel, name), params, value)
 
 
+def moved(
+    model: AbstractWheel, params: WheelParams, name: str, value: Elementwise
+) -> tuple[AbstractWheel, WheelParams]:
+    """Model and wheel with another value of one parameter of either; works on tracers."""
+    if name == FRICTION:
+        return eqx.tree_at(lambda ground: ground.friction, model, value), params
+    return model, with_parameter(params, name, value)
+
+
 def gait_measures(
     model: AbstractWheel, params: WheelParams, x: SectionState, options: Options, period_n: int
 ) -> dict[str, Array]:
@@ -220,7 +243,7 @@ def gait_measures(
 
     def one(x: SectionState, _: None) -> tuple[SectionState, dict[str, Array]]:
         result = model.step(params, x, options)
-        return result.section_state, step_measures(result)
+        return result.section_state, measures_of(result)
 
     end, steps = lax.scan(one, x, None, length=period_n)
     told = {}

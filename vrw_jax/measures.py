@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 from jaxtyping import Array
 
-from vrw_jax.models.base import StepResult
+from vrw_jax.models import LadderStep, StepResult, UnilateralStep
+from vrw_jax.models.ladder import PREMISES, UNILATERAL, VISCOELASTIC
 from vrw_jax.outcomes import Outcome
 from vrw_jax.params import DOMAINS
 
@@ -121,6 +122,54 @@ MARGINS = _table(
 )
 """Premises of the rung as signed margins over one step, negative where broken: `Margins`."""
 
+GROUND = _table(
+    Measure("duration_single", "s", "t₁", "time on one foot", "Time with one loaded foot."),
+    Measure("duration_flight", "s", "t₀", "time of flight", "Time with no loaded foot."),
+    Measure("slip", "m", "s", "slip per step", "Path of all sliding feet."),
+    Measure("energy_lost_impacts", "J", "ΔE_I", "energy lost in impacts",
+            "Mechanical energy lost in landings and at stoppers."),
+    Measure("energy_lost_friction", "J", "ΔE_μ", "energy lost by sliding",
+            "Mechanical energy lost by sliding feet between impacts."),
+    Measure("friction", "1", "μ", "friction coefficient", "Of the ground."),
+)
+"""Measures of a step on real ground, beside those of `STEP` that it shares (`SHARED`)."""
+
+SHARED = (
+    "dls_fraction",
+    "period",
+    "speed",
+    "step_length",
+    "duration_dls",
+    "theta_post_impact",
+    "dtheta_post_impact",
+    "theta_touchdown",
+    "dtheta_touchdown",
+    "energy_lost_damping",
+    "outcome",
+    "solver_steps",
+)
+"""Measures of `STEP` that every rung tells."""
+
+ON_GROUND = tuple(
+    name for name in (*SHARED, *GROUND) if name not in ("outcome", "solver_steps", "friction")
+)
+"""Measures of a step on real ground that have derivatives."""
+
+SERVED: dict[str, dict[str, object]] = {
+    "rung": {
+        "long_name": "rung that served",
+        "flag_values": [VISCOELASTIC, UNILATERAL],
+        "flag_meanings": "ViscoelasticWheel UnilateralWheel",
+    },
+    "reason": {
+        "long_name": "why that rung served",
+        "units": "1",
+        "description": "0: all premises of the paper's wheel hold; above: the first that breaks, "
+        f"of {', '.join(PREMISES)}; below: minus that wheel's outcome.",
+    },
+}
+"""Attributes of what the ladder tells beside them."""
+
 CYCLE = _table(
     Measure("spectral_radius", "1", "ρ", "spectral radius",
             "Largest magnitude of a multiplier of the limit cycle; the gait is stable below 1."),
@@ -176,7 +225,7 @@ PARAMETERS = _table(
 )
 """The wheel's parameters, for the axes of a scan."""
 
-MEASURES: dict[str, Measure] = STEP | MARGINS | CYCLE | TRAJECTORY | PARAMETERS
+MEASURES: dict[str, Measure] = STEP | MARGINS | GROUND | CYCLE | TRAJECTORY | PARAMETERS
 """Every quantity by name."""
 
 PHASES: tuple[str, ...] = ("DLS", "SLS-I", "SLS-II")
@@ -225,3 +274,31 @@ def step_measures(result: StepResult) -> dict[str, Array]:
         "solver_steps": result.solver_steps,
     }
     return values | {name: getattr(monitors, name) for name in MARGINS}
+
+
+def ground_measures(result: UnilateralStep | LadderStep) -> dict[str, Array]:
+    """The measures `SHARED` and of `GROUND` of a step, by name; batch axes lead."""
+    return {
+        "dls_fraction": result.dls_fraction,
+        "period": result.period,
+        "speed": result.speed,
+        "step_length": result.step_length,
+        "duration_dls": result.durations[..., 0],
+        "theta_post_impact": result.post_impact[..., 0],
+        "dtheta_post_impact": result.post_impact[..., 1],
+        "theta_touchdown": result.section_state[..., 0],
+        "dtheta_touchdown": result.section_state[..., 1],
+        "energy_lost_damping": result.energy_damping,
+        "outcome": result.outcome,
+        "solver_steps": result.solver_steps,
+        "duration_single": result.durations[..., 1],
+        "duration_flight": result.durations[..., 2],
+        "slip": result.slip,
+        "energy_lost_impacts": result.energy_impacts,
+        "energy_lost_friction": result.energy_friction,
+    }
+
+
+def measures_of(result: StepResult | UnilateralStep | LadderStep) -> dict[str, Array]:
+    """Every measure that a step of any rung tells."""
+    return step_measures(result) if isinstance(result, StepResult) else ground_measures(result)

@@ -1,14 +1,20 @@
 """Floquet multipliers of small real maps in closed form: they differentiate, batch, run anywhere.
 
-Matrices are the derivative of a return map, shape (..., n, n) with n = 1, 2 or 3. Eigenvalues are
-not differentiable where two of them meet; the Jury margins, polynomials of the matrix, are.
+Matrices are the derivative of a return map, shape (..., n, n) with n = 1, 2 or 3; multipliers,
+spectral radius and what vanishes at a bifurcation are told of larger ones too, by LAPACK, on a CPU.
+Eigenvalues are not differentiable where two of them meet; the Jury margins, polynomials of the
+matrix, are.
 """
 
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Complex, Float
 
 Matrix = Float[Array, "... n n"]
+
+LARGEST_CLOSED = 3
+"""Size of the largest matrix whose characteristic polynomial is solved in closed form."""
 
 SHARPNESS = 50.0
 """Of the smooth minimum in `stability_margin`, which lies at most log(4)/SHARPNESS below."""
@@ -90,18 +96,25 @@ def _parts(matrix: Matrix) -> tuple[list[Array], Array | None, Array | None, Arr
 
 def multipliers(matrix: Matrix) -> Complex[Array, "... n"]:
     """All eigenvalues, the one of largest modulus first."""
+    if matrix.shape[-1] > LARGEST_CLOSED:
+        return _by_modulus(jnp.linalg.eigvals(matrix))
     alone, mean, split, turn = _parts(matrix)
     values = [lax.complex(x, jnp.zeros_like(x)) for x in alone]
     if mean is not None and split is not None and turn is not None:
         values += [lax.complex(mean + sign * split, sign * turn) for sign in (1.0, -1.0)]
-    stacked = jnp.stack(values, -1)
-    modulus = jnp.square(stacked.real) + jnp.square(stacked.imag)
+    return _by_modulus(jnp.stack(values, -1))
+
+
+def _by_modulus(values: Array) -> Array:
+    modulus = jnp.square(values.real) + jnp.square(values.imag)
     order = jnp.argsort(-lax.stop_gradient(modulus), axis=-1)
-    return jnp.take_along_axis(stacked, order, -1)
+    return jnp.take_along_axis(values, order, -1)
 
 
 def spectral_radius(matrix: Matrix) -> Float[Array, "..."]:
     """Largest modulus of an eigenvalue; where two meet its derivative is one-sided or zero."""
+    if matrix.shape[-1] > LARGEST_CLOSED:
+        return jnp.abs(multipliers(matrix)[..., 0])
     alone, mean, split, turn = _parts(matrix)
     moduli = [jnp.abs(x) for x in alone]
     if mean is not None and split is not None and turn is not None:
@@ -129,6 +142,21 @@ def jury_margins(matrix: Matrix) -> Float[Array, "... n_margins"]:
     a0, a1, a2 = coefficients
     pair = 1.0 - a0 * a0 - a1 + a0 * a2
     return jnp.stack([1.0 + a2 + a1 + a0, 1.0 - a2 + a1 - a0, pair, 1.0 - a0 * a0], -1)
+
+
+def bifurcation_margins(matrix: Matrix) -> Float[Array, "... n_margins"]:
+    """The first three Jury margins (two for n = 1), of a matrix of any size.
+
+    Beyond closed forms: det(1 - matrix), det(1 + matrix), and the product of 1 - z_i z_j over all
+    pairs of eigenvalues.
+    """
+    n = matrix.shape[-1]
+    if n <= LARGEST_CLOSED:
+        return jury_margins(matrix)[..., :3]
+    one, values = jnp.eye(n, dtype=matrix.dtype), multipliers(matrix)
+    first, second = np.triu_indices(n, 1)
+    pairs = jnp.prod(1.0 - values[..., first] * values[..., second], axis=-1).real
+    return jnp.stack([jnp.linalg.det(one - matrix), jnp.linalg.det(one + matrix), pairs], -1)
 
 
 def stability_margin(matrix: Matrix) -> Float[Array, "..."]:

@@ -169,3 +169,5 @@ class WheelParams(eqx.Module):
 
 
 PARAMETER_NAMES: tuple[str, ...] = tuple(DOMAINS)
+FRICTION = "friction"
+"""What a design or a branch may move beside them: a parameter of the ground, held by its model."""

@@ -4,8 +4,9 @@ Everything here is pure and single-wheel, and works under `jit`, `vmap` and ever
 differentiation. A model compiles its own step once.
 """
 
+import dataclasses
 from collections.abc import Sequence
-from typing import overload
+from typing import Literal, overload
 
 import equinox as eqx
 import jax
@@ -16,6 +17,8 @@ from jaxtyping import Array, Int
 
 from vrw_jax.models import (
     AbstractWheel,
+    LadderStep,
+    LadderWheel,
     StepResult,
     UnilateralStep,
     UnilateralWheel,
@@ -28,6 +31,8 @@ from vrw_jax.params import WheelParams, as_float_array
 
 SectionLike = Array | np.ndarray | Sequence[float]
 """A section state as given by a caller; `checked` makes it an array of shape (3,)."""
+ModelLike = AbstractWheel | Literal["auto"]
+"""A rung as given by a caller; "auto" is `LadderWheel()`, the lowest rung that serves."""
 
 
 def paper_start() -> SectionState:
@@ -36,7 +41,7 @@ def paper_start() -> SectionState:
 
 
 def checked(
-    params: WheelParams, x: object, model: AbstractWheel | None, options: Options | None
+    params: WheelParams, x: object, model: ModelLike | None, options: Options | None
 ) -> tuple[WheelParams, Array, AbstractWheel, Options]:
     """Arguments with their defaults; one clear sentence for what can be seen to be wrong."""
     if not isinstance(params, WheelParams):
@@ -46,10 +51,12 @@ def checked(
         )
     if model is None:
         model = ViscoelasticWheel()
+    if isinstance(model, str) and model == "auto":
+        model = LadderWheel()
     if not isinstance(model, AbstractWheel):
         raise TypeError(
-            f"model is {model!r}, but a rung of the ladder is needed: "
-            "give vrw.ViscoelasticWheel(), vrw.RigidWheel() or vrw.UnilateralWheel()."
+            f"model is {model!r}, but a rung of the ladder is needed: give "
+            'vrw.ViscoelasticWheel(), vrw.RigidWheel(), vrw.UnilateralWheel() or "auto".'
         )
     options = Options() if options is None else options
     state = as_float_array(x)
@@ -80,6 +87,16 @@ def step(  # type: ignore[overload-overlap]
 
 
 @overload
+def step(  # type: ignore[overload-overlap]
+    params: WheelParams,
+    x: SectionLike,
+    *,
+    model: LadderWheel | Literal["auto"],
+    options: Options | None = None,
+) -> LadderStep: ...
+
+
+@overload
 def step(
     params: WheelParams,
     x: SectionLike,
@@ -93,9 +110,9 @@ def step(
     params: WheelParams,
     x: SectionLike,
     *,
-    model: AbstractWheel | None = None,
+    model: ModelLike | None = None,
     options: Options | None = None,
-) -> StepResult | UnilateralStep:
+) -> StepResult | UnilateralStep | LadderStep:
     """One step from touchdown to touchdown, with indicators, monitors and energies.
 
     `x` is (theta-, dtheta-, dL1-) just before touchdown, in rad, rad/s, m/s. How the step ended is
@@ -110,7 +127,7 @@ def return_map(
     params: WheelParams,
     x: SectionLike,
     *,
-    model: AbstractWheel | None = None,
+    model: ModelLike | None = None,
     options: Options | None = None,
 ) -> Array:
     """The section state one step later; all zeros (no section state) where the step failed.
@@ -146,11 +163,11 @@ def _walk(
         walking = outcome == Outcome.STEPPED
         advance = model.advance(params, jnp.where(walking, x, jnp.nan), options)
         outcome = jnp.where(walking, advance.outcome, outcome)
-        advance = Advance(
-            advance.section_state,
-            jnp.where(walking, advance.durations, 0.0),
-            outcome,
-            jnp.where(walking, advance.solver_steps, 0),
+        advance = dataclasses.replace(
+            advance,
+            durations=jnp.where(walking, advance.durations, 0.0),
+            outcome=outcome,
+            solver_steps=jnp.where(walking, advance.solver_steps, 0),
         )
         return (advance.section_state, outcome), advance
 
@@ -165,7 +182,7 @@ def walk(
     x: SectionLike,
     n_steps: int,
     *,
-    model: AbstractWheel | None = None,
+    model: ModelLike | None = None,
     options: Options | None = None,
 ) -> Walk:
     """`n_steps` steps, or as many as it can; the steps after a failure repeat its outcome."""

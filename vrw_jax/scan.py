@@ -18,12 +18,14 @@ import xarray as xr
 from vrw_jax.cycle_options import CycleOptions
 from vrw_jax.designs import AbstractDesign, Columns
 from vrw_jax.measures import MARGINS, attrs_of
-from vrw_jax.models import ViscoelasticWheel
+from vrw_jax.models import AbstractWheel, LadderWheel, UnilateralWheel, ViscoelasticWheel
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
-from vrw_jax.params import PARAMETER_NAMES, WheelParams
+from vrw_jax.params import FRICTION, PARAMETER_NAMES, WheelParams
+from vrw_jax.return_map import ModelLike
 from vrw_jax.scan_engine import LANES, Engine, n_cores
-from vrw_jax.scan_measures import ALWAYS, DEFAULT_MEASURES, check_measures, variable_attrs
+from vrw_jax.scan_ground import GroundEngine, LadderEngine, engine_for
+from vrw_jax.scan_measures import check_measures, offer_of, variable_attrs
 from vrw_jax.scan_store import (
     MANIFEST,
     PROVENANCE,
@@ -69,7 +71,7 @@ class Plan:
     design: AbstractDesign
     measures: tuple[str, ...]
     base: WheelParams
-    model: ViscoelasticWheel
+    model: AbstractWheel
     options: Options
     cycle_options: CycleOptions
     layout: Layout
@@ -107,17 +109,17 @@ class Plan:
             "config": self.text,
         }
 
-    def engine(self) -> Engine:
+    def engine(self) -> Engine | GroundEngine | LadderEngine:
         """The function that computes samples."""
-        return Engine(self.measures, self.base, self.model, self.options, self.cycle_options)
+        return engine_for(self.measures, self.base, self.model, self.options, self.cycle_options)
 
 
 def plan(
     design: AbstractDesign,
-    measures: Iterable[str] = DEFAULT_MEASURES,
+    measures: Iterable[str] | None = None,
     *,
     base: WheelParams | None = None,
-    model: ViscoelasticWheel | None = None,
+    model: ModelLike | None = None,
     options: Options | None = None,
     cycle_options: CycleOptions | None = None,
     chunk: int | None = None,
@@ -139,25 +141,38 @@ def plan(
     options.require_reachable(np.dtype(base.damping.dtype))
     if chunk is not None and chunk < 1:
         raise ValueError(f"chunk is {chunk}, but it must be at least 1 sample.")
-    names = check_measures(measures)
+    model = ViscoelasticWheel() if model is None else model
+    model = LadderWheel() if isinstance(model, str) and model == "auto" else model
+    if not isinstance(model, ViscoelasticWheel | UnilateralWheel | LadderWheel):
+        raise TypeError(
+            f"model is {model!r}, but a scan is of gaits with compliant legs: give "
+            'vrw.ViscoelasticWheel(), vrw.UnilateralWheel() or "auto".'
+        )
+    if FRICTION in design.names and isinstance(model, ViscoelasticWheel):
+        raise ValueError(
+            "the design sweeps friction, which the paper's wheel does not feel: give "
+            'model=vrw.UnilateralWheel() or "auto".'
+        )
+    offer = offer_of(model)
+    names = check_measures(offer.default if measures is None else measures, offer)
     return Plan(
         design=design,
         measures=names,
         base=base,
-        model=ViscoelasticWheel() if model is None else model,
+        model=model,
         options=options,
         cycle_options=CycleOptions() if cycle_options is None else cycle_options,
-        layout=_layout(design, names, base, CHUNK if chunk is None else chunk),
+        layout=_layout(design, (*names, *offer.always), base, CHUNK if chunk is None else chunk),
         text=text,
     )
 
 
 def scan(
     design: AbstractDesign,
-    measures: Iterable[str] = DEFAULT_MEASURES,
+    measures: Iterable[str] | None = None,
     *,
     base: WheelParams | None = None,
-    model: ViscoelasticWheel | None = None,
+    model: ModelLike | None = None,
     options: Options | None = None,
     cycle_options: CycleOptions | None = None,
     store: str | Path | None = None,
@@ -171,8 +186,10 @@ def scan(
     'd dls_fraction / d damping'. With `store` the result is kept there chunk by chunk: a scan that
     was interrupted goes on where it stopped and ends with bitwise the same data, a finished one is
     only opened. `report` is told the progress after each chunk. What a sample gives does not depend
-    on the others, nor on `chunk`. `dask` is the address of a cluster that computes in this
-    process' stead, "local" for one started here.
+    on the others, nor on `chunk`. `model` may be the wheel on real ground, whose samples walk
+    towards their gait, or "auto", each sample on the lowest rung that serves, with `rung` and
+    `reason`; both take `friction` as a swept parameter. `dask` is the address of a cluster that
+    computes in this process' stead, "local" for one started here.
     """
     planned = plan(
         design,
@@ -324,14 +341,14 @@ def _disk_full_explained(
 
 
 def _layout(
-    design: AbstractDesign, measures: tuple[str, ...], base: WheelParams, chunk: int
+    design: AbstractDesign, names: tuple[str, ...], base: WheelParams, chunk: int
 ) -> Layout:
     dtype = str(base.damping.dtype)
     legs = np.arange(3, base.n_legs + 1)
 
     def variable(name: str) -> Variable:
         attrs = variable_attrs(name)
-        if name == "outcome":
+        if name in ("outcome", "rung", "reason"):
             return Variable(name, "int8", -1, attrs)
         if name == "solver_steps":
             return Variable(name, "int32", -1, attrs)
@@ -340,7 +357,7 @@ def _layout(
         return Variable(name, dtype, np.nan, attrs)
 
     coordinates = {
-        name: (dim, values, attrs_of(name) if name in PARAMETER_NAMES else {})
+        name: (dim, values, attrs_of(name) if name in (*PARAMETER_NAMES, FRICTION) else {})
         for name, (dim, values) in design.coordinates().items()
     }
     coordinates["leg"] = ("leg", legs, {"long_name": "locked leg", "units": "1"})
@@ -348,7 +365,7 @@ def _layout(
         dims=design.dims,
         shape=design.shape,
         chunk=chunk_shape(design.shape, chunk),
-        variables=tuple(variable(name) for name in (*measures, *ALWAYS)),
+        variables=tuple(variable(name) for name in names),
         coordinates=coordinates,
     )
 
@@ -381,7 +398,7 @@ def explained(planned: Plan, store: str | Path | None = None) -> dict[str, str]:
     return {
         "samples": f"{size:,} ({axes})",
         "measures": ", ".join(planned.measures),
-        "always included": ", ".join(ALWAYS),
+        "always included": ", ".join(offer_of(planned.model).always),
         "chunks": f"{layout.n_chunks:,} of up to {chunk:,} samples, {len(missing):,} to compute",
         "result": f"{_bytes(size * layout.bytes_per_sample)} before compression",
         "memory": f"about {_bytes(MEMORY + chunk * 2 * layout.bytes_per_sample)}, "

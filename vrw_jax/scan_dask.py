@@ -17,6 +17,7 @@ import numpy as np
 from vrw_jax.designs import Columns
 from vrw_jax.scan import Chunk, Plan, Through, difference, origin
 from vrw_jax.scan_engine import Engine, n_cores
+from vrw_jax.scan_ground import GroundEngine, LadderEngine, engine_for
 from vrw_jax.start import start_jax
 
 if TYPE_CHECKING:
@@ -105,9 +106,9 @@ def _computed(recipe: bytes, columns: Columns) -> tuple[dict[str, object], dict[
 
 
 @functools.cache
-def _engine(recipe: bytes) -> Engine:
+def _engine(recipe: bytes) -> Engine | GroundEngine | LadderEngine:
     from distributed import get_worker
 
     measures, base, model, options, cycle_options = pickle.loads(recipe)
     threads = get_worker().state.nthreads
-    return Engine(measures, base, model, options, cycle_options, threads)
+    return engine_for(measures, base, model, options, cycle_options, threads)

@@ -4,8 +4,9 @@ import re
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from vrw_jax.measures import CYCLE, MARGINS, MEASURES, STEP, attrs_of
-from vrw_jax.params import PARAMETER_NAMES
+from vrw_jax.measures import CYCLE, MARGINS, MEASURES, ON_GROUND, SERVED, STEP, attrs_of
+from vrw_jax.models import AbstractWheel, LadderWheel, UnilateralWheel
+from vrw_jax.params import FRICTION, PARAMETER_NAMES
 from vrw_jax.wording import nearest
 
 ALWAYS = ("outcome", "spectral_radius", *MARGINS)
@@ -46,6 +47,42 @@ DEFAULT_MEASURES = (
     "lambda_4_plus",
 )
 
+
+class Offer(NamedTuple):
+    """What a scan of a rung can tell."""
+
+    on_request: tuple[str, ...]
+    always: tuple[str, ...]  # in every scan, asked for or not
+    differentiable: tuple[str, ...]
+    by: tuple[str, ...]  # parameters that derivatives may be taken by
+    default: tuple[str, ...]
+
+
+_DEFAULT = ("dls_fraction", "speed", "period", "step_length", "slip", "energy_lost_impacts")
+PAPER = Offer(ON_REQUEST, ALWAYS, OF_CYCLE, PARAMETER_NAMES, DEFAULT_MEASURES)
+REAL_GROUND = Offer(
+    (*ON_GROUND, *CYCLE),
+    ("outcome", "spectral_radius"),
+    ON_GROUND,
+    (*PARAMETER_NAMES, FRICTION),
+    _DEFAULT,
+)
+LADDER = Offer(
+    (*ON_GROUND, *CYCLE),
+    ("outcome", "spectral_radius", "rung", "reason"),
+    tuple(name for name in ON_GROUND if name in OF_CYCLE),
+    PARAMETER_NAMES,
+    _DEFAULT,
+)
+
+
+def offer_of(model: AbstractWheel) -> Offer:
+    """What a scan of this rung can tell."""
+    if isinstance(model, LadderWheel):
+        return LADDER
+    return REAL_GROUND if isinstance(model, UnilateralWheel) else PAPER
+
+
 _DERIVATIVE = re.compile(r"d[ _](\w+?)(?: */ *d |_d_)(\w+)")
 
 
@@ -80,32 +117,33 @@ def derivative(name: str) -> Derivative | None:
     return Derivative(*found.groups()) if found else None
 
 
-def check_measures(names: Iterable[str]) -> tuple[str, ...]:
+def check_measures(names: Iterable[str], offer: Offer = PAPER) -> tuple[str, ...]:
     """Names of variables, each once, without what is always there; a sentence for a wrong one."""
     checked: dict[str, None] = {}
+    known = (*offer.on_request, *offer.always)
     for name in names:
         wanted = derivative(name)
         if wanted is None:
-            if name not in (*ON_REQUEST, *ALWAYS):
+            if name not in known:
                 raise ValueError(
-                    f"{name!r} is no measure of a scan{nearest(name, (*ON_REQUEST, *ALWAYS))}: "
-                    f"choose from {', '.join(ON_REQUEST)}, or a derivative such as "
+                    f"{name!r} is no measure of a scan{nearest(name, known)}: "
+                    f"choose from {', '.join(offer.on_request)}, or a derivative such as "
                     "'d dls_fraction / d damping'."
                 )
-            if name not in ALWAYS:
+            if name not in offer.always:
                 checked[name] = None
             continue
-        if wanted.measure not in OF_CYCLE:
+        if wanted.measure not in offer.differentiable:
             raise ValueError(
                 f"{name!r} asks for a derivative of {wanted.measure!r}"
-                f"{nearest(wanted.measure, OF_CYCLE)}, but a scan differentiates only "
-                f"{', '.join(OF_CYCLE)}: choose one of these."
+                f"{nearest(wanted.measure, offer.differentiable)}, but a scan differentiates only "
+                f"{', '.join(offer.differentiable)}: choose one of these."
             )
-        if wanted.parameter not in PARAMETER_NAMES:
+        if wanted.parameter not in offer.by:
             raise ValueError(
                 f"{name!r} asks for a derivative by {wanted.parameter!r}"
-                f"{nearest(wanted.parameter, PARAMETER_NAMES)}, but it must be by a parameter: "
-                f"choose from {', '.join(PARAMETER_NAMES)}."
+                f"{nearest(wanted.parameter, offer.by)}, but it must be by a parameter: "
+                f"choose from {', '.join(offer.by)}."
             )
         checked[wanted.name] = None
     return tuple(checked)
@@ -113,5 +151,7 @@ def check_measures(names: Iterable[str]) -> tuple[str, ...]:
 
 def variable_attrs(name: str) -> dict[str, object]:
     """Attributes of a scan's variable, measure or derivative."""
+    if name in SERVED:
+        return dict(SERVED[name])
     wanted = derivative(name)
     return attrs_of(name) if wanted is None else wanted.attrs

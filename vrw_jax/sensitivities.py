@@ -1,6 +1,6 @@
 """How every measure of a gait answers to every parameter, as a labelled table."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import equinox as eqx
 import jax
@@ -11,11 +11,15 @@ from jaxtyping import Array
 
 from vrw_jax.cycle_options import CycleOptions
 from vrw_jax.cycle_search import parameters_of, wheel_of
+from vrw_jax.ground_gait import MOVED, GroundGait, ground_gait, told, values_of
 from vrw_jax.limit_cycle import Guess, LimitCycle, limit_cycle
+from vrw_jax.measures import MEASURES as MEASURES_BY_NAME
+from vrw_jax.measures import ON_GROUND
 from vrw_jax.models import AbstractWheel, UnilateralWheel
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
 from vrw_jax.params import DOMAINS, WheelParams
+from vrw_jax.return_map import checked
 from vrw_jax.walked_cycle import WalkedCycle
 
 MEASURES: dict[str, tuple[str, Callable[[LimitCycle | WalkedCycle], Array]]] = {
@@ -35,10 +39,6 @@ MEASURES: dict[str, tuple[str, Callable[[LimitCycle | WalkedCycle], Array]]] = {
     "stability_margin": ("1", lambda cycle: cycle.stability_margin),
 }
 """Unit and definition of each measure; the last two are second derivatives of the motion."""
-
-
-PAPER_ONLY = frozenset(("lambda_I4", "lambda_2", "lambda_4"))
-"""Measures of the paper's landing procedure, which real ground does not follow."""
 
 
 @eqx.filter_jit
@@ -77,11 +77,25 @@ def sensitivities(
 
     An elasticity is the relative change of the measure over that of the parameter; NaN where the
     measure is zero. Leaving out the measures of stability saves most of the compile time. `guess`,
-    `model` and `options` are those of `limit_cycle`.
+    `model` and `options` are those of `limit_cycle`. On real ground friction is a parameter too.
     """
-    without = PAPER_ONLY if isinstance(model, UnilateralWheel) else frozenset()
-    known = [name for name in MEASURES if name not in without]
+    if isinstance(model, UnilateralWheel):
+        return _on_ground(params, measures, guess, model, options)
+    known = list(MEASURES)
     measures = known if measures is None else measures
+    _check_known(measures, known)
+    vector = parameters_of(params)
+    jacobian, (values, outcome) = _jacobian(
+        vector, guess, params.n_legs, tuple(measures), model, options
+    )
+    if int(outcome) != Outcome.STEPPED:
+        raise ValueError(f"there is no gait to differentiate: {Outcome(int(outcome)).meaning}")
+    units = [MEASURES[name][0] for name in measures]
+    domains = {name: domain.unit or "1" for name, domain in DOMAINS.items()}
+    return _table(measures, units, domains, vector, values, jacobian)
+
+
+def _check_known(measures: Sequence[str], known: Sequence[str]) -> None:
     unknown = sorted(set(measures) - set(known))
     if unknown:
         raise ValueError(
@@ -89,12 +103,55 @@ def sensitivities(
             f"{', '.join(known)}: choose among these."
         )
 
-    vector = parameters_of(params)
-    jacobian, (values, outcome) = _jacobian(
-        vector, guess, params.n_legs, tuple(measures), model, options
-    )
-    if int(outcome) != Outcome.STEPPED:
-        raise ValueError(f"there is no gait to differentiate: {Outcome(int(outcome)).meaning}")
+
+def _on_ground(
+    params: WheelParams,
+    measures: Sequence[str] | None,
+    guess: Guess | None,
+    model: UnilateralWheel,
+    options: CycleOptions | Options | None,
+) -> xr.Dataset:
+    """The same of real ground, from one Jacobian of the step."""
+    if isinstance(options, CycleOptions):
+        raise TypeError("options is a CycleOptions, but real ground needs the Options of its step.")
+    measures = ON_GROUND if measures is None else measures
+    _check_known(measures, ON_GROUND)
+    begin = guess.section_state if isinstance(guess, LimitCycle | WalkedCycle) else guess
+    begin = model.start(params) if begin is None else begin
+    params, x, _, options = checked(params, begin, model, options)
+    values = values_of(params, model)
+    gait, both = _ground_jacobian(values, x, params.n_legs, tuple(measures), model, options)
+    if not bool(gait.cycle.found):
+        outcome = Outcome(int(gait.cycle.outcome))
+        raise ValueError(f"there is no gait to differentiate: {outcome.meaning}")
+    units = [MEASURES_BY_NAME[name].unit for name in measures]
+    domains = {name: MEASURES_BY_NAME[name].unit for name in MOVED}
+    return _table(measures, units, domains, values, *both)
+
+
+@eqx.filter_jit
+def _ground_jacobian(
+    values: Array,
+    start: Array,
+    n_legs: int,
+    measures: tuple[str, ...],
+    model: UnilateralWheel,
+    options: Options,
+) -> tuple[GroundGait, tuple[Array, Array]]:
+    gait = ground_gait(values, start, n_legs, model, options)
+    both = [told(gait, name) for name in measures]
+    return gait, (jnp.stack([value for value, _ in both]), jnp.stack([by for _, by in both]))
+
+
+def _table(
+    measures: Sequence[str],
+    units: Sequence[str],
+    parameters: Mapping[str, str],
+    vector: Array,
+    values: Array,
+    jacobian: Array,
+) -> xr.Dataset:
+    """The labelled table; `parameters` are names with units."""
     derivative, value = np.asarray(jacobian), np.asarray(values)
     with np.errstate(divide="ignore", invalid="ignore"):
         elasticity = derivative * np.asarray(vector) / value[:, None]
@@ -108,9 +165,9 @@ def sensitivities(
                 np.where(np.isfinite(elasticity), elasticity, np.nan),
                 {"long_name": "relative change of measure per relative change of parameter"},
             ),
-            "measure_unit": ("measure", [MEASURES[name][0] for name in measures]),
-            "parameter_unit": ("parameter", [domain.unit or "1" for domain in DOMAINS.values()]),
+            "measure_unit": ("measure", list(units)),
+            "parameter_unit": ("parameter", list(parameters.values())),
             "parameter_value": ("parameter", np.asarray(vector)),
         },
-        coords={"measure": list(measures), "parameter": list(DOMAINS)},
+        coords={"measure": list(measures), "parameter": list(parameters)},
     )

@@ -17,12 +17,12 @@ from jaxtyping import Array
 from vrw_jax.dynamics import damping_power
 from vrw_jax.geometry import Motion, landing_direction, rear_direction
 from vrw_jax.measures import TRAJECTORY, attrs_of
-from vrw_jax.models import AbstractWheel, UnilateralWheel
+from vrw_jax.models import AbstractWheel, LadderWheel, UnilateralWheel
 from vrw_jax.models.base import SectionState
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
 from vrw_jax.params import PARAMETER_NAMES, WheelParams
-from vrw_jax.return_map import SectionLike, checked
+from vrw_jax.return_map import ModelLike, SectionLike, checked
 from vrw_jax.simulate_ground import simulate_ground
 
 
@@ -73,7 +73,7 @@ def simulate(
     x: SectionLike,
     n_steps: int = 10,
     *,
-    model: AbstractWheel | None = None,
+    model: ModelLike | None = None,
     options: Options | None = None,
     n_samples: int = 100,
 ) -> xr.Dataset:
@@ -88,7 +88,7 @@ def simulate(
     if not n_samples >= 2:
         raise ValueError(f"n_samples is {n_samples}, but a phase has two ends: give 2 or more.")
     params, x, model, options = checked(params, x, model, options)
-    if isinstance(model, UnilateralWheel):
+    if isinstance(model, UnilateralWheel | LadderWheel):
         walked = simulate_ground(
             params, x, n_steps, model=model, options=options, n_samples=n_samples
         )

@@ -1,4 +1,7 @@
-"""A walk of the unilateral wheel as a labelled trajectory: every leg, every foot, every contact."""
+"""A walk with contacts as a labelled trajectory: every leg, every foot, every contact.
+
+Of the unilateral wheel, and of the ladder, whose motion is told alike on both its rungs.
+"""
 
 import equinox as eqx
 import jax
@@ -6,7 +9,8 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Array
 
-from vrw_jax.models import UnilateralWheel
+from vrw_jax.measures import SERVED
+from vrw_jax.models import LadderStep, LadderWheel, UnilateralWheel
 from vrw_jax.models.unilateral import UnilateralTrajectory
 from vrw_jax.models.unilateral_mechanics import (
     directions,
@@ -44,7 +48,11 @@ MODES = "in_the_air at_rest sliding_downhill sliding_uphill"
 
 @eqx.filter_jit
 def _columns(
-    model: UnilateralWheel, params: WheelParams, x: Array, options: Options, n_samples: int
+    model: UnilateralWheel | LadderWheel,
+    params: WheelParams,
+    x: Array,
+    options: Options,
+    n_samples: int,
 ) -> tuple[UnilateralTrajectory, dict[str, Array]]:
     """One step's trace and its quantities, shape (phase, sample) or (phase, sample, leg)."""
     s, trace = params.symbols(), model.trace(params, x, options, n_samples)
@@ -76,14 +84,15 @@ def simulate_ground(
     x: Array,
     n_steps: int,
     *,
-    model: UnilateralWheel,
+    model: UnilateralWheel | LadderWheel,
     options: Options,
     n_samples: int,
 ) -> xr.Dataset:
     """Walk `n_steps` steps as a trajectory over time and leg; legs bear the labels of their step.
 
     Each stretch between two events has `n_samples` times, both ends included. A step that fails
-    ends the trajectory; the attributes `outcome` and `outcome_meaning` say why.
+    ends the trajectory; the attributes `outcome` and `outcome_meaning` say why. Of the ladder,
+    `rung` and `reason` say for each time which rung served and why (see `ModelChoice`).
     """
     slope = float(params.slope)
     weight = float(params.gravity) * float(params.hub_mass + params.n_legs * params.leg_mass)
@@ -101,6 +110,9 @@ def simulate_ground(
             part["time"] = trace.time[phase] + time
             part["step"] = np.full(n_samples, stepped)
             part["contact"] = np.tile(trace.contact[phase], (n_samples, 1))
+            if isinstance(result, LadderStep):
+                part["rung"] = np.full(n_samples, int(result.choice.rung))
+                part["reason"] = np.full(n_samples, int(result.choice.reason))
             part["on_stopper"] = np.tile(trace.locked[phase], (n_samples, 1))
             parts.append(part)
         time += float(result.period)
@@ -123,6 +135,10 @@ def simulate_ground(
         for name, (unit, long_name) in LEGWISE.items()
     }
     variables["contact"].attrs |= {"flag_values": [0, 1, 2, 3], "flag_meanings": MODES}
+    if isinstance(model, LadderWheel):
+        variables |= {
+            name: xr.Variable("time", joined(name, ()), attrs) for name, attrs in SERVED.items()
+        }
     return xr.Dataset(
         variables,
         {
@@ -131,7 +147,7 @@ def simulate_ground(
             "leg": np.arange(1, params.n_legs + 1),
         },
         {
-            "title": "Walk of the UnilateralWheel",
+            "title": f"Walk of the {type(model).__name__}",
             "frame": "x downhill along the slope, z normal to it, first landing at the origin",
             "friction": float(model.friction),
             "n_steps": stepped,

@@ -19,8 +19,15 @@ from jaxtyping import Array
 from vrw_jax.cycle_options import CycleOptions
 from vrw_jax.cycle_search import Problem, parameters_of, wheel_of
 from vrw_jax.limit_cycle import LimitCycle
-from vrw_jax.measures import MARGINS, attrs_of, flags
-from vrw_jax.models import AbstractWheel, StepResult, ViscoelasticWheel
+from vrw_jax.measures import MARGINS, ON_GROUND, attrs_of, flags
+from vrw_jax.models import (
+    AbstractWheel,
+    LadderWheel,
+    StepResult,
+    UnilateralStep,
+    UnilateralWheel,
+    ViscoelasticWheel,
+)
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
 from vrw_jax.params import DOMAINS, PARAMETER_NAMES, WheelParams
@@ -28,16 +35,18 @@ from vrw_jax.premises import TAKE_OFF, default_margins, measure
 from vrw_jax.simulate import provenance
 from vrw_jax.tune_engine import (
     READABLE,
+    AbstractEngine,
     Engine,
     Gait,
     OfCycle,
     Reader,
     Weighted,
     outcome_of,
-    same_branch,
 )
+from vrw_jax.tune_ground import GroundEngine
 from vrw_jax.tune_search import Climb, Ending, Kind, Trial, breach, climb, optimality, slack_scales
 from vrw_jax.tune_starts import Lanes, explore
+from vrw_jax.walked_cycle import WalkedCycle
 from vrw_jax.wording import nearest
 
 Objective = str | Mapping[str, float] | Callable[..., Array]
@@ -74,8 +83,8 @@ class Tuned:
     objective: str
     value: float
     start_value: float
-    cycle: LimitCycle
-    step: StepResult
+    cycle: LimitCycle | WalkedCycle
+    step: StepResult | UnilateralStep
     active: tuple[Active, ...]
     kkt_residual: float  # of the first-order condition, relative to the objective's gradient
     unkept: tuple[str, ...]  # premises that were no constraint and are broken
@@ -155,7 +164,8 @@ def tune(
     constraint counts as kept within 1e-6 of what it changes over the bounds. Local: it ends at an
     optimum of the branch that `params` lies on. With `n_starts` above 1 so many wheels, `params`
     and random ones within the bounds, first take N_EXPLORED first-order steps side by side, and the
-    best is climbed from.
+    best is climbed from. On real ground (`UnilateralWheel`) the objective is a measure of a step
+    there or weights of several, without constraints by default, and the start walks to its gait.
     """
     began = time.perf_counter()
     problem = tuning_problem(
@@ -174,6 +184,8 @@ def tune(
         raise ValueError(f"tolerance is {tolerance:g}, but it must be positive.")
     if not n_starts >= 1:
         raise ValueError(f"n_starts is {n_starts}, but at least one start is needed.")
+    if n_starts > 1 and isinstance(problem.engine, GroundEngine):
+        raise ValueError("n_starts is for the paper's wheel: on real ground climb from one start.")
     lanes = problem.explore(n_starts, seed) if n_starts > 1 else None
     problem.engine.compile(params)
     start = problem.start() if lanes is None else problem.evaluate(lanes.u[lanes.best], None)
@@ -192,7 +204,7 @@ class TuneProblem:
     upper: np.ndarray
     margins: dict[str, float]
     label: str
-    engine: Engine
+    engine: AbstractEngine
 
     @property
     def widths(self) -> np.ndarray:
@@ -249,13 +261,13 @@ class TuneProblem:
         if near is None or near.gait is None:
             guess = self.engine.first_guess(parameters)
         else:
-            guess = near.gait.cycle.located
+            guess = self.engine.guess_of(near.gait)
         gait = self.engine(parameters, guess)
         outcome = outcome_of(gait)
         on_branch = True
         if outcome == Outcome.STEPPED and near is not None and near.gait is not None:
             change = self.parameters(u) - self.parameters(near.u)
-            on_branch = same_branch(near.gait, gait, change)
+            on_branch = self.engine.same_branch(near.gait, gait, change)
         return self.trial(u, gait, outcome, on_branch)
 
     def trial(self, u: np.ndarray, gait: Gait, outcome: Outcome, on_branch: bool) -> Trial:
@@ -272,6 +284,7 @@ class TuneProblem:
 
     def explore(self, n_starts: int, seed: int) -> Lanes:
         """First-order steps of many starts side by side: this wheel, and random ones."""
+        assert isinstance(self.engine, Engine)  # `tune` looked
         others = np.random.default_rng(seed).uniform(size=(n_starts - 1, len(self.free)))
         lanes = explore(
             self._batch,
@@ -290,6 +303,7 @@ class TuneProblem:
         return lanes
 
     def _batch(self, u: np.ndarray, near: Gait | None) -> Gait:
+        assert isinstance(self.engine, Engine)
         parameters = jnp.asarray([self.parameters(row) for row in u])
         first = self.engine.first_guesses(parameters)
         return self.engine.batch(parameters, first if near is None else near.cycle.located)
@@ -325,7 +339,7 @@ class TuneProblem:
                     active.append(Active(name, float(limit), unit, float(price / width)))
         climbed = time.perf_counter()
         walked = self._walk(params, best.gait)
-        monitors = {name: float(np.min(getattr(best.gait.step.monitors, name))) for name in MARGINS}
+        broken = self.engine.unkept(best.gait.step)
         return Tuned(
             params=params,
             ending=done.ending,
@@ -336,7 +350,7 @@ class TuneProblem:
             step=best.gait.step,
             active=tuple(active),
             kkt_residual=conditions.residual,
-            unkept=tuple(n for n, v in monitors.items() if n not in self.margins and v < 0.0),
+            unkept=tuple(name for name in broken if name not in self.margins),
             walked=walked,
             path=self._path(done),
             evaluations=len(done.trials) + (0 if lanes is None else lanes.gaits),
@@ -355,9 +369,10 @@ class TuneProblem:
             if outcome != Outcome.STEPPED:
                 break
             walked, x = walked + 1, np.array(one.section_state)
+            monitored = self.engine.monitored(one)
             for name, least in self.margins.items():
-                if name in MARGINS:
-                    value = np.array(getattr(one.monitors, name))
+                if name in monitored:
+                    value = monitored[name]
                     scale = 1e-3 * np.max(np.abs(value)) + 1e-9
                     kept &= bool(np.all(value >= least - scale))
         distance = float(np.max(np.abs(x - cycle)))
@@ -427,8 +442,16 @@ def tuning_problem(
             "params must be one wheel, whose parameters are plain numbers: "
             "write vrw.WheelParams(damping=..., slope=...)."
         )
-    reader, label = _objective(objective)
     names, lower, upper = _bounds(params, free, bounds)
+    options = Options() if options is None else options
+    if isinstance(model, UnilateralWheel):
+        return _ground_problem(params, objective, names, lower, upper, constraints, model, options)
+    if isinstance(model, LadderWheel):
+        raise TypeError(
+            "the ladder can't be tuned, since a gait that changes its rung jumps: give "
+            "vrw.ViscoelasticWheel() or vrw.UnilateralWheel()."
+        )
+    reader, label = _objective(objective)
     margins = _margins(params, constraints)
     engine = Engine(
         objective=reader,
@@ -437,12 +460,35 @@ def tuning_problem(
             params.n_legs, 1, CycleOptions() if cycle_options is None else cycle_options
         ),
         model=ViscoelasticWheel() if model is None else model,
-        options=Options() if options is None else options,
+        options=options,
     )
     return TuneProblem(params, names, lower, upper, margins, label, engine)
 
 
-def _objective(objective: Objective) -> tuple[Reader, str]:
+def _ground_problem(
+    params: WheelParams,
+    objective: Objective,
+    names: tuple[str, ...],
+    lower: np.ndarray,
+    upper: np.ndarray,
+    constraints: Margins | None,
+    model: UnilateralWheel,
+    options: Options,
+) -> TuneProblem:
+    """The same on real ground, which has no premises to keep unless measures are named."""
+    if callable(objective):
+        raise TypeError(
+            "objective is a function, but on real ground it must be a measure's name or weights "
+            f"of several: choose from {', '.join(ON_GROUND)}."
+        )
+    reader, label = _objective(objective, ON_GROUND)
+    assert isinstance(reader, Weighted)
+    margins = _margins(params, {} if constraints is None else constraints, ON_GROUND)
+    engine = GroundEngine(reader.weights, tuple(margins), params.n_legs, model, options)
+    return TuneProblem(params, names, lower, upper, margins, label, engine)
+
+
+def _objective(objective: Objective, readable: tuple[str, ...] = READABLE) -> tuple[Reader, str]:
     if callable(objective):
         label = getattr(objective, "__name__", "objective")
         takes = inspect.signature(objective).parameters
@@ -454,7 +500,7 @@ def _objective(objective: Objective) -> tuple[Reader, str]:
             'give a measure such as "dls_fraction".'
         )
     for name in weights:
-        _known(name, "objective")
+        _known(name, "objective", readable)
         if name in MARGINS and MARGINS[name].axis:
             raise ValueError(
                 f"{name} has one value for each locked leg, but an objective is one number: "
@@ -464,11 +510,11 @@ def _objective(objective: Objective) -> tuple[Reader, str]:
     return Weighted(tuple(weights.items())), label.replace("+ -", "- ")
 
 
-def _known(name: str, what: str) -> None:
-    if name not in READABLE:
+def _known(name: str, what: str, readable: tuple[str, ...]) -> None:
+    if name not in readable:
         raise ValueError(
-            f"{name!r} is no measure for {what}{nearest(name, READABLE)}: "
-            f"choose from {', '.join(READABLE)}."
+            f"{name!r} is no measure for {what}{nearest(name, readable)}: "
+            f"choose from {', '.join(readable)}."
         )
 
 
@@ -509,7 +555,9 @@ def _bounds(
     return names, ends[:, 0], ends[:, 1]
 
 
-def _margins(params: WheelParams, constraints: Margins | None) -> dict[str, float]:
+def _margins(
+    params: WheelParams, constraints: Margins | None, readable: tuple[str, ...] = READABLE
+) -> dict[str, float]:
     if constraints is None:
         return dict(default_margins(params))
     if isinstance(constraints, Mapping):
@@ -520,7 +568,7 @@ def _margins(params: WheelParams, constraints: Margins | None) -> dict[str, floa
     if "clearance_sls1" in margins:
         margins.setdefault(TAKE_OFF.name, 0.0)  # which has a slope where the clearance has none
     for name, least in margins.items():
-        _known(name, "a constraint")
+        _known(name, "a constraint", readable)
         if not math.isfinite(least):
             raise ValueError(f"the margin of {name} is {least}, but it must be a finite number.")
     return margins

@@ -6,10 +6,11 @@ along the branch), then what was asked for, read off both. The first two, which 
 compile, are the same for every tuning problem.
 """
 
+import abc
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -86,8 +87,8 @@ class OfCycle:
 class Gait(NamedTuple):
     """A cycle and the step from it, with what was asked for and its derivatives."""
 
-    cycle: LimitCycle
-    step: StepResult
+    cycle: Any  # LimitCycle, or WalkedCycle on real ground
+    step: Any  # StepResult, or UnilateralStep
     values: Array  # (1 + n_constraints,): the objective, then the constraints
     columns: Array  # (n_parameters, 1 + n_constraints), in the order of PARAMETER_NAMES
     posture: Array  # section state and durations, which tell branches apart
@@ -183,8 +184,47 @@ AGREEMENT = 1e-7
 step takes it: the two are independent computations."""
 
 
+class AbstractEngine(abc.ABC):
+    """Evaluates gaits of one tuning problem; a guess is whatever tells where to look for one."""
+
+    model: AbstractWheel
+    options: Options
+
+    @abc.abstractmethod
+    def first_guess(self, parameters: Array) -> Any:
+        """Where a search for a wheel's gait begins that knows no neighbour."""
+
+    @abc.abstractmethod
+    def guess_of(self, gait: Gait) -> Any:
+        """Where a neighbour's search begins."""
+
+    @abc.abstractmethod
+    def __call__(self, parameters: Array, guess: Any) -> Gait:
+        """The gait of one wheel near `guess`."""
+
+    @abc.abstractmethod
+    def same_branch(self, here: Gait, there: Gait, change: np.ndarray) -> bool:
+        """Whether a branch leads from one gait to the other when the parameters change so."""
+
+    @abc.abstractmethod
+    def step(self, params: WheelParams, x: np.ndarray) -> Any:
+        """One step of the rung."""
+
+    @abc.abstractmethod
+    def monitored(self, step: Any) -> dict[str, np.ndarray]:
+        """What a single step tells of constraints."""
+
+    @abc.abstractmethod
+    def unkept(self, step: Any) -> tuple[str, ...]:
+        """Premises of the rung that the step breaks."""
+
+    @abc.abstractmethod
+    def compile(self, params: WheelParams) -> None:
+        """Compile what is large."""
+
+
 @dataclass(frozen=True)
-class Engine:
+class Engine(AbstractEngine):
     """Evaluates gaits of one tuning problem: what is asked for, of which rung, how exactly."""
 
     objective: Reader
@@ -194,7 +234,6 @@ class Engine:
     options: Options
 
     def first_guess(self, parameters: Array) -> Located:
-        """Where a search for a wheel's gait begins that knows no neighbour."""
         lane = surface_start(self.problem, parameters[:, None], jnp.ones((1,), bool))
         return jax.tree.map(lambda x: x[..., 0], lane)
 
@@ -204,13 +243,24 @@ class Engine:
         return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), lanes)
 
     def __call__(self, parameters: Array, guess: Located) -> Gait:
-        """The gait of one wheel near `guess`."""
         n_legs = self.problem.n_legs
         cycle, d_cycle = _cycle_and_columns(self.problem, parameters, guess)
         x, dx = cycle.section_state, d_cycle.section_state
         step, d_step = _step_and_columns(self.model, n_legs, parameters, x, dx, self.options)
         told = _values_and_columns(self.objective, self.constraints, cycle, d_cycle, step, d_step)
         return _gait(cycle, d_cycle, step, told)
+
+    def guess_of(self, gait: Gait) -> Located:
+        return gait.cycle.located
+
+    def same_branch(self, here: Gait, there: Gait, change: np.ndarray) -> bool:
+        return same_branch(here, there, change)
+
+    def monitored(self, step: StepResult) -> dict[str, np.ndarray]:
+        return {name: np.array(getattr(step.monitors, name)) for name in MARGINS}
+
+    def unkept(self, step: StepResult) -> tuple[str, ...]:
+        return tuple(name for name, value in self.monitored(step).items() if np.min(value) < 0.0)
 
     def step(self, params: WheelParams, x: np.ndarray) -> StepResult:
         """One step by the function that is compiled already, with its derivatives thrown away."""
@@ -286,5 +336,5 @@ def is_same_branch(here: Told, there: Told, change: np.ndarray) -> bool:
     missed = np.linalg.norm(there[0] - here[0] - predicted)
     if missed > 0.5 * np.linalg.norm(predicted) + 1e-6:
         return False
-    fold = lambda told: np.linalg.det(np.eye(2) - told[3])
+    fold = lambda told: np.linalg.det(np.eye(len(told[3])) - told[3])
     return bool(np.array_equal(here[2], there[2]) and fold(here) * fold(there) > 0.0)

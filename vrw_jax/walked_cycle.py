@@ -11,11 +11,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from vrw_jax import multipliers as floquet
-from vrw_jax.models import AbstractWheel
+from vrw_jax.models import AbstractWheel, LadderWheel
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
 from vrw_jax.params import Scalar, WheelParams
-from vrw_jax.return_map import checked
+from vrw_jax.return_map import ModelLike, checked
 from vrw_jax.section_newton import newton_cycle
 
 
@@ -83,21 +83,17 @@ class WalkedCycle(eqx.Module):
     @property
     def multipliers(self) -> Complex[Array, "... n_section"]:
         """Floquet multipliers; in closed form, hence differentiable, up to a section of three."""
-        if self.matrix.shape[-1] > 3:
-            return jnp.linalg.eigvals(self.matrix)
         return floquet.multipliers(self.matrix)
 
     @property
     def spectral_radius(self) -> Array:
         """Largest modulus of a multiplier: below 1 the gait is stable."""
-        if self.matrix.shape[-1] > 3:
-            return jnp.max(jnp.abs(self.multipliers), axis=-1)
         return floquet.spectral_radius(self.matrix)
 
     @property
     def stability_margin(self) -> Array:
         """Positive where stable: smooth up to a section of three, 1 - spectral radius beyond."""
-        if self.matrix.shape[-1] > 3:
+        if self.matrix.shape[-1] > floquet.LARGEST_CLOSED:
             margin = 1.0 - self.spectral_radius
         else:
             margin = floquet.stability_margin(self.matrix)
@@ -117,12 +113,13 @@ class WalkedCycle(eqx.Module):
 
 def walked_cycle(
     params: WheelParams,
-    model: AbstractWheel,
+    model: ModelLike,
     start: object,
     period_n: int,
     options: Options | None,
 ) -> WalkedCycle:
     """The cycle next to `start` (the model's own start if None), stable or not."""
+    model = LadderWheel() if model == "auto" else model
     begin = model.start(params) if start is None else start
     params, x, model, options = checked(params, begin, model, options)
     return _walked_cycle(params, x, model, options, period_n)

@@ -8,6 +8,7 @@ from vrw_jax.models.base import (
     StepResult,
     Trajectory,
 )
+from vrw_jax.models.ladder import LadderStep, LadderWheel, ModelChoice
 from vrw_jax.models.rigid import RigidWheel
 from vrw_jax.models.unilateral import UnilateralStep, UnilateralWheel
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
@@ -16,7 +17,10 @@ __all__ = [
     "AbstractWheel",
     "EnergyLoss",
     "Indicators",
+    "LadderStep",
+    "LadderWheel",
     "Margins",
+    "ModelChoice",
     "RigidWheel",
     "StepResult",
     "Trajectory",

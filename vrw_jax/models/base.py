@@ -114,6 +114,8 @@ class Advance(eqx.Module):
     durations: Float[Array, "3"]  # of DLS, SLS-I, SLS-II, s
     outcome: Int[Array, ""]  # an Outcome
     solver_steps: Int[Array, ""]  # tried by the integrator
+    rung: Int[Array, ""] | None = None  # that took the step, of a model that chooses: see ladder
+    reason: Int[Array, ""] | None = None  # why that one
 
 
 class Trajectory(eqx.Module):
@@ -157,6 +159,10 @@ class AbstractWheel(eqx.Module):
     def section_size(self, params: WheelParams) -> int:
         """Length of a section state."""
         return 3
+
+    def section_numbers(self, params: WheelParams) -> int:
+        """How many of them, the first ones, move continuously; the others are codes."""
+        return self.section_size(params)
 
     def full_section(self, params: WheelParams, x: Array) -> Array:
         """The rung's section state of a paper's one; others are left as they are."""

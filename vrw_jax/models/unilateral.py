@@ -165,6 +165,10 @@ class UnilateralWheel(AbstractWheel):
         """4 + 3 n, see `FullState`."""
         return section_size(params.n_legs)
 
+    def section_numbers(self, params: WheelParams) -> int:
+        """All but the legs' codes."""
+        return section_size(params.n_legs) - params.n_legs
+
     def full_section(self, params: WheelParams, x: Array) -> FullState:
         """The full section state of the paper's (theta-, dtheta-, dL1-): Leg 1 planted."""
         return embedded(params.symbols(), x) if x.shape == (3,) else x

@@ -1,0 +1,91 @@
+"""A gait on real ground with its first derivatives by every parameter, friction included.
+
+The gait is found by Newton's method on its return map; how it moves with the parameters follows
+from one Jacobian of the step, by the implicit function theorem. Nothing is differentiated twice.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from vrw_jax.limit_cycle import limit_cycle
+from vrw_jax.measures import measures_of
+from vrw_jax.models import UnilateralStep, UnilateralWheel
+from vrw_jax.options import Options
+from vrw_jax.params import FRICTION, PARAMETER_NAMES, WheelParams
+from vrw_jax.walked_cycle import WalkedCycle
+
+MOVED = (*PARAMETER_NAMES, FRICTION)
+"""What a gait is differentiated by, in the order of its columns."""
+
+Values = Float[Array, " n_moved"]
+"""Numbers of MOVED."""
+
+
+class GroundGait(NamedTuple):
+    """A gait that repeats after one step, and how it moves. Where none was found, all is zero."""
+
+    cycle: WalkedCycle
+    step: UnilateralStep  # from the gait's section state
+    columns: UnilateralStep  # derivatives of `step` along the branch of gaits, leading axis: MOVED
+    section_columns: Float[Array, "n_moved n_section"]  # of the section state
+
+
+def values_of(params: WheelParams, model: UnilateralWheel) -> Values:
+    """The numbers that a gait is differentiated by."""
+    numbers = [getattr(params, name) for name in PARAMETER_NAMES]
+    return jnp.stack([*numbers, jnp.asarray(model.friction, params.damping.dtype)])
+
+
+def wheel_and_ground(
+    values: Values, n_legs: int, model: UnilateralWheel
+) -> tuple[WheelParams, UnilateralWheel]:
+    """The inverse of `values_of`; `model` gives what has no derivative."""
+    *parameters, friction = values
+    named = dict(zip(PARAMETER_NAMES, parameters, strict=True))
+    ground = eqx.tree_at(lambda ground: ground.friction, model, friction)
+    return WheelParams(**named, n_legs=n_legs), ground
+
+
+def cycle_of(
+    values: Values, start: Array, n_legs: int, model: UnilateralWheel, options: Options
+) -> WalkedCycle:
+    """The gait next to `start`."""
+    wheel, ground = wheel_and_ground(values, n_legs, model)
+    cycle = limit_cycle(wheel, guess=start, model=ground, options=options)
+    assert isinstance(cycle, WalkedCycle)
+    return cycle
+
+
+def ground_gait(
+    values: Values, start: Array, n_legs: int, model: UnilateralWheel, options: Options
+) -> GroundGait:
+    """The gait next to `start`, with its derivatives."""
+    cycle = cycle_of(values, start, n_legs, model, options)
+    n = values.shape[0]
+
+    def floats_of(inputs: Array) -> tuple:
+        wheel, ground = wheel_and_ground(inputs[:n], n_legs, model)
+        floats, rest = eqx.partition(ground.step(wheel, inputs[n:], options), eqx.is_inexact_array)
+        return floats, (floats, rest)
+
+    inputs = jnp.concatenate([values, cycle.section_state])
+    jacobian, (floats, rest) = jax.jacfwd(floats_of, has_aux=True)(inputs)
+    by_values, by_section = jnp.split(jacobian.section_state, [n], axis=-1)
+    one = jnp.eye(by_section.shape[0], dtype=values.dtype)
+    found = jnp.linalg.solve(one - by_section, by_values)
+    moved = jnp.concatenate([jnp.eye(n, dtype=values.dtype), found])
+    columns = jax.tree.map(lambda leaf: jnp.moveaxis(leaf @ moved, -1, 0), jacobian)
+    return GroundGait(cycle, eqx.combine(floats, rest), columns, found.T)
+
+
+def told(gait: GroundGait, name: str) -> tuple[Array, Array]:
+    """A measure of the gait by name, and its derivatives by MOVED."""
+    floats, rest = eqx.partition(gait.step, eqx.is_inexact_array)
+    read = lambda floats: measures_of(eqx.combine(floats, rest))[name]
+    columns = eqx.filter(gait.columns, eqx.is_inexact_array)
+    along = lambda column: jax.jvp(read, (floats,), (column,))[1]
+    return read(floats), jax.vmap(along)(columns)

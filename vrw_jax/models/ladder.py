@@ -1,0 +1,223 @@
+"""The ladder as one wheel: each step by the lowest rung whose premises hold over it.
+
+The paper's wheel takes the step and measures its premises; where one breaks, the wheel on real
+ground takes the step anew. Under `vmap` this is decided lane by lane, and a lane that the paper's
+wheel serves does no work on the upper rung. The rigid wheel never serves: its premise, legs that do
+not yield, fails for every finite stiffness.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from vrw_jax.models.base import AbstractWheel, Advance, StepResult, replaced_where_bad
+from vrw_jax.models.unilateral import UnilateralStep, UnilateralTrajectory, UnilateralWheel
+from vrw_jax.models.unilateral_contacts import OFF, STICK
+from vrw_jax.models.unilateral_section import LOCKED, FullState, embedded
+from vrw_jax.models.viscoelastic import PAPER_START, ViscoelasticWheel
+from vrw_jax.options import Options
+from vrw_jax.outcomes import Outcome
+from vrw_jax.params import Scalar, WheelParams, as_float_array
+
+VISCOELASTIC, UNILATERAL = 1, 2
+"""Numbers of the rungs; 0 is the rigid one."""
+
+PREMISES: dict[str, str] = {
+    "fore_foot_force": "the ground would have to pull on the fore foot",
+    "clearance_sls1": "the rear foot scuffs in single support I",
+    "clearance_sls2": "the rear foot scuffs in single support II",
+    "contraction": "the fore leg would pass its stopper",
+    "friction_fore": "the fore foot would slide",
+    "friction_rear": "the rear foot would slide just after landing",
+    "landing_friction_fore": "the fore foot would slide in the landing impulse",
+    "landing_friction_rear": "the rear foot would slide in the landing impulse",
+}
+"""Premises that the paper's rung needs and the unilateral rung does not, with what breaks them."""
+
+OFF_THE_PLANE = 1 + len(PREMISES)
+"""The reason of a start that is no section state of the paper's."""
+
+
+class ModelChoice(eqx.Module):
+    """Which rung serves, and why. Batched under vmap: every field gains the axis.
+
+    `reason` is 0 where the paper's rung serves, 1 + the place in PREMISES of the first premise that
+    breaks, OFF_THE_PLANE where a leg other than Leg 1 is loaded or off its stopper at the start,
+    and minus the paper's outcome where that rung's step does not reach a touchdown.
+    """
+
+    rung: Int[Array, ""]  # VISCOELASTIC or UNILATERAL
+    reason: Int[Array, ""]
+    margins: Float[Array, " n_premises"]  # of PREMISES, negative where broken
+    friction: Scalar
+
+    @property
+    def model(self) -> AbstractWheel:
+        """The rung itself, for one wheel."""
+        if int(self.rung) == VISCOELASTIC:
+            return ViscoelasticWheel(friction=float(self.friction))
+        return UnilateralWheel(friction=self.friction)
+
+    @property
+    def why(self) -> str:
+        """One sentence, for one wheel."""
+        return told_why(int(self.reason))
+
+
+def told_why(reason: int) -> str:
+    """A reason of `ModelChoice` as a sentence."""
+    if reason == 0:
+        return "The paper's wheel serves: all its premises hold over this step."
+    if reason < 0:
+        return f"The paper's wheel can't step: {Outcome(-reason).meaning}"
+    if reason == OFF_THE_PLANE:
+        return "The start is not the paper's: another leg is loaded or off its stopper."
+    return f"The paper's premises break: {list(PREMISES.values())[reason - 1]}."
+
+
+class LadderStep(eqx.Module):
+    """One step by the lowest rung that serves, told alike for both. Batched under vmap."""
+
+    choice: ModelChoice
+    section_state: FullState  # just before the next landing; zeros if there was none
+    post_impact: Float[Array, "2"]  # (theta, dtheta) just after the opening landing, rad, rad/s
+    durations: Float[Array, "3"]  # with two feet loaded, with one, with none, s
+    step_length: Scalar  # m
+    energy_impacts: Scalar  # lost in impacts, J
+    energy_damping: Scalar  # lost in the dampers, J
+    energy_friction: Scalar  # lost by sliding between impacts, J
+    slip: Scalar  # path of sliding feet, m
+    outcome: Int[Array, ""]  # an Outcome
+    solver_steps: Int[Array, ""]  # tried by the integrator, on both rungs
+
+    @property
+    def period(self) -> Array:
+        """Duration of the step, s."""
+        return jnp.sum(self.durations, axis=-1)
+
+    @property
+    def dls_fraction(self) -> Array:
+        """Share of the step with two loaded feet; 0 for a step without duration."""
+        period = self.period
+        return self.durations[..., 0] / jnp.where(period > 0.0, period, 1.0)
+
+    @property
+    def speed(self) -> Array:
+        """Step length over period, m/s; 0 for a step without duration."""
+        period = self.period
+        return jnp.where(period > 0.0, self.step_length / jnp.where(period > 0.0, period, 1.0), 0.0)
+
+
+class LadderWheel(AbstractWheel):
+    """The paper's wheel where it serves, the wheel on real ground of this `friction` elsewhere.
+
+    Section states are those of `UnilateralWheel`; the paper's three numbers may be given.
+    """
+
+    friction: Scalar = eqx.field(converter=as_float_array, default=0.7)
+
+    @property
+    def ground(self) -> UnilateralWheel:
+        """The upper rung."""
+        return UnilateralWheel(friction=self.friction)
+
+    def start(self, params: WheelParams) -> FullState:
+        return self.ground.start(params)
+
+    def section_size(self, params: WheelParams) -> int:
+        return self.ground.section_size(params)
+
+    def section_numbers(self, params: WheelParams) -> int:
+        return self.ground.section_numbers(params)
+
+    def full_section(self, params: WheelParams, x: Array) -> FullState:
+        return self.ground.full_section(params, x)
+
+    def choose(
+        self, params: WheelParams, x: FullState, options: Options
+    ) -> tuple[ModelChoice, StepResult]:
+        """Which rung serves, and the step of the paper's."""
+        paper, ground = ViscoelasticWheel(), self.friction.astype(x.dtype)
+        on_plane = _on_the_papers_plane(x, params.n_legs)
+        result = paper.step(
+            params, jnp.where(on_plane, _of_plane(x, params.n_legs), jnp.nan), options
+        )
+        margins = jnp.stack(
+            [
+                getattr(result.monitors, name)
+                + (ground - paper.friction if "friction" in name else 0.0)
+                for name in PREMISES
+            ]
+        )
+        broken = ~(margins >= 0.0)
+        reason = jnp.where(jnp.any(broken), 1 + jnp.argmax(broken), 0)
+        reason = jnp.where(result.outcome == Outcome.STEPPED, reason, -result.outcome)
+        reason = jnp.where(on_plane, reason, OFF_THE_PLANE).astype(jnp.int32)
+        rung = jnp.where(reason == 0, VISCOELASTIC, UNILATERAL).astype(jnp.int32)
+        return ModelChoice(rung, reason, margins, ground), result
+
+    def advance(self, params: WheelParams, x: FullState, options: Options) -> Advance:
+        choice, paper = self.choose(params, x, options)
+        serves = choice.rung == VISCOELASTIC
+        ground = self.ground.advance(params, jnp.where(serves, jnp.nan, x), options)
+        return Advance(
+            section_state=jnp.where(serves, _embedded(serves, params, paper), ground.section_state),
+            durations=jnp.where(serves, _by_feet(paper), ground.durations),
+            outcome=jnp.where(serves, paper.outcome, ground.outcome),
+            solver_steps=paper.solver_steps + ground.solver_steps,
+            rung=choice.rung,
+            reason=choice.reason,
+        )
+
+    def step(self, params: WheelParams, x: FullState, options: Options) -> LadderStep:
+        choice, paper = self.choose(params, x, options)
+        serves = choice.rung == VISCOELASTIC
+        ground: UnilateralStep = self.ground.step(params, jnp.where(serves, jnp.nan, x), options)
+        either = lambda lower, upper: jnp.where(serves, lower, upper)
+        return LadderStep(
+            choice=choice,
+            section_state=either(_embedded(serves, params, paper), ground.section_state),
+            post_impact=either(paper.post_impact, ground.post_impact),
+            durations=either(_by_feet(paper), ground.durations),
+            step_length=either(paper.step_length, ground.step_length),
+            energy_impacts=either(
+                paper.energy.landing + paper.energy.stopper, ground.energy_impacts
+            ),
+            energy_damping=either(paper.energy.damping, ground.energy_damping),
+            energy_friction=either(0.0, ground.energy_friction),
+            slip=either(0.0, ground.slip),
+            outcome=either(paper.outcome, ground.outcome),
+            solver_steps=paper.solver_steps + ground.solver_steps,
+        )
+
+    def trace(
+        self, params: WheelParams, x: FullState, options: Options, n_samples: int
+    ) -> UnilateralTrajectory:
+        """The motion as the upper rung tells it: without slip it is the paper's."""
+        choice, _ = self.choose(params, x, options)
+        friction = jnp.where(choice.rung == VISCOELASTIC, jnp.inf, self.friction)
+        return UnilateralWheel(friction=friction).trace(params, x, options, n_samples)
+
+
+def _of_plane(x: FullState, n: int) -> Float[Array, "3"]:
+    """(theta-, dtheta-, dL1-) of a full section state."""
+    return jnp.stack([x[0], x[1], x[4 + n]])
+
+
+def _on_the_papers_plane(x: FullState, n: int) -> Bool[Array, ""]:
+    """Whether Leg 1 alone is loaded, at rest, and all other legs are on their stoppers."""
+    papers = jnp.where(jnp.arange(n) == 0, float(STICK), float(LOCKED + OFF))
+    return jnp.all(jnp.round(x[4 + 2 * n :]) == papers)
+
+
+def _embedded(serves: Array, params: WheelParams, paper: StepResult) -> FullState:
+    """The full section state of the paper's; of Table 1's start where it does not serve."""
+    safe = jnp.asarray(PAPER_START, paper.section_state.dtype)
+    params, x = replaced_where_bad(serves, params, paper.section_state, safe)
+    return embedded(params.symbols(), x)
+
+
+def _by_feet(paper: StepResult) -> Float[Array, "3"]:
+    """Durations with two feet loaded, with one and with none, s."""
+    both, *single = paper.durations
+    return jnp.stack([both, single[0] + single[1], jnp.zeros_like(both)])

@@ -1,0 +1,181 @@
+"""The steady gait of many wheels on real ground, and of many wheels each on its lowest rung.
+
+On real ground a sample walks from the rung's start towards a gait, which Newton's method then
+solves for on the full section state. On the ladder the paper's engine goes first, over all samples;
+those whose premises break on this ground are gathered and walk on the upper rung, so that no sample
+pays for another.
+"""
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from vrw_jax.cycle_options import CycleOptions
+from vrw_jax.ground_gait import MOVED, cycle_of, ground_gait, told, wheel_and_ground
+from vrw_jax.measures import measures_of
+from vrw_jax.models import AbstractWheel, LadderWheel, UnilateralWheel, ViscoelasticWheel
+from vrw_jax.models.ladder import PREMISES, UNILATERAL, VISCOELASTIC
+from vrw_jax.options import Options
+from vrw_jax.outcomes import Outcome
+from vrw_jax.params import FRICTION, WheelParams
+from vrw_jax.return_map import walk
+from vrw_jax.scan_engine import Engine, n_cores
+from vrw_jax.scan_measures import derivative
+from vrw_jax.walked_cycle import WalkedCycle
+
+LANES = 64
+"""Wheels that one call of the compiled function takes: they wait for the slowest."""
+
+N_TOWARDS = 100
+"""Steps towards a gait, from the rung's start, before Newton's method."""
+
+Columns = Mapping[str, np.ndarray]
+Told = dict[str, np.ndarray]
+
+
+class GroundEngine:
+    """Evaluates samples on real ground for a fixed set of measures; compiled at the first call."""
+
+    def __init__(
+        self,
+        measures: tuple[str, ...],
+        base: WheelParams,
+        model: UnilateralWheel,
+        options: Options,
+        threads: int | None = None,
+    ) -> None:
+        self._base, self._model = base, model
+        self._threads = n_cores() if threads is None else threads
+        wanted = tuple(d for name in measures if (d := derivative(name)) is not None)
+        plain = (*(n for n in measures if derivative(n) is None), "spectral_radius")
+
+        def one(values: Array) -> tuple[Array, dict[str, Array]]:
+            wheel, ground = wheel_and_ground(values, base.n_legs, model)
+            walked = walk(wheel, ground.start(wheel), N_TOWARDS, model=ground, options=options)
+            begin = walked.steps.section_state[-1]
+            slopes = {}
+            if wanted:
+                gait = ground_gait(values, begin, base.n_legs, model, options)
+                cycle = gait.cycle
+                for d in wanted:
+                    slopes[d.name] = told(gait, d.measure)[1][MOVED.index(d.parameter)]
+            else:
+                cycle = cycle_of(values, begin, base.n_legs, model, options)
+            stepped = walked.outcome == Outcome.STEPPED
+            outcome = jnp.where(stepped, cycle.outcome, walked.outcome)
+            return outcome, {name: _read(name, cycle) for name in plain} | slopes
+
+        self._compiled: Callable = jax.jit(jax.vmap(one))
+
+    def __call__(self, columns: Columns) -> Told:
+        """Results of the samples in `columns` (one value per sample of each swept parameter)."""
+        n = len(next(iter(columns.values())))
+        values = np.empty((n, len(MOVED)), np.dtype(self._base.damping.dtype))
+        for i, name in enumerate(MOVED):
+            held = self._model if name == FRICTION else self._base
+            values[:, i] = columns[name] if name in columns else float(getattr(held, name))
+        batches = [values[begin : begin + LANES] for begin in range(0, n, LANES)]
+        with ThreadPoolExecutor(self._threads) as pool:
+            parts = list(pool.map(self._batch, batches))
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+    def _batch(self, values: np.ndarray) -> Told:
+        filled = np.concatenate([values, np.repeat(values[:1], LANES - len(values), 0)])
+        outcome, measures = jax.tree.map(np.array, self._compiled(filled))
+        failed = outcome != Outcome.STEPPED
+        for value in measures.values():
+            value[failed] = np.nan if np.issubdtype(value.dtype, np.floating) else -1
+        results = {"outcome": outcome.astype(np.int8)} | measures
+        return {name: value[: len(values)] for name, value in results.items()}
+
+
+def _read(name: str, cycle: WalkedCycle) -> Array:
+    """A measure of a gait that repeats after one step."""
+    if name in ("spectral_radius", "stability_margin"):
+        return getattr(cycle, name)
+    return measures_of(jax.tree.map(lambda leaf: leaf[0], cycle.steps))[name]
+
+
+OF_PAPER: dict[str, tuple[str, ...]] = {
+    "duration_single": ("duration_sls1", "duration_sls2"),
+    "duration_flight": (),
+    "slip": (),
+    "energy_lost_impacts": ("energy_lost_landing", "energy_lost_stopper"),
+    "energy_lost_friction": (),
+}
+"""Measures of real ground as sums of the paper's."""
+
+
+class LadderEngine:
+    """Evaluates samples on the lowest rung that serves each of them."""
+
+    def __init__(
+        self,
+        measures: tuple[str, ...],
+        base: WheelParams,
+        model: LadderWheel,
+        options: Options,
+        cycle_options: CycleOptions,
+        threads: int | None = None,
+    ) -> None:
+        self._measures, self._base, self._model = measures, base, model
+        self._paper = ViscoelasticWheel()
+        asked = [part for name in measures for part in OF_PAPER.get(name, (name,))]
+        self._lower = Engine(
+            tuple(dict.fromkeys(asked)), base, self._paper, options, cycle_options, threads
+        )
+        self._upper = GroundEngine(measures, base, model.ground, options, threads)
+
+    def __call__(self, columns: Columns) -> Told:
+        """Results of the samples in `columns`, with `rung` and `reason` of each."""
+        n = len(next(iter(columns.values())))
+        friction = columns.get(FRICTION, np.full(n, float(self._model.friction)))
+        lower = self._lower(
+            {"damping": np.full(n, float(self._base.damping))}
+            | {name: column for name, column in columns.items() if name != FRICTION}
+        )
+        reason = self._reasons(lower, friction)
+        rung = np.where(reason == 0, VISCOELASTIC, UNILATERAL).astype(np.int8)
+        names = (*self._measures, "outcome", "spectral_radius")
+        results = {
+            name: sum((lower[part] for part in OF_PAPER[name]), start=np.zeros(n))
+            if name in OF_PAPER
+            else lower[name]
+            for name in names
+        }
+        up = np.flatnonzero(rung == UNILATERAL)
+        if up.size:
+            upper = self._upper({name: column[up] for name, column in columns.items()})
+            for name in names:
+                results[name][up] = upper[name]
+        return results | {"rung": rung, "reason": reason}
+
+    def _reasons(self, lower: Told, friction: np.ndarray) -> np.ndarray:
+        """`ModelChoice.reason` of each sample, over the step that its gait repeats."""
+        left = friction - self._paper.friction
+        margins = np.stack([lower[m] + (left if "friction" in m else 0.0) for m in PREMISES], -1)
+        broken = ~(margins >= 0.0)
+        first = np.where(broken.any(-1), 1 + np.argmax(broken, -1), 0)
+        outcome = lower["outcome"].astype(int)
+        return np.where(outcome == Outcome.STEPPED, first, -outcome).astype(np.int8)
+
+
+def engine_for(
+    measures: tuple[str, ...],
+    base: WheelParams,
+    model: AbstractWheel,
+    options: Options,
+    cycle_options: CycleOptions,
+    threads: int | None = None,
+) -> Engine | GroundEngine | LadderEngine:
+    """What computes the samples of a scan of this rung."""
+    if isinstance(model, UnilateralWheel):
+        return GroundEngine(measures, base, model, options, threads)
+    if isinstance(model, LadderWheel):
+        return LadderEngine(measures, base, model, options, cycle_options, threads)
+    assert isinstance(model, ViscoelasticWheel)  # `scan.plan` looked
+    return Engine(measures, base, model, options, cycle_options, threads)
