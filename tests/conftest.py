@@ -17,7 +17,8 @@ with install_import_hook("vrw_jax", "beartype.beartype"):
 
 COMPILE_LONGEST = (
     "test_continuation", "test_limit_cycle", "test_derivatives", "test_tune", "test_unilateral",
-    "test_scan", "test_reproduction", "test_outcomes", "test_model_choice", "test_basin",
+    "test_ground_gaits", "test_scan", "test_reproduction", "test_outcomes", "test_model_choice",
+    "test_basin",
 )  # fmt: skip
 
 

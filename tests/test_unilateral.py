@@ -1,14 +1,17 @@
 """The wheel on real ground: contact laws, impacts, energy, the paper's gait, another code."""
 
 import math
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from oracle import moreau_jean
+from scipy.optimize import brentq
 
 import vrw_jax as vrw
+from vrw_jax.integrate import Watched, integrate_phase
 from vrw_jax.models.unilateral_contacts import OFF, SLIP_DOWN, SLIP_UP, STICK
 from vrw_jax.models.unilateral_events import event_of, resolve
 from vrw_jax.models.unilateral_mechanics import (
@@ -20,10 +23,14 @@ from vrw_jax.models.unilateral_mechanics import (
 )
 from vrw_jax.models.unilateral_motion import (
     Stance,
+    Tally,
     airborne_stopper_force,
+    field,
     flow_of,
     forces,
+    guards,
     guards_of,
+    pack,
     unpack,
 )
 from vrw_jax.models.unilateral_section import opened
@@ -216,6 +223,38 @@ def test_a_vertical_leg_lands_with_its_own_mass_alone():
     assert abs(float(change.motion.vz) + speed) < 1e-12
     assert abs(float(change.motion.dL[0]) + speed) < 1e-12
     assert not bool(change.stance.locked[0])
+
+
+def test_a_single_leg_bounces_as_a_damped_oscillator():
+    """Upright on flat ground: 17 kg on one spring and damper, until the foot no longer pushes."""
+    s, speed = vrw.WheelParams(slope=0.0, damping=20.0).symbols(), 2.0
+    mass, omega = s.Mt - s.m, jnp.sqrt(s.k / (s.Mt - s.m) - (0.5 * s.c / (s.Mt - s.m)) ** 2)
+    decay, rest = 0.5 * s.c / mass, s.Ls - mass * s.g / s.k
+    a, b = s.L0 - rest, (-speed + decay * (s.L0 - rest)) / omega
+
+    def length(t):
+        return rest + np.exp(-decay * t) * (a * np.cos(omega * t) + b * np.sin(omega * t))
+
+    def push(t, h=1e-5):  # of the ground: the leg's own weight, and what spring and damper give
+        rate = (length(t + h) - length(t - h)) / (2.0 * h)
+        return float(s.m * s.g + s.k * (s.Ls - length(t)) - s.c * rate)
+
+    time = brentq(push, 0.1, 1.0, xtol=1e-12)
+    zero = jnp.zeros(())
+    motion = at_rest(0.0, vz=jnp.asarray(-speed))._replace(dL=jnp.zeros(8).at[0].set(-speed))
+    flow = flow_of(s, jnp.asarray(0.7), False, stance_of((STICK, OFF), [False] + [True] * 7))
+    lift = guards_of(8, False).lift
+    watched = Watched(lambda y: guards(flow, y)[lift : lift + 1], 1)
+    start = pack(motion, Tally(zero, zero, zero, zero))
+    end = integrate_phase(partial(field, flow), watched, start, jnp.asarray(True), TIGHT)
+    landed, tally = unpack(end.state)
+    assert abs(float(end.duration) - time) < 1e-8
+    assert abs(float(landed.L[0]) - length(time)) < 1e-9
+    assert abs(float(landed.theta)) < 1e-12
+    lost = 0.5 * mass * speed**2 - 0.5 * mass * float(landed.vz) ** 2
+    lost += 0.5 * float(s.k) * float((s.Ls - s.L0) ** 2 - (s.Ls - landed.L[0]) ** 2)
+    lost += float(mass * s.g * (s.L0 - landed.L[0]))
+    assert abs(float(tally.damping) - lost) < 1e-9
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.1, 0.5])

@@ -34,7 +34,8 @@ from vrw_jax.followed_wheel import (
 )
 from vrw_jax.limit_cycle import LimitCycle, limit_cycle
 from vrw_jax.measures import CYCLE, GROUND, MARGINS, STEP, attrs_of
-from vrw_jax.models import AbstractWheel, LadderWheel, UnilateralWheel, ViscoelasticWheel
+from vrw_jax.models import AbstractWheel, UnilateralWheel, ViscoelasticWheel
+from vrw_jax.models.ladder import refuse_ladder
 from vrw_jax.multipliers import multipliers
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
@@ -141,7 +142,8 @@ def continue_branches(
     A wheel without a limit cycle to start from gets a branch without points, whose outcome says so.
     """
     model = ViscoelasticWheel() if model is None else model
-    on_ground = isinstance(model, UnilateralWheel | LadderWheel)
+    refuse_ladder(model, "followed")
+    on_ground = isinstance(model, UnilateralWheel)
     names = (*PARAMETER_NAMES, FRICTION) if on_ground else PARAMETER_NAMES
     if name not in names:
         raise ValueError(f"{name!r} is no parameter: choose from {', '.join(names)}.")

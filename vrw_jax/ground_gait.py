@@ -60,11 +60,11 @@ def cycle_of(
     return cycle
 
 
-def ground_gait(
-    values: Values, start: Array, n_legs: int, model: UnilateralWheel, options: Options
-) -> GroundGait:
-    """The gait next to `start`, with its derivatives."""
-    cycle = cycle_of(values, start, n_legs, model, options)
+@eqx.filter_jit
+def _step_and_columns(
+    values: Values, x: Array, n_legs: int, model: UnilateralWheel, options: Options
+) -> tuple[UnilateralStep, UnilateralStep, Array]:
+    """A step from a gait's section state, and how step and section state move along the branch."""
     n = values.shape[0]
 
     def floats_of(inputs: Array) -> tuple:
@@ -72,20 +72,39 @@ def ground_gait(
         floats, rest = eqx.partition(ground.step(wheel, inputs[n:], options), eqx.is_inexact_array)
         return floats, (floats, rest)
 
-    inputs = jnp.concatenate([values, cycle.section_state])
+    inputs = jnp.concatenate([values, x])
     jacobian, (floats, rest) = jax.jacfwd(floats_of, has_aux=True)(inputs)
     by_values, by_section = jnp.split(jacobian.section_state, [n], axis=-1)
-    one = jnp.eye(by_section.shape[0], dtype=values.dtype)
+    one = jnp.eye(x.shape[0], dtype=x.dtype)
     found = jnp.linalg.solve(one - by_section, by_values)
-    moved = jnp.concatenate([jnp.eye(n, dtype=values.dtype), found])
+    moved = jnp.concatenate([jnp.eye(n, dtype=x.dtype), found])
     columns = jax.tree.map(lambda leaf: jnp.moveaxis(leaf @ moved, -1, 0), jacobian)
-    return GroundGait(cycle, eqx.combine(floats, rest), columns, found.T)
+    return eqx.combine(floats, rest), columns, found.T
 
 
-def told(gait: GroundGait, name: str) -> tuple[Array, Array]:
-    """A measure of the gait by name, and its derivatives by MOVED."""
+def ground_gait(
+    values: Values, start: Array, n_legs: int, model: UnilateralWheel, options: Options
+) -> GroundGait:
+    """The gait next to `start`, with its derivatives.
+
+    Outside of `jit` its two large functions, gait and step, are compiled each by itself.
+    """
+    cycle = cycle_of(values, start, n_legs, model, options)
+    return GroundGait(
+        cycle, *_step_and_columns(values, cycle.section_state, n_legs, model, options)
+    )
+
+
+@eqx.filter_jit
+def told(gait: GroundGait, names: tuple[str, ...]) -> dict[str, tuple[Array, Array]]:
+    """Measures of the gait by name, each with its derivatives by MOVED."""
     floats, rest = eqx.partition(gait.step, eqx.is_inexact_array)
-    read = lambda floats: measures_of(eqx.combine(floats, rest))[name]
     columns = eqx.filter(gait.columns, eqx.is_inexact_array)
-    along = lambda column: jax.jvp(read, (floats,), (column,))[1]
-    return read(floats), jax.vmap(along)(columns)
+
+    def read(floats: UnilateralStep) -> dict[str, Array]:
+        measures = measures_of(eqx.combine(floats, rest))
+        return {name: measures[name] for name in names}
+
+    along = jax.vmap(lambda column: jax.jvp(read, (floats,), (column,))[1])(columns)
+    values = read(floats)
+    return {name: (values[name], along[name]) for name in names}

@@ -61,8 +61,9 @@ class GroundEngine:
             if wanted:
                 gait = ground_gait(values, begin, base.n_legs, model, options)
                 cycle = gait.cycle
+                both = told(gait, tuple(d.measure for d in wanted))
                 for d in wanted:
-                    slopes[d.name] = told(gait, d.measure)[1][MOVED.index(d.parameter)]
+                    slopes[d.name] = both[d.measure][1][MOVED.index(d.parameter)]
             else:
                 cycle = cycle_of(values, begin, base.n_legs, model, options)
             stepped = walked.outcome == Outcome.STEPPED

@@ -26,7 +26,7 @@ def newton_cycle(
     start: Float[Array, " n"],
     *,
     period_n: int = 1,
-    tolerance: float = 1e-12,
+    tolerance: float | Scalar = 1e-12,
     iterations: int = 30,
 ) -> SectionCycle:
     """A fixed point of `function` applied `period_n` times, by Newton's method from `start`.

@@ -11,11 +11,12 @@ from jaxtyping import Array
 
 from vrw_jax.cycle_options import CycleOptions
 from vrw_jax.cycle_search import parameters_of, wheel_of
-from vrw_jax.ground_gait import MOVED, GroundGait, ground_gait, told, values_of
+from vrw_jax.ground_gait import MOVED, ground_gait, told, values_of
 from vrw_jax.limit_cycle import Guess, LimitCycle, limit_cycle
 from vrw_jax.measures import MEASURES as MEASURES_BY_NAME
 from vrw_jax.measures import ON_GROUND
 from vrw_jax.models import AbstractWheel, UnilateralWheel
+from vrw_jax.models.ladder import refuse_ladder
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
 from vrw_jax.params import DOMAINS, WheelParams
@@ -79,6 +80,7 @@ def sensitivities(
     measure is zero. Leaving out the measures of stability saves most of the compile time. `guess`,
     `model` and `options` are those of `limit_cycle`. On real ground friction is a parameter too.
     """
+    refuse_ladder(model, "differentiated")
     if isinstance(model, UnilateralWheel):
         return _on_ground(params, measures, guess, model, options)
     known = list(MEASURES)
@@ -120,27 +122,15 @@ def _on_ground(
     begin = model.start(params) if begin is None else begin
     params, x, _, options = checked(params, begin, model, options)
     values = values_of(params, model)
-    gait, both = _ground_jacobian(values, x, params.n_legs, tuple(measures), model, options)
+    gait = ground_gait(values, x, params.n_legs, model, options)
     if not bool(gait.cycle.found):
         outcome = Outcome(int(gait.cycle.outcome))
         raise ValueError(f"there is no gait to differentiate: {outcome.meaning}")
+    both = told(gait, tuple(measures))
+    value, by = (jnp.stack([both[name][k] for name in measures]) for k in (0, 1))
     units = [MEASURES_BY_NAME[name].unit for name in measures]
     domains = {name: MEASURES_BY_NAME[name].unit for name in MOVED}
-    return _table(measures, units, domains, values, *both)
-
-
-@eqx.filter_jit
-def _ground_jacobian(
-    values: Array,
-    start: Array,
-    n_legs: int,
-    measures: tuple[str, ...],
-    model: UnilateralWheel,
-    options: Options,
-) -> tuple[GroundGait, tuple[Array, Array]]:
-    gait = ground_gait(values, start, n_legs, model, options)
-    both = [told(gait, name) for name in measures]
-    return gait, (jnp.stack([value for value, _ in both]), jnp.stack([by for _, by in both]))
+    return _table(measures, units, domains, values, value, by)
 
 
 def _table(

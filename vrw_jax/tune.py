@@ -22,12 +22,12 @@ from vrw_jax.limit_cycle import LimitCycle
 from vrw_jax.measures import MARGINS, ON_GROUND, attrs_of, flags
 from vrw_jax.models import (
     AbstractWheel,
-    LadderWheel,
     StepResult,
     UnilateralStep,
     UnilateralWheel,
     ViscoelasticWheel,
 )
+from vrw_jax.models.ladder import refuse_ladder
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
 from vrw_jax.params import DOMAINS, PARAMETER_NAMES, WheelParams
@@ -446,9 +446,10 @@ def tuning_problem(
     options = Options() if options is None else options
     if isinstance(model, UnilateralWheel):
         return _ground_problem(params, objective, names, lower, upper, constraints, model, options)
-    if isinstance(model, LadderWheel):
+    refuse_ladder(model, "tuned")
+    if not isinstance(model, ViscoelasticWheel | None):
         raise TypeError(
-            "the ladder can't be tuned, since a gait that changes its rung jumps: give "
+            f"model is {model!r}, but what is tuned has compliant legs: give "
             "vrw.ViscoelasticWheel() or vrw.UnilateralWheel()."
         )
     reader, label = _objective(objective)

@@ -6,13 +6,12 @@ gradients are one-sided.
 
 from dataclasses import dataclass
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from vrw_jax.cycle_search import parameters_of, wheel_of
-from vrw_jax.ground_gait import GroundGait, ground_gait, told, values_of
+from vrw_jax.ground_gait import ground_gait, told, values_of
 from vrw_jax.measures import ON_GROUND, measures_of
 from vrw_jax.models import UnilateralStep, UnilateralWheel
 from vrw_jax.options import Options
@@ -22,15 +21,6 @@ from vrw_jax.tune_engine import AbstractEngine, Gait, is_same_branch
 
 N_TOWARDS = 150
 """Steps towards the first gait, from the rung's start."""
-
-
-@eqx.filter_jit
-def _gait(
-    values: Array, guess: Array, n_legs: int, model: UnilateralWheel, options: Options
-) -> tuple[GroundGait, dict[str, tuple[Array, Array]]]:
-    """The gait with every measure that may be asked for and its derivatives by MOVED."""
-    gait = ground_gait(values, guess, n_legs, model, options)
-    return gait, {name: told(gait, name) for name in ON_GROUND}
 
 
 @dataclass(frozen=True)
@@ -55,7 +45,8 @@ class GroundEngine(AbstractEngine):
 
     def __call__(self, parameters: Array, guess: Array) -> Gait:
         values = values_of(wheel_of(parameters, self.n_legs), self.model)
-        gait, measures = _gait(values, guess, self.n_legs, self.model, self.options)
+        gait = ground_gait(values, guess, self.n_legs, self.model, self.options)
+        measures = told(gait, ON_GROUND)
         n = len(PARAMETER_NAMES)
         asked = [measures[name] for name in self.constraints]
         objective = sum(weight * measures[name][0] for name, weight in self.weights)

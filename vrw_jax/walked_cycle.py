@@ -18,6 +18,9 @@ from vrw_jax.params import Scalar, WheelParams
 from vrw_jax.return_map import ModelLike, checked
 from vrw_jax.section_newton import newton_cycle
 
+FINEST = 1e-12
+"""Newton's last correction need not be smaller, nor than the step's own tolerance."""
+
 
 class WalkedCycle(eqx.Module):
     """A gait that repeats after `period_n` steps, told by walking it. Batched under vmap.
@@ -130,7 +133,10 @@ def _walked_cycle(
     params: WheelParams, x: Array, model: AbstractWheel, options: Options, period_n: int
 ) -> WalkedCycle:
     found = newton_cycle(
-        lambda x: model.advance(params, x, options).section_state, x, period_n=period_n
+        lambda x: model.advance(params, x, options).section_state,
+        x,
+        period_n=period_n,
+        tolerance=jnp.maximum(FINEST, options.rtol),
     )
     x, results = found.x, []
     for _ in range(period_n):

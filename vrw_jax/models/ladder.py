@@ -221,3 +221,12 @@ def _by_feet(paper: StepResult) -> Float[Array, "3"]:
     """Durations with two feet loaded, with one and with none, s."""
     both, *single = paper.durations
     return jnp.stack([both, single[0] + single[1], jnp.zeros_like(both)])
+
+
+def refuse_ladder(model: object, what: str) -> None:
+    """One sentence where a rung is needed whose gaits move smoothly."""
+    if isinstance(model, LadderWheel | str):
+        raise TypeError(
+            f"the ladder can't be {what}, since its gaits jump where the rung changes: give "
+            "vrw.ViscoelasticWheel() or vrw.UnilateralWheel()."
+        )

@@ -19,7 +19,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Int
 
 from vrw_jax.models.unilateral_mechanics import Free, Hub, Pair, Vector3, kept
-from vrw_jax.params import Scalar, Symbols
+from vrw_jax.params import Elementwise, Scalar, Symbols
 
 OFF, STICK, SLIP_DOWN, SLIP_UP = 0, 1, 2, 3
 """Contact modes of a foot: in the air, at rest, sliding downhill, sliding uphill."""
@@ -59,7 +59,7 @@ def _pair(entry: Any) -> Pair:
 
 
 def answer(
-    s: Symbols, hub: Hub, free: Free, contact: Array, held: Array, friction: Scalar
+    s: Symbols, hub: Hub, free: Free, contact: Array, held: Array, friction: Elementwise
 ) -> Answer:
     """Solve one combination: contact modes and stoppers of the two slots, shape (2,) each.
 

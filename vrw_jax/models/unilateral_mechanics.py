@@ -4,7 +4,8 @@ Coordinates are the hub (x, z), the angle theta of Leg 1 and the n leg lengths. 
 the hub alone, so the mass matrix is an arrow: eliminating the legs whose length is free leaves a
 3 x 3 system. Up to two *slots* hold the legs whose feet may be loaded; a foot's force acts in the
 leg's own directions u (foot to hub) and e = du/dtheta, and only its e part reaches the hub. The
-same equations serve accelerations and, with momenta in place of forces, impacts.
+same equations serve accelerations and, with momenta in place of forces, impacts. All of it works
+element by element over lanes too, one more axis behind that of the legs.
 """
 
 from typing import Any, NamedTuple
@@ -15,9 +16,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from vrw_jax.params import Scalar, Symbols
+from vrw_jax.params import Elementwise, Scalar, Symbols
 
-Legs = Float[Array, " n_legs"]
+Legs = Float[Array, "n_legs ..."]
 Vector3 = tuple[Any, Any, Any]
 """Components along hub x, hub z and theta."""
 Pair = tuple[Any, Any]
@@ -44,17 +45,17 @@ class Legwise(NamedTuple):
     cos: Legs
 
 
-def directions(s: Symbols, theta: Scalar) -> Legwise:
+def directions(s: Symbols, theta: Elementwise) -> Legwise:
     """Sine and cosine of every leg's angle, from one sine and one cosine."""
-    turn = s.alpha * np.arange(s.n)
+    turn = (s.alpha * np.arange(s.n)).reshape(-1, *(1,) * jnp.ndim(theta))
     sin, cos = jnp.sin(theta), jnp.cos(theta)
     sin_turn, cos_turn = np.sin(turn), np.cos(turn)
     return Legwise(sin * cos_turn + cos * sin_turn, cos * cos_turn - sin * sin_turn)
 
 
 def over_legs(values: Array) -> Array:
-    """Sum over legs by halves, in one fixed order."""
-    return jnp.sum(values, axis=-1)
+    """Sum over legs, the first axis."""
+    return jnp.sum(values, axis=0)
 
 
 def kept(tree: Any, one: Array) -> Any:
@@ -75,8 +76,8 @@ def one_of(motion: "WheelMotion") -> Array:
 class Slots(NamedTuple):
     """The two legs whose feet may be loaded, fore first; an empty slot holds no leg."""
 
-    first: Bool[Array, " n_legs"]
-    second: Bool[Array, " n_legs"]
+    first: Bool[Array, "n_legs ..."]
+    second: Bool[Array, "n_legs ..."]
 
     def of(self, values: Array) -> Pair:
         """The slots' entries of a quantity of all legs; 0 for an empty slot."""
@@ -91,9 +92,9 @@ class Slots(NamedTuple):
         return jnp.where(self.first, pair[0], 0.0) + jnp.where(self.second, pair[1], 0.0)
 
 
-def slots_of(touching: Bool[Array, " n_legs"]) -> Slots:
+def slots_of(touching: Bool[Array, "n_legs ..."]) -> Slots:
     """The first two of the touching legs."""
-    rank = jnp.cumsum(touching.astype(jnp.int32))
+    rank = jnp.cumsum(touching.astype(jnp.int32), axis=0)
     return Slots(touching & (rank == 1), touching & (rank == 2))
 
 

@@ -12,6 +12,7 @@ from vrw_jax.models.unilateral_mechanics import (
     Free,
     Hub,
     Legs,
+    Legwise,
     Pair,
     Slots,
     WheelMotion,
@@ -24,7 +25,7 @@ from vrw_jax.models.unilateral_mechanics import (
     over_legs,
     slots_of,
 )
-from vrw_jax.params import Scalar, Symbols
+from vrw_jax.params import Elementwise, Scalar, Symbols
 
 State = Float[Array, " dim"]
 """Hub (x, z, theta) and rates, lengths, rates of lengths, then the tallies: see `Tally`."""
@@ -66,7 +67,7 @@ class Flow(NamedTuple):
     """The wheel in one stance: all that the motion between two events needs."""
 
     s: Symbols
-    friction: Scalar
+    friction: Elementwise
     one_sided: bool  # airborne legs may leave their stoppers
     stance: Stance
     slots: Slots
@@ -75,7 +76,7 @@ class Flow(NamedTuple):
     airborne: Bool[Array, " n_legs"]  # other legs on their stoppers
 
 
-def flow_of(s: Symbols, friction: Scalar, one_sided: bool, stance: Stance) -> Flow:
+def flow_of(s: Symbols, friction: Elementwise, one_sided: bool, stance: Stance) -> Flow:
     """The stance as seen by the equations of motion."""
     slots = slots_of(stance.contact != OFF)
     contact = jnp.stack(slots.of(stance.contact))
@@ -121,12 +122,17 @@ def _sliding(flow: Flow) -> Pair:
     return sign(flow.contact[0]), sign(flow.contact[1])
 
 
+def leg_acceleration(flow: Flow, now: Forces) -> Legs:
+    """Second derivative of every leg's length, m/s^2."""
+    pull = flow.slots.spread(now.answer.pull)
+    return jnp.where(flow.stance.locked, 0.0, _outward(now) - pull / flow.s.m)
+
+
 def field(flow: Flow, y: State) -> State:
     """Time derivative of the state."""
     motion, _ = unpack(y)
     now = forces(flow, motion)
-    pull = flow.slots.spread(now.answer.pull)
-    ddL = jnp.where(flow.stance.locked, 0.0, _outward(now) - pull / flow.s.m)
+    ddL = leg_acceleration(flow, now)
     direction = _sliding(flow)
     speeds = [direction[i] * now.feet.x[i] for i in range(2)]
     drag = [-now.answer.tangential[i] * direction[i] for i in range(2)]
@@ -170,37 +176,61 @@ def guards_of(n: int, one_sided: bool) -> Guards:
     return Guards(*(int(p) for p in places))
 
 
-def guards(flow: Flow, y: State) -> Float[Array, " n_guards"]:
-    """All guards, positive in the stance and falling through zero where it ends; 1 if not watched.
+class Felt(NamedTuple):
+    """What decides how long a stance lasts, beside the motion itself."""
+
+    legs: Legwise
+    normal: Pair
+    tangential: Pair
+    stopper: Pair
+    speed: Pair  # of the slots' feet along the slope
+
+
+def felt(now: Forces) -> Felt:
+    """What `stance_guards` needs of the forces."""
+    found = now.answer
+    return Felt(now.hub.legs, found.normal, found.tangential, found.stopper, now.feet.x)
+
+
+def stance_guards(flow: Flow, motion: WheelMotion, now: Felt, begun: Array) -> list[Array]:
+    """Guards in the order of `Guards`, without the last kind; `begun`: not at the stance's start.
 
     What the last event has just brought about (a foot off the ground, a leg off its stopper, a
     sliding foot) stands on its own guard: it is not watched at that very instant.
     """
     s, stance = flow.s, flow.stance
-    motion, tally = unpack(y)
-    now = forces(flow, motion)
-    begun = tally.clock > 0.0
     one = jnp.ones_like(motion.L)
     in_air = (stance.contact == OFF) & (begun | ~stance.new_foot)
     moving = ~stance.locked & (begun | ~stance.new_leg)
     just_slid = jnp.stack(flow.slots.of(stance.new_slip.astype(jnp.int32))) > 0
     rough = jnp.where(jnp.isfinite(flow.friction), flow.friction, 0.0)
-    normal, tangential = jnp.stack(now.answer.normal), jnp.stack(now.answer.tangential)
+    normal, tangential = jnp.stack(now.normal), jnp.stack(now.tangential)
     coulomb = (flow.contact == STICK) & jnp.isfinite(flow.friction)
     direction = jnp.stack(_sliding(flow))
     slides = (direction != 0.0) & (begun | ~just_slid)
     watched = lambda condition, value: jnp.where(condition, value, 1.0)
-    parts = [
-        jnp.where(in_air, foot_heights(motion, now.hub.legs), one),
+    return [
+        jnp.where(in_air, foot_heights(motion, now.legs), one),
         jnp.where(moving, s.L0 - motion.L, one),
         watched(flow.contact != OFF, normal),
         watched(coulomb, rough * normal - tangential),
         watched(coulomb, rough * normal + tangential),
-        watched(slides, direction * jnp.stack(now.feet.x)),
-        watched(flow.held, jnp.stack(now.answer.stopper)),
+        watched(slides, direction * jnp.stack(now.speed)),
+        watched(flow.held, jnp.stack(now.stopper)),
         motion.dtheta[None],
-        (jnp.min(motion.L) - s.a)[None],
+        (jnp.min(motion.L, axis=0) - s.a)[None],
     ]
+
+
+def guards(flow: Flow, y: State) -> Float[Array, " n_guards"]:
+    """All guards, positive in the stance and falling through zero where it ends; 1 if not watched.
+
+    Those of `stance_guards`, and the stopper forces in the air where stoppers are one-sided.
+    """
+    motion, tally = unpack(y)
+    now = forces(flow, motion)
+    parts = stance_guards(flow, motion, felt(now), tally.clock > 0.0)
     if flow.one_sided:
-        parts.append(jnp.where(flow.airborne, s.m * _outward(now), one))
+        one = jnp.ones_like(motion.L)
+        parts.append(jnp.where(flow.airborne, flow.s.m * _outward(now), one))
     return jnp.concatenate(kept(parts, one_of(motion)))

@@ -1,0 +1,175 @@
+"""Gaits on real ground: sensitivities, branches, scans, tuning, and batches by lanes."""
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vrw_jax as vrw
+from vrw_jax.models.ladder import UNILATERAL, VISCOELASTIC
+from vrw_jax.multipliers import bifurcation_margins, jury_margins, multipliers
+
+START = (0.1, 1.6, -0.1)
+SLOW = vrw.WheelParams(damping=300.0)
+GROUND = vrw.UnilateralWheel(friction=0.7)
+OPTIONS = vrw.Options(rtol=1e-11, atol=1e-11)
+
+
+@pytest.fixture(scope="module")
+def near():
+    """A section state next to the slow gait at c = 300, μ = 0.7."""
+    return vrw.walk(SLOW, START, 40, model=GROUND, options=OPTIONS).steps.section_state[-1]
+
+
+@pytest.mark.slow
+def test_sensitivities_on_real_ground_are_the_difference_quotients_friction_included(near):
+    names = ("dls_fraction", "period", "speed", "slip", "energy_lost_friction")
+    told = lambda params, model: vrw.sensitivities(
+        params, measures=names, guess=near, model=model, options=OPTIONS
+    )
+    table = told(SLOW, GROUND)
+    assert "friction" in table.parameter
+    step = 1e-4
+    for name, ends in {
+        "damping": [told(vrw.WheelParams(damping=300.0 + d), GROUND) for d in (step, -step)],
+        "friction": [told(SLOW, vrw.UnilateralWheel(friction=0.7 + d)) for d in (step, -step)],
+    }.items():
+        difference = (ends[0].value - ends[1].value) / (2.0 * step)
+        found = table.derivative.sel(parameter=name)
+        np.testing.assert_allclose(found, difference, rtol=2e-5, atol=1e-7)
+
+
+def test_what_real_ground_does_not_measure_is_refused_in_one_sentence():
+    with pytest.raises(ValueError, match="choose among these"):
+        vrw.sensitivities(SLOW, measures=("lambda_4",), model=GROUND)
+    with pytest.raises(ValueError, match="does not feel"):
+        vrw.scan(vrw.grid(friction=[0.5, 0.7]))
+    with pytest.raises(ValueError, match="is no parameter"):
+        vrw.continue_branch(vrw.WheelParams(), "friction", (0.5, 1.0))
+    with pytest.raises(TypeError, match="can't be tuned"):
+        vrw.tune(
+            SLOW, "dls_fraction", ["damping"], {"damping": (250.0, 350.0)}, model=vrw.LadderWheel()
+        )
+    with pytest.raises(TypeError, match="can't be differentiated"):
+        vrw.sensitivities(SLOW, model=vrw.LadderWheel())
+    with pytest.raises(TypeError, match="can't be followed"):
+        vrw.continue_branch(SLOW, "damping", (250.0, 350.0), model="auto")
+    with pytest.raises(TypeError, match="compliant legs"):
+        vrw.tune(SLOW, "speed", ["damping"], {"damping": (250.0, 350.0)}, model=vrw.RigidWheel())
+    with pytest.raises(TypeError, match="rung of the ladder"):
+        vrw.step(SLOW, START, model="best")
+
+
+def test_bifurcations_of_larger_maps_are_those_of_the_small_map_inside():
+    small = np.array([[0.4, 0.9, 0.1], [-0.7, 0.3, 0.2], [0.1, 0.0, -0.6]])
+    large = np.zeros((7, 7))
+    large[2:5, 2:5] = small
+    found = bifurcation_margins(jnp.asarray(large))
+    np.testing.assert_allclose(found, jury_margins(jnp.asarray(small))[:3], atol=1e-12)
+    three = np.asarray(multipliers(jnp.asarray(large)))[:3]
+    exact = np.asarray(multipliers(jnp.asarray(small)))
+    np.testing.assert_allclose(np.sort_complex(three), np.sort_complex(exact), atol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def lanes():
+    """Walks of four lanes on different grounds, and of one that can't begin."""
+    damping = np.array([200.0, 300.0, 250.0, 160.0, 200.0])
+    friction = np.array([0.7, 0.7, 1.2, math.inf, math.nan])
+    params = vrw.WheelParams(damping=jnp.asarray(damping))
+    model = vrw.UnilateralWheel(friction=friction)
+    states = np.tile(START, (5, 1))
+    return damping, friction, vrw.ground_steps(params, states, 3, model=model)
+
+
+def test_lanes_walk_on_real_ground_as_single_wheels_do(lanes):
+    damping, friction, found = lanes
+    for i in range(4):
+        walk = vrw.walk(
+            vrw.WheelParams(damping=damping[i]), START, 3,
+            model=vrw.UnilateralWheel(friction=friction[i]), options=OPTIONS,
+        )  # fmt: skip
+        assert int(found.outcome[i]) == vrw.Outcome.STEPPED
+        assert int(found.n_stepped[i]) == 3
+        numbers = 4 + 2 * SLOW.n_legs
+        own = walk.steps.section_state[-1]
+        np.testing.assert_allclose(found.section_state[i, :numbers], own[:numbers], atol=1e-7)
+        np.testing.assert_array_equal(found.section_state[i, numbers:], own[numbers:])
+        np.testing.assert_allclose(found.durations[i], walk.steps.durations[-1], atol=1e-8)
+
+
+def test_a_lane_that_cannot_begin_is_a_code(lanes):
+    *_, found = lanes
+    assert int(found.outcome[4]) == vrw.Outcome.BAD_INPUT
+    assert int(found.n_stepped[4]) == 0
+    assert np.all(np.isfinite(found.section_state))
+
+
+@pytest.mark.slow
+def test_a_scan_puts_each_sample_on_its_lowest_rung():
+    design = vrw.grid(damping=[150.0, 300.0], friction=[0.7, math.inf])
+    measures = ("dls_fraction", "period", "slip")
+    scan = vrw.scan(design, measures, model="auto")
+    assert scan.rung.values.tolist() == [[UNILATERAL, VISCOELASTIC], [UNILATERAL, UNILATERAL]]
+    paper = vrw.limit_cycle(vrw.WheelParams(damping=150.0))
+    np.testing.assert_allclose(scan.period[0, 1], paper.period, atol=1e-9)
+    assert float(scan.slip[0, 1]) == 0.0
+    ground = vrw.scan(design, (*measures, "d period / d friction"), model=vrw.UnilateralWheel())
+    for name in measures:
+        np.testing.assert_allclose(scan[name][1], ground[name][1], atol=1e-9)
+    # Feet that can't slide give the paper's gait on the upper rung too.
+    np.testing.assert_allclose(scan.period[0, 1], ground.period[0, 1], atol=1e-9)
+    assert float(scan.slip[1, 0]) > 0.0
+    assert np.isfinite(ground["d_period_d_friction"][1, 0])
+
+
+@pytest.mark.slow
+def test_a_branch_on_real_ground_holds_gaits_that_repeat(near):
+    cycle = vrw.limit_cycle(SLOW, guess=near, model=GROUND, options=OPTIONS)
+    branch = vrw.continue_branch(
+        SLOW, "friction", (0.65, 0.75), cycle=cycle, model=GROUND, step_options=OPTIONS
+    )
+    assert branch.outcome == vrw.Outcome.STEPPED
+    assert branch.values.min() == pytest.approx(0.65)
+    assert branch.values.max() == pytest.approx(0.75)
+    assert float(branch.dataset.closure.max()) < 1e-8
+    assert branch.stable.all()
+    place = int(np.argmin(np.abs(branch.values - 0.7)))
+    slope = (branch.dataset.period[place + 1] - branch.dataset.period[place - 1]) / (
+        branch.values[place + 1] - branch.values[place - 1]
+    )
+    table = vrw.sensitivities(SLOW, measures=("period",), guess=near, model=GROUND, options=OPTIONS)
+    exact = table.derivative.sel(parameter="friction", measure="period")
+    np.testing.assert_allclose(slope, exact, rtol=0.05)
+
+
+@pytest.mark.slow
+def test_tuning_on_real_ground_climbs_along_the_gradient():
+    bounds = {"damping": (280.0, 320.0), "slope": (0.29, 0.31)}
+    tuned = vrw.tune(
+        SLOW, "dls_fraction", list(bounds), bounds, model=GROUND, options=OPTIONS, tolerance=1e-4
+    )
+    assert tuned.value > tuned.start_value
+    assert tuned.walked.outcome == vrw.Outcome.STEPPED
+    for name, sign in (("damping", 1.0), ("slope", -1.0)):
+        moved = vrw.WheelParams(**({"damping": 300.0} | {name: getattr(SLOW, name) * 1.001}))
+        walk = vrw.walk(moved, START, 60, model=GROUND, options=OPTIONS).steps
+        share = walk.durations[-1, 0] / jnp.sum(walk.durations[-1])
+        assert sign * float(share - tuned.start_value) > 0.0
+    assert float(tuned.params.damping) == pytest.approx(320.0)
+    assert float(tuned.params.slope) == pytest.approx(0.29)
+
+
+@pytest.mark.slow
+def test_one_sided_stoppers_never_pull_and_hardly_change_the_gait(near):
+    honest = vrw.UnilateralWheel(friction=0.7, one_sided=True)
+    walk = vrw.walk(SLOW, near, 12, model=honest)
+    step = vrw.step(SLOW, walk.steps.section_state[-1], model=honest)
+    bilateral = vrw.step(SLOW, near, model=GROUND)
+    assert int(step.outcome) == vrw.Outcome.STEPPED
+    assert float(bilateral.monitors.stopper_impulse) < -0.1  # which an honest stopper lets go
+    assert float(step.monitors.stopper_force) >= -1e-9
+    assert float(step.monitors.stopper_impulse) >= 0.0
+    assert abs(float(step.period / bilateral.period) - 1.0) < 0.007
+    assert int(step.events) > int(bilateral.events)
