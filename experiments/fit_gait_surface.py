@@ -36,7 +36,9 @@ def reached_by_continuation(problem: cycle_search.Problem, parameters: jax.Array
         start = cycle_search.start_from(problem, section, durations, jnp.ones(lanes, bool))
         home = jnp.broadcast_to(home, parameters.shape)
         stages = jnp.int32(N_STAGES)
-        return cycle_search.newton(problem, parameters, start, home, stages, jnp.ones(lanes, bool))
+        pending = jnp.ones(lanes, bool)
+        limit = problem.options.iterations
+        return cycle_search.newton(problem, parameters, start, home, stages, limit, pending)
 
     return jax.jit(in_blocks(continued, 64))(parameters)
 

@@ -119,6 +119,8 @@ class Linearised(NamedTuple):
 
     correction: Solution  # of Newton's method
     columns: Solution  # leading axis: derivatives with respect to each parameter asked for
+    ends: LaneArray  # (n, 2 dim, lanes): coordinates and rates at each step's end, corrected
+    d_ends: LaneArray  # leading axis: their derivatives with respect to each parameter
     monodromy: LaneArray  # (row, column, lanes): derivative of the return to the section
 
 
@@ -179,15 +181,17 @@ def inverse(matrix: Float[Array, "n n lanes"]) -> Float[Array, "n n lanes"]:
     return jnp.stack([jnp.stack(row) for row in adjugate]) / determinant
 
 
+@jax.custom_jvp
 def _eliminate(
     matrix: Float[Array, "nodes dim nodes dim lanes"],
     right: Float[Array, "nodes dim columns lanes"],
-    hold: Hold,
+    for_barrier: LaneArray,
 ) -> Float[Array, "nodes dim columns lanes"]:
     """Solve the node equations of one step, block by block without pivoting.
 
     The matrix is the mass matrix plus terms of order h; its diagonal blocks stay regular.
     """
+    hold = fusion_barrier(for_barrier)
     n, dim = matrix.shape[:2]
     rest = jnp.concatenate([matrix.reshape(n, dim, n * dim, -1), right], axis=2)
     rows: list[Array] = []
@@ -206,6 +210,17 @@ def _eliminate(
     return solved.reshape(n, dim, *solved.shape[1:])
 
 
+@_eliminate.defjvp
+def _eliminate_jvp(primals: tuple, tangents: tuple) -> tuple:
+    """A second solve, where differentiating the elimination itself would double all of it."""
+    (matrix, _, for_barrier), (d_matrix, d_right, _) = primals, tangents
+    solved = _eliminate(*primals)
+    n, dim = matrix.shape[:2]
+    flat = d_matrix.reshape(n, dim, n * dim, -1)
+    moved = _contract(flat, solved.reshape(n * dim, *solved.shape[2:]))
+    return solved, _eliminate(matrix, d_right - moved, for_barrier)
+
+
 def _push(function: Callable, primals: tuple, tangents: tuple) -> tuple:
     """Value and derivatives of `function` along tangents with a leading axis of columns."""
     columns = lambda *t: jax.jvp(function, primals, t)
@@ -213,18 +228,18 @@ def _push(function: Callable, primals: tuple, tangents: tuple) -> tuple:
 
 
 def _partials(
-    function: Callable, arguments: Sequence[Array], chosen: Sequence[int]
+    function: Callable[..., Vector], arguments: Sequence[Array]
 ) -> tuple[Vector, list[Vector]]:
-    """Value and partial derivatives by each chosen argument, with their structural zeros."""
-    value, partials = function(*arguments), []
-    for i in chosen:
+    """Value of an elementwise function, and each output's derivatives by all arguments.
 
-        def along(x: Array, i: int = i) -> Vector:
-            return function(*arguments[:i], x, *arguments[i + 1 :])
-
-        partials.append(jax.jvp(along, (arguments[i],), (jnp.ones_like(arguments[i]),))[1])
-    shape = value[0].shape
-    return value, [tuple(jnp.broadcast_to(x, shape) for x in partial) for partial in partials]
+    Backwards: a phase has fewer equations than arguments.
+    """
+    value, forward = jax.linearize(function, *arguments)
+    by_output = []
+    for i, output in enumerate(value):
+        backward = jax.linear_transpose(lambda *t, i=i: forward(*t)[i], *arguments)
+        by_output.append(backward(jnp.ones_like(output)))
+    return value, by_output
 
 
 class _Front(NamedTuple):
@@ -264,7 +279,7 @@ def _pass_phase(
     n_columns, n_wanted = front.dq.shape[0], len(wanted)
 
     unit = np.eye(n_columns, dtype=dtype)[:, :, None, None, None]
-    first, last, for_wanted = unit[0], unit[-1], unit[n_columns - 1 - n_wanted : -1]
+    first, last = unit[0], unit[-1]
 
     def left_over(*arguments: Array) -> Vector:
         """The residual by (q, v, acceleration, held, parameters)."""
@@ -292,15 +307,17 @@ def _pass_phase(
         arguments += [jnp.broadcast_to(x, Q[:, 0].shape) for x in front.held]
         n_moving = len(arguments)
         if n_wanted:
-            arguments += list(parameters)
-        chosen = (*range(n_moving), *(n_moving + i for i in wanted))
+            arguments += [jnp.broadcast_to(x, Q[:, 0].shape) for x in parameters]
         # As separate arrays first: each is a small kernel; stacking them is a copy.
-        value, partials = hold(_partials(left_over, arguments, chosen))
+        value, partials = hold(_partials(left_over, arguments))
+        by_argument = list(zip(*partials, strict=True))
         value, jacobian, forced = hold(
             (
                 jnp.stack(value, 1),
-                jnp.stack([jnp.stack(p, 1) for p in partials[:n_moving]], 2),
-                jnp.stack([jnp.stack(p, 1) for p in partials[n_moving:]]) if n_wanted else (),
+                jnp.stack([jnp.stack(p, 1) for p in by_argument[:n_moving]], 2),
+                jnp.stack([jnp.stack(by_argument[n_moving + i], 1) for i in wanted])
+                if n_wanted
+                else (),
             )
         )
 
@@ -310,15 +327,15 @@ def _pass_phase(
             jacobian[:, :, 3 * dim + s] * front.d_held[:, s, None, None]
             for s in range(front.held.shape[0])
         ]
-        if n_wanted:
-            terms += [for_wanted[i] * forced[i] for i in range(n_wanted)]
         right = sum(terms, start=first * value)
+        if n_wanted:
+            right = right.at[n_columns - 1 - n_wanted : -1].add(forced)
         twice, once = (m.astype(dtype)[:, None, :, None, None] for m in (TWICE, ONCE))
         by_q, by_v, by_a = (jacobian[:, :, None, i * dim : (i + 1) * dim] for i in range(3))
         own_node = np.eye(N_NODES, dtype=dtype)[:, None, :, None, None]
         matrix = own_node * by_a + h * (h * twice * by_q + once * by_v)
         matrix, right = hold((matrix, -jnp.moveaxis(right, 0, 2)))
-        da = hold(_eliminate(matrix, right, hold))  # (node, row, column, lane)
+        da = hold(_eliminate(matrix, right, parameters))  # (node, row, column, lane)
 
         by_column = jnp.moveaxis(da, 2, 0)
         sum_once, sum_twice = _weigh(ENDS_ONCE, a), _weigh(ENDS_TWICE, a)
@@ -358,16 +375,15 @@ def _leave_phase(
         return phase.event(constants, point), tuple(stack(x) for x in after)
 
     n_columns = front.dq.shape[0]
-    zeros_before = n_columns - 1 - n_parameters
-    padded = tuple(
-        jnp.concatenate([jnp.zeros((zeros_before, *x.shape[1:]), x.dtype), x, 0.0 * duration[None]])
-        for x in d_constants
-    )
-    (event, after), (d_event, d_after) = _push(
-        end,
-        (front.held, front.q, front.v, *constants),
-        (front.d_held, front.dq, front.dv, *padded),
-    )
+    place, d_place = (front.held, front.q, front.v), (front.d_held, front.dq, front.dv)
+    if n_parameters:
+        zeros_before = n_columns - 1 - n_parameters
+        around = ((zeros_before, 1), *((0, 0),) * duration.ndim)
+        padded = (jnp.pad(x, around) for x in d_constants)
+        told = _push(end, (*place, *constants), (*d_place, *padded))
+    else:
+        told = _push(lambda *place: end(*place, *constants), place, d_place)
+    (event, after), (d_event, d_after) = told
     unit = np.eye(n_columns, dtype=duration.dtype)[:, :, None]
     event = jnp.where(happens, event, duration)
     d_event = jnp.where(happens, d_event, unit[-1])
@@ -421,7 +437,10 @@ def linearised_pass(
     def one_step(carry: tuple, inputs: tuple) -> tuple:
         section, d_section = carry
         durations, accelerations, happens = inputs
-        begin = _push(start, (section, *constants), (d_section, *full_d_constants))
+        if n_wanted:
+            begin = _push(start, (section, *constants), (d_section, *full_d_constants))
+        else:
+            begin = _push(lambda x: start(x, *constants), (section,), (d_section,))
         front = _Front(*begin[0], *begin[1])
         d_durations, d_accelerations = [], []
         for i, phase in enumerate(sequence.phases):
@@ -437,6 +456,9 @@ def linearised_pass(
                 meshes[i],
                 hold,
             )
+            end, d_end = (
+                jnp.concatenate(x, -2) for x in ((front.q, front.v), (front.dq, front.dv))
+            )
             front, d_duration, eliminate = _leave_phase(
                 phase, constants, d_constants, front, durations[i], happens[i]
             )
@@ -444,7 +466,9 @@ def linearised_pass(
             # Columns first, then steps: (column, step, node, row, lane).
             d_accelerations.append(eliminate(jnp.swapaxes(columns, 0, 1)))
             front = hold(front)
-        return (front.q, front.dq), (jnp.stack(d_durations, 1), tuple(d_accelerations))
+        # The end is that of the last phase.
+        traced = end, eliminate(d_end), jnp.stack(d_durations, 1), tuple(d_accelerations)
+        return (front.q, front.dq), traced
 
     if solution.durations.shape[0] == 1:
         inputs = jax.tree.map(lambda x: x[0], (solution.durations, solution.accelerations, happens))
@@ -470,12 +494,14 @@ def linearised_pass(
         ]
         return columns[own] + sum(by_section[1:], start=by_section[0])
 
-    d_durations, d_accelerations = hold(traced)
-    changes = Solution(d_closed, close(d_durations), tuple(close(x) for x in d_accelerations))
-    changes = hold(changes)
+    ends, *d_others = hold(traced)
+    d_ends, d_durations, d_accelerations = jax.tree.map(close, tuple(d_others))
+    d_ends, changes = hold((d_ends, Solution(d_closed, d_durations, d_accelerations)))
     return Linearised(
         correction=jax.tree.map(lambda x: x[0], changes),
         columns=jax.tree.map(lambda x: x[1:], changes),
+        ends=ends + d_ends[0],
+        d_ends=d_ends[1:],
         monodromy=monodromy,
     )
 

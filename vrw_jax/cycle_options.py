@@ -14,11 +14,12 @@ class CycleOptions:
     growth: float = 2.0  # last over first step in SLS-I
     tolerance: float = 1e-10  # of Newton's last correction, rad, rad/s, s or m
     iterations: int = 12  # of Newton's method per attempt
+    first_iterations: int = 4  # after which a batch gathers the wheels that need more
     stages: int = 12  # of a homotopy from Table 1, where the first attempt fails
     block: int = 64  # wheels that are solved side by side
 
     def __post_init__(self) -> None:
-        for name in ("iterations", "stages", "block"):
+        for name in ("iterations", "first_iterations", "stages", "block"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, but it must be at least 1.")
         for name in ("growth", "tolerance"):

@@ -22,6 +22,7 @@ from vrw_jax.collocation import (
     Mesh,
     PhaseSequence,
     Solution,
+    fusion_barrier,
     linearised_pass,
     walk_through,
 )
@@ -74,12 +75,14 @@ class Located(NamedTuple):
     solution: Solution
     happens: LaneArray  # (n, n_phases, lanes): 1 where the phase takes place, else 0
     found: LaneArray  # (lanes,): 1 for a limit cycle, 0 where there is none and values stand in
+    ends: LaneArray  # (n, 4, lanes): theta, L1 and their rates at the end of each step
 
 
 class Finding(NamedTuple):
     """The result of a search, lanes last."""
 
     located: Located
+    columns: Located | None  # derivatives by the parameters `wanted`, leading axis
     monodromy: LaneArray  # (row, column, lanes)
     residual: LaneArray  # size of Newton's last correction
     passes: Int[Array, " lanes"]  # linearised passes spent
@@ -122,7 +125,14 @@ def start_from(problem: Problem, section: Array, durations: Array, with_dls: Arr
     happens = happens.at[:, 0].set(jnp.where(with_dls, 1.0, 0.0))
     durations = jnp.broadcast_to(durations, (n, n_phases, lanes))
     solution = Solution(section, durations, accelerations)
-    return Located(solution, happens, jnp.zeros((lanes,), section.dtype))
+    return Located(solution, happens, *nothing_known(problem, section))
+
+
+def nothing_known(problem: Problem, section: Array) -> tuple[LaneArray, LaneArray]:
+    """`found` and `ends` of a start."""
+    lanes, n_ends = section.shape[1:], 2 * problem.sequence.phases[-1].dim
+    zeros = lambda *shape: jnp.zeros((*shape, *lanes), section.dtype)
+    return zeros(), zeros(problem.period_n, n_ends)
 
 
 def over_rows(combine: Callable[[Array, Array], Array], x: Array) -> LaneArray:
@@ -164,9 +174,25 @@ def _limited(solution: Solution, correction: Solution) -> LaneArray:
     return jnp.minimum(1.0, share)
 
 
+def columns_of(passed: Linearised, located: Located) -> Located | None:
+    """The columns of a pass, if any were wanted; what selects a solution has none."""
+    if not passed.d_ends.shape[0]:
+        return None
+    flat = lambda x: jnp.zeros((passed.d_ends.shape[0], *x.shape), x.dtype)
+    return Located(passed.columns, flat(located.happens), flat(located.found), passed.d_ends)
+
+
+def no_columns(located: Located, wanted: tuple[int, ...]) -> Located | None:
+    """Zeros in place of columns."""
+    if not wanted:
+        return None
+    return jax.tree.map(lambda x: jnp.zeros((len(wanted), *x.shape), x.dtype), located)
+
+
 class _Iterate(NamedTuple):
     iteration: Int[Array, ""]
-    solution: Solution
+    located: Located
+    columns: Located | None
     monodromy: LaneArray
     residual: LaneArray
     converged: Bool[Array, " lanes"]
@@ -180,7 +206,9 @@ def newton(
     start: Located,
     origin: Parameters,
     stages: Array,
+    iterations: Array | int,
     pending: Bool[Array, " lanes"],
+    wanted: tuple[int, ...] = (),
 ) -> Finding:
     """Newton's method with limited steps on the lanes that are `pending`.
 
@@ -199,22 +227,29 @@ def newton(
         )
         arrived = share >= 1.0
         here = jnp.where(arrived, parameters, origin + share * (parameters - origin))
-        passed = problem.pass_at(here, start._replace(solution=now.solution))
+        solution = now.located.solution
+        passed = problem.pass_at(here, now.located, wanted)
         correction = passed.correction
-        step_size = correction_size(now.solution, correction)
+        step_size = correction_size(solution, correction)
         sound = jnp.isfinite(step_size)
-        share_of_step = _limited(now.solution, correction)
+        share_of_step = _limited(solution, correction)
         moves = now.running & sound
+        take = lambda new, old: jnp.where(moves, new, old)
 
         def moved(x: Array, change: Array) -> Array:
             return jnp.where(moves, x + share_of_step * jnp.where(moves, change, 0.0), x)
 
         converged = moves & arrived & (step_size < tolerance)
+        located = now.located._replace(
+            solution=jax.tree.map(moved, solution, correction),
+            ends=take(passed.ends, now.located.ends),
+        )
         return _Iterate(
             iteration=now.iteration + 1,
-            solution=jax.tree.map(moved, now.solution, correction),
-            monodromy=jnp.where(moves, passed.monodromy, now.monodromy),
-            residual=jnp.where(moves, step_size, now.residual),
+            located=located,
+            columns=jax.tree.map(take, columns_of(passed, located), now.columns),
+            monodromy=take(passed.monodromy, now.monodromy),
+            residual=take(step_size, now.residual),
             converged=now.converged | converged,
             running=moves & ~converged,
             passes=now.passes + now.running,
@@ -222,19 +257,20 @@ def newton(
 
     first = _Iterate(
         iteration=jnp.zeros((), jnp.int32),
-        solution=start.solution,
+        located=start,
+        columns=no_columns(start, wanted),
         monodromy=jnp.zeros((size, size, lanes), parameters.dtype),
         residual=jnp.ones((lanes,), parameters.dtype),
         converged=jnp.zeros((lanes,), bool),
         running=pending,
         passes=jnp.zeros((lanes,), jnp.int32),
     )
-    going = lambda now: jnp.any(now.running) & (now.iteration < options.iterations + stages)
+    going = lambda now: jnp.any(now.running) & (now.iteration < iterations + stages)
     last = lax.while_loop(going, iterate, first)
-    located = Located(last.solution, start.happens, start.found)
-    found = last.converged & signs_hold(problem, parameters, located)
-    located = located._replace(found=found.astype(parameters.dtype))
-    return Finding(located, last.monodromy, last.residual, last.passes)
+    found = last.converged & signs_hold(problem, parameters, last.located)
+    located = last.located._replace(found=found.astype(parameters.dtype))
+    columns = jax.tree.map(lambda x: jnp.where(found, x, 0.0), last.columns)
+    return Finding(located, columns, last.monodromy, last.residual, last.passes)
 
 
 def signs_hold(problem: Problem, parameters: Parameters, located: Located) -> Bool[Array, " lanes"]:
@@ -242,6 +278,7 @@ def signs_hold(problem: Problem, parameters: Parameters, located: Located) -> Bo
     sequence = problem.sequence
     constants = problem.constants_of(*parameters)
     solution = located.solution
+    hold = fusion_barrier(parameters)
 
     def step(carry: tuple, inputs: tuple) -> tuple:
         section, good = carry
@@ -251,13 +288,14 @@ def signs_hold(problem: Problem, parameters: Parameters, located: Located) -> Bo
             sequence, problem.meshes, constants, tuple(section), durations, accelerations
         )
         for i, (phase, passage) in enumerate(zip(sequence.phases, passages, strict=True)):
-            inside = durations[i] > 0.0
-            for guard in phase.guards(constants, passage.nodes):
-                inside &= over_rows(jnp.minimum, guard) > 0.0
-            for guard in phase.guards(constants, passage.start):
-                inside &= guard > 0.0
-            for guard in phase.guards(constants, passage.end):
-                inside &= guard > -ZERO_AT_EVENT
+            everywhere = jax.tree.map(
+                lambda start, nodes, end: jnp.concatenate([start[None], nodes, end[None]]),
+                *(point._replace(held=()) for point in passage),
+            )
+            guards = phase.guards(constants, everywhere._replace(held=passage.start.held))
+            worst = functools.reduce(jnp.minimum, guards)
+            worst = worst.at[-1].add(ZERO_AT_EVENT)
+            inside = (durations[i] > 0.0) & (over_rows(jnp.minimum, hold(worst)) > 0.0)
             good &= inside | ~happens[i]
         for check in sequence.border_checks(constants, passages, happens):
             good &= check > 0.0
@@ -269,35 +307,46 @@ def signs_hold(problem: Problem, parameters: Parameters, located: Located) -> Bo
     return good
 
 
-def search(problem: Problem, parameters: Parameters, guess: Located | None) -> Finding:
-    """A limit cycle for each lane, by several attempts in turn.
+def search(
+    problem: Problem,
+    parameters: Parameters,
+    guess: Located | None,
+    wanted: tuple[int, ...] = (),
+) -> Finding:
+    """A limit cycle for each lane, by several attempts in turn; see ATTEMPTS.
 
-    Parameters must be usable. After the guess, if any, come the gait that the stored surface
-    predicts, a homotopy from Table 1, and a cycle without double support.
+    Parameters must be usable. With `wanted`, every pass carries the columns of these parameters.
     """
     options = problem.options
     n_lanes = parameters.shape[-1]
     block = min(options.block, n_lanes)
     table_1 = parameters_of(WheelParams(n_legs=problem.n_legs)).astype(parameters.dtype)
+    iterations = dict.fromkeys(ATTEMPTS, options.iterations) | {
+        "guess": options.first_iterations, "surface": options.first_iterations
+    }  # fmt: skip
+    limits = jnp.asarray([iterations[name] for name in ATTEMPTS], jnp.int32)
+    is_now = lambda attempt, name: attempt == ATTEMPTS.index(name)
 
     def start_of(attempt: Array, parameters: Parameters) -> tuple[Located, Array, Array]:
         origin = jnp.broadcast_to(table_1[:, None], parameters.shape)
-        is_homotopy = attempt == HOMOTOPY
+        is_homotopy = is_now(attempt, "homotopy")
         place = jnp.where(is_homotopy, origin, parameters)
-        with_dls = jnp.broadcast_to(attempt != WITHOUT_DLS, parameters.shape[-1:])
+        with_dls = jnp.broadcast_to(~is_now(attempt, "without DLS"), parameters.shape[-1:])
         stages = jnp.where(is_homotopy, options.stages, 0)
         return surface_start(problem, place, with_dls), origin, stages
 
     def attempt_block(
-        attempt: Array, parameters: Parameters, now: Finding, guess: object
+        attempt: Array, parameters: Parameters, now: Finding, guess: Located | None
     ) -> Finding:
         start, origin, stages = start_of(attempt, parameters)
+        goes_on = is_now(attempt, "guess, on") | is_now(attempt, "surface, on")
+        start = jax.tree.map(lambda s, n: jnp.where(goes_on, n, s), start, now.located)
         if guess is not None:
-            start = jax.tree.map(lambda g, s: jnp.where(attempt < 0, g, s), guess, start)
+            is_guess = is_now(attempt, "guess")
+            start = jax.tree.map(lambda s, g: jnp.where(is_guess, g, s), start, guess)
         pending = now.located.found < 0.5
-        tried = newton(problem, parameters, start, origin, stages, pending)
-        better = pending & ((tried.located.found > 0.5) | (tried.residual < now.residual))
-        chosen = jax.tree.map(lambda a, b: jnp.where(better, a, b), tried, now)
+        tried = newton(problem, parameters, start, origin, stages, limits[attempt], pending, wanted)
+        chosen = jax.tree.map(lambda a, b: jnp.where(pending, a, b), tried, now)
         return chosen._replace(passes=now.passes + tried.passes)
 
     def attempt_all(attempt: Array, now: Finding) -> Finding:
@@ -318,16 +367,18 @@ def search(problem: Problem, parameters: Parameters, guess: Located | None) -> F
         back = jnp.argsort(order)
         return jax.tree.map(lambda x: x[..., back], after)
 
-    first = jnp.asarray(0 if guess is None else -1, jnp.int32)
-    start, _, _ = start_of(jnp.asarray(0, jnp.int32), parameters)
+    first = jnp.asarray(ATTEMPTS.index("surface" if guess is None else "guess"), jnp.int32)
+    start = jax.eval_shape(lambda: start_of(first, parameters)[0])
+    start = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), start)
     size = problem.sequence.section_size
     nothing = Finding(
         start,
+        no_columns(start, wanted),
         jnp.zeros((size, size, n_lanes), parameters.dtype),
         jnp.full((n_lanes,), jnp.inf, parameters.dtype),
         jnp.zeros((n_lanes,), jnp.int32),
     )
-    more = lambda c: (c[0] <= WITHOUT_DLS) & jnp.any(c[1].located.found < 0.5)
+    more = lambda c: (c[0] < len(ATTEMPTS)) & jnp.any(c[1].located.found < 0.5)
     _, finding = lax.while_loop(more, lambda c: (c[0] + 1, attempt_all(*c)), (first, nothing))
     return finding
 
@@ -335,5 +386,7 @@ def search(problem: Problem, parameters: Parameters, guess: Located | None) -> F
 ZERO_AT_EVENT = 1e-6
 """How far below zero a guard may be at the end of the phase that it ends, N, m or rad/s."""
 
-HOMOTOPY, WITHOUT_DLS = 1, 2
-"""Numbers of the attempts after the first, which trusts the surface."""
+ATTEMPTS = ("guess", "guess, on", "surface", "surface, on", "homotopy", "without DLS")
+"""In turn: from the guess, if any; from the gait that the stored surface predicts; by a homotopy
+from Table 1; and for a cycle without double support. The first two begin with a few iterations, so
+that in a batch the lanes that need more can be gathered in blocks of their own."""

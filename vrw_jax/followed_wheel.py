@@ -22,6 +22,7 @@ from vrw_jax.cycle_search import (
     Located,
     Problem,
     correction_size,
+    nothing_known,
     parameters_of,
     wheel_of,
 )
@@ -126,7 +127,7 @@ def _linearised(
 
     Jitted so that it is traced once, however often a loop over lanes looks at its body.
     """
-    located = Located(z, happens, parameters[0])
+    located = Located(z, happens, *nothing_known(problem, z.section))
     passed = problem.pass_at(parameters, located, (index,))
     return passed.correction, jax.tree.map(lambda x: x[0], passed.columns), passed.monodromy
 

@@ -72,3 +72,11 @@ def from_blocks(tree: PyTree, n_lanes: int) -> PyTree:
         return moved.reshape(*moved.shape[:-2], -1)[..., :n_lanes]
 
     return jax.tree.map(join, tree)
+
+
+def compiled_by_caller() -> bool:
+    """Whether an enclosing `jit` compiles whatever is called here.
+
+    A jit within it would only trace the function once more: under a derivative, in vain.
+    """
+    return isinstance(jnp.zeros(()), jax.core.Tracer)

@@ -6,7 +6,7 @@ and reverse mode, and to any order.
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import overload
 
 import equinox as eqx
@@ -18,19 +18,22 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from vrw_jax import dynamics, transitions
 from vrw_jax import multipliers as floquet
-from vrw_jax.collocation import N_NODES, Solution, walk_through
+from vrw_jax.collocation import N_NODES, Solution
 from vrw_jax.cycle_options import CycleOptions
 from vrw_jax.cycle_search import (
+    Finding,
     Located,
     Parameters,
     Problem,
+    columns_of,
+    nothing_known,
     parameters_of,
     search,
     wheel_of,
 )
 from vrw_jax.derivatives import on_branch, push, total_derivative, without_derivative
 from vrw_jax.geometry import Motion
-from vrw_jax.lanes import one_wheel
+from vrw_jax.lanes import compiled_by_caller, one_wheel
 from vrw_jax.models import AbstractWheel, ViscoelasticWheel
 from vrw_jax.models.base import Indicators, Margins, SectionState
 from vrw_jax.options import Options
@@ -86,7 +89,8 @@ class LimitCycle(eqx.Module):
     @property
     def monodromy(self) -> Float[Array, "... 2 2"]:
         """Derivative of the return to the section after the impact, over (theta+, dtheta+)."""
-        attach = functools.partial(_attach_monodromy, self.problem)
+        attach_one = _attach_monodromy if compiled_by_caller() else _compiled_attach
+        attach = functools.partial(attach_one, self.problem)
         for _ in range(self.outcome.ndim):
             attach = jax.vmap(attach)
         return attach(self.matrix, self.parameters, self.located)
@@ -154,12 +158,9 @@ class LimitCycle(eqx.Module):
 
 def _tangent_space(problem: Problem, parameters: Parameters, located: Located) -> Located:
     """d located / d parameters over lanes, with a leading axis; zero where nothing was found."""
-    wanted = tuple(range(parameters.shape[0]))
-    found = located.found > 0.5
-    columns = problem.pass_at(parameters, located, wanted).columns
-    columns = jax.tree.map(lambda x: jnp.where(found, x, 0.0), columns)
-    flat = lambda x: jnp.zeros((len(wanted), *x.shape), x.dtype)
-    return Located(columns, flat(located.happens), flat(located.found))
+    passed = problem.pass_at(parameters, located, tuple(range(parameters.shape[0])))
+    columns = columns_of(passed, located)
+    return jax.tree.map(lambda x: jnp.where(located.found > 0.5, x, 0.0), columns)
 
 
 def _monodromy_over_lanes(problem: Problem, parameters: Parameters, located: Located) -> Array:
@@ -169,29 +170,41 @@ def _monodromy_over_lanes(problem: Problem, parameters: Parameters, located: Loc
 
 def _solve(problem: Problem, parameters: Array, guess: Located | None) -> tuple[Located, tuple]:
     """Search for one wheel, differentiable in its parameters; the guess has no derivative."""
-    tangent_space = functools.partial(_tangent_space, problem)
+    block = problem.options.block
 
-    if guess is None:
-        find = one_wheel(lambda parameters: search(problem, parameters, None))
-    else:
-        find = one_wheel(lambda parameters, guess: search(problem, parameters, guess))
+    def searching(wanted: tuple[int, ...]) -> Callable[..., Finding]:
+        return one_wheel(lambda p, g=None: search(problem, p, g, wanted))
+
+    def parts(finding: Finding) -> tuple[Located, tuple]:
+        return finding.located, (finding.monodromy, finding.residual, finding.passes)
 
     @jax.custom_jvp
     def solve(parameters: Array, *guess: Located) -> tuple[Located, tuple]:
-        finding = find(parameters, *guess)
-        return finding.located, (finding.monodromy, finding.residual, finding.passes)
+        return parts(searching(())(parameters, *guess))
 
+    @jax.custom_jvp
+    def solve_with_columns(parameters: Array, *guess: Located) -> tuple:
+        finding = searching(tuple(range(parameters.shape[0])))(parameters, *guess)
+        return *parts(finding), finding.columns
+
+    @solve.defjvp
     def rule(primals: tuple, tangents: tuple) -> tuple:
-        located, other = solve(*primals)
-        columns = on_branch(tangent_space, tangent_space, problem.options.block)
-        tangent = push(columns(primals[0], located), tangents[0])
-        return (located, other), (tangent, without_derivative(other))
+        located, other, columns = solve_with_columns(*primals)
+        return (located, other), (push(columns, tangents[0]), without_derivative(other))
 
-    solve.defjvp(rule)
+    @solve_with_columns.defjvp
+    def second_rule(primals: tuple, tangents: tuple) -> tuple:
+        located, other, columns = solve_with_columns(*primals)
+        tangent_space = functools.partial(_tangent_space, problem)
+        curvature = on_branch(total_derivative(tangent_space, tangent_space), tangent_space, block)(
+            primals[0], located
+        )
+        tangent = push((columns, curvature), tangents[0])
+        return (located, other, columns), (tangent[0], without_derivative(other), tangent[1])
+
     return solve(parameters, *(() if guess is None else (guess,)))
 
 
-@functools.partial(jax.jit, static_argnums=0)
 def _attach_monodromy(
     problem: Problem, matrix: Array, parameters: Array, located: Located
 ) -> Array:
@@ -213,8 +226,15 @@ def _attach_monodromy(
     return attach(matrix, parameters, located)
 
 
-@eqx.filter_jit
+_compiled_attach = jax.jit(_attach_monodromy, static_argnums=0)
+
+
 def _limit_cycle(params: WheelParams, problem: Problem, guess: Located | None) -> LimitCycle:
+    find = _find_cycle if compiled_by_caller() else _compiled_find_cycle
+    return find(params, problem, guess)
+
+
+def _find_cycle(params: WheelParams, problem: Problem, guess: Located | None) -> LimitCycle:
     usable = params.in_domain()
     table_1 = WheelParams(n_legs=problem.n_legs)
     safe = jax.tree.map(lambda x, d: jnp.where(usable, x, d.astype(x.dtype)), params, table_1)
@@ -227,20 +247,9 @@ def _limit_cycle(params: WheelParams, problem: Problem, guess: Located | None) -
     parameters = jax.tree.map(stand_in, parameters, parameters_of(table_1).astype(parameters.dtype))
 
     s = wheel_of(parameters, problem.n_legs).symbols()
-    constants = problem.constants_of(*parameters)
     n = problem.period_n
-    section = tuple(located.solution.section)
-    sections, states, landings = [], [], []
-    for k in range(n):
-        sections.append(section)
-        durations, accelerations = jax.tree.map(
-            lambda x, k=k: x[k], (located.solution.durations, located.solution.accelerations)
-        )
-        section, passages = walk_through(
-            problem.sequence, problem.meshes, constants, section, durations, accelerations
-        )
-        end = passages[-1].end
-        states.append(jnp.stack([end.q[0], *end.v]))
+    # theta, its rate and that of L1: L1 itself follows from theta at touchdown.
+    states = [jnp.stack([end[0], *end[2:]]) for end in located.ends]
     # The landing that opens step k follows the state at the end of the step before.
     landings = [transitions.land(s, *states[k - 1]) for k in range(n)]
     forces = [transitions.landing_forces(s, landing) for landing in landings]
@@ -252,7 +261,7 @@ def _limit_cycle(params: WheelParams, problem: Problem, guess: Located | None) -
     code = jnp.where(found, Outcome.STEPPED, Outcome.NO_CYCLE_FOUND)
     return LimitCycle(
         section_state=masked(states[-1]),
-        post_impact=masked(jnp.stack(sections[0])),
+        post_impact=masked(located.solution.section),
         durations=masked(durations[0] if n == 1 else durations),
         step_length=over_steps([landing.distance for landing in landings]),
         indicators=Indicators(
@@ -269,6 +278,8 @@ def _limit_cycle(params: WheelParams, problem: Problem, guess: Located | None) -
         problem=problem,
     )
 
+
+_compiled_find_cycle = eqx.filter_jit(_find_cycle)
 
 N_SAMPLES = 1025
 """Points of each phase between which a walked guess is interpolated. With too few, 33 at c = 221,
@@ -293,7 +304,7 @@ def _walked_guess(params: WheelParams, problem: Problem, x: SectionState) -> Loc
     by_phase = tuple(jnp.stack(steps) for steps in zip(*accelerations, strict=True))
     happens = (together > 0.0).astype(section.dtype)
     solution = Solution(section, together, by_phase)
-    return lax.stop_gradient(Located(solution, happens, jnp.zeros((), section.dtype)))
+    return lax.stop_gradient(Located(solution, happens, *nothing_known(problem, section)))
 
 
 def _accelerations_along(

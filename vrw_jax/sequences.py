@@ -146,7 +146,9 @@ def _phases(n_legs: int) -> tuple[Phase, Phase]:
         return point.q[2] / s.L0 - 1.0
 
     def sls1_reset(constants: Constants, point: Point) -> Point:
-        m = transitions.hit_stopper(symbols(constants), _single_support_1(point)).motion
+        s = symbols(constants)
+        before = _single_support_1(point)
+        m = transitions.stopped(s, before._replace(L2=s.L0 + 0.0 * before.L2))
         return Point((), (point.q[0], m.L1), (m.dtheta, m.dL1))
 
     def sls1_guards(constants: Constants, point: Point) -> Vector:
@@ -178,8 +180,7 @@ def _last_phase(n_legs: int) -> Phase:
     def reset(constants: Constants, point: Point) -> Point:
         s = symbols(constants)
         (theta, _), (dtheta, dL1) = point.q, point.v
-        landing = transitions.land(s, theta, dtheta, dL1)
-        return Point((), (landing.theta, landing.motion.dtheta), ())
+        return Point((), transitions.land_on_both(s, theta, dtheta, dL1), ())
 
     def guards(constants: Constants, point: Point) -> Vector:
         s = symbols(constants)

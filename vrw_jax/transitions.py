@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from vrw_jax.dynamics import (
     FootForce,
+    MassMatrix,
     double_support_acceleration,
     foot_force_from_residual,
     fore_foot_force,
@@ -53,43 +54,67 @@ def motion_before_landing(
     return Motion.of(theta, L1, s.L0 + zero, dtheta, dL1, zero)
 
 
-def land(s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise) -> Landing:
-    """Exchange of legs and inelastic landing, eqs (15)-(21), (A1)-(A4).
+class _HeldLanding(NamedTuple):
+    """The landing that leaves both feet on the ground (A1), and what led to it."""
 
-    theta, dtheta, dL1 are the section state just before touchdown in the labels of the step that
-    ends; the result is in the labels of the step that begins.
-    """
+    before: Motion
+    after: Motion
+    distance: Elementwise
+    foot: tuple[Elementwise, Elementwise]  # velocity of the landing foot before, m/s
+    mass: MassMatrix  # in the labels of the step that begins
+    momentum: tuple[Elementwise, ...]  # along its coordinates, about the new foot
+    row: tuple[Elementwise, ...]  # mass matrix times the tangent of the hub's circle
+
+
+def _held_landing(
+    s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise
+) -> _HeldLanding:
     before = motion_before_landing(s, theta, dtheta, dL1)
     reach = before.L1
     # Velocity of the landing foot, eqs (16), (17) with the rate of L1 before the impact.
-    ahead = landing_direction(s, before.sin, before.cos)
-    foot_x = (reach * before.cos - s.L0 * ahead.cos) * dtheta + dL1 * before.sin
-    foot_z = -(reach * before.sin - s.L0 * ahead.sin) * dtheta + dL1 * before.cos
+    sin, cos = landing_direction(s, before.sin, before.cos)
+    foot_x = (reach * before.cos - s.L0 * cos) * dtheta + dL1 * before.sin
+    foot_z = -(reach * before.sin - s.L0 * sin) * dtheta + dL1 * before.cos
 
-    theta_new = theta - s.alpha
-    sin, cos = ahead
     rear = rear_direction(s, sin, cos)
     M = mass_matrix(s, s.L0, reach)
     # Generalised momentum of (theta, L1, L2) about the new foot, whose velocity still counts.
-    rates = (dtheta, 0.0 * dtheta, dL1)
-    p = M.times(rates)
+    p = M.times((dtheta, 0.0 * dtheta, dL1))
     A, B = s.Mh * s.L0 + s.m * s.L0, s.m * (s.L0 - reach)
     p1 = p[0] + (A * cos + B * rear.cos) * foot_x - (A * sin + B * rear.sin) * foot_z
     p2 = p[1] + s.Mh * (sin * foot_x + cos * foot_z)
     p3 = p[2] - s.m * (rear.sin * foot_x + rear.cos * foot_z)
 
     # (A1) both feet held: the hub may only move on its circle.
-    distance = foot_distance(s, theta_new)
+    distance = foot_distance(s, theta - s.alpha)
     circle = double_support_circle(s, distance, sin, cos)
     row = M.times((jnp.ones_like(circle.G1), circle.G1, circle.G2))
     inertia = row[0] + circle.G1 * row[1] + circle.G2 * row[2]
     held = (p1 + circle.G1 * p2 + circle.G2 * p3) / inertia
-    rear_impulse = foot_force_from_residual(
-        s,
-        Motion(sin, cos, s.L0, reach, held, circle.G1 * held, circle.G2 * held),
-        row[1] * held - p2,
-        row[2] * held - p3,
+    full = s.L0 + 0.0 * reach
+    after = Motion(sin, cos, full, reach, held, circle.G1 * held, circle.G2 * held)
+    return _HeldLanding(before, after, distance, (foot_x, foot_z), M, (p1, p2, p3), row)
+
+
+def land_on_both(
+    s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise
+) -> tuple[Elementwise, Elementwise]:
+    """(theta+, dtheta+) of a landing that leaves both feet on the ground: `land`, and no more."""
+    return theta - s.alpha, _held_landing(s, theta, dtheta, dL1).after.dtheta
+
+
+def land(s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise) -> Landing:
+    """Exchange of legs and inelastic landing, eqs (15)-(21), (A1)-(A4).
+
+    theta, dtheta, dL1 are the section state just before touchdown in the labels of the step that
+    ends; the result is in the labels of the step that begins.
+    """
+    before, on_both, distance, (foot_x, foot_z), M, (p1, p2, p3), row = _held_landing(
+        s, theta, dtheta, dL1
     )
+    sin, cos, reach = on_both.sin, on_both.cos, before.L1
+    held = on_both.dtheta
+    rear_impulse = foot_force_from_residual(s, on_both, row[1] * held - p2, row[2] * held - p3)
     stays = rear_impulse.normal >= 0.0
 
     # (A3) only the landing foot held: M rates = p, Leg 2 eliminated by its own row.
@@ -102,18 +127,14 @@ def land(s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise) 
     free_dL1 = (A11 * F2 - A12 * F1) * inverse
     free_dL2 = p3 / s.m + q * free_dtheta + s.cos_alpha * free_dL1
 
-    after = Motion(
-        sin,
-        cos,
-        s.L0 + 0.0 * reach,
-        reach,
-        jnp.where(stays, held, free_dtheta),
-        jnp.where(stays, circle.G1 * held, free_dL1),
-        jnp.where(stays, circle.G2 * held, free_dL2),
+    after = on_both._replace(
+        dtheta=jnp.where(stays, held, free_dtheta),
+        dL1=jnp.where(stays, on_both.dL1, free_dL1),
+        dL2=jnp.where(stays, on_both.dL2, free_dL2),
     )
     # Impulses of the ground: the jump of total momentum, less what the rear foot took.
     px, pz = momentum(s, after)
-    moving = Motion(sin, cos, s.L0, reach, *rates)
+    moving = Motion(sin, cos, s.L0, reach, dtheta, 0.0 * dtheta, dL1)
     before_x, before_z = momentum(s, moving)
     taken = FootForce(
         jnp.where(stays, rear_impulse.tangential, 0.0), jnp.where(stays, rear_impulse.normal, 0.0)
@@ -124,7 +145,7 @@ def land(s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise) 
     )
     hub_before, hub_after = hub_velocity(before), hub_velocity(after)
     return Landing(
-        theta=theta_new,
+        theta=theta - s.alpha,
         motion=after,
         distance=distance,
         stays=stays,
@@ -132,6 +153,16 @@ def land(s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise) 
         rear=rear_impulse,
         energy_lost=kinetic_energy(s, before) - kinetic_energy(s, after),
         hub_jump=(hub_after[0] - hub_before[0], hub_after[1] - hub_before[1]),
+    )
+
+
+def stopped(s: Symbols, before: Motion) -> Motion:
+    """The motion after Leg 2, at L2 = L0, has met its stopper."""
+    M = mass_matrix(s, before.L1, before.L2)
+    return before._replace(
+        dtheta=before.dtheta + M.M13 * before.dL2 / M.M11,
+        dL1=before.dL1 + M.M23 * before.dL2 / M.M22,
+        dL2=0.0 * before.dL2,
     )
 
 
@@ -151,12 +182,7 @@ def hit_stopper(s: Symbols, motion: Motion) -> StopperHit:
     M12 vanishes there, so the impact is two divisions.
     """
     before = motion._replace(L2=s.L0 + 0.0 * motion.L2)
-    M = mass_matrix(s, before.L1, before.L2)
-    after = before._replace(
-        dtheta=before.dtheta + M.M13 * before.dL2 / M.M11,
-        dL1=before.dL1 + M.M23 * before.dL2 / M.M22,
-        dL2=0.0 * before.dL2,
-    )
+    after = stopped(s, before)
     hub_before, hub_after = hub_velocity(before), hub_velocity(after)
     jump = (hub_after[0] - hub_before[0], hub_after[1] - hub_before[1])
     rear = rear_direction(s, before.sin, before.cos)
