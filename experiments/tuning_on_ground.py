@@ -4,14 +4,13 @@
 
 Damping, stiffness, natural length and slope move in one box. On the paper's rung all premises that
 its gaits can keep are constraints; on real ground there are none. Each optimum is then evaluated on
-the other rung, and the optimum on real ground set beside the box's corners and random wheels of it.
+the other rung.
 """
 
 import csv
 from pathlib import Path
 
 import jax
-import numpy as np
 
 jax.config.update("jax_enable_x64", True)
 
@@ -25,14 +24,11 @@ BOX = {
     "slope": (0.26, 0.34),
 }
 ON_PAPER = BOX | {"damping": (20.0, 215.0)}  # beyond it the rear foot lifts off in the landing
-STARTS = (  # dampings on real ground from which slow gaits are climbed, else Table 1
-    250.0,
-    300.0,
-    380.0,
+DAMPING = (
+    300.0  # of the second start on real ground, else Table 1; the first is the paper's optimum
 )
-N_RANDOM, SEED = 48, 0
-TOLERANCE, MOST = 1e-5, 80  # gaits of one climb
-OPTIONS = vrw.Options(rtol=1e-11, atol=1e-11)
+TOLERANCE, MOST = 1e-4, 30  # gaits of one climb
+OPTIONS = vrw.Options(rtol=1e-9, atol=1e-9)
 TARGET = Path(__file__).parents[1] / "docs" / "figures"
 FIELDS = ("scene", *BOX, "ending", "held_by", "dls_fraction", "period", "speed", "slip", "radius")
 
@@ -86,8 +82,11 @@ def main() -> None:
         on_ground(paper.params, paper.cycle.section_state),
     )
     climbed = []
-    for damping in STARTS:
-        start = vrw.WheelParams(damping=damping)
+    starts = {
+        "climbed from the paper's optimum": paper.params,
+        f"climbed from c = {DAMPING:g}": vrw.WheelParams(damping=DAMPING),
+    }
+    for scene, start in starts.items():
         tuned = vrw.tune(
             start, "dls_fraction", list(BOX), BOX, model=model, options=OPTIONS,
             tolerance=TOLERANCE, max_evaluations=MOST,
@@ -95,25 +94,10 @@ def main() -> None:
         held = "; ".join(f"{a.name} at {a.limit:.4g}" for a in tuned.active)
         told = on_ground(tuned.params, tuned.cycle.section_state)
         print(tuned, flush=True)
-        row(f"climbed from c = {damping:g}", tuned.params, told, tuned.ending.name, held)
+        row(scene, tuned.params, told, tuned.ending.name, held)
         climbed.append(tuned)
     best = max(climbed, key=lambda tuned: tuned.value)
     row("optimum on real ground, paper's rung", best.params, on_paper(best.params))
-    corners = np.array(np.meshgrid(*BOX.values(), indexing="ij")).reshape(len(BOX), -1)
-    random = np.random.default_rng(SEED).uniform(
-        *np.array(list(BOX.values())).T, (N_RANDOM, len(BOX))
-    )
-    columns = dict(zip(BOX, np.concatenate([corners, random.T], 1), strict=True))
-    found = vrw.scan(
-        vrw.samples(columns), ("dls_fraction", "period", "speed", "slip"), model=model,
-        options=vrw.Options(rtol=1e-8, atol=1e-8),
-    )  # fmt: skip
-    steady = found.outcome.values == vrw.Outcome.STEPPED
-    place = int(np.nanargmax(found.dls_fraction.values))
-    wheel = vrw.WheelParams(**{name: column[place] for name, column in columns.items()})
-    told = [float(found[name][place]) for name in ("dls_fraction", "period", "speed", "slip")]
-    scene = f"best of {steady.sum()} gaits among {len(steady)} corners and random wheels"
-    row(scene, wheel, ("", *told, float(found.spectral_radius[place])))
     with (TARGET / "tuning_on_ground.csv").open("w", newline="") as file:
         csv.writer(file).writerows([FIELDS, *rows])
 
