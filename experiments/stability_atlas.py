@@ -199,8 +199,8 @@ def borders() -> Rows:
 
 # --- Long walks.
 
-WALK, BLOCK = 50_000, 1000
-WALKED = (1000, 2000, 5000, 10_000, 20_000, 50_000)
+WALK, BLOCK = 100_000, 1000
+WALKED = (1000, 2000, 5000, 10_000, 20_000, 50_000, 100_000)
 
 
 def long_walk() -> Rows:

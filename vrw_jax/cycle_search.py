@@ -128,7 +128,7 @@ def start_from(problem: Problem, section: Array, durations: Array, with_dls: Arr
     return Located(solution, happens, *nothing_known(problem, section))
 
 
-def nothing_known(problem: Problem, section: Array) -> tuple[LaneArray, LaneArray]:
+def nothing_known(problem: Problem, section: Array) -> tuple[Array, Array]:
     """`found` and `ends` of a start."""
     lanes, n_ends = section.shape[1:], 2 * problem.sequence.phases[-1].dim
     zeros = lambda *shape: jnp.zeros((*shape, *lanes), section.dtype)
