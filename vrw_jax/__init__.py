@@ -6,7 +6,6 @@ from vrw_jax.branch import Border, Branch
 from vrw_jax.continuation import continue_branch, continue_branches, continue_map
 from vrw_jax.cycle_options import CycleOptions
 from vrw_jax.designs import grid, saltelli, samples, sobol, uniform
-from vrw_jax.ground_lanes import GroundSteps, ground_steps
 from vrw_jax.lane_batch import Steps, steps
 from vrw_jax.limit_cycle import LimitCycle, limit_cycle
 from vrw_jax.model_choice import choose_model
@@ -44,7 +43,6 @@ __all__ = [
     "Branch",
     "CycleOptions",
     "EnergyLoss",
-    "GroundSteps",
     "Indicators",
     "LadderStep",
     "LadderWheel",
@@ -70,7 +68,6 @@ __all__ = [
     "continue_branches",
     "continue_map",
     "grid",
-    "ground_steps",
     "limit_cycle",
     "newton_cycle",
     "open_scan",

@@ -83,19 +83,11 @@ def integrate_lanes(
     options: Options,
     cut: Cut,
     patience: Patience,
-    begun: Vector | None = None,
 ) -> LanePhaseEnd:
-    """Every active lane from (q, v) to the earliest of its guards. Errors: as `integrate_phase`.
-
-    Guards named by `begun` stand at the start on the event that began the phase: zero and rising,
-    whatever rounding says of them there.
-    """
+    """Every active lane from (q, v) to the earliest of its guards. Errors: as `integrate_phase`."""
     start = Place(q, v, phase.evaluate(q, v))
     values, rates = _with_rates(phase, start)
     past = tuple((g < 0.0) | ((g == 0.0) & (r <= 0.0)) for g, r in zip(values, rates, strict=True))
-    if begun is not None:
-        past = tuple(p & ~b for p, b in zip(past, begun, strict=True))
-        values = tuple(jnp.where(b, 0.0, g) for g, b in zip(values, begun, strict=True))
     at_once = _first(past)
     begins = active & (at_once < 0)
 

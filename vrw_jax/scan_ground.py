@@ -6,8 +6,9 @@ those whose premises break on this ground are gathered and walk on the upper run
 pays for another.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -70,7 +71,12 @@ class GroundEngine:
             outcome = jnp.where(stepped, cycle.outcome, walked.outcome)
             return outcome, {name: _read(name, cycle) for name in plain} | slopes
 
-        self._compiled: Callable = jax.jit(jax.vmap(one))
+        self._compiled: Any = jax.jit(jax.vmap(one))
+
+    def compile(self) -> None:
+        """Compile the one large function."""
+        values = jax.ShapeDtypeStruct((LANES, len(MOVED)), np.dtype(self._base.damping.dtype))
+        self._compiled = self._compiled.lower(values).compile()
 
     def __call__(self, columns: Columns) -> Told:
         """Results of the samples in `columns` (one value per sample of each swept parameter)."""
@@ -139,7 +145,7 @@ class LadderEngine:
             {"damping": np.full(n, float(self._base.damping))}
             | {name: column for name, column in columns.items() if name != FRICTION}
         )
-        reason = self._reasons(lower, friction)
+        reason = self.reasons(lower, friction)
         rung = np.where(reason == 0, VISCOELASTIC, UNILATERAL).astype(np.int8)
         names = (*self._measures, "outcome", "spectral_radius")
         results = {
@@ -155,8 +161,8 @@ class LadderEngine:
                 results[name][up] = upper[name]
         return results | {"rung": rung, "reason": reason}
 
-    def _reasons(self, lower: Told, friction: np.ndarray) -> np.ndarray:
-        """`ModelChoice.reason` of each sample, over the step that its gait repeats."""
+    def reasons(self, lower: Told, friction: np.ndarray) -> np.ndarray:
+        """`ModelChoice.reason` of each of the paper's gaits, over the step that it repeats."""
         left = friction - self._paper.friction
         margins = np.stack([lower[m] + (left if "friction" in m else 0.0) for m in PREMISES], -1)
         broken = ~(margins >= 0.0)
