@@ -310,7 +310,7 @@ def signs_hold(problem: Problem, parameters: Parameters, located: Located) -> Bo
 def search(
     problem: Problem,
     parameters: Parameters,
-    guess: Located | None,
+    guess: Located | None = None,
     wanted: tuple[int, ...] = (),
 ) -> Finding:
     """A limit cycle for each lane, by several attempts in turn; see ATTEMPTS.

@@ -6,7 +6,7 @@ and reverse mode, and to any order.
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import overload
 
 import equinox as eqx
@@ -33,7 +33,7 @@ from vrw_jax.cycle_search import (
 )
 from vrw_jax.derivatives import on_branch, push, total_derivative, without_derivative
 from vrw_jax.geometry import Motion
-from vrw_jax.lanes import compiled_by_caller, one_wheel
+from vrw_jax.lanes import compiled_by_caller, in_blocks, one_wheel
 from vrw_jax.models import AbstractWheel, ViscoelasticWheel
 from vrw_jax.models.base import Indicators, Margins, SectionState
 from vrw_jax.options import Options
@@ -168,23 +168,40 @@ def _monodromy_over_lanes(problem: Problem, parameters: Parameters, located: Loc
     return jnp.where(located.found > 0.5, monodromy, 0.0)
 
 
+def _search_with_columns(
+    problem: Problem, parameters: Parameters, guess: Located | None = None
+) -> Finding:
+    """A search that also returns the columns of all parameters.
+
+    Alone, a wheel's passes carry them: one pass to compile. Batches save the time, and compile a
+    pass of its own for them.
+    """
+    block, n_lanes = problem.options.block, parameters.shape[-1]
+    if n_lanes <= block:
+        return search(problem, parameters, guess, tuple(range(parameters.shape[0])))
+    finding = search(problem, parameters, guess)
+    columns = in_blocks(functools.partial(_tangent_space, problem), block)
+    return finding._replace(columns=columns(parameters, finding.located))
+
+
 def _solve(problem: Problem, parameters: Array, guess: Located | None) -> tuple[Located, tuple]:
     """Search for one wheel, differentiable in its parameters; the guess has no derivative."""
     block = problem.options.block
 
-    def searching(wanted: tuple[int, ...]) -> Callable[..., Finding]:
-        return one_wheel(lambda p, g=None: search(problem, p, g, wanted))
+    find = one_wheel(functools.partial(search, problem))
+    find_with_columns = one_wheel(functools.partial(_search_with_columns, problem))
+    start = () if guess is None else (guess,)
 
     def parts(finding: Finding) -> tuple[Located, tuple]:
         return finding.located, (finding.monodromy, finding.residual, finding.passes)
 
     @jax.custom_jvp
     def solve(parameters: Array, *guess: Located) -> tuple[Located, tuple]:
-        return parts(searching(())(parameters, *guess))
+        return parts(find(parameters, *guess))
 
     @jax.custom_jvp
     def solve_with_columns(parameters: Array, *guess: Located) -> tuple:
-        finding = searching(tuple(range(parameters.shape[0])))(parameters, *guess)
+        finding = find_with_columns(parameters, *guess)
         return *parts(finding), finding.columns
 
     @solve.defjvp
@@ -202,7 +219,7 @@ def _solve(problem: Problem, parameters: Array, guess: Located | None) -> tuple[
         tangent = push((columns, curvature), tangents[0])
         return (located, other, columns), (tangent[0], without_derivative(other), tangent[1])
 
-    return solve(parameters, *(() if guess is None else (guess,)))
+    return solve(parameters, *start)
 
 
 def _attach_monodromy(
