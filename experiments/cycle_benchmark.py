@@ -169,6 +169,37 @@ def sensitivity_ratio() -> dict[str, float]:
     }
 
 
+def compiling() -> list[str]:
+    told = ["| to the first answer of a process | wall, s | CPU, s |", "|---|---|---|"]
+    for measure in ("dls_fraction", "spectral_radius"):
+        for state, (wall, cpu) in zip(("cold", "warm cache"), first_answer(measure), strict=True):
+            told.append(f"| gradient of `{measure}`, {state} | {wall:.1f} | {cpu:.1f} |")
+    return told
+
+
+def batches() -> list[str]:
+    told = [f"| batches of {LANES} | µs per cycle | per second and core |", "|---|---|---|"]
+    return told + [
+        f"| {name} | {cost:.0f} | {1e6 / cost:,.0f} |" for name, cost in throughput().items()
+    ]
+
+
+def alone() -> list[str]:
+    costs = sensitivity_ratio()
+    unit = next(iter(costs.values()))
+    told = ["| one gait alone | ms | return maps |", "|---|---|---|"]
+    return told + [f"| {name} | {cost:.2f} | {cost / unit:.2f} |" for name, cost in costs.items()]
+
+
+def finding() -> list[str]:
+    box = ", ".join(f"{n} {low:g}…{high:g}" for n, (low, high) in BOX.items())
+    told = [
+        f"Random wheels of the box {box}. Reference: continuation from Table 1 in {N_STAGES} "
+        "steps.", "", "| | wheels |", "|---|---|",
+    ]  # fmt: skip
+    return told + [f"| {name} | {count:,} |" for name, count in hit_rate().items()]
+
+
 def main(file: Path) -> None:
     processor = next(
         (line.split(":")[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines()
@@ -177,30 +208,12 @@ def main(file: Path) -> None:
     lines = [
         "# What limit cycles cost, and how often they are found", "",
         f"`python experiments/cycle_benchmark.py`; {processor}, jax {jax.__version__}. CPU "
-        "seconds, one core; wall times on two.", "",
-        "| to the first answer of a process | wall, s | CPU, s |", "|---|---|---|",
+        "seconds, one core; wall times on two.",
     ]  # fmt: skip
-    for measure in ("dls_fraction", "spectral_radius"):
-        for state, (wall, cpu) in zip(("cold", "warm cache"), first_answer(measure), strict=True):
-            lines.append(f"| gradient of `{measure}`, {state} | {wall:.1f} | {cpu:.1f} |")
-            print(lines[-1], flush=True)
-    lines += ["", f"| batches of {LANES} | µs per cycle | per second and core |", "|---|---|---|"]
-    for name, cost in throughput().items():
-        lines.append(f"| {name} | {cost:.0f} | {1e6 / cost:,.0f} |")
-        print(lines[-1], flush=True)
-    lines += ["", "| one gait alone | ms | return maps |", "|---|---|---|"]
-    alone = sensitivity_ratio()
-    unit = next(iter(alone.values()))
-    for name, cost in alone.items():
-        lines.append(f"| {name} | {cost:.2f} | {cost / unit:.2f} |")
-        print(lines[-1], flush=True)
-    box = ", ".join(f"{n} {low:g}…{high:g}" for n, (low, high) in BOX.items())
-    lines += ["", f"Random wheels of the box {box}. Reference: continuation from Table 1 in "
-              f"{N_STAGES} steps.", "", "| | wheels |", "|---|---|"]  # fmt: skip
-    for name, count in hit_rate().items():
-        lines.append(f"| {name} | {count:,} |")
-        print(lines[-1], flush=True)
-    file.write_text("\n".join(lines) + "\n")
+    for section in (compiling, batches, alone, finding):
+        lines += ["", *section()]
+        print("\n".join(lines[-8:]), flush=True)
+        file.write_text("\n".join(lines) + "\n")
 
 
 if __name__ == "__main__":
