@@ -123,17 +123,3 @@ def test_tuning_on_real_ground_climbs_along_the_gradient():
         assert sign * float(share - tuned.start_value) > 0.0
     assert float(tuned.params.damping) == pytest.approx(320.0)
     assert float(tuned.params.slope) == pytest.approx(0.29)
-
-
-@pytest.mark.slow
-def test_one_sided_stoppers_never_pull_and_hardly_change_the_gait(near):
-    honest = vrw.UnilateralWheel(friction=0.7, one_sided=True)
-    walk = vrw.walk(SLOW, near, 12, model=honest)
-    step = vrw.step(SLOW, walk.steps.section_state[-1], model=honest)
-    bilateral = vrw.step(SLOW, near, model=GROUND)
-    assert int(step.outcome) == vrw.Outcome.STEPPED
-    assert float(bilateral.monitors.stopper_impulse) < -0.1  # which an honest stopper lets go
-    assert float(step.monitors.stopper_force) >= -1e-9
-    assert float(step.monitors.stopper_impulse) >= 0.0
-    assert abs(float(step.period / bilateral.period) - 1.0) < 0.007
-    assert int(step.events) > int(bilateral.events)

@@ -150,14 +150,12 @@ class UnilateralWheel(AbstractWheel):
     """Feet on the ground push and slide by Coulomb's law; nothing has a fixed role.
 
     `friction` is the coefficient of the ground, `math.inf` for feet that never slide. A leg in the
-    air that has met its stopper stays on it until its foot is loaded; with `one_sided` it leaves as
-    soon as the stopper would have to pull, which costs ten times the events. `max_events` bounds
-    the events of one step.
+    air that has met its stopper stays on it until its foot is loaded. `max_events` bounds the
+    events of one step.
     """
 
     friction: Scalar = eqx.field(converter=as_float_array, default=0.7)
     max_events: int = eqx.field(static=True, default=100)
-    one_sided: bool = eqx.field(static=True, default=False)
 
     def start(self, params: WheelParams) -> FullState:
         """Close to the paper's gait of Table 1."""
@@ -227,16 +225,16 @@ def _walk(
     s, friction = params.symbols(), wheel.friction.astype(x.dtype)
     good = good & (friction >= 0.0)
     friction = jnp.where(good, friction, 1.0)
-    place, one_sided = guards_of(n, wheel.one_sided), wheel.one_sided
+    place = guards_of(n, False)
     state, stance = opened(s, x)
 
     def go_on(now: _Walked) -> _Walked:
         motion, tally = unpack(now.state)
         event = event_of(place, n, now.guard)
-        change = resolve(s, friction, motion, now.stance, event, one_sided)
+        change = resolve(s, friction, motion, now.stance, event)
         tally_now = tally._replace(clock=jnp.zeros_like(tally.clock))
         start = pack(change.motion, tally_now)
-        flow = flow_of(s, friction, one_sided, change.stance)
+        flow = flow_of(s, friction, False, change.stance)
         outcome = jnp.where(change.solutions > 0, Outcome.STEPPED, Outcome.NO_ADMISSIBLE_CONTACT)
         outcome = jnp.where(change.third_foot, Outcome.THREE_FEET_LOADED, outcome)
         sound = outcome == Outcome.STEPPED

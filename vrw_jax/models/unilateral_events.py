@@ -1,11 +1,8 @@
 """What an event changes: impacts by momentum, then which feet and stoppers carry the motion on."""
 
-from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Int
 
 from vrw_jax.models.unilateral_contacts import (
@@ -95,47 +92,24 @@ def moved_by(
     return motion._replace(vx=vx, vz=vz, dtheta=dtheta, dL=dL)
 
 
-def _settled_stoppers(solve: Callable, airborne: Array, one_sided: bool) -> tuple:
-    """What `solve` finds with the legs in the air that are held on their stoppers, and these.
-
-    `solve(airborne)` returns a result and the push of each stopper. Bilateral ones hold whatever it
-    takes; one-sided ones let go where they would have to pull, until none has to.
-    """
-    if not one_sided:
-        return solve(airborne)[0], airborne
-
-    def going(state: tuple) -> Array:
-        return state[1]
-
-    def let_go(state: tuple) -> tuple:
-        result, push = solve(state[0])
-        held = state[0] & (push >= 0.0)
-        return held, jnp.any(held != state[0]), result
-
-    empty = jax.tree.map(
-        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(solve, airborne)[0]
-    )
-    held, _, result = lax.while_loop(going, let_go, (airborne, jnp.asarray(True), empty))
-    return result, held
-
-
 def _impact(
     s: Symbols,
     friction: Scalar,
     motion: WheelMotion,
     stance: Stance,
     event: Event,
-    one_sided: bool,
-) -> tuple[WheelMotion, Slots, Choice, Legs, Array]:
+) -> tuple[WheelMotion, Slots, Choice, Legs]:
     """Velocity level: simultaneous, inelastic, with Coulomb's law in the impulse.
 
     Infinite friction keeps feet at rest planted when a leg meets its stopper, as the paper does.
-    Last come the stoppers' impulses on legs in the air, and which of these legs are held.
     """
     touching = (stance.contact != OFF) | event.lands
     slots = slots_of(touching)
     at_stopper = stance.locked | event.closes
     in_slot = slots.first | slots.second
+    airborne = at_stopper & ~in_slot
+    hub = hub_of(s, motion, slots, airborne)
+    free = free_velocity(s, motion, slots, hub)
     loaded = jnp.stack([jnp.any(slots.first), jnp.any(slots.second)])
     stops = jnp.stack(slots.of(at_stopper.astype(jnp.int32))) > 0
     before = jnp.stack(slots.of(stance.contact))
@@ -149,21 +123,11 @@ def _impact(
         known_contact=jnp.where(loaded[:, None], planted[:, None] & only(STICK), only(OFF)),
         known_open=~stops,
     )
-
-    def solve(airborne: Array) -> tuple:
-        hub = hub_of(s, motion, slots, airborne)
-        free = free_velocity(s, motion, slots, hub)
-        choice = choose(s, hub, free, allowed, friction)
-        after = moved_by(s, motion, slots, hub, airborne, choice)
-        jump_x, jump_z = after.vx - motion.vx, after.vz - motion.vz
-        impulse = s.m * (hub.legs.sin * jump_x + hub.legs.cos * jump_z + motion.dL)
-        impulse = jnp.where(airborne, impulse, jnp.inf)
-        return (after, choice, impulse), impulse
-
-    (after, choice, impulse), held = _settled_stoppers(solve, at_stopper & ~in_slot, one_sided)
-    passing = at_stopper & ~in_slot & ~held & (after.dL > 0.0)
-    solutions = jnp.where(jnp.any(passing), 0, choice.solutions)
-    return after, slots, choice._replace(solutions=solutions), impulse, held
+    choice = choose(s, hub, free, allowed, friction)
+    after = moved_by(s, motion, slots, hub, airborne, choice)
+    jump_x, jump_z = after.vx - motion.vx, after.vz - motion.vz
+    impulse = s.m * (hub.legs.sin * jump_x + hub.legs.cos * jump_z + motion.dL)
+    return after, slots, choice, jnp.where(airborne, impulse, jnp.inf)
 
 
 def _support(
@@ -173,16 +137,16 @@ def _support(
     contact: Int[Array, " n"],
     at_stopper: Bool[Array, " n"],
     event: Event,
-    one_sided: bool,
-) -> tuple[Slots, Choice, Array, Array]:
-    """Acceleration level: who carries the motion that follows. Also says which feet were at rest,
-    and which legs in the air are held on their stoppers.
+) -> tuple[Slots, Choice, Array]:
+    """Acceleration level: who carries the motion that follows. Also says which feet were at rest.
 
     What an event has just ended is not asked again: its force is zero, and its sign rounding. It
     is followed by what it was about to become, if that goes the right way (see `leaves`).
     """
     slots = slots_of(contact != OFF)
     in_slot = slots.first | slots.second
+    hub = hub_of(s, motion, slots, at_stopper & ~in_slot)
+    free = free_acceleration(s, motion, slots, hub)
     mode = jnp.stack(slots.of(contact))
     stops = jnp.stack(slots.of(at_stopper.astype(jnp.int32))) > 0
     only = lambda mode: jnp.arange(4) == mode
@@ -197,38 +161,24 @@ def _support(
     modes = jnp.where(event.stops[:, None], stopped, modes)
     known = (jnp.arange(4) == mode[:, None]) & ~rests[:, None]
     rigid = (mode == STICK) & ~jnp.isfinite(friction)  # a tangential force jumps to zero
+    for flags, direction, forced, ended in (
+        (event.lifts, 0, OFF, mode),
+        (event.slides_up, -1, SLIP_UP, jnp.full((2,), STICK)),
+        (event.slides_down, 1, SLIP_DOWN, jnp.full((2,), STICK)),
+    ):
+        leaving = [leaves(s, hub, free, (mode, stops), friction, i, direction) for i in range(2)]
+        goes = (jnp.stack(leaving) & ~rigid)[:, None]
+        tested = ~(jnp.arange(4) == ended[:, None]) & (goes | rigid[:, None] | ~only(forced))
+        modes = jnp.where(flags[:, None], jnp.where(goes, only(forced), tested), modes)
+        known = jnp.where(flags[:, None], goes & only(forced), known)
     opens = ~stops | event.releases
-
-    def solve(airborne: Array) -> tuple:
-        hub = hub_of(s, motion, slots, airborne)
-        free = free_acceleration(s, motion, slots, hub)
-        allowed_modes, certain = modes, known
-        for flags, direction, forced, ended in (
-            (event.lifts, 0, OFF, mode),
-            (event.slides_up, -1, SLIP_UP, jnp.full((2,), STICK)),
-            (event.slides_down, 1, SLIP_DOWN, jnp.full((2,), STICK)),
-        ):
-            leaving = [
-                leaves(s, hub, free, (mode, stops), friction, i, direction) for i in range(2)
-            ]
-            goes = (jnp.stack(leaving) & ~rigid)[:, None]
-            tested = ~(jnp.arange(4) == ended[:, None]) & (goes | rigid[:, None] | ~only(forced))
-            taken = jnp.where(goes, only(forced), tested)
-            allowed_modes = jnp.where(flags[:, None], taken, allowed_modes)
-            certain = jnp.where(flags[:, None], goes & only(forced), certain)
-        allowed = Allowed(
-            contact=allowed_modes,
-            held=jnp.stack([jnp.ones((2,), bool), ~opens], axis=1),
-            known_contact=certain,
-            known_open=opens,
-        )
-        choice = choose(s, hub, free, allowed, friction)
-        ax, az, _ = choice.answer.hub
-        outward = free.legs + hub.legs.sin * ax + hub.legs.cos * az
-        return choice, jnp.where(airborne, s.m * outward, jnp.inf)
-
-    choice, held = _settled_stoppers(solve, at_stopper & ~in_slot, one_sided)
-    return slots, choice, rests, held
+    allowed = Allowed(
+        contact=modes,
+        held=jnp.stack([jnp.ones((2,), bool), ~opens], axis=1),
+        known_contact=known,
+        known_open=opens,
+    )
+    return slots, choose(s, hub, free, allowed, friction), rests
 
 
 def resolve(
@@ -237,28 +187,25 @@ def resolve(
     motion: WheelMotion,
     stance: Stance,
     event: Event,
-    one_sided: bool = False,
 ) -> Change:
-    """Everything that an event changes; `one_sided`: stoppers of legs in the air may let go."""
+    """Everything that an event changes."""
     impact = event.impact
     touched = (stance.contact != OFF) | event.lands
     was_locked = (stance.locked | event.closes) & ~event.loosens
-    after, slots, shock, impulses, stays = _impact(s, friction, motion, stance, event, one_sided)
+    after, slots, shock, impulses = _impact(s, friction, motion, stance, event)
     after = WheelMotion(*(jnp.where(impact, a, b) for a, b in zip(after, motion, strict=True)))
     in_slot = slots.first | slots.second
     contact = jnp.where(impact, slots.spread(shock.contact).astype(jnp.int32), stance.contact)
-    kept = jnp.where(in_slot, slots.spread(shock.held) > 0, was_locked & stays)
+    kept = jnp.where(in_slot, slots.spread(shock.held) > 0, was_locked)
     at_stopper = jnp.where(impact, kept, was_locked)
     legs = directions(s, motion.theta)
     dropped = touched & ~in_slot
     foot_z = after.vz - after.dL * legs.cos + after.L * after.dtheta * legs.sin
 
-    slots, support, rests, stays = _support(
-        s, friction, after, contact, at_stopper, event, one_sided
-    )
+    slots, support, rests = _support(s, friction, after, contact, at_stopper, event)
     in_slot = slots.first | slots.second
     contact = slots.spread(support.contact).astype(jnp.int32)
-    locked = jnp.where(in_slot, slots.spread(support.held) > 0, at_stopper & stays)
+    locked = jnp.where(in_slot, slots.spread(support.held) > 0, at_stopper)
     slides = (support.contact == SLIP_DOWN) | (support.contact == SLIP_UP)
     stance = Stance(
         contact=contact,
