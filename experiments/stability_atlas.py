@@ -31,7 +31,7 @@ import numpy as np
 import vrw_jax as vrw
 from vrw_jax import transitions
 from vrw_jax.params import PARAMETER_NAMES
-from vrw_jax.runge_kutta import explicit_tableau
+from vrw_jax.runge_kutta import explicit_tableau, real_stability_limit
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from oracle import multiprecision
@@ -51,6 +51,7 @@ LIBRARY = (
     ("lanes", "Tsit5"),
     ("lanes", "Dopri8"),
     ("diffrax", "Kvaerno3"),
+    ("diffrax", "Kvaerno5"),
 )
 IMPLICIT_TOO = ("DOP853", "LSODA", "Radau")
 
@@ -65,12 +66,8 @@ def stiff_wheel(axis: str, value: float) -> dict[str, float]:
 def real_axis_limit(solver: str) -> float:
     """Largest z with |R(-z)| <= 1 of an explicit solver's stability polynomial."""
     tableau = explicit_tableau(solver, vrw.Options())
-    n = len(tableau.places)
-    weights = tableau.once[-1]
-    growth = lambda z: 1.0 - z * weights @ np.linalg.solve(np.eye(n) + z * tableau.once, np.ones(n))
-    z = np.linspace(0.01, 12.0, 12_000)
-    stable = np.abs([growth(x) for x in z]) <= 1.0 + 1e-12
-    return float(z[np.argmin(stable)])
+    assert tableau is not None
+    return real_stability_limit(tableau)
 
 
 def stiffness() -> Rows:

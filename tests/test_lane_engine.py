@@ -11,7 +11,14 @@ from batched import wheels_like
 import vrw_jax as vrw
 from vrw_jax import Outcome, lane_batch
 from vrw_jax.lane_phase import LanePhase, Patience, integrate_lanes
-from vrw_jax.runge_kutta import Place, Slope, cut_where, explicit_tableau, take_step
+from vrw_jax.runge_kutta import (
+    Place,
+    Slope,
+    cut_where,
+    explicit_tableau,
+    real_stability_limit,
+    take_step,
+)
 from vrw_jax.sequences import sine_cosine
 
 GAIT = truth.table("cycle", "section_state")[0]
@@ -281,3 +288,24 @@ def test_collocation_alone_is_bitwise_itself_among_others():
 def test_collocation_needs_durations():
     with pytest.raises(ValueError, match="durations"):
         vrw.steps(vrw.WheelParams(), GAIT[None], engine="collocation")
+
+
+@pytest.mark.parametrize(("solver", "published"), [("Dopri5", 3.31), ("Bosh3", 2.51)])
+def test_limits_of_stability_are_the_published_ones(solver, published):
+    tableau = explicit_tableau(solver, vrw.Options())
+    assert real_stability_limit(tableau) == pytest.approx(published, abs=0.02)
+
+
+@pytest.mark.slow
+def test_wheels_too_stiff_for_an_explicit_solver_go_to_an_implicit_one():
+    mass = np.array([1.0, 0.005])  # c/m of 100 and 20,000 1/s
+    vectors = wheels_like(leg_mass=mass, hub_mass=18.0 - 8.0 * mass, damping=100.0)
+    options = vrw.Options(solver="Tsit5", rtol=1e-6, atol=1e-6, max_solver_steps=300)
+    starts = np.tile([0.1, 1.6, -0.1], (2, 1))
+    found = vrw.steps(truth.wheels(vectors), starts, options=options)
+    assert list(found.implicit) == [False, True]
+    assert list(found.outcome) == [Outcome.STEPPED, Outcome.STEPPED]
+    _, explicit = told(vectors, starts, options, engine="lanes")
+    assert list(explicit) == [Outcome.STEPPED, Outcome.SOLVER_GAVE_UP]
+    exact, _ = told(vectors, starts, vrw.Options(), engine="lanes")
+    np.testing.assert_allclose(found.section_state[1], exact[1, :3], rtol=0, atol=1e-4)

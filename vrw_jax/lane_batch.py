@@ -6,6 +6,7 @@ among others, and in any order. Wheels of similar work share a block; a block do
 few late lanes, which run again among their like. None of this reaches into a lane.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -24,7 +25,7 @@ from vrw_jax.models import AbstractWheel, ViscoelasticWheel
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
 from vrw_jax.params import PARAMETER_NAMES, WheelParams
-from vrw_jax.runge_kutta import explicit_tableau
+from vrw_jax.runge_kutta import explicit_tableau, real_stability_limit
 
 BLOCK = 256
 """Lanes that march side by side on CPU: they stay in cache, and few wait for the slowest."""
@@ -32,6 +33,8 @@ BLOCKS = 8
 """Blocks in one call of the compiled program, so that the call itself costs little."""
 LANES_ELSEWHERE = 32_768
 """Lanes of the one block of a call on a GPU."""
+IMPLICIT = "Kvaerno5"
+"""Solver of wheels that are too stiff for explicit ones."""
 FEW = 8
 """A block waits no longer than usual once less than one in `FEW` of its lanes is running."""
 
@@ -45,6 +48,7 @@ class Steps(eqx.Module):
     n_stepped: Int[Array, " lanes"]  # steps that ended in a touchdown
     solver_steps: Int[Array, " lanes"]  # tried by the integrator, over all steps
     fixed: Bool[Array, " lanes"]  # whether the last step was taken in fixed work, by collocation
+    implicit: Bool[Array, " lanes"]  # whether "auto" took an implicit solver, for stiffness
     engine: str = eqx.field(static=True)  # that computed it: "lanes", "diffrax" or "collocation"
 
 
@@ -64,8 +68,10 @@ def steps(
     scalars or have the lanes' axis. "lanes" is the fast engine, for the viscoelastic wheel and
     explicit solvers; "diffrax" maps `model.advance` over the lanes and takes any solver; "auto"
     takes the first wherever it can, whatever the number of lanes, and `Steps.engine` says which it
-    was. Both keep the errors of `options`, which count for each local step; between them lie some
-    ten times the tolerance.
+    was; wheels whose airborne leg is too stiff for an explicit solver (c/m above 4e5 1/s at the
+    default options) go to IMPLICIT by "diffrax", and `Steps.implicit` says which. Both keep the
+    errors of `options`, which count for each local step; between them lie some ten times the
+    tolerance.
 
     "collocation" is faster still near a known gait: `durations`, shape (lanes, 3), s, are those of
     DLS, SLS-I and SLS-II to some per cent, as of a limit cycle or a neighbour's step; later steps
@@ -98,6 +104,12 @@ def steps(
         row[:] = np.asarray(column)
     walked = _Walked.start(states.astype(dtype))
     run = _chosen(engine, model, options, params.n_legs)
+    stiff = np.zeros(len(states), bool)
+    if engine == "auto" and run.name == "lanes":
+        stiff = _too_stiff(wheels, options)
+    for_stiffness = functools.partial(
+        _by_diffrax, model, _with_solver(options, IMPLICIT), params.n_legs
+    )
     if engine == "collocation":
         walked.durations[:] = _expected(durations, states, dtype)
     for _ in range(n_steps):
@@ -108,7 +120,10 @@ def steps(
             fixed, told = _by_collocation(model, params.n_legs, *given)
             walked.take(open_[fixed], tuple(part[fixed] for part in told), fixed=True)
         open_ = open_[~fixed]
-        walked.take(open_, run(wheels[:, open_], walked.section_state[open_]), fixed=False)
+        for solve, lanes in ((run, open_[~stiff[open_]]), (for_stiffness, open_[stiff[open_]])):
+            if len(lanes) > 0:
+                told = solve(wheels[:, lanes], walked.section_state[lanes])
+                walked.take(lanes, told, fixed=False)
     return Steps(
         jnp.asarray(walked.section_state),
         jnp.asarray(walked.durations),
@@ -116,6 +131,7 @@ def steps(
         jnp.asarray(walked.n_stepped),
         jnp.asarray(walked.solver_steps),
         jnp.asarray(walked.fixed),
+        jnp.asarray(stiff),
         engine="collocation" if engine == "collocation" else run.name,
     )
 
@@ -179,6 +195,28 @@ def _chosen(engine: str, model: AbstractWheel, options: Options, n_legs: int) ->
     assert isinstance(model, ViscoelasticWheel)
     by_lanes = functools.partial(_by_lanes, model.stop_at_lift_off, options, n_legs)
     return _Engine("lanes", by_lanes)
+
+
+def _too_stiff(wheels: np.ndarray, options: Options) -> np.ndarray:
+    """Which lanes an explicit solver can't take through single support I in `max_solver_steps`.
+
+    The airborne leg's fast mode decays at 1.03 c/m for some 0.67 sqrt(L0 / g), s, where legs are
+    light, and a step times that rate must stay below the solver's limit of stability; rejected
+    steps add a tenth.
+    """
+    tableau = explicit_tableau(options.solver, options)
+    assert tableau is not None  # `_chosen` looked
+    damping, mass, length, gravity = (
+        wheels[PARAMETER_NAMES.index(name)]
+        for name in ("damping", "leg_mass", "locked_length", "gravity")
+    )
+    with np.errstate(all="ignore"):
+        decays = 1.03 * damping / mass * 0.74 * np.sqrt(length / gravity)
+        return decays > options.max_solver_steps * real_stability_limit(tableau)
+
+
+def _with_solver(options: Options, solver: str) -> Options:
+    return dataclasses.replace(options, solver=solver)
 
 
 def _by_lanes(

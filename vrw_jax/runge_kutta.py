@@ -100,6 +100,15 @@ class Slope(NamedTuple):
     acceleration: Vector  # of all three coordinates; the phase's own come first
 
 
+def real_stability_limit(tableau: Tableau) -> float:
+    """Largest z with |R(-z)| <= 1: a mode that decays at rate r bears steps up to z / r."""
+    n = len(tableau.places)
+    weights, ones = tableau.once[-1], np.ones(n)
+    z = np.linspace(0.01, 20.0, 2000)
+    growth = [1.0 - x * weights @ np.linalg.solve(np.eye(n) + x * tableau.once, ones) for x in z]
+    return float(z[np.argmax(np.abs(growth) > 1.0 + 1e-12)])
+
+
 class Place(NamedTuple):
     """Positions, rates and slope of one stage."""
 
