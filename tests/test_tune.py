@@ -35,6 +35,7 @@ def most_dls_at_any_price() -> Tuned:
     return tune(vrw.WheelParams(), "dls_fraction", FREE, BOX, {})
 
 
+@pytest.mark.slow
 def test_gradients_of_objective_and_all_constraints_agree_with_central_differences():
     problem = problem_of({"dls_fraction": 1.0, "speed": -0.3})
     u = np.array([0.7, 0.45, 0.4, 0.55])

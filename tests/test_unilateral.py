@@ -270,6 +270,7 @@ def test_a_foot_that_lands_sliding_takes_coulombs_impulse(friction):
     assert abs(tangential + friction * normal) < 1e-12
 
 
+@pytest.mark.slow
 def test_derivatives_along_the_events_that_happened_match_differences():
     def told(mu, c, dtheta):
         params = vrw.WheelParams(damping=c)
