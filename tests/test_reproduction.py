@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 import xarray as xr
 from PIL import Image
+from typer.testing import CliRunner
 
-from vrw_jax import facts, plots, reproduce
+from vrw_jax import cli, facts, plots, reproduce
 from vrw_jax.facts import Evidence
 from vrw_jax.outcomes import Outcome
 
@@ -31,8 +32,8 @@ def reproduced(
     folder, told = tmp_path_factory.mktemp("reproduced"), []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(reproduce, "collect", lambda progress: evidence)
-        holds = reproduce.reproduce(folder, lambda share, what: told.append(share))
-    return folder, holds, told
+        table = reproduce.reproduce(folder, lambda share, what: told.append(share))
+    return folder, all(fact.holds for fact in table), told
 
 
 def test_every_published_fact_holds(evidence: Evidence) -> None:
@@ -67,7 +68,7 @@ def test_a_faithful_reproduction_is_true_and_writes_everything(
     assert {path.name for path in folder.iterdir()} == expected
 
 
-def test_a_broken_fact_does_not_hold_and_gives_false(
+def test_a_broken_fact_is_told_and_gives_an_exit_code(
     evidence: Evidence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     branch = evidence.branch.copy(deep=True)
@@ -75,7 +76,12 @@ def test_a_broken_fact_does_not_hold_and_gives_false(
     broken = dataclasses.replace(evidence, branch=branch)
     monkeypatch.setattr(reproduce, "collect", lambda progress: broken)
     monkeypatch.setattr(reproduce, "draw", lambda evidence, folder: [])
-    assert reproduce.reproduce(tmp_path) is False
+    monkeypatch.setattr("vrw_jax.start.start_jax", lambda: None)
+    result = CliRunner().invoke(cli.app, ["reproduce", "--out", str(tmp_path)])
+    assert result.exit_code == cli.FACT_FAILED
+    table = facts.facts(broken)
+    assert f"{sum(fact.holds for fact in table)} of {len(table)} hold" in result.output
+    assert "does not" in result.output
     text = (tmp_path / "facts.md").read_text(encoding="utf-8")
     assert "**does not hold**" in text
     assert "Not: λ4⁺ is gone at c = 220" in text
