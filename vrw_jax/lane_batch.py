@@ -107,9 +107,8 @@ def steps(
     stiff = np.zeros(len(states), bool)
     if engine == "auto" and run.name == "lanes":
         stiff = _too_stiff(wheels, options)
-    for_stiffness = functools.partial(
-        _by_diffrax, model, _with_solver(options, IMPLICIT), params.n_legs
-    )
+    implicit = dataclasses.replace(options, solver=IMPLICIT)
+    for_stiffness = functools.partial(_by_diffrax, model, implicit, params.n_legs)
     if engine == "collocation":
         walked.durations[:] = _expected(durations, states, dtype)
     for _ in range(n_steps):
@@ -213,10 +212,6 @@ def _too_stiff(wheels: np.ndarray, options: Options) -> np.ndarray:
     with np.errstate(all="ignore"):
         decays = 1.03 * damping / mass * 0.74 * np.sqrt(length / gravity)
         return decays > options.max_solver_steps * real_stability_limit(tableau)
-
-
-def _with_solver(options: Options, solver: str) -> Options:
-    return dataclasses.replace(options, solver=solver)
 
 
 def _by_lanes(

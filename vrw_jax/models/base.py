@@ -60,7 +60,31 @@ class Margins(eqx.Module):
     landing_friction_rear: Scalar  # friction left at the rear foot in the landing impulse
 
 
-class StepResult(eqx.Module):
+class AbstractStep(eqx.Module):
+    """What every rung's step tells alike. Batched under vmap."""
+
+    durations: eqx.AbstractVar[Float[Array, "3"]]  # of double support first, s
+    step_length: eqx.AbstractVar[Scalar]  # m
+
+    @property
+    def period(self) -> Array:
+        """Duration of the step, s."""
+        return jnp.sum(self.durations, axis=-1)
+
+    @property
+    def dls_fraction(self) -> Array:
+        """Share of the step with two loaded feet; 0 for a step without duration."""
+        period = self.period
+        return self.durations[..., 0] / jnp.where(period > 0.0, period, 1.0)
+
+    @property
+    def speed(self) -> Array:
+        """Step length over period, m/s; 0 for a step without duration."""
+        period = self.period
+        return jnp.where(period > 0.0, self.step_length / jnp.where(period > 0.0, period, 1.0), 0.0)
+
+
+class StepResult(AbstractStep):
     """One step from touchdown to touchdown. Batched under vmap: every field gains the axis.
 
     Fields of a step whose outcome is not STEPPED are finite and describe how far it came; its
@@ -76,23 +100,6 @@ class StepResult(eqx.Module):
     energy: EnergyLoss
     outcome: Int[Array, ""]  # an Outcome
     solver_steps: Int[Array, ""]  # tried by the integrator
-
-    @property
-    def period(self) -> Array:
-        """Duration of the step, s."""
-        return jnp.sum(self.durations, axis=-1)
-
-    @property
-    def dls_fraction(self) -> Array:
-        """Share of the step spent in double support; 0 for a step without duration."""
-        period = self.period
-        return self.durations[..., 0] / jnp.where(period > 0.0, period, 1.0)
-
-    @property
-    def speed(self) -> Array:
-        """Step length over period, m/s; 0 for a step without duration."""
-        period = self.period
-        return jnp.where(period > 0.0, self.step_length / jnp.where(period > 0.0, period, 1.0), 0.0)
 
     def __repr__(self) -> str:
         from vrw_jax import tables  # which imports this room

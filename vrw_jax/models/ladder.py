@@ -10,7 +10,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from vrw_jax.models.base import AbstractWheel, Advance, StepResult, replaced_where_bad
+from vrw_jax.models.base import AbstractStep, AbstractWheel, Advance, StepResult, replaced_where_bad
 from vrw_jax.models.unilateral import UnilateralStep, UnilateralTrajectory, UnilateralWheel
 from vrw_jax.models.unilateral_contacts import OFF, STICK
 from vrw_jax.models.unilateral_section import LOCKED, FullState, embedded
@@ -75,7 +75,7 @@ def told_why(reason: int) -> str:
     return f"The paper's premises break: {list(PREMISES.values())[reason - 1]}."
 
 
-class LadderStep(eqx.Module):
+class LadderStep(AbstractStep):
     """One step by the lowest rung that serves, told alike for both. Batched under vmap."""
 
     choice: ModelChoice
@@ -89,23 +89,6 @@ class LadderStep(eqx.Module):
     slip: Scalar  # path of sliding feet, m
     outcome: Int[Array, ""]  # an Outcome
     solver_steps: Int[Array, ""]  # tried by the integrator, on both rungs
-
-    @property
-    def period(self) -> Array:
-        """Duration of the step, s."""
-        return jnp.sum(self.durations, axis=-1)
-
-    @property
-    def dls_fraction(self) -> Array:
-        """Share of the step with two loaded feet; 0 for a step without duration."""
-        period = self.period
-        return self.durations[..., 0] / jnp.where(period > 0.0, period, 1.0)
-
-    @property
-    def speed(self) -> Array:
-        """Step length over period, m/s; 0 for a step without duration."""
-        period = self.period
-        return jnp.where(period > 0.0, self.step_length / jnp.where(period > 0.0, period, 1.0), 0.0)
 
 
 class LadderWheel(AbstractWheel):

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.derivatives import Forward, any_mode
 from vrw_jax.integrate import PhaseEnd, Watched, integrate_phase, sample_phase
-from vrw_jax.models.base import AbstractWheel, Advance, replaced_where_bad, usable
+from vrw_jax.models.base import AbstractStep, AbstractWheel, Advance, replaced_where_bad, usable
 from vrw_jax.models.unilateral_contacts import OFF
 from vrw_jax.models.unilateral_events import Change, Event, event_of, resolve
 from vrw_jax.models.unilateral_motion import (
@@ -48,7 +48,7 @@ class UnilateralMargins(eqx.Module):
     stopper_impulse: Scalar  # least stopper impulse of a locked leg in the air, N s
 
 
-class UnilateralStep(eqx.Module):
+class UnilateralStep(AbstractStep):
     """One step, from the landing of the foremost foot to the next. Batched under vmap.
 
     Fields of a step whose outcome is not STEPPED are finite and describe how far it came; its
@@ -73,23 +73,6 @@ class UnilateralStep(eqx.Module):
     most_solutions: Int[Array, ""]
     outcome: Int[Array, ""]  # an Outcome
     solver_steps: Int[Array, ""]  # tried by the integrator
-
-    @property
-    def period(self) -> Array:
-        """Duration of the step, s."""
-        return jnp.sum(self.durations, axis=-1)
-
-    @property
-    def dls_fraction(self) -> Array:
-        """Share of the step with two loaded feet; 0 for a step without duration."""
-        period = self.period
-        return self.durations[..., 0] / jnp.where(period > 0.0, period, 1.0)
-
-    @property
-    def speed(self) -> Array:
-        """Step length over period, m/s; 0 for a step without duration."""
-        period = self.period
-        return jnp.where(period > 0.0, self.step_length / jnp.where(period > 0.0, period, 1.0), 0.0)
 
 
 class UnilateralTrajectory(eqx.Module):
