@@ -132,7 +132,7 @@ def fusion_barrier(lanes: Float[Array, "... lanes"]) -> Hold:
 
     `lanes` must not hold NaN; that it does not is what XLA can't know.
     """
-    always = ~jnp.isnan(jnp.max(lanes))
+    always = ~jnp.isnan(jnp.max(lanes.real))
 
     def hold(tree: Any) -> Any:
         return lax.cond(always, lambda t: t, lambda t: jax.tree.map(jnp.zeros_like, t), tree)

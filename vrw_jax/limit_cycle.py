@@ -19,21 +19,17 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from vrw_jax import dynamics, transitions
 from vrw_jax import multipliers as floquet
 from vrw_jax.collocation import N_NODES, Solution
+from vrw_jax.cycle_derivatives import attach_monodromy, solve_cycle
 from vrw_jax.cycle_options import CycleOptions
 from vrw_jax.cycle_search import (
-    Finding,
     Located,
-    Parameters,
     Problem,
-    columns_of,
     nothing_known,
     parameters_of,
-    search,
     wheel_of,
 )
-from vrw_jax.derivatives import on_branch, push, total_derivative, without_derivative
 from vrw_jax.geometry import Motion
-from vrw_jax.lanes import compiled_by_caller, in_blocks, one_wheel
+from vrw_jax.lanes import compiled_by_caller
 from vrw_jax.models import AbstractWheel, ViscoelasticWheel
 from vrw_jax.models.base import Indicators, Margins, SectionState
 from vrw_jax.options import Options
@@ -89,7 +85,7 @@ class LimitCycle(eqx.Module):
     @property
     def monodromy(self) -> Float[Array, "... 2 2"]:
         """Derivative of the return to the section after the impact, over (theta+, dtheta+)."""
-        attach_one = _attach_monodromy if compiled_by_caller() else _compiled_attach
+        attach_one = attach_monodromy if compiled_by_caller() else _compiled_attach
         attach = functools.partial(attach_one, self.problem)
         for _ in range(self.outcome.ndim):
             attach = jax.vmap(attach)
@@ -156,94 +152,7 @@ class LimitCycle(eqx.Module):
         return tables.as_html("Limit cycle", tables.cycle_rows(self))
 
 
-def _tangent_space(problem: Problem, parameters: Parameters, located: Located) -> Located:
-    """d located / d parameters over lanes, with a leading axis; zero where nothing was found."""
-    passed = problem.pass_at(parameters, located, tuple(range(parameters.shape[0])))
-    columns = columns_of(passed, located)
-    return jax.tree.map(lambda x: jnp.where(located.found > 0.5, x, 0.0), columns)
-
-
-def _monodromy_over_lanes(problem: Problem, parameters: Parameters, located: Located) -> Array:
-    monodromy = problem.pass_at(parameters, located).monodromy
-    return jnp.where(located.found > 0.5, monodromy, 0.0)
-
-
-def _search_with_columns(
-    problem: Problem, parameters: Parameters, guess: Located | None = None
-) -> Finding:
-    """A search that also returns the columns of all parameters.
-
-    Alone, a wheel's passes carry them: one pass to compile. Batches save the time, and compile a
-    pass of its own for them.
-    """
-    block, n_lanes = problem.options.block, parameters.shape[-1]
-    if n_lanes <= block:
-        return search(problem, parameters, guess, tuple(range(parameters.shape[0])))
-    finding = search(problem, parameters, guess)
-    columns = in_blocks(functools.partial(_tangent_space, problem), block)
-    return finding._replace(columns=columns(parameters, finding.located))
-
-
-def _solve(problem: Problem, parameters: Array, guess: Located | None) -> tuple[Located, tuple]:
-    """Search for one wheel, differentiable in its parameters; the guess has no derivative."""
-    block = problem.options.block
-
-    find = one_wheel(functools.partial(search, problem))
-    find_with_columns = one_wheel(functools.partial(_search_with_columns, problem))
-    start = () if guess is None else (guess,)
-
-    def parts(finding: Finding) -> tuple[Located, tuple]:
-        return finding.located, (finding.monodromy, finding.residual, finding.passes)
-
-    @jax.custom_jvp
-    def solve(parameters: Array, *guess: Located) -> tuple[Located, tuple]:
-        return parts(find(parameters, *guess))
-
-    @jax.custom_jvp
-    def solve_with_columns(parameters: Array, *guess: Located) -> tuple:
-        finding = find_with_columns(parameters, *guess)
-        return *parts(finding), finding.columns
-
-    @solve.defjvp
-    def rule(primals: tuple, tangents: tuple) -> tuple:
-        located, other, columns = solve_with_columns(*primals)
-        return (located, other), (push(columns, tangents[0]), without_derivative(other))
-
-    @solve_with_columns.defjvp
-    def second_rule(primals: tuple, tangents: tuple) -> tuple:
-        located, other, columns = solve_with_columns(*primals)
-        tangent_space = functools.partial(_tangent_space, problem)
-        curvature = on_branch(total_derivative(tangent_space, tangent_space), tangent_space, block)(
-            primals[0], located
-        )
-        tangent = push((columns, curvature), tangents[0])
-        return (located, other, columns), (tangent[0], without_derivative(other), tangent[1])
-
-    return solve(parameters, *start)
-
-
-def _attach_monodromy(
-    problem: Problem, matrix: Array, parameters: Array, located: Located
-) -> Array:
-    """`matrix`, whose derivative is that of the monodromy matrix along the branch."""
-    tangent_space = functools.partial(_tangent_space, problem)
-    monodromy = functools.partial(_monodromy_over_lanes, problem)
-
-    @jax.custom_jvp
-    def attach(matrix: Array, parameters: Array, located: Located) -> Array:
-        return matrix
-
-    def rule(primals: tuple, tangents: tuple) -> tuple:
-        derivative = on_branch(
-            total_derivative(monodromy, tangent_space), tangent_space, problem.options.block
-        )
-        return attach(*primals), push(derivative(*primals[1:]), tangents[1])
-
-    attach.defjvp(rule)
-    return attach(matrix, parameters, located)
-
-
-_compiled_attach = jax.jit(_attach_monodromy, static_argnums=0)
+_compiled_attach = jax.jit(attach_monodromy, static_argnums=0)
 
 
 def _limit_cycle(params: WheelParams, problem: Problem, guess: Located | None) -> LimitCycle:
@@ -256,7 +165,7 @@ def _find_cycle(params: WheelParams, problem: Problem, guess: Located | None) ->
     table_1 = WheelParams(n_legs=problem.n_legs)
     safe = jax.tree.map(lambda x, d: jnp.where(usable, x, d.astype(x.dtype)), params, table_1)
     parameters = parameters_of(safe)
-    located, (matrix, residual, passes) = _solve(problem, parameters, guess)
+    located, (matrix, residual, passes) = solve_cycle(problem, parameters, guess)
     found = usable & (located.found > 0.5)
     # Zero measures and zero derivatives where there is no cycle: mask what goes in and comes out.
     masked = lambda x: jnp.where(found, x, 0.0)

@@ -146,26 +146,41 @@ class WheelParams(eqx.Module):
 
     def symbols(self) -> Symbols:
         """The paper's symbols with the combinations shared by every formula."""
-        m, L0, a = self.leg_mass, self.locked_length, self.leg_com
-        alpha = self.leg_angle
-        return Symbols(
-            m=m,
-            a=a,
-            L0=L0,
-            Ls=self.natural_length,
-            k=self.stiffness,
-            c=self.damping,
-            g=self.gravity,
-            sin_phi=jnp.sin(self.slope),
-            cos_phi=jnp.cos(self.slope),
-            Mh=self.hub_mass + (self.n_legs - 1) * m,
-            Mt=self.hub_mass + self.n_legs * m,
-            c0=L0 - a,
-            n=self.n_legs,
-            sin_alpha=math.sin(alpha),
-            cos_alpha=math.cos(alpha),
-            alpha=alpha,
-        )
+        return symbols_of(self.n_legs, *(getattr(self, name) for name in DOMAINS))
+
+
+def symbols_of(
+    n_legs: int,
+    hub_mass: Elementwise,
+    leg_mass: Elementwise,
+    leg_com: Elementwise,
+    locked_length: Elementwise,
+    natural_length: Elementwise,
+    stiffness: Elementwise,
+    damping: Elementwise,
+    slope: Elementwise,
+    gravity: Elementwise,
+) -> Symbols:
+    """`WheelParams.symbols` of bare numbers, which may be complex too."""
+    alpha = 2.0 * math.pi / n_legs
+    return Symbols(
+        m=leg_mass,
+        a=leg_com,
+        L0=locked_length,
+        Ls=natural_length,
+        k=stiffness,
+        c=damping,
+        g=gravity,
+        sin_phi=jnp.sin(slope),
+        cos_phi=jnp.cos(slope),
+        Mh=hub_mass + (n_legs - 1) * leg_mass,
+        Mt=hub_mass + n_legs * leg_mass,
+        c0=locked_length - leg_com,
+        n=n_legs,
+        sin_alpha=math.sin(alpha),
+        cos_alpha=math.cos(alpha),
+        alpha=alpha,
+    )
 
 
 PARAMETER_NAMES: tuple[str, ...] = tuple(DOMAINS)

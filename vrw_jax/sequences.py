@@ -21,7 +21,7 @@ from vrw_jax.geometry import (
     landing_foot_height,
     rear_direction,
 )
-from vrw_jax.params import PARAMETER_NAMES, Elementwise, Symbols, WheelParams
+from vrw_jax.params import Elementwise, Symbols, symbols_of
 
 N_CONSTANTS = 12
 """Fields of `Symbols` that vary from lane to lane; the rest follows from the number of legs."""
@@ -29,9 +29,8 @@ N_CONSTANTS = 12
 
 def constants_of(n_legs: int, *parameters: Elementwise) -> Constants:
     """The combinations that every formula needs, from the parameters in their order."""
-    fields = dict(zip(PARAMETER_NAMES, parameters, strict=True))
-    lane_fields: tuple[Any, ...] = WheelParams(**fields, n_legs=n_legs).symbols()
-    return lane_fields[:N_CONSTANTS]
+    symbols: tuple[Any, ...] = symbols_of(n_legs, *parameters)
+    return symbols[:N_CONSTANTS]
 
 
 def _symbols(n_legs: int, constants: Constants) -> Symbols:
