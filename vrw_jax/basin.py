@@ -1,14 +1,16 @@
 """Which starts end on which gait, and how the others fail: basins of attraction on a grid."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import xarray as xr
 
 from vrw_jax import transitions
 from vrw_jax.attractors import distinct, orbit_measures, settle
+from vrw_jax.lazy import xarray as xr
 from vrw_jax.measures import MARGINS, MEASURES, attrs_of
 from vrw_jax.models import AbstractWheel, ViscoelasticWheel
 from vrw_jax.options import Options

@@ -1,5 +1,7 @@
 """What a continuation hands back: a labelled branch, and the borders on it."""
 
+from __future__ import annotations
+
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -8,9 +10,9 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-import xarray as xr
 
 from vrw_jax import multipliers as floquet
+from vrw_jax.lazy import xarray as xr
 from vrw_jax.measures import MEASURES
 from vrw_jax.outcomes import Outcome
 

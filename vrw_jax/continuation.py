@@ -5,6 +5,8 @@ indicator or a monitor reaches zero. Each is solved for on the branch itself, ag
 so that it is as exact as the gaits are.
 """
 
+from __future__ import annotations
+
 import dataclasses
 import functools
 from collections.abc import Callable
@@ -14,7 +16,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import xarray as xr
 from jaxtyping import Array
 
 from vrw_jax.arclength import ArclengthOptions, MapFollowed, Point
@@ -32,6 +33,7 @@ from vrw_jax.followed_wheel import (
     on_mesh,
     with_parameter,
 )
+from vrw_jax.lazy import xarray as xr
 from vrw_jax.limit_cycle import LimitCycle, limit_cycle
 from vrw_jax.measures import CYCLE, GROUND, MARGINS, STEP, attrs_of
 from vrw_jax.models import AbstractWheel, UnilateralWheel, ViscoelasticWheel

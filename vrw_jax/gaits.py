@@ -4,6 +4,8 @@ No equation is solved for a fixed point: what stands here has been walked to, so
 it checks the Newton search independently.
 """
 
+from __future__ import annotations
+
 import dataclasses
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -11,8 +13,8 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-import xarray as xr
 
+from vrw_jax.lazy import xarray as xr
 from vrw_jax.measures import MARGINS, STEP, attrs_of, step_measures
 from vrw_jax.models import AbstractWheel
 from vrw_jax.models.base import SectionState

@@ -6,15 +6,17 @@ taken again, shortened by Newton's method until it ends on the event. Those last
 differentiated, hence first and second derivatives of event state and time hold as well.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import diffrax
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from vrw_jax.lazy import diffrax
 from vrw_jax.options import Options
 from vrw_jax.params import Scalar
 

@@ -4,6 +4,8 @@ A scan is cut into chunks, each computed by the same compiled function and, wher
 written at once: a scan that was interrupted goes on with the chunks that are missing.
 """
 
+from __future__ import annotations
+
 import contextlib
 import errno
 import platform
@@ -13,10 +15,10 @@ from pathlib import Path
 
 import jax
 import numpy as np
-import xarray as xr
 
 from vrw_jax.cycle_options import CycleOptions
 from vrw_jax.designs import AbstractDesign, Columns
+from vrw_jax.lazy import xarray as xr
 from vrw_jax.measures import MARGINS, attrs_of
 from vrw_jax.models import AbstractWheel, LadderWheel, UnilateralWheel, ViscoelasticWheel
 from vrw_jax.options import Options

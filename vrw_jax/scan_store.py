@@ -6,6 +6,8 @@ is written first and `chunk_done` marked after; every file is written beside its
 so whatever moment the process dies at, a chunk is either marked and complete or computed again.
 """
 
+from __future__ import annotations
+
 import abc
 import math
 import os
@@ -18,9 +20,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
-import zarr
-from zarr.codecs import Crc32cCodec, ZstdCodec
+
+from vrw_jax.lazy import xarray as xr
+from vrw_jax.lazy import zarr
 
 DONE = "chunk_done"
 MANIFEST = "scan"
@@ -243,6 +245,8 @@ def _umask() -> int:
 
 
 def _fill(path: Path, layout: Layout, attrs: Mapping[str, object]) -> None:
+    from zarr.codecs import Crc32cCodec, ZstdCodec
+
     # The attribute tells xarray which arrays are coordinates; it takes it off again when it opens.
     told = {**attrs, "coordinates": " ".join(layout.coordinates)}
     group = zarr.create_group(path, zarr_format=3, attributes=told)

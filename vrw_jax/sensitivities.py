@@ -1,17 +1,19 @@
 """How every measure of a gait answers to every parameter, as a labelled table."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import xarray as xr
 from jaxtyping import Array
 
 from vrw_jax.cycle_options import CycleOptions
 from vrw_jax.cycle_search import parameters_of, wheel_of
 from vrw_jax.ground_gait import MOVED, ground_gait, told, values_of
+from vrw_jax.lazy import xarray as xr
 from vrw_jax.limit_cycle import Guess, LimitCycle, limit_cycle
 from vrw_jax.measures import MEASURES as MEASURES_BY_NAME
 from vrw_jax.measures import ON_GROUND

@@ -4,6 +4,8 @@ The slope's frame: x downhill along the slope, z normal to it; the first foot st
 Angles and leg labels are those of the present step, so theta and the lengths jump at a landing.
 """
 
+from __future__ import annotations
+
 import importlib.metadata
 import platform
 
@@ -11,11 +13,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import xarray as xr
 from jaxtyping import Array
 
 from vrw_jax.dynamics import damping_power
 from vrw_jax.geometry import Motion, landing_direction, rear_direction
+from vrw_jax.lazy import xarray as xr
 from vrw_jax.measures import TRAJECTORY, attrs_of
 from vrw_jax.models import AbstractWheel, LadderWheel, UnilateralWheel
 from vrw_jax.models.base import SectionState

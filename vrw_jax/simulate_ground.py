@@ -3,12 +3,14 @@
 Of the unilateral wheel, and of the ladder, whose motion is told alike on both its rungs.
 """
 
+from __future__ import annotations
+
 import equinox as eqx
 import jax
 import numpy as np
-import xarray as xr
 from jaxtyping import Array
 
+from vrw_jax.lazy import xarray as xr
 from vrw_jax.measures import SERVED
 from vrw_jax.models import LadderStep, LadderWheel, UnilateralWheel
 from vrw_jax.models.unilateral import UnilateralTrajectory

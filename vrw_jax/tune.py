@@ -3,6 +3,8 @@
 Without premises as constraints more double support is simply bought by scuffing.
 """
 
+from __future__ import annotations
+
 import dataclasses
 import inspect
 import math
@@ -13,11 +15,11 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-import xarray as xr
 from jaxtyping import Array
 
 from vrw_jax.cycle_options import CycleOptions
 from vrw_jax.cycle_search import Problem, parameters_of, wheel_of
+from vrw_jax.lazy import xarray as xr
 from vrw_jax.limit_cycle import LimitCycle
 from vrw_jax.measures import MARGINS, ON_GROUND, attrs_of, flags
 from vrw_jax.models import (

@@ -4,12 +4,14 @@
 the indices off the result by `scipy.stats.sobol_indices` (Saltelli et al. 2010).
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable
 
 import numpy as np
-import xarray as xr
 
 from vrw_jax.designs import SALTELLI
+from vrw_jax.lazy import xarray as xr
 from vrw_jax.outcomes import Outcome
 from vrw_jax.wording import nearest
 
