@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Inexact
 from numpy.polynomial import legendre
 
 from vrw_jax.params import Elementwise
@@ -43,7 +43,7 @@ TWICE, ENDS_TWICE = ONCE @ ONCE, ENDS_ONCE @ ONCE
 
 Constants = tuple[Elementwise, ...]
 Vector = tuple[Elementwise, ...]
-LaneArray = Float[Array, "... lanes"]
+LaneArray = Inexact[Array, "... lanes"]
 
 
 class Point(NamedTuple):
@@ -127,7 +127,7 @@ class Linearised(NamedTuple):
 Hold = Callable[[Any], Any]
 
 
-def fusion_barrier(lanes: Float[Array, "... lanes"]) -> Hold:
+def fusion_barrier(lanes: Inexact[Array, "... lanes"]) -> Hold:
     """A function that returns its argument and that XLA can't fuse across.
 
     `lanes` must not hold NaN; that it does not is what XLA can't know.
@@ -160,7 +160,7 @@ def _contract(left: Array, right: Array) -> Array:
     return sum(terms[1:], start=terms[0])
 
 
-def inverse(matrix: Float[Array, "n n lanes"]) -> Float[Array, "n n lanes"]:
+def inverse(matrix: Inexact[Array, "n n lanes"]) -> Inexact[Array, "n n lanes"]:
     """Inverse of a 1x1, 2x2 or 3x3 matrix by cofactors."""
     m = matrix
     if m.shape[0] == 1:
@@ -183,10 +183,10 @@ def inverse(matrix: Float[Array, "n n lanes"]) -> Float[Array, "n n lanes"]:
 
 @jax.custom_jvp
 def _eliminate(
-    matrix: Float[Array, "nodes dim nodes dim lanes"],
-    right: Float[Array, "nodes dim columns lanes"],
+    matrix: Inexact[Array, "nodes dim nodes dim lanes"],
+    right: Inexact[Array, "nodes dim columns lanes"],
     for_barrier: LaneArray,
-) -> Float[Array, "nodes dim columns lanes"]:
+) -> Inexact[Array, "nodes dim columns lanes"]:
     """Solve the node equations of one step, block by block without pivoting.
 
     The matrix is the mass matrix plus terms of order h; its diagonal blocks stay regular.

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Inexact, Int
 
 from vrw_jax import gait_surface, sequences
 from vrw_jax.collocation import (
@@ -30,7 +30,7 @@ from vrw_jax.cycle_options import CycleOptions
 from vrw_jax.lanes import from_blocks, to_blocks
 from vrw_jax.params import PARAMETER_NAMES, WheelParams
 
-Parameters = Float[Array, "n_parameters lanes"]
+Parameters = Inexact[Array, "n_parameters lanes"]
 """The float parameters in the order of PARAMETER_NAMES."""
 
 

@@ -7,14 +7,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Inexact
 
 Scalar = Float[Array, ""]
 if TYPE_CHECKING:
     Elementwise = Array
 else:
-    Elementwise = Float[Array, "..."] | float
-"""A quantity that may carry any leading axes: formulas below `scan` act element by element."""
+    Elementwise = Inexact[Array, "..."] | float
+"""A quantity that may carry any leading axes: formulas below `scan` act element by element.
+
+Complex where a derivative is taken by complex step (see cycle_derivatives)."""
 
 
 def as_float_array(value: object) -> Array:
