@@ -6,7 +6,8 @@ and COBYLA, at equal numbers of limit cycles. Then a grid around the best wheel,
 Both optima are corners, held by as many constraints and bounds as there are parameters: where
 linear models are all it takes COBYLA is as good as it gets. Gaps below 1e-5 are the breach allowed.
 
-Writes `tuning_against_others.csv`, `.svg` and `.png` to `docs/figures` or the folder given:
+Writes `tuning_against_others.csv`, `.svg` and `.png` to `docs/figures` or the folder given, and the
+table of `docs/tuning.md` beside it:
 `python experiments/tuning_against_others.py [folder] [number of starts]`. Needs the extra
 `experiments`.
 """
@@ -255,6 +256,25 @@ def drawn(results: dict[str, dict]) -> Figure:
     return figure
 
 
+def summary(rows: list[dict]) -> str:
+    """How many starts came near the best, by how many gaits and in what time: medians."""
+    near = " | ".join(f"within {gap:g}: starts, gaits" for gap in NEAR)
+    lines = [f"| problem | method | {near} | s | longest, s |", "|---" * (4 + len(NEAR)) + "|"]
+    for (problem, method), some in itertools.groupby(
+        rows, key=lambda row: (row["problem"], row["method"])
+    ):
+        mine = list(some)
+        told = []
+        for gap in NEAR:
+            reached = [int(row[f"gaits to {gap:g}"]) for row in mine if row[f"gaits to {gap:g}"]]
+            gaits = f", {np.median(reached):.0f}" if reached else ""
+            told.append(f"{len(reached)} of {len(mine)}{gaits}")
+        seconds = [float(row["seconds"]) for row in mine]
+        cells = (problem, method, *told, f"{np.median(seconds):.2f}", f"{max(seconds):.2f}")
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
 def main(folder: Path, n_starts: int) -> None:
     rows: list[dict] = []
     results = {}
@@ -274,20 +294,18 @@ def main(folder: Path, n_starts: int) -> None:
         u = u / problem.widths
         print(f"\n{name}: best known {result['best']:.9g}\n{tuned}")
         print("grid around it:", grid_around(problem, result["values"], u, tuned.value))
-        for method in result["curves"]:
-            mine = [row for row in rows if row["method"] == method and row["problem"] == name]
-            told = []
-            for gap in NEAR:
-                reached = [row[f"gaits to {gap:g}"] for row in mine if row[f"gaits to {gap:g}"]]
-                middle = f"{np.median(reached):.0f}" if reached else "-"
-                told.append(f"within {gap:g}: {len(reached)} of {len(mine)} starts, {middle} gaits")
-            seconds = np.median([float(row["seconds"]) for row in mine])
-            print(f"  {method:12s} {'; '.join(told)}; {seconds:.2f} s per start")
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "tuning_against_others.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, fieldnames=list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
+    table = summary(rows)
+    print(table)
+    page = folder.parent / "tuning.md"
+    if page.exists():
+        before, rest = page.read_text().split("<!-- table -->\n")
+        after = rest.split("<!-- end of table -->")[1]
+        page.write_text(f"{before}<!-- table -->\n\n{table}\n\n<!-- end of table -->{after}")
     plots.save(drawn(results), folder, "tuning_against_others")
 
 

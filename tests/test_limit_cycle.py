@@ -95,10 +95,30 @@ def test_first_derivatives_agree_with_the_truth(options, allowed):
 @pytest.mark.slow
 def test_derivatives_of_the_spectral_radius_agree_with_the_truth():
     found = of_the_truth(None, ("spectral_radius",))[0]["spectral_radius"]
+    rows = [table_1(), table_1(slope=0.02), table_1(damping=np.nan)]
+    failed = differentiated(rows, None, ("spectral_radius",))[0]["spectral_radius"]
+    assert np.all(np.asarray(failed)[1:] == 0.0)
     expected = np.stack(
         [truth.floats(case["cycle"]["d_params"]["spectral_radius"]) for case in truth.CASES]
     )
     assert relative_error(found, expected) < 1e-8
+
+
+@pytest.mark.slow
+def test_second_derivatives_agree_with_differences_and_vanish_where_there_is_no_cycle():
+    rows = jnp.asarray(np.stack([table_1(), table_1(slope=0.02), table_1(damping=np.nan)]))
+    slope = PARAMETER_NAMES.index("slope")
+
+    def fraction(vector):
+        return vrw.limit_cycle(truth.wheel(vector)).dls_fraction
+
+    gradients = jax.jit(jax.vmap(jax.grad(fraction)))
+    found = jax.jit(jax.vmap(jax.jacfwd(jax.grad(fraction))))(rows)
+    assert np.all(np.asarray(found)[1:] == 0.0)
+    np.testing.assert_allclose(found[0], found[0].T, rtol=1e-9, atol=1e-12)
+    step = 1e-5 * np.eye(len(PARAMETER_NAMES))[slope]  # errors: 1e-10 of the step, 1e-15 over it
+    ahead, behind = gradients(rows[:1] + step)[0], gradients(rows[:1] - step)[0]
+    np.testing.assert_allclose(found[0][slope], (ahead - behind) / 2e-5, rtol=1e-6, atol=1e-8)
 
 
 @pytest.mark.slow
