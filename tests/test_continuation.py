@@ -9,8 +9,9 @@ import vrw_jax as vrw
 from vrw_jax.border_search import locate
 from vrw_jax.branch_plots import branch_figure
 from vrw_jax.branch_report import write
-from vrw_jax.integrate import Watched, integrate_phase
+from vrw_jax.integrate import integrate_phase
 from vrw_jax.measures import step_measures
+from vrw_jax.minima import Watched
 
 RADIUS_AT_200 = 0.32861954  # Table 1: published for orientation beside the physics
 WITHIN = 1e-9

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.integrate import Watched, integrate_phase
+from vrw_jax.integrate import integrate_phase
+from vrw_jax.minima import Watched
 
 TIGHT = vrw.Options.tight()
 

@@ -11,7 +11,8 @@ from oracle import moreau_jean
 from scipy.optimize import brentq
 
 import vrw_jax as vrw
-from vrw_jax.integrate import Watched, integrate_phase
+from vrw_jax.integrate import integrate_phase
+from vrw_jax.minima import Watched
 from vrw_jax.models.unilateral_contacts import OFF, SLIP_DOWN, SLIP_UP, STICK
 from vrw_jax.models.unilateral_events import event_of, resolve
 from vrw_jax.models.unilateral_mechanics import (

@@ -17,27 +17,24 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.lazy import diffrax
+from vrw_jax.minima import (
+    Minimum,
+    Settling,
+    State,
+    Step,
+    Watched,
+    cubic,
+    cubic_minimum,
+    lower,
+    no_minimum,
+    row_of,
+    settle,
+)
 from vrw_jax.options import Options
 from vrw_jax.params import Scalar
 
-State = Float[Array, " dim"]
 Field = Callable[[State], State]
 """Autonomous vector field of a phase."""
-Watch = Callable[[State], Float[Array, " n_watched"]]
-"""Guards and monitors as functions of the state."""
-
-
-class Watched(NamedTuple):
-    """What to watch along a phase: guards that end it, then monitors whose minimum is wanted.
-
-    `values` returns the `n_guards` guards followed by the monitors. A monitor's minimum is sought
-    at every interior local minimum and at the phase's end; at its start too (`count_start`), unless
-    the quantity is zero there by construction, like the height of a foot that leaves the ground.
-    """
-
-    values: Watch
-    n_guards: int
-    count_start: tuple[bool, ...] = ()
 
 
 class PhaseEnd(NamedTuple):
@@ -52,16 +49,6 @@ class PhaseEnd(NamedTuple):
     minima: Float[Array, " n_monitors"]  # of the monitors, empty without
 
 
-class _Step(NamedTuple):
-    """The end of the last accepted step: what a rejected step leaves as it is."""
-
-    time: Scalar
-    state: State
-    solver_state: Any
-    values: Float[Array, " n_watched"]
-    rates: Float[Array, " n_watched"]
-
-
 class _Search(NamedTuple):
     """Newton's search for the earliest event inside a step that brackets one."""
 
@@ -74,22 +61,13 @@ class _Search(NamedTuple):
     settled: Int[Array, ""]  # tries that no longer moved the event
 
 
-class _Minimum(NamedTuple):
-    """Lowest interior minimum so far of each monitor, and the step that holds it."""
-
-    value: Float[Array, " n"]
-    left: Float[Array, "n dim"]
-    length: Float[Array, " n"]  # of the step from `left`, s
-    offset: Float[Array, " n"]  # of the minimum from `left`, s
-    rate_left: Float[Array, " n"]
-
-
 class _Loop(NamedTuple):
-    step: _Step
+    step: Step
     length: Scalar  # of the next step to try, s
     controller_state: Any
     search: _Search
-    minimum: _Minimum
+    minimum: Minimum
+    settling: Settling
     running: Bool[Array, ""]
     guard: Int[Array, ""]
     timed_out: Bool[Array, ""]
@@ -118,7 +96,12 @@ class _Stepper(NamedTuple):
             lambda terms, t, y, args: terms.vf(t, y, args),
             self.solver.error_order(self.term),
         )
-        return self.solver.init(self.term, zero, options.first_step, state, None), controller_state
+        return self.solver_state(state, options), controller_state
+
+    def solver_state(self, state: State, options: Options) -> Any:
+        """What the solver keeps from step to step, at a state."""
+        zero = jnp.zeros((), state.dtype)
+        return self.solver.init(self.term, zero, options.first_step, state, None)
 
     def step(self, state: State, solver_state: Any, length: Scalar) -> tuple[State, State, Any]:
         """State after `length`, its error estimate and the solver state there."""
@@ -184,32 +167,6 @@ def _stepper(field: Field, options: Options) -> _Stepper:
     )
 
 
-def _cubic(x: Array, v0: Array, r0: Array, v1: Array, r1: Array) -> Array:
-    """Cubic Hermite interpolant on [0, 1]; the rates are already times the length."""
-    return (
-        (1 + 2 * x) * (1 - x) ** 2 * v0
-        + x * (1 - x) ** 2 * r0
-        + x * x * (3 - 2 * x) * v1
-        + x * x * (x - 1) * r1
-    )
-
-
-def _cubic_minimum(v0: Array, r0: Array, v1: Array, r1: Array) -> tuple[Array, Array]:
-    """Place in (0, 1) and value of the cubic's interior minimum; value inf where there is none."""
-    a = 3.0 * (2.0 * v0 + r0 - 2.0 * v1 + r1)
-    b = 2.0 * (-3.0 * v0 - 2.0 * r0 + 3.0 * v1 - r1)
-    discriminant = b * b - 4.0 * a * r0
-    root = jnp.sqrt(jnp.where(discriminant > 0.0, discriminant, 1.0))
-    # The minimum is the root with positive curvature, written without cancellation.
-    denominator = jnp.where(b >= 0.0, -(b + root), 2.0 * a)
-    numerator = jnp.where(b >= 0.0, 2.0 * r0, root - b)
-    safe = jnp.where(denominator == 0.0, 1.0, denominator)
-    x = jnp.where(denominator == 0.0, -1.0, numerator / safe)
-    exists = (discriminant > 0.0) & (x > 0.0) & (x < 1.0)
-    x = jnp.where(exists, x, 0.5)
-    return x, jnp.where(exists, _cubic(x, v0, r0, v1, r1), jnp.inf)
-
-
 def integrate_phase(
     field: Field,
     watched: Watched,
@@ -237,11 +194,12 @@ def integrate_phase(
     solver_state, controller_state = stepper.start(start, options)
     controller_state = jax.tree.map(lambda x: x + fixed, controller_state)
     loop = _Loop(
-        step=_Step(zero, start, solver_state, nothing, nothing),
+        step=Step(zero, start, solver_state, nothing, nothing),
         length=zero,  # the first step has no length: it evaluates the start
         controller_state=controller_state,
         search=_Search(no, jnp.zeros((n_guards,), bool) | no, fixed, fixed, fixed, none, none),
-        minimum=_no_minimum(watched, start),
+        minimum=no_minimum(watched, start),
+        settling=Settling(no, none, none, fixed, fixed, nothing[n_guards:] + jnp.inf),
         running=active,
         guard=none - 1,
         timed_out=no,
@@ -250,16 +208,21 @@ def integrate_phase(
     )
 
     def advance(loop: _Loop) -> _Loop:
-        """Take one step and judge it: march on, begin or go on searching an event, or end.
+        """Take one step and judge it: march on, search an event, settle a minimum, or end.
 
-        One call of solver and watch serves the evaluation of the start, marching and searching:
-        code compiled once.
+        One call of solver and watch serves the evaluation of the start, marching, searching and
+        settling: code compiled once.
         """
-        here, length, search = loop.step, loop.length, loop.search
-        end, error, solver_state = stepper.step(here.state, here.solver_state, length)
+        here, length, search, settling = loop.step, loop.length, loop.search, loop.settling
+        left = here.state, here.solver_state
+        if watched.count_start:
+            place = row_of(settling.monitor, loop.minimum.left)
+            left = _select(settling.on, (place, stepper.solver_state(place, options)), left)
+        end, error, solver_state = stepper.step(*left, length)
         values, rates = jax.jvp(watched.values, (end,), (stepper.field(end),))
         guards, guard_rates = values[:n_guards], rates[:n_guards]
-        starting, marching = loop.tried == 0, (loop.tried > 0) & ~search.on
+        starting = loop.tried == 0
+        marching = ~(starting | search.on | settling.on)
 
         # At the start: a guard that is past, or on its way, ends the phase at once.
         past = (guards < 0.0) | ((guards == 0.0) & (guard_rates <= 0.0))
@@ -289,9 +252,9 @@ def integrate_phase(
         arrived = search.on & (settled >= SETTLED)
 
         time = here.time + length
-        step = _Step(time, end, solver_state, values, rates)
+        step = Step(time, end, solver_state, values, rates)
         timed_out = accepted & (time >= options.max_phase_time)
-        tried = loop.tried + 1
+        tried = loop.tried + ~settling.on
         stuck = (search.on & ~arrived & (search.tries >= options.event_steps)) | (
             marching
             & ~crossed
@@ -302,14 +265,22 @@ def integrate_phase(
         following = jnp.where(retry, to_dip, following)
         following = jnp.where(crossed, guess, following)
         resolution = 1e3 * jnp.finfo(length.dtype).eps * time
+        following = jnp.where(search.on, found.length, lax.stop_gradient(following))
+        minimum = lower(watched, loop.minimum, here, step, length, (accepted & marching) | arrived)
+        ends = ends_at_once | arrived | timed_out | stuck
+        if watched.count_start:
+            settling, following = settle(
+                settling, watched, minimum, values, rates, length, following, starting, ends,
+                options.monitor_steps,
+            )  # fmt: skip
         return _Loop(
             step=_select(accepted | arrived, step, here),
-            length=jnp.where(search.on, found.length, lax.stop_gradient(following)),
+            length=following,
             controller_state=_select(
                 marching & ~retry, next_controller_state, loop.controller_state
             ),
             search=_Search(
-                on=search.on | crossed,
+                on=(search.on | crossed) & ~ends,
                 crossing=jnp.where(crossed, crossing, search.crossing),
                 low=jnp.where(crossed, 0.0, found.low),
                 high=jnp.where(crossed, lax.stop_gradient(length), found.high),
@@ -321,24 +292,21 @@ def integrate_phase(
                 tries=search.tries + search.on,
                 settled=settled,
             ),
-            minimum=_lower(
-                watched, loop.minimum, here, step, length, (accepted & marching) | arrived
-            ),
-            running=~(ends_at_once | arrived | timed_out | stuck),
+            minimum=minimum,
+            settling=settling,
+            running=~(ends | loop.settling.on) | settling.on,
             guard=jnp.where(
                 ends_at_once,
                 jnp.argmax(past).astype(jnp.int32),
                 jnp.where(arrived, found.guard, loop.guard),
             ),
-            timed_out=timed_out,
-            gave_up=stuck,
+            timed_out=timed_out | loop.timed_out,
+            gave_up=stuck | loop.gave_up,
             tried=tried,
         )
 
     loop = lax.while_loop(lambda loop: loop.running, advance, loop)
-    minima = jnp.zeros((0,), start.dtype)
-    if watched.count_start:
-        minima = _settle(stepper, watched, loop.minimum, start, loop.step, options)
+    minima = jnp.minimum(loop.settling.lowest, loop.step.values[n_guards:])
     return PhaseEnd(
         state=loop.step.state,
         duration=loop.step.time,
@@ -364,7 +332,7 @@ def _select(condition: Any, yes: Any, no: Any) -> Any:
 
 
 def _dips(
-    here: _Step, values: Array, rates: Array, length: Scalar, n_guards: int
+    here: Step, values: Array, rates: Array, length: Scalar, n_guards: int
 ) -> tuple[Array, Array]:
     """Places in (0, 1) where a guard that falls and rises again is lowest, and whether to look.
 
@@ -376,14 +344,14 @@ def _dips(
     v0, r0, v1, r1 = lax.stop_gradient((here.values, here.rates, values, rates))
     v0, r0, v1, r1 = v0[:n_guards], r0[:n_guards], v1[:n_guards], r1[:n_guards]
     length = lax.stop_gradient(length)
-    places, lows = _cubic_minimum(v0, r0 * length, v1, r1 * length)
+    places, lows = cubic_minimum(v0, r0 * length, v1, r1 * length)
     near = lows <= 0.25 * (jnp.maximum(v0, v1) - lows)
     new = (v0 - lows > 0.01 * lows) & (here.time + places * length > here.time)
     return places, (r0 < 0.0) & (r1 >= 0.0) & near & new
 
 
 def _first_guess(
-    here: _Step, values: Array, rates: Array, length: Scalar, n_guards: int, crossing: Array
+    here: Step, values: Array, rates: Array, length: Scalar, n_guards: int, crossing: Array
 ) -> Scalar:
     """Length to the earliest crossing by the guards' cubics: secant, then Newton's method."""
     v0, r0, v1, r1 = lax.stop_gradient((here.values, here.rates * length, values, rates * length))
@@ -397,7 +365,7 @@ def _first_guess(
             + at * (3.0 * at - 2.0) * r1
         )
         falls = slope < 0.0
-        change = _cubic(at, v0, r0, v1, r1) / jnp.where(falls, slope, 1.0)
+        change = cubic(at, v0, r0, v1, r1) / jnp.where(falls, slope, 1.0)
         at = jnp.where(crossing & falls, jnp.clip(at - change, 0.0, 1.0), at)
     return lax.stop_gradient(length) * jnp.min(jnp.where(crossing, at, 1.0))
 
@@ -436,101 +404,6 @@ def _searched(
     inside = (proposal >= low - search.accuracy) & (proposal <= high + search.accuracy)
     following = jnp.where(inside, jnp.where(inside, proposal, 0.0), 0.5 * (low + high))
     return _Found(following, guard, low, high)
-
-
-def _no_minimum(watched: Watched, start: State) -> _Minimum:
-    n = len(watched.count_start)
-    zeros = jnp.zeros((n,), start.dtype)
-    return _Minimum(zeros + jnp.inf, jnp.tile(start, (n, 1)), zeros, zeros, zeros)
-
-
-def _lower(
-    watched: Watched,
-    minimum: _Minimum,
-    left: _Step,
-    right: _Step,
-    length: Scalar,
-    counts: Bool[Array, ""],
-) -> _Minimum:
-    """Keep the step in which a monitor turns from falling to rising, if it is the lowest yet.
-
-    A monitor that is zero at the phase's start is at rest there: rounding must not make it fall.
-    """
-    if not watched.count_start:
-        return minimum
-    v0, r0, v1, r1 = (
-        lax.stop_gradient(v)[watched.n_guards :]
-        for v in (left.values, left.rates, right.values, right.rates)
-    )
-    at_rest = (left.time == 0.0) & ~jnp.asarray(watched.count_start)
-    r0 = jnp.where(at_rest, jnp.maximum(r0, 0.0), r0)
-    length = lax.stop_gradient(length)
-    x, value = _cubic_minimum(v0, r0 * length, v1, r1 * length)
-    value = jnp.where(jnp.isfinite(value), value, jnp.minimum(v0, v1))
-    better = counts & (r0 < 0.0) & (r1 >= 0.0) & (value < minimum.value)
-    return _Minimum(
-        jnp.where(better, value, minimum.value),
-        jnp.where(better[:, None], left.state, minimum.left),
-        jnp.where(better, length, minimum.length),
-        jnp.where(better, x * length, minimum.offset),
-        jnp.where(better, r0, minimum.rate_left),
-    )
-
-
-def _settle(
-    stepper: _Stepper,
-    watched: Watched,
-    minimum: _Minimum,
-    start: State,
-    end: _Step,
-    options: Options,
-) -> Float[Array, " n_monitors"]:
-    """Each monitor's minimum over the phase, to the integrator's accuracy.
-
-    Secant steps on the rate, each a re-step from the left end of the step that holds the minimum.
-    """
-    found = jnp.isfinite(minimum.value)
-
-    def refine(
-        index: Array, left: State, length: Scalar, offset: Scalar, rate_left: Scalar
-    ) -> Scalar:
-        zero = jnp.zeros_like(length)
-        solver_state = stepper.solver.init(stepper.term, zero, length, left, None)
-
-        def secant(carry: tuple, _iteration: None) -> tuple:
-            offset, at, rate_at, _ = carry
-            state, _, _ = stepper.step(left, solver_state, offset)
-            values, rates = jax.jvp(watched.values, (state,), (stepper.field(state),))
-            value, rate = values[index], rates[index]
-            fixed_rate, fixed_offset = lax.stop_gradient((rate, offset))
-            gap = fixed_offset - at
-            slope = (fixed_rate - rate_at) / jnp.where(gap == 0.0, 1.0, gap)
-            usable = (gap != 0.0) & (slope > 0.0)
-            following = offset - jnp.where(usable, rate / jnp.where(usable, slope, 1.0), 0.0)
-            following = jnp.clip(following, 0.0, length)
-            nearer = jnp.abs(fixed_rate) < jnp.abs(rate_at)
-            at, rate_at = _select(nearer, (fixed_offset, fixed_rate), (at, rate_at))
-            return (following, at, rate_at, value), None
-
-        carry = (offset, zero, rate_left, zero)
-        carry, _ = lax.scan(secant, carry, None, length=options.monitor_steps)
-        return carry[-1]
-
-    length, offset, rate_left = lax.stop_gradient(
-        (minimum.length, minimum.offset, minimum.rate_left)
-    )
-    indices = watched.n_guards + jnp.arange(len(watched.count_start))
-    values = jax.vmap(refine)(
-        indices,
-        minimum.left,
-        jnp.where(found, length, 0.0),
-        jnp.where(found, offset, 0.0),
-        rate_left,
-    )
-    at_start = watched.values(start)[watched.n_guards :]
-    at_start = jnp.where(jnp.asarray(watched.count_start), at_start, jnp.inf)
-    edges = jnp.minimum(at_start, end.values[watched.n_guards :])
-    return jnp.minimum(jnp.where(found, values, jnp.inf), edges)
 
 
 def sample_phase(

@@ -12,7 +12,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.derivatives import Forward, any_mode
-from vrw_jax.integrate import PhaseEnd, Watched, integrate_phase, sample_phase
+from vrw_jax.integrate import PhaseEnd, integrate_phase, sample_phase
+from vrw_jax.minima import Watched
 from vrw_jax.models.base import AbstractStep, AbstractWheel, Advance, replaced_where_bad, usable
 from vrw_jax.models.unilateral_contacts import OFF
 from vrw_jax.models.unilateral_events import Change, Event, event_of, resolve

@@ -18,7 +18,8 @@ from vrw_jax.geometry import (
     landing_foot_height,
     rear_foot_height,
 )
-from vrw_jax.integrate import Field, PhaseEnd, State, Watch, Watched, integrate_phase, sample_phase
+from vrw_jax.integrate import Field, PhaseEnd, integrate_phase, sample_phase
+from vrw_jax.minima import State, Watch, Watched
 from vrw_jax.models.base import (
     AbstractWheel,
     Advance,
