@@ -70,6 +70,7 @@ class Phase(NamedTuple):
     event: Callable[[Constants, Point], Elementwise]
     reset: Callable[[Constants, Point], Point]
     guards: Callable[[Constants, Point], Vector]
+    smooth: bool = True  # False: a fast mode that dies at once is left to the first step
 
 
 class PhaseSequence(NamedTuple):
@@ -567,6 +568,43 @@ def walk_through(
     return point.q, tuple(passages)
 
 
+def mesh_error(sequence: PhaseSequence, meshes: tuple[Mesh, ...], solution: Solution) -> LaneArray:
+    """Estimate of what the mesh leaves of error in a cycle, rad, m and parts of the period.
+
+    Each step's accelerations are a polynomial of their own; where two steps meet they differ by
+    what neither resolves. That jump times the longer step squared is a displacement; times
+    JUMP_TO_ERROR it bounds the error of all but some of rounding, among 346 random gaits with
+    periods to 10 s, on two meshes, and stands far above it in most. Phases that are not smooth do
+    not count: what they leave to one step hardly reaches the next.
+    """
+    largest = jnp.zeros(solution.section.shape[-1], solution.section.dtype)
+    for i, mesh in enumerate(meshes):
+        if mesh.n_steps == 1 or not sequence.phases[i].smooth:
+            continue
+        ends, begins = (
+            jnp.tensordot(jnp.asarray(_lagrange(place), largest.dtype), nodes, (0, 2))
+            for place, nodes in (
+                (1.0, solution.accelerations[i][:, :-1]),
+                (0.0, solution.accelerations[i][:, 1:]),
+            )
+        )
+        longer = np.maximum(mesh.fractions[1:], mesh.fractions[:-1])
+        length = longer[:, None, None].astype(largest.dtype) * solution.durations[:, None, None, i]
+        jump = jnp.abs(ends - begins) * length * length
+        largest = jnp.maximum(largest, jnp.max(jump, axis=(0, 1, 2)))
+    return JUMP_TO_ERROR * largest
+
+
+JUMP_TO_ERROR = 0.05
+
+
+def _lagrange(place: float) -> np.ndarray:
+    """Weights of a step's nodes for the value of their polynomial at `place`, in steps."""
+    gaps = NODES[:, None] - NODES + np.eye(N_NODES)
+    others = np.where(np.eye(N_NODES, dtype=bool), 1.0, (place - NODES) / gaps)
+    return np.prod(others, axis=1)
+
+
 def transfer_matrix(source: Mesh, target: Mesh) -> np.ndarray:
     """From accelerations at the nodes of one mesh to those of another, (target, source) nodes.
 
@@ -582,7 +620,5 @@ def transfer_matrix(source: Mesh, target: Mesh) -> np.ndarray:
     for row, time in enumerate(times):
         step = int(np.clip(np.searchsorted(borders, time) - 1, 0, source.n_steps - 1))
         place = (time - borders[step]) / source.fractions[step]
-        for node in range(N_NODES):
-            others = np.delete(NODES, node)
-            matrix[row, step * N_NODES + node] = np.prod((place - others) / (NODES[node] - others))
+        matrix[row, step * N_NODES : (step + 1) * N_NODES] = _lagrange(place)
     return matrix

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from vrw_jax import dynamics, transitions
 from vrw_jax import multipliers as floquet
-from vrw_jax.collocation import N_NODES, Solution
+from vrw_jax.collocation import N_NODES, Solution, mesh_error
 from vrw_jax.cycle_derivatives import attach_monodromy, solve_cycle
 from vrw_jax.cycle_options import CycleOptions
 from vrw_jax.cycle_search import (
@@ -121,6 +121,21 @@ class LimitCycle(eqx.Module):
         """Condition number of I - monodromy: how much the cycle magnifies a disturbance."""
         matrix = jnp.eye(self.matrix.shape[-1]) - self.matrix
         return jnp.where(self.found, jnp.linalg.cond(matrix), 0.0)
+
+    @property
+    def mesh_error(self) -> Array:
+        """Estimate, mostly too large, of the mesh's error: see collocation.mesh_error.
+
+        Above 1e-5 a gait does not count as found: give `CycleOptions` more steps.
+        """
+
+        def of_one(located: Located) -> Array:
+            lanes = jax.tree.map(lambda x: x[..., None], located.solution)
+            return mesh_error(self.problem.sequence, self.problem.meshes, lanes)[0]
+
+        for _ in range(self.outcome.ndim):
+            of_one = jax.vmap(of_one)
+        return jnp.where(self.found, of_one(self.located), 0.0)
 
     @property
     def monitors(self) -> Margins:
@@ -291,7 +306,8 @@ def limit_cycle(
     Needs no start for `period_n` 1. `guess`, a neighbour's cycle or a section state (theta-,
     dtheta-, dL1-) near the gait, makes it quicker and picks the branch. Found cycles satisfy the
     paper's sequence of phases at all nodes, stable or not. Errors at the default options: 1e-9
-    relative in values, 1e-8 in first derivatives. Differentiable in every mode and order;
+    relative in values, 1e-8 in first derivatives, while steps last some 1.5 s at most; longer ones
+    are told by `mesh_error`, and not found above 1e-5. Differentiable in every mode and order;
     `jax.vmap` runs the wheels side by side.
 
     Any other rung as `model` is solved on its own return map, with `Options` of its step: a

@@ -40,7 +40,9 @@ _MEANINGS = {
     Outcome.NO_TOUCHDOWN_IN_TIME: "No touchdown came within the allowed time of one phase.",
     Outcome.SOLVER_GAVE_UP: "The integrator ran out of steps or could not locate an event.",
     Outcome.BAD_INPUT: "A parameter or the start is not finite, or outside its domain.",
-    Outcome.NO_CYCLE_FOUND: "The search for a limit cycle did not converge to a valid one.",
+    Outcome.NO_CYCLE_FOUND: (
+        "The search for a limit cycle did not converge to a valid one, or its mesh is too coarse."
+    ),
     Outcome.TOO_MANY_EVENTS: "Contacts and stoppers changed more often than one step may.",
     Outcome.NO_ADMISSIBLE_CONTACT: (
         "No combination of contact modes satisfies Coulomb's law (a Painlevé paradox)."

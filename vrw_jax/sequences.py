@@ -159,7 +159,7 @@ def _phases(n_legs: int) -> tuple[Phase, Phase]:
 
     return (
         Phase("DLS", 1, dls_residual, lift_off, dls_reset, dls_guards),
-        Phase("SLS-I", 3, sls1_residual, stopper_gap, sls1_reset, sls1_guards),
+        Phase("SLS-I", 3, sls1_residual, stopper_gap, sls1_reset, sls1_guards, smooth=False),
     )
 
 
