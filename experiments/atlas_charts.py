@@ -1,6 +1,7 @@
 """Charts of stability_atlas.py, drawn from its tables alone."""
 
 import csv
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,6 +24,7 @@ STYLES = {  # of Okabe and Ito, a marker each
     "SciPy Radau": ("#56B4E9", ">"),
 }
 AXES = {"c/m": r"$c/m$ [s$^{-1}$] at $k$ = 500 N/m", "k/m": r"$k/m$ [s$^{-2}$] at $c/m$ = 100/s"}
+SIGNS = re.compile("λ([24])⁺ → 0")
 FAST = 1.03  # rate of SLS-I's fast mode over c/m, docs/physics.md
 
 
@@ -68,14 +70,15 @@ def stiffness(rows: list[Row], limit: Callable[[str], float]) -> Figure:
 
 def borders(rows: list[Row]) -> Figure:
     """Error of derivatives and values over the distance to a border."""
+    names = list(dict.fromkeys(row["border"] for row in rows))
     figure = Figure(figsize=(PAGE, 2.8))
-    grid = figure.subplots(1, 3, sharey=True)
-    for axes, name in zip(grid, dict.fromkeys(row["border"] for row in rows), strict=True):
+    grid = figure.subplots(1, len(names), sharey=True)
+    for axes, name in zip(grid, names, strict=True):
         some = [row for row in rows if row["border"] == name]
         x = numbers(some, "distance")
         axes.loglog(x, numbers(some, "derivative_error"), "o-", ms=4, label="derivative")
         axes.loglog(x, numbers(some, "value_error"), "s--", ms=4, label="value")
-        axes.set_title(name.replace("λ4⁺ → 0", r"$\lambda_4^+ \to 0$"))
+        axes.set_title(SIGNS.sub(r"$\\lambda_\1^+ \\to 0$", name), fontsize=8)
         axes.set_xlabel("relative distance to the border")
         axes.grid(color="0.9", lw=0.4)
     grid[0].set_ylabel("error")
@@ -143,6 +146,25 @@ def automatic(rows: list[Row]) -> str:
     return "\n".join(lines)
 
 
+def events(rows: list[Row]) -> list[Row]:
+    """Counts by kind of case, over all chunks."""
+    told = []
+    for kind in dict.fromkeys(row["kind"] for row in rows):
+        some = [row for row in rows if row["kind"] == kind]
+        pairs: dict[str, int] = {}
+        for part in filter(None, "; ".join(row["ours/isolated"] for row in some).split("; ")):
+            pair, count = part.split(": ")
+            pairs[pair] = pairs.get(pair, 0) + int(count)
+        counts = ("cases", "stepped", "other_outcome", "late")
+        told.append(
+            {"kind": kind}
+            | {name: str(sum(int(row[name]) for row in some)) for name in counts}
+            | {"largest_time_difference": f"{max(numbers(some, 'largest_time_difference')):.2e}"}
+            | {"ours/isolated": "; ".join(f"{pair}: {n}" for pair, n in sorted(pairs.items()))}
+        )
+    return told
+
+
 def as_table(rows: list[Row]) -> str:
     """All columns."""
     lines = [" | ".join(name.replace("_", " ") for name in rows[0])]
@@ -154,9 +176,11 @@ def draw(target: Path, tables: dict[str, Path], limit: Callable[[str], float]) -
     """Every chart whose tables exist."""
     page = target.parent / "stability_atlas.md"
     for name, path in tables.items():
-        if path.exists() and name in ("events", "borders", "long_walk"):
+        if path.exists() and name in ("borders", "long_walk"):
             replace(page, name, as_table(read(path)))
     known = {name: read(path) for name, path in tables.items() if path.exists()}
+    if "events" in known:
+        replace(page, "events", as_table(events(known["events"])))
     with style():
         if "stiffness" in known:
             save(stiffness(known["stiffness"], limit), target, "atlas_stiffness")
