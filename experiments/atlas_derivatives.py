@@ -17,14 +17,13 @@ import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
 from work_precision import seconds
-from work_precision_truth import VARIED, differences, load, plane_map
+from work_precision_truth import VARIED, load
 
 import vrw_jax as vrw
-from vrw_jax import Outcome, transitions
+from vrw_jax import Outcome, multipliers, transitions
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from oracle import multiprecision
-from oracle.differences import minus_identity, solve_two, spectrum
 from oracle.hub_form import HubForm
 from oracle.multiprecision import Flow, Number, Vector
 
@@ -112,7 +111,7 @@ def borders() -> Rows:
 # --- Scuffing: the lowest clearance of the swing foot tends to zero.
 
 SCUFFS_BETWEEN = (80.0, 150.0)  # N s/m
-BELOW = np.logspace(-1.0, -5.0, 9)  # of the damping at which it begins
+BELOW = np.logspace(-5.0, -1.0, 13)  # of the damping at which it begins; nearest first
 
 
 class Dip:
@@ -128,7 +127,7 @@ class Dip:
         along = lambda g: sum(hy.diff(g, v) * rate for v, rate in zip(y, rates, strict=True))
         height = L1 * cos - L2 * (cos * peers.CA - sin * peers.SA)
         rise = along(height)
-        self.swing = Flow(list(y), rates, -1.0 * rise, 11)
+        self.swing = Flow(list(y), rates, -1.0 * rise, 10)
         self.told = multiprecision.compiled([height, along(rise), along(along(rise))], list(y))
 
     def ask(self, state: Vector, P: Vector) -> Vector:
@@ -148,12 +147,16 @@ class Dip:
         speeds = [-scale * mp.sin(rear) * rate, -scale * mp.sin(theta) * rate]
         return [theta, *lengths, rate, *speeds], P
 
-    def lowest(self, y: Vector, p: Vector, about: float) -> tuple[Number, Number]:
-        """Height at the first minimum after lift-off, and its time."""
-        state, P = self.lift_off(y, p, about)
-        _, second, third = self.ask(state, P)
-        state, time = self.swing.until_guard(state, P, float(-2 * second / third))
+    def lowest(self, y: Vector, p: Vector, about: tuple[float, float]) -> tuple[Number, Number]:
+        """Height at the first minimum after lift-off, and its time; about: of DLS, of it."""
+        state, P = self.lift_off(y, p, about[0])
+        state, time = self.swing.until_guard(state, P[:10], about[1])
         return self.ask(state, P)[0], time
+
+    def first_guess(self, y: Vector, p: Vector, about: float) -> float:
+        """Time of the first minimum, from the derivatives at lift-off."""
+        _, second, third = self.ask(*self.lift_off(y, p, about))
+        return float(-2 * second / third)
 
 
 def scuffing() -> Rows:
@@ -171,11 +174,21 @@ def scuffing() -> Rows:
 
     lifts = lambda damping: dip.ask(*dip.lift_off(*at(damping)))[1]
     edge = mp.findroot(lifts, SCUFFS_BETWEEN, solver="anderson", tol=1e-30)
+    shares = np.array([[0.0, 0.0]])  # time over distance: nearly constant, and extrapolated
     for distance in BELOW:
         damping = mp.mpf(float(edge * (1 - mp.mpf(distance))))
         h = damping * mp.mpf(distance) * mp.mpf("1e-8")
-        (up, _), (down, _) = (dip.lowest(*at(damping + sign * h)) for sign in (1, -1))
-        low, time = dip.lowest(*at(damping))
+        *given, dls = at(damping)
+        if len(shares) == 1:
+            near = dip.first_guess(*given, dls)
+        else:
+            near = distance * np.polynomial.Polynomial.fit(
+                *shares[1:][-3:].T, deg=min(len(shares) - 2, 2)
+            )(distance)
+        low, time = dip.lowest(*given, (dls, near))
+        shares = np.append(shares, [[distance, float(time) / distance]], 0)
+        ends = [at(damping + sign * h) for sign in (1, -1)]
+        up, down = (dip.lowest(y, p, (dls, float(time)))[0] for y, p, dls in ends)
         truth = float((up - down) / (2 * h))
         value, derivative = map(float, derive(jnp.asarray(float(damping))))
         yield {
@@ -246,77 +259,75 @@ def growth() -> Rows:
 
 # --- Two multipliers meet.
 
-FIXED = {"damping": 210.0}
-MEETS_BETWEEN = (0.26, 0.28)  # slopes, rad
-FROM_MEETING = np.logspace(-1.5, -9.0, 16)  # rad of slope
-SIZE = mp.mpf("1e-12")
+APART, LIKELY = (
+    400,
+    {  # random wheels: do their multipliers ever meet?
+        "damping": (20.0, 215.0),
+        "stiffness": (200.0, 1500.0),
+        "natural_length": (1.0, 1.1),
+        "slope": (0.08, 0.35),
+        "leg_com": (0.1, 0.7),
+        "leg_mass": (0.2, 1.5),
+    },
+)
 
 
-def gait(hub: HubForm, slope: Number, y: Vector, about: list[float]) -> tuple[Vector, list]:
-    """(theta+, dtheta+) of the limit cycle at a slope and its monodromy matrix, by Newton."""
-    p = exact(vrw.WheelParams(**FIXED))
-    p[multiprecision.NAMES.index("slope")] = slope
-    around = lambda point: plane_map(hub, point, p, about)
-    for _ in range(8):
-        image = around(y)
-        columns = differences(around, y, [SIZE, SIZE])
-        matrix = [[columns[j][i] for j in range(2)] for i in range(2)]
-        change = solve_two(minus_identity(matrix), [a - b for a, b in zip(image, y, strict=False)])
-        y = [a + b for a, b in zip(y, change, strict=True)]
-        about[:] = [float(d) for d in image[2:]]
-        if max(map(abs, change)) < mp.mpf("1e-24"):
-            return y, matrix
-    raise ArithmeticError("Newton's method did not settle")
+def apart() -> Rows:
+    """How near to each other the multipliers of random gaits come."""
+    random = np.random.default_rng(3)
+    ratios, n_complex = [], 0
+    for _ in range(APART):
+        wheel = {name: random.uniform(*limits) for name, limits in LIKELY.items()}
+        cycle = vrw.limit_cycle(vrw.WheelParams(**wheel))
+        if bool(cycle.found):
+            first, second = np.asarray(cycle.multipliers)
+            n_complex += int(first.imag != 0.0)
+            ratios.append(abs(second) / abs(first))
+    yield {
+        "wheels": APART,
+        "gaits": len(ratios),
+        "complex_pairs": n_complex,
+        "largest_ratio": f"{max(ratios):.2f}",
+        "median_ratio": f"{np.median(ratios):.2f}",
+    }
 
 
-def discriminant(matrix: list) -> Number:
-    """Zero where the multipliers of a 2 x 2 matrix meet, negative where they are complex."""
-    (a, b), (c, d) = matrix
-    return (a - d) ** 2 + 4 * b * c
+DOUBLE = mp.mpf("0.3")  # the multiplier in which two meet
+FRAME = mp.matrix([["1.1", "0.7"], ["-0.3", "0.9"]])
+FROM_MEETING = np.logspace(-1.5, -13.0, 24)
 
 
 def meeting() -> Rows:
-    """Error of d(spectral radius)/d(slope) and of the Jury margins' over the distance."""
-    hub = oracle()
-    of = lambda slope: vrw.limit_cycle(vrw.WheelParams(**FIXED, slope=slope))
+    """Errors of derivatives where two eigenvalues of a matrix meet, over the distance s.
 
-    def measures(slope: jax.Array) -> tuple:
-        cycle = of(slope)
-        told = jnp.concatenate([cycle.spectral_radius[None], cycle.jury_margins])
-        return told, told
-
-    derive = jax.jit(jax.jacfwd(measures, has_aux=True))
-    cycle = of(MEETS_BETWEEN[1])
-    known = [mp.mpf(float(v)) for v in cycle.post_impact]
-    about = [float(d) for d in cycle.durations]
-    matrix_at = lambda slope: gait(hub, slope, known, list(about))[1]
-    low, high = map(mp.mpf, MEETS_BETWEEN)
-    at_low, at_high = (discriminant(matrix_at(end)) for end in (low, high))
-    assert at_low * at_high < 0
-    meets = mp.findroot(
-        lambda slope: discriminant(matrix_at(slope)), (low, high), solver="anderson", tol=1e-40
-    )
-    for side in (1, -1):
+    The matrix is that of eigenvalues DOUBLE +- sqrt(s), in a frame that hides it; the truth has 35
+    digits, the entries are doubles.
+    """
+    mp.mp.prec = 120
+    turned = lambda rows: FRAME * mp.matrix(rows) * FRAME**-1
+    base, change = turned([[DOUBLE, 1], [0, DOUBLE]]), turned([[0, 0], [1, 0]])
+    as_array = lambda matrix: jnp.asarray(np.array(matrix.tolist(), float))
+    at = lambda s: as_array(base) + s * as_array(change)
+    measures = {
+        "radius": lambda s: multipliers.spectral_radius(at(s)),
+        "jury": lambda s: multipliers.jury_margins(at(s)),
+    }
+    derive = {name: jax.jit(jax.jacfwd(measure)) for name, measure in measures.items()}
+    for kind, sign in (("real", 1), ("complex", -1)):
         for distance in FROM_MEETING:
-            slope = mp.mpf(float(meets + side * mp.mpf(distance)))
-            h = mp.mpf(distance) * mp.mpf("1e-6")
-            up, here, down = (matrix_at(slope + sign * h) for sign in (1, 0, -1))
-            rate = [[(up[i][j] - down[i][j]) / (2 * h) for j in range(2)] for i in range(2)]
-            _, radius, derivative = spectrum(here)
-            (a, b), (c, d) = here
-            d_trace = rate[0][0] + rate[1][1]
-            d_det = rate[0][0] * d + a * rate[1][1] - rate[0][1] * c - b * rate[1][0]
-            jury = [d_det - d_trace, d_det + d_trace, -d_det]
-            derivatives, values = map(np.asarray, derive(jnp.asarray(float(slope))))
-            truth = float(derivative(rate))
+            s = sign * mp.mpf(float(distance))
+            radius = DOUBLE + mp.sqrt(s) if sign > 0 else mp.sqrt(DOUBLE**2 - s)
+            d_radius = 1 / (2 * mp.sqrt(s)) if sign > 0 else -1 / (2 * radius)
+            jury = np.array([-1.0, -1.0, 1.0])  # det = DOUBLE^2 - s, trace = 2 DOUBLE
+            found = {name: np.asarray(f(jnp.asarray(float(s)))) for name, f in derive.items()}
+            value = float(measures["radius"](jnp.asarray(float(s))))
             yield {
-                "meets_at": mp.nstr(meets, 12),
-                "distance": f"{side * distance:.3e}",
-                "multipliers": "real" if discriminant(here) > 0 else "complex",
-                "radius_error": f"{abs(values[0] - float(radius)):.1e}",
-                "d_radius": f"{truth:.4g}",
-                "d_radius_error": f"{abs(derivatives[0] - truth):.1e}",
-                "d_jury_error": f"{max(abs(derivatives[1:] - np.array(jury, float))):.1e}",
+                "multipliers": kind,
+                "distance": f"{distance:.3e}",
+                "radius_error": f"{abs(value - float(radius)):.1e}",
+                "d_radius": f"{float(d_radius):.4g}",
+                "d_radius_error": f"{abs(found['radius'] - float(d_radius)):.1e}",
+                "d_jury_error": f"{np.max(np.abs(found['jury'] - jury)):.1e}",
             }
 
 

@@ -234,13 +234,15 @@ def settled(made: tuple, slope: float, start: np.ndarray) -> tuple[bool, np.ndar
 
 
 def upright_rate(slope: float, start: np.ndarray) -> float:
-    """Rate at which double support leaves its upright equilibrium, 1/s."""
+    """Rate at which double support leaves its upright equilibrium, 1/s; NaN without one."""
     s = vrw.WheelParams(**SLOW, slope=slope).symbols()
     landing = transitions.land(s, *start)
     field = double_support(PhaseBuilder(s, True, False), landing.distance).field
     push = jax.jit(lambda theta: field(jnp.stack([theta, 0.0 * theta]))[1])
     places = float(landing.theta) + np.linspace(0.0, 1.0, 2001)
     rises = np.diff(np.sign(np.asarray(jax.vmap(push)(jnp.asarray(places))))) > 0
+    if not np.any(rises):
+        return np.nan
     at = places[np.flatnonzero(rises)[0]]
     for _ in range(5):
         at = at - push(at) / jax.grad(push)(at)

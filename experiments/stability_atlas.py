@@ -130,6 +130,7 @@ MAPS: dict[str, Callable[..., Rows]] = {
     "borders": derivatives.borders,
     "scuffing": derivatives.scuffing,
     "growth": derivatives.growth,
+    "apart": derivatives.apart,
     "meeting": derivatives.meeting,
     "modes": derivatives.modes,
     "long_walk": walks.long_walk,

@@ -254,6 +254,31 @@ def on_the_front(rows: list[Row]) -> str:
     return "\n".join(lines)
 
 
+def floors(rows: list[Row]) -> str:
+    """The least p99 error of each quantity by number format, whatever it costs, and by what."""
+    lines = ["| quantity | float32 | by | float64 | by |", "|---|---|---|---|---|"]
+    for quantity, (_, title) in QUANTITIES.items():
+        cells = [title]
+        for precision in ("float32", "float64"):
+            some = [
+                row
+                for row in rows
+                if row["precision"] == precision
+                and row["family"] not in (*SCALAR, "diffrax by hand")
+                and row.get(f"{quantity}_p99")
+                and int(row["lanes"]) > 1
+                and int(row["failed"]) == 0
+            ]
+            least = min(some, key=lambda row: float(row[f"{quantity}_p99"]), default=None)
+            if least is None:
+                cells += ["none without failures", "–"]
+            else:
+                error = float(least[f"{quantity}_p99"])
+                cells += [f"{error:.0e}", f"{least['family']}, {least['setting']}"]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
 def failures(rows: list[Row]) -> str:
     """Every row in which lanes failed."""
     lines = ["| method | setting | wheels that failed |", "|---|---|---|"]
@@ -286,4 +311,5 @@ def draw(rows: list[Row], batches: list[Row], target: Path) -> None:
     page = target.parent / "work_precision.md"
     replace(page, "what to use", table(rows))
     replace(page, "defaults", on_the_front(rows))
+    replace(page, "floors", floors(rows))
     replace(page, "failures", failures(rows))
