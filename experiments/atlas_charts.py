@@ -85,8 +85,8 @@ def borders(rows: list[Row]) -> Figure:
         axes.loglog(x, numbers(some, "derivative_error"), "o-", ms=4, label="derivative")
         axes.loglog(x, numbers(some, "value_error"), "s--", ms=4, label="value")
         axes.set_title(SIGNS.sub(r"$\\lambda_\1^+ \\to 0$", name), fontsize=8)
-        axes.set_xlabel("relative distance to the border")
         axes.grid(color="0.9", lw=0.4)
+    figure.supxlabel("relative distance to the border", fontsize="medium")
     grid[0].set_ylabel("error")
     grid[0].legend()
     return figure
@@ -98,6 +98,11 @@ def groups(rows: list[Row], name: str) -> dict[str, list[Row]]:
         key: [row for row in rows if row[name] == key]
         for key in dict.fromkeys(map(itemgetter(name), rows))
     }
+
+
+def last_by(rows: list[Row], name: str) -> list[Row]:
+    """The last row for each value of a column."""
+    return [some[-1] for some in groups(rows, name).values()]
 
 
 def curves(axes: Axes, rows: list[Row], by: str, x: str, y: str, label: str = "{}") -> None:
@@ -125,7 +130,7 @@ def long_walk(rows: list[Row]) -> Figure:
     ):
         curves(axes, rows, "tolerance", "steps", y, "tolerance {}")
         axes.set(xlabel="steps", ylabel=name)
-    work = groups(rows, "tolerance")["1e-13"]
+    work = groups(rows, "tolerance")["1e-06"]
     lost = np.finfo(float).eps * numbers(work, "work_of_gravity_J")
     axes.loglog(
         numbers(work, "steps"), lost, "--", color="0.4", lw=1.0, label="one rounding of the sum"
@@ -147,8 +152,10 @@ def between(rows: list[Row]) -> Figure:
         "distance",
         "time_difference_s",
     )
-    left.set(xlabel="distance to the border", ylabel="share with another outcome")
-    right.set(xlabel="distance to the border", ylabel="largest difference of durations [s]")
+    left.set(xlabel="relative distance to the border", ylabel="share with another outcome")
+    right.set(
+        xlabel="relative distance to the border", ylabel="largest difference of durations [s]"
+    )
     handles = left.get_legend_handles_labels()
     figure.legend(*handles, loc="outside lower center", ncols=2, fontsize=6)
     return figure
@@ -287,6 +294,7 @@ def growth(rows: list[Row]) -> Figure:
     ):
         curves(axes, rows, "damping", "steps", y, "$c$ = {} N s/m")
         axes.set(xlabel="steps", ylabel=name)
+    axes.set_ylim(1e-13, 1e-7)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return figure
 
@@ -303,7 +311,13 @@ def meeting(rows: list[Row]) -> Figure:
             ("d_jury_error", "error of the Jury margins' derivatives", "^--", COLOURS[2]),
         ):
             axes.loglog(
-                x, np.abs(numbers(some, y)), line, color=colour, ms=3.5, lw=0.9, label=label
+                x,
+                np.maximum(np.abs(numbers(some, y)), 1e-17),
+                line,
+                color=colour,
+                ms=3.5,
+                lw=0.9,
+                label=label,
             )
         axes.set(xlabel="distance $s$", title=f"{kind} eigenvalues")
         axes.grid(color="0.9", lw=0.4)
@@ -416,7 +430,7 @@ def draw(target: Path, tables: dict[str, Path], limit: Callable[[str], float]) -
         "events": ("events", lambda rows: as_table(events(rows))),
         "between": ("between", corners),
         "limits": ("limits", limits),
-        "long_walk": ("long_walk", lambda rows: as_table([*groups(rows, "steps").values()][-1])),
+        "long_walk": ("long_walk", lambda rows: as_table(last_by(rows, "tolerance"))),
         "apart": ("apart", as_table),
     }
     for mark, (name, text) in told.items():

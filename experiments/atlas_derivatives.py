@@ -111,7 +111,7 @@ def borders() -> Rows:
 # --- Scuffing: the lowest clearance of the swing foot tends to zero.
 
 SCUFFS_BETWEEN = (80.0, 150.0)  # N s/m
-BELOW = np.logspace(-5.0, -1.0, 13)  # of the damping at which it begins; nearest first
+BELOW = np.logspace(-5.0, -4.0 / 3.0, 12)  # of the damping at which it begins; nearest first
 
 
 class Dip:
