@@ -162,20 +162,19 @@ def between(rows: list[Row]) -> Figure:
 
 
 def by_border(rows: list[Row]) -> list[Row]:
-    """Both kinds of cases and both sides together; borders met fewer than ten times left out."""
+    """Both kinds of cases and both sides together; borders met fewer than five times left out."""
     told = []
     for border, some in groups(rows, "border").items():
         for distance, here in groups(some, "distance").items():
-            cases, other, stepped = (
-                int(numbers(here, name).sum()) for name in ("cases", "other_outcome", "stepped")
-            )
-            if cases >= 20:  # ten borders, two sides each
+            names = ("cases", "other_outcome", "other_by_diffrax", "stepped")
+            cases, other, by_diffrax, stepped = (int(numbers(here, n).sum()) for n in names)
+            if cases >= 10:  # five borders, two sides each
                 told.append(
                     {
                         "border": border,
                         "distance": distance,
                         "cases": str(cases),
-                        "other_outcome": str(other),
+                        "other_outcome": f"{other} ({by_diffrax})",
                         "share": str(other / cases),
                         "stepped": str(stepped),
                         "time_difference_s": f"{max(numbers(here, 'time_difference_s')):.1e}",
@@ -185,7 +184,7 @@ def by_border(rows: list[Row]) -> list[Row]:
 
 
 def corners(rows: list[Row]) -> str:
-    """Other outcomes by border and distance."""
+    """Other outcomes of the lane engine, and of the diffrax engine, by border and distance."""
     told = by_border(rows)
     distances = list(dict.fromkeys(row["distance"] for row in told))
     lines = [f"| border | cases | {' | '.join(distances)} |", "|---" * (2 + len(distances)) + "|"]

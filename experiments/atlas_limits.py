@@ -297,7 +297,7 @@ CLOSER = np.logspace(-2.0, -14.0, 7)  # of the segment between two starts
 
 
 def between(kinds: tuple[str, ...] = ("anywhere", "near gaits")) -> Rows:
-    """Who is right how near to a border between outcomes, of `vrw.steps` at default options.
+    """Who is right how near to a border between outcomes: both engines at default options.
 
     Segments between random wheels and starts of other outcomes are halved by isolated roots until
     the border is known to the last digits; then both sides are asked at some distances.
@@ -333,6 +333,7 @@ def between(kinds: tuple[str, ...] = ("anywhere", "near gaits")) -> Rows:
                 told, durations, _ = events.isolated(made, *asked(there))
                 found = vrw.steps(*asked(there))
                 mine = np.asarray(found.outcome)
+                other = np.asarray(vrw.steps(*asked(there), engine="diffrax").outcome)
                 stepped = (mine == told) & (told == Outcome.STEPPED)
                 gap = np.max(np.abs(np.asarray(found.durations) - durations), 1)
                 pairs = [
@@ -347,6 +348,7 @@ def between(kinds: tuple[str, ...] = ("anywhere", "near gaits")) -> Rows:
                         "distance": f"{distance:.0e}",
                         "cases": int(here.sum()),
                         "other_outcome": int((here & (mine != told)).sum()),
+                        "other_by_diffrax": int((here & (other != told)).sum()),
                         "stepped": int((here & stepped).sum()),
                         "time_difference_s": f"{np.max(gap[here & stepped], initial=0.0):.1e}",
                     }
