@@ -220,7 +220,8 @@ def by_collocation(tolerance: float = 1e-10, dtype: type = np.float64) -> Callab
         find = jax.jit(jax.vmap(one) if len(rows) > 1 else one)
 
         def run() -> np.ndarray:
-            found = jax.block_until_ready(find(given if len(rows) > 1 else given[0]))
+            with jax.enable_x64(dtype is np.float64):  # with it, the mesh would be float64
+                found = jax.block_until_ready(find(given if len(rows) > 1 else given[0]))
             y, durations, matrix, passes, good = (np.asarray(x, float) for x in found)
             count = passes * 4.0 * sum(mesh)
             parts = y, durations, matrix.reshape(*matrix.shape[:-2], 4), count[..., None]
@@ -367,7 +368,8 @@ def by_columns(mode: str, tolerance: float = 1e-10, dtype: type = np.float64) ->
         find = jax.jit(jax.vmap(one) if len(rows) > 1 else one)
 
         def run() -> np.ndarray:
-            found, good = jax.block_until_ready(find(given if len(rows) > 1 else given[0]))
+            with jax.enable_x64(dtype is np.float64):
+                found, good = jax.block_until_ready(find(given if len(rows) > 1 else given[0]))
             told = np.asarray(found, float).reshape(-1, 8)
             told = np.concatenate([told, np.zeros((len(told), 1))], 1)
             told[~np.atleast_1d(good)] = np.nan
