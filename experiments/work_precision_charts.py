@@ -63,6 +63,12 @@ def label_of(row: Row) -> str:
     return f"{row['family']}: {row['name']}{exact}"
 
 
+def is_default(row: Row) -> bool:
+    """Whether this is what a user gets who chooses nothing."""
+    named = (row["group"], row["family"], row["name"], row["setting"])
+    return named in DEFAULTS and row["precision"] == "float64"
+
+
 def curves(rows: list[Row], quantity: str) -> dict[str, list[Row]]:
     """Rows of many lanes that tell of a quantity, by label, loosest first."""
     told: dict[str, list[Row]] = {}
@@ -118,8 +124,7 @@ def draw_panel(axes: Axes, rows: list[Row], quantity: str, x_of) -> None:
                 axes.plot(a, b, "x", color="#D00000", ms=7, mew=1.2, zorder=5)
                 note = f"{row['failed']}/{of_lanes(row)}"
                 axes.annotate(note, (a, b), (4, 3), textcoords="offset points", fontsize=6)
-            named = (row["group"], row["family"], row["name"], row["setting"])
-            if named in DEFAULTS and row["precision"] == "float64":
+            if is_default(row):
                 axes.plot(a, b, "o", ms=9, mfc="none", mec="#444444", mew=0.8)
     axes.set(xscale="log", yscale="log")
     axes.xaxis.set_minor_formatter(NullFormatter())
@@ -151,7 +156,8 @@ def batch_chart(rows: list[Row], every: list[Row]) -> Figure:
     left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.15))
     unit = unit_of(every)
     told: dict[str, list[Row]] = {}
-    for row in rows:
+    cycles = [row for row in every if is_default(row) and row["group"] == "cycle"]
+    for row in (*rows, *cycles):
         told.setdefault(f"{row['group']}, {row['family']}: {row['name']}", []).append(row)
     for label, some in told.items():
         some = sorted(some, key=lambda row: int(row["lanes"]))
@@ -238,8 +244,7 @@ def on_the_front(rows: list[Row]) -> str:
     lines = ["| default | quantity | p99 error | per gait | fastest of ours as accurate | ratio |"]
     lines += ["|---|---|---|---|---|---|"]
     for row in rows:
-        named = (row["group"], row["family"], row["name"], row["setting"])
-        if named not in DEFAULTS or row["precision"] != "float64" or row["lanes"] == "1":
+        if not is_default(row) or row["lanes"] == "1":
             continue
         for quantity, (group, _) in QUANTITIES.items():
             if group != row["group"]:
