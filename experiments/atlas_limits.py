@@ -292,11 +292,11 @@ def slowing() -> Rows:
 
 # --- Between two outcomes: two guards at once, guards that graze, phases that vanish.
 
-BORDERS, HALVINGS, DRAWN = 1000, 55, 20_000
+SEGMENTS, HALVINGS = 1000, 55  # of each kind of case
 CLOSER = np.logspace(-2.0, -14.0, 7)  # of the segment between two starts
 
 
-def between(kinds: tuple[str, ...] = ("anywhere", "near gaits")) -> Rows:
+def between() -> Rows:
     """Who is right how near to a border between outcomes: both engines at default options.
 
     Segments between random wheels and starts of other outcomes are halved by isolated roots until
@@ -308,28 +308,25 @@ def between(kinds: tuple[str, ...] = ("anywhere", "near gaits")) -> Rows:
     def asked(points: np.ndarray) -> tuple[vrw.WheelParams, np.ndarray]:
         return vrw.WheelParams(**dict(zip(names, points.T, strict=False))), points[:, len(names) :]
 
-    for kind in kinds:
-        params, starts = events.drawn(events.KINDS[kind], np.random.default_rng(11))
+    for kind, box in events.KINDS.items():
+        params, starts = events.drawn(box, np.random.default_rng(11))
         points = np.column_stack([*(np.asarray(getattr(params, n)) for n in names), starts])
-        points = points[: 2 * BORDERS]
+        points = points[: 2 * SEGMENTS]
         ends = points[::2].copy(), points[1::2].copy()
         codes = tuple(events.isolated(made, *asked(side))[0] for side in ends)
         differ = codes[0] != codes[1]
         low, high = (side[differ] for side in ends)
         codes_low, codes_high = (code[differ].copy() for code in codes)
-        whole = np.linalg.norm(high - low, axis=1)
+        segment = high - low
         for _ in range(HALVINGS):
             middle = 0.5 * (low + high)
             told, *_ = events.isolated(made, *asked(middle))
             same = told == codes_low
             low[same], high[~same] = middle[same], middle[~same]
             codes_high[~same] = told[~same]
-        along = (high_low := ends[1][differ] - ends[0][differ]) / np.linalg.norm(
-            high_low, axis=1, keepdims=True
-        )
         for distance in CLOSER:
             for side, sign in ((low, -1.0), (high, 1.0)):
-                there = side + sign * distance * whole[:, None] * along
+                there = side + sign * distance * segment
                 told, durations, _ = events.isolated(made, *asked(there))
                 found = vrw.steps(*asked(there))
                 mine = np.asarray(found.outcome)
