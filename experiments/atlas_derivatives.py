@@ -115,7 +115,10 @@ BELOW = np.logspace(-5.0, -4.0 / 3.0, 12)  # of the damping at which it begins; 
 
 
 class Dip:
-    """Foot 2 in SLS-I from the equations of docs/physics.md, at 35 digits."""
+    """Foot 2 in SLS-I from the equations of docs/physics.md, at 35 digits but for sin and cos pi/4.
+
+    Those are doubles, which moves heights by 1e-17 m.
+    """
 
     def __init__(self) -> None:
         P = [hy.par[i] for i in range(10)]
