@@ -69,7 +69,7 @@ def stiffness(rows: list[Row], limit: Callable[[str], float]) -> Figure:
         axes.set_ylabel(name)
     for axes in grid.flat:
         axes.grid(color="0.9", lw=0.4)
-    grid[2, 0].set_ylim(1e-9, 10.0)
+    grid[2, 0].set_ylim(1e-11, 10.0)
     figure.legend(*grid[1, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return figure
 
@@ -145,13 +145,7 @@ def between(rows: list[Row]) -> Figure:
     left, right = figure.subplots(1, 2)
     told = by_border(rows)
     curves(left, told, "border", "distance", "share")
-    curves(
-        right,
-        [row for row in told if int(row["stepped"])],
-        "border",
-        "distance",
-        "time_difference_s",
-    )
+    curves(right, told, "border", "distance", "time_difference_s")
     left.set(xlabel="relative distance to the border", ylabel="share with another outcome")
     right.set(
         xlabel="relative distance to the border", ylabel="largest difference of durations [s]"
