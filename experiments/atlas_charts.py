@@ -1,10 +1,13 @@
 """Charts of stability_atlas.py, drawn from its tables alone."""
 
 import csv
+import re
 from collections.abc import Callable
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 from work_precision_charts import replace
@@ -16,6 +19,8 @@ STYLES = {  # of Okabe and Ito, a marker each
     "lanes Tsit5": ("#0072B2", "o"),
     "lanes Dopri8": ("#0072B2", "s"),
     "diffrax Kvaerno3": ("#D55E00", "v"),
+    "diffrax Kvaerno5": ("#D55E00", "^"),
+    "automatic": ("#CC79A7", "*"),
     "numba Dopri5": ("#000000", "o"),
     "heyoka": ("#E69F00", "D"),
     "SciPy DOP853": ("#56B4E9", "s"),
@@ -23,6 +28,9 @@ STYLES = {  # of Okabe and Ito, a marker each
     "SciPy Radau": ("#56B4E9", ">"),
 }
 AXES = {"c/m": r"$c/m$ [s$^{-1}$] at $k$ = 500 N/m", "k/m": r"$k/m$ [s$^{-2}$] at $c/m$ = 100/s"}
+IMPLICIT = "diffrax Kvaerno5"  # what the automatic choice turns to
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000", "0.5")
+SIGNS = re.compile("λ([24])⁺ → 0")
 FAST = 1.03  # rate of SLS-I's fast mode over c/m, docs/physics.md
 
 
@@ -61,38 +69,268 @@ def stiffness(rows: list[Row], limit: Callable[[str], float]) -> Figure:
         axes.set_ylabel(name)
     for axes in grid.flat:
         axes.grid(color="0.9", lw=0.4)
-    grid[2, 0].set_ylim(1e-9, 10.0)
+    grid[2, 0].set_ylim(1e-11, 10.0)
     figure.legend(*grid[1, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return figure
 
 
 def borders(rows: list[Row]) -> Figure:
     """Error of derivatives and values over the distance to a border."""
+    names = list(dict.fromkeys(row["border"] for row in rows))
     figure = Figure(figsize=(PAGE, 2.8))
-    grid = figure.subplots(1, 3, sharey=True)
-    for axes, name in zip(grid, dict.fromkeys(row["border"] for row in rows), strict=True):
+    grid = figure.subplots(1, len(names), sharey=True)
+    for axes, name in zip(grid, names, strict=True):
         some = [row for row in rows if row["border"] == name]
         x = numbers(some, "distance")
         axes.loglog(x, numbers(some, "derivative_error"), "o-", ms=4, label="derivative")
         axes.loglog(x, numbers(some, "value_error"), "s--", ms=4, label="value")
-        axes.set_title(name.replace("λ4⁺ → 0", r"$\lambda_4^+ \to 0$"))
-        axes.set_xlabel("relative distance to the border")
+        axes.set_title(SIGNS.sub(r"$\\lambda_\1^+ \\to 0$", name), fontsize=8)
         axes.grid(color="0.9", lw=0.4)
+    figure.supxlabel("relative distance to the border", fontsize="medium")
     grid[0].set_ylabel("error")
     grid[0].legend()
     return figure
 
 
-def long_walk(rows: list[Row]) -> Figure:
-    """Distance from the cycle and error of the clock over steps."""
-    figure = Figure(figsize=(PAGE / 2.0, 2.6))
-    axes = figure.subplots()
-    x = numbers(rows, "steps")
-    axes.loglog(x, numbers(rows, "distance"), "o-", ms=4, label="distance from the cycle")
-    axes.loglog(x, numbers(rows, "clock_error_s"), "s--", ms=4, label="error of the clock [s]")
-    axes.set(xlabel="gait steps", ylabel="error")
+def groups(rows: list[Row], name: str) -> dict[str, list[Row]]:
+    """Rows by one of their columns, in order."""
+    return {
+        key: [row for row in rows if row[name] == key]
+        for key in dict.fromkeys(map(itemgetter(name), rows))
+    }
+
+
+def last_by(rows: list[Row], name: str) -> list[Row]:
+    """The last row for each value of a column."""
+    return [some[-1] for some in groups(rows, name).values()]
+
+
+def curves(axes: Axes, rows: list[Row], by: str, x: str, y: str, label: str = "{}") -> None:
+    """One curve for each value of a column, each with its own colour and marker; zeros left out."""
+    looks = zip(COLOURS, "os^Dv<>p", strict=True)
+    for (key, some), (colour, marker) in zip(groups(rows, by).items(), looks, strict=False):
+        xs, ys = numbers(some, x), np.abs(numbers(some, y))
+        shown = ys > 0.0
+        look = {"color": colour, "marker": marker, "ms": 3.5, "lw": 0.9}
+        axes.loglog(xs[shown], ys[shown], label=label.format(key), **look)
     axes.grid(color="0.9", lw=0.4)
-    axes.legend()
+
+
+def long_walk(rows: list[Row]) -> Figure:
+    """Distance from the cycle, error of the clock and energy not accounted for, over steps."""
+    figure = Figure(figsize=(PAGE, 2.8))
+    for axes, (y, name) in zip(
+        figure.subplots(1, 3),
+        (
+            ("distance", "distance from the cycle"),
+            ("clock_error_s", "error of the clock [s]"),
+            ("not_accounted_J", "energy not accounted for [J]"),
+        ),
+        strict=True,
+    ):
+        curves(axes, rows, "tolerance", "steps", y, "tolerance {}")
+        axes.set(xlabel="steps", ylabel=name)
+    work = groups(rows, "tolerance")["1e-06"]
+    lost = np.finfo(float).eps * numbers(work, "work_of_gravity_J")
+    axes.loglog(
+        numbers(work, "steps"), lost, "--", color="0.4", lw=1.0, label="one rounding of the sum"
+    )
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=5)
+    return figure
+
+
+def between(rows: list[Row]) -> Figure:
+    """Share of other outcomes, and the times' largest difference, next to borders of outcomes."""
+    figure = Figure(figsize=(PAGE, 3.4))
+    left, right = figure.subplots(1, 2)
+    told = by_border(rows)
+    curves(left, told, "border", "distance", "share")
+    curves(right, told, "border", "distance", "time_difference_s")
+    left.set(xlabel="relative distance to the border", ylabel="share with another outcome")
+    right.set(
+        xlabel="relative distance to the border", ylabel="largest difference of durations [s]"
+    )
+    handles = left.get_legend_handles_labels()
+    figure.legend(*handles, loc="outside lower center", ncols=2, fontsize=6)
+    return figure
+
+
+def by_border(rows: list[Row]) -> list[Row]:
+    """Both kinds of cases and both sides together; borders met fewer than five times left out."""
+    told = []
+    for border, some in groups(rows, "border").items():
+        for distance, here in groups(some, "distance").items():
+            names = ("cases", "other_outcome", "other_by_diffrax", "stepped")
+            cases, other, by_diffrax, stepped = (int(numbers(here, n).sum()) for n in names)
+            if cases >= 10:  # five borders, two sides each
+                told.append(
+                    {
+                        "border": border,
+                        "distance": distance,
+                        "cases": str(cases),
+                        "other_outcome": f"{other} ({by_diffrax})",
+                        "share": str(other / cases),
+                        "stepped": str(stepped),
+                        "time_difference_s": f"{max(numbers(here, 'time_difference_s')):.1e}",
+                    }
+                )
+    return told
+
+
+def corners(rows: list[Row]) -> str:
+    """Other outcomes of the lane engine, and of the diffrax engine, by border and distance."""
+    told = by_border(rows)
+    distances = list(dict.fromkeys(row["distance"] for row in told))
+    lines = [f"| border | cases | {' | '.join(distances)} |", "|---" * (2 + len(distances)) + "|"]
+    for border, some in groups(told, "border").items():
+        cells = [row["other_outcome"] for row in some]
+        lines.append(
+            f"| {border.replace(' | ', ' / ')} | {some[0]['cases']} | {' | '.join(cells)} |"
+        )
+    return "\n".join(lines)
+
+
+def limits(rows: list[Row]) -> str:
+    """What happens towards each limit, value by value where it changes."""
+    lines = ["| limit | outcomes by value | as isolated | times differ by | most solver steps |"]
+    lines += ["|---|---|---|---|---|"]
+    for limit, some in groups(rows, "limit").items():
+        told: list[str] = []
+        for i, row in enumerate(some):
+            if i == 0 or row["outcome"] != some[i - 1]["outcome"]:
+                told.append(f"from {row['value']}: {row['outcome']}")
+        same = sum(row["outcome"] == row["isolated"] for row in some)
+        cells = (
+            limit,
+            "; ".join(told),
+            f"{same} of {len(some)}",
+            f"{max(numbers(some, 'time_difference_s')):.0e} s",
+            str(int(max(numbers(some, "solver_steps")))),
+        )
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def first_order(rows: list[Row]) -> Figure:
+    """Error and cost of a leg of first order over c/m."""
+    figure = Figure(figsize=(PAGE, 2.8))
+    left, right = figure.subplots(1, 2)
+    curves(left, rows, "leg", "c_over_m", "error", "leg: {}")
+    curves(right, rows, "leg", "c_over_m", "us_per_gait")
+    left.set(xlabel=r"$c/m$ [s$^{-1}$]", ylabel="error of state and durations")
+    right.set(xlabel=r"$c/m$ [s$^{-1}$]", ylabel="CPU time per gait [µs]")
+    left.legend()
+    return figure
+
+
+def slowing(rows: list[Row]) -> Figure:
+    """Period, and error of the period by each method, over the distance to the stop."""
+    figure = Figure(figsize=(PAGE, 2.8))
+    left, right = figure.subplots(1, 2)
+    x, period, rate = (numbers(rows, name) for name in ("distance", "period_s", "upright_rate"))
+    left.semilogx(x, period, "o", ms=3.5, color=COLOURS[0], label="gait, by isolated roots")
+    line = period[-1] - np.log(x / x[-1]) / rate[-1]
+    left.semilogx(x, line, "--", color="0.4", lw=1.0, label="slope −1/rate of falling upright")
+    for (name, told), colour, marker in zip(
+        {
+            "default": "limit_cycle",
+            "tight": "limit_cycle, tight",
+            "step": "one step",
+        }.items(),
+        COLOURS,
+        "os^",
+        strict=False,
+    ):
+        error = numbers(rows, f"{name}_period_error")
+        look = {"color": colour, "marker": marker, "ms": 3.5, "lw": 0.9}
+        right.loglog(x, error, label=told, **look)
+    left.set(xlabel="slope less that of the stop [rad]", ylabel="period [s]")
+    right.set(xlabel="slope less that of the stop [rad]", ylabel="relative error of the period")
+    for axes in (left, right):
+        axes.grid(color="0.9", lw=0.4)
+        axes.legend()
+    return figure
+
+
+def scuffing(rows: list[Row]) -> Figure:
+    """Clearance and its derivative, and their errors, where scuffing begins."""
+    figure = Figure(figsize=(PAGE, 2.8))
+    for axes, (value, error, name) in zip(
+        figure.subplots(1, 2),
+        (
+            ("clearance_m", "value_error", "depth of the foot [m]"),
+            ("derivative", "derivative_error", "its derivative by $c$ [m/(N s/m)]"),
+        ),
+        strict=True,
+    ):
+        x = numbers(rows, "distance")
+        look = {"ms": 3.5, "lw": 0.9}
+        axes.loglog(x, np.abs(numbers(rows, value)), "o-", color=COLOURS[0], label="size", **look)
+        axes.loglog(x, numbers(rows, error), "s--", color=COLOURS[1], label="error", **look)
+        axes.set(xlabel="relative distance in $c$ below the border", ylabel=name)
+        axes.grid(color="0.9", lw=0.4)
+        axes.legend()
+    return figure
+
+
+def growth(rows: list[Row]) -> Figure:
+    """Derivatives through many steps and their error, over steps, by damping."""
+    figure = Figure(figsize=(PAGE, 3.0))
+    for axes, (y, name) in zip(
+        figure.subplots(1, 3),
+        (
+            ("by_start", "norm of derivative by the start"),
+            ("by_damping", "derivative by $c$"),
+            ("error", "error of the derivative by $c$"),
+        ),
+        strict=True,
+    ):
+        curves(axes, rows, "damping", "steps", y, "$c$ = {} N s/m")
+        axes.set(xlabel="steps", ylabel=name)
+    axes.set_ylim(1e-13, 1e-7)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    return figure
+
+
+def meeting(rows: list[Row]) -> Figure:
+    """Errors of derivatives of stability measures over the distance to where multipliers meet."""
+    figure = Figure(figsize=(PAGE, 2.8))
+    grid = figure.subplots(1, 2, sharey=True)
+    for axes, (kind, some) in zip(grid, groups(rows, "multipliers").items(), strict=True):
+        x = np.abs(numbers(some, "distance"))
+        for y, label, line, colour in (
+            ("d_radius", "derivative of the spectral radius", "o-", COLOURS[0]),
+            ("d_radius_error", "its error", "s--", COLOURS[1]),
+            ("d_jury_error", "error of the Jury margins' derivatives", "^--", COLOURS[2]),
+        ):
+            axes.loglog(
+                x,
+                np.maximum(np.abs(numbers(some, y)), 1e-17),
+                line,
+                color=colour,
+                ms=3.5,
+                lw=0.9,
+                label=label,
+            )
+        axes.set(xlabel="distance $s$", title=f"{kind} eigenvalues")
+        axes.grid(color="0.9", lw=0.4)
+    grid[0].legend(fontsize=6)
+    return figure
+
+
+def modes(rows: list[Row]) -> Figure:
+    """Error and cost of a gait's derivative, implicit and through n steps."""
+    figure = Figure(figsize=(PAGE, 2.8))
+    left, right = figure.subplots(1, 2)
+    walked = [row for row in rows if row["steps"] != "0"]
+    curves(left, walked, "way", "steps", "median_error")
+    curves(right, walked, "way", "steps", "ms")
+    for row, line in zip([row for row in rows if row["steps"] == "0"], ("--", ":"), strict=True):
+        for axes, name in ((left, "median_error"), (right, "ms")):
+            axes.axhline(float(row[name]), color=COLOURS[2], ls=line, lw=1.2, label=row["way"])
+    left.set(xlabel="steps of the walk", ylabel="relative error of d(period), median")
+    right.set(xlabel="steps of the walk", ylabel="CPU time per gait [ms]")
+    right.legend(fontsize=6)
     return figure
 
 
@@ -121,26 +359,52 @@ def formulations(drift: list[Row], penalty: list[Row]) -> Figure:
 
 
 def automatic(rows: list[Row]) -> str:
-    """The fastest method with an error below 1e-4 by axis and value, and the switch's cost."""
+    """The fastest method with an error below 1e-4, and the automatic choice over it."""
     lines = [
-        "| axis | value | fastest of ours | µs | fastest of all | µs |",
-        "|---|---|---|---|---|---|",
+        "| axis | value | fastest of ours | µs | fastest of all | µs | automatic | µs | ratio |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
+    fast = lambda some: min(some, key=lambda row: float(row["us_per_gait"]))
     for axis in AXES:
-        for value in dict.fromkeys(row["value"] for row in rows if row["axis"] == axis):
-            some = [r for r in rows if (r["axis"], r["value"]) == (axis, value)]
-            some = [r for r in some if r["outcome"] == "STEPPED" and float(r["error"]) < 1e-4]
-            cells = [axis, value]
-            for ours in (True, False):
-                fit = [
-                    r for r in some if not ours or r["method"].split()[0] in ("lanes", "diffrax")
-                ]
-                best = min(fit, key=lambda r: float(r["us_per_gait"]), default=None)
-                cells += (
-                    ["not measured", "–"] if best is None else [best["method"], best["us_per_gait"]]
-                )
-            lines.append(f"| {' | '.join(cells)} |")
+        for value, some in groups([r for r in rows if r["axis"] == axis], "value").items():
+            chosen = next(row for row in some if row["method"] == "automatic")
+            good = [r for r in some if r["outcome"] == "STEPPED" and float(r["error"]) < 1e-4]
+            assert chosen in good
+            good.remove(chosen)
+            ours = fast([r for r in good if r["method"].split()[0] in ("lanes", "diffrax")])
+            every = fast(good)
+            ratio = float(chosen["us_per_gait"]) / float(every["us_per_gait"])
+            engine = (
+                "implicit" if int(chosen["work"]) == work_of(some, IMPLICIT) else "lanes Dopri8"
+            )
+            cells = [axis, value, ours["method"], ours["us_per_gait"]]
+            cells += [every["method"], every["us_per_gait"], engine, chosen["us_per_gait"]]
+            lines.append(f"| {' | '.join(cells)} | {ratio:.2f} |")
     return "\n".join(lines)
+
+
+def work_of(rows: list[Row], method: str) -> int:
+    """Steps that a method tried."""
+    return next(int(row["work"]) for row in rows if row["method"] == method)
+
+
+def events(rows: list[Row]) -> list[Row]:
+    """Counts by kind of case, over all chunks."""
+    told = []
+    for kind in dict.fromkeys(row["kind"] for row in rows):
+        some = [row for row in rows if row["kind"] == kind]
+        pairs: dict[str, int] = {}
+        for part in filter(None, "; ".join(row["ours/isolated"] for row in some).split("; ")):
+            pair, count = part.split(": ")
+            pairs[pair] = pairs.get(pair, 0) + int(count)
+        counts = ("cases", "stepped", "other_outcome", "late")
+        told.append(
+            {"kind": kind}
+            | {name: str(sum(int(row[name]) for row in some)) for name in counts}
+            | {"largest_time_difference": f"{max(numbers(some, 'largest_time_difference')):.2e}"}
+            | {"ours/isolated": "; ".join(f"{pair}: {n}" for pair, n in sorted(pairs.items()))}
+        )
+    return told
 
 
 def as_table(rows: list[Row]) -> str:
@@ -151,20 +415,36 @@ def as_table(rows: list[Row]) -> str:
 
 
 def draw(target: Path, tables: dict[str, Path], limit: Callable[[str], float]) -> None:
-    """Every chart whose tables exist."""
+    """Every chart and table of the page whose data exist."""
     page = target.parent / "stability_atlas.md"
-    for name, path in tables.items():
-        if path.exists() and name in ("events", "borders", "long_walk"):
-            replace(page, name, as_table(read(path)))
     known = {name: read(path) for name, path in tables.items() if path.exists()}
+    told = {
+        "switch": ("stiffness", automatic),
+        "events": ("events", lambda rows: as_table(events(rows))),
+        "between": ("between", corners),
+        "limits": ("limits", limits),
+        "long_walk": ("long_walk", lambda rows: as_table(last_by(rows, "tolerance"))),
+        "apart": ("apart", as_table),
+    }
+    for mark, (name, text) in told.items():
+        if name in known:
+            replace(page, mark, text(known[name]))
+    charts: dict[str, Callable[[list[Row]], Figure]] = {
+        "stiffness": lambda rows: stiffness(rows, limit),
+        "between": between,
+        "first_order": first_order,
+        "slowing": slowing,
+        "borders": borders,
+        "scuffing": scuffing,
+        "growth": growth,
+        "meeting": meeting,
+        "modes": modes,
+        "long_walk": long_walk,
+    }
     with style():
-        if "stiffness" in known:
-            save(stiffness(known["stiffness"], limit), target, "atlas_stiffness")
-            replace(page, "switch", automatic(known["stiffness"]))
-        if "borders" in known:
-            save(borders(known["borders"]), target, "atlas_borders")
-        if "long_walk" in known:
-            save(long_walk(known["long_walk"]), target, "atlas_long_walk")
+        for name, chart in charts.items():
+            if name in known:
+                save(chart(known[name]), target, f"atlas_{name}")
         if {"drift", "formulations"} <= set(known):
             figure = formulations(known["drift"], known["formulations"])
             save(figure, target, "atlas_formulations")

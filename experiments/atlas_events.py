@@ -65,6 +65,7 @@ class Phase:
         variables = [pair[0] for pair in system]
         self.guards = hy.cfunc(guards, variables)
         self.outcomes = outcomes
+        self.limit = LIMIT
 
     def run(self, y: np.ndarray, parameters: tuple) -> tuple[Outcome, np.ndarray, float]:
         """Outcome, state and duration."""
@@ -76,9 +77,9 @@ class Phase:
         flow.reset_cooldowns()
         flow.time, flow.state[:] = 0.0, y
         flow.pars[:] = parameters[: len(flow.pars)]
-        code = int(flow.propagate_until(LIMIT)[0])
+        code = int(flow.propagate_until(self.limit)[0])
         if code == int(hy.taylor_outcome.time_limit):
-            return Outcome.NO_TOUCHDOWN_IN_TIME, flow.state, LIMIT
+            return Outcome.NO_TOUCHDOWN_IN_TIME, flow.state, self.limit
         if not -len(self.outcomes) <= code < 0:
             return Outcome.SOLVER_GAVE_UP, flow.state, flow.time
         return self.outcomes[-code - 1], flow.state.copy(), flow.time
@@ -135,13 +136,13 @@ def phases() -> tuple[Phase, Phase, Phase]:
 
 
 def isolated(made: tuple, params: vrw.WheelParams, starts: np.ndarray) -> tuple:
-    """Outcome and durations of one step of each lane."""
+    """Outcome, durations and section state (zeros where it failed) of one step of each lane."""
     dls, sls1, sls2 = made
     packed = peers.pack(params)
     landing = transitions.land(params.symbols(), *starts.T)
     stays = np.asarray(landing.stays)
     posture = np.stack([landing.theta, *landing.motion[2:]], 1)  # theta, L1, L2 and rates
-    outcomes, durations = np.zeros(len(starts), int), np.zeros((len(starts), 3))
+    outcomes, durations, ends = np.zeros(len(starts), int), *np.zeros((2, len(starts), 3))
     for lane, values in enumerate(packed):
         P = tuple(values)
         y, code = posture[lane], Outcome.STEPPED
@@ -156,9 +157,11 @@ def isolated(made: tuple, params: vrw.WheelParams, starts: np.ndarray) -> tuple:
             y = told.copy()
         if code == Outcome.STEPPED:
             peers.hit_numba(y, P)
-            code, _, durations[lane, 2] = sls2.run(y[:4], P)
+            code, told, durations[lane, 2] = sls2.run(y[:4], P)
         outcomes[lane] = code
-    return outcomes, durations
+        if code == Outcome.STEPPED:
+            ends[lane] = told[[0, 2, 3]]
+    return outcomes, durations, ends
 
 
 def drawn(box: dict, random: np.random.Generator) -> tuple[vrw.WheelParams, np.ndarray]:
@@ -168,35 +171,29 @@ def drawn(box: dict, random: np.random.Generator) -> tuple[vrw.WheelParams, np.n
     return vrw.WheelParams(**fields), np.stack([draw(limits) for limits in box["start"]], 1)
 
 
-def compare(cases: int) -> Iterator[dict[str, object]]:
-    """Counts of disagreement by kind of case."""
+def compare(cases: int, done: int) -> Iterator[dict[str, object]]:
+    """Counts of disagreement, chunk by chunk; the first `done` chunks are left out."""
     made = phases()
-    for kind, box in KINDS.items():
-        random = np.random.default_rng(7)
-        n_other, n_late, n_stepped, n, largest = 0, 0, 0, 0, 0.0
-        examples: list[str] = []
-        for _ in track(range(cases // 2 // CHUNK), kind):
-            params, starts = drawn(box, random)
-            found = vrw.steps(params, starts)
-            codes, durations = isolated(made, params, starts)
-            mine = np.asarray(found.outcome)
-            other = mine != codes
-            both = ~other & (mine == Outcome.STEPPED)
-            gap = np.max(np.abs(np.asarray(found.durations) - durations), 1)
-            late = both & (gap > LATE)
-            n, n_stepped = n + CHUNK, n_stepped + int(both.sum())
-            n_other, n_late = n_other + int(other.sum()), n_late + int(late.sum())
-            largest = max(largest, float(np.max(gap[both], initial=0.0)))
-            for lane in np.flatnonzero(other | late):
-                pair = f"{Outcome(mine[lane]).name}/{Outcome(codes[lane]).name}"
-                examples.append(pair if other[lane] else f"late by {gap[lane]:.1e}")
-        pairs = {pair: examples.count(pair) for pair in sorted(set(examples))}
+    n_chunks = cases // len(KINDS) // CHUNK
+    places = [(i, kind, chunk) for chunk in range(n_chunks) for i, kind in enumerate(KINDS)]
+    for i, kind, chunk in track(places[done:], "events"):
+        params, starts = drawn(KINDS[kind], np.random.default_rng((7, i, chunk)))
+        found = vrw.steps(params, starts)
+        codes, durations, _ = isolated(made, params, starts)
+        mine = np.asarray(found.outcome)
+        other = mine != codes
+        both = ~other & (mine == Outcome.STEPPED)
+        gap = np.max(np.abs(np.asarray(found.durations) - durations), 1)
+        differing = zip(mine[other], codes[other], strict=True)
+        pairs = [f"{Outcome(a).name}/{Outcome(b).name}" for a, b in differing]
+        counts = [f"{pair}: {pairs.count(pair)}" for pair in sorted(set(pairs))]
         yield {
             "kind": kind,
-            "cases": n,
-            "stepped": n_stepped,
-            "other_outcome": n_other,
-            "late": n_late,
-            "largest_time_difference": f"{largest:.2e}",
-            "ours/isolated": "; ".join(f"{pair}: {count}" for pair, count in pairs.items()),
+            "chunk": chunk,
+            "cases": CHUNK,
+            "stepped": int(both.sum()),
+            "other_outcome": int(other.sum()),
+            "late": int((both & (gap > LATE)).sum()),
+            "largest_time_difference": f"{np.max(gap[both], initial=0.0):.2e}",
+            "ours/isolated": "; ".join(counts),
         }

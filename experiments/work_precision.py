@@ -187,6 +187,7 @@ def main() -> None:
     parser.add_argument("--redraw", action="store_true", help="measure nothing")
     chosen = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_enable_compilation_cache", False)  # a first call compiles
     TARGET.mkdir(parents=True, exist_ok=True)
     if not chosen.redraw:
         measure_all(chosen)

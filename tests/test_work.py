@@ -7,6 +7,7 @@ import truth
 from batched import lean_steps
 
 import vrw_jax as vrw
+from vrw_jax.runge_kutta import explicit_tableau, real_stability_limit
 
 STARTS = truth.table("step", "start")
 VALUES = np.concatenate([truth.table("step", "section_state"), truth.table("step", "durations")], 1)
@@ -43,3 +44,14 @@ def test_a_limit_cycle_takes_no_more_passes_and_errs_no_more_than_it_did():
     error = truth.scaled_error(found.durations, truth.table("cycle", "durations"))
     assert np.mean(found.passes) <= MORE * 4.375
     assert error <= WORSE * 9.1e-12
+
+
+def test_a_stiff_step_takes_what_stability_asks_for_and_little_more():
+    mass = 0.01  # c/m of 10,000 1/s
+    wheel = vrw.WheelParams(leg_mass=mass, damping=100.0, hub_mass=18.0 - 8.0 * mass)
+    found = vrw.steps(wheel, np.array([[0.1, 1.6, -0.1]]))
+    tableau = explicit_tableau("Dopri8", vrw.Options())
+    # 1.03 c/m is the rate of SLS-I's fast mode; DLS, SLS-II and the start of it take the rest.
+    asked = 1.03 * 100.0 / mass * float(found.durations[0, 1]) / real_stability_limit(tableau)
+    assert not bool(found.implicit[0])
+    assert asked < int(found.solver_steps[0]) <= MORE * 570

@@ -102,10 +102,10 @@ class Slope(NamedTuple):
 
 def real_stability_limit(tableau: Tableau) -> float:
     """Largest z with |R(-z)| <= 1: a mode that decays at rate r bears steps up to z / r."""
-    n = len(tableau.places)
-    weights, ones = tableau.once[-1], np.ones(n)
-    z = np.linspace(0.01, 20.0, 2000)
-    growth = [1.0 - x * weights @ np.linalg.solve(np.eye(n) + x * tableau.once, ones) for x in z]
+    z, stages, growth = np.linspace(0.01, 20.0, 2000), np.ones(len(tableau.places)), 1.0
+    for power in range(1, len(stages) + 1):  # R is a polynomial: 1 - z w (1 - z A + ...)
+        growth = growth + (-z) ** power * (tableau.once[-1] @ stages)
+        stages = tableau.once @ stages
     return float(z[np.argmax(np.abs(growth) > 1.0 + 1e-12)])
 
 
