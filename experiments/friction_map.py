@@ -18,11 +18,12 @@ import vrw_jax as vrw
 FRICTION = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.4, 1.7, 2.0, 2.5, 3.0)
 DAMPING = tuple(float(c) for c in range(20, 401, 20))
 STARTS = {"slow": (0.1, 1.6, -0.1), "fast": (0.12, 2.4, -0.2)}
-N_STEPS, N_LAST = 300, 10
+N_STEPS, N_LAST = 150, 10
 LEAST_SLIP = 1e-3  # m: less is drawn alike
-OPTIONS = vrw.Options(solver="Tsit5", rtol=1e-8, atol=1e-8)
+TOWARDS, EXACT = vrw.Options(solver="Tsit5", rtol=1e-8, atol=1e-8), vrw.Options()
 FIELDS = ("period", "dls_fraction", "flight", "speed", "slip", "energy", "events", "solutions")
 CHUNK = 100
+HOLDS = 0.4  # friction from which a wheel does not slide without end; colours are of these
 TARGET = Path(__file__).parents[1] / "docs" / "figures"
 TABLE = TARGET / "friction_map.csv"
 
@@ -32,7 +33,7 @@ TABLE = TARGET / "friction_map.csv"
 def _told(friction: jax.Array, damping: jax.Array, x: jax.Array) -> jax.Array:
     """FIELDS of the step from a section state."""
     wheel = vrw.UnilateralWheel(friction=friction)
-    result = wheel.step(vrw.WheelParams(damping=damping), x, OPTIONS)
+    result = wheel.step(vrw.WheelParams(damping=damping), x, EXACT)
     energy = result.energy_impacts + result.energy_damping + result.energy_friction
     period = result.period
     flight = result.durations[2] / jnp.where(period > 0.0, period, 1.0)
@@ -58,7 +59,7 @@ def compute() -> None:
     x = np.array([STARTS[name] for name in names])
     outcome, made, periods = np.zeros(len(c), int), np.zeros(len(c), int), []
     for n_steps in (N_STEPS - N_LAST, *(1,) * N_LAST):
-        walked = vrw.steps(params, x, n_steps, model=model, options=OPTIONS)
+        walked = vrw.steps(params, x, n_steps, model=model, options=TOWARDS)
         outcome = np.where(outcome == 0, np.asarray(walked.outcome), outcome)
         made += np.where(outcome == 0, n_steps, np.asarray(walked.n_stepped))
         before, x = x, np.asarray(walked.section_state)
@@ -82,7 +83,7 @@ def draw() -> None:
         "period": ("period / s", False),
         "speed": ("speed / m/s", True),
         "slip": ("slip per step / m", True),
-        "energy": ("energy lost per step / J", True),
+        "energy": ("energy lost per step / J", False),
     }
     with TABLE.open() as file:
         rows = list(csv.DictReader(file))
@@ -93,9 +94,9 @@ def draw() -> None:
     for column, (field, (label, logarithmic)) in enumerate(shown.items()):
         values = [float(r[field]) if r["outcome"] == "STEPPED" else np.nan for r in rows]
         maps = np.array(values).reshape(shape)
-        least = max(float(np.nanmin(maps)), LEAST_SLIP)
-        norm = LogNorm(least, np.nanmax(maps), clip=True) if logarithmic else Normalize(0.0)
-        norm.autoscale_None(maps[np.isfinite(maps)])
+        gaits = maps[:, np.array(FRICTION) >= HOLDS]
+        least, most = max(float(np.nanmin(gaits)), LEAST_SLIP), float(np.nanmax(gaits))
+        norm = LogNorm(least, most, clip=True) if logarithmic else Normalize(0.0, most)
         for row, name in enumerate(STARTS):
             axis = axes[row, column]
             axis.set_facecolor("0.8")
@@ -107,7 +108,7 @@ def draw() -> None:
                 axis.set_ylabel(f"{name} start\ndamping / N s/m")
         axes[0, column].set_title(label, fontsize=10)
         axes[-1, column].set_xlabel("friction coefficient")
-        figure.colorbar(image, ax=axes[:, column], location="bottom")
+        figure.colorbar(image, ax=axes[:, column], location="bottom", extend="max")
     for ending in ("png", "svg"):
         figure.savefig(TARGET / f"friction_map.{ending}", dpi=110)
 

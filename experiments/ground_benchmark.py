@@ -25,7 +25,7 @@ jax.config.update("jax_enable_x64", True)
 
 import vrw_jax as vrw  # noqa: E402  the number format is chosen first
 
-WHEELS, MAPPED, N_STEPS, N_FIRST, SEED = 2048, 256, 10, 10, 0  # MAPPED: of them by vmap
+WHEELS, MAPPED, N_STEPS, N_FIRST, SEED = 2048, 64, 10, 10, 0  # MAPPED: of them by vmap
 DAMPING, FRICTION = (150.0, 350.0), (0.5, 1.2)
 START = (0.1, 1.6, -0.1)
 SOLVER, TOLERANCES = "Tsit5", (1e-9, 1e-8, 1e-6)  # the first one is the truth

@@ -1,6 +1,8 @@
 """Slow and fast gaits on real ground are branches with folds, in damping and in friction.
 
-    python experiments/ground_branches.py [--redraw]
+    python experiments/ground_branches.py [damping-slow ...] [--redraw]
+
+Branches named are followed again, and the rows of others kept; without names, those still missing.
 
 Pseudo-arclength continuation of fixed points of the step, stable or not; derivatives by central
 differences, all branches and all differences side by side in the lanes of `vrw.steps`. Codes of
@@ -24,7 +26,7 @@ FRICTION, DAMPING = 0.7, 200.0  # held while the other one moves
 SLOW, FAST = (0.1, 1.6, -0.1), (0.12, 2.4, -0.2)
 BRANCHES = (  # along what, label, start, damping and friction there
     ("damping", "slow", SLOW, 320.0, FRICTION),
-    ("damping", "fast", FAST, 320.0, FRICTION),
+    ("damping", "fast", FAST, 200.0, FRICTION),
     ("friction", "slow", SLOW, DAMPING, 1.4),
     ("friction", "fast", FAST, DAMPING, 0.8),
 )
@@ -38,6 +40,7 @@ GHOSTS, N_GHOST = (0.003, 0.01, 0.03), 500  # less friction than the fold's; ste
 SHOWN = {"dls_fraction": "DLS fraction", "period": "period / s", "slip": "slip per step / m"}
 NUMBERS = 20  # of a section state move continuously, the rest are codes
 TARGET = Path(__file__).parents[1] / "docs" / "figures"
+TABLE, GHOST = TARGET / "ground_branches.csv", TARGET / "ground_ghost.csv"
 
 
 @dataclass
@@ -113,18 +116,18 @@ def corrected(sides: list[Side], predicted: list[np.ndarray]) -> list[tuple | No
     return done
 
 
-def follow() -> list[Side]:
-    """All branches, both ways."""
-    columns = [np.array([b[k] for b in BRANCHES]) for k in (3, 4)]
+def follow(branches: list[tuple]) -> list[Side]:
+    """Branches, both ways."""
+    columns = [np.array([b[k] for b in branches]) for k in (3, 4)]
     begun = vrw.steps(
         vrw.WheelParams(damping=columns[0]),
-        np.array([b[2] for b in BRANCHES]),
+        np.array([b[2] for b in branches]),
         N_TOWARDS,
         model=vrw.UnilateralWheel(friction=columns[1]),
         options=STEP,
     )
     sides = []
-    for (along, label, _, c, mu), x in zip(BRANCHES, np.asarray(begun.section_state), strict=True):
+    for (along, label, _, c, mu), x in zip(branches, np.asarray(begun.section_state), strict=True):
         low, high = BOUNDS[along]
         p = ({"damping": c, "friction": mu}[along] - low) / (high - low)
         for sign in (1.0, -1.0):
@@ -156,10 +159,17 @@ def follow() -> list[Side]:
     return sides
 
 
-def compute() -> float | None:
-    """Follow all branches and tell their points; the least friction of the slow gait at DAMPING."""
-    lines, fold = [], None
-    for side in follow():
+def compute() -> None:
+    """Follow the branches that are asked for or missing, and tell their points."""
+    kept = read() if TABLE.exists() else []
+    asked = [b for b in BRANCHES if f"{b[0]}-{b[1]}" in sys.argv]
+    done = {(row["along"], row["branch"]) for row in kept}
+    branches = asked or [b for b in BRANCHES if b[:2] not in done]
+    if not branches:
+        return
+    again = {b[:2] for b in branches}
+    lines = [list(r.values()) for r in kept if (r["along"], r["branch"]) not in again]
+    for side in follow(branches):
         print(side.along, side.label, len(side.rows), "points,", side.ended, flush=True)
         values = np.array([row[0] for row in side.rows])
         held = {name: np.full(len(values), value) for name, value in side.held.items()}
@@ -172,16 +182,20 @@ def compute() -> float | None:
             numbers = [value, radius, slope, *row]
             head = [side.along, side.label, way, side.ended]
             lines.append([*head, *(f"{x:.8g}" for x in numbers)])
-        if (side.along, side.label) == ("friction", "slow"):
-            fold = float(values.min()) if fold is None else min(fold, float(values.min()))
-    with (TARGET / "ground_branches.csv").open("w", newline="") as file:
+    with TABLE.open("w", newline="") as file:
         header = ["along", "branch", "way", "ended", "value", "spectral_radius", "slope", *FIELDS]
         csv.writer(file).writerows([header, *lines])
-    return fold
 
 
-def ghosts(fold: float) -> None:
+def read() -> list[dict[str, str]]:
+    with TABLE.open() as file:
+        return list(csv.DictReader(file))
+
+
+def ghosts() -> None:
     """Walks from the slow start with a little less friction than the slow gait needs."""
+    slow = [r for r in read() if (r["along"], r["branch"]) == ("friction", "slow")]
+    fold = min(float(r["value"]) for r in slow)
     friction = fold - np.array(GHOSTS)
     params, model = vrw.WheelParams(damping=DAMPING), vrw.UnilateralWheel(friction=friction)
     x, lines = np.tile(SLOW, (len(GHOSTS), 1)), []
@@ -190,15 +204,14 @@ def ghosts(fold: float) -> None:
         found = vrw.steps(params, x, model=model, options=options)
         x = np.asarray(found.section_state)
         lines.append([step, *(f"{d:.8g}" for d in np.asarray(found.durations).sum(-1))])
-    with (TARGET / "ground_ghost.csv").open("w", newline="") as file:
+    with GHOST.open("w", newline="") as file:
         csv.writer(file).writerows([["step", *(f"{mu:.5f}" for mu in friction)], *lines])
 
 
 def draw() -> None:
     """Measures over damping and friction, stable gaits solid; walks beyond the fold."""
-    with (TARGET / "ground_branches.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    figure, axes = plt.subplots(2, 4, figsize=(13, 6), layout="constrained")
+    rows = read()
+    figure, axes = plt.subplots(2, 4, figsize=(14, 6), layout="constrained")
     held = {"damping": f"μ = {FRICTION}", "friction": f"c = {DAMPING:g} N s/m"}
     axis_names = {"damping": "damping / N s/m", "friction": "friction coefficient"}
     for line, (along, text) in zip(axes, held.items(), strict=True):
@@ -221,15 +234,20 @@ def draw() -> None:
                     for i in np.flatnonzero(slope[1:] * slope[:-1] < 0.0):
                         axis.plot(x[i + 1], y[i + 1], "k.", ms=8)
             axis.set(xlabel=axis_names[along], ylabel=label, title=text)
+            if key == "slip":
+                axis.set_yscale("log")
     axes[0, 0].legend(fontsize=8, title="solid: stable, dots: folds", title_fontsize=7)
-    with (TARGET / "ground_ghost.csv").open() as file:
+    with GHOST.open() as file:
         header, *lines = list(csv.reader(file))
     walks = np.array(lines, float)
+    grid = axes[0, 3].get_gridspec()
+    for axis in axes[:, 3]:
+        axis.remove()
+    beside = figure.add_subplot(grid[:, 3])
     for column, mu in enumerate(header[1:], 1):
-        axes[1, 3].plot(walks[:, 0], walks[:, column], label=f"μ = {float(mu):.4f}")
-    axes[1, 3].set(xlabel="step", ylabel="period / s", title="walks beyond the fold, c = 200")
-    axes[1, 3].legend(fontsize=8)
-    axes[0, 3].axis("off")
+        beside.plot(walks[:, 0], walks[:, column], label=f"μ = {float(mu):.4f}")
+    beside.set(xlabel="step", ylabel="period / s", title="ghost: walks beyond the fold, c = 200")
+    beside.legend(fontsize=8)
     for ending in ("png", "svg"):
         figure.savefig(TARGET / f"ground_branches.{ending}", dpi=110)
 
@@ -237,9 +255,9 @@ def draw() -> None:
 def main() -> None:
     jax.config.update("jax_enable_x64", True)
     if "--redraw" not in sys.argv:
-        fold = compute()
-        if fold is not None:
-            ghosts(fold)
+        compute()
+        if not GHOST.exists():
+            ghosts()
     draw()
 
 

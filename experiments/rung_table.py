@@ -18,6 +18,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from friction_map import FIELDS, told
 
 jax.config.update("jax_enable_x64", True)
 
@@ -42,8 +43,8 @@ OPTIONS = vrw.Options(solver="Tsit5", rtol=1e-8, atol=1e-8)
 TARGET = Path(__file__).parents[1] / "docs" / "figures"
 
 
-def values(step: object) -> list[float]:
-    return [float(getattr(step, name)) for name in MEASURES]
+def values(cycle: object) -> list[float]:
+    return [float(getattr(cycle, name)) for name in MEASURES]
 
 
 def seconds(call: Callable[[], object], times: int) -> float:
@@ -69,18 +70,17 @@ def errors() -> None:
     params, model = vrw.WheelParams(damping=damping), vrw.UnilateralWheel(friction=friction)
     walked = vrw.steps(params, np.array(x), N_STEPS - 1, model=model, options=OPTIONS)
     last = vrw.steps(params, walked.section_state, model=model, options=OPTIONS)
+    fields = dict(zip(FIELDS, told(friction, damping, walked.section_state).T, strict=True))
     rows = []
     for i, (label, (mu, changes)) in enumerate(SCENES.items()):
-        step = vrw.step(
-            wheel(changes), walked.section_state[i], model=vrw.UnilateralWheel(mu), options=OPTIONS
-        )
         again = float(jnp.sum(last.durations[i] - walked.durations[i]))
         outcome = vrw.Outcome(int(last.outcome[i]))
-        truth = values(step) if outcome == vrw.Outcome.STEPPED else [math.nan] * 3
+        good = outcome == vrw.Outcome.STEPPED
+        truth = [float(fields[name][i]) if good else math.nan for name in MEASURES]
         row = [label, mu, outcome.name, f"{again:.1e}", *(f"{v:.6g}" for v in truth)]
         for cycle in (papers[i], vrw.limit_cycle(wheel(changes), model=vrw.RigidWheel())):
-            told = values(cycle) if bool(cycle.found) else [math.nan] * 3
-            row += [f"{t - v:.3g}" for t, v in zip(told, truth, strict=True)]
+            found = values(cycle) if bool(cycle.found) else [math.nan] * 3
+            row += [f"{t - v:.3g}" for t, v in zip(found, truth, strict=True)]
         rows.append(row)
         print(row, flush=True)
     header = ["scene", "friction", "outcome", "period_change_s", *MEASURES]
