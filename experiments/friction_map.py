@@ -81,7 +81,7 @@ def draw() -> None:
     shown = {  # label and whether the colours are logarithmic
         "dls_fraction": ("DLS fraction", False),
         "period": ("period / s", False),
-        "speed": ("speed / m/s", True),
+        "speed": ("speed / m/s", False),
         "slip": ("slip per step / m", True),
         "energy": ("energy lost per step / J", False),
     }
@@ -92,11 +92,13 @@ def draw() -> None:
         len(STARTS), len(shown), figsize=(14, 5.4), sharex=True, sharey=True, layout="constrained"
     )
     for column, (field, (label, logarithmic)) in enumerate(shown.items()):
-        values = [float(r[field]) if r["outcome"] == "STEPPED" else np.nan for r in rows]
+        good = [r["outcome"] == "STEPPED" and float(r["speed"]) > 0.0 for r in rows]
+        values = [float(r[field]) if ok else np.nan for ok, r in zip(good, rows, strict=True)]
         maps = np.array(values).reshape(shape)
         gaits = maps[:, np.array(FRICTION) >= HOLDS]
         least, most = max(float(np.nanmin(gaits)), LEAST_SLIP), float(np.nanmax(gaits))
-        norm = LogNorm(least, most, clip=True) if logarithmic else Normalize(0.0, most)
+        start = least if field == "energy" else 0.0
+        norm = LogNorm(least, most, clip=True) if logarithmic else Normalize(start, most)
         for row, name in enumerate(STARTS):
             axis = axes[row, column]
             axis.set_facecolor("0.8")

@@ -87,6 +87,9 @@ def walk_lanes(
     dynamic, static = eqx.partition(options, eqx.is_array)
     dynamic = jax.tree.map(lambda leaf: np.asarray(leaf, columns.dtype), dynamic)
     program = _program(static, n, max_events)
+    if not len(states):
+        none = np.zeros(0, np.int32)
+        return states, np.zeros((0, 3), states.dtype), none, none, none
     parts = []
     # Wheels of like work side by side: stability bounds the step where damping is high.
     order = np.argsort(columns[PARAMETER_NAMES.index("damping")], kind="stable")

@@ -37,8 +37,8 @@ MARCHING, EVENT, WAITING = -1, -2, -3
 SAFETY, LEAST, MOST = 0.9, 0.2, 5.0
 """Of the step-size controller: the usual safety factor, and the limits of a step's change."""
 CLOSE = 30.0
-"""Newton's last correction to an event's time may be so many tolerances long: the try before it
-stood off by its square, or by a hundredth of it where a parabola's slope is used."""
+"""An event is found where the last correction to its time is no more than so many tolerances of the
+step: the proposal is a parabola's, whose own error is about a hundredth of the correction."""
 
 
 class Place(NamedTuple):
