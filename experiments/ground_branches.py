@@ -211,7 +211,9 @@ def ghosts() -> None:
 def draw() -> None:
     """Measures over damping and friction, stable gaits solid; walks beyond the fold."""
     rows = read()
-    figure, axes = plt.subplots(2, 4, figsize=(14, 6), layout="constrained")
+    figure, axes = plt.subplots(
+        2, 4, figsize=(14.5, 6), width_ratios=(1.0, 1.0, 1.0, 1.1), layout="constrained"
+    )
     held = {"damping": f"μ = {FRICTION}", "friction": f"c = {DAMPING:g} N s/m"}
     axis_names = {"damping": "damping / N s/m", "friction": "friction coefficient"}
     for line, (along, text) in zip(axes, held.items(), strict=True):
@@ -246,7 +248,7 @@ def draw() -> None:
     beside = figure.add_subplot(grid[:, 3])
     for column, mu in enumerate(header[1:], 1):
         beside.plot(walks[:, 0], walks[:, column], label=f"μ = {float(mu):.4f}")
-    beside.set(xlabel="step", ylabel="period / s", title="ghost: walks beyond the fold, c = 200")
+    beside.set(xlabel="step", ylabel="period / s", title="walks beyond the fold, c = 200")
     beside.legend(fontsize=8)
     for ending in ("png", "svg"):
         figure.savefig(TARGET / f"ground_branches.{ending}", dpi=110)
