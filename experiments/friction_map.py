@@ -1,4 +1,7 @@
-"""Double support on real ground: gaits over friction 0.3 to 3, damping 20 to 400, two starts."""
+"""Double support on real ground: gaits over friction 0.3 to 3, damping 20 to 400, two starts.
+
+python experiments/friction_map.py [--redraw]
+"""
 
 import csv
 import sys
@@ -8,24 +11,29 @@ import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
-from jax import lax
 from matplotlib.colors import LogNorm, Normalize
 
 import vrw_jax as vrw
 
-FRICTION = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.3, 1.6, 2.0, 3.0)
-DAMPING = (20.0, 50.0, 100.0, 150.0, 200.0, 250.0, 300.0, 400.0)
+FRICTION = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.4, 1.7, 2.0, 2.5, 3.0)
+DAMPING = tuple(float(c) for c in range(20, 401, 20))
 STARTS = {"slow": (0.1, 1.6, -0.1), "fast": (0.12, 2.4, -0.2)}
 N_STEPS, N_LAST = 150, 10
 LEAST_SLIP = 1e-3  # m: less is drawn alike
-OPTIONS = vrw.Options(rtol=1e-8, atol=1e-8)
+TOWARDS, EXACT = vrw.Options(solver="Tsit5", rtol=1e-8, atol=1e-8), vrw.Options()
 FIELDS = ("period", "dls_fraction", "flight", "speed", "slip", "energy", "events", "solutions")
+CHUNK = 100
+HOLDS = 0.4  # friction from which a wheel does not slide without end; colours are of these
 TARGET = Path(__file__).parents[1] / "docs" / "figures"
 TABLE = TARGET / "friction_map.csv"
 
 
-def told(result: vrw.UnilateralStep) -> jax.Array:
-    """One row of FIELDS."""
+@jax.jit
+@jax.vmap
+def _told(friction: jax.Array, damping: jax.Array, x: jax.Array) -> jax.Array:
+    """FIELDS of the step from a section state."""
+    wheel = vrw.UnilateralWheel(friction=friction)
+    result = wheel.step(vrw.WheelParams(damping=damping), x, EXACT)
     energy = result.energy_impacts + result.energy_damping + result.energy_friction
     period = result.period
     flight = result.durations[2] / jnp.where(period > 0.0, period, 1.0)
@@ -34,40 +42,38 @@ def told(result: vrw.UnilateralStep) -> jax.Array:
     return jnp.stack([*row, *(jnp.asarray(c, period.dtype) for c in counts)])
 
 
-@jax.jit
-@jax.vmap
-def walked(friction: jax.Array, damping: jax.Array, start: jax.Array) -> tuple:
-    """Rows of the last steps, the outcome and how many steps were made."""
-    params = vrw.WheelParams(damping=damping)
-    wheel = vrw.UnilateralWheel(friction=friction)
-
-    def one(carry: tuple, _: None) -> tuple:
-        x, outcome = carry
-        result = wheel.step(params, jnp.where(outcome == 0, x, jnp.nan), OPTIONS)
-        outcome = jnp.where(outcome == 0, result.outcome, outcome)
-        return (result.section_state, outcome), (told(result), outcome)
-
-    begin = (wheel.full_section(params, start), jnp.int32(0))
-    (_, outcome), (rows, outcomes) = lax.scan(one, begin, None, length=N_STEPS)
-    return rows[-N_LAST:], outcome, jnp.sum(outcomes == 0)
+def told(friction: np.ndarray, damping: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """FIELDS of the steps from many section states, by one program for any number of them."""
+    columns, rows = (np.asarray(friction), np.asarray(damping), np.asarray(x)), []
+    for begin in range(0, len(x), CHUNK):
+        some = [column[begin : begin + CHUNK] for column in columns]
+        fill = lambda c: np.concatenate([c, np.repeat(c[-1:], CHUNK - len(c), 0)])
+        rows.append(np.asarray(_told(*map(fill, some)))[: len(some[0])])
+    return np.concatenate(rows)
 
 
 def compute() -> None:
-    """Walk all lanes and keep their last step."""
-    names, mu, c = np.meshgrid(list(STARTS), FRICTION, DAMPING, indexing="ij")
-    starts = np.array([STARTS[name] for name in names.ravel()])
-    rows, outcome, steps = map(
-        np.asarray, walked(jnp.asarray(mu.ravel()), jnp.asarray(c.ravel()), jnp.asarray(starts))
-    )
+    """Walk all wheels and keep their last step."""
+    names, mu, c = (x.ravel() for x in np.meshgrid(list(STARTS), FRICTION, DAMPING, indexing="ij"))
+    params, model = vrw.WheelParams(damping=c), vrw.UnilateralWheel(friction=mu)
+    x = np.array([STARTS[name] for name in names])
+    outcome, made, periods = np.zeros(len(c), int), np.zeros(len(c), int), []
+    for n_steps in (N_STEPS - N_LAST, *(1,) * N_LAST):
+        walked = vrw.steps(params, x, n_steps, model=model, options=TOWARDS)
+        outcome = np.where(outcome == 0, np.asarray(walked.outcome), outcome)
+        made += np.where(outcome == 0, n_steps, np.asarray(walked.n_stepped))
+        before, x = x, np.asarray(walked.section_state)
+        periods.append(np.asarray(walked.durations).sum(-1))
+    spread = np.ptp(periods[1:], axis=0)
+    rows = told(mu, c, before)
     with TABLE.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["start", "friction", "damping", "steps", "outcome", "spread", *FIELDS])
-        for i, name in enumerate(names.ravel()):
-            spread = float(np.ptp(rows[i, :, 0])) if outcome[i] == 0 else 0.0
-            row = rows[i, -1] if outcome[i] == 0 else np.zeros(len(FIELDS))
+        for i, name in enumerate(names):
+            good = outcome[i] == 0
             label = vrw.Outcome(int(outcome[i])).name
-            where = [name, mu.ravel()[i], c.ravel()[i], int(steps[i]), label, f"{spread:.1e}"]
-            writer.writerow([*where, *(f"{v:.6g}" for v in row)])
+            where = [name, mu[i], c[i], made[i], label, f"{spread[i] if good else 0.0:.1e}"]
+            writer.writerow([*where, *(f"{v:.6g}" for v in (rows[i] if good else 0.0 * rows[i]))])
 
 
 def draw() -> None:
@@ -75,9 +81,9 @@ def draw() -> None:
     shown = {  # label and whether the colours are logarithmic
         "dls_fraction": ("DLS fraction", False),
         "period": ("period / s", False),
-        "speed": ("speed / m/s", True),
+        "speed": ("speed / m/s", False),
         "slip": ("slip per step / m", True),
-        "energy": ("energy lost per step / J", True),
+        "energy": ("energy lost per step / J", False),
     }
     with TABLE.open() as file:
         rows = list(csv.DictReader(file))
@@ -86,22 +92,25 @@ def draw() -> None:
         len(STARTS), len(shown), figsize=(14, 5.4), sharex=True, sharey=True, layout="constrained"
     )
     for column, (field, (label, logarithmic)) in enumerate(shown.items()):
-        values = [float(r[field]) if r["outcome"] == "STEPPED" else np.nan for r in rows]
+        good = [r["outcome"] == "STEPPED" and float(r["speed"]) > 0.0 for r in rows]
+        values = [float(r[field]) if ok else np.nan for ok, r in zip(good, rows, strict=True)]
         maps = np.array(values).reshape(shape)
-        least = max(float(np.nanmin(maps)), LEAST_SLIP)
-        norm = LogNorm(least, np.nanmax(maps), clip=True) if logarithmic else Normalize(0.0)
-        norm.autoscale_None(maps[np.isfinite(maps)])
+        gaits = maps[:, np.array(FRICTION) >= HOLDS]
+        least, most = max(float(np.nanmin(gaits)), LEAST_SLIP), float(np.nanmax(gaits))
+        start = least if field == "energy" else 0.0
+        norm = LogNorm(least, most, clip=True) if logarithmic else Normalize(start, most)
         for row, name in enumerate(STARTS):
             axis = axes[row, column]
             axis.set_facecolor("0.8")
             image = axis.imshow(maps[row].T, origin="lower", aspect="auto", norm=norm)
             axis.set_xticks(range(len(FRICTION)), [f"{m:g}" for m in FRICTION], rotation=90)
-            axis.set_yticks(range(len(DAMPING)), [f"{d:g}" for d in DAMPING])
+            shown_c = range(0, len(DAMPING), 3)
+            axis.set_yticks(shown_c, [f"{DAMPING[i]:g}" for i in shown_c])
             if column == 0:
                 axis.set_ylabel(f"{name} start\ndamping / N s/m")
         axes[0, column].set_title(label, fontsize=10)
         axes[-1, column].set_xlabel("friction coefficient")
-        figure.colorbar(image, ax=axes[:, column], location="bottom")
+        figure.colorbar(image, ax=axes[:, column], location="bottom", extend="max")
     for ending in ("png", "svg"):
         figure.savefig(TARGET / f"friction_map.{ending}", dpi=110)
 

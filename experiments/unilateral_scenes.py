@@ -1,4 +1,11 @@
-"""What really happens where the paper stops: scuffing, bouncing, the lost gait, early touchdown."""
+"""What really happens where the paper stops: scuffing, bouncing, the lost gait, early touchdown.
+
+    python experiments/unilateral_scenes.py
+
+Each scene is walked from the paper's gait at the nearest damping that has one. Drawn: ground forces
+and foot heights of the last good step with the paper's step from the same start beside them, and
+the time that each scene spends in each pair of contact modes.
+"""
 
 import csv
 import math
@@ -8,7 +15,6 @@ import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
-from jax import lax
 
 import vrw_jax as vrw
 from vrw_jax.models.unilateral_mechanics import directions, foot_heights
@@ -26,44 +32,52 @@ SCENES = [  # label, friction, damping, start (None: from the paper's gait at th
 ]
 SHOWN = ("bouncing, c = 4", "scuffing, c = 50", "lost gait, c = 225", "real ground, c = 250")
 N_STEPS, N_SAMPLES = 60, 40
+LEAST_SHARE = 0.5  # per cent: less in every scene is not drawn
+OPTIONS = vrw.Options(solver="Tsit5", rtol=1e-9, atol=1e-9)
 MODES = ("air", "rest", "down", "up")
 TARGET = Path(__file__).parents[1] / "docs" / "figures"
 
 
-def start_of(damping: float, start: tuple | None) -> jax.Array:
-    """The scene's own start, or the paper's gait at the nearest damping that has one."""
-    if start is not None:
-        return jnp.asarray(start)
-    nearest = float(np.clip(damping, *GAIT_RANGE))
-    return vrw.limit_cycle(vrw.WheelParams(damping=nearest)).section_state
+def starts() -> np.ndarray:
+    """Each scene's own start, or from the paper's gait at the nearest damping that has one."""
+    _, friction, damping, given = zip(*SCENES, strict=True)
+    x = []
+    for mu, c, start in zip(friction, damping, given, strict=True):
+        params = vrw.WheelParams(damping=float(np.clip(c, *GAIT_RANGE)))
+        start = vrw.limit_cycle(params).section_state if start is None else jnp.asarray(start)
+        x.append(np.asarray(vrw.UnilateralWheel(friction=mu).full_section(params, start)))
+    return np.stack(x)
 
 
 @jax.jit
 @jax.vmap
-def walked(friction: jax.Array, damping: jax.Array, start: jax.Array) -> tuple:
-    """The start of the last good step, that step, how many steps, and their periods."""
+def told(friction: jax.Array, damping: jax.Array, x: jax.Array) -> vrw.UnilateralStep:
+    """The step from a section state."""
     params, wheel = vrw.WheelParams(damping=damping), vrw.UnilateralWheel(friction=friction)
-    options = vrw.Options(rtol=1e-9, atol=1e-9)
+    return wheel.step(params, x, OPTIONS)
 
-    def one(carry: tuple, _: None) -> tuple:
-        x, outcome, last, kept = carry
-        result = wheel.step(params, jnp.where(outcome == 0, x, jnp.nan), options)
-        good = (outcome == 0) & (result.outcome == 0)
-        last, kept = jax.tree.map(lambda a, b: jnp.where(good, a, b), (x, result), (last, kept))
-        outcome = jnp.where(outcome == 0, result.outcome, outcome)
-        return (result.section_state, outcome, last, kept), (result.period, outcome)
 
-    x = wheel.full_section(params, start)
-    first = wheel.step(params, x, options)
-    carry, (periods, outcomes) = lax.scan(one, (x, jnp.int32(0), x, first), None, length=N_STEPS)
-    return carry[1], carry[2], carry[3], periods, jnp.sum(outcomes == 0)
+def walked(friction: np.ndarray, damping: np.ndarray, x: np.ndarray) -> tuple:
+    """Outcome, the start of the last good step, that step, all periods, and how many steps."""
+    params, model = vrw.WheelParams(damping=damping), vrw.UnilateralWheel(friction=friction)
+    outcome, last, periods = np.zeros(len(x), int), x, []
+    count = np.zeros(len(x), int)
+    for _ in range(N_STEPS):
+        found = vrw.steps(params, x, model=model, options=OPTIONS)
+        good = (outcome == 0) & (np.asarray(found.outcome) == 0)
+        outcome = np.where(outcome == 0, np.asarray(found.outcome), outcome)
+        last = np.where(good[:, None], x, last)
+        x = np.asarray(found.section_state)
+        periods.append(np.asarray(found.durations).sum(-1))
+        count += good
+    step = told(jnp.asarray(friction), jnp.asarray(damping), jnp.asarray(last))
+    return outcome, last, step, np.stack(periods, 1), count
 
 
 def main() -> None:
     jax.config.update("jax_enable_x64", True)
-    labels, friction, damping, starts = zip(*SCENES, strict=True)
-    x = jnp.stack([start_of(c, s) for c, s in zip(damping, starts, strict=True)])
-    outcome, last, step, periods, count = walked(jnp.asarray(friction), jnp.asarray(damping), x)
+    labels, friction, damping, _ = zip(*SCENES, strict=True)
+    outcome, last, step, periods, count = walked(np.array(friction), np.array(damping), starts())
     TARGET.mkdir(parents=True, exist_ok=True)
     with (TARGET / "unilateral_scenes.csv").open("w", newline="") as file:
         writer = csv.writer(file)
@@ -87,23 +101,33 @@ def main() -> None:
             row = [label, friction[i], damping[i], n, name, f"{period:.6f}", f"{spread:.1e}"]
             writer.writerow([*row, *(f"{float(v):.5g}" for v in numbers)])
     draw([labels.index(name) for name in SHOWN], labels, friction, damping, last)
+    shares = np.asarray(step.mode_durations / np.maximum(step.period, 1e-9)[:, None, None])
+    draw_modes(labels, shares)
 
 
-def draw(chosen: list[int], labels: tuple, friction: tuple, damping: tuple, x: jax.Array) -> None:
-    """Ground forces and foot heights of the last step of some scenes."""
+def save(figure: plt.Figure, name: str) -> None:
+    for ending in ("png", "svg"):
+        figure.savefig(TARGET / f"{name}.{ending}", dpi=110)
+
+
+def draw(chosen: list[int], labels: tuple, friction: tuple, damping: tuple, x: np.ndarray) -> None:
+    """Ground forces and foot heights of the last step of some scenes, and the paper's step."""
     figure, axes = plt.subplots(
         2, len(chosen), figsize=(3.3 * len(chosen), 5.0), sharey="row", layout="constrained"
     )
+    paper = vrw.ViscoelasticWheel(stop_at_lift_off=False)
     for column, i in enumerate(chosen):
         params = vrw.WheelParams(damping=damping[i])
         wheel = vrw.UnilateralWheel(friction=friction[i])
-        trace = wheel.trace(params, x[i], vrw.Options(), N_SAMPLES)
+        trace = wheel.trace(params, jnp.asarray(x[i]), vrw.Options(), N_SAMPLES)
         s, top, low = params.symbols(), axes[0, column], axes[1, column]
         heights = jax.vmap(
             jax.vmap(lambda y, s=s: foot_heights(unpack(y)[0], directions(s, unpack(y)[0].theta)))
         )(trace.state)
         happened = np.flatnonzero(np.asarray(trace.duration) > 0.0)
         time = np.concatenate([np.asarray(trace.time[k]) for k in happened])
+        on_paper = x[i][[0, 1, 4 + params.n_legs]]
+        formal = vrw.simulate(params, on_paper, 1, model=paper, n_samples=N_SAMPLES)
         for leg, (name, color) in enumerate((("fore foot", "C0"), ("rear foot", "C1"))):
             joined = lambda values, leg=leg, happened=happened: np.concatenate(
                 [np.asarray(values[k])[:, leg] for k in happened]
@@ -111,14 +135,37 @@ def draw(chosen: list[int], labels: tuple, friction: tuple, damping: tuple, x: j
             top.plot(time, joined(trace.normal), color, label=f"{name}, normal")
             top.plot(time, joined(trace.tangential), color + "--", label=f"{name}, tangential")
             low.plot(time, 1e3 * joined(heights), color, label=name)
+            grey = {"color": "0.6", "lw": 1.0, "zorder": 0, "ls": "-" if leg == 0 else "-."}
+            shown = f"{name}, paper's model"
+            top.plot(formal.time, formal[f"lambda_{2 * leg + 2}"], **grey, label=shown)
+            if leg == 1:
+                low.plot(formal.time, 1e3 * formal.foot_2_z, **grey, label=shown)
         top.set_title(labels[i], fontsize=10)
-        low.set(xlabel="time since landing / s", ylim=(-5.0, 60.0))
+        low.set(xlabel="time since landing / s", ylim=(-25.0, 60.0))
     axes[0, 0].set_ylabel("ground force / N")
     axes[1, 0].set_ylabel("foot height / mm")
-    axes[0, 0].legend(fontsize=7)
-    axes[1, 0].legend(fontsize=7)
-    for ending in ("png", "svg"):
-        figure.savefig(TARGET / f"unilateral_scenes.{ending}", dpi=110)
+    axes[0, 0].legend(fontsize=6)
+    axes[1, 0].legend(fontsize=6)
+    save(figure, "unilateral_scenes")
+
+
+def draw_modes(labels: tuple, shares: np.ndarray) -> None:
+    """Time in each pair of contact modes, fore foot first, scene by scene."""
+    figure, axis = plt.subplots(figsize=(9, 5.2), layout="constrained")
+    words = {"air": "air", "rest": "rest", "down": "slides down", "up": "slides up"}
+    colours, left, count = plt.get_cmap("tab20"), np.zeros(len(labels)), 0
+    for a, first in enumerate(MODES):
+        for b, second in enumerate(MODES):
+            share = 100.0 * shares[:, a, b]
+            if share.max() < LEAST_SHARE:
+                continue
+            name = f"{words[first]}, {words[second]}"
+            axis.barh(labels, share, left=left, color=colours(count), label=name)
+            left, count = left + share, count + 1
+    axis.invert_yaxis()
+    axis.set(xlabel="share of the step / %", xlim=(0.0, 100.0), title="fore foot, rear foot")
+    axis.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    save(figure, "unilateral_modes")
 
 
 if __name__ == "__main__":

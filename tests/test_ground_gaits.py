@@ -2,6 +2,7 @@
 
 import math
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -123,3 +124,54 @@ def test_tuning_on_real_ground_climbs_along_the_gradient():
         assert sign * float(share - tuned.start_value) > 0.0
     assert float(tuned.params.damping) == pytest.approx(320.0)
     assert float(tuned.params.slope) == pytest.approx(0.29)
+
+
+LANES = vrw.Options(solver="Tsit5", rtol=1e-8, atol=1e-8)
+
+
+@pytest.fixture(scope="module")
+def lanes():
+    """Three steps of several wheels side by side: damping, friction, start and what they did."""
+    damping = np.array([200.0, 300.0, 250.0, 160.0, 60.0, 150.0, 200.0])
+    friction = np.array([0.7, 0.7, 1.2, math.inf, math.inf, math.nan, 0.3])
+    states = np.tile(START, (len(damping), 1))
+    states[0, 1] = 2.0
+
+    def walked(some):
+        return vrw.steps(
+            vrw.WheelParams(damping=damping[some]),
+            states[some],
+            3,
+            model=vrw.UnilateralWheel(friction=friction[some]),
+            options=LANES,
+        )
+
+    return damping, friction, states, walked
+
+
+def test_lanes_walk_on_real_ground_as_single_wheels_do(lanes):
+    damping, friction, states, walked = lanes
+    found = walked(slice(None))
+    assert found.engine == "lanes"
+    for i in range(len(damping)):
+        ground = vrw.UnilateralWheel(friction=friction[i])
+        params = vrw.WheelParams(damping=damping[i])
+        walk = vrw.walk(params, states[i], 3, model=ground, options=OPTIONS)
+        assert int(found.outcome[i]) == int(walk.outcome)
+        assert int(found.n_stepped[i]) == int(walk.n_stepped)
+        np.testing.assert_allclose(found.section_state[i], walk.steps.section_state[-1], atol=2e-7)
+        np.testing.assert_allclose(found.durations[i], walk.steps.durations[-1], atol=5e-8)
+    assert int(found.outcome[5]) == vrw.Outcome.BAD_INPUT
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(found))
+
+
+def test_what_a_lane_gives_does_not_depend_on_its_company(lanes):
+    *_, walked = lanes
+    together, alone = walked(slice(None)), walked(slice(1, 2))
+    for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
+        np.testing.assert_array_equal(a[1], b[0])
+
+
+def test_an_implicit_solver_for_lanes_on_real_ground_is_refused_in_one_sentence():
+    with pytest.raises(ValueError, match="map vrw"):
+        vrw.steps(SLOW, np.asarray([START]), model=GROUND, options=vrw.Options(solver="Kvaerno5"))

@@ -150,14 +150,16 @@ def test_energy_lost_in_a_step_is_told_by_its_causes(traces):
 @pytest.mark.parametrize("friction", [0.7, 1.3])
 def test_time_stepping_converges_to_the_same_step_in_first_order(friction):
     truth = stepped(friction)
-    sizes = (16e-4, 8e-4, 4e-4)
+    sizes = (16e-4, 8e-4, 4e-4, 2e-4)
     walks = [moreau_jean.one_step(moreau_jean.Wheel(friction), *START, h) for h in sizes]
     errors = np.array([w.time - float(truth.period) for w in walks])
     np.testing.assert_allclose(errors[:-1] / errors[1:], 2.0, atol=0.15)
-    assert abs(2.0 * errors[2] - errors[1]) < 1e-5  # extrapolated, s
-    theta = 2.0 * walks[2].theta - walks[1].theta
+    once = 2.0 * errors[1:] - errors[:-1]  # extrapolated, s
+    assert abs(once[-1]) < 1e-5
+    assert abs(4.0 * once[-1] - once[-2]) / 3.0 < 1e-6  # and once more
+    theta = 2.0 * walks[3].theta - walks[2].theta
     assert abs(theta - float(truth.section_state[0])) < 1e-5
-    assert abs(walks[2].loaded_twice - float(truth.durations[0])) < 2e-3
+    assert abs(walks[3].loaded_twice - float(truth.durations[0])) < 2e-3
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -18,10 +18,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from vrw_jax.ground_lanes import as_full_states, walk_lanes
 from vrw_jax.lane_engine import LaneStep, gait_step
 from vrw_jax.lane_fixed import FixedStep, fixed_gait_step
 from vrw_jax.lane_phase import Patience
-from vrw_jax.models import AbstractWheel, ViscoelasticWheel
+from vrw_jax.models import AbstractWheel, UnilateralWheel, ViscoelasticWheel
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
 from vrw_jax.params import PARAMETER_NAMES, WheelParams
@@ -42,8 +43,8 @@ FEW = 8
 class Steps(eqx.Module):
     """Lean results of walks of some steps, leading axis: lanes; each tells of its last step."""
 
-    section_state: Float[Array, "lanes 3"]  # just before the next touchdown; zeros if it failed
-    durations: Float[Array, "lanes 3"]  # of DLS, SLS-I, SLS-II, s
+    section_state: Float[Array, "lanes section"]  # before the next touchdown; zeros if it failed
+    durations: Float[Array, "lanes 3"]  # of DLS, SLS-I, SLS-II, s; on real ground see its step
     outcome: Int[Array, " lanes"]  # an Outcome; the walk ends at the first that is not STEPPED
     n_stepped: Int[Array, " lanes"]  # steps that ended in a touchdown
     solver_steps: Int[Array, " lanes"]  # tried by the integrator, over all steps
@@ -79,6 +80,9 @@ def steps(
     `options` say. Each lane checks itself, and one that fails is left to the lane engine; `fixed`
     says which was which.
 
+    On real ground (`UnilateralWheel`, its friction a scalar or of the lanes' axis) states may be
+    the rung's own too, shape (lanes, 4 + 3 n), and the only engine is "lanes".
+
     Not for use inside `jax.jit`: it compiles itself, once.
     """
     model = ViscoelasticWheel() if model is None else model
@@ -89,10 +93,12 @@ def steps(
             "the parameters are traced, but vrw.steps compiles itself and has no derivatives: call "
             "it outside of jit, vmap and grad, or map vrw.return_map over the lanes."
         )
-    if states.ndim != 2 or states.shape[1] != 3:
+    ground = isinstance(model, UnilateralWheel)
+    sizes = (3, model.section_size(params)) if ground else (3,)
+    if states.ndim != 2 or states.shape[1] not in sizes:
         raise ValueError(
-            f"states have shape {states.shape}, but they are section states, shape (lanes, 3): "
-            "write states[None] for a single one."
+            f"states have shape {states.shape}, but they are section states, shape (lanes, "
+            f"{' or '.join(map(str, sizes))}): write states[None] for a single one."
         )
     if n_steps < 1:
         raise ValueError(f"n_steps is {n_steps}, but a walk needs at least one step.")
@@ -102,6 +108,10 @@ def steps(
     wheels = np.empty((len(columns), len(states)), dtype)
     for row, column in zip(wheels, columns, strict=True):
         row[:] = np.asarray(column)
+    if isinstance(model, UnilateralWheel):
+        return _on_ground(
+            model, wheels, states.astype(dtype), n_steps, options, engine, params.n_legs
+        )
     walked = _Walked.start(states.astype(dtype))
     run = _chosen(engine, model, options, params.n_legs)
     stiff = np.zeros(len(states), bool)
@@ -133,6 +143,29 @@ def steps(
         jnp.asarray(stiff),
         engine="collocation" if engine == "collocation" else run.name,
     )
+
+
+def _on_ground(
+    model: UnilateralWheel,
+    wheels: np.ndarray,
+    states: np.ndarray,
+    n_steps: int,
+    options: Options,
+    engine: str,
+    n_legs: int,
+) -> Steps:
+    if engine not in ("auto", "lanes") or explicit_tableau(options.solver, options) is None:
+        raise ValueError(
+            f"engine is {engine!r} and solver {options.solver}, but batches on real ground need "
+            "'lanes' and an explicit Runge-Kutta solver: map vrw.return_map over the wheels."
+        )
+    friction = np.broadcast_to(np.asarray(model.friction, wheels.dtype), (len(states),))
+    columns = np.concatenate([wheels, friction[None]])
+    states = as_full_states(columns, states, n_legs)
+    told = walk_lanes(columns, states, n_steps, model.max_events, options, n_legs)
+    section_state, durations, outcome, n_stepped, tried = map(jnp.asarray, told)
+    none = jnp.zeros(len(states), bool)
+    return Steps(section_state, durations, outcome, n_stepped, tried, none, none, engine="lanes")
 
 
 def _expected(durations: Any, states: np.ndarray, dtype: np.dtype) -> np.ndarray:

@@ -9,7 +9,6 @@ import functools
 import math
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -20,6 +19,7 @@ from vrw_jax.geometry import (
     double_support_circle,
     landing_foot_height,
     rear_direction,
+    sine_cosine,
 )
 from vrw_jax.params import Elementwise, Symbols, symbols_of
 
@@ -37,34 +37,6 @@ def _symbols(n_legs: int, constants: Constants) -> Symbols:
     alpha = 2.0 * math.pi / n_legs
     fields: tuple[Any, ...] = (*constants, n_legs, math.sin(alpha), math.cos(alpha), alpha)
     return Symbols(*fields)
-
-
-_SINE = tuple((-1) ** k / math.factorial(2 * k + 1) for k in range(10))
-_COSINE = tuple((-1) ** k / math.factorial(2 * k) for k in range(11))
-
-
-@jax.custom_jvp
-def sine_cosine(angle: Elementwise) -> tuple[Elementwise, Elementwise]:
-    """Sine and cosine by their Taylor series, right to rounding for |angle| < 1.8 rad.
-
-    The standard functions are scalar calls in float64 on CPU; these are fused and vectorised.
-    """
-    square = angle * angle
-
-    def series(coefficients: tuple[float, ...]) -> Elementwise:
-        value = jnp.full_like(square, coefficients[-1])
-        for coefficient in coefficients[-2::-1]:
-            value = value * square + coefficient
-        return value
-
-    return angle * series(_SINE), series(_COSINE)
-
-
-@sine_cosine.defjvp
-def _sine_cosine_jvp(primals: tuple, tangents: tuple) -> tuple:
-    sin, cos = sine_cosine(*primals)
-    (moved,) = tangents
-    return (sin, cos), (cos * moved, -sin * moved)
 
 
 def _double_support(s: Symbols, point: Point) -> tuple[Elementwise, Motion]:

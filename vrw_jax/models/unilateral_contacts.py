@@ -184,12 +184,12 @@ def _table() -> tuple[np.ndarray, np.ndarray]:
 
 MODES, HELD = _table()
 """Combinations in order of preference: contact modes and held stoppers, shape (63, 2) each."""
-PLACE_WITHOUT_SLIP = np.argsort(
-    np.argsort(
-        [sum({STICK: 0, OFF: 2}.get(int(m), 5) for m in row) for row in MODES], kind="stable"
-    )
+ORDER_WITHOUT_SLIP = np.argsort(
+    [sum({STICK: 0, OFF: 2}.get(int(m), 5) for m in row) for row in MODES], kind="stable"
 )
-"""Place of each combination where friction is infinite: sliding comes last."""
+"""The order where friction is infinite: sliding comes last."""
+AT_ONCE = 8
+"""Combinations looked at together: most events allow no more."""
 
 
 class Allowed(NamedTuple):
@@ -210,18 +210,27 @@ class Choice(NamedTuple):
     solutions: Int[Array, ""]  # admissible combinations
 
 
+class _Looked(NamedTuple):
+    """How far the table has been gone through."""
+
+    next: Int[Array, ""]  # of the combinations that may be chosen
+    best: Int[Array, ""]  # the first admissible one
+    solutions: Int[Array, ""]
+
+
 def choose(s: Symbols, hub: Hub, free: Free, allowed: Allowed, friction: Scalar) -> Choice:
     """The first admissible combination of the table; `solutions` is 0 where there is none."""
     modes, held = jnp.asarray(MODES), jnp.asarray(HELD)
     infinite = ~jnp.isfinite(friction)
     rough = jnp.where(infinite, 0.0, friction)
 
+    given = lax.stop_gradient((s, hub, free, friction))
+
     def admissible(contact: Array, on: Array) -> Array:
-        found = answer(s, hub, free, contact, on, friction)
+        found = answer(*given[:3], contact, on, given[3])
         good = jnp.asarray(True)
         for i in range(2):
             mode = contact[i]
-            may = jnp.take(allowed.contact[i], mode)
             known = jnp.take(allowed.known_contact[i], mode)
             t, n, x, z = (
                 v[i] for v in (found.tangential, found.normal, found.foot_x, found.foot_z)
@@ -230,24 +239,36 @@ def choose(s: Symbols, hub: Hub, free: Free, allowed: Allowed, friction: Scalar)
             direction = jnp.where(mode == SLIP_DOWN, x, -x)
             sticks = known | ((n >= 0.0) & inside)
             loaded = jnp.where(mode == STICK, sticks, (n >= 0.0) & (known | (direction >= 0.0)))
-            good &= may & jnp.where(mode == OFF, known | (z >= 0.0), loaded)
-            good &= jnp.where(on[i], allowed.held[i, 1], allowed.held[i, 0])
+            good &= jnp.where(mode == OFF, known | (z >= 0.0), loaded)
             good &= jnp.where(
                 on[i], found.stopper[i] >= 0.0, allowed.known_open[i] | (found.length[i] <= 0.0)
             )
             good &= jnp.isfinite(n) & jnp.isfinite(t)
         return good
 
-    good = jax.vmap(admissible)(modes, held)
-    place = jnp.where(infinite, jnp.asarray(PLACE_WITHOUT_SLIP), jnp.arange(len(MODES)))
-    best = jnp.argmin(jnp.where(good, place, len(MODES)))
-    contact, on = modes[best], held[best]
-    return Choice(
-        contact,
-        on,
-        answer(s, hub, free, contact, on, friction),
-        jnp.sum(good).astype(jnp.int32),
-    )
+    may = jnp.stack([allowed.contact[i][modes[:, i]] for i in range(2)])
+    may = may & jnp.stack([allowed.held[i][held[:, i].astype(jnp.int32)] for i in range(2)])
+    order = jnp.where(infinite, jnp.asarray(ORDER_WITHOUT_SLIP), jnp.arange(len(MODES)))
+    rank = jnp.cumsum(jnp.all(may, axis=0)[order].astype(jnp.int32))
+    count = rank[-1]
+
+    def look(looked: _Looked) -> _Looked:
+        """At the next few combinations that may be chosen."""
+        nth = looked.next + jnp.arange(AT_ONCE)
+        row = order[jnp.minimum(jnp.sum(rank[None] <= nth[:, None], axis=1), len(MODES) - 1)]
+        good = jax.vmap(admissible)(modes[row], held[row]) & (nth < count)
+        found = jnp.where(jnp.any(good), row[jnp.argmax(good)], 0)
+        first = (looked.solutions == 0) & jnp.any(good)
+        return _Looked(
+            looked.next + AT_ONCE,
+            jnp.where(first, found, looked.best).astype(jnp.int32),
+            looked.solutions + jnp.sum(good, dtype=jnp.int32),
+        )
+
+    none = 0 * count
+    looked = lax.while_loop(lambda now: now.next < count, look, _Looked(none, none, none))
+    contact, on = modes[looked.best], held[looked.best]
+    return Choice(contact, on, answer(s, hub, free, contact, on, friction), looked.solutions)
 
 
 def leaves(
@@ -256,25 +277,28 @@ def leaves(
     free: Free,
     stance: tuple[Array, Array],
     friction: Scalar,
-    slot: int,
-    direction: int,
+    second: Bool[Array, ""],
+    direction: Int[Array, ""],
 ) -> Bool[Array, ""]:
-    """Whether the slot's foot, just let go by its present mode, would move the way it is let go.
+    """Whether a slot's foot, just let go by its present mode, would move the way it is let go.
 
-    `direction`: 0 off the ground, 1 downhill, -1 uphill. The mode's margin must grow with the
-    acceleration that way: where it shrinks, the mode that follows would end before it begins, and
-    forces jump instead (Painlevé).
+    `second`: which slot's; `direction`: 0 off the ground, 1 downhill, -1 uphill. The mode's margin
+    must grow with the acceleration that way: where it shrinks, the mode that follows would end
+    before it begins, and forces jump instead (Painlevé).
     """
     contact, held = stance
-    sin, cos = hub.sin[slot], hub.cos[slot]
-    e, u = (-sin, cos) if direction == 0 else (direction * cos, direction * sin)
-    shift = lambda pair, by: tuple(v - by if i == slot else v for i, v in enumerate(pair))
+    here = jnp.stack([~second, second]).astype(hub.sin[0].dtype)
+    sin, cos = (here[0] * pair[0] + here[1] * pair[1] for pair in (hub.sin, hub.cos))
+    off = direction == 0
+    e, u = jnp.where(off, -sin, direction * cos), jnp.where(off, cos, direction * sin)
+    shift = lambda pair, by: (pair[0] - by * here[0], pair[1] - by * here[1])
     asked = free._replace(e=shift(free.e, e), u=shift(free.u, u))
     rough = jnp.where(jnp.isfinite(friction), friction, 0.0)
 
     def margin(given: Free) -> Array:
         found = answer(s, hub, given, contact, held, friction)
-        normal, tangential = found.normal[slot], found.tangential[slot]
-        return normal if direction == 0 else rough * normal + direction * tangential
+        normal = jnp.where(second, found.normal[1], found.normal[0])
+        tangential = jnp.where(second, found.tangential[1], found.tangential[0])
+        return jnp.where(off, normal, rough * normal + direction * tangential)
 
     return margin(asked) > margin(free)

@@ -161,13 +161,16 @@ def _support(
     modes = jnp.where(event.stops[:, None], stopped, modes)
     known = (jnp.arange(4) == mode[:, None]) & ~rests[:, None]
     rigid = (mode == STICK) & ~jnp.isfinite(friction)  # a tangential force jumps to zero
-    for flags, direction, forced, ended in (
-        (event.lifts, 0, OFF, mode),
-        (event.slides_up, -1, SLIP_UP, jnp.full((2,), STICK)),
-        (event.slides_down, 1, SLIP_DOWN, jnp.full((2,), STICK)),
+    up, down = event.slides_up, event.slides_down
+    second = (event.lifts | up | down)[1]
+    direction = jnp.any(down).astype(jnp.int32) - jnp.any(up).astype(jnp.int32)
+    leaving = leaves(s, hub, free, (mode, stops), friction, second, direction)
+    goes = (leaving & ~rigid)[:, None]
+    for flags, forced, ended in (
+        (event.lifts, OFF, mode),
+        (up, SLIP_UP, jnp.full((2,), STICK)),
+        (down, SLIP_DOWN, jnp.full((2,), STICK)),
     ):
-        leaving = [leaves(s, hub, free, (mode, stops), friction, i, direction) for i in range(2)]
-        goes = (jnp.stack(leaving) & ~rigid)[:, None]
         tested = ~(jnp.arange(4) == ended[:, None]) & (goes | rigid[:, None] | ~only(forced))
         modes = jnp.where(flags[:, None], jnp.where(goes, only(forced), tested), modes)
         known = jnp.where(flags[:, None], goes & only(forced), known)

@@ -16,6 +16,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from vrw_jax.geometry import sine_cosine
 from vrw_jax.params import Elementwise, Scalar, Symbols
 
 Legs = Float[Array, "n_legs ..."]
@@ -48,7 +49,7 @@ class Legwise(NamedTuple):
 def directions(s: Symbols, theta: Elementwise) -> Legwise:
     """Sine and cosine of every leg's angle, from one sine and one cosine."""
     turn = (s.alpha * np.arange(s.n)).reshape(-1, *(1,) * jnp.ndim(theta))
-    sin, cos = jnp.sin(theta), jnp.cos(theta)
+    sin, cos = sine_cosine(theta)
     sin_turn, cos_turn = np.sin(turn), np.cos(turn)
     return Legwise(sin * cos_turn + cos * sin_turn, cos * cos_turn - sin * sin_turn)
 
