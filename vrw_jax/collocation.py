@@ -21,25 +21,19 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Inexact
-from numpy.polynomial import legendre
 
+from vrw_jax.mesh import (
+    ENDS_ONCE,
+    ENDS_TWICE,
+    N_NODES,
+    NODES,
+    ONCE,
+    TWICE,
+    Mesh,
+    lagrange,
+    node_weights,
+)
 from vrw_jax.params import Elementwise
-
-N_NODES = 4
-
-
-def _gauss_rule() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Nodes, integration matrix and weights of the Gauss collocation on [0, 1]."""
-    nodes = (legendre.leggauss(N_NODES)[0] + 1.0) / 2.0
-    powers = np.arange(N_NODES)
-    to_polynomial = np.linalg.inv(nodes[:, None] ** powers)
-    matrix = (nodes[:, None] ** (powers + 1) / (powers + 1)) @ to_polynomial
-    return nodes, matrix, (1.0 / (powers + 1)) @ to_polynomial
-
-
-NODES, ONCE, ENDS_ONCE = _gauss_rule()
-TWICE, ENDS_TWICE = ONCE @ ONCE, ENDS_ONCE @ ONCE
-"""Once and twice integrated from a step's start to its nodes, and to its end."""
 
 Constants = tuple[Elementwise, ...]
 Vector = tuple[Elementwise, ...]
@@ -84,27 +78,6 @@ class PhaseSequence(NamedTuple):
     start: Callable[[Constants, Vector], Point]
     phases: tuple[Phase, ...]
     border_checks: Callable[[Constants, "tuple[Passage, ...]", Array], Vector]
-
-
-class Mesh(NamedTuple):
-    """Steps of one phase as fractions of its duration, growing by `growth` from first to last."""
-
-    n_steps: int
-    growth: float
-
-    @property
-    def fractions(self) -> np.ndarray:
-        places = np.linspace(0.0, 1.0, self.n_steps + 1)
-        rate = np.log(self.growth)
-        if abs(rate) > 1e-12:
-            places = np.expm1(rate * places) / np.expm1(rate)
-        return np.diff(places)
-
-    @property
-    def node_times(self) -> np.ndarray:
-        """Times of all nodes, as fractions of the phase's duration."""
-        begins = np.cumsum(self.fractions) - self.fractions
-        return (begins[:, None] + self.fractions[:, None] * NODES).ravel()
 
 
 class Solution(NamedTuple):
@@ -515,30 +488,6 @@ class Passage(NamedTuple):
     end: Point
 
 
-def _node_weights(mesh: Mesh) -> tuple[np.ndarray, ...]:
-    """Matrices from a phase's accelerations to rates and positions at its nodes and its end.
-
-    For a phase of duration 1 from rest at the origin, nodes in order; the end is the last row.
-    """
-    n = mesh.n_steps * N_NODES
-    rates, places = np.zeros((n + 1, n)), np.zeros((n + 1, n))
-    times = np.ones(n + 1)
-    rate, place, time = np.zeros(n), np.zeros(n), 0.0
-    for i, h in enumerate(mesh.fractions):
-        own = slice(i * N_NODES, (i + 1) * N_NODES)
-        rates[own], places[own] = rate, place + h * NODES[:, None] * rate
-        rates[own, own] += h * ONCE
-        places[own, own] += h * h * TWICE
-        times[own] = time + h * NODES
-        place = place + h * rate
-        place[own] += h * h * ENDS_TWICE
-        rate = rate.copy()
-        rate[own] += h * ENDS_ONCE
-        time += h
-    rates[n], places[n] = rate, place
-    return times, rates, places
-
-
 def walk_through(
     sequence: PhaseSequence,
     meshes: tuple[Mesh, ...],
@@ -554,7 +503,7 @@ def walk_through(
     point = sequence.start(constants, section)
     passages = []
     for i, phase in enumerate(sequence.phases):
-        times, rates, places = (w.astype(durations.dtype) for w in _node_weights(meshes[i]))
+        times, rates, places = (w.astype(durations.dtype) for w in node_weights(meshes[i]))
         a, T = accelerations[i], durations[i]
         a = a.reshape(-1, *a.shape[2:])
         q, v = jnp.stack(point.q), jnp.stack(point.v)
@@ -582,7 +531,7 @@ def mesh_error(sequence: PhaseSequence, meshes: tuple[Mesh, ...], solution: Solu
         if mesh.n_steps == 1 or not sequence.phases[i].smooth:
             continue
         ends, begins = (
-            jnp.tensordot(jnp.asarray(_lagrange(place), largest.dtype), nodes, (0, 2))
+            jnp.tensordot(jnp.asarray(lagrange(place), largest.dtype), nodes, (0, 2))
             for place, nodes in (
                 (1.0, solution.accelerations[i][:, :-1]),
                 (0.0, solution.accelerations[i][:, 1:]),
@@ -596,29 +545,3 @@ def mesh_error(sequence: PhaseSequence, meshes: tuple[Mesh, ...], solution: Solu
 
 
 JUMP_TO_ERROR = 0.05
-
-
-def _lagrange(place: float) -> np.ndarray:
-    """Weights of a step's nodes for the value of their polynomial at `place`, in steps."""
-    gaps = NODES[:, None] - NODES + np.eye(N_NODES)
-    others = np.where(np.eye(N_NODES, dtype=bool), 1.0, (place - NODES) / gaps)
-    return np.prod(others, axis=1)
-
-
-def transfer_matrix(source: Mesh, target: Mesh) -> np.ndarray:
-    """From accelerations at the nodes of one mesh to those of another, (target, source) nodes.
-
-    Exact where the accelerations are cubic in each step of the source.
-    """
-
-    def ends(mesh: Mesh) -> np.ndarray:
-        return np.concatenate([[0.0], np.cumsum(mesh.fractions)])
-
-    borders = ends(source)
-    times = (ends(target)[:-1, None] + target.fractions[:, None] * NODES).ravel()
-    matrix = np.zeros((times.size, source.n_steps * N_NODES))
-    for row, time in enumerate(times):
-        step = int(np.clip(np.searchsorted(borders, time) - 1, 0, source.n_steps - 1))
-        place = (time - borders[step]) / source.fractions[step]
-        matrix[row, step * N_NODES : (step + 1) * N_NODES] = _lagrange(place)
-    return matrix

@@ -16,10 +16,8 @@ from jaxtyping import Array, Bool, Inexact, Int
 
 from vrw_jax import gait_surface, sequences
 from vrw_jax.collocation import (
-    N_NODES,
     LaneArray,
     Linearised,
-    Mesh,
     PhaseSequence,
     Solution,
     fusion_barrier,
@@ -29,6 +27,7 @@ from vrw_jax.collocation import (
 )
 from vrw_jax.cycle_options import CycleOptions
 from vrw_jax.lanes import from_blocks, to_blocks
+from vrw_jax.mesh import N_NODES, Mesh
 from vrw_jax.params import PARAMETER_NAMES, WheelParams
 
 Parameters = Inexact[Array, "n_parameters lanes"]

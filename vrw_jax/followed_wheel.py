@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 
 from vrw_jax import dynamics
 from vrw_jax.arclength import AbstractFollowed, Linear, Section, Unknown
-from vrw_jax.collocation import N_NODES, Passage, Solution, walk_through
+from vrw_jax.collocation import Passage, Solution, walk_through
 from vrw_jax.cycle_search import (
     Located,
     Problem,
@@ -30,6 +30,7 @@ from vrw_jax.geometry import Motion, rear_foot_height
 from vrw_jax.lanes import one_wheel
 from vrw_jax.limit_cycle import LimitCycle
 from vrw_jax.measures import MARGINS, measures_of
+from vrw_jax.mesh import N_NODES
 from vrw_jax.models import AbstractWheel
 from vrw_jax.models.base import SectionState
 from vrw_jax.options import Options

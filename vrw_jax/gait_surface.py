@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from vrw_jax.collocation import N_NODES, Mesh, Solution, transfer_matrix
+from vrw_jax.collocation import Solution
+from vrw_jax.mesh import N_NODES, Mesh, transfer_matrix
 from vrw_jax.params import Elementwise, WheelParams
 
 MESHES = (Mesh(2, 1.0), Mesh(4, 2.0), Mesh(1, 1.0))

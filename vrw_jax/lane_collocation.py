@@ -21,8 +21,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from vrw_jax.collocation import ENDS_ONCE, ENDS_TWICE, N_NODES, NODES, ONCE, TWICE, Mesh
 from vrw_jax.lane_phase import LanePhase
+from vrw_jax.mesh import ENDS_ONCE, ENDS_TWICE, N_NODES, NODES, ONCE, TWICE, Mesh
 from vrw_jax.runge_kutta import Cut, Place, Slope, Vector
 from vrw_jax.sequences import sine_cosine
 

@@ -12,10 +12,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from vrw_jax import dynamics, lane_engine, transitions
-from vrw_jax.collocation import Mesh
 from vrw_jax.geometry import Motion, double_support_circle
 from vrw_jax.lane_collocation import Residual, Scheme, collocate
 from vrw_jax.lane_phase import LanePhase
+from vrw_jax.mesh import Mesh
 from vrw_jax.models.base import replaced_where_bad, usable
 from vrw_jax.models.viscoelastic import PAPER_START, PhaseBuilder
 from vrw_jax.params import Symbols, WheelParams

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from vrw_jax import dynamics, transitions
 from vrw_jax import multipliers as floquet
-from vrw_jax.collocation import N_NODES, Solution, mesh_error
+from vrw_jax.collocation import Solution, mesh_error
 from vrw_jax.cycle_derivatives import attach_monodromy, solve_cycle
 from vrw_jax.cycle_options import CycleOptions
 from vrw_jax.cycle_search import (
@@ -30,6 +30,7 @@ from vrw_jax.cycle_search import (
 )
 from vrw_jax.geometry import Motion
 from vrw_jax.lanes import compiled_by_caller
+from vrw_jax.mesh import N_NODES
 from vrw_jax.models import AbstractWheel, ViscoelasticWheel
 from vrw_jax.models.base import Indicators, Margins, SectionState
 from vrw_jax.options import Options
