@@ -14,6 +14,7 @@ import numpy as np
 from matplotlib.colors import LogNorm, Normalize
 
 import vrw_jax as vrw
+from vrw_jax import plots
 
 FRICTION = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.4, 1.7, 2.0, 2.5, 3.0)
 DAMPING = tuple(float(c) for c in range(20, 401, 20))
@@ -89,7 +90,7 @@ def draw() -> None:
         rows = list(csv.DictReader(file))
     shape = (len(STARTS), len(FRICTION), len(DAMPING))
     figure, axes = plt.subplots(
-        len(STARTS), len(shown), figsize=(14, 5.4), sharex=True, sharey=True, layout="constrained"
+        len(STARTS), len(shown), figsize=(1.5 * plots.PAGE, 4.6), sharex=True, sharey=True
     )
     for column, (field, (label, logarithmic)) in enumerate(shown.items()):
         good = [r["outcome"] == "STEPPED" and float(r["speed"]) > 0.0 for r in rows]
@@ -108,11 +109,10 @@ def draw() -> None:
             axis.set_yticks(shown_c, [f"{DAMPING[i]:g}" for i in shown_c])
             if column == 0:
                 axis.set_ylabel(f"{name} start\ndamping / N s/m")
-        axes[0, column].set_title(label, fontsize=10)
+        axes[0, column].set_title(label)
         axes[-1, column].set_xlabel("friction coefficient")
         figure.colorbar(image, ax=axes[:, column], location="bottom", extend="max")
-    for ending in ("png", "svg"):
-        figure.savefig(TARGET / f"friction_map.{ending}", dpi=110)
+    plots.save(figure, TARGET, "friction_map")
 
 
 def main() -> None:
@@ -120,7 +120,8 @@ def main() -> None:
     TARGET.mkdir(parents=True, exist_ok=True)
     if "--redraw" not in sys.argv:
         compute()
-    draw()
+    with plots.style():
+        draw()
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ import numpy as np
 from friction_map import FIELDS, told
 
 import vrw_jax as vrw
+from vrw_jax import plots
 
 FRICTION, DAMPING = 0.7, 200.0  # held while the other one moves
 SLOW, FAST = (0.1, 1.6, -0.1), (0.12, 2.4, -0.2)
@@ -212,7 +213,7 @@ def draw() -> None:
     """Measures over damping and friction, stable gaits solid; walks beyond the fold."""
     rows = read()
     figure, axes = plt.subplots(
-        2, 4, figsize=(14.5, 6), width_ratios=(1.0, 1.0, 1.0, 1.1), layout="constrained"
+        2, 4, figsize=(1.5 * plots.PAGE, 4.6), width_ratios=(1.0, 1.0, 1.0, 1.1)
     )
     held = {"damping": f"μ = {FRICTION}", "friction": f"c = {DAMPING:g} N s/m"}
     axis_names = {"damping": "damping / N s/m", "friction": "friction coefficient"}
@@ -238,7 +239,7 @@ def draw() -> None:
             axis.set(xlabel=axis_names[along], ylabel=label, title=text)
             if key == "slip":
                 axis.set_yscale("log")
-    axes[0, 0].legend(fontsize=8, title="solid: stable, dots: folds", title_fontsize=7)
+    axes[1, 2].legend(title="solid: stable, dots: folds", loc="upper right")
     with GHOST.open() as file:
         header, *lines = list(csv.reader(file))
     walks = np.array(lines, float)
@@ -249,9 +250,8 @@ def draw() -> None:
     for column, mu in enumerate(header[1:], 1):
         beside.plot(walks[:, 0], walks[:, column], label=f"μ = {float(mu):.4f}")
     beside.set(xlabel="step", ylabel="period / s", title="walks beyond the fold, c = 200")
-    beside.legend(fontsize=8)
-    for ending in ("png", "svg"):
-        figure.savefig(TARGET / f"ground_branches.{ending}", dpi=110)
+    beside.legend()
+    plots.save(figure, TARGET, "ground_branches")
 
 
 def main() -> None:
@@ -260,7 +260,8 @@ def main() -> None:
         compute()
         if not GHOST.exists():
             ghosts()
-    draw()
+    with plots.style():
+        draw()
 
 
 if __name__ == "__main__":

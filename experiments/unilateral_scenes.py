@@ -17,6 +17,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import vrw_jax as vrw
+from vrw_jax import plots
 from vrw_jax.models.unilateral_mechanics import directions, foot_heights
 from vrw_jax.models.unilateral_motion import unpack
 
@@ -100,21 +101,15 @@ def main() -> None:
             ]
             row = [label, friction[i], damping[i], n, name, f"{period:.6f}", f"{spread:.1e}"]
             writer.writerow([*row, *(f"{float(v):.5g}" for v in numbers)])
-    draw([labels.index(name) for name in SHOWN], labels, friction, damping, last)
     shares = np.asarray(step.mode_durations / np.maximum(step.period, 1e-9)[:, None, None])
-    draw_modes(labels, shares)
-
-
-def save(figure: plt.Figure, name: str) -> None:
-    for ending in ("png", "svg"):
-        figure.savefig(TARGET / f"{name}.{ending}", dpi=110)
+    with plots.style():
+        draw([labels.index(name) for name in SHOWN], labels, friction, damping, last)
+        draw_modes(labels, shares)
 
 
 def draw(chosen: list[int], labels: tuple, friction: tuple, damping: tuple, x: np.ndarray) -> None:
     """Ground forces and foot heights of the last step of some scenes, and the paper's step."""
-    figure, axes = plt.subplots(
-        2, len(chosen), figsize=(3.3 * len(chosen), 5.0), sharey="row", layout="constrained"
-    )
+    figure, axes = plt.subplots(2, len(chosen), figsize=(1.9 * len(chosen), 4.2), sharey="row")
     paper = vrw.ViscoelasticWheel(stop_at_lift_off=False)
     for column, i in enumerate(chosen):
         params = vrw.WheelParams(damping=damping[i])
@@ -140,18 +135,18 @@ def draw(chosen: list[int], labels: tuple, friction: tuple, damping: tuple, x: n
             top.plot(formal.time, formal[f"lambda_{2 * leg + 2}"], **grey, label=shown)
             if leg == 1:
                 low.plot(formal.time, 1e3 * formal.foot_2_z, **grey, label=shown)
-        top.set_title(labels[i], fontsize=10)
+        top.set_title(labels[i])
         low.set(xlabel="time since landing / s", ylim=(-25.0, 60.0))
     axes[0, 0].set_ylabel("ground force / N")
     axes[1, 0].set_ylabel("foot height / mm")
-    axes[0, 0].legend(fontsize=6)
-    axes[1, 0].legend(fontsize=6)
-    save(figure, "unilateral_scenes")
+    axes[0, 0].legend(fontsize=5)
+    axes[1, 0].legend(fontsize=5)
+    plots.save(figure, TARGET, "unilateral_scenes")
 
 
 def draw_modes(labels: tuple, shares: np.ndarray) -> None:
     """Time in each pair of contact modes, fore foot first, scene by scene."""
-    figure, axis = plt.subplots(figsize=(9, 5.2), layout="constrained")
+    figure, axis = plt.subplots(figsize=(plots.PAGE, 4.2))
     words = {"air": "air", "rest": "rest", "down": "slides down", "up": "slides up"}
     colours, left, count = plt.get_cmap("tab20"), np.zeros(len(labels)), 0
     for a, first in enumerate(MODES):
@@ -164,8 +159,8 @@ def draw_modes(labels: tuple, shares: np.ndarray) -> None:
             left, count = left + share, count + 1
     axis.invert_yaxis()
     axis.set(xlabel="share of the step / %", xlim=(0.0, 100.0), title="fore foot, rear foot")
-    axis.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    save(figure, "unilateral_modes")
+    axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+    plots.save(figure, TARGET, "unilateral_modes")
 
 
 if __name__ == "__main__":
