@@ -116,20 +116,25 @@ def curves(axes: Axes, rows: list[Row], by: str, x: str, y: str, label: str = "{
     axes.grid(color="0.9", lw=0.4)
 
 
+def over_steps(
+    rows: list[Row], key: str, label: str, shown: dict[str, str], height: float
+) -> tuple[Figure, Axes]:
+    """A panel over the number of steps for each column shown; the last panel too."""
+    figure = Figure(figsize=(PAGE, height))
+    for axes, (y, name) in zip(figure.subplots(1, len(shown)), shown.items(), strict=True):
+        curves(axes, rows, key, "steps", y, label)
+        axes.set(xlabel="steps", ylabel=name)
+    return figure, axes
+
+
 def long_walk(rows: list[Row]) -> Figure:
     """Distance from the cycle, error of the clock and energy not accounted for, over steps."""
-    figure = Figure(figsize=(PAGE, 2.8))
-    for axes, (y, name) in zip(
-        figure.subplots(1, 3),
-        (
-            ("distance", "distance from the cycle"),
-            ("clock_error_s", "error of the clock [s]"),
-            ("not_accounted_J", "energy not accounted for [J]"),
-        ),
-        strict=True,
-    ):
-        curves(axes, rows, "tolerance", "steps", y, "tolerance {}")
-        axes.set(xlabel="steps", ylabel=name)
+    shown = {
+        "distance": "distance from the cycle",
+        "clock_error_s": "error of the clock [s]",
+        "not_accounted_J": "energy not accounted for [J]",
+    }
+    figure, axes = over_steps(rows, "tolerance", "tolerance {}", shown, 2.8)
     work = groups(rows, "tolerance")["1e-06"]
     lost = np.finfo(float).eps * numbers(work, "work_of_gravity_J")
     axes.loglog(
@@ -275,18 +280,12 @@ def scuffing(rows: list[Row]) -> Figure:
 
 def growth(rows: list[Row]) -> Figure:
     """Derivatives through many steps and their error, over steps, by damping."""
-    figure = Figure(figsize=(PAGE, 3.0))
-    for axes, (y, name) in zip(
-        figure.subplots(1, 3),
-        (
-            ("by_start", "norm of derivative by the start"),
-            ("by_damping", "derivative by $c$"),
-            ("error", "error of the derivative by $c$"),
-        ),
-        strict=True,
-    ):
-        curves(axes, rows, "damping", "steps", y, "$c$ = {} N s/m")
-        axes.set(xlabel="steps", ylabel=name)
+    shown = {
+        "by_start": "norm of derivative by the start",
+        "by_damping": "derivative by $c$",
+        "error": "error of the derivative by $c$",
+    }
+    figure, axes = over_steps(rows, "damping", "$c$ = {} N s/m", shown, 3.0)
     axes.set_ylim(1e-13, 1e-7)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return figure

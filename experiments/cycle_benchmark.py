@@ -22,7 +22,7 @@ import jax.numpy as jnp  # noqa: E402  the number format is chosen first
 import numpy as np  # noqa: E402
 
 import vrw_jax as vrw  # noqa: E402
-from vrw_jax.cycle_search import parameters_of, wheel_of  # noqa: E402
+from vrw_jax.params import parameters_of, wheel_of  # noqa: E402
 from vrw_jax.sensitivities import MEASURES  # noqa: E402
 
 BOX = {

@@ -11,7 +11,7 @@ import numpy as np
 import vrw_jax as vrw
 from vrw_jax import cycle_search, gait_surface
 from vrw_jax.lanes import in_blocks
-from vrw_jax.params import PARAMETER_NAMES
+from vrw_jax.params import PARAMETER_NAMES, parameters_of, wheel_of
 
 BOX = {
     "damping": (15.0, 219.0),
@@ -29,7 +29,7 @@ def reached_by_continuation(problem: cycle_search.Problem, parameters: jax.Array
 
     def continued(parameters: jax.Array) -> cycle_search.Finding:
         lanes = parameters.shape[-1:]
-        home = cycle_search.parameters_of(vrw.WheelParams())[:, None]
+        home = parameters_of(vrw.WheelParams())[:, None]
         section, durations = (
             jnp.broadcast_to(jnp.asarray(x)[:, None], (len(x), *lanes)) for x in GAIT_OF_TABLE_1
         )
@@ -49,7 +49,7 @@ def main() -> None:
     options = dataclasses.replace(vrw.CycleOptions(), iterations=20, steps=steps)
     problem = cycle_search.Problem(8, 1, options)
     table_1 = vrw.WheelParams()
-    parameters = np.tile(np.asarray(cycle_search.parameters_of(table_1))[:, None], (1, N_WHEELS))
+    parameters = np.tile(np.asarray(parameters_of(table_1))[:, None], (1, N_WHEELS))
     generator = np.random.default_rng(SEED)
     for name, (low, high) in BOX.items():
         parameters[PARAMETER_NAMES.index(name)] = generator.uniform(low, high, N_WHEELS)
@@ -62,7 +62,7 @@ def main() -> None:
         rows.extend(np.asarray(block).reshape(-1, N_WHEELS) * unit**2)
     unknowns = np.stack([np.asarray(row) for row in rows])[:, found]
 
-    wheels = cycle_search.wheel_of(jnp.asarray(parameters[:, found]), 8)
+    wheels = wheel_of(jnp.asarray(parameters[:, found]), 8)
     places = np.stack([np.asarray(x) for x in gait_surface.coordinates(wheels)])
     centre, spread = places.mean(1), places.std(1)
     features = np.stack(

@@ -30,11 +30,12 @@ import jax.numpy as jnp  # noqa: E402  the number format is chosen first
 import numpy as np  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 from scipy.optimize import minimize  # noqa: E402
+from work_precision_charts import replace  # noqa: E402
 
 import vrw_jax as vrw  # noqa: E402
 from vrw_jax import plots, tune_engine  # noqa: E402
 from vrw_jax.config import load  # noqa: E402
-from vrw_jax.cycle_search import wheel_of  # noqa: E402
+from vrw_jax.params import wheel_of  # noqa: E402
 from vrw_jax.tune import TuneProblem, tune, tuning_problem  # noqa: E402
 
 CONFIGS = Path(__file__).parents[1] / "configs"
@@ -303,9 +304,7 @@ def main(folder: Path, n_starts: int) -> None:
     print(table)
     page = folder.parent / "tuning.md"
     if page.exists():
-        before, rest = page.read_text().split("<!-- table -->\n")
-        after = rest.split("<!-- end of table -->")[1]
-        page.write_text(f"{before}<!-- table -->\n\n{table}\n\n<!-- end of table -->{after}")
+        replace(page, "table", table)
     plots.save(drawn(results), folder, "tuning_against_others")
 
 

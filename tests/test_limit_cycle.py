@@ -9,9 +9,8 @@ import pytest
 import truth
 
 import vrw_jax as vrw
-from vrw_jax.cycle_search import wheel_of
 from vrw_jax.outcomes import Outcome
-from vrw_jax.params import PARAMETER_NAMES
+from vrw_jax.params import PARAMETER_NAMES, wheel_of
 
 TIGHT = vrw.CycleOptions.tight()
 VALUES = ("section_state", "post_impact", "durations", "period", "dls_fraction", "speed")
@@ -145,6 +144,15 @@ def test_a_gait_that_the_mesh_does_not_resolve_is_not_called_found():
     np.testing.assert_allclose(found.period[kept], expected.period[kept], rtol=1e-8)
     error = np.abs(np.asarray(found.period / expected.period)[kept] - 1.0)
     assert np.all(error <= found.mesh_error[kept])
+
+
+def test_every_measure_of_a_cycle_can_be_differentiated():
+    def measures(params):
+        cycle = vrw.limit_cycle(params)
+        names = ("stability_margin", "jury_margins", "condition", "mesh_error", "indicators")
+        return [getattr(cycle, name) for name in names]
+
+    jax.eval_shape(jax.jacrev(measures), vrw.WheelParams())  # traced, which is what can fail
 
 
 def test_vmap_gives_what_single_wheels_give():

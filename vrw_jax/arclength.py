@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from vrw_jax.lanes import select
 from vrw_jax.params import Scalar
 
 Unknown = Any
@@ -188,10 +189,6 @@ def _correct(
     return _Corrected(jax.tree.map(jnp.add, z, dz), share + d_share, size, column, linear.jacobian)
 
 
-def _select(condition: Array, yes: Any, no: Any) -> Any:
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
-
-
 def _share_of(p: Array, bounds: Array) -> Array:
     return (p - bounds[0]) / (bounds[1] - bounds[0])
 
@@ -298,7 +295,7 @@ def follow(
         place = jnp.where(accepted, track.n_points, options.max_points)
         points = jax.tree.map(lambda b, a: b.at[place].set(a, mode="drop"), track.points, reached)
         count = track.n_points + accepted
-        base = _select(accepted, reached, base)
+        base = select(accepted, reached, base)
 
         quick, slow = state.iteration < 4, state.iteration >= 6
         growth = jnp.where(quick, 1.4, jnp.where(slow, 0.6, 1.0))
@@ -306,7 +303,7 @@ def follow(
         step = jnp.where(accepted, longer, jnp.where(failed, 0.5 * state.step, state.step))
         step = jnp.where(starting, options.first_step, step)
         following = _predicted(followed, base, step, bounds)
-        following = _select(accepted | failed, following, trial._replace(z=now.z, share=now.share))
+        following = select(accepted | failed, following, trial._replace(z=now.z, share=now.share))
 
         at_end = accepted & (trial.final | (following.length <= 1e-12))
         ending = track.ending
@@ -346,7 +343,7 @@ def solve(
         following = _correct(followed, wheel, bounds, plane, now.z, now.share)
         # A trial that went astray stands still: no lane may hand its neighbours a NaN.
         sound = jnp.isfinite(following.size)
-        following = _select(sound, following, now)._replace(size=following.size)
+        following = select(sound, following, now)._replace(size=following.size)
         settled = jnp.where(following.size < options.tolerance, settled + 1, 0)
         return following, count + 1, settled
 

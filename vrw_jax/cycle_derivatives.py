@@ -30,8 +30,7 @@ from vrw_jax.lanes import in_blocks, one_wheel
 def _tangent_space(problem: Problem, parameters: Parameters, located: Located) -> Located:
     """d located / d parameters over lanes, with a leading axis; zero where nothing was found."""
     passed = problem.pass_at(parameters, located, tuple(range(parameters.shape[0])))
-    columns = columns_of(passed, located)
-    return _where_found(located, columns)
+    return _where_found(located, columns_of(passed, located))
 
 
 def _along_branch(
@@ -55,8 +54,8 @@ def _along_branch(
 
     units = jnp.broadcast_to(jnp.eye(n, dtype=parameters.dtype)[:, :, None], (n, n, lanes))
     moved_parameters = beside(parameters, units)
-    standing = jax.tree.map(lambda x: jnp.zeros((n, *x.shape), x.dtype), located)
-    happens = beside(located.happens, standing.happens).real
+    standing = jax.tree.map(lambda x: jnp.zeros((n, *x.shape), x.dtype), located.solution)
+    happens = jnp.tile(located.happens, n)
 
     def along(slopes: Solution) -> Linearised:
         solution = jax.tree.map(beside, located.solution, slopes)
@@ -67,9 +66,7 @@ def _along_branch(
         found = along(now.correction)
         return found._replace(correction=jax.tree.map(jnp.add, now.correction, found.correction))
 
-    start = jax.tree.map(
-        lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(along, standing.solution)
-    )
+    start = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(along, standing))
     return lax.fori_loop(0, 2, again, start)
 
 
@@ -81,10 +78,7 @@ def _where_found(located: Located, tree: Any) -> Any:
 def _curvature(problem: Problem, parameters: Parameters, located: Located) -> Located:
     """Derivatives of `_tangent_space`, with one more leading axis."""
     passed = _along_branch(problem, parameters, located, tuple(range(parameters.shape[0])))
-    n = parameters.shape[0]
-    flat = lambda x: jnp.zeros((n, n, *x.shape), x.dtype)
-    curved = Located(passed.columns, flat(located.happens), flat(located.found), passed.d_ends)
-    return _where_found(located, curved)
+    return _where_found(located, jax.vmap(columns_of, in_axes=(0, None))(passed, located))
 
 
 def _monodromy_slopes(problem: Problem, parameters: Parameters, located: Located) -> Array:

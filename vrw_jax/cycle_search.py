@@ -28,7 +28,7 @@ from vrw_jax.collocation import (
 from vrw_jax.cycle_options import CycleOptions
 from vrw_jax.lanes import from_blocks, to_blocks
 from vrw_jax.mesh import N_NODES, Mesh
-from vrw_jax.params import PARAMETER_NAMES, WheelParams
+from vrw_jax.params import WheelParams, parameters_of, wheel_of
 
 Parameters = Inexact[Array, "n_parameters lanes"]
 """The float parameters in the order of PARAMETER_NAMES."""
@@ -86,16 +86,6 @@ class Finding(NamedTuple):
     monodromy: LaneArray  # (row, column, lanes)
     residual: LaneArray  # size of Newton's last correction
     passes: Int[Array, " lanes"]  # linearised passes spent
-
-
-def parameters_of(params: WheelParams) -> Array:
-    """The float parameters as one array, first axis in the order of PARAMETER_NAMES."""
-    return jnp.stack([getattr(params, name) for name in PARAMETER_NAMES])
-
-
-def wheel_of(parameters: Array, n_legs: int) -> WheelParams:
-    """The inverse of `parameters_of`."""
-    return WheelParams(**dict(zip(PARAMETER_NAMES, parameters, strict=True)), n_legs=n_legs)
 
 
 def surface_start(problem: Problem, parameters: Parameters, with_dls: Array) -> Located:

@@ -18,14 +18,7 @@ from jaxtyping import Array, Bool, Float
 from vrw_jax import dynamics
 from vrw_jax.arclength import AbstractFollowed, Linear, Section, Unknown
 from vrw_jax.collocation import Passage, Solution, walk_through
-from vrw_jax.cycle_search import (
-    Located,
-    Problem,
-    correction_size,
-    nothing_known,
-    parameters_of,
-    wheel_of,
-)
+from vrw_jax.cycle_search import Located, Problem, correction_size, nothing_known
 from vrw_jax.geometry import Motion, rear_foot_height
 from vrw_jax.lanes import one_wheel
 from vrw_jax.limit_cycle import LimitCycle
@@ -35,7 +28,15 @@ from vrw_jax.models import AbstractWheel
 from vrw_jax.models.base import SectionState
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
-from vrw_jax.params import FRICTION, PARAMETER_NAMES, Elementwise, Scalar, WheelParams
+from vrw_jax.params import (
+    FRICTION,
+    PARAMETER_NAMES,
+    Elementwise,
+    Scalar,
+    WheelParams,
+    parameters_of,
+    wheel_of,
+)
 
 
 class Wheel(NamedTuple):

@@ -15,7 +15,7 @@ from vrw_jax.limit_cycle import limit_cycle
 from vrw_jax.measures import measures_of
 from vrw_jax.models import UnilateralStep, UnilateralWheel
 from vrw_jax.options import Options
-from vrw_jax.params import FRICTION, PARAMETER_NAMES, WheelParams
+from vrw_jax.params import FRICTION, PARAMETER_NAMES, WheelParams, parameters_of, wheel_of
 from vrw_jax.walked_cycle import WalkedCycle
 
 MOVED = (*PARAMETER_NAMES, FRICTION)
@@ -36,18 +36,15 @@ class GroundGait(NamedTuple):
 
 def values_of(params: WheelParams, model: UnilateralWheel) -> Values:
     """The numbers that a gait is differentiated by."""
-    numbers = [getattr(params, name) for name in PARAMETER_NAMES]
-    return jnp.stack([*numbers, jnp.asarray(model.friction, params.damping.dtype)])
+    return jnp.stack([*parameters_of(params), jnp.asarray(model.friction, params.damping.dtype)])
 
 
 def wheel_and_ground(
     values: Values, n_legs: int, model: UnilateralWheel
 ) -> tuple[WheelParams, UnilateralWheel]:
     """The inverse of `values_of`; `model` gives what has no derivative."""
-    *parameters, friction = values
-    named = dict(zip(PARAMETER_NAMES, parameters, strict=True))
-    ground = eqx.tree_at(lambda ground: ground.friction, model, friction)
-    return WheelParams(**named, n_legs=n_legs), ground
+    ground = eqx.tree_at(lambda ground: ground.friction, model, values[-1])
+    return wheel_of(values[:-1], n_legs), ground
 
 
 def cycle_of(

@@ -30,6 +30,7 @@ from vrw_jax.ground_march import (
     motion_of,
     place_of,
 )
+from vrw_jax.lanes import select
 from vrw_jax.models.base import replaced_where_bad, usable
 from vrw_jax.models.unilateral_contacts import OFF
 from vrw_jax.models.unilateral_events import event_of, resolve, settled
@@ -39,7 +40,14 @@ from vrw_jax.models.unilateral_section import closed, embedded, opened
 from vrw_jax.models.viscoelastic import PAPER_START
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
-from vrw_jax.params import PARAMETER_NAMES, Symbols, WheelParams
+from vrw_jax.params import (
+    PARAMETER_NAMES,
+    Symbols,
+    WheelParams,
+    parameters_of,
+    symbols_of,
+    wheel_of,
+)
 from vrw_jax.runge_kutta import Tableau, explicit_tableau
 
 LANES = 256
@@ -109,17 +117,12 @@ def as_full_states(columns: np.ndarray, states: np.ndarray, n: int) -> np.ndarra
     """The full section states of the paper's, wheel by wheel; others are left as they are."""
     if states.shape[1] != 3:
         return states
-    embed = lambda values, x: embedded(_wheel(values, n).symbols(), x)
+    embed = lambda values, x: embedded(symbols_of(n, *values), x)
     return np.asarray(jax.vmap(embed, (1, 0))(columns[:-1], jnp.asarray(states)))
 
 
-def _wheel(values: Array, n_legs: int) -> WheelParams:
-    names = dict(zip(PARAMETER_NAMES, values, strict=True))
-    return WheelParams(**names, n_legs=n_legs)
-
-
 def _symbols(columns: Array, n: int) -> Symbols:
-    return _wheel(columns[:-1], n).symbols()
+    return symbols_of(n, *columns[:-1])
 
 
 @functools.cache
@@ -138,12 +141,11 @@ def _program(static: Options, n_legs: int, max_events: int) -> Callable[..., tup
 
 def _queue_of(columns: Array, x: Array, n: int) -> _Queue:
     def made_safe(values: Array, x: Array) -> tuple[Array, Array, Array]:
-        params = _wheel(values[:-1], n)
+        params = wheel_of(values[:-1], n)
         safe_x = embedded(WheelParams(n_legs=n).symbols(), jnp.asarray(PAPER_START, x.dtype))
         good = usable(params, x) & (values[-1] >= 0.0)
         params, x = replaced_where_bad(good, params, x, safe_x)
-        numbers = [getattr(params, name) for name in PARAMETER_NAMES]
-        return jnp.stack([*numbers, jnp.where(good, values[-1], 1.0)]), x, good
+        return jnp.stack([*parameters_of(params), jnp.where(good, values[-1], 1.0)]), x, good
 
     columns, x, good = jax.vmap(made_safe, -1, -1)(columns, x)
     none = jnp.zeros(x.shape[-1:], jnp.int32)
@@ -238,7 +240,7 @@ def _walked(
         opens = fills | (landed & ~leaves)
         columns = jnp.where(fills, fresh(queue.columns), lane.columns)
         x = jnp.where(fills, fresh(queue.start), reached)
-        motion, stance = _select(opens, over(begins)(columns, x), (motion, stance))
+        motion, stance = select(opens, over(begins)(columns, x), (motion, stance))
         guard = jnp.where(opens, place.foot, here.guard)
         motion, stance, outcome = over(through)(columns, motion, stance, guard)
         outcome = jnp.where(fills & ~fresh(queue.good), Outcome.BAD_INPUT, outcome)
@@ -315,7 +317,3 @@ def _empty(queue: _Queue, n: int) -> tuple[_Lanes, March]:
         tried=none,
     )
     return _Lanes(none, columns, none, jnp.zeros((3, LANES), dtype), none, none), march
-
-
-def _select(condition: Array, yes: tuple, no: tuple) -> tuple:
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)

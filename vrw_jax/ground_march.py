@@ -6,7 +6,6 @@ Nothing here looks from one lane to another.
 """
 
 import functools
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -28,7 +27,7 @@ from vrw_jax.models.unilateral_motion import (
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
 from vrw_jax.params import Elementwise, Symbols
-from vrw_jax.runge_kutta import Tableau, cut_where
+from vrw_jax.runge_kutta import Tableau, cut_where, dips, parabola
 
 N_FELT = 8
 """Rows of a slope beside accelerations: what guards need of the forces."""
@@ -137,7 +136,6 @@ def march(
     flow = flow_of(s, friction, False, begin.stance)
     order, n = tableau.order, begin.here.q.shape[0]
     middle, last = tableau.middle, len(tableau.places) - 1
-    inside = float(tableau.places[middle])
     cut = cut_where(~jnp.isnan(jnp.max(begin.h)))
 
     def watched(place: Place, offset: Array) -> Array:
@@ -174,7 +172,7 @@ def march(
         running, marching = now.verdict == MARCHING, (now.verdict == MARCHING) & ~search.on
         keep = marching & (error <= 1.0)
         change = jnp.clip(SAFETY * power, LEAST, jnp.where(keep, MOST, 1.0))
-        bend, slope = cut(_parabola(inside), g0, gm, g1)
+        bend, slope = cut(functools.partial(parabola, tableau), g0, gm, g1)
         crosses = g1 <= 0.0
         to_dip = cut(_to_earliest_dip, g0, g1, slope, bend)
         retry = keep & (to_dip < 1.0) & (now.time + h * to_dip > now.time)
@@ -254,26 +252,11 @@ def _squared_error(
 def _to_earliest_dip(g0: Array, g1: Array, slope: Array, bend: Array) -> Array:
     """Share of the step up to where a guard that falls and rises again is lowest, if near zero.
 
-    See `lane_phase`: the step is taken again up to that place, and the march goes on from there. A
-    guard that stands on its own event at the start has no such place.
+    See `runge_kutta.dips`. A guard that stands on its own event at the start has no such place.
     """
-    falls_and_rises = (slope < 0.0) & (slope + 2.0 * bend > 0.0)
-    low = 4.0 * bend * g0 - slope * slope  # the lowest value, times 4 bend > 0
-    near = 5.0 * low <= 4.0 * bend * jnp.maximum(g0, g1)
-    new = 4.0 * bend * g0 > 1.01 * low
-    dips = falls_and_rises & near & new & (g0 > 0.0) & (g1 > 0.0)
-    place = -slope / jnp.where(dips, 2.0 * bend, 1.0)
-    return jnp.min(jnp.where(dips, place, 1.0), axis=0)
-
-
-def _parabola(inside: float) -> Callable[[Array, Array, Array], tuple[Array, Array]]:
-    """Bend and slope of the parabola through a step's start, a place inside and its end."""
-
-    def through(g0: Array, gm: Array, g1: Array) -> tuple[Array, Array]:
-        bend = (g1 - g0 - (gm - g0) / inside) / (1.0 - inside)
-        return bend, g1 - g0 - bend
-
-    return through
+    low = dips(g0, g1, bend, slope) & (g0 > 0.0)
+    place = -slope / jnp.where(low, 2.0 * bend, 1.0)
+    return jnp.min(jnp.where(low, place, 1.0), axis=0)
 
 
 def _earliest_root(g0: Array, slope: Array, bend: Array, crossing: Array) -> tuple[Array, Array]:

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from vrw_jax.lanes import select
 from vrw_jax.lazy import diffrax
 from vrw_jax.minima import (
     Minimum,
@@ -217,7 +218,7 @@ def integrate_phase(
         left = here.state, here.solver_state
         if watched.count_start:
             place = row_of(settling.monitor, loop.minimum.left)
-            left = _select(settling.on, (place, stepper.solver_state(place, options)), left)
+            left = select(settling.on, (place, stepper.solver_state(place, options)), left)
         end, error, solver_state = stepper.step(*left, length)
         values, rates = jax.jvp(watched.values, (end,), (stepper.field(end),))
         guards, guard_rates = values[:n_guards], rates[:n_guards]
@@ -274,9 +275,9 @@ def integrate_phase(
                 options.monitor_steps,
             )  # fmt: skip
         return _Loop(
-            step=_select(accepted | arrived, step, here),
+            step=select(accepted | arrived, step, here),
             length=following,
-            controller_state=_select(
+            controller_state=select(
                 marching & ~retry, next_controller_state, loop.controller_state
             ),
             search=_Search(
@@ -325,10 +326,6 @@ from itself alone by 1e-12, more than a hundred times its round-off."""
 SETTLED = 3
 """Tries at the located event before it counts: the first makes the event's time right to first
 order in its derivatives, the second to third order, the last evaluates the state there."""
-
-
-def _select(condition: Any, yes: Any, no: Any) -> Any:
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 
 def _dips(
@@ -433,7 +430,7 @@ def _march(stepper: _Stepper, state: State, interval: Scalar, options: Options) 
         )
         last = keep & (step_length >= interval - time)
         time = jnp.where(last, interval, jnp.where(keep, time + step_length, time))
-        state, solver_state = _select(keep, (end, end_solver_state), (state, solver_state))
+        state, solver_state = select(keep, (end, end_solver_state), (state, solver_state))
         return time, state, solver_state, next_length, controller_state, tried + 1
 
     unfinished = lambda c: (c[0] < interval) & (c[-1] < options.max_solver_steps)

@@ -25,7 +25,7 @@ from vrw_jax.lane_phase import Patience
 from vrw_jax.models import AbstractWheel, UnilateralWheel, ViscoelasticWheel
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
-from vrw_jax.params import PARAMETER_NAMES, WheelParams
+from vrw_jax.params import PARAMETER_NAMES, WheelParams, wheel_of
 from vrw_jax.runge_kutta import explicit_tableau, real_stability_limit
 
 BLOCK = 256
@@ -306,7 +306,7 @@ def _lane_program(
 
     def block(dynamic: Options, few: Array, given: tuple[Array, Array, Array]) -> LaneStep:
         columns, x, wanted = given
-        params = WheelParams(**dict(zip(PARAMETER_NAMES, columns, strict=True)), n_legs=n_legs)
+        params = wheel_of(columns, n_legs)
         options = eqx.combine(dynamic, static)
         tableau = explicit_tableau(options.solver, options)
         assert tableau is not None  # `_chosen` looked
@@ -352,7 +352,7 @@ def _fixed_program(
 
     def block(given: tuple[Array, Array, Array, Array]) -> FixedStep:
         columns, x, wanted, expected = given
-        params = WheelParams(**dict(zip(PARAMETER_NAMES, columns, strict=True)), n_legs=n_legs)
+        params = wheel_of(columns, n_legs)
         return fixed_gait_step(params, x.T, wanted, expected.T, stop_at_lift_off)
 
     return jax.jit(lambda *given: _in_blocks(block, given, width))
@@ -389,7 +389,7 @@ def _by_diffrax(
 @eqx.filter_jit
 def _mapped(model: AbstractWheel, options: Options, n_legs: int, columns: Any, x: Any) -> Any:
     def one(values: Array, state: Array) -> Any:
-        params = WheelParams(**dict(zip(PARAMETER_NAMES, values, strict=True)), n_legs=n_legs)
+        params = wheel_of(values, n_legs)
         return model.advance(params, state, options)
 
     return jax.vmap(one, 1)(columns, x)

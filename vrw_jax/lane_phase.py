@@ -14,9 +14,20 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from vrw_jax.lanes import select
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
-from vrw_jax.runge_kutta import Cut, Evaluate, Place, Tableau, Taken, Vector, take_step
+from vrw_jax.runge_kutta import (
+    Cut,
+    Evaluate,
+    Place,
+    Tableau,
+    Taken,
+    Vector,
+    dips,
+    parabola,
+    take_step,
+)
 
 
 class LanePhase(NamedTuple):
@@ -97,7 +108,7 @@ def integrate_lanes(
     lost = crossed & found.open
     guard = jnp.where(active & (at_once >= 0), at_once, jnp.where(crossed, found.guard, -1))
     return LanePhaseEnd(
-        place=_select(crossed, found.end, march.here),
+        place=select(crossed, found.end, march.here),
         duration=march.time + jnp.where(crossed, found.length, 0.0),
         guard=jnp.where(lost, -1, guard),
         timed_out=march.verdict == TIMED_OUT,
@@ -137,7 +148,7 @@ def _march(
         verdict, crossing, accepted, time, h = cut(
             partial(_verdict, options), march, change, kept, end
         )
-        here, values = cut(_select, accepted, (taken.end, end), (march.here, march.values))
+        here, values = cut(select, accepted, (taken.end, end), (march.here, march.values))
         left = jnp.sum(verdict == MARCHING, dtype=jnp.int32)
         half_left = 2 * left > first_step.shape[0]
         return _March(
@@ -229,22 +240,13 @@ def _squared_error(taken: Taken, start: Place, guards: Vector, rtol: Array, atol
 def _to_earliest_dip(tableau: Tableau, start: Vector, inside: Vector, end: Vector) -> Array:
     """Share of the step up to where a guard that falls and rises again is lowest, if near zero.
 
-    From the parabola through the start, a stage inside and the end; 1 where there is nothing to
-    look at. A step is taken again up to that place: either the guard has crossed there, or the
-    march goes on from its lowest point. A point no lower than the start by 1 % is not new.
+    1 where there is nothing to look at. See `runge_kutta.dips`.
     """
-    place = float(tableau.places[tableau.middle])
     over, under = jnp.ones_like(start[0]), jnp.ones_like(start[0])
     for g0, gm, g1 in zip(start, inside, end, strict=True):
-        bend = (g1 - g0 - (gm - g0) / place) / (1.0 - place)
-        slope = g1 - g0 - bend
-        falls_and_rises = (slope < 0.0) & (slope + 2.0 * bend > 0.0)
-        low = 4.0 * bend * g0 - slope * slope  # the lowest value, times 4 bend > 0
-        near = 5.0 * low <= 4.0 * bend * jnp.maximum(g0, g1)
-        new = 4.0 * bend * g0 > 1.01 * low
-        earlier = -slope * under < over * 2.0 * bend
-        dips = falls_and_rises & near & new & earlier & (g1 > 0.0)
-        over, under = jnp.where(dips, -slope, over), jnp.where(dips, 2.0 * bend, under)
+        bend, slope = parabola(tableau, g0, gm, g1)
+        first = dips(g0, g1, bend, slope) & (-slope * under < over * 2.0 * bend)
+        over, under = jnp.where(first, -slope, over), jnp.where(first, 2.0 * bend, under)
     return over / under
 
 
@@ -301,7 +303,7 @@ def _locate(
         def arrive(arrived: Array, shift: Array, end: Place, old: Place) -> Place:
             q = tuple(x + shift * y for x, y in zip(end.q, end.v, strict=True))
             v = tuple(x + shift * y for x, y in zip(end.v, end.slope.acceleration, strict=False))
-            return _select(arrived, end._replace(q=q, v=v), old)
+            return select(arrived, end._replace(q=q, v=v), old)
 
         return _Search(
             length=length,
@@ -339,12 +341,10 @@ def _first_guess(
     tableau: Tableau, start: Vector, inside: Vector, end: Vector, crossing: Array
 ) -> Array:
     """Share of the step to the earliest zero of the guards' parabolas: secant, then Newton."""
-    place = float(tableau.places[tableau.middle])
     earliest = jnp.ones_like(start[0])
     for index, (g0, gm, g1) in enumerate(zip(start, inside, end, strict=True)):
         crosses = (crossing >> index) & 1 == 1
-        bend = (g1 - g0 - (gm - g0) / place) / (1.0 - place)
-        slope = g1 - g0 - bend
+        bend, slope = parabola(tableau, g0, gm, g1)
         fall = jnp.where(crosses & (g0 > g1), g0 - g1, 1.0)
         at = jnp.clip(g0 / fall, 0.0, 1.0)
         for _ in range(3):
@@ -372,7 +372,3 @@ def _first(conditions: Vector) -> Array:
     for i in range(len(conditions) - 1, -1, -1):
         index = jnp.where(conditions[i], i, index)
     return index
-
-
-def _select(condition: Array, yes: Any, no: Any) -> Any:
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)

@@ -6,7 +6,7 @@ and reverse mode, and to any order.
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import overload
 
 import equinox as eqx
@@ -21,13 +21,7 @@ from vrw_jax import multipliers as floquet
 from vrw_jax.collocation import Solution, mesh_error
 from vrw_jax.cycle_derivatives import attach_monodromy, solve_cycle
 from vrw_jax.cycle_options import CycleOptions
-from vrw_jax.cycle_search import (
-    Located,
-    Problem,
-    nothing_known,
-    parameters_of,
-    wheel_of,
-)
+from vrw_jax.cycle_search import Located, Problem, nothing_known
 from vrw_jax.geometry import Motion
 from vrw_jax.lanes import compiled_by_caller
 from vrw_jax.mesh import N_NODES
@@ -35,7 +29,7 @@ from vrw_jax.models import AbstractWheel, ViscoelasticWheel
 from vrw_jax.models.base import Indicators, Margins, SectionState
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
-from vrw_jax.params import Scalar, Symbols, WheelParams
+from vrw_jax.params import Scalar, Symbols, WheelParams, parameters_of, wheel_of
 from vrw_jax.return_map import checked, step
 from vrw_jax.walked_cycle import WalkedCycle, walked_cycle
 
@@ -64,6 +58,12 @@ class LimitCycle(eqx.Module):
     def _many(self) -> bool:
         return self.problem.period_n > 1
 
+    def _mapped(self, of_one: Callable) -> Callable:
+        """A function of one cycle, over the axes of this batch."""
+        for _ in range(self.outcome.ndim):
+            of_one = jax.vmap(of_one)
+        return of_one
+
     @property
     def period(self) -> Array:
         """Duration of the whole cycle, s."""
@@ -87,9 +87,7 @@ class LimitCycle(eqx.Module):
     def monodromy(self) -> Float[Array, "... 2 2"]:
         """Derivative of the return to the section after the impact, over (theta+, dtheta+)."""
         attach_one = attach_monodromy if compiled_by_caller() else _compiled_attach
-        attach = functools.partial(attach_one, self.problem)
-        for _ in range(self.outcome.ndim):
-            attach = jax.vmap(attach)
+        attach = self._mapped(functools.partial(attach_one, self.problem))
         return attach(self.matrix, self.parameters, self.located)
 
     @property
@@ -130,13 +128,11 @@ class LimitCycle(eqx.Module):
         Above 1e-5 a gait does not count as found: give `CycleOptions` more steps.
         """
 
-        def of_one(located: Located) -> Array:
-            lanes = jax.tree.map(lambda x: x[..., None], located.solution)
+        def of_one(solution: Solution) -> Array:
+            lanes = jax.tree.map(lambda x: x[..., None], solution)
             return mesh_error(self.problem.sequence, self.problem.meshes, lanes)[0]
 
-        for _ in range(self.outcome.ndim):
-            of_one = jax.vmap(of_one)
-        return jnp.where(self.found, of_one(self.located), 0.0)
+        return jnp.where(self.found, self._mapped(of_one)(self.located.solution), 0.0)
 
     @property
     def monitors(self) -> Margins:
@@ -146,9 +142,7 @@ class LimitCycle(eqx.Module):
             wheel = wheel_of(parameters, self.problem.n_legs)
             return step(wheel, section_state).monitors
 
-        for _ in range(self.outcome.ndim):
-            walk = jax.vmap(walk)
-        return walk(self.parameters, self.section_state)
+        return self._mapped(walk)(self.parameters, self.section_state)
 
     @property
     def found(self) -> Bool[Array, "..."]:

@@ -188,3 +188,13 @@ def symbols_of(
 PARAMETER_NAMES: tuple[str, ...] = tuple(DOMAINS)
 FRICTION = "friction"
 """What a design or a branch may move beside them: a parameter of the ground, held by its model."""
+
+
+def parameters_of(params: WheelParams) -> Array:
+    """The float parameters as one array, first axis in the order of PARAMETER_NAMES."""
+    return jnp.stack([getattr(params, name) for name in PARAMETER_NAMES])
+
+
+def wheel_of(parameters: Array, n_legs: int) -> WheelParams:
+    """The inverse of `parameters_of`."""
+    return WheelParams(**dict(zip(PARAMETER_NAMES, parameters, strict=True)), n_legs=n_legs)

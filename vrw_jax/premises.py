@@ -14,11 +14,10 @@ from jaxtyping import Array
 
 from vrw_jax import dynamics
 from vrw_jax.collocation import walk_through
-from vrw_jax.cycle_search import wheel_of
 from vrw_jax.geometry import Motion, rear_foot_height
 from vrw_jax.limit_cycle import LimitCycle
 from vrw_jax.measures import MEASURES, Measure
-from vrw_jax.params import WheelParams
+from vrw_jax.params import WheelParams, wheel_of
 
 TAKE_OFF = Measure(
     "takeoff_acceleration",

@@ -24,7 +24,7 @@ from vrw_jax.measures import MARGINS, step_measures
 from vrw_jax.models import ViscoelasticWheel
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
-from vrw_jax.params import PARAMETER_NAMES, WheelParams
+from vrw_jax.params import PARAMETER_NAMES, WheelParams, wheel_of
 from vrw_jax.scan_measures import OF_CYCLE, derivative
 from vrw_jax.traces import compiled
 
@@ -86,14 +86,11 @@ class Engine:
         moved = tuple(dict.fromkeys(d.parameter for d in wanted))
         indices = np.asarray([PARAMETER_NAMES.index(name) for name in moved], int)
 
-        def wheel(values: Array) -> WheelParams:
-            return WheelParams(
-                **dict(zip(PARAMETER_NAMES, values, strict=True)), n_legs=base.n_legs
-            )
-
         def gait(values: Array) -> tuple[LimitCycle, dict[str, Array]]:
             def along(some: Array) -> tuple[dict[str, Array], LimitCycle]:
-                cycle = limit_cycle(wheel(values.at[indices].set(some)), options=cycle_options)
+                cycle = limit_cycle(
+                    wheel_of(values.at[indices].set(some), base.n_legs), options=cycle_options
+                )
                 return {d.measure: CYCLE_MEASURES[d.measure](cycle) for d in wanted}, cycle
 
             if not wanted:
@@ -108,7 +105,7 @@ class Engine:
             return cycle.outcome, cycle.section_state, kept | derivatives
 
         def told_by_step(values: Array, state: Array, options: Options) -> Told:
-            result = model.step(wheel(values), state, options)
+            result = model.step(wheel_of(values, base.n_legs), state, options)
             measures = step_measures(result)
             names = (*(name for name in plain if name not in OF_CYCLE), *MARGINS)
             return result.outcome, result.section_state, {name: measures[name] for name in names}

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Array
 
 from vrw_jax.cycle_options import CycleOptions
-from vrw_jax.cycle_search import parameters_of, wheel_of
 from vrw_jax.ground_gait import MOVED, ground_gait, told, values_of
 from vrw_jax.lazy import xarray as xr
 from vrw_jax.limit_cycle import Guess, LimitCycle, limit_cycle
@@ -21,7 +20,7 @@ from vrw_jax.models import AbstractWheel, UnilateralWheel
 from vrw_jax.models.ladder import refuse_ladder
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
-from vrw_jax.params import DOMAINS, WheelParams
+from vrw_jax.params import DOMAINS, WheelParams, parameters_of, wheel_of
 from vrw_jax.return_map import checked
 from vrw_jax.walked_cycle import WalkedCycle
 

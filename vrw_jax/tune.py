@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array
 
 from vrw_jax.cycle_options import CycleOptions
-from vrw_jax.cycle_search import Problem, parameters_of, wheel_of
+from vrw_jax.cycle_search import Problem
 from vrw_jax.lazy import xarray as xr
 from vrw_jax.limit_cycle import LimitCycle
 from vrw_jax.measures import MARGINS, ON_GROUND, attrs_of, flags
@@ -32,7 +32,7 @@ from vrw_jax.models import (
 from vrw_jax.models.ladder import refuse_ladder
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
-from vrw_jax.params import DOMAINS, PARAMETER_NAMES, WheelParams
+from vrw_jax.params import DOMAINS, PARAMETER_NAMES, WheelParams, parameters_of, wheel_of
 from vrw_jax.premises import TAKE_OFF, default_margins, measure
 from vrw_jax.simulate import provenance
 from vrw_jax.tune_engine import (

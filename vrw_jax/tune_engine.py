@@ -18,13 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from vrw_jax.cycle_search import Located, Problem, parameters_of, surface_start, wheel_of
+from vrw_jax.cycle_search import Located, Problem, surface_start
 from vrw_jax.limit_cycle import LimitCycle, _limit_cycle
 from vrw_jax.measures import MARGINS, step_measures
 from vrw_jax.models import AbstractWheel, StepResult
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
-from vrw_jax.params import PARAMETER_NAMES, WheelParams
+from vrw_jax.params import PARAMETER_NAMES, WheelParams, parameters_of, wheel_of
 from vrw_jax.premises import TAKE_OFF, takeoff_acceleration
 
 Reader = Callable[[LimitCycle, StepResult], Array]

@@ -10,12 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from vrw_jax.cycle_search import parameters_of, wheel_of
 from vrw_jax.ground_gait import ground_gait, told, values_of
 from vrw_jax.measures import ON_GROUND, measures_of
 from vrw_jax.models import UnilateralStep, UnilateralWheel
 from vrw_jax.options import Options
-from vrw_jax.params import PARAMETER_NAMES, WheelParams
+from vrw_jax.params import PARAMETER_NAMES, WheelParams, parameters_of, wheel_of
 from vrw_jax.return_map import walk
 from vrw_jax.tune_engine import AbstractEngine, Gait, is_same_branch
 
