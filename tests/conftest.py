@@ -1,19 +1,15 @@
-"""Float64, a persistent compilation cache, and shapes checked against signatures."""
+"""JAX as `start_jax` starts it, with a compilation cache; shapes checked against signatures."""
 
 import os
 from pathlib import Path
 
-import jax
 import pytest
 from jaxtyping import install_import_hook
 
-jax.config.update("jax_enable_x64", True)
-_CACHE = os.environ.get("VRW_TEST_CACHE", str(Path(__file__).parent.parent / ".jax_cache"))
-jax.config.update("jax_compilation_cache_dir", _CACHE)
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
-
 with install_import_hook("vrw_jax", "beartype.beartype"):
-    import vrw_jax  # noqa: F401  imported here so that its annotations are checked
+    import vrw_jax  # imported here so that its annotations are checked
+
+vrw_jax.start_jax(os.environ.get("VRW_TEST_CACHE", Path(__file__).parent.parent / ".jax_cache"))
 
 COMPILE_LONGEST = (
     "test_continuation", "test_limit_cycle", "test_derivatives", "test_tune", "test_unilateral",

@@ -68,8 +68,8 @@ def test_nothing_imports_the_command_line_or_plots_at_the_top():
 
 
 HEAVY = {
-    "diffrax", "distributed", "matplotlib", "rich", "scipy.optimize", "scipy.stats", "typer",
-    "xarray", "zarr",
+    "diffrax", "distributed", "matplotlib", "optax", "rich", "scipy.optimize", "scipy.stats",
+    "typer", "xarray", "zarr",
 }  # fmt: skip
 
 

@@ -32,6 +32,7 @@ from vrw_jax.scan_store import open_scan
 from vrw_jax.section_newton import SectionCycle, newton_cycle
 from vrw_jax.sensitivities import sensitivities
 from vrw_jax.simulate import simulate
+from vrw_jax.start import start_jax
 from vrw_jax.tune import Tuned, tune
 from vrw_jax.variance import sobol_indices
 from vrw_jax.walked_cycle import WalkedCycle
@@ -80,6 +81,7 @@ __all__ = [
     "simulate",
     "sobol",
     "sobol_indices",
+    "start_jax",
     "step",
     "steps",
     "tune",

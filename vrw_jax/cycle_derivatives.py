@@ -25,6 +25,7 @@ from vrw_jax.cycle_search import (
 )
 from vrw_jax.derivatives import on_branch, push, without_derivative
 from vrw_jax.lanes import in_blocks, one_wheel
+from vrw_jax.traces import remembered
 
 
 def _tangent_space(problem: Problem, parameters: Parameters, located: Located) -> Located:
@@ -108,8 +109,10 @@ def solve_cycle(
     """Search for one wheel, differentiable in its parameters; the guess has no derivative."""
     block = problem.options.block
 
-    find = one_wheel(functools.partial(search, problem))
-    find_with_columns = one_wheel(functools.partial(_search_with_columns, problem))
+    find, find_with_columns = (
+        one_wheel(remembered(functools.partial(f, problem), (f.__name__, problem)))
+        for f in (search, _search_with_columns)
+    )
     start = () if guess is None else (guess,)
 
     def parts(finding: Finding) -> tuple[Located, tuple]:

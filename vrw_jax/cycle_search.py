@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import lax
+from jax import export, lax
 from jaxtyping import Array, Bool, Inexact, Int
 
 from vrw_jax import gait_surface, sequences
@@ -86,6 +86,10 @@ class Finding(NamedTuple):
     monodromy: LaneArray  # (row, column, lanes)
     residual: LaneArray  # size of Newton's last correction
     passes: Int[Array, " lanes"]  # linearised passes spent
+
+
+for _type in (Solution, Located, Finding):
+    export.register_namedtuple_serialization(_type, serialized_name=f"vrw_jax.{_type.__name__}")
 
 
 def surface_start(problem: Problem, parameters: Parameters, with_dls: Array) -> Located:

@@ -49,6 +49,7 @@ from vrw_jax.params import (
     wheel_of,
 )
 from vrw_jax.runge_kutta import Tableau, explicit_tableau
+from vrw_jax.start import fusion_emitters
 
 LANES = 256
 """Lanes that march side by side: they stay in cache."""
@@ -136,7 +137,7 @@ def _program(static: Options, n_legs: int, max_events: int) -> Callable[..., tup
         queue = _queue_of(columns, x, n_legs)
         return _walked(queue, wanted, n_steps, n_legs, max_events, options, tableau)
 
-    return jax.jit(walk)
+    return jax.jit(walk, compiler_options=fusion_emitters(True))
 
 
 def _queue_of(columns: Array, x: Array, n: int) -> _Queue:

@@ -27,6 +27,7 @@ from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
 from vrw_jax.params import PARAMETER_NAMES, WheelParams, wheel_of
 from vrw_jax.runge_kutta import explicit_tableau, real_stability_limit
+from vrw_jax.start import fusion_emitters
 
 BLOCK = 256
 """Lanes that march side by side on CPU: they stay in cache, and few wait for the slowest."""
@@ -315,7 +316,7 @@ def _lane_program(
     def blocks(columns: Array, x: Array, wanted: Array, dynamic: Options, few: Array) -> LaneStep:
         return _in_blocks(functools.partial(block, dynamic, few), (columns, x, wanted), width)
 
-    return jax.jit(blocks)
+    return jax.jit(blocks, compiler_options=fusion_emitters(True))
 
 
 def _by_collocation(
@@ -355,7 +356,8 @@ def _fixed_program(
         params = wheel_of(columns, n_legs)
         return fixed_gait_step(params, x.T, wanted, expected.T, stop_at_lift_off)
 
-    return jax.jit(lambda *given: _in_blocks(block, given, width))
+    blocks = lambda *given: _in_blocks(block, given, width)
+    return jax.jit(blocks, compiler_options=fusion_emitters(True))
 
 
 def _in_blocks(block: Callable, given: Any, width: tuple[int, int]) -> Any:

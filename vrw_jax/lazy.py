@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import diffrax as diffrax
+    import optax as optax
     import xarray as xarray
     import zarr as zarr
 else:
@@ -16,4 +17,4 @@ else:
         def __getattr__(self, attribute: str) -> Any:
             return getattr(importlib.import_module(self._name), attribute)
 
-    diffrax, xarray, zarr = map(_Library, ("diffrax", "xarray", "zarr"))
+    diffrax, optax, xarray, zarr = map(_Library, ("diffrax", "optax", "xarray", "zarr"))

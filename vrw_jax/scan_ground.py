@@ -26,6 +26,7 @@ from vrw_jax.params import FRICTION, WheelParams
 from vrw_jax.return_map import walk
 from vrw_jax.scan_engine import Engine, n_cores
 from vrw_jax.scan_measures import derivative
+from vrw_jax.start import fusion_emitters
 from vrw_jax.walked_cycle import WalkedCycle
 
 LANES = 64
@@ -76,7 +77,7 @@ class GroundEngine:
     def compile(self) -> None:
         """Compile the one large function."""
         values = jax.ShapeDtypeStruct((LANES, len(MOVED)), np.dtype(self._base.damping.dtype))
-        self._compiled = self._compiled.lower(values).compile()
+        self._compiled = self._compiled.lower(values).compile(fusion_emitters(False))
 
     def __call__(self, columns: Columns) -> Told:
         """Results of the samples in `columns` (one value per sample of each swept parameter)."""

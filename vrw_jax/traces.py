@@ -14,8 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax import export
 from jax.sharding import SingleDeviceSharding
+
+from vrw_jax.start import fusion_emitters
 
 
 @functools.cache
@@ -39,8 +42,32 @@ def compiled(
     The way leads through the exported trace whether or not it is kept, so that all runs compile the
     same program.
     """
+    exported = _exported(function, arguments, settings)
+    there = SingleDeviceSharding(device)
+    placed = [jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=there) for x in exported.in_avals]
+    program = jax.jit(exported.call).lower(*placed).compile(fusion_emitters(False))
+    return lambda *arguments: program(*jax.tree.leaves(arguments))
+
+
+def remembered(function: Callable, settings: object) -> Callable:
+    """`function`, not traced where its trace is kept; to be called while a program is traced.
+
+    For functions that are neither mapped nor differentiated from outside. As with `compiled`,
+    first and later runs lead through the exported trace.
+    """
+
+    def call(*arguments: Any) -> Any:
+        if not _folder():
+            return function(*arguments)
+        return _exported(function, arguments, settings).call(*jax.tree.leaves(arguments))
+
+    return call
+
+
+def _exported(function: Callable, arguments: tuple, settings: object) -> export.Exported:
+    """The trace of `function` for arguments like these, as one of their leaves."""
     leaves, structure = jax.tree.flatten(arguments)
-    shapes = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves]
+    shapes = [jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)) for x in leaves]
     told = (settings, str(structure), shapes, jax.__version__, jax.default_backend(), code_digest())
     key = hashlib.sha256(repr(told).encode()).hexdigest()
     exported = _kept(key)
@@ -48,14 +75,15 @@ def compiled(
         flat = jax.jit(lambda *leaves: function(*jax.tree.unflatten(structure, leaves)))
         exported = export.export(flat)(*shapes)
         _keep(key, exported)
-    there = SingleDeviceSharding(device)
-    placed = [jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=there) for x in shapes]
-    program = jax.jit(exported.call).lower(*placed).compile()
-    return lambda *arguments: program(*jax.tree.leaves(arguments))
+    return exported
+
+
+def _folder() -> Any:
+    return jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
 
 
 def _place(key: str) -> Path | None:
-    folder: Any = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+    folder = _folder()
     return Path(folder) / f"vrw_trace_{key}" if folder else None
 
 

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 
+from vrw_jax.lazy import optax
 from vrw_jax.outcomes import Outcome
 from vrw_jax.tune_engine import AGREEMENT, Gait, is_same_branch
 
