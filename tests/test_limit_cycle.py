@@ -155,6 +155,13 @@ def test_every_measure_of_a_cycle_can_be_differentiated():
     jax.eval_shape(jax.jacrev(measures), vrw.WheelParams())  # traced, which is what can fail
 
 
+def test_a_wheel_in_float32_stays_in_float32_beside_64_bits():
+    params = jax.tree.map(lambda x: x.astype(jnp.float32), vrw.WheelParams())
+    cycle = jax.eval_shape(vrw.limit_cycle, params)
+    floats = [x for x in jax.tree.leaves(cycle) if jnp.issubdtype(x.dtype, jnp.inexact)]
+    assert {x.dtype for x in floats} == {jnp.dtype(jnp.float32)}
+
+
 def test_vmap_gives_what_single_wheels_give():
     batch = cycles()
     for index in (0, 3):

@@ -75,9 +75,10 @@ def monomials(centred: tuple[Elementwise, ...]) -> list[Elementwise]:
 def start(params: WheelParams, meshes: tuple[Mesh, ...]) -> Solution:
     """Section, durations and accelerations on `meshes` of the surface's gait, lanes last."""
     fit = surface()
+    numbers = (x.tolist() for x in fit[:4])  # plain floats keep the format of the parameters
     centred = tuple(
         (jnp.clip(x, low, high) - centre) / spread
-        for x, centre, spread, low, high in zip(coordinates(params), *fit[:4], strict=True)
+        for x, centre, spread, low, high in zip(coordinates(params), *numbers, strict=True)
     )
     features = jnp.stack(monomials(centred))
     values = jnp.tensordot(jnp.asarray(fit.coefficients.T, features.dtype), features, 1)
