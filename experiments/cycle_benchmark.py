@@ -15,15 +15,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
-jax.config.update("jax_enable_x64", True)
-
-import jax.numpy as jnp  # noqa: E402  the number format is chosen first
-import numpy as np  # noqa: E402
-
-import vrw_jax as vrw  # noqa: E402
-from vrw_jax.params import parameters_of, wheel_of  # noqa: E402
-from vrw_jax.sensitivities import MEASURES  # noqa: E402
+import vrw_jax as vrw
+from vrw_jax.params import parameters_of, wheel_of
+from vrw_jax.sensitivities import MEASURES
 
 BOX = {
     "damping": (20.0, 215.0), "stiffness": (400.0, 600.0), "natural_length": (1.01, 1.04),
@@ -228,6 +225,7 @@ def finding() -> list[str]:
 
 
 def main(file: Path) -> None:
+    vrw.start_jax()
     processor = next(
         (line.split(":")[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines()
          if line.startswith("model name")), platform.processor(),
