@@ -197,6 +197,7 @@ class Allowed(NamedTuple):
 
     contact: Bool[Array, "2 4"]  # modes of each slot's foot
     held: Bool[Array, "2 2"]  # stopper open, held
+    stays: Bool[Array, "2"]  # the foot keeps its mode whatever it takes
     known_contact: Bool[Array, "2 4"]  # lifts, sticks or slides that way without a test
     known_open: Bool[Array, "2"]  # an open stopper needs no test: the leg is away from it
 
@@ -239,7 +240,7 @@ def choose(s: Symbols, hub: Hub, free: Free, allowed: Allowed, friction: Scalar)
             direction = jnp.where(mode == SLIP_DOWN, x, -x)
             sticks = known | ((n >= 0.0) & inside)
             loaded = jnp.where(mode == STICK, sticks, (n >= 0.0) & (known | (direction >= 0.0)))
-            good &= jnp.where(mode == OFF, known | (z >= 0.0), loaded)
+            good &= allowed.stays[i] | jnp.where(mode == OFF, known | (z >= 0.0), loaded)
             good &= jnp.where(
                 on[i], found.stopper[i] >= 0.0, allowed.known_open[i] | (found.length[i] <= 0.0)
             )
