@@ -35,7 +35,7 @@ from vrw_jax.models.unilateral_section import FullState, closed, embedded, opene
 from vrw_jax.models.viscoelastic import PAPER_START
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
-from vrw_jax.params import Scalar, WheelParams, as_float_array
+from vrw_jax.params import Scalar, Symbols, WheelParams, as_float_array
 
 BILATERAL, ONE_SIDED = "bilateral", "one-sided"
 """What stoppers do to legs in the air: hold whatever it takes, or push alone."""
@@ -93,8 +93,14 @@ class UnilateralTrajectory(eqx.Module):
     duration: Float[Array, " phases"]  # s
 
 
-SEEN = 1e3
-"""Roundings of a leg's length in the least dip that is followed: three digits of its depth."""
+SEEN = 4e5
+"""Roundings of a leg's length in the least dip that is followed, 1e-10 m in float64: a dip takes
+the time 4 depth / speed, and its end is known to rounding / speed, here a millionth of that."""
+
+
+def least_dip(s: Symbols, options: Options) -> Scalar:
+    """Least excursion from a one-sided stopper that is followed, m."""
+    return jnp.maximum(options.atol, SEEN * jnp.finfo(s.L0.dtype).eps * s.L0)
 
 
 class _Log(NamedTuple):
@@ -153,6 +159,11 @@ class UnilateralWheel(AbstractWheel):
             raise ValueError(
                 f"stoppers is {self.stoppers!r}, but it must be {BILATERAL!r} or {ONE_SIDED!r}."
             )
+
+    @property
+    def one_sided(self) -> bool:
+        """Whether stoppers of legs in the air may let go."""
+        return self.stoppers == ONE_SIDED
 
     def start(self, params: WheelParams) -> FullState:
         """Close to the paper's gait of Table 1."""
@@ -222,10 +233,9 @@ def _walk(
     s, friction = params.symbols(), wheel.friction.astype(x.dtype)
     good = good & (friction >= 0.0)
     friction = jnp.where(good, friction, 1.0)
-    one_sided = wheel.stoppers == ONE_SIDED
+    one_sided = wheel.one_sided
     place = guards_of(n, one_sided)
-    # A leg can't dip by less than its length is known.
-    unseen = jnp.maximum(options.atol, SEEN * jnp.finfo(x.dtype).eps * s.L0) if one_sided else None
+    unseen = least_dip(s, options) if one_sided else None
     state, stance = opened(s, x)
 
     def go_on(now: _Walked) -> _Walked:
