@@ -34,10 +34,13 @@ def main() -> None:
     told = {}
     for stoppers in ("bilateral", "one-sided"):
         found = walked(damping, friction, begun.section_state, N_STEPS, stoppers)
-        told[stoppers] = [gait(*wheel, stoppers) for wheel in zip(damping, friction, *found[:3])]
+        wheels = damping, friction, found.section_state, found.durations, found.outcome
+        told[stoppers] = [gait(*wheel, stoppers) for wheel in zip(*wheels, strict=True)]
         some = np.resize(np.arange(len(damping)), WHEELS)
         began = time.process_time()
-        walked(damping[some], friction[some], np.asarray(found[0])[some], TIMED, stoppers)
+        walked(
+            damping[some], friction[some], np.asarray(found.section_state)[some], TIMED, stoppers
+        )
         speed = WHEELS * TIMED / (time.process_time() - began)
         print(f"{stoppers}: {speed:.0f} steps per second and core", flush=True)
     with TARGET.open("w", newline="") as file:
