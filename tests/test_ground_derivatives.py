@@ -15,7 +15,6 @@ SCENES = {  # friction, damping, dtheta at the start, stoppers; events that happ
         (0.7, 200.0, 1.6, "bilateral"),
         {"lands", "the fore leg leaves its stopper", "lifts off"},
     ),
-    "slips, sticks, slips again": ((2.0, 200.0, 1.6, "bilateral"), {"slips", "sticks"}),
     "reverses": ((0.5, 100.0, 2.2, "bilateral"), {"reverses", "slips", "sticks"}),
     "flies": (
         (0.5, 100.0, 1.2, "bilateral"),

@@ -198,7 +198,7 @@ def _walked(
         s, friction = _symbols(columns, n), columns[-1]
         motion = settled(s, motion, stance.contact, stance.locked)
         unseen = least_dip(s, options) if one_sided else None
-        change = resolve(s, friction, motion, stance, event_of(place, n, guard), unseen)
+        change = resolve(s, friction, motion, stance, event_of(place, n, guard), unseen, False)
         outcome = jnp.where(change.solutions > 0, Outcome.STEPPED, Outcome.NO_ADMISSIBLE_CONTACT)
         outcome = jnp.where(change.third_foot, Outcome.THREE_FEET_LOADED, outcome)
         return change.motion, change.stance, outcome.astype(jnp.int32)

@@ -16,7 +16,7 @@ from vrw_jax.integrate import PhaseEnd, integrate_phase, sample_phase
 from vrw_jax.minima import Watched
 from vrw_jax.models.base import AbstractStep, AbstractWheel, Advance, replaced_where_bad, usable
 from vrw_jax.models.unilateral_contacts import OFF
-from vrw_jax.models.unilateral_events import Change, Event, event_of, resolve
+from vrw_jax.models.unilateral_events import Change, Event, event_of, resolve, settled
 from vrw_jax.models.unilateral_motion import (
     Flow,
     Guards,
@@ -240,6 +240,8 @@ def _walk(
 
     def go_on(now: _Walked) -> _Walked:
         motion, tally = unpack(now.state)
+        # The integrator lets feet drift by its error; one that lifts would land again at once.
+        motion = settled(s, motion, now.stance.contact, now.stance.locked)
         event = event_of(place, n, now.guard)
         change = resolve(s, friction, motion, now.stance, event, unseen)
         tally_now = tally._replace(clock=jnp.zeros_like(tally.clock))

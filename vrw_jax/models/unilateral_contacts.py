@@ -219,8 +219,13 @@ class _Looked(NamedTuple):
     solutions: Int[Array, ""]
 
 
-def choose(s: Symbols, hub: Hub, free: Free, allowed: Allowed, friction: Scalar) -> Choice:
-    """The first admissible combination of the table; `solutions` is 0 where there is none."""
+def choose(
+    s: Symbols, hub: Hub, free: Free, allowed: Allowed, friction: Scalar, counted: bool
+) -> Choice:
+    """The first admissible combination of the table; `solutions` is 0 where there is none.
+
+    All admissible ones are counted, or else none is looked at once one is found.
+    """
     modes, held = jnp.asarray(MODES), jnp.asarray(HELD)
     infinite = ~jnp.isfinite(friction)
     rough = jnp.where(infinite, 0.0, friction)
@@ -266,8 +271,11 @@ def choose(s: Symbols, hub: Hub, free: Free, allowed: Allowed, friction: Scalar)
             looked.solutions + jnp.sum(good, dtype=jnp.int32),
         )
 
+    def goes_on(looked: _Looked) -> Array:
+        return (looked.next < count) & (counted | (looked.solutions == 0))
+
     none = 0 * count
-    looked = lax.while_loop(lambda now: now.next < count, look, _Looked(none, none, none))
+    looked = lax.while_loop(goes_on, look, _Looked(none, none, none))
     contact, on = modes[looked.best], held[looked.best]
     return Choice(contact, on, answer(s, hub, free, contact, on, friction), looked.solutions)
 

@@ -131,6 +131,13 @@ def moved_by(
     return motion._replace(vx=vx, vz=vz, dtheta=dtheta, dL=dL)
 
 
+class Law(NamedTuple):
+    """What is asked of all events alike."""
+
+    one_sided: bool  # stoppers of legs in the air only push
+    counted: bool  # the number of admissible solutions
+
+
 class Staying(NamedTuple):
     """What an impact may not throw off."""
 
@@ -159,7 +166,7 @@ def _impact(
     motion: WheelMotion,
     stance: Stance,
     event: Event,
-    one_sided: bool,
+    law: Law,
     stay: Staying,
 ) -> tuple[_Shock, Slots, Bool[Array, " n"]]:
     """Velocity level: simultaneous, inelastic, with Coulomb's law in the impulse.
@@ -179,10 +186,11 @@ def _impact(
     any_mode = jnp.asarray([True, True, True, True])
     only = lambda mode: jnp.arange(4) == mode
     modes = jnp.where(loaded[:, None], any_mode, only(OFF))
-    if one_sided:
+    if law.one_sided:
         planted = planted | (jnp.stack(slots.of(stay.feet.astype(jnp.int32))) > 0)
+    modes = jnp.where(planted[:, None], jnp.arange(4) == before[:, None], modes)
     allowed = Allowed(
-        contact=jnp.where(planted[:, None], jnp.arange(4) == before[:, None], modes),
+        contact=modes & event.impact,  # else nothing is to be looked at
         held=jnp.stack([jnp.ones((2,), bool), stops], axis=1),
         stays=planted,
         known_contact=~loaded[:, None] & only(OFF),
@@ -192,14 +200,14 @@ def _impact(
     def solve(airborne: Array) -> tuple[_Shock, Legs, Legs]:
         hub = hub_of(s, motion, slots, airborne)
         free = free_velocity(s, motion, slots, hub)
-        choice = choose(s, hub, free, allowed, friction)
+        choice = choose(s, hub, free, allowed, friction, law.counted)
         after = moved_by(s, motion, slots, hub, airborne, choice)
         jump_x, jump_z = after.vx - motion.vx, after.vz - motion.vz
         impulse = s.m * (hub.legs.sin * jump_x + hub.legs.cos * jump_z + motion.dL)
         return _Shock(after, choice, jnp.where(airborne, impulse, jnp.inf)), impulse, after.dL
 
     airborne = at_stopper & ~in_slot
-    if not one_sided:
+    if not law.one_sided:
         return solve(airborne)[0], slots, airborne
     shock, held, right = _that_push(solve, airborne, airborne & ~stay.legs & event.impact)
     return shock._replace(choice=_if(right, shock.choice)), slots, held
@@ -217,7 +225,7 @@ def _support(
     contact: Int[Array, " n"],
     at_stopper: Bool[Array, " n"],
     event: Event,
-    one_sided: bool,
+    law: Law,
 ) -> tuple[Choice, Slots, Array, Bool[Array, " n"], Thrown]:
     """Acceleration level: who carries the motion that follows.
 
@@ -267,7 +275,7 @@ def _support(
             known_contact=known,
             known_open=opens,
         )
-        choice = choose(s, hub, free, allowed, friction)
+        choice = choose(s, hub, free, allowed, friction, law.counted)
         ax, az, turning = choice.answer.hub
         sin, cos, dtheta = *hub.legs, motion.dtheta
         outward = free.legs + sin * ax + cos * az
@@ -276,7 +284,7 @@ def _support(
         return (choice, Thrown(outward, ddL * cos - az - turned)), outward, outward
 
     airborne = at_stopper & ~in_slot
-    if not one_sided:
+    if not law.one_sided:
         choice, thrown = solve(airborne)[0]
         return choice, slots, rests, airborne, thrown
     (choice, thrown), held, right = _that_push(solve, airborne, airborne)
@@ -290,22 +298,25 @@ def resolve(
     stance: Stance,
     event: Event,
     unseen: Scalar | None = None,
+    counted: bool = True,
 ) -> Change:
     """Everything that an event changes.
 
     Stoppers of legs in the air are bilateral where `unseen` is None. Else they only push, and what
     an impact throws off its stopper or the ground comes back: where it would go no farther than
     `unseen`, m, it stays. It would give the hub its momentum a moment later, so the motion is the
-    same to about `unseen`; else each return throws others off, ever less, without end.
+    same to about `unseen`; else each return throws others off, ever less, without end. Unless
+    `counted`, `solutions` says only whether there is one.
     """
+    law = Law(unseen is not None, counted)
     nothing = Staying(stance.locked & False, stance.locked & False)
     if unseen is None:
-        return _resolved(s, friction, motion, stance, event, False, nothing)[0]
+        return _resolved(s, friction, motion, stance, event, law, nothing)[0]
     legs = directions(s, motion.theta)
 
     def again(now: tuple) -> tuple:
         stay, _, _ = now
-        change, back = _resolved(s, friction, motion, stance, event, True, stay)
+        change, back = _resolved(s, friction, motion, stance, event, law, stay)
         after, now_stance = change.motion, change.stance
         rise = after.vz - after.dL * legs.cos + after.L * after.dtheta * legs.sin
         returns = lambda speed, back: (back > 0.0) & (speed**2 < 2.0 * back * unseen)
@@ -319,7 +330,7 @@ def resolve(
         return stay, new & event.impact, change
 
     blank = lambda leaf: jnp.zeros(leaf.shape, leaf.dtype)
-    resolved = lambda: _resolved(s, friction, motion, stance, event, True, nothing)
+    resolved = lambda: _resolved(s, friction, motion, stance, event, law, nothing)
     shapes = jax.eval_shape(resolved)
     begin = nothing, jnp.asarray(True), jax.tree.map(blank, shapes[0])
     return lax.while_loop(lambda now: now[1], again, begin)[2]
@@ -331,14 +342,14 @@ def _resolved(
     motion: WheelMotion,
     stance: Stance,
     event: Event,
-    one_sided: bool,
+    law: Law,
     stay: Staying,
 ) -> tuple[Change, Thrown]:
     """`resolve` where some stay whatever it takes; also how what was thrown off comes back."""
     impact = event.impact
     touched = (stance.contact != OFF) | event.lands
     was_locked = (stance.locked | event.closes) & ~event.loosens
-    shock, slots, held = _impact(s, friction, motion, stance, event, one_sided, stay)
+    shock, slots, held = _impact(s, friction, motion, stance, event, law, stay)
     after = select(impact, shock.after, motion)
     in_slot = slots.first | slots.second
     struck = slots.spread(shock.choice.contact).astype(jnp.int32)
@@ -350,7 +361,7 @@ def _resolved(
     foot_z = after.vz - after.dL * legs.cos + after.L * after.dtheta * legs.sin
 
     support, slots, rests, held, back = _support(
-        s, friction, after, contact, at_stopper, event, one_sided
+        s, friction, after, contact, at_stopper, event, law
     )
     in_slot = slots.first | slots.second
     contact = slots.spread(support.contact).astype(jnp.int32)
