@@ -3,7 +3,8 @@
     python experiments/one_sided_stoppers.py
 
 Gaits over friction and damping with stoppers that hold legs in the air whatever it takes, then on
-from there with stoppers that only push (outcome 8: lost on the way there); last, what a step in lanes costs with either (second call).
+from there with stoppers that only push (outcome 8: lost on the way there). Last, what a step in
+lanes costs with either (second call).
 """
 
 import csv
