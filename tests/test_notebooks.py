@@ -17,7 +17,7 @@ LARGEST = 400_000
 
 
 def test_there_are_notebooks():
-    assert {path.stem for path in NOTEBOOKS} >= {"branch", "sensitivities", "tuning"}
+    assert {path.stem for path in NOTEBOOKS} >= {"branch", "ground", "sensitivities", "tuning"}
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)

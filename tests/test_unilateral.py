@@ -273,26 +273,6 @@ def test_a_foot_that_lands_sliding_takes_coulombs_impulse(friction):
     assert abs(tangential + friction * normal) < 1e-12
 
 
-@pytest.mark.slow
-def test_derivatives_along_the_events_that_happened_match_differences():
-    def told(mu, c, dtheta):
-        params = vrw.WheelParams(damping=c)
-        wheel = vrw.UnilateralWheel(friction=mu)
-        x = wheel.full_section(params, jnp.stack([jnp.asarray(START[0]), dtheta, START[2]]))
-        advance = wheel.advance(params, x, TIGHT)
-        return jnp.concatenate([advance.section_state[:20], advance.durations])
-
-    step = 1e-5
-    for name in ("lands sliding", "slips, sticks, slips again", "sticks"):
-        at = [jnp.asarray(v) for v in (*SCENES[name], START[1])]
-        jacobian = jax.jacfwd(told, argnums=(0, 1, 2))(*at)
-        for i, column in enumerate(jacobian):
-            size = step * max(1.0, float(at[i]))
-            ends = [told(*at[:i], at[i] + d, *at[i + 1 :]) for d in (size, -size)]
-            difference = (ends[0] - ends[1]) / (2.0 * size)
-            np.testing.assert_allclose(column, difference, atol=2e-6, rtol=2e-6)
-
-
 def test_bad_input_and_paradoxes_are_codes_and_never_nan():
     for friction, x in ((0.7, (math.nan, 1.0, 0.0)), (-1.0, START), (math.nan, START)):
         step = stepped(friction, x=x)

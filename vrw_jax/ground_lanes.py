@@ -32,6 +32,7 @@ from vrw_jax.ground_march import (
 )
 from vrw_jax.lanes import select
 from vrw_jax.models.base import replaced_where_bad, usable
+from vrw_jax.models.unilateral import UnilateralWheel, least_dip
 from vrw_jax.models.unilateral_contacts import OFF
 from vrw_jax.models.unilateral_events import event_of, resolve, settled
 from vrw_jax.models.unilateral_mechanics import WheelMotion
@@ -85,17 +86,22 @@ class _Lanes(NamedTuple):
 
 
 def walk_lanes(
-    columns: np.ndarray, states: np.ndarray, n_steps: int, max_events: int, options: Options, n: int
+    columns: np.ndarray,
+    states: np.ndarray,
+    n_steps: int,
+    model: UnilateralWheel,
+    options: Options,
+    n: int,
 ) -> tuple[np.ndarray, ...]:
     """`n_steps` steps of many wheels with `n` legs: section states, durations, outcomes, steps
-    made and steps tried.
+    made and steps tried. What is static of the model holds for all.
 
     `columns` are the parameters in their order and friction, shape (10, wheels); `states` full
     section states, shape (wheels, 4 + 3 n).
     """
     dynamic, static = eqx.partition(options, eqx.is_array)
     dynamic = jax.tree.map(lambda leaf: np.asarray(leaf, columns.dtype), dynamic)
-    program = _program(static, n, max_events)
+    program = _program(static, n, model.max_events, model.one_sided)
     if not len(states):
         none = np.zeros(0, np.int32)
         return states, np.zeros((0, 3), states.dtype), none, none, none
@@ -127,7 +133,9 @@ def _symbols(columns: Array, n: int) -> Symbols:
 
 
 @functools.cache
-def _program(static: Options, n_legs: int, max_events: int) -> Callable[..., tuple]:
+def _program(
+    static: Options, n_legs: int, max_events: int, one_sided: bool
+) -> Callable[..., tuple]:
     """The compiled walk of one queue: one program for every batch and number of steps."""
 
     def walk(columns: Array, x: Array, wanted: Array, n_steps: Array, dynamic: Options) -> tuple:
@@ -135,7 +143,7 @@ def _program(static: Options, n_legs: int, max_events: int) -> Callable[..., tup
         tableau = explicit_tableau(options.solver, options)
         assert tableau is not None  # `lane_batch` looked
         queue = _queue_of(columns, x, n_legs)
-        return _walked(queue, wanted, n_steps, n_legs, max_events, options, tableau)
+        return _walked(queue, wanted, n_steps, n_legs, max_events, one_sided, options, tableau)
 
     return jax.jit(walk, compiler_options=fusion_emitters(True))
 
@@ -169,11 +177,12 @@ def _walked(
     n_steps: Array,
     n: int,
     max_events: int,
+    one_sided: bool,
     options: Options,
     tableau: Tableau,
 ) -> tuple:
     """Every wanted wheel through `n_steps` landings of its foremost foot."""
-    place = guards_of(n, False)
+    place = guards_of(n, one_sided)
     over = functools.partial(jax.vmap, in_axes=-1, out_axes=-1)
     dtype = queue.start.dtype
 
@@ -189,7 +198,8 @@ def _walked(
         """
         s, friction = _symbols(columns, n), columns[-1]
         motion = settled(s, motion, stance.contact, stance.locked)
-        change = resolve(s, friction, motion, stance, event_of(place, n, guard))
+        unseen = least_dip(s, options) if one_sided else None
+        change = resolve(s, friction, motion, stance, event_of(place, n, guard), unseen, False)
         outcome = jnp.where(change.solutions > 0, Outcome.STEPPED, Outcome.NO_ADMISSIBLE_CONTACT)
         outcome = jnp.where(change.third_foot, Outcome.THREE_FEET_LOADED, outcome)
         return change.motion, change.stance, outcome.astype(jnp.int32)
@@ -245,7 +255,7 @@ def _walked(
         guard = jnp.where(opens, place.foot, here.guard)
         motion, stance, outcome = over(through)(columns, motion, stance, guard)
         outcome = jnp.where(fills & ~fresh(queue.good), Outcome.BAD_INPUT, outcome)
-        flow = flow_of(_symbols(columns, n), columns[-1], False, stance)
+        flow = flow_of(_symbols(columns, n), columns[-1], one_sided, stance)
         start = place_of(flow, motion)
         values, rates, begun = guards_at(flow, start), guard_rates(flow, start), begun_guards(flow)
         past = ~begun & ((values < 0.0) | ((values == 0.0) & (rates <= 0.0)))
@@ -283,19 +293,20 @@ def _walked(
         s = _symbols(lanes.columns, n)
         to_fill = jnp.where(queue.next < wanted, jnp.sum(now.verdict == WAITING), 0)
         enough = TOGETHER - to_fill
-        return queue, lanes, march(s, lanes.columns[-1], now, enough, options, tableau)
+        friction = lanes.columns[-1]
+        return queue, lanes, march(s, friction, one_sided, now, enough, options, tableau)
 
     def goes_on(state: tuple) -> Array:
         queue, _, now = state
         return (queue.next < wanted) | jnp.any(now.verdict != WAITING)
 
-    queue, *_ = lax.while_loop(goes_on, round_, (queue, *_empty(queue, n)))
+    queue, *_ = lax.while_loop(goes_on, round_, (queue, *_empty(queue, n, one_sided)))
     return queue.section, queue.durations, queue.outcome, queue.n_stepped, queue.tried
 
 
-def _empty(queue: _Queue, n: int) -> tuple[_Lanes, March]:
+def _empty(queue: _Queue, n: int, one_sided: bool) -> tuple[_Lanes, March]:
     """Lanes without wheels, in place of which stands the first one."""
-    dtype, guards = queue.start.dtype, guards_of(n, False).total
+    dtype, guards = queue.start.dtype, guards_of(n, one_sided).total
     many = lambda value: jnp.broadcast_to(value[..., None], (*value.shape, LANES))
     zero, none = jnp.zeros((LANES,), dtype), jnp.zeros((LANES,), jnp.int32)
     first = queue.columns[:, 0]
@@ -303,7 +314,7 @@ def _empty(queue: _Queue, n: int) -> tuple[_Lanes, March]:
     stance = jax.tree.map(many, stance)
     motion = jax.tree.map(many, unpack(state)[0])
     columns = many(first)
-    here = place_of(flow_of(_symbols(columns, n), columns[-1], False, stance), motion)
+    here = place_of(flow_of(_symbols(columns, n), columns[-1], one_sided, stance), motion)
     blank = jnp.zeros((guards, LANES), dtype)
     march = March(
         here=here,

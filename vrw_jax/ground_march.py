@@ -30,7 +30,8 @@ from vrw_jax.params import Elementwise, Symbols
 from vrw_jax.runge_kutta import Tableau, cut_where, dips, parabola
 
 N_FELT = 8
-"""Rows of a slope beside accelerations: what guards need of the forces."""
+"""Rows of a slope after the accelerations: what guards need of the forces. Then, where stoppers are
+one-sided, those of legs in the air."""
 MARCHING, EVENT, WAITING = -1, -2, -3
 """Where a lane stands: on its way, at an event, without a wheel; else the `Outcome` it met."""
 SAFETY, LEAST, MOST = 0.9, 0.2, 5.0
@@ -45,7 +46,7 @@ class Place(NamedTuple):
 
     q: Array  # (3 + n, lanes)
     v: Array
-    slope: Array  # (3 + n + N_FELT, lanes)
+    slope: Array  # (3 + n + N_FELT or 3 + n + N_FELT + n, lanes)
 
 
 class Search(NamedTuple):
@@ -91,17 +92,20 @@ def _slope(flow: Flow, q: Array, v: Array) -> Array:
     """Accelerations of all coordinates, then `Felt` without the directions."""
     motion = motion_of(Place(q, v, q))
     now = forces(flow, motion)
-    told = felt(now)
+    told = felt(flow, now)
     ddL = kept(leg_acceleration(flow, now), one_of(motion))
     feet = [*told.normal, *told.tangential, *told.stopper, *told.speed]
-    return jnp.concatenate([jnp.stack(now.answer.hub), ddL, jnp.stack(feet)])
+    in_air = [] if told.in_air is None else [told.in_air]
+    return jnp.concatenate([jnp.stack(now.answer.hub), ddL, jnp.stack(feet), *in_air])
 
 
 def guards_at(flow: Flow, place: Place) -> Array:
     """All guards, in the order of `Guards`, whether or not the stance has just begun."""
     motion = motion_of(place)
-    n1, n2, t1, t2, s1, s2, x1, x2 = place.slope[-N_FELT:]
-    now = Felt(directions(flow.s, motion.theta), (n1, n2), (t1, t2), (s1, s2), (x1, x2))
+    of_felt = place.slope[len(place.q) :]
+    n1, n2, t1, t2, s1, s2, x1, x2 = of_felt[:N_FELT]
+    in_air = of_felt[N_FELT:] if flow.one_sided else None
+    now = Felt(directions(flow.s, motion.theta), (n1, n2), (t1, t2), (s1, s2), (x1, x2), in_air)
     begun = jnp.ones(place.q.shape[-1:], bool)
     return jnp.concatenate(stance_guards(flow, motion, now, begun))
 
@@ -120,20 +124,21 @@ def begun_guards(flow: Flow) -> Array:
     stance = flow.stance
     slid = jnp.stack(flow.slots.of(stance.new_slip.astype(jnp.int32))) > 0
     no = jnp.zeros((2, stance.contact.shape[-1]), bool)
-    parts = [stance.new_foot, stance.new_leg, no, no, no, slid, no, no]
-    return jnp.concatenate(parts)
+    in_air = [stance.locked & False] if flow.one_sided else []
+    return jnp.concatenate([stance.new_foot, stance.new_leg, no, no, no, slid, no, no, *in_air])
 
 
 def march(
     s: Symbols,
     friction: Elementwise,
+    one_sided: bool,
     begin: March,
     enough: Array,
     options: Options,
     tableau: Tableau,
 ) -> March:
     """On until `enough` lanes no longer march, or none does. Errors: as `integrate_phase`."""
-    flow = flow_of(s, friction, False, begin.stance)
+    flow = flow_of(s, friction, one_sided, begin.stance)
     order, n = tableau.order, begin.here.q.shape[0]
     middle, last = tableau.middle, len(tableau.places) - 1
     cut = cut_where(~jnp.isnan(jnp.max(begin.h)))

@@ -397,9 +397,12 @@ def _searched(
     low = jnp.where(before, lax.stop_gradient(length), search.low)
     high = jnp.where(before, search.high, lax.stop_gradient(length))
     proposal = proposals[guard]
-    # Within rounding of a collapsed bracket counts as inside: bisection has no derivative.
+    # Within rounding of a collapsed bracket counts as inside.
     inside = (proposal >= low - search.accuracy) & (proposal <= high + search.accuracy)
-    following = jnp.where(inside, jnp.where(inside, proposal, 0.0), 0.5 * (low + high))
+    # Where rounding throws Newton's method out of the bracket, its derivative still holds.
+    known = jnp.where(jnp.isfinite(proposal), proposal, 0.0)
+    halved = 0.5 * (low + high) + (known - lax.stop_gradient(known))
+    following = jnp.where(inside, known, halved)
     return _Found(following, guard, low, high)
 
 

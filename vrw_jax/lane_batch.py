@@ -163,7 +163,7 @@ def _on_ground(
     friction = np.broadcast_to(np.asarray(model.friction, wheels.dtype), (len(states),))
     columns = np.concatenate([wheels, friction[None]])
     states = as_full_states(columns, states, n_legs)
-    told = walk_lanes(columns, states, n_steps, model.max_events, options, n_legs)
+    told = walk_lanes(columns, states, n_steps, model, options, n_legs)
     section_state, durations, outcome, n_stepped, tried = map(jnp.asarray, told)
     none = jnp.zeros(len(states), bool)
     return Steps(section_state, durations, outcome, n_stepped, tried, none, none, engine="lanes")

@@ -11,29 +11,32 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from vrw_jax.cycle_options import CycleOptions
-from vrw_jax.ground_gait import MOVED, cycle_of, ground_gait, told, wheel_and_ground
+from vrw_jax.ground_gait import MOVED, cycle_of, ground_gait, told
+from vrw_jax.ground_lanes import as_full_states, walk_lanes
 from vrw_jax.measures import measures_of
 from vrw_jax.models import AbstractWheel, LadderWheel, UnilateralWheel, ViscoelasticWheel
 from vrw_jax.models.ladder import PREMISES, UNILATERAL, VISCOELASTIC
+from vrw_jax.models.viscoelastic import PAPER_START
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
-from vrw_jax.params import FRICTION, WheelParams
-from vrw_jax.return_map import walk
+from vrw_jax.params import FRICTION, WheelParams, as_float_array
 from vrw_jax.scan_engine import Engine, n_cores
 from vrw_jax.scan_measures import derivative
 from vrw_jax.start import fusion_emitters
 from vrw_jax.walked_cycle import WalkedCycle
 
-LANES = 64
-"""Wheels that one call of the compiled function takes: they wait for the slowest."""
+LANES = 8
+"""Wheels that one call of the compiled function takes: they wait for the slowest. Each is twenty
+lanes and more in the Jacobians of Newton's method."""
 
 N_TOWARDS = 100
 """Steps towards a gait, from the rung's start, before Newton's method."""
+SOLVER_TOWARDS, TOLERANCE_TOWARDS = "Tsit5", 1e-8
+"""Of these steps, whatever those of the gait itself."""
 
 Columns = Mapping[str, np.ndarray]
 Told = dict[str, np.ndarray]
@@ -51,14 +54,13 @@ class GroundEngine:
         threads: int | None = None,
     ) -> None:
         self._base, self._model = base, model
+        tolerance = as_float_array(TOLERANCE_TOWARDS)
+        self._towards = Options(solver=SOLVER_TOWARDS, rtol=tolerance, atol=tolerance)
         self._threads = n_cores() if threads is None else threads
         wanted = tuple(d for name in measures if (d := derivative(name)) is not None)
         plain = (*(n for n in measures if derivative(n) is None), "spectral_radius")
 
-        def one(values: Array) -> tuple[Array, dict[str, Array]]:
-            wheel, ground = wheel_and_ground(values, base.n_legs, model)
-            walked = walk(wheel, ground.start(wheel), N_TOWARDS, model=ground, options=options)
-            begin = walked.steps.section_state[-1]
+        def one(values: Array, begin: Array) -> tuple[Array, dict[str, Array]]:
             slopes = {}
             if wanted:
                 gait = ground_gait(values, begin, base.n_legs, model, options)
@@ -68,16 +70,17 @@ class GroundEngine:
                     slopes[d.name] = both[d.measure][1][MOVED.index(d.parameter)]
             else:
                 cycle = cycle_of(values, begin, base.n_legs, model, options)
-            stepped = walked.outcome == Outcome.STEPPED
-            outcome = jnp.where(stepped, cycle.outcome, walked.outcome)
-            return outcome, {name: _read(name, cycle) for name in plain} | slopes
+            return cycle.outcome, {name: _read(name, cycle) for name in plain} | slopes
 
         self._compiled: Any = jax.jit(jax.vmap(one))
 
     def compile(self) -> None:
         """Compile the one large function."""
-        values = jax.ShapeDtypeStruct((LANES, len(MOVED)), np.dtype(self._base.damping.dtype))
-        self._compiled = self._compiled.lower(values).compile(fusion_emitters(False))
+        dtype = np.dtype(self._base.damping.dtype)
+        shapes = (LANES, len(MOVED)), (LANES, self._model.section_size(self._base))
+        self._compiled = self._compiled.lower(
+            *(jax.ShapeDtypeStruct(shape, dtype) for shape in shapes)
+        ).compile(fusion_emitters(False))
 
     def __call__(self, columns: Columns) -> Told:
         """Results of the samples in `columns` (one value per sample of each swept parameter)."""
@@ -86,14 +89,22 @@ class GroundEngine:
         for i, name in enumerate(MOVED):
             held = self._model if name == FRICTION else self._base
             values[:, i] = columns[name] if name in columns else float(getattr(held, name))
-        batches = [values[begin : begin + LANES] for begin in range(0, n, LANES)]
+        n_legs = self._base.n_legs
+        paper = np.tile(np.asarray(PAPER_START, values.dtype), (n, 1))
+        start = as_full_states(values.T, paper, n_legs)
+        states, _, outcome, *_ = walk_lanes(
+            values.T, start, N_TOWARDS, self._model, self._towards, n_legs
+        )
+        batches = [slice(begin, begin + LANES) for begin in range(0, n, LANES)]
         with ThreadPoolExecutor(self._threads) as pool:
-            parts = list(pool.map(self._batch, batches))
+            parts = list(pool.map(lambda b: self._batch(values[b], states[b], outcome[b]), batches))
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
-    def _batch(self, values: np.ndarray) -> Told:
-        filled = np.concatenate([values, np.repeat(values[:1], LANES - len(values), 0)])
-        outcome, measures = jax.tree.map(np.array, self._compiled(filled))
+    def _batch(self, values: np.ndarray, states: np.ndarray, walked: np.ndarray) -> Told:
+        fill = lambda x: np.concatenate([x, np.repeat(x[:1], LANES - len(x), 0)])
+        told = self._compiled(fill(values), fill(states))
+        outcome, measures = jax.tree.map(np.array, told)
+        outcome = np.where(fill(walked) == Outcome.STEPPED, outcome, fill(walked))
         failed = outcome != Outcome.STEPPED
         for value in measures.values():
             value[failed] = np.nan if np.issubdtype(value.dtype, np.floating) else -1

@@ -10,7 +10,9 @@ import hashlib
 import os
 import tempfile
 from collections.abc import Callable
+from contextvars import ContextVar
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import jax
@@ -42,11 +44,16 @@ def compiled(
     The way leads through the exported trace whether or not it is kept, so that all runs compile the
     same program.
     """
-    exported = _exported(function, arguments, settings)
+    with _one_after_the_other:
+        exported = _exported(function, arguments, settings)
     there = SingleDeviceSharding(device)
     placed = [jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=there) for x in exported.in_avals]
     program = jax.jit(exported.call).lower(*placed).compile(fusion_emitters(False))
     return lambda *arguments: program(*jax.tree.leaves(arguments))
+
+
+_one_after_the_other = Lock()
+"""Python traces one program at a time: two together would both be late for the compiler."""
 
 
 def remembered(function: Callable, settings: object) -> Callable:
@@ -57,7 +64,7 @@ def remembered(function: Callable, settings: object) -> Callable:
     """
 
     def call(*arguments: Any) -> Any:
-        if not _folder():
+        if _exporting.get() or not _folder():
             return function(*arguments)
         return _exported(function, arguments, settings).call(*jax.tree.leaves(arguments))
 
@@ -73,9 +80,16 @@ def _exported(function: Callable, arguments: tuple, settings: object) -> export.
     exported = _kept(key)
     if exported is None:
         flat = jax.jit(lambda *leaves: function(*jax.tree.unflatten(structure, leaves)))
-        exported = export.export(flat)(*shapes)
+        outside = _exporting.set(True)  # what is remembered within is part of this trace
+        try:
+            exported = export.export(flat)(*shapes)
+        finally:
+            _exporting.reset(outside)
         _keep(key, exported)
     return exported
+
+
+_exporting: ContextVar[bool] = ContextVar("_exporting", default=False)
 
 
 def _folder() -> Any:

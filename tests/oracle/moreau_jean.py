@@ -3,7 +3,7 @@
 No events, no modes: every step solves Signorini's and Coulomb's laws for the velocities at its end
 by projected Gauss-Seidel. First order in the step. Shares no code with the library. Legs are in the
 labels of the step that begins; a leg in the air that reaches its stopper stays on it until its foot
-is loaded, a leg on the ground has a one-sided stopper.
+is loaded, a leg on the ground has a one-sided stopper. `one_sided`: so have all legs.
 """
 
 from typing import NamedTuple
@@ -27,6 +27,7 @@ class Wheel(NamedTuple):
     Ls: float = 1.02
     slope: float = 0.30
     g: float = 9.81
+    one_sided: bool = False
 
 
 class Walked(NamedTuple):
@@ -108,7 +109,7 @@ def one_step(w: Wheel, theta: float, dtheta: float, dL1: float, h: float) -> Wal
     q[1] = L1 * np.cos(theta)
     v[0] = dL1 * np.sin(theta) + L1 * dtheta * np.cos(theta)
     v[1] = dL1 * np.cos(theta) - L1 * dtheta * np.sin(theta)
-    locked = np.ones(N, bool)
+    locked = np.full(N, not w.one_sided)
     locked[:2] = False
     carried = np.zeros(N, bool)
     carried[1] = True
@@ -121,7 +122,7 @@ def one_step(w: Wheel, theta: float, dtheta: float, dL1: float, h: float) -> Wal
         feet = [j for j in range(N - 1) if gaps[j] <= 0.0 or carried[j]]
         for j in feet:
             locked[j] = False
-        stops = [j for j in feet if middle[3 + j] >= w.L0]
+        stops = [j for j in (range(N) if w.one_sided else feet) if middle[3 + j] >= w.L0]
         free_axes = np.concatenate([np.arange(3), 3 + np.flatnonzero(~locked)])
         rows = [r for j in feet for r in _foot_rows(middle, j)]
         rows += [-np.eye(3 + N)[3 + j] for j in stops]
@@ -156,7 +157,7 @@ def one_step(w: Wheel, theta: float, dtheta: float, dL1: float, h: float) -> Wal
         twice += share * h * (np.sum(carried) >= 2)
         if share < 1.0:
             return Walked(time, q[2] - (1.0 - share) * h * v[2], v[2], twice)
-        hits = ~locked & (q[3:] >= w.L0) & ~carried
+        hits = ~locked & (q[3:] >= w.L0) & ~carried & (not w.one_sided)
         if np.any(hits):  # inelastic: the leg joins the rigid rest with its momentum
             locked |= hits
             mass, _ = _mass_and_force(w, q, v)

@@ -16,7 +16,7 @@ from vrw_jax.integrate import PhaseEnd, integrate_phase, sample_phase
 from vrw_jax.minima import Watched
 from vrw_jax.models.base import AbstractStep, AbstractWheel, Advance, replaced_where_bad, usable
 from vrw_jax.models.unilateral_contacts import OFF
-from vrw_jax.models.unilateral_events import Change, Event, event_of, resolve
+from vrw_jax.models.unilateral_events import Change, Event, event_of, resolve, settled
 from vrw_jax.models.unilateral_motion import (
     Flow,
     Guards,
@@ -35,14 +35,16 @@ from vrw_jax.models.unilateral_section import FullState, closed, embedded, opene
 from vrw_jax.models.viscoelastic import PAPER_START
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
-from vrw_jax.params import Scalar, WheelParams, as_float_array
+from vrw_jax.params import Scalar, Symbols, WheelParams, as_float_array
+
+BILATERAL, ONE_SIDED = "bilateral", "one-sided"
+"""What stoppers do to legs in the air: hold whatever it takes, or push alone."""
 
 
 class UnilateralMargins(eqx.Module):
-    """How far the motion stayed from what this rung does not ask, over one step.
+    """How far the motion stayed from what bilateral stoppers do not ask, over one step.
 
-    Stopper margins refer to legs in the air that are held on their stoppers (`one_sided` False):
-    negative where an honest stopper would have let one go.
+    Negative where a one-sided stopper would have let a leg in the air go.
     """
 
     stopper_force: Scalar  # least stopper force of a locked leg in the air, N
@@ -91,6 +93,16 @@ class UnilateralTrajectory(eqx.Module):
     duration: Float[Array, " phases"]  # s
 
 
+SEEN = 4e5
+"""Roundings of a leg's length in the least dip that is followed, 1e-10 m in float64: a dip takes
+the time 4 depth / speed, and its end is known to rounding / speed, here a millionth of that."""
+
+
+def least_dip(s: Symbols, options: Options) -> Scalar:
+    """Least excursion from a one-sided stopper that is followed, m."""
+    return jnp.maximum(options.atol, SEEN * jnp.finfo(s.L0.dtype).eps * s.L0)
+
+
 class _Log(NamedTuple):
     """Starts of all phases, kept where a trajectory is wanted."""
 
@@ -134,12 +146,24 @@ class UnilateralWheel(AbstractWheel):
     """Feet on the ground push and slide by Coulomb's law; nothing has a fixed role.
 
     `friction` is the coefficient of the ground, `math.inf` for feet that never slide. A leg in the
-    air that has met its stopper stays on it until its foot is loaded. `max_events` bounds the
-    events of one step.
+    air that has met its stopper stays on it until its foot is loaded; with `stoppers="one-sided"`
+    it leaves as soon as the stopper would have to pull. `max_events` bounds the events of one step.
     """
 
     friction: Scalar = eqx.field(converter=as_float_array, default=0.7)
     max_events: int = eqx.field(static=True, default=100)
+    stoppers: str = eqx.field(static=True, default=BILATERAL)
+
+    def __check_init__(self) -> None:
+        if self.stoppers not in (BILATERAL, ONE_SIDED):
+            raise ValueError(
+                f"stoppers is {self.stoppers!r}, but it must be {BILATERAL!r} or {ONE_SIDED!r}."
+            )
+
+    @property
+    def one_sided(self) -> bool:
+        """Whether stoppers of legs in the air may let go."""
+        return self.stoppers == ONE_SIDED
 
     def start(self, params: WheelParams) -> FullState:
         """Close to the paper's gait of Table 1."""
@@ -209,16 +233,20 @@ def _walk(
     s, friction = params.symbols(), wheel.friction.astype(x.dtype)
     good = good & (friction >= 0.0)
     friction = jnp.where(good, friction, 1.0)
-    place = guards_of(n, False)
+    one_sided = wheel.one_sided
+    place = guards_of(n, one_sided)
+    unseen = least_dip(s, options) if one_sided else None
     state, stance = opened(s, x)
 
     def go_on(now: _Walked) -> _Walked:
         motion, tally = unpack(now.state)
+        # The integrator lets feet drift by its error; one that lifts would land again at once.
+        motion = settled(s, motion, now.stance.contact, now.stance.locked)
         event = event_of(place, n, now.guard)
-        change = resolve(s, friction, motion, now.stance, event)
+        change = resolve(s, friction, motion, now.stance, event, unseen)
         tally_now = tally._replace(clock=jnp.zeros_like(tally.clock))
         start = pack(change.motion, tally_now)
-        flow = flow_of(s, friction, False, change.stance)
+        flow = flow_of(s, friction, one_sided, change.stance)
         outcome = jnp.where(change.solutions > 0, Outcome.STEPPED, Outcome.NO_ADMISSIBLE_CONTACT)
         outcome = jnp.where(change.third_foot, Outcome.THREE_FEET_LOADED, outcome)
         sound = outcome == Outcome.STEPPED

@@ -197,6 +197,7 @@ class Allowed(NamedTuple):
 
     contact: Bool[Array, "2 4"]  # modes of each slot's foot
     held: Bool[Array, "2 2"]  # stopper open, held
+    stays: Bool[Array, "2"]  # the foot keeps its mode whatever it takes
     known_contact: Bool[Array, "2 4"]  # lifts, sticks or slides that way without a test
     known_open: Bool[Array, "2"]  # an open stopper needs no test: the leg is away from it
 
@@ -218,8 +219,13 @@ class _Looked(NamedTuple):
     solutions: Int[Array, ""]
 
 
-def choose(s: Symbols, hub: Hub, free: Free, allowed: Allowed, friction: Scalar) -> Choice:
-    """The first admissible combination of the table; `solutions` is 0 where there is none."""
+def choose(
+    s: Symbols, hub: Hub, free: Free, allowed: Allowed, friction: Scalar, counted: bool
+) -> Choice:
+    """The first admissible combination of the table; `solutions` is 0 where there is none.
+
+    All admissible ones are counted, or else none is looked at once one is found.
+    """
     modes, held = jnp.asarray(MODES), jnp.asarray(HELD)
     infinite = ~jnp.isfinite(friction)
     rough = jnp.where(infinite, 0.0, friction)
@@ -239,7 +245,7 @@ def choose(s: Symbols, hub: Hub, free: Free, allowed: Allowed, friction: Scalar)
             direction = jnp.where(mode == SLIP_DOWN, x, -x)
             sticks = known | ((n >= 0.0) & inside)
             loaded = jnp.where(mode == STICK, sticks, (n >= 0.0) & (known | (direction >= 0.0)))
-            good &= jnp.where(mode == OFF, known | (z >= 0.0), loaded)
+            good &= allowed.stays[i] | jnp.where(mode == OFF, known | (z >= 0.0), loaded)
             good &= jnp.where(
                 on[i], found.stopper[i] >= 0.0, allowed.known_open[i] | (found.length[i] <= 0.0)
             )
@@ -265,8 +271,11 @@ def choose(s: Symbols, hub: Hub, free: Free, allowed: Allowed, friction: Scalar)
             looked.solutions + jnp.sum(good, dtype=jnp.int32),
         )
 
+    def goes_on(looked: _Looked) -> Array:
+        return (looked.next < count) & (counted | (looked.solutions == 0))
+
     none = 0 * count
-    looked = lax.while_loop(lambda now: now.next < count, look, _Looked(none, none, none))
+    looked = lax.while_loop(goes_on, look, _Looked(none, none, none))
     contact, on = modes[looked.best], held[looked.best]
     return Choice(contact, on, answer(s, hub, free, contact, on, friction), looked.solutions)
 

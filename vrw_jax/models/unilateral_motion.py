@@ -184,16 +184,18 @@ class Felt(NamedTuple):
     tangential: Pair
     stopper: Pair
     speed: Pair  # of the slots' feet along the slope
+    in_air: Legs | None  # stopper force of legs in the air, where stoppers are one-sided
 
 
-def felt(now: Forces) -> Felt:
+def felt(flow: Flow, now: Forces) -> Felt:
     """What `stance_guards` needs of the forces."""
     found = now.answer
-    return Felt(now.hub.legs, found.normal, found.tangential, found.stopper, now.feet.x)
+    in_air = airborne_stopper_force(flow, now) if flow.one_sided else None
+    return Felt(now.hub.legs, found.normal, found.tangential, found.stopper, now.feet.x, in_air)
 
 
 def stance_guards(flow: Flow, motion: WheelMotion, now: Felt, begun: Array) -> list[Array]:
-    """Guards in the order of `Guards`, without the last kind; `begun`: not at the stance's start.
+    """Guards in the order of `Guards`; `begun`: not at the stance's start.
 
     What the last event has just brought about (a foot off the ground, a leg off its stopper, a
     sliding foot) stands on its own guard: it is not watched at that very instant.
@@ -209,6 +211,7 @@ def stance_guards(flow: Flow, motion: WheelMotion, now: Felt, begun: Array) -> l
     direction = jnp.stack(_sliding(flow))
     slides = (direction != 0.0) & (begun | ~just_slid)
     watched = lambda condition, value: jnp.where(condition, value, 1.0)
+    in_the_air = [] if now.in_air is None else [jnp.where(flow.airborne, now.in_air, one)]
     return [
         jnp.where(in_air, foot_heights(motion, now.legs), one),
         jnp.where(moving, s.L0 - motion.L, one),
@@ -219,18 +222,13 @@ def stance_guards(flow: Flow, motion: WheelMotion, now: Felt, begun: Array) -> l
         watched(flow.held, jnp.stack(now.stopper)),
         motion.dtheta[None],
         (jnp.min(motion.L, axis=0) - s.a)[None],
+        *in_the_air,
     ]
 
 
 def guards(flow: Flow, y: State) -> Float[Array, " n_guards"]:
-    """All guards, positive in the stance and falling through zero where it ends; 1 if not watched.
-
-    Those of `stance_guards`, and the stopper forces in the air where stoppers are one-sided.
-    """
+    """All guards, positive in the stance, falling through zero where it ends; 1 if not watched."""
     motion, tally = unpack(y)
-    now = forces(flow, motion)
-    parts = stance_guards(flow, motion, felt(now), tally.clock > 0.0)
-    if flow.one_sided:
-        one = jnp.ones_like(motion.L)
-        parts.append(jnp.where(flow.airborne, flow.s.m * _outward(now), one))
+    now = felt(flow, forces(flow, motion))
+    parts = stance_guards(flow, motion, now, tally.clock > 0.0)
     return jnp.concatenate(kept(parts, one_of(motion)))
