@@ -12,7 +12,6 @@ import tempfile
 from collections.abc import Callable
 from contextvars import ContextVar
 from pathlib import Path
-from threading import Lock
 from typing import Any
 
 import jax
@@ -44,16 +43,11 @@ def compiled(
     The way leads through the exported trace whether or not it is kept, so that all runs compile the
     same program.
     """
-    with _one_after_the_other:
-        exported = _exported(function, arguments, settings)
+    exported = _exported(function, arguments, settings)
     there = SingleDeviceSharding(device)
     placed = [jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=there) for x in exported.in_avals]
     program = jax.jit(exported.call).lower(*placed).compile(fusion_emitters(False))
     return lambda *arguments: program(*jax.tree.leaves(arguments))
-
-
-_one_after_the_other = Lock()
-"""Python traces one program at a time: two together would both be late for the compiler."""
 
 
 def remembered(function: Callable, settings: object) -> Callable:
