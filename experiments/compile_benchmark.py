@@ -1,0 +1,103 @@
+"""What XLA's two ways of making CPU code cost, program by program: to compile and to run.
+
+    python experiments/compile_benchmark.py
+
+Compiles programs of this package with and without XLA's fusion emitters, which `vrw.start_jax`
+switches off, and writes `docs/figures/compile_benchmark.csv` and the table of `docs/numerics.md`.
+CPU seconds of one core, no cache; each pair of a program's times is taken in turn.
+"""
+
+import csv
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import engine_benchmark  # noqa: F401  sets one core before JAX starts
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from work_precision_charts import replace
+
+import vrw_jax as vrw
+from vrw_jax.lane_batch import _filled, _lane_program, _width
+from vrw_jax.params import parameters_of
+from vrw_jax.start import fusion_emitters
+
+DOCS = Path(__file__).parents[1] / "docs"
+LANES, REPEATS = 256, 10
+Program = tuple[Callable, tuple]
+
+
+def programs() -> dict[str, Program]:
+    params, x, options = vrw.WheelParams(), jnp.array([0.1, 1.6, -0.1]), vrw.Options()
+    many = jax.tree.map(lambda value: jnp.full((LANES,), value), params)
+    starts = jnp.tile(x, (LANES, 1))
+
+    def measures(params: vrw.WheelParams) -> tuple:
+        cycle = vrw.limit_cycle(params)
+        return cycle.period, cycle.dls_fraction, cycle.durations
+
+    def monitors(params: vrw.WheelParams, x: jax.Array) -> vrw.Margins:
+        return vrw.step(params, x, options=options).monitors
+
+    return {
+        "a step": (lambda p, x: vrw.step(p, x, options=options), (params, x)),
+        "its monitors' derivatives": (jax.jacfwd(monitors, argnums=(0, 1)), (params, x)),
+        f"{LANES} steps (diffrax)": (jax.vmap(vrw.return_map), (many, starts)),
+        "a limit cycle's derivatives": (jax.jacfwd(measures), (params,)),
+        "gradient of the spectral radius": (
+            jax.grad(lambda p: vrw.limit_cycle(p).spectral_radius), (params,),
+        ),
+        f"{LANES} limit cycles": (jax.vmap(measures), (many,)),
+        "2,048 steps by lanes": lanes(many, starts, options),
+    }  # fmt: skip
+
+
+def lanes(params: vrw.WheelParams, starts: jax.Array, options: vrw.Options) -> Program:
+    """The lane engine's own program, all of its places filled."""
+    dynamic, static = eqx.partition(options, eqx.is_array)
+    program = _lane_program(static, params.n_legs, False, _width())
+    wheels, some = np.asarray(parameters_of(params)), np.arange(LANES)
+    return program, (*_filled(wheels, np.asarray(starts), some, _width()), dynamic, np.int32(0))
+
+
+def measured(function: Callable, arguments: tuple) -> dict[str, float]:
+    """Seconds to compile and milliseconds to run, each way."""
+    jitted = function if hasattr(function, "lower") else jax.jit(function)
+    lowered = jitted.lower(*arguments)
+    row, compiled = {}, {}
+    for way, on in (("with", True), ("without", False)):
+        began = time.process_time()
+        compiled[way] = lowered.compile(fusion_emitters(on))
+        row[f"compile_{way}_s"] = time.process_time() - began
+        jax.block_until_ready(compiled[way](*arguments))
+        row[f"run_{way}_ms"] = float("inf")
+    for _ in range(REPEATS):
+        for way, program in compiled.items():
+            began = time.process_time()
+            jax.block_until_ready(program(*arguments))
+            row[f"run_{way}_ms"] = min(row[f"run_{way}_ms"], 1e3 * (time.process_time() - began))
+    return row
+
+
+def main() -> None:
+    rows = []
+    for name, program in programs().items():
+        rows.append({"program": name} | {k: f"{v:.3g}" for k, v in measured(*program).items()})
+        print(rows[-1], flush=True)
+    with (DOCS / "figures" / "compile_benchmark.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    lines = [
+        "| program | compile with, s | without | run with, ms | without |", "|---|---|---|---|---|",
+    ]  # fmt: skip
+    for row in rows:
+        kinds = ("compile_with_s", "compile_without_s", "run_with_ms", "run_without_ms")
+        lines.append(f"| {row['program']} | " + " | ".join(row[k] for k in kinds) + " |")
+    replace(DOCS / "numerics.md", "compile times", "\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()
