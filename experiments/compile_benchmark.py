@@ -50,7 +50,7 @@ def programs() -> dict[str, Program]:
             jax.grad(lambda p: vrw.limit_cycle(p).spectral_radius), (params,),
         ),
         f"{LANES} limit cycles": (jax.vmap(measures), (many,)),
-        "2,048 steps by lanes": lanes(many, starts, options),
+        f"{LANES} steps by lanes": lanes(many, starts, options),
     }  # fmt: skip
 
 
