@@ -256,19 +256,15 @@ def _by_lanes(
     uniform = [np.asarray(leaf, wheels.dtype) for leaf in jax.tree.leaves(dynamic)]
     tableau = explicit_tableau(options.solver, options)
     assert tableau is not None  # `_chosen` looked
-    structure = jax.tree.structure(dynamic)
+    structure, n = jax.tree.structure(dynamic), len(PARAMETER_NAMES)
 
     def step(uniform: Any, lanes: Any, few: Array | None = None) -> tuple:
         known = eqx.combine(jax.tree.unflatten(structure, uniform), static)
-        params, x = wheel_of(lanes[: len(PARAMETER_NAMES)], n_legs), lanes[len(PARAMETER_NAMES) :]
-        told = gait_step(params, tuple(x), known, tableau, stop_at_lift_off, few)
+        params, x = wheel_of(lanes[:n], n_legs), tuple(lanes[n:])
+        told = gait_step(params, x, known, tableau, stop_at_lift_off, few)
         return (
-            told.unfinished,
-            told.outcome,
-            told.solver_steps,
-            *told.section_state,
-            *told.durations,
-        )
+            told.unfinished, told.outcome, told.solver_steps, *told.section_state, *told.durations
+        )  # fmt: skip
 
     # The airborne leg's fast rate, near c/m, sets the step where stability does.
     damping, mass = (wheels[PARAMETER_NAMES.index(name)] for name in ("damping", "leg_mass"))
@@ -307,6 +303,10 @@ def _by_collocation(
     return trusted, (np.stack(numbers[:3], 1), np.stack(numbers[3:], 1), none, none)
 
 
+def _on_cpu() -> bool:
+    return jax.default_backend() == "cpu"
+
+
 _programs: dict[Any, Callable] = {}
 """Compiled steps by what they depend on, see `_run`."""
 
@@ -320,7 +320,7 @@ def _run(
     """
     if len(lanes[0]) == 0:
         return [np.empty(0)] * 9
-    dtype, cpu = lanes[0].dtype, jax.default_backend() == "cpu"
+    dtype, cpu = lanes[0].dtype, _on_cpu()
     key = (settings, dtype, cpu, BLOCK)
     if key not in _programs:
         if cpu:

@@ -58,8 +58,8 @@ def lane_program(
     content = kept(f"vrw_lanes_{key}")
     if content is None:
         closed = jax.make_jaxpr(function)(*shapes)
-        kinds = ",".join(variable.aval.dtype.name for variable in closed.jaxpr.outvars)
-        content = kinds.encode() + b"\n" + _compiled(_module(closed, width))
+        told_kinds = ",".join(aval.dtype.name for aval in closed.out_avals)
+        content = told_kinds.encode() + b"\n" + _compiled(_module(closed, width))
         keep(f"vrw_lanes_{key}", content)
     kinds, _, code = content.partition(b"\n")
     return _Program(code, list(map(np.dtype, kinds.decode().split(","))), width)

@@ -194,15 +194,15 @@ class Emitter:
         build = self.builder
         if before == after:
             return value
-        if after == bool:
+        if after.kind == "b":
             return self._compare("!=", before.kind == "f", value, self.constant(value.type, 0))
         if before.kind == after.kind == "f":
             return (build.fptrunc if after.itemsize < before.itemsize else build.fpext)(value, kind)
         if after.kind == "f":
-            return (build.uitofp if before == bool else build.sitofp)(value, kind)
+            return (build.uitofp if before.kind == "b" else build.sitofp)(value, kind)
         if before.kind == "f":
             return build.fptosi(value, kind)
-        if before == bool:
+        if before.kind == "b":
             return build.zext(value, kind)
         return (build.trunc if after.itemsize < before.itemsize else build.sext)(value, kind)
 
@@ -330,11 +330,9 @@ class Emitter:
         return table
 
     def _entry(self, table: ir.GlobalVariable, index: Value) -> Value:
-        number = table.value_type.element
-        place = self.builder.gep(
-            table, [ir.Constant(LONG, 0), index], source_etype=table.value_type
-        )
-        return self.builder.load(place, typ=number)
+        kind = table.value_type
+        place = self.builder.gep(table, [ir.Constant(LONG, 0), index], source_etype=kind)
+        return self.builder.load(place, typ=kind.element)
 
 
 def _fitted(function: Callable[[np.ndarray], np.ndarray], degree: int) -> list[float]:

@@ -92,7 +92,7 @@ def _folder() -> Any:
 
 
 def kept(name: str) -> bytes | None:
-    """What was kept under that name beside JAX's compiled code; None where it is not, or damaged."""
+    """What was kept under that name beside JAX's compiled code; None if nothing, or damaged."""
     place = _folder() and Path(_folder()) / name
     if not place or not place.exists():
         return None

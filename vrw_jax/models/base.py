@@ -194,7 +194,7 @@ def replaced_where_bad(
     good: Array,
     params: WheelParams,
     x: Numbers,
-    safe_x: Numbers,
+    safe_x: Any,
 ) -> tuple[WheelParams, Any]:
     """Table 1 and a safe start in place of unusable input, so that no NaN is ever computed."""
     return jax.tree.map(
