@@ -151,7 +151,7 @@ def _on_ground(
     engine: str,
     n_legs: int,
 ) -> Steps:
-    if engine not in ("auto", "lanes") or explicit_tableau(options.solver, options) is None:
+    if engine not in ("auto", "lanes") or explicit_tableau(options.solver) is None:
         raise ValueError(
             f"engine is {engine!r} and solver {options.solver}, but batches on real ground need "
             "'lanes' and an explicit Runge-Kutta solver: map vrw.return_map over the wheels."
@@ -211,9 +211,7 @@ def _chosen(engine: str, model: AbstractWheel, options: Options, n_legs: int) ->
         raise ValueError(
             f"engine is {engine!r}, but it is 'auto', 'lanes', 'diffrax' or 'collocation'."
         )
-    fits = isinstance(model, ViscoelasticWheel) and (
-        explicit_tableau(options.solver, options) is not None
-    )
+    fits = isinstance(model, ViscoelasticWheel) and (explicit_tableau(options.solver) is not None)
     if engine in ("lanes", "collocation") and not fits:
         raise ValueError(
             f"the lane engine can't run {type(model).__name__} with {options.solver}: it knows "
@@ -233,7 +231,7 @@ def _too_stiff(wheels: np.ndarray, options: Options) -> np.ndarray:
     light, and a step times that rate must stay below the solver's limit of stability; rejected
     steps add a tenth.
     """
-    tableau = explicit_tableau(options.solver, options)
+    tableau = explicit_tableau(options.solver)
     assert tableau is not None  # `_chosen` looked
     damping, mass, length, gravity = (
         wheels[PARAMETER_NAMES.index(name)]
@@ -254,7 +252,7 @@ def _by_lanes(
     """By the lane engine: wheels of like work side by side."""
     dynamic, static = eqx.partition(options, eqx.is_array)
     uniform = [np.asarray(leaf, wheels.dtype) for leaf in jax.tree.leaves(dynamic)]
-    tableau = explicit_tableau(options.solver, options)
+    tableau = explicit_tableau(options.solver)
     assert tableau is not None  # `_chosen` looked
     structure, n = jax.tree.structure(dynamic), len(PARAMETER_NAMES)
 
@@ -343,10 +341,8 @@ def _by_xla(
         for begin in range(0, len(open_), BLOCK):
             some = open_[begin : begin + BLOCK]
             filled = np.concatenate([some, np.repeat(some[-1:], BLOCK - len(some))])
-            out = [
-                np.asarray(x)[: len(some)]
-                for x in program(uniform, [x[filled] for x in lanes], few)
-            ]
+            given = tuple(x[filled] for x in lanes)
+            out = [np.asarray(x)[: len(some)] for x in program(tuple(uniform), given, few)]
             told = told or [np.empty(len(lanes[0]), x.dtype) for x in out]
             for whole, part in zip(told, out, strict=True):
                 whole[some[~out[0]]] = part[~out[0]]

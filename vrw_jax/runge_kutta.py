@@ -5,6 +5,7 @@ of its stages alone: positions take the tableau's matrix twice, rates once. That
 with half of the stored slopes. Tableaus are diffrax's.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -33,9 +34,10 @@ class Tableau(NamedTuple):
     """A stage well inside the step, to look for guards that dip below zero and come back."""
 
 
-def explicit_tableau(name: str, options: Options) -> Tableau | None:
+@functools.cache
+def explicit_tableau(name: str) -> Tableau | None:
     """diffrax's tableau of that name; None where the method is not explicit Runge-Kutta."""
-    solver: Any = solver_named(name, options)
+    solver: Any = solver_named(name, Options())
     given = getattr(solver, "tableau", None)
     if given is None or not all(hasattr(given, part) for part in ("a_lower", "b_sol", "b_error")):
         return None

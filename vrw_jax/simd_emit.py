@@ -28,6 +28,8 @@ NUMBERS = {
 }
 FUSED = ("contract",)
 """Products and sums may be rounded once instead of twice; nothing else may be reordered."""
+RECIPROCAL = (*FUSED, "arcp")
+"""Divisors that stay the same may be inverted once: in float64, in float32 processors guess."""
 
 ARITHMETIC = {  # primitive: builder's method for floats and for integers
     "add": ("fadd", "add"),
@@ -145,8 +147,9 @@ class Emitter:
             vectors = [x.type for x in values if isinstance(x.type, ir.VectorType)]
             x, y = (self.spread(value, (*vectors, values[0].type)[0]) for value in values)
             if name in ARITHMETIC:
+                flags = RECIPROCAL if name == "div" and before == np.float64 else FUSED
                 method = ARITHMETIC[name][0 if floats else 1]
-                return getattr(build, method)(x, y, **({"flags": FUSED} if floats else {}))
+                return getattr(build, method)(x, y, **({"flags": flags} if floats else {}))
             if name in BITS:
                 return getattr(build, BITS[name])(x, y)
             if name in COMPARISONS:
