@@ -16,8 +16,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-import engine_benchmark  # sets one core before JAX starts
-import jax
+import engine_benchmark  # sets one core and starts JAX
 import numpy as np
 import work_precision_charts as charts
 from rich.progress import track
@@ -171,7 +170,7 @@ def measure_all(chosen: argparse.Namespace) -> None:
     last = None
     for table, method, settings in track(todo[: chosen.at_most], "methods"):
         if method[:4] != last:  # a first call compiles, whatever came before
-            jax.clear_caches()
+            engine_benchmark.start_cold()
             last = method[:4]
         for setting in settings:
             row = measure(method, setting, truth, reference, compiling)
@@ -186,8 +185,6 @@ def main() -> None:
     parser.add_argument("--only", default="", help="methods whose label holds this text")
     parser.add_argument("--redraw", action="store_true", help="measure nothing")
     chosen = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    jax.config.update("jax_enable_compilation_cache", False)  # a first call compiles
     TARGET.mkdir(parents=True, exist_ok=True)
     if not chosen.redraw:
         measure_all(chosen)
