@@ -377,6 +377,7 @@ def _by_diffrax(
 ) -> tuple[np.ndarray, ...]:
     """By the model's own step under `jax.vmap`, as many lanes at a time as the lane engine."""
     size = BLOCK
+    options = jax.tree.map(lambda leaf: np.asarray(leaf, wheels.dtype), options)
     parts: list[Any] = []
     for begin in range(0, len(states), size):
         some = np.arange(begin, min(begin + size, len(states)))
