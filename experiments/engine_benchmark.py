@@ -13,6 +13,7 @@ import argparse
 import csv
 import os
 import platform
+import tempfile
 import time
 from importlib.metadata import version
 from pathlib import Path
@@ -27,12 +28,23 @@ import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
+from jax.experimental.compilation_cache import compilation_cache
 
 import vrw_jax as vrw
 from vrw_jax import transitions
 from vrw_jax.params import PARAMETER_NAMES
 
-jax.config.update("jax_enable_x64", True)
+
+def start_cold() -> None:
+    """JAX as users start it, but with nothing compiled before: its cache is thrown away."""
+    global _cache
+    jax.clear_caches()
+    _cache = tempfile.TemporaryDirectory()
+    vrw.start_jax(_cache.name)
+    compilation_cache.reset_cache()  # it may have opened another folder
+
+
+start_cold()
 
 BOX = {
     "damping": (100.0, 215.0),

@@ -256,6 +256,50 @@ def scipy_steps(starts, parameters, tol, method="DOP853"):
     return out
 
 
+def torch_steps(starts, parameters, tol, method="dopri5"):
+    """torchdiffeq's odeint_event in eager PyTorch, both to be installed on their own."""
+    import torch
+    from torchdiffeq import odeint_event
+
+    torch.set_num_threads(1)
+    out = np.zeros((len(starts), 7))
+    zero = torch.zeros((), dtype=torch.float64)
+    for lane, (theta, w) in enumerate(starts):
+        P = tuple(map(float, parameters[lane]))
+        D = P[2] * SA / (math.cos(theta) * CA - math.sin(theta) * SA)
+
+        def rates(t, y, D=D, P=P, lane=lane):
+            out[lane, 6] += 1.0
+            sin, cos = torch.sin(y[0]), torch.cos(y[0])
+            if len(y) == 2:
+                return torch.stack([y[1], double_support(sin, cos, y[1], D, P)[0]])
+            if len(y) == 6:
+                return torch.cat([y[3:], torch.stack(single_support_1(sin, cos, *y[1:], P))])
+            return torch.cat([y[2:], torch.stack(single_support_2(sin, cos, *y[1:], P))])
+
+        def guard(t, y, D=D, P=P):
+            sin, cos = torch.sin(y[0]), torch.cos(y[0])
+            if len(y) == 2:
+                return double_support(sin, cos, y[1], D, P)[1]
+            return P[2] - y[2] if len(y) == 6 else y[1] * cos - P[2] * (cos * CA + sin * SA)
+
+        y = np.array([theta, w])
+        for phase in range(3):
+            with torch.no_grad():
+                end, found = odeint_event(
+                    rates, torch.tensor(y), zero, event_fn=guard, rtol=tol, atol=tol, method=method
+                )
+            y, out[lane, 3 + phase] = found[-1].numpy().copy(), float(end)
+            if phase == 0:
+                _, _, L1, L2, dL1, dL2 = n_dls(math.sin(y[0]), math.cos(y[0]), y[1], D, P)
+                y = np.array([y[0], L1, L2, y[1], dL1, dL2])
+            elif phase == 1:
+                hit(y, P)
+                y = y[:4]
+        out[lane, :3] = y[0], y[2], y[3]
+    return out
+
+
 class Heyoka:
     """Scalar adaptive Taylor integrators with terminal events, one for each phase."""
 

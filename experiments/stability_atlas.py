@@ -9,12 +9,8 @@ is kept; that of events goes on where it was stopped. docs/stability_atlas.md re
 import argparse
 import csv
 import functools
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
-
-os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
-os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
 import atlas_charts as charts
 import atlas_derivatives as derivatives
@@ -23,9 +19,8 @@ import atlas_formulations as formulations
 import atlas_limits as limits
 import atlas_walks as walks
 import engine_peers as peers
-import jax
 import numpy as np
-from work_precision import seconds
+from work_precision import seconds  # and its first import sets one core and starts JAX
 
 import vrw_jax as vrw
 from vrw_jax import Outcome, transitions
@@ -161,7 +156,6 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=1_000_000, help="of the map of events")
     parser.add_argument("--redraw", action="store_true", help="compute nothing")
     chosen = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
     TARGET.mkdir(parents=True, exist_ok=True)
     for name, rows in MAPS.items():
         if chosen.redraw or chosen.only not in (None, name):

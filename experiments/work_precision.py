@@ -1,6 +1,6 @@
 """Work against precision for a hybrid system: every engine and its peers, every quantity, honestly.
 
-    python experiments/work_precision.py [--at-most N] [--only TEXT] [--redraw]
+    python experiments/work_precision.py [--at-most N] [--only TEXT] [--again] [--redraw]
 
 256 wheels near their own limit cycles (see work_precision_truth.py) by each of METHODS of
 work_precision_methods.py. Error: largest over the parts of a quantity, against a truth of 20
@@ -16,8 +16,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-import engine_benchmark  # sets one core before JAX starts
-import jax
+import engine_benchmark  # sets one core and starts JAX
 import numpy as np
 import work_precision_charts as charts
 from rich.progress import track
@@ -39,6 +38,7 @@ KEY = ("group", "family", "name", "precision", "setting", "lanes")
 SHARES = {"p50": 0.5, "p99": 0.99, "worst": 1.0}
 REFERENCE_TOLERANCE = 1e-8
 LEAST_SECONDS, MOST_REPEATS = 0.5, 5  # of repeats of one measurement
+LONG = 20.0  # s: a first call that compiles nothing and lasts as long is not repeated
 
 
 def errors(group: str, told: np.ndarray, truth: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -105,7 +105,7 @@ def measure(
     first = time.process_time() - begin
     if method.family == NUMBA:
         first += compiling
-    taken = seconds(run)
+    taken = first if method.family in charts.SCALAR and first > LONG else seconds(run)
     told = told[: len(truth["rows"])]
     unit = 0.5 * (before + seconds(reference)) / len(truth["rows"]) * 1e6
     found = errors(method.group, told, truth)
@@ -162,16 +162,19 @@ def measure_all(chosen: argparse.Namespace) -> None:
     tables = {TABLE: kept(TABLE), BATCH_TABLE: kept(BATCH_TABLE)}
     todo = []
     for table, methods in ((TABLE, METHODS), (BATCH_TABLE, BATCHES)):
-        done = set(map(key, tables[table]))
         for method in methods:
             label = " ".join(map(str, (*method[:4], method.lanes)))
+            if chosen.again and chosen.only in label:
+                keys = {key(named(method, s)) for s in method.settings}
+                tables[table] = [row for row in tables[table] if key(row) not in keys]
+            done = set(map(key, tables[table]))
             settings = [s for s in method.settings if key(named(method, s)) not in done]
             if settings and chosen.only in label:
                 todo.append((table, method, settings))
     last = None
     for table, method, settings in track(todo[: chosen.at_most], "methods"):
         if method[:4] != last:  # a first call compiles, whatever came before
-            jax.clear_caches()
+            engine_benchmark.start_cold()
             last = method[:4]
         for setting in settings:
             row = measure(method, setting, truth, reference, compiling)
@@ -184,10 +187,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--at-most", type=int, default=None, help="methods measured in this run")
     parser.add_argument("--only", default="", help="methods whose label holds this text")
+    parser.add_argument("--again", action="store_true", help="measure them anew")
     parser.add_argument("--redraw", action="store_true", help="measure nothing")
     chosen = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    jax.config.update("jax_enable_compilation_cache", False)  # a first call compiles
     TARGET.mkdir(parents=True, exist_ok=True)
     if not chosen.redraw:
         measure_all(chosen)

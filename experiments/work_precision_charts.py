@@ -27,6 +27,7 @@ COLOURS = {  # of Okabe and Ito
     "numba": "#000000",
     "heyoka": "#E69F00",
     "SciPy": "#56B4E9",
+    "torchdiffeq": "#999999",
 }
 MARKS = "os^Dv<>ph"
 TARGETS = (1e-3, 1e-6, 1e-9, 1e-12)
@@ -44,7 +45,12 @@ WAYS = {  # of the table: group, one wheel or many
     "one gradient": ("gradient", True),
     "a batch of gradients": ("gradient", False),
 }
-SCALAR = ("numba", "heyoka", "SciPy")  # one wheel costs them what it costs in a batch
+SCALAR = (
+    "numba",
+    "heyoka",
+    "SciPy",
+    "torchdiffeq",
+)  # one wheel costs them what it costs in a batch
 
 
 def time_of(row: Row, unit: float) -> float:
@@ -146,7 +152,9 @@ def panels(rows: list[Row], x_of, x_label: str) -> Figure:
     for axes in grid.flat:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             found.setdefault(label, handle)
-    figure.legend(found.values(), found.keys(), loc="outside lower center", ncols=3, fontsize=6.5)
+    order = sorted(found, key=lambda label: [*COLOURS].index(label.split(":")[0]))
+    handles = [found[label] for label in order]
+    figure.legend(handles, order, loc="outside lower center", ncols=3, fontsize=6.5)
     return figure
 
 

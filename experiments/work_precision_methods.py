@@ -101,14 +101,16 @@ def by_fixed_work(spread: float, rows: np.ndarray, starts: np.ndarray) -> Run:
 def single_step(solver: str) -> Callable:
     """`vrw.return_map` of the first lane alone, compiled."""
 
-    def make(tolerance: float, rows: np.ndarray, starts: np.ndarray) -> Run:
+    @jax.jit
+    def step(params: vrw.WheelParams, x: jax.Array, tolerance: jax.Array) -> Any:
         options = vrw.Options(solver=solver, rtol=tolerance, atol=tolerance)
-        model, params = vrw.ViscoelasticWheel(), wheels(rows[0])
-        x = jnp.asarray(starts[0])
-        step = jax.jit(lambda params, x: model.advance(params, x, options))
+        return vrw.ViscoelasticWheel().advance(params, x, options)
+
+    def make(tolerance: float, rows: np.ndarray, starts: np.ndarray) -> Run:
+        params, x = wheels(rows[0]), jnp.asarray(starts[0])
 
         def run() -> np.ndarray:
-            found = jax.block_until_ready(step(params, x))
+            found = jax.block_until_ready(step(params, x, tolerance))
             count = found.solver_steps * stages(solver)
             return np.asarray([[*found.section_state, *found.durations, count]])
 
@@ -120,49 +122,44 @@ def single_step(solver: str) -> Callable:
 def by_diffeqsolve(solver: diffrax.AbstractAdaptiveSolver, fixed: bool) -> Callable:
     """Three `diffrax.diffeqsolve` with `diffrax.Event`; settings: tolerances or step lengths."""
 
-    def make(setting: float, rows: np.ndarray, starts: np.ndarray) -> Run:
+    root_finder = optx.Newton(1e-12, 1e-12)
+
+    def until(phase: Any, y: jax.Array, setting: jax.Array) -> tuple:
         controller: Any = diffrax.ConstantStepSize()
         if not fixed:
             controller = diffrax.PIDController(rtol=setting, atol=setting)
-        first = setting if fixed else 5e-3
-        root_finder = optx.Newton(1e-12, 1e-12)
+        found = diffrax.diffeqsolve(
+            diffrax.ODETerm(lambda t, y, args: phase.field(y)),
+            solver, 0.0, 20.0, setting if fixed else 5e-3, y,
+            stepsize_controller=controller,
+            event=diffrax.Event(
+                lambda t, y, args, **_: phase.watched.values(y)[0], root_finder, direction=False
+            ),
+            max_steps=20_000, throw=False,
+        )  # fmt: skip
+        ended = found.result == diffrax.RESULTS.event_occurred
+        return found.ys[0], jnp.where(ended, found.ts[0], jnp.nan), found.stats["num_steps"]
 
-        def until(phase: Any, y: jax.Array) -> tuple:
-            guard = lambda t, y, args, **_: phase.watched.values(y)[0]
-            found = diffrax.diffeqsolve(
-                diffrax.ODETerm(lambda t, y, args: phase.field(y)),
-                solver, 0.0, 20.0, first, y,
-                stepsize_controller=controller,
-                event=diffrax.Event(guard, root_finder, direction=False),
-                max_steps=20_000, throw=False,
-            )  # fmt: skip
-            ended = found.result == diffrax.RESULTS.event_occurred
-            return found.ys[0], jnp.where(ended, found.ts[0], jnp.nan), found.stats["num_steps"]
+    def one(row: jax.Array, x: jax.Array, setting: jax.Array) -> jax.Array:
+        s = wheels(row).symbols()
+        landing = transitions.land(s, *x)
+        build = PhaseBuilder(s, True, False)
+        dls = double_support(build, landing.distance)
+        y, first_time, n1 = until(dls, jnp.stack([landing.theta, landing.motion.dtheta]), setting)
+        m = dls.motion(y)
+        start = jnp.stack([y[0], m.L1, m.L2, m.dtheta, m.dL1, m.dL2])
+        y, second, n2 = until(single_support_1(build), start, setting)
+        hit = transitions.hit_stopper(s, single_support_1(build).motion(y)).motion
+        start = jnp.stack([y[0], hit.L1, hit.dtheta, hit.dL1])
+        y, third, n3 = until(single_support_2(build), start, setting)
+        times = first_time, second, third
+        good = jnp.isfinite(sum(times))
+        count = (n1 + n2 + n3) * float(stages(type(solver).__name__))
+        told = jnp.stack([y[0], y[2], y[3], *times, count])
+        return jnp.where(good, told, jnp.nan)
 
-        def one(row: jax.Array, x: jax.Array) -> jax.Array:
-            s = wheels(row).symbols()
-            landing = transitions.land(s, *x)
-            build = PhaseBuilder(s, True, False)
-            dls = double_support(build, landing.distance)
-            y, first_time, n1 = until(dls, jnp.stack([landing.theta, landing.motion.dtheta]))
-            m = dls.motion(y)
-            y, second, n2 = until(
-                single_support_1(build),
-                jnp.stack([y[0], m.L1, m.L2, m.dtheta, m.dL1, m.dL2]),
-            )
-            hit = transitions.hit_stopper(s, single_support_1(build).motion(y)).motion
-            start = jnp.stack([y[0], hit.L1, hit.dtheta, hit.dL1])
-            y, third, n3 = until(single_support_2(build), start)
-            times = first_time, second, third
-            good = jnp.isfinite(sum(times))
-            count = (n1 + n2 + n3) * float(stages(type(solver).__name__))
-            told = jnp.stack([y[0], y[2], y[3], *times, count])
-            return jnp.where(good, told, jnp.nan)
-
-        steps = jax.jit(jax.vmap(one))
-        return lambda: np.asarray(steps(rows, starts))
-
-    return make
+    steps = jax.jit(jax.vmap(one, (0, 0, None)))
+    return lambda setting, rows, starts: lambda: np.asarray(steps(rows, starts, setting))
 
 
 def plane_starts(rows: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -188,6 +185,8 @@ def peer_steps(name: str, tolerance: float) -> Callable[[np.ndarray, np.ndarray]
         return lambda y, packed: peers.numba_steps(y, packed, tolerance)
     if name == "heyoka":
         return peers.Heyoka(tolerance)
+    if name == "torchdiffeq":
+        return lambda y, packed: peers.torch_steps(y, packed, tolerance)
     return lambda y, packed: peers.scipy_steps(y, packed, tolerance, name)
 
 
@@ -450,6 +449,7 @@ def by_peer_gradient(name: str) -> Callable:
 assert set(VARIED) <= set(PARAMETER_NAMES)
 LANES, ENGINE, COLLOCATION = "lane engine", "diffrax engine", "collocation"
 BY_HAND, NUMBA, HEYOKA, SCIPY = "diffrax by hand", "numba", "heyoka", "SciPy"
+TORCH = "torchdiffeq"
 DEFAULT_MESH = vrw.CycleOptions().steps
 MESHES = ((3, 5, 2), DEFAULT_MESH, vrw.CycleOptions.tight().steps)
 WIDE = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12, 1e-13)
@@ -458,12 +458,6 @@ LOOSE = (1e-3, 1e-4, 2e-5)  # float32 resolves no less
 f32, f64 = "float32", "float64"
 
 METHODS = (
-    *(
-        Method("step", LANES, solver, f64, WIDE, by_library("lanes", solver), 2048)
-        for solver in ("Tsit5", "Dopri5", "Dopri8")
-    ),
-    Method("step", LANES, "Tsit5", f32, LOOSE, by_library("lanes", "Tsit5", np.float32), 2048),
-    Method("step", COLLOCATION, "durations known to 3 %", f64, (0.03,), by_fixed_work, 2048),
     Method("step", NUMBA, "Dopri5", f64, WIDE, by_peer("numba")),
     Method("step", HEYOKA, "Taylor", f64, (1e-3, 1e-6, 1e-9, 1e-12, 1e-15), by_peer("heyoka")),
     *(
@@ -475,11 +469,14 @@ METHODS = (
             ("Radau", (1e-4, 1e-6, 1e-8)),
         )
     ),
+    Method("step", TORCH, "dopri5", f64, (1e-4, 1e-6, 1e-8), by_peer("torchdiffeq")),
     *(
         Method("step", ENGINE, solver, f64, settings, by_library("diffrax", solver))
         for solver, settings in (
             ("Dopri8", (1e-3, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-13)),
             ("Tsit5", EVERY_OTHER),
+            ("Dopri5", EVERY_OTHER),
+            ("Kvaerno3", (1e-3, 1e-4, 1e-6)),
             ("Kvaerno5", (1e-3, 1e-4, 1e-6, 1e-8, 1e-10)),
         )
     ),
@@ -516,7 +513,7 @@ METHODS = (
         by_columns("forward", 1e-4, np.float32),
     ),
     Method("step", ENGINE, "Tsit5", f32, LOOSE, by_library("diffrax", "Tsit5", np.float32)),
-    # What remains is slower, or needs more of its user.
+    # What needs more of its user.
     Method(
         "step", BY_HAND, "Dopri8, Event", f64, (1e-4, 1e-6, 1e-8, 1e-10),
         by_diffeqsolve(diffrax.Dopri8(), False),
@@ -525,10 +522,13 @@ METHODS = (
         "step", BY_HAND, "Tsit5, fixed steps", f64, (3e-2, 1.5e-2, 8e-3, 4e-3, 2e-3),
         by_diffeqsolve(diffrax.Tsit5(), True),
     ),
+    # Batches of steps.
     *(
-        Method("step", ENGINE, solver, f64, settings, by_library("diffrax", solver))
-        for solver, settings in (("Kvaerno3", (1e-3, 1e-4, 1e-6)), ("Dopri5", EVERY_OTHER))
+        Method("step", LANES, solver, f64, WIDE, by_library("lanes", solver), 2048)
+        for solver in ("Tsit5", "Dopri5", "Dopri8")
     ),
+    Method("step", LANES, "Tsit5", f32, LOOSE, by_library("lanes", "Tsit5", np.float32), 2048),
+    Method("step", COLLOCATION, "durations known to 3 %", f64, (0.03,), by_fixed_work, 2048),
 )  # fmt: skip
 """In the order in which they are measured."""
 
@@ -537,12 +537,12 @@ BATCHES = (
     *(
         Method("step", family, name, f64, (setting,), make, size)
         for family, name, setting, make, sizes in (
-            (LANES, "Tsit5", 1e-8, by_library("lanes", "Tsit5"), SIZES),
-            (COLLOCATION, "durations known to 3 %", 0.03, by_fixed_work, SIZES),
             (NUMBA, "Dopri5", 1e-8, by_peer("numba"), SIZES),
             (HEYOKA, "Taylor", 1e-9, by_peer("heyoka"), SIZES[:4]),
             (SCIPY, "DOP853", 1e-9, by_peer("DOP853"), SIZES[:3]),
             (ENGINE, "Tsit5", 1e-8, by_library("diffrax", "Tsit5"), SIZES[:4]),
+            (LANES, "Tsit5", 1e-8, by_library("lanes", "Tsit5"), SIZES),
+            (COLLOCATION, "durations known to 3 %", 0.03, by_fixed_work, SIZES),
         )
         for size in sizes
     ),

@@ -2,6 +2,7 @@
 
 import math
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -170,6 +171,19 @@ def test_what_a_lane_gives_does_not_depend_on_its_company(lanes):
     together, alone = walked(slice(None)), walked(slice(1, 2))
     for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
         np.testing.assert_array_equal(a[1], b[0])
+
+
+def test_an_event_of_a_lane_on_real_ground_counts_within_the_time_allowed_alone(lanes):
+    damping, friction, states, _ = lanes
+    within = lambda seconds: vrw.steps(
+        vrw.WheelParams(damping=damping[1:2]),
+        states[1:2],
+        model=vrw.UnilateralWheel(friction=friction[1:2]),
+        options=eqx.tree_at(lambda o: o.max_phase_time, LANES, jnp.asarray(seconds)),
+    )
+    longest = np.max(within(20.0).durations)
+    assert int(within(1.001 * longest).outcome[0]) == vrw.Outcome.STEPPED
+    assert int(within(0.999 * longest).outcome[0]) == vrw.Outcome.NO_TOUCHDOWN_IN_TIME
 
 
 def test_an_implicit_solver_for_lanes_on_real_ground_is_refused_in_one_sentence():

@@ -71,6 +71,10 @@ def test_float32_works_where_it_is_asked_for():
     double = vrw.return_map(vrw.WheelParams(), vrw.paper_start())
     # Tolerance times a dozen steps, and round-off of 1e-7 through event times.
     np.testing.assert_allclose(single, double, atol=1e-3)
+    for engine in ("lanes", "diffrax"):
+        found = vrw.steps(params, start[None], options=options, engine=engine)
+        assert found.section_state.dtype == found.durations.dtype == jnp.float32
+        np.testing.assert_allclose(found.section_state[0], double, atol=1e-3)
 
 
 def test_bad_numbers_inside_a_batch_become_codes():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import truth
 from batched import wheels_like
+from test_outcomes import IN_TIME
 
 import vrw_jax as vrw
 from vrw_jax import Outcome, lane_batch
@@ -95,8 +96,10 @@ def test_each_outcome_is_provoked_side_by_side_and_stays_finite():
 
 
 def test_time_that_runs_out_is_a_code():
-    _, outcome = told(wheels_like(), GAIT[None], vrw.Options(max_phase_time=0.2))
-    assert outcome[0] == Outcome.NO_TOUCHDOWN_IN_TIME
+    longest = np.max(told(wheels_like(), GAIT[None])[0][0, 3:])
+    for share, expected in IN_TIME:
+        options = vrw.Options(max_phase_time=share * longest)
+        assert told(wheels_like(), GAIT[None], options)[1][0] == expected
 
 
 def test_a_solver_that_runs_out_of_steps_is_a_code():

@@ -28,6 +28,13 @@ PROVOKED = {
     Outcome.BAD_INPUT: (wheels_like(damping=np.nan), GAIT),
 }
 
+IN_TIME = (
+    (0.3, Outcome.NO_TOUCHDOWN_IN_TIME),
+    (0.999, Outcome.NO_TOUCHDOWN_IN_TIME),
+    (1.001, Outcome.STEPPED),
+)
+"""Time allowed over that of the longest phase, and how the step ends."""
+
 
 @pytest.mark.parametrize("outcome", PROVOKED, ids=lambda o: o.name)
 def test_each_outcome_is_provoked(outcome):
@@ -37,8 +44,10 @@ def test_each_outcome_is_provoked(outcome):
 
 
 def test_no_touchdown_in_time_is_a_code():
-    result = full_steps(wheels_like(), GAIT, vrw.Options(max_phase_time=0.2))
-    assert int(result.outcome[0]) == Outcome.NO_TOUCHDOWN_IN_TIME
+    longest = float(np.max(full_steps(wheels_like(), GAIT).durations))
+    for share, outcome in IN_TIME:  # within one solver step of the phase's end
+        result = full_steps(wheels_like(), GAIT, vrw.Options(max_phase_time=share * longest))
+        assert int(result.outcome[0]) == outcome
 
 
 def test_a_solver_that_runs_out_of_steps_is_a_code():

@@ -230,11 +230,12 @@ def march(
         time = jnp.where(taken, now.time + h + moved, now.time)
         tries = jnp.where(search.on, search.tries + 1, 0)
         late = accepted & (time >= options.max_phase_time)
+        late = late | (arrived & (time > options.max_phase_time))
         stuck = (tries >= options.event_steps) | (now.tried + 1 >= options.max_solver_steps)
         stuck = stuck | (~search.on & (now.time + following == now.time))
         verdict = jnp.where(stuck, Outcome.SOLVER_GAVE_UP, MARCHING)
-        verdict = jnp.where(late, Outcome.NO_TOUCHDOWN_IN_TIME, verdict)
         verdict = jnp.where(arrived, EVENT, verdict)
+        verdict = jnp.where(late, Outcome.NO_TOUCHDOWN_IN_TIME, verdict)
         return March(
             here=Place(*(jnp.where(taken, a, b) for a, b in zip(end, here, strict=True))),
             stance=now.stance,

@@ -255,6 +255,7 @@ def integrate_phase(
         time = here.time + length
         step = Step(time, end, solver_state, values, rates)
         timed_out = accepted & (time >= options.max_phase_time)
+        timed_out = timed_out | (arrived & (time > options.max_phase_time))
         tried = loop.tried + ~settling.on
         stuck = (search.on & ~arrived & (search.tries >= options.event_steps)) | (
             marching
@@ -299,7 +300,7 @@ def integrate_phase(
             guard=jnp.where(
                 ends_at_once,
                 jnp.argmax(past).astype(jnp.int32),
-                jnp.where(arrived, found.guard, loop.guard),
+                jnp.where(arrived & ~timed_out, found.guard, loop.guard),
             ),
             timed_out=timed_out | loop.timed_out,
             gave_up=stuck | loop.gave_up,

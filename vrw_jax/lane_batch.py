@@ -358,7 +358,8 @@ def _by_diffrax(
     wheels: np.ndarray,
     states: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
-    """By the model's own step under `jax.vmap`, as many lanes at a time as the lane engine."""
+    """By the model's own step under `jax.vmap`, MAPPED at a time."""
+    options = jax.tree.map(lambda leaf: np.asarray(leaf, wheels.dtype), options)
     parts: list[Any] = []
     for begin in range(0, len(states), MAPPED):
         some = np.arange(begin, min(begin + MAPPED, len(states)))

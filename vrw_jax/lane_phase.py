@@ -100,12 +100,14 @@ def integrate_lanes(
     crossed = march.verdict == CROSSED
     found = _locate(phase, tableau, march, options)
     lost = crossed & found.open
+    duration = march.time + jnp.where(crossed, found.length, 0.0)
+    late = crossed & ~found.open & (duration > options.max_phase_time)
     guard = jnp.where(active & (at_once >= 0), at_once, jnp.where(crossed, found.guard, -1))
     return LanePhaseEnd(
         place=select(crossed, found.end, march.here),
-        duration=march.time + jnp.where(crossed, found.length, 0.0),
-        guard=jnp.where(lost, -1, guard),
-        timed_out=march.verdict == TIMED_OUT,
+        duration=duration,
+        guard=jnp.where(lost | late, -1, guard),
+        timed_out=(march.verdict == TIMED_OUT) | late,
         unfinished=march.verdict == MARCHING,
         tried=march.tried + jnp.where(crossed, found.tried, 0),
         next_step=march.h,
