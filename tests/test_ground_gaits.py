@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
+from vrw_jax.arclength import ArclengthOptions
 from vrw_jax.models.ladder import UNILATERAL, VISCOELASTIC
 from vrw_jax.multipliers import bifurcation_margins, jury_margins, multipliers
 
@@ -93,8 +94,9 @@ def test_a_scan_puts_each_sample_on_its_lowest_rung():
 def test_a_branch_on_real_ground_holds_gaits_that_repeat(near):
     cycle = vrw.limit_cycle(SLOW, guess=near, model=GROUND, options=OPTIONS)
     branch = vrw.continue_branch(
-        SLOW, "friction", (0.65, 0.75), cycle=cycle, model=GROUND, step_options=OPTIONS
-    )
+        SLOW, "friction", (0.65, 0.75), cycle=cycle, model=GROUND, step_options=OPTIONS,
+        options=ArclengthOptions(first_step=0.1, largest_step=0.1),
+    )  # fmt: skip
     assert branch.outcome == vrw.Outcome.STEPPED
     assert branch.values.min() == pytest.approx(0.65)
     assert branch.values.max() == pytest.approx(0.75)
