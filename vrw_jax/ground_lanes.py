@@ -106,8 +106,9 @@ def walk_lanes(
         none = np.zeros(0, np.int32)
         return states, np.zeros((0, 3), states.dtype), none, none, none
     parts = []
-    # Wheels of like work side by side: stability bounds the step where damping is high.
-    order = np.argsort(columns[PARAMETER_NAMES.index("damping")], kind="stable")
+    # Most work first, so that no lane is left alone with much of it at the end: stability bounds the
+    # step where damping is high.
+    order = np.argsort(-columns[PARAMETER_NAMES.index("damping")], kind="stable")
     for begin in range(0, len(states), QUEUE):
         some = order[begin : begin + QUEUE]
         filled = np.concatenate([some, np.repeat(some[-1:], QUEUE - len(some))])
