@@ -199,7 +199,7 @@ def _walked(
         """
         s, friction = _symbols(columns, n), columns[-1]
         motion = settled(s, motion, stance.contact, stance.locked)
-        law, unseen = Law(one_sided, counted=False), least_dip(s, options)
+        law, unseen = Law(one_sided, counted=False), least_dip(s, options, one_sided)
         change = resolve(s, friction, motion, stance, event_of(place, n, guard), law, unseen)
         outcome = jnp.where(change.solutions > 0, Outcome.STEPPED, Outcome.NO_ADMISSIBLE_CONTACT)
         outcome = jnp.where(change.third_foot, Outcome.THREE_FEET_LOADED, outcome)
