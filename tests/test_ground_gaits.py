@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
+from vrw_jax.arclength import ArclengthOptions
 from vrw_jax.models.ladder import UNILATERAL, VISCOELASTIC
 from vrw_jax.multipliers import bifurcation_margins, jury_margins, multipliers
 
@@ -94,8 +95,9 @@ def test_a_scan_puts_each_sample_on_its_lowest_rung():
 def test_a_branch_on_real_ground_holds_gaits_that_repeat(near):
     cycle = vrw.limit_cycle(SLOW, guess=near, model=GROUND, options=OPTIONS)
     branch = vrw.continue_branch(
-        SLOW, "friction", (0.65, 0.75), cycle=cycle, model=GROUND, step_options=OPTIONS
-    )
+        SLOW, "friction", (0.65, 0.75), cycle=cycle, model=GROUND, step_options=OPTIONS,
+        options=ArclengthOptions(first_step=0.1, largest_step=0.1),
+    )  # fmt: skip
     assert branch.outcome == vrw.Outcome.STEPPED
     assert branch.values.min() == pytest.approx(0.65)
     assert branch.values.max() == pytest.approx(0.75)
@@ -112,7 +114,8 @@ def test_a_branch_on_real_ground_holds_gaits_that_repeat(near):
 
 @pytest.mark.slow
 def test_tuning_on_real_ground_climbs_along_the_gradient():
-    bounds = {"damping": (280.0, 320.0), "slope": (0.29, 0.31)}
+    # Up to here one order of events: next to a border (c = 311.2, slope 0.2944) climbing is slow.
+    bounds = {"damping": (280.0, 310.0), "slope": (0.295, 0.31)}
     tuned = vrw.tune(
         SLOW, "dls_fraction", list(bounds), bounds, model=GROUND, options=OPTIONS, tolerance=1e-4
     )
@@ -123,8 +126,8 @@ def test_tuning_on_real_ground_climbs_along_the_gradient():
         walk = vrw.walk(moved, START, 60, model=GROUND, options=OPTIONS).steps
         share = walk.durations[-1, 0] / jnp.sum(walk.durations[-1])
         assert sign * float(share - tuned.start_value) > 0.0
-    assert float(tuned.params.damping) == pytest.approx(320.0)
-    assert float(tuned.params.slope) == pytest.approx(0.29)
+    assert float(tuned.params.damping) == pytest.approx(310.0)
+    assert float(tuned.params.slope) == pytest.approx(0.295)
 
 
 LANES = vrw.Options(solver="Tsit5", rtol=1e-8, atol=1e-8)

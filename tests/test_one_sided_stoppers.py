@@ -10,7 +10,7 @@ from oracle import moreau_jean
 
 import vrw_jax as vrw
 from vrw_jax.models.unilateral_contacts import OFF
-from vrw_jax.models.unilateral_events import event_of, resolve
+from vrw_jax.models.unilateral_events import Law, event_of, resolve
 from vrw_jax.models.unilateral_mechanics import WheelMotion, kinetic_energy, potential_energy
 from vrw_jax.models.unilateral_motion import Stance, guards_of, unpack
 from vrw_jax.models.unilateral_section import opened
@@ -44,8 +44,12 @@ def struck():
     motion = motion._replace(dL=motion.dL.at[STRUCK].set(0.5))
     stance = Stance(jnp.full(8, OFF, jnp.int32), jnp.arange(8) != STRUCK, none, none, none)
     event = event_of(guards_of(8, True), 8, jnp.int32(8 + STRUCK))
-    after = jax.jit(lambda unseen: resolve(s, jnp.asarray(0.7), motion, stance, event, unseen))
-    bilateral = jax.jit(lambda: resolve(s, jnp.asarray(0.7), motion, stance, event))
+    after = jax.jit(
+        lambda unseen: resolve(s, jnp.asarray(0.7), motion, stance, event, Law(True, True), unseen)
+    )
+    bilateral = jax.jit(
+        lambda: resolve(s, jnp.asarray(0.7), motion, stance, event, Law(False, True), 0.0)
+    )
     return motion, after, bilateral
 
 

@@ -14,7 +14,7 @@ import vrw_jax as vrw
 from vrw_jax.integrate import integrate_phase
 from vrw_jax.minima import Watched
 from vrw_jax.models.unilateral_contacts import OFF, SLIP_DOWN, SLIP_UP, STICK
-from vrw_jax.models.unilateral_events import event_of, resolve
+from vrw_jax.models.unilateral_events import Law, event_of, resolve
 from vrw_jax.models.unilateral_mechanics import (
     WheelMotion,
     directions,
@@ -38,6 +38,7 @@ from vrw_jax.models.unilateral_section import opened
 
 START = (0.1, 1.6, -0.1)
 TIGHT = vrw.Options.tight()
+LAW = Law(one_sided=False, counted=True)
 TABLE_1 = vrw.WheelParams()
 SCENES = {  # friction, damping: what happens in the first step from START
     "lands sliding": (0.7, 200.0),
@@ -171,6 +172,16 @@ def test_landings_repeat_between_tolerances(name):
     assert abs(float(loose.period - tight.period)) < 1e-8
 
 
+def test_feet_that_throw_each_other_off_by_ever_less_stay_down():
+    """Past c = 311 each foot's landing lifts the other, after 3e-5 s, 2e-5 s, 5e-8 s and so on."""
+    params = vrw.WheelParams(damping=312.0, slope=0.294)
+    wheel = vrw.UnilateralWheel(friction=0.7)
+    walk = vrw.walk(params, START, 12, model=wheel)
+    assert int(walk.outcome) == vrw.Outcome.STEPPED
+    assert int(vrw.step(params, walk.steps.section_state[-1], model=wheel).events) < 12
+    assert abs(float(jnp.sum(walk.steps.durations[-1] - walk.steps.durations[-2]))) < 1e-6
+
+
 @pytest.mark.parametrize("friction", [0.5, 0.7, 1.0])
 def test_below_one_every_event_has_exactly_one_solution(friction):
     step = stepped(friction)
@@ -218,8 +229,9 @@ def test_a_wheel_in_the_air_falls_freely():
 def test_a_vertical_leg_lands_with_its_own_mass_alone():
     s, speed = TABLE_1.symbols(), 2.0
     motion = at_rest(0.0, vz=jnp.asarray(-speed))
+    in_the_air = stance_of((OFF, OFF), [True] * 8)
     event = event_of(guards_of(8, False), 8, jnp.int32(0))
-    change = resolve(s, jnp.asarray(0.7), motion, stance_of((OFF, OFF), [True] * 8), event)
+    change = resolve(s, jnp.asarray(0.7), motion, in_the_air, event, LAW, 0.0)
     # The leg's 1 kg stops, the other 17 kg go on; the spring then begins to work.
     assert abs(float(change.normal_impulse[0]) - 1.0 * speed) < 1e-12
     assert abs(float(change.energy_lost) - 0.5 * speed**2) < 1e-12
@@ -266,8 +278,9 @@ def test_a_single_leg_bounces_as_a_damped_oscillator():
 def test_a_foot_that_lands_sliding_takes_coulombs_impulse(friction):
     s = TABLE_1.symbols()
     motion = at_rest(0.0, vz=jnp.asarray(-1.0), vx=jnp.asarray(5.0))
+    in_the_air = stance_of((OFF, OFF), [True] * 8)
     event = event_of(guards_of(8, False), 8, jnp.int32(0))
-    change = resolve(s, jnp.asarray(friction), motion, stance_of((OFF, OFF), [True] * 8), event)
+    change = resolve(s, jnp.asarray(friction), motion, in_the_air, event, LAW, 0.0)
     normal, tangential = float(change.normal_impulse[0]), float(change.tangential_impulse[0])
     assert int(change.stance.contact[0]) == SLIP_DOWN
     assert abs(tangential + friction * normal) < 1e-12

@@ -25,7 +25,7 @@ from vrw_jax.limit_cycle import LimitCycle
 from vrw_jax.measures import MARGINS, measures_of
 from vrw_jax.mesh import N_NODES
 from vrw_jax.models import AbstractWheel
-from vrw_jax.models.base import SectionState
+from vrw_jax.models.base import RungState
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
 from vrw_jax.params import (
@@ -57,7 +57,7 @@ class AbstractFollowedWheel(AbstractFollowed):
         """Steps until the gait repeats."""
 
     @abc.abstractmethod
-    def read(self, wheel: Wheel, z: Unknown, p: Scalar) -> tuple[SectionState, dict[str, Array]]:
+    def read(self, wheel: Wheel, z: Unknown, p: Scalar) -> tuple[RungState, dict[str, Array]]:
         """Section state before the first landing, and quantities that go on beyond a border."""
 
 
@@ -92,7 +92,7 @@ class CycleFollowed(AbstractFollowedWheel):
         """Positive durations; the event-driven step is the judge of all else."""
         return jnp.all((z.durations > 0.0) | (wheel.happens < 0.5))
 
-    def read(self, wheel: Wheel, z: Unknown, p: Scalar) -> tuple[SectionState, dict[str, Array]]:
+    def read(self, wheel: Wheel, z: Unknown, p: Scalar) -> tuple[RungState, dict[str, Array]]:
         """Beyond a border: durations, shortest over the steps, and `takeoff_acceleration`: with
         which the rear foot leaves the ground, m/s^2, least over the steps.
         """
@@ -215,7 +215,7 @@ class RungFollowed(AbstractFollowedWheel):
     def valid(self, wheel: Wheel, z: Unknown, p: Scalar) -> Bool[Array, ""]:
         return jnp.all(jnp.isfinite(z))
 
-    def read(self, wheel: Wheel, z: Unknown, p: Scalar) -> tuple[SectionState, dict[str, Array]]:
+    def read(self, wheel: Wheel, z: Unknown, p: Scalar) -> tuple[RungState, dict[str, Array]]:
         """The section state; a step's own measures hold all there is."""
         return z, {}
 
@@ -235,7 +235,7 @@ def moved(
 
 
 def gait_measures(
-    model: AbstractWheel, params: WheelParams, x: SectionState, options: Options, period_n: int
+    model: AbstractWheel, params: WheelParams, x: RungState, options: Options, period_n: int
 ) -> dict[str, Array]:
     """All measures of one period of a gait that passes the section at x, with `closure`.
 
@@ -244,7 +244,7 @@ def gait_measures(
     failed. `closure` is how far the section state is from x after the period.
     """
 
-    def one(x: SectionState, _: None) -> tuple[SectionState, dict[str, Array]]:
+    def one(x: RungState, _: None) -> tuple[RungState, dict[str, Array]]:
         result = model.step(params, x, options)
         return result.section_state, measures_of(result)
 

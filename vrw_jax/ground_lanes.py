@@ -34,7 +34,7 @@ from vrw_jax.lanes import select
 from vrw_jax.models.base import replaced_where_bad, usable
 from vrw_jax.models.unilateral import UnilateralWheel, least_dip
 from vrw_jax.models.unilateral_contacts import OFF
-from vrw_jax.models.unilateral_events import event_of, resolve, settled
+from vrw_jax.models.unilateral_events import Law, event_of, resolve, settled
 from vrw_jax.models.unilateral_mechanics import WheelMotion
 from vrw_jax.models.unilateral_motion import Stance, flow_of, guards_of, unpack
 from vrw_jax.models.unilateral_section import closed, embedded, opened
@@ -106,8 +106,9 @@ def walk_lanes(
         none = np.zeros(0, np.int32)
         return states, np.zeros((0, 3), states.dtype), none, none, none
     parts = []
-    # Wheels of like work side by side: stability bounds the step where damping is high.
-    order = np.argsort(columns[PARAMETER_NAMES.index("damping")], kind="stable")
+    # Most work first, so that no lane is left alone with much of it at the end: stability bounds
+    # the step where damping is high.
+    order = np.argsort(-columns[PARAMETER_NAMES.index("damping")], kind="stable")
     for begin in range(0, len(states), QUEUE):
         some = order[begin : begin + QUEUE]
         filled = np.concatenate([some, np.repeat(some[-1:], QUEUE - len(some))])
@@ -198,8 +199,8 @@ def _walked(
         """
         s, friction = _symbols(columns, n), columns[-1]
         motion = settled(s, motion, stance.contact, stance.locked)
-        unseen = least_dip(s, options) if one_sided else None
-        change = resolve(s, friction, motion, stance, event_of(place, n, guard), unseen, False)
+        law, unseen = Law(one_sided, counted=False), least_dip(s, options, one_sided)
+        change = resolve(s, friction, motion, stance, event_of(place, n, guard), law, unseen)
         outcome = jnp.where(change.solutions > 0, Outcome.STEPPED, Outcome.NO_ADMISSIBLE_CONTACT)
         outcome = jnp.where(change.third_foot, Outcome.THREE_FEET_LOADED, outcome)
         return change.motion, change.stance, outcome.astype(jnp.int32)

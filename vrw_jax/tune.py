@@ -364,7 +364,8 @@ class TuneProblem:
 
     def _walk(self, params: WheelParams, gait: Gait) -> Walked:
         cycle = np.array(gait.cycle.section_state)
-        x, kept, outcome, walked = cycle * (1.0 + DISPLACED), True, Outcome.STEPPED, 0
+        # Shrunk and not grown: no leg may lie beyond its stopper.
+        x, kept, outcome, walked = cycle * (1.0 - DISPLACED), True, Outcome.STEPPED, 0
         for _ in range(N_WALKED):
             one = self.engine.step(params, x)
             outcome = Outcome(int(one.outcome))

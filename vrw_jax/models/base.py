@@ -16,6 +16,8 @@ from vrw_jax.params import LARGEST, Scalar, WheelParams
 SectionState = Float[Array, "3"]
 """(theta-, dtheta-, dL1-) just before touchdown, in the labels of the step that ends: rad, rad/s,
 m/s. The length of Leg 1 follows from touchdown itself, Leg 2 is on its stopper."""
+RungState = Float[Array, " section"]
+"""A `SectionState`, or the rung's own longer one."""
 
 
 class Indicators(eqx.Module):
@@ -119,7 +121,7 @@ class StepResult(AbstractStep):
 class Advance(eqx.Module):
     """The lean result of a step: what repeats."""
 
-    section_state: Float[Array, " section"]  # a SectionState, or the rung's own longer one
+    section_state: RungState
     durations: Float[Array, "3"]  # of DLS, SLS-I, SLS-II, s
     outcome: Int[Array, ""]  # an Outcome
     solver_steps: Int[Array, ""]  # tried by the integrator

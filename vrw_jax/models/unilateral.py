@@ -16,7 +16,7 @@ from vrw_jax.integrate import PhaseEnd, integrate_phase, sample_phase
 from vrw_jax.minima import Watched
 from vrw_jax.models.base import AbstractStep, AbstractWheel, Advance, replaced_where_bad, usable
 from vrw_jax.models.unilateral_contacts import OFF
-from vrw_jax.models.unilateral_events import Change, Event, event_of, resolve, settled
+from vrw_jax.models.unilateral_events import Change, Event, Law, event_of, resolve, settled
 from vrw_jax.models.unilateral_motion import (
     Flow,
     Guards,
@@ -98,9 +98,14 @@ SEEN = 4e5
 the time 4 depth / speed, and its end is known to rounding / speed, here a millionth of that."""
 
 
-def least_dip(s: Symbols, options: Options) -> Scalar:
-    """Least excursion from a one-sided stopper that is followed, m."""
-    return jnp.maximum(options.atol, SEEN * jnp.finfo(s.L0.dtype).eps * s.L0)
+def least_dip(s: Symbols, options: Options, one_sided: bool) -> Scalar:
+    """Least excursion, from the ground or a one-sided stopper, that follows an impact, m.
+
+    Legs leave such stoppers so often that it grows with the tolerance; feet alone do not, and the
+    shares of a step in double and single support would show it.
+    """
+    resolved = SEEN * jnp.finfo(s.L0.dtype).eps * s.L0
+    return jnp.maximum(options.atol, resolved) if one_sided else resolved
 
 
 class _Log(NamedTuple):
@@ -235,7 +240,7 @@ def _walk(
     friction = jnp.where(good, friction, 1.0)
     one_sided = wheel.one_sided
     place = guards_of(n, one_sided)
-    unseen = least_dip(s, options) if one_sided else None
+    law, unseen = Law(one_sided, counted=True), least_dip(s, options, one_sided)
     state, stance = opened(s, x)
 
     def go_on(now: _Walked) -> _Walked:
@@ -243,7 +248,7 @@ def _walk(
         # The integrator lets feet drift by its error; one that lifts would land again at once.
         motion = settled(s, motion, now.stance.contact, now.stance.locked)
         event = event_of(place, n, now.guard)
-        change = resolve(s, friction, motion, now.stance, event, unseen)
+        change = resolve(s, friction, motion, now.stance, event, law, unseen)
         tally_now = tally._replace(clock=jnp.zeros_like(tally.clock))
         start = pack(change.motion, tally_now)
         flow = flow_of(s, friction, one_sided, change.stance)

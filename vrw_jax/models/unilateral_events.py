@@ -33,7 +33,7 @@ from vrw_jax.models.unilateral_mechanics import (
     slots_of,
 )
 from vrw_jax.models.unilateral_motion import Guards, Stance
-from vrw_jax.params import Scalar, Symbols
+from vrw_jax.params import Elementwise, Scalar, Symbols
 
 
 class Event(NamedTuple):
@@ -135,7 +135,7 @@ class Law(NamedTuple):
     """What is asked of all events alike."""
 
     one_sided: bool  # stoppers of legs in the air only push
-    counted: bool  # the number of admissible solutions
+    counted: bool  # whether `solutions` is the number of admissible ones, or says if there is one
 
 
 class Staying(NamedTuple):
@@ -186,8 +186,7 @@ def _impact(
     any_mode = jnp.asarray([True, True, True, True])
     only = lambda mode: jnp.arange(4) == mode
     modes = jnp.where(loaded[:, None], any_mode, only(OFF))
-    if law.one_sided:
-        planted = planted | (jnp.stack(slots.of(stay.feet.astype(jnp.int32))) > 0)
+    planted = planted | (jnp.stack(slots.of(stay.feet.astype(jnp.int32))) > 0)
     modes = jnp.where(planted[:, None], jnp.arange(4) == before[:, None], modes)
     allowed = Allowed(
         contact=modes & event.impact,  # else nothing is to be looked at
@@ -297,21 +296,17 @@ def resolve(
     motion: WheelMotion,
     stance: Stance,
     event: Event,
-    unseen: Scalar | None = None,
-    counted: bool = True,
+    law: Law,
+    unseen: Elementwise,
 ) -> Change:
     """Everything that an event changes.
 
-    Stoppers of legs in the air are bilateral where `unseen` is None. Else they only push, and what
-    an impact throws off its stopper or the ground comes back: where it would go no farther than
-    `unseen`, m, it stays. It would give the hub its momentum a moment later, so the motion is the
-    same to about `unseen`; else each return throws others off, ever less, without end. Unless
-    `counted`, `solutions` says only whether there is one.
+    What an impact throws off the ground, or off a stopper that only pushes, comes back: where it
+    would go no farther than `unseen`, m, it stays. It would give the hub its momentum a moment
+    later, so the motion is the same to about `unseen`; else each return throws others off, ever
+    less, without end.
     """
-    law = Law(unseen is not None, counted)
     nothing = Staying(stance.locked & False, stance.locked & False)
-    if unseen is None:
-        return _resolved(s, friction, motion, stance, event, law, nothing)[0]
     legs = directions(s, motion.theta)
 
     def again(now: tuple) -> tuple:
@@ -322,7 +317,7 @@ def resolve(
         returns = lambda speed, back: (back > 0.0) & (speed**2 < 2.0 * back * unseen)
         in_air = now_stance.contact == OFF
         more = Staying(
-            now_stance.new_leg & in_air & returns(after.dL, back.legs),
+            now_stance.new_leg & in_air & returns(after.dL, back.legs) & law.one_sided,
             now_stance.new_foot & (stance.contact != OFF) & returns(rise, back.feet),
         )
         new = jnp.any(more.legs & ~stay.legs) | jnp.any(more.feet & ~stay.feet)
