@@ -13,15 +13,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import engine_benchmark  # noqa: F401  sets one core before JAX starts
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from work_precision_charts import replace
 
 import vrw_jax as vrw
-from vrw_jax.lane_batch import _filled, _lane_program, _width
-from vrw_jax.params import parameters_of
 from vrw_jax.start import fusion_emitters
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -50,22 +46,12 @@ def programs() -> dict[str, Program]:
             jax.grad(lambda p: vrw.limit_cycle(p).spectral_radius), (params,),
         ),
         f"{LANES} limit cycles": (jax.vmap(measures), (many,)),
-        f"{LANES} steps by lanes": lanes(many, starts, options),
     }  # fmt: skip
-
-
-def lanes(params: vrw.WheelParams, starts: jax.Array, options: vrw.Options) -> Program:
-    """The lane engine's own program, all of its places filled."""
-    dynamic, static = eqx.partition(options, eqx.is_array)
-    program = _lane_program(static, params.n_legs, False, _width())
-    wheels, some = np.asarray(parameters_of(params)), np.arange(LANES)
-    return program, (*_filled(wheels, np.asarray(starts), some, _width()), dynamic, np.int32(0))
 
 
 def measured(function: Callable, arguments: tuple) -> dict[str, float]:
     """Seconds to compile and milliseconds to run, each way."""
-    jitted = function if hasattr(function, "lower") else jax.jit(function)
-    lowered = jitted.lower(*arguments)
+    lowered = jax.jit(function).lower(*arguments)
     row, compiled = {}, {}
     for way, on in (("with", True), ("without", False)):
         began = time.process_time()

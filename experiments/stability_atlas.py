@@ -56,7 +56,7 @@ def stiff_wheel(axis: str, value: float) -> dict[str, float]:
 
 def real_axis_limit(solver: str) -> float:
     """Largest z with |R(-z)| <= 1 of an explicit solver's stability polynomial."""
-    tableau = explicit_tableau(solver, vrw.Options())
+    tableau = explicit_tableau(solver)
     assert tableau is not None
     return real_stability_limit(tableau)
 

@@ -56,7 +56,7 @@ class Method(NamedTuple):
 
 def stages(solver: str) -> int:
     """Evaluations of a tried step; 0 for an implicit solver, which does not tell."""
-    tableau = explicit_tableau(solver, vrw.Options())
+    tableau = explicit_tableau(solver)
     return 0 if tableau is None else len(tableau.places) - 1
 
 

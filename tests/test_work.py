@@ -50,7 +50,7 @@ def test_a_stiff_step_takes_what_stability_asks_for_and_little_more():
     mass = 0.01  # c/m of 10,000 1/s
     wheel = vrw.WheelParams(leg_mass=mass, damping=100.0, hub_mass=18.0 - 8.0 * mass)
     found = vrw.steps(wheel, np.array([[0.1, 1.6, -0.1]]))
-    tableau = explicit_tableau("Dopri8", vrw.Options())
+    tableau = explicit_tableau("Dopri8")
     # 1.03 c/m is the rate of SLS-I's fast mode; DLS, SLS-II and the start of it take the rest.
     asked = 1.03 * 100.0 / mass * float(found.durations[0, 1]) / real_stability_limit(tableau)
     assert not bool(found.implicit[0])

@@ -6,12 +6,13 @@ Nothing here looks from one lane to another.
 """
 
 import functools
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array
+from jaxtyping import Array, Bool
 
 from vrw_jax.models.unilateral_mechanics import WheelMotion, directions, kept, one_of
 from vrw_jax.models.unilateral_motion import (
@@ -27,7 +28,7 @@ from vrw_jax.models.unilateral_motion import (
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
 from vrw_jax.params import Elementwise, Symbols
-from vrw_jax.runge_kutta import Tableau, cut_where, dips, parabola
+from vrw_jax.runge_kutta import Tableau, dips, parabola
 
 N_FELT = 8
 """Rows of a slope after the accelerations: what guards need of the forces. Then, where stoppers are
@@ -39,6 +40,29 @@ SAFETY, LEAST, MOST = 0.9, 0.2, 5.0
 CLOSE = 30.0
 """An event is found where the last correction to its time is no more than so many tolerances of the
 step: the proposal is a parabola's, whose own error is about a hundredth of the correction."""
+
+
+Cut = Callable[..., Any]
+"""`cut(function, *arrays)` is `function(*arrays)`, computed once whoever reads it."""
+
+
+def cut_where(always: Bool[Array, ""]) -> Cut:
+    """Borders of fusion on CPU; `always` must be true, and only known at run time.
+
+    XLA there computes a producer again for each of its consumers, and can't fuse across a branch.
+    Elsewhere a branch would cost a round trip to the host, and fusion does not recompute.
+    """
+    if jax.default_backend() != "cpu":
+        return lambda function, *arrays: function(*arrays)
+
+    def cut(function: Callable, *arrays: Any) -> Any:
+        def nothing(*arrays: Any) -> Any:
+            shapes = jax.eval_shape(function, *arrays)
+            return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+
+        return lax.cond(always, function, nothing, *arrays)
+
+    return cut
 
 
 class Place(NamedTuple):

@@ -1,9 +1,9 @@
 """Gait steps of batches of wheels, by the engine that suits: one face, two engines.
 
-The lane engine always runs the same compiled program over the same number of lanes, cut into
-blocks, the last filled up with lanes that do nothing. So a lane's result is bitwise the same alone,
-among others, and in any order. Wheels of similar work share a block; a block does not wait for a
-few late lanes, which run again among their like. None of this reaches into a lane.
+On a CPU the lane engine is machine code for a few lanes at a time (`simd`), on a GPU a program of
+XLA for very many, of which a few late ones run again among their like. Either way the same code
+runs for every lane, and nothing reaches from one to another: a lane's result is bitwise the same
+alone, among others, and in any order. Wheels of similar work go side by side.
 """
 
 import dataclasses
@@ -15,26 +15,22 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from vrw_jax import simd
 from vrw_jax.ground_lanes import as_full_states, walk_lanes
-from vrw_jax.lane_engine import LaneStep, gait_step
-from vrw_jax.lane_fixed import FixedStep, fixed_gait_step
-from vrw_jax.lane_phase import Patience
+from vrw_jax.lane_engine import gait_step
+from vrw_jax.lane_fixed import fixed_gait_step
 from vrw_jax.models import AbstractWheel, UnilateralWheel, ViscoelasticWheel
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
 from vrw_jax.params import PARAMETER_NAMES, WheelParams, wheel_of
 from vrw_jax.runge_kutta import explicit_tableau, real_stability_limit
-from vrw_jax.start import fusion_emitters
 
-BLOCK = 256
-"""Lanes that march side by side on CPU: they stay in cache, and few wait for the slowest."""
-BLOCKS = 8
-"""Blocks in one call of the compiled program, so that the call itself costs little."""
-LANES_ELSEWHERE = 32_768
-"""Lanes of the one block of a call on a GPU."""
+BLOCK = 32_768
+"""Lanes that march side by side where XLA compiles them, as on a GPU."""
+MAPPED = 256
+"""Lanes that the diffrax engine takes at a time."""
 IMPLICIT = "Kvaerno5"
 """Solver of wheels that are too stiff for explicit ones."""
 FEW = 8
@@ -155,7 +151,7 @@ def _on_ground(
     engine: str,
     n_legs: int,
 ) -> Steps:
-    if engine not in ("auto", "lanes") or explicit_tableau(options.solver, options) is None:
+    if engine not in ("auto", "lanes") or explicit_tableau(options.solver) is None:
         raise ValueError(
             f"engine is {engine!r} and solver {options.solver}, but batches on real ground need "
             "'lanes' and an explicit Runge-Kutta solver: map vrw.return_map over the wheels."
@@ -215,9 +211,7 @@ def _chosen(engine: str, model: AbstractWheel, options: Options, n_legs: int) ->
         raise ValueError(
             f"engine is {engine!r}, but it is 'auto', 'lanes', 'diffrax' or 'collocation'."
         )
-    fits = isinstance(model, ViscoelasticWheel) and (
-        explicit_tableau(options.solver, options) is not None
-    )
+    fits = isinstance(model, ViscoelasticWheel) and (explicit_tableau(options.solver) is not None)
     if engine in ("lanes", "collocation") and not fits:
         raise ValueError(
             f"the lane engine can't run {type(model).__name__} with {options.solver}: it knows "
@@ -237,7 +231,7 @@ def _too_stiff(wheels: np.ndarray, options: Options) -> np.ndarray:
     light, and a step times that rate must stay below the solver's limit of stability; rejected
     steps add a tenth.
     """
-    tableau = explicit_tableau(options.solver, options)
+    tableau = explicit_tableau(options.solver)
     assert tableau is not None  # `_chosen` looked
     damping, mass, length, gravity = (
         wheels[PARAMETER_NAMES.index(name)]
@@ -255,68 +249,32 @@ def _by_lanes(
     wheels: np.ndarray,
     states: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
-    """By the lane engine: wheels of like work side by side, late lanes again among their like."""
+    """By the lane engine: wheels of like work side by side."""
     dynamic, static = eqx.partition(options, eqx.is_array)
-    dynamic = jax.tree.map(lambda leaf: np.asarray(leaf, wheels.dtype), dynamic)
-    n, width = len(states), _width()
-    program = _lane_program(static, n_legs, stop_at_lift_off, width)
-    told = (np.empty((n, 3), wheels.dtype), np.empty((n, 3), wheels.dtype))
-    counts = (np.empty(n, np.int32), np.empty(n, np.int32))
+    uniform = [np.asarray(leaf, wheels.dtype) for leaf in jax.tree.leaves(dynamic)]
+    tableau = explicit_tableau(options.solver)
+    assert tableau is not None  # `_chosen` looked
+    structure, n = jax.tree.structure(dynamic), len(PARAMETER_NAMES)
+
+    def step(uniform: Any, lanes: Any, few: Array | None = None) -> tuple:
+        known = eqx.combine(jax.tree.unflatten(structure, uniform), static)
+        params, x = wheel_of(lanes[:n], n_legs), tuple(lanes[n:])
+        told = gait_step(params, x, known, tableau, stop_at_lift_off, few)
+        return (
+            told.unfinished, told.outcome, told.solver_steps, *told.section_state, *told.durations
+        )  # fmt: skip
+
     # The airborne leg's fast rate, near c/m, sets the step where stability does.
     damping, mass = (wheels[PARAMETER_NAMES.index(name)] for name in ("damping", "leg_mass"))
     with np.errstate(all="ignore"):
-        open_ = np.argsort(damping / mass, kind="stable")
-    while len(open_) > 0:
-        few = width[1] // FEW if len(open_) > width[1] else 0
-        late = []
-        for begin in range(0, len(open_), width[0] * width[1]):
-            some = open_[begin : begin + width[0] * width[1]]
-            step = program(*_filled(wheels, states, some, width), dynamic, np.int32(few))
-            out = jax.tree.map(np.asarray, step)
-            kept = ~out.unfinished[: len(some)]
-            lanes = some[kept]
-            for to, rows in zip(told, (out.section_state, out.durations), strict=True):
-                to[lanes] = rows[: len(some)][kept]
-            for count, rows in zip(counts, (out.outcome, out.solver_steps), strict=True):
-                count[lanes] = rows[: len(some)][kept]
-            late.append(some[~kept])
-        open_ = np.concatenate(late)
-    return (*told, *counts)
-
-
-def _width() -> tuple[int, int]:
-    """Blocks of a call, and lanes of a block."""
-    return (BLOCKS, BLOCK) if jax.default_backend() == "cpu" else (1, LANES_ELSEWHERE)
-
-
-def _filled(
-    wheels: np.ndarray, states: np.ndarray, some: np.ndarray, width: tuple[int, int]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The chosen lanes, filled up to what the compiled program takes, and which are wanted."""
-    size = width[0] * width[1]
-    filled = np.concatenate([some, np.repeat(some[-1:], size - len(some))])
-    wanted = np.arange(size) < len(some)
-    return wheels[:, filled], states[filled].T.copy(), wanted
-
-
-@functools.cache
-def _lane_program(
-    static: Options, n_legs: int, stop_at_lift_off: bool, width: tuple[int, int]
-) -> Callable[..., LaneStep]:
-    """The compiled step of some blocks of lanes: one program for every batch."""
-
-    def block(dynamic: Options, few: Array, given: tuple[Array, Array, Array]) -> LaneStep:
-        columns, x, wanted = given
-        params = wheel_of(columns, n_legs)
-        options = eqx.combine(dynamic, static)
-        tableau = explicit_tableau(options.solver, options)
-        assert tableau is not None  # `_chosen` looked
-        return gait_step(params, x.T, wanted, options, tableau, stop_at_lift_off, Patience(few))
-
-    def blocks(columns: Array, x: Array, wanted: Array, dynamic: Options, few: Array) -> LaneStep:
-        return _in_blocks(functools.partial(block, dynamic, few), (columns, x, wanted), width)
-
-    return jax.jit(blocks, compiler_options=fusion_emitters(True))
+        order = np.argsort(damping / mass, kind="stable")
+    lanes = [*wheels[:, order], *states[order].T]
+    settings = ("gait step", n_legs, stop_at_lift_off, static)
+    told = _run(step, uniform, lanes, settings)
+    back = np.empty_like(order)
+    back[order] = np.arange(len(order))
+    outcome, tried, *numbers = (x[back] for x in told[1:])
+    return np.stack(numbers[:3], 1), np.stack(numbers[3:], 1), outcome, tried
 
 
 def _by_collocation(
@@ -328,44 +286,69 @@ def _by_collocation(
 ) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
     """Which lanes can be trusted, and their states, durations, outcomes and solver steps."""
     assert isinstance(model, ViscoelasticWheel)  # `_chosen` looked
-    n, width = len(states), _width()
-    program = _fixed_program(n_legs, model.stop_at_lift_off, width)
-    found: list[FixedStep] = []
-    for begin in range(0, n, width[0] * width[1]):
-        some = np.arange(begin, min(begin + width[0] * width[1], n))
-        filled = _filled(wheels, states, some, width)
-        expected = durations[np.minimum(begin + np.arange(width[0] * width[1]), n - 1)].T.copy()
-        out = program(*filled, expected)
-        used = slice(len(some))
-        found.append(jax.tree.map(lambda x, used=used: np.asarray(x)[used], out))
-    none = np.zeros(n, np.int32)
-    if not found:
-        return np.zeros(0, bool), (states, durations, none, none)
-    step = jax.tree.map(lambda *parts: np.concatenate(parts), *found)
-    return step.trusted, (step.section_state, step.durations, none, none)
+    stop_at_lift_off, n = model.stop_at_lift_off, len(PARAMETER_NAMES)
+
+    def step(uniform: Any, lanes: Any, few: Array | None = None) -> tuple:
+        params, rest = wheel_of(lanes[:n], n_legs), tuple(lanes[n:])
+        told = fixed_gait_step(params, rest[:3], rest[3:], stop_at_lift_off)
+        never = jnp.zeros_like(told.trusted)
+        return never, told.trusted, *told.section_state, *told.durations
+
+    lanes = [*wheels, *states.T, *durations.T]
+    settings = ("gait step by collocation", n_legs, stop_at_lift_off)
+    _, trusted, *numbers = _run(step, [], lanes, settings)
+    none = np.zeros(len(states), np.int32)
+    return trusted, (np.stack(numbers[:3], 1), np.stack(numbers[3:], 1), none, none)
 
 
-@functools.cache
-def _fixed_program(
-    n_legs: int, stop_at_lift_off: bool, width: tuple[int, int]
-) -> Callable[..., FixedStep]:
-    """The compiled step by collocation of some blocks of lanes."""
-
-    def block(given: tuple[Array, Array, Array, Array]) -> FixedStep:
-        columns, x, wanted, expected = given
-        params = wheel_of(columns, n_legs)
-        return fixed_gait_step(params, x.T, wanted, expected.T, stop_at_lift_off)
-
-    blocks = lambda *given: _in_blocks(block, given, width)
-    return jax.jit(blocks, compiler_options=fusion_emitters(True))
+def _on_cpu() -> bool:
+    return jax.default_backend() == "cpu"
 
 
-def _in_blocks(block: Callable, given: Any, width: tuple[int, int]) -> Any:
-    """`block` on blocks of lanes, which are the last axis going in and the first coming out."""
-    to_blocks = lambda a: jnp.moveaxis(a.reshape(*a.shape[:-1], *width), -2, 0)
-    out = lax.map(block, jax.tree.map(to_blocks, given))
-    flat = lambda a: jnp.moveaxis(a, 1, -1).reshape(-1, *a.shape[1:-1])
-    return jax.tree.map(flat, out)
+_programs: dict[Any, Callable] = {}
+"""Compiled steps by what they depend on, see `_run`."""
+
+
+def _run(
+    step: Callable[..., tuple], uniform: list[np.ndarray], lanes: list[np.ndarray], settings: Any
+) -> list[np.ndarray]:
+    """`step(uniform, lanes, few)` compiled and run; its first result: lanes that it left undone.
+
+    `settings`: all that `step` depends on but its arguments.
+    """
+    if len(lanes[0]) == 0:
+        return [np.empty(0)] * 9
+    dtype, cpu = lanes[0].dtype, _on_cpu()
+    key = (settings, dtype, cpu, BLOCK)
+    if key not in _programs:
+        if cpu:
+            kinds = [x.dtype for x in uniform]
+            _programs[key] = simd.lane_program(step, kinds, len(lanes), dtype, settings)
+        else:
+            _programs[key] = functools.partial(_by_xla, jax.jit(step))
+    return _programs[key](uniform, lanes)
+
+
+def _by_xla(
+    program: Callable, uniform: list[np.ndarray], lanes: list[np.ndarray]
+) -> list[np.ndarray]:
+    """Block by block; late lanes run again among their like."""
+    told: list[np.ndarray] = []
+    open_ = np.arange(len(lanes[0]))
+    while len(open_) > 0:
+        few = np.int32(BLOCK // FEW if len(open_) > BLOCK else 0)
+        late = []
+        for begin in range(0, len(open_), BLOCK):
+            some = open_[begin : begin + BLOCK]
+            filled = np.concatenate([some, np.repeat(some[-1:], BLOCK - len(some))])
+            given = tuple(x[filled] for x in lanes)
+            out = [np.asarray(x)[: len(some)] for x in program(tuple(uniform), given, few)]
+            told = told or [np.empty(len(lanes[0]), x.dtype) for x in out]
+            for whole, part in zip(told, out, strict=True):
+                whole[some[~out[0]]] = part[~out[0]]
+            late.append(some[out[0]])
+        open_ = np.concatenate(late)
+    return told
 
 
 def _by_diffrax(
@@ -375,14 +358,13 @@ def _by_diffrax(
     wheels: np.ndarray,
     states: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
-    """By the model's own step under `jax.vmap`, as many lanes at a time as the lane engine."""
-    size = BLOCK
+    """By the model's own step under `jax.vmap`, MAPPED at a time."""
     options = jax.tree.map(lambda leaf: np.asarray(leaf, wheels.dtype), options)
     parts: list[Any] = []
-    for begin in range(0, len(states), size):
-        some = np.arange(begin, min(begin + size, len(states)))
-        columns, x, _ = _filled(wheels, states, some, (1, size))
-        out = _mapped(model, options, n_legs, columns, x)
+    for begin in range(0, len(states), MAPPED):
+        some = np.arange(begin, min(begin + MAPPED, len(states)))
+        filled = np.minimum(np.arange(begin, begin + MAPPED), len(states) - 1)
+        out = _mapped(model, options, n_legs, wheels[:, filled], states[filled].T)
         used = slice(len(some))
         parts.append(jax.tree.map(lambda leaf, used=used: np.asarray(leaf)[used], out))
     advance = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)

@@ -11,8 +11,8 @@ last corrections, the mismatch of the collocation polynomial with the equations 
 step's start, where it was not asked to hold, and the least of all guards.
 """
 
+import functools
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -23,7 +23,7 @@ from jaxtyping import Array
 
 from vrw_jax.lane_phase import LanePhase
 from vrw_jax.mesh import ENDS_ONCE, ENDS_TWICE, N_NODES, NODES, ONCE, TWICE, Mesh
-from vrw_jax.runge_kutta import Cut, Place, Slope, Vector
+from vrw_jax.runge_kutta import Place, Slope, Vector
 from vrw_jax.sequences import sine_cosine
 
 
@@ -87,7 +87,6 @@ def collocate(
     v: Vector,
     expected: Array,
     scheme: Scheme,
-    cut: Cut,
 ) -> Collocated:
     """From (q, v) to the phase's own end, which is its first guard, near the expected duration."""
     fractions = scheme.mesh.fractions
@@ -95,8 +94,8 @@ def collocate(
 
     def march(carry: tuple, fraction: Array) -> tuple[tuple, None]:
         q, v, correction, mismatch, least = carry
-        solved = _solve(phase, residual, q, v, fraction * expected, (1, scheme.sweeps), cut)
-        low = _least(phase, q, v, solved, 0, cut)
+        solved = _solve(phase, residual, q, v, fraction * expected, (1, scheme.sweeps))
+        low = _least(phase, q, v, solved, 0)
         carry = (
             *solved.end,
             jnp.maximum(correction, _remaining(solved.step)),
@@ -110,8 +109,8 @@ def collocate(
         carry, _ = lax.scan(march, carry, jnp.asarray(fractions[:-1], expected.dtype))
     q, v, correction, mismatch, least = carry
     h = float(fractions[-1]) * expected
-    last = _solve(phase, residual, q, v, h, (scheme.rounds, 2), cut, lands=True)
-    low = jnp.minimum(_least(phase, q, v, last, 1, cut), last.step.h)
+    last = _solve(phase, residual, q, v, h, (scheme.rounds, 2), lands=True)
+    low = jnp.minimum(_least(phase, q, v, last, 1), last.step.h)
     return Collocated(
         *last.end,
         duration=float(1.0 - fractions[-1]) * expected + last.step.h + last.shift,
@@ -155,7 +154,6 @@ def _solve(
     v: Vector,
     h: Array,
     rounds_of_sweeps: tuple[int, int],
-    cut: Cut,
     lands: bool = False,
 ) -> _Solved:
     """The node accelerations of one step, by sweeps; where it lands, its length as well.
@@ -165,21 +163,21 @@ def _solve(
     n = len(q)
     rounds, sweeps = rounds_of_sweeps
     a0 = phase.evaluate(q, v).acceleration[:n]
-    middle_q, middle_v = cut(_middle, q, v, a0, h)
-    by_q, by_v, by_a = cut(partial(_partials, residual), middle_q, middle_v, a0)
-    inverses = [cut(partial(_factor, complex(value), cut), h, by_q, by_v, by_a) for value in VALUES]
+    middle_q, middle_v = _middle(q, v, a0, h)
+    by_q, by_v, by_a = _partials(residual, middle_q, middle_v, a0)
+    inverses = [_factor(complex(value), h, by_q, by_v, by_a) for value in VALUES]
 
     def sweep(step: _Step, _: None) -> tuple[_Step, None]:
         left = []
         for j in range(N_NODES):
-            Q, V = cut(partial(_node, j), q, v, step.h, step.nodes)
-            sin, cos = cut(sine_cosine, Q[0])
+            Q, V = _node(j, q, v, step.h, step.nodes)
+            sin, cos = sine_cosine(Q[0])
             left.append(residual(sin, cos, Q, V, step.nodes[j]))
         pairs = [
-            cut(_apply, inverse, cut(partial(_to_pair, weights), tuple(left)))
+            _apply(inverse, _to_pair(weights, tuple(left)))
             for inverse, weights in zip(inverses, TO_PAIRS, strict=True)
         ]
-        nodes, largest = cut(_corrected, step.nodes, tuple(pairs), step.h)
+        nodes, largest = _corrected(step.nodes, tuple(pairs), step.h)
         return _Step(step.h, nodes, largest, step.correction), None
 
     def turn(carry: tuple[_Step, Array], _: None) -> tuple[tuple[_Step, Array], None]:
@@ -187,7 +185,7 @@ def _solve(
         step = step._replace(h=step.h + shift)
         step, _ = lax.scan(sweep, step, None, length=sweeps)
         if lands:
-            shift = cut(partial(_to_event, phase), *cut(_end, q, v, step.h, step.nodes))
+            shift = _to_event(phase, *_end(q, v, step.h, step.nodes))
             shift = jnp.clip(shift, -0.5 * step.h, 0.5 * step.h)
         return (step, shift), None
 
@@ -195,8 +193,9 @@ def _solve(
     start = _Step(h, (a0,) * N_NODES, unknown, unknown)
     (step, shift), _ = lax.scan(turn, (start, jnp.zeros_like(h)), None, length=rounds)
     missed = [jnp.abs(_weigh(AT_START, step.nodes, d) - a0[d]) for d in range(n)]
-    end = cut(_end_shifted, q, v, step.h, step.nodes, shift)
-    return _Solved(step, end, shift, step.h * jnp.max(jnp.stack(missed), 0))
+    mismatch = step.h * functools.reduce(jnp.maximum, missed)
+    end = _end_shifted(q, v, step.h, step.nodes, shift)
+    return _Solved(step, end, shift, mismatch)
 
 
 def _middle(q: Vector, v: Vector, a: Vector, h: Array) -> tuple[Vector, Vector]:
@@ -263,7 +262,7 @@ def _plus(terms: Sequence[Complex]) -> Complex:
     return real, imaginary
 
 
-def _factor(value: complex, cut: Cut, h: Array, by_q: Any, by_v: Any, by_a: Any) -> Any:
+def _factor(value: complex, h: Array, by_q: Any, by_v: Any, by_a: Any) -> Any:
     """Inverse of by_a + h value by_v + (h value)^2 by_q."""
     n, square = len(by_q), value * value
     once, twice = (h * value.real, h * value.imag), (h * h * square.real, h * h * square.imag)
@@ -277,14 +276,11 @@ def _factor(value: complex, cut: Cut, h: Array, by_q: Any, by_v: Any, by_a: Any)
         ]
         for i in range(n)
     ]
-    adjugate, determinant = cut(_adjugate, matrix)
+    adjugate, determinant = _adjugate(matrix)
 
-    def divide(adjugate: Any, determinant: Complex) -> Any:
-        size = determinant[0] * determinant[0] + determinant[1] * determinant[1]
-        over = (determinant[0] / size, -determinant[1] / size)
-        return [[_times(over, entry) for entry in row] for row in adjugate]
-
-    return cut(divide, adjugate, determinant)
+    size = determinant[0] * determinant[0] + determinant[1] * determinant[1]
+    over = (determinant[0] / size, -determinant[1] / size)
+    return [[_times(over, entry) for entry in row] for row in adjugate]
 
 
 def _adjugate(m: list[list[Complex]]) -> tuple[Any, Complex]:
@@ -348,14 +344,12 @@ def _to_event(phase: LanePhase, q: Vector, v: Vector) -> Array:
     return -value / jnp.where(rate < 0.0, rate, -jnp.inf)
 
 
-def _slope(angle: Array, acceleration: Vector, cut: Cut) -> Slope:
-    sin, cos = cut(sine_cosine, angle)
+def _slope(angle: Array, acceleration: Vector) -> Slope:
+    sin, cos = sine_cosine(angle)
     return Slope(sin, cos, acceleration)
 
 
-def _least(
-    phase: LanePhase, q: Vector, v: Vector, solved: _Solved, skipped: int, cut: Cut
-) -> Array:
+def _least(phase: LanePhase, q: Vector, v: Vector, solved: _Solved, skipped: int) -> Array:
     """Least guard at two nodes and the step's end, -1 where one may be broken in between.
 
     Between them a guard may dip by a quarter of its second difference. `skipped` is 1 in the last
@@ -363,21 +357,18 @@ def _least(
     """
     step, places = solved.step, []
     for j in (0, 2):
-        Q, V = cut(partial(_node, j), q, v, step.h, step.nodes)
-        places.append(Place(Q, V, _slope(Q[0], step.nodes[j], cut)))
+        Q, V = _node(j, q, v, step.h, step.nodes)
+        places.append(Place(Q, V, _slope(Q[0], step.nodes[j])))
     at_end = tuple(_weigh(AT_END, step.nodes, d) for d in range(len(q)))
-    places.append(Place(*solved.end, _slope(solved.end[0][0], at_end, cut)))
+    places.append(Place(*solved.end, _slope(solved.end[0][0], at_end)))
     values = [phase.guards(place) for place in places]
 
-    def lowest(values: list[Vector]) -> Array:
-        least = jnp.full_like(step.h, jnp.inf)
-        for i, (first, middle, last) in enumerate(zip(*values, strict=True)):
-            low = jnp.minimum(first, middle)
-            if i >= skipped:
-                low = jnp.minimum(low, last)
-                hidden = 0.25 * jnp.abs(first - 2.0 * middle + last)
-                low = jnp.where(low > hidden, low, -1.0)
-            least = jnp.minimum(least, low)
-        return least
-
-    return cut(lowest, values)
+    least = jnp.full_like(step.h, jnp.inf)
+    for i, (first, middle, last) in enumerate(zip(*values, strict=True)):
+        low = jnp.minimum(first, middle)
+        if i >= skipped:
+            low = jnp.minimum(low, last)
+            hidden = 0.25 * jnp.abs(first - 2.0 * middle + last)
+            low = jnp.where(low > hidden, low, -1.0)
+        least = jnp.minimum(least, low)
+    return least

@@ -4,30 +4,25 @@ The same physics as `models.viscoelastic`, whose functions work element by eleme
 quantity of all wheels instead of one wheel's quantities.
 """
 
-from functools import partial
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from vrw_jax import dynamics, transitions
-from vrw_jax.geometry import Motion, double_support_circle, landing_foot_height
-from vrw_jax.lane_phase import LanePhase, LanePhaseEnd, Patience, integrate_lanes
+from vrw_jax.geometry import Motion, double_support_circle, landing_foot_height, sine_cosine
+from vrw_jax.lane_phase import LanePhase, LanePhaseEnd, integrate_lanes
 from vrw_jax.models.base import replaced_where_bad, usable
 from vrw_jax.models.viscoelastic import PAPER_START, SAFE_SINGLE_SUPPORT, PhaseBuilder
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
 from vrw_jax.params import WheelParams
 from vrw_jax.runge_kutta import (
-    Cut,
     Place,
     Slope,
     Tableau,
     Vector,
-    cut_where,
 )
-from vrw_jax.sequences import sine_cosine
 
 INTO_SINGLE_SUPPORT = 0.3
 """First step of SLS-I over the last of DLS: dropping the rear foot's force excites the airborne
@@ -37,14 +32,14 @@ leg's fast mode, which dies within 0.05 s."""
 class LaneStep(NamedTuple):
     """One gait step of a block of lanes."""
 
-    section_state: Float[Array, "3 lanes"]
-    durations: Float[Array, "3 lanes"]  # of DLS, SLS-I, SLS-II, s
+    section_state: Vector  # three arrays
+    durations: Vector  # of DLS, SLS-I, SLS-II, s
     outcome: Int[Array, " lanes"]  # an Outcome
     solver_steps: Int[Array, " lanes"]
-    unfinished: Array  # lanes that the block did not wait for: everything else there is void
+    unfinished: Bool[Array, " lanes"]  # not waited for: everything else there is void
 
 
-def double_support(build: PhaseBuilder, distance: Array, cut: Cut) -> LanePhase:
+def double_support(build: PhaseBuilder, distance: Array) -> LanePhase:
     """DLS over theta. Section 3.3.1."""
     s = build.s
 
@@ -60,14 +55,14 @@ def double_support(build: PhaseBuilder, distance: Array, cut: Cut) -> LanePhase:
         )
 
     def evaluate(q: Vector, v: Vector) -> Slope:
-        sin, cos = cut(sine_cosine, q[0])
-        return Slope(sin, cos, cut(accelerate, sin, cos, v[0]))
+        sin, cos = sine_cosine(q[0])
+        return Slope(sin, cos, accelerate(sin, cos, v[0]))
 
     def guards(place: Place) -> Vector:
-        m = cut(motion, place.slope.sin, place.slope.cos, place.v[0])
-        a = cut(partial(dynamics.double_support_acceleration, s, distance), m)
-        rear = cut(partial(dynamics.rear_foot_force, s), m, a)
-        fore = cut(partial(dynamics.fore_foot_force, s), m, a, rear)
+        m = motion(place.slope.sin, place.slope.cos, place.v[0])
+        a = dynamics.double_support_acceleration(s, distance, m)
+        rear = dynamics.rear_foot_force(s, m, a)
+        fore = dynamics.fore_foot_force(s, m, a, rear)
         return (rear.normal, s.L0 - m.L2, landing_foot_height(s, m), *build.falls(m, fore))
 
     return LanePhase(
@@ -79,27 +74,20 @@ def double_support(build: PhaseBuilder, distance: Array, cut: Cut) -> LanePhase:
     )
 
 
-def single_support_1(build: PhaseBuilder, cut: Cut) -> LanePhase:
+def single_support_1(build: PhaseBuilder) -> LanePhase:
     """SLS-I over (theta, L1, L2). Section 3.3.2."""
     s = build.s
 
-    def forces(sin: Array, cos: Array, q: Vector, v: Vector) -> Vector:
-        return dynamics.terms(s, Motion(sin, cos, q[1], q[2], *v))[1:]
-
-    def accelerate(L1: Array, L2: Array, f1: Array, f2: Array, f3: Array) -> Vector:
-        free = dynamics.Terms(dynamics.mass_matrix(s, L1, L2), f1, f2, f3)
-        return tuple(dynamics.free_acceleration(s, L1, free))
-
     def evaluate(q: Vector, v: Vector) -> Slope:
-        sin, cos = cut(sine_cosine, q[0])
-        applied = cut(forces, sin, cos, q, v)
-        return Slope(sin, cos, cut(accelerate, q[1], q[2], *applied))
+        sin, cos = sine_cosine(q[0])
+        motion = Motion(sin, cos, q[1], q[2], *v)
+        return Slope(sin, cos, tuple(dynamics.single_support_1_acceleration(s, motion)))
 
     def guards(place: Place) -> Vector:
         slope = place.slope
         m = Motion(slope.sin, slope.cos, place.q[1], place.q[2], *place.v)
         a = dynamics.Acceleration(*slope.acceleration)
-        fore = cut(partial(dynamics.fore_foot_force, s), m, a)
+        fore = dynamics.fore_foot_force(s, m, a)
         return (s.L0 - m.L2, landing_foot_height(s, m), *build.falls(m, fore))
 
     return LanePhase(
@@ -107,7 +95,7 @@ def single_support_1(build: PhaseBuilder, cut: Cut) -> LanePhase:
     )
 
 
-def single_support_2(build: PhaseBuilder, cut: Cut) -> LanePhase:
+def single_support_2(build: PhaseBuilder) -> LanePhase:
     """SLS-II over (theta, L1). Section 3.3.3."""
     s = build.s
 
@@ -118,15 +106,15 @@ def single_support_2(build: PhaseBuilder, cut: Cut) -> LanePhase:
         return dynamics.single_support_2_acceleration(s, motion(sin, cos, L1, v))[:2]
 
     def evaluate(q: Vector, v: Vector) -> Slope:
-        sin, cos = cut(sine_cosine, q[0])
-        return Slope(sin, cos, cut(accelerate, sin, cos, q[1], v))
+        sin, cos = sine_cosine(q[0])
+        return Slope(sin, cos, accelerate(sin, cos, q[1], v))
 
     def guards(place: Place) -> Vector:
         slope = place.slope
         m = motion(slope.sin, slope.cos, place.q[1], place.v)
         ddtheta, ddL1 = slope.acceleration
         a = dynamics.Acceleration(ddtheta, ddL1, 0.0 * m.L1)
-        fore = cut(partial(dynamics.fore_foot_force, s), m, a)
+        fore = dynamics.fore_foot_force(s, m, a)
         return (landing_foot_height(s, m), *build.falls(m, fore))
 
     return LanePhase(evaluate, guards, build.outcomes(Outcome.STEPPED))
@@ -142,39 +130,34 @@ def _outcome(phase: LanePhase, end: LanePhaseEnd) -> Array:
 
 def gait_step(
     params: WheelParams,
-    x: Float[Array, "lanes 3"],
-    wanted: Array,
+    x: Vector,
     options: Options,
     tableau: Tableau,
     stop_at_lift_off: bool,
-    patience: Patience,
+    few: Array | None = None,
 ) -> LaneStep:
-    """One gait step of every wanted lane of a block, from touchdown to touchdown."""
-    good = jax.vmap(usable)(params, x) & wanted
-    params, x = jax.vmap(replaced_where_bad, (0, 0, 0, None))(
-        good, params, x, jnp.asarray(PAPER_START)
-    )
-    cut = cut_where(~jnp.isnan(jnp.max(x)))
+    """One gait step of every lane, from touchdown to touchdown. `few`: see `integrate_lanes`."""
+    good = usable(params, x)
+    params, x = replaced_where_bad(good, params, x, PAPER_START)
     s = params.symbols()
     build = PhaseBuilder(s, stop_at_lift_off, monitored=False)
-    land = lambda *x: transitions.land(s, *x)
-    landing = cut(land, *x.T)
+    landing = transitions.land(s, *x)
     first = options.first_step + jnp.zeros_like(landing.theta)
     stepped = jnp.int32(Outcome.STEPPED)
-    safe = [jnp.asarray(value, x.dtype) for value in SAFE_SINGLE_SUPPORT]
+    safe = [jnp.asarray(value, x[0].dtype) for value in SAFE_SINGLE_SUPPORT]
 
     def run(
         phase: LanePhase, q: Vector, v: Vector, active: Array, first: Array
     ) -> tuple[LanePhaseEnd, Array]:
-        end = integrate_lanes(phase, tableau, q, v, active, first, options, cut, patience)
+        end = integrate_lanes(phase, tableau, q, v, active, first, options, few)
         return end, jnp.where(active, _outcome(phase, end), stepped)
 
-    dls = double_support(build, landing.distance, cut)
+    dls = double_support(build, landing.distance)
     active1 = good & landing.stays
     end1, code1 = run(dls, (landing.theta,), (landing.motion.dtheta,), active1, first)
 
     active2 = good & (code1 == stepped) & ~end1.unfinished
-    lifted = double_support_at(build, landing.distance, end1.place)
+    lifted = double_support_at(build, landing.distance, end1.place.q[0], end1.place.v[0])
     freed = landing.motion
     starts = (
         (end1.place.q[0], landing.theta),
@@ -184,7 +167,7 @@ def gait_step(
         jnp.where(active2, jnp.where(landing.stays, held, free), harmless)
         for (held, free), harmless in zip(starts, safe, strict=True)
     ]
-    sls1 = single_support_1(build, cut)
+    sls1 = single_support_1(build)
     first2 = jnp.where(landing.stays, INTO_SINGLE_SUPPORT * end1.next_step, first)
     end2, code2 = run(sls1, tuple(begin[:3]), tuple(begin[3:]), active2, first2)
 
@@ -192,30 +175,25 @@ def gait_step(
     q = [jnp.where(active3, x, harmless) for x, harmless in zip(end2.place.q, safe, strict=False)]
     v = [jnp.where(active3, x, y) for x, y in zip(end2.place.v, safe[3:], strict=True)]
 
-    def hit_stopper(theta: Array, L1: Array, L2: Array, *rates: Array) -> Vector:
-        hit = transitions.hit_stopper(s, Motion(*sine_cosine(theta), L1, L2, *rates))
-        return hit.motion.L1, hit.motion.dtheta, hit.motion.dL1
-
-    L1, dtheta, dL1 = cut(hit_stopper, *q, *v)
-    sls2 = single_support_2(build, cut)
-    end3, code3 = run(sls2, (q[0], L1), (dtheta, dL1), active3, end2.next_step)
+    hit = transitions.hit_stopper(s, Motion(*sine_cosine(q[0]), q[1], q[2], *v)).motion
+    sls2 = single_support_2(build)
+    end3, code3 = run(sls2, (q[0], hit.L1), (hit.dtheta, hit.dL1), active3, end2.next_step)
 
     code = jnp.where(active2, jnp.where(active3, code3, code2), code1)
     code = jnp.where(good, code, jnp.int32(Outcome.BAD_INPUT))
     ends = (end1, end2, end3)
-    section = jnp.stack([end3.place.q[0], *end3.place.v])
+    section = (end3.place.q[0], *end3.place.v)
     return LaneStep(
-        section_state=jnp.where(code == stepped, section, 0.0),
-        durations=jnp.stack([end.duration for end in ends]),
+        section_state=tuple(jnp.where(code == stepped, value, 0.0) for value in section),
+        durations=tuple(end.duration for end in ends),
         outcome=code,
         solver_steps=end1.tried + end2.tried + end3.tried,
         unfinished=end1.unfinished | end2.unfinished | end3.unfinished,
     )
 
 
-def double_support_at(build: PhaseBuilder, distance: Array, place: Place) -> Motion:
-    """The motion at the end of double support; its sine is taken anew, after the last shift."""
-    sin, cos = sine_cosine(place.q[0])
+def double_support_at(build: PhaseBuilder, distance: Array, theta: Array, dtheta: Array) -> Motion:
+    """The motion in double support there."""
+    sin, cos = sine_cosine(theta)
     circle = double_support_circle(build.s, distance, sin, cos)
-    dtheta = place.v[0]
     return Motion(sin, cos, circle.L1, circle.L2, dtheta, circle.G1 * dtheta, circle.G2 * dtheta)

@@ -1,12 +1,11 @@
 """One phase of many wheels at once, each with its own step size, to the earliest of its events.
 
 The lanes march side by side until every one has ended or holds a step that crosses a guard; then
-all locate their events together, taking that step again with its length corrected by Newton's
+they locate their events together, taking that step again with its length corrected by Newton's
 method. What a lane gives never depends on its neighbours: a lane that has ended is left alone.
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -18,7 +17,6 @@ from vrw_jax.lanes import select
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
 from vrw_jax.runge_kutta import (
-    Cut,
     Evaluate,
     Place,
     Tableau,
@@ -49,19 +47,9 @@ class LanePhaseEnd(NamedTuple):
     duration: Array  # s
     guard: Array  # index of the guard that ended it; -1 if none did: it gave up
     timed_out: Array
-    unfinished: Array  # left for a run with its like, see `Patience`
+    unfinished: Array  # left for a run with its like, see `integrate_lanes`
     tried: Array  # steps, accepted or not
     next_step: Array  # length that the controller would try next, s
-
-
-class Patience(NamedTuple):
-    """When a block of lanes stops waiting for its last ones: few are left, and they take long.
-
-    They are marked unfinished, and run again from their start among their like.
-    """
-
-    few: Array | int  # lanes; 0: wait for all
-    factor: int = 2  # times the iterations after which half had finished
 
 
 class _March(NamedTuple):
@@ -72,13 +60,15 @@ class _March(NamedTuple):
     verdict: Array  # on the last step tried
     crossing: Array  # bits of the guards that crossed in it
     tried: Array
-    left: Array  # lanes still running
     half: Array  # iterations after which half of the lanes had finished
     iterations: Array
 
 
 MARCHING, TIMED_OUT, GAVE_UP, CROSSED, IDLE = range(5)
 """Verdicts: where a lane's march stands."""
+
+LATE = 2
+"""Times the iterations after which half of the lanes had finished."""
 
 SAFETY, LEAST, MOST = 0.9, 0.2, 5.0
 """Of the step-size controller: the usual safety factor, and the limits of a step's change."""
@@ -92,19 +82,23 @@ def integrate_lanes(
     active: Array,
     first_step: Array,
     options: Options,
-    cut: Cut,
-    patience: Patience,
+    few: Array | None = None,
 ) -> LanePhaseEnd:
-    """Every active lane from (q, v) to the earliest of its guards. Errors: as `integrate_phase`."""
+    """Every active lane from (q, v) to the earliest of its guards. Errors: as `integrate_phase`.
+
+    Where many lanes march together, as on a GPU, they don't wait for their last `few` if these take
+    `LATE` times as long as half of them: these are marked unfinished, to run again from their start
+    among their like.
+    """
     start = Place(q, v, phase.evaluate(q, v))
     values, rates = _with_rates(phase, start)
     past = tuple((g < 0.0) | ((g == 0.0) & (r <= 0.0)) for g, r in zip(values, rates, strict=True))
     at_once = _first(past)
     begins = active & (at_once < 0)
 
-    march = _march(phase, tableau, start, values, begins, first_step, options, cut, patience)
+    march = _march(phase, tableau, start, values, begins, first_step, options, few)
     crossed = march.verdict == CROSSED
-    found = _locate(phase, tableau, march, options, cut)
+    found = _locate(phase, tableau, march, options)
     lost = crossed & found.open
     duration = march.time + jnp.where(crossed, found.length, 0.0)
     late = crossed & ~found.open & (duration > options.max_phase_time)
@@ -128,31 +122,34 @@ def _march(
     begins: Array,
     first_step: Array,
     options: Options,
-    cut: Cut,
-    patience: Patience,
+    few: Array | None,
 ) -> _March:
     """Adaptive steps until each lane has crossed a guard, run out of time or given up."""
 
     def waits(march: _March) -> Array:
-        late = march.iterations > patience.factor * march.half + 8
-        return (march.left > 0) & ~((march.left <= patience.few) & late)
+        marching = march.verdict == MARCHING
+        if few is None:
+            return jnp.any(marching)
+        left = jnp.sum(marching, dtype=jnp.int32)
+        late = march.iterations > LATE * march.half + 8
+        return (left > 0) & ~((left <= few) & late)
 
     def judge(march: _March, taken: Taken, inside: Vector, end: Vector) -> tuple[Array, Array]:
         """Length to try next, in units of this one, and what becomes of the step."""
-        squared = cut(_squared_error, taken, march.here, end, options.rtol, options.atol)
-        to_dip = cut(partial(_to_earliest_dip, tableau), march.values, inside, end)
-        return cut(partial(_change, tableau.order), squared, to_dip)
+        squared = _squared_error(taken, march.here, end, options.rtol, options.atol)
+        to_dip = _to_earliest_dip(tableau, march.values, inside, end)
+        return _change(tableau.order, squared, to_dip)
 
     def advance(march: _March) -> _March:
-        taken = take_step(tableau, phase.evaluate, march.here, march.h, cut)
+        taken = take_step(tableau, phase.evaluate, march.here, march.h)
         inside, end = phase.guards(taken.inside), phase.guards(taken.end)
         change, kept = judge(march, taken, inside, end)
-        verdict, crossing, accepted, time, h = cut(
-            partial(_verdict, options), march, change, kept, end
-        )
-        here, values = cut(select, accepted, (taken.end, end), (march.here, march.values))
-        left = jnp.sum(verdict == MARCHING, dtype=jnp.int32)
-        half_left = 2 * left > first_step.shape[0]
+        verdict, crossing, accepted, time, h = _verdict(options, march, change, kept, end)
+        here, values = select(accepted, (taken.end, end), (march.here, march.values))
+        half = march.half
+        if few is not None:
+            left = jnp.sum(verdict == MARCHING, dtype=jnp.int32)
+            half = jnp.where(2 * left > verdict.size, march.iterations + 1, half)
         return _March(
             here=here,
             values=values,
@@ -161,8 +158,7 @@ def _march(
             verdict=verdict,
             crossing=crossing,
             tried=march.tried + (march.verdict == MARCHING),
-            left=left,
-            half=jnp.where(half_left, march.iterations + 1, march.half),
+            half=half,
             iterations=march.iterations + 1,
         )
 
@@ -175,7 +171,6 @@ def _march(
         verdict=jnp.where(begins, MARCHING, IDLE).astype(jnp.int32),
         crossing=none,
         tried=none,
-        left=jnp.sum(begins, dtype=jnp.int32),
         half=count,
         iterations=count,
     )
@@ -263,9 +258,7 @@ class _Search(NamedTuple):
     tries: Array
 
 
-def _locate(
-    phase: LanePhase, tableau: Tableau, march: _March, options: Options, cut: Cut
-) -> _Search:
+def _locate(phase: LanePhase, tableau: Tableau, march: _March, options: Options) -> _Search:
     """The earliest event inside each crossing step, by Newton's method on the step's length.
 
     The first try is the whole step, the second where the guards' parabolas cross. Every guard that
@@ -280,9 +273,9 @@ def _locate(
     def propose(search: _Search, end: Place, inside: Place) -> tuple:
         values, rates = _with_rates(phase, end)
         within = phase.guards(inside)
-        change, guard = cut(_newton, values, rates, march.crossing)
-        at = cut(partial(_first_guess, tableau), march.values, within, values, march.crossing)
-        return cut(following, search, values, change, guard, at)
+        change, guard = _newton(values, rates, march.crossing)
+        at = _first_guess(tableau, march.values, within, values, march.crossing)
+        return following(search, values, change, guard, at)
 
     def following(search: _Search, values: Vector, change: Array, guard: Array, at: Array) -> tuple:
         before = jnp.ones(h.shape, bool)
@@ -298,7 +291,7 @@ def _locate(
         return length, low, high, search.open & arrived, jnp.where(arrived, change, 0.0), guard
 
     def improve(search: _Search) -> _Search:
-        taken = take_step(tableau, phase.evaluate, march.here, search.length, cut, False)
+        taken = take_step(tableau, phase.evaluate, march.here, search.length, with_error=False)
         end = taken.end
         length, low, high, arrived, shift, guard = propose(search, end, taken.inside)
 
@@ -312,7 +305,7 @@ def _locate(
             low=low,
             high=high,
             open=search.open & ~arrived,
-            end=cut(arrive, arrived, shift, end, search.end),
+            end=arrive(arrived, shift, end, search.end),
             guard=jnp.where(arrived, guard, search.guard),
             tried=search.tried + search.open,
             tries=search.tries + 1,

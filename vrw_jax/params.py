@@ -195,6 +195,6 @@ def parameters_of(params: WheelParams) -> Array:
     return jnp.stack([getattr(params, name) for name in PARAMETER_NAMES])
 
 
-def wheel_of(parameters: Array, n_legs: int) -> WheelParams:
+def wheel_of(parameters: Array | tuple[Array, ...], n_legs: int) -> WheelParams:
     """The inverse of `parameters_of`."""
     return WheelParams(**dict(zip(PARAMETER_NAMES, parameters, strict=True)), n_legs=n_legs)

@@ -3,19 +3,14 @@
 The equations of motion are of second order, q'' = f(q, q'), so that a step keeps the accelerations
 of its stages alone: positions take the tableau's matrix twice, rates once. That is the same method
 with half of the stored slopes. Tableaus are diffrax's.
-
-XLA on CPU computes a producer again for each of its consumers, which in a Runge-Kutta step costs
-more than all arithmetic. A branch of `lax.cond` is a border that it can't fuse across; its
-predicate is always true, but only known at run time.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from vrw_jax.integrate import solver_named
@@ -24,8 +19,6 @@ from vrw_jax.options import Options
 Lanes = Float[Array, " lanes"]
 Vector = tuple[Array, ...]
 """One array of lanes for each component."""
-Cut = Callable[..., Any]
-"""`cut(function, *arrays)` is `function(*arrays)`, computed once whoever reads it."""
 
 
 class Tableau(NamedTuple):
@@ -41,9 +34,10 @@ class Tableau(NamedTuple):
     """A stage well inside the step, to look for guards that dip below zero and come back."""
 
 
-def explicit_tableau(name: str, options: Options) -> Tableau | None:
+@functools.cache
+def explicit_tableau(name: str) -> Tableau | None:
     """diffrax's tableau of that name; None where the method is not explicit Runge-Kutta."""
-    solver: Any = solver_named(name, options)
+    solver: Any = solver_named(name, Options())
     given = getattr(solver, "tableau", None)
     if given is None or not all(hasattr(given, part) for part in ("a_lower", "b_sol", "b_error")):
         return None
@@ -97,24 +91,6 @@ def _without_rounding(x: np.ndarray) -> np.ndarray:
     return np.where(np.abs(x) < 1e-14 * np.max(np.abs(x)), 0.0, x)
 
 
-def cut_where(always: Bool[Array, ""]) -> Cut:
-    """Borders of fusion on CPU; `always` must be true, and only known at run time.
-
-    Elsewhere a branch would cost a round trip to the host, and fusion does not recompute.
-    """
-    if jax.default_backend() != "cpu":
-        return lambda function, *arrays: function(*arrays)
-
-    def cut(function: Callable, *arrays: Any) -> Any:
-        def nothing(*arrays: Any) -> Any:
-            shapes = jax.eval_shape(function, *arrays)
-            return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-
-        return lax.cond(always, function, nothing, *arrays)
-
-    return cut
-
-
 class Slope(NamedTuple):
     """What the equations of motion say at one point."""
 
@@ -152,38 +128,34 @@ Evaluate = Callable[[Vector, Vector], Slope]
 
 
 def take_step(
-    tableau: Tableau, evaluate: Evaluate, start: Place, h: Array, cut: Cut, with_error: bool = True
+    tableau: Tableau, evaluate: Evaluate, start: Place, h: Array, with_error: bool = True
 ) -> Taken:
     """From `start` by `h` (lane by lane)."""
     n = len(start.q)
     places, slopes = [start], [start.slope.acceleration[:n]]
     q0, v0 = start.q, start.v
 
-    def stage(i: int) -> Callable[..., tuple[Vector, Vector]]:
-        def position_and_rate(q: Vector, v: Vector, h: Array, slopes: list) -> tuple:
-            position, rate = [], []
-            for d in range(n):
-                known = [slope[d] for slope in slopes]
-                twice, once = _weigh(tableau.twice[i], known), _weigh(tableau.once[i], known)
-                drift = float(tableau.places[i]) * v[d]
-                position.append(q[d] + h * (drift if twice is None else drift + h * twice))
-                rate.append(v[d] + h * once)
-            return tuple(position), tuple(rate)
-
-        return position_and_rate
+    def stage(i: int) -> tuple[Vector, Vector]:
+        position, rate = [], []
+        for d in range(n):
+            known = [slope[d] for slope in slopes]
+            twice, once = _weigh(tableau.twice[i], known), _weigh(tableau.once[i], known)
+            drift = float(tableau.places[i]) * v0[d]
+            position.append(q0[d] + h * (drift if twice is None else drift + h * twice))
+            rate.append(v0[d] + h * once)
+        return tuple(position), tuple(rate)
 
     for i in range(1, len(tableau.places)):
-        q, v = cut(stage(i), q0, v0, h, slopes)
+        q, v = stage(i)
         slope = evaluate(q, v)
         places.append(Place(q, v, slope))
         slopes.append(slope.acceleration[:n])
 
-    def estimate(h: Array, slopes: list) -> Vector:
+    error: Vector = ()
+    if with_error:
         known = [[slope[d] for slope in slopes] for d in range(n)]
         of_position = [h * h * _weigh(tableau.error_twice, k) for k in known]
-        return tuple(of_position + [h * _weigh(tableau.error_once, k) for k in known])
-
-    error = estimate(h, slopes) if with_error else ()
+        error = tuple(of_position + [h * _weigh(tableau.error_once, k) for k in known])
     return Taken(places[-1], places[tableau.middle], error)
 
 

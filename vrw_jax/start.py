@@ -28,8 +28,8 @@ def fusion_emitters(on: bool) -> dict[str, str | bool]:
     """Which of its two ways of making CPU code XLA takes for a program: options for `jax.jit`.
 
     Without its fusion emitters it compiles limit cycles and single steps in half the time or less,
-    to code as fast; with them the lanes' long unrolled steps, in two thirds. Programs whose digits
-    are promised not to depend on the process always say which.
+    to code as fast; with them the march of lanes on real ground, in two thirds. Programs whose
+    digits are promised not to depend on the process always say which.
     """
     return {_EMITTERS: on} if _KNOWN and jax.default_backend() == "cpu" else {}
 

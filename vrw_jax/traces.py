@@ -70,8 +70,9 @@ def _exported(function: Callable, arguments: tuple, settings: object) -> export.
     leaves, structure = jax.tree.flatten(arguments)
     shapes = [jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)) for x in leaves]
     told = (settings, str(structure), shapes, jax.__version__, jax.default_backend(), code_digest())
-    key = hashlib.sha256(repr(told).encode()).hexdigest()
-    exported = _kept(key)
+    name = f"vrw_trace_{hashlib.sha256(repr(told).encode()).hexdigest()}"
+    trace = kept(name)
+    exported = None if trace is None else export.deserialize(bytearray(trace))
     if exported is None:
         flat = jax.jit(lambda *leaves: function(*jax.tree.unflatten(structure, leaves)))
         outside = _exporting.set(True)  # what is remembered within is part of this trace
@@ -79,7 +80,7 @@ def _exported(function: Callable, arguments: tuple, settings: object) -> export.
             exported = export.export(flat)(*shapes)
         finally:
             _exporting.reset(outside)
-        _keep(key, exported)
+        keep(name, bytes(exported.serialize()))
     return exported
 
 
@@ -90,33 +91,26 @@ def _folder() -> Any:
     return jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
 
 
-def _place(key: str) -> Path | None:
-    folder = _folder()
-    return Path(folder) / f"vrw_trace_{key}" if folder else None
-
-
-def _kept(key: str) -> export.Exported | None:
-    place = _place(key)
-    if place is None or not place.exists():
+def kept(name: str) -> bytes | None:
+    """What was kept under that name beside JAX's compiled code; None if nothing, or damaged."""
+    place = _folder() and Path(_folder()) / name
+    if not place or not place.exists():
         return None
-    content = place.read_bytes()
-    digest, trace = content[:32], content[32:]
-    if hashlib.sha256(trace).digest() != digest:
-        return None  # damaged: trace again
-    return export.deserialize(bytearray(trace))
+    stored = place.read_bytes()
+    digest, content = stored[:32], stored[32:]
+    return content if hashlib.sha256(content).digest() == digest else None
 
 
-def _keep(key: str, exported: export.Exported) -> None:
+def keep(name: str, content: bytes) -> None:
     """Written beside its place and renamed; a cache that can't be written is no error."""
-    place = _place(key)
-    if place is None:
+    if not _folder():
         return
-    trace = bytes(exported.serialize())
+    place = Path(_folder()) / name
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=place.parent)
+        handle, unfinished = tempfile.mkstemp(dir=place.parent)
         with os.fdopen(handle, "wb") as file:
-            file.write(hashlib.sha256(trace).digest() + trace)
-        os.replace(name, place)
+            file.write(hashlib.sha256(content).digest() + content)
+        os.replace(unfinished, place)
     except OSError:
         return

@@ -1,6 +1,8 @@
 """The one face of every rung: what a step takes, and what it tells."""
 
 import abc
+import functools
+import operator
 from typing import Any
 
 import equinox as eqx
@@ -176,24 +178,27 @@ class AbstractWheel(eqx.Module):
         return x
 
 
-def usable(params: WheelParams, x: Float[Array, " section"]) -> Array:
+Numbers = Float[Array, " section"] | tuple[Array, ...]
+"""A section state, or its numbers one by one: then each may be an array of lanes."""
+
+
+def usable(params: WheelParams, x: Numbers) -> Array:
     """Whether parameters and start are finite, in their domains and rolling forward."""
     theta, dtheta = x[0], x[1]
     upright = (jnp.abs(theta) < 0.5 * jnp.pi) & (jnp.abs(theta - params.leg_angle) < 0.5 * jnp.pi)
-    in_reach = jnp.all(jnp.abs(x) < LARGEST)  # False for NaN
-    return params.in_domain() & in_reach & upright & (dtheta > 0.0)
+    in_reach = functools.reduce(operator.and_, [jnp.abs(value) < LARGEST for value in x])
+    return params.in_domain() & in_reach & upright & (dtheta > 0.0)  # False for NaN
 
 
 def replaced_where_bad(
     good: Array,
     params: WheelParams,
-    x: Float[Array, " section"],
-    safe_x: Float[Array, " section"],
-) -> tuple[WheelParams, Array]:
+    x: Numbers,
+    safe_x: Any,
+) -> tuple[WheelParams, Any]:
     """Table 1 and a safe start in place of unusable input, so that no NaN is ever computed."""
-    safe = jax.tree.map(
-        lambda value, default: jnp.where(good, value, default.astype(value.dtype)),
-        params,
-        WheelParams(n_legs=params.n_legs),
+    return jax.tree.map(
+        lambda value, default: jnp.where(good, value, jnp.asarray(default, value.dtype)),
+        (params, x),
+        (WheelParams(n_legs=params.n_legs), safe_x),
     )
-    return safe, jnp.where(good, x, safe_x.astype(x.dtype))
