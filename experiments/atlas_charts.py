@@ -134,6 +134,7 @@ def long_walk(rows: list[Row]) -> Figure:
         "clock_error_s": "error of the clock [s]",
         "not_accounted_J": "energy not accounted for [J]",
     }
+    rows = sorted(rows, key=lambda row: -float(row["tolerance"]))
     figure, axes = over_steps(rows, "tolerance", "tolerance {}", shown, 2.8)
     work = groups(rows, "tolerance")["1e-06"]
     lost = np.finfo(float).eps * numbers(work, "work_of_gravity_J")
@@ -313,7 +314,7 @@ def meeting(rows: list[Row]) -> Figure:
             )
         axes.set(xlabel="distance $s$", title=f"{kind} eigenvalues")
         axes.grid(color="0.9", lw=0.4)
-    grid[0].legend(fontsize=6)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure
 
 

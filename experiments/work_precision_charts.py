@@ -1,12 +1,13 @@
 """Charts and tables of work_precision.py, drawn from its measurements alone."""
 
 import math
+import textwrap
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from vrw_jax.plots import PAGE, save, style
 
@@ -30,6 +31,11 @@ COLOURS = {  # of Okabe and Ito
     "torchdiffeq": "#999999",
 }
 MARKS = "os^Dv<>ph"
+NOTE: dict = {
+    "fontsize": 6,
+    "zorder": 6,
+    "bbox": {"boxstyle": "square,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.8},
+}
 TARGETS = (1e-3, 1e-6, 1e-9, 1e-12)
 DEFAULTS = {  # what a user gets who chooses nothing, by group
     ("step", "diffrax engine", "Dopri8", "1e-10"),
@@ -129,27 +135,31 @@ def draw_panel(axes: Axes, rows: list[Row], quantity: str, x_of) -> None:
             if int(row["failed"]):
                 axes.plot(a, b, "x", color="#D00000", ms=7, mew=1.2, zorder=5)
                 note = f"{row['failed']}/{of_lanes(row)}"
-                axes.annotate(note, (a, b), (4, 3), textcoords="offset points", fontsize=6)
+                axes.annotate(note, (a, b), (4, 3), textcoords="offset points", **NOTE)
             if is_default(row):
                 axes.plot(a, b, "o", ms=9, mfc="none", mec="#444444", mew=0.8)
     axes.set(xscale="log", yscale="log")
+    low, high = axes.get_xlim()
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0) if high < 200.0 * low else (1.0,)))
     axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.set_title(QUANTITIES[quantity][1])
+    axes.set_title(textwrap.fill(QUANTITIES[quantity][1], 28))
     axes.grid(color="0.9", lw=0.4)
 
 
 def panels(rows: list[Row], x_of, x_label: str) -> Figure:
-    """One panel for each quantity with one legend for all."""
-    figure = Figure(figsize=(PAGE, 7.2))
-    grid = figure.subplots(2, 3, sharey=True)
-    for axes, quantity in zip(grid.flat, QUANTITIES, strict=True):
+    """One panel for each quantity with one legend for all; steps have the most methods."""
+    figure = Figure(figsize=(PAGE, 8.0))
+    above, below = list(QUANTITIES)[:2], list(QUANTITIES)[2:]
+    wide = [name for name in above for _ in range(2)]
+    grid = figure.subplot_mosaic([wide, below], sharey=True, height_ratios=(1.3, 1.0))
+    for quantity, axes in grid.items():
         draw_panel(axes, rows, quantity, x_of)
-    for axes in grid[:, 0]:
-        axes.set_ylabel("error: p99, bar from p50 to worst")
-    for axes in grid[1]:
         axes.set_xlabel(x_label)
+        axes.tick_params(labelleft=quantity in (above[0], below[0]))
+    for first in (above[0], below[0]):
+        grid[first].set_ylabel("error: p99, bar from p50 to worst")
     found: dict[str, object] = {}
-    for axes in grid.flat:
+    for axes in grid.values():
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             found.setdefault(label, handle)
     order = sorted(found, key=lambda label: [*COLOURS].index(label.split(":")[0]))
@@ -160,7 +170,7 @@ def panels(rows: list[Row], x_of, x_label: str) -> Figure:
 
 def batch_chart(rows: list[Row], every: list[Row]) -> Figure:
     """Time per gait over the batch, and the first call beside a warm one."""
-    figure = Figure(figsize=(PAGE, 3.4))
+    figure = Figure(figsize=(PAGE, 4.4))
     left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.15))
     unit = unit_of(every)
     told: dict[str, list[Row]] = {}
@@ -178,7 +188,7 @@ def batch_chart(rows: list[Row], every: list[Row]) -> Figure:
         )  # fmt: skip
     left.set(xlabel="wheels in a call", ylabel="CPU time per gait [µs]")
     left.grid(color="0.9", lw=0.4)
-    left.legend(fontsize=6, loc="upper right")
+    left.legend(fontsize=6, loc="upper center", bbox_to_anchor=(0.45, -0.14), ncols=2)
     first: dict[str, tuple[float, float]] = {}
     for row in every:
         name = f"{row['group']}, {label_of(row)}" + (", one" if row["lanes"] == "1" else "")
@@ -190,7 +200,7 @@ def batch_chart(rows: list[Row], every: list[Row]) -> Figure:
     right.hlines(place, [first[n][1] for n in order], [first[n][0] for n in order], color="0.8")
     right.plot([first[n][1] for n in order], place, "o", ms=3, color="#0072B2", label="warm call")
     right.plot([first[n][0] for n in order], place, "s", ms=3, color="#D55E00", label="first call")
-    right.set_yticks(place, order, fontsize=5)
+    right.set_yticks(place, order, fontsize=5.5)
     right.set(xscale="log", xlabel="CPU time of a call [s]")
     right.legend(fontsize=6, loc="lower right")
     return figure
@@ -210,6 +220,7 @@ def best(rows: list[Row], group: str, alone: bool, target: float) -> Row | None:
         fits = fits and (alone or row["lanes"] != "1")
         same = [r for r in rows if r["lanes"] != "1" and curve_of(r) == curve_of(row)]
         judged = same[0] if same else row
+        fits = fits and int(judged["failed"]) == 0
         if fits and all(float(judged[f"{name}_p99"] or "nan") <= target for name in quantities):
             some.append(row)
     return min(some, key=lambda row: time_of(row, unit), default=None)
