@@ -114,8 +114,10 @@ def steps(
     stiff = np.zeros(len(states), bool)
     if engine == "auto" and run.name == "lanes":
         stiff = _too_stiff(wheels, options)
-    implicit = dataclasses.replace(options, solver=IMPLICIT)
-    for_stiffness = functools.partial(_by_diffrax, model, implicit, params.n_legs)
+    for_stiffness: Callable = run
+    if np.any(stiff):
+        implicit = dataclasses.replace(options, solver=IMPLICIT)
+        for_stiffness = functools.partial(_by_diffrax, model, implicit, params.n_legs)
     if engine == "collocation":
         walked.durations[:] = _expected(durations, states, dtype)
     for _ in range(n_steps):
@@ -231,15 +233,21 @@ def _too_stiff(wheels: np.ndarray, options: Options) -> np.ndarray:
     light, and a step times that rate must stay below the solver's limit of stability; rejected
     steps add a tenth.
     """
-    tableau = explicit_tableau(options.solver)
-    assert tableau is not None  # `_chosen` looked
     damping, mass, length, gravity = (
         wheels[PARAMETER_NAMES.index(name)]
         for name in ("damping", "leg_mass", "locked_length", "gravity")
     )
     with np.errstate(all="ignore"):
         decays = 1.03 * damping / mass * 0.74 * np.sqrt(length / gravity)
-        return decays > options.max_solver_steps * real_stability_limit(tableau)
+        return decays > options.max_solver_steps * _bearable(options.solver)
+
+
+@functools.cache
+def _bearable(solver: str) -> float:
+    """Step length times a mode's rate that the explicit solver bears."""
+    tableau = explicit_tableau(solver)
+    assert tableau is not None  # `_chosen` looked
+    return real_stability_limit(tableau)
 
 
 def _by_lanes(

@@ -98,7 +98,11 @@ class _Program:
 
 def _filled(x: np.ndarray, length: int) -> np.ndarray:
     """Contiguous, filled up by its last number."""
-    return np.ascontiguousarray(x) if len(x) == length else np.pad(x, (0, length - len(x)), "edge")
+    if len(x) == length:
+        return np.ascontiguousarray(x)
+    filled = np.full(length, x[-1])
+    filled[: len(x)] = x
+    return filled
 
 
 def _pointers(arrays: Sequence[np.ndarray]) -> Any:
