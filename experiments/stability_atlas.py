@@ -101,11 +101,9 @@ def stiffness() -> Rows:
 def by_library(wheel: dict[str, float], engine: str, solver: str) -> tuple:
     """Lanes in a call, the call, and what it tells: values, tried steps, outcome."""
     options = vrw.Options(solver=solver, rtol=TOLERANCE, atol=TOLERANCE)
-    params = vrw.WheelParams(**wheel)
-    run = lambda: vrw.steps(params, START[None], options=options, engine=engine)
-    first = run()
-    # Both engines fill up their blocks with equal lanes: that is what is timed.
-    lanes = 2048 if first.engine == "lanes" and not first.implicit[0] else 256
+    lanes = 256 if engine == "diffrax" else 2048  # full blocks
+    params, starts = vrw.WheelParams(**wheel), np.tile(START, (lanes, 1))
+    run = lambda: vrw.steps(params, starts, options=options, engine=engine)
 
     def read(told: vrw.Steps) -> tuple:
         values = np.concatenate([told.section_state[0], told.durations[0]])

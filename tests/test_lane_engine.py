@@ -296,6 +296,14 @@ def test_limits_of_stability_are_the_published_ones(solver, published):
     assert real_stability_limit(tableau) == pytest.approx(published, abs=0.02)
 
 
+def test_an_implicit_solver_is_taken_where_it_is_cheaper_too():
+    mass = 100.0 / np.array([1e5, 3e5, 1e6])  # c/m, 1/s
+    wheels = wheels_like(leg_mass=mass, hub_mass=18.0 - 8.0 * mass, damping=100.0).T
+    loose = vrw.Options(rtol=1e-6, atol=1e-6)
+    assert list(lane_batch._too_stiff(wheels, loose)) == [False, True, True]
+    assert list(lane_batch._too_stiff(wheels, vrw.Options())) == [False, False, True]
+
+
 @pytest.mark.slow
 def test_wheels_too_stiff_for_an_explicit_solver_go_to_an_implicit_one():
     mass = np.array([1.0, 0.005])  # c/m of 100 and 20,000 1/s

@@ -33,6 +33,9 @@ MAPPED = 256
 """Lanes that the diffrax engine takes at a time."""
 IMPLICIT = "Kvaerno5"
 """Solver of wheels that are too stiff for explicit ones."""
+WORTH = 5e3
+"""Explicit steps that cost what IMPLICIT does at a tolerance of 1e-6 (docs/stability_atlas.md). Its
+own cost goes with the tolerance's power of -0.19; at the limit of stability theirs does not."""
 FEW = 8
 """A block waits no longer than usual once less than one in `FEW` of its lanes is running."""
 
@@ -227,7 +230,8 @@ def _chosen(engine: str, model: AbstractWheel, options: Options, n_legs: int) ->
 
 
 def _too_stiff(wheels: np.ndarray, options: Options) -> np.ndarray:
-    """Which lanes an explicit solver can't take through single support I in `max_solver_steps`.
+    """Which lanes an explicit solver can't take through single support I in `max_solver_steps`, or
+    takes through it in so many that IMPLICIT is cheaper.
 
     The airborne leg's fast mode decays at 1.03 c/m for some 0.67 sqrt(L0 / g), s, where legs are
     light, and a step times that rate must stay below the solver's limit of stability; rejected
@@ -239,7 +243,9 @@ def _too_stiff(wheels: np.ndarray, options: Options) -> np.ndarray:
     )
     with np.errstate(all="ignore"):
         decays = 1.03 * damping / mass * 0.74 * np.sqrt(length / gravity)
-        return decays > options.max_solver_steps * _bearable(options.solver)
+        worth = WORTH * (1e-6 / float(options.rtol)) ** 0.19
+        most = min(options.max_solver_steps, worth)
+        return decays > most * _bearable(options.solver)
 
 
 @functools.cache
