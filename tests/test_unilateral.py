@@ -172,6 +172,7 @@ def test_landings_repeat_between_tolerances(name):
     assert abs(float(loose.period - tight.period)) < 1e-8
 
 
+@pytest.mark.slow
 def test_feet_that_throw_each_other_off_by_ever_less_stay_down():
     """Past c = 311 each foot's landing lifts the other, after 3e-5 s, 2e-5 s, 5e-8 s and so on."""
     params = vrw.WheelParams(damping=312.0, slope=0.294)
