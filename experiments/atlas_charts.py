@@ -350,7 +350,8 @@ def formulations(drift: list[Row], penalty: list[Row]) -> Figure:
         right.loglog(
             numbers(some, "evaluations"), numbers(some, "dtheta_error"), f"{marker}-", **look
         )
-    right.set(xlabel="evaluations per gait", ylabel=r"error of $\dot\theta$ before touchdown [rad/s]")
+    error_of = r"error of $\dot\theta$ before touchdown [rad/s]"
+    right.set(xlabel="evaluations per gait", ylabel=error_of)
     right.legend()
     for axes in (left, right):
         axes.xaxis.set_minor_formatter(NullFormatter())
