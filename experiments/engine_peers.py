@@ -219,6 +219,17 @@ def hit(y, P):
 hit_numba = _compiled(hit)
 
 
+def handed_on(phase, y, D, P):
+    """Coordinates and rates with which the next phase begins."""
+    if phase == 0:
+        _, _, L1, L2, dL1, dL2 = n_dls(math.sin(y[0]), math.cos(y[0]), y[1], D, P)
+        return np.array([y[0], L1, L2, y[1], dL1, dL2])
+    if phase == 1:
+        hit_numba(y, P)
+        return y[:4]
+    return y
+
+
 def scipy_steps(starts, parameters, tol, method="DOP853"):
     """solve_ivp with compiled right-hand side and its own events; NaN where it failed."""
     out = np.zeros((len(starts), 7))
@@ -290,12 +301,7 @@ def torch_steps(starts, parameters, tol, method="dopri5"):
                     rates, torch.tensor(y), zero, event_fn=guard, rtol=tol, atol=tol, method=method
                 )
             y, out[lane, 3 + phase] = found[-1].numpy().copy(), float(end)
-            if phase == 0:
-                _, _, L1, L2, dL1, dL2 = n_dls(math.sin(y[0]), math.cos(y[0]), y[1], D, P)
-                y = np.array([y[0], L1, L2, y[1], dL1, dL2])
-            elif phase == 1:
-                hit(y, P)
-                y = y[:4]
+            y = handed_on(phase, y, D, P)
         out[lane, :3] = y[0], y[2], y[3]
     return out
 
@@ -333,11 +339,6 @@ class Heyoka:
                 taken = ta.propagate_until(20.0)[3]
                 out[lane, 6] += taken * (ta.order + 1)  # a Taylor coefficient each
                 y, out[lane, 3 + phase] = ta.state.copy(), ta.time
-                if phase == 0:
-                    _, _, L1, L2, dL1, dL2 = n_dls(math.sin(y[0]), math.cos(y[0]), y[1], D, P)
-                    y = np.array([y[0], L1, L2, y[1], dL1, dL2])
-                elif phase == 1:
-                    hit_numba(y, P)
-                    y = y[:4]
+                y = handed_on(phase, y, D, P)
             out[lane, :3] = y[0], y[2], y[3]
         return out

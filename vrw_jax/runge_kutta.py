@@ -11,12 +11,11 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
 from vrw_jax.integrate import solver_named
 from vrw_jax.options import Options
 
-Lanes = Float[Array, " lanes"]
 Vector = tuple[Array, ...]
 """One array of lanes for each component."""
 

@@ -37,7 +37,6 @@ ARITHMETIC = {  # primitive: builder's method for floats and for integers
     "sub": ("fsub", "sub"),
     "mul": ("fmul", "mul"),
     "div": ("fdiv", "sdiv"),
-    "rem": ("frem", "srem"),
 }
 BITS = {
     "and": "and_",
@@ -59,7 +58,7 @@ CALLS = {
     "custom_jvp_call": "call_jaxpr",
     "custom_vjp_call": "call_jaxpr",
 }
-SAME = ("stop_gradient", "copy", "copy_p", "optimization_barrier")
+SAME = ("stop_gradient", "copy")
 
 
 class Emitter:
