@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from vrw_jax import simd
+from vrw_jax import simd, traces
 
 DRAW = np.random.default_rng(0)
 
@@ -141,6 +141,76 @@ def test_a_later_start_neither_traces_nor_compiles(folder, monkeypatch):
     assert len(traced) == 1
 
 
+def arrays_in_loops(x):
+    """Small and large arrays; axes moved, cut, joined; sums; loops that carry and stack."""
+    table = np.sin(np.arange(240.0)).reshape(12, 20)
+    large = jnp.tensordot(jnp.asarray(table, x.dtype), x, 1)  # (12, 3, lanes)
+    shifted = jnp.concatenate([large[1::2], large[:6] * 2.0, x[:7]]).swapaxes(
+        0, 1
+    )  # (3, 19, lanes)
+    flat = lax.optimization_barrier(shifted).reshape(57, -1)[2:50]
+
+    def turn(carry, given):
+        total, seen = carry
+        row, weight = given
+        total = total + weight * row.reshape(4, 3, -1)[:, 1]
+        return (total, seen * 0.5 + jnp.sum(row, 0)), jnp.stack([total, total * row[:4]])
+
+    start = (jnp.zeros((4, x.shape[-1]), x.dtype), x[0, 0])
+    rows = flat.reshape(4, 12, -1)
+    (total, seen), stacked = lax.scan(turn, start, (rows, jnp.arange(4.0)), reverse=True)
+
+    def halve(state):
+        field, count = state
+        on = jnp.max(jnp.abs(field), (0, 1)) > 4.0
+        smaller = jnp.where(on, field / 2.0, field)
+        return jnp.pad(jnp.where(on, field[:3], 0.0), ((0, 9), (0, 0), (0, 0))) + smaller, count + 1
+
+    going = lambda state: jnp.any(jnp.abs(state[0]) > 4.0) & (state[1] < 9)
+    halved, _ = lax.while_loop(going, halve, (large, jnp.int32(0)))
+    return {
+        "stacked": stacked,
+        "rest": (seen, jnp.min(flat, 0), jnp.min(stacked, (0, 2)), total),
+        "halved": halved - jnp.max(large, 0),
+        "found": jnp.any(large > 1.5, (0, 1)),
+        "turned": large.reshape(4, 9, -1).transpose(1, 0, 2)[:, :, None],
+    }
+
+
+@pytest.mark.parametrize("n", [1, 4, 1001])
+def test_functions_of_arrays_are_called_from_programs_of_jax(n):
+    x = jnp.asarray(DRAW.normal(size=(20, 3, n)))
+    call = simd.lane_function(arrays_in_loops, arrays_in_loops, "arrays")
+    # One lane after the other: no lane may see another.
+    expected = jax.vmap(
+        lambda one: jax.tree.map(lambda y: y[..., 0], arrays_in_loops(one[..., None])), -1, -1
+    )(x)
+    found = jax.jit(call)(x)
+    assert jax.tree.structure(found) == jax.tree.structure(expected)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        assert a.dtype == b.dtype
+        # Sums of terms of size some hundred in another order.
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
+
+
+def test_a_kept_program_finds_the_machine_code_that_it_calls(folder, monkeypatch):
+    x = jnp.asarray(DRAW.normal(size=(2, 9)))
+    double = simd.lane_function(lambda x: 2.0 * x, lambda x: x, "double")
+    run = lambda: traces.compiled(lambda x: double(x) + 1.0, (x,), "kept", jax.devices()[0])(x)
+    expected = 2.0 * np.asarray(x) + 1.0
+    np.testing.assert_array_equal(run(), expected)
+    monkeypatch.setattr(simd, "_registered", {})  # as in another process
+    names = []
+    monkeypatch.setattr(jax.ffi, "register_ffi_target", lambda name, *_, **__: names.append(name))
+    np.testing.assert_array_equal(run(), expected)
+    assert len(names) == 1
+    for place in folder.glob("vrw_lanes_*"):
+        place.unlink()
+    monkeypatch.setattr(simd, "_registered", {})
+    np.testing.assert_array_equal(run(), expected)  # traced and compiled anew
+    assert names[1] == names[0]
+
+
 def test_other_settings_and_damaged_files_are_compiled_anew(folder):
     lanes = [np.arange(4.0)]
     traced = []
@@ -165,5 +235,9 @@ def test_code_that_is_not_elementwise_is_refused_in_a_sentence():
     lanes = [np.arange(4.0)]
     with pytest.raises(NotImplementedError, match="cumsum is not elementwise"):
         program(lambda _, x: (jnp.cumsum(x[0]),), lanes)
-    with pytest.raises(NotImplementedError, match="neither a number nor one for each"):
-        program(lambda _, x: (jnp.stack([x[0], x[0]])[0],), lanes)
+    with pytest.raises(NotImplementedError, match="takes single lanes"):
+        program(lambda _, x: (x[0][:1],), lanes)
+    with pytest.raises(NotImplementedError, match="a sum or largest of lanes"):
+        program(lambda _, x: (x[0] - jnp.max(x[0]),), lanes)
+    with pytest.raises(NotImplementedError, match="moves the axis of lanes"):
+        program(lambda _, x: (jnp.stack([x[0], x[0]]).T[:, 0],), lanes)

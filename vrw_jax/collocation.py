@@ -22,6 +22,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Inexact
 
+from vrw_jax import simd
 from vrw_jax.mesh import (
     ENDS_ONCE,
     ENDS_TWICE,
@@ -106,6 +107,8 @@ def fusion_barrier(lanes: Inexact[Array, "... lanes"]) -> Hold:
 
     `lanes` must not hold NaN; that it does not is what XLA can't know.
     """
+    if simd.tracing():
+        return lax.optimization_barrier
     always = ~jnp.isnan(jnp.max(lanes.real))
 
     def hold(tree: Any) -> Any:
@@ -303,7 +306,8 @@ def _pass_phase(
         ]
         right = sum(terms, start=first * value)
         if n_wanted:
-            right = right.at[n_columns - 1 - n_wanted : -1].add(forced)
+            around = ((n_columns - 1 - n_wanted, 1), *((0, 0),) * 3)
+            right = right + jnp.pad(forced, around)
         twice, once = (m.astype(dtype)[:, None, :, None, None] for m in (TWICE, ONCE))
         by_q, by_v, by_a = (jacobian[:, :, None, i * dim : (i + 1) * dim] for i in range(3))
         own_node = np.eye(N_NODES, dtype=dtype)[:, None, :, None, None]
@@ -453,9 +457,9 @@ def linearised_pass(
         (back, d_back), traced = lax.scan(one_step, (section, d_section), inputs)
 
     monodromy = jnp.swapaxes(d_back[1 : 1 + size], 0, 1)
-    own = np.r_[0, 1 + size : n_columns]
+    own = lambda x: jnp.concatenate([x[:1], x[1 + size :]])  # without the section's columns
     first = np.eye(1 + n_wanted, dtype=dtype)[0][:, None, None]
-    right = d_back[own] + first * (back - section)
+    right = own(d_back) + first * (back - section)
     closing = inverse(jnp.eye(size, dtype=dtype)[:, :, None] - monodromy)
     d_closed = jnp.swapaxes(_contract(closing, jnp.swapaxes(right, 0, 1)), 0, 1)
 
@@ -466,7 +470,7 @@ def linearised_pass(
             d_closed[:, s].reshape((-1,) + (1,) * (columns.ndim - 2) + lanes) * columns[1 + s]
             for s in range(size)
         ]
-        return columns[own] + sum(by_section[1:], start=by_section[0])
+        return own(columns) + sum(by_section[1:], start=by_section[0])
 
     ends, *d_others = hold(traced)
     d_ends, d_durations, d_accelerations = jax.tree.map(close, tuple(d_others))

@@ -7,6 +7,7 @@ compiles in the time of a pass, where a program of tangents takes three times th
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -14,13 +15,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from vrw_jax import simd
 from vrw_jax.collocation import Linearised, Solution
 from vrw_jax.cycle_search import (
-    Finding,
     Located,
     Parameters,
     Problem,
     columns_of,
+    not_searched,
     search,
 )
 from vrw_jax.derivatives import on_branch, push, without_derivative
@@ -87,45 +89,36 @@ def _monodromy_slopes(problem: Problem, parameters: Parameters, located: Located
     return _where_found(located, _along_branch(problem, parameters, located).monodromy)
 
 
-def _search_with_columns(
-    problem: Problem, parameters: Parameters, guess: Located | None = None
-) -> Finding:
-    """A search that also returns the columns of all parameters.
-
-    Alone, a wheel's passes carry them: one pass to compile. Batches save the time, and compile a
-    pass of its own for them.
-    """
-    block, n_lanes = problem.options.block, parameters.shape[-1]
-    if n_lanes <= block:
-        return search(problem, parameters, guess, tuple(range(parameters.shape[0])))
-    finding = search(problem, parameters, guess)
-    columns = in_blocks(functools.partial(_tangent_space, problem), block)
-    return finding._replace(columns=columns(parameters, finding.located))
+def _over_lanes(function: Callable, like: Callable, problem: Problem, blocked: bool) -> Callable:
+    """A function of the problem over lanes, in its quickest form: machine code on a CPU."""
+    settings = (function.__name__, problem)
+    of_problem = functools.partial(function, problem)
+    if jax.default_backend() == "cpu":
+        return simd.lane_function(of_problem, functools.partial(like, problem), settings)
+    return remembered(
+        in_blocks(of_problem, problem.options.block) if blocked else of_problem, settings
+    )
 
 
 def solve_cycle(
     problem: Problem, parameters: Array, guess: Located | None
 ) -> tuple[Located, tuple]:
     """Search for one wheel, differentiable in its parameters; the guess has no derivative."""
-    block = problem.options.block
-
-    find, find_with_columns = (
-        one_wheel(remembered(functools.partial(f, problem), (f.__name__, problem)))
-        for f in (search, _search_with_columns)
-    )
+    nothing = lambda problem, parameters, *_: not_searched(problem, parameters)
+    alike = lambda problem, parameters, located: located
+    find = one_wheel(_over_lanes(search, nothing, problem, blocked=False))
+    columns_at = one_wheel(_over_lanes(_tangent_space, alike, problem, blocked=True))
     start = () if guess is None else (guess,)
-
-    def parts(finding: Finding) -> tuple[Located, tuple]:
-        return finding.located, (finding.monodromy, finding.residual, finding.passes)
 
     @jax.custom_jvp
     def solve(parameters: Array, *guess: Located) -> tuple[Located, tuple]:
-        return parts(find(parameters, *guess))
+        located, *other = find(parameters, *guess)
+        return located, tuple(other)
 
     @jax.custom_jvp
     def solve_with_columns(parameters: Array, *guess: Located) -> tuple:
-        finding = find_with_columns(parameters, *guess)
-        return *parts(finding), finding.columns
+        located, *other = find(parameters, *guess)
+        return located, tuple(other), columns_at(parameters, located)
 
     @solve.defjvp
     def rule(primals: tuple, tangents: tuple) -> tuple:
@@ -138,7 +131,9 @@ def solve_cycle(
         tangent_space, curvature_of = (
             functools.partial(f, problem) for f in (_tangent_space, _curvature)
         )
-        curvature = on_branch(curvature_of, tangent_space, block)(primals[0], located)
+        curvature = on_branch(curvature_of, tangent_space, problem.options.block)(
+            primals[0], located
+        )
         tangent = push((columns, curvature), tangents[0])
         return (located, other, columns), (tangent[0], without_derivative(other), tangent[1])
 

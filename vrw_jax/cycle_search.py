@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import export, lax
 from jaxtyping import Array, Bool, Inexact, Int
 
-from vrw_jax import gait_surface, sequences
+from vrw_jax import gait_surface, sequences, simd
 from vrw_jax.collocation import (
     LaneArray,
     Linearised,
@@ -82,7 +82,6 @@ class Finding(NamedTuple):
     """The result of a search, lanes last."""
 
     located: Located
-    columns: Located | None  # derivatives by the parameters `wanted`, leading axis
     monodromy: LaneArray  # (row, column, lanes)
     residual: LaneArray  # size of Newton's last correction
     passes: Int[Array, " lanes"]  # linearised passes spent
@@ -115,8 +114,9 @@ def start_from(problem: Problem, section: Array, durations: Array, with_dls: Arr
         jnp.zeros((n, mesh.n_steps, N_NODES, phase.dim, lanes), section.dtype)
         for phase, mesh in zip(problem.sequence.phases, problem.meshes, strict=True)
     )
-    happens = jnp.ones((n, n_phases, lanes), section.dtype)
-    happens = happens.at[:, 0].set(jnp.where(with_dls, 1.0, 0.0))
+    first = jnp.where(with_dls, 1.0, 0.0).astype(section.dtype)
+    others = jnp.ones((n, n_phases - 1, lanes), section.dtype)
+    happens = jnp.concatenate([jnp.broadcast_to(first, (n, 1, lanes)), others], 1)
     durations = jnp.broadcast_to(durations, (n, n_phases, lanes))
     solution = Solution(section, durations, accelerations)
     return Located(solution, happens, *nothing_known(problem, section))
@@ -131,6 +131,9 @@ def nothing_known(problem: Problem, section: Array) -> tuple[Array, Array]:
 
 def over_rows(combine: Callable[[Array, Array], Array], x: Array) -> LaneArray:
     """Reduction over all axes but the lanes, by halves: XLA's own runs along the wrong axis."""
+    if simd.tracing():
+        whole = jnp.max if combine is jnp.maximum else jnp.min
+        return whole(x, axis=tuple(range(x.ndim - 1)))
     rows = x.reshape(-1, x.shape[-1])
     while rows.shape[0] > 1:
         half = rows.shape[0] // 2
@@ -168,25 +171,15 @@ def _limited(solution: Solution, correction: Solution) -> LaneArray:
     return jnp.minimum(1.0, share)
 
 
-def columns_of(passed: Linearised, located: Located) -> Located | None:
-    """The columns of a pass, if any were wanted; what selects a solution has none."""
-    if not passed.d_ends.shape[0]:
-        return None
+def columns_of(passed: Linearised, located: Located) -> Located:
+    """The columns of a pass; what selects a solution has none."""
     flat = lambda x: jnp.zeros((passed.d_ends.shape[0], *x.shape), x.dtype)
     return Located(passed.columns, flat(located.happens), flat(located.found), passed.d_ends)
-
-
-def no_columns(located: Located, wanted: tuple[int, ...]) -> Located | None:
-    """Zeros in place of columns."""
-    if not wanted:
-        return None
-    return jax.tree.map(lambda x: jnp.zeros((len(wanted), *x.shape), x.dtype), located)
 
 
 class _Iterate(NamedTuple):
     iteration: Int[Array, ""]
     located: Located
-    columns: Located | None
     monodromy: LaneArray
     residual: LaneArray
     converged: Bool[Array, " lanes"]
@@ -202,7 +195,6 @@ def newton(
     stages: Array,
     iterations: Array | int,
     pending: Bool[Array, " lanes"],
-    wanted: tuple[int, ...] = (),
 ) -> Finding:
     """Newton's method with limited steps on the lanes that are `pending`.
 
@@ -222,7 +214,7 @@ def newton(
         arrived = share >= 1.0
         here = jnp.where(arrived, parameters, origin + share * (parameters - origin))
         solution = now.located.solution
-        passed = problem.pass_at(here, now.located, wanted)
+        passed = problem.pass_at(here, now.located)
         correction = passed.correction
         step_size = correction_size(solution, correction)
         sound = jnp.isfinite(step_size)
@@ -241,7 +233,6 @@ def newton(
         return _Iterate(
             iteration=now.iteration + 1,
             located=located,
-            columns=jax.tree.map(take, columns_of(passed, located), now.columns),
             monodromy=take(passed.monodromy, now.monodromy),
             residual=take(step_size, now.residual),
             converged=now.converged | converged,
@@ -252,7 +243,6 @@ def newton(
     first = _Iterate(
         iteration=jnp.zeros((), jnp.int32),
         located=start,
-        columns=no_columns(start, wanted),
         monodromy=jnp.zeros((size, size, lanes), parameters.dtype),
         residual=jnp.ones((lanes,), parameters.dtype),
         converged=jnp.zeros((lanes,), bool),
@@ -263,8 +253,7 @@ def newton(
     last = lax.while_loop(going, iterate, first)
     found = last.converged & signs_hold(problem, parameters, last.located)
     located = last.located._replace(found=found.astype(parameters.dtype))
-    columns = jax.tree.map(lambda x: jnp.where(found, x, 0.0), last.columns)
-    return Finding(located, columns, last.monodromy, last.residual, last.passes)
+    return Finding(located, last.monodromy, last.residual, last.passes)
 
 
 def signs_hold(problem: Problem, parameters: Parameters, located: Located) -> Bool[Array, " lanes"]:
@@ -285,14 +274,11 @@ def signs_hold(problem: Problem, parameters: Parameters, located: Located) -> Bo
             sequence, problem.meshes, constants, tuple(section), durations, accelerations
         )
         for i, (phase, passage) in enumerate(zip(sequence.phases, passages, strict=True)):
-            everywhere = jax.tree.map(
-                lambda start, nodes, end: jnp.concatenate([start[None], nodes, end[None]]),
-                *(point._replace(held=()) for point in passage),
+            start, nodes, end = (
+                functools.reduce(jnp.minimum, phase.guards(constants, point)) for point in passage
             )
-            guards = phase.guards(constants, everywhere._replace(held=passage.start.held))
-            worst = functools.reduce(jnp.minimum, guards)
-            worst = worst.at[-1].add(ZERO_AT_EVENT)
-            inside = (durations[i] > 0.0) & (over_rows(jnp.minimum, hold(worst)) > 0.0)
+            inside = jnp.minimum(start, over_rows(jnp.minimum, hold(nodes))) > 0.0
+            inside &= (durations[i] > 0.0) & (end > -ZERO_AT_EVENT)
             good &= inside | ~happens[i]
         for check in sequence.border_checks(constants, passages, happens):
             good &= check > 0.0
@@ -308,11 +294,10 @@ def search(
     problem: Problem,
     parameters: Parameters,
     guess: Located | None = None,
-    wanted: tuple[int, ...] = (),
 ) -> Finding:
     """A limit cycle for each lane, by several attempts in turn; see ATTEMPTS.
 
-    Parameters must be usable. With `wanted`, every pass carries the columns of these parameters.
+    Parameters must be usable.
     """
     options = problem.options
     n_lanes = parameters.shape[-1]
@@ -342,12 +327,12 @@ def search(
             is_guess = is_now(attempt, "guess")
             start = jax.tree.map(lambda s, g: jnp.where(is_guess, g, s), start, guess)
         pending = now.located.found < 0.5
-        tried = newton(problem, parameters, start, origin, stages, limits[attempt], pending, wanted)
+        tried = newton(problem, parameters, start, origin, stages, limits[attempt], pending)
         chosen = jax.tree.map(lambda a, b: jnp.where(pending, a, b), tried, now)
         return chosen._replace(passes=now.passes + tried.passes)
 
     def attempt_all(attempt: Array, now: Finding) -> Finding:
-        if n_lanes <= block:
+        if n_lanes <= block or simd.tracing():
             return attempt_block(attempt, parameters, now, guess)
         order = jnp.argsort(now.located.found, stable=True)
         everything = jax.tree.map(lambda x: x[..., order], (parameters, now, guess))
@@ -365,19 +350,22 @@ def search(
         return jax.tree.map(lambda x: x[..., back], after)
 
     first = jnp.asarray(ATTEMPTS.index("surface" if guess is None else "guess"), jnp.int32)
-    start = jax.eval_shape(lambda: start_of(first, parameters)[0])
-    start = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), start)
-    size = problem.sequence.section_size
-    nothing = Finding(
-        start,
-        no_columns(start, wanted),
-        jnp.zeros((size, size, n_lanes), parameters.dtype),
-        jnp.full((n_lanes,), jnp.inf, parameters.dtype),
-        jnp.zeros((n_lanes,), jnp.int32),
-    )
+    nothing = not_searched(problem, parameters)
     more = lambda c: (c[0] < len(ATTEMPTS)) & jnp.any(c[1].located.found < 0.5)
     _, finding = lax.while_loop(more, lambda c: (c[0] + 1, attempt_all(*c)), (first, nothing))
     return finding
+
+
+def not_searched(problem: Problem, parameters: Parameters) -> Finding:
+    """What is known before a search: nothing."""
+    size, n_phases = problem.sequence.section_size, len(problem.sequence.phases)
+    zeros = lambda *shape: jnp.zeros((*shape, parameters.shape[-1]), parameters.dtype)
+    return Finding(
+        start_from(problem, zeros(size), zeros(n_phases), zeros() > 0.0),
+        zeros(size, size),
+        zeros() + jnp.inf,
+        zeros().astype(jnp.int32),
+    )
 
 
 ZERO_AT_EVENT = 1e-6

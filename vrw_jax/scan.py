@@ -16,6 +16,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from vrw_jax.code_cache import code_digest
 from vrw_jax.cycle_options import CycleOptions
 from vrw_jax.designs import AbstractDesign, Columns
 from vrw_jax.lazy import xarray as xr
@@ -42,7 +43,6 @@ from vrw_jax.scan_store import (
     stored_manifest,
 )
 from vrw_jax.simulate import provenance
-from vrw_jax.traces import code_digest
 
 CHUNK = 4096
 """Most samples of a chunk, unless asked for otherwise: what a killed scan can lose."""

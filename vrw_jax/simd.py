@@ -10,25 +10,31 @@ traces nor compiles.
 import ctypes
 import functools
 import hashlib
+import json
+import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from contextvars import ContextVar
+from threading import Lock
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import llvmlite.binding as llvm
 import llvmlite.ir as ir
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
-from vrw_jax.simd_emit import BYTE, LONG, NUMBERS, TRUTH, Emitter
-from vrw_jax.traces import code_digest, keep, kept
+from vrw_jax.code_cache import code_digest, keep, kept
+from vrw_jax.simd_arrays import HELD, LANES, Arrays, Entries, Field, Index
+from vrw_jax.simd_emit import BYTE, INT, LONG, NUMBERS, TRUTH
 
-WIDTH = {np.dtype(np.float64): 8, np.dtype(np.float32): 16}
-"""Lanes of a group: two vectors of 256 bits, so that one computes while the other waits."""
+VECTOR = {np.dtype(np.float64): 4, np.dtype(np.float32): 8}
+"""Lanes of a vector: 256 bits."""
 TOGETHER = 64
 """Groups that a thread takes at a time."""
-NAME = "lanes"
+NAME, HANDLER = "lanes", "handler"
 
 
 def lane_program(
@@ -45,38 +51,143 @@ def lane_program(
     result takes numpy arrays of any equal length and gives bitwise the same for a lane in any
     company; it uses all cores that the process may.
     """
-    width = WIDTH[dtype]
+    width = 2 * VECTOR[dtype]  # one vector computes while the other waits
     shapes = (
         tuple(jax.ShapeDtypeStruct((), kind) for kind in uniform),
-        (jax.ShapeDtypeStruct((width,), dtype),) * n_lanes_in,
+        (jax.ShapeDtypeStruct((LANES,), dtype),) * n_lanes_in,
     )
+    return _Program(_code(function, shapes, settings, width), width)
+
+
+def lane_function(
+    function: Callable[..., Any], like: Callable[..., Any], settings: object
+) -> Callable[..., Any]:
+    """`function` of trees of arrays, lanes on their last axis, as one call within JAX's programs.
+
+    As with `lane_program`; but results form a tree, that of `like`, which is quick to trace.
+    Without derivatives, on CPUs only, and on the one core that runs the program.
+    """
+
+    def call(*arrays: Any) -> Any:
+        leaves, structure = jax.tree.flatten(arrays)
+        n_lanes = leaves[0].shape[-1]
+        width = VECTOR[np.dtype(leaves[0].dtype)]
+        missing = -n_lanes % width
+        shapes = [jax.ShapeDtypeStruct((*x.shape[:-1], LANES), x.dtype) for x in leaves]
+        flat = lambda *leaves: jax.tree.leaves(function(*jax.tree.unflatten(structure, leaves)))
+        code = _code(flat, shapes, (settings, str(structure)), width)
+        _register(code)
+        if missing:
+            last = [jnp.repeat(x[..., -1:], missing, -1) for x in leaves]
+            leaves = [jnp.concatenate(pair, -1) for pair in zip(leaves, last, strict=True)]
+        out = [jax.ShapeDtypeStruct((*n, n_lanes + missing), kind) for n, kind in code.out]
+        results = jax.ffi.ffi_call(code.name, out)(*leaves)
+        told = jax.tree.structure(jax.eval_shape(like, *arrays))
+        return jax.tree.unflatten(told, [x[..., :n_lanes] for x in results])
+
+    return call
+
+
+def at_hand(names: Sequence[str]) -> bool:
+    """Whether a kept program that calls machine code of these names can run, once this is said."""
+    for name in names:
+        content = None if name in _registered else kept(name)
+        if content is not None:
+            _register(_told(name, content))
+    return all(name in _registered for name in names)
+
+
+_registered: dict[str, "_Loaded"] = {}
+"""Machine code that JAX's programs may call, by name; XLA never lets go of it."""
+_registering = Lock()
+
+
+def _register(code: "_Code") -> None:
+    with _registering:
+        if code.name not in _registered:
+            loaded = _Loaded(code.code)
+            jax.ffi.register_ffi_target(code.name, loaded.capsule(HANDLER), platform="cpu")
+            _registered[code.name] = loaded
+
+
+class _Loaded:
+    """Machine code at its place in memory."""
+
+    def __init__(self, code: bytes) -> None:
+        self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
+        self._engine.add_object_file(llvm.ObjectFileRef.from_data(code))
+        self._engine.finalize_object()
+
+    def address(self, name: str) -> int:
+        """Where a function begins."""
+        return self._engine.get_function_address(name)
+
+    def capsule(self, name: str) -> Any:
+        """A function for hands that know what it takes."""
+        make = ctypes.pythonapi.PyCapsule_New
+        make.restype, make.argtypes = (
+            ctypes.py_object,
+            [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p],
+        )
+        return make(self.address(name), None, None)
+
+
+class _Code(NamedTuple):
+    """A function of lanes as machine code."""
+
+    name: str  # says everything that it depends on
+    out: tuple[tuple[tuple[int, ...], np.dtype], ...]  # of each result: axes before lanes, numbers
+    code: bytes
+
+
+def _code(function: Callable, shapes: Any, settings: object, width: int) -> _Code:
+    """Compiled, or found where it is kept."""
     told = (
-        "lanes", settings, shapes, jax.__version__, llvm.llvm_version_info, _processor(),
+        "lanes", settings, shapes, width, jax.__version__, llvm.llvm_version_info, _processor(),
         code_digest(),
     )  # fmt: skip
-    key = hashlib.sha256(repr(told).encode()).hexdigest()
-    content = kept(f"vrw_lanes_{key}")
+    name = f"vrw_lanes_{hashlib.sha256(repr(told).encode()).hexdigest()}"
+    content = kept(name)
     if content is None:
-        closed = jax.make_jaxpr(function)(*shapes)
-        told_kinds = ",".join(aval.dtype.name for aval in closed.out_avals)
-        content = told_kinds.encode() + b"\n" + _compiled(_module(closed, width))
-        keep(f"vrw_lanes_{key}", content)
-    kinds, _, code = content.partition(b"\n")
-    return _Program(code, list(map(np.dtype, kinds.decode().split(","))), width)
+        closed = traced(function, *shapes)
+        out = [(aval.shape[:-1], aval.dtype.name) for aval in closed.out_avals]
+        content = json.dumps(out).encode() + b"\n" + _compiled(_module(closed, width))
+        keep(name, content)
+    return _told(name, content)
+
+
+def _told(name: str, content: bytes) -> _Code:
+    """What is kept under a name."""
+    out, _, code = content.partition(b"\n")
+    return _Code(name, tuple((tuple(n), np.dtype(kind)) for n, kind in json.loads(out)), code)
+
+
+def traced(function: Callable, *shapes: Any) -> ClosedJaxpr:
+    """The trace of a function that is to be machine code."""
+    outside = _tracing.set(True)
+    try:
+        return jax.make_jaxpr(function)(*shapes)
+    finally:
+        _tracing.reset(outside)
+
+
+_tracing: ContextVar[bool] = ContextVar("_tracing", default=False)
+
+
+def tracing() -> bool:
+    """Whether what is traced now is to be machine code."""
+    return _tracing.get()
 
 
 class _Program:
-    """Loaded machine code."""
+    """Machine code for numpy's arrays."""
 
-    def __init__(self, code: bytes, out: list[np.dtype], width: int) -> None:
-        self.out, self.width = out, width
-        machine = _machine()
-        self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
-        self._engine.add_object_file(llvm.ObjectFileRef.from_data(code))
-        self._engine.finalize_object()
+    def __init__(self, code: _Code, width: int) -> None:
+        self.out, self.width = [kind for _, kind in code.out], width
+        self._loaded = _Loaded(code.code)
         pointer, count = ctypes.c_void_p, ctypes.c_int64
-        signature = ctypes.CFUNCTYPE(None, pointer, pointer, count, count)
-        self._run = signature(self._engine.get_function_address(NAME))
+        signature = ctypes.CFUNCTYPE(None, pointer, pointer, count, count, count)
+        self._run = signature(self._loaded.address(NAME))
 
     def __call__(self, uniform: Sequence[Any], lanes: Sequence[np.ndarray]) -> list[np.ndarray]:
         n = len(lanes[0])
@@ -85,7 +196,8 @@ class _Program:
         numbers = [np.asarray(x) for x in uniform]
         out = [np.empty(groups * self.width, kind) for kind in self.out]
         given, told = _pointers([*numbers, *filled]), _pointers(out)
-        run = lambda begin: self._run(given, told, begin, min(begin + TOGETHER, groups))
+        length = groups * self.width
+        run = lambda begin: self._run(given, told, length, begin, min(begin + TOGETHER, groups))
         pieces = range(0, groups, TOGETHER)
         if len(pieces) > 1 and _cores() > 1:
             with ThreadPoolExecutor(_cores()) as pool:
@@ -116,52 +228,115 @@ def _cores() -> int:
 
 
 def _module(closed: ClosedJaxpr, width: int) -> str:
-    """`void lanes(const void **given, void **told, int64 begin, int64 end)`, over groups."""
+    """`void lanes(const void **given, void **told, int64 lanes, int64 begin, int64 end)`.
+
+    Over groups of lanes; arrays lie there row after row, lanes last.
+    """
     module = ir.Module(NAME)
     pointer = ir.PointerType()
     kernel = ir.Function(
-        module, ir.FunctionType(ir.VoidType(), [pointer, pointer, LONG, LONG]), NAME
+        module, ir.FunctionType(ir.VoidType(), [pointer, pointer, LONG, LONG, LONG]), NAME
     )
     build = ir.IRBuilder(kernel.append_basic_block("entry"))
-    emitter = Emitter(build, width)
-    given, told, begin, end = kernel.args
+    arrays = Arrays(build, width)
+    given, told, n_lanes, begin, end = kernel.args
+    inputs, outputs = closed.in_avals, closed.out_avals
 
     def entry(base: Any, index: int) -> Any:
         place = build.gep(base, [ir.Constant(LONG, index)], source_etype=pointer)
         return build.load(place, typ=pointer)
 
-    def in_memory(aval: Any) -> ir.Type:
-        number = NUMBERS[aval.dtype.name]
-        return BYTE if number == TRUTH else number
-
-    inputs, outputs = closed.in_avals, closed.out_avals
     sources = [entry(given, i) for i in range(len(inputs))]
     targets = [entry(told, i) for i in range(len(outputs))]
 
-    def group(state: list[Any]) -> list[Any]:
-        lane = build.mul(state[0], ir.Constant(LONG, width))
-        values = []
-        for source, aval in zip(sources, inputs, strict=True):
-            number = in_memory(aval)
-            if aval.shape == ():
-                values.append(build.load(source, typ=number))
-                continue
-            place = build.gep(source, [lane], source_etype=number)
-            vector = ir.VectorType(number, width)
-            values.append(build.load(place, typ=vector, align=aval.dtype.itemsize))
-        results = emitter.closed(closed, values)
-        for target, aval, value in zip(targets, outputs, results, strict=True):
-            number, kind = in_memory(aval), ir.VectorType(NUMBERS[aval.dtype.name], width)
-            whole = emitter.spread(value, kind)
-            if number == BYTE:
-                whole = build.zext(whole, ir.VectorType(BYTE, width))
-            place = build.gep(target, [lane], source_etype=number)
-            build.store(whole, place, align=aval.dtype.itemsize)
-        return [build.add(state[0], ir.Constant(LONG, 1))]
+    def group(first: Any, _: Any) -> list[Any]:
+        lane = build.mul(first, ir.Constant(LONG, width))
 
-    emitter.loop([begin], lambda state: build.icmp_signed("<", state[0], end), group)
+        def place(base: Any, aval: Any, index: Index) -> tuple[Any, ir.Type]:
+            """Where a row's lanes are, and as what they lie there."""
+            number = NUMBERS[aval.dtype.name]
+            number = BYTE if number == TRUTH else number
+            if aval.shape == ():
+                return base, number
+            row = arrays.linear(index, aval.shape[:-1])
+            where = build.add(build.mul(row, n_lanes), lane)
+            return build.gep(base, [where], source_etype=number), arrays.vector(number)
+
+        def input_of(base: Any, aval: Any) -> Entries:
+            def at(index: Index) -> Any:
+                where, kind = place(base, aval, index)
+                return build.load(where, typ=kind, align=aval.dtype.itemsize)
+
+            field = Field(aval.shape[:-1], arrays.kind_of(aval), at)
+            return arrays.entries(field) if math.prod(field.shape) <= HELD else field
+
+        def write(base: Any, aval: Any, value: Entries) -> None:
+            def store(index: Index, _: Any) -> list[Any]:
+                where, kind = place(base, aval, index)
+                whole = arrays.spread(arrays.entry(value, index))
+                whole = build.zext(whole, kind) if kind.element == BYTE else whole
+                build.store(whole, where, align=aval.dtype.itemsize)
+                return []
+
+            arrays.each(aval.shape[:-1], store)
+
+        values = [input_of(*pair) for pair in zip(sources, inputs, strict=True)]
+        results = arrays.closed(closed, values)
+        for target, aval, value in zip(targets, outputs, results, strict=True):
+            write(target, aval, value)
+        return []
+
+    arrays.range(begin, end, group)
     build.ret_void()
+    _add_handler(module, kernel, len(inputs), len(outputs), width)
     return str(module)
+
+
+def _add_handler(module: ir.Module, kernel: ir.Function, n_in: int, n_out: int, width: int) -> None:
+    """`XLA_FFI_Error *handler(XLA_FFI_CallFrame *)`: the kernel as XLA calls functions from afar.
+
+    Offsets in bytes from its xla/ffi/api/c_api.h, whose structs only ever grow at their ends.
+    """
+    pointer = ir.PointerType()
+    handler = ir.Function(module, ir.FunctionType(pointer, [pointer]), HANDLER)
+    build = ir.IRBuilder(handler.append_basic_block("entry"))
+    asked, called = (handler.append_basic_block(name) for name in ("asked", "called"))
+    frame, none = handler.args[0], ir.Constant(pointer, None)
+
+    def at(base: Any, offset: int) -> Any:
+        return build.gep(base, [ir.Constant(LONG, offset)], source_etype=BYTE)
+
+    def read(base: Any, offset: int, kind: ir.Type = pointer) -> Any:
+        return build.load(at(base, offset), typ=kind)
+
+    extension = read(frame, 8)
+    build.cbranch(build.icmp_unsigned("==", extension, none), called, asked)
+    build.position_at_end(asked)  # for the version of the interface: it is the caller's own
+    metadata, version = read(extension, 24), at(read(frame, 16), 16)
+    for field in (16, 20):
+        build.store(read(version, field, INT), at(metadata, 8 + field))
+    build.ret(none)
+    build.position_at_end(called)
+
+    def buffers(offset: int, count: int) -> tuple[Any, Any]:
+        """Pointers to the data of a list of buffers, and the last of them."""
+        listed, buffer = read(frame, offset), None
+        pointers = build.alloca(pointer, ir.Constant(LONG, count))
+        for i in range(count):
+            buffer = read(listed, 8 * i)
+            build.store(
+                read(buffer, 24), build.gep(pointers, [ir.Constant(LONG, i)], source_etype=pointer)
+            )
+        return pointers, buffer
+
+    given, first = buffers(72, n_in)
+    told, _ = buffers(112, n_out)
+    rank = read(first, 32, LONG)
+    last = build.sub(rank, ir.Constant(LONG, 1))
+    n_lanes = build.load(build.gep(read(first, 40), [last], source_etype=LONG), typ=LONG)
+    groups = build.sdiv(n_lanes, ir.Constant(LONG, width))
+    build.call(kernel, [given, told, n_lanes, ir.Constant(LONG, 0), groups])
+    build.ret(none)
 
 
 def _compiled(text: str) -> bytes:

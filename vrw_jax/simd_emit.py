@@ -1,9 +1,7 @@
-"""From JAX's trace of a function over lanes to LLVM's intermediate language, value by value.
+"""Arithmetic of JAX's primitives as LLVM's: one number, or one for each of a few lanes.
 
-Every array of the function is either one number, the same for all lanes, or one number for each of
-`width` lanes, which becomes one LLVM vector. Loops become loops; nothing is ever in memory but what
-the compiler can't hold in registers. Knows the primitives that elementwise code is made of, says so
-where it meets another.
+Whatever repeats itself is computed once. Knows the primitives that elementwise code is made of, and
+says so where it meets another.
 """
 
 import contextlib
@@ -13,7 +11,6 @@ from typing import Any
 
 import llvmlite.ir as ir
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Literal
 
 Value = Any
 """An LLVM value: a number or a vector of them."""
@@ -51,104 +48,74 @@ INTRINSICS = {
     "abs": "fabs", "sqrt": "sqrt", "sin": "sin", "cos": "cos", "floor": "floor", "exp": "exp",
     "log": "log",
 }  # fmt: skip
-CALLS = {
-    "jit": "jaxpr",
-    "pjit": "jaxpr",
-    "closed_call": "call_jaxpr",
-    "custom_jvp_call": "call_jaxpr",
-    "custom_vjp_call": "call_jaxpr",
-}
 SAME = ("stop_gradient", "copy")
 
 
-class Emitter:
-    """Writes what traces say into a function of `builder`'s module."""
+class Numbers:
+    """Writes arithmetic into a function of `builder`'s module."""
 
     def __init__(self, builder: ir.IRBuilder, width: int) -> None:
         self.builder, self.width = builder, width
         # What was computed before, by operation and operands: traces repeat themselves a lot.
-        self.known: ChainMap[tuple, list[Value]] = ChainMap()
+        self.known: ChainMap[tuple, Any] = ChainMap()
         self.constants: dict[tuple[str, str], ir.Constant] = {}
 
-    def type_of(self, aval: Any) -> ir.Type:
-        """The LLVM type of one of the trace's arrays."""
-        if aval.dtype.name not in NUMBERS or aval.shape not in ((), (self.width,)):
-            raise NotImplementedError(
-                f"{aval.str_short()} is neither a number nor one for each of {self.width} lanes."
-            )
-        number = NUMBERS[aval.dtype.name]
-        return ir.VectorType(number, self.width) if aval.shape else number
-
-    def closed(self, closed: ClosedJaxpr, values: Sequence[Value]) -> list[Value]:
-        """The results of a trace for these values."""
-        jaxpr = closed.jaxpr
-        places: dict[Any, Value] = dict(zip(jaxpr.invars, values, strict=True))
-        for variable, value in zip(jaxpr.constvars, closed.consts, strict=True):
-            array = np.asarray(value)
-            places[variable] = array if array.ndim else self._constant_of(variable.aval, array)
-
-        def read(atom: Any) -> Value:
-            if isinstance(atom, Literal):
-                return self._constant_of(atom.aval, atom.val)
-            return places[atom]
-
-        for equation in jaxpr.eqns:
-            results = self._equation(equation, [read(atom) for atom in equation.invars])
-            places.update(zip(equation.outvars, results, strict=True))
-        return [read(atom) for atom in jaxpr.outvars]
+    def vector(self, number: ir.Type) -> ir.VectorType:
+        """A number of that type for each lane."""
+        return ir.VectorType(number, self.width)
 
     def constant(self, kind: ir.Type, value: Any) -> ir.Constant:
         """`value` as a constant of that type, the same for all lanes."""
         if isinstance(kind, ir.VectorType):
-            return self.spread(self.constant(kind.element, value), kind)
+            return self.spread(self.constant(kind.element, value))
         number = int(value) if isinstance(kind, ir.IntType) else float(value)
-        return self.constants.setdefault((str(kind), str(number)), ir.Constant(kind, number))
+        return self.constants.setdefault((str(kind), repr(number)), ir.Constant(kind, number))
 
-    def _constant_of(self, aval: Any, value: Any) -> ir.Constant:
-        return self.constant(self.type_of(aval), value)
-
-    def spread(self, value: Value, kind: ir.Type) -> Value:
-        """A number as a vector, where `kind` is one."""
-        if value.type == kind or not isinstance(kind, ir.VectorType):
+    def spread(self, value: Value) -> Value:
+        """A number as a vector."""
+        if isinstance(value.type, ir.VectorType):
             return value
+        kind = self.vector(value.type)
         if isinstance(value, ir.Constant):
             key = (str(kind), str(value))
             if key not in self.constants:
                 self.constants[key] = ir.Constant(kind, [value] * kind.count)
             return self.constants[key]
+        return self.once(("spread", id(value)), lambda: self._spread(value, kind))
+
+    def _spread(self, value: Value, kind: ir.VectorType) -> Value:
         empty = ir.Constant(kind, ir.Undefined)
         first = self.builder.insert_element(empty, value, ir.Constant(INT, 0))
         order = ir.Constant(ir.VectorType(INT, kind.count), [0] * kind.count)
         return self.builder.shuffle_vector(first, empty, order)
 
-    def _equation(self, equation: Any, values: list[Value]) -> list[Value]:
-        name, params = equation.primitive.name, equation.params
-        if name in CALLS:
-            return self.closed(params[CALLS[name]], values)
-        if name == "while":
-            return self._while(params, values)
-        if name == "scan":
-            return self._scan(params, values)
-        told = {key: str(params[key]) for key in ("new_dtype", "y") if key in params}
-        out = equation.outvars[0].aval
-        key = (name, *map(id, values), *told.items(), out.shape, out.dtype.name)
-        if key in self.known:  # values live as long as their function: no id is given twice
-            return self.known[key]
-        self.known[key] = [self._elementwise(name, params, equation, values)]
+    def once(self, key: tuple, make: Callable[[], Any]) -> Any:
+        """Made where it is asked for first. What a key names by `id` must live as long as this."""
+        if key not in self.known:
+            self.known[key] = make()
         return self.known[key]
 
-    def _elementwise(self, name: str, params: Any, equation: Any, values: list[Value]) -> Value:
-        """One primitive with one result."""
-        build, before = self.builder, equation.invars[0].aval.dtype
-        floats = before.kind == "f"
-        kind = self.type_of(equation.outvars[0].aval)
-        if name in ARITHMETIC or name in BITS or name in COMPARISONS or name in ("max", "min"):
-            vectors = [x.type for x in values if isinstance(x.type, ir.VectorType)]
-            x, y = (self.spread(value, (*vectors, values[0].type)[0]) for value in values)
-            if name in ARITHMETIC:
-                flags = RECIPROCAL if name == "div" and before == np.float64 else FUSED
-                method = ARITHMETIC[name][0 if floats else 1]
-                return getattr(build, method)(x, y, **({"flags": flags} if floats else {}))
+    def elementwise(
+        self, name: str, params: Any, before: Any, after: Any, values: Sequence[Value]
+    ) -> Value:
+        """One of JAX's primitives on numbers of type `before`, giving one of `after`."""
+        key = (name, str(after), params.get("y"), *map(id, values))
+        return self.once(key, lambda: self._elementwise(name, params, before, after, values))
+
+    def _alike(self, *values: Value) -> list[Value]:
+        """Vectors where one of them is."""
+        if any(isinstance(value.type, ir.VectorType) for value in values):
+            return [self.spread(value) for value in values]
+        return list(values)
+
+    def _elementwise(
+        self, name: str, params: Any, before: Any, after: Any, values: Sequence[Value]
+    ) -> Value:
+        build, floats = self.builder, before.kind == "f"
+        if name in ARITHMETIC:
+            return self._arithmetic(name, before, *values)
+        if name in BITS or name in COMPARISONS or name in ("max", "min"):
+            x, y = self._alike(*values)
             if name in BITS:
                 return getattr(build, BITS[name])(x, y)
             if name in COMPARISONS:
@@ -158,20 +125,22 @@ class Emitter:
             return build.select(build.fcmp_unordered("uno", x, x), x, chosen) if floats else chosen
         if name == "select_n":
             where, *cases = values
-            no, yes = (self.spread(value, kind) for value in cases)
+            if isinstance(where.type, ir.VectorType):
+                cases = [self.spread(case) for case in cases]
+            no, yes = self._alike(*cases)
             return build.select(where, yes, no)
-        if name == "broadcast_in_dim":
-            return self.spread(values[0], kind)
         if name in SAME:
             return values[0]
         if name == "convert_element_type":
-            return self._converted(values[0], before, equation.outvars[0].aval.dtype, kind)
+            return self._converted(values[0], before, after)
         if name == "neg":
             return build.fneg(values[0]) if floats else build.neg(values[0])
         if name == "not":
             return build.not_(values[0])
         if name == "integer_pow":
             return self._power(values[0], params["y"])
+        if name == "square":
+            return build.fmul(values[0], values[0], flags=FUSED)
         if name in ("exp", "log") and before == np.float32:
             return (self._exponential if name == "exp" else self._logarithm)(values[0])
         if name in INTRINSICS and floats:
@@ -179,12 +148,26 @@ class Emitter:
         if name == "is_finite":
             size = self._intrinsic("fabs", values[0])
             return build.fcmp_ordered("<", size, self.constant(size.type, np.inf))
-        if name in ("reduce_or", "reduce_and"):
-            bits = build.bitcast(values[0], ir.IntType(self.width))
-            if name == "reduce_or":
-                return build.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
-            return build.icmp_unsigned("==", bits, ir.Constant(bits.type, -1))
-        raise NotImplementedError(f"{name} is not elementwise: {equation}")
+        raise NotImplementedError(f"{name} is not elementwise over lanes.")
+
+    def _arithmetic(self, name: str, dtype: Any, x: Value, y: Value) -> Value:
+        """Sums and products, without the terms that are known to be zero and factors one."""
+        floats = dtype.kind == "f"
+        zero, one = (lambda v, n=n: isinstance(v, ir.Constant) and _is(v, n) for n in (0, 1))
+        if name in ("add", "add_any", "sub") and zero(y):
+            return x
+        if name in ("add", "add_any") and zero(x):
+            return y
+        if name in ("mul", "div") and one(y):
+            return x
+        if name == "mul" and one(x):
+            return y
+        if name == "mul" and (zero(x) or zero(y)):
+            return x if zero(x) else y
+        flags = RECIPROCAL if name == "div" and dtype == np.float64 else FUSED
+        x, y = self._alike(x, y)
+        method = ARITHMETIC[name][0 if floats else 1]
+        return getattr(self.builder, method)(x, y, **({"flags": flags} if floats else {}))
 
     def _compare(self, how: str, floats: bool, x: Value, y: Value) -> Value:
         if not floats:
@@ -192,8 +175,9 @@ class Emitter:
         ordered = self.builder.fcmp_unordered if how == "!=" else self.builder.fcmp_ordered
         return ordered(how, x, y)
 
-    def _converted(self, value: Value, before: Any, after: Any, kind: ir.Type) -> Value:
-        build = self.builder
+    def _converted(self, value: Value, before: Any, after: Any) -> Value:
+        build, kind = self.builder, NUMBERS[after.name]
+        kind = self.vector(kind) if isinstance(value.type, ir.VectorType) else kind
         if before == after:
             return value
         if after.kind == "b":
@@ -266,7 +250,7 @@ class Emitter:
         return build.fmul(part, build.bitcast(scale, kind))
 
     @contextlib.contextmanager
-    def _inner(self) -> Iterator[None]:
+    def inner(self) -> Iterator[None]:
         """What is computed within is not known after."""
         self.known = self.known.new_child()
         yield
@@ -288,53 +272,24 @@ class Emitter:
             phi = build.phi(value.type)
             phi.add_incoming(value, before)
             values.append(phi)
-        with self._inner():
+        with self.inner():
             build.cbranch(goes_on(values), within, after)
             build.position_at_end(within)
             following = body(values)
             for phi, value in zip(values, following, strict=True):
-                phi.add_incoming(self.spread(value, phi.type), build.block)
+                alike = self.spread(value) if isinstance(phi.type, ir.VectorType) else value
+                phi.add_incoming(alike, build.block)
             build.branch(head)
         build.position_at_end(after)
         return values
 
-    def _while(self, params: Any, values: list[Value]) -> list[Value]:
-        n_goes, n_body = params["cond_nconsts"], params["body_nconsts"]
-        fixed, own = values[:n_goes], values[n_goes : n_goes + n_body]
-        return self.loop(
-            values[n_goes + n_body :],
-            lambda carried: self.closed(params["cond_jaxpr"], [*fixed, *carried])[0],
-            lambda carried: self.closed(params["body_jaxpr"], [*own, *carried]),
-        )
 
-    def _scan(self, params: Any, values: list[Value]) -> list[Value]:
-        """A loop of known length over constants, one number for each turn; nothing is stacked."""
-        n_fixed, n_carried = params["num_consts"], params["num_carry"]
-        fixed, carried = values[:n_fixed], values[n_fixed : n_fixed + n_carried]
-        tables = [self._table(np.asarray(x)) for x in values[n_fixed + n_carried :]]
-        end = ir.Constant(LONG, params["length"])
-
-        def turn(state: list[Value]) -> list[Value]:
-            count, *rest = state
-            given = [self._entry(table, count) for table in tables]
-            following = self.closed(params["jaxpr"], [*fixed, *rest, *given])
-            return [self.builder.add(count, ir.Constant(LONG, 1)), *following]
-
-        goes_on = lambda state: self.builder.icmp_signed("<", state[0], end)
-        return self.loop([ir.Constant(LONG, 0), *carried], goes_on, turn)[1:]
-
-    def _table(self, array: np.ndarray) -> ir.GlobalVariable:
-        kind = ir.ArrayType(NUMBERS[array.dtype.name], len(array))
-        module = self.builder.module
-        table = ir.GlobalVariable(module, kind, module.get_unique_name("table"))
-        table.initializer = ir.Constant(kind, [self.constant(kind.element, x) for x in array])
-        table.global_constant, table.linkage = True, "internal"
-        return table
-
-    def _entry(self, table: ir.GlobalVariable, index: Value) -> Value:
-        kind = table.value_type
-        place = self.builder.gep(table, [ir.Constant(LONG, 0), index], source_etype=kind)
-        return self.builder.load(place, typ=kind.element)
+def _is(constant: ir.Constant, number: int) -> bool:
+    """Whether a constant is that number, in every lane."""
+    value = constant.constant
+    if isinstance(value, (list, tuple)):
+        return all(_is(entry, number) for entry in value)
+    return isinstance(value, (int, float)) and value == number
 
 
 def _fitted(function: Callable[[np.ndarray], np.ndarray], degree: int) -> list[float]:

@@ -5,13 +5,9 @@ derivatives takes longer than a scan of thousands. Where that cache is on, its f
 traces, by a key of everything that they depend on, the library's source included.
 """
 
-import functools
 import hashlib
-import os
-import tempfile
 from collections.abc import Callable
 from contextvars import ContextVar
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -19,18 +15,9 @@ import jax.numpy as jnp
 from jax import export
 from jax.sharding import SingleDeviceSharding
 
+from vrw_jax import simd
+from vrw_jax.code_cache import code_digest, folder, keep, kept
 from vrw_jax.start import fusion_emitters
-
-
-@functools.cache
-def code_digest() -> str:
-    """A digest of the library's source: other code may give other digits."""
-    digest = hashlib.sha256()
-    folder = Path(__file__).parent
-    for path in sorted(folder.rglob("*.py")):
-        digest.update(path.relative_to(folder).as_posix().encode())
-        digest.update(path.read_bytes())
-    return digest.hexdigest()
 
 
 def compiled(
@@ -58,7 +45,7 @@ def remembered(function: Callable, settings: object) -> Callable:
     """
 
     def call(*arguments: Any) -> Any:
-        if _exporting.get() or not _folder():
+        if _exporting.get() or not folder():
             return function(*arguments)
         return _exported(function, arguments, settings).call(*jax.tree.leaves(arguments))
 
@@ -71,46 +58,32 @@ def _exported(function: Callable, arguments: tuple, settings: object) -> export.
     shapes = [jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)) for x in leaves]
     told = (settings, str(structure), shapes, jax.__version__, jax.default_backend(), code_digest())
     name = f"vrw_trace_{hashlib.sha256(repr(told).encode()).hexdigest()}"
-    trace = kept(name)
-    exported = None if trace is None else export.deserialize(bytearray(trace))
-    if exported is None:
-        flat = jax.jit(lambda *leaves: function(*jax.tree.unflatten(structure, leaves)))
-        outside = _exporting.set(True)  # what is remembered within is part of this trace
-        try:
-            exported = export.export(flat)(*shapes)
-        finally:
-            _exporting.reset(outside)
-        keep(name, bytes(exported.serialize()))
+    content = kept(name)
+    if content is not None:
+        names, _, trace = content.partition(b"\n")
+        if simd.at_hand(names.decode().split()):
+            return export.deserialize(bytearray(trace))
+    flat = jax.jit(lambda *leaves: function(*jax.tree.unflatten(structure, leaves)))
+    outside = _exporting.set(True)  # what is remembered within is part of this trace
+    try:
+        called = sorted(_calls(flat.trace(*shapes).jaxpr))  # once: what follows finds the trace
+        allowed = [export.DisabledSafetyCheck.custom_call(name) for name in called]
+        exported = export.export(flat, disabled_checks=allowed)(*shapes)
+    finally:
+        _exporting.reset(outside)
+    keep(name, " ".join(called).encode() + b"\n" + bytes(exported.serialize()))
     return exported
 
 
+def _calls(trace: Any) -> set[str]:
+    """Names of the machine code that a trace calls."""
+    trace = getattr(trace, "jaxpr", trace)
+    names = {e.params["target_name"] for e in trace.eqns if e.primitive.name == "ffi_call"}
+    for equation in trace.eqns:
+        for leaf in jax.tree.leaves(list(equation.params.values())):
+            if hasattr(getattr(leaf, "jaxpr", leaf), "eqns"):
+                names |= _calls(leaf)
+    return names
+
+
 _exporting: ContextVar[bool] = ContextVar("_exporting", default=False)
-
-
-def _folder() -> Any:
-    return jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
-
-
-def kept(name: str) -> bytes | None:
-    """What was kept under that name beside JAX's compiled code; None if nothing, or damaged."""
-    place = _folder() and Path(_folder()) / name
-    if not place or not place.exists():
-        return None
-    stored = place.read_bytes()
-    digest, content = stored[:32], stored[32:]
-    return content if hashlib.sha256(content).digest() == digest else None
-
-
-def keep(name: str, content: bytes) -> None:
-    """Written beside its place and renamed; a cache that can't be written is no error."""
-    if not _folder():
-        return
-    place = Path(_folder()) / name
-    try:
-        place.parent.mkdir(parents=True, exist_ok=True)
-        handle, unfinished = tempfile.mkstemp(dir=place.parent)
-        with os.fdopen(handle, "wb") as file:
-            file.write(hashlib.sha256(content).digest() + content)
-        os.replace(unfinished, place)
-    except OSError:
-        return
