@@ -7,6 +7,7 @@ import numpy as np
 import truth
 
 import vrw_jax as vrw
+from vrw_jax import lane_step
 
 SIZE = 16
 TABLE_1 = truth.PARAMETERS[0]
@@ -31,12 +32,13 @@ def padded(rows, width):
 
 
 @eqx.filter_jit
-def _full(vectors, starts, options, model):
-    one = lambda vector, start: model.step(truth.wheel(vector), start, options)
+def _full(vectors, starts, options, model, by_lanes):
+    take = lane_step.step if by_lanes else type(model).step
+    one = lambda vector, start: take(model, truth.wheel(vector), start, options)
     return jax.vmap(one)(vectors, starts)
 
 
-def full_steps(vectors, starts, options=None, model=None):
+def full_steps(vectors, starts, options=None, model=None, by_lanes=False):
     """Full step results of a batch of wheels (rows of parameters) from section states."""
     count = max(np.atleast_2d(vectors).shape[0], np.atleast_2d(starts).shape[0])
     result = _full(
@@ -44,6 +46,7 @@ def full_steps(vectors, starts, options=None, model=None):
         jnp.asarray(padded(starts, 3)),
         vrw.Options() if options is None else options,
         vrw.ViscoelasticWheel() if model is None else model,
+        by_lanes,
     )
     return jax.tree.map(lambda leaf: leaf[:count], result)
 

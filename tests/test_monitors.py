@@ -1,5 +1,7 @@
 """Monitors and forces against Newton's law on the point masses, from the independent oracle."""
 
+import functools
+
 import jax
 import numpy as np
 import pytest
@@ -12,12 +14,13 @@ import vrw_jax as vrw
 CASES = (0, 1, 5)  # Table 1; c = 100, where foot 2 scuffs; a heavy-legged, softly damped wheel
 
 
+@pytest.mark.parametrize("by_lanes", [False, True], ids=["wheel", "lanes"])
 @pytest.mark.parametrize("index", CASES, ids=lambda i: truth.CASES[i]["name"])
-def test_every_margin_is_that_of_the_oracle(index):
+def test_every_margin_is_that_of_the_oracle(index, by_lanes):
     params = {k: float(v) for k, v in truth.CASES[index]["params"].items()}
     params["n_legs"] = int(params["n_legs"])
     start = truth.table("step", "start")[index]
-    found = full_steps(truth.PARAMETERS[index], start, vrw.Options.tight())
+    found = full_steps(truth.PARAMETERS[index], start, vrw.Options.tight(), by_lanes=by_lanes)
     found = jax.tree.map(lambda leaf: np.asarray(leaf[0]), found)
     m = found.monitors
     oracle = five_coordinates.monitors(params, start)
@@ -97,3 +100,33 @@ def test_a_rear_foot_without_load_after_the_landing_skips_double_support():
     assert float(found.indicators.lambda_I4) > 0.0
     assert float(found.indicators.lambda_4) < 0.0
     assert float(found.durations[0]) == 0.0
+
+
+def test_lanes_tell_all_of_a_step_that_the_wheel_does():
+    # Gaits, steps without double support (A3, B3), falls and a bad wheel, side by side.
+    vectors = wheels_like(
+        damping=[200.0, 60.0, 225.0, 100.0, -1.0, 160.0],
+        slope=[0.30, 0.23, 0.39, 0.09, 0.30, 0.30],
+    )
+    starts = np.array(
+        [[0.1027, 2.0, -0.109], [0.34, 1.35, 1.14], [0.34, 1.63, -0.43], [0.1027, 1.2, -0.109],
+         [0.1027, 2.0, -0.109], [0.1027, 1.8, -0.1]]
+    )  # fmt: skip
+    wheel, lanes = (full_steps(vectors, starts, by_lanes=way) for way in (False, True))
+    assert len(set(map(int, wheel.outcome))) == 3
+    for place, one in jax.tree_util.tree_leaves_with_path(wheel):
+        if "solver_steps" not in jax.tree_util.keystr(place):
+            other = functools.reduce(lambda tree, key: getattr(tree, key.name), place, lanes)
+            # Both engines' errors at the default tolerances; friction is a ratio of forces.
+            np.testing.assert_allclose(other, one, rtol=1e-8, atol=1e-8, err_msg=str(place))
+
+
+def test_a_lane_s_monitors_are_bitwise_its_own():
+    rng = np.random.default_rng(1)
+    vectors = wheels_like(damping=rng.uniform(100.0, 215.0, 16))
+    starts = np.array([0.1027, 2.0, -0.109]) * rng.uniform(0.95, 1.05, (16, 1))
+    whole = full_steps(vectors, starts, by_lanes=True)
+    some = rng.permutation(16)[:7]
+    part = full_steps(vectors[some], starts[some], by_lanes=True)
+    for a, b in zip(jax.tree.leaves(part), jax.tree.leaves(whole), strict=True):
+        np.testing.assert_array_equal(a, np.asarray(b)[some])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from vrw_jax import simd, traces
+from vrw_jax import simd, simd_trace, traces
 
 DRAW = np.random.default_rng(0)
 
@@ -193,6 +193,22 @@ def test_functions_of_arrays_are_called_from_programs_of_jax(n):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
 
 
+def test_functions_set_apart_are_called_and_give_the_same():
+    def cubes(how):
+        def run(_, lanes):
+            power = how(lambda x, y: (x * y * y, x + lanes[0]))
+            a, b = power(*power(*lanes))
+            along = jax.jvp(power, (a, b), (b, a))[1]
+            return (a, b, *along)
+
+        return run
+
+    lanes = [DRAW.normal(size=11) for _ in range(2)]
+    called = program(cubes(simd_trace.apart), lanes, settings="apart")([], lanes)
+    for found, expected in zip(called, cubes(jax.jit)((), lanes), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-13)
+
+
 def test_a_kept_program_finds_the_machine_code_that_it_calls(folder, monkeypatch):
     x = jnp.asarray(DRAW.normal(size=(2, 9)))
     double = simd.lane_function(lambda x: 2.0 * x, lambda x: x, "double")
@@ -235,9 +251,9 @@ def test_code_that_is_not_elementwise_is_refused_in_a_sentence():
     lanes = [np.arange(4.0)]
     with pytest.raises(NotImplementedError, match="cumsum is not elementwise"):
         program(lambda _, x: (jnp.cumsum(x[0]),), lanes)
-    with pytest.raises(NotImplementedError, match="takes single lanes"):
+    with pytest.raises(NotImplementedError, match="slice moves, joins or picks lanes"):
         program(lambda _, x: (x[0][:1],), lanes)
     with pytest.raises(NotImplementedError, match="a sum or largest of lanes"):
         program(lambda _, x: (x[0] - jnp.max(x[0]),), lanes)
-    with pytest.raises(NotImplementedError, match="moves the axis of lanes"):
+    with pytest.raises(NotImplementedError, match="transpose moves, joins or picks lanes"):
         program(lambda _, x: (jnp.stack([x[0], x[0]]).T[:, 0],), lanes)

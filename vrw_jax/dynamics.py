@@ -208,20 +208,20 @@ def momentum(s: Symbols, motion: Motion) -> tuple[Elementwise, Elementwise]:
 
 def stopper_force(
     s: Symbols, motion: Motion, acceleration: Acceleration, legs: range
-) -> Float[Array, "... n_legs_asked"]:
+) -> Float[Array, "n_legs_asked ..."]:
     """Force of the stopper that keeps each of `legs` at L0, N; negative where it would come off.
 
     The spring presses with k (L* - L0); weight and acceleration of the leg's mass relieve it.
     """
-    turn = s.alpha * (np.asarray(legs) - 1)
+    turn = s.alpha * (np.asarray(legs).reshape(-1, *(1,) * jnp.ndim(motion.L1)) - 1)
     radial = acceleration.ddL1 - motion.L1 * motion.dtheta * motion.dtheta
     across = 2.0 * motion.dL1 * motion.dtheta + motion.L1 * acceleration.ddtheta
     # Acceleration of the hub less gravity, in the frame of Leg 1.
     radial = radial + s.g * (motion.cos * s.cos_phi - motion.sin * s.sin_phi)
     across = across - s.g * (motion.sin * s.cos_phi + motion.cos * s.sin_phi)
-    along = radial[..., None] * np.cos(turn) + across[..., None] * np.sin(turn)
+    along = radial * np.cos(turn) + across * np.sin(turn)
     spin = s.c0 * motion.dtheta * motion.dtheta
-    return (s.k * (s.Ls - s.L0) + s.m * spin)[..., None] + s.m[..., None] * along
+    return s.k * (s.Ls - s.L0) + s.m * spin + s.m * along
 
 
 class Energy(NamedTuple):

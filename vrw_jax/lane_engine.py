@@ -4,14 +4,23 @@ The same physics as `models.viscoelastic`, whose functions work element by eleme
 quantity of all wheels instead of one wheel's quantities.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from vrw_jax import dynamics, transitions
-from vrw_jax.geometry import Motion, double_support_circle, landing_foot_height, sine_cosine
+from vrw_jax.geometry import (
+    Motion,
+    double_support_circle,
+    landing_foot_height,
+    rear_foot_height,
+    sine_cosine,
+)
+from vrw_jax.lane_minima import Monitors
 from vrw_jax.lane_phase import LanePhase, LanePhaseEnd, integrate_lanes
+from vrw_jax.models import viscoelastic
 from vrw_jax.models.base import replaced_where_bad, usable
 from vrw_jax.models.viscoelastic import PAPER_START, SAFE_SINGLE_SUPPORT, PhaseBuilder
 from vrw_jax.options import Options
@@ -27,6 +36,14 @@ from vrw_jax.runge_kutta import (
 INTO_SINGLE_SUPPORT = 0.3
 """First step of SLS-I over the last of DLS: dropping the rear foot's force excites the airborne
 leg's fast mode, which dies within 0.05 s."""
+
+
+class Walk(NamedTuple):
+    """A gait step of a block of lanes from landing to landing, phase by phase."""
+
+    ends: tuple[LanePhaseEnd, LanePhaseEnd, LanePhaseEnd]
+    happened: tuple[Array, Array, Array]
+    outcome: Int[Array, " lanes"]  # an Outcome
 
 
 class LaneStep(NamedTuple):
@@ -58,12 +75,19 @@ def double_support(build: PhaseBuilder, distance: Array) -> LanePhase:
         sin, cos = sine_cosine(q[0])
         return Slope(sin, cos, accelerate(sin, cos, v[0]))
 
-    def guards(place: Place) -> Vector:
+    def at(place: Place) -> tuple:
         m = motion(place.slope.sin, place.slope.cos, place.v[0])
         a = dynamics.double_support_acceleration(s, distance, m)
         rear = dynamics.rear_foot_force(s, m, a)
-        fore = dynamics.fore_foot_force(s, m, a, rear)
+        return m, a, rear, dynamics.fore_foot_force(s, m, a, rear)
+
+    def guards(place: Place) -> Vector:
+        m, _, rear, fore = at(place)
         return (rear.normal, s.L0 - m.L2, landing_foot_height(s, m), *build.falls(m, fore))
+
+    def premises(place: Place) -> Vector:
+        m, a, _, fore = at(place)
+        return tuple(build.premises(m, a, fore))
 
     return LanePhase(
         evaluate,
@@ -71,7 +95,15 @@ def double_support(build: PhaseBuilder, distance: Array) -> LanePhase:
         build.outcomes(
             Outcome.STEPPED, Outcome.STOPPER_IN_DOUBLE_SUPPORT, Outcome.TOUCHDOWN_BEFORE_STOPPER
         ),
+        _monitors(build, premises, viscoelastic.double_support(build, distance)),
     )
+
+
+def _monitors(
+    build: PhaseBuilder, values: Callable[[Place], Vector], of_one_wheel: viscoelastic.Phase
+) -> Monitors | None:
+    """What the single wheel's phase watches, too."""
+    return Monitors(values, of_one_wheel.watched.count_start) if build.monitored else None
 
 
 def single_support_1(build: PhaseBuilder) -> LanePhase:
@@ -83,15 +115,25 @@ def single_support_1(build: PhaseBuilder) -> LanePhase:
         motion = Motion(sin, cos, q[1], q[2], *v)
         return Slope(sin, cos, tuple(dynamics.single_support_1_acceleration(s, motion)))
 
-    def guards(place: Place) -> Vector:
+    def at(place: Place) -> tuple:
         slope = place.slope
         m = Motion(slope.sin, slope.cos, place.q[1], place.q[2], *place.v)
         a = dynamics.Acceleration(*slope.acceleration)
-        fore = dynamics.fore_foot_force(s, m, a)
+        return m, a, dynamics.fore_foot_force(s, m, a)
+
+    def guards(place: Place) -> Vector:
+        m, _, fore = at(place)
         return (s.L0 - m.L2, landing_foot_height(s, m), *build.falls(m, fore))
 
+    def premises(place: Place) -> Vector:
+        m, a, fore = at(place)
+        return (*build.premises(m, a, fore), rear_foot_height(s, m))
+
     return LanePhase(
-        evaluate, guards, build.outcomes(Outcome.STEPPED, Outcome.TOUCHDOWN_BEFORE_STOPPER)
+        evaluate,
+        guards,
+        build.outcomes(Outcome.STEPPED, Outcome.TOUCHDOWN_BEFORE_STOPPER),
+        _monitors(build, premises, viscoelastic.single_support_1(build)),
     )
 
 
@@ -109,15 +151,28 @@ def single_support_2(build: PhaseBuilder) -> LanePhase:
         sin, cos = sine_cosine(q[0])
         return Slope(sin, cos, accelerate(sin, cos, q[1], v))
 
-    def guards(place: Place) -> Vector:
+    def at(place: Place) -> tuple:
         slope = place.slope
         m = motion(slope.sin, slope.cos, place.q[1], place.v)
         ddtheta, ddL1 = slope.acceleration
         a = dynamics.Acceleration(ddtheta, ddL1, 0.0 * m.L1)
-        fore = dynamics.fore_foot_force(s, m, a)
+        return m, a, dynamics.fore_foot_force(s, m, a)
+
+    def guards(place: Place) -> Vector:
+        m, _, fore = at(place)
         return (landing_foot_height(s, m), *build.falls(m, fore))
 
-    return LanePhase(evaluate, guards, build.outcomes(Outcome.STEPPED))
+    def premises(place: Place) -> Vector:
+        m, a, fore = at(place)
+        rear_stopper = dynamics.stopper_force(s, m, a, range(2, 3))
+        return (*build.premises(m, a, fore), rear_foot_height(s, m), *rear_stopper)
+
+    return LanePhase(
+        evaluate,
+        guards,
+        build.outcomes(Outcome.STEPPED),
+        _monitors(build, premises, viscoelastic.single_support_2(build)),
+    )
 
 
 def _outcome(phase: LanePhase, end: LanePhaseEnd) -> Array:
@@ -137,10 +192,32 @@ def gait_step(
     few: Array | None = None,
 ) -> LaneStep:
     """One gait step of every lane, from touchdown to touchdown. `few`: see `integrate_lanes`."""
+    walked = walk(params, x, options, tableau, stop_at_lift_off, monitored=False, few=few)
+    ends, stepped = walked.ends, walked.outcome == Outcome.STEPPED
+    section = (ends[2].place.q[0], *ends[2].place.v)
+    return LaneStep(
+        section_state=tuple(jnp.where(stepped, value, 0.0) for value in section),
+        durations=tuple(end.duration for end in ends),
+        outcome=walked.outcome,
+        solver_steps=ends[0].tried + ends[1].tried + ends[2].tried,
+        unfinished=ends[0].unfinished | ends[1].unfinished | ends[2].unfinished,
+    )
+
+
+def walk(
+    params: WheelParams,
+    x: Vector,
+    options: Options,
+    tableau: Tableau,
+    stop_at_lift_off: bool,
+    monitored: bool,
+    few: Array | None = None,
+) -> Walk:
+    """One gait step of every lane, with the ends of its phases and the minima of their monitors."""
     good = usable(params, x)
     params, x = replaced_where_bad(good, params, x, PAPER_START)
     s = params.symbols()
-    build = PhaseBuilder(s, stop_at_lift_off, monitored=False)
+    build = PhaseBuilder(s, stop_at_lift_off, monitored)
     landing = transitions.land(s, *x)
     first = options.first_step + jnp.zeros_like(landing.theta)
     stepped = jnp.int32(Outcome.STEPPED)
@@ -181,14 +258,10 @@ def gait_step(
 
     code = jnp.where(active2, jnp.where(active3, code3, code2), code1)
     code = jnp.where(good, code, jnp.int32(Outcome.BAD_INPUT))
-    ends = (end1, end2, end3)
-    section = (end3.place.q[0], *end3.place.v)
-    return LaneStep(
-        section_state=tuple(jnp.where(code == stepped, value, 0.0) for value in section),
-        durations=tuple(end.duration for end in ends),
+    return Walk(
+        ends=(end1, end2, end3),
+        happened=(active1 & (end1.duration > 0.0), active2 & (end2.duration > 0.0), active3),
         outcome=code,
-        solver_steps=end1.tried + end2.tried + end3.tried,
-        unfinished=end1.unfinished | end2.unfinished | end3.unfinished,
     )
 
 

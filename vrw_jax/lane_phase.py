@@ -13,6 +13,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from vrw_jax import simd_trace
+from vrw_jax.lane_minima import Lowest, Monitors, at_start, lowered, settled, with_rates
 from vrw_jax.lanes import select
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
@@ -38,6 +40,7 @@ class LanePhase(NamedTuple):
     evaluate: Evaluate
     guards: Callable[[Place], Vector]
     outcomes: tuple[Outcome, ...]
+    monitors: Monitors | None = None  # whose minima are wanted
 
 
 class LanePhaseEnd(NamedTuple):
@@ -50,6 +53,7 @@ class LanePhaseEnd(NamedTuple):
     unfinished: Array  # left for a run with its like, see `integrate_lanes`
     tried: Array  # steps, accepted or not
     next_step: Array  # length that the controller would try next, s
+    minima: Array | None  # of the monitors, (monitors, lanes)
 
 
 class _March(NamedTuple):
@@ -62,6 +66,7 @@ class _March(NamedTuple):
     tried: Array
     half: Array  # iterations after which half of the lanes had finished
     iterations: Array
+    lowest: Lowest | None
 
 
 MARCHING, TIMED_OUT, GAVE_UP, CROSSED, IDLE = range(5)
@@ -90,28 +95,48 @@ def integrate_lanes(
     `LATE` times as long as half of them: these are marked unfinished, to run again from their start
     among their like.
     """
+    phase = _traced_once(phase)
     start = Place(q, v, phase.evaluate(q, v))
-    values, rates = _with_rates(phase, start)
+    values, rates = with_rates(phase.guards, phase.evaluate, start)
     past = tuple((g < 0.0) | ((g == 0.0) & (r <= 0.0)) for g, r in zip(values, rates, strict=True))
     at_once = _first(past)
     begins = active & (at_once < 0)
 
     march = _march(phase, tableau, start, values, begins, first_step, options, few)
     crossed = march.verdict == CROSSED
+    if phase.monitors is not None:  # a long program, which what follows makes longer
+        phase = _traced_once(phase, simd_trace.apart)
     found = _locate(phase, tableau, march, options)
     lost = crossed & found.open
     duration = march.time + jnp.where(crossed, found.length, 0.0)
+    place, minima = select(crossed, found.end, march.here), None
+    if phase.monitors is not None and march.lowest is not None:
+        given = phase.monitors, phase.evaluate
+        lowest = lowered(*given, march.lowest, march.here, place, found.length, crossed)
+        first_values = jnp.stack(phase.monitors.values(start))
+        minima = settled(
+            phase.monitors, tableau, phase.evaluate, lowest, first_values, options.monitor_steps
+        )
     late = crossed & ~found.open & (duration > options.max_phase_time)
     guard = jnp.where(active & (at_once >= 0), at_once, jnp.where(crossed, found.guard, -1))
     return LanePhaseEnd(
-        place=select(crossed, found.end, march.here),
+        place=place,
         duration=duration,
         guard=jnp.where(lost | late, -1, guard),
         timed_out=(march.verdict == TIMED_OUT) | late,
         unfinished=march.verdict == MARCHING,
         tried=march.tried + jnp.where(crossed, found.tried, 0),
         next_step=march.h,
+        minima=minima,
     )
+
+
+def _traced_once(phase: LanePhase, how: Callable = jax.jit) -> LanePhase:
+    """Its functions, of which each is traced once however often it is called."""
+    monitors = phase.monitors
+    if monitors is not None:
+        monitors = monitors._replace(values=how(monitors.values))
+    return phase._replace(evaluate=how(phase.evaluate), guards=how(phase.guards), monitors=monitors)
 
 
 def _march(
@@ -146,7 +171,10 @@ def _march(
         change, kept = judge(march, taken, inside, end)
         verdict, crossing, accepted, time, h = _verdict(options, march, change, kept, end)
         here, values = select(accepted, (taken.end, end), (march.here, march.values))
-        half = march.half
+        lowest, half = march.lowest, march.half
+        if phase.monitors is not None and lowest is not None:
+            given = phase.monitors, phase.evaluate
+            lowest = lowered(*given, lowest, march.here, taken.end, march.h, accepted)
         if few is not None:
             left = jnp.sum(verdict == MARCHING, dtype=jnp.int32)
             half = jnp.where(2 * left > verdict.size, march.iterations + 1, half)
@@ -160,6 +188,7 @@ def _march(
             tried=march.tried + (march.verdict == MARCHING),
             half=half,
             iterations=march.iterations + 1,
+            lowest=lowest,
         )
 
     none, count = jnp.zeros(first_step.shape, jnp.int32), jnp.zeros((), jnp.int32)
@@ -173,6 +202,7 @@ def _march(
         tried=none,
         half=count,
         iterations=count,
+        lowest=phase.monitors and at_start(phase.monitors, phase.evaluate, start),
     )
     return lax.while_loop(waits, advance, march)
 
@@ -271,7 +301,7 @@ def _locate(phase: LanePhase, tableau: Tableau, march: _March, options: Options)
     bits = [(march.crossing >> i) & 1 == 1 for i in range(len(march.values))]
 
     def propose(search: _Search, end: Place, inside: Place) -> tuple:
-        values, rates = _with_rates(phase, end)
+        values, rates = with_rates(phase.guards, phase.evaluate, end)
         within = phase.guards(inside)
         change, guard = _newton(values, rates, march.crossing)
         at = _first_guess(tableau, march.values, within, values, march.crossing)
@@ -349,16 +379,6 @@ def _first_guess(
             at = jnp.where(falls, jnp.clip(at - step, 0.0, 1.0), at)
         earliest = jnp.where(crosses, jnp.minimum(earliest, at), earliest)
     return earliest
-
-
-def _with_rates(phase: LanePhase, place: Place) -> tuple[Vector, Vector]:
-    """Guards and their derivatives in time along the motion."""
-    n = len(place.q)
-
-    def along(q: Vector, v: Vector) -> Vector:
-        return phase.guards(Place(q, v, phase.evaluate(q, v)))
-
-    return jax.jvp(along, (place.q, place.v), (place.v, place.slope.acceleration[:n]))
 
 
 def _first(conditions: Vector) -> Array:

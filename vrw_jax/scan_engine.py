@@ -18,6 +18,7 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
+from vrw_jax import lane_step
 from vrw_jax.cycle_options import CycleOptions
 from vrw_jax.limit_cycle import LimitCycle, limit_cycle
 from vrw_jax.measures import MARGINS, step_measures
@@ -105,7 +106,8 @@ class Engine:
             return cycle.outcome, cycle.section_state, kept | derivatives
 
         def told_by_step(values: Array, state: Array, options: Options) -> Told:
-            result = model.step(wheel_of(values, base.n_legs), state, options)
+            take = lane_step.step if lane_step.can_run(model, options) else type(model).step
+            result = take(model, wheel_of(values, base.n_legs), state, options)
             measures = step_measures(result)
             names = (*(name for name in plain if name not in OF_CYCLE), *MARGINS)
             return result.outcome, result.section_state, {name: measures[name] for name in names}
@@ -166,13 +168,13 @@ class Engine:
         state = jax.ShapeDtypeStruct((LANES, 3), self._dtype)
         settings = self._settings
         with ThreadPoolExecutor(2) as pool:
-            cycles = [
-                pool.submit(compiled, self._cycle, (values,), ("cycle", *settings), device)
-                for device in devices
-            ]
             given = (values, state, self._options)
             steps = [
                 pool.submit(compiled, self._step, given, ("step", *settings), device)
+                for device in devices
+            ]
+            cycles = [
+                pool.submit(compiled, self._cycle, (values,), ("cycle", *settings), device)
                 for device in devices
             ]
         for device, cycle, step in zip(devices, cycles, steps, strict=True):

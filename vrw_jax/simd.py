@@ -16,7 +16,7 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
-from threading import Lock
+from threading import Lock, RLock
 from typing import Any, NamedTuple
 
 import jax
@@ -27,8 +27,9 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 
 from vrw_jax.code_cache import code_digest, keep, kept
-from vrw_jax.simd_arrays import HELD, LANES, Arrays, Entries, Field, Index
+from vrw_jax.simd_arrays import HELD, LANES, Entries, Field, Index
 from vrw_jax.simd_emit import BYTE, INT, LONG, NUMBERS, TRUTH
+from vrw_jax.simd_trace import Traces
 
 VECTOR = {np.dtype(np.float64): 4, np.dtype(np.float32): 8}
 """Lanes of a vector: 256 bits."""
@@ -64,6 +65,7 @@ def lane_function(
 ) -> Callable[..., Any]:
     """`function` of trees of arrays, lanes on their last axis, as one call within JAX's programs.
 
+    The first array has lanes; numbers without an axis are the same for all.
     As with `lane_program`; but results form a tree, that of `like`, which is quick to trace.
     Without derivatives, on CPUs only, and on the one core that runs the program.
     """
@@ -73,13 +75,16 @@ def lane_function(
         n_lanes = leaves[0].shape[-1]
         width = VECTOR[np.dtype(leaves[0].dtype)]
         missing = -n_lanes % width
-        shapes = [jax.ShapeDtypeStruct((*x.shape[:-1], LANES), x.dtype) for x in leaves]
+        shapes = [
+            jax.ShapeDtypeStruct((*x.shape[:-1], LANES) if jnp.ndim(x) else (), jnp.result_type(x))
+            for x in leaves
+        ]
         flat = lambda *leaves: jax.tree.leaves(function(*jax.tree.unflatten(structure, leaves)))
         code = _code(flat, shapes, (settings, str(structure)), width)
         _register(code)
         if missing:
-            last = [jnp.repeat(x[..., -1:], missing, -1) for x in leaves]
-            leaves = [jnp.concatenate(pair, -1) for pair in zip(leaves, last, strict=True)]
+            fill = lambda x: jnp.concatenate([x, jnp.repeat(x[..., -1:], missing, -1)], -1)
+            leaves = [fill(x) if jnp.ndim(x) else x for x in leaves]
         out = [jax.ShapeDtypeStruct((*n, n_lanes + missing), kind) for n, kind in code.out]
         results = jax.ffi.ffi_call(code.name, out)(*leaves)
         told = jax.tree.structure(jax.eval_shape(like, *arrays))
@@ -149,11 +154,17 @@ def _code(function: Callable, shapes: Any, settings: object, width: int) -> _Cod
     name = f"vrw_lanes_{hashlib.sha256(repr(told).encode()).hexdigest()}"
     content = kept(name)
     if content is None:
-        closed = traced(function, *shapes)
+        with _python:
+            closed = traced(function, *shapes)
+            module = _module(closed, width)
         out = [(aval.shape[:-1], aval.dtype.name) for aval in closed.out_avals]
-        content = json.dumps(out).encode() + b"\n" + _compiled(_module(closed, width))
+        content = json.dumps(out).encode() + b"\n" + _compiled(module)
         keep(name, content)
     return _told(name, content)
+
+
+_python = RLock()
+"""Threads write their programs in turn: the first is soon with LLVM, which needs no lock."""
 
 
 def _told(name: str, content: bytes) -> _Code:
@@ -238,7 +249,7 @@ def _module(closed: ClosedJaxpr, width: int) -> str:
         module, ir.FunctionType(ir.VoidType(), [pointer, pointer, LONG, LONG, LONG]), NAME
     )
     build = ir.IRBuilder(kernel.append_basic_block("entry"))
-    arrays = Arrays(build, width)
+    arrays = Traces(build, width)
     given, told, n_lanes, begin, end = kernel.args
     inputs, outputs = closed.in_avals, closed.out_avals
 
@@ -329,8 +340,8 @@ def _add_handler(module: ir.Module, kernel: ir.Function, n_in: int, n_out: int, 
             )
         return pointers, buffer
 
-    given, first = buffers(72, n_in)
-    told, _ = buffers(112, n_out)
+    given, _ = buffers(72, n_in)
+    told, first = buffers(112, n_out)
     rank = read(first, 32, LONG)
     last = build.sub(rank, ir.Constant(LONG, 1))
     n_lanes = build.load(build.gep(read(first, 40), [last], source_etype=LONG), typ=LONG)

@@ -1,4 +1,4 @@
-"""From JAX's trace of a function over lanes to LLVM's intermediate language, array by array.
+"""Arrays of LLVM values: entries in registers, fields that are computed where an index asks.
 
 An array whose last axis are lanes is, without that axis, an array of LLVM vectors, any other one of
 plain numbers. Small ones are taken apart into their entries, which live in registers: moving axes,
@@ -15,7 +15,6 @@ from typing import Any
 
 import llvmlite.ir as ir
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Literal
 
 from vrw_jax.simd_emit import LONG, NUMBERS, Numbers, Value
 
@@ -70,13 +69,6 @@ class Memory(Field):
 Entries = np.ndarray | Field
 """LLVM values in an array, the axis of lanes left out."""
 
-CALLS = {
-    "jit": "jaxpr",
-    "pjit": "jaxpr",
-    "closed_call": "call_jaxpr",
-    "custom_jvp_call": "call_jaxpr",
-    "custom_vjp_call": "call_jaxpr",
-}
 REDUCED = {
     "reduce_max": "max",
     "reduce_min": "min",
@@ -87,54 +79,32 @@ REDUCED = {
 
 
 class Arrays(Numbers):
-    """Writes what traces say into a function of `builder`'s module."""
+    """Writes operations on arrays into a function of `builder`'s module."""
 
     def __init__(self, builder: ir.IRBuilder, width: int) -> None:
         super().__init__(builder, width)
         self.alive: list[Any] = []  # what is known by `id`
-        self.written_out = False  # within a loop's body that has no loops
+        self.written_out = False  # within a loop's body that has no loops: no fields are made
 
     def kind_of(self, aval: Any) -> ir.Type:
         """What entries of one of the trace's arrays are."""
-        return self.vector(_number(aval)) if _has_lanes(aval) else _number(aval)
+        return self.vector(_number(aval)) if has_lanes(aval) else _number(aval)
 
-    def closed(self, closed: ClosedJaxpr, values: Sequence[Entries]) -> list[Entries]:
-        """The results of a trace for these values."""
-        jaxpr = closed.jaxpr
-        places: dict[Any, Entries] = dict(zip(jaxpr.invars, values, strict=True))
-        for variable, value in zip(jaxpr.constvars, closed.consts, strict=True):
-            places[variable] = self._constants(np.asarray(value), variable.aval)
-
-        def read(atom: Any) -> Entries:
-            if isinstance(atom, Literal):
-                return self._constants(np.asarray(atom.val), atom.aval)
-            return places[atom]
-
-        for equation in jaxpr.eqns:
-            results = self._equation(equation, [read(atom) for atom in equation.invars])
-            places.update(zip(equation.outvars, results, strict=True))
-        return [read(atom) for atom in jaxpr.outvars]
-
-    def _constants(self, value: np.ndarray, aval: Any) -> Entries:
-        if _has_lanes(aval):
+    def constants_of(self, value: np.ndarray, aval: Any) -> Entries:
+        """Numbers of the program."""
+        if has_lanes(aval):
             raise NotImplementedError(f"{aval.str_short()} is constant, but differs by lane.")
         number = _number(aval)
-        entries = _array(value.shape, [self.constant(number, x) for x in value.ravel()])
+        entries = array_of(value.shape, [self.constant(number, x) for x in value.ravel()])
         return entries if value.size <= HELD or self.written_out else self._table(entries)
 
-    def _equation(self, equation: Any, values: list[Entries]) -> list[Entries]:
+    def primitive(self, equation: Any, values: Sequence[Entries]) -> Entries:
+        """The result of an equation that is neither a loop nor a call."""
         name, params = equation.primitive.name, equation.params
         given = [atom.aval for atom in equation.invars]
-        told = [variable.aval for variable in equation.outvars]
-        if name in CALLS:
-            return self.closed(params[CALLS[name]], values)
-        if name == "while":
-            return self._while(params, values)
-        if name == "scan":
-            return self._scan(params, values, given, told)
-        if name == "optimization_barrier":
-            return [self._in_memory(x) if isinstance(x, Field) else x for x in values]
-        out = told[0]
+        out = equation.outvars[0].aval
+        if any(map(has_lanes, given)) and not has_lanes(out) and name not in REDUCED:
+            raise NotImplementedError(f"{name} moves, joins or picks lanes: {equation}")
         if name in REDUCED:
             result: Entries = self._reduced(REDUCED[name], params["axes"], given[0], out, values[0])
         elif hasattr(self, f"_do_{name}"):
@@ -143,13 +113,13 @@ class Arrays(Numbers):
             result = self._mapped(name, params, given[0].dtype, out, values)
         if isinstance(result, Field) and math.prod(result.shape) <= SMALL:
             result = self.entries(result)
-        return [result]
+        return result
 
     def entries(self, array: Entries) -> np.ndarray:
         """All entries, one by one."""
         if isinstance(array, np.ndarray):
             return array
-        return _array(array.shape, [self.entry(array, i) for i in np.ndindex(array.shape)])
+        return array_of(array.shape, [self.entry(array, i) for i in np.ndindex(array.shape)])
 
     def entry(self, array: Entries, index: Index) -> Value:
         """An entry, computed once for each index."""
@@ -244,7 +214,8 @@ class Arrays(Numbers):
 
         self.each(memory.shape, store)
 
-    def _in_memory(self, array: Entries) -> Memory:
+    def in_memory(self, array: Entries) -> Memory:
+        """All entries computed, where an index can reach them."""
         if isinstance(array, Memory):
             return array
         memory = self.room(array.shape, _kind(array))
@@ -254,7 +225,7 @@ class Arrays(Numbers):
     def _table(self, array: np.ndarray) -> Memory:
         """Entries where an index can reach them: constants are stored with the program."""
         if not all(isinstance(x, ir.Constant) for x in array.ravel()):
-            return self._in_memory(array)
+            return self.in_memory(array)
         number = array.ravel()[0].type
         kind = ir.ArrayType(number, array.size)
         module = self.builder.module
@@ -267,16 +238,17 @@ class Arrays(Numbers):
         self, name: str, params: Any, before: Any, out: Any, values: Sequence[Entries]
     ) -> Entries:
         """An elementwise primitive."""
-        shape = _shape(out)
-        # One number for all lanes may have an axis for them, and one number be the same anywhere.
-        values = [self._fitted(x, x.shape[:-1], len(x.shape) > len(shape)) for x in values]
-        values = [self._broadcast(x, shape, range(len(x.shape))) for x in values]
+        shape = shape_of(out)
+        if any(x.shape != shape for x in values):
+            # One number for all lanes may have an axis for them, or be the same anywhere.
+            values = [self._fitted(x, x.shape[:-1], len(x.shape) > len(shape)) for x in values]
+            values = [self._broadcast(x, shape, range(len(x.shape))) for x in values]
         make = lambda some: self.elementwise(name, params, before, out.dtype, some)
         if any(isinstance(x, Field) for x in values):
             at = lambda index: make([self.entry(x, index) for x in values])
             return Field(shape, self.kind_of(out), at)
         entries = zip(*(x.ravel() for x in values), strict=True)  # type: ignore[union-attr]
-        return _array(shape, [make(some) for some in entries])
+        return array_of(shape, [make(some) for some in entries])
 
     def _fitted(self, array: Entries, shape: tuple[int, ...], needed: bool) -> Entries:
         return self._reshaped(array, shape) if needed else array
@@ -301,9 +273,9 @@ class Arrays(Numbers):
     def _do_broadcast_in_dim(
         self, params: Any, given: Any, out: Any, array: Entries, *_: Any
     ) -> Entries:
-        shape, axes = _shape(out), tuple(map(int, params["broadcast_dimensions"]))
+        shape, axes = shape_of(out), tuple(map(int, params["broadcast_dimensions"]))
         array = self._fitted(array, array.shape[:-1], len(array.shape) > len(shape))
-        if _has_lanes(out) and len(array.shape) == len(axes) and axes[-1:] == (len(shape),):
+        if has_lanes(out) and len(array.shape) == len(axes) and axes[-1:] == (len(shape),):
             array = self._reshaped(array, array.shape[:-1])  # one number has the axis of lanes
         result = self._broadcast(array, shape, axes[: len(array.shape)])
         if isinstance(result, Field):
@@ -342,24 +314,20 @@ class Arrays(Numbers):
         return Field(shape, array.kind, at)
 
     def _do_reshape(self, params: Any, given: Any, out: Any, array: Entries) -> Entries:
-        return self._reshaped(array, _shape(out))
+        return self._reshaped(array, shape_of(out))
 
     _do_squeeze = _do_expand_dims = _do_reshape
 
     def _do_transpose(self, params: Any, given: Any, out: Any, array: Entries) -> Entries:
         order = params["permutation"]
-        if _has_lanes(out) and order[-1] != len(out.shape) - 1:
-            raise NotImplementedError("transpose moves the axis of lanes from the last place.")
         order = order[: len(array.shape)]
         if isinstance(array, np.ndarray):
             return array.transpose(order)
         back = np.argsort(order)
         at = lambda index: self.entry(array, tuple(index[i] for i in back))
-        return Field(_shape(out), array.kind, at)
+        return Field(shape_of(out), array.kind, at)
 
     def _do_slice(self, params: Any, given: Any, out: Any, array: Entries) -> Entries:
-        if _has_lanes(given[0]) and not _has_lanes(out):
-            raise NotImplementedError("slice takes single lanes, but lanes are independent.")
         strides = params["strides"] or (1,) * len(params["start_indices"])
         places = zip(params["start_indices"], params["limit_indices"], strides, strict=True)
         slices = [slice(*place) for place in places][: len(array.shape)]
@@ -370,7 +338,7 @@ class Arrays(Numbers):
             pairs = zip(index, slices, strict=True)
             return self.entry(array, tuple(self._shifted(i, s.start, s.step) for i, s in pairs))
 
-        return Field(_shape(out), array.kind, at)
+        return Field(shape_of(out), array.kind, at)
 
     def _shifted(self, i: Any, start: int, step: int = 1) -> Any:
         """start + step * i."""
@@ -405,7 +373,7 @@ class Arrays(Numbers):
                     chosen = self.builder.select(inside, value, chosen)
             return chosen
 
-        return Field(_shape(out), self.kind_of(out), at)
+        return Field(shape_of(out), self.kind_of(out), at)
 
     def _clamped(self, i: Value, last: int) -> Value:
         build, zero, end = self.builder, ir.Constant(LONG, 0), ir.Constant(LONG, last)
@@ -422,7 +390,7 @@ class Arrays(Numbers):
         around = params["padding_config"][: len(array.shape)]
         if any(low < 0 or high < 0 or within for low, high, within in around):
             raise NotImplementedError("pad takes entries away or puts some between.")
-        filled = np.broadcast_to(self.entries(value).reshape(()), _shape(out)).copy()
+        filled = np.broadcast_to(self.entries(value).reshape(()), shape_of(out)).copy()
         inside = tuple(
             slice(low, low + n) for (low, _, _), n in zip(around, array.shape, strict=True)
         )
@@ -430,7 +398,7 @@ class Arrays(Numbers):
         return filled
 
     def _do_iota(self, params: Any, given: Any, out: Any) -> Entries:
-        return self._constants(np.indices(out.shape)[params["dimension"]], out)
+        return self.constants_of(np.indices(out.shape)[params["dimension"]], out)
 
     def _do_dynamic_slice(
         self, params: Any, given: Any, out: Any, table: Entries, *starts: Entries
@@ -441,7 +409,7 @@ class Arrays(Numbers):
         (start,) = self.entries(starts[0]).ravel()
         place = self._clamped(self._converted(start, given[1].dtype, np.dtype(np.int64)),
                               table.shape[0] - 1)  # fmt: skip
-        return _array((1,), [self.entry(table, (place,))])
+        return array_of((1,), [self.entry(table, (place,))])
 
     def _do_dot_general(
         self, params: Any, given: Any, out: Any, left: Entries, right: Entries
@@ -459,13 +427,13 @@ class Arrays(Numbers):
             return self.elementwise("mul", {}, dtype, dtype, (x, y))
 
         plus = lambda x, y: self.elementwise("add", {}, dtype, dtype, (x, y))
-        shape, kind = _shape(out), self.kind_of(out)
+        shape, kind = shape_of(out), self.kind_of(out)
         if length <= SMALL or self.written_out:
             at = lambda index: functools.reduce(plus, [product(index, k) for k in range(length)])
             if isinstance(left, Field) or isinstance(right, Field):
                 return Field(shape, kind, at)
-            return _array(shape, [at(index) for index in np.ndindex(shape)])
-        left, right = self._in_memory(left), self._in_memory(right)
+            return array_of(shape, [at(index) for index in np.ndindex(shape)])
+        left, right = self.in_memory(left), self.in_memory(right)
         memory = self.room(shape, kind)
 
         def total(index: Index, _: Any) -> list[Value]:
@@ -487,7 +455,7 @@ class Arrays(Numbers):
     def _reduced(self, name: str, axes: Sequence[int], before: Any, out: Any, array: Entries
                  ) -> Entries:  # fmt: skip
         """Over axes of entries, and for `or` and `and` over lanes."""
-        over_lanes = _has_lanes(before) and not _has_lanes(out)
+        over_lanes = has_lanes(before) and not has_lanes(out)
         if over_lanes and name not in ("or", "and"):
             raise NotImplementedError(f"a sum or largest of lanes is asked for: {before}.")
         axes = tuple(axis for axis in axes if axis < len(array.shape))
@@ -513,7 +481,7 @@ class Arrays(Numbers):
         values = [reduced(outer) for outer in np.ndindex(*left_over)]
         if over_lanes:
             values = [self._over_lanes(name, value) for value in values]
-        return _array(tuple(left_over), values)
+        return array_of(tuple(left_over), values)
 
     def _over_lanes(self, name: str, value: Value) -> Value:
         build = self.builder
@@ -524,118 +492,8 @@ class Arrays(Numbers):
             return build.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
         return build.icmp_unsigned("==", bits, ir.Constant(bits.type, -1))
 
-    def _while(self, params: Any, values: list[Entries]) -> list[Entries]:
-        n_goes, n_body = params["cond_nconsts"], params["body_nconsts"]
-        fixed, own = values[:n_goes], values[n_goes : n_goes + n_body]
-        carry = _Carry(self, params["body_jaxpr"].out_avals, HELD)
-
-        def goes_on(flat: list[Value]) -> Value:
-            told = self.closed(params["cond_jaxpr"], [*fixed, *carry.arrays(flat)])
-            return self.entries(told[0]).item()
-
-        def body(flat: list[Value]) -> list[Value]:
-            told = self.closed(params["body_jaxpr"], [*own, *carry.arrays(flat)])
-            return carry.on(told)
-
-        start = carry.start(values[n_goes + n_body :])
-        return carry.arrays(self.loop(start, goes_on, body))
-
-    def _scan(
-        self, params: Any, values: list[Entries], given: Sequence[Any], told: Sequence[Any]
-    ) -> list[Entries]:
-        """A loop of known length; what it reads and writes turn by turn lies in memory."""
-        n_fixed, n_carried = params["num_consts"], params["num_carry"]
-        inner, length = params["jaxpr"], params["length"]
-        read = [self._in_memory(x) for x in values[n_fixed + n_carried :]]
-        written = [self.room(_shape(aval), self.kind_of(aval)) for aval in told[n_carried:]]
-        outside, self.written_out = self.written_out, not _has_loops(inner.jaxpr)
-        fixed = values[:n_fixed]
-        limit = math.inf if self.written_out else HELD
-        carry = _Carry(self, inner.out_avals[:n_carried], limit)
-
-        def part(memory: Memory, turn: Value) -> Entries:
-            some = memory.part(turn)
-            return self.entries(some) if math.prod(some.shape) <= limit else some
-
-        def body(turn: Value, flat: list[Value]) -> list[Value]:
-            if params["reverse"]:
-                turn = self.builder.sub(ir.Constant(LONG, length - 1), turn)
-            some = [part(memory, turn) for memory in read]
-            results = self.closed(inner, [*fixed, *carry.arrays(flat), *some])
-            for memory, value in zip(written, results[n_carried:], strict=True):
-                self.fill(memory.part(turn), value)
-            return carry.on(results[:n_carried])
-
-        start = carry.start(values[n_fixed : n_fixed + n_carried])
-        last = carry.arrays(self.counted(length, body, start))
-        self.written_out = outside
-        return [*last, *written]
-
-
-class _Carry:
-    """Arrays between the turns of a loop: in registers up to `limit` entries, else in memory."""
-
-    def __init__(self, arrays: Arrays, avals: Sequence[Any], limit: int | float) -> None:
-        self.owner, self.avals = arrays, avals
-        self.places = [
-            arrays.room(_shape(aval), arrays.kind_of(aval))
-            if math.prod(_shape(aval)) > limit
-            else None
-            for aval in avals
-        ]
-
-    def arrays(self, flat: Sequence[Value]) -> list[Entries]:
-        """What is carried, in a turn or after the last one."""
-        found: list[Entries] = []
-        left = iter(flat)
-        for aval, place in zip(self.avals, self.places, strict=True):
-            shape = _shape(aval)
-            if place is None:
-                found.append(_array(shape, [next(left) for _ in range(math.prod(shape))]))
-            else:  # a field of its own: what was known of it is past
-                found.append(Memory(self.owner, shape, place.kind, place.base))
-        return found
-
-    def start(self, arrays: Sequence[Entries]) -> list[Value]:
-        """Values for registers are returned, the others stored."""
-        for array, place in zip(arrays, self.places, strict=True):
-            if place is not None:
-                self.owner.fill(place, array)
-        return self._in_registers(arrays)
-
-    def on(self, arrays: Sequence[Entries]) -> list[Value]:
-        """From one turn to the next: new values may depend on any of the old."""
-        flat, moves = self._in_registers(arrays), []
-        for array, place in zip(arrays, self.places, strict=True):
-            if place is not None and not (isinstance(array, Memory) and array.base is place.base):
-                fresh = self.owner.room(place.shape, place.kind)
-                self.owner.fill(fresh, array)
-                moves.append((place, fresh))
-        for place, fresh in moves:
-            self.owner.fill(place, fresh)
-        return flat
-
-    def _in_registers(self, arrays: Sequence[Entries]) -> list[Value]:
-        flat = []
-        for array, aval, place in zip(arrays, self.avals, self.places, strict=True):
-            if place is None:
-                full = np.broadcast_to(self.owner.entries(array), _shape(aval)).ravel()
-                flat += [self.owner.spread(x) if _has_lanes(aval) else x for x in full]
-        return flat
-
 
 _FLOATS = (ir.FloatType, ir.DoubleType)
-
-
-def _has_loops(jaxpr: Any) -> bool:
-    """Whether a trace has a loop anywhere."""
-    for equation in jaxpr.eqns:
-        if equation.primitive.name in ("while", "scan"):
-            return True
-        inner = equation.params.get(CALLS.get(equation.primitive.name, ""))
-        if inner is not None and _has_loops(inner.jaxpr):
-            return True
-    return False
 
 
 def _kind(array: Entries) -> ir.Type:
@@ -646,22 +504,25 @@ def _kind(array: Entries) -> ir.Type:
     return next((kind for kind in kinds if isinstance(kind, ir.VectorType)), kinds[0])
 
 
-def _has_lanes(aval: Any) -> bool:
+def has_lanes(aval: Any) -> bool:
     return bool(aval.shape) and aval.shape[-1] == LANES
 
 
-def _shape(aval: Any) -> tuple[int, ...]:
+def shape_of(aval: Any) -> tuple[int, ...]:
     """Without the axis of lanes."""
-    return aval.shape[:-1] if _has_lanes(aval) else aval.shape
+    return aval.shape[:-1] if has_lanes(aval) else aval.shape
 
 
 def _number(aval: Any) -> ir.Type:
-    if aval.dtype.name not in NUMBERS:
+    if aval.dtype not in _NUMBERS:
         raise NotImplementedError(f"numbers of {aval.str_short()} are of no kind known here.")
-    return NUMBERS[aval.dtype.name]
+    return _NUMBERS[aval.dtype]
 
 
-def _array(shape: tuple[int, ...], entries: Sequence[Value]) -> np.ndarray:
+_NUMBERS = {np.dtype(name): kind for name, kind in NUMBERS.items()}  # names are slow to ask for
+
+
+def array_of(shape: tuple[int, ...], entries: Sequence[Value]) -> np.ndarray:
     """An array of LLVM values."""
     array = np.empty(len(entries), object)
     array[:] = entries

@@ -99,7 +99,7 @@ class Numbers:
         self, name: str, params: Any, before: Any, after: Any, values: Sequence[Value]
     ) -> Value:
         """One of JAX's primitives on numbers of type `before`, giving one of `after`."""
-        key = (name, str(after), params.get("y"), *map(id, values))
+        key = (name, after.num, params.get("y"), *map(id, values))
         return self.once(key, lambda: self._elementwise(name, params, before, after, values))
 
     def _alike(self, *values: Value) -> list[Value]:

@@ -211,15 +211,15 @@ def locked_leg_impulses(
     motion: Motion,
     jump: tuple[Elementwise, Elementwise],
     legs: range,
-) -> Float[Array, "... n_legs_asked"]:
+) -> Float[Array, "n_legs_asked ..."]:
     """Stopper impulse on the mass of each of `legs` for a jump of the hub's velocity, N s.
 
     Negative where the collision throws the leg off its stopper: a preload resists no impulse.
     """
-    turn = s.alpha * (np.asarray(legs) - 1)
+    turn = s.alpha * (np.asarray(legs).reshape(-1, *(1,) * jnp.ndim(motion.sin)) - 1)
     radial = jump[0] * motion.sin + jump[1] * motion.cos
     across = jump[0] * motion.cos - jump[1] * motion.sin
-    return s.m[..., None] * (radial[..., None] * np.cos(turn) + across[..., None] * np.sin(turn))
+    return s.m * (radial * np.cos(turn) + across * np.sin(turn))
 
 
 def landing_forces(s: Symbols, landing: Landing) -> tuple[FootForce, FootForce]:

@@ -34,7 +34,7 @@ from vrw_jax.models.base import (
 )
 from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
-from vrw_jax.params import Scalar, Symbols, WheelParams
+from vrw_jax.params import Elementwise, Scalar, Symbols, WheelParams
 
 PAPER_START = (0.1, 1.6, -0.1)
 """A start near the gait of Table 1, inside its basin: rad, rad/s, m/s."""
@@ -102,7 +102,7 @@ class PhaseBuilder(NamedTuple):
         return Watched(values, n_guards, counts)
 
 
-def double_support(build: PhaseBuilder, distance: Scalar) -> Phase:
+def double_support(build: PhaseBuilder, distance: Elementwise) -> Phase:
     """DLS over y = (theta, dtheta); ends when lambda_4 falls through zero. Section 3.3.1."""
     s = build.s
 
@@ -192,17 +192,22 @@ def single_support_2(build: PhaseBuilder) -> Phase:
     )
 
 
-class _Walked(NamedTuple):
+class Walked(NamedTuple):
     """Everything a step went through; results are read off it."""
 
     s: Symbols
     landing: transitions.Landing
     phases: tuple[Phase, Phase, Phase]
-    starts: tuple[State, State, State]
     ends: tuple[PhaseEnd, PhaseEnd, PhaseEnd]
     happened: tuple[Bool[Array, ""], Bool[Array, ""], Bool[Array, ""]]
     hit: transitions.StopperHit
     outcome: Int[Array, ""]
+    starts: tuple[State, ...] = ()  # where a trajectory is wanted
+
+
+def phases_of(build: PhaseBuilder, distance: Elementwise) -> tuple[Phase, Phase, Phase]:
+    """The phases of a step that begins with the feet that far apart."""
+    return double_support(build, distance), single_support_1(build), single_support_2(build)
 
 
 def _state_of(theta: Scalar, m: Motion) -> Float[Array, "6"]:
@@ -271,14 +276,13 @@ class ViscoelasticWheel(AbstractWheel):
 
     def _walk(
         self, params: WheelParams, x: SectionState, options: Options, monitored: bool
-    ) -> _Walked:
+    ) -> Walked:
         good = usable(params, x)
         params, x = replaced_where_bad(good, params, x, jnp.asarray(PAPER_START))
         s = params.symbols()
         landing = transitions.land(s, *x)
         build = PhaseBuilder(s, self.stop_at_lift_off, monitored)
-        dls = double_support(build, landing.distance)
-        sls1, sls2 = single_support_1(build), single_support_2(build)
+        dls, sls1, sls2 = phases_of(build, landing.distance)
         stepped = jnp.int32(Outcome.STEPPED)
 
         def run(phase: Phase, start: State, active: Array) -> PhaseEnd:
@@ -306,15 +310,15 @@ class ViscoelasticWheel(AbstractWheel):
         start3 = jnp.stack([state[0], hit.motion.L1, hit.motion.dtheta, hit.motion.dL1])
         end3 = run(sls2, start3, active3)
         code3 = jnp.where(active3, sls2.outcome(end3), code2)
-        return _Walked(
+        return Walked(
             s=s,
             landing=landing,
             phases=(dls, sls1, sls2),
-            starts=(start1, start2, start3),
             ends=(end1, end2, end3),
             happened=(active1 & (end1.duration > 0.0), active2 & (end2.duration > 0.0), active3),
             hit=hit,
             outcome=jnp.where(good, code3, jnp.int32(Outcome.BAD_INPUT)),
+            starts=(start1, start2, start3),
         )
 
 
@@ -330,29 +334,29 @@ def _compiled(model: ViscoelasticWheel, structure: Any, full: bool) -> Forward:
         params, x, options = jax.tree.unflatten(structure, leaves)
         options = options.for_derivatives() if tighten else options
         walked = model._walk(params, x, options, monitored=full)
-        result = _result(walked, model.friction) if full else _lean_result(walked)
+        result = result_of(walked, model.friction) if full else _lean_result(walked)
         return eqx.partition(result, eqx.is_inexact_array)
 
     return any_mode(partial(walk, False), partial(walk, True))
 
 
-def _lean_result(walked: _Walked) -> Advance:
+def _lean_result(walked: Walked) -> Advance:
     durations = jnp.stack([end.duration for end in walked.ends])
     return Advance(_section_state(walked), durations, walked.outcome, _tried(walked))
 
 
-def _tried(walked: _Walked) -> Int[Array, ""]:
+def _tried(walked: Walked) -> Int[Array, ""]:
     """Solver steps of the whole step, accepted or not."""
     return jnp.sum(jnp.stack([end.solver_steps for end in walked.ends]))
 
 
-def _section_state(walked: _Walked) -> SectionState:
+def _section_state(walked: Walked) -> SectionState:
     theta, _, dtheta, dL1 = walked.ends[2].state
     state = jnp.stack([theta, dtheta, dL1])
     return jnp.where(walked.outcome == Outcome.STEPPED, state, jnp.zeros_like(state))
 
 
-def _result(walked: _Walked, friction: float) -> StepResult:
+def result_of(walked: Walked, friction: float) -> StepResult:
     s, landing, hit = walked.s, walked.landing, walked.hit
     began = walked.outcome != Outcome.BAD_INPUT
     hits = walked.happened[2]
