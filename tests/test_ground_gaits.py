@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
+from vrw_jax import ground_lanes, simd
 from vrw_jax.arclength import ArclengthOptions
 from vrw_jax.models.ladder import UNILATERAL, VISCOELASTIC
 from vrw_jax.multipliers import bifurcation_margins, jury_margins, multipliers
@@ -174,6 +175,20 @@ def test_what_a_lane_gives_does_not_depend_on_its_company(lanes):
     together, alone = walked(slice(None)), walked(slice(1, 2))
     for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
         np.testing.assert_array_equal(a[1], b[0])
+
+
+@pytest.mark.slow
+def test_a_march_by_xla_as_on_a_gpu_goes_as_the_machine_code(lanes, monkeypatch):
+    *_, walked = lanes
+    found = walked(slice(None))
+    monkeypatch.setattr(simd, "serves", lambda: False)
+    ground_lanes._program.cache_clear()
+    by_xla = walked(slice(None))
+    ground_lanes._program.cache_clear()
+    np.testing.assert_array_equal(by_xla.outcome, found.outcome)
+    # Rounding alone tells them apart, grown by the events of three steps.
+    np.testing.assert_allclose(by_xla.section_state, found.section_state, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(by_xla.durations, found.durations, rtol=0, atol=1e-9)
 
 
 def test_an_event_of_a_lane_on_real_ground_counts_within_the_time_allowed_alone(lanes):

@@ -9,7 +9,7 @@ from batched import wheels_like
 from test_outcomes import IN_TIME
 
 import vrw_jax as vrw
-from vrw_jax import Outcome, lane_batch
+from vrw_jax import Outcome, lane_batch, simd
 from vrw_jax.lane_phase import LanePhase, integrate_lanes
 from vrw_jax.runge_kutta import (
     Place,
@@ -138,7 +138,7 @@ COARSE = vrw.Options(solver="Bosh3", max_solver_steps=60, rtol=1e-4, atol=1e-4)
 def test_blocks_of_xla_as_on_a_gpu_go_as_the_machine_code(monkeypatch):
     vectors, states = hard_starts(300)
     found, codes = told(vectors, states, COARSE)
-    monkeypatch.setattr(lane_batch, "_on_cpu", lambda: False)
+    monkeypatch.setattr(simd, "serves", lambda: False)
     monkeypatch.setattr(lane_batch, "BLOCK", 64)
     monkeypatch.setattr(lane_batch, "FEW", 10**9)  # waits for all
     patient, code = told(vectors, states, COARSE)

@@ -9,6 +9,7 @@ import pytest
 import truth
 
 import vrw_jax as vrw
+from vrw_jax import simd
 from vrw_jax.outcomes import Outcome
 from vrw_jax.params import PARAMETER_NAMES, wheel_of
 
@@ -368,3 +369,28 @@ def test_unknown_measure_is_refused_in_one_sentence():
 def test_wheel_of_is_the_inverse_of_parameters_of():
     wheel = wheel_of(jnp.asarray(truth.PARAMETERS[1]), 8)
     assert float(wheel.damping) == 100.0
+
+
+@pytest.mark.slow
+def test_a_search_by_xla_as_on_a_gpu_goes_as_the_machine_code(monkeypatch):
+    """Easy wheels, one that needs the homotopy, one without double support, one without a gait."""
+    rows = np.tile(truth.PARAMETERS[0], (70, 1))  # more than a block
+    column = PARAMETER_NAMES.index
+    rows[:, column("damping")] = np.linspace(120.0, 215.0, 70)
+    rows[3, [column("damping"), column("slope")]] = 40.0, 0.33
+    rows[5, column("slope")] = 0.05
+
+    def told(vectors):
+        one = lambda vector: vrw.limit_cycle(truth.wheel(vector))
+        period = lambda vector: one(vector).period
+        cycle, slopes = jax.vmap(one)(vectors), jax.vmap(jax.grad(period))(vectors)
+        return cycle.durations, cycle.matrix, slopes, cycle.outcome, cycle.passes
+
+    *found, outcome, passes = jax.jit(told)(rows)
+    monkeypatch.setattr(simd, "serves", lambda: False)
+    *by_xla, code, n = jax.jit(lambda vectors: told(vectors))(rows)
+    np.testing.assert_array_equal(code, outcome)
+    np.testing.assert_array_equal(n, passes)
+    for a, b in zip(by_xla, found, strict=True):
+        # Newton's last correction is some 1e-14; what derivatives make of rounding.
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)

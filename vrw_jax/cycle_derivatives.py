@@ -93,7 +93,7 @@ def _over_lanes(function: Callable, like: Callable, problem: Problem, blocked: b
     """A function of the problem over lanes, in its quickest form: machine code on a CPU."""
     settings = (function.__name__, problem)
     of_problem = functools.partial(function, problem)
-    if jax.default_backend() == "cpu":
+    if simd.serves():
         return simd.lane_function(of_problem, functools.partial(like, problem), settings)
     return remembered(
         in_blocks(of_problem, problem.options.block) if blocked else of_problem, settings

@@ -17,6 +17,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from vrw_jax import simd
 from vrw_jax.ground_march import (
     EVENT,
     MARCHING,
@@ -53,9 +54,10 @@ from vrw_jax.runge_kutta import Tableau, explicit_tableau
 from vrw_jax.start import fusion_emitters
 
 LANES = 256
-"""Lanes that march side by side: they stay in cache."""
+"""Lanes that march side by side where XLA compiles the march. In machine code a lane that has come
+to its event costs nothing, and as many march as are taken through their events together."""
 TOGETHER = 64
-"""Lanes that are taken through their events together."""
+"""Lanes that are taken through their events together: they stay in cache."""
 QUEUE = 2048
 """Wheels of one call of the compiled program."""
 
@@ -146,7 +148,7 @@ def _program(
         queue = _queue_of(columns, x, n_legs)
         return _walked(queue, wanted, n_steps, n_legs, max_events, one_sided, options, tableau)
 
-    return jax.jit(walk, compiler_options=fusion_emitters(True))
+    return jax.jit(walk, compiler_options=fusion_emitters(False))
 
 
 def _queue_of(columns: Array, x: Array, n: int) -> _Queue:
@@ -205,13 +207,17 @@ def _walked(
         outcome = jnp.where(change.third_foot, Outcome.THREE_FEET_LOADED, outcome)
         return change.motion, change.stance, outcome.astype(jnp.int32)
 
+    lanes, now = _empty(queue, n, one_sided)
+    n_lanes = now.h.shape[-1]
+    on = _marches(n, one_sided, options, tableau)
+
     def events(queue: _Queue, lanes: _Lanes, now: March) -> tuple[_Queue, _Lanes, March]:
         """Some lanes through their events, or on to the next wheels."""
         ready = (now.verdict != MARCHING) & ((now.verdict != WAITING) | (queue.next < wanted))
-        (index,) = jnp.nonzero(ready, size=TOGETHER, fill_value=LANES)
+        (index,) = jnp.nonzero(ready, size=TOGETHER, fill_value=n_lanes)
         pick = lambda leaf: jnp.take(leaf, index, axis=-1, mode="clip")
         here, lane = jax.tree.map(pick, (now, lanes))
-        chosen = index < LANES
+        chosen = index < n_lanes
         came = chosen & (here.verdict != WAITING)
 
         # How the phase ended.
@@ -291,32 +297,49 @@ def _walked(
 
     def round_(state: tuple) -> tuple:
         queue, lanes, now = events(*state)
-        s = _symbols(lanes.columns, n)
         to_fill = jnp.where(queue.next < wanted, jnp.sum(now.verdict == WAITING), 0)
-        enough = TOGETHER - to_fill
-        friction = lanes.columns[-1]
-        return queue, lanes, march(s, friction, one_sided, now, enough, options, tableau)
+        return queue, lanes, on(lanes.columns, now, TOGETHER - to_fill)
 
     def goes_on(state: tuple) -> Array:
         queue, _, now = state
         return (queue.next < wanted) | jnp.any(now.verdict != WAITING)
 
-    queue, *_ = lax.while_loop(goes_on, round_, (queue, *_empty(queue, n, one_sided)))
+    queue, *_ = lax.while_loop(goes_on, round_, (queue, lanes, now))
     return queue.section, queue.durations, queue.outcome, queue.n_stepped, queue.tried
+
+
+def _marches(
+    n: int, one_sided: bool, options: Options, tableau: Tableau
+) -> Callable[[Array, March, Array], March]:
+    """The march by columns: by machine code each lane to its event, else until enough are."""
+    dynamic, static = eqx.partition(options, eqx.is_array)
+
+    def far(columns: Array, now: March, dynamic: Options, enough: Array | None = None) -> March:
+        known = eqx.combine(dynamic, static)
+        s, friction = _symbols(columns, n), columns[-1]
+        return march(s, friction, one_sided, now, enough, known, tableau)
+
+    if not simd.serves():
+        return lambda columns, now, enough: far(columns, now, dynamic, enough)
+    like = lambda columns, now, dynamic: now
+    settings = ("march on real ground", n, one_sided, static)
+    by_machine_code = simd.lane_function(far, like, settings)
+    return lambda columns, now, enough: by_machine_code(columns, now, dynamic)
 
 
 def _empty(queue: _Queue, n: int, one_sided: bool) -> tuple[_Lanes, March]:
     """Lanes without wheels, in place of which stands the first one."""
     dtype, guards = queue.start.dtype, guards_of(n, one_sided).total
-    many = lambda value: jnp.broadcast_to(value[..., None], (*value.shape, LANES))
-    zero, none = jnp.zeros((LANES,), dtype), jnp.zeros((LANES,), jnp.int32)
+    n_lanes = TOGETHER if simd.serves() else LANES
+    many = lambda value: jnp.broadcast_to(value[..., None], (*value.shape, n_lanes))
+    zero, none = jnp.zeros((n_lanes,), dtype), jnp.zeros((n_lanes,), jnp.int32)
     first = queue.columns[:, 0]
     state, stance = opened(_symbols(first, n), queue.start[:, 0])
     stance = jax.tree.map(many, stance)
     motion = jax.tree.map(many, unpack(state)[0])
     columns = many(first)
     here = place_of(flow_of(_symbols(columns, n), columns[-1], one_sided, stance), motion)
-    blank = jnp.zeros((guards, LANES), dtype)
+    blank = jnp.zeros((guards, n_lanes), dtype)
     march = March(
         here=here,
         stance=stance,
@@ -329,4 +352,4 @@ def _empty(queue: _Queue, n: int, one_sided: bool) -> tuple[_Lanes, March]:
         guard=none,
         tried=none,
     )
-    return _Lanes(none, columns, none, jnp.zeros((3, LANES), dtype), none, none), march
+    return _Lanes(none, columns, none, jnp.zeros((3, n_lanes), dtype), none, none), march

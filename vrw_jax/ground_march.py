@@ -12,8 +12,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Float
 
+from vrw_jax import simd
 from vrw_jax.models.unilateral_mechanics import WheelMotion, directions, kept, one_of
 from vrw_jax.models.unilateral_motion import (
     Felt,
@@ -46,14 +47,15 @@ Cut = Callable[..., Any]
 """`cut(function, *arrays)` is `function(*arrays)`, computed once whoever reads it."""
 
 
-def cut_where(always: Bool[Array, ""]) -> Cut:
-    """Borders of fusion on CPU; `always` must be true, and only known at run time.
+def cut_where(lanes: Float[Array, " lanes"]) -> Cut:
+    """Borders of fusion on CPU; `lanes` must not hold NaN, which XLA can't know.
 
     XLA there computes a producer again for each of its consumers, and can't fuse across a branch.
     Elsewhere a branch would cost a round trip to the host, and fusion does not recompute.
     """
-    if jax.default_backend() != "cpu":
+    if simd.tracing() or jax.default_backend() != "cpu":
         return lambda function, *arrays: function(*arrays)
+    always = ~jnp.isnan(jnp.max(lanes))
 
     def cut(function: Callable, *arrays: Any) -> Any:
         def nothing(*arrays: Any) -> Any:
@@ -157,7 +159,7 @@ def march(
     friction: Elementwise,
     one_sided: bool,
     begin: March,
-    enough: Array,
+    enough: Array | None,
     options: Options,
     tableau: Tableau,
 ) -> March:
@@ -165,7 +167,7 @@ def march(
     flow = flow_of(s, friction, one_sided, begin.stance)
     order, n = tableau.order, begin.here.q.shape[0]
     middle, last = tableau.middle, len(tableau.places) - 1
-    cut = cut_where(~jnp.isnan(jnp.max(begin.h)))
+    cut = cut_where(begin.h)
 
     def watched(place: Place, offset: Array) -> Array:
         return guards_at(flow, place) - offset
@@ -173,6 +175,8 @@ def march(
     once, twice, places = (jnp.asarray(x) for x in (tableau.once, tableau.twice, tableau.places))
 
     def goes_on(now: March) -> Array:
+        if enough is None:
+            return jnp.any(now.verdict == MARCHING)
         ended = (now.verdict != MARCHING) & (now.verdict != WAITING)
         return jnp.any(now.verdict == MARCHING) & (jnp.sum(ended) < enough)
 
@@ -189,7 +193,8 @@ def march(
             slope = cut(functools.partial(_slope, flow), *cut(at, i, slopes))
             return lax.dynamic_update_index_in_dim(slopes, slope, i, 0)
 
-        slopes = jnp.zeros((last + 1, *here.slope.shape), h.dtype).at[0].set(here.slope)
+        others = jnp.zeros((last, *here.slope.shape), h.dtype)
+        slopes = jnp.concatenate([here.slope[None], others])
         slopes = lax.fori_loop(1, last + 1, stage, slopes)
         reached = lambda i: Place(*cut(at, i, slopes), *slopes[i : i + 1])
         end, mid = reached(last), reached(middle)

@@ -315,10 +315,6 @@ def _by_collocation(
     return trusted, (np.stack(numbers[:3], 1), np.stack(numbers[3:], 1), none, none)
 
 
-def _on_cpu() -> bool:
-    return jax.default_backend() == "cpu"
-
-
 _programs: dict[Any, Callable] = {}
 """Compiled steps by what they depend on, see `_run`."""
 
@@ -332,7 +328,7 @@ def _run(
     """
     if len(lanes[0]) == 0:
         return [np.empty(0)] * 9
-    dtype, cpu = lanes[0].dtype, _on_cpu()
+    dtype, cpu = lanes[0].dtype, simd.serves()
     key = (settings, dtype, cpu, BLOCK)
     if key not in _programs:
         if cpu:

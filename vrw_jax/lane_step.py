@@ -8,7 +8,6 @@ import functools
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -44,7 +43,7 @@ class _Told(NamedTuple):
 
 def can_run(model: ViscoelasticWheel, options: Options) -> bool:
     """Whether there is such a step for this solver, and it is the quickest here."""
-    return explicit_tableau(options.solver) is not None and jax.default_backend() == "cpu"
+    return explicit_tableau(options.solver) is not None and simd.serves()
 
 
 def step(

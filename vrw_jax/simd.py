@@ -38,6 +38,11 @@ TOGETHER = 64
 NAME, HANDLER = "lanes", "handler"
 
 
+def serves() -> bool:
+    """Whether there is machine code for where JAX computes: on CPUs."""
+    return jax.default_backend() == "cpu"
+
+
 def lane_program(
     function: Callable[..., tuple],
     uniform: Sequence[np.dtype],
@@ -276,7 +281,9 @@ def _module(closed: ClosedJaxpr, width: int) -> str:
         def input_of(base: Any, aval: Any) -> Entries:
             def at(index: Index) -> Any:
                 where, kind = place(base, aval, index)
-                return build.load(where, typ=kind, align=aval.dtype.itemsize)
+                value = build.load(where, typ=kind, align=aval.dtype.itemsize)
+                truth = aval.dtype == bool
+                return build.icmp_signed("!=", value, arrays.constant(kind, 0)) if truth else value
 
             field = Field(aval.shape[:-1], arrays.kind_of(aval), at)
             return arrays.entries(field) if math.prod(field.shape) <= HELD else field

@@ -24,6 +24,8 @@ SMALL = 8
 """Entries of fields that are taken apart after all, and terms of sums that are written out."""
 HELD = 32
 """Entries of arrays that loops carry in registers, and of constants that need no table."""
+HELD_INSIDE = 64
+"""The first of these for loops that contain none: they are written out."""
 
 Index = tuple[Any, ...]
 """For each axis a plain number, or an LLVM value of type LONG."""
@@ -37,6 +39,29 @@ class Field:
 
     def __init__(self, shape: Sequence[int], kind: ir.Type, at: Callable[[Index], Value]) -> None:
         self.shape, self.kind, self.at = tuple(shape), kind, at
+
+
+class Updated(Field):
+    """An array in memory, but for a part of it."""
+
+    def __init__(self, arrays: "Arrays", whole: "Memory", part: "Entries", begin: Index) -> None:
+        super().__init__(whole.shape, whole.kind, self.load)
+        self.arrays, self.whole, self.part, self.begin = arrays, whole, part, begin
+
+    def load(self, index: Index) -> Value:
+        """The entry there."""
+        return self.arrays.entry(self.arrays.in_memory(self), index)
+
+    def store_into(self, memory: "Memory") -> None:
+        """Overwrites the part there."""
+        arrays = self.arrays
+        fresh = arrays.in_memory(self.part)  # it may depend on what it takes the place of
+
+        def store(index: Index, _: Any) -> list[Value]:
+            memory.store(arrays.further(index, self.begin), fresh.load(index))
+            return []
+
+        arrays.each(self.part.shape, store)
 
 
 class Memory(Field):
@@ -219,7 +244,11 @@ class Arrays(Numbers):
         if isinstance(array, Memory):
             return array
         memory = self.room(array.shape, _kind(array))
-        self.fill(memory, array)
+        if isinstance(array, Updated):
+            self.fill(memory, array.whole)
+            array.store_into(memory)
+        else:
+            self.fill(memory, array)
         return memory
 
     def _table(self, array: np.ndarray) -> Memory:
@@ -401,15 +430,54 @@ class Arrays(Numbers):
         return self.constants_of(np.indices(out.shape)[params["dimension"]], out)
 
     def _do_dynamic_slice(
-        self, params: Any, given: Any, out: Any, table: Entries, *starts: Entries
+        self, params: Any, given: Any, out: Any, array: Entries, *starts: Entries
     ) -> Entries:
-        """One entry of a row of numbers."""
-        if len(table.shape) != 1 or params["slice_sizes"] != (1,):
-            raise NotImplementedError("dynamic_slice takes more than one entry of a row.")
-        (start,) = self.entries(starts[0]).ravel()
-        place = self._clamped(self._converted(start, given[1].dtype, np.dtype(np.int64)),
-                              table.shape[0] - 1)  # fmt: skip
-        return array_of((1,), [self.entry(table, (place,))])
+        begin = self._starts(given, array.shape, shape_of(out), starts)
+        at = lambda index: self.entry(array, self.further(index, begin))
+        return Field(shape_of(out), self.kind_of(out), at)
+
+    def _do_dynamic_update_slice(
+        self, params: Any, given: Any, out: Any, array: Entries, update: Entries, *starts: Entries
+    ) -> Entries:
+        begin = self._starts(given[1:], array.shape, update.shape, starts)
+        return Updated(self, self.in_memory(array), update, begin)
+
+    def _starts(
+        self, given: Any, whole: Index, part: Index, starts: Sequence[Entries]
+    ) -> tuple[Any, ...]:
+        """Where a part begins, moved so that it lies inside."""
+        begin: list[Any] = []
+        for aval, n, m, start in zip(given[1:], whole, part, starts, strict=False):
+            place = self.entries(start).item()
+            if n == m:
+                begin.append(0)
+            elif isinstance(place, ir.Constant):
+                begin.append(min(max(int(place.constant), 0), n - m))
+            else:
+                place = self._converted(place, aval.dtype, np.dtype(np.int64))
+                begin.append(self._clamped(place, n - m))
+        return tuple(begin)
+
+    def further(self, index: Index, begin: Index) -> Index:
+        """The sum of two indices."""
+
+        def plus(i: Any, j: Any) -> Any:
+            if isinstance(j, int):
+                return self._shifted(i, j)
+            return self._shifted(j, i) if isinstance(i, int) else self.builder.add(i, j)
+
+        return tuple(plus(i, j) for i, j in zip(index, begin, strict=True))
+
+    def _do_cumsum(self, params: Any, given: Any, out: Any, array: Entries) -> Entries:
+        rows = np.moveaxis(self.entries(array), params["axis"], 0)
+        order = range(len(rows))[:: -1 if params["reverse"] else 1]
+        plus = lambda x, y: self.elementwise("add", {}, out.dtype, out.dtype, (x, y))
+        sums = np.empty_like(rows)
+        for k, i in enumerate(order):
+            pairs = zip(sums[order[k - 1], ...].ravel(), rows[i, ...].ravel(), strict=True)
+            told = [plus(*pair) if k else pair[1] for pair in pairs]
+            sums[i, ...] = array_of(rows.shape[1:], told)
+        return np.moveaxis(sums, 0, params["axis"])
 
     def _do_dot_general(
         self, params: Any, given: Any, out: Any, left: Entries, right: Entries

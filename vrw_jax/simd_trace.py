@@ -12,10 +12,12 @@ from jax.extend.core import ClosedJaxpr, Literal
 
 from vrw_jax.simd_arrays import (
     HELD,
+    HELD_INSIDE,
     Arrays,
     Entries,
     Field,
     Memory,
+    Updated,
     array_of,
     has_lanes,
     shape_of,
@@ -146,12 +148,13 @@ class Traces(Arrays):
         written = [self.room(shape_of(aval), self.kind_of(aval)) for aval in told[n_carried:]]
         outside, self.written_out = self.written_out, not _has_loops(inner.jaxpr)
         fixed = values[:n_fixed]
-        limit = math.inf if self.written_out else HELD
+        limit = HELD_INSIDE if self.written_out else HELD
         carry = _Carry(self, inner.out_avals[:n_carried], limit)
 
         def part(memory: Memory, turn: Value) -> Entries:
             some = memory.part(turn)
-            return self.entries(some) if math.prod(some.shape) <= limit else some
+            inside = self.written_out or math.prod(some.shape) <= HELD
+            return self.entries(some) if inside else some
 
         def body(turn: Value, flat: list[Value]) -> list[Value]:
             if params["reverse"]:
@@ -203,7 +206,11 @@ class _Carry:
         """From one turn to the next: new values may depend on any of the old."""
         flat, moves = self._in_registers(arrays), []
         for array, place in zip(arrays, self.places, strict=True):
-            if place is not None and not (isinstance(array, Memory) and array.base is place.base):
+            if place is None or (isinstance(array, Memory) and array.base is place.base):
+                continue
+            if isinstance(array, Updated) and array.whole.base is place.base:
+                array.store_into(place)
+            else:
                 fresh = self.owner.room(place.shape, place.kind)
                 self.owner.fill(fresh, array)
                 moves.append((place, fresh))

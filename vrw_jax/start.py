@@ -27,9 +27,9 @@ def start_jax(cache: str | Path | None = None) -> None:
 def fusion_emitters(on: bool) -> dict[str, str | bool]:
     """Which of its two ways of making CPU code XLA takes for a program: options for `jax.jit`.
 
-    Without its fusion emitters it compiles limit cycles and single steps in half the time or less,
-    to code as fast; with them the march of lanes on real ground, in two thirds. Programs whose
-    digits are promised not to depend on the process always say which.
+    Without its fusion emitters it compiles in half to two thirds of the time, to code as fast or,
+    for events on real ground, slower by a seventh. Programs whose digits are promised not to depend
+    on the process always say which.
     """
     return {_EMITTERS: on} if _KNOWN and jax.default_backend() == "cpu" else {}
 
