@@ -360,3 +360,15 @@ def test_wheels_too_stiff_for_an_explicit_solver_go_to_an_implicit_one():
     assert list(explicit) == [Outcome.STEPPED, Outcome.SOLVER_GAVE_UP]
     exact, _ = told(vectors, starts, vrw.Options(), engine="lanes")
     np.testing.assert_allclose(found.section_state[1], exact[1, :3], rtol=0, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_a_stiff_wheel_whose_phase_lasts_longer_than_expected_goes_to_an_implicit_one():
+    vectors = wheels_like(damping=[1e4, 1e3])  # the first falls back after 0.69 s: 2,300 steps
+    starts = np.tile([0.1, 1.6, -0.1], (2, 1))
+    options = vrw.Options(rtol=1e-6, atol=1e-6, max_solver_steps=1000)
+    found = vrw.steps(truth.wheels(vectors), starts, options=options)
+    assert [found.solvers[i] for i in found.solver] == [lane_batch.IMPLICIT, lane_batch.STABLE]
+    assert list(found.outcome) == [Outcome.FELL_BACK, Outcome.FELL_BACK]
+    _, code = told(vectors[1:], starts[1:], options)
+    assert code[0] == Outcome.FELL_BACK

@@ -81,7 +81,8 @@ def steps(
     ten times the tolerance. "auto" also takes another solver than the named one where the airborne
     leg is so stiff that another is cheaper, and `Steps.solver` says which: STABLE where stability
     limits the steps (c/m from 1,900 1/s up at the default options, from 300 at a tolerance of
-    1e-6), IMPLICIT by "diffrax" where explicit ones take too many (from 4e5, from 1.4e5).
+    1e-6), IMPLICIT by "diffrax" where explicit ones take too many (from 4e5, from 1.4e5) or STABLE
+    gave up.
 
     "collocation" is faster still near a known gait: `durations`, shape (lanes, 3), s, are those of
     DLS, SLS-I and SLS-II to some per cent, as of a limit cycle or a neighbour's step; later steps
@@ -146,7 +147,10 @@ def steps(
             lanes = open_[solver[open_] == index]
             if len(lanes) > 0:
                 told = solve(wheels[:, lanes], walked.section_state[lanes])
-                walked.take(lanes, told, fixed=False)
+                # A phase may last longer than `_cheapest` expects: IMPLICIT comes next.
+                lost = (index == 1) & (told[2] == Outcome.SOLVER_GAVE_UP)
+                solver[lanes[lost]] = 2
+                walked.take(lanes[~lost], tuple(part[~lost] for part in told), fixed=False)
     return Steps(
         jnp.asarray(walked.section_state),
         jnp.asarray(walked.durations),
