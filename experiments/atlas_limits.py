@@ -209,7 +209,7 @@ def limits() -> Rows:
                 "isolated": Outcome(code).name,
                 "time_difference_s": f"{np.max(np.abs(found.durations[0] - durations)):.1e}",
                 "solver_steps": int(found.solver_steps[0]),
-                "implicit": bool(found.implicit[0]),
+                "solver": found.solvers[int(found.solver[0])],
                 "durations": " ".join(f"{d:.3g}" for d in durations),
             }
 

@@ -62,8 +62,9 @@ def real_axis_limit(solver: str) -> float:
     return real_stability_limit(tableau)
 
 
-TURNS, LONG = 7, 0.5
-"""Of timing: rounds, and seconds of a call beyond which one is enough."""
+TURNS, SHORT, LONG = 7, 0.1, 3.0
+"""Of timing: rounds; seconds for which a method is repeated in each (a process's clock may stand
+still for some ms); seconds of a call beyond which one is enough."""
 
 
 def stiffness() -> Rows:
@@ -80,7 +81,7 @@ def stiffness() -> Rows:
         peer = lambda steps, *more, y=y, packed=packed: (
             1,
             functools.partial(steps, y, packed, *more),
-            lambda told: (told[0, :6], told[0, 6], Outcome.STEPPED),
+            lambda told: (told[0, :6], told[0, 6], Outcome.STEPPED, ""),
         )
         runs = {
             "numba Dopri5": peer(peers.numba_steps, TOLERANCE),
@@ -94,15 +95,18 @@ def stiffness() -> Rows:
             for name, (lanes, run, _) in runs.items():
                 if LONG < least[name] * lanes < np.inf:
                     continue
-                begin = time.process_time()
-                run()
-                least[name] = min(least[name], (time.process_time() - begin) / lanes)
-        for name, (values, work, outcome) in compiled.items():
+                begin, spent, calls = time.process_time(), 0.0, 0
+                while spent < SHORT:
+                    run()
+                    spent, calls = time.process_time() - begin, calls + 1
+                least[name] = min(least[name], spent / calls / lanes)
+        for name, (values, work, outcome, solver) in compiled.items():
             good = np.all(np.isfinite(values))
             yield {
                 "axis": axis,
                 "value": f"{value:.4g}",
                 "method": name,
+                "solver": solver,  # that `vrw.steps` took
                 "us_per_gait": f"{least[name] * 1e6:.4g}",
                 "work": f"{work:.0f}",  # evaluations of peers, tried steps of the library
                 "error": f"{np.max(np.abs(values - truth)):.2e}",
@@ -112,7 +116,7 @@ def stiffness() -> Rows:
 
 
 def by_library(wheel: dict[str, float], engine: str, solver: str) -> tuple:
-    """Lanes in a call, the call, and what it tells: values, tried steps, outcome."""
+    """Lanes in a call, the call, and what it tells: values, tried steps, outcome, solver."""
     options = vrw.Options(solver=solver, rtol=TOLERANCE, atol=TOLERANCE)
     lanes = 256 if engine == "diffrax" else 2048  # full blocks
     params, starts = vrw.WheelParams(**wheel), np.tile(START, (lanes, 1))
@@ -120,7 +124,8 @@ def by_library(wheel: dict[str, float], engine: str, solver: str) -> tuple:
 
     def read(told: vrw.Steps) -> tuple:
         values = np.concatenate([told.section_state[0], told.durations[0]])
-        return values, int(told.solver_steps[0]), Outcome(int(told.outcome[0]))
+        outcome, solver = Outcome(int(told.outcome[0])), told.solvers[int(told.solver[0])]
+        return values, int(told.solver_steps[0]), outcome, solver
 
     return lanes, run, read
 

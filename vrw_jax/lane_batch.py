@@ -31,11 +31,18 @@ BLOCK = 32_768
 """Lanes that march side by side where XLA compiles them, as on a GPU."""
 MAPPED = 256
 """Lanes that the diffrax engine takes at a time."""
+STABLE, TIGHTER = "Tsit5", 4.0
+"""Explicit solver of wheels whose steps stability limits, and how much tighter it is set.
+
+Of diffrax's of order 5 and more it goes farthest for an evaluation there: 0.58 over the mode's
+rate, Dopri8 0.40. So much tighter it costs little more, and from a tolerance of 1e-6 down its error
+is no larger than Dopri8's at the named one."""
 IMPLICIT = "Kvaerno5"
 """Solver of wheels that are too stiff for explicit ones."""
-WORTH = 5e3
-"""Explicit steps that cost what IMPLICIT does at a tolerance of 1e-6 (docs/stability_atlas.md). Its
-own cost goes with the tolerance's power of -0.19; at the limit of stability theirs does not."""
+WORTH = 6e4
+"""Evaluations by an explicit solver that cost what IMPLICIT does at a tolerance of 1e-6
+(docs/stability_atlas.md). Its own cost goes with the tolerance's power of -0.17, from 1e-4 to
+1e-10; at the limit of stability theirs does not."""
 FEW = 8
 """A block waits no longer than usual once less than one in `FEW` of its lanes is running."""
 
@@ -49,8 +56,9 @@ class Steps(eqx.Module):
     n_stepped: Int[Array, " lanes"]  # steps that ended in a touchdown
     solver_steps: Int[Array, " lanes"]  # tried by the integrator, over all steps
     fixed: Bool[Array, " lanes"]  # whether the last step was taken in fixed work, by collocation
-    implicit: Bool[Array, " lanes"]  # whether "auto" took an implicit solver, for stiffness
+    solver: Int[Array, " lanes"]  # which of `solvers` took the lane: "auto" goes by stiffness
     engine: str = eqx.field(static=True)  # that computed it: "lanes", "diffrax" or "collocation"
+    solvers: tuple[str, ...] = eqx.field(static=True)  # the named one first
 
 
 def steps(
@@ -69,10 +77,12 @@ def steps(
     scalars or have the lanes' axis. "lanes" is the fast engine, for the viscoelastic wheel and
     explicit solvers; "diffrax" maps `model.advance` over the lanes and takes any solver; "auto"
     takes the first wherever it can, whatever the number of lanes, and `Steps.engine` says which it
-    was; wheels whose airborne leg is too stiff for an explicit solver (c/m above 4e5 1/s at the
-    default options) go to IMPLICIT by "diffrax", and `Steps.implicit` says which. Both keep the
-    errors of `options`, which count for each local step; between them lie some ten times the
-    tolerance.
+    was. Both keep the errors of `options`, which count for each local step; between them lie some
+    ten times the tolerance. "auto" also takes another solver than the named one where the airborne
+    leg is so stiff that another is cheaper, and `Steps.solver` says which: STABLE where stability
+    limits the steps (c/m from 1,900 1/s up at the default options, from 300 at a tolerance of
+    1e-6), IMPLICIT by "diffrax" where explicit ones take too many (from 4e5, from 1.4e5) or STABLE
+    gave up.
 
     "collocation" is faster still near a known gait: `durations`, shape (lanes, 3), s, are those of
     DLS, SLS-I and SLS-II to some per cent, as of a limit cycle or a neighbour's step; later steps
@@ -114,13 +124,15 @@ def steps(
         )
     walked = _Walked.start(states.astype(dtype))
     run = _chosen(engine, model, options, params.n_legs)
-    stiff = np.zeros(len(states), bool)
+    runs, solver = [run], np.zeros(len(states), np.int32)
+    solvers: tuple[str, ...] = (options.solver,)
     if engine == "auto" and run.name == "lanes":
-        stiff = _too_stiff(wheels, options)
-    for_stiffness: Callable = run
-    if np.any(stiff):
-        implicit = dataclasses.replace(options, solver=IMPLICIT)
-        for_stiffness = functools.partial(_by_diffrax, model, implicit, params.n_legs)
+        solvers, solver = (options.solver, STABLE, IMPLICIT), _cheapest(wheels, options)
+    if np.any(solver > 0):
+        by = lambda solver: dataclasses.replace(options, solver=solver)
+        stable = by(STABLE).tightened(TIGHTER)
+        runs.append(_chosen("lanes", model, stable, params.n_legs))
+        runs.append(_chosen("diffrax", model, by(IMPLICIT), params.n_legs))
     if engine == "collocation":
         walked.durations[:] = _expected(durations, states, dtype)
     for _ in range(n_steps):
@@ -131,10 +143,14 @@ def steps(
             fixed, told = _by_collocation(model, params.n_legs, *given)
             walked.take(open_[fixed], tuple(part[fixed] for part in told), fixed=True)
         open_ = open_[~fixed]
-        for solve, lanes in ((run, open_[~stiff[open_]]), (for_stiffness, open_[stiff[open_]])):
+        for index, solve in enumerate(runs):
+            lanes = open_[solver[open_] == index]
             if len(lanes) > 0:
                 told = solve(wheels[:, lanes], walked.section_state[lanes])
-                walked.take(lanes, told, fixed=False)
+                # A phase may last longer than `_cheapest` expects: IMPLICIT comes next.
+                lost = (index == 1) & (told[2] == Outcome.SOLVER_GAVE_UP)
+                solver[lanes[lost]] = 2
+                walked.take(lanes[~lost], tuple(part[~lost] for part in told), fixed=False)
     return Steps(
         jnp.asarray(walked.section_state),
         jnp.asarray(walked.durations),
@@ -142,8 +158,9 @@ def steps(
         jnp.asarray(walked.n_stepped),
         jnp.asarray(walked.solver_steps),
         jnp.asarray(walked.fixed),
-        jnp.asarray(stiff),
+        jnp.asarray(solver),
         engine="collocation" if engine == "collocation" else run.name,
+        solvers=solvers,
     )
 
 
@@ -167,7 +184,10 @@ def _on_ground(
     told = walk_lanes(columns, states, n_steps, model, options, n_legs)
     section_state, durations, outcome, n_stepped, tried = map(jnp.asarray, told)
     none = jnp.zeros(len(states), bool)
-    return Steps(section_state, durations, outcome, n_stepped, tried, none, none, engine="lanes")
+    return Steps(
+        section_state, durations, outcome, n_stepped, tried, none, none.astype(jnp.int32),
+        engine="lanes", solvers=(options.solver,),
+    )  # fmt: skip
 
 
 def _expected(durations: Any, states: np.ndarray, dtype: np.dtype) -> np.ndarray:
@@ -229,31 +249,42 @@ def _chosen(engine: str, model: AbstractWheel, options: Options, n_legs: int) ->
     return _Engine("lanes", by_lanes)
 
 
-def _too_stiff(wheels: np.ndarray, options: Options) -> np.ndarray:
-    """Which lanes an explicit solver can't take through single support I in `max_solver_steps`, or
-    takes through it in so many that IMPLICIT is cheaper.
+def _cheapest(wheels: np.ndarray, options: Options) -> np.ndarray:
+    """Which solver takes each lane at the least cost: 0 that of `options`, 1 STABLE, 2 IMPLICIT.
 
     The airborne leg's fast mode decays at 1.03 c/m for some 0.67 sqrt(L0 / g), s, where legs are
-    light, and a step times that rate must stay below the solver's limit of stability; rejected
-    steps add a tenth.
+    light, and a step times that rate must stay below an explicit solver's limit of stability;
+    rejected steps add a tenth. Where accuracy asks STABLE for more steps than that, about its
+    tolerance to the power of -1/5, the solver remains that of `options`. More than
+    `max_solver_steps` are no choice.
     """
     damping, mass, length, gravity = (
         wheels[PARAMETER_NAMES.index(name)]
         for name in ("damping", "leg_mass", "locked_length", "gravity")
     )
+    tolerance = float(options.rtol)
     with np.errstate(all="ignore"):
         decays = 1.03 * damping / mass * 0.74 * np.sqrt(length / gravity)
-        worth = WORTH * (1e-6 / float(options.rtol)) ** 0.19
-        most = min(options.max_solver_steps, worth)
-        return decays > most * _bearable(options.solver)
+
+        def evaluations(solver: str) -> tuple[np.ndarray, np.ndarray]:
+            stages, bears = _stages_and_limit(solver)
+            steps = decays / bears
+            return steps, np.where(steps > options.max_solver_steps, np.inf, steps * stages)
+
+        _, named = evaluations(options.solver)
+        steps, stable = evaluations(STABLE)
+        limited = steps > (tolerance / TIGHTER) ** -0.2
+        implicit = np.full_like(decays, WORTH * (1e-6 / tolerance) ** 0.17)
+        costs = named, np.where(limited, stable, np.inf), implicit
+        return np.argmin(costs, axis=0).astype(np.int32)  # a wheel that is none: the first
 
 
 @functools.cache
-def _bearable(solver: str) -> float:
-    """Step length times a mode's rate that the explicit solver bears."""
+def _stages_and_limit(solver: str) -> tuple[int, float]:
+    """Of an explicit solver: evaluations of a step; its length times a mode's rate, at most."""
     tableau = explicit_tableau(solver)
     assert tableau is not None  # `_chosen` looked
-    return real_stability_limit(tableau)
+    return len(tableau.places) - 1, real_stability_limit(tableau)
 
 
 def _by_lanes(

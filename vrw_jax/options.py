@@ -48,10 +48,12 @@ class Options(eqx.Module):
 
     def for_derivatives(self) -> "Options":
         """The same choices with tolerances tightened for derivatives, down to round-off."""
+        return self.tightened(self.derivative_tightening)
+
+    def tightened(self, factor: Scalar | float) -> "Options":
+        """The same choices with tolerances divided by `factor`, down to round-off."""
         floor = FLOOR * jnp.finfo(self.rtol.dtype).eps
-        tighten = lambda tolerance: jnp.maximum(
-            tolerance / self.derivative_tightening, jnp.minimum(floor, tolerance)
-        )
+        tighten = lambda tolerance: jnp.maximum(tolerance / factor, jnp.minimum(floor, tolerance))
         return eqx.tree_at(
             lambda o: (o.rtol, o.atol), self, (tighten(self.rtol), tighten(self.atol))
         )
