@@ -7,13 +7,15 @@ for none but its own. Kept on disk beside JAX's compiled code, so that a later p
 traces nor compiles.
 """
 
+import contextlib
 import ctypes
 import functools
+import gc
 import hashlib
 import json
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
 from threading import Lock, RLock
@@ -159,13 +161,26 @@ def _code(function: Callable, shapes: Any, settings: object, width: int) -> _Cod
     name = f"vrw_lanes_{hashlib.sha256(repr(told).encode()).hexdigest()}"
     content = kept(name)
     if content is None:
-        with _python:
+        with _python, _uncollected():
             closed = traced(function, *shapes)
             module = _module(closed, width)
         out = [(aval.shape[:-1], aval.dtype.name) for aval in closed.out_avals]
         content = json.dumps(out).encode() + b"\n" + _compiled(module)
         keep(name, content)
     return _told(name, content)
+
+
+@contextlib.contextmanager
+def _uncollected() -> Iterator[None]:
+    """Garbage waits: a program is many small objects that live on, and looking for dead ones among
+    them takes a sixth of the time."""
+    before = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if before:
+            gc.enable()
 
 
 _python = RLock()
