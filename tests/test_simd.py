@@ -173,8 +173,21 @@ def arrays_in_loops(x):
         "rest": (seen, jnp.min(flat, 0), jnp.min(stacked, (0, 2)), total),
         "halved": halved - jnp.max(large, 0),
         "found": jnp.any(large > 1.5, (0, 1)),
+        "summed": (jnp.cumsum(flat[:5], 0), lax.cumsum(flat[:5], 0, reverse=True)),
+        "picked": picked(x, large),
         "turned": large.reshape(4, 9, -1).transpose(1, 0, 2)[:, :, None],
     }
+
+
+def picked(x, large):
+    """A table looked up turn by turn; rows of a large array overwritten by what stands there."""
+    table = jnp.asarray(np.cos(np.arange(144.0)).reshape(12, 12))
+
+    def turn(i, rows):
+        weighed = sum(table[i, j] * rows[j] for j in range(12))
+        return lax.dynamic_update_index_in_dim(rows, jnp.sin(weighed) + x[0], i, 0)
+
+    return lax.fori_loop(2, 12, turn, large)
 
 
 @pytest.mark.parametrize("n", [1, 4, 1001])
@@ -249,7 +262,9 @@ def test_other_settings_and_damaged_files_are_compiled_anew(folder):
 
 def test_code_that_is_not_elementwise_is_refused_in_a_sentence():
     lanes = [np.arange(4.0)]
-    with pytest.raises(NotImplementedError, match="cumsum is not elementwise"):
+    with pytest.raises(NotImplementedError, match="sort is not elementwise"):
+        program(lambda _, x: (jnp.sort(x[0]),), lanes)
+    with pytest.raises(NotImplementedError, match="cumsum moves, joins or picks lanes"):
         program(lambda _, x: (jnp.cumsum(x[0]),), lanes)
     with pytest.raises(NotImplementedError, match="slice moves, joins or picks lanes"):
         program(lambda _, x: (x[0][:1],), lanes)

@@ -1,7 +1,7 @@
 """Gait steps of many wheels on real ground at once: values only, no derivatives.
 
 The laws are those of `models.unilateral`, element by element over lanes. All lanes march
-(`ground_march`) until some have come to events; these are gathered and taken through them
+(`ground_march`) until some, on a CPU all, have come to events; these are taken through them
 together, and all march on. A landing of the foremost foot is an event like others; a lane whose
 wheel has made its steps takes the next wheel in the queue. So hardly a lane waits for another.
 """
