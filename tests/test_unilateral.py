@@ -40,12 +40,14 @@ START = (0.1, 1.6, -0.1)
 TIGHT = vrw.Options.tight()
 LAW = Law(one_sided=False, counted=True)
 TABLE_1 = vrw.WheelParams()
-SCENES = {  # friction, damping: what happens in the first step from START
-    "lands sliding": (0.7, 200.0),
-    "slips, sticks, slips again": (2.0, 200.0),
-    "sticks": (0.35, 300.0),
-    "drags the rear foot": (math.inf, 100.0),
-    "the paper's gait": (math.inf, 200.0),
+SCENES = {  # friction, damping, dtheta at the start: what happens in the first step
+    "lands sliding": (0.7, 200.0, 1.6),
+    "slips, sticks, slips again": (2.0, 200.0, 1.6),
+    "sticks": (0.35, 300.0, 1.6),
+    "reverses": (0.5, 100.0, 2.2),
+    "flies": (0.5, 100.0, 1.2),
+    "drags the rear foot": (math.inf, 100.0, 1.6),
+    "the paper's gait": (math.inf, 200.0, 1.6),
 }
 
 
@@ -59,9 +61,9 @@ def stepped(friction, damping=200.0, x=START, options=TIGHT):
 def traces():
     """The motion of each scene, phase by phase, with what it loses."""
     told = {}
-    for name, (friction, damping) in SCENES.items():
+    for name, (friction, damping, dtheta) in SCENES.items():
         wheel, params = vrw.UnilateralWheel(friction=friction), vrw.WheelParams(damping=damping)
-        x = wheel.full_section(params, jnp.asarray(START))
+        x = wheel.full_section(params, jnp.asarray([START[0], dtheta, START[2]]))
         told[name] = (params, friction, wheel.trace(params, x, TIGHT, 12))
     return told
 
@@ -152,7 +154,8 @@ def test_energy_lost_in_a_step_is_told_by_its_causes(traces):
 def test_time_stepping_converges_to_the_same_step_in_first_order(friction):
     truth = stepped(friction)
     sizes = (16e-4, 8e-4, 4e-4, 2e-4)
-    walks = [moreau_jean.one_step(moreau_jean.Wheel(friction), *START, h) for h in sizes]
+    wheel = moreau_jean.Wheel(friction)
+    walks = [moreau_jean.one_step(wheel, moreau_jean.paper_start(wheel, *START), h) for h in sizes]
     errors = np.array([w.time - float(truth.period) for w in walks])
     np.testing.assert_allclose(errors[:-1] / errors[1:], 2.0, atol=0.15)
     once = 2.0 * errors[1:] - errors[:-1]  # extrapolated, s
@@ -163,9 +166,39 @@ def test_time_stepping_converges_to_the_same_step_in_first_order(friction):
     assert abs(walks[3].loaded_twice - float(truth.durations[0])) < 2e-3
 
 
+def oracle_start(x):
+    """A full section state as the time-stepping code wants it."""
+    theta = float(x[0]) - moreau_jean.ALPHA
+    L, dL, code = (np.roll(x[4 + 8 * i : 12 + 8 * i], 1) for i in range(3))
+    hub = [L[0] * np.sin(theta), L[0] * np.cos(theta), theta]
+    rates = [x[2], x[3], x[1]]
+    code = np.round(code).astype(int)
+    return moreau_jean.Start(np.r_[hub, L], np.r_[rates, dL], code >= 4, code % 4 != OFF)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("friction", "damping"), [(0.7, 300.0), (1.3, 200.0)])
+def test_the_period_of_a_gait_is_that_of_time_stepping(friction, damping):
+    model, params = vrw.UnilateralWheel(friction=friction), vrw.WheelParams(damping=damping)
+    walk = vrw.walk(params, START, 120, model=model, options=TIGHT)
+    x = np.asarray(walk.steps.section_state[-1])
+    np.testing.assert_allclose(x, walk.steps.section_state[-2], atol=1e-9)  # a gait: it repeats
+    wheel = moreau_jean.Wheel(friction, c=damping)
+    steps = [moreau_jean.one_step(wheel, oracle_start(x), h) for h in (16e-4, 8e-4, 4e-4, 2e-4)]
+    once = lambda told: 2.0 * told[1:] - told[:-1]  # extrapolated; below once more
+    twice = lambda told: (4.0 * once(told)[1:] - once(told)[:-1]) / 3.0
+    periods = twice(np.array([step.time for step in steps]))
+    # Time stepping's own error: its last extrapolation moved by up to 4e-6 s.
+    assert abs(periods[1] - float(jnp.sum(walk.steps.durations[-1]))) < 2e-6
+    thetas = twice(np.array([step.theta for step in steps]))
+    assert abs(thetas[1] - float(x[0])) < 2e-6  # and the step ends where it began
+
+
 @pytest.mark.parametrize("name", SCENES)
 def test_landings_repeat_between_tolerances(name):
-    loose, tight = (stepped(*SCENES[name], options=o) for o in (vrw.Options(), TIGHT))
+    friction, damping, dtheta = SCENES[name]
+    x = (START[0], dtheta, START[2])
+    loose, tight = (stepped(friction, damping, x, options=o) for o in (vrw.Options(), TIGHT))
     assert int(tight.outcome) == vrw.Outcome.STEPPED
     assert int(loose.events) == int(tight.events)
     np.testing.assert_allclose(loose.section_state, tight.section_state, atol=1e-8)
@@ -287,12 +320,35 @@ def test_a_foot_that_lands_sliding_takes_coulombs_impulse(friction):
     assert abs(tangential + friction * normal) < 1e-12
 
 
-def test_bad_input_and_paradoxes_are_codes_and_never_nan():
+def test_bad_input_is_a_code_and_never_nan():
     for friction, x in ((0.7, (math.nan, 1.0, 0.0)), (-1.0, START), (math.nan, START)):
         step = stepped(friction, x=x)
         assert int(step.outcome) == vrw.Outcome.BAD_INPUT
         assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(step))
     assert not np.any(np.asarray(stepped(-1.0).section_state))
+
+
+@pytest.mark.parametrize(
+    ("friction", "damping", "x", "outcome"),
+    [
+        (1.5, 16.39, (0.001, 0.6, -0.4), vrw.Outcome.THREE_FEET_LOADED),  # Leg 3's foot is 1 mm up
+        (8.0, 183.0, (0.037, 2.31, -0.065), vrw.Outcome.SOLVER_GAVE_UP),  # a Painlevé paradox
+    ],
+)
+def test_what_the_model_does_not_cover_ends_a_step_with_its_code(friction, damping, x, outcome):
+    step = stepped(friction, damping, x)
+    assert int(step.outcome) == outcome
+    assert not np.any(np.asarray(step.section_state))
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(step))
+
+
+def test_events_without_end_are_bounded_and_told():
+    enough = int(stepped(0.7).events)
+    wheel = vrw.UnilateralWheel(friction=0.7, max_events=enough - 1)
+    x = wheel.full_section(TABLE_1, jnp.asarray(START))
+    cut_short = wheel.advance(TABLE_1, x, TIGHT)
+    assert int(cut_short.outcome) == vrw.Outcome.TOO_MANY_EVENTS
+    assert not np.any(np.asarray(cut_short.section_state))
 
 
 def test_a_slope_that_is_too_flat_ends_the_walk_with_a_code():

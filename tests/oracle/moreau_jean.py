@@ -30,6 +30,15 @@ class Wheel(NamedTuple):
     one_sided: bool = False
 
 
+class Start(NamedTuple):
+    """Just before a foot lands, in the labels of the step that begins: that foot is Leg 0's."""
+
+    q: np.ndarray  # hub x, z, theta, lengths
+    v: np.ndarray  # their rates
+    locked: np.ndarray  # legs on their stoppers
+    carried: np.ndarray  # feet that carried load
+
+
 class Walked(NamedTuple):
     """Where the next foot ahead landed."""
 
@@ -37,6 +46,7 @@ class Walked(NamedTuple):
     theta: float
     dtheta: float
     loaded_twice: float  # time with two feet loaded, s
+    end: Start
 
 
 def _legs(theta):
@@ -98,8 +108,8 @@ def _solve(w, W, free, feet, guess):
     return p
 
 
-def one_step(w: Wheel, theta: float, dtheta: float, dL1: float, h: float) -> Walked:
-    """From the paper's section state (labels of the step that ends) to the next landing ahead."""
+def paper_start(w: Wheel, theta: float, dtheta: float, dL1: float) -> Start:
+    """From the paper's section state, in the labels of the step that ends."""
     L1 = w.L0 * np.cos(theta - ALPHA) / np.cos(theta)
     q = np.zeros(3 + N)
     v = np.zeros(3 + N)
@@ -109,10 +119,22 @@ def one_step(w: Wheel, theta: float, dtheta: float, dL1: float, h: float) -> Wal
     q[1] = L1 * np.cos(theta)
     v[0] = dL1 * np.sin(theta) + L1 * dtheta * np.cos(theta)
     v[1] = dL1 * np.cos(theta) - L1 * dtheta * np.sin(theta)
-    locked = np.full(N, not w.one_sided)
-    locked[:2] = False
-    carried = np.zeros(N, bool)
-    carried[1] = True
+    return Start(q, v, np.arange(N) > 1, np.arange(N) == 1)
+
+
+def _next_start(q: np.ndarray, v: np.ndarray, locked: np.ndarray, carried: np.ndarray) -> Start:
+    """The same wheel in the labels of the step that begins, the hub above its landing foot."""
+    roll = lambda x: np.concatenate([x[:2], [x[2] - ALPHA], np.roll(x[3:], 1)])
+    q = roll(q)
+    q[0] = q[3] * np.sin(q[2])
+    v = np.concatenate([v[:3], np.roll(v[3:], 1)])
+    return Start(q, v, np.roll(locked, 1), np.roll(carried, 1))
+
+
+def one_step(w: Wheel, start: Start, h: float) -> Walked:
+    """From a landing to the next one ahead."""
+    q, v = start.q.copy(), start.v.copy()
+    locked, carried = start.locked & (not w.one_sided), start.carried.copy()
     time, twice = 0.0, 0.0
     impulses = {}
     while time < 3.0:
@@ -156,7 +178,8 @@ def one_step(w: Wheel, theta: float, dtheta: float, dL1: float, h: float) -> Wal
         time += share * h
         twice += share * h * (np.sum(carried) >= 2)
         if share < 1.0:
-            return Walked(time, q[2] - (1.0 - share) * h * v[2], v[2], twice)
+            q = q - (1.0 - share) * h * v
+            return Walked(time, q[2], v[2], twice, _next_start(q, v, locked, carried))
         hits = ~locked & (q[3:] >= w.L0) & ~carried & (not w.one_sided)
         if np.any(hits):  # inelastic: the leg joins the rigid rest with its momentum
             locked |= hits

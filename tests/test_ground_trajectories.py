@@ -1,0 +1,121 @@
+"""Trajectories on real ground: forces are momentum's, labels pass on, what is lost is told."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import vrw_jax as vrw
+from vrw_jax.models.ladder import UNILATERAL, VISCOELASTIC
+
+pytestmark = pytest.mark.slow
+
+START = (0.1, 1.6, -0.1)
+N_STEPS, N_SAMPLES = 2, 401
+PARAMS, GROUND = vrw.WheelParams(), vrw.UnilateralWheel(friction=0.7)
+MASS = float(PARAMS.hub_mass + 8.0 * PARAMS.leg_mass)
+
+
+@pytest.fixture(scope="module")
+def walk() -> xr.Dataset:
+    return vrw.simulate(PARAMS, START, N_STEPS, model=GROUND, n_samples=N_SAMPLES)
+
+
+def stretches(walk: xr.Dataset) -> list[xr.Dataset]:
+    """Between one event and the next."""
+    return [
+        walk.isel(time=slice(begin, begin + N_SAMPLES))
+        for begin in range(0, walk.sizes["time"], N_SAMPLES)
+    ]
+
+
+def mass_centre(part: xr.Dataset) -> np.ndarray:
+    """Moments of mass along x and z, kg m, from where the paper puts each mass."""
+    angles = part.theta.values[:, None] + 2.0 * math.pi / 8 * np.arange(8)
+    reach = part.length.values - float(PARAMS.leg_com)
+    leg = float(PARAMS.leg_mass)
+    return np.stack(
+        [
+            MASS * part.hub_x.values - leg * np.sum(reach * np.sin(angles), 1),
+            MASS * part.hub_z.values - leg * np.sum(reach * np.cos(angles), 1),
+        ]
+    )
+
+
+def test_ground_forces_and_weight_move_the_mass_centre(walk: xr.Dataset) -> None:
+    for part in stretches(walk):
+        time = part.time.values - part.time.values[0]
+        # Twice integrated from both ends to the middle, the velocities drop out.
+        lever = np.minimum(time, time[-1] - time)
+        simpson = np.ones(N_SAMPLES)
+        simpson[1:-1:2], simpson[2:-1:2] = 4.0, 2.0
+        weigh = time[1] / 3.0 * simpson * lever
+        weight = 9.81 * MASS * np.array([math.sin(0.30), -math.cos(0.30)])
+        pushes = np.stack([part.tangential.values.sum(1), part.normal.values.sum(1)])
+        moment = mass_centre(part)
+        bend = moment[:, 0] - 2.0 * moment[:, N_SAMPLES // 2] + moment[:, -1]
+        # Simpson's rule where a damped leg settles at c / m = 200 per second.
+        np.testing.assert_allclose((pushes + weight[:, None]) @ weigh, bend, atol=1e-8)
+
+
+def test_the_next_step_begins_where_the_last_one_ended(walk: xr.Dataset) -> None:
+    first, second = (walk.isel(time=walk.step.values == k) for k in range(N_STEPS))
+    end, begin = first.isel(time=-1), second.isel(time=0)
+    assert float(begin.time) == pytest.approx(float(end.time), abs=1e-12)
+    assert float(begin.theta - end.theta) == pytest.approx(-math.pi / 4, abs=1e-9)
+    for name in ("hub_x", "hub_z"):
+        assert float(begin[name]) == pytest.approx(float(end[name]), abs=1e-9)
+    for name in ("length", "foot_x", "foot_z"):
+        np.testing.assert_allclose(begin[name], np.roll(end[name], 1), atol=1e-9)
+    assert begin.foot_z.values[0] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_between_events_time_runs_on_and_nothing_moves_at_once(walk: xr.Dataset) -> None:
+    parts = stretches(walk)
+    assert len(parts) > 4
+    for before, after in pairwise(parts):
+        assert np.all(np.diff(before.time) > 0.0)
+        assert float(after.time[0] - before.time[-1]) == pytest.approx(0.0, abs=1e-12)
+        if after.step[0] == before.step[0]:
+            for name in ("hub_x", "hub_z", "theta", "length"):
+                np.testing.assert_allclose(after[name][0], before[name][-1], atol=1e-9)
+
+
+def test_energy_falls_from_step_to_step_by_what_the_step_lost(walk: xr.Dataset) -> None:
+    total = walk.kinetic_energy + walk.gravitational_energy + walk.elastic_energy
+    ends = [float(total[walk.step.values == k][-1]) for k in range(N_STEPS)]
+    x = vrw.step(PARAMS, START, model=GROUND).section_state
+    step = vrw.step(PARAMS, x, model=GROUND)
+    lost = step.energy_impacts + step.energy_damping + step.energy_friction
+    assert ends[0] - ends[1] == pytest.approx(float(lost), abs=1e-8)
+
+
+def test_forces_are_those_of_the_contact_that_is_named(walk: xr.Dataset) -> None:
+    in_the_air = walk.contact.values == 0
+    for force in (walk.normal.values, walk.tangential.values):
+        assert np.all(force[in_the_air] == 0.0)
+    assert np.all(walk.normal.values[~in_the_air] > -1e-9)
+    np.testing.assert_allclose(walk.foot_z.values[~in_the_air], 0.0, atol=1e-9)
+    sliding = walk.contact.values == 2
+    assert sliding.any()
+    cone = walk.tangential.values + 0.7 * walk.normal.values
+    np.testing.assert_allclose(cone[sliding], 0.0, atol=1e-9)
+    assert walk.contact.attrs["flag_meanings"].split()[2] == "sliding_downhill"
+    np.testing.assert_allclose(walk.length.values[walk.on_stopper.values], 1.0, atol=1e-12)
+
+
+def test_the_ladders_trajectory_says_which_rung_served() -> None:
+    for friction, rung in ((50.0, VISCOELASTIC), (0.7, UNILATERAL)):
+        ladder = vrw.LadderWheel(friction=friction)
+        walk = vrw.simulate(PARAMS, START, 1, model=ladder, n_samples=3)
+        assert np.all(walk.rung == rung)
+        resting = np.isin(walk.contact.values, (0, 1)).all()
+        assert resting == (rung == VISCOELASTIC)
+
+
+def test_a_failing_step_ends_the_trajectory_with_its_outcome() -> None:
+    walk = vrw.simulate(PARAMS, (0.1, math.nan, -0.1), 3, model=GROUND, n_samples=N_SAMPLES)
+    assert walk.attrs["outcome"] == "BAD_INPUT"
+    assert walk.sizes["time"] == 0
