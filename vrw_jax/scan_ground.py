@@ -72,15 +72,15 @@ class GroundEngine:
                 cycle = cycle_of(values, begin, base.n_legs, model, options)
             return cycle.outcome, {name: _read(name, cycle) for name in plain} | slopes
 
-        self._compiled: Any = jax.jit(jax.vmap(one))
+        self._program = jax.jit(jax.vmap(one), compiler_options=fusion_emitters(False))
+        self._compiled: Any = None
 
-    def compile(self) -> None:
-        """Compile the one large function."""
+    def _compile(self) -> Any:
+        """The one large function, ready to run: here, lest each thread compile its own."""
         dtype = np.dtype(self._base.damping.dtype)
         shapes = (LANES, len(MOVED)), (LANES, self._model.section_size(self._base))
-        self._compiled = self._compiled.lower(
-            *(jax.ShapeDtypeStruct(shape, dtype) for shape in shapes)
-        ).compile(fusion_emitters(False))
+        given = (jax.ShapeDtypeStruct(shape, dtype) for shape in shapes)
+        return self._program.lower(*given).compile()
 
     def __call__(self, columns: Columns) -> Told:
         """Results of the samples in `columns` (one value per sample of each swept parameter)."""
@@ -96,6 +96,7 @@ class GroundEngine:
             values.T, start, N_TOWARDS, self._model, self._towards, n_legs
         )
         batches = [slice(begin, begin + LANES) for begin in range(0, n, LANES)]
+        self._compiled = self._compiled or self._compile()
         with ThreadPoolExecutor(self._threads) as pool:
             parts = list(pool.map(lambda b: self._batch(values[b], states[b], outcome[b]), batches))
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
