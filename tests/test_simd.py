@@ -26,8 +26,9 @@ def both_ways(function, lanes, uniform=()):
 
 
 @pytest.fixture(autouse=True)
-def folder(tmp_path):
-    """A cache of the test's own."""
+def folder(tmp_path, monkeypatch):
+    """A cache of the test's own, since settings of the same name stand for other functions here."""
+    monkeypatch.setattr(simd, "_made", {})
     before = jax.config.jax_compilation_cache_dir
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
     yield tmp_path
@@ -138,6 +139,22 @@ def test_a_later_start_neither_traces_nor_compiles(folder, monkeypatch):
     assert list(program(double, lanes)([], lanes)[0]) == [0.0, 2.0, 4.0, 6.0]
     monkeypatch.setattr(simd, "_compiled", None)  # would fail
     assert list(program(double, lanes)([], lanes)[0]) == [0.0, 2.0, 4.0, 6.0]
+    monkeypatch.setattr(simd, "_made", {})  # as in another process
+    assert list(program(double, lanes)([], lanes)[0]) == [0.0, 2.0, 4.0, 6.0]
+    assert len(traced) == 1
+
+
+def test_another_batch_is_neither_traced_nor_compiled_again_without_a_cache(monkeypatch):
+    jax.config.update("jax_compilation_cache_dir", None)
+    traced = []
+
+    def double(x):
+        traced.append(1)
+        return 2.0 * x
+
+    call = simd.lane_function(double, lambda x: x, "batches")
+    for n in (1, 5, 8):
+        np.testing.assert_array_equal(jax.jit(call)(jnp.arange(n) + 1.0), 2.0 * (np.arange(n) + 1))
     assert len(traced) == 1
 
 
@@ -240,7 +257,7 @@ def test_a_kept_program_finds_the_machine_code_that_it_calls(folder, monkeypatch
     assert names[1] == names[0]
 
 
-def test_other_settings_and_damaged_files_are_compiled_anew(folder):
+def test_other_settings_and_damaged_files_are_compiled_anew(folder, monkeypatch):
     lanes = [np.arange(4.0)]
     traced = []
 
@@ -256,6 +273,7 @@ def test_other_settings_and_damaged_files_are_compiled_anew(folder):
         content = bytearray(place.read_bytes())
         content[-100] ^= 1
         place.write_bytes(content)
+    monkeypatch.setattr(simd, "_made", {})  # as in another process
     assert times(2.0) == 6.0
     assert traced == [2.0, 3.0, 2.0]
 

@@ -1,4 +1,4 @@
-"""Functions over lanes as machine code for CPUs: eight lanes side by side, from first to last line.
+"""Functions over lanes as machine code for CPUs: a few lanes side by side, from first to last line.
 
 XLA on CPU makes a loop over all lanes of every few operations, with results in memory between them,
 and a `while` waits for the slowest of hundreds. Here the trace of the whole function becomes one
@@ -159,6 +159,8 @@ def _code(function: Callable, shapes: Any, settings: object, width: int) -> _Cod
         code_digest(),
     )  # fmt: skip
     name = f"vrw_lanes_{hashlib.sha256(repr(told).encode()).hexdigest()}"
+    if name in _made:
+        return _made[name]
     content = kept(name)
     if content is None:
         with _python, _uncollected():
@@ -167,7 +169,12 @@ def _code(function: Callable, shapes: Any, settings: object, width: int) -> _Cod
         out = [(aval.shape[:-1], aval.dtype.name) for aval in closed.out_avals]
         content = json.dumps(out).encode() + b"\n" + _compiled(module)
         keep(name, content)
-    return _told(name, content)
+    _made[name] = _told(name, content)
+    return _made[name]
+
+
+_made: dict[str, _Code] = {}
+"""This process's, by name: whatever traces a program again, for another batch, finds it here."""
 
 
 @contextlib.contextmanager
