@@ -52,13 +52,16 @@ class Updated(Field):
         """The entry there."""
         return self.arrays.entry(self.arrays.in_memory(self), index)
 
+    def ready(self) -> "Updated":
+        """With the part computed: it may depend on what it takes the place of."""
+        return Updated(self.arrays, self.whole, self.arrays.in_memory(self.part), self.begin)
+
     def store_into(self, memory: "Memory") -> None:
-        """Overwrites the part there."""
+        """Overwrites the part there, which is `ready`."""
         arrays = self.arrays
-        fresh = arrays.in_memory(self.part)  # it may depend on what it takes the place of
 
         def store(index: Index, _: Any) -> list[Value]:
-            memory.store(arrays.further(index, self.begin), fresh.load(index))
+            memory.store(arrays.further(index, self.begin), arrays.entry(self.part, index))
             return []
 
         arrays.each(self.part.shape, store)
@@ -109,7 +112,7 @@ class Arrays(Numbers):
     def __init__(self, builder: ir.IRBuilder, width: int) -> None:
         super().__init__(builder, width)
         self.alive: list[Any] = []  # what is known by `id`
-        self.written_out = False  # within a loop's body that has no loops: no fields are made
+        self.written_out = False  # within a loop's body that has no loops: constants need no table
 
     def kind_of(self, aval: Any) -> ir.Type:
         """What entries of one of the trace's arrays are."""
@@ -228,6 +231,10 @@ class Arrays(Numbers):
 
     def fill(self, memory: Memory, array: Entries) -> None:
         """Stores all entries."""
+        if isinstance(array, Updated):
+            self.fill(memory, array.whole)
+            array.store_into(memory)
+            return
         if isinstance(array, np.ndarray):
             for index in np.ndindex(memory.shape):
                 memory.store(index, array[index])
@@ -244,11 +251,7 @@ class Arrays(Numbers):
         if isinstance(array, Memory):
             return array
         memory = self.room(array.shape, _kind(array))
-        if isinstance(array, Updated):
-            self.fill(memory, array.whole)
-            array.store_into(memory)
-        else:
-            self.fill(memory, array)
+        self.fill(memory, array)
         return memory
 
     def _table(self, array: np.ndarray) -> Memory:

@@ -204,18 +204,22 @@ class _Carry:
 
     def on(self, arrays: Sequence[Entries]) -> list[Value]:
         """From one turn to the next: new values may depend on any of the old."""
-        flat, moves = self._in_registers(arrays), []
+        flat = self._in_registers(arrays)
+        moves: list[tuple[Memory, Memory | Updated]] = []
         for array, place in zip(arrays, self.places, strict=True):
             if place is None or (isinstance(array, Memory) and array.base is place.base):
                 continue
             if isinstance(array, Updated) and array.whole.base is place.base:
-                array.store_into(place)
+                moves.append((place, array.ready()))
             else:
-                fresh = self.owner.room(place.shape, place.kind)
-                self.owner.fill(fresh, array)
-                moves.append((place, fresh))
+                copy = self.owner.room(place.shape, place.kind)
+                self.owner.fill(copy, array)
+                moves.append((place, copy))
         for place, fresh in moves:
-            self.owner.fill(place, fresh)
+            if isinstance(fresh, Updated):
+                fresh.store_into(place)
+            else:
+                self.owner.fill(place, fresh)
         return flat
 
     def _in_registers(self, arrays: Sequence[Entries]) -> list[Value]:
