@@ -29,8 +29,9 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 
 from vrw_jax.code_cache import code_digest, keep, kept
-from vrw_jax.simd_arrays import HELD, LANES, Entries, Field, Index
+from vrw_jax.simd_arrays import HELD, LANES
 from vrw_jax.simd_emit import BYTE, INT, LONG, NUMBERS, TRUTH
+from vrw_jax.simd_fields import Entries, Field, Index
 from vrw_jax.simd_trace import Traces
 
 VECTOR = {np.dtype(np.float64): 4, np.dtype(np.float32): 8}

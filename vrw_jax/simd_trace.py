@@ -10,19 +10,9 @@ import llvmlite.ir as ir
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 
-from vrw_jax.simd_arrays import (
-    HELD,
-    HELD_INSIDE,
-    Arrays,
-    Entries,
-    Field,
-    Memory,
-    Updated,
-    array_of,
-    has_lanes,
-    shape_of,
-)
+from vrw_jax.simd_arrays import HELD, HELD_INSIDE, Arrays, array_of, has_lanes, shape_of
 from vrw_jax.simd_emit import LONG, Value
+from vrw_jax.simd_fields import Entries, Field, Memory, Updated
 
 APART = "apart"
 
