@@ -17,7 +17,7 @@ import pytest
 import xarray as xr
 
 import vrw_jax as vrw
-from vrw_jax import designs
+from vrw_jax import designs, scan_store
 from vrw_jax.designs import Columns
 from vrw_jax.measures import MARGINS
 from vrw_jax.outcomes import Outcome
@@ -159,6 +159,27 @@ def slow(columns):
 print("ready", flush=True)
 test_scan.run(test_scan.planned(1), {store!r}, evaluate=slow)
 """
+
+
+def test_a_store_whose_making_was_killed_is_made_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing that a killed process can leave behind is taken for a store."""
+    fill, path = scan_store._fill, tmp_path / "s.zarr"
+
+    def killed(place: Path, *rest: object) -> None:
+        fill(place, *rest)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(scan_store, "_fill", killed)
+    monkeypatch.setattr(scan_store.shutil, "rmtree", lambda *_, **__: None)  # nothing cleans up
+    with pytest.raises(KeyboardInterrupt):
+        run(planned(), path, evaluate=arithmetic)
+    assert not path.exists()
+    monkeypatch.undo()
+    run(planned(), tmp_path / "whole.zarr", evaluate=arithmetic)
+    run(planned(), path, evaluate=arithmetic)
+    assert files(path) == files(tmp_path / "whole.zarr")
 
 
 def test_a_scan_killed_with_signal_9_ends_bitwise_the_same(tmp_path: Path) -> None:
