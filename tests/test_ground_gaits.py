@@ -114,39 +114,6 @@ def test_a_branch_on_real_ground_holds_gaits_that_repeat(near):
 
 
 @pytest.mark.slow
-def test_a_branch_on_real_ground_goes_through_its_fold_onto_gaits_that_repel():
-    ground, bounds = vrw.UnilateralWheel(friction=1.03), (0.95, 1.03)
-    near = vrw.walk(vrw.WheelParams(), START, 40, model=ground, options=OPTIONS)
-    at = lambda x: vrw.limit_cycle(vrw.WheelParams(), guess=x, model=ground, options=OPTIONS)
-    slow = at(near.steps.section_state[-1])
-    branch = vrw.continue_branch(
-        vrw.WheelParams(), "friction", bounds, cycle=slow, model=ground, step_options=OPTIONS,
-        options=ArclengthOptions(first_step=0.1, largest_step=0.1),
-    )  # fmt: skip
-    (fold,) = (border for border in branch.borders if border.kind == "fold")
-    assert branch.values.min() > fold.value - 1e-6
-    assert max(abs(branch.values[end] - 1.03) for end in (0, -1)) < 1e-9
-    assert float(branch.dataset.closure.max()) < 1e-8
-    end = 0 if branch.stable[-1] else -1
-    assert branch.stable[-1 - end]
-    assert not branch.stable[end]
-    # A walk from beside the gait that repels leaves it as fast as its multiplier says.
-    gait = at(jnp.asarray(branch.dataset.section_state.values[end]))
-    assert int(gait.outcome) == vrw.Outcome.STEPPED
-    assert float(gait.spectral_radius) > 1.05
-    beside = gait.section_state.at[1].add(1e-6)
-    steps = vrw.walk(vrw.WheelParams(), beside, 12, model=ground, options=OPTIONS).steps
-    away = jnp.linalg.norm(steps.section_state - gait.section_state, axis=-1)
-    np.testing.assert_allclose(away[-1] / away[-2], gait.spectral_radius, rtol=1e-3)
-    # Walks know nothing of branches: with more friction the slow gait is there, with less not.
-    for friction, slow_left in ((fold.value + 0.01, True), (fold.value - 0.03, False)):
-        walked = vrw.walk(
-            vrw.WheelParams(), START, 300, model=vrw.UnilateralWheel(friction=friction)
-        )
-        assert (float(jnp.sum(walked.steps.durations[-1])) > 0.5) == slow_left
-
-
-@pytest.mark.slow
 def test_without_slip_the_multipliers_are_those_of_the_papers_plane():
     paper = vrw.limit_cycle(vrw.WheelParams())
     held = vrw.UnilateralWheel(friction=math.inf)
