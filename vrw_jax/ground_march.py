@@ -5,16 +5,13 @@ whose step crosses a guard takes that step again, shortened, until it ends on th
 Nothing here looks from one lane to another.
 """
 
-import functools
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
-from vrw_jax import simd
 from vrw_jax.models.unilateral_mechanics import WheelMotion, directions, kept, one_of
 from vrw_jax.models.unilateral_motion import (
     Felt,
@@ -41,30 +38,6 @@ SAFETY, LEAST, MOST = 0.9, 0.2, 5.0
 CLOSE = 30.0
 """An event is found where the last correction to its time is no more than so many tolerances of the
 step: the proposal is a parabola's, whose own error is about a hundredth of the correction."""
-
-
-Cut = Callable[..., Any]
-"""`cut(function, *arrays)` is `function(*arrays)`, computed once whoever reads it."""
-
-
-def cut_where(lanes: Float[Array, " lanes"]) -> Cut:
-    """Borders of fusion on CPU; `lanes` must not hold NaN, which XLA can't know.
-
-    XLA there computes a producer again for each of its consumers, and can't fuse across a branch.
-    Elsewhere a branch would cost a round trip to the host, and fusion does not recompute.
-    """
-    if simd.tracing() or jax.default_backend() != "cpu":
-        return lambda function, *arrays: function(*arrays)
-    always = ~jnp.isnan(jnp.max(lanes))
-
-    def cut(function: Callable, *arrays: Any) -> Any:
-        def nothing(*arrays: Any) -> Any:
-            shapes = jax.eval_shape(function, *arrays)
-            return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-
-        return lax.cond(always, function, nothing, *arrays)
-
-    return cut
 
 
 class Place(NamedTuple):
@@ -167,7 +140,6 @@ def march(
     flow = flow_of(s, friction, one_sided, begin.stance)
     order, n = tableau.order, begin.here.q.shape[0]
     middle, last = tableau.middle, len(tableau.places) - 1
-    cut = cut_where(begin.h)
 
     def watched(place: Place, offset: Array) -> Array:
         return guards_at(flow, place) - offset
@@ -190,31 +162,31 @@ def march(
             return here.q + h * (places[i] * here.v + h * second), here.v + h * first
 
         def stage(i: Array, slopes: Array) -> Array:
-            slope = cut(functools.partial(_slope, flow), *cut(at, i, slopes))
+            slope = _slope(flow, *at(i, slopes))
             return lax.dynamic_update_index_in_dim(slopes, slope, i, 0)
 
         others = jnp.zeros((last, *here.slope.shape), h.dtype)
         slopes = jnp.concatenate([here.slope[None], others])
         slopes = lax.fori_loop(1, last + 1, stage, slopes)
-        reached = lambda i: Place(*cut(at, i, slopes), *slopes[i : i + 1])
+        reached = lambda i: Place(*at(i, slopes), slopes[i])
         end, mid = reached(last), reached(middle)
-        gm, g1 = (cut(watched, place, now.offset) for place in (mid, end))
+        gm, g1 = (watched(place, now.offset) for place in (mid, end))
         g0 = now.values
 
-        error = cut(functools.partial(_squared_error, tableau, options), here, end, slopes, h, g1)
+        error = _squared_error(tableau, options, here, end, slopes, h, g1)
         power = jnp.exp(jnp.log(jnp.clip(error, 1e-20, 1e20)) * (-0.5 / order))
         running, marching = now.verdict == MARCHING, (now.verdict == MARCHING) & ~search.on
         keep = marching & (error <= 1.0)
         change = jnp.clip(SAFETY * power, LEAST, jnp.where(keep, MOST, 1.0))
-        bend, slope = cut(functools.partial(parabola, tableau), g0, gm, g1)
+        bend, slope = parabola(tableau, g0, gm, g1)
         crosses = g1 <= 0.0
-        to_dip = cut(_to_earliest_dip, g0, g1, slope, bend)
+        to_dip = _to_earliest_dip(g0, g1, slope, bend)
         retry = keep & (to_dip < 1.0) & (now.time + h * to_dip > now.time)
         crossed = keep & ~retry & jnp.any(crosses, axis=0)
         accepted = keep & ~retry & ~crossed
 
         crossing = jnp.where(search.on, search.crossing | crosses, crosses)
-        first, guard = cut(_earliest_root, g0, slope, bend, crossing)
+        first, guard = _earliest_root(g0, slope, bend, crossing)
         proposal = h * first
         past = jnp.any(crossing & crosses, axis=0)
         low = jnp.where(search.on & ~past, h, search.low)

@@ -79,7 +79,7 @@ class Traces(Arrays):
         if key not in self._functions:
             self.alive.append(closed)
             self._functions[key] = self._function(closed)
-        flat = self._flat(values, closed.in_avals)
+        flat = self.flat(values, closed.in_avals)
         told = self.builder.call(self._functions[key], flat)
         results = [self.builder.extract_value(told, i) for i in range(len(told.type.elements))]
         return _arrays_of(results, closed.out_avals)
@@ -98,13 +98,13 @@ class Traces(Arrays):
         self.builder, self.known = ir.IRBuilder(function.append_basic_block("entry")), ChainMap()
         results = self.closed(closed, _arrays_of(function.args, closed.in_avals))
         whole: Value = ir.Constant(told, ir.Undefined)
-        for i, value in enumerate(self._flat(results, closed.out_avals)):
+        for i, value in enumerate(self.flat(results, closed.out_avals)):
             whole = self.builder.insert_value(whole, value, i)
         self.builder.ret(whole)
         self.builder, self.known = outside
         return function
 
-    def _flat(self, arrays: Sequence[Entries], avals: Sequence[Any]) -> list[Value]:
+    def flat(self, arrays: Sequence[Entries], avals: Sequence[Any]) -> list[Value]:
         """All entries in a row, those of lanes as vectors."""
         flat: list[Value] = []
         for array, aval in zip(arrays, avals, strict=True):
@@ -164,7 +164,7 @@ class Traces(Arrays):
 class _Carry:
     """Arrays between the turns of a loop: in registers up to `limit` entries, else in memory."""
 
-    def __init__(self, arrays: Arrays, avals: Sequence[Any], limit: int | float) -> None:
+    def __init__(self, arrays: Traces, avals: Sequence[Any], limit: int | float) -> None:
         self.owner, self.avals = arrays, avals
         self.places = [
             arrays.room(shape_of(aval), arrays.kind_of(aval))
@@ -175,15 +175,13 @@ class _Carry:
 
     def arrays(self, flat: Sequence[Value]) -> list[Entries]:
         """What is carried, in a turn or after the last one."""
-        found: list[Entries] = []
-        left = iter(flat)
-        for aval, place in zip(self.avals, self.places, strict=True):
-            shape = shape_of(aval)
-            if place is None:
-                found.append(array_of(shape, [next(left) for _ in range(math.prod(shape))]))
-            else:  # a field of its own: what was known of it is past
-                found.append(Memory(self.owner, shape, place.kind, place.base))
-        return found
+        held = [aval for aval, place in zip(self.avals, self.places, strict=True) if place is None]
+        left = iter(_arrays_of(flat, held))
+        # A field of its own each time: what was known of it is past.
+        return [
+            next(left) if place is None else Memory(self.owner, place.shape, place.kind, place.base)
+            for place in self.places
+        ]
 
     def start(self, arrays: Sequence[Entries]) -> list[Value]:
         """Values for registers are returned, the others stored."""
@@ -213,12 +211,9 @@ class _Carry:
         return flat
 
     def _in_registers(self, arrays: Sequence[Entries]) -> list[Value]:
-        flat = []
-        for array, aval, place in zip(arrays, self.avals, self.places, strict=True):
-            if place is None:
-                full = np.broadcast_to(self.owner.entries(array), shape_of(aval)).ravel()
-                flat += [self.owner.spread(x) if has_lanes(aval) else x for x in full]
-        return flat
+        triples = zip(arrays, self.avals, self.places, strict=True)
+        held = [(array, aval) for array, aval, place in triples if place is None]
+        return self.owner.flat([array for array, _ in held], [aval for _, aval in held])
 
 
 def _has_loops(jaxpr: Any) -> bool:
@@ -233,7 +228,7 @@ def _has_loops(jaxpr: Any) -> bool:
 
 
 def _arrays_of(flat: Sequence[Value], avals: Sequence[Any]) -> list[Entries]:
-    """The inverse of `Traces._flat`."""
+    """The inverse of `Traces.flat`."""
     found: list[Entries] = []
     begin = 0
     for aval in avals:
