@@ -29,9 +29,10 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 from jax.experimental.compilation_cache import compilation_cache
+from work_precision_charts import replace
 
 import vrw_jax as vrw
-from vrw_jax import transitions
+from vrw_jax import plots, transitions
 from vrw_jax.params import PARAMETER_NAMES
 
 
@@ -260,32 +261,41 @@ def write(table, shares, cost, out):
         f"on {os.cpu_count()} cores.",
     ]
     print("\n".join(lines))
-    (figures / "engine_table.md").write_text("\n".join(lines) + "\n")
+    replace(out / "engine.md", "speeds", "\n".join(lines))
+    with plots.style():
+        plots.save(draw_charts(table, shares, cost), figures, "engine")
 
-    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
+
+def draw_charts(table, shares, cost):
+    """Speed over error of every engine, and cost over the share of lanes that fall back."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(plots.PAGE, 3.9))
+    markers = dict(zip(("Tsit5", "Dopri5", "Dopri8"), "os^", strict=True))
+    colours = dict(
+        zip(LABELS, [*plt.rcParams["axes.prop_cycle"].by_key()["color"], plots.GREY], strict=True)
+    )
     for name, label in LABELS.items():
         for method in dict.fromkeys(e["method"] for e in table if e["engine"] == name):
             some = [e for e in table if (e["engine"], e["method"]) == (name, method)]
             some.sort(key=lambda e: e["p99_error"])
-            style = "o-" if name in ("lanes", "collocation") else "s--"
             several = name in ("lanes", "diffrax")
             left.loglog(
                 [e["p99_error"] for e in some],
                 [e["steps_per_s"] for e in some],
-                style,
                 ms=4,
+                marker=markers.get(method, "o") if several else "D",
+                linestyle="-" if name in ("lanes", "collocation") else "--",
+                color=colours[name],
                 label=f"{label}, {method}" if several else label,
             )
     left.axvline(CLAIMED, color="0.7", lw=1)
     left.set(xlabel="p99 error over lanes", ylabel="gait steps per second and core")
-    left.legend(fontsize=7)
+    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=2)
     for name, values in cost.items():
-        right.semilogy(100.0 * shares, values, "o-", label=LABELS[name])
+        right.semilogy(100.0 * shares, values, "o-", ms=4, color=colours[name], label=LABELS[name])
     right.set(xlabel="lanes that fall back, %", ylabel="CPU time per lane, µs")
     right.set_ylim(bottom=1.0)
-    right.legend(fontsize=8)
-    for suffix in ("png", "svg"):
-        figure.savefig(figures / f"engine.{suffix}", dpi=150)
+    right.legend()
+    return figure
 
 
 def main():

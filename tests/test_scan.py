@@ -460,6 +460,42 @@ def test_batches_run_side_by_side_and_change_nothing(
         np.testing.assert_array_equal(together[name][LANES:], np.roll(value, -12, 0), name)
 
 
+ON_TWO_DEVICES = """
+import os, sys
+os.environ["XLA_FLAGS"] = "--xla_force_host_platform_device_count=2"
+import jax, numpy as np
+import vrw_jax
+from vrw_jax.scan_engine import LANES
+vrw_jax.start_jax(os.environ["JAX_COMPILATION_CACHE_DIR"])
+sys.path.insert(0, {tests!r})
+import test_scan
+of = test_scan.planned()
+engine = test_scan.Engine(of.measures, of.base, of.model, of.options, of.cycle_options)
+columns = test_scan.GRID.block((slice(None), slice(None)))
+size = LANES + test_scan.GRID.size
+told = engine({{name: np.resize(column, size) for name, column in columns.items()}})
+devices = {{engine._free.get().device.id for _ in range(engine._workers)}}
+assert devices == {{0, 1}}, devices
+np.savez({place!r}, **told)
+"""
+
+
+def test_two_devices_give_bitwise_what_one_gives(
+    told: Mapping[str, np.ndarray], tmp_path: Path
+) -> None:
+    """Two batches, one for each device of a process that has two."""
+    place = tmp_path / "told.npz"
+    cache = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+    code = ON_TWO_DEVICES.format(tests=str(Path(__file__).parent), place=str(place))
+    environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": cache}
+    subprocess.run([sys.executable, "-c", code], check=True, env=environment)
+    together = np.load(place)
+    assert set(together) == set(told)
+    for name, value in told.items():
+        np.testing.assert_array_equal(together[name][: GRID.size], value, name)
+        np.testing.assert_array_equal(together[name][LANES:], np.roll(value, -12, 0), name)
+
+
 @pytest.mark.slow
 def test_a_cluster_that_loses_a_worker_gives_bitwise_the_serial_scan(
     engine: Engine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -35,7 +35,7 @@ from vrw_jax.simd_fields import Entries, Field, Index
 from vrw_jax.simd_trace import Traces
 
 VECTOR = {np.dtype(np.float64): 4, np.dtype(np.float32): 8}
-"""Lanes of a vector: 256 bits."""
+"""Lanes of 256 bits: a vector, or half of one where a processor has 512."""
 TOGETHER = 64
 """Groups that a thread takes at a time."""
 NAME, HANDLER = "lanes", "handler"
@@ -60,7 +60,7 @@ def lane_program(
     result takes numpy arrays of any equal length and gives bitwise the same for a lane in any
     company; it uses all cores that the process may.
     """
-    width = 2 * VECTOR[dtype]  # one vector computes while the other waits
+    width = 2 * VECTOR[dtype]  # of 256 bits one vector computes while the other waits
     shapes = (
         tuple(jax.ShapeDtypeStruct((), kind) for kind in uniform),
         (jax.ShapeDtypeStruct((LANES,), dtype),) * n_lanes_in,
@@ -81,7 +81,7 @@ def lane_function(
     def call(*arrays: Any) -> Any:
         leaves, structure = jax.tree.flatten(arrays)
         n_lanes = leaves[0].shape[-1]
-        width = VECTOR[np.dtype(leaves[0].dtype)]
+        width = VECTOR[np.dtype(leaves[0].dtype)] * (2 if _wide() else 1)
         missing = -n_lanes % width
         shapes = [
             jax.ShapeDtypeStruct((*x.shape[:-1], LANES) if jnp.ndim(x) else (), jnp.result_type(x))
@@ -396,6 +396,11 @@ def _compiled(text: str) -> bytes:
 def _processor() -> tuple[str, str, str]:
     features = llvm.get_host_cpu_features().flatten()
     return llvm.get_process_triple(), llvm.get_host_cpu_name(), features
+
+
+def _wide() -> bool:
+    """Whether vectors have 512 bits."""
+    return "+avx512f" in _processor()[2]
 
 
 def _machine() -> llvm.TargetMachine:
