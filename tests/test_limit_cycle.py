@@ -1,6 +1,7 @@
 """Limit cycles: against a truth of 27 digits, against walking, their derivatives, and failures."""
 
 import functools
+import math
 
 import jax
 import jax.numpy as jnp
@@ -333,6 +334,35 @@ def test_section_newton_finds_the_simplest_walkers_published_cycles(x, time, mul
     np.testing.assert_allclose(cycle.x, x, atol=1e-9)
     found = np.sort_complex(np.asarray(vrw.multipliers.multipliers(cycle.jacobian)))
     np.testing.assert_allclose(found, np.sort_complex(np.asarray(multipliers)), atol=3e-9)
+
+
+def test_section_newton_differentiates_fixed_point_and_multiplier():
+    """x -> a - x^2 repeats x = (sqrt(1 + 4 a) - 1) / 2, with the multiplier -2 x."""
+
+    def told(a, start=0.5):
+        found = vrw.newton_cycle(lambda x: a - x**2, jnp.asarray([start]))
+        return jnp.stack([found.x[0], found.jacobian[0, 0]])
+
+    a = 0.7
+    root = math.sqrt(1.0 + 4.0 * a)
+    expected = np.array([(root - 1.0) / 2.0, 1.0 / root, -2.0 / root**3, 12.0 / root**5])
+    first, second = jax.jacfwd(told), jax.jacfwd(jax.jacrev(told))
+    for function, value in zip((told, first), expected, strict=False):
+        np.testing.assert_allclose(function(a), [value, -2.0 * value], rtol=1e-13)
+    further = [second(a)[0], jax.jacfwd(second)(a)[0]]  # of the point alone
+    np.testing.assert_allclose(further, expected[2:], rtol=1e-12)
+    np.testing.assert_allclose(jax.jit(jax.grad(lambda a: told(a)[0]))(a), expected[1], rtol=1e-13)
+    many = jax.vmap(first)(jnp.asarray([0.1, a, 2.0]))
+    np.testing.assert_allclose(many[1], [expected[1], -2.0 * expected[1]], rtol=1e-13)
+
+
+def test_a_start_from_which_section_newton_does_not_converge_comes_back():
+    def told(a):
+        found = vrw.newton_cycle(lambda x: x + jnp.exp(-a * x), jnp.asarray([2.0]))  # repeats none
+        return found.x[0], found.converged
+
+    value, slope = jax.jvp(told, (1.0,), (1.0,))
+    assert (float(value[0]), bool(value[1]), float(slope[0])) == (2.0, False, 0.0)
 
 
 @pytest.mark.slow

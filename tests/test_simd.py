@@ -242,14 +242,20 @@ def test_functions_set_apart_are_called_and_give_the_same():
 def test_a_kept_program_finds_the_machine_code_that_it_calls(folder, monkeypatch):
     x = jnp.asarray(DRAW.normal(size=(2, 9)))
     double = simd.lane_function(lambda x: 2.0 * x, lambda x: x, "double")
-    run = lambda: traces.compiled(lambda x: double(x) + 1.0, (x,), "kept", jax.devices()[0])(x)
+    traced = []
+
+    def further(x):
+        traced.append(1)
+        return double(x) + 1.0
+
+    run = lambda: traces.compiled(further, (x,), "kept", jax.devices()[0])(x)
     expected = 2.0 * np.asarray(x) + 1.0
     np.testing.assert_array_equal(run(), expected)
     monkeypatch.setattr(simd, "_registered", {})  # as in another process
     names = []
     monkeypatch.setattr(jax.ffi, "register_ffi_target", lambda name, *_, **__: names.append(name))
     np.testing.assert_array_equal(run(), expected)
-    assert len(names) == 1
+    assert (len(names), len(traced)) == (1, 1)
     for place in folder.glob("vrw_lanes_*"):
         place.unlink()
     monkeypatch.setattr(simd, "_registered", {})

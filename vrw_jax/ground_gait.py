@@ -9,6 +9,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 from vrw_jax.limit_cycle import limit_cycle
@@ -16,7 +17,8 @@ from vrw_jax.measures import measures_of
 from vrw_jax.models import UnilateralStep, UnilateralWheel
 from vrw_jax.options import Options
 from vrw_jax.params import FRICTION, PARAMETER_NAMES, WheelParams, parameters_of, wheel_of
-from vrw_jax.walked_cycle import WalkedCycle
+from vrw_jax.section_newton import SectionCycle
+from vrw_jax.walked_cycle import WalkedCycle, cycle_from, finest
 
 MOVED = (*PARAMETER_NAMES, FRICTION)
 """What a gait is differentiated by, in the order of its columns."""
@@ -57,11 +59,19 @@ def cycle_of(
     return cycle
 
 
+N_CORRECTIONS = 30
+"""Of Newton's method, at most."""
+
+
 @eqx.filter_jit
-def _step_and_columns(
-    values: Values, x: Array, n_legs: int, model: UnilateralWheel, options: Options
-) -> tuple[UnilateralStep, UnilateralStep, Array]:
-    """A step from a gait's section state, and how step and section state move along the branch."""
+def ground_gait(
+    values: Values, start: Array, n_legs: int, model: UnilateralWheel, options: Options
+) -> GroundGait:
+    """The gait next to `start`, with its derivatives.
+
+    Each correction has all derivatives of the step: the step's Jacobian, by far the largest part of
+    the program, is compiled once for search and derivatives.
+    """
     n = values.shape[0]
 
     def floats_of(inputs: Array) -> tuple:
@@ -69,27 +79,39 @@ def _step_and_columns(
         floats, rest = eqx.partition(ground.step(wheel, inputs[n:], options), eqx.is_inexact_array)
         return floats, (floats, rest)
 
-    inputs = jnp.concatenate([values, x])
-    jacobian, (floats, rest) = jax.jacfwd(floats_of, has_aux=True)(inputs)
+    differentiated = jax.jacfwd(floats_of, has_aux=True)
+    tolerance, one = finest(options), jnp.eye(start.shape[0], dtype=start.dtype)
+
+    def going(state: tuple) -> Array:
+        _, size, count, ended, *_ = state
+        return ~ended & (count < N_CORRECTIONS) & jnp.isfinite(size)
+
+    def correct(state: tuple) -> tuple:
+        """Newton's correction; once it is small enough, only what stands at the gait."""
+        x, size, count, *_ = state
+        found = size <= tolerance
+        jacobian, (floats, rest) = differentiated(jnp.concatenate([values, x]))
+        miss = floats.section_state - x
+        change = jnp.linalg.solve(one - jacobian.section_state[:, n:], miss)
+        size = jnp.where(found, size, jnp.max(jnp.abs(change)))
+        moves = ~found & jnp.isfinite(size)
+        return jnp.where(moves, x + change, x), size, count + ~found, found, jacobian, floats, rest
+
+    shapes = jax.eval_shape(differentiated, jnp.concatenate([values, start]))
+    jacobian, (floats, rest) = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
+    zero, large = jnp.zeros((), jnp.int32), jnp.ones((), start.dtype)
+    begin = (start, large, zero, jnp.zeros((), bool), jacobian, floats, rest)
+    x, _, count, converged, jacobian, floats, rest = lax.while_loop(going, correct, begin)
     by_values, by_section = jnp.split(jacobian.section_state, [n], axis=-1)
-    one = jnp.eye(x.shape[0], dtype=x.dtype)
-    found = jnp.linalg.solve(one - by_section, by_values)
-    moved = jnp.concatenate([jnp.eye(n, dtype=x.dtype), found])
-    columns = jax.tree.map(lambda leaf: jnp.moveaxis(leaf @ moved, -1, 0), jacobian)
-    return eqx.combine(floats, rest), columns, found.T
-
-
-def ground_gait(
-    values: Values, start: Array, n_legs: int, model: UnilateralWheel, options: Options
-) -> GroundGait:
-    """The gait next to `start`, with its derivatives.
-
-    Outside of `jit` its two large functions, gait and step, are compiled each by itself.
-    """
-    cycle = cycle_of(values, start, n_legs, model, options)
-    return GroundGait(
-        cycle, *_step_and_columns(values, cycle.section_state, n_legs, model, options)
-    )
+    moved = jnp.linalg.solve(one - by_section, by_values)
+    along = jnp.concatenate([jnp.eye(n, dtype=start.dtype), moved])
+    columns = jax.tree.map(lambda leaf: jnp.moveaxis(leaf @ along, -1, 0), jacobian)
+    step = eqx.combine(floats, rest)
+    residual = jnp.max(jnp.abs(step.section_state - x))
+    found = SectionCycle(x, by_section, residual, converged, count)
+    wheel, _ = wheel_and_ground(values, n_legs, model)
+    cycle = cycle_from(wheel, found, jax.tree.map(lambda leaf: leaf[None], step))
+    return GroundGait(cycle, step, columns, moved.T)
 
 
 @eqx.filter_jit

@@ -1,7 +1,8 @@
 """Limit cycles of any return map by Newton's method on the section: it needs nothing else."""
 
+import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -31,8 +32,9 @@ def newton_cycle(
 ) -> SectionCycle:
     """A fixed point of `function` applied `period_n` times, by Newton's method from `start`.
 
-    Differentiable (to third order) in whatever `function` closes over, by two further iterations
-    that carry derivatives. A start that does not converge is returned as it is, without derivative.
+    Differentiable in whatever `function` closes over, by two further iterations that carry
+    derivatives: the point to third order, the Jacobian to first. A start that does not converge is
+    returned as it is, without derivative.
     """
 
     def iterate(x: Array) -> Array:
@@ -40,39 +42,75 @@ def newton_cycle(
             x = function(x)
         return x
 
-    def correction(x: Array) -> tuple[Array, Array, Array]:
-        """Newton's change, the map's Jacobian, and by how much the map misses."""
+    start = lax.stop_gradient(start)
+    image, closed_over = jax.closure_convert(iterate, start)
+    tolerance = lax.stop_gradient(jnp.asarray(tolerance, start.dtype))
+    return _found(image, iterations, start, tolerance, *closed_over)
 
-        def twice(y: Array) -> tuple[Array, Array]:
-            image = iterate(y)
-            return image, image
 
-        jacobian, image = jax.jacfwd(twice, has_aux=True)(x)
-        miss = image - x
-        return jnp.linalg.solve(jnp.eye(x.size, dtype=x.dtype) - jacobian, miss), jacobian, miss
+Map = Callable[..., Array]
 
-    def going(state: tuple) -> Array:
-        _, size, count = state
+
+def _correction(image: Map, x: Array, closed_over: tuple) -> tuple[Array, Array, Array]:
+    """Newton's change, the map's Jacobian, and by how much the map misses."""
+
+    def twice(y: Array) -> tuple[Array, Array]:
+        reached = image(y, *closed_over)
+        return reached, reached
+
+    jacobian, reached = jax.jacfwd(twice, has_aux=True)(x)
+    miss = reached - x
+    return jnp.linalg.solve(jnp.eye(x.size, dtype=x.dtype) - jacobian, miss), jacobian, miss
+
+
+POLISHED = 2
+"""Iterations after convergence. One from a point without derivatives leaves it with its first."""
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _found(
+    image: Map, iterations: int, start: Array, tolerance: Array, *closed_over: Any
+) -> SectionCycle:
+    """One loop, so that the map's Jacobian, often a large program, is compiled once."""
+
+    def searches(size: Array, count: Array) -> Array:
         return (size > tolerance) & (count < iterations) & jnp.isfinite(size)
 
+    def going(state: tuple) -> Array:
+        _, size, count, polished, *_ = state
+        return searches(size, count) | ((size <= tolerance) & (polished < POLISHED))
+
     def step(state: tuple) -> tuple:
-        x, _, count = state
-        change, _, _ = correction(x)
-        size = jnp.max(jnp.abs(change))
-        return jnp.where(jnp.isfinite(size), x + change, x), size, count + 1
+        x, size, count, polished, *_ = state
+        searching = searches(size, count)
+        change, jacobian, miss = _correction(image, x, closed_over)
+        size = jnp.where(searching, jnp.max(jnp.abs(change)), size)
+        x = jnp.where(jnp.all(jnp.isfinite(change)), x + change, x)
+        return x, size, count + searching, polished + ~searching, jacobian, jnp.max(jnp.abs(miss))
 
-    zero = jnp.zeros((), jnp.int32)
-    begin = (lax.stop_gradient(start), jnp.ones((), start.dtype), zero)
-    x, size, count = lax.while_loop(going, step, begin)
-    x, size = lax.stop_gradient((x, size))
+    zero, one = jnp.zeros((), jnp.int32), jnp.ones((), start.dtype)
+    begin = (start, one, zero, zero, jnp.zeros((start.size,) * 2, start.dtype), one)
+    x, size, count, _, jacobian, residual = lax.while_loop(going, step, begin)
     converged = size <= tolerance
-    point = jnp.where(converged, x, lax.stop_gradient(start))
+    return SectionCycle(jnp.where(converged, x, start), jacobian, residual, converged, count)
 
-    def polish(point: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
-        change, jacobian, miss = correction(point)
-        moved = point + jnp.where(converged, change, 0.0)
-        return moved, (jacobian, jnp.max(jnp.abs(miss)))
 
-    point, (jacobians, residuals) = lax.scan(polish, point, None, length=2)
-    point = jnp.where(converged, point, start)
-    return SectionCycle(point, jacobians[-1], residuals[-1], converged, count)
+@_found.defjvp
+def _found_and_moved(
+    image: Map, iterations: int, primals: tuple, tangents: tuple
+) -> tuple[SectionCycle, SectionCycle]:
+    """The derivative, by iterations from the fixed point that carry it along."""
+    start, _, *closed_over = primals
+    found = _found(image, iterations, *lax.stop_gradient(primals))
+
+    def polished(*closed_over: Any) -> SectionCycle:
+        def polish(point: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
+            change, jacobian, miss = _correction(image, point, closed_over)
+            moved = point + jnp.where(found.converged, change, 0.0)
+            return moved, (jacobian, jnp.max(jnp.abs(miss)))
+
+        point, (jacobians, residuals) = lax.scan(polish, found.x, None, length=POLISHED)
+        x = jnp.where(found.converged, point, start)
+        return SectionCycle(x, jacobians[-1], residuals[-1], found.converged, found.iterations)
+
+    return jax.jvp(polished, tuple(closed_over), tuple(tangents[2:]))

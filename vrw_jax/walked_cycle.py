@@ -16,10 +16,15 @@ from vrw_jax.options import Options
 from vrw_jax.outcomes import Outcome
 from vrw_jax.params import Scalar, WheelParams
 from vrw_jax.return_map import ModelLike, checked
-from vrw_jax.section_newton import newton_cycle
+from vrw_jax.section_newton import SectionCycle, newton_cycle
 
 FINEST = 1e-12
 """Newton's last correction need not be smaller, nor than the step's own tolerance."""
+
+
+def finest(options: Options) -> Scalar:
+    """Newton's last correction at these tolerances."""
+    return jnp.maximum(FINEST, options.rtol)
 
 
 class WalkedCycle(eqx.Module):
@@ -136,13 +141,17 @@ def _walked_cycle(
         lambda x: model.advance(params, x, options).section_state,
         x,
         period_n=period_n,
-        tolerance=jnp.maximum(FINEST, options.rtol),
+        tolerance=finest(options),
     )
     x, results = found.x, []
     for _ in range(period_n):
         results.append(model.step(params, x, options))
         x = results[-1].section_state
-    steps = jax.tree.map(lambda *leaves: jnp.stack(leaves), *results)
+    return cycle_from(params, found, jax.tree.map(lambda *leaves: jnp.stack(leaves), *results))
+
+
+def cycle_from(params: WheelParams, found: SectionCycle, steps: Any) -> WalkedCycle:
+    """The gait through a fixed point, whose steps have a leading axis."""
     # A step that fails returns zeros, which Newton's method may take for a fixed point.
     good = found.converged & jnp.all(steps.outcome == Outcome.STEPPED)
     missing = jnp.where(params.in_domain(), Outcome.NO_CYCLE_FOUND, Outcome.BAD_INPUT)
