@@ -346,10 +346,10 @@ def formulations(drift: list[Row], penalty: list[Row]) -> Figure:
     for marker, name in zip("os", dict.fromkeys(row["ground"] for row in penalty), strict=True):
         some = [row for row in penalty if row["ground"] == name and row["outcome"] == "STEPPED"]
         look = {"ms": 4, "label": f"penalty, {name}"}
-        right.loglog(
-            numbers(some, "evaluations"), numbers(some, "dtheta_error"), f"{marker}-", **look
-        )
-    error_of = r"error of $\dot\theta$ before touchdown [rad/s]"
+        # Each of the two errors changes sign somewhere.
+        error = np.maximum(numbers(some, "dtheta_error"), numbers(some, "period_error"))
+        right.loglog(numbers(some, "evaluations"), error, f"{marker}-", **look)
+    error_of = r"error of $\dot\theta$ [rad/s] and period [s], the larger"
     right.set(xlabel="evaluations per gait", ylabel=error_of)
     right.legend()
     for axes in (left, right):
