@@ -32,7 +32,7 @@ from jax.experimental.compilation_cache import compilation_cache
 from work_precision_charts import replace
 
 import vrw_jax as vrw
-from vrw_jax import plots, transitions
+from vrw_jax import plots, simd, transitions
 from vrw_jax.params import PARAMETER_NAMES
 
 
@@ -40,6 +40,7 @@ def start_cold() -> None:
     """JAX as users start it, but with nothing compiled before: its cache is thrown away."""
     global _cache
     jax.clear_caches()
+    simd._made.clear()
     _cache = tempfile.TemporaryDirectory()
     vrw.start_jax(_cache.name)
     compilation_cache.reset_cache()  # it may have opened another folder

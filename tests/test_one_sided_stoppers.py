@@ -130,15 +130,21 @@ def test_landings_with_one_sided_stoppers_repeat_between_tolerances(friction, da
 
 @pytest.mark.slow
 def test_lanes_with_one_sided_stoppers_walk_as_single_wheels_do():
-    friction, damping = (np.array(column) for column in zip(*SCENES, strict=True))
+    # The last: infinite friction is a rule of selection, which finds no contact in some impacts.
+    scenes = (*SCENES, (math.inf, 20.0 + 380.0 / 11.0))
+    friction, damping = (np.array(column) for column in zip(*scenes, strict=True))
     found = vrw.steps(
         vrw.WheelParams(damping=damping),
-        np.tile(START, (len(SCENES), 1)),
+        np.tile(START, (len(scenes), 1)),
         1,
         model=wheel_of(friction),
         options=vrw.Options(solver="Tsit5", rtol=1e-10, atol=1e-10),
     )
-    for i, scene in enumerate(SCENES):
+    for i, scene in enumerate(scenes):
         single = stepped(*scene)
+        assert int(found.outcome[i]) == int(single.outcome)
         np.testing.assert_allclose(found.section_state[i, :4], single.section_state[:4], atol=1e-7)
         np.testing.assert_allclose(found.durations[i].sum(), single.period, atol=5e-8)
+    assert np.all(found.outcome[:-1] == vrw.Outcome.STEPPED)
+    assert int(found.outcome[-1]) == vrw.Outcome.NO_ADMISSIBLE_CONTACT
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves((found, single)))
