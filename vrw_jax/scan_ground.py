@@ -6,9 +6,8 @@ those whose premises break on this ground are gathered and walk on the upper run
 pays for another.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import jax
 import numpy as np
@@ -26,7 +25,7 @@ from vrw_jax.outcomes import Outcome
 from vrw_jax.params import FRICTION, WheelParams, as_float_array
 from vrw_jax.scan_engine import Engine, n_cores
 from vrw_jax.scan_measures import derivative
-from vrw_jax.start import fusion_emitters
+from vrw_jax.traces import compiled
 from vrw_jax.walked_cycle import WalkedCycle
 
 LANES = 8
@@ -72,15 +71,18 @@ class GroundEngine:
                 cycle = cycle_of(values, begin, base.n_legs, model, options)
             return cycle.outcome, {name: _read(name, cycle) for name in plain} | slopes
 
-        self._program = jax.jit(jax.vmap(one), compiler_options=fusion_emitters(False))
-        self._compiled: Any = None
+        self._one = one
+        numbers, structure = jax.tree.flatten((model, options))
+        closed_over = str(structure), [np.asarray(x).tolist() for x in numbers]
+        self._settings = ("ground", measures, base.n_legs, *closed_over)
+        self._compiled: Callable | None = None
 
-    def _compile(self) -> Any:
+    def _compile(self) -> Callable:
         """The one large function, ready to run: here, lest each thread compile its own."""
         dtype = np.dtype(self._base.damping.dtype)
         shapes = (LANES, len(MOVED)), (LANES, self._model.section_size(self._base))
-        given = (jax.ShapeDtypeStruct(shape, dtype) for shape in shapes)
-        return self._program.lower(*given).compile()
+        given = tuple(jax.ShapeDtypeStruct(shape, dtype) for shape in shapes)
+        return compiled(jax.vmap(self._one), given, self._settings, jax.local_devices()[0])
 
     def __call__(self, columns: Columns) -> Told:
         """Results of the samples in `columns` (one value per sample of each swept parameter)."""
@@ -102,6 +104,7 @@ class GroundEngine:
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
     def _batch(self, values: np.ndarray, states: np.ndarray, walked: np.ndarray) -> Told:
+        assert self._compiled is not None
         fill = lambda x: np.concatenate([x, np.repeat(x[:1], LANES - len(x), 0)])
         told = self._compiled(fill(values), fill(states))
         outcome, measures = jax.tree.map(np.array, told)
