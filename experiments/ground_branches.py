@@ -193,11 +193,21 @@ def read() -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
+def fold(along: str) -> float:
+    """Where the slow branch turns: a quartic through the seven gaits next to it, over the share of
+    double support, which falls all along the branch."""
+    own = [r for r in read() if (r["along"], r["branch"], r["way"]) == (along, "slow", "down")]
+    value, share = (np.array([float(r[key]) for r in own]) for key in ("value", "dls_fraction"))
+    least = int(np.argmin(value))
+    near = slice(least - 3, least + 4)
+    x = share[near] - share[least]
+    along_x = np.linspace(x.min(), x.max(), 100_001)
+    return float(np.polyval(np.polyfit(x, value[near], 4), along_x).min())
+
+
 def ghosts() -> None:
     """Walks from the slow start with a little less friction than the slow gait needs."""
-    slow = [r for r in read() if (r["along"], r["branch"]) == ("friction", "slow")]
-    fold = min(float(r["value"]) for r in slow)
-    friction = fold - np.array(GHOSTS)
+    friction = fold("friction") - np.array(GHOSTS)
     params, model = vrw.WheelParams(damping=DAMPING), vrw.UnilateralWheel(friction=friction)
     x, lines = np.tile(SLOW, (len(GHOSTS), 1)), []
     options = vrw.Options(solver="Tsit5", rtol=1e-8, atol=1e-8)
@@ -260,6 +270,7 @@ def main() -> None:
         compute()
         if not GHOST.exists():
             ghosts()
+        print({along: fold(along) for along in BOUNDS})
     with plots.style():
         draw()
 

@@ -116,20 +116,21 @@ def test_a_branch_on_real_ground_holds_gaits_that_repeat(near):
 @pytest.mark.slow
 def test_a_branch_on_real_ground_turns_at_its_fold_and_comes_back_unstable():
     """At Table 1 the slow gait needs friction: two gaits above that, one repelling, none below."""
-    params, high = vrw.WheelParams(), vrw.UnilateralWheel(friction=1.1)
-    state = vrw.walk(params, START, 120, model=high, options=OPTIONS).steps.section_state[-1]
+    params, high = vrw.WheelParams(), vrw.UnilateralWheel(friction=1.0)
+    state = vrw.walk(params, START, 300, model=high, options=OPTIONS).steps.section_state[-1]
     cycle = vrw.limit_cycle(params, guess=state, model=high, options=OPTIONS)
     branch = vrw.continue_branch(
-        params, "friction", (0.9, 1.1), cycle=cycle, model=high, step_options=OPTIONS,
-        options=ArclengthOptions(first_step=0.05, largest_step=0.1),
+        params, "friction", (0.95, 1.0), cycle=cycle, model=high, step_options=OPTIONS,
+        options=ArclengthOptions(first_step=0.1, largest_step=0.2),
     )  # fmt: skip
     assert float(branch.dataset.closure.max()) < 1e-8
     (fold,) = (border.value for border in branch.borders if border.kind == "fold")
-    # Followed by lanes and central differences instead: experiments/ground_branches.py.
-    assert fold == pytest.approx(0.98348, abs=2e-4)
+    # By lanes and central differences, which went past it in large steps: a quartic through the
+    # seven gaits next to it, as experiments/ground_branches.py prints it.
+    assert fold == pytest.approx(0.98186, abs=1e-4)
     turn = int(np.argmin(branch.values))
     assert 0 < turn < branch.values.size - 1
-    assert branch.values[[0, -1]] == pytest.approx([1.1, 1.1])
+    assert branch.values[[0, -1]] == pytest.approx([1.0, 1.0])
     before, after = branch.stable[:turn], branch.stable[turn + 1 :]
     assert sorted([before.all(), after.all()]) == [False, True]
     assert not (before if after.all() else after).any()
