@@ -2,7 +2,8 @@
 
     python experiments/ladder_chart.py [--redraw]
 
-It follows from the margins of the paper's gaits, as in a scan of the ladder.
+It follows from the margins of the paper's gaits, as in a scan of the ladder; costs of a step are
+those that rung_table.py measures.
 """
 
 import csv
@@ -12,10 +13,12 @@ from pathlib import Path
 import jax
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.colors import ListedColormap
 
 jax.config.update("jax_enable_x64", True)
 
 import vrw_jax as vrw  # noqa: E402  the number format is chosen first
+from vrw_jax import plots  # noqa: E402
 from vrw_jax.models.ladder import PREMISES  # noqa: E402
 from vrw_jax.scan import plan  # noqa: E402
 
@@ -24,7 +27,7 @@ FRICTION = (0.7, 1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 50.0, np.inf)
 MEASURES = ("dls_fraction", "period", "speed", "slip")
 OPTIONS = vrw.Options(rtol=1e-8, atol=1e-8)
 TARGET = Path(__file__).parents[1] / "docs" / "figures"
-MAP = TARGET / "ladder_map.csv"
+MAP, COSTS = TARGET / "ladder_map.csv", TARGET / "rung_costs.csv"
 NAMES = ("served", *PREMISES)
 
 
@@ -54,10 +57,10 @@ def draw() -> None:
     labels[0] = "none: the paper's rung serves"
     seen = sorted({int(k) for k in kinds.ravel()})
     place = np.vectorize({k: i for i, k in enumerate(seen)}.get)(kinds)
-    figure, axes = plt.subplots(
-        1, 2, figsize=(10, 4.4), layout="constrained", width_ratios=(1.7, 1.0)
-    )
-    colours, at = plt.get_cmap("tab10"), np.arange(len(FRICTION))
+    figure, axes = plt.subplots(1, 3, figsize=(plots.PAGE, 3.1), width_ratios=(1.7, 1.0, 1.0))
+    colours = ListedColormap(["#0072B2", "#E69F00", "#009E73", "#D55E00", "#BBBBBB"])
+    assert len(seen) <= colours.N
+    at = np.arange(len(FRICTION))
     ticks = [f"{m:g}" if np.isfinite(m) else "∞" for m in FRICTION]
     axes[0].imshow(
         colours(place.T), origin="lower", aspect="auto",
@@ -66,23 +69,32 @@ def draw() -> None:
     for i, kind in enumerate(seen):
         axes[0].plot([], [], "s", color=colours(i), label=labels[kind])
     axes[0].set(ylabel="damping / N s/m", title="the first premise that breaks")
-    axes[0].legend(fontsize=7, loc="upper left", framealpha=0.9)
     share = np.mean(reason == 0, axis=1)
-    axes[1].bar(at, 100.0 * share, color="C0", label="paper's rung")
-    axes[1].bar(at, 100.0 * (1.0 - share), bottom=100.0 * share, color="0.75", label="real ground")
+    ground = {"label": "real ground", "color": plots.LIGHT, "edgecolor": plots.GREY, "lw": 0.4}
+    axes[1].bar(at, 100.0 * share, color=colours(0), label="the paper's rung")
+    axes[1].bar(at, 100.0 * (1.0 - share), bottom=100.0 * share, **ground)
     axes[1].set(ylabel="share of gaits / %", title="the rung that serves")
-    axes[1].legend(fontsize=7)
+    with COSTS.open() as file:
+        cost = {r["rung"]: float(r["us_in_a_batch"]) for r in csv.DictReader(file)}
+    paper = np.full(len(FRICTION), cost["paper"])  # every gait is tried there
+    axes[2].bar(at, paper, color=colours(0))
+    axes[2].bar(at, (1.0 - share) * cost["ground"], bottom=paper, **ground)
+    axes[2].axhline(cost["ground"], color="k", ls="--", lw=0.8, label="all on real ground")
+    axes[2].set(ylabel="µs per step, mean over gaits", title="what it costs")
     for axis in axes:
-        axis.set_xticks(at, ticks)
+        axis.set_xticks(at, ticks, rotation=90)
         axis.set_xlabel("friction coefficient")
-    for ending in ("png", "svg"):
-        figure.savefig(TARGET / f"ladder_chart.{ending}", dpi=110)
+    handles = [axis.get_legend_handles_labels() for axis in (axes[0], axes[1], axes[2])]
+    told = dict(pair for h, names in handles for pair in zip(names, h, strict=True))
+    figure.legend(told.values(), told.keys(), loc="outside lower center", ncols=3)
+    plots.save(figure, TARGET, "ladder_chart")
 
 
 def main() -> None:
     if "--redraw" not in sys.argv:
         compute()
-    draw()
+    with plots.style():
+        draw()
 
 
 if __name__ == "__main__":
