@@ -135,7 +135,7 @@ def test_a_branch_on_real_ground_turns_at_its_fold_and_comes_back_unstable():
     assert sorted([before.all(), after.all()]) == [False, True]
     assert not (before if after.all() else after).any()
     # Just below the fold no walk stays: the slow gait is a ghost there.
-    low = vrw.UnilateralWheel(friction=fold - 0.05)
+    low = vrw.UnilateralWheel(friction=fold - 0.1)
     walk = vrw.walk(params, START, 120, model=low, options=OPTIONS).steps
     slow = branch.dataset.period.values.min()
     assert float(jnp.sum(walk.durations[-1])) < 0.9 * slow

@@ -504,7 +504,7 @@ def test_a_cluster_that_loses_a_worker_gives_bitwise_the_serial_scan(
     from distributed import Client, LocalCluster
 
     alone, shared = tmp_path / "alone.zarr", tmp_path / "shared.zarr"
-    run(planned(2), alone, evaluate=engine)
+    run(planned(1), alone, evaluate=engine)
     cache = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", cache)  # workers start out with the suite's
     told: list[Progress] = []
@@ -521,11 +521,12 @@ def test_a_cluster_that_loses_a_worker_gives_bitwise_the_serial_scan(
             if progress.done and not killed:
                 busy = client.processing()
                 victim = max(places, key=lambda place: len(busy.get(place, ())))
-                assert busy[victim]
-                killed.append(places[victim])
-                os.kill(places[victim], signal.SIGKILL)
+                if busy.get(victim):  # else both are done with what they had: at a later chunk
+                    killed.append(places[victim])
+                    os.kill(places[victim], signal.SIGKILL)
 
-        result = run(planned(2), shared, report=report, through=through)
+        result = run(planned(1), shared, report=report, through=through)
+        assert len(killed) == 1
         assert killed[0] not in client.run(os.getpid).values()
     assert told[-1].done == GRID.size
     assert np.all(result.outcome.values != -1)
