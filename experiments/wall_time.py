@@ -5,8 +5,8 @@
     pytest-benchmark compare --group-by=name                     # commit beside commit
 
 Running: CPU time of a call that has been compiled. First: wall time of a process that starts,
-compiles with no cache and answers. All on one core. No test of the library looks at a clock; these are kept
-apart. Take them on an idle machine, both commits in one sitting.
+compiles with no cache and answers. All on one core. No test of the library looks at a clock; these
+are kept apart. Take them on an idle machine, both commits in one sitting.
 """
 
 import os
