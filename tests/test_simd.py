@@ -263,6 +263,22 @@ def test_a_kept_program_finds_the_machine_code_that_it_calls(folder, monkeypatch
     assert names[1] == names[0]
 
 
+def test_a_program_kept_by_another_processor_is_traced_anew(folder, monkeypatch):
+    """It calls machine code that may not run here."""
+    traced = []
+
+    def double(x):
+        traced.append(1)
+        return 2.0 * x
+
+    run = lambda: traces.compiled(double, (jnp.ones(2),), "kept", jax.devices()[0])(jnp.ones(2))
+    run(), run()
+    assert len(traced) == 1
+    monkeypatch.setattr(simd, "processor", lambda: ("x86_64", "another", ""))
+    run()
+    assert len(traced) == 2
+
+
 def test_other_settings_and_damaged_files_are_compiled_anew(folder, monkeypatch):
     lanes = [np.arange(4.0)]
     traced = []

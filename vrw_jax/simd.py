@@ -156,7 +156,7 @@ class _Code(NamedTuple):
 def _code(function: Callable, shapes: Any, settings: object, width: int) -> _Code:
     """Compiled, or found where it is kept."""
     told = (
-        "lanes", settings, shapes, width, jax.__version__, llvm.llvm_version_info, _processor(),
+        "lanes", settings, shapes, width, jax.__version__, llvm.llvm_version_info, processor(),
         code_digest(),
     )  # fmt: skip
     name = f"vrw_lanes_{hashlib.sha256(repr(told).encode()).hexdigest()}"
@@ -393,19 +393,20 @@ def _compiled(text: str) -> bytes:
 
 
 @functools.cache
-def _processor() -> tuple[str, str, str]:
+def processor() -> tuple[str, str, str]:
+    """What machine code is made for: the kind of machine, its processor, and what that can do."""
     features = llvm.get_host_cpu_features().flatten()
     return llvm.get_process_triple(), llvm.get_host_cpu_name(), features
 
 
 def _wide() -> bool:
     """Whether vectors have 512 bits."""
-    return "+avx512f" in _processor()[2]
+    return "+avx512f" in processor()[2]
 
 
 def _machine() -> llvm.TargetMachine:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
-    triple, name, features = _processor()
+    triple, name, features = processor()
     target = llvm.Target.from_triple(triple)
     return target.create_target_machine(cpu=name, features=features, opt=2, jit=True)

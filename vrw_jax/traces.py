@@ -56,7 +56,9 @@ def _exported(function: Callable, arguments: tuple, settings: object) -> export.
     """The trace of `function` for arguments like these, as one of their leaves."""
     leaves, structure = jax.tree.flatten(arguments)
     shapes = [jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)) for x in leaves]
-    told = (settings, str(structure), shapes, jax.__version__, jax.default_backend(), code_digest())
+    # A trace calls the machine code of one processor: others may share the folder.
+    where = (jax.default_backend(), simd.processor() if simd.serves() else None)
+    told = (settings, str(structure), shapes, jax.__version__, where, code_digest())
     name = f"vrw_trace_{hashlib.sha256(repr(told).encode()).hexdigest()}"
     content = kept(name)
     if content is not None:
