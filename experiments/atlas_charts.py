@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 from work_precision_charts import replace
 
-from vrw_jax.plots import PAGE, save, style
+from vrw_jax.figures.walk import PAGE, save, style
 
 Row = dict[str, str]
 STYLES = {  # of Okabe and Ito, a marker each

@@ -20,7 +20,9 @@ from work_precision import seconds
 from work_precision_truth import VARIED, load
 
 import vrw_jax as vrw
-from vrw_jax import Outcome, multipliers, transitions
+from vrw_jax import Outcome
+from vrw_jax.numerics import floquet as multipliers
+from vrw_jax.wheel import transitions
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from oracle import multiprecision

@@ -14,9 +14,10 @@ import numpy as np
 from rich.progress import track
 
 import vrw_jax as vrw
-from vrw_jax import Outcome, dynamics, geometry, transitions
-from vrw_jax.geometry import Motion
-from vrw_jax.params import Symbols
+from vrw_jax import Outcome
+from vrw_jax.wheel import dynamics, geometry, transitions
+from vrw_jax.wheel.geometry import Motion
+from vrw_jax.wheel.params import Symbols
 
 CHUNK = 10_000
 LATE = 1e-8  # s: a hundred times the engine's error at its default tolerance

@@ -15,16 +15,17 @@ import numpy as np
 from work_precision import seconds
 
 import vrw_jax as vrw
-from vrw_jax import Outcome, dynamics, transitions
-from vrw_jax.geometry import Motion, landing_foot_height
-from vrw_jax.integrate import Watched, integrate_phase
+from vrw_jax import Outcome
 from vrw_jax.models.viscoelastic import (
     PhaseBuilder,
     double_support,
     single_support_1,
     single_support_2,
 )
-from vrw_jax.params import Symbols
+from vrw_jax.numerics.events import Watched, integrate_phase
+from vrw_jax.wheel import dynamics, transitions
+from vrw_jax.wheel.geometry import Motion, landing_foot_height
+from vrw_jax.wheel.params import Symbols
 
 Rows = Iterator[dict[str, object]]
 START = np.array([0.1, 1.6, -0.1])  # near the gait of Table 1

@@ -9,9 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import vrw_jax as vrw
-from vrw_jax import Outcome, dynamics, transitions
-from vrw_jax.geometry import Motion
-from vrw_jax.integrate import PhaseEnd, Watched, integrate_phase
+from vrw_jax import Outcome
 from vrw_jax.models.viscoelastic import (
     Phase,
     PhaseBuilder,
@@ -19,6 +17,9 @@ from vrw_jax.models.viscoelastic import (
     single_support_1,
     single_support_2,
 )
+from vrw_jax.numerics.events import PhaseEnd, Watched, integrate_phase
+from vrw_jax.wheel import dynamics, transitions
+from vrw_jax.wheel.geometry import Motion
 
 ORACLE = Path(__file__).parents[1] / "tests" / "oracle"
 BLOCK = 1000

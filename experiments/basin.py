@@ -14,8 +14,9 @@ jax.config.update("jax_enable_x64", True)
 import numpy as np  # noqa: E402  the number format is chosen first
 
 import vrw_jax as vrw  # noqa: E402
-from vrw_jax import branch_plots, plots  # noqa: E402
-from vrw_jax.basin import share  # noqa: E402
+from vrw_jax.figures import branch as branch_plots  # noqa: E402
+from vrw_jax.figures import walk as plots  # noqa: E402
+from vrw_jax.walks.basins import share  # noqa: E402
 
 DAMPINGS = (100.0, 200.0)  # N s/m
 RATES = np.linspace(0.4, 3.2, 57)  # rad/s

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from work_precision_charts import replace
 
 import vrw_jax as vrw
-from vrw_jax.start import fusion_emitters
+from vrw_jax.runtime.start import fusion_emitters
 
 DOCS = Path(__file__).parents[1] / "docs"
 LANES, REPEATS = 256, 10

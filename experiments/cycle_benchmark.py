@@ -19,8 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import vrw_jax as vrw
-from vrw_jax.params import parameters_of, wheel_of
-from vrw_jax.sensitivities import MEASURES
+from vrw_jax.cycles.sensitivity import MEASURES
+from vrw_jax.wheel import PARAMETER_NAMES
+from vrw_jax.wheel.params import parameters_of, wheel_of
 
 BOX = {
     "damping": (20.0, 215.0), "stiffness": (400.0, 600.0), "natural_length": (1.01, 1.04),
@@ -42,8 +43,7 @@ def wheels(generator: np.random.Generator, n: int) -> vrw.WheelParams:
     drawn = {name: generator.uniform(*bounds, n) for name, bounds in BOX.items()}
     table_1 = vrw.WheelParams()
     filled = {
-        name: drawn.get(name, np.full(n, float(getattr(table_1, name))))
-        for name in vrw.params.PARAMETER_NAMES
+        name: drawn.get(name, np.full(n, float(getattr(table_1, name)))) for name in PARAMETER_NAMES
     }
     return vrw.WheelParams(**filled)
 

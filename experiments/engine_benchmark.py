@@ -32,8 +32,10 @@ from jax.experimental.compilation_cache import compilation_cache
 from work_precision_charts import replace
 
 import vrw_jax as vrw
-from vrw_jax import plots, simd, transitions
-from vrw_jax.params import PARAMETER_NAMES
+from vrw_jax import simd
+from vrw_jax.figures import walk as plots
+from vrw_jax.wheel import transitions
+from vrw_jax.wheel.params import PARAMETER_NAMES
 
 
 def start_cold() -> None:

@@ -11,7 +11,8 @@ import jax
 
 jax.config.update("jax_enable_x64", True)
 
-from vrw_jax import plots, reproduce  # noqa: E402  the number format is chosen first
+from vrw_jax.figures import walk as plots  # noqa: E402  the number format is chosen first
+from vrw_jax.paper import reproduction as reproduce  # noqa: E402
 
 STEPS = 3
 

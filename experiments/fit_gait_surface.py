@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import vrw_jax as vrw
-from vrw_jax import cycle_search, gait_surface
-from vrw_jax.lanes import in_blocks
-from vrw_jax.params import PARAMETER_NAMES, parameters_of, wheel_of
+from vrw_jax.cycles import search as cycle_search
+from vrw_jax.cycles import surface as gait_surface
+from vrw_jax.numerics.lanes import in_blocks
+from vrw_jax.wheel.params import PARAMETER_NAMES, parameters_of, wheel_of
 
 BOX = {
     "damping": (15.0, 219.0),

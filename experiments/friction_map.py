@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.colors import LogNorm, Normalize
 
 import vrw_jax as vrw
-from vrw_jax import plots
+from vrw_jax.figures import walk as plots
 
 FRICTION = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.4, 1.7, 2.0, 2.5, 3.0)
 DAMPING = tuple(float(c) for c in range(20, 401, 20))

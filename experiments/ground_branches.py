@@ -21,7 +21,7 @@ import numpy as np
 from friction_map import FIELDS, told
 
 import vrw_jax as vrw
-from vrw_jax import plots
+from vrw_jax.figures import walk as plots
 
 FRICTION, DAMPING = 0.7, 200.0  # held while the other one moves
 SLOW, FAST = (0.1, 1.6, -0.1), (0.12, 2.4, -0.2)

@@ -18,9 +18,9 @@ from matplotlib.colors import ListedColormap
 jax.config.update("jax_enable_x64", True)
 
 import vrw_jax as vrw  # noqa: E402  the number format is chosen first
-from vrw_jax import plots  # noqa: E402
+from vrw_jax.figures import walk as plots  # noqa: E402
 from vrw_jax.models.ladder import PREMISES  # noqa: E402
-from vrw_jax.scan import plan  # noqa: E402
+from vrw_jax.scans.running import plan  # noqa: E402
 
 DAMPING = np.linspace(20.0, 400.0, 77)
 FRICTION = (0.7, 1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 50.0, np.inf)

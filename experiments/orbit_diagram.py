@@ -15,8 +15,9 @@ import numpy as np  # noqa: E402  the number format is chosen first
 import pandas as pd  # noqa: E402
 
 import vrw_jax as vrw  # noqa: E402
-from vrw_jax import branch_plots, plots  # noqa: E402
-from vrw_jax.attractors import Settled, distinct, orbit_measures, settle  # noqa: E402
+from vrw_jax.figures import branch as branch_plots  # noqa: E402
+from vrw_jax.figures import walk as plots  # noqa: E402
+from vrw_jax.walks.attractors import Settled, distinct, orbit_measures, settle  # noqa: E402
 
 DAMPINGS = np.round(np.arange(215.0, 225.001, 0.1), 3)  # N s/m
 N_STARTS = 12

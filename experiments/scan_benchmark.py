@@ -33,7 +33,7 @@ CHECKED = 3
 
 def planned(size: int):
     import vrw_jax as vrw
-    from vrw_jax.scan import plan
+    from vrw_jax.scans.running import plan
 
     damping, stiffness, natural_length, slope = COUNTS[size]
     design = vrw.grid(
@@ -52,10 +52,10 @@ def log(size: int) -> Path:
 def scan(size: int) -> None:
     """In a process of its own: every chunk's progress goes to the log, kill or no kill."""
     began = time.time()
-    from vrw_jax.start import start_jax
+    from vrw_jax.runtime.start import start_jax
 
     start_jax()
-    from vrw_jax.scan import Progress, run
+    from vrw_jax.scans.running import Progress, run
 
     def report(progress: Progress) -> None:
         told = {
@@ -127,7 +127,7 @@ def figures_of(size: int) -> dict[str, object]:
 def draw(rows: list[dict[str, object]]) -> None:
     from matplotlib.figure import Figure
 
-    from vrw_jax import plots
+    from vrw_jax.figures import walk as plots
 
     size = [row["samples"] for row in rows]
     with plots.style():
@@ -159,7 +159,7 @@ def compare(size: int) -> None:
 
 
 def main(largest: int) -> None:
-    from vrw_jax.start import start_jax
+    from vrw_jax.runtime.start import start_jax
 
     start_jax()
     STORES.mkdir(parents=True, exist_ok=True)
@@ -176,8 +176,8 @@ def main(largest: int) -> None:
     compare(sizes[-1])
 
     import vrw_jax as vrw
-    from vrw_jax import plots
-    from vrw_jax.scan_plots import scan_figures
+    from vrw_jax.figures import walk as plots
+    from vrw_jax.figures.scan import scan_figures
 
     for name, figure in scan_figures(vrw.open_scan(STORES / f"{sizes[-1]}.zarr")).items():
         plots.save(figure, FIGURES, f"{name}_of_{sizes[-1]}")

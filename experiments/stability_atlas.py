@@ -24,9 +24,10 @@ import numpy as np
 import work_precision  # noqa: F401  sets one core and starts JAX
 
 import vrw_jax as vrw
-from vrw_jax import Outcome, transitions
-from vrw_jax.params import PARAMETER_NAMES
-from vrw_jax.runge_kutta import explicit_tableau, real_stability_limit
+from vrw_jax import Outcome
+from vrw_jax.numerics.tableaus import explicit_tableau, real_stability_limit
+from vrw_jax.wheel import transitions
+from vrw_jax.wheel.params import PARAMETER_NAMES
 
 TARGET = Path(__file__).parents[1] / "docs" / "figures"
 Rows = Iterator[dict[str, object]]

@@ -33,10 +33,11 @@ from scipy.optimize import minimize  # noqa: E402
 from work_precision_charts import replace  # noqa: E402
 
 import vrw_jax as vrw  # noqa: E402
-from vrw_jax import plots, tune_engine  # noqa: E402
-from vrw_jax.config import load  # noqa: E402
-from vrw_jax.params import wheel_of  # noqa: E402
-from vrw_jax.tune import TuneProblem, tune, tuning_problem  # noqa: E402
+from vrw_jax.app.config import load  # noqa: E402
+from vrw_jax.figures import walk as plots  # noqa: E402
+from vrw_jax.tuning import objective as tune_engine  # noqa: E402
+from vrw_jax.tuning.problem import TuneProblem, tune, tuning_problem  # noqa: E402
+from vrw_jax.wheel.params import wheel_of  # noqa: E402
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 PROBLEMS = {"most double support": "tune_dls", "largest stability margin": "tune_stability"}

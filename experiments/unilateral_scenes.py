@@ -17,9 +17,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import vrw_jax as vrw
-from vrw_jax import plots
-from vrw_jax.models.unilateral_mechanics import directions, foot_heights
-from vrw_jax.models.unilateral_motion import unpack
+from vrw_jax.figures import walk as plots
+from vrw_jax.models.unilateral.mechanics import directions, foot_heights
+from vrw_jax.models.unilateral.motion import unpack
 
 NO_SLIP, REAL = math.inf, 0.7
 GAIT_RANGE = (8.0, 215.0)  # dampings at which the paper's gait gives the start

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from vrw_jax.plots import PAGE, save, style
+from vrw_jax.figures.walk import PAGE, save, style
 
 Row = dict[str, str]
 QUANTITIES = {  # group and title of each panel

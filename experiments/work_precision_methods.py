@@ -25,15 +25,15 @@ import optimistix as optx
 from engine_benchmark import BOX, wheels
 
 import vrw_jax as vrw
-from vrw_jax import transitions
 from vrw_jax.models.viscoelastic import (
     PhaseBuilder,
     double_support,
     single_support_1,
     single_support_2,
 )
-from vrw_jax.params import PARAMETER_NAMES
-from vrw_jax.runge_kutta import explicit_tableau
+from vrw_jax.numerics.tableaus import explicit_tableau
+from vrw_jax.wheel import transitions
+from vrw_jax.wheel.params import PARAMETER_NAMES
 
 VARIED = tuple(BOX)
 Run = Callable[[], np.ndarray]

@@ -1,5 +1,5 @@
 """`python -m vrw_jax` is `vrw`."""
 
-from vrw_jax.cli import main
+from vrw_jax.app import main
 
 main()

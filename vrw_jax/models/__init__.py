@@ -1,30 +1,128 @@
-"""The model ladder: one file per rung, one face."""
+"""The model ladder: one rung a file, one face."""
 
+from vrw_jax.models import viscoelastic
 from vrw_jax.models.base import (
     AbstractWheel,
+    Advance,
     EnergyLoss,
     Indicators,
     Margins,
+    RungState,
+    SectionState,
     StepResult,
-    Trajectory,
+    replaced_where_bad,
+    usable,
 )
-from vrw_jax.models.ladder import LadderStep, LadderWheel, ModelChoice
+from vrw_jax.models.ladder import (
+    PREMISES,
+    SERVED,
+    UNILATERAL,
+    VISCOELASTIC,
+    LadderStep,
+    LadderWheel,
+    ModelChoice,
+    refuse_ladder,
+)
 from vrw_jax.models.rigid import RigidWheel
-from vrw_jax.models.unilateral import UnilateralStep, UnilateralWheel
-from vrw_jax.models.viscoelastic import ViscoelasticWheel
+from vrw_jax.models.unilateral.contacts import OFF
+from vrw_jax.models.unilateral.events import Law, event_of, resolve, settled
+from vrw_jax.models.unilateral.mechanics import (
+    WheelMotion,
+    directions,
+    foot_heights,
+    foot_places,
+    kept,
+    kinetic_energy,
+    one_of,
+    potential_energy,
+)
+from vrw_jax.models.unilateral.motion import (
+    Felt,
+    Flow,
+    Stance,
+    State,
+    felt,
+    flow_of,
+    forces,
+    guards_of,
+    leg_acceleration,
+    stance_guards,
+    unpack,
+)
+from vrw_jax.models.unilateral.section import closed, embedded, opened
+from vrw_jax.models.unilateral.wheel import (
+    UnilateralStep,
+    UnilateralTrajectory,
+    UnilateralWheel,
+    least_dip,
+)
+from vrw_jax.models.viscoelastic import (
+    PAPER_START,
+    SAFE_SINGLE_SUPPORT,
+    PhaseBuilder,
+    ViscoelasticWheel,
+    Walked,
+    phases_of,
+    result_of,
+)
 
 __all__ = [
+    "OFF",
+    "PAPER_START",
+    "PREMISES",
+    "SAFE_SINGLE_SUPPORT",
+    "SERVED",
+    "UNILATERAL",
+    "VISCOELASTIC",
     "AbstractWheel",
+    "Advance",
     "EnergyLoss",
+    "Felt",
+    "Flow",
     "Indicators",
     "LadderStep",
     "LadderWheel",
+    "Law",
     "Margins",
     "ModelChoice",
+    "PhaseBuilder",
     "RigidWheel",
+    "RungState",
+    "SectionState",
+    "Stance",
+    "State",
     "StepResult",
-    "Trajectory",
     "UnilateralStep",
+    "UnilateralTrajectory",
     "UnilateralWheel",
     "ViscoelasticWheel",
+    "Walked",
+    "WheelMotion",
+    "closed",
+    "directions",
+    "embedded",
+    "event_of",
+    "felt",
+    "flow_of",
+    "foot_heights",
+    "foot_places",
+    "forces",
+    "guards_of",
+    "kept",
+    "kinetic_energy",
+    "least_dip",
+    "leg_acceleration",
+    "one_of",
+    "opened",
+    "phases_of",
+    "potential_energy",
+    "refuse_ladder",
+    "replaced_where_bad",
+    "resolve",
+    "result_of",
+    "settled",
+    "stance_guards",
+    "unpack",
+    "usable",
+    "viscoelastic",
 ]

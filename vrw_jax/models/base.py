@@ -8,10 +8,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
-from vrw_jax.options import Options
-from vrw_jax.params import LARGEST, Scalar, WheelParams
+from vrw_jax.numerics import Options, Scalar
+from vrw_jax.results import MARGINS, STEP, Row, as_html, as_text, is_concrete
+from vrw_jax.wheel import LARGEST, Outcome, WheelParams
 
 SectionState = Float[Array, "3"]
 """(theta-, dtheta-, dL1-) just before touchdown, in the labels of the step that ends: rad, rad/s,
@@ -67,8 +69,12 @@ class Margins(eqx.Module):
 class AbstractStep(eqx.Module):
     """What every rung's step tells alike. Batched under vmap."""
 
+    section_state: eqx.AbstractVar[Array]  # just before the next touchdown
+    post_impact: eqx.AbstractVar[Float[Array, "2"]]  # (theta, dtheta), rad, rad/s
     durations: eqx.AbstractVar[Float[Array, "3"]]  # of double support first, s
     step_length: eqx.AbstractVar[Scalar]  # m
+    outcome: eqx.AbstractVar[Int[Array, ""]]  # an Outcome
+    solver_steps: eqx.AbstractVar[Int[Array, ""]]  # tried by the integrator
 
     @property
     def period(self) -> Array:
@@ -86,6 +92,49 @@ class AbstractStep(eqx.Module):
         """Step length over period, m/s; 0 for a step without duration."""
         period = self.period
         return jnp.where(period > 0.0, self.step_length / jnp.where(period > 0.0, period, 1.0), 0.0)
+
+    def measures(self) -> dict[str, Array]:
+        """Everything that the step tells, by the names of `results.MEASURES`.
+
+        Batch axes lead, legs come last.
+        """
+        shared = {
+            "dls_fraction": self.dls_fraction,
+            "period": self.period,
+            "speed": self.speed,
+            "step_length": self.step_length,
+            "duration_dls": self.durations[..., 0],
+            "theta_post_impact": self.post_impact[..., 0],
+            "dtheta_post_impact": self.post_impact[..., 1],
+            "theta_touchdown": self.section_state[..., 0],
+            "dtheta_touchdown": self.section_state[..., 1],
+            "outcome": self.outcome,
+            "solver_steps": self.solver_steps,
+        }
+        return shared | self.own_measures()
+
+    @abc.abstractmethod
+    def own_measures(self) -> dict[str, Array]:
+        """Those of `measures` that not every rung tells."""
+
+
+class AbstractGroundStep(AbstractStep):
+    """A step over contacts of any order; `durations` are with two feet loaded, with one, none."""
+
+    energy_impacts: eqx.AbstractVar[Scalar]  # lost in impacts, J
+    energy_damping: eqx.AbstractVar[Scalar]  # lost in the dampers, J
+    energy_friction: eqx.AbstractVar[Scalar]  # lost by sliding between impacts, J
+    slip: eqx.AbstractVar[Scalar]  # path of sliding feet, m
+
+    def own_measures(self) -> dict[str, Array]:
+        return {
+            "energy_lost_damping": self.energy_damping,
+            "duration_single": self.durations[..., 1],
+            "duration_flight": self.durations[..., 2],
+            "slip": self.slip,
+            "energy_lost_impacts": self.energy_impacts,
+            "energy_lost_friction": self.energy_friction,
+        }
 
 
 class StepResult(AbstractStep):
@@ -105,17 +154,41 @@ class StepResult(AbstractStep):
     outcome: Int[Array, ""]  # an Outcome
     solver_steps: Int[Array, ""]  # tried by the integrator
 
-    def __repr__(self) -> str:
-        from vrw_jax import tables  # which imports this room
+    def own_measures(self) -> dict[str, Array]:
+        return {
+            "duration_sls1": self.durations[..., 1],
+            "duration_sls2": self.durations[..., 2],
+            "dL1_touchdown": self.section_state[..., 2],
+            "lambda_I4": self.indicators.lambda_I4,
+            "lambda_2_plus": self.indicators.lambda_2,
+            "lambda_4_plus": self.indicators.lambda_4,
+            "energy_lost_landing": self.energy.landing,
+            "energy_lost_stopper": self.energy.stopper,
+            "energy_lost_damping": self.energy.damping,
+        } | {name: getattr(self.monitors, name) for name in MARGINS}
 
-        if not tables.is_concrete(self):
-            return eqx.tree_pformat(self)
-        return tables.as_text("StepResult", tables.step_rows(self))
+    def rows(self) -> list[Row]:
+        """What the step says of itself: measures, then premises and whether they hold."""
+        outcome = np.asarray(self.outcome)
+        if outcome.ndim:
+            stepped = int(np.sum(outcome == Outcome.STEPPED))
+            return [("steps", f"{outcome.size} in shape {outcome.shape}, {stepped} to touchdown")]
+        code, values = Outcome(int(outcome)), self.measures()
+        rows = [("outcome", f"{code.name}: {code.meaning}")]
+        rows += [
+            (m.long_name, m.text(values[name])) for name, m in STEP.items() if name != "outcome"
+        ]
+        for name, m in MARGINS.items():
+            least = float(np.min(np.asarray(values[name])))
+            verdict = "holds" if least >= 0.0 else "broken"
+            rows.append((f"premise: {m.long_name}", f"{m.text(least)}, {verdict}"))
+        return rows
+
+    def __repr__(self) -> str:
+        return as_text("StepResult", self.rows()) if is_concrete(self) else eqx.tree_pformat(self)
 
     def _repr_html_(self) -> str:
-        from vrw_jax import tables
-
-        return tables.as_html("Step", tables.step_rows(self))
+        return as_html("Step", self.rows())
 
 
 class Advance(eqx.Module):

@@ -10,14 +10,19 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from vrw_jax.models.base import AbstractStep, AbstractWheel, Advance, StepResult, replaced_where_bad
-from vrw_jax.models.unilateral import UnilateralStep, UnilateralTrajectory, UnilateralWheel
-from vrw_jax.models.unilateral_contacts import OFF, STICK
-from vrw_jax.models.unilateral_section import LOCKED, FullState, embedded
+from vrw_jax.models.base import (
+    AbstractGroundStep,
+    AbstractWheel,
+    Advance,
+    StepResult,
+    replaced_where_bad,
+)
+from vrw_jax.models.unilateral.contacts import OFF, STICK
+from vrw_jax.models.unilateral.section import LOCKED, FullState, embedded
+from vrw_jax.models.unilateral.wheel import UnilateralStep, UnilateralTrajectory, UnilateralWheel
 from vrw_jax.models.viscoelastic import PAPER_START, ViscoelasticWheel
-from vrw_jax.options import Options
-from vrw_jax.outcomes import Outcome
-from vrw_jax.params import Scalar, WheelParams, as_float_array
+from vrw_jax.numerics import Options, Scalar, as_float_array
+from vrw_jax.wheel import Outcome, WheelParams
 
 VISCOELASTIC, UNILATERAL = 1, 2
 """Numbers of the rungs; 0 is the rigid one."""
@@ -36,6 +41,22 @@ PREMISES: dict[str, str] = {
 
 OFF_THE_PLANE = 1 + len(PREMISES)
 """The reason of a start that is no section state of the paper's."""
+
+
+SERVED: dict[str, dict[str, object]] = {
+    "rung": {
+        "long_name": "rung that served",
+        "flag_values": [VISCOELASTIC, UNILATERAL],
+        "flag_meanings": "ViscoelasticWheel UnilateralWheel",
+    },
+    "reason": {
+        "long_name": "why that rung served",
+        "units": "1",
+        "description": "0: all premises of the paper's wheel hold; above: the first that breaks, "
+        f"of {', '.join(PREMISES)}; below: minus that wheel's outcome.",
+    },
+}
+"""Attributes of what the ladder tells beside them."""
 
 
 class ModelChoice(eqx.Module):
@@ -75,7 +96,7 @@ def told_why(reason: int) -> str:
     return f"The paper's premises break: {list(PREMISES.values())[reason - 1]}."
 
 
-class LadderStep(AbstractStep):
+class LadderStep(AbstractGroundStep):
     """One step by the lowest rung that serves, told alike for both. Batched under vmap."""
 
     choice: ModelChoice

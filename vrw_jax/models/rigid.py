@@ -6,8 +6,6 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from vrw_jax import dynamics, transitions
-from vrw_jax.geometry import Motion, rear_foot_height
 from vrw_jax.models.base import (
     AbstractWheel,
     Advance,
@@ -20,9 +18,16 @@ from vrw_jax.models.base import (
     replaced_where_bad,
     usable,
 )
-from vrw_jax.options import Options
-from vrw_jax.outcomes import Outcome
-from vrw_jax.params import Scalar, Symbols, WheelParams
+from vrw_jax.numerics import Options, Scalar
+from vrw_jax.wheel import (
+    Motion,
+    Outcome,
+    Symbols,
+    WheelParams,
+    dynamics,
+    rear_foot_height,
+    transitions,
+)
 
 GRID = 33
 """Angles in each zoom on a force's minimum: forces are smooth over the 45 degrees of a step."""

@@ -10,16 +10,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from vrw_jax import dynamics, transitions
-from vrw_jax.derivatives import Forward, any_mode
-from vrw_jax.geometry import (
-    Motion,
-    double_support_motion,
-    landing_foot_height,
-    rear_foot_height,
-)
-from vrw_jax.integrate import Field, PhaseEnd, integrate_phase, sample_phase
-from vrw_jax.minima import State, Watch, Watched
 from vrw_jax.models.base import (
     AbstractWheel,
     Advance,
@@ -32,9 +22,31 @@ from vrw_jax.models.base import (
     replaced_where_bad,
     usable,
 )
-from vrw_jax.options import Options
-from vrw_jax.outcomes import Outcome
-from vrw_jax.params import Elementwise, Scalar, Symbols, WheelParams
+from vrw_jax.numerics import (
+    Elementwise,
+    Field,
+    Forward,
+    Options,
+    PhaseEnd,
+    Scalar,
+    State,
+    Watch,
+    Watched,
+    any_mode,
+    integrate_phase,
+    sample_phase,
+)
+from vrw_jax.wheel import (
+    Motion,
+    Outcome,
+    Symbols,
+    WheelParams,
+    double_support_motion,
+    dynamics,
+    landing_foot_height,
+    rear_foot_height,
+    transitions,
+)
 
 PAPER_START = (0.1, 1.6, -0.1)
 """A start near the gait of Table 1, inside its basin: rad, rad/s, m/s."""

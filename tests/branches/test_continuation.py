@@ -1,0 +1,320 @@
+"""Branches pass folds, and every bifurcation and border on them is located to 1e-9."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vrw_jax as vrw
+from vrw_jax.app.branch_report import write
+from vrw_jax.figures.branch import branch_figure
+from vrw_jax.numerics.events import integrate_phase
+from vrw_jax.numerics.minima import Watched
+from vrw_jax.numerics.roots import locate
+
+RADIUS_AT_200 = 0.32861954  # Table 1: published for orientation beside the physics
+WITHIN = 1e-9
+
+
+# Maps with closed forms ---------------------------------------------------------------------------
+
+
+def henon(b, x, a):
+    """x -> 1 - a x^2 + y, y -> b x: fold at -(1-b)^2/4, period doubling at 3 (1-b)^2/4."""
+    return jnp.stack([1.0 - a * x[0] ** 2 + x[1], b * x[0]])
+
+
+def logistic(_, x, r):
+    """x -> r x (1 - x): period doubling at 3."""
+    return r * x * (1.0 - x)
+
+
+def delayed_logistic(_, x, r):
+    """x -> r x (1 - y), y -> x: Neimark-Sacker bifurcation at 2, multipliers exp(+-i pi/3)."""
+    return jnp.stack([r * x[0] * (1.0 - x[1]), x[0]])
+
+
+def stretched(_, x, p):
+    """Three numbers: a fold in the first at p = 0 beside two that contract."""
+    return jnp.stack([x[0] + p - x[0] ** 2, 0.5 * x[1] + x[0], -0.3 * x[2]])
+
+
+def borders_of(branch):
+    return {border.kind: border.value for border in branch.borders}
+
+
+def test_fold_and_period_doubling_of_henon_are_where_the_closed_form_puts_them():
+    for b in (0.3, -0.4):
+        branch = vrw.continue_map(henon, [0.6, 0.6 * b], 1.0, (-1.0, 2.0), constants=b)
+        found = borders_of(branch)
+        assert set(found) == {"fold", "period_doubling"}
+        assert abs(found["fold"] + (1.0 - b) ** 2 / 4.0) < WITHIN
+        assert abs(found["period_doubling"] - 3.0 * (1.0 - b) ** 2 / 4.0) < WITHIN
+
+
+def test_the_branch_turns_back_at_a_fold_and_goes_on_unstable():
+    branch = vrw.continue_map(henon, [0.6, 0.18], 1.0, (-1.0, 2.0), constants=0.3)
+    values, b = branch.values, 0.3
+    turn = int(np.argmin(values))
+    assert 0 < turn < values.size - 1
+    x = branch.dataset.x.values[:, 0]
+    residual = values * x**2 + (1.0 - b) * x - 1.0
+    assert np.abs(residual).max() < 1e-9 * max(1.0, np.abs(values * x**2).max())
+    assert not branch.stable[: turn - 2].any()
+
+
+def test_period_doubling_of_the_logistic_map_is_at_3():
+    branch = vrw.continue_map(logistic, [0.6], 2.5, (1.5, 4.0))
+    assert abs(borders_of(branch)["period_doubling"] - 3.0) < WITHIN
+
+
+def test_neimark_sacker_of_the_delayed_logistic_map_is_at_2():
+    branch = vrw.continue_map(delayed_logistic, [0.4, 0.4], 1.7, (1.4, 2.2))
+    (border,) = branch.borders
+    assert border.kind == "neimark_sacker"
+    assert abs(border.value - 2.0) < WITHIN
+    turn = np.exp(1j * np.pi / 3.0)
+    np.testing.assert_allclose(sorted(border.cycle.multipliers.imag), [-turn.imag, turn.imag])
+
+
+def test_real_reciprocal_multipliers_are_no_neimark_sacker_bifurcation():
+    # Multipliers 2 p and 1/2: their product is 1 at p = 1, where nothing happens.
+    saddle = lambda _, x, p: jnp.stack([2.0 * p * x[0], 0.5 * x[1]])
+    branch = vrw.continue_map(saddle, [0.0, 0.0], 0.8, (0.6, 1.4))
+    assert "neimark_sacker" not in borders_of(branch)
+
+
+def test_a_fold_of_a_map_of_three_numbers_is_found():
+    branch = vrw.continue_map(stretched, [0.5, 1.0, 0.0], 0.25, (-1.0, 1.0))
+    assert abs(borders_of(branch)["fold"]) < WITHIN
+
+
+def test_a_zero_is_located_to_its_width_even_at_a_jump():
+    def functions(x):
+        return np.array(
+            [x[0] ** 3 - 0.3, np.where(x[1] < 0.777, -1.0, 1e-3), np.exp(5 * x[2]) - 20]
+        )
+
+    zeros, ones = np.zeros(3), np.ones(3)
+    found = locate(functions, functions(zeros), functions(ones), np.full(3, 1e-12))
+    exact = np.array([0.3 ** (1 / 3), 0.777, np.log(20.0) / 5.0])
+    np.testing.assert_allclose(found.place, exact, atol=1e-12)
+    assert np.all(functions(found.left) <= 0.0)
+    assert np.all(functions(found.right) >= 0.0)
+
+
+# A model that is not ours: the simplest walking model (Garcia et al. 1998) ------------------------
+
+MIDSTANCE = -0.05
+"""Stance angle past which the swing foot is looked at: before, its feet scuff at mid-stance."""
+
+
+def simplest_walker(options):
+    """Map of (stance angle, its rate) just after heel strike; leg length and gravity are 1."""
+
+    def field(slope):
+        def rates(y):
+            theta, phi, dtheta, dphi = y
+            ddtheta = jnp.sin(theta - slope)
+            swing = ddtheta + dtheta**2 * jnp.sin(phi) - jnp.cos(theta - slope) * jnp.sin(phi)
+            return jnp.stack([dtheta, dphi, ddtheta, swing])
+
+        return rates
+
+    def walk(x, slope):
+        theta, dtheta = x
+        start = jnp.stack([theta, 2.0 * theta, dtheta, (1.0 - jnp.cos(2.0 * theta)) * dtheta])
+        going = jnp.asarray(True)
+        past = Watched(lambda y: jnp.stack([y[0] - MIDSTANCE]), 1)
+        strike = Watched(lambda y: jnp.stack([2.0 * y[0] - y[1]]), 1)
+        middle = integrate_phase(field(slope), past, start, going, options)
+        end = integrate_phase(field(slope), strike, middle.state, middle.guard == 0, options)
+        theta, _, dtheta, _ = end.state
+        after = jnp.stack([-theta, jnp.cos(2.0 * theta) * dtheta])
+        walked = (end.guard == 0) & (end.duration > 0.0)
+        return jnp.where(walked, after, jnp.nan), middle.duration + end.duration
+
+    return walk
+
+
+WALK = simplest_walker(vrw.Options.tight())
+
+
+def walker_map(_, x, slope):
+    return WALK(x, slope)[0]
+
+
+# docs/physics.md: section state, period, multipliers at slope 0.009.
+STABLE = ((0.200310900544, -0.199832473005), 3.88246375285, -0.19009984107 + 0.55759877668j)
+UNSTABLE = ((0.193937369810, -0.203866927442), 3.09610586808, (4.00386435893, 0.45958958980))
+
+
+@pytest.fixture(scope="module")
+def walker_branches():
+    step = vrw.ArclengthOptions(largest_step=0.05, first_step=0.02)
+    follow = lambda x: vrw.continue_map(
+        walker_map, x, 0.009, (0.004, 0.018), name="slope", options=step
+    )
+    return follow(STABLE[0]), follow(UNSTABLE[0])
+
+
+def at_slope(branch, slope):
+    return int(np.argmin(np.abs(branch.values - slope)))
+
+
+def test_simplest_walker_has_the_published_fixed_points_and_multipliers(walker_branches):
+    for branch, (x, period, _) in zip(walker_branches, (STABLE, UNSTABLE), strict=True):
+        i = at_slope(branch, 0.009)
+        assert branch.values[i] == 0.009
+        np.testing.assert_allclose(branch.dataset.x.values[i], x, atol=WITHIN)
+        assert abs(float(jax.jit(WALK)(jnp.asarray(x), 0.009)[1]) - period) < 1e-8
+    stable, unstable = (b.multipliers[at_slope(b, 0.009)] for b in walker_branches)
+    np.testing.assert_allclose(stable, [np.conj(STABLE[2]), STABLE[2]][::-1], atol=WITHIN)
+    np.testing.assert_allclose(unstable, UNSTABLE[2], atol=WITHIN)
+
+
+def test_simplest_walker_doubles_its_period_near_slope_0015(walker_branches):
+    stable, unstable = walker_branches
+    doubling = borders_of(stable)["period_doubling"]
+    assert 0.0148 < doubling < 0.0154
+    assert not unstable.stable.any()
+    below = stable.values < doubling
+    assert stable.stable[below].all()
+    assert not stable.stable[~below].any()
+
+
+# The wheel ----------------------------------------------------------------------------------------
+
+
+WHEELS = vrw.WheelParams(
+    damping=jnp.asarray([200.0, 150.0, 100.0]),
+    natural_length=jnp.asarray([1.02, 1.03, 1.02]),
+    slope=jnp.asarray([0.30, 0.28, 0.02]),  # the last does not walk
+)
+
+
+@pytest.fixture(scope="module")
+def branches():
+    return vrw.continue_branches(WHEELS, "damping", (4.0, 230.0))
+
+
+@pytest.fixture(scope="module")
+def branch(branches):
+    return branches[0]
+
+
+@pytest.fixture(scope="module")
+def gait_at(branch):
+    """The gait of Table 1's wheel at a damping, found again next to the branch."""
+    guess = branch.borders[-1].cycle
+
+    def find(damping):
+        params = vrw.WheelParams(damping=damping)
+        return params, vrw.limit_cycle(params, guess=guess, options=vrw.CycleOptions.tight())
+
+    return find
+
+
+def by_name(branch):
+    return {border.name: border for border in branch.borders}
+
+
+def test_the_branch_along_damping_ends_where_an_indicator_vanishes(branch):
+    first, last = branch.borders[0], branch.borders[-1]
+    assert (first.name, last.name) == ("lambda_2_plus", "lambda_4_plus")
+    assert first.ends_branch
+    assert last.ends_branch
+    assert abs(first.value - 4.65) < 0.01
+    assert abs(last.value - 219.85) < 0.01
+    assert branch.values[0] - first.value < WITHIN
+    assert last.value - branch.values[-1] < WITHIN
+    assert branch.stable.all()
+
+
+def test_every_gait_on_the_branch_repeats_when_walked(branch):
+    assert branch.dataset.closure.max() < 1e-11
+
+
+def test_scuffing_begins_between_100_and_120(branch, gait_at):
+    border = by_name(branch)["clearance_sls1"]
+    assert 100.0 < border.value < 120.0
+    for offset, scuffs in ((-1.0, True), (1.0, False)):
+        params, gait = gait_at(border.value + offset)
+        clearance = vrw.step(params, gait.section_state, options=vrw.Options.tight())
+        assert (float(clearance.monitors.clearance_sls1) < 0.0) == scuffs
+
+
+def test_each_border_is_located_to_1e_9(branch, gait_at):
+    def quantity(border, damping):
+        """Indicator or monitor `border.name` at that damping; negative where the gait is lost."""
+        params, gait = gait_at(damping)
+        if not bool(gait.found):
+            return -1.0
+        result = vrw.step(params, gait.section_state, options=vrw.Options.tight())
+        return float(result.measures()[border.name])
+
+    for border in branch.borders:
+        if border.name == "clearance_sls1":  # vanishes like a cube: see the test above
+            continue
+        below, above = (quantity(border, border.value + d) for d in (-WITHIN, WITHIN))
+        assert below * above < 0.0, border
+
+
+def test_the_cycle_at_a_border_is_a_limit_cycle_of_the_wheel(branch):
+    border = branch.borders[-1]
+    assert bool(border.cycle.found)
+    assert 0.0 < float(border.cycle.indicators.lambda_4) < 1e-8
+    np.testing.assert_allclose(
+        border.cycle.multipliers, border.point.multipliers, atol=1e-9, rtol=0.0
+    )
+
+
+def test_the_map_before_touchdown_and_after_impact_have_the_same_multipliers(gait_at):
+    options = vrw.Options.tight()
+    params, gait = gait_at(200.0)
+    before = jax.jacfwd(lambda x: vrw.return_map(params, x, options=options))
+    values = np.linalg.eigvals(np.asarray(before(gait.section_state)))
+    values = values[np.argsort(-np.abs(values))]
+    np.testing.assert_allclose(values[:2], gait.multipliers, atol=1e-9)
+    assert abs(values[2]) < 1e-9
+    assert abs(float(gait.spectral_radius) - RADIUS_AT_200) < 1e-8
+
+
+def test_wheels_side_by_side_have_each_their_own_branch(branches):
+    walks, lost = branches[1:]
+    i = int(np.argmin(np.abs(walks.values - 150.0)))
+    gait = vrw.limit_cycle(jax.tree.map(lambda x: jnp.broadcast_to(x, 3)[1], WHEELS))
+    assert walks.values[i] == 150.0
+    assert abs(walks.dataset.dls_fraction[i] - gait.dls_fraction) < 1e-8
+    assert lost.outcome == vrw.Outcome.NO_CYCLE_FOUND
+    assert not lost.values.size
+    assert "none" in str(lost)
+
+
+def test_a_rigid_wheel_is_followed_by_its_own_step():
+    branch = vrw.continue_branch(
+        vrw.WheelParams(), "slope", (0.2, 0.35), model=vrw.RigidWheel(stop_at_lift_off=False)
+    )
+    s = vrw.WheelParams().symbols()
+    inertia = float(8.0 * s.m * s.c0**2)
+    total = float(s.Mt * s.L0**2)
+    keep = (total * s.cos_alpha + inertia) / (total + inertia)
+    np.testing.assert_allclose(branch.dataset.spectral_radius, keep**2, atol=1e-9)
+    assert branch.values[[0, -1]].tolist() == [0.2, 0.35]
+
+
+def test_what_is_asked_wrongly_is_said_in_a_sentence():
+    with pytest.raises(ValueError, match="no parameter: choose from"):
+        vrw.continue_branch(vrw.WheelParams(), "damp", (50.0, 100.0))
+    with pytest.raises(ValueError, match="the lower must come first"):
+        vrw.continue_branch(vrw.WheelParams(), "damping", (100.0, 50.0))
+    with pytest.raises(ValueError, match="use continue_branches"):
+        vrw.continue_branch(vrw.WheelParams(damping=[1.0, 2.0]), "damping", (50.0, 100.0))
+
+
+def test_a_branch_is_written_drawn_and_told(branch, tmp_path):
+    assert len(branch_figure(branch).axes) == 4
+    names = {path.name for path in write(branch, tmp_path)}
+    assert names == {"branch.zarr", "borders.csv", "summary.md", "branch.svg", "branch.png"}
+    assert "219.84768" in (tmp_path / "summary.md").read_text()
+    assert "ends the branch" in branch._repr_html_()

@@ -1,0 +1,251 @@
+"""Gaits on real ground: sensitivities, branches, scans and tuning."""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vrw_jax as vrw
+from vrw_jax import simd
+from vrw_jax.batches import ground as ground_lanes
+from vrw_jax.models.ladder import UNILATERAL, VISCOELASTIC
+from vrw_jax.numerics.arclength import ArclengthOptions
+from vrw_jax.numerics.floquet import bifurcation_margins, jury_margins, multipliers
+
+START = (0.1, 1.6, -0.1)
+SLOW = vrw.WheelParams(damping=300.0)
+GROUND = vrw.UnilateralWheel(friction=0.7)
+OPTIONS = vrw.Options(rtol=1e-11, atol=1e-11)
+
+
+@pytest.fixture(scope="module")
+def near():
+    """A section state next to the slow gait at c = 300, μ = 0.7."""
+    return vrw.walk(SLOW, START, 40, model=GROUND, options=OPTIONS).steps.section_state[-1]
+
+
+@pytest.mark.slow
+def test_sensitivities_on_real_ground_are_the_difference_quotients_friction_included(near):
+    names = ("dls_fraction", "period", "speed", "slip", "energy_lost_friction")
+    told = lambda params, model: vrw.sensitivities(
+        params, measures=names, guess=near, model=model, options=OPTIONS
+    )
+    table = told(SLOW, GROUND)
+    assert "friction" in table.parameter
+    step = 1e-4
+    for name, ends in {
+        "damping": [told(vrw.WheelParams(damping=300.0 + d), GROUND) for d in (step, -step)],
+        "friction": [told(SLOW, vrw.UnilateralWheel(friction=0.7 + d)) for d in (step, -step)],
+    }.items():
+        difference = (ends[0].value - ends[1].value) / (2.0 * step)
+        found = table.derivative.sel(parameter=name)
+        np.testing.assert_allclose(found, difference, rtol=2e-5, atol=1e-7)
+
+
+def test_what_real_ground_does_not_measure_is_refused_in_one_sentence():
+    with pytest.raises(ValueError, match="choose among these"):
+        vrw.sensitivities(SLOW, measures=("lambda_4",), model=GROUND)
+    with pytest.raises(ValueError, match="does not feel"):
+        vrw.scan(vrw.grid(friction=[0.5, 0.7]))
+    with pytest.raises(ValueError, match="is no parameter"):
+        vrw.continue_branch(vrw.WheelParams(), "friction", (0.5, 1.0))
+    with pytest.raises(TypeError, match="can't be tuned"):
+        vrw.tune(
+            SLOW, "dls_fraction", ["damping"], {"damping": (250.0, 350.0)}, model=vrw.LadderWheel()
+        )
+    with pytest.raises(TypeError, match="can't be differentiated"):
+        vrw.sensitivities(SLOW, model=vrw.LadderWheel())
+    with pytest.raises(TypeError, match="can't be followed"):
+        vrw.continue_branch(SLOW, "damping", (250.0, 350.0), model=vrw.LadderWheel())
+    with pytest.raises(TypeError, match="compliant legs"):
+        vrw.tune(SLOW, "speed", ["damping"], {"damping": (250.0, 350.0)}, model=vrw.RigidWheel())
+
+
+def test_bifurcations_of_larger_maps_are_those_of_the_small_map_inside():
+    small = np.array([[0.4, 0.9, 0.1], [-0.7, 0.3, 0.2], [0.1, 0.0, -0.6]])
+    large = np.zeros((7, 7))
+    large[2:5, 2:5] = small
+    found = bifurcation_margins(jnp.asarray(large))
+    np.testing.assert_allclose(found, jury_margins(jnp.asarray(small))[:3], atol=1e-12)
+    three = np.asarray(multipliers(jnp.asarray(large)))[:3]
+    exact = np.asarray(multipliers(jnp.asarray(small)))
+    np.testing.assert_allclose(np.sort_complex(three), np.sort_complex(exact), atol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_scan_puts_each_sample_on_its_lowest_rung():
+    design = vrw.grid(damping=[150.0, 300.0], friction=[0.7, math.inf])
+    measures = ("dls_fraction", "period", "slip")
+    scan = vrw.scan(design, measures, model="auto")
+    assert scan.rung.values.tolist() == [[UNILATERAL, VISCOELASTIC], [UNILATERAL, UNILATERAL]]
+    paper = vrw.limit_cycle(vrw.WheelParams(damping=150.0))
+    np.testing.assert_allclose(scan.period[0, 1], paper.period, atol=1e-9)
+    assert float(scan.slip[0, 1]) == 0.0
+    ground = vrw.scan(design, (*measures, "d period / d friction"), model=vrw.UnilateralWheel())
+    for name in measures:
+        np.testing.assert_allclose(scan[name][1], ground[name][1], atol=1e-9)
+    # Feet that can't slide give the paper's gait on the upper rung too.
+    np.testing.assert_allclose(scan.period[0, 1], ground.period[0, 1], atol=1e-9)
+    assert float(scan.slip[1, 0]) > 0.0
+    assert np.isfinite(ground["d_period_d_friction"][1, 0])
+
+
+@pytest.mark.slow
+def test_a_branch_on_real_ground_holds_gaits_that_repeat(near):
+    cycle = vrw.limit_cycle(SLOW, guess=near, model=GROUND, options=OPTIONS)
+    branch = vrw.continue_branch(
+        SLOW, "friction", (0.65, 0.75), cycle=cycle, model=GROUND, step_options=OPTIONS,
+        options=ArclengthOptions(first_step=0.1, largest_step=0.1),
+    )  # fmt: skip
+    assert branch.outcome == vrw.Outcome.STEPPED
+    assert branch.values.min() == pytest.approx(0.65)
+    assert branch.values.max() == pytest.approx(0.75)
+    assert float(branch.dataset.closure.max()) < 1e-8
+    assert branch.stable.all()
+    place = int(np.argmin(np.abs(branch.values - 0.7)))
+    slope = (branch.dataset.period[place + 1] - branch.dataset.period[place - 1]) / (
+        branch.values[place + 1] - branch.values[place - 1]
+    )
+    table = vrw.sensitivities(SLOW, measures=("period",), guess=near, model=GROUND, options=OPTIONS)
+    exact = table.derivative.sel(parameter="friction", measure="period")
+    np.testing.assert_allclose(slope, exact, rtol=0.05)
+
+
+@pytest.mark.slow
+def test_a_branch_on_real_ground_turns_at_its_fold_and_comes_back_unstable():
+    """At Table 1 the slow gait needs friction: two gaits above that, one repelling, none below."""
+    params, high = vrw.WheelParams(), vrw.UnilateralWheel(friction=1.0)
+    state = vrw.walk(params, START, 300, model=high, options=OPTIONS).steps.section_state[-1]
+    cycle = vrw.limit_cycle(params, guess=state, model=high, options=OPTIONS)
+    branch = vrw.continue_branch(
+        params, "friction", (0.95, 1.0), cycle=cycle, model=high, step_options=OPTIONS,
+        options=ArclengthOptions(first_step=0.1, largest_step=0.2),
+    )  # fmt: skip
+    assert float(branch.dataset.closure.max()) < 1e-8
+    (fold,) = (border.value for border in branch.borders if border.kind == "fold")
+    # By lanes and central differences, which went past it in large steps: a quartic through the
+    # seven gaits next to it, as experiments/ground_branches.py prints it.
+    assert fold == pytest.approx(0.98186, abs=1e-4)
+    turn = int(np.argmin(branch.values))
+    assert 0 < turn < branch.values.size - 1
+    assert branch.values[[0, -1]] == pytest.approx([1.0, 1.0])
+    before, after = branch.stable[:turn], branch.stable[turn + 1 :]
+    assert sorted([before.all(), after.all()]) == [False, True]
+    assert not (before if after.all() else after).any()
+    # Just below the fold no walk stays: the slow gait is a ghost there.
+    low = vrw.UnilateralWheel(friction=fold - 0.1)
+    walk = vrw.walk(params, START, 120, model=low, options=OPTIONS).steps
+    slow = branch.dataset.period.values.min()
+    assert float(jnp.sum(walk.durations[-1])) < 0.9 * slow
+
+
+@pytest.mark.slow
+def test_without_slip_the_multipliers_are_those_of_the_papers_plane():
+    paper = vrw.limit_cycle(vrw.WheelParams())
+    held = vrw.UnilateralWheel(friction=math.inf)
+    ground = vrw.limit_cycle(vrw.WheelParams(), guess=START, model=held, options=OPTIONS)
+    assert int(ground.outcome) == vrw.Outcome.STEPPED
+    np.testing.assert_allclose(ground.period, paper.period, atol=1e-9)
+    largest = lambda cycle: np.sort(np.abs(np.asarray(cycle.multipliers)))[::-1]
+    np.testing.assert_allclose(largest(ground)[:2], largest(paper)[:2], atol=1e-7)
+    # Legs settle in the air at c / m = 200 per second, so hardly anything else is left of a step.
+    np.testing.assert_allclose(largest(ground)[2:], 0.0, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_tuning_on_real_ground_climbs_along_the_gradient():
+    # Up to here one order of events: next to a border (c = 311.2, slope 0.2944) climbing is slow.
+    bounds = {"damping": (280.0, 310.0), "slope": (0.295, 0.31)}
+    tuned = vrw.tune(
+        SLOW, "dls_fraction", list(bounds), bounds, model=GROUND, options=OPTIONS, tolerance=1e-4
+    )
+    assert tuned.value > tuned.start_value
+    assert tuned.walked.outcome == vrw.Outcome.STEPPED
+    for name, sign in (("damping", 1.0), ("slope", -1.0)):
+        moved = vrw.WheelParams(**({"damping": 300.0} | {name: getattr(SLOW, name) * 1.001}))
+        walk = vrw.walk(moved, START, 60, model=GROUND, options=OPTIONS).steps
+        share = walk.durations[-1, 0] / jnp.sum(walk.durations[-1])
+        assert sign * float(share - tuned.start_value) > 0.0
+    assert float(tuned.params.damping) == pytest.approx(310.0)
+    assert float(tuned.params.slope) == pytest.approx(0.295)
+
+
+LANES = vrw.Options(solver="Tsit5", rtol=1e-8, atol=1e-8)
+
+
+@pytest.fixture(scope="module")
+def lanes():
+    """Three steps of several wheels side by side: damping, friction, start and what they did."""
+    damping = np.array([200.0, 300.0, 250.0, 160.0, 60.0, 150.0, 200.0])
+    friction = np.array([0.7, 0.7, 1.2, math.inf, math.inf, math.nan, 0.3])
+    states = np.tile(START, (len(damping), 1))
+    states[0, 1] = 2.0
+
+    def walked(some):
+        return vrw.steps(
+            vrw.WheelParams(damping=damping[some]),
+            states[some],
+            3,
+            model=vrw.UnilateralWheel(friction=friction[some]),
+            options=LANES,
+        )
+
+    return damping, friction, states, walked
+
+
+def test_lanes_walk_on_real_ground_as_single_wheels_do(lanes):
+    damping, friction, states, walked = lanes
+    found = walked(slice(None))
+    assert found.engine == "lanes"
+    for i in range(len(damping)):
+        ground = vrw.UnilateralWheel(friction=friction[i])
+        params = vrw.WheelParams(damping=damping[i])
+        walk = vrw.walk(params, states[i], 3, model=ground, options=OPTIONS)
+        assert int(found.outcome[i]) == int(walk.outcome)
+        assert int(found.n_stepped[i]) == int(walk.n_stepped)
+        np.testing.assert_allclose(found.section_state[i], walk.steps.section_state[-1], atol=2e-7)
+        np.testing.assert_allclose(found.durations[i], walk.steps.durations[-1], atol=5e-8)
+    assert int(found.outcome[5]) == vrw.Outcome.BAD_INPUT
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(found))
+
+
+def test_what_a_lane_gives_does_not_depend_on_its_company(lanes):
+    *_, walked = lanes
+    together, alone = walked(slice(None)), walked(slice(1, 2))
+    for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
+        np.testing.assert_array_equal(a[1], b[0])
+
+
+@pytest.mark.slow
+def test_a_march_by_xla_as_on_a_gpu_goes_as_the_machine_code(lanes, monkeypatch):
+    *_, walked = lanes
+    found = walked(slice(None))
+    monkeypatch.setattr(simd, "serves", lambda: False)
+    ground_lanes._program.cache_clear()
+    by_xla = walked(slice(None))
+    ground_lanes._program.cache_clear()
+    np.testing.assert_array_equal(by_xla.outcome, found.outcome)
+    # Rounding alone tells them apart, grown by the events of three steps.
+    np.testing.assert_allclose(by_xla.section_state, found.section_state, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(by_xla.durations, found.durations, rtol=0, atol=1e-9)
+
+
+def test_an_event_of_a_lane_on_real_ground_counts_within_the_time_allowed_alone(lanes):
+    damping, friction, states, _ = lanes
+    within = lambda seconds: vrw.steps(
+        vrw.WheelParams(damping=damping[1:2]),
+        states[1:2],
+        model=vrw.UnilateralWheel(friction=friction[1:2]),
+        options=eqx.tree_at(lambda o: o.max_phase_time, LANES, jnp.asarray(seconds)),
+    )
+    longest = np.max(within(20.0).durations)
+    assert int(within(1.001 * longest).outcome[0]) == vrw.Outcome.STEPPED
+    assert int(within(0.999 * longest).outcome[0]) == vrw.Outcome.NO_TOUCHDOWN_IN_TIME
+
+
+def test_an_implicit_solver_for_lanes_on_real_ground_is_refused_in_one_sentence():
+    with pytest.raises(ValueError, match="map vrw"):
+        vrw.steps(SLOW, np.asarray([START]), model=GROUND, options=vrw.Options(solver="Kvaerno5"))

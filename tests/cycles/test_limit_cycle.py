@@ -1,0 +1,429 @@
+"""Limit cycles: against a truth of 27 digits, against walking, their derivatives, and failures."""
+
+import functools
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import truth
+
+import vrw_jax as vrw
+from vrw_jax import simd
+from vrw_jax.numerics import floquet
+from vrw_jax.wheel.outcomes import Outcome
+from vrw_jax.wheel.params import PARAMETER_NAMES, wheel_of
+
+TIGHT = vrw.CycleOptions.tight()
+VALUES = ("section_state", "post_impact", "durations", "period", "dls_fraction", "speed")
+DIFFERENTIATED = ("post_impact", "durations", "period", "dls_fraction", "speed", "step_length")
+
+
+def measures(cycle, names):
+    return {name: getattr(cycle, name) for name in names}
+
+
+@functools.cache
+def compiled(options, names, transform):
+    """Cycles of a batch with the derivatives of some measures, compiled once for many tests."""
+
+    def one(vector):
+        cycle = vrw.limit_cycle(truth.wheel(vector), options=options)
+        values = measures(cycle, names)
+        return (values[names[0]] if transform is jax.grad else values), cycle
+
+    return jax.jit(jax.vmap(transform(one, has_aux=True)))
+
+
+def differentiated(rows, options=None, names=DIFFERENTIATED, transform=jax.jacfwd):
+    """(derivatives, cycles) of rows of parameters, in a batch of one size."""
+    rows = np.atleast_2d(np.asarray(rows, float))
+    full = np.concatenate([rows, np.tile(rows[-1], (len(truth.CASES) - len(rows), 1))])
+    found = compiled(options, names, transform)(jnp.asarray(full))
+    return jax.tree.map(lambda x: x[: len(rows)], found)
+
+
+@functools.cache
+def of_the_truth(options=None, names=DIFFERENTIATED):
+    return differentiated(truth.PARAMETERS, options, names)
+
+
+def cycles(options=None):
+    return of_the_truth(options)[1]
+
+
+def table_1(**changes):
+    row = truth.PARAMETERS[0].copy()
+    for name, value in changes.items():
+        row[PARAMETER_NAMES.index(name)] = value
+    return row
+
+
+def relative_error(found, expected):
+    scale = np.max(np.abs(expected), axis=tuple(range(1, expected.ndim)), keepdims=True)
+    return np.max(np.abs(np.asarray(found) - expected) / scale)
+
+
+@pytest.mark.parametrize(("options", "allowed"), [(None, 1e-9), (TIGHT, 1e-12)])
+def test_cycles_agree_with_the_truth(options, allowed):
+    found = cycles(options)
+    assert np.all(np.asarray(found.outcome) == Outcome.STEPPED)
+    for name in VALUES:
+        assert relative_error(getattr(found, name), truth.table("cycle", name)) < allowed, name
+    for own, name in (("lambda_I4", "lambda_impulse_4"), ("lambda_2", "lambda2_plus")):
+        indicator = getattr(found.indicators, own)
+        assert truth.scaled_error(indicator, truth.table("cycle", name)) < 10 * allowed
+
+
+@pytest.mark.parametrize(("options", "allowed"), [(None, 1e-8), (TIGHT, 1e-11)])
+def test_multipliers_agree_with_the_truth(options, allowed):
+    expected = truth.table("cycle", "multipliers")
+    found = np.asarray(cycles(options).multipliers)
+    expected = expected[..., 0] + 1j * expected[..., 1]
+    gap = np.abs(found[:, :, None] - expected[:, None, :])
+    assert gap.min(1).max() < allowed
+
+
+@pytest.mark.parametrize(("options", "allowed"), [(None, 1e-8), (TIGHT, 1e-10)])
+def test_first_derivatives_agree_with_the_truth(options, allowed):
+    found, _ = of_the_truth(options)
+    for name in DIFFERENTIATED:
+        expected = np.stack([truth.floats(case["cycle"]["d_params"][name]) for case in truth.CASES])
+        own = np.asarray(found[name]).reshape(expected.shape)
+        assert relative_error(own, expected) < allowed, name
+
+
+@pytest.mark.slow
+def test_derivatives_of_the_spectral_radius_agree_with_the_truth():
+    found = of_the_truth(None, ("spectral_radius",))[0]["spectral_radius"]
+    rows = [table_1(), table_1(slope=0.02), table_1(damping=np.nan)]
+    failed = differentiated(rows, None, ("spectral_radius",))[0]["spectral_radius"]
+    assert np.all(np.asarray(failed)[1:] == 0.0)
+    expected = np.stack(
+        [truth.floats(case["cycle"]["d_params"]["spectral_radius"]) for case in truth.CASES]
+    )
+    assert relative_error(found, expected) < 1e-8
+
+
+@pytest.mark.slow
+def test_second_derivatives_agree_with_differences_and_vanish_where_there_is_no_cycle():
+    rows = jnp.asarray(np.stack([table_1(), table_1(slope=0.02), table_1(damping=np.nan)]))
+    slope = PARAMETER_NAMES.index("slope")
+
+    def fraction(vector):
+        return vrw.limit_cycle(truth.wheel(vector)).dls_fraction
+
+    gradients = jax.jit(jax.vmap(jax.grad(fraction)))
+    found = jax.jit(jax.vmap(jax.jacfwd(jax.grad(fraction))))(rows)
+    assert np.all(np.asarray(found)[1:] == 0.0)
+    np.testing.assert_allclose(found[0], found[0].T, rtol=1e-9, atol=1e-12)
+    step = 1e-5 * np.eye(len(PARAMETER_NAMES))[slope]  # errors: 1e-10 of the step, 1e-15 over it
+    ahead, behind = gradients(rows[:1] + step)[0], gradients(rows[:1] - step)[0]
+    np.testing.assert_allclose(found[0][slope], (ahead - behind) / 2e-5, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_reverse_mode_agrees_with_forward_mode():
+    reverse, _ = differentiated(truth.PARAMETERS, None, ("dls_fraction",), jax.grad)
+    np.testing.assert_allclose(reverse, of_the_truth()[0]["dls_fraction"], rtol=1e-10, atol=1e-13)
+
+
+def test_cycle_is_a_fixed_point_of_the_event_driven_map():
+    wheels = truth.wheels(truth.PARAMETERS[:6])
+    state = cycles().section_state[:6]
+    options = vrw.Options.tight()
+    walk = jax.jit(jax.vmap(lambda p, x: vrw.return_map(p, x, options=options)))
+    np.testing.assert_allclose(walk(wheels, state), state, rtol=0, atol=3e-9)
+
+
+def test_a_gait_that_the_mesh_does_not_resolve_is_not_called_found():
+    # Towards the slope where walking stops, 0.0969184, double support lasts longer and longer.
+    rows = np.stack([table_1(slope=slope) for slope in (0.3, 0.2, 0.15, 0.12, 0.105, 0.098)])
+    expected, found = differentiated(rows, TIGHT)[1], differentiated(rows)[1]
+    kept = np.asarray(found.found)
+    assert list(kept) == [True, True, True, False, False, False]
+    assert np.asarray(expected.found)[3]
+    np.testing.assert_allclose(found.period[kept], expected.period[kept], rtol=1e-8)
+    error = np.abs(np.asarray(found.period / expected.period)[kept] - 1.0)
+    assert np.all(error <= found.mesh_error[kept])
+
+
+def test_every_measure_of_a_cycle_can_be_differentiated():
+    def measures(params):
+        cycle = vrw.limit_cycle(params)
+        names = ("stability_margin", "jury_margins", "condition", "mesh_error", "indicators")
+        return [getattr(cycle, name) for name in names]
+
+    jax.eval_shape(jax.jacrev(measures), vrw.WheelParams())  # traced, which is what can fail
+
+
+def test_a_wheel_in_float32_stays_in_float32_beside_64_bits():
+    params = jax.tree.map(lambda x: x.astype(jnp.float32), vrw.WheelParams())
+    cycle = jax.eval_shape(vrw.limit_cycle, params)
+    floats = [x for x in jax.tree.leaves(cycle) if jnp.issubdtype(x.dtype, jnp.inexact)]
+    assert {x.dtype for x in floats} == {jnp.dtype(jnp.float32)}
+
+
+def test_vmap_gives_what_single_wheels_give():
+    batch = cycles()
+    for index in (0, 3):
+        single = vrw.limit_cycle(truth.wheel(truth.PARAMETERS[index]))
+        np.testing.assert_allclose(
+            single.section_state, batch.section_state[index], rtol=1e-12, atol=1e-13
+        )
+
+
+def test_no_cycle_is_an_outcome_with_zeros_and_disturbs_no_neighbour():
+    rows = np.stack([table_1(), table_1(slope=0.02), table_1(damping=np.nan)])
+    for transform in (jax.jacfwd, jax.grad):
+        names = DIFFERENTIATED if transform is jax.jacfwd else ("dls_fraction",)
+        derivatives, cycle = differentiated(rows, None, names, transform)
+        expected = [Outcome.STEPPED, Outcome.NO_CYCLE_FOUND, Outcome.BAD_INPUT]
+        assert list(np.asarray(cycle.outcome)) == expected
+        assert np.all(np.asarray(cycle.section_state)[1:] == 0.0)
+        assert all(np.all(np.asarray(leaf)[1:] == 0.0) for leaf in jax.tree.leaves(derivatives))
+        assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(cycle))
+        np.testing.assert_allclose(cycle.durations[0], cycles().durations[0], rtol=1e-12)
+
+
+def test_gait_without_double_support_is_found_though_unstable():
+    row = table_1(
+        natural_length=1.03163159, stiffness=529.980645, damping=179.091443, slope=0.314288553
+    )
+    _, cycle = differentiated(row)
+    assert int(cycle.outcome[0]) == Outcome.STEPPED
+    assert float(cycle.durations[0, 0]) == 0.0
+    assert float(cycle.indicators.lambda_4[0]) < 0.0
+    assert float(floquet.spectral_radius(cycle.matrix[0])) > 1.6
+    options = vrw.Options.tight()
+    back = vrw.return_map(truth.wheel(row), cycle.section_state[0], options=options)
+    np.testing.assert_allclose(back, cycle.section_state[0], atol=1e-8)
+
+
+def test_a_wheel_twice_as_large_takes_root_two_longer():
+    length = 2.0
+    large = table_1(
+        leg_com=0.3 * length,
+        locked_length=length,
+        natural_length=1.02 * length,
+        stiffness=500.0 / length,
+        damping=200.0 / np.sqrt(length),
+    )
+    _, cycle = differentiated(np.stack([table_1(), large]))
+    expected = np.sqrt(length) * cycle.durations[0]
+    np.testing.assert_allclose(cycle.durations[1], expected, rtol=1e-9)
+
+
+def test_neighbours_cycle_is_a_quicker_start():
+    first = vrw.limit_cycle(vrw.WheelParams())
+    second = vrw.limit_cycle(vrw.WheelParams(damping=202.0), guess=first)
+    assert int(second.outcome) == Outcome.STEPPED
+    assert int(second.passes) <= 4
+    cold = vrw.limit_cycle(vrw.WheelParams(damping=202.0))
+    np.testing.assert_allclose(second.section_state, cold.section_state, rtol=1e-11)
+
+
+@pytest.mark.slow
+def test_a_cycle_walked_twice_has_the_multipliers_squared():
+    once = vrw.limit_cycle(vrw.WheelParams())
+    twice = vrw.limit_cycle(vrw.WheelParams(), guess=once, period_n=2)
+    assert int(twice.outcome) == Outcome.STEPPED
+    np.testing.assert_allclose(twice.multipliers, once.multipliers**2, rtol=1e-10)
+    np.testing.assert_allclose(twice.durations, np.tile(once.durations, (2, 1)), rtol=1e-9)
+    np.testing.assert_allclose(twice.dls_fraction, once.dls_fraction, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_beyond_the_discontinuity_a_cycle_of_five_steps_is_found_from_a_walk():
+    # At c = 221 one step in five has no double support: found next to where a walk ends up.
+    params = vrw.WheelParams(damping=221.0)
+    walked = vrw.walk(params, vrw.paper_start(), 60)
+    end = walked.steps.section_state[-1]
+    five = vrw.limit_cycle(params, guess=end, period_n=5)
+    assert int(five.outcome) == Outcome.STEPPED
+    np.testing.assert_allclose(five.section_state, end, atol=1e-8)
+    assert np.sum(np.asarray(five.durations)[:, 0] == 0.0) == 1
+    x = five.section_state
+    for _ in range(5):
+        x = vrw.return_map(params, x, options=vrw.Options.tight())
+    np.testing.assert_allclose(x, five.section_state, atol=1e-9)
+    assert float(five.spectral_radius) < 1.0
+
+
+def test_another_rung_is_solved_on_its_own_return_map():
+    params, model = vrw.WheelParams(slope=0.1), vrw.RigidWheel()
+    cycle = vrw.limit_cycle(params, model=model)
+    assert int(cycle.outcome) == Outcome.STEPPED
+    back = vrw.return_map(params, cycle.section_state, model=model)
+    np.testing.assert_allclose(back, cycle.section_state, rtol=1e-12)
+    # Energy gained over a step is what the landing takes: the kept rate squared is the multiplier.
+    kept = cycle.post_impact[1] / cycle.section_state[1]
+    np.testing.assert_allclose(cycle.spectral_radius, kept**2, rtol=1e-10)
+    assert float(cycle.dls_fraction) == 0.0
+    table = vrw.sensitivities(params, model=model, measures=("period", "speed"))
+    above, below = (
+        vrw.limit_cycle(vrw.WheelParams(slope=0.1 + h), model=model) for h in (1e-5, -1e-5)
+    )
+    for name in ("period", "speed"):
+        difference = (getattr(above, name) - getattr(below, name)) / 2e-5
+        found = table.derivative.sel(measure=name, parameter="slope")
+        np.testing.assert_allclose(found, difference, rtol=1e-7)  # error of differences: h squared
+    lost = vrw.limit_cycle(vrw.WheelParams(slope=0.02), model=model)
+    assert int(lost.outcome) == Outcome.NO_CYCLE_FOUND
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(lost))
+
+
+def test_options_of_the_wrong_kind_are_answered_in_one_sentence():
+    with pytest.raises(TypeError, match="CycleOptions"):
+        vrw.limit_cycle(vrw.WheelParams(), options=vrw.Options())
+    with pytest.raises(TypeError, match="return map"):
+        vrw.limit_cycle(vrw.WheelParams(), model=vrw.RigidWheel(), options=TIGHT)
+    with pytest.raises(ValueError, match="1 step or more"):
+        vrw.limit_cycle(vrw.WheelParams(), period_n=0)
+
+
+def simplest_walker(slope):
+    """Garcia et al. 1998: the map just after heel strike, stance angle and rate."""
+
+    def field(y):
+        theta, phi, dtheta, dphi = y
+        ddtheta = jnp.sin(theta - slope)
+        ddphi = ddtheta + dtheta * dtheta * jnp.sin(phi) - jnp.cos(theta - slope) * jnp.sin(phi)
+        return jnp.stack([dtheta, dphi, ddtheta, ddphi])
+
+    def runge_kutta(y, h):
+        k1 = field(y)
+        k2 = field(y + 0.5 * h * k1)
+        k3 = field(y + 0.5 * h * k2)
+        k4 = field(y + h * k3)
+        return y + h / 6.0 * (k1 + 2 * k2 + 2 * k3 + k4)
+
+    def flow(y, time, n_steps=1200):
+        march = lambda y, _: (runge_kutta(y, time / n_steps), None)
+        return jax.lax.scan(march, y, None, length=n_steps)[0]
+
+    def step(x, time):
+        theta, dtheta = x
+        y = jnp.stack([theta, 2.0 * theta, dtheta, (1.0 - jnp.cos(2.0 * theta)) * dtheta])
+        for _ in range(6):  # heel strike: phi = 2 theta
+            end = flow(y, time)
+            gap, rate = end[1] - 2.0 * end[0], field(end)[1] - 2.0 * field(end)[0]
+            time = time - gap / rate
+        end = flow(y, time)
+        return jnp.stack([-end[0], jnp.cos(2.0 * end[0]) * end[2]])
+
+    return step
+
+
+@pytest.mark.parametrize(
+    ("x", "time", "multipliers"),
+    [
+        (
+            (0.200310900544, -0.199832473005),
+            3.88246375285,
+            (-0.19009984107 + 0.55759877668j, -0.19009984107 - 0.55759877668j),
+        ),
+        ((0.193937369810, -0.203866927442), 3.09610586808, (4.00386435893, 0.45958958980)),
+    ],
+)
+def test_section_newton_finds_the_simplest_walkers_published_cycles(x, time, multipliers):
+    step = simplest_walker(0.009)
+    start = jnp.asarray(x) * 1.002
+    cycle = jax.jit(lambda start: vrw.newton_cycle(lambda y: step(y, time), start))(start)
+    assert bool(cycle.converged)
+    np.testing.assert_allclose(cycle.x, x, atol=1e-9)
+    found = np.sort_complex(np.asarray(floquet.multipliers(cycle.jacobian)))
+    np.testing.assert_allclose(found, np.sort_complex(np.asarray(multipliers)), atol=3e-9)
+
+
+def test_section_newton_differentiates_fixed_point_and_multiplier():
+    """x -> a - x^2 repeats x = (sqrt(1 + 4 a) - 1) / 2, with the multiplier -2 x."""
+
+    def told(a, start=0.5):
+        found = vrw.newton_cycle(lambda x: a - x**2, jnp.asarray([start]))
+        return jnp.stack([found.x[0], found.jacobian[0, 0]])
+
+    a = 0.7
+    root = math.sqrt(1.0 + 4.0 * a)
+    expected = np.array([(root - 1.0) / 2.0, 1.0 / root, -2.0 / root**3, 12.0 / root**5])
+    first, second = jax.jacfwd(told), jax.jacfwd(jax.jacrev(told))
+    for function, value in zip((told, first), expected, strict=False):
+        np.testing.assert_allclose(function(a), [value, -2.0 * value], rtol=1e-13)
+    further = [second(a)[0], jax.jacfwd(second)(a)[0]]  # of the point alone
+    np.testing.assert_allclose(further, expected[2:], rtol=1e-12)
+    np.testing.assert_allclose(jax.jit(jax.grad(lambda a: told(a)[0]))(a), expected[1], rtol=1e-13)
+    many = jax.vmap(first)(jnp.asarray([0.1, a, 2.0]))
+    np.testing.assert_allclose(many[1], [expected[1], -2.0 * expected[1]], rtol=1e-13)
+
+
+def test_a_start_from_which_section_newton_does_not_converge_comes_back():
+    def told(a):
+        found = vrw.newton_cycle(lambda x: x + jnp.exp(-a * x), jnp.asarray([2.0]))  # repeats none
+        return found.x[0], found.converged
+
+    value, slope = jax.jvp(told, (1.0,), (1.0,))
+    for x, converged in (told(1.0), value):
+        assert (float(x), bool(converged)) == (2.0, False)
+    assert float(slope[0]) == 0.0
+
+
+@pytest.mark.slow
+def test_section_newton_agrees_with_the_collocation():
+    params = vrw.WheelParams()
+    exact = vrw.limit_cycle(params, options=TIGHT)
+    options = vrw.Options.tight()
+    step = lambda x: vrw.return_map(params, x, options=options)
+    start = exact.section_state * 1.01
+    cycle = jax.jit(lambda start: vrw.newton_cycle(step, start))(start)
+    np.testing.assert_allclose(cycle.x, exact.section_state, rtol=3e-12)
+    found = floquet.multipliers(cycle.jacobian)
+    np.testing.assert_allclose(np.abs(found[:2]), np.abs(exact.multipliers), rtol=1e-9)
+    assert abs(found[2]) < 1e-9  # the section before touchdown adds a multiplier of zero
+
+
+def test_sensitivities_are_labelled_and_agree_with_the_truth():
+    table = vrw.sensitivities(vrw.WheelParams(), measures=("dls_fraction", "period"))
+    expected = truth.floats(truth.CASES[0]["cycle"]["d_params"]["dls_fraction"])
+    order = [list(PARAMETER_NAMES).index(str(name)) for name in table.parameter.values]
+    np.testing.assert_allclose(
+        table.derivative.sel(measure="dls_fraction"), expected[order], rtol=1e-8, atol=1e-10
+    )
+    share = float(table.value.sel(measure="dls_fraction"))
+    elasticity = table.elasticity.sel(measure="dls_fraction", parameter="damping")
+    np.testing.assert_allclose(elasticity, 1.14691014e-4 * 200.0 / share, rtol=1e-6)
+
+
+def test_unknown_measure_is_refused_in_one_sentence():
+    with pytest.raises(ValueError, match="choose among these"):
+        vrw.sensitivities(vrw.WheelParams(), measures=("dls_fractoin",))
+
+
+def test_wheel_of_is_the_inverse_of_parameters_of():
+    wheel = wheel_of(jnp.asarray(truth.PARAMETERS[1]), 8)
+    assert float(wheel.damping) == 100.0
+
+
+@pytest.mark.slow
+def test_a_search_by_xla_as_on_a_gpu_goes_as_the_machine_code(monkeypatch):
+    """Easy wheels, one that needs the homotopy, one without double support, one without a gait."""
+    rows = np.tile(truth.PARAMETERS[0], (70, 1))  # more than a block
+    column = PARAMETER_NAMES.index
+    rows[:, column("damping")] = np.linspace(120.0, 215.0, 70)
+    rows[3, [column("damping"), column("slope")]] = 40.0, 0.33
+    rows[5, column("slope")] = 0.05
+
+    def told(vectors):
+        one = lambda vector: vrw.limit_cycle(truth.wheel(vector))
+        period = lambda vector: one(vector).period
+        cycle, slopes = jax.vmap(one)(vectors), jax.vmap(jax.grad(period))(vectors)
+        return cycle.durations, cycle.matrix, slopes, cycle.outcome, cycle.passes
+
+    *found, outcome, passes = jax.jit(told)(rows)
+    monkeypatch.setattr(simd, "serves", lambda: False)
+    *by_xla, code, n = jax.jit(lambda vectors: told(vectors))(rows)
+    np.testing.assert_array_equal(code, outcome)
+    np.testing.assert_array_equal(n, passes)
+    for a, b in zip(by_xla, found, strict=True):
+        # Newton's last correction is some 1e-14; what derivatives make of rounding.
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)

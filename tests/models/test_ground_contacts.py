@@ -1,0 +1,127 @@
+"""Which feet and stoppers carry an impact or a motion: every combination, by dense matrices."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracle import moreau_jean
+
+import vrw_jax as vrw
+from vrw_jax.models.unilateral.contacts import OFF, SLIP_DOWN, SLIP_UP, STICK, Allowed, choose
+from vrw_jax.models.unilateral.mechanics import (
+    WheelMotion,
+    free_acceleration,
+    free_velocity,
+    hub_of,
+    slots_of,
+)
+
+N_CASES = 200
+RNG_SEED = 6
+RANK = {STICK: 0, SLIP_DOWN: 1, SLIP_UP: 1, OFF: 2}
+"""Preferred are combinations with most feet at rest."""
+NUMBERS = {(0.7, False): {1}, (0.7, True): {1}, (3.0, False): {1, 3}, (3.0, True): {1, 3}}
+"""How many are admissible, by friction and level: one where the law is well posed."""
+
+
+def cases():
+    """Postures with two feet on the slope: coordinates, rates, stoppers reached (slots, others)."""
+    rng = np.random.default_rng(RNG_SEED)
+    for _ in range(N_CASES):
+        theta = rng.uniform(-0.7, -0.1)
+        at_stopper = rng.random(2) < 0.4
+        q, v = np.ones(11), rng.normal(0.0, 1.0, 11)
+        q[2], q[3:] = theta, rng.uniform(0.85, 1.0, 8)
+        q[1] = rng.uniform(0.85, 1.0) * min(np.cos(theta), np.cos(theta + moreau_jean.ALPHA))
+        q[3:5] = q[1] / np.cos(theta + moreau_jean.ALPHA * np.arange(2))
+        yield q, v, at_stopper, np.r_[False, False, rng.random(6) < 0.7]
+
+
+def admissible(wheel, q, v, at_stopper, locked, moving):
+    """All admissible combinations: modes, held stoppers, velocities or accelerations they leave.
+
+    `moving`: of forces, by the accelerations; else of impulses, by the velocities after them.
+    """
+    v = np.where(np.r_[[False] * 3, locked], 0.0, v) if moving else v
+    axes = np.r_[0:3, 3 + np.flatnonzero(~locked)]
+    mass, force = moreau_jean._mass_and_force(wheel, q, v)
+    inverse = np.linalg.inv(mass[np.ix_(axes, axes)])
+    free = inverse @ (force if moving else mass @ v)[axes]
+    rows_at = lambda q: np.array([moreau_jean._foot_rows(q, i) for i in range(2)])
+    feet, room = rows_at(q)[..., axes], -np.eye(11)[3:5][:, axes]
+    h = 1e-5  # the feet's rows turn along the motion
+    bias = (rows_at(q + h * v) - rows_at(q - h * v)) @ v / (2.0 * h) * moving
+    found = []
+    stoppers = itertools.product(*((False, True) if at else (False,) for at in at_stopper))
+    for modes, held in itertools.product(itertools.product(RANK, repeat=2), stoppers):
+        if modes == (STICK, STICK) and all(held):
+            continue  # fixes the hub twice over
+        closed = []  # row kept at rest, direction of its force, bias
+        for i, mode in enumerate(modes):
+            along, off = feet[i]
+            drag = {SLIP_DOWN: -wheel.friction, SLIP_UP: wheel.friction}.get(mode, 0.0)
+            closed += [(off, off + drag * along, bias[i, 1])] if mode != OFF else []
+            closed += [(along, along, bias[i, 0])] if mode == STICK else []
+            closed += [(room[i], room[i], 0.0)] if held[i] else []
+        R, C = (np.reshape([c[k] for c in closed], (-1, len(axes))) for k in range(2))
+        p = -np.linalg.solve(R @ inverse @ C.T, R @ free + [c[2] for c in closed])
+        after, forces, good = free + inverse @ C.T @ p, iter(p), True
+        for i, mode in enumerate(modes):
+            x, z = feet[i] @ after + bias[i]
+            normal = next(forces) if mode != OFF else 0.0
+            good &= normal >= 0.0
+            good &= mode != OFF or z >= 0.0
+            good &= mode != STICK or abs(next(forces)) <= wheel.friction * normal
+            good &= mode != SLIP_DOWN or x >= 0.0
+            good &= mode != SLIP_UP or x <= 0.0
+            good &= next(forces) >= 0.0 if held[i] else not at_stopper[i] or room[i] @ after >= 0.0
+        if good:
+            found.append((modes, held, dict(zip(axes.tolist(), after, strict=True))))
+    return found
+
+
+@jax.jit
+def chosen(q, v, at_stopper, locked, friction, moving):
+    """The library's choice: modes, held stoppers, rates of hub and slots' lengths, solutions."""
+    s = vrw.WheelParams().symbols()
+    slots = slots_of(jnp.arange(8) < 2)
+    motion = WheelMotion(*q[:3], *v[:3], q[3:], v[3:])
+    resting = motion._replace(dL=jnp.where(locked & moving, 0.0, motion.dL))
+    hub = hub_of(s, motion, slots, locked)
+    levels = free_acceleration(s, resting, slots, hub), free_velocity(s, motion, slots, hub)
+    free = jax.tree.map(lambda a, b: jnp.where(moving, a, b), *levels)
+    never = jnp.zeros((2, 4), bool)
+    allowed = Allowed(
+        contact=~never,
+        held=jnp.stack([jnp.ones((2,), bool), at_stopper], axis=1),
+        stays=never[:, 0],
+        known_contact=never,
+        known_open=~at_stopper,
+    )
+    choice = choose(s, hub, free, allowed, friction, True)
+    rates = jnp.stack([*choice.answer.hub, *choice.answer.length])
+    return choice.contact, choice.held, rates, choice.solutions
+
+
+@pytest.mark.parametrize("moving", [False, True], ids=["impulses", "forces"])
+@pytest.mark.parametrize("friction", [0.7, 3.0])
+def test_the_combination_taken_is_admissible_and_their_number_is_told(friction, moving):
+    wheel = moreau_jean.Wheel(friction)
+    numbers = set()
+    for q, v, at_stopper, locked in cases():
+        expected = admissible(wheel, q, v, at_stopper, locked, moving)
+        contact, held, rates, solutions = chosen(q, v, at_stopper, locked, friction, moving)
+        assert int(solutions) == len(expected)
+        numbers.add(len(expected))
+        if not expected:
+            continue
+        modes = tuple(np.asarray(contact).tolist())
+        stoppers = tuple(np.asarray(held).tolist())
+        (same,) = (x for m, h, x in expected if m == modes and h == stoppers)
+        # Differences of the feet's rows: rounding 1e-16 / 1e-5 and error 1e-10, times some 10.
+        np.testing.assert_allclose(rates, [same[i] for i in range(5)], rtol=1e-8, atol=1e-8)
+        rank = lambda modes: sum(RANK[mode] for mode in modes)
+        assert rank(modes) == min(rank(m) for m, _, _ in expected)
+    assert numbers == NUMBERS[friction, moving]

@@ -1,0 +1,89 @@
+"""Derivatives of a step on real ground through each kind of event, against central differences."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vrw_jax as vrw
+from vrw_jax.models.unilateral.contacts import OFF, SLIP_DOWN, SLIP_UP, STICK
+
+TIGHT = vrw.Options.tight()
+SLIDES = (SLIP_DOWN, SLIP_UP)
+SCENES = {  # friction, damping, dtheta at the start, stoppers; events that happen among others
+    "lands sliding": (
+        (0.7, 200.0, 1.6, "bilateral"),
+        {"lands", "the fore leg leaves its stopper", "lifts off"},
+    ),
+    "reverses": ((0.5, 100.0, 2.2, "bilateral"), {"reverses", "slips", "sticks"}),
+    "flies": (
+        (0.5, 100.0, 1.2, "bilateral"),
+        {"flies", "lands again", "meets its stopper", "slips", "sticks", "lifts off"},
+    ),
+    "stoppers only push": (
+        (0.7, 200.0, 1.6, "one-sided"),
+        {"leaves its stopper in the air", "meets its stopper"},
+    ),
+}
+
+
+def events_of(trace, first_locked):
+    """What happened from phase to phase, in words."""
+    rows = np.flatnonzero(np.asarray(trace.duration) > 0.0)
+    contact, locked = np.asarray(trace.contact)[rows], np.asarray(trace.locked)[rows]
+    told = {"lands"}  # the opening landing
+    if first_locked and not locked[0, 0]:
+        told.add("the fore leg leaves its stopper")
+    if np.any(np.all(contact == OFF, axis=1)):
+        told.add("flies")
+    for i in range(len(rows) - 1):
+        for before, after, was, on in zip(*contact[i : i + 2], *locked[i : i + 2], strict=True):
+            if before == STICK and after in SLIDES:
+                told.add("slips")
+            if before in SLIDES and after == STICK:
+                told.add("sticks")
+            if before in SLIDES and after in SLIDES and before != after:
+                told.add("reverses")
+            if before != OFF and after == OFF:
+                told.add("lifts off")
+            if before == OFF and after != OFF:
+                told.add("lands again")
+            if on and not was:
+                told.add("meets its stopper")
+            if was and not on and after == OFF:
+                told.add("leaves its stopper in the air")
+    return told
+
+
+def told(mu, c, dtheta, stoppers):
+    params = vrw.WheelParams(damping=c)
+    wheel = vrw.UnilateralWheel(friction=mu, stoppers=stoppers)
+    x = wheel.full_section(params, jnp.stack([jnp.asarray(0.1), dtheta, jnp.asarray(-0.1)]))
+    advance = wheel.advance(params, x, TIGHT)
+    return jnp.concatenate([advance.section_state[:20], advance.durations])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SCENES)
+def test_derivatives_through_the_events_of_a_step_match_differences(name):
+    (mu, c, dtheta, stoppers), kinds = SCENES[name]
+    params = vrw.WheelParams(damping=c)
+    wheel = vrw.UnilateralWheel(friction=mu, stoppers=stoppers)
+    x = wheel.full_section(params, jnp.asarray([0.1, dtheta, -0.1]))
+    trace = wheel.trace(params, x, vrw.Options(), 2)
+    assert kinds <= events_of(trace, bool(x[3 + 3 * params.n_legs] >= 4))
+    at = [jnp.asarray(v) for v in (mu, c, dtheta)]
+    jacobian = jax.jacfwd(told, argnums=(0, 1, 2))(*at, stoppers)
+    for i, column in enumerate(jacobian):
+        size = 1e-5 * max(1.0, float(at[i]))
+        ends = [told(*at[:i], at[i] + d, *at[i + 1 :], stoppers) for d in (size, -size)]
+        difference = (ends[0] - ends[1]) / (2.0 * size)
+        np.testing.assert_allclose(column, difference, atol=2e-6, rtol=2e-6)
+
+
+def test_every_kind_of_event_is_differentiated_through():
+    kinds = set.union(*(kinds for _, kinds in SCENES.values()))
+    assert kinds == {
+        "lands", "lifts off", "lands again", "flies", "slips", "sticks", "reverses",
+        "meets its stopper", "the fore leg leaves its stopper", "leaves its stopper in the air",
+    }  # fmt: skip

@@ -1,0 +1,363 @@
+"""The wheel on real ground: contact laws, impacts, energy, the paper's gait, another code."""
+
+import math
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracle import moreau_jean
+from scipy.optimize import brentq
+
+import vrw_jax as vrw
+from vrw_jax.models.unilateral.contacts import OFF, SLIP_DOWN, SLIP_UP, STICK
+from vrw_jax.models.unilateral.events import Law, event_of, resolve
+from vrw_jax.models.unilateral.mechanics import (
+    WheelMotion,
+    directions,
+    foot_heights,
+    kinetic_energy,
+    potential_energy,
+)
+from vrw_jax.models.unilateral.motion import (
+    Stance,
+    Tally,
+    airborne_stopper_force,
+    field,
+    flow_of,
+    forces,
+    guards,
+    guards_of,
+    pack,
+    unpack,
+)
+from vrw_jax.models.unilateral.section import opened
+from vrw_jax.numerics.events import integrate_phase
+from vrw_jax.numerics.minima import Watched
+
+START = (0.1, 1.6, -0.1)
+TIGHT = vrw.Options.tight()
+LAW = Law(one_sided=False, counted=True)
+TABLE_1 = vrw.WheelParams()
+SCENES = {  # friction, damping, dtheta at the start: what happens in the first step
+    "lands sliding": (0.7, 200.0, 1.6),
+    "slips, sticks, slips again": (2.0, 200.0, 1.6),
+    "sticks": (0.35, 300.0, 1.6),
+    "reverses": (0.5, 100.0, 2.2),
+    "flies": (0.5, 100.0, 1.2),
+    "drags the rear foot": (math.inf, 100.0, 1.6),
+    "the paper's gait": (math.inf, 200.0, 1.6),
+}
+
+
+def stepped(friction, damping=200.0, x=START, options=TIGHT):
+    """One full step."""
+    params = vrw.WheelParams(damping=damping)
+    return vrw.step(params, x, model=vrw.UnilateralWheel(friction=friction), options=options)
+
+
+@pytest.fixture(scope="module")
+def traces():
+    """The motion of each scene, phase by phase, with what it loses."""
+    told = {}
+    for name, (friction, damping, dtheta) in SCENES.items():
+        wheel, params = vrw.UnilateralWheel(friction=friction), vrw.WheelParams(damping=damping)
+        x = wheel.full_section(params, jnp.asarray([START[0], dtheta, START[2]]))
+        told[name] = (params, friction, wheel.trace(params, x, TIGHT, 12))
+    return told
+
+
+def phases(params, trace):
+    """Motions and tallies (samples first) of the phases that happened."""
+    for k in np.flatnonzero(np.asarray(trace.duration) > 0.0):
+        motion, tally = jax.vmap(unpack)(trace.state[k])
+        yield k, motion, tally
+
+
+def total_energy(s, motion):
+    return np.asarray(
+        jax.vmap(lambda m: kinetic_energy(s, m) + sum(potential_energy(s, m)))(motion)
+    )
+
+
+def test_without_slip_the_gait_is_the_papers():
+    paper = vrw.walk(TABLE_1, START, 40, options=TIGHT).steps
+    ground = vrw.walk(TABLE_1, START, 40, model=vrw.UnilateralWheel(math.inf), options=TIGHT).steps
+    assert float(jnp.max(jnp.abs(paper.section_state[-1] - paper.section_state[-2]))) < 1e-12
+    theta_rates = ground.section_state[-1][jnp.asarray([0, 1, 12])]
+    np.testing.assert_allclose(theta_rates, paper.section_state[-1], atol=1e-11)
+    np.testing.assert_allclose(ground.durations[-1, 0], paper.durations[-1, 0], atol=1e-11)
+    assert abs(float(jnp.sum(ground.durations[-1] - paper.durations[-1]))) < 1e-11
+
+
+def test_without_slip_a_step_is_the_papers_to_round_off():
+    paper = vrw.step(TABLE_1, START, options=TIGHT)
+    step = stepped(math.inf)
+    np.testing.assert_allclose(step.section_state[:2], paper.section_state[:2], atol=1e-12)
+    np.testing.assert_allclose(step.section_state[12], paper.section_state[2], atol=1e-12)
+    np.testing.assert_allclose(step.landing_normal[1], paper.indicators.lambda_I4, atol=1e-11)
+
+
+def test_feet_stay_above_the_slope_and_are_only_pushed(traces):
+    for params, _, trace in traces.values():
+        s = params.symbols()
+        for k, motion, _ in phases(params, trace):
+            legs = jax.vmap(directions, (None, 0))(s, motion.theta)
+            heights = jax.vmap(foot_heights)(motion, legs)
+            assert float(jnp.min(heights)) >= -1e-9
+            assert float(jnp.min(trace.normal[k])) >= -1e-9
+
+
+def test_friction_lies_in_coulombs_cone_and_against_the_slip(traces):
+    for params, friction, trace in traces.values():
+        for k, motion, _ in phases(params, trace):
+            legs = jax.vmap(directions, (None, 0))(params.symbols(), motion.theta)
+            speed = motion.vx[:, None] - motion.dL * legs.sin
+            speed = speed - motion.L * motion.dtheta[:, None] * legs.cos
+            tangential, normal = trace.tangential[k], trace.normal[k]
+            if math.isfinite(friction):
+                assert float(jnp.max(jnp.abs(tangential) - friction * normal)) <= 1e-9
+            for mode, sign in ((SLIP_DOWN, 1.0), (SLIP_UP, -1.0)):
+                sliding = np.asarray(trace.contact[k] == mode)
+                assert np.all(np.asarray(sign * speed)[:, sliding] >= -1e-9)
+                assert np.all(np.asarray(sign * tangential)[:, sliding] <= 1e-9)
+            resting = np.asarray(trace.contact[k] == STICK)
+            assert np.all(np.abs(np.asarray(speed)[:, resting]) <= 1e-9)
+
+
+def test_energy_balances_between_impacts_and_never_grows_at_one(traces):
+    for params, _, trace in traces.values():
+        s, last = params.symbols(), None
+        for _, motion, tally in phases(params, trace):
+            balance = total_energy(s, motion) + np.asarray(tally.damping + tally.friction)
+            np.testing.assert_allclose(balance, balance[0], atol=1e-9)
+            if last is not None:
+                assert balance[0] <= last + 1e-9
+            last = balance[-1]
+
+
+def test_energy_lost_in_a_step_is_told_by_its_causes(traces):
+    params, friction, trace = traces["lands sliding"]
+    s = params.symbols()
+    wheel = vrw.UnilateralWheel(friction=friction)
+    before, _ = unpack(opened(s, wheel.full_section(params, jnp.asarray(START)))[0])
+    begin = float(kinetic_energy(s, before) + sum(potential_energy(s, before)))
+    *_, (_, motion, _) = phases(params, trace)
+    step = stepped(friction)
+    lost = step.energy_impacts + step.energy_damping + step.energy_friction
+    assert abs(float(lost) - (begin - total_energy(s, motion)[-1])) < 1e-9
+    assert float(step.energy_friction) > 0.0
+
+
+@pytest.mark.parametrize("friction", [0.7, 1.3])
+def test_time_stepping_converges_to_the_same_step_in_first_order(friction):
+    truth = stepped(friction)
+    sizes = (16e-4, 8e-4, 4e-4, 2e-4)
+    wheel = moreau_jean.Wheel(friction)
+    walks = [moreau_jean.one_step(wheel, moreau_jean.paper_start(wheel, *START), h) for h in sizes]
+    errors = np.array([w.time - float(truth.period) for w in walks])
+    np.testing.assert_allclose(errors[:-1] / errors[1:], 2.0, atol=0.15)
+    once = 2.0 * errors[1:] - errors[:-1]  # extrapolated, s
+    assert abs(once[-1]) < 1e-5
+    assert abs(4.0 * once[-1] - once[-2]) / 3.0 < 1e-6  # and once more
+    theta = 2.0 * walks[3].theta - walks[2].theta
+    assert abs(theta - float(truth.section_state[0])) < 1e-5
+    assert abs(walks[3].loaded_twice - float(truth.durations[0])) < 2e-3
+
+
+def oracle_start(x):
+    """A full section state as the time-stepping code wants it."""
+    theta = float(x[0]) - moreau_jean.ALPHA
+    L, dL, code = (np.roll(x[4 + 8 * i : 12 + 8 * i], 1) for i in range(3))
+    hub = [L[0] * np.sin(theta), L[0] * np.cos(theta), theta]
+    rates = [x[2], x[3], x[1]]
+    code = np.round(code).astype(int)
+    return moreau_jean.Start(np.r_[hub, L], np.r_[rates, dL], code >= 4, code % 4 != OFF)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("friction", "damping"), [(0.7, 300.0), (1.3, 200.0)])
+def test_the_period_of_a_gait_is_that_of_time_stepping(friction, damping):
+    model, params = vrw.UnilateralWheel(friction=friction), vrw.WheelParams(damping=damping)
+    walk = vrw.walk(params, START, 120, model=model, options=TIGHT)
+    x = np.asarray(walk.steps.section_state[-1])
+    np.testing.assert_allclose(x, walk.steps.section_state[-2], atol=1e-9)  # a gait: it repeats
+    wheel = moreau_jean.Wheel(friction, c=damping)
+    steps = [moreau_jean.one_step(wheel, oracle_start(x), h) for h in (16e-4, 8e-4, 4e-4, 2e-4)]
+    once = lambda told: 2.0 * told[1:] - told[:-1]  # extrapolated; below once more
+    twice = lambda told: (4.0 * once(told)[1:] - once(told)[:-1]) / 3.0
+    periods = twice(np.array([step.time for step in steps]))
+    # Time stepping's own error: its last extrapolation moved by up to 4e-6 s.
+    assert abs(periods[1] - float(jnp.sum(walk.steps.durations[-1]))) < 2e-6
+    thetas = twice(np.array([step.theta for step in steps]))
+    assert abs(thetas[1] - float(x[0])) < 2e-6  # and the step ends where it began
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_landings_repeat_between_tolerances(name):
+    friction, damping, dtheta = SCENES[name]
+    x = (START[0], dtheta, START[2])
+    loose, tight = (stepped(friction, damping, x, options=o) for o in (vrw.Options(), TIGHT))
+    assert int(tight.outcome) == vrw.Outcome.STEPPED
+    assert int(loose.events) == int(tight.events)
+    np.testing.assert_allclose(loose.section_state, tight.section_state, atol=1e-8)
+    assert abs(float(loose.period - tight.period)) < 1e-8
+
+
+@pytest.mark.slow
+def test_feet_that_throw_each_other_off_by_ever_less_stay_down():
+    """Past c = 311 each foot's landing lifts the other, after 3e-5 s, 2e-5 s, 5e-8 s and so on."""
+    params = vrw.WheelParams(damping=312.0, slope=0.294)
+    wheel = vrw.UnilateralWheel(friction=0.7)
+    walk = vrw.walk(params, START, 12, model=wheel)
+    assert int(walk.outcome) == vrw.Outcome.STEPPED
+    assert int(vrw.step(params, walk.steps.section_state[-1], model=wheel).events) < 12
+    assert abs(float(jnp.sum(walk.steps.durations[-1] - walk.steps.durations[-2]))) < 1e-6
+
+
+@pytest.mark.parametrize("friction", [0.5, 0.7, 1.0])
+def test_below_one_every_event_has_exactly_one_solution(friction):
+    step = stepped(friction)
+    assert int(step.fewest_solutions) == 1
+    assert int(step.most_solutions) == 1
+
+
+def at_rest(theta, **changes):
+    """A wheel at rest on legs of length L0, the lower foot on the slope."""
+    zero = jnp.zeros(())
+    height = jnp.maximum(jnp.cos(theta), jnp.cos(theta + math.pi / 4))
+    motion = WheelMotion(
+        zero, height, jnp.asarray(theta), zero, zero, zero, jnp.ones(8), jnp.zeros(8)
+    )
+    return motion._replace(**changes)
+
+
+def stance_of(contact, locked):
+    none = jnp.zeros(8, bool)
+    codes = jnp.asarray(list(contact) + [OFF] * 6, jnp.int32)
+    return Stance(codes, jnp.asarray(locked), none, none, none)
+
+
+def test_a_wheel_on_two_stiff_legs_slides_like_a_block():
+    s, friction = TABLE_1.symbols(), 0.2
+    flow = flow_of(s, jnp.asarray(friction), False, stance_of((SLIP_DOWN, SLIP_DOWN), [True] * 8))
+    found = forces(flow, at_rest(-math.pi / 8, vx=jnp.asarray(0.1))).answer
+    g, slope = 9.81, 0.30
+    along = g * (math.sin(slope) - friction * math.cos(slope))
+    np.testing.assert_allclose(jnp.stack(found.hub), [along, 0.0, 0.0], atol=1e-12)
+    assert abs(float(sum(found.normal)) - 18.0 * g * math.cos(slope)) < 1e-10
+
+
+def test_a_wheel_in_the_air_falls_freely():
+    s = TABLE_1.symbols()
+    flow = flow_of(s, jnp.asarray(0.7), False, stance_of((OFF, OFF), [True] * 8))
+    motion = at_rest(-0.3, z=jnp.asarray(2.0), dtheta=jnp.asarray(3.0))
+    now = forces(flow, motion)
+    expected = [9.81 * math.sin(0.3), -9.81 * math.cos(0.3), 0.0]
+    np.testing.assert_allclose(jnp.stack(now.answer.hub), expected, atol=1e-12)
+    # Preload and spin press each leg on its stopper: 500 * 0.02 + 0.7 * 3^2 N.
+    np.testing.assert_allclose(airborne_stopper_force(flow, now), 10.0 + 6.3, atol=1e-12)
+
+
+def test_a_vertical_leg_lands_with_its_own_mass_alone():
+    s, speed = TABLE_1.symbols(), 2.0
+    motion = at_rest(0.0, vz=jnp.asarray(-speed))
+    in_the_air = stance_of((OFF, OFF), [True] * 8)
+    event = event_of(guards_of(8, False), 8, jnp.int32(0))
+    change = resolve(s, jnp.asarray(0.7), motion, in_the_air, event, LAW, 0.0)
+    # The leg's 1 kg stops, the other 17 kg go on; the spring then begins to work.
+    assert abs(float(change.normal_impulse[0]) - 1.0 * speed) < 1e-12
+    assert abs(float(change.energy_lost) - 0.5 * speed**2) < 1e-12
+    assert abs(float(change.motion.vz) + speed) < 1e-12
+    assert abs(float(change.motion.dL[0]) + speed) < 1e-12
+    assert not bool(change.stance.locked[0])
+
+
+def test_a_single_leg_bounces_as_a_damped_oscillator():
+    """Upright on flat ground: 17 kg on one spring and damper, until the foot no longer pushes."""
+    stiff = {"stiffness": 2000.0, "damping": 60.0, "natural_length": 1.005}
+    s, speed = vrw.WheelParams(slope=0.0, **stiff).symbols(), 3.0
+    mass, omega = s.Mt - s.m, jnp.sqrt(s.k / (s.Mt - s.m) - (0.5 * s.c / (s.Mt - s.m)) ** 2)
+    decay, rest = 0.5 * s.c / mass, s.Ls - mass * s.g / s.k
+    a, b = s.L0 - rest, (-speed + decay * (s.L0 - rest)) / omega
+
+    def length(t):
+        return rest + np.exp(-decay * t) * (a * np.cos(omega * t) + b * np.sin(omega * t))
+
+    def push(t, h=1e-5):  # of the ground: the leg's own weight, and what spring and damper give
+        rate = (length(t + h) - length(t - h)) / (2.0 * h)
+        return float(s.m * s.g + s.k * (s.Ls - length(t)) - s.c * rate)
+
+    first = next(t for t in np.linspace(0.01, 1.0, 100) if push(t) < 0.0)
+    time = brentq(push, first - 0.01, first, xtol=1e-12)
+    zero = jnp.zeros(())
+    motion = at_rest(0.0, vz=jnp.asarray(-speed))._replace(dL=jnp.zeros(8).at[0].set(-speed))
+    flow = flow_of(s, jnp.asarray(0.7), False, stance_of((STICK, OFF), [False] + [True] * 7))
+    lift = guards_of(8, False).lift
+    watched = Watched(lambda y: guards(flow, y)[lift : lift + 1], 1)
+    start = pack(motion, Tally(zero, zero, zero, zero))
+    end = integrate_phase(partial(field, flow), watched, start, jnp.asarray(True), TIGHT)
+    landed, tally = unpack(end.state)
+    assert abs(float(end.duration) - time) < 1e-8
+    assert abs(float(landed.L[0]) - length(time)) < 1e-9
+    assert abs(float(landed.theta)) < 1e-12
+    lost = 0.5 * mass * speed**2 - 0.5 * mass * float(landed.vz) ** 2
+    lost += 0.5 * float(s.k) * float((s.Ls - s.L0) ** 2 - (s.Ls - landed.L[0]) ** 2)
+    lost += float(mass * s.g * (s.L0 - landed.L[0]))
+    assert abs(float(tally.damping) - lost) < 1e-9
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.1, 0.5])
+def test_a_foot_that_lands_sliding_takes_coulombs_impulse(friction):
+    s = TABLE_1.symbols()
+    motion = at_rest(0.0, vz=jnp.asarray(-1.0), vx=jnp.asarray(5.0))
+    in_the_air = stance_of((OFF, OFF), [True] * 8)
+    event = event_of(guards_of(8, False), 8, jnp.int32(0))
+    change = resolve(s, jnp.asarray(friction), motion, in_the_air, event, LAW, 0.0)
+    normal, tangential = float(change.normal_impulse[0]), float(change.tangential_impulse[0])
+    assert int(change.stance.contact[0]) == SLIP_DOWN
+    assert abs(tangential + friction * normal) < 1e-12
+
+
+def test_bad_input_is_a_code_and_never_nan():
+    for friction, x in ((0.7, (math.nan, 1.0, 0.0)), (-1.0, START), (math.nan, START)):
+        step = stepped(friction, x=x)
+        assert int(step.outcome) == vrw.Outcome.BAD_INPUT
+        assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(step))
+    assert not np.any(np.asarray(stepped(-1.0).section_state))
+
+
+@pytest.mark.parametrize(
+    ("friction", "damping", "x", "outcome"),
+    [
+        (1.5, 16.39, (0.001, 0.6, -0.4), vrw.Outcome.THREE_FEET_LOADED),  # Leg 3's foot is 1 mm up
+        (8.0, 183.0, (0.037, 2.31, -0.065), vrw.Outcome.SOLVER_GAVE_UP),  # a Painlevé paradox
+    ],
+)
+def test_what_the_model_does_not_cover_ends_a_step_with_its_code(friction, damping, x, outcome):
+    step = stepped(friction, damping, x)
+    assert int(step.outcome) == outcome
+    assert not np.any(np.asarray(step.section_state))
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(step))
+
+
+def test_events_without_end_are_bounded_and_told():
+    enough = int(stepped(0.7).events)
+    wheel = vrw.UnilateralWheel(friction=0.7, max_events=enough - 1)
+    x = wheel.full_section(TABLE_1, jnp.asarray(START))
+    cut_short = wheel.advance(TABLE_1, x, TIGHT)
+    assert int(cut_short.outcome) == vrw.Outcome.TOO_MANY_EVENTS
+    assert not np.any(np.asarray(cut_short.section_state))
+
+
+def test_a_slope_that_is_too_flat_ends_the_walk_with_a_code():
+    params = vrw.WheelParams(slope=0.0)
+    walk = vrw.walk(params, (0.1, 1.0, -0.1), 40, model=vrw.UnilateralWheel(), options=TIGHT)
+    assert int(walk.outcome) in (vrw.Outcome.FELL_BACK, vrw.Outcome.NO_TOUCHDOWN_IN_TIME)
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(walk.steps))
+
+
+def test_sliding_uphill_is_a_mode_of_its_own(traces):
+    modes = np.concatenate([np.unique(trace.contact) for _, _, trace in traces.values()])
+    assert {OFF, STICK, SLIP_DOWN, SLIP_UP} <= set(modes.tolist())

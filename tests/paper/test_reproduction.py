@@ -1,0 +1,202 @@
+"""The paper comes out: each published fact holds, each can fail, and the figures are written."""
+
+import csv
+import dataclasses
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+import xarray as xr
+from PIL import Image
+from typer.testing import CliRunner
+
+from vrw_jax.app import cli
+from vrw_jax.figures import walk as plots
+from vrw_jax.paper import facts
+from vrw_jax.paper import reproduction as reproduce
+from vrw_jax.paper.facts.base import Evidence
+from vrw_jax.wheel.outcomes import Outcome
+
+FIGURES = ("fig06_gait", "fig07_sticks", "fig08_scuffing", "fig09_rear_force", "fig10_indicators")
+
+
+@pytest.fixture(scope="session")
+def evidence() -> Evidence:
+    return reproduce.collect()
+
+
+@pytest.fixture(scope="session")
+def reproduced(
+    evidence: Evidence, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, bool, list[float]]:
+    folder, told = tmp_path_factory.mktemp("reproduced"), []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(reproduce, "collect", lambda progress: evidence)
+        table = reproduce.reproduce(folder, lambda share, what: told.append(share))
+    return folder, all(fact.holds for fact in table), told
+
+
+def test_every_published_fact_holds(evidence: Evidence) -> None:
+    failing = [f"{f.claim}: found {f.found}" for f in facts.facts(evidence) if not f.holds]
+    assert not failing
+
+
+def test_every_fact_says_where_it_stands_and_why_its_tolerance(evidence: Evidence) -> None:
+    for fact in facts.facts(evidence):
+        assert fact.where
+        assert fact.published
+        assert fact.found
+        assert fact.reason
+
+
+def test_the_table_speaks_of_every_figure_and_of_the_misprints(evidence: Evidence) -> None:
+    text = facts.as_markdown(facts.facts(evidence))
+    for word in ("Fig. 6", "Fig. 8", "Fig. 9", "Fig. 10(a)", "Fig. 10(b)", "J43", "eq. (35)",
+                 "eqs (16), (17)", "φ = 0.10", "friction", "stopper"):  # fmt: skip
+        assert word in text
+
+
+def test_a_faithful_reproduction_is_true_and_writes_everything(
+    reproduced: tuple[Path, bool, list[float]],
+) -> None:
+    folder, holds, told = reproduced
+    assert holds
+    assert told == sorted(told)
+    assert told[-1] == 1.0
+    expected = {f"{name}.{kind}" for name in FIGURES for kind in ("svg", "png")}
+    expected |= {"walk.gif", "facts.md", "facts.csv", "indicators.csv"}
+    assert {path.name for path in folder.iterdir()} == expected
+
+
+def test_a_broken_fact_is_told_and_gives_an_exit_code(
+    evidence: Evidence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    branch = evidence.branch.copy(deep=True)
+    branch.lambda_4_plus.loc[{"damping": 219.0}] = -0.01
+    broken = dataclasses.replace(evidence, branch=branch)
+    monkeypatch.setattr(reproduce, "collect", lambda progress: broken)
+    monkeypatch.setattr(reproduce, "draw", lambda evidence, folder: [])
+    monkeypatch.setattr("vrw_jax.runtime.start_jax", lambda: None)
+    result = CliRunner().invoke(cli.app, ["reproduce", "--out", str(tmp_path)])
+    assert result.exit_code == cli.FACT_FAILED
+    table = facts.facts(broken)
+    assert f"{sum(fact.holds for fact in table)} of {len(table)} hold" in result.output
+    assert "does not" in result.output
+    text = (tmp_path / "facts.md").read_text(encoding="utf-8")
+    assert "**does not hold**" in text
+    assert "Not: λ4⁺ is gone at c = 220" in text
+    with (tmp_path / "facts.csv").open(encoding="utf-8", newline="") as file:
+        verdicts = {row["claim"]: row["holds"] for row in csv.DictReader(file)}
+    assert verdicts["λ4⁺ is gone at c = 220"] == "does not hold"
+    assert verdicts["λ2⁺ is gone at c = 4"] == "holds"
+
+
+def _scaled(results: xr.Dataset, factor: float) -> xr.Dataset:
+    """All numbers but the coordinates times a factor."""
+    return results.map(
+        lambda v: v * factor if v.dtype.kind == "f" else v, keep_attrs=True
+    ).assign_attrs(results.attrs)
+
+
+def _with_states(branch: xr.Dataset, factors: tuple[float, float, float]) -> xr.Dataset:
+    return branch.assign(section_state=branch.section_state * np.array(factors))
+
+
+def _spoiled_gait(e: Evidence) -> Evidence:
+    return dataclasses.replace(
+        e,
+        gait=_scaled(e.gait, -1.3).assign_coords(time=1.1 * e.gait.time),
+        by_damping=[_scaled(g, -1.0) for g in e.by_damping],
+    )
+
+
+def _spoiled_branch(e: Evidence) -> Evidence:
+    flipped = _scaled(e.branch, -1.1)
+    return dataclasses.replace(e, branch=flipped.assign(settled=~flipped.settled))
+
+
+def _spoiled_walks(e: Evidence) -> Evidence:
+    stepped = {"outcome": Outcome.STEPPED.name}
+    return dataclasses.replace(
+        e,
+        settling=e.settling.assign_attrs(settled=0),
+        too_fast=e.too_fast.assign_attrs(stepped),
+        gentler=_scaled(e.gentler, 1.1),
+        gentle=e.gentle.assign(settled=xr.ones_like(e.gentle.settled)),
+        gentle_low=_scaled(e.gentle_low, -1.0),
+    )
+
+
+def _spoiled_states(e: Evidence) -> Evidence:
+    return dataclasses.replace(e, branch=_with_states(e.branch, (1.0, -1.0, 0.0)))
+
+
+def _sinking_foot(e: Evidence) -> Evidence:
+    sinking = e.gait.assign(
+        foot_2_z=-e.gait.foot_2_z,
+        total_energy=-e.gait.total_energy,
+        lambda_2=e.gait.lambda_2 + 50.0 * np.sin(60.0 * e.gait.time),
+        lambda_3=-e.gait.lambda_3 * (e.gait.lambda_4 > 1.0),
+        lambda_4=100.0 * e.gait.lambda_4,
+        L1=e.gait.L1 + 0.05,
+        L2=e.gait.L2 + 0.05,
+        phase=2 - e.gait.phase,
+    )
+    return dataclasses.replace(e, gait=sinking)
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of numbers that were spoiled on purpose
+def test_every_fact_can_fail(evidence: Evidence) -> None:
+    spoils: tuple[Callable[[Evidence], Evidence], ...] = (
+        _spoiled_gait,
+        _spoiled_branch,
+        _spoiled_walks,
+        _spoiled_states,
+        _sinking_foot,
+    )
+    unmoved = {fact.claim for fact in facts.facts(evidence)}
+    for spoil in spoils:
+        unmoved &= {fact.claim for fact in facts.facts(spoil(evidence)) if fact.holds}
+    assert not unmoved
+
+
+def test_figures_are_drawings_that_a_reader_can_open(
+    reproduced: tuple[Path, bool, list[float]],
+) -> None:
+    folder = reproduced[0]
+    for name in FIGURES:
+        root = ElementTree.parse(folder / f"{name}.svg").getroot()
+        assert root.tag.endswith("svg")
+        with Image.open(folder / f"{name}.png") as picture:
+            assert min(picture.size) > 300
+    with Image.open(folder / "walk.gif") as walk:
+        assert walk.n_frames > 20
+        assert walk.info["loop"] == 0
+    sizes = {path.name: path.stat().st_size for path in folder.iterdir()}
+    assert sizes["walk.gif"] < 1_000_000
+    assert sum(sizes.values()) < 2_000_000
+
+
+def test_the_same_results_give_the_same_drawing(evidence: Evidence, tmp_path: Path) -> None:
+    first, second = (
+        plots.save(plots.indicators(evidence.branch), tmp_path / name, "figure")[0].read_bytes()
+        for name in ("first", "second")
+    )
+    assert first == second
+
+
+def test_drawing_leaves_matplotlib_as_it_was(evidence: Evidence, tmp_path: Path) -> None:
+    before = dict(mpl.rcParams)
+    plots.save(plots.rear_force(evidence.by_damping), tmp_path, "figure")
+    assert dict(mpl.rcParams) == before
+
+
+def test_figure_10_shows_only_gaits_that_the_paper_shows(evidence: Evidence) -> None:
+    figure = plots.indicators(evidence.branch, every=1)
+    for axes in figure.axes:
+        for line in axes.lines:
+            values = np.asarray(line.get_xdata())
+            assert values.size == 0 or (values.min() >= 5.0 and values.max() <= 219.0)

@@ -1,0 +1,95 @@
+"""How a process starts: number format, kept traces, XLA's quick way."""
+
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vrw_jax as vrw
+from vrw_jax.runtime.programs import remembered
+
+
+def told_by(code, **environment):
+    outside = {k: v for k, v in os.environ.items() if k not in ("XLA_FLAGS", "JAX_ENABLE_X64")}
+    out = subprocess.run(
+        [sys.executable, "-c", code], env=outside | environment, capture_output=True, text=True
+    )
+    assert out.returncode == 0, out.stderr
+    return out.stdout.split()
+
+
+@pytest.fixture
+def cache(tmp_path):
+    before = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    yield tmp_path
+    jax.config.update("jax_compilation_cache_dir", before)
+
+
+def counted():
+    """A function of two arrays, and the list to which each of its traces adds."""
+    traces = []
+
+    def function(x, y):
+        traces.append(x.shape)
+        return {"sum": jnp.sin(x) + y}
+
+    return function, traces
+
+
+def test_started_processes_compute_in_64_bits_by_the_quick_compiler(tmp_path):
+    code = (
+        "import os, jax, vrw_jax as vrw; vrw.start_jax(); x = jax.numpy.sin(1.0); "
+        "print(x.dtype, jax.config.jax_compilation_cache_dir, os.environ['XLA_FLAGS'])"
+    )
+    told = told_by(
+        code, JAX_COMPILATION_CACHE_DIR=str(tmp_path), XLA_FLAGS="--xla_cpu_enable_fast_math=false"
+    )
+    assert told[:2] == ["float64", str(tmp_path)]
+    assert told[2:] == ["--xla_cpu_enable_fast_math=false", "--xla_cpu_use_fusion_emitters=false"]
+
+
+def test_a_flag_that_the_user_set_stays():
+    flag = "--xla_cpu_use_fusion_emitters=true"
+    code = "import os, vrw_jax as vrw; vrw.start_jax(); print(os.environ['XLA_FLAGS'])"
+    assert told_by(code, XLA_FLAGS=flag) == [flag]
+
+
+def test_a_kept_trace_is_not_traced_again_and_gives_the_same(cache):
+    function, traces = counted()
+    x, y = jnp.arange(3.0), jnp.ones(3)
+    expected = function(x, y)["sum"]
+    traces.clear()
+    for _ in range(2):  # each as another process would: nothing is remembered but on disk
+        told = jax.jit(lambda x, y: remembered(function, "ours")(x, y)["sum"])(x, y)
+        np.testing.assert_array_equal(told, expected)
+    assert len(traces) == 1
+    jax.jit(lambda x, y: remembered(function, "other settings")(x, y)["sum"])(x, y)
+    jax.jit(lambda x, y: remembered(function, "ours")(x, y)["sum"])(x[:2], y[:2])
+    assert len(traces) == 3
+
+
+def test_a_damaged_trace_is_traced_again(cache):
+    function, traces = counted()
+    call = lambda x: remembered(function, "ours")(x, x)["sum"]
+    expected = jax.jit(call)(jnp.ones(2))
+    (place,) = cache.glob("vrw_trace_*")
+    place.write_bytes(place.read_bytes()[:-1] + b"?")
+    np.testing.assert_array_equal(jax.jit(lambda x: call(x))(jnp.ones(2)), expected)
+    assert len(traces) == 2
+
+
+def test_both_ways_of_compiling_give_the_same_gait():
+    params = vrw.WheelParams()
+    measured = lambda p: (lambda c: (c.section_state, c.multipliers.real))(vrw.limit_cycle(p))
+    lowered = jax.jit(measured).lower(params)
+    assert "use_fusion_emitters=false" in os.environ["XLA_FLAGS"]
+    usual, quick = lowered.compile({"xla_cpu_use_fusion_emitters": True})(params), measured(params)
+    # Another order of roundings, and Newton's last correction below 1e-11.
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-12), quick, usual
+    )

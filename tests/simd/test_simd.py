@@ -1,0 +1,316 @@
+"""Machine code for lanes does what JAX does with the same function; a later start finds it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from vrw_jax.runtime import programs as traces
+from vrw_jax.simd import apart
+from vrw_jax.simd import program as simd
+
+DRAW = np.random.default_rng(0)
+
+
+def program(function, lanes, uniform=(), settings="test"):
+    """`function(uniform, lanes)` compiled for inputs like these."""
+    kinds = [np.asarray(x).dtype for x in uniform]
+    return simd.lane_program(function, kinds, len(lanes), lanes[0].dtype, settings)
+
+
+def both_ways(function, lanes, uniform=()):
+    """Its results as machine code and by JAX, array by array."""
+    uniform = [np.asarray(x, lanes[0].dtype) for x in uniform]
+    compiled = program(function, lanes, uniform)(uniform, lanes)
+    expected = function(uniform, [jnp.asarray(x) for x in lanes])
+    return list(zip(compiled, map(np.asarray, expected), strict=True))
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    """A cache of the test's own, since settings of the same name stand for other functions here."""
+    monkeypatch.setattr(simd, "_made", {})
+    before = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    yield tmp_path
+    jax.config.update("jax_compilation_cache_dir", before)
+
+
+def arithmetic(uniform, lanes):
+    (a,), (x, y) = uniform, lanes
+    count = jnp.where(x > y, 3, 1).astype(jnp.int32)
+    return (
+        a * x + y / (1.0 + x * x) - x**3 + y**-2,
+        jnp.maximum(x, y) - jnp.minimum(x, 0.5) + jnp.abs(y) + jnp.sqrt(jnp.abs(x)),
+        jnp.sin(x) * jnp.cos(y) - jnp.floor(x) + jnp.clip(y, -0.3, 0.2),
+        jnp.where((x < y) & ~(y >= 0.5) | jnp.isfinite(x) & (x != y), x, -y),
+        (count << 2) | 1,
+        (count >> 1) & 1 == 1,
+        x.astype(jnp.float32) * 2.0 + count,
+        x >= y,
+    )
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_elementwise_code_gives_what_jax_gives(dtype):
+    lanes = [DRAW.normal(size=1003).astype(dtype) for _ in range(2)]
+    # Products and sums are rounded once where JAX may round twice; y^-2 magnifies that.
+    close = 40.0 * np.finfo(dtype).eps
+    for found, expected in both_ways(arithmetic, lanes, (0.7,)):
+        assert found.dtype == expected.dtype
+        if found.dtype.kind == "f":
+            np.testing.assert_allclose(found, expected, rtol=close, atol=close)
+        else:
+            np.testing.assert_array_equal(found, expected)
+
+
+def test_what_is_no_number_stays_none_and_is_compared_as_jax_does():
+    odd = np.array([np.nan, np.inf, -np.inf, 0.0, -0.0, 1.0])
+    x, y = (grid.ravel() for grid in np.meshgrid(odd, odd))
+
+    def compare(_, lanes):
+        x, y = lanes
+        return (
+            jnp.maximum(x, y), jnp.minimum(x, y), x < y, x >= y, x == y, x != y, jnp.isfinite(x),
+            jnp.where(x > y, 1.0, 2.0),
+        )  # fmt: skip
+
+    for found, expected in both_ways(compare, [x, y]):
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_powers_of_step_control_are_as_right_as_said():
+    x = np.geomspace(1e-20, 1e20, 10_001).astype(np.float32)
+    powers = lambda _, lanes: (jnp.log(lanes[0]), jnp.exp(0.9 * jnp.log(lanes[0]) / 10.0))
+    (log, exact), (power, _) = both_ways(powers, [x])
+    np.testing.assert_allclose(log, exact, atol=1e-5 + 1e-6 * 46)
+    np.testing.assert_allclose(power, np.exp(0.09 * np.log(x.astype(float))), rtol=1e-5)
+
+
+def collatz(_, lanes):
+    """Steps to 1: every lane ends when it likes."""
+    start = lanes[0].astype(jnp.int32)
+
+    def turn(state):
+        number, count = state
+        halved = jnp.where(number & 1 == 1, 3 * number + 1, number >> 1)
+        on = number != 1
+        return jnp.where(on, halved, number), count + on
+
+    return lax.while_loop(lambda s: jnp.any(s[0] != 1), turn, (start, jnp.zeros_like(start)))[1:]
+
+
+def test_loops_end_lane_by_lane_and_groups_wait_for_none():
+    start = np.arange(1.0, 1001.0)
+    ((found, expected),) = both_ways(collatz, [start])
+    np.testing.assert_array_equal(found, expected)
+    assert found[26] == 111  # of 27, the known one
+
+
+def test_scans_run_over_their_constants():
+    def horner(_, lanes):
+        coefficients = jnp.asarray([1.0, -2.0, 0.5, 3.0])
+        start = jnp.zeros_like(lanes[0])
+        return (lax.scan(lambda p, c: (p * lanes[0] + c, None), start, coefficients)[0],)
+
+    ((found, expected),) = both_ways(horner, [DRAW.normal(size=17)])
+    np.testing.assert_allclose(found, expected, rtol=1e-15, atol=1e-15)
+
+
+@pytest.mark.parametrize("n", [1, 7, 8, 9, 5_003])
+def test_a_lane_gives_the_same_bits_in_any_company_on_any_number_of_cores(monkeypatch, n):
+    lanes = [DRAW.normal(size=5_003) for _ in range(2)]
+    run = program(arithmetic, lanes, [np.float64(0.7)])
+    monkeypatch.setattr(simd, "_cores", lambda: 1)
+    whole = run([np.float64(0.7)], lanes)
+    monkeypatch.setattr(simd, "_cores", lambda: 3)
+    some = DRAW.permutation(5_003)[:n]
+    for part, all_ in zip(run([np.float64(0.7)], [x[some] for x in lanes]), whole, strict=True):
+        np.testing.assert_array_equal(part, all_[some])
+
+
+def test_a_later_start_neither_traces_nor_compiles(folder, monkeypatch):
+    lanes = [np.arange(4.0)]
+    traced = []
+
+    def double(_, lanes):
+        traced.append(1)
+        return (2.0 * lanes[0],)
+
+    assert list(program(double, lanes)([], lanes)[0]) == [0.0, 2.0, 4.0, 6.0]
+    monkeypatch.setattr(simd, "_compiled", None)  # would fail
+    assert list(program(double, lanes)([], lanes)[0]) == [0.0, 2.0, 4.0, 6.0]
+    monkeypatch.setattr(simd, "_made", {})  # as in another process
+    assert list(program(double, lanes)([], lanes)[0]) == [0.0, 2.0, 4.0, 6.0]
+    assert len(traced) == 1
+
+
+def test_another_batch_is_neither_traced_nor_compiled_again_without_a_cache(monkeypatch):
+    jax.config.update("jax_compilation_cache_dir", None)
+    traced = []
+
+    def double(x):
+        traced.append(1)
+        return 2.0 * x
+
+    call = simd.lane_function(double, lambda x: x, "batches")
+    for n in (1, 5, 8):
+        np.testing.assert_array_equal(jax.jit(call)(jnp.arange(n) + 1.0), 2.0 * (np.arange(n) + 1))
+    assert len(traced) == 1
+
+
+def arrays_in_loops(x):
+    """Small and large arrays; axes moved, cut, joined; sums; loops that carry and stack."""
+    table = np.sin(np.arange(240.0)).reshape(12, 20)
+    large = jnp.tensordot(jnp.asarray(table, x.dtype), x, 1)  # (12, 3, lanes)
+    shifted = jnp.concatenate([large[1::2], large[:6] * 2.0, x[:7]]).swapaxes(
+        0, 1
+    )  # (3, 19, lanes)
+    flat = lax.optimization_barrier(shifted).reshape(57, -1)[2:50]
+
+    def turn(carry, given):
+        total, seen = carry
+        row, weight = given
+        total = total + weight * row.reshape(4, 3, -1)[:, 1]
+        return (total, seen * 0.5 + jnp.sum(row, 0)), jnp.stack([total, total * row[:4]])
+
+    start = (jnp.zeros((4, x.shape[-1]), x.dtype), x[0, 0])
+    rows = flat.reshape(4, 12, -1)
+    (total, seen), stacked = lax.scan(turn, start, (rows, jnp.arange(4.0)), reverse=True)
+
+    def halve(state):
+        field, count = state
+        on = jnp.max(jnp.abs(field), (0, 1)) > 4.0
+        smaller = jnp.where(on, field / 2.0, field)
+        return jnp.pad(jnp.where(on, field[:3], 0.0), ((0, 9), (0, 0), (0, 0))) + smaller, count + 1
+
+    going = lambda state: jnp.any(jnp.abs(state[0]) > 4.0) & (state[1] < 9)
+    halved, _ = lax.while_loop(going, halve, (large, jnp.int32(0)))
+    return {
+        "stacked": stacked,
+        "rest": (seen, jnp.min(flat, 0), jnp.min(stacked, (0, 2)), total),
+        "halved": halved - jnp.max(large, 0),
+        "found": jnp.any(large > 1.5, (0, 1)),
+        "summed": (jnp.cumsum(flat[:5], 0), lax.cumsum(flat[:5], 0, reverse=True)),
+        "picked": picked(x, large),
+        "turned": large.reshape(4, 9, -1).transpose(1, 0, 2)[:, :, None],
+    }
+
+
+def picked(x, large):
+    """A table looked up turn by turn; rows of a large array overwritten by what stands there."""
+    table = jnp.asarray(np.cos(np.arange(144.0)).reshape(12, 12))
+
+    def turn(i, rows):
+        weighed = sum(table[i, j] * rows[j] for j in range(12))
+        return lax.dynamic_update_index_in_dim(rows, jnp.sin(weighed) + x[0], i, 0)
+
+    return lax.fori_loop(2, 12, turn, large)
+
+
+@pytest.mark.parametrize("n", [1, 4, 1001])
+def test_functions_of_arrays_are_called_from_programs_of_jax(n):
+    x = jnp.asarray(DRAW.normal(size=(20, 3, n)))
+    call = simd.lane_function(arrays_in_loops, arrays_in_loops, "arrays")
+    # One lane after the other: no lane may see another.
+    expected = jax.vmap(
+        lambda one: jax.tree.map(lambda y: y[..., 0], arrays_in_loops(one[..., None])), -1, -1
+    )(x)
+    found = jax.jit(call)(x)
+    assert jax.tree.structure(found) == jax.tree.structure(expected)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        assert a.dtype == b.dtype
+        # Sums of terms of size some hundred in another order.
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
+
+
+def test_functions_set_apart_are_called_and_give_the_same():
+    def cubes(how):
+        def run(_, lanes):
+            power = how(lambda x, y: (x * y * y, x + lanes[0]))
+            a, b = power(*power(*lanes))
+            along = jax.jvp(power, (a, b), (b, a))[1]
+            return (a, b, *along)
+
+        return run
+
+    lanes = [DRAW.normal(size=11) for _ in range(2)]
+    called = program(cubes(apart), lanes, settings="apart")([], lanes)
+    for found, expected in zip(called, cubes(jax.jit)((), lanes), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-13)
+
+
+def test_a_kept_program_finds_the_machine_code_that_it_calls(folder, monkeypatch):
+    x = jnp.asarray(DRAW.normal(size=(2, 9)))
+    double = simd.lane_function(lambda x: 2.0 * x, lambda x: x, "double")
+    traced = []
+
+    def further(x):
+        traced.append(1)
+        return double(x) + 1.0
+
+    run = lambda: traces.compiled(further, (x,), "kept", jax.devices()[0])(x)
+    expected = 2.0 * np.asarray(x) + 1.0
+    np.testing.assert_array_equal(run(), expected)
+    monkeypatch.setattr(simd, "_registered", {})  # as in another process
+    names = []
+    monkeypatch.setattr(jax.ffi, "register_ffi_target", lambda name, *_, **__: names.append(name))
+    np.testing.assert_array_equal(run(), expected)
+    assert (len(names), len(traced)) == (1, 1)
+    for place in folder.glob("vrw_lanes_*"):
+        place.unlink()
+    monkeypatch.setattr(simd, "_registered", {})
+    np.testing.assert_array_equal(run(), expected)  # traced and compiled anew
+    assert names[1] == names[0]
+
+
+def test_a_program_kept_by_another_processor_is_traced_anew(folder, monkeypatch):
+    """It calls machine code that may not run here."""
+    traced = []
+
+    def double(x):
+        traced.append(1)
+        return 2.0 * x
+
+    run = lambda: traces.compiled(double, (jnp.ones(2),), "kept", jax.devices()[0])(jnp.ones(2))
+    run(), run()
+    assert len(traced) == 1
+    monkeypatch.setattr(simd, "processor", lambda: ("x86_64", "another", ""))
+    run()
+    assert len(traced) == 2
+
+
+def test_other_settings_and_damaged_files_are_compiled_anew(folder, monkeypatch):
+    lanes = [np.arange(4.0)]
+    traced = []
+
+    def times(n):
+        def function(_, x):
+            traced.append(n)
+            return (n * x[0],)
+
+        return program(function, lanes, settings=n)([], lanes)[0][3]
+
+    assert (times(2.0), times(3.0)) == (6.0, 9.0)
+    for place in folder.glob("vrw_lanes_*"):
+        content = bytearray(place.read_bytes())
+        content[-100] ^= 1
+        place.write_bytes(content)
+    monkeypatch.setattr(simd, "_made", {})  # as in another process
+    assert times(2.0) == 6.0
+    assert traced == [2.0, 3.0, 2.0]
+
+
+def test_code_that_is_not_elementwise_is_refused_in_a_sentence():
+    lanes = [np.arange(4.0)]
+    with pytest.raises(NotImplementedError, match="sort is not elementwise"):
+        program(lambda _, x: (jnp.sort(x[0]),), lanes)
+    with pytest.raises(NotImplementedError, match="cumsum moves, joins or picks lanes"):
+        program(lambda _, x: (jnp.cumsum(x[0]),), lanes)
+    with pytest.raises(NotImplementedError, match="slice moves, joins or picks lanes"):
+        program(lambda _, x: (x[0][:1],), lanes)
+    with pytest.raises(NotImplementedError, match="a sum or largest of lanes"):
+        program(lambda _, x: (x[0] - jnp.max(x[0]),), lanes)
+    with pytest.raises(NotImplementedError, match="transpose moves, joins or picks lanes"):
+        program(lambda _, x: (jnp.stack([x[0], x[0]]).T[:, 0],), lanes)

@@ -1,0 +1,1 @@
+"""What many tests share: the truth as arrays, compiled steps, small designs."""

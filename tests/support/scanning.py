@@ -1,0 +1,45 @@
+"""A small design, and a stand-in for the engine that computes its samples."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from vrw_jax.results.measures import MARGINS
+from vrw_jax.scans import design as designs
+from vrw_jax.scans.design import Columns
+from vrw_jax.scans.evaluate import Engine as Engine
+from vrw_jax.scans.running import Plan, plan
+from vrw_jax.scans.running import run as run
+from vrw_jax.wheel.outcomes import Outcome
+
+MEASURES = ("dls_fraction", "speed", "d dls_fraction / d damping")
+GRID = designs.grid(damping=np.linspace(100.0, 200.0, 5), slope=np.linspace(0.28, 0.31, 4))
+
+
+def arithmetic(columns: Columns) -> Mapping[str, np.ndarray]:
+    """A stand-in for the engine, quick and exact: every variable is some function of the sample."""
+    total = np.sum([np.sin(column) for column in columns.values()], axis=0)
+    told = {name: total * (i + 1) for i, name in enumerate(MARGINS)}
+    for name, margin in MARGINS.items():
+        if margin.axis:
+            told[name] = told[name][:, None] + np.arange(6)
+    outcome = np.where(total > 0.9, Outcome.NO_CYCLE_FOUND, Outcome.STEPPED).astype(np.int8)
+    names = ("dls_fraction", "speed", "d_dls_fraction_d_damping", "spectral_radius")
+    return told | {name: total / (i + 1) for i, name in enumerate(names)} | {"outcome": outcome}
+
+
+class Counted:
+    """The stand-in, counting its calls and failing at the call that it is told to."""
+
+    def __init__(self, fails_at: int | None = None, error: type[BaseException] = KeyboardInterrupt):
+        self.calls, self.fails_at, self.error = 0, fails_at, error
+
+    def __call__(self, columns: Columns) -> Mapping[str, np.ndarray]:
+        self.calls += 1
+        if self.calls == self.fails_at:
+            raise self.error
+        return arithmetic(columns)
+
+
+def planned(chunk: int = 4, **changes: object) -> Plan:
+    return plan(GRID, MEASURES, chunk=chunk, **changes)

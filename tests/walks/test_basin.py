@@ -1,0 +1,94 @@
+"""Starts are sorted by where they end: which orbit attracts them, or how they fall."""
+
+import numpy as np
+import pytest
+
+import vrw_jax as vrw
+from vrw_jax.figures.branch import basin_figure
+from vrw_jax.walks.attractors import Settled, distinct
+from vrw_jax.walks.basins import AFTER, BEFORE, share
+
+OPTIONS = vrw.Options(rtol=1e-9, atol=1e-9)
+
+
+def basin_at(damping, **more):
+    grid = {
+        "theta_touchdown": 0.1,
+        "dtheta_touchdown": np.linspace(0.8, 2.8, 6),
+        "dL1_touchdown": np.linspace(-0.6, 0.2, 4),
+    }
+    return vrw.basin(vrw.WheelParams(damping=damping), grid, options=OPTIONS, **more)
+
+
+@pytest.fixture(scope="module")
+def basins():
+    return {damping: basin_at(damping) for damping in (100.0, 200.0, 221.0)}
+
+
+def test_the_attractor_is_the_limit_cycle(basins):
+    for damping in (100.0, 200.0):
+        result = basins[damping]
+        assert result.orbit_period.values.tolist() == [1]
+        gait = vrw.limit_cycle(vrw.WheelParams(damping=damping))
+        np.testing.assert_allclose(result.orbit_state[0, 0], gait.section_state, atol=1e-6)
+
+
+def test_the_basin_at_200_is_far_smaller_than_at_100(basins):
+    assert share(basins[100.0])["attractor 0"] > 0.9
+    assert share(basins[200.0])["attractor 0"] < 0.6  # half of the 24 starts, one at its edge
+
+
+def test_a_fast_start_at_200_meets_touchdown_before_the_stopper(basins):
+    fast = basins[200.0].sel(dtheta_touchdown=2.0, method="nearest").isel(dL1_touchdown=-1)
+    assert int(fast.outcome) == vrw.Outcome.TOUCHDOWN_BEFORE_STOPPER
+    assert int(fast.attractor) == -1
+
+
+def test_each_start_has_one_ending(basins):
+    for result in basins.values():
+        walks = result.outcome.values == vrw.Outcome.STEPPED
+        assert np.array_equal(walks, result.attractor.values >= 0)
+
+
+def test_beyond_the_discontinuity_five_steps_attract_one_of_them_without_dls(basins):
+    result = basins[221.0]
+    assert result.orbit_period.values.tolist() == [5]
+    states = result.orbit_state.values[0, :5]
+    lifts = [
+        float(vrw.step(vrw.WheelParams(damping=221.0), x, options=OPTIONS).durations[0]) == 0.0
+        for x in states
+    ]
+    assert sum(lifts) == 1
+
+
+def test_starts_after_the_landing_reach_what_starts_before_it_reach():
+    params = vrw.WheelParams(damping=200.0)
+    gait = vrw.limit_cycle(params)
+    theta, dtheta = (float(v) for v in gait.post_impact)
+    grid = {"theta_post_impact": [theta, -0.2], "dtheta_post_impact": [dtheta]}
+    result = vrw.basin(params, grid, options=OPTIONS)
+    assert result.attractor.values[0, 0] == 0
+    assert result.steps.values[0, 0] <= 1
+    assert set(result.coords) >= set(AFTER)
+    assert not set(result.coords) & set(BEFORE)
+
+
+def test_orbits_are_the_same_whatever_step_they_were_entered_at():
+    orbit = np.full((3, 4, 3), np.nan)
+    orbit[0, :2] = [[0.1, 1.0, 0.0], [0.1, 1.5, 0.0]]
+    orbit[1, :2] = orbit[0, :2] + 1e-6
+    orbit[2, :1] = [[0.1, 1.2, 0.0]]
+    settled = Settled(np.zeros(3, int), np.array([2, 2, 1]), np.zeros(3, int), orbit)
+    found = distinct(settled)
+    assert found.of_start.tolist() == [0, 0, 1]
+    assert [len(o) for o in found.orbits] == [2, 1]
+
+
+def test_a_grid_that_names_no_plane_is_told_what_to_name():
+    with pytest.raises(ValueError, match="must name all of"):
+        vrw.basin(vrw.WheelParams(), {"theta_touchdown": 0.1})
+
+
+def test_a_basin_draws_itself(basins):
+    figure = basin_figure([basins[100.0], basins[200.0]], ["a", "b"])
+    assert len(figure.axes) == 3

@@ -1,0 +1,173 @@
+"""Derivatives of the return map: forwards, in reverse, by differences and by saltation agree."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import truth
+
+import vrw_jax as vrw
+from vrw_jax.models.viscoelastic import (
+    PhaseBuilder,
+    double_support,
+    single_support_1,
+    single_support_2,
+)
+from vrw_jax.numerics.derivatives import any_mode
+from vrw_jax.wheel import transitions
+
+PARAMS = vrw.WheelParams()
+START = jnp.asarray(truth.table("step", "start")[0])
+TIGHT = vrw.Options.tight()
+
+
+@pytest.fixture(scope="module")
+def forward():
+    return jax.jacfwd(vrw.return_map, argnums=(0, 1))(PARAMS, START, options=TIGHT)
+
+
+def test_reverse_mode_equals_forward_mode(forward):
+    reverse = jax.jacrev(vrw.return_map, argnums=(0, 1))(PARAMS, START, options=TIGHT)
+    for one, other in zip(jax.tree.leaves(forward), jax.tree.leaves(reverse), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-13, atol=1e-13)
+
+
+def test_grad_of_a_scalar_is_a_row_of_the_jacobian(forward):
+    rate = lambda params: vrw.return_map(params, START, options=TIGHT)[1]
+    gradient = jax.grad(rate)(PARAMS)
+    np.testing.assert_allclose(gradient.damping, forward[0].damping[1], rtol=1e-13)
+    np.testing.assert_allclose(gradient.slope, forward[0].slope[1], rtol=1e-13)
+
+
+@pytest.mark.parametrize("name", ["damping", "natural_length", "slope", "leg_mass"])
+def test_central_differences_agree(forward, name):
+    value = float(getattr(PARAMS, name))
+    h = 1e-4 * value
+    at = lambda k: np.asarray(
+        vrw.return_map(vrw.WheelParams(**{name: value + k * h}), START, options=TIGHT)
+    )
+    difference = (8.0 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12.0 * h)
+    # Fourth-order differences of values good to 1e-14: rounding 1e-14 / h.
+    np.testing.assert_allclose(getattr(forward[0], name), difference, rtol=1e-8, atol=1e-13 / h)
+
+
+def test_the_saltation_formula_agrees(forward):
+    """Product of flow, saltation and reset Jacobians, with a flow that has nothing to do with ours.
+
+    The flow of each phase over its fixed duration is 2,000 steps of the classic Runge-Kutta method;
+    at a guard g the perturbed flow meets it dt = -grad g . dy / (grad g . f) later.
+    """
+    s = PARAMS.symbols()
+    build = PhaseBuilder(s, stop_at_lift_off=True, monitored=False)
+    walked = vrw.step(PARAMS, START, options=TIGHT)
+
+    def flow(field, y, duration):
+        h = duration / 2000
+
+        def rk4(y, _):
+            k1 = field(y)
+            k2 = field(y + 0.5 * h * k1)
+            k3 = field(y + 0.5 * h * k2)
+            k4 = field(y + h * k3)
+            return y + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4), None
+
+        return jax.lax.scan(rk4, y, None, length=2000)[0]
+
+    def through(phase, y, duration):
+        end = flow(phase.field, y, duration)
+        matrix = jax.jacfwd(partial(flow, phase.field), argnums=0)(y, duration)
+        gradient = jax.grad(lambda y: phase.watched.values(y)[0])(end)
+        f = phase.field(end)
+        return end, matrix - jnp.outer(f, gradient @ matrix) / (gradient @ f)
+
+    def landed(x):
+        landing = transitions.land(s, *x)
+        return jnp.stack([landing.theta, landing.motion.dtheta, landing.distance])
+
+    at_landing, by_landing = landed(START), jax.jacfwd(landed)(START)
+    # The distance between the feet is a constant of double support: a third coordinate at rest.
+    distance = at_landing[2]
+    with_distance = double_support(build, distance)._replace(
+        field=lambda y: jnp.append(double_support(build, y[2]).field(y[:2]), 0.0),
+        watched=double_support(build, distance).watched._replace(
+            values=lambda y: double_support(build, y[2]).watched.values(y[:2])
+        ),
+    )
+
+    def lifted(y):
+        m = double_support(build, y[2]).motion(y[:2])
+        return jnp.stack([y[0], m.L1, m.L2, m.dtheta, m.dL1, m.dL2])
+
+    def locked(y):
+        hit = transitions.hit_stopper(s, single_support_1(build).motion(y))
+        return jnp.stack([y[0], hit.motion.L1, hit.motion.dtheta, hit.motion.dL1])
+
+    end, dls = through(with_distance, at_landing, walked.durations[0])
+    end2, sls1 = through(single_support_1(build), lifted(end), walked.durations[1])
+    end3, sls2 = through(single_support_2(build), locked(end2), walked.durations[2])
+    section = jnp.asarray([[1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1.0]])
+    product = section @ sls2 @ jax.jacfwd(locked)(end2) @ sls1 @ jax.jacfwd(lifted)(end) @ dls
+    np.testing.assert_allclose(section @ end3, walked.section_state, atol=1e-10)
+    np.testing.assert_allclose(product @ by_landing, forward[1], atol=1e-9)
+
+
+@pytest.mark.slow
+def test_second_derivatives_agree_with_differences_of_first_ones():
+    # The event location must not be frozen for these: a stopped gradient is wrong by far here.
+    rate = lambda damping: vrw.return_map(vrw.WheelParams(damping=damping), START, options=TIGHT)[1]
+    first = jax.jit(jax.grad(rate))
+    h = 0.05
+    difference = (
+        8 * (first(200 + h) - first(200 - h)) - (first(200 + 2 * h) - first(200 - 2 * h))
+    ) / (12 * h)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(jax.grad(rate)))(200.0), difference, rtol=1e-8)
+
+
+def test_monitors_and_indicators_are_differentiable():
+    def told(damping):
+        result = vrw.step(vrw.WheelParams(damping=damping), START, options=TIGHT)
+        m = result.monitors
+        return jnp.stack(
+            [
+                m.fore_foot_force,
+                m.clearance_sls1,
+                m.contraction,
+                m.friction_fore,
+                m.landing_friction_rear,
+                m.hit_planted_impulse,
+                *m.locked_stopper_force,
+                result.indicators.lambda_4,
+                result.energy.damping,
+            ]
+        )
+
+    h = 0.02
+    difference = (8 * (told(200 + h) - told(200 - h)) - (told(200 + 2 * h) - told(200 - 2 * h))) / (
+        12 * h
+    )
+    # Differences of forces of 100 N good to 1e-12: 1e-12 / h.
+    np.testing.assert_allclose(jax.jacfwd(told)(200.0), difference, rtol=1e-7, atol=2e-10)
+
+
+def test_only_the_perturbed_inputs_cost_columns():
+    """With one of two arguments perturbed, the Jacobian is formed over that one alone."""
+
+    def function(a, b):
+        return jnp.sum(a) * jnp.sin(b), ()
+
+    many = jnp.ones(50)
+    one = jnp.asarray(1.0)
+    along_b = lambda b: jax.jvp(lambda b: any_mode(function)(many, b)[0], (b,), (one,))
+    assert "f64[50,50]" not in str(jax.make_jaxpr(along_b)(0.3 * one))
+    value, slope = along_b(0.3 * one)
+    np.testing.assert_allclose((value, slope), (50 * np.sin(0.3), 50 * np.cos(0.3)), rtol=1e-14)
+
+
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev], ids=["forward", "reverse"])
+@pytest.mark.parametrize("outer", [jax.jacfwd, jax.jacrev], ids=["forward", "reverse"])
+def test_any_mode_nests_to_third_order(mode, outer):
+    function = any_mode(lambda a: (jax.lax.fori_loop(0, 3, lambda _, v: v * a, a), ()))
+    third = outer(mode(outer(lambda a: function(a)[0])))
+    np.testing.assert_allclose(third(1.5), 24.0 * 1.5, rtol=1e-14)

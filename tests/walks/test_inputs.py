@@ -1,0 +1,87 @@
+"""Bad input gets one clear sentence: what was given, what is allowed, what to do."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support.batched import full_steps, wheels_like
+
+import vrw_jax as vrw
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: vrw.WheelParams(damping=-1.0), ("damping is -1", "[0, 1e+09) N s/m")),
+        (lambda: vrw.WheelParams(leg_mass=0.0), ("leg_mass is 0", "[1e-15, 1e+09) kg")),
+        (lambda: vrw.WheelParams(slope=2.0), ("slope is 2", "1.5708", "rad")),
+        (lambda: vrw.WheelParams(stiffness=float("nan")), ("stiffness is nan",)),
+        (lambda: vrw.WheelParams(leg_com=1.5), ("leg_com is 1.5", "leg_com < locked_length")),
+        (lambda: vrw.WheelParams(n_legs=3), ("n_legs is 3", "5 or more")),
+        (lambda: vrw.Options(rtol=0.0), ("rtol is 0", "positive")),
+        (lambda: vrw.Options(max_solver_steps=0), ("max_solver_steps is 0", "at least 1")),
+        (lambda: vrw.step(vrw.WheelParams(), [0.1, 1.6]), ("shape (2,)", "jax.vmap")),
+        (
+            lambda: vrw.step(vrw.WheelParams(damping=jnp.ones(3)), vrw.paper_start()),
+            ("damping has shape (3,)", "vrw.scan"),
+        ),
+        (
+            lambda: vrw.step(
+                vrw.WheelParams(), vrw.paper_start(), options=vrw.Options(solver="RK9")
+            ),
+            ("solver is 'RK9'", "'Dopri8'"),
+        ),
+        (
+            lambda: vrw.step(vrw.WheelParams(), vrw.paper_start(), options=vrw.Options(rtol=1e-17)),
+            ("rtol is 1e-17", "float64", "Options("),
+        ),
+        (lambda: vrw.walk(vrw.WheelParams(), vrw.paper_start(), 0), ("n_steps is 0",)),
+    ],
+    ids=lambda value: value[0] if isinstance(value, tuple) else None,
+)
+def test_a_wrong_number_gets_one_sentence(call, words):
+    with pytest.raises(ValueError, match=r"\w") as caught:
+        call()
+    message = str(caught.value)
+    for word in words:
+        assert word in message
+    assert "\n" not in message
+
+
+def test_a_dictionary_instead_of_parameters_gets_one_sentence():
+    # Undecorated: under pytest the annotations would speak first.
+    with pytest.raises(Exception, match="params"):
+        vrw.step({"damping": 200.0}, vrw.paper_start())
+
+
+def test_float32_is_refused_at_tolerances_it_cannot_resolve():
+    params = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), vrw.WheelParams())
+    start = vrw.paper_start().astype(jnp.float32)
+    with pytest.raises(ValueError, match="float32") as caught:
+        vrw.step(params, start)
+    assert "jax_enable_x64" in str(caught.value)
+
+
+def test_float32_works_where_it_is_asked_for():
+    params = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), vrw.WheelParams())
+    start = vrw.paper_start().astype(jnp.float32)
+    options = vrw.Options(rtol=2e-5, atol=2e-5)
+    single = vrw.return_map(params, start, options=options)
+    assert single.dtype == jnp.float32
+    double = vrw.return_map(vrw.WheelParams(), vrw.paper_start())
+    # Tolerance times a dozen steps, and round-off of 1e-7 through event times.
+    np.testing.assert_allclose(single, double, atol=1e-3)
+    for engine in ("lanes", "diffrax"):
+        found = vrw.steps(params, start[None], options=options, engine=engine)
+        assert found.section_state.dtype == found.durations.dtype == jnp.float32
+        np.testing.assert_allclose(found.section_state[0], double, atol=1e-3)
+
+
+def test_bad_numbers_inside_a_batch_become_codes():
+    vectors = wheels_like(damping=[200.0, -1.0, np.nan])
+    outcomes = full_steps(vectors, vrw.paper_start()).outcome
+    assert outcomes.tolist() == [
+        vrw.Outcome.STEPPED,
+        vrw.Outcome.BAD_INPUT,
+        vrw.Outcome.BAD_INPUT,
+    ]

@@ -1,0 +1,428 @@
+"""Configs: TOML files that say which wheel, which samples, which measures.
+
+Whatever is wrong with a file is said in one sentence: what was given, what is allowed, what to do.
+"""
+
+import math
+import tomllib
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar
+
+import jax.numpy as jnp
+import numpy as np
+
+from vrw_jax.models import ViscoelasticWheel
+from vrw_jax.numerics import Options
+from vrw_jax.results import nearest
+from vrw_jax.scans import check_measures
+from vrw_jax.scans import design as designs
+from vrw_jax.wheel import DOMAINS, PARAMETER_NAMES, WheelParams
+
+DRAWN = {"sobol": designs.sobol, "uniform": designs.uniform, "saltelli": designs.saltelli}
+DESIGNS = ("grid", "samples", *DRAWN)
+TABLES = ("wheel", "model", "options", "gait", "scan", "tune", "branch", *DESIGNS)
+_MODEL_KEYS = ("friction", "stop_at_lift_off")
+_OPTION_KEYS = tuple(Options.__dataclass_fields__)
+_AXIS_KEYS = ("from", "to", "count")
+
+
+T = TypeVar("T")
+
+
+class ConfigError(ValueError):
+    """A config that can't be used; its message is the sentence to show."""
+
+
+@dataclass(frozen=True)
+class ScanConfig:
+    """Table `[scan]`: what to report, and how many samples are written at a time."""
+
+    measures: tuple[str, ...] | None = None  # None: the scan's default
+    chunk: int | None = None
+
+
+@dataclass(frozen=True)
+class GaitConfig:
+    """Table `[gait]`: how far to walk, and from which section state (None: the model's own)."""
+
+    steps: int = 30
+    start: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True)
+class TuneConfig:
+    """Table `[tune]`: what is sought, what moves within which bounds, what is to be kept."""
+
+    objective: str | Mapping[str, float] = "dls_fraction"
+    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # of free parameters
+    constraints: Mapping[str, float] | None = None  # None: every premise the rung can keep
+    evaluations: int = 200  # at most
+
+
+@dataclass(frozen=True)
+class BranchConfig:
+    """Table `[branch]`: along which parameter gaits are followed, and within what."""
+
+    parameter: str
+    bounds: tuple[float, float]
+    period: int = 1  # steps until the gait repeats
+    largest_step: float | None = None  # share of the range; None: the continuation's default
+
+
+@dataclass(frozen=True)
+class Config:
+    """A config as checked values, with the text that it was read from."""
+
+    wheel: Mapping[str, float | int] = field(default_factory=dict)
+    model: Mapping[str, float | bool] = field(default_factory=dict)
+    options: Mapping[str, float | int | str] = field(default_factory=dict)
+    scan: ScanConfig = ScanConfig()
+    gait: GaitConfig = GaitConfig()
+    tune: TuneConfig | None = None
+    branch: BranchConfig | None = None
+    design: designs.AbstractDesign | None = None
+    text: str = ""
+    name: str = ""
+
+    def params(self, changed: Mapping[str, float | int] | None = None) -> WheelParams:
+        """The wheel: Table 1 with the config's values, then with those `changed`."""
+        return _sentence(WheelParams, **{**self.wheel, **(changed or {})})
+
+    def wheel_model(self) -> ViscoelasticWheel:
+        """The rung with the config's settings."""
+        return _sentence(ViscoelasticWheel, **self.model)
+
+    def numerical_options(self) -> Options:
+        """The defaults with the config's values."""
+        return _sentence(Options, **self.options)
+
+
+def load(path: str | Path) -> Config:
+    """Read and check a config file."""
+    path = Path(path)
+    if not path.exists():
+        near = nearest(path.name, (p.name for p in _siblings(path)))
+        raise ConfigError(
+            f"there is no config file {path}{near}: give the path of a TOML file, "
+            "such as configs/quickstart.toml."
+        )
+    if path.is_dir():
+        raise ConfigError(f"{path} is a folder, but a config is a TOML file: give its path.")
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(
+            f"{path} can't be read ({error}): give a readable text file in UTF-8."
+        ) from error
+    return parse(text, path.name)
+
+
+def _siblings(path: Path) -> Iterable[Path]:
+    return path.parent.glob("*.toml") if path.parent.is_dir() else ()
+
+
+def parse(text: str, name: str = "config") -> Config:
+    """Check the text of a config; `name` stands before every complaint."""
+    try:
+        tables = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{name}: this is not valid TOML ({error}): mend that line.") from error
+    try:
+        return _config(tables, text, name)
+    except ValueError as error:
+        raise ConfigError(f"{name}: {error}") from error
+
+
+def _config(tables: Mapping[str, object], text: str, name: str) -> Config:
+    _only(tables, TABLES, "the file", "tables")
+    for key, table in tables.items():
+        if not isinstance(table, dict):
+            raise ConfigError(
+                f"[{key}] is {_shown(table)}, but it must be a table: write [{key}] on a line of "
+                "its own and its settings below."
+            )
+    given = [kind for kind in DESIGNS if kind in tables]
+    if len(given) > 1:
+        raise ConfigError(
+            f"[{given[0]}] and [{given[1]}] are both given, but a scan has one design: keep one."
+        )
+    design = _design(given[0], _table(tables, given[0])) if given else None
+    wheel = _wheel(_table(tables, "wheel"))
+    both = [key for key in wheel if design is not None and key in design.names]
+    if both:
+        raise ConfigError(
+            f"{both[0]} is fixed in [wheel] and swept in [{given[0]}], but it can only be one: "
+            "drop one of the two."
+        )
+    config = Config(
+        wheel=wheel,
+        model=_model(_table(tables, "model")),
+        options=_options(_table(tables, "options")),
+        scan=_scan(_table(tables, "scan")),
+        gait=_gait(_table(tables, "gait")),
+        tune=_tune(_table(tables, "tune")) if "tune" in tables else None,
+        branch=_branch(_table(tables, "branch")) if "branch" in tables else None,
+        design=design,
+        text=text,
+        name=name,
+    )
+    config.params()
+    _sentence(config.numerical_options().require_reachable, np.dtype(float))
+    return config
+
+
+def _table(tables: Mapping[str, object], key: str) -> dict[str, object]:
+    table = tables.get(key, {})
+    assert isinstance(table, dict)
+    return table
+
+
+def assignment(text: str) -> tuple[str, float | int]:
+    """A parameter and its value from `name=value`, as given on the command line."""
+    name, equals, value = (part.strip() for part in text.partition("="))
+    if not equals:
+        raise ConfigError(f"--set {text} has no '=': write a parameter and its value, damping=150.")
+    try:
+        number = int(value) if name == "n_legs" else float(value)
+    except ValueError:
+        number = value  # type: ignore[assignment]  # the check below says what is wrong with it
+    return name, _wheel({name: number})[name]
+
+
+def _wheel(table: Mapping[str, object]) -> dict[str, float | int]:
+    _only(table, (*PARAMETER_NAMES, "n_legs"), "[wheel]", "parameters")
+    values: dict[str, float | int] = {}
+    for name, value in table.items():
+        if name == "n_legs":
+            values[name] = _whole(value, name, 5)
+        else:
+            values[name] = _in_domain(name, value)
+    return values
+
+
+def _model(table: Mapping[str, object]) -> dict[str, float | bool]:
+    _only(table, _MODEL_KEYS, "[model]", "settings")
+    values: dict[str, float | bool] = {}
+    if "friction" in table:
+        values["friction"] = _number(table["friction"], "friction", positive=True)
+    if "stop_at_lift_off" in table:
+        if not isinstance(table["stop_at_lift_off"], bool):
+            raise ConfigError(
+                f"stop_at_lift_off is {_shown(table['stop_at_lift_off'])}, but it must be "
+                "true or false."
+            )
+        values["stop_at_lift_off"] = table["stop_at_lift_off"]
+    return values
+
+
+def _options(table: Mapping[str, object]) -> dict[str, float | int | str]:
+    _only(table, _OPTION_KEYS, "[options]", "options")
+    values: dict[str, float | int | str] = {}
+    defaults = Options()
+    for key, value in table.items():
+        default = getattr(defaults, key)
+        if isinstance(default, str):
+            if not isinstance(value, str):
+                raise ConfigError(f'{key} is {_shown(value)}, but it must be a name, "{default}".')
+            values[key] = value
+        elif isinstance(default, int):
+            values[key] = _whole(value, key, 1)
+        else:
+            values[key] = _number(value, key, positive=True)
+    return values
+
+
+def _scan(table: Mapping[str, object]) -> ScanConfig:
+    _only(table, ScanConfig.__dataclass_fields__, "[scan]", "settings")
+    measures = table.get("measures")
+    if measures is not None:
+        if not (isinstance(measures, list) and all(isinstance(m, str) for m in measures)):
+            raise ConfigError(
+                f"measures is {_shown(measures)}, but it must be a list of names: "
+                'write measures = ["dls_fraction", "speed"].'
+            )
+        measures = check_measures(measures)
+    chunk = table.get("chunk")
+    return ScanConfig(measures, None if chunk is None else _whole(chunk, "chunk", 1))
+
+
+def _gait(table: Mapping[str, object]) -> GaitConfig:
+    _only(table, GaitConfig.__dataclass_fields__, "[gait]", "settings")
+    steps = _whole(table.get("steps", GaitConfig.steps), "steps", 1)
+    start = table.get("start")
+    if start is None:
+        return GaitConfig(steps)
+    if not (isinstance(start, list) and len(start) == 3):
+        raise ConfigError(
+            f"start is {_shown(start)}, but it must be the section state before touchdown, "
+            "three numbers: angle in rad, angular rate in rad/s, rate of Leg 1 in m/s."
+        )
+    theta, dtheta, dL1 = (_number(value, "start") for value in start)
+    return GaitConfig(steps, (theta, dtheta, dL1))
+
+
+def _tune(table: Mapping[str, object]) -> TuneConfig:
+    _only(table, TuneConfig.__dataclass_fields__, "[tune]", "settings")
+    objective = table.get("objective", TuneConfig.objective)
+    if isinstance(objective, dict):
+        objective = {name: _number(value, name) for name, value in objective.items()}
+    elif not isinstance(objective, str):
+        raise ConfigError(
+            f"objective is {_shown(objective)}, but it must be a measure or weights of several: "
+            'write objective = "dls_fraction" or objective = { dls_fraction = 1.0, speed = 0.1 }.'
+        )
+    bounds = table.get("bounds")
+    if not isinstance(bounds, dict) or not bounds:
+        raise ConfigError(
+            "[tune] lets no parameter move, but at least one must: add [tune.bounds] with lines "
+            "such as damping = [20.0, 215.0]."
+        )
+    _only(bounds, PARAMETER_NAMES, "[tune.bounds]", "parameters")
+    constraints = table.get("constraints")
+    if constraints is not None:
+        if not isinstance(constraints, dict):
+            raise ConfigError(
+                f"constraints is {_shown(constraints)}, but it must be a table: write "
+                "[tune.constraints] and below it lines such as clearance_sls1 = 0.001."
+            )
+        constraints = {name: _number(value, name) for name, value in constraints.items()}
+    return TuneConfig(
+        objective=objective,
+        bounds={name: _range(name, value) for name, value in bounds.items()},
+        constraints=constraints,
+        evaluations=_whole(table.get("evaluations", TuneConfig.evaluations), "evaluations", 1),
+    )
+
+
+def _branch(table: Mapping[str, object]) -> BranchConfig:
+    _only(table, BranchConfig.__dataclass_fields__, "[branch]", "settings")
+    parameter = table.get("parameter")
+    if not isinstance(parameter, str) or parameter not in PARAMETER_NAMES:
+        near = nearest(parameter, PARAMETER_NAMES) if isinstance(parameter, str) else ""
+        raise ConfigError(
+            f"parameter is {_shown(parameter)}{near}, but a branch runs along one of "
+            f'{", ".join(PARAMETER_NAMES)}: write parameter = "damping".'
+        )
+    if "bounds" not in table:
+        raise ConfigError("[branch] has no bounds: write bounds = [4.0, 230.0], say.")
+    lower, upper = _range("bounds of " + parameter, table["bounds"], parameter)
+    if not lower < upper:
+        raise ConfigError(
+            f"bounds are [{lower:g}, {upper:g}], but the lower must come first: swap them."
+        )
+    step = table.get("largest_step")
+    return BranchConfig(
+        parameter=parameter,
+        bounds=(lower, upper),
+        period=_whole(table.get("period", BranchConfig.period), "period", 1),
+        largest_step=None if step is None else _number(step, "largest_step", positive=True),
+    )
+
+
+def _design(kind: str, table: Mapping[str, object]) -> designs.AbstractDesign:
+    own = ("n", "seed") if kind in DRAWN else ()
+    _only(table, (*own, *PARAMETER_NAMES), f"[{kind}]", "settings")
+    swept = {name: value for name, value in table.items() if name not in own}
+    if not swept:
+        raise ConfigError(
+            f"[{kind}] sweeps no parameter, but a scan needs at least one: "
+            f"choose from {', '.join(PARAMETER_NAMES)}."
+        )
+    if own:
+        if "n" not in table:
+            raise ConfigError(f"[{kind}] says not how many samples: write n = 4096, say.")
+        n, seed = _whole(table["n"], "n", 1), _whole(table.get("seed", 0), "seed", 0)
+        ranges = {name: _range(name, value) for name, value in swept.items()}
+        return DRAWN[kind](ranges, n, seed)
+    if kind == "grid":
+        return designs.grid(**{name: _axis(name, value) for name, value in swept.items()})
+    return designs.samples({name: _list(name, value) for name, value in swept.items()})
+
+
+def _axis(name: str, value: object) -> np.ndarray:
+    """Values of a grid's axis: a list, or from, to and count."""
+    if not isinstance(value, dict):
+        return _list(name, value, " or { from = ..., to = ..., count = ... }")
+    _only(value, _AXIS_KEYS, f"the axis of {name}", "keys")
+    missing = [key for key in _AXIS_KEYS if key not in value]
+    if missing:
+        raise ConfigError(
+            f"the axis of {name} has no '{missing[0]}': "
+            f"write {name} = {{ from = ..., to = ..., count = ... }}."
+        )
+    first, last = (_in_domain(name, value[key]) for key in ("from", "to"))
+    return np.linspace(first, last, _whole(value["count"], f"count of {name}", 1))
+
+
+def _list(name: str, value: object, otherwise: str = "") -> np.ndarray:
+    if not isinstance(value, list):
+        raise ConfigError(
+            f"{name} is {_shown(value)}, but it must be a list of numbers{otherwise}."
+        )
+    if not value:
+        raise ConfigError(f"{name} is an empty list, but a scan needs at least one value: add one.")
+    return np.asarray([_in_domain(name, item) for item in value])
+
+
+def _range(name: str, value: object, parameter: str = "") -> tuple[float, float]:
+    """Two values in the domain of `parameter`, `name` itself if not given."""
+    if not (isinstance(value, list) and len(value) == 2):
+        raise ConfigError(
+            f"{name} is {_shown(value)}, but it must be a range of two numbers: "
+            f"write {name} = [lower, upper]."
+        )
+    lower, upper = (_in_domain(parameter or name, item) for item in value)
+    return lower, upper
+
+
+def _in_domain(name: str, value: object) -> float:
+    number, domain = _number(value, name), DOMAINS[name]
+    if not bool(domain.contains(jnp.asarray(number))):
+        raise ConfigError(
+            f"{name} is {number:g}, but {domain.description} must lie in {domain}: "
+            "give a value in that range."
+        )
+    return number
+
+
+def _number(value: object, name: str, positive: bool = False) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ConfigError(f"{name} is {_shown(value)}, but it must be a finite number.")
+    if positive and not value > 0:
+        raise ConfigError(f"{name} is {value:g}, but it must be positive.")
+    return float(value)
+
+
+def _whole(value: object, name: str, least: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+        raise ConfigError(
+            f"{name} is {_shown(value)}, but it must be a whole number of at least {least}."
+        )
+    return value
+
+
+def _only(table: Mapping[str, object], allowed: Iterable[str], where: str, kind: str) -> None:
+    allowed = tuple(allowed)
+    for key in table:
+        if key not in allowed:
+            raise ConfigError(
+                f"{where} has the unknown key '{key}'{nearest(key, allowed)}: "
+                f"its {kind} are {', '.join(allowed)}."
+            )
+
+
+def _shown(value: object) -> str:
+    """The value as a reader of TOML would write it."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return repr(value).replace("'", '"') if isinstance(value, str) else repr(value)
+
+
+def _sentence(make: Callable[..., T], *arguments: object, **values: object) -> T:
+    """`make(**values)`, whose own complaints are sentences already."""
+    try:
+        return make(*arguments, **values)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error

@@ -1,0 +1,119 @@
+"""What a continuation hands back: a labelled branch, and the borders on it."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from html import escape
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from vrw_jax.numerics import floquet
+from vrw_jax.results import MEASURES
+from vrw_jax.runtime import xarray as xr
+from vrw_jax.wheel import Outcome
+
+
+class FixedPoint(NamedTuple):
+    """A fixed point of a return map at one value of the parameter."""
+
+    section: np.ndarray  # the numbers that the map moves
+    parameter: float
+    jacobian: np.ndarray  # of the map
+
+    @property
+    def multipliers(self) -> np.ndarray:
+        """Eigenvalues of the Jacobian, the one of largest modulus first."""
+        return np.asarray(floquet.multipliers(jnp.asarray(self.jacobian)))
+
+    @property
+    def spectral_radius(self) -> float:
+        """Largest modulus of a multiplier."""
+        return float(np.max(np.abs(self.multipliers)))
+
+
+@dataclass(frozen=True)
+class Border:
+    """Where a branch changes its nature.
+
+    `kind` is "fold", "period_doubling", "neimark_sacker", "border_collision" (the indicator or
+    monitor `name` is zero) or "lost" (the order of events changes: `name` says which).
+    """
+
+    kind: str
+    name: str
+    value: float  # of the parameter
+    point: FixedPoint  # beside it, on the side that belongs to the branch
+    ends_branch: bool
+    find_cycle: Callable[[], Any] | None = field(default=None, repr=False, compare=False)
+
+    @functools.cached_property
+    def cycle(self) -> Any:
+        """The `LimitCycle` there; for models without one, the `FixedPoint`."""
+        return self.point if self.find_cycle is None else self.find_cycle()
+
+    def __str__(self) -> str:
+        name = "" if self.name == self.kind else f" {self.name}"
+        ends = ", ends the branch" if self.ends_branch else ""
+        return f"{self.value:.9g}: {self.kind.replace('_', ' ')}{name}{ends}"
+
+
+@dataclass(frozen=True)
+class Branch:
+    """Gaits along one parameter, in the order of the branch, and its borders in the same order.
+
+    `dataset` has the dimension `point`; the parameter is a coordinate on it, which turns back at
+    folds. `ends` says for the branch's first and last point why it was followed no further.
+    """
+
+    parameter: str
+    dataset: xr.Dataset
+    borders: tuple[Border, ...]
+    ends: tuple[str, str]
+    outcome: Outcome  # NO_CYCLE_FOUND or BAD_INPUT if there was none to start from
+
+    @property
+    def values(self) -> np.ndarray:
+        """The parameter at each point."""
+        return self.dataset[self.parameter].values
+
+    @property
+    def multipliers(self) -> np.ndarray:
+        """Complex multipliers, shape (point, n), the one of largest modulus first."""
+        return self.dataset.multiplier_real.values + 1j * self.dataset.multiplier_imag.values
+
+    @property
+    def stable(self) -> np.ndarray:
+        """Whether the gait at each point attracts its neighbours."""
+        return self.dataset.spectral_radius.values < 1.0
+
+    def __str__(self) -> str:
+        if not self.values.size:
+            return f"Branch along {self.parameter}: none. {self.outcome.meaning}"
+        unit = MEASURES[self.parameter].unit if self.parameter in MEASURES else "1"
+        unit = "" if unit == "1" else f" {unit}"
+        stable = self.stable
+        lines = [
+            f"Branch along {self.parameter}: {self.values.size} gaits from {self.values[0]:.6g} to "
+            f"{self.values[-1]:.6g}{unit}, {int(stable.sum())} stable, {int((~stable).sum())} not.",
+            f"  at {self.values[0]:.6g}: {self.ends[0]}",
+            f"  at {self.values[-1]:.6g}: {self.ends[1]}",
+            f"  {len(self.borders)} borders" + (":" if self.borders else "."),
+            *(f"    {border}" for border in self.borders),
+        ]
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        """For notebooks."""
+        rows = "".join(
+            f"<tr><td>{b.value:.9g}</td><td>{b.kind.replace('_', ' ')}</td>"
+            f"<td>{escape(b.name)}</td>"
+            f"<td>{'ends the branch' if b.ends_branch else ''}</td></tr>"
+            for b in self.borders
+        )
+        head = escape(str(self).split("\n  ")[0])
+        columns = "".join(f"<th>{t}</th>" for t in (escape(self.parameter), "kind", "name", ""))
+        return f"<p>{head}</p><table><tr>{columns}</tr>{rows}</table>"

@@ -1,0 +1,363 @@
+"""Branches of gaits along one parameter, stable or not, with every border on the way located.
+
+A border is where something changes its nature: a bifurcation, or a border collision, where an
+indicator or a monitor reaches zero. Each is solved for on the branch itself, again at every trial,
+so that it is as exact as the gaits are.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from vrw_jax.branches.branch import Branch
+from vrw_jax.branches.followed import (
+    AbstractFollowedWheel,
+    CycleFollowed,
+    RungFollowed,
+    Wheel,
+    gait_measures,
+    moved,
+    on_mesh,
+    with_parameter,
+)
+from vrw_jax.branches.run import IN_SEQUENCE, MakeCycle, Read, Run, Strand, Table, run_all
+from vrw_jax.cycles import CycleOptions, LimitCycle, Problem, WalkedCycle, limit_cycle
+from vrw_jax.models import AbstractWheel, UnilateralWheel, ViscoelasticWheel, refuse_ladder
+from vrw_jax.numerics import (
+    ArclengthOptions,
+    MapFollowed,
+    Options,
+    PathPoint,
+    as_float_array,
+    multipliers,
+)
+from vrw_jax.results import CYCLE, GROUND, MARGINS, STEP, attrs_of, provenance
+from vrw_jax.runtime import xarray as xr
+from vrw_jax.walks import Walk, walk
+from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, WheelParams
+
+CLOSED = 1e-7
+"""Most by which the event-driven step may miss a cycle's section state: rad, rad/s, m/s."""
+
+N_WALKED = 60
+"""Steps towards a start, for rungs whose limit cycles are not solved for."""
+
+INDICATORS = ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
+ENDING = (*INDICATORS, "duration_dls", "duration_sls1", "duration_sls2")
+"""Where one of these reaches zero the order of events changes, and the branch ends."""
+
+EXACT = {"clearance_sls1": "takeoff_acceleration"}
+"""A monitor that vanishes like a cube, and the quantity that vanishes with it like a line: a foot
+that leaves the ground ever less steeply dips ever less deep, until it rises at once."""
+
+
+@eqx.filter_jit
+def _read_gaits(
+    followed: AbstractFollowedWheel,
+    model: AbstractWheel,
+    options: Options,
+    wheels: Wheel,
+    points: PathPoint,
+) -> dict[str, Array]:
+    def one(wheel: Wheel, z: Any, p: Array) -> dict[str, Array]:
+        x, beyond = followed.read(wheel, z, p)
+        rung, params = moved(model, wheel.params, followed.name, p)
+        measures = gait_measures(rung, params, x, options, followed.n_steps)
+        return measures | beyond | {"section_state": x}
+
+    return jax.vmap(one)(wheels, points.z, points.p)
+
+
+def _is_margin(name: str) -> bool:
+    return name in INDICATORS or name.partition("[")[0] in MARGINS
+
+
+def _name_of_loss(table: Table, place: int) -> str:
+    """What a step beyond the end of a branch says of it."""
+    outcome = Outcome(int(table["outcome"][place]))
+    return IN_SEQUENCE if outcome == Outcome.STEPPED else outcome.name.lower()
+
+
+def continue_branch(
+    params: WheelParams,
+    name: str,
+    bounds: tuple[float, float],
+    *,
+    cycle: LimitCycle | WalkedCycle | None = None,
+    period_n: int = 1,
+    model: AbstractWheel | None = None,
+    options: ArclengthOptions | None = None,
+    cycle_options: CycleOptions | None = None,
+    step_options: Options | None = None,
+) -> Branch:
+    """The branch of limit cycles through `params` along the parameter `name` within `bounds`.
+
+    Starts from the limit cycle at `params` (or from `cycle`, found before at the same parameters)
+    and goes both ways, through folds, on stable and unstable gaits alike, until the bounds or the
+    end of the branch. Every border on the way is located to 1e-9 in the parameter, if the step
+    between points (options.largest_step) does not hide it: two changes of sign within one step
+    cancel. Gaits are those of the cycle options, `CycleOptions.tight()` by default, and checked by
+    one event-driven step each, from which indicators and monitors come.
+
+    Other rungs' gaits are fixed points of their own return map, as exact as `step_options`. On real
+    ground `name` may be "friction" too, and the start is a `WalkedCycle` or, without one, where a
+    walk of N_WALKED steps ends; a branch goes on where the order of events changes, with a kink.
+    """
+    if params.damping.ndim != 0:
+        raise ValueError(
+            f"damping has shape {params.damping.shape}, but one branch is that of one wheel: use "
+            "continue_branches for a batch."
+        )
+    batch = jax.tree.map(lambda x: x[None], params)
+    cycle = None if cycle is None else jax.tree.map(lambda x: x[None], cycle)
+    (branch,) = continue_branches(
+        batch, name, bounds, cycle=cycle, period_n=period_n, model=model, options=options,
+        cycle_options=cycle_options, step_options=step_options,
+    )  # fmt: skip
+    return branch
+
+
+def continue_branches(
+    params: WheelParams,
+    name: str,
+    bounds: tuple[float, float],
+    *,
+    cycle: LimitCycle | WalkedCycle | None = None,
+    period_n: int = 1,
+    model: AbstractWheel | None = None,
+    options: ArclengthOptions | None = None,
+    cycle_options: CycleOptions | None = None,
+    step_options: Options | None = None,
+) -> tuple[Branch, ...]:
+    """`continue_branch` of a batch of wheels side by side; every parameter has one leading axis.
+
+    A wheel without a limit cycle to start from gets a branch without points, whose outcome says so.
+    """
+    model = ViscoelasticWheel() if model is None else model
+    refuse_ladder(model, "followed")
+    on_ground = isinstance(model, UnilateralWheel)
+    names = (*PARAMETER_NAMES, FRICTION) if on_ground else PARAMETER_NAMES
+    if name not in names:
+        raise ValueError(f"{name!r} is no parameter: choose from {', '.join(names)}.")
+    low, high = (float(b) for b in bounds)
+    if not low < high:
+        raise ValueError(f"bounds are ({low:g}, {high:g}), but the lower must come first.")
+    options = ArclengthOptions() if options is None else options
+    step_options = Options.tight() if step_options is None else step_options
+    batch = np.broadcast_shapes(*(x.shape for x in jax.tree.leaves(params)))
+    if len(batch) != 1:
+        raise ValueError(f"the wheels' batch has shape {batch}, but it must have one axis.")
+    params = jax.tree.map(lambda x: jnp.broadcast_to(x, batch), params)
+    given = jnp.broadcast_to(getattr(model if name == FRICTION else params, name), batch)
+    p = jnp.clip(given, low, high)
+    if name != FRICTION:
+        params = with_parameter(params, name, p)
+
+    make_cycle: MakeCycle
+    if isinstance(model, ViscoelasticWheel):
+        cycle_options = CycleOptions.tight() if cycle_options is None else cycle_options
+        # The start needs neither the mesh nor the accuracy of the branch.
+        start = cycle
+        if start is None:
+            start = jax.vmap(functools.partial(limit_cycle, period_n=period_n))(params)
+        if not isinstance(start, LimitCycle):
+            raise TypeError(
+                f"cycle is a {type(start).__name__}, but the paper's branch starts from a "
+                "LimitCycle: give vrw.limit_cycle(params)."
+            )
+        outcomes = np.asarray(start.outcome)
+        problem = Problem(params.n_legs, period_n, cycle_options)
+        followed: AbstractFollowedWheel = CycleFollowed(problem=problem, name=name)
+        z: Any = jax.vmap(functools.partial(on_mesh, problem))(start)
+        wheels = Wheel(params, start.located.happens)
+
+        def make_cycle(owner: int, point: PathPoint) -> Callable[[], LimitCycle]:
+            def find() -> LimitCycle:
+                guess = jax.tree.map(lambda x: x[owner], start)
+                located = guess.located._replace(solution=jax.tree.map(jnp.asarray, point.z))
+                guess = dataclasses.replace(guess, located=located, problem=problem)
+                wheel = jax.tree.map(lambda x: x[owner], params)
+                wheel = with_parameter(wheel, name, jnp.asarray(point.p))
+                return limit_cycle(wheel, guess=guess, period_n=period_n, options=cycle_options)
+
+            return find
+    else:
+        followed = RungFollowed(
+            model=model,
+            options=step_options,
+            name=name,
+            period_n=period_n,
+            numbers=model.section_numbers(params),
+        )
+        if cycle is None:
+            walked = jax.vmap(functools.partial(_walked, model, step_options, name))(params, p)
+            outcomes, z = np.asarray(walked.outcome), walked.steps.section_state[:, -1]
+        else:
+            outcomes, z = np.asarray(cycle.outcome), cycle.section_state
+        wheels = Wheel(params, jnp.ones((*batch, 1, 1), p.dtype))
+        make_cycle = lambda owner, point: None
+
+    def read(wheels: Any, points: PathPoint) -> Table:
+        return jax.tree.map(np.asarray, _read_gaits(followed, model, step_options, wheels, points))
+
+    def kept(table: Table) -> np.ndarray:
+        return (table["outcome"] == Outcome.STEPPED) & (table["closure"] < CLOSED)
+
+    legs = range(3, params.n_legs + 1)
+    run = Run(
+        followed,
+        options,
+        wheels,
+        np.array([low, high]),
+        functools.partial(_by_leg, read, legs),
+        kept,
+        _is_margin,
+        ENDING,
+        EXACT,
+        _name_of_loss,
+    )
+    found = outcomes == Outcome.STEPPED
+    strands = run_all(run, z, p, found, make_cycle)
+    one = lambda owner: jax.tree.map(lambda x: x[owner], params)
+    return tuple(
+        _branch_of_gaits(strand, one(owner), name, model, step_options, int(outcomes[owner]))
+        for owner, strand in enumerate(strands)
+    )
+
+
+def _walked(
+    model: AbstractWheel, options: Options, name: str, params: WheelParams, p: Array
+) -> Walk:
+    """Towards a gait from the rung's own start."""
+    model, params = moved(model, params, name, p)
+    return walk(params, model.start(params), N_WALKED, model=model, options=options)
+
+
+def _by_leg(read: Read, legs: range, wheels: Any, points: PathPoint) -> Table:
+    """The table of `read` with one more column for each leg of a margin that has several."""
+    table = read(wheels, points)
+    for name, margin in MARGINS.items():
+        if margin.axis and name in table:
+            table |= {f"{name}[{leg}]": table[name][:, i] for i, leg in enumerate(legs)}
+    return table
+
+
+def _branch_of_gaits(
+    strand: Strand | None,
+    params: WheelParams,
+    name: str,
+    model: AbstractWheel,
+    options: Options,
+    outcome: int,
+) -> Branch:
+    origin = provenance(params, model, options)
+    origin.pop(f"parameter_{name}", None)
+    attrs = {"title": f"Branch of limit cycles along {name}"} | origin
+    if strand is None:
+        code = Outcome(outcome)
+        code = Outcome.NO_CYCLE_FOUND if code == Outcome.STEPPED else code
+        empty = xr.Dataset(coords={name: ("point", np.zeros(0))}, attrs=attrs)
+        return Branch(name, empty, (), ("", ""), code)
+    skipped = ("outcome", "solver_steps")
+    data = {
+        key: xr.Variable(
+            ("point", "leg") if measure.axis else "point", strand.table[key], attrs_of(key)
+        )
+        for key, measure in (STEP | MARGINS | GROUND).items()
+        if key in strand.table and key not in skipped
+    }
+    data["section_state"] = xr.Variable(
+        ("point", "component"),
+        strand.table["section_state"],
+        {"long_name": "section state just before touchdown"},
+    )
+    data["closure"] = xr.Variable(
+        "point",
+        strand.table["closure"],
+        {"units": "1", "long_name": "miss of the section state after one event-driven period"},
+    )
+    labels = {
+        name: xr.Variable("point", strand.points.p, attrs_of(name)),
+        "component": _components(strand.table["section_state"].shape[-1], params.n_legs),
+        "leg": xr.Variable("leg", np.arange(3, params.n_legs + 1), {"long_name": "locked leg"}),
+    }
+    dataset = xr.Dataset(data | _stability(np.asarray(strand.points.jacobian)), labels, attrs)
+    return Branch(name, dataset, strand.borders, strand.ends, Outcome.STEPPED)
+
+
+def _components(size: int, n: int) -> list[str]:
+    """Names of a section state's numbers: the paper's, or `unilateral_section.FullState`."""
+    if size == 3:
+        return ["theta", "dtheta", "dL1"]
+    legs = [f"{name}{leg}" for name in ("L", "dL", "code") for leg in range(1, n + 1)]
+    return ["theta", "dtheta", "vx", "vz", *legs]
+
+
+def _stability(jacobians: np.ndarray) -> dict[str, xr.Variable]:
+    """Multipliers and what follows from them, along the branch."""
+    values = np.asarray(multipliers(jnp.asarray(jacobians)))
+    radius = np.max(np.abs(values), -1)
+    names = {"multiplier_real": values.real, "multiplier_imag": values.imag}
+    return {
+        **{
+            key: xr.Variable(("point", "multiplier"), part, {"units": "1", "long_name": text})
+            for (key, part), text in zip(
+                names.items(), ("real part of a multiplier", "imaginary part"), strict=True
+            )
+        },
+        "spectral_radius": xr.Variable("point", radius, CYCLE["spectral_radius"].attrs),
+        "stability_margin": xr.Variable("point", 1.0 - radius, CYCLE["stability_margin"].attrs),
+    }
+
+
+def continue_map(
+    function: Callable[[Any, Array, Array], Array],
+    x: object,
+    p: float,
+    bounds: tuple[float, float],
+    *,
+    constants: Any = (),
+    name: str = "parameter",
+    options: ArclengthOptions | None = None,
+) -> Branch:
+    """The branch of fixed points of any map x -> `function(constants, x, p)` through (x, p).
+
+    The map must be differentiable forwards, and NaN where it is not defined. Its
+    bifurcations are located as for `continue_branch`.
+    """
+    low, high = (float(b) for b in bounds)
+    if not low <= p <= high:
+        raise ValueError(f"p is {p:g}, but the branch must start within ({low:g}, {high:g}).")
+    options = ArclengthOptions() if options is None else options
+    lead = lambda tree: jax.tree.map(lambda a: jnp.asarray(a, float)[None], tree)
+    run = Run(
+        MapFollowed(function),
+        options,
+        lead(constants),
+        np.array([low, high]),
+        lambda wheels, points: {"x": np.asarray(points.z)},
+        lambda table: np.asarray(np.isfinite(table["x"]).all(-1)),
+        lambda name: False,
+    )
+    (strand,) = run_all(
+        run, lead(as_float_array(x)), lead(p), np.array([True]), lambda owner, point: None
+    )
+    if strand is None:
+        empty = xr.Dataset(coords={name: ("point", np.zeros(0))})
+        return Branch(name, empty, (), ("", ""), Outcome.NO_CYCLE_FOUND)
+    dataset = xr.Dataset(
+        {"x": (("point", "component"), strand.table["x"])}
+        | _stability(np.asarray(strand.points.jacobian)),
+        {name: ("point", strand.points.p)},
+        {"title": f"Branch of fixed points along {name}"},
+    )
+    return Branch(name, dataset, strand.borders, strand.ends, Outcome.STEPPED)

@@ -1,0 +1,273 @@
+"""The wheel's gaits as something that a continuation can follow, and their measures.
+
+`CycleFollowed` is the fast way: the collocation system of the paper's sequence of phases, one
+linearised pass per Newton iteration. `RungFollowed` works for every rung: its own step, iterated
+and differentiated forwards.
+"""
+
+import abc
+import functools
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from vrw_jax.cycles import LimitCycle, Located, Problem, correction_size, nothing_known
+from vrw_jax.models import AbstractWheel, RungState
+from vrw_jax.numerics import (
+    N_NODES,
+    AbstractFollowed,
+    Elementwise,
+    Linear,
+    Options,
+    Passage,
+    Scalar,
+    Section,
+    Solution,
+    Unknown,
+    one_wheel,
+    walk_through,
+)
+from vrw_jax.results import MARGINS
+from vrw_jax.wheel import (
+    FRICTION,
+    PARAMETER_NAMES,
+    Motion,
+    Outcome,
+    WheelParams,
+    dynamics,
+    parameters_of,
+    rear_foot_height,
+    wheel_of,
+)
+
+
+class Wheel(NamedTuple):
+    """The wheel whose gaits are followed, whatever its value of the parameter in question."""
+
+    params: WheelParams
+    happens: Float[Array, "n n_phases"]  # 1 where a phase of the cycle takes place, else 0
+
+
+class AbstractFollowedWheel(AbstractFollowed):
+    """Gaits of `n_steps` steps along the float parameter `name`."""
+
+    name: eqx.AbstractVar[str]
+
+    @property
+    @abc.abstractmethod
+    def n_steps(self) -> int:
+        """Steps until the gait repeats."""
+
+    @abc.abstractmethod
+    def read(self, wheel: Wheel, z: Unknown, p: Scalar) -> tuple[RungState, dict[str, Array]]:
+        """Section state before the first landing, and quantities that go on beyond a border."""
+
+
+class CycleFollowed(AbstractFollowedWheel):
+    """Limit cycles by collocation; z is a `Solution`, without the axis over lanes.
+
+    Beyond an indicator's zero the formal solution goes on; the step says that it is no gait.
+    """
+
+    problem: Problem = eqx.field(static=True)
+    name: str = eqx.field(static=True)
+
+    @property
+    def n_steps(self) -> int:
+        return self.problem.period_n
+
+    def _moved(self, wheel: Wheel, p: Scalar) -> Array:
+        return parameters_of(with_parameter(wheel.params, self.name, p))
+
+    def linearise(self, wheel: Wheel, z: Unknown, p: Scalar) -> Linear:
+        index = PARAMETER_NAMES.index(self.name)
+        over_lanes = functools.partial(_linearised, self.problem, index)
+        return Linear(*one_wheel(over_lanes)(self._moved(wheel, p), wheel.happens, z))
+
+    def section(self, z: Unknown) -> Section:
+        return z.section
+
+    def size(self, z: Unknown, correction: Unknown) -> Scalar:
+        return one_wheel(correction_size)(z, correction)
+
+    def valid(self, wheel: Wheel, z: Unknown, p: Scalar) -> Bool[Array, ""]:
+        """Positive durations; the event-driven step is the judge of all else."""
+        return jnp.all((z.durations > 0.0) | (wheel.happens < 0.5))
+
+    def read(self, wheel: Wheel, z: Unknown, p: Scalar) -> tuple[RungState, dict[str, Array]]:
+        """Beyond a border: durations, shortest over the steps, and `takeoff_acceleration`: with
+        which the rear foot leaves the ground, m/s^2, least over the steps.
+        """
+        parameters = self._moved(wheel, p)
+        s = wheel_of(parameters, self.problem.n_legs).symbols()
+        constants = self.problem.constants_of(*parameters)
+        section = tuple(z.section)
+        takeoffs = []
+        for k in range(self.problem.period_n):
+            durations, accelerations = jax.tree.map(
+                lambda x, k=k: x[k], (z.durations, z.accelerations)
+            )
+            section, passages = walk_through(
+                self.problem.sequence, self.problem.meshes, constants, section, durations,
+                accelerations,
+            )  # fmt: skip
+            takeoffs.append(_takeoff_acceleration(s, passages[1]))
+        end = passages[-1].end
+        shortest = jnp.min(z.durations, 0)
+        formal = {
+            "duration_dls": jnp.where(wheel.happens[0, 0] > 0.5, shortest[0], jnp.nan),
+            "duration_sls1": shortest[1],
+            "duration_sls2": shortest[2],
+            "takeoff_acceleration": jnp.min(jnp.stack(takeoffs)),
+        }
+        return jnp.stack([end.q[0], *end.v]), formal
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _linearised(
+    problem: Problem, index: int, parameters: Array, happens: Array, z: Solution
+) -> tuple[Solution, Solution, Array]:
+    """Correction, column of one parameter and monodromy, lanes last.
+
+    Jitted so that it is traced once, however often a loop over lanes looks at its body.
+    """
+    located = Located(z, happens, *nothing_known(problem, z.section))
+    passed = problem.pass_at(parameters, located, (index,))
+    return passed.correction, jax.tree.map(lambda x: x[0], passed.columns), passed.monodromy
+
+
+def on_mesh(problem: Problem, cycle: LimitCycle) -> Solution:
+    """A start on the mesh of `problem` from a cycle on any other.
+
+    Accelerations are interpolated over each phase, which is near enough for Newton's method.
+    """
+    found = cycle.located.solution
+    accelerations = []
+    for old, new, known in zip(
+        cycle.problem.meshes, problem.meshes, found.accelerations, strict=True
+    ):
+        n, _, _, dim = known.shape
+        rows = jnp.moveaxis(known.reshape(n, -1, dim), 1, -1)
+        at = jnp.asarray(new.node_times)
+        over_time = lambda row, old=old, at=at: jnp.interp(at, jnp.asarray(old.node_times), row)
+        moved = jnp.moveaxis(jax.vmap(jax.vmap(over_time))(rows), -1, 1)
+        accelerations.append(moved.reshape(n, new.n_steps, N_NODES, dim))
+    return Solution(found.section, found.durations, tuple(accelerations))
+
+
+def _takeoff_acceleration(s: Any, sls1: Passage) -> Scalar:
+    q, v = jnp.stack(sls1.start.q), jnp.stack(sls1.start.v)
+    a = jnp.stack(dynamics.single_support_1_acceleration(s, Motion.of(*q, *v)))
+
+    def height(time: Array) -> Array:
+        return rear_foot_height(s, Motion.of(*(q + time * (v + 0.5 * time * a)), *v))
+
+    return jax.jacfwd(jax.jacfwd(height))(jnp.zeros_like(q[0]))
+
+
+class RungFollowed(AbstractFollowedWheel):
+    """Fixed points of `period_n` steps of any rung; z is the section state.
+
+    Codes at its end (`AbstractWheel.section_numbers`) are carried along: they are those of the
+    image of the last iteration, and Newton's method ends only where they agree.
+    """
+
+    model: AbstractWheel
+    options: Options
+    name: str = eqx.field(static=True)
+    period_n: int = eqx.field(static=True)
+    numbers: int = eqx.field(static=True)
+
+    @property
+    def n_steps(self) -> int:
+        return self.period_n
+
+    def _image(self, wheel: Wheel, z: Array, p: Scalar) -> Array:
+        model, params = moved(self.model, wheel.params, self.name, p)
+        for _ in range(self.period_n):
+            advance = model.advance(params, z, self.options)
+            z = jnp.where(advance.outcome == Outcome.STEPPED, advance.section_state, jnp.nan)
+        return z
+
+    def linearise(self, wheel: Wheel, z: Unknown, p: Scalar) -> Linear:
+        n = self.numbers
+
+        def both(x: Array, p: Array) -> tuple[Array, Array]:
+            image = self._image(wheel, jnp.concatenate([x, z[n:]]), p)
+            return image[:n], image
+
+        (by_x, by_p), image = jax.jacfwd(both, argnums=(0, 1), has_aux=True)(z[:n], p)
+        right = jnp.stack([image[:n] - z[:n], by_p], -1)
+        solved = jnp.linalg.solve(jnp.eye(n, dtype=z.dtype) - by_x, right)
+        codes = image[n:] - z[n:]
+        correction = jnp.concatenate([solved[:, 0], codes])
+        return Linear(correction, jnp.concatenate([solved[:, 1], jnp.zeros_like(codes)]), by_x)
+
+    def section(self, z: Unknown) -> Section:
+        return z[: self.numbers]
+
+    def between(self, left: Unknown, right: Unknown, place: Scalar) -> Unknown:
+        """Codes are those of the nearer point."""
+        codes = jnp.where(place < 0.5, left, right)[self.numbers :]
+        return jnp.concatenate([(left + place * (right - left))[: self.numbers], codes])
+
+    def size(self, z: Unknown, correction: Unknown) -> Scalar:
+        return jnp.max(jnp.abs(correction))
+
+    def valid(self, wheel: Wheel, z: Unknown, p: Scalar) -> Bool[Array, ""]:
+        return jnp.all(jnp.isfinite(z))
+
+    def read(self, wheel: Wheel, z: Unknown, p: Scalar) -> tuple[RungState, dict[str, Array]]:
+        """The section state; a step's own measures hold all there is."""
+        return z, {}
+
+
+def with_parameter(params: WheelParams, name: str, value: Elementwise) -> WheelParams:
+    """The same wheel with another value of one parameter; works on tracers."""
+    return eqx.tree_at(lambda wheel: getattr(wheel, name), params, value)
+
+
+def moved(
+    model: AbstractWheel, params: WheelParams, name: str, value: Elementwise
+) -> tuple[AbstractWheel, WheelParams]:
+    """Model and wheel with another value of one parameter of either; works on tracers."""
+    if name == FRICTION:
+        return eqx.tree_at(lambda ground: ground.friction, model, value), params
+    return model, with_parameter(params, name, value)
+
+
+def gait_measures(
+    model: AbstractWheel, params: WheelParams, x: RungState, options: Options, period_n: int
+) -> dict[str, Array]:
+    """All measures of one period of a gait that passes the section at x, with `closure`.
+
+    Indicators and margins are the least over the steps, durations and energies their sums, section
+    and post-impact state those of the last and first step; `outcome` is that of the first step that
+    failed. `closure` is how far the section state is from x after the period.
+    """
+
+    def one(x: RungState, _: None) -> tuple[RungState, dict[str, Array]]:
+        result = model.step(params, x, options)
+        return result.section_state, result.measures()
+
+    end, steps = lax.scan(one, x, None, length=period_n)
+    told = {}
+    for name, values in steps.items():
+        if name in MARGINS or name.startswith("lambda_"):
+            told[name] = jnp.min(values, 0)
+        elif name.endswith("_touchdown"):
+            told[name] = values[-1]
+        elif name.endswith("_post_impact"):
+            told[name] = values[0]
+        elif name == "outcome":
+            told[name] = values[jnp.argmax(values != Outcome.STEPPED)]
+        else:
+            told[name] = jnp.sum(values, 0)
+    period = jnp.where(told["period"] > 0.0, told["period"], 1.0)
+    told["dls_fraction"] = told["duration_dls"] / period
+    told["speed"] = told["step_length"] / period
+    return told | {"closure": jnp.max(jnp.abs(end - x))}

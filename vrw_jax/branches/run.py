@@ -1,0 +1,383 @@
+"""Branches followed, and every border on them located: the part that knows no wheel.
+
+Several branches run side by side. First each is followed both ways; then the places where it leaves
+what it stands for are located and become its ends; then every other sign change on it.
+"""
+
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from vrw_jax.branches.branch import Border, FixedPoint
+from vrw_jax.numerics import (
+    BIFURCATIONS,
+    AbstractFollowed,
+    ArclengthOptions,
+    Ending,
+    PathPoint,
+    Plane,
+    arclength,
+    bifurcation_functions,
+    brackets,
+    locate,
+    turns,
+)
+
+ACCURACY = 1e-10
+"""Of a border, in the parameter: the bracket's width at which the search for it ends."""
+
+AT_FOLD = 1e-6
+"""The same as a share of the bracket, where the parameter turns back: it enters squared."""
+
+BATCH = 32
+"""Points that are measured or located side by side: one shape, compiled once."""
+
+IN_SEQUENCE = "sequence"
+"""Column that is 1 where a point is what it stands for, else -1."""
+
+BRANCH_POINT = "branch_point"
+"""A multiplier passes 1 but the branch does not turn back: another branch crosses it. There the
+equations are singular, and the place is only as good as the steps are short."""
+
+Table = dict[str, np.ndarray]
+Read = Callable[[Any, PathPoint], Table]
+"""Named quantities over a batch of points, first axis, of the wheels given with the same axis."""
+
+
+class Run(NamedTuple):
+    """One continuation of several wheels side by side."""
+
+    followed: AbstractFollowed
+    options: ArclengthOptions
+    wheels: Any  # leading axis over wheels
+    bounds: np.ndarray
+    read: Read  # what is not said by the Jacobian
+    kept: Callable[[Table], np.ndarray]  # which points are what they stand for, by their table
+    is_margin: Callable[[str], bool]  # whether a column's zero is a border collision
+    ending: tuple[str, ...] = ()  # columns whose zero ends a branch: the order of events changes
+    exact: Mapping[str, str] = {}  # a margin that vanishes ill, and what vanishes well with it
+    name_of_loss: Callable[[Table, int], str] = lambda table, place: IN_SEQUENCE
+
+    def table(self, points: PathPoint, owners: np.ndarray) -> Table:
+        """Every quantity at each point, bifurcation functions and IN_SEQUENCE included."""
+        found = _in_batches(self.read, _taken(self.wheels, owners), points)
+        margins = bifurcation_functions(np.asarray(points.jacobian))
+        found |= {name: margins[:, i] for i, name in enumerate(BIFURCATIONS)}
+        good = np.asarray(points.valid) & self.kept(found)
+        return found | {IN_SEQUENCE: np.where(good, 1.0, -1.0)}
+
+
+def _taken(tree: Any, places: Any) -> Any:
+    return jax.tree.map(lambda x: np.asarray(x)[places], tree)
+
+
+def _joined(*trees: Any) -> Any:
+    return jax.tree.map(lambda *parts: np.concatenate([np.asarray(p) for p in parts]), *trees)
+
+
+def _in_batches(function: Callable, *trees: Any) -> Any:
+    """`function` of trees with a leading axis, `BATCH` of it at a time, the last one filled up."""
+    n = len(jax.tree.leaves(trees)[0])
+    parts = []
+    for begin in range(0, n, BATCH):
+        places = np.minimum(np.arange(begin, begin + BATCH), n - 1)
+        parts.append(jax.tree.map(np.asarray, function(*_taken(trees, places))))
+    return _taken(_joined(*parts), slice(0, n))
+
+
+@eqx.filter_jit
+def _follow_both_ways(
+    followed: AbstractFollowed,
+    options: ArclengthOptions,
+    wheels: Any,
+    z: Any,
+    p: Array,
+    bounds: Array,
+) -> arclength.Track:
+    """Tracks of all wheels, axes (wheel, direction): first towards smaller values."""
+    ways = jnp.asarray([-1.0, 1.0], bounds.dtype)
+    one = lambda wheel, z, p, way: arclength.follow(followed, options, wheel, z, p, bounds, way)
+    return jax.vmap(jax.vmap(one, (None, None, None, 0)), (0, 0, 0, None))(wheels, z, p, ways)
+
+
+@eqx.filter_jit
+def _solve_on(
+    followed: AbstractFollowed,
+    options: ArclengthOptions,
+    bounds: Array,
+    wheels: Any,
+    left: PathPoint,
+    right: PathPoint,
+    places: Array,
+) -> tuple[PathPoint, Array]:
+    """Points of the branch between neighbours, at `places` in [0, 1] of the chord."""
+
+    def one(wheel: Any, left: PathPoint, right: PathPoint, place: Array) -> tuple[PathPoint, Array]:
+        z = followed.between(left.z, right.z, place)
+        scale = bounds[1] - bounds[0]
+        row_x = followed.section(right.z) - followed.section(left.z)
+        row_share = (right.p - left.p) / scale
+        share = (left.p + place * (right.p - left.p) - bounds[0]) / scale
+        plane = Plane(followed.section(z), share, row_x, row_share)
+        return arclength.solve(followed, options, wheel, z, plane, bounds)
+
+    return jax.vmap(one)(wheels, left, right, places)
+
+
+class _Pieces(NamedTuple):
+    """Points of all wheels in one array; each wheel's in the order of its branch."""
+
+    points: PathPoint
+    owners: np.ndarray  # which wheel
+    table: Table
+
+
+class _Zero(NamedTuple):
+    """A located sign change."""
+
+    bracket: tuple[int, int, str]  # left and right point, quantity
+    value: float
+    place: float
+    beside: PathPoint  # on the side of the bracket's left point, leading axis 1
+    table: Table  # there
+
+
+def _zeros(run: Run, pieces: _Pieces, asked: list[tuple[int, int, str]]) -> list[_Zero]:
+    """Each (left, right, quantity) whose sign differs between two points, located."""
+    if not asked:
+        return []
+    lefts, rights = (np.array([a[i] for a in asked]) for i in (0, 1))
+    names = [a[2] for a in asked]
+    left, right = _taken(pieces.points, lefts), _taken(pieces.points, rights)
+    owners = pieces.owners[lefts]
+    wheels = _taken(run.wheels, owners)
+    solve = functools.partial(_solve_on, run.followed, run.options, jnp.asarray(run.bounds))
+
+    def evaluated(places: np.ndarray) -> tuple[PathPoint, Table]:
+        points, found = _in_batches(solve, wheels, left, right, places)
+        points = points._replace(valid=points.valid & found)
+        table = run.table(points, owners)
+        return points, {k: np.where(_along(found, v), v, np.nan) for k, v in table.items()}
+
+    def wanted(table: Table) -> np.ndarray:
+        return np.array([table[name][i] for i, name in enumerate(names)])
+
+    at_left = np.array([pieces.table[n][i] for n, i in zip(names, lefts, strict=True)])
+    at_right = np.array([pieces.table[n][i] for n, i in zip(names, rights, strict=True)])
+    reach = np.maximum(np.abs(right.p - left.p), ACCURACY)
+    width = np.minimum(ACCURACY / reach, AT_FOLD)
+    found = locate(lambda places: wanted(evaluated(places)[1]), at_left, at_right, width)
+    best, _ = evaluated(found.place)
+    # A little to the left even of an exact zero: there it is still what the branch stands for.
+    beside, table = evaluated(np.maximum(found.left - width, 0.0))
+    return [
+        _Zero(
+            asked[i],
+            float(best.p[i]),
+            float(found.place[i]),
+            _taken(beside, slice(i, i + 1)),
+            _taken(table, slice(i, i + 1)),
+        )
+        for i in range(len(asked))
+    ]
+
+
+def _along(flags: np.ndarray, values: np.ndarray) -> np.ndarray:
+    return flags.reshape(-1, *(1,) * (values.ndim - 1))
+
+
+def _collected(run: Run, tracks: arclength.Track) -> _Pieces:
+    """All points of all tracks, each wheel's two directions joined at its start."""
+    parts, owners = [], []
+    for wheel in range(tracks.n_points.shape[0]):
+        down, up = (int(n) for n in tracks.n_points[wheel])
+        if down:
+            points = _taken(tracks.points, (wheel, 0))
+            points = _taken(points, np.arange(down)[::-1])
+            parts.append(points._replace(share_slope=-points.share_slope))
+        if up:
+            points = _taken(tracks.points, (wheel, 1))
+            parts.append(_taken(points, np.arange(1 if down else 0, up)))
+        owners += [wheel] * (down + max(up - (1 if down else 0), 0))
+    if not owners:
+        return _Pieces(_taken(tracks.points, (0, 0, slice(0, 0))), np.zeros(0, int), {})
+    points = _joined(*parts)
+    return _Pieces(points, np.array(owners), run.table(points, np.array(owners)))
+
+
+class _Reach(NamedTuple):
+    """The valid points of one wheel, and the first one beyond at either end (-1: none)."""
+
+    owner: int
+    points: np.ndarray
+    beyond: tuple[int, int]
+
+
+def _reaches(pieces: _Pieces, starts: Mapping[int, int]) -> list[_Reach]:
+    """What of each wheel's points is connected to its start without leaving the sequence."""
+    reaches = []
+    for owner, start in starts.items():
+        own = np.flatnonzero(pieces.owners == owner)
+        good = pieces.table[IN_SEQUENCE][own] > 0.0
+        if not good[start]:
+            continue
+        low = high = start
+        while low > 0 and good[low - 1]:
+            low -= 1
+        while high < len(own) - 1 and good[high + 1]:
+            high += 1
+        below = int(own[low - 1]) if low > 0 else -1
+        above = int(own[high + 1]) if high < len(own) - 1 else -1
+        reaches.append(_Reach(owner, own[low : high + 1], (below, above)))
+    return reaches
+
+
+def _located_ends(run: Run, pieces: _Pieces, reaches: list[_Reach]) -> dict[tuple[int, int], _Zero]:
+    """Where each branch leaves its sequence, by (owner, end: 0 or 1): the nearest zero there."""
+    asked, keys = [], []
+    for reach in reaches:
+        for end, beyond in enumerate(reach.beyond):
+            if beyond < 0:
+                continue
+            last = int(reach.points[0 if end == 0 else -1])
+            crossing = [
+                name
+                for name in run.ending
+                if name in pieces.table
+                and pieces.table[name][last] * pieces.table[name][beyond] < 0.0
+            ]
+            for name in crossing or [IN_SEQUENCE]:
+                asked.append((last, beyond, name))
+                keys.append((reach.owner, end))
+    nearest: dict[tuple[int, int], _Zero] = {}
+    for key, zero in zip(keys, _zeros(run, pieces, asked), strict=True):
+        if key not in nearest or zero.place < nearest[key].place:
+            nearest[key] = zero
+    return nearest
+
+
+def _with_ends(
+    pieces: _Pieces, reaches: list[_Reach], ends: Mapping[tuple[int, int], _Zero]
+) -> _Pieces:
+    """The valid points alone, with the points beside the located ends joined to them."""
+    points, owners, tables = [], [], []
+
+    def add(some: PathPoint, owner: int, table: Table) -> None:
+        points.append(some)
+        owners.append(np.full(len(some.p), owner))
+        tables.append(table)
+
+    for reach in reaches:
+        low, high = (ends.get((reach.owner, end)) for end in (0, 1))
+        if low is not None and low.table[IN_SEQUENCE][0] > 0.0:
+            add(low.beside, reach.owner, low.table)
+        add(_taken(pieces.points, reach.points), reach.owner, _taken(pieces.table, reach.points))
+        if high is not None and high.table[IN_SEQUENCE][0] > 0.0:
+            add(high.beside, reach.owner, high.table)
+    return _Pieces(_joined(*points), np.concatenate(owners), _joined(*tables))
+
+
+def _inner_zeros(run: Run, pieces: _Pieces) -> list[tuple[str, _Zero]]:
+    """Every quantity's sign changes between neighbours on the same branch, with its name."""
+    skipped = (IN_SEQUENCE, *run.exact.values())
+    names = [
+        name for name, values in pieces.table.items() if values.ndim == 1 and name not in skipped
+    ]
+    names = [name for name in names if name in BIFURCATIONS or run.is_margin(name)]
+    asked, told = [], []
+    for found in brackets(np.stack([pieces.table[name] for name in names], 1)):
+        left, right, name = found.left, found.right, names[found.column]
+        if pieces.owners[left] != pieces.owners[right]:
+            continue
+        exact = run.exact.get(name)
+        if exact in pieces.table and pieces.table[exact][left] * pieces.table[exact][right] < 0.0:
+            asked.append((left, right, exact))
+        else:
+            asked.append((left, right, name))
+        told.append(name)
+    for i, (left, right, _) in enumerate(asked):
+        slopes = pieces.points.share_slope
+        if told[i] == "fold" and slopes[left] * slopes[right] > 0.0:
+            told[i] = BRANCH_POINT
+    zeros = list(zip(told, _zeros(run, pieces, asked), strict=True))
+    return [
+        (n, z) for n, z in zeros if n != "neimark_sacker" or turns(np.asarray(z.beside.jacobian[0]))
+    ]
+
+
+def _kind(run: Run, name: str) -> str:
+    if name in (*BIFURCATIONS, BRANCH_POINT):
+        return name
+    return "border_collision" if run.is_margin(name) else "lost"
+
+
+class Strand(NamedTuple):
+    """One wheel's finished branch, before it is labelled."""
+
+    points: PathPoint
+    table: Table
+    borders: tuple[Border, ...]
+    ends: tuple[str, str]
+
+
+MakeCycle = Callable[[int, PathPoint], Callable[[], Any] | None]
+"""From a wheel's place and a point to what computes its limit cycle."""
+
+
+def run_all(
+    run: Run, z: Any, p: Array, found: np.ndarray, make_cycle: MakeCycle
+) -> list[Strand | None]:
+    """Follow, locate, and sort by wheel; None where there was no start."""
+    bounds = jnp.asarray(run.bounds)
+    tracks = _follow_both_ways(run.followed, run.options, run.wheels, z, p, bounds)
+    tracks = tracks._replace(n_points=jnp.where(found[:, None], tracks.n_points, 0))
+    pieces = _collected(run, tracks)
+    n_wheels = len(found)
+    starts = {
+        w: max(int(tracks.n_points[w, 0]) - 1, 0) for w in range(n_wheels) if w in pieces.owners
+    }
+    reaches = _reaches(pieces, starts)
+    if not reaches:
+        return [None] * n_wheels
+    ends = _located_ends(run, pieces, reaches)
+    whole = _with_ends(pieces, reaches, ends)
+    inner = _inner_zeros(run, whole)
+
+    def border(name: str, zero: _Zero, owner: int, ends_branch: bool) -> Border:
+        beside = _taken(zero.beside, 0)
+        section = np.asarray(run.followed.section(jax.tree.map(jnp.asarray, beside.z)))
+        point = FixedPoint(section, float(beside.p), beside.jacobian)
+        if name == IN_SEQUENCE:
+            name = run.name_of_loss(pieces.table, zero.bracket[1])
+        return Border(
+            _kind(run, name), name, zero.value, point, ends_branch, make_cycle(owner, beside)
+        )
+
+    strands: list[Strand | None] = [None] * n_wheels
+    for reach in reaches:
+        own = np.flatnonzero(whole.owners == reach.owner)
+        placed = [
+            (zero.bracket[0] + zero.place, border(name, zero, reach.owner, False))
+            for name, zero in inner
+            if zero.bracket[0] in own
+        ]
+        endings = []
+        for end in (0, 1):
+            zero = ends.get((reach.owner, end))
+            if zero is None:
+                endings.append(Ending(int(tracks.ending[reach.owner, end])).meaning)
+                continue
+            last = border(zero.bracket[2], zero, reach.owner, True)
+            placed.append((own[0] - 1.0 if end == 0 else own[-1] + 1.0, last))
+            endings.append(f"{last.name.replace('_', ' ')} at {last.value:.9g} ends it.")
+        borders = tuple(b for _, b in sorted(placed, key=lambda pair: pair[0]))
+        strands[reach.owner] = Strand(
+            _taken(whole.points, own), _taken(whole.table, own), borders, (endings[0], endings[1])
+        )
+    return strands

@@ -1,0 +1,32 @@
+"""Gaits that repeat: found, checked and differentiated, each rung by its own means."""
+
+from vrw_jax.cycles.cycle import LimitCycle, _limit_cycle, limit_cycle
+from vrw_jax.cycles.ground import MOVED, cycle_of, ground_gait, told, values_of
+from vrw_jax.cycles.options import CycleOptions
+from vrw_jax.cycles.premises import TAKE_OFF, default_margins, measure, takeoff_acceleration
+from vrw_jax.cycles.search import Located, Problem, correction_size, nothing_known, surface_start
+from vrw_jax.cycles.section_cycle import WalkedCycle
+from vrw_jax.cycles.sensitivity import sensitivities
+
+__all__ = [
+    "MOVED",
+    "TAKE_OFF",
+    "CycleOptions",
+    "LimitCycle",
+    "Located",
+    "Problem",
+    "WalkedCycle",
+    "_limit_cycle",
+    "correction_size",
+    "cycle_of",
+    "default_margins",
+    "ground_gait",
+    "limit_cycle",
+    "measure",
+    "nothing_known",
+    "sensitivities",
+    "surface_start",
+    "takeoff_acceleration",
+    "told",
+    "values_of",
+]

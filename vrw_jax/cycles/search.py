@@ -1,0 +1,385 @@
+"""Finding limit cycles of many wheels at once: starts, Newton's method, sign checks, retries.
+
+Newton's method on the collocation system converges to formal solutions as gladly as to gaits, so a
+cycle counts as found only if every sign that its sequence of phases presumes holds at all nodes.
+Wheels still without a cycle after an attempt are packed together for the next one.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import export, lax
+from jaxtyping import Array, Bool, Inexact, Int
+
+from vrw_jax import simd
+from vrw_jax.cycles import sequence as sequences
+from vrw_jax.cycles import surface as gait_surface
+from vrw_jax.cycles.options import CycleOptions
+from vrw_jax.numerics import (
+    N_NODES,
+    LaneArray,
+    Linearised,
+    Mesh,
+    PhaseSequence,
+    Solution,
+    from_blocks,
+    fusion_barrier,
+    linearised_pass,
+    mesh_error,
+    to_blocks,
+    walk_through,
+)
+from vrw_jax.wheel import WheelParams, parameters_of, wheel_of
+
+Parameters = Inexact[Array, "n_parameters lanes"]
+"""The float parameters in the order of PARAMETER_NAMES."""
+
+
+class Problem(NamedTuple):
+    """What is static in a search: which phases, how many steps, how finely cut."""
+
+    n_legs: int
+    period_n: int
+    options: CycleOptions
+
+    @property
+    def sequence(self) -> PhaseSequence:
+        return sequences.held_landing(self.n_legs)
+
+    @property
+    def meshes(self) -> tuple[Mesh, ...]:
+        dls, sls1, sls2 = self.options.steps
+        return Mesh(dls, 1.0), Mesh(sls1, self.options.growth), Mesh(sls2, 1.0)
+
+    @property
+    def constants_of(self) -> Callable:
+        return functools.partial(sequences.constants_of, self.n_legs)
+
+    def pass_at(
+        self, parameters: Parameters, located: "Located", wanted: tuple[int, ...] = ()
+    ) -> Linearised:
+        """The linearised pass at a located solution."""
+        return linearised_pass(
+            self.sequence,
+            self.meshes,
+            self.constants_of,
+            parameters,
+            located.solution,
+            located.happens > 0.5,
+            wanted,
+        )
+
+
+class Located(NamedTuple):
+    """A solution of the collocation system, with what selects it. Floats only, lanes last."""
+
+    solution: Solution
+    happens: LaneArray  # (n, n_phases, lanes): 1 where the phase takes place, else 0
+    found: LaneArray  # (lanes,): 1 for a limit cycle, 0 where there is none and values stand in
+    ends: LaneArray  # (n, 4, lanes): theta, L1 and their rates at the end of each step
+
+
+class Finding(NamedTuple):
+    """The result of a search, lanes last."""
+
+    located: Located
+    monodromy: LaneArray  # (row, column, lanes)
+    residual: LaneArray  # size of Newton's last correction
+    passes: Int[Array, " lanes"]  # linearised passes spent
+
+
+for _type in (Solution, Located, Finding):
+    export.register_namedtuple_serialization(_type, serialized_name=f"vrw_jax.{_type.__name__}")
+
+
+def surface_start(problem: Problem, parameters: Parameters, with_dls: Array) -> Located:
+    """The gait that the stored surface predicts; without DLS its duration goes to SLS-I."""
+    predicted = gait_surface.start(wheel_of(parameters, problem.n_legs), problem.meshes)
+    first, second, third = predicted.durations[0]
+    durations = jnp.stack(
+        [jnp.where(with_dls, first, 0.0), jnp.where(with_dls, second, first + second), third]
+    )
+    start = start_from(problem, predicted.section, durations, with_dls)
+    accelerations = tuple(
+        jnp.broadcast_to(jnp.where(with_dls, a, 0.0), like.shape)
+        for a, like in zip(predicted.accelerations, start.solution.accelerations, strict=True)
+    )
+    return start._replace(solution=start.solution._replace(accelerations=accelerations))
+
+
+def start_from(problem: Problem, section: Array, durations: Array, with_dls: Array) -> Located:
+    """Section and durations of one step, repeated; accelerations zero."""
+    n, n_phases = problem.period_n, len(problem.sequence.phases)
+    lanes = section.shape[-1]
+    accelerations = tuple(
+        jnp.zeros((n, mesh.n_steps, N_NODES, phase.dim, lanes), section.dtype)
+        for phase, mesh in zip(problem.sequence.phases, problem.meshes, strict=True)
+    )
+    first = jnp.where(with_dls, 1.0, 0.0).astype(section.dtype)
+    others = jnp.ones((n, n_phases - 1, lanes), section.dtype)
+    happens = jnp.concatenate([jnp.broadcast_to(first, (n, 1, lanes)), others], 1)
+    durations = jnp.broadcast_to(durations, (n, n_phases, lanes))
+    solution = Solution(section, durations, accelerations)
+    return Located(solution, happens, *nothing_known(problem, section))
+
+
+def nothing_known(problem: Problem, section: Array) -> tuple[Array, Array]:
+    """`found` and `ends` of a start."""
+    lanes, n_ends = section.shape[1:], 2 * problem.sequence.phases[-1].dim
+    zeros = lambda *shape: jnp.zeros((*shape, *lanes), section.dtype)
+    return zeros(), zeros(problem.period_n, n_ends)
+
+
+def over_rows(combine: Callable[[Array, Array], Array], x: Array) -> LaneArray:
+    """Reduction over all axes but the lanes, by halves: XLA's own runs along the wrong axis."""
+    if simd.tracing():
+        whole = jnp.max if combine is jnp.maximum else jnp.min
+        return whole(x, axis=tuple(range(x.ndim - 1)))
+    rows = x.reshape(-1, x.shape[-1])
+    while rows.shape[0] > 1:
+        half = rows.shape[0] // 2
+        rest = rows[2 * half :]
+        rows = jnp.concatenate([combine(rows[:half], rows[half : 2 * half]), rest])
+    return rows[0]
+
+
+def correction_size(solution: Solution, correction: Solution) -> LaneArray:
+    """Largest entry of a correction, accelerations weighed by their effect on positions."""
+    largest = functools.partial(over_rows, jnp.maximum)
+    size = jnp.maximum(largest(jnp.abs(correction.section)), largest(jnp.abs(correction.durations)))
+    for i, change in enumerate(correction.accelerations):
+        duration = largest(jnp.abs(solution.durations[:, i]))
+        size = jnp.maximum(size, largest(jnp.abs(change)) * duration**2)
+    return size
+
+
+def _limited(solution: Solution, correction: Solution) -> LaneArray:
+    """The share of a correction that moves no number of the section and no duration too far."""
+    step_time = jnp.sum(solution.durations, 1, keepdims=True)
+    room = jnp.concatenate(
+        [
+            0.15 * jnp.abs(solution.section) + 0.05,
+            (0.25 * jnp.abs(solution.durations) + 0.02 * jnp.abs(step_time)).reshape(
+                -1, solution.section.shape[-1]
+            ),
+        ]
+    )
+    change = jnp.concatenate(
+        [correction.section, correction.durations.reshape(-1, solution.section.shape[-1])]
+    )
+    tiny = jnp.finfo(change.dtype).tiny
+    share = over_rows(jnp.minimum, room / jnp.maximum(jnp.abs(change), tiny))
+    return jnp.minimum(1.0, share)
+
+
+def columns_of(passed: Linearised, located: Located) -> Located:
+    """The columns of a pass; what selects a solution has none."""
+    flat = lambda x: jnp.zeros((passed.d_ends.shape[0], *x.shape), x.dtype)
+    return Located(passed.columns, flat(located.happens), flat(located.found), passed.d_ends)
+
+
+class _Iterate(NamedTuple):
+    iteration: Int[Array, ""]
+    located: Located
+    monodromy: LaneArray
+    residual: LaneArray
+    converged: Bool[Array, " lanes"]
+    running: Bool[Array, " lanes"]
+    passes: Int[Array, " lanes"]
+
+
+def newton(
+    problem: Problem,
+    parameters: Parameters,
+    start: Located,
+    origin: Parameters,
+    stages: Array,
+    iterations: Array | int,
+    pending: Bool[Array, " lanes"],
+) -> Finding:
+    """Newton's method with limited steps on the lanes that are `pending`.
+
+    During the first `stages` iterations the parameters move from `origin` to where they belong. A
+    lane that converged stands still, so that its result does not depend on its neighbours.
+    """
+    options = problem.options
+    size = problem.sequence.section_size
+    lanes = parameters.shape[-1]
+    floor = 1e3 * jnp.finfo(parameters.dtype).eps
+    tolerance = max(options.tolerance, float(floor))
+
+    def iterate(now: _Iterate) -> _Iterate:
+        share = jnp.minimum(1.0, (now.iteration + 1) / jnp.maximum(stages, 1)).astype(
+            parameters.dtype
+        )
+        arrived = share >= 1.0
+        here = jnp.where(arrived, parameters, origin + share * (parameters - origin))
+        solution = now.located.solution
+        passed = problem.pass_at(here, now.located)
+        correction = passed.correction
+        step_size = correction_size(solution, correction)
+        sound = jnp.isfinite(step_size)
+        share_of_step = _limited(solution, correction)
+        moves = now.running & sound
+        take = lambda new, old: jnp.where(moves, new, old)
+
+        def moved(x: Array, change: Array) -> Array:
+            return jnp.where(moves, x + share_of_step * jnp.where(moves, change, 0.0), x)
+
+        converged = moves & arrived & (step_size < tolerance)
+        located = now.located._replace(
+            solution=jax.tree.map(moved, solution, correction),
+            ends=take(passed.ends, now.located.ends),
+        )
+        return _Iterate(
+            iteration=now.iteration + 1,
+            located=located,
+            monodromy=take(passed.monodromy, now.monodromy),
+            residual=take(step_size, now.residual),
+            converged=now.converged | converged,
+            running=moves & ~converged,
+            passes=now.passes + now.running,
+        )
+
+    first = _Iterate(
+        iteration=jnp.zeros((), jnp.int32),
+        located=start,
+        monodromy=jnp.zeros((size, size, lanes), parameters.dtype),
+        residual=jnp.ones((lanes,), parameters.dtype),
+        converged=jnp.zeros((lanes,), bool),
+        running=pending,
+        passes=jnp.zeros((lanes,), jnp.int32),
+    )
+    going = lambda now: jnp.any(now.running) & (now.iteration < iterations + stages)
+    last = lax.while_loop(going, iterate, first)
+    found = last.converged & signs_hold(problem, parameters, last.located)
+    located = last.located._replace(found=found.astype(parameters.dtype))
+    return Finding(located, last.monodromy, last.residual, last.passes)
+
+
+def signs_hold(problem: Problem, parameters: Parameters, located: Located) -> Bool[Array, " lanes"]:
+    """Whether durations, guards at all nodes and the checks at all borders are positive.
+
+    And whether the mesh resolves the gait at all.
+    """
+    sequence = problem.sequence
+    constants = problem.constants_of(*parameters)
+    solution = located.solution
+    hold = fusion_barrier(parameters)
+
+    def step(carry: tuple, inputs: tuple) -> tuple:
+        section, good = carry
+        durations, accelerations, happens = inputs
+        happens = happens > 0.5
+        following, passages = walk_through(
+            sequence, problem.meshes, constants, tuple(section), durations, accelerations
+        )
+        for i, (phase, passage) in enumerate(zip(sequence.phases, passages, strict=True)):
+            start, nodes, end = (
+                functools.reduce(jnp.minimum, phase.guards(constants, point)) for point in passage
+            )
+            inside = jnp.minimum(start, over_rows(jnp.minimum, hold(nodes))) > 0.0
+            inside &= (durations[i] > 0.0) & (end > -ZERO_AT_EVENT)
+            good &= inside | ~happens[i]
+        for check in sequence.border_checks(constants, passages, happens):
+            good &= check > 0.0
+        return (jnp.stack(following), good), None
+
+    inputs = (solution.durations, solution.accelerations, located.happens)
+    carry = (solution.section, jnp.ones(parameters.shape[-1:], bool))
+    (_, good), _ = lax.scan(step, carry, inputs)
+    return good & (mesh_error(sequence, problem.meshes, solution) < LARGEST_MESH_ERROR)
+
+
+def search(
+    problem: Problem,
+    parameters: Parameters,
+    guess: Located | None = None,
+) -> Finding:
+    """A limit cycle for each lane, by several attempts in turn; see ATTEMPTS.
+
+    Parameters must be usable.
+    """
+    options = problem.options
+    n_lanes = parameters.shape[-1]
+    block = min(options.block, n_lanes)
+    table_1 = parameters_of(WheelParams(n_legs=problem.n_legs)).astype(parameters.dtype)
+    iterations = dict.fromkeys(ATTEMPTS, options.iterations) | {
+        "guess": options.first_iterations, "surface": options.first_iterations
+    }  # fmt: skip
+    limits = jnp.asarray([iterations[name] for name in ATTEMPTS], jnp.int32)
+    is_now = lambda attempt, name: attempt == ATTEMPTS.index(name)
+
+    def start_of(attempt: Array, parameters: Parameters) -> tuple[Located, Array, Array]:
+        origin = jnp.broadcast_to(table_1[:, None], parameters.shape)
+        is_homotopy = is_now(attempt, "homotopy")
+        place = jnp.where(is_homotopy, origin, parameters)
+        with_dls = jnp.broadcast_to(~is_now(attempt, "without DLS"), parameters.shape[-1:])
+        stages = jnp.where(is_homotopy, options.stages, 0)
+        return surface_start(problem, place, with_dls), origin, stages
+
+    def attempt_block(
+        attempt: Array, parameters: Parameters, now: Finding, guess: Located | None
+    ) -> Finding:
+        start, origin, stages = start_of(attempt, parameters)
+        goes_on = is_now(attempt, "guess, on") | is_now(attempt, "surface, on")
+        start = jax.tree.map(lambda s, n: jnp.where(goes_on, n, s), start, now.located)
+        if guess is not None:
+            is_guess = is_now(attempt, "guess")
+            start = jax.tree.map(lambda s, g: jnp.where(is_guess, g, s), start, guess)
+        pending = now.located.found < 0.5
+        tried = newton(problem, parameters, start, origin, stages, limits[attempt], pending)
+        chosen = jax.tree.map(lambda a, b: jnp.where(pending, a, b), tried, now)
+        return chosen._replace(passes=now.passes + tried.passes)
+
+    def attempt_all(attempt: Array, now: Finding) -> Finding:
+        if n_lanes <= block or simd.tracing():
+            return attempt_block(attempt, parameters, now, guess)
+        order = jnp.argsort(now.located.found, stable=True)
+        everything = jax.tree.map(lambda x: x[..., order], (parameters, now, guess))
+
+        def one(inputs: tuple) -> Finding:
+            parameters, now, guess = inputs
+            return lax.cond(
+                jnp.any(now.located.found < 0.5),
+                lambda: attempt_block(attempt, parameters, now, guess),
+                lambda: now,
+            )
+
+        after = from_blocks(lax.map(one, to_blocks(everything, block)), n_lanes)
+        back = jnp.argsort(order)
+        return jax.tree.map(lambda x: x[..., back], after)
+
+    first = jnp.asarray(ATTEMPTS.index("surface" if guess is None else "guess"), jnp.int32)
+    nothing = not_searched(problem, parameters)
+    more = lambda c: (c[0] < len(ATTEMPTS)) & jnp.any(c[1].located.found < 0.5)
+    _, finding = lax.while_loop(more, lambda c: (c[0] + 1, attempt_all(*c)), (first, nothing))
+    return finding
+
+
+def not_searched(problem: Problem, parameters: Parameters) -> Finding:
+    """What is known before a search: nothing."""
+    size, n_phases = problem.sequence.section_size, len(problem.sequence.phases)
+    zeros = lambda *shape: jnp.zeros((*shape, parameters.shape[-1]), parameters.dtype)
+    return Finding(
+        start_from(problem, zeros(size), zeros(n_phases), zeros() > 0.0),
+        zeros(size, size),
+        zeros() + jnp.inf,
+        zeros().astype(jnp.int32),
+    )
+
+
+ZERO_AT_EVENT = 1e-6
+"""How far below zero a guard may be at the end of the phase that it ends, N, m or rad/s."""
+
+LARGEST_MESH_ERROR = 1e-5
+"""Estimate above which a solution does not count as found: the errors themselves stay below, in all
+of some hundred random wheels, and mostly by far."""
+
+ATTEMPTS = ("guess", "guess, on", "surface", "surface, on", "homotopy", "without DLS")
+"""In turn: from the guess, if any; from the gait that the stored surface predicts; by a homotopy
+from Table 1; and for a cycle without double support. The first two begin with a few iterations, so
+that in a batch the lanes that need more can be gathered in blocks of their own."""

@@ -1,0 +1,103 @@
+"""Where gaits are: a cubic surface through gaits of many wheels, as the start of every search.
+
+Lengths are in L0, times in sqrt(L0 / g), masses in the total mass, so that a wheel of any size
+finds its start here. The surface was fitted by experiments/fit_gait_surface.py to the gaits that a
+continuation from Table 1 reaches, for Table 1's mass ratio, centre of mass and eight legs; it is
+right to about 1 % there and, clipped to its range, a start for a homotopy elsewhere.
+"""
+
+import functools
+import importlib.resources
+import itertools
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from vrw_jax.numerics import N_NODES, Elementwise, Mesh, Solution, transfer_matrix
+from vrw_jax.wheel import WheelParams
+
+MESHES = (Mesh(2, 1.0), Mesh(4, 2.0), Mesh(1, 1.0))
+"""Meshes that the surface's accelerations are for: DLS, SLS-I, SLS-II."""
+DIMENSIONS = (1, 3, 2)
+DEGREE = 3
+
+
+class Surface(NamedTuple):
+    """Coefficients (monomial, unknown) over centred coordinates, and the range they hold in."""
+
+    centre: np.ndarray
+    spread: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    coefficients: np.ndarray
+
+
+@functools.cache
+def surface() -> Surface:
+    """The stored surface."""
+    file = importlib.resources.files("vrw_jax.cycles") / "surface.npz"
+    with file.open("rb") as stream, np.load(stream) as arrays:
+        return Surface(**{name: arrays[name] for name in Surface._fields})
+
+
+def pace(params: WheelParams) -> Elementwise:
+    """The wheel's unit of time, sqrt(L0 / g), s."""
+    return jnp.sqrt(params.locked_length / params.gravity)
+
+
+def coordinates(params: WheelParams) -> tuple[Elementwise, ...]:
+    """Root of damping, stiffness, natural length and slope, unitless."""
+    mass = params.hub_mass + params.n_legs * params.leg_mass
+    length, gravity = params.locked_length, params.gravity
+    return (
+        jnp.sqrt(params.damping * pace(params) / mass),
+        params.stiffness * length / (mass * gravity),
+        params.natural_length / length,
+        params.slope,
+    )
+
+
+def monomials(centred: tuple[Elementwise, ...]) -> list[Elementwise]:
+    """All products of up to DEGREE coordinates."""
+    products = []
+    for degree in range(DEGREE + 1):
+        for factors in itertools.combinations_with_replacement(centred, degree):
+            product = jnp.ones_like(centred[0])
+            for factor in factors:
+                product = product * factor
+            products.append(product)
+    return products
+
+
+def start(params: WheelParams, meshes: tuple[Mesh, ...]) -> Solution:
+    """Section, durations and accelerations on `meshes` of the surface's gait, lanes last."""
+    fit = surface()
+    numbers = (x.tolist() for x in fit[:4])  # plain floats keep the format of the parameters
+    centred = tuple(
+        (jnp.clip(x, low, high) - centre) / spread
+        for x, centre, spread, low, high in zip(coordinates(params), *numbers, strict=True)
+    )
+    features = jnp.stack(monomials(centred))
+    values = jnp.tensordot(jnp.asarray(fit.coefficients.T, features.dtype), features, 1)
+    unit = pace(params)
+    section = jnp.stack([values[0], values[1] / unit])
+    durations = values[None, 2:5] * unit
+    accelerations, first = [], 5
+    for dim, own, mesh in zip(DIMENSIONS, MESHES, meshes, strict=True):
+        size = own.n_steps * N_NODES * dim
+        flat = values[first : first + size].reshape(-1, dim, *features.shape[1:])
+        first += size
+        matrix = jnp.asarray(transfer_matrix(own, mesh), features.dtype)
+        scale = _acceleration_scale(dim, params, unit)
+        moved = jnp.tensordot(matrix, flat, 1) * scale
+        accelerations.append(moved.reshape(1, mesh.n_steps, N_NODES, *moved.shape[1:]))
+    return Solution(section, durations, tuple(accelerations))
+
+
+def _acceleration_scale(dim: int, params: WheelParams, unit: Elementwise) -> Array:
+    """Units of (theta, L1, L2) over time squared."""
+    angle = 1.0 / unit**2
+    length = params.locked_length / unit**2
+    return jnp.stack([angle, length, length][:dim])

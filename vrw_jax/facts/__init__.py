@@ -1,6 +1,0 @@
-"""The paper's facts, published against found."""
-
-from vrw_jax.facts.base import Evidence, Fact
-from vrw_jax.facts.table import as_markdown, facts, write
-
-__all__ = ["Evidence", "Fact", "as_markdown", "facts", "write"]

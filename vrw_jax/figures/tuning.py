@@ -1,0 +1,123 @@
+"""Pictures of tuning: the path, and what every constraint had left at its start and end."""
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from vrw_jax.cycles import measure
+from vrw_jax.figures.walk import GREY, LIGHT, PAGE, style
+from vrw_jax.results import MEASURES
+from vrw_jax.tuning import ACTIVE, Kind, Tuned
+
+ROW = 0.19
+"""Height of a constraint's row, inches."""
+
+
+def tuning(tuned: Tuned) -> Figure:
+    """Objective and parameters over the gaits evaluated; slack of the constraints before and after.
+
+    Filled symbols keep every constraint, open ones break one; crosses are trials that lost the gait
+    and were shortened.
+    """
+    path = tuned.path
+    n = path.sizes["constraint"]
+    with style():
+        figure = Figure(figsize=(PAGE, max(3.2, ROW * n + 1.0)))
+        panels = figure.subplot_mosaic(
+            [["objective", "slack"], ["parameters", "slack"]], width_ratios=[1.0, 1.1]
+        )
+        panels["objective"].sharex(panels["parameters"])
+        _objective(panels["objective"], path)
+        _parameters(panels["parameters"], path)
+        _slack(panels["slack"], tuned)
+    return figure
+
+
+def _objective(axes: Axes, path: xr.Dataset) -> None:
+    number, value = path.evaluation.values, path.objective.values
+    lost = path.kind.values == Kind.LOST
+    axes.plot(number[~lost], value[~lost], color=GREY, linewidth=0.7, zorder=1)
+    for kept, fill in ((True, "#0072B2"), (False, "white")):
+        chosen = ~lost & ((path.breach.values <= ACTIVE) == kept)
+        axes.plot(
+            number[chosen],
+            value[chosen],
+            "o",
+            color="#0072B2",
+            markerfacecolor=fill,
+            markersize=4.0,
+            markeredgewidth=0.8,
+            label="keeps the constraints" if kept else "breaks one",
+        )
+    if lost.any():
+        for i, place in enumerate(number[lost]):
+            axes.axvline(
+                place, color="#D55E00", linewidth=0.8, linestyle=":",
+                label="gait lost, step shortened" if i == 0 else None,
+            )  # fmt: skip
+    name = path.objective.attrs["long_name"]
+    if name in MEASURES:
+        unit = MEASURES[name].unit
+        name = MEASURES[name].long_name + (f" [{unit}]" if unit != "1" else "")
+    axes.set_ylabel(name)
+    axes.legend(loc="best", fontsize=7.0)
+
+
+def _parameters(axes: Axes, path: xr.Dataset) -> None:
+    lower, upper = np.asarray(path.attrs["lower"]), np.asarray(path.attrs["upper"])
+    for i, name in enumerate(path.attrs["free"]):
+        u = (path[name].values - lower[i]) / (upper[i] - lower[i])
+        symbol = MEASURES[name].symbol
+        axes.plot(path.evaluation, u, marker=".", markersize=4.0, label=f"${_tex(symbol)}$")
+    axes.set_ylim(-0.05, 1.05)
+    axes.set_yticks([0.0, 1.0], ["lower\nbound", "upper\nbound"])
+    axes.set_xlabel("gaits evaluated")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+
+
+def _tex(symbol: str) -> str:
+    return {"phi": "\\varphi", "L*": "L^*", "L_0": "L_0"}.get(symbol, symbol)
+
+
+def _slack(axes: Axes, tuned: Tuned) -> None:
+    path = tuned.path
+    names = [str(name) for name in path.constraint.values]
+    values = path.constraint_value.values
+    margin = path.margin.values
+    last = np.nanargmin(
+        np.sum(
+            [
+                np.abs(path[name].values / float(getattr(tuned.params, name)) - 1.0)
+                for name in path.attrs["free"]
+            ],
+            axis=0,
+        )
+    )
+    with np.errstate(invalid="ignore"):
+        scale = np.maximum(np.nanmax(np.abs(values - margin), axis=0), 1e-12)
+    places = np.arange(len(names))[::-1]
+    held = {active.name for active in tuned.active}
+    for share, offset, tone, text in (
+        ((values[0] - margin) / scale, 0.19, LIGHT, "at the start"),
+        ((values[last] - margin) / scale, -0.19, "#0072B2", "tuned"),
+    ):
+        axes.barh(
+            places + offset, share, 0.36, color=tone, label=text, edgecolor=GREY, linewidth=0.3
+        )
+    axes.axvline(0.0, color="black", linewidth=0.6)
+    texts = []
+    for name in names:
+        plain, _, leg = name.partition("[")
+        long_name = measure(plain).long_name.replace("⁺", "$^+$")
+        texts.append(f"{long_name}{', ' + leg[:-1] if leg else ''}")
+    axes.set_yticks(places, texts, fontsize=7.0)
+    for tick, name in zip(axes.get_yticklabels(), names, strict=True):
+        if name in held:
+            tick.set_color("#D55E00")
+            tick.set_fontweight("bold")
+    axes.set_xlim(min(-0.05, axes.get_xlim()[0]), 1.05)
+    axes.set_xlabel("slack, share of the largest on the path\n(active in bold)")
+    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)

@@ -1,0 +1,314 @@
+"""Which foot sticks, slides or lifts, and which loaded leg is on its stopper: by enumeration.
+
+Every combination of contact modes and stoppers of the two slots is solved; admissible are those
+whose forces push, whose friction lies in Coulomb's cone and against the slip, and whose open
+constraints don't close. Among several the one with most sticking feet is taken. The same table
+serves impacts (impulses and velocities after them) and motion (forces and accelerations).
+
+Infinite friction is no law but a rule of selection: a foot sticks if that needs no pull, else it
+lifts, and only where neither is possible it slides, without friction.
+"""
+
+import itertools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Int
+
+from vrw_jax.models.unilateral.mechanics import Free, Hub, Pair, Vector3, kept
+from vrw_jax.numerics import Elementwise, Scalar
+from vrw_jax.wheel import Symbols
+
+OFF, STICK, SLIP_DOWN, SLIP_UP = 0, 1, 2, 3
+"""Contact modes of a foot: in the air, at rest, sliding downhill, sliding uphill."""
+
+
+class Answer(NamedTuple):
+    """Forces (N) and accelerations they leave, or impulses (N s) and velocities after them."""
+
+    tangential: Pair  # on each slot's foot, downhill positive
+    normal: Pair  # pushing positive
+    stopper: Pair  # of each slot's leg, pushing positive
+    pull: Pair  # sum of stopper and foot force along u: what acts on the leg's mass
+    hub: Vector3
+    length: Pair  # of each slot's leg
+    foot_x: Pair  # of each slot's foot
+    foot_z: Pair
+
+
+Matrix = tuple[tuple[Any, Any], tuple[Any, Any]]
+
+
+def _solved(A: Matrix, b: Pair) -> Pair:
+    determinant = A[0][0] * A[1][1] - A[0][1] * A[1][0]
+    scale = 1.0 / jnp.where(determinant == 0.0, jnp.nan, determinant)
+    return (
+        (A[1][1] * b[0] - A[0][1] * b[1]) * scale,
+        (A[0][0] * b[1] - A[1][0] * b[0]) * scale,
+    )
+
+
+def _matrix(entry: Any) -> Matrix:
+    return ((entry(0, 0), entry(0, 1)), (entry(1, 0), entry(1, 1)))
+
+
+def _pair(entry: Any) -> Pair:
+    return entry(0), entry(1)
+
+
+def answer(
+    s: Symbols, hub: Hub, free: Free, contact: Array, held: Array, friction: Elementwise
+) -> Answer:
+    """Solve one combination: contact modes and stoppers of the two slots, shape (2,) each.
+
+    A sticking foot is at rest, a sliding one keeps its height with friction against the slip, a
+    held leg keeps its length. The unknown of a foot is its force along e (sticks) or its normal
+    force (slides). Stoppers are eliminated first, by a system that is always regular.
+    """
+    sin, cos, m_inv = hub.sin, hub.cos, 1.0 / s.m
+    rough = jnp.where(jnp.isfinite(friction), friction, 0.0)
+    stick = _pair(lambda i: contact[i] == STICK)
+    slip = _pair(lambda i: (contact[i] == SLIP_DOWN) | (contact[i] == SLIP_UP))
+    drag = _pair(lambda i: jnp.where(contact[i] == SLIP_DOWN, -rough, rough))
+    chosen = lambda i, sticks, slides: jnp.where(stick[i], sticks, jnp.where(slip[i], slides, 0.0))
+    to_e = _pair(lambda i: chosen(i, 1.0, drag[i] * cos[i] - sin[i]))
+    to_u = _pair(lambda i: chosen(i, 0.0, drag[i] * sin[i] + cos[i]))
+    row_e = _pair(lambda i: chosen(i, 1.0, -sin[i]))
+    row_u = _pair(lambda i: chosen(i, 0.0, cos[i] * m_inv))
+    loose = _pair(lambda i: jnp.where(stick[i], 0.0, m_inv))
+    G = ((hub.G[0], hub.G[1]), (hub.G[1], hub.G[2]))
+    H = ((hub.H[0], hub.H[1]), (hub.H[2], hub.H[3]))
+    K = ((hub.K[0], hub.K[1]), (hub.K[1], hub.K[2]))
+    here = lambda i, j: 1.0 if i == j else 0.0
+
+    # Stoppers: N s = p + P c, the row of an open one being s = 0.
+    N = _matrix(lambda i, j: jnp.where(held[i], K[i][j] + here(i, j) * loose[i], here(i, j)))
+    grows = _pair(
+        lambda i: (
+            sin[i] * free.hub[0]
+            + cos[i] * free.hub[1]
+            + free.own[i]
+            + jnp.where(stick[i], free.u[i], 0.0)
+        )
+    )
+    p = _pair(lambda i: jnp.where(held[i], grows[i], 0.0))
+    P = _matrix(
+        lambda i, j: jnp.where(held[i], H[i][j] * to_e[j] - here(i, j) * to_u[i] * m_inv, 0.0)
+    )
+    one = 1.0 + 0.0 * lax.stop_gradient(free.hub[2])
+    p, P, N = kept((p, P, N), one)
+    s_free = _solved(N, p)
+    columns = _pair(lambda j: _solved(N, (P[0][j], P[1][j])))  # columns[j][k] = ds_k / dc_j
+
+    s_free, columns = kept((s_free, columns), one)
+    # Feet: their rows with the stoppers inserted; an unloaded foot has c = 0.
+    R = _matrix(lambda i, k: here(i, k) * row_u[i] - row_e[i] * H[k][i])
+    C = _matrix(
+        lambda i, j: (
+            row_e[i] * G[i][j] * to_e[j]
+            + here(i, j) * row_u[i] * to_u[i]
+            + R[i][0] * columns[j][0]
+            + R[i][1] * columns[j][1]
+            + here(i, j) * jnp.where(stick[i] | slip[i], 0.0, 1.0)
+        )
+    )
+    c = _solved(
+        C,
+        _pair(
+            lambda i: (
+                -row_e[i] * free.e[i]
+                - row_u[i] * s.m * free.u[i]
+                - R[i][0] * s_free[0]
+                - R[i][1] * s_free[1]
+            )
+        ),
+    )
+    stopper = _pair(lambda k: s_free[k] + columns[0][k] * c[0] + columns[1][k] * c[1])
+    along_e = _pair(lambda i: to_e[i] * c[i])
+    along_u = _pair(lambda i: jnp.where(stick[i], -s.m * free.u[i] - stopper[i], to_u[i] * c[i]))
+    stopper, along_e, along_u = kept((stopper, along_e, along_u), one)
+    pull = _pair(lambda i: along_u[i] + stopper[i])
+    z, y = hub.along_e, hub.along_u
+    moved = [
+        free.hub[k]
+        + z[0][k] * along_e[0]
+        + z[1][k] * along_e[1]
+        - y[0][k] * stopper[0]
+        - y[1][k] * stopper[1]
+        for k in range(3)
+    ]
+    foot_e = _pair(
+        lambda i: (
+            cos[i] * (moved[0] - free.hub[0])
+            - sin[i] * (moved[1] - free.hub[1])
+            - hub.L[i] * (moved[2] - free.hub[2])
+            + free.e[i]
+        )
+    )
+    foot_u = _pair(lambda i: free.u[i] + pull[i] * m_inv)
+    length = _pair(
+        lambda i: jnp.where(
+            held[i], 0.0, sin[i] * moved[0] + cos[i] * moved[1] + free.own[i] - pull[i] * m_inv
+        )
+    )
+    return Answer(
+        tangential=_pair(lambda i: along_e[i] * cos[i] + along_u[i] * sin[i]),
+        normal=_pair(lambda i: along_u[i] * cos[i] - along_e[i] * sin[i]),
+        stopper=stopper,
+        pull=pull,
+        hub=(moved[0], moved[1], moved[2]),
+        length=length,
+        foot_x=_pair(lambda i: foot_e[i] * cos[i] + foot_u[i] * sin[i]),
+        foot_z=_pair(lambda i: foot_u[i] * cos[i] - foot_e[i] * sin[i]),
+    )
+
+
+def _table() -> tuple[np.ndarray, np.ndarray]:
+    """All combinations of modes and stoppers, most sticking feet first, then most sliding ones.
+
+    Two sticking feet on two held legs are left out: they fix the hub twice over, so their forces
+    are not determined.
+    """
+    rank = {STICK: 0, SLIP_DOWN: 1, SLIP_UP: 1, OFF: 2}
+    rows = [
+        (modes, held)
+        for modes in itertools.product((STICK, SLIP_DOWN, SLIP_UP, OFF), repeat=2)
+        for held in itertools.product((False, True), repeat=2)
+        if not (modes == (STICK, STICK) and all(held))
+    ]
+    rows.sort(key=lambda row: (sum(rank[m] for m in row[0]), sum(row[1])))
+    return np.array([r[0] for r in rows], np.int32), np.array([r[1] for r in rows])
+
+
+MODES, HELD = _table()
+"""Combinations in order of preference: contact modes and held stoppers, shape (63, 2) each."""
+ORDER_WITHOUT_SLIP = np.argsort(
+    [sum({STICK: 0, OFF: 2}.get(int(m), 5) for m in row) for row in MODES], kind="stable"
+)
+"""The order where friction is infinite: sliding comes last."""
+AT_ONCE = 8
+"""Combinations looked at together: most events allow no more."""
+
+
+class Allowed(NamedTuple):
+    """What may be chosen, and which signs are known without looking."""
+
+    contact: Bool[Array, "2 4"]  # modes of each slot's foot
+    held: Bool[Array, "2 2"]  # stopper open, held
+    stays: Bool[Array, "2"]  # the foot keeps its mode whatever it takes
+    known_contact: Bool[Array, "2 4"]  # lifts, sticks or slides that way without a test
+    known_open: Bool[Array, "2"]  # an open stopper needs no test: the leg is away from it
+
+
+class Choice(NamedTuple):
+    """The combination taken."""
+
+    contact: Int[Array, "2"]
+    held: Bool[Array, "2"]
+    answer: Answer
+    solutions: Int[Array, ""]  # admissible combinations
+
+
+class _Looked(NamedTuple):
+    """How far the table has been gone through."""
+
+    next: Int[Array, ""]  # of the combinations that may be chosen
+    best: Int[Array, ""]  # the first admissible one
+    solutions: Int[Array, ""]
+
+
+def choose(
+    s: Symbols, hub: Hub, free: Free, allowed: Allowed, friction: Scalar, counted: bool
+) -> Choice:
+    """The first admissible combination of the table; `solutions` is 0 where there is none.
+
+    All admissible ones are counted, or else none is looked at once one is found.
+    """
+    modes, held = jnp.asarray(MODES), jnp.asarray(HELD)
+    infinite = ~jnp.isfinite(friction)
+    rough = jnp.where(infinite, 0.0, friction)
+
+    given = lax.stop_gradient((s, hub, free, friction))
+
+    def admissible(contact: Array, on: Array) -> Array:
+        found = answer(*given[:3], contact, on, given[3])
+        good = jnp.asarray(True)
+        for i in range(2):
+            mode = contact[i]
+            known = jnp.take(allowed.known_contact[i], mode)
+            t, n, x, z = (
+                v[i] for v in (found.tangential, found.normal, found.foot_x, found.foot_z)
+            )
+            inside = infinite | (jnp.abs(t) <= rough * n)
+            direction = jnp.where(mode == SLIP_DOWN, x, -x)
+            sticks = known | ((n >= 0.0) & inside)
+            loaded = jnp.where(mode == STICK, sticks, (n >= 0.0) & (known | (direction >= 0.0)))
+            good &= allowed.stays[i] | jnp.where(mode == OFF, known | (z >= 0.0), loaded)
+            good &= jnp.where(
+                on[i], found.stopper[i] >= 0.0, allowed.known_open[i] | (found.length[i] <= 0.0)
+            )
+            good &= jnp.isfinite(n) & jnp.isfinite(t)
+        return good
+
+    may = jnp.stack([allowed.contact[i][modes[:, i]] for i in range(2)])
+    may = may & jnp.stack([allowed.held[i][held[:, i].astype(jnp.int32)] for i in range(2)])
+    order = jnp.where(infinite, jnp.asarray(ORDER_WITHOUT_SLIP), jnp.arange(len(MODES)))
+    rank = jnp.cumsum(jnp.all(may, axis=0)[order].astype(jnp.int32))
+    count = rank[-1]
+
+    def look(looked: _Looked) -> _Looked:
+        """At the next few combinations that may be chosen."""
+        nth = looked.next + jnp.arange(AT_ONCE)
+        row = order[jnp.minimum(jnp.sum(rank[None] <= nth[:, None], axis=1), len(MODES) - 1)]
+        good = jax.vmap(admissible)(modes[row], held[row]) & (nth < count)
+        found = jnp.where(jnp.any(good), row[jnp.argmax(good)], 0)
+        first = (looked.solutions == 0) & jnp.any(good)
+        return _Looked(
+            looked.next + AT_ONCE,
+            jnp.where(first, found, looked.best).astype(jnp.int32),
+            looked.solutions + jnp.sum(good, dtype=jnp.int32),
+        )
+
+    def goes_on(looked: _Looked) -> Array:
+        return (looked.next < count) & (counted | (looked.solutions == 0))
+
+    none = 0 * count
+    looked = lax.while_loop(goes_on, look, _Looked(none, none, none))
+    contact, on = modes[looked.best], held[looked.best]
+    return Choice(contact, on, answer(s, hub, free, contact, on, friction), looked.solutions)
+
+
+def leaves(
+    s: Symbols,
+    hub: Hub,
+    free: Free,
+    stance: tuple[Array, Array],
+    friction: Scalar,
+    second: Bool[Array, ""],
+    direction: Int[Array, ""],
+) -> Bool[Array, ""]:
+    """Whether a slot's foot, just let go by its present mode, would move the way it is let go.
+
+    `second`: which slot's; `direction`: 0 off the ground, 1 downhill, -1 uphill. The mode's margin
+    must grow with the acceleration that way: where it shrinks, the mode that follows would end
+    before it begins, and forces jump instead (Painlevé).
+    """
+    contact, held = stance
+    here = jnp.stack([~second, second]).astype(hub.sin[0].dtype)
+    sin, cos = (here[0] * pair[0] + here[1] * pair[1] for pair in (hub.sin, hub.cos))
+    off = direction == 0
+    e, u = jnp.where(off, -sin, direction * cos), jnp.where(off, cos, direction * sin)
+    shift = lambda pair, by: (pair[0] - by * here[0], pair[1] - by * here[1])
+    asked = free._replace(e=shift(free.e, e), u=shift(free.u, u))
+    rough = jnp.where(jnp.isfinite(friction), friction, 0.0)
+
+    def margin(given: Free) -> Array:
+        found = answer(s, hub, given, contact, held, friction)
+        normal = jnp.where(second, found.normal[1], found.normal[0])
+        tangential = jnp.where(second, found.tangential[1], found.tangential[0])
+        return jnp.where(off, normal, rough * normal + direction * tangential)
+
+    return margin(asked) > margin(free)

@@ -1,0 +1,270 @@
+"""The free wheel: hub and all legs as coordinates, and how its feet answer forces and impulses.
+
+Coordinates are the hub (x, z), the angle theta of Leg 1 and the n leg lengths. A leg couples with
+the hub alone, so the mass matrix is an arrow: eliminating the legs whose length is free leaves a
+3 x 3 system. Up to two *slots* hold the legs whose feet may be loaded; a foot's force acts in the
+leg's own directions u (foot to hub) and e = du/dtheta, and only its e part reaches the hub. The
+same equations serve accelerations and, with momenta in place of forces, impacts. All of it works
+element by element over lanes too, one more axis behind that of the legs.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from vrw_jax.numerics import Elementwise, Scalar, sine_cosine
+from vrw_jax.wheel import Symbols
+
+Legs = Float[Array, "n_legs ..."]
+Vector3 = tuple[Any, Any, Any]
+"""Components along hub x, hub z and theta."""
+Pair = tuple[Any, Any]
+"""One quantity of each slot."""
+
+
+class WheelMotion(NamedTuple):
+    """Posture and rates of the free wheel in the slope's frame."""
+
+    x: Scalar  # of the hub, m, downhill
+    z: Scalar  # of the hub above the slope, m
+    theta: Scalar  # of Leg 1, rad
+    vx: Scalar  # of the hub, m/s
+    vz: Scalar
+    dtheta: Scalar  # rad/s
+    L: Legs  # m
+    dL: Legs  # m/s
+
+
+class Legwise(NamedTuple):
+    """Directions of all legs, u = (sin, cos) and e = (cos, -sin)."""
+
+    sin: Legs
+    cos: Legs
+
+
+def directions(s: Symbols, theta: Elementwise) -> Legwise:
+    """Sine and cosine of every leg's angle, from one sine and one cosine."""
+    turn = (s.alpha * np.arange(s.n)).reshape(-1, *(1,) * jnp.ndim(theta))
+    sin, cos = sine_cosine(theta)
+    sin_turn, cos_turn = np.sin(turn), np.cos(turn)
+    return Legwise(sin * cos_turn + cos * sin_turn, cos * cos_turn - sin * sin_turn)
+
+
+def over_legs(values: Array) -> Array:
+    """Sum over legs, the first axis."""
+    return jnp.sum(values, axis=0)
+
+
+def kept(tree: Any, one: Array) -> Any:
+    """The same numbers, each divided by a `one` that only the program's run knows to be 1.
+
+    XLA's fusions on a CPU repeat chains of cheap operations for each user, which here multiplies
+    into a hundredfold; a division it computes once.
+    """
+    floats = lambda x: jnp.issubdtype(jnp.result_type(x), jnp.floating)
+    return jax.tree.map(lambda x: x / one if floats(x) else x, tree)
+
+
+def one_of(motion: "WheelMotion") -> Array:
+    """1, in a form that no compiler can know."""
+    return lax.stop_gradient(1.0 + 0.0 * motion.theta)
+
+
+class Slots(NamedTuple):
+    """The two legs whose feet may be loaded, fore first; an empty slot holds no leg."""
+
+    first: Bool[Array, "n_legs ..."]
+    second: Bool[Array, "n_legs ..."]
+
+    def of(self, values: Array) -> Pair:
+        """The slots' entries of a quantity of all legs; 0 for an empty slot."""
+        zero = jnp.zeros_like(values)
+        return (
+            over_legs(jnp.where(self.first, values, zero)),
+            over_legs(jnp.where(self.second, values, zero)),
+        )
+
+    def spread(self, pair: Any) -> Legs:
+        """The inverse of `of`: zero for legs in no slot."""
+        return jnp.where(self.first, pair[0], 0.0) + jnp.where(self.second, pair[1], 0.0)
+
+
+def slots_of(touching: Bool[Array, "n_legs ..."]) -> Slots:
+    """The first two of the touching legs."""
+    rank = jnp.cumsum(touching.astype(jnp.int32), axis=0)
+    return Slots(touching & (rank == 1), touching & (rank == 2))
+
+
+class Hub(NamedTuple):
+    """Inverse inertia that the slots' forces meet, and how they answer each other."""
+
+    legs: Legwise
+    released: Bool[Array, " n_legs"]  # legs eliminated: free in length, or in a slot
+    inverse: tuple[Any, ...]  # xx, xz, x theta, zz, z theta, theta theta
+    sin: Pair
+    cos: Pair
+    L: Pair
+    along_e: tuple[Vector3, Vector3]  # hub's answer to a unit force along e of each foot
+    along_u: tuple[Vector3, Vector3]  # to a unit pull of each stopper
+    G: tuple[Any, Any, Any]  # 11, 12, 22 of e to e
+    H: tuple[Any, Any, Any, Any]  # 11, 12, 21, 22 of stopper to e
+    K: tuple[Any, Any, Any]  # 11, 12, 22 of stopper to stopper
+
+
+def times(inverse: tuple[Any, ...], f: Vector3) -> Vector3:
+    """Symmetric 3 x 3 matrix times vector."""
+    xx, xz, xt, zz, zt, tt = inverse
+    return (
+        xx * f[0] + xz * f[1] + xt * f[2],
+        xz * f[0] + zz * f[1] + zt * f[2],
+        xt * f[0] + zt * f[1] + tt * f[2],
+    )
+
+
+def _inverse_inertia(s: Symbols, legs: Legwise, b: Legs, released: Array) -> tuple[Any, ...]:
+    sin = jnp.where(released, legs.sin, 0.0)
+    cos = jnp.where(released, legs.cos, 0.0)
+    xx = s.Mt - s.m * over_legs(sin * sin)
+    xz = -s.m * over_legs(sin * cos)
+    zz = s.Mt - s.m * over_legs(cos * cos)
+    xt = -s.m * over_legs(b * legs.cos)
+    zt = s.m * over_legs(b * legs.sin)
+    tt = s.m * over_legs(b * b)
+    c_xx, c_xz, c_xt = zz * tt - zt * zt, xt * zt - xz * tt, xz * zt - zz * xt
+    scale = 1.0 / (xx * c_xx + xz * c_xz + xt * c_xt)
+    return (
+        c_xx * scale,
+        c_xz * scale,
+        c_xt * scale,
+        (xx * tt - xt * xt) * scale,
+        (xz * xt - xx * zt) * scale,
+        (xx * zz - xz * xz) * scale,
+    )
+
+
+def hub_of(s: Symbols, motion: WheelMotion, slots: Slots, locked: Array) -> Hub:
+    """How hub and slots answer forces at this posture; `locked`: airborne legs on stoppers."""
+    legs = directions(s, motion.theta)
+    released = slots.first | slots.second | ~locked
+    inverse = _inverse_inertia(s, legs, motion.L - s.a, released)
+    sin, cos, L = slots.of(legs.sin), slots.of(legs.cos), slots.of(motion.L)
+    e = [(cos[i], -sin[i], -L[i]) for i in range(2)]
+    u = [(sin[i], cos[i], jnp.zeros_like(sin[i])) for i in range(2)]
+    z = (times(inverse, e[0]), times(inverse, e[1]))
+    y = (times(inverse, u[0]), times(inverse, u[1]))
+    dot = lambda a, b: a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    plane = lambda a, b: a[0] * b[0] + a[1] * b[1]
+    return Hub(
+        legs,
+        released,
+        inverse,
+        sin,
+        cos,
+        L,
+        along_e=z,
+        along_u=y,
+        G=(dot(e[0], z[0]), dot(e[0], z[1]), dot(e[1], z[1])),
+        H=(plane(u[0], z[0]), plane(u[0], z[1]), plane(u[1], z[0]), plane(u[1], z[1])),
+        K=(plane(u[0], y[0]), plane(u[0], y[1]), plane(u[1], y[1])),
+    )
+
+
+class Free(NamedTuple):
+    """What would happen without the slots' forces: accelerations, or velocities in an impact."""
+
+    hub: Vector3
+    legs: Legs  # of a released leg's length, less the hub's share u . hub
+    own: Pair  # the same of the slots' legs
+    e: Pair  # of the slots' feet along e
+    u: Pair  # along u
+
+
+def free_acceleration(s: Symbols, motion: WheelMotion, slots: Slots, hub: Hub) -> Free:
+    """Gravity, springs, dampers and rotation, with no force on the slots' feet and stoppers."""
+    sin, cos = hub.legs
+    b, dtheta = motion.L - s.a, motion.dtheta
+    gx, gz = s.g * s.sin_phi, -s.g * s.cos_phi
+    spin = b * dtheta * dtheta
+    spring = s.k * (s.Ls - motion.L) - s.c * motion.dL
+    legs = spin - (sin * gx + cos * gz) + spring / s.m
+    coriolis = 2.0 * motion.dL * dtheta
+    radial = jnp.where(hub.released, legs, 0.0) - spin
+    force_x = s.Mt * gx + s.m * over_legs(radial * sin + coriolis * cos)
+    force_z = s.Mt * gz + s.m * over_legs(radial * cos - coriolis * sin)
+    torque = -s.m * over_legs(b * (coriolis + cos * gx - sin * gz))
+    at_hub = times(hub.inverse, (force_x, force_z, torque))
+    across, own = slots.of(coriolis), slots.of(legs)
+    e = [
+        hub.cos[i] * at_hub[0] - hub.sin[i] * at_hub[1] - hub.L[i] * at_hub[2] - across[i]
+        for i in range(2)
+    ]
+    u = [hub.L[i] * dtheta * dtheta - own[i] for i in range(2)]
+    return Free(at_hub, legs, own, (e[0], e[1]), (u[0], u[1]))
+
+
+def free_velocity(s: Symbols, motion: WheelMotion, slots: Slots, hub: Hub) -> Free:
+    """Velocities that the wheel's momentum gives where no foot and no slot's stopper pushes.
+
+    A leg that is `locked` though its length still changes meets its stopper, inelastically.
+    """
+    sin, cos = hub.legs
+    b, dtheta = motion.L - s.a, motion.dtheta
+    along = sin * motion.vx + cos * motion.vz
+    legs = jnp.where(hub.released, motion.dL - along, 0.0)
+    radial = legs - motion.dL
+    across = b * dtheta
+    px = s.Mt * motion.vx + s.m * over_legs(radial * sin - across * cos)
+    pz = s.Mt * motion.vz + s.m * over_legs(radial * cos + across * sin)
+    turning = -s.m * over_legs(b * (cos * motion.vx - sin * motion.vz - across))
+    at_hub = times(hub.inverse, (px, pz, turning))
+    own = slots.of(legs)
+    e = [hub.cos[i] * at_hub[0] - hub.sin[i] * at_hub[1] - hub.L[i] * at_hub[2] for i in range(2)]
+    return Free(at_hub, legs, own, (e[0], e[1]), (-own[0], -own[1]))
+
+
+class FootVelocity(NamedTuple):
+    """Velocity of the slots' feet, m/s."""
+
+    x: Pair
+    z: Pair
+
+
+def foot_velocity(motion: WheelMotion, slots: Slots, hub: Hub) -> FootVelocity:
+    """Velocity of the slots' feet along the slope and off it."""
+    dL = slots.of(motion.dL)
+    x = [motion.vx - dL[i] * hub.sin[i] - hub.L[i] * motion.dtheta * hub.cos[i] for i in range(2)]
+    z = [motion.vz - dL[i] * hub.cos[i] + hub.L[i] * motion.dtheta * hub.sin[i] for i in range(2)]
+    return FootVelocity((x[0], x[1]), (z[0], z[1]))
+
+
+def foot_heights(motion: WheelMotion, legs: Legwise) -> Legs:
+    """Height of every foot above the slope, m."""
+    return motion.z - motion.L * legs.cos
+
+
+def foot_places(motion: WheelMotion, legs: Legwise) -> Legs:
+    """Downhill position of every foot, m."""
+    return motion.x - motion.L * legs.sin
+
+
+def kinetic_energy(s: Symbols, motion: WheelMotion) -> Scalar:
+    """Of the hub and all legs' masses, J."""
+    legs = directions(s, motion.theta)
+    across = (motion.L - s.a) * motion.dtheta
+    x = motion.vx - motion.dL * legs.sin - across * legs.cos
+    z = motion.vz - motion.dL * legs.cos + across * legs.sin
+    hub_mass = s.Mt - s.n * s.m
+    return 0.5 * (hub_mass * (motion.vx**2 + motion.vz**2) + s.m * over_legs(x * x + z * z))
+
+
+def potential_energy(s: Symbols, motion: WheelMotion) -> Pair:
+    """Gravitational energy from the slope's origin, and elastic energy of all springs, J."""
+    legs = directions(s, motion.theta)
+    x = s.Mt * motion.x - s.m * over_legs((motion.L - s.a) * legs.sin)
+    z = s.Mt * motion.z - s.m * over_legs((motion.L - s.a) * legs.cos)
+    elastic = 0.5 * s.k * over_legs((motion.L - s.Ls) ** 2)
+    return s.g * (z * s.cos_phi - x * s.sin_phi), elastic

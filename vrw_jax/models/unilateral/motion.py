@@ -1,0 +1,235 @@
+"""How the wheel moves while no contact changes, and the guards of what may change next."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from vrw_jax.models.unilateral.contacts import OFF, SLIP_DOWN, SLIP_UP, STICK, Answer, answer
+from vrw_jax.models.unilateral.mechanics import (
+    FootVelocity,
+    Free,
+    Hub,
+    Legs,
+    Legwise,
+    Pair,
+    Slots,
+    WheelMotion,
+    foot_heights,
+    foot_velocity,
+    free_acceleration,
+    hub_of,
+    kept,
+    one_of,
+    over_legs,
+    slots_of,
+)
+from vrw_jax.numerics import Elementwise, Scalar
+from vrw_jax.wheel import Symbols
+
+State = Float[Array, " dim"]
+"""Hub (x, z, theta) and rates, lengths, rates of lengths, then the tallies: see `Tally`."""
+
+
+class Tally(NamedTuple):
+    """What is summed up along the motion, beside the motion itself."""
+
+    clock: Scalar  # time since the last event, s
+    damping: Scalar  # energy lost in the dampers, J
+    friction: Scalar  # energy lost by sliding, J
+    slip: Scalar  # path of all sliding feet, m
+
+
+def pack(motion: WheelMotion, tally: Tally) -> State:
+    """Everything that is integrated, as one vector of 10 + 2 n entries."""
+    return jnp.concatenate([jnp.stack(motion[:6]), motion.L, motion.dL, jnp.stack(tally)])
+
+
+def unpack(y: State) -> tuple[WheelMotion, Tally]:
+    """The inverse of `pack`."""
+    n = (y.shape[0] - 10) // 2
+    L, dL, tally = y[6 : 6 + n], y[6 + n : 6 + 2 * n], y[6 + 2 * n :]
+    motion = WheelMotion(y[0], y[1], y[2], y[3], y[4], y[5], L, dL)
+    return motion, Tally(tally[0], tally[1], tally[2], tally[3])
+
+
+class Stance(NamedTuple):
+    """Which feet are loaded and how, which legs are on their stoppers, and what has just begun."""
+
+    contact: Int[Array, " n_legs"]  # mode of every foot
+    locked: Bool[Array, " n_legs"]  # legs on their stoppers
+    new_foot: Bool[Array, " n_legs"]  # feet that have just left the ground
+    new_leg: Bool[Array, " n_legs"]  # legs that have just left their stoppers
+    new_slip: Bool[Array, " n_legs"]  # feet that have just begun to slide, from rest
+
+
+class Flow(NamedTuple):
+    """The wheel in one stance: all that the motion between two events needs."""
+
+    s: Symbols
+    friction: Elementwise
+    one_sided: bool  # airborne legs may leave their stoppers
+    stance: Stance
+    slots: Slots
+    contact: Int[Array, "2"]  # of the slots
+    held: Bool[Array, "2"]  # the slots' legs on their stoppers
+    airborne: Bool[Array, " n_legs"]  # other legs on their stoppers
+
+
+def flow_of(s: Symbols, friction: Elementwise, one_sided: bool, stance: Stance) -> Flow:
+    """The stance as seen by the equations of motion."""
+    slots = slots_of(stance.contact != OFF)
+    contact = jnp.stack(slots.of(stance.contact))
+    held = jnp.stack(slots.of(stance.locked.astype(jnp.int32))) > 0
+    airborne = stance.locked & ~slots.first & ~slots.second
+    return Flow(s, friction, one_sided, stance, slots, contact, held, airborne)
+
+
+class Forces(NamedTuple):
+    """Everything that acts at an instant."""
+
+    hub: Hub
+    free: Free
+    answer: Answer
+    feet: FootVelocity
+
+
+def forces(flow: Flow, motion: WheelMotion) -> Forces:
+    """Contact and stopper forces with the accelerations they leave."""
+    s, slots = flow.s, flow.slots
+    one = one_of(motion)
+    hub = kept(hub_of(s, motion, slots, flow.airborne), one)
+    free = kept(free_acceleration(s, motion, slots, hub), one)
+    found = kept(answer(s, hub, free, flow.contact, flow.held, flow.friction), one)
+    return Forces(hub, free, found, kept(foot_velocity(motion, slots, hub), one))
+
+
+def _outward(now: Forces) -> Legs:
+    """Acceleration of each leg's length that would be, were no force of slots or stoppers there."""
+    sin, cos = now.hub.legs
+    ax, az, _ = now.answer.hub
+    return now.free.legs + sin * ax + cos * az
+
+
+def airborne_stopper_force(flow: Flow, now: Forces) -> Legs:
+    """Force of the stoppers of locked legs in the air, N; 0 for the other legs."""
+    return jnp.where(flow.airborne, flow.s.m * _outward(now), 0.0)
+
+
+def _sliding(flow: Flow) -> Pair:
+    """1 for a foot that slides downhill, -1 uphill, 0 else."""
+    sign = lambda mode: jnp.where(mode == SLIP_DOWN, 1.0, jnp.where(mode == SLIP_UP, -1.0, 0.0))
+    return sign(flow.contact[0]), sign(flow.contact[1])
+
+
+def leg_acceleration(flow: Flow, now: Forces) -> Legs:
+    """Second derivative of every leg's length, m/s^2."""
+    pull = flow.slots.spread(now.answer.pull)
+    return jnp.where(flow.stance.locked, 0.0, _outward(now) - pull / flow.s.m)
+
+
+def field(flow: Flow, y: State) -> State:
+    """Time derivative of the state."""
+    motion, _ = unpack(y)
+    now = forces(flow, motion)
+    ddL = leg_acceleration(flow, now)
+    direction = _sliding(flow)
+    speeds = [direction[i] * now.feet.x[i] for i in range(2)]
+    drag = [-now.answer.tangential[i] * direction[i] for i in range(2)]
+    rates = WheelMotion(
+        motion.vx,
+        motion.vz,
+        motion.dtheta,
+        *now.answer.hub,
+        jnp.where(flow.stance.locked, 0.0, motion.dL),
+        ddL,
+    )
+    tally = Tally(
+        clock=jnp.ones_like(motion.x),
+        damping=flow.s.c * over_legs(motion.dL * motion.dL),
+        friction=drag[0] * speeds[0] + drag[1] * speeds[1],
+        slip=speeds[0] + speeds[1],
+    )
+    return kept(pack(rates, tally), one_of(motion))
+
+
+class Guards(NamedTuple):
+    """Where each kind of guard begins in the list of `guards`."""
+
+    foot: int  # heights of airborne feet, one per leg: falls to zero at a landing
+    leg: int  # room before the stopper, one per leg
+    lift: int  # normal force, one per slot
+    cone_up: int  # friction left before the foot slides uphill, one per slot
+    cone_down: int  # before it slides downhill
+    slip: int  # speed of a sliding foot, one per slot
+    release: int  # stopper force of a loaded leg, one per slot
+    rate: int  # dtheta
+    length: int  # shortest leg less a
+    loosen: int  # stopper force of airborne legs, one per leg, where stoppers are one-sided
+    total: int
+
+
+def guards_of(n: int, one_sided: bool) -> Guards:
+    """Places of the guards of a wheel with n legs."""
+    sizes = (n, n, 2, 2, 2, 2, 2, 1, 1, n if one_sided else 0)
+    places = np.concatenate([[0], np.cumsum(sizes)])
+    return Guards(*(int(p) for p in places))
+
+
+class Felt(NamedTuple):
+    """What decides how long a stance lasts, beside the motion itself."""
+
+    legs: Legwise
+    normal: Pair
+    tangential: Pair
+    stopper: Pair
+    speed: Pair  # of the slots' feet along the slope
+    in_air: Legs | None  # stopper force of legs in the air, where stoppers are one-sided
+
+
+def felt(flow: Flow, now: Forces) -> Felt:
+    """What `stance_guards` needs of the forces."""
+    found = now.answer
+    in_air = airborne_stopper_force(flow, now) if flow.one_sided else None
+    return Felt(now.hub.legs, found.normal, found.tangential, found.stopper, now.feet.x, in_air)
+
+
+def stance_guards(flow: Flow, motion: WheelMotion, now: Felt, begun: Array) -> list[Array]:
+    """Guards in the order of `Guards`; `begun`: not at the stance's start.
+
+    What the last event has just brought about (a foot off the ground, a leg off its stopper, a
+    sliding foot) stands on its own guard: it is not watched at that very instant.
+    """
+    s, stance = flow.s, flow.stance
+    one = jnp.ones_like(motion.L)
+    in_air = (stance.contact == OFF) & (begun | ~stance.new_foot)
+    moving = ~stance.locked & (begun | ~stance.new_leg)
+    just_slid = jnp.stack(flow.slots.of(stance.new_slip.astype(jnp.int32))) > 0
+    rough = jnp.where(jnp.isfinite(flow.friction), flow.friction, 0.0)
+    normal, tangential = jnp.stack(now.normal), jnp.stack(now.tangential)
+    coulomb = (flow.contact == STICK) & jnp.isfinite(flow.friction)
+    direction = jnp.stack(_sliding(flow))
+    slides = (direction != 0.0) & (begun | ~just_slid)
+    watched = lambda condition, value: jnp.where(condition, value, 1.0)
+    in_the_air = [] if now.in_air is None else [jnp.where(flow.airborne, now.in_air, one)]
+    return [
+        jnp.where(in_air, foot_heights(motion, now.legs), one),
+        jnp.where(moving, s.L0 - motion.L, one),
+        watched(flow.contact != OFF, normal),
+        watched(coulomb, rough * normal - tangential),
+        watched(coulomb, rough * normal + tangential),
+        watched(slides, direction * jnp.stack(now.speed)),
+        watched(flow.held, jnp.stack(now.stopper)),
+        motion.dtheta[None],
+        (jnp.min(motion.L, axis=0) - s.a)[None],
+        *in_the_air,
+    ]
+
+
+def guards(flow: Flow, y: State) -> Float[Array, " n_guards"]:
+    """All guards, positive in the stance, falling through zero where it ends; 1 if not watched."""
+    motion, tally = unpack(y)
+    now = felt(flow, forces(flow, motion))
+    parts = stance_guards(flow, motion, now, tally.clock > 0.0)
+    return jnp.concatenate(kept(parts, one_of(motion)))

@@ -1,0 +1,74 @@
+"""The full section state of the unilateral rung as one vector, and the paper's inside it."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from vrw_jax.models.unilateral.contacts import OFF, STICK
+from vrw_jax.models.unilateral.events import settled
+from vrw_jax.models.unilateral.mechanics import WheelMotion, directions
+from vrw_jax.models.unilateral.motion import Stance, State, Tally, pack
+from vrw_jax.wheel import Symbols, length_at_touchdown
+
+FullState = Float[Array, " n_full"]
+"""(theta-, dtheta-, vx-, vz-, L_1 ... L_n, dL_1 ... dL_n, code_1 ... code_n) just before the foot
+ahead of all others lands, in the labels of the step that ends: rad, rad/s, hub m/s, m, m/s.
+
+A leg's code is its foot's mode (0 in the air, 1 at rest, 2 sliding downhill, 3 uphill), plus 4 on
+its stopper. The hub's height follows from the landing foot's."""
+
+LOCKED = 4
+"""What a leg's code gains on its stopper."""
+
+
+def section_size(n: int) -> int:
+    """Length of the section state of a wheel with n legs."""
+    return 4 + 3 * n
+
+
+def embedded(s: Symbols, x: Float[Array, "3"]) -> FullState:
+    """The paper's section state: Leg 1 planted, all other legs on their stoppers."""
+    theta, dtheta, dL1 = x
+    sin, cos, L1 = jnp.sin(theta), jnp.cos(theta), length_at_touchdown(s, theta)
+    first = jnp.arange(s.n) == 0
+    vx, vz = dL1 * sin + L1 * dtheta * cos, dL1 * cos - L1 * dtheta * sin
+    return jnp.concatenate(
+        [
+            jnp.stack([theta, dtheta, vx, vz]),
+            jnp.where(first, L1, s.L0),
+            jnp.where(first, dL1, 0.0),
+            jnp.where(first, float(STICK), float(LOCKED + OFF)),
+        ]
+    )
+
+
+def opened(s: Symbols, x: FullState) -> tuple[State, Stance]:
+    """State and stance just before the landing, in the labels of the step that begins.
+
+    The landing foot is the origin; loaded feet are put on the slope and sticking ones to rest, so
+    that every vector near a section state is one.
+    """
+    n = s.n
+    theta, dtheta, vx, vz = x[0] - s.alpha, x[1], x[2], x[3]
+    L, dL, code = (jnp.roll(x[4 + i * n : 4 + (i + 1) * n], 1) for i in range(3))
+    code = jnp.round(code).astype(jnp.int32)
+    contact, locked = code % LOCKED, code >= LOCKED
+    L = jnp.where(locked, s.L0, L)
+    legs = directions(s, theta)
+    motion = WheelMotion(L[0] * legs.sin[0], L[0] * legs.cos[0], theta, vx, vz, dtheta, L, dL)
+    none = jnp.zeros((n,), bool)
+    zero = jnp.zeros_like(theta)
+    state = pack(settled(s, motion, contact, locked), Tally(zero, zero, zero, zero))
+    return state, Stance(contact, locked, none, none, none)
+
+
+def closed(motion: WheelMotion, stance: Stance) -> FullState:
+    """The section state of a motion just before the next landing."""
+    code = stance.contact + LOCKED * stance.locked
+    return jnp.concatenate(
+        [
+            jnp.stack([motion.theta, motion.dtheta, motion.vx, motion.vz]),
+            motion.L,
+            motion.dL,
+            code.astype(motion.L.dtype),
+        ]
+    )

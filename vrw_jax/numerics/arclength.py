@@ -1,0 +1,365 @@
+"""Pseudo-arclength continuation of fixed points in one parameter, through folds.
+
+Knows nothing of wheels: what is followed is an `AbstractFollowed`, which says how Newton's method
+corrects an unknown z at a parameter p and how z moves with p. All is written for one branch with
+buffers of fixed size, so that `jax.vmap` follows many side by side and `jax.jit` compiles it once.
+
+Lengths are measured in the section's numbers and in the parameter as a share of its range.
+"""
+
+import abc
+import dataclasses
+import enum
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from vrw_jax.numerics.lanes import select
+from vrw_jax.numerics.types import Scalar
+
+Unknown = Any
+"""A pytree of float arrays: all that Newton's method moves."""
+Section = Float[Array, " n"]
+
+
+@dataclasses.dataclass(frozen=True)
+class ArclengthOptions:
+    """Numerical choices of a continuation; each change compiles again. Lengths as above."""
+
+    first_step: float = 0.005
+    largest_step: float = 0.02
+    smallest_step: float = 1e-6
+    max_points: int = 400  # in each direction
+    iterations: int = 10  # of Newton's method for one point
+    tolerance: float = 1e-10  # of Newton's last correction
+    turn: float = 0.2  # rad, most that the branch may turn in one step
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if not value > 0:
+                raise ValueError(f"{field.name} is {value:g}, but it must be positive.")
+        if not self.smallest_step <= self.first_step <= self.largest_step:
+            raise ValueError(
+                f"the steps are {self.smallest_step:g} (smallest), {self.first_step:g} (first) and "
+                f"{self.largest_step:g} (largest), but they must not fall in this order."
+            )
+
+
+class Linear(NamedTuple):
+    """Newton's method at a trial (z, p)."""
+
+    correction: Unknown  # of z at fixed p
+    column: Unknown  # dz/dp along the branch
+    jacobian: Float[Array, "n n"]  # of the return map over the section's numbers
+
+
+class AbstractFollowed(eqx.Module):
+    """What can be followed; `wheel` is whatever else a branch's equations need, a pytree."""
+
+    @abc.abstractmethod
+    def linearise(self, wheel: Any, z: Unknown, p: Scalar) -> Linear:
+        """Correction, column and Jacobian; not finite where the map can't be evaluated."""
+
+    @abc.abstractmethod
+    def section(self, z: Unknown) -> Section:
+        """The section's numbers, a part of z."""
+
+    def between(self, left: Unknown, right: Unknown, place: Scalar) -> Unknown:
+        """Where Newton's method starts for a point at `place` in [0, 1] between two others."""
+        return jax.tree.map(lambda a, b: a + place * (b - a), left, right)
+
+    @abc.abstractmethod
+    def size(self, z: Unknown, correction: Unknown) -> Scalar:
+        """Size of a correction, to be compared with the tolerance."""
+
+    @abc.abstractmethod
+    def valid(self, wheel: Any, z: Unknown, p: Scalar) -> Bool[Array, ""]:
+        """Whether a converged z is what it stands for."""
+
+
+class MapFollowed(AbstractFollowed):
+    """Fixed points of any map x -> `function(wheel, x, p)` that JAX differentiates forwards.
+
+    Where the map is not defined it returns NaN.
+    """
+
+    function: Callable[[Any, Section, Scalar], Section] = eqx.field(static=True)
+
+    def linearise(self, wheel: Any, z: Unknown, p: Scalar) -> Linear:
+        def both(z: Array, p: Array) -> tuple[Array, Array]:
+            image = self.function(wheel, z, p)
+            return image, image
+
+        (by_x, by_p), image = jax.jacfwd(both, argnums=(0, 1), has_aux=True)(z, p)
+        right = jnp.stack([image - z, by_p], -1)
+        solved = jnp.linalg.solve(jnp.eye(z.shape[0], dtype=z.dtype) - by_x, right)
+        return Linear(solved[:, 0], solved[:, 1], by_x)
+
+    def section(self, z: Unknown) -> Section:
+        return z
+
+    def size(self, z: Unknown, correction: Unknown) -> Scalar:
+        return jnp.max(jnp.abs(correction))
+
+    def valid(self, wheel: Any, z: Unknown, p: Scalar) -> Bool[Array, ""]:
+        return jnp.all(jnp.isfinite(z))
+
+
+class Ending(enum.IntEnum):
+    """Why a branch was followed no further in one direction."""
+
+    GOING = 0
+    RANGE_ENDED = 1
+    LEFT_SEQUENCE = 2
+    STALLED = 3
+    BUFFER_FULL = 4
+    NO_START = 5
+
+    @property
+    def meaning(self) -> str:
+        """One sentence for a reader."""
+        return _MEANINGS[self]
+
+
+_MEANINGS = {
+    Ending.GOING: "It was still being followed.",
+    Ending.RANGE_ENDED: "The parameter's range ended.",
+    Ending.LEFT_SEQUENCE: "Its points no longer are what they stand for.",
+    Ending.STALLED: "Newton's method found no next point, however short the step.",
+    Ending.BUFFER_FULL: "It has as many points as were allowed: raise max_points.",
+    Ending.NO_START: "No point was found to start from.",
+}
+
+
+class PathPoint(NamedTuple):
+    """A point of a branch with the unit tangent to it."""
+
+    z: Unknown
+    p: Scalar
+    slope: Unknown  # dz over length along the branch
+    share_slope: Scalar  # the same of the parameter as a share of its range
+    jacobian: Float[Array, "n n"]
+    valid: Bool[Array, ""]
+
+
+class Track(NamedTuple):
+    """Points in buffers of `max_points`, the first `n_points` of them set."""
+
+    points: PathPoint
+    n_points: Int[Array, ""]
+    ending: Int[Array, ""]  # an Ending
+    passes: Int[Array, ""]  # linearisations spent
+
+
+class Plane(NamedTuple):
+    """The condition that picks a point: row . (section, share) is that of the place named."""
+
+    x: Section
+    share: Scalar
+    row_x: Section
+    row_share: Scalar
+
+
+class _Corrected(NamedTuple):
+    z: Unknown
+    share: Scalar
+    size: Scalar
+    column: Unknown  # dz over the share
+    jacobian: Float[Array, "n n"]
+
+
+def _correct(
+    followed: AbstractFollowed, wheel: Any, bounds: Array, plane: Plane, z: Unknown, share: Scalar
+) -> _Corrected:
+    """One Newton iteration on the branch's equations and the plane at once."""
+    scale = bounds[1] - bounds[0]
+    linear = followed.linearise(wheel, z, bounds[0] + scale * share)
+    column = jax.tree.map(lambda x: scale * x, linear.column)
+    x = followed.section(z) + followed.section(linear.correction)
+    ahead = plane.row_x @ (x - plane.x) + plane.row_share * (share - plane.share)
+    d_share = -ahead / (plane.row_x @ followed.section(column) + plane.row_share)
+    dz = jax.tree.map(lambda a, b: a + d_share * b, linear.correction, column)
+    size = jnp.maximum(followed.size(z, dz), jnp.abs(d_share))
+    return _Corrected(jax.tree.map(jnp.add, z, dz), share + d_share, size, column, linear.jacobian)
+
+
+def _share_of(p: Array, bounds: Array) -> Array:
+    return (p - bounds[0]) / (bounds[1] - bounds[0])
+
+
+def _parameter_at(share: Array, bounds: Array) -> Array:
+    """The inverse; exact at both ends."""
+    p = bounds[0] + (bounds[1] - bounds[0]) * share
+    return jnp.where(share == 1.0, bounds[1], p)
+
+
+class _Trial(NamedTuple):
+    """What Newton's method works on."""
+
+    plane: Plane
+    z: Unknown
+    share: Scalar
+    length: Scalar  # from the last point, as predicted
+    final: Bool[Array, ""]  # it is to lie on the end of the range
+
+
+def _predicted(followed: AbstractFollowed, base: PathPoint, step: Scalar, bounds: Array) -> _Trial:
+    """One step along the tangent, or on the end of the range if that is nearer."""
+    share, ahead = _share_of(base.p, bounds), base.share_slope
+    edge = jnp.where(ahead > 0.0, 1.0, 0.0)
+    still = ahead == 0.0
+    reach = jnp.where(still, jnp.inf, (edge - share) / jnp.where(still, 1.0, ahead))
+    final = reach <= step
+    length = jnp.where(final, reach, step)
+    z = jax.tree.map(lambda a, b: a + length * b, base.z, base.slope)
+    at = jnp.where(final, edge, share + length * ahead)
+    along_x = followed.section(base.slope)
+    plane = Plane(
+        followed.section(z),
+        at,
+        jnp.where(final, 0.0, along_x),
+        jnp.where(final, 1.0, ahead),
+    )
+    return _Trial(plane, z, at, length, final)
+
+
+class _State(NamedTuple):
+    base: PathPoint
+    step: Scalar
+    trial: _Trial
+    iteration: Int[Array, ""]
+    track: Track
+
+
+@eqx.filter_jit
+def follow(
+    followed: AbstractFollowed,
+    options: ArclengthOptions,
+    wheel: Any,
+    z: Unknown,
+    p: Scalar,
+    bounds: Float[Array, "2"],
+    direction: Scalar,
+) -> Track:
+    """The branch from the point near (z, p), towards growing p if `direction` is 1, falling if -1.
+
+    Ends at the range's end, or with the first point that is not `valid`, which is kept. Each turn
+    of the loop is one linearisation: of the running trial, whatever point it is for.
+    """
+    x = followed.section(z)
+    n, dtype = x.shape[0], x.dtype
+    zero, none, no = jnp.zeros((), dtype), jnp.zeros((), jnp.int32), jnp.asarray(False)
+    flat = jax.tree.map(jnp.zeros_like, z)
+    here = PathPoint(z, p, flat, zero + direction, jnp.zeros((n, n), dtype), no)
+    buffers = jax.tree.map(lambda a: jnp.zeros((options.max_points, *a.shape), a.dtype), here)
+    share = _share_of(p, bounds)
+    at_start = Plane(x, share, jnp.zeros_like(x), zero + 1.0)
+    state = _State(
+        base=here,
+        step=zero + options.first_step,
+        trial=_Trial(at_start, z, share, zero, no),
+        iteration=none,
+        track=Track(buffers, none, none + int(Ending.GOING), none),
+    )
+
+    def iterate(state: _State) -> _State:
+        track, base, trial = state.track, state.base, state.trial
+        starting = track.n_points == 0
+        now = _correct(followed, wheel, bounds, trial.plane, trial.z, trial.share)
+        off = jnp.maximum(
+            jnp.max(jnp.abs(followed.section(now.z) - trial.plane.x)),
+            jnp.abs(now.share - trial.plane.share),
+        )
+        sound = jnp.isfinite(now.size) & (starting | (off <= state.step))
+        converged = sound & (now.size < options.tolerance)
+
+        by_share = followed.section(now.column)
+        facing = followed.section(base.slope) @ by_share + base.share_slope
+        facing = jnp.where(starting, direction, facing)
+        norm = jnp.sqrt(1.0 + by_share @ by_share)
+        straight = starting | (jnp.abs(facing) >= norm * jnp.cos(options.turn))
+        accepted = converged & straight
+        failed = ~accepted & (~sound | converged | (state.iteration + 1 >= options.iterations))
+
+        share_slope = jnp.where(facing >= 0.0, 1.0, -1.0) / norm
+        p = _parameter_at(jnp.where(trial.final, trial.plane.share, now.share), bounds)
+        valid = followed.valid(wheel, now.z, p)
+        slope = jax.tree.map(lambda x: share_slope * x, now.column)
+        reached = PathPoint(now.z, p, slope, share_slope, now.jacobian, valid)
+        place = jnp.where(accepted, track.n_points, options.max_points)
+        points = jax.tree.map(lambda b, a: b.at[place].set(a, mode="drop"), track.points, reached)
+        count = track.n_points + accepted
+        base = select(accepted, reached, base)
+
+        quick, slow = state.iteration < 4, state.iteration >= 6
+        growth = jnp.where(quick, 1.4, jnp.where(slow, 0.6, 1.0))
+        longer = jnp.minimum(state.step * growth, options.largest_step)
+        step = jnp.where(accepted, longer, jnp.where(failed, 0.5 * state.step, state.step))
+        step = jnp.where(starting, options.first_step, step)
+        following = _predicted(followed, base, step, bounds)
+        following = select(accepted | failed, following, trial._replace(z=now.z, share=now.share))
+
+        at_end = accepted & (trial.final | (following.length <= 1e-12))
+        ending = track.ending
+        for happened, code in (
+            (failed & (step < options.smallest_step), Ending.STALLED),
+            (failed & starting, Ending.NO_START),
+            (accepted & (count >= options.max_points), Ending.BUFFER_FULL),
+            (at_end, Ending.RANGE_ENDED),
+            (accepted & ~valid, Ending.LEFT_SEQUENCE),
+        ):
+            ending = jnp.where(happened, int(code), ending)
+        iteration = jnp.where(accepted | failed, 0, state.iteration + 1)
+        track = Track(points, count, ending.astype(jnp.int32), track.passes + 1)
+        return _State(base, step, following, iteration, track)
+
+    going = lambda state: state.track.ending == int(Ending.GOING)
+    return lax.while_loop(going, iterate, state).track
+
+
+@eqx.filter_jit
+def solve(
+    followed: AbstractFollowed,
+    options: ArclengthOptions,
+    wheel: Any,
+    z: Unknown,
+    plane: Plane,
+    bounds: Float[Array, "2"],
+) -> tuple[PathPoint, Bool[Array, ""]]:
+    """The point of the branch on a plane, from the plane's place and z near it; whether found.
+
+    Once converged, Newton's method goes on for one more iteration: the Jacobian is then as exact
+    as the point.
+    """
+
+    def iterate(carry: tuple) -> tuple:
+        now, count, settled = carry
+        following = _correct(followed, wheel, bounds, plane, now.z, now.share)
+        # A trial that went astray stands still: no lane may hand its neighbours a NaN.
+        sound = jnp.isfinite(following.size)
+        following = select(sound, following, now)._replace(size=following.size)
+        settled = jnp.where(following.size < options.tolerance, settled + 1, 0)
+        return following, count + 1, settled
+
+    def going(carry: tuple) -> Array:
+        now, count, settled = carry
+        return (settled < 2) & (count < options.iterations) & jnp.isfinite(now.size)
+
+    n = plane.x.shape[0]
+    flat = jax.tree.map(jnp.zeros_like, z)
+    first = _Corrected(
+        z, plane.share, jnp.ones_like(plane.share), flat, jnp.zeros((n, n), plane.x.dtype)
+    )
+    none = jnp.zeros((), jnp.int32)
+    now, _, settled = lax.while_loop(going, iterate, (first, none, none))
+    p = _parameter_at(now.share, bounds)
+    point = PathPoint(
+        now.z, p, now.column, jnp.ones_like(p), now.jacobian, followed.valid(wheel, now.z, p)
+    )
+    return point, settled >= 1

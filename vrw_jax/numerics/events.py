@@ -1,0 +1,445 @@
+"""One phase from its start to the earliest of its events: the only room that knows diffrax.
+
+diffrax's solvers and step-size controller are stepped by hand, so that an event's state has the
+accuracy of the integrator and not of an interpolant: an accepted step that brackets an event is
+taken again, shortened by Newton's method until it ends on the event. Those last re-steps are
+differentiated, hence first and second derivatives of event state and time hold as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from vrw_jax.numerics.lanes import select
+from vrw_jax.numerics.minima import (
+    Minimum,
+    Settling,
+    State,
+    Step,
+    Watched,
+    cubic,
+    cubic_minimum,
+    lower,
+    no_minimum,
+    row_of,
+    settle,
+)
+from vrw_jax.numerics.options import Options
+from vrw_jax.numerics.types import Scalar
+from vrw_jax.runtime import diffrax
+
+Field = Callable[[State], State]
+"""Autonomous vector field of a phase."""
+
+
+class PhaseEnd(NamedTuple):
+    """Where and how a phase ended."""
+
+    state: State
+    duration: Scalar  # s
+    guard: Int[Array, ""]  # index of the guard that ended it; -1 if none did
+    timed_out: Bool[Array, ""]
+    gave_up: Bool[Array, ""]
+    solver_steps: Int[Array, ""]  # tried, accepted or not
+    minima: Float[Array, " n_monitors"]  # of the monitors, empty without
+
+
+class _Search(NamedTuple):
+    """Newton's search for the earliest event inside a step that brackets one."""
+
+    on: Bool[Array, ""]
+    crossing: Bool[Array, " n_guards"]
+    low: Scalar  # bracket of the event, s from the step's start
+    high: Scalar
+    accuracy: Scalar  # of the event's time, s
+    tries: Int[Array, ""]
+    settled: Int[Array, ""]  # tries that no longer moved the event
+
+
+class _Loop(NamedTuple):
+    step: Step
+    length: Scalar  # of the next step to try, s
+    controller_state: Any
+    search: _Search
+    minimum: Minimum
+    settling: Settling
+    running: Bool[Array, ""]
+    guard: Int[Array, ""]
+    timed_out: Bool[Array, ""]
+    gave_up: Bool[Array, ""]
+    tried: Int[Array, ""]
+
+
+class _Stepper(NamedTuple):
+    """A diffrax solver with its controller, seen as a function from state and length to state."""
+
+    field: Field
+    solver: diffrax.AbstractAdaptiveSolver
+    controller: diffrax.PIDController
+    term: diffrax.ODETerm
+
+    def start(self, state: State, options: Options) -> tuple[Any, Any]:
+        """Solver state and controller state at the start of a phase."""
+        zero = jnp.zeros((), state.dtype)
+        _, controller_state = self.controller.init(
+            self.term,
+            zero,
+            options.first_step,
+            lax.stop_gradient(state),
+            options.first_step,
+            None,
+            lambda terms, t, y, args: terms.vf(t, y, args),
+            self.solver.error_order(self.term),
+        )
+        return self.solver_state(state, options), controller_state
+
+    def solver_state(self, state: State, options: Options) -> Any:
+        """What the solver keeps from step to step, at a state."""
+        zero = jnp.zeros((), state.dtype)
+        return self.solver.init(self.term, zero, options.first_step, state, None)
+
+    def step(self, state: State, solver_state: Any, length: Scalar) -> tuple[State, State, Any]:
+        """State after `length`, its error estimate and the solver state there."""
+        zero = jnp.zeros_like(length)
+        end, error, _, solver_state, result = self.solver.step(
+            self.term, zero, length, state, None, solver_state, jnp.asarray(False)
+        )
+        if error is None:
+            raise ValueError(f"{type(self.solver).__name__} gives no error estimate.")
+        error = jnp.where(result == diffrax.RESULTS.successful, error, jnp.inf)
+        return end, error, solver_state
+
+    def judge(
+        self, start: State, end: State, error: State, length: Scalar, controller_state: Any
+    ) -> tuple[Bool[Array, ""], Scalar, Any]:
+        """Whether to keep the step, the length of the next, and the controller's state.
+
+        Nothing here is differentiated: derivatives are those of the steps taken.
+        """
+        start, end, error = lax.stop_gradient((start, end, error))
+        finite = jnp.all(jnp.isfinite(end))
+        keep, next_start, next_end, _, controller_state, _ = self.controller.adapt_step_size(
+            jnp.zeros_like(length),
+            length,
+            start,
+            jnp.where(finite, end, start),
+            None,
+            jnp.where(finite, error, jnp.inf),
+            self.solver.error_order(self.term),  # type: ignore[arg-type]
+            controller_state,
+        )
+        return jnp.asarray(keep), jnp.asarray(next_end - next_start), controller_state
+
+
+def solver_named(name: str, options: Options) -> diffrax.AbstractAdaptiveSolver:
+    """The diffrax solver of that name, ready for forward-mode derivatives."""
+    solver_class = getattr(diffrax, name, None)
+    if not (
+        isinstance(solver_class, type) and issubclass(solver_class, diffrax.AbstractAdaptiveSolver)
+    ):
+        raise ValueError(
+            f"solver is {name!r}, but it must name a diffrax solver with an error estimate: "
+            "take 'Dopri8', 'Tsit5', 'Dopri5', 'Kvaerno3' or 'Kvaerno5'."
+        )
+    fields = getattr(solver_class, "__dataclass_fields__", {})
+    keywords: dict[str, Any] = {}
+    if "scan_kind" in fields:
+        keywords["scan_kind"] = "lax"
+    if "root_finder" in fields:
+        tolerances: dict[str, Any] = {"rtol": options.rtol, "atol": options.atol}
+        keywords["root_finder"] = diffrax.VeryChord(**tolerances)
+    return solver_class(**keywords)
+
+
+def _stepper(field: Field, options: Options) -> _Stepper:
+    return _Stepper(
+        field=field,
+        solver=solver_named(options.solver, options),
+        controller=diffrax.PIDController(
+            rtol=options.rtol, atol=options.atol, factormax=STEP_GROWTH
+        ),
+        term=diffrax.ODETerm(lambda t, y, args: field(y)),
+    )
+
+
+def integrate_phase(
+    field: Field,
+    watched: Watched,
+    start: State,
+    active: Bool[Array, ""],
+    options: Options,
+) -> PhaseEnd:
+    """Follow `field` from `start` until the earliest guard reaches zero from above.
+
+    A guard that is negative at the start, or zero and not rising, ends the phase at once with
+    duration 0; one that is zero and rising does not fire. A guard that dips below zero and comes
+    back within one step is found: where the step's cubic through values and rates dips, the step
+    is retried up to the dip. With `active` False nothing is integrated. Two guards at once: the
+    first in the list wins. Errors are those of the solver at `options`' tolerances.
+    """
+    stepper = _stepper(field, options)
+    n_guards = watched.n_guards
+    # Every number that the loop carries is batched, and perturbed where it will be, from the start:
+    # JAX would otherwise trace the loop again for each round in which that spreads.
+    zero = 0.0 * start[0]
+    none = jnp.where(active, 0, 0).astype(jnp.int32)
+    nothing = jnp.zeros(jax.eval_shape(watched.values, start).shape, start.dtype) + zero
+    no = active & False
+    fixed = lax.stop_gradient(zero)
+    solver_state, controller_state = stepper.start(start, options)
+    controller_state = jax.tree.map(lambda x: x + fixed, controller_state)
+    loop = _Loop(
+        step=Step(zero, start, solver_state, nothing, nothing),
+        length=zero,  # the first step has no length: it evaluates the start
+        controller_state=controller_state,
+        search=_Search(no, jnp.zeros((n_guards,), bool) | no, fixed, fixed, fixed, none, none),
+        minimum=no_minimum(watched, start),
+        settling=Settling(no, none, none, fixed, fixed, nothing[n_guards:] + jnp.inf),
+        running=active,
+        guard=none - 1,
+        timed_out=no,
+        gave_up=no,
+        tried=none,
+    )
+
+    def advance(loop: _Loop) -> _Loop:
+        """Take one step and judge it: march on, search an event, settle a minimum, or end.
+
+        One call of solver and watch serves the evaluation of the start, marching, searching and
+        settling: code compiled once.
+        """
+        here, length, search, settling = loop.step, loop.length, loop.search, loop.settling
+        left = here.state, here.solver_state
+        if watched.count_start:
+            place = row_of(settling.monitor, loop.minimum.left)
+            left = select(settling.on, (place, stepper.solver_state(place, options)), left)
+        end, error, solver_state = stepper.step(*left, length)
+        values, rates = jax.jvp(watched.values, (end,), (stepper.field(end),))
+        guards, guard_rates = values[:n_guards], rates[:n_guards]
+        starting = loop.tried == 0
+        marching = ~(starting | search.on | settling.on)
+
+        # At the start: a guard that is past, or on its way, ends the phase at once.
+        past = (guards < 0.0) | ((guards == 0.0) & (guard_rates <= 0.0))
+        ends_at_once = starting & jnp.any(past)
+
+        # Marching: keep the step, or try another; look for crossings, and for dips within.
+        error = jnp.where(jnp.all(jnp.isfinite(values)), error, jnp.inf)
+        keep, next_length, next_controller_state = stepper.judge(
+            here.state,
+            end,
+            error,
+            jnp.where(starting, options.first_step, length),
+            loop.controller_state,
+        )
+        keep = keep & marching
+        crossing = guards <= 0.0
+        places, dips = _dips(here, values, rates, length, n_guards)
+        to_dip = length * jnp.min(jnp.where(dips & ~crossing, places, 1.0))
+        retry = keep & (to_dip < length)
+        crossed = keep & jnp.any(crossing) & ~retry
+        accepted = starting | (keep & ~crossed & ~retry)
+
+        # Searching: Newton's next proposal from this one.
+        found = _searched(search, guards, guard_rates, length, crossed, crossing)
+        settles = search.on & (jnp.abs(found.length - length) <= search.accuracy)
+        settled = search.settled + settles
+        arrived = search.on & (settled >= SETTLED)
+
+        time = here.time + length
+        step = Step(time, end, solver_state, values, rates)
+        timed_out = accepted & (time >= options.max_phase_time)
+        timed_out = timed_out | (arrived & (time > options.max_phase_time))
+        tried = loop.tried + ~settling.on
+        stuck = (search.on & ~arrived & (search.tries >= options.event_steps)) | (
+            marching
+            & ~crossed
+            & ((tried >= options.max_solver_steps) | (here.time + next_length == here.time))
+        )
+        guess = _first_guess(here, values, rates, length, n_guards, crossing)
+        following = jnp.where(starting, options.first_step, next_length)
+        following = jnp.where(retry, to_dip, following)
+        following = jnp.where(crossed, guess, following)
+        resolution = 1e3 * jnp.finfo(length.dtype).eps * time
+        following = jnp.where(search.on, found.length, lax.stop_gradient(following))
+        minimum = lower(watched, loop.minimum, here, step, length, (accepted & marching) | arrived)
+        ends = ends_at_once | arrived | timed_out | stuck
+        if watched.count_start:
+            settling, following = settle(
+                settling, watched, minimum, values, rates, length, following, starting, ends,
+                options.monitor_steps,
+            )  # fmt: skip
+        return _Loop(
+            step=select(accepted | arrived, step, here),
+            length=following,
+            controller_state=select(
+                marching & ~retry, next_controller_state, loop.controller_state
+            ),
+            search=_Search(
+                on=(search.on | crossed) & ~ends,
+                crossing=jnp.where(crossed, crossing, search.crossing),
+                low=jnp.where(crossed, 0.0, found.low),
+                high=jnp.where(crossed, lax.stop_gradient(length), found.high),
+                accuracy=jnp.where(
+                    crossed,
+                    lax.stop_gradient(jnp.maximum(options.rtol * length, resolution)),
+                    search.accuracy,
+                ),
+                tries=search.tries + search.on,
+                settled=settled,
+            ),
+            minimum=minimum,
+            settling=settling,
+            running=~(ends | loop.settling.on) | settling.on,
+            guard=jnp.where(
+                ends_at_once,
+                jnp.argmax(past).astype(jnp.int32),
+                jnp.where(arrived & ~timed_out, found.guard, loop.guard),
+            ),
+            timed_out=timed_out | loop.timed_out,
+            gave_up=stuck | loop.gave_up,
+            tried=tried,
+        )
+
+    loop = lax.while_loop(lambda loop: loop.running, advance, loop)
+    minima = jnp.minimum(loop.settling.lowest, loop.step.values[n_guards:])
+    return PhaseEnd(
+        state=loop.step.state,
+        duration=loop.step.time,
+        guard=loop.guard,
+        timed_out=loop.timed_out,
+        gave_up=loop.gave_up,
+        solver_steps=loop.tried,
+        minima=minima,
+    )
+
+
+STEP_GROWTH = 2.0
+"""Most that a step may outgrow the one before it. The error estimate of a step far shorter than
+needed is rounding, and so would be a length grown from it without bound: a lane would then differ
+from itself alone by 1e-12, more than a hundred times its round-off."""
+SETTLED = 3
+"""Tries at the located event before it counts: the first makes the event's time right to first
+order in its derivatives, the second to third order, the last evaluates the state there."""
+
+
+def _dips(
+    here: Step, values: Array, rates: Array, length: Scalar, n_guards: int
+) -> tuple[Array, Array]:
+    """Places in (0, 1) where a guard that falls and rises again is lowest, and whether to look.
+
+    Where the lowest point of the cubic through values and rates is near or below zero, compared
+    with the guard's change over the step (the cubic's own error is a small part of that), the step
+    is taken again up to that point: either the guard has crossed there, or the march goes on from
+    its lowest point. A point no lower than the step's start by 1 % of what is left is not new.
+    """
+    v0, r0, v1, r1 = lax.stop_gradient((here.values, here.rates, values, rates))
+    v0, r0, v1, r1 = v0[:n_guards], r0[:n_guards], v1[:n_guards], r1[:n_guards]
+    length = lax.stop_gradient(length)
+    places, lows = cubic_minimum(v0, r0 * length, v1, r1 * length)
+    near = lows <= 0.25 * (jnp.maximum(v0, v1) - lows)
+    new = (v0 - lows > 0.01 * lows) & (here.time + places * length > here.time)
+    return places, (r0 < 0.0) & (r1 >= 0.0) & near & new
+
+
+def _first_guess(
+    here: Step, values: Array, rates: Array, length: Scalar, n_guards: int, crossing: Array
+) -> Scalar:
+    """Length to the earliest crossing by the guards' cubics: secant, then Newton's method."""
+    v0, r0, v1, r1 = lax.stop_gradient((here.values, here.rates * length, values, rates * length))
+    v0, r0, v1, r1 = v0[:n_guards], r0[:n_guards], v1[:n_guards], r1[:n_guards]
+    fall = jnp.where(crossing & (v0 > v1), v0 - v1, 1.0)
+    at = jnp.where(crossing, jnp.clip(v0 / fall, 0.0, 1.0), 1.0)
+    for _ in range(3):
+        slope = (
+            6.0 * at * (at - 1.0) * (v0 - v1)
+            + (1.0 - at) * (1.0 - 3.0 * at) * r0
+            + at * (3.0 * at - 2.0) * r1
+        )
+        falls = slope < 0.0
+        change = cubic(at, v0, r0, v1, r1) / jnp.where(falls, slope, 1.0)
+        at = jnp.where(crossing & falls, jnp.clip(at - change, 0.0, 1.0), at)
+    return lax.stop_gradient(length) * jnp.min(jnp.where(crossing, at, 1.0))
+
+
+class _Found(NamedTuple):
+    """Newton's next proposal for an event's time, and the bracket that is left."""
+
+    length: Scalar
+    guard: Int[Array, ""]
+    low: Scalar
+    high: Scalar
+
+
+def _searched(
+    search: _Search,
+    guards: Array,
+    rates: Array,
+    length: Scalar,
+    crossed: Bool[Array, ""],
+    crossing: Bool[Array, " n_guards"],
+) -> _Found:
+    """Every guard that crosses proposes its own time and the earliest is taken.
+
+    Kept inside the shrinking bracket by bisection. The proposal carries derivatives: after k of
+    them in the quadratic regime, derivatives are right to order 2^k - 1.
+    """
+    falling = search.crossing & (rates < 0.0)
+    change = -guards / jnp.where(falling, rates, -1.0)
+    proposals = jnp.where(falling, length + change, jnp.inf)
+    guard = jnp.argmin(proposals).astype(jnp.int32)
+    before = jnp.all(jnp.where(search.crossing, guards > 0.0, True))
+    low = jnp.where(before, lax.stop_gradient(length), search.low)
+    high = jnp.where(before, search.high, lax.stop_gradient(length))
+    proposal = proposals[guard]
+    # Within rounding of a collapsed bracket counts as inside.
+    inside = (proposal >= low - search.accuracy) & (proposal <= high + search.accuracy)
+    # Where rounding throws Newton's method out of the bracket, its derivative still holds.
+    known = jnp.where(jnp.isfinite(proposal), proposal, 0.0)
+    halved = 0.5 * (low + high) + (known - lax.stop_gradient(known))
+    following = jnp.where(inside, known, halved)
+    return _Found(following, guard, low, high)
+
+
+def sample_phase(
+    field: Field, start: State, duration: Scalar, n_samples: int, options: Options
+) -> Float[Array, "n_samples dim"]:
+    """States at `n_samples` equal times of a phase, both ends included, at solver accuracy."""
+    stepper = _stepper(field, options)
+    interval = duration / (n_samples - 1)
+
+    def to_next(state: State, _sample: None) -> tuple[State, State]:
+        following = _march(stepper, state, interval, options)
+        return following, following
+
+    _, states = lax.scan(to_next, start, None, length=n_samples - 1)
+    return jnp.concatenate([start[None], states])
+
+
+def _march(stepper: _Stepper, state: State, interval: Scalar, options: Options) -> State:
+    """State after `interval`, by adaptive steps of which the last ends exactly there."""
+
+    def advance(carry: tuple) -> tuple:
+        time, state, solver_state, length, controller_state, tried = carry
+        step_length = jnp.minimum(length, interval - time)
+        end, error, end_solver_state = stepper.step(state, solver_state, step_length)
+        keep, next_length, controller_state = stepper.judge(
+            state, end, error, step_length, controller_state
+        )
+        last = keep & (step_length >= interval - time)
+        time = jnp.where(last, interval, jnp.where(keep, time + step_length, time))
+        state, solver_state = select(keep, (end, end_solver_state), (state, solver_state))
+        return time, state, solver_state, next_length, controller_state, tried + 1
+
+    unfinished = lambda c: (c[0] < interval) & (c[-1] < options.max_solver_steps)
+    none = jnp.zeros((), jnp.int32)
+    solver_state, controller_state = stepper.start(state, options)
+    zero = jnp.zeros_like(interval)
+    carry = (zero, state, solver_state, zero + options.first_step, controller_state, none)
+    return lax.while_loop(unfinished, advance, carry)[1]

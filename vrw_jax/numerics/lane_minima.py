@@ -1,0 +1,153 @@
+"""Lowest values that monitors take along a phase of many wheels, to the integrator's accuracy.
+
+As `minima` does it for one wheel: the march keeps, for each monitor, the step that holds its lowest
+minimum; when it has ended, secant steps on the monitor's rate find it, one monitor after the other.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from vrw_jax.numerics.lanes import select
+from vrw_jax.numerics.minima import AT_MINIMUM, cubic_minimum
+from vrw_jax.numerics.tableaus import Evaluate, Place, Tableau, take_step
+from vrw_jax.numerics.types import Vector
+
+
+class Monitors(NamedTuple):
+    """What is watched; `counts_at_start`: see `minima.Watched`."""
+
+    values: Callable[[Place], Vector]
+    counts_at_start: tuple[bool, ...]
+
+
+class Lowest(NamedTuple):
+    """Monitors where a lane stands, and the step that holds the lowest minimum of each so far."""
+
+    values: Array  # (monitors, lanes)
+    rates: Array
+    so_far: Array  # lowest interior minimum, (monitors, lanes); infinite before there is one
+    q: Array  # where that step begins, (monitors, coordinates, lanes)
+    v: Array
+    length: Array  # of that step, (monitors, lanes), s
+    offset: Array  # of the minimum from its beginning, s
+    rate: Array  # there
+
+
+def with_rates(
+    function: Callable[[Place], Vector], evaluate: Evaluate, place: Place
+) -> tuple[Vector, Vector]:
+    """A function of the place and its derivatives in time along the motion."""
+    n = len(place.q)
+
+    def along(q: Vector, v: Vector) -> Vector:
+        return function(Place(q, v, evaluate(q, v)))
+
+    return jax.jvp(along, (place.q, place.v), (place.v, place.slope.acceleration[:n]))
+
+
+def at_start(monitors: Monitors, evaluate: Evaluate, place: Place) -> Lowest:
+    """Before the first step.
+
+    What is zero at the start rests there: rounding must not make it fall.
+    """
+    values, rates = map(jnp.stack, with_rates(monitors.values, evaluate, place))
+    counts = jnp.asarray(monitors.counts_at_start)[:, None]
+    zeros = jnp.zeros_like(values)
+    held = jnp.zeros((len(values), len(place.q), values.shape[-1]), values.dtype)
+    rates = jnp.where(counts, rates, jnp.maximum(rates, 0.0))
+    return Lowest(values, rates, zeros + jnp.inf, held, held, zeros, zeros, zeros)
+
+
+def lowered(
+    monitors: Monitors,
+    evaluate: Evaluate,
+    lowest: Lowest,
+    here: Place,
+    end: Place,
+    length: Array,
+    taken: Array,
+) -> Lowest:
+    """After a step from `here` to `end` in the lanes that have `taken` it."""
+    values, rates = map(jnp.stack, with_rates(monitors.values, evaluate, end))
+    x, value = cubic_minimum(lowest.values, lowest.rates * length, values, rates * length)
+    value = jnp.where(jnp.isfinite(value), value, jnp.minimum(lowest.values, values))
+    turns = (lowest.rates < 0.0) & (rates >= 0.0)
+    better = taken & turns & (value < lowest.so_far)
+    keep = lambda new, old: jnp.where(better, new, old)
+    held = lambda new, old: jnp.where(better[:, None], jnp.stack(new), old)
+    return Lowest(
+        values=jnp.where(taken, values, lowest.values),
+        rates=jnp.where(taken, rates, lowest.rates),
+        so_far=keep(value, lowest.so_far),
+        q=held(here.q, lowest.q),
+        v=held(here.v, lowest.v),
+        length=keep(length, lowest.length),
+        offset=keep(x * length, lowest.offset),
+        rate=keep(lowest.rates, lowest.rate),
+    )
+
+
+class _Search(NamedTuple):
+    length: Array  # of the next try
+    at: Array  # length with the smallest rate so far
+    rate_at: Array
+    value: Array
+    open: Array
+    tries: Array
+
+
+def settled(
+    monitors: Monitors, tableau: Tableau, evaluate: Evaluate, lowest: Lowest, start: Array, n: int
+) -> Array:
+    """Minima over the phase, ends included, (monitors, lanes); `start`: values where it began.
+
+    At most `n` secant steps for each, all from where the step begins that holds it.
+    """
+
+    def one(_: None, given: tuple) -> tuple[None, Array]:
+        index, held, least = given
+        q, v = tuple(held.q), tuple(held.v)
+        begin = Place(q, v, evaluate(q, v))
+
+        def own(place: Place) -> Array:
+            """The monitor in question alone."""
+            chosen = jnp.arange(len(monitors.counts_at_start)) == index
+            return jnp.sum(jnp.where(chosen[:, None], jnp.stack(monitors.values(place)), 0.0), 0)
+
+        def improve(search: _Search) -> _Search:
+            end = take_step(tableau, evaluate, begin, search.length, with_error=False).end
+            (value,), (rate,) = with_rates(lambda place: (own(place),), evaluate, end)
+            gap = search.length - search.at
+            slope = (rate - search.rate_at) / jnp.where(gap == 0.0, 1.0, gap)
+            usable = (gap != 0.0) & (slope > 0.0)
+            change = jnp.where(usable, -rate / jnp.where(usable, slope, 1.0), 0.0)
+            length = jnp.clip(search.length + change, 0.0, held.length)
+            still = jnp.abs(length - search.length) <= AT_MINIMUM * held.length
+            nearer = jnp.abs(rate) < jnp.abs(search.rate_at)
+            told = _Search(
+                length=length,
+                at=jnp.where(nearer, search.length, search.at),
+                rate_at=jnp.where(nearer, rate, search.rate_at),
+                value=value,
+                open=search.open & ~still,
+                tries=search.tries,
+            )
+            return select(search.open, told, search)._replace(tries=search.tries + 1)
+
+        found = jnp.isfinite(held.so_far)
+        zero = jnp.zeros_like(held.length)
+        tries = jnp.zeros((), jnp.int32)
+        search = _Search(held.offset, zero, held.rate, zero + jnp.inf, found, tries)
+        goes_on = lambda search: jnp.any(search.open) & (search.tries < n)
+        return None, jnp.minimum(lax.while_loop(goes_on, improve, search).value, least)
+
+    counts = np.asarray(monitors.counts_at_start)[:, None]
+    least = jnp.minimum(jnp.where(counts, start, jnp.inf), lowest.values)
+    indices = jnp.arange(len(counts), dtype=jnp.int32)
+    return lax.scan(one, None, (indices, lowest, least))[1]

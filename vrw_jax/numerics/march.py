@@ -1,0 +1,380 @@
+"""One phase of many wheels at once, each with its own step size, to the earliest of its events.
+
+The lanes march side by side until every one has ended or holds a step that crosses a guard; then
+they locate their events together, taking that step again with its length corrected by Newton's
+method. What a lane gives never depends on its neighbours: a lane that has ended is left alone.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from vrw_jax.numerics.lane_minima import Lowest, Monitors, at_start, lowered, settled, with_rates
+from vrw_jax.numerics.lanes import select
+from vrw_jax.numerics.options import Options
+from vrw_jax.numerics.tableaus import Evaluate, Place, Tableau, Taken, dips, parabola, take_step
+from vrw_jax.numerics.types import Vector
+from vrw_jax.simd import apart
+
+
+class LanePhase(NamedTuple):
+    """A phase as data; functions are elementwise over lanes.
+
+    `guards` are positive inside the phase and watched on the way down; `outcomes` says what each
+    means. The earliest wins, of two at once the first in the list.
+    """
+
+    evaluate: Evaluate
+    guards: Callable[[Place], Vector]
+    outcomes: tuple[int, ...]
+    monitors: Monitors | None = None  # whose minima are wanted
+
+
+class LanePhaseEnd(NamedTuple):
+    """Where and how each lane ended; the start where it was not active."""
+
+    place: Place
+    duration: Array  # s
+    guard: Array  # index of the guard that ended it; -1 if none did: it gave up
+    timed_out: Array
+    unfinished: Array  # left for a run with its like, see `integrate_lanes`
+    tried: Array  # steps, accepted or not
+    next_step: Array  # length that the controller would try next, s
+    minima: Array | None  # of the monitors, (monitors, lanes)
+
+
+class _March(NamedTuple):
+    here: Place
+    values: Vector  # guards here
+    h: Array
+    time: Array
+    verdict: Array  # on the last step tried
+    crossing: Array  # bits of the guards that crossed in it
+    tried: Array
+    half: Array  # iterations after which half of the lanes had finished
+    iterations: Array
+    lowest: Lowest | None
+
+
+MARCHING, TIMED_OUT, GAVE_UP, CROSSED, IDLE = range(5)
+"""Verdicts: where a lane's march stands."""
+
+LATE = 2
+"""Times the iterations after which half of the lanes had finished."""
+
+SAFETY, LEAST, MOST = 0.9, 0.2, 5.0
+"""Of the step-size controller: the usual safety factor, and the limits of a step's change."""
+
+
+def integrate_lanes(
+    phase: LanePhase,
+    tableau: Tableau,
+    q: Vector,
+    v: Vector,
+    active: Array,
+    first_step: Array,
+    options: Options,
+    few: Array | None = None,
+) -> LanePhaseEnd:
+    """Every active lane from (q, v) to the earliest of its guards. Errors: as `integrate_phase`.
+
+    Where many lanes march together, as on a GPU, they don't wait for their last `few` if these take
+    `LATE` times as long as half of them: these are marked unfinished, to run again from their start
+    among their like.
+    """
+    phase = _traced_once(phase)
+    start = Place(q, v, phase.evaluate(q, v))
+    values, rates = with_rates(phase.guards, phase.evaluate, start)
+    past = tuple((g < 0.0) | ((g == 0.0) & (r <= 0.0)) for g, r in zip(values, rates, strict=True))
+    at_once = _first(past)
+    begins = active & (at_once < 0)
+
+    march = _march(phase, tableau, start, values, begins, first_step, options, few)
+    crossed = march.verdict == CROSSED
+    if phase.monitors is not None:  # a long program, which what follows makes longer
+        phase = _traced_once(phase, apart)
+    found = _locate(phase, tableau, march, options)
+    lost = crossed & found.open
+    duration = march.time + jnp.where(crossed, found.length, 0.0)
+    place, minima = select(crossed, found.end, march.here), None
+    if phase.monitors is not None and march.lowest is not None:
+        given = phase.monitors, phase.evaluate
+        lowest = lowered(*given, march.lowest, march.here, place, found.length, crossed)
+        first_values = jnp.stack(phase.monitors.values(start))
+        minima = settled(
+            phase.monitors, tableau, phase.evaluate, lowest, first_values, options.monitor_steps
+        )
+    late = crossed & ~found.open & (duration > options.max_phase_time)
+    guard = jnp.where(active & (at_once >= 0), at_once, jnp.where(crossed, found.guard, -1))
+    return LanePhaseEnd(
+        place=place,
+        duration=duration,
+        guard=jnp.where(lost | late, -1, guard),
+        timed_out=(march.verdict == TIMED_OUT) | late,
+        unfinished=march.verdict == MARCHING,
+        tried=march.tried + jnp.where(crossed, found.tried, 0),
+        next_step=march.h,
+        minima=minima,
+    )
+
+
+def _traced_once(phase: LanePhase, how: Callable = jax.jit) -> LanePhase:
+    """Its functions, of which each is traced once however often it is called."""
+    monitors = phase.monitors
+    if monitors is not None:
+        monitors = monitors._replace(values=how(monitors.values))
+    return phase._replace(evaluate=how(phase.evaluate), guards=how(phase.guards), monitors=monitors)
+
+
+def _march(
+    phase: LanePhase,
+    tableau: Tableau,
+    start: Place,
+    values: Vector,
+    begins: Array,
+    first_step: Array,
+    options: Options,
+    few: Array | None,
+) -> _March:
+    """Adaptive steps until each lane has crossed a guard, run out of time or given up."""
+
+    def waits(march: _March) -> Array:
+        marching = march.verdict == MARCHING
+        if few is None:
+            return jnp.any(marching)
+        left = jnp.sum(marching, dtype=jnp.int32)
+        late = march.iterations > LATE * march.half + 8
+        return (left > 0) & ~((left <= few) & late)
+
+    def judge(march: _March, taken: Taken, inside: Vector, end: Vector) -> tuple[Array, Array]:
+        """Length to try next, in units of this one, and what becomes of the step."""
+        squared = _squared_error(taken, march.here, end, options.rtol, options.atol)
+        to_dip = _to_earliest_dip(tableau, march.values, inside, end)
+        return _change(tableau.order, squared, to_dip)
+
+    def advance(march: _March) -> _March:
+        taken = take_step(tableau, phase.evaluate, march.here, march.h)
+        inside, end = phase.guards(taken.inside), phase.guards(taken.end)
+        change, kept = judge(march, taken, inside, end)
+        verdict, crossing, accepted, time, h = _verdict(options, march, change, kept, end)
+        here, values = select(accepted, (taken.end, end), (march.here, march.values))
+        lowest, half = march.lowest, march.half
+        if phase.monitors is not None and lowest is not None:
+            given = phase.monitors, phase.evaluate
+            lowest = lowered(*given, lowest, march.here, taken.end, march.h, accepted)
+        if few is not None:
+            left = jnp.sum(verdict == MARCHING, dtype=jnp.int32)
+            half = jnp.where(2 * left > verdict.size, march.iterations + 1, half)
+        return _March(
+            here=here,
+            values=values,
+            h=h,
+            time=time,
+            verdict=verdict,
+            crossing=crossing,
+            tried=march.tried + (march.verdict == MARCHING),
+            half=half,
+            iterations=march.iterations + 1,
+            lowest=lowest,
+        )
+
+    none, count = jnp.zeros(first_step.shape, jnp.int32), jnp.zeros((), jnp.int32)
+    march = _March(
+        here=start,
+        values=values,
+        h=first_step,
+        time=jnp.zeros_like(first_step),
+        verdict=jnp.where(begins, MARCHING, IDLE).astype(jnp.int32),
+        crossing=none,
+        tried=none,
+        half=count,
+        iterations=count,
+        lowest=phase.monitors and at_start(phase.monitors, phase.evaluate, start),
+    )
+    return lax.while_loop(waits, advance, march)
+
+
+def _change(order: int, squared: Array, to_dip: Array) -> tuple[Array, Array]:
+    """Length of the next try over this one's, and whether the step is kept (1) or retried (2)."""
+    # The controller's power needs no more than float32, which has a vectorised one.
+    power = jnp.exp(jnp.log(jnp.clip(squared, 1e-20, 1e20)) * (-0.5 / order)).astype(to_dip.dtype)
+    keep = squared <= 1.0
+    change = jnp.clip(SAFETY * power, LEAST, jnp.where(keep, MOST, 1.0))
+    retry = keep & (to_dip < 1.0)
+    kept = jnp.where(retry, 2, jnp.where(keep, 1, 0)).astype(jnp.int32)
+    return jnp.where(retry, to_dip, change), kept
+
+
+def _verdict(
+    options: Options, march: _March, change: Array, kept: Array, end: Vector
+) -> tuple[Array, Array, Array, Array, Array]:
+    """What becomes of each lane: verdict, crossing guards, accepted, time, length of its next try.
+
+    A dip that would not move the time on is no reason to stay.
+    """
+    running = march.verdict == MARCHING
+    keep = running & (kept == 1)
+    crossing = jnp.zeros_like(march.crossing)
+    for index, value in enumerate(end):
+        crossing = crossing | jnp.where(value <= 0.0, 1 << index, 0)
+    crossed = keep & (crossing > 0)
+    accepted = keep & ~crossed
+    time = jnp.where(accepted, march.time + march.h, march.time)
+    following = march.h * change
+    timed_out = accepted & (time >= options.max_phase_time)
+    stuck = (march.tried + 1 >= options.max_solver_steps) | (time + following == time)
+    verdict = jnp.where(stuck, GAVE_UP, MARCHING)
+    verdict = jnp.where(timed_out, TIMED_OUT, jnp.where(crossed, CROSSED, verdict))
+    return (
+        jnp.where(running, verdict, march.verdict).astype(jnp.int32),
+        jnp.where(running, crossing, march.crossing),
+        accepted,
+        time,
+        jnp.where(running & ~crossed, following, march.h),
+    )
+
+
+def _squared_error(taken: Taken, start: Place, guards: Vector, rtol: Array, atol: Array) -> Array:
+    """Mean square of the error over its tolerance; infinite where the step went nowhere.
+
+    float32 says enough about an error.
+    """
+    before, after = (*start.q, *start.v), (*taken.end.q, *taken.end.v)
+    single = lambda x: x.astype(jnp.float32)
+    total: Any = 0.0
+    for error, a, b in zip(taken.error, before, after, strict=True):
+        allowed = atol + rtol * jnp.maximum(jnp.abs(a), jnp.abs(b))
+        ratio = single(error) / single(allowed)
+        total = total + ratio * ratio
+    for value in guards:
+        total = total + single(0.0 * value)
+    return jnp.where(jnp.isfinite(total), total / len(before), jnp.inf)
+
+
+def _to_earliest_dip(tableau: Tableau, start: Vector, inside: Vector, end: Vector) -> Array:
+    """Share of the step up to where a guard that falls and rises again is lowest, if near zero.
+
+    1 where there is nothing to look at. See `runge_kutta.dips`.
+    """
+    over, under = jnp.ones_like(start[0]), jnp.ones_like(start[0])
+    for g0, gm, g1 in zip(start, inside, end, strict=True):
+        bend, slope = parabola(tableau, g0, gm, g1)
+        first = dips(g0, g1, bend, slope) & (-slope * under < over * 2.0 * bend)
+        over, under = jnp.where(first, -slope, over), jnp.where(first, 2.0 * bend, under)
+    return over / under
+
+
+class _Search(NamedTuple):
+    length: Array  # the next try; the event's, once found
+    low: Array
+    high: Array
+    open: Array
+    end: Place
+    guard: Array
+    tried: Array
+    tries: Array
+
+
+def _locate(phase: LanePhase, tableau: Tableau, march: _March, options: Options) -> _Search:
+    """The earliest event inside each crossing step, by Newton's method on the step's length.
+
+    The first try is the whole step, the second where the guards' parabolas cross. Every guard that
+    crossed proposes its own time and the earliest is taken, inside a bracket that bisection
+    shrinks. The last proposal moves the end along its slope; it is so short that what the next
+    order would add is a hundredth of the tolerance.
+    """
+    h = march.h
+    enough = 0.1 * jnp.sqrt(options.rtol) * h
+    bits = [(march.crossing >> i) & 1 == 1 for i in range(len(march.values))]
+
+    def propose(search: _Search, end: Place, inside: Place) -> tuple:
+        values, rates = with_rates(phase.guards, phase.evaluate, end)
+        within = phase.guards(inside)
+        change, guard = _newton(values, rates, march.crossing)
+        at = _first_guess(tableau, march.values, within, values, march.crossing)
+        return following(search, values, change, guard, at)
+
+    def following(search: _Search, values: Vector, change: Array, guard: Array, at: Array) -> tuple:
+        before = jnp.ones(h.shape, bool)
+        for g, crosses in zip(values, bits, strict=True):
+            before = before & ~(crosses & (g <= 0.0))
+        low = jnp.where(before, search.length, search.low)
+        high = jnp.where(before, search.high, search.length)
+        proposal = jnp.where(search.tries == 0, at * h, search.length + change)
+        inside = (proposal >= low - enough) & (proposal <= high + enough)
+        length = jnp.where(inside, proposal, 0.5 * (low + high))
+        arrived = inside & (jnp.abs(change) <= enough) & (search.tries > 0)
+        length = jnp.where(search.open, length, search.length)
+        return length, low, high, search.open & arrived, jnp.where(arrived, change, 0.0), guard
+
+    def improve(search: _Search) -> _Search:
+        taken = take_step(tableau, phase.evaluate, march.here, search.length, with_error=False)
+        end = taken.end
+        length, low, high, arrived, shift, guard = propose(search, end, taken.inside)
+
+        def arrive(arrived: Array, shift: Array, end: Place, old: Place) -> Place:
+            q = tuple(x + shift * y for x, y in zip(end.q, end.v, strict=True))
+            v = tuple(x + shift * y for x, y in zip(end.v, end.slope.acceleration, strict=False))
+            return select(arrived, end._replace(q=q, v=v), old)
+
+        return _Search(
+            length=length,
+            low=low,
+            high=high,
+            open=search.open & ~arrived,
+            end=arrive(arrived, shift, end, search.end),
+            guard=jnp.where(arrived, guard, search.guard),
+            tried=search.tried + search.open,
+            tries=search.tries + 1,
+        )
+
+    none = jnp.zeros(h.shape, jnp.int32)
+    start = _Search(
+        h, jnp.zeros_like(h), h, march.verdict == CROSSED, march.here, none, none,
+        jnp.zeros((), jnp.int32),
+    )  # fmt: skip
+    unsettled = lambda search: jnp.any(search.open) & (search.tries < options.event_steps)
+    return lax.while_loop(unsettled, improve, start)
+
+
+def _newton(values: Vector, rates: Vector, crossing: Array) -> tuple[Array, Array]:
+    """Time to the earliest event by each crossing guard's own proposal, and which guard it is."""
+    change = jnp.full_like(values[0], jnp.inf)
+    guard = jnp.zeros_like(crossing)
+    for index, (g, rate) in enumerate(zip(values, rates, strict=True)):
+        falling = ((crossing >> index) & 1 == 1) & (rate < 0.0)
+        own = jnp.where(falling, -g / jnp.where(falling, rate, -1.0), jnp.inf)
+        guard = jnp.where(own < change, index, guard)
+        change = jnp.minimum(own, change)
+    return change, guard
+
+
+def _first_guess(
+    tableau: Tableau, start: Vector, inside: Vector, end: Vector, crossing: Array
+) -> Array:
+    """Share of the step to the earliest zero of the guards' parabolas: secant, then Newton."""
+    earliest = jnp.ones_like(start[0])
+    for index, (g0, gm, g1) in enumerate(zip(start, inside, end, strict=True)):
+        crosses = (crossing >> index) & 1 == 1
+        bend, slope = parabola(tableau, g0, gm, g1)
+        fall = jnp.where(crosses & (g0 > g1), g0 - g1, 1.0)
+        at = jnp.clip(g0 / fall, 0.0, 1.0)
+        for _ in range(3):
+            rate = slope + 2.0 * bend * at
+            falls = rate < 0.0
+            step = (g0 + at * (slope + bend * at)) / jnp.where(falls, rate, 1.0)
+            at = jnp.where(falls, jnp.clip(at - step, 0.0, 1.0), at)
+        earliest = jnp.where(crosses, jnp.minimum(earliest, at), earliest)
+    return earliest
+
+
+def _first(conditions: Vector) -> Array:
+    """Index of the first condition that holds; -1 where none does."""
+    index = jnp.full(conditions[0].shape, -1, jnp.int32)
+    for i in range(len(conditions) - 1, -1, -1):
+        index = jnp.where(conditions[i], i, index)
+    return index

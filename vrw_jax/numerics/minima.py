@@ -1,0 +1,195 @@
+"""Lowest values that monitors take along a phase, to the integrator's accuracy.
+
+While the march goes on, the step that holds the lowest minimum of each monitor is kept; when it has
+ended, secant steps on the monitor's rate find it, one monitor after the other.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from vrw_jax.numerics.types import Scalar
+
+State = Float[Array, " dim"]
+Watch = Callable[[State], Float[Array, " n_watched"]]
+"""Guards and monitors as functions of the state."""
+
+
+class Watched(NamedTuple):
+    """What to watch along a phase: guards that end it, then monitors whose minimum is wanted.
+
+    `values` returns the `n_guards` guards followed by the monitors. A monitor's minimum is sought
+    at every interior local minimum and at the phase's end; at its start too (`count_start`), unless
+    the quantity is zero there by construction, like the height of a foot that leaves the ground.
+    """
+
+    values: Watch
+    n_guards: int
+    count_start: tuple[bool, ...] = ()
+
+
+class Step(NamedTuple):
+    """The end of the last accepted step: what a rejected step leaves as it is."""
+
+    time: Scalar
+    state: State
+    solver_state: Any
+    values: Float[Array, " n_watched"]
+    rates: Float[Array, " n_watched"]
+
+
+class Minimum(NamedTuple):
+    """Lowest interior minimum so far of each monitor, and the step that holds it."""
+
+    value: Float[Array, " n"]
+    left: Float[Array, "n dim"]
+    length: Float[Array, " n"]  # of the step from `left`, s
+    offset: Float[Array, " n"]  # of the minimum from `left`, s
+    rate_left: Float[Array, " n"]
+
+    @property
+    def found(self) -> Bool[Array, " n"]:
+        return jnp.isfinite(self.value)
+
+
+class Settling(NamedTuple):
+    """After the march: secant steps on a monitor's rate, one monitor after the other."""
+
+    on: Bool[Array, ""]
+    monitor: Int[Array, ""]
+    tries: Int[Array, ""]
+    at: Scalar  # place with the smallest rate so far, from the step's left end, s
+    rate_at: Scalar
+    lowest: Float[Array, " n"]  # settled minima, and the values at the phase's start
+
+
+def cubic(x: Array, v0: Array, r0: Array, v1: Array, r1: Array) -> Array:
+    """Cubic Hermite interpolant on [0, 1]; the rates are already times the length."""
+    return (
+        (1 + 2 * x) * (1 - x) ** 2 * v0
+        + x * (1 - x) ** 2 * r0
+        + x * x * (3 - 2 * x) * v1
+        + x * x * (x - 1) * r1
+    )
+
+
+def cubic_minimum(v0: Array, r0: Array, v1: Array, r1: Array) -> tuple[Array, Array]:
+    """Place in (0, 1) and value of the cubic's interior minimum; value inf where there is none."""
+    a = 3.0 * (2.0 * v0 + r0 - 2.0 * v1 + r1)
+    b = 2.0 * (-3.0 * v0 - 2.0 * r0 + 3.0 * v1 - r1)
+    discriminant = b * b - 4.0 * a * r0
+    root = jnp.sqrt(jnp.where(discriminant > 0.0, discriminant, 1.0))
+    # The minimum is the root with positive curvature, written without cancellation.
+    denominator = jnp.where(b >= 0.0, -(b + root), 2.0 * a)
+    numerator = jnp.where(b >= 0.0, 2.0 * r0, root - b)
+    safe = jnp.where(denominator == 0.0, 1.0, denominator)
+    x = jnp.where(denominator == 0.0, -1.0, numerator / safe)
+    exists = (discriminant > 0.0) & (x > 0.0) & (x < 1.0)
+    x = jnp.where(exists, x, 0.5)
+    return x, jnp.where(exists, cubic(x, v0, r0, v1, r1), jnp.inf)
+
+
+def no_minimum(watched: Watched, start: State) -> Minimum:
+    n = len(watched.count_start)
+    zeros = jnp.zeros((n,), start.dtype)
+    return Minimum(zeros + jnp.inf, jnp.tile(start, (n, 1)), zeros, zeros, zeros)
+
+
+def lower(
+    watched: Watched,
+    minimum: Minimum,
+    left: Step,
+    right: Step,
+    length: Scalar,
+    counts: Bool[Array, ""],
+) -> Minimum:
+    """Keep the step in which a monitor turns from falling to rising, if it is the lowest yet.
+
+    A monitor that is zero at the phase's start is at rest there: rounding must not make it fall.
+    """
+    if not watched.count_start:
+        return minimum
+    v0, r0, v1, r1 = (
+        lax.stop_gradient(v)[watched.n_guards :]
+        for v in (left.values, left.rates, right.values, right.rates)
+    )
+    at_rest = (left.time == 0.0) & ~jnp.asarray(watched.count_start)
+    r0 = jnp.where(at_rest, jnp.maximum(r0, 0.0), r0)
+    length = lax.stop_gradient(length)
+    x, value = cubic_minimum(v0, r0 * length, v1, r1 * length)
+    value = jnp.where(jnp.isfinite(value), value, jnp.minimum(v0, v1))
+    better = counts & (r0 < 0.0) & (r1 >= 0.0) & (value < minimum.value)
+    return Minimum(
+        jnp.where(better, value, minimum.value),
+        jnp.where(better[:, None], left.state, minimum.left),
+        jnp.where(better, length, minimum.length),
+        jnp.where(better, x * length, minimum.offset),
+        jnp.where(better, r0, minimum.rate_left),
+    )
+
+
+def row_of(index: Int[Array, ""], rows: Array) -> Array:
+    """The row of that index; a gather would cost more in a batch."""
+    chosen = jnp.arange(rows.shape[0]) == index
+    return jnp.sum(jnp.where(chosen.reshape(-1, *(1,) * (rows.ndim - 1)), rows, 0.0), axis=0)
+
+
+def settle(
+    settling: Settling,
+    watched: Watched,
+    minimum: Minimum,
+    values: Array,
+    rates: Array,
+    length: Scalar,
+    following: Scalar,
+    starting: Bool[Array, ""],
+    ends: Bool[Array, ""],
+    n_steps: int,
+) -> tuple[Settling, Scalar]:
+    """Each monitor's minimum to the integrator's accuracy, by re-steps once the march `ends`.
+
+    At most `n_steps` secant steps on the rate, each a step from the left end of the march's step
+    that holds the minimum. Returns where that stands, and the next length.
+    """
+    values, rates = values[watched.n_guards :], rates[watched.n_guards :]
+    monitor, tries = settling.monitor, settling.tries + settling.on
+    value, rate, room = (row_of(monitor, x) for x in (values, rates, minimum.length))
+    fixed_rate, fixed_length = lax.stop_gradient((rate, length))
+    gap = fixed_length - settling.at
+    slope = (fixed_rate - settling.rate_at) / jnp.where(gap == 0.0, 1.0, gap)
+    usable = (gap != 0.0) & (slope > 0.0)
+    secant = length - jnp.where(usable, rate / jnp.where(usable, slope, 1.0), 0.0)
+    secant = jnp.clip(secant, 0.0, lax.stop_gradient(room))
+    still = jnp.abs(secant - length) <= AT_MINIMUM * room
+    done = settling.on & ((tries == n_steps) | (still & (tries >= FEWEST)))
+    nearer = jnp.abs(fixed_rate) < jnp.abs(settling.rate_at)
+
+    monitors = jnp.arange(values.shape[0])
+    lowest = jnp.where(
+        done & (monitors == monitor), jnp.minimum(value, settling.lowest), settling.lowest
+    )
+    at_start = jnp.where(jnp.asarray(watched.count_start), values, jnp.inf)
+    left = minimum.found & (ends | (monitors > monitor))
+    turns = ends | done
+    monitor = jnp.where(turns, jnp.argmax(left).astype(jnp.int32), monitor)
+    offset, rate_left = lax.stop_gradient(
+        (row_of(monitor, minimum.offset), row_of(monitor, minimum.rate_left))
+    )
+    return Settling(
+        on=jnp.where(turns, jnp.any(left), settling.on),
+        monitor=monitor,
+        tries=jnp.where(turns, 0, tries),
+        at=jnp.where(turns, 0.0, jnp.where(nearer, fixed_length, settling.at)),
+        rate_at=jnp.where(turns, rate_left, jnp.where(nearer, fixed_rate, settling.rate_at)),
+        lowest=jnp.where(starting, at_start, lowest),
+    ), jnp.where(turns, offset, jnp.where(settling.on, secant, following))
+
+
+FEWEST = 3
+"""Tries at a minimum, at least: each makes the place's derivatives right to some digits more."""
+AT_MINIMUM = 1e-6
+"""How near a minimum's place is known when it counts, in lengths of the step that holds it: the
+value is then off by the square of that."""

@@ -1,0 +1,151 @@
+"""Limit cycles of any return map by Newton's method on the section: it needs nothing else."""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from vrw_jax.numerics.types import Scalar
+
+
+class SectionCycle(NamedTuple):
+    """A point that a map repeats, and how disturbances of it grow."""
+
+    x: Float[Array, " n"]
+    jacobian: Float[Array, "n n"]  # of the map, or of its period_n-th iterate
+    residual: Scalar  # largest entry of map(x) - x
+    converged: Bool[Array, ""]
+    iterations: Int[Array, ""]
+
+
+class Corrected(NamedTuple):
+    """Where Newton's method has come to."""
+
+    x: Float[Array, " n"]  # after the last correction
+    at: Float[Array, " n"]  # before it
+    told: Any  # what was told there
+    converged: Bool[Array, ""]
+    iterations: Int[Array, ""]  # until a change was small enough
+
+
+ITERATIONS = 30
+"""Of Newton's method, at most."""
+
+
+def corrected(
+    correct: Callable[[Array], tuple[Array, Any]],
+    start: Float[Array, " n"],
+    blank: Any,
+    tolerance: Scalar,
+    further: int,
+    iterations: int = ITERATIONS,
+) -> Corrected:
+    """Newton's method: `correct(x)` gives its change, and tells something in the form of `blank`.
+
+    Once a change is within `tolerance`, `further` corrections follow. All are turns of one loop, so
+    that `correct`, often a large program, is compiled once.
+    """
+
+    def searches(size: Array, count: Array) -> Array:
+        return (size > tolerance) & (count < iterations) & jnp.isfinite(size)
+
+    def going(state: tuple) -> Array:
+        _, size, count, followed, *_ = state
+        return searches(size, count) | ((size <= tolerance) & (followed < further))
+
+    def step(state: tuple) -> tuple:
+        x, size, count, followed, *_ = state
+        searching = searches(size, count)
+        change, told = correct(x)
+        size = jnp.where(searching, jnp.max(jnp.abs(change)), size)
+        moved = jnp.where(jnp.all(jnp.isfinite(change)), x + change, x)
+        return moved, size, count + searching, followed + ~searching, x, told
+
+    zero, one = jnp.zeros((), jnp.int32), jnp.ones((), start.dtype)
+    begin = (start, one, zero, zero, start, blank)
+    x, size, count, _, at, told = lax.while_loop(going, step, begin)
+    return Corrected(x, at, told, size <= tolerance, count)
+
+
+def newton_cycle(
+    function: Callable[[Array], Array],
+    start: Float[Array, " n"],
+    *,
+    period_n: int = 1,
+    tolerance: float | Scalar = 1e-12,
+    iterations: int = ITERATIONS,
+) -> SectionCycle:
+    """A fixed point of `function` applied `period_n` times, by Newton's method from `start`.
+
+    Differentiable in whatever `function` closes over, by two further iterations that carry
+    derivatives: the point to third order, the Jacobian to first. A start that does not converge is
+    returned as it is, without derivative.
+    """
+
+    def iterate(x: Array) -> Array:
+        for _ in range(period_n):
+            x = function(x)
+        return x
+
+    start = lax.stop_gradient(start)
+    image, closed_over = jax.closure_convert(iterate, start)
+    tolerance = lax.stop_gradient(jnp.asarray(tolerance, start.dtype))
+    return _found(image, iterations, start, tolerance, *closed_over)
+
+
+Map = Callable[..., Array]
+
+
+def _correction(image: Map, x: Array, closed_over: tuple) -> tuple[Array, Array, Array]:
+    """Newton's change, the map's Jacobian, and by how much the map misses."""
+
+    def twice(y: Array) -> tuple[Array, Array]:
+        reached = image(y, *closed_over)
+        return reached, reached
+
+    jacobian, reached = jax.jacfwd(twice, has_aux=True)(x)
+    miss = reached - x
+    return jnp.linalg.solve(jnp.eye(x.size, dtype=x.dtype) - jacobian, miss), jacobian, miss
+
+
+POLISHED = 2
+"""Iterations after convergence. One from a point without derivatives leaves it with its first."""
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _found(
+    image: Map, iterations: int, start: Array, tolerance: Array, *closed_over: Any
+) -> SectionCycle:
+    def correct(x: Array) -> tuple[Array, tuple[Array, Array]]:
+        change, jacobian, miss = _correction(image, x, closed_over)
+        return change, (jacobian, jnp.max(jnp.abs(miss)))
+
+    blank = jnp.zeros((start.size,) * 2, start.dtype), jnp.ones((), start.dtype)
+    found = corrected(correct, start, blank, tolerance, POLISHED, iterations)
+    x, (jacobian, residual) = jnp.where(found.converged, found.x, start), found.told
+    return SectionCycle(x, jacobian, residual, found.converged, found.iterations)
+
+
+@_found.defjvp
+def _found_and_moved(
+    image: Map, iterations: int, primals: tuple, tangents: tuple
+) -> tuple[SectionCycle, SectionCycle]:
+    """The derivative, by iterations from the fixed point that carry it along."""
+    start, _, *closed_over = primals
+    found = _found(image, iterations, *lax.stop_gradient(primals))
+
+    def polished(*closed_over: Any) -> SectionCycle:
+        def polish(point: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
+            change, jacobian, miss = _correction(image, point, closed_over)
+            moved = point + jnp.where(found.converged, change, 0.0)
+            return moved, (jacobian, jnp.max(jnp.abs(miss)))
+
+        point, (jacobians, residuals) = lax.scan(polish, found.x, None, length=POLISHED)
+        x = jnp.where(found.converged, point, start)
+        return SectionCycle(x, jacobians[-1], residuals[-1], found.converged, found.iterations)
+
+    return jax.jvp(polished, tuple(closed_over), tuple(tangents[2:]))

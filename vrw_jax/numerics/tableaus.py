@@ -1,0 +1,162 @@
+"""One explicit Runge-Kutta step of many wheels at once, lane by lane in separate arrays.
+
+The equations of motion are of second order, q'' = f(q, q'), so that a step keeps the accelerations
+of its stages alone: positions take the tableau's matrix twice, rates once. That is the same method
+with half of the stored slopes. Tableaus are diffrax's.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool
+
+from vrw_jax.numerics.events import solver_named
+from vrw_jax.numerics.options import Options
+from vrw_jax.numerics.types import Vector
+
+
+class Tableau(NamedTuple):
+    """An explicit method whose last stage is the step's end, and so the next step's first."""
+
+    order: int
+    places: np.ndarray  # of the stages, in step lengths
+    once: np.ndarray  # the method's matrix: from accelerations to rates
+    twice: np.ndarray  # its square: from accelerations to positions
+    error_once: np.ndarray
+    error_twice: np.ndarray
+    middle: int
+    """A stage well inside the step, to look for guards that dip below zero and come back."""
+
+
+@functools.cache
+def explicit_tableau(name: str) -> Tableau | None:
+    """diffrax's tableau of that name; None where the method is not explicit Runge-Kutta."""
+    solver: Any = solver_named(name, Options())
+    given = getattr(solver, "tableau", None)
+    if given is None or not all(hasattr(given, part) for part in ("a_lower", "b_sol", "b_error")):
+        return None
+    if getattr(given, "a_diagonal", None) is not None and np.any(given.a_diagonal):
+        return None
+    n, ends_there = len(given.b_sol), bool(given.ssal)
+    once = np.zeros((n + (not ends_there), n + (not ends_there)))
+    for i, row in enumerate(given.a_lower):
+        once[i + 1, : i + 1] = row
+    error = np.zeros(len(once))
+    error[:n] = given.b_error
+    if not ends_there:
+        once[n, :n] = given.b_sol
+    places = once.sum(axis=1)
+    return Tableau(
+        order=int(solver.order(None)),
+        places=places,
+        once=once,
+        twice=_without_rounding(once @ once),
+        error_once=error,
+        error_twice=_without_rounding(error @ once),
+        middle=int(np.argmin(np.abs(places - 0.45))),
+    )
+
+
+def parabola(tableau: Tableau, start: Array, inside: Array, end: Array) -> tuple[Array, Array]:
+    """Bend and slope, in step lengths, of the one through a guard's values along a step.
+
+    `inside`: at the stage `middle`.
+    """
+    place = float(tableau.places[tableau.middle])
+    bend = (end - start - (inside - start) / place) / (1.0 - place)
+    return bend, end - start - bend
+
+
+def dips(start: Array, end: Array, bend: Array, slope: Array) -> Bool[Array, "..."]:
+    """Whether a guard's parabola falls and rises again so low that the step is to end there first.
+
+    Then the guard has crossed there, or the march goes on from its lowest point, -slope / (2 bend).
+    A point no lower than the start by 1 % is not new.
+    """
+    falls_and_rises = (slope < 0.0) & (slope + 2.0 * bend > 0.0)
+    low = 4.0 * bend * start - slope * slope  # the lowest value, times 4 bend > 0
+    near = 5.0 * low <= 4.0 * bend * jnp.maximum(start, end)
+    new = 4.0 * bend * start > 1.01 * low
+    return falls_and_rises & near & new & (end > 0.0)
+
+
+def _without_rounding(x: np.ndarray) -> np.ndarray:
+    """Products of a tableau that vanish but for rounding, as zeros."""
+    return np.where(np.abs(x) < 1e-14 * np.max(np.abs(x)), 0.0, x)
+
+
+class Slope(NamedTuple):
+    """What the equations of motion say at one point."""
+
+    sin: Array  # of theta
+    cos: Array
+    acceleration: Vector  # of all three coordinates; the phase's own come first
+
+
+def real_stability_limit(tableau: Tableau) -> float:
+    """Largest z with |R(-z)| <= 1: a mode that decays at rate r bears steps up to z / r."""
+    z, stages, growth = np.linspace(0.01, 20.0, 2000), np.ones(len(tableau.places)), 1.0
+    for power in range(1, len(stages) + 1):  # R is a polynomial: 1 - z w (1 - z A + ...)
+        growth = growth + (-z) ** power * (tableau.once[-1] @ stages)
+        stages = tableau.once @ stages
+    return float(z[np.argmax(np.abs(growth) > 1.0 + 1e-12)])
+
+
+class Place(NamedTuple):
+    """Positions, rates and slope of one stage."""
+
+    q: Vector
+    v: Vector
+    slope: Slope
+
+
+class Taken(NamedTuple):
+    """A step: its end, a place inside and the error estimate."""
+
+    end: Place
+    inside: Place
+    error: Vector  # of positions, then rates
+
+
+Evaluate = Callable[[Vector, Vector], Slope]
+
+
+def take_step(
+    tableau: Tableau, evaluate: Evaluate, start: Place, h: Array, with_error: bool = True
+) -> Taken:
+    """From `start` by `h` (lane by lane)."""
+    n = len(start.q)
+    places, slopes = [start], [start.slope.acceleration[:n]]
+    q0, v0 = start.q, start.v
+
+    def stage(i: int) -> tuple[Vector, Vector]:
+        position, rate = [], []
+        for d in range(n):
+            known = [slope[d] for slope in slopes]
+            twice, once = _weigh(tableau.twice[i], known), _weigh(tableau.once[i], known)
+            drift = float(tableau.places[i]) * v0[d]
+            position.append(q0[d] + h * (drift if twice is None else drift + h * twice))
+            rate.append(v0[d] + h * once)
+        return tuple(position), tuple(rate)
+
+    for i in range(1, len(tableau.places)):
+        q, v = stage(i)
+        slope = evaluate(q, v)
+        places.append(Place(q, v, slope))
+        slopes.append(slope.acceleration[:n])
+
+    error: Vector = ()
+    if with_error:
+        known = [[slope[d] for slope in slopes] for d in range(n)]
+        of_position = [h * h * _weigh(tableau.error_twice, k) for k in known]
+        error = tuple(of_position + [h * _weigh(tableau.error_once, k) for k in known])
+    return Taken(places[-1], places[tableau.middle], error)
+
+
+def _weigh(weights: np.ndarray, terms: list[Array]) -> Any:
+    """Weighted sum; None where all weights vanish."""
+    parts = [float(w) * x for w, x in zip(weights, terms, strict=False) if w != 0.0]
+    return sum(parts[1:], start=parts[0]) if parts else None

@@ -1,0 +1,9 @@
+"""What the paper publishes, set beside what is computed here."""
+
+from vrw_jax.paper.facts.base import Fact
+from vrw_jax.paper.reproduction import reproduce
+
+__all__ = [
+    "Fact",
+    "reproduce",
+]

@@ -1,0 +1,39 @@
+"""What quantities are called and how results show themselves."""
+
+from vrw_jax.results.measures import (
+    CYCLE,
+    GROUND,
+    MARGINS,
+    MEASURES,
+    ON_GROUND,
+    PHASES,
+    STEP,
+    TRAJECTORY,
+    Measure,
+    attrs_of,
+    flags,
+)
+from vrw_jax.results.provenance import provenance
+from vrw_jax.results.text import Row, as_html, as_text, is_concrete, listed
+from vrw_jax.results.wording import nearest
+
+__all__ = [
+    "CYCLE",
+    "GROUND",
+    "MARGINS",
+    "MEASURES",
+    "ON_GROUND",
+    "PHASES",
+    "STEP",
+    "TRAJECTORY",
+    "Measure",
+    "Row",
+    "as_html",
+    "as_text",
+    "attrs_of",
+    "flags",
+    "is_concrete",
+    "listed",
+    "nearest",
+    "provenance",
+]

@@ -1,0 +1,39 @@
+"""Where results come from: versions, device, number format, tolerances, parameters."""
+
+import importlib.metadata
+import platform
+
+import jax
+
+from vrw_jax.numerics import Options
+from vrw_jax.wheel import PARAMETER_NAMES, WheelParams
+
+
+def provenance(
+    params: WheelParams, model: object, options: Options
+) -> dict[str, str | float | int]:
+    """Where a result comes from: versions, device, number format, tolerances, parameters."""
+    names = ("vrw-jax", "jax", "diffrax", "numpy")
+    values: dict[str, str | float | int] = {
+        f"parameter_{name}": float(getattr(params, name))
+        for name in PARAMETER_NAMES
+        if getattr(params, name).ndim == 0
+    }
+    return values | {
+        "parameter_n_legs": params.n_legs,
+        "model": repr(model),
+        "versions": ", ".join(f"{name} {_version(name)}" for name in names)
+        + f", python {platform.python_version()}",
+        "device": jax.devices()[0].device_kind,
+        "dtype": str(params.damping.dtype),
+        "solver": options.solver,
+        "rtol": float(options.rtol),
+        "atol": float(options.atol),
+    }
+
+
+def _version(name: str) -> str:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"

@@ -1,0 +1,20 @@
+"""How a process computes and what it keeps: number format, libraries on demand, store, programs."""
+
+from vrw_jax.runtime.lazy import diffrax, optax, xarray, zarr
+from vrw_jax.runtime.programs import compiled, remembered
+from vrw_jax.runtime.start import fusion_emitters, start_jax
+from vrw_jax.runtime.store import code_digest, keep, kept
+
+__all__ = [
+    "code_digest",
+    "compiled",
+    "diffrax",
+    "fusion_emitters",
+    "keep",
+    "kept",
+    "optax",
+    "remembered",
+    "start_jax",
+    "xarray",
+    "zarr",
+]

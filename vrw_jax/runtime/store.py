@@ -1,0 +1,51 @@
+"""What is computed from code alone, kept on disk beside JAX's compiled code."""
+
+import functools
+import hashlib
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import jax
+
+
+@functools.cache
+def code_digest() -> str:
+    """A digest of the library's source: other code may give other digits."""
+    digest = hashlib.sha256()
+    folder = Path(__file__).parents[1]
+    for path in sorted(folder.rglob("*.py")):
+        digest.update(path.relative_to(folder).as_posix().encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def folder() -> Any:
+    """JAX's compilation cache; None where there is none."""
+    return jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+
+
+def kept(name: str) -> bytes | None:
+    """What was kept under that name beside JAX's compiled code; None if nothing, or damaged."""
+    place = folder() and Path(folder()) / name
+    if not place or not place.exists():
+        return None
+    stored = place.read_bytes()
+    digest, content = stored[:32], stored[32:]
+    return content if hashlib.sha256(content).digest() == digest else None
+
+
+def keep(name: str, content: bytes) -> None:
+    """Written beside its place and renamed; a cache that can't be written is no error."""
+    if not folder():
+        return
+    place = Path(folder()) / name
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        handle, unfinished = tempfile.mkstemp(dir=place.parent)
+        with os.fdopen(handle, "wb") as file:
+            file.write(hashlib.sha256(content).digest() + content)
+        os.replace(unfinished, place)
+    except OSError:
+        return

@@ -1,0 +1,114 @@
+"""Scans on the workers of a dask cluster: the chunks of `run`, each by whichever worker is free.
+
+Workers only compute; the process that asked writes the store. A worker that dies loses the chunks
+it held to the others. Workers say by what means they compute, and other means than the store's are
+refused: its last digits might not fit.
+"""
+
+import contextlib
+import functools
+import itertools
+import pickle
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vrw_jax.runtime import start_jax
+from vrw_jax.scans.design import Columns
+from vrw_jax.scans.evaluate import Engine, n_cores
+from vrw_jax.scans.ground import GroundEngine, LadderEngine, engine_for
+from vrw_jax.scans.running import Chunk, Plan, Through, difference, origin
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+AHEAD = 2
+"""Chunks that wait at the cluster for each of its threads: enough to keep it busy, few to hold."""
+
+ANSWER = "10s"
+"""How long a scheduler may take to answer."""
+
+
+@contextlib.contextmanager
+def workers(address: str) -> Iterator[Through]:
+    """The workers of the scheduler at `address`, or for "local" one process for each core."""
+    try:
+        from distributed import Client, LocalCluster
+    except ImportError as error:
+        raise ValueError(
+            "a scan on a cluster needs dask.distributed, which is not installed: "
+            "run pip install 'vrw-jax[dask]'."
+        ) from error
+    with contextlib.ExitStack() as stack:
+        if address == "local":
+            cluster = LocalCluster(
+                n_workers=n_cores(), threads_per_worker=1, dashboard_address=None
+            )
+            client = Client(stack.enter_context(cluster))
+        else:
+            try:
+                client = Client(address, timeout=ANSWER)
+            except (OSError, ValueError) as error:  # no answer, or no address
+                raise ValueError(
+                    f"no dask scheduler answers at {address!r}: give the address that it printed "
+                    "when it started, such as tcp://host:8786, or 'local'."
+                ) from error
+        stack.enter_context(client)
+        yield functools.partial(_chunks, client)
+
+
+def _chunks(client: "Client", planned: Plan, missing: Sequence[int]) -> Iterator[Chunk]:
+    """Results of the missing chunks, in the order in which they come."""
+    from distributed import Future, KilledWorker, as_completed
+
+    of = planned
+    recipe = pickle.dumps((of.measures, of.base, of.model, of.options, of.cycle_options))
+    here, waiting = origin(), iter(missing)
+    held: dict[Future, int] = {}
+    coming = as_completed()
+
+    def fill() -> None:
+        room = AHEAD * max(1, sum(client.nthreads().values())) - len(held)
+        for index in itertools.islice(waiting, max(room, 0)):
+            columns = planned.design.block(planned.layout.region(index))
+            future = client.submit(_computed, recipe, columns, pure=False)
+            held[future] = index
+            coming.add(future)
+
+    try:
+        fill()
+        for future in coming:
+            try:
+                there, results = future.result()
+            except KilledWorker as error:
+                raise ValueError(
+                    "a chunk was given up because each worker that had it died: see to the "
+                    "workers (their memory, say) and run the same again, it goes on from there."
+                ) from error
+            told = difference(here, there)
+            if told:
+                raise ValueError(
+                    f"a worker computes by other means than this process: {told}. "
+                    "Start the workers from the same installation on machines of one kind."
+                )
+            yield held.pop(future), results
+            del future  # the cluster may forget it
+            fill()
+    finally:
+        client.cancel(list(held))
+
+
+def _computed(recipe: bytes, columns: Columns) -> tuple[dict[str, object], dict[str, np.ndarray]]:
+    """In a worker: by what means, and the results of a chunk."""
+    start_jax()
+    return origin(), _engine(recipe)(columns)
+
+
+@functools.cache
+def _engine(recipe: bytes) -> Engine | GroundEngine | LadderEngine:
+    from distributed import get_worker
+
+    measures, base, model, options, cycle_options = pickle.loads(recipe)
+    threads = get_worker().state.nthreads
+    return engine_for(measures, base, model, options, cycle_options, threads)

@@ -1,0 +1,227 @@
+"""What a scan looks at: samples of the wheel's parameters, as a grid or as a list."""
+
+import abc
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vrw_jax.results import nearest
+from vrw_jax.wheel import FRICTION, PARAMETER_NAMES
+
+Columns = dict[str, np.ndarray]
+"""One value per sample of each parameter that is swept."""
+SWEPT = (*PARAMETER_NAMES, FRICTION)
+"""What may be swept: the wheel's parameters, and the friction of a ground that has one."""
+Range = tuple[float, float]
+SALTELLI = "saltelli"
+"""Kind of the samples that Sobol' indices are read off."""
+
+
+class AbstractDesign(abc.ABC):
+    """Samples laid out over `shape`; a block of that shape is one unit of work."""
+
+    kind: str
+    values: Mapping[str, np.ndarray]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The parameters that are swept."""
+        return tuple(self.values)
+
+    @property
+    def size(self) -> int:
+        """Number of samples."""
+        return int(np.prod(self.shape, dtype=np.int64))
+
+    @property
+    @abc.abstractmethod
+    def dims(self) -> tuple[str, ...]:
+        """Names of the axes of a labelled result."""
+
+    @property
+    @abc.abstractmethod
+    def shape(self) -> tuple[int, ...]:
+        """Lengths of those axes."""
+
+    @abc.abstractmethod
+    def block(self, region: tuple[slice, ...]) -> Columns:
+        """The samples of a rectangular region, flat, the last axis fastest."""
+
+    @abc.abstractmethod
+    def coordinates(self) -> dict[str, tuple[str, np.ndarray]]:
+        """Coordinates of a labelled result: name -> (axis, values)."""
+
+    def description(self) -> dict[str, object]:
+        """What makes this design this one: kind, names, axes and a digest of every number."""
+        digest = hashlib.sha256(json.dumps([self.kind, *self.names]).encode())
+        for column in self.values.values():
+            digest.update(np.ascontiguousarray(column, dtype="<f8").tobytes())
+        return {
+            "kind": self.kind,
+            "swept": list(self.names),
+            "shape": list(self.shape),
+            "digest": digest.hexdigest(),
+        }
+
+
+@dataclass(frozen=True)
+class Grid(AbstractDesign):
+    """Every combination of the values given for each parameter; one axis per parameter."""
+
+    values: Mapping[str, np.ndarray]
+    kind: str = "grid"
+
+    @property
+    def dims(self) -> tuple[str, ...]:
+        return self.names
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return tuple(len(column) for column in self.values.values())
+
+    def block(self, region: tuple[slice, ...]) -> Columns:
+        pieces = [column[part] for column, part in zip(self.values.values(), region, strict=True)]
+        mesh = np.meshgrid(*pieces, indexing="ij")
+        return {name: axis.ravel() for name, axis in zip(self.names, mesh, strict=True)}
+
+    def coordinates(self) -> dict[str, tuple[str, np.ndarray]]:
+        return {name: (name, column) for name, column in self.values.items()}
+
+
+@dataclass(frozen=True)
+class Samples(AbstractDesign):
+    """Samples one by one, along the axis `sample`; all parameters may vary at once."""
+
+    values: Mapping[str, np.ndarray]
+    kind: str = "samples"
+
+    @property
+    def dims(self) -> tuple[str, ...]:
+        return ("sample",)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return (len(next(iter(self.values.values()))),)
+
+    def block(self, region: tuple[slice, ...]) -> Columns:
+        return {name: column[region[0]] for name, column in self.values.items()}
+
+    def coordinates(self) -> dict[str, tuple[str, np.ndarray]]:
+        index = {"sample": ("sample", np.arange(self.size))}
+        return index | {name: ("sample", column) for name, column in self.values.items()}
+
+
+def grid(**values: Sequence[float] | np.ndarray) -> Grid:
+    """Every combination of the values of each parameter, e.g. `grid(damping=..., slope=...)`."""
+    columns = {name: _column(name, value) for name, value in _known(values).items()}
+    for name, column in columns.items():
+        if len(np.unique(column)) != len(column):
+            raise ValueError(
+                f"{name} holds a value twice, but each value of a grid's axis names one place: "
+                "give every value once."
+            )
+    return Grid(columns)
+
+
+def samples(values: Mapping[str, Sequence[float] | np.ndarray]) -> Samples:
+    """The samples given, e.g. `samples({"damping": [100, 150], "slope": [0.29, 0.30]})`.
+
+    A sample out of a parameter's domain, or not finite, gets the outcome BAD_INPUT.
+    """
+    columns = {name: _column(name, value) for name, value in _known(values).items()}
+    lengths = {name: len(column) for name, column in columns.items()}
+    if len(set(lengths.values())) > 1:
+        raise ValueError(
+            f"the columns have lengths {lengths}, but a sample takes one value from each: "
+            "give columns of one length."
+        )
+    return Samples(columns)
+
+
+def sobol(ranges: Mapping[str, Range], n: int, seed: int = 0) -> Samples:
+    """`n` samples of a scrambled Sobol' sequence; even spread is best where n is a power of 2."""
+    from scipy.stats import qmc  # only drawing needs it, and its import is slow
+
+    names, lower, upper = _box(ranges, n)
+    exponent = max(int(n - 1).bit_length(), 0)
+    points = qmc.Sobol(len(names), rng=np.random.default_rng(seed)).random_base2(exponent)[:n]
+    return _spread(names, lower, upper, points, "sobol")
+
+
+def uniform(ranges: Mapping[str, Range], n: int, seed: int = 0) -> Samples:
+    """`n` independent samples, uniform over the box."""
+    names, lower, upper = _box(ranges, n)
+    points = np.random.default_rng(seed).random((n, len(names)))
+    return _spread(names, lower, upper, points, "uniform")
+
+
+def saltelli(ranges: Mapping[str, Range], n: int, seed: int = 0) -> Samples:
+    """Samples for `variance.sobol_indices`: for d parameters, `n` rows of 2 + d, n a power of two.
+
+    A row holds two independent points of the box, A and B, and A with each coordinate in turn taken
+    from B. Samples are ordered A, B, then by parameter.
+    """
+    from scipy.stats import qmc  # only drawing needs it, and its import is slow
+
+    names, lower, upper = _box(ranges, n)
+    if n & (n - 1):
+        raise ValueError(
+            f"n is {n}, but the rows of a Sobol' sequence are balanced for powers of two: "
+            f"give n = {1 << n.bit_length()}, say."
+        )
+    d = len(names)
+    points = qmc.Sobol(2 * d, rng=np.random.default_rng(seed)).random_base2(n.bit_length() - 1)
+    a, b = points[:, :d], points[:, d:]
+    mixed = [np.where(np.arange(d) == i, b, a) for i in range(d)]
+    return _spread(names, lower, upper, np.concatenate([a, b, *mixed]), SALTELLI)
+
+
+def _spread(
+    names: list[str], lower: np.ndarray, upper: np.ndarray, points: np.ndarray, kind: str
+) -> Samples:
+    values = lower + (upper - lower) * points
+    return Samples(dict(zip(names, np.ascontiguousarray(values.T), strict=True)), kind)
+
+
+def _box(ranges: Mapping[str, Range], n: int) -> tuple[list[str], np.ndarray, np.ndarray]:
+    if not (isinstance(n, int | np.integer) and n >= 1):
+        raise ValueError(f"n is {n!r}, but a scan needs at least one sample: give n = 1 or more.")
+    for name, pair in _known(ranges).items():
+        if np.shape(pair) != (2,) or not np.all(np.isfinite(pair)) or not pair[0] < pair[1]:
+            raise ValueError(
+                f"the range of {name} is {pair!r}, but it must be two finite numbers, the lower "
+                f"one first: write {name} = (lower, upper)."
+            )
+    bounds = np.asarray([ranges[name] for name in ranges], float)
+    return list(ranges), bounds[:, 0], bounds[:, 1]
+
+
+def _known(values: Mapping[str, object]) -> Mapping:
+    """`values`, if they name parameters that can be swept."""
+    if not values:
+        raise ValueError(
+            "the design sweeps no parameter, but a scan needs at least one: "
+            f"choose from {', '.join(SWEPT)}."
+        )
+    for name in values:
+        if name not in SWEPT:
+            raise ValueError(
+                f"{name!r} is no parameter that can be swept{nearest(name, SWEPT)}: "
+                f"choose from {', '.join(SWEPT)}."
+            )
+    return values
+
+
+def _column(name: str, value: object) -> np.ndarray:
+    try:
+        column = np.atleast_1d(np.asarray(value, float))
+    except (TypeError, ValueError):
+        column = np.zeros((0, 0))
+    if column.ndim != 1:
+        raise ValueError(f"{name} is {value!r}, but it must be a list of numbers.")
+    if not len(column):
+        raise ValueError(f"{name} has no values, but a scan needs at least one: add some.")
+    return column

@@ -1,0 +1,211 @@
+"""The steady gait of many wheels at once: one compiled function over a fixed number of lanes.
+
+A block of samples is cut into batches of LANES wheels, the last filled up, and every batch goes
+through the same compiled code: what a lane gives does not depend on where it stands, on its
+neighbours, or on how many samples a scan has.
+
+Batches run side by side: a thread for each core, all with one compiled program, or for each GPU.
+"""
+
+import os
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from queue import SimpleQueue
+from threading import Lock
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array
+
+from vrw_jax.batches import monitored as lane_step
+from vrw_jax.cycles import CycleOptions, LimitCycle, limit_cycle
+from vrw_jax.models import ViscoelasticWheel
+from vrw_jax.numerics import Options
+from vrw_jax.results import MARGINS
+from vrw_jax.runtime import compiled
+from vrw_jax.scans.offer import OF_CYCLE, derivative
+from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, wheel_of
+
+LANES = 512
+"""Wheels that one call of the compiled function takes."""
+
+AGREEMENT = 1e-8
+"""Largest distance, rad, rad/s and m/s, between a cycle's section state and where the event-driven
+step takes it: the two are independent computations."""
+
+
+CYCLE_MEASURES: dict[str, Callable[[LimitCycle], Array]] = {
+    "dls_fraction": lambda cycle: cycle.dls_fraction,
+    "period": lambda cycle: cycle.period,
+    "speed": lambda cycle: cycle.speed,
+    "step_length": lambda cycle: cycle.step_length,
+    "duration_dls": lambda cycle: cycle.durations[0],
+    "duration_sls1": lambda cycle: cycle.durations[1],
+    "duration_sls2": lambda cycle: cycle.durations[2],
+    "theta_post_impact": lambda cycle: cycle.post_impact[0],
+    "dtheta_post_impact": lambda cycle: cycle.post_impact[1],
+    "theta_touchdown": lambda cycle: cycle.section_state[0],
+    "dtheta_touchdown": lambda cycle: cycle.section_state[1],
+    "dL1_touchdown": lambda cycle: cycle.section_state[2],
+    "lambda_I4": lambda cycle: cycle.indicators.lambda_I4,
+    "lambda_2_plus": lambda cycle: cycle.indicators.lambda_2,
+    "lambda_4_plus": lambda cycle: cycle.indicators.lambda_4,
+    "spectral_radius": lambda cycle: cycle.spectral_radius,
+    "stability_margin": lambda cycle: cycle.stability_margin,
+}
+"""How a limit cycle tells the measures of `OF_CYCLE`, each only where it is asked for: tracing the
+derivative of one of the last two takes longer than all others together."""
+
+
+Told = tuple[Array, Array, dict[str, Array]]
+"""Outcome, section state, and measures by name."""
+
+
+class Engine:
+    """Evaluates samples of one wheel for a fixed set of measures; compiled at the first call.
+
+    Two functions take turns: the limit cycle with the derivatives asked for, then one event-driven
+    step from it, for the margins and as a check. They are compiled side by side.
+    """
+
+    def __init__(
+        self,
+        measures: tuple[str, ...],
+        base: WheelParams,
+        model: ViscoelasticWheel,
+        options: Options,
+        cycle_options: CycleOptions,
+        threads: int | None = None,  # at work side by side on a CPU; None: one for each core
+    ) -> None:
+        self._threads = n_cores() if threads is None else threads
+        self._base, self._options = base, options
+        wanted = tuple(d for name in measures if (d := derivative(name)) is not None)
+        plain = tuple(name for name in measures if derivative(name) is None)
+        moved = tuple(dict.fromkeys(d.parameter for d in wanted))
+        indices = np.asarray([PARAMETER_NAMES.index(name) for name in moved], int)
+
+        def gait(values: Array) -> tuple[LimitCycle, dict[str, Array]]:
+            def along(some: Array) -> tuple[dict[str, Array], LimitCycle]:
+                cycle = limit_cycle(
+                    wheel_of(values.at[indices].set(some), base.n_legs), options=cycle_options
+                )
+                return {d.measure: CYCLE_MEASURES[d.measure](cycle) for d in wanted}, cycle
+
+            if not wanted:
+                return along(values[indices])[1], {}
+            jacobian, cycle = jax.jacfwd(along, has_aux=True)(values[indices])
+            return cycle, {d.name: jacobian[d.measure][moved.index(d.parameter)] for d in wanted}
+
+        def told_by_cycle(values: Array) -> Told:
+            cycle, derivatives = gait(values)
+            names = (*(name for name in plain if name in OF_CYCLE), "spectral_radius")
+            kept = {name: CYCLE_MEASURES[name](cycle) for name in names}
+            return cycle.outcome, cycle.section_state, kept | derivatives
+
+        def told_by_step(values: Array, state: Array, options: Options) -> Told:
+            take = lane_step.step if lane_step.can_run(model, options) else type(model).step
+            result = take(model, wheel_of(values, base.n_legs), state, options)
+            measures = result.measures()
+            names = (*(name for name in plain if name not in OF_CYCLE), *MARGINS)
+            return result.outcome, result.section_state, {name: measures[name] for name in names}
+
+        self._cycle: Callable = jax.vmap(told_by_cycle)
+        self._step: Callable = jax.vmap(told_by_step, in_axes=(0, 0, None))
+        # A model's own repr leaves out what is its default by identity, which pickling loses.
+        told = (type(model).__name__, *vars(model).items())
+        self._settings = (measures, base.n_legs, told, cycle_options)
+        self._free: SimpleQueue[_Programs] = SimpleQueue()
+        self._workers, self._compiling = 0, Lock()
+
+    def __call__(self, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Results of the samples in `columns` (one value per sample of each swept parameter)."""
+        n = len(next(iter(columns.values())))
+        batches = [slice(begin, min(begin + LANES, n)) for begin in range(0, n, LANES)]
+        with self._compiling:
+            if not self._workers:
+                self._compile()
+        with ThreadPoolExecutor(self._workers) as pool:
+            told = pool.map(
+                lambda batch: self._batch({name: x[batch] for name, x in columns.items()}), batches
+            )
+            parts = [
+                {name: value[: batch.stop - batch.start] for name, value in part.items()}
+                for batch, part in zip(batches, told, strict=True)
+            ]
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+    def _batch(self, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        filled = np.empty((LANES, len(PARAMETER_NAMES)), self._dtype)
+        for i, name in enumerate(PARAMETER_NAMES):
+            column = columns.get(name)
+            if column is None:
+                filled[:, i] = float(getattr(self._base, name))
+            else:
+                filled[:, i] = column[0]  # fills up what is left
+                filled[: len(column), i] = column
+        programs = self._free.get()
+        try:
+            values = jax.device_put(filled, programs.device)
+            outcome, state, by_cycle = programs.cycle(values)
+            options = jax.device_put(self._options, programs.device)
+            walked, reached, by_step = programs.step(values, state, options)
+            checked = _checked_outcome(*map(np.asarray, (outcome, state, walked, reached)))
+            told = {name: np.array(value) for name, value in (by_cycle | by_step).items()}
+        finally:
+            self._free.put(programs)
+        failed = checked != Outcome.STEPPED
+        for value in told.values():
+            value[failed] = np.nan if np.issubdtype(value.dtype, np.floating) else -1
+        return {"outcome": checked} | told
+
+    def _compile(self) -> None:
+        """Programs for each device, both kinds side by side; a CPU's serve all of its cores."""
+        devices = jax.local_devices()
+        values = jax.ShapeDtypeStruct((LANES, len(PARAMETER_NAMES)), self._dtype)
+        state = jax.ShapeDtypeStruct((LANES, 3), self._dtype)
+        settings = self._settings
+        with ThreadPoolExecutor(2) as pool:
+            given = (values, state, self._options)
+            steps = [
+                pool.submit(compiled, self._step, given, ("step", *settings), device)
+                for device in devices
+            ]
+            cycles = [
+                pool.submit(compiled, self._cycle, (values,), ("cycle", *settings), device)
+                for device in devices
+            ]
+        for device, cycle, step in zip(devices, cycles, steps, strict=True):
+            n = self._threads if device.platform == "cpu" and len(devices) == 1 else 1
+            for _ in range(n):
+                self._free.put(_Programs(device, cycle.result(), step.result()))
+            self._workers += n
+
+    @property
+    def _dtype(self) -> np.dtype:
+        return np.dtype(self._base.damping.dtype)
+
+
+class _Programs(NamedTuple):
+    """What a thread works with."""
+
+    device: jax.Device
+    cycle: Callable
+    step: Callable
+
+
+def n_cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _checked_outcome(
+    outcome: np.ndarray, state: np.ndarray, walked: np.ndarray, reached: np.ndarray
+) -> np.ndarray:
+    """The cycle's outcome, unless the event-driven step from it fails or ends elsewhere."""
+    agrees = np.max(np.abs(reached - state), axis=-1) <= AGREEMENT
+    step = np.where(agrees, Outcome.STEPPED, Outcome.NO_CYCLE_FOUND)
+    step = np.where(walked == Outcome.STEPPED, step, walked)
+    return np.where(outcome == Outcome.STEPPED, step, outcome).astype(np.int8)

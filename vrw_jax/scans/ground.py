@@ -1,0 +1,207 @@
+"""The steady gait of many wheels on real ground, and of many wheels each on its lowest rung.
+
+On real ground a sample walks from the rung's start towards a gait, which Newton's method then
+solves for on the full section state. On the ladder the paper's engine goes first, over all samples;
+those whose premises break on this ground are gathered and walk on the upper rung, so that no sample
+pays for another.
+"""
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import numpy as np
+from jaxtyping import Array
+
+from vrw_jax.batches import as_full_states, walk_lanes
+from vrw_jax.cycles import MOVED, CycleOptions, WalkedCycle, cycle_of, ground_gait, told
+from vrw_jax.models import (
+    PAPER_START,
+    PREMISES,
+    UNILATERAL,
+    VISCOELASTIC,
+    AbstractWheel,
+    LadderWheel,
+    UnilateralWheel,
+    ViscoelasticWheel,
+)
+from vrw_jax.numerics import Options, as_float_array
+from vrw_jax.runtime import compiled
+from vrw_jax.scans.evaluate import Engine, n_cores
+from vrw_jax.scans.offer import derivative
+from vrw_jax.wheel import FRICTION, Outcome, WheelParams
+
+LANES = 8
+"""Wheels that one call of the compiled function takes: they wait for the slowest. Each is twenty
+lanes and more in the Jacobians of Newton's method."""
+
+N_TOWARDS = 100
+"""Steps towards a gait, from the rung's start, before Newton's method."""
+SOLVER_TOWARDS, TOLERANCE_TOWARDS = "Tsit5", 1e-8
+"""Of these steps, whatever those of the gait itself."""
+
+Columns = Mapping[str, np.ndarray]
+Told = dict[str, np.ndarray]
+
+
+class GroundEngine:
+    """Evaluates samples on real ground for a fixed set of measures; compiled at the first call."""
+
+    def __init__(
+        self,
+        measures: tuple[str, ...],
+        base: WheelParams,
+        model: UnilateralWheel,
+        options: Options,
+        threads: int | None = None,
+    ) -> None:
+        self._base, self._model = base, model
+        tolerance = as_float_array(TOLERANCE_TOWARDS)
+        self._towards = Options(solver=SOLVER_TOWARDS, rtol=tolerance, atol=tolerance)
+        self._threads = n_cores() if threads is None else threads
+        wanted = tuple(d for name in measures if (d := derivative(name)) is not None)
+        plain = (*(n for n in measures if derivative(n) is None), "spectral_radius")
+
+        def one(values: Array, begin: Array) -> tuple[Array, dict[str, Array]]:
+            slopes = {}
+            if wanted:
+                gait = ground_gait(values, begin, base.n_legs, model, options)
+                cycle = gait.cycle
+                both = told(gait, tuple(d.measure for d in wanted))
+                for d in wanted:
+                    slopes[d.name] = both[d.measure][1][MOVED.index(d.parameter)]
+            else:
+                cycle = cycle_of(values, begin, base.n_legs, model, options)
+            return cycle.outcome, {name: _read(name, cycle) for name in plain} | slopes
+
+        self._one = one
+        numbers, structure = jax.tree.flatten((model, options))
+        closed_over = str(structure), [np.asarray(x).tolist() for x in numbers]
+        self._settings = ("ground", measures, base.n_legs, *closed_over)
+        self._compiled: Callable | None = None
+
+    def _compile(self) -> Callable:
+        """The one large function, ready to run: here, lest each thread compile its own."""
+        dtype = np.dtype(self._base.damping.dtype)
+        shapes = (LANES, len(MOVED)), (LANES, self._model.section_size(self._base))
+        given = tuple(jax.ShapeDtypeStruct(shape, dtype) for shape in shapes)
+        return compiled(jax.vmap(self._one), given, self._settings, jax.local_devices()[0])
+
+    def __call__(self, columns: Columns) -> Told:
+        """Results of the samples in `columns` (one value per sample of each swept parameter)."""
+        n = len(next(iter(columns.values())))
+        values = np.empty((n, len(MOVED)), np.dtype(self._base.damping.dtype))
+        for i, name in enumerate(MOVED):
+            held = self._model if name == FRICTION else self._base
+            values[:, i] = columns[name] if name in columns else float(getattr(held, name))
+        n_legs = self._base.n_legs
+        paper = np.tile(np.asarray(PAPER_START, values.dtype), (n, 1))
+        start = as_full_states(values.T, paper, n_legs)
+        states, _, outcome, *_ = walk_lanes(
+            values.T, start, N_TOWARDS, self._model, self._towards, n_legs
+        )
+        batches = [slice(begin, begin + LANES) for begin in range(0, n, LANES)]
+        self._compiled = self._compiled or self._compile()
+        with ThreadPoolExecutor(self._threads) as pool:
+            parts = list(pool.map(lambda b: self._batch(values[b], states[b], outcome[b]), batches))
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+    def _batch(self, values: np.ndarray, states: np.ndarray, walked: np.ndarray) -> Told:
+        assert self._compiled is not None
+        fill = lambda x: np.concatenate([x, np.repeat(x[:1], LANES - len(x), 0)])
+        told = self._compiled(fill(values), fill(states))
+        outcome, measures = jax.tree.map(np.array, told)
+        outcome = np.where(fill(walked) == Outcome.STEPPED, outcome, fill(walked))
+        failed = outcome != Outcome.STEPPED
+        for value in measures.values():
+            value[failed] = np.nan if np.issubdtype(value.dtype, np.floating) else -1
+        results = {"outcome": outcome.astype(np.int8)} | measures
+        return {name: value[: len(values)] for name, value in results.items()}
+
+
+def _read(name: str, cycle: WalkedCycle) -> Array:
+    """A measure of a gait that repeats after one step."""
+    if name in ("spectral_radius", "stability_margin"):
+        return getattr(cycle, name)
+    return jax.tree.map(lambda leaf: leaf[0], cycle.steps).measures()[name]
+
+
+OF_PAPER: dict[str, tuple[str, ...]] = {
+    "duration_single": ("duration_sls1", "duration_sls2"),
+    "duration_flight": (),
+    "slip": (),
+    "energy_lost_impacts": ("energy_lost_landing", "energy_lost_stopper"),
+    "energy_lost_friction": (),
+}
+"""Measures of real ground as sums of the paper's."""
+
+
+class LadderEngine:
+    """Evaluates samples on the lowest rung that serves each of them."""
+
+    def __init__(
+        self,
+        measures: tuple[str, ...],
+        base: WheelParams,
+        model: LadderWheel,
+        options: Options,
+        cycle_options: CycleOptions,
+        threads: int | None = None,
+    ) -> None:
+        self._measures, self._base, self._model = measures, base, model
+        self._paper = ViscoelasticWheel()
+        asked = [part for name in measures for part in OF_PAPER.get(name, (name,))]
+        self._lower = Engine(
+            tuple(dict.fromkeys(asked)), base, self._paper, options, cycle_options, threads
+        )
+        self._upper = GroundEngine(measures, base, model.ground, options, threads)
+
+    def __call__(self, columns: Columns) -> Told:
+        """Results of the samples in `columns`, with `rung` and `reason` of each."""
+        n = len(next(iter(columns.values())))
+        friction = columns.get(FRICTION, np.full(n, float(self._model.friction)))
+        lower = self._lower(
+            {"damping": np.full(n, float(self._base.damping))}
+            | {name: column for name, column in columns.items() if name != FRICTION}
+        )
+        reason = self.reasons(lower, friction)
+        rung = np.where(reason == 0, VISCOELASTIC, UNILATERAL).astype(np.int8)
+        names = (*self._measures, "outcome", "spectral_radius")
+        results = {
+            name: sum((lower[part] for part in OF_PAPER[name]), start=np.zeros(n))
+            if name in OF_PAPER
+            else lower[name]
+            for name in names
+        }
+        up = np.flatnonzero(rung == UNILATERAL)
+        if up.size:
+            upper = self._upper({name: column[up] for name, column in columns.items()})
+            for name in names:
+                results[name][up] = upper[name]
+        return results | {"rung": rung, "reason": reason}
+
+    def reasons(self, lower: Told, friction: np.ndarray) -> np.ndarray:
+        """`ModelChoice.reason` of each of the paper's gaits, over the step that it repeats."""
+        left = friction - self._paper.friction
+        margins = np.stack([lower[m] + (left if "friction" in m else 0.0) for m in PREMISES], -1)
+        broken = ~(margins >= 0.0)
+        first = np.where(broken.any(-1), 1 + np.argmax(broken, -1), 0)
+        outcome = lower["outcome"].astype(int)
+        return np.where(outcome == Outcome.STEPPED, first, -outcome).astype(np.int8)
+
+
+def engine_for(
+    measures: tuple[str, ...],
+    base: WheelParams,
+    model: AbstractWheel,
+    options: Options,
+    cycle_options: CycleOptions,
+    threads: int | None = None,
+) -> Engine | GroundEngine | LadderEngine:
+    """What computes the samples of a scan of this rung."""
+    if isinstance(model, UnilateralWheel):
+        return GroundEngine(measures, base, model, options, threads)
+    if isinstance(model, LadderWheel):
+        return LadderEngine(measures, base, model, options, cycle_options, threads)
+    assert isinstance(model, ViscoelasticWheel)  # `scan.plan` looked
+    return Engine(measures, base, model, options, cycle_options, threads)

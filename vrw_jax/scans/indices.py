@@ -1,0 +1,85 @@
+"""Global sensitivity: which parameter's spread makes a measure spread, by Sobol' indices.
+
+`designs.saltelli` lays out the samples, `scan` computes them like any others, `sobol_indices` reads
+the indices off the result by `scipy.stats.sobol_indices` (Saltelli et al. 2010).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from vrw_jax.results import nearest
+from vrw_jax.runtime import xarray as xr
+from vrw_jax.scans.design import SALTELLI
+from vrw_jax.wheel import Outcome
+
+FEWEST = 64
+"""Rows below which indices are noise."""
+
+RESAMPLES, QUANTILES = 200, (0.025, 0.975)
+"""Rows are drawn again this often for an interval between these quantiles."""
+
+
+def sobol_indices(
+    scan: xr.Dataset, measures: Iterable[str] = ("dls_fraction", "speed")
+) -> xr.Dataset:
+    """First-order and total Sobol' indices of measures, shape (measure, parameter), pure numbers.
+
+    The first-order index is the share of a measure's variance that one parameter makes by itself,
+    the total index the share that would vanish if it were known; each with `lower` and `upper` of a
+    95 % bootstrap interval. Rows with a sample that has no gait are left out, then as many more as
+    leave a power of two: `rows` of them count, and `left_out` is the share without a gait. Where it
+    is not small, the indices are those of gaits only, whose parameters are no longer independent.
+    """
+    from scipy.stats import sobol_indices as indices_of
+
+    design = scan.attrs.get("scan", {}).get("design", {})
+    if design.get("kind") != SALTELLI:
+        raise ValueError(
+            f"the scan's samples are of kind {design.get('kind')!r}, but Sobol' indices need those "
+            "of vrw.saltelli({...}, n), or of a table [saltelli]: scan these."
+        )
+    parameters, wanted = list(design["swept"]), list(measures)
+    for name in wanted:
+        if name not in scan or scan[name].dims != ("sample",):
+            raise ValueError(
+                f"{name!r} is no measure of this scan{nearest(name, map(str, scan))}: "
+                "ask for one that was scanned."
+            )
+    blocks = 2 + len(parameters)
+    walks = (scan.outcome.values == Outcome.STEPPED).reshape(blocks, -1).all(axis=0)
+    kept = np.flatnonzero(walks)
+    n = 1 << (len(kept).bit_length() - 1) if len(kept) else 0
+    if n < FEWEST:
+        raise ValueError(
+            f"only {len(kept)} of {len(walks)} rows walk throughout, but indices need {FEWEST}: "
+            "narrow the ranges to where there are gaits, or take more rows."
+        )
+    rows = kept[:n]
+    told = np.stack([scan[name].values.reshape(blocks, -1)[:, rows] for name in wanted], axis=1)
+
+    def indices(some: np.ndarray) -> np.ndarray:
+        """First-order and total, over measures and parameters, from rows."""
+        drawn = told[..., some]
+        found = indices_of(func={"f_A": drawn[0], "f_B": drawn[1], "f_AB": drawn[2:]}, n=n)
+        shape = (len(wanted), len(parameters))
+        return np.stack(
+            [np.reshape(found.first_order, shape), np.reshape(found.total_order, shape)]
+        )
+
+    generator = np.random.default_rng(0)  # the same scan gives the same intervals
+    found = indices(np.arange(n))
+    spread = [indices(generator.integers(0, n, n)) for _ in range(RESAMPLES)]
+    lower, upper = np.quantile(spread, QUANTILES, axis=0)
+    named = {}
+    for i, (name, label) in enumerate((("first_order", "first-order"), ("total", "total"))):
+        attrs = {"units": "1", "long_name": f"{label} Sobol' index"}
+        for part, values in (("", found), ("_lower", lower), ("_upper", upper)):
+            named[name + part] = (("measure", "parameter"), values[i], attrs)
+    return xr.Dataset(
+        named,
+        coords={"measure": wanted, "parameter": parameters},
+        attrs={"rows": n, "left_out": 1.0 - len(kept) / len(walks)},
+    )

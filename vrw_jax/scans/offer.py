@@ -1,0 +1,156 @@
+"""What a scan may be asked for: measures of the steady gait, and their derivatives, by name."""
+
+import re
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from vrw_jax.models import SERVED, AbstractWheel, LadderWheel, UnilateralWheel
+from vrw_jax.results import CYCLE, MARGINS, MEASURES, ON_GROUND, STEP, attrs_of, nearest
+from vrw_jax.wheel import FRICTION, PARAMETER_NAMES
+
+ALWAYS = ("outcome", "spectral_radius", *MARGINS)
+"""In every scan, asked for or not: is there a cycle, is it stable, what does it break."""
+
+OF_CYCLE = (
+    "dls_fraction",
+    "period",
+    "speed",
+    "step_length",
+    "duration_dls",
+    "duration_sls1",
+    "duration_sls2",
+    "theta_post_impact",
+    "dtheta_post_impact",
+    "theta_touchdown",
+    "dtheta_touchdown",
+    "dL1_touchdown",
+    "lambda_I4",
+    "lambda_2_plus",
+    "lambda_4_plus",
+    *CYCLE,
+)
+"""Measures that the limit cycle itself tells; these have derivatives."""
+
+ON_REQUEST = (*OF_CYCLE, *(name for name in STEP if name not in (*OF_CYCLE, "outcome")))
+
+DEFAULT_MEASURES = (
+    "dls_fraction",
+    "speed",
+    "period",
+    "step_length",
+    "duration_dls",
+    "duration_sls1",
+    "duration_sls2",
+    "lambda_I4",
+    "lambda_2_plus",
+    "lambda_4_plus",
+)
+
+
+class Offer(NamedTuple):
+    """What a scan of a rung can tell."""
+
+    on_request: tuple[str, ...]
+    always: tuple[str, ...]  # in every scan, asked for or not
+    differentiable: tuple[str, ...]
+    by: tuple[str, ...]  # parameters that derivatives may be taken by
+    default: tuple[str, ...]
+
+
+_DEFAULT = ("dls_fraction", "speed", "period", "step_length", "slip", "energy_lost_impacts")
+PAPER = Offer(ON_REQUEST, ALWAYS, OF_CYCLE, PARAMETER_NAMES, DEFAULT_MEASURES)
+REAL_GROUND = Offer(
+    (*ON_GROUND, *CYCLE),
+    ("outcome", "spectral_radius"),
+    ON_GROUND,
+    (*PARAMETER_NAMES, FRICTION),
+    _DEFAULT,
+)
+LADDER = Offer(
+    (*ON_GROUND, *CYCLE),
+    ("outcome", "spectral_radius", "rung", "reason"),
+    tuple(name for name in ON_GROUND if name in OF_CYCLE),
+    PARAMETER_NAMES,
+    _DEFAULT,
+)
+
+
+def offer_of(model: AbstractWheel) -> Offer:
+    """What a scan of this rung can tell."""
+    if isinstance(model, LadderWheel):
+        return LADDER
+    return REAL_GROUND if isinstance(model, UnilateralWheel) else PAPER
+
+
+_DERIVATIVE = re.compile(r"d[ _](\w+?)(?: */ *d |_d_)(\w+)")
+
+
+class Derivative(NamedTuple):
+    """The derivative of a measure by a parameter, the gait staying a limit cycle."""
+
+    measure: str
+    parameter: str
+
+    @property
+    def name(self) -> str:
+        """Name of the variable that holds it."""
+        return f"d_{self.measure}_d_{self.parameter}"
+
+    @property
+    def attrs(self) -> dict[str, object]:
+        """Attributes of that variable."""
+        above, below = MEASURES[self.measure], MEASURES[self.parameter]
+        units = {unit for unit in (above.unit, below.unit) if unit != "1"}
+        unit = "1" if not units else above.unit if below.unit == "1" else None
+        return {
+            "units": unit or f"{above.unit}/({below.unit})",
+            "long_name": f"derivative of {above.long_name} by {below.long_name}",
+            "symbol": f"∂({above.symbol})/∂{below.symbol}",
+            "description": "Along the branch of limit cycles, by the implicit function theorem.",
+        }
+
+
+def derivative(name: str) -> Derivative | None:
+    """The derivative that 'd dls_fraction / d damping' asks for; None if it names a measure."""
+    found = _DERIVATIVE.fullmatch(name.strip())
+    return Derivative(*found.groups()) if found else None
+
+
+def check_measures(names: Iterable[str], offer: Offer = PAPER) -> tuple[str, ...]:
+    """Names of variables, each once, without what is always there; a sentence for a wrong one."""
+    checked: dict[str, None] = {}
+    known = (*offer.on_request, *offer.always)
+    for name in names:
+        wanted = derivative(name)
+        if wanted is None:
+            if name not in known:
+                raise ValueError(
+                    f"{name!r} is no measure of a scan{nearest(name, known)}: "
+                    f"choose from {', '.join(offer.on_request)}, or a derivative such as "
+                    "'d dls_fraction / d damping'."
+                )
+            if name not in offer.always:
+                checked[name] = None
+            continue
+        if wanted.measure not in offer.differentiable:
+            raise ValueError(
+                f"{name!r} asks for a derivative of {wanted.measure!r}"
+                f"{nearest(wanted.measure, offer.differentiable)}, but a scan differentiates only "
+                f"{', '.join(offer.differentiable)}: choose one of these."
+            )
+        if wanted.parameter not in offer.by:
+            raise ValueError(
+                f"{name!r} asks for a derivative by {wanted.parameter!r}"
+                f"{nearest(wanted.parameter, offer.by)}, but it must be by a parameter: "
+                f"choose from {', '.join(offer.by)}."
+            )
+        checked[wanted.name] = None
+    return tuple(checked)
+
+
+def variable_attrs(name: str) -> dict[str, object]:
+    """Attributes of a scan's variable, measure or derivative."""
+    if name in SERVED:
+        return dict(SERVED[name])
+    wanted = derivative(name)
+    return attrs_of(name) if wanted is None else wanted.attrs

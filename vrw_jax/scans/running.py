@@ -1,0 +1,430 @@
+"""Scans: the steady gait of every sample of a design, as one labelled dataset.
+
+A scan is cut into chunks, each computed by the same compiled function and, where a store is given,
+written at once: a scan that was interrupted goes on with the chunks that are missing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import platform
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from vrw_jax.cycles import CycleOptions
+from vrw_jax.models import AbstractWheel, LadderWheel, UnilateralWheel, ViscoelasticWheel
+from vrw_jax.numerics import Options
+from vrw_jax.results import MARGINS, attrs_of, provenance
+from vrw_jax.runtime import code_digest
+from vrw_jax.runtime import xarray as xr
+from vrw_jax.scans.design import AbstractDesign, Columns
+from vrw_jax.scans.evaluate import LANES, Engine, n_cores
+from vrw_jax.scans.ground import GroundEngine, LadderEngine, engine_for
+from vrw_jax.scans.offer import check_measures, offer_of, variable_attrs
+from vrw_jax.scans.store import (
+    MANIFEST,
+    PROVENANCE,
+    AbstractStore,
+    Layout,
+    MemoryStore,
+    Variable,
+    ZarrStore,
+    chunk_shape,
+    create,
+    first_difference,
+    stored_manifest,
+)
+from vrw_jax.walks import ModelLike
+from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, WheelParams
+
+CHUNK = 4096
+"""Most samples of a chunk, unless asked for otherwise: what a killed scan can lose."""
+
+Evaluate = Callable[[Columns], Mapping[str, np.ndarray]]
+"""Results of a block of samples by variable, samples first."""
+Chunk = tuple[int, Mapping[str, np.ndarray]]
+"""Number of a chunk and its results."""
+Through = Callable[["Plan", Sequence[int]], Iterator[Chunk]]
+"""Carries out chunks of a plan, by number, in any order."""
+Report = Callable[["Progress"], None]
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a scan is."""
+
+    samples: int  # to do in this run
+    done: int  # of them
+    failed: int  # of those, without a steady gait
+    kept: int  # samples that an earlier run had computed
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything about a scan that is known before it runs."""
+
+    design: AbstractDesign
+    measures: tuple[str, ...]
+    base: WheelParams
+    model: AbstractWheel
+    options: Options
+    cycle_options: CycleOptions
+    layout: Layout
+    text: str = ""
+
+    @property
+    def settings(self) -> dict[str, object]:
+        """What a store must have been made with to be gone on with."""
+        swept = self.design.names
+        return {
+            "design": self.design.description(),
+            "wheel": {
+                name: float(getattr(self.base, name))
+                for name in PARAMETER_NAMES
+                if name not in swept
+            }
+            | {"n_legs": self.base.n_legs},
+            "measures": list(self.measures),
+            "model": _fields(self.model),
+            "options": _fields(self.options),
+            "cycle_options": _fields(self.cycle_options),
+            "dtype": str(self.base.damping.dtype),
+            "chunk": list(self.layout.chunk),
+        }
+
+    @property
+    def attrs(self) -> dict[str, object]:
+        """Attributes of the whole result."""
+        return {
+            "title": f"Steady gaits of the viscoelastic-legged rimless wheel over "
+            f"{', '.join(self.design.names)}",
+            "rule": "NaN, or -1 in an integer, where the outcome is not STEPPED.",
+            MANIFEST: self.settings,
+            PROVENANCE: origin(),
+            "config": self.text,
+        }
+
+    def engine(self) -> Engine | GroundEngine | LadderEngine:
+        """The function that computes samples."""
+        return engine_for(self.measures, self.base, self.model, self.options, self.cycle_options)
+
+
+def plan(
+    design: AbstractDesign,
+    measures: Iterable[str] | None = None,
+    *,
+    base: WheelParams | None = None,
+    model: ModelLike | None = None,
+    options: Options | None = None,
+    cycle_options: CycleOptions | None = None,
+    chunk: int | None = None,
+    text: str = "",
+) -> Plan:
+    """Check what is asked for and lay out the result, without computing anything."""
+    if not isinstance(design, AbstractDesign):
+        raise TypeError(
+            f"design is a {type(design).__name__}, but it must say which samples: write "
+            "vrw.grid(damping=[...]), vrw.samples({...}), vrw.sobol({...}, n) or vrw.uniform."
+        )
+    base = WheelParams() if base is None else base
+    if base.damping.ndim:
+        raise ValueError(
+            "base holds batches, but it is the one wheel whose parameters the design replaces: "
+            "give scalars, and what varies in the design."
+        )
+    options = Options() if options is None else options
+    options.require_reachable(np.dtype(base.damping.dtype))
+    if chunk is not None and chunk < 1:
+        raise ValueError(f"chunk is {chunk}, but it must be at least 1 sample.")
+    model = ViscoelasticWheel() if model is None else model
+    model = LadderWheel() if isinstance(model, str) and model == "auto" else model
+    if not isinstance(model, ViscoelasticWheel | UnilateralWheel | LadderWheel):
+        raise TypeError(
+            f"model is {model!r}, but a scan is of gaits with compliant legs: give "
+            'vrw.ViscoelasticWheel(), vrw.UnilateralWheel() or "auto".'
+        )
+    if FRICTION in design.names and isinstance(model, ViscoelasticWheel):
+        raise ValueError(
+            "the design sweeps friction, which the paper's wheel does not feel: give "
+            'model=vrw.UnilateralWheel() or "auto".'
+        )
+    offer = offer_of(model)
+    names = check_measures(offer.default if measures is None else measures, offer)
+    return Plan(
+        design=design,
+        measures=names,
+        base=base,
+        model=model,
+        options=options,
+        cycle_options=CycleOptions() if cycle_options is None else cycle_options,
+        layout=_layout(design, (*names, *offer.always), base, CHUNK if chunk is None else chunk),
+        text=text,
+    )
+
+
+def scan(
+    design: AbstractDesign,
+    measures: Iterable[str] | None = None,
+    *,
+    base: WheelParams | None = None,
+    model: ModelLike | None = None,
+    options: Options | None = None,
+    cycle_options: CycleOptions | None = None,
+    store: str | Path | None = None,
+    chunk: int | None = None,
+    report: Report | None = None,
+    dask: str | None = None,
+) -> xr.Dataset:
+    """The steady gait of every sample, labelled, with outcome and premise margins of each.
+
+    `measures` are names (see `vrw_jax.scan_measures`), derivatives included as in
+    'd dls_fraction / d damping'. With `store` the result is kept there chunk by chunk: a scan that
+    was interrupted goes on where it stopped and ends with bitwise the same data, a finished one is
+    only opened. `report` is told the progress after each chunk. What a sample gives does not depend
+    on the others, nor on `chunk`. `model` may be the wheel on real ground, whose samples walk
+    towards their gait, or "auto", each sample on the lowest rung that serves, with `rung` and
+    `reason`; both take `friction` as a swept parameter. `dask` is the address of a cluster that
+    computes in this process' stead, "local" for one started here.
+    """
+    planned = plan(
+        design,
+        measures,
+        base=base,
+        model=model,
+        options=options,
+        cycle_options=cycle_options,
+        chunk=chunk,
+    )
+    with carried(dask) as through:
+        return run(planned, store, report=report, through=through)
+
+
+def carried(dask: str | None) -> contextlib.AbstractContextManager[Through | None]:
+    """The workers of a dask cluster; None where this process computes by itself."""
+    if dask is None:
+        return contextlib.nullcontext()
+    from vrw_jax.scans.dask import workers
+
+    return workers(dask)
+
+
+def origin() -> dict[str, object]:
+    """Where numbers of this process come from: code, versions, device."""
+    told = provenance(WheelParams(), ViscoelasticWheel(), Options())
+    return {
+        "code": code_digest(),
+        "versions": told["versions"],
+        "device": f"{jax.default_backend()}: {told['device']}, {_processor()}",
+    }
+
+
+def run(
+    planned: Plan,
+    store: str | Path | None = None,
+    *,
+    report: Report | None = None,
+    evaluate: Evaluate | None = None,
+    through: Through | None = None,
+) -> xr.Dataset:
+    """Carry out a plan, here or `through` others; `evaluate` stands in for the plan's engine."""
+    kept: AbstractStore
+    if store is None:
+        kept = MemoryStore(planned.layout, planned.attrs)
+    else:
+        kept = open_store(planned, Path(store))
+    missing = kept.missing()
+    if not missing:
+        return kept.dataset()
+    sizes = {index: _size(planned.layout.region(index)) for index in missing}
+    total, done, failed = sum(sizes.values()), 0, 0
+    if report is not None:
+        report(Progress(total, 0, 0, planned.design.size - total))
+    through = _in_turn(evaluate) if through is None else through
+    for index, results in through(planned, missing):
+        with _disk_full_explained(store, kept, planned.layout.n_chunks):
+            kept.write(index, _shaped(results, planned.layout.region(index)))
+        done += sizes[index]
+        failed += int(np.count_nonzero(results["outcome"] != Outcome.STEPPED))
+        if report is not None:
+            report(Progress(total, done, failed, planned.design.size - total))
+    return kept.dataset()
+
+
+def _in_turn(evaluate: Evaluate | None) -> Through:
+    def through(planned: Plan, missing: Sequence[int]) -> Iterator[Chunk]:
+        engine = planned.engine() if evaluate is None else evaluate
+        for index in missing:
+            yield index, engine(planned.design.block(planned.layout.region(index)))
+
+    return through
+
+
+def open_store(planned: Plan, path: Path) -> ZarrStore:
+    """The store at `path`, made now if nothing is there; refused if it holds another scan."""
+    there = stored_manifest(path)
+    if there is None:
+        create(path, planned.layout, planned.attrs)
+        return ZarrStore(path, planned.layout)
+    other = difference(there[MANIFEST], planned.settings)
+    if other:
+        raise ValueError(
+            f"{path} holds a scan made with other settings: {other}. "
+            "Give another place for this scan, or go back to those settings, or delete the store."
+        )
+    kept = ZarrStore(path, planned.layout)
+    other = difference(there[PROVENANCE], origin())
+    missing = len(kept.missing())
+    if other and missing:
+        raise ValueError(
+            f"{path} lacks {missing} of {planned.layout.n_chunks} chunks and was begun by other "
+            f"means, so that its last digits might not fit: {other}. "
+            "Go on with what it was begun with, or begin anew in another place."
+        )
+    kept.tidy()
+    return kept
+
+
+VECTOR_SETS = ("avx", "fma", "avx2", "avx512f", "avx512dq", "asimd", "sve")
+"""Instruction sets that decide which sums the compiler fuses, and so the last digits."""
+
+
+def _processor() -> str:
+    """The kind of processor, as far as last digits depend on it."""
+    try:
+        words = set(Path("/proc/cpuinfo").read_text().split())
+    except OSError:
+        words = set()
+    return " ".join([platform.machine(), *(name for name in VECTOR_SETS if name in words)])
+
+
+def difference(there: object, here: object) -> str:
+    """The first setting that differs, in words; empty where none does."""
+    name, old, new = first_difference(there, here)
+    if not name:
+        return ""
+    if name == "design.digest":
+        return "the values of the swept parameters differ"
+    if name == "code":
+        return "the library's code differs"
+    return f"{name} is {old!r} there and {new!r} here"
+
+
+def _size(region: tuple[slice, ...]) -> int:
+    return int(np.prod([part.stop - part.start for part in region]))
+
+
+def _shaped(results: Mapping[str, np.ndarray], region: tuple[slice, ...]) -> dict[str, np.ndarray]:
+    shape = tuple(part.stop - part.start for part in region)
+    return {name: value.reshape(*shape, *value.shape[1:]) for name, value in results.items()}
+
+
+@contextlib.contextmanager
+def _disk_full_explained(
+    store: str | Path | None, kept: AbstractStore, n_chunks: int
+) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        n_done = n_chunks - len(kept.missing())
+        raise OSError(
+            error.errno,
+            f"no space is left for {store}, where {n_done} chunks are complete: make room and run "
+            "the same again, it goes on from there",
+        ) from error
+
+
+def _layout(
+    design: AbstractDesign, names: tuple[str, ...], base: WheelParams, chunk: int
+) -> Layout:
+    dtype = str(base.damping.dtype)
+    legs = np.arange(3, base.n_legs + 1)
+
+    def variable(name: str) -> Variable:
+        attrs = variable_attrs(name)
+        if name in ("outcome", "rung", "reason"):
+            return Variable(name, "int8", -1, attrs)
+        if name == "solver_steps":
+            return Variable(name, "int32", -1, attrs)
+        if name in MARGINS and MARGINS[name].axis:
+            return Variable(name, dtype, np.nan, attrs, ("leg",), (len(legs),))
+        return Variable(name, dtype, np.nan, attrs)
+
+    coordinates = {
+        name: (dim, values, attrs_of(name) if name in (*PARAMETER_NAMES, FRICTION) else {})
+        for name, (dim, values) in design.coordinates().items()
+    }
+    coordinates["leg"] = ("leg", legs, {"long_name": "locked leg", "units": "1"})
+    return Layout(
+        dims=design.dims,
+        shape=design.shape,
+        chunk=chunk_shape(design.shape, chunk),
+        variables=tuple(variable(name) for name in names),
+        coordinates=coordinates,
+    )
+
+
+def _fields(settings: object) -> dict[str, object]:
+    """The fields of a settings object as plain values."""
+    told: dict[str, object] = {"kind": type(settings).__name__}
+    for name in type(settings).__dataclass_fields__:  # type: ignore[attr-defined]
+        value = getattr(settings, name)
+        if isinstance(value, Options):
+            continue  # recorded by itself
+        if isinstance(value, bool | int | str):
+            told[name] = value
+        elif isinstance(value, tuple):
+            told[name] = list(value)
+        else:
+            told[name] = float(value)
+    return told
+
+
+def explained(planned: Plan, store: str | Path | None = None) -> dict[str, str]:
+    """Sizes, chunks, memory and time of a scan, as lines for a reader; computes nothing."""
+    layout, size = planned.layout, planned.design.size
+    missing = list(range(layout.n_chunks))
+    if store is not None and stored_manifest(Path(store)) is not None:
+        missing = open_store(planned, Path(store)).missing()
+    left = sum(_size(layout.region(index)) for index in missing)
+    chunk, rate = int(np.prod(layout.chunk)), RATE * n_cores()
+    axes = " x ".join(f"{n} {name}" for name, n in zip(layout.dims, layout.shape, strict=True))
+    return {
+        "samples": f"{size:,} ({axes})",
+        "measures": ", ".join(planned.measures),
+        "always included": ", ".join(offer_of(planned.model).always),
+        "chunks": f"{layout.n_chunks:,} of up to {chunk:,} samples, {len(missing):,} to compute",
+        "result": f"{_bytes(size * layout.bytes_per_sample)} before compression",
+        "memory": f"about {_bytes(MEMORY + chunk * 2 * layout.bytes_per_sample)}, "
+        + ("whatever the number of samples" if store is not None else "plus the result"),
+        "time": f"about {in_words(left / rate + (COMPILE if left else 0.0))}: "
+        f"{left:,} samples at {rate:,.0f} per second on {n_cores()} cores, {COMPILE:.0f} s to "
+        "compile the first time (as measured on one machine; yours differ)",
+        "lanes": f"{LANES} wheels in a batch, a batch on each core",
+    }
+
+
+RATE, COMPILE, MEMORY = 600.0, 60.0, 1.1e9
+"""Samples per second and core (twice that in a box of gaits only, half where most have none),
+seconds to compile without a cache, bytes of code and arrays: `experiments/scan_benchmark.py`."""
+
+
+def _bytes(n: int | float) -> str:
+    for unit in ("B", "kB", "MB"):
+        if n < 1000:
+            return f"{n:.3g} {unit}"
+        n /= 1000
+    return f"{n:.3g} GB"
+
+
+def in_words(t: float) -> str:
+    """A time in seconds as a reader takes it in."""
+    if t < 90:
+        return f"{t:.0f} s"
+    return f"{t / 60:.0f} min" if t < 5400 else f"{t / 3600:.1f} h"

@@ -1,0 +1,289 @@
+"""Where a scan's results are kept: in memory, or in a Zarr store that survives being killed.
+
+A store is a Zarr group with one array per variable, cut into the scan's chunks, so that
+`xarray.open_zarr` reads it. It appears whole (built beside its place, then renamed). A chunk's data
+is written first and `chunk_done` marked after; every file is written beside its place and renamed,
+so whatever moment the process dies at, a chunk is either marked and complete or computed again.
+"""
+
+from __future__ import annotations
+
+import abc
+import math
+import os
+import shutil
+import tempfile
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vrw_jax.runtime import xarray as xr
+from vrw_jax.runtime import zarr
+
+DONE = "chunk_done"
+MANIFEST = "scan"
+PROVENANCE = "provenance"
+
+Region = tuple[slice, ...]
+Block = Mapping[str, np.ndarray]
+"""Results of one chunk by variable; the samples' axes first."""
+
+
+@dataclass(frozen=True)
+class Variable:
+    """One variable of the result. `dims` and `shape` are those beyond the samples' own."""
+
+    name: str
+    dtype: str
+    missing: float | int
+    attrs: Mapping[str, object]
+    dims: tuple[str, ...] = ()
+    shape: tuple[int, ...] = ()
+
+    @property
+    def bytes_per_sample(self) -> int:
+        """Size of one sample's value."""
+        return np.dtype(self.dtype).itemsize * math.prod(self.shape)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Axes, chunks, variables and coordinates of a result."""
+
+    dims: tuple[str, ...]
+    shape: tuple[int, ...]
+    chunk: tuple[int, ...]
+    variables: tuple[Variable, ...]
+    coordinates: Mapping[str, tuple[str, np.ndarray, Mapping[str, object]]]
+
+    @property
+    def n_chunks(self) -> int:
+        """Number of chunks."""
+        return math.prod(self._counts)
+
+    @property
+    def _counts(self) -> tuple[int, ...]:
+        return tuple(-(-n // c) for n, c in zip(self.shape, self.chunk, strict=True))
+
+    def region(self, index: int) -> Region:
+        """The samples of a chunk."""
+        places = np.unravel_index(index, self._counts)
+        return tuple(
+            slice(int(i) * c, min((int(i) + 1) * c, n))
+            for i, c, n in zip(places, self.chunk, self.shape, strict=True)
+        )
+
+    @property
+    def bytes_per_sample(self) -> int:
+        """Size of one sample's results, uncompressed."""
+        return sum(variable.bytes_per_sample for variable in self.variables)
+
+
+def chunk_shape(shape: tuple[int, ...], most: int) -> tuple[int, ...]:
+    """A box of at most `most` samples that is a slab of the array: the last axes are whole."""
+    chunk, room = [1] * len(shape), most
+    for axis in range(len(shape) - 1, -1, -1):
+        chunk[axis] = min(shape[axis], max(room, 1))
+        room //= chunk[axis]
+        if chunk[axis] < shape[axis]:
+            break
+    return tuple(chunk)
+
+
+class AbstractStore(abc.ABC):
+    """Takes chunks, tells which are missing, gives the labelled whole."""
+
+    @abc.abstractmethod
+    def missing(self) -> list[int]:
+        """Chunks still to compute, in order."""
+
+    @abc.abstractmethod
+    def write(self, index: int, block: Block) -> None:
+        """Keep a chunk's results; when this returns the chunk is done."""
+
+    @abc.abstractmethod
+    def dataset(self) -> xr.Dataset:
+        """The labelled whole."""
+
+
+class MemoryStore(AbstractStore):
+    """Results as arrays in memory."""
+
+    def __init__(self, layout: Layout, attrs: Mapping[str, object]) -> None:
+        self._layout, self._attrs = layout, attrs
+        self._done = np.zeros(layout.n_chunks, bool)
+        self._arrays = {
+            v.name: np.full((*layout.shape, *v.shape), v.missing, v.dtype) for v in layout.variables
+        }
+
+    def missing(self) -> list[int]:
+        return [int(i) for i in np.flatnonzero(~self._done)]
+
+    def write(self, index: int, block: Block) -> None:
+        region = self._layout.region(index)
+        for name, array in self._arrays.items():
+            array[region] = block[name]
+        self._done[index] = True
+
+    def dataset(self) -> xr.Dataset:
+        layout = self._layout
+        return xr.Dataset(
+            {
+                v.name: ((*layout.dims, *v.dims), self._arrays[v.name], dict(v.attrs))
+                for v in layout.variables
+            },
+            coords={
+                name: (dim, values, dict(attrs))
+                for name, (dim, values, attrs) in layout.coordinates.items()
+            },
+            attrs=dict(self._attrs),
+        )
+
+
+class ZarrStore(AbstractStore):
+    """Results in a folder, chunk by chunk."""
+
+    def __init__(self, path: Path, layout: Layout) -> None:
+        self._path, self._layout = path, layout
+        self._group = zarr.open_group(path, mode="r+", zarr_format=3)
+
+    def missing(self) -> list[int]:
+        return [int(i) for i in np.flatnonzero(np.asarray(_array(self._group, DONE)[:]) == 0)]
+
+    def write(self, index: int, block: Block) -> None:
+        region = self._layout.region(index)
+        for variable in self._layout.variables:
+            _array(self._group, variable.name)[region] = block[variable.name]
+        _array(self._group, DONE)[index : index + 1] = 1
+
+    def dataset(self) -> xr.Dataset:
+        return open_scan(self._path)
+
+    def tidy(self) -> None:
+        """Remove the half-written files that a killed run left behind."""
+        for path in self._path.rglob("*.partial"):
+            path.unlink(missing_ok=True)
+
+
+def _array(group: zarr.Group, name: str) -> zarr.Array:
+    array = group[name]
+    assert isinstance(array, zarr.Array)
+    return array
+
+
+def open_scan(path: str | Path) -> xr.Dataset:
+    """The labelled result of a scan, finished or not; values are read when they are used.
+
+    Where a scan isn't finished, samples not computed yet have the outcome -1 and NaN elsewhere.
+    """
+    _require_scan(Path(path))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)  # files of a killed run
+        dataset = xr.open_zarr(
+            path, consolidated=False, chunks=None, mask_and_scale=False, decode_times=False
+        )
+    return dataset.drop_vars(DONE)
+
+
+def _require_scan(path: Path) -> zarr.Group:
+    try:
+        group = zarr.open_group(path, mode="r", zarr_format=3)
+        attrs = dict(group.attrs)
+    except (FileNotFoundError, NotADirectoryError, ValueError) as error:
+        raise ValueError(
+            f"{path} is no scan's store: give the folder that `vrw scan` wrote, or a new place."
+        ) from error
+    if MANIFEST not in attrs:
+        raise ValueError(
+            f"{path} is a Zarr store, but not a scan's: give the folder that `vrw scan` wrote."
+        )
+    return group
+
+
+def stored_manifest(path: Path) -> dict | None:
+    """Settings and provenance of the store at `path`; None where nothing is."""
+    if not path.exists() or (path.is_dir() and not any(path.iterdir())):
+        return None
+    attrs = dict(_require_scan(path).attrs)
+    return {MANIFEST: attrs[MANIFEST], PROVENANCE: attrs.get(PROVENANCE, {})}
+
+
+def first_difference(there: object, here: object, name: str = "") -> tuple[str, object, object]:
+    """Name and values of the first setting that differs; ("", ...) where none does."""
+    if isinstance(there, dict) and isinstance(here, dict):
+        for key in [*there, *(k for k in here if k not in there)]:
+            below = first_difference(
+                there.get(key), here.get(key), f"{name}.{key}" if name else str(key)
+            )
+            if below[0]:
+                return below
+        return "", None, None
+    return ("", None, None) if there == here else (name, there, here)
+
+
+def create(path: Path, layout: Layout, attrs: Mapping[str, object]) -> None:
+    """Make an empty store at `path`, at once or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    building = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    try:
+        _fill(building, layout, attrs)
+        building.chmod(0o777 & ~_umask())
+        building.rename(path)
+    except BaseException:
+        shutil.rmtree(building, ignore_errors=True)
+        raise
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def _fill(path: Path, layout: Layout, attrs: Mapping[str, object]) -> None:
+    from zarr.codecs import Crc32cCodec, ZstdCodec
+
+    # The attribute tells xarray which arrays are coordinates; it takes it off again when it opens.
+    told = {**attrs, "coordinates": " ".join(layout.coordinates)}
+    group = zarr.create_group(path, zarr_format=3, attributes=told)
+    compressors = [ZstdCodec(level=3), Crc32cCodec()]  # a damaged file is noticed when read
+    for name, (dim, values, coordinate_attrs) in layout.coordinates.items():
+        array = group.create_array(
+            name,
+            shape=values.shape,
+            chunks=values.shape,
+            dtype=values.dtype,
+            dimension_names=(dim,),
+            compressors=compressors,
+            attributes=_json(coordinate_attrs),
+        )
+        array[:] = values
+    for variable in layout.variables:
+        group.create_array(
+            variable.name,
+            shape=(*layout.shape, *variable.shape),
+            chunks=(*layout.chunk, *variable.shape),
+            dtype=variable.dtype,
+            fill_value=variable.missing,
+            dimension_names=(*layout.dims, *variable.dims),
+            compressors=compressors,
+            attributes=_json(variable.attrs),
+        )
+    group.create_array(
+        DONE,
+        shape=(layout.n_chunks,),
+        chunks=(1,),
+        dtype="u1",
+        fill_value=0,
+        dimension_names=("chunk",),
+        attributes={"description": "1 where a chunk's results are complete."},
+    )
+
+
+def _json(attrs: Mapping[str, object]) -> dict[str, Any]:
+    """Attributes as Zarr takes them; all are plain values already."""
+    return dict(attrs)

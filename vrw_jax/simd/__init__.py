@@ -1,0 +1,21 @@
+"""Traces of JAX as machine code: a few lanes side by side, compiled by LLVM."""
+
+from vrw_jax.simd.program import (
+    at_hand,
+    lane_function,
+    lane_program,
+    processor,
+    serves,
+    tracing,
+)
+from vrw_jax.simd.trace import apart
+
+__all__ = [
+    "apart",
+    "at_hand",
+    "lane_function",
+    "lane_program",
+    "processor",
+    "serves",
+    "tracing",
+]

@@ -1,0 +1,82 @@
+"""Large arrays of LLVM values: computed where an index asks, or in memory.
+
+Those that compute know the `simd_arrays.Arrays` that they belong to.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import llvmlite.ir as ir
+import numpy as np
+
+from vrw_jax.simd.numbers import Value
+
+Index = tuple[Any, ...]
+"""For each axis a plain number, or an LLVM value of type LONG."""
+
+
+class Field:
+    """A large array: `at` an index it computes or loads an entry, a value of type `kind`.
+
+    Where `kind` is a vector an entry may also be a number, the same for all lanes.
+    """
+
+    def __init__(self, shape: Sequence[int], kind: ir.Type, at: Callable[[Index], Value]) -> None:
+        self.shape, self.kind, self.at = tuple(shape), kind, at
+
+
+class Updated(Field):
+    """An array in memory, but for a part of it."""
+
+    def __init__(self, arrays: Any, whole: "Memory", part: "Entries", begin: Index) -> None:
+        super().__init__(whole.shape, whole.kind, self.load)
+        self.arrays, self.whole, self.part, self.begin = arrays, whole, part, begin
+
+    def load(self, index: Index) -> Value:
+        """The entry there."""
+        return self.arrays.entry(self.arrays.in_memory(self), index)
+
+    def ready(self) -> "Updated":
+        """With the part computed: it may depend on what it takes the place of."""
+        return Updated(self.arrays, self.whole, self.arrays.in_memory(self.part), self.begin)
+
+    def store_into(self, memory: "Memory") -> None:
+        """Overwrites the part there, which is `ready`."""
+        arrays = self.arrays
+
+        def store(index: Index, _: Any) -> list[Value]:
+            memory.store(arrays.further(index, self.begin), arrays.entry(self.part, index))
+            return []
+
+        arrays.each(self.part.shape, store)
+
+
+class Memory(Field):
+    """A large array that lies in memory, entry after entry."""
+
+    def __init__(self, arrays: Any, shape: Sequence[int], kind: ir.Type, base: Value) -> None:
+        super().__init__(shape, kind, self.load)
+        self.arrays, self.base = arrays, base
+
+    def place(self, index: Index) -> Value:
+        """Where an entry is."""
+        where = self.arrays.linear(index, self.shape)
+        return self.arrays.builder.gep(self.base, [where], source_etype=self.kind)
+
+    def load(self, index: Index) -> Value:
+        """The entry there."""
+        return self.arrays.builder.load(self.place(index), typ=self.kind)
+
+    def store(self, index: Index, value: Value) -> None:
+        """Overwrites an entry."""
+        value = self.arrays.spread(value) if isinstance(self.kind, ir.VectorType) else value
+        self.arrays.builder.store(value, self.place(index))
+
+    def part(self, first: Value) -> "Memory":
+        """What lies at an index of the first axis."""
+        rest = (0,) * (len(self.shape) - 1)
+        return Memory(self.arrays, self.shape[1:], self.kind, self.place((first, *rest)))
+
+
+Entries = np.ndarray | Field
+"""LLVM values in an array, the axis of lanes left out."""

@@ -1,0 +1,11 @@
+"""The best gait that keeps its premises."""
+
+from vrw_jax.tuning.climbing import ACTIVE, Kind
+from vrw_jax.tuning.problem import Tuned, tune
+
+__all__ = [
+    "ACTIVE",
+    "Kind",
+    "Tuned",
+    "tune",
+]

@@ -1,0 +1,588 @@
+"""Tuning a wheel: the best gait that keeps its premises, climbed to with exact gradients.
+
+Without premises as constraints more double support is simply bought by scuffing.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from html import escape
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from vrw_jax.cycles import (
+    TAKE_OFF,
+    CycleOptions,
+    LimitCycle,
+    Problem,
+    WalkedCycle,
+    default_margins,
+    measure,
+)
+from vrw_jax.models import (
+    AbstractWheel,
+    StepResult,
+    UnilateralStep,
+    UnilateralWheel,
+    ViscoelasticWheel,
+    refuse_ladder,
+)
+from vrw_jax.numerics import Options
+from vrw_jax.results import MARGINS, ON_GROUND, attrs_of, flags, nearest, provenance
+from vrw_jax.runtime import xarray as xr
+from vrw_jax.tuning.climbing import (
+    Climb,
+    Ending,
+    Kind,
+    Trial,
+    breach,
+    climb,
+    optimality,
+    slack_scales,
+)
+from vrw_jax.tuning.ground import GroundEngine
+from vrw_jax.tuning.objective import (
+    READABLE,
+    AbstractEngine,
+    Engine,
+    Gait,
+    OfCycle,
+    Reader,
+    Weighted,
+    outcome_of,
+)
+from vrw_jax.tuning.starts import Lanes, explore
+from vrw_jax.wheel import DOMAINS, PARAMETER_NAMES, Outcome, WheelParams, parameters_of, wheel_of
+
+Objective = str | Mapping[str, float] | Callable[..., Array]
+Margins = Mapping[str, float] | Sequence[str]
+
+
+class Active(NamedTuple):
+    """A constraint or bound that holds the optimum."""
+
+    name: str  # of the constraint (with the leg, if it has one), or of the parameter
+    limit: float  # its margin, or the bound
+    unit: str
+    price: float  # objective gained per unit of limit given up
+
+
+class Walked(NamedTuple):
+    """What walking the tuned wheel showed, from a start displaced by `DISPLACED`."""
+
+    steps: int
+    outcome: Outcome
+    distance: float  # from the limit cycle after the last step, rad, rad/s and m/s
+    kept: bool  # whether every step kept every constraint on a monitor, within 1e-3 of its scale
+
+
+DISPLACED, N_WALKED, N_EXPLORED = 1e-5, 10, 25
+
+
+@dataclasses.dataclass(frozen=True)
+class Tuned:
+    """A tuned gait, how it was come by, and what holds it there."""
+
+    params: WheelParams
+    ending: Ending
+    objective: str
+    value: float
+    start_value: float
+    cycle: LimitCycle | WalkedCycle
+    step: StepResult | UnilateralStep
+    active: tuple[Active, ...]
+    kkt_residual: float  # of the first-order condition, relative to the objective's gradient
+    unkept: tuple[str, ...]  # premises that were no constraint and are broken
+    walked: Walked
+    path: xr.Dataset  # every gait that was evaluated, in order
+    evaluations: int  # limit cycles, each with one step
+    shortened: int  # trials that lost the gait or its branch
+    seconds: float  # of which `compile_seconds` went to compiling
+    compile_seconds: float  # and to exploring, if there were many starts
+    lanes: Lanes | None = None  # where many starts got to before the climb
+
+    @property
+    def converged(self) -> bool:
+        """Whether the climb ended at an optimum."""
+        return self.ending == Ending.CONVERGED
+
+    def lines(self) -> dict[str, str]:
+        """The result in words, for a reader."""
+        free = [str(name) for name in self.path.attrs["free"]]
+        wheel = [
+            f"{n} {float(getattr(self.params, n)):.6g} {DOMAINS[n].unit}".strip() for n in free
+        ]
+        kept = "every constraint kept" if self.walked.kept else "a constraint broken"
+        kept = kept if self.path.sizes["constraint"] else "no constraint to keep"
+        held = [f"{a.name} at {a.limit:.6g} {_plain(a.unit)}".strip() for a in self.active]
+        return {
+            "objective": f"{self.objective}: {self.start_value:.6g} at the start, {self.value:.6g}",
+            "wheel": ", ".join(wheel),
+            "ending": f"{self.ending.name}: {self.ending.meaning}",
+            "held by": ", ".join(held) or "nothing: a maximum inside all bounds and constraints",
+            "not asked for, and broken": ", ".join(self.unkept) or "none",
+            "walked": f"{self.walked.steps} steps, {self.walked.outcome.name}, "
+            f"{self.walked.distance:.1e} from the cycle at last; {kept}",
+            "cost": f"{self.evaluations} gaits, {self.shortened} steps shortened, "
+            f"{self.seconds - self.compile_seconds:.2f} s and {self.compile_seconds:.1f} s to "
+            "compile",
+        }
+
+    def __repr__(self) -> str:
+        return "Tuned\n" + "\n".join(f"  {key}: {text}" for key, text in self.lines().items())
+
+    def _repr_html_(self) -> str:
+        left = "style='text-align:left'"
+        rows = "".join(
+            f"<tr><th {left}>{key}</th><td {left}>{escape(text)}</td></tr>"
+            for key, text in self.lines().items()
+        )
+        return f"<table><caption>Tuned gait</caption>{rows}</table>"
+
+
+def _plain(unit: str) -> str:
+    return "" if unit == "1" else unit
+
+
+def tune(
+    params: WheelParams,
+    objective: Objective,
+    free: Sequence[str],
+    bounds: Mapping[str, tuple[float, float]],
+    constraints: Margins | None = None,
+    *,
+    model: AbstractWheel | None = None,
+    options: Options | None = None,
+    cycle_options: CycleOptions | None = None,
+    tolerance: float = 1e-6,
+    max_evaluations: int = 200,
+    n_starts: int = 1,
+    seed: int = 0,
+) -> Tuned:
+    """The wheel near `params` whose gait has the largest objective and keeps its constraints.
+
+    `objective`: a measure's name, weights of several, or a function of a LimitCycle (and, if it
+    takes two arguments, of the StepResult from it); it is maximised. `free` parameters move within
+    their `bounds`. `constraints`: least values of measures by name; names alone mean zero; the
+    default is every premise that gaits of this rung can keep (`premises.default_margins`), {} is
+    none. `tolerance` is on the first-order condition, relative to the objective's gradient; a
+    constraint counts as kept within 1e-6 of what it changes over the bounds. Local: it ends at an
+    optimum of the branch that `params` lies on. With `n_starts` above 1 so many wheels, `params`
+    and random ones within the bounds, first take N_EXPLORED first-order steps side by side, and the
+    best is climbed from. On real ground (`UnilateralWheel`) the objective is a measure of a step
+    there or weights of several, without constraints by default, and the start walks to its gait.
+    """
+    began = time.perf_counter()
+    problem = tuning_problem(
+        params,
+        objective,
+        free,
+        bounds,
+        constraints,
+        model=model,
+        options=options,
+        cycle_options=cycle_options,
+    )
+    if not max_evaluations >= 1:
+        raise ValueError(f"max_evaluations is {max_evaluations}, but it must be at least 1.")
+    if not tolerance > 0.0:
+        raise ValueError(f"tolerance is {tolerance:g}, but it must be positive.")
+    if not n_starts >= 1:
+        raise ValueError(f"n_starts is {n_starts}, but at least one start is needed.")
+    if n_starts > 1 and isinstance(problem.engine, GroundEngine):
+        raise ValueError("n_starts is for the paper's wheel: on real ground climb from one start.")
+    lanes = problem.explore(n_starts, seed) if n_starts > 1 else None
+    problem.engine.compile(params)
+    start = problem.start() if lanes is None else problem.evaluate(lanes.u[lanes.best], None)
+    compiled = time.perf_counter()
+    done = climb(problem.evaluate, start, tolerance=tolerance, max_evaluations=max_evaluations)
+    return problem.result(done, began, compiled, lanes)
+
+
+@dataclasses.dataclass(frozen=True)
+class TuneProblem:
+    """A checked tuning problem: what moves, what is sought, what is to be kept."""
+
+    params: WheelParams
+    free: tuple[str, ...]
+    lower: np.ndarray
+    upper: np.ndarray
+    margins: dict[str, float]
+    label: str
+    engine: AbstractEngine
+
+    @property
+    def widths(self) -> np.ndarray:
+        return self.upper - self.lower
+
+    @property
+    def constraint_names(self) -> tuple[str, ...]:
+        """One name for each number that is constrained: monitors of the locked legs have six."""
+        names: list[str] = []
+        for name in self.margins:
+            if name in MARGINS and MARGINS[name].axis:
+                names += [f"{name}[leg {leg}]" for leg in range(3, self.params.n_legs + 1)]
+            else:
+                names.append(name)
+        return tuple(names)
+
+    @property
+    def least(self) -> np.ndarray:
+        """Margins, one for each of `constraint_names`."""
+        return np.array([self.margins[name.split("[")[0]] for name in self.constraint_names])
+
+    def parameters(self, u: np.ndarray) -> np.ndarray:
+        """All float parameters where the free ones are `u` widths above their lower bounds."""
+        values = np.array(parameters_of(self.params))
+        values[[PARAMETER_NAMES.index(name) for name in self.free]] = self.lower + u * self.widths
+        return values
+
+    def wheel(self, u: np.ndarray) -> WheelParams:
+        """The wheel there."""
+        return wheel_of(jnp.asarray(self.parameters(u)), self.params.n_legs)
+
+    @property
+    def start_u(self) -> np.ndarray:
+        values = np.array([float(getattr(self.params, name)) for name in self.free])
+        return np.clip((values - self.lower) / self.widths, 0.0, 1.0)
+
+    def start(self) -> Trial:
+        """The gait of the start; refused if there is none."""
+        trial = self.evaluate(self.start_u, None)
+        if not trial.found:
+            raise ValueError(
+                f"the start has no gait to tune ({trial.outcome.name}: {trial.outcome.meaning[:-1]}"
+                "): start from a wheel that walks, such as WheelParams()."
+            )
+        return trial
+
+    def scales(self, trial: Trial) -> np.ndarray:
+        """What each constraint changes over the bounds, by its slope at a gait."""
+        return slack_scales(trial)
+
+    def evaluate(self, u: np.ndarray, near: Trial | None) -> Trial:
+        """The gait at `u`, from a neighbour's gait if one is given."""
+        parameters = jnp.asarray(self.parameters(u))
+        if near is None or near.gait is None:
+            guess = self.engine.first_guess(parameters)
+        else:
+            guess = self.engine.guess_of(near.gait)
+        gait = self.engine(parameters, guess)
+        outcome = outcome_of(gait)
+        on_branch = True
+        if outcome == Outcome.STEPPED and near is not None and near.gait is not None:
+            change = self.parameters(u) - self.parameters(near.u)
+            on_branch = self.engine.same_branch(near.gait, gait, change)
+        return self.trial(u, gait, outcome, on_branch)
+
+    def trial(self, u: np.ndarray, gait: Gait, outcome: Outcome, on_branch: bool) -> Trial:
+        """What a gait says about objective and constraints."""
+        values = np.array(gait.values)
+        indices = [PARAMETER_NAMES.index(name) for name in self.free]
+        slopes = np.array(gait.columns)[indices].T * self.widths
+        if outcome != Outcome.STEPPED:
+            values, slopes = np.full_like(values, np.nan), np.full_like(slopes, np.nan)
+        return Trial(
+            u, outcome, on_branch, float(values[0]), slopes[0], values[1:] - self.least,
+            slopes[1:], gait,
+        )  # fmt: skip
+
+    def explore(self, n_starts: int, seed: int) -> Lanes:
+        """First-order steps of many starts side by side: this wheel, and random ones."""
+        assert isinstance(self.engine, Engine)  # `tune` looked
+        others = np.random.default_rng(seed).uniform(size=(n_starts - 1, len(self.free)))
+        lanes = explore(
+            self._batch,
+            np.vstack([self.start_u, others]),
+            self._change,
+            [PARAMETER_NAMES.index(name) for name in self.free],
+            self.widths,
+            self.least,
+            N_EXPLORED,
+        )
+        if not np.isfinite(lanes.objective).any():
+            raise ValueError(
+                f"none of {n_starts} starts within the bounds has a gait: narrow the bounds around "
+                "wheels that walk, such as WheelParams()."
+            )
+        return lanes
+
+    def _batch(self, u: np.ndarray, near: Gait | None) -> Gait:
+        assert isinstance(self.engine, Engine)
+        parameters = jnp.asarray([self.parameters(row) for row in u])
+        first = self.engine.first_guesses(parameters)
+        return self.engine.batch(parameters, first if near is None else near.cycle.located)
+
+    def _change(self, difference: np.ndarray) -> np.ndarray:
+        """Differences of all parameters by differences of u, row by row."""
+        change = np.zeros((difference.shape[0], len(PARAMETER_NAMES)))
+        change[:, [PARAMETER_NAMES.index(name) for name in self.free]] = difference * self.widths
+        return change
+
+    def result(
+        self, done: Climb, began: float, compiled: float, lanes: Lanes | None = None
+    ) -> Tuned:
+        """The result of a climb, confirmed by walking."""
+        best = done.best
+        assert best.gait is not None
+        params = self.wheel(best.u)
+        conditions = optimality(best)
+        active = [
+            Active(name, float(limit), measure(name.split("[")[0]).unit, float(price))
+            for name, limit, price in zip(
+                self.constraint_names, self.least, conditions.prices, strict=True
+            )
+            if price > 0.0
+        ]
+        sides = ((self.lower, conditions.low), (self.upper, conditions.high))
+        for limits, prices in sides:
+            for name, limit, price, width in zip(
+                self.free, limits, prices, self.widths, strict=True
+            ):
+                if price > 0.0:
+                    unit = DOMAINS[name].unit or "1"
+                    active.append(Active(name, float(limit), unit, float(price / width)))
+        climbed = time.perf_counter()
+        walked = self._walk(params, best.gait)
+        broken = self.engine.unkept(best.gait.step)
+        return Tuned(
+            params=params,
+            ending=done.ending,
+            objective=self.label,
+            value=best.objective,
+            start_value=done.trials[0].objective,
+            cycle=best.gait.cycle,
+            step=best.gait.step,
+            active=tuple(active),
+            kkt_residual=conditions.residual,
+            unkept=tuple(name for name in broken if name not in self.margins),
+            walked=walked,
+            path=self._path(done),
+            evaluations=len(done.trials) + (0 if lanes is None else lanes.gaits),
+            shortened=sum(kind == Kind.LOST for kind in done.kinds),
+            seconds=climbed - began,
+            compile_seconds=compiled - began,
+            lanes=lanes,
+        )
+
+    def _walk(self, params: WheelParams, gait: Gait) -> Walked:
+        cycle = np.array(gait.cycle.section_state)
+        # Shrunk and not grown: no leg may lie beyond its stopper.
+        x, kept, outcome, walked = cycle * (1.0 - DISPLACED), True, Outcome.STEPPED, 0
+        for _ in range(N_WALKED):
+            one = self.engine.step(params, x)
+            outcome = Outcome(int(one.outcome))
+            if outcome != Outcome.STEPPED:
+                break
+            walked, x = walked + 1, np.array(one.section_state)
+            monitored = self.engine.monitored(one)
+            for name, least in self.margins.items():
+                if name in monitored:
+                    value = monitored[name]
+                    scale = 1e-3 * np.max(np.abs(value)) + 1e-9
+                    kept &= bool(np.all(value >= least - scale))
+        distance = float(np.max(np.abs(x - cycle)))
+        return Walked(walked, outcome, distance, kept and outcome == Outcome.STEPPED)
+
+    def _path(self, done: Climb) -> xr.Dataset:
+        """Every evaluated gait, labelled."""
+        along = "evaluation"
+        u = np.array([trial.u for trial in done.trials])
+        values = self.lower + u * self.widths
+        least = self.least
+        constraints = np.array([trial.slack + least for trial in done.trials])
+        scales = self.scales(done.trials[0])
+        outcomes = [
+            trial.outcome if trial.on_branch else Outcome.NO_CYCLE_FOUND for trial in done.trials
+        ]
+        data: dict[str, Any] = {
+            name: (along, values[:, i], attrs_of(name)) for i, name in enumerate(self.free)
+        }
+        data |= {
+            "objective": (along, [t.objective for t in done.trials], {"long_name": self.label}),
+            "constraint_value": ((along, "constraint"), constraints.reshape(len(u), least.size)),
+            "margin": ("constraint", least, {"long_name": "least value allowed"}),
+            "breach": (
+                along,
+                np.array([breach(trial, scales) for trial in done.trials]),
+                {"long_name": "largest breach of a constraint, in widths of the bounds"},
+            ),
+            "kind": (along, np.array(done.kinds, int), flags(kind.name for kind in Kind)),
+            "outcome": (along, np.array(outcomes, int), attrs_of("outcome")),
+            "on_branch": (along, np.array([t.on_branch for t in done.trials])),
+        }
+        units = [measure(name.split("[")[0]).unit for name in self.constraint_names]
+        labels = {
+            along: np.arange(len(u)),
+            "constraint": list(self.constraint_names),
+            "constraint_unit": ("constraint", units),
+        }
+        attrs = {
+            "title": f"Path of tuning {self.label} over {', '.join(self.free)}",
+            "free": list(self.free),
+            "lower": [float(v) for v in self.lower],
+            "upper": [float(v) for v in self.upper],
+            "ending": done.ending.name,
+        }
+        origin = provenance(self.params, self.engine.model, self.engine.options)
+        return xr.Dataset(data, labels, attrs | origin)
+
+
+def tuning_problem(
+    params: WheelParams,
+    objective: Objective,
+    free: Sequence[str],
+    bounds: Mapping[str, tuple[float, float]],
+    constraints: Margins | None = None,
+    *,
+    model: AbstractWheel | None = None,
+    options: Options | None = None,
+    cycle_options: CycleOptions | None = None,
+) -> TuneProblem:
+    """What `tune` solves, checked: for looking at single gaits, or for another method.
+
+    One clear sentence for what can be seen to be wrong.
+    """
+    if not isinstance(params, WheelParams) or params.damping.ndim:
+        raise ValueError(
+            "params must be one wheel, whose parameters are plain numbers: "
+            "write vrw.WheelParams(damping=..., slope=...)."
+        )
+    names, lower, upper = _bounds(params, free, bounds)
+    options = Options() if options is None else options
+    if isinstance(model, UnilateralWheel):
+        return _ground_problem(params, objective, names, lower, upper, constraints, model, options)
+    refuse_ladder(model, "tuned")
+    if not isinstance(model, ViscoelasticWheel | None):
+        raise TypeError(
+            f"model is {model!r}, but what is tuned has compliant legs: give "
+            "vrw.ViscoelasticWheel() or vrw.UnilateralWheel()."
+        )
+    reader, label = _objective(objective)
+    margins = _margins(params, constraints)
+    engine = Engine(
+        objective=reader,
+        constraints=tuple(margins),
+        problem=Problem(
+            params.n_legs, 1, CycleOptions() if cycle_options is None else cycle_options
+        ),
+        model=ViscoelasticWheel() if model is None else model,
+        options=options,
+    )
+    return TuneProblem(params, names, lower, upper, margins, label, engine)
+
+
+def _ground_problem(
+    params: WheelParams,
+    objective: Objective,
+    names: tuple[str, ...],
+    lower: np.ndarray,
+    upper: np.ndarray,
+    constraints: Margins | None,
+    model: UnilateralWheel,
+    options: Options,
+) -> TuneProblem:
+    """The same on real ground, which has no premises to keep unless measures are named."""
+    if callable(objective):
+        raise TypeError(
+            "objective is a function, but on real ground it must be a measure's name or weights "
+            f"of several: choose from {', '.join(ON_GROUND)}."
+        )
+    reader, label = _objective(objective, ON_GROUND)
+    assert isinstance(reader, Weighted)
+    margins = _margins(params, {} if constraints is None else constraints, ON_GROUND)
+    engine = GroundEngine(reader.weights, tuple(margins), params.n_legs, model, options)
+    return TuneProblem(params, names, lower, upper, margins, label, engine)
+
+
+def _objective(objective: Objective, readable: tuple[str, ...] = READABLE) -> tuple[Reader, str]:
+    if callable(objective):
+        label = getattr(objective, "__name__", "objective")
+        takes = inspect.signature(objective).parameters
+        return (objective if len(takes) >= 2 else OfCycle(objective)), label
+    weights = {objective: 1.0} if isinstance(objective, str) else dict(objective)
+    if not weights:
+        raise ValueError(
+            "objective is an empty mapping, but something must be maximised: "
+            'give a measure such as "dls_fraction".'
+        )
+    for name in weights:
+        _known(name, "objective", readable)
+        if name in MARGINS and MARGINS[name].axis:
+            raise ValueError(
+                f"{name} has one value for each locked leg, but an objective is one number: "
+                "give a function of the cycle and the step that reduces it."
+            )
+    label = " + ".join(n if w == 1.0 else f"{w:g} {n}" for n, w in weights.items())
+    return Weighted(tuple(weights.items())), label.replace("+ -", "- ")
+
+
+def _known(name: str, what: str, readable: tuple[str, ...]) -> None:
+    if name not in readable:
+        raise ValueError(
+            f"{name!r} is no measure for {what}{nearest(name, readable)}: "
+            f"choose from {', '.join(readable)}."
+        )
+
+
+def _bounds(
+    params: WheelParams, free: Sequence[str], bounds: Mapping[str, tuple[float, float]]
+) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
+    names = (free,) if isinstance(free, str) else tuple(free)
+    if not names:
+        raise ValueError(
+            f"free names no parameter, but at least one must move: choose from "
+            f"{', '.join(PARAMETER_NAMES)}."
+        )
+    for name in (*names, *bounds):
+        if name not in PARAMETER_NAMES:
+            raise ValueError(
+                f"{name!r} is no parameter of the wheel{nearest(name, PARAMETER_NAMES)}: "
+                f"choose from {', '.join(PARAMETER_NAMES)}."
+            )
+    for name in bounds:
+        if name not in names:
+            raise ValueError(f"bounds holds {name!r}, but it is not free: add it to free.")
+    for name in names:
+        if name not in bounds:
+            raise ValueError(f"{name} is free but has no bounds: give bounds[{name!r}].")
+        low, high = map(float, bounds[name])
+        if not (math.isfinite(low) and math.isfinite(high) and low < high):
+            raise ValueError(
+                f"the bounds of {name} are ({low:g}, {high:g}), which hold nothing: "
+                "give a lower one below the upper one."
+            )
+        value = float(getattr(params, name))
+        if not low <= value <= high:
+            raise ValueError(
+                f"the start has {name} {value:g}, outside its bounds ({low:g}, {high:g}): "
+                "widen the bounds or start inside them."
+            )
+    ends = np.array([[float(v) for v in bounds[name]] for name in names])
+    return names, ends[:, 0], ends[:, 1]
+
+
+def _margins(
+    params: WheelParams, constraints: Margins | None, readable: tuple[str, ...] = READABLE
+) -> dict[str, float]:
+    if constraints is None:
+        return dict(default_margins(params))
+    if isinstance(constraints, Mapping):
+        margins = {name: float(least) for name, least in constraints.items()}
+    else:
+        names = (constraints,) if isinstance(constraints, str) else constraints
+        margins = dict.fromkeys(names, 0.0)
+    if "clearance_sls1" in margins:
+        margins.setdefault(TAKE_OFF.name, 0.0)  # which has a slope where the clearance has none
+    for name, least in margins.items():
+        _known(name, "a constraint", readable)
+        if not math.isfinite(least):
+            raise ValueError(f"the margin of {name} is {least}, but it must be a finite number.")
+    return margins

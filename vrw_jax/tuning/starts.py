@@ -1,0 +1,119 @@
+"""Many starts at once: an augmented Lagrangian climbed by optax's Adam, all lanes in one batch.
+
+First-order steps bring every lane near an optimum of its own; which one to finish is chosen then.
+A lane whose trial lost its gait goes back and steps half as far from there on.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vrw_jax.runtime import optax
+from vrw_jax.tuning.objective import AGREEMENT, Gait, is_same_branch
+from vrw_jax.wheel import Outcome
+
+RATE, STIFFNESS = 0.06, 4.0
+"""Adam's first step in widths of the bounds; penalty on a breach of one width, in objectives."""
+
+BatchEvaluate = Callable[[np.ndarray, Gait | None], Gait]
+"""Gaits at u, one row per lane, from neighbours' gaits."""
+
+
+class Lanes(NamedTuple):
+    """Where each start got to."""
+
+    start: np.ndarray  # (n_lanes, n_free), in widths of the bounds
+    u: np.ndarray
+    objective: np.ndarray  # NaN where no gait was ever found
+    breach: np.ndarray  # largest, in widths of the bounds
+    lost: np.ndarray  # trials that lost the gait or its branch
+    gaits: int  # evaluated in all
+
+    @property
+    def best(self) -> int:
+        """The lane to go on from: of those that all but keep the constraints, the highest."""
+        merit = self.objective - STIFFNESS * np.abs(self.objective) * self.breach
+        return int(np.nanargmax(merit))
+
+
+def explore(
+    evaluate: BatchEvaluate,
+    starts: np.ndarray,
+    change: Callable[[np.ndarray], np.ndarray],
+    free: list[int],
+    widths: np.ndarray,
+    least: np.ndarray,
+    n_steps: int,
+) -> Lanes:
+    """`n_steps` first-order steps of every lane; `change` turns differences of u into parameters'.
+
+    Columns of a gait are over all parameters; `free` are the places of those that move.
+    """
+    n_lanes = starts.shape[0]
+    gait = evaluate(starts, None)
+    good = found(gait)
+    slack, slopes = _constraints(gait, free, widths, least)
+    scales = np.maximum(np.linalg.norm(slopes, axis=2), 1e-3 * np.abs(slack) + 1e-12)
+    scales = np.median(scales[good], axis=0) if good.any() else np.ones(least.size)
+    size = _gradient(gait, free, widths)[good]
+    size = np.median(np.linalg.norm(size, axis=1)) if good.any() else 1.0
+    rates = np.full((n_lanes, 1), RATE)
+    optimiser = optax.scale_by_adam(b1=0.7, b2=0.9)
+    memory = optimiser.init(jnp.asarray(starts))
+    prices = np.zeros((n_lanes, least.size))
+    u, kept, lost = starts.copy(), gait, np.zeros(n_lanes, int)
+    for i in range(n_steps):
+        slack, slopes = _constraints(kept, free, widths, least)
+        breach = np.maximum(0.0, prices - STIFFNESS * slack / scales)
+        prices = np.where(good[:, None], breach, prices)
+        pull = np.einsum("lc,lcf->lf", breach / scales, slopes)
+        uphill = _gradient(kept, free, widths) / size + pull
+        uphill = np.where(good[:, None], uphill, 0.0)
+        step, memory = optimiser.update(jnp.asarray(uphill), memory)
+        shrink = rates * 0.5 * (1.0 + np.cos(np.pi * i / n_steps))
+        trial = np.clip(u + shrink * np.asarray(step), 0.0, 1.0)
+        gait = evaluate(trial, kept)
+        holds = found(gait) & good & _on_branch(kept, gait, change(trial - u))
+        lost += good & ~holds
+        rates = np.where(holds[:, None], rates, 0.5 * rates)
+        u = np.where(holds[:, None], trial, u)
+        kept = jax.tree.map(lambda new, old, h=holds: _chosen(h, new, old), gait, kept)
+    slack, _ = _constraints(kept, free, widths, least)
+    objective = np.where(good, np.asarray(kept.values)[:, 0], np.nan)
+    breach = np.max(-slack / scales, axis=1, initial=0.0)
+    return Lanes(starts, u, objective, breach, lost, n_lanes * (n_steps + 1))
+
+
+def found(gait: Gait) -> np.ndarray:
+    """Whether each lane has a gait that the event-driven step agrees with."""
+    away = np.max(np.abs(np.asarray(gait.step.section_state - gait.cycle.section_state)), axis=-1)
+    codes = np.asarray(gait.cycle.outcome), np.asarray(gait.step.outcome)
+    return (codes[0] == Outcome.STEPPED) & (codes[1] == Outcome.STEPPED) & (away <= AGREEMENT)
+
+
+def _chosen(holds: np.ndarray, new: jax.Array, old: jax.Array) -> jax.Array:
+    return jnp.where(holds.reshape(-1, *(1,) * (jnp.ndim(new) - 1)), new, old)
+
+
+def _gradient(gait: Gait, free: list[int], widths: np.ndarray) -> np.ndarray:
+    return np.asarray(gait.columns)[:, free, 0] * widths
+
+
+def _constraints(
+    gait: Gait, free: list[int], widths: np.ndarray, least: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Slack, and its slopes over u: (lane, constraint) and (lane, constraint, free)."""
+    slopes = np.swapaxes(np.asarray(gait.columns)[:, free, 1:], 1, 2) * widths
+    return np.asarray(gait.values)[:, 1:] - least, slopes
+
+
+def _on_branch(here: Gait, there: Gait, change: np.ndarray) -> np.ndarray:
+    told = lambda g: (g.posture, g.posture_columns, g.cycle.located.happens, g.cycle.matrix)
+    first, second = ([np.asarray(x) for x in told(gait)] for gait in (here, there))
+    lane = lambda told, i: tuple(x[i] for x in told)
+    return np.array(
+        [is_same_branch(lane(first, i), lane(second, i), row) for i, row in enumerate(change)]
+    )

@@ -1,0 +1,157 @@
+"""What attracts: many starts walked until each repeats itself or falls.
+
+Starts may belong to different wheels. Those still undecided after a round are packed together for
+the next one, so that long transients cost little.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from vrw_jax.models import AbstractWheel
+from vrw_jax.numerics import Options
+from vrw_jax.walks.stepping import walk
+from vrw_jax.wheel import Outcome, WheelParams
+
+ROUND = 10
+"""Steps between two looks at who has settled."""
+
+BLOCK = 128
+"""Starts walked side by side: one shape, compiled once."""
+
+REPEATS = 1e-7
+"""Most by which a settled walk may miss its own section states one period ago."""
+
+ARRIVED = 1e-3
+"""Distance from its orbit below which a walk counts as having got there."""
+
+SAME = 1e-4
+"""Distance below which two orbits are one."""
+
+
+class Settled(NamedTuple):
+    """How each start ended; numpy arrays with a leading axis over starts."""
+
+    outcome: np.ndarray  # STEPPED where it still walked
+    period: np.ndarray  # of the orbit that it settled on, in steps; 0 where it did not settle
+    steps: np.ndarray  # until it was at its orbit, or fell
+    orbit: np.ndarray  # (start, longest period, 3): section states, lowest dtheta- first, then NaN
+
+
+@eqx.filter_jit
+def _walk_block(
+    model: AbstractWheel, options: Options, params: WheelParams, x: Array
+) -> tuple[Array, Array]:
+    one = lambda params, x: walk(params, x, ROUND, model=model, options=options)
+    walks = jax.vmap(one)(params, x)
+    return walks.steps.section_state, walks.steps.outcome
+
+
+def settle(
+    params: WheelParams,
+    starts: np.ndarray,
+    model: AbstractWheel,
+    options: Options,
+    most_steps: int,
+    longest_period: int,
+) -> Settled:
+    """Walk every start; `params` are those of one wheel or have the starts' leading axis."""
+    n = len(starts)
+    fill = lambda x: np.broadcast_to(np.asarray(x), n)
+    wheels = jax.tree.map(fill, params)
+    n_rounds = -(-most_steps // ROUND)
+    history = np.full((n, 1 + n_rounds * ROUND, 3), np.nan)
+    history[:, 0] = starts
+    outcome = np.full(n, int(Outcome.STEPPED))
+    period, walked = np.zeros(n, int), np.zeros(n, int)
+    open_ = np.arange(n)
+    for k in range(n_rounds):
+        now = slice(1 + k * ROUND, 1 + (k + 1) * ROUND)
+        for begin in range(0, len(open_), BLOCK):
+            some = open_[begin : begin + BLOCK]
+            filled = np.pad(some, (0, BLOCK - len(some)), mode="edge")
+            wheel = jax.tree.map(lambda x, filled=filled: x[filled], wheels)
+            states, codes = _walk_block(
+                model, options, wheel, jnp.asarray(history[filled, k * ROUND])
+            )
+            history[some, now] = np.asarray(states)[: len(some)]
+            ended = np.asarray(codes)[: len(some)]
+            outcome[some] = ended[:, -1]
+            walked[some] = k * ROUND + np.sum(ended == Outcome.STEPPED, 1)
+        known = (k + 1) * ROUND
+        period[open_] = _periods(history[open_, : known + 1], longest_period)
+        period[outcome != Outcome.STEPPED] = 0
+        open_ = open_[(outcome[open_] == Outcome.STEPPED) & (period[open_] == 0)]
+        if not len(open_):
+            break
+    orbit = np.full((n, longest_period, 3), np.nan)
+    for i in np.flatnonzero(period):
+        last = history[i, walked[i] + 1 - period[i] : walked[i] + 1]
+        orbit[i, : period[i]] = np.roll(last, -int(np.argmin(last[:, 1])), axis=0)
+        away = np.linalg.norm(history[i, : walked[i] + 1, None] - last[None], axis=-1).min(1)
+        beyond = np.flatnonzero(away > ARRIVED)
+        walked[i] = beyond[-1] + 1 if len(beyond) else 0
+    return Settled(outcome, period, walked, orbit)
+
+
+def _periods(history: np.ndarray, longest: int) -> np.ndarray:
+    """The shortest period of the last states, over as many steps as two of it; 0 for none."""
+    found = np.zeros(len(history), int)
+    last = history.shape[1]
+    for p in range(min(longest, (last - 1) // 3), 0, -1):
+        change = np.abs(history[:, last - 2 * p :] - history[:, last - 3 * p : last - p])
+        found[change.max((1, 2)) < REPEATS] = p
+    return found
+
+
+class Attractors(NamedTuple):
+    """The different orbits among many starts, the one with most starts first."""
+
+    of_start: np.ndarray  # index of each start's orbit; -1 where it did not settle
+    orbits: list[np.ndarray]  # (period, 3) each
+
+
+def distinct(settled: Settled) -> Attractors:
+    """Orbits told apart, whatever the step at which they were entered."""
+    index = np.full(len(settled.period), -1)
+    orbits: list[np.ndarray] = []
+    for i in np.flatnonzero(settled.period):
+        own = settled.orbit[i, : settled.period[i]]
+        for j, known in enumerate(orbits):
+            if len(known) == len(own) and np.abs(known - own).max() < SAME:
+                index[i] = j
+                break
+        else:
+            index[i] = len(orbits)
+            orbits.append(own)
+    count = [int(np.sum(index == j)) for j in range(len(orbits))]
+    order = np.argsort(count)[::-1]
+    place = np.full(len(orbits) + 1, -1)
+    place[order] = np.arange(len(orbits))
+    return Attractors(place[index], [orbits[j] for j in order])
+
+
+@eqx.filter_jit
+def _measure_block(
+    model: AbstractWheel, options: Options, params: WheelParams, x: Array
+) -> dict[str, Array]:
+    return jax.vmap(lambda p, x: model.step(p, x, options).measures())(params, x)
+
+
+def orbit_measures(
+    params: WheelParams, states: np.ndarray, model: AbstractWheel, options: Options
+) -> dict[str, np.ndarray]:
+    """All measures of the step from each of `states` (n, 3); `params` as in `settle`."""
+    n = len(states)
+    wheels = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), n), params)
+    parts = []
+    for begin in range(0, n, BLOCK):
+        places = np.minimum(np.arange(begin, begin + BLOCK), n - 1)
+        wheel = jax.tree.map(lambda x, places=places: x[places], wheels)
+        told = _measure_block(model, options, wheel, jnp.asarray(states[places]))
+        parts.append(jax.tree.map(np.asarray, told))
+    return {name: np.concatenate([part[name] for part in parts])[:n] for name in parts[0]}

@@ -1,0 +1,192 @@
+"""What repeats: one step, the return map, a walk of many steps.
+
+Everything here is pure and single-wheel, and works under `jit`, `vmap` and every mode of
+differentiation. A model compiles its own step once.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Literal, overload
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Int
+
+from vrw_jax.models import (
+    AbstractWheel,
+    Advance,
+    LadderStep,
+    LadderWheel,
+    SectionState,
+    StepResult,
+    UnilateralStep,
+    UnilateralWheel,
+    ViscoelasticWheel,
+)
+from vrw_jax.numerics import Options, as_float_array
+from vrw_jax.wheel import Outcome, WheelParams
+
+SectionLike = Array | np.ndarray | Sequence[float]
+"""A section state as given by a caller; `checked` makes it an array of shape (3,)."""
+ModelLike = AbstractWheel | Literal["auto"]
+"""A rung as given by a caller; "auto" is `LadderWheel()`, the lowest rung that serves."""
+
+
+def paper_start() -> SectionState:
+    """A section state (theta-, dtheta-, dL1-) inside the basin of the gait of Table 1."""
+    return ViscoelasticWheel().start(WheelParams())
+
+
+def checked(
+    params: WheelParams, x: object, model: ModelLike | None, options: Options | None
+) -> tuple[WheelParams, Array, AbstractWheel, Options]:
+    """Arguments with their defaults; one clear sentence for what can be seen to be wrong."""
+    if not isinstance(params, WheelParams):
+        raise TypeError(
+            f"params is a {type(params).__name__}, but a WheelParams is needed: "
+            "write vrw.WheelParams(damping=..., slope=...)."
+        )
+    if model is None:
+        model = ViscoelasticWheel()
+    if isinstance(model, str) and model == "auto":
+        model = LadderWheel()
+    if not isinstance(model, AbstractWheel):
+        raise TypeError(
+            f"model is {model!r}, but a rung of the ladder is needed: give "
+            'vrw.ViscoelasticWheel(), vrw.RigidWheel(), vrw.UnilateralWheel() or "auto".'
+        )
+    options = Options() if options is None else options
+    state = as_float_array(x)
+    size = model.section_size(params)
+    if state.shape == (3,) and size != 3:
+        state = model.full_section(params, state)
+    if state.shape != (size,):
+        raise ValueError(
+            f"the section state has shape {state.shape}, but it is (theta-, dtheta-, dL1-), shape "
+            f"(3,){'' if size == 3 else f', or this rung’s own of shape ({size},)'}: "
+            "for batches map over it with jax.vmap."
+        )
+    if params.damping.ndim != 0:
+        raise ValueError(
+            f"damping has shape {params.damping.shape}, but one step walks one wheel: map over "
+            "batches of parameters with jax.vmap, or use vrw.scan."
+        )
+    dtype = jnp.result_type(state, params.damping)
+    options.require_reachable(dtype)
+    convert = lambda leaf: leaf.astype(dtype)
+    return jax.tree.map(convert, params), convert(state), model, jax.tree.map(convert, options)
+
+
+@overload
+def step(  # type: ignore[overload-overlap]
+    params: WheelParams, x: SectionLike, *, model: UnilateralWheel, options: Options | None = None
+) -> UnilateralStep: ...
+
+
+@overload
+def step(  # type: ignore[overload-overlap]
+    params: WheelParams,
+    x: SectionLike,
+    *,
+    model: LadderWheel | Literal["auto"],
+    options: Options | None = None,
+) -> LadderStep: ...
+
+
+@overload
+def step(
+    params: WheelParams,
+    x: SectionLike,
+    *,
+    model: AbstractWheel | None = None,
+    options: Options | None = None,
+) -> StepResult: ...
+
+
+def step(
+    params: WheelParams,
+    x: SectionLike,
+    *,
+    model: ModelLike | None = None,
+    options: Options | None = None,
+) -> StepResult | UnilateralStep | LadderStep:
+    """One step from touchdown to touchdown, with indicators, monitors and energies.
+
+    `x` is (theta-, dtheta-, dL1-) just before touchdown, in rad, rad/s, m/s. How the step ended is
+    its `outcome`; nothing is raised for a wheel that falls. Errors: below 1e-9 at the default
+    options and 1e-12 at `Options.tight()`, for values and first derivatives.
+    """
+    params, state, model, options = checked(params, x, model, options)
+    return model.step(params, state, options)
+
+
+def return_map(
+    params: WheelParams,
+    x: SectionLike,
+    *,
+    model: ModelLike | None = None,
+    options: Options | None = None,
+) -> Array:
+    """The section state one step later; all zeros (no section state) where the step failed.
+
+    The lean path: no monitors are computed. Differentiable forwards and in reverse, to any order.
+    """
+    params, state, model, options = checked(params, x, model, options)
+    return model.advance(params, state, options).section_state
+
+
+class Walk(eqx.Module):
+    """Lean results of consecutive steps, with a leading axis over steps."""
+
+    start: Array
+    steps: Advance
+    n_stepped: Int[Array, ""]  # steps before the first that failed
+
+    @property
+    def outcome(self) -> Array:
+        """Outcome of the whole walk: of its first failing step, or STEPPED."""
+        last = self.steps.outcome.shape[-1] - 1
+        return jnp.take_along_axis(
+            self.steps.outcome, jnp.minimum(self.n_stepped, last)[..., None], axis=-1
+        )[..., 0]
+
+
+@eqx.filter_jit
+def _walk(
+    model: AbstractWheel, params: WheelParams, x: Array, options: Options, n_steps: int
+) -> Walk:
+    def one(carry: tuple, _: None) -> tuple:
+        x, outcome = carry
+        walking = outcome == Outcome.STEPPED
+        advance = model.advance(params, jnp.where(walking, x, jnp.nan), options)
+        outcome = jnp.where(walking, advance.outcome, outcome)
+        advance = dataclasses.replace(
+            advance,
+            durations=jnp.where(walking, advance.durations, 0.0),
+            outcome=outcome,
+            solver_steps=jnp.where(walking, advance.solver_steps, 0),
+        )
+        return (advance.section_state, outcome), advance
+
+    carry = (x, jnp.int32(Outcome.STEPPED))
+    steps: Advance
+    _, steps = lax.scan(one, carry, None, length=n_steps)
+    return Walk(x, steps, jnp.sum(steps.outcome == Outcome.STEPPED))
+
+
+def walk(
+    params: WheelParams,
+    x: SectionLike,
+    n_steps: int,
+    *,
+    model: ModelLike | None = None,
+    options: Options | None = None,
+) -> Walk:
+    """`n_steps` steps, or as many as it can; the steps after a failure repeat its outcome."""
+    if not n_steps >= 1:
+        raise ValueError(f"n_steps is {n_steps}, but a walk needs at least one step.")
+    params, state, model, options = checked(params, x, model, options)
+    return _walk(model, params, state, options, n_steps)

@@ -1,0 +1,139 @@
+"""A walk as a labelled trajectory: motion, forces, energy and points, with units and origin.
+
+The slope's frame: x downhill along the slope, z normal to it; the first foot stands at the origin.
+Angles and leg labels are those of the present step, so theta and the lengths jump at a landing.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from vrw_jax.models import AbstractWheel, LadderWheel, SectionState, UnilateralWheel
+from vrw_jax.numerics import Options
+from vrw_jax.results import TRAJECTORY, attrs_of, provenance
+from vrw_jax.runtime import xarray as xr
+from vrw_jax.walks.ground_trajectory import simulate_ground
+from vrw_jax.walks.stepping import ModelLike, SectionLike, checked
+from vrw_jax.wheel import (
+    Motion,
+    Outcome,
+    WheelParams,
+    damping_power,
+    landing_direction,
+    rear_direction,
+)
+
+
+@eqx.filter_jit
+def _columns(
+    model: AbstractWheel, params: WheelParams, x: SectionState, options: Options, n_samples: int
+) -> dict[str, Array]:
+    """One step by the names of `TRAJECTORY`, shape (phase, sample), Leg 1's foot at the origin.
+
+    `ahead` is added: where the landing leg stands or will stand, m.
+    """
+    s, moved = params.symbols(), model.trace(params, x, options, n_samples)
+    theta, L1, L2, dtheta, dL1, dL2 = jnp.moveaxis(moved.state, -1, 0)
+    kinetic, gravitational, elastic = jnp.moveaxis(moved.energy, -1, 0)
+    motion = Motion.of(theta, L1, L2, dtheta, dL1, dL2)
+    rear = rear_direction(s, motion.sin, motion.cos)
+    hub_x, hub_z, zero = L1 * motion.sin, L1 * motion.cos, jnp.zeros_like(L1)
+    return {
+        "time": moved.time,
+        "x": zero,
+        "z": zero,
+        "theta": theta,
+        "L1": L1,
+        "L2": L2,
+        "dx": zero,
+        "dz": zero,
+        "dtheta": dtheta,
+        "dL1": dL1,
+        "dL2": dL2,
+        **{f"lambda_{i + 1}": moved.forces[..., i] for i in range(4)},
+        "kinetic_energy": kinetic,
+        "gravitational_energy": gravitational,
+        "elastic_energy": elastic,
+        "total_energy": kinetic + gravitational + elastic,
+        "damping_power": damping_power(s, motion),
+        "foot_1_x": zero,
+        "foot_1_z": zero,
+        "foot_2_x": hub_x - L2 * rear.sin,
+        "foot_2_z": hub_z - L2 * rear.cos,
+        "hub_x": hub_x,
+        "hub_z": hub_z,
+        "ahead": hub_x - s.L0 * landing_direction(s, motion.sin, motion.cos).sin,
+    }
+
+
+def simulate(
+    params: WheelParams,
+    x: SectionLike,
+    n_steps: int = 10,
+    *,
+    model: ModelLike | None = None,
+    options: Options | None = None,
+    n_samples: int = 100,
+) -> xr.Dataset:
+    """Walk `n_steps` steps from the section state `x`, as a labelled trajectory over time.
+
+    Each phase has `n_samples` equal times, both ends included: an instant at which something jumps
+    stands there twice, just before and just after it. A step that fails ends the trajectory at the
+    event; the attributes `outcome` and `outcome_meaning` say why. Errors as in `vrw.step`.
+    """
+    if not n_steps >= 1:
+        raise ValueError(f"n_steps is {n_steps}, but a trajectory needs at least one step.")
+    if not n_samples >= 2:
+        raise ValueError(f"n_samples is {n_samples}, but a phase has two ends: give 2 or more.")
+    params, x, model, options = checked(params, x, model, options)
+    if isinstance(model, UnilateralWheel | LadderWheel):
+        walked = simulate_ground(
+            params, x, n_steps, model=model, options=options, n_samples=n_samples
+        )
+        return walked.assign_attrs(provenance(params, model, options))
+    s = params.symbols()
+    weight_along = float(s.Mt * s.g * s.sin_phi)
+    parts: list[dict[str, np.ndarray]] = []
+    start, outcome, stepped, time, foot = x, Outcome.STEPPED, 0, 0.0, 0.0
+    while outcome == Outcome.STEPPED and stepped < n_steps:
+        advance = model.advance(params, x, options)
+        columns = jax.tree.map(np.asarray, _columns(model, params, x, options, n_samples))
+        outcome = Outcome(int(advance.outcome))
+        durations = np.asarray(advance.durations)
+        for phase in np.flatnonzero(durations > 0.0):
+            part = {name: values[phase].copy() for name, values in columns.items()}
+            for name in ("x", "foot_1_x", "foot_2_x", "hub_x", "ahead"):
+                part[name] += foot
+            for name in ("gravitational_energy", "total_energy"):
+                part[name] -= weight_along * foot
+            part["time"] += time
+            part["step"] = np.full(n_samples, stepped)
+            part["phase"] = np.full(n_samples, phase)
+            parts.append(part)
+        if outcome == Outcome.STEPPED:
+            stepped += 1
+            time += float(durations.sum())
+            foot = float(parts[-1]["ahead"][-1])
+            x = advance.section_state
+    joined = {
+        name: np.concatenate([part[name] for part in parts]) if parts else np.zeros(0)
+        for name in TRAJECTORY
+    }
+    attrs = {
+        "title": f"Walk of the {type(model).__name__}",
+        "frame": "x downhill along the slope, z normal to it, first foot at the origin",
+        "start": [float(v) for v in start],
+        "start_meaning": "theta-, dtheta-, dL1- just before the first landing, rad, rad/s, m/s",
+        "n_steps": stepped,
+        "outcome": outcome.name,
+        "outcome_meaning": outcome.meaning,
+    }
+    variables = {
+        name: xr.Variable("time", values, attrs_of(name)) for name, values in joined.items()
+    }
+    labels = {name: variables.pop(name) for name in ("time", "step", "phase")}
+    return xr.Dataset(variables, labels, attrs | provenance(params, model, options))

@@ -1,0 +1,261 @@
+"""How the wheel accelerates, phase by phase, and the forces that hold it there.
+
+With Leg 1's foot at rest the wheel has the coordinates (theta, L1, L2). Written with the hub's
+velocity in Leg 1's own frame the mass matrix does not depend on theta, and every phase follows from
+one set of `terms`: double support restricts it to the circle of the hub (1 degree of freedom),
+single support I is its 3 x 3 solve, single support II drops L2 (2 degrees of freedom). The
+constraints of eq. (2) hold by construction. Docs: docs/physics.md derives every line.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from vrw_jax.numerics import Elementwise
+from vrw_jax.wheel.geometry import Motion, double_support_circle, rear_direction
+from vrw_jax.wheel.params import Symbols
+
+
+class Acceleration(NamedTuple):
+    """Second derivatives of (theta, L1, L2)."""
+
+    ddtheta: Elementwise  # rad/s^2
+    ddL1: Elementwise  # m/s^2
+    ddL2: Elementwise  # m/s^2
+
+
+class MassMatrix(NamedTuple):
+    """Symmetric mass matrix over (theta, L1, L2); M22, M33 and M23 are constants."""
+
+    M11: Elementwise  # kg m^2
+    M12: Elementwise  # kg m
+    M13: Elementwise  # kg m
+    M22: Elementwise  # kg
+    M23: Elementwise  # kg
+    M33: Elementwise  # kg
+
+    def times(self, x: tuple[Elementwise, Elementwise, Elementwise]) -> tuple[Elementwise, ...]:
+        """The product with a vector over (theta, L1, L2)."""
+        return (
+            self.M11 * x[0] + self.M12 * x[1] + self.M13 * x[2],
+            self.M12 * x[0] + self.M22 * x[1] + self.M23 * x[2],
+            self.M13 * x[0] + self.M23 * x[1] + self.M33 * x[2],
+        )
+
+
+class Terms(NamedTuple):
+    """Mass matrix and the applied forces f of M q'' = f + constraint forces (eq. 1)."""
+
+    mass: MassMatrix
+    f1: Elementwise  # N m, along theta
+    f2: Elementwise  # N, along L1
+    f3: Elementwise  # N, along L2
+
+
+def mass_matrix(s: Symbols, L1: Elementwise, L2: Elementwise) -> MassMatrix:
+    """M(q) of eq. (1) restricted to a planted Leg 1."""
+    b = L2 - s.a
+    inertia = s.m * (s.a * s.a + b * b + (s.n - 2) * s.c0 * s.c0)
+    coupling = s.m * (s.c0 * (1.0 + s.cos_alpha) - b * s.cos_alpha)
+    return MassMatrix(
+        M11=L1 * (s.Mh * L1 + 2.0 * coupling) + inertia,
+        M12=s.m * s.sin_alpha * (L2 - s.L0),
+        M13=-s.m * s.sin_alpha * L1,
+        M22=s.Mh,
+        M23=-s.m * s.cos_alpha,
+        M33=s.m,
+    )
+
+
+def terms(s: Symbols, motion: Motion) -> Terms:
+    """Mass matrix and applied forces: gravity, springs and dampers (eq. 3), inertial forces."""
+    sin, cos, L1, L2, dtheta, dL1, dL2 = motion
+    mass = mass_matrix(s, L1, L2)
+    sin_p = sin * s.cos_phi + cos * s.sin_phi  # of theta + phi
+    cos_p = cos * s.cos_phi - sin * s.sin_phi
+    rear_sin_p = sin_p * s.cos_alpha + cos_p * s.sin_alpha  # of theta + alpha + phi
+    rear_cos_p = cos_p * s.cos_alpha - sin_p * s.sin_alpha
+    b = L2 - s.a
+    P1 = s.Mh * L1 + s.m * (s.c0 * (1.0 + s.cos_alpha) - b * s.cos_alpha)  # half dM11/dL1
+    P2 = s.m * (b - s.cos_alpha * L1)  # half dM11/dL2
+    coriolis = 2.0 * s.m * s.sin_alpha * dtheta
+    return Terms(
+        mass=mass,
+        f1=s.g * ((s.Mh * L1 + s.m * s.L0) * sin_p + s.m * (s.L0 - L2) * rear_sin_p)
+        - 2.0 * (P1 * dL1 + P2 * dL2) * dtheta,
+        f2=s.k * (s.Ls - L1)
+        - s.c * dL1
+        + P1 * dtheta * dtheta
+        - coriolis * dL2
+        - s.g * s.Mh * cos_p,
+        f3=s.k * (s.Ls - L2)
+        - s.c * dL2
+        + P2 * dtheta * dtheta
+        + coriolis * dL1
+        + s.g * s.m * rear_cos_p,
+    )
+
+
+def single_support_1_acceleration(s: Symbols, motion: Motion) -> Acceleration:
+    """SLS-I, three degrees of freedom: Leg 2 swings and telescopes freely. Section 3.3.2."""
+    return free_acceleration(s, motion.L1, terms(s, motion))
+
+
+def free_acceleration(s: Symbols, L1: Elementwise, free: Terms) -> Acceleration:
+    """What the applied forces alone do with Leg 1's foot at rest: M q'' = f."""
+    M, f1, f2, f3 = free
+    q = s.sin_alpha * L1  # eliminates L2: its row of M is m (-q, -cos alpha, 1)
+    A11 = M.M11 + M.M13 * q
+    A12 = M.M12 + M.M13 * s.cos_alpha
+    A22 = M.M22 + M.M23 * s.cos_alpha
+    F1 = f1 + q * f3
+    F2 = f2 + s.cos_alpha * f3
+    inverse = 1.0 / (A11 * A22 - A12 * A12)
+    ddtheta = (A22 * F1 - A12 * F2) * inverse
+    ddL1 = (A11 * F2 - A12 * F1) * inverse
+    return Acceleration(ddtheta, ddL1, f3 / s.m + q * ddtheta + s.cos_alpha * ddL1)
+
+
+def single_support_2_acceleration(s: Symbols, motion: Motion) -> Acceleration:
+    """SLS-II, two degrees of freedom: Leg 2 is on its stopper, where M12 = 0. Section 3.3.3."""
+    M, f1, f2, _ = terms(s, motion)
+    return Acceleration(f1 / M.M11, f2 / M.M22, 0.0 * f1)
+
+
+def double_support_acceleration(s: Symbols, distance: Elementwise, motion: Motion) -> Acceleration:
+    """DLS, one degree of freedom: the hub moves on a circle over both feet. Section 3.3.1."""
+    M, f1, f2, f3 = terms(s, motion)
+    circle = double_support_circle(s, distance, motion.sin, motion.cos)
+    tangent = (jnp.ones_like(circle.G1), circle.G1, circle.G2)
+    row = M.times(tangent)
+    centripetal = motion.dtheta * motion.dtheta
+    force = f1 + circle.G1 * f2 + circle.G2 * f3
+    inertia = row[0] + circle.G1 * row[1] + circle.G2 * row[2]
+    ddtheta = (force + centripetal * (circle.L1 * row[1] + circle.L2 * row[2])) / inertia
+    return Acceleration(
+        ddtheta,
+        circle.G1 * ddtheta - circle.L1 * centripetal,
+        circle.G2 * ddtheta - circle.L2 * centripetal,
+    )
+
+
+class FootForce(NamedTuple):
+    """Force (N) or impulse (N s) of the ground on a foot."""
+
+    tangential: Elementwise  # downhill positive: lambda_1 (fore) or lambda_3 (rear)
+    normal: Elementwise  # pushing positive: lambda_2 (fore) or lambda_4 (rear)
+
+
+def friction_needed(force: FootForce) -> Elementwise:
+    """Tangential over normal force; 0 for a foot that is not pressed on the ground."""
+    pressed = force.normal > 0.0
+    ratio = jnp.abs(force.tangential) / jnp.where(pressed, force.normal, 1.0)
+    return jnp.where(pressed, ratio, 0.0)
+
+
+def foot_force_from_residual(
+    s: Symbols, motion: Motion, along_L1: Elementwise, along_L2: Elementwise
+) -> FootForce:
+    """Rear-foot force that supplies the generalised forces along L1 and L2 (rows of eq. 1)."""
+    rear = rear_direction(s, motion.sin, motion.cos)
+    return FootForce(
+        -(rear.cos * along_L1 + motion.cos * along_L2) / s.sin_alpha,
+        (rear.sin * along_L1 + motion.sin * along_L2) / s.sin_alpha,
+    )
+
+
+def rear_foot_force(s: Symbols, motion: Motion, acceleration: Acceleration) -> FootForce:
+    """(lambda_3, lambda_4) in double support, N: what M q'' needs beyond the applied forces."""
+    M, _, f2, f3 = terms(s, motion)
+    needed = M.times(acceleration)
+    return foot_force_from_residual(s, motion, needed[1] - f2, needed[2] - f3)
+
+
+def fore_foot_force(
+    s: Symbols, motion: Motion, acceleration: Acceleration, rear: FootForce | None = None
+) -> FootForce:
+    """(lambda_1, lambda_2), N: rate of total momentum less weight and rear-foot force."""
+    sin, cos, L1, L2, dtheta, dL1, dL2 = motion
+    ddtheta, ddL1, ddL2 = acceleration
+    A, dA, ddA = s.Mh * L1 + s.m * s.L0, s.Mh * dL1, s.Mh * ddL1
+    B, dB, ddB = s.m * (s.L0 - L2), -s.m * dL2, -s.m * ddL2
+    radial_1 = ddA - A * dtheta * dtheta
+    across_1 = 2.0 * dA * dtheta + A * ddtheta
+    radial_2 = ddB - B * dtheta * dtheta
+    across_2 = 2.0 * dB * dtheta + B * ddtheta
+    leg2 = rear_direction(s, sin, cos)
+    x = radial_1 * sin + across_1 * cos + radial_2 * leg2.sin + across_2 * leg2.cos
+    z = radial_1 * cos - across_1 * sin + radial_2 * leg2.cos - across_2 * leg2.sin
+    tangential = x - s.Mt * s.g * s.sin_phi
+    normal = z + s.Mt * s.g * s.cos_phi
+    if rear is None:
+        return FootForce(tangential, normal)
+    return FootForce(tangential - rear.tangential, normal - rear.normal)
+
+
+def momentum(s: Symbols, motion: Motion) -> tuple[Elementwise, Elementwise]:
+    """Total linear momentum along (x, z) with Leg 1's foot at rest, kg m/s."""
+    sin, cos, L1, L2, dtheta, dL1, dL2 = motion
+    leg2 = rear_direction(s, sin, cos)
+    radial_1, across_1 = s.Mh * dL1, (s.Mh * L1 + s.m * s.L0) * dtheta
+    radial_2, across_2 = -s.m * dL2, s.m * (s.L0 - L2) * dtheta
+    return (
+        radial_1 * sin + across_1 * cos + radial_2 * leg2.sin + across_2 * leg2.cos,
+        radial_1 * cos - across_1 * sin + radial_2 * leg2.cos - across_2 * leg2.sin,
+    )
+
+
+def stopper_force(
+    s: Symbols, motion: Motion, acceleration: Acceleration, legs: range
+) -> Float[Array, "n_legs_asked ..."]:
+    """Force of the stopper that keeps each of `legs` at L0, N; negative where it would come off.
+
+    The spring presses with k (L* - L0); weight and acceleration of the leg's mass relieve it.
+    """
+    turn = s.alpha * (np.asarray(legs).reshape(-1, *(1,) * jnp.ndim(motion.L1)) - 1)
+    radial = acceleration.ddL1 - motion.L1 * motion.dtheta * motion.dtheta
+    across = 2.0 * motion.dL1 * motion.dtheta + motion.L1 * acceleration.ddtheta
+    # Acceleration of the hub less gravity, in the frame of Leg 1.
+    radial = radial + s.g * (motion.cos * s.cos_phi - motion.sin * s.sin_phi)
+    across = across - s.g * (motion.sin * s.cos_phi + motion.cos * s.sin_phi)
+    along = radial * np.cos(turn) + across * np.sin(turn)
+    spin = s.c0 * motion.dtheta * motion.dtheta
+    return s.k * (s.Ls - s.L0) + s.m * spin + s.m * along
+
+
+class Energy(NamedTuple):
+    """Mechanical energy, J; gravity counts from the present foot of Leg 1. Section 3.5."""
+
+    kinetic: Elementwise
+    gravitational: Elementwise
+    elastic: Elementwise
+
+    @property
+    def total(self) -> Elementwise:
+        """E of eq. (26), J."""
+        return self.kinetic + self.gravitational + self.elastic
+
+
+def kinetic_energy(s: Symbols, motion: Motion) -> Elementwise:
+    """Half of q' M q', J."""
+    rates = (motion.dtheta, motion.dL1, motion.dL2)
+    p = mass_matrix(s, motion.L1, motion.L2).times(rates)
+    return 0.5 * (p[0] * rates[0] + p[1] * rates[1] + p[2] * rates[2])
+
+
+def energy(s: Symbols, motion: Motion) -> Energy:
+    """Kinetic, gravitational and elastic energy (eqs 26, 27), J."""
+    sin_p = motion.sin * s.cos_phi + motion.cos * s.sin_phi
+    cos_p = motion.cos * s.cos_phi - motion.sin * s.sin_phi
+    rear_cos_p = cos_p * s.cos_alpha - sin_p * s.sin_alpha
+    moment = (s.Mh * motion.L1 + s.m * s.L0) * cos_p + s.m * (s.L0 - motion.L2) * rear_cos_p
+    stretch_1, stretch_2, locked = motion.L1 - s.Ls, motion.L2 - s.Ls, s.L0 - s.Ls
+    elastic = 0.5 * s.k * (stretch_1**2 + stretch_2**2 + (s.n - 2) * locked**2)
+    return Energy(kinetic_energy(s, motion), s.g * moment, elastic)
+
+
+def damping_power(s: Symbols, motion: Motion) -> Elementwise:
+    """Power lost in the dampers, c (dL1^2 + dL2^2), W (eq. 29)."""
+    return s.c * (motion.dL1 * motion.dL1 + motion.dL2 * motion.dL2)

@@ -1,0 +1,233 @@
+"""When a phase ends and what jumps: each guard beside its reset.
+
+Guards are positive inside their phase and watched on the way down. Resets are the two collisions of
+the paper, landing (Section 3.4.1 with the procedure of Section 5.1) and stopper (Section 3.4.2).
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from vrw_jax.numerics import Elementwise
+from vrw_jax.wheel.dynamics import (
+    FootForce,
+    MassMatrix,
+    double_support_acceleration,
+    foot_force_from_residual,
+    fore_foot_force,
+    kinetic_energy,
+    mass_matrix,
+    momentum,
+    rear_foot_force,
+)
+from vrw_jax.wheel.geometry import (
+    Motion,
+    double_support_circle,
+    foot_distance,
+    landing_direction,
+    length_at_touchdown,
+    rear_direction,
+)
+from vrw_jax.wheel.params import Symbols
+
+
+class Landing(NamedTuple):
+    """What the collision of Leg 1's foot leaves behind, and what it cost."""
+
+    theta: Elementwise  # rad, in the labels of the step that begins
+    motion: Motion  # just after the impact
+    distance: Elementwise  # D, between both feet, m
+    stays: Bool[Array, "..."]  # lambda_I4 >= 0: the rear foot stays (A4); else it is freed (A3)
+    fore: FootForce  # (lambda_I1, lambda_I2), N s, of the impact that happened
+    rear: FootForce  # (lambda_I3, lambda_I4), N s, with both feet held (A1)
+    energy_lost: Elementwise  # J
+    hub_jump: tuple[Elementwise, Elementwise]  # jump of the hub's velocity along (x, z), m/s
+
+
+def motion_before_landing(
+    s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise
+) -> Motion:
+    """The section state (theta-, dtheta-, dL1-) as a motion: Leg 2 locked, next foot at z = 0."""
+    L1 = length_at_touchdown(s, theta)
+    zero = 0.0 * (theta + s.L0)
+    return Motion.of(theta, L1, s.L0 + zero, dtheta, dL1, zero)
+
+
+class _HeldLanding(NamedTuple):
+    """The landing that leaves both feet on the ground (A1), and what led to it."""
+
+    before: Motion
+    after: Motion
+    distance: Elementwise
+    foot: tuple[Elementwise, Elementwise]  # velocity of the landing foot before, m/s
+    mass: MassMatrix  # in the labels of the step that begins
+    momentum: tuple[Elementwise, ...]  # along its coordinates, about the new foot
+    row: tuple[Elementwise, ...]  # mass matrix times the tangent of the hub's circle
+
+
+def _held_landing(
+    s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise
+) -> _HeldLanding:
+    before = motion_before_landing(s, theta, dtheta, dL1)
+    reach = before.L1
+    # Velocity of the landing foot, eqs (16), (17) with the rate of L1 before the impact.
+    sin, cos = landing_direction(s, before.sin, before.cos)
+    foot_x = (reach * before.cos - s.L0 * cos) * dtheta + dL1 * before.sin
+    foot_z = -(reach * before.sin - s.L0 * sin) * dtheta + dL1 * before.cos
+
+    rear = rear_direction(s, sin, cos)
+    M = mass_matrix(s, s.L0, reach)
+    # Generalised momentum of (theta, L1, L2) about the new foot, whose velocity still counts.
+    p = M.times((dtheta, 0.0 * dtheta, dL1))
+    A, B = s.Mh * s.L0 + s.m * s.L0, s.m * (s.L0 - reach)
+    p1 = p[0] + (A * cos + B * rear.cos) * foot_x - (A * sin + B * rear.sin) * foot_z
+    p2 = p[1] + s.Mh * (sin * foot_x + cos * foot_z)
+    p3 = p[2] - s.m * (rear.sin * foot_x + rear.cos * foot_z)
+
+    # (A1) both feet held: the hub may only move on its circle.
+    distance = foot_distance(s, theta - s.alpha)
+    circle = double_support_circle(s, distance, sin, cos)
+    row = M.times((jnp.ones_like(circle.G1), circle.G1, circle.G2))
+    inertia = row[0] + circle.G1 * row[1] + circle.G2 * row[2]
+    held = (p1 + circle.G1 * p2 + circle.G2 * p3) / inertia
+    full = s.L0 + 0.0 * reach
+    after = Motion(sin, cos, full, reach, held, circle.G1 * held, circle.G2 * held)
+    return _HeldLanding(before, after, distance, (foot_x, foot_z), M, (p1, p2, p3), row)
+
+
+def land_on_both(
+    s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise
+) -> tuple[Elementwise, Elementwise]:
+    """(theta+, dtheta+) of a landing that leaves both feet on the ground: `land`, and no more."""
+    return theta - s.alpha, _held_landing(s, theta, dtheta, dL1).after.dtheta
+
+
+def land(s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise) -> Landing:
+    """Exchange of legs and inelastic landing, eqs (15)-(21), (A1)-(A4).
+
+    theta, dtheta, dL1 are the section state just before touchdown in the labels of the step that
+    ends; the result is in the labels of the step that begins.
+    """
+    before, on_both, distance, (foot_x, foot_z), M, (p1, p2, p3), row = _held_landing(
+        s, theta, dtheta, dL1
+    )
+    sin, cos, reach = on_both.sin, on_both.cos, before.L1
+    held = on_both.dtheta
+    rear_impulse = foot_force_from_residual(s, on_both, row[1] * held - p2, row[2] * held - p3)
+    stays = rear_impulse.normal >= 0.0
+
+    # (A3) only the landing foot held: M rates = p, Leg 2 eliminated by its own row.
+    q = s.sin_alpha * s.L0
+    A11, A12 = M.M11 + M.M13 * q, M.M12 + M.M13 * s.cos_alpha
+    A22 = M.M22 + M.M23 * s.cos_alpha
+    F1, F2 = p1 + q * p3, p2 + s.cos_alpha * p3
+    inverse = 1.0 / (A11 * A22 - A12 * A12)
+    free_dtheta = (A22 * F1 - A12 * F2) * inverse
+    free_dL1 = (A11 * F2 - A12 * F1) * inverse
+    free_dL2 = p3 / s.m + q * free_dtheta + s.cos_alpha * free_dL1
+
+    after = on_both._replace(
+        dtheta=jnp.where(stays, held, free_dtheta),
+        dL1=jnp.where(stays, on_both.dL1, free_dL1),
+        dL2=jnp.where(stays, on_both.dL2, free_dL2),
+    )
+    # Impulses of the ground: the jump of total momentum, less what the rear foot took.
+    px, pz = momentum(s, after)
+    moving = Motion(sin, cos, s.L0, reach, dtheta, 0.0 * dtheta, dL1)
+    before_x, before_z = momentum(s, moving)
+    taken = FootForce(
+        jnp.where(stays, rear_impulse.tangential, 0.0), jnp.where(stays, rear_impulse.normal, 0.0)
+    )
+    fore = FootForce(
+        px - before_x - s.Mt * foot_x - taken.tangential,
+        pz - before_z - s.Mt * foot_z - taken.normal,
+    )
+    hub_before, hub_after = hub_velocity(before), hub_velocity(after)
+    return Landing(
+        theta=theta - s.alpha,
+        motion=after,
+        distance=distance,
+        stays=stays,
+        fore=fore,
+        rear=rear_impulse,
+        energy_lost=kinetic_energy(s, before) - kinetic_energy(s, after),
+        hub_jump=(hub_after[0] - hub_before[0], hub_after[1] - hub_before[1]),
+    )
+
+
+def stopped(s: Symbols, before: Motion) -> Motion:
+    """The motion after Leg 2, at L2 = L0, has met its stopper."""
+    M = mass_matrix(s, before.L1, before.L2)
+    return before._replace(
+        dtheta=before.dtheta + M.M13 * before.dL2 / M.M11,
+        dL1=before.dL1 + M.M23 * before.dL2 / M.M22,
+        dL2=0.0 * before.dL2,
+    )
+
+
+class StopperHit(NamedTuple):
+    """What the collision of Leg 2 with its stopper leaves behind, and what it cost."""
+
+    motion: Motion  # just after the impact, L2 = L0 exactly
+    stopper_impulse: Elementwise  # on Leg 2's mass, towards the hub, N s
+    planted: FootForce  # impulse of the ground on Leg 1's foot, N s
+    energy_lost: Elementwise  # J
+    hub_jump: tuple[Elementwise, Elementwise]  # m/s
+
+
+def hit_stopper(s: Symbols, motion: Motion) -> StopperHit:
+    """Inelastic collision of Leg 2 with its stopper at L2 = L0, eqs (22)-(25).
+
+    M12 vanishes there, so the impact is two divisions.
+    """
+    before = motion._replace(L2=s.L0 + 0.0 * motion.L2)
+    after = stopped(s, before)
+    hub_before, hub_after = hub_velocity(before), hub_velocity(after)
+    jump = (hub_after[0] - hub_before[0], hub_after[1] - hub_before[1])
+    rear = rear_direction(s, before.sin, before.cos)
+    before_x, before_z = momentum(s, before)
+    after_x, after_z = momentum(s, after)
+    return StopperHit(
+        motion=after,
+        stopper_impulse=s.m * (before.dL2 + jump[0] * rear.sin + jump[1] * rear.cos),
+        planted=FootForce(after_x - before_x, after_z - before_z),
+        energy_lost=kinetic_energy(s, before) - kinetic_energy(s, after),
+        hub_jump=jump,
+    )
+
+
+def hub_velocity(motion: Motion) -> tuple[Elementwise, Elementwise]:
+    """Velocity of the hub along (x, z) with Leg 1's foot at rest, m/s."""
+    across = motion.L1 * motion.dtheta
+    return (
+        motion.dL1 * motion.sin + across * motion.cos,
+        motion.dL1 * motion.cos - across * motion.sin,
+    )
+
+
+def locked_leg_impulses(
+    s: Symbols,
+    motion: Motion,
+    jump: tuple[Elementwise, Elementwise],
+    legs: range,
+) -> Float[Array, "n_legs_asked ..."]:
+    """Stopper impulse on the mass of each of `legs` for a jump of the hub's velocity, N s.
+
+    Negative where the collision throws the leg off its stopper: a preload resists no impulse.
+    """
+    turn = s.alpha * (np.asarray(legs).reshape(-1, *(1,) * jnp.ndim(motion.sin)) - 1)
+    radial = jump[0] * motion.sin + jump[1] * motion.cos
+    across = jump[0] * motion.cos - jump[1] * motion.sin
+    return s.m * (radial * np.cos(turn) + across * np.sin(turn))
+
+
+def landing_forces(s: Symbols, landing: Landing) -> tuple[FootForce, FootForce]:
+    """Fore and rear foot force just after the landing with both feet planted, N (B1, eq. 38)."""
+    circle = double_support_circle(s, landing.distance, landing.motion.sin, landing.motion.cos)
+    dtheta = landing.motion.dtheta
+    motion = landing.motion._replace(dL1=circle.G1 * dtheta, dL2=circle.G2 * dtheta)
+    acceleration = double_support_acceleration(s, landing.distance, motion)
+    rear = rear_foot_force(s, motion, acceleration)
+    return fore_foot_force(s, motion, acceleration, rear), rear
