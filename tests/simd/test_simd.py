@@ -1,4 +1,6 @@
-"""Machine code for lanes does what JAX does with the same function; a later start finds it."""
+"""Machine code for lanes does what JAX does with the same function."""
+
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -6,17 +8,16 @@ import numpy as np
 import pytest
 from jax import lax
 
-from vrw_jax.runtime import programs as traces
-from vrw_jax.simd import apart
-from vrw_jax.simd import program as simd
+from vrw_jax import simd
 
+KEYS = itertools.count()
 DRAW = np.random.default_rng(0)
 
 
-def program(function, lanes, uniform=(), settings="test"):
+def program(function, lanes, uniform=()):
     """`function(uniform, lanes)` compiled for inputs like these."""
     kinds = [np.asarray(x).dtype for x in uniform]
-    return simd.lane_program(function, kinds, len(lanes), lanes[0].dtype, settings)
+    return simd.lane_program(function, kinds, len(lanes), lanes[0].dtype, next(KEYS), None)
 
 
 def both_ways(function, lanes, uniform=()):
@@ -25,16 +26,6 @@ def both_ways(function, lanes, uniform=()):
     compiled = program(function, lanes, uniform)(uniform, lanes)
     expected = function(uniform, [jnp.asarray(x) for x in lanes])
     return list(zip(compiled, map(np.asarray, expected), strict=True))
-
-
-@pytest.fixture(autouse=True)
-def folder(tmp_path, monkeypatch):
-    """A cache of the test's own, since settings of the same name stand for other functions here."""
-    monkeypatch.setattr(simd, "_made", {})
-    before = jax.config.jax_compilation_cache_dir
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
-    yield tmp_path
-    jax.config.update("jax_compilation_cache_dir", before)
 
 
 def arithmetic(uniform, lanes):
@@ -122,42 +113,12 @@ def test_scans_run_over_their_constants():
 def test_a_lane_gives_the_same_bits_in_any_company_on_any_number_of_cores(monkeypatch, n):
     lanes = [DRAW.normal(size=5_003) for _ in range(2)]
     run = program(arithmetic, lanes, [np.float64(0.7)])
-    monkeypatch.setattr(simd, "_cores", lambda: 1)
+    monkeypatch.setattr(simd.program, "_cores", lambda: 1)
     whole = run([np.float64(0.7)], lanes)
-    monkeypatch.setattr(simd, "_cores", lambda: 3)
+    monkeypatch.setattr(simd.program, "_cores", lambda: 3)
     some = DRAW.permutation(5_003)[:n]
     for part, all_ in zip(run([np.float64(0.7)], [x[some] for x in lanes]), whole, strict=True):
         np.testing.assert_array_equal(part, all_[some])
-
-
-def test_a_later_start_neither_traces_nor_compiles(folder, monkeypatch):
-    lanes = [np.arange(4.0)]
-    traced = []
-
-    def double(_, lanes):
-        traced.append(1)
-        return (2.0 * lanes[0],)
-
-    assert list(program(double, lanes)([], lanes)[0]) == [0.0, 2.0, 4.0, 6.0]
-    monkeypatch.setattr(simd, "_compiled", None)  # would fail
-    assert list(program(double, lanes)([], lanes)[0]) == [0.0, 2.0, 4.0, 6.0]
-    monkeypatch.setattr(simd, "_made", {})  # as in another process
-    assert list(program(double, lanes)([], lanes)[0]) == [0.0, 2.0, 4.0, 6.0]
-    assert len(traced) == 1
-
-
-def test_another_batch_is_neither_traced_nor_compiled_again_without_a_cache(monkeypatch):
-    jax.config.update("jax_compilation_cache_dir", None)
-    traced = []
-
-    def double(x):
-        traced.append(1)
-        return 2.0 * x
-
-    call = simd.lane_function(double, lambda x: x, "batches")
-    for n in (1, 5, 8):
-        np.testing.assert_array_equal(jax.jit(call)(jnp.arange(n) + 1.0), 2.0 * (np.arange(n) + 1))
-    assert len(traced) == 1
 
 
 def arrays_in_loops(x):
@@ -212,7 +173,7 @@ def picked(x, large):
 @pytest.mark.parametrize("n", [1, 4, 1001])
 def test_functions_of_arrays_are_called_from_programs_of_jax(n):
     x = jnp.asarray(DRAW.normal(size=(20, 3, n)))
-    call = simd.lane_function(arrays_in_loops, arrays_in_loops, "arrays")
+    call = simd.lane_function(arrays_in_loops, arrays_in_loops, "arrays", None)
     # One lane after the other: no lane may see another.
     expected = jax.vmap(
         lambda one: jax.tree.map(lambda y: y[..., 0], arrays_in_loops(one[..., None])), -1, -1
@@ -236,70 +197,9 @@ def test_functions_set_apart_are_called_and_give_the_same():
         return run
 
     lanes = [DRAW.normal(size=11) for _ in range(2)]
-    called = program(cubes(apart), lanes, settings="apart")([], lanes)
+    called = program(cubes(simd.apart), lanes)([], lanes)
     for found, expected in zip(called, cubes(jax.jit)((), lanes), strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-13)
-
-
-def test_a_kept_program_finds_the_machine_code_that_it_calls(folder, monkeypatch):
-    x = jnp.asarray(DRAW.normal(size=(2, 9)))
-    double = simd.lane_function(lambda x: 2.0 * x, lambda x: x, "double")
-    traced = []
-
-    def further(x):
-        traced.append(1)
-        return double(x) + 1.0
-
-    run = lambda: traces.compiled(further, (x,), "kept", jax.devices()[0])(x)
-    expected = 2.0 * np.asarray(x) + 1.0
-    np.testing.assert_array_equal(run(), expected)
-    monkeypatch.setattr(simd, "_registered", {})  # as in another process
-    names = []
-    monkeypatch.setattr(jax.ffi, "register_ffi_target", lambda name, *_, **__: names.append(name))
-    np.testing.assert_array_equal(run(), expected)
-    assert (len(names), len(traced)) == (1, 1)
-    for place in folder.glob("vrw_lanes_*"):
-        place.unlink()
-    monkeypatch.setattr(simd, "_registered", {})
-    np.testing.assert_array_equal(run(), expected)  # traced and compiled anew
-    assert names[1] == names[0]
-
-
-def test_a_program_kept_by_another_processor_is_traced_anew(folder, monkeypatch):
-    """It calls machine code that may not run here."""
-    traced = []
-
-    def double(x):
-        traced.append(1)
-        return 2.0 * x
-
-    run = lambda: traces.compiled(double, (jnp.ones(2),), "kept", jax.devices()[0])(jnp.ones(2))
-    run(), run()
-    assert len(traced) == 1
-    monkeypatch.setattr(simd, "processor", lambda: ("x86_64", "another", ""))
-    run()
-    assert len(traced) == 2
-
-
-def test_other_settings_and_damaged_files_are_compiled_anew(folder, monkeypatch):
-    lanes = [np.arange(4.0)]
-    traced = []
-
-    def times(n):
-        def function(_, x):
-            traced.append(n)
-            return (n * x[0],)
-
-        return program(function, lanes, settings=n)([], lanes)[0][3]
-
-    assert (times(2.0), times(3.0)) == (6.0, 9.0)
-    for place in folder.glob("vrw_lanes_*"):
-        content = bytearray(place.read_bytes())
-        content[-100] ^= 1
-        place.write_bytes(content)
-    monkeypatch.setattr(simd, "_made", {})  # as in another process
-    assert times(2.0) == 6.0
-    assert traced == [2.0, 3.0, 2.0]
 
 
 def test_code_that_is_not_elementwise_is_refused_in_a_sentence():

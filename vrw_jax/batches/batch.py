@@ -23,6 +23,7 @@ from vrw_jax.batches.ground import as_full_states, walk_lanes
 from vrw_jax.batches.paper import gait_step
 from vrw_jax.models import AbstractWheel, UnilateralWheel, ViscoelasticWheel
 from vrw_jax.numerics import Options, explicit_tableau, real_stability_limit
+from vrw_jax.runtime import lane_program
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, wheel_of
 
 BLOCK = 32_768
@@ -362,7 +363,7 @@ def _run(
     if key not in _programs:
         if cpu:
             kinds = [x.dtype for x in uniform]
-            _programs[key] = simd.lane_program(step, kinds, len(lanes), dtype, settings)
+            _programs[key] = lane_program(step, kinds, len(lanes), dtype, settings)
         else:
             _programs[key] = functools.partial(_by_xla, jax.jit(step))
     return _programs[key](uniform, lanes)

@@ -52,7 +52,7 @@ from vrw_jax.models import (
     usable,
 )
 from vrw_jax.numerics import Options, Tableau, explicit_tableau, select
-from vrw_jax.runtime import fusion_emitters
+from vrw_jax.runtime import fusion_emitters, lane_function
 from vrw_jax.wheel import (
     PARAMETER_NAMES,
     Outcome,
@@ -333,7 +333,7 @@ def _marches(
         return lambda columns, now, enough: far(columns, now, dynamic, enough)
     like = lambda columns, now, dynamic: now
     settings = ("march on real ground", n, one_sided, static)
-    by_machine_code = simd.lane_function(far, like, settings)
+    by_machine_code = lane_function(far, like, settings)
     return lambda columns, now, enough: by_machine_code(columns, now, dynamic)
 
 

@@ -27,6 +27,7 @@ from vrw_jax.models import (
     usable,
 )
 from vrw_jax.numerics import Options, PhaseEnd, explicit_tableau, one_wheel
+from vrw_jax.runtime import lane_function
 from vrw_jax.wheel import WheelParams, parameters_of, transitions, wheel_of
 
 
@@ -55,7 +56,7 @@ def step(
     dynamic, static = eqx.partition(options, eqx.is_array)
     rest = (params.n_legs, model.stop_at_lift_off, static, tableau)
     over_lanes, like = (functools.partial(function, rest) for function in (_over_lanes, _like))
-    compiled = simd.lane_function(over_lanes, like, ("monitored step", rest[:-1]))
+    compiled = lane_function(over_lanes, like, ("monitored step", rest[:-1]))
     told = one_wheel(lambda *arrays: compiled(*arrays, dynamic))(parameters_of(params), x)
     good = usable(params, x)
     params, x = replaced_where_bad(good, params, x, jnp.asarray(PAPER_START))

@@ -26,7 +26,7 @@ from vrw_jax.numerics import (
     push,
     without_derivative,
 )
-from vrw_jax.runtime import remembered
+from vrw_jax.runtime import lane_function, remembered
 
 
 def _tangent_space(problem: Problem, parameters: Parameters, located: Located) -> Located:
@@ -93,7 +93,7 @@ def _over_lanes(function: Callable, like: Callable, problem: Problem, blocked: b
     settings = (function.__name__, problem)
     of_problem = functools.partial(function, problem)
     if simd.serves():
-        return simd.lane_function(of_problem, functools.partial(like, problem), settings)
+        return lane_function(of_problem, functools.partial(like, problem), settings)
     return remembered(
         in_blocks(of_problem, problem.options.block) if blocked else of_problem, settings
     )

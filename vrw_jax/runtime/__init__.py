@@ -1,7 +1,7 @@
 """How a process computes and what it keeps: number format, libraries on demand, store, programs."""
 
 from vrw_jax.runtime.lazy import diffrax, optax, xarray, zarr
-from vrw_jax.runtime.programs import compiled, remembered
+from vrw_jax.runtime.programs import compiled, lane_function, lane_program, remembered
 from vrw_jax.runtime.start import fusion_emitters, start_jax
 from vrw_jax.runtime.store import code_digest, keep, kept
 
@@ -12,6 +12,8 @@ __all__ = [
     "fusion_emitters",
     "keep",
     "kept",
+    "lane_function",
+    "lane_program",
     "optax",
     "remembered",
     "start_jax",

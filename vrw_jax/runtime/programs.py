@@ -6,18 +6,19 @@ traces, by a key of everything that they depend on, the library's source include
 """
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextvars import ContextVar
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import export
 from jax.sharding import SingleDeviceSharding
 
 from vrw_jax import simd
+from vrw_jax.runtime import store
 from vrw_jax.runtime.start import fusion_emitters
-from vrw_jax.runtime.store import code_digest, folder, keep, kept
 
 
 def compiled(
@@ -45,11 +46,24 @@ def remembered(function: Callable, settings: object) -> Callable:
     """
 
     def call(*arguments: Any) -> Any:
-        if _exporting.get() or not folder():
+        if _exporting.get() or not store.folder():
             return function(*arguments)
         return _exported(function, arguments, settings).call(*jax.tree.leaves(arguments))
 
     return call
+
+
+def lane_program(
+    function: Callable, uniform: Sequence[np.dtype], n_lanes_in: int, dtype: np.dtype, settings: Any
+) -> Callable[[Sequence[Any], Sequence[np.ndarray]], list[np.ndarray]]:
+    """`simd.lane_program` of this library's functions, kept here; `settings` as for `compiled`."""
+    key = (settings, store.code_digest())
+    return simd.lane_program(function, uniform, n_lanes_in, dtype, key, store)
+
+
+def lane_function(function: Callable, like: Callable, settings: object) -> Callable:
+    """`simd.lane_function` of this library's functions, likewise."""
+    return simd.lane_function(function, like, (settings, store.code_digest()), store)
 
 
 def _exported(function: Callable, arguments: tuple, settings: object) -> export.Exported:
@@ -58,12 +72,12 @@ def _exported(function: Callable, arguments: tuple, settings: object) -> export.
     shapes = [jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)) for x in leaves]
     # A trace calls the machine code of one processor: others may share the folder.
     where = (jax.default_backend(), simd.processor() if simd.serves() else None)
-    told = (settings, str(structure), shapes, jax.__version__, where, code_digest())
+    told = (settings, str(structure), shapes, jax.__version__, where, store.code_digest())
     name = f"vrw_trace_{hashlib.sha256(repr(told).encode()).hexdigest()}"
-    content = kept(name)
+    content = store.kept(name)
     if content is not None:
         names, _, trace = content.partition(b"\n")
-        if simd.at_hand(names.decode().split()):
+        if simd.at_hand(names.decode().split(), store):
             return export.deserialize(bytearray(trace))
     flat = jax.jit(lambda *leaves: function(*jax.tree.unflatten(structure, leaves)))
     outside = _exporting.set(True)  # what is remembered within is part of this trace
@@ -73,7 +87,7 @@ def _exported(function: Callable, arguments: tuple, settings: object) -> export.
         exported = export.export(flat, disabled_checks=allowed)(*shapes)
     finally:
         _exporting.reset(outside)
-    keep(name, " ".join(called).encode() + b"\n" + bytes(exported.serialize()))
+    store.keep(name, " ".join(called).encode() + b"\n" + bytes(exported.serialize()))
     return exported
 
 

@@ -1,0 +1,148 @@
+"""Machine code is kept by its content: what a later start, or another text, finds of it."""
+
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from vrw_jax import simd
+from vrw_jax.simd import code
+
+LANES = [np.arange(4.0)]
+
+
+class Folder(dict):
+    """A store in memory."""
+
+    kept = dict.get
+    keep = dict.__setitem__
+
+
+@pytest.fixture(autouse=True)
+def another_process(monkeypatch):
+    """What is called makes this process forget its code, as another would not know it."""
+
+    def forget():
+        monkeypatch.setattr(code, "_made", {})
+        monkeypatch.setattr(simd.ffi, "registered", {})
+        monkeypatch.setattr(simd.program, "registered", simd.ffi.registered)
+
+    forget()
+    return forget
+
+
+def counted(factor=2.0):
+    """A function of lanes, and the list to which each of its traces adds."""
+    traces = []
+
+    def times(_, lanes):
+        traces.append(factor)
+        return (factor * lanes[0],)
+
+    return times, traces
+
+
+def run(function, key, store):
+    again = lambda *arguments: function(*arguments)  # JAX knows the trace of the function itself
+    return list(simd.lane_program(again, [], 1, LANES[0].dtype, key, store)([], LANES)[0])
+
+
+def test_a_later_start_neither_traces_nor_compiles(monkeypatch, another_process):
+    double, traces = counted()
+    store = Folder()
+    assert run(double, "double", store) == [0.0, 2.0, 4.0, 6.0]
+    monkeypatch.setattr(code, "compiled", None)  # would fail
+    assert run(double, "double", store) == [0.0, 2.0, 4.0, 6.0]
+    another_process()
+    assert run(double, "double", store) == [0.0, 2.0, 4.0, 6.0]
+    assert len(traces) == 1
+
+
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_the_same_trace_under_another_key_is_not_compiled(monkeypatch, another_process, elsewhere):
+    double, traces = counted()
+    store = Folder()
+    run(double, "double", store)
+    if elsewhere:
+        another_process()
+    else:
+        store = None
+    monkeypatch.setattr(code, "compiled", None)  # would fail
+    assert run(double, ("double", "after an edit of its docstring"), store) == [0.0, 2.0, 4.0, 6.0]
+    assert len(traces) == 2
+
+
+def test_other_traces_and_other_ways_of_compiling_have_code_of_their_own(monkeypatch):
+    store = Folder()
+    assert run(counted(2.0)[0], 2, store)[3] == 6.0
+    assert run(counted(3.0)[0], 3, store)[3] == 9.0
+    monkeypatch.setattr(code, "how_compiled", lambda: "by another processor")
+    double, traces = counted()
+    assert run(double, 2, store)[3] == 6.0
+    assert len(traces) == 1
+    names = [name.split("_")[1] for name in store]
+    assert (names.count("code"), names.count("index")) == (3, 3)
+
+
+def test_an_index_whose_code_is_gone_is_made_anew(another_process):
+    double, traces = counted()
+    store = Folder()
+    run(double, "double", store)
+    del store[next(name for name in store if name.startswith("lanes_code_"))]
+    another_process()
+    assert run(double, "double", store)[3] == 6.0
+    another_process()
+    assert run(double, "double", store)[3] == 6.0
+    assert len(traces) == 2
+
+
+def test_another_batch_is_neither_traced_nor_compiled_again_without_a_store():
+    traced = []
+
+    def double(x):
+        traced.append(1)
+        return 2.0 * x
+
+    call = simd.lane_function(double, lambda x: x, "batches", None)
+    for n in (1, 5, 8):
+        np.testing.assert_array_equal(jax.jit(call)(jnp.arange(n) + 1.0), 2.0 * (np.arange(n) + 1))
+    assert len(traced) == 1
+
+
+def test_code_is_at_hand_by_its_name_alone(monkeypatch, another_process):
+    store, names = Folder(), []
+    double = simd.lane_function(lambda x: 2.0 * x, lambda x: x, "at hand", store)
+    jax.jit(double)(jnp.ones(3))
+    (name,) = simd.ffi.registered
+    assert not simd.at_hand([name, "lanes_code_of_none"], store)
+    another_process()
+    monkeypatch.setattr(jax.ffi, "register_ffi_target", lambda name, *_, **__: names.append(name))
+    assert not simd.at_hand([name], None)
+    assert simd.at_hand([name], store)
+    assert names == [name]
+
+
+def test_the_text_that_llvm_compiles_is_the_same_in_every_process():
+    told = """
+        import jax, jax.numpy as jnp
+        from vrw_jax.simd import code, kernel
+        def step(x, table):
+            f = lambda k: {name: jnp.sin(k * x[0]) for name in ("beta", "alpha", "gamma")}
+            sums = jax.tree.map(lambda y: y + jnp.sum(x * table[:, None], 0), f(2.0) | f(0.5))
+            turn = lambda i, z: z + table[i] * sums["beta"]
+            return {"loop": jax.lax.fori_loop(0, 9, turn, x[1]), **sums}
+        shape = jax.ShapeDtypeStruct((9, 1021), jnp.float32)
+        closed = code.traced(lambda x: step(x, jnp.arange(9.0)), shape)
+        print(code._digest(kernel.module_text(closed, 8).encode()))
+    """
+    lines = "\n".join(line[8:] for line in told.splitlines())
+    ways = [os.environ | {"PYTHONHASHSEED": seed} for seed in ("1", "2")]
+    first, second = (
+        subprocess.run([sys.executable, "-c", lines], env=way, capture_output=True, check=True)
+        for way in ways
+    )
+    assert first.stdout == second.stdout != b""

@@ -1,0 +1,71 @@
+"""LLVM's part: what this machine is, object code for it, and such code at its place in memory."""
+
+import ctypes
+import functools
+from typing import Any
+
+import llvmlite.binding as llvm
+
+LEVEL = 2
+"""How hard LLVM tries."""
+VECTORIZES = False
+"""Whether it looks for vectors: they are there."""
+
+
+@functools.cache
+def processor() -> tuple[str, str, str]:
+    """What machine code is made for: the kind of machine, its processor, and what that can do."""
+    features = llvm.get_host_cpu_features().flatten()
+    return llvm.get_process_triple(), llvm.get_host_cpu_name(), features
+
+
+def how_compiled() -> str:
+    """All that object code depends on besides LLVM's text."""
+    return repr((llvm.llvm_version_info, processor(), LEVEL, VECTORIZES))
+
+
+def wide() -> bool:
+    """Whether vectors have 512 bits."""
+    return "+avx512f" in processor()[2]
+
+
+def compiled(text: str) -> bytes:
+    """Object code for this processor."""
+    machine = _machine()
+    module = llvm.parse_assembly(text)
+    module.triple, module.data_layout = machine.triple, str(machine.target_data)
+    choices = llvm.create_pipeline_tuning_options(LEVEL)
+    choices.loop_vectorization = choices.slp_vectorization = VECTORIZES
+    builder = llvm.create_pass_builder(machine, choices)
+    builder.getModulePassManager().run(module, builder)
+    return machine.emit_object(module)
+
+
+class Loaded:
+    """Machine code at its place in memory."""
+
+    def __init__(self, code: bytes) -> None:
+        self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
+        self._engine.add_object_file(llvm.ObjectFileRef.from_data(code))
+        self._engine.finalize_object()
+
+    def address(self, name: str) -> int:
+        """Where a function begins."""
+        return self._engine.get_function_address(name)
+
+    def capsule(self, name: str) -> Any:
+        """A function for hands that know what it takes."""
+        make = ctypes.pythonapi.PyCapsule_New
+        make.restype, make.argtypes = (
+            ctypes.py_object,
+            [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p],
+        )
+        return make(self.address(name), None, None)
+
+
+def _machine() -> llvm.TargetMachine:
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    triple, name, features = processor()
+    target = llvm.Target.from_triple(triple)
+    return target.create_target_machine(cpu=name, features=features, opt=LEVEL, jit=True)
