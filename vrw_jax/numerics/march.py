@@ -372,7 +372,7 @@ def _first_guess(
     return earliest
 
 
-def _first(conditions: Vector) -> Array:
+def _first(conditions: tuple[Array, ...]) -> Array:
     """Index of the first condition that holds; -1 where none does."""
     index = jnp.full(conditions[0].shape, -1, jnp.int32)
     for i in range(len(conditions) - 1, -1, -1):
