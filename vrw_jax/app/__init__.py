@@ -1,7 +1,3 @@
 """The command line: configurations in, reports out."""
 
 from vrw_jax.app.cli import main
-
-__all__ = [
-    "main",
-]

@@ -3,11 +3,3 @@
 from vrw_jax.batches import monitored
 from vrw_jax.batches.batch import Steps, steps
 from vrw_jax.batches.ground import as_full_states, walk_lanes
-
-__all__ = [
-    "Steps",
-    "as_full_states",
-    "monitored",
-    "steps",
-    "walk_lanes",
-]

@@ -2,11 +2,3 @@
 
 from vrw_jax.branches.branch import Border, Branch
 from vrw_jax.branches.continuation import continue_branch, continue_branches, continue_map
-
-__all__ = [
-    "Border",
-    "Branch",
-    "continue_branch",
-    "continue_branches",
-    "continue_map",
-]

@@ -7,26 +7,3 @@ from vrw_jax.cycles.premises import TAKE_OFF, default_margins, measure, takeoff_
 from vrw_jax.cycles.search import Located, Problem, correction_size, nothing_known, surface_start
 from vrw_jax.cycles.section_cycle import WalkedCycle
 from vrw_jax.cycles.sensitivity import sensitivities
-
-__all__ = [
-    "MOVED",
-    "TAKE_OFF",
-    "CycleOptions",
-    "LimitCycle",
-    "Located",
-    "Problem",
-    "WalkedCycle",
-    "_limit_cycle",
-    "correction_size",
-    "cycle_of",
-    "default_margins",
-    "ground_gait",
-    "limit_cycle",
-    "measure",
-    "nothing_known",
-    "sensitivities",
-    "surface_start",
-    "takeoff_acceleration",
-    "told",
-    "values_of",
-]

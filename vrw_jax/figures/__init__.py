@@ -4,11 +4,3 @@ from vrw_jax.figures import walk
 from vrw_jax.figures.branch import border_text, branch_figure
 from vrw_jax.figures.scan import scan_figures
 from vrw_jax.figures.tuning import tuning
-
-__all__ = [
-    "border_text",
-    "branch_figure",
-    "scan_figures",
-    "tuning",
-    "walk",
-]

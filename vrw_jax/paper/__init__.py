@@ -2,8 +2,3 @@
 
 from vrw_jax.paper.facts.base import Fact
 from vrw_jax.paper.reproduction import reproduce
-
-__all__ = [
-    "Fact",
-    "reproduce",
-]

@@ -16,24 +16,3 @@ from vrw_jax.results.measures import (
 from vrw_jax.results.provenance import provenance
 from vrw_jax.results.text import Row, as_html, as_text, is_concrete, listed
 from vrw_jax.results.wording import nearest
-
-__all__ = [
-    "CYCLE",
-    "GROUND",
-    "MARGINS",
-    "MEASURES",
-    "ON_GROUND",
-    "PHASES",
-    "STEP",
-    "TRAJECTORY",
-    "Measure",
-    "Row",
-    "as_html",
-    "as_text",
-    "attrs_of",
-    "flags",
-    "is_concrete",
-    "listed",
-    "nearest",
-    "provenance",
-]

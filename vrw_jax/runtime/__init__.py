@@ -4,19 +4,3 @@ from vrw_jax.runtime.lazy import diffrax, optax, xarray, zarr
 from vrw_jax.runtime.programs import compiled, lane_function, lane_program, remembered
 from vrw_jax.runtime.start import fusion_emitters, start_jax
 from vrw_jax.runtime.store import code_digest, keep, kept
-
-__all__ = [
-    "code_digest",
-    "compiled",
-    "diffrax",
-    "fusion_emitters",
-    "keep",
-    "kept",
-    "lane_function",
-    "lane_program",
-    "optax",
-    "remembered",
-    "start_jax",
-    "xarray",
-    "zarr",
-]

@@ -16,27 +16,3 @@ from vrw_jax.scans.running import (
     scan,
 )
 from vrw_jax.scans.store import open_scan
-
-__all__ = [
-    "DEFAULT_MEASURES",
-    "OF_CYCLE",
-    "SALTELLI",
-    "Plan",
-    "Progress",
-    "carried",
-    "check_measures",
-    "design",
-    "explained",
-    "grid",
-    "in_words",
-    "open_scan",
-    "open_store",
-    "plan",
-    "run",
-    "saltelli",
-    "samples",
-    "scan",
-    "sobol",
-    "sobol_indices",
-    "uniform",
-]

@@ -4,14 +4,3 @@ from vrw_jax.simd.code import Store, tracing
 from vrw_jax.simd.machine import processor
 from vrw_jax.simd.program import at_hand, lane_function, lane_program, serves
 from vrw_jax.simd.trace import apart
-
-__all__ = [
-    "Store",
-    "apart",
-    "at_hand",
-    "lane_function",
-    "lane_program",
-    "processor",
-    "serves",
-    "tracing",
-]

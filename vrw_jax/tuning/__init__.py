@@ -2,10 +2,3 @@
 
 from vrw_jax.tuning.climbing import ACTIVE, Kind
 from vrw_jax.tuning.problem import Tuned, tune
-
-__all__ = [
-    "ACTIVE",
-    "Kind",
-    "Tuned",
-    "tune",
-]

@@ -2,5 +2,3 @@
 
 from vrw_jax.paper.facts.base import Evidence, Fact
 from vrw_jax.paper.facts.table import as_markdown, facts, write
-
-__all__ = ["Evidence", "Fact", "as_markdown", "facts", "write"]
