@@ -1,70 +1,252 @@
-"""Imports flow one way, nothing happens on import, and diffrax stays in its room."""
+"""The house keeps its rules, each rule sees what breaks it, and importing anything does nothing."""
 
-import ast
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+from support import rules
+from support.rooms import House
+
 import vrw_jax
 
-PACKAGE = Path(vrw_jax.__file__).parent
+HOUSE = House(Path(vrw_jax.__file__).parent)
+KEPT = (rules.past_faces, rules.strangers)  # of `rules.RULES`; the others follow as they are kept
 
 
-def imports_of(path):
-    """Modules of the package that a file imports at its top level."""
-    found = set()
-    for node in ast.parse(path.read_text()).body:
-        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("vrw_jax"):
-            names = [f"{node.module}.{alias.name}" for alias in node.names]
-            found |= {name for name in names if (PACKAGE.parent / to_path(name)).exists()}
-            if not (PACKAGE.parent / to_path(node.module)).is_dir():
-                found.add(node.module)
-        elif isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names if alias.name.startswith("vrw_jax.")}
-    return found
+@pytest.mark.parametrize("rule", KEPT, ids=lambda rule: rule.__name__)
+def test_the_house_keeps_the_rule(rule):
+    assert not rule(HOUSE), "\n" + "\n".join(rule(HOUSE))
 
 
-def to_path(module):
-    base = PACKAGE.parent / Path(*module.split("."))
-    return base if base.is_dir() else base.with_suffix(".py")
+# Small packages made up for the rules: {file: source}. `house` has two rooms, wheel below walks,
+# and keeps every rule until a case adds or replaces files.
+SOUND = {
+    "__init__.py": "from house.walks import step\n",
+    "runtime/__init__.py": "from house.runtime.lazy import zarr\n",
+    "runtime/lazy.py": "import importlib\n\nimport zarr as zarr\n",
+    "wheel/__init__.py": "from house.wheel.params import Params\n",
+    "wheel/params.py": "class Params: ...\n",
+    "models/__init__.py": "from house.models.base import AbstractRung\n"
+    "from house.models.stiff import Stiff\n",
+    "models/base.py": "class AbstractRung: ...\n",
+    "models/stiff.py": "from house.models.base import AbstractRung\n\n\n"
+    "class Stiff(AbstractRung): ...\n",
+    "walks/__init__.py": "from house.walks.stepping import step\n",
+    "walks/stepping.py": "from house.models import AbstractRung, Stiff\n"
+    "from house.wheel import Params\n\n\n"
+    "def step():\n    return isinstance(Stiff(Params), AbstractRung)\n",
+}
 
 
-def test_imports_have_no_cycle():
-    graph = {}
-    for path in PACKAGE.rglob("*.py"):
-        name = ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts)
-        if path.name != "__init__.py":
-            graph[name] = imports_of(path)
-    order, seen = [], {}
-
-    def visit(name, trail):
-        if seen.get(name) == "done":
-            return
-        assert seen.get(name) != "open", " -> ".join([*trail, name])
-        seen[name] = "open"
-        for other in graph.get(name, ()):
-            visit(other, [*trail, name])
-        seen[name] = "done"
-        order.append(name)
-
-    for name in graph:
-        visit(name, [])
-    flow = ["params", "geometry", "dynamics", "transitions", "integrate", "return_map"]
-    for index, room in enumerate(flow):
-        later = {f"vrw_jax.{other}" for other in flow[index + 1 :]}
-        assert not later & graph[f"vrw_jax.{room}"], room
+def house(folder, changes):
+    """The made-up package, read."""
+    for name, text in {**SOUND, **changes}.items():
+        path = folder / "house" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    return House(folder / "house")
 
 
-def test_only_integrate_knows_diffrax():
-    users = {p.name for p in PACKAGE.rglob("*.py") if "import diffrax" in p.read_text()}
-    assert users == {"integrate.py", "lazy.py"}
+def test_every_rule_is_silent_where_nothing_breaks_it(tmp_path):
+    sound = house(tmp_path, {})
+    assert [rule(sound) for rule in rules.RULES] == [[]] * len(rules.RULES)
 
 
-def test_nothing_imports_the_command_line_or_plots_at_the_top():
-    for path in PACKAGE.rglob("*.py"):
-        if path.name in {"cli.py", "__main__.py"}:
-            continue
-        assert "vrw_jax.cli" not in imports_of(path), path
+UPWARD = {
+    "at the top": "from house.walks import step",
+    "plain": "import house.walks",
+    "under a name": "import house.walks.stepping as w",
+    "of a module": "from house.walks import stepping",
+    "inside a function": "def f():\n    from house.walks import step",
+    "for types only": "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import house.walks",
+    "of the room from the package": "from house import walks",
+    "relative": "from ..walks import step",
+    "relative to the package": "from .. import walks",
+    "by name": "import importlib\nimportlib.import_module('house.walks')",
+    "by a name of its own": "from importlib import import_module as m\nm('house.walks.stepping')",
+    "by a string handed on": "NAMES = ('house.walks',)",
+    "of a name below": "from house.walks.stepping import step",
+    "of the package's face": "import house as h\n\n\ndef f():\n    return h.step()",
+}
+
+
+@pytest.mark.parametrize("text", UPWARD.values(), ids=UPWARD)
+def test_an_upward_import_is_seen_however_it_is_written(text, tmp_path):
+    broken = house(tmp_path, {"wheel/params.py": f"{text}\n\n\nclass Params: ...\n"})
+    assert any("house.wheel.params" in line for line in rules.upward(broken)), broken.arrows
+
+
+def test_rooms_of_one_row_do_not_know_each_other(tmp_path):
+    files = {
+        "batches/__init__.py": "", "batches/batch.py": "from house.cycles import find\n",
+        "cycles/__init__.py": "from house.cycles.cycle import find\n",
+        "cycles/cycle.py": "def find(): ...\n",
+    }  # fmt: skip
+    assert rules.upward(house(tmp_path, files))
+
+
+def test_a_room_that_the_flow_does_not_know_is_seen(tmp_path):
+    files = {"attic/__init__.py": "", "loose.py": ""}
+    found = rules.upward(house(tmp_path, files))
+    assert [line.split()[0] for line in found] == ["attic", "loose"]
+
+
+def test_a_circle_inside_a_room_is_seen_through_its_face(tmp_path):
+    inner = "def f():\n    from house.wheel import Params\n    return Params\n\n\n"
+    files = {
+        "wheel/__init__.py": "from house.wheel.params import Params\n"
+        "from house.wheel.phase import g\n",
+        "wheel/phase.py": inner + "def g(): ...\n",
+    }
+    assert rules.circles(house(tmp_path, files)) == [
+        "house.wheel -> house.wheel.phase -> house.wheel"
+    ]
+
+
+def test_a_circle_of_two_modules_is_seen(tmp_path):
+    files = {
+        "wheel/params.py": "def f():\n    from house.wheel import phase\n\n\nclass Params: ...\n",
+        "wheel/phase.py": "from house.wheel.params import Params\n",
+    }
+    assert rules.circles(house(tmp_path, files)) == [
+        "house.wheel.params -> house.wheel.phase -> house.wheel.params"
+    ]
+
+
+def test_an_arrow_leads_to_where_a_name_is_defined(tmp_path):
+    read = house(tmp_path, {})
+    targets = {arrow.target for arrow in read.arrows if arrow.source == "house.walks.stepping"}
+    assert targets == {
+        "house.wheel", "house.wheel.params", "house.models", "house.models.base",
+        "house.models.stiff",
+    }  # fmt: skip
+
+
+PAST_FACES = {
+    "deep": "from house.wheel.params import Params",
+    "plain": "import house.wheel.params",
+    "module not handed out": "from house.wheel import params",
+    "by attribute": "import house.wheel as w\n\n\ndef f():\n    return w.params.Params()",
+    "by attributes of the package": "import house.wheel\nPARAMS = house.wheel.params.Params",
+    "relative": "from ..wheel.params import Params",
+    "by name": "import importlib\nimportlib.import_module('house.wheel.params')",
+}
+
+
+@pytest.mark.parametrize("text", PAST_FACES.values(), ids=PAST_FACES)
+def test_entering_a_room_past_its_face_is_seen(text, tmp_path):
+    assert rules.past_faces(house(tmp_path, {"walks/deep.py": f"{text}\n"}))
+
+
+def test_a_face_may_hand_out_a_module(tmp_path):
+    files = {
+        "wheel/__init__.py": "from house.wheel import params\n",
+        "walks/stepping.py": "from house.wheel import params\nPARAMS = params.Params\n",
+        "walks/__init__.py": "", "__init__.py": "",
+    }  # fmt: skip
+    assert not rules.past_faces(house(tmp_path, files))
+
+
+LIBRARIES = {
+    "plain": "import diffrax",
+    "a part": "from matplotlib.figure import Figure",
+    "inside a function": "def f():\n    import llvmlite.binding as llvm",
+    "by name": "import importlib\nimportlib.import_module('typer')",
+    "through the lazy ones": "from house.runtime import zarr\nOPEN = zarr.open",
+    "through another module": "from house.numerics import events\nSOLVER = events.diffrax.Tsit5",
+    "a name made up": "import importlib\nimportlib.import_module('mat' + 'plotlib')",
+    "pictures": "from PIL import Image",
+}
+
+
+@pytest.mark.parametrize("text", LIBRARIES.values(), ids=LIBRARIES)
+def test_a_library_known_outside_its_room_is_seen(text, tmp_path):
+    files = {
+        "numerics/__init__.py": "from house.numerics import events\n",
+        "numerics/events.py": "import diffrax\n",
+    }
+    assert not rules.strangers(house(tmp_path, files))
+    assert rules.strangers(house(tmp_path, {"walks/stranger.py": f"{text}\n"}))
+
+
+def test_simd_that_knows_a_room_is_seen(tmp_path):
+    files = {"simd/__init__.py": "", "simd/program.py": "from house import wheel\n"}
+    assert rules.strangers(house(tmp_path, files))
+
+
+QUESTIONS = {
+    "isinstance": "isinstance(x, Stiff)",
+    "one of two": "isinstance(x, AbstractRung | Stiff)",
+    "one of a tuple": "isinstance(x, (int, Stiff))",
+    "by attribute": "isinstance(x, models.Stiff)",
+    "a constant": "isinstance(x, RUNGS)",
+    "issubclass": "issubclass(type(x), Stiff)",
+    "its type": "type(x) is Stiff",
+    "its class": "x.__class__ == Stiff",
+    "its type in a list": "type(x) in (Stiff, int)",
+    "a table": "{Stiff: 1}[type(x)]",
+}
+
+
+@pytest.mark.parametrize("text", QUESTIONS.values(), ids=QUESTIONS)
+def test_a_question_for_a_rung_is_seen(text, tmp_path):
+    source = (
+        "from house import models\nfrom house.models import AbstractRung, Stiff\n\n"
+        f"RUNGS = (int, Stiff)\n\n\ndef ask(x):\n    return {text}\n"
+    )
+    assert rules.asked_rungs(house(tmp_path, {"walks/ask.py": source}))
+    assert not rules.asked_rungs(house(tmp_path, {"walks/ask.py": "", "models/ask.py": source}))
+
+
+def test_a_question_by_pattern_is_seen(tmp_path):
+    source = (
+        "from house.models import Stiff\n\n\n"
+        "def ask(x):\n    match x:\n        case Stiff():\n            return 1\n"
+    )
+    assert rules.asked_rungs(house(tmp_path, {"walks/ask.py": source}))
+
+
+NAMESAKES = {
+    "a function": {"wheel/params.py": "def params(): ...\n\n\nclass Params: ...\n"},
+    "a class": {"wheel/axle.py": "class axle: ...\n"},
+    "in a face": {"wheel/__init__.py": "from house.wheel.hub import params\n", "wheel/hub.py": ""},
+    "in the package's face": {"__init__.py": "from house.walks import step as walks\n"},
+    "defined in a face": {"wheel/__init__.py": "def params(): ...\n"},
+}
+
+
+@pytest.mark.parametrize("files", NAMESAKES.values(), ids=NAMESAKES)
+def test_what_hides_a_module_is_seen(files, tmp_path):
+    assert rules.namesakes(house(tmp_path, files))
+
+
+@pytest.mark.parametrize(("lines", "seen"), [(500, False), (501, True)])
+def test_a_long_module_is_seen(lines, seen, tmp_path):
+    files = {"wheel/long.py": "x = 1\n" * lines}
+    assert bool(rules.long_ones(house(tmp_path, files))) == seen
+
+
+@pytest.mark.parametrize(("lines", "seen"), [(60, False), (61, True)])
+def test_a_long_function_is_seen_wherever_it_stands(lines, seen, tmp_path):
+    body = "        def f(self):\n" + "            x = 1\n" * (lines - 1)
+    files = {"wheel/long.py": f"def outer():\n    class A:\n{body}\n    return A\n"}
+    found = rules.long_ones(house(tmp_path, files))
+    assert any(" f has " in line for line in found) == seen
+
+
+def test_an_idle_or_private_name_in_a_face_is_seen(tmp_path):
+    files = {
+        "wheel/__init__.py": "from house.wheel.params import Params, _table, idle, tested\n",
+        "wheel/params.py": "class Params: ...\n\n\n_table = idle = tested = 0\n",
+    }
+    read, outside = house(tmp_path, files), ["code = 'from house.wheel import tested'"]
+    assert rules.idle_names(read, [*outside, "from house.models import Stiff, AbstractRung"]) == [
+        "house.runtime hands out zarr, which nobody fetches there",
+        "house.wheel hands out _table, which nobody fetches there",
+        "house.wheel hands out _table, which is private",
+        "house.wheel hands out idle, which nobody fetches there",
+    ]
 
 
 HEAVY = {
@@ -73,20 +255,24 @@ HEAVY = {
 }  # fmt: skip
 
 
+def run(code):
+    """A fresh process; an assertion that fails there fails here."""
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def test_import_loads_nothing_that_only_some_need():
-    code = f"import vrw_jax, sys; loaded = {HEAVY} & set(sys.modules); assert not loaded, loaded"
-    subprocess.run([sys.executable, "-c", code], check=True)
+    run(f"import vrw_jax, sys; loaded = {HEAVY} & set(sys.modules); assert not loaded, loaded")
 
 
-def test_import_changes_no_global_setting():
-    code = (
-        "import jax; before = jax.config.values.copy(); import vrw_jax; "
-        "assert before == jax.config.values"
+def test_import_of_any_module_changes_no_setting_and_starts_no_plotting():
+    run(
+        "import importlib, pkgutil, sys, jax, matplotlib as mpl\n"
+        "jax_before, mpl_before = jax.config.values.copy(), mpl.rcParams.copy()\n"
+        "import vrw_jax\n"
+        "for module in pkgutil.walk_packages(vrw_jax.__path__, 'vrw_jax.'):\n"
+        "    if module.name != 'vrw_jax.__main__':\n"
+        "        importlib.import_module(module.name)\n"
+        "assert jax_before == jax.config.values\n"
+        "assert mpl_before == mpl.rcParams.copy()\n"
+        "assert 'matplotlib.pyplot' not in sys.modules\n"
     )
-    subprocess.run([sys.executable, "-c", code], check=True)
-
-
-def test_rooms_stay_small():
-    # A room past some 500 lines is cut by question; 600 is where it is refused.
-    for path in PACKAGE.rglob("*.py"):
-        assert len(path.read_text().splitlines()) <= 600, path.name
