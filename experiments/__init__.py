@@ -1,0 +1,1 @@
+"""Scripts with a claim on line one each: `python -m experiments.FOLDER.NAME` from the root."""

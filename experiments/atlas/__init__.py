@@ -1,0 +1,1 @@
+"""Where methods fail: stiffness, events, borders of derivatives, long walks, formulations."""

@@ -1,0 +1,416 @@
+"""Charts and tables of the atlas, drawn from its tables of numbers alone."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
+
+from experiments.shared.tables import DOCS, FIGURES, Row, groups, markdown, numbers, read, replace
+from vrw_jax.figures.walk import PAGE, save, style
+
+STYLES = {  # of Okabe and Ito, a marker each
+    "lanes Tsit5": ("#0072B2", "o"),
+    "lanes Dopri8": ("#0072B2", "s"),
+    "diffrax Kvaerno3": ("#D55E00", "v"),
+    "diffrax Kvaerno5": ("#D55E00", "^"),
+    "automatic": ("#CC79A7", "*"),
+    "numba Dopri5": ("#000000", "o"),
+    "heyoka": ("#E69F00", "D"),
+    "SciPy DOP853": ("#56B4E9", "s"),
+    "SciPy LSODA": ("#56B4E9", "<"),
+    "SciPy Radau": ("#56B4E9", ">"),
+}
+AXES = {"c/m": r"$c/m$ [s$^{-1}$] at $k$ = 500 N/m", "k/m": r"$k/m$ [s$^{-2}$] at $c/m$ = 100/s"}
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000", "0.5")
+SIGNS = re.compile("λ([24])⁺ → 0")
+FAST = 1.03  # rate of SLS-I's fast mode over c/m, docs/physics.md
+
+
+def stiffness(rows: list[Row], limit: Callable[[str], float]) -> Figure:
+    """Time, work and error over stiffness; crosses where a method gave up or stepped otherwise."""
+    figure = Figure(figsize=(PAGE, 7.4))
+    grid = figure.subplots(3, 2, sharex="col", sharey="row")
+    for column, axis in enumerate(AXES):
+        for method, (colour, marker) in STYLES.items():
+            some = [row for row in rows if row["axis"] == axis and row["method"] == method]
+            good = [row for row in some if row["outcome"] == "STEPPED" and row["error"] != "nan"]
+            look = {"color": colour, "marker": marker, "ms": 3.5, "lw": 0.9}
+            for axes, name in zip(grid[:, column], ("us_per_gait", "work", "error"), strict=True):
+                axes.loglog(numbers(good, "value"), numbers(good, name), label=method, **look)
+                failed = [row for row in some if row not in good]
+                y = np.nan_to_num(numbers(failed, name), nan=1.0)
+                axes.plot(numbers(failed, "value"), y, "x", color="#D00000", ms=6, zorder=5)
+        grid[2, column].set_xlabel(AXES[axis])
+    stiff = [row for row in rows if row["axis"] == "c/m" and row["method"] == "numba Dopri5"]
+    value, time = numbers(stiff, "value"), numbers(stiff, "duration_sls1")
+    for solver, line in (("Tsit5", "--"), ("Dopri8", ":")):
+        steps = time * FAST * value / limit(solver)
+        grid[1, 0].plot(value, steps, line, color="0.4", lw=1.0, label=f"stability, {solver}")
+    for axes, name in zip(
+        grid[:, 0], ("CPU time per gait [µs]", "tried steps or evaluations", "error"), strict=True
+    ):
+        axes.set_ylabel(name)
+    for axes in grid.flat:
+        axes.grid(color="0.9", lw=0.4)
+    grid[2, 0].set_ylim(1e-11, 10.0)
+    figure.legend(*grid[1, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    return figure
+
+
+def borders(rows: list[Row]) -> Figure:
+    """Error of derivatives and values over the distance to a border."""
+    names = list(dict.fromkeys(row["border"] for row in rows))
+    figure = Figure(figsize=(PAGE, 2.8))
+    grid = figure.subplots(1, len(names), sharey=True)
+    for axes, name in zip(grid, names, strict=True):
+        some = [row for row in rows if row["border"] == name]
+        x = numbers(some, "distance")
+        axes.loglog(x, numbers(some, "derivative_error"), "o-", ms=4, label="derivative")
+        axes.loglog(x, numbers(some, "value_error"), "s--", ms=4, label="value")
+        axes.set_title(SIGNS.sub(r"$\\lambda_\1^+ \\to 0$", name), fontsize=8)
+        axes.grid(color="0.9", lw=0.4)
+    figure.supxlabel("relative distance to the border", fontsize="medium")
+    grid[0].set_ylabel("error")
+    grid[0].legend()
+    return figure
+
+
+def last_by(rows: list[Row], name: str) -> list[Row]:
+    """The last row for each value of a column."""
+    return [some[-1] for some in groups(rows, name).values()]
+
+
+def curves(axes: Axes, rows: list[Row], by: str, x: str, y: str, label: str = "{}") -> None:
+    """One curve for each value of a column, each with its own colour and marker; zeros left out."""
+    looks = zip(COLOURS, "os^Dv<>p", strict=True)
+    for (key, some), (colour, marker) in zip(groups(rows, by).items(), looks, strict=False):
+        xs, ys = numbers(some, x), np.abs(numbers(some, y))
+        shown = ys > 0.0
+        look = {"color": colour, "marker": marker, "ms": 3.5, "lw": 0.9}
+        axes.loglog(xs[shown], ys[shown], label=label.format(key), **look)
+    axes.grid(color="0.9", lw=0.4)
+
+
+def over_steps(
+    rows: list[Row], key: str, label: str, shown: dict[str, str], height: float
+) -> tuple[Figure, Axes]:
+    """A panel over the number of steps for each column shown; the last panel too."""
+    figure = Figure(figsize=(PAGE, height))
+    for axes, (y, name) in zip(figure.subplots(1, len(shown)), shown.items(), strict=True):
+        curves(axes, rows, key, "steps", y, label)
+        axes.set(xlabel="steps", ylabel=name)
+    return figure, axes
+
+
+def long_walk(rows: list[Row]) -> Figure:
+    """Distance from the cycle, error of the clock and energy not accounted for, over steps."""
+    shown = {
+        "distance": "distance from the cycle",
+        "clock_error_s": "error of the clock [s]",
+        "not_accounted_J": "energy not accounted for [J]",
+    }
+    rows = sorted(rows, key=lambda row: -float(row["tolerance"]))
+    figure, axes = over_steps(rows, "tolerance", "tolerance {}", shown, 2.8)
+    work = groups(rows, "tolerance")["1e-06"]
+    lost = np.finfo(float).eps * numbers(work, "work_of_gravity_J")
+    axes.loglog(
+        numbers(work, "steps"), lost, "--", color="0.4", lw=1.0, label="one rounding of the sum"
+    )
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=5)
+    return figure
+
+
+def between(rows: list[Row]) -> Figure:
+    """Share of other outcomes, and the times' largest difference, next to borders of outcomes."""
+    figure = Figure(figsize=(PAGE, 3.4))
+    left, right = figure.subplots(1, 2)
+    told = by_border(rows)
+    curves(left, told, "border", "distance", "share")
+    curves(right, told, "border", "distance", "time_difference_s")
+    left.set(xlabel="relative distance to the border", ylabel="share with another outcome")
+    right.set(
+        xlabel="relative distance to the border", ylabel="largest difference of durations [s]"
+    )
+    handles = left.get_legend_handles_labels()
+    figure.legend(*handles, loc="outside lower center", ncols=2, fontsize=6)
+    return figure
+
+
+def by_border(rows: list[Row]) -> list[Row]:
+    """Both kinds of cases and both sides together; borders met fewer than five times left out."""
+    told = []
+    for border, some in groups(rows, "border").items():
+        for distance, here in groups(some, "distance").items():
+            names = ("cases", "other_outcome", "other_by_diffrax", "stepped")
+            cases, other, by_diffrax, stepped = (int(numbers(here, n).sum()) for n in names)
+            if cases >= 10:  # five borders, two sides each
+                told.append(
+                    {
+                        "border": border,
+                        "distance": distance,
+                        "cases": str(cases),
+                        "other_outcome": f"{other} ({by_diffrax})",
+                        "share": str(other / cases),
+                        "stepped": str(stepped),
+                        "time_difference_s": f"{max(numbers(here, 'time_difference_s')):.1e}",
+                    }
+                )
+    return told
+
+
+def corners(rows: list[Row]) -> str:
+    """Other outcomes of the lane engine, and of the diffrax engine, by border and distance."""
+    told = by_border(rows)
+    distances = list(dict.fromkeys(row["distance"] for row in told))
+    lines = [
+        (border.replace(" | ", " / "), some[0]["cases"], *(row["other_outcome"] for row in some))
+        for border, some in groups(told, "border").items()
+    ]
+    return markdown(("border", "cases", *distances), lines)
+
+
+def limits(rows: list[Row]) -> str:
+    """What happens towards each limit, value by value where it changes."""
+    lines = []
+    for limit, some in groups(rows, "limit").items():
+        told: list[str] = []
+        for i, row in enumerate(some):
+            if i == 0 or row["outcome"] != some[i - 1]["outcome"]:
+                told.append(f"from {row['value']}: {row['outcome']}")
+        same = sum(row["outcome"] == row["isolated"] for row in some)
+        cells = (
+            limit,
+            "; ".join(told),
+            f"{same} of {len(some)}",
+            f"{max(numbers(some, 'time_difference_s')):.0e} s",
+            str(int(max(numbers(some, "solver_steps")))),
+        )
+        lines.append(cells)
+    header = ("limit", "outcomes by value", "as isolated", "times differ by", "most solver steps")
+    return markdown(header, lines)
+
+
+def first_order(rows: list[Row]) -> Figure:
+    """Error and cost of a leg of first order over c/m."""
+    figure = Figure(figsize=(PAGE, 2.8))
+    left, right = figure.subplots(1, 2)
+    curves(left, rows, "leg", "c_over_m", "error", "leg: {}")
+    curves(right, rows, "leg", "c_over_m", "us_per_gait")
+    left.set(xlabel=r"$c/m$ [s$^{-1}$]", ylabel="error of state and durations")
+    right.set(xlabel=r"$c/m$ [s$^{-1}$]", ylabel="CPU time per gait [µs]")
+    left.legend()
+    return figure
+
+
+def slowing(rows: list[Row]) -> Figure:
+    """Period, and error of the period by each method, over the distance to the stop."""
+    figure = Figure(figsize=(PAGE, 2.8))
+    left, right = figure.subplots(1, 2)
+    x, period, rate = (numbers(rows, name) for name in ("distance", "period_s", "upright_rate"))
+    left.semilogx(x, period, "o", ms=3.5, color=COLOURS[0], label="gait, by isolated roots")
+    line = period[-1] - np.log(x / x[-1]) / rate[-1]
+    left.semilogx(x, line, "--", color="0.4", lw=1.0, label="slope −1/rate of falling upright")
+    for (name, told), colour, marker in zip(
+        {
+            "default": "limit_cycle",
+            "tight": "limit_cycle, tight",
+            "step": "one step",
+        }.items(),
+        COLOURS,
+        "os^",
+        strict=False,
+    ):
+        error = numbers(rows, f"{name}_period_error")
+        look = {"color": colour, "marker": marker, "ms": 3.5, "lw": 0.9}
+        right.loglog(x, error, label=told, **look)
+    left.set(xlabel="slope less that of the stop [rad]", ylabel="period [s]")
+    right.set(xlabel="slope less that of the stop [rad]", ylabel="relative error of the period")
+    for axes in (left, right):
+        axes.grid(color="0.9", lw=0.4)
+        axes.legend()
+    return figure
+
+
+def scuffing(rows: list[Row]) -> Figure:
+    """Clearance and its derivative, and their errors, where scuffing begins."""
+    figure = Figure(figsize=(PAGE, 2.8))
+    for axes, (value, error, name) in zip(
+        figure.subplots(1, 2),
+        (
+            ("clearance_m", "value_error", "depth of the foot [m]"),
+            ("derivative", "derivative_error", "its derivative by $c$ [m/(N s/m)]"),
+        ),
+        strict=True,
+    ):
+        x = numbers(rows, "distance")
+        look = {"ms": 3.5, "lw": 0.9}
+        axes.loglog(x, np.abs(numbers(rows, value)), "o-", color=COLOURS[0], label="size", **look)
+        axes.loglog(x, numbers(rows, error), "s--", color=COLOURS[1], label="error", **look)
+        axes.set(xlabel="relative distance in $c$ below the border", ylabel=name)
+        axes.grid(color="0.9", lw=0.4)
+        axes.legend()
+    return figure
+
+
+def growth(rows: list[Row]) -> Figure:
+    """Derivatives through many steps and their error, over steps, by damping."""
+    shown = {
+        "by_start": "norm of derivative by the start",
+        "by_damping": "derivative by $c$",
+        "error": "error of the derivative by $c$",
+    }
+    figure, axes = over_steps(rows, "damping", "$c$ = {} N s/m", shown, 3.0)
+    axes.set_ylim(1e-13, 1e-7)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    return figure
+
+
+def meeting(rows: list[Row]) -> Figure:
+    """Errors of derivatives of stability measures over the distance to where multipliers meet."""
+    figure = Figure(figsize=(PAGE, 2.8))
+    grid = figure.subplots(1, 2, sharey=True)
+    for axes, (kind, some) in zip(grid, groups(rows, "multipliers").items(), strict=True):
+        x = np.abs(numbers(some, "distance"))
+        for y, label, line, colour in (
+            ("d_radius", "derivative of the spectral radius", "o-", COLOURS[0]),
+            ("d_radius_error", "its error", "s--", COLOURS[1]),
+            ("d_jury_error", "error of the Jury margins' derivatives", "^--", COLOURS[2]),
+        ):
+            axes.loglog(
+                x,
+                np.maximum(np.abs(numbers(some, y)), 1e-17),
+                line,
+                color=colour,
+                ms=3.5,
+                lw=0.9,
+                label=label,
+            )
+        axes.set(xlabel="distance $s$", title=f"{kind} eigenvalues")
+        axes.grid(color="0.9", lw=0.4)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    return figure
+
+
+def modes(rows: list[Row]) -> Figure:
+    """Error and cost of a gait's derivative, implicit and through n steps."""
+    figure = Figure(figsize=(PAGE, 2.8))
+    left, right = figure.subplots(1, 2)
+    walked = [row for row in rows if row["steps"] != "0"]
+    curves(left, walked, "way", "steps", "median_error")
+    curves(right, walked, "way", "steps", "ms")
+    for row, line in zip([row for row in rows if row["steps"] == "0"], ("--", ":"), strict=True):
+        for axes, name in ((left, "median_error"), (right, "ms")):
+            axes.axhline(float(row[name]), color=COLOURS[2], ls=line, lw=1.2, label=row["way"])
+    left.set(xlabel="steps of the walk", ylabel="relative error of d(period), median")
+    right.set(xlabel="steps of the walk", ylabel="CPU time per gait [ms]")
+    right.legend(fontsize=6)
+    return figure
+
+
+def formulations(drift: list[Row], penalty: list[Row]) -> Figure:
+    """Constraint drift over steps, and a penalty ground's error over its work."""
+    figure = Figure(figsize=(PAGE, 2.9))
+    left, right = figure.subplots(1, 2)
+    for marker, name in zip("os^", dict.fromkeys(row["stabilised"] for row in drift), strict=True):
+        some = [row for row in drift if row["stabilised"] == name]
+        gap = numbers(some, "gap_m")
+        left.loglog(numbers(some, "steps"), gap, f"{marker}-", ms=4, label=f"stabilised: {name}")
+    left.set(xlabel="integrator steps", ylabel="largest gap of a held foot [m]")
+    left.legend()
+    for marker, name in zip("os", dict.fromkeys(row["ground"] for row in penalty), strict=True):
+        some = [row for row in penalty if row["ground"] == name and row["outcome"] == "STEPPED"]
+        look = {"ms": 4, "label": f"penalty, {name}"}
+        # Each of the two errors changes sign somewhere.
+        error = np.maximum(numbers(some, "dtheta_error"), numbers(some, "period_error"))
+        right.loglog(numbers(some, "evaluations"), error, f"{marker}-", **look)
+    error_of = r"error of $\dot\theta$ [rad/s] and period [s], the larger"
+    right.set(xlabel="evaluations per gait", ylabel=error_of)
+    right.legend()
+    for axes in (left, right):
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.grid(color="0.9", lw=0.4)
+    return figure
+
+
+def automatic(rows: list[Row]) -> str:
+    """The fastest method with an error below 1e-4, and the automatic choice over it."""
+    lines = []
+    fast = lambda some: min(some, key=lambda row: float(row["us_per_gait"]))
+    for axis in AXES:
+        for value, some in groups([r for r in rows if r["axis"] == axis], "value").items():
+            chosen = next(row for row in some if row["method"] == "automatic")
+            good = [r for r in some if r["outcome"] == "STEPPED" and float(r["error"]) < 1e-4]
+            assert chosen in good
+            good.remove(chosen)
+            ours = fast([r for r in good if r["method"].split()[0] in ("lanes", "diffrax")])
+            every = fast(good)
+            ratio = float(chosen["us_per_gait"]) / float(every["us_per_gait"])
+            cells = [axis, value, ours["method"], ours["us_per_gait"]]
+            cells += [every["method"], every["us_per_gait"]]
+            cells += [chosen["solver"], chosen["us_per_gait"]]
+            lines.append([*cells, f"{ratio:.2f}"])
+    header = ("axis", "value", "fastest of ours", "µs", "fastest of all", "µs", "automatic", "µs")
+    return markdown((*header, "ratio"), lines)
+
+
+def events(rows: list[Row]) -> list[Row]:
+    """Counts by kind of case, over all chunks."""
+    told = []
+    for kind, some in groups(rows, "kind").items():
+        pairs: dict[str, int] = {}
+        for part in filter(None, "; ".join(row["ours/isolated"] for row in some).split("; ")):
+            pair, count = part.split(": ")
+            pairs[pair] = pairs.get(pair, 0) + int(count)
+        counts = ("cases", "stepped", "other_outcome", "late")
+        told.append(
+            {"kind": kind}
+            | {name: str(sum(int(row[name]) for row in some)) for name in counts}
+            | {"largest_time_difference": f"{max(numbers(some, 'largest_time_difference')):.2e}"}
+            | {"ours/isolated": "; ".join(f"{pair}: {n}" for pair, n in sorted(pairs.items()))}
+        )
+    return told
+
+
+def as_table(rows: list[Row]) -> str:
+    """All columns."""
+    return markdown([name.replace("_", " ") for name in rows[0]], [row.values() for row in rows])
+
+
+def draw(tables: dict[str, Path], limit: Callable[[str], float]) -> None:
+    """Every chart and table of the page whose data exist."""
+    page = DOCS / "stability_atlas.md"
+    known = {name: read(path) for name, path in tables.items() if path.exists()}
+    told = {
+        "switch": ("stiffness", automatic),
+        "events": ("events", lambda rows: as_table(events(rows))),
+        "between": ("between", corners),
+        "limits": ("limits", limits),
+        "long_walk": ("long_walk", lambda rows: as_table(last_by(rows, "tolerance"))),
+        "apart": ("apart", as_table),
+    }
+    for mark, (name, text) in told.items():
+        if name in known:
+            replace(page, mark, text(known[name]))
+    charts: dict[str, Callable[[list[Row]], Figure]] = {
+        "stiffness": lambda rows: stiffness(rows, limit),
+        "between": between,
+        "first_order": first_order,
+        "slowing": slowing,
+        "borders": borders,
+        "scuffing": scuffing,
+        "growth": growth,
+        "meeting": meeting,
+        "modes": modes,
+        "long_walk": long_walk,
+    }
+    with style():
+        for name, chart in charts.items():
+            if name in known:
+                save(chart(known[name]), FIGURES, f"atlas_{name}")
+        if {"drift", "formulations"} <= set(known):
+            figure = formulations(known["drift"], known["formulations"])
+            save(figure, FIGURES, "atlas_formulations")

@@ -1,0 +1,347 @@
+"""Limits of the model and corners between outcomes.
+
+What happens where a parameter or a start runs to its limit, whether a leg without its own inertia
+(of first order) could stand in for a stiff one, how a gait slows down before it stops, and who is
+right next to a border between two outcomes.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import vrw_jax as vrw
+from experiments.atlas import events
+from experiments.atlas.events import START, Rows
+from experiments.shared.timing import seconds
+from experiments.speed import peers
+from vrw_jax import Outcome
+from vrw_jax.models.viscoelastic import (
+    PhaseBuilder,
+    double_support,
+    single_support_1,
+    single_support_2,
+)
+from vrw_jax.numerics import Watched, integrate_phase
+from vrw_jax.wheel import Motion, Symbols, dynamics, landing_foot_height, transitions
+
+# --- A leg of first order: SLS-I without the airborne leg's own inertia.
+
+
+def light_wheel(rate: float) -> dict[str, float]:
+    """Table 1 at c = 100 N s/m with legs so light that c/m is `rate`, 1/s; its total mass stays."""
+    mass = 100.0 / rate
+    return {"leg_mass": mass, "damping": 100.0, "hub_mass": 18.0 - 8.0 * mass}
+
+
+LANES = 256
+LEGS = ("full", "first order", "corrected")
+TOLERANCE = 1e-8
+LIGHT = {  # c/m, 1/s: Table 1 itself, then ever lighter legs at c = 100 N s/m and its total mass
+    200.0: {},
+    **{rate: light_wheel(rate) for rate in (3e2, 1e3, 3e3, 1e4, 3e4, 1e5)},
+}
+
+
+def first_order_rates(s: Symbols, y: jax.Array, ddL2: jax.Array | float = 0.0) -> jax.Array:
+    """(theta', L1', L2', theta'', L1'') of y = (theta, L1, L2, theta', L1') with L2'' given.
+
+    Forces are linear in L2': with L2'' known the three rows of M q'' = f give theta'', L1'', L2'.
+    """
+    theta, L1, L2, dtheta, dL1 = y
+    at = lambda dL2: dynamics.terms(s, Motion.of(theta, L1, L2, dtheta, dL1, dL2))
+    zero = 0.0 * theta
+    M, *rest = at(zero)
+    slope = [a - b for a, b in zip(at(zero + 1.0)[1:], rest, strict=True)]
+    rows = [[M.M11, M.M12, -slope[0]], [M.M12, M.M22, -slope[1]], [M.M13, M.M23, -slope[2]]]
+    rows = [[zero + entry for entry in row] for row in rows]
+    column = jnp.stack([M.M13 + zero, M.M23 + zero, M.M33 + zero])
+    right = jnp.stack(rest) - column * ddL2
+    ddtheta, ddL1, dL2 = jnp.linalg.solve(jnp.array(rows), right)
+    return jnp.stack([dtheta, dL1, dL2, ddtheta, ddL1])
+
+
+def corrected_rates(s: Symbols, y: jax.Array) -> jax.Array:
+    """The same with L2'' from the rate at which L2' itself changes: an order better in m/c."""
+    slow = lambda y: first_order_rates(s, y)
+    rates = slow(y)
+    return first_order_rates(s, y, jax.jvp(slow, (y,), (rates,))[1][2])
+
+
+def after_the_layer(s: Symbols, state: jax.Array, rates: Callable) -> jax.Array:
+    """What the fast mode of lift-off leaves behind, to first order in m/c.
+
+    The excess of L2' over its slow value dies at the rate c (M^-1)_33 and moves rates and places
+    along M^-1 e_3, like an impact.
+    """
+    M = dynamics.mass_matrix(s, state[1], state[2])
+    zero = 0.0 * state[0]
+    matrix = [[M.M11, M.M12, M.M13], [M.M12, M.M22, M.M23], [M.M13, M.M23, M.M33]]
+    matrix = jnp.array([[zero + entry for entry in row] for row in matrix])
+    along = jnp.linalg.solve(matrix, jnp.array([0.0, 0.0, 1.0]))
+    y = state[:5]
+    for _ in range(3):  # the slow value is that of the state left behind
+        excess = state[5] - rates(y)[2]
+        jump = along * excess / along[2]
+        moved = state[:3] + jump / (s.c * along[2])
+        y = jnp.concatenate([moved, state[3:5] - jump[:2]])
+    return y
+
+
+def step_with_leg(leg: str, params: vrw.WheelParams, x: jax.Array, options: vrw.Options) -> tuple:
+    """Section state and durations, and solver steps and outcome of SLS-I, of a step."""
+    s = params.symbols()
+    build = PhaseBuilder(s, True, False)
+    landing = transitions.land(s, *x)
+    on = jnp.asarray(True)
+    dls, sls1, sls2 = (
+        double_support(build, landing.distance),
+        single_support_1(build),
+        single_support_2(build),
+    )
+    run = lambda phase, y: integrate_phase(phase.field, phase.watched, y, on, options)
+    first = run(dls, jnp.stack([landing.theta, landing.motion.dtheta]))
+    m = dls.motion(first.state)
+    state = jnp.stack([first.state[0], m.L1, m.L2, m.dtheta, m.dL1, m.dL2])
+    if leg == "full":
+        second = run(sls1, state)
+        motion = sls1.motion(second.state)
+    else:
+        rates = lambda y: (corrected_rates if leg == "corrected" else first_order_rates)(s, y)
+        full = lambda y: Motion.of(y[0], y[1], y[2], y[3], y[4], rates(y)[2])
+        start = after_the_layer(s, state, rates) if leg == "corrected" else state[:5]
+
+        def guards(y: jax.Array) -> jax.Array:
+            return jnp.stack([s.L0 - y[2], landing_foot_height(s, full(y)), y[3]])
+
+        second = integrate_phase(rates, Watched(guards, 3), start, on, options)
+        motion = full(second.state)
+    hit = transitions.hit_stopper(s, motion).motion
+    third = run(sls2, jnp.stack([second.state[0], hit.L1, hit.dtheta, hit.dL1]))
+    theta, _, dtheta, dL1 = third.state
+    durations = jnp.stack([first.duration, second.duration, third.duration])
+    told = jnp.concatenate([jnp.stack([theta, dtheta, dL1]), durations])
+    return told, second.solver_steps, second.guard
+
+
+def first_order() -> Rows:
+    """Error and cost of legs of first order over c/m, Tsit5, against isolated roots."""
+    options = vrw.Options(solver="Tsit5", rtol=TOLERANCE, atol=TOLERANCE)
+    runs = {}
+    for leg in LEGS:
+        one = lambda params, x, leg=leg: step_with_leg(leg, params, x, options)
+        runs[leg] = jax.jit(jax.vmap(one))
+    for rate, wheel in LIGHT.items():
+        params = vrw.WheelParams(**wheel)
+        params = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (LANES,)), params)
+        landing = transitions.land(params.symbols(), *START)
+        y = np.stack([landing.theta + 0.0 * landing.motion.dtheta, landing.motion.dtheta], 1)[:1]
+        truth = peers.Heyoka(1e-15)(y, peers.pack(params)[:1])[0, :6]
+        for leg, run in runs.items():
+            call = lambda run=run, params=params: jax.block_until_ready(
+                run(params, jnp.tile(START, (LANES, 1)))
+            )
+            told, steps, guard = call()
+            yield {
+                "c_over_m": f"{rate:.4g}",
+                "leg": leg,
+                "error": f"{np.max(np.abs(np.asarray(told[0]) - truth)):.2e}",
+                "steps_sls1": int(steps[0]),
+                "us_per_gait": f"{seconds(call) / LANES * 1e6:.4g}",
+                "ended_on_stopper": bool(guard[0] == 0),
+            }
+
+
+# --- One parameter or start to its limit, all else Table 1's.
+
+at_start = lambda rate: {"start": (START[0], rate, START[2] * rate / START[1])}
+SWEEPS: dict[str, tuple[Callable[[float], dict], tuple[float, ...]]] = {
+    "c → ∞ [N s/m]": (
+        lambda c: {"damping": c},
+        (200.0, 300.0, 500.0, 1e3, 1e4, 1e5, 1e6),
+    ),
+    "k → ∞, preload 10 N [N/m]": (
+        lambda k: {"stiffness": k, "natural_length": 1.0 + 10.0 / k},
+        (500.0, 1e3, 2e3, 5e3, 1e4, 1e5, 1e6, 1e7, 1e8),
+    ),
+    "L* − L0 → 0 [m]": (
+        lambda stretch: {"natural_length": 1.0 + stretch},
+        (2e-2, 1.5e-2, 1.2e-2, 1e-2, 1e-3, 1e-6, 1e-9, 0.0),
+    ),
+    "L* − L0 → 0 at c = 50 [m]": (
+        lambda stretch: {"natural_length": 1.0 + stretch, "damping": 50.0},
+        (2e-2, 1e-2, 1e-3, 1e-6, 1e-9, 0.0),
+    ),
+    "slope → 0 [rad]": (
+        lambda slope: {"slope": slope},
+        (0.3, 0.2, 0.15, 0.1, 0.05, 0.01, 1e-3, 1e-6, 0.0),
+    ),
+    "rates → 0, by that of θ [rad/s]": (
+        at_start,
+        (1.6, 0.5, 0.1, 1e-2, 1e-4, 1e-6, 1e-9, 1e-12),
+    ),
+    "rates → 0 on level ground [rad/s]": (
+        lambda rate: at_start(rate) | {"slope": 0.0},
+        (1.6, 0.5, 0.1, 1e-2, 1e-4, 1e-6, 1e-9, 1e-12),
+    ),
+}
+
+
+def limits() -> Rows:
+    """Outcome and error of one step of `vrw.steps` towards each limit, against isolated roots."""
+    made = events.phases()
+    for sweep, (given, values) in SWEEPS.items():
+        for value in values:
+            wheel = {"damping": 200.0} | given(value)
+            start = np.array([wheel.pop("start", START)])
+            params = vrw.WheelParams(**{key: np.full(1, v) for key, v in wheel.items()})
+            (code,), (durations,), _ = events.isolated(made, params, start)
+            found = vrw.steps(params, start)
+            yield {
+                "limit": sweep,
+                "value": f"{value:.4g}",
+                "outcome": Outcome(int(found.outcome[0])).name,
+                "isolated": Outcome(code).name,
+                "time_difference_s": f"{np.max(np.abs(found.durations[0] - durations)):.1e}",
+                "solver_steps": int(found.solver_steps[0]),
+                "solver": found.solvers[int(found.solver[0])],
+                "durations": " ".join(f"{d:.3g}" for d in durations),
+            }
+
+
+# --- The gait slows down before it stops: step time to infinity.
+
+SLOW = {"damping": 100.0}
+WALKS, STANDS = 0.12, 0.02  # slopes, rad
+SETTLING = 12  # steps: neighbours' gaits are near, and multipliers small
+PATIENCE = 200.0  # s of double support
+BEYOND = np.logspace(-1.5, -11.0, 20)  # slope less the one at which the gait stops, rad
+
+
+def settled(made: tuple, slope: float, start: np.ndarray) -> tuple[bool, np.ndarray, np.ndarray]:
+    """Whether the wheel walks on from a start, then its section state and durations."""
+    params = vrw.WheelParams(damping=np.full(1, SLOW["damping"]), slope=np.full(1, slope))
+    for _ in range(SETTLING):
+        (code,), (durations,), (start,) = events.isolated(made, params, start[None])
+        if code != Outcome.STEPPED:
+            return False, start, durations
+    return True, start, durations
+
+
+def upright_rate(slope: float, start: np.ndarray) -> float:
+    """Rate at which double support leaves its upright equilibrium, 1/s; NaN without one."""
+    s = vrw.WheelParams(**SLOW, slope=slope).symbols()
+    landing = transitions.land(s, *start)
+    field = double_support(PhaseBuilder(s, True, False), landing.distance).field
+    push = jax.jit(lambda theta: field(jnp.stack([theta, 0.0 * theta]))[1])
+    places = float(landing.theta) + np.linspace(0.0, 1.0, 2001)
+    rises = np.diff(np.sign(np.asarray(jax.vmap(push)(jnp.asarray(places))))) > 0
+    if not np.any(rises):
+        return np.nan
+    at = places[np.flatnonzero(rises)[0]]
+    for _ in range(5):
+        at = at - push(at) / jax.grad(push)(at)
+    matrix = np.asarray(jax.jacfwd(field)(jnp.stack([at, 0.0 * at])))
+    return float(np.max(np.linalg.eigvals(matrix).real))
+
+
+def slowing() -> Rows:
+    """Period of the gait towards the slope at which it stops, and who still finds the gait."""
+    made = events.phases()
+    made[0].limit = PATIENCE
+    walks, start, _ = settled(made, WALKS, START * [1.0, 0.6, 0.5])
+    assert walks
+    low, high, near = STANDS, WALKS, start
+    while high - low > 2.0 * np.spacing(high):
+        middle = 0.5 * (low + high)
+        walks, end, _ = settled(made, middle, near)
+        low, high, near = (low, middle, end) if walks else (middle, high, near)
+    at = lambda slope: vrw.WheelParams(**SLOW, slope=slope)
+    meshes = {"default": vrw.CycleOptions(), "tight": vrw.CycleOptions.tight()}
+    guess = {name: vrw.limit_cycle(at(WALKS), options=mesh) for name, mesh in meshes.items()}
+    for distance in BEYOND:
+        slope = high + distance
+        _, start, durations = settled(made, slope, start)
+        row: dict[str, object] = {
+            "slope": f"{slope:.12g}",
+            "distance": f"{distance:.2e}",
+            "period_s": f"{durations.sum():.9g}",
+            "dls_fraction": f"{durations[0] / durations.sum():.6g}",
+            "upright_rate": f"{upright_rate(slope, start):.9g}",
+        }
+        for name, options in meshes.items():
+            cycle = vrw.limit_cycle(at(slope), guess=guess[name], options=options)
+            found = bool(cycle.found)
+            guess[name] = cycle if found else guess[name]
+            gap = np.max(np.abs(np.asarray(cycle.section_state) - start))
+            missed = abs(float(cycle.period) - durations.sum()) / durations.sum()
+            row |= {
+                f"{name}_found": found,
+                f"{name}_state_error": f"{gap:.1e}" if found else "nan",
+                f"{name}_period_error": f"{missed:.1e}" if found else "nan",
+            }
+        step = vrw.step(at(slope), start, options=vrw.Options(max_phase_time=PATIENCE))
+        missed = abs(float(np.sum(step.durations)) - durations.sum()) / durations.sum()
+        yield row | {"step": Outcome(int(step.outcome)).name, "step_period_error": f"{missed:.1e}"}
+
+
+# --- Between two outcomes: two guards at once, guards that graze, phases that vanish.
+
+SEGMENTS, HALVINGS = 1000, 55  # of each kind of case
+CLOSER = np.logspace(-2.0, -14.0, 7)  # of the segment between two starts
+
+
+def between() -> Rows:
+    """Who is right how near to a border between outcomes: both engines at default options.
+
+    Segments between random wheels and starts of other outcomes are halved by isolated roots until
+    the border is known to the last digits; then both sides are asked at some distances.
+    """
+    made = events.phases()
+    names = [name for name in events.KINDS["anywhere"] if name != "start"]
+
+    def asked(points: np.ndarray) -> tuple[vrw.WheelParams, np.ndarray]:
+        return vrw.WheelParams(**dict(zip(names, points.T, strict=False))), points[:, len(names) :]
+
+    for kind, box in events.KINDS.items():
+        params, starts = events.drawn(box, np.random.default_rng(11))
+        points = np.column_stack([*(np.asarray(getattr(params, n)) for n in names), starts])
+        points = points[: 2 * SEGMENTS]
+        ends = points[::2].copy(), points[1::2].copy()
+        codes = tuple(events.isolated(made, *asked(side))[0] for side in ends)
+        differ = codes[0] != codes[1]
+        low, high = (side[differ] for side in ends)
+        codes_low, codes_high = (code[differ].copy() for code in codes)
+        segment = high - low
+        for _ in range(HALVINGS):
+            middle = 0.5 * (low + high)
+            told, *_ = events.isolated(made, *asked(middle))
+            same = told == codes_low
+            low[same], high[~same] = middle[same], middle[~same]
+            codes_high[~same] = told[~same]
+        for distance in CLOSER:
+            for side, sign in ((low, -1.0), (high, 1.0)):
+                there = side + sign * distance * segment
+                told, durations, _ = events.isolated(made, *asked(there))
+                found = vrw.steps(*asked(there))
+                mine = np.asarray(found.outcome)
+                other = np.asarray(vrw.steps(*asked(there), engine="diffrax").outcome)
+                stepped = (mine == told) & (told == Outcome.STEPPED)
+                gap = np.max(np.abs(np.asarray(found.durations) - durations), 1)
+                pairs = [
+                    tuple(sorted(Outcome(code).name for code in pair))
+                    for pair in zip(codes_low, codes_high, strict=True)
+                ]
+                for pair in sorted(set(pairs)):
+                    here = np.array([one == pair for one in pairs])
+                    yield {
+                        "kind": kind,
+                        "border": " | ".join(pair),
+                        "distance": f"{distance:.0e}",
+                        "cases": int(here.sum()),
+                        "other_outcome": int((here & (mine != told)).sum()),
+                        "other_by_diffrax": int((here & (other != told)).sum()),
+                        "stepped": int((here & stepped).sum()),
+                        "time_difference_s": f"{np.max(gap[here & stepped], initial=0.0):.1e}",
+                    }

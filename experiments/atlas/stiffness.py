@@ -1,0 +1,109 @@
+"""Stiffness: a leg's mass goes to nothing, total mass and everything else stay."""
+
+import functools
+import time
+
+import numpy as np
+
+import vrw_jax as vrw
+from experiments.atlas.events import START, Rows
+from experiments.atlas.limits import light_wheel
+from experiments.speed import peers
+from vrw_jax import Outcome
+from vrw_jax.numerics import explicit_tableau, real_stability_limit
+from vrw_jax.wheel import transitions
+
+STIFFNESS = np.logspace(2.0, 6.0, 9)  # c/m or k/m, 1/s or 1/s^2
+HEAVIEST = 300.0  # k/m below which eight legs outweigh the wheel
+TOLERANCE = 1e-6
+LIBRARY = {  # engine and solver of `vrw.steps`
+    "lanes Tsit5": ("lanes", "Tsit5"),
+    "lanes Dopri8": ("lanes", "Dopri8"),
+    "diffrax Kvaerno3": ("diffrax", "Kvaerno3"),
+    "diffrax Kvaerno5": ("diffrax", "Kvaerno5"),
+    "automatic": ("auto", "Dopri8"),
+}
+PEERS = ("DOP853", "LSODA", "Radau")  # of SciPy
+
+
+def stiff_wheel(axis: str, value: float) -> dict[str, float]:
+    """Table 1 with a lighter leg: c stays and c/m grows, or k stays and k/m grows at c/m = 100."""
+    if axis == "c/m":
+        return light_wheel(value)
+    mass = 500.0 / value
+    return {"leg_mass": mass, "damping": 100.0 * mass, "hub_mass": 18.0 - 8.0 * mass}
+
+
+def real_axis_limit(solver: str) -> float:
+    """Largest z with |R(-z)| <= 1 of an explicit solver's stability polynomial."""
+    tableau = explicit_tableau(solver)
+    assert tableau is not None
+    return real_stability_limit(tableau)
+
+
+TURNS, SHORT, LONG = 7, 0.1, 3.0
+"""Of timing: rounds; seconds for which a method is repeated in each (a process's clock may stand
+still for some ms); seconds of a call beyond which one is enough."""
+
+
+def over_rates() -> Rows:
+    """Cost, error and outcome of one step by every method over c/m and k/m."""
+    places = [("c/m", value) for value in STIFFNESS]
+    places += [("k/m", value) for value in STIFFNESS if value > HEAVIEST]
+    for axis, value in places:
+        wheel = stiff_wheel(axis, value)
+        params = vrw.WheelParams(**{name: np.full(1, x) for name, x in wheel.items()})
+        landing = transitions.land(params.symbols(), *START)
+        y = np.stack([landing.theta + 0.0 * landing.motion.dtheta, landing.motion.dtheta], 1)
+        packed = peers.pack(params)
+        truth = peers.Heyoka(1e-15)(y, packed)[0, :6]
+        peer = lambda steps, *more, y=y, packed=packed: (
+            1,
+            functools.partial(steps, y, packed, *more),
+            lambda told: (told[0, :6], told[0, 6], Outcome.STEPPED, ""),
+        )
+        runs = {
+            "numba Dopri5": peer(peers.numba_steps, TOLERANCE),
+            "heyoka": peer(peers.Heyoka(TOLERANCE)),
+            **{f"SciPy {name}": peer(peers.scipy_steps, TOLERANCE, name) for name in PEERS},
+            **{name: by_library(wheel, *how) for name, how in LIBRARY.items()},
+        }
+        compiled = {name: read(run()) for name, (_, run, read) in runs.items()}
+        least = dict.fromkeys(runs, np.inf)
+        for _ in range(TURNS):  # in turn: a shared machine's clock changes within minutes
+            for name, (lanes, run, _) in runs.items():
+                if LONG < least[name] * lanes < np.inf:
+                    continue
+                begin, spent, calls = time.process_time(), 0.0, 0
+                while spent < SHORT:
+                    run()
+                    spent, calls = time.process_time() - begin, calls + 1
+                least[name] = min(least[name], spent / calls / lanes)
+        for name, (values, work, outcome, solver) in compiled.items():
+            good = np.all(np.isfinite(values))
+            yield {
+                "axis": axis,
+                "value": f"{value:.4g}",
+                "method": name,
+                "solver": solver,  # that `vrw.steps` took
+                "us_per_gait": f"{least[name] * 1e6:.4g}",
+                "work": f"{work:.0f}",  # evaluations of peers, tried steps of the library
+                "error": f"{np.max(np.abs(values - truth)):.2e}",
+                "outcome": (outcome if good else Outcome.SOLVER_GAVE_UP).name,
+                "duration_sls1": f"{truth[4]:.6g}",
+            }
+
+
+def by_library(wheel: dict[str, float], engine: str, solver: str) -> tuple:
+    """Lanes in a call, the call, and what it tells: values, tried steps, outcome, solver."""
+    options = vrw.Options(solver=solver, rtol=TOLERANCE, atol=TOLERANCE)
+    lanes = 256 if engine == "diffrax" else 2048  # full blocks
+    params, starts = vrw.WheelParams(**wheel), np.tile(START, (lanes, 1))
+    run = lambda: vrw.steps(params, starts, options=options, engine=engine)
+
+    def read(told: vrw.Steps) -> tuple:
+        values = np.concatenate([told.section_state[0], told.durations[0]])
+        outcome, solver = Outcome(int(told.outcome[0])), told.solvers[int(told.solver[0])]
+        return values, int(told.solver_steps[0]), outcome, solver
+
+    return lanes, run, read

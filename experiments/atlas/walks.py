@@ -1,0 +1,118 @@
+"""Long walks: does the cycle hold, does error grow, where energy goes."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import vrw_jax as vrw
+from vrw_jax import Outcome
+from vrw_jax.models.viscoelastic import (
+    Phase,
+    PhaseBuilder,
+    double_support,
+    single_support_1,
+    single_support_2,
+)
+from vrw_jax.numerics import PhaseEnd, Watched, integrate_phase
+from vrw_jax.wheel import Motion, dynamics, transitions
+
+ORACLE = Path(__file__).parents[2] / "tests" / "oracle"
+BLOCK = 1000
+WALKED = (1000, 2000, 5000, 10_000, 20_000, 50_000, 100_000)
+WALKS = {(1e-6, 1e-8, 1e-13): 10_000, (1e-10,): 100_000}
+"""Steps by tolerances that walk side by side; 1e-10 is the default, 1e-13 `Options.tight()`."""
+
+
+def with_damping(
+    phase: Phase, start: jax.Array, params: vrw.WheelParams, options: vrw.Options
+) -> tuple[PhaseEnd, jax.Array, Motion]:
+    """A phase of the library, the energy that its dampers take (J, eq. 29), and its last motion.
+
+    The integral is one more component of the state: its error counts like any other.
+    """
+    s = params.symbols()
+    power = lambda y: dynamics.damping_power(s, phase.motion(y))
+    field = lambda y: jnp.append(phase.field(y[:-1]), power(y[:-1]))
+    watched = Watched(lambda y: phase.watched.values(y[:-1]), phase.watched.n_guards)
+    zero = 0.0 * start[:1]
+    end = integrate_phase(
+        field, watched, jnp.concatenate([start, zero]), jnp.asarray(True), options
+    )
+    return end, end.state[-1], phase.motion(end.state[:-1])
+
+
+def accounted_step(params: vrw.WheelParams, x: jax.Array, options: vrw.Options) -> tuple:
+    """Next section state; whether it stepped; duration, gravity's work and energy not accounted.
+
+    Energy before the landing + gravity's work from foot to foot - what both impacts and the
+    dampers take - energy at the next touchdown.
+    """
+    s = params.symbols()
+    build = PhaseBuilder(s, True, False)
+    before = transitions.motion_before_landing(s, *x)
+    landing = transitions.land(s, *x)
+    dls, sls1, sls2 = (
+        double_support(build, landing.distance),
+        single_support_1(build),
+        single_support_2(build),
+    )
+    start = jnp.stack([landing.theta, landing.motion.dtheta])
+    first, lost_1, m = with_damping(dls, start, params, options)
+    start = jnp.stack([first.state[0], m.L1, m.L2, m.dtheta, m.dL1, m.dL2])
+    second, lost_2, m = with_damping(sls1, start, params, options)
+    hit = transitions.hit_stopper(s, m)
+    start = jnp.stack([second.state[0], hit.motion.L1, hit.motion.dtheta, hit.motion.dL1])
+    third, lost_3, m = with_damping(sls2, start, params, options)
+    ends = first, second, third
+    outcomes = [p.outcome(end) for p, end in zip((dls, sls1, sls2), ends, strict=True)]
+    stepped = jnp.all(jnp.stack(outcomes) == Outcome.STEPPED)
+    theta, _, dtheta, dL1, _ = third.state
+    work = (s.Mt) * s.g * landing.distance * s.sin_phi
+    lost = landing.energy_lost + hit.energy_lost + lost_1 + lost_2 + lost_3
+    change = dynamics.energy(s, m).total - dynamics.energy(s, before).total
+    duration = first.duration + second.duration + third.duration
+    return jnp.stack([theta, dtheta, dL1]), stepped, duration, work, work - lost - change
+
+
+def long_walk() -> Iterator[dict[str, object]]:
+    """Many steps of Table 1's wheel from its limit cycle, at four tolerances."""
+    truth = json.loads((ORACLE / "truth.json").read_text())["cases"][0]["cycle"]
+    first = np.array([float(value) for value in truth["section_state"]])
+    period = float(truth["period"])
+    params = vrw.WheelParams()
+
+    def walk(x: jax.Array, tolerance: jax.Array) -> tuple:
+        options = vrw.Options(rtol=tolerance, atol=tolerance)
+
+        def one(x: jax.Array, _: None) -> tuple:
+            x, *told = accounted_step(params, x, options)
+            return x, told
+
+        return jax.lax.scan(one, x, None, length=BLOCK)
+
+    block = jax.jit(jax.vmap(walk))
+    for tolerances, length in WALKS.items():
+        x = jnp.tile(first, (len(tolerances), 1))
+        failed, largest, clock, work, rest = np.zeros((5, len(tolerances)))
+        for count in range(BLOCK, length + 1, BLOCK):
+            x, (stepped, durations, works, rests) = block(x, jnp.asarray(tolerances))
+            failed += np.sum(~np.asarray(stepped), 1)
+            distance = np.max(np.abs(np.asarray(x) - first), 1)
+            largest, clock = np.maximum(largest, distance), clock + np.sum(durations, 1)
+            work, rest = work + np.sum(works, 1), rest + np.sum(rests, 1)
+            for i, tolerance in enumerate(tolerances if count in WALKED else ()):
+                yield {
+                    "tolerance": f"{tolerance:.0e}",
+                    "steps": count,
+                    "failed": int(failed[i]),
+                    "distance": f"{distance[i]:.2e}",
+                    "largest_distance": f"{largest[i]:.2e}",
+                    "clock_error_s": f"{abs(clock[i] - count * period):.2e}",
+                    "work_of_gravity_J": f"{work[i]:.6e}",
+                    "not_accounted_J": f"{rest[i]:+.2e}",
+                    "share": f"{abs(rest[i]) / work[i]:.1e}",
+                }

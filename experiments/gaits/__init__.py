@@ -1,0 +1,1 @@
+"""Which gaits there are: orbits beyond the borders, basins, the surface that guesses them."""

@@ -1,0 +1,40 @@
+"""At c = 100 nearly every start walks; at c = 200 a fast one meets touchdown before the stopper.
+
+    python -m experiments.gaits.basin [folder]
+
+Starts differ in θ̇⁻ and L̇1⁻ just before touchdown; θ⁻ is that of the gait. Writes `basin.svg` and
+`.png` to `results/` or the folder given.
+"""
+
+import numpy as np
+
+import vrw_jax as vrw
+from experiments.shared.command import started_with_folder
+from vrw_jax.figures import branch as branch_plots
+from vrw_jax.figures import walk as plots
+from vrw_jax.walks.basins import share
+
+DAMPINGS = (100.0, 200.0)  # N s/m
+RATES = np.linspace(0.4, 3.2, 57)  # rad/s
+LEG_RATES = np.linspace(-1.0, 0.6, 49)  # m/s
+
+
+def main() -> None:
+    folder = started_with_folder(__doc__)
+    results, titles = [], []
+    for damping in DAMPINGS:
+        params = vrw.WheelParams(damping=damping)
+        gait = vrw.limit_cycle(params)
+        theta = float(gait.section_state[0])
+        grid = {
+            "theta_touchdown": theta, "dtheta_touchdown": RATES, "dL1_touchdown": LEG_RATES,
+        }  # fmt: skip
+        result = vrw.basin(params, grid, options=vrw.Options(rtol=1e-9, atol=1e-9))
+        results.append(result)
+        titles.append(f"$c$ = {damping:g} N·s/m, $\\theta^-$ = {theta:.4f} rad")
+        print(damping, share(result), "periods", result.orbit_period.values)
+    plots.save(branch_plots.basin_figure(results, titles), folder, "basin")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""The wheel on real ground, and what the rungs below it miss."""

@@ -1,0 +1,52 @@
+"""Where the paper's wheel bounces (c = 1 ... 4) high friction gives one gait from most starts.
+
+    python -m experiments.ground.bouncing
+
+Wheels from a grid of starts, walked at finite friction and by the rule for infinite friction; told
+are how many are left, and median and spread of their periods and double support.
+"""
+
+import itertools
+import math
+
+import numpy as np
+
+import vrw_jax as vrw
+from experiments.shared.command import command, started
+from experiments.shared.tables import FIGURES, write
+
+DAMPING, FRICTION = (1.0, 2.0, 4.0), (5.0, 8.0, 15.0, 100.0, 1e6, math.inf)
+STARTS = np.array(
+    list(itertools.product((0.0, 0.1, 0.2), np.linspace(0.6, 2.4, 6), (-0.4, -0.1, 0.2)))
+)
+N_STEPS = 80
+OPTIONS = {"solver": "Tsit5", "rtol": 1e-9, "atol": 1e-9}
+HEADER = ("damping", "friction", "starts", "left", "period_s", "period_spread_s")
+
+
+def main() -> None:
+    started(command(__doc__))
+    rows, options = [], vrw.Options(**OPTIONS)
+    for damping, friction in itertools.product(DAMPING, FRICTION):
+        found = vrw.steps(
+            vrw.WheelParams(damping=np.full(len(STARTS), damping)),
+            STARTS,
+            N_STEPS,
+            model=vrw.UnilateralWheel(friction=friction),
+            options=options,
+        )
+        left = np.asarray(found.outcome) == vrw.Outcome.STEPPED
+        durations = np.asarray(found.durations)[left]
+        period = durations.sum(-1)
+        told = [np.nan] * 4
+        if left.any():
+            share = durations[:, 0] / period
+            told = [np.median(period), np.ptp(period), np.median(share), np.ptp(share)]
+        rows.append([damping, friction, len(STARTS), left.sum(), *told])
+        print([f"{value:.5g}" for value in rows[-1]], flush=True)
+    header = (*HEADER, "dls_fraction", "dls_spread")
+    write(FIGURES / "bouncing.csv", header, [[f"{value:.5g}" for value in row] for row in rows])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,104 @@
+"""Use this rung when: the lower rungs' errors against real ground, scene by scene, and their cost.
+
+    python -m experiments.ground.rung_table
+
+A scene is a wheel on a ground; the reference is its gait on the unilateral rung, reached by a walk
+from the gait of the paper's rung (or the paper's start, where that has none). Costs are CPU times
+of one compiled step, of one wheel by itself and of one among many (`vrw.steps`).
+"""
+
+import math
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import vrw_jax as vrw
+from experiments.ground.friction_map import FIELDS, TOWARDS, told
+from experiments.shared.command import command, started
+from experiments.shared.tables import FIGURES, write
+from experiments.shared.timing import seconds
+
+SCENES = {  # label: friction and what differs from Table 1
+    "Table 1, feet can't slide": (math.inf, {}),
+    "Table 1, μ = 50": (50.0, {}),
+    "Table 1, μ = 20": (20.0, {}),
+    "Table 1, μ = 1.3": (1.3, {}),
+    "Table 1, μ = 0.7": (0.7, {}),
+    "c = 150, feet can't slide": (math.inf, {"damping": 150.0}),
+    "c = 50 (scuffs), feet can't slide": (math.inf, {"damping": 50.0}),
+    "c = 225 (rear foot lifts off), feet can't slide": (math.inf, {"damping": 225.0}),
+    "c = 300, feet can't slide": (math.inf, {"damping": 300.0}),
+    "c = 300, μ = 0.7": (0.7, {"damping": 300.0}),
+    "c = 400, μ = 0.7": (0.7, {"damping": 400.0}),
+}
+N_STEPS, N_TIMED, MANY = 300, 30, 2048
+MEASURES = ("period", "dls_fraction", "speed")
+
+
+def values(cycle: object) -> list[float]:
+    return [float(getattr(cycle, name)) for name in MEASURES]
+
+
+def wheel(changes: dict[str, float]) -> vrw.WheelParams:
+    return vrw.WheelParams(**{name: jnp.asarray(value) for name, value in changes.items()})
+
+
+def errors() -> None:
+    """Of the lower rungs in every scene."""
+    papers = [vrw.limit_cycle(wheel(changes)) for _, changes in SCENES.values()]
+    friction = np.array([mu for mu, _ in SCENES.values()])
+    damping = np.array([changes.get("damping", 200.0) for _, changes in SCENES.values()])
+    x = [p.section_state if bool(p.found) else vrw.paper_start() for p in papers]
+    params, model = vrw.WheelParams(damping=damping), vrw.UnilateralWheel(friction=friction)
+    walked = vrw.steps(
+        params, np.array(x), N_STEPS - 1, model=model, options=vrw.Options(**TOWARDS)
+    )
+    last = vrw.steps(params, walked.section_state, model=model, options=vrw.Options(**TOWARDS))
+    fields = dict(zip(FIELDS, told(friction, damping, walked.section_state).T, strict=True))
+    rows = []
+    for i, (label, (mu, changes)) in enumerate(SCENES.items()):
+        again = float(jnp.sum(last.durations[i] - walked.durations[i]))
+        outcome = vrw.Outcome(int(last.outcome[i]))
+        good = outcome == vrw.Outcome.STEPPED
+        truth = [float(fields[name][i]) if good else math.nan for name in MEASURES]
+        row = [label, mu, outcome.name, f"{again:.1e}", *(f"{v:.6g}" for v in truth)]
+        for cycle in (papers[i], vrw.limit_cycle(wheel(changes), model=vrw.RigidWheel())):
+            found = values(cycle) if bool(cycle.found) else [math.nan] * 3
+            row += [f"{t - v:.3g}" for t, v in zip(found, truth, strict=True)]
+        rows.append(row)
+        print(row, flush=True)
+    header = ["scene", "friction", "outcome", "period_change_s", *MEASURES]
+    header += [f"{rung}_{name}_error" for rung in ("paper", "rigid") for name in MEASURES]
+    write(FIGURES / "rung_table.csv", header, rows)
+
+
+def costs() -> None:
+    """Of one step of each rung at Table 1 and μ = 0.7, by itself and in a batch."""
+    params, start = vrw.WheelParams(), vrw.paper_start()
+    rungs = {
+        "rigid": (vrw.RigidWheel(), jnp.asarray([math.pi / 8, 1.6, 0.0])),
+        "paper": (vrw.ViscoelasticWheel(), start),
+        "ground": (vrw.UnilateralWheel(friction=0.7), start),
+    }
+    rows = []
+    for name, (model, x) in rungs.items():
+        alone = partial(vrw.return_map, params, x, model=model, options=vrw.Options(**TOWARDS))
+        if name == "rigid":
+            mapped = jax.jit(jax.vmap(partial(vrw.return_map, params, model=model)))
+            many = partial(mapped, jnp.tile(x, (MANY, 1)))
+        else:
+            states = np.tile(x, (MANY, 1))
+            many = partial(vrw.steps, params, states, model=model, options=vrw.Options(**TOWARDS))
+        jax.block_until_ready((alone(), many()))  # compiled
+        row = [name, f"{1e3 * seconds(alone, N_TIMED):.3g}", f"{1e6 * seconds(many, 3) / MANY:.3g}"]
+        rows.append(row)
+        print(row, flush=True)
+    write(FIGURES / "rung_costs.csv", ("rung", "ms_alone", "us_in_a_batch"), rows)
+
+
+if __name__ == "__main__":
+    started(command(__doc__))
+    errors()
+    costs()

@@ -1,0 +1,162 @@
+"""What really happens where the paper stops: scuffing, bouncing, the lost gait, early touchdown.
+
+    python -m experiments.ground.scenes
+
+Each scene is walked from the paper's gait at the nearest damping that has one. Drawn: ground forces
+and foot heights of the last good step with the paper's step from the same start beside them, and
+the time that each scene spends in each pair of contact modes.
+"""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+
+import vrw_jax as vrw
+from experiments.shared.command import command, started
+from experiments.shared.tables import FIGURES, write
+from vrw_jax.figures import walk as plots
+from vrw_jax.models import directions, foot_heights, unpack
+
+NO_SLIP, REAL = math.inf, 0.7
+GAIT_RANGE = (8.0, 215.0)  # dampings at which the paper's gait gives the start
+FAST = (0.1, 2.0, -0.1)
+SCENES = [  # label, friction, damping, start (None: from the paper's gait at the nearest damping)
+    *((f"bouncing, c = {c:g}", NO_SLIP, c, None) for c in (1.0, 2.0, 3.0, 4.0)),
+    *((f"scuffing, c = {c:g}", NO_SLIP, c, None) for c in (50.0, 100.0)),
+    *((f"lost gait, c = {c:g}", NO_SLIP, c, None) for c in (220.0, 225.0, 250.0, 280.0, 300.0)),
+    ("early touchdown, c = 200", NO_SLIP, 200.0, FAST),
+    *((f"real ground, c = {c:g}", REAL, c, None) for c in (4.0, 50.0, 100.0, 200.0, 250.0, 300.0)),
+]
+SHOWN = ("bouncing, c = 4", "scuffing, c = 50", "lost gait, c = 225", "real ground, c = 250")
+N_STEPS, N_SAMPLES = 60, 40
+LEAST_SHARE = 0.5  # per cent: less in every scene is not drawn
+OPTIONS = {"solver": "Tsit5", "rtol": 1e-9, "atol": 1e-9}
+MODES = ("air", "rest", "down", "up")
+
+
+def starts() -> np.ndarray:
+    """Each scene's own start, or from the paper's gait at the nearest damping that has one."""
+    _, friction, damping, given = zip(*SCENES, strict=True)
+    x = []
+    for mu, c, start in zip(friction, damping, given, strict=True):
+        params = vrw.WheelParams(damping=float(np.clip(c, *GAIT_RANGE)))
+        start = vrw.limit_cycle(params).section_state if start is None else jnp.asarray(start)
+        x.append(np.asarray(vrw.UnilateralWheel(friction=mu).full_section(params, start)))
+    return np.stack(x)
+
+
+@jax.jit
+@jax.vmap
+def told(friction: jax.Array, damping: jax.Array, x: jax.Array) -> vrw.UnilateralStep:
+    """The step from a section state."""
+    params, wheel = vrw.WheelParams(damping=damping), vrw.UnilateralWheel(friction=friction)
+    return wheel.step(params, x, vrw.Options(**OPTIONS))
+
+
+def walked(friction: np.ndarray, damping: np.ndarray, x: np.ndarray) -> tuple:
+    """Outcome, the start of the last good step, that step, all periods, and how many steps."""
+    params, model = vrw.WheelParams(damping=damping), vrw.UnilateralWheel(friction=friction)
+    outcome, last, periods = np.zeros(len(x), int), x, []
+    count = np.zeros(len(x), int)
+    for _ in range(N_STEPS):
+        found = vrw.steps(params, x, model=model, options=vrw.Options(**OPTIONS))
+        good = (outcome == 0) & (np.asarray(found.outcome) == 0)
+        outcome = np.where(outcome == 0, np.asarray(found.outcome), outcome)
+        last = np.where(good[:, None], x, last)
+        x = np.asarray(found.section_state)
+        periods.append(np.asarray(found.durations).sum(-1))
+        count += good
+    step = told(jnp.asarray(friction), jnp.asarray(damping), jnp.asarray(last))
+    return outcome, last, step, np.stack(periods, 1), count
+
+
+def main() -> None:
+    started(command(__doc__))
+    labels, friction, damping, _ = zip(*SCENES, strict=True)
+    outcome, last, step, periods, count = walked(np.array(friction), np.array(damping), starts())
+    header = ("scene", "friction", "damping", "steps", "outcome", "period_s", "period_spread_s")
+    more = ("dls_fraction", "flight_fraction", "speed_m_s", "slip_m", "events", "solutions")
+    pairs, rows = [f"share_{a}_{b}" for a in MODES for b in MODES], []
+    for i, label in enumerate(labels):
+        n, period = int(count[i]), float(step.period[i])
+        spread = float(np.ptp(np.asarray(periods[i, max(n - 5, 0) : n]))) if n else 0.0
+        name = vrw.Outcome(int(outcome[i])).name
+        numbers = [
+            step.dls_fraction[i],
+            step.durations[i, 2] / max(period, 1e-9),
+            step.speed[i],
+            step.slip[i],
+            int(step.events[i]),
+            int(step.most_solutions[i]),
+            *(np.asarray(step.mode_durations[i]).ravel() / max(period, 1e-9)),
+        ]
+        row = [label, friction[i], damping[i], n, name, f"{period:.6f}", f"{spread:.1e}"]
+        rows.append([*row, *(f"{float(v):.5g}" for v in numbers)])
+    write(FIGURES / "unilateral_scenes.csv", (*header, *more, *pairs), rows)
+    shares = np.asarray(step.mode_durations / np.maximum(step.period, 1e-9)[:, None, None])
+    with plots.style():
+        draw([labels.index(name) for name in SHOWN], labels, friction, damping, last)
+        draw_modes(labels, shares)
+
+
+def draw(chosen: list[int], labels: tuple, friction: tuple, damping: tuple, x: np.ndarray) -> None:
+    """Ground forces and foot heights of the last step of some scenes, and the paper's step."""
+    figure, axes = plt.subplots(2, len(chosen), figsize=(1.9 * len(chosen), 4.2), sharey="row")
+    paper = vrw.ViscoelasticWheel(stop_at_lift_off=False)
+    for column, i in enumerate(chosen):
+        params = vrw.WheelParams(damping=damping[i])
+        wheel = vrw.UnilateralWheel(friction=friction[i])
+        trace = wheel.trace(params, jnp.asarray(x[i]), vrw.Options(), N_SAMPLES)
+        s, top, low = params.symbols(), axes[0, column], axes[1, column]
+        heights = jax.vmap(
+            jax.vmap(lambda y, s=s: foot_heights(unpack(y)[0], directions(s, unpack(y)[0].theta)))
+        )(trace.state)
+        happened = np.flatnonzero(np.asarray(trace.duration) > 0.0)
+        time = np.concatenate([np.asarray(trace.time[k]) for k in happened])
+        on_paper = x[i][[0, 1, 4 + params.n_legs]]
+        formal = vrw.simulate(params, on_paper, 1, model=paper, n_samples=N_SAMPLES)
+        for leg, (name, color) in enumerate((("fore foot", "C0"), ("rear foot", "C1"))):
+            joined = lambda values, leg=leg, happened=happened: np.concatenate(
+                [np.asarray(values[k])[:, leg] for k in happened]
+            )
+            top.plot(time, joined(trace.normal), color, label=f"{name}, normal")
+            top.plot(time, joined(trace.tangential), color + "--", label=f"{name}, tangential")
+            low.plot(time, 1e3 * joined(heights), color, label=name)
+            grey = {"color": "0.6", "lw": 1.0, "zorder": 0, "ls": "-" if leg == 0 else "-."}
+            shown = f"{name}, paper's model"
+            top.plot(formal.time, formal[f"lambda_{2 * leg + 2}"], **grey, label=shown)
+            if leg == 1:
+                low.plot(formal.time, 1e3 * formal.foot_2_z, **grey, label=shown)
+        top.set_title(labels[i])
+        low.set(xlabel="time since landing / s", ylim=(-25.0, 60.0))
+    axes[0, 0].set_ylabel("ground force / N")
+    axes[1, 0].set_ylabel("foot height / mm")
+    axes[0, 0].legend(fontsize=5)
+    axes[1, 0].legend(fontsize=5)
+    plots.save(figure, FIGURES, "unilateral_scenes")
+
+
+def draw_modes(labels: tuple, shares: np.ndarray) -> None:
+    """Time in each pair of contact modes, fore foot first, scene by scene."""
+    figure, axis = plt.subplots(figsize=(plots.PAGE, 4.2))
+    words = {"air": "air", "rest": "rest", "down": "slides down", "up": "slides up"}
+    colours, left, count = plt.get_cmap("tab20"), np.zeros(len(labels)), 0
+    for a, first in enumerate(MODES):
+        for b, second in enumerate(MODES):
+            share = 100.0 * shares[:, a, b]
+            if share.max() < LEAST_SHARE:
+                continue
+            name = f"{words[first]}, {words[second]}"
+            axis.barh(labels, share, left=left, color=colours(count), label=name)
+            left, count = left + share, count + 1
+    axis.invert_yaxis()
+    axis.set(xlabel="share of the step / %", xlim=(0.0, 100.0), title="fore foot, rear foot")
+    axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+    plots.save(figure, FIGURES, "unilateral_modes")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,21 @@
+"""Over a step of Table 1's gait θ grows, Leg 1 contracts, Leg 2 extends and the load goes forward.
+
+    python -m experiments.paper.fig06_gait [folder]
+
+Writes `fig06_gait.svg` and `.png` to `results/` or the folder given.
+"""
+
+from experiments.shared.command import started_with_folder
+from vrw_jax.figures import walk as plots
+from vrw_jax.paper import reproduction
+
+STEPS = 3
+
+
+def main() -> None:
+    folder = started_with_folder(__doc__)
+    plots.save(plots.gait_panels(reproduction.gait_at_table_1(STEPS)), folder, "fig06_gait")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,21 @@
+"""The normal force on foot 2 just after landing approaches zero as the damping grows.
+
+    python -m experiments.paper.fig09_rear_force [folder]
+
+Writes `fig09_rear_force.svg` and `.png` to `results/` or the folder given.
+"""
+
+from experiments.shared.command import started_with_folder
+from vrw_jax.figures import walk as plots
+from vrw_jax.paper import reproduction
+
+DAMPINGS = (50.0, 100.0, 200.0)  # N s/m
+
+
+def main() -> None:
+    folder = started_with_folder(__doc__)
+    plots.save(plots.rear_force(reproduction.gaits_at(DAMPINGS)), folder, "fig09_rear_force")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,23 @@
+"""λ_I4 stays positive along the damping; λ2⁺ vanishes at c = 4 and λ4⁺ at c = 220, at slope 0.30.
+
+    python -m experiments.paper.fig10_indicators [folder]
+
+Writes `fig10_indicators.svg` and `.png` to `results/` or the folder given.
+"""
+
+from experiments.shared.command import started_with_folder
+from vrw_jax.figures import walk as plots
+from vrw_jax.paper import reproduction
+
+EVERY = 4  # one symbol for so many gaits
+
+
+def main() -> None:
+    folder = started_with_folder(__doc__)
+    plots.save(
+        plots.indicators(reproduction.gaits_along_damping(), EVERY), folder, "fig10_indicators"
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""What every experiment needs: its command, its tables, its clock, its wheels."""

@@ -1,0 +1,1 @@
+"""What steps, cycles, scans and compiling cost, beside others and beside before."""

@@ -1,0 +1,224 @@
+"""What limit cycles cost: per cycle and core, per gradient, to the first answer; and the hit rate.
+
+    python -m experiments.speed.cycle_benchmark [file]
+
+Writes `docs/cycles.md`, or the file given. Times are CPU seconds of one core, the least of some,
+unless called wall; take them on an idle machine.
+"""
+
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import vrw_jax as vrw
+from experiments.shared.command import command, started
+from experiments.shared.tables import DOCS, markdown
+from experiments.shared.timing import on_one_core, processor, seconds
+from experiments.shared.wheels import WIDE_BOX, rows_of
+from experiments.shared.wheels import wheels as wheels_of_rows
+from vrw_jax.cycles.sensitivity import MEASURES
+from vrw_jax.wheel import parameters_of, wheel_of
+
+N_SETS, N_STAGES, LANES = 2048, 48, 1024
+FIRST = """
+import time; began = time.time(), time.process_time()
+import jax
+import vrw_jax as vrw
+{start}
+gradient = jax.jit(jax.grad(lambda p: vrw.limit_cycle(p).{measure}))(vrw.WheelParams())
+jax.block_until_ready(gradient)
+print(time.time() - began[0], time.process_time() - began[1])
+"""
+
+
+def wheels(generator: np.random.Generator, n: int) -> vrw.WheelParams:
+    """Random wheels, every parameter a lane of its own."""
+    drawn = wheels_of_rows(rows_of(WIDE_BOX, n, generator))
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n,)), drawn)
+
+
+def least(function: Callable, *arguments: object) -> float:
+    """CPU seconds of a call on one core."""
+    jax.block_until_ready(function(*arguments))
+    with on_one_core():
+        return seconds(lambda: function(*arguments), told=min)
+
+
+STARTS = {
+    "cold": "vrw.start_jax()",
+    "warm cache": "vrw.start_jax()",
+    "cold, without `start_jax`": 'jax.config.update("jax_enable_x64", True)',
+}
+"""How a process begins; the first two share a cache."""
+
+
+def first_answer(measure: str) -> list[tuple[float, float]]:
+    """(wall, CPU) seconds of a process that asks for one gradient, for each of STARTS."""
+    told = []
+    with tempfile.TemporaryDirectory() as cache:
+        for start in STARTS.values():
+            environment = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
+            if "start_jax" in start:
+                environment["JAX_COMPILATION_CACHE_DIR"] = cache
+            command = [sys.executable, "-c", FIRST.format(measure=measure, start=start)]
+            out = subprocess.run(
+                command, env=environment, capture_output=True, text=True, check=True
+            )
+            wall, cpu = map(float, out.stdout.split()[-2:])
+            told.append((wall, cpu))
+    return told
+
+
+def reference(params: vrw.WheelParams) -> np.ndarray:
+    """Which wheels natural continuation from Table 1 reaches, in small steps, each from the last.
+
+    A lane whose gait is lost, or jumps, on the way is not reached.
+    """
+    ends = parameters_of(params)
+    starts = jnp.broadcast_to(parameters_of(vrw.WheelParams())[:, None], ends.shape)
+    find = jax.jit(jax.vmap(lambda p, guess: vrw.limit_cycle(wheel_of(p, 8), guess=guess)))
+    here = jax.jit(jax.vmap(lambda p: vrw.limit_cycle(wheel_of(p, 8))))(starts.T)
+    reached = np.ones(ends.shape[1], bool)
+    for share in np.linspace(0.0, 1.0, N_STAGES + 1)[1:]:
+        there = find((starts + share * (ends - starts)).T, here)
+        moved = np.max(np.abs(np.asarray(there.durations - here.durations)), axis=-1)
+        with_dls = np.asarray(there.durations)[:, 0] > 0.0
+        reached &= np.asarray(there.found) & (moved < 0.1) & with_dls
+        here = there
+    return reached
+
+
+def hit_rate() -> dict[str, int]:
+    params = wheels(np.random.default_rng(7), N_SETS)
+    reached = reference(params)
+    cold = jax.jit(jax.vmap(vrw.limit_cycle))(params)
+    found = np.asarray(cold.found)
+    options = vrw.Options.tight()
+    walk = jax.jit(jax.vmap(lambda p, x: vrw.return_map(p, x, options=options)))
+    x = np.asarray(cold.section_state)
+    away = np.max(np.abs(np.asarray(walk(params, cold.section_state)) - x), axis=-1)
+    return {
+        "sets": N_SETS,
+        "reached by continuation": int(reached.sum()),
+        "of those found from a cold start": int((reached & found).sum()),
+        "found besides": int((found & ~reached).sum()),
+        "found, but not confirmed by the event-driven step to 1e-7": int(
+            (found & ~(away < 1e-7)).sum()
+        ),
+    }
+
+
+def throughput() -> dict[str, float]:
+    """Microseconds of one core per cycle, in batches."""
+    params = wheels(np.random.default_rng(3), 8 * LANES)
+    every = jax.jit(jax.vmap(vrw.limit_cycle))
+    kept = np.flatnonzero(np.asarray(every(params).found))[:LANES]
+    params = jax.tree.map(lambda x: x[kept], params)
+    vectors = parameters_of(params).T
+    cold = jax.jit(jax.vmap(vrw.limit_cycle))
+    near = cold(jax.tree.map(lambda x: x * (1.0 + 1e-3), params))
+
+    def residuals(p: vrw.WheelParams) -> tuple:
+        cycle = vrw.limit_cycle(p)
+        return cycle.section_state, cycle.residual, cycle.multipliers
+
+    def from_neighbour(p: vrw.WheelParams, guess: vrw.LimitCycle) -> tuple:
+        cycle = vrw.limit_cycle(p, guess=guess)
+        return cycle.section_state, cycle.residual, cycle.multipliers
+
+    def differentiated(v: jax.Array) -> tuple:
+        def told(v: jax.Array) -> tuple:
+            cycle = vrw.limit_cycle(wheel_of(v, 8))
+            values = jnp.concatenate([cycle.post_impact, cycle.durations, cycle.dls_fraction[None]])
+            return values, cycle.residual
+
+        return jax.jacfwd(told, has_aux=True)(v)
+
+    table = {
+        "from the default guess, with multipliers": (jax.jit(jax.vmap(residuals)), params),
+        "from a neighbour 0.1 % away, with multipliers": (
+            jax.jit(jax.vmap(from_neighbour)), params, near,
+        ),
+        "with nine first derivatives of everything": (jax.jit(jax.vmap(differentiated)), vectors),
+    }  # fmt: skip
+    return {name: 1e6 * least(*call) / LANES for name, call in table.items()}
+
+
+def sensitivity_ratio() -> dict[str, float]:
+    """Milliseconds of one gait alone: a return map, a cycle, and a full sensitivity."""
+    params, x = vrw.WheelParams(), vrw.limit_cycle(vrw.WheelParams()).section_state
+    names = [name for name in MEASURES if name not in ("spectral_radius", "stability_margin")]
+
+    def told(v: jax.Array) -> jax.Array:
+        cycle = vrw.limit_cycle(wheel_of(v, 8))
+        return jnp.stack([MEASURES[name][1](cycle) for name in names])
+
+    v = parameters_of(params)
+    return {
+        "return map at the default options": 1e3 * least(jax.jit(vrw.return_map), params, x),
+        "limit cycle from the default guess": 1e3 * least(jax.jit(told), v),
+        f"limit cycle with {len(names)} measures x 9 derivatives": 1e3
+        * least(jax.jit(jax.jacfwd(told)), v),
+    }
+
+
+def compiling() -> str:
+    """Seconds of processes that ask for one gradient."""
+    answers = [
+        (f"gradient of `{measure}`, {state}", f"{wall:.1f}", f"{cpu:.1f}")
+        for measure in ("dls_fraction", "spectral_radius")
+        for state, (wall, cpu) in zip(STARTS, first_answer(measure), strict=True)
+    ]
+    return markdown(("to the first answer of a process", "wall, s", "CPU, s"), answers)
+
+
+def batches() -> str:
+    """Cycles side by side."""
+    header = (f"batches of {LANES}", "µs per cycle", "per second and core")
+    costs = throughput().items()
+    return markdown(header, [(name, f"{us:.0f}", f"{1e6 / us:,.0f}") for name, us in costs])
+
+
+def alone() -> str:
+    """One gait by itself."""
+    costs = sensitivity_ratio()
+    unit = next(iter(costs.values()))
+    cells = [(name, f"{ms:.2f}", f"{ms / unit:.2f}") for name, ms in costs.items()]
+    return markdown(("one gait alone", "ms", "return maps"), cells)
+
+
+def finding() -> str:
+    """How often gaits are found."""
+    box = ", ".join(f"{n} {low:g}…{high:g}" for n, (low, high) in WIDE_BOX.items())
+    table = markdown(("", "wheels"), [(name, f"{n:,}") for name, n in hit_rate().items()])
+    return (
+        f"Random wheels of the box {box}. Reference: continuation from Table 1 in {N_STAGES} "
+        f"steps.\n\n{table}"
+    )
+
+
+def main() -> None:
+    parser = command(__doc__)
+    parser.add_argument("file", type=Path, nargs="?", default=DOCS / "cycles.md")
+    file = started(parser).file
+    parts = [
+        "# What limit cycles cost, and how often they are found",
+        f"`python -m experiments.speed.cycle_benchmark`; {processor()}, jax {jax.__version__}. CPU "
+        "seconds, one core; wall times on two. On a shared machine the same code has taken up to "
+        "1.5 times more or less.",
+    ]
+    for section in (compiling, batches, alone, finding):
+        parts.append(section())
+        print(parts[-1], flush=True)
+        file.write_text("\n\n".join(parts) + "\n")
+
+
+if __name__ == "__main__":
+    main()

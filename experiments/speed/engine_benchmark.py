@@ -1,0 +1,246 @@
+"""The lane engine takes more gait steps per second and core than its peers, at equal error.
+
+    python -m experiments.speed.engine_benchmark [--lanes 4096] [--repeats 5]
+
+4,096 wheels near their own limit cycles (1 % off) take one gait step each, by every engine and at
+several tolerances, in turns. Error: largest of section state and durations, against the diffrax
+engine at `Options.tight()`; its 99th percentile over lanes counts. Time: CPU time of one core,
+median over turns. Peers start after the landing and watch three events alone. Writes a table (csv,
+markdown) and two charts: speed over error, and cost over the share of lanes that fail.
+"""
+
+import os
+import platform
+import time
+from importlib.metadata import version
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+import vrw_jax as vrw
+from experiments.shared.command import command
+from experiments.shared.tables import DOCS, markdown, replace, write_named
+from experiments.shared.timing import on_one_core, processor, start_cold
+from experiments.shared.wheels import near_gaits, wheels
+from experiments.speed import peers
+from vrw_jax.figures import walk as plots
+from vrw_jax.wheel import transitions
+
+LABELS = {
+    "collocation": "lanes by collocation, durations known to 3 %",
+    "lanes": "lane engine, any start",
+    "diffrax": "vmapped diffrax engine",
+    "numba": "numba, scalar Dormand-Prince 5(4)",
+    "heyoka": "heyoka, scalar Taylor",
+    "scipy": "SciPy DOP853, compiled right-hand side",
+}
+CLAIMED = 1e-8
+"""Error at which engines are compared."""
+
+
+def by_library(engine, solver, tolerance):
+    """A run of the library's engine: rows, states -> states and durations."""
+    options = vrw.Options(solver=solver, rtol=tolerance, atol=tolerance)
+
+    def run(rows, states):
+        found = vrw.steps(wheels(rows), states, options=options, engine=engine)
+        return np.concatenate([found.section_state, found.durations], 1)
+
+    return run
+
+
+def by_collocation(options, expected):
+    """A run in fixed work, lanes that fail their check by the lane engine."""
+
+    def run(rows, states):
+        found = vrw.steps(
+            wheels(rows),
+            states,
+            options=options,
+            engine="collocation",
+            durations=expected[: len(rows)],
+        )
+        return np.concatenate([found.section_state, found.durations], 1)
+
+    return run
+
+
+def by_peer(function):
+    """A run of a peer, which starts after the landing."""
+
+    def prepare(rows, states):
+        params = wheels(rows)
+        landing = transitions.land(params.symbols(), *np.asarray(states).T)
+        starts = np.asarray(np.stack([landing.theta, landing.motion.dtheta], 1))
+        packed = peers.pack(params)
+        return lambda: function(starts, packed)[:, :6]
+
+    return prepare
+
+
+def candidates(durations):
+    """(engine, method, tolerance, lanes, prepare): one entry for each row of the table."""
+    near = durations * np.random.default_rng(3).uniform(0.97, 1.03, durations.shape)
+    options = vrw.Options(rtol=6e-8, atol=6e-8)
+    yield "collocation", "Gauss-4", 6e-8, 1.0, by_collocation(options, near)
+    for solver in ("Tsit5", "Dopri5", "Dopri8"):
+        for tolerance in (1e-6, 1e-7, 6e-8, 1.5e-8, 1e-9, 1e-10):
+            yield "lanes", solver, tolerance, 1.0, by_library("lanes", solver, tolerance)
+    for solver in ("Tsit5", "Dopri8"):
+        for tolerance in (6e-8, 1.5e-8, 1e-10):
+            yield "diffrax", solver, tolerance, 0.25, by_library("diffrax", solver, tolerance)
+    for tolerance in (1e-6, 1e-7, 8e-9, 1e-9, 1e-10):
+        yield (
+            "numba", "Dopri5", tolerance, 0.25,
+            by_peer(lambda s, p, tol=tolerance: peers.numba_steps(s, p, tol)),
+        )  # fmt: skip
+    for tolerance in (1e-6, 3e-7, 1e-9, 1e-12):
+        yield "heyoka", "Taylor", tolerance, 0.25, by_peer(peers.Heyoka(tolerance))
+    for tolerance in (1e-6, 1e-8, 5e-10):
+        yield (
+            "scipy", "DOP853", tolerance, 1 / 128,
+            by_peer(lambda s, p, tol=tolerance: peers.scipy_steps(s, p, tol)),
+        )  # fmt: skip
+
+
+def compare(rows, states, truth, repeats):
+    """The table: engine, method, tolerance, p99 error, gait steps per second, first call."""
+    table, runs = [], []
+    for engine, method, tolerance, share, make in candidates(truth[:, 3:]):
+        n = max(int(share * len(rows)), 16)
+        if engine in ("collocation", "lanes", "diffrax"):
+            run = lambda make=make, n=n: make(rows[:n], states[:n])
+        else:
+            run = make(rows[:n], states[:n])
+        begin = time.perf_counter()
+        found = run()
+        first = time.perf_counter() - begin
+        error = np.quantile(np.max(np.abs(found - truth[:n]), 1), 0.99)
+        entry = {"engine": engine, "method": method, "tolerance": tolerance, "p99_error": error}
+        table.append(entry | {"lanes": n, "first_call_s": first, "times": []})
+        runs.append(run)
+        print(f"{engine:8s} {method:7s} {tolerance:.1e}  error {error:.1e}  {first:.1f} s")
+    for _ in range(repeats):
+        for entry, run in zip(table, runs, strict=True):
+            begin = time.process_time()
+            run()
+            entry["times"].append(time.process_time() - begin)
+    for entry in table:
+        entry["steps_per_s"] = entry["lanes"] / np.median(entry.pop("times"))
+    return table
+
+
+def at_claimed_error(table):
+    """The fastest entry of each engine with an error of at most CLAIMED."""
+    best = {}
+    for entry in sorted(table, key=lambda e: e["steps_per_s"]):
+        if entry["p99_error"] <= CLAIMED:
+            best[entry["engine"]] = entry
+    return {name: best[name] for name in LABELS if name in best}
+
+
+def cost_of_failures(rows, states, repeats):
+    """CPU microseconds per lane over the share of lanes that fall back, by engine."""
+    failing_rows, failing = rows.copy(), states.copy()
+    failing_rows[:, 3], failing[:, 1] = 0.1, 0.9  # too flat, too slow: they fall back
+    shares, random = np.linspace(0.0, 1.0, 6), np.random.default_rng(2)
+    runs = {
+        "lanes": (by_library("lanes", "Dopri8", 6e-8), len(rows)),
+        "diffrax": (by_library("diffrax", "Dopri8", 6e-8), len(rows) // 4),
+    }
+    cost = {name: np.zeros((repeats, len(shares))) for name in runs}
+    for repeat in range(repeats):
+        for k, share in enumerate(shares):
+            fails = random.permutation(len(rows)) < share * len(rows)
+            some = np.where(fails[:, None], failing_rows, rows)
+            start = np.where(fails[:, None], failing, states)
+            for name, (run, n) in runs.items():
+                begin = time.process_time()
+                run(some[:n], start[:n])
+                cost[name][repeat, k] = (time.process_time() - begin) / n * 1e6
+    return shares, {name: np.median(x, 0) for name, x in cost.items()}
+
+
+def write(table, shares, cost, out):
+    """Table, page and charts."""
+    figures = out / "figures"
+    shown = {"p99_error": ".2e", "steps_per_s": ".0f", "first_call_s": ".1f"}
+    rounded = [entry | {k: format(entry[k], form) for k, form in shown.items()} for entry in table]
+    write_named(figures / "engine.csv", rounded)
+    best = at_claimed_error(table)
+    fastest = best["lanes"]["steps_per_s"]
+    header = ("engine", "method, tolerance", "p99 error", "gait steps per second and core")
+    header = (*header, "of the lane engine's")
+    cells = [
+        (
+            LABELS[name],
+            f"{entry['method']}, {entry['tolerance']:.1e}",
+            f"{entry['p99_error']:.1e}",
+            f"{entry['steps_per_s']:,.0f}",
+            f"{entry['steps_per_s'] / fastest:.3g}",
+        )
+        for name, entry in best.items()
+    ]
+    packages = ("jax", "jaxlib", "diffrax", "numba", "scipy", "heyoka", "numpy")
+    quiet = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
+    versions = ", ".join(f"{name} {version(name)}" for name in packages)
+    text = (
+        f"{markdown(header, cells)}\n\n"
+        f"{processor()}; Python {platform.python_version()}, {versions}; load average {quiet:.1f} "
+        f"on {os.cpu_count()} cores."
+    )
+    print(text)
+    replace(out / "engine.md", "speeds", text)
+    with plots.style():
+        plots.save(draw_charts(table, shares, cost), figures, "engine")
+
+
+def draw_charts(table, shares, cost):
+    """Speed over error of every engine, and cost over the share of lanes that fall back."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(plots.PAGE, 3.9))
+    markers = dict(zip(("Tsit5", "Dopri5", "Dopri8"), "os^", strict=True))
+    colours = dict(
+        zip(LABELS, [*plt.rcParams["axes.prop_cycle"].by_key()["color"], plots.GREY], strict=True)
+    )
+    for name, label in LABELS.items():
+        for method in dict.fromkeys(e["method"] for e in table if e["engine"] == name):
+            some = [e for e in table if (e["engine"], e["method"]) == (name, method)]
+            some.sort(key=lambda e: e["p99_error"])
+            several = name in ("lanes", "diffrax")
+            left.loglog(
+                [e["p99_error"] for e in some],
+                [e["steps_per_s"] for e in some],
+                ms=4,
+                marker=markers.get(method, "o") if several else "D",
+                linestyle="-" if name in ("lanes", "collocation") else "--",
+                color=colours[name],
+                label=f"{label}, {method}" if several else label,
+            )
+    left.axvline(CLAIMED, color="0.7", lw=1)
+    left.set(xlabel="p99 error over lanes", ylabel="gait steps per second and core")
+    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    for name, values in cost.items():
+        right.semilogy(100.0 * shares, values, "o-", ms=4, color=colours[name], label=LABELS[name])
+    right.set(xlabel="lanes that fall back, %", ylabel="CPU time per lane, µs")
+    right.set_ylim(bottom=1.0)
+    right.legend()
+    return figure
+
+
+def main():
+    parser = command(__doc__)
+    parser.add_argument("--lanes", type=int, default=4096)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--out", type=Path, default=DOCS)
+    chosen = parser.parse_args()
+    with on_one_core():
+        start_cold()
+        rows, states, truth = near_gaits(chosen.lanes)
+        table = compare(rows, states, truth, chosen.repeats)
+        shares, cost = cost_of_failures(rows, states, chosen.repeats)
+    write(table, shares, cost, chosen.out)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,187 @@
+"""A scan takes time linear in its samples and flat memory, on two cores, killed or not.
+
+    python -m experiments.speed.scan_benchmark [largest]
+
+Grids of 1,000 samples and ten times as many each time, up to the largest (1,000,000), are scanned
+by a process each; the largest is killed with signal 9 after a third and after two thirds. Run it
+again after any interruption: it goes on. Writes `scan_benchmark.csv`, `.png` and `.svg`, and
+pictures of the largest scan, into `docs/figures`.
+"""
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+import vrw_jax as vrw
+from experiments.shared.command import command, started
+from experiments.shared.tables import FIGURES, write_named
+from vrw_jax.scans import Plan, Progress, plan, run
+
+ROOT = Path(__file__).parents[2]
+STORES = ROOT / "results" / "scan_benchmark"
+COUNTS = {  # damping, stiffness, natural length, slope
+    1_000: (5, 4, 5, 10),
+    10_000: (10, 10, 5, 20),
+    100_000: (25, 20, 5, 40),
+    1_000_000: (50, 40, 5, 100),
+}
+MEASURES = ("dls_fraction", "speed", "period", "step_length", "lambda_I4", "lambda_4_plus")
+KILLED_AT = (1 / 3, 2 / 3)
+ITSELF = (sys.executable, "-m", "experiments.speed.scan_benchmark")
+CHECKED = 3
+"""Chunks of the largest scan that are computed again and compared bit by bit."""
+
+
+def planned(size: int) -> Plan:
+    damping, stiffness, natural_length, slope = COUNTS[size]
+    design = vrw.grid(
+        damping=np.linspace(100.0, 200.0, damping),
+        stiffness=np.linspace(420.0, 500.0, stiffness),
+        natural_length=np.linspace(1.015, 1.035, natural_length),
+        slope=np.linspace(0.27, 0.305, slope),
+    )
+    return plan(design, MEASURES)
+
+
+def log(size: int) -> Path:
+    return STORES / f"{size}.jsonl"
+
+
+def scan(size: int, since: float) -> None:
+    """In a process of its own: every chunk's progress goes to the log, kill or no kill."""
+
+    def report(progress: Progress) -> None:
+        told = {
+            "session": os.getpid(),
+            "kept": progress.kept,
+            "done": progress.done,
+            "failed": progress.failed,
+            "wall": time.time() - since,
+            "cpu": time.process_time(),
+            "peak": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,  # MiB
+        }
+        with log(size).open("a") as file:
+            file.write(json.dumps(told) + "\n")
+
+    run(planned(size), STORES / f"{size}.zarr", report=report)
+
+
+def sessions(size: int) -> list[list[dict]]:
+    """Reports of each process that worked on a scan, in order."""
+    if not log(size).exists():
+        return []
+    told: dict[int, list[dict]] = {}
+    for line in log(size).read_text().splitlines():
+        entry = json.loads(line)
+        told.setdefault(entry["session"], []).append(entry)
+    return list(told.values())
+
+
+def done(size: int) -> int:
+    """Samples in the store, as far as told."""
+    told = sessions(size)
+    return told[-1][-1]["kept"] + told[-1][-1]["done"] if told else 0
+
+
+def supervise(size: int, killed_at: tuple[float, ...]) -> None:
+    """Run a scan to its end, killing it on the way where that has not happened yet."""
+    due = [share * size for share in killed_at if done(size) < share * size]
+    returned = None
+    while returned != 0:
+        itself = [*ITSELF, str(size), "--since", str(time.time())]
+        process = subprocess.Popen(itself, cwd=ROOT)
+        while process.poll() is None:
+            time.sleep(1.0)
+            if due and done(size) >= due[0]:
+                due.pop(0)
+                os.kill(process.pid, signal.SIGKILL)
+                print(f"killed after {done(size):,} of {size:,}", flush=True)
+                process.wait()
+        returned = process.returncode
+        if returned not in (0, -signal.SIGKILL):
+            raise SystemExit(returned)
+
+
+def figures_of(size: int) -> dict[str, object]:
+    told = sessions(size)
+    last = [reports[-1] for reports in told]
+    scanning = sum(reports[-1]["wall"] - reports[0]["wall"] for reports in told)
+    return {
+        "samples": size,
+        "processes": len(told),
+        "wall_s": round(sum(entry["wall"] for entry in last), 1),
+        "cpu_s": round(sum(entry["cpu"] for entry in last), 1),
+        "to_first_chunk_s": round(told[0][0]["wall"], 1),
+        "samples_per_s": round(sum(entry["done"] for entry in last) / max(scanning, 1e-9), 0),
+        "failed_share": round(sum(entry["failed"] for entry in last) / size, 4),
+        "peak_MiB": round(max(entry["peak"] for entry in last)),
+    }
+
+
+def draw(rows: list[dict[str, object]]) -> None:
+    """The scanning processes, whose memory is told, do not know how to draw."""
+    from matplotlib.figure import Figure
+
+    from vrw_jax.figures import walk as plots
+
+    size = [row["samples"] for row in rows]
+    with plots.style():
+        figure = Figure(figsize=(plots.PAGE, 2.4))
+        left, right = figure.subplots(1, 2)
+        left.loglog(size, [row["wall_s"] for row in rows], "o-", label="wall")
+        left.loglog(size, [row["cpu_s"] for row in rows], "s--", label="CPU, both cores")
+        left.set(xlabel="samples", ylabel="time [s]")
+        left.legend()
+        right.semilogx(size, [row["peak_MiB"] for row in rows], "o-")
+        right.axhline(2048, color="#555555", linestyle=":")
+        right.set(xlabel="samples", ylabel="peak memory [MiB]", ylim=(0, 2300))
+    plots.save(figure, FIGURES, "scan_benchmark")
+
+
+def compare(size: int) -> None:
+    """Some chunks computed again, by nobody's leave: they must be the stored ones, bit by bit."""
+    of = planned(size)
+    stored, engine = vrw.open_scan(STORES / f"{size}.zarr"), of.engine()
+    assert np.all(stored.outcome.values >= 0), "samples are missing"
+    for index in np.linspace(0, of.layout.n_chunks - 1, CHECKED).astype(int):
+        region = of.layout.region(int(index))
+        for name, values in engine(of.design.block(region)).items():
+            there = stored[name][region].values
+            np.testing.assert_array_equal(values.reshape(there.shape), there, name)
+    print(f"{CHECKED} chunks of {size:,} samples computed again: bitwise the stored ones")
+
+
+def main() -> None:
+    parser = command(__doc__)
+    parser.add_argument("largest", type=int, choices=COUNTS, nargs="?", default=max(COUNTS))
+    parser.add_argument("--since", type=float, help="that scan alone, in a process begun then")
+    chosen = started(parser)
+    STORES.mkdir(parents=True, exist_ok=True)
+    if chosen.since:
+        scan(chosen.largest, chosen.since)
+        return
+    sizes = [size for size in COUNTS if size <= chosen.largest]
+    for size in sizes:
+        supervise(size, KILLED_AT if size == max(COUNTS) else ())
+        print(figures_of(size), flush=True)
+    rows = [figures_of(size) for size in sizes]
+    write_named(FIGURES / "scan_benchmark.csv", rows)
+    draw(rows)
+    compare(sizes[-1])
+
+    from vrw_jax.figures import scan_figures
+    from vrw_jax.figures import walk as plots
+
+    for name, figure in scan_figures(vrw.open_scan(STORES / f"{sizes[-1]}.zarr")).items():
+        plots.save(figure, FIGURES, f"{name}_of_{sizes[-1]}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,81 @@
+"""Times that can be compared between commits: running and compiling apart.
+
+    python -m experiments.speed.wall_time       # keeps them under .benchmarks
+    pytest-benchmark compare --group-by=name    # commit beside commit
+
+Running: CPU time of a call that has been compiled. First: wall time of a process that starts,
+compiles with no cache and answers. All on one core. No test of the library looks at a clock; these
+are kept apart. Take them on an idle machine, both commits in one sitting. Further arguments are
+pytest's.
+"""
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vrw_jax as vrw
+from experiments.shared.command import command, extra
+from experiments.shared.timing import on_one_core, start_cold
+from experiments.shared.wheels import BOX, rows_of, wheels
+
+START = (0.1, 1.6, -0.1)
+RUNNING = {
+    "one step": lambda: vrw.return_map(vrw.WheelParams(), START),
+    "4,096 steps": lambda: vrw.steps(wheels(rows(4096)), np.tile(START, (4096, 1))),
+    "one limit cycle": lambda: vrw.limit_cycle(vrw.WheelParams()),
+    "1,024 limit cycles": lambda: many_cycles(rows(1024)),
+    "a gradient": lambda: gradient(vrw.WheelParams()),
+    "256 steps on real ground": lambda: vrw.steps(
+        wheels(rows(256)), np.tile(START, (256, 1)), model=vrw.UnilateralWheel()
+    ),
+}
+FIRST = {
+    "step": "vrw.step(vrw.WheelParams(), (0.1, 1.6, -0.1))",
+    "gradient": "jax.grad(lambda p: vrw.limit_cycle(p).dls_fraction)(vrw.WheelParams())",
+    "scan": "vrw.scan(vrw.grid(damping=[100.0, 150.0], slope=[0.28, 0.3]), ['dls_fraction'])",
+}
+
+
+def rows(n: int) -> np.ndarray:
+    """Parameters of some wheels, the same each time."""
+    return rows_of(BOX, n, np.random.default_rng(0))
+
+
+many_cycles = jax.jit(jax.vmap(lambda row: vrw.limit_cycle(wheels(row)).period))
+gradient = jax.jit(jax.grad(lambda p: vrw.limit_cycle(p).dls_fraction))
+
+
+@pytest.mark.benchmark(timer=time.process_time, min_time=0.02, max_time=2.0)
+@pytest.mark.parametrize("name", RUNNING)
+def test_running(name: str, benchmark: Callable) -> None:
+    call = lambda: jax.block_until_ready(jax.tree.leaves(RUNNING[name]()))
+    call()
+    told = benchmark(call)
+    assert all(np.all(np.isfinite(jnp.asarray(leaf))) for leaf in told)
+
+
+@pytest.mark.parametrize("name", FIRST)
+def test_first_answer(name: str, benchmark: Callable, tmp_path: object) -> None:
+    code = f"import jax, vrw_jax as vrw; vrw.start_jax({str(tmp_path)!r}); {FIRST[name]}"
+    start = [sys.executable, "-c", code]
+    run = lambda: subprocess.run(start, check=True, env=dict(os.environ))
+    benchmark.pedantic(run, rounds=1, iterations=1)
+
+
+def main() -> None:
+    _, more = command(__doc__).parse_known_args()
+    extra("pytest_benchmark")
+    with on_one_core():
+        start_cold()
+        raise SystemExit(pytest.main([__file__, "-n", "0", "--benchmark-autosave", *more]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Work against precision of every engine and its peers, quantity by quantity."""

@@ -1,0 +1,339 @@
+"""Charts and tables of work against precision, drawn from its measurements alone."""
+
+import math
+import textwrap
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
+
+from experiments.shared.tables import DOCS, FIGURES, Row, markdown, replace
+from vrw_jax.figures.walk import PAGE, save, style
+
+QUANTITIES = {  # group and title of each panel
+    "post_impact": ("step", "state after the next landing"),
+    "event_times": ("step", "times of the three events"),
+    "cycle": ("cycle", "limit cycle and period"),
+    "dls_fraction": ("cycle", "DLS fraction of the cycle"),
+    "multipliers": ("cycle", "multipliers"),
+    "gradient": ("gradient", "gradient of DLS fraction, period"),
+}
+COLOURS = {  # of Okabe and Ito
+    "lane engine": "#0072B2",
+    "diffrax engine": "#D55E00",
+    "collocation": "#009E73",
+    "diffrax by hand": "#CC79A7",
+    "numba": "#000000",
+    "heyoka": "#E69F00",
+    "SciPy": "#56B4E9",
+    "torchdiffeq": "#999999",
+}
+MARKS = "os^Dv<>ph"
+NOTE: dict = {
+    "fontsize": 6,
+    "zorder": 6,
+    "bbox": {"boxstyle": "square,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.8},
+}
+TARGETS = (1e-3, 1e-6, 1e-9, 1e-12)
+DEFAULTS = {  # what a user gets who chooses nothing, by group
+    ("step", "diffrax engine", "Dopri8", "1e-10"),
+    ("step", "lane engine", "Dopri8", "1e-10"),
+    ("cycle", "collocation", "from nothing", "(10, 8, 3)"),
+    ("gradient", "collocation", "forward", "(10, 8, 3)"),
+}
+WAYS = {  # of the table: group, one wheel or many
+    "one step": ("step", True),
+    "a batch of steps": ("step", False),
+    "one limit cycle": ("cycle", True),
+    "a batch of limit cycles": ("cycle", False),
+    "one gradient": ("gradient", True),
+    "a batch of gradients": ("gradient", False),
+}
+SCALAR = (
+    "numba",
+    "heyoka",
+    "SciPy",
+    "torchdiffeq",
+)  # one wheel costs them what it costs in a batch
+
+
+def time_of(row: Row, unit: float) -> float:
+    """CPU time per gait, us, as if the reference always took `unit`."""
+    return float(row["us_per_gait"]) / float(row["reference_us"]) * unit
+
+
+def unit_of(rows: list[Row]) -> float:
+    """The reference's usual time, us."""
+    return float(np.median([float(row["reference_us"]) for row in rows]))
+
+
+def label_of(row: Row) -> str:
+    """Name of a curve."""
+    exact = "" if row["precision"] == "float64" else f", {row['precision']}"
+    return f"{row['family']}: {row['name']}{exact}"
+
+
+def is_default(row: Row) -> bool:
+    """Whether this is what a user gets who chooses nothing."""
+    named = (row["group"], row["family"], row["name"], row["setting"])
+    return named in DEFAULTS and row["precision"] == "float64"
+
+
+def curves(rows: list[Row], quantity: str) -> dict[str, list[Row]]:
+    """Rows of many lanes that tell of a quantity, by label, loosest first."""
+    told: dict[str, list[Row]] = {}
+    for row in rows:
+        if row.get(f"{quantity}_p99") and int(row["lanes"]) > 1:
+            told.setdefault(label_of(row), []).append(row)
+    return told
+
+
+def style_of(rows: list[Row]) -> dict[str, dict]:
+    """Colour by family, marker by name, float32 hollow and dotted."""
+    styles: dict[str, dict] = {}
+    used: dict[str, list[str]] = {}
+    for row in rows:
+        names = used.setdefault(row["family"], [])
+        if row["name"] not in names:
+            names.append(row["name"])
+        single = row["precision"] == "float32"
+        colour = COLOURS[row["family"]]
+        styles[label_of(row)] = {
+            "color": colour,
+            "marker": MARKS[names.index(row["name"])],
+            "ls": ":" if single else "-",
+            "mfc": "white" if single else colour,
+            "ms": 3.5,
+            "lw": 0.9,
+        }
+    return styles
+
+
+def of_lanes(row: Row) -> int:
+    """Lanes that have a truth among those measured."""
+    return min(int(row["lanes"]), 256)
+
+
+def draw_panel(axes: Axes, rows: list[Row], quantity: str, x_of) -> None:
+    """p99 as a curve, p50 to worst as bars, failures as crosses with their share."""
+    styles = style_of(rows)
+    for label, some in curves(rows, quantity).items():
+        shown = [row for row in some if x_of(row) > 0.0 and int(row["failed"]) < of_lanes(row)]
+        shown = [row for row in shown if float(row[f"{quantity}_p99"]) > 0.0]
+        if not shown:
+            continue
+        x = np.array([x_of(row) for row in shown])
+        p50, p99, worst = (
+            np.array([max(float(row[f"{quantity}_{part}"]), 1e-17) for row in shown])
+            for part in ("p50", "p99", "worst")
+        )
+        axes.vlines(x, p50, worst, color=styles[label]["color"], lw=0.5, alpha=0.6)
+        axes.plot(x, p99, label=label, **styles[label])
+        for a, b, row in zip(x, p99, shown, strict=True):
+            if int(row["failed"]):
+                axes.plot(a, b, "x", color="#D00000", ms=7, mew=1.2, zorder=5)
+                note = f"{row['failed']}/{of_lanes(row)}"
+                axes.annotate(note, (a, b), (4, 3), textcoords="offset points", **NOTE)
+            if is_default(row):
+                axes.plot(a, b, "o", ms=9, mfc="none", mec="#444444", mew=0.8)
+    axes.set(xscale="log", yscale="log")
+    low, high = axes.get_xlim()
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0) if high < 200.0 * low else (1.0,)))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.set_title(textwrap.fill(QUANTITIES[quantity][1], 28))
+    axes.grid(color="0.9", lw=0.4)
+
+
+def panels(rows: list[Row], x_of, x_label: str) -> Figure:
+    """One panel for each quantity with one legend for all; steps have the most methods."""
+    figure = Figure(figsize=(PAGE, 8.0))
+    above, below = list(QUANTITIES)[:2], list(QUANTITIES)[2:]
+    wide = [name for name in above for _ in range(2)]
+    grid = figure.subplot_mosaic([wide, below], sharey=True, height_ratios=(1.3, 1.0))
+    for quantity, axes in grid.items():
+        draw_panel(axes, rows, quantity, x_of)
+        axes.set_xlabel(x_label)
+        axes.tick_params(labelleft=quantity in (above[0], below[0]))
+    for first in (above[0], below[0]):
+        grid[first].set_ylabel("error: p99, bar from p50 to worst")
+    found: dict[str, object] = {}
+    for axes in grid.values():
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            found.setdefault(label, handle)
+    order = sorted(found, key=lambda label: [*COLOURS].index(label.split(":")[0]))
+    handles = [found[label] for label in order]
+    figure.legend(handles, order, loc="outside lower center", ncols=3, fontsize=6.5)
+    return figure
+
+
+def batch_chart(rows: list[Row], every: list[Row]) -> Figure:
+    """Time per gait over the batch, and the first call beside a warm one."""
+    figure = Figure(figsize=(PAGE, 4.4))
+    left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.15))
+    unit = unit_of(every)
+    told: dict[str, list[Row]] = {}
+    cycles = [row for row in every if is_default(row) and row["group"] == "cycle"]
+    for row in (*rows, *cycles):
+        told.setdefault(f"{row['group']}, {row['family']}: {row['name']}", []).append(row)
+    for label, some in told.items():
+        some = sorted(some, key=lambda row: int(row["lanes"]))
+        marker = "s" if some[0]["group"] == "cycle" else "o"
+        ls = "--" if some[0]["group"] == "cycle" else "-"
+        left.loglog(
+            [int(row["lanes"]) for row in some],
+            [time_of(row, unit) for row in some],
+            ls=ls, marker=marker, ms=3.5, color=COLOURS[some[0]["family"]], label=label,
+        )  # fmt: skip
+    left.set(xlabel="wheels in a call", ylabel="CPU time per gait [µs]")
+    left.grid(color="0.9", lw=0.4)
+    left.legend(fontsize=6, loc="upper center", bbox_to_anchor=(0.45, -0.14), ncols=2)
+    first: dict[str, tuple[float, float]] = {}
+    for row in every:
+        name = f"{row['group']}, {label_of(row)}" + (", one" if row["lanes"] == "1" else "")
+        warm = float(row["us_per_gait"]) * int(row["lanes"]) * 1e-6
+        if name not in first or float(row["first_call_s"]) > first[name][0]:
+            first[name] = float(row["first_call_s"]), warm
+    order = sorted(first, key=lambda name: first[name][0])
+    place = np.arange(len(order))
+    right.hlines(place, [first[n][1] for n in order], [first[n][0] for n in order], color="0.8")
+    right.plot([first[n][1] for n in order], place, "o", ms=3, color="#0072B2", label="warm call")
+    right.plot([first[n][0] for n in order], place, "s", ms=3, color="#D55E00", label="first call")
+    right.set_yticks(place, order, fontsize=5.5)
+    right.set(xscale="log", xlabel="CPU time of a call [s]")
+    right.legend(fontsize=6, loc="lower right")
+    return figure
+
+
+def best(rows: list[Row], group: str, alone: bool, target: float) -> Row | None:
+    """The fastest row that keeps every quantity's p99 below the target, with no lane failed.
+
+    One wheel alone is judged by the errors of many: its own might be lucky.
+    """
+    quantities = [name for name, (of, _) in QUANTITIES.items() if of == group]
+    unit = unit_of(rows)
+    some = []
+    for row in rows:
+        fits = row["group"] == group and int(row["failed"]) == 0
+        fits = fits and (row["lanes"] == "1" or not alone or row["family"] in SCALAR)
+        fits = fits and (alone or row["lanes"] != "1")
+        same = [r for r in rows if r["lanes"] != "1" and curve_of(r) == curve_of(row)]
+        judged = same[0] if same else row
+        fits = fits and int(judged["failed"]) == 0
+        if fits and all(float(judged[f"{name}_p99"] or "nan") <= target for name in quantities):
+            some.append(row)
+    return min(some, key=lambda row: time_of(row, unit), default=None)
+
+
+def curve_of(row: Row) -> tuple[str, ...]:
+    """Method and setting, whatever the number of lanes."""
+    return tuple(row[name] for name in ("group", "family", "name", "precision", "setting"))
+
+
+def told_time(us: float) -> str:
+    """Microseconds with a unit."""
+    scale, unit = (1.0, "µs") if us < 1e3 else (1e-3, "ms") if us < 1e6 else (1e-6, "s")
+    return f"{us * scale:.3g} {unit}"
+
+
+def table(rows: list[Row]) -> str:
+    """What to use, ours and of all."""
+    unit = unit_of(rows)
+    ours = [row for row in rows if row["family"] not in (*SCALAR, "diffrax by hand")]
+    lines = []
+    for way, (group, alone) in WAYS.items():
+        for target in TARGETS:
+            cells = [way, f"1e{round(math.log10(target))}"]
+            for some in (ours, rows):
+                row = best(some, group, alone, target)
+                if row is None:
+                    tried = best(some, group, alone, math.inf) is not None
+                    cells += ["none" if tried else "not measured", "–"]
+                else:
+                    cells += [f"{label_of(row)}, {row['setting']}", told_time(time_of(row, unit))]
+            lines.append(cells)
+    header = ("wanted", "p99 error", "ours", "per gait", "fastest of all", "per gait")
+    return markdown(header, lines)
+
+
+def on_the_front(rows: list[Row]) -> str:
+    """How far the defaults lie from the fastest of ours that is at least as accurate."""
+    unit = unit_of(rows)
+    lines = []
+    for row in rows:
+        if not is_default(row) or row["lanes"] == "1":
+            continue
+        for quantity, (group, _) in QUANTITIES.items():
+            if group != row["group"]:
+                continue
+            error = float(row[f"{quantity}_p99"])
+            some = [
+                r
+                for r in rows
+                if r["family"] not in (*SCALAR, "diffrax by hand")
+                and r["group"] == group
+                and r["lanes"] != "1"
+                and int(r["failed"]) == 0
+                and float(r[f"{quantity}_p99"] or "inf") <= error
+            ]
+            quick = min(some, key=lambda r: time_of(r, unit))
+            ratio = time_of(row, unit) / time_of(quick, unit)
+            default = f"{label_of(row)}, {row['setting']}"
+            fastest = f"{label_of(quick)}, {quick['setting']}"
+            costs = f"{error:.1e}", told_time(time_of(row, unit)), fastest, f"{ratio:.2g}"
+            lines.append((default, QUANTITIES[quantity][1], *costs))
+    header = ("default", "quantity", "p99 error", "per gait", "fastest of ours as accurate")
+    return markdown((*header, "ratio"), lines)
+
+
+def floors(rows: list[Row]) -> str:
+    """The least p99 error of each quantity by number format, whatever it costs, and by what."""
+    lines = []
+    for quantity, (_, title) in QUANTITIES.items():
+        cells = [title]
+        for precision in ("float32", "float64"):
+            some = [
+                row
+                for row in rows
+                if row["precision"] == precision
+                and row["family"] not in (*SCALAR, "diffrax by hand")
+                and row.get(f"{quantity}_p99")
+                and int(row["lanes"]) > 1
+                and "durations" not in row["name"]  # of a step, with wheels handed on
+            ]
+            least = min(some, key=lambda row: float(row[f"{quantity}_p99"]), default=None)
+            if least is None:
+                cells += ["not measured", "–"]
+            else:
+                error = float(least[f"{quantity}_p99"])
+                failed = int(least["failed"])
+                lost = f", {failed} of {of_lanes(least)} failed" if failed else ""
+                cells += [f"{error:.0e}", f"{least['family']}, {least['setting']}{lost}"]
+        lines.append(cells)
+    return markdown(("quantity", "float32", "by", "float64", "by"), lines)
+
+
+def failures(rows: list[Row]) -> str:
+    """Every row in which lanes failed."""
+    lines = [
+        (f"{r['group']}, {label_of(r)}", r["setting"], f"{r['failed']} of {of_lanes(r)}")
+        for r in rows
+        if int(r["failed"])
+    ]
+    return markdown(("method", "setting", "wheels that failed"), lines)
+
+
+def draw(rows: list[Row], batches: list[Row]) -> None:
+    """All charts and the tables."""
+    unit = unit_of(rows)
+    with style():
+        time_chart = panels(rows, lambda row: time_of(row, unit), "CPU time per gait [µs]")
+        save(time_chart, FIGURES, "work_precision_time")
+        count = panels(rows, lambda row: float(row["evaluations"]), "evaluations per gait")
+        save(count, FIGURES, "work_precision_evaluations")
+        save(batch_chart(batches, rows), FIGURES, "work_precision_batch")
+    page = DOCS / "work_precision.md"
+    replace(page, "what to use", table(rows))
+    replace(page, "defaults", on_the_front(rows))
+    replace(page, "floors", floors(rows))
+    replace(page, "failures", failures(rows))
