@@ -13,7 +13,7 @@ import jax
 from jax.experimental.compilation_cache import compilation_cache
 
 import vrw_jax as vrw
-from vrw_jax.simd import program
+from vrw_jax.simd import code
 
 
 @contextlib.contextmanager
@@ -39,7 +39,7 @@ def start_cold() -> None:
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
     jax.config.update("jax_platforms", "cpu")
     jax.clear_caches()
-    program._made.clear()
+    code._made.clear()
     _cache = tempfile.TemporaryDirectory()
     vrw.start_jax(_cache.name)
     compilation_cache.reset_cache()  # it may have opened another folder

@@ -2,12 +2,11 @@
 
     python -m experiments.work_precision.run [--at-most N] [--only TEXT] [--again] [--redraw]
 
-256 wheels near their own limit cycles (see `truth`) by each of METHODS of `methods`. Error:
-largest over the parts of a quantity, against a truth of 20
-digits; p50, p99 and worst over lanes; lanes that fail are counted. Time: CPU time of one core per
-gait, median of repeats, scaled by a reference (numba's step) timed just before and after, because
-machines are shared. Results are kept method by method in a table: a run that was stopped goes on.
-Then charts and tables are drawn from it.
+256 wheels near their own limit cycles (see `truth`) by each of METHODS of `methods`. Error: largest
+over the parts of a quantity, against a truth of 20 digits; p50, p99 and worst over lanes; failed
+lanes are counted. Time: CPU time of one core per gait, median of repeats, scaled by a reference
+(numba's step) timed just before and after, because machines are shared. Results are kept method by
+method in a table: a run that was stopped goes on. Then charts and tables are drawn from it.
 """
 
 import argparse

@@ -127,7 +127,7 @@ def test_a_branch_on_real_ground_turns_at_its_fold_and_comes_back_unstable():
     assert float(branch.dataset.closure.max()) < 1e-8
     (fold,) = (border.value for border in branch.borders if border.kind == "fold")
     # By lanes and central differences, which went past it in large steps: a quartic through the
-    # seven gaits next to it, as experiments/ground_branches.py prints it.
+    # seven gaits next to it, as experiments/ground/branches.py prints it.
     assert fold == pytest.approx(0.98186, abs=1e-4)
     turn = int(np.argmin(branch.values))
     assert 0 < turn < branch.values.size - 1

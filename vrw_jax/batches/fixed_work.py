@@ -23,7 +23,7 @@ SCHEMES = (
     Scheme(Mesh(1, 1.0), sweeps=0, rounds=3),
 )
 """Of DLS, SLS-I and SLS-II: the cheapest of those tried whose 99th percentile of errors over lanes
-near their gaits is about 1e-8 (experiments/engine_benchmark.py)."""
+near their gaits is about 1e-8 (experiments/speed/engine_benchmark.py)."""
 
 MOST_CORRECTION = 5e-8
 MOST_SHIFT = 1e-6

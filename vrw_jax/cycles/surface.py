@@ -1,7 +1,7 @@
 """Where gaits are: a cubic surface through gaits of many wheels, as the start of every search.
 
 Lengths are in L0, times in sqrt(L0 / g), masses in the total mass, so that a wheel of any size
-finds its start here. The surface was fitted by experiments/fit_gait_surface.py to the gaits that a
+finds its start here. The surface was fitted by experiments/gaits/fit_surface.py to the gaits that a
 continuation from Table 1 reaches, for Table 1's mass ratio, centre of mass and eight legs; it is
 right to about 1 % there and, clipped to its range, a start for a homotopy elsewhere.
 """

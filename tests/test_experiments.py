@@ -1,0 +1,79 @@
+"""Every experiment starts: it imports, does nothing by that, and tells its own command."""
+
+import ast
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+MODULES = {
+    ".".join(path.relative_to(ROOT).with_suffix("").parts): path
+    for path in sorted((ROOT / "experiments").glob("*/*.py"))
+    if path.name != "__init__.py"
+}
+STARTED = """
+import contextlib, importlib, io, json, os, runpy, sys
+from jax._src import xla_bridge
+told = {}
+environment, cores = dict(os.environ), getattr(os, "sched_getaffinity", lambda _: None)(0)
+for name in sys.argv[1:]:
+    out, sys.argv = io.StringIO(), [name, "--help"]
+    try:
+        importlib.import_module(name)
+        with contextlib.redirect_stdout(out):
+            runpy.run_module(name, run_name="__main__", alter_sys=True)
+    except SystemExit as end:
+        out.write(end.code if isinstance(end.code, str) else "")
+    touched = [what for what, yes in {
+        "arrays": xla_bridge._backends, "environment": environment != dict(os.environ),
+        "cores": cores != getattr(os, "sched_getaffinity", lambda _: None)(0),
+    }.items() if yes]
+    told[name] = out.getvalue(), touched
+print(json.dumps(told))
+"""
+"""Imports each module, then runs it with `--help`; what it printed, and what that has touched."""
+
+
+@pytest.fixture(scope="module")
+def started():
+    """By module, one process for all."""
+    outside = {k: v for k, v in os.environ.items() if k != "PYTHONSAFEPATH"}
+    command = [sys.executable, "-W", "ignore", "-c", STARTED, *MODULES]
+    out = subprocess.run(command, cwd=ROOT, env=outside, capture_output=True, text=True)
+    assert out.returncode == 0, out.stderr
+    return json.loads(out.stdout)
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_an_experiment_starts_and_tells_its_command(module, started):
+    text = MODULES[module].read_text()
+    told, touched = started[module]
+    if told.startswith("This experiment needs"):
+        assert 'pip install -e ".[experiments]"' in told
+        pytest.skip(told)
+    assert not touched, f"by importing {module}"
+    assert ast.get_docstring(ast.parse(text))
+    if '__name__ == "__main__"' in text:
+        assert told.startswith(f"usage: python -m {module}")
+        assert f"python -m {module}" in told.split("\n\n", 1)[1]
+
+
+def test_folders_of_experiments_say_what_they_are_for():
+    for folder in {path.parent for path in MODULES.values()}:
+        assert ast.get_docstring(ast.parse((folder / "__init__.py").read_text())), folder
+
+
+def test_every_experiment_that_is_named_exists():
+    folders = {name.rpartition(".")[0] for name in MODULES}
+    pages = [ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")]
+    notebooks = (ROOT / "docs").rglob("*.ipynb")
+    code = [p for room in ("vrw_jax", "tests", "experiments") for p in (ROOT / room).rglob("*.py")]
+    for page in (*pages, *notebooks, *code):
+        for path in re.findall(r"\bexperiments(?:[./][a-z0-9_]+)+", page.read_text()):
+            name = path.removesuffix(".py").replace("/", ".")
+            assert name in MODULES or name in folders, f"{page.name} names {path}"
