@@ -412,7 +412,7 @@ def explained(planned: Plan, store: str | Path | None = None) -> dict[str, str]:
 
 RATE, COMPILE, MEMORY = 600.0, 60.0, 1.1e9
 """Samples per second and core (twice that in a box of gaits only, half where most have none),
-seconds to compile without a cache, bytes of code and arrays: `experiments/speed/scan_benchmark.py`."""
+seconds to compile without a cache, bytes of code and arrays: `experiments.speed.scan_benchmark`."""
 
 
 def _bytes(n: int | float) -> str:
