@@ -182,7 +182,7 @@ def scan(
 ) -> xr.Dataset:
     """The steady gait of every sample, labelled, with outcome and premise margins of each.
 
-    `measures` are names (see `vrw_jax.scan_measures`), derivatives included as in
+    `measures` are names (see `vrw_jax.scans.offer`), derivatives included as in
     'd dls_fraction / d damping'. With `store` the result is kept there chunk by chunk: a scan that
     was interrupted goes on where it stopped and ends with bitwise the same data, a finished one is
     only opened. `report` is told the progress after each chunk. What a sample gives does not depend

@@ -1,0 +1,43 @@
+"""What documents and comments name exists: files, commands, modules."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+DOCUMENTS = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
+SOURCES = [
+    path
+    for folder in ("vrw_jax", "experiments", "tests")
+    for path in (ROOT / folder).rglob("*.py")
+    if path != Path(__file__)
+]
+FILE = re.compile(r"\b((?:tests|vrw_jax|experiments|configs)/[\w/]+(?:\.\w+)?)")
+COMMAND = re.compile(r"python -m ((?:experiments|tests|vrw_jax)[\w.]*)")
+MODULE = re.compile(r"(?:from|import|`)\s*(vrw_jax(?:\.[a-z_]+)+)")
+
+
+def missing(text):
+    """Places that a text names and that are not there."""
+    modules = {name.replace(".", "/") for name in COMMAND.findall(text) + MODULE.findall(text)}
+    for place in {*FILE.findall(text), *modules}:
+        path = ROOT / place
+        if not (path.exists() or path.with_suffix(".py").exists()):
+            yield place
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_a_document_names_what_is_there(path):
+    assert not sorted(missing(path.read_text()))
+
+
+def test_sources_name_what_is_there():
+    found = {str(path.relative_to(ROOT)): sorted(missing(path.read_text())) for path in SOURCES}
+    assert not {path: places for path, places in found.items() if places}
+
+
+def test_what_is_not_there_is_seen():
+    text = "`tests/test_gone.py`, `python -m experiments.gone`, `from vrw_jax.gone import x`"
+    assert len(list(missing(text))) == 3
+    assert not list(missing("`tests/test_documents.py`, `from vrw_jax.wheel import x`, configs/"))
