@@ -6,6 +6,7 @@ a face, or through `runtime.lazy`, is an arrow to where it is defined as well.
 """
 
 import ast
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import cached_property
@@ -80,6 +81,17 @@ class House:
                     if target != module:
                         found.setdefault(arrow[:4], arrow)
         return list(found.values())
+
+    @cached_property
+    def links(self) -> Counter[tuple[str, str]]:
+        """How many names the modules of a room fetch from what another room defines."""
+        fetched = {
+            (arrow.source, arrow.written, self.room(arrow.target))
+            for arrow in self.arrows
+            if arrow.target in self.paths and not self.is_face(arrow.target)
+        }
+        rooms = ((self.room(source), target) for source, _, target in fetched)
+        return Counter((one, other) for one, other in rooms if one and one != other)
 
     def way(self, written: str) -> list[str]:
         """Modules that `module:name` leads through, then the name where it is defined, dotted.
