@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-DOCUMENTS = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
+DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 SOURCES = [
     path
     for folder in ("vrw_jax", "experiments", "tests")
@@ -14,13 +14,13 @@ SOURCES = [
     if path != Path(__file__)
 ]
 FILE = re.compile(r"\b((?:tests|vrw_jax|experiments|configs)/[\w/]+(?:\.\w+)?)")
-COMMAND = re.compile(r"python -m ((?:experiments|tests|vrw_jax)[\w.]*)")
+SCRIPT = re.compile(r"\b(experiments(?:\.[a-z0-9_]+)+)(?<!\.py)")
 MODULE = re.compile(r"(?:from|import|`)\s*(vrw_jax(?:\.[a-z_]+)+)")
 
 
 def missing(text):
     """Places that a text names and that are not there."""
-    modules = {name.replace(".", "/") for name in COMMAND.findall(text) + MODULE.findall(text)}
+    modules = {name.replace(".", "/") for name in SCRIPT.findall(text) + MODULE.findall(text)}
     for place in {*FILE.findall(text), *modules}:
         path = ROOT / place
         if not (path.exists() or path.with_suffix(".py").exists()):

@@ -3,7 +3,6 @@
 import ast
 import json
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -66,14 +65,3 @@ def test_an_experiment_starts_and_tells_its_command(module, started):
 def test_folders_of_experiments_say_what_they_are_for():
     for folder in {path.parent for path in MODULES.values()}:
         assert ast.get_docstring(ast.parse((folder / "__init__.py").read_text())), folder
-
-
-def test_every_experiment_that_is_named_exists():
-    folders = {name.rpartition(".")[0] for name in MODULES}
-    pages = [ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")]
-    notebooks = (ROOT / "docs").rglob("*.ipynb")
-    code = [p for room in ("vrw_jax", "tests", "experiments") for p in (ROOT / room).rglob("*.py")]
-    for page in (*pages, *notebooks, *code):
-        for path in re.findall(r"\bexperiments(?:[./][a-z0-9_]+)+", page.read_text()):
-            name = path.removesuffix(".py").replace("/", ".")
-            assert name in MODULES or name in folders, f"{page.name} names {path}"

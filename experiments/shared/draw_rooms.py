@@ -6,7 +6,6 @@ Writes `rooms.svg` and `rooms.png` to `docs/figures` or the folder given. Nothin
 run for it; every import counts, inside functions, through faces and for type checkers too.
 """
 
-import argparse
 from itertools import pairwise
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch, Polygon
 
+from experiments.shared.command import command
 from tests.support.rooms import FLOW, House
 from vrw_jax.figures import walk as plots
 
@@ -113,11 +113,10 @@ def _legend(axes: Axes, house: House) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command(__doc__)
     parser.add_argument("folder", type=Path, nargs="?", default=ROOT / "docs" / "figures")
-    for path in plots.save(draw(House(ROOT / "vrw_jax")), parser.parse_args().folder, "rooms"):
+    folder = parser.parse_args().folder
+    for path in plots.save(draw(House(ROOT / "vrw_jax")), folder, "rooms"):
         print(path)
 
 
