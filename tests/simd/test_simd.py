@@ -9,6 +9,8 @@ import pytest
 from jax import lax
 
 from vrw_jax import simd
+from vrw_jax.simd.arithmetic import ELEMENTWISE
+from vrw_jax.simd.rules import RULES
 
 KEYS = itertools.count()
 DRAW = np.random.default_rng(0)
@@ -202,15 +204,30 @@ def test_functions_set_apart_are_called_and_give_the_same():
         np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-13)
 
 
-def test_code_that_is_not_elementwise_is_refused_in_a_sentence():
-    lanes = [np.arange(4.0)]
-    with pytest.raises(NotImplementedError, match="sort is not elementwise"):
-        program(lambda _, x: (jnp.sort(x[0]),), lanes)
-    with pytest.raises(NotImplementedError, match="cumsum moves, joins or picks lanes"):
-        program(lambda _, x: (jnp.cumsum(x[0]),), lanes)
-    with pytest.raises(NotImplementedError, match="slice moves, joins or picks lanes"):
-        program(lambda _, x: (x[0][:1],), lanes)
-    with pytest.raises(NotImplementedError, match="a sum or largest of lanes"):
-        program(lambda _, x: (x[0] - jnp.max(x[0]),), lanes)
-    with pytest.raises(NotImplementedError, match="transpose moves, joins or picks lanes"):
-        program(lambda _, x: (jnp.stack([x[0], x[0]]).T[:, 0],), lanes)
+def test_integers_and_truths_are_compared_and_multiplied_as_jax_does():
+    def compare(_, lanes):
+        x, y = (lane.astype(jnp.int32) for lane in lanes)
+        a, b = x > 0, y > 0
+        return (
+            x**3 * 2 - jnp.square(y), jnp.abs(x), jnp.minimum(x, y), -y,
+            a < b, a >= b, jnp.maximum(a, b), a ^ b, jnp.where(a, x, y), x.astype(bool), x != y,
+        )  # fmt: skip
+
+    for found, expected in both_ways(compare, [10.0 * DRAW.normal(size=99) for _ in range(2)]):
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_a_primitive_takes_one_row_of_the_table(monkeypatch):
+    lanes = [DRAW.normal(size=9)]
+    tangent = lambda _, lanes: (jnp.tan(lanes[0]),)
+    with pytest.raises(NotImplementedError, match="tan has no machine code"):
+        program(tangent, lanes)
+    monkeypatch.setitem(
+        ELEMENTWISE, "tan",
+        lambda n, params, before, after, x: n.builder.fdiv(
+            *(ELEMENTWISE[name](n, params, before, after, x) for name in ("sin", "cos"))
+        ),
+    )  # fmt: skip
+    monkeypatch.setitem(RULES, "tan", RULES["sin"])
+    ((found, expected),) = both_ways(tangent, lanes)
+    np.testing.assert_allclose(found, expected, rtol=1e-14)

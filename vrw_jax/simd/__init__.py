@@ -3,4 +3,5 @@
 from vrw_jax.simd.code import Store, tracing
 from vrw_jax.simd.machine import processor
 from vrw_jax.simd.program import at_hand, lane_function, lane_program, serves
+from vrw_jax.simd.rules import primitives
 from vrw_jax.simd.trace import apart

@@ -1,6 +1,6 @@
 """Large arrays of LLVM values: computed where an index asks, or in memory.
 
-Those that compute know the `simd_arrays.Arrays` that they belong to.
+Those that compute know the `Arrays` that they belong to.
 """
 
 from collections.abc import Callable, Sequence
@@ -69,7 +69,7 @@ class Memory(Field):
 
     def store(self, index: Index, value: Value) -> None:
         """Overwrites an entry."""
-        value = self.arrays.spread(value) if isinstance(self.kind, ir.VectorType) else value
+        value = self.arrays.numbers.spread(value) if isinstance(self.kind, ir.VectorType) else value
         self.arrays.builder.store(value, self.place(index))
 
     def part(self, first: Value) -> "Memory":

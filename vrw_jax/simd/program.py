@@ -73,6 +73,12 @@ def lane_function(
     def call(*arrays: Any) -> Any:
         leaves, structure = jax.tree.flatten(arrays)
         n_lanes = leaves[0].shape[-1]
+        for shape in (jnp.shape(x) for x in leaves):
+            if shape and shape[-1] != n_lanes:
+                raise ValueError(
+                    f"An argument has the shape {shape}, but the first one {n_lanes} lanes: they "
+                    "are the last axis of every array; what has no axis is the same for all."
+                )
         width = VECTOR[np.dtype(leaves[0].dtype)] * (2 if wide() else 1)
         missing = -n_lanes % width
         shapes = [

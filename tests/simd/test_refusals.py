@@ -1,0 +1,93 @@
+"""What machine code can't do is refused in a sentence that names it, and never misread."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from vrw_jax import simd
+from vrw_jax.simd.arrays import LANES
+
+X = np.random.default_rng(0).normal(size=(2, 9))
+
+
+def call(function, *arrays):
+    """Its results as machine code."""
+    run = simd.lane_function(function, function, object(), None)
+    return jax.jit(run)(*map(jnp.asarray, arrays))
+
+
+@pytest.mark.parametrize(
+    ("function", "sentence"),
+    [
+        (lambda x: jnp.sort(x, 0), "sort has no machine code: write it by primitives that"),
+        (lambda x: jnp.cumsum(x, 1), "cumsum moves, joins or picks lanes"),
+        (lambda x: x[:, :1] + x, "slice moves, joins or picks lanes"),
+        (lambda x: lax.pad(x, 0.0, [(0, 0, 0), (1, 1, 0)])[:, 1:-1], "pad moves, joins or picks"),
+        (lambda x: x - jnp.max(x, 1)[:, None], "reduce_max moves, joins or picks lanes"),
+        (lambda x: jnp.sum(x.astype(int)) | x.astype(int), "reduce_sum moves, joins or picks"),
+        (lambda x: lax.reduce_or(x.astype(int), (1,))[0] | x.astype(int), "reduce_or moves"),
+        (lambda x: lax.dynamic_update_slice(x, jnp.ones((2, 3)), (0, 3)), "dynamic_update_slice m"),
+        (lambda x: lax.concatenate([jnp.ones((2, 0)), x], 1), "concatenate moves, joins or picks"),
+        (lambda x: lax.pad(x, 0.0, [(0, 0, 0), (1, -1, 0)]), "pad takes entries away"),
+        (lambda x: x + (x[0] @ x[1]), "dot_general moves, joins or picks lanes"),
+        (lambda x: lax.pad(x, 0.0, [(-1, 0, 0), (0, 0, 0)]), "pad takes entries away"),
+        (lambda x: (x + 1j).real, "complex128.* convert them to one of bool, int32"),
+        (lambda x: x.astype(int) // 3 + lax.div(x.astype(int), 2), "div of int64 has no machine"),
+        (lambda x: jnp.ones(3), "A result has the shape float64.3., the same for all lanes"),
+    ],
+)
+def test_what_is_not_done_to_each_lane_by_itself_is_refused(function, sentence):
+    with pytest.raises(NotImplementedError, match=sentence):
+        call(function, X)
+
+
+@pytest.mark.parametrize(
+    ("function", "what"),
+    [
+        (lambda x: x + jnp.asarray(np.zeros(LANES))[0], "A constant"),
+        (lambda x: x + jnp.sum(jnp.asarray(np.zeros((LANES, 3)))), "A constant"),
+        (lambda x: x + jnp.sum(lax.iota(float, LANES)), "The result of iota"),
+        (lambda x: x + jnp.sum(lax.broadcasted_iota(float, (LANES, 2), 1)), "The result of iota"),
+        (lambda x: x + jnp.sum(lax.iota(float, LANES + 1)[1:]), "The result of slice"),
+        (lambda x: x + lax.iota(float, 2 * LANES).reshape(2, -1), "The result of reshape"),
+        (lambda x: x + lax.iota(float, 2 * LANES).reshape(-1, 2)[0, 0], "The result of reshape"),
+        (lambda x: x + jnp.pad(lax.iota(float, LANES - 1), (0, 1))[0], "The result of pad"),
+        (lambda x: x + jnp.concatenate([lax.iota(float, 1000), lax.iota(float, 21)]),
+         "The result of concatenate"),
+        (lambda x: jnp.concatenate([jnp.repeat(x[:1], 1000, 0), jnp.repeat(x[:1], 21, 0)])[:2],
+         "The result of .*"),
+        (lambda x: jnp.broadcast_to(x[:, None], (2, LANES, x.shape[-1])).sum(1),
+         "The result of broadcast_in_dim"),
+        (lambda x: jnp.stack([x, x], -1)[..., 0], "The result of .*"),
+        (lambda x: x.T.reshape(x.shape), "The result of transpose"),
+    ],
+)  # fmt: skip
+def test_an_axis_as_long_as_the_lanes_is_refused_where_it_arises(function, what):
+    with pytest.raises(NotImplementedError, match=rf"{what} has the shape .*{LANES}"):
+        call(function, X)
+
+
+def test_arguments_have_one_axis_of_lanes():
+    with pytest.raises(NotImplementedError, match=r"An argument has .* float64\[1021,1021\]"):
+        call(lambda x: x[0] + x[1], np.zeros((LANES, 9)))
+    with pytest.raises(ValueError, match=r"shape \(3,\), but the first one 9 lanes"):
+        call(lambda x, table: x * table[0], X, np.zeros(3))
+
+
+def test_loops_do_not_run_along_the_lanes_but_as_often_as_they_are():
+    along = lambda x: x + lax.scan(lambda total, y: (total + y, None), 0.0, x[0])[0]
+    with pytest.raises(NotImplementedError, match="scan reads or writes along an axis of 1021"):
+        call(along, X)
+    written = lambda x: x + lax.scan(lambda k, _: (k + 1.0, k), 0.0, None, length=LANES)[1][0]
+    with pytest.raises(NotImplementedError, match="scan reads or writes along an axis of 1021"):
+        call(written, X)
+    often = lambda x: lax.fori_loop(0, LANES, lambda i, y: y + 1.0, x)
+    np.testing.assert_allclose(call(often, X), X + LANES, rtol=1e-12)
+
+
+def test_one_number_for_all_lanes_is_theirs():
+    """As many as lanes, and nothing to tell them from: what is broadcast is no misreading."""
+    told = call(lambda x: jnp.full(x.shape[-1], 2.0) * x + jnp.ones_like(x), X)
+    np.testing.assert_array_equal(told, 2.0 * X + 1.0)

@@ -1,0 +1,135 @@
+"""Loops of traces: what they carry lies in registers or, if it is much, in memory."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import llvmlite.ir as ir
+
+from vrw_jax.simd.arrays import HELD, HELD_INSIDE, LANES, Arrays, arrays_of, shape_of
+from vrw_jax.simd.fields import Entries, Memory, Updated
+from vrw_jax.simd.numbers import LONG, Value
+from vrw_jax.simd.trace import CALLS, Traces
+
+
+def while_(traces: Traces, equation: Any, values: list[Entries]) -> list[Entries]:
+    """A loop that goes on while a number says so, of which each group has its own."""
+    arrays, params = traces.arrays, equation.params
+    n_goes, n_body = params["cond_nconsts"], params["body_nconsts"]
+    fixed, own = values[:n_goes], values[n_goes : n_goes + n_body]
+    carry = _Carry(arrays, params["body_jaxpr"].out_avals, HELD)
+
+    def goes_on(flat: list[Value]) -> Value:
+        told = traces.closed(params["cond_jaxpr"], [*fixed, *carry.arrays(flat)])
+        return arrays.entries(told[0]).item()
+
+    def body(flat: list[Value]) -> list[Value]:
+        told = traces.closed(params["body_jaxpr"], [*own, *carry.arrays(flat)])
+        return carry.on(told)
+
+    start = carry.start(values[n_goes + n_body :])
+    return carry.arrays(arrays.numbers.loop(start, goes_on, body))
+
+
+def scan(traces: Traces, equation: Any, values: list[Entries]) -> list[Entries]:
+    """A loop of known length; what it reads and writes turn by turn lies in memory."""
+    arrays, params = traces.arrays, equation.params
+    n_fixed, n_carried = params["num_consts"], params["num_carry"]
+    inner, length = params["jaxpr"], params["length"]
+    told = [variable.aval for variable in equation.outvars[n_carried:]]
+    if length == LANES and (told or len(values) > n_fixed + n_carried):
+        raise NotImplementedError(
+            f"scan reads or writes along an axis of {LANES}, which is the lanes': do the same to "
+            "each by itself, and give other axes another length."
+        )
+    read = [arrays.in_memory(x) for x in values[n_fixed + n_carried :]]
+    written = [arrays.room(shape_of(aval), arrays.kind_of(aval)) for aval in told]
+    outside, arrays.written_out = arrays.written_out, not _has_loops(inner.jaxpr)
+    fixed = values[:n_fixed]
+    limit = HELD_INSIDE if arrays.written_out else HELD
+    carry = _Carry(arrays, inner.out_avals[:n_carried], limit)
+
+    def part(memory: Memory, turn: Value) -> Entries:
+        some = memory.part(turn)
+        inside = arrays.written_out or math.prod(some.shape) <= HELD
+        return arrays.entries(some) if inside else some
+
+    def body(turn: Value, flat: list[Value]) -> list[Value]:
+        if params["reverse"]:
+            turn = arrays.builder.sub(ir.Constant(LONG, length - 1), turn)
+        some = [part(memory, turn) for memory in read]
+        results = traces.closed(inner, [*fixed, *carry.arrays(flat), *some])
+        for memory, value in zip(written, results[n_carried:], strict=True):
+            arrays.fill(memory.part(turn), value)
+        return carry.on(results[:n_carried])
+
+    start = carry.start(values[n_fixed : n_fixed + n_carried])
+    last = carry.arrays(arrays.counted(length, body, start))
+    arrays.written_out = outside
+    return [*last, *written]
+
+
+class _Carry:
+    """Arrays between the turns of a loop: in registers up to `limit` entries, else in memory."""
+
+    def __init__(self, arrays: Arrays, avals: Sequence[Any], limit: int | float) -> None:
+        self.owner, self.avals = arrays, avals
+        self.places = [
+            arrays.room(shape_of(aval), arrays.kind_of(aval))
+            if math.prod(shape_of(aval)) > limit
+            else None
+            for aval in avals
+        ]
+
+    def arrays(self, flat: Sequence[Value]) -> list[Entries]:
+        """What is carried, in a turn or after the last one."""
+        held = [aval for aval, place in zip(self.avals, self.places, strict=True) if place is None]
+        left = iter(arrays_of(flat, held))
+        # A field of its own each time: what was known of it is past.
+        return [
+            next(left) if place is None else Memory(self.owner, place.shape, place.kind, place.base)
+            for place in self.places
+        ]
+
+    def start(self, arrays: Sequence[Entries]) -> list[Value]:
+        """Values for registers are returned, the others stored."""
+        for array, place in zip(arrays, self.places, strict=True):
+            if place is not None:
+                self.owner.fill(place, array)
+        return self._in_registers(arrays)
+
+    def on(self, arrays: Sequence[Entries]) -> list[Value]:
+        """From one turn to the next: new values may depend on any of the old."""
+        flat = self._in_registers(arrays)
+        moves: list[tuple[Memory, Memory | Updated]] = []
+        for array, place in zip(arrays, self.places, strict=True):
+            if place is None or (isinstance(array, Memory) and array.base is place.base):
+                continue
+            if isinstance(array, Updated) and array.whole.base is place.base:
+                moves.append((place, array.ready()))
+            else:
+                copy = self.owner.room(place.shape, place.kind)
+                self.owner.fill(copy, array)
+                moves.append((place, copy))
+        for place, fresh in moves:
+            if isinstance(fresh, Updated):
+                fresh.store_into(place)
+            else:
+                self.owner.fill(place, fresh)
+        return flat
+
+    def _in_registers(self, arrays: Sequence[Entries]) -> list[Value]:
+        triples = zip(arrays, self.avals, self.places, strict=True)
+        held = [(array, aval) for array, aval, place in triples if place is None]
+        return self.owner.flat([array for array, _ in held], [aval for _, aval in held])
+
+
+def _has_loops(jaxpr: Any) -> bool:
+    """Whether a trace has a loop anywhere."""
+    for equation in jaxpr.eqns:
+        if equation.primitive.name in ("while", "scan"):
+            return True
+        inner = equation.params.get(CALLS.get(equation.primitive.name, ""))
+        if inner is not None and _has_loops(inner.jaxpr):
+            return True
+    return False

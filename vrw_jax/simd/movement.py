@@ -1,0 +1,148 @@
+"""Primitives that move entries: which one stands where, and in arrays of what shape."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import llvmlite.ir as ir
+import numpy as np
+
+from vrw_jax.simd.arithmetic import converted
+from vrw_jax.simd.arrays import Arrays, Asked, has_lanes, moved, shape_of
+from vrw_jax.simd.fields import Entries, Field, Index, Updated
+from vrw_jax.simd.numbers import LONG, Value
+
+
+def broadcast_in_dim(arrays: Arrays, asked: Asked, array: Entries, *_: Any) -> Entries:
+    """Repeated along new axes, the lanes' too."""
+    shape, axes = shape_of(asked.out), tuple(map(int, asked.params["broadcast_dimensions"]))
+    array = arrays.fitted(array, array.shape[:-1], len(array.shape) > len(shape))
+    if has_lanes(asked.out) and len(array.shape) == len(axes) and axes[-1:] == (len(shape),):
+        array = arrays.reshaped(array, array.shape[:-1])  # one number has the axis of lanes
+    result = arrays.broadcast(array, shape, axes[: len(array.shape)])
+    if isinstance(result, Field):
+        return Field(shape, arrays.kind_of(asked.out), result.at)
+    return result
+
+
+def reshape(arrays: Arrays, asked: Asked, array: Entries) -> Entries:
+    """Entries in the same order, in another shape."""
+    return arrays.reshaped(array, shape_of(asked.out))
+
+
+def transpose(arrays: Arrays, asked: Asked, array: Entries) -> Entries:
+    """Axes in another order."""
+    order = asked.params["permutation"]
+    order = order[: len(array.shape)]
+    if isinstance(array, np.ndarray):
+        return array.transpose(order)
+    back = np.argsort(order)
+    at = lambda index: arrays.entry(array, tuple(index[i] for i in back))
+    return Field(shape_of(asked.out), array.kind, at)
+
+
+def slice_(arrays: Arrays, asked: Asked, array: Entries) -> Entries:
+    """From one index to another, by steps."""
+    strides = asked.params["strides"] or (1,) * len(asked.params["start_indices"])
+    places = zip(asked.params["start_indices"], asked.params["limit_indices"], strides, strict=True)
+    slices = [slice(*place) for place in places][: len(array.shape)]
+    if isinstance(array, np.ndarray):
+        return array[tuple(slices)]
+
+    def at(index: Index) -> Value:
+        pairs = zip(index, slices, strict=True)
+        return arrays.entry(array, tuple(arrays.shifted(i, s.start, s.step) for i, s in pairs))
+
+    return Field(shape_of(asked.out), array.kind, at)
+
+
+def concatenate(arrays: Arrays, asked: Asked, *values: Entries) -> Entries:
+    """Arrays one after the other along an axis."""
+    return _joined(arrays, asked, asked.params["dimension"], values)
+
+
+def stack(arrays: Arrays, asked: Asked, *values: Entries) -> Entries:
+    """Arrays of one shape along a new axis."""
+    axis = asked.params["axis"]
+    longer = [arrays.reshaped(x, (*x.shape[:axis], 1, *x.shape[axis:])) for x in values]
+    return _joined(arrays, asked, axis, longer)
+
+
+def _joined(arrays: Arrays, asked: Asked, axis: int, values: Sequence[Entries]) -> Entries:
+    shape = shape_of(asked.out)
+    if axis == len(shape):
+        raise moved(asked.name)
+    if all(isinstance(x, np.ndarray) for x in values):
+        return np.concatenate(values, axis)  # type: ignore[arg-type]
+    parts = [x for x in values if x.shape[axis]]
+    starts = np.cumsum([0, *(x.shape[axis] for x in parts)]).tolist()
+
+    def at(index: Index) -> Value:
+        i, chosen = index[axis], None
+        for part, start in zip(parts, starts, strict=False):
+            here, last = arrays.shifted(i, -start), part.shape[axis] - 1
+            if isinstance(i, int):
+                if 0 <= here <= last:
+                    return arrays.entry(part, (*index[:axis], here, *index[axis + 1 :]))
+                continue
+            # Beyond its end, any entry will do: another part's is chosen there.
+            here = 0 if last == 0 else arrays.clamped(here, last)
+            value = arrays.entry(part, (*index[:axis], here, *index[axis + 1 :]))
+            inside = arrays.builder.icmp_signed(">=", i, ir.Constant(LONG, start))
+            if chosen is None:
+                chosen = value
+            else:
+                value, chosen = arrays.numbers.alike(value, chosen)
+                chosen = arrays.builder.select(inside, value, chosen)
+        return chosen
+
+    return Field(shape, arrays.kind_of(asked.out), at)
+
+
+def pad(arrays: Arrays, asked: Asked, array: Entries, value: Entries) -> Entries:
+    """With more entries around, none within."""
+    around = asked.params["padding_config"]
+    if any(low < 0 or high < 0 or within for low, high, within in around):
+        raise NotImplementedError("pad takes entries away or puts some between: slice and stack.")
+    filled = np.broadcast_to(arrays.entries(value).reshape(()), shape_of(asked.out)).copy()
+    inside = tuple(slice(low, low + n) for (low, _, _), n in zip(around, array.shape, strict=False))
+    filled[inside] = arrays.entries(array)
+    return filled
+
+
+def iota(arrays: Arrays, asked: Asked) -> Entries:
+    """The indices along an axis."""
+    return arrays.constants_of(np.indices(asked.out.shape)[asked.params["dimension"]], asked.out)
+
+
+def dynamic_slice(arrays: Arrays, asked: Asked, array: Entries, *starts: Entries) -> Entries:
+    """A part that begins where numbers say, the same for all lanes."""
+    begin = _starts(arrays, asked.given, array.shape, shape_of(asked.out), starts)
+    at = lambda index: arrays.entry(array, arrays.further(index, begin))
+    return Field(shape_of(asked.out), arrays.kind_of(asked.out), at)
+
+
+def dynamic_update_slice(
+    arrays: Arrays, asked: Asked, array: Entries, update: Entries, *starts: Entries
+) -> Entries:
+    """A part overwritten that begins where numbers say, the same for all lanes."""
+    if has_lanes(asked.out) and not has_lanes(asked.given[1]):
+        raise moved(asked.name)
+    begin = _starts(arrays, asked.given[1:], array.shape, update.shape, starts)
+    return Updated(arrays, arrays.in_memory(array), update, begin)
+
+
+def _starts(
+    arrays: Arrays, given: Any, whole: Index, part: Index, starts: Sequence[Entries]
+) -> tuple[Any, ...]:
+    """Where a part begins, moved so that it lies inside."""
+    begin: list[Any] = []
+    for aval, n, m, start in zip(given[1:], whole, part, starts, strict=False):
+        place = arrays.entries(start).item()
+        if n == m:
+            begin.append(0)
+        elif isinstance(place, ir.Constant):
+            begin.append(min(max(int(place.constant), 0), n - m))
+        else:
+            place = converted(arrays.numbers, place, aval.dtype, np.dtype(np.int64))
+            begin.append(arrays.clamped(place, n - m))
+    return tuple(begin)
