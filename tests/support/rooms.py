@@ -192,7 +192,7 @@ def loaded(node: ast.AST) -> str | None:
     """What a call imports by name; "" where the name is not written out, None for other nodes."""
     if not isinstance(node, ast.Call) or not node.args:
         return None
-    if (_chain(node.func) or [""])[-1] not in {"import_module", "__import__"}:
+    if (_chain(node.func) or [""])[-1] not in {"import_module", "__import__", "library"}:
         return None
     name = node.args[0]
     return name.value if isinstance(name, ast.Constant) else ""

@@ -11,7 +11,7 @@ ONLY = {
     "diffrax": ("numerics.events",), "llvmlite": ("simd",), "matplotlib": ("figures",),
     "PIL": ("figures",), "rich": ("app",), "typer": ("app",), "zarr": ("scans.store",),
 }  # fmt: skip
-"""Who may know a library: modules or rooms. `runtime.lazy` and faces only hand libraries on."""
+"""Who may know a library: modules or rooms. Faces only hand on."""
 
 
 def circles(house: House) -> list[str]:
@@ -76,7 +76,7 @@ def strangers(house: House) -> list[str]:
     found, lazy = [], f"{house.name}.runtime.lazy"
     for arrow in house.arrows:
         places = [f"{house.name}.{place}" for place in ONLY.get(arrow.target.split(".")[0], ())]
-        hands_on = house.is_face(arrow.source) or arrow.source == lazy
+        hands_on = house.is_face(arrow.source)
         at_home = any(f"{arrow.source}.".startswith(f"{place}.") for place in places)
         if places and not hands_on and not at_home:
             found.append(f"{_place(arrow)} knows {arrow.target.split('.')[0]}")

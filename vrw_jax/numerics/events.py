@@ -9,7 +9,7 @@ differentiated, hence first and second derivatives of event state and time hold 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +32,12 @@ from vrw_jax.numerics.minima import (
 )
 from vrw_jax.numerics.options import Options
 from vrw_jax.numerics.types import Scalar
-from vrw_jax.runtime import diffrax
+from vrw_jax.runtime import library
+
+if TYPE_CHECKING:
+    import diffrax
+else:
+    diffrax = library("diffrax")
 
 Field = Callable[[State], State]
 """Autonomous vector field of a phase."""

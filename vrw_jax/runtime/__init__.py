@@ -1,6 +1,6 @@
 """How a process computes and what it keeps: number format, libraries on demand, store, programs."""
 
-from vrw_jax.runtime.lazy import diffrax, optax, xarray, zarr
+from vrw_jax.runtime.lazy import library, xarray
 from vrw_jax.runtime.programs import compiled, lane_function, lane_program, remembered
 from vrw_jax.runtime.start import fusion_emitters, start_jax
 from vrw_jax.runtime.store import code_digest, keep, kept

@@ -17,12 +17,17 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vrw_jax.runtime import library
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.runtime import zarr
+
+if TYPE_CHECKING:
+    import zarr
+else:
+    zarr = library("zarr")
 
 DONE = "chunk_done"
 MANIFEST = "scan"

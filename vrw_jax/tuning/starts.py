@@ -11,9 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.runtime import optax
+from vrw_jax.runtime import library
 from vrw_jax.tuning.objective import AGREEMENT, Gait, is_same_branch
 from vrw_jax.wheel import Outcome
+
+optax = library("optax")
 
 RATE, STIFFNESS = 0.06, 4.0
 """Adam's first step in widths of the bounds; penalty on a breach of one width, in objectives."""
