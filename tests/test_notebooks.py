@@ -28,6 +28,14 @@ def test_a_notebook_is_stored_executed_and_small(path):
     assert not re.search(r"/(home|root|work|tmp)/", path.read_text())
 
 
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_what_a_notebook_imports_is_there(path):
+    cells = [c.source for c in nbformat.read(path, as_version=4).cells if c.cell_type == "code"]
+    lines = [line for cell in cells for line in cell.splitlines()]
+    for line in (line for line in lines if re.match(r"(from|import) .*\bvrw_jax\b", line)):
+        exec(line, {})
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_runs_and_prints_what_it_is_stored_with(path, monkeypatch):

@@ -154,7 +154,7 @@ def _program(
     def walk(columns: Array, x: Array, wanted: Array, n_steps: Array, dynamic: Options) -> tuple:
         options = eqx.combine(dynamic, static)
         tableau = explicit_tableau(options.solver)
-        assert tableau is not None  # `lane_batch` looked
+        assert tableau is not None  # `batch` looked
         queue = _queue_of(columns, x, n_legs)
         return _walked(queue, wanted, n_steps, n_legs, max_events, one_sided, options, tableau)
 

@@ -260,7 +260,7 @@ def _squared_error(
 def _to_earliest_dip(g0: Array, g1: Array, slope: Array, bend: Array) -> Array:
     """Share of the step up to where a guard that falls and rises again is lowest, if near zero.
 
-    See `runge_kutta.dips`. A guard that stands on its own event at the start has no such place.
+    See `numerics.dips`. A guard that stands on its own event at the start has no such place.
     """
     low = dips(g0, g1, bend, slope) & (g0 > 0.0)
     place = -slope / jnp.where(low, 2.0 * bend, 1.0)

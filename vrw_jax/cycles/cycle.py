@@ -1,6 +1,6 @@
 """Limit cycles as differentiable functions of the parameters.
 
-The search (see cycle_search) carries no derivative. Derivatives come from the implicit function
+The search (see `search`) carries no derivative. Derivatives come from the implicit function
 theorem: the columns of the linearised pass at the cycle. They hold on unstable cycles, in forward
 and reverse mode, and to any order.
 """

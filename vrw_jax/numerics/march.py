@@ -258,7 +258,7 @@ def _squared_error(taken: Taken, start: Place, guards: Vector, rtol: Array, atol
 def _to_earliest_dip(tableau: Tableau, start: Vector, inside: Vector, end: Vector) -> Array:
     """Share of the step up to where a guard that falls and rises again is lowest, if near zero.
 
-    1 where there is nothing to look at. See `runge_kutta.dips`.
+    1 where there is nothing to look at. See `tableaus.dips`.
     """
     over, under = jnp.ones_like(start[0]), jnp.ones_like(start[0])
     for g0, gm, g1 in zip(start, inside, end, strict=True):

@@ -159,7 +159,7 @@ def uniform(ranges: Mapping[str, Range], n: int, seed: int = 0) -> Samples:
 
 
 def saltelli(ranges: Mapping[str, Range], n: int, seed: int = 0) -> Samples:
-    """Samples for `variance.sobol_indices`: for d parameters, `n` rows of 2 + d, n a power of two.
+    """Samples for `indices.sobol_indices`: for d parameters, `n` rows of 2 + d, n a power of two.
 
     A row holds two independent points of the box, A and B, and A with each coordinate in turn taken
     from B. Samples are ordered A, B, then by parameter.

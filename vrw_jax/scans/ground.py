@@ -203,5 +203,5 @@ def engine_for(
         return GroundEngine(measures, base, model, options, threads)
     if isinstance(model, LadderWheel):
         return LadderEngine(measures, base, model, options, cycle_options, threads)
-    assert isinstance(model, ViscoelasticWheel)  # `scan.plan` looked
+    assert isinstance(model, ViscoelasticWheel)  # `running.plan` looked
     return Engine(measures, base, model, options, cycle_options, threads)

@@ -1,6 +1,6 @@
 """Global sensitivity: which parameter's spread makes a measure spread, by Sobol' indices.
 
-`designs.saltelli` lays out the samples, `scan` computes them like any others, `sobol_indices` reads
+`design.saltelli` lays out the samples, `scan` computes them like any others, `sobol_indices` reads
 the indices off the result by `scipy.stats.sobol_indices` (Saltelli et al. 2010).
 """
 

@@ -1,6 +1,6 @@
 """Objective and constraints of a gait on real ground, with gradients along its branch.
 
-The face is that of the paper's engine (`tune_engine.Engine`). Where the order of events changes,
+The face is that of the paper's engine (`objective.Engine`). Where the order of events changes,
 gradients are one-sided.
 """
 

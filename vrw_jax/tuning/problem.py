@@ -171,7 +171,7 @@ def tune(
     `objective`: a measure's name, weights of several, or a function of a LimitCycle (and, if it
     takes two arguments, of the StepResult from it); it is maximised. `free` parameters move within
     their `bounds`. `constraints`: least values of measures by name; names alone mean zero; the
-    default is every premise that gaits of this rung can keep (`premises.default_margins`), {} is
+    default is every premise that gaits of this rung can keep (`cycles.default_margins`), {} is
     none. `tolerance` is on the first-order condition, relative to the objective's gradient; a
     constraint counts as kept within 1e-6 of what it changes over the bounds. Local: it ends at an
     optimum of the branch that `params` lies on. With `n_starts` above 1 so many wheels, `params`
