@@ -13,8 +13,8 @@ import xarray as xr
 from PIL import Image
 from typer.testing import CliRunner
 
+from vrw_jax import figures as plots
 from vrw_jax.app import cli
-from vrw_jax.figures import walk as plots
 from vrw_jax.paper import facts
 from vrw_jax.paper import reproduction as reproduce
 from vrw_jax.paper.facts.base import Evidence

@@ -1,6 +1,15 @@
 """Pictures of labelled results; the only room that knows matplotlib."""
 
-from vrw_jax.figures import walk
-from vrw_jax.figures.branch import border_text, branch_figure
+from vrw_jax.figures.branch import basin_figure, branch_figure, orbit_figure
 from vrw_jax.figures.scan import scan_figures
-from vrw_jax.figures.tuning import tuning
+from vrw_jax.figures.style import COLUMN, GREY, LIGHT, PAGE, axis_label, figure_style, save
+from vrw_jax.figures.tuning import tuning_figure
+from vrw_jax.figures.walk import (
+    foot_height,
+    gait_panels,
+    indicators,
+    rear_force,
+    save_animation,
+    sticks,
+    walk_frames,
+)

@@ -3,73 +3,46 @@
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
 from vrw_jax.branches import Border, Branch
-from vrw_jax.figures.scan import OUTCOMES, SYMBOLS, axis_label
-from vrw_jax.figures.walk import GREY, LEG_1, LEG_2, LIGHT, PAGE, style
-from vrw_jax.results import MARGINS, MEASURES
+from vrw_jax.figures.style import (
+    GREEN,
+    GREY,
+    LEG_1,
+    LEG_2,
+    LIGHT,
+    ORANGE,
+    PAGE,
+    YELLOW,
+    axis_label,
+    draw_marks,
+    figure_style,
+    outcome_cells,
+    outcome_patches,
+    panel_letter,
+    typeset,
+    value_label,
+)
+from vrw_jax.results import MEASURES, what_breaks
 from vrw_jax.walks import BEFORE
 from vrw_jax.wheel import Outcome
 
-COLOURS = {
-    "fold": "#000000",
-    "branch_point": "#000000",
-    "period_doubling": "#000000",
-    "neimark_sacker": "#000000",
-    "lost": "#D55E00",
-    "border_collision": "#009E73",
-}
-ENDS = "#D55E00"
-
-TEXTS = {
-    "lambda_I4": "$\\lambda_{I4}$ = 0: rear foot is freed by the landing",
-    "lambda_2_plus": "$\\lambda_2^+$ = 0: fore foot would pull",
-    "lambda_4_plus": "$\\lambda_4^+$ = 0: rear foot lifts at once",
-    "clearance_sls1": "foot 2 scuffs as it takes off",
-    "clearance_sls2": "foot 2 below ground at collision II",
-    "fore_foot_force": "fore foot pulls",
-    "contraction": "Leg 1 passes its stopper",
-    "hit_planted_impulse": "collision II pulls at the foot",
-    "rear_stopper_force": "Leg 2 leaves its stopper",
-    "friction_fore": "fore foot needs friction μ",
-    "friction_rear": "rear foot needs friction μ",
-    "landing_friction_fore": "fore foot needs μ in landing",
-    "landing_friction_rear": "rear foot needs μ in landing",
-}
-"""What happens at the zero of an indicator or a margin."""
+COLOURS = {"lost": ORANGE, "border_collision": GREEN}
+"""Of borders, by kind; where the gait's own stability changes: black. What ends a branch: ENDS."""
+ENDS, DASHED = ORANGE, (0, (3, 1.5))
 
 PANELS = (
-    (("dls_fraction", LEG_1),),
-    (("spectral_radius", "#000000"),),
-    (("lambda_2_plus", LEG_1), ("lambda_4_plus", LEG_2)),
-    (("clearance_sls1", LEG_2),),
+    ("DLS fraction", {"dls_fraction": LEG_1}),
+    ("moduli of multipliers", {"spectral_radius": "black"}),
+    (
+        f"${MEASURES['lambda_2_plus'].tex}$, ${MEASURES['lambda_4_plus'].tex}$ [N]",
+        {"lambda_2_plus": LEG_1, "lambda_4_plus": LEG_2},
+    ),
+    ("clearance in SLS-I [mm]", {"clearance_sls1": LEG_2}),
 )
-NAMES = {
-    "dls_fraction": "DLS fraction",
-    "spectral_radius": "moduli of multipliers",
-    "lambda_2_plus": "$\\lambda_2^+$",
-    "lambda_4_plus": "$\\lambda_4^+$",
-    "clearance_sls1": "clearance in SLS-I [mm]",
-}
-PLANE_LABELS = {
-    "theta_touchdown": "$\\theta^-$ [rad]",
-    "dtheta_touchdown": "$\\dot\\theta^-$ [rad/s]",
-    "dL1_touchdown": "$\\dot L_1^-$ [m/s]",
-    "theta_post_impact": "$\\theta^+$ [rad]",
-    "dtheta_post_impact": "$\\dot\\theta^+$ [rad/s]",
-}
-
-
-def border_text(border: Border) -> str:
-    """What happens at a border, in a few words."""
-    base, _, leg = border.name.partition("[")
-    if leg:
-        return f"{MARGINS[base].long_name}, leg {leg[:-1]}"
-    return TEXTS.get(base, base.replace("_", " "))
+"""Label, and the colour of each measure, of the panels of a branch."""
 
 
 def _pieces(branch: Branch) -> list[tuple[np.ndarray, bool]]:
@@ -83,6 +56,7 @@ def _pieces(branch: Branch) -> list[tuple[np.ndarray, bool]]:
     ]  # fmt: skip
 
 
+@figure_style()
 def branch_figure(branch: Branch) -> Figure:
     """DLS fraction, multipliers, indicators and clearance along a branch, with its borders.
 
@@ -90,37 +64,35 @@ def branch_figure(branch: Branch) -> Figure:
     """
     values, data = branch.values, branch.dataset
     borders = sorted(branch.borders, key=lambda border: border.value)
-    with style():
-        rows = -(-len(borders) // 2)
-        figure = Figure(figsize=(PAGE, 4.0 + 0.16 * rows))
-        panels = figure.subplots(2, 2, sharex=True)
-        for axes, series, letter in zip(panels.ravel(), PANELS, "abcd", strict=True):
-            axes.text(-0.12, 1.02, f"({letter})", transform=axes.transAxes, ha="right", va="bottom")
-            for name, colour in series:
-                scale = 1e3 if name == "clearance_sls1" else 1.0
-                columns = [_broken(name, scale * data[name].values)]
-                if name == "spectral_radius":
-                    columns = list(np.abs(branch.multipliers).T)
-                for column in columns:
-                    for places, stable in _pieces(branch):
-                        line = "-" if stable else "--"
-                        axes.plot(values[places], column[places], line, color=colour)
-            _draw_borders(axes, borders, numbered=letter in "ab")
-            label = ", ".join(NAMES[name] for name, _ in series)
-            axes.set_ylabel(label + (" [N]" if "lambda_2_plus" in dict(series) else ""))
-        panels[0, 1].axhline(1.0, color=GREY, linewidth=0.5)
-        panels[0, 1].set_ylim(0.0, None)
-        panels[1, 0].axhline(0.0, color=GREY, linewidth=0.5)
-        panels[1, 1].axhline(0.0, color=GREY, linewidth=0.5)
-        for name, colour in PANELS[2]:
-            panels[1, 0].plot([], [], color=colour, label=NAMES[name])
-        panels[1, 0].legend(loc="center left")
-        clearance = 1e3 * data.clearance_sls1.values
-        panels[1, 1].set_yscale("symlog", linthresh=0.1)
-        panels[1, 1].set_ylim(2.0 * min(clearance.min(), -0.1), 2.0 * max(clearance.max(), 0.1))
-        for axes in panels[1]:
-            axes.set_xlabel(_axis(branch.parameter))
-        _name_borders(figure, borders, _unit(branch.parameter))
+    rows = -(-len(borders) // 2)
+    figure = Figure(figsize=(PAGE, 4.0 + 0.16 * rows))
+    panels = figure.subplots(2, 2, sharex=True)
+    for axes, (label, series), letter in zip(panels.ravel(), PANELS, "abcd", strict=True):
+        panel_letter(axes, letter)
+        for name, colour in series.items():
+            scale = 1e3 if name == "clearance_sls1" else 1.0
+            columns = [_broken(name, scale * data[name].values)]
+            if name == "spectral_radius":
+                columns = list(np.abs(branch.multipliers).T)
+            for column in columns:
+                for places, stable in _pieces(branch):
+                    line = "-" if stable else "--"
+                    axes.plot(values[places], column[places], line, color=colour)
+        _draw_borders(axes, borders, numbered=letter in "ab")
+        axes.set_ylabel(label)
+    panels[0, 1].axhline(1.0, color=GREY, linewidth=0.5)
+    panels[0, 1].set_ylim(0.0, None)
+    panels[1, 0].axhline(0.0, color=GREY, linewidth=0.5)
+    panels[1, 1].axhline(0.0, color=GREY, linewidth=0.5)
+    for name, colour in PANELS[2][1].items():
+        panels[1, 0].plot([], [], color=colour, label=f"${MEASURES[name].tex}$")
+    panels[1, 0].legend(loc="center left")
+    clearance = 1e3 * data.clearance_sls1.values
+    panels[1, 1].set_yscale("symlog", linthresh=0.1)
+    panels[1, 1].set_ylim(2.0 * min(clearance.min(), -0.1), 2.0 * max(clearance.max(), 0.1))
+    for axes in panels[1]:
+        axes.set_xlabel(axis_label(branch.parameter))
+    _name_borders(figure, borders, branch.parameter)
     return figure
 
 
@@ -132,21 +104,15 @@ def _broken(name: str, values: np.ndarray) -> np.ndarray:
     return values
 
 
-def _axis(name: str) -> str:
-    return axis_label(name) if name in SYMBOLS and name in MEASURES else name
-
-
-def _unit(name: str) -> str:
-    unit = MEASURES[name].unit if name in MEASURES else "1"
-    return "" if unit == "1" else f" {unit.replace(' ', '·')}"
+def _colour(border: Border) -> str:
+    return ENDS if border.ends_branch else COLOURS.get(border.kind, "black")
 
 
 def _draw_borders(axes: Axes, borders: list[Border], numbered: bool) -> None:
     low, high = axes.get_xlim()
     last = -np.inf
     for i, border in enumerate(borders):
-        colour = ENDS if border.ends_branch else COLOURS[border.kind]
-        axes.axvline(border.value, color=colour, linewidth=0.7, linestyle=(0, (3, 1.5)), zorder=0)
+        axes.axvline(border.value, color=_colour(border), lw=0.7, linestyle=DASHED, zorder=0)
         if numbered:
             last = max(border.value, last + 0.03 * (high - low))
             axes.annotate(
@@ -156,28 +122,24 @@ def _draw_borders(axes: Axes, borders: list[Border], numbered: bool) -> None:
                 ha="center",
                 va="bottom",
                 fontsize=7.0,
-                color=colour,
+                color=_colour(border),
             )
 
 
-def _name_borders(figure: Figure, borders: list[Border], unit: str) -> None:
-    handles = [
-        Line2D(
-            [],
-            [],
-            color=ENDS if border.ends_branch else COLOURS[border.kind],
-            linewidth=0.9,
-            linestyle=(0, (3, 1.5)),
-            label=f"{i + 1}  {border.value:.6g}{unit}: {border_text(border)}"
-            + (" (ends here)" if border.ends_branch else ""),
+def _name_borders(figure: Figure, borders: list[Border], parameter: str) -> None:
+    handles = []
+    for i, border in enumerate(borders):
+        text = f"{value_label(parameter, border.value, 6)}: {typeset(what_breaks(border.name))}"
+        text = f"{i + 1}  {text}" + (" (ends here)" if border.ends_branch else "")
+        handles.append(
+            Line2D([], [], color=_colour(border), linewidth=0.9, linestyle=DASHED, label=text)
         )
-        for i, border in enumerate(borders)
-    ]
     handles.append(Line2D([], [], color="black", linestyle="-", label="stable"))
     handles.append(Line2D([], [], color="black", linestyle="--", label="unstable"))
     figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=7.5)
 
 
+@figure_style()
 def orbit_figure(orbits: xr.Dataset, border: float | None = None) -> Figure:
     """Post-impact rates and periods of all that attracts over a parameter.
 
@@ -186,46 +148,37 @@ def orbit_figure(orbits: xr.Dataset, border: float | None = None) -> Figure:
     parameter = str(orbits.attrs["parameter"])
     value = orbits[parameter].values
     lifts, scuffs = orbits.duration_dls.values == 0.0, orbits.clearance.values < 0.0
-    with style():
-        figure = Figure(figsize=(PAGE, 3.9))
-        rates, periods = figure.subplots(2, 1, sharex=True, height_ratios=[2.2, 1.0])
-        groups = (
-            (~lifts & ~scuffs, "o", LEG_1, LEG_1, "with DLS"),
-            (~lifts & scuffs, "o", LEG_1, "white", "with DLS, foot 2 scuffs"),
-            (lifts, "x", LEG_2, LEG_2, "rear foot lifts at once ($\\lambda_4^+ < 0$)"),
-            (lifts & scuffs, "o", LEG_2, "none", "the same, foot 2 scuffs"),
-        )
-        for chosen, marker, colour, fill, text in groups:
-            if chosen.any():
-                rates.plot(
-                    value[chosen],
-                    orbits.dtheta_post_impact.values[chosen],
-                    marker,
-                    color=colour,
-                    markerfacecolor=fill,
-                    markersize=2.4 if marker == "o" else 3.4,
-                    markeredgewidth=0.6,
-                    linestyle="none",
-                    label=text,
-                )
-        periods.plot(value, orbits.period.values, "s", color="black", markersize=2.0)
-        for axes in (rates, periods):
-            if border is not None:
-                axes.axvline(border, color=ENDS, linewidth=0.7, linestyle=(0, (3, 1.5)), zorder=0)
-            for left, right in _empty_stretches(orbits):
-                axes.axvspan(left, right, color=LIGHT, linewidth=0.0, zorder=0)
-        for left, right in _empty_stretches(orbits)[-1:]:
-            rates.text(0.5 * (left + right), 0.5, "falls", rotation=90, ha="center", va="center",
-                       transform=rates.get_xaxis_transform(), color=GREY)  # fmt: skip
+    figure = Figure(figsize=(PAGE, 3.9))
+    rates, periods = figure.subplots(2, 1, sharex=True, height_ratios=[2.2, 1.0])
+    groups = (
+        (~lifts & ~scuffs, "o", LEG_1, LEG_1, "with DLS"),
+        (~lifts & scuffs, "o", LEG_1, "white", "with DLS, foot 2 scuffs"),
+        (lifts, "x", LEG_2, LEG_2, "rear foot lifts at once ($\\lambda_4^+ < 0$)"),
+        (lifts & scuffs, "o", LEG_2, "none", "the same, foot 2 scuffs"),
+    )
+    for chosen, marker, colour, fill, text in groups:
+        if chosen.any():
+            size = 2.4 if marker == "o" else 3.4
+            x, y = value[chosen], orbits.dtheta_post_impact.values[chosen]
+            draw_marks(rates, x, y, marker, colour, fill, markersize=size, label=text)
+    periods.plot(value, orbits.period.values, "s", color="black", markersize=2.0)
+    for axes in (rates, periods):
         if border is not None:
-            rates.text(border, 0.4, " $\\lambda_4^+ = 0$", color=ENDS,
-                       transform=rates.get_xaxis_transform())  # fmt: skip
-        rates.set_ylabel("rate after landing, $\\dot\\theta^+$ [rad/s]")
-        rates.legend(loc="lower left", fontsize=7.5)
-        periods.set_ylabel("period [steps]")
-        periods.set_ylim(0.0, 1.0 + float(orbits.period.max()))
-        periods.yaxis.get_major_locator().set_params(integer=True)
-        periods.set_xlabel(_axis(parameter))
+            axes.axvline(border, color=ENDS, linewidth=0.7, linestyle=DASHED, zorder=0)
+        for left, right in _empty_stretches(orbits):
+            axes.axvspan(left, right, color=LIGHT, linewidth=0.0, zorder=0)
+    for left, right in _empty_stretches(orbits)[-1:]:
+        rates.text(0.5 * (left + right), 0.5, "falls", rotation=90, ha="center", va="center",
+                   transform=rates.get_xaxis_transform(), color=GREY)  # fmt: skip
+    if border is not None:
+        rates.text(border, 0.4, " $\\lambda_4^+ = 0$", color=ENDS,
+                   transform=rates.get_xaxis_transform())  # fmt: skip
+    rates.set_ylabel("rate after landing, $\\dot\\theta^+$ [rad/s]")
+    rates.legend(loc="lower left", fontsize=7.5)
+    periods.set_ylabel("period [steps]")
+    periods.set_ylim(0.0, 1.0 + float(orbits.period.max()))
+    periods.yaxis.get_major_locator().set_params(integer=True)
+    periods.set_xlabel(axis_label(parameter))
     return figure
 
 
@@ -239,46 +192,33 @@ def _empty_stretches(orbits: xr.Dataset) -> list[tuple[float, float]]:
     return [(tried[part[0]] - half, tried[part[-1]] + half) for part in parts]
 
 
+@figure_style()
 def basin_figure(results: list[xr.Dataset], titles: list[str]) -> Figure:
     """Which starts of a plane end where, one panel per result; crosses are the gaits' own states.
 
     Shades of blue count the steps until the gait is reached; other colours are the falls.
     """
     codes = sorted({int(c) for r in results for c in np.unique(r.outcome) if c != Outcome.STEPPED})
-    with style():
-        figure = Figure(figsize=(PAGE, 3.3))
-        panels = figure.subplots(1, len(results), sharey=True, squeeze=False)[0]
-        most = max(float(r.steps.where(r.attractor >= 0).max()) for r in results)
-        for axes, result, title in zip(panels, results, titles, strict=True):
-            y, x = (str(d) for d in result.attractor.dims)
-            steps = result.steps.where(result.attractor >= 0)
-            image = axes.pcolormesh(
-                result[x], result[y], steps, cmap="Blues_r", vmin=0.0, vmax=1.6 * most
-            )
-            image.set_rasterized(True)
-            falls = result.outcome.where(result.outcome != Outcome.STEPPED)
-            if codes:
-                colours = ListedColormap([OUTCOMES[Outcome(code)][1] for code in codes])
-                places = np.full(falls.shape, np.nan)
-                for i, code in enumerate(codes):
-                    places[falls.values == code] = i
-                norm = BoundaryNorm(np.arange(len(codes) + 1) - 0.5, len(codes))
-                fallen = np.ma.masked_invalid(places)
-                if len(codes) == 1:
-                    mesh = axes.pcolormesh(result[x], result[y], fallen, cmap=colours)
-                else:
-                    mesh = axes.pcolormesh(result[x], result[y], fallen, cmap=colours, norm=norm)
-                mesh.set_rasterized(True)
-            _mark_orbits(axes, result, x, y)
-            axes.set_title(title)
-            axes.set_xlabel(PLANE_LABELS[x])
-        panels[0].set_ylabel(PLANE_LABELS[str(results[0].attractor.dims[0])])
-        bar = figure.colorbar(image, ax=list(panels), aspect=25, pad=0.01)
-        bar.set_label("steps until the gait is reached")
-        bar.ax.set_ylim(0.0, most)
-        patches = [Patch(facecolor=OUTCOMES[Outcome(c)][1], label=OUTCOMES[Outcome(c)][0])
-                   for c in codes]  # fmt: skip
-        figure.legend(handles=patches, loc="outside lower center", ncols=4, fontsize=7.5)
+    figure = Figure(figsize=(PAGE, 3.3))
+    panels = figure.subplots(1, len(results), sharey=True, squeeze=False)[0]
+    most = max(float(r.steps.where(r.attractor >= 0).max()) for r in results)
+    for axes, result, title in zip(panels, results, titles, strict=True):
+        y, x = (str(d) for d in result.attractor.dims)
+        steps = result.steps.where(result.attractor >= 0)
+        image = axes.pcolormesh(
+            result[x], result[y], steps, cmap="Blues_r", vmin=0.0, vmax=1.6 * most
+        )
+        image.set_rasterized(True)
+        if codes:
+            outcome_cells(axes, result[x].values, result[y].values, result.outcome.values, codes)
+        _mark_orbits(axes, result, x, y)
+        axes.set_title(title)
+        axes.set_xlabel(axis_label(x, "{symbol}"))
+    panels[0].set_ylabel(axis_label(str(results[0].attractor.dims[0]), "{symbol}"))
+    bar = figure.colorbar(image, ax=list(panels), aspect=25, pad=0.01)
+    bar.set_label("steps until the gait is reached")
+    bar.ax.set_ylim(0.0, most)
+    figure.legend(handles=outcome_patches(codes), loc="outside lower center", ncols=4, fontsize=7.5)
     return figure
 
 
@@ -287,4 +227,4 @@ def _mark_orbits(axes: Axes, result: xr.Dataset, x: str, y: str) -> None:
         return
     columns = [BEFORE.index(x), BEFORE.index(y)]
     states = result.orbit_state.values.reshape(-1, len(BEFORE))[:, columns]
-    axes.plot(*states.T, "+", color="#F0E442", markersize=6.0, markeredgewidth=1.2)
+    axes.plot(*states.T, "+", color=YELLOW, markersize=6.0, markeredgewidth=1.2)

@@ -6,13 +6,30 @@ from typing import Literal
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
-from vrw_jax.figures.walk import COLUMN, PAGE, style
+from vrw_jax.figures.style import (
+    AMBER,
+    BLUE,
+    COLUMN,
+    GREEN,
+    LIGHT,
+    ORANGE,
+    OUTCOMES,
+    PAGE,
+    PINK,
+    SKY,
+    UNSTABLE,
+    axis_label,
+    figure_style,
+    outcome_cells,
+    outcome_patches,
+    outcome_style,
+    typeset,
+    value_label,
+)
 from vrw_jax.results import MARGINS, MEASURES
 from vrw_jax.scans import OF_CYCLE, SALTELLI, sobol_indices
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome
@@ -20,66 +37,22 @@ from vrw_jax.wheel import PARAMETER_NAMES, Outcome
 PREFERRED = ("damping", "slope", "stiffness", "natural_length", *PARAMETER_NAMES)
 """Which axes a picture takes first: across, then up, then side by side."""
 
-SYMBOLS = {
-    "hub_mass": "m_H",
-    "leg_mass": "m",
-    "leg_com": "a",
-    "locked_length": "L_0",
-    "natural_length": "L^*",
-    "stiffness": "k",
-    "damping": "c",
-    "slope": r"\phi",
-    "gravity": "g",
-    "dls_fraction": r"T_\mathrm{DLS}/T",
-    "speed": "v",
-}
-
-INDICATORS = {
-    "lambda_I4": r"indicator $\lambda_{I4}$",
-    "lambda_2_plus": r"indicator $\lambda_2^+$",
-    "lambda_4_plus": r"indicator $\lambda_4^+$",
-}
-"""Titles whose letters the type of figures lacks."""
-
 Dash = Literal["-", "--", "-.", ":"]
 
-BORDERS: dict[str, tuple[str, str, Dash]] = {
-    "fore_foot_force": ("fore foot pushes", "#000000", "-"),
-    "clearance_sls1": ("swing foot clear", "#D55E00", "-"),
-    "clearance_sls2": ("swing foot clear in SLS-II", "#D55E00", ":"),
-    "locked_stopper_force": ("locked legs on stoppers", "#CC79A7", "--"),
-    "rear_stopper_force": ("Leg 2 on its stopper", "#CC79A7", ":"),
-    "contraction": ("Leg 1 below $L_0$", "#009E73", "--"),
-    "friction_fore": ("fore foot grips", "#56B4E9", "-."),
-    "landing_friction_fore": ("fore foot grips in the landing", "#56B4E9", ":"),
-    "hit_planted_impulse": ("planted foot pushes in collision II", "#009E73", ":"),
+BORDERS: dict[str, tuple[str, Dash]] = {
+    "fore_foot_force": ("black", "-"),
+    "clearance_sls1": (ORANGE, "-"),
+    "clearance_sls2": (ORANGE, ":"),
+    "locked_stopper_force": (PINK, "--"),
+    "rear_stopper_force": (PINK, ":"),
+    "contraction": (GREEN, "--"),
+    "friction_fore": (SKY, "-."),
+    "landing_friction_fore": (SKY, ":"),
+    "hit_planted_impulse": (GREEN, ":"),
 }
-"""Premises whose borders are drawn: what holds on one side, colour and line."""
+"""Premises whose borders are drawn: colour and line."""
 
-OUTCOMES: dict[Outcome, tuple[str, str]] = {
-    Outcome.STEPPED: ("stable limit cycle", "#0072B2"),
-    Outcome.TOUCHDOWN_BEFORE_STOPPER: ("touchdown before stopper", "#E69F00"),
-    Outcome.STOPPER_IN_DOUBLE_SUPPORT: ("stopper in DLS", "#009E73"),
-    Outcome.FELL_BACK: ("fell back", "#56B4E9"),
-    Outcome.COLLAPSED: ("collapsed", "#D55E00"),
-    Outcome.LEG_1_LIFTED_OFF: ("Leg 1 lifted off", "#CC79A7"),
-    Outcome.NO_TOUCHDOWN_IN_TIME: ("no touchdown in time", "#999933"),
-    Outcome.SOLVER_GAVE_UP: ("solver gave up", "#882255"),
-    Outcome.BAD_INPUT: ("bad input", "#000000"),
-    Outcome.NO_CYCLE_FOUND: ("no cycle found", "#DDDDDD"),
-}
-NOT_COMPUTED = ("not computed", "#FFFFFF")
-UNSTABLE = 100
-"""Stands for a cycle whose spectral radius is 1 or more, beside the codes of `Outcome`."""
 MOST_COLUMNS, MOST_PAIRED, MOST_DRAWN = 4, 6, 20_000
-MISSING = "#E9E9E9"
-
-
-def axis_label(name: str) -> str:
-    """Name, symbol and unit of a parameter or measure."""
-    measure = MEASURES[name]
-    unit = "" if measure.unit == "1" else f" [{measure.unit.replace(' ', '·')}]"
-    return f"{measure.long_name} ${SYMBOLS[name]}${unit}"
 
 
 def scan_figures(scan: xr.Dataset) -> dict[str, Figure]:
@@ -104,6 +77,7 @@ def scan_figures(scan: xr.Dataset) -> dict[str, Figure]:
     return {f"scan_over_{name}": slice_figure(scan, long[0], long[1], name) for name in others}
 
 
+@figure_style()
 def slice_figure(scan: xr.Dataset, x: str, y: str, across: str | None = None) -> Figure:
     """DLS fraction, speed and outcome over (x, y), one column for each value of `across`.
 
@@ -118,69 +92,68 @@ def slice_figure(scan: xr.Dataset, x: str, y: str, across: str | None = None) ->
         places = np.unique(np.linspace(0, n - 1, min(n, MOST_COLUMNS)).round().astype(int))
         columns = [shown.isel({across: int(place)}) for place in places]
     rows = [name for name in ("dls_fraction", "speed") if name in scan]
-    with style():
-        width = PAGE if len(columns) > 1 else COLUMN
-        figure = Figure(figsize=(width, 1.65 * (len(rows) + 1) + 1.0))
-        panels = figure.subplots(
-            len(rows) + 1, len(columns), sharex=True, sharey=True, squeeze=False
-        )
-        for row, name in zip(panels, rows, strict=False):
-            values = [column[name].transpose(y, x).values for column in columns]
-            limits = _limits(values)
-            for axes, column, value in zip(row, columns, values, strict=True):
-                image = _cells(axes, column[x].values, column[y].values, value, limits)
-            bar = figure.colorbar(image, ax=row.tolist(), aspect=12, pad=0.01)
-            bar.set_label(_bar_label(name))
-        codes = np.unique([_codes(column).values for column in columns])
-        for axes, column in zip(panels[-1], columns, strict=True):
-            _outcome_cells(axes, column, x, y, codes)
-        drawn: dict[str, Line2D] = {}
-        for panel_row in panels:
-            for axes, column in zip(panel_row, columns, strict=True):
-                drawn |= _borders(axes, column, x, y)
-        for axes, column in zip(panels[0], columns, strict=True):
-            if across is not None:
-                axes.set_title(_value(across, column[across].item()))
-        for axes in panels[-1]:
-            axes.set_xlabel(axis_label(x) if len(columns) < 3 else _short_label(x))
-        for axes in panels[:, 0]:
-            axes.set_ylabel(_short_label(y))
-        _legend(figure, codes, drawn, len(columns))
-        if cut:
-            where = ", ".join(_value(n, scan[n].values[i]) for n, i in cut.items())
-            figure.suptitle(f"at {where}", fontsize=9.0)
+    width = PAGE if len(columns) > 1 else COLUMN
+    figure = Figure(figsize=(width, 1.65 * (len(rows) + 1) + 1.0))
+    panels = figure.subplots(len(rows) + 1, len(columns), sharex=True, sharey=True, squeeze=False)
+    for row, name in zip(panels, rows, strict=False):
+        values = [column[name].transpose(y, x).values for column in columns]
+        limits = _limits(values)
+        for axes, column, value in zip(row, columns, values, strict=True):
+            image = _cells(axes, column[x].values, column[y].values, value, limits)
+        bar = figure.colorbar(image, ax=row.tolist(), aspect=12, pad=0.01)
+        bar.set_label(axis_label(name, "{name}"))
+    codes = np.unique([_codes(column).values for column in columns])
+    for axes, column in zip(panels[-1], columns, strict=True):
+        kinds = _codes(column).transpose(y, x).values
+        outcome_cells(axes, _edges(column[x].values), _edges(column[y].values), kinds, codes)
+    drawn: dict[str, Line2D] = {}
+    for panel_row in panels:
+        for axes, column in zip(panel_row, columns, strict=True):
+            drawn |= _borders(axes, column, x, y)
+    for axes, column in zip(panels[0], columns, strict=True):
+        if across is not None:
+            axes.set_title(value_label(across, column[across].item()))
+    for axes in panels[-1]:
+        axes.set_xlabel(axis_label(x) if len(columns) < 3 else axis_label(x, "{symbol}"))
+    for axes in panels[:, 0]:
+        axes.set_ylabel(axis_label(y, "{symbol}"))
+    _legend(figure, codes, drawn, len(columns))
+    if cut:
+        where = ", ".join(value_label(n, scan[n].values[i]) for n, i in cut.items())
+        figure.suptitle(f"at {where}", fontsize=9.0)
     return figure
 
 
+@figure_style()
 def sample_figure(scan: xr.Dataset, names: Sequence[str]) -> Figure:
     """DLS fraction, speed and outcome of single samples over the first two parameters."""
     x, y = (names[0], names[1]) if len(names) > 1 else (names[0], "sample")
     walks = scan.outcome.values == Outcome.STEPPED
     rows = [name for name in ("dls_fraction", "speed") if name in scan]
     size = float(np.clip(3000.0 / max(scan.sizes["sample"], 1), 1.0, 12.0))
-    with style():
-        figure = Figure(figsize=(PAGE, 2.9))
-        panels = figure.subplots(1, len(rows) + 1, sharey=True, squeeze=False)[0]
-        dot = {"s": size, "linewidths": 0.0, "rasterized": True}
-        for axes, name in zip(panels, rows, strict=False):
-            axes.scatter(scan[x].values[~walks], scan[y].values[~walks], color=MISSING, **dot)
-            points = axes.scatter(
-                scan[x].values[walks], scan[y].values[walks], c=scan[name].values[walks], **dot
-            )
-            figure.colorbar(points, ax=axes, location="top", aspect=25).set_label(axis_label(name))
-        told = _codes(scan).values
-        codes = np.unique(told)
-        for code in codes:
-            there = told == code
-            color = _outcome_style(int(code))[1]
-            panels[-1].scatter(scan[x].values[there], scan[y].values[there], color=color, **dot)
-        for axes in panels:
-            axes.set_xlabel(_short_label(x))
-        panels[0].set_ylabel("sample" if y == "sample" else _short_label(y))
-        _legend(figure, codes, {}, 3)
+    figure = Figure(figsize=(PAGE, 2.9))
+    panels = figure.subplots(1, len(rows) + 1, sharey=True, squeeze=False)[0]
+    dot = {"s": size, "linewidths": 0.0, "rasterized": True}
+    for axes, name in zip(panels, rows, strict=False):
+        axes.scatter(scan[x].values[~walks], scan[y].values[~walks], color=LIGHT, **dot)
+        points = axes.scatter(
+            scan[x].values[walks], scan[y].values[walks], c=scan[name].values[walks], **dot
+        )
+        figure.colorbar(points, ax=axes, location="top", aspect=25).set_label(axis_label(name))
+    told = _codes(scan).values
+    codes = np.unique(told)
+    for code in codes:
+        there = told == code
+        color = outcome_style(int(code))[1]
+        panels[-1].scatter(scan[x].values[there], scan[y].values[there], color=color, **dot)
+    for axes in panels:
+        axes.set_xlabel(axis_label(x, "{symbol}"))
+    panels[0].set_ylabel("sample" if y == "sample" else axis_label(y, "{symbol}"))
+    _legend(figure, codes, {}, 3)
     return figure
 
 
+@figure_style()
 def pairs_figure(scan: xr.Dataset, names: Sequence[str]) -> Figure:
     """Samples over each pair of parameters: DLS fraction below the diagonal, outcome above.
 
@@ -193,32 +166,31 @@ def pairs_figure(scan: xr.Dataset, names: Sequence[str]) -> Figure:
     kinds, d = np.unique(codes), len(names)
     size = float(np.clip(8000.0 / len(codes), 0.6, 8.0))
     dot = {"s": size, "linewidths": 0.0, "rasterized": True}
-    with style():
-        figure = Figure(figsize=(PAGE, PAGE * 0.9))
-        panels = figure.subplots(d, d, sharex="col", squeeze=False)
-        points = None
-        for (i, j), axes in np.ndenumerate(panels):
-            x, y = shown[names[j]].values, shown[names[i]].values
-            if i == j:
-                _share_along(axes, x, codes == Outcome.STEPPED)
-            elif i < j:
-                axes.scatter(x, y, color=[_outcome_style(int(code))[1] for code in codes], **dot)
-            else:
-                axes.scatter(x[~walks], y[~walks], color=MISSING, **dot)
-                if value is not None:
-                    told = shown[value].values[walks]
-                    points = axes.scatter(x[walks], y[walks], c=told, **dot)
-            if i == d - 1:
-                axes.set_xlabel(_short_label(names[j]))
-            if j == 0 and i > 0:
-                axes.set_ylabel(_short_label(names[i]))
-            elif i != j:
-                axes.tick_params(labelleft=False)
-        panels[0, 0].set_ylabel("share that walks")
-        if value is not None and points is not None:
-            bar = figure.colorbar(points, ax=panels.ravel().tolist(), aspect=40, pad=0.01)
-            bar.set_label(_bar_label(value))
-        _legend(figure, kinds, {}, 3)
+    figure = Figure(figsize=(PAGE, PAGE * 0.9))
+    panels = figure.subplots(d, d, sharex="col", squeeze=False)
+    points = None
+    for (i, j), axes in np.ndenumerate(panels):
+        x, y = shown[names[j]].values, shown[names[i]].values
+        if i == j:
+            _share_along(axes, x, codes == Outcome.STEPPED)
+        elif i < j:
+            axes.scatter(x, y, color=[outcome_style(int(code))[1] for code in codes], **dot)
+        else:
+            axes.scatter(x[~walks], y[~walks], color=LIGHT, **dot)
+            if value is not None:
+                told = shown[value].values[walks]
+                points = axes.scatter(x[walks], y[walks], c=told, **dot)
+        if i == d - 1:
+            axes.set_xlabel(axis_label(names[j], "{symbol}"))
+        if j == 0 and i > 0:
+            axes.set_ylabel(axis_label(names[i], "{symbol}"))
+        elif i != j:
+            axes.tick_params(labelleft=False)
+    panels[0, 0].set_ylabel("share that walks")
+    if value is not None and points is not None:
+        bar = figure.colorbar(points, ax=panels.ravel().tolist(), aspect=40, pad=0.01)
+        bar.set_label(axis_label(value, "{name}"))
+    _legend(figure, kinds, {}, 3)
     return figure
 
 
@@ -230,59 +202,59 @@ def _share_along(axes: Axes, x: np.ndarray, walks: np.ndarray) -> None:
     axes.set_ylim(0.0, 1.0)
 
 
+@figure_style()
 def indices_figure(indices: xr.Dataset) -> Figure:
     """First-order and total Sobol' indices of each measure, with their intervals."""
     measures, parameters = indices.measure.values, [str(p) for p in indices.parameter.values]
     n_columns = min(len(measures), 3)
     n_rows = -(-len(measures) // n_columns)
     places = np.arange(len(parameters))
-    with style():
-        height = (0.26 * len(parameters) + 0.5) * n_rows + 0.6
-        figure = Figure(figsize=(PAGE, height))
-        panels = figure.subplots(n_rows, n_columns, sharex=True, sharey=True, squeeze=False)
-        for axes in panels.ravel()[len(measures) :]:
-            axes.set_axis_off()
-        for axes, name in zip(panels.ravel(), measures, strict=False):
-            told = indices.sel(measure=name)
-            for kind, label, shift, color in (
-                ("first_order", "by itself (first order)", -0.19, "#0072B2"),
-                ("total", "with all it meets (total)", 0.19, "#E69F00"),
-            ):
-                value = told[kind].values
-                low, high = told[f"{kind}_lower"].values, told[f"{kind}_upper"].values
-                away = np.maximum([value - low, high - value], 0.0)
-                bars = {"height": 0.36, "color": color, "label": label}
-                axes.barh(places + shift, value, xerr=away, error_kw={"elinewidth": 0.7}, **bars)
-            axes.set_title(INDICATORS.get(str(name), MEASURES[str(name)].long_name))
-            axes.set_yticks(places, [f"${SYMBOLS[p]}$" for p in parameters])
-            axes.set_xlim(0.0, 1.05)
-        panels[0, 0].invert_yaxis()
-        for axes in panels.ravel()[max(len(measures) - n_columns, 0) : len(measures)]:
-            axes.set_xlabel("share of the variance")
-            axes.tick_params(labelbottom=True)
-        handles, labels = panels[0, 0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=2)
-        left_out = 100.0 * indices.attrs["left_out"]
-        note = f"{indices.attrs['rows']:,} rows; {left_out:.1f} % left out, without a gait"
-        figure.suptitle(note, fontsize=8.0)
+    height = (0.26 * len(parameters) + 0.5) * n_rows + 0.6
+    figure = Figure(figsize=(PAGE, height))
+    panels = figure.subplots(n_rows, n_columns, sharex=True, sharey=True, squeeze=False)
+    for axes in panels.ravel()[len(measures) :]:
+        axes.set_axis_off()
+    for axes, name in zip(panels.ravel(), measures, strict=False):
+        told = indices.sel(measure=name)
+        for kind, label, shift, color in (
+            ("first_order", "by itself (first order)", -0.19, BLUE),
+            ("total", "with all it meets (total)", 0.19, AMBER),
+        ):
+            value = told[kind].values
+            low, high = told[f"{kind}_lower"].values, told[f"{kind}_upper"].values
+            away = np.maximum([value - low, high - value], 0.0)
+            bars = {"height": 0.36, "color": color, "label": label}
+            axes.barh(places + shift, value, xerr=away, error_kw={"elinewidth": 0.7}, **bars)
+        axes.set_title(typeset(MEASURES[str(name)].long_name))
+        axes.set_yticks(places, [f"${MEASURES[p].tex}$" for p in parameters])
+        axes.set_xlim(0.0, 1.05)
+    panels[0, 0].invert_yaxis()
+    for axes in panels.ravel()[max(len(measures) - n_columns, 0) : len(measures)]:
+        axes.set_xlabel("share of the variance")
+        axes.tick_params(labelbottom=True)
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=2)
+    left_out = 100.0 * indices.attrs["left_out"]
+    note = f"{indices.attrs['rows']:,} rows; {left_out:.1f} % left out, without a gait"
+    figure.suptitle(note, fontsize=8.0)
     return figure
 
 
+@figure_style()
 def curve_figure(scan: xr.Dataset, x: str) -> Figure:
     """DLS fraction and speed along one parameter; grey where there is no gait."""
     scan = scan.isel({n: 0 for n in PARAMETER_NAMES if n in scan.dims and n != x}).sortby(x)
     rows = [name for name in ("dls_fraction", "speed") if name in scan] or ["fore_foot_force"]
-    with style():
-        figure = Figure(figsize=(COLUMN, 1.6 * len(rows) + 0.6))
-        panels = figure.subplots(len(rows), 1, sharex=True, squeeze=False)[:, 0]
-        edges = _edges(scan[x].values)
-        failed = scan.outcome.values != Outcome.STEPPED
-        for axes, name in zip(panels, rows, strict=True):
-            axes.plot(scan[x].values, scan[name].values, marker=".", color="#0072B2")
-            axes.set_ylabel(_bar_label(name) if name in SYMBOLS else name)
-            for cell in np.flatnonzero(failed):
-                axes.axvspan(edges[cell], edges[cell + 1], color=MISSING, linewidth=0.0, zorder=0)
-        panels[-1].set_xlabel(axis_label(x))
+    figure = Figure(figsize=(COLUMN, 1.6 * len(rows) + 0.6))
+    panels = figure.subplots(len(rows), 1, sharex=True, squeeze=False)[:, 0]
+    edges = _edges(scan[x].values)
+    failed = scan.outcome.values != Outcome.STEPPED
+    for axes, name in zip(panels, rows, strict=True):
+        axes.plot(scan[x].values, scan[name].values, marker=".", color=BLUE)
+        axes.set_ylabel(axis_label(name, "{name}"))
+        for cell in np.flatnonzero(failed):
+            axes.axvspan(edges[cell], edges[cell + 1], color=LIGHT, linewidth=0.0, zorder=0)
+    panels[-1].set_xlabel(axis_label(x))
     return figure
 
 
@@ -296,7 +268,7 @@ def _cells(
     axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, limits: tuple[float, float]
 ) -> AxesImage:
     """One coloured cell per sample, so that nothing is seen that was not computed."""
-    axes.set_facecolor(MISSING)
+    axes.set_facecolor(LIGHT)
     masked = np.ma.masked_invalid(values)
     mesh = axes.pcolormesh(
         _edges(x), _edges(y), masked, cmap="viridis", vmin=limits[0], vmax=limits[1]
@@ -314,22 +286,6 @@ def _edges(places: np.ndarray) -> np.ndarray:
     return np.concatenate([[first], middle, [last]])
 
 
-def _outcome_cells(axes: Axes, scan: xr.Dataset, x: str, y: str, codes: np.ndarray) -> None:
-    colors = ListedColormap([_outcome_style(int(code))[1] for code in codes])
-    places = np.searchsorted(codes, _codes(scan).transpose(y, x).values)
-    norm = BoundaryNorm(np.arange(len(codes) + 1) - 0.5, len(codes)) if len(codes) > 1 else None
-    mesh = axes.pcolormesh(
-        _edges(scan[x].values), _edges(scan[y].values), places, cmap=colors, norm=norm
-    )
-    mesh.set_rasterized(True)
-
-
-def _outcome_style(code: int) -> tuple[str, str]:
-    if code == UNSTABLE:
-        return "unstable limit cycle", "#F0E442"
-    return OUTCOMES[Outcome(code)] if code >= 0 else NOT_COMPUTED
-
-
 def _codes(scan: xr.Dataset) -> xr.DataArray:
     """Outcomes, with unstable cycles told apart where the scan knows."""
     codes = scan.outcome.astype(int)
@@ -341,11 +297,11 @@ def _codes(scan: xr.Dataset) -> xr.DataArray:
 def _borders(axes: Axes, scan: xr.Dataset, x: str, y: str) -> dict[str, Line2D]:
     """Lines where a premise's margin is zero; returns what a legend needs."""
     drawn = {}
-    for name, (label, color, line) in BORDERS.items():
+    for name, (color, line) in BORDERS.items():
         if name not in scan or scan.sizes[x] < 2 or scan.sizes[y] < 2:
             continue
         margin = scan[name]
-        if name in MARGINS and MARGINS[name].axis:
+        if MARGINS[name].axis:
             margin = margin.min("leg")
         values = margin.transpose(y, x).values
         known = values[np.isfinite(values)]
@@ -360,35 +316,16 @@ def _borders(axes: Axes, scan: xr.Dataset, x: str, y: str) -> dict[str, Line2D]:
             linestyles=[line],
             linewidths=1.2,
         )
-        drawn[name] = Line2D([], [], color=color, linestyle=line, label=label)
+        drawn[name] = Line2D([], [], color=color, linestyle=line, label=MARGINS[name].breaks)
     return drawn
 
 
 def _legend(figure: Figure, codes: np.ndarray, drawn: Mapping[str, Line2D], n_columns: int) -> None:
-    patches = [
-        Patch(facecolor=color, edgecolor="#888888", linewidth=0.4, label=label)
-        for label, color in (_outcome_style(int(code)) for code in codes)
-    ]
     lines = [drawn[name] for name in BORDERS if name in drawn]
     figure.legend(
-        handles=[*patches, *lines],
+        handles=[*outcome_patches(codes), *lines],
         loc="outside lower center",
         ncols=4 if n_columns > 1 else 2,
         fontsize=7.5,
         columnspacing=1.4,
     )
-
-
-def _bar_label(name: str) -> str:
-    return {"dls_fraction": "DLS fraction", "speed": "speed [m/s]"}.get(name, name)
-
-
-def _short_label(name: str) -> str:
-    unit = MEASURES[name].unit
-    text = f"${SYMBOLS[name]}$"
-    return text if unit == "1" else f"{text} [{unit.replace(' ', '·')}]"
-
-
-def _value(name: str, value: float) -> str:
-    unit = MEASURES[name].unit
-    return f"${SYMBOLS[name]}$ = {value:.4g}" + ("" if unit == "1" else f" {unit}")

@@ -7,7 +7,17 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from vrw_jax.cycles import measure
-from vrw_jax.figures.walk import GREY, LIGHT, PAGE, style
+from vrw_jax.figures.style import (
+    BLUE,
+    GREY,
+    LIGHT,
+    ORANGE,
+    PAGE,
+    axis_label,
+    draw_marks,
+    figure_style,
+    typeset,
+)
 from vrw_jax.results import MEASURES
 from vrw_jax.tuning import ACTIVE, Kind, Tuned
 
@@ -15,7 +25,8 @@ ROW = 0.19
 """Height of a constraint's row, inches."""
 
 
-def tuning(tuned: Tuned) -> Figure:
+@figure_style()
+def tuning_figure(tuned: Tuned) -> Figure:
     """Objective and parameters over the gaits evaluated; slack of the constraints before and after.
 
     Filled symbols keep every constraint, open ones break one; crosses are trials that lost the gait
@@ -23,15 +34,14 @@ def tuning(tuned: Tuned) -> Figure:
     """
     path = tuned.path
     n = path.sizes["constraint"]
-    with style():
-        figure = Figure(figsize=(PAGE, max(3.2, ROW * n + 1.0)))
-        panels = figure.subplot_mosaic(
-            [["objective", "slack"], ["parameters", "slack"]], width_ratios=[1.0, 1.1]
-        )
-        panels["objective"].sharex(panels["parameters"])
-        _objective(panels["objective"], path)
-        _parameters(panels["parameters"], path)
-        _slack(panels["slack"], tuned)
+    figure = Figure(figsize=(PAGE, max(3.2, ROW * n + 1.0)))
+    panels = figure.subplot_mosaic(
+        [["objective", "slack"], ["parameters", "slack"]], width_ratios=[1.0, 1.1]
+    )
+    panels["objective"].sharex(panels["parameters"])
+    _objective(panels["objective"], path)
+    _parameters(panels["parameters"], path)
+    _slack(panels["slack"], tuned)
     return figure
 
 
@@ -39,29 +49,14 @@ def _objective(axes: Axes, path: xr.Dataset) -> None:
     number, value = path.evaluation.values, path.objective.values
     lost = path.kind.values == Kind.LOST
     axes.plot(number[~lost], value[~lost], color=GREY, linewidth=0.7, zorder=1)
-    for kept, fill in ((True, "#0072B2"), (False, "white")):
+    for kept, fill, text in ((True, BLUE, "keeps the constraints"), (False, "white", "breaks one")):
         chosen = ~lost & ((path.breach.values <= ACTIVE) == kept)
-        axes.plot(
-            number[chosen],
-            value[chosen],
-            "o",
-            color="#0072B2",
-            markerfacecolor=fill,
-            markersize=4.0,
-            markeredgewidth=0.8,
-            label="keeps the constraints" if kept else "breaks one",
-        )
+        draw_marks(axes, number[chosen], value[chosen], "o", BLUE, fill, markersize=4.0, label=text)
     if lost.any():
         for i, place in enumerate(number[lost]):
-            axes.axvline(
-                place, color="#D55E00", linewidth=0.8, linestyle=":",
-                label="gait lost, step shortened" if i == 0 else None,
-            )  # fmt: skip
-    name = path.objective.attrs["long_name"]
-    if name in MEASURES:
-        unit = MEASURES[name].unit
-        name = MEASURES[name].long_name + (f" [{unit}]" if unit != "1" else "")
-    axes.set_ylabel(name)
+            first = "gait lost, step shortened" if i == 0 else None
+            axes.axvline(place, color=ORANGE, linewidth=0.8, linestyle=":", label=first)
+    axes.set_ylabel(axis_label(path.objective.attrs["long_name"], "{name}"))
     axes.legend(loc="best", fontsize=7.0)
 
 
@@ -69,17 +64,12 @@ def _parameters(axes: Axes, path: xr.Dataset) -> None:
     lower, upper = np.asarray(path.attrs["lower"]), np.asarray(path.attrs["upper"])
     for i, name in enumerate(path.attrs["free"]):
         u = (path[name].values - lower[i]) / (upper[i] - lower[i])
-        symbol = MEASURES[name].symbol
-        axes.plot(path.evaluation, u, marker=".", markersize=4.0, label=f"${_tex(symbol)}$")
+        axes.plot(path.evaluation, u, marker=".", markersize=4.0, label=f"${MEASURES[name].tex}$")
     axes.set_ylim(-0.05, 1.05)
     axes.set_yticks([0.0, 1.0], ["lower\nbound", "upper\nbound"])
     axes.set_xlabel("gaits evaluated")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
-
-
-def _tex(symbol: str) -> str:
-    return {"phi": "\\varphi", "L*": "L^*", "L_0": "L_0"}.get(symbol, symbol)
 
 
 def _slack(axes: Axes, tuned: Tuned) -> None:
@@ -102,7 +92,7 @@ def _slack(axes: Axes, tuned: Tuned) -> None:
     held = {active.name for active in tuned.active}
     for share, offset, tone, text in (
         ((values[0] - margin) / scale, 0.19, LIGHT, "at the start"),
-        ((values[last] - margin) / scale, -0.19, "#0072B2", "tuned"),
+        ((values[last] - margin) / scale, -0.19, BLUE, "tuned"),
     ):
         axes.barh(
             places + offset, share, 0.36, color=tone, label=text, edgecolor=GREY, linewidth=0.3
@@ -111,12 +101,11 @@ def _slack(axes: Axes, tuned: Tuned) -> None:
     texts = []
     for name in names:
         plain, _, leg = name.partition("[")
-        long_name = measure(plain).long_name.replace("⁺", "$^+$")
-        texts.append(f"{long_name}{', ' + leg[:-1] if leg else ''}")
+        texts.append(typeset(measure(plain).long_name) + (f", {leg[:-1]}" if leg else ""))
     axes.set_yticks(places, texts, fontsize=7.0)
     for tick, name in zip(axes.get_yticklabels(), names, strict=True):
         if name in held:
-            tick.set_color("#D55E00")
+            tick.set_color(ORANGE)
             tick.set_fontweight("bold")
     axes.set_xlim(min(-0.05, axes.get_xlim()[0]), 1.05)
     axes.set_xlabel("slack, share of the largest on the path\n(active in bold)")

@@ -1,86 +1,34 @@
-"""Figures of labelled results, in one style: journal widths, colours for every eye, vector output.
+"""Figures of walks: the paper's figures 6 to 10, and the walk itself as moving frames."""
 
-Functions take labelled datasets and return a matplotlib Figure. No global setting of matplotlib is
-touched and no window is opened: figures are made inside `style()` and written by `save`.
-"""
-
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 import xarray as xr
-from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
+from vrw_jax.figures.style import (
+    COLUMN,
+    GREY,
+    LEG_1,
+    LEG_2,
+    LIGHT,
+    PAGE,
+    SKY,
+    axis_label,
+    draw_marks,
+    figure_style,
+    panel_letter,
+    value_label,
+)
 from vrw_jax.results import MEASURES, PHASES
-
-STYLE: dict[Any, Any] = {
-    "font.family": "serif",
-    "font.serif": ["STIXGeneral"],  # comes with matplotlib
-    "mathtext.fontset": "stix",
-    "font.size": 9.0,
-    "axes.titlesize": 9.0,
-    "axes.labelsize": 9.0,
-    "xtick.labelsize": 8.0,
-    "ytick.labelsize": 8.0,
-    "legend.fontsize": 8.0,
-    "legend.frameon": False,
-    "legend.handlelength": 2.2,
-    "axes.linewidth": 0.6,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "lines.linewidth": 1.2,
-    "xtick.major.width": 0.6,
-    "ytick.major.width": 0.6,
-    "xtick.direction": "out",
-    "ytick.direction": "out",
-    "axes.prop_cycle": cycler(color=["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9"]),
-    "figure.constrained_layout.use": True,
-    "savefig.dpi": 200,
-    "svg.hashsalt": "vrw_jax",  # the same figure gives the same file
-}
-"""Colours of Okabe and Ito; serif type as in the journal; nothing that the system must have."""
-
-COLUMN, PAGE = 3.4, 6.9
-"""Widths of one column and of the page, inches."""
 
 Coordinate = float | np.ndarray
 
-LEG_1, LEG_2, GREY, LIGHT = "#0072B2", "#D55E00", "#555555", "#E9E9E9"
-
-
-@contextmanager
-def style() -> Iterator[None]:
-    """The style of every figure, for the time of a `with` block."""
-    with mpl.rc_context(STYLE):
-        yield
-
-
-def save(figure: Figure, folder: Path, name: str) -> list[Path]:
-    """Write `figure` as SVG and PNG into `folder`; returns the paths."""
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"{name}.svg", folder / f"{name}.png"]
-    with style():
-        figure.savefig(paths[0], metadata={"Date": None})
-        figure.savefig(paths[1], metadata={"Software": None})
-    return paths
-
-
-def label(name: str, symbol: str | None = None) -> str:
-    """Axis label of a measure: its symbol with the unit in brackets."""
-    measure = MEASURES[name]
-    text = symbol if symbol is not None else measure.symbol
-    return f"{text} [{_unit(measure.unit)}]" if measure.unit != "1" else text
-
-
-def _unit(unit: str) -> str:
-    return unit.replace(" ", "·").replace("^2", "²")
+FORCES = ("lambda_1", "lambda_2", "lambda_3", "lambda_4")
 
 
 def phase_spans(gait: xr.Dataset) -> list[tuple[float, float, int]]:
@@ -106,102 +54,92 @@ def _shade_double_support(axes: Axes, gait: xr.Dataset) -> None:
             axes.axvline(begin, color=GREY, linewidth=0.5, linestyle=(0, (1, 2)), zorder=0)
 
 
-def _panel(axes: Axes, letter: str) -> None:
-    axes.text(-0.12, 1.02, f"({letter})", transform=axes.transAxes, ha="right", va="bottom")
-
-
+@figure_style()
 def gait_panels(gait: xr.Dataset) -> Figure:
     """Angle, leg lengths, share of the load, height of foot 2 and ground forces over time (Fig. 6).
 
     Grey bands are double support; dotted lines are collision II.
     """
     time, theta, L1, L2, z2, *forces = broken_at_events(
-        gait, "theta", "L1", "L2", "foot_2_z", "lambda_1", "lambda_2", "lambda_3", "lambda_4"
+        gait, "theta", "L1", "L2", "foot_2_z", *FORCES
     )
     share = 100.0 * forces[3] / (forces[1] + forces[3])
-    with style():
-        figure = Figure(figsize=(0.8 * PAGE, 7.4))
-        panels = figure.subplots(5, 1, sharex=True, height_ratios=[1, 1, 1, 1, 1.5])
-        for axes, letter in zip(panels, "abcde", strict=True):
-            _shade_double_support(axes, gait)
-            _panel(axes, letter)
-        panels[0].plot(time, theta, color="black")
-        panels[0].set_ylabel(label("theta", "$\\theta$"))
-        for begin, end, phase in phase_spans(gait)[:3]:
-            panels[0].annotate(
-                PHASES[phase],
-                (0.5 * (begin + end), 1.0),
-                xycoords=("data", "axes fraction"),
-                ha="center",
-                va="bottom",
-                fontsize=7.5,
-                rotation=90 if phase == 2 else 0,
-            )
-        panels[1].plot(time, L1, color=LEG_1, label="Leg 1, $L_1$")
-        panels[1].plot(time, L2, color=LEG_2, linestyle="--", label="Leg 2, $L_2$")
-        panels[1].set_ylabel("$L_1,\\ L_2$ [m]")
-        panels[2].plot(time, 100.0 - share, color=LEG_1, label="foot 1")
-        panels[2].plot(time, share, color=LEG_2, linestyle="--", label="foot 2")
-        panels[2].set_ylabel("share of the\nnormal force [%]")
-        panels[3].plot(time, z2, color=LEG_2, linestyle="--")
-        panels[3].set_ylabel("$z_2$ [m]")
-        names = ("$\\lambda_1$", "$\\lambda_2$", "$\\lambda_3$", "$\\lambda_4$")
-        for force, name, color, line, width in zip(
-            forces,
-            names,
-            (LEG_1, LEG_1, LEG_2, LEG_2),
-            ("-", "-", "--", "--"),
-            (0.7, 1.4, 0.7, 1.4),
-            strict=True,
-        ):
-            panels[4].plot(time, force, color=color, linestyle=line, linewidth=width, label=name)
-        panels[4].axhline(0.0, color=GREY, linewidth=0.4)
-        panels[4].set_ylabel("ground reaction\nforce [N]")
-        panels[4].set_xlabel("time [s]")
-        panels[4].set_xlim(time[0], time[-1])
-        for axes in panels[[1, 2, 4]]:
-            axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
-        figure.align_ylabels(panels)
+    figure = Figure(figsize=(0.8 * PAGE, 7.4))
+    panels = figure.subplots(5, 1, sharex=True, height_ratios=[1, 1, 1, 1, 1.5])
+    for axes, letter in zip(panels, "abcde", strict=True):
+        _shade_double_support(axes, gait)
+        panel_letter(axes, letter)
+    panels[0].plot(time, theta, color="black")
+    panels[0].set_ylabel(axis_label("theta", "{symbol}"))
+    for begin, end, phase in phase_spans(gait)[:3]:
+        panels[0].annotate(
+            PHASES[phase],
+            (0.5 * (begin + end), 1.0),
+            xycoords=("data", "axes fraction"),
+            ha="center",
+            va="bottom",
+            fontsize=7.5,
+            rotation=90 if phase == 2 else 0,
+        )
+    panels[1].plot(time, L1, color=LEG_1, label="Leg 1, $L_1$")
+    panels[1].plot(time, L2, color=LEG_2, linestyle="--", label="Leg 2, $L_2$")
+    panels[1].set_ylabel("$L_1,\\ L_2$ [m]")
+    panels[2].plot(time, 100.0 - share, color=LEG_1, label="foot 1")
+    panels[2].plot(time, share, color=LEG_2, linestyle="--", label="foot 2")
+    panels[2].set_ylabel("share of the\nnormal force [%]")
+    panels[3].plot(time, z2, color=LEG_2, linestyle="--")
+    panels[3].set_ylabel("$z_2$ [m]")
+    for i, force in enumerate(forces):
+        color, line = (LEG_1, "-") if i < 2 else (LEG_2, "--")
+        name, width = f"${MEASURES[FORCES[i]].tex}$", (0.7, 1.4)[i % 2]
+        panels[4].plot(time, force, color=color, linestyle=line, linewidth=width, label=name)
+    panels[4].axhline(0.0, color=GREY, linewidth=0.4)
+    panels[4].set_ylabel("ground reaction\nforce [N]")
+    panels[4].set_xlabel("time [s]")
+    panels[4].set_xlim(time[0], time[-1])
+    for axes in panels[[1, 2, 4]]:
+        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+    figure.align_ylabels(panels)
     return figure
 
 
+@figure_style()
 def sticks(gait: xr.Dataset, interval: float = 0.05) -> Figure:
     """Stick diagram in the X-Z plane each `interval`, s: Leg 1 solid, Leg 2 dotted (Fig. 7)."""
-    tones = ("#A0A0A0", "#56B4E9", "#000000")
+    tones = ("#A0A0A0", SKY, "#000000")
     time = gait.time.values
-    with style():
-        figure = Figure(figsize=(PAGE, 2.8))
-        axes = figure.subplots()
-        for i in np.searchsorted(time, np.arange(0.0, time[-1], interval)):
-            one = gait.isel(time=int(i))
-            for foot, line in ((1, "-"), (2, ":")):
-                axes.plot(
-                    [float(one[f"foot_{foot}_x"]), float(one.hub_x)],
-                    [float(one[f"foot_{foot}_z"]), float(one.hub_z)],
-                    color=tones[int(one.phase)],
-                    linestyle=line,
-                    linewidth=0.8,
-                )
-        axes.plot(gait.hub_x, gait.hub_z, color=LEG_2, linewidth=1.0)
-        axes.axhline(0.0, color="black", linewidth=0.8)
-        axes.annotate(
-            "downhill",
-            (float(gait.foot_1_x[-1]), -0.07),
-            (float(gait.foot_1_x[-1]) - 0.3, -0.07),
-            va="center",
-            ha="right",
-            arrowprops={"arrowstyle": "->", "linewidth": 0.6},
-        )
-        axes.set_ylim(-0.12, None)
-        axes.set_aspect("equal")
-        axes.set_xlabel("$X$ [m]")
-        axes.set_ylabel("$Z$ [m]")
-        for line, name in (("-", "Leg 1"), (":", "Leg 2")):
-            axes.plot([], [], color="black", linestyle=line, linewidth=0.8, label=name)
-        axes.plot([], [], color=LEG_2, label="hub")
-        for phase, tone in zip(PHASES, tones, strict=True):
-            axes.plot([], [], color=tone, linewidth=3.0, label=phase)
-        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+    figure = Figure(figsize=(PAGE, 2.8))
+    axes = figure.subplots()
+    for i in np.searchsorted(time, np.arange(0.0, time[-1], interval)):
+        one = gait.isel(time=int(i))
+        for foot, line in ((1, "-"), (2, ":")):
+            axes.plot(
+                [float(one[f"foot_{foot}_x"]), float(one.hub_x)],
+                [float(one[f"foot_{foot}_z"]), float(one.hub_z)],
+                color=tones[int(one.phase)],
+                linestyle=line,
+                linewidth=0.8,
+            )
+    axes.plot(gait.hub_x, gait.hub_z, color=LEG_2, linewidth=1.0)
+    axes.axhline(0.0, color="black", linewidth=0.8)
+    axes.annotate(
+        "downhill",
+        (float(gait.foot_1_x[-1]), -0.07),
+        (float(gait.foot_1_x[-1]) - 0.3, -0.07),
+        va="center",
+        ha="right",
+        arrowprops={"arrowstyle": "->", "linewidth": 0.6},
+    )
+    axes.set_ylim(-0.12, None)
+    axes.set_aspect("equal")
+    axes.set_xlabel("$X$ [m]")
+    axes.set_ylabel("$Z$ [m]")
+    for line, name in (("-", "Leg 1"), (":", "Leg 2")):
+        axes.plot([], [], color="black", linestyle=line, linewidth=0.8, label=name)
+    axes.plot([], [], color=LEG_2, label="hub")
+    for phase, tone in zip(PHASES, tones, strict=True):
+        axes.plot([], [], color=tone, linewidth=3.0, label=phase)
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
 
@@ -210,60 +148,58 @@ LINES = ("-", "--", (0, (4, 1, 1, 1)), ":")
 
 def _name_of(gait: xr.Dataset, vary: str) -> str:
     """What sets this gait apart, as in "c = 50 N·s/m"."""
-    measure = MEASURES[vary]
-    return f"${measure.symbol}$ = {gait.attrs[f'parameter_{vary}']:g} {_unit(measure.unit)}"
+    return value_label(vary, gait.attrs[f"parameter_{vary}"])
 
 
+@figure_style()
 def foot_height(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
     """Height of foot 2 over one step for each gait, and around take-off in mm (Fig. 8)."""
-    with style():
-        figure = Figure(figsize=(PAGE, 2.6))
-        whole, near = figure.subplots(1, 2)
-        for gait, line in zip(gaits, LINES, strict=False):
-            name, lowest = _name_of(gait, vary), 1e3 * float(gait.foot_2_z.min())
-            reach = f"lowest −{-lowest:.1f} mm" if lowest < -1e-6 else "clear"
-            whole.plot(gait.time, gait.foot_2_z, linestyle=line, label=name)
-            near.plot(gait.time, 1e3 * gait.foot_2_z, linestyle=line, label=reach)
-        for letter, axes in zip("ab", (whole, near), strict=True):
-            _panel(axes, letter)
-            axes.axhspan(-1e3, 0.0, color=LIGHT, linewidth=0.0, zorder=0)
-            axes.axhline(0.0, color="black", linewidth=0.5, zorder=1)
-            axes.set_xlabel("time since landing [s]")
-            axes.legend(loc="upper left")
-        lowest = min(float(gait.foot_2_z.min()) for gait in gaits)
-        take_off = [float(gait.time[gait.phase == 1][0]) for gait in gaits]
-        highest = max(float(gait.foot_2_z.max()) for gait in gaits)
-        whole.set_ylim(2.0 * lowest - 0.004, 1.05 * highest)
-        whole.set_xlim(0.0, max(float(gait.time.max()) for gait in gaits))
-        whole.set_ylabel("height of foot 2, $z_2$ [m]")
-        near.set_ylim(1.3e3 * lowest - 0.5, -1.8e3 * lowest + 0.5)
-        near.set_xlim(min(take_off) - 0.03, max(take_off) + 0.1)
-        near.set_ylabel("$z_2$ [mm]")
-        near.text(0.98, 0.03, "below the ground", transform=near.transAxes, ha="right", color=GREY)
+    figure = Figure(figsize=(PAGE, 2.6))
+    whole, near = figure.subplots(1, 2)
+    for gait, line in zip(gaits, LINES, strict=False):
+        name, lowest = _name_of(gait, vary), 1e3 * float(gait.foot_2_z.min())
+        reach = f"lowest −{-lowest:.1f} mm" if lowest < -1e-6 else "clear"
+        whole.plot(gait.time, gait.foot_2_z, linestyle=line, label=name)
+        near.plot(gait.time, 1e3 * gait.foot_2_z, linestyle=line, label=reach)
+    for letter, axes in zip("ab", (whole, near), strict=True):
+        panel_letter(axes, letter)
+        axes.axhspan(-1e3, 0.0, color=LIGHT, linewidth=0.0, zorder=0)
+        axes.axhline(0.0, color="black", linewidth=0.5, zorder=1)
+        axes.set_xlabel("time since landing [s]")
+        axes.legend(loc="upper left")
+    lowest = min(float(gait.foot_2_z.min()) for gait in gaits)
+    take_off = [float(gait.time[gait.phase == 1][0]) for gait in gaits]
+    highest = max(float(gait.foot_2_z.max()) for gait in gaits)
+    whole.set_ylim(2.0 * lowest - 0.004, 1.05 * highest)
+    whole.set_xlim(0.0, max(float(gait.time.max()) for gait in gaits))
+    whole.set_ylabel("height of foot 2, $z_2$ [m]")
+    near.set_ylim(1.3e3 * lowest - 0.5, -1.8e3 * lowest + 0.5)
+    near.set_xlim(min(take_off) - 0.03, max(take_off) + 0.1)
+    near.set_ylabel("$z_2$ [mm]")
+    near.text(0.98, 0.03, "below the ground", transform=near.transAxes, ha="right", color=GREY)
     return figure
 
 
+@figure_style()
 def rear_force(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
     """Normal force of the ground on foot 2 over double support for each gait (Fig. 9)."""
-    with style():
-        figure = Figure(figsize=(COLUMN, 2.5))
-        axes = figure.subplots()
-        for gait, line in zip(gaits, LINES, strict=False):
-            held = gait.isel(time=gait.phase.values == 0)
-            (drawn,) = axes.plot(
-                held.time, held.lambda_4, linestyle=line, label=_name_of(gait, vary)
-            )
-            axes.plot(
-                0.0, held.lambda_4[0], "o", color=drawn.get_color(), markersize=3.5, clip_on=False
-            )
-        axes.set_xlim(0.0, None)
-        axes.set_ylim(0.0, None)
-        axes.set_xlabel("time since landing [s]")
-        axes.set_ylabel("normal force on foot 2, $\\lambda_4$ [N]")
-        axes.legend(loc="upper right")
+    figure = Figure(figsize=(COLUMN, 2.5))
+    axes = figure.subplots()
+    for gait, line in zip(gaits, LINES, strict=False):
+        held = gait.isel(time=gait.phase.values == 0)
+        (drawn,) = axes.plot(held.time, held.lambda_4, linestyle=line, label=_name_of(gait, vary))
+        axes.plot(
+            0.0, held.lambda_4[0], "o", color=drawn.get_color(), markersize=3.5, clip_on=False
+        )
+    axes.set_xlim(0.0, None)
+    axes.set_ylim(0.0, None)
+    axes.set_xlabel("time since landing [s]")
+    axes.set_ylabel("normal force on foot 2, $\\lambda_4$ [N]")
+    axes.legend(loc="upper right")
     return figure
 
 
+@figure_style()
 def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
     """The DLS indicators over a parameter, where the gait is period-1 and λ2⁺ >= 0 (Fig. 10).
 
@@ -275,43 +211,26 @@ def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
     values = kept[vary].values
     drawn = (values % every == 0) | (values == values.min()) | (values == values.max())
     rows = (
-        ((("lambda_I4", "$\\lambda_{I4}$", LEG_1, "o"),), "impulse [N·s]"),
-        (
-            (
-                ("lambda_2_plus", "$\\lambda_2^+$", LEG_1, "s"),
-                ("lambda_4_plus", "$\\lambda_4^+$", LEG_2, "o"),
-            ),
-            "force [N]",
-        ),
+        ((("lambda_I4", LEG_1, "o"),), "impulse [N·s]"),
+        ((("lambda_2_plus", LEG_1, "s"), ("lambda_4_plus", LEG_2, "o")), "force [N]"),
     )
-    with style():
-        figure = Figure(figsize=(PAGE, 2.7))
-        panels = figure.subplots(1, 2)
-        for axes, letter, (series, text) in zip(panels, "ab", rows, strict=True):
-            _panel(axes, letter)
-            for name, symbol, color, marker in series:
-                data = kept[name].values
-                axes.plot(values, data, color=color, linewidth=0.7)
-                for scuffing, fill in ((False, color), (True, "white")):
-                    chosen = drawn & (scuffs == scuffing)
-                    suffix = ", scuffing" if scuffing else ""
-                    axes.plot(
-                        values[chosen],
-                        data[chosen],
-                        marker,
-                        color=color,
-                        markersize=3.2,
-                        markerfacecolor=fill,
-                        markeredgewidth=0.7,
-                        linestyle="none",
-                        label=symbol + suffix,
-                        clip_on=False,
-                    )
-            axes.set_xlim(0.0, values.max() + 1.0)
-            axes.set_ylim(0.0, 1.18 * max(float(kept[name].max()) for name, *_ in series))
-            axes.set_xlabel(label(vary, f"${MEASURES[vary].symbol}$"))
-            axes.set_ylabel(text)
-            axes.legend(loc="lower right" if letter == "a" else "upper right", ncols=len(series))
+    figure = Figure(figsize=(PAGE, 2.7))
+    panels = figure.subplots(1, 2)
+    for axes, letter, (series, kind) in zip(panels, "ab", rows, strict=True):
+        panel_letter(axes, letter)
+        for name, color, marker in series:
+            data, symbol = kept[name].values, f"${MEASURES[name].tex}$"
+            axes.plot(values, data, color=color, linewidth=0.7)
+            for scuffing, fill in ((False, color), (True, "white")):
+                chosen = drawn & (scuffs == scuffing)
+                text = symbol + (", scuffing" if scuffing else "")
+                x, y = values[chosen], data[chosen]
+                draw_marks(axes, x, y, marker, color, fill, label=text, clip_on=False)
+        axes.set_xlim(0.0, values.max() + 1.0)
+        axes.set_ylim(0.0, 1.18 * max(float(kept[name].max()) for name, *_ in series))
+        axes.set_xlabel(axis_label(vary, "{symbol}"))
+        axes.set_ylabel(kind)
+        axes.legend(loc="lower right" if letter == "a" else "upper right", ncols=len(series))
     return figure
 
 
@@ -323,6 +242,7 @@ def _rotated(x: Coordinate, z: Coordinate, slope: float) -> tuple[Coordinate, Co
     )
 
 
+@figure_style()
 def walk_frames(
     step: xr.Dataset, n_frames: int = 36, slow: float = 2.0
 ) -> tuple[list[Image.Image], int]:
@@ -331,67 +251,66 @@ def walk_frames(
     The camera travels with the mean speed; arrows are ground forces, 1 m for 300 N. `slow` is how
     many times slower than life it plays.
     """
-    slope, n = step.attrs["parameter_slope"], step.attrs["parameter_n_legs"]
-    length, time = step.attrs["parameter_locked_length"], step.time.values
+    slope, time = step.attrs["parameter_slope"], step.time.values
     period = time[-1]
     stride = float(step.hub_x[-1] - step.hub_x[0])
-    names = ("theta", "L1", "L2", "hub_x", "hub_z", "foot_2_x", "foot_2_z")
-    forces = ("lambda_1", "lambda_2", "lambda_3", "lambda_4")
     frames = []
-    with style():
-        for t in np.linspace(0.0, period, n_frames, endpoint=False):
-            i = min(int(np.searchsorted(time, t, side="right")), time.size - 1)
-            now = {name: float(np.interp(t, time, step[name])) for name in names}
-            push = {name: float(step[name][i]) for name in forces}
-            figure = Figure(figsize=(3.6, 3.3), dpi=100)
-            figure.set_layout_engine("none")
-            canvas = FigureCanvasAgg(figure)
-            axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-            centre = float(step.hub_x[0]) + stride * t / period
-            axes.set_axis_off()
-            _draw_ground(axes, slope, centre, stride)
-            for j in range(1, n + 1):
-                angle = now["theta"] + (j - 1) * 2.0 * np.pi / n
-                reach = {1: now["L1"], 2: now["L2"]}.get(j, length)
-                x = np.array([now["hub_x"], now["hub_x"] - reach * np.sin(angle)])
-                z = np.array([now["hub_z"], now["hub_z"] - reach * np.cos(angle)])
-                colour, width = {1: (LEG_1, 3.0), 2: (LEG_2, 3.0)}.get(j, ("#999999", 1.5))
-                axes.plot(
-                    *_rotated(x, z, slope),
-                    color=colour,
-                    linewidth=width,
-                    solid_capstyle="round",
-                    zorder=5 if j < 3 else 3,
-                )
-            axes.plot(
-                *_rotated(now["hub_x"], now["hub_z"], slope),
-                "o",
-                color="black",
-                markersize=9,
-                zorder=6,
-            )
-            for foot, tangential, normal in (
-                (0.0, push["lambda_1"], push["lambda_2"]),
-                (now["foot_2_x"], push["lambda_3"], push["lambda_4"]),
-            ):
-                if normal == 0.0:
-                    continue
-                tip = _rotated(foot + tangential / 300.0, normal / 300.0, slope)
-                axes.annotate(
-                    "",
-                    tip,
-                    _rotated(foot, 0.0, slope),
-                    zorder=7,
-                    arrowprops={"arrowstyle": "-|>", "linewidth": 1.2, "color": "black"},
-                )
-            middle = [float(v) for v in _rotated(centre, 0.75, slope)]
-            axes.set_xlim(middle[0] - 1.35, middle[0] + 1.35)
-            axes.set_ylim(middle[1] - 1.25, middle[1] + 1.225)
-            axes.text(0.02, 0.03, PHASES[int(step.phase[i])], transform=axes.transAxes, fontsize=14)
-            canvas.draw()
-            picture = Image.frombuffer("RGBA", canvas.get_width_height(), canvas.buffer_rgba())
-            frames.append(picture.convert("RGB"))
+    for t in np.linspace(0.0, period, n_frames, endpoint=False):
+        figure = Figure(figsize=(3.6, 3.3), dpi=100)
+        figure.set_layout_engine("none")
+        canvas = FigureCanvasAgg(figure)
+        axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+        axes.set_axis_off()
+        centre = float(step.hub_x[0]) + stride * t / period
+        _draw_ground(axes, slope, centre, stride)
+        _draw_wheel(axes, step, t)
+        last = min(int(np.searchsorted(time, t, side="right")), time.size - 1)
+        _draw_forces(axes, step.isel(time=last), np.interp(t, time, step.foot_2_x))
+        middle = [float(v) for v in _rotated(centre, 0.75, slope)]
+        axes.set_xlim(middle[0] - 1.35, middle[0] + 1.35)
+        axes.set_ylim(middle[1] - 1.25, middle[1] + 1.225)
+        axes.text(0.02, 0.03, PHASES[int(step.phase[last])], transform=axes.transAxes, fontsize=14)
+        canvas.draw()
+        picture = Image.frombuffer("RGBA", canvas.get_width_height(), canvas.buffer_rgba())
+        frames.append(picture.convert("RGB"))
     return frames, round(1e3 * slow * period / n_frames)
+
+
+def _draw_wheel(axes: Axes, step: xr.Dataset, t: float) -> None:
+    """Legs and hub at time t, s."""
+    slope, n = step.attrs["parameter_slope"], step.attrs["parameter_n_legs"]
+    names = ("theta", "L1", "L2", "hub_x", "hub_z")
+    theta, L1, L2, x, z = (float(np.interp(t, step.time, step[name])) for name in names)
+    for j in range(1, n + 1):
+        angle = theta + (j - 1) * 2.0 * np.pi / n
+        reach = {1: L1, 2: L2}.get(j, step.attrs["parameter_locked_length"])
+        colour, width = {1: (LEG_1, 3.0), 2: (LEG_2, 3.0)}.get(j, ("#999999", 1.5))
+        axes.plot(
+            *_rotated(
+                np.array([x, x - reach * np.sin(angle)]),
+                np.array([z, z - reach * np.cos(angle)]),
+                slope,
+            ),
+            color=colour,
+            linewidth=width,
+            solid_capstyle="round",
+            zorder=5 if j < 3 else 3,
+        )
+    axes.plot(*_rotated(x, z, slope), "o", color="black", markersize=9, zorder=6)
+
+
+def _draw_forces(axes: Axes, now: xr.Dataset, foot_2_x: float) -> None:
+    """Arrows for what the ground does to both feet."""
+    slope, push = now.attrs["parameter_slope"], [float(now[name]) for name in FORCES]
+    for foot, tangential, normal in ((0.0, *push[:2]), (foot_2_x, *push[2:])):
+        if normal != 0.0:
+            axes.annotate(
+                "",
+                _rotated(foot + tangential / 300.0, normal / 300.0, slope),
+                _rotated(foot, 0.0, slope),
+                zorder=7,
+                arrowprops={"arrowstyle": "-|>", "linewidth": 1.2, "color": "black"},
+            )
 
 
 def _draw_ground(axes: Axes, slope: float, centre: float, stride: float) -> None:

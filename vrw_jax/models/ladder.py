@@ -22,20 +22,24 @@ from vrw_jax.models.unilateral.section import LOCKED, FullState, embedded
 from vrw_jax.models.unilateral.wheel import UnilateralStep, UnilateralTrajectory, UnilateralWheel
 from vrw_jax.models.viscoelastic import PAPER_START, ViscoelasticWheel
 from vrw_jax.numerics import Options, Scalar, as_float_array
+from vrw_jax.results import MARGINS
 from vrw_jax.wheel import Outcome, WheelParams
 
 VISCOELASTIC, UNILATERAL = 1, 2
 """Numbers of the rungs; 0 is the rigid one."""
 
 PREMISES: dict[str, str] = {
-    "fore_foot_force": "the ground would have to pull on the fore foot",
-    "clearance_sls1": "the rear foot scuffs in single support I",
-    "clearance_sls2": "the rear foot scuffs in single support II",
-    "contraction": "the fore leg would pass its stopper",
-    "friction_fore": "the fore foot would slide",
-    "friction_rear": "the rear foot would slide just after landing",
-    "landing_friction_fore": "the fore foot would slide in the landing impulse",
-    "landing_friction_rear": "the rear foot would slide in the landing impulse",
+    name: MARGINS[name].breaks
+    for name in (
+        "fore_foot_force",
+        "clearance_sls1",
+        "clearance_sls2",
+        "contraction",
+        "friction_fore",
+        "friction_rear",
+        "landing_friction_fore",
+        "landing_friction_rear",
+    )
 }
 """Premises that the paper's rung needs and the unilateral rung does not, with what breaks them."""
 

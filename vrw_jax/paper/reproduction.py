@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from vrw_jax.figures import walk as plots
+from vrw_jax import figures as plots
 from vrw_jax.models import ViscoelasticWheel
 from vrw_jax.paper import facts
 from vrw_jax.paper.facts.base import Evidence, Fact

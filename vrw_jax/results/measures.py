@@ -9,12 +9,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vrw_jax.results.text import as_tex
 from vrw_jax.wheel import DOMAINS, Outcome
 
 
 @dataclass(frozen=True)
 class Measure:
-    """A named quantity. `unit` is "1" for a pure number; `equation` is the paper's, "" if none."""
+    """A named quantity. `unit` is "1" for a pure number; `equation` is the paper's, "" if none.
+
+    `breaks` is a clause: what happens where it is negative, "" where nothing does.
+    """
 
     name: str
     unit: str
@@ -23,6 +27,17 @@ class Measure:
     description: str
     equation: str = ""
     axis: str = ""  # "leg": one value for each of the locked legs 3..n
+    breaks: str = ""
+
+    @property
+    def tex(self) -> str:
+        """The symbol as mathtext, without dollar signs."""
+        return as_tex(self.symbol)
+
+    @property
+    def plain_unit(self) -> str:
+        """The unit for a reader, "" for a pure number."""
+        return "" if self.unit == "1" else self.unit
 
     @property
     def attrs(self) -> dict[str, str]:
@@ -37,7 +52,7 @@ class Measure:
 
     def text(self, value: object) -> str:
         """A number with its unit, for a reader."""
-        return f"{float(np.asarray(value)):.6g} {'' if self.unit == '1' else self.unit}".strip()
+        return f"{float(np.asarray(value)):.6g} {self.plain_unit}".strip()
 
 
 def _table(*measures: Measure) -> dict[str, Measure]:
@@ -72,11 +87,14 @@ STEP = _table(
     Measure("dL1_touchdown", "m/s", "L̇1⁻", "rate of Leg 1 just before touchdown",
             "Rate of the length of Leg 1 then: section state, third number."),
     Measure("lambda_I4", "N s", "λ_I4", "DLS indicator λ_I4",
-            "Normal impulse of the rear foot in the landing with both feet held.", "(35)"),
+            "Normal impulse of the rear foot in the landing with both feet held.", "(35)",
+            breaks="landing frees the rear foot"),
     Measure("lambda_2_plus", "N", "λ2⁺", "DLS indicator λ2⁺",
-            "Normal force of the fore foot just after landing, both feet held.", "(38)"),
+            "Normal force of the fore foot just after landing, both feet held.", "(38)",
+            breaks="fore foot pulls at once"),
     Measure("lambda_4_plus", "N", "λ4⁺", "DLS indicator λ4⁺",
-            "Normal force of the rear foot just after landing, both feet held.", "(38)"),
+            "Normal force of the rear foot just after landing, both feet held.", "(38)",
+            breaks="rear foot lifts at once"),
     Measure("energy_lost_landing", "J", "ΔE_I", "energy lost in the landing",
             "Mechanical energy lost in collision I, positive when lost.", "(18)"),
     Measure("energy_lost_stopper", "J", "ΔE_II", "energy lost at the stopper",
@@ -90,36 +108,46 @@ STEP = _table(
 
 MARGINS = _table(
     Measure("fore_foot_force", "N", "min λ2", "least normal force on the fore foot",
-            "Negative where the ground would have to pull on Leg 1."),
+            "Negative where the ground would have to pull on Leg 1.",
+            breaks="fore foot pulls"),
     Measure("clearance_sls1", "m", "min z2, SLS-I", "foot clearance in SLS-I",
-            "Least height of foot 2 in SLS-I; negative when it scuffs."),
+            "Least height of foot 2 in SLS-I; negative when it scuffs.",
+            breaks="rear foot scuffs in SLS-I"),
     Measure("clearance_sls2", "m", "min z2, SLS-II", "foot clearance in SLS-II",
-            "Least height of foot 2 in SLS-II; negative when it scuffs."),
+            "Least height of foot 2 in SLS-II; negative when it scuffs.",
+            breaks="rear foot scuffs in SLS-II"),
     Measure("locked_stopper_force", "N", "min F_stop", "stopper force of the locked legs",
             "Least force of the stopper on each of the legs 3..n; negative where one comes off.",
-            axis="leg"),
+            axis="leg", breaks="locked leg leaves its stopper"),
     Measure("rear_stopper_force", "N", "min F_stop,2", "stopper force of Leg 2 in SLS-II",
-            "Least force of the stopper on Leg 2 in SLS-II; negative where it comes off."),
+            "Least force of the stopper on Leg 2 in SLS-II; negative where it comes off.",
+            breaks="Leg 2 leaves its stopper"),
     Measure("contraction", "m", "min(L0 - L1)", "contraction of Leg 1",
-            "Least contraction after the landing; negative where Leg 1 passes its stopper."),
+            "Least contraction after the landing; negative where Leg 1 passes its stopper.",
+            breaks="Leg 1 passes its stopper"),
     Measure("friction_fore", "1", "μ - |λ1|/λ2", "friction left at the fore foot",
-            "Friction coefficient of the model less the coefficient needed at the fore foot."),
+            "Friction coefficient of the model less the coefficient needed at the fore foot.",
+            breaks="fore foot slides"),
     Measure("friction_rear", "1", "μ - |λ3⁺|/λ4⁺", "friction left at the rear foot after landing",
-            "Friction coefficient less the one needed at the rear foot just after landing."),
+            "Friction coefficient less the one needed at the rear foot just after landing.",
+            breaks="rear foot slides just after landing"),
     Measure("landing_stopper_impulse", "N s", "I_stop, I", "stopper impulse at the landing",
             "Impulse on each of the legs 3..n; negative where the landing throws one off.",
-            axis="leg"),
+            axis="leg", breaks="landing throws a locked leg off"),
     Measure("hit_stopper_impulse", "N s", "I_stop, II", "stopper impulse at collision II",
             "Impulse on each of the legs 3..n; negative where the collision throws one off.",
-            axis="leg"),
+            axis="leg", breaks="collision II throws a locked leg off"),
     Measure("hit_planted_impulse", "N s", "λ_s2", "normal impulse of the planted foot",
-            "Of collision II; negative where the ground would have to pull.", "(22)"),
+            "Of collision II; negative where the ground would have to pull.", "(22)",
+            breaks="foot pulls in collision II"),
     Measure("landing_friction_fore", "1", "μ - |λ_I1|/λ_I2",
             "friction left at the fore foot in the landing",
-            "Friction coefficient less the one needed at the fore foot in the landing impulse."),
+            "Friction coefficient less the one needed at the fore foot in the landing impulse.",
+            breaks="fore foot slides in the landing"),
     Measure("landing_friction_rear", "1", "μ - |λ_I3|/λ_I4",
             "friction left at the rear foot in the landing",
-            "Friction coefficient less the one needed at the rear foot in the landing impulse."),
+            "Friction coefficient less the one needed at the rear foot in the landing impulse.",
+            breaks="rear foot slides in the landing"),
 )
 """Premises of the rung as signed margins over one step, negative where broken: `Margins`."""
 
@@ -222,6 +250,15 @@ def flags(names: Iterable[str]) -> dict[str, object]:
     """CF attributes of an integer variable whose values 0, 1, ... have names."""
     names = [name.replace(" ", "_") for name in names]
     return {"flag_values": list(range(len(names))), "flag_meanings": " ".join(names)}
+
+
+def what_breaks(name: str) -> str:
+    """What happens where a margin or an indicator is zero; `name` may end in its leg, "[5]"."""
+    base, _, leg = name.partition("[")
+    if base not in MEASURES or not MEASURES[base].breaks:
+        return name.replace("_", " ")
+    symbol = f"{MEASURES[base].symbol} = 0: " if base in STEP else ""
+    return symbol + MEASURES[base].breaks + (f", leg {leg[:-1]}" if leg else "")
 
 
 def attrs_of(name: str) -> dict[str, object]:

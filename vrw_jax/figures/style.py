@@ -1,0 +1,154 @@
+"""The look of all figures: journal widths, colours for every eye, vector output, labels with units.
+
+No global setting of matplotlib is touched and no window is opened: figures are made inside
+`figure_style()` and written by `save`.
+"""
+
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from cycler import cycler
+from matplotlib.axes import Axes
+from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from vrw_jax.results import MEASURES, as_tex
+from vrw_jax.wheel import Outcome
+
+BLUE, ORANGE, GREEN, PINK, SKY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9"
+AMBER, YELLOW = "#E69F00", "#F0E442"
+"""Colours of Okabe and Ito."""
+
+LEG_1, LEG_2, GREY, LIGHT = BLUE, ORANGE, "#555555", "#E9E9E9"
+
+STYLE: dict[Any, Any] = {
+    "font.family": "serif",
+    "font.serif": ["STIXGeneral"],  # comes with matplotlib
+    "mathtext.fontset": "stix",
+    "font.size": 9.0,
+    "axes.titlesize": 9.0,
+    "axes.labelsize": 9.0,
+    "xtick.labelsize": 8.0,
+    "ytick.labelsize": 8.0,
+    "legend.fontsize": 8.0,
+    "legend.frameon": False,
+    "legend.handlelength": 2.2,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "lines.linewidth": 1.2,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "xtick.direction": "out",
+    "ytick.direction": "out",
+    "axes.prop_cycle": cycler(color=[BLUE, ORANGE, GREEN, PINK, SKY]),
+    "figure.constrained_layout.use": True,
+    "savefig.dpi": 200,
+    "svg.hashsalt": "vrw_jax",  # the same figure gives the same file
+}
+"""Serif type as in the journal; nothing that the system must have."""
+
+COLUMN, PAGE = 3.4, 6.9
+"""Widths of one column and of the page, inches."""
+
+OUTCOMES: dict[Outcome, tuple[str, str]] = {
+    Outcome.STEPPED: ("stable limit cycle", BLUE),
+    Outcome.TOUCHDOWN_BEFORE_STOPPER: ("touchdown before stopper", AMBER),
+    Outcome.STOPPER_IN_DOUBLE_SUPPORT: ("stopper in DLS", GREEN),
+    Outcome.FELL_BACK: ("fell back", SKY),
+    Outcome.COLLAPSED: ("collapsed", ORANGE),
+    Outcome.LEG_1_LIFTED_OFF: ("Leg 1 lifted off", PINK),
+    Outcome.NO_TOUCHDOWN_IN_TIME: ("no touchdown in time", "#999933"),
+    Outcome.SOLVER_GAVE_UP: ("solver gave up", "#882255"),
+    Outcome.BAD_INPUT: ("bad input", "#000000"),
+    Outcome.NO_CYCLE_FOUND: ("no cycle found", "#DDDDDD"),
+}
+NOT_COMPUTED = ("not computed", "#FFFFFF")
+UNSTABLE = 100
+"""Stands for a cycle whose spectral radius is 1 or more, beside the codes of `Outcome`."""
+
+
+@contextmanager
+def figure_style() -> Iterator[None]:
+    """The style of every figure, for the time of a `with` block."""
+    with mpl.rc_context(STYLE):
+        yield
+
+
+def save(figure: Figure, folder: Path, name: str) -> list[Path]:
+    """Write `figure` as SVG and PNG into `folder`; returns the paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / f"{name}.svg", folder / f"{name}.png"]
+    with figure_style():
+        figure.savefig(paths[0], metadata={"Date": None})
+        figure.savefig(paths[1], metadata={"Software": None})
+    return paths
+
+
+def typeset(text: str) -> str:
+    """Text whose Greek symbols, "λ2⁺", are set as formulas: the type lacks some of their signs."""
+    return re.sub(r"[θλ]\S*", lambda found: f"${as_tex(found[0])}$", text)
+
+
+def _unit(name: str) -> str:
+    return MEASURES[name].plain_unit.replace(" ", "·").replace("^2", "²")
+
+
+def axis_label(name: str, form: str = "{name} {symbol}") -> str:
+    """A quantity's name and symbol, as `form` says, and its unit; a name unknown here as it is."""
+    if name not in MEASURES:
+        return name
+    measure = MEASURES[name]
+    text = form.format(name=typeset(measure.long_name), symbol=f"${measure.tex}$")
+    return f"{text} [{_unit(name)}]" if _unit(name) else text
+
+
+def value_label(name: str, value: float, digits: int = 4) -> str:
+    """A quantity with a value, as in "c = 50 N·s/m"."""
+    if name not in MEASURES:
+        return f"{name} = {value:.{digits}g}"
+    return f"${MEASURES[name].tex}$ = {value:.{digits}g} {_unit(name)}".rstrip()
+
+
+def panel_letter(axes: Axes, letter: str) -> None:
+    """The letter of a panel, beside its upper left corner."""
+    axes.text(-0.12, 1.02, f"({letter})", transform=axes.transAxes, ha="right", va="bottom")
+
+
+def draw_marks(
+    axes: Axes, x: np.ndarray, y: np.ndarray, marker: str, color: str, fill: str, **more: Any
+) -> None:
+    """Symbols without a line, whose inside may have another colour: open ones are "white"."""
+    look: dict[str, Any] = {"markersize": 3.2, "markeredgewidth": 0.7, "linestyle": "none"} | more
+    axes.plot(x, y, marker, color=color, markerfacecolor=fill, **look)
+
+
+def outcome_style(code: int) -> tuple[str, str]:
+    """Name and colour of an outcome, of an unstable cycle, or of what was not computed."""
+    if code == UNSTABLE:
+        return "unstable limit cycle", YELLOW
+    return OUTCOMES[Outcome(code)] if code >= 0 else NOT_COMPUTED
+
+
+def outcome_cells(
+    axes: Axes, x: np.ndarray, y: np.ndarray, codes: np.ndarray, known: Sequence[int] | np.ndarray
+) -> None:
+    """Cells over (x, y) in the colours of their outcomes; those not among `known` stay empty."""
+    colors = ListedColormap([outcome_style(int(code))[1] for code in known])
+    places = np.ma.masked_where(~np.isin(codes, known), np.searchsorted(known, codes))
+    norm = BoundaryNorm(np.arange(len(known) + 1) - 0.5, len(known)) if len(known) > 1 else None
+    axes.pcolormesh(x, y, places, cmap=colors, norm=norm).set_rasterized(True)
+
+
+def outcome_patches(codes: Iterable[int]) -> list[Patch]:
+    """What a legend needs of the colours of outcomes."""
+    return [
+        Patch(facecolor=color, edgecolor="#888888", linewidth=0.4, label=label)
+        for label, color in (outcome_style(int(code)) for code in codes)
+    ]
