@@ -11,7 +11,8 @@ import pytest
 from support.scanning import Counted, arithmetic
 from typer.testing import CliRunner, Result
 
-from vrw_jax.app.cli import _reporter, app
+from vrw_jax.app.cli import app
+from vrw_jax.app.printing import scan_reporter
 from vrw_jax.scans.running import Plan, Progress
 from vrw_jax.scans.store import open_scan
 
@@ -110,7 +111,7 @@ def test_progress_tells_rate_failures_and_time_left(monkeypatch: pytest.MonkeyPa
     clock = iter([0.0, 100.0, 110.0])
     monkeypatch.setattr("time.monotonic", lambda: next(clock))
     told: list[dict] = []
-    report = _reporter(lambda _, **shown: told.append(shown), 0)
+    report = scan_reporter(lambda _, **shown: told.append(shown), 0)
     for done, failed in ((0, 0), (1000, 100), (3000, 300)):
         report(Progress(samples=6_000, done=done, failed=failed, kept=0))
     assert [shown["description"] for shown in told] == ["compiling", "scanning", "scanning"]

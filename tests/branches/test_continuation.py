@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.app.branch_report import write
+from vrw_jax.app.reports import write_branch
 from vrw_jax.figures.branch import branch_figure
 from vrw_jax.numerics.events import integrate_phase
 from vrw_jax.numerics.minima import Watched
@@ -314,7 +314,7 @@ def test_what_is_asked_wrongly_is_said_in_a_sentence():
 
 def test_a_branch_is_written_drawn_and_told(branch, tmp_path):
     assert len(branch_figure(branch).axes) == 4
-    names = {path.name for path in write(branch, tmp_path)}
+    names = {path.name for path in write_branch(branch, tmp_path)}
     assert names == {"branch.zarr", "borders.csv", "summary.md", "branch.svg", "branch.png"}
     assert "219.84768" in (tmp_path / "summary.md").read_text()
     assert "ends the branch" in branch._repr_html_()

@@ -4,30 +4,38 @@ Nothing heavy is imported before a command runs, so that help comes at once. Wha
 is said in one sentence on stderr, with exit code 2.
 """
 
-import contextlib
 import gc
 import importlib.metadata
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
-from rich.table import Table
+
+from vrw_jax.app.printing import (
+    err,
+    out,
+    progress_bar,
+    scan_reporter,
+    sentences,
+    tell_facts,
+    tell_gait,
+    tell_outcomes,
+    tell_table,
+    tell_written,
+)
 
 if TYPE_CHECKING:
-    from rich.progress import Progress as Bar
-
     from vrw_jax.app.config import Config
-    from vrw_jax.cycles import LimitCycle
-    from vrw_jax.models import StepResult
-    from vrw_jax.paper import Fact
-    from vrw_jax.scans import Plan, Progress
-    from vrw_jax.tuning import Tuned
-    from vrw_jax.wheel import WheelParams
+    from vrw_jax.scans import Plan
 
-USER_ERROR, FACT_FAILED, NOT_CONVERGED, INTERRUPTED = 2, 1, 1, 130
-"""Exit codes."""
+FACT_FAILED, NOT_CONVERGED, INTERRUPTED = 1, 1, 130
+"""Exit codes, beside that of a user's mistake."""
+
+Folder = Annotated[
+    Path | None,
+    typer.Option("--out", help="Folder for the result; results/NAME of the config by default."),
+]
+Picture = Annotated[bool, typer.Option(help="Draw the result.")]
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -36,7 +44,6 @@ app = typer.Typer(
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-out, err = Console(), Console(stderr=True)
 
 
 def main() -> None:
@@ -112,11 +119,27 @@ def gait(
 
       vrw gait configs/table1.toml --steps 50
     """
-    with _sentences():
-        settings = _config(config)
-        changed = dict(_assignment(text) for text in changes or [])
-        params = settings.params(changed)
-    _tell_gait(settings, params, steps or settings.gait.steps)
+    with sentences():
+        settings = _settings(config)
+        from vrw_jax.app.config import assignment
+
+        params = settings.params(dict(assignment(text) for text in changes or []))
+    import vrw_jax as vrw
+    from vrw_jax.cycles import limit_cycle
+
+    model, options = settings.wheel_model(), settings.numerical_options()
+    state = model.start(params) if settings.gait.start is None else settings.gait.start
+    walked, n_steps = 0, steps or settings.gait.steps
+    with err.status("walking (the first time compiles for a while)"):
+        while True:
+            result = vrw.step(params, state, model=model, options=options)
+            stepped = int(result.outcome) == vrw.Outcome.STEPPED
+            walked += stepped
+            if not stepped or walked == n_steps:
+                break
+            state = result.section_state
+        cycle = limit_cycle(params)
+    tell_gait(params, result, state, walked, cycle)
 
 
 @app.command()
@@ -132,39 +155,25 @@ def reproduce(
     """
     from vrw_jax.runtime import start_jax
 
-    with _sentences():
+    with sentences():
         start_jax()
         folder.mkdir(parents=True, exist_ok=True)
     from vrw_jax.paper import reproduce as run
 
-    with _bar("reproducing the paper") as bar:
+    with progress_bar("reproducing the paper") as bar:
         task = bar.add_task("starting", total=1.0)
         facts = run(
             folder, progress=lambda share, what: bar.update(task, completed=share, description=what)
         )
-    _tell_facts(facts, folder)
+    tell_facts(facts, folder)
     if not all(fact.holds for fact in facts):
         raise typer.Exit(FACT_FAILED)
-
-
-def _tell_facts(facts: "list[Fact]", folder: Path) -> None:
-    table = Table("fact", "where", "published", "found", "", box=None)
-    for fact in facts:
-        verdict = "[green]holds[/green]" if fact.holds else "[bold red]does not hold[/bold red]"
-        told = fact.claim, fact.where, fact.published, fact.found
-        table.add_row(*map(_escaped, told), verdict)
-    out.print(table)
-    n_held = sum(fact.holds for fact in facts)
-    out.print(f"{n_held} of {len(facts)} hold; figures and {folder / 'facts.md'} tell more.")
 
 
 @app.command()
 def scan(
     config: Annotated[Path, typer.Argument(help="TOML file with the samples and measures.")],
-    folder: Annotated[
-        Path | None,
-        typer.Option("--out", help="Folder for the result; results/NAME of the config by default."),
-    ] = None,
+    folder: Folder = None,
     explain: Annotated[
         bool, typer.Option("--explain", help="Only tell sizes, chunks, memory and time.")
     ] = False,
@@ -178,7 +187,7 @@ def scan(
             help="Compute on the dask cluster at this address; 'local' starts one here.",
         ),
     ] = None,
-    picture: Annotated[bool, typer.Option(help="Draw the result.")] = True,
+    picture: Picture = True,
 ) -> None:
     """Find the steady gait of every sample of a design, with outcome and premises of each.
 
@@ -194,31 +203,63 @@ def scan(
 
       vrw scan configs/quickstart.toml --dask tcp://host:8786
     """
-    with _sentences():
-        planned, name = _planned(config, chunk)
-        folder = Path("results") / name if folder is None else folder
-        store = folder / "scan.zarr"
-        if explain:
-            _tell_plan(planned, store)
-            return
-        from vrw_jax.scans import open_store
+    with sentences():
+        settings, folder = _asked(config, folder, "design")
+        planned, store = _planned(settings, chunk), folder / "scan.zarr"
+        from vrw_jax.scans import explained, open_scan, open_store
 
+        if explain:
+            told = explained(planned, store) | {"store": str(store)}
+            tell_table("What this scan would do", told.items())
+            return
         missing = open_store(planned, store).missing()
     if missing:
         _compute(planned, store, dask)
     else:
         out.print(f"{store} is complete: nothing to compute.", highlight=False)
-    _tell_scan(store, folder, picture)
+    dataset = open_scan(store)
+    tell_outcomes(dataset)
+    out.print(f"data: {store}", highlight=False, soft_wrap=True)
+    if picture:
+        from vrw_jax.app.reports import write_scan
+
+        tell_written(write_scan(dataset, folder))
+
+
+def _planned(settings: "Config", chunk: int | None) -> "Plan":
+    from vrw_jax.scans import DEFAULT_MEASURES, plan
+
+    assert settings.design is not None
+    return plan(
+        settings.design,
+        settings.scan.measures or DEFAULT_MEASURES,
+        base=settings.params(),
+        model=settings.wheel_model(),
+        options=settings.numerical_options(),
+        chunk=chunk or settings.scan.chunk,
+        text=settings.text,
+    )
+
+
+def _compute(planned: "Plan", store: Path, dask: str | None) -> None:
+    from vrw_jax.scans import carried, run
+
+    try:
+        with sentences(), carried(dask) as through, progress_bar("scan") as bar:
+            task = bar.add_task("compiling", total=None, note="")
+            run(planned, store, report=scan_reporter(bar.update, task), through=through)
+    except KeyboardInterrupt:
+        err.print(
+            f"vrw: stopped; what is done stays in {store}, run the same to go on.", soft_wrap=True
+        )
+        raise typer.Exit(INTERRUPTED) from None
 
 
 @app.command()
 def tune(
     config: Annotated[Path, typer.Argument(help="TOML file with objective, bounds, constraints.")],
-    folder: Annotated[
-        Path | None,
-        typer.Option("--out", help="Folder for the result; results/NAME of the config by default."),
-    ] = None,
-    picture: Annotated[bool, typer.Option(help="Draw the result.")] = True,
+    folder: Folder = None,
+    picture: Picture = True,
 ) -> None:
     """Tune a wheel: the best gait within bounds that keeps its premises.
 
@@ -234,16 +275,12 @@ def tune(
 
       vrw gait results/steady/wheel.toml
     """
-    with _sentences():
-        settings = _config(config)
+    with sentences():
+        settings, folder = _asked(config, folder, "tune")
         sought = settings.tune
-        if sought is None:
-            raise ValueError(
-                f"{settings.name} seeks nothing, but tuning needs an objective and bounds: add the "
-                "tables [tune] and [tune.bounds], as in configs/tune_dls.toml."
-            )
-        folder = Path("results") / config.stem if folder is None else folder
+        assert sought is not None
         folder.mkdir(parents=True, exist_ok=True)
+        from vrw_jax.app.reports import write_tuned
         from vrw_jax.tuning import tune as run
 
         with err.status("tuning (the first time compiles for a while)"):
@@ -257,31 +294,17 @@ def tune(
                 options=settings.numerical_options(),
                 max_evaluations=sought.evaluations,
             )
-    _tell_tuned(tuned)
-    from vrw_jax.app.tune_report import write
-
-    with _sentences():
-        for path in write(tuned, folder, picture):
-            out.print(f"written: {path}", highlight=False, soft_wrap=True)
+        tell_table("Tuned gait", tuned.lines().items())
+        tell_written(write_tuned(tuned, folder, picture))
     if not tuned.converged:
         raise typer.Exit(NOT_CONVERGED)
-
-
-def _tell_tuned(tuned: "Tuned") -> None:
-    table = Table(title="Tuned gait", title_justify="left", show_header=False, box=None)
-    for name, text in tuned.lines().items():
-        table.add_row(f"[bold]{name}[/]", _escaped(text))
-    out.print(table)
 
 
 @app.command("continue")
 def continue_(
     config: Annotated[Path, typer.Argument(help="TOML file with a table [branch].")],
-    folder: Annotated[
-        Path | None,
-        typer.Option("--out", help="Folder for the result; results/NAME of the config by default."),
-    ] = None,
-    picture: Annotated[bool, typer.Option(help="Draw the result.")] = True,
+    folder: Folder = None,
+    picture: Picture = True,
 ) -> None:
     """Follow a branch of gaits along a parameter, stable or not, and locate every border on it.
 
@@ -294,16 +317,12 @@ def continue_(
 
       vrw continue configs/branch_damping.toml --out results/along_c --no-picture
     """
-    with _sentences():
-        settings = _config(config)
+    with sentences():
+        settings, folder = _asked(config, folder, "branch")
         asked = settings.branch
-        if asked is None:
-            raise ValueError(
-                f"{settings.name} names no branch, but continuation needs a parameter and bounds: "
-                "add a table [branch], as in configs/branch_damping.toml."
-            )
-        folder = Path("results") / config.stem if folder is None else folder
+        assert asked is not None
         folder.mkdir(parents=True, exist_ok=True)
+        from vrw_jax.app.reports import write_branch
         from vrw_jax.branches import continue_branch
         from vrw_jax.numerics import ArclengthOptions
 
@@ -320,39 +339,13 @@ def continue_(
                 model=settings.wheel_model(),
                 options=options,
             )
-    out.print(_escaped(str(branch)), highlight=False)
-    from vrw_jax.app.branch_report import write
-
-    with _sentences():
-        for path in write(branch, folder, picture):
-            out.print(f"written: {path}", highlight=False, soft_wrap=True)
+        out.print(str(branch), highlight=False, markup=False)
+        tell_written(write_branch(branch, folder, picture))
     if not branch.values.size:
         raise typer.Exit(NOT_CONVERGED)
 
 
-@contextlib.contextmanager
-def _sentences() -> Iterator[None]:
-    """What the user got wrong as one sentence on stderr and exit code 2."""
-    try:
-        yield
-    except (ValueError, OSError) as error:
-        text = str(error) if isinstance(error, ValueError) else _of_system(error)
-        err.print(f"[bold red]vrw:[/] {_escaped(text)}", highlight=False, soft_wrap=True)
-        raise typer.Exit(USER_ERROR) from error
-
-
-def _of_system(error: OSError) -> str:
-    place = f"{error.filename}: " if error.filename else ""
-    return f"{place}{error.strerror or error}."
-
-
-def _escaped(text: str) -> str:
-    from rich.markup import escape
-
-    return escape(text)
-
-
-def _config(path: Path | None) -> "Config":
+def _settings(path: Path | None) -> "Config":
     from vrw_jax.runtime import start_jax
 
     start_jax()
@@ -361,225 +354,20 @@ def _config(path: Path | None) -> "Config":
     return Config() if path is None else load(path)
 
 
-def _assignment(text: str) -> tuple[str, float | int]:
-    from vrw_jax.app.config import assignment
-
-    return assignment(text)
-
-
-def _bar(what: str) -> "Bar":
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
-    from rich.progress import Progress as Bar
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        *((MofNCompleteColumn(),) if what == "scan" else ()),
-        TextColumn("{task.fields[note]}") if what == "scan" else TimeElapsedColumn(),
-    )
-    return Bar(*columns, console=err)
+NEEDED = {
+    "design": "has no samples, but a scan needs a design: add a table [grid], [samples], [sobol], "
+    "[uniform] or [saltelli], as in configs/quickstart.toml.",
+    "tune": "seeks nothing, but tuning needs an objective and bounds: add the tables [tune] and "
+    "[tune.bounds], as in configs/tune_dls.toml.",
+    "branch": "names no branch, but continuation needs a parameter and bounds: add a table "
+    "[branch], as in configs/branch_damping.toml.",
+}
+"""What to say of a config that lacks what a command works on."""
 
 
-def _planned(path: Path, chunk: int | None) -> tuple["Plan", str]:
-    settings = _config(path)
-    from vrw_jax.app.config import ConfigError
-    from vrw_jax.scans import DEFAULT_MEASURES, plan
-
-    if settings.design is None:
-        raise ConfigError(
-            f"{settings.name} has no samples, but a scan needs a design: add a table [grid], "
-            "[samples], [sobol], [uniform] or [saltelli], as in configs/quickstart.toml."
-        )
-    planned = plan(
-        settings.design,
-        settings.scan.measures or DEFAULT_MEASURES,
-        base=settings.params(),
-        model=settings.wheel_model(),
-        options=settings.numerical_options(),
-        chunk=chunk or settings.scan.chunk,
-        text=settings.text,
-    )
-    return planned, path.stem
-
-
-def _tell_plan(planned: "Plan", store: Path) -> None:
-    from vrw_jax.scans import explained
-
-    table = Table(
-        title="What this scan would do", title_justify="left", show_header=False, box=None
-    )
-    for name, text in explained(planned, store).items():
-        table.add_row(f"[bold]{name}[/]", text)
-    table.add_row("[bold]store[/]", str(store))
-    out.print(table)
-
-
-def _compute(planned: "Plan", store: Path, dask: str | None) -> None:
-    from vrw_jax.scans import carried, run
-
-    try:
-        with _sentences(), carried(dask) as through, _bar("scan") as bar:
-            task = bar.add_task("compiling", total=None, note="")
-            run(planned, store, report=_reporter(bar.update, task), through=through)
-    except KeyboardInterrupt:
-        err.print(
-            f"vrw: stopped; what is done stays in {store}, run the same to go on.", soft_wrap=True
-        )
-        raise typer.Exit(INTERRUPTED) from None
-
-
-def _reporter(update: Callable, task: int) -> Callable[["Progress"], None]:
-    """Shows rate, share without a gait and time left; the first chunk's time is compiling too."""
-    import time
-
-    from vrw_jax.scans import in_words
-
-    first: list[tuple[float, int]] = []
-
-    def report(progress: "Progress") -> None:
-        now, done = time.monotonic(), progress.done
-        note = ""
-        if done:
-            first.append((now, done))
-            began, before = first[0]
-            note = f"{100 * progress.failed / done:.0f} % without a gait"
-            if now > began:
-                rate = (done - before) / (now - began)
-                left = (progress.samples - done) / rate
-                note = f"{rate:,.0f} per s, {note}, {in_words(left)} left"
-        update(
-            task,
-            total=progress.samples,
-            completed=done,
-            description="scanning" if done else "compiling",
-            note=note,
-        )
-
-    return report
-
-
-def _tell_scan(store: Path, folder: Path, picture: bool) -> None:
-    import numpy as np
-
-    from vrw_jax.scans import open_scan
-    from vrw_jax.wheel import Outcome
-
-    dataset = open_scan(store)
-    codes, counts = np.unique(dataset.outcome.values, return_counts=True)
-    table = Table(title="Outcomes", title_justify="left", box=None)
-    for heading in ("samples", "share", "outcome", "meaning"):
-        table.add_column(heading, justify="right" if heading in ("samples", "share") else "left")
-    for code, count in zip(codes, counts, strict=True):
-        outcome = Outcome(int(code))
-        share = f"{100 * count / counts.sum():.1f} %"
-        table.add_row(f"{count:,}", share, outcome.name, outcome.meaning)
-    out.print(table)
-    out.print(f"data: {store}", highlight=False, soft_wrap=True)
-    if picture:
-        from vrw_jax.figures import scan_figures
-        from vrw_jax.figures import walk as plots
-
-        for name, figure in scan_figures(dataset).items():
-            for path in plots.save(figure, folder, name):
-                out.print(f"picture: {path}", highlight=False, soft_wrap=True)
-
-
-def _tell_gait(settings: "Config", params: "WheelParams", n_steps: int) -> None:
-    import numpy as np
-
-    import vrw_jax as vrw
-    from vrw_jax.cycles import limit_cycle
-
-    model, options = settings.wheel_model(), settings.numerical_options()
-    start = settings.gait.start
-    state = model.start(params) if start is None else start
-    walked = 0
-    with err.status("walking (the first time compiles for a while)"):
-        while True:
-            result = vrw.step(params, state, model=model, options=options)
-            outcome = vrw.Outcome(int(result.outcome))
-            walked += outcome == vrw.Outcome.STEPPED
-            if outcome != vrw.Outcome.STEPPED or walked == n_steps:
-                break
-            state = result.section_state
-        cycle = limit_cycle(params)
-    _tell_wheel(params)
-    if outcome == vrw.Outcome.STEPPED:
-        change = float(np.abs(np.asarray(result.section_state) - np.asarray(state)).max())
-        out.print(f"Walked {walked} steps; the last changed the section state by {change:.1e}.")
-        _tell_step(result)
-    else:
-        out.print(f"[bold]Step {walked + 1} ended as {outcome.name}:[/] {outcome.meaning}")
-    _tell_cycle(cycle)
-    if outcome == vrw.Outcome.STEPPED:
-        _tell_premises(result)
-
-
-def _tell_wheel(params: "WheelParams") -> None:
-    from vrw_jax.wheel import DOMAINS
-
-    told = [f"{name} {float(getattr(params, name)):g} {d.unit}" for name, d in DOMAINS.items()]
-    out.print("[bold]Wheel[/]  " + ", ".join(told) + f", {params.n_legs} legs")
-
-
-def _tell_step(result: "StepResult") -> None:
-    from vrw_jax.results import MARGINS, STEP
-
-    values = result.measures()
-    table = Table(title="Last step", title_justify="left", box=None)
-    for heading in ("quantity", "symbol", "value", "unit"):
-        table.add_column(heading, justify="right" if heading == "value" else "left")
-    for name, measure in STEP.items():
-        if name in ("outcome", "solver_steps") or name in MARGINS:
-            continue
-        unit = "" if measure.unit == "1" else measure.unit
-        table.add_row(measure.long_name, measure.symbol, f"{float(values[name]):.5g}", unit)
-    out.print(table)
-
-
-def _tell_cycle(cycle: "LimitCycle") -> None:
-    import numpy as np
-
-    if not bool(cycle.found):
-        out.print("[bold]Limit cycle[/]  none was found in the paper's sequence of phases.")
-        return
-    multipliers = ", ".join(_complex(complex(z)) for z in np.asarray(cycle.multipliers))
-    radius = float(cycle.spectral_radius)
-    verdict = "stable" if radius < 1.0 else "unstable"
-    out.print(
-        f"[bold]Limit cycle[/]  {verdict}: multipliers {multipliers}; period "
-        f"{float(cycle.period):.5f} s, speed {float(cycle.speed):.5f} m/s, "
-        f"DLS {100 * float(cycle.dls_fraction):.2f} %."
-    )
-
-
-def _complex(z: complex) -> str:
-    return f"{z.real:.4f}" if abs(z.imag) < 1e-12 else f"{z.real:.4f}{z.imag:+.4f}i"
-
-
-def _tell_premises(result: "StepResult") -> None:
-    import numpy as np
-
-    from vrw_jax.results import MARGINS
-
-    table = Table(title="Premises of the paper's rung", title_justify="left", box=None)
-    for heading in ("", "margin of", "symbol", "least", "unit"):
-        table.add_column(heading, justify="right" if heading == "least" else "left")
-    broken = 0
-    for name, measure in MARGINS.items():
-        values = np.atleast_1d(np.asarray(getattr(result.monitors, name)))
-        least = float(values.min())
-        mark = "[green]holds[/]" if least >= 0.0 else "[bold red]broken[/]"
-        broken += least < 0.0
-        where = measure.long_name
-        if measure.axis:
-            legs = [str(leg + 3) for leg in np.flatnonzero(values < 0.0)]
-            where += f" (broken at legs {', '.join(legs)})" if legs else ""
-        unit = "" if measure.unit == "1" else measure.unit
-        table.add_row(mark, where, measure.symbol, f"{least:.4g}", unit)
-    out.print(table)
-    n = len(MARGINS)
-    out.print(
-        f"{n - broken} of {n} premises hold, {broken} are broken. The rung walks on regardless: "
-        "it measures what it does not model."
-    )
+def _asked(path: Path, folder: Path | None, needed: str) -> tuple["Config", Path]:
+    """The config, which says what is `needed`, and the folder of the result."""
+    settings = _settings(path)
+    if getattr(settings, needed) is None:
+        raise ValueError(f"{settings.name} {NEEDED[needed]}")
+    return settings, Path("results") / path.stem if folder is None else folder

@@ -5,14 +5,13 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from html import escape
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.numerics import floquet
-from vrw_jax.results import MEASURES
+from vrw_jax.results import MEASURES, as_html
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.wheel import Outcome
 
@@ -108,12 +107,10 @@ class Branch:
 
     def _repr_html_(self) -> str:
         """For notebooks."""
-        rows = "".join(
-            f"<tr><td>{b.value:.9g}</td><td>{b.kind.replace('_', ' ')}</td>"
-            f"<td>{escape(b.name)}</td>"
-            f"<td>{'ends the branch' if b.ends_branch else ''}</td></tr>"
-            for b in self.borders
-        )
-        head = escape(str(self).split("\n  ")[0])
-        columns = "".join(f"<th>{t}</th>" for t in (escape(self.parameter), "kind", "name", ""))
-        return f"<p>{head}</p><table><tr>{columns}</tr>{rows}</table>"
+        ends = ("", "ends the branch")
+        return as_html(
+            str(self).split("\n  ")[0],
+            ((f"{b.value:.9g}", b.kind.replace("_", " "), b.name, ends[b.ends_branch])
+             for b in self.borders),
+            (self.parameter, "kind", "name", ""),
+        )  # fmt: skip

@@ -10,7 +10,6 @@ import inspect
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from html import escape
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -35,7 +34,16 @@ from vrw_jax.models import (
     refuse_ladder,
 )
 from vrw_jax.numerics import Options
-from vrw_jax.results import MARGINS, ON_GROUND, attrs_of, flags, nearest, provenance
+from vrw_jax.results import (
+    MARGINS,
+    ON_GROUND,
+    as_html,
+    as_text,
+    attrs_of,
+    flags,
+    nearest,
+    provenance,
+)
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.tuning.climbing import (
     Climb,
@@ -136,15 +144,10 @@ class Tuned:
         }
 
     def __repr__(self) -> str:
-        return "Tuned\n" + "\n".join(f"  {key}: {text}" for key, text in self.lines().items())
+        return as_text("Tuned", self.lines().items())
 
     def _repr_html_(self) -> str:
-        left = "style='text-align:left'"
-        rows = "".join(
-            f"<tr><th {left}>{key}</th><td {left}>{escape(text)}</td></tr>"
-            for key, text in self.lines().items()
-        )
-        return f"<table><caption>Tuned gait</caption>{rows}</table>"
+        return as_html("Tuned gait", self.lines().items())
 
 
 def _plain(unit: str) -> str:

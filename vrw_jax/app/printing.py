@@ -1,0 +1,227 @@
+"""What commands say: tables, progress, and one sentence for what a user got wrong."""
+
+import contextlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from jax.typing import ArrayLike
+    from rich.progress import Progress as Bar
+
+    from vrw_jax.cycles import LimitCycle
+    from vrw_jax.models import StepResult
+    from vrw_jax.paper import Fact
+    from vrw_jax.scans import Progress
+    from vrw_jax.wheel import WheelParams
+
+USER_ERROR = 2
+"""Exit code."""
+
+out, err = Console(), Console(stderr=True)
+
+
+@contextlib.contextmanager
+def sentences() -> Iterator[None]:
+    """What the user got wrong as one sentence on stderr and exit code 2."""
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        text = str(error) if isinstance(error, ValueError) else _of_system(error)
+        err.print(f"[bold red]vrw:[/] {escape(text)}", highlight=False, soft_wrap=True)
+        raise typer.Exit(USER_ERROR) from error
+
+
+def _of_system(error: OSError) -> str:
+    place = f"{error.filename}: " if error.filename else ""
+    return f"{place}{error.strerror or error}."
+
+
+def tell_written(paths: Iterable[Path]) -> None:
+    """Where files were written."""
+    for path in paths:
+        out.print(f"written: {path}", highlight=False, soft_wrap=True)
+
+
+def tell_table(
+    title: str | None,
+    rows: Iterable[Sequence[str]],
+    headings: Sequence[str] = (),
+    right: Sequence[str] = (),
+) -> None:
+    """Print rows under their headings, those of `right` to the right; without any, names in bold.
+
+    Texts are shown as they are; of the marks for colours only those of a "" column count.
+    """
+    table = Table(title=title, title_justify="left", show_header=bool(headings), box=None)
+    for heading in headings or ("name", "text"):
+        table.add_column(heading, justify="right" if heading in right else "left")
+    for row in rows:
+        cells = [
+            text if heading == "" else escape(text)
+            for heading, text in zip(headings or ("name", "text"), row, strict=True)
+        ]
+        table.add_row(*(cells if headings else (f"[bold]{cells[0]}[/]", *cells[1:])))
+    out.print(table)
+
+
+def tell_facts(facts: "list[Fact]", folder: Path) -> None:
+    """The paper's facts, published against found."""
+    verdict = ("[bold red]does not hold[/]", "[green]holds[/]")
+    tell_table(
+        None,
+        ((f.claim, f.where, f.published, f.found, verdict[f.holds]) for f in facts),
+        ("fact", "where", "published", "found", ""),
+    )
+    n_held = sum(fact.holds for fact in facts)
+    out.print(f"{n_held} of {len(facts)} hold; figures and {folder / 'facts.md'} tell more.")
+
+
+def progress_bar(what: str) -> "Bar":
+    """A bar on stderr; that of a scan counts chunks and has a note beside it."""
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bar
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        *((MofNCompleteColumn(),) if what == "scan" else ()),
+        TextColumn("{task.fields[note]}") if what == "scan" else TimeElapsedColumn(),
+    )
+    return Bar(*columns, console=err)
+
+
+def scan_reporter(update: Callable, task: int) -> Callable[["Progress"], None]:
+    """Shows rate, share without a gait and time left; the first chunk's time is compiling too."""
+    import time
+
+    from vrw_jax.scans import in_words
+
+    first: list[tuple[float, int]] = []
+
+    def report(progress: "Progress") -> None:
+        now, done = time.monotonic(), progress.done
+        note = ""
+        if done:
+            first.append((now, done))
+            began, before = first[0]
+            note = f"{100 * progress.failed / done:.0f} % without a gait"
+            if now > began:
+                rate = (done - before) / (now - began)
+                left = (progress.samples - done) / rate
+                note = f"{rate:,.0f} per s, {note}, {in_words(left)} left"
+        update(
+            task,
+            total=progress.samples,
+            completed=done,
+            description="scanning" if done else "compiling",
+            note=note,
+        )
+
+    return report
+
+
+def tell_outcomes(scan: "xr.Dataset") -> None:
+    """How many samples of a scan ended in which way."""
+    import numpy as np
+
+    from vrw_jax.wheel import Outcome
+
+    codes, counts = np.unique(scan.outcome.values, return_counts=True)
+    ends = [Outcome(int(code)) for code in codes]
+    tell_table(
+        "Outcomes",
+        (
+            (f"{count:,}", f"{100 * count / counts.sum():.1f} %", end.name, end.meaning)
+            for count, end in zip(counts, ends, strict=True)
+        ),
+        ("samples", "share", "outcome", "meaning"),
+        ("samples", "share"),
+    )
+
+
+def tell_gait(
+    params: "WheelParams",
+    result: "StepResult",
+    start: "ArrayLike | tuple[float, ...]",
+    walked: int,
+    cycle: "LimitCycle",
+) -> None:
+    """A wheel, the last step of its walk from the section state `start`, and its limit cycle."""
+    import numpy as np
+
+    from vrw_jax.wheel import DOMAINS, Outcome
+
+    told = [f"{name} {float(getattr(params, name)):g} {d.unit}" for name, d in DOMAINS.items()]
+    out.print("[bold]Wheel[/]  " + ", ".join(told) + f", {params.n_legs} legs")
+    outcome = Outcome(int(result.outcome))
+    if outcome == Outcome.STEPPED:
+        change = float(np.abs(np.asarray(result.section_state) - np.asarray(start)).max())
+        out.print(f"Walked {walked} steps; the last changed the section state by {change:.1e}.")
+        _tell_step(result)
+    else:
+        out.print(f"[bold]Step {walked + 1} ended as {outcome.name}:[/] {outcome.meaning}")
+    _tell_cycle(cycle)
+    if outcome == Outcome.STEPPED:
+        _tell_premises(result)
+
+
+def _tell_step(result: "StepResult") -> None:
+    from vrw_jax.results import STEP
+
+    values = result.measures()
+    rows = (
+        (measure.long_name, measure.symbol, f"{float(values[name]):.5g}", measure.plain_unit)
+        for name, measure in STEP.items()
+        if name not in ("outcome", "solver_steps")
+    )
+    tell_table("Last step", rows, ("quantity", "symbol", "value", "unit"), ("value",))
+
+
+def _tell_cycle(cycle: "LimitCycle") -> None:
+    import numpy as np
+
+    if not bool(cycle.found):
+        out.print("[bold]Limit cycle[/]  none was found in the paper's sequence of phases.")
+        return
+    multipliers = ", ".join(_complex(complex(z)) for z in np.asarray(cycle.multipliers))
+    radius = float(cycle.spectral_radius)
+    verdict = "stable" if radius < 1.0 else "unstable"
+    out.print(
+        f"[bold]Limit cycle[/]  {verdict}: multipliers {multipliers}; period "
+        f"{float(cycle.period):.5f} s, speed {float(cycle.speed):.5f} m/s, "
+        f"DLS {100 * float(cycle.dls_fraction):.2f} %."
+    )
+
+
+def _complex(z: complex) -> str:
+    return f"{z.real:.4f}" if abs(z.imag) < 1e-12 else f"{z.real:.4f}{z.imag:+.4f}i"
+
+
+def _tell_premises(result: "StepResult") -> None:
+    import numpy as np
+
+    from vrw_jax.results import MARGINS
+
+    rows = []
+    for name, measure in MARGINS.items():
+        values = np.atleast_1d(np.asarray(getattr(result.monitors, name)))
+        least, where = float(values.min()), measure.long_name
+        mark = "[green]holds[/]" if least >= 0.0 else "[bold red]broken[/]"
+        if measure.axis and least < 0.0:
+            legs = [str(leg + 3) for leg in np.flatnonzero(values < 0.0)]
+            where += f" (broken at legs {', '.join(legs)})"
+        rows.append((mark, where, measure.symbol, f"{least:.4g}", measure.plain_unit))
+    headings = ("", "margin of", "symbol", "least", "unit")
+    tell_table("Premises of the paper's rung", rows, headings, ("least",))
+    n, broken = len(rows), sum("broken[" in mark for mark, *_ in rows)
+    out.print(
+        f"{n - broken} of {n} premises hold, {broken} are broken. The rung walks on regardless: "
+        "it measures what it does not model."
+    )
