@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from experiments.shared.tables import DOCS, FIGURES, Row, groups, markdown, numbers, read, replace
-from vrw_jax.figures.walk import PAGE, save, style
+from vrw_jax.figures import PAGE, figure_style, save
 
 STYLES = {  # of Okabe and Ito, a marker each
     "lanes Tsit5": ("#0072B2", "o"),
@@ -407,7 +407,7 @@ def draw(tables: dict[str, Path], limit: Callable[[str], float]) -> None:
         "modes": modes,
         "long_walk": long_walk,
     }
-    with style():
+    with figure_style():
         for name, chart in charts.items():
             if name in known:
                 save(chart(known[name]), FIGURES, f"atlas_{name}")

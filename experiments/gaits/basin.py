@@ -10,8 +10,7 @@ import numpy as np
 
 import vrw_jax as vrw
 from experiments.shared.command import started_with_folder
-from vrw_jax.figures import branch as branch_plots
-from vrw_jax.figures import walk as plots
+from vrw_jax import figures as plots
 from vrw_jax.walks.basins import share
 
 DAMPINGS = (100.0, 200.0)  # N s/m
@@ -33,7 +32,7 @@ def main() -> None:
         results.append(result)
         titles.append(f"$c$ = {damping:g} N·s/m, $\\theta^-$ = {theta:.4f} rad")
         print(damping, share(result), "periods", result.orbit_period.values)
-    plots.save(branch_plots.basin_figure(results, titles), folder, "basin")
+    plots.save(plots.basin_figure(results, titles), folder, "basin")
 
 
 if __name__ == "__main__":

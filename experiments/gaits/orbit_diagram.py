@@ -11,8 +11,7 @@ import pandas as pd
 
 import vrw_jax as vrw
 from experiments.shared.command import started_with_folder
-from vrw_jax.figures import branch as branch_plots
-from vrw_jax.figures import walk as plots
+from vrw_jax import figures as plots
 from vrw_jax.walks.attractors import Settled, distinct, orbit_measures, settle
 
 DAMPINGS = np.round(np.arange(215.0, 225.001, 0.1), 3)  # N s/m
@@ -71,7 +70,7 @@ def main() -> None:
     table.to_csv(folder / "orbit_diagram.csv", index=False, float_format="%.7g")
     points = table.to_xarray().assign_attrs(parameter="damping", tried=DAMPINGS.tolist())
     border = vrw.continue_branch(vrw.WheelParams(), "damping", (190.0, 230.0)).borders[-1]
-    plots.save(branch_plots.orbit_figure(points, border.value), folder, "orbit_diagram")
+    plots.save(plots.orbit_figure(points, border.value), folder, "orbit_diagram")
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ import vrw_jax as vrw
 from experiments.ground.friction_map import FIELDS, TOWARDS, told
 from experiments.shared.command import command, started
 from experiments.shared.tables import FIGURES, Row, numbers, read, write
-from vrw_jax.figures import walk as plots
+from vrw_jax import figures as plots
 
 FRICTION, DAMPING = 0.7, 200.0  # held while the other one moves
 SLOW, FAST = (0.1, 1.6, -0.1), (0.12, 2.4, -0.2)
@@ -269,7 +269,7 @@ def main() -> None:
         if not GHOST.exists():
             ghosts()
         print({along: fold(along) for along in BOUNDS})
-    with plots.style():
+    with plots.figure_style():
         draw()
 
 

@@ -12,7 +12,7 @@ from matplotlib.colors import LogNorm, Normalize
 import vrw_jax as vrw
 from experiments.shared.command import command, started
 from experiments.shared.tables import FIGURES, read, write
-from vrw_jax.figures import walk as plots
+from vrw_jax import figures as plots
 
 FRICTION = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.4, 1.7, 2.0, 2.5, 3.0)
 DAMPING = tuple(float(c) for c in range(20, 401, 20))
@@ -115,7 +115,7 @@ def main() -> None:
     parser.add_argument("--redraw", action="store_true", help="compute nothing")
     if not started(parser).redraw:
         compute()
-    with plots.style():
+    with plots.figure_style():
         draw()
 
 

@@ -13,7 +13,7 @@ from matplotlib.colors import ListedColormap
 import vrw_jax as vrw
 from experiments.shared.command import command, started
 from experiments.shared.tables import FIGURES, read, write
-from vrw_jax.figures import walk as plots
+from vrw_jax import figures as plots
 from vrw_jax.models import PREMISES
 from vrw_jax.scans import plan
 
@@ -86,7 +86,7 @@ def main() -> None:
     parser.add_argument("--redraw", action="store_true", help="compute nothing")
     if not started(parser).redraw:
         compute()
-    with plots.style():
+    with plots.figure_style():
         draw()
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import vrw_jax as vrw
 from experiments.shared.command import command, started
 from experiments.shared.tables import FIGURES, write
-from vrw_jax.figures import walk as plots
+from vrw_jax import figures as plots
 from vrw_jax.models import directions, foot_heights, unpack
 
 NO_SLIP, REAL = math.inf, 0.7
@@ -97,7 +97,7 @@ def main() -> None:
         rows.append([*row, *(f"{float(v):.5g}" for v in numbers)])
     write(FIGURES / "unilateral_scenes.csv", (*header, *more, *pairs), rows)
     shares = np.asarray(step.mode_durations / np.maximum(step.period, 1e-9)[:, None, None])
-    with plots.style():
+    with plots.figure_style():
         draw([labels.index(name) for name in SHOWN], labels, friction, damping, last)
         draw_modes(labels, shares)
 

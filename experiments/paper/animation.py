@@ -6,7 +6,7 @@ Writes `walk.gif` to `results/` or the folder given.
 """
 
 from experiments.shared.command import started_with_folder
-from vrw_jax.figures import walk as plots
+from vrw_jax import figures as plots
 from vrw_jax.paper import reproduction
 
 FRAMES = 36

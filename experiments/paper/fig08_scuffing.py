@@ -6,7 +6,7 @@ Writes `fig08_scuffing.svg` and `.png` to `results/` or the folder given.
 """
 
 from experiments.shared.command import started_with_folder
-from vrw_jax.figures import walk as plots
+from vrw_jax import figures as plots
 from vrw_jax.paper import reproduction
 
 DAMPINGS = (50.0, 100.0, 200.0)  # N s/m

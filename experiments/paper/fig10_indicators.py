@@ -6,7 +6,7 @@ Writes `fig10_indicators.svg` and `.png` to `results/` or the folder given.
 """
 
 from experiments.shared.command import started_with_folder
-from vrw_jax.figures import walk as plots
+from vrw_jax import figures as plots
 from vrw_jax.paper import reproduction
 
 EVERY = 4  # one symbol for so many gaits

@@ -24,7 +24,7 @@ from experiments.shared.tables import DOCS, markdown, replace, write_named
 from experiments.shared.timing import on_one_core, processor, start_cold
 from experiments.shared.wheels import near_gaits, wheels
 from experiments.speed import peers
-from vrw_jax.figures import walk as plots
+from vrw_jax import figures as plots
 from vrw_jax.wheel import transitions
 
 LABELS = {
@@ -192,7 +192,7 @@ def write(table, shares, cost, out):
     )
     print(text)
     replace(out / "engine.md", "speeds", text)
-    with plots.style():
+    with plots.figure_style():
         plots.save(draw_charts(table, shares, cost), figures, "engine")
 
 

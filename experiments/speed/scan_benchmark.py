@@ -129,10 +129,10 @@ def draw(rows: list[dict[str, object]]) -> None:
     """The scanning processes, whose memory is told, do not know how to draw."""
     from matplotlib.figure import Figure
 
-    from vrw_jax.figures import walk as plots
+    from vrw_jax import figures as plots
 
     size = [row["samples"] for row in rows]
-    with plots.style():
+    with plots.figure_style():
         figure = Figure(figsize=(plots.PAGE, 2.4))
         left, right = figure.subplots(1, 2)
         left.loglog(size, [row["wall_s"] for row in rows], "o-", label="wall")
@@ -176,8 +176,8 @@ def main() -> None:
     draw(rows)
     compare(sizes[-1])
 
+    from vrw_jax import figures as plots
     from vrw_jax.figures import scan_figures
-    from vrw_jax.figures import walk as plots
 
     for name, figure in scan_figures(vrw.open_scan(STORES / f"{sizes[-1]}.zarr")).items():
         plots.save(figure, FIGURES, f"{name}_of_{sizes[-1]}")

@@ -28,8 +28,8 @@ from scipy.optimize import minimize
 import vrw_jax as vrw
 from experiments.shared.command import command, extra, started
 from experiments.shared.tables import FIGURES, markdown, replace, write_named
+from vrw_jax import figures as plots
 from vrw_jax.app.config import load
-from vrw_jax.figures import walk as plots
 from vrw_jax.tuning import objective as tune_engine
 from vrw_jax.tuning import tune
 from vrw_jax.tuning.problem import TuneProblem, tuning_problem
@@ -234,7 +234,7 @@ def compared(problem: TuneProblem, n_starts: int, rows: list[dict], name: str) -
 
 def drawn(results: dict[str, dict]) -> Figure:
     """Gap to the best known over gaits evaluated: median of the starts, and quartiles."""
-    with plots.style():
+    with plots.figure_style():
         figure = Figure(figsize=(plots.PAGE, 2.9))
         panels = figure.subplots(1, len(results), sharey=True)
         for axes, (name, result) in zip(panels, results.items(), strict=True):

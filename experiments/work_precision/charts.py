@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from experiments.shared.tables import DOCS, FIGURES, Row, markdown, replace
-from vrw_jax.figures.walk import PAGE, save, style
+from vrw_jax.figures import PAGE, figure_style, save
 
 QUANTITIES = {  # group and title of each panel
     "post_impact": ("step", "state after the next landing"),
@@ -326,7 +326,7 @@ def failures(rows: list[Row]) -> str:
 def draw(rows: list[Row], batches: list[Row]) -> None:
     """All charts and the tables."""
     unit = unit_of(rows)
-    with style():
+    with figure_style():
         time_chart = panels(rows, lambda row: time_of(row, unit), "CPU time per gait [µs]")
         save(time_chart, FIGURES, "work_precision_time")
         count = panels(rows, lambda row: float(row["evaluations"]), "evaluations per gait")

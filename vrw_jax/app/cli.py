@@ -124,16 +124,17 @@ def gait(
         from vrw_jax.app.config import assignment
 
         params = settings.params(dict(assignment(text) for text in changes or []))
-    import vrw_jax as vrw
     from vrw_jax.cycles import limit_cycle
+    from vrw_jax.walks import step
+    from vrw_jax.wheel import Outcome
 
     model, options = settings.wheel_model(), settings.numerical_options()
     state = model.start(params) if settings.gait.start is None else settings.gait.start
     walked, n_steps = 0, steps or settings.gait.steps
     with err.status("walking (the first time compiles for a while)"):
         while True:
-            result = vrw.step(params, state, model=model, options=options)
-            stepped = int(result.outcome) == vrw.Outcome.STEPPED
+            result = step(params, state, model=model, options=options)
+            stepped = int(result.outcome) == Outcome.STEPPED
             walked += stepped
             if not stepped or walked == n_steps:
                 break

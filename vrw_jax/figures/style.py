@@ -68,6 +68,7 @@ OUTCOMES: dict[Outcome, tuple[str, str]] = {
     Outcome.SOLVER_GAVE_UP: ("solver gave up", "#882255"),
     Outcome.BAD_INPUT: ("bad input", "#000000"),
     Outcome.NO_CYCLE_FOUND: ("no cycle found", "#DDDDDD"),
+    Outcome.TOO_MANY_EVENTS: ("too many events", "#332288"),
 }
 NOT_COMPUTED = ("not computed", "#FFFFFF")
 UNSTABLE = 100

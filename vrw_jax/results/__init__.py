@@ -14,6 +14,6 @@ from vrw_jax.results.measures import (
     flags,
     what_breaks,
 )
-from vrw_jax.results.provenance import provenance
+from vrw_jax.results.origin import provenance
 from vrw_jax.results.text import Row, as_html, as_markdown, as_tex, as_text, is_concrete, listed
 from vrw_jax.results.wording import nearest
