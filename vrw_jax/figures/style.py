@@ -69,6 +69,8 @@ OUTCOMES: dict[Outcome, tuple[str, str]] = {
     Outcome.BAD_INPUT: ("bad input", "#000000"),
     Outcome.NO_CYCLE_FOUND: ("no cycle found", "#DDDDDD"),
     Outcome.TOO_MANY_EVENTS: ("too many events", "#332288"),
+    Outcome.NO_ADMISSIBLE_CONTACT: ("no admissible contact", "#661100"),
+    Outcome.THREE_FEET_LOADED: ("three feet loaded", "#44AA99"),
 }
 NOT_COMPUTED = ("not computed", "#FFFFFF")
 UNSTABLE = 100
