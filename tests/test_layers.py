@@ -11,7 +11,7 @@ from support.rooms import House
 import vrw_jax
 
 HOUSE = House(Path(vrw_jax.__file__).parent)
-KEPT = (rules.past_faces, rules.strangers)  # of `rules.RULES`; the others follow as they are kept
+KEPT = (rules.upward, rules.past_faces, rules.strangers)  # of `rules.RULES`; the others follow as they are kept
 
 
 @pytest.mark.parametrize("rule", KEPT, ids=lambda rule: rule.__name__)
@@ -276,3 +276,9 @@ def test_import_of_any_module_changes_no_setting_and_starts_no_plotting():
         "assert mpl_before == mpl.rcParams.copy()\n"
         "assert 'matplotlib.pyplot' not in sys.modules\n"
     )
+
+
+def test_the_map_is_drawn_from_the_imports(tmp_path):
+    command = [sys.executable, "-m", "experiments.shared.draw_rooms", str(tmp_path)]
+    subprocess.run(command, cwd=Path(__file__).parents[1], check=True)
+    assert sum(path.stat().st_size > 10_000 for path in tmp_path.iterdir()) == 2

@@ -15,11 +15,14 @@ from matplotlib.patches import FancyBboxPatch, Polygon
 
 from experiments.shared.command import command
 from tests.support.rooms import FLOW, House
-from vrw_jax.figures import walk as plots
+from vrw_jax.figures import GREY, PAGE, figure_style, save
 
 ROOT = Path(__file__).parents[2]
 STEP, WIDTH, HEIGHT = 1.0, 3.6, 0.74
 """From one room to the next, and the size of a room's box, in rows."""
+
+KNOWS, KNOWN = "#0072B2", "#D55E00"
+"""Colours of the lines out of a box and into one."""
 
 TRUNK = 0.62
 """Where the lines of a box begin, from its left edge, rows."""
@@ -32,8 +35,8 @@ def draw(house: House) -> Figure:
     """Rooms down a stair in the flow's order; each reaches left and up to the rooms it knows."""
     rooms, links = house.rooms, house.links
     size = len(rooms)
-    with plots.style():
-        figure = Figure(figsize=(plots.PAGE, plots.PAGE * (size + 0.5) / (size + WIDTH)))
+    with figure_style():
+        figure = Figure(figsize=(PAGE, PAGE * (size + 0.5) / (size + WIDTH)))
         axes = figure.add_subplot(xlim=(-0.2, size + WIDTH - 0.9), ylim=(size - 0.5, -0.8))
         axes.set_aspect("equal")
         axes.axis("off")
@@ -56,7 +59,7 @@ def _lines(axes: Axes, row: int, counts: list[int]) -> None:
     for index, column in enumerate(known):
         end = known[index + 1] + TRUNK if index + 1 < len(known) else row * STEP
         width = THICK * sum(counts[: column + 1]) ** 0.5
-        axes.plot([column + TRUNK, end], [row, row], color=plots.LEG_1, linewidth=width, alpha=0.55,
+        axes.plot([column + TRUNK, end], [row, row], color=KNOWS, linewidth=width, alpha=0.55,
                   solid_capstyle="butt", zorder=1)  # fmt: skip
 
 
@@ -66,12 +69,12 @@ def _trunk(axes: Axes, row: int, counts: list[int]) -> None:
     x, bottom, head = row + TRUNK, row + HEIGHT / 2, 0.2
     for upper, lower in pairwise([bottom + head, *knowing]):
         width = THICK * sum(counts[round(lower) - row - 1 :]) ** 0.5
-        axes.plot([x, x], [upper, lower], color=plots.LEG_2, linewidth=width, alpha=0.55,
+        axes.plot([x, x], [upper, lower], color=KNOWN, linewidth=width, alpha=0.55,
                   solid_capstyle="butt", zorder=1)  # fmt: skip
     if knowing:
         half = 0.1 + 0.012 * sum(counts) ** 0.5
         corners = [(x, bottom), (x - half, bottom + head), (x + half, bottom + head)]
-        axes.add_patch(Polygon(corners, color=plots.LEG_2, linewidth=0, zorder=2))
+        axes.add_patch(Polygon(corners, color=KNOWN, linewidth=0, zorder=2))
 
 
 def _box(axes: Axes, row: int, house: House, room: str) -> None:
@@ -80,16 +83,16 @@ def _box(axes: Axes, row: int, house: House, room: str) -> None:
     corner = (float(row), row - HEIGHT / 2)
     axes.add_patch(
         FancyBboxPatch(corner, WIDTH, HEIGHT, boxstyle="round,pad=0,rounding_size=0.12",
-                       facecolor="white", edgecolor=plots.GREY, linewidth=0.7, zorder=3)
+                       facecolor="white", edgecolor=GREY, linewidth=0.7, zorder=3)
     )  # fmt: skip
     axes.text(row + 0.15, row, room, va="center", weight="bold", fontsize=8.0, zorder=4)
     size = f"{len(modules)} files\n{lines:,} lines"
     axes.text(row + WIDTH - 0.12, row, size, va="center", ha="right", fontsize=6.0,
-              color=plots.GREY, linespacing=1.05, zorder=4)  # fmt: skip
+              color=GREY, linespacing=1.05, zorder=4)  # fmt: skip
 
 
 def _count(axes: Axes, x: float, y: float, count: int) -> None:
-    axes.scatter([x], [y], s=62, color="white", edgecolor=plots.GREY, linewidth=0.4, zorder=3)
+    axes.scatter([x], [y], s=62, color="white", edgecolor=GREY, linewidth=0.4, zorder=3)
     axes.text(x, y + 0.02, str(count), ha="center", va="center", fontsize=5.2, zorder=4)
 
 
@@ -106,17 +109,17 @@ def _legend(axes: Axes, house: House) -> None:
         rows = [house.rooms.index(room) for room in alike if room in house.rooms]
         x = rows[-1] + WIDTH + 0.2
         top, bottom = rows[0] - HEIGHT / 2, rows[-1] + HEIGHT / 2
-        axes.plot([x - 0.1, x, x, x - 0.1], [top, top, bottom, bottom], color=plots.GREY,
+        axes.plot([x - 0.1, x, x, x - 0.1], [top, top, bottom, bottom], color=GREY,
                   linewidth=0.7)  # fmt: skip
         axes.text(x + 0.15, (top + bottom) / 2, "do not know\neach other", va="center",
-                  fontsize=7.0, color=plots.GREY)  # fmt: skip
+                  fontsize=7.0, color=GREY)  # fmt: skip
 
 
 def main() -> None:
     parser = command(__doc__)
     parser.add_argument("folder", type=Path, nargs="?", default=ROOT / "docs" / "figures")
     folder = parser.parse_args().folder
-    for path in plots.save(draw(House(ROOT / "vrw_jax")), folder, "rooms"):
+    for path in save(draw(House(ROOT / "vrw_jax")), folder, "rooms"):
         print(path)
 
 
