@@ -11,7 +11,11 @@ from support.rooms import House
 import vrw_jax
 
 HOUSE = House(Path(vrw_jax.__file__).parent)
-KEPT = (rules.upward, rules.past_faces, rules.strangers)  # of `rules.RULES`; the others follow as they are kept
+KEPT = (
+    rules.upward,
+    rules.past_faces,
+    rules.strangers,
+)  # of `rules.RULES`; the others follow as they are kept
 
 
 @pytest.mark.parametrize("rule", KEPT, ids=lambda rule: rule.__name__)
