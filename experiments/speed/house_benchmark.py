@@ -1,0 +1,101 @@
+"""A change of the house costs no speed: two checkouts, in turns within one run, none below 0.97.
+
+    python -m experiments.speed.house_benchmark A B [--turns 5] [--csv FILE]
+
+Gait steps by lanes and by collocation, limit cycles from a cold guess, samples of a scan, and the
+import (the one figure that is to be small), of the libraries in folders A (before) and B (after).
+Each turn of each is a process of its own with a cache of its own; the first, uncounted, fills it.
+CPU time of one core; told are medians over turns, of B over A too. Take it on an idle machine.
+"""
+
+import json
+import os
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from experiments.shared.command import command
+from experiments.shared.tables import markdown, write
+from experiments.shared.timing import on_one_core
+
+WORKER = Path(__file__).with_name("house_worker.py")
+TURN = f"import runpy; runpy.run_path({str(WORKER)!r})['turn']()"
+IMPORT = "CPU ms of import vrw_jax"
+HEADER = ("figure", "A", "B", "B / A", "lowest", "highest")
+
+
+def environment(checkout: Path, cache: Path) -> dict[str, str]:
+    """Where a process finds its library, and keeps what it compiles."""
+    more = {
+        "PYTHONPATH": str(checkout),
+        "JAX_COMPILATION_CACHE_DIR": str(cache),
+        "JAX_PLATFORMS": "cpu",
+        "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false",
+    }
+    return dict(os.environ) | more
+
+
+def asked(code: str, given: dict[str, str]) -> tuple[str, float]:
+    """What a process prints, and its CPU seconds; the folder it starts in is not on its path."""
+    began = os.times()
+    out = subprocess.run(
+        [sys.executable, "-P", "-c", code], env=given, stdout=subprocess.PIPE, text=True, check=True
+    )
+    ended = os.times()
+    spent = ended.children_user - began.children_user
+    return out.stdout, spent + ended.children_system - began.children_system
+
+
+def turn(checkout: Path, cache: Path) -> tuple[dict[str, float], dict[str, int]]:
+    """Figures of one turn, and how many lanes of each kind came to an end."""
+    given = environment(checkout, cache)
+    lines, _ = asked(TURN, given)
+    told = json.loads(lines.splitlines()[-1])
+    if not Path(told["where"]).is_relative_to(checkout):
+        raise SystemExit(f"{checkout} holds no vrw_jax: Python found {told['where']}.")
+    imports = [asked("import vrw_jax", given)[1] for _ in range(3)]
+    return told["told"] | {IMPORT: 1e3 * statistics.median(imports)}, told["ended"]
+
+
+def compared(checkouts: tuple[Path, Path], caches: Path, turns: int) -> list[tuple]:
+    """A row of HEADER for each figure."""
+    places = [(folder, caches / name) for folder, name in zip(checkouts, "ab", strict=True)]
+    ended = [turn(*place)[1] for place in places]
+    if ended[0] != ended[1]:
+        print(f"A and B do not end alike: {ended[0]}, {ended[1]}", flush=True)
+    told: tuple[list, list] = ([], [])
+    for count in range(turns):
+        began = time.time()
+        for side in (0, 1) if count % 2 == 0 else (1, 0):
+            told[side].append(turn(*places[side])[0])
+        print(f"turn {count + 1} of {turns}: {time.time() - began:.0f} s", flush=True)
+    rows = []
+    for name in told[0][0]:
+        a, b = ([one[name] for one in side] for side in told)
+        ratios = [y / x for x, y in zip(a, b, strict=True)]
+        shown = statistics.median(ratios), min(ratios), max(ratios)
+        sizes = (f"{statistics.median(side):.4g}" for side in (a, b))
+        rows.append((name, *sizes, *(f"{ratio:.3f}" for ratio in shown)))
+    return rows
+
+
+def main() -> None:
+    parser = command(__doc__)
+    parser.add_argument("a", type=Path, help="folder of the checkout before")
+    parser.add_argument("b", type=Path, help="folder of the checkout after")
+    parser.add_argument("--turns", type=int, default=5)
+    parser.add_argument("--csv", type=Path, help="keep the table there")
+    parser.add_argument("--caches", type=Path, default="results/house_benchmark")
+    chosen = parser.parse_args()
+    with on_one_core():
+        both = chosen.a.resolve(), chosen.b.resolve()
+        rows = compared(both, chosen.caches.resolve(), chosen.turns)
+    print(markdown(HEADER, rows))
+    if chosen.csv:
+        write(chosen.csv, HEADER, rows)
+
+
+if __name__ == "__main__":
+    main()
