@@ -12,10 +12,10 @@ BOX = {
     "natural_length": (1.01, 1.04),
     "slope": (0.28, 0.34),
 }
-"""Wheels that walk with double support and from 1 % off their gait, nearly all."""
+"""Six wheels in ten have a gait with double support."""
 
 WIDE_BOX = BOX | {"damping": (20.0, 215.0), "slope": (0.26, 0.34)}
-"""Most wheels have a gait."""
+"""Seven in ten have a gait."""
 
 
 def rows_of(box: dict[str, tuple[float, float]], n: int, random: np.random.Generator) -> np.ndarray:
