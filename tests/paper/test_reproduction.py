@@ -40,12 +40,12 @@ def reproduced(
 
 
 def test_every_published_fact_holds(evidence: Evidence) -> None:
-    failing = [f"{f.claim}: found {f.found}" for f in facts.facts(evidence) if not f.holds]
+    failing = [f"{f.claim}: found {f.found}" for f in facts.all_facts(evidence) if not f.holds]
     assert not failing
 
 
 def test_every_fact_says_where_it_stands_and_why_its_tolerance(evidence: Evidence) -> None:
-    for fact in facts.facts(evidence):
+    for fact in facts.all_facts(evidence):
         assert fact.where
         assert fact.published
         assert fact.found
@@ -53,7 +53,7 @@ def test_every_fact_says_where_it_stands_and_why_its_tolerance(evidence: Evidenc
 
 
 def test_the_table_speaks_of_every_figure_and_of_the_misprints(evidence: Evidence) -> None:
-    text = facts.as_markdown(facts.facts(evidence))
+    text = facts.as_page(facts.all_facts(evidence))
     for word in ("Fig. 6", "Fig. 8", "Fig. 9", "Fig. 10(a)", "Fig. 10(b)", "J43", "eq. (35)",
                  "eqs (16), (17)", "φ = 0.10", "friction", "stopper"):  # fmt: skip
         assert word in text
@@ -82,7 +82,7 @@ def test_a_broken_fact_is_told_and_gives_an_exit_code(
     monkeypatch.setattr("vrw_jax.runtime.start_jax", lambda: None)
     result = CliRunner().invoke(cli.app, ["reproduce", "--out", str(tmp_path)])
     assert result.exit_code == cli.FACT_FAILED
-    table = facts.facts(broken)
+    table = facts.all_facts(broken)
     assert f"{sum(fact.holds for fact in table)} of {len(table)} hold" in result.output
     assert "does not" in result.output
     text = (tmp_path / "facts.md").read_text(encoding="utf-8")
@@ -157,9 +157,9 @@ def test_every_fact_can_fail(evidence: Evidence) -> None:
         _spoiled_states,
         _sinking_foot,
     )
-    unmoved = {fact.claim for fact in facts.facts(evidence)}
+    unmoved = {fact.claim for fact in facts.all_facts(evidence)}
     for spoil in spoils:
-        unmoved &= {fact.claim for fact in facts.facts(spoil(evidence)) if fact.holds}
+        unmoved &= {fact.claim for fact in facts.all_facts(spoil(evidence)) if fact.holds}
     assert not unmoved
 
 

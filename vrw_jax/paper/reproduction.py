@@ -142,7 +142,7 @@ def reproduce(folder: str | Path, progress: Progress = silent) -> list[Fact]:
     progress(0.8, "figures")
     draw(evidence, folder)
     progress(0.98, "table of facts")
-    table = facts.facts(evidence)
+    table = facts.all_facts(evidence)
     facts.write(table, folder)
     flat = evidence.branch.drop_dims(["leg", "component"]).to_dataframe()
     flat.to_csv(folder / "indicators.csv", float_format="%.10g")

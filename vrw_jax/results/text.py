@@ -32,7 +32,8 @@ def as_html(title: str, rows: Iterable[Sequence[str]], header: Sequence[str] = (
 
 def as_markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     """Lines of a table for a page."""
-    line = lambda cells: "| " + " | ".join(text.replace("|", "\\|") for text in cells) + " |"
+    cell = lambda text: " " + text.replace("|", r"\|") + " " * bool(text)
+    line = lambda cells: "|" + "|".join(map(cell, cells)) + "|"
     return [line(header), "|" + "---|" * len(header), *map(line, rows)]
 
 

@@ -1,4 +1,3 @@
 """The paper's facts, published against found."""
 
-from vrw_jax.paper.facts.base import Evidence, Fact
-from vrw_jax.paper.facts.table import as_markdown, facts, write
+from vrw_jax.paper.facts.table import all_facts, as_page, write

@@ -1,10 +1,14 @@
-"""One row of the table, the evidence it is read off, and how numbers are compared."""
+"""One row of the table, the evidence it is read off, and how claims are held against numbers."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import xarray as xr
 
+from vrw_jax.results import PHASES
 from vrw_jax.wheel import WheelParams
 
 
@@ -46,18 +50,65 @@ class Evidence:
         return self.branch.sel(damping=200.0)
 
 
+CODE = "independent code"
 DIGIT = "half a unit of the last digit published"
 SIGN = "a sign: no tolerance"
 ROUND_OFF = 1e-9
 
+Numbers = Mapping[str, Any]
+"""What a group of claims speaks of, read off the evidence."""
 
-def near(value: float, published: float, tolerance: float) -> bool:
-    return bool(abs(value - published) <= tolerance)
+
+@dataclass(frozen=True)
+class Claim:
+    """What is published, how the numbers tell what was found, and when the two agree."""
+
+    claim: str
+    where: str
+    published: str
+    found: str  # a format of the group's numbers
+    holds: Callable[[Any], bool]  # asked with the group's numbers as attributes
+    reason: str = DIGIT
+
+
+@dataclass(frozen=True)
+class Group:
+    """Claims under one heading that speak of the same numbers."""
+
+    title: str
+    numbers: Callable[[Evidence], Numbers]
+    claims: tuple[Claim, ...]
+
+    def facts(self, evidence: Evidence) -> list[Fact]:
+        """The rows of the table."""
+        numbers = self.numbers(evidence)
+        told = SimpleNamespace(**numbers)
+        return [
+            Fact(
+                group=self.title,
+                claim=c.claim,
+                where=c.where,
+                published=c.published,
+                found=c.found.format(**numbers),
+                holds=bool(c.holds(told)),
+                reason=c.reason,
+            )
+            for c in self.claims
+        ]
+
+
+def near(**published: tuple[float | tuple[float, ...], float]) -> Callable[[Any], bool]:
+    """Holds where every number named lies at its published value, within the tolerance."""
+    return lambda n: all(
+        bool(np.all(np.abs(np.asarray(getattr(n, name)) - value) <= tolerance))
+        for name, (value, tolerance) in published.items()
+    )
 
 
 def first_step(gait: xr.Dataset) -> xr.Dataset:
     return gait.isel(time=gait.step.values == 0)
 
 
-def in_phase(gait: xr.Dataset, phase: int) -> xr.Dataset:
-    return gait.isel(time=gait.phase.values == phase)
+def by_phase(gait: xr.Dataset) -> list[xr.Dataset]:
+    """Its DLS, SLS-I and SLS-II."""
+    return [gait.isel(time=gait.phase.values == phase) for phase in range(len(PHASES))]

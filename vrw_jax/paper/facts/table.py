@@ -1,16 +1,18 @@
 """The whole table: every fact that the paper publishes, beside what is found; each can fail."""
 
 import csv
+import itertools
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 from vrw_jax.paper.facts.base import Evidence, Fact
-from vrw_jax.paper.facts.gait import damping_facts, gait_facts
-from vrw_jax.paper.facts.indicators import indicator_facts
-from vrw_jax.paper.facts.misprints import misprint_facts
-from vrw_jax.paper.facts.premises import premise_facts
+from vrw_jax.paper.facts.gait import THREE_DAMPINGS, TYPICAL_GAIT
+from vrw_jax.paper.facts.indicators import INDICATORS
+from vrw_jax.paper.facts.misprints import MISPRINTS
+from vrw_jax.paper.facts.premises import PREMISES
+from vrw_jax.results import as_markdown
 
 INTRODUCTION = (
     "“independent code” is a solver in the paper's own five constrained coordinates: where the "
@@ -18,27 +20,21 @@ INTRODUCTION = (
     "half a unit of the last digit published unless the row gives another reason."
 )
 
-GROUPS: tuple[Callable[[Evidence], list[Fact]], ...] = (
-    gait_facts,
-    damping_facts,
-    indicator_facts,
-    premise_facts,
-    misprint_facts,
-)
+GROUPS = (TYPICAL_GAIT, THREE_DAMPINGS, INDICATORS, PREMISES, MISPRINTS)
 
 
-def facts(evidence: Evidence) -> list[Fact]:
+def all_facts(evidence: Evidence) -> list[Fact]:
     """The whole table, in the paper's order."""
-    return [fact for group in GROUPS for fact in group(evidence)]
+    return [fact for group in GROUPS for fact in group.facts(evidence)]
 
 
 def _cell(text: str) -> str:
-    """Text that a Markdown table can hold, with minus signs for hyphens before numbers."""
-    return re.sub(r"(?<![\w.])-(?=\d)", "−", text).replace("|", "\\|")
+    """Text with minus signs for hyphens before numbers."""
+    return re.sub(r"(?<![\w.])-(?=\d)", "−", text)
 
 
-def as_markdown(table: Sequence[Fact]) -> str:
-    """The table for a reader."""
+def as_page(table: Sequence[Fact]) -> str:
+    """The table for a reader, in Markdown."""
     missing = [fact for fact in table if not fact.holds]
     lines = [
         "# The paper's facts, published against found",
@@ -52,26 +48,14 @@ def as_markdown(table: Sequence[Fact]) -> str:
         "its numbers (last group). With Coulomb friction the rear foot would slip in the landing; "
         "this rung of the model holds it, as the paper does.",
     ]
-    group = ""
-    for fact in table:
-        if fact.group != group:
-            group = fact.group
-            lines += [
-                "",
-                f"## {group}",
-                "",
-                "| fact | where | published | found | | tolerance |",
-                "|---|---|---|---|---|---|",
-            ]
-        cells = [
-            fact.claim,
-            fact.where,
-            fact.published,
-            fact.found,
-            fact.verdict if fact.holds else f"**{fact.verdict}**",
-            fact.reason,
-        ]
-        lines.append("| " + " | ".join(_cell(text) for text in cells) + " |")
+    for title, group in itertools.groupby(table, lambda fact: fact.group):
+        rows = []
+        for fact in group:
+            verdict = fact.verdict if fact.holds else f"**{fact.verdict}**"
+            told = (fact.claim, fact.where, fact.published, fact.found, verdict, fact.reason)
+            rows.append([_cell(text) for text in told])
+        header = ("fact", "where", "published", "found", "", "tolerance")
+        lines += ["", f"## {title}", "", *as_markdown(header, rows)]
     return "\n".join(lines) + "\n"
 
 
@@ -79,7 +63,7 @@ def write(table: Sequence[Fact], folder: Path) -> list[Path]:
     """The table as Markdown and CSV in `folder`; returns the paths."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / "facts.md", folder / "facts.csv"]
-    paths[0].write_text(as_markdown(table), encoding="utf-8")
+    paths[0].write_text(as_page(table), encoding="utf-8")
     with paths[1].open("w", newline="", encoding="utf-8") as file:
         rows = [asdict(fact) | {"holds": fact.verdict} for fact in table]
         writer = csv.DictWriter(file, rows[0].keys())
