@@ -1,7 +1,9 @@
 """Which gait a wheel settles into by walking, and along a parameter from neighbour to neighbour.
 
 No equation is solved for a fixed point: what stands here has been walked to, so it is stable, and
-it checks the Newton search independently.
+it checks the Newton search independently. The rung continues formally where the ground would have
+to pull on Leg 1, as it does for scuffing, so that gaits can be followed past the c at which λ2⁺
+vanishes; elsewhere that changes nothing.
 """
 
 from __future__ import annotations
@@ -14,12 +16,15 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.models import AbstractWheel, SectionState
+from vrw_jax.models import SectionState, ViscoelasticWheel
 from vrw_jax.numerics import Options
 from vrw_jax.results import MARGINS, STEP, attrs_of, provenance
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.walks import checked, step, walk
+from vrw_jax.walks import step, walk
 from vrw_jax.wheel import Outcome, WheelParams
+
+N_STEPS = 30
+"""Steps of each walk: the slowest gait on the branch, c = 70, settles to rounding in them."""
 
 SETTLED = 1e-8
 """Largest change of the section state from step to step in a settled gait: ten times the error of
@@ -29,23 +34,26 @@ LAST = 5
 """Steps that must not change it: a gait of longer period may by chance repeat once."""
 
 
-def approach(
-    params: WheelParams,
-    x: SectionState,
-    n_steps: int,
-    *,
-    model: AbstractWheel | None = None,
-    options: Options | None = None,
-) -> xr.Dataset:
+def paper_wheel() -> ViscoelasticWheel:
+    """The rung that all of it walks on."""
+    return ViscoelasticWheel(stop_at_lift_off=False)
+
+
+def changed(params: WheelParams, name: str, value: float) -> WheelParams:
+    """The same wheel with one parameter changed."""
+    change: dict[str, Any] = {name: value}
+    return dataclasses.replace(params, **change)
+
+
+def approach(params: WheelParams, x: SectionState) -> xr.Dataset:
     """Section states of a walk and how much each step still changes them.
 
     `change` is the Euclidean distance to the section state before, over (rad, rad/s, m/s); the
     walk has `settled` into a period-1 gait when each of the last five is below `SETTLED`.
     """
-    walked = walk(params, x, n_steps, model=model, options=options)
-    params, x, model, options = checked(params, x, model, options)
+    walked = walk(params, x, N_STEPS, model=paper_wheel())
     stepped = int(walked.n_stepped)
-    states = np.concatenate([np.asarray(x)[None], walked.steps.section_state[:stepped]])
+    states = np.concatenate([walked.start[None], walked.steps.section_state[:stepped]])
     change = np.full(stepped + 1, np.nan)
     change[1:] = np.linalg.norm(np.diff(states, axis=0), axis=1)
     outcome = Outcome(int(walked.outcome))
@@ -63,19 +71,12 @@ def approach(
             "last_change": last,
             "settled": int(settled),
         }
-        | provenance(params, model, options),
+        | provenance(params, paper_wheel(), Options()),
     )
 
 
 def states_along(
-    params: WheelParams,
-    name: str,
-    values: Sequence[float],
-    x: SectionState,
-    n_steps: int,
-    *,
-    model: AbstractWheel | None = None,
-    options: Options | None = None,
+    params: WheelParams, name: str, values: Sequence[float], x: SectionState
 ) -> Iterator[xr.Dataset]:
     """The walks at each of `values` of the parameter `name`, each begun from its neighbour's gait.
 
@@ -86,18 +87,11 @@ def states_along(
     settled_states: list[np.ndarray] = []
     for value in values:
         start = _extrapolated(settled_values, settled_states, value, x)
-        wheel = changed(params, name, value)
-        walked = approach(wheel, start, n_steps, model=model, options=options)
+        walked = approach(changed(params, name, value), start)
         if walked.settled:
             settled_values.append(value)
             settled_states.append(walked.section_state.values[-1])
         yield walked
-
-
-def changed(params: WheelParams, name: str, value: float) -> WheelParams:
-    """The same wheel with one parameter changed."""
-    change: dict[str, Any] = {name: value}
-    return dataclasses.replace(params, **change)
 
 
 def along(
@@ -105,10 +99,6 @@ def along(
     name: str,
     values: Sequence[float],
     x: SectionState,
-    n_steps: int,
-    *,
-    model: AbstractWheel | None = None,
-    options: Options | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> xr.Dataset:
     """The gaits of `states_along` with all measures of one more step, over the parameter `name`.
@@ -117,12 +107,9 @@ def along(
     still changed it. `progress` is told the share that is done.
     """
     rows: list[dict[str, np.ndarray]] = []
-    walks = states_along(params, name, values, x, n_steps, model=model, options=options)
-    for value, walked in zip(values, walks, strict=True):
+    for value, walked in zip(values, states_along(params, name, values, x), strict=True):
         state = walked.section_state.values[-1]
-        result = step(
-            changed(params, name, value), jnp.asarray(state), model=model, options=options
-        )
+        result = step(changed(params, name, value), jnp.asarray(state), model=paper_wheel())
         row = {key: np.asarray(values) for key, values in result.measures().items()}
         if walked.outcome != Outcome.STEPPED.name:
             row["outcome"] = np.asarray(int(Outcome[walked.outcome]))
@@ -132,7 +119,7 @@ def along(
         rows.append(row)
         if progress is not None:
             progress(len(rows) / len(values))
-    return _table(params, name, values, rows, checked(params, x, model, options)[2:])
+    return _table(params, name, values, {key: np.stack([r[key] for r in rows]) for key in rows[0]})
 
 
 def _extrapolated(
@@ -148,39 +135,28 @@ def _extrapolated(
 
 
 def _table(
-    params: WheelParams,
-    name: str,
-    values: Sequence[float],
-    rows: list[dict[str, np.ndarray]],
-    choices: tuple[AbstractWheel, Options],
+    params: WheelParams, name: str, values: Sequence[float], columns: dict[str, np.ndarray]
 ) -> xr.Dataset:
-    columns = {key: np.stack([row[key] for row in rows]) for key in rows[0]}
     data = {
-        key: xr.Variable(
-            (name, "leg") if MARGINS.get(key, STEP["period"]).axis else name,
-            columns[key],
-            attrs_of(key),
-        )
-        for key in STEP | MARGINS
+        key: xr.Variable((name, "leg") if measure.axis else name, columns[key], attrs_of(key))
+        for key, measure in (STEP | MARGINS).items()
     }
-    data["section_state"] = xr.Variable(
-        (name, "component"), columns["section_state"], {"long_name": "section state"}
-    )
-    data["change"] = xr.Variable(
-        name,
-        columns["change"],
-        {"units": "1", "long_name": "largest change of the last five steps"},
-    )
-    data["settled"] = xr.Variable(
-        name, columns["settled"], {"long_name": "whether the walk settled into a period-1 gait"}
-    )
+    told = {"units": "1", "long_name": "largest change of the last five steps"}
+    data |= {
+        "section_state": xr.Variable(
+            (name, "component"), columns["section_state"], {"long_name": "section state"}
+        ),
+        "change": xr.Variable(name, columns["change"], told),
+        "settled": xr.Variable(
+            name, columns["settled"], {"long_name": "whether the walk settled into a period-1 gait"}
+        ),
+    }
     labels = {
         name: xr.Variable(name, np.asarray(values, float), attrs_of(name)),
         "component": ["theta", "dtheta", "dL1"],
         "leg": xr.Variable("leg", np.arange(3, params.n_legs + 1), {"long_name": "locked leg"}),
     }
-    origin = provenance(params, *choices)
+    origin = provenance(params, paper_wheel(), Options())
     origin.pop(f"parameter_{name}")
-    return xr.Dataset(data, labels, {"title": f"Gaits walked to along {name}"} | origin).sortby(
-        name
-    )
+    attrs = {"title": f"Gaits walked to along {name}"} | origin
+    return xr.Dataset(data, labels, attrs).sortby(name)

@@ -1,8 +1,6 @@
 """The paper, reproduced: its figures, and the table of its facts published against found.
 
-Everything is walked to from one start; no fixed point is solved for. The rung continues formally
-where the ground would have to pull on Leg 1, as it does for scuffing, so that the branch can be
-followed past the c at which λ2⁺ vanishes; elsewhere that changes nothing.
+Everything is walked to from one start; no fixed point is solved for.
 """
 
 import math
@@ -14,19 +12,14 @@ import numpy as np
 import xarray as xr
 
 from vrw_jax import figures as plots
-from vrw_jax.models import ViscoelasticWheel
 from vrw_jax.paper import facts
 from vrw_jax.paper.facts.base import Evidence, Fact
-from vrw_jax.paper.gaits import along, approach, changed, states_along
+from vrw_jax.paper.gaits import along, approach, changed, paper_wheel, states_along
 from vrw_jax.walks import paper_start, simulate
 from vrw_jax.wheel import WheelParams
 
 Progress = Callable[[float, str], None]
 """Told the share that is done, 0 to 1, and what is being done."""
-
-N_STEPS = 30
-"""Steps of each walk: the slowest gait on the branch, c = 70, settles to rounding in them."""
-
 
 DAMPINGS = (50.0, 100.0, 200.0)
 """Of figures 8 and 9, N s/m."""
@@ -36,20 +29,15 @@ def silent(share: float, what: str) -> None:
     """Progress for nobody."""
 
 
-def wheel() -> ViscoelasticWheel:
-    """The rung that all of it walks on."""
-    return ViscoelasticWheel(stop_at_lift_off=False)
-
-
 def settle_at_table_1() -> xr.Dataset:
     """The walk from the start for Table 1 into its gait."""
-    return approach(WheelParams(), paper_start(), N_STEPS, model=wheel())
+    return approach(WheelParams(), paper_start())
 
 
 def gait_at_table_1(n_steps: int = 3) -> xr.Dataset:
     """Trajectory of the gait of Table 1 at slope 0.30: figures 6 and 7."""
     state = jnp.asarray(settle_at_table_1().section_state.values[-1])
-    return simulate(WheelParams(), state, n_steps, model=wheel())
+    return simulate(WheelParams(), state, n_steps, model=paper_wheel())
 
 
 def gaits_at(dampings: Sequence[float]) -> list[xr.Dataset]:
@@ -63,31 +51,29 @@ def gaits_at(dampings: Sequence[float]) -> list[xr.Dataset]:
         begin = float(table_1.damping)
         n = 1 + math.ceil(abs(damping - begin) / 10.0)
         path = np.linspace(begin, damping, n).tolist()
-        *_, walked = states_along(table_1, "damping", path, start, N_STEPS, model=wheel())
+        *_, walked = states_along(table_1, "damping", path, start)
         if not walked.settled:
             raise ValueError(f"No period-1 gait was met at damping {damping:g}: choose 1 to 219.")
         state = jnp.asarray(walked.section_state.values[-1])
-        gaits.append(simulate(changed(table_1, "damping", damping), state, 1, model=wheel()))
+        gaits.append(simulate(changed(table_1, "damping", damping), state, 1, model=paper_wheel()))
     return gaits
 
 
 def gaits_along_damping(progress: Callable[[float], None] | None = None) -> xr.Dataset:
     """The gaits at every whole c from 1 to 219, and the walks up to 224: figure 10."""
-    params, model = WheelParams(), wheel()
+    params = WheelParams()
     start = jnp.asarray(settle_at_table_1().section_state.values[-1])
-    down = along(
-        params, "damping", range(200, 0, -1), start, N_STEPS, model=model, progress=progress
-    )
-    up = along(params, "damping", range(201, 225), start, N_STEPS, model=model)
+    down = along(params, "damping", range(200, 0, -1), start, progress)
+    up = along(params, "damping", range(201, 225), start)
     return xr.concat([down, up], "damping", data_vars="minimal", combine_attrs="override")
 
 
 def collect(progress: Progress = silent) -> Evidence:
     """Walk everything that the facts and figures are read off."""
-    table_1, model = WheelParams(), wheel()
+    table_1 = WheelParams()
     progress(0.0, "walk from the start for Table 1")
     settling = settle_at_table_1()
-    too_fast = approach(table_1, jnp.asarray((0.1, 2.0, -0.1)), N_STEPS, model=model)
+    too_fast = approach(table_1, jnp.asarray((0.1, 2.0, -0.1)))
 
     what = "gaits along c from 1 to 224"
     progress(0.1, what)
@@ -97,11 +83,11 @@ def collect(progress: Progress = silent) -> Evidence:
     start = jnp.asarray(branch.section_state.sel(damping=100.0).values)
     slopes = [0.01 * i for i in range(30, 9, -1)]
     medium, flat = changed(table_1, "damping", 100.0), changed(table_1, "slope", 0.10)
-    gentler = along(medium, "slope", slopes, start, N_STEPS, model=model)
+    gentler = along(medium, "slope", slopes, start)
     start = jnp.asarray(gentler.section_state.sel(slope=0.10, method="nearest").values)
-    gentle = along(flat, "damping", range(100, 221, 10), start, N_STEPS, model=model)
+    gentle = along(flat, "damping", range(100, 221, 10), start)
     falling = [*range(100, 0, -10), 5, 4]
-    gentle_low = along(flat, "damping", falling, start, N_STEPS, model=model)
+    gentle_low = along(flat, "damping", falling, start)
 
     progress(0.7, "trajectories")
     return Evidence(
