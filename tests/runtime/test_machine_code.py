@@ -5,46 +5,29 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
+from support.machine_code import Forgetful
 
 from vrw_jax import simd
 from vrw_jax.runtime import compiled, lane_function, lane_program, store
-from vrw_jax.simd import code, ffi
+from vrw_jax.simd import code
 
 X = jnp.asarray(np.random.default_rng(0).normal(size=(2, 9)))
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
+def folder(tmp_path):
     """A cache of the test's own, in which JAX too keeps whatever it compiles."""
     before = jax.config.jax_compilation_cache_dir
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
-    forget(monkeypatch)
     compilation_cache.reset_cache()  # it may have opened another folder
     yield tmp_path
     jax.config.update("jax_compilation_cache_dir", before)
     compilation_cache.reset_cache()
 
 
-def forget(monkeypatch):
-    """As in another process; names that are registered twice stand for the same code."""
-    monkeypatch.setattr(code, "_made", {})
-    monkeypatch.setattr(ffi, "registered", {})
-    monkeypatch.setattr(simd.program, "registered", ffi.registered)
-
-
 @pytest.fixture
-def names(monkeypatch):
-    """Of all machine code that is registered with XLA."""
-    names = []
-    once = jax.ffi.register_ffi_target
-
-    def register(name, *rest, **named):
-        if name not in names:
-            once(name, *rest, **named)
-        names.append(name)
-
-    monkeypatch.setattr(jax.ffi, "register_ffi_target", register)
-    return names
+def process(monkeypatch):
+    return Forgetful(monkeypatch)
 
 
 def further(traced):
@@ -58,20 +41,20 @@ def further(traced):
     return compiled(run, (X,), "kept", jax.devices()[0])(X)
 
 
-def test_a_kept_program_finds_the_machine_code_that_it_calls(folder, names, monkeypatch):
+def test_a_kept_program_finds_the_machine_code_that_it_calls(folder, process):
     traced, expected = [], 2.0 * np.asarray(X) + 1.0
     np.testing.assert_array_equal(further(traced), expected)
-    forget(monkeypatch)
+    process.forget()
     np.testing.assert_array_equal(further(traced), expected)
-    assert (len(names), len(traced)) == (2, 1)
+    assert (len(process.names), len(traced)) == (2, 1)
     for place in folder.glob("lanes_code_*"):
         place.unlink()
-    forget(monkeypatch)
+    process.forget()
     np.testing.assert_array_equal(further(traced), expected)  # traced and compiled anew
-    assert (len(set(names)), len(traced)) == (1, 2)
+    assert (len(set(process.names)), len(traced)) == (1, 2)
 
 
-def test_an_edit_that_changes_no_trace_compiles_nothing(folder, names, monkeypatch):
+def test_an_edit_that_changes_no_trace_compiles_nothing(folder, process, monkeypatch):
     """Neither the machine code, whose name stays, nor JAX's program that calls it by that name."""
     traced = []
     before = jax.config.jax_persistent_cache_min_compile_time_secs
@@ -79,14 +62,14 @@ def test_an_edit_that_changes_no_trace_compiles_nothing(folder, names, monkeypat
     try:
         first = further(traced)
         by_jax = set(folder.glob("*-cache"))
-        forget(monkeypatch)
+        process.forget()
         monkeypatch.setattr(store, "code_digest", lambda: "of the library with another docstring")
         monkeypatch.setattr(code, "compiled", None)  # would fail
         np.testing.assert_array_equal(further(traced), first)
     finally:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", before)
     assert len(traced) == 2
-    assert len(set(names)) == 1
+    assert len(set(process.names)) == 1
     assert by_jax == set(folder.glob("*-cache")) != set()
 
 
@@ -106,7 +89,7 @@ def test_a_program_kept_by_another_processor_is_traced_anew(folder, monkeypatch)
     assert len(traced) == 2
 
 
-def test_damaged_files_are_compiled_anew(folder, monkeypatch):
+def test_damaged_files_are_compiled_anew(folder, process):
     lanes, traced = [np.arange(4.0)], []
 
     def run():
@@ -121,6 +104,6 @@ def test_damaged_files_are_compiled_anew(folder, monkeypatch):
         content = bytearray(place.read_bytes())
         content[-10] ^= 1
         place.write_bytes(content)
-    forget(monkeypatch)
+    process.forget()
     assert run()[3] == 6.0
     assert len(traced) == 2

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.machine_code import Forgetful
 
 from vrw_jax import simd
 from vrw_jax.simd import code
@@ -23,16 +24,8 @@ class Folder(dict):
 
 
 @pytest.fixture(autouse=True)
-def another_process(monkeypatch):
-    """What is called makes this process forget its code, as another would not know it."""
-
-    def forget():
-        monkeypatch.setattr(code, "_made", {})
-        monkeypatch.setattr(simd.ffi, "registered", {})
-        monkeypatch.setattr(simd.program, "registered", simd.ffi.registered)
-
-    forget()
-    return forget
+def process(monkeypatch):
+    return Forgetful(monkeypatch)
 
 
 def counted(factor=2.0):
@@ -51,24 +44,24 @@ def run(function, key, store):
     return list(simd.lane_program(again, [], 1, LANES[0].dtype, key, store)([], LANES)[0])
 
 
-def test_a_later_start_neither_traces_nor_compiles(monkeypatch, another_process):
+def test_a_later_start_neither_traces_nor_compiles(monkeypatch, process):
     double, traces = counted()
     store = Folder()
     assert run(double, "double", store) == [0.0, 2.0, 4.0, 6.0]
     monkeypatch.setattr(code, "compiled", None)  # would fail
     assert run(double, "double", store) == [0.0, 2.0, 4.0, 6.0]
-    another_process()
+    process.forget()
     assert run(double, "double", store) == [0.0, 2.0, 4.0, 6.0]
     assert len(traces) == 1
 
 
 @pytest.mark.parametrize("elsewhere", [False, True])
-def test_the_same_trace_under_another_key_is_not_compiled(monkeypatch, another_process, elsewhere):
+def test_the_same_trace_under_another_key_is_not_compiled(monkeypatch, process, elsewhere):
     double, traces = counted()
     store = Folder()
     run(double, "double", store)
     if elsewhere:
-        another_process()
+        process.forget()
     else:
         store = None
     monkeypatch.setattr(code, "compiled", None)  # would fail
@@ -88,14 +81,14 @@ def test_other_traces_and_other_ways_of_compiling_have_code_of_their_own(monkeyp
     assert (names.count("code"), names.count("index")) == (3, 3)
 
 
-def test_an_index_whose_code_is_gone_is_made_anew(another_process):
+def test_an_index_whose_code_is_gone_is_made_anew(process):
     double, traces = counted()
     store = Folder()
     run(double, "double", store)
     del store[next(name for name in store if name.startswith("lanes_code_"))]
-    another_process()
+    process.forget()
     assert run(double, "double", store)[3] == 6.0
-    another_process()
+    process.forget()
     assert run(double, "double", store)[3] == 6.0
     assert len(traces) == 2
 
@@ -113,17 +106,16 @@ def test_another_batch_is_neither_traced_nor_compiled_again_without_a_store():
     assert len(traced) == 1
 
 
-def test_code_is_at_hand_by_its_name_alone(monkeypatch, another_process):
-    store, names = Folder(), []
+def test_code_is_at_hand_by_its_name_alone(process):
+    store = Folder()
     double = simd.lane_function(lambda x: 2.0 * x, lambda x: x, "at hand", store)
     jax.jit(double)(jnp.ones(3))
-    (name,) = simd.ffi.registered
+    (name,) = process.names
     assert not simd.at_hand([name, "lanes_code_of_none"], store)
-    another_process()
-    monkeypatch.setattr(jax.ffi, "register_ffi_target", lambda name, *_, **__: names.append(name))
+    process.forget()
     assert not simd.at_hand([name], None)
     assert simd.at_hand([name], store)
-    assert names == [name]
+    assert process.names == [name, name]
 
 
 def test_the_text_that_llvm_compiles_is_the_same_in_every_process():

@@ -1,5 +1,7 @@
 """What machine code can't do is refused in a sentence that names it, and never misread."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,12 +11,13 @@ from jax import lax
 from vrw_jax import simd
 from vrw_jax.simd.arrays import LANES
 
+KEYS = itertools.count()
 X = np.random.default_rng(0).normal(size=(2, 9))
 
 
 def call(function, *arrays):
     """Its results as machine code."""
-    run = simd.lane_function(function, function, object(), None)
+    run = simd.lane_function(function, function, ("refusals", next(KEYS)), None)
     return jax.jit(run)(*map(jnp.asarray, arrays))
 
 
@@ -91,3 +94,11 @@ def test_one_number_for_all_lanes_is_theirs():
     """As many as lanes, and nothing to tell them from: what is broadcast is no misreading."""
     told = call(lambda x: jnp.full(x.shape[-1], 2.0) * x + jnp.ones_like(x), X)
     np.testing.assert_array_equal(told, 2.0 * X + 1.0)
+
+
+def test_calls_are_neither_mapped_nor_differentiated_from_outside():
+    double = simd.lane_function(lambda x: 2.0 * x, lambda x: x, "from outside", None)
+    with pytest.raises(NotImplementedError, match="vmap"):
+        jax.vmap(double)(jnp.asarray(X))
+    with pytest.raises(ValueError, match="cannot be differentiated"):
+        jax.grad(lambda x: double(x).sum())(jnp.asarray(X[0]))

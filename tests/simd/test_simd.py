@@ -19,7 +19,9 @@ DRAW = np.random.default_rng(0)
 def program(function, lanes, uniform=()):
     """`function(uniform, lanes)` compiled for inputs like these."""
     kinds = [np.asarray(x).dtype for x in uniform]
-    return simd.lane_program(function, kinds, len(lanes), lanes[0].dtype, next(KEYS), None)
+    return simd.lane_program(
+        function, kinds, len(lanes), lanes[0].dtype, ("simd", next(KEYS)), None
+    )
 
 
 def both_ways(function, lanes, uniform=()):

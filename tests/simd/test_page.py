@@ -1,0 +1,20 @@
+"""The page of machine code says what there is: a table of primitives, an example that runs."""
+
+import re
+from pathlib import Path
+
+from vrw_jax import simd
+
+PAGE = (Path(__file__).parents[2] / "docs" / "machine_code.md").read_text()
+
+
+def test_the_page_has_the_table_of_primitives():
+    table = PAGE.split("## Primitives")[1].split("Numbers are")[0]
+    rows = [row.strip("| ").split(" | ") for row in table.strip().splitlines()[2:]]
+    told = {name: does for names, does in rows for name in re.findall("`(.+?)`", names)}
+    assert told == simd.primitives()
+    assert all(told.values())
+
+
+def test_its_example_runs():
+    exec(re.search("```python\n(.+?)```", PAGE, re.DOTALL)[1], {})
