@@ -354,7 +354,7 @@ def test_wheels_too_stiff_for_an_explicit_solver_go_to_an_implicit_one():
     options = vrw.Options(solver="Tsit5", rtol=1e-6, atol=1e-6, max_solver_steps=300)
     starts = np.tile([0.1, 1.6, -0.1], (2, 1))
     found = vrw.steps(truth.wheels(vectors), starts, options=options)
-    assert [found.solvers[i] for i in found.solver] == ["Tsit5", lane_batch.IMPLICIT]
+    assert [found.solvers[i] for i in found.solver] == ["Tsit5", lane_batch.IMPLICIT_SOLVER]
     assert list(found.outcome) == [Outcome.STEPPED, Outcome.STEPPED]
     _, explicit = told(vectors, starts, options, engine="lanes")
     assert list(explicit) == [Outcome.STEPPED, Outcome.SOLVER_GAVE_UP]
@@ -368,7 +368,8 @@ def test_a_stiff_wheel_whose_phase_lasts_longer_than_expected_goes_to_an_implici
     starts = np.tile([0.1, 1.6, -0.1], (2, 1))
     options = vrw.Options(rtol=1e-6, atol=1e-6, max_solver_steps=1000)
     found = vrw.steps(truth.wheels(vectors), starts, options=options)
-    assert [found.solvers[i] for i in found.solver] == [lane_batch.IMPLICIT, lane_batch.STABLE]
+    told = [found.solvers[i] for i in found.solver]
+    assert told == [lane_batch.IMPLICIT_SOLVER, lane_batch.STABLE_SOLVER]
     assert list(found.outcome) == [Outcome.FELL_BACK, Outcome.FELL_BACK]
     _, code = told(vectors[1:], starts[1:], options)
     assert code[0] == Outcome.FELL_BACK

@@ -21,25 +21,28 @@ from vrw_jax import simd
 from vrw_jax.batches.fixed_work import fixed_gait_step
 from vrw_jax.batches.ground import as_full_states, walk_lanes
 from vrw_jax.batches.paper import gait_step
-from vrw_jax.models import AbstractWheel, UnilateralWheel, ViscoelasticWheel
+from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import Options, explicit_tableau, real_stability_limit
 from vrw_jax.runtime import lane_program
+from vrw_jax.walks import rung_of
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, wheel_of
 
 BLOCK = 32_768
 """Lanes that march side by side where XLA compiles them, as on a GPU."""
 MAPPED = 256
 """Lanes that the diffrax engine takes at a time."""
-STABLE, TIGHTER = "Tsit5", 4.0
+NAMED, STABLE, IMPLICIT = range(3)
+"""Solvers that take a lane: that of the options, and two for stiff wheels."""
+STABLE_SOLVER, TIGHTER = "Tsit5", 4.0
 """Explicit solver of wheels whose steps stability limits, and how much tighter it is set.
 
 Of diffrax's of order 5 and more it goes farthest for an evaluation there: 0.58 over the mode's
 rate, Dopri8 0.40. So much tighter it costs little more, and from a tolerance of 1e-6 down its error
 is no larger than Dopri8's at the named one."""
-IMPLICIT = "Kvaerno5"
+IMPLICIT_SOLVER = "Kvaerno5"
 """Solver of wheels that are too stiff for explicit ones."""
 WORTH = 6e4
-"""Evaluations by an explicit solver that cost what IMPLICIT does at a tolerance of 1e-6
+"""Evaluations by an explicit solver that cost what IMPLICIT_SOLVER does at a tolerance of 1e-6
 (docs/stability_atlas.md). Its own cost goes with the tolerance's power of -0.17, from 1e-4 to
 1e-10; at the limit of stability theirs does not."""
 FEW = 8
@@ -78,9 +81,9 @@ def steps(
     takes the first wherever it can, whatever the number of lanes, and `Steps.engine` says which it
     was. Both keep the errors of `options`, which count for each local step; between them lie some
     ten times the tolerance. "auto" also takes another solver than the named one where the airborne
-    leg is so stiff that another is cheaper, and `Steps.solver` says which: STABLE where stability
+    leg is so stiff that another is cheaper, and `Steps.solver` says which: Tsit5 where stability
     limits the steps (c/m from 1,900 1/s up at the default options, from 300 at a tolerance of
-    1e-6), IMPLICIT by "diffrax" where explicit ones take too many (from 4e5, from 1.4e5) or STABLE
+    1e-6), Kvaerno5 by "diffrax" where explicit ones take too many (from 4e5, from 1.4e5) or Tsit5
     gave up.
 
     "collocation" is faster still near a known gait: `durations`, shape (lanes, 3), s, are those of
@@ -94,16 +97,25 @@ def steps(
 
     Not for use inside `jax.jit`: it compiles itself, once.
     """
-    model = ViscoelasticWheel() if model is None else model
-    options = Options() if options is None else options
+    rung, options = rung_of(model), Options() if options is None else options
     states = np.asarray(states)
+    wheels = _wheels(params, states, rung, n_steps, options)
+    states = states.astype(wheels.dtype)
+    by_legs = rung.rung == "unilateral"
+    given = rung, wheels, states, n_steps, options, engine, params.n_legs
+    return _on_ground(*given) if by_legs else _by_phases(*given, durations)
+
+
+def _wheels(
+    params: WheelParams, states: np.ndarray, model: AbstractWheel, n_steps: int, options: Options
+) -> np.ndarray:
+    """Parameters of each lane, (parameters, lanes); one clear sentence for what can't be walked."""
     if isinstance(params.damping, jax.core.Tracer):
         raise TypeError(
             "the parameters are traced, but vrw.steps compiles itself and has no derivatives: call "
             "it outside of jit, vmap and grad, or map vrw.return_map over the lanes."
         )
-    ground = isinstance(model, UnilateralWheel)
-    sizes = (3, model.section_size(params)) if ground else (3,)
+    sizes = sorted({3, model.section_size(params)})
     if states.ndim != 2 or states.shape[1] not in sizes:
         raise ValueError(
             f"states have shape {states.shape}, but they are section states, shape (lanes, "
@@ -117,54 +129,59 @@ def steps(
     wheels = np.empty((len(columns), len(states)), dtype)
     for row, column in zip(wheels, columns, strict=True):
         row[:] = np.asarray(column)
-    if isinstance(model, UnilateralWheel):
-        return _on_ground(
-            model, wheels, states.astype(dtype), n_steps, options, engine, params.n_legs
-        )
-    walked = _Walked.start(states.astype(dtype))
-    run = _chosen(engine, model, options, params.n_legs)
-    runs, solver = [run], np.zeros(len(states), np.int32)
+    return wheels
+
+
+def _by_phases(
+    model: Any,
+    wheels: np.ndarray,
+    states: np.ndarray,
+    n_steps: int,
+    options: Options,
+    engine: str,
+    n_legs: int,
+    durations: Any,
+) -> Steps:
+    """Of rungs that step through the paper's phases."""
+    walked = _Walked.start(states)
+    runs = {NAMED: _chosen(engine, model, options, n_legs)}
+    solver = np.full(len(states), NAMED, np.int32)
     solvers: tuple[str, ...] = (options.solver,)
-    if engine == "auto" and run.name == "lanes":
-        solvers, solver = (options.solver, STABLE, IMPLICIT), _cheapest(wheels, options)
-    if np.any(solver > 0):
+    name = runs[NAMED].name
+    if engine == "auto" and name == "lanes":
+        solvers, solver = (
+            (options.solver, STABLE_SOLVER, IMPLICIT_SOLVER),
+            _cheapest(wheels, options),
+        )
+    if np.any(solver != NAMED):
         by = lambda solver: dataclasses.replace(options, solver=solver)
-        stable = by(STABLE).tightened(TIGHTER)
-        runs.append(_chosen("lanes", model, stable, params.n_legs))
-        runs.append(_chosen("diffrax", model, by(IMPLICIT), params.n_legs))
+        stable = by(STABLE_SOLVER).tightened(TIGHTER)
+        runs[STABLE] = _chosen("lanes", model, stable, n_legs)
+        runs[IMPLICIT] = _chosen("diffrax", model, by(IMPLICIT_SOLVER), n_legs)
     if engine == "collocation":
-        walked.durations[:] = _expected(durations, states, dtype)
+        name = engine
+        walked.durations[:] = _expected(durations, states, wheels.dtype)
     for _ in range(n_steps):
         open_ = np.flatnonzero(walked.outcome == Outcome.STEPPED)
         fixed = np.zeros(len(open_), bool)
         if engine == "collocation":
             given = wheels[:, open_], walked.section_state[open_], walked.durations[open_]
-            fixed, told = _by_collocation(model, params.n_legs, *given)
+            fixed, told = _by_collocation(model, n_legs, *given)
             walked.take(open_[fixed], tuple(part[fixed] for part in told), fixed=True)
         open_ = open_[~fixed]
-        for index, solve in enumerate(runs):
-            lanes = open_[solver[open_] == index]
+        for which, solve in runs.items():
+            lanes = open_[solver[open_] == which]
             if len(lanes) > 0:
                 told = solve(wheels[:, lanes], walked.section_state[lanes])
                 # A phase may last longer than `_cheapest` expects: IMPLICIT comes next.
-                lost = (index == 1) & (told[2] == Outcome.SOLVER_GAVE_UP)
-                solver[lanes[lost]] = 2
+                lost = (which == STABLE) & (told[2] == Outcome.SOLVER_GAVE_UP)
+                solver[lanes[lost]] = IMPLICIT
                 walked.take(lanes[~lost], tuple(part[~lost] for part in told), fixed=False)
-    return Steps(
-        jnp.asarray(walked.section_state),
-        jnp.asarray(walked.durations),
-        jnp.asarray(walked.outcome),
-        jnp.asarray(walked.n_stepped),
-        jnp.asarray(walked.solver_steps),
-        jnp.asarray(walked.fixed),
-        jnp.asarray(solver),
-        engine="collocation" if engine == "collocation" else run.name,
-        solvers=solvers,
-    )
+    return walked.told(solver, name, solvers)
 
 
 def _on_ground(
-    model: UnilateralWheel,
+    model: Any,
     wheels: np.ndarray,
     states: np.ndarray,
     n_steps: int,
@@ -211,6 +228,13 @@ class _Walked:
     def start(cls, states: np.ndarray) -> "_Walked":
         return cls(states.copy(), len(states))
 
+    def told(self, solver: np.ndarray, engine: str, solvers: tuple[str, ...]) -> Steps:
+        states, outcome = jnp.asarray(self.section_state), jnp.asarray(self.outcome)
+        counts = jnp.asarray(self.n_stepped), jnp.asarray(self.solver_steps)
+        fixed, which = jnp.asarray(self.fixed), jnp.asarray(solver)
+        durations = jnp.asarray(self.durations)
+        return Steps(states, durations, outcome, *counts, fixed, which, engine, solvers)
+
     def take(self, lanes: np.ndarray, told: tuple[np.ndarray, ...], fixed: bool) -> None:
         state, durations, outcome, tried = told
         self.section_state[lanes], self.durations[lanes] = state, durations
@@ -230,12 +254,12 @@ class _Engine(eqx.Module):
         return self.call(wheels, states)
 
 
-def _chosen(engine: str, model: AbstractWheel, options: Options, n_legs: int) -> _Engine:
+def _chosen(engine: str, model: Any, options: Options, n_legs: int) -> _Engine:
     if engine not in ("auto", "lanes", "diffrax", "collocation"):
         raise ValueError(
             f"engine is {engine!r}, but it is 'auto', 'lanes', 'diffrax' or 'collocation'."
         )
-    fits = isinstance(model, ViscoelasticWheel) and (explicit_tableau(options.solver) is not None)
+    fits = model.rung == "viscoelastic" and explicit_tableau(options.solver) is not None
     if engine in ("lanes", "collocation") and not fits:
         raise ValueError(
             f"the lane engine can't run {type(model).__name__} with {options.solver}: it knows "
@@ -243,13 +267,12 @@ def _chosen(engine: str, model: AbstractWheel, options: Options, n_legs: int) ->
         )
     if engine == "diffrax" or not fits:
         return _Engine("diffrax", functools.partial(_by_diffrax, model, options, n_legs))
-    assert isinstance(model, ViscoelasticWheel)
     by_lanes = functools.partial(_by_lanes, model.stop_at_lift_off, options, n_legs)
     return _Engine("lanes", by_lanes)
 
 
 def _cheapest(wheels: np.ndarray, options: Options) -> np.ndarray:
-    """Which solver takes each lane at the least cost: 0 that of `options`, 1 STABLE, 2 IMPLICIT.
+    """Which solver takes each lane at the least cost: NAMED, STABLE or IMPLICIT.
 
     The airborne leg's fast mode decays at 1.03 c/m for some 0.67 sqrt(L0 / g), s, where legs are
     light, and a step times that rate must stay below an explicit solver's limit of stability;
@@ -271,7 +294,7 @@ def _cheapest(wheels: np.ndarray, options: Options) -> np.ndarray:
             return steps, np.where(steps > options.max_solver_steps, np.inf, steps * stages)
 
         _, named = evaluations(options.solver)
-        steps, stable = evaluations(STABLE)
+        steps, stable = evaluations(STABLE_SOLVER)
         limited = steps > (tolerance / TIGHTER) ** -0.2
         implicit = np.full_like(decays, WORTH * (1e-6 / tolerance) ** 0.17)
         costs = named, np.where(limited, stable, np.inf), implicit
@@ -322,14 +345,13 @@ def _by_lanes(
 
 
 def _by_collocation(
-    model: AbstractWheel,
+    model: Any,
     n_legs: int,
     wheels: np.ndarray,
     states: np.ndarray,
     durations: np.ndarray,
 ) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
     """Which lanes can be trusted, and their states, durations, outcomes and solver steps."""
-    assert isinstance(model, ViscoelasticWheel)  # `_chosen` looked
     stop_at_lift_off, n = model.stop_at_lift_off, len(PARAMETER_NAMES)
 
     def step(uniform: Any, lanes: Any, few: Array | None = None) -> tuple:

@@ -7,7 +7,6 @@ so that it is as exact as the gaits are.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -19,19 +18,11 @@ import numpy as np
 from jaxtyping import Array
 
 from vrw_jax.branches.branch import Branch
-from vrw_jax.branches.followed import (
-    AbstractFollowedWheel,
-    CycleFollowed,
-    RungFollowed,
-    Wheel,
-    gait_measures,
-    moved,
-    on_mesh,
-    with_parameter,
-)
-from vrw_jax.branches.run import IN_SEQUENCE, MakeCycle, Read, Run, Strand, Table, run_all
-from vrw_jax.cycles import CycleOptions, LimitCycle, Problem, WalkedCycle, limit_cycle
-from vrw_jax.models import AbstractWheel, UnilateralWheel, ViscoelasticWheel, refuse_ladder
+from vrw_jax.branches.followed import AbstractFollowedWheel, Wheel, gait_measures
+from vrw_jax.branches.run import IN_SEQUENCE, Read, Run, Strand, Table, run_all
+from vrw_jax.branches.starts import STARTS, Wanted, start_by_walking
+from vrw_jax.cycles import AGREEMENT, CycleOptions, LimitCycle, WalkedCycle
+from vrw_jax.models import AbstractWheel, refuse_ladder
 from vrw_jax.numerics import (
     ArclengthOptions,
     MapFollowed,
@@ -42,14 +33,8 @@ from vrw_jax.numerics import (
 )
 from vrw_jax.results import CYCLE, GROUND, MARGINS, STEP, attrs_of, provenance
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.walks import Walk, walk
-from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, WheelParams
-
-CLOSED = 1e-7
-"""Most by which the event-driven step may miss a cycle's section state: rad, rad/s, m/s."""
-
-N_WALKED = 60
-"""Steps towards a start, for rungs whose limit cycles are not solved for."""
+from vrw_jax.walks import rung_of
+from vrw_jax.wheel import FRICTION, Outcome, WheelParams
 
 INDICATORS = ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
 ENDING = (*INDICATORS, "duration_dls", "duration_sls1", "duration_sls2")
@@ -70,7 +55,7 @@ def _read_gaits(
 ) -> dict[str, Array]:
     def one(wheel: Wheel, z: Any, p: Array) -> dict[str, Array]:
         x, beyond = followed.read(wheel, z, p)
-        rung, params = moved(model, wheel.params, followed.name, p)
+        rung, params = model.moved(wheel.params, followed.name, p)
         measures = gait_measures(rung, params, x, options, followed.n_steps)
         return measures | beyond | {"section_state": x}
 
@@ -110,7 +95,7 @@ def continue_branch(
 
     Other rungs' gaits are fixed points of their own return map, as exact as `step_options`. On real
     ground `name` may be "friction" too, and the start is a `WalkedCycle` or, without one, where a
-    walk of N_WALKED steps ends; a branch goes on where the order of events changes, with a kink.
+    walk of some steps ends; a branch goes on where the order of events changes, with a kink.
     """
     if params.damping.ndim != 0:
         raise ValueError(
@@ -142,10 +127,9 @@ def continue_branches(
 
     A wheel without a limit cycle to start from gets a branch without points, whose outcome says so.
     """
-    model = ViscoelasticWheel() if model is None else model
+    model = rung_of(model)
     refuse_ladder(model, "followed")
-    on_ground = isinstance(model, UnilateralWheel)
-    names = (*PARAMETER_NAMES, FRICTION) if on_ground else PARAMETER_NAMES
+    names = model.parameter_names
     if name not in names:
         raise ValueError(f"{name!r} is no parameter: choose from {', '.join(names)}.")
     low, high = (float(b) for b in bounds)
@@ -160,86 +144,35 @@ def continue_branches(
     given = jnp.broadcast_to(getattr(model if name == FRICTION else params, name), batch)
     p = jnp.clip(given, low, high)
     if name != FRICTION:
-        params = with_parameter(params, name, p)
-
-    make_cycle: MakeCycle
-    if isinstance(model, ViscoelasticWheel):
-        cycle_options = CycleOptions.tight() if cycle_options is None else cycle_options
-        # The start needs neither the mesh nor the accuracy of the branch.
-        start = cycle
-        if start is None:
-            start = jax.vmap(functools.partial(limit_cycle, period_n=period_n))(params)
-        if not isinstance(start, LimitCycle):
-            raise TypeError(
-                f"cycle is a {type(start).__name__}, but the paper's branch starts from a "
-                "LimitCycle: give vrw.limit_cycle(params)."
-            )
-        outcomes = np.asarray(start.outcome)
-        problem = Problem(params.n_legs, period_n, cycle_options)
-        followed: AbstractFollowedWheel = CycleFollowed(problem=problem, name=name)
-        z: Any = jax.vmap(functools.partial(on_mesh, problem))(start)
-        wheels = Wheel(params, start.located.happens)
-
-        def make_cycle(owner: int, point: PathPoint) -> Callable[[], LimitCycle]:
-            def find() -> LimitCycle:
-                guess = jax.tree.map(lambda x: x[owner], start)
-                located = guess.located._replace(solution=jax.tree.map(jnp.asarray, point.z))
-                guess = dataclasses.replace(guess, located=located, problem=problem)
-                wheel = jax.tree.map(lambda x: x[owner], params)
-                wheel = with_parameter(wheel, name, jnp.asarray(point.p))
-                return limit_cycle(wheel, guess=guess, period_n=period_n, options=cycle_options)
-
-            return find
-    else:
-        followed = RungFollowed(
-            model=model,
-            options=step_options,
-            name=name,
-            period_n=period_n,
-            numbers=model.section_numbers(params),
-        )
-        if cycle is None:
-            walked = jax.vmap(functools.partial(_walked, model, step_options, name))(params, p)
-            outcomes, z = np.asarray(walked.outcome), walked.steps.section_state[:, -1]
-        else:
-            outcomes, z = np.asarray(cycle.outcome), cycle.section_state
-        wheels = Wheel(params, jnp.ones((*batch, 1, 1), p.dtype))
-        make_cycle = lambda owner, point: None
+        _, params = model.moved(params, name, p)
+    wanted = Wanted(params, model, name, p, period_n, cycle_options, step_options)
+    start = STARTS.get(model.rung, start_by_walking)(wanted, cycle)
 
     def read(wheels: Any, points: PathPoint) -> Table:
-        return jax.tree.map(np.asarray, _read_gaits(followed, model, step_options, wheels, points))
+        found = _read_gaits(start.followed, model, step_options, wheels, points)
+        return jax.tree.map(np.asarray, found)
 
     def kept(table: Table) -> np.ndarray:
-        return (table["outcome"] == Outcome.STEPPED) & (table["closure"] < CLOSED)
+        return (table["outcome"] == Outcome.STEPPED) & (table["closure"] <= AGREEMENT)
 
-    legs = range(3, params.n_legs + 1)
     run = Run(
-        followed,
+        start.followed,
         options,
-        wheels,
+        start.wheels,
         np.array([low, high]),
-        functools.partial(_by_leg, read, legs),
+        functools.partial(_by_leg, read, range(3, params.n_legs + 1)),
         kept,
         _is_margin,
         ENDING,
         EXACT,
         _name_of_loss,
     )
-    found = outcomes == Outcome.STEPPED
-    strands = run_all(run, z, p, found, make_cycle)
+    strands = run_all(run, start.z, p, start.outcomes == Outcome.STEPPED, start.make_cycle)
     one = lambda owner: jax.tree.map(lambda x: x[owner], params)
     return tuple(
-        _branch_of_gaits(strand, one(owner), name, model, step_options, int(outcomes[owner]))
+        _branch_of_gaits(strand, one(owner), name, model, step_options, int(start.outcomes[owner]))
         for owner, strand in enumerate(strands)
     )
-
-
-def _walked(
-    model: AbstractWheel, options: Options, name: str, params: WheelParams, p: Array
-) -> Walk:
-    """Towards a gait from the rung's own start."""
-    model, params = moved(model, params, name, p)
-    return walk(params, model.start(params), N_WALKED, model=model, options=options)
 
 
 def _by_leg(read: Read, legs: range, wheels: Any, points: PathPoint) -> Table:
@@ -315,7 +248,7 @@ def _stability(jacobians: np.ndarray) -> dict[str, xr.Variable]:
             )
         },
         "spectral_radius": xr.Variable("point", radius, CYCLE["spectral_radius"].attrs),
-        "stability_margin": xr.Variable("point", 1.0 - radius, CYCLE["stability_margin"].attrs),
+        "spectral_margin": xr.Variable("point", 1.0 - radius, CYCLE["spectral_margin"].attrs),
     }
 
 

@@ -7,7 +7,7 @@ and differentiated forwards.
 
 import abc
 import functools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,32 +15,32 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from vrw_jax.cycles import LimitCycle, Located, Problem, correction_size, nothing_known
+from vrw_jax.cycles import (
+    LimitCycle,
+    Located,
+    Problem,
+    correction_size,
+    nothing_known,
+    takeoff_acceleration,
+)
 from vrw_jax.models import AbstractWheel, RungState
 from vrw_jax.numerics import (
     N_NODES,
     AbstractFollowed,
-    Elementwise,
     Linear,
     Options,
-    Passage,
     Scalar,
     Section,
     Solution,
     Unknown,
     one_wheel,
-    walk_through,
 )
 from vrw_jax.results import MARGINS
 from vrw_jax.wheel import (
-    FRICTION,
     PARAMETER_NAMES,
-    Motion,
     Outcome,
     WheelParams,
-    dynamics,
     parameters_of,
-    rear_foot_height,
     wheel_of,
 )
 
@@ -81,7 +81,7 @@ class CycleFollowed(AbstractFollowedWheel):
         return self.problem.period_n
 
     def _moved(self, wheel: Wheel, p: Scalar) -> Array:
-        return parameters_of(with_parameter(wheel.params, self.name, p))
+        return parameters_of(eqx.tree_at(lambda w: getattr(w, self.name), wheel.params, p))
 
     def linearise(self, wheel: Wheel, z: Unknown, p: Scalar) -> Linear:
         index = PARAMETER_NAMES.index(self.name)
@@ -104,20 +104,9 @@ class CycleFollowed(AbstractFollowedWheel):
         """
         parameters = self._moved(wheel, p)
         s = wheel_of(parameters, self.problem.n_legs).symbols()
-        constants = self.problem.constants_of(*parameters)
-        section = tuple(z.section)
-        takeoffs = []
-        for k in range(self.problem.period_n):
-            durations, accelerations = jax.tree.map(
-                lambda x, k=k: x[k], (z.durations, z.accelerations)
-            )
-            section, passages = walk_through(
-                self.problem.sequence, self.problem.meshes, constants, section, durations,
-                accelerations,
-            )  # fmt: skip
-            takeoffs.append(_takeoff_acceleration(s, passages[1]))
-        end = passages[-1].end
-        shortest = jnp.min(z.durations, 0)
+        _, steps = self.problem.passages(parameters, z)
+        takeoffs = [takeoff_acceleration(s, sls1) for _, sls1, _ in steps]
+        end, shortest = steps[-1][-1].end, jnp.min(z.durations, 0)
         formal = {
             "duration_dls": jnp.where(wheel.happens[0, 0] > 0.5, shortest[0], jnp.nan),
             "duration_sls1": shortest[1],
@@ -159,16 +148,6 @@ def on_mesh(problem: Problem, cycle: LimitCycle) -> Solution:
     return Solution(found.section, found.durations, tuple(accelerations))
 
 
-def _takeoff_acceleration(s: Any, sls1: Passage) -> Scalar:
-    q, v = jnp.stack(sls1.start.q), jnp.stack(sls1.start.v)
-    a = jnp.stack(dynamics.single_support_1_acceleration(s, Motion.of(*q, *v)))
-
-    def height(time: Array) -> Array:
-        return rear_foot_height(s, Motion.of(*(q + time * (v + 0.5 * time * a)), *v))
-
-    return jax.jacfwd(jax.jacfwd(height))(jnp.zeros_like(q[0]))
-
-
 class RungFollowed(AbstractFollowedWheel):
     """Fixed points of `period_n` steps of any rung; z is the section state.
 
@@ -187,7 +166,7 @@ class RungFollowed(AbstractFollowedWheel):
         return self.period_n
 
     def _image(self, wheel: Wheel, z: Array, p: Scalar) -> Array:
-        model, params = moved(self.model, wheel.params, self.name, p)
+        model, params = self.model.moved(wheel.params, self.name, p)
         for _ in range(self.period_n):
             advance = model.advance(params, z, self.options)
             z = jnp.where(advance.outcome == Outcome.STEPPED, advance.section_state, jnp.nan)
@@ -224,20 +203,6 @@ class RungFollowed(AbstractFollowedWheel):
     def read(self, wheel: Wheel, z: Unknown, p: Scalar) -> tuple[RungState, dict[str, Array]]:
         """The section state; a step's own measures hold all there is."""
         return z, {}
-
-
-def with_parameter(params: WheelParams, name: str, value: Elementwise) -> WheelParams:
-    """The same wheel with another value of one parameter; works on tracers."""
-    return eqx.tree_at(lambda wheel: getattr(wheel, name), params, value)
-
-
-def moved(
-    model: AbstractWheel, params: WheelParams, name: str, value: Elementwise
-) -> tuple[AbstractWheel, WheelParams]:
-    """Model and wheel with another value of one parameter of either; works on tracers."""
-    if name == FRICTION:
-        return eqx.tree_at(lambda ground: ground.friction, model, value), params
-    return model, with_parameter(params, name, value)
 
 
 def gait_measures(

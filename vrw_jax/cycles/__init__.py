@@ -1,9 +1,23 @@
 """Gaits that repeat: found, checked and differentiated, each rung by its own means."""
 
-from vrw_jax.cycles.cycle import LimitCycle, _limit_cycle, limit_cycle
-from vrw_jax.cycles.ground import MOVED, cycle_of, ground_gait, told, values_of
+from vrw_jax.cycles.by_collocation import CollocationFinder
+from vrw_jax.cycles.collocated import LimitCycle
+from vrw_jax.cycles.cycle import MEASURED, ON_STABILITY, AbstractCycle
+from vrw_jax.cycles.finder import (
+    AGREEMENT,
+    AbstractGaitFinder,
+    Gait,
+    Measured,
+    OnBranch,
+    Readings,
+    confirmed,
+    read_along,
+    read_along_lanes,
+    same_branch,
+)
+from vrw_jax.cycles.finding import Guess, finder_of, limit_cycle
 from vrw_jax.cycles.options import CycleOptions
-from vrw_jax.cycles.premises import TAKE_OFF, default_margins, measure, takeoff_acceleration
-from vrw_jax.cycles.search import Located, Problem, correction_size, nothing_known, surface_start
+from vrw_jax.cycles.premises import PREMISES, default_margins, takeoff_acceleration
+from vrw_jax.cycles.search import Located, Problem, correction_size, nothing_known
 from vrw_jax.cycles.section_cycle import WalkedCycle
 from vrw_jax.cycles.sensitivity import sensitivities

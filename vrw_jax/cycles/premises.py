@@ -12,38 +12,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from vrw_jax.cycles.cycle import LimitCycle
-from vrw_jax.numerics import walk_through
-from vrw_jax.results import MEASURES, Measure
-from vrw_jax.wheel import Motion, WheelParams, dynamics, rear_foot_height, wheel_of
-
-TAKE_OFF = Measure(
-    "takeoff_acceleration",
-    "m/s^2",
-    "z̈2⁺",
-    "normal acceleration of foot 2 at take-off",
-    "Just after the rear foot is let go, at rest on the ground; negative where it scuffs at once.",
-)
+from vrw_jax.numerics import Passage, Scalar
+from vrw_jax.results import MEASURES
+from vrw_jax.wheel import Motion, Symbols, WheelParams, dynamics, rear_foot_height
 
 
-def takeoff_acceleration(cycle: LimitCycle) -> Array:
-    """Normal acceleration of foot 2 at the start of SLS-I of the first step, m/s^2.
+def takeoff_acceleration(s: Symbols, sls1: Passage) -> Scalar:
+    """Normal acceleration of foot 2 at the start of SLS-I, m/s^2, for one wheel.
 
     The foot is at rest on the ground there, so its sign says whether it rises or scuffs; the jump
     from zero is the tangential force that the ground no longer gives.
     """
-    problem, solution = cycle.problem, cycle.located.solution
-    s = wheel_of(cycle.parameters, problem.n_legs).symbols()
-    _, passages = walk_through(
-        problem.sequence,
-        problem.meshes,
-        problem.constants_of(*cycle.parameters),
-        tuple(solution.section),
-        solution.durations[0],
-        tuple(accelerations[0] for accelerations in solution.accelerations),
-    )
-    start = passages[1].start
-    q, v = jnp.stack(start.q), jnp.stack(start.v)
+    q, v = jnp.stack(sls1.start.q), jnp.stack(sls1.start.v)
     a = jnp.stack(dynamics.single_support_1_acceleration(s, Motion.of(*q, *v)))
 
     def height(time: Array) -> Array:
@@ -85,9 +65,4 @@ def default_margins(params: WheelParams) -> Mapping[str, float]:
         "N s": mass * (gravity * length) ** 0.5,
         "1": 1.0,
     }
-    return {name: SHARE * natural[measure(name).unit] for name in PREMISES}
-
-
-def measure(name: str) -> Measure:
-    """Unit, symbol and long name of anything that a constraint may name."""
-    return TAKE_OFF if name == TAKE_OFF.name else MEASURES[name]
+    return {name: SHARE * natural[MEASURES[name].unit] for name in PREMISES}

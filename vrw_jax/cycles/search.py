@@ -23,8 +23,10 @@ from vrw_jax.numerics import (
     LaneArray,
     Linearised,
     Mesh,
+    Passage,
     PhaseSequence,
     Solution,
+    Vector,
     from_blocks,
     fusion_barrier,
     linearised_pass,
@@ -71,6 +73,22 @@ class Problem(NamedTuple):
             located.happens > 0.5,
             wanted,
         )
+
+    def passages(
+        self, parameters: Array, solution: Solution
+    ) -> tuple[Vector, list[tuple[Passage, ...]]]:
+        """Section after the last step, and the passages of each, of one wheel or of lanes."""
+        constants, section = self.constants_of(*parameters), tuple(solution.section)
+        told = []
+        for k in range(self.period_n):
+            durations, accelerations = jax.tree.map(
+                lambda x, k=k: x[k], (solution.durations, solution.accelerations)
+            )
+            section, passages = walk_through(
+                self.sequence, self.meshes, constants, section, durations, accelerations
+            )
+            told.append(passages)
+        return section, told
 
 
 class Located(NamedTuple):

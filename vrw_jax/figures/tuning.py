@@ -6,7 +6,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from vrw_jax.cycles import measure
 from vrw_jax.figures.style import (
     BLUE,
     GREY,
@@ -101,7 +100,7 @@ def _slack(axes: Axes, tuned: Tuned) -> None:
     texts = []
     for name in names:
         plain, _, leg = name.partition("[")
-        texts.append(typeset(measure(plain).long_name) + (f", {leg[:-1]}" if leg else ""))
+        texts.append(typeset(MEASURES[plain].long_name) + (f", {leg[:-1]}" if leg else ""))
     axes.set_yticks(places, texts, fontsize=7.0)
     for tick, name in zip(axes.get_yticklabels(), names, strict=True):
         if name in held:

@@ -2,6 +2,7 @@
 
 from vrw_jax.models import viscoelastic
 from vrw_jax.models.base import (
+    AbstractStep,
     AbstractWheel,
     Advance,
     EnergyLoss,

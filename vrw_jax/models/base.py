@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from vrw_jax.numerics import Options, Scalar
+from vrw_jax.numerics import Elementwise, Options, Scalar
 from vrw_jax.results import MARGINS, STEP, Row, as_html, as_text, is_concrete
-from vrw_jax.wheel import LARGEST, Outcome, WheelParams
+from vrw_jax.wheel import FRICTION, LARGEST, PARAMETER_NAMES, Outcome, WheelParams, wheel_of
 
 SectionState = Float[Array, "3"]
 """(theta-, dtheta-, dL1-) just before touchdown, in the labels of the step that ends: rad, rad/s,
@@ -112,6 +112,10 @@ class AbstractStep(eqx.Module):
             "solver_steps": self.solver_steps,
         }
         return shared | self.own_measures()
+
+    def served(self) -> dict[str, Array]:
+        """Of a model that chooses: which rung took the step and why, by the names of `SERVED`."""
+        return {}
 
     @abc.abstractmethod
     def own_measures(self) -> dict[str, Array]:
@@ -220,6 +224,36 @@ class AbstractWheel(eqx.Module):
 
     `advance` and `step` compile themselves, once for each structure of their arguments.
     """
+
+    rung: eqx.AbstractClassVar[str]
+    """Name of the rung, by which the rooms above find what is its own."""
+    parameter_names: eqx.AbstractClassVar[tuple[str, ...]]
+    """What its motion depends on: the wheel's parameters, and where it feels it, friction."""
+    tells_contacts: eqx.AbstractClassVar[bool]
+    """Whether trajectories tell every leg's contact instead of the paper's phases."""
+
+    def values(self, params: WheelParams) -> Float[Array, " n_values"]:
+        """Numbers of `parameter_names`, of one wheel on this ground."""
+        held = [
+            getattr(self if name == FRICTION else params, name) for name in self.parameter_names
+        ]
+        return jnp.stack([jnp.asarray(value, params.damping.dtype) for value in held])
+
+    def at(self, values: Array, n_legs: int) -> tuple["AbstractWheel", WheelParams]:
+        """Rung and wheel of other numbers: the inverse of `values`; works on tracers."""
+        n = len(PARAMETER_NAMES)
+        model = self
+        if FRICTION in self.parameter_names:
+            model = eqx.tree_at(lambda ground: ground.friction, self, values[n])
+        return model, wheel_of(values[:n], n_legs)
+
+    def moved(
+        self, params: WheelParams, name: str, value: Elementwise
+    ) -> tuple["AbstractWheel", WheelParams]:
+        """Rung and wheel with another value of one of `parameter_names`; works on tracers."""
+        if name == FRICTION:
+            return eqx.tree_at(lambda ground: ground.friction, self, value), params
+        return self, eqx.tree_at(lambda wheel: getattr(wheel, name), params, value)
 
     @abc.abstractmethod
     def advance(self, params: WheelParams, x: SectionState, options: Options) -> Advance:

@@ -6,6 +6,8 @@ wheel serves does no work on the upper rung. The rigid wheel never serves: its p
 not yield, fails for every finite stiffness.
 """
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -23,7 +25,7 @@ from vrw_jax.models.unilateral.wheel import UnilateralStep, UnilateralTrajectory
 from vrw_jax.models.viscoelastic import PAPER_START, ViscoelasticWheel
 from vrw_jax.numerics import Options, Scalar, as_float_array
 from vrw_jax.results import MARGINS
-from vrw_jax.wheel import Outcome, WheelParams
+from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, WheelParams
 
 VISCOELASTIC, UNILATERAL = 1, 2
 """Numbers of the rungs; 0 is the rigid one."""
@@ -115,12 +117,19 @@ class LadderStep(AbstractGroundStep):
     outcome: Int[Array, ""]  # an Outcome
     solver_steps: Int[Array, ""]  # tried by the integrator, on both rungs
 
+    def served(self) -> dict[str, Array]:
+        return {"rung": self.choice.rung, "reason": self.choice.reason}
+
 
 class LadderWheel(AbstractWheel):
     """The paper's wheel where it serves, the wheel on real ground of this `friction` elsewhere.
 
     Section states are those of `UnilateralWheel`; the paper's three numbers may be given.
     """
+
+    rung: ClassVar[str] = "ladder"
+    parameter_names: ClassVar[tuple[str, ...]] = (*PARAMETER_NAMES, FRICTION)
+    tells_contacts: ClassVar[bool] = True
 
     friction: Scalar = eqx.field(converter=as_float_array, default=0.7)
 

@@ -1,5 +1,7 @@
 """The lowest rung: all legs rigid. A step is a closed formula; nothing is integrated."""
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -20,6 +22,7 @@ from vrw_jax.models.base import (
 )
 from vrw_jax.numerics import Options, Scalar
 from vrw_jax.wheel import (
+    PARAMETER_NAMES,
     Motion,
     Outcome,
     Symbols,
@@ -42,6 +45,10 @@ class RigidWheel(AbstractWheel):
     kept). True is the stiff limit of the paper's own landing (A4), whose rear foot is held during
     the impulse: the limit of `ViscoelasticWheel` as docs/physics.md derives it.
     """
+
+    rung: ClassVar[str] = "rigid"
+    parameter_names: ClassVar[tuple[str, ...]] = PARAMETER_NAMES
+    tells_contacts: ClassVar[bool] = False
 
     friction: float = eqx.field(static=True, default=1.0)
     stop_at_lift_off: bool = eqx.field(static=True, default=True)

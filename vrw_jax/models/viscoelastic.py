@@ -3,7 +3,7 @@
 import functools
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -37,6 +37,7 @@ from vrw_jax.numerics import (
     sample_phase,
 )
 from vrw_jax.wheel import (
+    PARAMETER_NAMES,
     Motion,
     Outcome,
     Symbols,
@@ -234,6 +235,10 @@ class ViscoelasticWheel(AbstractWheel):
     the monitors. `friction` is the coefficient of the ground that friction margins refer to; the
     motion does not use it.
     """
+
+    rung: ClassVar[str] = "viscoelastic"
+    parameter_names: ClassVar[tuple[str, ...]] = PARAMETER_NAMES
+    tells_contacts: ClassVar[bool] = False
 
     friction: float = eqx.field(static=True, default=1.0)
     stop_at_lift_off: bool = eqx.field(static=True, default=True)

@@ -187,8 +187,14 @@ ON_GROUND = tuple(
 CYCLE = _table(
     Measure("spectral_radius", "1", "ρ", "spectral radius",
             "Largest magnitude of a multiplier of the limit cycle; the gait is stable below 1."),
-    Measure("stability_margin", "1", "1 - ρ", "stability margin",
+    Measure("spectral_margin", "1", "1 - ρ", "spectral margin",
             "One less the spectral radius; negative when the gait is unstable."),
+    Measure("stability_margin", "1", "σ", "stability margin",
+            "Smooth least Jury margin: to fold, period doubling and a pair on the unit circle; "
+            "negative when the gait is unstable."),
+    Measure("takeoff_acceleration", "m/s^2", "z̈2⁺", "normal acceleration of foot 2 at take-off",
+            "Just after the rear foot is let go, at rest on the ground; negative where it scuffs "
+            "at once."),
 )
 """Measures of a limit cycle."""
 

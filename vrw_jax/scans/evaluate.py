@@ -12,15 +12,15 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from queue import SimpleQueue
 from threading import Lock
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Array
 
-from vrw_jax.batches import monitored as lane_step
-from vrw_jax.cycles import CycleOptions, LimitCycle, limit_cycle
-from vrw_jax.models import ViscoelasticWheel
+from vrw_jax.batches import monitored
+from vrw_jax.cycles import AbstractCycle, CycleOptions, confirmed, finder_of
+from vrw_jax.models import AbstractWheel, ViscoelasticWheel
 from vrw_jax.numerics import Options
 from vrw_jax.results import MARGINS
 from vrw_jax.runtime import compiled
@@ -29,34 +29,6 @@ from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, wheel_of
 
 LANES = 512
 """Wheels that one call of the compiled function takes."""
-
-AGREEMENT = 1e-8
-"""Largest distance, rad, rad/s and m/s, between a cycle's section state and where the event-driven
-step takes it: the two are independent computations."""
-
-
-CYCLE_MEASURES: dict[str, Callable[[LimitCycle], Array]] = {
-    "dls_fraction": lambda cycle: cycle.dls_fraction,
-    "period": lambda cycle: cycle.period,
-    "speed": lambda cycle: cycle.speed,
-    "step_length": lambda cycle: cycle.step_length,
-    "duration_dls": lambda cycle: cycle.durations[0],
-    "duration_sls1": lambda cycle: cycle.durations[1],
-    "duration_sls2": lambda cycle: cycle.durations[2],
-    "theta_post_impact": lambda cycle: cycle.post_impact[0],
-    "dtheta_post_impact": lambda cycle: cycle.post_impact[1],
-    "theta_touchdown": lambda cycle: cycle.section_state[0],
-    "dtheta_touchdown": lambda cycle: cycle.section_state[1],
-    "dL1_touchdown": lambda cycle: cycle.section_state[2],
-    "lambda_I4": lambda cycle: cycle.indicators.lambda_I4,
-    "lambda_2_plus": lambda cycle: cycle.indicators.lambda_2,
-    "lambda_4_plus": lambda cycle: cycle.indicators.lambda_4,
-    "spectral_radius": lambda cycle: cycle.spectral_radius,
-    "stability_margin": lambda cycle: cycle.stability_margin,
-}
-"""How a limit cycle tells the measures of `OF_CYCLE`, each only where it is asked for: tracing the
-derivative of one of the last two takes longer than all others together."""
-
 
 Told = tuple[Array, Array, dict[str, Array]]
 """Outcome, section state, and measures by name."""
@@ -79,18 +51,18 @@ class Engine:
         threads: int | None = None,  # at work side by side on a CPU; None: one for each core
     ) -> None:
         self._threads = n_cores() if threads is None else threads
-        self._base, self._options = base, options
+        self._base, self._model, self._options = base, model, options
         wanted = tuple(d for name in measures if (d := derivative(name)) is not None)
         plain = tuple(name for name in measures if derivative(name) is None)
         moved = tuple(dict.fromkeys(d.parameter for d in wanted))
         indices = np.asarray([PARAMETER_NAMES.index(name) for name in moved], int)
 
-        def gait(values: Array) -> tuple[LimitCycle, dict[str, Array]]:
-            def along(some: Array) -> tuple[dict[str, Array], LimitCycle]:
-                cycle = limit_cycle(
-                    wheel_of(values.at[indices].set(some), base.n_legs), options=cycle_options
-                )
-                return {d.measure: CYCLE_MEASURES[d.measure](cycle) for d in wanted}, cycle
+        finder = finder_of(model, base.n_legs, cycle_options=cycle_options, step_options=options)
+
+        def gait(values: Array) -> tuple[AbstractCycle, dict[str, Array]]:
+            def along(some: Array) -> tuple[dict[str, Array], AbstractCycle]:
+                cycle = finder.cycle_of(values.at[indices].set(some))
+                return cycle.measures(d.measure for d in wanted), cycle
 
             if not wanted:
                 return along(values[indices])[1], {}
@@ -100,11 +72,10 @@ class Engine:
         def told_by_cycle(values: Array) -> Told:
             cycle, derivatives = gait(values)
             names = (*(name for name in plain if name in OF_CYCLE), "spectral_radius")
-            kept = {name: CYCLE_MEASURES[name](cycle) for name in names}
-            return cycle.outcome, cycle.section_state, kept | derivatives
+            return cycle.outcome, cycle.section_state, cycle.measures(names) | derivatives
 
         def told_by_step(values: Array, state: Array, options: Options) -> Told:
-            take = lane_step.step if lane_step.can_run(model, options) else type(model).step
+            take = monitored.step if monitored.can_run(model, options) else type(model).step
             result = take(model, wheel_of(values, base.n_legs), state, options)
             measures = result.measures()
             names = (*(name for name in plain if name not in OF_CYCLE), *MARGINS)
@@ -136,28 +107,18 @@ class Engine:
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
     def _batch(self, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        filled = np.empty((LANES, len(PARAMETER_NAMES)), self._dtype)
-        for i, name in enumerate(PARAMETER_NAMES):
-            column = columns.get(name)
-            if column is None:
-                filled[:, i] = float(getattr(self._base, name))
-            else:
-                filled[:, i] = column[0]  # fills up what is left
-                filled[: len(column), i] = column
+        filled = filled_up(numbers(columns, self._model, self._base), LANES)
         programs = self._free.get()
         try:
             values = jax.device_put(filled, programs.device)
             outcome, state, by_cycle = programs.cycle(values)
             options = jax.device_put(self._options, programs.device)
             walked, reached, by_step = programs.step(values, state, options)
-            checked = _checked_outcome(*map(np.asarray, (outcome, state, walked, reached)))
-            told = {name: np.array(value) for name, value in (by_cycle | by_step).items()}
+            checked = confirmed(outcome, state, walked, reached)
+            told = by_cycle | by_step
         finally:
             self._free.put(programs)
-        failed = checked != Outcome.STEPPED
-        for value in told.values():
-            value[failed] = np.nan if np.issubdtype(value.dtype, np.floating) else -1
-        return {"outcome": checked} | told
+        return masked(checked, told)
 
     def _compile(self) -> None:
         """Programs for each device, both kinds side by side; a CPU's serve all of its cores."""
@@ -201,11 +162,30 @@ def n_cores() -> int:
     return os.cpu_count() or 1
 
 
-def _checked_outcome(
-    outcome: np.ndarray, state: np.ndarray, walked: np.ndarray, reached: np.ndarray
+def numbers(
+    columns: Mapping[str, np.ndarray], model: AbstractWheel, base: WheelParams
 ) -> np.ndarray:
-    """The cycle's outcome, unless the event-driven step from it fails or ends elsewhere."""
-    agrees = np.max(np.abs(reached - state), axis=-1) <= AGREEMENT
-    step = np.where(agrees, Outcome.STEPPED, Outcome.NO_CYCLE_FOUND)
-    step = np.where(walked == Outcome.STEPPED, step, walked)
-    return np.where(outcome == Outcome.STEPPED, step, outcome).astype(np.int8)
+    """The rung's numbers of each sample, (samples, numbers): swept ones, and those of the base."""
+    n = len(next(iter(columns.values())))
+    own = np.asarray(model.values(base))
+    return np.stack(
+        [
+            np.asarray(columns.get(name, np.broadcast_to(value, n)), own.dtype)
+            for name, value in zip(model.parameter_names, own, strict=True)
+        ],
+        axis=-1,
+    )
+
+
+def filled_up(rows: np.ndarray, n: int) -> np.ndarray:
+    """`n` rows: the first stands in for those that are missing."""
+    return np.concatenate([rows, np.repeat(rows[:1], n - len(rows), 0)])
+
+
+def masked(outcome: np.ndarray, told: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Outcome and measures, these without numbers where there is no gait."""
+    measures = {name: np.array(value) for name, value in told.items()}
+    for value in measures.values():
+        absent = np.nan if np.issubdtype(value.dtype, np.floating) else -1
+        value[outcome != Outcome.STEPPED] = absent
+    return {"outcome": outcome.astype(np.int8)} | measures

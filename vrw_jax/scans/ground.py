@@ -8,13 +8,14 @@ pays for another.
 
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import jax
 import numpy as np
 from jaxtyping import Array
 
 from vrw_jax.batches import as_full_states, walk_lanes
-from vrw_jax.cycles import MOVED, CycleOptions, WalkedCycle, cycle_of, ground_gait, told
+from vrw_jax.cycles import CycleOptions, Readings, finder_of, read_along
 from vrw_jax.models import (
     PAPER_START,
     PREMISES,
@@ -27,18 +28,17 @@ from vrw_jax.models import (
 )
 from vrw_jax.numerics import Options, as_float_array
 from vrw_jax.runtime import compiled
-from vrw_jax.scans.evaluate import Engine, n_cores
+from vrw_jax.scans.evaluate import Engine, filled_up, masked, n_cores, numbers
 from vrw_jax.scans.offer import derivative
+from vrw_jax.walks import N_TOWARDS
 from vrw_jax.wheel import FRICTION, Outcome, WheelParams
 
 LANES = 8
 """Wheels that one call of the compiled function takes: they wait for the slowest. Each is twenty
 lanes and more in the Jacobians of Newton's method."""
 
-N_TOWARDS = 100
-"""Steps towards a gait, from the rung's start, before Newton's method."""
 SOLVER_TOWARDS, TOLERANCE_TOWARDS = "Tsit5", 1e-8
-"""Of these steps, whatever those of the gait itself."""
+"""Of the steps towards a gait, whatever those of the gait itself."""
 
 Columns = Mapping[str, np.ndarray]
 Told = dict[str, np.ndarray]
@@ -53,6 +53,7 @@ class GroundEngine:
         base: WheelParams,
         model: UnilateralWheel,
         options: Options,
+        _cycle_options: CycleOptions | None = None,  # gaits here are walked
         threads: int | None = None,
     ) -> None:
         self._base, self._model = base, model
@@ -62,38 +63,43 @@ class GroundEngine:
         wanted = tuple(d for name in measures if (d := derivative(name)) is not None)
         plain = (*(n for n in measures if derivative(n) is None), "spectral_radius")
 
+        finder = finder_of(model, base.n_legs, step_options=options)
+        names = model.parameter_names
+
         def one(values: Array, begin: Array) -> tuple[Array, dict[str, Array]]:
             slopes = {}
             if wanted:
-                gait = ground_gait(values, begin, base.n_legs, model, options)
-                cycle = gait.cycle
-                both = told(gait, tuple(d.measure for d in wanted))
+                gait = finder.find(values, begin)
+                cycle, step = gait.cycle, gait.step
+                _, both = read_along(Readings(finder.read, tuple(d.measure for d in wanted)), gait)
                 for d in wanted:
-                    slopes[d.name] = both[d.measure][1][MOVED.index(d.parameter)]
+                    slopes[d.name] = both[d.measure][names.index(d.parameter)]
             else:
-                cycle = cycle_of(values, begin, base.n_legs, model, options)
-            return cycle.outcome, {name: _read(name, cycle) for name in plain} | slopes
+                walked: Any = finder.cycle_of(values, begin)
+                cycle, step = walked, jax.tree.map(lambda leaf: leaf[0], walked.steps)
+            told = {name: finder.read(name, cycle, step) for name in plain}
+            return cycle.outcome, told | slopes
 
         self._one = one
-        numbers, structure = jax.tree.flatten((model, options))
-        closed_over = str(structure), [np.asarray(x).tolist() for x in numbers]
+        leaves, structure = jax.tree.flatten((model, options))
+        closed_over = str(structure), [np.asarray(x).tolist() for x in leaves]
         self._settings = ("ground", measures, base.n_legs, *closed_over)
         self._compiled: Callable | None = None
 
     def _compile(self) -> Callable:
         """The one large function, ready to run: here, lest each thread compile its own."""
         dtype = np.dtype(self._base.damping.dtype)
-        shapes = (LANES, len(MOVED)), (LANES, self._model.section_size(self._base))
+        shapes = (
+            (LANES, len(self._model.parameter_names)),
+            (LANES, self._model.section_size(self._base)),
+        )
         given = tuple(jax.ShapeDtypeStruct(shape, dtype) for shape in shapes)
         return compiled(jax.vmap(self._one), given, self._settings, jax.local_devices()[0])
 
     def __call__(self, columns: Columns) -> Told:
         """Results of the samples in `columns` (one value per sample of each swept parameter)."""
-        n = len(next(iter(columns.values())))
-        values = np.empty((n, len(MOVED)), np.dtype(self._base.damping.dtype))
-        for i, name in enumerate(MOVED):
-            held = self._model if name == FRICTION else self._base
-            values[:, i] = columns[name] if name in columns else float(getattr(held, name))
+        values = numbers(columns, self._model, self._base)
+        n = len(values)
         n_legs = self._base.n_legs
         paper = np.tile(np.asarray(PAPER_START, values.dtype), (n, 1))
         start = as_full_states(values.T, paper, n_legs)
@@ -108,22 +114,11 @@ class GroundEngine:
 
     def _batch(self, values: np.ndarray, states: np.ndarray, walked: np.ndarray) -> Told:
         assert self._compiled is not None
-        fill = lambda x: np.concatenate([x, np.repeat(x[:1], LANES - len(x), 0)])
-        told = self._compiled(fill(values), fill(states))
-        outcome, measures = jax.tree.map(np.array, told)
-        outcome = np.where(fill(walked) == Outcome.STEPPED, outcome, fill(walked))
-        failed = outcome != Outcome.STEPPED
-        for value in measures.values():
-            value[failed] = np.nan if np.issubdtype(value.dtype, np.floating) else -1
-        results = {"outcome": outcome.astype(np.int8)} | measures
-        return {name: value[: len(values)] for name, value in results.items()}
-
-
-def _read(name: str, cycle: WalkedCycle) -> Array:
-    """A measure of a gait that repeats after one step."""
-    if name in ("spectral_radius", "stability_margin"):
-        return getattr(cycle, name)
-    return jax.tree.map(lambda leaf: leaf[0], cycle.steps).measures()[name]
+        fill = lambda x: filled_up(x, LANES)
+        outcome, measures = self._compiled(fill(values), fill(states))
+        walked = fill(walked)
+        outcome = np.where(walked == Outcome.STEPPED, np.asarray(outcome), walked)
+        return {name: x[: len(values)] for name, x in masked(outcome, measures).items()}
 
 
 OF_PAPER: dict[str, tuple[str, ...]] = {
@@ -154,7 +149,7 @@ class LadderEngine:
         self._lower = Engine(
             tuple(dict.fromkeys(asked)), base, self._paper, options, cycle_options, threads
         )
-        self._upper = GroundEngine(measures, base, model.ground, options, threads)
+        self._upper = GroundEngine(measures, base, model.ground, options, None, threads)
 
     def __call__(self, columns: Columns) -> Told:
         """Results of the samples in `columns`, with `rung` and `reason` of each."""
@@ -199,9 +194,9 @@ def engine_for(
     threads: int | None = None,
 ) -> Engine | GroundEngine | LadderEngine:
     """What computes the samples of a scan of this rung."""
-    if isinstance(model, UnilateralWheel):
-        return GroundEngine(measures, base, model, options, threads)
-    if isinstance(model, LadderWheel):
-        return LadderEngine(measures, base, model, options, cycle_options, threads)
-    assert isinstance(model, ViscoelasticWheel)  # `running.plan` looked
-    return Engine(measures, base, model, options, cycle_options, threads)
+    make: Any = ENGINES[model.rung]
+    return make(measures, base, model, options, cycle_options, threads)
+
+
+ENGINES = {"viscoelastic": Engine, "unilateral": GroundEngine, "ladder": LadderEngine}
+"""By rung: those that a scan has an offer of."""

@@ -4,31 +4,15 @@ import re
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from vrw_jax.models import SERVED, AbstractWheel, LadderWheel, UnilateralWheel
-from vrw_jax.results import CYCLE, MARGINS, MEASURES, ON_GROUND, STEP, attrs_of, nearest
+from vrw_jax.cycles import CollocationFinder
+from vrw_jax.models import SERVED, AbstractWheel
+from vrw_jax.results import MARGINS, MEASURES, ON_GROUND, STEP, attrs_of, nearest
 from vrw_jax.wheel import FRICTION, PARAMETER_NAMES
 
 ALWAYS = ("outcome", "spectral_radius", *MARGINS)
 """In every scan, asked for or not: is there a cycle, is it stable, what does it break."""
 
-OF_CYCLE = (
-    "dls_fraction",
-    "period",
-    "speed",
-    "step_length",
-    "duration_dls",
-    "duration_sls1",
-    "duration_sls2",
-    "theta_post_impact",
-    "dtheta_post_impact",
-    "theta_touchdown",
-    "dtheta_touchdown",
-    "dL1_touchdown",
-    "lambda_I4",
-    "lambda_2_plus",
-    "lambda_4_plus",
-    *CYCLE,
-)
+OF_CYCLE = CollocationFinder.of_cycle
 """Measures that the limit cycle itself tells; these have derivatives."""
 
 ON_REQUEST = (*OF_CYCLE, *(name for name in STEP if name not in (*OF_CYCLE, "outcome")))
@@ -60,26 +44,26 @@ class Offer(NamedTuple):
 _DEFAULT = ("dls_fraction", "speed", "period", "step_length", "slip", "energy_lost_impacts")
 PAPER = Offer(ON_REQUEST, ALWAYS, OF_CYCLE, PARAMETER_NAMES, DEFAULT_MEASURES)
 REAL_GROUND = Offer(
-    (*ON_GROUND, *CYCLE),
+    (*ON_GROUND, "spectral_margin"),
     ("outcome", "spectral_radius"),
     ON_GROUND,
     (*PARAMETER_NAMES, FRICTION),
     _DEFAULT,
 )
 LADDER = Offer(
-    (*ON_GROUND, *CYCLE),
-    ("outcome", "spectral_radius", "rung", "reason"),
+    (*ON_GROUND, "spectral_margin"),
+    ("outcome", "spectral_radius", *SERVED),
     tuple(name for name in ON_GROUND if name in OF_CYCLE),
     PARAMETER_NAMES,
     _DEFAULT,
 )
+OFFERS = {"viscoelastic": PAPER, "unilateral": REAL_GROUND, "ladder": LADDER}
+"""By rung: those with compliant legs."""
 
 
 def offer_of(model: AbstractWheel) -> Offer:
     """What a scan of this rung can tell."""
-    if isinstance(model, LadderWheel):
-        return LADDER
-    return REAL_GROUND if isinstance(model, UnilateralWheel) else PAPER
+    return OFFERS[model.rung]
 
 
 _DERIVATIVE = re.compile(r"d[ _](\w+?)(?: */ *d |_d_)(\w+)")

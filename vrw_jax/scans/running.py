@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 from vrw_jax.cycles import CycleOptions
-from vrw_jax.models import AbstractWheel, LadderWheel, UnilateralWheel, ViscoelasticWheel
+from vrw_jax.models import AbstractWheel, ViscoelasticWheel
 from vrw_jax.numerics import Options
 from vrw_jax.results import MARGINS, attrs_of, provenance
 from vrw_jax.runtime import code_digest
@@ -25,7 +25,7 @@ from vrw_jax.runtime import xarray as xr
 from vrw_jax.scans.design import AbstractDesign, Columns
 from vrw_jax.scans.evaluate import LANES, Engine, n_cores
 from vrw_jax.scans.ground import GroundEngine, LadderEngine, engine_for
-from vrw_jax.scans.offer import check_measures, offer_of, variable_attrs
+from vrw_jax.scans.offer import OFFERS, check_measures, offer_of, variable_attrs
 from vrw_jax.scans.store import (
     MANIFEST,
     PROVENANCE,
@@ -39,7 +39,7 @@ from vrw_jax.scans.store import (
     first_difference,
     stored_manifest,
 )
-from vrw_jax.walks import ModelLike
+from vrw_jax.walks import ModelLike, rung_of
 from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, WheelParams
 
 CHUNK = 4096
@@ -141,14 +141,13 @@ def plan(
     options.require_reachable(np.dtype(base.damping.dtype))
     if chunk is not None and chunk < 1:
         raise ValueError(f"chunk is {chunk}, but it must be at least 1 sample.")
-    model = ViscoelasticWheel() if model is None else model
-    model = LadderWheel() if isinstance(model, str) and model == "auto" else model
-    if not isinstance(model, ViscoelasticWheel | UnilateralWheel | LadderWheel):
+    model = rung_of(model)
+    if model.rung not in OFFERS:
         raise TypeError(
             f"model is {model!r}, but a scan is of gaits with compliant legs: give "
             'vrw.ViscoelasticWheel(), vrw.UnilateralWheel() or "auto".'
         )
-    if FRICTION in design.names and isinstance(model, ViscoelasticWheel):
+    if FRICTION in design.names and FRICTION not in model.parameter_names:
         raise ValueError(
             "the design sweeps friction, which the paper's wheel does not feel: give "
             'model=vrw.UnilateralWheel() or "auto".'

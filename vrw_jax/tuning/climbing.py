@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vrw_jax.tuning.objective import Gait
+from vrw_jax.tuning.objective import Evaluated
 from vrw_jax.wheel import Outcome
 
 
@@ -57,7 +57,7 @@ class Trial(NamedTuple):
     gradient: np.ndarray  # over u
     slack: np.ndarray  # constraint values above their margins, in their own units
     slopes: np.ndarray  # of slack: (n_constraints, n_free)
-    gait: Gait | None
+    told: Evaluated | None
 
     @property
     def found(self) -> bool:

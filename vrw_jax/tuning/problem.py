@@ -10,148 +10,36 @@ import inspect
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from vrw_jax.cycles import (
-    TAKE_OFF,
+    AbstractGaitFinder,
     CycleOptions,
-    LimitCycle,
-    Problem,
-    WalkedCycle,
-    default_margins,
-    measure,
-)
-from vrw_jax.models import (
-    AbstractWheel,
-    StepResult,
-    UnilateralStep,
-    UnilateralWheel,
-    ViscoelasticWheel,
-    refuse_ladder,
-)
-from vrw_jax.numerics import Options
-from vrw_jax.results import (
-    MARGINS,
-    ON_GROUND,
-    as_html,
-    as_text,
-    attrs_of,
-    flags,
-    nearest,
-    provenance,
-)
-from vrw_jax.runtime import xarray as xr
-from vrw_jax.tuning.climbing import (
-    Climb,
-    Ending,
-    Kind,
-    Trial,
-    breach,
-    climb,
-    optimality,
-    slack_scales,
-)
-from vrw_jax.tuning.ground import GroundEngine
-from vrw_jax.tuning.objective import (
-    READABLE,
-    AbstractEngine,
-    Engine,
     Gait,
-    OfCycle,
-    Reader,
-    Weighted,
-    outcome_of,
+    default_margins,
+    finder_of,
+    same_branch,
 )
+from vrw_jax.models import AbstractWheel, refuse_ladder
+from vrw_jax.numerics import Options
+from vrw_jax.results import MARGINS, MEASURES, attrs_of, flags, nearest, provenance
+from vrw_jax.runtime import xarray as xr
+from vrw_jax.tuning.climbing import Climb, Kind, Trial, breach, climb, optimality, slack_scales
+from vrw_jax.tuning.objective import Engine, Evaluated, OfCycle, Reader, Sought, Weighted
+from vrw_jax.tuning.result import Active, Tuned, Walked
 from vrw_jax.tuning.starts import Lanes, explore
-from vrw_jax.wheel import DOMAINS, PARAMETER_NAMES, Outcome, WheelParams, parameters_of, wheel_of
+from vrw_jax.walks import rung_of
+from vrw_jax.wheel import DOMAINS, PARAMETER_NAMES, Outcome, WheelParams
 
 Objective = str | Mapping[str, float] | Callable[..., Array]
 Margins = Mapping[str, float] | Sequence[str]
 
 
-class Active(NamedTuple):
-    """A constraint or bound that holds the optimum."""
-
-    name: str  # of the constraint (with the leg, if it has one), or of the parameter
-    limit: float  # its margin, or the bound
-    unit: str
-    price: float  # objective gained per unit of limit given up
-
-
-class Walked(NamedTuple):
-    """What walking the tuned wheel showed, from a start displaced by `DISPLACED`."""
-
-    steps: int
-    outcome: Outcome
-    distance: float  # from the limit cycle after the last step, rad, rad/s and m/s
-    kept: bool  # whether every step kept every constraint on a monitor, within 1e-3 of its scale
-
-
 DISPLACED, N_WALKED, N_EXPLORED = 1e-5, 10, 25
-
-
-@dataclasses.dataclass(frozen=True)
-class Tuned:
-    """A tuned gait, how it was come by, and what holds it there."""
-
-    params: WheelParams
-    ending: Ending
-    objective: str
-    value: float
-    start_value: float
-    cycle: LimitCycle | WalkedCycle
-    step: StepResult | UnilateralStep
-    active: tuple[Active, ...]
-    kkt_residual: float  # of the first-order condition, relative to the objective's gradient
-    unkept: tuple[str, ...]  # premises that were no constraint and are broken
-    walked: Walked
-    path: xr.Dataset  # every gait that was evaluated, in order
-    evaluations: int  # limit cycles, each with one step
-    shortened: int  # trials that lost the gait or its branch
-    seconds: float  # of which `compile_seconds` went to compiling
-    compile_seconds: float  # and to exploring, if there were many starts
-    lanes: Lanes | None = None  # where many starts got to before the climb
-
-    @property
-    def converged(self) -> bool:
-        """Whether the climb ended at an optimum."""
-        return self.ending == Ending.CONVERGED
-
-    def lines(self) -> dict[str, str]:
-        """The result in words, for a reader."""
-        free = [str(name) for name in self.path.attrs["free"]]
-        wheel = [
-            f"{n} {float(getattr(self.params, n)):.6g} {DOMAINS[n].unit}".strip() for n in free
-        ]
-        kept = "every constraint kept" if self.walked.kept else "a constraint broken"
-        kept = kept if self.path.sizes["constraint"] else "no constraint to keep"
-        held = [f"{a.name} at {a.limit:.6g} {_plain(a.unit)}".strip() for a in self.active]
-        return {
-            "objective": f"{self.objective}: {self.start_value:.6g} at the start, {self.value:.6g}",
-            "wheel": ", ".join(wheel),
-            "ending": f"{self.ending.name}: {self.ending.meaning}",
-            "held by": ", ".join(held) or "nothing: a maximum inside all bounds and constraints",
-            "not asked for, and broken": ", ".join(self.unkept) or "none",
-            "walked": f"{self.walked.steps} steps, {self.walked.outcome.name}, "
-            f"{self.walked.distance:.1e} from the cycle at last; {kept}",
-            "cost": f"{self.evaluations} gaits, {self.shortened} steps shortened, "
-            f"{self.seconds - self.compile_seconds:.2f} s and {self.compile_seconds:.1f} s to "
-            "compile",
-        }
-
-    def __repr__(self) -> str:
-        return as_text("Tuned", self.lines().items())
-
-    def _repr_html_(self) -> str:
-        return as_html("Tuned gait", self.lines().items())
-
-
-def _plain(unit: str) -> str:
-    return "" if unit == "1" else unit
 
 
 def tune(
@@ -174,7 +62,7 @@ def tune(
     `objective`: a measure's name, weights of several, or a function of a LimitCycle (and, if it
     takes two arguments, of the StepResult from it); it is maximised. `free` parameters move within
     their `bounds`. `constraints`: least values of measures by name; names alone mean zero; the
-    default is every premise that gaits of this rung can keep (`cycles.default_margins`), {} is
+    default is every premise that gaits of this rung can keep (`premises.default_margins`), {} is
     none. `tolerance` is on the first-order condition, relative to the objective's gradient; a
     constraint counts as kept within 1e-6 of what it changes over the bounds. Local: it ends at an
     optimum of the branch that `params` lies on. With `n_starts` above 1 so many wheels, `params`
@@ -199,10 +87,10 @@ def tune(
         raise ValueError(f"tolerance is {tolerance:g}, but it must be positive.")
     if not n_starts >= 1:
         raise ValueError(f"n_starts is {n_starts}, but at least one start is needed.")
-    if n_starts > 1 and isinstance(problem.engine, GroundEngine):
+    if n_starts > 1 and not problem.finder.from_nothing:
         raise ValueError("n_starts is for the paper's wheel: on real ground climb from one start.")
     lanes = problem.explore(n_starts, seed) if n_starts > 1 else None
-    problem.engine.compile(params)
+    problem.finder.compile(params)
     start = problem.start() if lanes is None else problem.evaluate(lanes.u[lanes.best], None)
     compiled = time.perf_counter()
     done = climb(problem.evaluate, start, tolerance=tolerance, max_evaluations=max_evaluations)
@@ -219,7 +107,8 @@ class TuneProblem:
     upper: np.ndarray
     margins: dict[str, float]
     label: str
-    engine: AbstractEngine
+    engine: Engine
+    finder: AbstractGaitFinder
 
     @property
     def widths(self) -> np.ndarray:
@@ -243,13 +132,13 @@ class TuneProblem:
 
     def parameters(self, u: np.ndarray) -> np.ndarray:
         """All float parameters where the free ones are `u` widths above their lower bounds."""
-        values = np.array(parameters_of(self.params))
+        values = np.array(self.finder.model.values(self.params))
         values[[PARAMETER_NAMES.index(name) for name in self.free]] = self.lower + u * self.widths
         return values
 
     def wheel(self, u: np.ndarray) -> WheelParams:
         """The wheel there."""
-        return wheel_of(jnp.asarray(self.parameters(u)), self.params.n_legs)
+        return self.finder.model.at(jnp.asarray(self.parameters(u)), self.params.n_legs)[1]
 
     @property
     def start_u(self) -> np.ndarray:
@@ -273,33 +162,29 @@ class TuneProblem:
     def evaluate(self, u: np.ndarray, near: Trial | None) -> Trial:
         """The gait at `u`, from a neighbour's gait if one is given."""
         parameters = jnp.asarray(self.parameters(u))
-        if near is None or near.gait is None:
-            guess = self.engine.first_guess(parameters)
-        else:
-            guess = self.engine.guess_of(near.gait)
-        gait = self.engine(parameters, guess)
-        outcome = outcome_of(gait)
-        on_branch = True
-        if outcome == Outcome.STEPPED and near is not None and near.gait is not None:
+        before = None if near is None else near.told
+        guess = self.finder.first_guess(parameters) if before is None else before.gait.cycle.near
+        told = self.engine(parameters, guess)
+        outcome, on_branch = Outcome(int(told.gait.outcome)), True
+        if outcome == Outcome.STEPPED and near is not None and before is not None:
             change = self.parameters(u) - self.parameters(near.u)
-            on_branch = self.engine.same_branch(near.gait, gait, change)
-        return self.trial(u, gait, outcome, on_branch)
+            on_branch = same_branch(before.gait.on_branch, told.gait.on_branch, change)
+        return self.trial(u, told, outcome, on_branch)
 
-    def trial(self, u: np.ndarray, gait: Gait, outcome: Outcome, on_branch: bool) -> Trial:
+    def trial(self, u: np.ndarray, told: Evaluated, outcome: Outcome, on_branch: bool) -> Trial:
         """What a gait says about objective and constraints."""
-        values = np.array(gait.values)
+        values = np.array(told.values)
         indices = [PARAMETER_NAMES.index(name) for name in self.free]
-        slopes = np.array(gait.columns)[indices].T * self.widths
+        slopes = np.array(told.columns)[indices].T * self.widths
         if outcome != Outcome.STEPPED:
             values, slopes = np.full_like(values, np.nan), np.full_like(slopes, np.nan)
         return Trial(
             u, outcome, on_branch, float(values[0]), slopes[0], values[1:] - self.least,
-            slopes[1:], gait,
+            slopes[1:], told,
         )  # fmt: skip
 
     def explore(self, n_starts: int, seed: int) -> Lanes:
         """First-order steps of many starts side by side: this wheel, and random ones."""
-        assert isinstance(self.engine, Engine)  # `tune` looked
         others = np.random.default_rng(seed).uniform(size=(n_starts - 1, len(self.free)))
         lanes = explore(
             self._batch,
@@ -317,15 +202,14 @@ class TuneProblem:
             )
         return lanes
 
-    def _batch(self, u: np.ndarray, near: Gait | None) -> Gait:
-        assert isinstance(self.engine, Engine)
+    def _batch(self, u: np.ndarray, near: Evaluated | None) -> Evaluated:
         parameters = jnp.asarray([self.parameters(row) for row in u])
-        first = self.engine.first_guesses(parameters)
-        return self.engine.batch(parameters, first if near is None else near.cycle.located)
+        first = self.finder.first_guesses(parameters)
+        return self.engine.batch(parameters, first if near is None else near.gait.cycle.near)
 
     def _change(self, difference: np.ndarray) -> np.ndarray:
         """Differences of all parameters by differences of u, row by row."""
-        change = np.zeros((difference.shape[0], len(PARAMETER_NAMES)))
+        change = np.zeros((difference.shape[0], len(self.finder.model.parameter_names)))
         change[:, [PARAMETER_NAMES.index(name) for name in self.free]] = difference * self.widths
         return change
 
@@ -334,11 +218,12 @@ class TuneProblem:
     ) -> Tuned:
         """The result of a climb, confirmed by walking."""
         best = done.best
-        assert best.gait is not None
+        assert best.told is not None
+        gait = best.told.gait
         params = self.wheel(best.u)
         conditions = optimality(best)
         active = [
-            Active(name, float(limit), measure(name.split("[")[0]).unit, float(price))
+            Active(name, float(limit), MEASURES[name.split("[")[0]].unit, float(price))
             for name, limit, price in zip(
                 self.constraint_names, self.least, conditions.prices, strict=True
             )
@@ -353,16 +238,17 @@ class TuneProblem:
                     unit = DOMAINS[name].unit or "1"
                     active.append(Active(name, float(limit), unit, float(price / width)))
         climbed = time.perf_counter()
-        walked = self._walk(params, best.gait)
-        broken = self.engine.unkept(best.gait.step)
+        walked = self._walk(params, gait)
+        told = gait.step.measures()
+        broken = [name for name in MARGINS if name in told and np.min(told[name]) < 0.0]
         return Tuned(
             params=params,
             ending=done.ending,
             objective=self.label,
             value=best.objective,
             start_value=done.trials[0].objective,
-            cycle=best.gait.cycle,
-            step=best.gait.step,
+            cycle=gait.cycle,
+            step=gait.step,
             active=tuple(active),
             kkt_residual=conditions.residual,
             unkept=tuple(name for name in broken if name not in self.margins),
@@ -379,13 +265,14 @@ class TuneProblem:
         cycle = np.array(gait.cycle.section_state)
         # Shrunk and not grown: no leg may lie beyond its stopper.
         x, kept, outcome, walked = cycle * (1.0 - DISPLACED), True, Outcome.STEPPED, 0
+        model, options = self.finder.model, self.finder.step_options
         for _ in range(N_WALKED):
-            one = self.engine.step(params, x)
+            one = model.step(params, jnp.asarray(x), options)
             outcome = Outcome(int(one.outcome))
             if outcome != Outcome.STEPPED:
                 break
             walked, x = walked + 1, np.array(one.section_state)
-            monitored = self.engine.monitored(one)
+            monitored = {name: np.asarray(value) for name, value in one.measures().items()}
             for name, least in self.margins.items():
                 if name in monitored:
                     value = monitored[name]
@@ -421,7 +308,7 @@ class TuneProblem:
             "outcome": (along, np.array(outcomes, int), attrs_of("outcome")),
             "on_branch": (along, np.array([t.on_branch for t in done.trials])),
         }
-        units = [measure(name.split("[")[0]).unit for name in self.constraint_names]
+        units = [MEASURES[name.split("[")[0]].unit for name in self.constraint_names]
         labels = {
             along: np.arange(len(u)),
             "constraint": list(self.constraint_names),
@@ -434,7 +321,7 @@ class TuneProblem:
             "upper": [float(v) for v in self.upper],
             "ending": done.ending.name,
         }
-        origin = provenance(self.params, self.engine.model, self.engine.options)
+        origin = provenance(self.params, self.finder.model, self.finder.step_options)
         return xr.Dataset(data, labels, attrs | origin)
 
 
@@ -459,54 +346,28 @@ def tuning_problem(
             "write vrw.WheelParams(damping=..., slope=...)."
         )
     names, lower, upper = _bounds(params, free, bounds)
-    options = Options() if options is None else options
-    if isinstance(model, UnilateralWheel):
-        return _ground_problem(params, objective, names, lower, upper, constraints, model, options)
     refuse_ladder(model, "tuned")
-    if not isinstance(model, ViscoelasticWheel | None):
+    finder = finder_of(
+        rung_of(model), params.n_legs, cycle_options=cycle_options, step_options=options
+    )
+    if finder.model.rung not in ("viscoelastic", "unilateral"):
         raise TypeError(
             f"model is {model!r}, but what is tuned has compliant legs: give "
             "vrw.ViscoelasticWheel() or vrw.UnilateralWheel()."
         )
-    reader, label = _objective(objective)
-    margins = _margins(params, constraints)
-    engine = Engine(
-        objective=reader,
-        constraints=tuple(margins),
-        problem=Problem(
-            params.n_legs, 1, CycleOptions() if cycle_options is None else cycle_options
-        ),
-        model=ViscoelasticWheel() if model is None else model,
-        options=options,
-    )
-    return TuneProblem(params, names, lower, upper, margins, label, engine)
+    reader, label = _objective(objective, finder)
+    margins = _margins(params, constraints, finder)
+    sought = Sought(reader, type(finder).read, tuple(margins))
+    return TuneProblem(params, names, lower, upper, margins, label, Engine(finder, sought), finder)
 
 
-def _ground_problem(
-    params: WheelParams,
-    objective: Objective,
-    names: tuple[str, ...],
-    lower: np.ndarray,
-    upper: np.ndarray,
-    constraints: Margins | None,
-    model: UnilateralWheel,
-    options: Options,
-) -> TuneProblem:
-    """The same on real ground, which has no premises to keep unless measures are named."""
+def _objective(objective: Objective, finder: AbstractGaitFinder) -> tuple[Reader, str]:
     if callable(objective):
-        raise TypeError(
-            "objective is a function, but on real ground it must be a measure's name or weights "
-            f"of several: choose from {', '.join(ON_GROUND)}."
-        )
-    reader, label = _objective(objective, ON_GROUND)
-    assert isinstance(reader, Weighted)
-    margins = _margins(params, {} if constraints is None else constraints, ON_GROUND)
-    engine = GroundEngine(reader.weights, tuple(margins), params.n_legs, model, options)
-    return TuneProblem(params, names, lower, upper, margins, label, engine)
-
-
-def _objective(objective: Objective, readable: tuple[str, ...] = READABLE) -> tuple[Reader, str]:
-    if callable(objective):
+        if not finder.from_nothing:
+            raise TypeError(
+                "objective is a function, but on real ground it must be a measure's name or "
+                f"weights of several: choose from {', '.join(finder.differentiable)}."
+            )
         label = getattr(objective, "__name__", "objective")
         takes = inspect.signature(objective).parameters
         return (objective if len(takes) >= 2 else OfCycle(objective)), label
@@ -517,14 +378,14 @@ def _objective(objective: Objective, readable: tuple[str, ...] = READABLE) -> tu
             'give a measure such as "dls_fraction".'
         )
     for name in weights:
-        _known(name, "objective", readable)
+        _known(name, "objective", finder.readable)
         if name in MARGINS and MARGINS[name].axis:
             raise ValueError(
                 f"{name} has one value for each locked leg, but an objective is one number: "
                 "give a function of the cycle and the step that reduces it."
             )
     label = " + ".join(n if w == 1.0 else f"{w:g} {n}" for n, w in weights.items())
-    return Weighted(tuple(weights.items())), label.replace("+ -", "- ")
+    return Weighted(type(finder).read, tuple(weights.items())), label.replace("+ -", "- ")
 
 
 def _known(name: str, what: str, readable: tuple[str, ...]) -> None:
@@ -573,19 +434,21 @@ def _bounds(
 
 
 def _margins(
-    params: WheelParams, constraints: Margins | None, readable: tuple[str, ...] = READABLE
+    params: WheelParams, constraints: Margins | None, finder: AbstractGaitFinder
 ) -> dict[str, float]:
     if constraints is None:
-        return dict(default_margins(params))
+        premises = default_margins(params)
+        return {name: least for name, least in premises.items() if finder.from_nothing}
     if isinstance(constraints, Mapping):
         margins = {name: float(least) for name, least in constraints.items()}
     else:
         names = (constraints,) if isinstance(constraints, str) else constraints
         margins = dict.fromkeys(names, 0.0)
     if "clearance_sls1" in margins:
-        margins.setdefault(TAKE_OFF.name, 0.0)  # which has a slope where the clearance has none
+        # It has a slope where the clearance has none.
+        margins.setdefault("takeoff_acceleration", 0.0)
     for name, least in margins.items():
-        _known(name, "a constraint", readable)
+        _known(name, "a constraint", finder.readable)
         if not math.isfinite(least):
             raise ValueError(f"the margin of {name} is {least}, but it must be a finite number.")
     return margins

@@ -11,8 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vrw_jax.cycles import same_branch
 from vrw_jax.runtime import library
-from vrw_jax.tuning.objective import AGREEMENT, Gait, is_same_branch
+from vrw_jax.tuning.objective import Evaluated
 from vrw_jax.wheel import Outcome
 
 optax = library("optax")
@@ -20,7 +21,7 @@ optax = library("optax")
 RATE, STIFFNESS = 0.06, 4.0
 """Adam's first step in widths of the bounds; penalty on a breach of one width, in objectives."""
 
-BatchEvaluate = Callable[[np.ndarray, Gait | None], Gait]
+BatchEvaluate = Callable[[np.ndarray, Evaluated | None], Evaluated]
 """Gaits at u, one row per lane, from neighbours' gaits."""
 
 
@@ -89,33 +90,28 @@ def explore(
     return Lanes(starts, u, objective, breach, lost, n_lanes * (n_steps + 1))
 
 
-def found(gait: Gait) -> np.ndarray:
+def found(told: Evaluated) -> np.ndarray:
     """Whether each lane has a gait that the event-driven step agrees with."""
-    away = np.max(np.abs(np.asarray(gait.step.section_state - gait.cycle.section_state)), axis=-1)
-    codes = np.asarray(gait.cycle.outcome), np.asarray(gait.step.outcome)
-    return (codes[0] == Outcome.STEPPED) & (codes[1] == Outcome.STEPPED) & (away <= AGREEMENT)
+    return told.gait.outcome == Outcome.STEPPED
 
 
 def _chosen(holds: np.ndarray, new: jax.Array, old: jax.Array) -> jax.Array:
     return jnp.where(holds.reshape(-1, *(1,) * (jnp.ndim(new) - 1)), new, old)
 
 
-def _gradient(gait: Gait, free: list[int], widths: np.ndarray) -> np.ndarray:
+def _gradient(gait: Evaluated, free: list[int], widths: np.ndarray) -> np.ndarray:
     return np.asarray(gait.columns)[:, free, 0] * widths
 
 
 def _constraints(
-    gait: Gait, free: list[int], widths: np.ndarray, least: np.ndarray
+    gait: Evaluated, free: list[int], widths: np.ndarray, least: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Slack, and its slopes over u: (lane, constraint) and (lane, constraint, free)."""
     slopes = np.swapaxes(np.asarray(gait.columns)[:, free, 1:], 1, 2) * widths
     return np.asarray(gait.values)[:, 1:] - least, slopes
 
 
-def _on_branch(here: Gait, there: Gait, change: np.ndarray) -> np.ndarray:
-    told = lambda g: (g.posture, g.posture_columns, g.cycle.located.happens, g.cycle.matrix)
-    first, second = ([np.asarray(x) for x in told(gait)] for gait in (here, there))
-    lane = lambda told, i: tuple(x[i] for x in told)
-    return np.array(
-        [is_same_branch(lane(first, i), lane(second, i), row) for i, row in enumerate(change)]
-    )
+def _on_branch(here: Evaluated, there: Evaluated, change: np.ndarray) -> np.ndarray:
+    first, second = here.gait.on_branch, there.gait.on_branch
+    pairs = ((first.lane(i), second.lane(i), row) for i, row in enumerate(change))
+    return np.array([same_branch(*pair) for pair in pairs])

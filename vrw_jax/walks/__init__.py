@@ -2,5 +2,16 @@
 
 from vrw_jax.walks.basins import BEFORE, basin
 from vrw_jax.walks.choice import choose_model
-from vrw_jax.walks.stepping import ModelLike, Walk, checked, paper_start, return_map, step, walk
+from vrw_jax.walks.stepping import (
+    N_TOWARDS,
+    ModelLike,
+    Walk,
+    checked,
+    paper_start,
+    return_map,
+    rung_of,
+    step,
+    walk,
+    walk_towards,
+)
 from vrw_jax.walks.trajectory import simulate

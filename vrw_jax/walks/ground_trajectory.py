@@ -5,6 +5,8 @@ Of the unilateral wheel, and of the ladder, whose motion is told alike on both i
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import numpy as np
@@ -12,11 +14,8 @@ from jaxtyping import Array
 
 from vrw_jax.models import (
     SERVED,
-    LadderStep,
-    LadderWheel,
     State,
     UnilateralTrajectory,
-    UnilateralWheel,
     directions,
     foot_heights,
     foot_places,
@@ -52,7 +51,7 @@ MODES = "in_the_air at_rest sliding_downhill sliding_uphill"
 
 @eqx.filter_jit
 def _columns(
-    model: UnilateralWheel | LadderWheel,
+    model: Any,
     params: WheelParams,
     x: Array,
     options: Options,
@@ -88,7 +87,7 @@ def simulate_ground(
     x: Array,
     n_steps: int,
     *,
-    model: UnilateralWheel | LadderWheel,
+    model: Any,
     options: Options,
     n_samples: int,
 ) -> xr.Dataset:
@@ -114,9 +113,8 @@ def simulate_ground(
             part["time"] = trace.time[phase] + time
             part["step"] = np.full(n_samples, stepped)
             part["contact"] = np.tile(trace.contact[phase], (n_samples, 1))
-            if isinstance(result, LadderStep):
-                part["rung"] = np.full(n_samples, int(result.choice.rung))
-                part["reason"] = np.full(n_samples, int(result.choice.reason))
+            for name, value in result.served().items():
+                part[name] = np.full(n_samples, int(value))
             part["on_stopper"] = np.tile(trace.locked[phase], (n_samples, 1))
             parts.append(part)
         time += float(result.period)
@@ -139,10 +137,8 @@ def simulate_ground(
         for name, (unit, long_name) in LEGWISE.items()
     }
     variables["contact"].attrs |= {"flag_values": [0, 1, 2, 3], "flag_meanings": MODES}
-    if isinstance(model, LadderWheel):
-        variables |= {
-            name: xr.Variable("time", joined(name, ()), attrs) for name, attrs in SERVED.items()
-        }
+    for name in result.served():
+        variables[name] = xr.Variable("time", joined(name, ()), SERVED[name])
     return xr.Dataset(
         variables,
         {

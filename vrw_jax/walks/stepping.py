@@ -40,6 +40,20 @@ def paper_start() -> SectionState:
     return ViscoelasticWheel().start(WheelParams())
 
 
+def rung_of(model: ModelLike | None) -> AbstractWheel:
+    """The rung that a caller names: the paper's by default, the lowest that serves for "auto"."""
+    if model is None:
+        return ViscoelasticWheel()
+    if isinstance(model, str) and model == "auto":
+        return LadderWheel()
+    if not isinstance(model, AbstractWheel):
+        raise TypeError(
+            f"model is {model!r}, but a rung of the ladder is needed: give "
+            'vrw.ViscoelasticWheel(), vrw.RigidWheel(), vrw.UnilateralWheel() or "auto".'
+        )
+    return model
+
+
 def checked(
     params: WheelParams, x: object, model: ModelLike | None, options: Options | None
 ) -> tuple[WheelParams, Array, AbstractWheel, Options]:
@@ -49,15 +63,7 @@ def checked(
             f"params is a {type(params).__name__}, but a WheelParams is needed: "
             "write vrw.WheelParams(damping=..., slope=...)."
         )
-    if model is None:
-        model = ViscoelasticWheel()
-    if isinstance(model, str) and model == "auto":
-        model = LadderWheel()
-    if not isinstance(model, AbstractWheel):
-        raise TypeError(
-            f"model is {model!r}, but a rung of the ladder is needed: give "
-            'vrw.ViscoelasticWheel(), vrw.RigidWheel(), vrw.UnilateralWheel() or "auto".'
-        )
+    model = rung_of(model)
     options = Options() if options is None else options
     state = as_float_array(x)
     size = model.section_size(params)
@@ -190,3 +196,12 @@ def walk(
         raise ValueError(f"n_steps is {n_steps}, but a walk needs at least one step.")
     params, state, model, options = checked(params, x, model, options)
     return _walk(model, params, state, options, n_steps)
+
+
+N_TOWARDS = 100
+"""Steps towards a gait, from the rung's start, where its search needs a place nearby."""
+
+
+def walk_towards(model: AbstractWheel, params: WheelParams, options: Options) -> Walk:
+    """Towards a gait that attracts, from the rung's own start."""
+    return walk(params, model.start(params), N_TOWARDS, model=model, options=options)

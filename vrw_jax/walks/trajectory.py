@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from vrw_jax.models import AbstractWheel, LadderWheel, SectionState, UnilateralWheel
+from vrw_jax.models import AbstractWheel, SectionState
 from vrw_jax.numerics import Options
 from vrw_jax.results import TRAJECTORY, attrs_of, provenance
 from vrw_jax.runtime import xarray as xr
@@ -90,7 +90,7 @@ def simulate(
     if not n_samples >= 2:
         raise ValueError(f"n_samples is {n_samples}, but a phase has two ends: give 2 or more.")
     params, x, model, options = checked(params, x, model, options)
-    if isinstance(model, UnilateralWheel | LadderWheel):
+    if model.tells_contacts:
         walked = simulate_ground(
             params, x, n_steps, model=model, options=options, n_samples=n_samples
         )

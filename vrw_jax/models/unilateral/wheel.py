@@ -3,7 +3,7 @@
 import functools
 import math
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -47,7 +47,7 @@ from vrw_jax.numerics import (
     integrate_phase,
     sample_phase,
 )
-from vrw_jax.wheel import Outcome, Symbols, WheelParams
+from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, Symbols, WheelParams
 
 BILATERAL, ONE_SIDED = "bilateral", "one-sided"
 """What stoppers do to legs in the air: hold whatever it takes, or push alone."""
@@ -166,6 +166,10 @@ class UnilateralWheel(AbstractWheel):
     air that has met its stopper stays on it until its foot is loaded; with `stoppers="one-sided"`
     it leaves as soon as the stopper would have to pull. `max_events` bounds the events of one step.
     """
+
+    rung: ClassVar[str] = "unilateral"
+    parameter_names: ClassVar[tuple[str, ...]] = (*PARAMETER_NAMES, FRICTION)
+    tells_contacts: ClassVar[bool] = True
 
     friction: Scalar = eqx.field(converter=as_float_array, default=0.7)
     max_events: int = eqx.field(static=True, default=100)

@@ -1,0 +1,112 @@
+"""Where a branch begins, each rung by its own means: gaits to be followed, and their wheels."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from vrw_jax.branches.followed import (
+    AbstractFollowedWheel,
+    CycleFollowed,
+    RungFollowed,
+    Wheel,
+    on_mesh,
+)
+from vrw_jax.branches.run import MakeCycle
+from vrw_jax.cycles import CycleOptions, LimitCycle, Problem, limit_cycle
+from vrw_jax.models import AbstractWheel
+from vrw_jax.numerics import Options, PathPoint
+from vrw_jax.walks import walk_towards
+from vrw_jax.wheel import WheelParams
+
+
+class Wanted(NamedTuple):
+    """Branches of a batch of wheels: whose, along what, from where."""
+
+    params: WheelParams  # one leading axis
+    model: AbstractWheel
+    name: str  # of the parameter
+    p: Array  # its values where the branches begin
+    period_n: int
+    cycle_options: CycleOptions | None
+    step_options: Options
+
+
+class Start(NamedTuple):
+    """What a continuation needs to begin."""
+
+    followed: AbstractFollowedWheel
+    wheels: Wheel
+    z: Any
+    outcomes: np.ndarray  # of the gaits to begin with
+    make_cycle: MakeCycle
+
+
+def start_by_collocation(wanted: Wanted, cycle: Any) -> Start:
+    """Limit cycles as collocation finds them, from those given or from nothing."""
+    params, name, period_n = wanted.params, wanted.name, wanted.period_n
+    options = CycleOptions.tight() if wanted.cycle_options is None else wanted.cycle_options
+    # The start needs neither the mesh nor the accuracy of the branch.
+    start = cycle
+    if start is None:
+        start = jax.vmap(functools.partial(limit_cycle, period_n=period_n))(params)
+    if not isinstance(start, LimitCycle):
+        raise TypeError(
+            f"cycle is a {type(start).__name__}, but the paper's branch starts from a "
+            "LimitCycle: give vrw.limit_cycle(params)."
+        )
+    problem = Problem(params.n_legs, period_n, options)
+
+    def make_cycle(owner: int, point: PathPoint) -> Callable[[], LimitCycle]:
+        def find() -> LimitCycle:
+            guess = jax.tree.map(lambda x: x[owner], start)
+            located = guess.located._replace(solution=jax.tree.map(jnp.asarray, point.z))
+            guess = dataclasses.replace(guess, located=located, problem=problem)
+            wheel = jax.tree.map(lambda x: x[owner], params)
+            _, wheel = wanted.model.moved(wheel, name, jnp.asarray(point.p))
+            return limit_cycle(wheel, guess=guess, period_n=period_n, options=options)
+
+        return find
+
+    return Start(
+        CycleFollowed(problem=problem, name=name),
+        Wheel(params, start.located.happens),
+        jax.vmap(functools.partial(on_mesh, problem))(start),
+        np.asarray(start.outcome),
+        make_cycle,
+    )
+
+
+def start_by_walking(wanted: Wanted, cycle: Any) -> Start:
+    """Fixed points of the rung's own step, from those given or where walks end."""
+    params, model, options = wanted.params, wanted.model, wanted.step_options
+
+    def towards(params: WheelParams, p: Array) -> tuple[Array, Array]:
+        ground, wheel = model.moved(params, wanted.name, p)
+        walked = walk_towards(ground, wheel, options)
+        return walked.outcome, walked.steps.section_state[-1]
+
+    if cycle is None:
+        outcomes, z = jax.vmap(towards)(params, wanted.p)
+    else:
+        outcomes, z = cycle.outcome, cycle.section_state
+    followed = RungFollowed(
+        model=model,
+        options=options,
+        name=wanted.name,
+        period_n=wanted.period_n,
+        numbers=model.section_numbers(params),
+    )
+    happens = jnp.ones((*wanted.p.shape, 1, 1), wanted.p.dtype)
+    return Start(
+        followed, Wheel(params, happens), z, np.asarray(outcomes), lambda owner, point: None
+    )
+
+
+STARTS: dict[str, Callable[[Wanted, Any], Start]] = {"viscoelastic": start_by_collocation}
+"""By rung, where it is not `start_by_walking`."""

@@ -1,0 +1,172 @@
+"""Gaits of the paper's wheel: one algebraic system for the cycle, one step as a check."""
+
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from vrw_jax.cycles.collocated import LimitCycle, solved, walked_guess
+from vrw_jax.cycles.cycle import MEASURED, AbstractCycle
+from vrw_jax.cycles.finder import (
+    AbstractGaitFinder,
+    Gait,
+    Measured,
+    Values,
+    measured_by_cycle,
+    measured_of,
+)
+from vrw_jax.cycles.options import CycleOptions
+from vrw_jax.cycles.search import Located, Problem, surface_start
+from vrw_jax.models import AbstractStep, StepResult, ViscoelasticWheel
+from vrw_jax.numerics import Options
+from vrw_jax.results import MARGINS, MEASURES
+from vrw_jax.walks import checked
+from vrw_jax.wheel import PARAMETER_NAMES, WheelParams, parameters_of, wheel_of
+
+
+class CollocationFinder(AbstractGaitFinder):
+    """Finds limit cycles without a start; `period_n` counts for `cycle` alone."""
+
+    model: ViscoelasticWheel
+    n_legs: int = eqx.field(static=True)
+    step_options: Options
+    options: CycleOptions = eqx.field(static=True)
+    period_n: int = eqx.field(static=True)
+
+    options_type: ClassVar[type] = CycleOptions
+    of_cycle: ClassVar[tuple[str, ...]] = tuple(MEASURED)
+    readable: ClassVar[tuple[str, ...]] = (
+        *of_cycle, "energy_lost_landing", "energy_lost_stopper", "energy_lost_damping", *MARGINS,
+    )  # fmt: skip
+    differentiable: ClassVar[tuple[str, ...]] = tuple(n for n in readable if not MEASURES[n].axis)
+    from_nothing: ClassVar[bool] = True
+    usual: ClassVar[tuple[str, ...]] = tuple(n for n in of_cycle if n != "spectral_margin")
+
+    @property
+    def problem(self) -> Problem:
+        """What is static in the search."""
+        return Problem(self.n_legs, self.period_n, self.options)
+
+    @classmethod
+    def read(cls, name: str, cycle: AbstractCycle, step: AbstractStep) -> Array:
+        """A measure of a gait by name.
+
+        The clearance in SLS-I is told as if a foot that scuffs at take-off rose: it would jump
+        there otherwise. Whoever reads it must look at `takeoff_acceleration` too.
+        """
+        value = cycle.measure(name) if name in cls.of_cycle else step.measures()[name]
+        if name == "clearance_sls1":
+            scuffs = cycle.measure("takeoff_acceleration") < 0.0
+            return jnp.where(scuffs, step.measures()["clearance_sls2"], value)
+        return value
+
+    def cycle(self, params: WheelParams, guess: Any = None) -> LimitCycle:
+        if guess is None or isinstance(guess, Located):
+            return solved(params, self.problem, guess)
+        if isinstance(guess, LimitCycle) and guess.problem == self.problem:
+            return solved(params, self.problem, guess.located)
+        x = guess.section_state if isinstance(guess, AbstractCycle) else guess
+        params, state, _, _ = checked(params, x, None, None)
+        return solved(params, self.problem, walked_guess(params, self.problem, state))
+
+    def first_guess(self, values: Values) -> Located:
+        lane = surface_start(self.problem, values[:, None], jnp.ones((1,), bool))
+        return jax.tree.map(lambda x: x[..., 0], lane)
+
+    def first_guesses(self, values: Array) -> Located:
+        """The same for many wheels, one row of numbers for each."""
+        lanes = surface_start(self.problem, values.T, jnp.ones(values.shape[:1], bool))
+        return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), lanes)
+
+    def find(self, values: Values, guess: Located) -> Gait:
+        cycle, d_cycle = _cycle_and_columns(self.problem, values, guess)
+        x, dx = cycle.section_state, d_cycle.section_state
+        step, d_step = _step_and_columns(self.model, self.n_legs, values, x, dx, self.step_options)
+        return _gait(cycle, step, d_cycle, d_step)
+
+    def measured(self, values: Values, guess: Any, names: tuple[str, ...]) -> Measured:
+        if set(names) <= set(self.of_cycle):
+            return measured_by_cycle(self, values, guess, names)
+        cycle: Any = None if guess is None else self.cycle_of(values, guess)
+        near = self.first_guess(values) if cycle is None else cycle.located
+        return measured_of(self.find(values, near), type(self).read, names)
+
+    def find_many(self, values: Array, guess: Located) -> Gait:
+        """The gaits of many wheels side by side; every array gains a leading axis."""
+        cycle, d_cycle = _cycles_and_columns(self.problem, values, guess)
+        x, dx = cycle.section_state, d_cycle.section_state
+        step, d_step = _steps_and_columns(self.model, self.n_legs, values, x, dx, self.step_options)
+        return _gait(cycle, step, d_cycle, d_step)
+
+    def compile(self, params: WheelParams) -> None:
+        values = parameters_of(params)
+        x = jnp.asarray(self.model.start(params), values.dtype)
+        dx = jnp.zeros((len(PARAMETER_NAMES), x.shape[0]), x.dtype)
+        with ThreadPoolExecutor(2) as pool:
+            cycle = pool.submit(_cycle_and_columns, self.problem, values, self.first_guess(values))
+            step = pool.submit(
+                _step_and_columns, self.model, self.n_legs, values, x, dx, self.step_options
+            )
+            cycle.result(), step.result()
+
+
+def _gait(cycle: LimitCycle, step: StepResult, d_cycle: LimitCycle, d_step: StepResult) -> Gait:
+    posture = lambda c: jnp.concatenate([c.section_state, c.durations], -1)
+    told = posture(cycle), posture(d_cycle), cycle.located.happens, cycle.matrix
+    return Gait(cycle, step, d_cycle, d_step, *told)
+
+
+def cycle_and_columns(
+    problem: Problem, values: Array, guess: Located
+) -> tuple[LimitCycle, LimitCycle]:
+    """The cycle near `guess`, and its derivatives by all parameters as a leading axis."""
+
+    def floats_of(values: Array) -> tuple[LimitCycle, tuple[LimitCycle, LimitCycle]]:
+        cycle = solved(wheel_of(values, problem.n_legs), problem, guess)
+        floats, rest = eqx.partition(cycle, eqx.is_inexact_array)
+        return floats, (floats, rest)
+
+    columns, (floats, rest) = jax.jacfwd(floats_of, has_aux=True)(values)
+    leading = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), columns)
+    return eqx.combine(floats, rest), leading
+
+
+def step_and_columns(
+    model: ViscoelasticWheel, n_legs: int, values: Array, x: Array, dx: Array, options: Options
+) -> tuple[StepResult, StepResult]:
+    """One step and its derivatives by all parameters when the start moves by `dx` with them."""
+
+    n = values.shape[0]
+
+    def floats_of(inputs: Array) -> tuple:
+        result = model.step(wheel_of(inputs[:n], n_legs), inputs[n:], options)
+        floats, rest = eqx.partition(result, eqx.is_inexact_array)
+        return floats, (floats, rest)
+
+    inputs = jnp.concatenate([values, x])
+    jacobian, (floats, rest) = jax.jacfwd(floats_of, has_aux=True)(inputs)
+    moved = jnp.concatenate([jnp.eye(n, dtype=x.dtype), dx], axis=1)
+    along = lambda by_inputs: jnp.moveaxis(by_inputs @ moved.T, -1, 0)
+    return eqx.combine(floats, rest), jax.tree.map(along, jacobian)
+
+
+_cycle_and_columns = eqx.filter_jit(cycle_and_columns)
+_step_and_columns = eqx.filter_jit(step_and_columns)
+
+
+@eqx.filter_jit
+def _cycles_and_columns(
+    problem: Problem, values: Array, guess: Located
+) -> tuple[LimitCycle, LimitCycle]:
+    return eqx.filter_vmap(lambda v, g: cycle_and_columns(problem, v, g))(values, guess)
+
+
+@eqx.filter_jit
+def _steps_and_columns(
+    model: ViscoelasticWheel, n_legs: int, values: Array, x: Array, dx: Array, options: Options
+) -> tuple[StepResult, StepResult]:
+    one = lambda v, x, dx: step_and_columns(model, n_legs, v, x, dx, options)
+    return eqx.filter_vmap(one)(values, x, dx)

@@ -1,0 +1,239 @@
+"""Limit cycles of the paper's wheel as differentiable functions of its parameters.
+
+The search (see `search`) carries no derivative. Derivatives come from the implicit function
+theorem: the columns of the linearised pass at the cycle. They hold on unstable cycles, in forward
+and reverse mode, and to any order.
+"""
+
+import functools
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from vrw_jax.cycles.cycle import AbstractCycle
+from vrw_jax.cycles.derivatives import attach_monodromy, solve_cycle
+from vrw_jax.cycles.premises import takeoff_acceleration
+from vrw_jax.cycles.search import Located, Problem, nothing_known
+from vrw_jax.models import Indicators, Margins, SectionState, ViscoelasticWheel
+from vrw_jax.numerics import (
+    N_NODES,
+    Options,
+    Scalar,
+    Solution,
+    compiled_by_caller,
+    floquet,
+    mesh_error,
+)
+from vrw_jax.results import Row, listed
+from vrw_jax.walks import step
+from vrw_jax.wheel import (
+    Motion,
+    Outcome,
+    Symbols,
+    WheelParams,
+    dynamics,
+    parameters_of,
+    transitions,
+    wheel_of,
+)
+
+
+class LimitCycle(AbstractCycle):
+    """A gait of the paper's wheel, found by collocation. Batched under vmap.
+
+    See `AbstractCycle`. Differentiable in the parameters, in every mode and to any order.
+    """
+
+    section_state: SectionState  # (theta-, dtheta-, dL1-) before touchdown, fixed under return_map
+    post_impact: Float[Array, "2"]  # (theta, dtheta) after the first landing, rad, rad/s
+    durations: Float[Array, "*n 3"]  # of DLS, SLS-I, SLS-II, s; (n, 3) for period_n = n > 1
+    step_length: Float[Array, "*n"]  # distance between the feet at the landing, m; (n,) for n > 1
+    indicators: Indicators  # of the landing; (n,) each for n > 1
+    outcome: Int[Array, ""]  # Outcome.STEPPED, NO_CYCLE_FOUND or BAD_INPUT
+    residual: Scalar  # last correction of Newton's method, rad, rad/s, s or m
+    passes: Int[Array, ""]  # linearised passes that the search took
+    parameters: Float[Array, " n_parameters"]  # in the order of params.PARAMETER_NAMES
+    located: Located  # the solution itself: a start for neighbours
+    matrix: Float[Array, "2 2"]  # value of the monodromy matrix, without derivative
+    problem: Problem = eqx.field(static=True)
+
+    @property
+    def period_n(self) -> int:
+        return self.problem.period_n
+
+    @property
+    def near(self) -> Located:
+        return self.located
+
+    def _mapped(self, of_one: Callable) -> Callable:
+        """A function of one cycle, over the axes of this batch."""
+        for _ in range(self.outcome.ndim):
+            of_one = jax.vmap(of_one)
+        return of_one
+
+    @property
+    def monodromy(self) -> Float[Array, "... 2 2"]:
+        """Derivative of the return to the section after the impact, over (theta+, dtheta+).
+
+        A third multiplier, in the section before it, is zero.
+        """
+        attach_one = attach_monodromy if compiled_by_caller() else _compiled_attach
+        attach = self._mapped(functools.partial(attach_one, self.problem))
+        return attach(self.matrix, self.parameters, self.located)
+
+    @property
+    def jury_margins(self) -> Array:
+        """Margins to fold, period doubling, Neimark-Sacker: see floquet.jury_margins."""
+        return floquet.jury_margins(self.monodromy)
+
+    @property
+    def at_double_multiplier(self) -> Bool[Array, "..."]:
+        """Whether the spectral radius is at a kink, because two multipliers tie."""
+        return floquet.at_double_multiplier(self.matrix) & self.found
+
+    @property
+    def mesh_error(self) -> Array:
+        """Estimate, mostly too large, of the mesh's error: see collocation.mesh_error.
+
+        Above 1e-5 a gait does not count as found: give `CycleOptions` more steps.
+        """
+
+        def of_one(solution: Solution) -> Array:
+            lanes = jax.tree.map(lambda x: x[..., None], solution)
+            return mesh_error(self.problem.sequence, self.problem.meshes, lanes)[0]
+
+        return jnp.where(self.found, self._mapped(of_one)(self.located.solution), 0.0)
+
+    @property
+    def takeoff_acceleration(self) -> Array:
+        """With which the rear foot leaves the ground, m/s^2: see `premises`; least of the steps."""
+        of_one = functools.partial(_takeoff, self.problem)
+        return jnp.where(self.found, self._mapped(of_one)(self.parameters, self.located), 0.0)
+
+    @property
+    def monitors(self) -> Margins:
+        """The premises' margins over the (first) step, by walking it once event by event."""
+
+        def walk(parameters: Array, section_state: Array) -> Margins:
+            wheel = wheel_of(parameters, self.problem.n_legs)
+            return step(wheel, section_state).monitors
+
+        return self._mapped(walk)(self.parameters, self.section_state)
+
+    def own_rows(self) -> list[Row]:
+        forces = self.indicators
+        told = f"{listed(forces.lambda_I4)} N s, {listed(forces.lambda_2)} N"
+        return [
+            ("durations of DLS, SLS-I, SLS-II", f"{listed(self.durations)} s"),
+            ("indicators λ_I4, λ2⁺, λ4⁺", f"{told}, {listed(forces.lambda_4)} N"),
+        ]
+
+
+def _takeoff(problem: Problem, parameters: Array, located: Located) -> Array:
+    s = wheel_of(parameters, problem.n_legs).symbols()
+    _, steps = problem.passages(parameters, located.solution)
+    return jnp.min(jnp.stack([takeoff_acceleration(s, sls1) for _, sls1, _ in steps]))
+
+
+_compiled_attach = jax.jit(attach_monodromy, static_argnums=0)
+
+
+def solved(params: WheelParams, problem: Problem, guess: Located | None) -> LimitCycle:
+    find = _find_cycle if compiled_by_caller() else _compiled_find_cycle
+    return find(params, problem, guess)
+
+
+def _find_cycle(params: WheelParams, problem: Problem, guess: Located | None) -> LimitCycle:
+    usable = params.in_domain()
+    table_1 = WheelParams(n_legs=problem.n_legs)
+    safe = jax.tree.map(lambda x, d: jnp.where(usable, x, d.astype(x.dtype)), params, table_1)
+    parameters = parameters_of(safe)
+    located, (matrix, residual, passes) = solve_cycle(problem, parameters, guess)
+    found = usable & (located.found > 0.5)
+    # Zero measures and zero derivatives where there is no cycle: mask what goes in and comes out.
+    masked = lambda x: jnp.where(found, x, 0.0)
+    stand_in = lambda x, d: jnp.where(found, x, d)
+    parameters = jax.tree.map(stand_in, parameters, parameters_of(table_1).astype(parameters.dtype))
+
+    s = wheel_of(parameters, problem.n_legs).symbols()
+    n = problem.period_n
+    # theta, its rate and that of L1: L1 itself follows from theta at touchdown.
+    states = [jnp.stack([end[0], *end[2:]]) for end in located.ends]
+    # The landing that opens step k follows the state at the end of the step before.
+    landings = [transitions.land(s, *states[k - 1]) for k in range(n)]
+    forces = [transitions.landing_forces(s, landing) for landing in landings]
+
+    def over_steps(values: list[Array]) -> Array:
+        return masked(values[0] if n == 1 else jnp.stack(values))
+
+    durations = located.solution.durations
+    code = jnp.where(found, Outcome.STEPPED, Outcome.NO_CYCLE_FOUND)
+    return LimitCycle(
+        section_state=masked(states[-1]),
+        post_impact=masked(located.solution.section),
+        durations=masked(durations[0] if n == 1 else durations),
+        step_length=over_steps([landing.distance for landing in landings]),
+        indicators=Indicators(
+            lambda_I4=over_steps([landing.rear.normal for landing in landings]),
+            lambda_2=over_steps([fore.normal for fore, _ in forces]),
+            lambda_4=over_steps([rear.normal for _, rear in forces]),
+        ),
+        outcome=jnp.where(usable, code, Outcome.BAD_INPUT).astype(jnp.int32),
+        residual=jnp.where(jnp.isfinite(residual), residual, 1.0),
+        passes=passes,
+        parameters=parameters,
+        located=located,
+        matrix=masked(matrix),
+        problem=problem,
+    )
+
+
+_compiled_find_cycle = eqx.filter_jit(_find_cycle)
+
+N_SAMPLES = 1025
+"""Points of each phase between which a walked guess is interpolated. With too few, 33 at c = 221,
+the fast start of a step without double support is lost, and Newton with it."""
+
+
+@eqx.filter_jit
+def walked_guess(params: WheelParams, problem: Problem, x: SectionState) -> Located:
+    """The cycle's unknowns as `period_n` event-driven steps from a section state tell them."""
+    model, options, s = ViscoelasticWheel(), Options(), params.symbols()
+    landing = transitions.land(s, *x)
+    section = jnp.stack([landing.theta, landing.motion.dtheta])
+    durations, accelerations = [], []
+    for _ in range(problem.period_n):
+        distance = transitions.land(s, *x).distance
+        states = model.trace(params, x, options, N_SAMPLES).state
+        walked = model.advance(params, x, options)
+        x = walked.section_state
+        durations.append(walked.durations)
+        accelerations.append(_accelerations_along(problem, s, distance, states))
+    together = jnp.stack(durations)
+    by_phase = tuple(jnp.stack(steps) for steps in zip(*accelerations, strict=True))
+    happens = (together > 0.0).astype(section.dtype)
+    solution = Solution(section, together, by_phase)
+    return lax.stop_gradient(Located(solution, happens, *nothing_known(problem, section)))
+
+
+def _accelerations_along(
+    problem: Problem, s: Symbols, distance: Scalar, states: Float[Array, "3 n_samples 6"]
+) -> tuple[Array, ...]:
+    """Accelerations at the nodes of each phase, (step, node, coordinate), of a sampled step."""
+    told = []
+    for i, (phase, mesh) in enumerate(zip(problem.sequence.phases, problem.meshes, strict=True)):
+        known, wanted = jnp.linspace(0.0, 1.0, states.shape[1]), jnp.asarray(mesh.node_times)
+        rows = [jnp.interp(wanted, known, states[i, :, j]) for j in range(states.shape[2])]
+        motion = Motion.of(*rows)
+        acceleration = (
+            dynamics.double_support_acceleration(s, distance, motion),
+            dynamics.single_support_1_acceleration(s, motion),
+            dynamics.single_support_2_acceleration(s, motion),
+        )[i]
+        nodes = jnp.stack(acceleration[: phase.dim], axis=-1)
+        told.append(nodes.reshape(mesh.n_steps, N_NODES, phase.dim))
+    return tuple(told)

@@ -1,0 +1,90 @@
+"""A tuned gait, how it was come by, and what holds it there."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+from vrw_jax.results import as_html, as_text
+from vrw_jax.runtime import xarray as xr
+from vrw_jax.tuning.climbing import Ending
+from vrw_jax.tuning.starts import Lanes
+from vrw_jax.wheel import DOMAINS, Outcome, WheelParams
+
+
+class Active(NamedTuple):
+    """A constraint or bound that holds the optimum."""
+
+    name: str  # of the constraint (with the leg, if it has one), or of the parameter
+    limit: float  # its margin, or the bound
+    unit: str
+    price: float  # objective gained per unit of limit given up
+
+
+class Walked(NamedTuple):
+    """What walking the tuned wheel showed, from a start displaced a little."""
+
+    steps: int
+    outcome: Outcome
+    distance: float  # from the limit cycle after the last step, rad, rad/s and m/s
+    kept: bool  # whether every step kept every constraint on a monitor, within 1e-3 of its scale
+
+
+@dataclasses.dataclass(frozen=True)
+class Tuned:
+    """A tuned gait, how it was come by, and what holds it there."""
+
+    params: WheelParams
+    ending: Ending
+    objective: str
+    value: float
+    start_value: float
+    cycle: Any  # LimitCycle, or WalkedCycle on real ground
+    step: Any  # StepResult, or UnilateralStep
+    active: tuple[Active, ...]
+    kkt_residual: float  # of the first-order condition, relative to the objective's gradient
+    unkept: tuple[str, ...]  # premises that were no constraint and are broken
+    walked: Walked
+    path: xr.Dataset  # every gait that was evaluated, in order
+    evaluations: int  # limit cycles, each with one step
+    shortened: int  # trials that lost the gait or its branch
+    seconds: float  # of which `compile_seconds` went to compiling
+    compile_seconds: float  # and to exploring, if there were many starts
+    lanes: Lanes | None = None  # where many starts got to before the climb
+
+    @property
+    def converged(self) -> bool:
+        """Whether the climb ended at an optimum."""
+        return self.ending == Ending.CONVERGED
+
+    def lines(self) -> dict[str, str]:
+        """The result in words, for a reader."""
+        free = [str(name) for name in self.path.attrs["free"]]
+        wheel = [
+            f"{n} {float(getattr(self.params, n)):.6g} {DOMAINS[n].unit}".strip() for n in free
+        ]
+        kept = "every constraint kept" if self.walked.kept else "a constraint broken"
+        kept = kept if self.path.sizes["constraint"] else "no constraint to keep"
+        held = [f"{a.name} at {a.limit:.6g} {_plain(a.unit)}".strip() for a in self.active]
+        return {
+            "objective": f"{self.objective}: {self.start_value:.6g} at the start, {self.value:.6g}",
+            "wheel": ", ".join(wheel),
+            "ending": f"{self.ending.name}: {self.ending.meaning}",
+            "held by": ", ".join(held) or "nothing: a maximum inside all bounds and constraints",
+            "not asked for, and broken": ", ".join(self.unkept) or "none",
+            "walked": f"{self.walked.steps} steps, {self.walked.outcome.name}, "
+            f"{self.walked.distance:.1e} from the cycle at last; {kept}",
+            "cost": f"{self.evaluations} gaits, {self.shortened} steps shortened, "
+            f"{self.seconds - self.compile_seconds:.2f} s and {self.compile_seconds:.1f} s to "
+            "compile",
+        }
+
+    def __repr__(self) -> str:
+        return as_text("Tuned", self.lines().items())
+
+    def _repr_html_(self) -> str:
+        return as_html("Tuned gait", self.lines().items())
+
+
+def _plain(unit: str) -> str:
+    return "" if unit == "1" else unit
