@@ -18,7 +18,8 @@ import xarray as xr
 from support.scanning import GRID, MEASURES, Counted, arithmetic, planned
 
 import vrw_jax as vrw
-from vrw_jax.scans import dask, evaluate, running
+from vrw_jax.cycles import finder
+from vrw_jax.scans import dask, running
 from vrw_jax.scans import design as designs
 from vrw_jax.scans import store as scan_store
 from vrw_jax.scans.dask import workers
@@ -390,7 +391,7 @@ def test_a_cycle_that_the_step_does_not_confirm_is_told_so(
     engine: Engine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     engine({"damping": np.array([200.0])})
-    monkeypatch.setattr(evaluate, "AGREEMENT", 0.0)
+    monkeypatch.setattr(finder, "AGREEMENT", 0.0)
     told = engine({"damping": np.array([200.0])})
     assert told["outcome"] == Outcome.NO_CYCLE_FOUND
     assert np.isnan(told["speed"])

@@ -69,7 +69,7 @@ def most_dls_gait(tuned: Tuned):
     """The gait at a result, evaluated afresh and from no neighbour."""
     problem = problem_of("dls_fraction")
     u = (np.array([float(getattr(tuned.params, n)) for n in FREE]) - problem.lower) / problem.widths
-    return problem.evaluate(u, None).gait
+    return problem.evaluate(u, None).told
 
 
 def test_no_wheel_on_a_grid_around_the_optimum_is_better(most_dls):

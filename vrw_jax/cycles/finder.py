@@ -39,7 +39,7 @@ class Gait(eqx.Module):
     posture: Float[Array, "*lanes n"]  # section state and durations, which tell branches apart
     d_posture: Float[Array, "*lanes n_values n"]
     order: Array  # what may not change along a branch: which phases happen
-    returns: Float[Array, "*lanes n n"]  # derivative of the return to the section
+    returns: Float[Array, "*lanes m m"]  # derivative of the return to the section
 
     @property
     def outcome(self) -> np.ndarray:
