@@ -23,7 +23,7 @@ from experiments.shared.tables import DOCS, markdown
 from experiments.shared.timing import on_one_core, processor, seconds
 from experiments.shared.wheels import WIDE_BOX, rows_of
 from experiments.shared.wheels import wheels as wheels_of_rows
-from vrw_jax.cycles.sensitivity import MEASURES
+from vrw_jax.cycles import MEASURED, ON_STABILITY
 from vrw_jax.wheel import parameters_of, wheel_of
 
 N_SETS, N_STAGES, LANES = 2048, 48, 1024
@@ -154,11 +154,11 @@ def throughput() -> dict[str, float]:
 def sensitivity_ratio() -> dict[str, float]:
     """Milliseconds of one gait alone: a return map, a cycle, and a full sensitivity."""
     params, x = vrw.WheelParams(), vrw.limit_cycle(vrw.WheelParams()).section_state
-    names = [name for name in MEASURES if name not in ("spectral_radius", "stability_margin")]
+    names = [name for name in MEASURED if name not in ON_STABILITY]
 
     def told(v: jax.Array) -> jax.Array:
         cycle = vrw.limit_cycle(wheel_of(v, 8))
-        return jnp.stack([MEASURES[name][1](cycle) for name in names])
+        return jnp.stack([cycle.measure(name) for name in names])
 
     v = parameters_of(params)
     return {

@@ -30,7 +30,7 @@ from experiments.shared.command import command, extra, started
 from experiments.shared.tables import FIGURES, markdown, replace, write_named
 from vrw_jax import figures as plots
 from vrw_jax.app.config import load
-from vrw_jax.tuning import objective as tune_engine
+from vrw_jax.cycles import AGREEMENT
 from vrw_jax.tuning import tune
 from vrw_jax.tuning.problem import TuneProblem, tuning_problem
 from vrw_jax.wheel import wheel_of
@@ -93,16 +93,15 @@ class Counter:
 
 def values_of(problem: TuneProblem) -> Callable:
     """Whether there is a gait, and objective and constraints, compiled without derivatives."""
-    engine = problem.engine
+    sought, finder = problem.engine.sought, problem.finder
 
     def values(parameters: jax.Array) -> tuple[jax.Array, jax.Array]:
         wheel = wheel_of(parameters, problem.params.n_legs)
-        cycle = vrw.limit_cycle(wheel)
-        step = engine.model.step(wheel, cycle.section_state, engine.options)
-        agrees = jnp.max(jnp.abs(step.section_state - cycle.section_state)) < tune_engine.AGREEMENT
-        told = [jnp.ravel(engine.objective(cycle, step))]
-        told += [jnp.ravel(tune_engine.read(name, cycle, step)) for name in engine.constraints]
-        return cycle.found & (step.outcome == vrw.Outcome.STEPPED) & agrees, jnp.concatenate(told)
+        cycle = finder.cycle(wheel)
+        step = finder.model.step(wheel, cycle.section_state, finder.step_options)
+        agrees = jnp.max(jnp.abs(step.section_state - cycle.section_state)) <= AGREEMENT
+        found = cycle.found & (step.outcome == vrw.Outcome.STEPPED) & agrees
+        return found, sought(cycle, step)
 
     return jax.jit(values)
 
@@ -150,7 +149,7 @@ def by_tune(problem: TuneProblem, u: np.ndarray, scales: np.ndarray) -> Seen:
     began = time.perf_counter()
     tuned = tune(
         problem.wheel(u),
-        problem.engine.objective,
+        problem.engine.sought.objective,
         problem.free,
         dict(zip(problem.free, zip(problem.lower, problem.upper, strict=True), strict=True)),
         problem.margins,

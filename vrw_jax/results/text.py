@@ -38,13 +38,13 @@ def as_markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[st
 
 
 _MATH = {
-    "θ": r"\theta ", "λ": r"\lambda ", "μ": r"\mu ", "ρ": r"\rho ", "Δ": r"\Delta ",
+    "θ": r"\theta ", "λ": r"\lambda ", "μ": r"\mu ", "ρ": r"\rho ", "σ": r"\sigma ", "Δ": r"\Delta ",
     "∂": r"\partial ", "phi": r"\phi ", "min": r"\min ",
     "⁺": "^+", "⁻": "^-", "²": "^2", "*": "^*", "₀": "_0", "₁": "_1",
 }  # fmt: skip
 _TOKEN = re.compile(
-    r"_(?P<below>\w[\w-]*(?:, ?\w+)?)|(?P<dotted>\w)\u0307|(?P<word>[A-Za-z]{2,}(?:-I+)?)"
-    r"|(?P<index>(?<=[^\W\d_]|\u0307)\d)|(?P<sign>[^\s\d()|/,A-Za-z-])"
+    r"_(?P<below>\w[\w-]*(?:, ?\w+)?)|(?P<dotted>\w)\u0307|(?P<twice>\w)\u0308|(?P<word>[A-Za-z]{2,}(?:-I+)?)"
+    r"|(?P<index>(?<=[^\W\d_]|\u0307|\u0308)\d)|(?P<sign>[^\s\d()|/,A-Za-z-])"
 )
 
 
@@ -58,9 +58,12 @@ def _token_as_tex(found: re.Match[str]) -> str:
     text = found[kind]
     roman = kind == "word" or re.search("[A-Za-z]{3}", text)
     told = _MATH.get(text, f"\\mathrm{{{text}}}" if roman else text)
-    return {"below": f"_{{{told}}}", "dotted": f"\\dot{{{told}}}", "index": f"_{told}"}.get(
-        kind, told
-    )
+    return {
+        "below": f"_{{{told}}}",
+        "dotted": f"\\dot{{{told}}}",
+        "twice": f"\\ddot{{{told}}}",
+        "index": f"_{told}",
+    }.get(kind, told)
 
 
 def listed(values: object) -> str:
