@@ -38,12 +38,13 @@ def as_markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[st
 
 
 _MATH = {
-    "θ": r"\theta ", "λ": r"\lambda ", "μ": r"\mu ", "ρ": r"\rho ", "σ": r"\sigma ", "Δ": r"\Delta ",
-    "∂": r"\partial ", "phi": r"\phi ", "min": r"\min ",
+    "θ": r"\theta ", "λ": r"\lambda ", "μ": r"\mu ", "ρ": r"\rho ", "Δ": r"\Delta ",
+    "σ": r"\sigma ", "∂": r"\partial ", "phi": r"\phi ", "min": r"\min ",
     "⁺": "^+", "⁻": "^-", "²": "^2", "*": "^*", "₀": "_0", "₁": "_1",
 }  # fmt: skip
 _TOKEN = re.compile(
-    r"_(?P<below>\w[\w-]*(?:, ?\w+)?)|(?P<dotted>\w)\u0307|(?P<twice>\w)\u0308|(?P<word>[A-Za-z]{2,}(?:-I+)?)"
+    r"_(?P<below>\w[\w-]*(?:, ?\w+)?)|(?P<dotted>\w)\u0307|(?P<twice>\w)\u0308"
+    r"|(?P<word>[A-Za-z]{2,}(?:-I+)?)"
     r"|(?P<index>(?<=[^\W\d_]|\u0307|\u0308)\d)|(?P<sign>[^\s\d()|/,A-Za-z-])"
 )
 
