@@ -13,7 +13,8 @@ from typer.testing import CliRunner, Result
 
 from vrw_jax.app.cli import app
 from vrw_jax.app.printing import scan_reporter
-from vrw_jax.scans.running import Plan, Progress
+from vrw_jax.scans.planning import Plan
+from vrw_jax.scans.running import Progress
 from vrw_jax.scans.store import open_scan
 
 SCAN = """

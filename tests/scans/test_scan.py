@@ -19,13 +19,14 @@ from support.scanning import GRID, MEASURES, Counted, arithmetic, planned
 
 import vrw_jax as vrw
 from vrw_jax.cycles import finder
-from vrw_jax.scans import dask, running
+from vrw_jax.scans import dask, planning
 from vrw_jax.scans import design as designs
 from vrw_jax.scans import store as scan_store
 from vrw_jax.scans.dask import workers
 from vrw_jax.scans.evaluate import LANES, Engine
 from vrw_jax.scans.offer import ALWAYS
-from vrw_jax.scans.running import Chunk, Plan, Progress, plan, run
+from vrw_jax.scans.planning import Chunk, Plan, plan
+from vrw_jax.scans.running import Progress, run
 from vrw_jax.scans.store import chunk_shape, first_difference, open_scan
 from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams
@@ -115,6 +116,38 @@ def test_a_chunk_whose_writing_broke_off_is_computed_again(
         assert files(store) == files(tmp_path / "whole.zarr")
         fails_at += 7  # coprime to the writes per chunk, so that every kind of write has its turn
     assert broke_off > 10
+
+
+@pytest.mark.parametrize("kind", ["ViscoelasticWheel", "UnilateralWheel", "LadderWheel"])
+def test_a_store_of_version_0_1_tells_its_two_stability_margins_apart(
+    tmp_path: Path, kind: str
+) -> None:
+    """There `stability_margin` was labelled 1 - rho, and was that on real ground alone."""
+    radius, rung = np.array([0.5, 0.9]), np.array([1, 2], np.int8)
+    held = np.where(rung == 1, 0.123, 1.0 - radius)
+    label = {"symbol": "1 - ρ", "units": "1"}
+    xr.Dataset(
+        {
+            "spectral_radius": ("damping", radius),
+            "rung": ("damping", rung),
+            "stability_margin": ("damping", held, label),
+            scan_store.DONE: ("chunk", [1]),
+        },
+        {"damping": [100.0, 200.0]},
+        {scan_store.MANIFEST: {"model": {"kind": kind}}},
+    ).to_zarr(tmp_path / "old", zarr_format=3, consolidated=False)
+    found = open_scan(tmp_path / "old")
+    if kind == "ViscoelasticWheel":
+        np.testing.assert_array_equal(found.stability_margin, held)
+        assert "spectral_margin" not in found
+        assert found.stability_margin.attrs["symbol"] != "1 - ρ"
+        return
+    np.testing.assert_array_equal(found.spectral_margin, 1.0 - radius)
+    assert found.spectral_margin.attrs["symbol"] == "1 - ρ"
+    if kind == "UnilateralWheel":
+        assert "stability_margin" not in found
+    else:
+        np.testing.assert_array_equal(found.stability_margin, [0.123, np.nan])
 
 
 KILLED = """
@@ -217,12 +250,12 @@ def test_an_unfinished_scan_is_not_gone_on_with_by_other_code(
     store = tmp_path / "s.zarr"
     with pytest.raises(KeyboardInterrupt):
         run(planned(), store, evaluate=Counted(2))
-    monkeypatch.setattr(running, "code_digest", lambda: "other")
+    monkeypatch.setattr(planning, "code_digest", lambda: "other")
     with pytest.raises(ValueError, match="the library's code differs"):
         run(planned(), store, evaluate=arithmetic)
     monkeypatch.undo()
     run(planned(), store, evaluate=arithmetic)
-    monkeypatch.setattr(running, "code_digest", lambda: "other")
+    monkeypatch.setattr(planning, "code_digest", lambda: "other")
     run(planned(), store, evaluate=Counted(1))  # finished: nothing is computed, all is there
 
 

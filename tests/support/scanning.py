@@ -8,7 +8,7 @@ from vrw_jax.results.measures import MARGINS
 from vrw_jax.scans import design as designs
 from vrw_jax.scans.design import Columns
 from vrw_jax.scans.evaluate import Engine as Engine
-from vrw_jax.scans.running import Plan, plan
+from vrw_jax.scans.planning import Plan, plan
 from vrw_jax.scans.running import run as run
 from vrw_jax.wheel.outcomes import Outcome
 

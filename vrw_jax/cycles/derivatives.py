@@ -16,7 +16,14 @@ from jax import lax
 from jaxtyping import Array
 
 from vrw_jax import simd
-from vrw_jax.cycles.search import Located, Parameters, Problem, columns_of, not_searched, search
+from vrw_jax.cycles.search import (
+    Located,
+    Parameters,
+    Problem,
+    columns_of,
+    not_searched,
+    search_lanes,
+)
 from vrw_jax.numerics import (
     Linearised,
     Solution,
@@ -105,7 +112,7 @@ def solve_cycle(
     """Search for one wheel, differentiable in its parameters; the guess has no derivative."""
     nothing = lambda problem, parameters, *_: not_searched(problem, parameters)
     alike = lambda problem, parameters, located: located
-    find = one_wheel(_over_lanes(search, nothing, problem, blocked=False))
+    find = one_wheel(_over_lanes(search_lanes, nothing, problem, blocked=False))
     columns_at = one_wheel(_over_lanes(_tangent_space, alike, problem, blocked=True))
     start = () if guess is None else (guess,)
 

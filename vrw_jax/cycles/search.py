@@ -6,6 +6,7 @@ Wheels still without a cycle after an attempt are packed together for the next o
 """
 
 import functools
+import operator
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -15,9 +16,9 @@ from jax import export, lax
 from jaxtyping import Array, Bool, Inexact, Int
 
 from vrw_jax import simd
-from vrw_jax.cycles import sequence as sequences
-from vrw_jax.cycles import surface as gait_surface
 from vrw_jax.cycles.options import CycleOptions
+from vrw_jax.cycles.sequence import constants_of, held_landing
+from vrw_jax.cycles.surface import gait_on_surface
 from vrw_jax.numerics import (
     N_NODES,
     LaneArray,
@@ -49,7 +50,7 @@ class Problem(NamedTuple):
 
     @property
     def sequence(self) -> PhaseSequence:
-        return sequences.held_landing(self.n_legs)
+        return held_landing(self.n_legs)
 
     @property
     def meshes(self) -> tuple[Mesh, ...]:
@@ -58,7 +59,7 @@ class Problem(NamedTuple):
 
     @property
     def constants_of(self) -> Callable:
-        return functools.partial(sequences.constants_of, self.n_legs)
+        return functools.partial(constants_of, self.n_legs)
 
     def pass_at(
         self, parameters: Parameters, located: "Located", wanted: tuple[int, ...] = ()
@@ -115,7 +116,7 @@ for _type in (Solution, Located, Finding):
 
 def surface_start(problem: Problem, parameters: Parameters, with_dls: Array) -> Located:
     """The gait that the stored surface predicts; without DLS its duration goes to SLS-I."""
-    predicted = gait_surface.start(wheel_of(parameters, problem.n_legs), problem.meshes)
+    predicted = gait_on_surface(wheel_of(parameters, problem.n_legs), problem.meshes)
     first, second, third = predicted.durations[0]
     durations = jnp.stack(
         [jnp.where(with_dls, first, 0.0), jnp.where(with_dls, second, first + second), third]
@@ -209,6 +210,20 @@ class _Iterate(NamedTuple):
     passes: Int[Array, " lanes"]
 
 
+def _first_iterate(problem: Problem, start: Located, pending: Bool[Array, " lanes"]) -> _Iterate:
+    size, dtype = problem.sequence.section_size, start.found.dtype
+    lanes = pending.shape[-1]
+    return _Iterate(
+        iteration=jnp.zeros((), jnp.int32),
+        located=start,
+        monodromy=jnp.zeros((size, size, lanes), dtype),
+        residual=jnp.ones((lanes,), dtype),
+        converged=jnp.zeros((lanes,), bool),
+        running=pending,
+        passes=jnp.zeros((lanes,), jnp.int32),
+    )
+
+
 def newton(
     problem: Problem,
     parameters: Parameters,
@@ -224,8 +239,6 @@ def newton(
     lane that converged stands still, so that its result does not depend on its neighbours.
     """
     options = problem.options
-    size = problem.sequence.section_size
-    lanes = parameters.shape[-1]
     floor = 1e3 * jnp.finfo(parameters.dtype).eps
     tolerance = max(options.tolerance, float(floor))
 
@@ -262,17 +275,8 @@ def newton(
             passes=now.passes + now.running,
         )
 
-    first = _Iterate(
-        iteration=jnp.zeros((), jnp.int32),
-        located=start,
-        monodromy=jnp.zeros((size, size, lanes), parameters.dtype),
-        residual=jnp.ones((lanes,), parameters.dtype),
-        converged=jnp.zeros((lanes,), bool),
-        running=pending,
-        passes=jnp.zeros((lanes,), jnp.int32),
-    )
     going = lambda now: jnp.any(now.running) & (now.iteration < iterations + stages)
-    last = lax.while_loop(going, iterate, first)
+    last = lax.while_loop(going, iterate, _first_iterate(problem, start, pending))
     found = last.converged & signs_hold(problem, parameters, last.located)
     located = last.located._replace(found=found.astype(parameters.dtype))
     return Finding(located, last.monodromy, last.residual, last.passes)
@@ -312,7 +316,39 @@ def signs_hold(problem: Problem, parameters: Parameters, located: Located) -> Bo
     return good & (mesh_error(sequence, problem.meshes, solution) < LARGEST_MESH_ERROR)
 
 
-def search(
+def _is(attempt: Array, *names: str) -> Array:
+    """Whether it is one of these of ATTEMPTS."""
+    return functools.reduce(operator.or_, [attempt == ATTEMPTS.index(name) for name in names])
+
+
+def _attempted(
+    problem: Problem, attempt: Array, parameters: Parameters, now: Finding, guess: Located | None
+) -> Finding:
+    """One attempt on the lanes that have no cycle yet."""
+    options = problem.options
+    table_1 = parameters_of(WheelParams(n_legs=problem.n_legs)).astype(parameters.dtype)
+    iterations = dict.fromkeys(ATTEMPTS, options.iterations) | {
+        "guess": options.first_iterations, "surface": options.first_iterations
+    }  # fmt: skip
+    limits = jnp.asarray([iterations[name] for name in ATTEMPTS], jnp.int32)
+    origin = jnp.broadcast_to(table_1[:, None], parameters.shape)
+    is_homotopy = _is(attempt, "homotopy")
+    place = jnp.where(is_homotopy, origin, parameters)
+    with_dls = jnp.broadcast_to(~_is(attempt, "without DLS"), parameters.shape[-1:])
+    stages = jnp.where(is_homotopy, options.stages, 0)
+    start = surface_start(problem, place, with_dls)
+    goes_on = _is(attempt, "guess, on", "surface, on")
+    start = jax.tree.map(lambda s, n: jnp.where(goes_on, n, s), start, now.located)
+    if guess is not None:
+        is_guess = _is(attempt, "guess")
+        start = jax.tree.map(lambda s, g: jnp.where(is_guess, g, s), start, guess)
+    pending = now.located.found < 0.5
+    tried = newton(problem, parameters, start, origin, stages, limits[attempt], pending)
+    chosen = jax.tree.map(lambda a, b: jnp.where(pending, a, b), tried, now)
+    return chosen._replace(passes=now.passes + tried.passes)
+
+
+def search_lanes(
     problem: Problem,
     parameters: Parameters,
     guess: Located | None = None,
@@ -321,41 +357,12 @@ def search(
 
     Parameters must be usable.
     """
-    options = problem.options
     n_lanes = parameters.shape[-1]
-    block = min(options.block, n_lanes)
-    table_1 = parameters_of(WheelParams(n_legs=problem.n_legs)).astype(parameters.dtype)
-    iterations = dict.fromkeys(ATTEMPTS, options.iterations) | {
-        "guess": options.first_iterations, "surface": options.first_iterations
-    }  # fmt: skip
-    limits = jnp.asarray([iterations[name] for name in ATTEMPTS], jnp.int32)
-    is_now = lambda attempt, name: attempt == ATTEMPTS.index(name)
-
-    def start_of(attempt: Array, parameters: Parameters) -> tuple[Located, Array, Array]:
-        origin = jnp.broadcast_to(table_1[:, None], parameters.shape)
-        is_homotopy = is_now(attempt, "homotopy")
-        place = jnp.where(is_homotopy, origin, parameters)
-        with_dls = jnp.broadcast_to(~is_now(attempt, "without DLS"), parameters.shape[-1:])
-        stages = jnp.where(is_homotopy, options.stages, 0)
-        return surface_start(problem, place, with_dls), origin, stages
-
-    def attempt_block(
-        attempt: Array, parameters: Parameters, now: Finding, guess: Located | None
-    ) -> Finding:
-        start, origin, stages = start_of(attempt, parameters)
-        goes_on = is_now(attempt, "guess, on") | is_now(attempt, "surface, on")
-        start = jax.tree.map(lambda s, n: jnp.where(goes_on, n, s), start, now.located)
-        if guess is not None:
-            is_guess = is_now(attempt, "guess")
-            start = jax.tree.map(lambda s, g: jnp.where(is_guess, g, s), start, guess)
-        pending = now.located.found < 0.5
-        tried = newton(problem, parameters, start, origin, stages, limits[attempt], pending)
-        chosen = jax.tree.map(lambda a, b: jnp.where(pending, a, b), tried, now)
-        return chosen._replace(passes=now.passes + tried.passes)
+    block = min(problem.options.block, n_lanes)
 
     def attempt_all(attempt: Array, now: Finding) -> Finding:
         if n_lanes <= block or simd.tracing():
-            return attempt_block(attempt, parameters, now, guess)
+            return _attempted(problem, attempt, parameters, now, guess)
         order = jnp.argsort(now.located.found, stable=True)
         everything = jax.tree.map(lambda x: x[..., order], (parameters, now, guess))
 
@@ -363,7 +370,7 @@ def search(
             parameters, now, guess = inputs
             return lax.cond(
                 jnp.any(now.located.found < 0.5),
-                lambda: attempt_block(attempt, parameters, now, guess),
+                lambda: _attempted(problem, attempt, parameters, now, guess),
                 lambda: now,
             )
 

@@ -35,7 +35,7 @@ class Surface(NamedTuple):
 
 
 @functools.cache
-def surface() -> Surface:
+def stored_surface() -> Surface:
     """The stored surface."""
     file = importlib.resources.files("vrw_jax.cycles") / "surface.npz"
     with file.open("rb") as stream, np.load(stream) as arrays:
@@ -71,9 +71,9 @@ def monomials(centred: tuple[Elementwise, ...]) -> list[Elementwise]:
     return products
 
 
-def start(params: WheelParams, meshes: tuple[Mesh, ...]) -> Solution:
+def gait_on_surface(params: WheelParams, meshes: tuple[Mesh, ...]) -> Solution:
     """Section, durations and accelerations on `meshes` of the surface's gait, lanes last."""
-    fit = surface()
+    fit = stored_surface()
     numbers = (x.tolist() for x in fit[:4])  # plain floats keep the format of the parameters
     centred = tuple(
         (jnp.clip(x, low, high) - centre) / spread

@@ -18,7 +18,7 @@ from vrw_jax.runtime import start_jax
 from vrw_jax.scans.design import Columns
 from vrw_jax.scans.evaluate import Engine, n_cores
 from vrw_jax.scans.ground import GroundEngine, LadderEngine, engine_for
-from vrw_jax.scans.running import Chunk, Plan, Through, difference, origin
+from vrw_jax.scans.planning import Chunk, Plan, Through, difference, origin
 
 if TYPE_CHECKING:
     from distributed import Client

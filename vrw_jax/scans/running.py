@@ -8,49 +8,31 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import platform
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import jax
 import numpy as np
 
 from vrw_jax.cycles import CycleOptions
-from vrw_jax.models import AbstractWheel, ViscoelasticWheel
 from vrw_jax.numerics import Options
-from vrw_jax.results import MARGINS, attrs_of, provenance
-from vrw_jax.runtime import code_digest
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.scans.design import AbstractDesign, Columns
-from vrw_jax.scans.evaluate import LANES, Engine, n_cores
-from vrw_jax.scans.ground import GroundEngine, LadderEngine, engine_for
-from vrw_jax.scans.offer import OFFERS, check_measures, offer_of, variable_attrs
+from vrw_jax.scans.design import AbstractDesign
+from vrw_jax.scans.evaluate import LANES, n_cores
+from vrw_jax.scans.offer import offer_of
+from vrw_jax.scans.planning import Chunk, Evaluate, Plan, Through, difference, origin, plan
 from vrw_jax.scans.store import (
     MANIFEST,
     PROVENANCE,
     AbstractStore,
-    Layout,
     MemoryStore,
-    Variable,
     ZarrStore,
-    chunk_shape,
     create,
-    first_difference,
     stored_manifest,
 )
-from vrw_jax.walks import ModelLike, rung_of
-from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, WheelParams
+from vrw_jax.walks import ModelLike
+from vrw_jax.wheel import Outcome, WheelParams
 
-CHUNK = 4096
-"""Most samples of a chunk, unless asked for otherwise: what a killed scan can lose."""
-
-Evaluate = Callable[[Columns], Mapping[str, np.ndarray]]
-"""Results of a block of samples by variable, samples first."""
-Chunk = tuple[int, Mapping[str, np.ndarray]]
-"""Number of a chunk and its results."""
-Through = Callable[["Plan", Sequence[int]], Iterator[Chunk]]
-"""Carries out chunks of a plan, by number, in any order."""
 Report = Callable[["Progress"], None]
 
 
@@ -62,108 +44,6 @@ class Progress:
     done: int  # of them
     failed: int  # of those, without a steady gait
     kept: int  # samples that an earlier run had computed
-
-
-@dataclass(frozen=True)
-class Plan:
-    """Everything about a scan that is known before it runs."""
-
-    design: AbstractDesign
-    measures: tuple[str, ...]
-    base: WheelParams
-    model: AbstractWheel
-    options: Options
-    cycle_options: CycleOptions
-    layout: Layout
-    text: str = ""
-
-    @property
-    def settings(self) -> dict[str, object]:
-        """What a store must have been made with to be gone on with."""
-        swept = self.design.names
-        return {
-            "design": self.design.description(),
-            "wheel": {
-                name: float(getattr(self.base, name))
-                for name in PARAMETER_NAMES
-                if name not in swept
-            }
-            | {"n_legs": self.base.n_legs},
-            "measures": list(self.measures),
-            "model": _fields(self.model),
-            "options": _fields(self.options),
-            "cycle_options": _fields(self.cycle_options),
-            "dtype": str(self.base.damping.dtype),
-            "chunk": list(self.layout.chunk),
-        }
-
-    @property
-    def attrs(self) -> dict[str, object]:
-        """Attributes of the whole result."""
-        return {
-            "title": f"Steady gaits of the viscoelastic-legged rimless wheel over "
-            f"{', '.join(self.design.names)}",
-            "rule": "NaN, or -1 in an integer, where the outcome is not STEPPED.",
-            MANIFEST: self.settings,
-            PROVENANCE: origin(),
-            "config": self.text,
-        }
-
-    def engine(self) -> Engine | GroundEngine | LadderEngine:
-        """The function that computes samples."""
-        return engine_for(self.measures, self.base, self.model, self.options, self.cycle_options)
-
-
-def plan(
-    design: AbstractDesign,
-    measures: Iterable[str] | None = None,
-    *,
-    base: WheelParams | None = None,
-    model: ModelLike | None = None,
-    options: Options | None = None,
-    cycle_options: CycleOptions | None = None,
-    chunk: int | None = None,
-    text: str = "",
-) -> Plan:
-    """Check what is asked for and lay out the result, without computing anything."""
-    if not isinstance(design, AbstractDesign):
-        raise TypeError(
-            f"design is a {type(design).__name__}, but it must say which samples: write "
-            "vrw.grid(damping=[...]), vrw.samples({...}), vrw.sobol({...}, n) or vrw.uniform."
-        )
-    base = WheelParams() if base is None else base
-    if base.damping.ndim:
-        raise ValueError(
-            "base holds batches, but it is the one wheel whose parameters the design replaces: "
-            "give scalars, and what varies in the design."
-        )
-    options = Options() if options is None else options
-    options.require_reachable(np.dtype(base.damping.dtype))
-    if chunk is not None and chunk < 1:
-        raise ValueError(f"chunk is {chunk}, but it must be at least 1 sample.")
-    model = rung_of(model)
-    if model.rung not in OFFERS:
-        raise TypeError(
-            f"model is {model!r}, but a scan is of gaits with compliant legs: give "
-            'vrw.ViscoelasticWheel(), vrw.UnilateralWheel() or "auto".'
-        )
-    if FRICTION in design.names and FRICTION not in model.parameter_names:
-        raise ValueError(
-            "the design sweeps friction, which the paper's wheel does not feel: give "
-            'model=vrw.UnilateralWheel() or "auto".'
-        )
-    offer = offer_of(model)
-    names = check_measures(offer.default if measures is None else measures, offer)
-    return Plan(
-        design=design,
-        measures=names,
-        base=base,
-        model=model,
-        options=options,
-        cycle_options=CycleOptions() if cycle_options is None else cycle_options,
-        layout=_layout(design, (*names, *offer.always), base, CHUNK if chunk is None else chunk),
-        text=text,
-    )
 
 
 def scan(
@@ -210,16 +90,6 @@ def carried(dask: str | None) -> contextlib.AbstractContextManager[Through | Non
     from vrw_jax.scans.dask import workers
 
     return workers(dask)
-
-
-def origin() -> dict[str, object]:
-    """Where numbers of this process come from: code, versions, device."""
-    told = provenance(WheelParams(), ViscoelasticWheel(), Options())
-    return {
-        "code": code_digest(),
-        "versions": told["versions"],
-        "device": f"{jax.default_backend()}: {told['device']}, {_processor()}",
-    }
 
 
 def run(
@@ -288,31 +158,6 @@ def open_store(planned: Plan, path: Path) -> ZarrStore:
     return kept
 
 
-VECTOR_SETS = ("avx", "fma", "avx2", "avx512f", "avx512dq", "asimd", "sve")
-"""Instruction sets that decide which sums the compiler fuses, and so the last digits."""
-
-
-def _processor() -> str:
-    """The kind of processor, as far as last digits depend on it."""
-    try:
-        words = set(Path("/proc/cpuinfo").read_text().split())
-    except OSError:
-        words = set()
-    return " ".join([platform.machine(), *(name for name in VECTOR_SETS if name in words)])
-
-
-def difference(there: object, here: object) -> str:
-    """The first setting that differs, in words; empty where none does."""
-    name, old, new = first_difference(there, here)
-    if not name:
-        return ""
-    if name == "design.digest":
-        return "the values of the swept parameters differ"
-    if name == "code":
-        return "the library's code differs"
-    return f"{name} is {old!r} there and {new!r} here"
-
-
 def _size(region: tuple[slice, ...]) -> int:
     return int(np.prod([part.stop - part.start for part in region]))
 
@@ -337,52 +182,6 @@ def _disk_full_explained(
             f"no space is left for {store}, where {n_done} chunks are complete: make room and run "
             "the same again, it goes on from there",
         ) from error
-
-
-def _layout(
-    design: AbstractDesign, names: tuple[str, ...], base: WheelParams, chunk: int
-) -> Layout:
-    dtype = str(base.damping.dtype)
-    legs = np.arange(3, base.n_legs + 1)
-
-    def variable(name: str) -> Variable:
-        attrs = variable_attrs(name)
-        if name in ("outcome", "rung", "reason"):
-            return Variable(name, "int8", -1, attrs)
-        if name == "solver_steps":
-            return Variable(name, "int32", -1, attrs)
-        if name in MARGINS and MARGINS[name].axis:
-            return Variable(name, dtype, np.nan, attrs, ("leg",), (len(legs),))
-        return Variable(name, dtype, np.nan, attrs)
-
-    coordinates = {
-        name: (dim, values, attrs_of(name) if name in (*PARAMETER_NAMES, FRICTION) else {})
-        for name, (dim, values) in design.coordinates().items()
-    }
-    coordinates["leg"] = ("leg", legs, {"long_name": "locked leg", "units": "1"})
-    return Layout(
-        dims=design.dims,
-        shape=design.shape,
-        chunk=chunk_shape(design.shape, chunk),
-        variables=tuple(variable(name) for name in names),
-        coordinates=coordinates,
-    )
-
-
-def _fields(settings: object) -> dict[str, object]:
-    """The fields of a settings object as plain values."""
-    told: dict[str, object] = {"kind": type(settings).__name__}
-    for name in type(settings).__dataclass_fields__:  # type: ignore[attr-defined]
-        value = getattr(settings, name)
-        if isinstance(value, Options):
-            continue  # recorded by itself
-        if isinstance(value, bool | int | str):
-            told[name] = value
-        elif isinstance(value, tuple):
-            told[name] = list(value)
-        else:
-            told[name] = float(value)
-    return told
 
 
 def explained(planned: Plan, store: str | Path | None = None) -> dict[str, str]:

@@ -21,6 +21,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vrw_jax.models import VISCOELASTIC
+from vrw_jax.results import MEASURES
 from vrw_jax.runtime import library
 from vrw_jax.runtime import xarray as xr
 
@@ -191,7 +193,27 @@ def open_scan(path: str | Path) -> xr.Dataset:
         dataset = xr.open_zarr(
             path, consolidated=False, chunks=None, mask_and_scale=False, decode_times=False
         )
-    return dataset.drop_vars(DONE)
+    return _told_apart(dataset.drop_vars(DONE))
+
+
+def _told_apart(dataset: xr.Dataset) -> xr.Dataset:
+    """Stores of version 0.1 told two quantities as `stability_margin`, by rung: each by its name.
+
+    It was the smooth Jury margin of the paper's wheel, and 1 - spectral radius on real ground.
+    """
+    old = dataset.get("stability_margin")
+    if old is None or old.attrs.get("symbol") != MEASURES["spectral_margin"].symbol:
+        return dataset
+    smooth, plain = (MEASURES[n].attrs for n in ("stability_margin", "spectral_margin"))
+    kind = dataset.attrs[MANIFEST]["model"]["kind"]
+    if kind == "ViscoelasticWheel":
+        return dataset.assign(stability_margin=old.assign_attrs(smooth))
+    radius = dataset["spectral_radius"].astype(old.dtype)
+    dataset = dataset.assign(spectral_margin=(1.0 - radius).assign_attrs(plain))
+    if kind == "UnilateralWheel":
+        return dataset.drop_vars("stability_margin")
+    of_paper = old.where(dataset["rung"] == VISCOELASTIC).assign_attrs(smooth)
+    return dataset.assign(stability_margin=of_paper)
 
 
 def _require_scan(path: Path) -> zarr.Group:
