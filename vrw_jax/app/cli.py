@@ -11,18 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vrw_jax.app.printing import (
-    err,
-    out,
-    progress_bar,
-    scan_reporter,
-    sentences,
-    tell_facts,
-    tell_gait,
-    tell_outcomes,
-    tell_table,
-    tell_written,
-)
+from vrw_jax.app import printing
+from vrw_jax.app.printing import err, out, sentences
 
 if TYPE_CHECKING:
     from vrw_jax.app.config import Config
@@ -140,7 +130,7 @@ def gait(
                 break
             state = result.section_state
         cycle = limit_cycle(params)
-    tell_gait(params, result, state, walked, cycle)
+    printing.tell_gait(params, result, state, walked, cycle)
 
 
 @app.command()
@@ -161,12 +151,12 @@ def reproduce(
         folder.mkdir(parents=True, exist_ok=True)
     from vrw_jax.paper import reproduce as run
 
-    with progress_bar("reproducing the paper") as bar:
+    with printing.progress_bar("reproducing the paper") as bar:
         task = bar.add_task("starting", total=1.0)
         facts = run(
             folder, progress=lambda share, what: bar.update(task, completed=share, description=what)
         )
-    tell_facts(facts, folder)
+    printing.tell_facts(facts, folder)
     if not all(fact.holds for fact in facts):
         raise typer.Exit(FACT_FAILED)
 
@@ -211,7 +201,7 @@ def scan(
 
         if explain:
             told = explained(planned, store) | {"store": str(store)}
-            tell_table("What this scan would do", told.items())
+            printing.tell_table("What this scan would do", told.items())
             return
         missing = open_store(planned, store).missing()
     if missing:
@@ -219,12 +209,12 @@ def scan(
     else:
         out.print(f"{store} is complete: nothing to compute.", highlight=False)
     dataset = open_scan(store)
-    tell_outcomes(dataset)
+    printing.tell_outcomes(dataset)
     out.print(f"data: {store}", highlight=False, soft_wrap=True)
     if picture:
         from vrw_jax.app.reports import write_scan
 
-        tell_written(write_scan(dataset, folder))
+        printing.tell_written(write_scan(dataset, folder))
 
 
 def _planned(settings: "Config", chunk: int | None) -> "Plan":
@@ -246,9 +236,9 @@ def _compute(planned: "Plan", store: Path, dask: str | None) -> None:
     from vrw_jax.scans import carried, run
 
     try:
-        with sentences(), carried(dask) as through, progress_bar("scan") as bar:
+        with sentences(), carried(dask) as through, printing.progress_bar("scan") as bar:
             task = bar.add_task("compiling", total=None, note="")
-            run(planned, store, report=scan_reporter(bar.update, task), through=through)
+            run(planned, store, report=printing.scan_reporter(bar.update, task), through=through)
     except KeyboardInterrupt:
         err.print(
             f"vrw: stopped; what is done stays in {store}, run the same to go on.", soft_wrap=True
@@ -295,8 +285,8 @@ def tune(
                 options=settings.numerical_options(),
                 max_evaluations=sought.evaluations,
             )
-        tell_table("Tuned gait", tuned.lines().items())
-        tell_written(write_tuned(tuned, folder, picture))
+        printing.tell_table("Tuned gait", tuned.lines().items())
+        printing.tell_written(write_tuned(tuned, folder, picture))
     if not tuned.converged:
         raise typer.Exit(NOT_CONVERGED)
 
@@ -341,7 +331,7 @@ def continue_(
                 options=options,
             )
         out.print(str(branch), highlight=False, markup=False)
-        tell_written(write_branch(branch, folder, picture))
+        printing.tell_written(write_branch(branch, folder, picture))
     if not branch.values.size:
         raise typer.Exit(NOT_CONVERGED)
 

@@ -139,10 +139,8 @@ def _config(tables: Mapping[str, object], text: str, name: str) -> Config:
     _only(tables, TABLES, "the file", "tables")
     for key, table in tables.items():
         if not isinstance(table, dict):
-            raise ConfigError(
-                f"[{key}] is {_shown(table)}, but it must be a table: write [{key}] on a line of "
-                "its own and its settings below."
-            )
+            must = f"a table: write [{key}] on a line of its own and its settings below"
+            raise _wrong(f"[{key}]", table, must)
     given = [kind for kind in DESIGNS if kind in tables]
     if len(given) > 1:
         raise ConfigError(
@@ -209,10 +207,7 @@ def _model(table: Mapping[str, object]) -> dict[str, float | bool]:
         values["friction"] = _number(table["friction"], "friction", positive=True)
     if "stop_at_lift_off" in table:
         if not isinstance(table["stop_at_lift_off"], bool):
-            raise ConfigError(
-                f"stop_at_lift_off is {_shown(table['stop_at_lift_off'])}, but it must be "
-                "true or false."
-            )
+            raise _wrong("stop_at_lift_off", table["stop_at_lift_off"], "true or false")
         values["stop_at_lift_off"] = table["stop_at_lift_off"]
     return values
 
@@ -225,7 +220,7 @@ def _options(table: Mapping[str, object]) -> dict[str, float | int | str]:
         default = getattr(defaults, key)
         if isinstance(default, str):
             if not isinstance(value, str):
-                raise ConfigError(f'{key} is {_shown(value)}, but it must be a name, "{default}".')
+                raise _wrong(key, value, f'a name, "{default}"')
             values[key] = value
         elif isinstance(default, int):
             values[key] = _whole(value, key, 1)
@@ -239,10 +234,8 @@ def _scan(table: Mapping[str, object]) -> ScanConfig:
     measures = table.get("measures")
     if measures is not None:
         if not (isinstance(measures, list) and all(isinstance(m, str) for m in measures)):
-            raise ConfigError(
-                f"measures is {_shown(measures)}, but it must be a list of names: "
-                'write measures = ["dls_fraction", "speed"].'
-            )
+            must = 'a list of names: write measures = ["dls_fraction", "speed"]'
+            raise _wrong("measures", measures, must)
         measures = check_measures(measures)
     chunk = table.get("chunk")
     return ScanConfig(measures, None if chunk is None else _whole(chunk, "chunk", 1))
@@ -255,10 +248,8 @@ def _gait(table: Mapping[str, object]) -> GaitConfig:
     if start is None:
         return GaitConfig(steps)
     if not (isinstance(start, list) and len(start) == 3):
-        raise ConfigError(
-            f"start is {_shown(start)}, but it must be the section state before touchdown, "
-            "three numbers: angle in rad, angular rate in rad/s, rate of Leg 1 in m/s."
-        )
+        must = "the section state before touchdown, three numbers: angle in rad, angular rate in "
+        raise _wrong("start", start, must + "rad/s, rate of Leg 1 in m/s")
     theta, dtheta, dL1 = (_number(value, "start") for value in start)
     return GaitConfig(steps, (theta, dtheta, dL1))
 
@@ -269,10 +260,8 @@ def _tune(table: Mapping[str, object]) -> TuneConfig:
     if isinstance(objective, dict):
         objective = {name: _number(value, name) for name, value in objective.items()}
     elif not isinstance(objective, str):
-        raise ConfigError(
-            f"objective is {_shown(objective)}, but it must be a measure or weights of several: "
-            'write objective = "dls_fraction" or objective = { dls_fraction = 1.0, speed = 0.1 }.'
-        )
+        must = 'a measure or weights of several: write objective = "dls_fraction" or objective = '
+        raise _wrong("objective", objective, must + "{ dls_fraction = 1.0, speed = 0.1 }")
     bounds = table.get("bounds")
     if not isinstance(bounds, dict) or not bounds:
         raise ConfigError(
@@ -283,10 +272,8 @@ def _tune(table: Mapping[str, object]) -> TuneConfig:
     constraints = table.get("constraints")
     if constraints is not None:
         if not isinstance(constraints, dict):
-            raise ConfigError(
-                f"constraints is {_shown(constraints)}, but it must be a table: write "
-                "[tune.constraints] and below it lines such as clearance_sls1 = 0.001."
-            )
+            must = "a table: write [tune.constraints] and below it lines such as "
+            raise _wrong("constraints", constraints, must + "clearance_sls1 = 0.001")
         constraints = {name: _number(value, name) for name, value in constraints.items()}
     return TuneConfig(
         objective=objective,
@@ -358,9 +345,7 @@ def _axis(name: str, value: object) -> np.ndarray:
 
 def _list(name: str, value: object, otherwise: str = "") -> np.ndarray:
     if not isinstance(value, list):
-        raise ConfigError(
-            f"{name} is {_shown(value)}, but it must be a list of numbers{otherwise}."
-        )
+        raise _wrong(name, value, f"a list of numbers{otherwise}")
     if not value:
         raise ConfigError(f"{name} is an empty list, but a scan needs at least one value: add one.")
     return np.asarray([_in_domain(name, item) for item in value])
@@ -369,10 +354,7 @@ def _list(name: str, value: object, otherwise: str = "") -> np.ndarray:
 def _range(name: str, value: object, parameter: str = "") -> tuple[float, float]:
     """Two values in the domain of `parameter`, `name` itself if not given."""
     if not (isinstance(value, list) and len(value) == 2):
-        raise ConfigError(
-            f"{name} is {_shown(value)}, but it must be a range of two numbers: "
-            f"write {name} = [lower, upper]."
-        )
+        raise _wrong(name, value, f"a range of two numbers: write {name} = [lower, upper]")
     lower, upper = (_in_domain(parameter or name, item) for item in value)
     return lower, upper
 
@@ -389,7 +371,7 @@ def _in_domain(name: str, value: object) -> float:
 
 def _number(value: object, name: str, positive: bool = False) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ConfigError(f"{name} is {_shown(value)}, but it must be a finite number.")
+        raise _wrong(name, value, "a finite number")
     if positive and not value > 0:
         raise ConfigError(f"{name} is {value:g}, but it must be positive.")
     return float(value)
@@ -397,9 +379,7 @@ def _number(value: object, name: str, positive: bool = False) -> float:
 
 def _whole(value: object, name: str, least: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise ConfigError(
-            f"{name} is {_shown(value)}, but it must be a whole number of at least {least}."
-        )
+        raise _wrong(name, value, f"a whole number of at least {least}")
     return value
 
 
@@ -411,6 +391,10 @@ def _only(table: Mapping[str, object], allowed: Iterable[str], where: str, kind:
                 f"{where} has the unknown key '{key}'{nearest(key, allowed)}: "
                 f"its {kind} are {', '.join(allowed)}."
             )
+
+
+def _wrong(name: str, value: object, must: str) -> ConfigError:
+    return ConfigError(f"{name} is {_shown(value)}, but it must be {must}.")
 
 
 def _shown(value: object) -> str:

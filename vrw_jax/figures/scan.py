@@ -1,11 +1,12 @@
 """Pictures of scans: DLS fraction, speed and outcome over two parameters, with premise borders."""
 
 from collections.abc import Mapping, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
+from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
@@ -31,10 +32,10 @@ from vrw_jax.figures.style import (
     value_label,
 )
 from vrw_jax.results import MARGINS, MEASURES
-from vrw_jax.scans import OF_CYCLE, SALTELLI, sobol_indices
-from vrw_jax.wheel import PARAMETER_NAMES, Outcome
+from vrw_jax.scans import OF_CYCLE, SALTELLI, SWEPT, sobol_indices
+from vrw_jax.wheel import Outcome
 
-PREFERRED = ("damping", "slope", "stiffness", "natural_length", *PARAMETER_NAMES)
+PREFERRED = ("damping", "slope", "stiffness", "natural_length", *SWEPT)
 """Which axes a picture takes first: across, then up, then side by side."""
 
 Dash = Literal["-", "--", "-.", ":"]
@@ -57,8 +58,7 @@ MOST_COLUMNS, MOST_PAIRED, MOST_DRAWN = 4, 6, 20_000
 
 def scan_figures(scan: xr.Dataset) -> dict[str, Figure]:
     """Pictures of a scan by name: one for each axis that can be set side by side."""
-    names = [name for name in PREFERRED if name in scan.coords]
-    names = list(dict.fromkeys(names))
+    names = [name for name in dict.fromkeys(PREFERRED) if name in scan.coords]
     if "sample" in scan.dims:
         swept = [name for name in names if np.ptp(scan[name].values) > 0.0] or names
         if len(swept) < 3:
@@ -83,7 +83,7 @@ def slice_figure(scan: xr.Dataset, x: str, y: str, across: str | None = None) ->
 
     Axes that are not shown are cut at their middle value, which the title names. Grey: no gait.
     """
-    cut = {n: scan.sizes[n] // 2 for n in PARAMETER_NAMES if n in scan.dims}
+    cut = {n: scan.sizes[n] // 2 for n in SWEPT if n in scan.dims}
     cut = {name: place for name, place in cut.items() if name not in (x, y, across)}
     shown = scan.isel(cut)
     columns = [shown]
@@ -91,7 +91,7 @@ def slice_figure(scan: xr.Dataset, x: str, y: str, across: str | None = None) ->
         n = scan.sizes[across]
         places = np.unique(np.linspace(0, n - 1, min(n, MOST_COLUMNS)).round().astype(int))
         columns = [shown.isel({across: int(place)}) for place in places]
-    rows = [name for name in ("dls_fraction", "speed") if name in scan]
+    rows = _shown(scan)
     width = PAGE if len(columns) > 1 else COLUMN
     figure = Figure(figsize=(width, 1.65 * (len(rows) + 1) + 1.0))
     panels = figure.subplots(len(rows) + 1, len(columns), sharex=True, sharey=True, squeeze=False)
@@ -129,27 +129,19 @@ def sample_figure(scan: xr.Dataset, names: Sequence[str]) -> Figure:
     """DLS fraction, speed and outcome of single samples over the first two parameters."""
     x, y = (names[0], names[1]) if len(names) > 1 else (names[0], "sample")
     walks = scan.outcome.values == Outcome.STEPPED
-    rows = [name for name in ("dls_fraction", "speed") if name in scan]
+    rows = _shown(scan)
     size = float(np.clip(3000.0 / max(scan.sizes["sample"], 1), 1.0, 12.0))
     figure = Figure(figsize=(PAGE, 2.9))
     panels = figure.subplots(1, len(rows) + 1, sharey=True, squeeze=False)[0]
-    dot = {"s": size, "linewidths": 0.0, "rasterized": True}
     for axes, name in zip(panels, rows, strict=False):
-        axes.scatter(scan[x].values[~walks], scan[y].values[~walks], color=LIGHT, **dot)
-        points = axes.scatter(
-            scan[x].values[walks], scan[y].values[walks], c=scan[name].values[walks], **dot
-        )
+        points = _draw_values(axes, scan[x].values, scan[y].values, scan[name].values, walks, size)
         figure.colorbar(points, ax=axes, location="top", aspect=25).set_label(axis_label(name))
-    told = _codes(scan).values
-    codes = np.unique(told)
-    for code in codes:
-        there = told == code
-        color = outcome_style(int(code))[1]
-        panels[-1].scatter(scan[x].values[there], scan[y].values[there], color=color, **dot)
+    codes = _codes(scan).values
+    _draw_outcomes(panels[-1], scan[x].values, scan[y].values, codes, size)
     for axes in panels:
         axes.set_xlabel(axis_label(x, "{symbol}"))
     panels[0].set_ylabel("sample" if y == "sample" else axis_label(y, "{symbol}"))
-    _legend(figure, codes, {}, 3)
+    _legend(figure, np.unique(codes), {}, 3)
     return figure
 
 
@@ -161,11 +153,10 @@ def pairs_figure(scan: xr.Dataset, names: Sequence[str]) -> Figure:
     the first MOST_DRAWN samples are drawn, which are as well spread as all.
     """
     shown = scan.isel(sample=slice(MOST_DRAWN))
-    value = next((name for name in ("dls_fraction", "speed") if name in scan), None)
+    value = next(iter(_shown(scan)), None)
     codes, walks = _codes(shown).values, shown.outcome.values == Outcome.STEPPED
-    kinds, d = np.unique(codes), len(names)
+    d = len(names)
     size = float(np.clip(8000.0 / len(codes), 0.6, 8.0))
-    dot = {"s": size, "linewidths": 0.0, "rasterized": True}
     figure = Figure(figsize=(PAGE, PAGE * 0.9))
     panels = figure.subplots(d, d, sharex="col", squeeze=False)
     points = None
@@ -174,12 +165,9 @@ def pairs_figure(scan: xr.Dataset, names: Sequence[str]) -> Figure:
         if i == j:
             _share_along(axes, x, codes == Outcome.STEPPED)
         elif i < j:
-            axes.scatter(x, y, color=[outcome_style(int(code))[1] for code in codes], **dot)
-        else:
-            axes.scatter(x[~walks], y[~walks], color=LIGHT, **dot)
-            if value is not None:
-                told = shown[value].values[walks]
-                points = axes.scatter(x[walks], y[walks], c=told, **dot)
+            _draw_outcomes(axes, x, y, codes, size)
+        elif value is not None:
+            points = _draw_values(axes, x, y, shown[value].values, walks, size)
         if i == d - 1:
             axes.set_xlabel(axis_label(names[j], "{symbol}"))
         if j == 0 and i > 0:
@@ -190,8 +178,24 @@ def pairs_figure(scan: xr.Dataset, names: Sequence[str]) -> Figure:
     if value is not None and points is not None:
         bar = figure.colorbar(points, ax=panels.ravel().tolist(), aspect=40, pad=0.01)
         bar.set_label(axis_label(value, "{name}"))
-    _legend(figure, kinds, {}, 3)
+    _legend(figure, np.unique(codes), {}, 3)
     return figure
+
+
+def _draw_values(
+    axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, walks: np.ndarray, size: float
+) -> PathCollection:
+    """Samples in the colours of a measure, in grey where there is none to tell."""
+    dot: dict[str, Any] = {"s": size, "linewidths": 0.0, "rasterized": True}
+    axes.scatter(x[~walks], y[~walks], color=LIGHT, **dot)
+    return axes.scatter(x[walks], y[walks], c=values[walks], **dot)
+
+
+def _draw_outcomes(
+    axes: Axes, x: np.ndarray, y: np.ndarray, codes: np.ndarray, size: float
+) -> None:
+    colors = [outcome_style(int(code))[1] for code in codes]
+    axes.scatter(x, y, s=size, color=colors, linewidths=0.0, rasterized=True)
 
 
 def _share_along(axes: Axes, x: np.ndarray, walks: np.ndarray) -> None:
@@ -243,8 +247,8 @@ def indices_figure(indices: xr.Dataset) -> Figure:
 @figure_style()
 def curve_figure(scan: xr.Dataset, x: str) -> Figure:
     """DLS fraction and speed along one parameter; grey where there is no gait."""
-    scan = scan.isel({n: 0 for n in PARAMETER_NAMES if n in scan.dims and n != x}).sortby(x)
-    rows = [name for name in ("dls_fraction", "speed") if name in scan] or ["fore_foot_force"]
+    scan = scan.isel({n: 0 for n in SWEPT if n in scan.dims and n != x}).sortby(x)
+    rows = _shown(scan) or ["fore_foot_force"]
     figure = Figure(figsize=(COLUMN, 1.6 * len(rows) + 0.6))
     panels = figure.subplots(len(rows), 1, sharex=True, squeeze=False)[:, 0]
     edges = _edges(scan[x].values)
@@ -256,6 +260,11 @@ def curve_figure(scan: xr.Dataset, x: str) -> Figure:
             axes.axvspan(edges[cell], edges[cell + 1], color=LIGHT, linewidth=0.0, zorder=0)
     panels[-1].set_xlabel(axis_label(x))
     return figure
+
+
+def _shown(scan: xr.Dataset) -> list[str]:
+    """Which measures are drawn."""
+    return [name for name in ("dls_fraction", "speed") if name in scan]
 
 
 def _limits(values: Sequence[np.ndarray]) -> tuple[float, float]:

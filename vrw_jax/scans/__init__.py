@@ -1,7 +1,7 @@
 """The steady gait of every sample of a design, as one labelled dataset."""
 
 from vrw_jax.scans import design
-from vrw_jax.scans.design import SALTELLI, grid, saltelli, samples, sobol, uniform
+from vrw_jax.scans.design import SALTELLI, SWEPT, grid, saltelli, samples, sobol, uniform
 from vrw_jax.scans.indices import sobol_indices
 from vrw_jax.scans.offer import DEFAULT_MEASURES, OF_CYCLE, check_measures
 from vrw_jax.scans.running import (
