@@ -62,6 +62,10 @@ def _read_gaits(
     return jax.vmap(one)(wheels, points.z, points.p)
 
 
+def _kept(table: Table) -> np.ndarray:
+    return (table["outcome"] == Outcome.STEPPED) & (table["closure"] <= AGREEMENT)
+
+
 def _is_margin(name: str) -> bool:
     return name in INDICATORS or name.partition("[")[0] in MARGINS
 
@@ -129,9 +133,9 @@ def continue_branches(
     """
     model = rung_of(model)
     refuse_ladder(model, "followed")
-    names = model.parameter_names
-    if name not in names:
-        raise ValueError(f"{name!r} is no parameter: choose from {', '.join(names)}.")
+    if name not in model.parameter_names:
+        known = ", ".join(model.parameter_names)
+        raise ValueError(f"{name!r} is no parameter: choose from {known}.")
     low, high = (float(b) for b in bounds)
     if not low < high:
         raise ValueError(f"bounds are ({low:g}, {high:g}), but the lower must come first.")
@@ -152,16 +156,13 @@ def continue_branches(
         found = _read_gaits(start.followed, model, step_options, wheels, points)
         return jax.tree.map(np.asarray, found)
 
-    def kept(table: Table) -> np.ndarray:
-        return (table["outcome"] == Outcome.STEPPED) & (table["closure"] <= AGREEMENT)
-
     run = Run(
         start.followed,
         options,
         start.wheels,
         np.array([low, high]),
         functools.partial(_by_leg, read, range(3, params.n_legs + 1)),
-        kept,
+        _kept,
         _is_margin,
         ENDING,
         EXACT,

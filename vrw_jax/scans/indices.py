@@ -64,10 +64,8 @@ def sobol_indices(
         """First-order and total, over measures and parameters, from rows."""
         drawn = told[..., some]
         found = indices_of(func={"f_A": drawn[0], "f_B": drawn[1], "f_AB": drawn[2:]}, n=n)
-        shape = (len(wanted), len(parameters))
-        return np.stack(
-            [np.reshape(found.first_order, shape), np.reshape(found.total_order, shape)]
-        )
+        both, shape = (found.first_order, found.total_order), (len(wanted), len(parameters))
+        return np.stack([np.reshape(some, shape) for some in both])
 
     generator = np.random.default_rng(0)  # the same scan gives the same intervals
     found = indices(np.arange(n))

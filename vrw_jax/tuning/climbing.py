@@ -151,8 +151,7 @@ def climb(evaluate: Evaluate, start: Trial, *, tolerance: float, max_evaluations
         return trial
 
     centre, radius, widest = start, WHOLE, WHOLE
-    ending = Ending.CONVERGED
-    known = 0
+    ending, known = Ending.CONVERGED, 0
     while True:
         # A round that evaluated nothing new would only be repeated: the next one sees less.
         widest = widest if len(record.trials) > known else 0.5 * widest

@@ -77,11 +77,13 @@ def basin(
             {"units": "1", "long_name": "steps until the orbit is reached, or the fall"},
         ),
     }
-    labels = {name: xr.Variable(name, values[name], dict(MEASURES[name].attrs)) for name in axes}
-    labels |= {
-        name: xr.Variable((), values[name][0], dict(MEASURES[name].attrs))
-        for name in names
-        if name not in axes
+    labels = {
+        name: xr.Variable(
+            name if name in axes else (),
+            values[name] if name in axes else values[name][0],
+            dict(MEASURES[name].attrs),
+        )
+        for name in (*axes, *(name for name in names if name not in axes))
     }
     orbits = _orbits(params, attractors.orbits, longest_period, model, options)
     attrs = {

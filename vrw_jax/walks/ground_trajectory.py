@@ -25,6 +25,7 @@ from vrw_jax.models import (
 )
 from vrw_jax.numerics import Options
 from vrw_jax.runtime import xarray as xr
+from vrw_jax.walks.samples import Stretches, joined
 from vrw_jax.wheel import Outcome, WheelParams
 
 LEGWISE = {  # unit, long name
@@ -97,61 +98,53 @@ def simulate_ground(
     ends the trajectory; the attributes `outcome` and `outcome_meaning` say why. Of the ladder,
     `rung` and `reason` say for each time which rung served and why (see `ModelChoice`).
     """
-    slope = float(params.slope)
-    weight = float(params.gravity) * float(params.hub_mass + params.n_legs * params.leg_mass)
-    parts: list[dict[str, np.ndarray]] = []
-    outcome, stepped, time, place = Outcome.STEPPED, 0, 0.0, 0.0
-    while outcome == Outcome.STEPPED and stepped < n_steps:
+    served: dict[str, Array] = {}
+
+    def stretches(x: Array) -> Stretches:
         result = model.step(params, x, options)
-        trace, columns = jax.tree.map(np.asarray, _columns(model, params, x, options, n_samples))
-        outcome = Outcome(int(result.outcome))
-        for phase in np.flatnonzero(trace.duration > 0.0):
-            part = {name: values[phase].copy() for name, values in columns.items()}
-            for name in ("hub_x", "foot_x"):
-                part[name] += place
-            part["gravitational_energy"] -= weight * np.sin(slope) * place
-            part["time"] = trace.time[phase] + time
-            part["step"] = np.full(n_samples, stepped)
-            part["contact"] = np.tile(trace.contact[phase], (n_samples, 1))
-            for name, value in result.served().items():
-                part[name] = np.full(n_samples, int(value))
-            part["on_stopper"] = np.tile(trace.locked[phase], (n_samples, 1))
-            parts.append(part)
-        time += float(result.period)
-        if outcome == Outcome.STEPPED:
-            stepped += 1
-            place += float(result.step_length)
-            x = result.section_state
-    joined = lambda name, width: (
-        np.concatenate([part[name] for part in parts]) if parts else np.zeros((0, *width))
-    )
-    variables = {
-        name: xr.Variable("time", joined(name, ()), {"units": unit, "long_name": long_name})
-        for name, (unit, long_name) in SCALAR.items()
-    } | {
-        name: xr.Variable(
-            ("time", "leg"),
-            joined(name, (params.n_legs,)),
-            {"units": unit, "long_name": long_name},
+        trace, columns = jax.tree.map(np.array, _columns(model, params, x, options, n_samples))
+        served.update(result.served())
+        shape = (len(trace.duration), n_samples)
+        over_samples = lambda legs: np.repeat(legs[:, None], n_samples, axis=1)
+        columns |= {"time": trace.time, "contact": over_samples(trace.contact)}
+        columns |= {name: np.full(shape, int(value)) for name, value in result.served().items()}
+        columns["on_stopper"] = over_samples(trace.locked)
+        return Stretches(
+            columns,
+            trace.duration,
+            Outcome(int(result.outcome)),
+            result.section_state,
+            float(result.period),
+            float(result.step_length),
         )
-        for name, (unit, long_name) in LEGWISE.items()
+
+    s = params.symbols()
+    told = joined(
+        stretches, x, n_steps, ("hub_x", "foot_x"), ("gravitational_energy",),
+        float(s.Mt * s.g * s.sin_phi),
+    )  # fmt: skip
+    tables = (("time",), SCALAR), (("time", "leg"), LEGWISE)
+    variables = {
+        name: xr.Variable(dims, told.columns[name], {"units": unit, "long_name": long_name})
+        for dims, table in tables
+        for name, (unit, long_name) in table.items()
     }
     variables["contact"].attrs |= {"flag_values": [0, 1, 2, 3], "flag_meanings": MODES}
-    for name in result.served():
-        variables[name] = xr.Variable("time", joined(name, ()), SERVED[name])
+    variables |= {name: xr.Variable("time", told.columns[name], SERVED[name]) for name in served}
+    time = {"units": "s", "long_name": "time"}
     return xr.Dataset(
         variables,
         {
-            "time": xr.Variable("time", joined("time", ()), {"units": "s", "long_name": "time"}),
-            "step": xr.Variable("time", joined("step", ()), {"long_name": "number of the step"}),
+            "time": xr.Variable("time", told.columns["time"], time),
+            "step": xr.Variable("time", told.columns["step"], {"long_name": "number of the step"}),
             "leg": np.arange(1, params.n_legs + 1),
         },
         {
             "title": f"Walk of the {type(model).__name__}",
             "frame": "x downhill along the slope, z normal to it, first landing at the origin",
             "friction": float(model.friction),
-            "n_steps": stepped,
-            "outcome": outcome.name,
-            "outcome_meaning": outcome.meaning,
+            "n_steps": told.n_stepped,
+            "outcome": told.outcome.name,
+            "outcome_meaning": told.outcome.meaning,
         },
     )

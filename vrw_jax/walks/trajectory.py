@@ -17,6 +17,7 @@ from vrw_jax.numerics import Options
 from vrw_jax.results import TRAJECTORY, attrs_of, provenance
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.walks.ground_trajectory import simulate_ground
+from vrw_jax.walks.samples import Stretches, joined
 from vrw_jax.walks.stepping import ModelLike, SectionLike, checked
 from vrw_jax.wheel import (
     Motion,
@@ -90,50 +91,58 @@ def simulate(
     if not n_samples >= 2:
         raise ValueError(f"n_samples is {n_samples}, but a phase has two ends: give 2 or more.")
     params, x, model, options = checked(params, x, model, options)
-    if model.tells_contacts:
-        walked = simulate_ground(
-            params, x, n_steps, model=model, options=options, n_samples=n_samples
-        )
-        return walked.assign_attrs(provenance(params, model, options))
-    s = params.symbols()
-    weight_along = float(s.Mt * s.g * s.sin_phi)
-    parts: list[dict[str, np.ndarray]] = []
-    start, outcome, stepped, time, foot = x, Outcome.STEPPED, 0, 0.0, 0.0
-    while outcome == Outcome.STEPPED and stepped < n_steps:
+    simulated = simulate_ground if model.tells_contacts else _simulate_phases
+    walked = simulated(params, x, n_steps, model=model, options=options, n_samples=n_samples)
+    return walked.assign_attrs(provenance(params, model, options))
+
+
+def _simulate_phases(
+    params: WheelParams,
+    x: SectionState,
+    n_steps: int,
+    *,
+    model: AbstractWheel,
+    options: Options,
+    n_samples: int,
+) -> xr.Dataset:
+    """Of rungs that step through the paper's phases."""
+
+    def stretches(x: Array) -> Stretches:
         advance = model.advance(params, x, options)
-        columns = jax.tree.map(np.asarray, _columns(model, params, x, options, n_samples))
-        outcome = Outcome(int(advance.outcome))
-        durations = np.asarray(advance.durations)
-        for phase in np.flatnonzero(durations > 0.0):
-            part = {name: values[phase].copy() for name, values in columns.items()}
-            for name in ("x", "foot_1_x", "foot_2_x", "hub_x", "ahead"):
-                part[name] += foot
-            for name in ("gravitational_energy", "total_energy"):
-                part[name] -= weight_along * foot
-            part["time"] += time
-            part["step"] = np.full(n_samples, stepped)
-            part["phase"] = np.full(n_samples, phase)
-            parts.append(part)
-        if outcome == Outcome.STEPPED:
-            stepped += 1
-            time += float(durations.sum())
-            foot = float(parts[-1]["ahead"][-1])
-            x = advance.section_state
-    joined = {
-        name: np.concatenate([part[name] for part in parts]) if parts else np.zeros(0)
-        for name in TRAJECTORY
+        columns = jax.tree.map(np.array, _columns(model, params, x, options, n_samples))
+        ahead, durations = columns.pop("ahead"), np.asarray(advance.durations)
+        columns["phase"] = np.tile(np.arange(len(durations))[:, None], (1, n_samples))
+        happened = np.flatnonzero(durations > 0.0)
+        length = float(ahead[happened[-1], -1]) if happened.size else 0.0
+        return Stretches(
+            columns,
+            durations,
+            Outcome(int(advance.outcome)),
+            advance.section_state,
+            float(durations.sum()),
+            length,
+        )
+
+    s = params.symbols()
+    told = joined(
+        stretches, x, n_steps, ALONG, ("gravitational_energy", "total_energy"),
+        float(s.Mt * s.g * s.sin_phi),
+    )  # fmt: skip
+    variables = {
+        name: xr.Variable("time", told.columns[name], attrs_of(name)) for name in TRAJECTORY
     }
+    labels = {name: variables.pop(name) for name in ("time", "step", "phase")}
     attrs = {
         "title": f"Walk of the {type(model).__name__}",
         "frame": "x downhill along the slope, z normal to it, first foot at the origin",
-        "start": [float(v) for v in start],
+        "start": [float(v) for v in x],
         "start_meaning": "theta-, dtheta-, dL1- just before the first landing, rad, rad/s, m/s",
-        "n_steps": stepped,
-        "outcome": outcome.name,
-        "outcome_meaning": outcome.meaning,
+        "n_steps": told.n_stepped,
+        "outcome": told.outcome.name,
+        "outcome_meaning": told.outcome.meaning,
     }
-    variables = {
-        name: xr.Variable("time", values, attrs_of(name)) for name, values in joined.items()
-    }
-    labels = {name: variables.pop(name) for name in ("time", "step", "phase")}
-    return xr.Dataset(variables, labels, attrs | provenance(params, model, options))
+    return xr.Dataset(variables, labels, attrs)
+
+
+ALONG = ("x", "foot_1_x", "foot_2_x", "hub_x")
+"""Columns that are places along the slope."""
