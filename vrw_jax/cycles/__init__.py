@@ -7,17 +7,15 @@ from vrw_jax.cycles.finder import (
     AGREEMENT,
     AbstractGaitFinder,
     Gait,
-    Measured,
-    OnBranch,
     Readings,
     confirmed,
     read_along,
     read_along_lanes,
     same_branch,
 )
-from vrw_jax.cycles.finding import Guess, finder_of, limit_cycle
+from vrw_jax.cycles.finding import finder_of, limit_cycle
 from vrw_jax.cycles.options import CycleOptions
-from vrw_jax.cycles.premises import PREMISES, default_margins, takeoff_acceleration
+from vrw_jax.cycles.premises import default_margins, takeoff_acceleration
 from vrw_jax.cycles.search import Located, Problem, correction_size, nothing_known
 from vrw_jax.cycles.section_cycle import WalkedCycle
 from vrw_jax.cycles.sensitivity import sensitivities

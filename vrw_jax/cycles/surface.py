@@ -37,7 +37,7 @@ class Surface(NamedTuple):
 @functools.cache
 def stored_surface() -> Surface:
     """The stored surface."""
-    file = importlib.resources.files("vrw_jax.cycles") / "surface.npz"
+    file = importlib.resources.files(__package__) / "surface.npz"
     with file.open("rb") as stream, np.load(stream) as arrays:
         return Surface(**{name: arrays[name] for name in Surface._fields})
 

@@ -77,14 +77,7 @@ def basin(
             {"units": "1", "long_name": "steps until the orbit is reached, or the fall"},
         ),
     }
-    labels = {
-        name: xr.Variable(
-            name if name in axes else (),
-            values[name] if name in axes else values[name][0],
-            dict(MEASURES[name].attrs),
-        )
-        for name in (*axes, *(name for name in names if name not in axes))
-    }
+    labels = {name: _label(name, values[name], name in axes) for name in names}
     orbits = _orbits(params, attractors.orbits, longest_period, model, options)
     attrs = {
         "title": "Basins of attraction",
@@ -92,6 +85,11 @@ def basin(
         "starts": "before touchdown" if names == BEFORE else "after landing",
     }
     return xr.Dataset(data | orbits, labels, attrs | provenance(params, model, options))
+
+
+def _label(name: str, values: np.ndarray, is_axis: bool) -> xr.Variable:
+    told = (name, values) if is_axis else ((), values[0])
+    return xr.Variable(*told, dict(MEASURES[name].attrs))
 
 
 def _names(grid: Grid) -> tuple[str, ...]:

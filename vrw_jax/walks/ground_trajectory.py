@@ -25,7 +25,7 @@ from vrw_jax.models import (
 )
 from vrw_jax.numerics import Options
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.walks.samples import Stretches, joined
+from vrw_jax.walks.samples import Joined, Stretches, joined
 from vrw_jax.wheel import Outcome, WheelParams
 
 LEGWISE = {  # unit, long name
@@ -123,10 +123,9 @@ def simulate_ground(
         stretches, x, n_steps, ("hub_x", "foot_x"), ("gravitational_energy",),
         float(s.Mt * s.g * s.sin_phi),
     )  # fmt: skip
-    tables = (("time",), SCALAR), (("time", "leg"), LEGWISE)
     variables = {
         name: xr.Variable(dims, told.columns[name], {"units": unit, "long_name": long_name})
-        for dims, table in tables
+        for dims, table in ((("time",), SCALAR), (("time", "leg"), LEGWISE))
         for name, (unit, long_name) in table.items()
     }
     variables["contact"].attrs |= {"flag_values": [0, 1, 2, 3], "flag_meanings": MODES}
@@ -139,12 +138,16 @@ def simulate_ground(
             "step": xr.Variable("time", told.columns["step"], {"long_name": "number of the step"}),
             "leg": np.arange(1, params.n_legs + 1),
         },
-        {
-            "title": f"Walk of the {type(model).__name__}",
-            "frame": "x downhill along the slope, z normal to it, first landing at the origin",
-            "friction": float(model.friction),
-            "n_steps": told.n_stepped,
-            "outcome": told.outcome.name,
-            "outcome_meaning": told.outcome.meaning,
-        },
+        _attrs(model, told),
     )
+
+
+def _attrs(model: Any, told: Joined) -> dict[str, object]:
+    return {
+        "title": f"Walk of the {type(model).__name__}",
+        "frame": "x downhill along the slope, z normal to it, first landing at the origin",
+        "friction": float(model.friction),
+        "n_steps": told.n_stepped,
+        "outcome": told.outcome.name,
+        "outcome_meaning": told.outcome.meaning,
+    }
