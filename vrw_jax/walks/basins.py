@@ -88,8 +88,8 @@ def basin(
 
 
 def _label(name: str, values: np.ndarray, is_axis: bool) -> xr.Variable:
-    told = (name, values) if is_axis else ((), values[0])
-    return xr.Variable(*told, dict(MEASURES[name].attrs))
+    dims, told = (name, values) if is_axis else ((), values[0])
+    return xr.Variable(dims, told, dict(MEASURES[name].attrs))
 
 
 def _names(grid: Grid) -> tuple[str, ...]:
