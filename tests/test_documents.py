@@ -1,12 +1,16 @@
 """What documents and comments name exists: files, commands, modules."""
 
+import ast
 import re
 from pathlib import Path
 
 import pytest
+from support.rooms import House
 
 ROOT = Path(__file__).parent.parent
-DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+DOCUMENTS = sorted(
+    [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "docs").rglob("*.ipynb")]
+)
 SOURCES = [
     path
     for folder in ("vrw_jax", "experiments", "tests")
@@ -15,6 +19,8 @@ SOURCES = [
 ]
 FILE = re.compile(r"\b((?:tests|vrw_jax|experiments|configs)/[\w/]+(?:\.\w+)?)")
 SCRIPT = re.compile(r"\b(experiments(?:\.[a-z0-9_]+)+)(?<!\.py)")
+HOUSE = House(ROOT / "vrw_jax")
+PLACE = re.compile(rf"`((?:{'|'.join(HOUSE.rooms)})/[a-z_/]+)(?:\.(\w+))?[\w.]*`")
 MODULE = re.compile(r"(?:from|import|`)\s*(vrw_jax(?:\.[a-z_]+)+)")
 
 
@@ -27,9 +33,28 @@ def missing(text):
             yield place
 
 
+def unknown(text):
+    """Modules and names in them, `room/module.name`, that are not there."""
+    for module, name in PLACE.findall(text.replace(".py`", "`")):
+        dotted = "vrw_jax." + module.replace("/", ".")
+        if dotted not in HOUSE.paths:
+            yield module
+        elif name and name not in bound(HOUSE.trees[dotted]):
+            yield f"{module}.{name}"
+
+
+def bound(tree):
+    """Names that a module binds, at any depth."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            yield node.name
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            yield node.id
+
+
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_a_document_names_what_is_there(path):
-    assert not sorted(missing(path.read_text()))
+    assert not sorted({*missing(path.read_text()), *unknown(path.read_text())})
 
 
 def test_sources_name_what_is_there():
@@ -40,4 +65,6 @@ def test_sources_name_what_is_there():
 def test_what_is_not_there_is_seen():
     text = "`tests/test_gone.py`, `python -m experiments.gone`, `from vrw_jax.gone import x`"
     assert len(list(missing(text))) == 3
+    assert list(unknown("`wheel/gone`, `wheel/params.gone`")) == ["wheel/gone", "wheel/params.gone"]
+    assert not list(unknown("`wheel/params.WheelParams.symbols`, `wheel`, `wheel/params`"))
     assert not list(missing("`tests/test_documents.py`, `from vrw_jax.wheel import x`, configs/"))

@@ -141,8 +141,7 @@ class House:
     def _names(self, module: str, tree: ast.AST) -> dict[str, str]:
         """Names that a module imports, wherever in it, and what each stands for."""
         names: dict[str, str] = {}
-        nodes = list(ast.walk(tree))
-        for node in nodes:
+        for node in ast.walk(tree):
             if isinstance(node, ast.Import):
                 for alias in node.names:
                     first = alias.name.split(".")[0]
@@ -150,10 +149,6 @@ class House:
             elif isinstance(node, ast.ImportFrom):
                 origin = self._origin(module, node)
                 names |= {a.asname or a.name: f"{origin}:{a.name}" for a in node.names}
-        if any(loaded(node) == "" for node in nodes):  # by strings: names that are a string, too
-            texts = {node.value for node in nodes if isinstance(node, ast.Constant)}
-            stored = {node.id for node in nodes if isinstance(node, ast.Name)}
-            names |= {name: name for name in (texts & stored) - set(names)}
         own = {getattr(node, "name", "") for node in ast.iter_child_nodes(tree)}
         return {name: origin for name, origin in names.items() if name not in own}
 
@@ -174,7 +169,7 @@ class House:
                 yield from ((f"{origin}:{a.name}", origin, node.lineno) for a in node.names)
             elif isinstance(node, ast.Constant) and node.value in self.paths and "." in node.value:
                 yield node.value, node.value, node.lineno
-            elif name := loaded(node):
+            elif name := loaded(node, names):
                 yield name, name, node.lineno
             elif isinstance(node, ast.Attribute):
                 first, *rest = _chain(node) or [""]
@@ -188,11 +183,13 @@ def _joined(origin: str, names: list[str]) -> str:
     return f"{origin}{'.' if ':' in origin else ':'}{'.'.join(names)}" if names else origin
 
 
-def loaded(node: ast.AST) -> str | None:
+def loaded(node: ast.AST, names: dict[str, str]) -> str | None:
     """What a call imports by name; "" where the name is not written out, None for other nodes."""
     if not isinstance(node, ast.Call) or not node.args:
         return None
-    if (_chain(node.func) or [""])[-1] not in {"import_module", "__import__", "library"}:
+    first, *rest = _chain(node.func) or [""]
+    called = _joined(names.get(first, first), rest).replace(":", ".").split(".")[-1]
+    if called not in {"import_module", "__import__", "library"}:
         return None
     name = node.args[0]
     return name.value if isinstance(name, ast.Constant) else ""

@@ -84,7 +84,9 @@ def strangers(house: House) -> list[str]:
         if inner and not outer and arrow.target in house.paths:
             found.append(f"{_place(arrow)} knows {arrow.target}: simd knows nothing of the rest")
     for module, tree in house.trees.items():
-        if module != lazy and any(loaded(node) == "" for node in ast.walk(tree)):
+        if module != lazy and any(
+            loaded(node, house.names[module]) == "" for node in ast.walk(tree)
+        ):
             found.append(f"{module} loads a module by a name that is not written out")
     return sorted(set(found))
 

@@ -9,7 +9,6 @@ from vrw_jax.results.measures import (
     PHASES,
     STEP,
     TRAJECTORY,
-    Measure,
     attrs_of,
     flags,
     what_breaks,
