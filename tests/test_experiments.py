@@ -16,14 +16,22 @@ MODULES = {
     if path.name != "__init__.py"
 }
 STARTED = """
-import contextlib, importlib, io, json, os, runpy, sys
+import ast, contextlib, importlib, inspect, io, json, os, runpy, sys, types
 from jax._src import xla_bridge
+
+def gone(module):
+    for node in ast.walk(ast.parse(inspect.getsource(module))):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+            other = getattr(module, node.value.id, None)
+            if isinstance(other, types.ModuleType) and not hasattr(other, node.attr):
+                yield f"{node.value.id}.{node.attr}"
+
 told = {}
 environment, cores = dict(os.environ), getattr(os, "sched_getaffinity", lambda _: None)(0)
 for name in sys.argv[1:]:
-    out, sys.argv = io.StringIO(), [name, "--help"]
+    out, sys.argv, absent = io.StringIO(), [name, "--help"], []
     try:
-        importlib.import_module(name)
+        absent = list(gone(importlib.import_module(name)))
         with contextlib.redirect_stdout(out):
             runpy.run_module(name, run_name="__main__", alter_sys=True)
     except SystemExit as end:
@@ -32,10 +40,11 @@ for name in sys.argv[1:]:
         "arrays": xla_bridge._backends, "environment": environment != dict(os.environ),
         "cores": cores != getattr(os, "sched_getaffinity", lambda _: None)(0),
     }.items() if yes]
-    told[name] = out.getvalue(), touched
+    told[name] = out.getvalue(), touched, absent
 print(json.dumps(told))
 """
-"""Imports each module, then runs it with `--help`; what it printed, and what that has touched."""
+"""Imports each module, then runs it with `--help`; what it printed, what that has touched, and what
+it asks of other modules that they do not have."""
 
 
 @pytest.fixture(scope="module")
@@ -51,11 +60,12 @@ def started():
 @pytest.mark.parametrize("module", MODULES)
 def test_an_experiment_starts_and_tells_its_command(module, started):
     text = MODULES[module].read_text()
-    told, touched = started[module]
+    told, touched, absent = started[module]
     if told.startswith("This experiment needs"):
         assert 'pip install -e ".[experiments]"' in told
         pytest.skip(told)
     assert not touched, f"by importing {module}"
+    assert not absent
     assert ast.get_docstring(ast.parse(text))
     if '__name__ == "__main__"' in text:
         assert told.startswith(f"usage: python -m {module}")
