@@ -32,6 +32,15 @@ def test_two_finders_tell_the_same_gait(both, name):
     np.testing.assert_allclose(walked.measure(name), collocated.measure(name), rtol=1e-9, atol=1e-9)
 
 
+def test_a_cycle_tells_what_the_step_from_it_tells(both):
+    collocated, _ = both
+    step = vrw.step(TABLE_1, collocated.section_state, options=vrw.Options.tight()).measures()
+    shared = [name for name in MEASURED if name in step]
+    assert {"dL1_touchdown", "duration_sls2", "lambda_4_plus", "theta_post_impact"} <= {*shared}
+    for name in shared:
+        np.testing.assert_allclose(collocated.measure(name), step[name], rtol=1e-9, atol=1e-9)
+
+
 def test_the_two_margins_of_stability_are_two_quantities(both):
     collocated, _ = both
     radius = np.max(np.abs(np.linalg.eigvals(np.asarray(collocated.matrix))))
