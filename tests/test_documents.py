@@ -68,3 +68,8 @@ def test_what_is_not_there_is_seen():
     assert list(unknown("`wheel/gone`, `wheel/params.gone`")) == ["wheel/gone", "wheel/params.gone"]
     assert not list(unknown("`wheel/params.WheelParams.symbols`, `wheel`, `wheel/params`"))
     assert not list(missing("`tests/test_documents.py`, `from vrw_jax.wheel import x`, configs/"))
+
+
+def test_the_page_of_the_house_tells_every_room_in_the_flow_s_order():
+    text = (ROOT / "docs" / "architecture.md").read_text()
+    assert tuple(re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE)) == HOUSE.rooms
