@@ -17,14 +17,16 @@ from experiments.atlas.events import START, Rows
 from experiments.shared.timing import seconds
 from experiments.speed import peers
 from vrw_jax import Outcome
-from vrw_jax.models.viscoelastic import (
-    PhaseBuilder,
-    double_support,
-    single_support_1,
-    single_support_2,
-)
+from vrw_jax.models.viscoelastic import flow_of
 from vrw_jax.numerics import Watched, integrate_phase
-from vrw_jax.wheel import Motion, Symbols, dynamics, landing_foot_height, transitions
+from vrw_jax.wheel import (
+    Motion,
+    Symbols,
+    dynamics,
+    landing_foot_height,
+    phases_of,
+    transitions,
+)
 
 # --- A leg of first order: SLS-I without the airborne leg's own inertia.
 
@@ -92,14 +94,10 @@ def after_the_layer(s: Symbols, state: jax.Array, rates: Callable) -> jax.Array:
 def step_with_leg(leg: str, params: vrw.WheelParams, x: jax.Array, options: vrw.Options) -> tuple:
     """Section state and durations, and solver steps and outcome of SLS-I, of a step."""
     s = params.symbols()
-    build = PhaseBuilder(s, True, False)
     landing = transitions.land(s, *x)
     on = jnp.asarray(True)
-    dls, sls1, sls2 = (
-        double_support(build, landing.distance),
-        single_support_1(build),
-        single_support_2(build),
-    )
+    phases = phases_of(s, landing.distance, stop_at_lift_off=True)
+    dls, sls1, sls2 = (flow_of(phase, monitored=False) for phase in phases)
     run = lambda phase, y: integrate_phase(phase.field, phase.watched, y, on, options)
     first = run(dls, jnp.stack([landing.theta, landing.motion.dtheta]))
     m = dls.motion(first.state)
@@ -233,7 +231,8 @@ def upright_rate(slope: float, start: np.ndarray) -> float:
     """Rate at which double support leaves its upright equilibrium, 1/s; NaN without one."""
     s = vrw.WheelParams(**SLOW, slope=slope).symbols()
     landing = transitions.land(s, *start)
-    field = double_support(PhaseBuilder(s, True, False), landing.distance).field
+    double_support = phases_of(s, landing.distance, stop_at_lift_off=True)[0]
+    field = flow_of(double_support, monitored=False).field
     push = jax.jit(lambda theta: field(jnp.stack([theta, 0.0 * theta]))[1])
     places = float(landing.theta) + np.linspace(0.0, 1.0, 2001)
     rises = np.diff(np.sign(np.asarray(jax.vmap(push)(jnp.asarray(places))))) > 0

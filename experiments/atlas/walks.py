@@ -10,15 +10,9 @@ import numpy as np
 
 import vrw_jax as vrw
 from vrw_jax import Outcome
-from vrw_jax.models.viscoelastic import (
-    Phase,
-    PhaseBuilder,
-    double_support,
-    single_support_1,
-    single_support_2,
-)
+from vrw_jax.models.viscoelastic import Flow, flow_of
 from vrw_jax.numerics import PhaseEnd, Watched, integrate_phase
-from vrw_jax.wheel import Motion, dynamics, transitions
+from vrw_jax.wheel import Motion, dynamics, phases_of, transitions
 
 ORACLE = Path(__file__).parents[2] / "tests" / "oracle"
 BLOCK = 1000
@@ -28,7 +22,7 @@ WALKS = {(1e-6, 1e-8, 1e-13): 10_000, (1e-10,): 100_000}
 
 
 def with_damping(
-    phase: Phase, start: jax.Array, params: vrw.WheelParams, options: vrw.Options
+    phase: Flow, start: jax.Array, params: vrw.WheelParams, options: vrw.Options
 ) -> tuple[PhaseEnd, jax.Array, Motion]:
     """A phase of the library, the energy that its dampers take (J, eq. 29), and its last motion.
 
@@ -52,14 +46,10 @@ def accounted_step(params: vrw.WheelParams, x: jax.Array, options: vrw.Options) 
     dampers take - energy at the next touchdown.
     """
     s = params.symbols()
-    build = PhaseBuilder(s, True, False)
     before = transitions.motion_before_landing(s, *x)
     landing = transitions.land(s, *x)
-    dls, sls1, sls2 = (
-        double_support(build, landing.distance),
-        single_support_1(build),
-        single_support_2(build),
-    )
+    phases = phases_of(s, landing.distance, stop_at_lift_off=True)
+    dls, sls1, sls2 = (flow_of(phase, monitored=False) for phase in phases)
     start = jnp.stack([landing.theta, landing.motion.dtheta])
     first, lost_1, m = with_damping(dls, start, params, options)
     start = jnp.stack([first.state[0], m.L1, m.L2, m.dtheta, m.dL1, m.dL2])
@@ -68,7 +58,7 @@ def accounted_step(params: vrw.WheelParams, x: jax.Array, options: vrw.Options) 
     start = jnp.stack([second.state[0], hit.motion.L1, hit.motion.dtheta, hit.motion.dL1])
     third, lost_3, m = with_damping(sls2, start, params, options)
     ends = first, second, third
-    outcomes = [p.outcome(end) for p, end in zip((dls, sls1, sls2), ends, strict=True)]
+    outcomes = [p.outcome(e.guard, e.timed_out) for p, e in zip(phases, ends, strict=True)]
     stepped = jnp.all(jnp.stack(outcomes) == Outcome.STEPPED)
     theta, _, dtheta, dL1, _ = third.state
     work = (s.Mt) * s.g * landing.distance * s.sin_phi

@@ -25,14 +25,9 @@ import optimistix as optx
 import vrw_jax as vrw
 from experiments.shared.wheels import BOX, wheels
 from experiments.speed import peers
-from vrw_jax.models.viscoelastic import (
-    PhaseBuilder,
-    double_support,
-    single_support_1,
-    single_support_2,
-)
+from vrw_jax.models.viscoelastic import flow_of
 from vrw_jax.numerics import explicit_tableau
-from vrw_jax.wheel import transitions
+from vrw_jax.wheel import phases_of, transitions
 
 VARIED = tuple(BOX)
 Run = Callable[[], np.ndarray]
@@ -142,15 +137,15 @@ def by_diffeqsolve(solver: diffrax.AbstractAdaptiveSolver, fixed: bool) -> Calla
     def one(row: jax.Array, x: jax.Array, setting: jax.Array) -> jax.Array:
         s = wheels(row).symbols()
         landing = transitions.land(s, *x)
-        build = PhaseBuilder(s, True, False)
-        dls = double_support(build, landing.distance)
+        phases = phases_of(s, landing.distance, stop_at_lift_off=True)
+        dls, sls1, sls2 = (flow_of(phase, monitored=False) for phase in phases)
         y, first_time, n1 = until(dls, jnp.stack([landing.theta, landing.motion.dtheta]), setting)
         m = dls.motion(y)
         start = jnp.stack([y[0], m.L1, m.L2, m.dtheta, m.dL1, m.dL2])
-        y, second, n2 = until(single_support_1(build), start, setting)
-        hit = transitions.hit_stopper(s, single_support_1(build).motion(y)).motion
+        y, second, n2 = until(sls1, start, setting)
+        hit = transitions.hit_stopper(s, sls1.motion(y)).motion
         start = jnp.stack([y[0], hit.L1, hit.dtheta, hit.dL1])
-        y, third, n3 = until(single_support_2(build), start, setting)
+        y, third, n3 = until(sls2, start, setting)
         times = first_time, second, third
         good = jnp.isfinite(sum(times))
         count = (n1 + n2 + n3) * float(stages(type(solver).__name__))

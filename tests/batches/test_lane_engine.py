@@ -220,7 +220,6 @@ def fall(height, options=None):
     phase = LanePhase(
         lambda q, v: Slope(q[0], q[0], (jnp.ones_like(q[0]),)),
         lambda place: (place.q[0],),
-        (Outcome.STEPPED,),
     )
     end = integrate_lanes(
         phase,

@@ -10,8 +10,7 @@ from support import truth
 from support.batched import NAMES, full_steps, lean_steps
 
 import vrw_jax as vrw
-from vrw_jax.wheel import dynamics, transitions
-from vrw_jax.wheel.geometry import Motion, double_support_motion, rear_foot_height
+from vrw_jax.wheel import Motion, dynamics, phases_of, rear_foot_height, transitions
 
 STARTS = truth.table("step", "start")
 
@@ -53,7 +52,8 @@ def test_planted_feet_do_not_move_in_double_support(theta, dtheta, distance):
     s = vrw.WheelParams().symbols()
 
     def rear_foot(angle):
-        m = double_support_motion(s, jnp.asarray(distance), angle, jnp.asarray(dtheta))
+        phase = phases_of(s, jnp.asarray(distance), True)[0]
+        m = phase.at((angle,), (jnp.asarray(dtheta),))
         rear = jnp.stack([jnp.sin(angle + s.alpha), jnp.cos(angle + s.alpha)])
         return m.L1 * jnp.stack([m.sin, m.cos]) - m.L2 * rear
 

@@ -9,14 +9,9 @@ import pytest
 from support import truth
 
 import vrw_jax as vrw
-from vrw_jax.models.viscoelastic import (
-    PhaseBuilder,
-    double_support,
-    single_support_1,
-    single_support_2,
-)
+from vrw_jax.models.viscoelastic import flow_of
 from vrw_jax.numerics.derivatives import any_mode
-from vrw_jax.wheel import transitions
+from vrw_jax.wheel import phases_of, transitions
 
 PARAMS = vrw.WheelParams()
 START = jnp.asarray(truth.table("step", "start")[0])
@@ -60,7 +55,6 @@ def test_the_saltation_formula_agrees(forward):
     at a guard g the perturbed flow meets it dt = -grad g . dy / (grad g . f) later.
     """
     s = PARAMS.symbols()
-    build = PhaseBuilder(s, stop_at_lift_off=True, monitored=False)
     walked = vrw.step(PARAMS, START, options=TIGHT)
 
     def flow(field, y, duration):
@@ -89,24 +83,24 @@ def test_the_saltation_formula_agrees(forward):
     at_landing, by_landing = landed(START), jax.jacfwd(landed)(START)
     # The distance between the feet is a constant of double support: a third coordinate at rest.
     distance = at_landing[2]
-    with_distance = double_support(build, distance)._replace(
-        field=lambda y: jnp.append(double_support(build, y[2]).field(y[:2]), 0.0),
-        watched=double_support(build, distance).watched._replace(
-            values=lambda y: double_support(build, y[2]).watched.values(y[:2])
-        ),
+    flows = lambda distance: [flow_of(phase, False) for phase in phases_of(s, distance, True)]
+    first, second, third = flows(distance)
+    with_distance = first._replace(
+        field=lambda y: jnp.append(flows(y[2])[0].field(y[:2]), 0.0),
+        watched=first.watched._replace(values=lambda y: flows(y[2])[0].watched.values(y[:2])),
     )
 
     def lifted(y):
-        m = double_support(build, y[2]).motion(y[:2])
+        m = flows(y[2])[0].motion(y[:2])
         return jnp.stack([y[0], m.L1, m.L2, m.dtheta, m.dL1, m.dL2])
 
     def locked(y):
-        hit = transitions.hit_stopper(s, single_support_1(build).motion(y))
+        hit = transitions.hit_stopper(s, second.motion(y))
         return jnp.stack([y[0], hit.motion.L1, hit.motion.dtheta, hit.motion.dL1])
 
     end, dls = through(with_distance, at_landing, walked.durations[0])
-    end2, sls1 = through(single_support_1(build), lifted(end), walked.durations[1])
-    end3, sls2 = through(single_support_2(build), locked(end2), walked.durations[2])
+    end2, sls1 = through(second, lifted(end), walked.durations[1])
+    end3, sls2 = through(third, locked(end2), walked.durations[2])
     section = jnp.asarray([[1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1.0]])
     product = section @ sls2 @ jax.jacfwd(locked)(end2) @ sls1 @ jax.jacfwd(lifted)(end) @ dls
     np.testing.assert_allclose(section @ end3, walked.section_state, atol=1e-10)

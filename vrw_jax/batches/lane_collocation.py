@@ -12,7 +12,7 @@ step's start, where it was not asked to hold, and the least of all guards.
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -28,13 +28,10 @@ from vrw_jax.numerics import (
     NODES,
     ONCE,
     TWICE,
-    LanePhase,
     Mesh,
-    Place,
-    Slope,
     Vector,
-    sine_cosine,
 )
+from vrw_jax.wheel import AbstractPhase, Instant
 
 
 def _eigenvectors() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -49,10 +46,6 @@ _OTHERS = [np.delete(NODES, j) for j in range(N_NODES)]
 AT_START = np.array([np.prod(o / (o - NODES[j])) for j, o in enumerate(_OTHERS)])
 AT_END = np.array([np.prod((1.0 - o) / (NODES[j] - o)) for j, o in enumerate(_OTHERS)])
 """Weights that extrapolate node values to both ends of a step."""
-
-Residual = Callable[[Array, Array, Vector, Vector, Vector], Vector]
-"""What (sine, cosine, q, v, acceleration) leave over of the equations of motion, linear in the
-acceleration."""
 
 
 class Scheme(NamedTuple):
@@ -91,12 +84,7 @@ class _Solved(NamedTuple):
 
 
 def collocate(
-    phase: LanePhase,
-    residual: Residual,
-    q: Vector,
-    v: Vector,
-    expected: Array,
-    scheme: Scheme,
+    phase: AbstractPhase, q: Vector, v: Vector, expected: Array, scheme: Scheme
 ) -> Collocated:
     """From (q, v) to the phase's own end, which is its first guard, near the expected duration."""
     fractions = scheme.mesh.fractions
@@ -104,7 +92,7 @@ def collocate(
 
     def march(carry: tuple, fraction: Array) -> tuple[tuple, None]:
         q, v, correction, mismatch, least = carry
-        solved = _solve(phase, residual, q, v, fraction * expected, (1, scheme.sweeps))
+        solved = _solve(phase, q, v, fraction * expected, (1, scheme.sweeps))
         low = _least(phase, q, v, solved, 0)
         carry = (
             *solved.end,
@@ -119,7 +107,7 @@ def collocate(
         carry, _ = lax.scan(march, carry, jnp.asarray(fractions[:-1], expected.dtype))
     q, v, correction, mismatch, least = carry
     h = float(fractions[-1]) * expected
-    last = _solve(phase, residual, q, v, h, (scheme.rounds, 2), lands=True)
+    last = _solve(phase, q, v, h, (scheme.rounds, 2), lands=True)
     low = jnp.minimum(_least(phase, q, v, last, 1), last.step.h)
     return Collocated(
         *last.end,
@@ -158,8 +146,7 @@ def _node(j: int, q: Vector, v: Vector, h: Array, nodes: tuple[Vector, ...]) -> 
 
 
 def _solve(
-    phase: LanePhase,
-    residual: Residual,
+    phase: AbstractPhase,
     q: Vector,
     v: Vector,
     h: Array,
@@ -172,17 +159,15 @@ def _solve(
     """
     n = len(q)
     rounds, sweeps = rounds_of_sweeps
-    a0 = phase.evaluate(q, v).acceleration[:n]
-    middle_q, middle_v = _middle(q, v, a0, h)
-    by_q, by_v, by_a = _partials(residual, middle_q, middle_v, a0)
+    a0 = phase.acceleration(phase.at(q, v))[:n]
+    by_q, by_v, by_a = _partials(phase, *_middle(q, v, a0, h), a0)
     inverses = [_factor(complex(value), h, by_q, by_v, by_a) for value in VALUES]
 
     def sweep(step: _Step, _: None) -> tuple[_Step, None]:
         left = []
         for j in range(N_NODES):
             Q, V = _node(j, q, v, step.h, step.nodes)
-            sin, cos = sine_cosine(Q[0])
-            left.append(residual(sin, cos, Q, V, step.nodes[j]))
+            left.append(phase.residual(phase.at(Q, V), step.nodes[j]))
         pairs = [
             _apply(inverse, _to_pair(weights, tuple(left)))
             for inverse, weights in zip(inverses, TO_PAIRS, strict=True)
@@ -229,13 +214,9 @@ def _end_shifted(
     )
 
 
-def _partials(residual: Residual, q: Vector, v: Vector, a: Vector) -> tuple:
+def _partials(phase: AbstractPhase, q: Vector, v: Vector, a: Vector) -> tuple:
     """Columns of the residual's derivatives by q, v and a."""
-
-    def whole(q: Vector, v: Vector, a: Vector) -> Vector:
-        sin, cos = sine_cosine(q[0])
-        return residual(sin, cos, q, v, a)
-
+    whole = lambda q, v, a: phase.residual(phase.at(q, v), a)
     arguments = (q, v, a)
 
     def column(which: int, d: int) -> Vector:
@@ -346,32 +327,31 @@ def _corrected(
     return tuple(corrected), h * largest
 
 
-def _to_event(phase: LanePhase, q: Vector, v: Vector) -> Array:
-    """Time from (q, v) to the zero of the phase's first guard, by Newton's method."""
-    event = lambda q, v: phase.guards(Place(q, v, phase.evaluate(q, v)))[0]
-    slope = phase.evaluate(q, v).acceleration[: len(q)]
-    value, rate = jax.jvp(event, (q, v), (v, slope))
+def _to_event(phase: AbstractPhase, q: Vector, v: Vector) -> Array:
+    """Time from (q, v) to the phase's own end, by Newton's method."""
+
+    def event(q: Vector, v: Vector) -> tuple[Array, Vector]:
+        at = Instant(phase, phase.at(q, v), None)
+        return phase.end(at), at.acceleration[: phase.n]
+
+    _, slope = event(q, v)
+    (value, _), (rate, _) = jax.jvp(event, (q, v), (v, slope))
     return -value / jnp.where(rate < 0.0, rate, -jnp.inf)
 
 
-def _slope(angle: Array, acceleration: Vector) -> Slope:
-    sin, cos = sine_cosine(angle)
-    return Slope(sin, cos, acceleration)
-
-
-def _least(phase: LanePhase, q: Vector, v: Vector, solved: _Solved, skipped: int) -> Array:
+def _least(phase: AbstractPhase, q: Vector, v: Vector, solved: _Solved, skipped: int) -> Array:
     """Least guard at two nodes and the step's end, -1 where one may be broken in between.
 
     Between them a guard may dip by a quarter of its second difference. `skipped` is 1 in the last
     step, whose first guard is the event itself and zero at the end.
     """
-    step, places = solved.step, []
-    for j in (0, 2):
-        Q, V = _node(j, q, v, step.h, step.nodes)
-        places.append(Place(Q, V, _slope(Q[0], step.nodes[j])))
+    step = solved.step
     at_end = tuple(_weigh(AT_END, step.nodes, d) for d in range(len(q)))
-    places.append(Place(*solved.end, _slope(solved.end[0][0], at_end)))
-    values = [phase.guards(place) for place in places]
+    places = [(*_node(j, q, v, step.h, step.nodes), step.nodes[j]) for j in (0, 2)]
+    values = [
+        phase.guards(Instant(phase, phase.at(q, v), a))
+        for q, v, a in (*places, (*solved.end, at_end))
+    ]
 
     least = jnp.full_like(step.h, jnp.inf)
     for i, (first, middle, last) in enumerate(zip(*values, strict=True)):

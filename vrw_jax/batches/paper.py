@@ -1,26 +1,17 @@
 """Gait steps of many wheels at once: the fast engine for batches.
 
-The same physics as `models.viscoelastic`, whose functions work element by element; arrays hold one
-quantity of all wheels instead of one wheel's quantities.
+The same phases as the single wheel's; arrays hold one quantity of all wheels instead of one wheel's
+quantities.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from vrw_jax.models import (
-    PAPER_START,
-    SAFE_SINGLE_SUPPORT,
-    PhaseBuilder,
-    replaced_where_bad,
-    usable,
-    viscoelastic,
-)
+from vrw_jax.models import End, Walked, through_phases
 from vrw_jax.numerics import (
     LanePhase,
-    LanePhaseEnd,
     Monitors,
     Options,
     Place,
@@ -30,28 +21,11 @@ from vrw_jax.numerics import (
     integrate_lanes,
     sine_cosine,
 )
-from vrw_jax.wheel import (
-    Motion,
-    Outcome,
-    WheelParams,
-    double_support_circle,
-    dynamics,
-    landing_foot_height,
-    rear_foot_height,
-    transitions,
-)
+from vrw_jax.wheel import AbstractPhase, Instant, Outcome, WheelParams
 
 INTO_SINGLE_SUPPORT = 0.3
 """First step of SLS-I over the last of DLS: dropping the rear foot's force excites the airborne
 leg's fast mode, which dies within 0.05 s."""
-
-
-class Walk(NamedTuple):
-    """A gait step of a block of lanes from landing to landing, phase by phase."""
-
-    ends: tuple[LanePhaseEnd, LanePhaseEnd, LanePhaseEnd]
-    happened: tuple[Array, Array, Array]
-    outcome: Int[Array, " lanes"]  # an Outcome
 
 
 class LaneStep(NamedTuple):
@@ -64,131 +38,29 @@ class LaneStep(NamedTuple):
     unfinished: Bool[Array, " lanes"]  # not waited for: everything else there is void
 
 
-def double_support(build: PhaseBuilder, distance: Array) -> LanePhase:
-    """DLS over theta. Section 3.3.1."""
-    s = build.s
+class _Handed(NamedTuple):
+    """From one phase to the next."""
 
-    def motion(sin: Array, cos: Array, dtheta: Array) -> Motion:
-        circle = double_support_circle(s, distance, sin, cos)
-        return Motion(
-            sin, cos, circle.L1, circle.L2, dtheta, circle.G1 * dtheta, circle.G2 * dtheta
-        )
+    next_step: Array  # that the controller would try, s
+    ran: Bool[Array, " lanes"]  # where the phase took place
+    unfinished: Bool[Array, " lanes"]
 
-    def accelerate(sin: Array, cos: Array, dtheta: Array) -> Vector:
-        return (
-            dynamics.double_support_acceleration(s, distance, motion(sin, cos, dtheta)).ddtheta,
-        )
+
+def lane_phase(phase: AbstractPhase, monitored: bool) -> LanePhase:
+    """A phase as the march takes it. `monitored`: watch its premises as well as its guards."""
 
     def evaluate(q: Vector, v: Vector) -> Slope:
         sin, cos = sine_cosine(q[0])
-        return Slope(sin, cos, accelerate(sin, cos, v[0]))
+        return Slope(sin, cos, phase.acceleration(phase.motion(sin, cos, q, v))[: phase.n])
 
-    def at(place: Place) -> tuple:
-        m = motion(place.slope.sin, place.slope.cos, place.v[0])
-        a = dynamics.double_support_acceleration(s, distance, m)
-        rear = dynamics.rear_foot_force(s, m, a)
-        return m, a, rear, dynamics.fore_foot_force(s, m, a, rear)
+    def instant(place: Place) -> Instant:
+        sin, cos, acceleration = place.slope
+        return Instant(phase, phase.motion(sin, cos, place.q, place.v), acceleration)
 
-    def guards(place: Place) -> Vector:
-        m, _, rear, fore = at(place)
-        return (rear.normal, s.L0 - m.L2, landing_foot_height(s, m), *build.falls(m, fore))
-
-    def premises(place: Place) -> Vector:
-        m, a, _, fore = at(place)
-        return tuple(build.premises(m, a, fore))
-
+    watched = Monitors(lambda place: phase.premises(instant(place)), phase.counts_at_start)
     return LanePhase(
-        evaluate,
-        guards,
-        build.outcomes(
-            Outcome.STEPPED, Outcome.STOPPER_IN_DOUBLE_SUPPORT, Outcome.TOUCHDOWN_BEFORE_STOPPER
-        ),
-        _monitors(build, premises, viscoelastic.double_support(build, distance)),
+        evaluate, lambda place: phase.guards(instant(place)), watched if monitored else None
     )
-
-
-def _monitors(
-    build: PhaseBuilder, values: Callable[[Place], Vector], of_one_wheel: viscoelastic.Phase
-) -> Monitors | None:
-    """What the single wheel's phase watches, too."""
-    return Monitors(values, of_one_wheel.watched.count_start) if build.monitored else None
-
-
-def single_support_1(build: PhaseBuilder) -> LanePhase:
-    """SLS-I over (theta, L1, L2). Section 3.3.2."""
-    s = build.s
-
-    def evaluate(q: Vector, v: Vector) -> Slope:
-        sin, cos = sine_cosine(q[0])
-        motion = Motion(sin, cos, q[1], q[2], *v)
-        return Slope(sin, cos, tuple(dynamics.single_support_1_acceleration(s, motion)))
-
-    def at(place: Place) -> tuple:
-        slope = place.slope
-        m = Motion(slope.sin, slope.cos, place.q[1], place.q[2], *place.v)
-        a = dynamics.Acceleration(*slope.acceleration)
-        return m, a, dynamics.fore_foot_force(s, m, a)
-
-    def guards(place: Place) -> Vector:
-        m, _, fore = at(place)
-        return (s.L0 - m.L2, landing_foot_height(s, m), *build.falls(m, fore))
-
-    def premises(place: Place) -> Vector:
-        m, a, fore = at(place)
-        return (*build.premises(m, a, fore), rear_foot_height(s, m))
-
-    return LanePhase(
-        evaluate,
-        guards,
-        build.outcomes(Outcome.STEPPED, Outcome.TOUCHDOWN_BEFORE_STOPPER),
-        _monitors(build, premises, viscoelastic.single_support_1(build)),
-    )
-
-
-def single_support_2(build: PhaseBuilder) -> LanePhase:
-    """SLS-II over (theta, L1). Section 3.3.3."""
-    s = build.s
-
-    def motion(sin: Array, cos: Array, L1: Array, v: Vector) -> Motion:
-        return Motion(sin, cos, L1, s.L0 + 0.0 * L1, v[0], v[1], 0.0 * v[1])
-
-    def accelerate(sin: Array, cos: Array, L1: Array, v: Vector) -> Vector:
-        return dynamics.single_support_2_acceleration(s, motion(sin, cos, L1, v))[:2]
-
-    def evaluate(q: Vector, v: Vector) -> Slope:
-        sin, cos = sine_cosine(q[0])
-        return Slope(sin, cos, accelerate(sin, cos, q[1], v))
-
-    def at(place: Place) -> tuple:
-        slope = place.slope
-        m = motion(slope.sin, slope.cos, place.q[1], place.v)
-        ddtheta, ddL1 = slope.acceleration
-        a = dynamics.Acceleration(ddtheta, ddL1, 0.0 * m.L1)
-        return m, a, dynamics.fore_foot_force(s, m, a)
-
-    def guards(place: Place) -> Vector:
-        m, _, fore = at(place)
-        return (landing_foot_height(s, m), *build.falls(m, fore))
-
-    def premises(place: Place) -> Vector:
-        m, a, fore = at(place)
-        rear_stopper = dynamics.stopper_force(s, m, a, range(2, 3))
-        return (*build.premises(m, a, fore), rear_foot_height(s, m), *rear_stopper)
-
-    return LanePhase(
-        evaluate,
-        guards,
-        build.outcomes(Outcome.STEPPED),
-        _monitors(build, premises, viscoelastic.single_support_2(build)),
-    )
-
-
-def _outcome(phase: LanePhase, end: LanePhaseEnd) -> Array:
-    """STEPPED where the phase ended as in the paper."""
-    code = jnp.full(end.guard.shape, int(Outcome.SOLVER_GAVE_UP), jnp.int32)
-    for index, meaning in enumerate(phase.outcomes):
-        code = jnp.where(end.guard == index, jnp.int32(meaning), code)
-    return jnp.where(end.timed_out, jnp.int32(Outcome.NO_TOUCHDOWN_IN_TIME), code)
 
 
 def gait_step(
@@ -202,13 +74,13 @@ def gait_step(
     """One gait step of every lane, from touchdown to touchdown. `few`: see `integrate_lanes`."""
     walked = walk(params, x, options, tableau, stop_at_lift_off, monitored=False, few=few)
     ends, stepped = walked.ends, walked.outcome == Outcome.STEPPED
-    section = (ends[2].place.q[0], *ends[2].place.v)
+    section = (ends[2].q[0], *ends[2].v)
     return LaneStep(
         section_state=tuple(jnp.where(stepped, value, 0.0) for value in section),
         durations=tuple(end.duration for end in ends),
         outcome=walked.outcome,
         solver_steps=ends[0].tried + ends[1].tried + ends[2].tried,
-        unfinished=ends[0].unfinished | ends[1].unfinished | ends[2].unfinished,
+        unfinished=ends[0].own.unfinished | ends[1].own.unfinished | ends[2].own.unfinished,
     )
 
 
@@ -220,61 +92,26 @@ def walk(
     stop_at_lift_off: bool,
     monitored: bool,
     few: Array | None = None,
-) -> Walk:
-    """One gait step of every lane, with the ends of its phases and the minima of their monitors."""
-    good = usable(params, x)
-    params, x = replaced_where_bad(good, params, x, PAPER_START)
-    s = params.symbols()
-    build = PhaseBuilder(s, stop_at_lift_off, monitored)
-    landing = transitions.land(s, *x)
-    first = options.first_step + jnp.zeros_like(landing.theta)
-    stepped = jnp.int32(Outcome.STEPPED)
-    safe = [jnp.asarray(value, x[0].dtype) for value in SAFE_SINGLE_SUPPORT]
+) -> Walked:
+    """One gait step of every lane, phase by phase."""
 
-    def run(
-        phase: LanePhase, q: Vector, v: Vector, active: Array, first: Array
-    ) -> tuple[LanePhaseEnd, Array]:
-        end = integrate_lanes(phase, tableau, q, v, active, first, options, few)
-        return end, jnp.where(active, _outcome(phase, end), stepped)
+    def run(phase: AbstractPhase, q: Vector, v: Vector, active: Array, before: End | None) -> End:
+        first = options.first_step + jnp.zeros_like(q[0])
+        if before is not None:
+            known: _Handed = before.own
+            first = known.next_step
+            if phase.stiff_start:
+                first = jnp.where(known.ran, INTO_SINGLE_SUPPORT * first, first)
+        march = lane_phase(phase, monitored)
+        end = integrate_lanes(march, tableau, q, v, active, first, options, few)
+        return End(
+            *end.place[:2],
+            duration=end.duration,
+            guard=end.guard,
+            timed_out=end.timed_out,
+            tried=end.tried,
+            minima=end.minima,
+            own=_Handed(end.next_step, active, end.unfinished),
+        )
 
-    dls = double_support(build, landing.distance)
-    active1 = good & landing.stays
-    end1, code1 = run(dls, (landing.theta,), (landing.motion.dtheta,), active1, first)
-
-    active2 = good & (code1 == stepped) & ~end1.unfinished
-    lifted = double_support_at(build, landing.distance, end1.place.q[0], end1.place.v[0])
-    freed = landing.motion
-    starts = (
-        (end1.place.q[0], landing.theta),
-        *((getattr(lifted, name), getattr(freed, name)) for name in Motion._fields[2:]),
-    )
-    begin = [
-        jnp.where(active2, jnp.where(landing.stays, held, free), harmless)
-        for (held, free), harmless in zip(starts, safe, strict=True)
-    ]
-    sls1 = single_support_1(build)
-    first2 = jnp.where(landing.stays, INTO_SINGLE_SUPPORT * end1.next_step, first)
-    end2, code2 = run(sls1, tuple(begin[:3]), tuple(begin[3:]), active2, first2)
-
-    active3 = active2 & (code2 == stepped) & ~end2.unfinished
-    q = [jnp.where(active3, x, harmless) for x, harmless in zip(end2.place.q, safe, strict=False)]
-    v = [jnp.where(active3, x, y) for x, y in zip(end2.place.v, safe[3:], strict=True)]
-
-    hit = transitions.hit_stopper(s, Motion(*sine_cosine(q[0]), q[1], q[2], *v)).motion
-    sls2 = single_support_2(build)
-    end3, code3 = run(sls2, (q[0], hit.L1), (hit.dtheta, hit.dL1), active3, end2.next_step)
-
-    code = jnp.where(active2, jnp.where(active3, code3, code2), code1)
-    code = jnp.where(good, code, jnp.int32(Outcome.BAD_INPUT))
-    return Walk(
-        ends=(end1, end2, end3),
-        happened=(active1 & (end1.duration > 0.0), active2 & (end2.duration > 0.0), active3),
-        outcome=code,
-    )
-
-
-def double_support_at(build: PhaseBuilder, distance: Array, theta: Array, dtheta: Array) -> Motion:
-    """The motion in double support there."""
-    sin, cos = sine_cosine(theta)
-    circle = double_support_circle(build.s, distance, sin, cos)
-    return Motion(sin, cos, circle.L1, circle.L2, dtheta, circle.G1 * dtheta, circle.G2 * dtheta)
+    return through_phases(run, params, x, stop_at_lift_off)

@@ -1,6 +1,5 @@
 """The model ladder: one rung a file, one face."""
 
-from vrw_jax.models import viscoelastic
 from vrw_jax.models.base import (
     AbstractStep,
     AbstractWheel,
@@ -23,6 +22,15 @@ from vrw_jax.models.ladder import (
     LadderWheel,
     ModelChoice,
     refuse_ladder,
+)
+from vrw_jax.models.paper_step import (
+    PAPER_START,
+    End,
+    Told,
+    Walked,
+    result_of,
+    through_phases,
+    told_of,
 )
 from vrw_jax.models.rigid import RigidWheel
 from vrw_jax.models.unilateral.contacts import OFF
@@ -57,12 +65,4 @@ from vrw_jax.models.unilateral.wheel import (
     UnilateralWheel,
     least_dip,
 )
-from vrw_jax.models.viscoelastic import (
-    PAPER_START,
-    SAFE_SINGLE_SUPPORT,
-    PhaseBuilder,
-    ViscoelasticWheel,
-    Walked,
-    phases_of,
-    result_of,
-)
+from vrw_jax.models.viscoelastic import ViscoelasticWheel

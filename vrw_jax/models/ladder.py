@@ -19,10 +19,11 @@ from vrw_jax.models.base import (
     StepResult,
     replaced_where_bad,
 )
+from vrw_jax.models.paper_step import PAPER_START
 from vrw_jax.models.unilateral.contacts import OFF, STICK
 from vrw_jax.models.unilateral.section import LOCKED, FullState, embedded
 from vrw_jax.models.unilateral.wheel import UnilateralStep, UnilateralTrajectory, UnilateralWheel
-from vrw_jax.models.viscoelastic import PAPER_START, ViscoelasticWheel
+from vrw_jax.models.viscoelastic import ViscoelasticWheel
 from vrw_jax.numerics import Options, Scalar, as_float_array
 from vrw_jax.results import MARGINS
 from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, WheelParams

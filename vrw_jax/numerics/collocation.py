@@ -53,9 +53,9 @@ class Phase(NamedTuple):
 
     `residual` is what the equations of motion leave over at (constants, point, acceleration),
     linear in the acceleration: multiplied out it costs far less to differentiate than solved for.
-    `event` (zero at the end, of order 1) and `guards` (positive inside)
-    read (constants, point); `reset` turns the phase's end into the next phase's start, and the
-    last one's into the section's numbers (in `q`).
+    `event` (zero at the end) and `guards` (positive inside) read (constants, point); `reset` turns
+    the phase's end into the next phase's start, and the last one's into the section's numbers (in
+    `q`).
     """
 
     name: str

@@ -24,13 +24,12 @@ from vrw_jax.simd import apart
 class LanePhase(NamedTuple):
     """A phase as data; functions are elementwise over lanes.
 
-    `guards` are positive inside the phase and watched on the way down; `outcomes` says what each
-    means. The earliest wins, of two at once the first in the list.
+    `guards` are positive inside the phase and watched on the way down. The earliest wins, of two at
+    once the first in the list.
     """
 
     evaluate: Evaluate
     guards: Callable[[Place], Vector]
-    outcomes: tuple[int, ...]
     monitors: Monitors | None = None  # whose minima are wanted
 
 

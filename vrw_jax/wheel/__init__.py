@@ -5,7 +5,6 @@ from vrw_jax.wheel.dynamics import damping_power, mass_matrix, momentum
 from vrw_jax.wheel.geometry import (
     Motion,
     double_support_circle,
-    double_support_motion,
     landing_direction,
     landing_foot_height,
     length_at_touchdown,
@@ -24,3 +23,5 @@ from vrw_jax.wheel.params import (
     symbols_of,
     wheel_of,
 )
+from vrw_jax.wheel.phases import PHASES, AbstractPhase, Instant, Premises, phases_of
+from vrw_jax.wheel.transitions import Landing

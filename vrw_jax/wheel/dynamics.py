@@ -13,8 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vrw_jax.numerics import Elementwise
-from vrw_jax.wheel.geometry import Motion, double_support_circle, rear_direction
+from vrw_jax.numerics import Elementwise, Vector
+from vrw_jax.wheel.geometry import (
+    CircleOfDoubleSupport,
+    Motion,
+    double_support_circle,
+    rear_direction,
+)
 from vrw_jax.wheel.params import Symbols
 
 
@@ -36,7 +41,7 @@ class MassMatrix(NamedTuple):
     M23: Elementwise  # kg
     M33: Elementwise  # kg
 
-    def times(self, x: tuple[Elementwise, Elementwise, Elementwise]) -> tuple[Elementwise, ...]:
+    def times(self, x: tuple[Elementwise, Elementwise, Elementwise]) -> Vector:
         """The product with a vector over (theta, L1, L2)."""
         return (
             self.M11 * x[0] + self.M12 * x[1] + self.M13 * x[2],
@@ -134,6 +139,14 @@ def double_support_acceleration(s: Symbols, distance: Elementwise, motion: Motio
     force = f1 + circle.G1 * f2 + circle.G2 * f3
     inertia = row[0] + circle.G1 * row[1] + circle.G2 * row[2]
     ddtheta = (force + centripetal * (circle.L1 * row[1] + circle.L2 * row[2])) / inertia
+    return along_circle(circle, motion.dtheta, ddtheta)
+
+
+def along_circle(
+    circle: CircleOfDoubleSupport, dtheta: Elementwise, ddtheta: Elementwise
+) -> Acceleration:
+    """All accelerations in double support, where the hub's circle leaves only theta free."""
+    centripetal = dtheta * dtheta
     return Acceleration(
         ddtheta,
         circle.G1 * ddtheta - circle.L1 * centripetal,

@@ -94,12 +94,3 @@ def double_support_circle(
     scale = distance / s.sin_alpha
     rear = rear_direction(s, sin, cos)
     return CircleOfDoubleSupport(scale * rear.cos, scale * cos, -scale * rear.sin, -scale * sin)
-
-
-def double_support_motion(
-    s: Symbols, distance: Elementwise, theta: Elementwise, dtheta: Elementwise
-) -> Motion:
-    """The motion of the one-degree-of-freedom phase as coordinates (theta, L1, L2)."""
-    sin, cos = jnp.sin(theta), jnp.cos(theta)
-    circle = double_support_circle(s, distance, sin, cos)
-    return Motion(sin, cos, circle.L1, circle.L2, dtheta, circle.G1 * dtheta, circle.G2 * dtheta)

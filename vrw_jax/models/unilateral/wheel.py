@@ -18,6 +18,7 @@ from vrw_jax.models.base import (
     replaced_where_bad,
     usable,
 )
+from vrw_jax.models.paper_step import PAPER_START
 from vrw_jax.models.unilateral.contacts import OFF
 from vrw_jax.models.unilateral.events import Change, Event, Law, event_of, resolve, settled
 from vrw_jax.models.unilateral.motion import (
@@ -35,7 +36,6 @@ from vrw_jax.models.unilateral.motion import (
     unpack,
 )
 from vrw_jax.models.unilateral.section import FullState, closed, embedded, opened, section_size
-from vrw_jax.models.viscoelastic import PAPER_START
 from vrw_jax.numerics import (
     Forward,
     Options,

@@ -1,0 +1,314 @@
+"""The three phases of the paper's step, written once: every engine reads them here.
+
+A phase moves in the first `n` of the coordinates (theta, L1, L2); the others follow. All is
+elementwise: one wheel, lanes, nodes of a collocation. Guards are positive inside the phase and
+watched on the way down; the first of them is the phase's own end, and `after` turns the motion
+there into that with which the next of PHASES begins. Section 3.3.
+"""
+
+import abc
+import dataclasses
+import functools
+from typing import ClassVar, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+from vrw_jax.numerics import Elementwise, Vector, sine_cosine
+from vrw_jax.wheel import dynamics, transitions
+from vrw_jax.wheel.dynamics import Acceleration, FootForce
+from vrw_jax.wheel.geometry import (
+    CircleOfDoubleSupport,
+    Motion,
+    double_support_circle,
+    landing_foot_height,
+    rear_foot_height,
+)
+from vrw_jax.wheel.outcomes import Outcome
+from vrw_jax.wheel.params import Symbols
+
+FALLS = (Outcome.FELL_BACK, Outcome.COLLAPSED, Outcome.LEG_1_LIFTED_OFF)
+"""Ways to leave the paper's sequence that every phase shares."""
+
+
+class Premises(NamedTuple):
+    """What a phase measures but does not act on, in this order: negative where one breaks."""
+
+    fore_foot_force: Elementwise  # N
+    contraction: Elementwise  # L0 - L1, m
+    friction: Elementwise  # minus the coefficient needed at the fore foot
+    locked_stopper_force: Vector  # of legs 3..n, N
+    rear_clearance: Elementwise | None = None  # height of foot 2 in single support, m
+    rear_stopper_force: Elementwise | None = None  # of Leg 2 in single support II, N
+
+    @classmethod
+    def named(cls, row: Vector, n_legs: int) -> "Premises":
+        """From all values in a row."""
+        n_locked = n_legs - 2
+        fore, contraction, friction, *rest = row
+        locked, own = tuple(rest[:n_locked]), rest[n_locked:]
+        return cls(fore, contraction, friction, locked, *own)
+
+
+@dataclasses.dataclass(frozen=True)
+class AbstractPhase(abc.ABC):
+    """A phase of the wheel `s`."""
+
+    s: Symbols
+    held: Vector  # what the phase holds constant: in double support the feet's distance, m
+    stop_at_lift_off: bool  # whether a ground that would have to pull ends it
+
+    name: ClassVar[str]
+    n: ClassVar[int]
+    """Degrees of freedom."""
+    own_outcomes: ClassVar[tuple[Outcome, ...]]
+    """What `end` (STEPPED) and `own_guards` mean."""
+    contraction_counts: ClassVar[bool] = False
+    own_premises_count: ClassVar[tuple[bool, ...]] = ()
+    """Whether Leg 1's contraction and the phase's own premises count where it starts: not what is
+    zero there by construction."""
+    stiff_start: ClassVar[bool] = False
+    """Whether it begins with the airborne leg's fast mode, near c/m, which dies at once."""
+
+    @abc.abstractmethod
+    def motion(self, sin: Elementwise, cos: Elementwise, q: Vector, v: Vector) -> Motion:
+        """All coordinates from the phase's own ones and their rates; sine and cosine of theta."""
+
+    @abc.abstractmethod
+    def acceleration(self, motion: Motion) -> Acceleration:
+        """What the equations of motion say."""
+
+    @abc.abstractmethod
+    def residual(self, motion: Motion, own: Vector) -> Vector:
+        """What the equations of motion leave over at accelerations `own`, linear in them.
+
+        Multiplied out they cost far less to differentiate than solved for.
+        """
+
+    @abc.abstractmethod
+    def complete(self, motion: Motion, own: Vector) -> Acceleration:
+        """All three accelerations from the phase's own ones."""
+
+    @abc.abstractmethod
+    def end(self, at: "Instant") -> Elementwise:
+        """The guard that is the phase's own end."""
+
+    @abc.abstractmethod
+    def own_guards(self, at: "Instant") -> Vector:
+        """Guards that other phases have not."""
+
+    @abc.abstractmethod
+    def own_premises(self, at: "Instant") -> Vector:
+        """Premises beyond those of every phase."""
+
+    @abc.abstractmethod
+    def after(self, motion: Motion) -> Motion:
+        """The motion just after the phase's own end."""
+
+    def at(self, q: Vector, v: Vector) -> Motion:
+        """The motion at the phase's own coordinates and rates."""
+        return self.motion(*sine_cosine(q[0]), q, v)
+
+    def rear(self, motion: Motion, acceleration: Acceleration) -> FootForce | None:
+        """Force of the ground on the rear foot."""
+        return None
+
+    def guards(self, at: "Instant") -> Vector:
+        """What must stay positive: the phase's own guards first, then those of FALLS."""
+        m = at.motion
+        own = (self.end(at), *self.own_guards(at), m.dtheta, jnp.minimum(m.L1, m.L2) - self.s.a)
+        return (*own, at.fore.normal) if self.stop_at_lift_off else own
+
+    @property
+    def outcomes(self) -> tuple[Outcome, ...]:
+        """What each guard means."""
+        return self.own_outcomes + (FALLS if self.stop_at_lift_off else FALLS[:-1])
+
+    def premises(self, at: "Instant") -> Vector:
+        """Values of `Premises`, in a row."""
+        s, m = self.s, at.motion
+        locked = dynamics.stopper_force(s, m, at.acceleration, range(3, s.n + 1))
+        shared = (at.fore.normal, s.L0 - m.L1, -dynamics.friction_needed(at.fore))
+        return (*shared, *locked, *self.own_premises(at))
+
+    @property
+    def counts_at_start(self) -> tuple[bool, ...]:
+        """Which of them count where the phase starts."""
+        locked = (True,) * (self.s.n - 2)
+        return (True, self.contraction_counts, True, *locked, *self.own_premises_count)
+
+    def outcome(self, guard: Int[Array, "..."], timed_out: Bool[Array, "..."]) -> Array:
+        """The Outcome of a phase that this guard ended, none if -1: STEPPED as in the paper."""
+        code = jnp.full_like(guard, Outcome.SOLVER_GAVE_UP)
+        for index, meaning in enumerate(self.outcomes):
+            code = jnp.where(guard == index, jnp.int32(meaning), code)
+        return jnp.where(timed_out, jnp.int32(Outcome.NO_TOUCHDOWN_IN_TIME), code)
+
+    @classmethod
+    def own(cls, theta: Elementwise, motion: Motion) -> tuple[Vector, Vector]:
+        """The phase's own coordinates and rates of a motion."""
+        q, v = (theta, motion.L1, motion.L2), (motion.dtheta, motion.dL1, motion.dL2)
+        return q[: cls.n], v[: cls.n]
+
+
+class Instant:
+    """A moment of a phase; what guards and premises read of it is computed when first asked for.
+
+    `own`: accelerations of the phase's own coordinates; None: those of the equations of motion.
+    """
+
+    def __init__(self, phase: AbstractPhase, motion: Motion, own: Vector | None) -> None:
+        self.phase, self.motion, self._own = phase, motion, own
+
+    @functools.cached_property
+    def acceleration(self) -> Acceleration:
+        if self._own is None:
+            return self.phase.acceleration(self.motion)
+        return self.phase.complete(self.motion, self._own)
+
+    @functools.cached_property
+    def rear(self) -> FootForce | None:
+        """Force of the ground on the rear foot, N; None in the air."""
+        return self.phase.rear(self.motion, self.acceleration)
+
+    @functools.cached_property
+    def fore(self) -> FootForce:
+        """Force of the ground on the fore foot, N."""
+        return dynamics.fore_foot_force(self.phase.s, self.motion, self.acceleration, self.rear)
+
+
+class DoubleSupport(AbstractPhase):
+    """DLS, over theta: the hub on a circle over both feet, until the rear one lifts. 3.3.1."""
+
+    name, n = "DLS", 1
+    own_outcomes = (
+        Outcome.STEPPED, Outcome.STOPPER_IN_DOUBLE_SUPPORT, Outcome.TOUCHDOWN_BEFORE_STOPPER
+    )  # fmt: skip
+
+    def _circle(self, sin: Elementwise, cos: Elementwise) -> CircleOfDoubleSupport:
+        return double_support_circle(self.s, self.held[0], sin, cos)
+
+    def motion(self, sin: Elementwise, cos: Elementwise, q: Vector, v: Vector) -> Motion:
+        circle, (dtheta,) = self._circle(sin, cos), v
+        rates = (dtheta, circle.G1 * dtheta, circle.G2 * dtheta)
+        return Motion(sin, cos, circle.L1, circle.L2, *rates)
+
+    def acceleration(self, motion: Motion) -> Acceleration:
+        return dynamics.double_support_acceleration(self.s, self.held[0], motion)
+
+    def complete(self, motion: Motion, own: Vector) -> Acceleration:
+        return dynamics.along_circle(self._circle(motion.sin, motion.cos), motion.dtheta, own[0])
+
+    def residual(self, motion: Motion, own: Vector) -> Vector:
+        circle = self._circle(motion.sin, motion.cos)
+        along = dynamics.along_circle(circle, motion.dtheta, own[0])
+        rows = _left_over(self.s, motion, along)
+        return (rows[0] + circle.G1 * rows[1] + circle.G2 * rows[2],)
+
+    def rear(self, motion: Motion, acceleration: Acceleration) -> FootForce:
+        return dynamics.rear_foot_force(self.s, motion, acceleration)
+
+    def end(self, at: Instant) -> Elementwise:
+        assert at.rear is not None
+        return at.rear.normal
+
+    def own_guards(self, at: Instant) -> Vector:
+        return self.s.L0 - at.motion.L2, landing_foot_height(self.s, at.motion)
+
+    def own_premises(self, at: Instant) -> Vector:
+        return ()
+
+    def after(self, motion: Motion) -> Motion:
+        """The rear foot is let go at rest."""
+        return motion
+
+
+class SingleSupport1(AbstractPhase):
+    """SLS-I, over (theta, L1, L2): Leg 2 swings and telescopes freely, until its stopper. 3.3.2."""
+
+    name, n = "SLS-I", 3
+    own_outcomes = Outcome.STEPPED, Outcome.TOUCHDOWN_BEFORE_STOPPER
+    own_premises_count = (False,)
+    stiff_start = True
+
+    def motion(self, sin: Elementwise, cos: Elementwise, q: Vector, v: Vector) -> Motion:
+        return Motion(sin, cos, q[1], q[2], *v)
+
+    def acceleration(self, motion: Motion) -> Acceleration:
+        return dynamics.single_support_1_acceleration(self.s, motion)
+
+    def complete(self, motion: Motion, own: Vector) -> Acceleration:
+        return Acceleration(*own)
+
+    def residual(self, motion: Motion, own: Vector) -> Vector:
+        return _left_over(self.s, motion, Acceleration(*own))
+
+    def end(self, at: Instant) -> Elementwise:
+        return self.s.L0 - at.motion.L2
+
+    def own_guards(self, at: Instant) -> Vector:
+        return (landing_foot_height(self.s, at.motion),)
+
+    def own_premises(self, at: Instant) -> Vector:
+        return (rear_foot_height(self.s, at.motion),)
+
+    def after(self, motion: Motion) -> Motion:
+        """Leg 2 has hit its stopper, where it is at L0 exactly."""
+        return transitions.stopped(self.s, motion._replace(L2=self.s.L0 + 0.0 * motion.L2))
+
+
+class SingleSupport2(AbstractPhase):
+    """SLS-II, over (theta, L1): Leg 2 is on its stopper, until touchdown. Section 3.3.3."""
+
+    name, n = "SLS-II", 2
+    own_outcomes = (Outcome.STEPPED,)
+    contraction_counts, own_premises_count = True, (True, True)
+
+    def motion(self, sin: Elementwise, cos: Elementwise, q: Vector, v: Vector) -> Motion:
+        zero = jnp.zeros_like(q[1])
+        return Motion(sin, cos, q[1], self.s.L0 + zero, v[0], v[1], zero)
+
+    def acceleration(self, motion: Motion) -> Acceleration:
+        return dynamics.single_support_2_acceleration(self.s, motion)
+
+    def complete(self, motion: Motion, own: Vector) -> Acceleration:
+        return Acceleration(own[0], own[1], motion.dL2)
+
+    def residual(self, motion: Motion, own: Vector) -> Vector:
+        M, f1, f2, _ = dynamics.terms(self.s, motion)
+        return M.M11 * own[0] - f1, M.M22 * own[1] - f2  # M12 is zero at L2 = L0
+
+    def end(self, at: Instant) -> Elementwise:
+        return landing_foot_height(self.s, at.motion)
+
+    def own_guards(self, at: Instant) -> Vector:
+        return ()
+
+    def own_premises(self, at: Instant) -> Vector:
+        s, m = self.s, at.motion
+        stopper = dynamics.stopper_force(s, m, at.acceleration, range(2, 3))
+        return rear_foot_height(s, m), *stopper
+
+    def after(self, motion: Motion) -> Motion:
+        """What comes after touchdown is the next step's `transitions.land`."""
+        return motion
+
+
+def _left_over(s: Symbols, motion: Motion, acceleration: Acceleration) -> Vector:
+    """M q'' - f over (theta, L1, L2)."""
+    M, *forces = dynamics.terms(s, motion)
+    return tuple(n - f for n, f in zip(M.times(acceleration), forces, strict=True))
+
+
+PHASES: tuple[type[AbstractPhase], ...] = (DoubleSupport, SingleSupport1, SingleSupport2)
+"""The paper's step, in order."""
+
+
+def phases_of(
+    s: Symbols, distance: Elementwise, stop_at_lift_off: bool
+) -> tuple[AbstractPhase, ...]:
+    """The phases of a step that begins with the feet that far apart, m."""
+    helds = ((distance,), (), ())
+    return tuple(
+        phase(s, held, stop_at_lift_off) for phase, held in zip(PHASES, helds, strict=True)
+    )
