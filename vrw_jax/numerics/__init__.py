@@ -48,8 +48,8 @@ from vrw_jax.numerics.lanes import (
     select,
     to_blocks,
 )
-from vrw_jax.numerics.march import LanePhase, LanePhaseEnd, integrate_lanes
-from vrw_jax.numerics.minima import State, Watch, Watched
+from vrw_jax.numerics.march import LanePhase, integrate_lanes
+from vrw_jax.numerics.minima import State, Watched
 from vrw_jax.numerics.newton import SectionCycle, corrected, newton_cycle
 from vrw_jax.numerics.options import Options
 from vrw_jax.numerics.roots import BIFURCATIONS, bifurcation_functions, brackets, locate, turns

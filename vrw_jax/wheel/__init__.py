@@ -4,7 +4,6 @@ from vrw_jax.wheel import dynamics, transitions
 from vrw_jax.wheel.dynamics import damping_power, mass_matrix, momentum
 from vrw_jax.wheel.geometry import (
     Motion,
-    double_support_circle,
     landing_direction,
     landing_foot_height,
     length_at_touchdown,
