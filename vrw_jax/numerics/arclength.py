@@ -237,6 +237,72 @@ class _State(NamedTuple):
     track: Track
 
 
+class _Judged(NamedTuple):
+    """What an iteration of Newton's method makes of a trial; neither: it goes on."""
+
+    accepted: Bool[Array, ""]
+    failed: Bool[Array, ""]
+    share_slope: Scalar  # along the branch, the way it is followed
+
+
+def _judged(
+    followed: AbstractFollowed,
+    options: ArclengthOptions,
+    state: _State,
+    now: _Corrected,
+    direction: Scalar,
+) -> _Judged:
+    base, trial, starting = state.base, state.trial, state.track.n_points == 0
+    off = jnp.maximum(
+        jnp.max(jnp.abs(followed.section(now.z) - trial.plane.x)),
+        jnp.abs(now.share - trial.plane.share),
+    )
+    sound = jnp.isfinite(now.size) & (starting | (off <= state.step))
+    converged = sound & (now.size < options.tolerance)
+    by_share = followed.section(now.column)
+    facing = followed.section(base.slope) @ by_share + base.share_slope
+    facing = jnp.where(starting, direction, facing)
+    norm = jnp.sqrt(1.0 + by_share @ by_share)
+    straight = starting | (jnp.abs(facing) >= norm * jnp.cos(options.turn))
+    accepted = converged & straight
+    failed = ~accepted & (~sound | converged | (state.iteration + 1 >= options.iterations))
+    return _Judged(accepted, failed, jnp.where(facing >= 0.0, 1.0, -1.0) / norm)
+
+
+def _next_step(options: ArclengthOptions, state: _State, judged: _Judged) -> Scalar:
+    """Longer where Newton's method was quick, shorter where it was slow, half where it failed."""
+    quick, slow = state.iteration < 4, state.iteration >= 6
+    growth = jnp.where(quick, 1.4, jnp.where(slow, 0.6, 1.0))
+    longer = jnp.minimum(state.step * growth, options.largest_step)
+    shorter = jnp.where(judged.failed, 0.5 * state.step, state.step)
+    step = jnp.where(judged.accepted, longer, shorter)
+    return jnp.where(state.track.n_points == 0, options.first_step, step)
+
+
+def _extended(
+    options: ArclengthOptions,
+    state: _State,
+    judged: _Judged,
+    reached: PathPoint,
+    step: Scalar,
+    ahead: Scalar,
+) -> Track:
+    """The track with the point reached, where it is accepted; `ahead`: length of what follows."""
+    track, (accepted, failed, _) = state.track, judged
+    place = jnp.where(accepted, track.n_points, options.max_points)
+    points = jax.tree.map(lambda b, a: b.at[place].set(a, mode="drop"), track.points, reached)
+    count, ending = track.n_points + accepted, track.ending
+    for happened, code in (
+        (failed & (step < options.smallest_step), Ending.STALLED),
+        (failed & (track.n_points == 0), Ending.NO_START),
+        (accepted & (count >= options.max_points), Ending.BUFFER_FULL),
+        (accepted & (state.trial.final | (ahead <= 1e-12)), Ending.RANGE_ENDED),
+        (accepted & ~reached.valid, Ending.LEFT_SEQUENCE),
+    ):
+        ending = jnp.where(happened, int(code), ending)
+    return Track(points, count, ending.astype(jnp.int32), track.passes + 1)
+
+
 @eqx.filter_jit
 def follow(
     followed: AbstractFollowed,
@@ -269,55 +335,20 @@ def follow(
     )
 
     def iterate(state: _State) -> _State:
-        track, base, trial = state.track, state.base, state.trial
-        starting = track.n_points == 0
+        trial = state.trial
         now = _correct(followed, wheel, bounds, trial.plane, trial.z, trial.share)
-        off = jnp.maximum(
-            jnp.max(jnp.abs(followed.section(now.z) - trial.plane.x)),
-            jnp.abs(now.share - trial.plane.share),
-        )
-        sound = jnp.isfinite(now.size) & (starting | (off <= state.step))
-        converged = sound & (now.size < options.tolerance)
-
-        by_share = followed.section(now.column)
-        facing = followed.section(base.slope) @ by_share + base.share_slope
-        facing = jnp.where(starting, direction, facing)
-        norm = jnp.sqrt(1.0 + by_share @ by_share)
-        straight = starting | (jnp.abs(facing) >= norm * jnp.cos(options.turn))
-        accepted = converged & straight
-        failed = ~accepted & (~sound | converged | (state.iteration + 1 >= options.iterations))
-
-        share_slope = jnp.where(facing >= 0.0, 1.0, -1.0) / norm
+        judged = _judged(followed, options, state, now, direction)
         p = _parameter_at(jnp.where(trial.final, trial.plane.share, now.share), bounds)
         valid = followed.valid(wheel, now.z, p)
-        slope = jax.tree.map(lambda x: share_slope * x, now.column)
-        reached = PathPoint(now.z, p, slope, share_slope, now.jacobian, valid)
-        place = jnp.where(accepted, track.n_points, options.max_points)
-        points = jax.tree.map(lambda b, a: b.at[place].set(a, mode="drop"), track.points, reached)
-        count = track.n_points + accepted
-        base = select(accepted, reached, base)
-
-        quick, slow = state.iteration < 4, state.iteration >= 6
-        growth = jnp.where(quick, 1.4, jnp.where(slow, 0.6, 1.0))
-        longer = jnp.minimum(state.step * growth, options.largest_step)
-        step = jnp.where(accepted, longer, jnp.where(failed, 0.5 * state.step, state.step))
-        step = jnp.where(starting, options.first_step, step)
+        slope = jax.tree.map(lambda x: judged.share_slope * x, now.column)
+        reached = PathPoint(now.z, p, slope, judged.share_slope, now.jacobian, valid)
+        base = select(judged.accepted, reached, state.base)
+        step = _next_step(options, state, judged)
         following = _predicted(followed, base, step, bounds)
-        following = select(accepted | failed, following, trial._replace(z=now.z, share=now.share))
-
-        at_end = accepted & (trial.final | (following.length <= 1e-12))
-        ending = track.ending
-        for happened, code in (
-            (failed & (step < options.smallest_step), Ending.STALLED),
-            (failed & starting, Ending.NO_START),
-            (accepted & (count >= options.max_points), Ending.BUFFER_FULL),
-            (at_end, Ending.RANGE_ENDED),
-            (accepted & ~valid, Ending.LEFT_SEQUENCE),
-        ):
-            ending = jnp.where(happened, int(code), ending)
-        iteration = jnp.where(accepted | failed, 0, state.iteration + 1)
-        track = Track(points, count, ending.astype(jnp.int32), track.passes + 1)
-        return _State(base, step, following, iteration, track)
+        done = judged.accepted | judged.failed
+        following = select(done, following, trial._replace(z=now.z, share=now.share))
+        track = _extended(options, state, judged, reached, step, following.length)
+        return _State(base, step, following, jnp.where(done, 0, state.iteration + 1), track)
 
     going = lambda state: state.track.ending == int(Ending.GOING)
     return lax.while_loop(going, iterate, state).track
