@@ -103,19 +103,7 @@ class RigidWheel(AbstractWheel):
         zero = jnp.zeros_like(before)
         tell = lambda value: jnp.where(good, value, jnp.zeros_like(value))
         walked = lambda value: jnp.where(stepped, value, jnp.zeros_like(value))
-        first = roll.motion(-half + zero)
-        landing = transitions.land(s, *x)
-        hub_after = transitions.hub_velocity(first)
-        hub_before = transitions.hub_velocity(transitions.motion_before_landing(s, *x))
-        hub_jump = (hub_after[0] - hub_before[0], hub_after[1] - hub_before[1])
-        # Impulse at the fore foot: the jump of total momentum Mt v_hub (the mass centre).
-        rear = landing.rear if self.held_landing else dynamics.FootForce(zero, zero)
-        fore = dynamics.FootForce(
-            s.Mt * hub_jump[0] - rear.tangential, s.Mt * hub_jump[1] - rear.normal
-        )
-        locked = range(3, s.n + 1)
-        needed = dynamics.friction_needed
-        foot_2 = lambda theta: rear_foot_height(s, roll.motion(theta))
+        rear, friction_left, stopper_impulse = self._landing(s, x, roll)
         return StepResult(
             section_state=walked(jnp.stack([half + zero, after, zero])),
             post_impact=tell(jnp.stack([-half + zero, rate])),
@@ -129,19 +117,17 @@ class RigidWheel(AbstractWheel):
             monitors=Margins(
                 fore_foot_force=walked(lowest[0]),
                 clearance_sls1=zero,
-                clearance_sls2=walked(foot_2(half + zero)),
+                clearance_sls2=walked(rear_foot_height(s, roll.motion(half + zero))),
                 locked_stopper_force=walked(lowest[3:]),
                 rear_stopper_force=walked(lowest[2]),
                 contraction=zero,
                 friction_fore=walked(self.friction + lowest[1]),
                 friction_rear=tell(self.friction + zero),
-                landing_stopper_impulse=tell(
-                    transitions.locked_leg_impulses(s, first, hub_jump, locked)
-                ),
+                landing_stopper_impulse=tell(stopper_impulse),
                 hit_stopper_impulse=jnp.zeros((s.n - 2,), zero.dtype),
                 hit_planted_impulse=zero,
-                landing_friction_fore=tell(self.friction - needed(fore)),
-                landing_friction_rear=tell(self.friction - needed(rear)),
+                landing_friction_fore=tell(friction_left[0]),
+                landing_friction_rear=tell(friction_left[1]),
             ),
             energy=EnergyLoss(
                 landing=tell(0.5 * _foot_inertia(s) * (before * before - rate * rate)),
@@ -151,6 +137,22 @@ class RigidWheel(AbstractWheel):
             outcome=outcome,
             solver_steps=jnp.zeros((), jnp.int32),
         )
+
+    def _landing(self, s: Symbols, x: SectionState, roll: "_Roll") -> tuple:
+        """Impulse at the rear foot, friction left at the fore and the rear foot, and impulses of
+        the stoppers of legs 3..n."""
+        zero = jnp.zeros_like(x[1])
+        first = roll.motion(-jnp.asarray(0.5 * s.alpha, x.dtype) + zero)
+        hub_after = transitions.hub_velocity(first)
+        hub_before = transitions.hub_velocity(transitions.motion_before_landing(s, *x))
+        jump = (hub_after[0] - hub_before[0], hub_after[1] - hub_before[1])
+        held = self.held_landing
+        rear = transitions.land(s, *x).rear if held else dynamics.FootForce(zero, zero)
+        # Impulse at the fore foot: the jump of total momentum Mt v_hub (the mass centre).
+        fore = dynamics.FootForce(s.Mt * jump[0] - rear.tangential, s.Mt * jump[1] - rear.normal)
+        left = tuple(self.friction - dynamics.friction_needed(foot) for foot in (fore, rear))
+        impulse = transitions.locked_leg_impulses(s, first, jump, range(3, s.n + 1))
+        return rear, left, impulse
 
     def trace(
         self, params: WheelParams, x: SectionState, options: Options, n_samples: int
