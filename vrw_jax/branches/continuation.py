@@ -42,7 +42,8 @@ ENDING = (*INDICATORS, "duration_dls", "duration_sls1", "duration_sls2")
 
 EXACT = {"clearance_sls1": "takeoff_acceleration"}
 """A monitor that vanishes like a cube, and the quantity that vanishes with it like a line: a foot
-that leaves the ground ever less steeply dips ever less deep, until it rises at once."""
+that leaves the ground ever less steeply dips ever less deep, until it rises at once. The last of
+those dips no step of a solver shows, but the line has its sign on both sides."""
 
 
 @eqx.filter_jit

@@ -61,7 +61,7 @@ class Run(NamedTuple):
     kept: Callable[[Table], np.ndarray]  # which points are what they stand for, by their table
     is_margin: Callable[[str], bool]  # whether a column's zero is a border collision
     ending: tuple[str, ...] = ()  # columns whose zero ends a branch: the order of events changes
-    exact: Mapping[str, str] = {}  # a margin that vanishes ill, and what vanishes well with it
+    exact: Mapping[str, str] = {}  # a margin that vanishes ill, and what it stands and falls with
     name_of_loss: Callable[[Table, int], str] = lambda table, place: IN_SEQUENCE
 
     def table(self, points: PathPoint, owners: np.ndarray) -> Table:
@@ -69,8 +69,24 @@ class Run(NamedTuple):
         found = _in_batches(self.read, _taken(self.wheels, owners), points)
         margins = bifurcation_functions(np.asarray(points.jacobian))
         found |= {name: margins[:, i] for i, name in enumerate(BIFURCATIONS)}
+        for name, exact in self.exact.items():
+            if exact in found:
+                found[_both(name)] = both_hold(found[name], found[exact])
         good = np.asarray(points.valid) & self.kept(found)
         return found | {IN_SEQUENCE: np.where(good, 1.0, -1.0)}
+
+
+def _both(name: str) -> str:
+    """The column that is positive where a margin and what it stands and falls with both are."""
+    return f"{name} for certain"
+
+
+def both_hold(margin: np.ndarray, exact: np.ndarray) -> np.ndarray:
+    """A quantity with the sign of both, and of `exact` alone where that is negative.
+
+    It passes zero without a jump at either's border.
+    """
+    return np.where(exact < 0.0, exact, np.minimum(exact, margin))
 
 
 def _taken(tree: Any, places: Any) -> Any:
@@ -290,17 +306,12 @@ def _inner_zeros(run: Run, pieces: _Pieces) -> list[tuple[str, _Zero]]:
         name for name, values in pieces.table.items() if values.ndim == 1 and name not in skipped
     ]
     names = [name for name in names if name in BIFURCATIONS or run.is_margin(name)]
+    columns = [_both(name) if _both(name) in pieces.table else name for name in names]
     asked, told = [], []
-    for found in brackets(np.stack([pieces.table[name] for name in names], 1)):
-        left, right, name = found.left, found.right, names[found.column]
-        if pieces.owners[left] != pieces.owners[right]:
-            continue
-        exact = run.exact.get(name)
-        if exact in pieces.table and pieces.table[exact][left] * pieces.table[exact][right] < 0.0:
-            asked.append((left, right, exact))
-        else:
-            asked.append((left, right, name))
-        told.append(name)
+    for left, right, place in brackets(np.stack([pieces.table[name] for name in columns], 1)):
+        if pieces.owners[left] == pieces.owners[right]:
+            asked.append((left, right, columns[place]))
+            told.append(names[place])
     for i, (left, right, _) in enumerate(asked):
         slopes = pieces.points.share_slope
         if told[i] == "fold" and slopes[left] * slopes[right] > 0.0:
