@@ -8,6 +8,7 @@ differentiated, hence first and second derivatives of event state and time hold 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -55,10 +56,14 @@ class PhaseEnd(NamedTuple):
     minima: Float[Array, " n_monitors"]  # of the monitors, empty without
 
 
+STARTING, MARCHING, SEARCHING, SETTLING, DONE = range(5)
+"""What the next step is for: to look at the start; to go on; to find the event inside a step that
+brackets one; to find a monitor's minimum; nothing."""
+
+
 class _Search(NamedTuple):
     """Newton's search for the earliest event inside a step that brackets one."""
 
-    on: Bool[Array, ""]
     crossing: Bool[Array, " n_guards"]
     low: Scalar  # bracket of the event, s from the step's start
     high: Scalar
@@ -68,13 +73,13 @@ class _Search(NamedTuple):
 
 
 class _Loop(NamedTuple):
-    step: Step
+    mode: Int[Array, ""]
+    step: Step  # the last that counts
     length: Scalar  # of the next step to try, s
     controller_state: Any
     search: _Search
     minimum: Minimum
     settling: Settling
-    running: Bool[Array, ""]
     guard: Int[Array, ""]
     timed_out: Bool[Array, ""]
     gave_up: Bool[Array, ""]
@@ -188,132 +193,13 @@ def integrate_phase(
     is retried up to the dip. With `active` False nothing is integrated. Two guards at once: the
     first in the list wins. Errors are those of the solver at `options`' tolerances.
     """
-    stepper = _stepper(field, options)
-    n_guards = watched.n_guards
-    # Every number that the loop carries is batched, and perturbed where it will be, from the start:
-    # JAX would otherwise trace the loop again for each round in which that spreads.
-    zero = 0.0 * start[0]
-    none = jnp.where(active, 0, 0).astype(jnp.int32)
-    nothing = jnp.zeros(jax.eval_shape(watched.values, start).shape, start.dtype) + zero
-    no = active & False
-    fixed = lax.stop_gradient(zero)
-    solver_state, controller_state = stepper.start(start, options)
-    controller_state = jax.tree.map(lambda x: x + fixed, controller_state)
-    loop = _Loop(
-        step=Step(zero, start, solver_state, nothing, nothing),
-        length=zero,  # the first step has no length: it evaluates the start
-        controller_state=controller_state,
-        search=_Search(no, jnp.zeros((n_guards,), bool) | no, fixed, fixed, fixed, none, none),
-        minimum=no_minimum(watched, start),
-        settling=Settling(no, none, none, fixed, fixed, nothing[n_guards:] + jnp.inf),
-        running=active,
-        guard=none - 1,
-        timed_out=no,
-        gave_up=no,
-        tried=none,
+    task = _Task(_stepper(field, options), watched, options)
+    loop = lax.while_loop(
+        lambda loop: loop.mode != DONE,
+        functools.partial(_advance, task),
+        _begin(task, start, active),
     )
-
-    def advance(loop: _Loop) -> _Loop:
-        """Take one step and judge it: march on, search an event, settle a minimum, or end.
-
-        One call of solver and watch serves the evaluation of the start, marching, searching and
-        settling: code compiled once.
-        """
-        here, length, search, settling = loop.step, loop.length, loop.search, loop.settling
-        left = here.state, here.solver_state
-        if watched.count_start:
-            place = row_of(settling.monitor, loop.minimum.left)
-            left = select(settling.on, (place, stepper.solver_state(place, options)), left)
-        end, error, solver_state = stepper.step(*left, length)
-        values, rates = jax.jvp(watched.values, (end,), (stepper.field(end),))
-        guards, guard_rates = values[:n_guards], rates[:n_guards]
-        starting = loop.tried == 0
-        marching = ~(starting | search.on | settling.on)
-
-        # At the start: a guard that is past, or on its way, ends the phase at once.
-        past = (guards < 0.0) | ((guards == 0.0) & (guard_rates <= 0.0))
-        ends_at_once = starting & jnp.any(past)
-
-        # Marching: keep the step, or try another; look for crossings, and for dips within.
-        error = jnp.where(jnp.all(jnp.isfinite(values)), error, jnp.inf)
-        keep, next_length, next_controller_state = stepper.judge(
-            here.state,
-            end,
-            error,
-            jnp.where(starting, options.first_step, length),
-            loop.controller_state,
-        )
-        keep = keep & marching
-        crossing = guards <= 0.0
-        places, dips = _dips(here, values, rates, length, n_guards)
-        to_dip = length * jnp.min(jnp.where(dips & ~crossing, places, 1.0))
-        retry = keep & (to_dip < length)
-        crossed = keep & jnp.any(crossing) & ~retry
-        accepted = starting | (keep & ~crossed & ~retry)
-
-        # Searching: Newton's next proposal from this one.
-        found = _searched(search, guards, guard_rates, length, crossed, crossing)
-        settles = search.on & (jnp.abs(found.length - length) <= search.accuracy)
-        settled = search.settled + settles
-        arrived = search.on & (settled >= SETTLED)
-
-        time = here.time + length
-        step = Step(time, end, solver_state, values, rates)
-        timed_out = accepted & (time >= options.max_phase_time)
-        timed_out = timed_out | (arrived & (time > options.max_phase_time))
-        tried = loop.tried + ~settling.on
-        stuck = (search.on & ~arrived & (search.tries >= options.event_steps)) | (
-            marching
-            & ~crossed
-            & ((tried >= options.max_solver_steps) | (here.time + next_length == here.time))
-        )
-        guess = _first_guess(here, values, rates, length, n_guards, crossing)
-        following = jnp.where(starting, options.first_step, next_length)
-        following = jnp.where(retry, to_dip, following)
-        following = jnp.where(crossed, guess, following)
-        resolution = 1e3 * jnp.finfo(length.dtype).eps * time
-        following = jnp.where(search.on, found.length, lax.stop_gradient(following))
-        minimum = lower(watched, loop.minimum, here, step, length, (accepted & marching) | arrived)
-        ends = ends_at_once | arrived | timed_out | stuck
-        if watched.count_start:
-            settling, following = settle(
-                settling, watched, minimum, values, rates, length, following, starting, ends,
-                options.monitor_steps,
-            )  # fmt: skip
-        return _Loop(
-            step=select(accepted | arrived, step, here),
-            length=following,
-            controller_state=select(
-                marching & ~retry, next_controller_state, loop.controller_state
-            ),
-            search=_Search(
-                on=(search.on | crossed) & ~ends,
-                crossing=jnp.where(crossed, crossing, search.crossing),
-                low=jnp.where(crossed, 0.0, found.low),
-                high=jnp.where(crossed, lax.stop_gradient(length), found.high),
-                accuracy=jnp.where(
-                    crossed,
-                    lax.stop_gradient(jnp.maximum(options.rtol * length, resolution)),
-                    search.accuracy,
-                ),
-                tries=search.tries + search.on,
-                settled=settled,
-            ),
-            minimum=minimum,
-            settling=settling,
-            running=~(ends | loop.settling.on) | settling.on,
-            guard=jnp.where(
-                ends_at_once,
-                jnp.argmax(past).astype(jnp.int32),
-                jnp.where(arrived & ~timed_out, found.guard, loop.guard),
-            ),
-            timed_out=timed_out | loop.timed_out,
-            gave_up=stuck | loop.gave_up,
-            tried=tried,
-        )
-
-    loop = lax.while_loop(lambda loop: loop.running, advance, loop)
-    minima = jnp.minimum(loop.settling.lowest, loop.step.values[n_guards:])
+    minima = jnp.minimum(loop.settling.lowest, loop.step.values[watched.n_guards :])
     return PhaseEnd(
         state=loop.step.state,
         duration=loop.step.time,
@@ -322,6 +208,163 @@ def integrate_phase(
         gave_up=loop.gave_up,
         solver_steps=loop.tried,
         minima=minima,
+    )
+
+
+class _Task(NamedTuple):
+    """What a phase's loop does not change."""
+
+    stepper: _Stepper
+    watched: Watched
+    options: Options
+
+
+def _begin(task: _Task, start: State, active: Bool[Array, ""]) -> _Loop:
+    """Before the first step.
+
+    Every number that the loop carries is batched, and perturbed where it will be, from the start:
+    JAX would otherwise trace the loop again for each round in which that spreads.
+    """
+    stepper, watched, options = task
+    zero = 0.0 * start[0]
+    none = jnp.where(active, 0, 0).astype(jnp.int32)
+    nothing = jnp.zeros(jax.eval_shape(watched.values, start).shape, start.dtype) + zero
+    no = active & False
+    fixed = lax.stop_gradient(zero)
+    solver_state, controller_state = stepper.start(start, options)
+    crossing = jnp.zeros((watched.n_guards,), bool) | no
+    return _Loop(
+        mode=jnp.where(active, STARTING, DONE).astype(jnp.int32),
+        step=Step(zero, start, solver_state, nothing, nothing),
+        length=zero,  # the first step has no length: it evaluates the start
+        controller_state=jax.tree.map(lambda x: x + fixed, controller_state),
+        search=_Search(crossing, fixed, fixed, fixed, none, none),
+        minimum=no_minimum(watched, start),
+        settling=Settling(none, none, fixed, fixed, nothing[watched.n_guards :] + jnp.inf),
+        guard=none - 1,
+        timed_out=no,
+        gave_up=no,
+        tried=none,
+    )
+
+
+def _advance(task: _Task, loop: _Loop) -> _Loop:
+    """Take one step and judge it by the loop's mode."""
+    _, watched, options = task
+    n, here, length, search = watched.n_guards, loop.step, loop.length, loop.search
+    starting, searching = loop.mode == STARTING, loop.mode == SEARCHING
+    step, error = _taken(task, loop)
+    guards, rates = step.values[:n], step.rates[:n]
+    past = (guards < 0.0) | ((guards == 0.0) & (rates <= 0.0))
+    ends_at_once = starting & jnp.any(past)
+    marched = _marched(task, loop, step, error)
+    found = _searched(search, guards, rates, length)
+    settled = search.settled + (searching & (jnp.abs(found.length - length) <= search.accuracy))
+    arrived = searching & (settled >= SETTLED)
+
+    timed_out = marched.accepted & (step.time >= options.max_phase_time)
+    timed_out = timed_out | (arrived & (step.time > options.max_phase_time))
+    stuck = marched.stuck | (searching & ~arrived & (search.tries >= options.event_steps))
+    ends = ends_at_once | arrived | timed_out | stuck
+    mode = jnp.where(starting, MARCHING, loop.mode)
+    mode = jnp.where(ends, DONE, jnp.where(marched.crossed, SEARCHING, mode)).astype(jnp.int32)
+    following = jnp.where(searching, found.length, lax.stop_gradient(marched.following))
+    counts = (marched.accepted & ~starting) | arrived
+    minimum = lower(watched, loop.minimum, here, step, length, counts)
+    settling = loop.settling
+    if watched.count_start:
+        was_on = loop.mode == SETTLING
+        settling, on, to_minimum = settle(
+            settling, watched, minimum, step, length, was_on, starting, ends, options.monitor_steps
+        )
+        mode = jnp.where(on, SETTLING, jnp.where(was_on, DONE, mode))
+        following = jnp.where(on, to_minimum, following)
+    return _Loop(
+        mode=mode,
+        step=select(marched.accepted | arrived, step, here),
+        length=following,
+        controller_state=marched.controller_state,
+        search=_Search(
+            crossing=jnp.where(marched.crossed, marched.crossing, search.crossing),
+            low=jnp.where(marched.crossed, 0.0, found.low),
+            high=jnp.where(marched.crossed, lax.stop_gradient(length), found.high),
+            accuracy=jnp.where(marched.crossed, marched.accuracy, search.accuracy),
+            tries=search.tries + searching,
+            settled=settled,
+        ),
+        minimum=minimum,
+        settling=settling,
+        guard=jnp.where(
+            ends_at_once,
+            jnp.argmax(past).astype(jnp.int32),
+            jnp.where(arrived & ~timed_out, found.guard, loop.guard),
+        ),
+        timed_out=timed_out | loop.timed_out,
+        gave_up=stuck | loop.gave_up,
+        tried=marched.tried,
+    )
+
+
+def _taken(task: _Task, loop: _Loop) -> tuple[Step, Array]:
+    """The step to try, with what is watched at its end, and its error.
+
+    One call of solver and watch serves every mode: code compiled once.
+    """
+    stepper, watched, options = task
+    left = loop.step.state, loop.step.solver_state
+    if watched.count_start:
+        place = row_of(loop.settling.monitor, loop.minimum.left)
+        again = place, stepper.solver_state(place, options)
+        left = select(loop.mode == SETTLING, again, left)
+    end, error, solver_state = stepper.step(*left, loop.length)
+    values, rates = jax.jvp(watched.values, (end,), (stepper.field(end),))
+    error = jnp.where(jnp.all(jnp.isfinite(values)), error, jnp.inf)
+    return Step(loop.step.time + loop.length, end, solver_state, values, rates), error
+
+
+class _Marched(NamedTuple):
+    """What marching makes of a step."""
+
+    accepted: Bool[Array, ""]  # it counts; so does the start
+    crossed: Bool[Array, ""]  # it brackets an event
+    crossing: Bool[Array, " n_guards"]  # of which guards
+    stuck: Bool[Array, ""]
+    following: Scalar  # length of the next step, s
+    accuracy: Scalar  # of the event's time, s
+    controller_state: Any
+    tried: Int[Array, ""]
+
+
+def _marched(task: _Task, loop: _Loop, step: Step, error: Array) -> _Marched:
+    """Keep the step, or try another; look for crossings, and for dips within."""
+    stepper, watched, options = task
+    n, here, length = watched.n_guards, loop.step, loop.length
+    starting, marching = loop.mode == STARTING, loop.mode == MARCHING
+    nominal = jnp.where(starting, options.first_step, length)
+    keep, next_length, controller_state = stepper.judge(
+        here.state, step.state, error, nominal, loop.controller_state
+    )
+    keep = keep & marching
+    crossing = step.values[:n] <= 0.0
+    places, dips = _dips(here, step.values, step.rates, length, n)
+    to_dip = length * jnp.min(jnp.where(dips & ~crossing, places, 1.0))
+    retry = keep & (to_dip < length)
+    crossed = keep & jnp.any(crossing) & ~retry
+    tried = loop.tried + (loop.mode != SETTLING)
+    no_way = (tried >= options.max_solver_steps) | (here.time + next_length == here.time)
+    following = jnp.where(starting, options.first_step, next_length)
+    following = jnp.where(retry, to_dip, following)
+    guess = _first_guess(here, step.values, step.rates, length, n, crossing)
+    resolution = 1e3 * jnp.finfo(length.dtype).eps * step.time
+    return _Marched(
+        accepted=starting | (keep & ~crossed & ~retry),
+        crossed=crossed,
+        crossing=crossing,
+        stuck=marching & ~crossed & no_way,
+        following=jnp.where(crossed, guess, following),
+        accuracy=lax.stop_gradient(jnp.maximum(options.rtol * length, resolution)),
+        controller_state=select(marching & ~retry, controller_state, loop.controller_state),
+        tried=tried,
     )
 
 
@@ -382,14 +425,7 @@ class _Found(NamedTuple):
     high: Scalar
 
 
-def _searched(
-    search: _Search,
-    guards: Array,
-    rates: Array,
-    length: Scalar,
-    crossed: Bool[Array, ""],
-    crossing: Bool[Array, " n_guards"],
-) -> _Found:
+def _searched(search: _Search, guards: Array, rates: Array, length: Scalar) -> _Found:
     """Every guard that crosses proposes its own time and the earliest is taken.
 
     Kept inside the shrinking bracket by bisection. The proposal carries derivatives: after k of

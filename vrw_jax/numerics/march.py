@@ -141,14 +141,6 @@ def _march(
 ) -> _March:
     """Adaptive steps until each lane has crossed a guard, run out of time or given up."""
 
-    def waits(march: _March) -> Array:
-        marching = march.verdict == MARCHING
-        if few is None:
-            return jnp.any(marching)
-        left = jnp.sum(marching, dtype=jnp.int32)
-        late = march.iterations > LATE * march.half + 8
-        return (left > 0) & ~((left <= few) & late)
-
     def judge(march: _March, taken: Taken, inside: Vector, end: Vector) -> tuple[Array, Array]:
         """Length to try next, in units of this one, and what becomes of the step."""
         squared = _squared_error(taken, march.here, end, options.rtol, options.atol)
@@ -182,7 +174,7 @@ def _march(
         )
 
     none, count = jnp.zeros(first_step.shape, jnp.int32), jnp.zeros((), jnp.int32)
-    march = _March(
+    begin = _March(
         here=start,
         values=values,
         h=first_step,
@@ -194,7 +186,17 @@ def _march(
         iterations=count,
         lowest=phase.monitors and at_start(phase.monitors, phase.evaluate, start),
     )
-    return lax.while_loop(waits, advance, march)
+    return lax.while_loop(lambda march: _waits(march, few), advance, begin)
+
+
+def _waits(march: _March, few: Array | None) -> Array:
+    """Whether enough lanes march on to go on with."""
+    marching = march.verdict == MARCHING
+    if few is None:
+        return jnp.any(marching)
+    left = jnp.sum(marching, dtype=jnp.int32)
+    late = march.iterations > LATE * march.half + 8
+    return (left > 0) & ~((left <= few) & late)
 
 
 def _change(order: int, squared: Array, to_dip: Array) -> tuple[Array, Array]:

@@ -58,7 +58,6 @@ class Minimum(NamedTuple):
 class Settling(NamedTuple):
     """After the march: secant steps on a monitor's rate, one monitor after the other."""
 
-    on: Bool[Array, ""]
     monitor: Int[Array, ""]
     tries: Int[Array, ""]
     at: Scalar  # place with the smallest rate so far, from the step's left end, s
@@ -141,21 +140,21 @@ def settle(
     settling: Settling,
     watched: Watched,
     minimum: Minimum,
-    values: Array,
-    rates: Array,
+    step: Step,
     length: Scalar,
-    following: Scalar,
+    on: Bool[Array, ""],
     starting: Bool[Array, ""],
     ends: Bool[Array, ""],
     n_steps: int,
-) -> tuple[Settling, Scalar]:
+) -> tuple[Settling, Bool[Array, ""], Scalar]:
     """Each monitor's minimum to the integrator's accuracy, by re-steps once the march `ends`.
 
-    At most `n_steps` secant steps on the rate, each a step from the left end of the march's step
-    that holds the minimum. Returns where that stands, and the next length.
+    At most `n_steps` secant steps on the rate, each a step of `length` from the left end of the
+    march's step that holds the minimum. Returns where that stands, whether another step is wanted
+    (this one was if `on`), and its length.
     """
-    values, rates = values[watched.n_guards :], rates[watched.n_guards :]
-    monitor, tries = settling.monitor, settling.tries + settling.on
+    values, rates = step.values[watched.n_guards :], step.rates[watched.n_guards :]
+    monitor, tries = settling.monitor, settling.tries + on
     value, rate, room = (row_of(monitor, x) for x in (values, rates, minimum.length))
     fixed_rate, fixed_length = lax.stop_gradient((rate, length))
     gap = fixed_length - settling.at
@@ -164,7 +163,7 @@ def settle(
     secant = length - jnp.where(usable, rate / jnp.where(usable, slope, 1.0), 0.0)
     secant = jnp.clip(secant, 0.0, lax.stop_gradient(room))
     still = jnp.abs(secant - length) <= AT_MINIMUM * room
-    done = settling.on & ((tries == n_steps) | (still & (tries >= FEWEST)))
+    done = on & ((tries == n_steps) | (still & (tries >= FEWEST)))
     nearer = jnp.abs(fixed_rate) < jnp.abs(settling.rate_at)
 
     monitors = jnp.arange(values.shape[0])
@@ -178,14 +177,14 @@ def settle(
     offset, rate_left = lax.stop_gradient(
         (row_of(monitor, minimum.offset), row_of(monitor, minimum.rate_left))
     )
-    return Settling(
-        on=jnp.where(turns, jnp.any(left), settling.on),
+    told = Settling(
         monitor=monitor,
         tries=jnp.where(turns, 0, tries),
         at=jnp.where(turns, 0.0, jnp.where(nearer, fixed_length, settling.at)),
         rate_at=jnp.where(turns, rate_left, jnp.where(nearer, fixed_rate, settling.rate_at)),
         lowest=jnp.where(starting, at_start, lowest),
-    ), jnp.where(turns, offset, jnp.where(settling.on, secant, following))
+    )
+    return told, jnp.where(turns, jnp.any(left), on), jnp.where(turns, offset, secant)
 
 
 FEWEST = 3
