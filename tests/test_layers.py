@@ -17,13 +17,14 @@ ROOT = Path(__file__).parent.parent
 HOUSE = House(Path(vrw_jax.__file__).parent)
 KEPT = [rule for rule in rules.RULES if rule != rules.long_ones]
 TO_BE_CUT = {
-    "batches.ground _walked", "batches.ground events", "batches.ground_march march",
-    "batches.ground_march advance", "models.rigid step", "models.unilateral.contacts answer",
-    "models.unilateral.events _support", "models.unilateral.wheel _walk",
-    "numerics.arclength follow", "numerics.collocation", "numerics.collocation _pass_phase",
-    "numerics.collocation linearised_pass", "numerics.events integrate_phase",
-    "numerics.events advance", "numerics.march _march",
-}  # fmt: skip
+    "batches.ground _walked",
+    "batches.ground events",
+    "batches.ground_march march",
+    "batches.ground_march advance",
+    "models.unilateral.contacts answer",
+    "models.unilateral.events _support",
+    "models.unilateral.wheel _walk",
+}
 """Functions over 60 lines and modules over 500, still to be cut by question: none is added."""
 
 

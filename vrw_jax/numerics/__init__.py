@@ -14,14 +14,12 @@ from vrw_jax.numerics.arclength import (
 )
 from vrw_jax.numerics.collocation import (
     Constants,
-    LaneArray,
     Linearised,
     Passage,
     Phase,
     PhaseSequence,
     Point,
     Solution,
-    fusion_barrier,
     linearised_pass,
     mesh_error,
     walk_through,
@@ -39,6 +37,7 @@ from vrw_jax.numerics.gauss import (
     Mesh,
     transfer_matrix,
 )
+from vrw_jax.numerics.lane_algebra import LaneArray, fusion_barrier
 from vrw_jax.numerics.lane_minima import Monitors
 from vrw_jax.numerics.lanes import (
     compiled_by_caller,
