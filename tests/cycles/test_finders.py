@@ -77,10 +77,11 @@ def test_a_rung_and_its_numbers_are_each_other_s_inverse(model: AbstractWheel):
 def test_a_cycle_counts_only_where_the_step_from_it_ends_on_it():
     outcome = vrw.Outcome
     found, lost, fell = outcome.STEPPED, outcome.NO_CYCLE_FOUND, outcome.FELL_BACK
+    coarse = outcome.MESH_TOO_COARSE
     state = np.zeros((4, 3))
     reached = state + np.array([0.0, 0.9, 1.1, 0.0])[:, None] * AGREEMENT
     told = confirmed([found, found, found, lost], state, [found, found, found, fell], reached)
-    assert list(told) == [found, found, lost, lost]
+    assert list(told) == [found, found, coarse, lost]
     assert confirmed(found, state[0], fell, reached[0]) == fell
 
 

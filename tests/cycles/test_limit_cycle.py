@@ -187,6 +187,34 @@ def test_no_cycle_is_an_outcome_with_zeros_and_disturbs_no_neighbour():
         np.testing.assert_allclose(cycle.durations[0], cycles().durations[0], rtol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("changes", "outcome", "words"),
+    [
+        ({"damping": 240.0}, Outcome.ORDER_DIFFERS, "DLS ends only once"),
+        (
+            {"damping": 15.0, "stiffness": 1117.9, "natural_length": 1.0302, "slope": 0.08},
+            Outcome.ORDER_DIFFERS,
+            "LEG_1_LIFTED_OFF in DLS",
+        ),
+        ({"slope": 0.02}, Outcome.NO_CYCLE_FOUND, "did not converge"),
+    ],
+)
+def test_why_there_is_no_gait_is_told_apart(changes, outcome, words):
+    cycle = vrw.limit_cycle(vrw.WheelParams(**changes))
+    assert int(cycle.outcome) == outcome
+    assert words in cycle.why
+    assert cycle.why in repr(cycle)
+
+
+def test_a_mesh_too_coarse_says_so_and_more_of_it_finds_the_gait():
+    params = vrw.WheelParams(damping=190.6, stiffness=838.6, natural_length=1.0211, slope=0.126)
+    coarse, fine = (vrw.CycleOptions(steps=steps) for steps in ((2, 1, 1), (30, 30, 10)))
+    cycle = vrw.limit_cycle(params, options=coarse)
+    assert int(cycle.outcome) == Outcome.MESH_TOO_COARSE
+    assert "more steps" in cycle.why
+    assert int(vrw.limit_cycle(params, options=fine).outcome) == Outcome.STEPPED
+
+
 def test_gait_without_double_support_is_found_though_unstable():
     row = table_1(
         natural_length=1.03163159, stiffness=529.980645, damping=179.091443, slope=0.314288553

@@ -17,7 +17,8 @@ from jaxtyping import Array, Bool, Float, Int
 from vrw_jax.cycles.cycle import AbstractCycle
 from vrw_jax.cycles.derivatives import attach_monodromy, solve_cycle
 from vrw_jax.cycles.premises import takeoff_acceleration
-from vrw_jax.cycles.search import Located, Problem, nothing_known
+from vrw_jax.cycles.search import MESH, Located, Problem, nothing_known
+from vrw_jax.cycles.sequence import SIGNS
 from vrw_jax.models import Indicators, Margins, SectionState, ViscoelasticWheel
 from vrw_jax.numerics import (
     N_NODES,
@@ -53,7 +54,7 @@ class LimitCycle(AbstractCycle):
     durations: Float[Array, "*n 3"]  # of DLS, SLS-I, SLS-II, s; (n, 3) for period_n = n > 1
     step_length: Float[Array, "*n"]  # distance between the feet at the landing, m; (n,) for n > 1
     indicators: Indicators  # of the landing; (n,) each for n > 1
-    outcome: Int[Array, ""]  # Outcome.STEPPED, NO_CYCLE_FOUND or BAD_INPUT
+    outcome: Int[Array, ""]  # Outcome.STEPPED, or why there is none
     residual: Scalar  # last correction of Newton's method, rad, rad/s, s or m
     passes: Int[Array, ""]  # linearised passes that the search took
     parameters: Float[Array, " n_parameters"]  # in the order of params.PARAMETER_NAMES
@@ -124,6 +125,12 @@ class LimitCycle(AbstractCycle):
 
         return self._mapped(walk)(self.parameters, self.section_state)
 
+    @property
+    def why(self) -> str:
+        broken = int(self.located.broken)
+        told = f" Broken: {SIGNS[broken - 1]}." if self.outcome == Outcome.ORDER_DIFFERS else ""
+        return super().why + told
+
     def own_rows(self) -> list[Row]:
         forces = self.indicators
         told = f"{listed(forces.lambda_I4)} N s, {listed(forces.lambda_2)} N"
@@ -171,7 +178,9 @@ def _find_cycle(params: WheelParams, problem: Problem, guess: Located | None) ->
         return masked(values[0] if n == 1 else jnp.stack(values))
 
     durations = located.solution.durations
-    code = jnp.where(found, Outcome.STEPPED, Outcome.NO_CYCLE_FOUND)
+    code = jnp.where(located.broken > 0.0, Outcome.ORDER_DIFFERS, Outcome.NO_CYCLE_FOUND)
+    code = jnp.where(located.broken == MESH, Outcome.MESH_TOO_COARSE, code)
+    code = jnp.where(found, Outcome.STEPPED, code)
     return LimitCycle(
         section_state=masked(states[-1]),
         post_impact=masked(located.solution.section),

@@ -26,7 +26,7 @@ class AbstractCycle(eqx.Module):
     durations: eqx.AbstractVar[Float[Array, "*n 3"]]  # of double support first, s
     step_length: eqx.AbstractVar[Float[Array, "*n"]]  # between the feet at the landing, m
     matrix: eqx.AbstractVar[Array]  # value of the monodromy matrix
-    outcome: eqx.AbstractVar[Int[Array, ""]]  # Outcome.STEPPED, NO_CYCLE_FOUND or BAD_INPUT
+    outcome: eqx.AbstractVar[Int[Array, ""]]  # Outcome.STEPPED, or why there is none
 
     @property
     @abc.abstractmethod
@@ -51,6 +51,11 @@ class AbstractCycle(eqx.Module):
     def found(self) -> Bool[Array, "..."]:
         """Whether there is a cycle."""
         return self.outcome == Outcome.STEPPED
+
+    @property
+    def why(self) -> str:
+        """Why there is no cycle, as a sentence; of one wheel."""
+        return Outcome(int(self.outcome)).meaning
 
     @property
     def period(self) -> Array:
@@ -116,8 +121,7 @@ class AbstractCycle(eqx.Module):
             found = int(np.sum(outcome == Outcome.STEPPED))
             return [("wheels", f"{outcome.size} in shape {outcome.shape}, {found} with a gait")]
         if outcome != Outcome.STEPPED:
-            code = Outcome(int(outcome))
-            return [("outcome", f"{code.name}: {code.meaning}")]
+            return [("outcome", f"{Outcome(int(outcome)).name}: {self.why}")]
         multipliers = sorted(np.linalg.eigvals(np.asarray(self.matrix)), key=abs, reverse=True)
         radius = float(np.max(np.abs(multipliers)))
         shown = [z for z in multipliers[:4] if abs(z) > 1e-9] or multipliers[:1]

@@ -84,7 +84,7 @@ def same_branch(here: OnBranch, there: OnBranch, change: np.ndarray) -> bool:
 def confirmed(outcome: Any, state: Any, walked: Any, reached: Any) -> np.ndarray:
     """Outcomes of cycles with these section states, from which a step was walked to `reached`."""
     agrees = np.max(np.abs(np.asarray(reached) - np.asarray(state)), axis=-1) <= AGREEMENT
-    step = np.where(agrees, Outcome.STEPPED, Outcome.NO_CYCLE_FOUND)
+    step = np.where(agrees, Outcome.STEPPED, Outcome.MESH_TOO_COARSE)
     step = np.where(np.asarray(walked) == Outcome.STEPPED, step, np.asarray(walked))
     return np.where(np.asarray(outcome) == Outcome.STEPPED, step, np.asarray(outcome))
 

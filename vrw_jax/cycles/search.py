@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Inexact, Int
 
 from vrw_jax import simd
 from vrw_jax.cycles.options import CycleOptions
-from vrw_jax.cycles.sequence import constants_of, held_landing
+from vrw_jax.cycles.sequence import SIGNS, constants_of, held_landing
 from vrw_jax.cycles.surface import gait_on_surface
 from vrw_jax.numerics import (
     N_NODES,
@@ -98,6 +98,7 @@ class Located(NamedTuple):
     solution: Solution
     happens: LaneArray  # (n, n_phases, lanes): 1 where the phase takes place, else 0
     found: LaneArray  # (lanes,): 1 for a limit cycle, 0 where there is none and values stand in
+    broken: LaneArray  # (lanes,): 1 + place in SIGNS of what a root that is no gait breaks, else 0
     ends: LaneArray  # (n, 4, lanes): theta, L1 and their rates at the end of each step
 
 
@@ -145,11 +146,11 @@ def start_from(problem: Problem, section: Array, durations: Array, with_dls: Arr
     return Located(solution, happens, *nothing_known(problem, section))
 
 
-def nothing_known(problem: Problem, section: Array) -> tuple[Array, Array]:
-    """`found` and `ends` of a start."""
+def nothing_known(problem: Problem, section: Array) -> tuple[Array, Array, Array]:
+    """`found`, `broken` and `ends` of a start."""
     lanes, n_ends = section.shape[1:], 2 * problem.sequence.phases[-1].dim
     zeros = lambda *shape: jnp.zeros((*shape, *lanes), section.dtype)
-    return zeros(), zeros(problem.period_n, n_ends)
+    return zeros(), zeros(), zeros(problem.period_n, n_ends)
 
 
 def over_rows(combine: Callable[[Array, Array], Array], x: Array) -> LaneArray:
@@ -197,7 +198,8 @@ def _limited(solution: Solution, correction: Solution) -> LaneArray:
 def columns_of(passed: Linearised, located: Located) -> Located:
     """The columns of a pass; what selects a solution has none."""
     flat = lambda x: jnp.zeros((passed.d_ends.shape[0], *x.shape), x.dtype)
-    return Located(passed.columns, flat(located.happens), flat(located.found), passed.d_ends)
+    found, broken = flat(located.found), flat(located.broken)
+    return Located(passed.columns, flat(located.happens), found, broken, passed.d_ends)
 
 
 class _Iterate(NamedTuple):
@@ -277,15 +279,17 @@ def newton(
 
     going = lambda now: jnp.any(now.running) & (now.iteration < iterations + stages)
     last = lax.while_loop(going, iterate, _first_iterate(problem, start, pending))
-    found = last.converged & signs_hold(problem, parameters, last.located)
-    located = last.located._replace(found=found.astype(parameters.dtype))
+    broken = first_broken(problem, parameters, last.located)
+    found = (last.converged & (broken == 0.0)).astype(parameters.dtype)
+    broken = jnp.where(last.converged, broken, 0.0)
+    located = last.located._replace(found=found, broken=broken)
     return Finding(located, last.monodromy, last.residual, last.passes)
 
 
-def signs_hold(problem: Problem, parameters: Parameters, located: Located) -> Bool[Array, " lanes"]:
-    """Whether durations, guards at all nodes and the checks at all borders are positive.
+def first_broken(problem: Problem, parameters: Parameters, located: Located) -> LaneArray:
+    """1 + the place in SIGNS of the first that does not hold, 0 where all do.
 
-    And whether the mesh resolves the gait at all.
+    Durations, guards at all nodes and the checks at all borders must be positive.
     """
     sequence = problem.sequence
     constants = problem.constants_of(*parameters)
@@ -293,27 +297,30 @@ def signs_hold(problem: Problem, parameters: Parameters, located: Located) -> Bo
     hold = fusion_barrier(parameters)
 
     def step(carry: tuple, inputs: tuple) -> tuple:
-        section, good = carry
+        section, broken = carry
         durations, accelerations, happens = inputs
         happens = happens > 0.5
         following, passages = walk_through(
             sequence, problem.meshes, constants, tuple(section), durations, accelerations
         )
+        holds: list[Array] = []
         for i, (phase, passage) in enumerate(zip(sequence.phases, passages, strict=True)):
-            start, nodes, end = (
-                functools.reduce(jnp.minimum, phase.guards(constants, point)) for point in passage
-            )
-            inside = jnp.minimum(start, over_rows(jnp.minimum, hold(nodes))) > 0.0
-            inside &= (durations[i] > 0.0) & (end > -ZERO_AT_EVENT)
-            good &= inside | ~happens[i]
-        for check in sequence.border_checks(constants, passages, happens):
-            good &= check > 0.0
-        return (jnp.stack(following), good), None
+            holds.append(~happens[i] | (durations[i] > 0.0))
+            for start, nodes, end in zip(
+                *(phase.guards(constants, point) for point in passage), strict=True
+            ):
+                least = jnp.minimum(start, over_rows(jnp.minimum, hold(nodes)))
+                holds.append(~happens[i] | ((least > 0.0) & (end > -ZERO_AT_EVENT)))
+        holds += [check > 0.0 for check in sequence.border_checks(constants, passages, happens)]
+        for place, good in enumerate(holds):
+            broken = jnp.where((broken == 0.0) & ~good, 1.0 + place, broken)
+        return (jnp.stack(following), broken), None
 
     inputs = (solution.durations, solution.accelerations, located.happens)
-    carry = (solution.section, jnp.ones(parameters.shape[-1:], bool))
-    (_, good), _ = lax.scan(step, carry, inputs)
-    return good & (mesh_error(sequence, problem.meshes, solution) < LARGEST_MESH_ERROR)
+    carry = (solution.section, jnp.zeros(parameters.shape[-1:], parameters.dtype))
+    (_, broken), _ = lax.scan(step, carry, inputs)
+    resolved = mesh_error(sequence, problem.meshes, solution) < LARGEST_MESH_ERROR
+    return jnp.where((broken == 0.0) & ~resolved, float(MESH), broken)
 
 
 def _is(attempt: Array, *names: str) -> Array:
@@ -345,7 +352,12 @@ def _attempted(
     pending = now.located.found < 0.5
     tried = newton(problem, parameters, start, origin, stages, limits[attempt], pending)
     chosen = jax.tree.map(lambda a, b: jnp.where(pending, a, b), tried, now)
-    return chosen._replace(passes=now.passes + tried.passes)
+    # The first root that is no gait is told, unless only the mesh forbids another one.
+    before, after = now.located.broken, chosen.located.broken
+    broken = jnp.where((before == 0.0) | (after == MESH), after, before)
+    broken = jnp.where(chosen.located.found > 0.5, 0.0, broken)
+    located = chosen.located._replace(broken=broken)
+    return chosen._replace(located=located, passes=now.passes + tried.passes)
 
 
 def search_lanes(
@@ -396,6 +408,9 @@ def not_searched(problem: Problem, parameters: Parameters) -> Finding:
         zeros().astype(jnp.int32),
     )
 
+
+MESH = len(SIGNS)
+"""`Located.broken` of a root that the mesh does not resolve."""
 
 ZERO_AT_EVENT = 1e-6
 """How far below zero a guard may be at the end of the phase that it ends, N, m or rad/s."""

@@ -38,7 +38,7 @@ class WalkedCycle(AbstractCycle):
     step_length: Float[Array, "*n"]  # distance between the feet at the landing, m
     steps: Any  # the model's step results, with an axis over the steps of one cycle
     matrix: Float[Array, "n_section n_section"]  # derivative of the return to the section
-    outcome: Int[Array, ""]  # Outcome.STEPPED, NO_CYCLE_FOUND or BAD_INPUT
+    outcome: Int[Array, ""]  # Outcome.STEPPED, or why there is none
     residual: Scalar  # largest entry of map(x) - x, rad, rad/s or m/s
     iterations: Int[Array, ""]  # of Newton's method
 

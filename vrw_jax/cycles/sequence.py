@@ -23,6 +23,7 @@ from vrw_jax.numerics import (
     sine_cosine,
 )
 from vrw_jax.wheel import (
+    FALLS,
     PHASES,
     AbstractPhase,
     Instant,
@@ -80,6 +81,20 @@ def _collocated(n_legs: int, index: int) -> Phase:
 
     reset = to_section if kind is PHASES[-1] else to_next_phase
     return Phase(kind.name, kind.n, residual, event, reset, guards, smooth=not kind.stiff_start)
+
+
+def _signs() -> tuple[str, ...]:
+    told: list[str] = []
+    for kind in PHASES:
+        others = (*kind.own_outcomes[1:], *FALLS)
+        told += [f"{kind.name} lasts", f"{kind.name} ends only once"]
+        told += [f"no {outcome.name} in {kind.name}" for outcome in others]
+    return (*told, "λ4⁺ says whether there is DLS", "λ_I4 holds the rear foot", "Leg 2 extends")
+
+
+SIGNS = (*_signs(), "mesh")
+"""What is presumed of a gait, in the order in which it is looked at: by phase its duration and its
+guards, then the checks at the borders between phases; and that the mesh resolves it at all."""
 
 
 @functools.cache

@@ -71,6 +71,8 @@ OUTCOMES: dict[Outcome, tuple[str, str]] = {
     Outcome.TOO_MANY_EVENTS: ("too many events", "#332288"),
     Outcome.NO_ADMISSIBLE_CONTACT: ("no admissible contact", "#661100"),
     Outcome.THREE_FEET_LOADED: ("three feet loaded", "#44AA99"),
+    Outcome.MESH_TOO_COARSE: ("mesh too coarse", "#777777"),
+    Outcome.ORDER_DIFFERS: ("other order of events", "#AAAAAA"),
 }
 NOT_COMPUTED = ("not computed", "#FFFFFF")
 UNSTABLE = 100

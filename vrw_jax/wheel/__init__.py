@@ -22,5 +22,5 @@ from vrw_jax.wheel.params import (
     symbols_of,
     wheel_of,
 )
-from vrw_jax.wheel.phases import PHASES, AbstractPhase, Instant, Premises, phases_of
+from vrw_jax.wheel.phases import FALLS, PHASES, AbstractPhase, Instant, Premises, phases_of
 from vrw_jax.wheel.transitions import Landing

@@ -19,6 +19,8 @@ class Outcome(enum.IntEnum):
     TOO_MANY_EVENTS = 10
     NO_ADMISSIBLE_CONTACT = 11
     THREE_FEET_LOADED = 12
+    MESH_TOO_COARSE = 13
+    ORDER_DIFFERS = 14
 
     @property
     def meaning(self) -> str:
@@ -41,11 +43,17 @@ _MEANINGS = {
     Outcome.SOLVER_GAVE_UP: "The integrator ran out of steps or could not locate an event.",
     Outcome.BAD_INPUT: "A parameter or the start is not finite, or outside its domain.",
     Outcome.NO_CYCLE_FOUND: (
-        "The search for a limit cycle did not converge to a valid one, or its mesh is too coarse."
+        "The search for a limit cycle did not converge: there may be one that it missed."
     ),
     Outcome.TOO_MANY_EVENTS: "Contacts and stoppers changed more often than one step may.",
     Outcome.NO_ADMISSIBLE_CONTACT: (
         "No combination of contact modes satisfies Coulomb's law (a Painlevé paradox)."
     ),
     Outcome.THREE_FEET_LOADED: "Three feet would have to carry load at once.",
+    Outcome.MESH_TOO_COARSE: (
+        "A cycle solves the equations, but the mesh is too coarse for it: give more steps."
+    ),
+    Outcome.ORDER_DIFFERS: (
+        "A cycle solves the equations, but its events do not come in the paper's order."
+    ),
 }
