@@ -44,13 +44,10 @@ def struck():
     )
     motion = motion._replace(dL=motion.dL.at[STRUCK].set(0.5))
     stance = Stance(jnp.full(8, OFF, jnp.int32), jnp.arange(8) != STRUCK, none, none, none)
-    event = event_of(guards_of(8, True), 8, jnp.int32(8 + STRUCK))
-    after = jax.jit(
-        lambda unseen: resolve(s, jnp.asarray(0.7), motion, stance, event, Law(True, True), unseen)
-    )
-    bilateral = jax.jit(
-        lambda: resolve(s, jnp.asarray(0.7), motion, stance, event, Law(False, True), 0.0)
-    )
+    law = lambda one_sided, unseen: Law(s, jnp.asarray(0.7), one_sided, True, unseen)
+    event = event_of(guards_of(8, True), jnp.int32(8 + STRUCK))
+    after = jax.jit(lambda unseen: resolve(law(True, unseen), motion, stance, event))
+    bilateral = jax.jit(lambda: resolve(law(False, 0.0), motion, stance, event))
     return motion, after, bilateral
 
 

@@ -38,7 +38,6 @@ from vrw_jax.numerics.minima import Watched
 
 START = (0.1, 1.6, -0.1)
 TIGHT = vrw.Options.tight()
-LAW = Law(one_sided=False, counted=True)
 TABLE_1 = vrw.WheelParams()
 SCENES = {  # friction, damping, dtheta at the start: what happens in the first step
     "lands sliding": (0.7, 200.0, 1.6),
@@ -223,6 +222,10 @@ def test_below_one_every_event_has_exactly_one_solution(friction):
     assert int(step.most_solutions) == 1
 
 
+def law_of(s, friction):
+    return Law(s, jnp.asarray(friction), one_sided=False, counted=True, unseen=0.0)
+
+
 def at_rest(theta, **changes):
     """A wheel at rest on legs of length L0, the lower foot on the slope."""
     zero = jnp.zeros(())
@@ -264,8 +267,8 @@ def test_a_vertical_leg_lands_with_its_own_mass_alone():
     s, speed = TABLE_1.symbols(), 2.0
     motion = at_rest(0.0, vz=jnp.asarray(-speed))
     in_the_air = stance_of((OFF, OFF), [True] * 8)
-    event = event_of(guards_of(8, False), 8, jnp.int32(0))
-    change = resolve(s, jnp.asarray(0.7), motion, in_the_air, event, LAW, 0.0)
+    event = event_of(guards_of(8, False), jnp.int32(0))
+    change = resolve(law_of(s, 0.7), motion, in_the_air, event)
     # The leg's 1 kg stops, the other 17 kg go on; the spring then begins to work.
     assert abs(float(change.normal_impulse[0]) - 1.0 * speed) < 1e-12
     assert abs(float(change.energy_lost) - 0.5 * speed**2) < 1e-12
@@ -313,8 +316,8 @@ def test_a_foot_that_lands_sliding_takes_coulombs_impulse(friction):
     s = TABLE_1.symbols()
     motion = at_rest(0.0, vz=jnp.asarray(-1.0), vx=jnp.asarray(5.0))
     in_the_air = stance_of((OFF, OFF), [True] * 8)
-    event = event_of(guards_of(8, False), 8, jnp.int32(0))
-    change = resolve(s, jnp.asarray(friction), motion, in_the_air, event, LAW, 0.0)
+    event = event_of(guards_of(8, False), jnp.int32(0))
+    change = resolve(law_of(s, friction), motion, in_the_air, event)
     normal, tangential = float(change.normal_impulse[0]), float(change.tangential_impulse[0])
     assert int(change.stance.contact[0]) == SLIP_DOWN
     assert abs(tangential + friction * normal) < 1e-12

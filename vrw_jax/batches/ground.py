@@ -23,41 +23,36 @@ from vrw_jax.batches.ground_march import (
     MARCHING,
     WAITING,
     March,
-    Search,
-    begun_guards,
-    guard_rates,
-    guards_at,
     march,
     motion_of,
     place_of,
+    set_off,
 )
 from vrw_jax.models import (
-    OFF,
-    PAPER_START,
-    Law,
+    Flow,
+    Ledger,
     Stance,
     UnilateralWheel,
     WheelMotion,
+    blank,
     closed,
     embedded,
-    event_of,
     flow_of,
     guards_of,
-    least_dip,
+    law_of,
+    made_sound,
     opened,
-    replaced_where_bad,
-    resolve,
-    settled,
+    outcome_at,
+    passed,
+    past,
     unpack,
-    usable,
 )
-from vrw_jax.numerics import Options, Tableau, explicit_tableau, select
+from vrw_jax.numerics import Options, Tableau, explicit_tableau, select, zeros_of
 from vrw_jax.runtime import fusion_emitters, lane_function
 from vrw_jax.wheel import (
     PARAMETER_NAMES,
     Outcome,
     Symbols,
-    WheelParams,
     parameters_of,
     symbols_of,
     wheel_of,
@@ -91,10 +86,27 @@ class _Lanes(NamedTuple):
 
     wheel: Array  # its place in the queue
     columns: Array
-    events: Array  # in this step
-    durations: Array  # (3, lanes), of this step
+    ledger: Ledger  # of this step; steps tried are all of the wheel's
     n_stepped: Array
-    tried: Array
+
+
+class _Walk(NamedTuple):
+    """What holds for all wheels of a batch."""
+
+    n: int
+    n_steps: Array
+    max_events: int
+    one_sided: bool
+    options: Options
+    tableau: Tableau
+
+    def symbols(self, columns: Array) -> Symbols:
+        """Of one wheel, or of lanes."""
+        return symbols_of(self.n, *columns[:-1])
+
+    def flow(self, columns: Array, stance: Stance) -> Flow:
+        """Of lanes in their stances."""
+        return flow_of(self.symbols(columns), columns[-1], self.one_sided, stance)
 
 
 def walk_lanes(
@@ -141,10 +153,6 @@ def as_full_states(columns: np.ndarray, states: np.ndarray, n: int) -> np.ndarra
     return np.asarray(jax.vmap(embed, (1, 0))(columns[:-1], jnp.asarray(states)))
 
 
-def _symbols(columns: Array, n: int) -> Symbols:
-    return symbols_of(n, *columns[:-1])
-
-
 @functools.cache
 def _program(
     static: Options, n_legs: int, max_events: int, one_sided: bool
@@ -155,21 +163,18 @@ def _program(
         options = eqx.combine(dynamic, static)
         tableau = explicit_tableau(options.solver)
         assert tableau is not None  # `batch` looked
-        queue = _queue_of(columns, x, n_legs)
-        return _walked(queue, wanted, n_steps, n_legs, max_events, one_sided, options, tableau)
+        on = _Walk(n_legs, n_steps, max_events, one_sided, options, tableau)
+        return _walked(_queue_of(columns, x, n_legs), wanted, on)
 
     return jax.jit(walk, compiler_options=fusion_emitters(False))
 
 
 def _queue_of(columns: Array, x: Array, n: int) -> _Queue:
-    def made_safe(values: Array, x: Array) -> tuple[Array, Array, Array]:
-        params = wheel_of(values[:-1], n)
-        safe_x = embedded(WheelParams(n_legs=n).symbols(), jnp.asarray(PAPER_START, x.dtype))
-        good = usable(params, x) & (values[-1] >= 0.0)
-        params, x = replaced_where_bad(good, params, x, safe_x)
-        return jnp.stack([*parameters_of(params), jnp.where(good, values[-1], 1.0)]), x, good
+    def sound(values: Array, x: Array) -> tuple[Array, Array, Array]:
+        good, params, friction, x = made_sound(wheel_of(values[:-1], n), values[-1], x)
+        return jnp.stack([*parameters_of(params), friction]), x, good
 
-    columns, x, good = jax.vmap(made_safe, -1, -1)(columns, x)
+    columns, x, good = jax.vmap(sound, -1, -1)(columns, x)
     none = jnp.zeros(x.shape[-1:], jnp.int32)
     return _Queue(
         columns=columns,
@@ -184,182 +189,157 @@ def _queue_of(columns: Array, x: Array, n: int) -> _Queue:
     )
 
 
-def _walked(
-    queue: _Queue,
-    wanted: Array,
-    n_steps: Array,
-    n: int,
-    max_events: int,
-    one_sided: bool,
-    options: Options,
-    tableau: Tableau,
-) -> tuple:
-    """Every wanted wheel through `n_steps` landings of its foremost foot."""
-    place = guards_of(n, one_sided)
-    over = functools.partial(jax.vmap, in_axes=-1, out_axes=-1)
-    dtype = queue.start.dtype
-
-    def begins(columns: Array, x: Array) -> tuple[WheelMotion, Stance]:
-        state, stance = opened(_symbols(columns, n), x)
-        return unpack(state)[0], stance
-
-    def through(columns: Array, motion: WheelMotion, stance: Stance, guard: Array) -> tuple:
-        """Past an event: motion, stance and outcome.
-
-        The integrator lets feet drift by its error. One that lifts rises like the third power of
-        time, from the slope and from rest: else it would land again at once.
-        """
-        s, friction = _symbols(columns, n), columns[-1]
-        motion = settled(s, motion, stance.contact, stance.locked)
-        law, unseen = Law(one_sided, counted=False), least_dip(s, options, one_sided)
-        change = resolve(s, friction, motion, stance, event_of(place, n, guard), law, unseen)
-        outcome = jnp.where(change.solutions > 0, Outcome.STEPPED, Outcome.NO_ADMISSIBLE_CONTACT)
-        outcome = jnp.where(change.third_foot, Outcome.THREE_FEET_LOADED, outcome)
-        return change.motion, change.stance, outcome.astype(jnp.int32)
-
-    lanes, now = _empty(queue, n, one_sided)
-    n_lanes = now.h.shape[-1]
-    on = _marches(n, one_sided, options, tableau)
-
-    def events(queue: _Queue, lanes: _Lanes, now: March) -> tuple[_Queue, _Lanes, March]:
-        """Some lanes through their events, or on to the next wheels."""
-        ready = (now.verdict != MARCHING) & ((now.verdict != WAITING) | (queue.next < wanted))
-        (index,) = jnp.nonzero(ready, size=TOGETHER, fill_value=n_lanes)
-        pick = lambda leaf: jnp.take(leaf, index, axis=-1, mode="clip")
-        here, lane = jax.tree.map(pick, (now, lanes))
-        chosen = index < n_lanes
-        came = chosen & (here.verdict != WAITING)
-
-        # How the phase ended.
-        loaded = jnp.sum(here.stance.contact != OFF, axis=0)
-        share = jnp.arange(3)[:, None] == 2 - loaded
-        durations = lane.durations + jnp.where(share, here.time, 0.0)
-        tried = lane.tried + here.tried
-        at_event = here.verdict == EVENT
-        landed = came & at_event & (here.guard == place.foot + n - 1)
-        code = jnp.where(lane.events >= max_events, Outcome.TOO_MANY_EVENTS, Outcome.STEPPED)
-        code = jnp.where(here.guard == place.rate, Outcome.FELL_BACK, code)
-        code = jnp.where(here.guard == place.length, Outcome.COLLAPSED, code)
-        code = jnp.where(at_event, jnp.where(landed, Outcome.STEPPED, code), here.verdict)
-        n_stepped = lane.n_stepped + landed
-        motion, stance = motion_of(here.here), here.stance
-        reached = over(closed)(motion, stance)
-
-        # A wheel that is done or lost is told, and makes room for the next one.
-        failed = came & (code != Outcome.STEPPED)
-        leaves = failed | (landed & (n_stepped >= n_steps))
-        to = jnp.where(leaves, lane.wheel, QUEUE)
-        put = lambda old, new: old.at[..., to].set(new, mode="drop")
-        free = leaves | (chosen & ~came)
-        following = queue.next + jnp.cumsum(free.astype(jnp.int32)) - 1
-        fills = free & (following < wanted)
-        wheel = jnp.where(fills, following, lane.wheel)
-        fresh = lambda leaf: jnp.take(leaf, wheel, axis=-1, mode="clip")
-        queue = queue._replace(
-            next=jnp.minimum(queue.next + jnp.sum(free, dtype=jnp.int32), wanted),
-            section=put(queue.section, jnp.where(failed, 0.0, reached)),
-            durations=put(queue.durations, durations),
-            outcome=put(queue.outcome, code.astype(jnp.int32)),
-            n_stepped=put(queue.n_stepped, n_stepped),
-            tried=put(queue.tried, tried),
-        )
-
-        # A landing of the foremost foot opens the next step; all go through their events.
-        opens = fills | (landed & ~leaves)
-        columns = jnp.where(fills, fresh(queue.columns), lane.columns)
-        x = jnp.where(fills, fresh(queue.start), reached)
-        motion, stance = select(opens, over(begins)(columns, x), (motion, stance))
-        guard = jnp.where(opens, place.foot, here.guard)
-        motion, stance, outcome = over(through)(columns, motion, stance, guard)
-        outcome = jnp.where(fills & ~fresh(queue.good), Outcome.BAD_INPUT, outcome)
-        flow = flow_of(_symbols(columns, n), columns[-1], one_sided, stance)
-        start = place_of(flow, motion)
-        values, rates, begun = guards_at(flow, start), guard_rates(flow, start), begun_guards(flow)
-        past = ~begun & ((values < 0.0) | ((values == 0.0) & (rates <= 0.0)))
-        offset = jnp.where(begun, values, 0.0)
-        verdict = jnp.where(jnp.any(past, axis=0), EVENT, MARCHING)
-        verdict = jnp.where(outcome != Outcome.STEPPED, outcome, verdict)
-        verdict = jnp.where(free & ~fills, WAITING, verdict).astype(jnp.int32)
-        zero, none = jnp.zeros(index.shape, dtype), jnp.zeros(index.shape, jnp.int32)
-        after = March(
-            here=start,
-            stance=stance,
-            values=values - offset,
-            offset=offset,
-            h=zero + options.first_step,
-            time=zero,
-            search=Search(none > 0, jnp.zeros_like(begun), zero, zero, zero, none),
-            verdict=verdict,
-            guard=jnp.argmax(past, axis=0).astype(jnp.int32),
-            tried=none,
-        )
-        kept = _Lanes(
-            wheel=wheel,
-            columns=columns,
-            events=jnp.where(opens, 1, lane.events + 1),
-            durations=jnp.where(opens, 0.0, durations),
-            n_stepped=jnp.where(fills, 0, n_stepped),
-            tried=jnp.where(fills, 0, tried),
-        )
-        put_back = lambda old, new: old.at[..., index].set(new, mode="drop")
-        now, lanes = jax.tree.map(put_back, (now, lanes), (after, kept))
-        return queue, lanes, now
+def _walked(queue: _Queue, wanted: Array, on: _Walk) -> tuple:
+    """Every wanted wheel through its landings of the foremost foot."""
+    marches = _marches(on)
 
     def round_(state: tuple) -> tuple:
-        queue, lanes, now = events(*state)
+        queue, lanes, now = _events(on, wanted, *state)
         to_fill = jnp.where(queue.next < wanted, jnp.sum(now.verdict == WAITING), 0)
-        return queue, lanes, on(lanes.columns, now, TOGETHER - to_fill)
+        return queue, lanes, marches(lanes.columns, now, TOGETHER - to_fill)
 
     def goes_on(state: tuple) -> Array:
         queue, _, now = state
         return (queue.next < wanted) | jnp.any(now.verdict != WAITING)
 
-    queue, *_ = lax.while_loop(goes_on, round_, (queue, lanes, now))
+    queue, *_ = lax.while_loop(goes_on, round_, (queue, *_empty(queue, on)))
     return queue.section, queue.durations, queue.outcome, queue.n_stepped, queue.tried
 
 
-def _marches(
-    n: int, one_sided: bool, options: Options, tableau: Tableau
-) -> Callable[[Array, March, Array], March]:
+class _Ended(NamedTuple):
+    """Lanes that are looked at together, and how each one's last stretch ended."""
+
+    chosen: Array  # else it fills the row only
+    came: Array  # it has a wheel
+    landed: Array
+    failed: Array
+    leaves: Array  # its wheel is done or lost
+    code: Array  # STEPPED, or why it is lost
+    stands: tuple[WheelMotion, Stance]
+    reached: Array  # section state there
+    lane: _Lanes  # with what it told
+
+
+def _ended(on: _Walk, chosen: Array, lane: _Lanes, here: March) -> _Ended:
+    place = guards_of(on.n, on.one_sided)
+    came = chosen & (here.verdict != WAITING)
+    ledger = passed(lane.ledger, here.stance, here.time, here.tried)
+    at_event = here.verdict == EVENT
+    landed = came & at_event & (here.guard == place.foremost)
+    known = ledger, place, at_event, here.guard, landed, here.verdict
+    code = outcome_at(*known, on.max_events)
+    n_stepped = lane.n_stepped + landed
+    stands = motion_of(here.here), here.stance
+    failed = came & (code != Outcome.STEPPED)
+    return _Ended(
+        chosen=chosen,
+        came=came,
+        landed=landed,
+        failed=failed,
+        leaves=failed | (landed & (n_stepped >= on.n_steps)),
+        code=code.astype(jnp.int32),
+        stands=stands,
+        reached=_over_lanes(closed)(*stands),
+        lane=lane._replace(ledger=ledger, n_stepped=n_stepped),
+    )
+
+
+_over_lanes = functools.partial(jax.vmap, in_axes=-1, out_axes=-1)
+
+
+def _handed_over(queue: _Queue, wanted: Array, ended: _Ended) -> tuple[_Queue, Array, Array, Array]:
+    """Wheels that are done or lost are told, and make room for the next ones.
+
+    Also says which lanes are free, which of them are filled, and each lane's place in the queue.
+    """
+    lane = ended.lane
+    to = jnp.where(ended.leaves, lane.wheel, QUEUE)
+    put = lambda old, new: old.at[..., to].set(new, mode="drop")
+    free = ended.leaves | (ended.chosen & ~ended.came)
+    following = queue.next + jnp.cumsum(free.astype(jnp.int32)) - 1
+    fills = free & (following < wanted)
+    wheel = jnp.where(fills, following, lane.wheel)
+    queue = queue._replace(
+        next=jnp.minimum(queue.next + jnp.sum(free, dtype=jnp.int32), wanted),
+        section=put(queue.section, jnp.where(ended.failed, 0.0, ended.reached)),
+        durations=put(queue.durations, lane.ledger.durations),
+        outcome=put(queue.outcome, ended.code),
+        n_stepped=put(queue.n_stepped, lane.n_stepped),
+        tried=put(queue.tried, lane.ledger.tried),
+    )
+    return queue, free, fills, wheel
+
+
+def _events(
+    on: _Walk, wanted: Array, queue: _Queue, lanes: _Lanes, now: March
+) -> tuple[_Queue, _Lanes, March]:
+    """Some lanes through their events, or on to the next wheels."""
+    n_lanes = now.h.shape[-1]
+    ready = (now.verdict != MARCHING) & ((now.verdict != WAITING) | (queue.next < wanted))
+    (index,) = jnp.nonzero(ready, size=TOGETHER, fill_value=n_lanes)
+    pick = lambda leaf: jnp.take(leaf, index, axis=-1, mode="clip")
+    here, lane = jax.tree.map(pick, (now, lanes))
+    ended = _ended(on, index < n_lanes, lane, here)
+    queue, free, fills, wheel = _handed_over(queue, wanted, ended)
+    fresh = lambda leaf: jnp.take(leaf, wheel, axis=-1, mode="clip")
+
+    def begins(columns: Array, x: Array) -> tuple[WheelMotion, Stance]:
+        state, stance = opened(on.symbols(columns), x)
+        return unpack(state)[0], stance
+
+    def through(columns: Array, motion: WheelMotion, stance: Stance, guard: Array) -> tuple:
+        given = on.symbols(columns), columns[-1], on.options, on.one_sided
+        change, _, outcome = past(law_of(*given, counted=False), place, motion, stance, guard)
+        return change.motion, change.stance, outcome
+
+    # A landing of the foremost foot opens the next step; all go through their events.
+    place = guards_of(on.n, on.one_sided)
+    opens = fills | (ended.landed & ~ended.leaves)
+    columns = jnp.where(fills, fresh(queue.columns), lane.columns)
+    x = jnp.where(fills, fresh(queue.start), ended.reached)
+    motion, stance = select(opens, _over_lanes(begins)(columns, x), ended.stands)
+    guard = jnp.where(opens, place.foot, here.guard)
+    motion, stance, outcome = _over_lanes(through)(columns, motion, stance, guard)
+    outcome = jnp.where(fills & ~fresh(queue.good), Outcome.BAD_INPUT, outcome)
+    after = set_off(on.flow(columns, stance), motion, on.options.first_step)
+    verdict = jnp.where(outcome != Outcome.STEPPED, outcome, after.verdict)
+    verdict = jnp.where(free & ~fills, WAITING, verdict).astype(jnp.int32)
+
+    told = ended.lane.ledger
+    ledger = select(opens, blank(motion.x), told)
+    ledger = ledger._replace(events=ledger.events + 1, tried=jnp.where(fills, 0, told.tried))
+    n_stepped = jnp.where(fills, 0, ended.lane.n_stepped)
+    kept = after._replace(verdict=verdict), _Lanes(wheel, columns, ledger, n_stepped)
+    put_back = lambda old, new: old.at[..., index].set(new, mode="drop")
+    now, lanes = jax.tree.map(put_back, (now, lanes), kept)
+    return queue, lanes, now
+
+
+def _marches(on: _Walk) -> Callable[[Array, March, Array], March]:
     """The march by columns: by machine code each lane to its event, else until enough are."""
-    dynamic, static = eqx.partition(options, eqx.is_array)
+    dynamic, static = eqx.partition(on.options, eqx.is_array)
 
     def far(columns: Array, now: March, dynamic: Options, enough: Array | None = None) -> March:
-        known = eqx.combine(dynamic, static)
-        s, friction = _symbols(columns, n), columns[-1]
-        return march(s, friction, one_sided, now, enough, known, tableau)
+        flow = on.flow(columns, now.stance)
+        return march(flow, now, enough, eqx.combine(dynamic, static), on.tableau)
 
     if not simd.serves():
         return lambda columns, now, enough: far(columns, now, dynamic, enough)
     like = lambda columns, now, dynamic: now
-    settings = ("march on real ground", n, one_sided, static)
+    settings = ("march on real ground", on.n, on.one_sided, static)
     by_machine_code = lane_function(far, like, settings)
     return lambda columns, now, enough: by_machine_code(columns, now, dynamic)
 
 
-def _empty(queue: _Queue, n: int, one_sided: bool) -> tuple[_Lanes, March]:
+def _empty(queue: _Queue, on: _Walk) -> tuple[_Lanes, March]:
     """Lanes without wheels, in place of which stands the first one."""
-    dtype, guards = queue.start.dtype, guards_of(n, one_sided).total
     n_lanes = TOGETHER if simd.serves() else LANES
     many = lambda value: jnp.broadcast_to(value[..., None], (*value.shape, n_lanes))
-    zero, none = jnp.zeros((n_lanes,), dtype), jnp.zeros((n_lanes,), jnp.int32)
-    first = queue.columns[:, 0]
-    state, stance = opened(_symbols(first, n), queue.start[:, 0])
-    stance = jax.tree.map(many, stance)
-    motion = jax.tree.map(many, unpack(state)[0])
-    columns = many(first)
-    here = place_of(flow_of(_symbols(columns, n), columns[-1], one_sided, stance), motion)
-    blank = jnp.zeros((guards, n_lanes), dtype)
-    march = March(
-        here=here,
-        stance=stance,
-        values=blank,
-        offset=blank,
-        h=zero,
-        time=zero,
-        search=Search(none > 0, blank > 0.0, zero, zero, zero, none),
-        verdict=none + WAITING,
-        guard=none,
-        tried=none,
-    )
-    return _Lanes(none, columns, none, jnp.zeros((3, n_lanes), dtype), none, none), march
+    columns, x = queue.columns[:, 0], queue.start[:, 0]
+    state, stance = opened(on.symbols(columns), x)
+    columns, motion, stance = jax.tree.map(many, (columns, unpack(state)[0], stance))
+    flow = on.flow(columns, stance)
+    now = zeros_of(lambda: set_off(flow, motion, on.options.first_step))
+    waiting = now.verdict + WAITING
+    lanes = _Lanes(waiting * 0, columns, blank(motion.x), waiting * 0)
+    return lanes, now._replace(here=place_of(flow, motion), stance=stance, verdict=waiting)

@@ -19,23 +19,20 @@ from vrw_jax.models import (
     WheelMotion,
     directions,
     felt,
-    flow_of,
     forces,
     kept,
     leg_acceleration,
     one_of,
     stance_guards,
 )
-from vrw_jax.numerics import Elementwise, Options, Tableau, dips, parabola
-from vrw_jax.wheel import Outcome, Symbols
+from vrw_jax.numerics import Options, Tableau, change_of_length, dips, parabola, select
+from vrw_jax.wheel import Outcome
 
 N_FELT = 8
 """Rows of a slope after the accelerations: what guards need of the forces. Then, where stoppers are
 one-sided, those of legs in the air."""
 MARCHING, EVENT, WAITING = -1, -2, -3
 """Where a lane stands: on its way, at an event, without a wheel; else the `Outcome` it met."""
-SAFETY, LEAST, MOST = 0.9, 0.2, 5.0
-"""Of the step-size controller: the usual safety factor, and the limits of a step's change."""
 CLOSE = 30.0
 """An event is found where the last correction to its time is no more than so many tolerances of the
 step: the proposal is a parabola's, whose own error is about a hundredth of the correction."""
@@ -122,30 +119,37 @@ def guard_rates(flow: Flow, place: Place) -> Array:
 def begun_guards(flow: Flow) -> Array:
     """Guards that stand on the event which has just begun the stance, in the order of `Guards`."""
     stance = flow.stance
-    slid = jnp.stack(flow.slots.of(stance.new_slip.astype(jnp.int32))) > 0
+    slid = flow.slots.flags(stance.new_slip)
     no = jnp.zeros((2, stance.contact.shape[-1]), bool)
     in_air = [stance.locked & False] if flow.one_sided else []
     return jnp.concatenate([stance.new_foot, stance.new_leg, no, no, no, slid, no, no, *in_air])
 
 
+def set_off(flow: Flow, motion: WheelMotion, h: Array) -> March:
+    """Lanes at the start of a stance, at an event again where a guard falls at once."""
+    here, begun = place_of(flow, motion), begun_guards(flow)
+    values, rates = guards_at(flow, here), guard_rates(flow, here)
+    past = ~begun & ((values < 0.0) | ((values == 0.0) & (rates <= 0.0)))
+    offset = jnp.where(begun, values, 0.0)
+    zero, none = jnp.zeros_like(motion.x), jnp.zeros(motion.x.shape, jnp.int32)
+    return March(
+        here=here,
+        stance=flow.stance,
+        values=values - offset,
+        offset=offset,
+        h=zero + h,
+        time=zero,
+        search=Search(none > 0, jnp.zeros_like(begun), zero, zero, zero, none),
+        verdict=jnp.where(jnp.any(past, axis=0), EVENT, MARCHING).astype(jnp.int32),
+        guard=jnp.argmax(past, axis=0).astype(jnp.int32),
+        tried=none,
+    )
+
+
 def march(
-    s: Symbols,
-    friction: Elementwise,
-    one_sided: bool,
-    begin: March,
-    enough: Array | None,
-    options: Options,
-    tableau: Tableau,
+    flow: Flow, begin: March, enough: Array | None, options: Options, tableau: Tableau
 ) -> March:
     """On until `enough` lanes no longer march, or none does. Errors: as `integrate_phase`."""
-    flow = flow_of(s, friction, one_sided, begin.stance)
-    order, n = tableau.order, begin.here.q.shape[0]
-    middle, last = tableau.middle, len(tableau.places) - 1
-
-    def watched(place: Place, offset: Array) -> Array:
-        return guards_at(flow, place) - offset
-
-    once, twice, places = (jnp.asarray(x) for x in (tableau.once, tableau.twice, tableau.places))
 
     def goes_on(now: March) -> Array:
         if enough is None:
@@ -154,116 +158,135 @@ def march(
         return jnp.any(now.verdict == MARCHING) & (jnp.sum(ended) < enough)
 
     def advance(now: March) -> March:
-        here, h, search = now.here, now.h, now.search
-
-        def at(i: Array | int, slopes: Array) -> tuple[Array, Array]:
-            a, b = once[i], twice[i]
-            first = sum(a[j] * slopes[j, :n] for j in range(last))
-            second = sum(b[j] * slopes[j, :n] for j in range(last))
-            return here.q + h * (places[i] * here.v + h * second), here.v + h * first
-
-        def stage(i: Array, slopes: Array) -> Array:
-            slope = _slope(flow, *at(i, slopes))
-            return lax.dynamic_update_index_in_dim(slopes, slope, i, 0)
-
-        others = jnp.zeros((last, *here.slope.shape), h.dtype)
-        slopes = jnp.concatenate([here.slope[None], others])
-        slopes = lax.fori_loop(1, last + 1, stage, slopes)
-        reached = lambda i: Place(*at(i, slopes), slopes[i])
-        end, mid = reached(last), reached(middle)
-        gm, g1 = (watched(place, now.offset) for place in (mid, end))
-        g0 = now.values
-
-        error = _squared_error(tableau, options, here, end, slopes, h, g1)
-        power = jnp.exp(jnp.log(jnp.clip(error, 1e-20, 1e20)) * (-0.5 / order))
-        running, marching = now.verdict == MARCHING, (now.verdict == MARCHING) & ~search.on
-        keep = marching & (error <= 1.0)
-        change = jnp.clip(SAFETY * power, LEAST, jnp.where(keep, MOST, 1.0))
-        bend, slope = parabola(tableau, g0, gm, g1)
-        crosses = g1 <= 0.0
-        to_dip = _to_earliest_dip(g0, g1, slope, bend)
-        retry = keep & (to_dip < 1.0) & (now.time + h * to_dip > now.time)
-        crossed = keep & ~retry & jnp.any(crosses, axis=0)
-        accepted = keep & ~retry & ~crossed
-
-        crossing = jnp.where(search.on, search.crossing | crosses, crosses)
-        first, guard = _earliest_root(g0, slope, bend, crossing)
-        proposal = h * first
-        past = jnp.any(crossing & crosses, axis=0)
-        low = jnp.where(search.on & ~past, h, search.low)
-        high = jnp.where(search.on & past, h, search.high)
-        low, high = jnp.where(crossed, 0.0, low), jnp.where(crossed, h, high)
-        resolution = 1e3 * jnp.finfo(h.dtype).eps * (now.time + h)
-        accuracy = jnp.maximum(CLOSE * options.rtol * h, resolution)
-        accuracy = jnp.where(search.on, search.accuracy, accuracy)
-        within = (proposal >= low - accuracy) & (proposal <= high + accuracy)
-        shift = proposal - h
-        arrived = running & search.on & within & (jnp.abs(shift) <= accuracy)
-        following = jnp.where(within, proposal, 0.5 * (low + high))
-        following = jnp.where(search.on | crossed, following, h * jnp.where(retry, to_dip, change))
-
-        moved = jnp.where(arrived, shift, 0.0)
-        end = Place(end.q + moved * end.v, end.v + moved * end.slope[:n], end.slope)
-        taken = accepted | arrived
-        time = jnp.where(taken, now.time + h + moved, now.time)
-        tries = jnp.where(search.on, search.tries + 1, 0)
-        late = accepted & (time >= options.max_phase_time)
-        late = late | (arrived & (time > options.max_phase_time))
-        stuck = (tries >= options.event_steps) | (now.tried + 1 >= options.max_solver_steps)
-        stuck = stuck | (~search.on & (now.time + following == now.time))
-        verdict = jnp.where(stuck, Outcome.SOLVER_GAVE_UP, MARCHING)
-        verdict = jnp.where(arrived, EVENT, verdict)
-        verdict = jnp.where(late, Outcome.NO_TOUCHDOWN_IN_TIME, verdict)
-        return March(
-            here=Place(*(jnp.where(taken, a, b) for a, b in zip(end, here, strict=True))),
-            stance=now.stance,
-            values=jnp.where(accepted, g1, now.values),
-            offset=now.offset,
-            h=jnp.where(running, following, h),
-            time=time,
-            search=Search(
-                on=(search.on | crossed) & ~arrived,
-                crossing=jnp.where(running, crossing, search.crossing),
-                low=jnp.where(running, low, search.low),
-                high=jnp.where(running, high, search.high),
-                accuracy=jnp.where(running, accuracy, search.accuracy),
-                tries=jnp.where(running, tries, search.tries),
-            ),
-            verdict=jnp.where(running, verdict, now.verdict).astype(jnp.int32),
-            guard=jnp.where(arrived, guard, now.guard),
-            tried=now.tried + running,
-        )
+        return _advanced(now, _tried(flow, tableau, options, now), tableau, options)
 
     return lax.while_loop(goes_on, advance, begin)
 
 
+class _Try(NamedTuple):
+    """One Runge-Kutta step of every lane."""
+
+    end: Place
+    squared: Array  # error over tolerance
+    values: Array  # guards at the end
+    bend: Array  # of the guards' parabolas
+    slope: Array
+
+
+def _tried(flow: Flow, tableau: Tableau, options: Options, now: March) -> _Try:
+    here, h, n = now.here, now.h, now.here.q.shape[0]
+    last = len(tableau.places) - 1
+    once, twice, places = (jnp.asarray(x) for x in (tableau.once, tableau.twice, tableau.places))
+
+    def at(i: Array | int, slopes: Array) -> tuple[Array, Array]:
+        a, b = once[i], twice[i]
+        first = sum(a[j] * slopes[j, :n] for j in range(last))
+        second = sum(b[j] * slopes[j, :n] for j in range(last))
+        return here.q + h * (places[i] * here.v + h * second), here.v + h * first
+
+    def stage(i: Array, slopes: Array) -> Array:
+        slope = _slope(flow, *at(i, slopes))
+        return lax.dynamic_update_index_in_dim(slopes, slope, i, 0)
+
+    others = jnp.zeros((last, *here.slope.shape), h.dtype)
+    slopes = jnp.concatenate([here.slope[None], others])
+    slopes = lax.fori_loop(1, last + 1, stage, slopes)
+    reached = lambda i: Place(*at(i, slopes), slopes[i])
+    end, middle = reached(last), reached(tableau.middle)
+    inside, values = (guards_at(flow, place) - now.offset for place in (middle, end))
+    weigh = lambda weights: sum(float(w) * slopes[j, :n] for j, w in enumerate(weights) if w != 0.0)
+    errors = h * h * weigh(tableau.error_twice), h * weigh(tableau.error_once)
+    squared = _squared_error(options, errors, here, end, values)
+    return _Try(end, squared, values, *parabola(tableau, now.values, inside, values))
+
+
+def _advanced(now: March, tried: _Try, tableau: Tableau, options: Options) -> March:
+    """The lane takes its step, tries another length, or has come to an event."""
+    here, h, search, end = now.here, now.h, now.search, tried.end
+    running = now.verdict == MARCHING
+    keep = running & ~search.on & (tried.squared <= 1.0)
+    to_dip = _to_earliest_dip(now.values, tried)
+    retry = keep & (to_dip < 1.0) & (now.time + h * to_dip > now.time)
+    crossed = keep & ~retry & jnp.any(tried.values <= 0.0, axis=0)
+    accepted = keep & ~retry & ~crossed
+    searched, found = _searched(now, tried, crossed, options)
+    arrived = found.arrived
+    change = jnp.where(retry, to_dip, change_of_length(tableau, tried.squared, h.dtype))
+    following = jnp.where(search.on | crossed, found.following, h * change)
+
+    moved = jnp.where(arrived, found.shift, 0.0)
+    end = Place(end.q + moved * end.v, end.v + moved * end.slope[: len(end.q)], end.slope)
+    taken = accepted | arrived
+    time = jnp.where(taken, now.time + h + moved, now.time)
+    late = accepted & (time >= options.max_phase_time)
+    late = late | (arrived & (time > options.max_phase_time))
+    stuck = (searched.tries >= options.event_steps) | (now.tried + 1 >= options.max_solver_steps)
+    stuck = stuck | (~search.on & (now.time + following == now.time))
+    verdict = jnp.where(stuck, Outcome.SOLVER_GAVE_UP, MARCHING)
+    verdict = jnp.where(arrived, EVENT, verdict)
+    verdict = jnp.where(late, Outcome.NO_TOUCHDOWN_IN_TIME, verdict)
+    return now._replace(
+        here=select(taken, end, here),
+        values=jnp.where(accepted, tried.values, now.values),
+        h=jnp.where(running, following, h),
+        time=time,
+        search=select(running, searched, search),
+        verdict=jnp.where(running, verdict, now.verdict).astype(jnp.int32),
+        guard=jnp.where(arrived, found.guard, now.guard),
+        tried=now.tried + running,
+    )
+
+
+class _Found(NamedTuple):
+    """Of the earliest event inside a step."""
+
+    following: Array  # length to be tried next, s
+    shift: Array  # from this length to the event's, s
+    arrived: Array  # the event is that close
+    guard: Array
+
+
+def _searched(now: March, tried: _Try, crossed: Array, options: Options) -> tuple[Search, _Found]:
+    """One more look for the earliest event, from where the guards' parabolas fall through zero."""
+    h, search = now.h, now.search
+    crosses = tried.values <= 0.0
+    crossing = jnp.where(search.on, search.crossing | crosses, crosses)
+    first, guard = _earliest_root(now.values, tried.slope, tried.bend, crossing)
+    proposal = h * first
+    past = jnp.any(crossing & crosses, axis=0)
+    low = jnp.where(search.on & ~past, h, search.low)
+    high = jnp.where(search.on & past, h, search.high)
+    low, high = jnp.where(crossed, 0.0, low), jnp.where(crossed, h, high)
+    resolution = 1e3 * jnp.finfo(h.dtype).eps * (now.time + h)
+    accuracy = jnp.maximum(CLOSE * options.rtol * h, resolution)
+    accuracy = jnp.where(search.on, search.accuracy, accuracy)
+    within = (proposal >= low - accuracy) & (proposal <= high + accuracy)
+    shift = proposal - h
+    close = search.on & within & (jnp.abs(shift) <= accuracy)
+    following = jnp.where(within, proposal, 0.5 * (low + high))
+    tries = jnp.where(search.on, search.tries + 1, 0)
+    searched = Search((search.on | crossed) & ~close, crossing, low, high, accuracy, tries)
+    return searched, _Found(following, shift, close & (now.verdict == MARCHING), guard)
+
+
 def _squared_error(
-    tableau: Tableau,
-    options: Options,
-    here: Place,
-    end: Place,
-    slopes: Array,
-    h: Array,
-    guards: Array,
+    options: Options, errors: tuple[Array, Array], here: Place, end: Place, guards: Array
 ) -> Array:
     """Mean square of the error over its tolerance; infinite where the step went nowhere."""
-    n = here.q.shape[0]
-    weigh = lambda weights: sum(float(w) * slopes[j, :n] for j, w in enumerate(weights) if w != 0.0)
     total = 0.0 * jnp.sum(guards, axis=0)
-    errors = h * h * weigh(tableau.error_twice), h * weigh(tableau.error_once)
     for error, a, b in zip(errors, here[:2], end[:2], strict=True):
         allowed = options.atol + options.rtol * jnp.maximum(jnp.abs(a), jnp.abs(b))
         total = total + jnp.sum(jnp.square(error / allowed), axis=0)
-    return jnp.where(jnp.isfinite(total), total / (2 * n), jnp.inf)
+    return jnp.where(jnp.isfinite(total), total / (2 * here.q.shape[0]), jnp.inf)
 
 
-def _to_earliest_dip(g0: Array, g1: Array, slope: Array, bend: Array) -> Array:
+def _to_earliest_dip(values: Array, tried: _Try) -> Array:
     """Share of the step up to where a guard that falls and rises again is lowest, if near zero.
 
     See `numerics.dips`. A guard that stands on its own event at the start has no such place.
     """
-    low = dips(g0, g1, bend, slope) & (g0 > 0.0)
-    place = -slope / jnp.where(low, 2.0 * bend, 1.0)
+    low = dips(values, tried.values, tried.bend, tried.slope) & (values > 0.0)
+    place = -tried.slope / jnp.where(low, 2.0 * tried.bend, 1.0)
     return jnp.min(jnp.where(low, place, 1.0), axis=0)
 
 

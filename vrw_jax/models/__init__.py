@@ -33,8 +33,7 @@ from vrw_jax.models.paper_step import (
     told_of,
 )
 from vrw_jax.models.rigid import RigidWheel
-from vrw_jax.models.unilateral.contacts import OFF
-from vrw_jax.models.unilateral.events import Law, event_of, resolve, settled
+from vrw_jax.models.unilateral.ledger import Ledger, blank, law_of, outcome_at, passed, past
 from vrw_jax.models.unilateral.mechanics import (
     WheelMotion,
     directions,
@@ -58,11 +57,6 @@ from vrw_jax.models.unilateral.motion import (
     stance_guards,
     unpack,
 )
-from vrw_jax.models.unilateral.section import closed, embedded, opened
-from vrw_jax.models.unilateral.wheel import (
-    UnilateralStep,
-    UnilateralTrajectory,
-    UnilateralWheel,
-    least_dip,
-)
+from vrw_jax.models.unilateral.section import closed, embedded, made_sound, opened
+from vrw_jax.models.unilateral.wheel import UnilateralStep, UnilateralTrajectory, UnilateralWheel
 from vrw_jax.models.viscoelastic import ViscoelasticWheel

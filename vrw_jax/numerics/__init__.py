@@ -46,6 +46,7 @@ from vrw_jax.numerics.lanes import (
     one_wheel,
     select,
     to_blocks,
+    zeros_of,
 )
 from vrw_jax.numerics.march import LanePhase, integrate_lanes
 from vrw_jax.numerics.minima import State, Watched
@@ -56,6 +57,7 @@ from vrw_jax.numerics.tableaus import (
     Place,
     Slope,
     Tableau,
+    change_of_length,
     dips,
     explicit_tableau,
     parabola,

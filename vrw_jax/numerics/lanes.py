@@ -85,3 +85,9 @@ def compiled_by_caller() -> bool:
 def select(condition: Array, yes: PyTree, no: PyTree) -> PyTree:
     """`jnp.where`, leaf by leaf."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
+
+
+def zeros_of(function: Callable[..., PyTree], *arguments: PyTree) -> PyTree:
+    """What `function` would return, without calling it, with zeros in all places."""
+    blank = lambda leaf: jnp.zeros(leaf.shape, leaf.dtype)
+    return jax.tree.map(blank, jax.eval_shape(function, *arguments))

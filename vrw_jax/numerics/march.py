@@ -16,7 +16,16 @@ from jaxtyping import Array
 from vrw_jax.numerics.lane_minima import Lowest, Monitors, at_start, lowered, settled, with_rates
 from vrw_jax.numerics.lanes import select
 from vrw_jax.numerics.options import Options
-from vrw_jax.numerics.tableaus import Evaluate, Place, Tableau, Taken, dips, parabola, take_step
+from vrw_jax.numerics.tableaus import (
+    Evaluate,
+    Place,
+    Tableau,
+    Taken,
+    change_of_length,
+    dips,
+    parabola,
+    take_step,
+)
 from vrw_jax.numerics.types import Vector
 from vrw_jax.simd import apart
 
@@ -64,9 +73,6 @@ MARCHING, TIMED_OUT, GAVE_UP, CROSSED, IDLE = range(5)
 
 LATE = 2
 """Times the iterations after which half of the lanes had finished."""
-
-SAFETY, LEAST, MOST = 0.9, 0.2, 5.0
-"""Of the step-size controller: the usual safety factor, and the limits of a step's change."""
 
 
 def integrate_lanes(
@@ -145,7 +151,7 @@ def _march(
         """Length to try next, in units of this one, and what becomes of the step."""
         squared = _squared_error(taken, march.here, end, options.rtol, options.atol)
         to_dip = _to_earliest_dip(tableau, march.values, inside, end)
-        return _change(tableau.order, squared, to_dip)
+        return _change(tableau, squared, to_dip)
 
     def advance(march: _March) -> _March:
         taken = take_step(tableau, phase.evaluate, march.here, march.h)
@@ -199,15 +205,12 @@ def _waits(march: _March, few: Array | None) -> Array:
     return (left > 0) & ~((left <= few) & late)
 
 
-def _change(order: int, squared: Array, to_dip: Array) -> tuple[Array, Array]:
+def _change(tableau: Tableau, squared: Array, to_dip: Array) -> tuple[Array, Array]:
     """Length of the next try over this one's, and whether the step is kept (1) or retried (2)."""
-    # The controller's power needs no more than float32, which has a vectorised one.
-    power = jnp.exp(jnp.log(jnp.clip(squared, 1e-20, 1e20)) * (-0.5 / order)).astype(to_dip.dtype)
     keep = squared <= 1.0
-    change = jnp.clip(SAFETY * power, LEAST, jnp.where(keep, MOST, 1.0))
     retry = keep & (to_dip < 1.0)
     kept = jnp.where(retry, 2, jnp.where(keep, 1, 0)).astype(jnp.int32)
-    return jnp.where(retry, to_dip, change), kept
+    return jnp.where(retry, to_dip, change_of_length(tableau, squared, to_dip.dtype)), kept
 
 
 def _verdict(

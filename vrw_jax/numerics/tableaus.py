@@ -83,6 +83,16 @@ def dips(start: Array, end: Array, bend: Array, slope: Array) -> Bool[Array, "..
     return falls_and_rises & near & new & (end > 0.0)
 
 
+SAFETY, LEAST, MOST = 0.9, 0.2, 5.0
+"""Of the step-size controller: the usual safety factor, and the limits of a step's change."""
+
+
+def change_of_length(tableau: Tableau, squared: Array, dtype: Any) -> Array:
+    """Length of the next step over this one's, by the squared error of this one over tolerance."""
+    power = jnp.exp(jnp.log(jnp.clip(squared, 1e-20, 1e20)) * (-0.5 / tableau.order)).astype(dtype)
+    return jnp.clip(SAFETY * power, LEAST, jnp.where(squared <= 1.0, MOST, 1.0))
+
+
 def _without_rounding(x: np.ndarray) -> np.ndarray:
     """Products of a tableau that vanish but for rounding, as zeros."""
     return np.where(np.abs(x) < 1e-14 * np.max(np.abs(x)), 0.0, x)

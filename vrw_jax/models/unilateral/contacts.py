@@ -59,108 +59,113 @@ def _pair(entry: Any) -> Pair:
     return entry(0), entry(1)
 
 
+class _Feet(NamedTuple):
+    """What a combination asks of each slot's foot. Its unknown c is the force along e (it sticks)
+    or the normal force (it slides); an unloaded foot has c = 0."""
+
+    stick: Pair
+    loaded: Pair
+    to_e: Pair  # force of c = 1 along e
+    to_u: Pair  # along u, but for what a sticking foot's own leg asks
+    row_e: Pair  # what must vanish: so much of the foot's motion along e
+    row_u: Pair  # and so much of its force on the leg's mass
+
+
+def _feet(s: Symbols, hub: Hub, contact: Array, friction: Elementwise) -> _Feet:
+    sin, cos = hub.sin, hub.cos
+    rough = jnp.where(jnp.isfinite(friction), friction, 0.0)
+    stick = _pair(lambda i: contact[i] == STICK)
+    slip = _pair(lambda i: (contact[i] == SLIP_DOWN) | (contact[i] == SLIP_UP))
+    drag = _pair(lambda i: jnp.where(contact[i] == SLIP_DOWN, -rough, rough))
+    chosen = lambda i, sticks, slides: jnp.where(stick[i], sticks, jnp.where(slip[i], slides, 0.0))
+    return _Feet(
+        stick=stick,
+        loaded=_pair(lambda i: stick[i] | slip[i]),
+        to_e=_pair(lambda i: chosen(i, 1.0, drag[i] * cos[i] - sin[i])),
+        to_u=_pair(lambda i: chosen(i, 0.0, drag[i] * sin[i] + cos[i])),
+        row_e=_pair(lambda i: chosen(i, 1.0, -sin[i])),
+        row_u=_pair(lambda i: chosen(i, 0.0, cos[i] * (1.0 / s.m))),
+    )
+
+
+def _same(i: int, j: int) -> float:
+    return 1.0 if i == j else 0.0
+
+
+def _stoppers(
+    s: Symbols, hub: Hub, free: Free, held: Array, feet: _Feet, one: Array
+) -> tuple[Pair, Matrix]:
+    """Stopper forces without the feet's, and what each foot's c adds to them, [foot][stopper].
+
+    Of N s = p + P c, the row of an open one being s = 0: a system that is always regular.
+    """
+    sin, cos, m_inv = hub.sin, hub.cos, 1.0 / s.m
+    H, K = ((hub.H[0], hub.H[1]), (hub.H[2], hub.H[3])), ((hub.K[0], hub.K[1]), hub.K[1:])
+    loose = _pair(lambda i: jnp.where(feet.stick[i], 0.0, m_inv))
+    N = _matrix(lambda i, j: jnp.where(held[i], K[i][j] + _same(i, j) * loose[i], _same(i, j)))
+    across = _pair(lambda i: sin[i] * free.hub[0] + cos[i] * free.hub[1] + free.own[i])
+    grows = _pair(lambda i: across[i] + jnp.where(feet.stick[i], free.u[i], 0.0))
+    p = _pair(lambda i: jnp.where(held[i], grows[i], 0.0))
+    added = lambda i, j: H[i][j] * feet.to_e[j] - _same(i, j) * feet.to_u[i] * m_inv
+    P = _matrix(lambda i, j: jnp.where(held[i], added(i, j), 0.0))
+    p, P, N = kept((p, P, N), one)
+    return kept((_solved(N, p), _pair(lambda j: _solved(N, (P[0][j], P[1][j])))), one)
+
+
+def _carried(
+    s: Symbols, hub: Hub, free: Free, feet: _Feet, alone: Pair, columns: Matrix, one: Array
+) -> tuple[Pair, Pair, Pair]:
+    """Forces of the stoppers, and of the feet along e and u: the feet's rows with the stoppers, as
+    `_stoppers` gives them, inserted."""
+    row_e, row_u, to_e, to_u = feet.row_e, feet.row_u, feet.to_e, feet.to_u
+    G, H = ((hub.G[0], hub.G[1]), hub.G[1:]), ((hub.H[0], hub.H[1]), (hub.H[2], hub.H[3]))
+    R = _matrix(lambda i, k: _same(i, k) * row_u[i] - row_e[i] * H[k][i])
+    C = _matrix(
+        lambda i, j: (
+            row_e[i] * G[i][j] * to_e[j]
+            + _same(i, j) * row_u[i] * to_u[i]
+            + R[i][0] * columns[j][0]
+            + R[i][1] * columns[j][1]
+            + _same(i, j) * jnp.where(feet.loaded[i], 0.0, 1.0)
+        )
+    )
+    moves = _pair(lambda i: -row_e[i] * free.e[i] - row_u[i] * s.m * free.u[i])
+    c = _solved(C, _pair(lambda i: moves[i] - R[i][0] * alone[0] - R[i][1] * alone[1]))
+    stopper = _pair(lambda k: alone[k] + columns[0][k] * c[0] + columns[1][k] * c[1])
+    along_e = _pair(lambda i: to_e[i] * c[i])
+    sticks = _pair(lambda i: -s.m * free.u[i] - stopper[i])
+    along_u = _pair(lambda i: jnp.where(feet.stick[i], sticks[i], to_u[i] * c[i]))
+    return kept((stopper, along_e, along_u), one)
+
+
 def answer(
     s: Symbols, hub: Hub, free: Free, contact: Array, held: Array, friction: Elementwise
 ) -> Answer:
     """Solve one combination: contact modes and stoppers of the two slots, shape (2,) each.
 
     A sticking foot is at rest, a sliding one keeps its height with friction against the slip, a
-    held leg keeps its length. The unknown of a foot is its force along e (sticks) or its normal
-    force (slides). Stoppers are eliminated first, by a system that is always regular.
+    held leg keeps its length. Stoppers are eliminated first.
     """
     sin, cos, m_inv = hub.sin, hub.cos, 1.0 / s.m
-    rough = jnp.where(jnp.isfinite(friction), friction, 0.0)
-    stick = _pair(lambda i: contact[i] == STICK)
-    slip = _pair(lambda i: (contact[i] == SLIP_DOWN) | (contact[i] == SLIP_UP))
-    drag = _pair(lambda i: jnp.where(contact[i] == SLIP_DOWN, -rough, rough))
-    chosen = lambda i, sticks, slides: jnp.where(stick[i], sticks, jnp.where(slip[i], slides, 0.0))
-    to_e = _pair(lambda i: chosen(i, 1.0, drag[i] * cos[i] - sin[i]))
-    to_u = _pair(lambda i: chosen(i, 0.0, drag[i] * sin[i] + cos[i]))
-    row_e = _pair(lambda i: chosen(i, 1.0, -sin[i]))
-    row_u = _pair(lambda i: chosen(i, 0.0, cos[i] * m_inv))
-    loose = _pair(lambda i: jnp.where(stick[i], 0.0, m_inv))
-    G = ((hub.G[0], hub.G[1]), (hub.G[1], hub.G[2]))
-    H = ((hub.H[0], hub.H[1]), (hub.H[2], hub.H[3]))
-    K = ((hub.K[0], hub.K[1]), (hub.K[1], hub.K[2]))
-    here = lambda i, j: 1.0 if i == j else 0.0
-
-    # Stoppers: N s = p + P c, the row of an open one being s = 0.
-    N = _matrix(lambda i, j: jnp.where(held[i], K[i][j] + here(i, j) * loose[i], here(i, j)))
-    grows = _pair(
-        lambda i: (
-            sin[i] * free.hub[0]
-            + cos[i] * free.hub[1]
-            + free.own[i]
-            + jnp.where(stick[i], free.u[i], 0.0)
-        )
-    )
-    p = _pair(lambda i: jnp.where(held[i], grows[i], 0.0))
-    P = _matrix(
-        lambda i, j: jnp.where(held[i], H[i][j] * to_e[j] - here(i, j) * to_u[i] * m_inv, 0.0)
-    )
     one = 1.0 + 0.0 * lax.stop_gradient(free.hub[2])
-    p, P, N = kept((p, P, N), one)
-    s_free = _solved(N, p)
-    columns = _pair(lambda j: _solved(N, (P[0][j], P[1][j])))  # columns[j][k] = ds_k / dc_j
-
-    s_free, columns = kept((s_free, columns), one)
-    # Feet: their rows with the stoppers inserted; an unloaded foot has c = 0.
-    R = _matrix(lambda i, k: here(i, k) * row_u[i] - row_e[i] * H[k][i])
-    C = _matrix(
-        lambda i, j: (
-            row_e[i] * G[i][j] * to_e[j]
-            + here(i, j) * row_u[i] * to_u[i]
-            + R[i][0] * columns[j][0]
-            + R[i][1] * columns[j][1]
-            + here(i, j) * jnp.where(stick[i] | slip[i], 0.0, 1.0)
-        )
-    )
-    c = _solved(
-        C,
-        _pair(
-            lambda i: (
-                -row_e[i] * free.e[i]
-                - row_u[i] * s.m * free.u[i]
-                - R[i][0] * s_free[0]
-                - R[i][1] * s_free[1]
-            )
-        ),
-    )
-    stopper = _pair(lambda k: s_free[k] + columns[0][k] * c[0] + columns[1][k] * c[1])
-    along_e = _pair(lambda i: to_e[i] * c[i])
-    along_u = _pair(lambda i: jnp.where(stick[i], -s.m * free.u[i] - stopper[i], to_u[i] * c[i]))
-    stopper, along_e, along_u = kept((stopper, along_e, along_u), one)
+    feet = _feet(s, hub, contact, friction)
+    stoppers = _stoppers(s, hub, free, held, feet, one)
+    stopper, along_e, along_u = _carried(s, hub, free, feet, *stoppers, one)
     pull = _pair(lambda i: along_u[i] + stopper[i])
     z, y = hub.along_e, hub.along_u
-    moved = [
-        free.hub[k]
-        + z[0][k] * along_e[0]
-        + z[1][k] * along_e[1]
-        - y[0][k] * stopper[0]
-        - y[1][k] * stopper[1]
-        for k in range(3)
-    ]
-    foot_e = _pair(
-        lambda i: (
-            cos[i] * (moved[0] - free.hub[0])
-            - sin[i] * (moved[1] - free.hub[1])
-            - hub.L[i] * (moved[2] - free.hub[2])
-            + free.e[i]
-        )
-    )
+    by_feet = [free.hub[k] + z[0][k] * along_e[0] + z[1][k] * along_e[1] for k in range(3)]
+    vx, vz, turn = (by_feet[k] - y[0][k] * stopper[0] - y[1][k] * stopper[1] for k in range(3))
+    dx, dz, dturn = vx - free.hub[0], vz - free.hub[1], turn - free.hub[2]
+    foot_e = _pair(lambda i: cos[i] * dx - sin[i] * dz - hub.L[i] * dturn + free.e[i])
     foot_u = _pair(lambda i: free.u[i] + pull[i] * m_inv)
-    length = _pair(
-        lambda i: jnp.where(
-            held[i], 0.0, sin[i] * moved[0] + cos[i] * moved[1] + free.own[i] - pull[i] * m_inv
-        )
-    )
+    grows = _pair(lambda i: sin[i] * vx + cos[i] * vz + free.own[i] - pull[i] * m_inv)
     return Answer(
         tangential=_pair(lambda i: along_e[i] * cos[i] + along_u[i] * sin[i]),
         normal=_pair(lambda i: along_u[i] * cos[i] - along_e[i] * sin[i]),
         stopper=stopper,
         pull=pull,
-        hub=(moved[0], moved[1], moved[2]),
-        length=length,
+        hub=(vx, vz, turn),
+        length=_pair(lambda i: jnp.where(held[i], 0.0, grows[i])),
         foot_x=_pair(lambda i: foot_e[i] * cos[i] + foot_u[i] * sin[i]),
         foot_z=_pair(lambda i: foot_u[i] * cos[i] - foot_e[i] * sin[i]),
     )

@@ -1,9 +1,8 @@
 """What an event changes: impacts by momentum, then which feet and stoppers carry the motion on."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Int
@@ -32,7 +31,7 @@ from vrw_jax.models.unilateral.mechanics import (
     slots_of,
 )
 from vrw_jax.models.unilateral.motion import Guards, Stance
-from vrw_jax.numerics import Elementwise, Scalar, select
+from vrw_jax.numerics import Elementwise, Scalar, select, zeros_of
 from vrw_jax.wheel import Symbols
 
 
@@ -54,8 +53,9 @@ class Event(NamedTuple):
         return jnp.any(self.lands) | jnp.any(self.closes)
 
 
-def event_of(place: Guards, n: int, guard: Int[Array, ""]) -> Event:
+def event_of(place: Guards, guard: Int[Array, ""]) -> Event:
     """The event of a guard's index."""
+    n = place.n_legs
     flags = lambda start, count: guard == start + jnp.arange(count)
     loosens = flags(place.loosen, n) if place.total > place.loosen else jnp.zeros((n,), bool)
     return Event(
@@ -70,13 +70,21 @@ def event_of(place: Guards, n: int, guard: Int[Array, ""]) -> Event:
     )
 
 
+class Law(NamedTuple):
+    """The wheel on its ground, and what is asked of all events alike."""
+
+    s: Symbols
+    friction: Elementwise
+    one_sided: bool  # stoppers of legs in the air only push
+    counted: bool  # whether `solutions` is the number of admissible ones, or says if there is one
+    unseen: Elementwise  # least excursion that is followed, m
+
+
 MOST_SWITCHES = 40
 """Rounds in search of the stoppers that hold; a few are enough unless friction is paradoxical."""
 
 
-def _that_push(
-    solve: Callable[[Array], tuple[Any, Legs, Legs]], at_stopper: Array, asked: Array
-) -> tuple[Any, Array, Array]:
+def _that_push(solve: Callable[[Array], tuple], at_stopper: Array, asked: Array) -> tuple:
     """What `solve` finds, with which legs in the air are held, and whether their signs are right.
 
     `solve(held)` returns its result, the stoppers' pushes, and how each free leg's length moves.
@@ -98,8 +106,7 @@ def _that_push(
         _, wrong, tries, _ = now
         return (tries == 0) | (jnp.any(wrong) & (tries < MOST_SWITCHES))
 
-    shapes = jax.eval_shape(solve, at_stopper)[0]
-    empty = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    empty = zeros_of(solve, at_stopper)[0]
     begin = at_stopper, at_stopper & False, jnp.zeros((), jnp.int32), empty
     held, wrong, _, result = lax.while_loop(goes_on, switch, begin)
     return result, held, ~jnp.any(wrong)
@@ -125,17 +132,10 @@ def moved_by(
     """The motion with the velocities of an impact's answer."""
     free = free_velocity(s, motion, slots, hub)
     vx, vz, dtheta = choice.answer.hub
-    in_slot = slots.first | slots.second
     dL = free.legs + hub.legs.sin * vx + hub.legs.cos * vz
-    dL = jnp.where(in_slot, slots.spread(choice.answer.length), jnp.where(airborne, 0.0, dL))
+    held = jnp.where(airborne, 0.0, dL)
+    dL = jnp.where(slots.filled, slots.spread(choice.answer.length), held)
     return motion._replace(vx=vx, vz=vz, dtheta=dtheta, dL=dL)
-
-
-class Law(NamedTuple):
-    """What is asked of all events alike."""
-
-    one_sided: bool  # stoppers of legs in the air only push
-    counted: bool  # whether `solutions` is the number of admissible ones, or says if there is one
 
 
 class Staying(NamedTuple):
@@ -160,14 +160,13 @@ class _Shock(NamedTuple):
     impulse: Legs  # of the stoppers in the air, N s; inf for other legs
 
 
+def _is(mode: Array | int) -> Bool[Array, "... 4"]:
+    """A flag for each of the four contact modes: whether it is this one."""
+    return jnp.arange(4) == jnp.asarray(mode)[..., None]
+
+
 def _impact(
-    s: Symbols,
-    friction: Scalar,
-    motion: WheelMotion,
-    stance: Stance,
-    event: Event,
-    law: Law,
-    stay: Staying,
+    law: Law, motion: WheelMotion, stance: Stance, event: Event, stay: Staying
 ) -> tuple[_Shock, Slots, Bool[Array, " n"]]:
     """Velocity level: simultaneous, inelastic, with Coulomb's law in the impulse.
 
@@ -175,24 +174,20 @@ def _impact(
     those that `stay`. Infinite friction keeps feet at rest planted when a leg meets its stopper, as
     the paper does.
     """
-    touching = (stance.contact != OFF) | event.lands
-    slots = slots_of(touching)
+    s, friction = law.s, law.friction
+    slots = slots_of((stance.contact != OFF) | event.lands)
     at_stopper = stance.locked | event.closes
-    in_slot = slots.first | slots.second
     loaded = jnp.stack([jnp.any(slots.first), jnp.any(slots.second)])
-    stops = jnp.stack(slots.of(at_stopper.astype(jnp.int32))) > 0
-    before = jnp.stack(slots.of(stance.contact))
+    stops, before = slots.flags(at_stopper), slots.codes(stance.contact)
     planted = (before == STICK) & ~jnp.any(event.lands) & ~jnp.isfinite(friction)
-    any_mode = jnp.asarray([True, True, True, True])
-    only = lambda mode: jnp.arange(4) == mode
-    modes = jnp.where(loaded[:, None], any_mode, only(OFF))
-    planted = planted | (jnp.stack(slots.of(stay.feet.astype(jnp.int32))) > 0)
-    modes = jnp.where(planted[:, None], jnp.arange(4) == before[:, None], modes)
+    planted = planted | slots.flags(stay.feet)
+    modes = jnp.where(loaded[:, None], jnp.ones((4,), bool), _is(OFF))
+    modes = jnp.where(planted[:, None], _is(before), modes)
     allowed = Allowed(
         contact=modes & event.impact,  # else nothing is to be looked at
         held=jnp.stack([jnp.ones((2,), bool), stops], axis=1),
         stays=planted,
-        known_contact=~loaded[:, None] & only(OFF),
+        known_contact=~loaded[:, None] & _is(OFF),
         known_open=~stops,
     )
 
@@ -205,7 +200,7 @@ def _impact(
         impulse = s.m * (hub.legs.sin * jump_x + hub.legs.cos * jump_z + motion.dL)
         return _Shock(after, choice, jnp.where(airborne, impulse, jnp.inf)), impulse, after.dL
 
-    airborne = at_stopper & ~in_slot
+    airborne = at_stopper & ~slots.filled
     if not law.one_sided:
         return solve(airborne)[0], slots, airborne
     shock, held, right = _that_push(solve, airborne, airborne & ~stay.legs & event.impact)
@@ -217,14 +212,32 @@ def _if(right: Array, choice: Choice) -> Choice:
     return choice._replace(solutions=jnp.where(right, choice.solutions, 0))
 
 
+def _following(
+    event: Event, mode: Array, goes: Array, rigid: Array
+) -> tuple[Bool[Array, "2 4"], Bool[Array, "2 4"]]:
+    """Modes that may follow an event in each slot, and those of them that need no test.
+
+    `goes`: what a slot's foot was about to become goes the right way (see `leaves`).
+    """
+    rests = (mode == STICK) | event.stops
+    modes = jnp.where((mode == STICK)[:, None], jnp.ones((4,), bool), _is(mode) | _is(OFF))
+    back = jnp.where(mode == SLIP_DOWN, SLIP_UP, SLIP_DOWN)
+    modes = jnp.where(event.stops[:, None], _is(STICK) | _is(OFF) | _is(back), modes)
+    known = _is(mode) & ~rests[:, None]
+    stuck = jnp.full((2,), STICK)
+    for flags, forced, ended in (
+        (event.lifts, OFF, mode),
+        (event.slides_up, SLIP_UP, stuck),
+        (event.slides_down, SLIP_DOWN, stuck),
+    ):
+        tested = ~_is(ended) & (goes | rigid | ~_is(forced))
+        modes = jnp.where(flags[:, None], jnp.where(goes, _is(forced), tested), modes)
+        known = jnp.where(flags[:, None], goes & _is(forced), known)
+    return modes, known
+
+
 def _support(
-    s: Symbols,
-    friction: Scalar,
-    motion: WheelMotion,
-    contact: Int[Array, " n"],
-    at_stopper: Bool[Array, " n"],
-    event: Event,
-    law: Law,
+    law: Law, motion: WheelMotion, contact: Int[Array, " n"], at_stopper: Array, event: Event
 ) -> tuple[Choice, Slots, Array, Bool[Array, " n"], Thrown]:
     """Acceleration level: who carries the motion that follows.
 
@@ -232,21 +245,10 @@ def _support(
     back. What an event has just ended is not asked again: its force is zero, and its sign rounding.
     It is followed by what it was about to become, if that goes the right way (see `leaves`).
     """
+    s, friction = law.s, law.friction
     slots = slots_of(contact != OFF)
-    in_slot = slots.first | slots.second
-    mode = jnp.stack(slots.of(contact))
-    stops = jnp.stack(slots.of(at_stopper.astype(jnp.int32))) > 0
-    only = lambda mode: jnp.arange(4) == mode
+    mode, stops = slots.codes(contact), slots.flags(at_stopper)
     rests = (mode == STICK) | event.stops
-    ways = jnp.where(
-        (mode == STICK)[:, None],
-        jnp.ones((4,), bool),
-        (jnp.arange(4) == mode[:, None]) | only(OFF),
-    )
-    back = jnp.where(mode == SLIP_DOWN, SLIP_UP, SLIP_DOWN)
-    stopped = only(STICK) | only(OFF) | (jnp.arange(4) == back[:, None])
-    ways = jnp.where(event.stops[:, None], stopped, ways)
-    moves = (jnp.arange(4) == mode[:, None]) & ~rests[:, None]
     rigid = (mode == STICK) & ~jnp.isfinite(friction)  # a tangential force jumps to zero
     up, down = event.slides_up, event.slides_down
     second = (event.lifts | up | down)[1]
@@ -257,16 +259,7 @@ def _support(
         hub = hub_of(s, motion, slots, airborne)
         free = free_acceleration(s, motion, slots, hub)
         leaving = leaves(s, hub, free, (mode, stops), friction, second, direction)
-        goes = (leaving & ~rigid)[:, None]
-        modes, known = ways, moves
-        for flags, forced, ended in (
-            (event.lifts, OFF, mode),
-            (up, SLIP_UP, jnp.full((2,), STICK)),
-            (down, SLIP_DOWN, jnp.full((2,), STICK)),
-        ):
-            tested = ~(jnp.arange(4) == ended[:, None]) & (goes | rigid[:, None] | ~only(forced))
-            modes = jnp.where(flags[:, None], jnp.where(goes, only(forced), tested), modes)
-            known = jnp.where(flags[:, None], goes & only(forced), known)
+        modes, known = _following(event, mode, (leaving & ~rigid)[:, None], rigid[:, None])
         allowed = Allowed(
             contact=modes,
             held=jnp.stack([jnp.ones((2,), bool), ~opens], axis=1),
@@ -282,7 +275,7 @@ def _support(
         turned = 2.0 * motion.dL * dtheta * sin + motion.L * (turning * sin + dtheta**2 * cos)
         return (choice, Thrown(outward, ddL * cos - az - turned)), outward, outward
 
-    airborne = at_stopper & ~in_slot
+    airborne = at_stopper & ~slots.filled
     if not law.one_sided:
         choice, thrown = solve(airborne)[0]
         return choice, slots, rests, airborne, thrown
@@ -290,31 +283,24 @@ def _support(
     return _if(right, choice), slots, rests, held, thrown
 
 
-def resolve(
-    s: Symbols,
-    friction: Scalar,
-    motion: WheelMotion,
-    stance: Stance,
-    event: Event,
-    law: Law,
-    unseen: Elementwise,
-) -> Change:
+def resolve(law: Law, motion: WheelMotion, stance: Stance, event: Event) -> Change:
     """Everything that an event changes.
 
     What an impact throws off the ground, or off a stopper that only pushes, comes back: where it
-    would go no farther than `unseen`, m, it stays. It would give the hub its momentum a moment
-    later, so the motion is the same to about `unseen`; else each return throws others off, ever
+    would go no farther than `law.unseen` it stays. It would give the hub its momentum a moment
+    later, so the motion is the same to about that; else each return throws others off, ever
     less, without end.
     """
     nothing = Staying(stance.locked & False, stance.locked & False)
-    legs = directions(s, motion.theta)
+    legs = directions(law.s, motion.theta)
+    resolved = lambda stay: _resolved(law, motion, stance, event, stay)
 
     def again(now: tuple) -> tuple:
         stay, _, _ = now
-        change, back = _resolved(s, friction, motion, stance, event, law, stay)
+        change, back = resolved(stay)
         after, now_stance = change.motion, change.stance
         rise = after.vz - after.dL * legs.cos + after.L * after.dtheta * legs.sin
-        returns = lambda speed, back: (back > 0.0) & (speed**2 < 2.0 * back * unseen)
+        returns = lambda speed, back: (back > 0.0) & (speed**2 < 2.0 * back * law.unseen)
         in_air = now_stance.contact == OFF
         more = Staying(
             now_stance.new_leg & in_air & returns(after.dL, back.legs) & law.one_sided,
@@ -324,43 +310,30 @@ def resolve(
         stay = Staying(stay.legs | more.legs, stay.feet | more.feet)
         return stay, new & event.impact, change
 
-    blank = lambda leaf: jnp.zeros(leaf.shape, leaf.dtype)
-    resolved = lambda: _resolved(s, friction, motion, stance, event, law, nothing)
-    shapes = jax.eval_shape(resolved)
-    begin = nothing, jnp.asarray(True), jax.tree.map(blank, shapes[0])
+    begin = nothing, jnp.asarray(True), zeros_of(resolved, nothing)[0]
     return lax.while_loop(lambda now: now[1], again, begin)[2]
 
 
 def _resolved(
-    s: Symbols,
-    friction: Scalar,
-    motion: WheelMotion,
-    stance: Stance,
-    event: Event,
-    law: Law,
-    stay: Staying,
+    law: Law, motion: WheelMotion, stance: Stance, event: Event, stay: Staying
 ) -> tuple[Change, Thrown]:
     """`resolve` where some stay whatever it takes; also how what was thrown off comes back."""
-    impact = event.impact
+    s, impact = law.s, event.impact
     touched = (stance.contact != OFF) | event.lands
     was_locked = (stance.locked | event.closes) & ~event.loosens
-    shock, slots, held = _impact(s, friction, motion, stance, event, law, stay)
+    shock, slots, held = _impact(law, motion, stance, event, stay)
     after = select(impact, shock.after, motion)
-    in_slot = slots.first | slots.second
     struck = slots.spread(shock.choice.contact).astype(jnp.int32)
     contact = jnp.where(impact, struck, stance.contact)
-    kept = jnp.where(in_slot, slots.spread(shock.choice.held) > 0, was_locked & held)
+    kept = jnp.where(slots.filled, slots.spread(shock.choice.held) > 0, was_locked & held)
     at_stopper = jnp.where(impact, kept, was_locked)
     legs = directions(s, motion.theta)
-    dropped = touched & ~in_slot
+    dropped = touched & ~slots.filled
     foot_z = after.vz - after.dL * legs.cos + after.L * after.dtheta * legs.sin
 
-    support, slots, rests, held, back = _support(
-        s, friction, after, contact, at_stopper, event, law
-    )
-    in_slot = slots.first | slots.second
+    support, slots, rests, held, back = _support(law, after, contact, at_stopper, event)
     contact = slots.spread(support.contact).astype(jnp.int32)
-    locked = jnp.where(in_slot, slots.spread(support.held) > 0, at_stopper & held)
+    locked = jnp.where(slots.filled, slots.spread(support.held) > 0, at_stopper & held)
     slides = (support.contact == SLIP_DOWN) | (support.contact == SLIP_UP)
     stance = Stance(
         contact=contact,
@@ -401,10 +374,10 @@ def settled(
     L = jnp.where(locked, s.L0, L)
     motion = motion._replace(L=L, dL=jnp.where(locked, 0.0, motion.dL))
     slots = slots_of(contact != OFF)
-    airborne = locked & ~slots.first & ~slots.second
+    airborne = locked & ~slots.filled
     hub = hub_of(s, motion, slots, airborne)
     free = free_velocity(s, motion, slots, hub)
-    modes, held = jnp.stack(slots.of(contact)), jnp.stack(slots.of(locked.astype(jnp.int32))) > 0
+    modes, held = slots.codes(contact), slots.flags(locked)
     zero = jnp.zeros_like(motion.theta)
     found = answer(s, hub, free, modes, held, zero)
     choice = Choice(modes, held, found, jnp.ones((), jnp.int32))

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.numerics import Elementwise, Scalar, sine_cosine
 from vrw_jax.wheel import Symbols
@@ -79,6 +79,19 @@ class Slots(NamedTuple):
 
     first: Bool[Array, "n_legs ..."]
     second: Bool[Array, "n_legs ..."]
+
+    @property
+    def filled(self) -> Bool[Array, "n_legs ..."]:
+        """Legs that are in a slot."""
+        return self.first | self.second
+
+    def codes(self, values: Array) -> Int[Array, "2 ..."]:
+        """The slots' entries of a code of all legs."""
+        return jnp.stack(self.of(values))
+
+    def flags(self, values: Array) -> Bool[Array, "2 ..."]:
+        """The slots' entries of a flag of all legs; False for an empty slot."""
+        return self.codes(values.astype(jnp.int32)) > 0
 
     def of(self, values: Array) -> Pair:
         """The slots' entries of a quantity of all legs; 0 for an empty slot."""
@@ -149,7 +162,7 @@ def _inverse_inertia(s: Symbols, legs: Legwise, b: Legs, released: Array) -> tup
 def hub_of(s: Symbols, motion: WheelMotion, slots: Slots, locked: Array) -> Hub:
     """How hub and slots answer forces at this posture; `locked`: airborne legs on stoppers."""
     legs = directions(s, motion.theta)
-    released = slots.first | slots.second | ~locked
+    released = slots.filled | ~locked
     inverse = _inverse_inertia(s, legs, motion.L - s.a, released)
     sin, cos, L = slots.of(legs.sin), slots.of(legs.cos), slots.of(motion.L)
     e = [(cos[i], -sin[i], -L[i]) for i in range(2)]

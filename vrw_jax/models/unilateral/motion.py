@@ -80,9 +80,8 @@ class Flow(NamedTuple):
 def flow_of(s: Symbols, friction: Elementwise, one_sided: bool, stance: Stance) -> Flow:
     """The stance as seen by the equations of motion."""
     slots = slots_of(stance.contact != OFF)
-    contact = jnp.stack(slots.of(stance.contact))
-    held = jnp.stack(slots.of(stance.locked.astype(jnp.int32))) > 0
-    airborne = stance.locked & ~slots.first & ~slots.second
+    contact, held = slots.codes(stance.contact), slots.flags(stance.locked)
+    airborne = stance.locked & ~slots.filled
     return Flow(s, friction, one_sided, stance, slots, contact, held, airborne)
 
 
@@ -169,6 +168,16 @@ class Guards(NamedTuple):
     loosen: int  # stopper force of airborne legs, one per leg, where stoppers are one-sided
     total: int
 
+    @property
+    def n_legs(self) -> int:
+        """Legs of the wheel."""
+        return self.leg - self.foot
+
+    @property
+    def foremost(self) -> int:
+        """Guard of the foot ahead of all others, whose landing ends a step."""
+        return self.leg - 1
+
 
 def guards_of(n: int, one_sided: bool) -> Guards:
     """Places of the guards of a wheel with n legs."""
@@ -205,7 +214,7 @@ def stance_guards(flow: Flow, motion: WheelMotion, now: Felt, begun: Array) -> l
     one = jnp.ones_like(motion.L)
     in_air = (stance.contact == OFF) & (begun | ~stance.new_foot)
     moving = ~stance.locked & (begun | ~stance.new_leg)
-    just_slid = jnp.stack(flow.slots.of(stance.new_slip.astype(jnp.int32))) > 0
+    just_slid = flow.slots.flags(stance.new_slip)
     rough = jnp.where(jnp.isfinite(flow.friction), flow.friction, 0.0)
     normal, tangential = jnp.stack(now.normal), jnp.stack(now.tangential)
     coulomb = (flow.contact == STICK) & jnp.isfinite(flow.friction)

@@ -1,13 +1,16 @@
 """The full section state of the unilateral rung as one vector, and the paper's inside it."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
+from vrw_jax.models.base import replaced_where_bad, usable
+from vrw_jax.models.paper_step import PAPER_START
 from vrw_jax.models.unilateral.contacts import OFF, STICK
 from vrw_jax.models.unilateral.events import settled
 from vrw_jax.models.unilateral.mechanics import WheelMotion, directions
 from vrw_jax.models.unilateral.motion import Stance, State, Tally, pack
-from vrw_jax.wheel import Symbols, length_at_touchdown
+from vrw_jax.numerics import Scalar
+from vrw_jax.wheel import Symbols, WheelParams, length_at_touchdown
 
 FullState = Float[Array, " n_full"]
 """(theta-, dtheta-, vx-, vz-, L_1 ... L_n, dL_1 ... dL_n, code_1 ... code_n) just before the foot
@@ -39,6 +42,18 @@ def embedded(s: Symbols, x: Float[Array, "3"]) -> FullState:
             jnp.where(first, float(STICK), float(LOCKED + OFF)),
         ]
     )
+
+
+def made_sound(
+    params: WheelParams, friction: Scalar, x: FullState
+) -> tuple[Bool[Array, ""], WheelParams, Scalar, FullState]:
+    """Whether a step may begin there, and the same, or what one always may begin with."""
+    safe_x = embedded(
+        WheelParams(n_legs=params.n_legs).symbols(), jnp.asarray(PAPER_START, x.dtype)
+    )
+    good = usable(params, x) & (friction >= 0.0)
+    params, x = replaced_where_bad(good, params, x, safe_x)
+    return good, params, jnp.where(good, friction, 1.0), x
 
 
 def opened(s: Symbols, x: FullState) -> tuple[State, Stance]:

@@ -11,22 +11,25 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from vrw_jax.models.base import (
-    AbstractGroundStep,
-    AbstractWheel,
-    Advance,
-    replaced_where_bad,
-    usable,
-)
+from vrw_jax.models.base import AbstractGroundStep, AbstractWheel, Advance
 from vrw_jax.models.paper_step import PAPER_START
-from vrw_jax.models.unilateral.contacts import OFF
-from vrw_jax.models.unilateral.events import Change, Event, Law, event_of, resolve, settled
+from vrw_jax.models.unilateral.events import Law
+from vrw_jax.models.unilateral.ledger import (
+    Details,
+    Ledger,
+    UnilateralMargins,
+    blank,
+    law_of,
+    no_details,
+    noted,
+    outcome_at,
+    passed,
+    past,
+)
 from vrw_jax.models.unilateral.motion import (
-    Flow,
     Guards,
     Stance,
     State,
-    airborne_stopper_force,
     field,
     flow_of,
     forces,
@@ -35,11 +38,17 @@ from vrw_jax.models.unilateral.motion import (
     pack,
     unpack,
 )
-from vrw_jax.models.unilateral.section import FullState, closed, embedded, opened, section_size
+from vrw_jax.models.unilateral.section import (
+    FullState,
+    closed,
+    embedded,
+    made_sound,
+    opened,
+    section_size,
+)
 from vrw_jax.numerics import (
     Forward,
     Options,
-    PhaseEnd,
     Scalar,
     Watched,
     any_mode,
@@ -47,20 +56,10 @@ from vrw_jax.numerics import (
     integrate_phase,
     sample_phase,
 )
-from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, Symbols, WheelParams
+from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, WheelParams
 
 BILATERAL, ONE_SIDED = "bilateral", "one-sided"
 """What stoppers do to legs in the air: hold whatever it takes, or push alone."""
-
-
-class UnilateralMargins(eqx.Module):
-    """How far the motion stayed from what bilateral stoppers do not ask, over one step.
-
-    Negative where a one-sided stopper would have let a leg in the air go.
-    """
-
-    stopper_force: Scalar  # least stopper force of a locked leg in the air, N
-    stopper_impulse: Scalar  # least stopper impulse of a locked leg in the air, N s
 
 
 class UnilateralStep(AbstractGroundStep):
@@ -105,21 +104,6 @@ class UnilateralTrajectory(eqx.Module):
     duration: Float[Array, " phases"]  # s
 
 
-SEEN = 4e5
-"""Roundings of a leg's length in the least dip that is followed, 1e-10 m in float64: a dip takes
-the time 4 depth / speed, and its end is known to rounding / speed, here a millionth of that."""
-
-
-def least_dip(s: Symbols, options: Options, one_sided: bool) -> Scalar:
-    """Least excursion, from the ground or a one-sided stopper, that follows an impact, m.
-
-    Legs leave such stoppers so often that it grows with the tolerance; feet alone do not, and the
-    shares of a step in double and single support would show it.
-    """
-    resolved = SEEN * jnp.finfo(s.L0.dtype).eps * s.L0
-    return jnp.maximum(options.atol, resolved) if one_sided else resolved
-
-
 class _Log(NamedTuple):
     """Starts of all phases, kept where a trajectory is wanted."""
 
@@ -129,33 +113,16 @@ class _Log(NamedTuple):
     duration: Float[Array, " phases"]
 
 
-class _Sums(NamedTuple):
-    """What a step adds up and keeps."""
-
-    durations: Float[Array, "3"]
-    mode_durations: Float[Array, "4 4"]
-    post_impact: Float[Array, "2"]
-    landing_normal: Float[Array, "2"]
-    landing_tangential: Float[Array, "2"]
-    energy_impacts: Scalar
-    stopper_force: Scalar
-    stopper_impulse: Scalar
-    impacts: Int[Array, ""]
-    fewest: Int[Array, ""]
-    most: Int[Array, ""]
-    tried: Int[Array, ""]
-
-
 class _Walked(NamedTuple):
     """Where a step stands between two of its events."""
 
     state: State
     stance: Stance
     guard: Int[Array, ""]  # that ended the last phase
-    events: Int[Array, ""]
     outcome: Int[Array, ""]
-    running: Array
-    sums: _Sums
+    running: Bool[Array, ""]
+    ledger: Ledger
+    details: Details | None
     log: _Log | None
 
 
@@ -213,8 +180,7 @@ class UnilateralWheel(AbstractWheel):
     def trace(
         self, params: WheelParams, x: FullState, options: Options, n_samples: int
     ) -> UnilateralTrajectory:
-        walked = _walk(self, params, x, options, monitored=False, logged=True)
-        log = walked.log
+        log = _walk(self, params, x, options, detailed=False, logged=True).log
         assert log is not None
         begins = jnp.concatenate([jnp.zeros((1,)), jnp.cumsum(log.duration)[:-1]])
         s = params.symbols()
@@ -243,143 +209,66 @@ def _walk(
     params: WheelParams,
     x: FullState,
     options: Options,
-    monitored: bool,
+    detailed: bool,
     logged: bool = False,
 ) -> _Walked:
     """Follow one step from event to event."""
-    n = params.n_legs
-    safe_x = embedded(WheelParams(n_legs=n).symbols(), jnp.asarray(PAPER_START, x.dtype))
-    good = usable(params, x)
-    params, x = replaced_where_bad(good, params, x, safe_x)
-    s, friction = params.symbols(), wheel.friction.astype(x.dtype)
-    good = good & (friction >= 0.0)
-    friction = jnp.where(good, friction, 1.0)
-    one_sided = wheel.one_sided
-    place = guards_of(n, one_sided)
-    law, unseen = Law(one_sided, counted=True), least_dip(s, options, one_sided)
+    good, params, friction, x = made_sound(params, wheel.friction.astype(x.dtype), x)
+    s, n = params.symbols(), params.n_legs
+    law = law_of(s, friction, options, wheel.one_sided, counted=True)
+    place = guards_of(n, wheel.one_sided)
     state, stance = opened(s, x)
-
-    def go_on(now: _Walked) -> _Walked:
-        motion, tally = unpack(now.state)
-        # The integrator lets feet drift by its error; one that lifts would land again at once.
-        motion = settled(s, motion, now.stance.contact, now.stance.locked)
-        event = event_of(place, n, now.guard)
-        change = resolve(s, friction, motion, now.stance, event, law, unseen)
-        tally_now = tally._replace(clock=jnp.zeros_like(tally.clock))
-        start = pack(change.motion, tally_now)
-        flow = flow_of(s, friction, one_sided, change.stance)
-        outcome = jnp.where(change.solutions > 0, Outcome.STEPPED, Outcome.NO_ADMISSIBLE_CONTACT)
-        outcome = jnp.where(change.third_foot, Outcome.THREE_FEET_LOADED, outcome)
-        sound = outcome == Outcome.STEPPED
-        start = jnp.where(sound, start, now.state)
-        end = integrate_phase(
-            partial(field, flow), Watched(partial(guards, flow), place.total), start, sound, options
-        )
-        watched = guards(flow, end.state)[jnp.maximum(end.guard, 0)] != 1.0
-        outcome = jnp.where(sound, _outcome(place, end, watched), outcome)
-        ended = outcome != Outcome.STEPPED
-        done = sound & (end.guard == place.foot + n - 1)
-        events = now.events + 1
-        chained = (events >= wheel.max_events) & ~done & ~ended
-        outcome = jnp.where(chained, Outcome.TOO_MANY_EVENTS, outcome)
-        log = now.log
-        if log is not None:
-            row = (start, change.stance.contact, change.stance.locked, end.duration)
-            log = _Log(*(old.at[now.events].set(new) for old, new in zip(log, row, strict=True)))
-        return _Walked(
-            state=end.state,
-            stance=change.stance,
-            guard=end.guard,
-            events=events,
-            outcome=outcome.astype(jnp.int32),
-            running=~(done | ended | chained),
-            sums=_added(now, flow, change, event, end, monitored),
-            log=log,
-        )
-
-    zero, none = jnp.zeros_like(x[0]), jnp.zeros((), jnp.int32)
-    two = jnp.zeros((2,), x.dtype)
-    big = jnp.int32(jnp.iinfo(jnp.int32).max)
-    log = None
-    if logged:
-        shape = (wheel.max_events,)
-        log = _Log(
-            jnp.broadcast_to(state, (*shape, *state.shape)),
-            jnp.zeros((*shape, n), jnp.int32),
-            jnp.zeros((*shape, n), bool),
-            jnp.zeros(shape, x.dtype),
-        )
-    sums = _Sums(
-        jnp.zeros((3,), x.dtype),
-        jnp.zeros((4, 4), x.dtype),
-        two,
-        two,
-        two,
-        zero,
-        zero + jnp.inf,
-        zero + jnp.inf,
-        none,
-        big,
-        none,
-        none,
-    )
+    rows = lambda leaf: jnp.broadcast_to(leaf, (wheel.max_events, *leaf.shape))
+    first = _Log(state, jnp.zeros((n,), jnp.int32), jnp.zeros((n,), bool), jnp.zeros_like(x[0]))
     begin = _Walked(
-        state,
-        stance,
-        jnp.int32(place.foot),
-        none,
-        jnp.where(good, Outcome.STEPPED, Outcome.BAD_INPUT).astype(jnp.int32),
-        good,
-        sums,
-        log,
+        state=state,
+        stance=stance,
+        guard=jnp.int32(place.foot),
+        outcome=jnp.where(good, Outcome.STEPPED, Outcome.BAD_INPUT).astype(jnp.int32),
+        running=good,
+        ledger=blank(x[0]),
+        details=no_details(x.dtype) if detailed else None,
+        log=jax.tree.map(rows, first) if logged else None,
     )
+    go_on = partial(_go_on, law, place, wheel.max_events, options)
     return lax.while_loop(lambda now: now.running, go_on, begin)
 
 
-def _outcome(place: Guards, end: PhaseEnd, watched: Array) -> Int[Array, ""]:
-    """STEPPED where the motion may go on with an event.
+def _go_on(law: Law, place: Guards, max_events: int, options: Options, now: _Walked) -> _Walked:
+    """Through the event that a step stands at, and to the next one."""
+    motion, tally = unpack(now.state)
+    change, event, outcome = past(law, place, motion, now.stance, now.guard)
+    flow = flow_of(law.s, law.friction, law.one_sided, change.stance)
+    sound = outcome == Outcome.STEPPED
+    start = pack(change.motion, tally._replace(clock=jnp.zeros_like(tally.clock)))
+    start = jnp.where(sound, start, now.state)
+    guarded = Watched(partial(guards, flow), place.total)
+    end = integrate_phase(partial(field, flow), guarded, start, sound, options)
 
-    At a Painlevé singularity forces change sign without passing zero: no guard is found there.
-    """
-    located = (end.guard >= 0) & watched
-    code = jnp.where(located, Outcome.STEPPED, Outcome.SOLVER_GAVE_UP)
-    code = jnp.where(end.timed_out, Outcome.NO_TOUCHDOWN_IN_TIME, code)
-    code = jnp.where(end.guard == place.rate, Outcome.FELL_BACK, code)
-    return jnp.where(end.guard == place.length, Outcome.COLLAPSED, code)
-
-
-def _added(
-    now: _Walked, flow: Flow, change: Change, event: Event, end: PhaseEnd, monitored: bool
-) -> _Sums:
-    """The sums after one more event and the phase that followed it."""
-    sums, dtype = now.sums, end.duration.dtype
-    loaded = jnp.sum(flow.contact != OFF)
-    one_hot = lambda index, size: (jnp.arange(size) == index).astype(dtype)
-    modes = one_hot(flow.contact[0], 4)[:, None] * one_hot(flow.contact[1], 4)[None, :]
-    first = now.events == 0
-    motion = change.motion
-    force, impulse = sums.stopper_force, sums.stopper_impulse
-    if monitored:
-        for y in (pack(motion, unpack(now.state)[1]), end.state):
-            at = unpack(y)[0]
-            found = airborne_stopper_force(flow, forces(flow, at))
-            force = jnp.minimum(force, jnp.min(jnp.where(flow.airborne, found, jnp.inf)))
-        impulse = jnp.minimum(impulse, change.stopper_impulse)
-    return _Sums(
-        durations=sums.durations + one_hot(2 - loaded, 3) * end.duration,
-        mode_durations=sums.mode_durations + modes * end.duration,
-        post_impact=jnp.where(first, jnp.stack([motion.theta, motion.dtheta]), sums.post_impact),
-        landing_normal=jnp.where(first, jnp.stack(change.normal_impulse), sums.landing_normal),
-        landing_tangential=jnp.where(
-            first, jnp.stack(change.tangential_impulse), sums.landing_tangential
-        ),
-        energy_impacts=sums.energy_impacts + change.energy_lost,
-        stopper_force=force,
-        stopper_impulse=impulse,
-        impacts=sums.impacts + event.impact,
-        fewest=jnp.minimum(sums.fewest, change.solutions),
-        most=jnp.maximum(sums.most, change.most_solutions),
-        tried=sums.tried + end.solver_steps,
+    ledger = now.ledger._replace(events=now.ledger.events + 1)
+    ledger = passed(ledger, change.stance, end.duration, end.solver_steps)
+    # At a Painlevé singularity forces change sign without passing zero: no guard is found there.
+    watched = guards(flow, end.state)[jnp.maximum(end.guard, 0)] != 1.0
+    lost = jnp.where(end.timed_out, Outcome.NO_TOUCHDOWN_IN_TIME, Outcome.SOLVER_GAVE_UP)
+    lost = jnp.where(sound, lost, outcome)
+    found = sound & (end.guard >= 0) & watched
+    lands = found & (end.guard == place.foremost)
+    outcome = outcome_at(ledger, place, found, end.guard, lands, lost, max_events)
+    details, log = now.details, now.log
+    if details is not None:
+        details = noted(details, now.ledger.events == 0, flow, change, event, end)
+    if log is not None:
+        row = _Log(start, change.stance.contact, change.stance.locked, end.duration)
+        log = jax.tree.map(lambda old, new: old.at[now.ledger.events].set(new), log, row)
+    return _Walked(
+        state=end.state,
+        stance=change.stance,
+        guard=end.guard,
+        outcome=outcome.astype(jnp.int32),
+        running=(outcome == Outcome.STEPPED) & ~lands,
+        ledger=ledger,
+        details=details,
+        log=log,
     )
 
 
@@ -390,7 +279,7 @@ def _compiled(structure: Any, full: bool) -> Forward:
     def walk(tighten: bool, *leaves: Array) -> tuple:
         wheel, params, x, options = jax.tree.unflatten(structure, leaves)
         options = options.for_derivatives() if tighten else options
-        walked = _walk(wheel, params, x, options, monitored=full)
+        walked = _walk(wheel, params, x, options, detailed=full)
         result = _result(walked, params.n_legs) if full else _lean(walked)
         return eqx.partition(result, eqx.is_inexact_array)
 
@@ -404,34 +293,31 @@ def _section_state(walked: _Walked) -> FullState:
 
 
 def _lean(walked: _Walked) -> Advance:
-    return Advance(_section_state(walked), walked.sums.durations, walked.outcome, walked.sums.tried)
+    ledger = walked.ledger
+    return Advance(_section_state(walked), ledger.durations, walked.outcome, ledger.tried)
 
 
 def _result(walked: _Walked, n: int) -> UnilateralStep:
-    sums = walked.sums
+    ledger, details = walked.ledger, walked.details
+    assert details is not None
     motion, tally = unpack(walked.state)
-    began = walked.events > 0
     stepped = walked.outcome == Outcome.STEPPED
-    theta = motion.theta
-    landing = motion.x - motion.L[n - 1] * jnp.sin(theta + (n - 1) * 2.0 * math.pi / n)
+    turned = motion.theta + (n - 1) * 2.0 * math.pi / n
+    landing = motion.x - motion.L[n - 1] * jnp.sin(turned)
     finite = lambda value: jnp.where(jnp.isfinite(value), value, 0.0)
+    details = details._replace(
+        monitors=jax.tree.map(finite, details.monitors),
+        fewest_solutions=jnp.where(ledger.events > 0, details.fewest_solutions, 0),
+    )
     return UnilateralStep(
         section_state=_section_state(walked),
-        post_impact=sums.post_impact,
-        durations=sums.durations,
-        mode_durations=sums.mode_durations,
+        durations=ledger.durations,
         step_length=jnp.where(stepped, landing, 0.0),
-        landing_normal=sums.landing_normal,
-        landing_tangential=sums.landing_tangential,
-        energy_impacts=sums.energy_impacts,
         energy_damping=tally.damping,
         energy_friction=tally.friction,
         slip=tally.slip,
-        monitors=UnilateralMargins(finite(sums.stopper_force), finite(sums.stopper_impulse)),
-        events=walked.events,
-        impacts=sums.impacts,
-        fewest_solutions=jnp.where(began, sums.fewest, 0),
-        most_solutions=sums.most,
+        events=ledger.events,
         outcome=walked.outcome,
-        solver_steps=sums.tried,
+        solver_steps=ledger.tried,
+        **details._asdict(),
     )

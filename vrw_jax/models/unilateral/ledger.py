@@ -1,0 +1,168 @@
+"""What a step on real ground tells: of one wheel or, element by element, of lanes.
+
+A step is a row of events, each followed by a stretch in which no contact changes. Its first event
+is the landing that opened it; it is complete where the foot ahead of all others lands.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from vrw_jax.models.unilateral.contacts import OFF
+from vrw_jax.models.unilateral.events import Change, Event, Law, event_of, resolve, settled
+from vrw_jax.models.unilateral.mechanics import WheelMotion
+from vrw_jax.models.unilateral.motion import (
+    Flow,
+    Guards,
+    Stance,
+    airborne_stopper_force,
+    forces,
+    unpack,
+)
+from vrw_jax.numerics import Elementwise, Options, PhaseEnd, Scalar, select
+from vrw_jax.wheel import Outcome, Symbols
+
+SEEN = 4e5
+"""Roundings of a leg's length in the least dip that is followed, 1e-10 m in float64: a dip takes
+the time 4 depth / speed, and its end is known to rounding / speed, here a millionth of that."""
+
+
+def law_of(
+    s: Symbols, friction: Elementwise, options: Options, one_sided: bool, counted: bool
+) -> Law:
+    """The law of a walk, with the least excursion from ground or stopper that follows an impact.
+
+    Legs leave one-sided stoppers so often that it grows with the tolerance; feet alone do not, and
+    the shares of a step in double and single support would show it.
+    """
+    unseen = SEEN * jnp.finfo(s.L0.dtype).eps * s.L0
+    unseen = jnp.maximum(options.atol, unseen) if one_sided else unseen
+    return Law(s, friction, one_sided, counted, unseen)
+
+
+def past(
+    law: Law, place: Guards, motion: WheelMotion, stance: Stance, guard: Int[Array, ""]
+) -> tuple[Change, Event, Int[Array, ""]]:
+    """Through the event of a guard: what it changes, what it was, and STEPPED where all went well.
+
+    The integrator lets feet drift by its error. One that lifts rises like the third power of time,
+    from the slope and from rest: else it would land again at once.
+    """
+    motion, event = settled(law.s, motion, stance.contact, stance.locked), event_of(place, guard)
+    change = resolve(law, motion, stance, event)
+    outcome = jnp.where(change.solutions > 0, Outcome.STEPPED, Outcome.NO_ADMISSIBLE_CONTACT)
+    outcome = jnp.where(change.third_foot, Outcome.THREE_FEET_LOADED, outcome)
+    return change, event, outcome.astype(jnp.int32)
+
+
+class UnilateralMargins(eqx.Module):
+    """How far the motion stayed from what bilateral stoppers do not ask, over one step.
+
+    Negative where a one-sided stopper would have let a leg in the air go.
+    """
+
+    stopper_force: Scalar  # least stopper force of a locked leg in the air, N
+    stopper_impulse: Scalar  # least stopper impulse of a locked leg in the air, N s
+
+
+class Ledger(NamedTuple):
+    """What a step has told so far."""
+
+    events: Int[Array, "..."]  # contacts and stoppers that changed
+    durations: Float[Array, "3 ..."]  # with two feet loaded, with one, with none, s
+    tried: Int[Array, "..."]  # steps of the integrator
+
+
+def blank(like: Array) -> Ledger:
+    """Of a step that is about to begin, for wheels of the shape and dtype of `like`."""
+    none = jnp.zeros(like.shape, jnp.int32)
+    return Ledger(none, jnp.zeros((3, *like.shape), like.dtype), none)
+
+
+def passed(ledger: Ledger, stance: Stance, duration: Elementwise, tried: Array) -> Ledger:
+    """After one more stretch."""
+    loaded = jnp.sum(stance.contact != OFF, axis=0)
+    share = jnp.stack([loaded == feet for feet in (2, 1, 0)])
+    durations = ledger.durations + jnp.where(share, duration, 0.0)
+    return ledger._replace(durations=durations, tried=ledger.tried + tried)
+
+
+def outcome_at(
+    ledger: Ledger,
+    place: Guards,
+    at_event: Array,
+    guard: Array,
+    landed: Array,
+    lost: Array,
+    max_events: int,
+) -> Int[Array, "..."]:
+    """STEPPED where a stretch ended `at_event` of a guard that the walk goes on from, or that
+    completes the step as the foremost foot `landed`; where it ended at no event, `lost`."""
+    code = jnp.where(ledger.events >= max_events, Outcome.TOO_MANY_EVENTS, Outcome.STEPPED)
+    code = jnp.where(guard == place.rate, Outcome.FELL_BACK, code)
+    code = jnp.where(guard == place.length, Outcome.COLLAPSED, code)
+    return jnp.where(at_event, jnp.where(landed, Outcome.STEPPED, code), lost)
+
+
+class Details(NamedTuple):
+    """What a step tells of one wheel beside its ledger, named as in `UnilateralStep`."""
+
+    post_impact: Float[Array, "2"]
+    mode_durations: Float[Array, "4 4"]
+    landing_normal: Float[Array, "2"]
+    landing_tangential: Float[Array, "2"]
+    energy_impacts: Scalar
+    monitors: UnilateralMargins
+    impacts: Int[Array, ""]
+    fewest_solutions: Int[Array, ""]
+    most_solutions: Int[Array, ""]
+
+
+def no_details(dtype: jnp.dtype) -> Details:
+    """Of a step that is about to begin."""
+    zero, none = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
+    two = jnp.zeros((2,), dtype)
+    return Details(
+        post_impact=two,
+        mode_durations=jnp.zeros((4, 4), dtype),
+        landing_normal=two,
+        landing_tangential=two,
+        energy_impacts=zero,
+        monitors=UnilateralMargins(zero + jnp.inf, zero + jnp.inf),
+        impacts=none,
+        fewest_solutions=none + jnp.iinfo(jnp.int32).max,
+        most_solutions=none,
+    )
+
+
+def noted(
+    details: Details, first: Array, flow: Flow, change: Change, event: Event, end: PhaseEnd
+) -> Details:
+    """After one more event, the step's `first` or not, and the stretch that followed it."""
+    motion, dtype = change.motion, end.duration.dtype
+    mode = [(jnp.arange(4) == flow.contact[i]).astype(dtype) for i in range(2)]
+    opening = (
+        jnp.stack([motion.theta, motion.dtheta]),
+        jnp.stack(change.normal_impulse),
+        jnp.stack(change.tangential_impulse),
+    )
+    known = details.post_impact, details.landing_normal, details.landing_tangential
+    post_impact, normal, tangential = select(first, opening, known)
+    force = details.monitors.stopper_force
+    for at in (motion, unpack(end.state)[0]):
+        found = airborne_stopper_force(flow, forces(flow, at))
+        force = jnp.minimum(force, jnp.min(jnp.where(flow.airborne, found, jnp.inf)))
+    impulse = jnp.minimum(details.monitors.stopper_impulse, change.stopper_impulse)
+    return Details(
+        post_impact=post_impact,
+        mode_durations=details.mode_durations + mode[0][:, None] * mode[1][None, :] * end.duration,
+        landing_normal=normal,
+        landing_tangential=tangential,
+        energy_impacts=details.energy_impacts + change.energy_lost,
+        monitors=UnilateralMargins(force, impulse),
+        impacts=details.impacts + event.impact,
+        fewest_solutions=jnp.minimum(details.fewest_solutions, change.solutions),
+        most_solutions=jnp.maximum(details.most_solutions, change.most_solutions),
+    )
