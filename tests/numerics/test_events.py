@@ -93,6 +93,14 @@ def test_a_guard_that_starts_at_zero_and_rises_fires_only_when_it_comes_back():
     assert abs(float(end.duration) - np.pi) < 1e-12
 
 
+@pytest.mark.parametrize("height", [1e-2, 1e-5, 1e-10])
+def test_a_guard_that_rises_from_zero_and_comes_back_within_the_first_step_fires(height):
+    arc = lambda y: jnp.stack([y[1], -jnp.ones_like(y[1])])  # up at rate v, back after 2 v
+    end = end_of((lambda y: y[0],), start=(0.0, height), field=arc)
+    assert int(end.guard) == 0
+    assert abs(float(end.duration) / (2.0 * height) - 1.0) < 1e-14
+
+
 def test_a_tiny_phase_is_walked_and_not_skipped():
     for length in (1e-6, 1e-9, 1e-12):
         end = end_of((lambda y, length=length: length - y[0],))

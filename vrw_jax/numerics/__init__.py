@@ -1,4 +1,8 @@
-"""Numerical methods that know no wheel: flows with events, collocation, Newton, continuation."""
+"""Numerical methods that know no wheel: flows with events, collocation, Newton, continuation.
+
+For any field, guards and resets: `walk`, `newton_cycle`, `segment_maps` with `product_multipliers`,
+`arclength`, `complementary`; docs/any_system.md tells them by examples.
+"""
 
 from vrw_jax.numerics import arclength, floquet
 from vrw_jax.numerics.arclength import (
@@ -24,6 +28,7 @@ from vrw_jax.numerics.collocation import (
     mesh_error,
     walk_through,
 )
+from vrw_jax.numerics.complementarity import Answers, complementary
 from vrw_jax.numerics.derivatives import Forward, any_mode, on_branch, push, without_derivative
 from vrw_jax.numerics.events import Field, PhaseEnd, integrate_phase, sample_phase
 from vrw_jax.numerics.floquet import multipliers
@@ -37,6 +42,7 @@ from vrw_jax.numerics.gauss import (
     Mesh,
     transfer_matrix,
 )
+from vrw_jax.numerics.hybrid import Guard, Mode, Stop, walk
 from vrw_jax.numerics.lane_algebra import LaneArray, fusion_barrier
 from vrw_jax.numerics.lane_minima import Monitors
 from vrw_jax.numerics.lanes import (
@@ -53,6 +59,7 @@ from vrw_jax.numerics.minima import State, Watched
 from vrw_jax.numerics.newton import SectionCycle, corrected, newton_cycle
 from vrw_jax.numerics.options import Options
 from vrw_jax.numerics.roots import BIFURCATIONS, bifurcation_functions, brackets, locate, turns
+from vrw_jax.numerics.segments import product_multipliers, segment_maps
 from vrw_jax.numerics.tableaus import (
     Place,
     Slope,

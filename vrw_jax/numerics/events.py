@@ -404,6 +404,11 @@ def _first_guess(
     v0, r0, v1, r1 = v0[:n_guards], r0[:n_guards], v1[:n_guards], r1[:n_guards]
     fall = jnp.where(crossing & (v0 > v1), v0 - v1, 1.0)
     at = jnp.where(crossing, jnp.clip(v0 / fall, 0.0, 1.0), 1.0)
+    # One that rises from zero is at zero where the step begins: its cubic over x has the root.
+    linear, square = 3.0 * v1 - 2.0 * r0 - r1, r0 - 2.0 * v1 + r1
+    root = jnp.sqrt(jnp.maximum(linear * linear - 4.0 * r0 * square, 0.0)) - linear
+    other = jnp.clip(2.0 * r0 / jnp.where(root > 0.0, root, 1.0), 0.0, 1.0)
+    at = jnp.where(crossing & (v0 == 0.0) & (r0 > 0.0), other, at)
     for _ in range(3):
         slope = (
             6.0 * at * (at - 1.0) * (v0 - v1)
@@ -435,7 +440,8 @@ def _searched(search: _Search, guards: Array, rates: Array, length: Scalar) -> _
     change = -guards / jnp.where(falling, rates, -1.0)
     proposals = jnp.where(falling, length + change, jnp.inf)
     guard = jnp.argmin(proposals).astype(jnp.int32)
-    before = jnp.all(jnp.where(search.crossing, guards > 0.0, True))
+    rising = (guards == 0.0) & (rates > 0.0)  # from where the step begins
+    before = jnp.all(jnp.where(search.crossing, (guards > 0.0) | rising, True))
     low = jnp.where(before, lax.stop_gradient(length), search.low)
     high = jnp.where(before, search.high, lax.stop_gradient(length))
     proposal = proposals[guard]

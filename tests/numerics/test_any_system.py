@@ -1,0 +1,195 @@
+"""The documented face: any field, guards and resets; closed forms, and what it refuses."""
+
+import re
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vrw_jax as vrw
+from vrw_jax.numerics import (
+    Answers,
+    Guard,
+    Mode,
+    Stop,
+    complementary,
+    product_multipliers,
+    segment_maps,
+    walk,
+)
+
+PAGE = Path(__file__).parents[2] / "docs" / "any_system.md"
+TIGHT = vrw.Options.tight()
+G = 9.81
+
+
+def fall(y):
+    return jnp.stack([y[1], -G + 0.0 * y[1]])
+
+
+def ball(restitution=0.8):
+    return Mode(
+        fall,
+        (Guard(lambda y: y[0], lambda y: jnp.stack([0.0 * y[0], -restitution * y[1]])),),
+    )
+
+
+def code(told):
+    return Stop(int(told.stop))
+
+
+def test_the_page_s_examples_print_what_it_says(capsys, monkeypatch):
+    monkeypatch.setattr(vrw, "start_jax", lambda: None)
+    blocks = re.findall(r"```python\n(.*?)```\n\n```text\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    assert len(blocks) == PAGE.read_text().count("```python")
+    assert len([x for x in blocks[0][0].splitlines() if x]) <= 10
+    names = {}
+    for source, printed in blocks:
+        exec(source, names)
+        assert capsys.readouterr().out == printed
+
+
+@pytest.mark.parametrize("restitution", [0.2, 0.5, 0.9])
+def test_a_ball_bounces_until_the_clock_stands_still(restitution):
+    told = walk([ball(restitution)], [1.0, 0.0], events=600, options=TIGHT)
+    n = int(told.n_events)
+    powers = restitution ** np.arange(n)
+    truth = np.sqrt(2.0 / G) * (1.0 + 2.0 * restitution * (1.0 - powers) / (1.0 - restitution))
+    assert code(told) == Stop.EVENTS_PILE_UP
+    np.testing.assert_allclose(told.times[:n], truth, rtol=1e-14)
+    end = np.sqrt(2.0 / G) * (1.0 + restitution) / (1.0 - restitution)
+    assert abs(float(told.time) - end) < 1e-14 * end
+
+
+def test_event_times_have_the_closed_form_s_derivatives():
+    third = lambda height: walk(
+        [ball()], jnp.stack([height, 0.0 * height]), events=3, options=TIGHT
+    ).times[2]
+    truth = lambda height: jnp.sqrt(2.0 * height / G) * (1.0 + 2.0 * (0.8 + 0.64))
+    np.testing.assert_allclose(jax.jacfwd(third)(1.3), jax.grad(truth)(1.3), rtol=1e-12)
+
+
+def test_modes_follow_each_other_as_their_guards_say():
+    # A thermostat: up with rate 2, down with rate 1, between 0 and 1.
+    heat = Mode(lambda y: jnp.full_like(y, 2.0), (Guard(lambda y: 1.0 - y[0], to=1),))
+    cool = Mode(lambda y: jnp.full_like(y, -1.0), (Guard(lambda y: y[0], to=0),))
+    told = walk([heat, cool], [0.5], events=5, options=TIGHT)
+    assert code(told) == Stop.EVENTS_DONE
+    np.testing.assert_array_equal(told.modes, [0, 1, 0, 1, 0])
+    np.testing.assert_allclose(told.times, [0.25, 1.25, 1.75, 2.75, 3.25], rtol=1e-14)
+
+
+def test_a_walk_in_a_batch_is_the_walk_alone():
+    heights = jnp.array([0.5, 1.0, 2.0])
+    one = lambda height: walk([ball()], jnp.stack([height, 0.0 * height]), events=4)
+    many = jax.vmap(one)(heights)
+    for i, height in enumerate(heights):
+        np.testing.assert_allclose(many.times[i], one(height).times, rtol=1e-13)
+
+
+def test_what_goes_wrong_on_the_way_is_a_code():
+    assert code(walk([ball()], [-1.0, 0.0], events=3)) == Stop.GUARD_PAST
+    short = vrw.Options(max_phase_time=0.1)
+    assert code(walk([ball()], [1.0, 0.0], events=3, options=short)) == Stop.TIME_OVER
+    few = vrw.Options(max_solver_steps=2)
+    told = walk([ball()], [1.0, 0.0], events=3, options=few)
+    assert code(told) == Stop.STEPS_SPENT
+    assert int(told.n_events) == 0
+    sinks = Mode(lambda y: -0.5 / y, (Guard(lambda y: y[0] + 1.0),))  # sqrt(1 - t), then nothing
+    assert code(walk([sinks], [1.0], events=1)) == Stop.STUCK
+    assert np.all(np.isfinite(walk([sinks], [1.0], events=1).state))
+    into = Mode(fall, (Guard(lambda y: y[0], lambda y: jnp.stack([y[0] - 1.0, -y[1]])),))
+    told = walk([into], [1.0, 0.0], events=3)
+    assert (code(told), int(told.n_events)) == (Stop.GUARD_PAST, 1)
+    assert all(len(stop.meaning) > 20 for stop in Stop)
+
+
+@pytest.mark.parametrize(
+    ("modes", "start", "sentence"),
+    [
+        ([Mode(lambda y: y[:1], ball().guards)], [1.0, 0.0], r"field of mode 0 gives .*\(1,\)"),
+        ([Mode(lambda y: (y[1], -G), ball().guards)], [1.0, 0.0], "field of mode 0 gives tuple"),
+        ([Mode(fall, (Guard(lambda y: y),))], [1.0, 0.0], r"guard 0 of mode 0 gives .*\(2,\)"),
+        ([Mode(fall, (Guard(lambda y: y[0] > 0),))], [1.0, 0.0], "guard 0 of mode 0 gives bool"),
+        (
+            [Mode(fall, (Guard(lambda y: y[0], lambda y: -y[1]),))],
+            [1.0, 0.0],
+            r"reset of guard 0 of mode 0 gives .*\(\)",
+        ),
+        ([Mode(fall, ())], [1.0, 0.0], "mode 0 has no guard"),
+        ([Mode(fall, (Guard(lambda y: y[0], to=3),))], [1.0, 0.0], "leads to mode 3"),
+        ([ball()], [[1.0, 0.0]], "one row of numbers"),
+        ([ball()], [np.nan, 0.0], "not finite"),
+    ],
+)
+def test_what_can_not_be_walked_is_one_sentence(modes, start, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        walk(modes, start, events=2)
+
+
+def decaying(y):
+    x1, x2, t = y
+    return jnp.stack([x2, -10 * jnp.cos(t) * x1 - (24 + 10 * jnp.sin(t)) * x2, 1.0 + 0.0 * t])
+
+
+def test_multipliers_of_a_product_keep_every_digit_or_say_that_they_do_not():
+    cut = lambda n: segment_maps(decaying, jnp.zeros(3), 2 * np.pi, n, TIGHT, directions=2)
+    told = product_multipliers(cut(200).maps)
+    assert np.all(told.known)
+    np.testing.assert_allclose(told.values, [1.0, np.exp(-48 * np.pi)], rtol=1e-12)
+    assert abs(float(cut(200).divergence) + 48 * np.pi) < 1e-12
+    whole = product_multipliers(cut(1).maps)
+    np.testing.assert_array_equal(whole.known, [True, False])
+    assert abs(whole.values[0] - 1.0) < 1e-12
+    assert np.isnan(whole.values[1])
+
+
+@pytest.mark.parametrize("size", [1, 2, 4, 6])
+def test_multipliers_of_products_agree_with_those_of_the_product(size):
+    random = np.random.default_rng(size)
+    for _ in range(20):
+        maps = np.eye(size) + 0.3 * random.normal(size=(4, size, size))
+        truth = np.linalg.eigvals(np.linalg.multi_dot(maps[::-1]))
+        found = product_multipliers(maps).values
+        gap = np.abs(found[:, None] - truth[None])
+        assert max(gap.min(0).max(), gap.min(1).max()) < 1e-9 * np.abs(truth).max()
+
+
+def test_a_singular_factor_hides_one_multiplier_and_leaves_the_others():
+    told = product_multipliers([[[1.0, 2.0], [0.5, 1.0]], [[1.0, 0.0], [0.0, 2.0]]])
+    np.testing.assert_array_equal(told.known, [True, False])
+    assert abs(told.values[0] - 3.0) < 1e-14
+    assert told.logarithms[1] < -30.0
+
+
+def test_segments_and_products_refuse_wrong_shapes_in_a_sentence():
+    with pytest.raises(ValueError, match=r"maps has shape \(2, 2\)"):
+        product_multipliers(np.eye(2))
+    spent = segment_maps(decaying, jnp.zeros(3), 9.0, 1, vrw.Options(max_solver_steps=3), 2)
+    with pytest.raises(ValueError, match="not finite: the flow left its domain, or its steps"):
+        product_multipliers(spent.maps)
+    with pytest.raises(ValueError, match="directions is 4"):
+        segment_maps(decaying, jnp.zeros(3), 1.0, 2, TIGHT, directions=4)
+    with pytest.raises(ValueError, match="row of the same length"):
+        segment_maps(lambda y: y[:1], jnp.zeros(3), 1.0, 2, TIGHT)
+
+
+def test_contacts_have_one_answer_several_or_none():
+    answers = lambda matrix, free: Answers(int(complementary(matrix, free).answers))
+    assert answers([[1.0]], [-1.0]) == Answers.ONE
+    assert answers([[-1.0]], [1.0]) == Answers.SEVERAL
+    assert answers([[-1.0]], [-1.0]) == Answers.NONE
+    random = np.random.default_rng(0)
+    for _ in range(10):  # a positive definite matrix: one answer, by the quadratic programme
+        root = random.normal(size=(3, 3))
+        matrix, free = root @ root.T + 0.1 * np.eye(3), random.normal(size=3)
+        told = complementary(matrix, free)
+        assert int(told.answers) == Answers.ONE
+        assert float(jnp.min(told.force)) >= 0.0
+        assert float(jnp.min(told.gap)) >= -1e-12
+        np.testing.assert_allclose(told.force * told.gap, 0.0, atol=1e-12)
+        np.testing.assert_allclose(told.gap, matrix @ told.force + free, atol=1e-12)
+    with pytest.raises(ValueError, match=r"free \(2,\)"):
+        complementary(np.eye(3), np.zeros(2))

@@ -1,0 +1,211 @@
+"""Walks through modes: any field, the guards that end it and the resets that follow.
+
+    ball = Mode(lambda y: jnp.stack([y[1], -9.81 + 0.0 * y[1]]), (Guard(height, bounced),))
+    walk((ball,), start, events=10)
+
+What is wrong with a mode's shapes is one sentence at the edge; what goes wrong on the way is one
+code, `Stop`, with all events before it.
+"""
+
+import enum
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int
+
+from vrw_jax.numerics.events import Field, PhaseEnd, integrate_phase
+from vrw_jax.numerics.minima import State, Watched
+from vrw_jax.numerics.options import Options
+from vrw_jax.numerics.types import Scalar, as_float_array
+
+
+class Guard(NamedTuple):
+    """Ends its mode where `value`, positive inside, falls to zero; then the reset, then `to`."""
+
+    value: Callable[[State], Scalar]
+    reset: Callable[[State], State] = lambda y: y
+    to: int | None = None  # index of the mode that follows; None: the same again
+
+
+class Mode(NamedTuple):
+    """An autonomous field, shape (dim,) to (dim,), and its guards; time is a coordinate if any."""
+
+    field: Field
+    guards: tuple[Guard, ...]
+
+
+class Stop(enum.IntEnum):
+    """Why a walk ended."""
+
+    EVENTS_DONE = 0
+    TIME_OVER = 1
+    EVENTS_PILE_UP = 2
+    GUARD_PAST = 3
+    STEPS_SPENT = 4
+    STUCK = 5
+
+    @property
+    def meaning(self) -> str:
+        """One sentence for a reader."""
+        return _MEANINGS[self]
+
+
+_MEANINGS = {
+    Stop.EVENTS_DONE: "It has as many events as were asked for.",
+    Stop.TIME_OVER: "No guard ended the mode within Options.max_phase_time.",
+    Stop.EVENTS_PILE_UP: "Events follow each other so fast that the clock no longer moves (Zeno).",
+    Stop.GUARD_PAST: "A mode begins with a guard below zero: begin on it or inside, or elsewhere.",
+    Stop.STEPS_SPENT: "The solver's steps are spent: raise Options.max_solver_steps.",
+    Stop.STUCK: "The solver's steps became too short, or no event settled: the field is singular.",
+}
+
+
+class Walk(NamedTuple):
+    """Events in order of time; rows past `n_events` are zero."""
+
+    times: Float[Array, " events"]
+    before: Float[Array, "events dim"]  # states on the guard
+    after: Float[Array, "events dim"]  # and past the reset
+    modes: Int[Array, " events"]  # that ended
+    guards: Int[Array, " events"]  # of those modes, that ended them
+    n_events: Int[Array, ""]
+    time: Scalar  # of the last state
+    state: State  # where it stopped
+    mode: Int[Array, ""]
+    solver_steps: Int[Array, ""]
+    stop: Int[Array, ""]  # a Stop
+
+
+def walk(
+    modes: Sequence[Mode],
+    start: ArrayLike | Sequence,
+    *,
+    events: int,
+    mode: int = 0,
+    options: Options | None = None,
+) -> Walk:
+    """Follow `modes` from `start` through at most `events` events.
+
+    Guards are met as `integrate_phase` meets them: the earliest first, at the integrator's
+    accuracy, with derivatives of event times and states. A guard that a reset leaves within the
+    clock's rounding of zero counts as zero. Transforms (`jax.jit`, `jax.jacfwd`, `jax.vmap`) apply.
+    """
+    options = Options() if options is None else options
+    start = as_float_array(start)
+    _require(modes, start, events, mode)
+    options.require_reachable(start.dtype)
+    return _walk(tuple(modes), events, options, start, mode)
+
+
+def _require(modes: Sequence[Mode], start: Array, events: int, mode: int) -> None:
+    """Refuse, in one sentence, what can't be walked."""
+    if start.ndim != 1 or not start.size:
+        raise ValueError(f"start has shape {start.shape}, but a state is one row of numbers.")
+    if not isinstance(start, jax.core.Tracer) and not np.all(np.isfinite(start)):
+        raise ValueError("start holds a number that is not finite.")
+    if events < 1:
+        raise ValueError(f"events is {events}, but it must be at least 1.")
+    if not 0 <= mode < len(modes):
+        raise ValueError(f"mode is {mode}, but there are {len(modes)} modes, counted from 0.")
+    for i, (field, guards) in enumerate(modes):
+        if not guards:
+            raise ValueError(f"mode {i} has no guard, but only a guard can end it.")
+        _require_shape(f"the field of mode {i}", field, start, start.shape)
+        for k, guard in enumerate(guards):
+            name = f"guard {k} of mode {i}"
+            _require_shape(name, guard.value, start, ())
+            _require_shape(f"the reset of {name}", guard.reset, start, start.shape)
+            if guard.to is not None and not 0 <= guard.to < len(modes):
+                raise ValueError(f"{name} leads to mode {guard.to}, but there are {len(modes)}.")
+
+
+def _require_shape(name: str, function: Callable, start: Array, shape: tuple) -> None:
+    told: Any = jax.eval_shape(function, start)
+    found = getattr(told, "shape", None)
+    if found != shape or not jnp.issubdtype(told.dtype, jnp.floating):
+        what = f"{told.dtype} of shape {found}" if found is not None else type(told).__name__
+        raise ValueError(
+            f"{name} gives {what} for a state of shape {start.shape}, but it must give floats of "
+            f"shape {shape}."
+        )
+
+
+def _entered(mode: Mode, state: Array, time: Array, options: Options) -> tuple[PhaseEnd, Array]:
+    """The mode's phase from a state, and whether a guard was past there."""
+    values = lambda y: jnp.stack([guard.value(y) for guard in mode.guards])
+    first, rates = jax.jvp(values, (state,), (mode.field(state),))
+    first, rates = lax.stop_gradient((first, rates))
+    resolution = 1e3 * jnp.finfo(state.dtype).eps * lax.stop_gradient(time)
+    near = -first <= jnp.abs(rates) * resolution
+    past = jnp.any((first < 0.0) & ~near)
+    lift = jnp.where((first < 0.0) & near & (rates > 0.0), -first, 0.0)
+    watched = Watched(lambda y: values(y) + lift, len(mode.guards))
+    return integrate_phase(mode.field, watched, state, ~past, options), past
+
+
+def _left(mode: Mode, guard: Array, state: Array, own: int) -> tuple[Array, Array]:
+    """State after the reset of the guard that ended the mode, and the mode that follows."""
+    index = jnp.maximum(guard, 0)
+    after = lax.switch(index, [g.reset for g in mode.guards], state)
+    return after, jnp.asarray([own if g.to is None else g.to for g in mode.guards], jnp.int32)[
+        index
+    ]
+
+
+def _walk(modes: tuple[Mode, ...], events: int, options: Options, start: Array, mode: int) -> Walk:
+    def visit(own: int) -> Callable:
+        def visited(state: Array, time: Array) -> tuple:
+            end, past = _entered(modes[own], state, time, options)
+            return end, past, *_left(modes[own], end.guard, end.state, own)
+
+        return visited
+
+    visits = [visit(own) for own in range(len(modes))]
+
+    def event(carry: tuple) -> tuple:
+        walked, still = carry
+        end, past, after, following = lax.switch(walked.mode, visits, walked.state, walked.time)
+        happened = ~past & (end.guard >= 0)
+        time = walked.time + end.duration
+        still = jnp.where(time > walked.time, 0, still + 1)
+        spent = end.solver_steps >= options.max_solver_steps
+        stop = jnp.where(walked.n_events + 1 >= events, int(Stop.EVENTS_DONE), _GOING)
+        stop = jnp.where(still > len(modes), int(Stop.EVENTS_PILE_UP), stop)
+        unended = jnp.where(end.timed_out, int(Stop.TIME_OVER), int(Stop.STUCK))
+        unended = jnp.where(end.gave_up & spent, int(Stop.STEPS_SPENT), unended)
+        stop = jnp.where(happened, stop, jnp.where(past, int(Stop.GUARD_PAST), unended))
+        place = jnp.where(happened, walked.n_events, events)
+        put = lambda row, value: row.at[place].set(value, mode="drop")
+        return (
+            Walk(
+                times=put(walked.times, time),
+                before=put(walked.before, end.state),
+                after=put(walked.after, after),
+                modes=put(walked.modes, walked.mode),
+                guards=put(walked.guards, end.guard),
+                n_events=walked.n_events + happened,
+                time=time,
+                state=jnp.where(happened, after, end.state),
+                mode=jnp.where(happened, following, walked.mode).astype(jnp.int32),
+                solver_steps=walked.solver_steps + end.solver_steps,
+                stop=stop.astype(jnp.int32),
+            ),
+            still,
+        )
+
+    none, zero = jnp.zeros((), jnp.int32), 0.0 * start[0]
+    rows, places = jnp.zeros((events, start.size)) + zero, jnp.zeros((events,), jnp.int32)
+    first = Walk(
+        times=jnp.zeros(events) + zero, before=rows, after=rows, modes=places, guards=places,
+        n_events=none, time=zero, state=start, mode=none + mode, solver_steps=none,
+        stop=none + _GOING,
+    )  # fmt: skip
+    return lax.while_loop(lambda carry: carry[0].stop == _GOING, event, (first, none))[0]
+
+
+_GOING = -1
