@@ -90,17 +90,18 @@ def test_a_fold_of_a_map_of_three_numbers_is_found():
 
 
 def test_a_zero_is_located_to_its_width_even_at_a_jump():
-    def functions(x):
-        return np.array(
-            [x[0] ** 3 - 0.3, np.where(x[1] < 0.777, -1.0, 1e-3), np.exp(5 * x[2]) - 20]
-        )
-
-    zeros, ones = np.zeros(3), np.ones(3)
-    found = locate(functions, functions(zeros), functions(ones), np.full(3, 1e-12))
+    kinds = (
+        lambda x: x**3 - 0.3,
+        lambda x: np.where(x < 0.777, -1.0, np.nan),  # no number counts to the side of 1
+        lambda x: np.exp(5 * x) - 20,
+    )
+    functions = lambda x, which: np.array([kinds[k](y) for k, y in zip(which, x, strict=True)])
+    every = np.arange(3)
+    found = locate(functions, np.array([0.7, 1e-3, 128.4]), np.full(3, 1e-12))
     exact = np.array([0.3 ** (1 / 3), 0.777, np.log(20.0) / 5.0])
     np.testing.assert_allclose(found.place, exact, atol=1e-12)
-    assert np.all(functions(found.left) <= 0.0)
-    assert np.all(functions(found.right) >= 0.0)
+    assert np.all(functions(found.left, every) <= 0.0)
+    assert not np.any(functions(found.right, every) < 0.0)
 
 
 # A model that is not ours: the simplest walking model (Garcia et al. 1998) ------------------------

@@ -33,6 +33,7 @@ from vrw_jax.numerics import (
     Section,
     Solution,
     Unknown,
+    arclength,
     one_wheel,
 )
 from vrw_jax.results import MARGINS
@@ -173,18 +174,8 @@ class RungFollowed(AbstractFollowedWheel):
         return z
 
     def linearise(self, wheel: Wheel, z: Unknown, p: Scalar) -> Linear:
-        n = self.numbers
-
-        def both(x: Array, p: Array) -> tuple[Array, Array]:
-            image = self._image(wheel, jnp.concatenate([x, z[n:]]), p)
-            return image[:n], image
-
-        (by_x, by_p), image = jax.jacfwd(both, argnums=(0, 1), has_aux=True)(z[:n], p)
-        right = jnp.stack([image[:n] - z[:n], by_p], -1)
-        solved = jnp.linalg.solve(jnp.eye(n, dtype=z.dtype) - by_x, right)
-        codes = image[n:] - z[n:]
-        correction = jnp.concatenate([solved[:, 0], codes])
-        return Linear(correction, jnp.concatenate([solved[:, 1], jnp.zeros_like(codes)]), by_x)
+        image = lambda z, p: self._image(wheel, z, p)
+        return arclength.at_fixed_point(image, z, p, self.numbers)
 
     def section(self, z: Unknown) -> Section:
         return z[: self.numbers]
@@ -193,12 +184,6 @@ class RungFollowed(AbstractFollowedWheel):
         """Codes are those of the nearer point."""
         codes = jnp.where(place < 0.5, left, right)[self.numbers :]
         return jnp.concatenate([(left + place * (right - left))[: self.numbers], codes])
-
-    def size(self, z: Unknown, correction: Unknown) -> Scalar:
-        return jnp.max(jnp.abs(correction))
-
-    def valid(self, wheel: Wheel, z: Unknown, p: Scalar) -> Bool[Array, ""]:
-        return jnp.all(jnp.isfinite(z))
 
     def read(self, wheel: Wheel, z: Unknown, p: Scalar) -> tuple[RungState, dict[str, Array]]:
         """The section state; a step's own measures hold all there is."""

@@ -175,23 +175,23 @@ def _zeros(run: Run, pieces: _Pieces, asked: list[tuple[int, int, str]]) -> list
     wheels = _taken(run.wheels, owners)
     solve = functools.partial(_solve_on, run.followed, run.options, jnp.asarray(run.bounds))
 
-    def evaluated(places: np.ndarray) -> tuple[PathPoint, Table]:
-        points, found = _in_batches(solve, wheels, left, right, places)
+    def evaluated(places: np.ndarray, which: np.ndarray) -> tuple[PathPoint, Table]:
+        points, found = _in_batches(solve, *_taken((wheels, left, right), which), places)
         points = points._replace(valid=points.valid & found)
-        table = run.table(points, owners)
+        table = run.table(points, owners[which])
         return points, {k: np.where(_along(found, v), v, np.nan) for k, v in table.items()}
 
-    def wanted(table: Table) -> np.ndarray:
-        return np.array([table[name][i] for i, name in enumerate(names)])
+    def asked_at(places: np.ndarray, which: np.ndarray) -> np.ndarray:
+        table = evaluated(places, which)[1]
+        return np.array([table[names[k]][i] for i, k in enumerate(which)])
 
-    at_left = np.array([pieces.table[n][i] for n, i in zip(names, lefts, strict=True)])
     at_right = np.array([pieces.table[n][i] for n, i in zip(names, rights, strict=True)])
     reach = np.maximum(np.abs(right.p - left.p), ACCURACY)
     width = np.minimum(ACCURACY / reach, AT_FOLD)
-    found = locate(lambda places: wanted(evaluated(places)[1]), at_left, at_right, width)
-    best, _ = evaluated(found.place)
+    found, every = locate(asked_at, at_right, width), np.arange(len(asked))
+    best, _ = evaluated(found.place, every)
     # A little to the left even of an exact zero: there it is still what the branch stands for.
-    beside, table = evaluated(np.maximum(found.left - width, 0.0))
+    beside, table = evaluated(np.maximum(found.left - width, 0.0), every)
     return [
         _Zero(
             asked[i],

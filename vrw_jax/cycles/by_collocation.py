@@ -15,13 +15,14 @@ from vrw_jax.cycles.finder import (
     Gait,
     Measured,
     Values,
+    leading,
     measured_by_cycle,
     measured_of,
 )
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.search import Located, Problem, surface_start
 from vrw_jax.models import AbstractStep, StepResult, ViscoelasticWheel
-from vrw_jax.numerics import Options
+from vrw_jax.numerics import Options, with_jacobian
 from vrw_jax.results import MARGINS, MEASURES
 from vrw_jax.walks import checked
 from vrw_jax.wheel import PARAMETER_NAMES, WheelParams, parameters_of, wheel_of
@@ -44,6 +45,12 @@ class CollocationFinder(AbstractGaitFinder):
     differentiable: ClassVar[tuple[str, ...]] = tuple(n for n in readable if not MEASURES[n].axis)
     from_nothing: ClassVar[bool] = True
     usual: ClassVar[tuple[str, ...]] = tuple(n for n in of_cycle if n != "spectral_margin")
+
+    @classmethod
+    def of(
+        cls, model: Any, n_legs: int, step: Options, period_n: int, cycle: CycleOptions
+    ) -> "CollocationFinder":
+        return cls(model, n_legs, step, cycle, period_n)
 
     @property
     def problem(self) -> Problem:
@@ -76,15 +83,10 @@ class CollocationFinder(AbstractGaitFinder):
         lane = surface_start(self.problem, values[:, None], jnp.ones((1,), bool))
         return jax.tree.map(lambda x: x[..., 0], lane)
 
-    def first_guesses(self, values: Array) -> Located:
-        """The same for many wheels, one row of numbers for each."""
-        lanes = surface_start(self.problem, values.T, jnp.ones(values.shape[:1], bool))
-        return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), lanes)
-
     def find(self, values: Values, guess: Located) -> Gait:
-        cycle, d_cycle = _cycle_and_columns(self.problem, values, guess)
+        cycle, d_cycle = cycle_and_columns(self.problem, values, guess)
         x, dx = cycle.section_state, d_cycle.section_state
-        step, d_step = _step_and_columns(self.model, self.n_legs, values, x, dx, self.step_options)
+        step, d_step = step_and_columns(self.model, self.n_legs, values, x, dx, self.step_options)
         return _gait(cycle, step, d_cycle, d_step)
 
     def measured(self, values: Values, guess: Any, names: tuple[str, ...]) -> Measured:
@@ -94,21 +96,14 @@ class CollocationFinder(AbstractGaitFinder):
         near = self.first_guess(values) if cycle is None else cycle.located
         return measured_of(self.find(values, near), type(self).read, names)
 
-    def find_many(self, values: Array, guess: Located) -> Gait:
-        """The gaits of many wheels side by side; every array gains a leading axis."""
-        cycle, d_cycle = _cycles_and_columns(self.problem, values, guess)
-        x, dx = cycle.section_state, d_cycle.section_state
-        step, d_step = _steps_and_columns(self.model, self.n_legs, values, x, dx, self.step_options)
-        return _gait(cycle, step, d_cycle, d_step)
-
     def compile(self, params: WheelParams) -> None:
         values = parameters_of(params)
         x = jnp.asarray(self.model.start(params), values.dtype)
         dx = jnp.zeros((len(PARAMETER_NAMES), x.shape[0]), x.dtype)
         with ThreadPoolExecutor(2) as pool:
-            cycle = pool.submit(_cycle_and_columns, self.problem, values, self.first_guess(values))
+            cycle = pool.submit(cycle_and_columns, self.problem, values, self.first_guess(values))
             step = pool.submit(
-                _step_and_columns, self.model, self.n_legs, values, x, dx, self.step_options
+                step_and_columns, self.model, self.n_legs, values, x, dx, self.step_options
             )
             cycle.result(), step.result()
 
@@ -119,54 +114,25 @@ def _gait(cycle: LimitCycle, step: StepResult, d_cycle: LimitCycle, d_step: Step
     return Gait(cycle, step, d_cycle, d_step, *told)
 
 
+@eqx.filter_jit
 def cycle_and_columns(
     problem: Problem, values: Array, guess: Located
 ) -> tuple[LimitCycle, LimitCycle]:
     """The cycle near `guess`, and its derivatives by all parameters as a leading axis."""
 
-    def floats_of(values: Array) -> tuple[LimitCycle, tuple[LimitCycle, LimitCycle]]:
-        cycle = solved(wheel_of(values, problem.n_legs), problem, guess)
-        floats, rest = eqx.partition(cycle, eqx.is_inexact_array)
-        return floats, (floats, rest)
-
-    columns, (floats, rest) = jax.jacfwd(floats_of, has_aux=True)(values)
-    leading = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), columns)
-    return eqx.combine(floats, rest), leading
+    find = lambda values: solved(wheel_of(values, problem.n_legs), problem, guess)
+    cycle, columns = with_jacobian(find, values)
+    return cycle, leading(columns)
 
 
+@eqx.filter_jit
 def step_and_columns(
     model: ViscoelasticWheel, n_legs: int, values: Array, x: Array, dx: Array, options: Options
 ) -> tuple[StepResult, StepResult]:
     """One step and its derivatives by all parameters when the start moves by `dx` with them."""
 
     n = values.shape[0]
-
-    def floats_of(inputs: Array) -> tuple:
-        result = model.step(wheel_of(inputs[:n], n_legs), inputs[n:], options)
-        floats, rest = eqx.partition(result, eqx.is_inexact_array)
-        return floats, (floats, rest)
-
-    inputs = jnp.concatenate([values, x])
-    jacobian, (floats, rest) = jax.jacfwd(floats_of, has_aux=True)(inputs)
+    take = lambda inputs: model.step(wheel_of(inputs[:n], n_legs), inputs[n:], options)
+    step, jacobian = with_jacobian(take, jnp.concatenate([values, x]))
     moved = jnp.concatenate([jnp.eye(n, dtype=x.dtype), dx], axis=1)
-    along = lambda by_inputs: jnp.moveaxis(by_inputs @ moved.T, -1, 0)
-    return eqx.combine(floats, rest), jax.tree.map(along, jacobian)
-
-
-_cycle_and_columns = eqx.filter_jit(cycle_and_columns)
-_step_and_columns = eqx.filter_jit(step_and_columns)
-
-
-@eqx.filter_jit
-def _cycles_and_columns(
-    problem: Problem, values: Array, guess: Located
-) -> tuple[LimitCycle, LimitCycle]:
-    return eqx.filter_vmap(lambda v, g: cycle_and_columns(problem, v, g))(values, guess)
-
-
-@eqx.filter_jit
-def _steps_and_columns(
-    model: ViscoelasticWheel, n_legs: int, values: Array, x: Array, dx: Array, options: Options
-) -> tuple[StepResult, StepResult]:
-    one = lambda v, x, dx: step_and_columns(model, n_legs, v, x, dx, options)
-    return eqx.filter_vmap(one)(values, x, dx)
+    return step, leading(jax.tree.map(lambda by_inputs: by_inputs @ moved.T, jacobian))

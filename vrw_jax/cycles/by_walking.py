@@ -12,10 +12,19 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from vrw_jax.cycles.cycle import MEASURED, AbstractCycle
-from vrw_jax.cycles.finder import AbstractGaitFinder, Gait, Measured, Values, along, measured_of
+from vrw_jax.cycles.finder import (
+    AbstractGaitFinder,
+    Gait,
+    Measured,
+    Values,
+    along,
+    leading,
+    measured_of,
+)
+from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.section_cycle import WalkedCycle, cycle_from, finest, of_steps, walked_cycle
 from vrw_jax.models import AbstractWheel
-from vrw_jax.numerics import Options, SectionCycle, corrected
+from vrw_jax.numerics import Options, SectionCycle, corrected, with_jacobian
 from vrw_jax.results import ON_GROUND
 from vrw_jax.walks import checked, walk_towards
 from vrw_jax.wheel import WheelParams
@@ -24,7 +33,19 @@ from vrw_jax.wheel import WheelParams
 class AbstractWalkingFinder(AbstractGaitFinder):
     """Gaits as fixed points of `period_n` steps of the rung."""
 
-    period_n: eqx.AbstractVar[int]
+    model: AbstractWheel
+    n_legs: int = eqx.field(static=True)
+    step_options: Options
+    period_n: int = eqx.field(static=True, default=1)
+
+    options_type: ClassVar[type] = Options
+    from_nothing: ClassVar[bool] = False
+
+    @classmethod
+    def of(
+        cls, model: AbstractWheel, n_legs: int, step: Options, period_n: int, cycle: CycleOptions
+    ) -> "AbstractWalkingFinder":
+        return cls(model, n_legs, step, period_n)
 
     def cycle(self, params: WheelParams, guess: Any = None) -> WalkedCycle:
         start = guess.section_state if isinstance(guess, AbstractCycle) else guess
@@ -44,17 +65,10 @@ class AbstractWalkingFinder(AbstractGaitFinder):
 class SectionFinder(AbstractWalkingFinder):
     """Of any rung; derivatives are those of Newton's method."""
 
-    model: AbstractWheel
-    n_legs: int = eqx.field(static=True)
-    step_options: Options
-    period_n: int = eqx.field(static=True, default=1)
-
-    options_type: ClassVar[type] = Options
     of_cycle: ClassVar[tuple[str, ...]] = tuple(n for n in MEASURED if n != "takeoff_acceleration")
     differentiable: ClassVar[tuple[str, ...]] = of_cycle
     usual: ClassVar[tuple[str, ...]] = tuple(n for n in of_cycle if n != "spectral_margin")
     readable: ClassVar[tuple[str, ...]] = of_cycle
-    from_nothing: ClassVar[bool] = False
 
     def find(self, values: Values, guess: Array) -> Gait:
         return _differentiated(self, values, guess)
@@ -64,35 +78,20 @@ class SectionFinder(AbstractWalkingFinder):
 def _differentiated(finder: SectionFinder, values: Values, guess: Array) -> Gait:
     """The gait and all of its derivatives, those of the map's Jacobian included."""
 
-    def floats_of(values: Values) -> tuple:
-        cycle = finder.cycle_of(values, guess)
-        floats, rest = eqx.partition(cycle, eqx.is_inexact_array)
-        return floats, (floats, rest)
-
-    jacobian, (floats, rest) = jax.jacfwd(floats_of, has_aux=True)(values)
-    cycle = eqx.combine(floats, rest)
-    d_cycle = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), jacobian)
-    step, d_step = (
-        jax.tree.map(lambda x: x[0], cycle.steps),
-        jax.tree.map(lambda x: x[:, 0], d_cycle.steps),
-    )
+    cycle, jacobian = with_jacobian(lambda values: finder.cycle_of(values, guess), values)
+    d_cycle = leading(jacobian)
+    step = jax.tree.map(lambda x: x[0], cycle.steps)
+    d_step = jax.tree.map(lambda x: x[:, 0], d_cycle.steps)
     return _gait(finder.model, finder.n_legs, cycle, step, d_cycle, d_step)
 
 
 class GroundFinder(AbstractWalkingFinder):
     """On real ground, with first derivatives, friction's included."""
 
-    model: AbstractWheel
-    n_legs: int = eqx.field(static=True)
-    step_options: Options
-    period_n: int = eqx.field(static=True, default=1)
-
-    options_type: ClassVar[type] = Options
     of_cycle: ClassVar[tuple[str, ...]] = ("spectral_radius", "spectral_margin")
     differentiable: ClassVar[tuple[str, ...]] = ON_GROUND
     usual: ClassVar[tuple[str, ...]] = ON_GROUND
     readable: ClassVar[tuple[str, ...]] = ON_GROUND
-    from_nothing: ClassVar[bool] = False
 
     def find(self, values: Values, guess: Array) -> Gait:
         return _ground_gait(self.model, self.n_legs, self.step_options, values, guess)
@@ -128,29 +127,26 @@ def _ground_gait(
     """
     n = values.shape[0]
 
-    def floats_of(inputs: Array) -> tuple:
+    def step_at(inputs: Array) -> Any:
         ground, wheel = model.at(inputs[:n], n_legs)
-        floats, rest = eqx.partition(ground.step(wheel, inputs[n:], options), eqx.is_inexact_array)
-        return floats, (floats, rest)
+        return ground.step(wheel, inputs[n:], options)
 
-    differentiated = jax.jacfwd(floats_of, has_aux=True)
     one = jnp.eye(start.shape[0], dtype=start.dtype)
 
     def correct(x: Array) -> tuple:
-        jacobian, (floats, rest) = differentiated(jnp.concatenate([values, x]))
-        miss = floats.section_state - x
+        step, jacobian = with_jacobian(step_at, jnp.concatenate([values, x]))
+        miss = step.section_state - x
         change = jnp.linalg.solve(one - jacobian.section_state[:, n:], miss)
-        return change, (jacobian, floats, rest, jnp.max(jnp.abs(miss)))
+        return change, (jacobian, step, jnp.max(jnp.abs(miss)))
 
     shapes = jax.eval_shape(correct, start)[1]
     blank = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
     found = corrected(correct, start, blank, finest(options), 1)
-    jacobian, floats, rest, residual = found.told
+    jacobian, step, residual = found.told
     by_values, by_section = jnp.split(jacobian.section_state, [n], axis=-1)
     moved = jnp.linalg.solve(one - by_section, by_values)
     follow = jnp.concatenate([jnp.eye(n, dtype=start.dtype), moved])
-    d_step = jax.tree.map(lambda leaf: jnp.moveaxis(leaf @ follow, -1, 0), jacobian)
-    step = eqx.combine(floats, rest)
+    d_step = leading(jax.tree.map(lambda leaf: leaf @ follow, jacobian))
     wheel = model.at(values, n_legs)[1]
     fixed = SectionCycle(found.at, by_section, residual, found.converged, found.iterations)
     cycle = cycle_from(wheel, fixed, jax.tree.map(lambda leaf: leaf[None], step))

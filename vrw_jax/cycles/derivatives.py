@@ -21,6 +21,7 @@ from vrw_jax.cycles.search import (
     Parameters,
     Problem,
     columns_of,
+    name_for_export,
     not_searched,
     search_lanes,
 )
@@ -101,6 +102,7 @@ def _over_lanes(function: Callable, like: Callable, problem: Problem, blocked: b
     of_problem = functools.partial(function, problem)
     if simd.serves():
         return lane_function(of_problem, functools.partial(like, problem), settings)
+    name_for_export()
     return remembered(
         in_blocks(of_problem, problem.options.block) if blocked else of_problem, settings
     )

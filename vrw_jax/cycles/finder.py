@@ -12,8 +12,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from vrw_jax.cycles.cycle import AbstractCycle
+from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.models import AbstractStep, AbstractWheel
-from vrw_jax.numerics import Options
+from vrw_jax.numerics import Options, with_jacobian
 from vrw_jax.wheel import Outcome, WheelParams
 
 AGREEMENT = 1e-8
@@ -103,6 +104,13 @@ class AbstractGaitFinder(eqx.Module):
     readable: eqx.AbstractClassVar[tuple[str, ...]]  # `differentiable`, and those of several legs
     from_nothing: eqx.AbstractClassVar[bool]  # whether a search needs no start nearby
 
+    @classmethod
+    @abc.abstractmethod
+    def of(
+        cls, model: Any, n_legs: int, step: Options, period_n: int, cycle: CycleOptions
+    ) -> "AbstractGaitFinder":
+        """The finder with the options of its step, and of its search if that has its own."""
+
     @abc.abstractmethod
     def cycle(self, params: WheelParams, guess: Any = None) -> AbstractCycle:
         """The cycle of a wheel near `guess`: a neighbour's `near`, a section state or nothing."""
@@ -114,10 +122,6 @@ class AbstractGaitFinder(eqx.Module):
     @abc.abstractmethod
     def find(self, values: Values, guess: Any) -> Gait:
         """The gait near `guess`, with its derivatives; the large programs are compiled once."""
-
-    def first_guesses(self, values: Float[Array, "lanes n_values"]) -> Any:
-        """`first_guess` of many wheels."""
-        return jax.vmap(self.first_guess)(values)
 
     def find_many(self, values: Float[Array, "lanes n_values"], guess: Any) -> Gait:
         """`find` of many wheels side by side; every array gains a leading axis."""
@@ -157,13 +161,17 @@ class Measured(NamedTuple):
 def measured_by_cycle(
     finder: AbstractGaitFinder, values: Values, guess: Any, names: tuple[str, ...]
 ) -> Measured:
-    def told(values: Values) -> tuple[Array, tuple[Array, Array]]:
+    def told(values: Values) -> tuple[Array, Array]:
         cycle = finder.cycle_of(values, guess)
-        measures = jnp.stack(list(cycle.measures(names).values()))
-        return measures, (measures, cycle.outcome)
+        return jnp.stack(list(cycle.measures(names).values())), cycle.outcome
 
-    slopes, (measures, outcome) = jax.jacfwd(told, has_aux=True)(values)
+    (measures, outcome), (slopes, _) = with_jacobian(told, values)
     return Measured(measures, slopes, outcome)
+
+
+def leading(columns: Any) -> Any:
+    """Derivatives by the rung's numbers, these as the first axis."""
+    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), columns)
 
 
 def along(function: Callable, told: tuple, d_told: tuple) -> tuple[Any, Any]:

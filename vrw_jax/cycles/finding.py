@@ -20,8 +20,10 @@ from vrw_jax.wheel import WheelParams
 Guess = LimitCycle | WalkedCycle | Array | np.ndarray | Sequence[float]
 """A neighbour's cycle, or a section state near the one that is wanted."""
 
-WALKING: dict[str, type[GroundFinder | SectionFinder]] = {"unilateral": GroundFinder}
-"""Finders of rungs whose gaits are walked, where it is not the one for any rung."""
+FINDERS: dict[str, type[AbstractGaitFinder]] = {
+    "viscoelastic": CollocationFinder, "unilateral": GroundFinder
+}  # fmt: skip
+"""By rung, where it is not the one for any rung."""
 
 
 def finder_of(
@@ -33,12 +35,10 @@ def finder_of(
     step_options: Options | None = None,
 ) -> AbstractGaitFinder:
     """What finds, checks and differentiates gaits of this rung."""
-    rung: Any = rung_of(model)
-    step_options = Options() if step_options is None else step_options
-    if rung.rung == "viscoelastic":
-        chosen = CycleOptions() if cycle_options is None else cycle_options
-        return CollocationFinder(rung, n_legs, step_options, chosen, period_n)
-    return WALKING.get(rung.rung, SectionFinder)(rung, n_legs, step_options, period_n)
+    rung = rung_of(model)
+    make = FINDERS.get(rung.rung, SectionFinder).of
+    return make(rung, n_legs, Options() if step_options is None else step_options, period_n,
+                CycleOptions() if cycle_options is None else cycle_options)  # fmt: skip
 
 
 @overload

@@ -111,8 +111,11 @@ class Finding(NamedTuple):
     passes: Int[Array, " lanes"]  # linearised passes spent
 
 
-for _type in (Solution, Located, Finding):
-    export.register_namedtuple_serialization(_type, serialized_name=f"vrw_jax.{_type.__name__}")
+@functools.cache
+def name_for_export() -> None:
+    """Tell JAX by what names traces on disk know these types: once in a process."""
+    for kind in (Solution, Located, Finding):
+        export.register_namedtuple_serialization(kind, serialized_name=f"vrw_jax.{kind.__name__}")
 
 
 def surface_start(problem: Problem, parameters: Parameters, with_dls: Array) -> Located:

@@ -3,7 +3,7 @@
 import abc
 import functools
 import operator
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -231,6 +231,8 @@ class AbstractWheel(eqx.Module):
     """What its motion depends on: the wheel's parameters, and where it feels it, friction."""
     tells_contacts: eqx.AbstractClassVar[bool]
     """Whether trajectories tell every leg's contact instead of the paper's phases."""
+    legs_yield: ClassVar[bool] = True
+    """Whether springs and dampers play a part: what is tuned and scanned."""
 
     def values(self, params: WheelParams) -> Float[Array, " n_values"]:
         """Numbers of `parameter_names`, of one wheel on this ground."""

@@ -49,6 +49,7 @@ class RigidWheel(AbstractWheel):
     rung: ClassVar[str] = "rigid"
     parameter_names: ClassVar[tuple[str, ...]] = PARAMETER_NAMES
     tells_contacts: ClassVar[bool] = False
+    legs_yield: ClassVar[bool] = False
 
     friction: float = eqx.field(static=True, default=1.0)
     stop_at_lift_off: bool = eqx.field(static=True, default=True)

@@ -29,7 +29,14 @@ from vrw_jax.numerics.collocation import (
     walk_through,
 )
 from vrw_jax.numerics.complementarity import Answers, complementary
-from vrw_jax.numerics.derivatives import Forward, any_mode, on_branch, push, without_derivative
+from vrw_jax.numerics.derivatives import (
+    Forward,
+    any_mode,
+    on_branch,
+    push,
+    with_jacobian,
+    without_derivative,
+)
 from vrw_jax.numerics.events import Field, PhaseEnd, integrate_phase, sample_phase
 from vrw_jax.numerics.floquet import multipliers
 from vrw_jax.numerics.gauss import (

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from vrw_jax.numerics.derivatives import with_jacobian
 from vrw_jax.numerics.lanes import select
 from vrw_jax.numerics.types import Scalar
 
@@ -74,13 +75,31 @@ class AbstractFollowed(eqx.Module):
         """Where Newton's method starts for a point at `place` in [0, 1] between two others."""
         return jax.tree.map(lambda a, b: a + place * (b - a), left, right)
 
-    @abc.abstractmethod
     def size(self, z: Unknown, correction: Unknown) -> Scalar:
-        """Size of a correction, to be compared with the tolerance."""
+        """Size of a correction, to be compared with the tolerance: its largest entry."""
+        return jnp.max(jnp.abs(correction))
 
-    @abc.abstractmethod
     def valid(self, wheel: Any, z: Unknown, p: Scalar) -> Bool[Array, ""]:
         """Whether a converged z is what it stands for."""
+        return jnp.all(jnp.isfinite(z))
+
+
+def at_fixed_point(
+    image: Callable[[Array, Scalar], Array], z: Array, p: Scalar, numbers: int
+) -> Linear:
+    """Newton's method on `image(z, p)` = z, of which the first `numbers` move continuously.
+
+    The others are codes: those of the image are taken over.
+    """
+    beside = lambda x, p: image(jnp.concatenate([x, z[numbers:]]), p)
+    reached, slopes = with_jacobian(beside, z[:numbers], p)
+    by_x, by_p = (slope[:numbers] for slope in slopes)
+    miss = reached - z
+    right = jnp.stack([miss[:numbers], by_p], -1)
+    solved = jnp.linalg.solve(jnp.eye(numbers, dtype=z.dtype) - by_x, right)
+    codes = miss[numbers:]
+    column = jnp.concatenate([solved[:, 1], jnp.zeros_like(codes)])
+    return Linear(jnp.concatenate([solved[:, 0], codes]), column, by_x)
 
 
 class MapFollowed(AbstractFollowed):
@@ -92,23 +111,10 @@ class MapFollowed(AbstractFollowed):
     function: Callable[[Any, Section, Scalar], Section] = eqx.field(static=True)
 
     def linearise(self, wheel: Any, z: Unknown, p: Scalar) -> Linear:
-        def both(z: Array, p: Array) -> tuple[Array, Array]:
-            image = self.function(wheel, z, p)
-            return image, image
-
-        (by_x, by_p), image = jax.jacfwd(both, argnums=(0, 1), has_aux=True)(z, p)
-        right = jnp.stack([image - z, by_p], -1)
-        solved = jnp.linalg.solve(jnp.eye(z.shape[0], dtype=z.dtype) - by_x, right)
-        return Linear(solved[:, 0], solved[:, 1], by_x)
+        return at_fixed_point(lambda x, p: self.function(wheel, x, p), z, p, z.shape[0])
 
     def section(self, z: Unknown) -> Section:
         return z
-
-    def size(self, z: Unknown, correction: Unknown) -> Scalar:
-        return jnp.max(jnp.abs(correction))
-
-    def valid(self, wheel: Any, z: Unknown, p: Scalar) -> Bool[Array, ""]:
-        return jnp.all(jnp.isfinite(z))
 
 
 class Ending(enum.IntEnum):

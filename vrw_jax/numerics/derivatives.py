@@ -10,6 +10,7 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -112,6 +113,21 @@ def total_derivative(function: LaneFunction, tangent_space: Callable) -> Callabl
         return jax.vmap(along)(units, tangent_space(p, z))
 
     return derivative
+
+
+def with_jacobian(function: Callable, *arguments: Array) -> tuple[Any, Any]:
+    """What `function` tells, and the derivatives of its floats on last axes, in one program.
+
+    A leaf's derivatives are a tuple, one for each argument, where there are several.
+    """
+
+    def floats_of(*arguments: Array) -> tuple:
+        floats, rest = eqx.partition(function(*arguments), eqx.is_inexact_array)
+        return floats, (floats, rest)
+
+    moved = tuple(range(len(arguments))) if len(arguments) > 1 else 0
+    jacobian, (floats, rest) = jax.jacfwd(floats_of, moved, has_aux=True)(*arguments)
+    return eqx.combine(floats, rest), jacobian
 
 
 def push(jacobian: PyTree, tangent: Array) -> PyTree:

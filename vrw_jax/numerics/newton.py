@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from vrw_jax.numerics.derivatives import with_jacobian
 from vrw_jax.numerics.types import Scalar
 
 
@@ -102,12 +103,7 @@ Map = Callable[..., Array]
 
 def _correction(image: Map, x: Array, closed_over: tuple) -> tuple[Array, Array, Array]:
     """Newton's change, the map's Jacobian, and by how much the map misses."""
-
-    def twice(y: Array) -> tuple[Array, Array]:
-        reached = image(y, *closed_over)
-        return reached, reached
-
-    jacobian, reached = jax.jacfwd(twice, has_aux=True)(x)
+    reached, jacobian = with_jacobian(lambda y: image(y, *closed_over), x)
     miss = reached - x
     return jnp.linalg.solve(jnp.eye(x.size, dtype=x.dtype) - jacobian, miss), jacobian, miss
 

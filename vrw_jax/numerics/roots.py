@@ -65,62 +65,27 @@ class Located(NamedTuple):
 
 
 def locate(
-    function: Callable[[np.ndarray], np.ndarray],
-    at_zero: np.ndarray,
+    function: Callable[[np.ndarray, np.ndarray], np.ndarray],
     at_one: np.ndarray,
     width: np.ndarray,
 ) -> Located:
     """Zeros of functions that have opposite signs at 0 and 1, by Chandrupatla's method.
 
-    Inverse quadratic interpolation where it can be trusted, bisection else: a jump is found as
-    surely as a smooth zero. Ends when each bracket is narrower than `width`. A place where the
-    function is not a number counts to the side of 1.
+    `function` takes places and which brackets they are of. Inverse quadratic interpolation where it
+    can be trusted, bisection else: a jump is found as surely as a smooth zero. Ends when each
+    bracket is narrower than `width`. A place where the function is not a number counts to the side
+    of 1, whose values are `at_one`.
     """
-    n = len(at_zero)
-    a, fa = np.ones(n), np.array(at_one, float)  # the newest
-    b, fb = np.zeros(n), np.array(at_zero, float)  # across from it
-    c, fc = a.copy(), fa.copy()  # the one before
-    sign_one = np.sign(at_one)
-    share = np.full(n, 0.5)
-    left, right = np.zeros(n), np.ones(n)
-    for _ in range(ROUNDS):
-        open_ = (np.abs(b - a) > width) & (fa != 0.0) & (fb != 0.0)
-        if not open_.any():
-            break
-        trial = np.where(open_, a + share * (b - a), a)
-        value = np.asarray(function(trial), float)
-        value = np.where(np.isnan(value), sign_one, value)
-        across = np.sign(value) == np.sign(fa)
-        c_new, fc_new = np.where(across, a, b), np.where(across, fa, fb)
-        b_new, fb_new = np.where(across, b, a), np.where(across, fb, fa)
-        c, fc = np.where(open_, c_new, c), np.where(open_, fc_new, fc)
-        b, fb = np.where(open_, b_new, b), np.where(open_, fb_new, fb)
-        a, fa = np.where(open_, trial, a), np.where(open_, value, fa)
-        on_right = np.sign(fa) == sign_one
-        right = np.where(on_right, a, np.where(np.sign(fb) == sign_one, b, right))
-        left = np.where(~on_right, a, np.where(np.sign(fb) != sign_one, b, left))
-        share = _share(a, fa, b, fb, c, fc, width)
-    place = np.where(np.abs(fa) <= np.abs(fb), a, b)
-    return Located(place, left, right)
+    from scipy.optimize.elementwise import find_root  # only borders need it, its import is slow
 
+    def signed(place: np.ndarray, which: np.ndarray) -> np.ndarray:
+        value = np.asarray(function(place * width[which], which), float)
+        return np.where(np.isnan(value), at_one[which], value)
 
-def _share(
-    a: np.ndarray,
-    fa: np.ndarray,
-    b: np.ndarray,
-    fb: np.ndarray,
-    c: np.ndarray,
-    fc: np.ndarray,
-    width: np.ndarray,
-) -> np.ndarray:
-    """Where between a and b to look next, as a share of the way."""
-    with np.errstate(all="ignore"):
-        xi = (a - b) / (c - b)
-        phi = (fa - fb) / (fc - fb)
-        trusted = (phi**2 < xi) & ((1.0 - phi) ** 2 < 1.0 - xi)
-        by_parabola = fa / (fb - fa) * fc / (fb - fc) + (c - a) / (b - a) * fa / (fc - fa) * fb / (
-            fc - fb
-        )
-        share = np.where(trusted & np.isfinite(by_parabola), by_parabola, 0.5)
-        least = np.minimum(0.5, 0.5 * width / np.abs(b - a))
-        return np.clip(np.where(np.isfinite(share), share, 0.5), least, 1.0 - least)
+    # Places in widths: the tolerance is one for all.
+    inside = (np.zeros(len(width)), 1.0 / width)
+    tolerances = {"xatol": 1.0, "xrtol": 0.0, "fatol": 0.0}
+    found = find_root(
+        signed, inside, args=(np.arange(len(width)),), tolerances=tolerances, maxiter=ROUNDS
+    )
+    return Located(*(place * width for place in (found.x, *found.bracket)))

@@ -18,7 +18,7 @@ from vrw_jax.runtime import code_digest
 from vrw_jax.scans.design import AbstractDesign, Columns
 from vrw_jax.scans.evaluate import Engine
 from vrw_jax.scans.ground import GroundEngine, LadderEngine, engine_for
-from vrw_jax.scans.offer import OFFERS, check_measures, offer_of, variable_attrs
+from vrw_jax.scans.offer import check_measures, offer_of, variable_attrs
 from vrw_jax.scans.store import (
     MANIFEST,
     PROVENANCE,
@@ -119,7 +119,7 @@ def plan(
     if chunk is not None and chunk < 1:
         raise ValueError(f"chunk is {chunk}, but it must be at least 1 sample.")
     model = rung_of(model)
-    if model.rung not in OFFERS:
+    if not model.legs_yield:
         raise TypeError(
             f"model is {model!r}, but a scan is of gaits with compliant legs: give "
             'vrw.ViscoelasticWheel(), vrw.UnilateralWheel() or "auto".'

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -204,7 +205,7 @@ class TuneProblem:
 
     def _batch(self, u: np.ndarray, near: Evaluated | None) -> Evaluated:
         parameters = jnp.asarray([self.parameters(row) for row in u])
-        first = self.finder.first_guesses(parameters)
+        first = jax.vmap(self.finder.first_guess)(parameters)
         return self.engine.batch(parameters, first if near is None else near.gait.cycle.near)
 
     def _change(self, difference: np.ndarray) -> np.ndarray:
@@ -350,7 +351,7 @@ def tuning_problem(
     finder = finder_of(
         rung_of(model), params.n_legs, cycle_options=cycle_options, step_options=options
     )
-    if finder.model.rung not in ("viscoelastic", "unilateral"):
+    if not finder.model.legs_yield:
         raise TypeError(
             f"model is {model!r}, but what is tuned has compliant legs: give "
             "vrw.ViscoelasticWheel() or vrw.UnilateralWheel()."
