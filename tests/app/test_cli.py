@@ -3,19 +3,27 @@
 Scans here are computed by the stand-in of support.scanning; one gait is walked for real.
 """
 
+import signal
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
+import xarray as xr
 from support.scanning import Counted, arithmetic
 from typer.testing import CliRunner, Result
 
+from vrw_jax.app import cli
 from vrw_jax.app.cli import app
+from vrw_jax.app.config import parse
 from vrw_jax.app.printing import scan_reporter
+from vrw_jax.branches.branch import Branch
 from vrw_jax.scans.planning import Plan
 from vrw_jax.scans.running import Progress
 from vrw_jax.scans.store import open_scan
+from vrw_jax.wheel.outcomes import Outcome
 
 SCAN = """
 [grid]
@@ -64,39 +72,15 @@ def test_the_version_is_told() -> None:
     assert told.output.startswith("vrw ")
 
 
-MISTAKES = {
-    "missing config": (("scan", "nowhere.toml"), "no config file nowhere.toml"),
-    "misspelt config": (("scan", "smal.toml"), "did you mean 'small.toml'"),
-    "no design": (("scan", "plain.toml"), "a scan needs a design"),
-    "bad config": (("gait", "bad.toml"), "did you mean 'damping'"),
-    "no assignment": (("gait", "--set", "damping"), "has no '='"),
-    "unknown parameter": (("gait", "--set", "dampin=3"), "did you mean 'damping'"),
-    "out of its domain": (("gait", "--set", "damping=-3"), "must lie in"),
-    "mass beyond the hub": (("gait", "--set", "leg_com=1.5"), "leg_com < locked_length"),
-    "no folder": (("scan", "small.toml", "--out", "plain.toml"), "plain.toml"),
-    "no scheduler": (("scan", "small.toml", "--dask", "nowhere://"), "no dask scheduler answers"),
-    "no scan there": (("scan", "small.toml", "--out", "occupied"), "no scan's store"),
-}
-
-
-@pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_mistake_gets_one_sentence_on_stderr_and_exit_code_2(mistake: str, config: Path) -> None:
-    (config.parent / "plain.toml").write_text("[wheel]\nslope = 0.3\n")
-    (config.parent / "bad.toml").write_text("[wheel]\ndampin = 3\n")
-    (config.parent / "occupied" / "scan.zarr").mkdir(parents=True)
-    (config.parent / "occupied" / "scan.zarr" / "letter.txt").write_text("dear reader")
-    arguments, expected = MISTAKES[mistake]
-    told = vrw(*arguments)
-    assert told.exit_code == 2
-    assert expected in told.stderr
-    assert told.stderr.startswith("vrw: ")
-    assert len(told.stderr.strip().splitlines()) == 1
-    assert "Traceback" not in told.output
-
-
-def test_explain_tells_the_size_and_computes_nothing(config: Path) -> None:
+def test_explain_measures_some_samples_and_writes_nothing(
+    config: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = iter([0.0, 10.0, 12.0])
+    monkeypatch.setattr("time.perf_counter", lambda: next(clock))
     told = vrw("scan", config, "--explain")
-    assert told.exit_code == 0
+    assert told.exit_code == 0, told.output
+    assert "about 7 s: 24 samples at 12 per second" in told.stdout
+    assert "the code for it took 10 s and is kept" in told.stdout
     for word in (
         "24 (4 damping x 3 slope x 2 stiffness)",
         "4 of up to 6 samples",
@@ -196,3 +180,135 @@ def test_a_gait_is_told_with_its_premises(config: Path) -> None:
     assert told.exit_code == 0, told.output
     for words in ("DLS fraction", "0.53", "stable: multipliers 0.3286", "6 are broken"):
         assert words in told.stdout
+
+
+def test_help_shows_brackets_and_every_command(config: Path) -> None:
+    assert "[branch]" in vrw("continue", "--help").output
+    for command in ("init", "tune", "continue"):
+        assert vrw(command, "--help").exit_code == 0
+
+
+def test_init_writes_the_example_configs_and_nothing_twice(config: Path) -> None:
+    examples = Path(__file__).parents[2] / "configs"
+    told = vrw("init", "mine")
+    assert told.exit_code == 0, told.output
+    for path in examples.glob("*.toml"):
+        assert (config.parent / "mine" / path.name).read_text() == path.read_text()
+        assert path.name in told.stdout
+    again = vrw("init", "mine")
+    assert again.exit_code == 0
+    assert "nothing to write" in again.stdout
+
+
+def test_an_installed_wheel_brings_the_example_configs() -> None:
+    told = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
+    built = told["tool"]["hatch"]["build"]["targets"]["wheel"]
+    assert built["force-include"]["configs"] == "vrw_jax/configs"
+    assert cli._examples().name == "configs"
+
+
+def test_verify_tells_whether_a_store_is_complete_and_sound(
+    config: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Plan, "engine", lambda _: Counted(fails_at=3))
+    assert vrw("scan", config, "--no-picture").exit_code == 130
+    told = vrw("scan", config, "--verify")
+    assert told.exit_code == 0
+    assert "lacks 2 of 4 chunks" in told.stdout
+    monkeypatch.setattr(Plan, "engine", lambda _: arithmetic)
+    assert vrw("scan", config, "--no-picture").exit_code == 0
+    assert "is complete and sound" in vrw("scan", config, "--verify").stdout
+    file = config.parent / "results" / "small" / "scan.zarr" / "speed" / "c" / "1" / "0" / "0"
+    file.unlink()
+    told = vrw("scan", config, "--verify")
+    assert told.exit_code == 1
+    assert "1 damaged chunk (number 1): run the same without --verify" in told.stderr
+    assert not file.exists()
+    rest = Counted()
+    monkeypatch.setattr(Plan, "engine", lambda _: rest)
+    again = vrw("scan", config, "--no-picture")
+    assert again.exit_code == 0
+    assert "1 damaged chunk (number 1): computed again" in again.stderr
+    assert rest.calls == 1
+
+
+def test_a_branch_without_a_gait_says_so_and_writes_nothing(
+    config: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    none = Branch("damping", xr.Dataset(coords={"damping": ("point", np.zeros(0))}), (),
+                  ("", ""), Outcome.NO_CYCLE_FOUND)  # fmt: skip
+    monkeypatch.setattr("vrw_jax.branches.continue_branch", lambda *_, **__: none)
+    config.write_text('[branch]\nparameter = "damping"\nbounds = [290.0, 300.0]\n')
+    told = vrw("continue", config)
+    assert told.exit_code == 1
+    assert "there is no gait to start from (NO_CYCLE_FOUND" in told.stderr
+    assert not (config.parent / "results").exists()
+
+
+RUNGS = {
+    "viscoelastic": ("", 1.0),
+    "unilateral": ("friction = 0.6\n", 0.6),
+    "rigid": ("held_landing = true\n", 1.0),
+    "auto": ("friction = 0.5\n", 0.5),
+}
+
+
+@pytest.mark.parametrize("rung", RUNGS)
+def test_a_config_names_any_rung_and_its_ground(rung: str) -> None:
+    settings, friction = RUNGS[rung]
+    model = parse(f'[model]\nrung = "{rung}"\n{settings}').wheel_model()
+    assert model.rung == {"auto": "ladder"}.get(rung, rung)
+    assert float(model.friction) == friction
+
+
+@pytest.mark.parametrize("rung", ["unilateral", "auto"])
+def test_friction_is_swept_on_real_ground_and_on_the_ladder(rung: str) -> None:
+    told = parse(
+        f'[model]\nrung = "{rung}"\n[grid]\nfriction = [0.4, 0.8]\nslope = [0.3]\n'
+        '[scan]\nmeasures = ["slip", "d speed / d damping"]'
+    )
+    planned = cli._planned(told, None)
+    assert planned.design.names == ("friction", "slope")
+    assert planned.asked == ("slip", "d speed / d damping")
+    assert planned.model.rung == {"auto": "ladder"}.get(rung, rung)
+
+
+def test_a_gait_of_rigid_legs_is_told(config: Path) -> None:
+    config.write_text('[wheel]\nslope = 0.1\n[model]\nrung = "rigid"\n[gait]\nsteps = 3\n')
+    told = vrw("gait", config)
+    assert told.exit_code == 0, told.output
+    assert "Walked 3 steps" in told.stdout
+    assert "stable: multipliers" in told.stdout
+
+
+STOPPED = """
+import sys, time
+sys.path.insert(0, {tests!r})
+from vrw_jax.scans.planning import Plan
+def slow(columns):
+    while True:
+        try:
+            print("at work", flush=True)
+            time.sleep(60)
+        except KeyboardInterrupt:
+            print("stopping", flush=True)
+            time.sleep(60)
+Plan.engine = lambda _: slow
+sys.argv = ["vrw", "scan", {config!r}]
+from vrw_jax.app import main
+main()
+"""
+
+
+def test_a_second_ctrl_c_ends_a_scan_at_once_with_one_sentence(config: Path) -> None:
+    code = STOPPED.format(tests=str(Path(__file__).parents[1]), config=str(config))
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen([sys.executable, "-c", code], text=True, **pipes) as process:  # type: ignore[call-overload]
+        for line in ("at work", "stopping"):
+            while line not in (told := process.stdout.readline()):
+                assert told, process.stderr.read()
+            process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 130
+        told = process.stderr.read()
+    assert "vrw: stopped at once; run the same to go on." in told
+    assert "Traceback" not in told

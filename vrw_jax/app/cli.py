@@ -6,20 +6,25 @@ is said in one sentence on stderr, with exit code 2.
 
 import gc
 import importlib.metadata
+import os
+import signal
+import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from vrw_jax.app import printing
-from vrw_jax.app.printing import err, out, sentences
+from vrw_jax.app.printing import INTERRUPTED, complain, err, out, sentences
 
 if TYPE_CHECKING:
+    import xarray as xr
+
     from vrw_jax.app.config import Config
     from vrw_jax.scans import Plan
 
-FACT_FAILED, NOT_CONVERGED, INTERRUPTED = 1, 1, 130
-"""Exit codes, beside that of a user's mistake."""
+FACT_FAILED, NOT_CONVERGED, DAMAGED = 1, 1, 1
+"""Exit codes, beside those of a user's mistake and of a Ctrl-C."""
 
 Folder = Annotated[
     Path | None,
@@ -28,6 +33,7 @@ Folder = Annotated[
 Picture = Annotated[bool, typer.Option(help="Draw the result.")]
 
 app = typer.Typer(
+    name="vrw",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -41,7 +47,19 @@ def main() -> None:
     # Traces are many small objects that live on: looking for dead ones among them as often as
     # Python does by itself takes a tenth of a cold start.
     gc.set_threshold(200_000, 20, 20)
+    signal.signal(signal.SIGINT, _stop)
     app()
+
+
+def _stop(_signal: int, _frame: object) -> None:
+    """A first Ctrl-C ends the command in order; a second one need not wait for that."""
+    signal.signal(signal.SIGINT, _stop_at_once)
+    raise KeyboardInterrupt
+
+
+def _stop_at_once(_signal: int, _frame: object) -> None:
+    os.write(2, b"vrw: stopped at once; run the same to go on.\n")
+    os._exit(INTERRUPTED)
 
 
 def _version(wanted: bool) -> None:
@@ -64,6 +82,8 @@ def root(
 
     [bold]Examples[/bold]
 
+      [cyan]vrw init[/cyan]                              the example configs named here
+
       [cyan]vrw gait[/cyan]                              the wheel of Table 1 on the paper's slope
 
       [cyan]vrw gait --set damping=150[/cyan]            the same with softer dampers
@@ -76,10 +96,10 @@ def root(
 
       [cyan]vrw continue configs/branch_damping.toml[/cyan]   a branch of gaits and its borders
 
-    [bold]What is written[/bold]   gait: nothing. reproduce: figures and tables into its folder.
-    scan: scan.zarr (open it with vrw_jax.open_scan or xarray.open_zarr) and pictures, PNG and SVG.
-    tune: path.zarr, a picture, summary.md, and wheel.toml, which vrw gait walks. continue:
-    branch.zarr, borders.csv, a picture and summary.md.
+    [bold]What is written[/bold]   init: configs. gait: nothing. reproduce: figures and tables into
+    its folder. scan: scan.zarr (open it with vrw_jax.open_scan or xarray.open_zarr) and pictures,
+    PNG and SVG. tune: path.zarr, a picture, summary.md, and wheel.toml, which vrw gait walks.
+    continue: branch.zarr, borders.csv, a picture and summary.md.
 
     The first run of a command compiles for a while; the code is kept in a cache folder of yours
     (JAX_COMPILATION_CACHE_DIR names another), and later runs start quickly. Angles are in rad, all
@@ -114,23 +134,77 @@ def gait(
         from vrw_jax.app.config import assignment
 
         params = settings.params(dict(assignment(text) for text in changes or []))
-    from vrw_jax.cycles import limit_cycle
-    from vrw_jax.walks import step
-    from vrw_jax.wheel import Outcome
+        import jax.numpy as jnp
 
-    model, options = settings.wheel_model(), settings.numerical_options()
-    state = model.start(params) if settings.gait.start is None else settings.gait.start
-    walked, n_steps = 0, steps or settings.gait.steps
-    with err.status("walking (the first time compiles for a while)"):
-        while True:
-            result = step(params, state, model=model, options=options)
-            stepped = int(result.outcome) == Outcome.STEPPED
-            walked += stepped
-            if not stepped or walked == n_steps:
-                break
-            state = result.section_state
-        cycle = limit_cycle(params)
-    printing.tell_gait(params, result, state, walked, cycle)
+        from vrw_jax.cycles import limit_cycle
+        from vrw_jax.walks import step
+        from vrw_jax.wheel import Outcome
+
+        model, options = settings.wheel_model(), settings.numerical_options()
+        start = settings.gait.start
+        state = model.start(params) if start is None else jnp.asarray(start)
+        state = model.full_section(params, state)
+        walked, n_steps = 0, steps or settings.gait.steps
+        with err.status("walking (the first time compiles for a while)"):
+            while True:
+                result: Any = step(params, state, model=model, options=options)
+                stepped = int(result.outcome) == Outcome.STEPPED
+                walked += stepped
+                if not stepped or walked == n_steps:
+                    break
+                state = result.section_state
+            if settings.rung == "auto":
+                model = result.choice.model
+            walks = settings.rung != "viscoelastic"  # the paper's gait is found without a guess
+            cycle: Any = (
+                limit_cycle(params, guess=state, model=model) if walks else limit_cycle(params)
+            )
+        printing.tell_gait(params, result, state, walked, cycle)
+
+
+@app.command()
+def init(
+    folder: Annotated[Path, typer.Argument(help="Where to write them.")] = Path("configs"),
+) -> None:
+    """Write the example configs: start from one of them and change what you like.
+
+    Files that are there already stay as they are; one that differs is named, and nothing written.
+    """
+    with sentences():
+        source = _examples()
+        texts = {path.name: path.read_text(encoding="utf-8") for path in source.glob("*.toml")}
+        there = [folder / name for name in sorted(texts) if (folder / name).exists()]
+        for path in there:
+            if path.read_text(encoding="utf-8", errors="replace") != texts[path.name]:
+                raise ValueError(f"{path} is there already and differs: give another folder.")
+        _require_place(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        new = [folder / name for name in sorted(texts) if folder / name not in there]
+        for path in new:
+            path.write_text(texts[path.name], encoding="utf-8")
+        printing.tell_written(new)
+        if not new:
+            out.print(f"{folder} has them all: nothing to write.", highlight=False)
+
+
+def _examples() -> Path:
+    """The folder of the example configs: in an installed package inside it, else beside it."""
+    package = Path(__file__).parents[1]
+    return next(p for p in (package / "configs", package.parent / "configs") if p.is_dir())
+
+
+def _require_place(folder: Path) -> None:
+    """Refuse, before anything is computed, a folder that can't be written; leave none behind."""
+    there = folder
+    while not there.exists():
+        there = there.parent
+    try:
+        with tempfile.TemporaryDirectory(dir=there):
+            pass
+    except OSError as error:
+        raise ValueError(
+            f"nothing can be written to {folder} ({error.strerror}): give a place of your own."
+        ) from error
 
 
 @app.command()
@@ -148,10 +222,13 @@ def reproduce(
 
     with sentences():
         start_jax()
-        folder.mkdir(parents=True, exist_ok=True)
+        _require_place(folder)
     from vrw_jax.paper import reproduce as run
 
-    with printing.progress_bar("reproducing the paper") as bar:
+    with (
+        sentences(f"stopped; what is done stays in {folder}."),
+        printing.progress_bar("reproducing the paper") as bar,
+    ):
         task = bar.add_task("starting", total=1.0)
         facts = run(
             folder, progress=lambda share, what: bar.update(task, completed=share, description=what)
@@ -166,7 +243,13 @@ def scan(
     config: Annotated[Path, typer.Argument(help="TOML file with the samples and measures.")],
     folder: Folder = None,
     explain: Annotated[
-        bool, typer.Option("--explain", help="Only tell sizes, chunks, memory and time.")
+        bool,
+        typer.Option(
+            "--explain", help="Only tell sizes, and memory and time as measured on some samples."
+        ),
+    ] = False,
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Only tell whether the store is complete and sound.")
     ] = False,
     chunk: Annotated[
         int | None, typer.Option(min=1, help="Most samples that are written at a time.")
@@ -184,7 +267,7 @@ def scan(
 
     Writes scan.zarr and pictures (PNG and SVG) into the folder. Interrupt it as you like: the same
     command goes on where it stopped, and ends with bitwise the same data. A finished scan is not
-    computed again.
+    computed again, but for chunks whose files are damaged. Exit code 1 if --verify finds damage.
 
     [bold]Examples[/bold]
 
@@ -197,18 +280,18 @@ def scan(
     with sentences():
         settings, folder = _asked(config, folder, "design")
         planned, store = _planned(settings, chunk), folder / "scan.zarr"
-        from vrw_jax.scans import explained, open_scan, open_store
+        from vrw_jax.scans import explained
 
         if explain:
-            told = explained(planned, store) | {"store": str(store)}
+            with err.status("measuring some samples (the first time compiles for a while)"):
+                told = explained(planned, store) | {"store": str(store)}
             printing.tell_table("What this scan would do", told.items())
             return
-        missing = open_store(planned, store).missing()
-    if missing:
-        _compute(planned, store, dask)
-    else:
-        out.print(f"{store} is complete: nothing to compute.", highlight=False)
-    dataset = open_scan(store)
+        if verify:
+            _verify(planned, store)
+            return
+        _require_place(folder)
+    dataset = _compute(planned, store, dask)
     printing.tell_outcomes(dataset)
     out.print(f"data: {store}", highlight=False, soft_wrap=True)
     if picture:
@@ -218,12 +301,12 @@ def scan(
 
 
 def _planned(settings: "Config", chunk: int | None) -> "Plan":
-    from vrw_jax.scans import DEFAULT_MEASURES, plan
+    from vrw_jax.scans import plan
 
     assert settings.design is not None
     return plan(
         settings.design,
-        settings.scan.measures or DEFAULT_MEASURES,
+        settings.scan.measures,
         base=settings.params(),
         model=settings.wheel_model(),
         options=settings.numerical_options(),
@@ -232,18 +315,35 @@ def _planned(settings: "Config", chunk: int | None) -> "Plan":
     )
 
 
-def _compute(planned: "Plan", store: Path, dask: str | None) -> None:
-    from vrw_jax.scans import carried, run
+def _verify(planned: "Plan", store: Path) -> None:
+    from vrw_jax.scans import found_store
 
-    try:
-        with sentences(), carried(dask) as through, printing.progress_bar("scan") as bar:
+    kept = found_store(planned, store)
+    if kept is None:
+        raise ValueError(f"there is no store {store} to verify: run the same without --verify.")
+    if kept.damage:
+        complain(f"{kept.damage}: run the same without --verify, which computes these again.")
+        raise typer.Exit(DAMAGED)
+    n, missing = planned.layout.n_chunks, len(kept.missing())
+    told = f"lacks {missing:,} of {n:,} chunks, the others are" if missing else "is complete and"
+    out.print(f"{store} {told} sound.", highlight=False, soft_wrap=True)
+
+
+def _compute(planned: "Plan", store: Path, dask: str | None) -> "xr.Dataset":
+    from vrw_jax.scans import carried, open_store, run
+
+    stopped = f"stopped; what is done stays in {store}, run the same to go on."
+    with sentences(stopped), carried(dask) as through:
+        kept = open_store(planned, store)
+        if kept.damage:
+            complain(f"{kept.damage}: computed again.")
+        elif not kept.missing():
+            out.print(f"{store} is complete: nothing to compute.", highlight=False)
+            return kept.dataset()
+        with printing.progress_bar("scan") as bar:
             task = bar.add_task("compiling", total=None, note="")
-            run(planned, store, report=printing.scan_reporter(bar.update, task), through=through)
-    except KeyboardInterrupt:
-        err.print(
-            f"vrw: stopped; what is done stays in {store}, run the same to go on.", soft_wrap=True
-        )
-        raise typer.Exit(INTERRUPTED) from None
+            report = printing.scan_reporter(bar.update, task)
+            return run(planned, kept, report=report, through=through)
 
 
 @app.command()
@@ -270,7 +370,7 @@ def tune(
         settings, folder = _asked(config, folder, "tune")
         sought = settings.tune
         assert sought is not None
-        folder.mkdir(parents=True, exist_ok=True)
+        _require_place(folder)
         from vrw_jax.app.reports import write_tuned
         from vrw_jax.tuning import tune as run
 
@@ -288,19 +388,20 @@ def tune(
         printing.tell_table("Tuned gait", tuned.lines().items())
         printing.tell_written(write_tuned(tuned, folder, picture))
     if not tuned.converged:
+        complain(f"this is no optimum ({tuned.ending.name}): what was reached is written.")
         raise typer.Exit(NOT_CONVERGED)
 
 
 @app.command("continue")
 def continue_(
-    config: Annotated[Path, typer.Argument(help="TOML file with a table [branch].")],
+    config: Annotated[Path, typer.Argument(help=r"TOML file with a table \[branch].")],
     folder: Folder = None,
     picture: Picture = True,
 ) -> None:
     """Follow a branch of gaits along a parameter, stable or not, and locate every border on it.
 
     Writes branch.zarr (open it with xarray.open_zarr), borders.csv, summary.md and pictures (PNG
-    and SVG) into the folder. Exit code 1 if there is no limit cycle to start from.
+    and SVG) into the folder. Exit code 1, and nothing written, if there is no gait to start from.
 
     [bold]Examples[/bold]
 
@@ -312,7 +413,7 @@ def continue_(
         settings, folder = _asked(config, folder, "branch")
         asked = settings.branch
         assert asked is not None
-        folder.mkdir(parents=True, exist_ok=True)
+        _require_place(folder)
         from vrw_jax.app.reports import write_branch
         from vrw_jax.branches import continue_branch
         from vrw_jax.numerics import ArclengthOptions
@@ -330,10 +431,14 @@ def continue_(
                 model=settings.wheel_model(),
                 options=options,
             )
+        if not branch.values.size:
+            complain(
+                f"there is no gait to start from ({branch.outcome.name}: "
+                f"{branch.outcome.meaning[:-1]}): give a wheel that walks, such as that of Table 1."
+            )
+            raise typer.Exit(NOT_CONVERGED)
         out.print(str(branch), highlight=False, markup=False)
         printing.tell_written(write_branch(branch, folder, picture))
-    if not branch.values.size:
-        raise typer.Exit(NOT_CONVERGED)
 
 
 def _settings(path: Path | None) -> "Config":
@@ -347,13 +452,20 @@ def _settings(path: Path | None) -> "Config":
 
 NEEDED = {
     "design": "has no samples, but a scan needs a design: add a table [grid], [samples], [sobol], "
-    "[uniform] or [saltelli], as in configs/quickstart.toml.",
+    "[uniform] or [saltelli], as in configs/quickstart.toml of `vrw init`.",
     "tune": "seeks nothing, but tuning needs an objective and bounds: add the tables [tune] and "
-    "[tune.bounds], as in configs/tune_dls.toml.",
+    "[tune.bounds], as in configs/tune_dls.toml of `vrw init`.",
     "branch": "names no branch, but continuation needs a parameter and bounds: add a table "
-    "[branch], as in configs/branch_damping.toml.",
+    "[branch], as in configs/branch_damping.toml of `vrw init`.",
 }
 """What to say of a config that lacks what a command works on."""
+
+SERVES = {
+    "design": ("viscoelastic", "unilateral", "auto"),
+    "tune": ("viscoelastic", "unilateral"),
+    "branch": ("viscoelastic", "unilateral", "rigid"),
+}
+"""The rungs that a command takes."""
 
 
 def _asked(path: Path, folder: Path | None, needed: str) -> tuple["Config", Path]:
@@ -361,4 +473,9 @@ def _asked(path: Path, folder: Path | None, needed: str) -> tuple["Config", Path
     settings = _settings(path)
     if getattr(settings, needed) is None:
         raise ValueError(f"{settings.name} {NEEDED[needed]}")
+    if settings.rung not in SERVES[needed]:
+        raise ValueError(
+            f"{settings.name} names the rung {settings.rung}, but this command takes "
+            f"{', '.join(SERVES[needed])}: write one of these below [model]."
+        )
     return settings, Path("results") / path.stem if folder is None else folder

@@ -13,17 +13,29 @@ from typing import TypeVar
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.models import ViscoelasticWheel
-from vrw_jax.numerics import Options
+from vrw_jax.models import (
+    AbstractWheel,
+    LadderWheel,
+    RigidWheel,
+    UnilateralWheel,
+    ViscoelasticWheel,
+)
+from vrw_jax.numerics import Options, solver_named
 from vrw_jax.results import nearest
-from vrw_jax.scans import check_measures
+from vrw_jax.scans import LONGEST, OFFERS, check_measures
 from vrw_jax.scans import design as designs
-from vrw_jax.wheel import DOMAINS, PARAMETER_NAMES, WheelParams
+from vrw_jax.wheel import DOMAINS, FRICTION, PARAMETER_NAMES, WheelParams
 
 DRAWN = {"sobol": designs.sobol, "uniform": designs.uniform, "saltelli": designs.saltelli}
 DESIGNS = ("grid", "samples", *DRAWN)
 TABLES = ("wheel", "model", "options", "gait", "scan", "tune", "branch", *DESIGNS)
-_MODEL_KEYS = ("friction", "stop_at_lift_off")
+RUNGS: dict[str, type[AbstractWheel]] = {
+    "viscoelastic": ViscoelasticWheel,
+    "unilateral": UnilateralWheel,
+    "rigid": RigidWheel,
+    "auto": LadderWheel,
+}
+"""Rungs as a config names them."""
 _OPTION_KEYS = tuple(Options.__dataclass_fields__)
 _AXIS_KEYS = ("from", "to", "count")
 
@@ -76,8 +88,9 @@ class Config:
     """A config as checked values, with the text that it was read from."""
 
     wheel: Mapping[str, float | int] = field(default_factory=dict)
-    model: Mapping[str, float | bool] = field(default_factory=dict)
-    options: Mapping[str, float | int | str] = field(default_factory=dict)
+    rung: str = "viscoelastic"
+    model: Mapping[str, float | int | str | bool] = field(default_factory=dict)
+    options: Mapping[str, float | int | str | bool] = field(default_factory=dict)
     scan: ScanConfig = ScanConfig()
     gait: GaitConfig = GaitConfig()
     tune: TuneConfig | None = None
@@ -90,9 +103,9 @@ class Config:
         """The wheel: Table 1 with the config's values, then with those `changed`."""
         return _sentence(WheelParams, **{**self.wheel, **(changed or {})})
 
-    def wheel_model(self) -> ViscoelasticWheel:
+    def wheel_model(self) -> AbstractWheel:
         """The rung with the config's settings."""
-        return _sentence(ViscoelasticWheel, **self.model)
+        return _sentence(RUNGS[self.rung], **self.model)
 
     def numerical_options(self) -> Options:
         """The defaults with the config's values."""
@@ -106,7 +119,7 @@ def load(path: str | Path) -> Config:
         near = nearest(path.name, (p.name for p in _siblings(path)))
         raise ConfigError(
             f"there is no config file {path}{near}: give the path of a TOML file, "
-            "such as configs/quickstart.toml."
+            "such as configs/quickstart.toml, which `vrw init` writes."
         )
     if path.is_dir():
         raise ConfigError(f"{path} is a folder, but a config is a TOML file: give its path.")
@@ -146,7 +159,9 @@ def _config(tables: Mapping[str, object], text: str, name: str) -> Config:
         raise ConfigError(
             f"[{given[0]}] and [{given[1]}] are both given, but a scan has one design: keep one."
         )
-    design = _design(given[0], _table(tables, given[0])) if given else None
+    rung, model = _model(_table(tables, "model"))
+    names = RUNGS[rung].parameter_names
+    design = _design(given[0], _table(tables, given[0]), names) if given else None
     wheel = _wheel(_table(tables, "wheel"))
     both = [key for key in wheel if design is not None and key in design.names]
     if both:
@@ -156,18 +171,22 @@ def _config(tables: Mapping[str, object], text: str, name: str) -> Config:
         )
     config = Config(
         wheel=wheel,
-        model=_model(_table(tables, "model")),
+        rung=rung,
+        model=model,
         options=_options(_table(tables, "options")),
-        scan=_scan(_table(tables, "scan")),
+        scan=_scan(_table(tables, "scan"), RUNGS[rung].rung),
         gait=_gait(_table(tables, "gait")),
         tune=_tune(_table(tables, "tune")) if "tune" in tables else None,
-        branch=_branch(_table(tables, "branch")) if "branch" in tables else None,
+        branch=_branch(_table(tables, "branch"), names) if "branch" in tables else None,
         design=design,
         text=text,
         name=name,
     )
     config.params()
-    _sentence(config.numerical_options().require_reachable, np.dtype(float))
+    config.wheel_model()
+    options = config.numerical_options()
+    _sentence(options.require_reachable, np.dtype(float))
+    _sentence(solver_named, options.solver, options)
     return config
 
 
@@ -200,43 +219,60 @@ def _wheel(table: Mapping[str, object]) -> dict[str, float | int]:
     return values
 
 
-def _model(table: Mapping[str, object]) -> dict[str, float | bool]:
-    _only(table, _MODEL_KEYS, "[model]", "settings")
-    values: dict[str, float | bool] = {}
-    if "friction" in table:
-        values["friction"] = _number(table["friction"], "friction", positive=True)
-    if "stop_at_lift_off" in table:
-        if not isinstance(table["stop_at_lift_off"], bool):
-            raise _wrong("stop_at_lift_off", table["stop_at_lift_off"], "true or false")
-        values["stop_at_lift_off"] = table["stop_at_lift_off"]
-    return values
+def _model(table: Mapping[str, object]) -> tuple[str, dict[str, float | int | str | bool]]:
+    """The rung, and its settings."""
+    rung = table.get("rung", Config.rung)
+    if not isinstance(rung, str) or rung not in RUNGS:
+        near = nearest(rung, RUNGS) if isinstance(rung, str) else ""
+        raise ConfigError(
+            f"rung is {_shown(rung)}{near}, but it must be one of {', '.join(RUNGS)}: "
+            'write rung = "unilateral", say.'
+        )
+    settings = RUNGS[rung].__dataclass_fields__
+    _only(table, ("rung", *settings), f"[model] of the rung {rung}", "settings")
+    given = {name: value for name, value in table.items() if name != "rung"}
+    return rung, _like(given, {name: settings[name].default for name in settings})
 
 
-def _options(table: Mapping[str, object]) -> dict[str, float | int | str]:
+def _options(table: Mapping[str, object]) -> dict[str, float | int | str | bool]:
     _only(table, _OPTION_KEYS, "[options]", "options")
-    values: dict[str, float | int | str] = {}
     defaults = Options()
+    return _like(table, {key: getattr(defaults, key) for key in _OPTION_KEYS})
+
+
+def _like(
+    table: Mapping[str, object], defaults: Mapping[str, object]
+) -> dict[str, float | int | str | bool]:
+    """Settings of the kinds of their defaults: switches, names, whole or positive numbers."""
+    values: dict[str, float | int | str | bool] = {}
     for key, value in table.items():
-        default = getattr(defaults, key)
-        if isinstance(default, str):
+        default = defaults[key]
+        if isinstance(default, bool):
+            if not isinstance(value, bool):
+                raise _wrong(key, value, "true or false")
+            values[key] = value
+        elif isinstance(default, str):
             if not isinstance(value, str):
                 raise _wrong(key, value, f'a name, "{default}"')
             values[key] = value
         elif isinstance(default, int):
             values[key] = _whole(value, key, 1)
+        elif key == FRICTION and value == math.inf:
+            values[key] = math.inf  # feet that never slide
         else:
             values[key] = _number(value, key, positive=True)
     return values
 
 
-def _scan(table: Mapping[str, object]) -> ScanConfig:
+def _scan(table: Mapping[str, object], rung: str) -> ScanConfig:
     _only(table, ScanConfig.__dataclass_fields__, "[scan]", "settings")
     measures = table.get("measures")
     if measures is not None:
         if not (isinstance(measures, list) and all(isinstance(m, str) for m in measures)):
             must = 'a list of names: write measures = ["dls_fraction", "speed"]'
             raise _wrong("measures", measures, must)
-        measures = check_measures(measures)
+        check_measures(measures, OFFERS.get(rung, OFFERS["viscoelastic"]))
+        measures = tuple(measures)
     chunk = table.get("chunk")
     return ScanConfig(measures, None if chunk is None else _whole(chunk, "chunk", 1))
 
@@ -283,14 +319,14 @@ def _tune(table: Mapping[str, object]) -> TuneConfig:
     )
 
 
-def _branch(table: Mapping[str, object]) -> BranchConfig:
+def _branch(table: Mapping[str, object], names: tuple[str, ...]) -> BranchConfig:
     _only(table, BranchConfig.__dataclass_fields__, "[branch]", "settings")
     parameter = table.get("parameter")
-    if not isinstance(parameter, str) or parameter not in PARAMETER_NAMES:
-        near = nearest(parameter, PARAMETER_NAMES) if isinstance(parameter, str) else ""
+    if not isinstance(parameter, str) or parameter not in names:
+        near = nearest(parameter, names) if isinstance(parameter, str) else ""
         raise ConfigError(
-            f"parameter is {_shown(parameter)}{near}, but a branch runs along one of "
-            f'{", ".join(PARAMETER_NAMES)}: write parameter = "damping".'
+            f"parameter is {_shown(parameter)}{near}, but a branch of this rung runs along one of "
+            f'{", ".join(names)}: write parameter = "damping".'
         )
     if "bounds" not in table:
         raise ConfigError("[branch] has no bounds: write bounds = [4.0, 230.0], say.")
@@ -300,6 +336,10 @@ def _branch(table: Mapping[str, object]) -> BranchConfig:
             f"bounds are [{lower:g}, {upper:g}], but the lower must come first: swap them."
         )
     step = table.get("largest_step")
+    if step is not None and _number(step, "largest_step", positive=True) > 1.0:
+        raise ConfigError(
+            f"largest_step is {step:g}, but it is a share of the range: give 0.02, say."
+        )
     return BranchConfig(
         parameter=parameter,
         bounds=(lower, upper),
@@ -308,14 +348,21 @@ def _branch(table: Mapping[str, object]) -> BranchConfig:
     )
 
 
-def _design(kind: str, table: Mapping[str, object]) -> designs.AbstractDesign:
+def _design(
+    kind: str, table: Mapping[str, object], names: tuple[str, ...]
+) -> designs.AbstractDesign:
     own = ("n", "seed") if kind in DRAWN else ()
-    _only(table, (*own, *PARAMETER_NAMES), f"[{kind}]", "settings")
+    if FRICTION in table and FRICTION not in names:
+        raise ConfigError(
+            f"[{kind}] sweeps friction, which the motion of this rung does not feel: write [model] "
+            'and below it rung = "unilateral" or rung = "auto".'
+        )
+    _only(table, (*own, *names), f"[{kind}]", "settings")
     swept = {name: value for name, value in table.items() if name not in own}
     if not swept:
         raise ConfigError(
             f"[{kind}] sweeps no parameter, but a scan needs at least one: "
-            f"choose from {', '.join(PARAMETER_NAMES)}."
+            f"choose from {', '.join(names)}."
         )
     if own:
         if "n" not in table:
@@ -340,7 +387,12 @@ def _axis(name: str, value: object) -> np.ndarray:
             f"write {name} = {{ from = ..., to = ..., count = ... }}."
         )
     first, last = (_in_domain(name, value[key]) for key in ("from", "to"))
-    return np.linspace(first, last, _whole(value["count"], f"count of {name}", 1))
+    count = _whole(value["count"], f"count of {name}", 1)
+    if count > LONGEST:
+        raise ConfigError(
+            f"the axis of {name} has {count:,} values, but {LONGEST:,} is the most: give fewer."
+        )
+    return np.linspace(first, last, count)
 
 
 def _list(name: str, value: object, otherwise: str = "") -> np.ndarray:
@@ -360,7 +412,10 @@ def _range(name: str, value: object, parameter: str = "") -> tuple[float, float]
 
 
 def _in_domain(name: str, value: object) -> float:
-    number, domain = _number(value, name), DOMAINS[name]
+    number = _number(value, name, positive=name == FRICTION)
+    if name == FRICTION:
+        return number
+    domain = DOMAINS[name]
     if not bool(domain.contains(jnp.asarray(number))):
         raise ConfigError(
             f"{name} is {number:g}, but {domain.description} must lie in {domain}: "

@@ -3,7 +3,7 @@
 import contextlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 from rich.console import Console
@@ -15,32 +15,42 @@ if TYPE_CHECKING:
     from jax.typing import ArrayLike
     from rich.progress import Progress as Bar
 
-    from vrw_jax.cycles import LimitCycle
-    from vrw_jax.models import StepResult
+    from vrw_jax.cycles import LimitCycle, WalkedCycle
+    from vrw_jax.models import AbstractStep, StepResult
     from vrw_jax.paper import Fact
     from vrw_jax.scans import Progress
     from vrw_jax.wheel import WheelParams
 
-USER_ERROR = 2
-"""Exit code."""
+USER_ERROR, INTERRUPTED = 2, 130
+"""Exit codes."""
 
 out, err = Console(), Console(stderr=True)
 
 
 @contextlib.contextmanager
-def sentences() -> Iterator[None]:
-    """What the user got wrong as one sentence on stderr and exit code 2."""
+def sentences(stopped: str = "stopped; nothing was written.") -> Iterator[None]:
+    """What the user got wrong as one sentence on stderr and exit code 2; a Ctrl-C and 130."""
     try:
         yield
-    except (ValueError, OSError) as error:
-        text = str(error) if isinstance(error, ValueError) else _of_system(error)
-        err.print(f"[bold red]vrw:[/] {escape(text)}", highlight=False, soft_wrap=True)
+    except KeyboardInterrupt:
+        complain(stopped)
+        raise typer.Exit(INTERRUPTED) from None
+    except MemoryError as error:
+        complain("this asks for more memory than there is: give smaller designs, or fewer at once.")
         raise typer.Exit(USER_ERROR) from error
+    except (ValueError, OSError) as error:
+        complain(str(error) if isinstance(error, ValueError) else _of_system(error))
+        raise typer.Exit(USER_ERROR) from error
+
+
+def complain(sentence: str) -> None:
+    """One sentence on stderr."""
+    err.print(f"[bold red]vrw:[/] {escape(sentence)}", highlight=False, soft_wrap=True)
 
 
 def _of_system(error: OSError) -> str:
     place = f"{error.filename}: " if error.filename else ""
-    return f"{place}{error.strerror or error}."
+    return f"{place}{str(error.strerror or error).rstrip('.')}."
 
 
 def tell_written(paths: Iterable[Path]) -> None:
@@ -148,10 +158,10 @@ def tell_outcomes(scan: "xr.Dataset") -> None:
 
 def tell_gait(
     params: "WheelParams",
-    result: "StepResult",
+    result: Any,  # of any rung's step
     start: "ArrayLike | tuple[float, ...]",
     walked: int,
-    cycle: "LimitCycle",
+    cycle: "LimitCycle | WalkedCycle",
 ) -> None:
     """A wheel, the last step of its walk from the section state `start`, and its limit cycle."""
     import numpy as np
@@ -168,27 +178,30 @@ def tell_gait(
     else:
         out.print(f"[bold]Step {walked + 1} ended as {outcome.name}:[/] {outcome.meaning}")
     _tell_cycle(cycle)
-    if outcome == Outcome.STEPPED:
+    if outcome == Outcome.STEPPED and "lambda_4_plus" in result.measures():  # not on real ground
         _tell_premises(result)
 
 
-def _tell_step(result: "StepResult") -> None:
-    from vrw_jax.results import STEP
+def _tell_step(result: "AbstractStep") -> None:
+    from vrw_jax.results import MARGINS, MEASURES
 
     values = result.measures()
     rows = (
         (measure.long_name, measure.symbol, f"{float(values[name]):.5g}", measure.plain_unit)
-        for name, measure in STEP.items()
-        if name not in ("outcome", "solver_steps")
+        for name, measure in MEASURES.items()
+        if name in values and name not in ("outcome", "solver_steps", *MARGINS)
     )
     tell_table("Last step", rows, ("quantity", "symbol", "value", "unit"), ("value",))
 
 
-def _tell_cycle(cycle: "LimitCycle") -> None:
+def _tell_cycle(cycle: "LimitCycle | WalkedCycle") -> None:
     import numpy as np
 
+    from vrw_jax.wheel import Outcome
+
     if not bool(cycle.found):
-        out.print("[bold]Limit cycle[/]  none was found in the paper's sequence of phases.")
+        end = Outcome(int(cycle.outcome))
+        out.print(f"[bold]Limit cycle[/]  {end.name}: {end.meaning}")
         return
     multipliers = ", ".join(_complex(complex(z)) for z in np.asarray(cycle.multipliers))
     radius = float(cycle.spectral_radius)

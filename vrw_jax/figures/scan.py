@@ -32,7 +32,7 @@ from vrw_jax.figures.style import (
     value_label,
 )
 from vrw_jax.results import MARGINS, MEASURES
-from vrw_jax.scans import OF_CYCLE, SALTELLI, SWEPT, sobol_indices
+from vrw_jax.scans import OF_CYCLE, SALTELLI, SWEPT, manifest_of, sobol_indices
 from vrw_jax.wheel import Outcome
 
 PREFERRED = ("damping", "slope", "stiffness", "natural_length", *SWEPT)
@@ -64,7 +64,7 @@ def scan_figures(scan: xr.Dataset) -> dict[str, Figure]:
         if len(swept) < 3:
             return {"scan": sample_figure(scan, swept)}
         figures = {"scan_pairs": pairs_figure(scan, swept[:MOST_PAIRED])}
-        if scan.attrs.get("scan", {}).get("design", {}).get("kind") == SALTELLI:
+        if manifest_of(scan.attrs).get("design", {}).get("kind") == SALTELLI:
             measures = [n for n in OF_CYCLE if n in scan]
             figures["sobol_indices"] = indices_figure(sobol_indices(scan, measures))
         return figures

@@ -37,7 +37,13 @@ from vrw_jax.numerics.derivatives import (
     with_jacobian,
     without_derivative,
 )
-from vrw_jax.numerics.events import Field, PhaseEnd, integrate_phase, sample_phase
+from vrw_jax.numerics.events import (
+    Field,
+    PhaseEnd,
+    integrate_phase,
+    sample_phase,
+    solver_named,
+)
 from vrw_jax.numerics.floquet import multipliers
 from vrw_jax.numerics.gauss import (
     ENDS_ONCE,

@@ -16,6 +16,8 @@ Columns = dict[str, np.ndarray]
 SWEPT = (*PARAMETER_NAMES, FRICTION)
 """What may be swept: the wheel's parameters, and the friction of a ground that has one."""
 Range = tuple[float, float]
+LONGEST = 10_000_000
+"""Values of an axis, or samples of a list, at most: they are held in memory."""
 SALTELLI = "saltelli"
 """Kind of the samples that Sobol' indices are read off."""
 
@@ -56,15 +58,20 @@ class AbstractDesign(abc.ABC):
 
     def description(self) -> dict[str, object]:
         """What makes this design this one: kind, names, axes and a digest of every number."""
-        digest = hashlib.sha256(json.dumps([self.kind, *self.names]).encode())
-        for column in self.values.values():
-            digest.update(np.ascontiguousarray(column, dtype="<f8").tobytes())
         return {
             "kind": self.kind,
             "swept": list(self.names),
             "shape": list(self.shape),
-            "digest": digest.hexdigest(),
+            "digest": digest_of(self.kind, self.values),
         }
+
+
+def digest_of(kind: str, values: Mapping[str, np.ndarray]) -> str:
+    """A digest of every number of a design."""
+    digest = hashlib.sha256(json.dumps([kind, *values]).encode())
+    for column in values.values():
+        digest.update(np.ascontiguousarray(column, dtype="<f8").tobytes())
+    return digest.hexdigest()
 
 
 @dataclass(frozen=True)
@@ -189,6 +196,10 @@ def _spread(
 def _box(ranges: Mapping[str, Range], n: int) -> tuple[list[str], np.ndarray, np.ndarray]:
     if not (isinstance(n, int | np.integer) and n >= 1):
         raise ValueError(f"n is {n!r}, but a scan needs at least one sample: give n = 1 or more.")
+    if n > LONGEST:
+        raise ValueError(
+            f"n is {n:,}, but a list takes {LONGEST:,} samples at most: give fewer, or a grid."
+        )
     for name, pair in _known(ranges).items():
         if np.shape(pair) != (2,) or not np.all(np.isfinite(pair)) or not pair[0] < pair[1]:
             raise ValueError(

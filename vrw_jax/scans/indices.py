@@ -13,6 +13,7 @@ import numpy as np
 from vrw_jax.results import nearest
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.scans.design import SALTELLI
+from vrw_jax.scans.soundness import manifest_of
 from vrw_jax.wheel import Outcome
 
 FEWEST = 64
@@ -35,7 +36,7 @@ def sobol_indices(
     """
     from scipy.stats import sobol_indices as indices_of
 
-    design = scan.attrs.get("scan", {}).get("design", {})
+    design = manifest_of(scan.attrs).get("design", {})
     if design.get("kind") != SALTELLI:
         raise ValueError(
             f"the scan's samples are of kind {design.get('kind')!r}, but Sobol' indices need those "

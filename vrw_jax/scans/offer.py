@@ -100,6 +100,12 @@ def derivative(name: str) -> Derivative | None:
     return Derivative(*found.groups()) if found else None
 
 
+def canonical(name: str) -> str:
+    """The name of the variable that holds what `name` asks for, as files can hold it."""
+    wanted = derivative(name)
+    return name.strip() if wanted is None else wanted.name
+
+
 def check_measures(names: Iterable[str], offer: Offer = PAPER) -> tuple[str, ...]:
     """Names of variables, each once, without what is always there; a sentence for a wrong one."""
     checked: dict[str, None] = {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import platform
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,14 +13,15 @@ import numpy as np
 
 from vrw_jax.cycles import CycleOptions
 from vrw_jax.models import AbstractWheel, ViscoelasticWheel
-from vrw_jax.numerics import Options
+from vrw_jax.numerics import Options, solver_named
 from vrw_jax.results import MARGINS, attrs_of, provenance
 from vrw_jax.runtime import code_digest
 from vrw_jax.scans.design import AbstractDesign, Columns
 from vrw_jax.scans.evaluate import Engine
 from vrw_jax.scans.ground import GroundEngine, LadderEngine, engine_for
-from vrw_jax.scans.offer import check_measures, offer_of, variable_attrs
+from vrw_jax.scans.offer import canonical, check_measures, offer_of, variable_attrs
 from vrw_jax.scans.store import (
+    ASKED,
     MANIFEST,
     PROVENANCE,
     Layout,
@@ -29,6 +31,9 @@ from vrw_jax.scans.store import (
 )
 from vrw_jax.walks import ModelLike, rung_of
 from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, WheelParams
+
+MOST_SAMPLES = 1_000_000_000
+"""Of a scan: a day and more of computing, and some hundred GB."""
 
 CHUNK = 4096
 """Most samples of a chunk, unless asked for otherwise: what a killed scan can lose."""
@@ -52,6 +57,7 @@ class Plan:
     options: Options
     cycle_options: CycleOptions
     layout: Layout
+    asked: tuple[str, ...]  # measures by the names that they were asked for
     text: str = ""
 
     @property
@@ -81,8 +87,9 @@ class Plan:
             "title": f"Steady gaits of the viscoelastic-legged rimless wheel over "
             f"{', '.join(self.design.names)}",
             "rule": "NaN, or -1 in an integer, where the outcome is not STEPPED.",
-            MANIFEST: self.settings,
-            PROVENANCE: origin(),
+            MANIFEST: json.dumps(self.settings),  # as text: other files take no tables
+            PROVENANCE: json.dumps(origin()),
+            ASKED: ", ".join(self.asked),
             "config": self.text,
         }
 
@@ -116,8 +123,14 @@ def plan(
         )
     options = Options() if options is None else options
     options.require_reachable(np.dtype(base.damping.dtype))
-    if chunk is not None and chunk < 1:
-        raise ValueError(f"chunk is {chunk}, but it must be at least 1 sample.")
+    solver_named(options.solver, options)  # refused here, and not when a store is there already
+    if chunk is not None and (isinstance(chunk, bool) or chunk != int(chunk) or chunk < 1):
+        raise ValueError(f"chunk is {chunk}, but it must be a whole number of at least 1 sample.")
+    if design.size > MOST_SAMPLES:
+        raise ValueError(
+            f"the design has {design.size:,} samples, but a scan takes {MOST_SAMPLES:,} at most: "
+            "give its axes fewer values, or draw samples with vrw.sobol."
+        )
     model = rung_of(model)
     if not model.legs_yield:
         raise TypeError(
@@ -130,7 +143,9 @@ def plan(
             'model=vrw.UnilateralWheel() or "auto".'
         )
     offer = offer_of(model)
-    names = check_measures(offer.default if measures is None else measures, offer)
+    asked = tuple(offer.default if measures is None else measures)
+    names = check_measures(asked, offer)
+    first = dict.fromkeys(canonical(name) for name in asked)
     return Plan(
         design=design,
         measures=names,
@@ -138,7 +153,8 @@ def plan(
         model=model,
         options=options,
         cycle_options=CycleOptions() if cycle_options is None else cycle_options,
-        layout=_layout(design, (*names, *offer.always), base, CHUNK if chunk is None else chunk),
+        layout=_layout(design, tuple(first | dict.fromkeys(offer.always)), base, chunk or CHUNK),
+        asked=asked,
         text=text,
     )
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,8 +19,6 @@ from vrw_jax.cycles import CycleOptions
 from vrw_jax.numerics import Options
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.scans.design import AbstractDesign
-from vrw_jax.scans.evaluate import LANES, n_cores
-from vrw_jax.scans.offer import offer_of
 from vrw_jax.scans.planning import Chunk, Evaluate, Plan, Through, difference, origin, plan
 from vrw_jax.scans.store import (
     MANIFEST,
@@ -62,13 +61,15 @@ def scan(
     """The steady gait of every sample, labelled, with outcome and premise margins of each.
 
     `measures` are names (see `vrw_jax.scans.offer`), derivatives included as in
-    'd dls_fraction / d damping'. With `store` the result is kept there chunk by chunk: a scan that
-    was interrupted goes on where it stopped and ends with bitwise the same data, a finished one is
-    only opened. `report` is told the progress after each chunk. What a sample gives does not depend
-    on the others, nor on `chunk`. `model` may be the wheel on real ground, whose samples walk
-    towards their gait, or "auto", each sample on the lowest rung that serves, with `rung` and
-    `reason`; both take `friction` as a swept parameter. `dask` is the address of a cluster that
-    computes in this process' stead, "local" for one started here.
+    'd dls_fraction / d damping'; variables have the names that were asked for, in that order. With
+    `store` the result is kept there chunk by chunk: a scan that was interrupted goes on where it
+    stopped and ends with bitwise the same data, a finished one is only opened, and chunks whose
+    files are damaged are computed again, with a warning. `report` is told the progress after each
+    chunk. What a sample gives does not depend on the others, nor on `chunk`. `model` may be the
+    wheel on real ground, whose samples walk towards their gait, or "auto", each sample on the
+    lowest rung that serves, with `rung` and `reason`; both take `friction` as a swept parameter.
+    `dask` is the address of a cluster that computes in this process' stead, "local" for one started
+    here.
     """
     planned = plan(
         design,
@@ -94,34 +95,50 @@ def carried(dask: str | None) -> contextlib.AbstractContextManager[Through | Non
 
 def run(
     planned: Plan,
-    store: str | Path | None = None,
+    store: str | Path | AbstractStore | None = None,
     *,
     report: Report | None = None,
     evaluate: Evaluate | None = None,
     through: Through | None = None,
 ) -> xr.Dataset:
     """Carry out a plan, here or `through` others; `evaluate` stands in for the plan's engine."""
-    kept: AbstractStore
-    if store is None:
-        kept = MemoryStore(planned.layout, planned.attrs)
-    else:
-        kept = open_store(planned, Path(store))
+    kept = store if isinstance(store, AbstractStore) else _kept(planned, store)
     missing = kept.missing()
-    if not missing:
-        return kept.dataset()
+    if missing or kept.damage:
+        with kept.at_work():
+            _compute(planned, kept, missing, report, evaluate, through)
+    return kept.dataset()
+
+
+def _kept(planned: Plan, store: str | Path | None) -> AbstractStore:
+    if store is None:
+        return MemoryStore(planned.layout, planned.attrs)
+    kept = open_store(planned, Path(store))
+    if kept.damage:
+        warnings.warn(f"{kept.damage}: computed again.", stacklevel=4)
+    return kept
+
+
+def _compute(
+    planned: Plan,
+    kept: AbstractStore,
+    missing: list[int],
+    report: Report | None,
+    evaluate: Evaluate | None,
+    through: Through | None,
+) -> None:
     sizes = {index: _size(planned.layout.region(index)) for index in missing}
     total, done, failed = sum(sizes.values()), 0, 0
     if report is not None:
         report(Progress(total, 0, 0, planned.design.size - total))
     through = _in_turn(evaluate) if through is None else through
     for index, results in through(planned, missing):
-        with _disk_full_explained(store, kept, planned.layout.n_chunks):
+        with _disk_full_explained(kept, planned.layout.n_chunks):
             kept.write(index, _shaped(results, planned.layout.region(index)))
         done += sizes[index]
         failed += int(np.count_nonzero(results["outcome"] != Outcome.STEPPED))
         if report is not None:
             report(Progress(total, done, failed, planned.design.size - total))
-    return kept.dataset()
 
 
 def _in_turn(evaluate: Evaluate | None) -> Through:
@@ -135,27 +152,39 @@ def _in_turn(evaluate: Evaluate | None) -> Through:
 
 def open_store(planned: Plan, path: Path) -> ZarrStore:
     """The store at `path`, made now if nothing is there; refused if it holds another scan."""
+    kept = found_store(planned, path)
+    if kept is None:
+        create(path, planned.layout, planned.attrs)
+        kept = found_store(planned, path)
+        assert kept is not None
+    there = stored_manifest(path) or {}
+    other = difference(there[PROVENANCE], origin())
+    missing = len(kept.missing())
+    if other and missing:
+        raise ValueError(
+            f"{path} lacks {missing} of {planned.layout.n_chunks} chunks{_damaged_among(kept)} and "
+            f"was begun by other means, so that its last digits might not fit: {other}. "
+            "Go on with what it was begun with, or begin anew in another place."
+        )
+    return kept
+
+
+def found_store(planned: Plan, path: Path, verify: bool = True) -> ZarrStore | None:
+    """The store at `path`, None if nothing is there; refused if it holds another scan."""
     there = stored_manifest(path)
     if there is None:
-        create(path, planned.layout, planned.attrs)
-        return ZarrStore(path, planned.layout)
+        return None
     other = difference(there[MANIFEST], planned.settings)
     if other:
         raise ValueError(
             f"{path} holds a scan made with other settings: {other}. "
             "Give another place for this scan, or go back to those settings, or delete the store."
         )
-    kept = ZarrStore(path, planned.layout)
-    other = difference(there[PROVENANCE], origin())
-    missing = len(kept.missing())
-    if other and missing:
-        raise ValueError(
-            f"{path} lacks {missing} of {planned.layout.n_chunks} chunks and was begun by other "
-            f"means, so that its last digits might not fit: {other}. "
-            "Go on with what it was begun with, or begin anew in another place."
-        )
-    kept.tidy()
-    return kept
+    return ZarrStore(path, planned.layout, verify)
+
+
+def _damaged_among(kept: ZarrStore) -> str:
+    return f" ({len(kept.damaged)} of them damaged)" if kept.damaged else ""
 
 
 def _size(region: tuple[slice, ...]) -> int:
@@ -168,9 +197,7 @@ def _shaped(results: Mapping[str, np.ndarray], region: tuple[slice, ...]) -> dic
 
 
 @contextlib.contextmanager
-def _disk_full_explained(
-    store: str | Path | None, kept: AbstractStore, n_chunks: int
-) -> Iterator[None]:
+def _disk_full_explained(kept: AbstractStore, n_chunks: int) -> Iterator[None]:
     try:
         yield
     except OSError as error:
@@ -179,50 +206,6 @@ def _disk_full_explained(
         n_done = n_chunks - len(kept.missing())
         raise OSError(
             error.errno,
-            f"no space is left for {store}, where {n_done} chunks are complete: make room and run "
-            "the same again, it goes on from there",
+            f"no space is left for {kept.place}, where {n_done} chunks are complete: make room and "
+            "run the same again, it goes on from there",
         ) from error
-
-
-def explained(planned: Plan, store: str | Path | None = None) -> dict[str, str]:
-    """Sizes, chunks, memory and time of a scan, as lines for a reader; computes nothing."""
-    layout, size = planned.layout, planned.design.size
-    missing = list(range(layout.n_chunks))
-    if store is not None and stored_manifest(Path(store)) is not None:
-        missing = open_store(planned, Path(store)).missing()
-    left = sum(_size(layout.region(index)) for index in missing)
-    chunk, rate = int(np.prod(layout.chunk)), RATE * n_cores()
-    axes = " x ".join(f"{n} {name}" for name, n in zip(layout.dims, layout.shape, strict=True))
-    return {
-        "samples": f"{size:,} ({axes})",
-        "measures": ", ".join(planned.measures),
-        "always included": ", ".join(offer_of(planned.model).always),
-        "chunks": f"{layout.n_chunks:,} of up to {chunk:,} samples, {len(missing):,} to compute",
-        "result": f"{_bytes(size * layout.bytes_per_sample)} before compression",
-        "memory": f"about {_bytes(MEMORY + chunk * 2 * layout.bytes_per_sample)}, "
-        + ("whatever the number of samples" if store is not None else "plus the result"),
-        "time": f"about {in_words(left / rate + (COMPILE if left else 0.0))}: "
-        f"{left:,} samples at {rate:,.0f} per second on {n_cores()} cores, {COMPILE:.0f} s to "
-        "compile the first time (as measured on one machine; yours differ)",
-        "lanes": f"{LANES} wheels in a batch, a batch on each core",
-    }
-
-
-RATE, COMPILE, MEMORY = 600.0, 60.0, 1.1e9
-"""Samples per second and core (twice that in a box of gaits only, half where most have none),
-seconds to compile without a cache, bytes of code and arrays: `experiments.speed.scan_benchmark`."""
-
-
-def _bytes(n: int | float) -> str:
-    for unit in ("B", "kB", "MB"):
-        if n < 1000:
-            return f"{n:.3g} {unit}"
-        n /= 1000
-    return f"{n:.3g} GB"
-
-
-def in_words(t: float) -> str:
-    """A time in seconds as a reader takes it in."""
-    if t < 90:
-        return f"{t:.0f} s"
-    return f"{t / 60:.0f} min" if t < 5400 else f"{t / 3600:.1f} h"

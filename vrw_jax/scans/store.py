@@ -2,19 +2,21 @@
 
 A store is a Zarr group with one array per variable, cut into the scan's chunks, so that
 `xarray.open_zarr` reads it. It appears whole (built beside its place, then renamed). A chunk's data
-is written first and `chunk_done` marked after; every file is written beside its place and renamed,
-so whatever moment the process dies at, a chunk is either marked and complete or computed again.
+is written first and its mark after, a digest of what was written (`soundness`); every file is
+written beside its place and renamed, so whatever moment the process dies at, a chunk is either
+marked and complete or computed again.
 """
 
 from __future__ import annotations
 
 import abc
+import contextlib
+import json
 import math
 import os
 import shutil
 import tempfile
-import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,15 +27,25 @@ from vrw_jax.models import VISCOELASTIC
 from vrw_jax.results import MEASURES
 from vrw_jax.runtime import library
 from vrw_jax.runtime import xarray as xr
+from vrw_jax.scans.offer import canonical
+from vrw_jax.scans.soundness import (
+    BOOKS,
+    DIGEST,
+    DONE,
+    MANIFEST,
+    SIZE,
+    Books,
+    alone,
+    manifest_of,
+    told_damage,
+)
 
 if TYPE_CHECKING:
     import zarr
 else:
     zarr = library("zarr")
 
-DONE = "chunk_done"
-MANIFEST = "scan"
-PROVENANCE = "provenance"
+PROVENANCE, ASKED = "provenance", "asked"
 
 Region = tuple[slice, ...]
 Block = Mapping[str, np.ndarray]
@@ -104,6 +116,10 @@ def chunk_shape(shape: tuple[int, ...], most: int) -> tuple[int, ...]:
 class AbstractStore(abc.ABC):
     """Takes chunks, tells which are missing, gives the labelled whole."""
 
+    place: str = "memory"
+    damage: str = ""
+    """What is damaged, in words; empty where nothing is."""
+
     @abc.abstractmethod
     def missing(self) -> list[int]:
         """Chunks still to compute, in order."""
@@ -116,6 +132,10 @@ class AbstractStore(abc.ABC):
     def dataset(self) -> xr.Dataset:
         """The labelled whole."""
 
+    @abc.abstractmethod
+    def at_work(self) -> contextlib.AbstractContextManager[None]:
+        """Around all writing: clears away what was left unfinished, lets no other work here."""
+
 
 class MemoryStore(AbstractStore):
     """Results as arrays in memory."""
@@ -123,9 +143,17 @@ class MemoryStore(AbstractStore):
     def __init__(self, layout: Layout, attrs: Mapping[str, object]) -> None:
         self._layout, self._attrs = layout, attrs
         self._done = np.zeros(layout.n_chunks, bool)
-        self._arrays = {
-            v.name: np.full((*layout.shape, *v.shape), v.missing, v.dtype) for v in layout.variables
-        }
+        try:
+            self._arrays = {
+                v.name: np.full((*layout.shape, *v.shape), v.missing, v.dtype)
+                for v in layout.variables
+            }
+        except MemoryError as error:
+            size = math.prod(layout.shape)
+            raise ValueError(
+                f"the result of {size:,} samples takes {size * layout.bytes_per_sample / 1e9:,.0f} "
+                "GB, more than this memory holds: give a store, whose chunks go to the disk."
+            ) from error
 
     def missing(self) -> list[int]:
         return [int(i) for i in np.flatnonzero(~self._done)]
@@ -136,9 +164,12 @@ class MemoryStore(AbstractStore):
             array[region] = block[name]
         self._done[index] = True
 
+    def at_work(self) -> contextlib.AbstractContextManager[None]:
+        return contextlib.nullcontext()
+
     def dataset(self) -> xr.Dataset:
         layout = self._layout
-        return xr.Dataset(
+        dataset = xr.Dataset(
             {
                 v.name: ((*layout.dims, *v.dims), self._arrays[v.name], dict(v.attrs))
                 for v in layout.variables
@@ -149,31 +180,44 @@ class MemoryStore(AbstractStore):
             },
             attrs=dict(self._attrs),
         )
+        return _as_asked(dataset)
 
 
 class ZarrStore(AbstractStore):
-    """Results in a folder, chunk by chunk."""
+    """Results in a folder, chunk by chunk. `verify`: look for damage, to be computed again."""
 
-    def __init__(self, path: Path, layout: Layout) -> None:
-        self._path, self._layout = path, layout
+    def __init__(self, path: Path, layout: Layout, verify: bool = True) -> None:
+        self._path, self._layout, self.place = path, layout, str(path)
         self._group = zarr.open_group(path, mode="r+", zarr_format=3)
+        self._books = Books(path, self._group)
+        self.damaged = self._books.damaged() if verify else []
+        self._coordinates = self._books.damaged_coordinates() if verify else []
+        self.damage = told_damage(path, self.damaged, self._coordinates)
 
     def missing(self) -> list[int]:
-        return [int(i) for i in np.flatnonzero(np.asarray(_array(self._group, DONE)[:]) == 0)]
+        done = self._books.done()
+        done[np.asarray(self.damaged, int)] = False
+        return [int(i) for i in np.flatnonzero(~done)]
 
     def write(self, index: int, block: Block) -> None:
         region = self._layout.region(index)
         for variable in self._layout.variables:
             _array(self._group, variable.name)[region] = block[variable.name]
-        _array(self._group, DONE)[index : index + 1] = 1
+        self._books.mark(index)
+        self.damaged = [chunk for chunk in self.damaged if chunk != index]
 
     def dataset(self) -> xr.Dataset:
-        return open_scan(self._path)
+        return open_scan(self._path, verify=False)
 
-    def tidy(self) -> None:
-        """Remove the half-written files that a killed run left behind."""
-        for path in self._path.rglob("*.partial"):
-            path.unlink(missing_ok=True)
+    @contextlib.contextmanager
+    def at_work(self) -> Iterator[None]:
+        with alone(self._path):
+            for path in self._path.rglob("*.partial"):
+                path.unlink(missing_ok=True)
+            for name in self._coordinates:
+                _array(self._group, name)[:] = self._layout.coordinates[name][1]
+            self._coordinates = []
+            yield
 
 
 def _array(group: zarr.Group, name: str) -> zarr.Array:
@@ -182,18 +226,42 @@ def _array(group: zarr.Group, name: str) -> zarr.Array:
     return array
 
 
-def open_scan(path: str | Path) -> xr.Dataset:
+def open_scan(path: str | Path, *, verify: bool = True) -> xr.Dataset:
     """The labelled result of a scan, finished or not; values are read when they are used.
 
-    Where a scan isn't finished, samples not computed yet have the outcome -1 and NaN elsewhere.
+    Where a scan isn't finished, samples not computed yet have the outcome -1 and NaN elsewhere. A
+    store with damaged files is refused; `verify=False` opens it to read what can be read.
     """
-    _require_scan(Path(path))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)  # files of a killed run
-        dataset = xr.open_zarr(
-            path, consolidated=False, chunks=None, mask_and_scale=False, decode_times=False
-        )
-    return _told_apart(dataset.drop_vars(DONE))
+    group = _require_scan(Path(path))
+    books = Books(Path(path), group)
+    if verify:
+        damage = told_damage(path, books.damaged(), books.damaged_coordinates())
+        if damage:
+            raise ValueError(
+                f"{damage}: run the scan again, which computes these anew, or read the rest with "
+                "open_scan(path, verify=False)."
+            )
+    dataset = xr.open_zarr(
+        path,
+        consolidated=group.metadata.consolidated_metadata is not None,
+        chunks=None,
+        mask_and_scale=False,
+        decode_times=False,
+    )
+    return _as_asked(_told_apart(dataset.drop_vars(DONE, errors="ignore")))
+
+
+def _as_asked(dataset: xr.Dataset) -> xr.Dataset:
+    """Variables in the order and by the names that they were asked for, then the others.
+
+    A file can't hold the name "d speed / d damping", so that in a store its array has another.
+    """
+    asked = dataset.attrs.get(ASKED)
+    names = str(asked).split(", ") if asked else manifest_of(dataset.attrs).get("measures", [])
+    told = {canonical(name): name for name in reversed(names) if canonical(name) in dataset}
+    first = list(dict.fromkeys(map(canonical, names)))
+    order = dict.fromkeys([*(n for n in first if n in told), *map(str, dataset.data_vars)])
+    return dataset[list(order)].rename({n: told[n] for n in told if n != told[n]})
 
 
 def _told_apart(dataset: xr.Dataset) -> xr.Dataset:
@@ -205,7 +273,7 @@ def _told_apart(dataset: xr.Dataset) -> xr.Dataset:
     if old is None or old.attrs.get("symbol") != MEASURES["spectral_margin"].symbol:
         return dataset
     smooth, plain = (MEASURES[n].attrs for n in ("stability_margin", "spectral_margin"))
-    kind = dataset.attrs[MANIFEST]["model"]["kind"]
+    kind = manifest_of(dataset.attrs)["model"]["kind"]
     if kind == "ViscoelasticWheel":
         return dataset.assign(stability_margin=old.assign_attrs(smooth))
     radius = dataset["spectral_radius"].astype(old.dtype)
@@ -236,7 +304,9 @@ def stored_manifest(path: Path) -> dict | None:
     if not path.exists() or (path.is_dir() and not any(path.iterdir())):
         return None
     attrs = dict(_require_scan(path).attrs)
-    return {MANIFEST: attrs[MANIFEST], PROVENANCE: attrs.get(PROVENANCE, {})}
+    origin = attrs.get(PROVENANCE, {})
+    origin = json.loads(origin) if isinstance(origin, str) else origin
+    return {MANIFEST: manifest_of(attrs), PROVENANCE: origin}
 
 
 def first_difference(there: object, here: object, name: str = "") -> tuple[str, object, object]:
@@ -253,16 +323,23 @@ def first_difference(there: object, here: object, name: str = "") -> tuple[str, 
 
 
 def create(path: Path, layout: Layout, attrs: Mapping[str, object]) -> None:
-    """Make an empty store at `path`, at once or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    building = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    """Make an empty store at `path`, at once or not at all; there may be one in the meantime."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        building = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    except OSError as error:
+        reason = error.strerror or "no folder can be made there"
+        raise OSError(
+            error.errno, f"no store can be made at {path} ({reason}): give a place of your own"
+        ) from error
     try:
         _fill(building, layout, attrs)
         building.chmod(0o777 & ~_umask())
         building.rename(path)
-    except BaseException:
+    except BaseException as error:
         shutil.rmtree(building, ignore_errors=True)
-        raise
+        if not (isinstance(error, OSError) and stored_manifest(path) is not None):
+            raise
 
 
 def _umask() -> int:
@@ -300,15 +377,20 @@ def _fill(path: Path, layout: Layout, attrs: Mapping[str, object]) -> None:
             compressors=compressors,
             attributes=_json(variable.attrs),
         )
-    group.create_array(
-        DONE,
-        shape=(layout.n_chunks,),
-        chunks=(1,),
-        dtype="u1",
-        fill_value=0,
-        dimension_names=("chunk",),
-        attributes={"description": "1 where a chunk's results are complete."},
+    chunks = (layout.n_chunks, SIZE)
+    group.create_group(BOOKS).create_array(
+        "digest", shape=chunks, chunks=(1, SIZE), dtype="u1", fill_value=0
     )
+    _consolidate(path, [*layout.coordinates, *(v.name for v in layout.variables), BOOKS, DIGEST])
+
+
+def _consolidate(path: Path, names: list[str]) -> None:
+    """All metadata in one file, in this order: zarr's own way sorts by name, and warns."""
+    place = path / "zarr.json"
+    told = json.loads(place.read_text())
+    parts = {name: json.loads((path / name / "zarr.json").read_text()) for name in names}
+    whole = {"kind": "inline", "must_understand": False, "metadata": parts}
+    place.write_text(json.dumps(told | {"consolidated_metadata": whole}, indent=2))
 
 
 def _json(attrs: Mapping[str, object]) -> dict[str, Any]:

@@ -1,0 +1,394 @@
+"""What can be got wrong at the command line: one sentence, exit code 2, and nothing written."""
+
+from pathlib import Path
+
+import jax
+import pytest
+from support.scanning import arithmetic
+from typer.testing import CliRunner
+
+from vrw_jax.app.cli import app
+from vrw_jax.scans.planning import Plan
+
+CONFIGS: dict[str, tuple[str, str]] = {
+    "not TOML": ("[wheel", "not valid TOML"),
+    "unknown table": ("[whel]\nslope = 0.3", "did you mean 'wheel'"),
+    "table as value": ("wheel = 3", "must be a table"),
+    "unknown parameter": ("[wheel]\ndampin = 3.0", "did you mean 'damping'"),
+    "text for a number": ('[wheel]\ndamping = "much"', "must be a finite number"),
+    "true for a number": ("[wheel]\ndamping = true", "must be a finite number"),
+    "not finite": ("[wheel]\ndamping = nan", "must be a finite number"),
+    "out of its domain": ("[wheel]\ndamping = -1.0", "must lie in [0, 1e+09) N s/m"),
+    "mass beyond the hub": ("[wheel]\nleg_com = 2.0", "leg_com < locked_length"),
+    "too few legs": ("[wheel]\nn_legs = 4", "at least 5"),
+    "part of a leg": ("[wheel]\nn_legs = 8.5", "whole number"),
+    "unknown setting": ("[scan]\nchunks = 3", "did you mean 'chunk'"),
+    "no samples in a chunk": ("[scan]\nchunk = 0", "at least 1"),
+    "measures as text": ('[scan]\nmeasures = "speed"', "list of names"),
+    "unknown measure": ('[scan]\nmeasures = ["sped"]', "did you mean 'speed'"),
+    "derivative of what": ('[scan]\nmeasures = ["d sped / d damping"]', "did you mean 'speed'"),
+    "derivative by what": ('[scan]\nmeasures = ["d speed / d dampin"]', "did you mean 'damping'"),
+    "derivative of a margin": (
+        '[scan]\nmeasures = ["d clearance_sls1 / d damping"]',
+        "a scan differentiates only",
+    ),
+    "empty grid": ("[grid]", "sweeps no parameter"),
+    "empty axis": ("[grid]\ndamping = []", "empty list"),
+    "axis as number": ("[grid]\ndamping = 3.0", "list of numbers or { from"),
+    "axis without count": ("[grid]\ndamping = { from = 1.0, to = 2.0 }", "no 'count'"),
+    "axis with no values": ("[grid]\ndamping = { from = 1.0, to = 2.0, count = 0 }", "at least 1"),
+    "axis out of its domain": ("[grid]\nslope = { from = 0.1, to = 2.0, count = 3 }", "rad"),
+    "value twice": ("[grid]\ndamping = [1.0, 1.0]", "holds a value twice"),
+    "unknown axis key": (
+        "[grid]\ndamping = { from = 1.0, to = 2.0, cout = 3 }",
+        "did you mean 'count'",
+    ),
+    "columns of two lengths": ("[samples]\ndamping = [1.0]\nslope = [0.1, 0.2]", "one length"),
+    "no number of samples": ("[sobol]\ndamping = [1.0, 2.0]", "says not how many"),
+    "range of three": ("[sobol]\nn = 4\ndamping = [1.0, 2.0, 3.0]", "range of two numbers"),
+    "range upside down": ("[uniform]\nn = 4\ndamping = [2.0, 1.0]", "lower one first"),
+    "negative seed": ("[uniform]\nn = 4\nseed = -1\ndamping = [1.0, 2.0]", "at least 0"),
+    "two designs": ("[grid]\ndamping = [1.0]\n[samples]\nslope = [0.1]", "keep one"),
+    "fixed and swept": ("[wheel]\nslope = 0.3\n[grid]\nslope = [0.1]", "drop one of the two"),
+    "unknown option": ("[options]\nrtoll = 1e-9", "did you mean 'rtol'"),
+    "tolerance not positive": ("[options]\nrtol = -1.0", "must be positive"),
+    "tolerance out of reach": ("[options]\nrtol = 1e-30", "can't resolve"),
+    "solver as number": ("[options]\nsolver = 5", "must be a name"),
+    "no steps": ("[gait]\nsteps = 0", "at least 1"),
+    "start of two numbers": ("[gait]\nstart = [0.1, 1.6]", "three numbers"),
+    "friction not positive": ("[model]\nfriction = 0", "must be positive"),
+    "switch as number": ("[model]\nstop_at_lift_off = 1", "true or false"),
+    # name: text of the config, what the sentence holds
+    "a table twice": ("[wheel]\n[wheel]", "not valid TOML"),
+    "a value without quotes": ("[options]\nsolver = Dopri8", "not valid TOML"),
+    "a number with a comma": ("[wheel]\ndamping = 1,5", "not valid TOML"),
+    "a table of tables": ("[[grid]]\ndamping = [1.0]", "must be a table"),
+    "a table in capitals": ("[Wheel]\nslope = 0.3", "did you mean 'wheel'"),
+    "infinite": ("[wheel]\nstiffness = inf", "must be a finite number"),
+    "a list for a number": ("[wheel]\nslope = [0.3]", "must be a finite number"),
+    "a slope too steep": ("[wheel]\nslope = 1.6", "must lie in"),
+    "less than no mass": ("[wheel]\nhub_mass = -1.0", "must lie in"),
+    "a spring that pulls": ("[wheel]\nstiffness = -500.0", "must lie in"),
+    "legs as text": ('[wheel]\nn_legs = "eight"', "whole number"),
+    "legs yes": ("[wheel]\nn_legs = true", "whole number"),
+    "a solver misspelt": ('[options]\nsolver = "Dopri9"', "must name a diffrax solver"),
+    "a solver without an error": ('[options]\nsolver = "Euler"', "must name a diffrax solver"),
+    "no time": ("[options]\nmax_phase_time = 0.0", "must be positive"),
+    "part of a step": ("[options]\nmax_solver_steps = 2.5", "whole number"),
+    "no events": ("[options]\nevent_steps = 0", "at least 1"),
+    "tolerance as text": ('[options]\nrtol = "1e-9"', "must be a finite number"),
+    "tolerance true": ("[options]\natol = true", "must be a finite number"),
+    "unknown rung": ('[model]\nrung = "unilaterl"', "did you mean 'unilateral'"),
+    "rung as number": ("[model]\nrung = 2", "must be one of viscoelastic"),
+    "rung as list": ('[model]\nrung = ["rigid"]', "must be one of viscoelastic"),
+    "another rung's setting": ('[model]\nrung = "auto"\nstoppers = "one-sided"', "unknown key"),
+    "a setting of real ground": ("[model]\nmax_events = 5", "unknown key 'max_events'"),
+    "stoppers of a third kind": (
+        '[model]\nrung = "unilateral"\nstoppers = "none"',
+        "must be 'bilateral' or 'one-sided'",
+    ),
+    "friction below zero": ('[model]\nrung = "unilateral"\nfriction = -1.0', "must be positive"),
+    "friction nan": ('[model]\nrung = "auto"\nfriction = nan', "must be a finite number"),
+    "friction as text": ('[model]\nfriction = "high"', "must be a finite number"),
+    "no events on ground": ('[model]\nrung = "unilateral"\nmax_events = 0', "at least 1"),
+    "part of an event": ('[model]\nrung = "unilateral"\nmax_events = 2.5', "whole number"),
+    "a misspelt setting": ("[model]\nfricton = 0.5", "did you mean 'friction'"),
+    "a switch as text": ('[model]\nstop_at_lift_off = "yes"', "true or false"),
+    "friction swept, not felt": ("[grid]\nfriction = [0.5, 0.7]", "does not feel"),
+    "friction sampled, not felt": ("[sobol]\nn = 4\nfriction = [0.5, 0.7]", "does not feel"),
+    "friction swept below zero": (
+        '[model]\nrung = "auto"\n[grid]\nfriction = [0.5, -0.7]',
+        "must be positive",
+    ),
+    "a measure of another rung": (
+        '[model]\nrung = "unilateral"\n[scan]\nmeasures = ["lambda_I4"]',
+        "is no measure of a scan",
+    ),
+    "a measure of real ground": ('[scan]\nmeasures = ["slip"]', "is no measure of a scan"),
+    "a measure as number": ("[scan]\nmeasures = [3]", "list of names"),
+    "a derivative by friction": (
+        '[scan]\nmeasures = ["d speed / d friction"]',
+        "must be by a parameter",
+    ),
+    "half a derivative": ('[scan]\nmeasures = ["d speed / damping"]', "is no measure of a scan"),
+    "chunk as text": ('[scan]\nchunk = "large"', "whole number"),
+    "part of a sample": ("[scan]\nchunk = 2.5", "whole number"),
+    "n_legs swept": ("[grid]\nn_legs = [6, 8]", "unknown key 'n_legs'"),
+    "an axis of text": ('[grid]\ndamping = ["much"]', "must be a finite number"),
+    "an axis of lists": ("[grid]\ndamping = [[1.0]]", "must be a finite number"),
+    "an axis too long": (
+        "[grid]\ndamping = { from = 1.0, to = 2.0, count = 20000000000 }",
+        "is the most",
+    ),
+    "half a value": ("[grid]\ndamping = { from = 1.0, to = 2.0, count = 2.5 }", "whole number"),
+    "an axis that stands still": (
+        "[grid]\ndamping = { from = 1.0, to = 1.0, count = 3 }",
+        "holds a value twice",
+    ),
+    "an axis nowhere": ("[grid]\ndamping = { from = nan, to = 2.0, count = 3 }", "finite number"),
+    "a sample out of its domain": ("[samples]\nslope = [0.3, 3.0]", "must lie in"),
+    "no samples": ("[sobol]\nn = 0\ndamping = [1.0, 2.0]", "at least 1"),
+    "too many samples": ("[sobol]\nn = 20000000000\ndamping = [1.0, 2.0]", "at most"),
+    "rows that aren't balanced": ("[saltelli]\nn = 100\ndamping = [1.0, 2.0]", "powers of two"),
+    "a range of one": ("[uniform]\nn = 4\ndamping = [1.0]", "range of two numbers"),
+    "a range of none": ("[uniform]\nn = 4\ndamping = [2.0, 2.0]", "lower one first"),
+    "a seed as text": ('[sobol]\nn = 4\nseed = "x"\ndamping = [1.0, 2.0]', "at least 0"),
+    "a box of nothing": ("[sobol]\nn = 4", "sweeps no parameter"),
+    "steps as text": ('[gait]\nsteps = "ten"', "whole number"),
+    "a start of text": ('[gait]\nstart = ["a", "b", "c"]', "must be a finite number"),
+    "a start nowhere": ("[gait]\nstart = [nan, 1.0, 0.0]", "must be a finite number"),
+    "unknown in gait": ("[gait]\nstep = 3", "did you mean 'steps'"),
+    "nothing may move": ("[tune]", "lets no parameter move"),
+    "bounds as list": ("[tune]\nbounds = [1.0, 2.0]", "lets no parameter move"),
+    "bounds of what": ("[tune.bounds]\ndampin = [1.0, 2.0]", "did you mean 'damping'"),
+    "bounds of one": ("[tune.bounds]\ndamping = [1.0]", "range of two numbers"),
+    "bounds out of the domain": ("[tune.bounds]\nslope = [0.1, 2.0]", "must lie in"),
+    "objective as number": ("[tune]\nobjective = 3\n[tune.bounds]\nslope = [0.2, 0.4]", "weights"),
+    "weight as text": (
+        '[tune]\nobjective = { speed = "much" }\n[tune.bounds]\nslope = [0.2, 0.4]',
+        "finite number",
+    ),
+    "constraints as list": (
+        '[tune]\nconstraints = ["speed"]\n[tune.bounds]\nslope = [0.2, 0.4]',
+        "must be a table",
+    ),
+    "a limit as text": (
+        '[tune.constraints]\nspeed = "high"\n[tune.bounds]\nslope = [0.2, 0.4]',
+        "finite number",
+    ),
+    "no gaits to try": ("[tune]\nevaluations = 0\n[tune.bounds]\nslope = [0.2, 0.4]", "at least 1"),
+    "unknown in tune": ("[tune]\nbound = 3", "did you mean 'bounds'"),
+    "a branch along nothing": ("[branch]\nbounds = [1.0, 2.0]", "parameter is None"),
+    "a branch along what": ('[branch]\nparameter = "dampin"', "did you mean 'damping'"),
+    "a branch along friction": (
+        '[branch]\nparameter = "friction"\nbounds = [0.5, 1.0]',
+        "runs along one of",
+    ),
+    "a branch without bounds": ('[branch]\nparameter = "damping"', "has no bounds"),
+    "a branch upside down": (
+        '[branch]\nparameter = "damping"\nbounds = [200.0, 100.0]',
+        "lower must come first",
+    ),
+    "a branch of one bound": ('[branch]\nparameter = "damping"\nbounds = 200.0', "two numbers"),
+    "a branch out of the domain": (
+        '[branch]\nparameter = "slope"\nbounds = [0.1, 2.0]',
+        "must lie in",
+    ),
+    "no period": ('[branch]\nparameter = "damping"\nbounds = [1.0, 2.0]\nperiod = 0', "at least 1"),
+    "no step": (
+        '[branch]\nparameter = "damping"\nbounds = [1.0, 2.0]\nlargest_step = 0.0',
+        "be positive",
+    ),
+}
+
+GRID = "[grid]\ndamping = [100.0, 150.0]\n"
+TUNE = '[tune]\nobjective = "{}"\n[tune.bounds]\n{}\n'
+BRANCH = '[branch]\nparameter = "damping"\nbounds = [{}]\n'
+BOUNDS = "damping = [20.0, 215.0]"
+
+COMMANDS: dict[str, tuple[tuple[str, ...], str, str]] = {
+    # name: arguments, text of my.toml, what the sentence holds
+    "missing config": (("scan", "nowhere.toml"), "", "no config file nowhere.toml"),
+    "misspelt config": (("scan", "mi.toml"), "", "did you mean 'my.toml'"),
+    "a folder as config": (("scan", "."), "", "is a folder"),
+    "a picture as config": (("gait", "letter.bin"), "", "can't be read"),
+    "a missing folder": (("tune", "nowhere/my.toml"), "", "no config file"),
+    "no design": (("scan", "my.toml"), "[wheel]\nslope = 0.3", "a scan needs a design"),
+    "an empty config to scan": (("scan", "my.toml"), "", "a scan needs a design"),
+    "nothing to tune": (("tune", "my.toml"), GRID, "tuning needs an objective"),
+    "nothing to follow": (("continue", "my.toml"), GRID, "continuation needs a parameter"),
+    "no assignment": (("gait", "--set", "damping"), "", "has no '='"),
+    "an empty assignment": (("gait", "--set", "damping="), "", "must be a finite number"),
+    "a nameless assignment": (("gait", "--set", "=3"), "", "unknown key ''"),
+    "unknown parameter": (("gait", "--set", "dampin=3"), "", "did you mean 'damping'"),
+    "text for a parameter": (("gait", "--set", "damping=much"), "", "must be a finite number"),
+    "a complex parameter": (("gait", "--set", "damping=1+2j"), "", "must be a finite number"),
+    "a parameter nan": (("gait", "--set", "damping=nan"), "", "must be a finite number"),
+    "out of its domain": (("gait", "--set", "damping=-3"), "", "must lie in"),
+    "mass beyond the hub": (("gait", "--set", "leg_com=1.5"), "", "leg_com < locked_length"),
+    "half a leg": (("gait", "--set", "n_legs=8.5"), "", "whole number"),
+    "three legs": (("gait", "--set", "n_legs=3"), "", "at least 5"),
+    "a file as folder": (("scan", "my.toml", "--out", "letter.txt"), GRID, "letter.txt"),
+    "a place of the system": (("scan", "my.toml", "--out", "/proc/x"), GRID, "/proc/x"),
+    "a place below a file": (("scan", "my.toml", "--out", "letter.txt/x"), GRID, "letter.txt/x"),
+    "no place to tune": (
+        ("tune", "my.toml", "--out", "/proc/x"),
+        TUNE.format("speed", BOUNDS),
+        "/proc/x",
+    ),
+    "no place to follow": (
+        ("continue", "my.toml", "--out", "/proc/x"),
+        BRANCH.format("100.0, 200.0"),
+        "/proc/x",
+    ),
+    "no place to reproduce": (("reproduce", "--out", "/proc/x"), "", "/proc/x"),
+    "no place for examples": (("init", "/proc/x"), "", "/proc/x"),
+    "examples that differ": (("init", "mine"), "", "is there already and differs"),
+    "no scan there": (("scan", "my.toml", "--out", "occupied"), GRID, "no scan's store"),
+    "another's store": (("scan", "my.toml", "--out", "other"), GRID, "but not a scan's"),
+    "a torn store": (("scan", "my.toml", "--out", "torn"), GRID, "no scan's store"),
+    "no store to verify": (("scan", "my.toml", "--verify"), GRID, "no store"),
+    "no scheduler": (
+        ("scan", "my.toml", "--dask", "nowhere://"),
+        GRID,
+        "no dask scheduler answers",
+    ),
+    "a solver misspelt": (
+        ("scan", "my.toml"),
+        GRID + '[options]\nsolver = "Dopri9"',
+        "diffrax solver",
+    ),
+    "too large a grid": (
+        ("scan", "my.toml"),
+        "[grid]\n"
+        + "".join(
+            f"{name} = {{ from = 0.3, to = 0.4, count = 1000000 }}\n"
+            for name in ("slope", "leg_com")
+        ),
+        "but a scan takes",
+    ),
+    "too large a grid to explain": (
+        ("scan", "my.toml", "--explain"),
+        "[grid]\n"
+        + "".join(
+            f"{name} = {{ from = 0.3, to = 0.4, count = 1000000 }}\n"
+            for name in ("slope", "leg_com")
+        ),
+        "but a scan takes",
+    ),
+    "rigid legs scanned": (
+        ("scan", "my.toml"),
+        GRID + '[model]\nrung = "rigid"',
+        "this command takes viscoelastic",
+    ),
+    "rigid legs tuned": (
+        ("tune", "my.toml"),
+        TUNE.format("speed", BOUNDS) + '[model]\nrung = "rigid"',
+        "takes viscoelastic",
+    ),
+    "the ladder tuned": (
+        ("tune", "my.toml"),
+        TUNE.format("speed", BOUNDS) + '[model]\nrung = "auto"',
+        "takes viscoelastic",
+    ),
+    "the ladder followed": (
+        ("continue", "my.toml"),
+        BRANCH.format("100.0, 300.0") + '[model]\nrung = "auto"',
+        "takes viscoelastic",
+    ),
+    "an objective of nothing": (
+        ("tune", "my.toml"),
+        TUNE.format("sped", BOUNDS),
+        "did you mean 'speed'",
+    ),
+    "an objective with legs": (
+        ("tune", "my.toml"),
+        TUNE.format("locked_stopper_force", BOUNDS),
+        "one value for each locked leg",
+    ),
+    "an objective of another rung": (
+        ("tune", "my.toml"),
+        TUNE.format("slip", BOUNDS),
+        "is no measure for objective",
+    ),
+    "bounds that hold nothing": (
+        ("tune", "my.toml"),
+        TUNE.format("speed", "damping = [215.0, 20.0]"),
+        "hold nothing",
+    ),
+    "a start outside its bounds": (
+        ("tune", "my.toml"),
+        TUNE.format("speed", "damping = [20.0, 100.0]"),
+        "outside its bounds",
+    ),
+    "a constraint on nothing": (
+        ("tune", "my.toml"),
+        TUNE.format("speed", BOUNDS) + "[tune.constraints]\nclearence = 0.0",
+        "no measure for a constraint",
+    ),
+    "a step beyond the range": (
+        ("continue", "my.toml"),
+        BRANCH.format("4.0, 230.0") + "largest_step = 5.0",
+        "largest_step",
+    ),
+}
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A place with a letter, and with what is no store; a second is enough for a scheduler."""
+    monkeypatch.setattr(Plan, "engine", lambda _: arithmetic)
+    monkeypatch.setattr("vrw_jax.scans.dask.ANSWER", "1s")
+    monkeypatch.chdir(tmp_path)
+    cache = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", cache)
+    (tmp_path / "letter.txt").write_text("dear reader")
+    (tmp_path / "letter.bin").write_bytes(b"\xff\xfe\x00")
+    for place in ("occupied", "other", "torn"):
+        (tmp_path / place / "scan.zarr").mkdir(parents=True)
+        (tmp_path / place / "scan.zarr" / "letter.txt").write_text("dear reader")
+    group = '{"attributes": {}, "zarr_format": 3, "node_type": "group"}'
+    (tmp_path / "other" / "scan.zarr" / "zarr.json").write_text(group)
+    (tmp_path / "torn" / "scan.zarr" / "zarr.json").write_text(group[:20])
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "quickstart.toml").write_text("# mine")
+    return tmp_path
+
+
+def what_is_there(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() if path.is_file() else b"" for path in folder.rglob("*")}
+
+
+def refused(arguments: tuple[str, ...], expected: str, folder: Path) -> str:
+    """The sentence, of a command that must be refused with nothing written."""
+    before = what_is_there(folder)
+    told = CliRunner().invoke(app, list(arguments))
+    assert told.exit_code == 2, told.output
+    assert expected in told.stderr
+    assert told.stdout == ""
+    assert told.stderr.startswith("vrw: ")
+    sentence = told.stderr.strip()
+    assert sentence.endswith(".")
+    assert "\n" not in sentence
+    assert "Traceback" not in sentence
+    assert "Errno" not in sentence
+    assert what_is_there(folder) == before
+    return sentence
+
+
+@pytest.mark.parametrize("mistake", CONFIGS)
+def test_a_mistake_in_a_config_gets_one_sentence_that_helps(mistake: str, folder: Path) -> None:
+    text, expected = CONFIGS[mistake]
+    (folder / "my.toml").write_text(text)
+    sentence = refused(("gait", "my.toml"), expected, folder)
+    assert sentence.startswith("vrw: my.toml: ")
+
+
+@pytest.mark.parametrize("mistake", COMMANDS)
+def test_a_mistake_in_a_command_gets_one_sentence_that_helps(mistake: str, folder: Path) -> None:
+    arguments, text, expected = COMMANDS[mistake]
+    (folder / "my.toml").write_text(text)
+    refused(arguments, expected, folder)
+
+
+USAGE = {
+    "no such command": ("scann",),
+    "no config": ("scan",),
+    "no such option": ("scan", "my.toml", "--chunks", "3"),
+    "no samples in a chunk": ("scan", "my.toml", "--chunk", "0"),
+    "a chunk as text": ("scan", "my.toml", "--chunk", "large"),
+    "no steps": ("gait", "--steps", "0"),
+    "a word too many": ("gait", "my.toml", "again"),
+    "an option without its value": ("scan", "my.toml", "--out"),
+}
+
+
+@pytest.mark.parametrize("mistake", USAGE)
+def test_a_misspelt_command_shows_where_help_is(mistake: str, folder: Path) -> None:
+    (folder / "my.toml").write_text(GRID)
+    before = what_is_there(folder)
+    told = CliRunner().invoke(app, list(USAGE[mistake]))
+    assert told.exit_code == 2
+    assert "Error" in told.stderr
+    assert "Traceback" not in told.stderr
+    assert what_is_there(folder) == before
