@@ -203,7 +203,8 @@ def test_init_writes_the_example_configs_and_nothing_twice(config: Path) -> None
 def test_an_installed_wheel_brings_the_example_configs() -> None:
     told = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
     built = told["tool"]["hatch"]["build"]["targets"]["wheel"]
-    assert built["force-include"]["configs"] == "vrw_jax/configs"
+    package = Path(cli.__file__).parents[1].name
+    assert built["force-include"]["configs"] == f"{package}/configs"
     assert cli._examples().name == "configs"
 
 
