@@ -32,6 +32,7 @@ from vrw_jax import figures as plots
 from vrw_jax.app.config import load
 from vrw_jax.cycles import AGREEMENT
 from vrw_jax.tuning import tune
+from vrw_jax.tuning.climbing import slack_scales
 from vrw_jax.tuning.problem import TuneProblem, tuning_problem
 from vrw_jax.wheel import wheel_of
 
@@ -204,7 +205,7 @@ def compared(problem: TuneProblem, n_starts: int, rows: list[dict], name: str) -
     values = values_of(problem)
     starts = starts_of(problem, values, n_starts)
     # What a constraint changes over the box makes breaches comparable; once, at the config's wheel.
-    scales = problem.scales(problem.start())
+    scales = slack_scales(problem.start())
     seen: dict[str, list[Seen]] = {"tune": [by_tune(problem, u, scales) for u in starts]}
     for method, run in OTHERS.items():
         seen[method] = [

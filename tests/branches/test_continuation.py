@@ -321,7 +321,7 @@ def test_a_rigid_wheel_is_followed_by_its_own_step():
 
 
 def test_what_is_asked_wrongly_is_said_in_a_sentence():
-    with pytest.raises(ValueError, match="no parameter: choose from"):
+    with pytest.raises(ValueError, match=r"no parameter \(did you mean 'damping'\?\): choose from"):
         vrw.continue_branch(vrw.WheelParams(), "damp", (50.0, 100.0))
     with pytest.raises(ValueError, match="the lower must come first"):
         vrw.continue_branch(vrw.WheelParams(), "damping", (100.0, 50.0))

@@ -10,7 +10,7 @@ import xarray as xr
 
 from vrw_jax import figures
 from vrw_jax.branches import Branch
-from vrw_jax.results import MEASURES, as_markdown, what_breaks
+from vrw_jax.results import MEASURES, as_markdown, measure_of, what_breaks
 from vrw_jax.tuning import Tuned
 from vrw_jax.wheel import DOMAINS, PARAMETER_NAMES
 
@@ -59,10 +59,7 @@ def _wheel_toml(tuned: Tuned) -> str:
 
 def tuned_summary(tuned: Tuned) -> str:
     """The result for a reader, in Markdown."""
-    held = [
-        (a.name, f"{a.limit:.6g} {'' if a.unit == '1' else a.unit}".strip(), f"{a.price:.4g}")
-        for a in tuned.active
-    ]
+    held = [(a.name, measure_of(a.name).text(a.limit), f"{a.price:.4g}") for a in tuned.active]
     moved = [
         (name, f"{float(tuned.path[name][0]):.6g}", f"{float(getattr(tuned.params, name)):.6g}",
          MEASURES[name].plain_unit)

@@ -92,8 +92,8 @@ class Branch:
     def __str__(self) -> str:
         if not self.values.size:
             return f"Branch along {self.parameter}: none. {self.outcome.meaning}"
-        unit = MEASURES[self.parameter].unit if self.parameter in MEASURES else "1"
-        unit = "" if unit == "1" else f" {unit}"
+        known = self.parameter in MEASURES
+        unit = f" {MEASURES[self.parameter].plain_unit}".rstrip() if known else ""
         stable = self.stable
         lines = [
             f"Branch along {self.parameter}: {self.values.size} gaits from {self.values[0]:.6g} to "

@@ -7,9 +7,9 @@ so that it is as exact as the gaits are.
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -18,8 +18,8 @@ import numpy as np
 from jaxtyping import Array
 
 from vrw_jax.branches.branch import Branch
-from vrw_jax.branches.followed import AbstractFollowedWheel, Wheel, gait_measures
-from vrw_jax.branches.run import IN_SEQUENCE, Read, Run, Strand, Table, run_all
+from vrw_jax.branches.followed import Wheel, gait_measures
+from vrw_jax.branches.run import IN_SEQUENCE, AbstractRun, Strand, Table, run_all
 from vrw_jax.branches.starts import STARTS, Wanted, start_by_walking
 from vrw_jax.cycles import AGREEMENT, CycleOptions, LimitCycle, WalkedCycle
 from vrw_jax.models import AbstractWheel, refuse_ladder
@@ -31,7 +31,17 @@ from vrw_jax.numerics import (
     as_float_array,
     multipliers,
 )
-from vrw_jax.results import CYCLE, GROUND, MARGINS, STEP, attrs_of, provenance
+from vrw_jax.results import (
+    CYCLE,
+    GROUND,
+    MARGINS,
+    STEP,
+    attrs_of,
+    locked_legs,
+    provenance,
+    require_known,
+    variables,
+)
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.walks import rung_of
 from vrw_jax.wheel import FRICTION, Outcome, WheelParams
@@ -40,19 +50,10 @@ INDICATORS = ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
 ENDING = (*INDICATORS, "duration_dls", "duration_sls1", "duration_sls2")
 """Where one of these reaches zero the order of events changes, and the branch ends."""
 
-EXACT = {"clearance_sls1": "takeoff_acceleration"}
-"""A monitor that vanishes like a cube, and the quantity that vanishes with it like a line: a foot
-that leaves the ground ever less steeply dips ever less deep, until it rises at once. The last of
-those dips no step of a solver shows, but the line has its sign on both sides."""
-
 
 @eqx.filter_jit
 def _read_gaits(
-    followed: AbstractFollowedWheel,
-    model: AbstractWheel,
-    options: Options,
-    wheels: Wheel,
-    points: PathPoint,
+    followed: Any, model: AbstractWheel, options: Options, wheels: Wheel, points: PathPoint
 ) -> dict[str, Array]:
     def one(wheel: Wheel, z: Any, p: Array) -> dict[str, Array]:
         x, beyond = followed.read(wheel, z, p)
@@ -63,18 +64,39 @@ def _read_gaits(
     return jax.vmap(one)(wheels, points.z, points.p)
 
 
-def _kept(table: Table) -> np.ndarray:
-    return (table["outcome"] == Outcome.STEPPED) & (table["closure"] <= AGREEMENT)
+@dataclass(frozen=True)
+class _GaitRun(AbstractRun):
+    """Of gaits: read by event-driven steps, kept where these go on and come back."""
 
+    model: AbstractWheel
+    step_options: Options
+    n_legs: int
 
-def _is_margin(name: str) -> bool:
-    return name in INDICATORS or name.partition("[")[0] in MARGINS
+    ending: ClassVar[tuple[str, ...]] = ENDING
+    exact: ClassVar[Mapping[str, str]] = {"clearance_sls1": "takeoff_acceleration"}
+    """A monitor that vanishes like a cube, and the quantity that vanishes with it like a line: a
+    foot that leaves the ground ever less steeply dips ever less deep, until it rises at once. The
+    last of those dips no step of a solver shows, but the line has its sign on both sides."""
 
+    def read(self, wheels: Wheel, points: PathPoint) -> Table:
+        """One column more for each leg of a margin that has several."""
+        found = _read_gaits(self.followed, self.model, self.step_options, wheels, points)
+        table = jax.tree.map(np.asarray, found)
+        for name, margin in MARGINS.items():
+            if margin.axis and name in table:
+                legs = enumerate(range(3, self.n_legs + 1))
+                table |= {f"{name}[{leg}]": table[name][:, i] for i, leg in legs}
+        return table
 
-def _name_of_loss(table: Table, place: int) -> str:
-    """What a step beyond the end of a branch says of it."""
-    outcome = Outcome(int(table["outcome"][place]))
-    return IN_SEQUENCE if outcome == Outcome.STEPPED else outcome.name.lower()
+    def kept(self, table: Table) -> np.ndarray:
+        return (table["outcome"] == Outcome.STEPPED) & (table["closure"] <= AGREEMENT)
+
+    def is_margin(self, name: str) -> bool:
+        return name in INDICATORS or name.partition("[")[0] in MARGINS
+
+    def name_of_loss(self, table: Table, place: int) -> str:
+        outcome = Outcome(int(table["outcome"][place]))
+        return IN_SEQUENCE if outcome == Outcome.STEPPED else outcome.name.lower()
 
 
 def continue_branch(
@@ -134,9 +156,7 @@ def continue_branches(
     """
     model = rung_of(model)
     refuse_ladder(model, "followed")
-    if name not in model.parameter_names:
-        known = ", ".join(model.parameter_names)
-        raise ValueError(f"{name!r} is no parameter: choose from {known}.")
+    require_known(name, model.parameter_names, "parameter")
     low, high = (float(b) for b in bounds)
     if not low < high:
         raise ValueError(f"bounds are ({low:g}, {high:g}), but the lower must come first.")
@@ -153,21 +173,9 @@ def continue_branches(
     wanted = Wanted(params, model, name, p, period_n, cycle_options, step_options)
     start = STARTS.get(model.rung, start_by_walking)(wanted, cycle)
 
-    def read(wheels: Any, points: PathPoint) -> Table:
-        found = _read_gaits(start.followed, model, step_options, wheels, points)
-        return jax.tree.map(np.asarray, found)
-
-    run = Run(
-        start.followed,
-        options,
-        start.wheels,
-        np.array([low, high]),
-        functools.partial(_by_leg, read, range(3, params.n_legs + 1)),
-        _kept,
-        _is_margin,
-        ENDING,
-        EXACT,
-        _name_of_loss,
+    limits = np.array([low, high])
+    run = _GaitRun(
+        start.followed, options, start.wheels, limits, model, step_options, params.n_legs
     )
     strands = run_all(run, start.z, p, start.outcomes == Outcome.STEPPED, start.make_cycle)
     one = lambda owner: jax.tree.map(lambda x: x[owner], params)
@@ -177,13 +185,8 @@ def continue_branches(
     )
 
 
-def _by_leg(read: Read, legs: range, wheels: Any, points: PathPoint) -> Table:
-    """The table of `read` with one more column for each leg of a margin that has several."""
-    table = read(wheels, points)
-    for name, margin in MARGINS.items():
-        if margin.axis and name in table:
-            table |= {f"{name}[{leg}]": table[name][:, i] for i, leg in enumerate(legs)}
-    return table
+UNTOLD = ("outcome", "solver_steps")
+"""Of the checking step, and not of a branch."""
 
 
 def _branch_of_gaits(
@@ -202,14 +205,8 @@ def _branch_of_gaits(
         code = Outcome.NO_CYCLE_FOUND if code == Outcome.STEPPED else code
         empty = xr.Dataset(coords={name: ("point", np.zeros(0))}, attrs=attrs)
         return Branch(name, empty, (), ("", ""), code)
-    skipped = ("outcome", "solver_steps")
-    data = {
-        key: xr.Variable(
-            ("point", "leg") if measure.axis else "point", strand.table[key], attrs_of(key)
-        )
-        for key, measure in (STEP | MARGINS | GROUND).items()
-        if key in strand.table and key not in skipped
-    }
+    asked = (name for name in STEP | MARGINS | GROUND if name not in UNTOLD)
+    data = variables({key: strand.table[key] for key in asked if key in strand.table}, "point")
     data["section_state"] = xr.Variable(
         ("point", "component"),
         strand.table["section_state"],
@@ -223,7 +220,7 @@ def _branch_of_gaits(
     labels = {
         name: xr.Variable("point", strand.points.p, attrs_of(name)),
         "component": _components(strand.table["section_state"].shape[-1], params.n_legs),
-        "leg": xr.Variable("leg", np.arange(3, params.n_legs + 1), {"long_name": "locked leg"}),
+        "leg": locked_legs(params.n_legs),
     }
     dataset = xr.Dataset(data | _stability(np.asarray(strand.points.jacobian)), labels, attrs)
     return Branch(name, dataset, strand.borders, strand.ends, Outcome.STEPPED)
@@ -254,6 +251,16 @@ def _stability(jacobians: np.ndarray) -> dict[str, xr.Variable]:
     }
 
 
+class _MapRun(AbstractRun):
+    """Of fixed points of any map."""
+
+    def read(self, wheels: Any, points: PathPoint) -> Table:
+        return {"x": np.asarray(points.z)}
+
+    def kept(self, table: Table) -> np.ndarray:
+        return np.asarray(np.isfinite(table["x"]).all(-1))
+
+
 def continue_map(
     function: Callable[[Any, Array, Array], Array],
     x: object,
@@ -274,15 +281,7 @@ def continue_map(
         raise ValueError(f"p is {p:g}, but the branch must start within ({low:g}, {high:g}).")
     options = ArclengthOptions() if options is None else options
     lead = lambda tree: jax.tree.map(lambda a: jnp.asarray(a, float)[None], tree)
-    run = Run(
-        MapFollowed(function),
-        options,
-        lead(constants),
-        np.array([low, high]),
-        lambda wheels, points: {"x": np.asarray(points.z)},
-        lambda table: np.asarray(np.isfinite(table["x"]).all(-1)),
-        lambda name: False,
-    )
+    run = _MapRun(MapFollowed(function), options, lead(constants), np.array([low, high]))
     (strand,) = run_all(
         run, lead(as_float_array(x)), lead(p), np.array([True]), lambda owner, point: None
     )

@@ -4,9 +4,11 @@ Several branches run side by side. First each is followed both ways; then the pl
 what it stands for are located and become its ends; then every other sign change on it.
 """
 
+import abc
 import functools
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -46,23 +48,38 @@ BRANCH_POINT = "branch_point"
 equations are singular, and the place is only as good as the steps are short."""
 
 Table = dict[str, np.ndarray]
-Read = Callable[[Any, PathPoint], Table]
-"""Named quantities over a batch of points, first axis, of the wheels given with the same axis."""
+"""Named quantities over a batch of points, first axis."""
 
 
-class Run(NamedTuple):
-    """One continuation of several wheels side by side."""
+@dataclass(frozen=True)
+class AbstractRun(abc.ABC):
+    """One continuation of several wheels side by side, and what is asked of its points."""
 
     followed: AbstractFollowed
     options: ArclengthOptions
     wheels: Any  # leading axis over wheels
     bounds: np.ndarray
-    read: Read  # what is not said by the Jacobian
-    kept: Callable[[Table], np.ndarray]  # which points are what they stand for, by their table
-    is_margin: Callable[[str], bool]  # whether a column's zero is a border collision
-    ending: tuple[str, ...] = ()  # columns whose zero ends a branch: the order of events changes
-    exact: Mapping[str, str] = {}  # a margin that vanishes ill, and what it stands and falls with
-    name_of_loss: Callable[[Table, int], str] = lambda table, place: IN_SEQUENCE
+
+    ending: ClassVar[tuple[str, ...]] = ()
+    """Columns whose zero ends a branch: the order of events changes."""
+    exact: ClassVar[Mapping[str, str]] = {}
+    """A margin that vanishes ill, and the column that it stands and falls with."""
+
+    @abc.abstractmethod
+    def read(self, wheels: Any, points: PathPoint) -> Table:
+        """What the Jacobian does not say, of the wheels with the same axis."""
+
+    @abc.abstractmethod
+    def kept(self, table: Table) -> np.ndarray:
+        """Which points are what they stand for, by their table."""
+
+    def is_margin(self, name: str) -> bool:
+        """Whether a column's zero is a border collision."""
+        return False
+
+    def name_of_loss(self, table: Table, place: int) -> str:
+        """What the first point beyond the end of a branch says of it."""
+        return IN_SEQUENCE
 
     def table(self, points: PathPoint, owners: np.ndarray) -> Table:
         """Every quantity at each point, bifurcation functions and IN_SEQUENCE included."""
@@ -164,7 +181,7 @@ class _Zero(NamedTuple):
     table: Table  # there
 
 
-def _zeros(run: Run, pieces: _Pieces, asked: list[tuple[int, int, str]]) -> list[_Zero]:
+def _zeros(run: AbstractRun, pieces: _Pieces, asked: list[tuple[int, int, str]]) -> list[_Zero]:
     """Each (left, right, quantity) whose sign differs between two points, located."""
     if not asked:
         return []
@@ -208,7 +225,7 @@ def _along(flags: np.ndarray, values: np.ndarray) -> np.ndarray:
     return flags.reshape(-1, *(1,) * (values.ndim - 1))
 
 
-def _collected(run: Run, tracks: arclength.Track) -> _Pieces:
+def _collected(run: AbstractRun, tracks: arclength.Track) -> _Pieces:
     """All points of all tracks, each wheel's two directions joined at its start."""
     parts, owners = [], []
     for wheel in range(tracks.n_points.shape[0]):
@@ -254,7 +271,9 @@ def _reaches(pieces: _Pieces, starts: Mapping[int, int]) -> list[_Reach]:
     return reaches
 
 
-def _located_ends(run: Run, pieces: _Pieces, reaches: list[_Reach]) -> dict[tuple[int, int], _Zero]:
+def _located_ends(
+    run: AbstractRun, pieces: _Pieces, reaches: list[_Reach]
+) -> dict[tuple[int, int], _Zero]:
     """Where each branch leaves its sequence, by (owner, end: 0 or 1): the nearest zero there."""
     asked, keys = [], []
     for reach in reaches:
@@ -299,7 +318,7 @@ def _with_ends(
     return _Pieces(_joined(*points), np.concatenate(owners), _joined(*tables))
 
 
-def _inner_zeros(run: Run, pieces: _Pieces) -> list[tuple[str, _Zero]]:
+def _inner_zeros(run: AbstractRun, pieces: _Pieces) -> list[tuple[str, _Zero]]:
     """Every quantity's sign changes between neighbours on the same branch, with its name."""
     skipped = (IN_SEQUENCE, *run.exact.values())
     names = [
@@ -322,7 +341,7 @@ def _inner_zeros(run: Run, pieces: _Pieces) -> list[tuple[str, _Zero]]:
     ]
 
 
-def _kind(run: Run, name: str) -> str:
+def _kind(run: AbstractRun, name: str) -> str:
     if name in (*BIFURCATIONS, BRANCH_POINT):
         return name
     return "border_collision" if run.is_margin(name) else "lost"
@@ -342,7 +361,7 @@ MakeCycle = Callable[[int, PathPoint], Callable[[], Any] | None]
 
 
 def run_all(
-    run: Run, z: Any, p: Array, found: np.ndarray, make_cycle: MakeCycle
+    run: AbstractRun, z: Any, p: Array, found: np.ndarray, make_cycle: MakeCycle
 ) -> list[Strand | None]:
     """Follow, locate, and sort by wheel; None where there was no start."""
     bounds = jnp.asarray(run.bounds)

@@ -18,7 +18,7 @@ import numpy as np
 
 from vrw_jax.models import SectionState, ViscoelasticWheel
 from vrw_jax.numerics import Options
-from vrw_jax.results import MARGINS, STEP, attrs_of, provenance
+from vrw_jax.results import MARGINS, STEP, attrs_of, locked_legs, provenance, variables
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.walks import step, walk
 from vrw_jax.wheel import Outcome, WheelParams
@@ -137,10 +137,7 @@ def _extrapolated(
 def _table(
     params: WheelParams, name: str, values: Sequence[float], columns: dict[str, np.ndarray]
 ) -> xr.Dataset:
-    data = {
-        key: xr.Variable((name, "leg") if measure.axis else name, columns[key], attrs_of(key))
-        for key, measure in (STEP | MARGINS).items()
-    }
+    data = variables({key: columns[key] for key in STEP | MARGINS}, name)
     told = {"units": "1", "long_name": "largest change of the last five steps"}
     data |= {
         "section_state": xr.Variable(
@@ -154,7 +151,7 @@ def _table(
     labels = {
         name: xr.Variable(name, np.asarray(values, float), attrs_of(name)),
         "component": ["theta", "dtheta", "dL1"],
-        "leg": xr.Variable("leg", np.arange(3, params.n_legs + 1), {"long_name": "locked leg"}),
+        "leg": locked_legs(params.n_legs),
     }
     origin = provenance(params, paper_wheel(), Options())
     origin.pop(f"parameter_{name}")

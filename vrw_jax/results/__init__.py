@@ -11,8 +11,11 @@ from vrw_jax.results.measures import (
     TRAJECTORY,
     attrs_of,
     flags,
+    locked_legs,
+    measure_of,
+    variables,
     what_breaks,
 )
 from vrw_jax.results.origin import provenance
 from vrw_jax.results.text import Row, as_html, as_markdown, as_tex, as_text, is_concrete, listed
-from vrw_jax.results.wording import nearest
+from vrw_jax.results.wording import nearest, require_known

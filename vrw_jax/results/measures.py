@@ -4,12 +4,15 @@ Every labelled result takes its units and long names from here, so that a scan, 
 figure name the same thing alike. Frame: x downhill along the slope, z normal to it.
 """
 
-from collections.abc import Iterable
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from vrw_jax.results.text import as_tex
+from vrw_jax.runtime import xarray as xr
 from vrw_jax.wheel import DOMAINS, Outcome
 
 
@@ -256,6 +259,23 @@ def flags(names: Iterable[str]) -> dict[str, object]:
     """CF attributes of an integer variable whose values 0, 1, ... have names."""
     names = [name.replace(" ", "_") for name in names]
     return {"flag_values": list(range(len(names))), "flag_meanings": " ".join(names)}
+
+
+def measure_of(name: str) -> Measure:
+    """The measure that a number belongs to; its name may end in its leg, as "[5]"."""
+    return MEASURES[name.partition("[")[0]]
+
+
+def variables(columns: Mapping[str, np.ndarray], along: str) -> dict[str, xr.Variable]:
+    """Measures over one dimension, labelled; those of the locked legs have `leg` beside it."""
+    dims = lambda name: (along, MEASURES[name].axis) if MEASURES[name].axis else along
+    return {name: xr.Variable(dims(name), x, attrs_of(name)) for name, x in columns.items()}
+
+
+def locked_legs(n_legs: int) -> xr.Variable:
+    """The coordinate `leg` of margins of legs 3..n."""
+    attrs = {"long_name": "locked leg", "units": "1"}
+    return xr.Variable("leg", np.arange(3, n_legs + 1), attrs)
 
 
 def what_breaks(name: str) -> str:

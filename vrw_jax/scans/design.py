@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vrw_jax.results import nearest
+from vrw_jax.results import require_known
 from vrw_jax.wheel import FRICTION, PARAMETER_NAMES
 
 Columns = dict[str, np.ndarray]
@@ -218,11 +218,7 @@ def _known(values: Mapping[str, object]) -> Mapping:
             f"choose from {', '.join(SWEPT)}."
         )
     for name in values:
-        if name not in SWEPT:
-            raise ValueError(
-                f"{name!r} is no parameter that can be swept{nearest(name, SWEPT)}: "
-                f"choose from {', '.join(SWEPT)}."
-            )
+        require_known(name, SWEPT, "parameter that can be swept")
     return values
 
 

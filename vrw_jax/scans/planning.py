@@ -14,7 +14,7 @@ import numpy as np
 from vrw_jax.cycles import CycleOptions
 from vrw_jax.models import AbstractWheel, ViscoelasticWheel
 from vrw_jax.numerics import Options, solver_named
-from vrw_jax.results import MARGINS, attrs_of, provenance
+from vrw_jax.results import MARGINS, attrs_of, locked_legs, provenance
 from vrw_jax.runtime import code_digest
 from vrw_jax.scans.design import AbstractDesign, Columns
 from vrw_jax.scans.evaluate import Engine
@@ -198,7 +198,7 @@ def _layout(
     design: AbstractDesign, names: tuple[str, ...], base: WheelParams, chunk: int
 ) -> Layout:
     dtype = str(base.damping.dtype)
-    legs = np.arange(3, base.n_legs + 1)
+    legs = locked_legs(base.n_legs)
 
     def variable(name: str) -> Variable:
         attrs = variable_attrs(name)
@@ -207,14 +207,14 @@ def _layout(
         if name == "solver_steps":
             return Variable(name, "int32", -1, attrs)
         if name in MARGINS and MARGINS[name].axis:
-            return Variable(name, dtype, np.nan, attrs, ("leg",), (len(legs),))
+            return Variable(name, dtype, np.nan, attrs, ("leg",), legs.shape)
         return Variable(name, dtype, np.nan, attrs)
 
     coordinates = {
         name: (dim, values, attrs_of(name) if name in (*PARAMETER_NAMES, FRICTION) else {})
         for name, (dim, values) in design.coordinates().items()
     }
-    coordinates["leg"] = ("leg", legs, {"long_name": "locked leg", "units": "1"})
+    coordinates["leg"] = ("leg", legs.values, legs.attrs)
     return Layout(
         dims=design.dims,
         shape=design.shape,

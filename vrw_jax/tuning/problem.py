@@ -27,14 +27,22 @@ from vrw_jax.cycles import (
 )
 from vrw_jax.models import AbstractWheel, refuse_ladder
 from vrw_jax.numerics import Options
-from vrw_jax.results import MARGINS, MEASURES, attrs_of, flags, nearest, provenance
+from vrw_jax.results import (
+    MARGINS,
+    MEASURES,
+    attrs_of,
+    flags,
+    measure_of,
+    provenance,
+    require_known,
+)
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.tuning.climbing import Climb, Kind, Trial, breach, climb, optimality, slack_scales
 from vrw_jax.tuning.objective import Engine, Evaluated, OfCycle, Reader, Sought, Weighted
 from vrw_jax.tuning.result import Active, Tuned, Walked
 from vrw_jax.tuning.starts import Lanes, explore
 from vrw_jax.walks import rung_of
-from vrw_jax.wheel import DOMAINS, PARAMETER_NAMES, Outcome, WheelParams
+from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams
 
 Objective = str | Mapping[str, float] | Callable[..., Array]
 Margins = Mapping[str, float] | Sequence[str]
@@ -116,11 +124,16 @@ class TuneProblem:
         return self.upper - self.lower
 
     @property
+    def moved(self) -> list[int]:
+        """Places of the free parameters among all."""
+        return [PARAMETER_NAMES.index(name) for name in self.free]
+
+    @property
     def constraint_names(self) -> tuple[str, ...]:
         """One name for each number that is constrained: monitors of the locked legs have six."""
         names: list[str] = []
         for name in self.margins:
-            if name in MARGINS and MARGINS[name].axis:
+            if MEASURES[name].axis:
                 names += [f"{name}[leg {leg}]" for leg in range(3, self.params.n_legs + 1)]
             else:
                 names.append(name)
@@ -129,12 +142,12 @@ class TuneProblem:
     @property
     def least(self) -> np.ndarray:
         """Margins, one for each of `constraint_names`."""
-        return np.array([self.margins[name.split("[")[0]] for name in self.constraint_names])
+        return np.array([self.margins[measure_of(name).name] for name in self.constraint_names])
 
     def parameters(self, u: np.ndarray) -> np.ndarray:
         """All float parameters where the free ones are `u` widths above their lower bounds."""
         values = np.array(self.finder.model.values(self.params))
-        values[[PARAMETER_NAMES.index(name) for name in self.free]] = self.lower + u * self.widths
+        values[self.moved] = self.lower + u * self.widths
         return values
 
     def wheel(self, u: np.ndarray) -> WheelParams:
@@ -156,10 +169,6 @@ class TuneProblem:
             )
         return trial
 
-    def scales(self, trial: Trial) -> np.ndarray:
-        """What each constraint changes over the bounds, by its slope at a gait."""
-        return slack_scales(trial)
-
     def evaluate(self, u: np.ndarray, near: Trial | None) -> Trial:
         """The gait at `u`, from a neighbour's gait if one is given."""
         parameters = jnp.asarray(self.parameters(u))
@@ -175,8 +184,7 @@ class TuneProblem:
     def trial(self, u: np.ndarray, told: Evaluated, outcome: Outcome, on_branch: bool) -> Trial:
         """What a gait says about objective and constraints."""
         values = np.array(told.values)
-        indices = [PARAMETER_NAMES.index(name) for name in self.free]
-        slopes = np.array(told.columns)[indices].T * self.widths
+        slopes = np.array(told.columns)[self.moved].T * self.widths
         if outcome != Outcome.STEPPED:
             values, slopes = np.full_like(values, np.nan), np.full_like(slopes, np.nan)
         return Trial(
@@ -191,7 +199,7 @@ class TuneProblem:
             self._batch,
             np.vstack([self.start_u, others]),
             self._change,
-            [PARAMETER_NAMES.index(name) for name in self.free],
+            self.moved,
             self.widths,
             self.least,
             N_EXPLORED,
@@ -211,7 +219,7 @@ class TuneProblem:
     def _change(self, difference: np.ndarray) -> np.ndarray:
         """Differences of all parameters by differences of u, row by row."""
         change = np.zeros((difference.shape[0], len(self.finder.model.parameter_names)))
-        change[:, [PARAMETER_NAMES.index(name) for name in self.free]] = difference * self.widths
+        change[:, self.moved] = difference * self.widths
         return change
 
     def result(
@@ -224,7 +232,7 @@ class TuneProblem:
         params = self.wheel(best.u)
         conditions = optimality(best)
         active = [
-            Active(name, float(limit), MEASURES[name.split("[")[0]].unit, float(price))
+            Active(name, float(limit), measure_of(name).unit, float(price))
             for name, limit, price in zip(
                 self.constraint_names, self.least, conditions.prices, strict=True
             )
@@ -236,8 +244,8 @@ class TuneProblem:
                 self.free, limits, prices, self.widths, strict=True
             ):
                 if price > 0.0:
-                    unit = DOMAINS[name].unit or "1"
-                    active.append(Active(name, float(limit), unit, float(price / width)))
+                    unit, cost = measure_of(name).unit, float(price / width)
+                    active.append(Active(name, float(limit), unit, cost))
         climbed = time.perf_counter()
         walked = self._walk(params, gait)
         told = gait.step.measures()
@@ -289,7 +297,7 @@ class TuneProblem:
         values = self.lower + u * self.widths
         least = self.least
         constraints = np.array([trial.slack + least for trial in done.trials])
-        scales = self.scales(done.trials[0])
+        scales = slack_scales(done.trials[0])
         outcomes = [
             trial.outcome if trial.on_branch else Outcome.NO_CYCLE_FOUND for trial in done.trials
         ]
@@ -309,7 +317,7 @@ class TuneProblem:
             "outcome": (along, np.array(outcomes, int), attrs_of("outcome")),
             "on_branch": (along, np.array([t.on_branch for t in done.trials])),
         }
-        units = [MEASURES[name.split("[")[0]].unit for name in self.constraint_names]
+        units = [measure_of(name).unit for name in self.constraint_names]
         labels = {
             along: np.arange(len(u)),
             "constraint": list(self.constraint_names),
@@ -379,22 +387,14 @@ def _objective(objective: Objective, finder: AbstractGaitFinder) -> tuple[Reader
             'give a measure such as "dls_fraction".'
         )
     for name in weights:
-        _known(name, "objective", finder.readable)
-        if name in MARGINS and MARGINS[name].axis:
+        require_known(name, finder.readable, "measure for objective")
+        if MEASURES[name].axis:
             raise ValueError(
                 f"{name} has one value for each locked leg, but an objective is one number: "
                 "give a function of the cycle and the step that reduces it."
             )
     label = " + ".join(n if w == 1.0 else f"{w:g} {n}" for n, w in weights.items())
     return Weighted(type(finder).read, tuple(weights.items())), label.replace("+ -", "- ")
-
-
-def _known(name: str, what: str, readable: tuple[str, ...]) -> None:
-    if name not in readable:
-        raise ValueError(
-            f"{name!r} is no measure for {what}{nearest(name, readable)}: "
-            f"choose from {', '.join(readable)}."
-        )
 
 
 def _bounds(
@@ -407,11 +407,7 @@ def _bounds(
             f"{', '.join(PARAMETER_NAMES)}."
         )
     for name in (*names, *bounds):
-        if name not in PARAMETER_NAMES:
-            raise ValueError(
-                f"{name!r} is no parameter of the wheel{nearest(name, PARAMETER_NAMES)}: "
-                f"choose from {', '.join(PARAMETER_NAMES)}."
-            )
+        require_known(name, PARAMETER_NAMES, "parameter of the wheel")
     for name in bounds:
         if name not in names:
             raise ValueError(f"bounds holds {name!r}, but it is not free: add it to free.")
@@ -449,7 +445,7 @@ def _margins(
         # It has a slope where the clearance has none.
         margins.setdefault("takeoff_acceleration", 0.0)
     for name, least in margins.items():
-        _known(name, "a constraint", finder.readable)
+        require_known(name, finder.readable, "measure for a constraint")
         if not math.isfinite(least):
             raise ValueError(f"the margin of {name} is {least}, but it must be a finite number.")
     return margins

@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, NamedTuple
 
-from vrw_jax.results import as_html, as_text
+from vrw_jax.results import MEASURES, as_html, as_text, measure_of
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.tuning.climbing import Ending
 from vrw_jax.tuning.starts import Lanes
-from vrw_jax.wheel import DOMAINS, Outcome, WheelParams
+from vrw_jax.wheel import Outcome, WheelParams
 
 
 class Active(NamedTuple):
@@ -59,13 +59,11 @@ class Tuned:
 
     def lines(self) -> dict[str, str]:
         """The result in words, for a reader."""
-        free = [str(name) for name in self.path.attrs["free"]]
-        wheel = [
-            f"{n} {float(getattr(self.params, n)):.6g} {DOMAINS[n].unit}".strip() for n in free
-        ]
+        free = self.path.attrs["free"]
+        wheel = [f"{n} {MEASURES[n].text(getattr(self.params, n))}" for n in free]
         kept = "every constraint kept" if self.walked.kept else "a constraint broken"
         kept = kept if self.path.sizes["constraint"] else "no constraint to keep"
-        held = [f"{a.name} at {a.limit:.6g} {_plain(a.unit)}".strip() for a in self.active]
+        held = [f"{a.name} at {measure_of(a.name).text(a.limit)}" for a in self.active]
         return {
             "objective": f"{self.objective}: {self.start_value:.6g} at the start, {self.value:.6g}",
             "wheel": ", ".join(wheel),
@@ -84,7 +82,3 @@ class Tuned:
 
     def _repr_html_(self) -> str:
         return as_html("Tuned gait", self.lines().items())
-
-
-def _plain(unit: str) -> str:
-    return "" if unit == "1" else unit
