@@ -16,6 +16,7 @@ from vrw_jax.numerics.arclength import (
     Section,
     Unknown,
 )
+from vrw_jax.numerics.codes import Code
 from vrw_jax.numerics.collocation import (
     Constants,
     Linearised,

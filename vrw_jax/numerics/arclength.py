@@ -9,7 +9,6 @@ Lengths are measured in the section's numbers and in the parameter as a share of
 
 import abc
 import dataclasses
-import enum
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -19,6 +18,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from vrw_jax.numerics.codes import Code
 from vrw_jax.numerics.derivatives import with_jacobian
 from vrw_jax.numerics.lanes import select
 from vrw_jax.numerics.types import Scalar
@@ -117,30 +117,15 @@ class MapFollowed(AbstractFollowed):
         return z
 
 
-class Ending(enum.IntEnum):
+class Ending(Code):
     """Why a branch was followed no further in one direction."""
 
-    GOING = 0
-    RANGE_ENDED = 1
-    LEFT_SEQUENCE = 2
-    STALLED = 3
-    BUFFER_FULL = 4
-    NO_START = 5
-
-    @property
-    def meaning(self) -> str:
-        """One sentence for a reader."""
-        return _MEANINGS[self]
-
-
-_MEANINGS = {
-    Ending.GOING: "It was still being followed.",
-    Ending.RANGE_ENDED: "The parameter's range ended.",
-    Ending.LEFT_SEQUENCE: "Its points no longer are what they stand for.",
-    Ending.STALLED: "Newton's method found no next point, however short the step.",
-    Ending.BUFFER_FULL: "It has as many points as were allowed: raise max_points.",
-    Ending.NO_START: "No point was found to start from.",
-}
+    GOING = 0, "It was still being followed."
+    RANGE_ENDED = 1, "The parameter's range ended."
+    LEFT_SEQUENCE = 2, "Its points no longer are what they stand for."
+    STALLED = 3, "Newton's method found no next point, however short the step."
+    BUFFER_FULL = 4, "It has as many points as were allowed: raise max_points."
+    NO_START = 5, "No point was found to start from."
 
 
 class PathPoint(NamedTuple):

@@ -1,6 +1,5 @@
 """Contacts that push or open: all answers of a linear complementarity problem, by enumeration."""
 
-import enum
 import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -11,28 +10,18 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
+from vrw_jax.numerics.codes import Code
+
 MOST_CONTACTS = 10
 """Two to the power of that many combinations are solved."""
 
 
-class Answers(enum.IntEnum):
+class Answers(Code):
     """How many answers there are."""
 
-    NONE = 0
-    ONE = 1
-    SEVERAL = 2
-
-    @property
-    def meaning(self) -> str:
-        """One sentence for a reader."""
-        return _MEANINGS[self]
-
-
-_MEANINGS = {
-    Answers.NONE: "No force fits: a rigid body would have to jump at once.",
-    Answers.ONE: "One answer.",
-    Answers.SEVERAL: "Several answers fit: the law of contact does not choose.",
-}
+    NONE = 0, "No force fits: a rigid body would have to jump at once."
+    ONE = 1, "One answer."
+    SEVERAL = 2, "Several answers fit: the law of contact does not choose."
 
 
 class Contact(NamedTuple):

@@ -7,7 +7,6 @@ What is wrong with a mode's shapes is one sentence at the edge; what goes wrong 
 code, `Stop`, with all events before it.
 """
 
-import enum
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -18,6 +17,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
+from vrw_jax.numerics.codes import Code
 from vrw_jax.numerics.events import Field, PhaseEnd, integrate_phase
 from vrw_jax.numerics.minima import State, Watched
 from vrw_jax.numerics.options import Options
@@ -39,30 +39,15 @@ class Mode(NamedTuple):
     guards: tuple[Guard, ...]
 
 
-class Stop(enum.IntEnum):
+class Stop(Code):
     """Why a walk ended."""
 
-    EVENTS_DONE = 0
-    TIME_OVER = 1
-    EVENTS_PILE_UP = 2
-    GUARD_PAST = 3
-    STEPS_SPENT = 4
-    STUCK = 5
-
-    @property
-    def meaning(self) -> str:
-        """One sentence for a reader."""
-        return _MEANINGS[self]
-
-
-_MEANINGS = {
-    Stop.EVENTS_DONE: "It has as many events as were asked for.",
-    Stop.TIME_OVER: "No guard ended the mode within Options.max_phase_time.",
-    Stop.EVENTS_PILE_UP: "Events follow each other so fast that the clock no longer moves (Zeno).",
-    Stop.GUARD_PAST: "A mode begins with a guard below zero: begin on it or inside, or elsewhere.",
-    Stop.STEPS_SPENT: "The solver's steps are spent: raise Options.max_solver_steps.",
-    Stop.STUCK: "The solver's steps became too short, or no event settled: the field is singular.",
-}
+    EVENTS_DONE = 0, "It has as many events as were asked for."
+    TIME_OVER = 1, "No guard ended the mode within Options.max_phase_time."
+    EVENTS_PILE_UP = 2, "Events follow each other so fast that the clock no longer moves (Zeno)."
+    GUARD_PAST = 3, "A mode begins with a guard below zero: begin on it or inside, or elsewhere."
+    STEPS_SPENT = 4, "The solver's steps are spent: raise Options.max_solver_steps."
+    STUCK = 5, "The solver's steps became too short, or no event settled: the field is singular."
 
 
 class Walk(NamedTuple):

@@ -12,30 +12,18 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vrw_jax.numerics import Code
 from vrw_jax.tuning.objective import Evaluated
 from vrw_jax.wheel import Outcome
 
 
-class Ending(enum.IntEnum):
+class Ending(Code):
     """How a climb ended."""
 
-    CONVERGED = 0
-    AT_A_BORDER = 1
-    OUT_OF_EVALUATIONS = 2
-    NO_FEASIBLE_GAIT = 3
-
-    @property
-    def meaning(self) -> str:
-        """One sentence for a reader."""
-        return _MEANINGS[self]
-
-
-_MEANINGS = {
-    Ending.CONVERGED: "The gait can't be improved nearby without breaking a constraint.",
-    Ending.AT_A_BORDER: "The branch ends here: every smaller step on lost the gait.",
-    Ending.OUT_OF_EVALUATIONS: "The allowed number of gaits was spent before it converged.",
-    Ending.NO_FEASIBLE_GAIT: "No gait that keeps every constraint was found from this start.",
-}
+    CONVERGED = 0, "The gait can't be improved nearby without breaking a constraint."
+    AT_A_BORDER = 1, "The branch ends here: every smaller step on lost the gait."
+    OUT_OF_EVALUATIONS = 2, "The allowed number of gaits was spent before it converged."
+    NO_FEASIBLE_GAIT = 3, "No gait that keeps every constraint was found from this start."
 
 
 class Kind(enum.IntEnum):
