@@ -1,6 +1,7 @@
 """What quantities are called and how results show themselves."""
 
 from vrw_jax.results.measures import (
+    CONTACTS,
     CYCLE,
     GROUND,
     MARGINS,

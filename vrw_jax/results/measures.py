@@ -29,7 +29,7 @@ class Measure:
     long_name: str
     description: str
     equation: str = ""
-    axis: str = ""  # "leg": one value for each of the locked legs 3..n
+    axis: str = ""  # "leg": one value for each of the locked legs 3..n, of `CONTACTS` for each leg
     breaks: str = ""
 
     @property
@@ -239,6 +239,21 @@ TRAJECTORY = _table(
 )
 """Coordinates and variables of a trajectory."""
 
+CONTACTS = _table(
+    Measure("length", "m", "L", "length of the leg", "Of each leg.", axis="leg"),
+    Measure("length_rate", "m/s", "L̇", "rate of the leg's length", "Of each leg.", axis="leg"),
+    Measure("foot_x", "m", "x", "foot along the slope", "Downhill position.", axis="leg"),
+    Measure("foot_z", "m", "z", "foot above the slope", "Height.", axis="leg"),
+    Measure("tangential", "N", "λ_t", "tangential force on the foot", "Downhill positive.",
+            axis="leg"),
+    Measure("normal", "N", "λ_n", "normal force on the foot", "Positive when it pushes.",
+            axis="leg"),
+    Measure("contact", "1", "contact", "contact mode of the foot", "Of each leg.", axis="leg"),
+    Measure("on_stopper", "1", "on stopper", "whether the leg is on its stopper", "Of each leg.",
+            axis="leg"),
+)
+"""Variables of a trajectory on real ground, of each leg 1..n."""
+
 # fmt: on
 PARAMETERS = _table(
     *(
@@ -248,7 +263,7 @@ PARAMETERS = _table(
 )
 """The wheel's parameters, for the axes of a scan."""
 
-MEASURES: dict[str, Measure] = STEP | MARGINS | GROUND | CYCLE | TRAJECTORY | PARAMETERS
+MEASURES: dict[str, Measure] = STEP | MARGINS | GROUND | CYCLE | TRAJECTORY | CONTACTS | PARAMETERS
 """Every quantity by name."""
 
 PHASES: tuple[str, ...] = ("DLS", "SLS-I", "SLS-II")
@@ -292,6 +307,8 @@ def attrs_of(name: str) -> dict[str, object]:
     attrs: dict[str, object] = dict(MEASURES[name].attrs)
     if name == "phase":
         attrs |= flags(PHASES)
+    if name == "contact":
+        attrs |= flags(("in the air", "at rest", "sliding downhill", "sliding uphill"))
     if name == "outcome":
         attrs |= flags(outcome.name for outcome in Outcome)
     return attrs

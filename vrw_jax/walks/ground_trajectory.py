@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Array
 
 from vrw_jax.models import (
-    SERVED,
     State,
     UnilateralTrajectory,
     directions,
@@ -24,30 +23,12 @@ from vrw_jax.models import (
     unpack,
 )
 from vrw_jax.numerics import Options
-from vrw_jax.runtime import xarray as xr
-from vrw_jax.walks.samples import Joined, Stretches, joined
+from vrw_jax.results import CONTACTS
+from vrw_jax.walks.samples import Stretches, Telling
 from vrw_jax.wheel import Outcome, WheelParams
 
-LEGWISE = {  # unit, long name
-    "length": ("m", "length of the leg"),
-    "length_rate": ("m/s", "rate of the leg's length"),
-    "foot_x": ("m", "downhill position of the foot"),
-    "foot_z": ("m", "height of the foot above the slope"),
-    "tangential": ("N", "tangential force on the foot, downhill positive"),
-    "normal": ("N", "normal force on the foot"),
-    "contact": ("1", "contact mode of the foot"),
-    "on_stopper": ("1", "whether the leg is on its stopper"),
-}
-SCALAR = {
-    "hub_x": ("m", "downhill position of the hub"),
-    "hub_z": ("m", "height of the hub above the slope"),
-    "theta": ("rad", "angle of Leg 1 from the slope's normal"),
-    "dtheta": ("rad/s", "angular rate"),
-    "kinetic_energy": ("J", "kinetic energy"),
-    "gravitational_energy": ("J", "gravitational energy, from the first landing's place"),
-    "elastic_energy": ("J", "elastic energy of all springs"),
-}
-MODES = "in_the_air at_rest sliding_downhill sliding_uphill"
+OF_WALK = ("time", "step", "hub_x", "hub_z", "theta", "dtheta")
+ENERGIES = ("kinetic_energy", "gravitational_energy", "elastic_energy")
 
 
 @eqx.filter_jit
@@ -83,27 +64,16 @@ def _columns(
     return trace, told | {"tangential": trace.tangential, "normal": trace.normal}
 
 
-def simulate_ground(
-    params: WheelParams,
-    x: Array,
-    n_steps: int,
-    *,
-    model: Any,
-    options: Options,
-    n_samples: int,
-) -> xr.Dataset:
-    """Walk `n_steps` steps as a trajectory over time and leg; legs bear the labels of their step.
+def over_contacts(params: WheelParams, model: Any, options: Options, n_samples: int) -> Telling:
+    """Steps over time and leg; legs bear the labels of their step.
 
-    Each stretch between two events has `n_samples` times, both ends included. A step that fails
-    ends the trajectory; the attributes `outcome` and `outcome_meaning` say why. Of the ladder,
+    Each stretch between two events has `n_samples` times, both ends included. Of the ladder,
     `rung` and `reason` say for each time which rung served and why (see `ModelChoice`).
     """
-    served: dict[str, Array] = {}
 
     def stretches(x: Array) -> Stretches:
         result = model.step(params, x, options)
         trace, columns = jax.tree.map(np.array, _columns(model, params, x, options, n_samples))
-        served.update(result.served())
         shape = (len(trace.duration), n_samples)
         over_samples = lambda legs: np.repeat(legs[:, None], n_samples, axis=1)
         columns |= {"time": trace.time, "contact": over_samples(trace.contact)}
@@ -118,36 +88,10 @@ def simulate_ground(
             float(result.step_length),
         )
 
-    s = params.symbols()
-    told = joined(
-        stretches, x, n_steps, ("hub_x", "foot_x"), ("gravitational_energy",),
-        float(s.Mt * s.g * s.sin_phi),
-    )  # fmt: skip
-    variables = {
-        name: xr.Variable(dims, told.columns[name], {"units": unit, "long_name": long_name})
-        for dims, table in ((("time",), SCALAR), (("time", "leg"), LEGWISE))
-        for name, (unit, long_name) in table.items()
-    }
-    variables["contact"].attrs |= {"flag_values": [0, 1, 2, 3], "flag_meanings": MODES}
-    variables |= {name: xr.Variable("time", told.columns[name], SERVED[name]) for name in served}
-    time = {"units": "s", "long_name": "time"}
-    return xr.Dataset(
-        variables,
-        {
-            "time": xr.Variable("time", told.columns["time"], time),
-            "step": xr.Variable("time", told.columns["step"], {"long_name": "number of the step"}),
-            "leg": np.arange(1, params.n_legs + 1),
-        },
-        _attrs(model, told),
-    )
-
-
-def _attrs(model: Any, told: Joined) -> dict[str, object]:
-    return {
-        "title": f"Walk of the {type(model).__name__}",
+    attrs: dict[str, object] = {
         "frame": "x downhill along the slope, z normal to it, first landing at the origin",
         "friction": float(model.friction),
-        "n_steps": told.n_stepped,
-        "outcome": told.outcome.name,
-        "outcome_meaning": told.outcome.meaning,
     }
+    names = (*OF_WALK, *ENERGIES, *CONTACTS)
+    legs = {"leg": np.arange(1, params.n_legs + 1)}
+    return Telling(stretches, names, ("hub_x", "foot_x"), legs, attrs)

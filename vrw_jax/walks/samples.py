@@ -1,7 +1,7 @@
 """Samples of steps, one after the other, as one trajectory."""
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Array
@@ -20,6 +20,16 @@ class Stretches(NamedTuple):
     length: float  # from this step's landing to the next, m
 
 
+class Telling(NamedTuple):
+    """How a rung's steps are sampled, and what of them is told."""
+
+    stretches_of: Callable[[Array], Stretches]  # of the step from a section state
+    names: tuple[str, ...]  # measures that are told over time
+    along: tuple[str, ...]  # of these, places along the slope
+    labels: dict[str, Any]  # coordinates beside those among the names
+    attrs: dict[str, object]
+
+
 class Joined(NamedTuple):
     """A walk, sampled."""
 
@@ -28,28 +38,25 @@ class Joined(NamedTuple):
     outcome: Outcome
 
 
-def joined(
-    stretches_of: Callable[[Array], Stretches],
-    x: Array,
-    n_steps: int,
-    along: Sequence[str],
-    falling: Sequence[str],
-    weight_along: float,
-) -> Joined:
+FALLING = ("gravitational_energy", "total_energy")
+"""Energies that count from the walk's first foot."""
+
+
+def joined(telling: Telling, x: Array, n_steps: int, weight_along: float) -> Joined:
     """Steps from the section state x, as many as it can.
 
-    Places `along` the slope, m, count from the first landing; `falling` energies, J, lose
+    Places along the slope, m, count from the first landing; energies that are `FALLING`, J, lose
     `weight_along`, N, times the way.
     """
     parts: list[dict[str, np.ndarray]] = []
     outcome, stepped, time, place = Outcome.STEPPED, 0, 0.0, 0.0
     while outcome == Outcome.STEPPED and stepped < n_steps:
-        told = stretches_of(x)
+        told = telling.stretches_of(x)
         for stretch in np.flatnonzero(told.durations > 0.0):
             part = {name: values[stretch].copy() for name, values in told.columns.items()}
-            for name in along:
+            for name in telling.along:
                 part[name] += place
-            for name in falling:
+            for name in part.keys() & FALLING:
                 part[name] -= weight_along * place
             part["time"] += time
             part["step"] = np.full(len(part["time"]), stepped)

@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from vrw_jax.models import AbstractWheel, SectionState
+from vrw_jax.models import SERVED, AbstractWheel, SectionState
 from vrw_jax.numerics import Options
-from vrw_jax.results import TRAJECTORY, attrs_of, provenance
+from vrw_jax.results import TRAJECTORY, provenance, variables
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.walks.ground_trajectory import simulate_ground
-from vrw_jax.walks.samples import Stretches, joined
+from vrw_jax.walks.ground_trajectory import over_contacts
+from vrw_jax.walks.samples import Stretches, Telling, joined
 from vrw_jax.walks.stepping import ModelLike, SectionLike, checked
 from vrw_jax.wheel import (
     Motion,
@@ -91,20 +91,28 @@ def simulate(
     if not n_samples >= 2:
         raise ValueError(f"n_samples is {n_samples}, but a phase has two ends: give 2 or more.")
     params, x, model, options = checked(params, x, model, options)
-    simulated = simulate_ground if model.tells_contacts else _simulate_phases
-    walked = simulated(params, x, n_steps, model=model, options=options, n_samples=n_samples)
-    return walked.assign_attrs(provenance(params, model, options))
+    sampled = over_contacts if model.tells_contacts else over_phases
+    telling, s = sampled(params, model, options, n_samples), params.symbols()
+    told = joined(telling, x, n_steps, float(s.Mt * s.g * s.sin_phi))
+    columns = told.columns
+    data = variables({name: columns[name] for name in telling.names}, "time")
+    for name in filter(columns.__contains__, SERVED):
+        data[name] = xr.Variable("time", columns[name], SERVED[name])
+    attrs = {
+        "title": f"Walk of the {type(model).__name__}",
+        "n_steps": told.n_stepped,
+        "outcome": told.outcome.name,
+        "outcome_meaning": told.outcome.meaning,
+        "start": [float(v) for v in x],
+    }
+    origin = telling.attrs | provenance(params, model, options)
+    walked = xr.Dataset(data, telling.labels, attrs | origin)
+    return walked.set_coords([name for name in ("step", "phase") if name in data])
 
 
-def _simulate_phases(
-    params: WheelParams,
-    x: SectionState,
-    n_steps: int,
-    *,
-    model: AbstractWheel,
-    options: Options,
-    n_samples: int,
-) -> xr.Dataset:
+def over_phases(
+    params: WheelParams, model: AbstractWheel, options: Options, n_samples: int
+) -> Telling:
     """Of rungs that step through the paper's phases."""
 
     def stretches(x: Array) -> Stretches:
@@ -123,25 +131,11 @@ def _simulate_phases(
             length,
         )
 
-    s = params.symbols()
-    told = joined(
-        stretches, x, n_steps, ALONG, ("gravitational_energy", "total_energy"),
-        float(s.Mt * s.g * s.sin_phi),
-    )  # fmt: skip
-    variables = {
-        name: xr.Variable("time", told.columns[name], attrs_of(name)) for name in TRAJECTORY
-    }
-    labels = {name: variables.pop(name) for name in ("time", "step", "phase")}
-    attrs = {
-        "title": f"Walk of the {type(model).__name__}",
+    attrs: dict[str, object] = {
         "frame": "x downhill along the slope, z normal to it, first foot at the origin",
-        "start": [float(v) for v in x],
         "start_meaning": "theta-, dtheta-, dL1- just before the first landing, rad, rad/s, m/s",
-        "n_steps": told.n_stepped,
-        "outcome": told.outcome.name,
-        "outcome_meaning": told.outcome.meaning,
     }
-    return xr.Dataset(variables, labels, attrs)
+    return Telling(stretches, tuple(TRAJECTORY), ALONG, {}, attrs)
 
 
 ALONG = ("x", "foot_1_x", "foot_2_x", "hub_x")
