@@ -11,6 +11,8 @@ from matplotlib.ticker import NullFormatter
 
 from experiments.shared.tables import DOCS, FIGURES, Row, groups, markdown, numbers, read, replace
 from vrw_jax.figures import PAGE, figure_style, save
+from vrw_jax.figures.style import OUTCOMES
+from vrw_jax.wheel import Outcome
 
 STYLES = {  # of Okabe and Ito, a marker each
     "lanes Tsit5": ("#0072B2", "o"),
@@ -43,7 +45,7 @@ def stiffness(rows: list[Row], limit: Callable[[str], float]) -> Figure:
                 axes.loglog(numbers(good, "value"), numbers(good, name), label=method, **look)
                 failed = [row for row in some if row not in good]
                 y = np.nan_to_num(numbers(failed, name), nan=1.0)
-                axes.plot(numbers(failed, "value"), y, "x", color="#D00000", ms=6, zorder=5)
+                axes.plot(numbers(failed, "value"), y, "x", color="black", ms=6, zorder=5)
         grid[2, column].set_xlabel(AXES[axis])
     stiff = [row for row in rows if row["axis"] == "c/m" and row["method"] == "numba Dopri5"]
     value, time = numbers(stiff, "value"), numbers(stiff, "duration_sls1")
@@ -129,6 +131,8 @@ def between(rows: list[Row]) -> Figure:
     figure = Figure(figsize=(PAGE, 3.4))
     left, right = figure.subplots(1, 2)
     told = by_border(rows)
+    for row in told:
+        row["border"] = ", ".join(map(named, row["border"].split(" | ")))
     curves(left, told, "border", "distance", "share")
     curves(right, told, "border", "distance", "time_difference_s")
     left.set(xlabel="relative distance to the border", ylabel="share with another outcome")
@@ -138,6 +142,11 @@ def between(rows: list[Row]) -> Figure:
     handles = left.get_legend_handles_labels()
     figure.legend(*handles, loc="outside lower center", ncols=2, fontsize=6)
     return figure
+
+
+def named(outcome: str) -> str:
+    """How a step ended, in words."""
+    return "stepped" if outcome == "STEPPED" else OUTCOMES[Outcome[outcome]][0]
 
 
 def by_border(rows: list[Row]) -> list[Row]:
@@ -216,8 +225,8 @@ def slowing(rows: list[Row]) -> Figure:
     left.semilogx(x, line, "--", color="0.4", lw=1.0, label="slope −1/rate of falling upright")
     for (name, told), colour, marker in zip(
         {
-            "default": "limit_cycle",
-            "tight": "limit_cycle, tight",
+            "default": "limit cycle, defaults",
+            "tight": "limit cycle, tight",
             "step": "one step",
         }.items(),
         COLOURS,
@@ -242,7 +251,7 @@ def scuffing(rows: list[Row]) -> Figure:
         figure.subplots(1, 2),
         (
             ("clearance_m", "value_error", "depth of the foot [m]"),
-            ("derivative", "derivative_error", "its derivative by $c$ [m/(N s/m)]"),
+            ("derivative", "derivative_error", "its derivative by $c$ [m/(N·s/m)]"),
         ),
         strict=True,
     ):
@@ -263,7 +272,7 @@ def growth(rows: list[Row]) -> Figure:
         "by_damping": "derivative by $c$",
         "error": "error of the derivative by $c$",
     }
-    figure, axes = over_steps(rows, "damping", "$c$ = {} N s/m", shown, 3.0)
+    figure, axes = over_steps(rows, "damping", "$c$ = {} N·s/m", shown, 3.0)
     axes.set_ylim(1e-13, 1e-7)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return figure

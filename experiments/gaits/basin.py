@@ -11,6 +11,7 @@ import numpy as np
 import vrw_jax as vrw
 from experiments.shared.command import started_with_folder
 from vrw_jax import figures as plots
+from vrw_jax.figures.style import value_label
 from vrw_jax.walks.basins import share
 
 DAMPINGS = (100.0, 200.0)  # N s/m
@@ -30,7 +31,8 @@ def main() -> None:
         }  # fmt: skip
         result = vrw.basin(params, grid, options=vrw.Options(rtol=1e-9, atol=1e-9))
         results.append(result)
-        titles.append(f"$c$ = {damping:g} N·s/m, $\\theta^-$ = {theta:.4f} rad")
+        shown = value_label("damping", damping), value_label("theta_touchdown", theta)
+        titles.append(", ".join(shown))
         print(damping, share(result), "periods", result.orbit_period.values)
     plots.save(plots.basin_figure(results, titles), folder, "basin")
 

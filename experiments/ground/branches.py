@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.lines import Line2D
 
 import vrw_jax as vrw
 from experiments.ground.friction_map import FIELDS, TOWARDS, told
@@ -37,7 +38,8 @@ DIFFERENCE = 1e-5  # of central differences, of section states and of a paramete
 FIRST, LARGEST, LEAST = 0.01, 0.05, 1e-4  # steps along a branch, in ranges
 CLOSE, N_TRIES, N_POINTS = 3e-8, 6, 90
 GHOSTS, N_GHOST = (0.003, 0.01, 0.03), 500  # less friction than the fold's; steps
-SHOWN = {"dls_fraction": "DLS fraction", "period": "period / s", "slip": "slip per step / m"}
+SHOWN = {"dls_fraction": "DLS fraction", "period": "period [s]", "slip": "slip per step [m]"}
+COLOURS = {"slow": plots.LEG_1, "fast": plots.LEG_2}
 NUMBERS = 20  # of a section state move continuously, the rest are codes
 TABLE, GHOST = FIGURES / "ground_branches.csv", FIGURES / "ground_ghost.csv"
 HEADER = ("along", "branch", "way", "ended", "value", "spectral_radius", "slope", *FIELDS)
@@ -225,26 +227,31 @@ def draw() -> None:
     figure, axes = plt.subplots(
         2, 4, figsize=(1.5 * plots.PAGE, 4.6), width_ratios=(1.0, 1.0, 1.0, 1.1)
     )
-    held = {"damping": f"μ = {FRICTION}", "friction": f"c = {DAMPING:g} N s/m"}
-    axis_names = {"damping": "damping / N s/m", "friction": "friction coefficient"}
+    held = {"damping": f"$\\mu$ = {FRICTION}", "friction": f"$c$ = {DAMPING:g} N·s/m"}
+    axis_names = {"damping": "damping $c$ [N·s/m]", "friction": "friction coefficient $\\mu$"}
     for line, (along, text) in zip(axes, held.items(), strict=True):
         for axis, (key, label) in zip(line, SHOWN.items(), strict=False):
-            for branch, color in (("slow", "C0"), ("fast", "C1")):
+            for branch, color in COLOURS.items():
                 for way in ("up", "down"):
                     own = one_way(rows, along, branch, way)
                     x, y, radius, slope = (
                         numbers(own, k) for k in ("value", key, "spectral_radius", "slope")
                     )
                     stable = radius < 1.0
-                    name = branch if way == "up" else None
-                    axis.plot(x, y, color + ":", lw=1.2)
-                    axis.plot(x, np.where(stable, y, np.nan), color, lw=2.0, label=name)
+                    axis.plot(x, y, color=color, ls=":", lw=1.2)
+                    axis.plot(x, np.where(stable, y, np.nan), color=color, lw=2.0)
                     for i in np.flatnonzero(slope[1:] * slope[:-1] < 0.0):
                         axis.plot(x[i + 1], y[i + 1], "k.", ms=8)
             axis.set(xlabel=axis_names[along], ylabel=label, title=text)
             if key == "slip":
                 axis.set_yscale("log")
-    axes[1, 2].legend(title="solid: stable, dots: folds", loc="upper right")
+    lines = [Line2D([], [], color=c, lw=2.0, label=f"{name} gait") for name, c in COLOURS.items()]
+    lines += [
+        Line2D([], [], color="black", lw=2.0, label="stable"),
+        Line2D([], [], color="black", ls=":", lw=1.2, label="unstable"),
+        Line2D([], [], color="black", ls="", marker=".", ms=8, label="fold"),
+    ]
+    figure.legend(handles=lines, loc="outside lower center", ncols=5)
     with GHOST.open() as file:
         header, *lines = list(csv.reader(file))
     walks = np.array(lines, float)
@@ -252,9 +259,11 @@ def draw() -> None:
     for axis in axes[:, 3]:
         axis.remove()
     beside = figure.add_subplot(grid[:, 3])
-    for column, mu in enumerate(header[1:], 1):
-        beside.plot(walks[:, 0], walks[:, column], label=f"μ = {float(mu):.4f}")
-    beside.set(xlabel="step", ylabel="period / s", title="walks beyond the fold, c = 200")
+    for (column, mu), line in zip(enumerate(header[1:], 1), ("-", "--", "-."), strict=True):
+        label = f"$\\mu$ = {float(mu):.4f}"
+        beside.plot(walks[:, 0], walks[:, column], color="black", ls=line, label=label)
+    title = f"walks beyond the fold, $c$ = {DAMPING:g} N·s/m"
+    beside.set(xlabel="step", ylabel="period [s]", title=title)
     beside.legend()
     plots.save(figure, FIGURES, "ground_branches")
 

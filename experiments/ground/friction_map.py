@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import LogNorm, Normalize
+from matplotlib.patches import Patch
 
 import vrw_jax as vrw
 from experiments.shared.command import command, started
@@ -23,6 +24,7 @@ TOWARDS = {"solver": "Tsit5", "rtol": 1e-8, "atol": 1e-8}  # a gait; its last st
 FIELDS = ("period", "dls_fraction", "flight", "speed", "slip", "energy", "events", "solutions")
 CHUNK = 100
 HOLDS = 0.4  # friction from which a wheel does not slide without end; colours are of these
+GREY = "0.8"
 TABLE = FIGURES / "friction_map.csv"
 
 
@@ -77,10 +79,10 @@ def draw() -> None:
     """Maps of five measures from the table, a row of panels for each start; failed walks grey."""
     shown = {  # label and whether the colours are logarithmic
         "dls_fraction": ("DLS fraction", False),
-        "period": ("period / s", False),
-        "speed": ("speed / m/s", False),
-        "slip": ("slip per step / m", True),
-        "energy": ("energy lost per step / J", False),
+        "period": ("period [s]", False),
+        "speed": ("speed [m/s]", False),
+        "slip": ("slip per step [m]", True),
+        "energy": ("energy lost per step [J]", False),
     }
     rows = read(TABLE)
     shape = (len(STARTS), len(FRICTION), len(DAMPING))
@@ -97,16 +99,25 @@ def draw() -> None:
         norm = LogNorm(least, most, clip=True) if logarithmic else Normalize(start, most)
         for row, name in enumerate(STARTS):
             axis = axes[row, column]
-            axis.set_facecolor("0.8")
+            axis.set_facecolor(GREY)
             image = axis.imshow(maps[row].T, origin="lower", aspect="auto", norm=norm)
             axis.set_xticks(range(len(FRICTION)), [f"{m:g}" for m in FRICTION], rotation=90)
             shown_c = range(0, len(DAMPING), 3)
             axis.set_yticks(shown_c, [f"{DAMPING[i]:g}" for i in shown_c])
             if column == 0:
-                axis.set_ylabel(f"{name} start\ndamping / N s/m")
+                axis.set_ylabel(f"{name} start\ndamping $c$ [N·s/m]")
         axes[0, column].set_title(label)
         axes[-1, column].set_xlabel("friction coefficient")
         figure.colorbar(image, ax=axes[:, column], location="bottom", extend="max")
+    figure.legend(
+        handles=[
+            Patch(color=GREY, label="no steady gait told: the walk ended, or has no exact step"),
+            Patch(color=image.cmap(1.0), label=f"beyond the scale, which is that of friction from "
+                  f"{HOLDS:g} up: with less, wheels slide on without end"),
+        ],
+        loc="outside lower center",
+        ncols=2,
+    )  # fmt: skip
     plots.save(figure, FIGURES, "friction_map")
 
 

@@ -22,7 +22,6 @@ FRICTION = (0.7, 1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 50.0, np.inf)
 MEASURES = ("dls_fraction", "period", "speed", "slip")
 TOLERANCE = 1e-8
 MAP, COSTS = FIGURES / "ladder_map.csv", FIGURES / "rung_costs.csv"
-NAMES = ("served", *PREMISES)
 
 
 def compute() -> None:
@@ -44,9 +43,9 @@ def compute() -> None:
 def draw() -> None:
     """Which premise breaks first, and the share of each rung."""
     reason = np.array([int(r["reason"]) for r in read(MAP)]).reshape(len(FRICTION), len(DAMPING))
-    kinds = np.where(reason < 0, len(NAMES), reason)
-    labels = [*(name.replace("_", " ") for name in NAMES), "no gait on the paper's rung"]
-    labels[0] = "none: the paper's rung serves"
+    kinds = np.where(reason < 0, 1 + len(PREMISES), reason)
+    broken = PREMISES.values()
+    labels = ["none: the paper's wheel serves", *broken, "no gait of the paper's wheel"]
     seen = sorted({int(k) for k in kinds.ravel()})
     place = np.vectorize({k: i for i, k in enumerate(seen)}.get)(kinds)
     figure, axes = plt.subplots(1, 3, figsize=(plots.PAGE, 3.1), width_ratios=(1.7, 1.0, 1.0))
@@ -60,18 +59,18 @@ def draw() -> None:
     )  # fmt: skip
     for i, kind in enumerate(seen):
         axes[0].plot([], [], "s", color=colours(i), label=labels[kind])
-    axes[0].set(ylabel="damping / N s/m", title="the first premise that breaks")
+    axes[0].set(ylabel="damping $c$ [N·s/m]", title="the first premise that breaks")
     share = np.mean(reason == 0, axis=1)
     ground = {"label": "real ground", "color": plots.LIGHT, "edgecolor": plots.GREY, "lw": 0.4}
-    axes[1].bar(at, 100.0 * share, color=colours(0), label="the paper's rung")
+    axes[1].bar(at, 100.0 * share, color=colours(0), label="the paper's wheel")
     axes[1].bar(at, 100.0 * (1.0 - share), bottom=100.0 * share, **ground)
-    axes[1].set(ylabel="share of gaits / %", title="the rung that serves")
+    axes[1].set(ylabel="share of gaits [%]", title="the wheel that serves")
     cost = {r["rung"]: float(r["us_in_a_batch"]) for r in read(COSTS)}
     paper = np.full(len(FRICTION), cost["paper"])  # every gait is tried there
     axes[2].bar(at, paper, color=colours(0))
     axes[2].bar(at, (1.0 - share) * cost["ground"], bottom=paper, **ground)
     axes[2].axhline(cost["ground"], color="k", ls="--", lw=0.8, label="all on real ground")
-    axes[2].set(ylabel="µs per step, mean over gaits", title="what it costs")
+    axes[2].set(ylabel="time per step, mean over gaits [µs]", title="what it costs")
     for axis in axes:
         axis.set_xticks(at, ticks, rotation=90)
         axis.set_xlabel("friction coefficient")

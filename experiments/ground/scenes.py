@@ -1,6 +1,6 @@
 """What really happens where the paper stops: scuffing, bouncing, the lost gait, early touchdown.
 
-    python -m experiments.ground.scenes
+    python -m experiments.ground.scenes [--redraw]
 
 Each scene is walked from the paper's gait at the nearest damping that has one. Drawn: ground forces
 and foot heights of the last good step with the paper's step from the same start beside them, and
@@ -13,10 +13,11 @@ import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.patches import Patch
 
 import vrw_jax as vrw
 from experiments.shared.command import command, started
-from experiments.shared.tables import FIGURES, write
+from experiments.shared.tables import FIGURES, numbers, read, write
 from vrw_jax import figures as plots
 from vrw_jax.models import directions, foot_heights, unpack
 
@@ -32,9 +33,12 @@ SCENES = [  # label, friction, damping, start (None: from the paper's gait at th
 ]
 SHOWN = ("bouncing, c = 4", "scuffing, c = 50", "lost gait, c = 225", "real ground, c = 250")
 N_STEPS, N_SAMPLES = 60, 40
-LEAST_SHARE = 0.5  # per cent: less in every scene is not drawn
 OPTIONS = {"solver": "Tsit5", "rtol": 1e-9, "atol": 1e-9}
 MODES = ("air", "rest", "down", "up")
+WORDS = {"air": "air", "rest": "rest", "down": "slides down", "up": "slides up"}
+COLOURS = {"air": "#FFFFFF", "rest": "#56B4E9", "down": "#E69F00", "up": "#CC79A7"}
+HATCHES = {"air": "", "rest": "..", "down": "\\\\", "up": "//"}
+TABLE = FIGURES / "unilateral_scenes.csv"
 
 
 def starts() -> np.ndarray:
@@ -74,7 +78,16 @@ def walked(friction: np.ndarray, damping: np.ndarray, x: np.ndarray) -> tuple:
 
 
 def main() -> None:
-    started(command(__doc__))
+    parser = command(__doc__)
+    parser.add_argument("--redraw", action="store_true", help="walk nothing: draw the shares alone")
+    if not started(parser).redraw:
+        compute()
+    with plots.figure_style():
+        draw_modes()
+
+
+def compute() -> None:
+    """Walk the scenes, keep what they tell, and draw the last steps of some."""
     labels, friction, damping, _ = zip(*SCENES, strict=True)
     outcome, last, step, periods, count = walked(np.array(friction), np.array(damping), starts())
     header = ("scene", "friction", "damping", "steps", "outcome", "period_s", "period_spread_s")
@@ -95,11 +108,9 @@ def main() -> None:
         ]
         row = [label, friction[i], damping[i], n, name, f"{period:.6f}", f"{spread:.1e}"]
         rows.append([*row, *(f"{float(v):.5g}" for v in numbers)])
-    write(FIGURES / "unilateral_scenes.csv", (*header, *more, *pairs), rows)
-    shares = np.asarray(step.mode_durations / np.maximum(step.period, 1e-9)[:, None, None])
+    write(TABLE, (*header, *more, *pairs), rows)
     with plots.figure_style():
         draw([labels.index(name) for name in SHOWN], labels, friction, damping, last)
-        draw_modes(labels, shares)
 
 
 def draw(chosen: list[int], labels: tuple, friction: tuple, damping: tuple, x: np.ndarray) -> None:
@@ -130,32 +141,44 @@ def draw(chosen: list[int], labels: tuple, friction: tuple, damping: tuple, x: n
             top.plot(formal.time, formal[f"lambda_{2 * leg + 2}"], **grey, label=shown)
             if leg == 1:
                 low.plot(formal.time, 1e3 * formal.foot_2_z, **grey, label=shown)
-        top.set_title(labels[i])
-        low.set(xlabel="time since landing / s", ylim=(-25.0, 60.0))
-    axes[0, 0].set_ylabel("ground force / N")
-    axes[1, 0].set_ylabel("foot height / mm")
+        top.set_title(with_unit(labels[i]).replace(", ", "\n"))
+        low.set(xlabel="time since landing [s]", ylim=(-25.0, 60.0))
+    axes[0, 0].set_ylabel("ground force [N]")
+    axes[1, 0].set_ylabel("foot height [mm]")
     axes[0, 0].legend(fontsize=5)
     axes[1, 0].legend(fontsize=5)
     plots.save(figure, FIGURES, "unilateral_scenes")
 
 
-def draw_modes(labels: tuple, shares: np.ndarray) -> None:
-    """Time in each pair of contact modes, fore foot first, scene by scene."""
-    figure, axis = plt.subplots(figsize=(plots.PAGE, 4.2))
-    words = {"air": "air", "rest": "rest", "down": "slides down", "up": "slides up"}
-    colours, left, count = plt.get_cmap("tab20"), np.zeros(len(labels)), 0
-    for a, first in enumerate(MODES):
-        for b, second in enumerate(MODES):
-            share = 100.0 * shares[:, a, b]
-            if share.max() < LEAST_SHARE:
-                continue
-            name = f"{words[first]}, {words[second]}"
-            axis.barh(labels, share, left=left, color=colours(count), label=name)
-            left, count = left + share, count + 1
+def draw_modes() -> None:
+    """Time in each pair of contact modes by scene: colours are the fore foot, hatches the rear."""
+    rows = read(TABLE)
+    figure, axis = plt.subplots(figsize=(plots.PAGE, 4.4))
+    left = np.zeros(len(rows))
+    for first, colour in COLOURS.items():
+        for second, hatch in HATCHES.items():
+            share = 100.0 * numbers(rows, f"share_{first}_{second}")
+            look = {"color": colour, "hatch": hatch, "edgecolor": "black", "linewidth": 0.4}
+            axis.barh([with_unit(row["scene"]) for row in rows], share, left=left, **look)
+            left += share
     axis.invert_yaxis()
-    axis.set(xlabel="share of the step / %", xlim=(0.0, 100.0), title="fore foot, rear foot")
-    axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+    axis.set(xlabel="share of the step [%]", xlim=(0.0, 100.0))
+    edge = {"edgecolor": "black", "linewidth": 0.4}
+    feet = (
+        ("fore foot: colour", [Patch(facecolor=COLOURS[m], label=WORDS[m], **edge) for m in MODES]),
+        ("rear foot: hatch", [
+            Patch(facecolor="white", hatch=HATCHES[m], label=WORDS[m], **edge) for m in MODES
+        ]),
+    )  # fmt: skip
+    for (title, handles), place in zip(feet, ("upper", "lower"), strict=True):
+        figure.legend(handles=handles, title=title, loc=f"outside right {place}", handleheight=1.4)
     plots.save(figure, FIGURES, "unilateral_modes")
+
+
+def with_unit(label: str) -> str:
+    """A scene's label with its damping as all pictures write it."""
+    name, _, damping = label.partition(", c = ")
+    return f"{name}, $c$ = {damping} N·s/m"
 
 
 if __name__ == "__main__":

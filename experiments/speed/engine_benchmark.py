@@ -222,7 +222,7 @@ def draw_charts(table, shares, cost):
     figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=2)
     for name, values in cost.items():
         right.semilogy(100.0 * shares, values, "o-", ms=4, color=colours[name], label=LABELS[name])
-    right.set(xlabel="lanes that fall back, %", ylabel="CPU time per lane, µs")
+    right.set(xlabel="lanes that fall back [%]", ylabel="CPU time per lane [µs]")
     right.set_ylim(bottom=1.0)
     right.legend()
     return figure

@@ -39,6 +39,7 @@ from vrw_jax.wheel import wheel_of
 cma = extra("cma")
 
 CONFIGS = Path(__file__).parents[2] / "configs"
+LABELS = {"tune": "this library"}
 PROBLEMS = {"most double support": "tune_dls", "largest stability margin": "tune_stability"}
 ALLOWED = 400  # gaits per start and method
 SEED = 1
@@ -245,7 +246,7 @@ def drawn(results: dict[str, dict]) -> Figure:
                 )
                 gap = np.clip((result["best"] - table) / abs(result["best"]), 1e-9, 1.0)
                 low, middle, high = np.quantile(gap, (0.25, 0.5, 0.75), axis=0)
-                (line,) = axes.plot(gaits, middle, label=method)
+                (line,) = axes.plot(gaits, middle, label=LABELS.get(method, method))
                 axes.fill_between(gaits, low, high, color=line.get_color(), alpha=0.15, linewidth=0)
             axes.set_xscale("log")
             axes.set_yscale("log")

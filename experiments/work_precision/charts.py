@@ -1,7 +1,10 @@
 """Charts and tables of work against precision, drawn from its measurements alone."""
 
+import json
 import math
 import textwrap
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -29,6 +32,8 @@ COLOURS = {  # of Okabe and Ito
     "SciPy": "#56B4E9",
     "torchdiffeq": "#999999",
 }
+OURS = ("lane engine", "diffrax engine", "collocation")
+PAGE_TEXT = Path(__file__).parent / "page.html"
 MARKS = "os^Dv<>ph"
 NOTE: dict = {
     "fontsize": 6,
@@ -132,7 +137,7 @@ def draw_panel(axes: Axes, rows: list[Row], quantity: str, x_of) -> None:
         axes.plot(x, p99, label=label, **styles[label])
         for a, b, row in zip(x, p99, shown, strict=True):
             if int(row["failed"]):
-                axes.plot(a, b, "x", color="#D00000", ms=7, mew=1.2, zorder=5)
+                axes.plot(a, b, "x", color="black", ms=7, mew=1.2, zorder=5)
                 note = f"{row['failed']}/{of_lanes(row)}"
                 axes.annotate(note, (a, b), (4, 3), textcoords="offset points", **NOTE)
             if is_default(row):
@@ -145,25 +150,21 @@ def draw_panel(axes: Axes, rows: list[Row], quantity: str, x_of) -> None:
     axes.grid(color="0.9", lw=0.4)
 
 
-def panels(rows: list[Row], x_of, x_label: str) -> Figure:
-    """One panel for each quantity with one legend for all; steps have the most methods."""
-    figure = Figure(figsize=(PAGE, 8.0))
-    above, below = list(QUANTITIES)[:2], list(QUANTITIES)[2:]
-    wide = [name for name in above for _ in range(2)]
-    grid = figure.subplot_mosaic([wide, below], sharey=True, height_ratios=(1.3, 1.0))
-    for quantity, axes in grid.items():
+def panels(rows: list[Row], quantities: list[str], x_of, x_label: str) -> Figure:
+    """One panel for each quantity, with one legend for all."""
+    figure = Figure(figsize=(PAGE, 4.2))
+    grid = figure.subplots(1, len(quantities), sharey=True)
+    for quantity, axes in zip(quantities, grid, strict=True):
         draw_panel(axes, rows, quantity, x_of)
         axes.set_xlabel(x_label)
-        axes.tick_params(labelleft=quantity in (above[0], below[0]))
-    for first in (above[0], below[0]):
-        grid[first].set_ylabel("error: p99, bar from p50 to worst")
+    grid[0].set_ylabel("error: p99, bar from p50 to worst")
     found: dict[str, object] = {}
-    for axes in grid.values():
+    for axes in grid:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             found.setdefault(label, handle)
     order = sorted(found, key=lambda label: [*COLOURS].index(label.split(":")[0]))
     handles = [found[label] for label in order]
-    figure.legend(handles, order, loc="outside lower center", ncols=3, fontsize=6.5)
+    figure.legend(handles, order, loc="outside lower center", ncols=3, fontsize=7)
     return figure
 
 
@@ -323,15 +324,66 @@ def failures(rows: list[Row]) -> str:
     return markdown(("method", "setting", "wheels that failed"), lines)
 
 
+STEPS, CYCLES = list(QUANTITIES)[:2], list(QUANTITIES)[2:]
+CHARTS = {  # quantities, and which rows are shown
+    "steps": (STEPS, lambda row: row["family"] in OURS),
+    "peers": (STEPS, lambda row: row["family"] not in OURS or is_default_method(row)),
+    "cycles": (CYCLES, lambda row: row["group"] != "step"),
+}
+
+
+def is_default_method(row: Row) -> bool:
+    """Whether this is the method that a user gets who chooses none, at any setting."""
+    named = (row["group"], row["family"], row["name"])
+    return named in {one[:3] for one in DEFAULTS} and row["precision"] == "float64"
+
+
+def works(unit: float) -> dict[str, tuple[str, Callable[[Row], float]]]:
+    """What work is counted by: label of the axis, and the number of a row."""
+    return {
+        "time": ("CPU time per gait [µs]", lambda row: time_of(row, unit)),
+        "evaluations": ("evaluations per gait", lambda row: float(row["evaluations"])),
+    }
+
+
+def write_page(
+    rows: list[Row], path: Path, counted: dict[str, tuple[str, Callable[[Row], float]]]
+) -> None:
+    """All methods and quantities in one page, each to be shown or hidden."""
+    curves_of = []
+    for quantity, (_, title) in QUANTITIES.items():
+        for label, some in curves(rows, quantity).items():
+            parts = [f"{quantity}_{part}" for part in ("p50", "p99", "worst")]
+            points = [
+                [
+                    row["setting"],
+                    *(x_of(row) for _, x_of in counted.values()),
+                    *(max(float(row[part]), 1e-17) for part in parts),
+                    int(row["failed"]),
+                    of_lanes(row),
+                ]
+                for row in some
+                if int(row["failed"]) < of_lanes(row)
+            ]
+            look = {"quantity": title, "label": label, "colour": COLOURS[label.split(":")[0]]}
+            curves_of.append(look | {"points": points})
+    labels = json.dumps([label for label, _ in counted.values()])
+    text = PAGE_TEXT.read_text(encoding="utf-8")
+    text = text.replace("CURVES", json.dumps(curves_of)).replace("LABELS", labels)
+    path.write_text(text, encoding="utf-8")
+
+
 def draw(rows: list[Row], batches: list[Row]) -> None:
     """All charts and the tables."""
     unit = unit_of(rows)
     with figure_style():
-        time_chart = panels(rows, lambda row: time_of(row, unit), "CPU time per gait [µs]")
-        save(time_chart, FIGURES, "work_precision_time")
-        count = panels(rows, lambda row: float(row["evaluations"]), "evaluations per gait")
-        save(count, FIGURES, "work_precision_evaluations")
+        for name, (quantities, shown) in CHARTS.items():
+            some = [row for row in rows if shown(row)]
+            for work, (label, x_of) in works(unit).items():
+                chart = panels(some, quantities, x_of, label)
+                save(chart, FIGURES, f"work_precision_{name}_{work}")
         save(batch_chart(batches, rows), FIGURES, "work_precision_batch")
+    write_page(rows, FIGURES / "work_precision.html", works(unit))
     page = DOCS / "work_precision.md"
     replace(page, "what to use", table(rows))
     replace(page, "defaults", on_the_front(rows))

@@ -5,7 +5,8 @@ import pytest
 import xarray as xr
 
 from vrw_jax.figures import scan_figures
-from vrw_jax.figures.style import axis_label
+from vrw_jax.figures.style import OUTCOMES, axis_label
+from vrw_jax.wheel import Outcome
 
 
 @pytest.mark.parametrize("second", ["friction", "gravity"])
@@ -23,3 +24,31 @@ def test_a_scan_is_drawn_over_both_its_axes(second):
     speed, outcome, _ = figure.axes
     assert outcome.get_ylabel() == axis_label(second, "{symbol}")
     assert speed.collections[0].get_array().shape == (4, 3)
+
+
+def scan_of(outcome: np.ndarray, speed: np.ndarray, radius: np.ndarray) -> xr.Dataset:
+    over = ("damping", "slope")
+    values = {"damping": [100.0, 150.0, 200.0], "slope": [0.28, 0.3]}
+    named = {"outcome": outcome, "speed": speed, "spectral_radius": radius}
+    return xr.Dataset({name: (over, array) for name, array in named.items()}, values)
+
+
+def test_a_few_unstable_gaits_do_not_stretch_the_colours_of_the_stable_ones():
+    speed, radius = np.linspace(0.8, 0.9, 6).reshape(3, 2), np.full((3, 2), 0.5)
+    speed[0, 0], radius[0, 0] = 40.0, 1.5
+    (figure,) = scan_figures(scan_of(np.zeros((3, 2), int), speed, radius)).values()
+    mesh = figure.axes[0].collections[0]
+    assert mesh.get_clim() == (speed[0, 1], speed[2, 1])
+    assert mesh.colorbar.extend == "max"
+    radius[:] = 1.5
+    (figure,) = scan_figures(scan_of(np.zeros((3, 2), int), speed, radius)).values()
+    assert figure.axes[0].collections[0].get_clim() == (speed[0, 1], 40.0)
+
+
+@pytest.mark.parametrize("code", [Outcome.NO_CYCLE_FOUND, Outcome.ORDER_DIFFERS])
+def test_why_there_is_no_gait_is_told_by_colour(code):
+    outcome = np.zeros((3, 2), int)
+    outcome[0, 0] = code
+    (figure,) = scan_figures(scan_of(outcome, np.ones((3, 2)), np.full((3, 2), 0.5))).values()
+    names = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert OUTCOMES[code][0] in names

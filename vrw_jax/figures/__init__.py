@@ -2,7 +2,7 @@
 
 from vrw_jax.figures.branch import basin_figure, branch_figure, orbit_figure
 from vrw_jax.figures.scan import scan_figures
-from vrw_jax.figures.style import GREY, LIGHT, PAGE, figure_style, save
+from vrw_jax.figures.style import GREY, LEG_1, LEG_2, LIGHT, PAGE, figure_style, save
 from vrw_jax.figures.tuning import tuning_figure
 from vrw_jax.figures.walk import (
     foot_height,

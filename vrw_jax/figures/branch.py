@@ -13,8 +13,8 @@ from vrw_jax.figures.style import (
     LEG_1,
     LEG_2,
     LIGHT,
-    ORANGE,
     PAGE,
+    PINK,
     YELLOW,
     axis_label,
     draw_marks,
@@ -29,9 +29,10 @@ from vrw_jax.results import MEASURES, what_breaks
 from vrw_jax.walks import BEFORE
 from vrw_jax.wheel import Outcome
 
-COLOURS = {"lost": ORANGE, "border_collision": GREEN}
-"""Of borders, by kind; where the gait's own stability changes: black. What ends a branch: ENDS."""
-ENDS, DASHED = ORANGE, (0, (3, 1.5))
+ENDS, BORDER = PINK, (0, (1, 1.2))
+COLOURS = {"lost": ENDS, "border_collision": GREEN}
+"""Of borders, by kind; where the gait's own stability changes: black. What ends a branch: ENDS.
+Neither colours nor dots are those of a curve."""
 
 PANELS = (
     ("DLS fraction", {"dls_fraction": LEG_1}),
@@ -112,7 +113,7 @@ def _draw_borders(axes: Axes, borders: list[Border], numbered: bool) -> None:
     low, high = axes.get_xlim()
     last = -np.inf
     for i, border in enumerate(borders):
-        axes.axvline(border.value, color=_colour(border), lw=0.7, linestyle=DASHED, zorder=0)
+        axes.axvline(border.value, color=_colour(border), lw=0.7, linestyle=BORDER, zorder=0)
         if numbered:
             last = max(border.value, last + 0.03 * (high - low))
             axes.annotate(
@@ -132,7 +133,7 @@ def _name_borders(figure: Figure, borders: list[Border], parameter: str) -> None
         text = f"{value_label(parameter, border.value, 6)}: {typeset(what_breaks(border.name))}"
         text = f"{i + 1}  {text}" + (" (ends here)" if border.ends_branch else "")
         handles.append(
-            Line2D([], [], color=_colour(border), linewidth=0.9, linestyle=DASHED, label=text)
+            Line2D([], [], color=_colour(border), linewidth=0.9, linestyle=BORDER, label=text)
         )
     handles.append(Line2D([], [], color="black", linestyle="-", label="stable"))
     handles.append(Line2D([], [], color="black", linestyle="--", label="unstable"))
@@ -164,7 +165,7 @@ def orbit_figure(orbits: xr.Dataset, border: float | None = None) -> Figure:
     periods.plot(value, orbits.period.values, "s", color="black", markersize=2.0)
     for axes in (rates, periods):
         if border is not None:
-            axes.axvline(border, color=ENDS, linewidth=0.7, linestyle=DASHED, zorder=0)
+            axes.axvline(border, color=ENDS, linewidth=0.7, linestyle=BORDER, zorder=0)
         for left, right in _empty_stretches(orbits):
             axes.axvspan(left, right, color=LIGHT, linewidth=0.0, zorder=0)
     for left, right in _empty_stretches(orbits)[-1:]:
@@ -196,7 +197,7 @@ def _empty_stretches(orbits: xr.Dataset) -> list[tuple[float, float]]:
 def basin_figure(results: list[xr.Dataset], titles: list[str]) -> Figure:
     """Which starts of a plane end where, one panel per result; crosses are the gaits' own states.
 
-    Shades of blue count the steps until the gait is reached; other colours are the falls.
+    Shades of grey count the steps until the gait is reached; colours are the falls.
     """
     codes = sorted({int(c) for r in results for c in np.unique(r.outcome) if c != Outcome.STEPPED})
     figure = Figure(figsize=(PAGE, 3.3))
@@ -206,7 +207,7 @@ def basin_figure(results: list[xr.Dataset], titles: list[str]) -> Figure:
         y, x = (str(d) for d in result.attractor.dims)
         steps = result.steps.where(result.attractor >= 0)
         image = axes.pcolormesh(
-            result[x], result[y], steps, cmap="Blues_r", vmin=0.0, vmax=1.6 * most
+            result[x], result[y], steps, cmap="Greys_r", vmin=0.0, vmax=2.2 * most
         )
         image.set_rasterized(True)
         if codes:
@@ -227,4 +228,4 @@ def _mark_orbits(axes: Axes, result: xr.Dataset, x: str, y: str) -> None:
         return
     columns = [BEFORE.index(x), BEFORE.index(y)]
     states = result.orbit_state.values.reshape(-1, len(BEFORE))[:, columns]
-    axes.plot(*states.T, "+", color=YELLOW, markersize=6.0, markeredgewidth=1.2)
+    axes.plot(*states.T, "+", color=YELLOW, markersize=7.0, markeredgewidth=1.6)

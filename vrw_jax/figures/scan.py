@@ -97,10 +97,12 @@ def slice_figure(scan: xr.Dataset, x: str, y: str, across: str | None = None) ->
     panels = figure.subplots(len(rows) + 1, len(columns), sharex=True, sharey=True, squeeze=False)
     for row, name in zip(panels, rows, strict=False):
         values = [column[name].transpose(y, x).values for column in columns]
-        limits = _limits(values)
+        stable = [_codes(column).transpose(y, x).values == Outcome.STEPPED for column in columns]
+        limits = _limits(values, stable)
         for axes, column, value in zip(row, columns, values, strict=True):
             image = _cells(axes, column[x].values, column[y].values, value, limits)
-        bar = figure.colorbar(image, ax=row.tolist(), aspect=12, pad=0.01)
+        beyond = _extended(values, limits)
+        bar = figure.colorbar(image, ax=row.tolist(), aspect=12, pad=0.01, extend=beyond)
         bar.set_label(axis_label(name, "{name}"))
     codes = np.unique([_codes(column).values for column in columns])
     for axes, column in zip(panels[-1], columns, strict=True):
@@ -128,14 +130,15 @@ def slice_figure(scan: xr.Dataset, x: str, y: str, across: str | None = None) ->
 def sample_figure(scan: xr.Dataset, names: Sequence[str]) -> Figure:
     """DLS fraction, speed and outcome of single samples over the first two parameters."""
     x, y = (names[0], names[1]) if len(names) > 1 else (names[0], "sample")
-    walks = scan.outcome.values == Outcome.STEPPED
     rows = _shown(scan)
     size = float(np.clip(3000.0 / max(scan.sizes["sample"], 1), 1.0, 12.0))
     figure = Figure(figsize=(PAGE, 2.9))
     panels = figure.subplots(1, len(rows) + 1, sharey=True, squeeze=False)[0]
     for axes, name in zip(panels, rows, strict=False):
-        points = _draw_values(axes, scan[x].values, scan[y].values, scan[name].values, walks, size)
-        figure.colorbar(points, ax=axes, location="top", aspect=25).set_label(axis_label(name))
+        points = _draw_values(axes, scan, x, y, name, size)
+        beyond = _extended([scan[name].values], points.get_clim())
+        bar = figure.colorbar(points, ax=axes, location="top", aspect=25, extend=beyond)
+        bar.set_label(axis_label(name))
     codes = _codes(scan).values
     _draw_outcomes(panels[-1], scan[x].values, scan[y].values, codes, size)
     for axes in panels:
@@ -154,7 +157,7 @@ def pairs_figure(scan: xr.Dataset, names: Sequence[str]) -> Figure:
     """
     shown = scan.isel(sample=slice(MOST_DRAWN))
     value = next(iter(_shown(scan)), None)
-    codes, walks = _codes(shown).values, shown.outcome.values == Outcome.STEPPED
+    codes = _codes(shown).values
     d = len(names)
     size = float(np.clip(8000.0 / len(codes), 0.6, 8.0))
     figure = Figure(figsize=(PAGE, PAGE * 0.9))
@@ -167,7 +170,7 @@ def pairs_figure(scan: xr.Dataset, names: Sequence[str]) -> Figure:
         elif i < j:
             _draw_outcomes(axes, x, y, codes, size)
         elif value is not None:
-            points = _draw_values(axes, x, y, shown[value].values, walks, size)
+            points = _draw_values(axes, shown, names[j], names[i], value, size)
         if i == d - 1:
             axes.set_xlabel(axis_label(names[j], "{symbol}"))
         if j == 0 and i > 0:
@@ -176,19 +179,24 @@ def pairs_figure(scan: xr.Dataset, names: Sequence[str]) -> Figure:
             axes.tick_params(labelleft=False)
     panels[0, 0].set_ylabel("share that walks")
     if value is not None and points is not None:
-        bar = figure.colorbar(points, ax=panels.ravel().tolist(), aspect=40, pad=0.01)
+        beyond = _extended([shown[value].values], points.get_clim())
+        around = panels.ravel().tolist()
+        bar = figure.colorbar(points, ax=around, aspect=40, pad=0.01, extend=beyond)
         bar.set_label(axis_label(value, "{name}"))
     _legend(figure, np.unique(codes), {}, 3)
     return figure
 
 
 def _draw_values(
-    axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, walks: np.ndarray, size: float
+    axes: Axes, scan: xr.Dataset, x: str, y: str, name: str, size: float
 ) -> PathCollection:
     """Samples in the colours of a measure, in grey where there is none to tell."""
     dot: dict[str, Any] = {"s": size, "linewidths": 0.0, "rasterized": True}
-    axes.scatter(x[~walks], y[~walks], color=LIGHT, **dot)
-    return axes.scatter(x[walks], y[walks], c=values[walks], **dot)
+    walks, values = scan.outcome.values == Outcome.STEPPED, scan[name].values
+    low, high = _limits([values], [_codes(scan).values == Outcome.STEPPED])
+    across, up = scan[x].values, scan[y].values
+    axes.scatter(across[~walks], up[~walks], color=LIGHT, **dot)
+    return axes.scatter(across[walks], up[walks], c=values[walks], vmin=low, vmax=high, **dot)
 
 
 def _draw_outcomes(
@@ -267,10 +275,24 @@ def _shown(scan: xr.Dataset) -> list[str]:
     return [name for name in ("dls_fraction", "speed") if name in scan]
 
 
-def _limits(values: Sequence[np.ndarray]) -> tuple[float, float]:
-    """Range of colours that all panels of a row share."""
-    known = np.concatenate([value[np.isfinite(value)] for value in values])
+def _limits(values: Sequence[np.ndarray], stable: Sequence[np.ndarray]) -> tuple[float, float]:
+    """Range of colours that all panels of a row share: that of stable gaits, if there are any.
+
+    A few unstable ones, far from the others, would leave these one colour.
+    """
+    every = [value[np.isfinite(value)] for value in values]
+    walked = [v[s & np.isfinite(v)] for v, s in zip(values, stable, strict=True)]
+    known = np.concatenate(walked if any(map(len, walked)) else every)
     return (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
+
+
+def _extended(
+    values: Sequence[np.ndarray], limits: tuple[float, float]
+) -> Literal["neither", "min", "max", "both"]:
+    """At which ends of a colour bar there are values beyond it."""
+    known = np.concatenate([value[np.isfinite(value)] for value in values])
+    below, above = np.any(known < limits[0]), np.any(known > limits[1])
+    return ("both" if above else "min") if below else ("max" if above else "neither")
 
 
 def _cells(

@@ -101,8 +101,13 @@ def typeset(text: str) -> str:
     return re.sub(r"[θλ]\S*", lambda found: f"${as_tex(found[0])}$", text)
 
 
+def unit_text(unit: str) -> str:
+    """A unit as all pictures write it: "N s/m" is "N·s/m"."""
+    return unit.replace(" ", "·").replace("^2", "²")
+
+
 def _unit(name: str) -> str:
-    return MEASURES[name].plain_unit.replace(" ", "·").replace("^2", "²")
+    return unit_text(MEASURES[name].plain_unit)
 
 
 def axis_label(name: str, form: str = "{name} {symbol}") -> str:

@@ -231,6 +231,8 @@ def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
         axes.set_xlabel(axis_label(vary, "{symbol}"))
         axes.set_ylabel(kind)
         axes.legend(loc="lower right" if letter == "a" else "upper right", ncols=len(series))
+    slope = gaits.attrs["parameter_slope"]  # the paper's caption has another: a misprint
+    panels[0].text(0.02, 0.05, value_label("slope", slope), transform=panels[0].transAxes)
     return figure
 
 
