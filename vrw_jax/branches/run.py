@@ -27,7 +27,10 @@ from vrw_jax.numerics import (
     arclength,
     bifurcation_functions,
     brackets,
+    in_batches,
+    joined,
     locate,
+    taken,
     turns,
 )
 
@@ -83,7 +86,7 @@ class AbstractRun(abc.ABC):
 
     def table(self, points: PathPoint, owners: np.ndarray) -> Table:
         """Every quantity at each point, bifurcation functions and IN_SEQUENCE included."""
-        found = _in_batches(self.read, _taken(self.wheels, owners), points)
+        found = in_batches(self.read, BATCH, taken(self.wheels, owners), points)
         margins = bifurcation_functions(np.asarray(points.jacobian))
         found |= {name: margins[:, i] for i, name in enumerate(BIFURCATIONS)}
         for name, exact in self.exact.items():
@@ -104,24 +107,6 @@ def both_hold(margin: np.ndarray, exact: np.ndarray) -> np.ndarray:
     It passes zero without a jump at either's border.
     """
     return np.where(exact < 0.0, exact, np.minimum(exact, margin))
-
-
-def _taken(tree: Any, places: Any) -> Any:
-    return jax.tree.map(lambda x: np.asarray(x)[places], tree)
-
-
-def _joined(*trees: Any) -> Any:
-    return jax.tree.map(lambda *parts: np.concatenate([np.asarray(p) for p in parts]), *trees)
-
-
-def _in_batches(function: Callable, *trees: Any) -> Any:
-    """`function` of trees with a leading axis, `BATCH` of it at a time, the last one filled up."""
-    n = len(jax.tree.leaves(trees)[0])
-    parts = []
-    for begin in range(0, n, BATCH):
-        places = np.minimum(np.arange(begin, begin + BATCH), n - 1)
-        parts.append(jax.tree.map(np.asarray, function(*_taken(trees, places))))
-    return _taken(_joined(*parts), slice(0, n))
 
 
 @eqx.filter_jit
@@ -187,13 +172,13 @@ def _zeros(run: AbstractRun, pieces: _Pieces, asked: list[tuple[int, int, str]])
         return []
     lefts, rights = (np.array([a[i] for a in asked]) for i in (0, 1))
     names = [a[2] for a in asked]
-    left, right = _taken(pieces.points, lefts), _taken(pieces.points, rights)
+    left, right = taken(pieces.points, lefts), taken(pieces.points, rights)
     owners = pieces.owners[lefts]
-    wheels = _taken(run.wheels, owners)
+    wheels = taken(run.wheels, owners)
     solve = functools.partial(_solve_on, run.followed, run.options, jnp.asarray(run.bounds))
 
     def evaluated(places: np.ndarray, which: np.ndarray) -> tuple[PathPoint, Table]:
-        points, found = _in_batches(solve, *_taken((wheels, left, right), which), places)
+        points, found = in_batches(solve, BATCH, *taken((wheels, left, right), which), places)
         points = points._replace(valid=points.valid & found)
         table = run.table(points, owners[which])
         return points, {k: np.where(_along(found, v), v, np.nan) for k, v in table.items()}
@@ -214,8 +199,8 @@ def _zeros(run: AbstractRun, pieces: _Pieces, asked: list[tuple[int, int, str]])
             asked[i],
             float(best.p[i]),
             float(found.place[i]),
-            _taken(beside, slice(i, i + 1)),
-            _taken(table, slice(i, i + 1)),
+            taken(beside, slice(i, i + 1)),
+            taken(table, slice(i, i + 1)),
         )
         for i in range(len(asked))
     ]
@@ -231,16 +216,16 @@ def _collected(run: AbstractRun, tracks: arclength.Track) -> _Pieces:
     for wheel in range(tracks.n_points.shape[0]):
         down, up = (int(n) for n in tracks.n_points[wheel])
         if down:
-            points = _taken(tracks.points, (wheel, 0))
-            points = _taken(points, np.arange(down)[::-1])
+            points = taken(tracks.points, (wheel, 0))
+            points = taken(points, np.arange(down)[::-1])
             parts.append(points._replace(share_slope=-points.share_slope))
         if up:
-            points = _taken(tracks.points, (wheel, 1))
-            parts.append(_taken(points, np.arange(1 if down else 0, up)))
+            points = taken(tracks.points, (wheel, 1))
+            parts.append(taken(points, np.arange(1 if down else 0, up)))
         owners += [wheel] * (down + max(up - (1 if down else 0), 0))
     if not owners:
-        return _Pieces(_taken(tracks.points, (0, 0, slice(0, 0))), np.zeros(0, int), {})
-    points = _joined(*parts)
+        return _Pieces(taken(tracks.points, (0, 0, slice(0, 0))), np.zeros(0, int), {})
+    points = joined(*parts)
     return _Pieces(points, np.array(owners), run.table(points, np.array(owners)))
 
 
@@ -312,10 +297,10 @@ def _with_ends(
         low, high = (ends.get((reach.owner, end)) for end in (0, 1))
         if low is not None and low.table[IN_SEQUENCE][0] > 0.0:
             add(low.beside, reach.owner, low.table)
-        add(_taken(pieces.points, reach.points), reach.owner, _taken(pieces.table, reach.points))
+        add(taken(pieces.points, reach.points), reach.owner, taken(pieces.table, reach.points))
         if high is not None and high.table[IN_SEQUENCE][0] > 0.0:
             add(high.beside, reach.owner, high.table)
-    return _Pieces(_joined(*points), np.concatenate(owners), _joined(*tables))
+    return _Pieces(joined(*points), np.concatenate(owners), joined(*tables))
 
 
 def _inner_zeros(run: AbstractRun, pieces: _Pieces) -> list[tuple[str, _Zero]]:
@@ -380,7 +365,7 @@ def run_all(
     inner = _inner_zeros(run, whole)
 
     def border(name: str, zero: _Zero, owner: int, ends_branch: bool) -> Border:
-        beside = _taken(zero.beside, 0)
+        beside = taken(zero.beside, 0)
         section = np.asarray(run.followed.section(jax.tree.map(jnp.asarray, beside.z)))
         point = FixedPoint(section, float(beside.p), beside.jacobian)
         if name == IN_SEQUENCE:
@@ -408,6 +393,6 @@ def run_all(
             endings.append(f"{last.name.replace('_', ' ')} at {last.value:.9g} ends it.")
         borders = tuple(b for _, b in sorted(placed, key=lambda pair: pair[0]))
         strands[reach.owner] = Strand(
-            _taken(whole.points, own), _taken(whole.table, own), borders, (endings[0], endings[1])
+            taken(whole.points, own), taken(whole.table, own), borders, (endings[0], endings[1])
         )
     return strands

@@ -21,6 +21,7 @@ from vrw_jax.models.ladder import (
     LadderStep,
     LadderWheel,
     ModelChoice,
+    reason_of,
     refuse_ladder,
 )
 from vrw_jax.models.paper_step import (

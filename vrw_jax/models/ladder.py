@@ -6,7 +6,8 @@ wheel serves does no work on the upper rung. The rigid wheel never serves: its p
 not yield, fails for every finite stiffness.
 """
 
-from typing import ClassVar
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -103,6 +104,18 @@ def told_why(reason: int) -> str:
     return f"The paper's premises break: {list(PREMISES.values())[reason - 1]}."
 
 
+def reason_of(told: Mapping[str, Any], more_friction: Any) -> tuple[Array, Array]:
+    """`ModelChoice.reason` of the paper's steps, and margins of PREMISES on the last axis.
+
+    `told` are measures and outcome, on a ground with that much less friction.
+    """
+    margins = [told[name] + (more_friction if "friction" in name else 0.0) for name in PREMISES]
+    broken = ~(jnp.stack(margins, -1) >= 0.0)
+    first = jnp.where(jnp.any(broken, -1), 1 + jnp.argmax(broken, -1), 0)
+    outcome = jnp.asarray(told["outcome"], first.dtype)
+    return jnp.where(outcome == Outcome.STEPPED, first, -outcome), jnp.stack(margins, -1)
+
+
 class LadderStep(AbstractGroundStep):
     """One step by the lowest rung that serves, told alike for both. Batched under vmap."""
 
@@ -160,16 +173,7 @@ class LadderWheel(AbstractWheel):
         result = paper.step(
             params, jnp.where(on_plane, _of_plane(x, params.n_legs), jnp.nan), options
         )
-        margins = jnp.stack(
-            [
-                getattr(result.monitors, name)
-                + (ground - paper.friction if "friction" in name else 0.0)
-                for name in PREMISES
-            ]
-        )
-        broken = ~(margins >= 0.0)
-        reason = jnp.where(jnp.any(broken), 1 + jnp.argmax(broken), 0)
-        reason = jnp.where(result.outcome == Outcome.STEPPED, reason, -result.outcome)
+        reason, margins = reason_of(result.measures(), ground - paper.friction)
         reason = jnp.where(on_plane, reason, OFF_THE_PLANE).astype(jnp.int32)
         rung = jnp.where(reason == 0, VISCOELASTIC, UNILATERAL).astype(jnp.int32)
         return ModelChoice(rung, reason, margins, ground), result

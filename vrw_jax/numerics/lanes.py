@@ -5,9 +5,11 @@ for one wheel under `jax.vmap`. Here every `vmap`, nested ones included, is merg
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, PyTree
@@ -91,3 +93,21 @@ def zeros_of(function: Callable[..., PyTree], *arguments: PyTree) -> PyTree:
     """What `function` would return, without calling it, with zeros in all places."""
     blank = lambda leaf: jnp.zeros(leaf.shape, leaf.dtype)
     return jax.tree.map(blank, jax.eval_shape(function, *arguments))
+
+
+def taken(tree: PyTree, places: Any) -> PyTree:
+    """Rows of arrays with a leading axis, as numpy holds them."""
+    return jax.tree.map(lambda x: np.asarray(x)[places], tree)
+
+
+def joined(*trees: PyTree) -> PyTree:
+    """Such arrays one behind the other."""
+    return jax.tree.map(lambda *parts: np.concatenate([np.asarray(p) for p in parts]), *trees)
+
+
+def in_batches(function: Callable, size: int, *trees: PyTree) -> PyTree:
+    """`function` of trees with a leading axis, `size` rows at a time: one shape, compiled once."""
+    n = len(jax.tree.leaves(trees)[0])
+    rows = [np.minimum(np.arange(begin, begin + size), n - 1) for begin in range(0, n, size)]
+    parts = [function(*taken(trees, places)) for places in rows]
+    return taken(joined(*parts), slice(0, n))

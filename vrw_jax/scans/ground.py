@@ -18,13 +18,13 @@ from vrw_jax.batches import as_full_states, walk_lanes
 from vrw_jax.cycles import CycleOptions, Readings, finder_of, read_along
 from vrw_jax.models import (
     PAPER_START,
-    PREMISES,
     UNILATERAL,
     VISCOELASTIC,
     AbstractWheel,
     LadderWheel,
     UnilateralWheel,
     ViscoelasticWheel,
+    reason_of,
 )
 from vrw_jax.numerics import Options, as_float_array
 from vrw_jax.runtime import compiled
@@ -177,12 +177,8 @@ class LadderEngine:
 
     def reasons(self, lower: Told, friction: np.ndarray) -> np.ndarray:
         """`ModelChoice.reason` of each of the paper's gaits, over the step that it repeats."""
-        left = friction - self._paper.friction
-        margins = np.stack([lower[m] + (left if "friction" in m else 0.0) for m in PREMISES], -1)
-        broken = ~(margins >= 0.0)
-        first = np.where(broken.any(-1), 1 + np.argmax(broken, -1), 0)
-        outcome = lower["outcome"].astype(int)
-        return np.where(outcome == Outcome.STEPPED, first, -outcome).astype(np.int8)
+        reason, _ = reason_of(lower, friction - self._paper.friction)
+        return np.asarray(reason, np.int8)
 
 
 def engine_for(

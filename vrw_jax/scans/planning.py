@@ -6,11 +6,11 @@ import json
 import platform
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import jax
 import numpy as np
 
+from vrw_jax import simd
 from vrw_jax.cycles import CycleOptions
 from vrw_jax.models import AbstractWheel, ViscoelasticWheel
 from vrw_jax.numerics import Options, solver_named
@@ -169,17 +169,14 @@ def origin() -> dict[str, object]:
     }
 
 
-VECTOR_SETS = ("avx", "fma", "avx2", "avx512f", "avx512dq", "asimd", "sve")
+VECTOR_SETS = ("avx", "fma", "avx2", "avx512f", "avx512dq", "neon", "sve")
 """Instruction sets that decide which sums the compiler fuses, and so the last digits."""
 
 
 def _processor() -> str:
     """The kind of processor, as far as last digits depend on it."""
-    try:
-        words = set(Path("/proc/cpuinfo").read_text().split())
-    except OSError:
-        words = set()
-    return " ".join([platform.machine(), *(name for name in VECTOR_SETS if name in words)])
+    able = simd.processor()[2].split(",")
+    return " ".join([platform.machine(), *(name for name in VECTOR_SETS if f"+{name}" in able)])
 
 
 def difference(there: object, here: object) -> str:

@@ -4,16 +4,16 @@ Starts may belong to different wheels. Those still undecided after a round are p
 the next one, so that long transients cost little.
 """
 
+import functools
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from vrw_jax.models import AbstractWheel
-from vrw_jax.numerics import Options
+from vrw_jax.numerics import Options, in_batches, taken
 from vrw_jax.walks.stepping import walk
 from vrw_jax.wheel import Outcome, WheelParams
 
@@ -69,19 +69,13 @@ def settle(
     outcome = np.full(n, int(Outcome.STEPPED))
     period, walked = np.zeros(n, int), np.zeros(n, int)
     open_ = np.arange(n)
+    step_on = functools.partial(_walk_block, model, options)
     for k in range(n_rounds):
         now = slice(1 + k * ROUND, 1 + (k + 1) * ROUND)
-        for begin in range(0, len(open_), BLOCK):
-            some = open_[begin : begin + BLOCK]
-            filled = np.pad(some, (0, BLOCK - len(some)), mode="edge")
-            wheel = jax.tree.map(lambda x, filled=filled: x[filled], wheels)
-            states, codes = _walk_block(
-                model, options, wheel, jnp.asarray(history[filled, k * ROUND])
-            )
-            history[some, now] = np.asarray(states)[: len(some)]
-            ended = np.asarray(codes)[: len(some)]
-            outcome[some] = ended[:, -1]
-            walked[some] = k * ROUND + np.sum(ended == Outcome.STEPPED, 1)
+        here = taken(wheels, open_), history[open_, k * ROUND]
+        states, codes = in_batches(step_on, BLOCK, *here)
+        history[open_, now], outcome[open_] = states, codes[:, -1]
+        walked[open_] = k * ROUND + np.sum(codes == Outcome.STEPPED, 1)
         known = (k + 1) * ROUND
         period[open_] = _periods(history[open_, : known + 1], longest_period)
         period[outcome != Outcome.STEPPED] = 0
@@ -148,10 +142,4 @@ def orbit_measures(
     """All measures of the step from each of `states` (n, 3); `params` as in `settle`."""
     n = len(states)
     wheels = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), n), params)
-    parts = []
-    for begin in range(0, n, BLOCK):
-        places = np.minimum(np.arange(begin, begin + BLOCK), n - 1)
-        wheel = jax.tree.map(lambda x, places=places: x[places], wheels)
-        told = _measure_block(model, options, wheel, jnp.asarray(states[places]))
-        parts.append(jax.tree.map(np.asarray, told))
-    return {name: np.concatenate([part[name] for part in parts])[:n] for name in parts[0]}
+    return in_batches(functools.partial(_measure_block, model, options), BLOCK, wheels, states)
