@@ -84,6 +84,7 @@ def test_a_broken_fact_is_told_and_gives_an_exit_code(
     assert result.exit_code == cli.FACT_FAILED
     table = facts.all_facts(broken)
     assert f"{sum(fact.holds for fact in table)} of {len(table)} hold" in result.output
+    assert "26 that the paper publishes, 28 by independent code" in " ".join(result.output.split())
     assert "does not" in result.output
     text = (tmp_path / "facts.md").read_text(encoding="utf-8")
     assert "**does not hold**" in text

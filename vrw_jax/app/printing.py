@@ -89,8 +89,9 @@ def tell_facts(facts: "list[Fact]", folder: Path) -> None:
         ((f.claim, f.where, f.published, f.found, verdict[f.holds]) for f in facts),
         ("fact", "where", "published", "found", ""),
     )
-    n_held = sum(fact.holds for fact in facts)
-    out.print(f"{n_held} of {len(facts)} hold; figures and {folder / 'facts.md'} tell more.")
+    from vrw_jax.paper import held
+
+    out.print(f"{held(facts)}; figures and {folder / 'facts.md'} tell more.")
 
 
 def progress_bar(what: str) -> "Bar":

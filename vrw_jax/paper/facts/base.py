@@ -25,6 +25,11 @@ class Fact:
     reason: str  # for the tolerance, or what would make it fail
 
     @property
+    def by_code(self) -> bool:
+        """Whether the number to meet is not printed, but an independent code's."""
+        return CODE in self.where or CODE in self.published
+
+    @property
     def verdict(self) -> str:
         """Holds, or does not hold."""
         return "holds" if self.holds else "does not hold"

@@ -33,13 +33,20 @@ def _cell(text: str) -> str:
     return re.sub(r"(?<![\w.])-(?=\d)", "−", text)
 
 
+def held(table: Sequence[Fact]) -> str:
+    """How many hold, and whose numbers they are."""
+    n, by_code = len(table), sum(fact.by_code for fact in table)
+    by_whom = f"{n - by_code} that the paper publishes, {by_code} by independent code"
+    return f"{sum(fact.holds for fact in table)} of {n} hold: {by_whom}"
+
+
 def as_page(table: Sequence[Fact]) -> str:
     """The table for a reader, in Markdown."""
     missing = [fact for fact in table if not fact.holds]
     lines = [
         "# The paper's facts, published against found",
         "",
-        f"{len(table) - len(missing)} of {len(table)} hold."
+        f"{held(table)}."
         + ("" if not missing else " Not: " + "; ".join(fact.claim for fact in missing) + "."),
         "",
         INTRODUCTION,
