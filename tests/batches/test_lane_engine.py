@@ -179,10 +179,8 @@ def test_what_can_be_seen_to_be_wrong_is_said_in_one_sentence():
     params = vrw.WheelParams()
     with pytest.raises(ValueError, match=r"shape \(lanes, 3\)"):
         vrw.steps(params, GAIT)
-    with pytest.raises(ValueError, match="at least one step"):
+    with pytest.raises(ValueError, match="at least 1"):
         vrw.steps(params, GAIT[None], 0)
-    with pytest.raises(ValueError, match="'auto', 'lanes', 'diffrax' or 'collocation'"):
-        vrw.steps(params, GAIT[None], engine="fast")
     with pytest.raises(TypeError, match="vmap"):
         jax.jit(lambda c: vrw.steps(vrw.WheelParams(damping=c), GAIT[None]).outcome)(200.0)
 

@@ -323,9 +323,9 @@ def test_a_rigid_wheel_is_followed_by_its_own_step():
 def test_what_is_asked_wrongly_is_said_in_a_sentence():
     with pytest.raises(ValueError, match=r"no parameter \(did you mean 'damping'\?\): choose from"):
         vrw.continue_branch(vrw.WheelParams(), "damp", (50.0, 100.0))
-    with pytest.raises(ValueError, match="the lower must come first"):
+    with pytest.raises(ValueError, match="which holds nothing"):
         vrw.continue_branch(vrw.WheelParams(), "damping", (100.0, 50.0))
-    with pytest.raises(ValueError, match="use continue_branches"):
+    with pytest.raises(ValueError, match=r"use vrw\.continue_branches"):
         vrw.continue_branch(vrw.WheelParams(damping=[1.0, 2.0]), "damping", (50.0, 100.0))
 
 

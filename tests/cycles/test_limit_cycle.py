@@ -160,7 +160,8 @@ def test_every_measure_of_a_cycle_can_be_differentiated():
 
 def test_a_wheel_in_float32_stays_in_float32_beside_64_bits():
     params = jax.tree.map(lambda x: x.astype(jnp.float32), vrw.WheelParams())
-    cycle = jax.eval_shape(vrw.limit_cycle, params)
+    loose = vrw.CycleOptions(tolerance=1e-3)
+    cycle = jax.eval_shape(lambda p: vrw.limit_cycle(p, options=loose), params)
     floats = [x for x in jax.tree.leaves(cycle) if jnp.issubdtype(x.dtype, jnp.inexact)]
     assert {x.dtype for x in floats} == {jnp.dtype(jnp.float32)}
 
@@ -307,7 +308,7 @@ def test_options_of_the_wrong_kind_are_answered_in_one_sentence():
         vrw.limit_cycle(vrw.WheelParams(), options=vrw.Options())
     with pytest.raises(TypeError, match="return map"):
         vrw.limit_cycle(vrw.WheelParams(), model=vrw.RigidWheel(), options=TIGHT)
-    with pytest.raises(ValueError, match="1 step or more"):
+    with pytest.raises(ValueError, match="at least 1"):
         vrw.limit_cycle(vrw.WheelParams(), period_n=0)
 
 

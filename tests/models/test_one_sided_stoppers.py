@@ -31,7 +31,7 @@ def stepped(friction, damping, x=START, options=TIGHT):
 
 
 def test_an_unknown_kind_of_stopper_is_refused_in_one_sentence():
-    with pytest.raises(ValueError, match="must be 'bilateral' or 'one-sided'"):
+    with pytest.raises(ValueError, match="one of 'bilateral', 'one-sided'"):
         vrw.UnilateralWheel(stoppers="soft")
 
 

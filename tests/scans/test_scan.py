@@ -324,10 +324,10 @@ def test_the_first_difference_is_named_by_its_path() -> None:
         (lambda: designs.grid(dampin=[1.0]), "did you mean 'damping'"),
         (lambda: designs.grid(damping=[]), "has no values"),
         (lambda: designs.samples({"damping": [1.0], "slope": [0.1, 0.2]}), "one length"),
-        (lambda: designs.sobol({"damping": (2.0, 1.0)}, 4), "lower one first"),
-        (lambda: designs.uniform({"damping": (1.0, 2.0)}, 0), "at least one sample"),
+        (lambda: designs.sobol({"damping": (2.0, 1.0)}, 4), "holds nothing"),
+        (lambda: designs.uniform({"damping": (1.0, 2.0)}, 0), "at least 1"),
         (lambda: plan(GRID, ["sped"]), "did you mean 'speed'"),
-        (lambda: plan(GRID, chunk=0), "at least 1 sample"),
+        (lambda: plan(GRID, chunk=0), "at least 1"),
     ],
 )
 def test_a_wrong_design_gets_one_sentence(make, expected: str) -> None:

@@ -15,7 +15,8 @@ from textwrap import dedent
 from typing import NamedTuple
 
 FLOW = (
-    ("simd",), ("runtime",), ("numerics",), ("wheel",), ("results",), ("models",), ("walks",),
+    ("simd",), ("runtime",), ("wording",), ("numerics",), ("wheel",), ("results",),
+    ("models",), ("walks",),
     ("batches", "cycles"), ("branches", "tuning", "scans"), ("figures",), ("paper",), ("app",),
 )  # fmt: skip
 """Rooms in the order in which they may know each other; those of one row do not."""

@@ -157,7 +157,7 @@ def test_bad_input_gives_an_empty_trajectory_that_says_so() -> None:
 
 @pytest.mark.parametrize(
     ("choice", "sentence"),
-    [({"n_steps": 0}, "at least one step"), ({"n_samples": 1}, "give 2 or more")],
+    [({"n_steps": 0}, "at least 1"), ({"n_samples": 1}, "at least 2")],
 )
 def test_an_impossible_length_is_refused_in_a_sentence(
     choice: dict[str, int], sentence: str

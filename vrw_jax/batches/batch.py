@@ -9,7 +9,7 @@ alone, among others, and in any order. Wheels of similar work go side by side.
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal, get_args
 
 import equinox as eqx
 import jax
@@ -24,8 +24,12 @@ from vrw_jax.batches.paper import gait_step
 from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import Options, explicit_tableau, real_stability_limit
 from vrw_jax.runtime import lane_program
-from vrw_jax.walks import rung_of
+from vrw_jax.walks import options_of, rung_of, state_of
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, wheel_of
+from vrw_jax.wording import chosen, instance, reals, untraced, whole
+
+Engine = Literal["auto", "lanes", "diffrax", "collocation"]
+ENGINES: tuple[str, ...] = get_args(Engine)
 
 BLOCK = 32_768
 """Lanes that march side by side where XLA compiles them, as on a GPU."""
@@ -70,7 +74,7 @@ def steps(
     *,
     model: AbstractWheel | None = None,
     options: Options | None = None,
-    engine: str = "auto",
+    engine: Engine = "auto",
     durations: Array | np.ndarray | None = None,
 ) -> Steps:
     """`n_steps` gait steps of many wheels, or as many as each can: values only, no derivatives.
@@ -97,8 +101,12 @@ def steps(
 
     Not for use inside `jax.jit`: it compiles itself, once.
     """
-    rung, options = rung_of(model), Options() if options is None else options
-    states = np.asarray(states)
+    untraced("vrw.steps", "map vrw.return_map over the lanes", params, states, durations)
+    instance("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
+    rung, options = rung_of(model), options_of(options)
+    chosen("engine", engine, ENGINES)
+    n_steps = whole("n_steps", n_steps)
+    states = np.asarray(state_of(states, "states"))
     wheels = _wheels(params, states, rung, n_steps, options)
     states = states.astype(wheels.dtype)
     by_legs = rung.rung == "unilateral"
@@ -110,22 +118,22 @@ def _wheels(
     params: WheelParams, states: np.ndarray, model: AbstractWheel, n_steps: int, options: Options
 ) -> np.ndarray:
     """Parameters of each lane, (parameters, lanes); one clear sentence for what can't be walked."""
-    if isinstance(params.damping, jax.core.Tracer):
-        raise TypeError(
-            "the parameters are traced, but vrw.steps compiles itself and has no derivatives: call "
-            "it outside of jit, vmap and grad, or map vrw.return_map over the lanes."
-        )
     sizes = sorted({3, model.section_size(params)})
     if states.ndim != 2 or states.shape[1] not in sizes:
         raise ValueError(
             f"states have shape {states.shape}, but they are section states, shape (lanes, "
             f"{' or '.join(map(str, sizes))}): write states[None] for a single one."
         )
-    if n_steps < 1:
-        raise ValueError(f"n_steps is {n_steps}, but a walk needs at least one step.")
+    options.require_reachable(jnp.result_type(*jax.tree.leaves(params)))
     dtype = np.dtype(jnp.result_type(params.damping, states.dtype))
     options.require_reachable(dtype)
     columns = [getattr(params, name) for name in PARAMETER_NAMES]
+    for name, column in zip(PARAMETER_NAMES, columns, strict=True):
+        if column.shape not in ((), states.shape[:1]):
+            raise ValueError(
+                f"{name} has shape {column.shape}, but there are {len(states)} states: give one "
+                "value for all, or one for each."
+            )
     wheels = np.empty((len(columns), len(states)), dtype)
     for row, column in zip(wheels, columns, strict=True):
         row[:] = np.asarray(column)
@@ -213,7 +221,7 @@ def _expected(durations: Any, states: np.ndarray, dtype: np.dtype) -> np.ndarray
             f"durations have shape {shape}, but collocation needs those of DLS, SLS-I and SLS-II "
             "to some per cent, shape (lanes, 3): give those of a limit cycle, or take 'lanes'."
         )
-    return np.asarray(durations, dtype)
+    return np.asarray(reals("durations", durations), dtype)
 
 
 class _Walked:
@@ -255,10 +263,6 @@ class _Engine(eqx.Module):
 
 
 def _chosen(engine: str, model: Any, options: Options, n_legs: int) -> _Engine:
-    if engine not in ("auto", "lanes", "diffrax", "collocation"):
-        raise ValueError(
-            f"engine is {engine!r}, but it is 'auto', 'lanes', 'diffrax' or 'collocation'."
-        )
     fits = model.rung == "viscoelastic" and explicit_tableau(options.solver) is not None
     if engine in ("lanes", "collocation") and not fits:
         raise ValueError(
@@ -406,8 +410,8 @@ def _by_xla(
             given = tuple(x[filled] for x in lanes)
             out = [np.asarray(x)[: len(some)] for x in program(tuple(uniform), given, few)]
             told = told or [np.empty(len(lanes[0]), x.dtype) for x in out]
-            for whole, part in zip(told, out, strict=True):
-                whole[some[~out[0]]] = part[~out[0]]
+            for told_whole, part in zip(told, out, strict=True):
+                told_whole[some[~out[0]]] = part[~out[0]]
             late.append(some[out[0]])
         open_ = np.concatenate(late)
     return told

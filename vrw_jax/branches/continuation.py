@@ -21,14 +21,20 @@ from vrw_jax.branches.branch import Branch
 from vrw_jax.branches.followed import Wheel, gait_measures
 from vrw_jax.branches.run import IN_SEQUENCE, AbstractRun, Strand, Table, run_all
 from vrw_jax.branches.starts import STARTS, Wanted, start_by_walking
-from vrw_jax.cycles import AGREEMENT, CycleOptions, LimitCycle, WalkedCycle
+from vrw_jax.cycles import (
+    AGREEMENT,
+    AbstractCycle,
+    CycleOptions,
+    LimitCycle,
+    WalkedCycle,
+    finder_of,
+)
 from vrw_jax.models import AbstractWheel, refuse_ladder
 from vrw_jax.numerics import (
     ArclengthOptions,
     MapFollowed,
     Options,
     PathPoint,
-    as_float_array,
     multipliers,
 )
 from vrw_jax.results import (
@@ -43,8 +49,17 @@ from vrw_jax.results import (
     variables,
 )
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.walks import rung_of
+from vrw_jax.walks import one_wheel, options_of, rung_of
 from vrw_jax.wheel import FRICTION, Outcome, WheelParams
+from vrw_jax.wording import (
+    function_of,
+    instance,
+    range_of,
+    real,
+    reals,
+    untraced,
+    whole,
+)
 
 INDICATORS = ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
 ENDING = (*INDICATORS, "duration_dls", "duration_sls1", "duration_sls2")
@@ -124,11 +139,9 @@ def continue_branch(
     ground `name` may be "friction" too, and the start is a `WalkedCycle` or, without one, where a
     walk of some steps ends; a branch goes on where the order of events changes, with a kink.
     """
-    if params.damping.ndim != 0:
-        raise ValueError(
-            f"damping has shape {params.damping.shape}, but one branch is that of one wheel: use "
-            "continue_branches for a batch."
-        )
+    one_wheel(params, "use vrw.continue_branches for a batch")
+    if cycle is not None:
+        instance("cycle", cycle, AbstractCycle, "give vrw.limit_cycle(params)")
     batch = jax.tree.map(lambda x: x[None], params)
     cycle = None if cycle is None else jax.tree.map(lambda x: x[None], cycle)
     (branch,) = continue_branches(
@@ -154,14 +167,13 @@ def continue_branches(
 
     A wheel without a limit cycle to start from gets a branch without points, whose outcome says so.
     """
-    model = rung_of(model)
-    refuse_ladder(model, "followed")
-    require_known(name, model.parameter_names, "parameter")
-    low, high = (float(b) for b in bounds)
-    if not low < high:
-        raise ValueError(f"bounds are ({low:g}, {high:g}), but the lower must come first.")
-    options = ArclengthOptions() if options is None else options
-    step_options = Options.tight() if step_options is None else step_options
+    untraced("vrw.continue_branch", "differentiate vrw.limit_cycle", params, cycle)
+    instance("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
+    model, step_options = rung_of(model), options_of(step_options or Options.tight())
+    _check_followed(model, name, whole("period_n", period_n), cycle)
+    (low, high), options = range_of("bounds", bounds), _arclength(options)
+    finder = finder_of(model, params.n_legs, cycle_options=cycle_options, step_options=step_options)
+    finder.options_used.require_reachable(jnp.result_type(*jax.tree.leaves(params)))
     batch = np.broadcast_shapes(*(x.shape for x in jax.tree.leaves(params)))
     if len(batch) != 1:
         raise ValueError(f"the wheels' batch has shape {batch}, but it must have one axis.")
@@ -187,6 +199,22 @@ def continue_branches(
 
 UNTOLD = ("outcome", "solver_steps")
 """Of the checking step, and not of a branch."""
+
+
+def _check_followed(model: AbstractWheel, name: str, period_n: int, cycle: Any) -> None:
+    refuse_ladder(model, "followed")
+    require_known(name, model.parameter_names, "parameter")
+    if period_n > 1 and cycle is None:
+        raise ValueError(
+            f"period_n is {period_n} and there is no cycle, but a gait of several steps is one of "
+            "many beside the gait of one step: give cycle=vrw.limit_cycle(..., guess=...)."
+        )
+
+
+def _arclength(options: ArclengthOptions | None) -> ArclengthOptions:
+    if options is not None:
+        instance("options", options, ArclengthOptions, "give vrw.ArclengthOptions()")
+    return ArclengthOptions() if options is None else options
 
 
 def _branch_of_gaits(
@@ -276,15 +304,18 @@ def continue_map(
     The map must be differentiable forwards, and NaN where it is not defined. Its
     bifurcations are located as for `continue_branch`.
     """
-    low, high = (float(b) for b in bounds)
-    if not low <= p <= high:
-        raise ValueError(f"p is {p:g}, but the branch must start within ({low:g}, {high:g}).")
-    options = ArclengthOptions() if options is None else options
+    function_of("function", function, "of constants, x and p")
+    untraced("vrw.continue_map", "use vrw.newton_cycle", x, p, constants)
+    low, high = range_of("bounds", bounds)
+    if not low <= real("p", p) <= high:
+        raise ValueError(
+            f"p is {p:g}, but the branch must start within its bounds: give one in [{low:g}, "
+            f"{high:g}]."
+        )
+    options, x = _arclength(options), reals("x", x)
     lead = lambda tree: jax.tree.map(lambda a: jnp.asarray(a, float)[None], tree)
     run = _MapRun(MapFollowed(function), options, lead(constants), np.array([low, high]))
-    (strand,) = run_all(
-        run, lead(as_float_array(x)), lead(p), np.array([True]), lambda owner, point: None
-    )
+    (strand,) = run_all(run, lead(x), lead(p), np.array([True]), lambda owner, point: None)
     if strand is None:
         empty = xr.Dataset(coords={name: ("point", np.zeros(0))})
         return Branch(name, empty, (), ("", ""), Outcome.NO_CYCLE_FOUND)

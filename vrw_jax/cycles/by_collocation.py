@@ -53,6 +53,10 @@ class CollocationFinder(AbstractGaitFinder):
         return cls(model, n_legs, step, cycle, period_n)
 
     @property
+    def options_used(self) -> CycleOptions:
+        return self.options
+
+    @property
     def problem(self) -> Problem:
         """What is static in the search."""
         return Problem(self.n_legs, self.period_n, self.options)

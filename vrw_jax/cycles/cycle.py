@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from vrw_jax.numerics import floquet
 from vrw_jax.results import Row, as_html, as_text, is_concrete, listed
 from vrw_jax.wheel import Outcome
+from vrw_jax.wording import chosen
 
 
 class AbstractCycle(eqx.Module):
@@ -108,7 +109,7 @@ class AbstractCycle(eqx.Module):
 
         Durations are summed over the cycle's steps, of indicators the least counts.
         """
-        return MEASURED[name](self)
+        return MEASURED[chosen("the measure", name, tuple(MEASURED))](self)
 
     def measures(self, names: Iterable[str]) -> dict[str, Array]:
         """Several of `measure`; what is not asked for is not traced."""

@@ -111,6 +111,11 @@ class AbstractGaitFinder(eqx.Module):
     ) -> "AbstractGaitFinder":
         """The finder with the options of its step, and of its search if that has its own."""
 
+    @property
+    def options_used(self) -> Any:
+        """Those of `options_type`."""
+        return self.step_options
+
     @abc.abstractmethod
     def cycle(self, params: WheelParams, guess: Any = None) -> AbstractCycle:
         """The cycle of a wheel near `guess`: a neighbour's `near`, a section state or nothing."""

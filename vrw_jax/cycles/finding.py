@@ -3,19 +3,25 @@
 from collections.abc import Sequence
 from typing import Any, overload
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from vrw_jax.cycles.by_collocation import CollocationFinder
 from vrw_jax.cycles.by_walking import GroundFinder, SectionFinder
 from vrw_jax.cycles.collocated import LimitCycle
+from vrw_jax.cycles.cycle import AbstractCycle
 from vrw_jax.cycles.finder import AbstractGaitFinder
 from vrw_jax.cycles.options import CycleOptions
+from vrw_jax.cycles.search import Located
 from vrw_jax.cycles.section_cycle import WalkedCycle
 from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import Options
-from vrw_jax.walks import ModelLike, rung_of
+from vrw_jax.results import is_concrete, listed
+from vrw_jax.walks import ModelLike, one_wheel, options_of, rung_of, state_of
 from vrw_jax.wheel import WheelParams
+from vrw_jax.wording import instance, whole
 
 Guess = LimitCycle | WalkedCycle | Array | np.ndarray | Sequence[float]
 """A neighbour's cycle, or a section state near the one that is wanted."""
@@ -35,9 +41,11 @@ def finder_of(
     step_options: Options | None = None,
 ) -> AbstractGaitFinder:
     """What finds, checks and differentiates gaits of this rung."""
+    if cycle_options is not None:
+        instance("cycle_options", cycle_options, CycleOptions, "give vrw.CycleOptions()")
     rung = rung_of(model)
     make = FINDERS.get(rung.rung, SectionFinder).of
-    return make(rung, n_legs, Options() if step_options is None else step_options, period_n,
+    return make(rung, n_legs, options_of(step_options), period_n,
                 CycleOptions() if cycle_options is None else cycle_options)  # fmt: skip
 
 
@@ -83,10 +91,27 @@ def limit_cycle(
     Any other rung as `model` is solved on its own return map, with `Options` of its step: a
     `WalkedCycle`, to the step's errors.
     """
-    if period_n < 1:
-        raise ValueError(f"period_n is {period_n}, but a gait repeats after 1 step or more.")
-    found: Any = finder_for(params, model, options, period_n).cycle(params, guess)
+    finder = finder_for(params, model, options, whole("period_n", period_n))
+    if guess is None and period_n > 1:
+        raise ValueError(
+            f"period_n is {period_n} and there is no guess, but a gait of several steps is one of "
+            "many beside the gait of one step: give guess=, a section state near it."
+        )
+    found: Any = finder.cycle(params, near(guess))
     return found
+
+
+def near(guess: Any) -> Any:
+    """A guess as a caller gives it: a cycle, a place that one told, or a finite section state."""
+    if guess is None or isinstance(guess, AbstractCycle | Located):
+        return guess
+    state = state_of(guess, "guess")
+    if is_concrete(state) and not jnp.isfinite(state).all():
+        raise ValueError(
+            f"guess is {listed(state)}, but a search can begin at finite numbers only: give a "
+            "neighbour's cycle, or a section state near the gait."
+        )
+    return state
 
 
 def finder_for(
@@ -95,7 +120,10 @@ def finder_for(
     options: CycleOptions | Options | None,
     period_n: int = 1,
 ) -> AbstractGaitFinder:
-    """The finder that takes these options; one clear sentence where they are another's."""
+    """The finder that takes these options; one clear sentence for what can be seen to be wrong."""
+    one_wheel(params, "map over batches with jax.vmap, in_axes=(params.in_axes,), or use vrw.scan")
+    if options is not None:
+        instance("options", options, (CycleOptions, Options), "give vrw.CycleOptions()")
     of_cycle = isinstance(options, CycleOptions)
     finder = finder_of(
         model,
@@ -114,4 +142,5 @@ def finder_for(
             "options is an Options, but the paper's wheel is solved by collocation: "
             "give vrw.CycleOptions(), or CycleOptions.tight()."
         )
+    finder.options_used.require_reachable(jnp.result_type(*jax.tree.leaves(params)))
     return finder

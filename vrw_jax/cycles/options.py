@@ -2,33 +2,54 @@
 
 import dataclasses
 
+import jax.numpy as jnp
+import numpy as np
+
+from vrw_jax.wording import positive, shown, whole
+
 
 @dataclasses.dataclass(frozen=True)
 class CycleOptions:
     """Numerical choices of `limit_cycle`; each change compiles again.
 
     The defaults reach 1e-9 relative in values and 1e-8 in first derivatives.
+
+    - `steps`: of order 8 in DLS, SLS-I, SLS-II;
+    - `growth`: last over first step in SLS-I;
+    - `tolerance`: of Newton's last correction, rad, rad/s, s or m;
+    - `iterations`: of Newton's method per attempt;
+    - `first_iterations`: after which a batch gathers the wheels that need more;
+    - `stages`: of a homotopy from Table 1, where the first attempt fails;
+    - `block`: wheels that are solved side by side.
     """
 
-    steps: tuple[int, int, int] = (10, 8, 3)  # of order 8 in DLS, SLS-I, SLS-II
-    growth: float = 2.0  # last over first step in SLS-I
-    tolerance: float = 1e-10  # of Newton's last correction, rad, rad/s, s or m
-    iterations: int = 12  # of Newton's method per attempt
-    first_iterations: int = 4  # after which a batch gathers the wheels that need more
-    stages: int = 12  # of a homotopy from Table 1, where the first attempt fails
-    block: int = 64  # wheels that are solved side by side
+    steps: tuple[int, int, int] = (10, 8, 3)
+    growth: float = 2.0
+    tolerance: float = 1e-10
+    iterations: int = 12
+    first_iterations: int = 4
+    stages: int = 12
+    block: int = 64
 
     def __post_init__(self) -> None:
         for name in ("iterations", "first_iterations", "stages", "block"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}, but it must be at least 1.")
+            whole(name, getattr(self, name))
         for name in ("growth", "tolerance"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"{name} is {getattr(self, name):g}, but it must be positive.")
-        if len(self.steps) != 3 or min(self.steps) < 1:
+            positive(name, getattr(self, name))
+        if not isinstance(self.steps, tuple | list) or len(self.steps) != 3:
             raise ValueError(
-                f"steps is {self.steps}, but it counts the steps in DLS, SLS-I and SLS-II: "
+                f"steps is {shown(self.steps)}, but it counts the steps in DLS, SLS-I and SLS-II: "
                 "give three whole numbers of at least 1, as (10, 8, 3)."
+            )
+        steps = tuple(whole(f"steps[{i}]", count) for i, count in enumerate(self.steps))
+        object.__setattr__(self, "steps", steps)
+
+    def require_reachable(self, dtype: np.dtype) -> None:
+        """Refuse a tolerance below what the number format can resolve."""
+        if self.tolerance < jnp.finfo(dtype).eps:
+            raise ValueError(
+                f"the wheel holds {np.dtype(dtype).name} numbers, in which no limit cycle is found "
+                f"to {self.tolerance:g}: call vrw.start_jax() before WheelParams are made."
             )
 
     @classmethod

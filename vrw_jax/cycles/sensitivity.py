@@ -6,13 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vrw_jax.cycles.finding import Guess, finder_for
+from vrw_jax.cycles.finding import Guess, finder_for, near
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.models import AbstractWheel, refuse_ladder
 from vrw_jax.numerics import Options
 from vrw_jax.results import MEASURES
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.wheel import Outcome, WheelParams
+from vrw_jax.wording import names_of, nearest, untraced
 
 
 def sensitivities(
@@ -29,17 +30,20 @@ def sensitivities(
     measure is zero. Leaving out the measures of stability saves most of the compile time. `guess`,
     `model` and `options` are those of `limit_cycle`. On real ground friction is a parameter too.
     """
+    untraced("vrw.sensitivities", "differentiate vrw.limit_cycle", params, guess)
     refuse_ladder(model, "differentiated")
     finder = finder_for(params, model, options)
-    names = finder.usual if measures is None else tuple(measures)
+    names = finder.usual if measures is None else names_of("measures", measures)
     unknown = sorted(set(names) - set(finder.differentiable))
-    if unknown:
+    if unknown or not names:
         raise ValueError(
-            f"measures holds {', '.join(unknown)}, but the measures of a cycle are "
+            f"measures holds {', '.join(unknown) or 'nothing'}"
+            f"{nearest(unknown[0], finder.differentiable) if unknown else ''}, "
+            "but the measures of a cycle are "
             f"{', '.join(finder.differentiable)}: choose among these."
         )
     vector = finder.model.values(params)
-    found = finder.measured(vector, guess, names)
+    found = finder.measured(vector, near(guess), names)
     if int(found.outcome) != Outcome.STEPPED:
         outcome = Outcome(int(found.outcome))
         raise ValueError(f"there is no gait to differentiate: {outcome.meaning}")

@@ -7,7 +7,7 @@ not yield, fails for every finite stiffness.
 """
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -25,9 +25,9 @@ from vrw_jax.models.unilateral.contacts import OFF, STICK
 from vrw_jax.models.unilateral.section import LOCKED, FullState, embedded
 from vrw_jax.models.unilateral.wheel import UnilateralStep, UnilateralTrajectory, UnilateralWheel
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
-from vrw_jax.numerics import Options, Scalar, as_float_array
+from vrw_jax.numerics import Number, Options, Scalar
 from vrw_jax.results import MARGINS
-from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, WheelParams
+from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, WheelParams, friction_of
 
 VISCOELASTIC, UNILATERAL = 1, 2
 """Numbers of the rungs; 0 is the rigid one."""
@@ -145,7 +145,11 @@ class LadderWheel(AbstractWheel):
     parameter_names: ClassVar[tuple[str, ...]] = (*PARAMETER_NAMES, FRICTION)
     tells_contacts: ClassVar[bool] = True
 
-    friction: Scalar = eqx.field(converter=as_float_array, default=0.7)
+    friction: Scalar = eqx.field(converter=friction_of, default=0.7)
+
+    if TYPE_CHECKING:
+
+        def __init__(self, friction: Number = 0.7) -> None: ...
 
     @property
     def ground(self) -> UnilateralWheel:

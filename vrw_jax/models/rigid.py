@@ -1,5 +1,6 @@
 """The lowest rung: all legs rigid. A step is a closed formula; nothing is integrated."""
 
+from functools import partial
 from typing import ClassVar
 
 import equinox as eqx
@@ -28,9 +29,11 @@ from vrw_jax.wheel import (
     Symbols,
     WheelParams,
     dynamics,
+    known_friction,
     rear_foot_height,
     transitions,
 )
+from vrw_jax.wording import flag
 
 GRID = 33
 """Angles in each zoom on a force's minimum: forces are smooth over the 45 degrees of a step."""
@@ -51,9 +54,13 @@ class RigidWheel(AbstractWheel):
     tells_contacts: ClassVar[bool] = False
     legs_yield: ClassVar[bool] = False
 
-    friction: float = eqx.field(static=True, default=1.0)
-    stop_at_lift_off: bool = eqx.field(static=True, default=True)
-    held_landing: bool = eqx.field(static=True, default=False)
+    friction: float = eqx.field(static=True, converter=known_friction, default=1.0)
+    stop_at_lift_off: bool = eqx.field(
+        static=True, converter=partial(flag, "stop_at_lift_off"), default=True
+    )
+    held_landing: bool = eqx.field(
+        static=True, converter=partial(flag, "held_landing"), default=False
+    )
 
     def start(self, params: WheelParams) -> SectionState:
         """The rolling fixed point's rate, where there is one; a brisk start where there is none."""

@@ -37,7 +37,9 @@ from vrw_jax.wheel import (
     Motion,
     WheelParams,
     dynamics,
+    known_friction,
 )
+from vrw_jax.wording import flag
 
 
 class Flow(NamedTuple):
@@ -97,8 +99,10 @@ class ViscoelasticWheel(AbstractWheel):
     parameter_names: ClassVar[tuple[str, ...]] = PARAMETER_NAMES
     tells_contacts: ClassVar[bool] = False
 
-    friction: float = eqx.field(static=True, default=1.0)
-    stop_at_lift_off: bool = eqx.field(static=True, default=True)
+    friction: float = eqx.field(static=True, converter=known_friction, default=1.0)
+    stop_at_lift_off: bool = eqx.field(
+        static=True, converter=functools.partial(flag, "stop_at_lift_off"), default=True
+    )
 
     def start(self, params: WheelParams) -> SectionState:
         """Close to the gait of Table 1, inside its basin."""

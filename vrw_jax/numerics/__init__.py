@@ -74,7 +74,7 @@ from vrw_jax.numerics.lanes import (
 from vrw_jax.numerics.march import LanePhase, integrate_lanes
 from vrw_jax.numerics.minima import State, Watched
 from vrw_jax.numerics.newton import SectionCycle, corrected, newton_cycle
-from vrw_jax.numerics.options import Options
+from vrw_jax.numerics.options import Options, SolverName
 from vrw_jax.numerics.roots import BIFURCATIONS, bifurcation_functions, brackets, locate, turns
 from vrw_jax.numerics.segments import product_multipliers, segment_maps
 from vrw_jax.numerics.tableaus import (
@@ -88,4 +88,4 @@ from vrw_jax.numerics.tableaus import (
     real_stability_limit,
 )
 from vrw_jax.numerics.trig import sine_cosine
-from vrw_jax.numerics.types import Elementwise, Scalar, Vector, as_float_array
+from vrw_jax.numerics.types import Elementwise, Number, Scalar, Vector, as_float_array

@@ -22,6 +22,7 @@ from vrw_jax.numerics.codes import Code
 from vrw_jax.numerics.derivatives import with_jacobian
 from vrw_jax.numerics.lanes import select
 from vrw_jax.numerics.types import Scalar
+from vrw_jax.wording import positive, whole
 
 Unknown = Any
 """A pytree of float arrays: all that Newton's method moves."""
@@ -30,25 +31,34 @@ Section = Float[Array, " n"]
 
 @dataclasses.dataclass(frozen=True)
 class ArclengthOptions:
-    """Numerical choices of a continuation; each change compiles again. Lengths as above."""
+    """Numerical choices of a continuation; each change compiles again.
+
+    - `first_step`, `largest_step`, `smallest_step`: along the branch, in the section's numbers and
+      in the parameter as a share of its range;
+    - `max_points`: in each direction;
+    - `iterations`: of Newton's method for one point;
+    - `tolerance`: of Newton's last correction;
+    - `turn`: most that the branch may turn in one step, rad.
+    """
 
     first_step: float = 0.005
     largest_step: float = 0.02
     smallest_step: float = 1e-6
-    max_points: int = 400  # in each direction
-    iterations: int = 10  # of Newton's method for one point
-    tolerance: float = 1e-10  # of Newton's last correction
-    turn: float = 0.2  # rad, most that the branch may turn in one step
+    max_points: int = 400
+    iterations: int = 10
+    tolerance: float = 1e-10
+    turn: float = 0.2
 
     def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if not value > 0:
-                raise ValueError(f"{field.name} is {value:g}, but it must be positive.")
+        for name in ("max_points", "iterations"):
+            whole(name, getattr(self, name))
+        for name in ("first_step", "largest_step", "smallest_step", "tolerance", "turn"):
+            positive(name, getattr(self, name))
         if not self.smallest_step <= self.first_step <= self.largest_step:
             raise ValueError(
                 f"the steps are {self.smallest_step:g} (smallest), {self.first_step:g} (first) and "
-                f"{self.largest_step:g} (largest), but they must not fall in this order."
+                f"{self.largest_step:g} (largest), but they must not fall in this order: "
+                "give smallest_step <= first_step <= largest_step."
             )
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.numerics.derivatives import with_jacobian
 from vrw_jax.numerics.types import Scalar
+from vrw_jax.wording import function_of, reals, whole
 
 
 class SectionCycle(NamedTuple):
@@ -86,6 +87,10 @@ def newton_cycle(
     derivatives: the point to third order, the Jacobian to first. A start that does not converge is
     returned as it is, without derivative.
     """
+
+    function_of("function", function, "that maps a state to the next")
+    start, period_n = reals("start", start), whole("period_n", period_n)
+    iterations = whole("iterations", iterations)
 
     def iterate(x: Array) -> Array:
         for _ in range(period_n):

@@ -1,45 +1,78 @@
 """Every numerical choice of the event-driven step in one visible object."""
 
+import functools
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.numerics.types import Scalar, as_float_array
+from vrw_jax.numerics.types import Number, Scalar, as_float_array
+from vrw_jax.wording import chosen, positive, reals, whole
+
+SolverName = Literal[
+    "Dopri8", "Tsit5", "Dopri5", "Bosh3", "Heun", "Midpoint", "Ralston",
+    "Kvaerno3", "Kvaerno4", "Kvaerno5", "ImplicitEuler",
+]  # fmt: skip
+"""diffrax's Runge-Kutta solvers with an error estimate: explicit ones, then implicit ones."""
+SOLVERS: tuple[str, ...] = get_args(SolverName)
 
 FLOOR = 90.0
 """Smallest useful tolerance in units of round-off (2e-14 in float64): below it rounding rules."""
 
 
+def _positive(name: str, default: float) -> Any:
+    return eqx.field(converter=functools.partial(reals, name), default=default)
+
+
 class Options(eqx.Module):
     """Numerical choices of an event-driven step. The tolerances may change without recompiling.
 
-    `solver` names any diffrax Runge-Kutta solver with an error estimate, explicit or implicit:
-    "Dopri8", "Tsit5", "Dopri5", "Bosh3", "Kvaerno3", "Kvaerno5", ...
+    - `solver`: one of `SOLVERS`, diffrax's Runge-Kutta solvers with an error estimate;
+    - `rtol`, `atol`: relative and absolute tolerance of each local step, in m, rad, m/s, rad/s;
+    - `derivative_tightening`: derivatives are computed so much tighter, since tangents take no part
+      in the step-size control, and at equal tolerances err up to 100 times as much as values;
+    - `max_phase_time`: of one phase, s;
+    - `max_solver_steps`: of one phase, tried steps;
+    - `first_step`: of each phase, s;
+    - `event_steps`: at most so many to locate an event;
+    - `monitor_steps`: secant re-steps to a monitor's minimum.
     """
 
     solver: str = eqx.field(static=True, default="Dopri8")
-    rtol: Scalar = eqx.field(converter=as_float_array, default=1e-10)  # of each local step
-    atol: Scalar = eqx.field(converter=as_float_array, default=1e-10)  # m, rad, m/s, rad/s
-    # Derivatives are computed this much tighter: tangents take no part in the step-size control,
-    # and at equal tolerances their error is up to 100 times that of the values.
-    derivative_tightening: Scalar = eqx.field(converter=as_float_array, default=100.0)
-    max_phase_time: Scalar = eqx.field(converter=as_float_array, default=20.0)  # s
-    max_solver_steps: int = eqx.field(static=True, default=20_000)  # of one phase, tried steps
-    first_step: Scalar = eqx.field(converter=as_float_array, default=5e-3)  # of each phase, s
-    event_steps: int = eqx.field(static=True, default=30)  # at most, to locate an event
-    monitor_steps: int = eqx.field(static=True, default=5)  # secant re-steps to a monitor's minimum
+    rtol: Scalar = _positive("rtol", 1e-10)
+    atol: Scalar = _positive("atol", 1e-10)
+    derivative_tightening: Scalar = _positive("derivative_tightening", 100.0)
+    max_phase_time: Scalar = _positive("max_phase_time", 20.0)
+    max_solver_steps: int = eqx.field(static=True, default=20_000)
+    first_step: Scalar = _positive("first_step", 5e-3)
+    event_steps: int = eqx.field(static=True, default=30)
+    monitor_steps: int = eqx.field(static=True, default=5)
+
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            solver: SolverName = "Dopri8",
+            rtol: Number = 1e-10,
+            atol: Number = 1e-10,
+            derivative_tightening: Number = 100.0,
+            max_phase_time: Number = 20.0,
+            max_solver_steps: int = 20_000,
+            first_step: Number = 5e-3,
+            event_steps: int = 30,
+            monitor_steps: int = 5,
+        ) -> None: ...
 
     def __check_init__(self) -> None:
+        chosen("solver", self.solver, SOLVERS)
         for name in ("rtol", "atol", "derivative_tightening", "max_phase_time", "first_step"):
             value = getattr(self, name)
-            if isinstance(value, jax.core.Tracer) or jnp.ndim(value) > 0:
-                continue
-            if not float(value) > 0.0:
-                raise ValueError(f"{name} is {float(value):g}, but it must be positive.")
+            if not isinstance(value, jax.core.Tracer) and jnp.ndim(value) == 0:
+                positive(name, value)
         for name in ("max_solver_steps", "event_steps", "monitor_steps"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}, but it must be at least 1.")
+            whole(name, getattr(self, name))
 
     @classmethod
     def tight(cls) -> "Options":
@@ -68,10 +101,7 @@ class Options(eqx.Module):
             enough = 1e2 * floor
             hint = f"ask for no less, as with Options(rtol={enough:.0e}, atol={enough:.0e})"
             if dtype == np.float32:
-                hint = (
-                    'call jax.config.update("jax_enable_x64", True) before anything else, or '
-                    + hint
-                )
+                hint = "call vrw.start_jax() before anything else, or " + hint
             raise ValueError(
                 f"{name} is {float(value):g}, but {np.dtype(dtype).name} numbers can't resolve "
                 f"less than {floor:.0e}: {hint}."

@@ -2,10 +2,10 @@
 
 from typing import TYPE_CHECKING
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Inexact
+
+from vrw_jax.wording import reals
 
 Scalar = Float[Array, ""]
 if TYPE_CHECKING:
@@ -20,9 +20,10 @@ Vector = tuple[Elementwise, ...]
 """One quantity for each component."""
 
 
+Number = float | Array | np.ndarray
+"""A number as a caller gives it, or an array of them."""
+
+
 def as_float_array(value: object) -> Array:
     """A strongly typed floating-point array; Python numbers take JAX's default float type."""
-    array = jnp.asarray(value)
-    if not jnp.issubdtype(array.dtype, jnp.floating):
-        array = array.astype(jnp.result_type(float))
-    return jax.lax.convert_element_type(array, np.dtype(array.dtype))
+    return reals("the value", value)

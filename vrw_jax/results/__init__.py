@@ -18,5 +18,14 @@ from vrw_jax.results.measures import (
     what_breaks,
 )
 from vrw_jax.results.origin import provenance
-from vrw_jax.results.text import Row, as_html, as_markdown, as_tex, as_text, is_concrete, listed
-from vrw_jax.results.wording import nearest, require_known
+from vrw_jax.wording import (
+    Row,
+    as_html,
+    as_markdown,
+    as_tex,
+    as_text,
+    is_concrete,
+    listed,
+    nearest,
+    require_known,
+)

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vrw_jax.results.text import as_tex
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.wheel import DOMAINS, Outcome
+from vrw_jax.wording import as_tex
 
 
 @dataclass(frozen=True)

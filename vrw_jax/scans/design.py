@@ -10,6 +10,7 @@ import numpy as np
 
 from vrw_jax.results import require_known
 from vrw_jax.wheel import FRICTION, PARAMETER_NAMES
+from vrw_jax.wording import instance, range_of, shown, untraced, whole
 
 Columns = dict[str, np.ndarray]
 """One value per sample of each parameter that is swept."""
@@ -154,14 +155,14 @@ def sobol(ranges: Mapping[str, Range], n: int, seed: int = 0) -> Samples:
 
     names, lower, upper = _box(ranges, n)
     exponent = max(int(n - 1).bit_length(), 0)
-    points = qmc.Sobol(len(names), rng=np.random.default_rng(seed)).random_base2(exponent)[:n]
+    points = qmc.Sobol(len(names), rng=_generator(seed)).random_base2(exponent)[:n]
     return _spread(names, lower, upper, points, "sobol")
 
 
 def uniform(ranges: Mapping[str, Range], n: int, seed: int = 0) -> Samples:
     """`n` independent samples, uniform over the box."""
     names, lower, upper = _box(ranges, n)
-    points = np.random.default_rng(seed).random((n, len(names)))
+    points = _generator(seed).random((n, len(names)))
     return _spread(names, lower, upper, points, "uniform")
 
 
@@ -180,7 +181,7 @@ def saltelli(ranges: Mapping[str, Range], n: int, seed: int = 0) -> Samples:
             f"give n = {1 << n.bit_length()}, say."
         )
     d = len(names)
-    points = qmc.Sobol(2 * d, rng=np.random.default_rng(seed)).random_base2(n.bit_length() - 1)
+    points = qmc.Sobol(2 * d, rng=_generator(seed)).random_base2(n.bit_length() - 1)
     a, b = points[:, :d], points[:, d:]
     mixed = [np.where(np.arange(d) == i, b, a) for i in range(d)]
     return _spread(names, lower, upper, np.concatenate([a, b, *mixed]), SALTELLI)
@@ -193,25 +194,23 @@ def _spread(
     return Samples(dict(zip(names, np.ascontiguousarray(values.T), strict=True)), kind)
 
 
+def _generator(seed: int) -> np.random.Generator:
+    return np.random.default_rng(whole("seed", seed, 0))
+
+
 def _box(ranges: Mapping[str, Range], n: int) -> tuple[list[str], np.ndarray, np.ndarray]:
-    if not (isinstance(n, int | np.integer) and n >= 1):
-        raise ValueError(f"n is {n!r}, but a scan needs at least one sample: give n = 1 or more.")
-    if n > LONGEST:
+    if whole("n", n) > LONGEST:
         raise ValueError(
             f"n is {n:,}, but a list takes {LONGEST:,} samples at most: give fewer, or a grid."
         )
-    for name, pair in _known(ranges).items():
-        if np.shape(pair) != (2,) or not np.all(np.isfinite(pair)) or not pair[0] < pair[1]:
-            raise ValueError(
-                f"the range of {name} is {pair!r}, but it must be two finite numbers, the lower "
-                f"one first: write {name} = (lower, upper)."
-            )
-    bounds = np.asarray([ranges[name] for name in ranges], float)
+    pairs = [range_of(f"the range of {name}", pair) for name, pair in _known(ranges).items()]
+    bounds = np.asarray(pairs)
     return list(ranges), bounds[:, 0], bounds[:, 1]
 
 
 def _known(values: Mapping[str, object]) -> Mapping:
     """`values`, if they name parameters that can be swept."""
+    instance("the design", values, Mapping, "write {'damping': (100.0, 200.0)}")
     if not values:
         raise ValueError(
             "the design sweeps no parameter, but a scan needs at least one: "
@@ -223,12 +222,17 @@ def _known(values: Mapping[str, object]) -> Mapping:
 
 
 def _column(name: str, value: object) -> np.ndarray:
-    try:
-        column = np.atleast_1d(np.asarray(value, float))
-    except (TypeError, ValueError):
-        column = np.zeros((0, 0))
+    untraced("a design", "use jax.vmap", value)
+    column = np.atleast_1d(np.asarray(value))
+    if column.dtype.kind not in "fiu" and column.size:
+        raise TypeError(
+            f"{name} is {shown(value)}, but it must be a list of numbers: write [100.0]."
+        )
+    column = column.astype(float)
     if column.ndim != 1:
-        raise ValueError(f"{name} is {value!r}, but it must be a list of numbers.")
+        raise ValueError(
+            f"{name} has shape {column.shape}, but it must be a list of numbers: give one axis."
+        )
     if not len(column):
         raise ValueError(f"{name} has no values, but a scan needs at least one: add some.")
     return column

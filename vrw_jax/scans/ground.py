@@ -26,7 +26,7 @@ from vrw_jax.models import (
     ViscoelasticWheel,
     reason_of,
 )
-from vrw_jax.numerics import Options, as_float_array
+from vrw_jax.numerics import Options, SolverName, as_float_array
 from vrw_jax.runtime import compiled
 from vrw_jax.scans.evaluate import Engine, filled_up, masked, n_cores, numbers
 from vrw_jax.scans.offer import derivative
@@ -37,7 +37,8 @@ LANES = 8
 """Wheels that one call of the compiled function takes: they wait for the slowest. Each is twenty
 lanes and more in the Jacobians of Newton's method."""
 
-SOLVER_TOWARDS, TOLERANCE_TOWARDS = "Tsit5", 1e-8
+SOLVER_TOWARDS: SolverName = "Tsit5"
+TOLERANCE_TOWARDS = 1e-8
 """Of the steps towards a gait, whatever those of the gait itself."""
 
 Columns = Mapping[str, np.ndarray]

@@ -15,6 +15,7 @@ from vrw_jax.runtime import xarray as xr
 from vrw_jax.scans.design import SALTELLI
 from vrw_jax.scans.soundness import manifest_of
 from vrw_jax.wheel import Outcome
+from vrw_jax.wording import instance, names_of
 
 FEWEST = 64
 """Rows below which indices are noise."""
@@ -36,13 +37,14 @@ def sobol_indices(
     """
     from scipy.stats import sobol_indices as indices_of
 
+    instance("scan", scan, xr.Dataset, "give what vrw.scan or vrw.open_scan returned")
     design = manifest_of(scan.attrs).get("design", {})
     if design.get("kind") != SALTELLI:
         raise ValueError(
             f"the scan's samples are of kind {design.get('kind')!r}, but Sobol' indices need those "
             "of vrw.saltelli({...}, n), or of a table [saltelli]: scan these."
         )
-    parameters, wanted = list(design["swept"]), list(measures)
+    parameters, wanted = list(design["swept"]), list(names_of("measures", measures))
     for name in wanted:
         if name not in scan or scan[name].dims != ("sample",):
             raise ValueError(

@@ -11,9 +11,9 @@ import jax
 import numpy as np
 
 from vrw_jax import simd
-from vrw_jax.cycles import CycleOptions
+from vrw_jax.cycles import CycleOptions, finder_of
 from vrw_jax.models import AbstractWheel, ViscoelasticWheel
-from vrw_jax.numerics import Options, solver_named
+from vrw_jax.numerics import Options
 from vrw_jax.results import MARGINS, attrs_of, locked_legs, provenance
 from vrw_jax.runtime import code_digest
 from vrw_jax.scans.design import AbstractDesign, Columns
@@ -29,8 +29,9 @@ from vrw_jax.scans.store import (
     chunk_shape,
     first_difference,
 )
-from vrw_jax.walks import ModelLike, rung_of
+from vrw_jax.walks import ModelLike, options_of, rung_of
 from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, WheelParams
+from vrw_jax.wording import instance, names_of, whole
 
 MOST_SAMPLES = 1_000_000_000
 """Of a scan: a day and more of computing, and some hundred GB."""
@@ -116,22 +117,18 @@ def plan(
             "vrw.grid(damping=[...]), vrw.samples({...}), vrw.sobol({...}, n) or vrw.uniform."
         )
     base = WheelParams() if base is None else base
-    if base.damping.ndim:
-        raise ValueError(
-            "base holds batches, but it is the one wheel whose parameters the design replaces: "
-            "give scalars, and what varies in the design."
-        )
-    options = Options() if options is None else options
+    instance("base", base, WheelParams, "write vrw.WheelParams(slope=...)")
+    base.require_one("give numbers, and what varies in the design")
+    options, model = options_of(options), rung_of(model)
     options.require_reachable(np.dtype(base.damping.dtype))
-    solver_named(options.solver, options)  # refused here, and not when a store is there already
-    if chunk is not None and (isinstance(chunk, bool) or chunk != int(chunk) or chunk < 1):
-        raise ValueError(f"chunk is {chunk}, but it must be a whole number of at least 1 sample.")
+    finder = finder_of(model, base.n_legs, cycle_options=cycle_options, step_options=options)
+    finder.options_used.require_reachable(np.dtype(base.damping.dtype))
+    chunk = CHUNK if chunk is None else whole("chunk", chunk)
     if design.size > MOST_SAMPLES:
         raise ValueError(
             f"the design has {design.size:,} samples, but a scan takes {MOST_SAMPLES:,} at most: "
             "give its axes fewer values, or draw samples with vrw.sobol."
         )
-    model = rung_of(model)
     if not model.legs_yield:
         raise TypeError(
             f"model is {model!r}, but a scan is of gaits with compliant legs: give "
@@ -143,7 +140,7 @@ def plan(
             'model=vrw.UnilateralWheel() or "auto".'
         )
     offer = offer_of(model)
-    asked = tuple(offer.default if measures is None else measures)
+    asked = offer.default if measures is None else names_of("measures", measures)
     names = check_measures(asked, offer)
     first = dict.fromkeys(canonical(name) for name in asked)
     return Plan(
@@ -153,7 +150,7 @@ def plan(
         model=model,
         options=options,
         cycle_options=CycleOptions() if cycle_options is None else cycle_options,
-        layout=_layout(design, tuple(first | dict.fromkeys(offer.always)), base, chunk or CHUNK),
+        layout=_layout(design, tuple(first | dict.fromkeys(offer.always)), base, chunk),
         asked=asked,
         text=text,
     )

@@ -9,6 +9,7 @@ from jaxtyping import Array
 
 from vrw_jax.cycles import AbstractCycle, AbstractGaitFinder, Gait, read_along, read_along_lanes
 from vrw_jax.models import AbstractStep
+from vrw_jax.wording import reals
 
 Reader = Callable[[AbstractCycle, AbstractStep], Array]
 Read = Callable[[str, AbstractCycle, AbstractStep], Array]
@@ -45,8 +46,14 @@ class Sought:
     constraints: tuple[str, ...]
 
     def __call__(self, cycle: AbstractCycle, step: AbstractStep) -> Array:
+        told = self.objective(cycle, step)
+        if jnp.shape(reals("objective", told, "return one number")):
+            raise ValueError(
+                f"objective returns an array of shape {jnp.shape(told)}, but what is maximised is "
+                "one number: reduce it, as by jnp.min or jnp.sum."
+            )
         kept = [jnp.ravel(self.read(name, cycle, step)) for name in self.constraints]
-        return jnp.concatenate([jnp.ravel(self.objective(cycle, step)), *kept])
+        return jnp.concatenate([jnp.ravel(told), *kept])
 
 
 class Evaluated(NamedTuple):

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -41,8 +40,18 @@ from vrw_jax.tuning.climbing import Climb, Kind, Trial, breach, climb, optimalit
 from vrw_jax.tuning.objective import Engine, Evaluated, OfCycle, Reader, Sought, Weighted
 from vrw_jax.tuning.result import Active, Tuned, Walked
 from vrw_jax.tuning.starts import Lanes, explore
-from vrw_jax.walks import rung_of
-from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams
+from vrw_jax.walks import one_wheel, rung_of
+from vrw_jax.wheel import DOMAINS, PARAMETER_NAMES, Outcome, WheelParams
+from vrw_jax.wording import (
+    instance,
+    names_of,
+    positive,
+    range_of,
+    real,
+    shown,
+    untraced,
+    whole,
+)
 
 Objective = str | Mapping[str, float] | Callable[..., Array]
 Margins = Mapping[str, float] | Sequence[str]
@@ -79,6 +88,12 @@ def tune(
     best is climbed from. On real ground (`UnilateralWheel`) the objective is a measure of a step
     there or weights of several, without constraints by default, and the start walks to its gait.
     """
+    untraced("vrw.tune", "climb by your own loop over vrw.limit_cycle", params)
+    max_evaluations, n_starts = (
+        whole("max_evaluations", max_evaluations),
+        whole("n_starts", n_starts),
+    )
+    tolerance, seed = positive("tolerance", tolerance), whole("seed", seed, 0)
     began = time.perf_counter()
     problem = tuning_problem(
         params,
@@ -90,12 +105,6 @@ def tune(
         options=options,
         cycle_options=cycle_options,
     )
-    if not max_evaluations >= 1:
-        raise ValueError(f"max_evaluations is {max_evaluations}, but it must be at least 1.")
-    if not tolerance > 0.0:
-        raise ValueError(f"tolerance is {tolerance:g}, but it must be positive.")
-    if not n_starts >= 1:
-        raise ValueError(f"n_starts is {n_starts}, but at least one start is needed.")
     if n_starts > 1 and not problem.finder.from_nothing:
         raise ValueError("n_starts is for the paper's wheel: on real ground climb from one start.")
     lanes = problem.explore(n_starts, seed) if n_starts > 1 else None
@@ -349,11 +358,7 @@ def tuning_problem(
 
     One clear sentence for what can be seen to be wrong.
     """
-    if not isinstance(params, WheelParams) or params.damping.ndim:
-        raise ValueError(
-            "params must be one wheel, whose parameters are plain numbers: "
-            "write vrw.WheelParams(damping=..., slope=...)."
-        )
+    one_wheel(params, "tune one after the other")
     names, lower, upper = _bounds(params, free, bounds)
     refuse_ladder(model, "tuned")
     finder = finder_of(
@@ -364,13 +369,24 @@ def tuning_problem(
             f"model is {model!r}, but what is tuned has compliant legs: give "
             "vrw.ViscoelasticWheel() or vrw.UnilateralWheel()."
         )
+    finder.options_used.require_reachable(jnp.result_type(*jax.tree.leaves(params)))
     reader, label = _objective(objective, finder)
     margins = _margins(params, constraints, finder)
     sought = Sought(reader, type(finder).read, tuple(margins))
+    if callable(objective):  # looked at before anything is compiled
+        cycle = jax.eval_shape(finder.cycle, params)
+        x = jax.ShapeDtypeStruct((finder.model.section_size(params),), params.damping.dtype)
+        step = jax.eval_shape(finder.model.step, params, x, finder.step_options)
+        jax.eval_shape(sought, cycle, step)
     return TuneProblem(params, names, lower, upper, margins, label, Engine(finder, sought), finder)
 
 
 def _objective(objective: Objective, finder: AbstractGaitFinder) -> tuple[Reader, str]:
+    if not (callable(objective) or isinstance(objective, str | Mapping)):
+        raise TypeError(
+            f"objective is {shown(objective)}, but it is a measure's name, weights of several or a "
+            'function of the cycle: give "dls_fraction", say.'
+        )
     if callable(objective):
         if not finder.from_nothing:
             raise TypeError(
@@ -386,8 +402,9 @@ def _objective(objective: Objective, finder: AbstractGaitFinder) -> tuple[Reader
             "objective is an empty mapping, but something must be maximised: "
             'give a measure such as "dls_fraction".'
         )
-    for name in weights:
+    for name, weight in weights.items():
         require_known(name, finder.readable, "measure for objective")
+        real(f"the weight of {name}", weight)
         if MEASURES[name].axis:
             raise ValueError(
                 f"{name} has one value for each locked leg, but an objective is one number: "
@@ -400,7 +417,10 @@ def _objective(objective: Objective, finder: AbstractGaitFinder) -> tuple[Reader
 def _bounds(
     params: WheelParams, free: Sequence[str], bounds: Mapping[str, tuple[float, float]]
 ) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
-    names = (free,) if isinstance(free, str) else tuple(free)
+    names = names_of("free", free)
+    instance("bounds", bounds, Mapping, "write {'damping': (100.0, 200.0)}")
+    if len(set(names)) < len(names):
+        raise ValueError(f"free is {names}, which names one twice: name each once.")
     if not names:
         raise ValueError(
             f"free names no parameter, but at least one must move: choose from "
@@ -414,12 +434,13 @@ def _bounds(
     for name in names:
         if name not in bounds:
             raise ValueError(f"{name} is free but has no bounds: give bounds[{name!r}].")
-        low, high = map(float, bounds[name])
-        if not (math.isfinite(low) and math.isfinite(high) and low < high):
-            raise ValueError(
-                f"the bounds of {name} are ({low:g}, {high:g}), which hold nothing: "
-                "give a lower one below the upper one."
-            )
+        low, high = range_of(f"the range of {name}", bounds[name])
+        for end in (low, high):
+            if not DOMAINS[name].contains(end):
+                raise ValueError(
+                    f"the bounds of {name} reach {end:g}, but {DOMAINS[name].description} must lie "
+                    f"in {DOMAINS[name]}: keep them inside."
+                )
         value = float(getattr(params, name))
         if not low <= value <= high:
             raise ValueError(
@@ -437,15 +458,12 @@ def _margins(
         premises = default_margins(params)
         return {name: least for name, least in premises.items() if finder.from_nothing}
     if isinstance(constraints, Mapping):
-        margins = {name: float(least) for name, least in constraints.items()}
+        margins = {n: real(f"the margin of {n}", least) for n, least in constraints.items()}
     else:
-        names = (constraints,) if isinstance(constraints, str) else constraints
-        margins = dict.fromkeys(names, 0.0)
+        margins = dict.fromkeys(names_of("constraints", constraints), 0.0)
     if "clearance_sls1" in margins:
         # It has a slope where the clearance has none.
         margins.setdefault("takeoff_acceleration", 0.0)
-    for name, least in margins.items():
+    for name in margins:
         require_known(name, finder.readable, "measure for a constraint")
-        if not math.isfinite(least):
-            raise ValueError(f"the margin of {name} is {least}, but it must be a finite number.")
     return margins

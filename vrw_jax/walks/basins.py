@@ -8,12 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.models import AbstractWheel, ViscoelasticWheel
+from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import Options
 from vrw_jax.results import MARGINS, MEASURES, attrs_of, provenance
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.walks.attractors import distinct, orbit_measures, settle
+from vrw_jax.walks.stepping import one_wheel, options_of, rung_of
 from vrw_jax.wheel import Outcome, WheelParams, transitions
+from vrw_jax.wording import instance, reals, untraced, whole
 
 BEFORE = ("theta_touchdown", "dtheta_touchdown", "dL1_touchdown")
 """The section state just before the first touchdown: rad, rad/s, m/s."""
@@ -50,10 +52,11 @@ def basin(
     The orbits stand in `orbit_state` over (attractor_index, orbit_step), the one with most starts
     first, with their `orbit_period` in steps, DLS fraction and least margins.
     """
-    model = ViscoelasticWheel() if model is None else model
-    options = Options() if options is None else options
-    names = _names(grid)
-    values = {name: np.atleast_1d(np.asarray(grid[name], float)) for name in names}
+    model, options = _checked(params, model, options)
+    most_steps = whole("most_steps", most_steps)
+    longest_period = whole("longest_period", longest_period)
+    values = _values(grid)
+    names = tuple(values)
     axes = [name for name in names if np.ndim(grid[name]) > 0]
     shape = tuple(len(values[name]) for name in axes)
     mesh = np.meshgrid(*values.values(), indexing="ij")
@@ -92,13 +95,40 @@ def _label(name: str, values: np.ndarray, is_axis: bool) -> xr.Variable:
     return xr.Variable(dims, told, dict(MEASURES[name].attrs))
 
 
+def _checked(
+    params: WheelParams, model: AbstractWheel | None, options: Options | None
+) -> tuple[AbstractWheel, Options]:
+    untraced("vrw.basin", "map vrw.walk over the starts", params, options)
+    one_wheel(params, "ask for one basin after the other")
+    rung, options = rung_of(model), options_of(options)
+    if rung.section_size(params) != 3:
+        raise TypeError(
+            f"model is {type(rung).__name__}, but basins are those of section states of three "
+            "numbers: give vrw.ViscoelasticWheel() or vrw.RigidWheel()."
+        )
+    options.require_reachable(np.dtype(params.damping.dtype))
+    return rung, options
+
+
+def _values(grid: Grid) -> dict[str, np.ndarray]:
+    values = {name: np.asarray(reals(name, grid[name]), float) for name in _names(grid)}
+    for name, value in values.items():
+        if value.ndim > 1 or not value.size:
+            raise ValueError(
+                f"{name} has shape {value.shape}, but it is a number, or a list of at least one: "
+                "give one axis of values."
+            )
+    return {name: np.atleast_1d(value) for name, value in values.items()}
+
+
 def _names(grid: Grid) -> tuple[str, ...]:
+    instance("grid", grid, Mapping, "write {'theta_touchdown': 0.09, 'dtheta_touchdown': ...}")
     for names in (BEFORE, AFTER):
         if set(grid) == set(names):
             return names
     raise ValueError(
         f"the grid names {', '.join(grid) or 'nothing'}, but it must name all of "
-        f"{', '.join(BEFORE)}, or all of {', '.join(AFTER)}."
+        f"{', '.join(BEFORE)}, or all of {', '.join(AFTER)}: give each a number or an axis."
     )
 
 

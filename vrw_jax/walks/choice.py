@@ -3,7 +3,7 @@
 from jaxtyping import Array
 
 from vrw_jax.models import LadderWheel, ModelChoice
-from vrw_jax.numerics import Options, as_float_array
+from vrw_jax.numerics import Options
 from vrw_jax.walks.stepping import SectionLike, checked
 from vrw_jax.wheel import WheelParams
 
@@ -20,6 +20,6 @@ def choose_model(
     `start` is the paper's section state (theta-, dtheta-, dL1-) or the full one of the unilateral
     rung. Maps over lanes by `jax.vmap`.
     """
-    model = LadderWheel(friction=as_float_array(friction))
+    model = LadderWheel(friction=friction)
     params, x, _, options = checked(params, start, model, options)
     return model.choose(params, x, options)[0]

@@ -6,7 +6,7 @@ differentiation. A model compiles its own step once.
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Literal, overload
+from typing import Any, Literal, overload
 
 import equinox as eqx
 import jax
@@ -26,8 +26,9 @@ from vrw_jax.models import (
     UnilateralWheel,
     ViscoelasticWheel,
 )
-from vrw_jax.numerics import Options, as_float_array
+from vrw_jax.numerics import Options
 from vrw_jax.wheel import Outcome, WheelParams
+from vrw_jax.wording import instance, reals, whole
 
 SectionLike = Array | np.ndarray | Sequence[float]
 """A section state as given by a caller; `checked` makes it an array of shape (3,)."""
@@ -54,18 +55,36 @@ def rung_of(model: ModelLike | None) -> AbstractWheel:
     return model
 
 
+def one_wheel(params: Any, instead: str) -> None:
+    """Refuse what is no wheel, or more than one."""
+    instance("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
+    params.require_one(instead)
+
+
+def options_of(options: Options | None) -> Options:
+    """The options of a step as a caller gives them."""
+    if options is not None:
+        instance("options", options, Options, "give vrw.Options(), or vrw.Options.tight()")
+    return Options() if options is None else options
+
+
+def state_of(x: Any, what: str = "the section state") -> Array:
+    """A section state as a caller gives it."""
+    return reals(
+        what,
+        x,
+        "give (theta-, dtheta-, dL1-), as vrw.paper_start(), or that of a cycle, "
+        "cycle.section_state",
+    )
+
+
 def checked(
     params: WheelParams, x: object, model: ModelLike | None, options: Options | None
 ) -> tuple[WheelParams, Array, AbstractWheel, Options]:
     """Arguments with their defaults; one clear sentence for what can be seen to be wrong."""
-    if not isinstance(params, WheelParams):
-        raise TypeError(
-            f"params is a {type(params).__name__}, but a WheelParams is needed: "
-            "write vrw.WheelParams(damping=..., slope=...)."
-        )
-    model = rung_of(model)
-    options = Options() if options is None else options
-    state = as_float_array(x)
+    one_wheel(params, "map over batches of parameters with jax.vmap, or use vrw.scan")
+    model, options = rung_of(model), options_of(options)
+    state = state_of(x)
     size = model.section_size(params)
     if state.shape == (3,) and size != 3:
         state = model.full_section(params, state)
@@ -75,11 +94,8 @@ def checked(
             f"(3,){'' if size == 3 else f', or this rung’s own of shape ({size},)'}: "
             "for batches map over it with jax.vmap."
         )
-    if params.damping.ndim != 0:
-        raise ValueError(
-            f"damping has shape {params.damping.shape}, but one step walks one wheel: map over "
-            "batches of parameters with jax.vmap, or use vrw.scan."
-        )
+    # Numbers made before 64 bits were asked for stay coarse, whatever they are mixed with.
+    options.require_reachable(jnp.result_type(*jax.tree.leaves(params)))
     dtype = jnp.result_type(state, params.damping)
     options.require_reachable(dtype)
     convert = lambda leaf: leaf.astype(dtype)
@@ -192,8 +208,7 @@ def walk(
     options: Options | None = None,
 ) -> Walk:
     """`n_steps` steps, or as many as it can; the steps after a failure repeat its outcome."""
-    if not n_steps >= 1:
-        raise ValueError(f"n_steps is {n_steps}, but a walk needs at least one step.")
+    n_steps = whole("n_steps", n_steps)
     params, state, model, options = checked(params, x, model, options)
     return _walk(model, params, state, options, n_steps)
 

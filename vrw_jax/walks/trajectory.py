@@ -18,7 +18,7 @@ from vrw_jax.results import TRAJECTORY, provenance, variables
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.walks.ground_trajectory import over_contacts
 from vrw_jax.walks.samples import Stretches, Telling, joined
-from vrw_jax.walks.stepping import ModelLike, SectionLike, checked
+from vrw_jax.walks.stepping import ModelLike, SectionLike, checked, one_wheel, rung_of
 from vrw_jax.wheel import (
     Motion,
     Outcome,
@@ -27,6 +27,7 @@ from vrw_jax.wheel import (
     landing_direction,
     rear_direction,
 )
+from vrw_jax.wording import untraced, whole
 
 
 @eqx.filter_jit
@@ -73,7 +74,7 @@ def _columns(
 
 def simulate(
     params: WheelParams,
-    x: SectionLike,
+    x: SectionLike | None = None,
     n_steps: int = 10,
     *,
     model: ModelLike | None = None,
@@ -82,15 +83,17 @@ def simulate(
 ) -> xr.Dataset:
     """Walk `n_steps` steps from the section state `x`, as a labelled trajectory over time.
 
+    Without `x` the walk begins at the rung's own start, near the gait of Table 1.
+
     Each phase has `n_samples` equal times, both ends included: an instant at which something jumps
     stands there twice, just before and just after it. A step that fails ends the trajectory at the
     event; the attributes `outcome` and `outcome_meaning` say why. Errors as in `vrw.step`.
     """
-    if not n_steps >= 1:
-        raise ValueError(f"n_steps is {n_steps}, but a trajectory needs at least one step.")
-    if not n_samples >= 2:
-        raise ValueError(f"n_samples is {n_samples}, but a phase has two ends: give 2 or more.")
-    params, x, model, options = checked(params, x, model, options)
+    untraced("vrw.simulate", "use vrw.walk", params, x)
+    n_steps, n_samples = whole("n_steps", n_steps), whole("n_samples", n_samples, 2)
+    one_wheel(params, "simulate one at a time")
+    start = rung_of(model).start(params) if x is None else x
+    params, x, model, options = checked(params, start, model, options)
     sampled = over_contacts if model.tells_contacts else over_phases
     telling, s = sampled(params, model, options, n_samples), params.symbols()
     told = joined(telling, x, n_steps, float(s.Mt * s.g * s.sin_phi))

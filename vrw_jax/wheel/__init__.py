@@ -18,6 +18,8 @@ from vrw_jax.wheel.params import (
     PARAMETER_NAMES,
     Symbols,
     WheelParams,
+    friction_of,
+    known_friction,
     parameters_of,
     symbols_of,
     wheel_of,

@@ -1,14 +1,17 @@
 """What the wheel is made of: parameters with units and domains, and the paper's symbols."""
 
+import functools
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool
 
-from vrw_jax.numerics import Elementwise, Scalar, as_float_array
+from vrw_jax.numerics import Elementwise, Number, Scalar
+from vrw_jax.wording import Row, as_html, as_text, is_concrete, reals, shown, whole
 
 
 class Domain(NamedTuple):
@@ -21,7 +24,7 @@ class Domain(NamedTuple):
     lower_is_allowed: bool
     description: str
 
-    def contains(self, value: Array) -> Array:
+    def contains(self, value: Any) -> Any:
         """Whether value lies in the range; False for NaN."""
         above = value >= self.lower if self.lower_is_allowed else value > self.lower
         return above & (value < self.upper)
@@ -73,6 +76,18 @@ class Symbols(NamedTuple):
     alpha: float
 
 
+def _quantity(name: str, default: float) -> Any:
+    return eqx.field(converter=functools.partial(reals, name), default=default)
+
+
+_n_legs = functools.partial(
+    whole,
+    "n_legs",
+    least=5,
+    why=" (with fewer the angle between legs is 90 degrees or more)",
+)
+
+
 class WheelParams(eqx.Module):
     """Parameters of the viscoelastic-legged rimless wheel; the defaults are Table 1, slope 0.30.
 
@@ -81,41 +96,97 @@ class WheelParams(eqx.Module):
     refused here when it is a plain scalar; inside a batch it becomes `Outcome.BAD_INPUT`.
     """
 
-    hub_mass: Scalar = eqx.field(converter=as_float_array, default=10.0)  # m_H, kg, >= 0
-    leg_mass: Scalar = eqx.field(converter=as_float_array, default=1.0)  # m, kg, > 0
-    leg_com: Scalar = eqx.field(converter=as_float_array, default=0.3)  # a, m, 0 <= a < L0
-    locked_length: Scalar = eqx.field(converter=as_float_array, default=1.0)  # L_0, m, > 0
-    natural_length: Scalar = eqx.field(converter=as_float_array, default=1.02)  # L*, m, > 0
-    stiffness: Scalar = eqx.field(converter=as_float_array, default=500.0)  # k, N/m, >= 0
-    damping: Scalar = eqx.field(converter=as_float_array, default=200.0)  # c, N s/m, >= 0
-    slope: Scalar = eqx.field(converter=as_float_array, default=0.30)  # phi, rad, |phi| < pi/2
-    gravity: Scalar = eqx.field(converter=as_float_array, default=9.81)  # g, m/s^2, > 0
-    n_legs: int = eqx.field(static=True, default=8)  # alpha = 2 pi / n_legs, >= 5
+    hub_mass: Scalar = _quantity("hub_mass", 10.0)
+    leg_mass: Scalar = _quantity("leg_mass", 1.0)
+    leg_com: Scalar = _quantity("leg_com", 0.3)
+    locked_length: Scalar = _quantity("locked_length", 1.0)
+    natural_length: Scalar = _quantity("natural_length", 1.02)
+    stiffness: Scalar = _quantity("stiffness", 500.0)
+    damping: Scalar = _quantity("damping", 200.0)
+    slope: Scalar = _quantity("slope", 0.30)
+    gravity: Scalar = _quantity("gravity", 9.81)
+    n_legs: int = eqx.field(static=True, converter=_n_legs, default=8)
+
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            hub_mass: Number = 10.0,
+            leg_mass: Number = 1.0,
+            leg_com: Number = 0.3,
+            locked_length: Number = 1.0,
+            natural_length: Number = 1.02,
+            stiffness: Number = 500.0,
+            damping: Number = 200.0,
+            slope: Number = 0.30,
+            gravity: Number = 9.81,
+            n_legs: int = 8,
+        ) -> None: ...
 
     def __check_init__(self) -> None:
-        if not isinstance(self.n_legs, int) or self.n_legs < 5:
-            raise ValueError(
-                f"n_legs is {self.n_legs!r}, but the wheel needs a whole number of at least 5 legs "
-                "(with fewer the angle between legs is 90 degrees or more): choose 5 or more."
-            )
-        for name, domain in DOMAINS.items():
-            value = getattr(self, name)
-            if isinstance(value, jax.core.Tracer) or jnp.ndim(value) > 0:
-                continue
-            if not bool(domain.contains(value)):
+        plain = {
+            name: float(value)
+            for name in DOMAINS
+            if not isinstance(value := getattr(self, name), jax.core.Tracer) and value.ndim == 0
+        }
+        for name, value in plain.items():
+            domain = DOMAINS[name]
+            if not domain.contains(value):
                 raise ValueError(
-                    f"{name} is {float(value):g}, but {domain.description} must lie in {domain}: "
+                    f"{name} is {value:g}, but {domain.description} must lie in {domain}: "
                     "give a value in that range."
                 )
-        if not any(
-            isinstance(x, jax.core.Tracer) or jnp.ndim(x) > 0
-            for x in (self.leg_com, self.locked_length)
-        ) and not float(self.leg_com) < float(self.locked_length):
+        com, length = (plain.get(name) for name in ("leg_com", "locked_length"))
+        if com is not None and length is not None and not com < length:
             raise ValueError(
-                f"leg_com is {float(self.leg_com):g} m and locked_length "
-                f"{float(self.locked_length):g} m, but a leg's mass sits between foot and hub: "
-                "give leg_com < locked_length."
+                f"leg_com is {com:g} m and locked_length {length:g} m, but a leg's mass sits "
+                "between foot and hub: give leg_com < locked_length."
             )
+        shapes = {name: shape for name in DOMAINS if (shape := getattr(self, name).shape)}
+        if len({shape[0] for shape in shapes.values()}) > 1:
+            raise ValueError(
+                f"the parameters have shapes {shapes}, but a batch has one wheel for each place of "
+                "its axis: give arrays of one length."
+            )
+
+    @property
+    def in_axes(self) -> "WheelParams":
+        """0 for each parameter with an axis, None for the others: the `in_axes` of `jax.vmap`.
+
+        As in `jax.vmap(vrw.limit_cycle, in_axes=(params.in_axes,))(params)`.
+        """
+        return jax.tree.map(lambda x: 0 if jnp.ndim(x) else None, self)
+
+    def require_one(self, instead: str) -> None:
+        """Refuse a batch where one wheel is meant."""
+        for name in DOMAINS:
+            if shape := getattr(self, name).shape:
+                raise ValueError(
+                    f"{name} has shape {shape}, but this is about one wheel: {instead}."
+                )
+
+    def table(self) -> tuple[str, list[Row]]:
+        """A title, and symbol, value and unit of each parameter; of a gradient, what it is by."""
+        is_wheel, told = bool(np.all(self.in_domain())), []
+        for name, domain in DOMAINS.items():
+            value = np.asarray(getattr(self, name))
+            text = f"{value:.6g}" if value.ndim == 0 else f"{value.size} values"
+            if value.size > 1:
+                text += f" from {value.min():.6g} to {value.max():.6g}"
+            unit = f", {domain.unit}" if domain.unit and not is_wheel else ""
+            label = f"{name} {domain.symbol}" if is_wheel else f"by {name} {domain.symbol}{unit}"
+            told.append((label, f"{text} {domain.unit if is_wheel else ''}".strip()))
+        if is_wheel:
+            return "WheelParams", [*told, ("n_legs", str(self.n_legs))]
+        return "WheelParams out of its domain: a gradient or a difference", told
+
+    def __repr__(self) -> str:
+        leaves = jax.tree.leaves(self)  # other things than numbers in an `in_axes`
+        whole = len(leaves) == len(DOMAINS) and all(map(eqx.is_array, leaves))
+        return as_text(*self.table()) if whole and is_concrete(self) else eqx.tree_pformat(self)
+
+    def _repr_html_(self) -> str:
+        return as_html(*self.table())
 
     @property
     def leg_angle(self) -> float:
@@ -169,9 +240,35 @@ def symbols_of(
     )
 
 
+WheelParams.__doc__ = (WheelParams.__doc__ or "").rstrip() + "\n".join(
+    ["\n"] + [f"    - `{name}`: {d.symbol}, {d.description}, in {d}" for name, d in DOMAINS.items()]
+)
+
 PARAMETER_NAMES: tuple[str, ...] = tuple(DOMAINS)
 FRICTION = "friction"
 """What a design or a branch may move beside them: a parameter of the ground, held by its model."""
+
+
+def friction_of(value: object) -> Array:
+    """A coefficient of friction, or an array of them."""
+    friction = reals(FRICTION, value)
+    plain = not isinstance(friction, jax.core.Tracer) and friction.ndim == 0
+    if plain and not friction >= 0.0:
+        raise ValueError(
+            f"friction is {float(friction):g}, but a coefficient of friction is at least 0: give "
+            "0.7, say, or math.inf for feet that never slide."
+        )
+    return friction
+
+
+def known_friction(value: Any) -> float:
+    """The same as a plain number, for rungs whose motion does not feel it."""
+    if friction_of(value).ndim or isinstance(value, jax.core.Tracer):
+        raise TypeError(
+            f"friction is {shown(value)}, but this rung takes one known number, which its margins "
+            "refer to: give a float, or take vrw.UnilateralWheel."
+        )
+    return float(value)
 
 
 def parameters_of(params: WheelParams) -> Array:

@@ -3,7 +3,7 @@
 import functools
 import math
 from functools import partial
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -48,15 +48,16 @@ from vrw_jax.models.unilateral.section import (
 )
 from vrw_jax.numerics import (
     Forward,
+    Number,
     Options,
     Scalar,
     Watched,
     any_mode,
-    as_float_array,
     integrate_phase,
     sample_phase,
 )
-from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, WheelParams
+from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, WheelParams, friction_of
+from vrw_jax.wording import chosen, whole
 
 BILATERAL, ONE_SIDED = "bilateral", "one-sided"
 """What stoppers do to legs in the air: hold whatever it takes, or push alone."""
@@ -138,15 +139,21 @@ class UnilateralWheel(AbstractWheel):
     parameter_names: ClassVar[tuple[str, ...]] = (*PARAMETER_NAMES, FRICTION)
     tells_contacts: ClassVar[bool] = True
 
-    friction: Scalar = eqx.field(converter=as_float_array, default=0.7)
-    max_events: int = eqx.field(static=True, default=100)
+    friction: Scalar = eqx.field(converter=friction_of, default=0.7)
+    max_events: int = eqx.field(static=True, converter=partial(whole, "max_events"), default=100)
     stoppers: str = eqx.field(static=True, default=BILATERAL)
 
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            friction: Number = 0.7,
+            max_events: int = 100,
+            stoppers: Literal["bilateral", "one-sided"] = "bilateral",
+        ) -> None: ...
+
     def __check_init__(self) -> None:
-        if self.stoppers not in (BILATERAL, ONE_SIDED):
-            raise ValueError(
-                f"stoppers is {self.stoppers!r}, but it must be {BILATERAL!r} or {ONE_SIDED!r}."
-            )
+        chosen("stoppers", self.stoppers, (BILATERAL, ONE_SIDED))
 
     @property
     def one_sided(self) -> bool:

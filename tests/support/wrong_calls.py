@@ -1,0 +1,641 @@
+"""Wrong uses of the library, each with the kind of error and words of its sentence.
+
+Run as a program it tries them all in a process of its own, where nothing checks annotations as the
+tests do, and prints what came: {name: [kind, sentence, file that refused]}.
+"""
+
+import json
+import sys
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+
+class Wrong(NamedTuple):
+    call: Callable[[], Any]
+    kind: str
+    words: str
+
+
+USES: dict[str, Wrong] = {}
+
+
+def use(name: str, call: Callable[[], Any], kind: str, words: str) -> None:
+    assert name not in USES, name
+    USES[name] = Wrong(call, kind, words)
+
+
+def family(name: str, call: Callable[[Any], Any], cases: dict[str, tuple[Any, str]], words: str):
+    for label, (value, kind) in cases.items():
+        use(f"{name}: {label}", lambda value=value: call(value), kind, words)
+
+
+def make() -> None:
+    import diffrax
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    import vrw_jax as vrw
+
+    table_1, start = vrw.WheelParams(), vrw.paper_start()
+    several = vrw.WheelParams(damping=np.linspace(100.0, 200.0, 3))
+    single = jax.tree.map(lambda x: x.astype(jnp.float32), table_1)
+    not_numbers = {
+        "text": ("fast", "TypeError"),
+        "digits": ("150", "TypeError"),
+        "nothing": (None, "TypeError"),
+        "complex": (1.0 + 2.0j, "TypeError"),
+        "truth": (True, "TypeError"),
+        "table": ({}, "TypeError"),
+        "object": (object(), "TypeError"),
+    }
+    whole = not_numbers | {
+        "fraction": (2.5, "ValueError"),
+        "float": (2.0, "ValueError"),
+        "zero": (0, "ValueError"),
+        "negative": (-3, "ValueError"),
+        "several": (np.array([1, 2]), "TypeError"),
+    }
+    positive = not_numbers | {
+        "zero": (0.0, "ValueError"),
+        "negative": (-1.0, "ValueError"),
+        "nan": (float("nan"), "ValueError"),
+        "infinite": (float("inf"), "ValueError"),
+    }
+
+    # Parameters
+    for name in ("damping", "slope", "leg_mass"):
+        bad = not_numbers | {
+            "nan": (float("nan"), "ValueError"), "negative": (-9.0, "ValueError"),
+            "huge": (1e12, "ValueError"), "a list with text": ([1.0, "a"], "TypeError"),
+        }  # fmt: skip
+        family(f"WheelParams {name}", lambda v, n=name: vrw.WheelParams(**{n: v}), bad, name)
+    family("WheelParams n_legs", lambda v: vrw.WheelParams(n_legs=v), whole, "n_legs")
+    use("a leg's mass above the hub", lambda: vrw.WheelParams(leg_com=1.5), "ValueError", "leg_com")
+    use(
+        "batches of two lengths",
+        lambda: vrw.WheelParams(damping=np.ones(3), slope=np.ones(4) / 9),
+        "ValueError",
+        "shapes",
+    )
+
+    # Options
+    for name in ("rtol", "atol", "max_phase_time", "first_step"):
+        family(f"Options {name}", lambda v, n=name: vrw.Options(**{n: v}), positive, name)
+    for name in ("max_solver_steps", "event_steps"):
+        family(f"Options {name}", lambda v, n=name: vrw.Options(**{n: v}), whole, name)
+    solvers = not_numbers | {
+        "an object of diffrax": (diffrax.Tsit5(), "TypeError"), "typo": ("Tsit6", "ValueError"),
+        "for noise": ("ShARK", "ValueError"),
+    }  # fmt: skip
+    del solvers["text"], solvers["digits"]
+    family("Options solver", lambda v: vrw.Options(solver=v), solvers, "solver")
+    for name in ("iterations", "block"):
+        family(f"CycleOptions {name}", lambda v, n=name: vrw.CycleOptions(**{n: v}), whole, name)
+    family("CycleOptions tolerance", lambda v: vrw.CycleOptions(tolerance=v), positive, "tolerance")
+    for label, value in {
+        "two": (1, 2), "fractions": (1.5, 2, 3), "text": "abcd", "one": 5, "zeros": (0, 1, 1)
+    }.items():  # fmt: skip
+        use(
+            f"CycleOptions steps: {label}",
+            lambda v=value: vrw.CycleOptions(steps=v),
+            "ValueError",
+            "steps",
+        )
+    family(
+        "ArclengthOptions max_points",
+        lambda v: vrw.ArclengthOptions(max_points=v),
+        whole,
+        "max_points",
+    )
+    family("ArclengthOptions turn", lambda v: vrw.ArclengthOptions(turn=v), positive, "turn")
+    use(
+        "steps of a branch out of order",
+        lambda: vrw.ArclengthOptions(first_step=1.0),
+        "ValueError",
+        "order",
+    )
+
+    # Rungs
+    frictions = not_numbers | {
+        "negative": (-1.0, "ValueError"), "nan": (float("nan"), "ValueError")
+    }  # fmt: skip
+    for rung in (vrw.UnilateralWheel, vrw.ViscoelasticWheel, vrw.RigidWheel, vrw.LadderWheel):
+        family(f"{rung.__name__} friction", lambda v, r=rung: r(friction=v), frictions, "friction")
+    family(
+        "UnilateralWheel max_events",
+        lambda v: vrw.UnilateralWheel(max_events=v),
+        whole,
+        "max_events",
+    )
+    use(
+        "stoppers misspelt",
+        lambda: vrw.UnilateralWheel(stoppers="one sided"),
+        "ValueError",
+        "did you mean 'one-sided'",
+    )
+    use(
+        "a choice that is no choice",
+        lambda: vrw.ViscoelasticWheel(stop_at_lift_off="no"),
+        "TypeError",
+        "stop_at_lift_off",
+    )
+    family(
+        "choose_model friction",
+        lambda v: vrw.choose_model(table_1, start, friction=v),
+        frictions,
+        "friction",
+    )
+
+    # States
+    states = {
+        "text": ("abc", "TypeError"),
+        "texts": (["0.1", "1.6", "-0.1"], "TypeError"),
+        "nothing": (None, "TypeError"),
+        "complex": ([0.1, 1.6, 1j], "TypeError"),
+        "a row": (np.ones((1, 3)), "ValueError"),
+        "two numbers": ([0.1, 1.6], "ValueError"),
+        "a wheel": (table_1, "TypeError"),
+        "one number": (0.1, "ValueError"),
+    }
+    for name, call in {
+        "step": vrw.step, "return_map": vrw.return_map, "choose_model": vrw.choose_model,
+        "walk": lambda p, x: vrw.walk(p, x, 2),
+    }.items():  # fmt: skip
+        family(f"{name} state", lambda v, c=call: c(table_1, v), states, "section state")
+        use(
+            f"{name} of a table",
+            lambda c=call: c({"damping": 200.0}, start),
+            "TypeError",
+            "WheelParams",
+        )
+        use(f"{name} of a batch", lambda c=call: c(several, start), "ValueError", "jax.vmap")
+        use(
+            f"{name} of single numbers",
+            lambda c=call: c(single, start),
+            "ValueError",
+            "vrw.start_jax()",
+        )
+    given = {k: v for k, v in states.items() if k != "nothing"}
+    family("simulate state", lambda v: vrw.simulate(table_1, v), given, "section state")
+    rows = given | {"three numbers": (np.ones(3), "ValueError"),
+                    "four columns": (np.ones((2, 4)), "ValueError")}  # fmt: skip
+    rows.pop("a row")
+    family("steps states", lambda v: vrw.steps(table_1, v), rows, "states")
+    use(
+        "step by options of a cycle",
+        lambda: vrw.step(table_1, start, options=vrw.CycleOptions()),
+        "TypeError",
+        "vrw.Options",
+    )
+    use(
+        "a rung that is a class",
+        lambda: vrw.step(table_1, start, model=vrw.RigidWheel),
+        "TypeError",
+        "model",
+    )
+    use(
+        "a rung by another name",
+        lambda: vrw.step(table_1, start, model="rigid"),
+        "TypeError",
+        "auto",
+    )
+    use(
+        "a tolerance below rounding",
+        lambda: vrw.step(table_1, start, options=vrw.Options(rtol=1e-17)),
+        "ValueError",
+        "resolve",
+    )
+    use("walk on 2.5", lambda: vrw.walk(table_1, start, 2.5), "ValueError", "n_steps")
+    family("walk n_steps", lambda v: vrw.walk(table_1, start, v), whole, "n_steps")
+    family("simulate n_steps", lambda v: vrw.simulate(table_1, start, v), whole, "n_steps")
+    family(
+        "simulate n_samples",
+        lambda v: vrw.simulate(table_1, n_samples=v),
+        whole | {"one": (1, "ValueError")},
+        "n_samples",
+    )
+    use("simulate a batch", lambda: vrw.simulate(several), "ValueError", "one wheel")
+
+    # Batches
+    ones = np.asarray(start)[None]
+    family("steps n_steps", lambda v: vrw.steps(table_1, ones, v), whole, "n_steps")
+    use(
+        "steps engine",
+        lambda: vrw.steps(table_1, ones, engine="lane"),
+        "ValueError",
+        "did you mean 'lanes'",
+    )
+    use("steps engine none", lambda: vrw.steps(table_1, ones, engine=None), "TypeError", "engine")
+    use(
+        "steps of another number of wheels",
+        lambda: vrw.steps(several, ones),
+        "ValueError",
+        "one for each",
+    )
+    use("steps of a table", lambda: vrw.steps({}, ones), "TypeError", "WheelParams")
+    use(
+        "steps by options of a cycle",
+        lambda: vrw.steps(table_1, ones, options=vrw.CycleOptions()),
+        "TypeError",
+        "vrw.Options",
+    )
+    use(
+        "steps by collocation without durations",
+        lambda: vrw.steps(table_1, ones, engine="collocation"),
+        "ValueError",
+        "durations",
+    )
+    use("steps of single numbers", lambda: vrw.steps(single, ones), "ValueError", "vrw.start_jax()")
+
+    # Inside transformations
+    for name, call in {
+        "steps": lambda p: vrw.steps(p, ones), "simulate": lambda p: vrw.simulate(p, start),
+        "tune": lambda p: vrw.tune(p, "speed", ["damping"], {"damping": (100.0, 300.0)}),
+        "sensitivities": lambda p: vrw.sensitivities(p),
+        "continue_branch": lambda p: vrw.continue_branch(p, "damping", (100.0, 300.0)),
+        "basin": lambda p: vrw.basin(p, {}),
+    }.items():  # fmt: skip
+        use(f"{name} under jit", lambda c=call: jax.jit(c)(table_1), "TypeError", "outside")
+        use(f"{name} under grad", lambda c=call: jax.grad(c)(table_1), "TypeError", "outside")
+        use(
+            f"{name} under vmap",
+            lambda c=call: jax.vmap(c, in_axes=(several.in_axes,))(several),
+            "TypeError",
+            "outside",
+        )
+
+    # Cycles
+    guesses = given | {"nan": ([0.1, float("nan"), 0.0], "ValueError")}
+    family("limit_cycle guess", lambda v: vrw.limit_cycle(table_1, guess=v), guesses, "")
+    family(
+        "limit_cycle period_n", lambda v: vrw.limit_cycle(table_1, period_n=v), whole, "period_n"
+    )
+    use(
+        "two steps without a guess",
+        lambda: vrw.limit_cycle(table_1, period_n=2),
+        "ValueError",
+        "guess",
+    )
+    use("limit_cycle of a batch", lambda: vrw.limit_cycle(several), "ValueError", "jax.vmap")
+    use("limit_cycle of a state", lambda: vrw.limit_cycle(start), "TypeError", "WheelParams")
+    use(
+        "limit_cycle of single numbers",
+        lambda: vrw.limit_cycle(single),
+        "ValueError",
+        "vrw.start_jax()",
+    )
+    use(
+        "limit_cycle by options of a step",
+        lambda: vrw.limit_cycle(table_1, options=vrw.Options()),
+        "TypeError",
+        "CycleOptions",
+    )
+    use(
+        "limit_cycle by a table of options",
+        lambda: vrw.limit_cycle(table_1, options={}),
+        "TypeError",
+        "CycleOptions",
+    )
+    use(
+        "a rigid cycle by options of a mesh",
+        lambda: vrw.limit_cycle(table_1, model=vrw.RigidWheel(), options=vrw.CycleOptions()),
+        "TypeError",
+        "return map",
+    )
+    use(
+        "sensitivities of nothing",
+        lambda: vrw.sensitivities(table_1, measures=[]),
+        "ValueError",
+        "nothing",
+    )
+    use(
+        "sensitivities misspelt",
+        lambda: vrw.sensitivities(table_1, measures="spead"),
+        "ValueError",
+        "did you mean 'speed'",
+    )
+    use(
+        "sensitivities of a number",
+        lambda: vrw.sensitivities(table_1, measures=3),
+        "TypeError",
+        "measures",
+    )
+    use("sensitivities of a batch", lambda: vrw.sensitivities(several), "ValueError", "one wheel")
+    use(
+        "sensitivities of single numbers",
+        lambda: vrw.sensitivities(single),
+        "ValueError",
+        "vrw.start_jax()",
+    )
+    use(
+        "sensitivities of no gait",
+        lambda: vrw.sensitivities(vrw.WheelParams(slope=0.02)),
+        "ValueError",
+        "no gait",
+    )
+    use(
+        "sensitivities on the ladder",
+        lambda: vrw.sensitivities(table_1, model="auto"),
+        "TypeError",
+        "ladder",
+    )
+    use(
+        "newton_cycle of no function", lambda: vrw.newton_cycle(3.0, start), "TypeError", "function"
+    )
+    family(
+        "newton_cycle period_n",
+        lambda v: vrw.newton_cycle(lambda x: x, start, period_n=v),
+        whole,
+        "period_n",
+    )
+    use(
+        "newton_cycle from text", lambda: vrw.newton_cycle(lambda x: x, "abc"), "TypeError", "start"
+    )
+
+    # Branches
+    bounds = {
+        "one number": (200.0, "TypeError"), "three": ((1.0, 2.0, 3.0), "TypeError"),
+        "turned": ((300.0, 100.0), "ValueError"), "equal": ((100.0, 100.0), "ValueError"),
+        "text": (("a", "b"), "TypeError"), "nan": ((100.0, float("nan")), "ValueError"),
+        "infinite": ((100.0, float("inf")), "ValueError"), "nothing": (None, "TypeError"),
+    }  # fmt: skip
+    along = lambda **changes: vrw.continue_branch(
+        **({"params": table_1, "name": "damping", "bounds": (100.0, 300.0)} | changes)
+    )
+    family("continue_branch bounds", lambda v: along(bounds=v), bounds, "bounds")
+    family("continue_branch period_n", lambda v: along(period_n=v), whole, "period_n")
+    use(
+        "continue_branch misspelt",
+        lambda: along(name="dampin"),
+        "ValueError",
+        "did you mean 'damping'",
+    )
+    use("continue_branch along a number", lambda: along(name=3), "ValueError", "no parameter")
+    use(
+        "continue_branch along friction nobody feels",
+        lambda: along(name="friction"),
+        "ValueError",
+        "no parameter",
+    )
+    use(
+        "continue_branch of a batch",
+        lambda: along(params=several),
+        "ValueError",
+        "continue_branches",
+    )
+    use("continue_branch of a table", lambda: along(params={}), "TypeError", "WheelParams")
+    use(
+        "continue_branch of single numbers",
+        lambda: along(params=single),
+        "ValueError",
+        "vrw.start_jax()",
+    )
+    use(
+        "continue_branch of two steps from nothing",
+        lambda: along(period_n=2),
+        "ValueError",
+        "cycle=",
+    )
+    use("continue_branch from a state", lambda: along(cycle=start), "TypeError", "cycle")
+    use(
+        "continue_branch by options of a step",
+        lambda: along(options=vrw.Options()),
+        "TypeError",
+        "ArclengthOptions",
+    )
+    use(
+        "continue_branch by options of a mesh in the step's place",
+        lambda: along(step_options=vrw.CycleOptions()),
+        "TypeError",
+        "vrw.Options",
+    )
+    use(
+        "continue_branch by options of a step in the mesh's place",
+        lambda: along(cycle_options=vrw.Options()),
+        "TypeError",
+        "CycleOptions",
+    )
+    use("continue_branch on the ladder", lambda: along(model="auto"), "TypeError", "ladder")
+    a_map = lambda constants, x, p: p * x
+    family(
+        "continue_map bounds", lambda v: vrw.continue_map(a_map, [0.1], 150.0, v), bounds, "bounds"
+    )
+    use(
+        "continue_map from outside",
+        lambda: vrw.continue_map(a_map, [0.1], 5.0, (0.0, 1.0)),
+        "ValueError",
+        "within",
+    )
+    use(
+        "continue_map from text",
+        lambda: vrw.continue_map(a_map, "a", 0.5, (0.0, 1.0)),
+        "TypeError",
+        "x is",
+    )
+    use(
+        "continue_map of no map",
+        lambda: vrw.continue_map(2.0, [0.1], 0.5, (0.0, 1.0)),
+        "TypeError",
+        "function",
+    )
+
+    # Basins
+    grid = {"theta_touchdown": 0.09, "dtheta_touchdown": [1.0, 2.0], "dL1_touchdown": 0.0}
+    use(
+        "basin over a scan's grid",
+        lambda: vrw.basin(table_1, vrw.grid(damping=[1.0, 2.0])),
+        "TypeError",
+        "theta_touchdown",
+    )
+    use(
+        "basin over half a grid",
+        lambda: vrw.basin(table_1, {"theta_touchdown": 0.1}),
+        "ValueError",
+        "must name all",
+    )
+    for label, (value, kind) in {
+        "text": ("a", "TypeError"), "nothing": (None, "TypeError"),
+        "a table": (np.ones((2, 2)), "ValueError"), "no values": ([], "ValueError"),
+    }.items():  # fmt: skip
+        use(
+            f"basin: {label}",
+            lambda v=value: vrw.basin(table_1, grid | {"dtheta_touchdown": v}),
+            kind,
+            "dtheta_touchdown",
+        )
+    family(
+        "basin most_steps", lambda v: vrw.basin(table_1, grid, most_steps=v), whole, "most_steps"
+    )
+    use("basin of a batch", lambda: vrw.basin(several, grid), "ValueError", "one wheel")
+    use(
+        "basin on real ground",
+        lambda: vrw.basin(table_1, grid, model=vrw.UnilateralWheel()),
+        "TypeError",
+        "three numbers",
+    )
+    use(
+        "basin by options of a cycle",
+        lambda: vrw.basin(table_1, grid, options=vrw.CycleOptions()),
+        "TypeError",
+        "vrw.Options",
+    )
+    use("basin of single numbers", lambda: vrw.basin(single, grid), "ValueError", "start_jax")
+
+    # Tuning
+    tune = lambda **changes: vrw.tune(
+        **({"params": table_1, "objective": "speed", "free": ["damping"],
+            "bounds": {"damping": (100.0, 300.0)}} | changes)
+    )  # fmt: skip
+    for name in ("max_evaluations", "n_starts"):
+        family(f"tune {name}", lambda v, n=name: tune(**{n: v}), whole, name)
+    family("tune tolerance", lambda v: tune(tolerance=v), positive, "tolerance")
+    family("tune bounds of damping", lambda v: tune(bounds={"damping": v}), bounds, "damping")
+    use("tune bounds of no table", lambda: tune(bounds=(100.0, 300.0)), "TypeError", "bounds")
+    use(
+        "tune bounds out of the domain",
+        lambda: tune(bounds={"damping": (-5.0, 300.0)}),
+        "ValueError",
+        "inside",
+    )
+    use("tune free misspelt", lambda: tune(free=["dampin"]), "ValueError", "did you mean")
+    use("tune free twice", lambda: tune(free=["damping", "damping"]), "ValueError", "twice")
+    use("tune nothing", lambda: tune(free=[]), "ValueError", "no parameter")
+    use("tune a number", lambda: tune(free=3), "TypeError", "free")
+    use("tune for a typo", lambda: tune(objective="spead"), "ValueError", "did you mean 'speed'")
+    use("tune for a number", lambda: tune(objective=3.0), "TypeError", "objective")
+    use("tune for nothing", lambda: tune(objective={}), "ValueError", "empty")
+    use("tune for a weight of text", lambda: tune(objective={"speed": "1"}), "TypeError", "weight")
+    use(
+        "tune for several numbers",
+        lambda: tune(objective=lambda cycle: cycle.durations),
+        "ValueError",
+        "one number",
+    )
+    use("tune for a word", lambda: tune(objective=lambda cycle: "fast"), "TypeError", "objective")
+    use(
+        "tune under nan",
+        lambda: tune(constraints={"contraction": float("nan")}),
+        "ValueError",
+        "finite",
+    )
+    use("tune under a typo", lambda: tune(constraints=["contractio"]), "ValueError", "did you mean")
+    use("tune under a number", lambda: tune(constraints=3), "TypeError", "constraints")
+    use("tune a batch", lambda: tune(params=several), "ValueError", "one wheel")
+    use("tune a table", lambda: tune(params={"damping": 200.0}), "TypeError", "WheelParams")
+    use("tune single numbers", lambda: tune(params=single), "ValueError", "vrw.start_jax()")
+    use("tune on the ladder", lambda: tune(model="auto"), "TypeError", "ladder")
+    use("tune a rigid wheel", lambda: tune(model=vrw.RigidWheel()), "TypeError", "compliant")
+    use(
+        "tune from where nothing walks",
+        lambda: tune(params=vrw.WheelParams(slope=0.02)),
+        "ValueError",
+        "no gait",
+    )
+    use(
+        "tune by options of a mesh",
+        lambda: tune(options=vrw.CycleOptions()),
+        "TypeError",
+        "vrw.Options",
+    )
+
+    # Designs and scans
+    columns = {
+        "text": ("fast", "TypeError"), "texts": (["1", "2"], "TypeError"),
+        "complex": ([1.0, 2j], "TypeError"), "truths": ([True, False], "TypeError"),
+        "nothing": (None, "TypeError"), "no values": ([], "ValueError"),
+        "a table": (np.ones((2, 2)), "ValueError"),
+    }  # fmt: skip
+    family("grid", lambda v: vrw.grid(damping=v), columns, "damping")
+    family("samples", lambda v: vrw.samples({"damping": v}), columns, "damping")
+    for name in ("sobol", "uniform", "saltelli"):
+        draw = getattr(vrw, name)
+        family(f"{name} n", lambda v, d=draw: d({"damping": (100.0, 200.0)}, v), whole, "n is")
+        use(
+            f"{name} seed",
+            lambda d=draw: d({"damping": (1.0, 2.0)}, 4, seed=0.5),
+            "ValueError",
+            "seed",
+        )
+        use(
+            f"{name} of too many",
+            lambda d=draw: d({"damping": (1.0, 2.0)}, 2 * 10**10),
+            "ValueError",
+            "fewer",
+        )
+    family("sobol range", lambda v: vrw.sobol({"damping": v}, 4), bounds, "damping")
+    use("a design of no table", lambda: vrw.sobol(["damping"], 4), "TypeError", "the design")
+    use("a design of nothing", lambda: vrw.grid(), "ValueError", "at least one")
+    use("a design misspelt", lambda: vrw.grid(dampin=[1.0]), "ValueError", "did you mean")
+    use("a grid with a value twice", lambda: vrw.grid(damping=[1.0, 1.0]), "ValueError", "twice")
+    use(
+        "columns of two lengths",
+        lambda: vrw.samples({"damping": [1.0], "slope": [0.1, 0.2]}),
+        "ValueError",
+        "one length",
+    )
+    small = vrw.grid(damping=[150.0, 200.0])
+    scan = lambda **changes: vrw.scan(**({"design": small} | changes))
+    family(
+        "scan chunk",
+        lambda v: scan(chunk=v),
+        {k: v for k, v in whole.items() if k != "nothing"},
+        "chunk",
+    )
+    use("scan over a table", lambda: scan(design={"damping": [1.0]}), "TypeError", "vrw.grid")
+    use("scan for a typo", lambda: scan(measures="spead"), "ValueError", "did you mean 'speed'")
+    use("scan for a number", lambda: scan(measures=3), "TypeError", "measures")
+    use("scan for numbers", lambda: scan(measures=[3]), "TypeError", "measures")
+    use("scan of a batch", lambda: scan(base=several), "ValueError", "one wheel")
+    use("scan of a table", lambda: scan(base={"slope": 0.3}), "TypeError", "WheelParams")
+    use("scan of single numbers", lambda: scan(base=single), "ValueError", "vrw.start_jax()")
+    use("scan of rigid wheels", lambda: scan(model=vrw.RigidWheel()), "TypeError", "compliant")
+    use(
+        "scan by options of a mesh",
+        lambda: scan(options=vrw.CycleOptions()),
+        "TypeError",
+        "vrw.Options",
+    )
+    use(
+        "scan by options of a step in the mesh's place",
+        lambda: scan(cycle_options=vrw.Options()),
+        "TypeError",
+        "CycleOptions",
+    )
+    use(
+        "scan over friction nobody feels",
+        lambda: scan(design=vrw.grid(friction=[0.5, 0.7])),
+        "ValueError",
+        "friction",
+    )
+    use(
+        "indices of what is no saltelli scan",
+        lambda: vrw.sobol_indices(vrw.simulate(table_1, n_steps=1)),
+        "ValueError",
+        "saltelli",
+    )
+    use("indices of a table", lambda: vrw.sobol_indices({}), "TypeError", "scan")
+
+
+def tried() -> dict[str, tuple[str, str, str]]:
+    make()
+    told = {}
+    for name, wrong in USES.items():
+        try:
+            wrong.call()
+        except Exception as error:
+            last = traceback.extract_tb(error.__traceback__)[-1].filename
+            told[name] = (type(error).__name__, str(error), last)
+        else:
+            told[name] = ("nothing", "", "")
+    return told
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).parent.parent.parent))
+    import vrw_jax
+
+    vrw_jax.start_jax(sys.argv[1])
+    print(json.dumps(tried()))

@@ -1,0 +1,19 @@
+"""What people read and write: values checked with one sentence each, results as text and tables."""
+
+from vrw_jax.wording.checks import (
+    chosen,
+    flag,
+    function_of,
+    instance,
+    names_of,
+    nearest,
+    positive,
+    range_of,
+    real,
+    reals,
+    require_known,
+    shown,
+    untraced,
+    whole,
+)
+from vrw_jax.wording.text import Row, as_html, as_markdown, as_tex, as_text, is_concrete, listed
