@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.files import kept_by_netcdf
 
 import vrw_jax as vrw
 from vrw_jax.app.reports import write_branch
@@ -330,6 +331,7 @@ def test_what_is_asked_wrongly_is_said_in_a_sentence():
 
 
 def test_a_branch_is_written_drawn_and_told(branch, tmp_path):
+    kept_by_netcdf(branch.dataset, tmp_path)
     assert len(branch_figure(branch).axes) == 4
     names = {path.name for path in write_branch(branch, tmp_path)}
     assert names == {"branch.zarr", "borders.csv", "summary.md", "branch.svg", "branch.png"}

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import truth
+from support.files import kept_by_netcdf
 
 import vrw_jax as vrw
 from vrw_jax import simd
@@ -411,8 +412,9 @@ def test_section_newton_agrees_with_the_collocation():
     assert abs(found[2]) < 1e-9  # the section before touchdown adds a multiplier of zero
 
 
-def test_sensitivities_are_labelled_and_agree_with_the_truth():
+def test_sensitivities_are_labelled_and_agree_with_the_truth(tmp_path):
     table = vrw.sensitivities(vrw.WheelParams(), measures=("dls_fraction", "period"))
+    kept_by_netcdf(table, tmp_path)
     expected = truth.floats(truth.CASES[0]["cycle"]["d_params"]["dls_fraction"])
     order = [list(PARAMETER_NAMES).index(str(name)) for name in table.parameter.values]
     np.testing.assert_allclose(

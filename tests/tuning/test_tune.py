@@ -5,6 +5,7 @@ import itertools
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.files import kept_by_netcdf
 
 import vrw_jax as vrw
 from vrw_jax.cycles.premises import PREMISES, default_margins
@@ -140,7 +141,8 @@ def test_functions_of_cycle_and_step_are_objectives_like_names():
         np.testing.assert_allclose(other.gradient, by_name.gradient, rtol=1e-6)
 
 
-def test_the_path_is_a_labelled_dataset_and_the_result_prints_itself(most_dls):
+def test_the_path_is_a_labelled_dataset_and_the_result_prints_itself(most_dls, tmp_path):
+    kept_by_netcdf(most_dls.path, tmp_path)
     path = most_dls.path
     assert path.damping.attrs["units"] == "N s/m"
     assert path.sizes["evaluation"] == most_dls.evaluations

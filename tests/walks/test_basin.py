@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from support.files import kept_by_netcdf
 
 import vrw_jax as vrw
 from vrw_jax.figures.branch import basin_figure
@@ -44,7 +45,8 @@ def test_a_fast_start_at_200_meets_touchdown_before_the_stopper(basins):
     assert int(fast.attractor) == -1
 
 
-def test_each_start_has_one_ending(basins):
+def test_each_start_has_one_ending(basins, tmp_path):
+    kept_by_netcdf(basins[100.0], tmp_path)
     for result in basins.values():
         walks = result.outcome.values == vrw.Outcome.STEPPED
         assert np.array_equal(walks, result.attractor.values >= 0)

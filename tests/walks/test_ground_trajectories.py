@@ -2,10 +2,12 @@
 
 import math
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
+from support.files import kept_by_netcdf
 
 import vrw_jax as vrw
 from vrw_jax.models.ladder import UNILATERAL, VISCOELASTIC
@@ -72,7 +74,10 @@ def test_the_next_step_begins_where_the_last_one_ended(walk: xr.Dataset) -> None
     assert begin.foot_z.values[0] == pytest.approx(0.0, abs=1e-9)
 
 
-def test_between_events_time_runs_on_and_nothing_moves_at_once(walk: xr.Dataset) -> None:
+def test_between_events_time_runs_on_and_nothing_moves_at_once(
+    walk: xr.Dataset, tmp_path: Path
+) -> None:
+    kept_by_netcdf(walk, tmp_path)
     parts = stretches(walk)
     assert len(parts) > 4
     for before, after in pairwise(parts):

@@ -1,11 +1,13 @@
 """Trajectories: what is planted stands, what is lost was dissipated, forces are momentum's."""
 
 from itertools import pairwise
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
+from support.files import kept_by_netcdf
 
 import vrw_jax as vrw
 from vrw_jax.results.measures import MEASURES, TRAJECTORY
@@ -52,7 +54,8 @@ def test_every_variable_has_unit_long_name_and_symbol(walk: xr.Dataset) -> None:
     assert walk.phase.attrs["flag_meanings"] == "DLS SLS-I SLS-II"
 
 
-def test_a_trajectory_says_where_it_comes_from(walk: xr.Dataset) -> None:
+def test_a_trajectory_says_where_it_comes_from(walk: xr.Dataset, tmp_path: Path) -> None:
+    kept_by_netcdf(walk, tmp_path)
     for key in ("versions", "device", "dtype", "solver", "rtol", "atol", "outcome", "start"):
         assert key in walk.attrs
     assert walk.attrs["parameter_damping"] == 200.0

@@ -63,7 +63,7 @@ def tuned_summary(tuned: Tuned) -> str:
     moved = [
         (name, f"{float(tuned.path[name][0]):.6g}", f"{float(getattr(tuned.params, name)):.6g}",
          MEASURES[name].plain_unit)
-        for name in tuned.path.attrs["free"]
+        for name in tuned.path.attrs["free"].split()
     ]  # fmt: skip
     return "\n".join([
         f"# Tuned: {tuned.objective}",

@@ -61,7 +61,7 @@ def _objective(axes: Axes, path: xr.Dataset) -> None:
 
 def _parameters(axes: Axes, path: xr.Dataset) -> None:
     lower, upper = np.asarray(path.attrs["lower"]), np.asarray(path.attrs["upper"])
-    for i, name in enumerate(path.attrs["free"]):
+    for i, name in enumerate(path.attrs["free"].split()):
         u = (path[name].values - lower[i]) / (upper[i] - lower[i])
         axes.plot(path.evaluation, u, marker=".", markersize=4.0, label=f"${MEASURES[name].tex}$")
     axes.set_ylim(-0.05, 1.05)
@@ -80,7 +80,7 @@ def _slack(axes: Axes, tuned: Tuned) -> None:
         np.sum(
             [
                 np.abs(path[name].values / float(getattr(tuned.params, name)) - 1.0)
-                for name in path.attrs["free"]
+                for name in path.attrs["free"].split()
             ],
             axis=0,
         )

@@ -334,7 +334,7 @@ class TuneProblem:
         }
         attrs = {
             "title": f"Path of tuning {self.label} over {', '.join(self.free)}",
-            "free": list(self.free),
+            "free": " ".join(self.free),  # as text: netCDF takes no lists of names
             "lower": [float(v) for v in self.lower],
             "upper": [float(v) for v in self.upper],
             "ending": done.ending.name,

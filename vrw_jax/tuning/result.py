@@ -59,7 +59,7 @@ class Tuned:
 
     def lines(self) -> dict[str, str]:
         """The result in words, for a reader."""
-        free = self.path.attrs["free"]
+        free = self.path.attrs["free"].split()
         wheel = [f"{n} {MEASURES[n].text(getattr(self.params, n))}" for n in free]
         kept = "every constraint kept" if self.walked.kept else "a constraint broken"
         kept = kept if self.path.sizes["constraint"] else "no constraint to keep"
