@@ -36,8 +36,8 @@ from vrw_jax.wheel import (
     Outcome,
     Symbols,
     WheelParams,
-    dynamics,
     parameters_of,
+    phases_of,
     transitions,
     wheel_of,
 )
@@ -233,16 +233,10 @@ def _accelerations_along(
     problem: Problem, s: Symbols, distance: Scalar, states: Float[Array, "3 n_samples 6"]
 ) -> tuple[Array, ...]:
     """Accelerations at the nodes of each phase, (step, node, coordinate), of a sampled step."""
-    told = []
-    for i, (phase, mesh) in enumerate(zip(problem.sequence.phases, problem.meshes, strict=True)):
-        known, wanted = jnp.linspace(0.0, 1.0, states.shape[1]), jnp.asarray(mesh.node_times)
-        rows = [jnp.interp(wanted, known, states[i, :, j]) for j in range(states.shape[2])]
-        motion = Motion.of(*rows)
-        acceleration = (
-            dynamics.double_support_acceleration(s, distance, motion),
-            dynamics.single_support_1_acceleration(s, motion),
-            dynamics.single_support_2_acceleration(s, motion),
-        )[i]
-        nodes = jnp.stack(acceleration[: phase.dim], axis=-1)
-        told.append(nodes.reshape(mesh.n_steps, N_NODES, phase.dim))
+    told, phases = [], phases_of(s, distance, stop_at_lift_off=False)
+    known = jnp.linspace(0.0, 1.0, states.shape[1])
+    for phase, mesh, sampled in zip(phases, problem.meshes, states, strict=True):
+        rows = [jnp.interp(jnp.asarray(mesh.node_times), known, row) for row in sampled.T]
+        nodes = jnp.stack(phase.acceleration(Motion.of(*rows))[: phase.n], axis=-1)
+        told.append(nodes.reshape(mesh.n_steps, N_NODES, phase.n))
     return tuple(told)

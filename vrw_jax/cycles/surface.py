@@ -9,6 +9,7 @@ right to about 1 % there and, clipped to its range, a start for a homotopy elsew
 import functools
 import importlib.resources
 import itertools
+import operator
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -61,14 +62,12 @@ def coordinates(params: WheelParams) -> tuple[Elementwise, ...]:
 
 def monomials(centred: tuple[Elementwise, ...]) -> list[Elementwise]:
     """All products of up to DEGREE coordinates."""
-    products = []
-    for degree in range(DEGREE + 1):
-        for factors in itertools.combinations_with_replacement(centred, degree):
-            product = jnp.ones_like(centred[0])
-            for factor in factors:
-                product = product * factor
-            products.append(product)
-    return products
+    one = jnp.ones_like(centred[0])
+    return [
+        functools.reduce(operator.mul, factors, one)
+        for degree in range(DEGREE + 1)
+        for factors in itertools.combinations_with_replacement(centred, degree)
+    ]
 
 
 def gait_on_surface(params: WheelParams, meshes: tuple[Mesh, ...]) -> Solution:

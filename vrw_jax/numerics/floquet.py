@@ -6,6 +6,9 @@ Eigenvalues are not differentiable where two of them meet; the Jury margins, pol
 matrix, are.
 """
 
+import functools
+from typing import NamedTuple
+
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -48,11 +51,24 @@ def _root(x: Array) -> Array:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
 
 
-def _quadratic(a0: Array, a1: Array) -> tuple[Array, Array, Array]:
-    """Roots of z^2 + a1 z + a0: (mean +- split) if real, else mean +- i turn."""
+class _Pair(NamedTuple):
+    """Two eigenvalues: mean +- split if they are real, else mean +- i turn."""
+
+    mean: Array
+    split: Array
+    turn: Array
+
+    @property
+    def modulus(self) -> Array:
+        """Of complex ones."""
+        return _root(self.mean * self.mean + self.turn * self.turn)
+
+
+def _quadratic(a0: Array, a1: Array) -> _Pair:
+    """Roots of z^2 + a1 z + a0."""
     mean = -0.5 * a1
     discriminant = mean * mean - a0
-    return mean, _root(discriminant), _root(-discriminant)
+    return _Pair(mean, _root(discriminant), _root(-discriminant))
 
 
 def _real_root_of_cubic(a0: Array, a1: Array, a2: Array) -> Array:
@@ -81,26 +97,27 @@ def _real_root_of_cubic(a0: Array, a1: Array, a2: Array) -> Array:
     return z
 
 
-def _parts(matrix: Matrix) -> tuple[list[Array], Array | None, Array | None, Array | None]:
-    """Isolated real eigenvalues, then mean, split and turn of the remaining pair."""
+def _parts(matrix: Matrix) -> tuple[list[Array], _Pair | None]:
+    """Isolated real eigenvalues, then the remaining pair."""
     coefficients = characteristic_polynomial(matrix)
     if len(coefficients) == 1:
-        return [-coefficients[0]], None, None, None
+        return [-coefficients[0]], None
     if len(coefficients) == 2:
-        return [], *_quadratic(*coefficients)
+        return [], _quadratic(*coefficients)
     a0, a1, a2 = coefficients
     alone = _real_root_of_cubic(a0, a1, a2)
     slope = a2 + alone
-    return [alone], *_quadratic(a1 + alone * slope, slope)
+    return [alone], _quadratic(a1 + alone * slope, slope)
 
 
 def multipliers(matrix: Matrix) -> Complex[Array, "... n"]:
     """All eigenvalues, the one of largest modulus first."""
     if matrix.shape[-1] > LARGEST_CLOSED:
         return _by_modulus(jnp.linalg.eigvals(matrix))
-    alone, mean, split, turn = _parts(matrix)
+    alone, pair = _parts(matrix)
     values = [lax.complex(x, jnp.zeros_like(x)) for x in alone]
-    if mean is not None and split is not None and turn is not None:
+    if pair is not None:
+        mean, split, turn = pair
         values += [lax.complex(mean + sign * split, sign * turn) for sign in (1.0, -1.0)]
     return _by_modulus(jnp.stack(values, -1))
 
@@ -115,15 +132,12 @@ def spectral_radius(matrix: Matrix) -> Float[Array, "..."]:
     """Largest modulus of an eigenvalue; where two meet its derivative is one-sided or zero."""
     if matrix.shape[-1] > LARGEST_CLOSED:
         return jnp.abs(multipliers(matrix)[..., 0])
-    alone, mean, split, turn = _parts(matrix)
+    alone, pair = _parts(matrix)
     moduli = [jnp.abs(x) for x in alone]
-    if mean is not None and split is not None and turn is not None:
-        pair = mean * mean + turn * turn
-        moduli.append(jnp.where(turn > 0.0, _root(pair), jnp.abs(mean) + split))
-    largest = moduli[0]
-    for modulus in moduli[1:]:
-        largest = jnp.maximum(largest, modulus)
-    return largest
+    if pair is not None:
+        real = jnp.abs(pair.mean) + pair.split
+        moduli.append(jnp.where(pair.turn > 0.0, pair.modulus, real))
+    return functools.reduce(jnp.maximum, moduli)
 
 
 def jury_margins(matrix: Matrix) -> Float[Array, "... n_margins"]:
@@ -172,15 +186,15 @@ def at_double_multiplier(matrix: Matrix, tolerance: float = 1e-6) -> Bool[Array,
 
     A complex pair ties by nature and is smooth; it counts only where it is about to become real.
     """
-    alone, mean, split, turn = _parts(matrix)
-    if mean is None or split is None or turn is None:
+    alone, pair = _parts(matrix)
+    if pair is None:
         return jnp.zeros(matrix.shape[:-2], bool)
+    mean, split, turn = pair
     real = [*alone, mean + split, mean - split]
     complex_pair = turn > 0.0
     moduli = jnp.sort(jnp.abs(jnp.stack(real, -1)), -1)
     tie_of_real = moduli[..., -1] - moduli[..., -2] <= tolerance
-    pair = _root(mean * mean + turn * turn)
     tie = jnp.where(complex_pair, turn <= tolerance, tie_of_real)
     for x in alone:
-        tie = tie | (complex_pair & (jnp.abs(jnp.abs(x) - pair) <= tolerance))
+        tie = tie | (complex_pair & (jnp.abs(jnp.abs(x) - pair.modulus) <= tolerance))
     return tie
