@@ -26,7 +26,17 @@ from vrw_jax.numerics import Options, explicit_tableau, real_stability_limit
 from vrw_jax.runtime import lane_program
 from vrw_jax.walks import options_of, rung_of, state_of
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, wheel_of
-from vrw_jax.wording import chosen, instance, reals, untraced, whole
+from vrw_jax.wording import (
+    AbstractTold,
+    Row,
+    chosen,
+    counted,
+    instance,
+    reals,
+    told,
+    untraced,
+    whole,
+)
 
 Engine = Literal["auto", "lanes", "diffrax", "collocation"]
 ENGINES: tuple[str, ...] = get_args(Engine)
@@ -53,18 +63,39 @@ FEW = 8
 """A block waits no longer than usual once less than one in `FEW` of its lanes is running."""
 
 
-class Steps(eqx.Module):
-    """Lean results of walks of some steps, leading axis: lanes; each tells of its last step."""
+class Steps(AbstractTold):
+    """Lean results of walks of some steps, leading axis: lanes; each tells of its last step.
 
-    section_state: Float[Array, "lanes section"]  # before the next touchdown; zeros if it failed
-    durations: Float[Array, "lanes 3"]  # of DLS, SLS-I, SLS-II, s; on real ground see its step
-    outcome: Int[Array, " lanes"]  # an Outcome; the walk ends at the first that is not STEPPED
-    n_stepped: Int[Array, " lanes"]  # steps that ended in a touchdown
-    solver_steps: Int[Array, " lanes"]  # tried by the integrator, over all steps
-    fixed: Bool[Array, " lanes"]  # whether the last step was taken in fixed work, by collocation
-    solver: Int[Array, " lanes"]  # which of `solvers` took the lane: "auto" goes by stiffness
-    engine: str = eqx.field(static=True)  # that computed it: "lanes", "diffrax" or "collocation"
-    solvers: tuple[str, ...] = eqx.field(static=True)  # the named one first
+    - `section_state`: before the next touchdown; zeros if it failed;
+    - `durations`: of DLS, SLS-I, SLS-II, s; on real ground see its step;
+    - `outcome`: an Outcome; the walk ends at the first that is not STEPPED;
+    - `n_stepped`: steps that ended in a touchdown;
+    - `solver_steps`: tried by the integrator, over all steps;
+    - `fixed`: whether the last step was taken in fixed work, by collocation;
+    - `solver`: which of `solvers` took the lane: "auto" goes by stiffness;
+    - `engine`: that computed it: "lanes", "diffrax" or "collocation";
+    - `solvers`: the named one first.
+    """
+
+    section_state: Float[Array, "lanes section"]
+    durations: Float[Array, "lanes 3"]
+    outcome: Int[Array, " lanes"]
+    n_stepped: Int[Array, " lanes"]
+    solver_steps: Int[Array, " lanes"]
+    fixed: Bool[Array, " lanes"]
+    solver: Int[Array, " lanes"]
+    engine: str = eqx.field(static=True)
+    solvers: tuple[str, ...] = eqx.field(static=True)
+
+    def rows(self) -> list[Row]:
+        n = np.bincount(np.ravel(self.solver), minlength=len(self.solvers))
+        by = (f"{count:,} by {name}" for count, name in zip(n, self.solvers, strict=True) if count)
+        return [
+            ("lanes", counted(self.outcome, Outcome)),
+            ("steps each", told(self.n_stepped, "")),
+            ("engine", f"{self.engine}; {', '.join(by)}"),
+            ("duration of the last step", told(jnp.sum(self.durations, -1), "s")),
+        ]
 
 
 def steps(

@@ -15,13 +15,20 @@ from vrw_jax.results import MEASURES, as_html
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.wheel import Outcome
 
+MOST_SHOWN = 20
+"""Borders that a branch prints of itself."""
+
 
 class FixedPoint(NamedTuple):
-    """A fixed point of a return map at one value of the parameter."""
+    """A fixed point of a return map at one value of the parameter.
 
-    section: np.ndarray  # the numbers that the map moves
+    - `section`: the numbers that the map moves;
+    - `jacobian`: of the map.
+    """
+
+    section: np.ndarray
     parameter: float
-    jacobian: np.ndarray  # of the map
+    jacobian: np.ndarray
 
     @property
     def multipliers(self) -> np.ndarray:
@@ -40,12 +47,15 @@ class Border:
 
     `kind` is "fold", "period_doubling", "neimark_sacker", "border_collision" (the indicator or
     monitor `name` is zero) or "lost" (the order of events changes: `name` says which).
+
+    - `value`: of the parameter;
+    - `point`: beside it, on the side that belongs to the branch.
     """
 
     kind: str
     name: str
-    value: float  # of the parameter
-    point: FixedPoint  # beside it, on the side that belongs to the branch
+    value: float
+    point: FixedPoint
     ends_branch: bool
     find_cycle: Callable[[], Any] | None = field(default=None, repr=False, compare=False)
 
@@ -60,19 +70,21 @@ class Border:
         return f"{self.value:.9g}: {self.kind.replace('_', ' ')}{name}{ends}"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Branch:
     """Gaits along one parameter, in the order of the branch, and its borders in the same order.
 
     `dataset` has the dimension `point`; the parameter is a coordinate on it, which turns back at
     folds. `ends` says for the branch's first and last point why it was followed no further.
+
+    - `outcome`: NO_CYCLE_FOUND or BAD_INPUT if there was none to start from.
     """
 
     parameter: str
     dataset: xr.Dataset
     borders: tuple[Border, ...]
     ends: tuple[str, str]
-    outcome: Outcome  # NO_CYCLE_FOUND or BAD_INPUT if there was none to start from
+    outcome: Outcome
 
     @property
     def values(self) -> np.ndarray:
@@ -101,9 +113,13 @@ class Branch:
             f"  at {self.values[0]:.6g}: {self.ends[0]}",
             f"  at {self.values[-1]:.6g}: {self.ends[1]}",
             f"  {len(self.borders)} borders" + (":" if self.borders else "."),
-            *(f"    {border}" for border in self.borders),
+            *(f"    {border}" for border in self.borders[:MOST_SHOWN]),
         ]
+        if len(self.borders) > MOST_SHOWN:
+            lines.append(f"    and {len(self.borders) - MOST_SHOWN} more, in .borders")
         return "\n".join(lines)
+
+    __repr__ = __str__
 
     def _repr_html_(self) -> str:
         """For notebooks."""

@@ -47,19 +47,31 @@ class LimitCycle(AbstractCycle):
     """A gait of the paper's wheel, found by collocation. Batched under vmap.
 
     See `AbstractCycle`. Differentiable in the parameters, in every mode and to any order.
+
+    - `section_state`: (theta-, dtheta-, dL1-) before touchdown, fixed under return_map;
+    - `post_impact`: (theta, dtheta) after the first landing, rad, rad/s;
+    - `durations`: of DLS, SLS-I, SLS-II, s; (n, 3) for period_n = n > 1;
+    - `step_length`: distance between the feet at the landing, m; (n,) for n > 1;
+    - `indicators`: of the landing; (n,) each for n > 1;
+    - `outcome`: Outcome.STEPPED, or why there is none;
+    - `residual`: last correction of Newton's method, rad, rad/s, s or m;
+    - `passes`: linearised passes that the search took;
+    - `parameters`: in the order of params.PARAMETER_NAMES;
+    - `located`: the solution itself: a start for neighbours;
+    - `matrix`: value of the monodromy matrix, without derivative.
     """
 
-    section_state: SectionState  # (theta-, dtheta-, dL1-) before touchdown, fixed under return_map
-    post_impact: Float[Array, "2"]  # (theta, dtheta) after the first landing, rad, rad/s
-    durations: Float[Array, "*n 3"]  # of DLS, SLS-I, SLS-II, s; (n, 3) for period_n = n > 1
-    step_length: Float[Array, "*n"]  # distance between the feet at the landing, m; (n,) for n > 1
-    indicators: Indicators  # of the landing; (n,) each for n > 1
-    outcome: Int[Array, ""]  # Outcome.STEPPED, or why there is none
-    residual: Scalar  # last correction of Newton's method, rad, rad/s, s or m
-    passes: Int[Array, ""]  # linearised passes that the search took
-    parameters: Float[Array, " n_parameters"]  # in the order of params.PARAMETER_NAMES
-    located: Located  # the solution itself: a start for neighbours
-    matrix: Float[Array, "2 2"]  # value of the monodromy matrix, without derivative
+    section_state: SectionState
+    post_impact: Float[Array, "2"]
+    durations: Float[Array, "*n 3"]
+    step_length: Float[Array, "*n"]
+    indicators: Indicators
+    outcome: Int[Array, ""]
+    residual: Scalar
+    passes: Int[Array, ""]
+    parameters: Float[Array, " n_parameters"]
+    located: Located
+    matrix: Float[Array, "2 2"]
     problem: Problem = eqx.field(static=True)
 
     @property

@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from vrw_jax.numerics import floquet
-from vrw_jax.results import Row, as_html, as_text, is_concrete, listed
+from vrw_jax.results import Row, listed
 from vrw_jax.wheel import Outcome
-from vrw_jax.wording import chosen
+from vrw_jax.wording import AbstractTold, chosen, counted
 
 
-class AbstractCycle(eqx.Module):
+class AbstractCycle(AbstractTold):
     """A gait that repeats after `period_n` steps. Batched under vmap: every field gains the axis.
 
     Where none was found, `outcome` says so and every other number is zero, as are its derivatives.
@@ -119,8 +119,9 @@ class AbstractCycle(eqx.Module):
         """What the cycle says of itself; of many, how many were found."""
         outcome = np.asarray(self.outcome)
         if outcome.ndim:
-            found = int(np.sum(outcome == Outcome.STEPPED))
-            return [("wheels", f"{outcome.size} in shape {outcome.shape}, {found} with a gait")]
+            return [
+                ("wheels", f"{outcome.size} in shape {outcome.shape}: {counted(outcome, Outcome)}")
+            ]
         if outcome != Outcome.STEPPED:
             return [("outcome", f"{Outcome(int(outcome)).name}: {self.why}")]
         multipliers = sorted(np.linalg.eigvals(np.asarray(self.matrix)), key=abs, reverse=True)
@@ -142,13 +143,6 @@ class AbstractCycle(eqx.Module):
     @abc.abstractmethod
     def own_rows(self) -> list[Row]:
         """Those of `rows` that not every rung tells."""
-
-    def __repr__(self) -> str:
-        title = type(self).__name__
-        return as_text(title, self.rows()) if is_concrete(self) else eqx.tree_pformat(self)
-
-    def _repr_html_(self) -> str:
-        return as_html("Limit cycle", self.rows())
 
 
 def _own(name: str) -> Callable[[AbstractCycle], Array]:

@@ -18,7 +18,7 @@ from vrw_jax.cycles.search import Located
 from vrw_jax.cycles.section_cycle import WalkedCycle
 from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import Options
-from vrw_jax.results import is_concrete, listed
+from vrw_jax.results import listed
 from vrw_jax.walks import ModelLike, one_wheel, options_of, rung_of, state_of
 from vrw_jax.wheel import WheelParams
 from vrw_jax.wording import instance, whole
@@ -106,7 +106,7 @@ def near(guess: Any) -> Any:
     if guess is None or isinstance(guess, AbstractCycle | Located):
         return guess
     state = state_of(guess, "guess")
-    if is_concrete(state) and not jnp.isfinite(state).all():
+    if not isinstance(state, jax.core.Tracer) and not jnp.isfinite(state).all():
         raise ValueError(
             f"guess is {listed(state)}, but a search can begin at finite numbers only: give a "
             "neighbour's cycle, or a section state near the gait."

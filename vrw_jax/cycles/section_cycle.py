@@ -30,17 +30,27 @@ class WalkedCycle(AbstractCycle):
 
     Differentiable in the parameters by the implicit function theorem, to second order. Where none
     was found, `outcome` says so and every other number is zero.
+
+    - `section_state`: fixed under `period_n` return maps;
+    - `post_impact`: (theta, dtheta) after the first landing, rad, rad/s;
+    - `durations`: as the rung's step tells them, s; (n, 3) for period_n = n > 1;
+    - `step_length`: distance between the feet at the landing, m;
+    - `steps`: the model's step results, with an axis over the steps of one cycle;
+    - `matrix`: derivative of the return to the section;
+    - `outcome`: Outcome.STEPPED, or why there is none;
+    - `residual`: largest entry of map(x) - x, rad, rad/s or m/s;
+    - `iterations`: of Newton's method.
     """
 
-    section_state: Float[Array, " n_section"]  # fixed under `period_n` return maps
-    post_impact: Float[Array, "2"]  # (theta, dtheta) after the first landing, rad, rad/s
-    durations: Float[Array, "*n 3"]  # as the rung's step tells them, s; (n, 3) for period_n = n > 1
-    step_length: Float[Array, "*n"]  # distance between the feet at the landing, m
-    steps: Any  # the model's step results, with an axis over the steps of one cycle
-    matrix: Float[Array, "n_section n_section"]  # derivative of the return to the section
-    outcome: Int[Array, ""]  # Outcome.STEPPED, or why there is none
-    residual: Scalar  # largest entry of map(x) - x, rad, rad/s or m/s
-    iterations: Int[Array, ""]  # of Newton's method
+    section_state: Float[Array, " n_section"]
+    post_impact: Float[Array, "2"]
+    durations: Float[Array, "*n 3"]
+    step_length: Float[Array, "*n"]
+    steps: Any
+    matrix: Float[Array, "n_section n_section"]
+    outcome: Int[Array, ""]
+    residual: Scalar
+    iterations: Int[Array, ""]
 
     @property
     def period_n(self) -> int:

@@ -3,6 +3,7 @@
 import abc
 import functools
 import operator
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -12,8 +13,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vrw_jax.numerics import Elementwise, Options, Scalar
-from vrw_jax.results import MARGINS, STEP, Row, as_html, as_text, is_concrete
+from vrw_jax.results import MARGINS, MEASURES
 from vrw_jax.wheel import FRICTION, LARGEST, PARAMETER_NAMES, Outcome, WheelParams, wheel_of
+from vrw_jax.wording import AbstractTold, Row, counted, told
 
 SectionState = Float[Array, "3"]
 """(theta-, dtheta-, dL1-) just before touchdown, in the labels of the step that ends: rad, rad/s,
@@ -22,25 +24,45 @@ RungState = Float[Array, " section"]
 """A `SectionState`, or the rung's own longer one."""
 
 
-class Indicators(eqx.Module):
-    """The double-limb-support indicators of Section 5.1, of the landing that opens the step."""
+class AbstractMeasured(AbstractTold):
+    """Several measures, each field told as one of `results.MEASURES`."""
 
-    lambda_I4: Float[
-        Array, "*steps"
-    ]  # normal impulse of the rear foot in the landing, both feet held, N s
-    lambda_2: Float[Array, "*steps"]  # normal force of the fore foot just after it, N
-    lambda_4: Float[Array, "*steps"]  # normal force of the rear foot just after it, N
+    named: eqx.AbstractClassVar[Mapping[str, str]]
+    """Names there, where they are not the fields' own."""
+
+    def rows(self) -> list[Row]:
+        told_as = [
+            (MEASURES[type(self).named.get(name, name)], x) for name, x in vars(self).items()
+        ]
+        return [(m.label, told(value, m.unit)) for m, value in told_as]
 
 
-class EnergyLoss(eqx.Module):
+class Indicators(AbstractMeasured):
+    """The double-limb-support indicators of Section 5.1, of the landing that opens the step.
+
+    - `lambda_I4`: normal impulse of the rear foot in the landing, both feet held, N s;
+    - `lambda_2`: normal force of the fore foot just after it, N;
+    - `lambda_4`: normal force of the rear foot just after it, N.
+    """
+
+    named: ClassVar = {"lambda_2": "lambda_2_plus", "lambda_4": "lambda_4_plus"}
+
+    lambda_I4: Float[Array, "*steps"]
+    lambda_2: Float[Array, "*steps"]
+    lambda_4: Float[Array, "*steps"]
+
+
+class EnergyLoss(AbstractMeasured):
     """Mechanical energy lost in the step, J, each positive when lost."""
+
+    named: ClassVar = {name: f"energy_lost_{name}" for name in ("landing", "stopper", "damping")}
 
     landing: Scalar
     stopper: Scalar
     damping: Scalar
 
 
-class Margins(eqx.Module):
+class Margins(AbstractMeasured):
     """Premises of the paper's rung as signed margins over one step: negative means broken.
 
     The model does not act on them. Forces and lengths are minima over the step, found to the
@@ -49,24 +71,40 @@ class Margins(eqx.Module):
     margins are the model's `friction` less the coefficient needed; the rear foot's is taken just
     after landing, since it grows without bound as the foot unloads. A phase that did not happen
     does not count; a step that did not begin has margins zero.
+
+    - `fore_foot_force`: lambda_2, N;
+    - `clearance_sls1`: height of foot 2 in SLS-I, m;
+    - `clearance_sls2`: height of foot 2 in SLS-II, m;
+    - `locked_stopper_force`: of legs 3..n on their stoppers, N;
+    - `rear_stopper_force`: of Leg 2 on its stopper in SLS-II, N;
+    - `contraction`: L0 - L1 after landing, m;
+    - `friction_fore`: friction left at the fore foot;
+    - `friction_rear`: friction left at the rear foot just after landing;
+    - `landing_stopper_impulse`: on legs 3..n at the landing, N s;
+    - `hit_stopper_impulse`: on legs 3..n when Leg 2 hits its stopper, N s;
+    - `hit_planted_impulse`: normal impulse of the planted foot then, N s;
+    - `landing_friction_fore`: friction left at the fore foot in the landing impulse;
+    - `landing_friction_rear`: friction left at the rear foot in the landing impulse.
     """
 
-    fore_foot_force: Scalar  # lambda_2, N
-    clearance_sls1: Scalar  # height of foot 2 in SLS-I, m
-    clearance_sls2: Scalar  # height of foot 2 in SLS-II, m
-    locked_stopper_force: Float[Array, " n_locked"]  # of legs 3..n on their stoppers, N
-    rear_stopper_force: Scalar  # of Leg 2 on its stopper in SLS-II, N
-    contraction: Scalar  # L0 - L1 after landing, m
-    friction_fore: Scalar  # friction left at the fore foot
-    friction_rear: Scalar  # friction left at the rear foot just after landing
-    landing_stopper_impulse: Float[Array, " n_locked"]  # on legs 3..n at the landing, N s
-    hit_stopper_impulse: Float[Array, " n_locked"]  # on legs 3..n when Leg 2 hits its stopper, N s
-    hit_planted_impulse: Scalar  # normal impulse of the planted foot then, N s
-    landing_friction_fore: Scalar  # friction left at the fore foot in the landing impulse
-    landing_friction_rear: Scalar  # friction left at the rear foot in the landing impulse
+    named: ClassVar = {}
+
+    fore_foot_force: Scalar
+    clearance_sls1: Scalar
+    clearance_sls2: Scalar
+    locked_stopper_force: Float[Array, " n_locked"]
+    rear_stopper_force: Scalar
+    contraction: Scalar
+    friction_fore: Scalar
+    friction_rear: Scalar
+    landing_stopper_impulse: Float[Array, " n_locked"]
+    hit_stopper_impulse: Float[Array, " n_locked"]
+    hit_planted_impulse: Scalar
+    landing_friction_fore: Scalar
+    landing_friction_rear: Scalar
 
 
-class AbstractStep(eqx.Module):
+class AbstractStep(AbstractTold):
     """What every rung's step tells alike. Batched under vmap."""
 
     section_state: eqx.AbstractVar[Array]  # just before the next touchdown
@@ -113,6 +151,27 @@ class AbstractStep(eqx.Module):
         }
         return shared | self.own_measures()
 
+    def rows(self) -> list[Row]:
+        """What the step says of itself: measures, then premises and whether they hold."""
+        outcome, values = np.asarray(self.outcome), self.measures()
+        if outcome.ndim:
+            return [
+                ("steps", f"{outcome.size} in shape {outcome.shape}: {counted(outcome, Outcome)}")
+            ]
+        code = Outcome(int(outcome))
+        rows = [("outcome", f"{code.name}: {code.meaning}")]
+        for name, value in values.items():
+            if name == "outcome":
+                continue
+            measure, least = MEASURES[name], float(np.min(np.asarray(value)))
+            verdict = ", holds" if least >= 0.0 else ", broken"
+            text = measure.text(least)
+            if name in MARGINS:
+                rows.append((f"premise: {measure.label}", text + verdict))
+            else:
+                rows.append((measure.label, text))
+        return rows
+
     def served(self) -> dict[str, Array]:
         """Of a model that chooses: which rung took the step and why, by the names of `SERVED`."""
         return {}
@@ -146,17 +205,24 @@ class StepResult(AbstractStep):
 
     Fields of a step whose outcome is not STEPPED are finite and describe how far it came; its
     `section_state` is all zeros, which is no section state.
+
+    - `section_state`: just before the next touchdown;
+    - `post_impact`: (theta, dtheta) just after the opening landing, rad, rad/s;
+    - `durations`: of DLS, SLS-I, SLS-II, s;
+    - `step_length`: distance between the feet at the opening landing, m;
+    - `outcome`: an Outcome;
+    - `solver_steps`: tried by the integrator.
     """
 
-    section_state: SectionState  # just before the next touchdown
-    post_impact: Float[Array, "2"]  # (theta, dtheta) just after the opening landing, rad, rad/s
-    durations: Float[Array, "3"]  # of DLS, SLS-I, SLS-II, s
-    step_length: Scalar  # distance between the feet at the opening landing, m
+    section_state: SectionState
+    post_impact: Float[Array, "2"]
+    durations: Float[Array, "3"]
+    step_length: Scalar
     indicators: Indicators
     monitors: Margins
     energy: EnergyLoss
-    outcome: Int[Array, ""]  # an Outcome
-    solver_steps: Int[Array, ""]  # tried by the integrator
+    outcome: Int[Array, ""]
+    solver_steps: Int[Array, ""]
 
     def own_measures(self) -> dict[str, Array]:
         return {
@@ -170,29 +236,6 @@ class StepResult(AbstractStep):
             "energy_lost_stopper": self.energy.stopper,
             "energy_lost_damping": self.energy.damping,
         } | {name: getattr(self.monitors, name) for name in MARGINS}
-
-    def rows(self) -> list[Row]:
-        """What the step says of itself: measures, then premises and whether they hold."""
-        outcome = np.asarray(self.outcome)
-        if outcome.ndim:
-            stepped = int(np.sum(outcome == Outcome.STEPPED))
-            return [("steps", f"{outcome.size} in shape {outcome.shape}, {stepped} to touchdown")]
-        code, values = Outcome(int(outcome)), self.measures()
-        rows = [("outcome", f"{code.name}: {code.meaning}")]
-        rows += [
-            (m.long_name, m.text(values[name])) for name, m in STEP.items() if name != "outcome"
-        ]
-        for name, m in MARGINS.items():
-            least = float(np.min(np.asarray(values[name])))
-            verdict = "holds" if least >= 0.0 else "broken"
-            rows.append((f"premise: {m.long_name}", f"{m.text(least)}, {verdict}"))
-        return rows
-
-    def __repr__(self) -> str:
-        return as_text("StepResult", self.rows()) if is_concrete(self) else eqx.tree_pformat(self)
-
-    def _repr_html_(self) -> str:
-        return as_html("Step", self.rows())
 
 
 class Advance(eqx.Module):

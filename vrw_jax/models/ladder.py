@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.models.base import (
@@ -28,6 +29,7 @@ from vrw_jax.models.viscoelastic import ViscoelasticWheel
 from vrw_jax.numerics import Number, Options, Scalar
 from vrw_jax.results import MARGINS
 from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, WheelParams, friction_of
+from vrw_jax.wording import AbstractTold, Row
 
 VISCOELASTIC, UNILATERAL = 1, 2
 """Numbers of the rungs; 0 is the rigid one."""
@@ -67,18 +69,32 @@ SERVED: dict[str, dict[str, object]] = {
 """Attributes of what the ladder tells beside them."""
 
 
-class ModelChoice(eqx.Module):
+class ModelChoice(AbstractTold):
     """Which rung serves, and why. Batched under vmap: every field gains the axis.
 
     `reason` is 0 where the paper's rung serves, 1 + the place in PREMISES of the first premise that
     breaks, OFF_THE_PLANE where a leg other than Leg 1 is loaded or off its stopper at the start,
     and minus the paper's outcome where that rung's step does not reach a touchdown.
+
+    - `rung`: VISCOELASTIC or UNILATERAL;
+    - `margins`: of PREMISES, negative where broken.
     """
 
-    rung: Int[Array, ""]  # VISCOELASTIC or UNILATERAL
+    rung: Int[Array, ""]
     reason: Int[Array, ""]
-    margins: Float[Array, " n_premises"]  # of PREMISES, negative where broken
+    margins: Float[Array, " n_premises"]
     friction: Scalar
+
+    def rows(self) -> list[Row]:
+        reason = np.asarray(self.reason)
+        if reason.ndim:
+            served = int(np.sum(reason == 0))
+            return [
+                ("wheels", f"{reason.size} in shape {reason.shape}, {served} served by the paper's")
+            ]
+        told_margins = zip(PREMISES, np.asarray(self.margins), strict=True)
+        margins = [(MARGINS[n].label, MARGINS[n].text(value)) for n, value in told_margins]
+        return [("rung", type(self.model).__name__), ("why", self.why), *margins]
 
     @property
     def model(self) -> AbstractWheel:
@@ -117,19 +133,31 @@ def reason_of(told: Mapping[str, Any], more_friction: Any) -> tuple[Array, Array
 
 
 class LadderStep(AbstractGroundStep):
-    """One step by the lowest rung that serves, told alike for both. Batched under vmap."""
+    """One step by the lowest rung that serves, told alike for both. Batched under vmap.
+
+    - `section_state`: just before the next landing; zeros if there was none;
+    - `post_impact`: (theta, dtheta) just after the opening landing, rad, rad/s;
+    - `durations`: with two feet loaded, with one, with none, s;
+    - `step_length`: m;
+    - `energy_impacts`: lost in impacts, J;
+    - `energy_damping`: lost in the dampers, J;
+    - `energy_friction`: lost by sliding between impacts, J;
+    - `slip`: path of sliding feet, m;
+    - `outcome`: an Outcome;
+    - `solver_steps`: tried by the integrator, on both rungs.
+    """
 
     choice: ModelChoice
-    section_state: FullState  # just before the next landing; zeros if there was none
-    post_impact: Float[Array, "2"]  # (theta, dtheta) just after the opening landing, rad, rad/s
-    durations: Float[Array, "3"]  # with two feet loaded, with one, with none, s
-    step_length: Scalar  # m
-    energy_impacts: Scalar  # lost in impacts, J
-    energy_damping: Scalar  # lost in the dampers, J
-    energy_friction: Scalar  # lost by sliding between impacts, J
-    slip: Scalar  # path of sliding feet, m
-    outcome: Int[Array, ""]  # an Outcome
-    solver_steps: Int[Array, ""]  # tried by the integrator, on both rungs
+    section_state: FullState
+    post_impact: Float[Array, "2"]
+    durations: Float[Array, "3"]
+    step_length: Scalar
+    energy_impacts: Scalar
+    energy_damping: Scalar
+    energy_friction: Scalar
+    slip: Scalar
+    outcome: Int[Array, ""]
+    solver_steps: Int[Array, ""]
 
     def served(self) -> dict[str, Array]:
         return {"rung": self.choice.rung, "reason": self.choice.reason}

@@ -15,11 +15,15 @@ from vrw_jax.wording import function_of, reals, whole
 
 
 class SectionCycle(NamedTuple):
-    """A point that a map repeats, and how disturbances of it grow."""
+    """A point that a map repeats, and how disturbances of it grow.
+
+    - `jacobian`: of the map, or of its period_n-th iterate;
+    - `residual`: largest entry of map(x) - x.
+    """
 
     x: Float[Array, " n"]
-    jacobian: Float[Array, "n n"]  # of the map, or of its period_n-th iterate
-    residual: Scalar  # largest entry of map(x) - x
+    jacobian: Float[Array, "n n"]
+    residual: Scalar
     converged: Bool[Array, ""]
     iterations: Int[Array, ""]
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.numerics.types import Number, Scalar, as_float_array
-from vrw_jax.wording import chosen, positive, reals, whole
+from vrw_jax.wording import AbstractTold, Row, chosen, positive, reals, told, whole
 
 SolverName = Literal[
     "Dopri8", "Tsit5", "Dopri5", "Bosh3", "Heun", "Midpoint", "Ralston",
@@ -26,7 +26,7 @@ def _positive(name: str, default: float) -> Any:
     return eqx.field(converter=functools.partial(reals, name), default=default)
 
 
-class Options(eqx.Module):
+class Options(AbstractTold):
     """Numerical choices of an event-driven step. The tolerances may change without recompiling.
 
     - `solver`: one of `SOLVERS`, diffrax's Runge-Kutta solvers with an error estimate;
@@ -73,6 +73,13 @@ class Options(eqx.Module):
                 positive(name, value)
         for name in ("max_solver_steps", "event_steps", "monitor_steps"):
             whole(name, getattr(self, name))
+
+    def rows(self) -> list[Row]:
+        units = {"max_phase_time": "s", "first_step": "s"}
+        return [
+            (name, value if isinstance(value, str) else told(value, units.get(name, "")))
+            for name, value in vars(self).items()
+        ]
 
     @classmethod
     def tight(cls) -> "Options":

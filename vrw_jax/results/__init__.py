@@ -24,7 +24,6 @@ from vrw_jax.wording import (
     as_markdown,
     as_tex,
     as_text,
-    is_concrete,
     listed,
     nearest,
     require_known,

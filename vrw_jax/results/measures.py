@@ -38,6 +38,12 @@ class Measure:
         return as_tex(self.symbol)
 
     @property
+    def label(self) -> str:
+        """Name and symbol."""
+        known = self.symbol in self.long_name
+        return self.long_name if known else f"{self.long_name} {self.symbol}"
+
+    @property
     def plain_unit(self) -> str:
         """The unit for a reader, "" for a pure number."""
         return "" if self.unit == "1" else self.unit

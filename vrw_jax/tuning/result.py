@@ -13,44 +13,65 @@ from vrw_jax.wheel import Outcome, WheelParams
 
 
 class Active(NamedTuple):
-    """A constraint or bound that holds the optimum."""
+    """A constraint or bound that holds the optimum.
 
-    name: str  # of the constraint (with the leg, if it has one), or of the parameter
-    limit: float  # its margin, or the bound
+    - `name`: of the constraint (with the leg, if it has one), or of the parameter;
+    - `limit`: its margin, or the bound;
+    - `price`: objective gained per unit of limit given up.
+    """
+
+    name: str
+    limit: float
     unit: str
-    price: float  # objective gained per unit of limit given up
+    price: float
 
 
 class Walked(NamedTuple):
-    """What walking the tuned wheel showed, from a start displaced a little."""
+    """What walking the tuned wheel showed, from a start displaced a little.
+
+    - `distance`: from the limit cycle after the last step, rad, rad/s and m/s;
+    - `kept`: whether every step kept every constraint on a monitor, within 1e-3 of its scale.
+    """
 
     steps: int
     outcome: Outcome
-    distance: float  # from the limit cycle after the last step, rad, rad/s and m/s
-    kept: bool  # whether every step kept every constraint on a monitor, within 1e-3 of its scale
+    distance: float
+    kept: bool
 
 
 @dataclasses.dataclass(frozen=True)
 class Tuned:
-    """A tuned gait, how it was come by, and what holds it there."""
+    """A tuned gait, how it was come by, and what holds it there.
+
+    - `cycle`: LimitCycle, or WalkedCycle on real ground;
+    - `step`: StepResult, or UnilateralStep;
+    - `kkt_residual`: of the first-order condition, relative to the objective's gradient;
+    - `unkept`: premises that were no constraint and are broken;
+    - `path`: every gait that was evaluated, in order;
+    - `evaluations`: limit cycles, each with one step;
+    - `shortened`: trials that lost the gait or its branch;
+    - `seconds`: of which `compile_seconds` went to compiling;
+    - `compile_seconds`: and to exploring, if there were many starts;
+    - `lanes`: where many starts got to before the climb.
+    """
 
     params: WheelParams
     ending: Ending
     objective: str
     value: float
     start_value: float
-    cycle: Any  # LimitCycle, or WalkedCycle on real ground
-    step: Any  # StepResult, or UnilateralStep
+    cycle: Any
+    step: Any
     active: tuple[Active, ...]
-    kkt_residual: float  # of the first-order condition, relative to the objective's gradient
-    unkept: tuple[str, ...]  # premises that were no constraint and are broken
+    kkt_residual: float
+    unkept: tuple[str, ...]
     walked: Walked
-    path: xr.Dataset  # every gait that was evaluated, in order
-    evaluations: int  # limit cycles, each with one step
-    shortened: int  # trials that lost the gait or its branch
-    seconds: float  # of which `compile_seconds` went to compiling
-    compile_seconds: float  # and to exploring, if there were many starts
-    lanes: Lanes | None = None  # where many starts got to before the climb
+    path: xr.Dataset
+    evaluations: int
+    shortened: int
+    seconds: float
+    compile_seconds: float
+    lanes: Lanes | None = None
 
     @property
     def converged(self) -> bool:

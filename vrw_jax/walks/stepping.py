@@ -28,7 +28,7 @@ from vrw_jax.models import (
 )
 from vrw_jax.numerics import Options
 from vrw_jax.wheel import Outcome, WheelParams
-from vrw_jax.wording import instance, reals, whole
+from vrw_jax.wording import AbstractTold, Row, counted, instance, listed, reals, told, whole
 
 SectionLike = Array | np.ndarray | Sequence[float]
 """A section state as given by a caller; `checked` makes it an array of shape (3,)."""
@@ -160,12 +160,15 @@ def return_map(
     return model.advance(params, state, options).section_state
 
 
-class Walk(eqx.Module):
-    """Lean results of consecutive steps, with a leading axis over steps."""
+class Walk(AbstractTold):
+    """Lean results of consecutive steps, with a leading axis over steps.
+
+    - `n_stepped`: steps before the first that failed.
+    """
 
     start: Array
     steps: Advance
-    n_stepped: Int[Array, ""]  # steps before the first that failed
+    n_stepped: Int[Array, ""]
 
     @property
     def outcome(self) -> Array:
@@ -174,6 +177,21 @@ class Walk(eqx.Module):
         return jnp.take_along_axis(
             self.steps.outcome, jnp.minimum(self.n_stepped, last)[..., None], axis=-1
         )[..., 0]
+
+    def rows(self) -> list[Row]:
+        outcome = np.asarray(self.outcome)
+        if outcome.ndim:
+            return [
+                ("walks", f"{outcome.size} in shape {outcome.shape}: {counted(outcome, Outcome)}")
+            ]
+        last = max(int(self.n_stepped) - 1, 0)
+        return [
+            ("outcome", Outcome(int(outcome)).meaning),
+            ("steps", f"{int(self.n_stepped)} of {self.steps.outcome.shape[-1]}"),
+            ("start", f"{listed(self.start)} (rad, rad/s, m/s)"),
+            ("last section state", listed(self.steps.section_state[last])),
+            ("time", told(np.sum(self.steps.durations), "s")),
+        ]
 
 
 @eqx.filter_jit

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from vrw_jax.numerics import Elementwise, Number, Scalar
-from vrw_jax.wording import Row, as_html, as_text, is_concrete, reals, shown, whole
+from vrw_jax.wording import AbstractTold, Row, reals, shown, told, whole
 
 
 class Domain(NamedTuple):
@@ -88,7 +88,7 @@ _n_legs = functools.partial(
 )
 
 
-class WheelParams(eqx.Module):
+class WheelParams(AbstractTold):
     """Parameters of the viscoelastic-legged rimless wheel; the defaults are Table 1, slope 0.30.
 
     All fields but `n_legs` are pytree leaves in SI units and may be swept and differentiated.
@@ -165,28 +165,19 @@ class WheelParams(eqx.Module):
                     f"{name} has shape {shape}, but this is about one wheel: {instead}."
                 )
 
-    def table(self) -> tuple[str, list[Row]]:
-        """A title, and symbol, value and unit of each parameter; of a gradient, what it is by."""
-        is_wheel, told = bool(np.all(self.in_domain())), []
-        for name, domain in DOMAINS.items():
-            value = np.asarray(getattr(self, name))
-            text = f"{value:.6g}" if value.ndim == 0 else f"{value.size} values"
-            if value.size > 1:
-                text += f" from {value.min():.6g} to {value.max():.6g}"
-            unit = f", {domain.unit}" if domain.unit and not is_wheel else ""
-            label = f"{name} {domain.symbol}" if is_wheel else f"by {name} {domain.symbol}{unit}"
-            told.append((label, f"{text} {domain.unit if is_wheel else ''}".strip()))
-        if is_wheel:
-            return "WheelParams", [*told, ("n_legs", str(self.n_legs))]
-        return "WheelParams out of its domain: a gradient or a difference", told
+    @property
+    def title(self) -> str:
+        other = "" if np.all(self.in_domain()) else " out of its domain: a gradient or a difference"
+        return "WheelParams" + other
 
-    def __repr__(self) -> str:
-        leaves = jax.tree.leaves(self)  # other things than numbers in an `in_axes`
-        whole = len(leaves) == len(DOMAINS) and all(map(eqx.is_array, leaves))
-        return as_text(*self.table()) if whole and is_concrete(self) else eqx.tree_pformat(self)
-
-    def _repr_html_(self) -> str:
-        return as_html(*self.table())
+    def rows(self) -> list[Row]:
+        """Symbol, value and unit of each parameter; of a gradient, what it is by."""
+        values = {name: getattr(self, name) for name in DOMAINS}
+        if not np.all(self.in_domain()):
+            by = lambda d: f"{d.symbol}, {d.unit}" if d.unit else d.symbol
+            return [(f"by {n} {by(DOMAINS[n])}", told(value, "")) for n, value in values.items()]
+        named = [(f"{n} {DOMAINS[n].symbol}", told(x, DOMAINS[n].unit)) for n, x in values.items()]
+        return [*named, ("n_legs", str(self.n_legs))]
 
     @property
     def leg_angle(self) -> float:

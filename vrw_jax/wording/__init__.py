@@ -16,4 +16,14 @@ from vrw_jax.wording.checks import (
     untraced,
     whole,
 )
-from vrw_jax.wording.text import Row, as_html, as_markdown, as_tex, as_text, is_concrete, listed
+from vrw_jax.wording.text import (
+    AbstractTold,
+    Row,
+    as_html,
+    as_markdown,
+    as_tex,
+    as_text,
+    counted,
+    listed,
+    told,
+)

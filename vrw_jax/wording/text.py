@@ -1,19 +1,61 @@
 """How results show themselves: a few lines of text, tables of two kinds, symbols as mathtext."""
 
+import abc
+import enum
 import re
 import unicodedata
 from collections.abc import Iterable, Sequence
 from html import escape
+from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 
 Row = tuple[str, str]
 
 
-def is_concrete(tree: object) -> bool:
-    """Whether all numbers are known, as they aren't inside `jit` or `vmap`."""
-    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
+def is_concrete(tree: Any) -> bool:
+    """Whether all numbers of a module are there and known, as they aren't inside `jit`."""
+    known = lambda leaf: eqx.is_array_like(leaf) and not isinstance(leaf, int | jax.core.Tracer)
+    whole = not any(value is None for value in vars(tree).values())
+    return whole and all(map(known, jax.tree.leaves(tree)))
+
+
+class AbstractTold(eqx.Module):
+    """What prints itself in words and numbers, and as a table in a notebook."""
+
+    @abc.abstractmethod
+    def rows(self) -> list[Row]:
+        """Names and texts."""
+
+    @property
+    def title(self) -> str:
+        """Stands above them."""
+        return type(self).__name__
+
+    def __repr__(self) -> str:
+        return as_text(self.title, self.rows()) if is_concrete(self) else eqx.tree_pformat(self)
+
+    def _repr_html_(self) -> str:
+        return as_html(self.title, self.rows()) if is_concrete(self) else f"<pre>{self!r}</pre>"
+
+
+def told(value: object, unit: str) -> str:
+    """A number with its unit, or of many how many and between which."""
+    values, unit = np.asarray(value), "" if unit == "1" else unit
+    if values.ndim == 0:
+        return f"{float(values):.6g} {unit}".strip()
+    ends = f" from {np.min(values):.6g} to {np.max(values):.6g} {unit}" if values.size else ""
+    return f"{values.size} values{ends}".rstrip()
+
+
+def counted(outcomes: Any, code: type[enum.IntEnum]) -> str:
+    """How many there are, and how often each outcome came."""
+    n, shape = np.size(outcomes), np.shape(outcomes)
+    codes, counts = np.unique(np.asarray(outcomes), return_counts=True)
+    each = (f"{count:,} {code(int(c)).name}" for c, count in zip(codes, counts, strict=True))
+    return f"{n:,} in shape {shape}: {', '.join(each)}"
 
 
 def as_text(title: str, rows: Iterable[Row]) -> str:

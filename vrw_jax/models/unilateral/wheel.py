@@ -68,26 +68,43 @@ class UnilateralStep(AbstractGroundStep):
 
     Fields of a step whose outcome is not STEPPED are finite and describe how far it came; its
     `section_state` is all zeros, which is no section state.
+
+    - `section_state`: just before the next landing;
+    - `post_impact`: (theta, dtheta) just after the opening landing, rad, rad/s;
+    - `durations`: with two feet loaded, with one, with none, s;
+    - `mode_durations`: by mode of the first and second loaded foot, s;
+    - `step_length`: between the places of the two landings, m;
+    - `landing_normal`: normal impulses of the opening landing, N s;
+    - `landing_tangential`: tangential ones; fore and rear foot;
+    - `energy_impacts`: lost in impacts, J;
+    - `energy_damping`: lost in the dampers, J;
+    - `energy_friction`: lost by sliding between impacts, J;
+    - `slip`: path of sliding feet, m;
+    - `events`: contacts and stoppers that changed;
+    - `impacts`: events in which velocities jumped;
+    - `fewest_solutions`: admissible combinations at an event: 1 where well posed;
+    - `outcome`: an Outcome;
+    - `solver_steps`: tried by the integrator.
     """
 
-    section_state: FullState  # just before the next landing
-    post_impact: Float[Array, "2"]  # (theta, dtheta) just after the opening landing, rad, rad/s
-    durations: Float[Array, "3"]  # with two feet loaded, with one, with none, s
-    mode_durations: Float[Array, "4 4"]  # by mode of the first and second loaded foot, s
-    step_length: Scalar  # between the places of the two landings, m
-    landing_normal: Float[Array, "2"]  # normal impulses of the opening landing, N s
-    landing_tangential: Float[Array, "2"]  # tangential ones; fore and rear foot
-    energy_impacts: Scalar  # lost in impacts, J
-    energy_damping: Scalar  # lost in the dampers, J
-    energy_friction: Scalar  # lost by sliding between impacts, J
-    slip: Scalar  # path of sliding feet, m
+    section_state: FullState
+    post_impact: Float[Array, "2"]
+    durations: Float[Array, "3"]
+    mode_durations: Float[Array, "4 4"]
+    step_length: Scalar
+    landing_normal: Float[Array, "2"]
+    landing_tangential: Float[Array, "2"]
+    energy_impacts: Scalar
+    energy_damping: Scalar
+    energy_friction: Scalar
+    slip: Scalar
     monitors: UnilateralMargins
-    events: Int[Array, ""]  # contacts and stoppers that changed
-    impacts: Int[Array, ""]  # events in which velocities jumped
-    fewest_solutions: Int[Array, ""]  # admissible combinations at an event: 1 where well posed
+    events: Int[Array, ""]
+    impacts: Int[Array, ""]
+    fewest_solutions: Int[Array, ""]
     most_solutions: Int[Array, ""]
-    outcome: Int[Array, ""]  # an Outcome
-    solver_steps: Int[Array, ""]  # tried by the integrator
+    outcome: Int[Array, ""]
+    solver_steps: Int[Array, ""]
 
 
 class UnilateralTrajectory(eqx.Module):

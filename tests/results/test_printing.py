@@ -1,0 +1,99 @@
+"""Results print numbers with symbols and units, as text and tables; help says what fields mean."""
+
+import dataclasses
+import pydoc
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vrw_jax as vrw
+
+TABLE_1, START = vrw.WheelParams(), vrw.paper_start()
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: TABLE_1, ("damping c: 200 N s/m", "slope phi: 0.3 rad", "n_legs: 8")),
+        (
+            lambda: vrw.WheelParams(damping=np.array([1.0, 2.0])),
+            ("2 values from 1 to 2 N s/m",),
+        ),
+        (
+            lambda: jax.tree.map(jnp.negative, TABLE_1),
+            ("a gradient or a difference", "by damping c, N s/m: -200"),
+        ),
+        (vrw.Options, ("solver: Dopri8", "rtol: 1e-10", "first_step: 0.005 s")),
+        (lambda: vrw.step(TABLE_1, START), ("DLS fraction T_DLS/T: 0.53", "N s, broken")),
+        (lambda: vrw.step(TABLE_1, START).monitors, ("min λ2: 103.", " N")),
+        (lambda: vrw.step(TABLE_1, START).indicators, ("λ_I4: 1.96", "N s")),
+        (lambda: vrw.step(TABLE_1, START).energy, ("ΔE_c: 29.5", " J")),
+        (lambda: vrw.walk(TABLE_1, START, 3), ("steps: 3 of 3", "rad, rad/s, m/s")),
+        (lambda: vrw.steps(TABLE_1, np.stack([START, 0.0 * START])), ("1 STEPPED, 1 BAD_INPUT",)),
+        (lambda: vrw.limit_cycle(TABLE_1).indicators, ("N s",)),
+        (
+            lambda: vrw.limit_cycle(vrw.WheelParams(slope=0.1), model=vrw.RigidWheel()),
+            ("period", "m/s"),
+        ),
+    ],
+)
+def test_a_result_prints_numbers_and_units(make, words):
+    result = make()
+    text, table = repr(result), result._repr_html_()
+    for word in words:
+        assert word in text
+    assert len(text.splitlines()) < 50
+    assert table.startswith("<table>")
+
+
+def test_what_is_traced_prints_its_shapes():
+    assert "float64" in repr(jax.eval_shape(lambda p: vrw.step(p, START), TABLE_1))
+    assert "None" in repr(vrw.WheelParams(damping=np.ones(3)).in_axes)
+
+
+@pytest.mark.parametrize(
+    ("thing", "words"),
+    [
+        (vrw.WheelParams, "`damping`: c, viscous damping of each leg"),
+        (vrw.Options, "`first_step`: of each phase, s"),
+        (vrw.CycleOptions, "`stages`: of a homotopy"),
+        (vrw.StepResult, "`step_length`: distance between the feet at the opening landing, m"),
+        (vrw.Margins, "`contraction`:"),
+        (vrw.Steps, "`solver_steps`: tried by the integrator"),
+        (vrw.LimitCycle, "`passes`: linearised passes"),
+        (vrw.Tuned, "`evaluations`: limit cycles"),
+        (vrw.UnilateralStep, "`slip`: path of sliding feet, m"),
+    ],
+)
+def test_help_says_what_fields_mean(thing, words):
+    assert words in pydoc.plain(pydoc.render_doc(thing))
+
+
+def test_partly_batched_wheels_are_mapped_by_their_own_axes():
+    wheels = vrw.WheelParams(damping=np.array([150.0, 200.0]))
+    cycles = jax.vmap(vrw.limit_cycle, in_axes=(wheels.in_axes,))(wheels)
+    one = vrw.limit_cycle(dataclasses.replace(TABLE_1, damping=150.0))
+    np.testing.assert_allclose(cycles.period[0], one.period, rtol=1e-12)
+
+
+def test_the_face_shows_public_names_and_draws_only_when_asked():
+    code = (
+        "import sys, vrw_jax as vrw\n"
+        "assert 'matplotlib' not in sys.modules\n"
+        "assert set(dir(vrw)) == {*vrw.__all__, '__version__'}\n"
+        "assert all(hasattr(vrw, name) for name in vrw.__all__)\n"
+        "assert vrw.__version__.split('.')[0].isdigit()\n"
+        "assert callable(vrw.plot.save_animation) and 'matplotlib' in sys.modules\n"
+        "assert vrw.MEASURES['period'].unit == 's'\n"
+        "assert vrw.default_margins(vrw.WheelParams())['contraction'] > 0.0\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_walk_can_begin_without_a_start():
+    walked = vrw.simulate(TABLE_1, n_steps=2)
+    np.testing.assert_array_equal(walked.attrs["start"], np.asarray(START))
