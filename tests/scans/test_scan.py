@@ -429,7 +429,7 @@ def test_a_cycle_that_the_step_does_not_confirm_is_told_so(
     engine({"damping": np.array([200.0])})
     monkeypatch.setattr(finder, "AGREEMENT", 0.0)
     told = engine({"damping": np.array([200.0])})
-    assert told["outcome"] == Outcome.NO_CYCLE_FOUND
+    assert told["outcome"] == Outcome.MESH_TOO_COARSE
     assert np.isnan(told["speed"])
 
 
