@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from vrw_jax import simd
 from vrw_jax.batches.fixed_work import fixed_gait_step
 from vrw_jax.batches.ground import as_full_states, walk_lanes
-from vrw_jax.batches.paper import gait_step
+from vrw_jax.models.lane_step import gait_step
 from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import Options, explicit_tableau, real_stability_limit
 from vrw_jax.runtime import lane_program

@@ -9,10 +9,20 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from vrw_jax.models.base import AbstractWheel, Advance, SectionState, StepResult, Trajectory
+from vrw_jax.models.base import (
+    AbstractWheel,
+    Advance,
+    SectionState,
+    StepResult,
+    Trajectory,
+    replaced_where_bad,
+    usable,
+)
+from vrw_jax.models.lane_step import lanes_can, moved_by_lanes, told_by_lanes
 from vrw_jax.models.paper_step import (
     PAPER_START,
     End,
+    Told,
     Walked,
     result_of,
     section_state_of,
@@ -38,6 +48,7 @@ from vrw_jax.wheel import (
     WheelParams,
     dynamics,
     known_friction,
+    transitions,
 )
 from vrw_jax.wording import flag
 
@@ -109,12 +120,16 @@ class ViscoelasticWheel(AbstractWheel):
         return jnp.asarray(PAPER_START, params.damping.dtype)
 
     def advance(self, params: WheelParams, x: SectionState, options: Options) -> Advance:
-        leaves, structure = jax.tree.flatten((params, x, options))
-        return eqx.combine(*_compiled(self, structure, False)(*leaves))
+        told = self._told(params, x, options, monitored=False)
+        tried = jnp.sum(told.tried, axis=0)
+        return Advance(section_state_of(told), told.durations, told.outcome, tried)
 
     def step(self, params: WheelParams, x: SectionState, options: Options) -> StepResult:
+        return _full_step(self, params, x, options)
+
+    def _told(self, params: WheelParams, x: SectionState, options: Options, monitored: bool) -> Told:
         leaves, structure = jax.tree.flatten((params, x, options))
-        return eqx.combine(*_compiled(self, structure, True)(*leaves))
+        return eqx.combine(*_compiled(self, structure, monitored)(*leaves))
 
     def trace(
         self, params: WheelParams, x: SectionState, options: Options, n_samples: int
@@ -152,20 +167,30 @@ def _describe(phase: AbstractPhase, y: State) -> tuple[Array, Array, Array]:
     )
 
 
-@functools.cache
-def _compiled(model: ViscoelasticWheel, structure: Any, full: bool) -> Forward:
-    """A step over the leaves of (params, x, options): compiled, and differentiable in any mode."""
+@eqx.filter_jit
+def _full_step(
+    model: ViscoelasticWheel, params: WheelParams, x: SectionState, options: Options
+) -> StepResult:
+    told = model._told(params, x, options, monitored=True)
+    good = usable(params, x)
+    params, x = replaced_where_bad(good, params, x, jnp.asarray(PAPER_START))
+    s = params.symbols()
+    return result_of(s, transitions.land(s, *x), told, model.friction)
 
-    def walk(tighten: bool, *leaves: Array) -> tuple:
+
+@functools.cache
+def _compiled(model: ViscoelasticWheel, structure: Any, monitored: bool) -> Forward:
+    """What a step tells, over the leaves of (params, x, options), differentiable in any mode."""
+
+    def by_diffrax(tighten: bool, *leaves: Array) -> tuple:
         params, x, options = jax.tree.unflatten(structure, leaves)
         options = options.for_derivatives() if tighten else options
-        walked = model._walk(params, x, options, monitored=full)
-        told = told_of(walked)
-        if full:
-            result: Any = result_of(walked.s, walked.landing, told, model.friction)
-        else:
-            tried = jnp.sum(told.tried, axis=0)
-            result = Advance(section_state_of(told), told.durations, told.outcome, tried)
-        return eqx.partition(result, eqx.is_inexact_array)
+        walked = model._walk(params, x, options, monitored=monitored)
+        return eqx.partition(told_of(walked), eqx.is_inexact_array)
 
-    return any_mode(functools.partial(walk, False), functools.partial(walk, True))
+    values, tighter = (functools.partial(by_diffrax, tighten) for tighten in (False, True))
+    static = jax.tree.unflatten(structure, [0.0] * structure.num_leaves)[2]
+    if not lanes_can(static):
+        return any_mode(values, tighter)
+    given = structure, model.stop_at_lift_off, monitored
+    return any_mode(told_by_lanes(*given), tighter, functools.partial(moved_by_lanes, *given))

@@ -87,5 +87,6 @@ from vrw_jax.numerics.tableaus import (
     parabola,
     real_stability_limit,
 )
+from vrw_jax.numerics.tangents import Balance
 from vrw_jax.numerics.trig import sine_cosine
 from vrw_jax.numerics.types import Elementwise, Number, Scalar, Vector, as_float_array

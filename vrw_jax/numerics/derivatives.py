@@ -23,13 +23,18 @@ Forward = Callable[..., tuple[PyTree[Array], PyTree[Array]]]
 """Maps float arrays to (float outputs, other outputs that carry no derivative)."""
 
 
-def any_mode(function: Forward, to_differentiate: Forward | None = None) -> Forward:
+def any_mode(
+    function: Forward,
+    to_differentiate: Forward | None = None,
+    jacobian_of: Callable[[tuple[int, ...]], Forward] | None = None,
+) -> Forward:
     """`function` with derivatives in forward and reverse mode, to any order.
 
     `function(*arrays)` must take floating-point arrays only and be differentiable by `jax.jvp` to
     the order wanted. It must not close over values that are themselves differentiated. Where
     derivatives are asked for, `to_differentiate` (the same function computed more tightly, say)
-    takes its place. Function and Jacobians are compiled once each: outside of `jit`, forward mode,
+    takes its place; `jacobian_of` some of the arguments, by their places, may be given too, as what
+    (Jacobian by each argument, value) and the other outputs are. Function and Jacobians are compiled once each: outside of `jit`, forward mode,
     reverse mode and single directions all call the same compiled Jacobian.
     """
     tighter = function if to_differentiate is None else to_differentiate
@@ -37,7 +42,8 @@ def any_mode(function: Forward, to_differentiate: Forward | None = None) -> Forw
 
     @functools.cache
     def differentiated(moved: tuple[int, ...]) -> Forward:
-        return any_mode(_jacobian(tighter, moved))
+        forwards = _jacobian(tighter, moved)
+        return any_mode(forwards) if jacobian_of is None else any_mode(jacobian_of(moved), forwards)
 
     def rule(primals: tuple, tangents: tuple) -> tuple:
         moved = tuple(i for i, t in enumerate(tangents) if not isinstance(t, SymbolicZero))

@@ -5,6 +5,7 @@ they locate their events together, taking that step again with its length correc
 method. What a lane gives never depends on its neighbours: a lane that has ended is left alone.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -13,6 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from vrw_jax.numerics.derivatives import without_derivative
 from vrw_jax.numerics.lane_minima import Lowest, Monitors, at_start, lowered, settled, with_rates
 from vrw_jax.numerics.lanes import select
 from vrw_jax.numerics.options import Options
@@ -26,6 +28,7 @@ from vrw_jax.numerics.tableaus import (
     parabola,
     take_step,
 )
+from vrw_jax.numerics.tangents import Balance, Moving
 from vrw_jax.numerics.types import Vector
 from vrw_jax.simd import apart
 
@@ -40,6 +43,7 @@ class LanePhase(NamedTuple):
     evaluate: Evaluate
     guards: Callable[[Place], Vector]
     monitors: Monitors | None = None  # whose minima are wanted
+    balance: Balance | None = None  # for derivatives
 
 
 class LanePhaseEnd(NamedTuple):
@@ -66,6 +70,7 @@ class _March(NamedTuple):
     half: Array  # iterations after which half of the lanes had finished
     iterations: Array
     lowest: Lowest | None
+    direction: Array | None  # in which it moves here, (2 n, lanes), see `tangents`
 
 
 MARCHING, TIMED_OUT, GAVE_UP, CROSSED, IDLE = range(5)
@@ -75,8 +80,13 @@ LATE = 2
 """Times the iterations after which half of the lanes had finished."""
 
 
+PhaseOf = Callable[[Any], LanePhase]
+"""By what the phase holds constant, a tree of arrays."""
+
+
 def integrate_lanes(
-    phase: LanePhase,
+    phase_of: PhaseOf,
+    constants: Any,
     tableau: Tableau,
     q: Vector,
     v: Vector,
@@ -89,16 +99,98 @@ def integrate_lanes(
 
     Where many lanes march together, as on a GPU, they don't wait for their last `few` if these take
     `LATE` times as long as half of them: these are marked unfinished, to run again from their start
-    among their like.
+    among their like. Derivatives: by `constants`, `q` and `v`, see `tangents`.
     """
-    phase = _traced_once(phase)
+    run = jax.custom_jvp(functools.partial(_integrated, phase_of, tableau))
+
+    @run.defjvp
+    def rule(primals: tuple, tangents: tuple) -> tuple[LanePhaseEnd, LanePhaseEnd]:
+        constants, q, v, *_ = primals
+        start = jnp.stack([*tangents[1], *tangents[2]])
+        balance_of = lambda held: phase_of(held).balance
+        moving = Moving(balance_of, constants, tangents[0], start)
+        return _integrated_and_moved(phase_of, tableau, *primals, moving=moving)
+
+    return run(constants, q, v, active, first_step, options, few)
+
+
+def _integrated(
+    phase_of: PhaseOf,
+    tableau: Tableau,
+    constants: Any,
+    q: Vector,
+    v: Vector,
+    active: Array,
+    first_step: Array,
+    options: Options,
+    few: Array | None,
+) -> LanePhaseEnd:
+    phase = _traced_once(phase_of(constants))
+    return _ended(phase, tableau, q, v, active, first_step, options, few, None)[0]
+
+
+def _integrated_and_moved(
+    phase_of: PhaseOf,
+    tableau: Tableau,
+    constants: Any,
+    q: Vector,
+    v: Vector,
+    active: Array,
+    first_step: Array,
+    options: Options,
+    few: Array | None,
+    moving: Moving,
+) -> tuple[LanePhaseEnd, LanePhaseEnd]:
+    """The phase's end, and how it moves along a direction of its start and constants."""
+    phase = _traced_once(phase_of(constants))
+    given = tableau, q, v, active, first_step, options, few
+    end, march = _ended(phase, *given, moving)
+    n, h = len(q), jnp.where(march.verdict == CROSSED, end.duration - march.time, 0.0)
+    taken = take_step(tableau, phase.evaluate, march.here, h, with_error=False)
+    assert march.direction is not None
+    direction = moving.along(tableau, taken.stages, march.direction, h)
+
+    def guards(constants: Any, q: Vector, v: Vector) -> Vector:
+        phase = phase_of(constants)
+        return phase.guards(Place(q, v, phase.evaluate(q, v)))
+
+    place = taken.end
+    numbers = tuple(direction)
+    here = (constants, place.q, place.v)
+    slope = place.slope.acceleration[:n]
+    still = jax.tree.map(jnp.zeros_like, constants)
+    rates = jax.jvp(guards, here, (still, place.v, slope))[1]
+    moves = jax.jvp(guards, here, (moving.moved, numbers[:n], numbers[n:]))[1]
+    crossed = (march.verdict == CROSSED) & (end.guard >= 0)
+    later = jnp.zeros_like(h)
+    for index, (rate, move) in enumerate(zip(rates, moves, strict=True)):
+        own = crossed & (end.guard == index) & (rate < 0.0)
+        later = jnp.where(own, -move / jnp.where(own, rate, -1.0), later)
+    motion = (*place.v, *slope)
+    told = tuple(x + later * y for x, y in zip(numbers, motion, strict=True))
+    nothing = without_derivative(end)
+    place_moved = nothing.place._replace(q=told[:n], v=told[n:])
+    return end, nothing._replace(place=place_moved, duration=later)
+
+
+def _ended(
+    phase: LanePhase,
+    tableau: Tableau,
+    q: Vector,
+    v: Vector,
+    active: Array,
+    first_step: Array,
+    options: Options,
+    few: Array | None,
+    moving: Moving | None,
+) -> tuple[LanePhaseEnd, _March]:
     start = Place(q, v, phase.evaluate(q, v))
     values, rates = with_rates(phase.guards, phase.evaluate, start)
     past = tuple((g < 0.0) | ((g == 0.0) & (r <= 0.0)) for g, r in zip(values, rates, strict=True))
     at_once = _first(past)
     begins = active & (at_once < 0)
 
-    march = _march(phase, tableau, start, values, begins, first_step, options, few)
+    march = _march(phase, tableau, start, values, begins, first_step, options, few, moving)
     crossed = march.verdict == CROSSED
     if phase.monitors is not None:  # a long program, which what follows makes longer
         phase = _traced_once(phase, apart)
@@ -115,7 +207,7 @@ def integrate_lanes(
         )
     late = crossed & ~found.open & (duration > options.max_phase_time)
     guard = jnp.where(active & (at_once >= 0), at_once, jnp.where(crossed, found.guard, -1))
-    return LanePhaseEnd(
+    end = LanePhaseEnd(
         place=place,
         duration=duration,
         guard=jnp.where(lost | late, -1, guard),
@@ -125,6 +217,7 @@ def integrate_lanes(
         next_step=march.h,
         minima=minima,
     )
+    return end, march
 
 
 def _traced_once(phase: LanePhase, how: Callable = jax.jit) -> LanePhase:
@@ -144,6 +237,7 @@ def _march(
     first_step: Array,
     options: Options,
     few: Array | None,
+    moving: Moving | None,
 ) -> _March:
     """Adaptive steps until each lane has crossed a guard, run out of time or given up."""
 
@@ -157,19 +251,23 @@ def _march(
         taken = take_step(tableau, phase.evaluate, march.here, march.h)
         inside, end = phase.guards(taken.inside), phase.guards(taken.end)
         change, kept = judge(march, taken, inside, end)
-        verdict, crossing, accepted, time, h = _verdict(options, march, change, kept, end)
+        verdict, crossing, accepted, time, length = _verdict(options, march, change, kept, end)
         here, values = select(accepted, (taken.end, end), (march.here, march.values))
         lowest, half = march.lowest, march.half
         if phase.monitors is not None and lowest is not None:
             given = phase.monitors, phase.evaluate
             lowest = lowered(*given, lowest, march.here, taken.end, march.h, accepted)
+        direction = march.direction
+        if moving is not None and direction is not None:
+            along = moving.along(tableau, taken.stages, direction, march.h)
+            direction = jnp.where(accepted, along, direction)
         if few is not None:
             left = jnp.sum(verdict == MARCHING, dtype=jnp.int32)
             half = jnp.where(2 * left > verdict.size, march.iterations + 1, half)
         return _March(
             here=here,
             values=values,
-            h=h,
+            h=length,
             time=time,
             verdict=verdict,
             crossing=crossing,
@@ -177,6 +275,7 @@ def _march(
             half=half,
             iterations=march.iterations + 1,
             lowest=lowest,
+            direction=direction,
         )
 
     none, count = jnp.zeros(first_step.shape, jnp.int32), jnp.zeros((), jnp.int32)
@@ -191,6 +290,7 @@ def _march(
         half=count,
         iterations=count,
         lowest=phase.monitors and at_start(phase.monitors, phase.evaluate, start),
+        direction=None if moving is None else moving.start,
     )
     return lax.while_loop(lambda march: _waits(march, few), advance, begin)
 

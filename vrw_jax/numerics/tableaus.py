@@ -129,6 +129,7 @@ class Taken(NamedTuple):
     end: Place
     inside: Place
     error: Vector  # of positions, then rates
+    stages: list[Place]  # the start first, the end last
 
 
 Evaluate = Callable[[Vector, Vector], Slope]
@@ -140,20 +141,8 @@ def take_step(
     """From `start` by `h` (lane by lane)."""
     n = len(start.q)
     places, slopes = [start], [start.slope.acceleration[:n]]
-    q0, v0 = start.q, start.v
-
-    def stage(i: int) -> tuple[Vector, Vector]:
-        position, rate = [], []
-        for d in range(n):
-            known = [slope[d] for slope in slopes]
-            twice, once = _weigh(tableau.twice[i], known), _weigh(tableau.once[i], known)
-            drift = float(tableau.places[i]) * v0[d]
-            position.append(q0[d] + h * (drift if twice is None else drift + h * twice))
-            rate.append(v0[d] + h * once)
-        return tuple(position), tuple(rate)
-
     for i in range(1, len(tableau.places)):
-        q, v = stage(i)
+        q, v = stage_at(tableau, i, start.q, start.v, slopes, h)
         slope = evaluate(q, v)
         places.append(Place(q, v, slope))
         slopes.append(slope.acceleration[:n])
@@ -163,10 +152,24 @@ def take_step(
         known = [[slope[d] for slope in slopes] for d in range(n)]
         of_position = [h * h * _weigh(tableau.error_twice, k) for k in known]
         error = tuple(of_position + [h * _weigh(tableau.error_once, k) for k in known])
-    return Taken(places[-1], places[tableau.middle], error)
+    return Taken(places[-1], places[tableau.middle], error, places)
+
+
+def stage_at(
+    tableau: Tableau, i: int, q0: Vector, v0: Vector, slopes: list[Vector], h: Array
+) -> tuple[Vector, Vector]:
+    """Positions and rates of stage `i`, from the accelerations of those before."""
+    position, rate = [], []
+    for d in range(len(q0)):
+        known = [slope[d] for slope in slopes]
+        twice, once = _weigh(tableau.twice[i], known), _weigh(tableau.once[i], known)
+        drift = float(tableau.places[i]) * v0[d]
+        position.append(q0[d] + h * (drift if twice is None else drift + h * twice))
+        rate.append(v0[d] + h * once)
+    return tuple(position), tuple(rate)
 
 
 def _weigh(weights: np.ndarray, terms: list[Array]) -> Any:
-    """Weighted sum; None where all weights vanish."""
+    """A weighted sum; None where all weights vanish."""
     parts = [float(w) * x for w, x in zip(weights, terms, strict=False) if w != 0.0]
     return sum(parts[1:], start=parts[0]) if parts else None

@@ -121,6 +121,8 @@ def _extreme(how: str) -> Rule:
 
 def _select_n(n: Numbers, params: Any, before: Any, after: Any, *values: Value) -> Value:
     where, *cases = values
+    if all(_is(case, 0) for case in cases) or cases[0] is cases[1]:
+        return cases[0]
     if isinstance(where.type, ir.VectorType):
         cases = [n.spread(case) for case in cases]
     no, yes = n.alike(*cases)

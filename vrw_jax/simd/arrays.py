@@ -21,7 +21,7 @@ from vrw_jax.simd.numbers import LONG, NUMBERS, Numbers, Value
 
 LANES = 1021
 """Lanes of the trace, by which their axis is known; machine code has as many as suit it."""
-SMALL = 8
+SMALL = 12
 """Entries of fields that are taken apart after all, and terms of sums that are written out."""
 HELD = 32
 """Entries of arrays that loops carry in registers, and of constants that need no table."""

@@ -23,6 +23,7 @@ CALLS = {  # primitive: the parameter that is the trace it calls
     "pjit": "jaxpr",
     "closed_call": "call_jaxpr",
     "custom_jvp_call": "call_jaxpr",
+    "custom_vmap_call": "call",
     "custom_vjp_call": "call_jaxpr",
 }
 
@@ -59,6 +60,8 @@ class Traces:
             return places[atom]
 
         for equation in jaxpr.eqns:
+            if all(variable.aval.dtype == jax.dtypes.float0 for variable in equation.outvars):
+                continue  # the derivative of a whole number, which nothing reads
             results = self._results(equation, [read(atom) for atom in equation.invars])
             places.update(zip(equation.outvars, results, strict=True))
         return [read(atom) for atom in jaxpr.outvars]

@@ -86,6 +86,10 @@ class AbstractPhase(abc.ABC):
         """
 
     @abc.abstractmethod
+    def solve(self, motion: Motion, rows: Vector) -> Vector:
+        """The phase's own accelerations that `residual` is linear in, where it equals `rows`."""
+
+    @abc.abstractmethod
     def complete(self, motion: Motion, own: Vector) -> Acceleration:
         """All three accelerations from the phase's own ones."""
 
@@ -205,6 +209,13 @@ class DoubleSupport(AbstractPhase):
         rows = _left_over(self.s, motion, along)
         return (rows[0] + circle.G1 * rows[1] + circle.G2 * rows[2],)
 
+    def solve(self, motion: Motion, rows: Vector) -> Vector:
+        circle = self._circle(motion.sin, motion.cos)
+        M = dynamics.mass_matrix(self.s, motion.L1, motion.L2)
+        row = M.times((jnp.ones_like(circle.G1), circle.G1, circle.G2))
+        inverse = 1.0 / (row[0] + circle.G1 * row[1] + circle.G2 * row[2])
+        return (inverse * rows[0],)
+
     def rear(self, motion: Motion, acceleration: Acceleration) -> FootForce:
         return dynamics.rear_foot_force(self.s, motion, acceleration)
 
@@ -243,6 +254,10 @@ class SingleSupport1(AbstractPhase):
     def residual(self, motion: Motion, own: Vector) -> Vector:
         return _left_over(self.s, motion, Acceleration(*own))
 
+    def solve(self, motion: Motion, rows: Vector) -> Vector:
+        M = dynamics.mass_matrix(self.s, motion.L1, motion.L2)
+        return dynamics.free_acceleration(self.s, motion.L1, dynamics.Terms(M, *rows))
+
     def end(self, at: Instant) -> Elementwise:
         return self.s.L0 - at.motion.L2
 
@@ -277,6 +292,10 @@ class SingleSupport2(AbstractPhase):
     def residual(self, motion: Motion, own: Vector) -> Vector:
         M, f1, f2, _ = dynamics.terms(self.s, motion)
         return M.M11 * own[0] - f1, M.M22 * own[1] - f2  # M12 is zero at L2 = L0
+
+    def solve(self, motion: Motion, rows: Vector) -> Vector:
+        M = dynamics.mass_matrix(self.s, motion.L1, motion.L2)
+        return (1.0 / M.M11) * rows[0], (1.0 / M.M22) * rows[1]
 
     def end(self, at: Instant) -> Elementwise:
         return landing_foot_height(self.s, at.motion)

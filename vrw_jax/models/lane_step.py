@@ -1,0 +1,251 @@
+"""The paper's step by lanes: one text for machine code and GPUs, for values and derivatives.
+
+The same phases as those of the diffrax engine; arrays hold one quantity of all wheels instead of
+one wheel's quantities. `told_by_lanes` is a function of one wheel that `jax.vmap` maps onto lanes,
+within programs of JAX.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Int
+
+from vrw_jax import simd
+from vrw_jax.models.paper_step import End, Told, Walked, through_phases, told_of
+from vrw_jax.numerics import (
+    LanePhase,
+    Balance,
+    Forward,
+    Monitors,
+    Options,
+    Place,
+    Slope,
+    Tableau,
+    Vector,
+    explicit_tableau,
+    integrate_lanes,
+    one_wheel,
+    sine_cosine,
+)
+from vrw_jax.runtime import lane_function
+from vrw_jax.wheel import (
+    PARAMETER_NAMES,
+    AbstractPhase,
+    Instant,
+    Motion,
+    Outcome,
+    WheelParams,
+)
+
+INTO_SINGLE_SUPPORT = 0.3
+"""First step of SLS-I over the last of DLS: dropping the rear foot's force excites the airborne
+leg's fast mode, which dies within 0.05 s."""
+
+
+class LaneStep(NamedTuple):
+    """One gait step of a block of lanes."""
+
+    section_state: Vector  # three arrays
+    durations: Vector  # of DLS, SLS-I, SLS-II, s
+    outcome: Int[Array, " lanes"]  # an Outcome
+    solver_steps: Int[Array, " lanes"]
+    unfinished: Bool[Array, " lanes"]  # not waited for: everything else there is void
+
+
+class _Handed(NamedTuple):
+    """From one phase to the next."""
+
+    next_step: Array  # that the controller would try, s
+    ran: Bool[Array, " lanes"]  # where the phase took place
+    unfinished: Bool[Array, " lanes"]
+
+
+def lane_phase(phase: AbstractPhase, monitored: bool) -> LanePhase:
+    """A phase as the march takes it. `monitored`: watch its premises as well as its guards."""
+
+    def evaluate(q: Vector, v: Vector) -> Slope:
+        sin, cos = sine_cosine(q[0])
+        return Slope(sin, cos, phase.acceleration(phase.motion(sin, cos, q, v))[: phase.n])
+
+    def motion(place: Place) -> Motion:
+        return phase.motion(place.slope.sin, place.slope.cos, place.q, place.v)
+
+    def instant(place: Place) -> Instant:
+        return Instant(phase, motion(place), place.slope.acceleration)
+
+    balance = Balance(
+        lambda place: phase.residual(motion(place), place.slope.acceleration),
+        lambda place, rows: phase.solve(motion(place), rows),
+    )
+    watched = Monitors(lambda place: phase.premises(instant(place)), phase.counts_at_start)
+    guards = lambda place: phase.guards(instant(place))
+    return LanePhase(evaluate, guards, watched if monitored else None, balance)
+
+
+def gait_step(
+    params: WheelParams,
+    x: Vector,
+    options: Options,
+    tableau: Tableau,
+    stop_at_lift_off: bool,
+    few: Array | None = None,
+) -> LaneStep:
+    """One gait step of every lane, from touchdown to touchdown. `few`: see `integrate_lanes`."""
+    walked = walk(params, x, options, tableau, stop_at_lift_off, monitored=False, few=few)
+    ends, stepped = walked.ends, walked.outcome == Outcome.STEPPED
+    section = (ends[2].q[0], *ends[2].v)
+    return LaneStep(
+        section_state=tuple(jnp.where(stepped, value, 0.0) for value in section),
+        durations=tuple(end.duration for end in ends),
+        outcome=walked.outcome,
+        solver_steps=ends[0].tried + ends[1].tried + ends[2].tried,
+        unfinished=ends[0].own.unfinished | ends[1].own.unfinished | ends[2].own.unfinished,
+    )
+
+
+def walk(
+    params: WheelParams,
+    x: Vector,
+    options: Options,
+    tableau: Tableau,
+    stop_at_lift_off: bool,
+    monitored: bool,
+    few: Array | None = None,
+) -> Walked:
+    """One gait step of every lane, phase by phase."""
+
+    def run(phase: AbstractPhase, q: Vector, v: Vector, active: Array, before: End | None) -> End:
+        first = options.first_step + jnp.zeros_like(q[0])
+        if before is not None:
+            known: _Handed = before.own
+            first = known.next_step
+            if phase.stiff_start:
+                first = jnp.where(known.ran, INTO_SINGLE_SUPPORT * first, first)
+        held, fixed = eqx.partition((phase.s, phase.held), eqx.is_array)
+
+        def phase_of(held: Any) -> LanePhase:
+            s, own = eqx.combine(held, fixed)
+            return lane_phase(dataclasses.replace(phase, s=s, held=own), monitored)
+
+        end = integrate_lanes(phase_of, held, tableau, q, v, active, first, options, few)
+        return End(
+            *end.place[:2],
+            duration=end.duration,
+            guard=end.guard,
+            timed_out=end.timed_out,
+            tried=end.tried,
+            minima=end.minima,
+            own=_Handed(end.next_step, active, end.unfinished),
+        )
+
+    return through_phases(run, params, x, stop_at_lift_off)
+
+
+def lanes_can(options: Options) -> bool:
+    """Whether the step goes by lanes here: where there is machine code, by explicit solvers."""
+    return simd.serves() and explicit_tableau(options.solver) is not None
+
+
+class _Setting(NamedTuple):
+    """What a step by lanes depends on besides its arrays."""
+
+    structure: Any  # of (params, x, options), whose leaves are the arrays
+    stop_at_lift_off: bool
+    monitored: bool
+
+    @property
+    def key(self) -> tuple:
+        """By `repr`: what the trace depends on."""
+        return str(self.structure), self.stop_at_lift_off, self.monitored
+
+    def told(self, *leaves: Array) -> Told:
+        """Over lanes: the leaves have them on their last axis."""
+        params, x, options = jax.tree.unflatten(self.structure, leaves)
+        tableau = explicit_tableau(options.solver)
+        assert tableau is not None  # `lanes_can` looked
+        given = params, tuple(x), options, tableau, self.stop_at_lift_off, self.monitored
+        return told_of(walk(*given))
+
+
+def told_by_lanes(structure: Any, stop_at_lift_off: bool, monitored: bool) -> Forward:
+    """The step over the leaves of (params, x, options), as `any_mode` takes it."""
+    setting = _Setting(structure, stop_at_lift_off, monitored)
+
+    def over_lanes(*leaves: Array) -> tuple:
+        return eqx.partition(setting.told(*leaves), eqx.is_inexact_array)
+
+    like = lambda *leaves: eqx.partition(_like(monitored, leaves), eqx.is_inexact_array)
+    return one_wheel(lane_function(over_lanes, like, ("gait step", *setting.key)))
+
+
+def moved_by_lanes(
+    structure: Any, stop_at_lift_off: bool, monitored: bool, moved: tuple[int, ...]
+) -> Forward:
+    """(Jacobian by the leaves `moved`, floats) and the other outputs of `told_by_lanes`."""
+    setting = _Setting(structure, stop_at_lift_off, monitored)
+
+    def tightened(*leaves: Array) -> list[Array]:
+        params, x, options = jax.tree.unflatten(structure, leaves)
+        return jax.tree.leaves((params, x, options.for_derivatives()))
+
+    def over_lanes(*leaves: Array) -> tuple:
+        def floats(*some: Array) -> tuple:
+            full = list(leaves)
+            for i, leaf in zip(moved, some, strict=True):
+                full[i] = leaf
+            return eqx.partition(setting.told(*tightened(*full)), eqx.is_inexact_array)
+
+        directions = _directions([leaves[i] for i in moved])
+        along = lambda tangents: jax.jvp(floats, [leaves[i] for i in moved], tangents, has_aux=True)
+        value, tangent, other = jax.vmap(along, out_axes=(None, 0, None))(directions)
+        return tangent, value, other
+
+    def like(*leaves: Array) -> tuple:
+        value, other = eqx.partition(_like(monitored, leaves), eqx.is_inexact_array)
+        return value, value, other
+
+    settings = ("gait step with derivatives", *setting.key, moved)
+    call = one_wheel(lane_function(over_lanes, like, settings))
+
+    def jacobian(*leaves: Array) -> tuple:
+        columns, value, other = call(*leaves)
+        by_argument, begin = [], 0
+        for i in moved:
+            shape = jnp.shape(leaves[i])
+            some = slice(begin, begin + int(np.prod(shape)))
+            take = lambda x, some=some, shape=shape: jnp.moveaxis(x[some], 0, -1).reshape(
+                *x.shape[1:], *shape
+            )
+            by_argument.append(jax.tree.map(take, columns))
+            begin = some.stop
+        return (tuple(by_argument), value), other
+
+    return jacobian
+
+
+def _directions(leaves: Sequence[Array]) -> list[Array]:
+    """For each leaf its part of the unit vectors of all, directions first.
+
+    Each number has its own ones and zeros, by which machine code leaves out what they multiply.
+    """
+    sizes = [int(np.prod(leaf.shape[:-1])) for leaf in leaves]
+    units, told, begin = np.eye(sum(sizes)), [], 0
+    for leaf, size in zip(leaves, sizes, strict=True):
+        rows = [jnp.asarray(units[:, i], leaf.dtype)[:, None] for i in range(begin, begin + size)]
+        wide = [jnp.broadcast_to(row, (len(units), leaf.shape[-1])) for row in rows]
+        told.append(wide[0] if leaf.ndim == 1 else jnp.stack(wide, 1))
+        begin += size
+    return told
+
+
+def _like(monitored: bool, leaves: Sequence[Array]) -> Told:
+    """A tree of `Told`'s form."""
+    x = leaves[0]
+    other = jnp.zeros_like(x, jnp.int32)
+    return Told((x, x, x), x, other, (x, x, x) if monitored else (), other, other)
