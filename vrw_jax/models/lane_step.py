@@ -28,6 +28,7 @@ from vrw_jax.numerics import (
     Slope,
     Tableau,
     Vector,
+    by_directions,
     explicit_tableau,
     integrate_lanes,
     one_wheel,
@@ -41,6 +42,7 @@ from vrw_jax.wheel import (
     Motion,
     Outcome,
     WheelParams,
+    transitions,
 )
 
 INTO_SINGLE_SUPPORT = 0.3
@@ -127,13 +129,15 @@ def walk(
             first = known.next_step
             if phase.stiff_start:
                 first = jnp.where(known.ran, INTO_SINGLE_SUPPORT * first, first)
-        held, fixed = eqx.partition((phase.s, phase.held), eqx.is_array)
+        floats, fixed = eqx.partition(phase.s, eqx.is_array)
 
-        def phase_of(held: Any) -> LanePhase:
-            s, own = eqx.combine(held, fixed)
-            return lane_phase(dataclasses.replace(phase, s=s, held=own), monitored)
+        def phase_of(floats: Any, held: Vector) -> LanePhase:
+            s = eqx.combine(floats, fixed)
+            return lane_phase(dataclasses.replace(phase, s=s, held=held), monitored)
 
-        end = integrate_lanes(phase_of, held, tableau, q, v, active, first, options, few)
+        end = integrate_lanes(
+            phase_of, floats, phase.held, tableau, q, v, active, first, options, few
+        )
         return End(
             *end.place[:2],
             duration=end.duration,
@@ -144,7 +148,8 @@ def walk(
             own=_Handed(end.next_step, active, end.unfinished),
         )
 
-    return through_phases(run, params, x, stop_at_lift_off)
+    land = by_directions(transitions.land)
+    return through_phases(run, params, x, stop_at_lift_off, land)
 
 
 def lanes_can(options: Options) -> bool:

@@ -82,12 +82,18 @@ class Told(NamedTuple):
     tried: Array  # (3, ...)
 
 
-def through_phases(run: Run, params: WheelParams, x: Numbers, stop_at_lift_off: bool) -> Walked:
+def through_phases(
+    run: Run,
+    params: WheelParams,
+    x: Numbers,
+    stop_at_lift_off: bool,
+    land: Callable[..., Landing] = transitions.land,
+) -> Walked:
     """One step from the section state `x`, its numbers one by one."""
     good = usable(params, x)
     params, x = replaced_where_bad(good, params, x, PAPER_START)
     s = params.symbols()
-    landing = transitions.land(s, *x)
+    landing = land(s, *x)
     phases = phases_of(s, landing.distance, stop_at_lift_off)
     theta, motion = landing.theta, landing.motion
     active = good & landing.stays  # a landing that frees the rear foot goes on to SLS-I

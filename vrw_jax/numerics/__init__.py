@@ -87,6 +87,6 @@ from vrw_jax.numerics.tableaus import (
     parabola,
     real_stability_limit,
 )
-from vrw_jax.numerics.tangents import Balance
+from vrw_jax.numerics.tangents import Balance, by_directions
 from vrw_jax.numerics.trig import sine_cosine
 from vrw_jax.numerics.types import Elementwise, Number, Scalar, Vector, as_float_array

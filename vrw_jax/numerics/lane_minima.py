@@ -4,8 +4,9 @@ As `minima` does it for one wheel: the march keeps, for each monitor, the step t
 minimum; when it has ended, secant steps on the monitor's rate find it, one monitor after the other.
 """
 
+import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,7 @@ from jaxtyping import Array
 from vrw_jax.numerics.lanes import select
 from vrw_jax.numerics.minima import AT_MINIMUM, cubic_minimum
 from vrw_jax.numerics.tableaus import Evaluate, Place, Tableau, take_step
+from vrw_jax.numerics.tangents import Moving
 from vrw_jax.numerics.types import Vector
 
 
@@ -37,6 +39,7 @@ class Lowest(NamedTuple):
     length: Array  # of that step, (monitors, lanes), s
     offset: Array  # of the minimum from its beginning, s
     rate: Array  # there
+    direction: Array | None = None  # in which that beginning moves, (monitors, ., lanes)
 
 
 def with_rates(
@@ -51,7 +54,9 @@ def with_rates(
     return jax.jvp(along, (place.q, place.v), (place.v, place.slope.acceleration[:n]))
 
 
-def at_start(monitors: Monitors, evaluate: Evaluate, place: Place) -> Lowest:
+def at_start(
+    monitors: Monitors, evaluate: Evaluate, place: Place, moving: Moving | None
+) -> Lowest:
     """Before the first step.
 
     What is zero at the start rests there: rounding must not make it fall.
@@ -61,7 +66,8 @@ def at_start(monitors: Monitors, evaluate: Evaluate, place: Place) -> Lowest:
     zeros = jnp.zeros_like(values)
     held = jnp.zeros((len(values), len(place.q), values.shape[-1]), values.dtype)
     rates = jnp.where(counts, rates, jnp.maximum(rates, 0.0))
-    return Lowest(values, rates, zeros + jnp.inf, held, held, zeros, zeros, zeros)
+    moves = None if moving is None else jnp.stack([jnp.zeros_like(moving.start)] * len(values))
+    return Lowest(values, rates, zeros + jnp.inf, held, held, zeros, zeros, zeros, moves)
 
 
 def lowered(
@@ -72,6 +78,7 @@ def lowered(
     end: Place,
     length: Array,
     taken: Array,
+    direction: Array | None,
 ) -> Lowest:
     """After a step from `here` to `end` in the lanes that have `taken` it."""
     values, rates = map(jnp.stack, with_rates(monitors.values, evaluate, end))
@@ -90,7 +97,16 @@ def lowered(
         length=keep(length, lowest.length),
         offset=keep(x * length, lowest.offset),
         rate=keep(lowest.rates, lowest.rate),
+        direction=None if direction is None else held(direction[None], lowest.direction),
     )
+
+
+class Settled(NamedTuple):
+    """Minima of monitors over a phase, each (monitors, lanes)."""
+
+    lowest: Array  # ends included
+    inside: Array  # infinite where there is none
+    length: Array  # of the step to that one, from where it is held
 
 
 class _Search(NamedTuple):
@@ -104,14 +120,14 @@ class _Search(NamedTuple):
 
 def settled(
     monitors: Monitors, tableau: Tableau, evaluate: Evaluate, lowest: Lowest, start: Array, n: int
-) -> Array:
-    """Minima over the phase, ends included, (monitors, lanes); `start`: values where it began.
+) -> Settled:
+    """Minima over the phase; `start`: values where it began.
 
     At most `n` secant steps for each, all from where the step begins that holds it.
     """
 
-    def one(_: None, given: tuple) -> tuple[None, Array]:
-        index, held, least = given
+    def one(_: None, given: tuple) -> tuple[None, tuple[Array, Array]]:
+        index, held = given
         q, v = tuple(held.q), tuple(held.v)
         begin = Place(q, v, evaluate(q, v))
 
@@ -145,9 +161,48 @@ def settled(
         tries = jnp.zeros((), jnp.int32)
         search = _Search(held.offset, zero, held.rate, zero + jnp.inf, found, tries)
         goes_on = lambda search: jnp.any(search.open) & (search.tries < n)
-        return None, jnp.minimum(lax.while_loop(goes_on, improve, search).value, least)
+        last = lax.while_loop(goes_on, improve, search)
+        return None, (last.value, last.length)
 
     counts = np.asarray(monitors.counts_at_start)[:, None]
     least = jnp.minimum(jnp.where(counts, start, jnp.inf), lowest.values)
     indices = jnp.arange(len(counts), dtype=jnp.int32)
-    return lax.scan(one, None, (indices, lowest, least))[1]
+    inside, length = lax.scan(one, None, (indices, lowest._replace(direction=None)))[1]
+    return Settled(jnp.minimum(inside, least), inside, length)
+
+
+def moved(
+    monitors_of: Callable[..., tuple[Monitors, Evaluate]],
+    tableau: Tableau,
+    moving: Moving,
+    lowest: Lowest,
+    found: Settled,
+    ends: tuple[Place, Place],
+    direction: Array,
+) -> Array:
+    """How minima move: along the motion there, since their place takes no part in first order.
+
+    `ends`: of the phase; `direction`: in which the last of them moves.
+    """
+    monitors, evaluate = monitors_of(moving.constants, moving.held)
+
+    def values(constants: Any, held: Vector, q: Vector, v: Vector) -> Array:
+        watched, slope = monitors_of(constants, held)
+        return jnp.stack(watched.values(Place(q, v, slope(q, v))))
+
+    along = functools.partial(moving.of_values, values)
+
+    def one(_: None, given: tuple) -> tuple[None, Array]:
+        index, held, length = given
+        q, v = tuple(held.q), tuple(held.v)
+        begin = Place(q, v, evaluate(q, v))
+        taken = take_step(tableau, evaluate, begin, length, with_error=False)
+        way = moving.along(tableau, taken.stages, held.direction, length)
+        chosen = jnp.arange(len(monitors.counts_at_start)) == index
+        return None, jnp.sum(jnp.where(chosen[:, None], along(taken.end, way), 0.0), 0)
+
+    indices = jnp.arange(len(found.lowest), dtype=jnp.int32)
+    inside = lax.scan(one, None, (indices, lowest, found.length))[1]
+    first, last = along(ends[0], moving.start), along(ends[1], direction)
+    at_end = jnp.where(lowest.values <= found.lowest, last, first)
+    return jnp.where(found.inside <= found.lowest, inside, at_end)

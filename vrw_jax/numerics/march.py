@@ -15,7 +15,16 @@ from jax import lax
 from jaxtyping import Array
 
 from vrw_jax.numerics.derivatives import without_derivative
-from vrw_jax.numerics.lane_minima import Lowest, Monitors, at_start, lowered, settled, with_rates
+from vrw_jax.numerics.lane_minima import (
+    Lowest,
+    Monitors,
+    Settled,
+    at_start,
+    lowered,
+    settled,
+    with_rates,
+)
+from vrw_jax.numerics.lane_minima import moved as moved_minima
 from vrw_jax.numerics.lanes import select
 from vrw_jax.numerics.options import Options
 from vrw_jax.numerics.tableaus import (
@@ -80,13 +89,14 @@ LATE = 2
 """Times the iterations after which half of the lanes had finished."""
 
 
-PhaseOf = Callable[[Any], LanePhase]
-"""By what the phase holds constant, a tree of arrays."""
+PhaseOf = Callable[[Any, Vector], LanePhase]
+"""By what it holds constant, see `tangents.BalanceOf`."""
 
 
 def integrate_lanes(
     phase_of: PhaseOf,
     constants: Any,
+    held: Vector,
     tableau: Tableau,
     q: Vector,
     v: Vector,
@@ -99,25 +109,27 @@ def integrate_lanes(
 
     Where many lanes march together, as on a GPU, they don't wait for their last `few` if these take
     `LATE` times as long as half of them: these are marked unfinished, to run again from their start
-    among their like. Derivatives: by `constants`, `q` and `v`, see `tangents`.
+    among their like. Derivatives: by `constants`, `held`,
+    `q` and `v`, see `tangents`.
     """
     run = jax.custom_jvp(functools.partial(_integrated, phase_of, tableau))
 
     @run.defjvp
     def rule(primals: tuple, tangents: tuple) -> tuple[LanePhaseEnd, LanePhaseEnd]:
-        constants, q, v, *_ = primals
-        start = jnp.stack([*tangents[1], *tangents[2]])
-        balance_of = lambda held: phase_of(held).balance
-        moving = Moving(balance_of, constants, tangents[0], start)
+        moved, held, q, v, *_ = tangents
+        balance_of = lambda *constants: phase_of(*constants).balance
+        start = jnp.stack([*q, *v, *held])
+        moving = Moving(balance_of, *primals[:2], moved, start)
         return _integrated_and_moved(phase_of, tableau, *primals, moving=moving)
 
-    return run(constants, q, v, active, first_step, options, few)
+    return run(constants, held, q, v, active, first_step, options, few)
 
 
 def _integrated(
     phase_of: PhaseOf,
     tableau: Tableau,
     constants: Any,
+    held: Vector,
     q: Vector,
     v: Vector,
     active: Array,
@@ -125,7 +137,7 @@ def _integrated(
     options: Options,
     few: Array | None,
 ) -> LanePhaseEnd:
-    phase = _traced_once(phase_of(constants))
+    phase = _traced_once(phase_of(constants, held))
     return _ended(phase, tableau, q, v, active, first_step, options, few, None)[0]
 
 
@@ -133,6 +145,7 @@ def _integrated_and_moved(
     phase_of: PhaseOf,
     tableau: Tableau,
     constants: Any,
+    held: Vector,
     q: Vector,
     v: Vector,
     active: Array,
@@ -142,35 +155,53 @@ def _integrated_and_moved(
     moving: Moving,
 ) -> tuple[LanePhaseEnd, LanePhaseEnd]:
     """The phase's end, and how it moves along a direction of its start and constants."""
-    phase = _traced_once(phase_of(constants))
+    phase = _traced_once(phase_of(constants, held))
     given = tableau, q, v, active, first_step, options, few
-    end, march = _ended(phase, *given, moving)
+    end, march, lowest, searched = _ended(phase, *given, moving)
     n, h = len(q), jnp.where(march.verdict == CROSSED, end.duration - march.time, 0.0)
     taken = take_step(tableau, phase.evaluate, march.here, h, with_error=False)
     assert march.direction is not None
     direction = moving.along(tableau, taken.stages, march.direction, h)
 
-    def guards(constants: Any, q: Vector, v: Vector) -> Vector:
-        phase = phase_of(constants)
+    place, numbers = taken.end, tuple(direction)
+    later = _event_moved(phase_of, moving, place, direction, march, end.guard)
+    motion = (*place.v, *place.slope.acceleration[:n])
+    told = tuple(x + later * y for x, y in zip(numbers[: 2 * n], motion, strict=True))
+    nothing = without_derivative(end)
+    minima = None
+    if lowest is not None:
+
+        def monitors_of(*constants: Any) -> tuple[Monitors, Evaluate]:
+            phase = phase_of(*constants)
+            assert phase.monitors is not None
+            return phase.monitors, phase.evaluate
+
+        ends = Place(q, v, phase.evaluate(q, v)), end.place
+        found = Settled(end.minima, *searched)
+        minima = moved_minima(
+            monitors_of, tableau, moving, lowest, found, ends, jnp.stack([*told, *numbers[2 * n :]])
+        )
+    place_moved = nothing.place._replace(q=told[:n], v=told[n:])
+    return end, nothing._replace(place=place_moved, duration=later, minima=minima)
+
+
+def _event_moved(
+    phase_of: PhaseOf, moving: Moving, place: Place, direction: Array, march: _March, guard: Array
+) -> Array:
+    """How much later the event comes, s: where its guard vanishes along the moved motion."""
+
+    def guards(constants: Any, held: Vector, q: Vector, v: Vector) -> Vector:
+        phase = phase_of(constants, held)
         return phase.guards(Place(q, v, phase.evaluate(q, v)))
 
-    place = taken.end
-    numbers = tuple(direction)
-    here = (constants, place.q, place.v)
-    slope = place.slope.acceleration[:n]
-    still = jax.tree.map(jnp.zeros_like, constants)
-    rates = jax.jvp(guards, here, (still, place.v, slope))[1]
-    moves = jax.jvp(guards, here, (moving.moved, numbers[:n], numbers[n:]))[1]
-    crossed = (march.verdict == CROSSED) & (end.guard >= 0)
-    later = jnp.zeros_like(h)
+    phase = phase_of(moving.constants, moving.held)
+    _, rates = with_rates(phase.guards, phase.evaluate, place)
+    moves = moving.of_values(guards, place, direction)
+    crossed, later = march.verdict == CROSSED, jnp.zeros_like(march.h)
     for index, (rate, move) in enumerate(zip(rates, moves, strict=True)):
-        own = crossed & (end.guard == index) & (rate < 0.0)
+        own = crossed & (guard == index) & (rate < 0.0)
         later = jnp.where(own, -move / jnp.where(own, rate, -1.0), later)
-    motion = (*place.v, *slope)
-    told = tuple(x + later * y for x, y in zip(numbers, motion, strict=True))
-    nothing = without_derivative(end)
-    place_moved = nothing.place._replace(q=told[:n], v=told[n:])
-    return end, nothing._replace(place=place_moved, duration=later)
+    return later
 
 
 def _ended(
@@ -183,7 +214,7 @@ def _ended(
     options: Options,
     few: Array | None,
     moving: Moving | None,
-) -> tuple[LanePhaseEnd, _March]:
+) -> tuple[LanePhaseEnd, _March, Lowest | None, tuple]:
     start = Place(q, v, phase.evaluate(q, v))
     values, rates = with_rates(phase.guards, phase.evaluate, start)
     past = tuple((g < 0.0) | ((g == 0.0) & (r <= 0.0)) for g, r in zip(values, rates, strict=True))
@@ -198,11 +229,12 @@ def _ended(
     lost = crossed & found.open
     duration = march.time + jnp.where(crossed, found.length, 0.0)
     place, minima = select(crossed, found.end, march.here), None
-    if phase.monitors is not None and march.lowest is not None:
-        given = phase.monitors, phase.evaluate
-        lowest = lowered(*given, march.lowest, march.here, place, found.length, crossed)
+    lowest, searched = march.lowest, ()
+    if phase.monitors is not None and lowest is not None:
+        step = march.here, place, found.length, crossed, march.direction
+        lowest = lowered(phase.monitors, phase.evaluate, lowest, *step)
         first_values = jnp.stack(phase.monitors.values(start))
-        minima = settled(
+        minima, *searched = settled(
             phase.monitors, tableau, phase.evaluate, lowest, first_values, options.monitor_steps
         )
     late = crossed & ~found.open & (duration > options.max_phase_time)
@@ -217,7 +249,7 @@ def _ended(
         next_step=march.h,
         minima=minima,
     )
-    return end, march
+    return end, march, lowest, tuple(searched)
 
 
 def _traced_once(phase: LanePhase, how: Callable = jax.jit) -> LanePhase:
@@ -256,7 +288,8 @@ def _march(
         lowest, half = march.lowest, march.half
         if phase.monitors is not None and lowest is not None:
             given = phase.monitors, phase.evaluate
-            lowest = lowered(*given, lowest, march.here, taken.end, march.h, accepted)
+            step = march.here, taken.end, march.h, accepted, march.direction
+            lowest = lowered(*given, lowest, *step)
         direction = march.direction
         if moving is not None and direction is not None:
             along = moving.along(tableau, taken.stages, direction, march.h)
@@ -289,7 +322,7 @@ def _march(
         tried=none,
         half=count,
         iterations=count,
-        lowest=phase.monitors and at_start(phase.monitors, phase.evaluate, start),
+        lowest=phase.monitors and at_start(phase.monitors, phase.evaluate, start, moving),
         direction=None if moving is None else moving.start,
     )
     return lax.while_loop(lambda march: _waits(march, few), advance, begin)

@@ -30,6 +30,9 @@ class Tableau(NamedTuple):
     middle: int
     """A stage well inside the step, to look for guards that dip below zero and come back."""
 
+    def __hash__(self) -> int:
+        return id(self)  # `explicit_tableau` makes each once
+
 
 @functools.cache
 def explicit_tableau(name: str) -> Tableau | None:

@@ -7,15 +7,18 @@ search tried take no part: the derivative is that of the discrete flow at the le
 taken, and of the time at which its guard vanishes.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.custom_batching import custom_vmap
+from jax.custom_batching import sequential_vmap
 from jaxtyping import Array
 
+from vrw_jax.numerics.derivatives import without_derivative
 from vrw_jax.numerics.tableaus import Place, Slope, Tableau, stage_at
 from vrw_jax.numerics.types import Vector
 
@@ -29,28 +32,36 @@ class Balance(NamedTuple):
     """Accelerations that the left side turns into these rows."""
 
 
-BalanceOf = Callable[[Any], Balance]
-"""By what the equations hold constant, a tree of arrays."""
+BalanceOf = Callable[[Any, Vector], Balance]
+"""By what the equations hold constant: a tree of arrays that moves in few directions, and numbers
+that move in any, as a phase's start does."""
 
 
 class Slopes(NamedTuple):
     """Derivatives of the accelerations at the stages of a step."""
 
-    by_state: Array  # (stages, n, 2 n, lanes): by positions, then rates
+    by_state: Array  # (stages, n, ., lanes): by positions, rates, then what is held
     by_constants: Array  # (stages, n, lanes): along their direction
 
 
-def slopes_of(of: BalanceOf, constants: Any, moved: Any, stages: list[Place]) -> Slopes:
-    """At each stage, and along `moved`, a direction of `constants`."""
+@functools.partial(jax.jit, static_argnums=0)
+def _slopes_of(
+    of: BalanceOf, constants: Any, moved: Any, held: Vector, stages: list[Place]
+) -> Slopes:
+    """At each stage; `moved`: the direction of `constants`."""
 
     def at(row: Array) -> tuple[Array, Array]:
-        place = _unpacked(row)
-        by_state = [_moved(of(constants), place, *unit) for unit in _units(place)]
-        rows = jax.jvp(lambda held: of(held).residual(place), (constants,), (moved,))[1]
-        by_constants = _accelerated(of(constants), place, rows)
+        place, balance = _unpacked(row), of(constants, held)
+        residual = lambda constants, held: of(constants, held).residual(place)
+        along = lambda *way: _accelerated(balance, place, jax.jvp(residual, *way)[1])
+        still = jax.tree.map(jnp.zeros_like, constants)
+        by_state = [_moved(balance, place, *unit) for unit in _units(place)]
+        by_state += [along((constants, held), (still, unit)) for unit in _unit_rows(held)]
+        unmoved = tuple(jnp.zeros_like(x) for x in held)
+        by_constants = along((constants, held), (moved, unmoved))
         return jnp.stack([jnp.stack(x) for x in zip(*by_state, strict=True)]), by_constants
 
-    return Slopes(*lax.map(at, jnp.stack([_packed(place) for place in stages])))
+    return Slopes(*lax.map(at, jnp.stack([_packed(place) for place in stages[:-1]])))
 
 
 def _packed(place: Place) -> Array:
@@ -66,11 +77,16 @@ def _unpacked(row: Array) -> Place:
     return Place(numbers[:n], numbers[n : 2 * n], slope)
 
 
+def _unit_rows(like: Vector) -> list[Vector]:
+    """Each number by itself."""
+    n = len(like)
+    return [tuple(jnp.full_like(like[j], float(i == j)) for j in range(n)) for i in range(n)]
+
+
 def _units(place: Place) -> list[tuple[Vector, Vector]]:
     """Each position and each rate by itself."""
-    n, like = len(place.q), place.q[0]
-    row = lambda i: tuple(jnp.full_like(like, float(i == j)) for j in range(n))
-    return [(row(i), row(-1)) for i in range(n)] + [(row(-1), row(i)) for i in range(n)]
+    rows, n = _unit_rows((*place.q, *place.v)), len(place.q)
+    return [(row[:n], row[n:]) for row in rows]
 
 
 def _moved(balance: Balance, place: Place, dq: Vector, dv: Vector) -> Vector:
@@ -85,55 +101,72 @@ def _accelerated(balance: Balance, place: Place, rows: Vector) -> Array:
     return -jnp.stack(balance.solve(place, rows))
 
 
-def carried(tableau: Tableau, slopes: Slopes, start: Array, h: Array) -> Array:
-    """A direction (positions, then rates) at a step's start, carried to its end.
+@functools.cache
+def _carried(tableau: Tableau) -> Callable[..., Array]:
+    """A direction (positions, rates, what is held) at a step's start, carried to its end.
 
-    Under `jax.vmap` over directions a few are taken at a time: they live in registers, and while
-    one waits for its last sum the others go on.
+    Under `jax.vmap` over directions one is taken after the other: each lives in registers.
     """
 
+    @jax.jit  # traced once, wherever it is called
     def step(by_state: Array, by_constants: Array, start: Array, h: Array) -> Array:
-        n = len(start) // 2
-        q0, v0 = tuple(start[:n]), tuple(start[n:])
+        n = by_state.shape[1]
+        q0, v0, held = tuple(start[:n]), tuple(start[n : 2 * n]), tuple(start[2 * n :])
         known: list[Vector] = []
         for i in range(len(tableau.places) - 1):
             q, v = stage_at(tableau, i, q0, v0, known, h) if i else (q0, v0)
-            rows = [[by_state[i, d, e] * x for e, x in enumerate((*q, *v))] for d in range(n)]
+            rows = [[by_state[i, d, e] * x for e, x in enumerate((*q, *v, *held))] for d in range(n)]
             known.append(tuple(sum(row, start=by_constants[i, d]) for d, row in enumerate(rows)))
         q, v = stage_at(tableau, len(tableau.places) - 1, q0, v0, known, h)
-        return jnp.stack([*q, *v])
+        return jnp.stack([*q, *v, *held])
 
-    over_directions = custom_vmap(step)
-
-    @over_directions.def_vmap
-    def few_at_a_time(n: int, batched: list, by_state: Array, *others: Array) -> tuple:
-        assert not batched[0] and not batched[3]  # all directions leave from one place
-        by_constants, start = (
-            x if its_own else jnp.broadcast_to(x, (n, *x.shape))
-            for x, its_own in zip(others[:2], batched[1:3], strict=True)
-        )
-        h = others[2]
-        size = min(TOGETHER, key=lambda size: (-n % size, -size))
-        cut = lambda x: jnp.concatenate([x, x[: -n % size]]).reshape(-1, size, *x.shape[1:])
-        some = jax.vmap(step, in_axes=(None, 0, 0, None))
-        told = lax.map(lambda given: some(by_state, *given, h), (cut(by_constants), cut(start)))
-        return told.reshape(-1, *start.shape[1:])[:n], True
-
-    return over_directions(slopes.by_state, slopes.by_constants, start, h)
+    return sequential_vmap(step)
 
 
-TOGETHER = (1,)
-"""Directions that are carried at a time: what leaves none over."""
+def pushed(function: Callable[..., Any], at: tuple, direction: tuple) -> Any:
+    """`jax.jvp` without the value; under `jax.vmap` one direction after the other.
+
+    The code is short then however many there are. `function` may close over no traced arrays.
+    """
+    return sequential_vmap(lambda at, way: jax.jvp(function, at, way)[1])(at, direction)
+
+
+def by_directions(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function` of trees, whose derivative by their floats is `pushed`."""
+
+    def call(*arguments: Any) -> Any:
+        floats, others = eqx.partition(arguments, eqx.is_inexact_array)
+        whole = lambda *floats: function(*eqx.combine(floats, others))
+        only_floats = lambda *floats: eqx.filter(whole(*floats), eqx.is_inexact_array)
+        called = jax.custom_jvp(whole)
+
+        @called.defjvp
+        def rule(at: tuple, direction: tuple) -> tuple:
+            out = whole(*at)
+            moved = pushed(only_floats, at, direction)
+            return out, eqx.combine(moved, without_derivative(out))
+
+        return called(*floats)
+
+    return call
 
 
 class Moving(NamedTuple):
-    """A direction in which a phase's start and constants move."""
+    """A direction in which a phase moves: its constants, its start and what it holds since then."""
 
     of: BalanceOf
     constants: Any
+    held: Vector
     moved: Any  # like the constants
-    start: Array  # positions, then rates, (2 n, lanes)
+    start: Array  # positions, rates, what is held, (., lanes)
 
     def along(self, tableau: Tableau, stages: list[Place], start: Array, h: Array) -> Array:
         """The direction at a step's start, carried to its end."""
-        return carried(tableau, slopes_of(self.of, self.constants, self.moved, stages), start, h)
+        slopes = _slopes_of(self.of, self.constants, self.moved, self.held, stages)
+        return _carried(tableau)(*slopes, start, h)
+
+    def of_values(self, values: Callable[..., Any], place: Place, direction: Array) -> Any:
+        """How `values(constants, held, q, v)` move with the direction there."""
+        n, numbers = len(place.q), tuple(direction)
+        at = self.constants, self.held, place.q, place.v
+        return pushed(values, at, (self.moved, numbers[2 * n :], numbers[:n], numbers[n : 2 * n]))

@@ -75,8 +75,7 @@ class Engine:
             return cycle.outcome, cycle.section_state, cycle.measures(names) | derivatives
 
         def told_by_step(values: Array, state: Array, options: Options) -> Told:
-            take = monitored.step if monitored.can_run(model, options) else type(model).step
-            result = take(model, wheel_of(values, base.n_legs), state, options)
+            result = model.step(wheel_of(values, base.n_legs), state, options)
             measures = result.measures()
             names = (*(name for name in plain if name not in OF_CYCLE), *MARGINS)
             return result.outcome, result.section_state, {name: measures[name] for name in names}
