@@ -220,7 +220,9 @@ def fall(height, options=None):
         lambda place: (place.q[0],),
     )
     end = integrate_lanes(
-        phase,
+        lambda constants, held: phase,
+        (),
+        (),
         explicit_tableau("Dopri8"),
         (0.5 * one + height,),
         (-one,),

@@ -18,7 +18,7 @@ WORSE = 1.5
 
 
 def by_diffrax():
-    values, tried = lean_steps(truth.PARAMETERS, STARTS, vrw.Options())
+    values, tried = lean_steps(truth.PARAMETERS, STARTS, vrw.Options(engine="diffrax"))
     return np.asarray(values), np.asarray(tried)
 
 

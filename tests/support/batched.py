@@ -7,7 +7,6 @@ import numpy as np
 
 import vrw_jax as vrw
 from support import truth
-from vrw_jax.batches import monitored as lane_step
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome
 
 SIZE = 16
@@ -40,8 +39,8 @@ def padded(rows, width):
 
 @eqx.filter_jit
 def _full(vectors, starts, options, model, by_lanes):
-    take = lane_step.step if by_lanes else type(model).step
-    one = lambda vector, start: take(model, truth.wheel(vector), start, options)
+    options = options.by("lanes" if by_lanes else "diffrax")
+    one = lambda vector, start: model.step(truth.wheel(vector), start, options)
     return jax.vmap(one)(vectors, starts)
 
 

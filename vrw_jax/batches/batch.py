@@ -301,7 +301,7 @@ def _chosen(engine: str, model: Any, options: Options, n_legs: int) -> _Engine:
             "the viscoelastic wheel and explicit Runge-Kutta solvers; take engine='diffrax'."
         )
     if engine == "diffrax" or not fits:
-        return _Engine("diffrax", functools.partial(_by_diffrax, model, options, n_legs))
+        return _Engine("diffrax", functools.partial(_by_diffrax, model, options.by("diffrax"), n_legs))
     by_lanes = functools.partial(_by_lanes, model.stop_at_lift_off, options, n_legs)
     return _Engine("lanes", by_lanes)
 

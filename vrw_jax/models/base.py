@@ -211,7 +211,8 @@ class StepResult(AbstractStep):
     - `durations`: of DLS, SLS-I, SLS-II, s;
     - `step_length`: distance between the feet at the opening landing, m;
     - `outcome`: an Outcome;
-    - `solver_steps`: tried by the integrator.
+    - `solver_steps`: tried by the integrator;
+    - `engine`: that took the step, see `Options`.
     """
 
     section_state: SectionState
@@ -223,6 +224,7 @@ class StepResult(AbstractStep):
     energy: EnergyLoss
     outcome: Int[Array, ""]
     solver_steps: Int[Array, ""]
+    engine: str = eqx.field(static=True, default="")
 
     def own_measures(self) -> dict[str, Array]:
         return {
@@ -247,6 +249,7 @@ class Advance(eqx.Module):
     solver_steps: Int[Array, ""]  # tried by the integrator
     rung: Int[Array, ""] | None = None  # that took the step, of a model that chooses: see ladder
     reason: Int[Array, ""] | None = None  # why that one
+    engine: str = eqx.field(static=True, default="")  # that took it, see `Options`
 
 
 class Trajectory(eqx.Module):

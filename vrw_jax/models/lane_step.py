@@ -154,7 +154,13 @@ def walk(
 
 def lanes_can(options: Options) -> bool:
     """Whether the step goes by lanes here: where there is machine code, by explicit solvers."""
-    return simd.serves() and explicit_tableau(options.solver) is not None
+    fits = explicit_tableau(options.solver) is not None
+    if options.engine == "lanes" and not (fits and simd.serves()):
+        raise ValueError(
+            f"engine is 'lanes', which needs a CPU and an explicit solver, but the solver is "
+            f"{options.solver} on a {jax.default_backend()}: take engine='diffrax'."
+        )
+    return fits and simd.serves() and options.engine != "diffrax"
 
 
 class _Setting(NamedTuple):

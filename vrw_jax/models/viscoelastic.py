@@ -1,5 +1,6 @@
 """The paper's wheel: landing, double support, single support I, stopper, single support II."""
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
@@ -122,7 +123,9 @@ class ViscoelasticWheel(AbstractWheel):
     def advance(self, params: WheelParams, x: SectionState, options: Options) -> Advance:
         told = self._told(params, x, options, monitored=False)
         tried = jnp.sum(told.tried, axis=0)
-        return Advance(section_state_of(told), told.durations, told.outcome, tried)
+        return Advance(
+            section_state_of(told), told.durations, told.outcome, tried, engine=_engine(options)
+        )
 
     def step(self, params: WheelParams, x: SectionState, options: Options) -> StepResult:
         return _full_step(self, params, x, options)
@@ -175,7 +178,12 @@ def _full_step(
     good = usable(params, x)
     params, x = replaced_where_bad(good, params, x, jnp.asarray(PAPER_START))
     s = params.symbols()
-    return result_of(s, transitions.land(s, *x), told, model.friction)
+    result = result_of(s, transitions.land(s, *x), told, model.friction)
+    return dataclasses.replace(result, engine=_engine(options))
+
+
+def _engine(options: Options) -> str:
+    return "lanes" if lanes_can(options) else "diffrax"
 
 
 @functools.cache
