@@ -7,8 +7,8 @@ import pytest
 
 import vrw_jax as vrw
 from vrw_jax.batches import lane_collocation
-from vrw_jax.models import lane_step
 from vrw_jax.cycles import sequence
+from vrw_jax.models import lane_step
 from vrw_jax.models.viscoelastic import flow_of
 from vrw_jax.numerics import Mesh, Point, explicit_tableau, integrate_lanes, integrate_phase
 from vrw_jax.wheel import (
@@ -158,8 +158,9 @@ def by_diffrax():
 def by_lanes():
     phase, q, v = at(2)
     lanes = lambda x: tuple(jnp.tile(number, 8) for number in x)
+    phase_of = lambda *_: lane_step.lane_phase(phase, monitored=False)
     end = integrate_lanes(
-        lambda *_: lane_step.lane_phase(phase, monitored=False), (), (), explicit_tableau("Bosh3"), lanes(q), lanes(v),
+        phase_of, (), (), explicit_tableau("Bosh3"), lanes(q), lanes(v),
         jnp.ones(8, bool), jnp.full(8, 5e-3), vrw.Options(),
     ).place  # fmt: skip
     return tuple(x[0] for x in end.q), tuple(x[0] for x in end.v)

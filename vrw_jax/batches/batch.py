@@ -8,7 +8,7 @@ alone, among others, and in any order. Wheels of similar work go side by side.
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, get_args
 
 import equinox as eqx
@@ -20,9 +20,17 @@ from jaxtyping import Array, Bool, Float, Int
 from vrw_jax import simd
 from vrw_jax.batches.fixed_work import fixed_gait_step
 from vrw_jax.batches.ground import as_full_states, walk_lanes
-from vrw_jax.models.lane_step import gait_step
-from vrw_jax.models import AbstractWheel
-from vrw_jax.numerics import Options, explicit_tableau, real_stability_limit
+from vrw_jax.batches.stiffness import (
+    IMPLICIT,
+    IMPLICIT_SOLVER,
+    NAMED,
+    STABLE,
+    STABLE_SOLVER,
+    TIGHTER,
+    cheapest_solver,
+)
+from vrw_jax.models import AbstractWheel, Advance, along_units, gait_step
+from vrw_jax.numerics import Options, explicit_tableau
 from vrw_jax.runtime import lane_program
 from vrw_jax.walks import options_of, rung_of, state_of
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, wheel_of
@@ -45,22 +53,15 @@ BLOCK = 32_768
 """Lanes that march side by side where XLA compiles them, as on a GPU."""
 MAPPED = 256
 """Lanes that the diffrax engine takes at a time."""
-NAMED, STABLE, IMPLICIT = range(3)
-"""Solvers that take a lane: that of the options, and two for stiff wheels."""
-STABLE_SOLVER, TIGHTER = "Tsit5", 4.0
-"""Explicit solver of wheels whose steps stability limits, and how much tighter it is set.
-
-Of diffrax's of order 5 and more it goes farthest for an evaluation there: 0.58 over the mode's
-rate, Dopri8 0.40. So much tighter it costs little more, and from a tolerance of 1e-6 down its error
-is no larger than Dopri8's at the named one."""
-IMPLICIT_SOLVER = "Kvaerno5"
-"""Solver of wheels that are too stiff for explicit ones."""
-WORTH = 6e4
-"""Evaluations by an explicit solver that cost what IMPLICIT_SOLVER does at a tolerance of 1e-6
-(docs/stability_atlas.md). Its own cost goes with the tolerance's power of -0.17, from 1e-4 to
-1e-10; at the limit of stability theirs does not."""
 FEW = 8
 """A block waits no longer than usual once less than one in `FEW` of its lanes is running."""
+
+
+class By(eqx.Module):
+    """How the end of a walk moves with its start, which has an axis of its own, or a parameter."""
+
+    section_state: Float[Array, "lanes 3 *start"]
+    durations: Float[Array, "lanes 3 *start"]
 
 
 class Steps(AbstractTold):
@@ -74,7 +75,8 @@ class Steps(AbstractTold):
     - `fixed`: whether the last step was taken in fixed work, by collocation;
     - `solver`: which of `solvers` took the lane: "auto" goes by stiffness;
     - `engine`: that computed it: "lanes", "diffrax" or "collocation";
-    - `solvers`: the named one first.
+    - `solvers`: the named one first;
+    - `derivatives`: by what was asked for.
     """
 
     section_state: Float[Array, "lanes section"]
@@ -86,6 +88,7 @@ class Steps(AbstractTold):
     solver: Int[Array, " lanes"]
     engine: str = eqx.field(static=True)
     solvers: tuple[str, ...] = eqx.field(static=True)
+    derivatives: dict[str, By] = eqx.field(default_factory=dict)
 
     def rows(self) -> list[Row]:
         n = np.bincount(np.ravel(self.solver), minlength=len(self.solvers))
@@ -107,8 +110,9 @@ def steps(
     options: Options | None = None,
     engine: Engine = "auto",
     durations: Array | np.ndarray | None = None,
+    derivatives: Sequence[str] = (),
 ) -> Steps:
-    """`n_steps` gait steps of many wheels, or as many as each can: values only, no derivatives.
+    """`n_steps` gait steps of many wheels, or as many as each can, and what they move with.
 
     `states` are section states, shape (lanes, 3), in rad, rad/s, m/s; fields of `params` are
     scalars or have the lanes' axis. "lanes" is the fast engine, for the viscoelastic wheel and
@@ -127,6 +131,11 @@ def steps(
     `options` say. Each lane checks itself, and one that fails is left to the lane engine; `fixed`
     says which was which.
 
+    `derivatives` names "section_state" (the start) and parameters: `Steps.derivatives` then tells
+    how state and durations at the end move with each, through all steps and their events; those of
+    a lane that fell are zero. Tolerances are tightened for them as `options` say. Not by
+    collocation nor on real ground.
+
     On real ground (`UnilateralWheel`, its friction a scalar or of the lanes' axis) states may be
     the rung's own too, shape (lanes, 4 + 3 n), and the only engine is "lanes".
 
@@ -141,8 +150,29 @@ def steps(
     wheels = _wheels(params, states, rung, n_steps, options)
     states = states.astype(wheels.dtype)
     by_legs = rung.rung == "unilateral"
+    moved = _moved(derivatives, by_legs or engine == "collocation")
     given = rung, wheels, states, n_steps, options, engine, params.n_legs
-    return _on_ground(*given) if by_legs else _by_phases(*given, durations)
+    return _on_ground(*given) if by_legs else _by_phases(*given, durations, moved)
+
+
+START = "section_state"
+
+
+def _moved(derivatives: Sequence[str], refused: bool) -> list[str]:
+    """What the end is to be told to move with; one clear sentence for what it can't be."""
+    names = [derivatives] if isinstance(derivatives, str) else list(derivatives)
+    known = (START, *PARAMETER_NAMES)
+    for name in names:
+        if name not in known:
+            raise ValueError(
+                f"derivatives name {name!r}, but a step moves with one of {', '.join(known)}."
+            )
+    if names and refused:
+        raise ValueError(
+            "derivatives are asked of collocation or real ground, which have none in batches: take "
+            "engine='lanes' on the paper's wheel, or jax.jacfwd of vrw.return_map."
+        )
+    return names
 
 
 def _wheels(
@@ -180,23 +210,27 @@ def _by_phases(
     engine: str,
     n_legs: int,
     durations: Any,
+    asked: Sequence[str],
 ) -> Steps:
     """Of rungs that step through the paper's phases."""
-    walked = _Walked.start(states)
-    runs = {NAMED: _chosen(engine, model, options, n_legs)}
+    walked = _Walked(states, asked)
+    if asked:
+        options = options.for_derivatives()
+    some = options, n_legs, walked.moved
+    runs = {NAMED: _chosen(engine, model, *some)}
     solver = np.full(len(states), NAMED, np.int32)
     solvers: tuple[str, ...] = (options.solver,)
     name = runs[NAMED].name
     if engine == "auto" and name == "lanes":
         solvers, solver = (
             (options.solver, STABLE_SOLVER, IMPLICIT_SOLVER),
-            _cheapest(wheels, options),
+            cheapest_solver(wheels, options),
         )
     if np.any(solver != NAMED):
         by = lambda solver: dataclasses.replace(options, solver=solver)
         stable = by(STABLE_SOLVER).tightened(TIGHTER)
-        runs[STABLE] = _chosen("lanes", model, stable, n_legs)
-        runs[IMPLICIT] = _chosen("diffrax", model, by(IMPLICIT_SOLVER), n_legs)
+        runs[STABLE] = _chosen("lanes", model, stable, *some[1:])
+        runs[IMPLICIT] = _chosen("diffrax", model, by(IMPLICIT_SOLVER), *some[1:])
     if engine == "collocation":
         name = engine
         walked.durations[:] = _expected(durations, states, wheels.dtype)
@@ -212,7 +246,7 @@ def _by_phases(
             lanes = open_[solver[open_] == which]
             if len(lanes) > 0:
                 told = solve(wheels[:, lanes], walked.section_state[lanes])
-                # A phase may last longer than `_cheapest` expects: IMPLICIT comes next.
+                # A phase may last longer than `cheapest_solver` expects: IMPLICIT comes next.
                 lost = (which == STABLE) & (told[2] == Outcome.SOLVER_GAVE_UP)
                 solver[lanes[lost]] = IMPLICIT
                 walked.take(lanes[~lost], tuple(part[~lost] for part in told), fixed=False)
@@ -258,29 +292,49 @@ def _expected(durations: Any, states: np.ndarray, dtype: np.dtype) -> np.ndarray
 class _Walked:
     """Results so far, as numpy arrays."""
 
-    def __init__(self, states: np.ndarray, n: int) -> None:
-        self.section_state, self.durations = states, np.zeros_like(states)
+    def __init__(self, states: np.ndarray, asked: Sequence[str]) -> None:
+        n = len(states)
+        self.section_state, self.durations = states.copy(), np.zeros_like(states)
         self.outcome, self.n_stepped, self.solver_steps = (np.zeros(n, np.int32) for _ in range(3))
         self.fixed = np.zeros(n, bool)
-
-    @classmethod
-    def start(cls, states: np.ndarray) -> "_Walked":
-        return cls(states.copy(), len(states))
+        # Of a step, and of the walk: by the start and then by the other names asked for.
+        self.asked, self.names = asked, [name for name in asked if name != START]
+        self.moved = (*(PARAMETER_NAMES.index(x) for x in self.names), *STATE) if asked else ()
+        self.jacobian = np.zeros((n, 6, 3 + len(self.names)), states.dtype)
+        self.jacobian[:, :3, :3] = np.eye(3)
 
     def told(self, solver: np.ndarray, engine: str, solvers: tuple[str, ...]) -> Steps:
         states, outcome = jnp.asarray(self.section_state), jnp.asarray(self.outcome)
         counts = jnp.asarray(self.n_stepped), jnp.asarray(self.solver_steps)
         fixed, which = jnp.asarray(self.fixed), jnp.asarray(solver)
         durations = jnp.asarray(self.durations)
-        return Steps(states, durations, outcome, *counts, fixed, which, engine, solvers)
+        stepped = (self.outcome == Outcome.STEPPED)[:, None, None]
+        by = jnp.asarray(np.where(stepped, self.jacobian, 0.0))
+        columns: dict[str, Any] = {name: 3 + i for i, name in enumerate(self.names)}
+        columns[START] = slice(3)
+        derivatives = {
+            name: By(by[:, :3, columns[name]], by[:, 3:, columns[name]]) for name in self.asked
+        }
+        return Steps(
+            states, durations, outcome, *counts, fixed, which, engine, solvers, derivatives
+        )
 
     def take(self, lanes: np.ndarray, told: tuple[np.ndarray, ...], fixed: bool) -> None:
-        state, durations, outcome, tried = told
+        state, durations, outcome, tried, *jacobian = told
         self.section_state[lanes], self.durations[lanes] = state, durations
         self.outcome[lanes] = outcome
         self.n_stepped[lanes] += outcome == Outcome.STEPPED
         self.solver_steps[lanes] += tried
         self.fixed[lanes] = fixed
+        if jacobian:
+            (by,), n = jacobian, len(self.names)
+            before = self.jacobian[lanes, :3]
+            self.jacobian[lanes] = by[:, :, n:] @ before
+            self.jacobian[lanes, :, 3:] += by[:, :, :n]
+
+
+STATE = tuple(range(len(PARAMETER_NAMES), len(PARAMETER_NAMES) + 3))
+"""Places of the section state among the numbers of a lane, which parameters lead."""
 
 
 class _Engine(eqx.Module):
@@ -293,7 +347,9 @@ class _Engine(eqx.Module):
         return self.call(wheels, states)
 
 
-def _chosen(engine: str, model: Any, options: Options, n_legs: int) -> _Engine:
+def _chosen(
+    engine: str, model: Any, options: Options, n_legs: int, moved: tuple[int, ...]
+) -> _Engine:
     fits = model.rung == "viscoelastic" and explicit_tableau(options.solver) is not None
     if engine in ("lanes", "collocation") and not fits:
         raise ValueError(
@@ -301,53 +357,17 @@ def _chosen(engine: str, model: Any, options: Options, n_legs: int) -> _Engine:
             "the viscoelastic wheel and explicit Runge-Kutta solvers; take engine='diffrax'."
         )
     if engine == "diffrax" or not fits:
-        return _Engine("diffrax", functools.partial(_by_diffrax, model, options.by("diffrax"), n_legs))
-    by_lanes = functools.partial(_by_lanes, model.stop_at_lift_off, options, n_legs)
+        by_diffrax = functools.partial(_by_diffrax, model, options.by("diffrax"), n_legs, moved)
+        return _Engine("diffrax", by_diffrax)
+    by_lanes = functools.partial(_by_lanes, model.stop_at_lift_off, options, n_legs, moved)
     return _Engine("lanes", by_lanes)
-
-
-def _cheapest(wheels: np.ndarray, options: Options) -> np.ndarray:
-    """Which solver takes each lane at the least cost: NAMED, STABLE or IMPLICIT.
-
-    The airborne leg's fast mode decays at 1.03 c/m for some 0.67 sqrt(L0 / g), s, where legs are
-    light, and a step times that rate must stay below an explicit solver's limit of stability;
-    rejected steps add a tenth. Where accuracy asks STABLE for more steps than that, about its
-    tolerance to the power of -1/5, the solver remains that of `options`. More than
-    `max_solver_steps` are no choice.
-    """
-    damping, mass, length, gravity = (
-        wheels[PARAMETER_NAMES.index(name)]
-        for name in ("damping", "leg_mass", "locked_length", "gravity")
-    )
-    tolerance = float(options.rtol)
-    with np.errstate(all="ignore"):
-        decays = 1.03 * damping / mass * 0.74 * np.sqrt(length / gravity)
-
-        def evaluations(solver: str) -> tuple[np.ndarray, np.ndarray]:
-            stages, bears = _stages_and_limit(solver)
-            steps = decays / bears
-            return steps, np.where(steps > options.max_solver_steps, np.inf, steps * stages)
-
-        _, named = evaluations(options.solver)
-        steps, stable = evaluations(STABLE_SOLVER)
-        limited = steps > (tolerance / TIGHTER) ** -0.2
-        implicit = np.full_like(decays, WORTH * (1e-6 / tolerance) ** 0.17)
-        costs = named, np.where(limited, stable, np.inf), implicit
-        return np.argmin(costs, axis=0).astype(np.int32)  # a wheel that is none: the first
-
-
-@functools.cache
-def _stages_and_limit(solver: str) -> tuple[int, float]:
-    """Of an explicit solver: evaluations of a step; its length times a mode's rate, at most."""
-    tableau = explicit_tableau(solver)
-    assert tableau is not None  # `_chosen` looked
-    return len(tableau.places) - 1, real_stability_limit(tableau)
 
 
 def _by_lanes(
     stop_at_lift_off: bool,
     options: Options,
     n_legs: int,
+    moved: tuple[int, ...],
     wheels: np.ndarray,
     states: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
@@ -360,23 +380,33 @@ def _by_lanes(
 
     def step(uniform: Any, lanes: Any, few: Array | None = None) -> tuple:
         known = eqx.combine(jax.tree.unflatten(structure, uniform), static)
-        params, x = wheel_of(lanes[:n], n_legs), tuple(lanes[n:])
-        told = gait_step(params, x, known, tableau, stop_at_lift_off, few)
-        return (
-            told.unfinished, told.outcome, told.solver_steps, *told.section_state, *told.durations
-        )  # fmt: skip
+
+        def told(*lanes: Array) -> tuple:
+            params, x = wheel_of(lanes[:n], n_legs), lanes[n:]
+            step = gait_step(params, x, known, tableau, stop_at_lift_off, few)
+            others = step.unfinished, step.outcome, step.solver_steps
+            return (*step.section_state, *step.durations), others
+
+        if not moved:
+            numbers, others = told(*lanes)
+            return (*others, *numbers)
+        columns, numbers, others = along_units(told, lanes, moved)
+        return (*others, *numbers, *(column for moves in columns for column in moves))
 
     # The airborne leg's fast rate, near c/m, sets the step where stability does.
     damping, mass = (wheels[PARAMETER_NAMES.index(name)] for name in ("damping", "leg_mass"))
     with np.errstate(all="ignore"):
         order = np.argsort(damping / mass, kind="stable")
     lanes = [*wheels[:, order], *states[order].T]
-    settings = ("gait step", n_legs, stop_at_lift_off, static)
+    settings = ("gait step", n_legs, stop_at_lift_off, static, moved)
     told = _run(step, uniform, lanes, settings)
     back = np.empty_like(order)
     back[order] = np.arange(len(order))
     outcome, tried, *numbers = (x[back] for x in told[1:])
-    return np.stack(numbers[:3], 1), np.stack(numbers[3:], 1), outcome, tried
+    values = np.stack(numbers[:3], 1), np.stack(numbers[3:6], 1), outcome, tried
+    if not moved:
+        return values
+    return *values, np.stack(numbers[6:], 1).reshape(len(order), 6, len(moved))
 
 
 def _by_collocation(
@@ -414,7 +444,7 @@ def _run(
     `settings`: all that `step` depends on but its arguments.
     """
     if len(lanes[0]) == 0:
-        return [np.empty(0)] * 9
+        return [np.empty(0)] * 9  # only collocation asks for none
     dtype, cpu = lanes[0].dtype, simd.serves()
     key = (settings, dtype, cpu, BLOCK)
     if key not in _programs:
@@ -452,26 +482,41 @@ def _by_diffrax(
     model: AbstractWheel,
     options: Options,
     n_legs: int,
+    moved: tuple[int, ...],
     wheels: np.ndarray,
     states: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
     """By the model's own step under `jax.vmap`, MAPPED at a time."""
     options = jax.tree.map(lambda leaf: np.asarray(leaf, wheels.dtype), options)
-    parts: list[Any] = []
+    columns, parts = np.concatenate([wheels, states.T]), []
     for begin in range(0, len(states), MAPPED):
         some = np.arange(begin, min(begin + MAPPED, len(states)))
         filled = np.minimum(np.arange(begin, begin + MAPPED), len(states) - 1)
-        out = _mapped(model, options, n_legs, wheels[:, filled], states[filled].T)
+        out = _mapped(model, options, n_legs, moved, columns[:, filled])
         used = slice(len(some))
         parts.append(jax.tree.map(lambda leaf, used=used: np.asarray(leaf)[used], out))
-    advance = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-    return advance.section_state, advance.durations, advance.outcome, advance.solver_steps
+    whole: list[np.ndarray] = [np.concatenate(leaves) for leaves in zip(*parts, strict=True)]
+    return tuple(whole)
 
 
 @eqx.filter_jit
-def _mapped(model: AbstractWheel, options: Options, n_legs: int, columns: Any, x: Any) -> Any:
-    def one(values: Array, state: Array) -> Any:
-        params = wheel_of(values, n_legs)
-        return model.advance(params, state, options)
+def _mapped(
+    model: AbstractWheel, options: Options, n_legs: int, moved: tuple[int, ...], columns: Any
+) -> tuple[Array, ...]:
+    n = len(PARAMETER_NAMES)
 
-    return jax.vmap(one, 1)(columns, x)
+    def one(numbers: Array) -> tuple[Array, ...]:
+        def told(some: Array) -> tuple[Array, Advance]:
+            full = numbers.at[np.array(moved, int)].set(some)
+            taken = model.advance(wheel_of(full[:n], n_legs), full[n:], options)
+            return jnp.concatenate([taken.section_state, taken.durations]), taken
+
+        some = numbers[np.array(moved, int)]
+        if not moved:
+            _, taken = told(some)
+            return taken.section_state, taken.durations, taken.outcome, taken.solver_steps
+        jacobian, taken = jax.jacfwd(told, has_aux=True)(some)
+        values = taken.section_state, taken.durations, taken.outcome, taken.solver_steps
+        return *values, jacobian
+
+    return jax.vmap(one, 1)(columns)

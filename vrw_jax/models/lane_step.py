@@ -6,7 +6,6 @@ within programs of JAX.
 """
 
 import dataclasses
-import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -19,9 +18,10 @@ from jaxtyping import Array, Bool, Int
 from vrw_jax import simd
 from vrw_jax.models.paper_step import End, Told, Walked, through_phases, told_of
 from vrw_jax.numerics import (
-    LanePhase,
     Balance,
     Forward,
+    LaneFunction,
+    LanePhase,
     Monitors,
     Options,
     Place,
@@ -36,7 +36,6 @@ from vrw_jax.numerics import (
 )
 from vrw_jax.runtime import lane_function
 from vrw_jax.wheel import (
-    PARAMETER_NAMES,
     AbstractPhase,
     Instant,
     Motion,
@@ -206,16 +205,8 @@ def moved_by_lanes(
         return jax.tree.leaves((params, x, options.for_derivatives()))
 
     def over_lanes(*leaves: Array) -> tuple:
-        def floats(*some: Array) -> tuple:
-            full = list(leaves)
-            for i, leaf in zip(moved, some, strict=True):
-                full[i] = leaf
-            return eqx.partition(setting.told(*tightened(*full)), eqx.is_inexact_array)
-
-        directions = _directions([leaves[i] for i in moved])
-        along = lambda tangents: jax.jvp(floats, [leaves[i] for i in moved], tangents, has_aux=True)
-        value, tangent, other = jax.vmap(along, out_axes=(None, 0, None))(directions)
-        return tangent, value, other
+        floats = lambda *full: eqx.partition(setting.told(*full), eqx.is_inexact_array)
+        return along_units(floats, leaves, moved)
 
     def like(*leaves: Array) -> tuple:
         value, other = eqx.partition(_like(monitored, leaves), eqx.is_inexact_array)
@@ -225,7 +216,7 @@ def moved_by_lanes(
     call = one_wheel(lane_function(over_lanes, like, settings))
 
     def jacobian(*leaves: Array) -> tuple:
-        columns, value, other = call(*leaves)
+        columns, value, other = call(*tightened(*leaves))
         by_argument, begin = [], 0
         for i in moved:
             shape = jnp.shape(leaves[i])
@@ -238,6 +229,24 @@ def moved_by_lanes(
         return (tuple(by_argument), value), other
 
     return jacobian
+
+
+def along_units(function: LaneFunction, leaves: Sequence[Array], moved: Sequence[int]) -> tuple:
+    """Columns of the Jacobian of `function(*leaves)` by the leaves `moved`, and its results.
+
+    It returns floats over lanes and other things; columns come first in what moves.
+    """
+
+    def only(*some: Array) -> tuple:
+        given = list(leaves)
+        for i, leaf in zip(moved, some, strict=True):
+            given[i] = leaf
+        return function(*given)
+
+    at = [leaves[i] for i in moved]
+    along = lambda ways: jax.jvp(only, at, ways, has_aux=True)
+    value, columns, other = jax.vmap(along, out_axes=(None, 0, None))(_directions(at))
+    return columns, value, other
 
 
 def _directions(leaves: Sequence[Array]) -> list[Array]:

@@ -130,7 +130,9 @@ class ViscoelasticWheel(AbstractWheel):
     def step(self, params: WheelParams, x: SectionState, options: Options) -> StepResult:
         return _full_step(self, params, x, options)
 
-    def _told(self, params: WheelParams, x: SectionState, options: Options, monitored: bool) -> Told:
+    def _told(
+        self, params: WheelParams, x: SectionState, options: Options, monitored: bool
+    ) -> Told:
         leaves, structure = jax.tree.flatten((params, x, options))
         return eqx.combine(*_compiled(self, structure, monitored)(*leaves))
 

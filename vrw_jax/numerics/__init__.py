@@ -60,6 +60,7 @@ from vrw_jax.numerics.hybrid import Guard, Mode, Stop, walk
 from vrw_jax.numerics.lane_algebra import LaneArray, fusion_barrier
 from vrw_jax.numerics.lane_minima import Monitors
 from vrw_jax.numerics.lanes import (
+    LaneFunction,
     compiled_by_caller,
     from_blocks,
     in_batches,

@@ -33,9 +33,9 @@ def any_mode(
     `function(*arrays)` must take floating-point arrays only and be differentiable by `jax.jvp` to
     the order wanted. It must not close over values that are themselves differentiated. Where
     derivatives are asked for, `to_differentiate` (the same function computed more tightly, say)
-    takes its place; `jacobian_of` some of the arguments, by their places, may be given too, as what
-    (Jacobian by each argument, value) and the other outputs are. Function and Jacobians are compiled once each: outside of `jit`, forward mode,
-    reverse mode and single directions all call the same compiled Jacobian.
+    takes its place; `jacobian_of` may give (Jacobian by each of these arguments, value) and the
+    other outputs in another way. Function and Jacobians are compiled once each: outside of `jit`,
+    forward mode, reverse mode and single directions all call the same compiled Jacobian.
     """
     tighter = function if to_differentiate is None else to_differentiate
     wrapped = jax.custom_jvp(jax.jit(function))
@@ -77,10 +77,9 @@ def _jacobian(function: Forward, moved: tuple[int, ...]) -> Forward:
 
 
 def _push(out: PyTree, jacobian: PyTree, tangent: Array) -> PyTree:
-    """Jacobian times tangent, leaf by leaf."""
-    return jax.tree.map(
-        lambda _, part: jnp.tensordot(part, tangent, jnp.ndim(tangent)), out, jacobian
-    )
+    """Jacobian times tangent, leaf by leaf: as sums, since products of small arrays are calls."""
+    axes = tuple(range(-jnp.ndim(tangent), 0))
+    return jax.tree.map(lambda _, part: jnp.sum(part * tangent, axis=axes), out, jacobian)
 
 
 def _no_tangent(tree: PyTree) -> PyTree:

@@ -16,6 +16,7 @@ from jaxtyping import Array
 
 from vrw_jax.numerics.lanes import select
 from vrw_jax.numerics.minima import AT_MINIMUM, cubic_minimum
+from vrw_jax.numerics.options import Options
 from vrw_jax.numerics.tableaus import Evaluate, Place, Tableau, take_step
 from vrw_jax.numerics.tangents import Moving
 from vrw_jax.numerics.types import Vector
@@ -54,9 +55,7 @@ def with_rates(
     return jax.jvp(along, (place.q, place.v), (place.v, place.slope.acceleration[:n]))
 
 
-def at_start(
-    monitors: Monitors, evaluate: Evaluate, place: Place, moving: Moving | None
-) -> Lowest:
+def at_start(monitors: Monitors, evaluate: Evaluate, place: Place, moving: Moving | None) -> Lowest:
     """Before the first step.
 
     What is zero at the start rests there: rounding must not make it fall.
@@ -70,17 +69,19 @@ def at_start(
     return Lowest(values, rates, zeros + jnp.inf, held, held, zeros, zeros, zeros, moves)
 
 
-def lowered(
-    monitors: Monitors,
-    evaluate: Evaluate,
-    lowest: Lowest,
-    here: Place,
-    end: Place,
-    length: Array,
-    taken: Array,
-    direction: Array | None,
-) -> Lowest:
-    """After a step from `here` to `end` in the lanes that have `taken` it."""
+class Passed(NamedTuple):
+    """A step of those lanes that have taken it."""
+
+    here: Place
+    end: Place
+    length: Array
+    taken: Array
+    direction: Array | None  # in which its beginning moves
+
+
+def lowered(monitors: Monitors, evaluate: Evaluate, lowest: Lowest, step: Passed) -> Lowest:
+    """After a step."""
+    here, end, length, taken, direction = step
     values, rates = map(jnp.stack, with_rates(monitors.values, evaluate, end))
     x, value = cubic_minimum(lowest.values, lowest.rates * length, values, rates * length)
     value = jnp.where(jnp.isfinite(value), value, jnp.minimum(lowest.values, values))
@@ -119,11 +120,16 @@ class _Search(NamedTuple):
 
 
 def settled(
-    monitors: Monitors, tableau: Tableau, evaluate: Evaluate, lowest: Lowest, start: Array, n: int
+    monitors: Monitors,
+    tableau: Tableau,
+    evaluate: Evaluate,
+    lowest: Lowest,
+    start: Array,
+    options: Options,
 ) -> Settled:
     """Minima over the phase; `start`: values where it began.
 
-    At most `n` secant steps for each, all from where the step begins that holds it.
+    At most `monitor_steps` secant steps for each, all from where the step begins that holds it.
     """
 
     def one(_: None, given: tuple) -> tuple[None, tuple[Array, Array]]:
@@ -160,7 +166,7 @@ def settled(
         zero = jnp.zeros_like(held.length)
         tries = jnp.zeros((), jnp.int32)
         search = _Search(held.offset, zero, held.rate, zero + jnp.inf, found, tries)
-        goes_on = lambda search: jnp.any(search.open) & (search.tries < n)
+        goes_on = lambda search: jnp.any(search.open) & (search.tries < options.monitor_steps)
         last = lax.while_loop(goes_on, improve, search)
         return None, (last.value, last.length)
 

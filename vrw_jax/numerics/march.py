@@ -14,10 +14,12 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from vrw_jax.numerics.crossing import Crossing, locate
 from vrw_jax.numerics.derivatives import without_derivative
 from vrw_jax.numerics.lane_minima import (
     Lowest,
     Monitors,
+    Passed,
     Settled,
     at_start,
     lowered,
@@ -117,10 +119,15 @@ def integrate_lanes(
     @run.defjvp
     def rule(primals: tuple, tangents: tuple) -> tuple[LanePhaseEnd, LanePhaseEnd]:
         moved, held, q, v, *_ = tangents
-        balance_of = lambda *constants: phase_of(*constants).balance
+
+        def balance_of(*constants: Any) -> Balance:
+            balance = phase_of(*constants).balance
+            assert balance is not None
+            return balance
+
         start = jnp.stack([*q, *v, *held])
-        moving = Moving(balance_of, *primals[:2], moved, start)
-        return _integrated_and_moved(phase_of, tableau, *primals, moving=moving)
+        moving = Moving(balance_of, primals[0], primals[1], moved, start)
+        return _integrated_and_moved(moving, phase_of, tableau, *primals)
 
     return run(constants, held, q, v, active, first_step, options, few)
 
@@ -138,10 +145,11 @@ def _integrated(
     few: Array | None,
 ) -> LanePhaseEnd:
     phase = _traced_once(phase_of(constants, held))
-    return _ended(phase, tableau, q, v, active, first_step, options, few, None)[0]
+    return _ended(phase, tableau, q, v, active, first_step, options, few, None).end
 
 
 def _integrated_and_moved(
+    moving: Moving,
     phase_of: PhaseOf,
     tableau: Tableau,
     constants: Any,
@@ -152,12 +160,11 @@ def _integrated_and_moved(
     first_step: Array,
     options: Options,
     few: Array | None,
-    moving: Moving,
 ) -> tuple[LanePhaseEnd, LanePhaseEnd]:
     """The phase's end, and how it moves along a direction of its start and constants."""
     phase = _traced_once(phase_of(constants, held))
     given = tableau, q, v, active, first_step, options, few
-    end, march, lowest, searched = _ended(phase, *given, moving)
+    end, march, lowest, least = _ended(phase, *given, moving)
     n, h = len(q), jnp.where(march.verdict == CROSSED, end.duration - march.time, 0.0)
     taken = take_step(tableau, phase.evaluate, march.here, h, with_error=False)
     assert march.direction is not None
@@ -169,7 +176,7 @@ def _integrated_and_moved(
     told = tuple(x + later * y for x, y in zip(numbers[: 2 * n], motion, strict=True))
     nothing = without_derivative(end)
     minima = None
-    if lowest is not None:
+    if lowest is not None and least is not None:
 
         def monitors_of(*constants: Any) -> tuple[Monitors, Evaluate]:
             phase = phase_of(*constants)
@@ -177,10 +184,8 @@ def _integrated_and_moved(
             return phase.monitors, phase.evaluate
 
         ends = Place(q, v, phase.evaluate(q, v)), end.place
-        found = Settled(end.minima, *searched)
-        minima = moved_minima(
-            monitors_of, tableau, moving, lowest, found, ends, jnp.stack([*told, *numbers[2 * n :]])
-        )
+        way = jnp.stack([*told, *numbers[2 * n :]])
+        minima = moved_minima(monitors_of, tableau, moving, lowest, least, ends, way)
     place_moved = nothing.place._replace(q=told[:n], v=told[n:])
     return end, nothing._replace(place=place_moved, duration=later, minima=minima)
 
@@ -204,6 +209,13 @@ def _event_moved(
     return later
 
 
+class _Ended(NamedTuple):
+    end: LanePhaseEnd
+    march: _March
+    lowest: Lowest | None
+    least: Settled | None
+
+
 def _ended(
     phase: LanePhase,
     tableau: Tableau,
@@ -214,7 +226,7 @@ def _ended(
     options: Options,
     few: Array | None,
     moving: Moving | None,
-) -> tuple[LanePhaseEnd, _March, Lowest | None, tuple]:
+) -> _Ended:
     start = Place(q, v, phase.evaluate(q, v))
     values, rates = with_rates(phase.guards, phase.evaluate, start)
     past = tuple((g < 0.0) | ((g == 0.0) & (r <= 0.0)) for g, r in zip(values, rates, strict=True))
@@ -225,18 +237,18 @@ def _ended(
     crossed = march.verdict == CROSSED
     if phase.monitors is not None:  # a long program, which what follows makes longer
         phase = _traced_once(phase, apart)
-    found = _locate(phase, tableau, march, options)
+    step = Crossing(march.here, march.values, march.h, march.crossing, crossed)
+    found = locate(phase.guards, phase.evaluate, tableau, step, options)
     lost = crossed & found.open
     duration = march.time + jnp.where(crossed, found.length, 0.0)
-    place, minima = select(crossed, found.end, march.here), None
-    lowest, searched = march.lowest, ()
+    place = select(crossed, found.end, march.here)
+    lowest, least = march.lowest, None
     if phase.monitors is not None and lowest is not None:
-        step = march.here, place, found.length, crossed, march.direction
-        lowest = lowered(phase.monitors, phase.evaluate, lowest, *step)
+        given = phase.monitors, phase.evaluate
+        taken = Passed(march.here, place, found.length, crossed, march.direction)
+        lowest = lowered(*given, lowest, taken)
         first_values = jnp.stack(phase.monitors.values(start))
-        minima, *searched = settled(
-            phase.monitors, tableau, phase.evaluate, lowest, first_values, options.monitor_steps
-        )
+        least = settled(phase.monitors, tableau, phase.evaluate, lowest, first_values, options)
     late = crossed & ~found.open & (duration > options.max_phase_time)
     guard = jnp.where(active & (at_once >= 0), at_once, jnp.where(crossed, found.guard, -1))
     end = LanePhaseEnd(
@@ -247,9 +259,9 @@ def _ended(
         unfinished=march.verdict == MARCHING,
         tried=march.tried + jnp.where(crossed, found.tried, 0),
         next_step=march.h,
-        minima=minima,
+        minima=None if least is None else least.lowest,
     )
-    return end, march, lowest, tuple(searched)
+    return _Ended(end, march, lowest, least)
 
 
 def _traced_once(phase: LanePhase, how: Callable = jax.jit) -> LanePhase:
@@ -288,8 +300,8 @@ def _march(
         lowest, half = march.lowest, march.half
         if phase.monitors is not None and lowest is not None:
             given = phase.monitors, phase.evaluate
-            step = march.here, taken.end, march.h, accepted, march.direction
-            lowest = lowered(*given, lowest, *step)
+            step = Passed(march.here, taken.end, march.h, accepted, march.direction)
+            lowest = lowered(*given, lowest, step)
         direction = march.direction
         if moving is not None and direction is not None:
             along = moving.along(tableau, taken.stages, direction, march.h)
@@ -311,8 +323,21 @@ def _march(
             direction=direction,
         )
 
+    lowest = phase.monitors and at_start(phase.monitors, phase.evaluate, start, moving)
+    begin = _at_start(start, values, begins, first_step, lowest, moving)
+    return lax.while_loop(lambda march: _waits(march, few), advance, begin)
+
+
+def _at_start(
+    start: Place,
+    values: Vector,
+    begins: Array,
+    first_step: Array,
+    lowest: Lowest | None,
+    moving: Moving | None,
+) -> _March:
     none, count = jnp.zeros(first_step.shape, jnp.int32), jnp.zeros((), jnp.int32)
-    begin = _March(
+    return _March(
         here=start,
         values=values,
         h=first_step,
@@ -322,10 +347,9 @@ def _march(
         tried=none,
         half=count,
         iterations=count,
-        lowest=phase.monitors and at_start(phase.monitors, phase.evaluate, start, moving),
+        lowest=lowest,
         direction=None if moving is None else moving.start,
     )
-    return lax.while_loop(lambda march: _waits(march, few), advance, begin)
 
 
 def _waits(march: _March, few: Array | None) -> Array:
@@ -403,110 +427,6 @@ def _to_earliest_dip(tableau: Tableau, start: Vector, inside: Vector, end: Vecto
         first = dips(g0, g1, bend, slope) & (-slope * under < over * 2.0 * bend)
         over, under = jnp.where(first, -slope, over), jnp.where(first, 2.0 * bend, under)
     return over / under
-
-
-class _Search(NamedTuple):
-    length: Array  # the next try; the event's, once found
-    low: Array
-    high: Array
-    open: Array
-    end: Place
-    guard: Array
-    tried: Array
-    tries: Array
-
-
-def _locate(phase: LanePhase, tableau: Tableau, march: _March, options: Options) -> _Search:
-    """The earliest event inside each crossing step, by Newton's method on the step's length.
-
-    The first try is the whole step, the second where the guards' parabolas cross. Every guard that
-    crossed proposes its own time and the earliest is taken, inside a bracket that bisection
-    shrinks. The last proposal moves the end along its slope; it is so short that what the next
-    order would add is a hundredth of the tolerance.
-    """
-    h = march.h
-    enough = 0.1 * jnp.sqrt(options.rtol) * h
-    bits = [(march.crossing >> i) & 1 == 1 for i in range(len(march.values))]
-
-    def propose(search: _Search, end: Place, inside: Place) -> tuple:
-        values, rates = with_rates(phase.guards, phase.evaluate, end)
-        within = phase.guards(inside)
-        change, guard = _newton(values, rates, march.crossing)
-        at = _first_guess(tableau, march.values, within, values, march.crossing)
-        return following(search, values, change, guard, at)
-
-    def following(search: _Search, values: Vector, change: Array, guard: Array, at: Array) -> tuple:
-        before = jnp.ones(h.shape, bool)
-        for g, crosses in zip(values, bits, strict=True):
-            before = before & ~(crosses & (g <= 0.0))
-        low = jnp.where(before, search.length, search.low)
-        high = jnp.where(before, search.high, search.length)
-        proposal = jnp.where(search.tries == 0, at * h, search.length + change)
-        inside = (proposal >= low - enough) & (proposal <= high + enough)
-        length = jnp.where(inside, proposal, 0.5 * (low + high))
-        arrived = inside & (jnp.abs(change) <= enough) & (search.tries > 0)
-        length = jnp.where(search.open, length, search.length)
-        return length, low, high, search.open & arrived, jnp.where(arrived, change, 0.0), guard
-
-    def improve(search: _Search) -> _Search:
-        taken = take_step(tableau, phase.evaluate, march.here, search.length, with_error=False)
-        end = taken.end
-        length, low, high, arrived, shift, guard = propose(search, end, taken.inside)
-
-        def arrive(arrived: Array, shift: Array, end: Place, old: Place) -> Place:
-            q = tuple(x + shift * y for x, y in zip(end.q, end.v, strict=True))
-            v = tuple(x + shift * y for x, y in zip(end.v, end.slope.acceleration, strict=False))
-            return select(arrived, end._replace(q=q, v=v), old)
-
-        return _Search(
-            length=length,
-            low=low,
-            high=high,
-            open=search.open & ~arrived,
-            end=arrive(arrived, shift, end, search.end),
-            guard=jnp.where(arrived, guard, search.guard),
-            tried=search.tried + search.open,
-            tries=search.tries + 1,
-        )
-
-    none = jnp.zeros(h.shape, jnp.int32)
-    start = _Search(
-        h, jnp.zeros_like(h), h, march.verdict == CROSSED, march.here, none, none,
-        jnp.zeros((), jnp.int32),
-    )  # fmt: skip
-    unsettled = lambda search: jnp.any(search.open) & (search.tries < options.event_steps)
-    return lax.while_loop(unsettled, improve, start)
-
-
-def _newton(values: Vector, rates: Vector, crossing: Array) -> tuple[Array, Array]:
-    """Time to the earliest event by each crossing guard's own proposal, and which guard it is."""
-    change = jnp.full_like(values[0], jnp.inf)
-    guard = jnp.zeros_like(crossing)
-    for index, (g, rate) in enumerate(zip(values, rates, strict=True)):
-        falling = ((crossing >> index) & 1 == 1) & (rate < 0.0)
-        own = jnp.where(falling, -g / jnp.where(falling, rate, -1.0), jnp.inf)
-        guard = jnp.where(own < change, index, guard)
-        change = jnp.minimum(own, change)
-    return change, guard
-
-
-def _first_guess(
-    tableau: Tableau, start: Vector, inside: Vector, end: Vector, crossing: Array
-) -> Array:
-    """Share of the step to the earliest zero of the guards' parabolas: secant, then Newton."""
-    earliest = jnp.ones_like(start[0])
-    for index, (g0, gm, g1) in enumerate(zip(start, inside, end, strict=True)):
-        crosses = (crossing >> index) & 1 == 1
-        bend, slope = parabola(tableau, g0, gm, g1)
-        fall = jnp.where(crosses & (g0 > g1), g0 - g1, 1.0)
-        at = jnp.clip(g0 / fall, 0.0, 1.0)
-        for _ in range(3):
-            rate = slope + 2.0 * bend * at
-            falls = rate < 0.0
-            step = (g0 + at * (slope + bend * at)) / jnp.where(falls, rate, 1.0)
-            at = jnp.where(falls, jnp.clip(at - step, 0.0, 1.0), at)
-        earliest = jnp.where(crosses, jnp.minimum(earliest, at), earliest)
-    return earliest
 
 
 def _first(conditions: tuple[Array, ...]) -> Array:

@@ -55,11 +55,11 @@ def _slopes_of(
         residual = lambda constants, held: of(constants, held).residual(place)
         along = lambda *way: _accelerated(balance, place, jax.jvp(residual, *way)[1])
         still = jax.tree.map(jnp.zeros_like, constants)
-        by_state = [_moved(balance, place, *unit) for unit in _units(place)]
+        by_state = [jnp.stack(_moved(balance, place, *unit)) for unit in _units(place)]
         by_state += [along((constants, held), (still, unit)) for unit in _unit_rows(held)]
         unmoved = tuple(jnp.zeros_like(x) for x in held)
         by_constants = along((constants, held), (moved, unmoved))
-        return jnp.stack([jnp.stack(x) for x in zip(*by_state, strict=True)]), by_constants
+        return jnp.stack(by_state, 1), by_constants
 
     return Slopes(*lax.map(at, jnp.stack([_packed(place) for place in stages[:-1]])))
 
@@ -115,7 +115,9 @@ def _carried(tableau: Tableau) -> Callable[..., Array]:
         known: list[Vector] = []
         for i in range(len(tableau.places) - 1):
             q, v = stage_at(tableau, i, q0, v0, known, h) if i else (q0, v0)
-            rows = [[by_state[i, d, e] * x for e, x in enumerate((*q, *v, *held))] for d in range(n)]
+            rows = [
+                [by_state[i, d, e] * x for e, x in enumerate((*q, *v, *held))] for d in range(n)
+            ]
             known.append(tuple(sum(row, start=by_constants[i, d]) for d, row in enumerate(rows)))
         q, v = stage_at(tableau, len(tableau.places) - 1, q0, v0, known, h)
         return jnp.stack([*q, *v, *held])

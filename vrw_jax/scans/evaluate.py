@@ -18,7 +18,6 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
-
 from vrw_jax.cycles import AbstractCycle, CycleOptions, confirmed, finder_of
 from vrw_jax.models import AbstractWheel, ViscoelasticWheel
 from vrw_jax.numerics import Options
