@@ -77,15 +77,14 @@ def locate(
 
     def improve(search: Located) -> Located:
         taken = take_step(tableau, evaluate, step.here, search.length, with_error=False)
-        end = taken.end
-        length, low, high, arrived, shift, guard = propose(search, end, taken.inside)
+        length, low, high, arrived, shift, guard = propose(search, taken.end, taken.inside)
 
         return Located(
             length=length,
             low=low,
             high=high,
             open=search.open & ~arrived,
-            end=select(arrived, _along(end, shift), search.end),
+            end=select(arrived, _along(taken.end, shift), search.end),
             guard=jnp.where(arrived, guard, search.guard),
             tried=search.tried + search.open,
             tries=search.tries + 1,
