@@ -1,0 +1,127 @@
+"""One step, two engines: machine code and diffrax tell the same, values and derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vrw_jax as vrw
+from vrw_jax.wheel import DOMAINS, PARAMETER_NAMES, wheel_of
+
+N = 192
+ALL = ("section_state", *PARAMETER_NAMES)
+START = (0.1, 1.6, -0.1)
+
+
+def box(n, seed):
+    """Wheels and starts of a wide box: many step, some fall in every way."""
+    random = np.random.default_rng(seed)
+    table = {name: np.full(n, float(getattr(vrw.WheelParams(), name))) for name in DOMAINS}
+    table["damping"] = random.uniform(5.0, 400.0, n)
+    table["stiffness"] = random.uniform(200.0, 1200.0, n)
+    table["natural_length"] = random.uniform(1.0, 1.06, n)
+    table["slope"] = random.uniform(0.05, 0.45, n)
+    table["leg_mass"] = random.uniform(0.3, 2.0, n)
+    states = random.uniform((-0.05, 0.8, -0.4), (0.2, 2.4, 0.1), (n, 3))
+    return vrw.WheelParams(**table), states
+
+
+def flat(by):
+    """Derivatives of state and durations by everything, (lanes, 6, 12)."""
+    columns = [
+        np.concatenate([by[name].section_state, by[name].durations], 1).reshape(
+            len(by[name].durations), 6, -1
+        )
+        for name in ALL
+    ]
+    return np.concatenate(columns, -1)
+
+
+@pytest.fixture(scope="module")
+def both():
+    params, states = box(N, 0)
+    lanes, diffrax = (
+        vrw.steps(params, states, options=vrw.Options.tight(), engine=engine, derivatives=ALL)
+        for engine in ("lanes", "diffrax")
+    )
+    return lanes, diffrax
+
+
+def test_outcomes_and_values_are_the_same(both):
+    lanes, diffrax = both
+    assert len(set(np.asarray(lanes.outcome))) >= 4  # the box is wide
+    np.testing.assert_array_equal(lanes.outcome, diffrax.outcome)
+    # Each errs by some 1e-12 at these tolerances, more where the state grows along the step.
+    np.testing.assert_allclose(lanes.section_state, diffrax.section_state, atol=2e-11)
+    np.testing.assert_allclose(lanes.durations, diffrax.durations, atol=2e-11)
+
+
+def test_derivatives_by_start_and_every_parameter_are_the_same(both):
+    lanes, diffrax = (flat(found.derivatives) for found in both)
+    scale = 1.0 + np.max(np.abs(diffrax), axis=(1, 2), keepdims=True)
+    assert np.max(np.abs(lanes - diffrax) / scale) < 1e-9
+    assert np.median(scale) > 2.0  # there is something to compare
+
+
+def test_a_lane_that_falls_has_a_code_and_derivatives_that_are_zero(both):
+    lanes, _ = both
+    fell = np.asarray(lanes.outcome) != vrw.Outcome.STEPPED
+    assert fell.any()
+    assert not fell.all()
+    by = flat(lanes.derivatives)
+    assert np.isfinite(by).all()
+    assert not by[fell].any()
+
+
+def test_derivatives_of_a_lane_are_bitwise_its_own_in_any_company():
+    params, states = box(24, 1)
+    rows = np.stack([np.asarray(getattr(params, name)) for name in PARAMETER_NAMES])
+    some = np.random.default_rng(2).permutation(24)[:11]
+    asked = {"derivatives": ("section_state", "damping")}
+    whole = vrw.steps(params, states, **asked)
+    part = vrw.steps(wheel_of(tuple(rows[:, some]), 8), states[some], **asked)
+    for name in asked["derivatives"]:
+        np.testing.assert_array_equal(
+            whole.derivatives[name].section_state[some], part.derivatives[name].section_state
+        )
+
+
+def test_derivatives_of_several_steps_are_those_of_the_walk():
+    states = np.array([START])
+    found = vrw.steps(vrw.WheelParams(), states, 3, derivatives=("section_state", "slope"))
+
+    def last(slope, x):
+        walked = vrw.walk(vrw.WheelParams(slope=slope), x, 3)
+        return walked.steps.section_state[-1], walked.steps.durations[-1]
+
+    by_slope, by_start = zip(*jax.jacfwd(last, argnums=(0, 1))(0.3, states[0]), strict=True)
+    for name, wanted in (("slope", by_slope), ("section_state", by_start)):
+        by = found.derivatives[name]
+        np.testing.assert_allclose(by.section_state[0], wanted[0], atol=1e-9)
+        np.testing.assert_allclose(by.durations[0], wanted[1], atol=1e-9)
+
+
+def test_the_result_names_its_engine():
+    params, x = vrw.WheelParams(), jnp.asarray(START)
+    assert vrw.step(params, x).engine == "lanes"
+    assert vrw.step(params, x, engine="diffrax").engine == "diffrax"
+    assert vrw.walk(params, x, 1).steps.engine == "lanes"
+    assert vrw.step(params, x, options=vrw.Options(solver="Kvaerno5")).engine == "diffrax"
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"engine": "lane"}, "'auto', 'lanes' or 'diffrax'"),
+        ({"engine": "lanes", "options": vrw.Options(solver="Kvaerno5")}, "engine='diffrax'"),
+    ],
+)
+def test_an_engine_that_is_none_or_cannot_is_one_sentence(given, said):
+    with pytest.raises(ValueError, match=said):
+        vrw.step(vrw.WheelParams(), START, **given)
+
+
+@pytest.mark.parametrize("names", [("speed",), "c", ("section_state", "friction")])
+def test_derivatives_by_what_does_not_move_a_step_are_one_sentence(names):
+    with pytest.raises(ValueError, match="a step moves with one of section_state, hub_mass"):
+        vrw.steps(vrw.WheelParams(), np.array([START]), derivatives=names)
