@@ -10,6 +10,7 @@ from support.batched import IN_TIME, wheels_like
 import vrw_jax as vrw
 from vrw_jax import Outcome, simd
 from vrw_jax.batches import batch as lane_batch
+from vrw_jax.batches.stiffness import cheapest_solver
 from vrw_jax.numerics.march import LanePhase, integrate_lanes
 from vrw_jax.numerics.tableaus import (
     Place,
@@ -301,10 +302,10 @@ def stiff_wheels(rates):
     return wheels_like(leg_mass=mass, hub_mass=18.0 - 8.0 * mass, damping=100.0)
 
 
-def test_thecheapest_solver_solver_takes_each_wheel():
+def test_the_cheapest_solver_takes_each_wheel():
     wheels = stiff_wheels([200.0, 1e3, 1e4, 1e5, 3e5, 1e6, np.nan]).T
     named, stable, implicit = range(3)
-    choice = lambda **options: list(lane_stiffness.cheapest_solver(wheels, vrw.Options(**options)))
+    choice = lambda **options: list(cheapest_solver(wheels, vrw.Options(**options)))
     loose = {"rtol": 1e-6, "atol": 1e-6}
     assert choice(**loose) == [named, stable, stable, stable, implicit, implicit, named]
     # Tighter, IMPLICIT costs more; where STABLE would give up Dopri8 does not yet.

@@ -46,8 +46,8 @@ from vrw_jax.wording import (
     whole,
 )
 
-Engine = Literal["auto", "lanes", "diffrax", "collocation"]
-ENGINES: tuple[str, ...] = get_args(Engine)
+BatchEngine = Literal["auto", "lanes", "diffrax", "collocation"]
+ENGINES: tuple[str, ...] = get_args(BatchEngine)
 
 BLOCK = 32_768
 """Lanes that march side by side where XLA compiles them, as on a GPU."""
@@ -108,7 +108,7 @@ def steps(
     *,
     model: AbstractWheel | None = None,
     options: Options | None = None,
-    engine: Engine = "auto",
+    engine: BatchEngine = "auto",
     durations: Array | np.ndarray | None = None,
     derivatives: Sequence[str] = (),
 ) -> Steps:

@@ -75,7 +75,7 @@ from vrw_jax.numerics.lanes import (
 from vrw_jax.numerics.march import LanePhase, integrate_lanes
 from vrw_jax.numerics.minima import State, Watched
 from vrw_jax.numerics.newton import SectionCycle, corrected, newton_cycle
-from vrw_jax.numerics.options import Options, SolverName
+from vrw_jax.numerics.options import Engine, Options, SolverName
 from vrw_jax.numerics.roots import BIFURCATIONS, bifurcation_functions, brackets, locate, turns
 from vrw_jax.numerics.segments import product_multipliers, segment_maps
 from vrw_jax.numerics.tableaus import (

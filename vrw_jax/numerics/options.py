@@ -1,5 +1,6 @@
 """Every numerical choice of the event-driven step in one visible object."""
 
+import dataclasses
 import functools
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -18,6 +19,9 @@ SolverName = Literal[
 """diffrax's Runge-Kutta solvers with an error estimate: explicit ones, then implicit ones."""
 SOLVERS: tuple[str, ...] = get_args(SolverName)
 
+Engine = Literal["auto", "lanes", "diffrax"]
+"""Who takes the steps of the paper's wheel."""
+
 FLOOR = 90.0
 """Smallest useful tolerance in units of round-off (2e-14 in float64): below it rounding rules."""
 
@@ -30,9 +34,11 @@ class Options(AbstractTold):
     """Numerical choices of an event-driven step. The tolerances may change without recompiling.
 
     - `solver`: one of `SOLVERS`, diffrax's Runge-Kutta solvers with an error estimate;
+    - `engine`: "diffrax", the definition, for any solver, device and order of derivative; "lanes",
+      its machine code for explicit solvers on CPUs; "auto", the latter wherever it can;
     - `rtol`, `atol`: relative and absolute tolerance of each local step, in m, rad, m/s, rad/s;
-    - `derivative_tightening`: derivatives are computed so much tighter, since tangents take no part
-      in the step-size control, and at equal tolerances err up to 100 times as much as values;
+    - `derivative_tightening`: derivatives are computed so much tighter, since they take no part in
+      the step-size control; so they err at most ten times as much as values do without it;
     - `max_phase_time`: of one phase, s;
     - `max_solver_steps`: of one phase, tried steps;
     - `first_step`: of each phase, s;
@@ -41,9 +47,10 @@ class Options(AbstractTold):
     """
 
     solver: str = eqx.field(static=True, default="Dopri8")
+    engine: Engine = eqx.field(static=True, default="auto")
     rtol: Scalar = _positive("rtol", 1e-10)
     atol: Scalar = _positive("atol", 1e-10)
-    derivative_tightening: Scalar = _positive("derivative_tightening", 100.0)
+    derivative_tightening: Scalar = _positive("derivative_tightening", 20.0)
     max_phase_time: Scalar = _positive("max_phase_time", 20.0)
     max_solver_steps: int = eqx.field(static=True, default=20_000)
     first_step: Scalar = _positive("first_step", 5e-3)
@@ -55,9 +62,10 @@ class Options(AbstractTold):
         def __init__(
             self,
             solver: SolverName = "Dopri8",
+            engine: Engine = "auto",
             rtol: Number = 1e-10,
             atol: Number = 1e-10,
-            derivative_tightening: Number = 100.0,
+            derivative_tightening: Number = 20.0,
             max_phase_time: Number = 20.0,
             max_solver_steps: int = 20_000,
             first_step: Number = 5e-3,
@@ -67,6 +75,7 @@ class Options(AbstractTold):
 
     def __check_init__(self) -> None:
         chosen("solver", self.solver, SOLVERS)
+        chosen("engine", self.engine, get_args(Engine))
         for name in ("rtol", "atol", "derivative_tightening", "max_phase_time", "first_step"):
             value = getattr(self, name)
             if not isinstance(value, jax.core.Tracer) and jnp.ndim(value) == 0:
@@ -80,6 +89,11 @@ class Options(AbstractTold):
             (name, value if isinstance(value, str) else told(value, units.get(name, "")))
             for name, value in vars(self).items()
         ]
+
+    def by(self, engine: Engine) -> "Options":
+        """The same choices for that engine; "auto" leaves theirs."""
+        chosen("engine", engine, get_args(Engine))
+        return self if engine == "auto" else dataclasses.replace(self, engine=engine)
 
     @classmethod
     def tight(cls) -> "Options":

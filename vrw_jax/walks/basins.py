@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.models import AbstractWheel
-from vrw_jax.numerics import Options
+from vrw_jax.numerics import Engine, Options
 from vrw_jax.results import MARGINS, MEASURES, attrs_of, provenance
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.walks.attractors import distinct, orbit_measures, settle
@@ -36,6 +36,7 @@ def basin(
     *,
     model: AbstractWheel | None = None,
     options: Options | None = None,
+    engine: Engine = "auto",
     most_steps: int = 200,
     longest_period: int = 16,
 ) -> xr.Dataset:
@@ -53,6 +54,7 @@ def basin(
     first, with their `orbit_period` in steps, DLS fraction and least margins.
     """
     model, options = _checked(params, model, options)
+    options = options.by(engine)
     most_steps = whole("most_steps", most_steps)
     longest_period = whole("longest_period", longest_period)
     values = _values(grid)

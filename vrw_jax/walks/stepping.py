@@ -26,7 +26,7 @@ from vrw_jax.models import (
     UnilateralWheel,
     ViscoelasticWheel,
 )
-from vrw_jax.numerics import Options
+from vrw_jax.numerics import Engine, Options
 from vrw_jax.wheel import Outcome, WheelParams
 from vrw_jax.wording import AbstractTold, Row, counted, instance, listed, reals, told, whole
 
@@ -79,11 +79,15 @@ def state_of(x: Any, what: str = "the section state") -> Array:
 
 
 def checked(
-    params: WheelParams, x: object, model: ModelLike | None, options: Options | None
+    params: WheelParams,
+    x: object,
+    model: ModelLike | None,
+    options: Options | None,
+    engine: Engine = "auto",
 ) -> tuple[WheelParams, Array, AbstractWheel, Options]:
     """Arguments with their defaults; one clear sentence for what can be seen to be wrong."""
     one_wheel(params, "map over batches of parameters with jax.vmap, or use vrw.scan")
-    model, options = rung_of(model), options_of(options)
+    model, options = rung_of(model), options_of(options).by(engine)
     state = state_of(x)
     size = model.section_size(params)
     if state.shape == (3,) and size != 3:
@@ -104,7 +108,12 @@ def checked(
 
 @overload
 def step(  # type: ignore[overload-overlap]
-    params: WheelParams, x: SectionLike, *, model: UnilateralWheel, options: Options | None = None
+    params: WheelParams,
+    x: SectionLike,
+    *,
+    model: UnilateralWheel,
+    options: Options | None = None,
+    engine: Engine = "auto",
 ) -> UnilateralStep: ...
 
 
@@ -115,6 +124,7 @@ def step(  # type: ignore[overload-overlap]
     *,
     model: LadderWheel | Literal["auto"],
     options: Options | None = None,
+    engine: Engine = "auto",
 ) -> LadderStep: ...
 
 
@@ -125,6 +135,7 @@ def step(
     *,
     model: AbstractWheel | None = None,
     options: Options | None = None,
+    engine: Engine = "auto",
 ) -> StepResult: ...
 
 
@@ -134,6 +145,7 @@ def step(
     *,
     model: ModelLike | None = None,
     options: Options | None = None,
+    engine: Engine = "auto",
 ) -> StepResult | UnilateralStep | LadderStep:
     """One step from touchdown to touchdown, with indicators, monitors and energies.
 
@@ -141,7 +153,7 @@ def step(
     its `outcome`; nothing is raised for a wheel that falls. Errors: below 1e-9 at the default
     options and 1e-12 at `Options.tight()`, for values and first derivatives.
     """
-    params, state, model, options = checked(params, x, model, options)
+    params, state, model, options = checked(params, x, model, options, engine)
     return model.step(params, state, options)
 
 
@@ -151,12 +163,13 @@ def return_map(
     *,
     model: ModelLike | None = None,
     options: Options | None = None,
+    engine: Engine = "auto",
 ) -> Array:
     """The section state one step later; all zeros (no section state) where the step failed.
 
     The lean path: no monitors are computed. Differentiable forwards and in reverse, to any order.
     """
-    params, state, model, options = checked(params, x, model, options)
+    params, state, model, options = checked(params, x, model, options, engine)
     return model.advance(params, state, options).section_state
 
 
@@ -224,10 +237,11 @@ def walk(
     *,
     model: ModelLike | None = None,
     options: Options | None = None,
+    engine: Engine = "auto",
 ) -> Walk:
     """`n_steps` steps, or as many as it can; the steps after a failure repeat its outcome."""
     n_steps = whole("n_steps", n_steps)
-    params, state, model, options = checked(params, x, model, options)
+    params, state, model, options = checked(params, x, model, options, engine)
     return _walk(model, params, state, options, n_steps)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array
 
 from vrw_jax.models import SERVED, AbstractWheel, SectionState
-from vrw_jax.numerics import Options
+from vrw_jax.numerics import Engine, Options
 from vrw_jax.results import TRAJECTORY, provenance, variables
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.walks.ground_trajectory import over_contacts
@@ -79,6 +79,7 @@ def simulate(
     *,
     model: ModelLike | None = None,
     options: Options | None = None,
+    engine: Engine = "auto",
     n_samples: int = 100,
 ) -> xr.Dataset:
     """Walk `n_steps` steps from the section state `x`, as a labelled trajectory over time.
@@ -93,7 +94,7 @@ def simulate(
     n_steps, n_samples = whole("n_steps", n_steps), whole("n_samples", n_samples, 2)
     one_wheel(params, "simulate one at a time")
     start = rung_of(model).start(params) if x is None else x
-    params, x, model, options = checked(params, start, model, options)
+    params, x, model, options = checked(params, start, model, options, engine)
     sampled = over_contacts if model.tells_contacts else over_phases
     telling, s = sampled(params, model, options, n_samples), params.symbols()
     told = joined(telling, x, n_steps, float(s.Mt * s.g * s.sin_phi))
