@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from vrw_jax import simd
 from vrw_jax.batches.fixed_work import fixed_gait_step
 from vrw_jax.batches.ground import as_full_states, walk_lanes
+from vrw_jax.batches.programs import run_lanes
 from vrw_jax.batches.stiffness import (
     IMPLICIT,
     IMPLICIT_SOLVER,
@@ -31,7 +31,6 @@ from vrw_jax.batches.stiffness import (
 )
 from vrw_jax.models import AbstractWheel, Advance, along_units, gait_step
 from vrw_jax.numerics import Options, explicit_tableau
-from vrw_jax.runtime import lane_program
 from vrw_jax.walks import options_of, rung_of, state_of
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, wheel_of
 from vrw_jax.wording import (
@@ -49,12 +48,8 @@ from vrw_jax.wording import (
 BatchEngine = Literal["auto", "lanes", "diffrax", "collocation"]
 ENGINES: tuple[str, ...] = get_args(BatchEngine)
 
-BLOCK = 32_768
-"""Lanes that march side by side where XLA compiles them, as on a GPU."""
 MAPPED = 256
 """Lanes that the diffrax engine takes at a time."""
-FEW = 8
-"""A block waits no longer than usual once less than one in `FEW` of its lanes is running."""
 
 
 class By(eqx.Module):
@@ -399,7 +394,7 @@ def _by_lanes(
         order = np.argsort(damping / mass, kind="stable")
     lanes = [*wheels[:, order], *states[order].T]
     settings = ("gait step", n_legs, stop_at_lift_off, static, moved)
-    told = _run(step, uniform, lanes, settings)
+    told = run_lanes(step, uniform, lanes, settings)
     back = np.empty_like(order)
     back[order] = np.arange(len(order))
     outcome, tried, *numbers = (x[back] for x in told[1:])
@@ -427,55 +422,9 @@ def _by_collocation(
 
     lanes = [*wheels, *states.T, *durations.T]
     settings = ("gait step by collocation", n_legs, stop_at_lift_off)
-    _, trusted, *numbers = _run(step, [], lanes, settings)
+    _, trusted, *numbers = run_lanes(step, [], lanes, settings)
     none = np.zeros(len(states), np.int32)
     return trusted, (np.stack(numbers[:3], 1), np.stack(numbers[3:], 1), none, none)
-
-
-_programs: dict[Any, Callable] = {}
-"""Compiled steps by what they depend on, see `_run`."""
-
-
-def _run(
-    step: Callable[..., tuple], uniform: list[np.ndarray], lanes: list[np.ndarray], settings: Any
-) -> list[np.ndarray]:
-    """`step(uniform, lanes, few)` compiled and run; its first result: lanes that it left undone.
-
-    `settings`: all that `step` depends on but its arguments.
-    """
-    if len(lanes[0]) == 0:
-        return [np.empty(0)] * 9  # only collocation asks for none
-    dtype, cpu = lanes[0].dtype, simd.serves()
-    key = (settings, dtype, cpu, BLOCK)
-    if key not in _programs:
-        if cpu:
-            kinds = [x.dtype for x in uniform]
-            _programs[key] = lane_program(step, kinds, len(lanes), dtype, settings)
-        else:
-            _programs[key] = functools.partial(_by_xla, jax.jit(step))
-    return _programs[key](uniform, lanes)
-
-
-def _by_xla(
-    program: Callable, uniform: list[np.ndarray], lanes: list[np.ndarray]
-) -> list[np.ndarray]:
-    """Block by block; late lanes run again among their like."""
-    told: list[np.ndarray] = []
-    open_ = np.arange(len(lanes[0]))
-    while len(open_) > 0:
-        few = np.int32(BLOCK // FEW if len(open_) > BLOCK else 0)
-        late = []
-        for begin in range(0, len(open_), BLOCK):
-            some = open_[begin : begin + BLOCK]
-            filled = np.concatenate([some, np.repeat(some[-1:], BLOCK - len(some))])
-            given = tuple(x[filled] for x in lanes)
-            out = [np.asarray(x)[: len(some)] for x in program(tuple(uniform), given, few)]
-            told = told or [np.empty(len(lanes[0]), x.dtype) for x in out]
-            for told_whole, part in zip(told, out, strict=True):
-                told_whole[some[~out[0]]] = part[~out[0]]
-            late.append(some[out[0]])
-        open_ = np.concatenate(late)
-    return told
 
 
 def _by_diffrax(
