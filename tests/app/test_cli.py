@@ -282,6 +282,21 @@ def test_a_gait_of_rigid_legs_is_told(config: Path) -> None:
     assert "stable: multipliers" in told.stdout
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("friction", "serves"), [(20.0, "paper's wheel serves"), (0.7, "break")])
+def test_a_gait_of_the_lowest_rung_says_which_and_why(
+    config: Path, friction: float, serves: str
+) -> None:
+    config.write_text(
+        f'[wheel]\ndamping = 180.0\n[model]\nrung = "auto"\nfriction = {friction}\n'
+        "[gait]\nsteps = 2\n"
+    )
+    told = vrw("gait", config)
+    assert told.exit_code == 0, told.output
+    assert serves in told.stdout
+    assert "slip per step" in told.stdout
+
+
 STOPPED = """
 import sys, time
 sys.path.insert(0, {tests!r})

@@ -155,11 +155,13 @@ def gait(
                 state = result.section_state
             if settings.rung == "auto":
                 model = result.choice.model
-            walks = settings.rung != "viscoelastic"  # the paper's gait is found without a guess
+            found_cold = model.rung == "viscoelastic"  # the other rungs' gaits need a guess
             cycle: Any = (
-                limit_cycle(params, guess=state, model=model) if walks else limit_cycle(params)
+                limit_cycle(params) if found_cold else limit_cycle(params, guess=state, model=model)
             )
         printing.tell_gait(params, result, state, walked, cycle)
+        if settings.rung == "auto":
+            out.print(result.choice.why)
 
 
 @app.command()
