@@ -32,6 +32,7 @@ from vrw_jax.numerics import (
     explicit_tableau,
     integrate_lanes,
     one_wheel,
+    sample_lanes,
     sine_cosine,
 )
 from vrw_jax.runtime import lane_function
@@ -192,6 +193,27 @@ def told_by_lanes(structure: Any, stop_at_lift_off: bool, monitored: bool) -> Fo
 
     like = lambda *leaves: eqx.partition(_like(monitored, leaves), eqx.is_inexact_array)
     return one_wheel(lane_function(over_lanes, like, ("gait step", *setting.key)))
+
+
+def sampled_by_lanes(structure: Any, stop_at_lift_off: bool, n_samples: int) -> LaneFunction:
+    """Durations of the phases, and states at equal times of each, over the same leaves."""
+    setting = _Setting(structure, stop_at_lift_off, monitored=False)
+
+    def over_lanes(*leaves: Array) -> tuple:
+        params, x, options = jax.tree.unflatten(structure, leaves)
+        tableau = explicit_tableau(options.solver)
+        assert tableau is not None  # `lanes_can` looked
+        walked = walk(params, tuple(x), options, tableau, stop_at_lift_off, monitored=False)
+        samples = [
+            sample_lanes(
+                lane_phase(phase, False), tableau, *start, end.duration, n_samples, options
+            )
+            for phase, start, end in zip(walked.phases, walked.starts, walked.ends, strict=True)
+        ]
+        return jnp.stack([end.duration for end in walked.ends]), tuple(samples)
+
+    like = lambda *leaves: (leaves[0], (leaves[0],) * 3)
+    return one_wheel(lane_function(over_lanes, like, ("samples", *setting.key, n_samples)))
 
 
 def moved_by_lanes(

@@ -19,7 +19,7 @@ from vrw_jax.models.base import (
     replaced_where_bad,
     usable,
 )
-from vrw_jax.models.lane_step import lanes_can, moved_by_lanes, told_by_lanes
+from vrw_jax.models.lane_step import lanes_can, moved_by_lanes, sampled_by_lanes, told_by_lanes
 from vrw_jax.models.paper_step import (
     PAPER_START,
     End,
@@ -45,10 +45,13 @@ from vrw_jax.wheel import (
     PARAMETER_NAMES,
     AbstractPhase,
     Instant,
+    Landing,
     Motion,
+    Symbols,
     WheelParams,
     dynamics,
     known_friction,
+    phases_of,
     transitions,
 )
 from vrw_jax.wording import flag
@@ -139,18 +142,33 @@ class ViscoelasticWheel(AbstractWheel):
     def trace(
         self, params: WheelParams, x: SectionState, options: Options, n_samples: int
     ) -> Trajectory:
-        walked = self._walk(params, x, options, monitored=False)
-        times, told = [], []
-        begin = jnp.zeros_like(x[0])
-        for phase, start, end in zip(walked.phases, walked.starts, walked.ends, strict=True):
-            flow = flow_of(phase, monitored=False)
-            y = jnp.stack([*start[0], *start[1]])
-            samples = sample_phase(flow.field, y, end.duration, n_samples, options)
-            times.append(begin + jnp.linspace(0.0, 1.0, n_samples) * end.duration)
-            begin = begin + end.duration
-            told.append(jax.vmap(functools.partial(_describe, phase))(samples))
+        leaves, structure = jax.tree.flatten((params, x, options))
+        if lanes_can(options):
+            sampled = sampled_by_lanes(structure, self.stop_at_lift_off, n_samples)
+        else:
+            sampled = functools.partial(self._sampled_by_diffrax, structure, n_samples)
+        durations, samples = sampled(*leaves)
+        s, landing = _landed(params, x)
+        times = jnp.linspace(0.0, 1.0, n_samples) * durations[:, None]
+        begins = jnp.concatenate([jnp.zeros_like(durations[:1]), jnp.cumsum(durations)[:-1]])
+        told = [
+            jax.vmap(functools.partial(_describe, phase))(states)
+            for phase, states in zip(
+                phases_of(s, landing.distance, self.stop_at_lift_off), samples, strict=True
+            )
+        ]
         states, forces, energies = (jnp.stack(parts) for parts in zip(*told, strict=True))
-        return Trajectory(jnp.stack(times), states, forces, energies)
+        return Trajectory(begins[:, None] + times, states, forces, energies)
+
+    def _sampled_by_diffrax(
+        self, structure: Any, n_samples: int, *leaves: Array
+    ) -> tuple[Array, tuple[Array, ...]]:
+        params, x, options = jax.tree.unflatten(structure, leaves)
+        walked, samples = self._walk(params, x, options, monitored=False), []
+        for phase, start, end in zip(walked.phases, walked.starts, walked.ends, strict=True):
+            field, y = flow_of(phase, monitored=False).field, jnp.stack([*start[0], *start[1]])
+            samples.append(sample_phase(field, y, end.duration, n_samples, options))
+        return jnp.stack([end.duration for end in walked.ends]), tuple(samples)
 
     def _walk(
         self, params: WheelParams, x: SectionState, options: Options, monitored: bool
@@ -177,11 +195,16 @@ def _full_step(
     model: ViscoelasticWheel, params: WheelParams, x: SectionState, options: Options
 ) -> StepResult:
     told = model._told(params, x, options, monitored=True)
-    good = usable(params, x)
-    params, x = replaced_where_bad(good, params, x, jnp.asarray(PAPER_START))
-    s = params.symbols()
-    result = result_of(s, transitions.land(s, *x), told, model.friction)
+    result = result_of(*_landed(params, x), told, model.friction)
     return dataclasses.replace(result, engine=_engine(options))
+
+
+def _landed(params: WheelParams, x: SectionState) -> tuple[Symbols, Landing]:
+    """The landing that a step begins with; Table 1's where its input is unusable."""
+    safe = jnp.asarray(PAPER_START)
+    params, x = replaced_where_bad(usable(params, x), params, x, safe)
+    s = params.symbols()
+    return s, transitions.land(s, *x)
 
 
 def _engine(options: Options) -> str:

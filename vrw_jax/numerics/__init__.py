@@ -72,7 +72,7 @@ from vrw_jax.numerics.lanes import (
     to_blocks,
     zeros_of,
 )
-from vrw_jax.numerics.march import LanePhase, integrate_lanes
+from vrw_jax.numerics.march import LanePhase, integrate_lanes, sample_lanes
 from vrw_jax.numerics.minima import State, Watched
 from vrw_jax.numerics.newton import SectionCycle, corrected, newton_cycle
 from vrw_jax.numerics.options import Engine, Options, SolverName

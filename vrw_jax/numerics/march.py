@@ -435,3 +435,44 @@ def _first(conditions: tuple[Array, ...]) -> Array:
     for i in range(len(conditions) - 1, -1, -1):
         index = jnp.where(conditions[i], i, index)
     return index
+
+
+def sample_lanes(
+    phase: LanePhase,
+    tableau: Tableau,
+    q: Vector,
+    v: Vector,
+    duration: Array,
+    n_samples: int,
+    options: Options,
+) -> Array:
+    """Positions, then rates, at equal times of a phase, ends included: (samples, ., lanes)."""
+    start = Place(q, v, phase.evaluate(q, v))
+    none = jnp.zeros((), jnp.int32)
+
+    def advance(now: tuple) -> tuple:
+        place, h, left, tried = now
+        length = jnp.minimum(h, left)
+        taken = take_step(tableau, phase.evaluate, place, length)
+        squared = _squared_error(taken, place, (), options.rtol, options.atol)
+        change = change_of_length(tableau, squared, length.dtype)
+        keep = squared <= 1.0
+        # A step that a sample has cut short says nothing against the length before.
+        h = jnp.where(keep & (length < h), jnp.maximum(h, length * change), length * change)
+        going = left > 0.0
+        return (
+            select(going & keep, taken.end, place),
+            jnp.where(going, h, now[1]),
+            jnp.where(going & keep, jnp.where(length == left, 0.0, left - length), left),
+            tried + 1,
+        )
+
+    def to_next(now: tuple, _: None) -> tuple[tuple, Array]:
+        unsettled = lambda now: jnp.any(now[2] > 0.0) & (now[3] < options.max_solver_steps)
+        begin = (*now, duration / (n_samples - 1), none)
+        place, h, _, _ = lax.while_loop(unsettled, advance, begin)
+        return (place, h), jnp.stack([*place.q, *place.v])
+
+    first = start, options.first_step + jnp.zeros_like(duration)
+    later = lax.scan(to_next, first, None, length=n_samples - 1)[1]
+    return jnp.concatenate([jnp.stack([*q, *v])[None], later])
