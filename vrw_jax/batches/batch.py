@@ -29,7 +29,7 @@ from vrw_jax.batches.stiffness import (
     TIGHTER,
     cheapest_solver,
 )
-from vrw_jax.models import AbstractWheel, Advance, along_units, gait_step
+from vrw_jax.models import DIRECTIONS, AbstractWheel, Advance, along_units, gait_step
 from vrw_jax.numerics import Options, explicit_tableau
 from vrw_jax.walks import options_of, rung_of, state_of
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, wheel_of
@@ -394,7 +394,8 @@ def _by_lanes(
         order = np.argsort(damping / mass, kind="stable")
     lanes = [*wheels[:, order], *states[order].T]
     settings = ("gait step", n_legs, stop_at_lift_off, static, moved)
-    told = run_lanes(step, uniform, lanes, settings)
+    small = (DIRECTIONS,) if moved else ()
+    told = run_lanes(step, uniform, lanes, settings, *small)
     back = np.empty_like(order)
     back[order] = np.arange(len(order))
     outcome, tried, *numbers = (x[back] for x in told[1:])

@@ -20,7 +20,11 @@ _programs: dict[Any, Callable] = {}
 
 
 def run_lanes(
-    step: Callable[..., tuple], uniform: list[np.ndarray], lanes: list[np.ndarray], settings: Any
+    step: Callable[..., tuple],
+    uniform: list[np.ndarray],
+    lanes: list[np.ndarray],
+    settings: Any,
+    small: int = simd.SMALL,
 ) -> list[np.ndarray]:
     """`step(uniform, lanes, few)` compiled and run; its first result: lanes that it left undone.
 
@@ -33,7 +37,7 @@ def run_lanes(
     if key not in _programs:
         if cpu:
             kinds = [x.dtype for x in uniform]
-            _programs[key] = lane_program(step, kinds, len(lanes), dtype, settings)
+            _programs[key] = lane_program(step, kinds, len(lanes), dtype, settings, small)
         else:
             _programs[key] = functools.partial(_by_xla, jax.jit(step))
     return _programs[key](uniform, lanes)

@@ -24,7 +24,7 @@ from vrw_jax.models.ladder import (
     reason_of,
     refuse_ladder,
 )
-from vrw_jax.models.lane_step import along_units, gait_step
+from vrw_jax.models.lane_step import DIRECTIONS, along_units, gait_step
 from vrw_jax.models.paper_step import PAPER_START
 from vrw_jax.models.rigid import RigidWheel
 from vrw_jax.models.unilateral.ledger import Ledger, blank, law_of, outcome_at, passed, past

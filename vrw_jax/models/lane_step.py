@@ -37,6 +37,7 @@ from vrw_jax.numerics import (
 )
 from vrw_jax.runtime import lane_function
 from vrw_jax.wheel import (
+    PARAMETER_NAMES,
     AbstractPhase,
     Instant,
     Motion,
@@ -235,7 +236,7 @@ def moved_by_lanes(
         return value, value, other
 
     settings = ("gait step with derivatives", *setting.key, moved)
-    call = one_wheel(lane_function(over_lanes, like, settings))
+    call = one_wheel(lane_function(over_lanes, like, settings, DIRECTIONS))
 
     def jacobian(*leaves: Array) -> tuple:
         columns, value, other = call(*tightened(*leaves))
@@ -251,6 +252,10 @@ def moved_by_lanes(
         return (tuple(by_argument), value), other
 
     return jacobian
+
+
+DIRECTIONS = len(PARAMETER_NAMES) + 3
+"""All numbers that a step moves with: machine code keeps one of each direction in registers."""
 
 
 def along_units(function: LaneFunction, leaves: Sequence[Array], moved: Sequence[int]) -> tuple:

@@ -54,16 +54,23 @@ def remembered(function: Callable, settings: object) -> Callable:
 
 
 def lane_program(
-    function: Callable, uniform: Sequence[np.dtype], n_lanes_in: int, dtype: np.dtype, settings: Any
+    function: Callable,
+    uniform: Sequence[np.dtype],
+    n_lanes_in: int,
+    dtype: np.dtype,
+    settings: Any,
+    small: int = simd.SMALL,
 ) -> Callable[[Sequence[Any], Sequence[np.ndarray]], list[np.ndarray]]:
     """`simd.lane_program` of this library's functions, kept here; `settings` as for `compiled`."""
     key = (settings, store.code_digest())
-    return simd.lane_program(function, uniform, n_lanes_in, dtype, key, store)
+    return simd.lane_program(function, uniform, n_lanes_in, dtype, key, store, small)
 
 
-def lane_function(function: Callable, like: Callable, settings: object) -> Callable:
+def lane_function(
+    function: Callable, like: Callable, settings: object, small: int = simd.SMALL
+) -> Callable:
     """`simd.lane_function` of this library's functions, likewise."""
-    return simd.lane_function(function, like, (settings, store.code_digest()), store)
+    return simd.lane_function(function, like, (settings, store.code_digest()), store, small)
 
 
 def _exported(function: Callable, arguments: tuple, settings: object) -> export.Exported:

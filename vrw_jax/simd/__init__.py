@@ -1,5 +1,6 @@
 """Traces of JAX as machine code: a few lanes side by side, compiled by LLVM."""
 
+from vrw_jax.simd.arrays import SMALL
 from vrw_jax.simd.code import tracing
 from vrw_jax.simd.machine import processor
 from vrw_jax.simd.program import at_hand, lane_function, lane_program, serves

@@ -21,7 +21,7 @@ from vrw_jax.simd.numbers import LONG, NUMBERS, Numbers, Value
 
 LANES = 1021
 """Lanes of the trace, by which their axis is known; machine code has as many as suit it."""
-SMALL = 12
+SMALL = 8
 """Entries of fields that are taken apart after all, and terms of sums that are written out."""
 HELD = 32
 """Entries of arrays that loops carry in registers, and of constants that need no table."""
@@ -41,8 +41,8 @@ class Asked(NamedTuple):
 class Arrays:
     """Writes operations on arrays into the function that `numbers` writes."""
 
-    def __init__(self, numbers: Numbers, written_out: bool = False) -> None:
-        self.numbers, self.builder = numbers, numbers.builder
+    def __init__(self, numbers: Numbers, written_out: bool = False, small: int = SMALL) -> None:
+        self.numbers, self.builder, self.small = numbers, numbers.builder, small
         self.alive: list[Any] = []  # what is known by `id`
         self.written_out = written_out  # in a loop's body without loops: constants need no table
 

@@ -41,22 +41,26 @@ class Code(NamedTuple):
     code: bytes
 
 
-def code_of(function: Callable, shapes: Any, key: object, width: int, store: Store | None) -> Code:
+def code_of(
+    function: Callable, shapes: Any, key: object, width: int, store: Store | None, small: int
+) -> Code:
     """Compiled, or found where it is kept."""
-    asked = (key, shapes, width, jax.__version__, how_compiled())
+    asked = (key, shapes, width, small, jax.__version__, how_compiled())
     index = f"lanes_index_{_digest(repr(asked).encode())}"
     if index not in _made:
         name = store.kept(index) if store is not None else None
         code = kept_code(name.decode(), store) if name else None
-        _made[index] = code or _written(function, shapes, width, index, store)
+        _made[index] = code or _written(function, shapes, width, index, store, small)
     return _made[index]
 
 
-def _written(function: Callable, shapes: Any, width: int, index: str, store: Store | None) -> Code:
+def _written(
+    function: Callable, shapes: Any, width: int, index: str, store: Store | None, small: int
+) -> Code:
     """Traced; compiled only if nothing of the same text was."""
     with _python, _uncollected():
         closed = traced(function, *shapes)
-        text = module_text(closed, width)
+        text = module_text(closed, width, small)
     out = json.dumps([(aval.shape[:-1], aval.dtype.name) for aval in closed.out_avals])
     name = f"lanes_code_{_digest(f'{out}{how_compiled()}{text}'.encode())}"
     code = kept_code(name, store)

@@ -6,7 +6,7 @@ from typing import Any
 import llvmlite.ir as ir
 from jax.extend.core import ClosedJaxpr
 
-from vrw_jax.simd.arrays import HELD, LANES, Arrays, has_lanes, taken_for_lanes
+from vrw_jax.simd.arrays import HELD, LANES, SMALL, Arrays, has_lanes, taken_for_lanes
 from vrw_jax.simd.ffi import add_handler
 from vrw_jax.simd.fields import Entries, Field, Index
 from vrw_jax.simd.numbers import BYTE, LONG, NUMBERS, TRUTH, Numbers, Value
@@ -16,7 +16,7 @@ from vrw_jax.simd.trace import Traces
 NAME = "lanes"
 
 
-def module_text(closed: ClosedJaxpr, width: int) -> str:
+def module_text(closed: ClosedJaxpr, width: int, small: int = SMALL) -> str:
     """`void lanes(const void **given, void **told, int64 lanes, int64 begin, int64 end)`.
 
     Over groups of lanes.
@@ -28,7 +28,7 @@ def module_text(closed: ClosedJaxpr, width: int) -> str:
         module, ir.FunctionType(ir.VoidType(), [pointer, pointer, LONG, LONG, LONG]), NAME
     )
     build = ir.IRBuilder(kernel.append_basic_block("entry"))
-    arrays = Arrays(Numbers(build, width))
+    arrays = Arrays(Numbers(build, width), small=small)
     given, told, n_lanes, begin, end = kernel.args
     inputs, outputs = closed.in_avals, closed.out_avals
 

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.simd.arrays import LANES
+from vrw_jax.simd.arrays import LANES, SMALL
 from vrw_jax.simd.code import Code, Store, code_of, kept_code
 from vrw_jax.simd.ffi import register, registered
 from vrw_jax.simd.kernel import NAME
@@ -40,12 +40,14 @@ def lane_program(
     dtype: np.dtype,
     key: object,
     store: Store | None,
+    small: int = SMALL,
 ) -> Callable[[Sequence[Any], Sequence[np.ndarray]], list[np.ndarray]]:
     """`function(uniform, lanes)` compiled: `uniform` numbers, `lanes` arrays of the float `dtype`.
 
     It must be elementwise over lanes, but for loops that end where no lane goes on, and return a
     flat tuple of arrays of the lanes' length. `key` says by `repr` what its trace depends on but
-    shapes: what it closes over, and its text. Code is kept in `store`, if there is one. The result
+    shapes: what it closes over, and its text. Code is kept in `store`, if there is one; parts of
+    large arrays with up to `small` entries are registers. The result
     takes numpy arrays of any equal length and gives bitwise the same for a lane in any
     company; it uses all cores that the process may.
     """
@@ -54,7 +56,7 @@ def lane_program(
         tuple(jax.ShapeDtypeStruct((), kind) for kind in uniform),
         (jax.ShapeDtypeStruct((LANES,), dtype),) * n_lanes_in,
     )
-    return _Program(code_of(function, shapes, key, width, store), width)
+    return _Program(code_of(function, shapes, key, width, store, small), width)
 
 
 def lane_function(
@@ -62,6 +64,7 @@ def lane_function(
     like: Callable[..., Any],
     key: object,
     store: Store | None,
+    small: int = SMALL,
 ) -> Callable[..., Any]:
     """`function` of trees of arrays, lanes on their last axis, as one call within JAX's programs.
 
@@ -86,7 +89,7 @@ def lane_function(
             for x in leaves
         ]
         flat = lambda *leaves: jax.tree.leaves(function(*jax.tree.unflatten(structure, leaves)))
-        code = code_of(flat, shapes, (key, str(structure)), width, store)
+        code = code_of(flat, shapes, (key, str(structure)), width, store, small)
         register(code.name, code.code)
         if missing:
             fill = lambda x: jnp.concatenate([x, jnp.repeat(x[..., -1:], missing, -1)], -1)

@@ -6,7 +6,7 @@ from typing import Any
 
 from vrw_jax.simd import loops, movement, sums
 from vrw_jax.simd.arithmetic import ELEMENTWISE
-from vrw_jax.simd.arrays import SMALL, Asked, has_lanes, moved, number_of, taken_for_lanes
+from vrw_jax.simd.arrays import Asked, has_lanes, moved, number_of, taken_for_lanes
 from vrw_jax.simd.fields import Entries, Field
 from vrw_jax.simd.trace import CALLS, Rule, Traces, called
 
@@ -24,7 +24,7 @@ def _single(write: Callable[..., Entries]) -> Rule:
             raise taken_for_lanes(f"The result of {name}", out)
         number_of(out)  # refuses those of no known kind
         result = write(traces.arrays, Asked(name, equation.params, given, out), *values)
-        if isinstance(result, Field) and math.prod(result.shape) <= SMALL:
+        if isinstance(result, Field) and math.prod(result.shape) <= traces.arrays.small:
             result = traces.arrays.entries(result)
         return [result]
 

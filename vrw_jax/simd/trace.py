@@ -100,7 +100,8 @@ class Traces:
         function.linkage = "internal"
         function.attributes.add("noinline")
         build = ir.IRBuilder(function.append_basic_block("entry"))
-        arrays = Arrays(Numbers(build, self.arrays.numbers.width), self.arrays.written_out)
+        outer = self.arrays
+        arrays = Arrays(Numbers(build, outer.numbers.width), outer.written_out, outer.small)
         results = Traces(arrays, self.rules, self.functions).closed(
             closed, arrays_of(function.args, closed.in_avals)
         )
