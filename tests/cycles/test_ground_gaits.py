@@ -201,6 +201,8 @@ def test_lanes_walk_on_real_ground_as_single_wheels_do(lanes):
     found = walked(slice(None))
     assert found.engine == "lanes"
     for i in range(len(damping)):
+        if math.isnan(friction[i]):
+            continue  # a lone wheel of that friction is refused
         ground = vrw.UnilateralWheel(friction=friction[i])
         params = vrw.WheelParams(damping=damping[i])
         walk = vrw.walk(params, states[i], 3, model=ground, options=OPTIONS)

@@ -324,11 +324,16 @@ def test_a_foot_that_lands_sliding_takes_coulombs_impulse(friction):
 
 
 def test_bad_input_is_a_code_and_never_nan():
+    # Friction is refused in a sentence as a plain number, and is a code within a batch.
     for friction, x in ((0.7, (math.nan, 1.0, 0.0)), (-1.0, START), (math.nan, START)):
-        step = stepped(friction, x=x)
+        start = jnp.asarray(x)
+        step = jax.tree.map(
+            lambda leaf: leaf[0],
+            jax.vmap(lambda mu, x=start: stepped(mu, x=x))(jnp.asarray([friction])),
+        )
         assert int(step.outcome) == vrw.Outcome.BAD_INPUT
         assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(step))
-    assert not np.any(np.asarray(stepped(-1.0).section_state))
+        assert not np.any(np.asarray(step.section_state))
 
 
 @pytest.mark.parametrize(

@@ -45,10 +45,10 @@ def workers(address: str) -> Iterator[Through]:
             cluster = LocalCluster(
                 n_workers=n_cores(), threads_per_worker=1, dashboard_address=None
             )
-            client = Client(stack.enter_context(cluster))
+            client = Client(stack.enter_context(cluster), set_as_default=False)
         else:
             try:
-                client = Client(address, timeout=ANSWER)
+                client = Client(address, timeout=ANSWER, set_as_default=False)
             except (OSError, ValueError) as error:  # no answer, or no address
                 raise ValueError(
                     f"no dask scheduler answers at {address!r}: give the address that it printed "
@@ -66,7 +66,7 @@ def _chunks(client: "Client", planned: Plan, missing: Sequence[int]) -> Iterator
     recipe = pickle.dumps((of.measures, of.base, of.model, of.options, of.cycle_options))
     here, waiting = origin(), iter(missing)
     held: dict[Future, int] = {}
-    coming = as_completed()
+    coming = as_completed(loop=client.loop)
 
     def fill() -> None:
         room = AHEAD * max(1, sum(client.nthreads().values())) - len(held)
