@@ -11,9 +11,9 @@ from vrw_jax.cycles import (
     LimitCycle,
     WalkedCycle,
     default_margins,
-    limit_cycle,
     sensitivities,
 )
+from vrw_jax.gaits import limit_cycle, limit_cycles
 from vrw_jax.models import (
     AbstractWheel,
     EnergyLoss,
@@ -72,6 +72,7 @@ __all__ = (
     "default_margins",
     "grid",
     "limit_cycle",
+    "limit_cycles",
     "newton_cycle",
     "open_scan",
     "paper_start",

@@ -309,6 +309,18 @@ def test_wheels_side_by_side_have_each_their_own_branch(branches):
     assert "none" in str(lost)
 
 
+@pytest.mark.slow
+def test_the_mesh_of_a_branch_is_as_fine_as_its_gaits_need_or_the_end_is_the_mesh_s():
+    wheel = vrw.WheelParams(slope=0.13)  # towards the least slope double support lasts and lasts
+    fixed = vrw.CycleOptions.tight()
+    coarse = vrw.continue_branch(wheel, "slope", (0.11, 0.14), cycle_options=fixed)
+    assert coarse.borders[0].name == "mesh_too_coarse"
+    assert coarse.ends[0].startswith("mesh too coarse at 0.1168")
+    fine = vrw.continue_branch(wheel, "slope", (0.11, 0.14))
+    assert fine.values[0] == 0.11
+    assert "range" in fine.ends[0]
+
+
 def test_a_rigid_wheel_is_followed_by_its_own_step():
     branch = vrw.continue_branch(
         vrw.WheelParams(), "slope", (0.2, 0.35), model=vrw.RigidWheel(stop_at_lift_off=False)

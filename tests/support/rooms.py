@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 FLOW = (
     ("simd",), ("runtime",), ("wording",), ("numerics",), ("wheel",), ("results",),
-    ("models",), ("walks",),
-    ("batches", "cycles"), ("branches", "tuning", "scans"), ("figures",), ("paper",), ("app",),
+    ("models",), ("walks",), ("batches", "cycles"), ("gaits",),
+    ("branches", "tuning", "scans"), ("figures",), ("paper",), ("app",),
 )  # fmt: skip
 """Rooms in the order in which they may know each other; those of one row do not."""
 

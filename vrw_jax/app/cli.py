@@ -136,7 +136,7 @@ def gait(
         params = settings.params(dict(assignment(text) for text in changes or []))
         import jax.numpy as jnp
 
-        from vrw_jax.cycles import limit_cycle
+        from vrw_jax.gaits import limit_cycle
         from vrw_jax.walks import step
         from vrw_jax.wheel import Outcome
 
@@ -155,10 +155,8 @@ def gait(
                 state = result.section_state
             if settings.rung == "auto":
                 model = result.choice.model
-            found_cold = model.rung == "viscoelastic"  # the other rungs' gaits need a guess
-            cycle: Any = (
-                limit_cycle(params) if found_cold else limit_cycle(params, guess=state, model=model)
-            )
+            cold = model.rung == "viscoelastic"  # the other rungs' gaits need a guess
+            cycle: Any = limit_cycle(params, guess=None if cold else state, model=model)
         printing.tell_gait(params, result, state, walked, cycle)
         if settings.rung == "auto":
             out.print(result.choice.why)

@@ -65,6 +65,12 @@ INDICATORS = ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
 ENDING = (*INDICATORS, "duration_dls", "duration_sls1", "duration_sls2")
 """Where one of these reaches zero the order of events changes, and the branch ends."""
 
+COARSE = Outcome.MESH_TOO_COARSE.name.lower()
+"""What an end is called where the gaits, not repeating when walked, are the mesh's alone."""
+
+MESH_ERROR, REFINEMENTS = 1e-8, 3
+"""Estimate of the mesh's error on a branch above which a finer one is taken, and how often."""
+
 
 @eqx.filter_jit
 def _read_gaits(
@@ -80,7 +86,7 @@ def _read_gaits(
 
 
 @dataclass(frozen=True)
-class _GaitRun(AbstractRun):
+class GaitRun(AbstractRun):
     """Of gaits: read by event-driven steps, kept where these go on and come back."""
 
     model: AbstractWheel
@@ -111,7 +117,9 @@ class _GaitRun(AbstractRun):
 
     def name_of_loss(self, table: Table, place: int) -> str:
         outcome = Outcome(int(table["outcome"][place]))
-        return IN_SEQUENCE if outcome == Outcome.STEPPED else outcome.name.lower()
+        if outcome != Outcome.STEPPED:
+            return outcome.name.lower()
+        return COARSE if "mesh_error" in table else IN_SEQUENCE
 
 
 def continue_branch(
@@ -130,10 +138,12 @@ def continue_branch(
 
     Starts from the limit cycle at `params` (or from `cycle`, found before at the same parameters)
     and goes both ways, through folds, on stable and unstable gaits alike, until the bounds or the
-    end of the branch. Every border on the way is located to 1e-9 in the parameter, if the step
+    end of the branch. `Branch.ends` says whose that is: the wheel's, whose events come in another
+    order, or the mesh's (`mesh_too_coarse`), which without `cycle_options` is made finer first,
+    up to eight times. Every border on the way is located to 1e-9 in the parameter, if the step
     between points (options.largest_step) does not hide it: two changes of sign within one step
-    cancel. Gaits are those of the cycle options, `CycleOptions.tight()` by default, and checked by
-    one event-driven step each, from which indicators and monitors come.
+    cancel. Gaits are those of the cycle options, at least `CycleOptions.tight()` by default, and
+    checked by one event-driven step each, from which indicators and monitors come.
 
     Other rungs' gaits are fixed points of their own return map, as exact as `step_options`. On real
     ground `name` may be "friction" too, and the start is a `WalkedCycle` or, without one, where a
@@ -183,18 +193,41 @@ def continue_branches(
     if name != FRICTION:
         _, params = model.moved(params, name, p)
     wanted = Wanted(params, model, name, p, period_n, cycle_options, step_options)
-    start = STARTS.get(model.rung, start_by_walking)(wanted, cycle)
-
-    limits = np.array([low, high])
-    run = _GaitRun(
-        start.followed, options, start.wheels, limits, model, step_options, params.n_legs
-    )
-    strands = run_all(run, start.z, p, start.outcomes == Outcome.STEPPED, start.make_cycle)
+    outcomes, strands = _followed(wanted, cycle, options, np.array([low, high]))
     one = lambda owner: jax.tree.map(lambda x: x[owner], params)
     return tuple(
-        _branch_of_gaits(strand, one(owner), name, model, step_options, int(start.outcomes[owner]))
+        _branch_of_gaits(strand, one(owner), name, model, step_options, int(outcomes[owner]))
         for owner, strand in enumerate(strands)
     )
+
+
+def _followed(
+    wanted: Wanted, cycle: Any, options: ArclengthOptions, limits: np.ndarray
+) -> tuple[np.ndarray, list[Strand | None]]:
+    """Outcomes of the starts, and what was followed from them.
+
+    On the mesh of the cycle options; without any, on one as fine as the branches need.
+    """
+    adaptive = wanted.cycle_options is None
+    for refinement in range(1 + REFINEMENTS):
+        start = STARTS.get(wanted.model.rung, start_by_walking)(wanted, cycle)
+        run = GaitRun(
+            start.followed, options, start.wheels, limits, wanted.model, wanted.step_options,
+            wanted.params.n_legs,
+        )  # fmt: skip
+        good = start.outcomes == Outcome.STEPPED
+        strands = run_all(run, start.z, wanted.p, good, start.make_cycle)
+        rough = any(strand is not None and _is_rough(strand) for strand in strands)
+        if not (adaptive and rough) or start.finer is None or refinement == REFINEMENTS:
+            break
+        wanted, cycle = wanted._replace(cycle_options=start.finer), start.cycle
+    return start.outcomes, strands
+
+
+def _is_rough(strand: Strand) -> bool:
+    """Whether the mesh, not the wheel, says how far the branch goes or how exact it is."""
+    ended = any(border.ends_branch and border.name == COARSE for border in strand.borders)
+    return ended or bool(np.max(strand.table.get("mesh_error", 0.0)) > MESH_ERROR)
 
 
 UNTOLD = ("outcome", "solver_steps")

@@ -16,7 +16,6 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from vrw_jax.cycles import (
-    LimitCycle,
     Located,
     Problem,
     correction_size,
@@ -25,7 +24,6 @@ from vrw_jax.cycles import (
 )
 from vrw_jax.models import AbstractWheel, RungState
 from vrw_jax.numerics import (
-    N_NODES,
     AbstractFollowed,
     Linear,
     Options,
@@ -34,6 +32,7 @@ from vrw_jax.numerics import (
     Solution,
     Unknown,
     arclength,
+    mesh_error,
     one_wheel,
 )
 from vrw_jax.results import MARGINS
@@ -89,6 +88,10 @@ class CycleFollowed(AbstractFollowedWheel):
         over_lanes = functools.partial(_linearised, self.problem, index)
         return Linear(*one_wheel(over_lanes)(self._moved(wheel, p), wheel.happens, z))
 
+    def _mesh_error(self, z: Solution) -> Array:
+        lanes = jax.tree.map(lambda x: x[..., None], z)
+        return mesh_error(self.problem.sequence, self.problem.meshes, lanes)[0]
+
     def section(self, z: Unknown) -> Section:
         return z.section
 
@@ -113,6 +116,7 @@ class CycleFollowed(AbstractFollowedWheel):
             "duration_sls1": shortest[1],
             "duration_sls2": shortest[2],
             "takeoff_acceleration": jnp.min(jnp.stack(takeoffs)),
+            "mesh_error": self._mesh_error(z),
         }
         return jnp.stack([end.q[0], *end.v]), formal
 
@@ -128,25 +132,6 @@ def _linearised(
     located = Located(z, happens, *nothing_known(problem, z.section))
     passed = problem.pass_at(parameters, located, (index,))
     return passed.correction, jax.tree.map(lambda x: x[0], passed.columns), passed.monodromy
-
-
-def on_mesh(problem: Problem, cycle: LimitCycle) -> Solution:
-    """A start on the mesh of `problem` from a cycle on any other.
-
-    Accelerations are interpolated over each phase, which is near enough for Newton's method.
-    """
-    found = cycle.located.solution
-    accelerations = []
-    for old, new, known in zip(
-        cycle.problem.meshes, problem.meshes, found.accelerations, strict=True
-    ):
-        n, _, _, dim = known.shape
-        rows = jnp.moveaxis(known.reshape(n, -1, dim), 1, -1)
-        at = jnp.asarray(new.node_times)
-        over_time = lambda row, old=old, at=at: jnp.interp(at, jnp.asarray(old.node_times), row)
-        moved = jnp.moveaxis(jax.vmap(jax.vmap(over_time))(rows), -1, 1)
-        accelerations.append(moved.reshape(n, new.n_steps, N_NODES, dim))
-    return Solution(found.section, found.durations, tuple(accelerations))
 
 
 class RungFollowed(AbstractFollowedWheel):

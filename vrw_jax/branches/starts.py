@@ -1,7 +1,6 @@
 """Where a branch begins, each rung by its own means: gaits to be followed, and their wheels."""
 
 import dataclasses
-import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -15,10 +14,10 @@ from vrw_jax.branches.followed import (
     CycleFollowed,
     RungFollowed,
     Wheel,
-    on_mesh,
 )
 from vrw_jax.branches.run import MakeCycle
-from vrw_jax.cycles import CycleOptions, LimitCycle, Problem, limit_cycle
+from vrw_jax.cycles import CycleOptions, LimitCycle, finder_of, on_mesh
+from vrw_jax.gaits import limit_cycles
 from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import Options, PathPoint
 from vrw_jax.walks import walk_towards
@@ -45,6 +44,8 @@ class Start(NamedTuple):
     z: Any
     outcomes: np.ndarray  # of the gaits to begin with
     make_cycle: MakeCycle
+    cycle: Any = None  # the gaits themselves
+    finer: CycleOptions | None = None  # options with a finer mesh; None where there is no mesh
 
 
 def start_by_collocation(wanted: Wanted, cycle: Any) -> Start:
@@ -54,13 +55,14 @@ def start_by_collocation(wanted: Wanted, cycle: Any) -> Start:
     # The start needs neither the mesh nor the accuracy of the branch.
     start = cycle
     if start is None:
-        start = jax.vmap(functools.partial(limit_cycle, period_n=period_n))(params)
+        start = limit_cycles(params, period_n=period_n, model=wanted.model)
     if not isinstance(start, LimitCycle):
         raise TypeError(
             f"cycle is a {type(start).__name__}, but the paper's branch starts from a "
             "LimitCycle: give vrw.limit_cycle(params)."
         )
-    problem = Problem(params.n_legs, period_n, options)
+    finder: Any = finder_of(wanted.model, params.n_legs, period_n=period_n, cycle_options=options)
+    problem = finder.problem
 
     def make_cycle(owner: int, point: PathPoint) -> Callable[[], LimitCycle]:
         def find() -> LimitCycle:
@@ -69,16 +71,18 @@ def start_by_collocation(wanted: Wanted, cycle: Any) -> Start:
             guess = dataclasses.replace(guess, located=located, problem=problem)
             wheel = jax.tree.map(lambda x: x[owner], params)
             _, wheel = wanted.model.moved(wheel, name, jnp.asarray(point.p))
-            return limit_cycle(wheel, guess=guess, period_n=period_n, options=options)
+            return finder.cycle(wheel, guess)
 
         return find
 
     return Start(
         CycleFollowed(problem=problem, name=name),
         Wheel(params, start.located.happens),
-        jax.vmap(functools.partial(on_mesh, problem))(start),
+        jax.vmap(lambda found: on_mesh(start.problem, problem, found))(start.located.solution),
         np.asarray(start.outcome),
         make_cycle,
+        start,
+        options.finer(),
     )
 
 

@@ -1,7 +1,7 @@
 """Gaits that repeat: found, checked and differentiated, each rung by its own means."""
 
 from vrw_jax.cycles.by_collocation import CollocationFinder
-from vrw_jax.cycles.collocated import LimitCycle
+from vrw_jax.cycles.collocated import LimitCycle, on_mesh
 from vrw_jax.cycles.cycle import MEASURED, ON_STABILITY, AbstractCycle
 from vrw_jax.cycles.finder import (
     AGREEMENT,
@@ -13,7 +13,7 @@ from vrw_jax.cycles.finder import (
     read_along_lanes,
     same_branch,
 )
-from vrw_jax.cycles.finding import finder_of, limit_cycle
+from vrw_jax.cycles.finding import Guess, finder_for, finder_of, near
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.premises import default_margins, takeoff_acceleration
 from vrw_jax.cycles.search import Located, Problem, correction_size, nothing_known

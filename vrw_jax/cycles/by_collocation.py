@@ -1,5 +1,6 @@
 """Gaits of the paper's wheel: one algebraic system for the cycle, one step as a check."""
 
+import dataclasses
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, ClassVar
 
@@ -8,7 +9,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from vrw_jax.cycles.collocated import LimitCycle, solved, walked_guess
+from vrw_jax.cycles.collocated import (
+    LimitCycle,
+    guess_along,
+    on_mesh,
+    sampled_walk,
+    solved,
+)
 from vrw_jax.cycles.cycle import MEASURED, AbstractCycle
 from vrw_jax.cycles.finder import (
     AbstractGaitFinder,
@@ -21,11 +28,11 @@ from vrw_jax.cycles.finder import (
 )
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.search import Located, Problem, surface_start
-from vrw_jax.models import AbstractStep, StepResult, ViscoelasticWheel
+from vrw_jax.models import AbstractStep, SectionState, StepResult, ViscoelasticWheel
 from vrw_jax.numerics import Options, with_jacobian
 from vrw_jax.results import MARGINS, MEASURES
 from vrw_jax.walks import checked
-from vrw_jax.wheel import PARAMETER_NAMES, WheelParams, parameters_of, wheel_of
+from vrw_jax.wheel import PARAMETER_NAMES, WheelParams, parameters_of, transitions, wheel_of
 
 
 class CollocationFinder(AbstractGaitFinder):
@@ -59,7 +66,11 @@ class CollocationFinder(AbstractGaitFinder):
     @property
     def problem(self) -> Problem:
         """What is static in the search."""
-        return Problem(self.n_legs, self.period_n, self.options)
+        return Problem(self.n_legs, self.period_n, self.options, self.model.stop_at_lift_off)
+
+    def finer(self) -> "CollocationFinder":
+        """The same on a mesh about twice as fine."""
+        return dataclasses.replace(self, options=self.options.finer())
 
     @classmethod
     def read(cls, name: str, cycle: AbstractCycle, step: AbstractStep) -> Array:
@@ -75,13 +86,35 @@ class CollocationFinder(AbstractGaitFinder):
         return value
 
     def cycle(self, params: WheelParams, guess: Any = None) -> LimitCycle:
-        if guess is None or isinstance(guess, Located):
-            return solved(params, self.problem, guess)
         if isinstance(guess, LimitCycle) and guess.problem == self.problem:
-            return solved(params, self.problem, guess.located)
-        x = guess.section_state if isinstance(guess, AbstractCycle) else guess
-        params, state, _, _ = checked(params, x, None, None)
-        return solved(params, self.problem, walked_guess(params, self.problem, state))
+            guess = guess.located
+        elif guess is not None and not isinstance(guess, Located):
+            x = guess.section_state if isinstance(guess, AbstractCycle) else guess
+            params, state, _, _ = checked(params, x, None, None)
+            guess = self.after(params, state)
+        return dataclasses.replace(solved(params, self.problem, guess), model=self.model)
+
+    def after(self, params: WheelParams, x: SectionState) -> Located:
+        """A start from where a walk is: the next `period_n` steps of it."""
+        walked = sampled_walk(self.model, params, x, self.period_n)
+        return guess_along(self.problem, params, walked)
+
+    def counted_from(self, step: int, params: WheelParams, located: Located) -> Located:
+        """The same cycle, counted from another of its steps."""
+        before = located.ends[step - 1]
+        landing = transitions.land(params.symbols(), before[0], *before[2:])
+        solution, happens, ends = jax.tree.map(
+            lambda x: jnp.roll(x, -step, 0), (located.solution, located.happens, located.ends)
+        )
+        section = jnp.stack([landing.theta, landing.motion.dtheta])
+        return located._replace(
+            solution=solution._replace(section=section), happens=happens, ends=ends
+        )
+
+    def on_mesh(self, problem: Problem, located: Located) -> Located:
+        """A start from what was located on the mesh of `problem`."""
+        solution = on_mesh(problem, self.problem, located.solution)
+        return located._replace(solution=solution)
 
     def first_guess(self, values: Values) -> Located:
         lane = surface_start(self.problem, values[:, None], jnp.ones((1,), bool))

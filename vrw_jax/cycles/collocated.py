@@ -7,6 +7,7 @@ and reverse mode, and to any order.
 
 import functools
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -28,6 +29,7 @@ from vrw_jax.numerics import (
     compiled_by_caller,
     floquet,
     mesh_error,
+    transfer_matrix,
 )
 from vrw_jax.results import Row, listed
 from vrw_jax.walks import step
@@ -73,6 +75,7 @@ class LimitCycle(AbstractCycle):
     located: Located
     matrix: Float[Array, "2 2"]
     problem: Problem = eqx.field(static=True)
+    model: ViscoelasticWheel = ViscoelasticWheel()  # whose ground the monitors are for
 
     @property
     def period_n(self) -> int:
@@ -133,7 +136,7 @@ class LimitCycle(AbstractCycle):
 
         def walk(parameters: Array, section_state: Array) -> Margins:
             wheel = wheel_of(parameters, self.problem.n_legs)
-            return step(wheel, section_state).monitors
+            return step(wheel, section_state, model=self.model).monitors
 
         return self._mapped(walk)(self.parameters, self.section_state)
 
@@ -220,25 +223,54 @@ N_SAMPLES = 1025
 the fast start of a step without double support is lost, and Newton with it."""
 
 
+class SampledWalk(NamedTuple):
+    """A walk, event by event, as a start on any mesh."""
+
+    post_impact: Float[Array, "2"]  # (theta, dtheta) after the first landing
+    distances: Float[Array, " n"]  # between the feet at each landing, m
+    durations: Float[Array, "n 3"]
+    states: Float[Array, "n 3 n_samples 6"]  # theta, L1, L2 and their rates in each phase
+
+
 @eqx.filter_jit
-def walked_guess(params: WheelParams, problem: Problem, x: SectionState) -> Located:
-    """The cycle's unknowns as `period_n` event-driven steps from a section state tell them."""
-    model, options, s = ViscoelasticWheel(), Options(), params.symbols()
+def sampled_walk(
+    model: ViscoelasticWheel, params: WheelParams, x: SectionState, n_steps: int
+) -> SampledWalk:
+    """`n_steps` event-driven steps from a section state."""
+    options, s = Options(), params.symbols()
     landing = transitions.land(s, *x)
     section = jnp.stack([landing.theta, landing.motion.dtheta])
-    durations, accelerations = [], []
-    for _ in range(problem.period_n):
-        distance = transitions.land(s, *x).distance
+
+    def one(x: Array, _: None) -> tuple[Array, tuple]:
         states = model.trace(params, x, options, N_SAMPLES).state
         walked = model.advance(params, x, options)
-        x = walked.section_state
-        durations.append(walked.durations)
-        accelerations.append(_accelerations_along(problem, s, distance, states))
-    together = jnp.stack(durations)
-    by_phase = tuple(jnp.stack(steps) for steps in zip(*accelerations, strict=True))
-    happens = (together > 0.0).astype(section.dtype)
-    solution = Solution(section, together, by_phase)
-    return lax.stop_gradient(Located(solution, happens, *nothing_known(problem, section)))
+        told = transitions.land(s, *x).distance, walked.durations, states
+        return walked.section_state, told
+
+    _, told = lax.scan(one, x, None, length=n_steps)
+    return SampledWalk(section, *told)
+
+
+@eqx.filter_jit
+def guess_along(problem: Problem, params: WheelParams, walked: SampledWalk) -> Located:
+    """The cycle's unknowns as a walk of `period_n` steps tells them."""
+    accelerations = functools.partial(_accelerations_along, problem, params.symbols())
+    happens = (walked.durations > 0.0).astype(walked.durations.dtype)
+    by_phase = jax.vmap(accelerations)(walked.distances, walked.states)
+    solution = Solution(walked.post_impact, walked.durations, by_phase)
+    nothing = nothing_known(problem, walked.post_impact)
+    return lax.stop_gradient(Located(solution, happens, *nothing))
+
+
+def on_mesh(known: Problem, wanted: Problem, found: Solution) -> Solution:
+    """A start on another mesh: each step's accelerations are a polynomial of their own."""
+    accelerations = []
+    for old, new, rows in zip(known.meshes, wanted.meshes, found.accelerations, strict=True):
+        matrix = jnp.asarray(transfer_matrix(old, new), found.section.dtype)
+        n, _, _, dim = rows.shape
+        moved = jnp.einsum("ij,njd->nid", matrix, rows.reshape(n, -1, dim))
+        accelerations.append(moved.reshape(n, new.n_steps, N_NODES, dim))
+    return Solution(found.section, found.durations, tuple(accelerations))
 
 
 def _accelerations_along(

@@ -1,7 +1,7 @@
 """The gait of a wheel, by the finder of its rung."""
 
 from collections.abc import Sequence
-from typing import Any, overload
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,12 +16,11 @@ from vrw_jax.cycles.finder import AbstractGaitFinder
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.search import Located
 from vrw_jax.cycles.section_cycle import WalkedCycle
-from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import Options
 from vrw_jax.results import listed
 from vrw_jax.walks import ModelLike, one_wheel, options_of, rung_of, state_of
 from vrw_jax.wheel import WheelParams
-from vrw_jax.wording import instance, whole
+from vrw_jax.wording import instance
 
 Guess = LimitCycle | WalkedCycle | Array | np.ndarray | Sequence[float]
 """A neighbour's cycle, or a section state near the one that is wanted."""
@@ -47,58 +46,6 @@ def finder_of(
     make = FINDERS.get(rung.rung, SectionFinder).of
     return make(rung, n_legs, options_of(step_options), period_n,
                 CycleOptions() if cycle_options is None else cycle_options)  # fmt: skip
-
-
-@overload
-def limit_cycle(
-    params: WheelParams,
-    *,
-    guess: Guess | None = None,
-    period_n: int = 1,
-    model: None = None,
-    options: CycleOptions | Options | None = None,
-) -> LimitCycle: ...
-
-
-@overload
-def limit_cycle(
-    params: WheelParams,
-    *,
-    guess: Guess | None = None,
-    period_n: int = 1,
-    model: AbstractWheel,
-    options: CycleOptions | Options | None = None,
-) -> LimitCycle | WalkedCycle: ...
-
-
-def limit_cycle(
-    params: WheelParams,
-    *,
-    guess: Guess | None = None,
-    period_n: int = 1,
-    model: AbstractWheel | None = None,
-    options: CycleOptions | Options | None = None,
-) -> LimitCycle | WalkedCycle:
-    """The limit cycle of this wheel: the gait that repeats after `period_n` steps.
-
-    Needs no start for `period_n` 1. `guess`, a neighbour's cycle or a section state (theta-,
-    dtheta-, dL1-) near the gait, makes it quicker and picks the branch. Found cycles satisfy the
-    paper's sequence of phases at all nodes, stable or not. Errors at the default options: 1e-9
-    relative in values, 1e-8 in first derivatives, while steps last some 1.5 s at most; longer ones
-    are told by `mesh_error`, and not found above 1e-5. Differentiable in every mode and order;
-    `jax.vmap` runs the wheels side by side.
-
-    Any other rung as `model` is solved on its own return map, with `Options` of its step: a
-    `WalkedCycle`, to the step's errors.
-    """
-    finder = finder_for(params, model, options, whole("period_n", period_n))
-    if guess is None and period_n > 1:
-        raise ValueError(
-            f"period_n is {period_n} and there is no guess, but a gait of several steps is one of "
-            "many beside the gait of one step: give guess=, a section state near it."
-        )
-    found: Any = finder.cycle(params, near(guess))
-    return found
 
 
 def near(guess: Any) -> Any:

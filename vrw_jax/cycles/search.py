@@ -47,10 +47,11 @@ class Problem(NamedTuple):
     n_legs: int
     period_n: int
     options: CycleOptions
+    stop_at_lift_off: bool = True  # whether a ground that would have to pull is no gait
 
     @property
     def sequence(self) -> PhaseSequence:
-        return held_landing(self.n_legs)
+        return held_landing(self.n_legs, self.stop_at_lift_off)
 
     @property
     def meshes(self) -> tuple[Mesh, ...]:

@@ -50,7 +50,7 @@ def _symbols(n_legs: int, constants: Constants) -> Symbols:
     return Symbols(*fields)
 
 
-def _collocated(n_legs: int, index: int) -> Phase:
+def _collocated(n_legs: int, stop_at_lift_off: bool, index: int) -> Phase:
     """A phase of the wheel over the constants of `constants_of`."""
     kind = PHASES[index]
 
@@ -68,7 +68,9 @@ def _collocated(n_legs: int, index: int) -> Phase:
 
     def guards(constants: Constants, point: Point) -> Vector:
         phase, motion = at(constants, point)
-        return phase.guards(Instant(phase, motion, None))
+        guards = phase.guards(Instant(phase, motion, None))
+        # Every guard keeps its place in SIGNS, the one that nobody looks at too.
+        return guards if stop_at_lift_off else (*guards[:-1], jnp.ones_like(guards[-1]))
 
     def to_next_phase(constants: Constants, point: Point) -> Point:
         phase, motion = at(constants, point)
@@ -98,9 +100,9 @@ guards, then the checks at the borders between phases; and that the mesh resolve
 
 
 @functools.cache
-def held_landing(n_legs: int) -> PhaseSequence:
+def held_landing(n_legs: int, stop_at_lift_off: bool = True) -> PhaseSequence:
     """DLS, SLS-I, SLS-II on the plane section (theta+, dtheta+) after the impact."""
-    phases = tuple(_collocated(n_legs, index) for index in range(len(PHASES)))
+    phases = tuple(_collocated(n_legs, stop_at_lift_off, index) for index in range(len(PHASES)))
 
     def start(constants: Constants, section: Vector) -> Point:
         s = _symbols(n_legs, constants)

@@ -136,6 +136,7 @@ class Ending(Code):
     STALLED = 3, "Newton's method found no next point, however short the step."
     BUFFER_FULL = 4, "It has as many points as were allowed: raise max_points."
     NO_START = 5, "No point was found to start from."
+    CLOSED = 6, "It came back to where it began."
 
 
 class PathPoint(NamedTuple):

@@ -1,0 +1,304 @@
+"""The gait of a wheel wherever one can be reached: searched for, on a finer mesh, walked to.
+
+The search (`cycles`) begins where gaits are in the paper's box and on a mesh that suits them. Where
+it fails, lanes walk (`batches`) from starts that scale with the wheel, and a walk that goes on is
+the start of another search; where the mesh fails, it is made finer. Only values decide: under a
+`jit` or `vmap` of the caller the search is alone.
+"""
+
+import functools
+from typing import Any, NamedTuple, overload
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from vrw_jax import cycles
+from vrw_jax.batches import steps
+from vrw_jax.cycles import (
+    AbstractGaitFinder,
+    CollocationFinder,
+    CycleOptions,
+    Guess,
+    LimitCycle,
+    Located,
+    WalkedCycle,
+)
+from vrw_jax.models import AbstractWheel
+from vrw_jax.numerics import Options, select
+from vrw_jax.wheel import Outcome, WheelParams, parameters_of
+from vrw_jax.wording import whole
+
+LOST = (Outcome.NO_CYCLE_FOUND, Outcome.ORDER_DIFFERS, Outcome.MESH_TOO_COARSE)
+"""Outcomes of a search that may have missed a gait."""
+
+MESH_ERROR = 1e-7
+"""Estimate of the mesh's error above which a finer mesh is taken: the errors themselves are a
+hundredth of it, and what the options promise."""
+
+REFINEMENTS = 3
+"""How often a mesh is made twice as fine at most."""
+
+N_STEPS = 80
+"""Steps of a walk towards a gait."""
+
+STARTS = ((1.0, 0.45), (1.0, 0.7), (1.0, 1.0), (0.5, 1.0), (0.0, 1.0))
+"""Where walks start: how much of its static contraction Leg 1 has at touchdown, and the rate of the
+hub as a share of the rigid rolling gait's. Of 143 gaits of random wheels with 5 to 16 legs walks
+from these reach all (experiments/gaits/off_the_box.py)."""
+
+NEAR = 0.1
+"""Most by which a walk that is a start may miss its own state one period ago, rad, rad/s, m/s."""
+
+SHAPES = (1, 8, 64, 512, 4096)
+"""Numbers of lanes that programs are compiled for."""
+
+
+@overload
+def limit_cycle(
+    params: WheelParams,
+    *,
+    guess: Guess | None = None,
+    period_n: int = 1,
+    model: None = None,
+    options: CycleOptions | Options | None = None,
+) -> LimitCycle: ...
+
+
+@overload
+def limit_cycle(
+    params: WheelParams,
+    *,
+    guess: Guess | None = None,
+    period_n: int = 1,
+    model: AbstractWheel,
+    options: CycleOptions | Options | None = None,
+) -> LimitCycle | WalkedCycle: ...
+
+
+def limit_cycle(
+    params: WheelParams,
+    *,
+    guess: Guess | None = None,
+    period_n: int = 1,
+    model: AbstractWheel | None = None,
+    options: CycleOptions | Options | None = None,
+) -> LimitCycle | WalkedCycle:
+    """The limit cycle of this wheel: the gait that repeats after `period_n` steps.
+
+    Needs no start for `period_n` 1. `guess`, a neighbour's cycle or a section state (theta-,
+    dtheta-, dL1-) near the gait, makes it quicker and picks the branch. Found cycles satisfy the
+    paper's sequence of phases at all nodes, stable or not. Errors: 1e-9 relative in values, 1e-8 in
+    first derivatives; without `options` the mesh is made as fine as that needs, with them it is
+    theirs, and `mesh_error` tells what it leaves. Differentiable in every mode and order.
+
+    Where the search fails, walks are tried, and finer meshes. Under `jax.jit` and `jax.vmap`
+    neither can be: the search is alone there, on the mesh of the options. See `limit_cycles`.
+
+    Any other rung as `model` is solved on its own return map, with `Options` of its step: a
+    `WalkedCycle`, to the step's errors.
+    """
+    finder = cycles.finder_for(params, model, options, whole("period_n", period_n))
+    if guess is None and period_n > 1:
+        raise ValueError(
+            f"period_n is {period_n} and there is no guess, but a gait of several steps is one of "
+            "many beside the gait of one step: give guess=, a section state near it."
+        )
+    cycle: Any = _wherever(finder, params, cycles.near(guess), options is None)
+    return cycle
+
+
+def limit_cycles(
+    params: WheelParams,
+    *,
+    period_n: int = 1,
+    model: AbstractWheel | None = None,
+    options: CycleOptions | Options | None = None,
+) -> LimitCycle | WalkedCycle:
+    """`limit_cycle` of a batch of wheels side by side; fields have one leading axis, or none.
+
+    The result's fields have it too. All are told on one mesh, as fine as any of them needs.
+    """
+    shape = np.broadcast_shapes(*(np.shape(x) for x in jax.tree.leaves(params)))
+    if len(shape) != 1:
+        raise ValueError(f"the wheels' batch has shape {shape}, but it must have one axis.")
+    params = jax.tree.map(lambda x: jnp.broadcast_to(x, shape), params)
+    one = jax.tree.map(lambda x: x[0], params)
+    finder = cycles.finder_for(one, model, options, whole("period_n", period_n))
+    cycle: Any = _wherever(finder, params, None, options is None)
+    return cycle
+
+
+def _wherever(finder: Any, params: WheelParams, guess: Any, adaptive: bool) -> Any:
+    """The cycle of one wheel or of a batch, by all means."""
+    many = params.damping.ndim > 0
+    cycle = _searched(finder, params, guess)
+    known = lax.stop_gradient((params, cycle))  # what derivatives are taken of has values, too
+    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(known))
+    if not finder.from_nothing or traced:
+        return cycle
+    if not many:
+        known = jax.tree.map(lambda x: x[None], known)
+    reached = _reached(finder, *known, adaptive)
+    if reached is None and finder.period_n > 1 and guess is not None:
+        reached = _from_another_step(finder, *known, np.asarray(_state(guess))[None])
+    if reached is None:
+        return cycle
+    finder, located = reached
+    return _searched(finder, params, located if many else jax.tree.map(lambda x: x[0], located))
+
+
+def _searched(finder: AbstractGaitFinder, params: WheelParams, guess: Any) -> Any:
+    """The cycle of one wheel, or of each of a batch."""
+    if not params.damping.ndim:
+        return finder.cycle(params, guess)
+    if guess is None:
+        return jax.vmap(finder.cycle)(params)
+    return jax.vmap(finder.cycle)(params, guess)
+
+
+def _in_shapes(function: Any, *trees: Any) -> Any:
+    """`function` of trees with a leading axis, filled up to one of `SHAPES` lanes at a time."""
+    n, parts = len(jax.tree.leaves(trees)[0]), []
+    for begin in range(0, n, SHAPES[-1]):
+        some = np.arange(begin, min(begin + SHAPES[-1], n))
+        size = next(size for size in SHAPES if size >= len(some))
+        filled = np.pad(some, (0, size - len(some)), mode="edge")
+        found = function(*_taken(trees, filled))
+        parts.append(_taken(found, slice(0, len(some))))
+    return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
+
+
+def _taken(tree: Any, places: Any) -> Any:
+    return jax.tree.map(lambda x: jnp.asarray(x)[places], tree)
+
+
+def _put(tree: Any, places: np.ndarray, values: Any) -> Any:
+    return jax.tree.map(lambda x, v: jnp.asarray(x).at[places].set(v), tree, values)
+
+
+class _Walks(NamedTuple):
+    """Where walks of a batch of wheels are after N_STEPS."""
+
+    reached: np.ndarray  # whether one goes on, and repeats to NEAR
+    x: np.ndarray  # (lanes, 3): section state of the one that repeats best
+
+
+def _starts_of(params: WheelParams) -> np.ndarray:
+    """STARTS of each wheel, (start, lane, 3)."""
+    s = jax.tree.map(np.asarray, params.symbols())
+    weight = s.Mt * s.g * np.cos(np.asarray(params.slope))
+    static = np.asarray(params.natural_length - weight / params.stiffness) / s.L0
+    rolling = np.sqrt(4.0 * s.g / s.L0 * np.sin(0.5 * s.alpha) * np.sin(params.slope)) / s.sin_alpha
+    told = []
+    for contraction, share in STARTS:
+        length = np.clip(1.0 + contraction * (static - 1.0), s.cos_alpha + 0.02, 1.0)
+        theta = np.arctan((length - s.cos_alpha) / s.sin_alpha)
+        told.append(np.stack([theta, share * rolling, -0.1 * np.sqrt(s.g * s.L0) / 3.0], -1))
+    return np.stack(told)
+
+
+def _walked(finder: CollocationFinder, params: WheelParams, wanted: np.ndarray) -> _Walks:
+    """Walks of the wheels that are `wanted`."""
+    n, places = len(wanted), np.flatnonzero(wanted)
+    best, x = np.full(n, np.inf), np.zeros((n, 3))
+    if not len(places):
+        return _Walks(wanted, x)
+    own, model = _taken(params, places), finder.model
+    for start in _starts_of(own):
+        there = steps(own, start, N_STEPS, model=model)
+        states = np.array(there.section_state)
+        walking = np.flatnonzero(np.asarray(there.outcome) == Outcome.STEPPED)
+        if not len(walking):
+            continue
+        later = steps(_taken(own, walking), states[walking], finder.period_n, model=model)
+        missed = np.abs(np.asarray(later.section_state) - states[walking]).max(-1)
+        missed = np.where(np.asarray(later.outcome) == Outcome.STEPPED, missed, np.inf)
+        nearer = missed < best[places[walking]]
+        lanes = places[walking[nearer]]
+        best[lanes], x[lanes] = missed[nearer], states[walking[nearer]]
+    return _Walks(best < NEAR, x)
+
+
+def _begun(
+    finder: CollocationFinder, params: WheelParams, located: Located, has: np.ndarray, walks: _Walks
+) -> Located:
+    """Where searches begin: at what was located, else along walks, else on the surface of gaits."""
+    values = jnp.moveaxis(parameters_of(params), 0, -1)
+    start = jax.vmap(finder.first_guess)(values)
+    along = np.flatnonzero(walks.reached & ~has)
+    if len(along):
+        walk = jax.vmap(finder.after)
+        start = _put(start, along, _in_shapes(walk, _taken(params, along), walks.x[along]))
+    return jax.vmap(select)(jnp.asarray(has), located, start)
+
+
+def _reached(
+    finder: CollocationFinder, params: WheelParams, cycle: LimitCycle, adaptive: bool
+) -> tuple[CollocationFinder, Located] | None:
+    """A finder and starts from which it finds more of a batch's gaits; None: there is none.
+
+    `adaptive`: whether the mesh may be another.
+    """
+    outcome = np.asarray(cycle.outcome)
+    rough = adaptive & (np.asarray(cycle.mesh_error) > MESH_ERROR)
+    lost = np.isin(outcome, LOST)
+    open_ = lost | rough
+    if not open_.any():
+        return None
+    walks = _walked(finder, params, lost)
+    # Each lane's best start so far, located by a search and told on the mesh of `finder`.
+    located, has = cycle.located, rough.copy()
+    coarse = outcome == Outcome.MESH_TOO_COARSE
+    best = None
+    for refinement in range(1 + REFINEMENTS * adaptive):
+        if refinement:
+            before, finder = finder, finder.finer()
+            located = jax.vmap(functools.partial(finder.on_mesh, before.problem))(located)
+        # The search's own mesh has been tried without walks; without reason, one finer mesh is.
+        promising = walks.reached | has | (coarse & (refinement > 0)) | (refinement == 1)
+        places = np.flatnonzero(open_ & promising)
+        if not len(places):
+            continue
+        some, own = _taken(params, places), _Walks(*(part[places] for part in walks))
+        begin = _begun(finder, some, _taken(located, places), has[places], own)
+        again = _in_shapes(functools.partial(_searched, finder), some, begin)
+        gait, error = np.asarray(again.found), np.asarray(again.mesh_error)
+        located = _put(located, places[gait], _taken(again.located, gait))
+        if gait.any():
+            best = finder, located
+        has[places[gait]] = True
+        coarse[places] = np.asarray(again.outcome) == Outcome.MESH_TOO_COARSE
+        open_[places[gait & ((error <= MESH_ERROR) | (not adaptive))]] = False
+    return best
+
+
+def _state(guess: Any) -> Any:
+    """Its section state, of a guess that is a cycle or one itself."""
+    return getattr(guess, "section_state", guess)
+
+
+def _from_another_step(
+    finder: CollocationFinder, params: WheelParams, cycle: LimitCycle, x: np.ndarray
+) -> tuple[CollocationFinder, Located] | None:
+    """The same orbit, counted from another of its steps.
+
+    A guess holds the accelerations of all steps, and what they are wrong by adds up: where a step
+    without double support, the most sensitive of all, comes first or last, it may be too much.
+    """
+    lost = np.flatnonzero(np.isin(np.asarray(cycle.outcome), LOST))
+    if not len(lost):
+        return None
+    some, x, best = _taken(params, lost), np.array(x[lost]), None
+    located = cycle.located
+    for ahead in range(1, finder.period_n):
+        x = np.asarray(steps(some, x, model=finder.model).section_state)
+        found = _in_shapes(functools.partial(_searched, finder), some, x)
+        gait = np.flatnonzero(np.asarray(found.found) & (np.asarray(located.found)[lost] < 0.5))
+        if len(gait):
+            back = jax.vmap(functools.partial(finder.counted_from, finder.period_n - ahead))
+            own = back(_taken(some, gait), _taken(found.located, gait))
+            located = _put(located, lost[gait], own)
+            best = finder, located
+    return best
