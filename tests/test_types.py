@@ -1,0 +1,78 @@
+"""mypy and pyright accept the README's lines as written, and refuse what can be seen to be wrong."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+MORE = """
+import numpy as np
+
+tuned = vrw.tune(params, "dls_fraction", ["damping"], {"damping": (100.0, 200.0)})
+print(tuned.step.monitors.contraction, tuned.cycle.speed)
+batch = vrw.WheelParams(damping=np.linspace(1.0, 2.0, 3), slope=0.3)
+print(vrw.steps(batch, np.ones((3, 3)), engine="lanes").n_stepped)
+print(vrw.Options(solver="Tsit5", rtol=1e-8).rtol, vrw.UnilateralWheel(friction=0.7).friction)
+"""
+"""Lines of other pages."""
+
+BAD = """import vrw_jax as vrw
+
+vrw.WheelParams(damping="fast")
+vrw.steps(vrw.WheelParams(), vrw.paper_start()[None], engine="lane")
+vrw.Options(solver="RK4")
+vrw.Options(rtol="small")
+vrw.CycleOptions(steps=(1, 2))
+vrw.UnilateralWheel(stoppers="none")
+vrw.UnilateralWheel(friction="high")
+vrw.step(vrw.WheelParams(), vrw.paper_start(), options=vrw.CycleOptions())
+vrw.limit_cycle({"damping": 200.0})
+vrw.step(vrw.WheelParams(), vrw.paper_start(), model="rigid")
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    place = tmp_path_factory.mktemp("typed")
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
+    (place / "good.py").write_text("\n".join(blocks) + MORE)
+    (place / "bad.py").write_text(BAD)
+    settings = {"typeCheckingMode": "standard", "extraPaths": [str(ROOT)]}
+    (place / "pyrightconfig.json").write_text(json.dumps(settings))
+    return place
+
+
+def refused(folder: Path, command: list[str], line: str) -> dict[str, set[int]]:
+    """Lines with an error by file."""
+    env = os.environ | {"MYPYPATH": str(ROOT)}
+    run = subprocess.run(
+        [sys.executable, "-m", *command], cwd=folder, env=env, capture_output=True, text=True
+    )
+    told: dict[str, set[int]] = {"good.py": set(), "bad.py": set()}
+    for name, number in re.findall(line, run.stdout, re.M):
+        told[name].add(int(number))
+    assert told["bad.py"], run.stdout + run.stderr
+    return told
+
+
+@pytest.mark.parametrize(
+    ("command", "line"),
+    [
+        (
+            ["mypy", "--ignore-missing-imports", "--follow-imports=silent", "good.py", "bad.py"],
+            r"^(\w+\.py):(\d+): error",
+        ),
+        (["basedpyright", "--level", "error", "."], r"/(\w+\.py):(\d+):\d+ - error"),
+    ],
+    ids=("mypy", "pyright"),
+)
+def test_a_checker_accepts_the_readme_and_refuses_each_bad_line(folder, command, line):
+    told = refused(folder, command, line)
+    assert not told["good.py"]
+    assert told["bad.py"] == set(range(3, 3 + len(BAD.splitlines()) - 2))
