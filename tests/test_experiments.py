@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 MODULES = {
     ".".join(path.relative_to(ROOT).with_suffix("").parts): path
-    for path in sorted((ROOT / "experiments").glob("*/*.py"))
+    for path in sorted((ROOT / "experiments").glob("*/**/*.py"))
     if path.name != "__init__.py"
 }
 STARTED = """

@@ -89,6 +89,13 @@ def test_a_walk_in_a_batch_is_the_walk_alone():
         np.testing.assert_allclose(many.times[i], one(height).times, rtol=1e-13)
 
 
+@pytest.mark.parametrize("height", [-1e-17, 1e-17, 0.0])
+def test_a_start_that_is_a_rounding_off_its_guard_is_on_it(height):
+    told = walk([ball()], [height, 1.0], events=1, options=TIGHT)
+    assert code(told) == Stop.EVENTS_DONE
+    assert abs(float(told.time) - 2.0 / G) < 1e-14
+
+
 def test_what_goes_wrong_on_the_way_is_a_code():
     assert code(walk([ball()], [-1.0, 0.0], events=3)) == Stop.GUARD_PAST
     short = vrw.Options(max_phase_time=0.1)

@@ -77,8 +77,9 @@ def walk(
     """Follow `modes` from `start` through at most `events` events.
 
     Guards are met as `integrate_phase` meets them: the earliest first, at the integrator's
-    accuracy, with derivatives of event times and states. A guard that a reset leaves within the
-    clock's rounding of zero counts as zero. Transforms (`jax.jit`, `jax.jacfwd`, `jax.vmap`) apply.
+    accuracy, with derivatives of event times and states. A guard within the clock's rounding of
+    zero where its mode begins counts as zero. Transforms (`jax.jit`, `jax.jacfwd`, `jax.vmap`)
+    apply.
     """
     options = Options() if options is None else options
     start = as_float_array(start)
@@ -125,7 +126,8 @@ def _entered(mode: Mode, state: Array, time: Array, options: Options) -> tuple[P
     values = lambda y: jnp.stack([guard.value(y) for guard in mode.guards])
     first, rates = jax.jvp(values, (state,), (mode.field(state),))
     first, rates = lax.stop_gradient((first, rates))
-    resolution = 1e3 * jnp.finfo(state.dtype).eps * lax.stop_gradient(time)
+    clock = lax.stop_gradient(time + options.first_step)
+    resolution = 1e3 * jnp.finfo(state.dtype).eps * clock
     near = -first <= jnp.abs(rates) * resolution
     past = jnp.any((first < 0.0) & ~near)
     lift = jnp.where((first < 0.0) & near & (rates > 0.0), -first, 0.0)

@@ -1,0 +1,57 @@
+"""A bouncing ball: infinitely many bounces in a finite time.
+
+The ball falls from 1 m and keeps r = 0.8 of its rate at each bounce. Bounces end at t = sqrt(2 h/g)
+(1 + r)/(1 - r); the k-th is at sqrt(2 h/g) (1 + 2 (r + ... + r^(k-1))).
+"""
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from experiments.atlas.hybrid import METHODS, Edge, Part, last_time, row
+from experiments.atlas.told import Case, Row
+
+G, R = 9.81, 0.8
+FALL = math.sqrt(2.0 / G)
+EVENTS = 250
+BALL = (Part(lambda y, m: (y[1], -G), (Edge(lambda y, m: y[0], lambda y, m: (0.0, -R * y[1])),)),)
+
+
+def times(n: int) -> np.ndarray:
+    """Of the first n bounces."""
+    return FALL * (1.0 + 2.0 * R * (1.0 - R ** np.arange(n)) / (1.0 - R))
+
+
+def rows() -> Iterator[Row]:
+    for method in METHODS:
+        walked = method(BALL, (1.0, 0.0), EVENTS, 10.0)
+        early = walked._replace(says="", admits=False)
+        yield row(early, "time of bounce 20", last_time(walked, 20), float(times(20)[-1]))
+        end = float(walked.times[-1]) if len(walked.times) else math.nan
+        told = walked._replace(says=walked.says or f"goes on: {len(walked.times)} bounces")
+        yield row(told, "time of the last bounce", end, FALL * (1.0 + R) / (1.0 - R))
+
+
+def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
+    axes = figure.subplots()
+    truth = times(EVENTS)
+    for method, marker in zip(METHODS, "o^sD", strict=True):
+        walked = method(BALL, (1.0, 0.0), EVENTS, 10.0)
+        n = len(walked.times)
+        error = np.abs(walked.times - truth[:n]) + 1e-17
+        axes.semilogy(np.arange(1, n + 1), error, marker, ms=3, label=f"{walked.method}: {n}")
+    axes.set_xlabel("bounce")
+    axes.set_ylabel("error of its time [s]")
+    axes.legend(title="bounces found")
+
+
+CASE = Case(
+    "Bouncing ball",
+    "Zeno: events without end",
+    "closed form, √(2h/g) (1 + r)/(1 − r)",
+    "textbook; heyoka's tutorial on event detection",
+    rows,
+    draw,
+)

@@ -1,0 +1,103 @@
+"""Steinmetz and Larter's reaction beside a Chenciner point: a cycle whose pair is on the circle.
+
+Published (De Witte, Della Rossa, Govaerts, Kuznetsov 2013): at k7 = 1.5163129, k8 = 0.83200664 a
+pair of multipliers has modulus 1 and the cycle's first nonlinear coefficient vanishes. Beside it a
+walk neither settles nor leaves, so that only Newton's method finds the cycle. Along any cycle one
+multiplier is 1, and the product of all is the exponential of the divergence's integral.
+"""
+
+from collections.abc import Iterator
+from importlib.metadata import version
+
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+
+import vrw_jax as vrw
+from experiments.atlas.gaits import Return, gaits
+from experiments.atlas.hybrid import JAX, METHODS, Edge, Part, row
+from experiments.atlas.told import Case, Row, off, timed
+from vrw_jax.numerics import product_multipliers, segment_maps
+
+K1, K2, K3, K4, K5, K6, K9 = 0.1631021, 1250.0, 0.046875, 20.0, 1.104, 0.001, 0.1175
+K7, K8 = 1.5163129, 0.83200664
+LEVEL = 9.82
+START = (6.697, 4.07e-3, 1.246e-2)  # of A, X, Y where B rises through LEVEL
+SEGMENTS = 600
+
+
+def field(y, m):
+    A, B, X, Y = y
+    first, third, second = K1 * A * B * X, K3 * A * B * Y, 2.0 * K2 * X * X
+    return (
+        K7 - K9 * A - first - third,
+        K8 - first - third,
+        first - second + 2.0 * third - K4 * X + K6,
+        second - third - K5 * Y,
+    )
+
+
+SYSTEM = (
+    Part(field, (Edge(lambda y, m: y[1] - LEVEL, lambda y, m: (y[0], LEVEL, y[2], y[3]), 1),)),
+    Part(field, (Edge(lambda y, m: LEVEL - y[1], lambda y, m: (y[0], LEVEL, y[2], y[3]), 0),)),
+)
+CYCLE = Return(
+    SYSTEM,
+    lambda x, m: (x[0], LEVEL + 0.0 * x[0], x[1], x[2]),
+    lambda y: (y[0], y[2], y[3]),
+    events=2,
+    guess=START,
+    limit=60.0,
+)
+
+
+def rows() -> Iterator[Row]:
+    told = gaits(CYCLE)
+    other = told[-1]
+    for gait in told:
+        modulus = float(np.abs(gait.multipliers[0]))
+        yield row(gait.walked, "modulus of the pair, as published", modulus, 1.0, within=1e-5)
+        if gait is not other:
+            yield row(gait.walked, "period, as heyoka's", gait.duration, other.duration)
+    start = jnp.array(CYCLE.begin(told[0].x, np), float)
+
+    def whole():
+        cut = segment_maps(
+            lambda y: jnp.stack(field(y, JAX)), start, told[0].duration, SEGMENTS,
+            vrw.Options.tight(),
+        )  # fmt: skip
+        return product_multipliers(cut.maps), float(cut.divergence)
+
+    (found, divergence), seconds = timed(whole)
+    trivial = float(found.values[np.nanargmin(np.abs(found.values - 1.0))].real)
+    sums = float(np.sum(found.logarithms))
+    for name, value, truth in (
+        ("trivial multiplier", trivial, 1.0),
+        ("logarithm of their product", sums, divergence),
+    ):
+        yield Row(
+            name, "ours", value, truth, off(value, truth), "", False, SEGMENTS, seconds,
+            f"Dopri8 1e-13, {SEGMENTS} segments", version("vrw-jax"),
+        )  # fmt: skip
+
+
+def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
+    axes = figure.subplots()
+    walked = METHODS[3](SYSTEM, CYCLE.begin(np.array(START) * (1.01, 1.0, 1.0), np), 400, 60.0)
+    rising = walked.states[1::2]
+    axes.plot(rising[:, 0], rising[:, 2], ".-", ms=3, lw=0.3, label="returns of a walk")
+    cycle = gaits(CYCLE._replace(limit=60.0))[0].x
+    axes.plot(cycle[0], cycle[1], "r*", ms=9, label="the cycle, by Newton")
+    axes.set_xlabel("A")
+    axes.set_ylabel("X")
+    axes.legend()
+
+
+CASE = Case(
+    "Chenciner point",
+    "a cycle that no walk reaches; its pair on the circle",
+    "published parameters; trivial multiplier 1; Liouville",
+    "De Witte et al., Physica D 239 and 267; the reaction as in MatCont's examples",
+    rows,
+    draw,
+)

@@ -1,0 +1,115 @@
+"""The compass gait of Goswami, Espiau and Keramane on a slope of 3 degrees.
+
+Two legs of 1 m with 5 kg at their middle, 10 kg at the hip. Published just after impact: stance
+0.2187, swing -0.3234 rad, rates -1.0918 and -0.3772 rad/s. The equations are derived in docstrings
+below from energies and angular momenta; the truth beyond four digits is heyoka's, by Newton's
+method on its map, printed once and checked by every other row.
+"""
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.integrate import solve_ivp
+
+from experiments.atlas.gaits import Return, gaits
+from experiments.atlas.hybrid import METHODS, Edge, Part, row
+from experiments.atlas.told import Case, Row
+
+G, LEG, HALF, MASS, HIP = 9.8, 1.0, 0.5, 5.0, 10.0
+SLOPE = math.radians(3.0)
+PUBLISHED = (0.2187, -1.0918, -0.3772)  # stance angle, its rate, the swing leg's
+
+
+def field(y, m):
+    """Lagrange's equations of two masses and a hip, angles from the vertical."""
+    stance, w, swing, v = y
+    sin, cos = m.sin(stance - swing), m.cos(stance - swing)
+    m11 = (HIP + MASS) * LEG**2 + MASS * HALF**2
+    m22, m12 = MASS * HALF**2, -MASS * LEG * HALF * cos
+    f1 = MASS * LEG * HALF * sin * v * v
+    f1 = f1 + G * (MASS * HALF + (HIP + MASS) * LEG) * m.sin(stance)
+    f2 = -MASS * LEG * HALF * sin * w * w - G * MASS * HALF * m.sin(swing)
+    scale = 1.0 / (m11 * m22 - m12 * m12)
+    return w, (m22 * f1 - m12 * f2) * scale, v, (m11 * f2 - m12 * f1) * scale
+
+
+def impact(y, m):
+    """Legs change; angular momentum stays about the new foot, and about the hip for the old leg."""
+    stance, w, swing, v = y
+    cos = m.cos(stance - swing)
+    a11 = HIP * LEG**2 + MASS * HALF**2 + MASS * LEG**2 - MASS * LEG * HALF * cos
+    a12 = MASS * HALF**2 - MASS * LEG * HALF * cos
+    b1 = ((HIP * LEG**2 + 2.0 * MASS * HALF * LEG) * cos - MASS * HALF**2) * w - MASS * HALF**2 * v
+    a21, a22, b2 = -LEG * cos, HALF, -HALF * w
+    scale = 1.0 / (a11 * a22 - a12 * a21)
+    return (
+        swing, (a22 * b1 - a12 * b2) * scale, -2.0 * SLOPE - swing, (a11 * b2 - a21 * b1) * scale,
+    )  # fmt: skip
+
+
+def depth(y, m):
+    """Of the swing foot below the ground, up to a positive factor while the leg swings forwards."""
+    return y[0] + y[2] + 2.0 * SLOPE
+
+
+NAMES = ("stance angle", "its rate", "swing rate")
+SYSTEM = (
+    Part(
+        field,
+        (Edge(lambda y, m: -depth(y, m), lambda y, m: (y[0], y[1], -2 * SLOPE - y[0], y[3]), 1),),
+    ),
+    Part(field, (Edge(depth, impact, 0),)),
+)
+COMPASS = Return(
+    SYSTEM,
+    lambda x, m: (x[0], x[1], -2.0 * SLOPE - x[0], x[2]),
+    lambda y: (y[0], y[1], y[3]),
+    events=2,
+    guess=PUBLISHED,
+)
+
+
+def rows() -> Iterator[Row]:
+    told = gaits(COMPASS)
+    other = told[-1]  # heyoka, an independent integrator
+    for gait in told:
+        for name, found, truth in zip(
+            ("stance angle", "its rate"), gait.x, PUBLISHED, strict=False
+        ):
+            yield row(gait.walked, f"{name} as published", float(found), truth, within=5e-5)
+        if gait is not other:
+            yield row(gait.walked, "stance angle as heyoka's", float(gait.x[0]), float(other.x[0]))
+            modulus = float(np.abs(gait.multipliers[0]))
+            yield row(
+                gait.walked, "spectral radius as heyoka's", modulus,
+                float(np.abs(other.multipliers[0])), within=1e-8,
+            )  # fmt: skip
+
+
+def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
+    axes = figure.subplots()
+    step = METHODS[0](SYSTEM, COMPASS.begin(PUBLISHED, math), 2, 20.0)
+    begin = COMPASS.begin(PUBLISHED, math)
+    for leg, style in ((0, "-"), (2, "--")):
+        told = solve_ivp(
+            lambda t, y: field(y, math), (0.0, float(step.times[1])), begin,
+            rtol=1e-8, atol=1e-8, max_step=0.01,
+        )  # fmt: skip
+        name = "stance leg" if leg == 0 else "swing leg"
+        axes.plot(told.y[leg], told.y[leg + 1], style, label=name)
+    axes.plot([PUBLISHED[0], -2 * SLOPE - PUBLISHED[0]], PUBLISHED[1:], "ko", label="published")
+    axes.set_xlabel("angle from the vertical [rad]")
+    axes.set_ylabel("its rate [rad/s]")
+    axes.legend()
+
+
+CASE = Case(
+    "Compass gait",
+    "scuffing let through; an impact that exchanges legs",
+    "published to 4 digits; heyoka's beyond",
+    "Goswami, Espiau, Keramane, Autonomous Robots 4 (1997); Drake's example compass_gait",
+    rows,
+    draw,
+)

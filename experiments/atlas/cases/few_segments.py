@@ -1,0 +1,134 @@
+"""A stable orbit that collocation with few segments calls unstable.
+
+r' = r (1 - r^2) s(theta)/2 + ..., theta' = 1 with the orbit r = 1: along it a disturbance grows at
+the rate 1 - 2 p(theta), p the Poisson kernel with q = 0.97, a narrow peak whose mean is 1. The
+multiplier is exp(2 pi (1 - 2)) = exp(-2 pi). Gauss collocation (four nodes, as AUTO's default)
+never lets one segment decay by more than a factor of its choosing: with few segments the peak is
+lost.
+"""
+
+import math
+from collections.abc import Iterator
+from importlib.metadata import version
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.integrate import solve_ivp
+
+import vrw_jax as vrw
+from experiments.atlas.hybrid import JAX, hy
+from experiments.atlas.told import Case, Row, off, timed
+from vrw_jax.numerics import ENDS_ONCE, NODES, ONCE, product_multipliers, segment_maps
+
+Q = 0.97
+TRUTH = math.exp(-2.0 * math.pi)
+PERIOD = 2.0 * math.pi
+
+
+def growth(theta, m):
+    """Rate at which a disturbance of the radius grows."""
+    return 1.0 - 2.0 * (1.0 - Q * Q) / (1.0 - 2.0 * Q * m.cos(theta - math.pi) + Q * Q)
+
+
+def field(y, m):
+    r, theta = y
+    return 0.5 * growth(theta, m) * (r * r - 1.0) / r, 1.0 + 0.0 * theta
+
+
+def collocated(n: int) -> float:
+    """The multiplier of `n` equal segments of Gauss collocation with four nodes."""
+    told, h = 1.0, PERIOD / n
+    for i in range(n):
+        rates = np.array([growth(h * (i + node), np) for node in NODES])
+        slopes = np.linalg.solve(np.eye(len(NODES)) - h * rates[:, None] * ONCE, rates)
+        told *= 1.0 + h * ENDS_ONCE @ slopes
+    return float(told)
+
+
+def ours(n: int) -> tuple[float, bool, float]:
+    flow = lambda y: jnp.stack(field(y, JAX))
+    cut = segment_maps(flow, jnp.array([1.0, 0.0]), PERIOD, n, vrw.Options.tight(), directions=1)
+    told = product_multipliers(cut.maps)
+    return float(told.values[0].real), bool(told.known[0]), float(cut.divergence)
+
+
+def varied(z, m):
+    return growth(z[1], m) * z[0], 1.0 + 0.0 * z[1]
+
+
+def rows() -> Iterator[Row]:
+    for n in (1, 100):
+        (found, known, _), seconds = timed(lambda n=n: ours(n))
+        name = f"ours, {n} segment{'s' * (n > 1)}"
+        yield Row(
+            "multiplier", name, found, TRUTH, off(found, TRUTH, relative=True), "",
+            not known, n, seconds, "Dopri8 1e-13", version("vrw-jax"),
+        )  # fmt: skip
+    for n in (10, 40, 400):
+        found, seconds = timed(lambda n=n: collocated(n))
+        yield Row(
+            "multiplier", f"collocation, {n} segments", found, TRUTH,
+            off(found, TRUTH, relative=True), "", False, n, seconds, "4 Gauss nodes, equal",
+            version("vrw-jax"),
+        )  # fmt: skip
+    told, seconds = timed(
+        lambda: solve_ivp(
+            lambda t, z: varied(z, math),
+            (0.0, PERIOD),
+            (1.0, 0.0),
+            "DOP853",
+            rtol=1e-13,
+            atol=1e-20,
+        )
+    )
+    found = float(told.y[0, -1])
+    yield Row(
+        "multiplier", "SciPy", found, TRUTH, off(found, TRUTH, relative=True), "", False, told.nfev,
+        seconds, "DOP853 1e-13", version("scipy"),
+    )  # fmt: skip
+    solve = jax.jit(
+        lambda z: diffrax.diffeqsolve(
+            diffrax.ODETerm(lambda t, z, _: jnp.stack(varied(z, JAX))), diffrax.Dopri8(), 0.0,
+            PERIOD, 1e-3, z, stepsize_controller=diffrax.PIDController(rtol=1e-13, atol=1e-20),
+        ).ys[-1, 0]
+    )  # fmt: skip
+    answer, seconds = timed(lambda: float(solve(jnp.array([1.0, 0.0]))))
+    yield Row(
+        "multiplier", "diffrax", answer, TRUTH, off(answer, TRUTH, relative=True), "", False, 0,
+        seconds, "Dopri8 1e-13", version("diffrax"),
+    )  # fmt: skip
+    names = hy.make_vars("u", "theta")
+    flow = hy.taylor_adaptive(list(zip(names, varied(names, hy), strict=True)), [1.0, 0.0])
+    flow.propagate_until(PERIOD)
+    found = float(flow.state[0])
+    yield Row(
+        "multiplier", "heyoka", found, TRUTH, off(found, TRUTH, relative=True), "", False, 0, 0.0,
+        "Taylor 2.2e-16", version("heyoka"),
+    )  # fmt: skip
+
+
+def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
+    axes = figure.subplots()
+    counts = np.unique(np.round(np.geomspace(4, 1000, 60)).astype(int))
+    found = np.abs([collocated(int(n)) for n in counts])
+    axes.loglog(counts, found, ".-", label="collocation, equal segments")
+    axes.axhline(TRUTH, color="k", lw=0.8, label="truth, exp(−2π)")
+    axes.axhline(1.0, color="0.6", ls=":", label="border of stability")
+    mine = [ours(n)[0] for n in (1, 10, 100)]
+    axes.loglog((1, 10, 100), mine, "s", mfc="w", label="ours")
+    axes.set_xlabel("segments")
+    axes.set_ylabel("|multiplier|")
+    axes.legend()
+
+
+CASE = Case(
+    "Stability told wrong with few segments",
+    "collocation loses a narrow contraction",
+    "closed form, exp(−2π)",
+    "the failure that issues of continuation packages tell of; closed form made here",
+    rows,
+    draw,
+)

@@ -1,0 +1,141 @@
+"""An impact oscillator at grazing: a square root in every map, on which Newton's method fails.
+
+x'' + x = F cos(w t) with a stop at x = 1 that gives back r = 0.8 of the rate. Without impact the
+motion is -c cos(w t). With c = 1 + d it reaches the stop at (pi - arccos(1/c))/w with the rate w
+sqrt(c^2 - 1): a stop touched by d costs the map (1 + r) sqrt(2 a d), a = w^2, which is Nordmark's
+coefficient, and its derivative grows as 1/sqrt(d). The motion with one impact each period is closed
+too; its disturbances' area shrinks by r^2 each time, the product of its multipliers.
+"""
+
+import math
+from collections.abc import Iterator
+from importlib.metadata import version
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+
+import vrw_jax as vrw
+from experiments.atlas.gaits import Return, by_differences, by_newton, gaits
+from experiments.atlas.hybrid import METHODS, Edge, Part, last_time, modes, row
+from experiments.atlas.told import Case, Row, off, timed
+from vrw_jax.numerics import walk
+
+KEPT = 0.8
+
+
+def stopped(w: float) -> tuple[Part, ...]:
+    """State: x, rate, clock, c."""
+    force = 1.0 - w * w  # over -c: the particular motion is -c cos(w t)
+    field = lambda y, m: (
+        y[1],
+        -force * y[3] * m.cos(w * y[2]) - y[0],
+        1.0 + 0.0 * y[0],
+        0.0 * y[0],
+    )
+    stop = Edge(lambda y, m: 1.0 - y[0], lambda y, m: (1.0 + 0.0 * y[0], -KEPT * y[1], y[2], y[3]))
+    return (Part(field, (stop,)),)
+
+
+def touches(w: float, depth: float) -> float:
+    """Time of the first touch from x = -c at rest; arccos(1/c) without cancellation."""
+    return (math.pi - math.atan(math.sqrt(depth * (2.0 + depth)))) / w
+
+
+def repeating(w: float, depth: float) -> tuple[float, float]:
+    """Motion with one impact each period: the clock at impact, and the rate after it.
+
+    From x = A cos t + B sin t - c cos(w t + p) with x(0) = x(T) = 1 and v(0) = -r v(T).
+    """
+    c, period = -(1.0 + depth), 2.0 * math.pi / w
+    cot, ratio = 1.0 / math.tan(period / 2.0), (1.0 - KEPT) / (1.0 + KEPT)
+    a, b, e = cot**2 + (ratio / w) ** 2, -2.0 * cot, 1.0 - c * c
+    roots = [(-b + sign * math.sqrt(b * b - 4.0 * a * e)) / (2.0 * a) for sign in (1.0, -1.0)]
+    B = min(roots)  # it must push into the stop: B < 0
+    phase = math.atan2(B * ratio / w / c, (1.0 - B * cot) / c)
+    return (phase / w) % period, KEPT * 2.0 * B / (1.0 + KEPT)
+
+
+W, DEPTH = 2.6, 0.05
+NEAR = 1e-6
+"""By how much the stop is touched."""
+
+
+def of_impact(w: float, depth: float) -> Return:
+    """From just after one impact to just after the next: clock and rate."""
+    c, period = 1.0 + depth, 2.0 * math.pi / w
+    system = stopped(w)
+    clock, rate = repeating(w, depth)
+    return Return(
+        system,
+        lambda x, m: (1.0 + 0.0 * x[0], x[1], x[0], c + 0.0 * x[0]),
+        lambda y: (y[2] - period, y[1]),
+        events=1,
+        guess=(clock + 1e-3, rate * 1.01),
+    )
+
+
+def derivative() -> Iterator[Row]:
+    """Of the time of touching by the depth, where it grows as 1/sqrt(depth)."""
+    c = 1.0 + NEAR
+    truth = -1.0 / (W * c * math.sqrt(c * c - 1.0))
+    parts, options = modes(stopped(W)), vrw.Options.tight()
+    start = lambda c: jnp.stack([-c, 0.0 * c, 0.0 * c, c])
+    slope = jax.jit(jax.jacfwd(lambda c: walk(parts, start(c), events=1, options=options).times[0]))
+    found, seconds = timed(lambda: float(slope(c)))
+    yield Row(
+        "derivative of that time", "ours", found, truth, off(found, truth, relative=True), "",
+        False, 1, seconds, "Dopri8 1e-13", version("vrw-jax"), 1e-7,
+    )  # fmt: skip
+    h = 1e-8
+    for method in METHODS[1:]:
+        ends = [method(stopped(W), (-(c + s), 0.0, 0.0, c + s), 1, 20.0) for s in (h, -h)]
+        found = (last_time(ends[0], 1) - last_time(ends[1], 1)) / (2.0 * h)
+        walked = ends[0]._replace(method=f"{ends[0].method}, differences")
+        yield row(walked, "derivative of that time", found, truth, relative=True, within=1e-7)
+
+
+def rows() -> Iterator[Row]:
+    for method in METHODS:
+        walked = method(stopped(W), (-(1.0 + NEAR), 0.0, 0.0, 1.0 + NEAR), 1, 20.0)
+        yield row(walked, "time of touching by 1e-6", last_time(walked, 1), touches(W, NEAR))
+    yield from derivative()
+    _, rate = repeating(W, DEPTH)
+    for gait in gaits(of_impact(W, DEPTH)):
+        yield row(gait.walked, "rate after impact", float(gait.x[1]), rate)
+        product = float(np.linalg.det(gait.jacobian))
+        yield row(gait.walked, "product of multipliers", product, KEPT**2)
+    graze = of_impact(W, 1e-9)._replace(guess=(math.pi / W, -1e-4))
+    truth = repeating(W, 1e-9)[1]
+    for gait in (by_newton(graze), by_differences(METHODS[3], graze)):
+        found = float(gait.x[1])
+        yield row(gait.walked, "rate, Newton from the graze", found, truth)
+
+
+def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
+    axes = figure.subplots()
+    depths = 10.0 ** -np.arange(1.0, 14.0)
+    for method, marker in zip(METHODS, "o^sD", strict=True):
+        errors = []
+        for depth in depths:
+            walked = method(stopped(W), (-(1.0 + depth), 0.0, 0.0, 1.0 + depth), 1, 4.0)
+            errors.append(abs(last_time(walked, 1) - touches(W, depth)) + 1e-17)
+        missed = np.array([not error < 0.5 for error in errors])
+        found = np.array(errors)[~missed]
+        line = axes.loglog(depths[~missed], found, marker + "-", ms=4, label=walked.method)
+        axes.loglog(depths[missed], np.full(missed.sum(), 1.0), "x", color=line[0].get_color())
+    axes.loglog(depths, 1e-16 / (W * np.sqrt(2.0 * depths)), "k-", lw=0.7, label="rounding")
+    axes.set_xlabel("depth of touching")
+    axes.set_ylabel("error of its time (×: missed)")
+    axes.legend()
+
+
+CASE = Case(
+    "Impact oscillator at grazing",
+    "a square root: derivatives without bound, Newton on the map",
+    "closed form; Nordmark's coefficient",
+    "Nordmark, J. Sound Vib. 145 (1991); derived in the module",
+    rows,
+    draw,
+)

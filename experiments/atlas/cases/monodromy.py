@@ -1,0 +1,135 @@
+"""A linear periodic system whose multipliers are 66 decades apart.
+
+x1' = x2, x2' = -10 cos t x1 - (24 + 10 sin t) x2 conserves x2 + (24 + 10 sin t) x1, so one
+multiplier is 1; the trace integrates to -48 pi, so the other is exp(-48 pi) = 3.2e-66. Colaneri's
+example, in the documentation of PeriodicMatrices.jl: one product of monodromies has no correct
+digit of it.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from importlib.metadata import version
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.integrate import solve_ivp
+
+import vrw_jax as vrw
+from experiments.atlas.hybrid import JAX, hy
+from experiments.atlas.told import Case, Row, off, timed
+from vrw_jax.numerics import product_multipliers, segment_maps
+
+SMALL = math.exp(-48.0 * math.pi)
+PERIOD = 2.0 * math.pi
+SEGMENTS = 200
+
+
+def field(y: Any, m: Any) -> tuple:
+    x1, x2, t = y
+    return x2, -10.0 * m.cos(t) * x1 - (24.0 + 10.0 * m.sin(t)) * x2, 1.0 + 0.0 * t
+
+
+def columns(z: Any, m: Any) -> tuple:
+    """Two solutions at once, and the clock."""
+    (a, b, t), (c, d, _) = field((z[0], z[1], z[4]), m), field((z[2], z[3], z[4]), m)
+    return a, b, c, d, t
+
+
+BEGIN = (1.0, 0.0, 0.0, 1.0, 0.0)
+
+
+def by_segments(n: int) -> Any:
+    """This library's multipliers, with `n` segments."""
+    flow = lambda y: jnp.stack(field(y, JAX))
+    cut = segment_maps(flow, jnp.zeros(3), PERIOD, n, vrw.Options.tight(), directions=2)
+    return product_multipliers(cut.maps), np.asarray(cut.maps)
+
+
+def of_product(matrix: np.ndarray) -> np.ndarray:
+    values = np.linalg.eigvals(matrix)
+    return values[np.argsort(-np.abs(values))]
+
+
+def with_scipy() -> tuple[np.ndarray, int]:
+    told = solve_ivp(
+        lambda t, z: columns(z, np), (0.0, PERIOD), BEGIN, method="DOP853", rtol=1e-13, atol=1e-30
+    )
+    return told.y[:4, -1].reshape(2, 2).T, told.nfev
+
+
+def with_diffrax() -> tuple[np.ndarray, int]:
+    told = _solved(jnp.array(BEGIN))
+    return np.asarray(told.ys[-1][:4]).reshape(2, 2).T, int(told.stats["num_steps"])
+
+
+@eqx.filter_jit
+def _solved(z: Any) -> Any:
+    return diffrax.diffeqsolve(
+        diffrax.ODETerm(lambda t, z, _: jnp.stack(columns(z, JAX))), diffrax.Dopri8(), 0.0, PERIOD,
+        1e-3, z, stepsize_controller=diffrax.PIDController(rtol=1e-13, atol=1e-30),
+        max_steps=100_000,
+    )  # fmt: skip
+
+
+def with_heyoka() -> tuple[np.ndarray, int]:
+    names = hy.make_vars(*"abcde")
+    flow = hy.taylor_adaptive(list(zip(names, columns(names, hy), strict=True)), list(BEGIN))
+    steps = flow.propagate_until(PERIOD)[3]
+    return flow.state[:4].reshape(2, 2).T, steps
+
+
+PEERS: tuple[tuple[str, Callable, str, str], ...] = (
+    ("diffrax + NumPy", with_diffrax, "Dopri8 1e-13, one matrix", "diffrax"),
+    ("SciPy + NumPy", with_scipy, "DOP853 1e-13, one matrix", "scipy"),
+    ("heyoka + NumPy", with_heyoka, "Taylor 2.2e-16, one matrix", "heyoka"),
+)
+
+
+def rows() -> Iterator[Row]:
+    for name, n in (("ours", SEGMENTS), ("ours, one segment", 1)):
+        (told, _), seconds = timed(lambda n=n: by_segments(n))
+        for i, truth in enumerate((1.0, SMALL)):
+            found, known = float(told.values[i].real), bool(told.known[i])
+            says = "" if known else f"not known: uncertainty {told.uncertainty[i]:.0e}"
+            yield Row(
+                f"multiplier {truth:.1e}", name, found, truth, off(found, truth, relative=True),
+                says, not known, n, seconds, f"Dopri8 1e-13, {n} segments", version("vrw-jax"),
+            )  # fmt: skip
+    for name, call, options, package in PEERS:
+        (matrix, work), seconds = timed(call)
+        for found, truth in zip(of_product(matrix).real, (1.0, SMALL), strict=True):
+            error = off(float(found), truth, relative=True)
+            yield Row(
+                f"multiplier {truth:.1e}", name, float(found), truth, error, "", False, work,
+                seconds, options, version(package),
+            )  # fmt: skip
+
+
+def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
+    axes = figure.subplots()
+    counts = (4, 8, 16, 30, 60, 120, 250, 500)
+    told = [by_segments(n) for n in counts]
+    gap = [abs(t.logarithms[1] + 48.0 * math.pi) for t, _ in told]
+    axes.loglog(counts, gap, "o-", label="triangular factors")
+    axes.loglog(
+        counts, [t.uncertainty[1] for t, _ in told], "o--", mfc="w", label="its own estimate"
+    )
+    naive = [abs(of_product(np.linalg.multi_dot(maps[::-1]))[1] / SMALL - 1.0) for _, maps in told]
+    axes.loglog(counts, naive, "s:", label="their product")
+    axes.set_xlabel("segments")
+    axes.set_ylabel("relative error of $\\exp(-48\\pi)$")
+    axes.legend()
+
+
+CASE = Case(
+    "Two multipliers 66 decades apart",
+    "a product of monodromies has no correct digit of the small one",
+    "closed form: 1 and exp(−48π)",
+    "Colaneri's example, as in PeriodicMatrices.jl (exponents 0 and −24), derived in the module",
+    rows,
+    draw,
+)

@@ -1,0 +1,84 @@
+"""ARGESIM benchmark C7: a pendulum that winds around a pin and off again.
+
+Length 1 m, from pi/6 at rest; at -pi/12 the string meets a pin 0.7 m below the pivot, and swings on
+with 0.3 m. Its end's speed stays, so the angle's rate jumps by 1/0.3, and back. Without damping
+times are elliptic integrals; the benchmark's own run with damping has none.
+"""
+
+import math
+from collections.abc import Iterator
+
+import mpmath
+import numpy as np
+from matplotlib.figure import Figure
+
+from experiments.atlas.hybrid import METHODS, Edge, Part, last_time, row
+from experiments.atlas.told import Case, Row
+
+G, LONG, SHORT = 9.81, 1.0, 0.3
+HIGH, PIN = math.pi / 6, -math.pi / 12
+EVENTS = 12
+
+
+def swing(length: float, gain: float, sign: float, to: int) -> Part:
+    return Part(
+        lambda y, m: (y[1], -G / length * m.sin(y[0])),
+        (Edge(lambda y, m: sign * (y[0] - PIN), lambda y, m: (PIN, gain * y[1]), to),),
+    )
+
+
+SYSTEM = (swing(LONG, LONG / SHORT, 1.0, 1), swing(SHORT, SHORT / LONG, -1.0, 0))
+START = (HIGH, 0.0)
+
+
+def truth(events: int) -> np.ndarray:
+    """Times of touching and leaving the pin."""
+    with mpmath.workdps(40):
+        half = lambda high, angle: mpmath.sin(mpmath.mpf(angle) / 2) / mpmath.sin(high / 2)
+
+        def passage(length: float, high: mpmath.mpf, angle: mpmath.mpf) -> mpmath.mpf:
+            """From the highest angle to another."""
+            m = mpmath.sin(high / 2) ** 2
+            part = mpmath.ellipk(m) - mpmath.ellipf(mpmath.asin(half(high, angle)), m)
+            return part * mpmath.sqrt(mpmath.mpf(length) / mpmath.mpf(G))
+
+        high, pin = mpmath.mpf(HIGH), mpmath.mpf(PIN)
+        rise = mpmath.mpf(LONG) * (mpmath.cos(pin) - mpmath.cos(high))  # of energy at the pin
+        other = mpmath.acos(mpmath.cos(pin) - rise / mpmath.mpf(SHORT))
+        on_long = passage(LONG, high, pin)
+        on_short = 2 * passage(SHORT, other, -pin)
+        parts = [on_long] + [on_short, 2 * on_long] * events
+        return np.array([float(x) for x in np.cumsum(parts[:events])])
+
+
+def rows() -> Iterator[Row]:
+    times = truth(EVENTS)
+    for method in METHODS:
+        walked = method(SYSTEM, START, EVENTS, 10.0)
+        for n in (1, 2, EVENTS):
+            yield row(walked, f"time of event {n}", last_time(walked, n), float(times[n - 1]))
+
+
+def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
+    axes = figure.subplots()
+    times = truth(EVENTS)
+    for method, marker in zip(METHODS, "o^sD", strict=True):
+        walked = method(SYSTEM, START, EVENTS, 10.0)
+        n = len(walked.times)
+        axes.semilogy(
+            range(1, n + 1), np.abs(walked.times - times[:n]) + 1e-17, marker, label=walked.method
+        )
+    axes.set_xlabel("event: on the pin, off the pin, ...")
+    axes.set_ylabel("error of its time [s]")
+    axes.set_ylim(1e-19, 1e-10)
+    axes.legend(loc="lower center", ncols=4)
+
+
+CASE = Case(
+    "Pendulum with a pin",
+    "a sequence of modes, each begun on its own guard",
+    "elliptic integrals",
+    "ARGESIM benchmark C7 (undamped)",
+    rows,
+    draw,
+)

@@ -1,0 +1,96 @@
+"""Garcia's simplest walker at slope 0.009: a swing foot that scuffs and is let through.
+
+theta'' = sin(theta - slope); phi'' = theta'' + theta'^2 sin phi - cos(theta - slope) sin phi. The
+foot's height passes zero at mid-stance, where the model ignores it, and at heelstrike, where theta
+changes its sign and rates follow from impulse laws. Published: both gaits at 0.009 to 15 digits
+(Garcia, Chatterjee, Ruina, Coleman 1998; eigenvalues again in Bhounsule 2014).
+"""
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from experiments.atlas.gaits import Return, gaits
+from experiments.atlas.hybrid import METHODS, Edge, Part, row
+from experiments.atlas.told import Case, Row
+
+SLOPE = 0.009
+LONG = (0.200310900544287, -0.199832473004977)
+PAIR = (-0.190099639402167, 0.557599274284362)  # real and imaginary part of the multipliers
+
+
+def field(y, m):
+    theta, rate, phi, swing = y
+    fall = m.sin(theta - SLOPE)
+    return rate, fall, swing, fall + (rate * rate - m.cos(theta - SLOPE)) * m.sin(phi)
+
+
+def heelstrike(y, m):
+    theta, rate = y[0], y[1]
+    kept = m.cos(2.0 * theta)
+    return -theta, kept * rate, -2.0 * theta, kept * (1.0 - kept) * rate
+
+
+def height(y, m):
+    """Of the swing foot, up to a positive factor: zero just after heelstrike, and rising."""
+    return y[2] - 2.0 * y[0]
+
+
+SYSTEM = (
+    Part(field, (Edge(height, lambda y, m: (y[0], y[1], 2.0 * y[0], y[3]), 1),)),
+    Part(field, (Edge(lambda y, m: -height(y, m), heelstrike, 0),)),
+)
+
+
+def begin(x, m):
+    kept = (m if hasattr(m, "cos") else math).cos(2.0 * x[0])
+    return x[0], x[1], 2.0 * x[0], x[1] * (1.0 - kept)
+
+
+WALKER = Return(SYSTEM, begin, lambda y: (y[0], y[1]), events=2, guess=(0.2, -0.2))
+
+
+def rows() -> Iterator[Row]:
+    told = gaits(WALKER)
+    other = told[-1].multipliers[0]  # by heyoka, an independent integrator
+    for gait in told:
+        walked, first = gait.walked, gait.multipliers[0]
+        yield row(walked, "stance angle", float(gait.x[0]), LONG[0])
+        yield row(walked, "its rate", float(gait.x[1]), LONG[1])
+        parts = (("real", first.real, other.real), ("imaginary", abs(first.imag), abs(other.imag)))
+        for (name, found, own), published in zip(parts, PAIR, strict=True):
+            told_as = f"multipliers, {name} part"
+            yield row(walked, f"{told_as}, as published", float(found), published, within=1e-6)
+            if gait is not told[-1]:
+                yield row(walked, f"{told_as}, as heyoka's", float(found), float(own))
+
+
+def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
+    axes = figure.subplots()
+    for method, marker in zip(METHODS, "o^sD", strict=True):
+        x = np.array(LONG) * 1.01
+        gaps = []
+        for _ in range(25):
+            walked = method(SYSTEM, begin(x, math), 2, 20.0)
+            if len(walked.times) < 2:
+                break
+            x = walked.end[:2]
+            gaps.append(float(np.hypot(*(x - LONG))) + 1e-17)
+        axes.semilogy(range(1, len(gaps) + 1), gaps, marker, ms=3, label=walked.method)
+    steps = np.arange(1, 26)
+    axes.semilogy(steps, 3e-3 * np.hypot(*PAIR) ** steps, "k-", lw=0.7, label="|multiplier|ⁿ")
+    axes.set_xlabel("step")
+    axes.set_ylabel("distance from the published gait")
+    axes.legend()
+
+
+CASE = Case(
+    "Simplest walker",
+    "each mode begins on its own guard; the foot grazes the ground",
+    "published to 15 digits",
+    "Garcia et al., J. Biomech. Eng. 120 (1998); Bhounsule, DCDIS B 21 (2014)",
+    rows,
+    draw,
+)

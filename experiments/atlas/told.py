@@ -1,0 +1,59 @@
+"""What a case tells: a row for each method, and who is right, says so, or is wrong silently."""
+
+import math
+import time
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+from matplotlib.figure import Figure
+
+RIGHT = 1e-9
+"""An error that counts as right where nothing else is said; the error itself stands beside."""
+
+
+class Row(NamedTuple):
+    """One method's answer to one question of a case."""
+
+    quantity: str
+    method: str
+    found: float
+    truth: float
+    error: float  # absolute, or relative where the case says so
+    says: str  # its own code, message or exception
+    admits: bool  # whether that is a failure told, and not success claimed
+    work: int  # steps tried, or evaluations where a method tells those alone
+    seconds: float  # CPU time of a call that has been compiled before
+    options: str
+    version: str
+    within: float = RIGHT  # an error that counts as right; more where only few digits are published
+
+    @property
+    def verdict(self) -> str:
+        if self.error <= self.within:
+            return "right"
+        return "says so" if self.admits else "WRONG, silently"
+
+
+class Case(NamedTuple):
+    """A problem of somebody else."""
+
+    title: str
+    breaks: str
+    truth: str
+    source: str
+    rows: Callable[[], Iterable[Row]]
+    draw: Callable[[Figure, list[dict[str, str]]], None]
+
+
+def off(found: float, truth: float, *, relative: bool = False) -> float:
+    """Error; infinite where nothing was found."""
+    gap = abs(found - truth) / (abs(truth) if relative else 1.0)
+    return gap if math.isfinite(gap) else math.inf
+
+
+def timed(call: Callable[[], Any]) -> tuple[Any, float]:
+    """What a second call gives, and its CPU seconds: compiling does not count."""
+    call()
+    began = time.process_time()
+    told = call()
+    return told, time.process_time() - began

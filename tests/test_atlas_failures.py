@@ -1,0 +1,104 @@
+"""What the page of failures promises: every case told, and ours never wrong without saying so."""
+
+import csv
+import importlib
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("heyoka", exc_type=ImportError)
+
+from experiments.atlas import failures
+from experiments.atlas.hybrid import METHODS, Edge, Part, by_scipy, last_time, ours
+from experiments.atlas.told import Row
+
+ROOT = Path(__file__).parents[1]
+TABLE = list(csv.DictReader((ROOT / "docs" / "figures" / "atlas_failures.csv").open()))
+
+
+def module(name):
+    return importlib.import_module(f"experiments.atlas.cases.{name}")
+
+
+@pytest.mark.parametrize("name", failures.NAMES)
+def test_a_case_has_a_truth_rows_a_picture_and_a_place_on_the_page(name):
+    case = module(name).CASE
+    assert all((case.title, case.breaks, case.truth, case.source))
+    assert any(row["case"] == name for row in TABLE)
+    assert (ROOT / "docs" / "figures" / f"failure_{name}.png").exists()
+    page = (ROOT / "docs" / "stability_atlas.md").read_text()
+    assert f"### {case.title}\n" in page
+    assert f"](#{failures.anchor(case.title)})" in page
+    assert f"<!-- failure {name} -->" in page
+
+
+def test_there_are_ten_cases_and_more_and_ours_is_nowhere_silently_wrong():
+    assert len(failures.NAMES) >= 10
+    assert {row["case"] for row in TABLE} == set(failures.NAMES)
+    mine = [row for row in TABLE if row["method"].startswith("ours")]
+    assert not [row for row in mine if row["verdict"].startswith("WRONG")]
+    assert {"diffrax", "SciPy", "heyoka"} <= {row["method"] for row in TABLE}
+    assert all(row["version"] and row["options"] for row in TABLE)
+
+
+def test_a_verdict_needs_a_right_answer_or_an_admission():
+    row = Row("q", "m", 1.0, 2.0, 1.0, "", False, 1, 0.0, "o", "v")
+    assert row.verdict == "WRONG, silently"
+    assert row._replace(admits=True).verdict == "says so"
+    assert row._replace(error=1e-12, admits=True).verdict == "right"
+    assert row._replace(error=math.inf).verdict == "WRONG, silently"
+    assert row._replace(error=1e-6, within=1e-5).verdict == "right"
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_system_written_once_is_walked_by_every_method(method):
+    ball = module("bouncing_ball")
+    walked = method(ball.BALL, (1.0, 0.0), 3, 10.0)
+    np.testing.assert_allclose(walked.times, ball.times(3), rtol=1e-11)
+    assert not walked.says
+
+
+def test_a_method_that_meets_no_event_does_not_admit_a_failure():
+    never = (Part(lambda y, m: (1.0 + 0.0 * y[0],), (Edge(lambda y, m: 1.0 + y[0]),)),)
+    for method in (ours, by_scipy):
+        walked = method(never, (0.0,), 1, 2.0)
+        assert walked.says
+        assert not walked.admits
+        assert math.isnan(last_time(walked, 1))
+
+
+@pytest.mark.parametrize(
+    ("name", "system", "start", "truth"),
+    [
+        ("pinned_pendulum", "SYSTEM", "START", lambda m: m.truth(3)),
+        ("singular_field", "QUESTIONS", (1.0,), lambda m: [m.QUESTIONS[0][2]]),
+        ("grazing", "stopped", None, lambda m: [m.touches(m.W, 1e-4)]),
+        ("tangent_guards", "circle", (1.0, 0.0, 0.0), lambda m: [m.entry(1e-4)]),
+    ],
+)
+def test_event_times_are_within_1e_12_of_their_closed_forms(name, system, start, truth):
+    case = module(name)
+    made = getattr(case, system)
+    if name == "singular_field":
+        made = made[0][1]
+    if name == "grazing":
+        made, start = made(case.W), (-1.0001, 0.0, 0.0, 1.0001)
+    if name == "tangent_guards":
+        made = made(1e-4)
+    start = getattr(case, start) if isinstance(start, str) else start
+    times = truth(case)
+    walked = ours(made, start, len(times), 10.0)
+    np.testing.assert_allclose(walked.times, times, rtol=0.0, atol=1e-12)
+
+
+def test_closed_forms_of_the_impact_oscillator_repeat_themselves():
+    case = module("grazing")
+    for w, depth in ((2.6, 0.05), (2.2, 0.01), (2.0001, 0.01)):
+        told = case.of_impact(w, depth)
+        x = case.repeating(w, depth)
+        walked = ours(told.system, told.begin(x, math), 1, 10.0)
+        np.testing.assert_allclose(told.read(walked.end), x, atol=1e-9)
+    resonant = module("resonant_grazing")
+    assert abs(case.repeating(2.0 + 1e-7, 0.01)[1] / resonant.rate(0.01) - 1.0) < 1e-3
