@@ -1,4 +1,4 @@
-"""mypy and pyright accept the README's lines as written, and refuse what can be seen to be wrong."""
+"""mypy and pyright accept the README as it is written, and refuse what can be seen to be wrong."""
 
 import json
 import os

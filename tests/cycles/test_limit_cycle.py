@@ -208,6 +208,17 @@ def test_why_there_is_no_gait_is_told_apart(changes, outcome, words):
     assert cycle.why in repr(cycle)
 
 
+def test_a_lost_gait_is_nan_in_value_and_derivative_where_asked_for():
+    fraction = lambda c, **how: vrw.limit_cycle(vrw.WheelParams(damping=c), **how).dls_fraction
+    both = jax.value_and_grad(lambda c: fraction(c, lost="nan"))
+    assert all(map(np.isnan, both(240.0)))
+    np.testing.assert_array_equal(both(150.0), jax.value_and_grad(fraction)(150.0))
+    assert [float(x) for x in jax.value_and_grad(fraction)(240.0)] == [0.0, 0.0]
+    cycle = vrw.limit_cycle(vrw.WheelParams(damping=240.0), lost="nan")
+    told = cycle.measures(("spectral_margin", "stability_margin", "takeoff_acceleration", "speed"))
+    assert all(np.isnan(value) for value in told.values())
+
+
 def test_a_mesh_too_coarse_says_so_and_more_of_it_finds_the_gait():
     params = vrw.WheelParams(damping=190.6, stiffness=838.6, natural_length=1.0211, slope=0.126)
     coarse, fine = (vrw.CycleOptions(steps=steps) for steps in ((2, 1, 1), (30, 30, 10)))

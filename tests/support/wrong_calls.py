@@ -279,6 +279,8 @@ def make() -> None:
         "ValueError",
         "guess",
     )
+    use("lost gaits as a number", lambda: vrw.limit_cycle(table_1, lost=0.0), "TypeError", "lost")
+    use("lost gaits misspelt", lambda: vrw.limit_cycle(table_1, lost="NaN"), "ValueError", "lost")
     use("limit_cycle of a batch", lambda: vrw.limit_cycle(several), "ValueError", "jax.vmap")
     use("limit_cycle of a state", lambda: vrw.limit_cycle(start), "TypeError", "WheelParams")
     use(

@@ -128,7 +128,7 @@ class LimitCycle(AbstractCycle):
     def takeoff_acceleration(self) -> Array:
         """With which the rear foot leaves the ground, m/s^2: see `premises`; least of the steps."""
         of_one = functools.partial(_takeoff, self.problem)
-        return jnp.where(self.found, self._mapped(of_one)(self.parameters, self.located), 0.0)
+        return self._if_found(self._mapped(of_one)(self.parameters, self.located))
 
     @property
     def monitors(self) -> Margins:

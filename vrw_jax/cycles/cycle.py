@@ -1,17 +1,19 @@
 """What a gait that repeats tells, whichever rung it belongs to and however it was found."""
 
 import abc
+import dataclasses
 from collections.abc import Callable, Iterable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from vrw_jax.numerics import floquet
 from vrw_jax.results import Row, listed
-from vrw_jax.wheel import Outcome
+from vrw_jax.wheel import Outcome, WheelParams
 from vrw_jax.wording import AbstractTold, chosen, counted
 
 
@@ -43,6 +45,22 @@ class AbstractCycle(AbstractTold):
     @abc.abstractmethod
     def near(self) -> Any:
         """Where the search for a neighbour's gait begins."""
+
+    def or_nan(self, params: WheelParams) -> Any:
+        """The same, but NaN in place of zeros where there is none, in derivatives by params too."""
+        lost = jnp.where(self.found, 0.0, jnp.nan)
+        weight = 1.0 + lost * sum(jax.tree.leaves(params))  # which leads derivatives past the masks
+
+        def told(x: Array) -> Array:
+            return x * weight.astype(x.dtype) if eqx.is_inexact_array(x) else x
+
+        names = [name for name in MASKED if name in vars(self)]
+        values = {name: jax.tree.map(told, getattr(self, name)) for name in names}
+        return dataclasses.replace(self, **values)
+
+    def _if_found(self, value: Array) -> Array:
+        """Zero where there is no cycle, or NaN after `or_nan`."""
+        return jnp.where(self.found, value, 0.0 * self.period)
 
     def over_steps(self, values: Array, combine: Callable[[Array, int], Array]) -> Array:
         """One value for the whole cycle, of one for each step on the last axis."""
@@ -88,7 +106,7 @@ class AbstractCycle(AbstractTold):
     @property
     def spectral_margin(self) -> Array:
         """1 - spectral radius, positive where stable; told of every rung."""
-        return jnp.where(self.found, 1.0 - self.spectral_radius, 0.0)
+        return self._if_found(1.0 - self.spectral_radius)
 
     @property
     def stability_margin(self) -> Array:
@@ -96,13 +114,13 @@ class AbstractCycle(AbstractTold):
 
         Of sections of at most three numbers, as all are but those on real ground.
         """
-        return jnp.where(self.found, floquet.stability_margin(self.monodromy), 0.0)
+        return self._if_found(floquet.stability_margin(self.monodromy))
 
     @property
     def condition(self) -> Array:
         """Condition number of I - monodromy: how much the cycle magnifies a disturbance."""
         matrix = jnp.eye(self.matrix.shape[-1]) - self.matrix
-        return jnp.where(self.found, jnp.linalg.cond(matrix), 0.0)
+        return self._if_found(jnp.linalg.cond(matrix))
 
     def measure(self, name: str) -> Array:
         """One of `MEASURED`, by its name in `results.MEASURES`; batch axes lead.
@@ -143,6 +161,18 @@ class AbstractCycle(AbstractTold):
     @abc.abstractmethod
     def own_rows(self) -> list[Row]:
         """Those of `rows` that not every rung tells."""
+
+
+MASKED = (
+    "section_state",
+    "post_impact",
+    "durations",
+    "step_length",
+    "indicators",
+    "steps",
+    "matrix",
+)
+"""Fields that are zero where there is no gait."""
 
 
 def _own(name: str) -> Callable[[AbstractCycle], Array]:

@@ -7,7 +7,7 @@ the start of another search; where the mesh fails, it is made finer. Only values
 """
 
 import functools
-from typing import Any, NamedTuple, overload
+from typing import Any, Literal, NamedTuple, get_args, overload
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ from vrw_jax.cycles import (
 from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import Options, select
 from vrw_jax.wheel import Outcome, WheelParams, parameters_of
-from vrw_jax.wording import whole
+from vrw_jax.wording import chosen, whole
 
 LOST = (Outcome.NO_CYCLE_FOUND, Outcome.ORDER_DIFFERS, Outcome.MESH_TOO_COARSE)
 """Outcomes of a search that may have missed a gait."""
@@ -55,6 +55,10 @@ SHAPES = (1, 8, 64, 512, 4096)
 """Numbers of lanes that programs are compiled for."""
 
 
+Lost = Literal["zeros", "nan"]
+ZEROS_OR_NAN: tuple[str, ...] = get_args(Lost)
+
+
 @overload
 def limit_cycle(
     params: WheelParams,
@@ -63,6 +67,7 @@ def limit_cycle(
     period_n: int = 1,
     model: None = None,
     options: CycleOptions | Options | None = None,
+    lost: Lost = "zeros",
 ) -> LimitCycle: ...
 
 
@@ -74,6 +79,7 @@ def limit_cycle(
     period_n: int = 1,
     model: AbstractWheel,
     options: CycleOptions | Options | None = None,
+    lost: Lost = "zeros",
 ) -> LimitCycle | WalkedCycle: ...
 
 
@@ -84,6 +90,7 @@ def limit_cycle(
     period_n: int = 1,
     model: AbstractWheel | None = None,
     options: CycleOptions | Options | None = None,
+    lost: Lost = "zeros",
 ) -> LimitCycle | WalkedCycle:
     """The limit cycle of this wheel: the gait that repeats after `period_n` steps.
 
@@ -96,17 +103,21 @@ def limit_cycle(
     Where the search fails, walks are tried, and finer meshes. Under `jax.jit` and `jax.vmap`
     neither can be: the search is alone there, on the mesh of the options. See `limit_cycles`.
 
+    Where none was found, `outcome` and `why` say so and numbers and derivatives are zeros; with
+    `lost="nan"` they are NaN, for optimisation loops that should not stand still there in silence.
+
     Any other rung as `model` is solved on its own return map, with `Options` of its step: a
     `WalkedCycle`, to the step's errors.
     """
     finder = cycles.finder_for(params, model, options, whole("period_n", period_n))
+    or_nan = chosen("lost", lost, ZEROS_OR_NAN) == "nan"
     if guess is None and period_n > 1:
         raise ValueError(
             f"period_n is {period_n} and there is no guess, but a gait of several steps is one of "
             "many beside the gait of one step: give guess=, a section state near it."
         )
     cycle: Any = _wherever(finder, params, cycles.near(guess), options is None)
-    return cycle
+    return cycle.or_nan(params) if or_nan else cycle
 
 
 def limit_cycles(
