@@ -39,6 +39,7 @@ from vrw_jax.numerics.derivatives import (
     without_derivative,
 )
 from vrw_jax.numerics.events import (
+    ROUNDING,
     Field,
     PhaseEnd,
     integrate_phase,

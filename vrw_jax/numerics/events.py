@@ -259,7 +259,14 @@ def _advance(task: _Task, loop: _Loop) -> _Loop:
     ends_at_once = starting & jnp.any(past)
     marched = _marched(task, loop, step, error)
     found = _searched(search, guards, rates, length)
-    settled = search.settled + (searching & (jnp.abs(found.length - length) <= search.accuracy))
+    close = jnp.abs(found.length - length) <= search.accuracy
+    if watched.sizes is not None:
+        lowest = jnp.where(search.crossing, guards / watched.sizes, jnp.inf)
+        there = jnp.abs(jnp.min(lowest)) <= ROUNDING * jnp.finfo(lowest.dtype).eps
+        beside = jnp.argmin(lowest).astype(jnp.int32)
+        found = found._replace(guard=jnp.where(there, beside, found.guard))
+        close = close | there
+    settled = search.settled + (searching & close)
     arrived = searching & (settled >= SETTLED)
 
     timed_out = marched.accepted & (step.time >= options.max_phase_time)
@@ -372,6 +379,8 @@ STEP_GROWTH = 2.0
 """Most that a step may outgrow the one before it. The error estimate of a step far shorter than
 needed is rounding, and so would be a length grown from it without bound: a lane would then differ
 from itself alone by 1e-12, more than a hundred times its round-off."""
+ROUNDING = 32.0
+"""Roundings of its size in a guard's value."""
 SETTLED = 3
 """Tries at the located event before it counts: the first makes the event's time right to first
 order in its derivatives, the second to third order, the last evaluates the state there."""

@@ -24,11 +24,14 @@ class Watched(NamedTuple):
     `values` returns the `n_guards` guards followed by the monitors. A monitor's minimum is sought
     at every interior local minimum and at the phase's end; at its start too (`count_start`), unless
     the quantity is zero there by construction, like the height of a foot that leaves the ground.
+    `sizes`: what guards are differences of. One within some roundings of it is at zero: in a dip
+    of microseconds no time brings it closer.
     """
 
     values: Watch
     n_guards: int
     count_start: tuple[bool, ...] = ()
+    sizes: Array | None = None
 
 
 class Step(NamedTuple):
