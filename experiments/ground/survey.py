@@ -1,10 +1,10 @@
-"""Which wheels on real ground lose their way: how walks end, over a wide box and all tolerances.
+"""No wheel on real ground loses its way: how walks end, over a wide box and all tolerances.
 
     python -m experiments.ground.survey [--wheels 192] [--steps 60]
 
 Wheels drawn over damping, friction and slope, from slow and fast starts, walk with both kinds of
-stoppers at each tolerance. Falling back, collapsing, sliding without landing and a third loaded
-foot are physics; a code of the method is a loss.
+stoppers at each tolerance. Falling back, collapsing, sliding without landing, a third loaded foot
+and Painlevé's paradox are physics; a code of the method is a loss.
 """
 
 import math

@@ -37,23 +37,23 @@ def test_an_unknown_kind_of_stopper_is_refused_in_one_sentence():
 
 @pytest.fixture(scope="module")
 def struck():
-    """A spinning wheel in the air of which one leg meets its stopper, by the least dip followed."""
+    """A spinning wheel in the air of which one leg meets its stopper, by the speed of rest."""
     s, zero, none = vrw.WheelParams().symbols(), jnp.zeros(()), jnp.zeros(8, bool)
     motion = WheelMotion(
         zero, zero + 2.0, zero - 0.2, zero + 1.0, zero - 0.5, zero + 1.5, jnp.ones(8), jnp.zeros(8)
     )
     motion = motion._replace(dL=motion.dL.at[STRUCK].set(0.5))
     stance = Stance(jnp.full(8, OFF, jnp.int32), jnp.arange(8) != STRUCK, none, none, none)
-    law = lambda one_sided, unseen: Law(s, jnp.asarray(0.7), one_sided, True, unseen)
+    law = lambda one_sided, rest: Law(s, jnp.asarray(0.7), one_sided, True, rest)
     event = event_of(guards_of(8, True), jnp.int32(8 + STRUCK))
-    after = jax.jit(lambda unseen: resolve(law(True, unseen), motion, stance, event))
+    after = jax.jit(lambda rest: resolve(law(True, rest), motion, stance, event))
     bilateral = jax.jit(lambda: resolve(law(False, 0.0), motion, stance, event))
     return motion, after, bilateral
 
 
 def test_a_leg_at_its_stopper_throws_off_those_that_would_have_to_pull(struck):
     motion, after, _ = struck
-    change = after(1e-10)
+    change = after(1e-6)
     # Another code: the dense mass matrix, and all stoppers at once by projected Gauss-Seidel.
     wheel = moreau_jean.Wheel(0.7)
     q = np.concatenate([[0.0, 2.0, -0.2], np.ones(8)])
@@ -74,7 +74,7 @@ def test_a_leg_at_its_stopper_throws_off_those_that_would_have_to_pull(struck):
 
 def test_what_would_come_back_unseen_stays(struck):
     _, after, bilateral = struck
-    for a, b in zip(jax.tree.leaves(after(1.0)), jax.tree.leaves(bilateral()), strict=True):
+    for a, b in zip(jax.tree.leaves(after(100.0)), jax.tree.leaves(bilateral()), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-13)
 
 

@@ -223,7 +223,7 @@ def test_below_one_every_event_has_exactly_one_solution(friction):
 
 
 def law_of(s, friction):
-    return Law(s, jnp.asarray(friction), one_sided=False, counted=True, unseen=0.0)
+    return Law(s, jnp.asarray(friction), one_sided=False, counted=True, rest=1e-6)
 
 
 def at_rest(theta, **changes):

@@ -20,12 +20,21 @@ from vrw_jax.models import (
     directions,
     felt,
     forces,
+    guard_sizes,
     kept,
     leg_acceleration,
     one_of,
     stance_guards,
 )
-from vrw_jax.numerics import Options, Tableau, change_of_length, dips, parabola, select
+from vrw_jax.numerics import (
+    ROUNDING,
+    Options,
+    Tableau,
+    change_of_length,
+    dips,
+    parabola,
+    select,
+)
 from vrw_jax.wheel import Outcome
 
 N_FELT = 8
@@ -33,6 +42,8 @@ N_FELT = 8
 one-sided, those of legs in the air."""
 MARCHING, EVENT, WAITING = -1, -2, -3
 """Where a lane stands: on its way, at an event, without a wheel; else the `Outcome` it met."""
+PARABOLAS = 3
+"""Tries at an event by parabolas; then by secants, which in stiff dips are better."""
 CLOSE = 30.0
 """An event is found where the last correction to its time is no more than so many tolerances of the
 step: the proposal is a parabola's, whose own error is about a hundredth of the correction."""
@@ -55,6 +66,8 @@ class Search(NamedTuple):
     high: Array
     accuracy: Array  # s
     tries: Array
+    last: Array  # step tried before this one, s
+    values: Array  # guards at its end, (guards, lanes)
 
 
 class March(NamedTuple):
@@ -139,7 +152,7 @@ def set_off(flow: Flow, motion: WheelMotion, h: Array) -> March:
         offset=offset,
         h=zero + h,
         time=zero,
-        search=Search(none > 0, jnp.zeros_like(begun), zero, zero, zero, none),
+        search=Search(none > 0, jnp.zeros_like(begun), zero, zero, zero, none, zero, values),
         verdict=jnp.where(jnp.any(past, axis=0), EVENT, MARCHING).astype(jnp.int32),
         guard=jnp.argmax(past, axis=0).astype(jnp.int32),
         tried=none,
@@ -151,6 +164,8 @@ def march(
 ) -> March:
     """On until `enough` lanes no longer march, or none does. Errors: as `integrate_phase`."""
 
+    sizes = guard_sizes(flow)
+
     def goes_on(now: March) -> Array:
         if enough is None:
             return jnp.any(now.verdict == MARCHING)
@@ -158,7 +173,7 @@ def march(
         return jnp.any(now.verdict == MARCHING) & (jnp.sum(ended) < enough)
 
     def advance(now: March) -> March:
-        return _advanced(now, _tried(flow, tableau, options, now), tableau, options)
+        return _advanced(now, _tried(flow, tableau, options, now), sizes, tableau, options)
 
     return lax.while_loop(goes_on, advance, begin)
 
@@ -200,7 +215,7 @@ def _tried(flow: Flow, tableau: Tableau, options: Options, now: March) -> _Try:
     return _Try(end, squared, values, *parabola(tableau, now.values, inside, values))
 
 
-def _advanced(now: March, tried: _Try, tableau: Tableau, options: Options) -> March:
+def _advanced(now: March, tried: _Try, sizes: Array, tableau: Tableau, options: Options) -> March:
     """The lane takes its step, tries another length, or has come to an event."""
     here, h, search, end = now.here, now.h, now.search, tried.end
     running = now.verdict == MARCHING
@@ -209,7 +224,7 @@ def _advanced(now: March, tried: _Try, tableau: Tableau, options: Options) -> Ma
     retry = keep & (to_dip < 1.0) & (now.time + h * to_dip > now.time)
     crossed = keep & ~retry & jnp.any(tried.values <= 0.0, axis=0)
     accepted = keep & ~retry & ~crossed
-    searched, found = _searched(now, tried, crossed, options)
+    searched, found = _searched(now, tried, crossed, sizes, options)
     arrived = found.arrived
     change = jnp.where(retry, to_dip, change_of_length(tableau, tried.squared, h.dtype))
     following = jnp.where(search.on | crossed, found.following, h * change)
@@ -246,13 +261,17 @@ class _Found(NamedTuple):
     guard: Array
 
 
-def _searched(now: March, tried: _Try, crossed: Array, options: Options) -> tuple[Search, _Found]:
+def _searched(
+    now: March, tried: _Try, crossed: Array, sizes: Array, options: Options
+) -> tuple[Search, _Found]:
     """One more look for the earliest event, from where the guards' parabolas fall through zero."""
     h, search = now.h, now.search
     crosses = tried.values <= 0.0
     crossing = jnp.where(search.on, search.crossing | crosses, crosses)
     first, guard = _earliest_root(now.values, tried.slope, tried.bend, crossing)
-    proposal = h * first
+    by_ends, guard_by_ends = _earliest_secant(search, tried.values, h, crossing)
+    slow = search.on & (search.tries >= PARABOLAS)
+    proposal, guard = jnp.where(slow, by_ends, h * first), jnp.where(slow, guard_by_ends, guard)
     past = jnp.any(crossing & crosses, axis=0)
     low = jnp.where(search.on & ~past, h, search.low)
     high = jnp.where(search.on & past, h, search.high)
@@ -261,11 +280,18 @@ def _searched(now: March, tried: _Try, crossed: Array, options: Options) -> tupl
     accuracy = jnp.maximum(CLOSE * options.rtol * h, resolution)
     accuracy = jnp.where(search.on, search.accuracy, accuracy)
     within = (proposal >= low - accuracy) & (proposal <= high + accuracy)
-    shift = proposal - h
-    close = search.on & within & (jnp.abs(shift) <= accuracy)
-    following = jnp.where(within, proposal, 0.5 * (low + high))
+    # In a dip of microseconds rounding throws proposals out of the bracket: its middle is as good.
+    halve = ~within | (slow & ((search.tries & 3) == 3))
+    following = jnp.where(halve, 0.5 * (low + high), proposal)
+    shift = following - h
+    # Where a guard reads no more than its rounding, no length is better than this one.
+    beside, lowest = _lowest(tried.values / sizes, crossing)
+    at_rest = search.on & (jnp.abs(lowest) <= ROUNDING * jnp.finfo(h.dtype).eps)
+    shift, guard = jnp.where(at_rest, 0.0, shift), jnp.where(at_rest, beside, guard)
+    close = search.on & (jnp.abs(shift) <= accuracy)
     tries = jnp.where(search.on, search.tries + 1, 0)
-    searched = Search((search.on | crossed) & ~close, crossing, low, high, accuracy, tries)
+    on = (search.on | crossed) & ~close
+    searched = Search(on, crossing, low, high, accuracy, tries, h, tried.values)
     return searched, _Found(following, shift, close & (now.verdict == MARCHING), guard)
 
 
@@ -290,6 +316,30 @@ def _to_earliest_dip(values: Array, tried: _Try) -> Array:
     return jnp.min(jnp.where(low, place, 1.0), axis=0)
 
 
+def _lowest(values: Array, crossing: Array) -> tuple[Array, Array]:
+    """Which of the crossing guards is lowest, and its value; infinite where none crosses."""
+    least, guard = jnp.full_like(values[0], jnp.inf), jnp.zeros(values.shape[1:], jnp.int32)
+    for index in range(len(values)):
+        lower = crossing[index] & (values[index] < least)
+        least, guard = jnp.where(lower, values[index], least), jnp.where(lower, index, guard)
+    return guard, least
+
+
+def _earliest_secant(
+    search: Search, values: Array, h: Array, crossing: Array
+) -> tuple[Array, Array]:
+    """Where the first of the crossing guards falls through zero by the last two tries, and which;
+    infinite where none does. Their ends are as right as the march, the inner stage is not."""
+    rate = (values - search.values) / jnp.where(h == search.last, jnp.inf, h - search.last)
+    first, guard = jnp.full_like(h, jnp.inf), jnp.zeros(h.shape, jnp.int32)
+    for index in range(len(values)):
+        falls = crossing[index] & (rate[index] < 0.0)
+        place = h - values[index] / jnp.where(falls, rate[index], 1.0)
+        earlier = falls & (place < first)
+        first, guard = jnp.where(earlier, place, first), jnp.where(earlier, index, guard)
+    return first, guard
+
+
 def _earliest_root(g0: Array, slope: Array, bend: Array, crossing: Array) -> tuple[Array, Array]:
     """Where the first of the crossing guards' parabolas falls through zero, in step lengths, and
     which; infinite where none does ahead."""
@@ -301,6 +351,8 @@ def _earliest_root(g0: Array, slope: Array, bend: Array, crossing: Array) -> tup
     place = over / jnp.where(under == 0.0, 1.0, under)
     exists = crossing & (discriminant >= 0.0) & (under != 0.0) & (place > 0.0)
     first, guard = jnp.full_like(place[0], jnp.inf), jnp.zeros(place.shape[-1:], jnp.int32)
+    for index in reversed(range(len(place))):
+        guard = jnp.where(crossing[index], index, guard)
     for index in range(len(place)):
         earlier = exists[index] & (place[index] < first)
         first = jnp.where(earlier, place[index], first)

@@ -46,6 +46,7 @@ from vrw_jax.models.unilateral.motion import (
     felt,
     flow_of,
     forces,
+    guard_sizes,
     guards_of,
     leg_acceleration,
     stance_guards,

@@ -73,7 +73,7 @@ from vrw_jax.numerics.lanes import (
     zeros_of,
 )
 from vrw_jax.numerics.march import LanePhase, integrate_lanes, sample_lanes
-from vrw_jax.numerics.minima import State, Watched
+from vrw_jax.numerics.minima import ROUNDING, State, Watched
 from vrw_jax.numerics.newton import SectionCycle, corrected, newton_cycle
 from vrw_jax.numerics.options import Engine, Options, SolverName
 from vrw_jax.numerics.roots import BIFURCATIONS, bifurcation_functions, brackets, locate, turns

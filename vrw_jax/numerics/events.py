@@ -24,6 +24,7 @@ from vrw_jax.numerics.minima import (
     State,
     Step,
     Watched,
+    at_rounding,
     cubic,
     cubic_minimum,
     lower,
@@ -259,7 +260,10 @@ def _advance(task: _Task, loop: _Loop) -> _Loop:
     ends_at_once = starting & jnp.any(past)
     marched = _marched(task, loop, step, error)
     found = _searched(search, guards, rates, length)
-    settled = search.settled + (searching & (jnp.abs(found.length - length) <= search.accuracy))
+    close = jnp.abs(found.length - length) <= search.accuracy
+    there, beside = at_rounding(watched, search.crossing, guards)
+    found = found._replace(guard=jnp.where(there, beside, found.guard))
+    settled = search.settled + (searching & (close | there))
     arrived = searching & (settled >= SETTLED)
 
     timed_out = marched.accepted & (step.time >= options.max_phase_time)

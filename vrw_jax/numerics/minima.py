@@ -24,11 +24,29 @@ class Watched(NamedTuple):
     `values` returns the `n_guards` guards followed by the monitors. A monitor's minimum is sought
     at every interior local minimum and at the phase's end; at its start too (`count_start`), unless
     the quantity is zero there by construction, like the height of a foot that leaves the ground.
+    `sizes`: what guards are differences of. One within some roundings of it is at zero: in a dip
+    of microseconds no time brings it closer.
     """
 
     values: Watch
     n_guards: int
     count_start: tuple[bool, ...] = ()
+    sizes: Array | None = None
+
+
+ROUNDING = 32.0
+"""Roundings of its size in a guard's value."""
+
+
+def at_rounding(
+    watched: Watched, crossing: Bool[Array, " n_guards"], guards: Float[Array, " n_guards"]
+) -> tuple[Bool[Array, ""], Int[Array, ""]]:
+    """Whether the lowest of the guards that cross reads only rounding, and which one it is."""
+    sizes = jnp.ones_like(guards) if watched.sizes is None else watched.sizes
+    lowest = jnp.where(crossing, guards / sizes, jnp.inf)
+    near = jnp.abs(jnp.min(lowest)) <= ROUNDING * jnp.finfo(lowest.dtype).eps
+    known = watched.sizes is not None
+    return near & known, jnp.argmin(lowest).astype(jnp.int32)
 
 
 class Step(NamedTuple):

@@ -24,7 +24,7 @@ class Outcome(Code):
     )  # fmt: skip
     TOO_MANY_EVENTS = 10, "Contacts and stoppers changed more often than one step may."
     NO_ADMISSIBLE_CONTACT = (
-        11, "No combination of contact modes satisfies Coulomb's law (a Painlevé paradox)."
+        11, "No combination of contact modes was found that satisfies Coulomb's law in an impact."
     )  # fmt: skip
     THREE_FEET_LOADED = 12, "Three feet would have to carry load at once."
     MESH_TOO_COARSE = (
@@ -32,4 +32,7 @@ class Outcome(Code):
     )  # fmt: skip
     ORDER_DIFFERS = (
         14, "A cycle solves the equations, but its events do not come in the paper's order."
+    )  # fmt: skip
+    FRICTION_PARADOX = (
+        15, "Friction is so high that no forces can carry the motion on (Painlevé's paradox)."
     )  # fmt: skip

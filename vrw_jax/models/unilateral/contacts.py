@@ -9,6 +9,7 @@ Infinite friction is no law but a rule of selection: a foot sticks if that needs
 lifts, and only where neither is possible it slides, without friction.
 """
 
+import functools
 import itertools
 from typing import Any, NamedTuple
 
@@ -214,50 +215,80 @@ class Choice(NamedTuple):
     contact: Int[Array, "2"]
     held: Bool[Array, "2"]
     answer: Answer
-    solutions: Int[Array, ""]  # admissible combinations
+    wrong: Elementwise  # how far its worst sign is off, see `Negligible`; 0 where it is admissible
+    solutions: Int[Array, ""]  # admissible combinations, no less than 1 where `wrong` is small
+
+
+class Negligible(NamedTuple):
+    """What signs are judged by where rounding decides: the unit of how wrong one is."""
+
+    force: Elementwise  # N, or N s in an impact
+    motion: Elementwise  # m/s^2, or m/s
+
+
+ACCEPTED = 1e3
+"""Units of `Negligible` by which a sign may be wrong where no combination has all signs right."""
 
 
 class _Looked(NamedTuple):
     """How far the table has been gone through."""
 
     next: Int[Array, ""]  # of the combinations that may be chosen
-    best: Int[Array, ""]  # the first admissible one
+    best: Int[Array, ""]  # the first admissible one, else the one that is least wrong
+    wrong: Scalar
     solutions: Int[Array, ""]
 
 
+def _wrong(
+    s: Symbols,
+    hub: Hub,
+    free: Free,
+    friction: Scalar,
+    allowed: Allowed,
+    small: Negligible,
+    contact: Array,
+    on: Array,
+) -> Array:
+    """By how much a combination of contacts and held stoppers errs, over what is negligible."""
+    infinite = ~jnp.isfinite(friction)
+    rough = jnp.where(infinite, 0.0, friction)
+    found = answer(s, hub, free, contact, on, friction)
+    worst = jnp.zeros_like(found.hub[0])
+    for i in range(2):
+        mode = contact[i]
+        unless = lambda known, value: jnp.where(known, 0.0, value)
+        known = jnp.take(allowed.known_contact[i], mode)
+        t, n, x, z = (v[i] for v in (found.tangential, found.normal, found.foot_x, found.foot_z))
+        pulls, outside = -n / small.force, unless(infinite, jnp.abs(t) - rough * n)
+        rests = unless(known, jnp.maximum(pulls, outside / small.force))
+        against = jnp.where(mode == SLIP_DOWN, -x, x) / small.motion
+        slides = jnp.maximum(pulls, unless(known, against))
+        loaded = jnp.where(mode == STICK, rests, slides)
+        foot = jnp.where(mode == OFF, unless(known, -z / small.motion), loaded)
+        opens = unless(allowed.known_open[i], found.length[i] / small.motion)
+        stopper = jnp.where(on[i], -found.stopper[i] / small.force, opens)
+        worst = jnp.maximum(worst, jnp.maximum(unless(allowed.stays[i], foot), stopper))
+        worst = jnp.where(jnp.isfinite(n) & jnp.isfinite(t), worst, jnp.inf)
+    return worst
+
+
 def choose(
-    s: Symbols, hub: Hub, free: Free, allowed: Allowed, friction: Scalar, counted: bool
+    s: Symbols,
+    hub: Hub,
+    free: Free,
+    allowed: Allowed,
+    friction: Scalar,
+    small: Negligible,
+    counted: bool,
 ) -> Choice:
     """The first admissible combination of the table; `solutions` is 0 where there is none.
 
-    All admissible ones are counted, or else none is looked at once one is found.
+    All admissible ones are counted, or else none is looked at once one is found. Where none is,
+    the one that is least wrong is taken, if that is little: two touch by rounding, or part by it.
     """
     modes, held = jnp.asarray(MODES), jnp.asarray(HELD)
     infinite = ~jnp.isfinite(friction)
-    rough = jnp.where(infinite, 0.0, friction)
-
-    given = lax.stop_gradient((s, hub, free, friction))
-
-    def admissible(contact: Array, on: Array) -> Array:
-        found = answer(*given[:3], contact, on, given[3])
-        good = jnp.asarray(True)
-        for i in range(2):
-            mode = contact[i]
-            known = jnp.take(allowed.known_contact[i], mode)
-            t, n, x, z = (
-                v[i] for v in (found.tangential, found.normal, found.foot_x, found.foot_z)
-            )
-            inside = infinite | (jnp.abs(t) <= rough * n)
-            direction = jnp.where(mode == SLIP_DOWN, x, -x)
-            sticks = known | ((n >= 0.0) & inside)
-            loaded = jnp.where(mode == STICK, sticks, (n >= 0.0) & (known | (direction >= 0.0)))
-            good &= allowed.stays[i] | jnp.where(mode == OFF, known | (z >= 0.0), loaded)
-            good &= jnp.where(
-                on[i], found.stopper[i] >= 0.0, allowed.known_open[i] | (found.length[i] <= 0.0)
-            )
-            good &= jnp.isfinite(n) & jnp.isfinite(t)
-        return good
-
+    wrong = functools.partial(_wrong, *lax.stop_gradient((s, hub, free, friction)), allowed, small)
     may = jnp.stack([allowed.contact[i][modes[:, i]] for i in range(2)])
     may = may & jnp.stack([allowed.held[i][held[:, i].astype(jnp.int32)] for i in range(2)])
     order = jnp.where(infinite, jnp.asarray(ORDER_WITHOUT_SLIP), jnp.arange(len(MODES)))
@@ -268,22 +299,26 @@ def choose(
         """At the next few combinations that may be chosen."""
         nth = looked.next + jnp.arange(AT_ONCE)
         row = order[jnp.minimum(jnp.sum(rank[None] <= nth[:, None], axis=1), len(MODES) - 1)]
-        good = jax.vmap(admissible)(modes[row], held[row]) & (nth < count)
-        found = jnp.where(jnp.any(good), row[jnp.argmax(good)], 0)
-        first = (looked.solutions == 0) & jnp.any(good)
+        off = jnp.where(nth < count, jax.vmap(wrong)(modes[row], held[row]), jnp.inf)
+        least = jnp.argmin(off)
+        better = off[least] < looked.wrong
         return _Looked(
             looked.next + AT_ONCE,
-            jnp.where(first, found, looked.best).astype(jnp.int32),
-            looked.solutions + jnp.sum(good, dtype=jnp.int32),
+            jnp.where(better, row[least], looked.best).astype(jnp.int32),
+            jnp.where(better, off[least], looked.wrong),
+            looked.solutions + jnp.sum(off == 0.0, dtype=jnp.int32),
         )
 
     def goes_on(looked: _Looked) -> Array:
         return (looked.next < count) & (counted | (looked.solutions == 0))
 
     none = 0 * count
-    looked = lax.while_loop(goes_on, look, _Looked(none, none, none))
+    far = jnp.full_like(lax.stop_gradient(free.hub[0]), jnp.inf)
+    looked = lax.while_loop(goes_on, look, _Looked(none, none, far, none))
     contact, on = modes[looked.best], held[looked.best]
-    return Choice(contact, on, answer(s, hub, free, contact, on, friction), looked.solutions)
+    found = answer(s, hub, free, contact, on, friction)
+    solutions = jnp.maximum(looked.solutions, looked.wrong <= ACCEPTED)
+    return Choice(contact, on, found, looked.wrong, solutions)
 
 
 def leaves(

@@ -1,19 +1,21 @@
 """What an event changes: impacts by momentum, then which feet and stoppers carry the motion on."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Int
 
 from vrw_jax.models.unilateral.contacts import (
+    ACCEPTED,
     OFF,
     SLIP_DOWN,
     SLIP_UP,
     STICK,
     Allowed,
     Choice,
+    Negligible,
     answer,
     choose,
     leaves,
@@ -24,6 +26,7 @@ from vrw_jax.models.unilateral.mechanics import (
     Slots,
     WheelMotion,
     directions,
+    foot_heights,
     free_acceleration,
     free_velocity,
     hub_of,
@@ -77,39 +80,63 @@ class Law(NamedTuple):
     friction: Elementwise
     one_sided: bool  # stoppers of legs in the air only push
     counted: bool  # whether `solutions` is the number of admissible ones, or says if there is one
-    unseen: Elementwise  # least excursion that is followed, m
+    rest: Elementwise  # speed below which a contact that an impact leaves is at rest, m/s
 
 
-MOST_SWITCHES = 40
-"""Rounds in search of the stoppers that hold; a few are enough unless friction is paradoxical."""
+AT_ONCE, IN_TURN = 8, 16
+"""Rounds in search of the stoppers that hold; a few are enough unless friction couples the legs."""
+MOST_LEGS = 8
+"""Legs on stoppers whose every combination is tried where those rounds don't find one."""
 
 
-def _that_push(solve: Callable[[Array], tuple], at_stopper: Array, asked: Array) -> tuple:
-    """What `solve` finds, with which legs in the air are held, and whether their signs are right.
+class _Solved(NamedTuple):
+    """What a guess of the legs held in the air leads to."""
 
-    `solve(held)` returns its result, the stoppers' pushes, and how each free leg's length moves.
+    choice: Choice
+    push: Legs  # of the stoppers, N or N s
+    outward: Legs  # of the legs, m/s^2 or m/s
+    more: Any
+
+
+def _that_push(
+    solve: Callable[[Array], _Solved], at_stopper: Array, asked: Array, small: Negligible
+) -> tuple[_Solved, Array]:
+    """What `solve` finds for the legs in the air that are held, and which those are.
+
     Of `at_stopper` those that are `asked` are held where their stopper pushes, else they move
     inwards. All of the wrong sign switch at once, then, against going in circles, only the last:
-    principal pivoting, finite where no friction couples the legs (Murty 1974, Kostreva 1978).
+    principal pivoting, finite where no friction couples the legs (Murty 1974, Kostreva 1978). Then
+    all combinations are gone through. The least wrong one is taken; it is admissible if that is
+    little, see `ACCEPTED`.
     """
-    place = jnp.arange(at_stopper.shape[0])
+    place, rank = jnp.arange(at_stopper.shape[0]), jnp.cumsum(asked.astype(jnp.int32)) - 1
+    many = 2 ** jnp.minimum(jnp.sum(asked, dtype=jnp.int32), MOST_LEGS)
 
     def switch(now: tuple) -> tuple:
-        held, wrong, tries, _ = now
+        held, code, tries, best = now
+        found = solve(held)
+        off = jnp.where(held, -found.push / small.force, found.outward / small.motion)
+        off = jnp.where(asked, lax.stop_gradient(off), 0.0)
+        wrong = off > 1.0
+        worst = jnp.maximum(jnp.max(off), found.choice.wrong)
+        best = select(worst < best[0], (worst, held, found), best)
         last = place == jnp.max(jnp.where(wrong, place, -1))
-        held = held ^ jnp.where(tries <= MOST_SWITCHES // 2, wrong, last)
-        result, push, outward = solve(held)
-        wrong = asked & jnp.where(held, push < 0.0, outward > 0.0)
-        return held, wrong, tries + 1, result
+        pivoted = held ^ jnp.where(tries < AT_ONCE, wrong, last)
+        pivots = (code < 0) & jnp.any(wrong) & (tries < AT_ONCE + IN_TURN)
+        code = jnp.where(pivots, code, code + 1)
+        counted = jnp.where(asked, ((code >> rank) & 1) == 1, at_stopper)
+        return jnp.where(pivots, pivoted, counted), code, tries + 1, best
 
     def goes_on(now: tuple) -> Array:
-        _, wrong, tries, _ = now
-        return (tries == 0) | (jnp.any(wrong) & (tries < MOST_SWITCHES))
+        _, code, tries, best = now
+        return (tries == 0) | ((best[0] > 1.0) & (code < many))
 
-    empty = zeros_of(solve, at_stopper)[0]
-    begin = at_stopper, at_stopper & False, jnp.zeros((), jnp.int32), empty
-    held, wrong, _, result = lax.while_loop(goes_on, switch, begin)
-    return result, held, ~jnp.any(wrong)
+    empty, none = zeros_of(solve, at_stopper), jnp.zeros((), jnp.int32)
+    unknown = jnp.full_like(empty.choice.wrong, jnp.inf), at_stopper, empty
+    begin = at_stopper, none - 1, none, unknown
+    worst, held, found = lax.while_loop(goes_on, switch, begin)[3]
+    solutions = jnp.where(worst <= ACCEPTED, found.choice.solutions, 0)
+    return found._replace(choice=found.choice._replace(solutions=solutions)), held
 
 
 class Change(NamedTuple):
@@ -122,6 +149,7 @@ class Change(NamedTuple):
     tangential_impulse: tuple[Scalar, Scalar]
     stopper_impulse: Scalar  # least of the locked legs in the air, N s; inf without an impact
     solutions: Int[Array, ""]  # admissible combinations: the worse of both levels
+    paradox: Bool[Array, ""]  # no forces carry the motion on
     most_solutions: Int[Array, ""]
     third_foot: Bool[Array, ""]  # three feet would have to be loaded
 
@@ -138,41 +166,18 @@ def moved_by(
     return motion._replace(vx=vx, vz=vz, dtheta=dtheta, dL=dL)
 
 
-class Staying(NamedTuple):
-    """What an impact may not throw off."""
-
-    legs: Bool[Array, " n_legs"]  # from their stoppers, in the air
-    feet: Bool[Array, " n_legs"]  # from the ground
-
-
-class Thrown(NamedTuple):
-    """How fast what has just been thrown off comes back, m/s^2."""
-
-    legs: Legs  # to the stopper
-    feet: Legs  # to the slope
-
-
-class _Shock(NamedTuple):
-    """The answer of an impact."""
-
-    after: WheelMotion
-    choice: Choice
-    impulse: Legs  # of the stoppers in the air, N s; inf for other legs
-
-
 def _is(mode: Array | int) -> Bool[Array, "... 4"]:
     """A flag for each of the four contact modes: whether it is this one."""
     return jnp.arange(4) == jnp.asarray(mode)[..., None]
 
 
 def _impact(
-    law: Law, motion: WheelMotion, stance: Stance, event: Event, stay: Staying
-) -> tuple[_Shock, Slots, Bool[Array, " n"]]:
+    law: Law, motion: WheelMotion, stance: Stance, event: Event
+) -> tuple[_Solved, Slots, Bool[Array, " n"]]:
     """Velocity level: simultaneous, inelastic, with Coulomb's law in the impulse.
 
-    Also says which legs in the air are held: with one-sided stoppers those that need not pull, and
-    those that `stay`. Infinite friction keeps feet at rest planted when a leg meets its stopper, as
-    the paper does.
+    Also says which legs in the air are held: with one-sided stoppers those that need not pull.
+    Infinite friction keeps feet at rest planted when a leg meets its stopper, as the paper does.
     """
     s, friction = law.s, law.friction
     slots = slots_of((stance.contact != OFF) | event.lands)
@@ -180,7 +185,6 @@ def _impact(
     loaded = jnp.stack([jnp.any(slots.first), jnp.any(slots.second)])
     stops, before = slots.flags(at_stopper), slots.codes(stance.contact)
     planted = (before == STICK) & ~jnp.any(event.lands) & ~jnp.isfinite(friction)
-    planted = planted | slots.flags(stay.feet)
     modes = jnp.where(loaded[:, None], jnp.ones((4,), bool), _is(OFF))
     modes = jnp.where(planted[:, None], _is(before), modes)
     allowed = Allowed(
@@ -190,26 +194,22 @@ def _impact(
         known_contact=~loaded[:, None] & _is(OFF),
         known_open=~stops,
     )
+    small = Negligible(s.m * law.rest / ACCEPTED, law.rest / ACCEPTED)
 
-    def solve(airborne: Array) -> tuple[_Shock, Legs, Legs]:
+    def solve(airborne: Array) -> _Solved:
         hub = hub_of(s, motion, slots, airborne)
         free = free_velocity(s, motion, slots, hub)
-        choice = choose(s, hub, free, allowed, friction, law.counted)
+        choice = choose(s, hub, free, allowed, friction, small, law.counted)
         after = moved_by(s, motion, slots, hub, airborne, choice)
         jump_x, jump_z = after.vx - motion.vx, after.vz - motion.vz
         impulse = s.m * (hub.legs.sin * jump_x + hub.legs.cos * jump_z + motion.dL)
-        return _Shock(after, choice, jnp.where(airborne, impulse, jnp.inf)), impulse, after.dL
+        return _Solved(choice, impulse, after.dL, after)
 
     airborne = at_stopper & ~slots.filled
     if not law.one_sided:
-        return solve(airborne)[0], slots, airborne
-    shock, held, right = _that_push(solve, airborne, airborne & ~stay.legs & event.impact)
-    return shock._replace(choice=_if(right, shock.choice)), slots, held
-
-
-def _if(right: Array, choice: Choice) -> Choice:
-    """The same, not admissible where the stoppers in the air found no right signs."""
-    return choice._replace(solutions=jnp.where(right, choice.solutions, 0))
+        return solve(airborne), slots, airborne
+    found, held = _that_push(solve, airborne, airborne & event.impact, small)
+    return found, slots, held
 
 
 def _following(
@@ -236,14 +236,18 @@ def _following(
     return modes, known
 
 
+SOUND = 1e-9
+"""Share of the wheel's weight, and of gravity, that is nothing: forces are known to rounding."""
+
+
 def _support(
     law: Law, motion: WheelMotion, contact: Int[Array, " n"], at_stopper: Array, event: Event
-) -> tuple[Choice, Slots, Array, Bool[Array, " n"], Thrown]:
+) -> tuple[Choice, Slots, Array, Bool[Array, " n"]]:
     """Acceleration level: who carries the motion that follows.
 
-    Also says which feet were at rest, which legs in the air are held, and how what is off comes
-    back. What an event has just ended is not asked again: its force is zero, and its sign rounding.
-    It is followed by what it was about to become, if that goes the right way (see `leaves`).
+    Also says which feet were at rest, and which legs in the air are held. What an event has just
+    ended is not asked again: its force is zero, and its sign rounding. It is followed by what it
+    was about to become, if that goes the right way (see `leaves`).
     """
     s, friction = law.s, law.friction
     slots = slots_of(contact != OFF)
@@ -254,8 +258,9 @@ def _support(
     second = (event.lifts | up | down)[1]
     direction = jnp.any(down).astype(jnp.int32) - jnp.any(up).astype(jnp.int32)
     opens = ~stops | event.releases
+    small = Negligible(SOUND * s.Mt * s.g, SOUND * s.g)
 
-    def solve(airborne: Array) -> tuple[tuple[Choice, Thrown], Legs, Legs]:
+    def solve(airborne: Array) -> _Solved:
         hub = hub_of(s, motion, slots, airborne)
         free = free_acceleration(s, motion, slots, hub)
         leaving = leaves(s, hub, free, (mode, stops), friction, second, direction)
@@ -267,71 +272,72 @@ def _support(
             known_contact=known,
             known_open=opens,
         )
-        choice = choose(s, hub, free, allowed, friction, law.counted)
-        ax, az, turning = choice.answer.hub
-        sin, cos, dtheta = *hub.legs, motion.dtheta
-        outward = free.legs + sin * ax + cos * az
-        ddL = jnp.where(airborne, 0.0, outward)
-        turned = 2.0 * motion.dL * dtheta * sin + motion.L * (turning * sin + dtheta**2 * cos)
-        return (choice, Thrown(outward, ddL * cos - az - turned)), outward, outward
+        choice = choose(s, hub, free, allowed, friction, small, law.counted)
+        ax, az, _ = choice.answer.hub
+        outward = free.legs + hub.legs.sin * ax + hub.legs.cos * az
+        return _Solved(choice, s.m * outward, outward, None)
 
     airborne = at_stopper & ~slots.filled
     if not law.one_sided:
-        choice, thrown = solve(airborne)[0]
-        return choice, slots, rests, airborne, thrown
-    (choice, thrown), held, right = _that_push(solve, airborne, airborne)
-    return _if(right, choice), slots, rests, held, thrown
+        return solve(airborne).choice, slots, rests, airborne
+    found, held = _that_push(solve, airborne, airborne, small)
+    return found.choice, slots, rests, held
+
+
+def _at_rest(
+    law: Law, motion: WheelMotion, slots: Slots, contact: Array, at_stopper: Array, struck: Array
+) -> tuple[WheelMotion, Array, Array]:
+    """What an impact leaves: motion, modes of the touching feet, legs on their stoppers.
+
+    A contact that it leaves slower than `law.rest` is at rest: it would come back after a dip
+    that is no longer followed, and throw off another by less, without end. `struck`: legs that
+    were at their stoppers. What carries it from there is for the forces to say.
+    """
+    legs = directions(law.s, motion.theta)
+    turn = motion.L * motion.dtheta
+    foot_x = motion.vx - motion.dL * legs.sin - turn * legs.cos
+    foot_z = motion.vz - motion.dL * legs.cos + turn * legs.sin
+    stays = slots.filled & ((contact != OFF) | (foot_z < law.rest))
+    slips = jnp.where(foot_x > 0.0, SLIP_DOWN, SLIP_UP)
+    mode = jnp.where(jnp.abs(foot_x) < law.rest, STICK, slips)
+    mode = jnp.where((contact == STICK) | ~stays, contact, mode)
+    on = at_stopper | (struck & (jnp.abs(motion.dL) < law.rest))
+    new = jnp.any(mode != contact) | jnp.any(on != at_stopper)
+    return select(new, settled(law.s, motion, mode, on), motion), mode, on
+
+
+def _joined(law: Law, motion: WheelMotion, stance: Stance, event: Event) -> Event:
+    """An impact with all that touches, whether or not its own event has come: what is nearer than
+    a dip that is followed, and does not part. In turns they would throw each other off for ever."""
+    s, legs = law.s, directions(law.s, motion.theta)
+    near = law.rest**2 / (2.0 * s.g)
+    rising = motion.vz - motion.dL * legs.cos + motion.L * motion.dtheta * legs.sin
+    low = (foot_heights(motion, legs) <= near) & (rising <= law.rest)
+    lands = event.lands | (low & (stance.contact == OFF) & event.impact)
+    few = jnp.sum(lands | (stance.contact != OFF)) <= 2
+    out = (near >= s.L0 - motion.L) & (motion.dL >= -law.rest)
+    closes = event.closes | (out & ~stance.locked & event.impact)
+    return event._replace(lands=jnp.where(few, lands, event.lands), closes=closes)
 
 
 def resolve(law: Law, motion: WheelMotion, stance: Stance, event: Event) -> Change:
-    """Everything that an event changes.
-
-    What an impact throws off the ground, or off a stopper that only pushes, comes back: where it
-    would go no farther than `law.unseen` it stays. It would give the hub its momentum a moment
-    later, so the motion is the same to about that; else each return throws others off, ever
-    less, without end.
-    """
-    nothing = Staying(stance.locked & False, stance.locked & False)
-    legs = directions(law.s, motion.theta)
-    resolved = lambda stay: _resolved(law, motion, stance, event, stay)
-
-    def again(now: tuple) -> tuple:
-        stay, _, _ = now
-        change, back = resolved(stay)
-        after, now_stance = change.motion, change.stance
-        rise = after.vz - after.dL * legs.cos + after.L * after.dtheta * legs.sin
-        returns = lambda speed, back: (back > 0.0) & (speed**2 < 2.0 * back * law.unseen)
-        in_air = now_stance.contact == OFF
-        more = Staying(
-            now_stance.new_leg & in_air & returns(after.dL, back.legs) & law.one_sided,
-            now_stance.new_foot & (stance.contact != OFF) & returns(rise, back.feet),
-        )
-        new = jnp.any(more.legs & ~stay.legs) | jnp.any(more.feet & ~stay.feet)
-        stay = Staying(stay.legs | more.legs, stay.feet | more.feet)
-        return stay, new & event.impact, change
-
-    begin = nothing, jnp.asarray(True), zeros_of(resolved, nothing)[0]
-    return lax.while_loop(lambda now: now[1], again, begin)[2]
-
-
-def _resolved(
-    law: Law, motion: WheelMotion, stance: Stance, event: Event, stay: Staying
-) -> tuple[Change, Thrown]:
-    """`resolve` where some stay whatever it takes; also how what was thrown off comes back."""
+    """Everything that an event changes."""
+    event = _joined(law, motion, stance, event)
     s, impact = law.s, event.impact
     touched = (stance.contact != OFF) | event.lands
     was_locked = (stance.locked | event.closes) & ~event.loosens
-    shock, slots, held = _impact(law, motion, stance, event, stay)
-    after = select(impact, shock.after, motion)
+    shock, slots, held = _impact(law, motion, stance, event)
     struck = slots.spread(shock.choice.contact).astype(jnp.int32)
-    contact = jnp.where(impact, struck, stance.contact)
     kept = jnp.where(slots.filled, slots.spread(shock.choice.held) > 0, was_locked & held)
-    at_stopper = jnp.where(impact, kept, was_locked)
+    left = _at_rest(law, shock.more, slots, struck, kept, was_locked)
+    after, contact, at_stopper = select(impact, left, (motion, stance.contact, was_locked))
     legs = directions(s, motion.theta)
     dropped = touched & ~slots.filled
     foot_z = after.vz - after.dL * legs.cos + after.L * after.dtheta * legs.sin
+    lost = kinetic_energy(s, motion) - kinetic_energy(s, after)
+    impulse = jnp.where(held, shock.push, jnp.inf)
 
-    support, slots, rests, held, back = _support(law, after, contact, at_stopper, event)
+    support, slots, rests, held = _support(law, after, contact, at_stopper, event)
     contact = slots.spread(support.contact).astype(jnp.int32)
     locked = jnp.where(slots.filled, slots.spread(support.held) > 0, at_stopper & held)
     slides = (support.contact == SLIP_DOWN) | (support.contact == SLIP_UP)
@@ -342,10 +348,9 @@ def _resolved(
         new_leg=(stance.locked | event.closes) & ~locked,
         new_slip=slots.spread(slides & rests) > 0,
     )
-    lost = kinetic_energy(s, motion) - kinetic_energy(s, after)
     shocked, stands = shock.choice.solutions, support.solutions
     blank = lambda pair: (jnp.where(impact, pair[0], 0.0), jnp.where(impact, pair[1], 0.0))
-    change = Change(
+    return Change(
         motion=after._replace(
             L=jnp.where(locked, s.L0, after.L), dL=jnp.where(locked, 0.0, after.dL)
         ),
@@ -353,12 +358,12 @@ def _resolved(
         energy_lost=jnp.where(impact, lost, 0.0),
         normal_impulse=blank(shock.choice.answer.normal),
         tangential_impulse=blank(shock.choice.answer.tangential),
-        stopper_impulse=jnp.where(impact, jnp.min(shock.impulse), jnp.inf),
+        stopper_impulse=jnp.where(impact, jnp.min(impulse), jnp.inf),
         solutions=jnp.where(impact, jnp.minimum(shocked, stands), stands),
+        paradox=(stands == 0) & ((shocked > 0) | ~impact),
         most_solutions=jnp.where(impact, jnp.maximum(shocked, stands), stands),
         third_foot=jnp.any(dropped & (foot_z < 0.0)) & impact,
     )
-    return change, back
 
 
 def settled(
@@ -378,7 +383,9 @@ def settled(
     hub = hub_of(s, motion, slots, airborne)
     free = free_velocity(s, motion, slots, hub)
     modes, held = slots.codes(contact), slots.flags(locked)
+    # Two resting feet on two held legs would fix the hub twice over.
+    held = held & ~(jnp.all(modes == STICK) & jnp.all(held) & jnp.asarray([False, True]))
     zero = jnp.zeros_like(motion.theta)
     found = answer(s, hub, free, modes, held, zero)
-    choice = Choice(modes, held, found, jnp.ones((), jnp.int32))
+    choice = Choice(modes, held, found, zero, jnp.ones((), jnp.int32))
     return moved_by(s, motion, slots, hub, airborne, choice)

@@ -24,22 +24,17 @@ from vrw_jax.models.unilateral.motion import (
 from vrw_jax.numerics import Elementwise, Options, PhaseEnd, Scalar, select
 from vrw_jax.wheel import Outcome, Symbols
 
-SEEN = 4e5
-"""Roundings of a leg's length in the least dip that is followed, 1e-10 m in float64: a dip takes
-the time 4 depth / speed, and its end is known to rounding / speed, here a millionth of that."""
+SHARE, SEEN = 1e-2, 4e2
+"""Least dip that is followed: this share of the tolerance, and no less than so many roundings of a
+leg's length, 1e-13 m in float64."""
 
 
 def law_of(
     s: Symbols, friction: Elementwise, options: Options, one_sided: bool, counted: bool
 ) -> Law:
-    """The law of a walk, with the least excursion from ground or stopper that follows an impact.
-
-    Legs leave one-sided stoppers so often that it grows with the tolerance; feet alone do not, and
-    the shares of a step in double and single support would show it.
-    """
-    unseen = SEEN * jnp.finfo(s.L0.dtype).eps * s.L0
-    unseen = jnp.maximum(options.atol, unseen) if one_sided else unseen
-    return Law(s, friction, one_sided, counted, unseen)
+    """The law of a walk; the speed of rest is that of the least dip under gravity."""
+    dip = jnp.maximum(SHARE * options.atol, SEEN * jnp.finfo(s.L0.dtype).eps * s.L0)
+    return Law(s, friction, one_sided, counted, jnp.sqrt(2.0 * s.g * dip))
 
 
 def past(
@@ -53,6 +48,7 @@ def past(
     motion, event = settled(law.s, motion, stance.contact, stance.locked), event_of(place, guard)
     change = resolve(law, motion, stance, event)
     outcome = jnp.where(change.solutions > 0, Outcome.STEPPED, Outcome.NO_ADMISSIBLE_CONTACT)
+    outcome = jnp.where(change.paradox, Outcome.FRICTION_PARADOX, outcome)
     outcome = jnp.where(change.third_foot, Outcome.THREE_FEET_LOADED, outcome)
     return change, event, outcome.astype(jnp.int32)
 

@@ -236,6 +236,14 @@ def stance_guards(flow: Flow, motion: WheelMotion, now: Felt, begun: Array) -> l
     ]
 
 
+def guard_sizes(flow: Flow) -> Array:
+    """What a guard of each kind is of, in the order of `Guards`: m, N, m/s, rad/s."""
+    s = flow.s
+    weight, speed = s.Mt * s.g, jnp.sqrt(s.g * s.L0)
+    rows = [s.L0] * 2 * s.n + [weight] * 6 + [speed] * 2 + [weight] * 2 + [speed / s.L0, s.L0]
+    return jnp.stack(rows + [weight] * s.n * flow.one_sided)
+
+
 def guards(flow: Flow, y: State) -> Float[Array, " n_guards"]:
     """All guards, positive in the stance, falling through zero where it ends; 1 if not watched."""
     motion, tally = unpack(y)

@@ -33,6 +33,7 @@ from vrw_jax.models.unilateral.motion import (
     field,
     flow_of,
     forces,
+    guard_sizes,
     guards,
     guards_of,
     pack,
@@ -157,7 +158,7 @@ class UnilateralWheel(AbstractWheel):
     tells_contacts: ClassVar[bool] = True
 
     friction: Scalar = eqx.field(converter=friction_of, default=0.7)
-    max_events: int = eqx.field(static=True, converter=partial(whole, "max_events"), default=100)
+    max_events: int = eqx.field(static=True, converter=partial(whole, "max_events"), default=400)
     stoppers: str = eqx.field(static=True, default=BILATERAL)
 
     if TYPE_CHECKING:
@@ -165,7 +166,7 @@ class UnilateralWheel(AbstractWheel):
         def __init__(
             self,
             friction: Number = 0.7,
-            max_events: int = 100,
+            max_events: int = 400,
             stoppers: Literal["bilateral", "one-sided"] = "bilateral",
         ) -> None: ...
 
@@ -266,7 +267,7 @@ def _go_on(law: Law, place: Guards, max_events: int, options: Options, now: _Wal
     sound = outcome == Outcome.STEPPED
     start = pack(change.motion, tally._replace(clock=jnp.zeros_like(tally.clock)))
     start = jnp.where(sound, start, now.state)
-    guarded = Watched(partial(guards, flow), place.total)
+    guarded = Watched(partial(guards, flow), place.total, sizes=guard_sizes(flow))
     end = integrate_phase(partial(field, flow), guarded, start, sound, options)
 
     ledger = now.ledger._replace(events=now.ledger.events + 1)
