@@ -9,7 +9,15 @@ import pytest
 from oracle import moreau_jean
 
 import vrw_jax as vrw
-from vrw_jax.models.unilateral.contacts import OFF, SLIP_DOWN, SLIP_UP, STICK, Allowed, choose
+from vrw_jax.models.unilateral.contacts import (
+    OFF,
+    SLIP_DOWN,
+    SLIP_UP,
+    STICK,
+    Allowed,
+    Negligible,
+    choose,
+)
 from vrw_jax.models.unilateral.mechanics import (
     WheelMotion,
     free_acceleration,
@@ -100,7 +108,8 @@ def chosen(q, v, at_stopper, locked, friction, moving):
         known_contact=never,
         known_open=~at_stopper,
     )
-    choice = choose(s, hub, free, allowed, friction, True)
+    small = Negligible(jnp.asarray(1e-12), jnp.asarray(1e-12))  # no case is near a border
+    choice = choose(s, hub, free, allowed, friction, small, True)
     rates = jnp.stack([*choice.answer.hub, *choice.answer.length])
     return choice.contact, choice.held, rates, choice.solutions
 
