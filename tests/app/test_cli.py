@@ -18,9 +18,9 @@ from typer.testing import CliRunner, Result
 from vrw_jax.app import cli
 from vrw_jax.app.cli import app
 from vrw_jax.app.config import parse
-from vrw_jax.scans import forecast
 from vrw_jax.app.printing import scan_reporter
 from vrw_jax.branches.branch import Branch
+from vrw_jax.scans import forecast
 from vrw_jax.scans.planning import Plan
 from vrw_jax.scans.running import Progress
 from vrw_jax.scans.store import open_scan

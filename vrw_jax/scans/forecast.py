@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import sys
-from time import perf_counter
 from pathlib import Path
+from time import perf_counter
 
 import numpy as np
 
