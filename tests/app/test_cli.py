@@ -20,6 +20,7 @@ from vrw_jax.app.cli import app
 from vrw_jax.app.config import parse
 from vrw_jax.app.printing import scan_reporter
 from vrw_jax.branches.branch import Branch
+from vrw_jax.scans import forecast
 from vrw_jax.scans.planning import Plan
 from vrw_jax.scans.running import Progress
 from vrw_jax.scans.store import open_scan
@@ -76,7 +77,7 @@ def test_explain_measures_some_samples_and_writes_nothing(
     config: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = iter([0.0, 10.0, 12.0])
-    monkeypatch.setattr("time.perf_counter", lambda: next(clock))
+    monkeypatch.setattr(forecast, "perf_counter", lambda: next(clock))
     told = vrw("scan", config, "--explain")
     assert told.exit_code == 0, told.output
     assert "about 7 s: 24 samples at 12 per second" in told.stdout

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import sys
-import time
 from pathlib import Path
+from time import perf_counter
 
 import numpy as np
 
@@ -50,11 +50,11 @@ def explained(
         return told | {"time": "none: the store is complete"}
     n = min(left, MEASURED[planned.model.rung] * n_cores())
     engine = planned.engine() if evaluate is None else evaluate
-    began = time.perf_counter()
+    began = perf_counter()
     engine(_spread(planned.design, 1))
-    ready = time.perf_counter()
+    ready = perf_counter()
     engine(_spread(planned.design, n))
-    rate = n / (time.perf_counter() - ready)
+    rate = n / (perf_counter() - ready)
     memory = _peak() + chunk * 2 * layout.bytes_per_sample
     return told | {
         "memory": f"about {_bytes(memory)}, "
