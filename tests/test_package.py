@@ -40,7 +40,7 @@ def test_images_and_links_lead_from_the_package_index_to_the_sources(
     for path in paths:
         assert path.startswith(("https://", "#")), path
         if path.startswith("https://example.org"):
-            assert (ROOT / path.split("/HEAD/")[1]).exists(), path
+            assert (ROOT / path.split("/HEAD/")[1].split("#")[0]).exists(), path
     assert "](" not in hook.for_index("![a](b.png) [c](d.md)", "")
 
 

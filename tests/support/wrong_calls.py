@@ -618,7 +618,7 @@ def make() -> None:
         "ValueError",
         "saltelli",
     )
-    use("a name that is not there", lambda: vrw.limit_cycles, "AttributeError", "limit_cycle")
+    use("a name that is not there", lambda: vrw.limit_cycel, "AttributeError", "limit_cycle")
     use("indices of a table", lambda: vrw.sobol_indices({}), "TypeError", "scan")
 
 

@@ -75,7 +75,9 @@ class LimitCycle(AbstractCycle):
     located: Located
     matrix: Float[Array, "2 2"]
     problem: Problem = eqx.field(static=True)
-    model: ViscoelasticWheel = ViscoelasticWheel()  # whose ground the monitors are for
+    model: ViscoelasticWheel = eqx.field(
+        default_factory=ViscoelasticWheel
+    )  # whose ground the monitors are for
 
     @property
     def period_n(self) -> int:
