@@ -25,12 +25,14 @@ def on_one_core() -> Iterator[None]:
     cores = os.sched_getaffinity(0)
     threads = [int(name) for name in os.listdir("/proc/self/task")]
     for thread in threads:
-        os.sched_setaffinity(thread, {max(cores)})
+        with contextlib.suppress(ProcessLookupError):  # it has ended since
+            os.sched_setaffinity(thread, {max(cores)})
     try:
         yield
     finally:
         for thread in map(int, os.listdir("/proc/self/task")):
-            os.sched_setaffinity(thread, cores)
+            with contextlib.suppress(ProcessLookupError):
+                os.sched_setaffinity(thread, cores)
 
 
 def start_cold() -> None:
