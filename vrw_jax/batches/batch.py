@@ -209,23 +209,21 @@ def _by_phases(
 ) -> Steps:
     """Of rungs that step through the paper's phases."""
     walked = _Walked(states, asked)
-    if asked:
-        options = options.for_derivatives()
-    some = options, n_legs, walked.moved
-    runs = {NAMED: _chosen(engine, model, *some)}
+    some = n_legs, walked.moved
+    runs = {NAMED: _chosen(engine, model, options, *some)}
     solver = np.full(len(states), NAMED, np.int32)
     solvers: tuple[str, ...] = (options.solver,)
     name = runs[NAMED].name
     if engine == "auto" and name == "lanes":
         solvers, solver = (
             (options.solver, STABLE_SOLVER, IMPLICIT_SOLVER),
-            cheapest_solver(wheels, options),
+            cheapest_solver(wheels, options.for_derivatives() if asked else options),
         )
     if np.any(solver != NAMED):
         by = lambda solver: dataclasses.replace(options, solver=solver)
         stable = by(STABLE_SOLVER).tightened(TIGHTER)
-        runs[STABLE] = _chosen("lanes", model, stable, *some[1:])
-        runs[IMPLICIT] = _chosen("diffrax", model, by(IMPLICIT_SOLVER), *some[1:])
+        runs[STABLE] = _chosen("lanes", model, stable, *some)
+        runs[IMPLICIT] = _chosen("diffrax", model, by(IMPLICIT_SOLVER), *some)
     if engine == "collocation":
         name = engine
         walked.durations[:] = _expected(durations, states, wheels.dtype)
@@ -295,7 +293,7 @@ class _Walked:
         # Of a step, and of the walk: by the start and then by the other names asked for.
         self.asked, self.names = asked, [name for name in asked if name != START]
         self.moved = (*(PARAMETER_NAMES.index(x) for x in self.names), *STATE) if asked else ()
-        self.jacobian = np.zeros((n, 6, 3 + len(self.names)), states.dtype)
+        self.jacobian = np.zeros((n if asked else 0, 6, 3 + len(self.names)), states.dtype)
         self.jacobian[:, :3, :3] = np.eye(3)
 
     def told(self, solver: np.ndarray, engine: str, solvers: tuple[str, ...]) -> Steps:
@@ -303,16 +301,18 @@ class _Walked:
         counts = jnp.asarray(self.n_stepped), jnp.asarray(self.solver_steps)
         fixed, which = jnp.asarray(self.fixed), jnp.asarray(solver)
         durations = jnp.asarray(self.durations)
+        by = self.derivatives()
+        return Steps(states, durations, outcome, *counts, fixed, which, engine, solvers, by)
+
+    def derivatives(self) -> dict[str, By]:
+        """Of the walk, by what was asked for; zero where it failed."""
+        if not self.asked:
+            return {}
         stepped = (self.outcome == Outcome.STEPPED)[:, None, None]
         by = jnp.asarray(np.where(stepped, self.jacobian, 0.0))
         columns: dict[str, Any] = {name: 3 + i for i, name in enumerate(self.names)}
         columns[START] = slice(3)
-        derivatives = {
-            name: By(by[:, :3, columns[name]], by[:, 3:, columns[name]]) for name in self.asked
-        }
-        return Steps(
-            states, durations, outcome, *counts, fixed, which, engine, solvers, derivatives
-        )
+        return {name: By(by[:, :3, columns[name]], by[:, 3:, columns[name]]) for name in self.asked}
 
     def take(self, lanes: np.ndarray, told: tuple[np.ndarray, ...], fixed: bool) -> None:
         state, durations, outcome, tried, *jacobian = told
@@ -367,6 +367,7 @@ def _by_lanes(
     states: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
     """By the lane engine: wheels of like work side by side."""
+    options = options.for_derivatives() if moved else options
     dynamic, static = eqx.partition(options, eqx.is_array)
     uniform = [np.asarray(leaf, wheels.dtype) for leaf in jax.tree.leaves(dynamic)]
     tableau = explicit_tableau(options.solver)

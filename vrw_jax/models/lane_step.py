@@ -176,13 +176,17 @@ class _Setting(NamedTuple):
         """By `repr`: what the trace depends on."""
         return str(self.structure), self.stop_at_lift_off, self.monitored
 
-    def told(self, *leaves: Array) -> Told:
-        """Over lanes: the leaves have them on their last axis."""
+    def walked(self, *leaves: Array) -> tuple[Walked, Tableau, Options]:
+        """The step over lanes, which the leaves have on their last axis, and what made it."""
         params, x, options = jax.tree.unflatten(self.structure, leaves)
         tableau = explicit_tableau(options.solver)
         assert tableau is not None  # `lanes_can` looked
         given = params, tuple(x), options, tableau, self.stop_at_lift_off, self.monitored
-        return told_of(walk(*given))
+        return walk(*given), tableau, options
+
+    def told(self, *leaves: Array) -> Told:
+        """What the step tells, over lanes."""
+        return told_of(self.walked(*leaves)[0])
 
 
 def told_by_lanes(structure: Any, stop_at_lift_off: bool, monitored: bool) -> Forward:
@@ -201,10 +205,7 @@ def sampled_by_lanes(structure: Any, stop_at_lift_off: bool, n_samples: int) -> 
     setting = _Setting(structure, stop_at_lift_off, monitored=False)
 
     def over_lanes(*leaves: Array) -> tuple:
-        params, x, options = jax.tree.unflatten(structure, leaves)
-        tableau = explicit_tableau(options.solver)
-        assert tableau is not None  # `lanes_can` looked
-        walked = walk(params, tuple(x), options, tableau, stop_at_lift_off, monitored=False)
+        walked, tableau, options = setting.walked(*leaves)
         samples = [
             sample_lanes(
                 lane_phase(phase, False), tableau, *start, end.duration, n_samples, options

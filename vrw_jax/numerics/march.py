@@ -5,7 +5,6 @@ they locate their events together, taking that step again with its length correc
 method. What a lane gives never depends on its neighbours: a lane that has ended is left alone.
 """
 
-import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -111,10 +110,9 @@ def integrate_lanes(
 
     Where many lanes march together, as on a GPU, they don't wait for their last `few` if these take
     `LATE` times as long as half of them: these are marked unfinished, to run again from their start
-    among their like. Derivatives: by `constants`, `held`,
-    `q` and `v`, see `tangents`.
+    among their like. Derivatives: by `constants`, `held`, `q` and `v`, see `tangents`.
     """
-    run = jax.custom_jvp(functools.partial(_integrated, phase_of, tableau))
+    run = jax.custom_jvp(lambda *given: _ended(phase_of, tableau, None, *given).end)
 
     @run.defjvp
     def rule(primals: tuple, tangents: tuple) -> tuple[LanePhaseEnd, LanePhaseEnd]:
@@ -127,45 +125,27 @@ def integrate_lanes(
 
         start = jnp.stack([*q, *v, *held])
         moving = Moving(balance_of, primals[0], primals[1], moved, start)
-        return _integrated_and_moved(moving, phase_of, tableau, *primals)
+        ended = _ended(phase_of, tableau, moving, *primals)
+        return ended.end, _end_moved(phase_of, tableau, moving, ended)
 
     return run(constants, held, q, v, active, first_step, options, few)
 
 
-def _integrated(
-    phase_of: PhaseOf,
-    tableau: Tableau,
-    constants: Any,
-    held: Vector,
-    q: Vector,
-    v: Vector,
-    active: Array,
-    first_step: Array,
-    options: Options,
-    few: Array | None,
-) -> LanePhaseEnd:
-    phase = _traced_once(phase_of(constants, held))
-    return _ended(phase, tableau, q, v, active, first_step, options, few, None).end
+class _Ended(NamedTuple):
+    """A phase with its end, and what was found on the way there."""
+
+    phase: LanePhase
+    start: Place
+    end: LanePhaseEnd
+    march: _March
+    lowest: Lowest | None
+    least: Settled | None
 
 
-def _integrated_and_moved(
-    moving: Moving,
-    phase_of: PhaseOf,
-    tableau: Tableau,
-    constants: Any,
-    held: Vector,
-    q: Vector,
-    v: Vector,
-    active: Array,
-    first_step: Array,
-    options: Options,
-    few: Array | None,
-) -> tuple[LanePhaseEnd, LanePhaseEnd]:
-    """The phase's end, and how it moves along a direction of its start and constants."""
-    phase = _traced_once(phase_of(constants, held))
-    given = tableau, q, v, active, first_step, options, few
-    end, march, lowest, least = _ended(phase, *given, moving)
-    n, h = len(q), jnp.where(march.verdict == CROSSED, end.duration - march.time, 0.0)
+def _end_moved(phase_of: PhaseOf, tableau: Tableau, moving: Moving, ended: _Ended) -> LanePhaseEnd:
+    """How the phase's end moves along a direction of its start and constants."""
+    phase, start, end, march, lowest, least = ended
+    n, h = len(start.q), jnp.where(march.verdict == CROSSED, end.duration - march.time, 0.0)
     taken = take_step(tableau, phase.evaluate, march.here, h, with_error=False)
     assert march.direction is not None
     direction = moving.along(tableau, taken.stages, march.direction, h)
@@ -183,11 +163,10 @@ def _integrated_and_moved(
             assert phase.monitors is not None
             return phase.monitors, phase.evaluate
 
-        ends = Place(q, v, phase.evaluate(q, v)), end.place
-        way = jnp.stack([*told, *numbers[2 * n :]])
+        ends, way = (start, end.place), jnp.stack([*told, *numbers[2 * n :]])
         minima = moved_minima(monitors_of, tableau, moving, lowest, least, ends, way)
     place_moved = nothing.place._replace(q=told[:n], v=told[n:])
-    return end, nothing._replace(place=place_moved, duration=later, minima=minima)
+    return nothing._replace(place=place_moved, duration=later, minima=minima)
 
 
 def _event_moved(
@@ -209,24 +188,20 @@ def _event_moved(
     return later
 
 
-class _Ended(NamedTuple):
-    end: LanePhaseEnd
-    march: _March
-    lowest: Lowest | None
-    least: Settled | None
-
-
 def _ended(
-    phase: LanePhase,
+    phase_of: PhaseOf,
     tableau: Tableau,
+    moving: Moving | None,
+    constants: Any,
+    held: Vector,
     q: Vector,
     v: Vector,
     active: Array,
     first_step: Array,
     options: Options,
     few: Array | None,
-    moving: Moving | None,
 ) -> _Ended:
+    whole = phase = _traced_once(phase_of(constants, held))
     start = Place(q, v, phase.evaluate(q, v))
     values, rates = with_rates(phase.guards, phase.evaluate, start)
     past = tuple((g < 0.0) | ((g == 0.0) & (r <= 0.0)) for g, r in zip(values, rates, strict=True))
@@ -261,7 +236,7 @@ def _ended(
         next_step=march.h,
         minima=None if least is None else least.lowest,
     )
-    return _Ended(end, march, lowest, least)
+    return _Ended(whole, start, end, march, lowest, least)
 
 
 def _traced_once(phase: LanePhase, how: Callable = jax.jit) -> LanePhase:
