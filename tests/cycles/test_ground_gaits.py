@@ -10,8 +10,8 @@ import pytest
 
 import vrw_jax as vrw
 from vrw_jax import simd
-from vrw_jax.batches import ground as ground_lanes
 from vrw_jax.models.ladder import UNILATERAL, VISCOELASTIC
+from vrw_jax.models.unilateral import lanes as ground_lanes
 from vrw_jax.numerics.arclength import ArclengthOptions
 from vrw_jax.numerics.floquet import bifurcation_margins, jury_margins, multipliers
 

@@ -18,7 +18,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.batches.fixed_work import fixed_gait_step
-from vrw_jax.batches.ground import as_full_states, walk_lanes
 from vrw_jax.batches.programs import run_lanes
 from vrw_jax.batches.stiffness import (
     IMPLICIT,
@@ -29,7 +28,15 @@ from vrw_jax.batches.stiffness import (
     TIGHTER,
     cheapest_solver,
 )
-from vrw_jax.models import DIRECTIONS, AbstractWheel, Advance, along_units, gait_step
+from vrw_jax.models import (
+    DIRECTIONS,
+    AbstractWheel,
+    Advance,
+    along_units,
+    as_full_states,
+    gait_step,
+    walk_lanes,
+)
 from vrw_jax.numerics import Options, explicit_tableau
 from vrw_jax.walks import options_of, rung_of, state_of
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, wheel_of

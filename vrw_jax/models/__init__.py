@@ -27,31 +27,14 @@ from vrw_jax.models.ladder import (
 from vrw_jax.models.lane_step import DIRECTIONS, along_units, gait_step
 from vrw_jax.models.paper_step import PAPER_START
 from vrw_jax.models.rigid import RigidWheel
-from vrw_jax.models.unilateral.ledger import Ledger, blank, law_of, outcome_at, passed, past
+from vrw_jax.models.unilateral.lanes import as_full_states, walk_lanes
 from vrw_jax.models.unilateral.mechanics import (
-    WheelMotion,
     directions,
     foot_heights,
     foot_places,
-    kept,
     kinetic_energy,
-    one_of,
     potential_energy,
 )
-from vrw_jax.models.unilateral.motion import (
-    Felt,
-    Flow,
-    Stance,
-    State,
-    felt,
-    flow_of,
-    forces,
-    guard_sizes,
-    guards_of,
-    leg_acceleration,
-    stance_guards,
-    unpack,
-)
-from vrw_jax.models.unilateral.section import closed, embedded, made_sound, opened
+from vrw_jax.models.unilateral.motion import State, unpack
 from vrw_jax.models.unilateral.wheel import UnilateralStep, UnilateralTrajectory, UnilateralWheel
 from vrw_jax.models.viscoelastic import ViscoelasticWheel

@@ -14,7 +14,6 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
-from vrw_jax.batches import as_full_states, walk_lanes
 from vrw_jax.cycles import CycleOptions, Readings, finder_of, read_along
 from vrw_jax.models import (
     PAPER_START,
@@ -24,7 +23,9 @@ from vrw_jax.models import (
     LadderWheel,
     UnilateralWheel,
     ViscoelasticWheel,
+    as_full_states,
     reason_of,
+    walk_lanes,
 )
 from vrw_jax.numerics import Options, SolverName, as_float_array
 from vrw_jax.runtime import compiled

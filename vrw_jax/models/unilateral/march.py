@@ -12,18 +12,15 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from vrw_jax.models import (
+from vrw_jax.models.unilateral.mechanics import WheelMotion, directions, kept, one_of
+from vrw_jax.models.unilateral.motion import (
     Felt,
     Flow,
     Stance,
-    WheelMotion,
-    directions,
     felt,
     forces,
     guard_sizes,
-    kept,
     leg_acceleration,
-    one_of,
     stance_guards,
 )
 from vrw_jax.numerics import (
@@ -159,7 +156,7 @@ def set_off(flow: Flow, motion: WheelMotion, h: Array) -> March:
     )
 
 
-def march(
+def marched(
     flow: Flow, begin: March, enough: Array | None, options: Options, tableau: Tableau
 ) -> March:
     """On until `enough` lanes no longer march, or none does. Errors: as `integrate_phase`."""

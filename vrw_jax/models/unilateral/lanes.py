@@ -1,7 +1,7 @@
 """Gait steps of many wheels on real ground at once: values only, no derivatives.
 
-The laws are those of `models.unilateral`, element by element over lanes. All lanes march
-(`ground_march`) until some, on a CPU all, have come to events; these are taken through them
+The laws are those of one wheel, element by element over lanes. All lanes march
+(`march`) until some, on a CPU all, have come to events; these are taken through them
 together, and all march on. A landing of the foremost foot is an event like others; a lane whose
 wheel has made its steps takes the next wheel in the queue. So hardly a lane waits for another.
 """
@@ -18,35 +18,21 @@ from jax import lax
 from jaxtyping import Array
 
 from vrw_jax import simd
-from vrw_jax.batches.ground_march import (
+from vrw_jax.models.unilateral.ledger import Ledger, blank, law_of, outcome_at, passed, past
+from vrw_jax.models.unilateral.march import (
     EVENT,
     MARCHING,
     WAITING,
     March,
-    march,
+    marched,
     motion_of,
     place_of,
     set_off,
 )
-from vrw_jax.models import (
-    Flow,
-    Ledger,
-    Stance,
-    UnilateralWheel,
-    WheelMotion,
-    blank,
-    closed,
-    embedded,
-    flow_of,
-    guards_of,
-    law_of,
-    made_sound,
-    opened,
-    outcome_at,
-    passed,
-    past,
-    unpack,
-)
+from vrw_jax.models.unilateral.mechanics import WheelMotion
+from vrw_jax.models.unilateral.motion import Flow, Stance, flow_of, guards_of, unpack
+from vrw_jax.models.unilateral.section import closed, embedded, made_sound, opened
+from vrw_jax.models.unilateral.wheel import UnilateralWheel
 from vrw_jax.numerics import Options, Tableau, explicit_tableau, select, zeros_of
 from vrw_jax.runtime import fusion_emitters, lane_function
 from vrw_jax.wheel import (
@@ -162,7 +148,7 @@ def _program(
     def walk(columns: Array, x: Array, wanted: Array, n_steps: Array, dynamic: Options) -> tuple:
         options = eqx.combine(dynamic, static)
         tableau = explicit_tableau(options.solver)
-        assert tableau is not None  # `batch` looked
+        assert tableau is not None  # the caller looked
         on = _Walk(n_legs, n_steps, max_events, one_sided, options, tableau)
         return _walked(_queue_of(columns, x, n_legs), wanted, on)
 
@@ -321,7 +307,7 @@ def _marches(on: _Walk) -> Callable[[Array, March, Array], March]:
 
     def far(columns: Array, now: March, dynamic: Options, enough: Array | None = None) -> March:
         flow = on.flow(columns, now.stance)
-        return march(flow, now, enough, eqx.combine(dynamic, static), on.tableau)
+        return marched(flow, now, enough, eqx.combine(dynamic, static), on.tableau)
 
     if not simd.serves():
         return lambda columns, now, enough: far(columns, now, dynamic, enough)
