@@ -21,15 +21,17 @@ from vrw_jax.cycles.sequence import SIGNS, constants_of, held_landing
 from vrw_jax.cycles.surface import gait_on_surface
 from vrw_jax.numerics import (
     N_NODES,
+    Constants,
     LaneArray,
     Linearised,
     Mesh,
     Passage,
+    Phase,
     PhaseSequence,
+    Point,
     Solution,
     Vector,
     from_blocks,
-    fusion_barrier,
     linearised_pass,
     mesh_error,
     to_blocks,
@@ -290,6 +292,19 @@ def newton(
     return Finding(located, last.monodromy, last.residual, last.passes)
 
 
+def _least_guards(phase: Phase, constants: Constants, passage: Passage) -> Vector:
+    """Each guard's least value at the phase's start and nodes, all guards in one loop."""
+
+    def lower(least: Vector, node: tuple[Array, Array]) -> tuple[Vector, None]:
+        q, v = node
+        guards = phase.guards(constants, Point(passage.nodes.held, tuple(q), tuple(v)))
+        return tuple(map(jnp.minimum, least, guards)), None
+
+    at_start = phase.guards(constants, passage.start)
+    nodes = jnp.stack(passage.nodes.q, 1), jnp.stack(passage.nodes.v, 1)
+    return lax.scan(lower, at_start, nodes)[0]
+
+
 def first_broken(problem: Problem, parameters: Parameters, located: Located) -> LaneArray:
     """1 + the place in SIGNS of the first that does not hold, 0 where all do.
 
@@ -298,7 +313,6 @@ def first_broken(problem: Problem, parameters: Parameters, located: Located) -> 
     sequence = problem.sequence
     constants = problem.constants_of(*parameters)
     solution = located.solution
-    hold = fusion_barrier(parameters)
 
     def step(carry: tuple, inputs: tuple) -> tuple:
         section, broken = carry
@@ -310,10 +324,8 @@ def first_broken(problem: Problem, parameters: Parameters, located: Located) -> 
         holds: list[Array] = []
         for i, (phase, passage) in enumerate(zip(sequence.phases, passages, strict=True)):
             holds.append(~happens[i] | (durations[i] > 0.0))
-            for start, nodes, end in zip(
-                *(phase.guards(constants, point) for point in passage), strict=True
-            ):
-                least = jnp.minimum(start, over_rows(jnp.minimum, hold(nodes)))
+            ends = phase.guards(constants, passage.end)
+            for least, end in zip(_least_guards(phase, constants, passage), ends, strict=True):
                 holds.append(~happens[i] | ((least > 0.0) & (end > -ZERO_AT_EVENT)))
         holds += [check > 0.0 for check in sequence.border_checks(constants, passages, happens)]
         for place, good in enumerate(holds):

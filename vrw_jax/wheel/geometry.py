@@ -8,9 +8,7 @@ foot of Leg 1. A posture never needs theta itself, only its sine and cosine.
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
-
-from vrw_jax.numerics import Elementwise
+from vrw_jax.numerics import Elementwise, sine_cosine
 from vrw_jax.wheel.params import Symbols
 
 
@@ -36,7 +34,7 @@ class Motion(NamedTuple):
         dL2: Elementwise,
     ) -> "Motion":
         """From the angle theta, rad, lengths, m, and rates."""
-        return cls(jnp.sin(theta), jnp.cos(theta), L1, L2, dtheta, dL1, dL2)
+        return cls(*sine_cosine(theta), L1, L2, dtheta, dL1, dL2)
 
 
 class Trig(NamedTuple):
@@ -68,14 +66,8 @@ def landing_foot_height(s: Symbols, motion: Motion) -> Elementwise:
 
 def length_at_touchdown(s: Symbols, theta: Elementwise) -> Elementwise:
     """Length of Leg 1 when the next foot meets the ground at angle theta, m."""
-    sin, cos = jnp.sin(theta), jnp.cos(theta)
+    sin, cos = sine_cosine(theta)
     return s.L0 * landing_direction(s, sin, cos).cos / cos
-
-
-def foot_distance(s: Symbols, theta: Elementwise) -> Elementwise:
-    """Distance D between both feet just after landing at angle theta with L1 = L0, m."""
-    sin, cos = jnp.sin(theta), jnp.cos(theta)
-    return s.L0 * s.sin_alpha / rear_direction(s, sin, cos).cos
 
 
 class CircleOfDoubleSupport(NamedTuple):

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from vrw_jax.numerics import Elementwise, Number, Scalar
+from vrw_jax.numerics import Elementwise, Number, Scalar, sine_cosine
 from vrw_jax.wording import AbstractTold, Row, reals, shown, told, whole
 
 
@@ -211,6 +211,7 @@ def symbols_of(
 ) -> Symbols:
     """`WheelParams.symbols` of bare numbers, which may be complex too."""
     alpha = 2.0 * math.pi / n_legs
+    sin_phi, cos_phi = sine_cosine(slope)
     return Symbols(
         m=leg_mass,
         a=leg_com,
@@ -219,8 +220,8 @@ def symbols_of(
         k=stiffness,
         c=damping,
         g=gravity,
-        sin_phi=jnp.sin(slope),
-        cos_phi=jnp.cos(slope),
+        sin_phi=sin_phi,
+        cos_phi=cos_phi,
         Mh=hub_mass + (n_legs - 1) * leg_mass,
         Mt=hub_mass + n_legs * leg_mass,
         c0=locked_length - leg_com,

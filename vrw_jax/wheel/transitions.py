@@ -25,7 +25,6 @@ from vrw_jax.wheel.dynamics import (
 from vrw_jax.wheel.geometry import (
     Motion,
     double_support_circle,
-    foot_distance,
     landing_direction,
     length_at_touchdown,
     rear_direction,
@@ -87,7 +86,7 @@ def _held_landing(
     p3 = p[2] - s.m * (rear.sin * foot_x + rear.cos * foot_z)
 
     # (A1) both feet held: the hub may only move on its circle.
-    distance = foot_distance(s, theta - s.alpha)
+    distance = s.L0 * s.sin_alpha / rear.cos
     circle = double_support_circle(s, distance, sin, cos)
     row = M.times((jnp.ones_like(circle.G1), circle.G1, circle.G2))
     inertia = row[0] + circle.G1 * row[1] + circle.G2 * row[2]
