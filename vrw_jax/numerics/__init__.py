@@ -57,7 +57,7 @@ from vrw_jax.numerics.gauss import (
     transfer_matrix,
 )
 from vrw_jax.numerics.hybrid import Guard, Mode, Stop, walk
-from vrw_jax.numerics.lane_algebra import LaneArray, fusion_barrier
+from vrw_jax.numerics.lane_algebra import LaneArray
 from vrw_jax.numerics.lane_minima import Monitors
 from vrw_jax.numerics.lanes import (
     LaneFunction,
