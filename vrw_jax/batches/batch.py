@@ -271,7 +271,7 @@ def _on_ground(
     columns = np.concatenate([wheels, friction[None]])
     states = as_full_states(columns, states, n_legs)
     told = walk_lanes(columns, states, n_steps, model, options, n_legs)
-    section_state, durations, outcome, n_stepped, tried = map(jnp.asarray, told)
+    section_state, durations, outcome, n_stepped, tried, _ = map(jnp.asarray, told)
     none = jnp.zeros(len(states), bool)
     return Steps(
         section_state, durations, outcome, n_stepped, tried, none, none.astype(jnp.int32),

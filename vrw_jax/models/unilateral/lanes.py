@@ -29,7 +29,7 @@ from vrw_jax.models.unilateral.march import (
     place_of,
     set_off,
 )
-from vrw_jax.models.unilateral.mechanics import WheelMotion
+from vrw_jax.models.unilateral.mechanics import WheelMotion, place_of_landing
 from vrw_jax.models.unilateral.motion import Flow, Stance, flow_of, guards_of, unpack
 from vrw_jax.models.unilateral.section import closed, embedded, made_sound, opened
 from vrw_jax.models.unilateral.wheel import UnilateralWheel
@@ -62,6 +62,7 @@ class _Queue(NamedTuple):
     next: Array  # wheel to be taken
     section: Array  # after the last step
     durations: Array  # (3, wheels), of the last step
+    length: Array  # of the last step, m
     outcome: Array
     n_stepped: Array
     tried: Array
@@ -104,7 +105,7 @@ def walk_lanes(
     n: int,
 ) -> tuple[np.ndarray, ...]:
     """`n_steps` steps of many wheels with `n` legs: section states, durations, outcomes, steps
-    made and steps tried. What is static of the model holds for all.
+    made, steps tried and the last one's length, m. What is static of the model holds for all.
 
     `columns` are the parameters in their order and friction, shape (10, wheels); `states` full
     section states, shape (wheels, 4 + 3 n).
@@ -114,7 +115,7 @@ def walk_lanes(
     program = _program(static, n, model.max_events, model.one_sided)
     if not len(states):
         none = np.zeros(0, np.int32)
-        return states, np.zeros((0, 3), states.dtype), none, none, none
+        return states, np.zeros((0, 3), states.dtype), none, none, none, np.zeros(0, states.dtype)
     parts = []
     # Most work first, so that no lane is left alone with much of it at the end: stability bounds
     # the step where damping is high.
@@ -169,6 +170,7 @@ def _queue_of(columns: Array, x: Array, n: int) -> _Queue:
         next=jnp.zeros((), jnp.int32),
         section=jnp.zeros_like(x),
         durations=jnp.zeros((3, x.shape[-1]), x.dtype),
+        length=jnp.zeros(x.shape[-1:], x.dtype),
         outcome=jnp.where(good, Outcome.STEPPED, Outcome.BAD_INPUT).astype(jnp.int32),
         n_stepped=none,
         tried=none,
@@ -189,7 +191,8 @@ def _walked(queue: _Queue, wanted: Array, on: _Walk) -> tuple:
         return (queue.next < wanted) | jnp.any(now.verdict != WAITING)
 
     queue, *_ = lax.while_loop(goes_on, round_, (queue, *_empty(queue, on)))
-    return queue.section, queue.durations, queue.outcome, queue.n_stepped, queue.tried
+    told = queue.section, queue.durations, queue.outcome, queue.n_stepped, queue.tried
+    return *told, queue.length
 
 
 class _Ended(NamedTuple):
@@ -203,6 +206,7 @@ class _Ended(NamedTuple):
     code: Array  # STEPPED, or why it is lost
     stands: tuple[WheelMotion, Stance]
     reached: Array  # section state there
+    length: Array  # of a step that ends there, m
     lane: _Lanes  # with what it told
 
 
@@ -226,6 +230,7 @@ def _ended(on: _Walk, chosen: Array, lane: _Lanes, here: March) -> _Ended:
         code=code.astype(jnp.int32),
         stands=stands,
         reached=_over_lanes(closed)(*stands),
+        length=place_of_landing(on.n, stands[0]),
         lane=lane._replace(ledger=ledger, n_stepped=n_stepped),
     )
 
@@ -249,6 +254,7 @@ def _handed_over(queue: _Queue, wanted: Array, ended: _Ended) -> tuple[_Queue, A
         next=jnp.minimum(queue.next + jnp.sum(free, dtype=jnp.int32), wanted),
         section=put(queue.section, jnp.where(ended.failed, 0.0, ended.reached)),
         durations=put(queue.durations, lane.ledger.durations),
+        length=put(queue.length, jnp.where(ended.failed, 0.0, ended.length)),
         outcome=put(queue.outcome, ended.code),
         n_stepped=put(queue.n_stepped, lane.n_stepped),
         tried=put(queue.tried, lane.ledger.tried),

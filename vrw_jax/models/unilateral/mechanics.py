@@ -8,6 +8,7 @@ same equations serve accelerations and, with momenta in place of forces, impacts
 element by element over lanes too, one more axis behind that of the legs.
 """
 
+import math
 from typing import Any, NamedTuple
 
 import jax
@@ -262,6 +263,12 @@ def foot_heights(motion: WheelMotion, legs: Legwise) -> Legs:
 def foot_places(motion: WheelMotion, legs: Legwise) -> Legs:
     """Downhill position of every foot, m."""
     return motion.x - motion.L * legs.sin
+
+
+def place_of_landing(n: int, motion: WheelMotion) -> Scalar:
+    """Downhill position of the foremost of `n` feet, m."""
+    turned = motion.theta + (n - 1) * 2.0 * math.pi / n
+    return motion.x - motion.L[n - 1] * jnp.sin(turned)
 
 
 def kinetic_energy(s: Symbols, motion: WheelMotion) -> Scalar:

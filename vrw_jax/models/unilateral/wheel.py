@@ -1,7 +1,6 @@
 """The wheel on real ground: one-sided contacts with Coulomb friction, any order of events."""
 
 import functools
-import math
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
@@ -26,6 +25,7 @@ from vrw_jax.models.unilateral.ledger import (
     passed,
     past,
 )
+from vrw_jax.models.unilateral.mechanics import place_of_landing
 from vrw_jax.models.unilateral.motion import (
     Guards,
     Stance,
@@ -327,8 +327,7 @@ def _result(walked: _Walked, n: int) -> UnilateralStep:
     assert details is not None
     motion, tally = unpack(walked.state)
     stepped = walked.outcome == Outcome.STEPPED
-    turned = motion.theta + (n - 1) * 2.0 * math.pi / n
-    landing = motion.x - motion.L[n - 1] * jnp.sin(turned)
+    landing = place_of_landing(n, motion)
     finite = lambda value: jnp.where(jnp.isfinite(value), value, 0.0)
     details = details._replace(
         monitors=jax.tree.map(finite, details.monitors),
