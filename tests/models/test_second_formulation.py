@@ -1,0 +1,84 @@
+"""Real ground against a second event-driven formulation: every mode, both kinds of stoppers."""
+
+import numpy as np
+import pytest
+from oracle import complementarity
+
+import vrw_jax as vrw
+
+TIGHT = vrw.Options.tight()
+START = (0.1, 1.6, -0.1)
+STEPS = [  # friction, damping, slope, start
+    (0.7, 200.0, 0.3, START),  # lands sliding
+    (0.5, 100.0, 0.3, (0.1, 1.2, -0.1)),  # flies
+    (0.5, 100.0, 0.3, (0.1, 2.2, -0.1)),  # reverses
+    (1e4, 100.0, 0.3, START),  # drags the rear foot
+]
+WIDE = (0.1, 0.3, 0.5, 0.7, 1.0, 1.3, 2.0, 5.0, 30.0, 1e4)
+CUT = 5e-8
+"""s; what stays down below a dip of 1e-13 m, in chains of some fifty events where stoppers only
+push: by 2.4e-8 in the first of these steps, by 4e-9 with a cut of 1e-14 m."""
+
+
+def told(friction, damping, slope, x, stoppers, n_steps=1):
+    """Durations over all steps and the last section state, by the library and by the oracle."""
+    model = vrw.UnilateralWheel(friction=friction, stoppers=stoppers)
+    params = vrw.WheelParams(damping=damping, slope=slope)
+    wheel = complementarity.Wheel(
+        friction, c=damping, slope=slope, one_sided=stoppers == "one-sided"
+    )
+    place, durations, oracle = complementarity.paper_start(wheel, *x), 0.0, 0.0
+    for _ in range(n_steps):
+        step = vrw.step(params, x, model=model, options=TIGHT)
+        assert int(step.outcome) == vrw.Outcome.STEPPED
+        assert int(step.fewest_solutions) == 1
+        other = complementarity.one_step(wheel, place)
+        x, place = step.section_state, other.end
+        durations, oracle = durations + np.asarray(step.durations), oracle + other.durations
+    q, v = other.end.q, other.end.v
+    ends = np.r_[q[2] + complementarity.ALPHA, v[2], v[:2], np.roll(q[3:], -1), np.roll(v[3:], -1)]
+    return durations, np.asarray(x[:20]), oracle, ends
+
+
+@pytest.mark.parametrize(("friction", "damping", "slope", "x"), STEPS)
+def test_a_step_is_that_of_another_event_driven_code(friction, damping, slope, x):
+    durations, state, oracle, ends = told(friction, damping, slope, x, "bilateral")
+    np.testing.assert_allclose(durations, oracle, atol=1e-11)
+    np.testing.assert_allclose(state, ends, atol=1e-10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("friction", "damping", "slope", "x"), STEPS)
+def test_a_step_with_stoppers_that_only_push_is_that_of_another_code(friction, damping, slope, x):
+    durations, state, oracle, ends = told(friction, damping, slope, x, "one-sided")
+    assert abs(durations.sum() - oracle.sum()) < CUT
+    np.testing.assert_allclose(state[:4], ends[:4], atol=10.0 * CUT)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stoppers", ["bilateral", "one-sided"])
+@pytest.mark.parametrize(("friction", "damping"), [(0.7, 300.0), (1.3, 200.0), (1e4, 50.0)])
+def test_ten_steps_are_those_of_another_code(friction, damping, stoppers):
+    durations, state, oracle, ends = told(friction, damping, 0.3, START, stoppers, n_steps=10)
+    assert abs(durations.sum() - oracle.sum()) < 1e-6
+    np.testing.assert_allclose(state[:4], ends[:4], atol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("friction", WIDE)
+def test_steps_over_a_wide_box_are_those_of_another_code(friction):
+    draw = np.random.default_rng(round(10 * friction)).uniform
+    x = (draw(0.05, 0.15), draw(1.4, 2.2), draw(-0.3, 0.0))
+    durations, _, oracle, _ = told(friction, draw(20.0, 400.0), draw(0.2, 0.34), x, "bilateral")
+    assert abs(durations.sum() - oracle.sum()) < 1e-8
+
+
+def test_a_wheel_on_two_stiff_legs_slides_like_a_block_in_the_oracle_too():
+    wheel = complementarity.Wheel(0.2, slope=0.3)
+    q, v = np.r_[0.0, np.cos(np.pi / 8), -np.pi / 8, np.ones(8)], np.zeros(11)
+    v[0] = 0.1
+    modes = (complementarity.DOWN,) * 2 + (complementarity.OFF,) * 6
+    acceleration, on_feet, _ = complementarity._carried(wheel, q, v, modes, (True,) * 8)
+    along = 9.81 * (np.sin(0.3) - 0.2 * np.cos(0.3))
+    np.testing.assert_allclose(acceleration[:3], [along, 0.0, 0.0], atol=1e-12)
+    assert abs(on_feet[:, 1].sum() - 18.0 * 9.81 * np.cos(0.3)) < 1e-10

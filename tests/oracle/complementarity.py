@@ -1,0 +1,447 @@
+"""Oracle of the unilateral rung: event-driven in all eleven coordinates, dense, NumPy and SciPy.
+
+Hub (x, z), theta and all lengths stay coordinates; contacts and stoppers are multipliers on the
+dense mass matrix. Whatever touches at an event is one complementarity problem, every mode of which
+is solved: with impulses where something strikes, then with forces. Where rounding leaves several,
+each is followed for a microsecond: the one whose signs hold there is right. Shares no code with the
+library. Legs are in the labels of the step that begins.
+"""
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+from scipy.integrate import DOP853
+from scipy.optimize import brentq, minimize_scalar
+
+N = 8
+ALPHA = 2.0 * np.pi / N
+OFF, STICK, DOWN, UP = 0, 1, 2, 3
+ALONG = {DOWN: 1.0, UP: -1.0}
+REST = 1.4e-6  # m/s: what parts or closes more slowly is at rest, a dip of 1e-13 m
+TOUCH = 1e-13  # m
+SOUND = 1e-9  # of weight and gravity, of momentum and speed: a sign is rounding
+ARMED = {"gap": 1e-14, "room": 1e-14, "speed": 1e-12, "force": 1e-10}
+"""A guard that has read more than this is one that may fall: m, m/s, N."""
+MOMENT = 1e-6  # s, for which modes are followed that rounding cannot tell apart
+RTOL = ATOL = 1e-13
+
+
+class LostError(RuntimeError):
+    """The walk ends here: no or several solutions, a third foot, no landing."""
+
+
+class Wheel(NamedTuple):
+    """Table 1, slope 0.30; SI units."""
+
+    friction: float | np.ndarray  # of all feet, or of each
+    c: float = 200.0
+    k: float = 500.0
+    m_hub: float = 10.0
+    m: float = 1.0
+    a: float = 0.3
+    L0: float = 1.0
+    Ls: float = 1.02
+    slope: float = 0.30
+    g: float = 9.81
+    one_sided: bool = False
+    restitution: float = 0.0  # of the feet
+
+    @property
+    def mass(self) -> float:
+        return self.m_hub + N * self.m
+
+    @property
+    def rough(self) -> np.ndarray:
+        return np.broadcast_to(self.friction, (N,))
+
+
+class Place(NamedTuple):
+    """Between two events: coordinates, rates, modes of feet, legs on stoppers."""
+
+    q: np.ndarray  # hub x, z, theta, lengths
+    v: np.ndarray
+    mode: tuple
+    held: tuple
+
+
+class Step(NamedTuple):
+    """From a landing to the next one ahead."""
+
+    durations: np.ndarray  # with two feet loaded, one, none, s
+    end: Place  # just before that landing, in the labels of the step that follows
+    events: int
+    ambiguous: int  # events at which several modes held
+
+
+def paper_start(w: Wheel, theta: float, dtheta: float, dL1: float) -> Place:
+    """From the paper's section numbers."""
+    L1 = w.L0 * np.cos(theta - ALPHA) / np.cos(theta)
+    q, v = np.zeros(3 + N), np.zeros(3 + N)
+    q[2], v[2] = theta - ALPHA, dtheta
+    q[3:] = w.L0
+    q[4], v[4] = L1, dL1
+    q[0], q[1] = w.L0 * np.sin(q[2]), L1 * np.cos(theta)
+    v[0] = dL1 * np.sin(theta) + L1 * dtheta * np.cos(theta)
+    v[1] = dL1 * np.cos(theta) - L1 * dtheta * np.sin(theta)
+    return Place(q, v, (OFF, STICK, *(OFF,) * (N - 2)), tuple(j != 1 for j in range(N)))
+
+
+def _legs(theta):
+    psi = theta + ALPHA * np.arange(N)
+    return np.stack([np.sin(psi), np.cos(psi)], 1), np.stack([np.cos(psi), -np.sin(psi)], 1)
+
+
+def _points(q, v, arm):
+    """Velocity of a point on each leg, `arm` from the hub, over all rates; and what it is more."""
+    u, e = _legs(q[2])
+    rows = np.zeros((N, 2, 3 + N))
+    rows[:, 0, 0] = rows[:, 1, 1] = 1.0
+    rows[:, :, 2] = -arm[:, None] * e
+    rows[np.arange(N), :, 3 + np.arange(N)] = -u
+    more = -2.0 * (v[3:] * v[2])[:, None] * e + (arm * v[2] ** 2)[:, None] * u
+    return rows, more
+
+
+def _mass_and_force(w, q, v):
+    rows, more = _points(q, v, q[3:] - w.a)
+    gravity = w.g * np.array([np.sin(w.slope), -np.cos(w.slope)])
+    flat = rows.reshape(2 * N, -1)
+    mass = w.m * flat.T @ flat
+    mass[0, 0] += w.m_hub
+    mass[1, 1] += w.m_hub
+    force = w.m * flat.T @ (gravity - more).ravel()
+    force[:2] += w.m_hub * gravity
+    force[3:] += w.k * (w.Ls - q[3:]) - w.c * v[3:]
+    return mass, force
+
+
+def _rooms(legs):
+    return -np.eye(3 + N)[3 + np.array(legs, int)]
+
+
+def _carried(w, q, v, mode, held):
+    """Accelerations in these modes; forces (tangential, normal) of feet; stopper forces."""
+    mass, force = _mass_and_force(w, q, v)
+    feet, more = _points(q, v, q[3:])
+    rows, along, bias, where = [], [], [], []
+    for j in range(N):
+        if mode[j] == OFF:
+            continue
+        drag = -ALONG.get(mode[j], 0.0) * w.rough[j]
+        rows.append(feet[j, 1])
+        along.append(feet[j, 1] + drag * feet[j, 0])
+        bias.append(more[j, 1])
+        where.append((j, drag, 1.0))
+        if mode[j] == STICK:
+            rows.append(feet[j, 0])
+            along.append(feet[j, 0])
+            bias.append(more[j, 0])
+            where.append((j, 1.0, 0.0))
+    legs = np.flatnonzero(held)
+    rows = np.array(rows + list(_rooms(legs))).reshape(-1, 3 + N)
+    along = np.array(along + list(_rooms(legs))).reshape(-1, 3 + N)
+    bias = np.r_[bias, np.zeros(len(legs))]
+    solved = np.linalg.solve(mass, np.column_stack([force, along.T]))
+    p = -np.linalg.solve(rows @ solved[:, 1:], rows @ solved[:, 0] + bias) if len(rows) else bias
+    on_feet, on_legs = np.zeros((N, 2)), np.zeros(N)
+    for (j, x, z), value in zip(where, p, strict=False):
+        on_feet[j] += value * np.array([x, z])
+    on_legs[legs] = p[len(where) :]
+    return solved[:, 0] + solved[:, 1:] @ p, on_feet, on_legs
+
+
+class _Problem(NamedTuple):
+    """One level: what touches, and what may become of it."""
+
+    inverse: np.ndarray
+    free: np.ndarray  # rates or accelerations without contacts
+    feet: list  # those that touch
+    may: list  # modes of each
+    legs: list  # on stoppers that only push
+    locked: list  # on stoppers that hold
+    rows: np.ndarray  # tangential and normal of each foot, then of legs, then of locked
+    bias: np.ndarray
+    scales: tuple  # force, motion
+
+
+def _solutions(w, problem, signs):
+    """All modes whose signs are wrong by less than `signs`: feet's, legs held, rates after."""
+    inverse, free, feet, may, legs, _, rows, bias, (F, A) = problem
+    W, w0 = rows @ inverse @ rows.T, rows @ free + bias
+    combos = list(itertools.product(*may, *((True, False),) * len(legs)))
+    d, f = len(w0), 2 * len(feet)
+    lhs, rhs = np.tile(np.eye(d), (len(combos), 1, 1)), np.zeros((len(combos), d))
+    modes = np.array([c[: len(feet)] for c in combos], int).reshape(len(combos), -1)
+    on = np.array([c[len(feet) :] for c in combos], bool).reshape(len(combos), -1)
+    active = np.zeros((len(combos), d), bool)
+    active[:, 0:f:2], active[:, 1:f:2] = modes == STICK, modes != OFF
+    active[:, f : f + len(legs)], active[:, f + len(legs) :] = on, True
+    lhs[active], rhs[active] = (
+        np.broadcast_to(W, lhs.shape)[active],
+        -np.tile(w0, (len(rhs), 1))[active],
+    )
+    for i, j in enumerate(feet):
+        sign = np.where(modes[:, i] == DOWN, 1.0, np.where(modes[:, i] == UP, -1.0, 0.0))
+        lhs[sign != 0.0, 2 * i, 2 * i + 1] = w.rough[j] * sign[sign != 0.0]
+    regular = np.abs(np.linalg.det(lhs)) > 1e-12 * np.prod(np.linalg.norm(lhs, axis=2), axis=1)
+    lhs[~regular] = np.eye(d)
+    p = np.linalg.solve(lhs, rhs[..., None])[..., 0]
+    after = p @ W.T + w0
+    wrong = np.where(regular, 0.0, np.inf)
+    worse = lambda where, value: np.maximum(wrong, np.where(where, value, 0.0))
+    for i, j in enumerate(feet):
+        m, t, n = modes[:, i], 2 * i, 2 * i + 1
+        wrong = worse(m == OFF, -after[:, n] / A)
+        wrong = worse(m != OFF, -p[:, n] / F)
+        wrong = worse(m == STICK, (np.abs(p[:, t]) - w.rough[j] * p[:, n]) / F)
+        if STICK in may[i]:  # else it slides, and may speed up or slow down
+            wrong = worse(m == DOWN, -after[:, t] / A)
+            wrong = worse(m == UP, after[:, t] / A)
+    for i in range(len(legs)):
+        wrong = worse(on[:, i], -p[:, f + i] / F)
+        wrong = worse(~on[:, i], -after[:, f + i] / A)
+    good = np.flatnonzero(wrong < signs)
+    turn = inverse @ rows.T
+    return [(tuple(modes[g]), tuple(on[g]), free + turn @ p[g]) for g in good]
+
+
+def _preferred(found):
+    """Most feet at rest, then most sliding."""
+    rank = {STICK: 0, DOWN: 1, UP: 1, OFF: 2}
+    return min(found, key=lambda one: (sum(rank[m] for m in one[0]), sum(one[1])))
+
+
+def _level(w, q, v, feet, may, at_stopper, moving):
+    """The problem of these feet and legs, by accelerations or by rates."""
+    mass, force = _mass_and_force(w, q, v)
+    inverse = np.linalg.inv(mass)
+    of_feet, more = _points(q, v, q[3:])
+    unilateral = [j for j in at_stopper if w.one_sided or j in feet]
+    locked = [j for j in at_stopper if j not in unilateral]
+    rows = np.concatenate([of_feet[feet].reshape(-1, 3 + N), _rooms(unilateral), _rooms(locked)])
+    bias = np.zeros(len(rows))
+    if moving:
+        bias[: 2 * len(feet)] = more[feet].ravel()
+    else:  # Newton's law: what strikes comes back
+        struck = np.minimum(of_feet[feet, 1] @ v, 0.0)
+        bias[1 : 2 * len(feet) : 2] = w.restitution * np.where(struck < -REST, struck, 0.0)
+    scales = (w.mass * w.g, w.g) if moving else (w.mass, 1.0)
+    free = inverse @ force if moving else v
+    return _Problem(inverse, free, feet, may, unilateral, locked, rows, bias, scales)
+
+
+def _at_rest(w, q, v, rows):
+    """Rates with these rows exactly at rest."""
+    if not len(rows):
+        return v
+    mass, _ = _mass_and_force(w, q, v)
+    turned = np.linalg.solve(mass, rows.T)
+    p, *_ = np.linalg.lstsq(rows @ turned, rows @ v, rcond=1e-11)
+    return v - turned @ p
+
+
+def _event(w, place, struck_foot, struck_leg):
+    """Through an event: rates, modes and held legs after it, and how many modes would do."""
+    q, v, mode, held = place
+    u, _ = _legs(q[2])
+    gaps, (rows, _) = q[1] - q[3:] * u[:, 1], _points(q, v, q[3:])
+    speeds = rows @ v
+    near = (gaps <= TOUCH) & (speeds[:, 1] <= REST)
+    feet = [j for j in range(N) if mode[j] != OFF or j == struck_foot or near[j]]
+    out = (w.L0 - q[3:] <= TOUCH) & (v[3:] >= -REST)
+    legs = [j for j in range(N) if held[j] or j == struck_leg or out[j]]
+    several = 0
+    if np.any(speeds[feet, 1] < -REST) or np.any(v[3:][legs] > REST):
+        problem = _level(w, q, v, feet, [(STICK, DOWN, UP, OFF)] * len(feet), legs, False)
+        found = _solutions(w, problem, SOUND)
+        if not found:
+            raise LostError("no impulses")
+        several += max(np.max(np.abs(after - found[0][2])) for *_, after in found) > 1e-6
+        _, on, v = _preferred(found)
+        speeds = rows @ v
+        feet = [j for j in feet if speeds[j, 1] < REST]
+        kept = {*problem.locked, *itertools.compress(problem.legs, on)}
+        legs = [j for j in legs if j in kept or v[3 + j] > -REST]
+    still = [j for j in feet if abs(speeds[j, 0]) < REST]
+    v = _at_rest(w, q, v, np.concatenate([rows[feet, 1], rows[still, 0], _rooms(legs)]))
+    may = [
+        (STICK, DOWN, UP, OFF) if j in still else (DOWN if speeds[j, 0] > 0 else UP, OFF)
+        for j in feet
+    ]
+    problem = _level(w, q, v, feet, may, legs, True)
+    found = _solutions(w, problem, SOUND)
+    if not found:
+        raise LostError("no forces")
+    options = []
+    for modes, on, _ in found:
+        after = np.zeros(N, int)
+        after[feet] = modes
+        stays = np.zeros(N, bool)
+        stays[problem.locked] = True
+        stays[problem.legs] = on
+        options.append((tuple(after.tolist()), tuple(stays.tolist())))
+    if len(options) > 1:
+        holds = [_moments_margin(w, q, v, *one, feet, still, problem.legs) for one in options]
+        good = [one for one, margin in zip(options, holds, strict=True) if margin > 0.0]
+        several += len(good) > 1
+        rank = {STICK: 0, DOWN: 1, UP: 1, OFF: 2}
+        options = sorted(good, key=lambda one: (sum(rank[m] for m in one[0]), sum(one[1])))
+        options = options or [max(zip(holds, options, strict=True))[1]]
+    return Place(q, v, *options[0]), several
+
+
+def _moments_margin(w, q, v, mode, held, feet, still, legs):
+    """Least sign, scaled, of these modes a moment later."""
+    h = MOMENT
+    a = _carried(w, q, v, mode, held)[0]
+    middle = _carried(w, q + 0.5 * h * v, v + 0.5 * h * a, mode, held)[0]
+    q, v = q + h * v + 0.5 * h * h * a, v + h * middle
+    a, on_feet, on_legs = _carried(w, q, v, mode, held)
+    rows, more = _points(q, v, q[3:])
+    F, A, least = w.mass * w.g, w.g, np.inf
+    for j in feet:
+        x, z = rows[j] @ a + more[j]
+        t, n = on_feet[j]
+        least = min(least, z / A if mode[j] == OFF else n / F)
+        if mode[j] == STICK:
+            least = min(least, (w.rough[j] * n - abs(t)) / F)
+        elif mode[j] != OFF and j in still:
+            least = min(least, ALONG[mode[j]] * x / A)
+    for j in legs:
+        least = min(least, on_legs[j] / F if held[j] else -a[3 + j] / A)
+    return least
+
+
+def _guards(w, place):
+    """Names of what is watched in these modes, and their values at a state."""
+    _, _, mode, held = place
+    names = [("gap", j) for j in range(N) if mode[j] == OFF]
+    names += [("room", j) for j in range(N) if not held[j]]
+    names += [("normal", j) for j in range(N) if mode[j] != OFF]
+    names += [(name, j) for j in range(N) if mode[j] == STICK for name in ("cone up", "cone down")]
+    names += [("speed", j) for j in range(N) if mode[j] in ALONG]
+    names += [("stopper", j) for j in range(N) if held[j] and (w.one_sided or mode[j] != OFF)]
+
+    def values(y):
+        q, v = y[: 3 + N], y[3 + N :]
+        u, _ = _legs(q[2])
+        on_feet, on_legs = _carried(w, q, v, mode, held)[1:]
+        speeds = _points(q, v, q[3:])[0][:, 0] @ v
+        told = {
+            "gap": q[1] - q[3:] * u[:, 1],
+            "room": w.L0 - q[3:],
+            "normal": on_feet[:, 1],
+            "cone up": w.rough * on_feet[:, 1] - on_feet[:, 0],
+            "cone down": w.rough * on_feet[:, 1] + on_feet[:, 0],
+            "speed": np.array([ALONG.get(m, 0.0) for m in mode]) * speeds,
+            "stopper": on_legs,
+        }
+        return np.array([told[name][j] for name, j in names])
+
+    armed = np.array([ARMED.get(name, ARMED["force"]) for name, _ in names])
+    return names, values, armed
+
+
+def _first_fall(values, inside, times, told, armed, least):
+    """When the first of the armed guards falls between these times, and which; arms the others."""
+    first, which = np.inf, None
+    for i in range(len(armed)):
+        g = np.array([row[i] for row in told])
+        reads = lambda t, i=i: values(inside(t))[i]
+        for k in range(1, len(times)):
+            low, high = times[k - 1], times[k]
+            if armed[i] and k < len(times) - 1 and 0.0 < g[k] < min(g[k - 1], g[k + 1]):
+                dip = minimize_scalar(reads, bounds=(low, times[k + 1]), method="bounded")
+                high, g[k] = (dip.x, dip.fun) if dip.fun < 0.0 else (high, g[k])
+            if armed[i] and g[k] <= 0.0:
+                root = low if g[k - 1] <= 0.0 else brentq(reads, low, high, xtol=1e-16)
+                first, which = (root, i) if root < first else (first, which)
+                break
+            armed[i] |= g[k] > least[i]
+        if not armed[i] and g[-1] < -1e-6:
+            raise LostError("a guard was wrong from the start")
+    return first, which
+
+
+def _to_event(w, place):
+    """The motion in these modes to the first guard that falls: time, state, what fell."""
+    names, values, least = _guards(w, place)
+
+    def rates(_, y):
+        q, v = y[: 3 + N], y[3 + N :]
+        return np.r_[v, _carried(w, q, v, place.mode, place.held)[0]]
+
+    def by(t, y, end, h):
+        return DOP853(rates, t, y, end, rtol=RTOL, atol=ATOL, first_step=h, max_step=4e-3)
+
+    y = np.r_[place.q, place.v]
+    solver, now = by(0.0, y, 5.0, 1e-7), values(y)
+    armed = now > least
+    while solver.status == "running":
+        begin, y = solver.t, solver.y.copy()
+        solver.step()
+        inside, times = solver.dense_output(), np.linspace(begin, solver.t, 5)
+        told = [now, *(values(inside(t)) for t in times[1:-1]), values(solver.y)]
+        first, which = _first_fall(values, inside, times, told, armed, least)
+        now = told[-1]
+        if which is None:
+            continue
+        for _ in range(3):  # the interpolant is coarser than a step that ends there
+            length = first - begin
+            if length <= 0.0:
+                break
+            exact = by(begin, y, first, length)
+            while exact.status == "running":
+                exact.step()
+            here, before = exact.y, exact.y - 1e-2 * length * rates(0.0, exact.y)
+            slope = (values(here)[which] - values(before)[which]) / (1e-2 * length)
+            shift = -values(here)[which] / slope if slope < 0.0 else 0.0
+            if abs(shift) < 1e-15 or abs(shift) > 0.1 * length:
+                break
+            first += shift
+        return first, here if first > begin else y, names[which]
+    raise LostError("no landing")
+
+
+def one_step(w: Wheel, begin: Place, most_events: int = 1000) -> Step:
+    """From a landing to the next one ahead."""
+    place, struck, durations, ambiguous = begin, ("gap", 0), np.zeros(3), 0
+    for event in range(most_events):
+        name, j = struck
+        foot, leg = (j if name == "gap" else None), (j if name == "room" else None)
+        place, several = _event(w, place, foot, leg)
+        ambiguous += several
+        loaded = sum(m != OFF for m in place.mode)
+        if loaded > 2:
+            raise LostError("three feet")
+        time, y, struck = _to_event(w, place)
+        durations[2 - loaded] += time
+        place = place._replace(q=y[: 3 + N].copy(), v=y[3 + N :].copy())
+        if place.v[2] <= 0.0:
+            raise LostError("fell back")
+        if struck == ("gap", N - 1):
+            return Step(durations, _relabelled(place), event + 1, ambiguous)
+        _put_back(w, place)
+    raise LostError("events without end")
+
+
+def _put_back(w, place):
+    """Loaded feet on the slope, held legs on their stoppers: the integrator's drift."""
+    q, _, mode, held = place
+    u, _ = _legs(q[2])
+    for j in range(N):
+        if held[j]:
+            q[3 + j] = w.L0
+        elif mode[j] != OFF:
+            q[3 + j] = q[1] / u[j, 1]
+
+
+def _relabelled(place):
+    """The same wheel in the labels of the step that begins, its origin where that foot lands."""
+    roll = lambda x: np.roll(x, 1)
+    q = np.r_[0.0, place.q[1], place.q[2] - ALPHA, roll(place.q[3:])]
+    q[0] = q[3] * np.sin(q[2])
+    v = np.r_[place.v[:3], roll(place.v[3:])]
+    mode, held = (tuple(roll(np.array(x)).tolist()) for x in (place.mode, place.held))
+    return Place(q, v, mode, held)
