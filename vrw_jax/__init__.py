@@ -34,6 +34,7 @@ from vrw_jax.runtime import start_jax
 from vrw_jax.scans import grid, open_scan, saltelli, samples, scan, sobol, sobol_indices, uniform
 from vrw_jax.tuning import Tuned, tune
 from vrw_jax.walks import Walk, basin, choose_model, paper_start, return_map, simulate, step, walk
+from vrw_jax.web import explore
 from vrw_jax.wheel import Outcome, WheelParams
 from vrw_jax.wording import nearest
 
@@ -70,6 +71,7 @@ __all__ = (
     "continue_branches",
     "continue_map",
     "default_margins",
+    "explore",
     "grid",
     "limit_cycle",
     "limit_cycles",

@@ -10,6 +10,7 @@ LONGEST_MODULE, LONGEST_FUNCTION = 500, 60
 ONLY = {
     "diffrax": ("numerics.events",), "llvmlite": ("simd",), "matplotlib": ("figures",),
     "PIL": ("figures",), "rich": ("app",), "typer": ("app",), "zarr": ("scans.store",),
+    "anywidget": ("web",),
 }  # fmt: skip
 """Who may know a library: modules or rooms. Faces only hand on."""
 

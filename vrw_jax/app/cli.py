@@ -9,6 +9,7 @@ import importlib.metadata
 import os
 import signal
 import tempfile
+import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -160,6 +161,23 @@ def gait(
         printing.tell_gait(params, result, state, walked, cycle)
         if settings.rung == "auto":
             out.print(result.choice.why)
+
+
+@app.command()
+def explore(
+    changes: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="Begin there; may be repeated."),
+    ] = None,
+) -> None:
+    """Open the wheel to play with in your browser: one page, which computes by itself."""
+    with sentences():
+        from vrw_jax.app.config import assignment
+        from vrw_jax.web import page_address
+
+        address = page_address(_settings(None).params(dict(assignment(t) for t in changes or [])))
+        webbrowser.open(address)
+        print(address)
 
 
 @app.command()

@@ -143,13 +143,16 @@ def section_state_of(told: Told) -> SectionState:
     return jnp.where(told.outcome == Outcome.STEPPED, state, jnp.zeros_like(state))
 
 
-def result_of(s: Symbols, landing: Landing, told: Told, friction: float) -> StepResult:
-    """All that a step tells, of one wheel."""
+def result_of(
+    s: Symbols, landing: Landing, told: Told, friction: Elementwise | float
+) -> StepResult:
+    """All that a step tells, of one wheel or of lanes."""
     began = told.outcome != Outcome.BAD_INPUT
     hits, stepped = told.happened[2], told.outcome == Outcome.STEPPED
     _, sls1, sls2 = phases_of(s, landing.distance, stop_at_lift_off=True)
-    at_stopper = jnp.where(hits, told.states[1], jnp.asarray(SAFE_SINGLE_SUPPORT, s.L0.dtype))
-    hit = transitions.hit_stopper(s, sls1.at(tuple(at_stopper[:3]), tuple(at_stopper[3:])))
+    safe = jnp.asarray(SAFE_SINGLE_SUPPORT, s.L0.dtype)
+    at_stopper = tuple(jnp.where(hits, told.states[1][i], value) for i, value in enumerate(safe))
+    hit = transitions.hit_stopper(s, sls1.at(at_stopper[:3], at_stopper[3:]))
     last = sls2.at(tuple(told.states[2][:2]), tuple(told.states[2][2:]))
     begins, finishes = (dynamics.energy(s, m).total for m in (landing.motion, last))
     fore_after, rear_after = transitions.landing_forces(s, landing)
@@ -180,7 +183,7 @@ def _margins(
     rear_after: dynamics.FootForce,
     hit: transitions.StopperHit,
     told: Told,
-    friction: float,
+    friction: Elementwise | float,
 ) -> Margins:
     """`rear_after`: force on the rear foot just after the landing."""
     began = told.outcome != Outcome.BAD_INPUT

@@ -152,7 +152,7 @@ class ViscoelasticWheel(AbstractWheel):
         times = jnp.linspace(0.0, 1.0, n_samples) * durations[:, None]
         begins = jnp.concatenate([jnp.zeros_like(durations[:1]), jnp.cumsum(durations)[:-1]])
         told = [
-            jax.vmap(functools.partial(_describe, phase))(states)
+            jax.vmap(functools.partial(described, phase))(states)
             for phase, states in zip(
                 phases_of(s, landing.distance, self.stop_at_lift_off), samples, strict=True
             )
@@ -177,8 +177,11 @@ class ViscoelasticWheel(AbstractWheel):
         return through_phases(run, params, tuple(x), self.stop_at_lift_off)
 
 
-def _describe(phase: AbstractPhase, y: State) -> tuple[Array, Array, Array]:
-    """Coordinates and rates, forces of the ground and energies at a state of the phase."""
+def described(phase: AbstractPhase, y: State) -> tuple[Array, Array, Array]:
+    """Coordinates and rates, forces of the ground and energies at a state of the phase.
+
+    Axes of `y` beyond its first stay last.
+    """
     m = flow_of(phase, monitored=False).motion(y)
     at = Instant(phase, m, None)
     zero = 0.0 * m.L1

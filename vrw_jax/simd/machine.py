@@ -31,8 +31,28 @@ def wide() -> bool:
 
 def compiled(text: str) -> bytes:
     """Object code for this processor."""
-    machine = _machine()
+    return _emitted(llvm.parse_assembly(text), _machine())
+
+
+def compiled_for_web(text: str, begins: str, name: str) -> bytes:
+    """Object code for WebAssembly, to be linked with its like: a 32-bit machine with vectors of 128
+    bits. Its one function for others is `begins`, there called `name`.
+    """
     module = llvm.parse_assembly(text)
+    for symbol in (*module.functions, *module.global_variables):
+        if not symbol.is_declaration and symbol.name != begins:
+            symbol.linkage = "internal"
+    module.get_function(begins).name = name
+    llvm.initialize_all_targets()
+    llvm.initialize_all_asmprinters()
+    target = llvm.Target.from_triple("wasm32-unknown-unknown")
+    machine = target.create_target_machine(
+        cpu="generic", features="+simd128", opt=LEVEL, reloc="static", codemodel="default"
+    )
+    return _emitted(module, machine)
+
+
+def _emitted(module: llvm.ModuleRef, machine: llvm.TargetMachine) -> bytes:
     module.triple, module.data_layout = machine.triple, str(machine.target_data)
     choices = llvm.create_pipeline_tuning_options(LEVEL)
     choices.loop_vectorization = choices.slp_vectorization = VECTORIZES

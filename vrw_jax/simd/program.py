@@ -17,10 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.simd.arrays import LANES, SMALL
-from vrw_jax.simd.code import Code, Store, code_of, kept_code
+from vrw_jax.simd.code import Code, Store, code_of, kept_code, traced
 from vrw_jax.simd.ffi import register, registered
-from vrw_jax.simd.kernel import NAME
-from vrw_jax.simd.machine import Loaded, wide
+from vrw_jax.simd.kernel import NAME, module_text
+from vrw_jax.simd.machine import Loaded, compiled_for_web, wide
 
 VECTOR = {np.dtype(np.float64): 4, np.dtype(np.float32): 8}
 """Lanes of 256 bits: a vector, or half of one where a processor has 512."""
@@ -57,6 +57,20 @@ def lane_program(
         (jax.ShapeDtypeStruct((LANES,), dtype),) * n_lanes_in,
     )
     return _Program(code_of(function, shapes, key, width, store, small), width)
+
+
+def web_object(
+    function: Callable[..., Any], numbers: int, rows: Sequence[int], name: str, small: int = SMALL
+) -> bytes:
+    """`function(*numbers, *arrays)` as object code for WebAssembly, two lanes at a time.
+
+    Float64: so many numbers, and arrays of so many rows, lanes last. The code's function `name`
+    takes (given, told, lanes, begin, end): tables of pointers to arguments and results, the number
+    of lanes, and which pairs of them to compute. `sin` and `cos` are the caller's.
+    """
+    lanes = [jax.ShapeDtypeStruct((n, LANES), np.float64) for n in rows]
+    shapes = [jax.ShapeDtypeStruct((), np.float64)] * numbers + lanes
+    return compiled_for_web(module_text(traced(function, *shapes), 2, small), NAME, name)
 
 
 def lane_function(

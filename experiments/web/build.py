@@ -1,0 +1,165 @@
+"""docs/wheel.html: the wheel in a browser, one file with the library's own step inside.
+
+`--page` takes the step's code from the page that stands there, which is quick; without it the step
+is traced and compiled anew, some minutes. `wasm-ld` is Debian's `lld`, or `pip install ziglang`.
+"""
+
+import base64
+import datetime
+import gzip
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import vrw_jax as vrw
+from experiments.shared.command import command, started
+from experiments.web.programs import LEGS, SAMPLES, programs
+from vrw_jax.models import PAPER_START, EnergyLoss, Indicators
+from vrw_jax.results import CYCLE, MARGINS, STEP
+from vrw_jax.wheel import DOMAINS
+
+ROOT = Path(__file__).parents[2]
+PAGE, SOURCES = ROOT / "docs" / "wheel.html", Path(__file__).parent / "page"
+CODE, FACTS = "code", "facts"
+"""Where in the page lie the step's code, and what the library calls things."""
+STACK = 1 << 20
+"""Bytes that the code has for what it can't hold in registers."""
+
+SLIDERS = {
+    "damping": (0.0, 600.0),
+    "stiffness": (200.0, 2000.0),
+    "natural_length": (0.95, 1.15),
+    "slope": (0.0, 0.6),
+    "hub_mass": (0.0, 40.0),
+    "leg_mass": (0.1, 4.0),
+    "leg_com": (0.0, 0.9),
+    "locked_length": (0.6, 1.4),
+    "gravity": (1.0, 25.0),
+}
+"""What a slider spans, parameters that one turns first first."""
+
+
+def linked(objects: dict[str, bytes]) -> bytes:
+    """One module of functions by name, that imports `sin` and `cos`."""
+    linker = [shutil.which("wasm-ld")]
+    if linker == [None]:
+        if find_spec("ziglang") is None:
+            raise SystemExit("wasm-ld is missing: install Debian's lld, or pip install ziglang.")
+        linker = [sys.executable, "-m", "ziglang", "wasm-ld"]
+    with tempfile.TemporaryDirectory() as folder:
+        paths = []
+        for name, content in objects.items():
+            paths.append(Path(folder, f"{name}.o"))
+            paths[-1].write_bytes(content)
+        out = Path(folder, "linked.wasm")
+        exports = [f"--export={name}" for name in (*objects, "__heap_base")]
+        choices = ["--no-entry", "--gc-sections", "--strip-all", "--allow-undefined"]
+        stack = ["-z", f"stack-size={STACK}"]
+        subprocess.run([*linker, *choices, *stack, *exports, *paths, "-o", out], check=True)
+        return out.read_bytes()
+
+
+def compiled(n_legs: int) -> str:
+    """The step's code for so many legs, packed as the page holds it."""
+    code = linked({name: program.object(name) for name, program in programs(n_legs).items()})
+    return base64.b64encode(gzip.compress(code, 9, mtime=0)).decode()
+
+
+def told_rows(n_legs: int) -> list[str]:
+    """Names of what `told` tells, row by row."""
+    legs = range(3, n_legs + 1)
+    margins = [
+        [f"{name}[{leg}]" for leg in legs] if measure.axis else [name]
+        for name, measure in MARGINS.items()
+    ]
+    return [
+        "theta_touchdown", "dtheta_touchdown", "dL1_touchdown",
+        "theta_post_impact", "dtheta_post_impact",
+        "duration_dls", "duration_sls1", "duration_sls2", "step_length",
+        *_named(Indicators), *(name for names in margins for name in names), *_named(EnergyLoss),
+    ]  # fmt: skip
+
+
+def _named(told: Any) -> list[str]:
+    return [told.named.get(name, name) for name in told.__annotations__ if name != "named"]
+
+
+def facts() -> dict[str, Any]:
+    """What the page is to know: names, units, sentences, defaults."""
+    git = lambda *what: subprocess.run(
+        ["git", *what], cwd=ROOT, check=True, capture_output=True, text=True
+    ).stdout.strip()
+    told = lambda m: {
+        "label": m.long_name, "symbol": m.symbol, "unit": m.plain_unit,
+        "meaning": m.description, "breaks": m.breaks,
+    }  # fmt: skip
+    default = vrw.WheelParams()
+    return {
+        "commit": git("rev-parse", "--short", "HEAD"),
+        "version": vrw.__version__,
+        "built": datetime.date.today().isoformat(),
+        "order": list(DOMAINS),
+        "parameters": {
+            name: {
+                "symbol": DOMAINS[name].symbol,
+                "unit": DOMAINS[name].unit,
+                "meaning": DOMAINS[name].description,
+                "value": float(getattr(default, name)),
+                "from": span[0],
+                "to": span[1],
+                "least": DOMAINS[name].lower,
+            }
+            for name, span in SLIDERS.items()
+        },
+        "start": list(PAPER_START),
+        "legs": list(LEGS),
+        "samples": SAMPLES,
+        "rows": {n: told_rows(n) for n in LEGS},
+        "measures": {name: told(m) for name, m in (STEP | MARGINS | CYCLE).items()},
+        "margins": {name: bool(m.axis) for name, m in MARGINS.items()},
+        "outcomes": {int(o): {"name": o.name, "meaning": o.meaning} for o in vrw.Outcome},
+    }
+
+
+def told_in(page: str, name: str) -> Any:
+    """What a built page holds under a name."""
+    _, _, rest = page.partition(f'<script type="application/json" id="{name}">')
+    return json.loads(rest.partition("</script>")[0])
+
+
+def written(code: dict[str, str]) -> str:
+    """The page with all that it needs inside."""
+    part = lambda name: (SOURCES / name).read_text(encoding="utf-8")
+    page, held = part("page.html"), {}
+    for name in ("page.css", "engine.js", "worker.js", "pictures.js", "page.js"):
+        held[f"/*{name}*/"] = part(name)
+    held[f"/*{FACTS}*/"] = json.dumps(facts(), ensure_ascii=False)
+    held[f"/*{CODE}*/"] = json.dumps(code)
+    for mark, text in held.items():
+        if page.count(mark) != 1:
+            raise SystemExit(f"page.html says {mark} {page.count(mark)} times: once is needed.")
+        page = page.replace(mark, text)
+    return page.replace("/*size*/", f"{len(page.encode()) / 1000:,.0f} kB")
+
+
+def main() -> int:
+    parser = command(__doc__)
+    parser.add_argument("--page", action="store_true", help="keep the step's code as it is")
+    only_page = started(parser).page
+    if only_page:
+        code = told_in(PAGE.read_text(encoding="utf-8"), CODE)
+    else:
+        code = {str(n): compiled(n) for n in LEGS}
+    page = written(code)
+    PAGE.write_text(page, encoding="utf-8")
+    print(f"{PAGE}: {len(page.encode()):,} bytes, {sum(map(len, code.values())):,} of them code")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

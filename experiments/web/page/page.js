@@ -1,0 +1,645 @@
+"use strict";
+// The page: what is chosen, what it gives, and where it is shown.
+
+const told = (id) => JSON.parse(document.getElementById(id).textContent);
+const $ = (id) => document.getElementById(id);
+const facts = told("facts"), packed = told("code");
+const MEASURED = ["speed", "dls_fraction", "period", "step_length", "duration_dls", "duration_sls1", "duration_sls2",
+  "theta_touchdown", "dtheta_touchdown", "energy_lost_landing", "energy_lost_stopper", "energy_lost_damping"];
+const INDICATORS = ["lambda_I4", "lambda_2_plus", "lambda_4_plus"];
+const MAPPED = ["speed", "dls_fraction", "period", "spectral_radius", ...INDICATORS, ...Object.keys(facts.margins)];
+const PRESETS = {
+  "Table 1": {},
+  "foot scuffs": { damping: 40 },
+  "hardly stable": { damping: 242, slope: 0.25, stiffness: 955, natural_length: 1.07, hub_mass: 22.1 },
+  "unstable": { damping: 228, slope: 0.288, stiffness: 642, natural_length: 1.03, hub_mass: 11.1 },
+  "touches early": { damping: 300 },
+  "leaps off": { stiffness: 1000 },
+  "falls back": { slope: 0.1 },
+};
+const OUTCOME_COLORS = { 1: "#e69f00", 2: "#009e73", 3: "#56b4e9", 4: "#d55e00", 5: "#cc79a7", 6: "#999933", 7: "#882255",
+  8: "#000000", 9: "#bbbbbb" };
+const LAST = 64, LOST_STEPS = 60;
+
+const defaults = () => {
+  const values = { friction: 1, n_legs: 8 };
+  for (const [name, parameter] of Object.entries(facts.parameters)) values[name] = parameter.value;
+  return values;
+};
+const state = {
+  values: defaults(), engines: {}, guess: null, result: null, took: 0,
+  playing: !matchMedia("(prefers-reduced-motion: reduce)").matches,
+  map: { x: "damping", y: "slope", measure: "speed", cells: new Map(), key: "" },
+  basin: { cells: new Map(), key: "", cross: null },
+};
+
+const columnOf = (values) => facts.order.map((name) => values[name]);
+const number = (value) => {
+  const size = Math.abs(value);
+  return value === 0 ? "0" : size < 1e-3 || size >= 1e5 ? value.toExponential(2) : +value.toPrecision(4) + "";
+};
+const unitText = (unit) => unit.replaceAll(" ", "·").replace("^2", "²").replace("/s²", "/s²");
+const symbol = (name) => (name === "friction" ? "μ" : facts.parameters[name].symbol.replace("phi", "φ").replace("_", ""));
+const set = (text) => text.replace("phi", "φ").replace(/_([A-Za-z0-9-]+)/g, "<sub>$1</sub>");
+const signOf = (name) => (name === "friction" ? "μ" : set(facts.parameters[name].symbol));
+const table = (caption, rows) => `<table><caption class="unseen">${caption}</caption><tbody>${rows.join("")}</tbody></table>`;
+const parts = (list, count) => Array.from({ length: count }, (_, i) =>
+  list.slice(Math.ceil((i * list.length) / count), Math.ceil(((i + 1) * list.length) / count)));
+const named = (name) => name.replaceAll("_", " ");
+
+// ---- what a wheel gives
+
+async function engineOf(legs) {
+  state.engines[legs] ||= Engine.load(packed[legs], facts, legs);
+  return state.engines[legs];
+}
+
+// The gait, or the walk that loses it, and all that is told of a step.
+function computed(engine, values, guess) {
+  const wheel = columnOf(values), guesses = guess ? [guess, facts.start] : [facts.start];
+  const gait = allowed(values) ? engine.gait(wheel, guesses) : null;
+  if (!gait) return walkedFrom(engine, values, guess || facts.start, LOST_STEPS);
+  const step = engine.told(wheel, values.friction, gait.x);
+  return { gait, outcome: step.outcome, steps: [stepOf(engine, step)], measures: step.measures };
+}
+
+// A walk's last steps, and how it ended.
+function walkedFrom(engine, values, start, most) {
+  const wheel = columnOf(values);
+  const { states: [states], outcomes: [outcome] } = engine.walks(SHOWN, [wheel], [start], most);
+  const shown = states.slice(-8).map((x) => engine.told(wheel, values.friction, x));
+  const { measures } = shown[shown.length - 1];
+  return { gait: null, outcome, taken: states.length - 1, steps: shown.map((step) => stepOf(engine, step)), measures };
+}
+
+const allowed = (values) => values.leg_com < values.locked_length;
+
+// A step's samples over all of its phases, row by row: theta, L1, L2, their rates, forces, energies.
+function stepOf(engine, { measures, motion }) {
+  const n = engine.samples, durations = ["dls", "sls1", "sls2"].map((name) => measures[`duration_${name}`]);
+  const times = [], rows = Array.from({ length: 13 }, () => []);
+  let begin = 0;
+  durations.forEach((duration, phase) => {
+    if (!(duration > 0)) return;
+    for (let i = 0; i < n; i++) {
+      times.push(begin + (duration * i) / (n - 1));
+      rows.forEach((row, k) => row.push(motion[phase][k * n + i]));
+    }
+    begin += duration;
+  });
+  return { durations, times, rows, period: begin };
+}
+
+// ---- the walk on the screen
+
+const walk = { index: 0, time: 0, place: 0, count: 0, prints: [0], trail: [], held: 0 };
+
+function restart() {
+  Object.assign(walk, { index: 0, time: 0, place: 0, count: 0, prints: [], trail: [], held: 0 });
+}
+
+function sampleAt(step, time) {
+  const { times, rows } = step;
+  if (!times.length) return null;
+  let i = 0;
+  while (i < times.length - 2 && times[i + 1] < time) i++;
+  const span = times[i + 1] - times[i], share = span > 0 ? Math.min(1, Math.max(0, (time - times[i]) / span)) : 1;
+  return rows.map((row) => row[i] + (row[i + 1] - row[i]) * share);
+}
+
+const landsAhead = (values, sample) =>
+  sample[1] * Math.sin(sample[0]) - values.locked_length * Math.sin(sample[0] - (2 * Math.PI) / values.n_legs);
+
+function moved(seconds) {
+  const { steps, gait } = state.result;
+  if (walk.held > 0) {
+    // A lost walk stands still for a while before it is shown again.
+    walk.held -= seconds;
+    if (walk.held <= 0) restart();
+    return;
+  }
+  walk.time += seconds;
+  for (let turn = 0; turn < 4 && walk.time > steps[walk.index].period; turn++) {
+    const step = steps[walk.index], last = walk.index === steps.length - 1;
+    if (!gait && last && state.result.outcome !== STEPPED) {
+      walk.time = step.period;
+      walk.held = 1.6;
+      return;
+    }
+    const end = sampleAt(step, step.period);
+    if (!end) break;
+    walk.time -= step.period;
+    walk.place += landsAhead(state.values, end);
+    walk.prints = [...walk.prints.slice(-12), walk.place];
+    walk.count++;
+    walk.index = last ? 0 : walk.index + 1;
+    if (last && !gait) {
+      // A walk that never settles begins anew.
+      restart();
+      return;
+    }
+  }
+}
+
+function show() {
+  const { result, values } = state, step = result.steps[walk.index], sample = sampleAt(step, walk.time);
+  if (!sample) return;
+  const [theta, L1, L2] = sample, alpha = (2 * Math.PI) / values.n_legs;
+  const hub = [walk.place + L1 * Math.sin(theta), L1 * Math.cos(theta)];
+  const rear = [hub[0] - L2 * Math.sin(theta + alpha), hub[1] - L2 * Math.cos(theta + alpha)];
+  const last = walk.trail[walk.trail.length - 1];
+  if (!last || Math.hypot(last[0] - hub[0], last[1] - hub[1]) > 0.02) walk.trail = [...walk.trail.slice(-120), hub];
+  const lost = walk.held > 0 && result.outcome !== STEPPED;
+  drawWalk($("walk"), {
+    wheel: values, legs: values.n_legs, theta, L1, L2, x: walk.place, step: walk.count,
+    feet: [[walk.place, 0, sample[6], sample[7]], [...rear, sample[8], sample[9]]],
+    prints: walk.prints, trail: walk.trail,
+    caption: lost ? named(facts.outcomes[result.outcome].name.toLowerCase()) : `step ${walk.count + 1}`,
+  });
+  const weight = (values.hub_mass + values.n_legs * values.leg_mass) * values.gravity;
+  drawStrips($("strips"), step, weight, walk.time);
+  const slider = $("moment");
+  if (document.activeElement !== slider || state.playing) slider.value = step.period ? walk.time / step.period : 0;
+  slider.setAttribute("aria-valuetext", `${(walk.time * 1000).toFixed(0)} ms of ${(step.period * 1000).toFixed(0)}`);
+}
+
+let before = 0;
+function tick(now) {
+  const seconds = Math.min(0.1, (now - before) / 1000);
+  before = now;
+  if (state.result && state.playing) {
+    moved(seconds * Number($("pace").value));
+    show();
+  }
+  requestAnimationFrame(tick);
+}
+
+// ---- what is told in words
+
+function leastOf(name) {
+  const { measures } = state.result;
+  if (!facts.margins[name]) return [measures[name], ""];
+  const legs = Object.keys(measures).filter((key) => key.startsWith(`${name}[`));
+  const least = legs.reduce((a, b) => (measures[a] < measures[b] ? a : b));
+  return [measures[least], ` (leg ${least.slice(name.length + 1, -1)})`];
+}
+
+function tellVerdict() {
+  const { result, values } = state, box = $("verdict"), { gait, outcome, measures } = result;
+  const say = (kind, title, text) => {
+    box.className = kind;
+    box.innerHTML = `<b>${title}</b> <span>${text}</span>`;
+  };
+  if (!allowed(values)) return say("bad", "No such wheel", "A leg's mass sits between foot and hub: a must be below L₀.");
+  if (gait) {
+    const broken = Object.keys(facts.margins).filter((name) => leastOf(name)[0] < 0).length;
+    const premises = broken ? ` <a href="#margins-title">${broken} of 13 premises don't hold.</a>` : " All 13 premises hold.";
+    const how = `${number(measures.speed)} m/s, ${number(measures.period)} s a step, both feet on the ground for ${(100 * measures.dls_fraction).toFixed(1)} % of it.`;
+    if (outcome !== STEPPED) return say("bad", "Lost", facts.outcomes[outcome].meaning);
+    if (!isStable(gait)) return say("warn", "An unstable gait", `${how} It repeats itself, but a touch grows by a factor of ${radius(gait).toFixed(3)} with each step.${premises}`);
+    if (measures.clearance_sls1 < 0 || measures.clearance_sls2 < 0)
+      return say("warn", "A stable gait, but the rear foot scuffs", `${how} The model lets it pass through the ground.${premises}`);
+    return say("good", "A stable gait", `${how} A touch shrinks to ${(100 * radius(gait)).toFixed(1)} % of it with each step.${premises}`);
+  }
+  if (result.from && outcome === STEPPED)
+    return say("good", "From there it walks on", "Seven steps are shown, again and again. Move a slider to return to the gait.");
+  if (outcome === STEPPED)
+    return say("warn", "It walks, but never settles", `No gait of one step was found; ${LOST_STEPS} steps went on without repeating.`);
+  const steps = result.taken === 1 ? "one step" : `${result.taken} steps`;
+  say("bad", `${result.from ? "From there" : "No gait"}: lost after ${result.taken ? steps : "no whole step"}`, facts.outcomes[outcome].meaning);
+}
+
+function tellGait() {
+  const { measures, gait } = state.result;
+  $("gait-hint").textContent = gait ? "Of the step that repeats itself." : "No step repeats itself: of the last step, as far as it came.";
+  const rows = MEASURED.map((name) => {
+    const m = facts.measures[name];
+    return `<tr title="${m.meaning}"><th scope="row">${m.label} <i>${set(m.symbol)}</i></th><td data-measure="${name}">${number(measures[name])} ${unitText(m.unit)}</td></tr>`;
+  });
+  $("gait").innerHTML = parts(rows, 3).map((some) => table("Measures of the step", some)).join("");
+  const list = gait ? gait.multipliers : [];
+  drawCircle($("circle"), list);
+  const text = ({ re, im }) => (im ? `${number(re)} ${im < 0 ? "−" : "+"} ${number(Math.abs(im))}i` : Math.abs(re) < 1e-12 ? "0" : number(re));
+  $("multipliers").innerHTML = gait
+    ? `Multipliers of the gait: ${list.map(text).join(", ")}. Spectral radius ρ = <b data-measure="spectral_radius">${number(radius(gait))}</b>.`
+    : "Multipliers need a gait.";
+  $("circle").setAttribute("aria-label", $("multipliers").textContent);
+}
+
+function tellMargins() {
+  const { values } = state, L = values.locked_length, mass = values.hub_mass + values.n_legs * values.leg_mass;
+  const scale = { N: mass * values.gravity, "N s": 0.2 * mass * Math.sqrt(values.gravity * L), m: 0.2 * L, "": 1 };
+  const rows = [...INDICATORS, ...Object.keys(facts.margins)].map((name) => {
+    const m = facts.measures[name], [value, leg] = INDICATORS.includes(name) ? [state.result.measures[name], ""] : leastOf(name);
+    const broken = value < 0, share = 50 * Math.tanh(Math.abs(value) / scale[m.unit]);
+    const bar = `<div class="bar" aria-hidden="true"><i style="${broken ? `right:50%` : `left:50%`};width:${share}%"></i></div>`;
+    const shown = number(value);
+    return `<tr class="${broken ? "broken" : ""}"><th scope="row">${set(m.label)}${leg}<small>${broken ? m.breaks : m.meaning}</small></th>`
+      + `<td>${bar}</td><td data-measure="${name}">${shown} ${unitText(m.unit)}<small>${broken ? "broken" : "holds"}</small></td></tr>`;
+  });
+  $("margins").innerHTML = parts(rows, 2).map((some) => table("Indicators and margins of the step", some)).join("");
+}
+
+function tellPython() {
+  const base = defaults(), { values } = state;
+  const changed = facts.order.concat("n_legs").filter((name) => values[name] !== base[name]).map((name) => `${name}=${values[name]}`);
+  $("python").textContent = `vrw.limit_cycle(vrw.WheelParams(${changed.join(", ")}))`;
+}
+
+// ---- maps and basins
+
+const workers = {};
+function send(kind, job) {
+  job.kind = kind;
+  job.id = `${kind} ${++send.count}`;
+  workers[kind] ||= worker(news);
+  const known = (workers[kind].known ||= new Set()), legs = state.values.n_legs;
+  const first = known.has(legs) ? {} : { packed: packed[legs], facts };
+  known.add(legs);
+  workers[kind].post({ job: { ...job, legs }, ...first });
+  return job.id;
+}
+send.count = 0;
+
+// Beside the page, or where that is forbidden, within it, piece by piece.
+function worker(hear) {
+  const source = [$("engine"), $("worker")].map((script) => script.textContent).join("\n");
+  const door = "\nconst hear = jobs((news) => postMessage(news)); onmessage = (event) => hear(event.data);";
+  try {
+    const own = new Worker(URL.createObjectURL(new Blob([source + door], { type: "text/javascript" })));
+    own.onmessage = (event) => hear(event.data);
+    return { post: (message) => own.postMessage(message) };
+  } catch {
+    return { post: jobs(hear) };
+  }
+}
+
+function news({ kind, job, stride, nodes, done }) {
+  const picture = state[kind];
+  if (picture.job !== job) return;
+  if (done) {
+    picture.done = true;
+    picture.seconds = (performance.now() - picture.began) / 1000;
+  } else
+    for (const node of nodes) {
+      const key = node.node.join();
+      picture.cells.set(key, { ...node, stride });
+    }
+  if (!picture.waits) {
+    picture.waits = true;
+    requestAnimationFrame(() => {
+      picture.waits = false;
+      kind === "map" ? showMap() : showBasin();
+    });
+  }
+}
+
+function axisOf(name) {
+  const { from, to, unit } = facts.parameters[name];
+  return { name, from, to, index: facts.order.indexOf(name), label: `${named(name)} ${symbol(name)}${unit ? ` [${unitText(unit)}]` : ""}` };
+}
+
+const ZOOM = { damping: [20, 320], slope: [0.15, 0.45], stiffness: [250, 900], natural_length: [0.97, 1.12] };
+const mapAxis = (name) => {
+  const axis = axisOf(name);
+  return ZOOM[name] ? { ...axis, from: ZOOM[name][0], to: ZOOM[name][1] } : axis;
+};
+
+const mapAxes = () => {
+  const { given, x, y } = state.map;
+  return given ? [given.x, given.y] : [mapAxis(x), mapAxis(y)];
+};
+
+function askMap() {
+  const { map, values, result } = state;
+  const others = facts.order.concat("n_legs", "friction").filter((name) => name !== map.x && name !== map.y);
+  const key = JSON.stringify([map.x, map.y, others.map((name) => values[name])]);
+  if (key === map.key || !result || map.given) return showMap();
+  map.key = key;
+  map.done = false;
+  map.began = performance.now();
+  map.cells = new Map();
+  const x = mapAxis(map.x), y = mapAxis(map.y), share = (axis) => (LAST * (values[axis.name] - axis.from)) / (axis.to - axis.from);
+  map.job = send("map", {
+    wheel: columnOf(values), x, y, friction: values.friction, last: LAST, batch: 32,
+    guess: state.guess || facts.start, dot: [share(x), share(y)],
+  });
+}
+
+function mapValue(cell) {
+  const { measure, given } = state.map;
+  if (given) return given.measures[measure][cell.node[1]][cell.node[0]];
+  if (!cell.told) return null;
+  if (measure === "spectral_radius") return cell.radius;
+  const rows = facts.rows[state.values.n_legs], at = (name) => cell.told[rows.indexOf(name)];
+  const period = at("duration_dls") + at("duration_sls1") + at("duration_sls2");
+  if (measure === "period") return period;
+  if (measure === "speed") return at("step_length") / period;
+  if (measure === "dls_fraction") return at("duration_dls") / period;
+  if (!facts.margins[measure]) return at(measure);
+  return Math.min(...rows.flatMap((name, i) => (name.startsWith(`${measure}[`) ? [cell.told[i]] : [])));
+}
+
+const coarseFirst = (cells) => [...cells.values()].sort((a, b) => b.stride - a.stride);
+
+function showMap() {
+  const { map, values } = state, cells = coarseFirst(map.cells), found = cells.map(mapValue);
+  const finite = found.filter((value) => value !== null && isFinite(value)).sort((a, b) => a - b);
+  const low = finite[Math.floor(0.01 * finite.length)], high = finite[Math.ceil(0.99 * finite.length) - 1];
+  const codes = new Set();
+  const drawn = cells.map((cell, i) => {
+    if (found[i] === null) {
+      codes.add(cell.outcome);
+      return { ...cell, color: lostColor(cell.outcome) };
+    }
+    const [r, g, b] = shade(high > low ? (found[i] - low) / (high - low) : 0.5);
+    return { ...cell, color: `rgb(${r},${g},${b})`, hatched: cell.radius >= 1 };
+  });
+  const [x, y] = mapAxes(), last = map.given ? [x.last, y.last] : LAST;
+  map.place = drawGrid($("map"), { last, cells: drawn, x, y, dot: [values[map.x], values[map.y]] });
+  const m = facts.measures[map.measure] || { label: named(map.measure), unit: "" }, unit = unitText(m.unit);
+  const bar = `<span><span style="width:90px;height:12px;border-radius:3px;background:linear-gradient(90deg,${VIRIDIS.map(
+    (rgb) => `rgb(${rgb})`).join(",")})"></span></span>`;
+  $("map-legend").innerHTML = (finite.length ? `<span>${m.label}: ${number(low)}</span>${bar}<span>${number(high)} ${unit}</span>` : "")
+    + [...codes].sort().map((code) => swatch(lostColor(code), lostName(code))).join("");
+  $("map-state").textContent = map.given ? "From your dataset." : map.done ? `${map.cells.size.toLocaleString("en")} gaits in ${map.seconds.toFixed(1)} s.` : "Refining …";
+  $("map").setAttribute("aria-label", `Map of ${m.label} over ${named(map.x)}, now ${values[map.x]}, and ${named(map.y)}, now ${values[map.y]}`);
+}
+
+const lostColor = (code) => (code === STEPPED ? "#9aa0a8" : OUTCOME_COLORS[code] || "#555555");
+const lostName = (code) => (code === STEPPED ? "walks, but no gait of one step" : named(facts.outcomes[code].name.toLowerCase()));
+const swatch = (color, text) => `<span><i class="swatch" style="background:${color}"></i>${text}</span>`;
+
+function basinAxes() {
+  const [theta, rate] = state.result.gait.x;
+  const symbols = ["theta_touchdown", "dtheta_touchdown"].map((name) => facts.measures[name]);
+  const label = ({ symbol, unit }) => `${symbol} [${unit}]`;
+  return [
+    { from: theta - 0.4, to: theta + 0.4, label: label(symbols[0]) },
+    { from: 0, to: Math.max(3, 1.6 * rate), label: label(symbols[1]) },
+  ];
+}
+
+function askBasin() {
+  const { basin, values, result } = state, canvas = $("basin");
+  if (!result.gait || !isStable(result.gait)) {
+    basin.key = basin.job = "";
+    basin.cells = new Map();
+    sheet(canvas);
+    $("basin-legend").textContent = "There is no stable gait for starts to lead to.";
+    $("basin-state").textContent = "";
+    return;
+  }
+  const key = JSON.stringify([columnOf(values), values.n_legs]);
+  if (key === basin.key) return showBasin();
+  const [x, y] = basinAxes();
+  Object.assign(basin, { key, axes: [x, y], done: false, began: performance.now(), cells: new Map(), cross: result.gait.x.slice(0, 2), gait: result.gait.x });
+  basin.job = send("basin", { wheel: columnOf(values), gait: result.gait.x, x, y, last: LAST - 1 });
+}
+
+function showBasin() {
+  const { basin } = state;
+  if (!basin.axes) return;
+  const codes = new Set(), cells = coarseFirst(basin.cells).map((cell) => {
+    codes.add(cell.code);
+    return { ...cell, color: cell.code === SETTLED ? "#0072b2" : lostColor(cell.code) };
+  });
+  const home = [...basin.cells.values()].filter(({ code }) => code === SETTLED).length;
+  basin.place = drawGrid($("basin"), { last: LAST - 1, cells, x: basin.axes[0], y: basin.axes[1], cross: basin.cross, dot: basin.gait });
+  $("basin-legend").innerHTML = [...codes].sort((a, b) => a - b).map((code) =>
+    swatch(code === SETTLED ? "#0072b2" : lostColor(code), code === SETTLED ? "to the gait" : code === STEPPED ? "never settles" : lostName(code))).join("");
+  const share = `${((100 * home) / Math.max(1, basin.cells.size)).toFixed(0)} % of the starts lead to the gait`;
+  $("basin-state").textContent = basin.done ? `${share}; ${basin.cells.size.toLocaleString("en")} starts in ${basin.seconds.toFixed(1)} s.` : `${share} so far.`;
+  $("basin").setAttribute("aria-label", `Basin of the gait: ${share}`);
+}
+
+// ---- what is chosen
+
+let asked = 0;
+function later() {
+  clearTimeout(asked);
+  asked = setTimeout(() => {
+    askMap();
+    askBasin();
+    remember();
+  }, 120);
+}
+
+function tell() {
+  tellVerdict();
+  tellGait();
+  tellMargins();
+  tellPython();
+  show();
+}
+
+async function update(changes = {}) {
+  Object.assign(state.values, changes);
+  const { values } = state, legs = values.n_legs, began = performance.now();
+  const engine = await engineOf(legs);
+  if (state.values.n_legs !== legs) return;
+  if (state.legs !== legs) state.guess = null;
+  state.legs = legs;
+  state.result = computed(engine, values, state.guess);
+  if (state.result.gait && isStable(state.result.gait)) state.guess = state.result.gait.x;
+  state.took = performance.now() - began;
+  // The walk goes on where it was, unless its steps are others.
+  const share = walk.step ? walk.time / (walk.step.period || 1) : 0;
+  if (!state.result.gait || walk.lost) restart();
+  else walk.time = share * state.result.steps[0].period;
+  walk.lost = !state.result.gait;
+  walk.index = Math.min(walk.index, state.result.steps.length - 1);
+  walk.step = state.result.steps[walk.index];
+  for (const [name, value] of Object.entries(values)) showValue(name, value);
+  tell();
+  showMap();
+  document.querySelector("[data-told=legs]").textContent = { 6: "six", 8: "eight", 10: "ten" }[legs];
+  $("took").textContent = `${state.took.toFixed(1)} ms`;
+  later();
+  tellParent({ vrw: "values", values: { ...values }, told: spoken(state.result) });
+}
+
+// In a notebook the page is a widget's, which hears what is shown.
+const tellParent = (news) => window.parent !== window && window.parent.postMessage(news, "*");
+const spoken = ({ measures, gait, outcome }) =>
+  ({ ...measures, outcome, ...(gait ? { spectral_radius: radius(gait), gait: gait.x } : {}) });
+
+function known(given) {
+  const names = Object.keys(given).filter((name) => name in state.values && isFinite(Number(given[name])));
+  return Object.fromEntries(names.map((name) => [name, Number(given[name])]));
+}
+
+// A scan's dataset in place of what the page computes: two axes, and rows of measures over them.
+function giveMap(given) {
+  if (!given?.axes) return;
+  const { map } = state, [x, y] = given.axes.map(({ name, values }) => (
+    { ...axisOf(name), from: values[0], to: values[values.length - 1], last: values.length - 1 }));
+  Object.assign(map, { given: { ...given, x, y }, x: x.name, y: y.name, job: "", done: true, cells: new Map() });
+  const names = Object.keys(given.measures);
+  map.measure = names.includes(map.measure) ? map.measure : names[0];
+  $("map-measure").innerHTML = names.map((name) => `<option value="${name}">${facts.measures[name]?.label || named(name)}</option>`).join("");
+  $("map-measure").value = map.measure;
+  for (const side of ["x", "y"]) {
+    $(`map-${side}`).value = map[side];
+    $(`map-${side}`).disabled = true;
+  }
+  given.outcome.forEach((row, r) => row.forEach((outcome, c) => map.cells.set(`${c},${r}`, { node: [c, r], stride: 1, outcome })));
+  showMap();
+}
+
+function showValue(name, value) {
+  const number = $(`number-${name}`), slider = $(`slider-${name}`);
+  if (document.activeElement !== number) number.value = +value.toPrecision(6);
+  if (slider && Number(slider.value) !== value) slider.value = value;
+}
+
+// Seven steps from a start of the basin's picture.
+async function walkFrom(place) {
+  const { basin, values } = state;
+  if (!basin.gait) return;
+  basin.cross = place;
+  const engine = await engineOf(values.n_legs);
+  state.result = { ...walkedFrom(engine, values, [...place, basin.gait[2]], 7), from: place };
+  restart();
+  walk.lost = true;
+  tell();
+  showBasin();
+}
+
+function remember() {
+  const base = defaults(), changed = Object.entries(state.values).filter(([name, value]) => value !== base[name]);
+  const text = changed.map(([name, value]) => `${name}=${value}`).join("&");
+  try {
+    history.replaceState(null, "", text ? `#${text}` : location.pathname + location.search);
+  } catch {
+    // Pages within a frame have no address of their own.
+  }
+}
+
+function fromAddress() {
+  const values = {};
+  for (const [name, text] of new URLSearchParams(location.hash.slice(1)))
+    if (name in state.values && isFinite(Number(text))) values[name] = Number(text);
+  if (!facts.legs.includes(values.n_legs ?? 8)) delete values.n_legs;
+  return values;
+}
+
+// ---- building and listening
+
+function built() {
+  const rows = Object.entries(facts.parameters).map(([name, p]) => [name, signOf(name), p.unit, p.meaning, p.from, p.to]);
+  rows.push(["friction", "μ", "", "coefficient of friction that margins refer to", 0, 2]);
+  const step = (from, to) => 10 ** Math.floor(Math.log10((to - from) / 400));
+  $("sliders").innerHTML = rows.map(([name, sign, unit, meaning, from, to]) =>
+    `<div class="slider" title="${meaning}"><label for="slider-${name}">${named(name)} <i>${sign}</i></label>`
+    + `<input type="number" id="number-${name}" step="any" aria-label="${named(name)}, a number, ${unit}"><span class="unit">${unitText(unit)}</span>`
+    + `<input type="range" id="slider-${name}" min="${from}" max="${to}" step="${step(from, to)}" aria-describedby="about-${name}"><span id="about-${name}" class="unseen">${meaning}</span></div>`).join("")
+    + `<div class="slider"><label for="number-n_legs">number of legs <i>n</i></label><select id="number-n_legs">${facts.legs.map((n) => `<option>${n}</option>`).join("")}</select></div>`;
+  for (const [name] of rows) {
+    const least = facts.parameters[name]?.least ?? 0, above = name === "slope" ? -1.5 : least;
+    $(`slider-${name}`).addEventListener("input", (event) => update({ [name]: Number(event.target.value) }));
+    $(`number-${name}`).addEventListener("change", (event) => {
+      const value = Number(event.target.value);
+      if (event.target.value !== "" && isFinite(value) && value >= above) update({ [name]: value });
+      else showValue(name, state.values[name]);
+    });
+  }
+  $("number-n_legs").addEventListener("change", (event) => update({ n_legs: Number(event.target.value) }));
+  $("presets").innerHTML = Object.keys(PRESETS).map((name) => `<button type="button">${name}</button>`).join("");
+  [...$("presets").children].forEach((button) => button.addEventListener("click", () => {
+    state.guess = null;
+    restart();
+    update({ ...defaults(), ...PRESETS[button.textContent] });
+  }));
+  const options = (names, text) => names.map((name) => `<option value="${name}">${text(name)}</option>`).join("");
+  $("map-measure").innerHTML = options(MAPPED, (name) => facts.measures[name].label);
+  for (const side of ["x", "y"]) {
+    $(`map-${side}`).innerHTML = options(Object.keys(facts.parameters), (name) => `${named(name)} ${symbol(name)}`);
+    $(`map-${side}`).value = state.map[side];
+    $(`map-${side}`).addEventListener("change", (event) => {
+      const other = side === "x" ? "y" : "x";
+      if (state.map[other] === event.target.value) {
+        state.map[other] = state.map[side];
+        $(`map-${other}`).value = state.map[other];
+      }
+      state.map[side] = event.target.value;
+      askMap();
+    });
+  }
+  $("map-measure").addEventListener("change", (event) => {
+    state.map.measure = event.target.value;
+    showMap();
+  });
+  $("play").addEventListener("click", () => play(!state.playing));
+  play(state.playing);
+  $("moment").addEventListener("input", (event) => {
+    play(false);
+    walk.held = 0;
+    walk.time = Number(event.target.value) * state.result.steps[walk.index].period;
+    show();
+  });
+  dragged($("map"), (place) => {
+    const [a, b] = state.map.place(place), round = (v) => +v.toPrecision(4);
+    update({ [state.map.x]: round(a), [state.map.y]: round(b) });
+  }, (dx, dy) => {
+    const axes = mapAxes(), by = [dx, dy];
+    const values = axes.map((axis, i) => state.values[axis.name] + (by[i] * (axis.to - axis.from)) / LAST);
+    const inside = axes.map((axis, i) => +Math.min(axis.to, Math.max(axis.from, values[i])).toPrecision(4));
+    update({ [axes[0].name]: inside[0], [axes[1].name]: inside[1] });
+  });
+  dragged($("basin"), (place) => state.basin.place && walkFrom(state.basin.place(place)), (dx, dy, enter) => {
+    const { basin } = state;
+    if (!basin.cross) return;
+    const move = basin.axes.map((axis) => (axis.to - axis.from) / LAST);
+    basin.cross = [basin.cross[0] + dx * move[0], Math.max(1e-3, basin.cross[1] + dy * move[1])];
+    enter ? walkFrom(basin.cross) : showBasin();
+  });
+  $("strip-legend").innerHTML = [["one", "force on foot 1"], ["two", "on foot 2"], ["soft", "dotted: weight; dashed: along the slope"],
+    ["ink", "energy, total"], ["three", "kinetic"], ["other", "of height"], ["four", "of springs"]]
+    .map(([name, text]) => `<span><i class="swatch" style="background:var(--${name})"></i>${text}</span>`).join("");
+  for (const place of document.querySelectorAll("[data-told]")) place.textContent = facts[place.dataset.told] || place.textContent;
+  
+  new ResizeObserver(() => state.result && (show(), showMap(), showBasin(), tellGait())).observe($("walk"));
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => state.result && update());
+  window.addEventListener("hashchange", () => update({ ...defaults(), ...fromAddress() }));
+  window.addEventListener("message", ({ data }) => {
+    if (data?.vrw === "set") update(known(data.values));
+    if (data?.vrw === "map") giveMap(data.given);
+  });
+}
+
+function play(on) {
+  state.playing = on;
+  $("play").textContent = on ? "Pause" : "Play";
+  $("play").setAttribute("aria-pressed", String(on));
+}
+
+function dragged(canvas, to, by) {
+  const move = (event) => {
+    const box = canvas.getBoundingClientRect();
+    to([event.clientX - box.left, event.clientY - box.top]);
+  };
+  canvas.addEventListener("pointerdown", (event) => {
+    canvas.setPointerCapture(event.pointerId);
+    move(event);
+  });
+  canvas.addEventListener("pointermove", (event) => canvas.hasPointerCapture(event.pointerId) && move(event));
+  const arrows = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1], Enter: [0, 0, true] };
+  canvas.addEventListener("keydown", (event) => {
+    if (!arrows[event.key]) return;
+    event.preventDefault();
+    by(...arrows[event.key]);
+  });
+}
+
+const ready = (async () => {
+  built();
+  await update(fromAddress());
+  tellParent({ vrw: "ready" });
+  requestAnimationFrame(tick);
+})();
+ready.catch((error) => {
+  $("verdict").className = "bad";
+  $("verdict").innerHTML = `<b>This browser can't run the page</b> <span>It needs WebAssembly with vectors (2021) and DecompressionStream (2023): ${error}</span>`;
+});
+window.vrw = { ready, state, update };

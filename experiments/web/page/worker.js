@@ -1,0 +1,127 @@
+"use strict";
+// Maps and basins, computed beside the page and refined as they go. `post` tells what is new.
+
+const pause = () => new Promise((go) => setTimeout(go));
+
+// Every node of a square grid once, coarse ones first: lists of [column, row] by stride.
+function* levels(last) {
+  for (let stride = 8; stride >= 1; stride /= 2) {
+    const nodes = [];
+    for (let row = 0; row <= last; row += stride)
+      for (let column = 0; column <= last; column += stride)
+        if (stride === 8 || row % (2 * stride) || column % (2 * stride)) nodes.push([column, row]);
+    yield [stride, nodes];
+  }
+}
+
+// Gaits over two parameters: rows of what they tell, their spectral radius, or how they are lost.
+async function mapped(engine, job, post, current) {
+  const { wheel, x, y, friction, last, guess, batch } = job;
+  const width = last + 1, known = new Array(width * width).fill(null);
+  const value = (axis, i) => axis.from + ((axis.to - axis.from) * i) / last;
+  const wheelAt = (column, row) => {
+    const here = [...wheel];
+    here[x.index] = value(x, column);
+    here[y.index] = value(y, row);
+    return here;
+  };
+  for (const [stride, nodes] of levels(last)) {
+    // The coarse grid grows from the dot, later ones from the nodes beside them.
+    if (stride === 8) {
+      const far = ([c, r]) => Math.hypot(c - job.dot[0], r - job.dot[1]);
+      nodes.sort((a, b) => far(a) - far(b));
+    }
+    const size = stride === 8 ? 4 : batch;
+    for (let begin = 0; begin < nodes.length; begin += size) {
+      const some = nodes.slice(begin, begin + size), wheels = some.map(([c, r]) => wheelAt(c, r));
+      const guesses = some.map(([c, r]) => nearest(known, width, c, r, stride) || guess);
+      const gaits = engine.gaits(wheels, guesses);
+      const found = gaits.map((gait, i) => ({ gait, outcome: STEPPED, node: some[i] }));
+      // Where Newton's method finds nothing a walk says how the gait is lost, or leads to it.
+      const missed = found.map((_, i) => i).filter((i) => !gaits[i]);
+      if (missed.length) {
+        const lostWheels = missed.map((i) => wheels[i]);
+        const starts = missed.map((i) => guesses[i]);
+        const { states, outcomes } = engine.walks(ROUGH, lostWheels, starts, 24);
+        const ends = states.map((list, k) => (outcomes[k] === STEPPED ? list[24] : null));
+        const again = engine.gaits(lostWheels, ends.map((end) => end || engine.start));
+        missed.forEach((i, k) => {
+          found[i].gait = outcomes[k] === STEPPED ? again[k] : null;
+          found[i].outcome = outcomes[k];
+        });
+      }
+      const walking = found.filter(({ gait }) => gait);
+      if (walking.length) {
+        const told = engine.measured(
+          walking.map(({ node }) => wheelAt(...node)), friction, walking.map(({ gait }) => gait.x),
+        );
+        walking.forEach((one, i) => (one.told = told[i]));
+      }
+      for (const { gait, node: [c, r] } of found) known[r * width + c] = gait && gait.x;
+      post({
+        job: job.id,
+        stride,
+        nodes: found.map(({ gait, outcome, node, told }) =>
+          gait ? { node, told, radius: radius(gait) } : { node, outcome }),
+      });
+      await pause();
+      if (!current(job)) return;
+    }
+  }
+  post({ job: job.id, done: true });
+}
+
+// The gait of a known node beside this one.
+function nearest(known, width, column, row, stride) {
+  for (let ring = 1; ring <= 2; ring++)
+    for (const [dc, dr] of [[-1, 0], [1, 0], [0, -1], [0, 1], [-1, -1], [1, 1], [-1, 1], [1, -1]]) {
+      const c = column + dc * ring * stride, r = row + dr * ring * stride;
+      if (c < 0 || r < 0 || c >= width || r >= width) continue;
+      if (known[r * width + c]) return known[r * width + c];
+    }
+  return null;
+}
+
+const NEAR = 0.02, MOST = 40; // a start is home so near to a stable gait, and lost after so many steps
+const SETTLED = -1;
+
+// Where starts lead: to the gait, or to which end. Codes by node.
+async function starts(engine, job, post, current) {
+  const { wheel, gait, x, y, last } = job;
+  const value = (axis, i) => axis.from + ((axis.to - axis.from) * (i + 0.5)) / (last + 1);
+  for (const [stride, nodes] of levels(last)) {
+    for (let begin = 0; begin < nodes.length; begin += 512) {
+      const some = nodes.slice(begin, begin + 512), codes = some.map(() => STEPPED);
+      let open = some.map(([c, r], i) => ({ i, at: [value(x, c), value(y, r), gait[2]] }));
+      for (let step = 0; step < MOST && open.length; step++) {
+        const taken = engine.advance(ROUGH, open.map(() => wheel), open.map(({ at }) => at));
+        open = open.filter((one, k) => {
+          codes[one.i] = taken[k].outcome;
+          one.at = taken[k].x;
+          if (taken[k].outcome !== STEPPED) return false;
+          const away = Math.max(...one.at.map((v, j) => Math.abs(v - gait[j])));
+          if (away < NEAR) codes[one.i] = SETTLED;
+          return away >= NEAR;
+        });
+      }
+      post({ job: job.id, stride, nodes: some.map((node, i) => ({ node, code: codes[i] })) });
+      await pause();
+      if (!current(job)) return;
+    }
+  }
+  post({ job: job.id, done: true });
+}
+
+// The same two behind one door, wherever they run: a later job of a kind ends the one before.
+function jobs(post) {
+  const latest = {}, engines = {};
+  const current = (job) => latest[job.kind] === job.id;
+  return async ({ job, packed, facts }) => {
+    latest[job.kind] = job.id;
+    if (packed) engines[job.legs] = Engine.load(packed, facts, job.legs);
+    const engine = await engines[job.legs];
+    if (!current(job)) return;
+    const tell = (news) => current(job) && post({ kind: job.kind, ...news });
+    await (job.kind === "map" ? mapped : starts)(engine, job, tell, current);
+  };
+}

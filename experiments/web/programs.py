@@ -1,0 +1,93 @@
+"""What the page computes: the library's own step by lanes, as functions of plain arrays.
+
+A wheel is a column of nine parameters in the order of `WheelParams`, a start one of three numbers.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from vrw_jax import simd
+from vrw_jax.models import DIRECTIONS, along_units, gait_step
+from vrw_jax.models.lane_step import lane_phase, walk
+from vrw_jax.models.paper_step import result_of, told_of
+from vrw_jax.models.viscoelastic import described
+from vrw_jax.numerics import Options, explicit_tableau, sample_lanes
+from vrw_jax.wheel import PARAMETER_NAMES, WheelParams, wheel_of
+
+LEGS = (6, 8, 10)
+"""Numbers of legs that the page offers: each is code of its own."""
+SAMPLES = 24
+"""Times of each phase that the animation knows, ends included."""
+
+TABLEAU = explicit_tableau(Options().solver)
+
+
+class Program(NamedTuple):
+    """A function of `numbers` numbers and of a wheel and a start."""
+
+    function: Callable[..., tuple]
+    numbers: int
+    small: int = simd.SMALL
+
+    def object(self, name: str) -> bytes:
+        """As code for WebAssembly."""
+        rows = len(PARAMETER_NAMES), 3
+        return simd.web_object(self.function, self.numbers, rows, name, self.small)
+
+
+def programs(n_legs: int) -> dict[str, Program]:
+    """By name: what of a step is told, of wheels with so many legs."""
+
+    def wheel(parameters: Array) -> WheelParams:
+        return wheel_of(tuple(parameters), n_legs)
+
+    def advance(tolerance: Array, parameters: Array, x: Array) -> tuple:
+        """Section state and durations; outcome and solver's steps."""
+        numbers, codes = _advance(wheel(parameters), tuple(x), _options(tolerance))
+        return jnp.stack(numbers), jnp.stack(codes)
+
+    def linearised(tolerance: Array, parameters: Array, x: Array) -> tuple:
+        """The same, and how state and durations move with each of the start's numbers."""
+        params, options = wheel(parameters), _options(tolerance)
+        moved = lambda *start: _advance(params, start, options)
+        columns, numbers, codes = along_units(moved, tuple(x), range(3))
+        return jnp.stack(numbers), jnp.stack(codes), jnp.stack(columns, 1)
+
+    def told(tolerance: Array, friction: Array, parameters: Array, x: Array) -> tuple:
+        """All that the step tells, in `result_of`'s order, and its motion phase by phase."""
+        params, options = wheel(parameters), _options(tolerance)
+        walked = walk(params, tuple(x), options, TABLEAU, True, monitored=True)
+        step = result_of(walked.s, walked.landing, told_of(walked), friction)
+        parts = (
+            step.section_state, step.post_impact, step.durations, step.step_length,
+            *vars(step.indicators).values(), *vars(step.monitors).values(),
+            *vars(step.energy).values(),
+        )  # fmt: skip
+        numbers = jnp.concatenate([jnp.atleast_2d(part) for part in parts])
+        motion = []
+        for phase, start, end in zip(walked.phases, walked.starts, walked.ends, strict=True):
+            flow = lane_phase(phase, monitored=False)
+            samples = sample_lanes(flow, TABLEAU, *start, end.duration, SAMPLES, options)
+            motion.append(jnp.concatenate(described(phase, jnp.moveaxis(samples, 1, 0))))
+        codes = jnp.stack([step.outcome, step.solver_steps]).astype(jnp.int32)
+        return numbers, codes, *motion
+
+    return {
+        "advance": Program(advance, 1),
+        "linearised": Program(linearised, 1, DIRECTIONS),
+        "told": Program(told, 2),
+    }
+
+
+def _advance(params: WheelParams, x: tuple[Array, ...], options: Options) -> tuple[tuple, tuple]:
+    step = gait_step(params, x, options, TABLEAU, stop_at_lift_off=True)
+    return (*step.section_state, *step.durations), (step.outcome, step.solver_steps)
+
+
+def _options(tolerance: Array) -> Options:
+    """The library's own, but for the tolerance."""
+    return eqx.tree_at(lambda o: (o.rtol, o.atol), Options(), (tolerance, tolerance))

@@ -1,0 +1,62 @@
+"""The code inside docs/wheel.html, run here by wasmtime as a browser runs it."""
+
+import base64
+import gzip
+import math
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from experiments.web.build import CODE, FACTS, told_in
+
+PAGE = Path(__file__).parents[2] / "docs" / "wheel.html"
+
+
+class WebCode:
+    """The page's functions for wheels with so many legs; lanes are the last axis."""
+
+    def __init__(self, n_legs: int) -> None:
+        wasmtime = pytest.importorskip("wasmtime", reason="wasmtime runs the page's code here")
+        page = PAGE.read_text(encoding="utf-8")
+        self.facts = told_in(page, FACTS)
+        code = gzip.decompress(base64.b64decode(told_in(page, CODE)[str(n_legs)]))
+        self._store = wasmtime.Store()
+        module = wasmtime.Module(self._store.engine, code)
+        real = wasmtime.FuncType([wasmtime.ValType.f64()], [wasmtime.ValType.f64()])
+        self.imports = [needed.name for needed in module.imports]
+        given = [wasmtime.Func(self._store, real, getattr(math, name)) for name in self.imports]
+        self._exports = wasmtime.Instance(self._store, module, given).exports(self._store)
+        self._memory = self._exports["memory"]
+        self._free = self._exports["__heap_base"].value(self._store)
+
+    def __call__(
+        self, name: str, numbers: list[float], arrays: list[np.ndarray], told: list[Any]
+    ) -> list[np.ndarray]:
+        """`told`: the results' rows and kinds."""
+        n = arrays[0].shape[-1]
+        lanes = n + n % 2
+        filled = [np.concatenate([x, x[..., -1:]], -1)[..., :lanes] for x in arrays]
+        inputs = [struct.pack("<d", x) for x in numbers]
+        inputs += [np.ascontiguousarray(x, np.float64).tobytes() for x in filled]
+        sizes = [math.prod(rows) * lanes * np.dtype(kind).itemsize for rows, kind in told]
+        places, end = [], -(-self._free // 16) * 16
+        for size in [*map(len, inputs), *sizes, 4 * len(inputs), 4 * len(told)]:
+            places.append(end)
+            end += -(-size // 16) * 16
+        missing = end - self._memory.data_len(self._store)
+        if missing > 0:
+            self._memory.grow(self._store, -(-missing // 65536))
+        for place, content in zip(places, inputs, strict=False):
+            self._memory.write(self._store, content, place)
+        given, out = places[: len(inputs)], places[len(inputs) : -2]
+        for table, where in ((given, places[-2]), (out, places[-1])):
+            self._memory.write(self._store, struct.pack(f"<{len(table)}i", *table), where)
+        self._exports[name](self._store, places[-2], places[-1], lanes, 0, lanes // 2)
+        read = lambda place, size: bytes(self._memory.read(self._store, place, place + size))
+        return [
+            np.frombuffer(read(place, size), kind).reshape(*rows, lanes)[..., :n]
+            for place, size, (rows, kind) in zip(out, sizes, told, strict=True)
+        ]

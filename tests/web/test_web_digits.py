@@ -1,0 +1,131 @@
+"""The code in docs/wheel.html gives what the library gives: it is the library's own step."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support.web_code import PAGE, WebCode
+
+import vrw_jax as vrw
+from experiments.web.build import told_rows
+from vrw_jax.wheel import PARAMETER_NAMES
+
+SAME = 1e-9
+"""Difference of digits over their scale; the libraries' sines differ in their last bits."""
+RANGES = {
+    "hub_mass": (2.0, 20.0), "leg_mass": (0.5, 2.0), "leg_com": (0.1, 0.6),
+    "locked_length": (0.8, 1.2), "natural_length": (0.8, 1.3), "stiffness": (200.0, 1500.0),
+    "damping": (20.0, 400.0), "slope": (0.05, 0.6), "gravity": (2.0, 20.0),
+}  # fmt: skip
+STARTS = (-0.3, 0.5), (0.3, 4.0), (-1.0, 0.3)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _started():
+    pytest.importorskip("wasmtime", reason="wasmtime runs the page's code here")
+
+
+@functools.cache
+def code(n_legs):
+    return WebCode(n_legs)
+
+
+def drawn(n):
+    """Wheels and starts far and wide: half of them near Table 1's gait."""
+    random = np.random.default_rng(7)
+    draw = lambda ranges: np.stack([random.uniform(*limits, n) for limits in ranges])
+    wheels, starts = draw(RANGES.values()), draw(STARTS)
+    default = np.array([float(getattr(vrw.WheelParams(), x)) for x in PARAMETER_NAMES])
+    near = np.arange(n) % 2 == 0
+    spread = 1.0 + 0.05 * (random.random((9, n)) - 0.5)
+    wheels = np.where(near, default[:, None] * spread, wheels)
+    gait = np.array([0.096, 1.61, -0.09])[:, None] * (1.0 + 0.2 * (random.random((3, n)) - 0.5))
+    return wheels, np.where(near, gait, starts)
+
+
+def wheels_of(columns, n_legs):
+    return vrw.WheelParams(
+        **dict(zip(PARAMETER_NAMES, jnp.asarray(columns), strict=True)), n_legs=n_legs
+    )
+
+
+def same(found, expected, scale):
+    return np.max(np.abs(found - expected) / (scale + np.abs(expected)))
+
+
+def same_steps(n, n_legs):
+    wheels, starts = drawn(n)
+    tolerance = float(vrw.Options().rtol)
+    told = [((6,), np.float64), ((2,), np.int32)]
+    numbers, codes = code(n_legs)("advance", [tolerance], [wheels, starts], told)
+    steps = vrw.steps(wheels_of(wheels, n_legs), starts.T)
+    known = steps.solver == 0  # stiff legs go to other solvers there
+    assert np.mean(known) > 0.9
+    assert np.array_equal(codes[0][known], steps.outcome[known])
+    assert len(np.unique(codes[0])) > 4  # of many outcomes
+    expected = np.concatenate([steps.section_state.T, steps.durations.T])
+    assert same(numbers[:, known], expected[:, known], 1.0) < SAME
+
+
+def test_steps_and_outcomes_are_the_librarys():
+    same_steps(1000, 8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n_legs", [6, 8, 10])
+def test_steps_and_outcomes_are_the_librarys_over_ten_thousand_wheels(n_legs):
+    same_steps(10_000, n_legs)
+
+
+def test_jacobians_are_the_librarys():
+    wheels, starts = drawn(400)
+    options = vrw.Options()
+    told = [((6,), np.float64), ((2,), np.int32), ((3, 6), np.float64)]
+    tolerance = float(options.for_derivatives().rtol)
+    _, codes, columns = code(8)("linearised", [tolerance], [wheels, starts], told)
+    steps = vrw.steps(wheels_of(wheels, 8), starts.T, derivatives="section_state")
+    by = steps.derivatives["section_state"]
+    expected = np.concatenate([by.section_state, by.durations], 1).T  # by the start, first axis
+    stepped = np.asarray((steps.outcome == 0) & (steps.solver == 0))
+    assert np.array_equal(codes[0] == 0, steps.outcome == 0)
+    scale = np.max(np.abs(expected), axis=(0, 1))
+    assert same(columns[..., stepped], expected[..., stepped], scale[stepped]) < SAME
+
+
+def test_all_that_a_step_tells_is_the_librarys():
+    n = 200
+    wheels, starts = drawn(n)
+    rows, samples = told_rows(8), code(8).facts["samples"]
+    assert rows == code(8).facts["rows"]["8"]
+    told = [((len(rows),), np.float64), ((2,), np.int32), *[((13, samples), np.float64)] * 3]
+    numbers, codes, *motion = code(8)("told", [1e-10, 0.9], [wheels, starts], told)
+    step = jax.vmap(functools.partial(vrw.step, model=vrw.ViscoelasticWheel(friction=0.9)))
+    expected = step(wheels_of(wheels, 8), jnp.asarray(starts.T))
+    assert np.array_equal(codes[0], expected.outcome)
+    measures = expected.measures()
+    for name, row in zip(rows, numbers, strict=True):
+        base, _, leg = name.partition("[")
+        known = np.asarray(measures[base])
+        known = known[:, int(leg[:-1]) - 3] if leg else known
+        # As a foot unloads the friction that it needs grows without bound.
+        bounded = codes[0] != vrw.Outcome.LEG_1_LIFTED_OFF
+        assert same(row[bounded], known[bounded], 1.0) < SAME, name
+    one = int(np.flatnonzero(codes[0] == 0)[0])
+    walked = vrw.simulate(
+        wheels_of(wheels[:, one], 8), starts[:, one], n_steps=1, n_samples=samples
+    )
+    names = ("theta", "L1", "L2", "dtheta", "dL1", "dL2", "lambda_1", "lambda_2", "lambda_3",
+             "lambda_4", "kinetic_energy", "gravitational_energy", "elastic_energy")  # fmt: skip
+    for i, name in enumerate(names):
+        found = np.concatenate([phase[i, :, one] for phase in motion])
+        assert same(found, walked[name].values, 1.0) < SAME, name
+
+
+def test_the_page_is_one_file_below_a_megabyte_that_fetches_nothing():
+    page = PAGE.read_text(encoding="utf-8")
+    assert len(page.encode()) <= 1_000_000
+    assert set(code(8).imports) == {"sin", "cos"}
+    for word in ("<link", "src=", "@import", "fetch(", "XMLHttpRequest", "import("):
+        assert word not in page, word

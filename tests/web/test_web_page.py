@@ -1,0 +1,154 @@
+"""docs/wheel.html in a real browser: sliders move, numbers follow, nothing is cut off."""
+
+import os
+import shutil
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support.web_code import PAGE
+
+import vrw_jax as vrw
+
+SWITCHES = [
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync",
+]  # fmt: skip
+SIZES = {"desktop": (1280, 900), "phone": (390, 844)}
+PATIENCE = 120_000
+"""For the map, ms: what it takes on a machine that does much else."""
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    """A Chromium of this machine, with nothing of anyone's in it."""
+    playwright = pytest.importorskip(
+        "playwright.sync_api", reason="playwright drives the browser: pip install playwright"
+    )
+    path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("chrome")
+    if path is None:
+        pytest.skip("no Chromium is installed here, which the page is looked at in")
+    folder = tmp_path_factory.mktemp("browser")
+    with playwright.sync_playwright() as machine:
+        opened = machine.chromium.launch_persistent_context(
+            folder, executable_path=path, args=SWITCHES, headless=True
+        )
+        opened.set_default_timeout(PATIENCE)
+        yield opened
+        opened.close()
+
+
+def fetched(address, complaints):
+    """The page has all that it needs inside."""
+    if not address.startswith(("file:", "blob:", "data:")):
+        complaints.append(address)
+
+
+@pytest.fixture
+def page(browser):
+    """The page, opened from its file; what it complains of fails the test."""
+    shown, complaints = browser.new_page(), []
+    shown.on("pageerror", lambda error: complaints.append(str(error)))
+    shown.on("console", lambda said: complaints.append(said.text) if said.type == "error" else None)
+    shown.on(
+        "request", lambda asked: complaints.append(asked.url) if asked.url[:4] == "http" else None
+    )
+    shown.goto(PAGE.as_uri())
+    shown.evaluate("vrw.ready")
+    yield shown
+    shown.close()
+    assert not complaints
+
+
+def gait_of(page):
+    found = page.evaluate("vrw.state.result.gait")
+    values = [complex(m["re"], m["im"]) for m in found["multipliers"]]
+    return np.array(found["x"]), np.array(values)
+
+
+def test_a_gait_and_its_multipliers_are_the_librarys(page):
+    for changed in ({}, {"damping": 150.0, "slope": 0.27}, {"stiffness": 560.0}):
+        page.evaluate(
+            "values => vrw.update(values)",
+            {"damping": 200, "slope": 0.3, "stiffness": 500} | changed,
+        )
+        x, multipliers = gait_of(page)
+        cycle = vrw.limit_cycle(vrw.WheelParams(**changed))
+        assert np.max(np.abs(x - cycle.section_state)) < 1e-8
+        expected = np.asarray(cycle.multipliers)
+        order = np.argsort(-np.abs(expected))
+        assert np.max(np.abs(multipliers - expected[order])) < 1e-7
+        step = vrw.step(vrw.WheelParams(**changed), jnp.asarray(x))
+        told = page.evaluate("vrw.state.result.measures")
+        for name, value in step.measures().items():
+            if np.ndim(value) == 0 and name in told:
+                assert abs(told[name] - float(value)) < 1e-8 * (1.0 + abs(float(value))), name
+
+
+def test_a_slider_moves_the_numbers(page):
+    before = page.inner_text("[data-measure=speed]")
+    page.locator("#slider-damping").focus()
+    for _ in range(5):
+        page.keyboard.press("ArrowLeft")
+    page.wait_for_function(
+        "text => document.querySelector('[data-measure=speed]').innerText !== text", arg=before
+    )
+    assert float(page.input_value("#number-damping")) < 200.0
+    page.fill("#number-damping", "300")
+    page.locator("#number-damping").press("Tab")
+    page.wait_for_function("document.getElementById('verdict').className === 'bad'")
+    assert "before Leg 2 was back at its stopper" in page.inner_text("#verdict")
+    assert "damping=300" in page.inner_text("#python")
+
+
+def test_a_wheel_can_be_sent_as_an_address(browser):
+    shown = browser.new_page()
+    shown.goto(PAGE.as_uri() + "#damping=40&n_legs=8")
+    shown.evaluate("vrw.ready")
+    assert "scuffs" in shown.inner_text("#verdict")
+    shown.goto("about:blank")
+    shown.goto(PAGE.as_uri() + "#n_legs=10")
+    shown.evaluate("vrw.ready")
+    assert "ten legs" in shown.inner_text("header")
+    assert shown.evaluate("vrw.state.result.measures.locked_stopper_force === undefined")
+    assert shown.evaluate("'locked_stopper_force[10]' in vrw.state.result.measures")
+    shown.close()
+
+
+def test_map_and_basin_fill_and_the_dot_moves_the_wheel(page):
+    page.wait_for_function("vrw.state.basin.done && vrw.state.map.done")
+    assert page.evaluate("vrw.state.basin.cells.size") == 64 * 64
+    assert page.evaluate("vrw.state.map.cells.size") == 65 * 65
+    page.locator("#map").focus()
+    page.keyboard.press("ArrowLeft")
+    page.wait_for_function("vrw.state.values.damping < 200")
+    box = page.locator("#map").bounding_box()
+    page.mouse.click(box["x"] + 0.3 * box["width"], box["y"] + 0.7 * box["height"])
+    page.wait_for_function("vrw.state.values.damping < 150 && vrw.state.values.slope < 0.27")
+    assert page.evaluate("vrw.state.map.cells.size") == 65 * 65  # two parameters' map stays
+    # What the map shows under the dot is what the wheel does.
+    speed = page.evaluate("""() => {
+      const { map, values } = vrw.state, [x, y] = ["damping", "slope"].map(mapAxis);
+      const share = (axis) => (values[axis.name] - axis.from) / (axis.to - axis.from);
+      const at = (axis) => Math.round(64 * share(axis));
+      return mapValue(map.cells.get([at(x), at(y)].join()));
+    }""")
+    assert abs(speed - page.evaluate("vrw.state.result.measures.speed")) < 0.05
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_nothing_is_cut_off_and_everything_has_a_name(page, size, scheme, tmp_path):
+    page.emulate_media(color_scheme=scheme)
+    width, height = SIZES[size]
+    page.set_viewport_size({"width": width, "height": height})
+    page.wait_for_timeout(300)
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    nameless = page.evaluate("""() => {
+      const name = (one) => one.getAttribute("aria-label") || one.labels?.length || one.innerText;
+      return [...document.querySelectorAll("input, select, button, canvas")].filter(
+        (one) => !name(one)).length;
+    }""")
+    assert nameless == 0
+    shot = os.environ.get("VRW_SCREENSHOTS", str(tmp_path))
+    page.screenshot(path=f"{shot}/wheel_{size}_{scheme}.png", full_page=True)
