@@ -141,12 +141,20 @@ def throughput() -> dict[str, float]:
 
         return jax.jacfwd(told, has_aux=True)(v)
 
+    measured = lambda name: lambda v: vrw.limit_cycle(wheel_of(v, 8)).measure(name)
+    derived = {
+        "gradient of `dls_fraction`": jax.grad(measured("dls_fraction")),
+        "gradient of `spectral_radius`": jax.grad(measured("spectral_radius")),
+        "gradient of `stability_margin`": jax.grad(measured("stability_margin")),
+        "Hessian of `dls_fraction`": jax.hessian(measured("dls_fraction")),
+    }
     table = {
         "from the default guess, with multipliers": (jax.jit(jax.vmap(residuals)), params),
         "from a neighbour 0.1 % away, with multipliers": (
             jax.jit(jax.vmap(from_neighbour)), params, near,
         ),
         "with nine first derivatives of everything": (jax.jit(jax.vmap(differentiated)), vectors),
+        **{name: (jax.jit(jax.vmap(function)), vectors) for name, function in derived.items()},
     }  # fmt: skip
     return {name: 1e6 * least(*call) / LANES for name, call in table.items()}
 

@@ -2,6 +2,7 @@
 
 import functools
 import math
+import re
 
 import jax
 import jax.numpy as jnp
@@ -95,7 +96,15 @@ def test_first_derivatives_agree_with_the_truth(options, allowed):
         assert relative_error(own, expected) < allowed, name
 
 
-@pytest.mark.slow
+@pytest.mark.skipif(not simd.serves(), reason="machine code is for CPUs")
+def test_gradients_of_multipliers_are_machine_code_from_search_to_slopes():
+    radius = lambda vector: vrw.limit_cycle(truth.wheel(vector)).spectral_radius
+    program = jax.jit(jax.vmap(jax.grad(radius))).lower(truth.PARAMETERS).as_text()
+    called = set(re.findall(r"lanes_code_\w+", program))
+    assert len(called) == 3  # the search, the columns, the monodromy's derivatives along them
+    assert "while" not in program
+
+
 def test_derivatives_of_the_spectral_radius_agree_with_the_truth():
     found = of_the_truth(None, ("spectral_radius",))[0]["spectral_radius"]
     rows = [table_1(), table_1(slope=0.02), table_1(damping=np.nan)]
@@ -458,8 +467,10 @@ def test_a_search_by_xla_as_on_a_gpu_goes_as_the_machine_code(monkeypatch):
     def told(vectors):
         one = lambda vector: vrw.limit_cycle(truth.wheel(vector))
         period = lambda vector: one(vector).period
-        cycle, slopes = jax.vmap(one)(vectors), jax.vmap(jax.grad(period))(vectors)
-        return cycle.durations, cycle.matrix, slopes, cycle.outcome, cycle.passes
+        margin = lambda vector: one(vector).stability_margin
+        cycle = jax.vmap(one)(vectors)
+        slopes, second = (jax.vmap(jax.grad(f))(vectors) for f in (period, margin))
+        return cycle.durations, cycle.matrix, slopes, second, cycle.outcome, cycle.passes
 
     *found, outcome, passes = jax.jit(told)(rows)
     monkeypatch.setattr(simd, "serves", lambda: False)

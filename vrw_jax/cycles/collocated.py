@@ -244,9 +244,8 @@ def sampled_walk(
     section = jnp.stack([landing.theta, landing.motion.dtheta])
 
     def one(x: Array, _: None) -> tuple[Array, tuple]:
-        states = model.trace(params, x, options, N_SAMPLES).state
-        walked = model.advance(params, x, options)
-        told = transitions.land(s, *x).distance, walked.durations, states
+        walked = model.trace(params, x, options, N_SAMPLES)
+        told = transitions.land(s, *x).distance, walked.durations, walked.state
         return walked.section_state, told
 
     _, told = lax.scan(one, x, None, length=n_steps)

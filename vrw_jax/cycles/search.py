@@ -13,7 +13,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import export, lax
-from jaxtyping import Array, Bool, Inexact, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax import simd
 from vrw_jax.cycles.options import CycleOptions
@@ -39,7 +39,7 @@ from vrw_jax.numerics import (
 )
 from vrw_jax.wheel import WheelParams, parameters_of, wheel_of
 
-Parameters = Inexact[Array, "n_parameters lanes"]
+Parameters = Float[Array, "n_parameters lanes"]
 """The float parameters in the order of PARAMETER_NAMES."""
 
 

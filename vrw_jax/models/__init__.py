@@ -10,6 +10,7 @@ from vrw_jax.models.base import (
     RungState,
     SectionState,
     StepResult,
+    Trajectory,
     replaced_where_bad,
     usable,
 )

@@ -255,6 +255,8 @@ class Advance(eqx.Module):
 class Trajectory(eqx.Module):
     """States of one step at samples of each phase, both ends included, with the forces there.
 
+    And what its `Advance` tells, from the same integration.
+
     Axes: phase (DLS, SLS-I, SLS-II), sample. A phase that did not happen has duration 0 and repeats
     its start. Coordinates are in the labels of this step; the origin is Leg 1's foot.
     """
@@ -263,6 +265,9 @@ class Trajectory(eqx.Module):
     state: Float[Array, "3 n 6"]  # theta, L1, L2 and their rates
     forces: Float[Array, "3 n 4"]  # lambda_1 ... lambda_4, N
     energy: Float[Array, "3 n 3"]  # kinetic, gravitational, elastic, J
+    section_state: RungState
+    durations: Float[Array, "3"]  # s
+    outcome: Int[Array, ""]  # an Outcome
 
 
 class AbstractWheel(eqx.Module):

@@ -201,7 +201,7 @@ def told_by_lanes(structure: Any, stop_at_lift_off: bool, monitored: bool) -> Fo
 
 
 def sampled_by_lanes(structure: Any, stop_at_lift_off: bool, n_samples: int) -> LaneFunction:
-    """Durations of the phases, and states at equal times of each, over the same leaves."""
+    """What the step tells, and states at equal times of each phase, over the same leaves."""
     setting = _Setting(structure, stop_at_lift_off, monitored=False)
 
     def over_lanes(*leaves: Array) -> tuple:
@@ -212,9 +212,9 @@ def sampled_by_lanes(structure: Any, stop_at_lift_off: bool, n_samples: int) -> 
             )
             for phase, start, end in zip(walked.phases, walked.starts, walked.ends, strict=True)
         ]
-        return jnp.stack([end.duration for end in walked.ends]), tuple(samples)
+        return told_of(walked), tuple(samples)
 
-    like = lambda *leaves: (leaves[0], (leaves[0],) * 3)
+    like = lambda *leaves: (_like(False, leaves), (leaves[0],) * 3)
     return one_wheel(lane_function(over_lanes, like, ("samples", *setting.key, n_samples)))
 
 

@@ -185,7 +185,9 @@ class RigidWheel(AbstractWheel):
             forces = jnp.stack([force.tangential, force.normal, zero, zero])
             return roll.time(theta), state, forces, jnp.stack(dynamics.energy(s, m))
 
-        return Trajectory(*jax.vmap(jax.vmap(describe))(angles))
+        time, state, forces, energy = jax.vmap(jax.vmap(describe))(angles)
+        ends = result.section_state, result.durations, result.outcome
+        return Trajectory(time, state, forces, energy, *ends)
 
 
 class _Roll(eqx.Module):

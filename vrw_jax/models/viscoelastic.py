@@ -147,28 +147,30 @@ class ViscoelasticWheel(AbstractWheel):
             sampled = sampled_by_lanes(structure, self.stop_at_lift_off, n_samples)
         else:
             sampled = functools.partial(self._sampled_by_diffrax, structure, n_samples)
-        durations, samples = sampled(*leaves)
+        told, samples = sampled(*leaves)
         s, landing = _landed(params, x)
+        durations = told.durations
         times = jnp.linspace(0.0, 1.0, n_samples) * durations[:, None]
         begins = jnp.concatenate([jnp.zeros_like(durations[:1]), jnp.cumsum(durations)[:-1]])
-        told = [
+        parts = [
             jax.vmap(functools.partial(described, phase))(states)
             for phase, states in zip(
                 phases_of(s, landing.distance, self.stop_at_lift_off), samples, strict=True
             )
         ]
-        states, forces, energies = (jnp.stack(parts) for parts in zip(*told, strict=True))
-        return Trajectory(begins[:, None] + times, states, forces, energies)
+        states, forces, energies = (jnp.stack(part) for part in zip(*parts, strict=True))
+        ends = section_state_of(told), durations, told.outcome
+        return Trajectory(begins[:, None] + times, states, forces, energies, *ends)
 
     def _sampled_by_diffrax(
         self, structure: Any, n_samples: int, *leaves: Array
-    ) -> tuple[Array, tuple[Array, ...]]:
+    ) -> tuple[Told, tuple[Array, ...]]:
         params, x, options = jax.tree.unflatten(structure, leaves)
         walked, samples = self._walk(params, x, options, monitored=False), []
         for phase, start, end in zip(walked.phases, walked.starts, walked.ends, strict=True):
             field, y = flow_of(phase, monitored=False).field, jnp.stack([*start[0], *start[1]])
             samples.append(sample_phase(field, y, end.duration, n_samples, options))
-        return jnp.stack([end.duration for end in walked.ends]), tuple(samples)
+        return told_of(walked), tuple(samples)
 
     def _walk(
         self, params: WheelParams, x: SectionState, options: Options, monitored: bool

@@ -32,9 +32,11 @@ from vrw_jax.numerics.collocation import (
 from vrw_jax.numerics.complementarity import Answers, complementary
 from vrw_jax.numerics.derivatives import (
     Forward,
+    InForm,
     any_mode,
     on_branch,
     push,
+    slopes_on_branch,
     with_jacobian,
     without_derivative,
 )

@@ -14,10 +14,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, PyTree
 
-from vrw_jax.numerics.lanes import LaneFunction, in_blocks, one_wheel
+from vrw_jax.numerics.lanes import LaneFunction, one_wheel
 
 Forward = Callable[..., tuple[PyTree[Array], PyTree[Array]]]
 """Maps float arrays to (float outputs, other outputs that carry no derivative)."""
@@ -87,37 +88,48 @@ def _no_tangent(tree: PyTree) -> PyTree:
     return jax.tree.map(lambda x: np.zeros(jnp.shape(x), jax.dtypes.float0), tree)
 
 
-def on_branch(function: LaneFunction, tangent_space: Callable, block: int) -> Callable:
+InForm = Callable[[LaneFunction, int], LaneFunction]
+"""The form in which a function over lanes is computed, which is a derivative of this order."""
+
+
+def on_branch(
+    function: LaneFunction, tangents_of: Callable, in_form: InForm, order: int = 0
+) -> Callable:
     """`function(p, z)` of one wheel, differentiable along z = z(p) to any order and in any mode.
 
-    `function(p, z)` and `tangent_space(p, z)` are over lanes; the latter is dz/dp with a leading
-    axis over p, right wherever z = z(p). The rule ignores the tangent of z, which can only be
-    dz/dp times that of p, and returns the total derivative times the tangent of p.
+    `function(p, z)` is over lanes; `tangents_of(p, z)` is dz/dp of one wheel with a leading axis
+    over p, right wherever z = z(p), and made by this function too. The rule ignores the tangent of
+    z, which can only be dz/dp times that of p, and returns the total derivative times that of p.
     """
-    of_one_wheel = one_wheel(in_blocks(function, block))
+    of_one_wheel = one_wheel(in_form(function, order))
+    wrapped = jax.custom_jvp(lambda p, z: of_one_wheel(p, z))
 
-    @jax.custom_jvp
-    def wrapped(p: Array, z: PyTree) -> PyTree:
-        return of_one_wheel(p, z)
-
+    @wrapped.defjvp
     def rule(primals: tuple, tangents: tuple) -> tuple:
-        derivative = on_branch(total_derivative(function, tangent_space), tangent_space, block)
-        return wrapped(*primals), push(derivative(*primals), tangents[0])
+        slopes = slopes_on_branch(function, tangents_of, in_form, order + 1)(*primals)
+        return wrapped(*primals), push(slopes, tangents[0])
 
-    wrapped.defjvp(rule)
     return wrapped
 
 
-def total_derivative(function: LaneFunction, tangent_space: Callable) -> Callable:
-    """d function(p, z(p)) / dp over lanes, with a leading axis over p."""
+def slopes_on_branch(
+    function: LaneFunction, tangents_of: Callable, in_form: InForm, order: int = 1
+) -> Callable:
+    """d function(p, z(p)) / dp with a leading axis over p, itself as `on_branch`."""
 
-    def derivative(p: Array, z: PyTree) -> PyTree:
-        n = p.shape[0]
+    def along(p: Array, known: tuple[PyTree, PyTree]) -> PyTree:
+        """Over lanes, one direction after another: the code is as short as for one."""
+        n, (z, dz) = p.shape[0], known
         units = jnp.broadcast_to(jnp.eye(n, dtype=p.dtype)[:, :, None], (n, *p.shape))
-        along = lambda dp, dz: jax.jvp(function, (p, z), (dp, dz))[1]
-        return jax.vmap(along)(units, tangent_space(p, z))
+        return lax.map(lambda way: jax.jvp(function, (p, z), way)[1], (units, dz))
 
-    return derivative
+    def known_moves(p: Array, known: tuple[PyTree, PyTree]) -> tuple[PyTree, PyTree]:
+        z, dz = known
+        by_p = jax.jacfwd(tangents_of)(p, z)
+        return dz, jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), by_p)
+
+    slopes = on_branch(along, known_moves, in_form, order)
+    return lambda p, z: slopes(p, lax.stop_gradient((z, tangents_of(p, z))))
 
 
 def with_jacobian(function: Callable, *arguments: Array) -> tuple[Any, Any]:

@@ -12,24 +12,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Inexact
+from jaxtyping import Array, Float
 
 from vrw_jax import simd
 from vrw_jax.numerics.types import Vector
 
-LaneArray = Inexact[Array, "... lanes"]
+LaneArray = Float[Array, "... lanes"]
 
 Hold = Callable[[Any], Any]
 
 
-def fusion_barrier(lanes: Inexact[Array, "... lanes"]) -> Hold:
+def fusion_barrier(lanes: Float[Array, "... lanes"]) -> Hold:
     """A function that returns its argument and that XLA can't fuse across.
 
     `lanes` must not hold NaN; that it does not is what XLA can't know.
     """
     if simd.tracing():
         return lax.optimization_barrier
-    always = ~jnp.isnan(jnp.max(lanes.real))
+    always = ~jnp.isnan(jnp.max(lanes))
 
     def hold(tree: Any) -> Any:
         return lax.cond(always, lambda t: t, lambda t: jax.tree.map(jnp.zeros_like, t), tree)
@@ -57,7 +57,7 @@ def contract(left: Array, right: Array) -> Array:
     return sum(terms[1:], start=terms[0])
 
 
-def inverse(matrix: Inexact[Array, "n n lanes"]) -> Inexact[Array, "n n lanes"]:
+def inverse(matrix: Float[Array, "n n lanes"]) -> Float[Array, "n n lanes"]:
     """Inverse of a 1x1, 2x2 or 3x3 matrix by cofactors."""
     m = matrix
     if m.shape[0] == 1:
@@ -80,10 +80,10 @@ def inverse(matrix: Inexact[Array, "n n lanes"]) -> Inexact[Array, "n n lanes"]:
 
 @jax.custom_jvp
 def eliminate(
-    matrix: Inexact[Array, "nodes dim nodes dim lanes"],
-    right: Inexact[Array, "nodes dim columns lanes"],
+    matrix: Float[Array, "nodes dim nodes dim lanes"],
+    right: Float[Array, "nodes dim columns lanes"],
     for_barrier: LaneArray,
-) -> Inexact[Array, "nodes dim columns lanes"]:
+) -> Float[Array, "nodes dim columns lanes"]:
     """Solve the node equations of one step, block by block without pivoting.
 
     The matrix is the mass matrix plus terms of order h; its diagonal blocks stay regular.

@@ -14,7 +14,7 @@ else:
     Elementwise = Inexact[Array, "..."] | float
 """A quantity that may carry any leading axes: formulas below `scans` act element by element.
 
-Complex where a derivative is taken by complex step (see cycles.derivatives)."""
+Complex numbers go through too, as for a complex step."""
 
 Vector = tuple[Elementwise, ...]
 """One quantity for each component."""

@@ -1,5 +1,6 @@
 """Where results come from: versions, device, number format, tolerances, parameters."""
 
+import functools
 import importlib.metadata
 import platform
 
@@ -32,6 +33,7 @@ def provenance(
     }
 
 
+@functools.cache  # reading it takes longer than the steps of a walk
 def _version(name: str) -> str:
     try:
         return importlib.metadata.version(name)

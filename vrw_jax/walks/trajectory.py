@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from vrw_jax.models import SERVED, AbstractWheel, SectionState
+from vrw_jax.models import SERVED, AbstractWheel, SectionState, Trajectory
 from vrw_jax.numerics import Engine, Options
 from vrw_jax.results import TRAJECTORY, provenance, variables
 from vrw_jax.runtime import xarray as xr
@@ -33,8 +33,8 @@ from vrw_jax.wording import untraced, whole
 @eqx.filter_jit
 def _columns(
     model: AbstractWheel, params: WheelParams, x: SectionState, options: Options, n_samples: int
-) -> dict[str, Array]:
-    """One step by the names of `TRAJECTORY`, shape (phase, sample), Leg 1's foot at the origin.
+) -> tuple[Trajectory, dict[str, Array]]:
+    """One step, also by the names of `TRAJECTORY`, (phase, sample), Leg 1's foot at the origin.
 
     `ahead` is added: where the landing leg stands or will stand, m.
     """
@@ -44,7 +44,7 @@ def _columns(
     motion = Motion.of(theta, L1, L2, dtheta, dL1, dL2)
     rear = rear_direction(s, motion.sin, motion.cos)
     hub_x, hub_z, zero = L1 * motion.sin, L1 * motion.cos, jnp.zeros_like(L1)
-    return {
+    return moved, {
         "time": moved.time,
         "x": zero,
         "z": zero,
@@ -120,17 +120,17 @@ def over_phases(
     """Of rungs that step through the paper's phases."""
 
     def stretches(x: Array) -> Stretches:
-        advance = model.advance(params, x, options)
-        columns = jax.tree.map(np.array, _columns(model, params, x, options, n_samples))
-        ahead, durations = columns.pop("ahead"), np.asarray(advance.durations)
+        moved, told = _columns(model, params, x, options, n_samples)
+        columns, durations = jax.tree.map(np.array, told), np.asarray(moved.durations)
+        ahead = columns.pop("ahead")
         columns["phase"] = np.tile(np.arange(len(durations))[:, None], (1, n_samples))
         happened = np.flatnonzero(durations > 0.0)
         length = float(ahead[happened[-1], -1]) if happened.size else 0.0
         return Stretches(
             columns,
             durations,
-            Outcome(int(advance.outcome)),
-            advance.section_state,
+            Outcome(int(moved.outcome)),
+            moved.section_state,
             float(durations.sum()),
             length,
         )
