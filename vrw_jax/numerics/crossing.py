@@ -10,7 +10,14 @@ from jaxtyping import Array
 from vrw_jax.numerics.lane_minima import with_rates
 from vrw_jax.numerics.lanes import select
 from vrw_jax.numerics.options import Options
-from vrw_jax.numerics.tableaus import Evaluate, Place, Tableau, parabola, take_step
+from vrw_jax.numerics.tableaus import (
+    Evaluate,
+    Place,
+    Tableau,
+    explicit_tableau,
+    parabola,
+    take_step,
+)
 from vrw_jax.numerics.types import Vector
 
 
@@ -19,6 +26,8 @@ class Crossing(NamedTuple):
 
     here: Place  # where they begin
     values: Vector  # of the guards there
+    inside: Vector  # at the tableau's stage `middle`
+    beyond: Vector  # at the end
     h: Array
     guards: Array  # bits of those that cross
     crossed: Array  # in which lanes there is such a step
@@ -32,6 +41,7 @@ class Located(NamedTuple):
     high: Array
     open: Array
     end: Place
+    shift: Array  # from there to the event, by Newton's method
     guard: Array
     tried: Array
     tries: Array
@@ -46,57 +56,72 @@ def locate(
 ) -> Located:
     """The earliest event inside each crossing step, by Newton's method on the step's length.
 
-    The first try is the whole step, the second where the guards' parabolas cross. Every guard that
-    crossed proposes its own time and the earliest is taken, inside a bracket that bisection
-    shrinks. The last proposal moves the end along its slope; it is so short that what the next
-    order would add is a hundredth of the tolerance.
+    The first try is where the guards' parabolas cross. Every guard that crossed proposes its own
+    time and the earliest is taken, inside a bracket that bisection shrinks. Once a proposal is
+    near, and no guard so bent that Newton's method might still miss, a short step of low order goes
+    there; what is left moves the end along its slope.
     """
-    h = step.h
-    enough = 0.1 * jnp.sqrt(options.rtol) * h
+    h, root = step.h, jnp.sqrt(options.rtol)
+    enough, near = 0.1 * root * h, 0.3 * jnp.sqrt(root) * h
     bits = [(step.guards >> i) & 1 == 1 for i in range(len(step.values))]
-
-    def propose(search: Located, end: Place, inside: Place) -> tuple:
-        values, rates = with_rates(guards, evaluate, end)
-        within = guards(inside)
-        change, guard = _newton(values, rates, step.guards)
-        at = _first_guess(tableau, step.values, within, values, step.guards)
-        return following(search, values, change, guard, at)
-
-    def following(search: Located, values: Vector, change: Array, guard: Array, at: Array) -> tuple:
-        before = jnp.ones(h.shape, bool)
-        for g, crosses in zip(values, bits, strict=True):
-            before = before & ~(crosses & (g <= 0.0))
-        low = jnp.where(before, search.length, search.low)
-        high = jnp.where(before, search.high, search.length)
-        proposal = jnp.where(search.tries == 0, at * h, search.length + change)
-        inside = (proposal >= low - enough) & (proposal <= high + enough)
-        length = jnp.where(inside, proposal, 0.5 * (low + high))
-        arrived = inside & (jnp.abs(change) <= enough) & (search.tries > 0)
-        length = jnp.where(search.open, length, search.length)
-        return length, low, high, search.open & arrived, jnp.where(arrived, change, 0.0), guard
 
     def improve(search: Located) -> Located:
         taken = take_step(tableau, evaluate, step.here, search.length, with_error=False)
-        length, low, high, arrived, shift, guard = propose(search, taken.end, taken.inside)
-
+        values, rates = with_rates(guards, evaluate, taken.end)
+        change, guard = _newton(values, rates, step.guards)
+        before, straight = jnp.ones(h.shape, bool), jnp.ones(h.shape, bool)
+        for g0, g, rate, crosses in zip(step.values, values, rates, bits, strict=True):
+            before = before & ~(crosses & (g <= 0.0))
+            fall = rate * search.length
+            bent = jnp.abs(2.0 * (g0 - g + fall) * g) > 0.25 * fall * fall
+            straight = straight & ~(crosses & bent)
+        low = jnp.where(before, search.length, search.low)
+        high = jnp.where(before, search.high, search.length)
+        proposal = search.length + change
+        inside = (proposal >= low - enough) & (proposal <= high + enough)
+        length = jnp.where(inside, proposal, 0.5 * (low + high))
+        arrived = search.open & inside & (jnp.abs(change) <= jnp.where(straight, near, enough))
         return Located(
-            length=length,
+            length=jnp.where(search.open, length, search.length),
             low=low,
             high=high,
             open=search.open & ~arrived,
-            end=select(arrived, _along(taken.end, shift), search.end),
+            end=select(arrived, taken.end, search.end),
+            shift=jnp.where(arrived, change, search.shift),
             guard=jnp.where(arrived, guard, search.guard),
             tried=search.tried + search.open,
             tries=search.tries + 1,
         )
 
-    none = jnp.zeros(h.shape, jnp.int32)
-    start = Located(
-        h, jnp.zeros_like(h), h, step.crossed, step.here, none, none,
-        jnp.zeros((), jnp.int32),
-    )  # fmt: skip
+    first = h * _first_guess(tableau, *step[1:4], step.guards)
+    none, zero = jnp.zeros(h.shape, jnp.int32), jnp.zeros_like(h)
+    count = jnp.zeros((), jnp.int32)
+    start = Located(first, zero, h, step.crossed, step.here, zero, none, none, count)
     unsettled = lambda search: jnp.any(search.open) & (search.tries < options.event_steps)
-    return lax.while_loop(unsettled, improve, start)
+    found = lax.while_loop(unsettled, improve, start)
+
+    short = explicit_tableau("Bosh3")  # over a thousandth of a step exact to rounding
+    assert short is not None
+
+    def goes(far: Array, shift: Array) -> Array:
+        return far & (jnp.abs(shift) <= near)
+
+    def approach(now: tuple) -> tuple:
+        end, shift, length, guard, far, tries = now
+        on = goes(far, shift)
+        end = select(on, take_step(short, evaluate, end, shift, with_error=False).end, end)
+        left, earliest = _newton(*with_rates(guards, evaluate, end), step.guards)
+        shift = jnp.where(on, left, shift)
+        length = jnp.where(goes(on, left), length + left, length)
+        guard = jnp.where(on, earliest, guard)
+        return end, shift, length, guard, far & (jnp.abs(shift) > enough), tries + 1
+
+    far = step.crossed & ~found.open & (jnp.abs(found.shift) > enough)
+    begin = found.end, found.shift, found.length, found.guard, far, count
+    more = lambda now: jnp.any(goes(now[4], now[1])) & (now[5] < options.event_steps)
+    end, shift, length, guard, far, _ = lax.while_loop(more, approach, begin)
+    end = select(far, step.here, _along(end, shift))
+    return found._replace(length=length, open=found.open | far, end=end, guard=guard)
 
 
 def _along(place: Place, shift: Array) -> Place:

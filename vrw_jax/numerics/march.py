@@ -76,6 +76,8 @@ class _March(NamedTuple):
     time: Array
     verdict: Array  # on the last step tried
     crossing: Array  # bits of the guards that crossed in it
+    inside: Vector  # guards within the step that crossed, and at its end
+    beyond: Vector
     tried: Array
     half: Array  # iterations after which half of the lanes had finished
     iterations: Array
@@ -212,7 +214,7 @@ def _ended(
     crossed = march.verdict == CROSSED
     if phase.monitors is not None:  # a long program, which what follows makes longer
         phase = _traced_once(phase, apart)
-    step = Crossing(march.here, march.values, march.h, march.crossing, crossed)
+    step = Crossing(*march[:2], march.inside, march.beyond, march.h, march.crossing, crossed)
     found = locate(phase.guards, phase.evaluate, tableau, step, options)
     lost = crossed & found.open
     duration = march.time + jnp.where(crossed, found.length, 0.0)
@@ -272,6 +274,8 @@ def _march(
         change, kept = judge(march, taken, inside, end)
         verdict, crossing, accepted, time, length = _verdict(options, march, change, kept, end)
         here, values = select(accepted, (taken.end, end), (march.here, march.values))
+        tried = march.verdict == MARCHING
+        within, beyond = select(tried, (inside, end), (march.inside, march.beyond))
         lowest, half = march.lowest, march.half
         if phase.monitors is not None and lowest is not None:
             given = phase.monitors, phase.evaluate
@@ -291,7 +295,9 @@ def _march(
             time=time,
             verdict=verdict,
             crossing=crossing,
-            tried=march.tried + (march.verdict == MARCHING),
+            inside=within,
+            beyond=beyond,
+            tried=march.tried + tried,
             half=half,
             iterations=march.iterations + 1,
             lowest=lowest,
@@ -319,6 +325,8 @@ def _at_start(
         time=jnp.zeros_like(first_step),
         verdict=jnp.where(begins, MARCHING, IDLE).astype(jnp.int32),
         crossing=none,
+        inside=values,
+        beyond=values,
         tried=none,
         half=count,
         iterations=count,

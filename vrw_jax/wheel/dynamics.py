@@ -120,13 +120,15 @@ def free_acceleration(s: Symbols, L1: Elementwise, free: Terms) -> Acceleration:
     inverse = 1.0 / (A11 * A22 - A12 * A12)
     ddtheta = (A22 * F1 - A12 * F2) * inverse
     ddL1 = (A11 * F2 - A12 * F1) * inverse
-    return Acceleration(ddtheta, ddL1, f3 / s.m + q * ddtheta + s.cos_alpha * ddL1)
+    per_mass = 1.0 / s.m  # known before a loop over steps begins
+    return Acceleration(ddtheta, ddL1, f3 * per_mass + q * ddtheta + s.cos_alpha * ddL1)
 
 
 def single_support_2_acceleration(s: Symbols, motion: Motion) -> Acceleration:
     """SLS-II, two degrees of freedom: Leg 2 is on its stopper, where M12 = 0. Section 3.3.3."""
     M, f1, f2, _ = terms(s, motion)
-    return Acceleration(f1 / M.M11, f2 / M.M22, 0.0 * f1)
+    per_mass = 1.0 / M.M22
+    return Acceleration(f1 / M.M11, f2 * per_mass, 0.0 * f1)
 
 
 def double_support_acceleration(s: Symbols, distance: Elementwise, motion: Motion) -> Acceleration:
