@@ -100,6 +100,23 @@ def locate(
     unsettled = lambda search: jnp.any(search.open) & (search.tries < options.event_steps)
     found = lax.while_loop(unsettled, improve, start)
 
+    return _closed_in(guards, evaluate, step, found, (enough, near), options)
+
+
+def _closed_in(
+    guards: Callable[[Place], Vector],
+    evaluate: Evaluate,
+    step: Crossing,
+    found: Located,
+    limits: tuple[Array, Array],
+    options: Options,
+) -> Located:
+    """From a place near the event to the event, by short steps of low order.
+
+    One, but for guards that touch zero more than cross it; lost where Newton's method goes away.
+    `limits`: how much is left to a move along the slope, and how much to such a step, s.
+    """
+    enough, near = limits
     short = explicit_tableau("Bosh3")  # over a thousandth of a step exact to rounding
     assert short is not None
 
@@ -117,7 +134,7 @@ def locate(
         return end, shift, length, guard, far & (jnp.abs(shift) > enough), tries + 1
 
     far = step.crossed & ~found.open & (jnp.abs(found.shift) > enough)
-    begin = found.end, found.shift, found.length, found.guard, far, count
+    begin = found.end, found.shift, found.length, found.guard, far, jnp.zeros((), jnp.int32)
     more = lambda now: jnp.any(goes(now[4], now[1])) & (now[5] < options.event_steps)
     end, shift, length, guard, far, _ = lax.while_loop(more, approach, begin)
     end = select(far, step.here, _along(end, shift))
