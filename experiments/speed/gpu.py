@@ -1,0 +1,129 @@
+"""What a GPU makes of the same functions: rates, compile times, and agreement with the CPU.
+
+    python -m experiments.speed.gpu [--lanes 1000000] [--rehearse]
+
+Steps, seven columns of their Jacobians, limit cycles and a scan in float64, on JAX's default
+device, where that is a GPU; without one it says so and writes nothing. The same lanes are then computed by
+the CPU in a process of its own. A rate is lanes over the wall time of the second call; what the
+first call took beyond it is compiling. Writes a table into `docs/engine.md`; `--rehearse` goes the
+same way on a CPU and prints the table instead.
+"""
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import numpy as np
+
+import vrw_jax as vrw
+from experiments.shared.command import command, started
+from experiments.shared.tables import DOCS, markdown, replace
+from experiments.shared.wheels import BOX, rows_of, wheels
+
+COLUMNS = ("section_state", "damping", "stiffness", "natural_length", "slope")
+LARGEST_ERROR = 1e-8
+"""Of a lane's numbers between both devices, where the tolerance of a step is 1e-10."""
+
+
+def _steps(rows: np.ndarray) -> np.ndarray:
+    starts = np.broadcast_to(np.asarray(vrw.paper_start()), (len(rows), 3))
+    told = vrw.steps(wheels(rows), starts)
+    return np.concatenate([told.section_state, told.durations, told.outcome[:, None]], 1)
+
+
+def _jacobians(rows: np.ndarray) -> np.ndarray:
+    starts = np.broadcast_to(np.asarray(vrw.paper_start()), (len(rows), 3))
+    told = vrw.steps(wheels(rows), starts, derivatives=COLUMNS)
+    parts = (told.derivatives[name].section_state for name in COLUMNS)
+    return np.concatenate([np.asarray(x).reshape(len(rows), -1) for x in parts], 1)
+
+
+@jax.jit
+@jax.vmap
+def _cycle(row: jax.Array) -> vrw.LimitCycle:
+    return vrw.limit_cycle(wheels(row))
+
+
+def _cycles(rows: np.ndarray) -> np.ndarray:
+    told = _cycle(rows)
+    found = np.asarray(told.outcome == 0)[:, None]
+    numbers = np.concatenate([told.section_state, told.durations], 1)
+    return np.concatenate([np.where(found, numbers, 0.0), told.outcome[:, None]], 1)
+
+
+def _scan(rows: np.ndarray) -> np.ndarray:
+    names = ("speed", "dls_fraction", "spectral_radius")
+    design = vrw.samples(dict(zip(BOX, rows.T, strict=True)))
+    told = vrw.scan(design, names)
+    return np.stack([np.nan_to_num(told[name].values) for name in names], 1)
+
+
+JOBS: dict[str, tuple[Callable[[np.ndarray], np.ndarray], float]] = {
+    "steps": (_steps, 1.0),
+    "Jacobians by state, c, k, L\\*, φ": (_jacobians, 0.1),
+    "limit cycles": (_cycles, 0.1),
+    "samples of a scan": (_scan, 0.05),
+}
+"""What is computed, and for which share of the lanes."""
+
+
+def computed(lanes: int) -> list[tuple[str, np.ndarray, float, float]]:
+    """(job, numbers, lanes a second, seconds of compiling) on the default device."""
+    told = []
+    for name, (job, share) in JOBS.items():
+        rows = rows_of(BOX, max(16, int(share * lanes)), np.random.default_rng(3))
+        times = []
+        for _ in range(2):
+            began = time.perf_counter()
+            numbers = job(rows)
+            times.append(time.perf_counter() - began)
+        told.append((name, numbers, len(rows) / times[1], times[0] - times[1]))
+    return told
+
+
+def by_cpu(lanes: int) -> list[np.ndarray]:
+    """The same numbers from a process that sees the CPU alone."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "cpu.npz"
+        call = [sys.executable, "-m", "experiments.speed.gpu", f"--lanes={lanes}", f"--to={file}"]
+        subprocess.run(call, env=os.environ | {"JAX_PLATFORMS": "cpu"}, check=True)
+        with np.load(file) as kept:
+            return [kept[f"arr_{k}"] for k in range(len(JOBS))]
+
+
+def main() -> None:
+    parser = command(__doc__)
+    parser.add_argument("--lanes", type=int, default=1_000_000)
+    parser.add_argument("--rehearse", action="store_true", help="on a CPU, and write nothing")
+    parser.add_argument("--to", type=Path, help="only compute, and keep the numbers in this file")
+    chosen = started(parser)
+    if chosen.to is not None:
+        np.savez(chosen.to, *[numbers for _, numbers, _, _ in computed(chosen.lanes)])
+        return
+    device = jax.devices()[0]
+    if device.platform != "gpu" and not chosen.rehearse:
+        print(f"JAX finds no GPU here, only {device.device_kind}: nothing is measured or written.")
+        return
+    here, there = computed(chosen.lanes), by_cpu(chosen.lanes)
+    rows = []
+    for (name, numbers, rate, compiling), others in zip(here, there, strict=True):
+        away = np.max(np.abs(numbers - others) / np.maximum(1.0, np.abs(others)), 1)
+        apart = int(np.sum(away > LARGEST_ERROR))
+        agree = f"{np.quantile(away, 0.99):.1e}", f"{apart:,} of {len(away):,}"
+        rows.append((name, f"{rate:,.0f}", f"{compiling:.0f}", *agree))
+    header = "job", "a second", "compiling, s", "p99 difference from the CPU", "lanes beyond 1e-8"
+    table = markdown(header, rows)
+    told = f"{table}\n\n{device.device_kind}, float64, JAX {jax.__version__}."
+    if chosen.rehearse:
+        print(told)
+    else:
+        replace(DOCS / "engine.md", "gpu", told)
+
+
+if __name__ == "__main__":
+    main()
