@@ -3,10 +3,10 @@
     python -m experiments.speed.gpu [--lanes 1000000] [--rehearse]
 
 Steps, seven columns of their Jacobians, limit cycles and a scan in float64, on JAX's default
-device, where that is a GPU; without one it says so and writes nothing. The same lanes are then computed by
-the CPU in a process of its own. A rate is lanes over the wall time of the second call; what the
-first call took beyond it is compiling. Writes a table into `docs/engine.md`; `--rehearse` goes the
-same way on a CPU and prints the table instead.
+device, where that is a GPU; without one it says so and writes nothing. The same lanes are then
+computed by the CPU in a process of its own. A rate is lanes over the wall time of the second call;
+what the first call took beyond it is compiling. Writes a table into `docs/engine.md`; `--rehearse`
+goes the same way on a CPU and prints the table instead.
 """
 
 import os
