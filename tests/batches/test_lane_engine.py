@@ -212,12 +212,12 @@ def test_a_step_has_the_order_of_its_tableau(name, order):
     assert abs(slope - order) < 0.4
 
 
-def fall(height, options=None):
-    """A lane of free fall upwards: q(t) = (t - 1)^2 / 2 + height; the guard is q."""
+def flown(start, rate, acceleration=1.0, options=None):
+    """Guard and duration of a flight with that acceleration; the guard is the height q."""
     options = vrw.Options() if options is None else options
     zero, one = jnp.zeros(8), jnp.ones(8)
     phase = LanePhase(
-        lambda q, v: Slope(q[0], q[0], (jnp.ones_like(q[0]),)),
+        lambda q, v: Slope(q[0], q[0], (acceleration * jnp.ones_like(q[0]),)),
         lambda place: (place.q[0],),
     )
     end = integrate_lanes(
@@ -225,8 +225,8 @@ def fall(height, options=None):
         (),
         (),
         explicit_tableau("Dopri8"),
-        (0.5 * one + height,),
-        (-one,),
+        (start * one,),
+        (rate * one,),
         one > 0.0,
         zero + 5e-3,
         options,
@@ -236,15 +236,22 @@ def fall(height, options=None):
 
 def test_a_guard_that_dips_below_zero_within_one_step_is_found():
     # The method is exact here, so that its steps grow until one jumps over the dip at t = 1.
-    guard, duration = fall(-1e-3)
+    guard, duration = flown(0.5 - 1e-3, -1.0)
     assert int(guard) == 0
     assert abs(float(duration) - (1.0 - np.sqrt(2e-3))) < 1e-9
 
 
 def test_a_guard_that_comes_close_and_turns_back_does_not_fire():
-    guard, duration = fall(1e-3, vrw.Options(max_phase_time=3.0))
+    guard, duration = flown(0.5 + 1e-3, -1.0, options=vrw.Options(max_phase_time=3.0))
     assert int(guard) == -1
     assert float(duration) >= 3.0
+
+
+@pytest.mark.parametrize("height", [1e-1, 1e-3, 1e-6, 1e-10])
+def test_a_guard_that_rises_from_zero_and_comes_back_within_the_first_step_fires(height):
+    guard, duration = flown(0.0, height, -1.0)  # back after 2 height; the first step is 0.005
+    assert int(guard) == 0
+    assert abs(float(duration) / (2.0 * height) - 1.0) < 1e-13
 
 
 def test_collocation_is_right_near_known_durations_and_says_which_lanes_it_took():

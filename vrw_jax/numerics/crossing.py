@@ -71,7 +71,8 @@ def locate(
         change, guard = _newton(values, rates, step.guards)
         before, straight = jnp.ones(h.shape, bool), jnp.ones(h.shape, bool)
         for g0, g, rate, crosses in zip(step.values, values, rates, bits, strict=True):
-            before = before & ~(crosses & (g <= 0.0))
+            past = (g < 0.0) | ((g == 0.0) & (rate <= 0.0))  # one that rises has yet to come back
+            before = before & ~(crosses & past)
             fall = rate * search.length
             bent = jnp.abs(2.0 * (g0 - g + fall) * g) > 0.25 * fall * fall
             straight = straight & ~(crosses & bent)
@@ -170,6 +171,9 @@ def _first_guess(
         bend, slope = parabola(tableau, g0, gm, g1)
         fall = jnp.where(crosses & (g0 > g1), g0 - g1, 1.0)
         at = jnp.clip(g0 / fall, 0.0, 1.0)
+        # One that rises from zero is at zero where the step begins: the other root counts.
+        rises = crosses & (g0 == 0.0) & (slope > 0.0)
+        at = jnp.where(rises, jnp.clip(-slope / jnp.where(rises, bend, -1.0), 0.0, 1.0), at)
         for _ in range(3):
             rate = slope + 2.0 * bend * at
             falls = rate < 0.0
