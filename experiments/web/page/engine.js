@@ -111,7 +111,7 @@ class Engine {
   // Newton's method on step(x) - x, all lanes at once; null where it finds nothing.
   gaits(wheels, guesses) {
     const found = wheels.map(() => null), tries = wheels.map(() => 0);
-    const at = guesses.map((x) => [...x]), before = guesses.map(() => null);
+    const at = guesses.map((x) => x && [...x]), before = guesses.map(() => null);
     let open = wheels.map((_, i) => i).filter((i) => guesses[i]);
     for (let turn = 0; turn < 16 && open.length; turn++) {
       const steps = this.linearised(SOUGHT, open.map((i) => wheels[i]), open.map((i) => at[i]));
@@ -156,23 +156,21 @@ class Engine {
 
   // A wheel's gait, from guesses, else from where walks from many starts lead; null if none is found.
   gait(wheel, guesses) {
+    let unstable = null;
     for (const guess of guesses) {
       const [found] = this.gaits([wheel], [guess]);
       if (found && isStable(found)) return found;
+      unstable ||= found;
     }
     const starts = [];
     for (const theta of [0.1, 0.25, 0.5, 0.75])
       for (const rate of [0.7, 1.1, 1.6, 2.2, 3.0]) starts.push([theta * this.alpha, rate, -0.1]);
     const { states, outcomes } = this.walks(ROUGH, starts.map(() => wheel), starts, 30);
-    const left = starts.map((_, i) => i).filter((i) => outcomes[i] === STEPPED);
-    const ends = left.map((i) => states[i][30]);
-    const all = this.gaits(ends.map(() => wheel), ends).filter((found) => found);
-    if (all.length) return all.find(isStable) || all[0];
-    for (const guess of guesses) {
-      const [found] = this.gaits([wheel], [guess]);
-      if (found) return found;
-    }
-    return null;
+    const ends = states.filter((_, i) => outcomes[i] === STEPPED).map((list) => list[30]);
+    const alike = (a, b) => a.every((value, j) => Math.abs(value - b[j]) < 1e-2);
+    const apart = ends.filter((end, i) => ends.findIndex((other) => alike(end, other)) === i).slice(0, 4);
+    const all = this.gaits(apart.map(() => wheel), apart).filter((found) => found);
+    return all.find(isStable) || unstable || all[0] || null;
   }
 }
 

@@ -214,10 +214,11 @@ function tellGait() {
   $("gait-hint").textContent = gait ? "Of the step that repeats itself." : "No step repeats itself: of the last step, as far as it came.";
   const rows = MEASURED.map((name) => {
     const m = facts.measures[name];
-    return `<tr title="${m.meaning}"><th scope="row">${m.label} <i>${set(m.symbol)}</i></th><td data-measure="${name}">${number(measures[name])} ${unitText(m.unit)}</td></tr>`;
+    return `<tr title="${m.meaning}"><th scope="row">${m.label} <i>${set(m.symbol)}</i></th><td data-measure="${name}">${measures[name] === 0 ? "–" : `${number(measures[name])} ${unitText(m.unit)}`}</td></tr>`;
   });
   $("gait").innerHTML = parts(rows, 3).map((some) => table("Measures of the step", some)).join("");
-  const list = gait ? gait.multipliers : [];
+  // One is zero: where both feet land the rate of Leg 1 is forgotten.
+  const list = gait ? gait.multipliers.filter((m) => Math.hypot(m.re, m.im) > 1e-10) : [];
   drawCircle($("circle"), list);
   const text = ({ re, im }) => (im ? `${number(re)} ${im < 0 ? "−" : "+"} ${number(Math.abs(im))}i` : Math.abs(re) < 1e-12 ? "0" : number(re));
   $("multipliers").innerHTML = gait
@@ -233,9 +234,10 @@ function tellMargins() {
     const m = facts.measures[name], [value, leg] = INDICATORS.includes(name) ? [state.result.measures[name], ""] : leastOf(name);
     const broken = value < 0, share = 50 * Math.tanh(Math.abs(value) / scale[m.unit]);
     const bar = `<div class="bar" aria-hidden="true"><i style="${broken ? `right:50%` : `left:50%`};width:${share}%"></i></div>`;
-    const shown = number(value);
+    if (value === 0)
+      return `<tr><th scope="row">${set(m.label)}<small>${m.meaning}</small></th><td></td><td data-measure="${name}">–<small>not reached</small></td></tr>`;
     return `<tr class="${broken ? "broken" : ""}"><th scope="row">${set(m.label)}${leg}<small>${broken ? m.breaks : m.meaning}</small></th>`
-      + `<td>${bar}</td><td data-measure="${name}">${shown} ${unitText(m.unit)}<small>${broken ? "broken" : "holds"}</small></td></tr>`;
+      + `<td>${bar}</td><td data-measure="${name}">${number(value)} ${unitText(m.unit)}<small>${broken ? "broken" : "holds"}</small></td></tr>`;
   });
   $("margins").innerHTML = parts(rows, 2).map((some) => table("Indicators and margins of the step", some)).join("");
 }
@@ -385,11 +387,13 @@ function askBasin() {
   if (!result.gait || !isStable(result.gait)) {
     basin.key = basin.job = "";
     basin.cells = new Map();
-    sheet(canvas);
+    basin.axes = null;
+    canvas.hidden = true;
     $("basin-legend").textContent = "There is no stable gait for starts to lead to.";
     $("basin-state").textContent = "";
     return;
   }
+  canvas.hidden = false;
   const key = JSON.stringify([columnOf(values), values.n_legs]);
   if (key === basin.key) return showBasin();
   const [x, y] = basinAxes();

@@ -36,6 +36,8 @@ async function mapped(engine, job, post, current) {
       const some = nodes.slice(begin, begin + size), wheels = some.map(([c, r]) => wheelAt(c, r));
       const guesses = some.map(([c, r]) => nearest(known, width, c, r, stride) || guess);
       const gaits = engine.gaits(wheels, guesses);
+      again(engine, gaits, wheels, some.map(([c, r]) => nearest(known, width, c, r, stride, true)));
+      again(engine, gaits, wheels, some.map(() => engine.start));
       const found = gaits.map((gait, i) => ({ gait, outcome: STEPPED, node: some[i] }));
       // Where Newton's method finds nothing a walk says how the gait is lost, or leads to it.
       const missed = found.map((_, i) => i).filter((i) => !gaits[i]);
@@ -44,9 +46,9 @@ async function mapped(engine, job, post, current) {
         const starts = missed.map((i) => guesses[i]);
         const { states, outcomes } = engine.walks(ROUGH, lostWheels, starts, 24);
         const ends = states.map((list, k) => (outcomes[k] === STEPPED ? list[24] : null));
-        const again = engine.gaits(lostWheels, ends.map((end) => end || engine.start));
+        const reached = engine.gaits(lostWheels, ends);
         missed.forEach((i, k) => {
-          found[i].gait = outcomes[k] === STEPPED ? again[k] : null;
+          found[i].gait = reached[k];
           found[i].outcome = outcomes[k];
         });
       }
@@ -71,10 +73,20 @@ async function mapped(engine, job, post, current) {
   post({ job: job.id, done: true });
 }
 
-// The gait of a known node beside this one.
-function nearest(known, width, column, row, stride) {
+// Newton's method once more where it found nothing, from other guesses.
+function again(engine, gaits, wheels, guesses) {
+  const missed = gaits.map((_, i) => i).filter((i) => !gaits[i] && guesses[i]);
+  if (!missed.length) return;
+  const found = engine.gaits(missed.map((i) => wheels[i]), missed.map((i) => guesses[i]));
+  missed.forEach((i, k) => (gaits[i] = found[k]));
+}
+
+const AROUND = [[-1, 0], [1, 0], [0, -1], [0, 1], [-1, -1], [1, 1], [-1, 1], [1, -1]];
+
+// The gait of a known node beside this one, looked for around it in one turn or the other.
+function nearest(known, width, column, row, stride, backwards) {
   for (let ring = 1; ring <= 2; ring++)
-    for (const [dc, dr] of [[-1, 0], [1, 0], [0, -1], [0, 1], [-1, -1], [1, 1], [-1, 1], [1, -1]]) {
+    for (const [dc, dr] of backwards ? [...AROUND].reverse() : AROUND) {
       const c = column + dc * ring * stride, r = row + dr * ring * stride;
       if (c < 0 || r < 0 || c >= width || r >= width) continue;
       if (known[r * width + c]) return known[r * width + c];
