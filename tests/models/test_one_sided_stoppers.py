@@ -143,9 +143,8 @@ def test_lanes_with_one_sided_stoppers_walk_as_single_wheels_do():
 
 
 @pytest.mark.slow
-def test_impacts_without_an_admissible_contact_end_a_lane_with_its_code():
-    """High and infinite friction from any start; in which lanes depends on the last digits."""
-    random, n = np.random.default_rng(0), 400
+def test_high_friction_from_any_start_has_an_admissible_contact_at_every_impact():
+    random, n = np.random.default_rng(0), 200
     damping, high = random.uniform(5.0, 400.0, n), random.uniform(2.0, 20.0, n)
     limits = ((0.0, 0.25), (0.3, 2.6), (-0.6, 0.2))
     found = vrw.steps(
@@ -155,7 +154,9 @@ def test_impacts_without_an_admissible_contact_end_a_lane_with_its_code():
         model=wheel_of(np.where(np.arange(n) % 2 == 0, math.inf, high)),
         options=LANES,
     )
-    lost = np.asarray(found.outcome) == vrw.Outcome.NO_ADMISSIBLE_CONTACT
-    assert 0 < lost.sum() < n // 10
-    assert not np.any(np.asarray(found.section_state)[lost])
+    outcome = np.asarray(found.outcome)
+    assert not np.any(outcome == vrw.Outcome.NO_ADMISSIBLE_CONTACT)
+    lost = np.isin(outcome, [vrw.Outcome.SOLVER_GAVE_UP, vrw.Outcome.TOO_MANY_EVENTS])
+    assert lost.sum() <= n // 50
+    assert not np.any(np.asarray(found.section_state)[outcome != vrw.Outcome.STEPPED])
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(found))

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Int
@@ -21,12 +22,14 @@ from vrw_jax.models.unilateral.contacts import (
     leaves,
 )
 from vrw_jax.models.unilateral.mechanics import (
+    Free,
     Hub,
     Legs,
     Slots,
     WheelMotion,
     directions,
     foot_heights,
+    foot_velocity,
     free_acceleration,
     free_velocity,
     hub_of,
@@ -81,6 +84,7 @@ class Law(NamedTuple):
     one_sided: bool  # stoppers of legs in the air only push
     counted: bool  # whether `solutions` is the number of admissible ones, or says if there is one
     rest: Elementwise  # speed below which a contact that an impact leaves is at rest, m/s
+    restitution: Elementwise | None = None  # of the feet: they come back at this share of the speed
 
 
 AT_ONCE, IN_TURN = 8, 16
@@ -166,6 +170,42 @@ def moved_by(
     return motion._replace(vx=vx, vz=vz, dtheta=dtheta, dL=dL)
 
 
+def _thrown_back(law: Law, motion: WheelMotion, slots: Slots, hub: Hub, free: Free) -> Free:
+    """The same velocities, with what feet that strike keep of theirs by Newton's law."""
+    if law.restitution is None:
+        return free
+    speed = foot_velocity(motion, slots, hub).z
+    back = [law.restitution * jnp.where(z < -law.rest, z, 0.0) for z in speed]
+    return free._replace(
+        e=(free.e[0] - hub.sin[0] * back[0], free.e[1] - hub.sin[1] * back[1]),
+        u=(free.u[0] + hub.cos[0] * back[0], free.u[1] + hub.cos[1] * back[1]),
+    )
+
+
+def _without_gain(law: Law, motion: WheelMotion, thrown: _Solved, inelastic: _Solved) -> _Solved:
+    """The part of Newton's law that energy allows.
+
+    With Coulomb's friction the law can create energy (Kane 1984). Between the inelastic impact,
+    which cannot, and Newton's, energy is a parabola: as far is gone as it does not grow. Impulses
+    stay in the cone, which is convex.
+    """
+    energy = lambda at: kinetic_energy(law.s, at)
+    low, high = energy(inelastic.more), energy(thrown.more)
+    half = energy(jax.tree.map(lambda a, b: 0.5 * (a + b), inelastic.more, thrown.more))
+    bend, slope = 2.0 * (low - 2.0 * half + high), 4.0 * half - 3.0 * low - high
+    room = jnp.maximum(energy(motion) - low, 0.0)
+    gains = high > energy(motion)
+    root = jnp.sqrt(jnp.where(gains, slope * slope + 4.0 * bend * room, 1.0))
+    share = jnp.where(gains, 2.0 * room / jnp.where(gains, slope + root, 1.0), 1.0)
+    mixed = lambda a, b: jnp.where(gains, a + share * (b - a), b)
+    answer, push, outward, more = jax.tree.map(
+        mixed,
+        (inelastic.choice.answer, inelastic.push, inelastic.outward, inelastic.more),
+        (thrown.choice.answer, thrown.push, thrown.outward, thrown.more),
+    )
+    return _Solved(thrown.choice._replace(answer=answer), push, outward, more)
+
+
 def _is(mode: Array | int) -> Bool[Array, "... 4"]:
     """A flag for each of the four contact modes: whether it is this one."""
     return jnp.arange(4) == jnp.asarray(mode)[..., None]
@@ -199,7 +239,8 @@ def _impact(
     def solve(airborne: Array) -> _Solved:
         hub = hub_of(s, motion, slots, airborne)
         free = free_velocity(s, motion, slots, hub)
-        choice = choose(s, hub, free, allowed, friction, small, law.counted)
+        given = _thrown_back(law, motion, slots, hub, free)
+        choice = choose(s, hub, given, allowed, friction, small, law.counted)
         after = moved_by(s, motion, slots, hub, airborne, choice)
         jump_x, jump_z = after.vx - motion.vx, after.vz - motion.vz
         impulse = s.m * (hub.legs.sin * jump_x + hub.legs.cos * jump_z + motion.dL)
@@ -297,10 +338,10 @@ def _at_rest(
     turn = motion.L * motion.dtheta
     foot_x = motion.vx - motion.dL * legs.sin - turn * legs.cos
     foot_z = motion.vz - motion.dL * legs.cos + turn * legs.sin
-    stays = slots.filled & ((contact != OFF) | (foot_z < law.rest))
+    stays = slots.filled & (foot_z < law.rest)
     slips = jnp.where(foot_x > 0.0, SLIP_DOWN, SLIP_UP)
     mode = jnp.where(jnp.abs(foot_x) < law.rest, STICK, slips)
-    mode = jnp.where((contact == STICK) | ~stays, contact, mode)
+    mode = jnp.where(stays, jnp.where(contact == STICK, STICK, mode), OFF)
     on = at_stopper | (struck & (jnp.abs(motion.dL) < law.rest))
     new = jnp.any(mode != contact) | jnp.any(on != at_stopper)
     return select(new, settled(law.s, motion, mode, on), motion), mode, on
@@ -327,8 +368,13 @@ def resolve(law: Law, motion: WheelMotion, stance: Stance, event: Event) -> Chan
     touched = (stance.contact != OFF) | event.lands
     was_locked = (stance.locked | event.closes) & ~event.loosens
     shock, slots, held = _impact(law, motion, stance, event)
+    if law.restitution is not None:
+        inelastic = _impact(law._replace(restitution=None), motion, stance, event)[0]
+        shock = _without_gain(law, motion, shock, inelastic)
     struck = slots.spread(shock.choice.contact).astype(jnp.int32)
     kept = jnp.where(slots.filled, slots.spread(shock.choice.held) > 0, was_locked & held)
+    if law.restitution is not None:  # only a part of what holds a leg may have been taken
+        kept = kept & (jnp.abs(shock.more.dL) < law.rest)
     left = _at_rest(law, shock.more, slots, struck, kept, was_locked)
     after, contact, at_stopper = select(impact, left, (motion, stance.contact, was_locked))
     legs = directions(s, motion.theta)

@@ -30,11 +30,16 @@ leg's length, 1e-13 m in float64."""
 
 
 def law_of(
-    s: Symbols, friction: Elementwise, options: Options, one_sided: bool, counted: bool
+    s: Symbols,
+    friction: Elementwise,
+    options: Options,
+    one_sided: bool,
+    counted: bool,
+    restitution: Elementwise | None = None,
 ) -> Law:
     """The law of a walk; the speed of rest is that of the least dip under gravity."""
     dip = jnp.maximum(SHARE * options.atol, SEEN * jnp.finfo(s.L0.dtype).eps * s.L0)
-    return Law(s, friction, one_sided, counted, jnp.sqrt(2.0 * s.g * dip))
+    return Law(s, friction, one_sided, counted, jnp.sqrt(2.0 * s.g * dip), restitution)
 
 
 def past(

@@ -58,7 +58,7 @@ from vrw_jax.numerics import (
     sample_phase,
 )
 from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, WheelParams, friction_of
-from vrw_jax.wording import chosen, whole
+from vrw_jax.wording import chosen, reals, whole
 
 BILATERAL, ONE_SIDED = "bilateral", "one-sided"
 """What stoppers do to legs in the air: hold whatever it takes, or push alone."""
@@ -145,12 +145,26 @@ class _Walked(NamedTuple):
     log: _Log | None
 
 
+def _restitution_of(value: Any) -> Array | None:
+    """Newton's coefficient; None stands for 0."""
+    if value is None or (isinstance(value, float | int) and value == 0):
+        return None
+    restitution = reals("restitution", value)
+    if not isinstance(restitution, jax.core.Tracer) and not jnp.all(
+        (restitution >= 0.0) & (restitution <= 1.0)
+    ):
+        raise ValueError(f"restitution is {value}, but feet come back at 0 to 1 of their speed.")
+    return restitution
+
+
 class UnilateralWheel(AbstractWheel):
     """Feet on the ground push and slide by Coulomb's law; nothing has a fixed role.
 
     `friction` is the coefficient of the ground, `math.inf` for feet that never slide. A leg in the
     air that has met its stopper stays on it until its foot is loaded; with `stoppers="one-sided"`
     it leaves as soon as the stopper would have to pull. `max_events` bounds the events of one step.
+    A foot that strikes comes back at `restitution` times its speed, as far as energy allows; in
+    None's place, as of 0, is a smaller program.
     """
 
     rung: ClassVar[str] = "unilateral"
@@ -160,6 +174,7 @@ class UnilateralWheel(AbstractWheel):
     friction: Scalar = eqx.field(converter=friction_of, default=0.7)
     max_events: int = eqx.field(static=True, converter=partial(whole, "max_events"), default=400)
     stoppers: str = eqx.field(static=True, default=BILATERAL)
+    restitution: Scalar | None = eqx.field(converter=_restitution_of, default=None)
 
     if TYPE_CHECKING:
 
@@ -168,6 +183,7 @@ class UnilateralWheel(AbstractWheel):
             friction: Number = 0.7,
             max_events: int = 400,
             stoppers: Literal["bilateral", "one-sided"] = "bilateral",
+            restitution: Number | None = None,
         ) -> None: ...
 
     def __check_init__(self) -> None:
@@ -240,7 +256,7 @@ def _walk(
     """Follow one step from event to event."""
     good, params, friction, x = made_sound(params, wheel.friction.astype(x.dtype), x)
     s, n = params.symbols(), params.n_legs
-    law = law_of(s, friction, options, wheel.one_sided, counted=True)
+    law = law_of(s, friction, options, wheel.one_sided, True, wheel.restitution)
     place = guards_of(n, wheel.one_sided)
     state, stance = opened(s, x)
     rows = lambda leaf: jnp.broadcast_to(leaf, (wheel.max_events, *leaf.shape))
