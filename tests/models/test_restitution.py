@@ -63,6 +63,9 @@ def test_restitution_outside_of_its_domain_is_refused_in_a_sentence():
     with pytest.raises(ValueError, match="0 to 1"):
         vrw.UnilateralWheel(restitution=1.5)
     assert vrw.UnilateralWheel(restitution=0.0).restitution is None
+    with pytest.raises(ValueError, match="in lanes"):
+        model = vrw.UnilateralWheel(restitution=0.5)
+        vrw.steps(vrw.WheelParams(), np.array([START]), model=model)
 
 
 @pytest.mark.slow

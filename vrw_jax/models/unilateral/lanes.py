@@ -110,6 +110,11 @@ def walk_lanes(
     `columns` are the parameters in their order and friction, shape (10, wheels); `states` full
     section states, shape (wheels, 4 + 3 n).
     """
+    if model.restitution is not None:
+        raise ValueError(
+            "restitution is given, but in lanes feet don't come back: walk wheels one by one, by "
+            "vrw.walk, or map vrw.return_map over them."
+        )
     dynamic, static = eqx.partition(options, eqx.is_array)
     dynamic = jax.tree.map(lambda leaf: np.asarray(leaf, columns.dtype), dynamic)
     program = _program(static, n, model.max_events, model.one_sided)
