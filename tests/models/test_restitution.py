@@ -63,8 +63,8 @@ def test_restitution_outside_of_its_domain_is_refused_in_a_sentence():
     with pytest.raises(ValueError, match="0 to 1"):
         vrw.UnilateralWheel(restitution=1.5)
     assert vrw.UnilateralWheel(restitution=0.0).restitution is None
+    model = vrw.UnilateralWheel(restitution=0.5)
     with pytest.raises(ValueError, match="in lanes"):
-        model = vrw.UnilateralWheel(restitution=0.5)
         vrw.steps(vrw.WheelParams(), np.array([START]), model=model)
 
 
