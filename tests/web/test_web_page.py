@@ -10,6 +10,7 @@ import pytest
 from support.web_code import PAGE
 
 import vrw_jax as vrw
+from vrw_jax.web import explorer
 
 SWITCHES = [
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
@@ -162,3 +163,50 @@ def test_nothing_is_cut_off_and_everything_has_a_name(page, size, scheme, tmp_pa
       return new Set(new Uint32Array(dots.buffer)).size;
     })""")
     assert min(drawn) > 10
+
+
+def test_a_widgets_frame_passes_values_on_in_both_directions(browser):
+    shown = browser.new_page()
+    shown.set_content("<div id='cell'></div>")
+    traits = {"page": PAGE.read_text(encoding="utf-8"), "height": 800, "map": {}, "told": {}}
+    traits["values"] = explorer._values(vrw.WheelParams(damping=150.0), 0.9)
+    shown.evaluate(
+        """traits => {
+          const listeners = {};
+          window.model = {
+            get: (name) => traits[name],
+            set: (name, value) => { traits[name] = value; },
+            save_changes: () => {},
+            on: (event, call) => { listeners[event] = call; },
+            fromPython: (name, value) => { traits[name] = value; listeners[`change:${name}`](); },
+          };
+        }""",
+        traits,
+    )
+    render = explorer.FRAME.replace("export default { render };", "")
+    shown.evaluate(
+        f"() => {{ {render}; render({{ model, el: document.getElementById('cell') }}) }}"
+    )
+    shown.wait_for_function("model.get('told').speed > 0 && model.get('values').damping === 150")
+    told = shown.evaluate("model.get('told')")
+    cycle = vrw.limit_cycle(vrw.WheelParams(damping=150.0))
+    assert abs(told["speed"] - float(cycle.speed)) < 1e-8
+    shown.evaluate("model.fromPython('values', { ...model.get('values'), damping: 170 })")
+    shown.wait_for_function(f"Math.abs(model.get('told').speed - {told['speed']}) > 1e-4")
+    inside = shown.frames[1]
+    assert inside.input_value("#number-damping") == "170"
+    inside.fill("#number-damping", "180")
+    inside.locator("#number-damping").press("Tab")
+    shown.wait_for_function("model.get('values').damping === 180")
+    axes = [{"name": "damping", "values": [100, 150, 200]}, {"name": "slope", "values": [0.2, 0.3]}]
+    given = {
+        "axes": axes,
+        "measures": {"speed": [[1, 2, None], [3, 4, 5]]},
+        "outcome": [[0, 0, 3]] * 2,
+    }
+    shown.evaluate("given => model.fromPython('map', given)", given)
+    inside.wait_for_function(
+        "document.getElementById('map-state').innerText === 'From your dataset.'"
+    )
+    assert "fell back" in inside.inner_text("#map-legend")
+    shown.close()

@@ -21,7 +21,7 @@ function render({ model, el }) {
   frame.title = "A wheel that walks on springs";
   frame.style.cssText = `width: 100%; height: ${model.get("height")}px; border: 0`;
   frame.srcdoc = model.get("page");
-  let told = "";
+  let told = "", ready = false; // what it says before it is ready is its own beginning
   const send = () => {
     const values = model.get("values");
     const news = { vrw: "set", values };
@@ -32,9 +32,10 @@ function render({ model, el }) {
   const hear = ({ source, data }) => {
     if (source !== frame.contentWindow || !data) return;
     if (data.vrw === "ready") {
+      ready = true;
       show();
       send();
-    } else if (data.vrw === "values") {
+    } else if (data.vrw === "values" && ready) {
       told = JSON.stringify(data.values);
       model.set("values", data.values);
       model.set("told", data.told);

@@ -1,0 +1,108 @@
+"""`vrw.explore`: the wheel that is shown is read and set from Python."""
+
+import subprocess
+import sys
+from urllib.parse import parse_qs, urlsplit
+
+import numpy as np
+import pytest
+import xarray as xr
+from typer.testing import CliRunner
+
+import vrw_jax as vrw
+from vrw_jax.app.cli import app
+from vrw_jax.web import page_address
+
+
+@pytest.fixture
+def widget():
+    pytest.importorskip("anywidget", reason="widgets are anywidget's")
+    return vrw.explore(vrw.WheelParams(damping=150.0, n_legs=10), friction=0.8)
+
+
+def test_parameters_are_read_and_set(widget):
+    assert float(widget.params.damping) == 150.0
+    assert widget.params.n_legs == 10
+    assert widget.friction == 0.8
+    widget.values = {**widget.values, "damping": 170.0}  # as the page does when a slider moves
+    assert float(widget.params.damping) == 170.0
+    widget.params = vrw.WheelParams(slope=0.28)
+    assert widget.values["slope"] == 0.28
+    assert widget.values["n_legs"] == 8
+    assert widget.friction == 0.8
+    widget.friction = 0.7
+    assert widget.values["friction"] == 0.7
+
+
+def test_the_page_is_inside(widget):
+    assert widget.page.startswith("<!doctype html>")
+    assert 'id="code"' in widget.page
+
+
+def grid(**outside):
+    damping, slope = np.linspace(100.0, 200.0, 3), np.linspace(0.28, 0.32, 2)
+    speed = np.arange(6.0).reshape(3, 2)
+    speed[0, 0] = np.nan
+    dims = ("damping", "slope")
+    force = xr.DataArray(np.arange(36.0).reshape(3, 2, 6), dims=(*dims, "leg"))
+    return xr.Dataset(
+        {
+            "speed": (dims, speed),
+            "locked_stopper_force": force,
+            "outcome": (dims, np.zeros((3, 2), int)),
+        },
+        coords={"damping": damping, "slope": slope, **outside},
+    )
+
+
+def test_a_dataset_becomes_the_map():
+    pytest.importorskip("anywidget", reason="widgets are anywidget's")
+    shown = vrw.explore(dataset=grid()).map
+    assert [axis["name"] for axis in shown["axes"]] == ["damping", "slope"]
+    assert shown["measures"]["speed"] == [[None, 2.0, 4.0], [1.0, 3.0, 5.0]]  # rows: of the slope
+    assert shown["measures"]["locked_stopper_force"][0] == [0.0, 12.0, 24.0]  # least of the legs
+    with pytest.raises(ValueError, match="two parameters: give a scan"):
+        vrw.explore(dataset=grid().isel(slope=0))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [
+        ({"params": vrw.WheelParams(damping=np.ones(3))}, "show one after the other"),
+        ({"friction": -1.0}, "a coefficient of friction is at least 0"),
+        ({"height": 0}, "height"),
+    ],
+)
+def test_what_is_given_wrongly_gets_one_sentence(wrong, sentence):
+    with pytest.raises((TypeError, ValueError), match=sentence):
+        vrw.explore(**wrong)
+
+
+def test_without_anywidget_it_says_what_to_install(monkeypatch):
+    from vrw_jax.web import explorer
+
+    monkeypatch.setitem(sys.modules, "anywidget", None)
+    explorer._widget.cache_clear()
+    with pytest.raises(ImportError, match=r"pip install 'vrw-jax\[explore\]'"):
+        vrw.explore()
+    explorer._widget.cache_clear()
+
+
+def test_the_address_holds_the_wheel():
+    assert page_address(vrw.WheelParams()).endswith("wheel.html")
+    address = urlsplit(page_address(vrw.WheelParams(damping=150.0, n_legs=6)))
+    assert parse_qs(address.fragment) == {"damping": ["150.0"], "n_legs": ["6"]}
+
+
+def test_the_command_opens_the_page(monkeypatch):
+    opened = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    told = CliRunner().invoke(app, ["explore", "--set", "damping=150"])
+    assert told.exit_code == 0
+    assert opened == [told.output.strip()]
+    assert opened[0].endswith("wheel.html#damping=150.0")
+
+
+def test_nobody_pays_for_it_on_import():
+    code = "import sys, vrw_jax; assert not {'anywidget', 'ipywidgets'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
