@@ -66,7 +66,8 @@ def web_object(
 
     Float64: so many numbers, and arrays of so many rows, lanes last. The code's function `name`
     takes (given, told, lanes, begin, end): tables of pointers to arguments and results, the number
-    of lanes, and which pairs of them to compute. `sin` and `cos`, where a trace leaves them over, are the caller's.
+    of lanes, and which pairs of them to compute. `sin` and `cos`, where a trace leaves some over,
+    are the caller's.
     """
     lanes = [jax.ShapeDtypeStruct((n, LANES), np.float64) for n in rows]
     shapes = [jax.ShapeDtypeStruct((), np.float64)] * numbers + lanes
