@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
+from vrw_jax import simd
 from vrw_jax.wheel import DOMAINS, PARAMETER_NAMES, wheel_of
 
 N = 192
@@ -111,6 +112,21 @@ def test_the_result_names_its_engine():
     assert vrw.step(params, x, engine="diffrax").engine == "diffrax"
     assert vrw.walk(params, x, 1).steps.engine == "lanes"
     assert vrw.step(params, x, options=vrw.Options(solver="Kvaerno5")).engine == "diffrax"
+
+
+@pytest.mark.skipif(not simd.serves(), reason="machine code is for CPUs")
+def test_a_jacobian_within_jit_asks_for_its_own_machine_code_alone(monkeypatch):
+    class AskedError(Exception):
+        pass
+
+    def code_of(function, shapes, key, *rest):
+        raise AskedError(repr(key))
+
+    monkeypatch.setattr("vrw_jax.simd.program.code_of", code_of)
+    unknown = vrw.Options(max_solver_steps=12_345)  # nothing is traced for it yet
+    state = lambda x: vrw.step(vrw.WheelParams(), x, options=unknown).section_state
+    with pytest.raises(AskedError, match="gait step with derivatives"):
+        jax.jit(jax.jacfwd(state)).lower(jnp.asarray(START))
 
 
 def test_lanes_that_cannot_are_refused_in_one_sentence():

@@ -38,6 +38,7 @@ from vrw_jax.numerics import (
     Vector,
     Watched,
     any_mode,
+    compiled_by_caller,
     integrate_phase,
     sample_phase,
 )
@@ -131,7 +132,9 @@ class ViscoelasticWheel(AbstractWheel):
         )
 
     def step(self, params: WheelParams, x: SectionState, options: Options) -> StepResult:
-        return _full_step(self, params, x, options)
+        # Under a caller's derivative a jit of its own would have the values' machine code too.
+        full_step = _full_step if compiled_by_caller() else _compiled_full_step
+        return full_step(self, params, x, options)
 
     def _told(
         self, params: WheelParams, x: SectionState, options: Options, monitored: bool
@@ -195,13 +198,15 @@ def described(phase: AbstractPhase, y: State) -> tuple[Array, Array, Array]:
     )
 
 
-@eqx.filter_jit
 def _full_step(
     model: ViscoelasticWheel, params: WheelParams, x: SectionState, options: Options
 ) -> StepResult:
     told = model._told(params, x, options, monitored=True)
     result = result_of(*_landed(params, x), told, model.friction)
     return dataclasses.replace(result, engine=_engine(options))
+
+
+_compiled_full_step = eqx.filter_jit(_full_step)
 
 
 def _landed(params: WheelParams, x: SectionState) -> tuple[Symbols, Landing]:
