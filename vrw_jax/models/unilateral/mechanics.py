@@ -265,7 +265,7 @@ def foot_places(motion: WheelMotion, legs: Legwise) -> Legs:
     return motion.x - motion.L * legs.sin
 
 
-def place_of_landing(n: int, motion: WheelMotion) -> Scalar:
+def place_of_landing(n: int, motion: WheelMotion) -> Elementwise:
     """Downhill position of the foremost of `n` feet, m."""
     turned = motion.theta + (n - 1) * 2.0 * math.pi / n
     return motion.x - motion.L[n - 1] * jnp.sin(turned)
