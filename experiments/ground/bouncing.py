@@ -32,7 +32,7 @@ def main() -> None:
             vrw.WheelParams(damping=np.full(len(STARTS), damping)),
             STARTS,
             N_STEPS,
-            model=vrw.UnilateralWheel(friction=friction),
+            model=vrw.UnilateralWheel(friction=friction, infinite="paper"),
             options=options,
         )
         left = np.asarray(found.outcome) == vrw.Outcome.STEPPED

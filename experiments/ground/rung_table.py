@@ -51,7 +51,8 @@ def errors() -> None:
     friction = np.array([mu for mu, _ in SCENES.values()])
     damping = np.array([changes.get("damping", 200.0) for _, changes in SCENES.values()])
     x = [p.section_state if bool(p.found) else vrw.paper_start() for p in papers]
-    params, model = vrw.WheelParams(damping=damping), vrw.UnilateralWheel(friction=friction)
+    params = vrw.WheelParams(damping=damping)
+    model = vrw.UnilateralWheel(friction=friction, infinite="paper")
     walked = vrw.steps(
         params, np.array(x), N_STEPS - 1, model=model, options=vrw.Options(**TOWARDS)
     )

@@ -48,7 +48,11 @@ def starts() -> np.ndarray:
     for mu, c, start in zip(friction, damping, given, strict=True):
         params = vrw.WheelParams(damping=float(np.clip(c, *GAIT_RANGE)))
         start = vrw.limit_cycle(params).section_state if start is None else jnp.asarray(start)
-        x.append(np.asarray(vrw.UnilateralWheel(friction=mu).full_section(params, start)))
+        x.append(
+            np.asarray(
+                vrw.UnilateralWheel(friction=mu, infinite="paper").full_section(params, start)
+            )
+        )
     return np.stack(x)
 
 
@@ -56,13 +60,15 @@ def starts() -> np.ndarray:
 @jax.vmap
 def told(friction: jax.Array, damping: jax.Array, x: jax.Array) -> vrw.UnilateralStep:
     """The step from a section state."""
-    params, wheel = vrw.WheelParams(damping=damping), vrw.UnilateralWheel(friction=friction)
+    params = vrw.WheelParams(damping=damping)
+    wheel = vrw.UnilateralWheel(friction=friction, infinite="paper")
     return wheel.step(params, x, vrw.Options(**OPTIONS))
 
 
 def walked(friction: np.ndarray, damping: np.ndarray, x: np.ndarray) -> tuple:
     """Outcome, the start of the last good step, that step, all periods, and how many steps."""
-    params, model = vrw.WheelParams(damping=damping), vrw.UnilateralWheel(friction=friction)
+    params = vrw.WheelParams(damping=damping)
+    model = vrw.UnilateralWheel(friction=friction, infinite="paper")
     outcome, last, periods = np.zeros(len(x), int), x, []
     count = np.zeros(len(x), int)
     for _ in range(N_STEPS):
@@ -119,7 +125,7 @@ def draw(chosen: list[int], labels: tuple, friction: tuple, damping: tuple, x: n
     paper = vrw.ViscoelasticWheel(stop_at_lift_off=False)
     for column, i in enumerate(chosen):
         params = vrw.WheelParams(damping=damping[i])
-        wheel = vrw.UnilateralWheel(friction=friction[i])
+        wheel = vrw.UnilateralWheel(friction=friction[i], infinite="paper")
         trace = wheel.trace(params, jnp.asarray(x[i]), vrw.Options(), N_SAMPLES)
         s, top, low = params.symbols(), axes[0, column], axes[1, column]
         heights = jax.vmap(

@@ -1,6 +1,7 @@
 """Gaits on real ground: sensitivities, branches, scans and tuning."""
 
 import math
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,8 +11,10 @@ import pytest
 
 import vrw_jax as vrw
 from vrw_jax import simd
+from vrw_jax.cycles import on_ground
+from vrw_jax.models import step_lanes
 from vrw_jax.models.ladder import UNILATERAL, VISCOELASTIC
-from vrw_jax.models.unilateral import lanes as ground_lanes
+from vrw_jax.models.unilateral import queues as ground_lanes
 from vrw_jax.numerics.arclength import ArclengthOptions
 from vrw_jax.numerics.floquet import bifurcation_margins, jury_margins, multipliers
 
@@ -52,12 +55,8 @@ def test_what_real_ground_does_not_measure_is_refused_in_one_sentence():
         vrw.scan(vrw.grid(friction=[0.5, 0.7]))
     with pytest.raises(ValueError, match="is no parameter"):
         vrw.continue_branch(vrw.WheelParams(), "friction", (0.5, 1.0))
-    with pytest.raises(TypeError, match="can't be tuned"):
-        vrw.tune(
-            SLOW, "dls_fraction", ["damping"], {"damping": (250.0, 350.0)}, model=vrw.LadderWheel()
-        )
-    with pytest.raises(TypeError, match="can't be differentiated"):
-        vrw.sensitivities(SLOW, model=vrw.LadderWheel())
+    with pytest.raises(ValueError, match="slowest"):
+        vrw.limit_cycle(SLOW, model=GROUND, which="slow")
     with pytest.raises(TypeError, match="can't be followed"):
         vrw.continue_branch(SLOW, "damping", (250.0, 350.0), model=vrw.LadderWheel())
     with pytest.raises(TypeError, match="compliant legs"):
@@ -87,8 +86,9 @@ def test_a_scan_puts_each_sample_on_its_lowest_rung():
     ground = vrw.scan(design, (*measures, "d period / d friction"), model=vrw.UnilateralWheel())
     for name in measures:
         np.testing.assert_allclose(scan[name][1], ground[name][1], atol=1e-9)
-    # Feet that can't slide give the paper's gait on the upper rung too.
-    np.testing.assert_allclose(scan.period[0, 1], ground.period[0, 1], atol=1e-9)
+    # Feet that can't slide give the paper's gait on the upper rung too, but for the microseconds by
+    # which a stopper pulls a planted foot.
+    np.testing.assert_allclose(scan.period[0, 1], ground.period[0, 1], atol=1e-5)
     assert float(scan.slip[1, 0]) > 0.0
     assert np.isfinite(ground["d_period_d_friction"][1, 0])
 
@@ -145,7 +145,7 @@ def test_a_branch_on_real_ground_turns_at_its_fold_and_comes_back_unstable():
 @pytest.mark.slow
 def test_without_slip_the_multipliers_are_those_of_the_papers_plane():
     paper = vrw.limit_cycle(vrw.WheelParams())
-    held = vrw.UnilateralWheel(friction=math.inf)
+    held = vrw.UnilateralWheel(friction=math.inf, infinite="paper")
     ground = vrw.limit_cycle(vrw.WheelParams(), guess=START, model=held, options=OPTIONS)
     assert int(ground.outcome) == vrw.Outcome.STEPPED
     np.testing.assert_allclose(ground.period, paper.period, atol=1e-9)
@@ -251,3 +251,98 @@ def test_an_event_of_a_lane_on_real_ground_counts_within_the_time_allowed_alone(
 def test_an_implicit_solver_for_lanes_on_real_ground_is_refused_in_one_sentence():
     with pytest.raises(ValueError, match="map vrw"):
         vrw.steps(SLOW, np.asarray([START]), model=GROUND, options=vrw.Options(solver="Kvaerno5"))
+
+
+@pytest.mark.slow
+def test_infinite_friction_walks_as_large_friction_does():
+    """Where the rear foot scuffs, where the gait is the paper's, and where that has none."""
+    damping, friction = np.array([50.0, 200.0, 300.0, 2.0]), np.array([math.inf, 1e6])
+    wheels = vrw.WheelParams(damping=np.repeat(damping, 2))
+    ground = vrw.UnilateralWheel(friction=np.tile(friction, 4))
+    found = vrw.steps(wheels, np.tile(START, (8, 1)), 100, model=ground, options=LANES)
+    assert np.all(np.asarray(found.outcome) == vrw.Outcome.STEPPED)
+    period = np.asarray(found.durations).sum(-1).reshape(4, 2)
+    np.testing.assert_allclose(period[:, 0], period[:, 1], rtol=2e-6)
+    share = np.asarray(found.durations)[0, 0] / period[0, 0]
+    # Of an independent simulator at frictions of 10,000 and a million.
+    assert period[0, 0] == pytest.approx(0.52296, abs=2e-5)
+    assert float(share) == pytest.approx(0.717, abs=5e-4)
+
+
+@pytest.mark.slow
+def test_gaits_on_real_ground_are_found_cold_slow_and_fast_ones(near):
+    both = vrw.limit_cycles(SLOW, model=GROUND)
+    assert np.asarray(both.found).tolist() == [True, True]
+    assert np.all(np.asarray(both.spectral_radius) < 1.0)
+    slow, fast = (vrw.limit_cycle(SLOW, model=GROUND, which=end) for end in ("slowest", "fastest"))
+    np.testing.assert_allclose(both.period, [slow.period, fast.period], atol=1e-12)
+    assert float(fast.speed) > 2.0 * float(slow.speed)
+    with pytest.raises(ValueError, match="2 gaits of this wheel attract"):
+        vrw.limit_cycle(SLOW, model=GROUND, which=2)
+    # A gait of one step is none of two.
+    assert not bool(vrw.limit_cycle(SLOW, model=GROUND, period_n=2).found)
+    known = vrw.limit_cycle(SLOW, model=GROUND, guess=near)
+    np.testing.assert_allclose(slow.section_state, known.section_state, atol=1e-10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stoppers", ["bilateral", "one-sided"])
+@pytest.mark.parametrize("scene", [(0.7, 200.0, 1.6), (0.5, 100.0, 1.2), (0.5, 100.0, 2.2)])
+def test_a_step_of_lanes_tells_what_a_single_wheel_does_and_how_it_moves(scene, stoppers):
+    friction, damping, rate = scene
+    params = vrw.WheelParams(damping=damping)
+    ground = vrw.UnilateralWheel(friction=friction, stoppers=stoppers)
+    x = np.asarray(ground.full_section(params, jnp.asarray([0.1, rate, -0.1])))
+    values = np.asarray(ground.values(params))
+    step, moved = step_lanes(values[:, None], x[None], ground, OPTIONS, 8)
+    alone = vrw.step(params, x, model=ground, options=vrw.Options.tight())
+    for name in ("section_state", "durations", "post_impact", "slip", "energy_impacts",
+                 "energy_damping", "energy_friction", "step_length", "mode_durations"):  # fmt: skip
+        told = getattr(step, name)[0]
+        np.testing.assert_allclose(told, getattr(alone, name), rtol=1e-8, atol=1e-8, err_msg=name)
+    assert int(step.events[0]) == int(alone.events)
+
+    def told(c, mu, rate):
+        wheel, model = vrw.WheelParams(damping=c), eqx.tree_at(lambda m: m.friction, ground, mu)
+        start = jnp.asarray(x).at[1].set(rate)
+        advance = model.advance(wheel, start, vrw.Options.tight())
+        return jnp.concatenate([advance.section_state[:20], advance.durations])
+
+    at = [jnp.asarray(v) for v in (damping, friction, x[1])]
+    exact = jax.jacfwd(told, argnums=(0, 1, 2))(*at)
+    names = (*ground.parameter_names, "theta", "dtheta")
+    for name, column in zip(("damping", "friction", "dtheta"), exact, strict=True):
+        place = names.index(name)
+        found = np.concatenate([moved.section_state[0, :20, place], moved.durations[0, :, place]])
+        np.testing.assert_allclose(found, column, rtol=1e-6, atol=1e-8, err_msg=name)
+
+
+def test_newtons_method_on_lanes_goes_back_where_no_step_ends(monkeypatch):
+    """A map of one number, x to x^2 / 4 + 1 - a, that is none beyond 3: without wheels."""
+    calls = []
+
+    def step(columns, states, *_):
+        (a,), x = columns, states[:, 0]
+        calls.append(x.copy())
+        image, good = 0.25 * x**2 + 1.0 - a, np.abs(x) < 3.0
+        state = lambda value: np.stack([value, 0.0 * value], 1)
+        by = np.zeros((len(x), 2, 3))
+        by[:, 0, 0], by[:, 0, 1] = -1.0, 0.5 * x
+        outcome = np.where(good, int(vrw.Outcome.STEPPED), int(vrw.Outcome.FELL_BACK))
+        return _Told(np.where(good[:, None], state(image), 0.0), outcome), _Told(by, None)
+
+    monkeypatch.setattr(on_ground, "step_lanes", step)
+    a, begin = np.array([[0.25], [0.75], [-9.0]]), np.array([[1.9, 0.0], [1.5, 0.0], [0.0, 0.0]])
+    found = on_ground._newton(None, 1, vrw.Options(), 1, a, begin)
+    assert found.converged.tolist() == [True, True, False]  # the last has no fixed point
+    exact = 2.0 - 2.0 * np.sqrt(a[:2, 0])
+    np.testing.assert_allclose(found.x[:2, 0], exact, atol=1e-12)
+    np.testing.assert_allclose(found.residual[:2], 0.0, atol=1e-12)
+    assert max(np.abs(x).max() for x in calls) > 3.0  # where it was sent back from
+
+
+class _Told(NamedTuple):
+    """As much of a step as Newton's method looks at."""
+
+    section_state: np.ndarray
+    outcome: np.ndarray | None

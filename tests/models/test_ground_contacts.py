@@ -134,3 +134,18 @@ def test_the_combination_taken_is_admissible_and_their_number_is_told(friction, 
         rank = lambda modes: sum(RANK[mode] for mode in modes)
         assert rank(modes) == min(rank(m) for m, _, _ in expected)
     assert numbers == NUMBERS[friction, moving]
+
+
+@pytest.mark.parametrize("moving", [False, True], ids=["impulses", "forces"])
+def test_infinite_friction_is_the_limit_of_large_friction(moving):
+    """Where a foot slides friction alone carries it; what differs falls with the friction."""
+    slid = 0
+    for q, v, at_stopper, locked in itertools.islice(cases(), 60):
+        given = q, v, at_stopper, locked
+        contact, held, rates, _ = chosen(*given, jnp.inf, moving)
+        large = chosen(*given, 1e8, moving)
+        np.testing.assert_array_equal(contact, large[0])
+        np.testing.assert_array_equal(held, large[1])
+        np.testing.assert_allclose(rates, large[2], rtol=1e-4, atol=1e-4)
+        slid += bool(np.isin(contact, (SLIP_DOWN, SLIP_UP)).any())
+    assert slid > 5

@@ -51,9 +51,10 @@ SCENES = {  # friction, damping, dtheta at the start: what happens in the first 
 
 
 def stepped(friction, damping=200.0, x=START, options=TIGHT):
-    """One full step."""
+    """One full step; infinite friction is the paper's."""
     params = vrw.WheelParams(damping=damping)
-    return vrw.step(params, x, model=vrw.UnilateralWheel(friction=friction), options=options)
+    model = vrw.UnilateralWheel(friction=friction, infinite="paper")
+    return vrw.step(params, x, model=model, options=options)
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +83,8 @@ def total_energy(s, motion):
 
 def test_without_slip_the_gait_is_the_papers():
     paper = vrw.walk(TABLE_1, START, 40, options=TIGHT).steps
-    ground = vrw.walk(TABLE_1, START, 40, model=vrw.UnilateralWheel(math.inf), options=TIGHT).steps
+    held = vrw.UnilateralWheel(math.inf, infinite="paper")
+    ground = vrw.walk(TABLE_1, START, 40, model=held, options=TIGHT).steps
     assert float(jnp.max(jnp.abs(paper.section_state[-1] - paper.section_state[-2]))) < 1e-12
     theta_rates = ground.section_state[-1][jnp.asarray([0, 1, 12])]
     np.testing.assert_allclose(theta_rates, paper.section_state[-1], atol=1e-11)

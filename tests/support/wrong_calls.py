@@ -339,12 +339,6 @@ def make() -> None:
         "no gait",
     )
     use(
-        "sensitivities on the ladder",
-        lambda: vrw.sensitivities(table_1, model="auto"),
-        "TypeError",
-        "ladder",
-    )
-    use(
         "newton_cycle of no function", lambda: vrw.newton_cycle(3.0, start), "TypeError", "function"
     )
     family(
@@ -528,7 +522,6 @@ def make() -> None:
     use("tune a batch", lambda: tune(params=several), "ValueError", "one wheel")
     use("tune a table", lambda: tune(params={"damping": 200.0}), "TypeError", "WheelParams")
     use("tune single numbers", lambda: tune(params=single), "ValueError", "vrw.start_jax()")
-    use("tune on the ladder", lambda: tune(model="auto"), "TypeError", "ladder")
     use("tune a rigid wheel", lambda: tune(model=vrw.RigidWheel()), "TypeError", "compliant")
     use(
         "tune from where nothing walks",

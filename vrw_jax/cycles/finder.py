@@ -3,7 +3,7 @@
 import abc
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -103,6 +103,8 @@ class AbstractGaitFinder(eqx.Module):
     usual: eqx.AbstractClassVar[tuple[str, ...]]  # of them, where nothing is asked for
     readable: eqx.AbstractClassVar[tuple[str, ...]]  # `differentiable`, and those of several legs
     from_nothing: eqx.AbstractClassVar[bool]  # whether a search needs no start nearby
+    coexisting: ClassVar[bool] = False
+    """Whether several gaits of a wheel may attract, which walks from several starts tell apart."""
 
     @classmethod
     @abc.abstractmethod
@@ -120,9 +122,19 @@ class AbstractGaitFinder(eqx.Module):
     def cycle(self, params: WheelParams, guess: Any = None) -> AbstractCycle:
         """The cycle of a wheel near `guess`: a neighbour's `near`, a section state or nothing."""
 
+    def cycles(self, params: WheelParams, guess: Any = None) -> Any:
+        """Those of a batch of wheels; every array gains a leading axis."""
+        if guess is None:
+            return jax.vmap(self.cycle)(params)
+        return jax.vmap(self.cycle)(params, guess)
+
     @abc.abstractmethod
     def first_guess(self, values: Values) -> Any:
         """Where a search begins that knows no neighbour."""
+
+    def first_guesses(self, values: Float[Array, "lanes n_values"]) -> Any:
+        """The same of many wheels."""
+        return jax.vmap(self.first_guess)(values)
 
     @abc.abstractmethod
     def find(self, values: Values, guess: Any) -> Gait:

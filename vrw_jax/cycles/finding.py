@@ -9,10 +9,11 @@ import numpy as np
 from jaxtyping import Array
 
 from vrw_jax.cycles.by_collocation import CollocationFinder
-from vrw_jax.cycles.by_walking import GroundFinder, SectionFinder
+from vrw_jax.cycles.by_walking import SectionFinder
 from vrw_jax.cycles.collocated import LimitCycle
 from vrw_jax.cycles.cycle import AbstractCycle
 from vrw_jax.cycles.finder import AbstractGaitFinder
+from vrw_jax.cycles.on_ground import GroundFinder
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.search import Located
 from vrw_jax.cycles.section_cycle import WalkedCycle
@@ -46,6 +47,23 @@ def finder_of(
     make = FINDERS.get(rung.rung, SectionFinder).of
     return make(rung, n_legs, options_of(step_options), period_n,
                 CycleOptions() if cycle_options is None else cycle_options)  # fmt: skip
+
+
+def serving(params: WheelParams, model: ModelLike | None) -> ModelLike | None:
+    """The rung of this wheel's gait: of the ladder the lowest whose premises its step keeps.
+
+    The paper's gait is looked for first. Where it is not found, or breaks a premise on this ground,
+    it is the rung above. Any other rung is itself; so is the ladder where nothing has a value.
+    """
+    traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((params, model)))
+    if model is None or traced or params.damping.ndim or rung_of(model).rung != "ladder":
+        return model
+    ladder: Any = rung_of(model)
+    cycle = finder_of(None, params.n_legs).cycle(params)
+    if not bool(cycle.found):
+        return ladder.ground
+    x = ladder.full_section(params, cycle.section_state)
+    return ladder.choose(params, x, Options())[0].model
 
 
 def near(guess: Any) -> Any:

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vrw_jax.cycles.finding import Guess, finder_for, near
+from vrw_jax.cycles.finding import Guess, finder_for, near, serving
 from vrw_jax.cycles.options import CycleOptions
-from vrw_jax.models import AbstractWheel, refuse_ladder
 from vrw_jax.numerics import Options
 from vrw_jax.results import MEASURES
 from vrw_jax.runtime import xarray as xr
+from vrw_jax.walks import ModelLike
 from vrw_jax.wheel import Outcome, WheelParams
 from vrw_jax.wording import names_of, nearest, untraced
 
@@ -21,17 +21,18 @@ def sensitivities(
     *,
     measures: Sequence[str] | None = None,
     guess: Guess | None = None,
-    model: AbstractWheel | None = None,
+    model: ModelLike | None = None,
     options: CycleOptions | Options | None = None,
 ) -> xr.Dataset:
     """d(measure)/d(parameter) of one gait, plain and as elasticities, with the measures' values.
 
     An elasticity is the relative change of the measure over that of the parameter; NaN where the
     measure is zero. Leaving out the measures of stability saves most of the compile time. `guess`,
-    `model` and `options` are those of `limit_cycle`. On real ground friction is a parameter too.
+    `model` and `options` are those of `limit_cycle`; "auto" takes the rung that serves the gait,
+    and `attrs` say which. On real ground friction is a parameter too.
     """
     untraced("vrw.sensitivities", "differentiate vrw.limit_cycle", params, guess)
-    refuse_ladder(model, "differentiated")
+    model = serving(params, model)
     finder = finder_for(params, model, options)
     names = finder.usual if measures is None else names_of("measures", measures)
     unknown = sorted(set(names) - set(finder.differentiable))
@@ -65,4 +66,5 @@ def sensitivities(
             "parameter_value": ("parameter", np.asarray(vector)),
         },
         coords={"measure": list(names), "parameter": list(moved)},
+        attrs={"rung": finder.model.rung},
     )

@@ -25,10 +25,11 @@ from vrw_jax.cycles import (
     Located,
     WalkedCycle,
 )
-from vrw_jax.models import AbstractWheel
+from vrw_jax.gaits.attracting import N_STEPS, NEAR, gaits_attracting, starts_of
 from vrw_jax.numerics import Options, select
+from vrw_jax.walks import ModelLike
 from vrw_jax.wheel import Outcome, WheelParams, parameters_of
-from vrw_jax.wording import chosen, whole
+from vrw_jax.wording import chosen, untraced, whole
 
 LOST = (Outcome.NO_CYCLE_FOUND, Outcome.ORDER_DIFFERS, Outcome.MESH_TOO_COARSE)
 """Outcomes of a search that may have missed a gait."""
@@ -40,23 +41,15 @@ hundredth of it, and what the options promise."""
 REFINEMENTS = 3
 """How often a mesh is made twice as fine at most."""
 
-N_STEPS = 80
-"""Steps of a walk towards a gait."""
-
-STARTS = ((1.0, 0.45), (1.0, 0.7), (1.0, 1.0), (0.5, 1.0), (0.0, 1.0))
-"""Where walks start: how much of its static contraction Leg 1 has at touchdown, and the rate of the
-hub as a share of the rigid rolling gait's. Of 143 gaits of random wheels with 5 to 16 legs walks
-from these reach all (experiments/gaits/off_the_box.py)."""
-
-NEAR = 0.1
-"""Most by which a walk that is a start may miss its own state one period ago, rad, rad/s, m/s."""
-
 SHAPES = (1, 8, 64, 512, 4096)
 """Numbers of lanes that programs are compiled for."""
 
 
 Lost = Literal["zeros", "nan"]
 ZEROS_OR_NAN: tuple[str, ...] = get_args(Lost)
+
+Which = Literal["slowest", "fastest"] | int
+"""Of the gaits of a wheel that attract, by speed: an end of their list, or a place in it."""
 
 
 @overload
@@ -68,6 +61,7 @@ def limit_cycle(
     model: None = None,
     options: CycleOptions | Options | None = None,
     lost: Lost = "zeros",
+    which: Which = "slowest",
 ) -> LimitCycle: ...
 
 
@@ -77,9 +71,10 @@ def limit_cycle(
     *,
     guess: Guess | None = None,
     period_n: int = 1,
-    model: AbstractWheel,
+    model: ModelLike,
     options: CycleOptions | Options | None = None,
     lost: Lost = "zeros",
+    which: Which = "slowest",
 ) -> LimitCycle | WalkedCycle: ...
 
 
@@ -88,9 +83,10 @@ def limit_cycle(
     *,
     guess: Guess | None = None,
     period_n: int = 1,
-    model: AbstractWheel | None = None,
+    model: ModelLike | None = None,
     options: CycleOptions | Options | None = None,
     lost: Lost = "zeros",
+    which: Which = "slowest",
 ) -> LimitCycle | WalkedCycle:
     """The limit cycle of this wheel: the gait that repeats after `period_n` steps.
 
@@ -107,16 +103,22 @@ def limit_cycle(
     `lost="nan"` they are NaN, for optimisation loops that should not stand still there in silence.
 
     Any other rung as `model` is solved on its own return map, with `Options` of its step: a
-    `WalkedCycle`, to the step's errors.
+    `WalkedCycle`, to the step's errors. On real ground several gaits may attract: without a `guess`
+    walks from a stated set of starts tell them apart (`gaits.attracting`), and `which` takes the
+    "slowest", the "fastest" or a place in their list, slowest first. `limit_cycles` tells all.
+    "auto" is the lowest rung whose premises the gait keeps on its ground: a `LimitCycle` is the
+    paper's, a `WalkedCycle` that of real ground.
     """
+    place_in_list(which)
+    model = cycles.serving(params, model)
     finder = cycles.finder_for(params, model, options, whole("period_n", period_n))
     or_nan = chosen("lost", lost, ZEROS_OR_NAN) == "nan"
-    if guess is None and period_n > 1:
+    if guess is None and period_n > 1 and not finder.coexisting:
         raise ValueError(
             f"period_n is {period_n} and there is no guess, but a gait of several steps is one of "
             "many beside the gait of one step: give guess=, a section state near it."
         )
-    cycle: Any = _wherever(finder, params, cycles.near(guess), options is None)
+    cycle: Any = _wherever(finder, params, cycles.near(guess), options is None, which)
     return cycle.or_nan(params) if or_nan else cycle
 
 
@@ -124,26 +126,68 @@ def limit_cycles(
     params: WheelParams,
     *,
     period_n: int = 1,
-    model: AbstractWheel | None = None,
+    model: ModelLike | None = None,
     options: CycleOptions | Options | None = None,
+    which: Which = "slowest",
 ) -> LimitCycle | WalkedCycle:
     """`limit_cycle` of a batch of wheels side by side; fields have one leading axis, or none.
 
-    The result's fields have it too. All are told on one mesh, as fine as any of them needs.
+    The result's fields have it too. All are told on one mesh, as fine as any of them needs. Of one
+    wheel on real ground all gaits that attract, slowest first.
     """
+    place_in_list(which)
     shape = np.broadcast_shapes(*(np.shape(x) for x in jax.tree.leaves(params)))
+    if not shape:
+        model = cycles.serving(params, model)
+        finder = cycles.finder_for(params, model, options, whole("period_n", period_n))
+        if finder.coexisting:
+            untraced("vrw.limit_cycles", "give vrw.limit_cycle a guess", params)
+            return gaits_attracting(finder, jax.tree.map(lambda x: x[None], params))[0]
     if len(shape) != 1:
         raise ValueError(f"the wheels' batch has shape {shape}, but it must have one axis.")
     params = jax.tree.map(lambda x: jnp.broadcast_to(x, shape), params)
     one = jax.tree.map(lambda x: x[0], params)
     finder = cycles.finder_for(one, model, options, whole("period_n", period_n))
-    cycle: Any = _wherever(finder, params, None, options is None)
+    cycle: Any = _wherever(finder, params, None, options is None, which)
     return cycle
 
 
-def _wherever(finder: Any, params: WheelParams, guess: Any, adaptive: bool) -> Any:
+def place_in_list(which: Which) -> int:
+    """Of a list of gaits, slowest first; one clear sentence for what is none."""
+    if which in ("slowest", "fastest"):
+        return 0 if which == "slowest" else -1
+    if isinstance(which, str) or int(which) != which:
+        raise ValueError(
+            f"which is {which!r}, but it names one of a wheel's gaits: give 'slowest', 'fastest' "
+            "or its place in vrw.limit_cycles(params, model=...)."
+        )
+    return int(which)
+
+
+def _chosen(finder: Any, params: WheelParams, which: Which) -> Any:
+    """Of each wheel of a batch one of the gaits that attract."""
+    told = []
+    for gaits in gaits_attracting(finder, params):
+        n, place = len(gaits.outcome), place_in_list(which)
+        if not -n <= place < n:
+            raise ValueError(
+                f"which is {which}, but {n} gait{'s' * (n > 1)} of this wheel attract"
+                f"{'s' * (n == 1)}: vrw.limit_cycles(params, model=...) tells them."
+            )
+        told.append(jax.tree.map(lambda x, place=place: x[place], gaits))
+    return jax.tree.map(lambda *x: jnp.stack(x), *told)
+
+
+def _wherever(finder: Any, params: WheelParams, guess: Any, adaptive: bool, which: Which) -> Any:
     """The cycle of one wheel or of a batch, by all means."""
     many = params.damping.ndim > 0
+    still = lax.stop_gradient(params)
+    hidden = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(still))
+    if finder.coexisting and guess is None and not hidden:
+        cycle = _chosen(finder, still if many else jax.tree.map(lambda x: x[None], still), which)
+        cycle = cycle if many else jax.tree.map(lambda x: x[0], cycle)
+        plain = not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(params))
+        return cycle if plain else _searched(finder, params, cycle.section_state)
     cycle = _searched(finder, params, guess)
     known = lax.stop_gradient((params, cycle))  # what derivatives are taken of has values, too
     traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(known))
@@ -162,11 +206,7 @@ def _wherever(finder: Any, params: WheelParams, guess: Any, adaptive: bool) -> A
 
 def _searched(finder: AbstractGaitFinder, params: WheelParams, guess: Any) -> Any:
     """The cycle of one wheel, or of each of a batch."""
-    if not params.damping.ndim:
-        return finder.cycle(params, guess)
-    if guess is None:
-        return jax.vmap(finder.cycle)(params)
-    return jax.vmap(finder.cycle)(params, guess)
+    return (finder.cycles if params.damping.ndim else finder.cycle)(params, guess)
 
 
 def _in_shapes(function: Any, *trees: Any) -> Any:
@@ -196,20 +236,6 @@ class _Walks(NamedTuple):
     x: np.ndarray  # (lanes, 3): section state of the one that repeats best
 
 
-def _starts_of(params: WheelParams) -> np.ndarray:
-    """STARTS of each wheel, (start, lane, 3)."""
-    s = jax.tree.map(np.asarray, params.symbols())
-    weight = s.Mt * s.g * np.cos(np.asarray(params.slope))
-    static = np.asarray(params.natural_length - weight / params.stiffness) / s.L0
-    rolling = np.sqrt(4.0 * s.g / s.L0 * np.sin(0.5 * s.alpha) * np.sin(params.slope)) / s.sin_alpha
-    told = []
-    for contraction, share in STARTS:
-        length = np.clip(1.0 + contraction * (static - 1.0), s.cos_alpha + 0.02, 1.0)
-        theta = np.arctan((length - s.cos_alpha) / s.sin_alpha)
-        told.append(np.stack([theta, share * rolling, -0.1 * np.sqrt(s.g * s.L0) / 3.0], -1))
-    return np.stack(told)
-
-
 def _walked(finder: CollocationFinder, params: WheelParams, wanted: np.ndarray) -> _Walks:
     """Walks of the wheels that are `wanted`."""
     n, places = len(wanted), np.flatnonzero(wanted)
@@ -217,7 +243,7 @@ def _walked(finder: CollocationFinder, params: WheelParams, wanted: np.ndarray) 
     if not len(places):
         return _Walks(wanted, x)
     own, model = _taken(params, places), finder.model
-    for start in _starts_of(own):
+    for start in starts_of(own):
         there = steps(own, start, N_STEPS, model=model)
         states = np.array(there.section_state)
         walking = np.flatnonzero(np.asarray(there.outcome) == Outcome.STEPPED)

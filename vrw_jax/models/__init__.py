@@ -28,7 +28,6 @@ from vrw_jax.models.ladder import (
 from vrw_jax.models.lane_step import DIRECTIONS, along_units, gait_step
 from vrw_jax.models.paper_step import PAPER_START
 from vrw_jax.models.rigid import RigidWheel
-from vrw_jax.models.unilateral.lanes import as_full_states, walk_lanes
 from vrw_jax.models.unilateral.mechanics import (
     directions,
     foot_heights,
@@ -37,5 +36,6 @@ from vrw_jax.models.unilateral.mechanics import (
     potential_energy,
 )
 from vrw_jax.models.unilateral.motion import State, unpack
+from vrw_jax.models.unilateral.queues import as_full_states, step_lanes, walk_lanes
 from vrw_jax.models.unilateral.wheel import UnilateralStep, UnilateralTrajectory, UnilateralWheel
 from vrw_jax.models.viscoelastic import ViscoelasticWheel

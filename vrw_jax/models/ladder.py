@@ -250,7 +250,9 @@ class LadderWheel(AbstractWheel):
         """The motion as the upper rung tells it: without slip it is the paper's."""
         choice, _ = self.choose(params, x, options)
         friction = jnp.where(choice.rung == VISCOELASTIC, jnp.inf, self.friction)
-        return UnilateralWheel(friction=friction).trace(params, x, options, n_samples)
+        return UnilateralWheel(friction=friction, infinite="paper").trace(
+            params, x, options, n_samples
+        )
 
 
 def _of_plane(x: FullState, n: int) -> Float[Array, "3"]:

@@ -76,7 +76,7 @@ from vrw_jax.numerics.lanes import (
 )
 from vrw_jax.numerics.march import LanePhase, integrate_lanes, sample_lanes
 from vrw_jax.numerics.minima import ROUNDING, State, Watched
-from vrw_jax.numerics.newton import SectionCycle, corrected, newton_cycle
+from vrw_jax.numerics.newton import SectionCycle, newton_cycle
 from vrw_jax.numerics.options import Engine, Options, SolverName
 from vrw_jax.numerics.roots import BIFURCATIONS, bifurcation_functions, brackets, locate, turns
 from vrw_jax.numerics.segments import product_multipliers, segment_maps

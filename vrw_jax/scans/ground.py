@@ -6,15 +6,22 @@ those whose premises break on this ground are gathered and walk on the upper run
 pays for another.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-import jax
+import equinox as eqx
 import numpy as np
 from jaxtyping import Array
 
-from vrw_jax.cycles import CycleOptions, Readings, finder_of, read_along
+from vrw_jax.cycles import (
+    CycleOptions,
+    Gait,
+    Readings,
+    finder_of,
+    options_towards,
+    read_along_lanes,
+)
 from vrw_jax.models import (
     PAPER_START,
     UNILATERAL,
@@ -27,27 +34,21 @@ from vrw_jax.models import (
     reason_of,
     walk_lanes,
 )
-from vrw_jax.numerics import Options, SolverName, as_float_array
-from vrw_jax.runtime import compiled
+from vrw_jax.numerics import Options
 from vrw_jax.scans.evaluate import Engine, filled_up, masked, n_cores, numbers
 from vrw_jax.scans.offer import derivative
 from vrw_jax.walks import N_TOWARDS
 from vrw_jax.wheel import FRICTION, Outcome, WheelParams
 
-LANES = 8
-"""Wheels that one call of the compiled function takes: they wait for the slowest. Each is twenty
-lanes and more in the Jacobians of Newton's method."""
-
-SOLVER_TOWARDS: SolverName = "Tsit5"
-TOLERANCE_TOWARDS = 1e-8
-"""Of the steps towards a gait, whatever those of the gait itself."""
+LANES = 16
+"""Wheels that are searched together: a number of its own, so that a sample has no company."""
 
 Columns = Mapping[str, np.ndarray]
 Told = dict[str, np.ndarray]
 
 
 class GroundEngine:
-    """Evaluates samples on real ground for a fixed set of measures; compiled at the first call."""
+    """Evaluates samples on real ground for a fixed set of measures."""
 
     def __init__(
         self,
@@ -59,68 +60,47 @@ class GroundEngine:
         threads: int | None = None,
     ) -> None:
         self._base, self._model = base, model
-        tolerance = as_float_array(TOLERANCE_TOWARDS)
-        self._towards = Options(solver=SOLVER_TOWARDS, rtol=tolerance, atol=tolerance)
         self._threads = n_cores() if threads is None else threads
         wanted = tuple(d for name in measures if (d := derivative(name)) is not None)
         plain = (*(n for n in measures if derivative(n) is None), "spectral_radius")
 
-        finder = finder_of(model, base.n_legs, step_options=options)
-        names = model.parameter_names
-
-        def one(values: Array, begin: Array) -> tuple[Array, dict[str, Array]]:
-            slopes = {}
-            if wanted:
-                gait = finder.find(values, begin)
-                cycle, step = gait.cycle, gait.step
-                _, both = read_along(Readings(finder.read, tuple(d.measure for d in wanted)), gait)
-                for d in wanted:
-                    slopes[d.name] = both[d.measure][names.index(d.parameter)]
-            else:
-                walked: Any = finder.cycle_of(values, begin)
-                cycle, step = walked, jax.tree.map(lambda leaf: leaf[0], walked.steps)
-            told = {name: finder.read(name, cycle, step) for name in plain}
-            return cycle.outcome, told | slopes
-
-        self._one = one
-        leaves, structure = jax.tree.flatten((model, options))
-        closed_over = str(structure), [np.asarray(x).tolist() for x in leaves]
-        self._settings = ("ground", measures, base.n_legs, *closed_over)
-        self._compiled: Callable | None = None
-
-    def _compile(self) -> Callable:
-        """The one large function, ready to run: here, lest each thread compile its own."""
-        dtype = np.dtype(self._base.damping.dtype)
-        shapes = (
-            (LANES, len(self._model.parameter_names)),
-            (LANES, self._model.section_size(self._base)),
-        )
-        given = tuple(jax.ShapeDtypeStruct(shape, dtype) for shape in shapes)
-        return compiled(jax.vmap(self._one), given, self._settings, jax.local_devices()[0])
+        self._finder: Any = finder_of(model, base.n_legs, step_options=options)
+        read = type(self._finder).read
+        self._plain, self._wanted = Readings(read, plain), wanted
+        self._moved = Readings(read, tuple(dict.fromkeys(d.measure for d in wanted)))
 
     def __call__(self, columns: Columns) -> Told:
         """Results of the samples in `columns` (one value per sample of each swept parameter)."""
         values = numbers(columns, self._model, self._base)
-        n = len(values)
         n_legs = self._base.n_legs
-        paper = np.tile(np.asarray(PAPER_START, values.dtype), (n, 1))
+        paper = np.tile(np.asarray(PAPER_START, values.dtype), (len(values), 1))
         start = as_full_states(values.T, paper, n_legs)
         states, _, outcome, *_ = walk_lanes(
-            values.T, start, N_TOWARDS, self._model, self._towards, n_legs
+            values.T, start, N_TOWARDS, self._model, options_towards(), n_legs
         )
-        batches = [slice(begin, begin + LANES) for begin in range(0, n, LANES)]
-        self._compiled = self._compiled or self._compile()
+        batches = [slice(begin, begin + LANES) for begin in range(0, len(values), LANES)]
+        told = lambda b: self._batch(values[b], states[b], outcome[b])
+        parts = [told(batches[0])]  # alone, lest each thread compile its own
         with ThreadPoolExecutor(self._threads) as pool:
-            parts = list(pool.map(lambda b: self._batch(values[b], states[b], outcome[b]), batches))
+            parts += pool.map(told, batches[1:])
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
     def _batch(self, values: np.ndarray, states: np.ndarray, walked: np.ndarray) -> Told:
-        assert self._compiled is not None
-        fill = lambda x: filled_up(x, LANES)
-        outcome, measures = self._compiled(fill(values), fill(states))
-        walked = fill(walked)
-        outcome = np.where(walked == Outcome.STEPPED, np.asarray(outcome), walked)
-        return {name: x[: len(values)] for name, x in masked(outcome, measures).items()}
+        gait = self._finder.find_many(filled_up(values, LANES), filled_up(states, LANES))
+        told = dict(_read_lanes(self._plain, gait))
+        if self._wanted:
+            _, slopes = read_along_lanes(self._moved, gait)
+            names = self._model.parameter_names
+            for d in self._wanted:
+                told[d.name] = slopes[d.measure][:, names.index(d.parameter)]
+        walked = filled_up(walked, LANES)
+        outcome = np.where(walked == Outcome.STEPPED, np.asarray(gait.cycle.outcome), walked)
+        return {name: x[: len(values)] for name, x in masked(outcome, told).items()}
+
+
+@eqx.filter_jit
+def _read_lanes(readings: Readings, gait: Gait) -> dict[str, Array]:
+    return eqx.filter_vmap(readings)(gait.cycle, gait.step)
 
 
 OF_PAPER: dict[str, tuple[str, ...]] = {

@@ -23,8 +23,9 @@ from vrw_jax.cycles import (
     default_margins,
     finder_of,
     same_branch,
+    serving,
 )
-from vrw_jax.models import AbstractWheel, refuse_ladder
+from vrw_jax.models import PREMISES
 from vrw_jax.numerics import Options
 from vrw_jax.results import (
     MARGINS,
@@ -40,7 +41,7 @@ from vrw_jax.tuning.climbing import Climb, Kind, Trial, breach, climb, optimalit
 from vrw_jax.tuning.objective import Engine, Evaluated, OfCycle, Reader, Sought, Weighted
 from vrw_jax.tuning.result import Active, Tuned, Walked
 from vrw_jax.tuning.starts import Lanes, explore
-from vrw_jax.walks import one_wheel, rung_of
+from vrw_jax.walks import ModelLike, one_wheel, rung_of
 from vrw_jax.wheel import DOMAINS, PARAMETER_NAMES, Outcome, WheelParams
 from vrw_jax.wording import (
     instance,
@@ -67,7 +68,7 @@ def tune(
     bounds: Mapping[str, tuple[float, float]],
     constraints: Margins | None = None,
     *,
-    model: AbstractWheel | None = None,
+    model: ModelLike | None = None,
     options: Options | None = None,
     cycle_options: CycleOptions | None = None,
     tolerance: float = 1e-6,
@@ -87,6 +88,8 @@ def tune(
     and random ones within the bounds, first take N_EXPLORED first-order steps side by side, and the
     best is climbed from. On real ground (`UnilateralWheel`) the objective is a measure of a step
     there or weights of several, without constraints by default, and the start walks to its gait.
+    "auto" climbs on the rung that serves the start's gait: on the paper's its premises are the
+    constraints, so that it still serves.
     """
     untraced("vrw.tune", "climb by your own loop over vrw.limit_cycle", params)
     max_evaluations, n_starts = (
@@ -105,8 +108,6 @@ def tune(
         options=options,
         cycle_options=cycle_options,
     )
-    if n_starts > 1 and not problem.finder.from_nothing:
-        raise ValueError("n_starts is for the paper's wheel: on real ground climb from one start.")
     lanes = problem.explore(n_starts, seed) if n_starts > 1 else None
     problem.finder.compile(params)
     start = problem.start() if lanes is None else problem.evaluate(lanes.u[lanes.best], None)
@@ -222,7 +223,7 @@ class TuneProblem:
 
     def _batch(self, u: np.ndarray, near: Evaluated | None) -> Evaluated:
         parameters = jnp.asarray([self.parameters(row) for row in u])
-        first = jax.vmap(self.finder.first_guess)(parameters)
+        first = self.finder.first_guesses(parameters)
         return self.engine.batch(parameters, first if near is None else near.gait.cycle.near)
 
     def _change(self, difference: np.ndarray) -> np.ndarray:
@@ -350,7 +351,7 @@ def tuning_problem(
     bounds: Mapping[str, tuple[float, float]],
     constraints: Margins | None = None,
     *,
-    model: AbstractWheel | None = None,
+    model: ModelLike | None = None,
     options: Options | None = None,
     cycle_options: CycleOptions | None = None,
 ) -> TuneProblem:
@@ -360,9 +361,12 @@ def tuning_problem(
     """
     one_wheel(params, "tune one after the other")
     names, lower, upper = _bounds(params, free, bounds)
-    refuse_ladder(model, "tuned")
+    asked = rung_of(model)
     finder = finder_of(
-        rung_of(model), params.n_legs, cycle_options=cycle_options, step_options=options
+        rung_of(serving(params, asked)),
+        params.n_legs,
+        cycle_options=cycle_options,
+        step_options=options,
     )
     if not finder.model.legs_yield:
         raise TypeError(
@@ -371,6 +375,8 @@ def tuning_problem(
         )
     finder.options_used.require_reachable(jnp.result_type(*jax.tree.leaves(params)))
     reader, label = _objective(objective, finder)
+    if constraints is None and asked.rung == "ladder" and finder.from_nothing:
+        constraints = tuple(PREMISES)
     margins = _margins(params, constraints, finder)
     sought = Sought(reader, type(finder).read, tuple(margins))
     if callable(objective):  # looked at before anything is compiled

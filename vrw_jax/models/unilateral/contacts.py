@@ -5,8 +5,11 @@ whose forces push, whose friction lies in Coulomb's cone and against the slip, a
 constraints don't close. Among several the one with most sticking feet is taken. The same table
 serves impacts (impulses and velocities after them) and motion (forces and accelerations).
 
-Infinite friction is no law but a rule of selection: a foot sticks if that needs no pull, else it
-lifts, and only where neither is possible it slides, without friction.
+Infinite friction is the limit of large friction. Of Coulomb's |t| = mu n a finite t leaves n = 0: a
+sliding foot is carried by friction alone, against its slip, and a resting one begins to slide
+where its normal force vanishes. The paper's rule (A1)-(A4), told by a friction of minus infinity
+(`THE_PAPERS`), is another: a foot sticks if that needs no pull, else it lifts, and only where
+neither is possible it slides, without friction.
 """
 
 import functools
@@ -25,6 +28,10 @@ from vrw_jax.wheel import Symbols
 
 OFF, STICK, SLIP_DOWN, SLIP_UP = 0, 1, 2, 3
 """Contact modes of a foot: in the air, at rest, sliding downhill, sliding uphill."""
+
+
+THE_PAPERS = -np.inf
+"""Friction by which the paper's rule is told from the limit of large friction."""
 
 
 class Answer(NamedTuple):
@@ -62,7 +69,8 @@ def _pair(entry: Any) -> Pair:
 
 class _Feet(NamedTuple):
     """What a combination asks of each slot's foot. Its unknown c is the force along e (it sticks)
-    or the normal force (it slides); an unloaded foot has c = 0."""
+    or the normal force (it slides; friction in the limit where it is infinite); an unloaded foot
+    has c = 0."""
 
     stick: Pair
     loaded: Pair
@@ -74,7 +82,9 @@ class _Feet(NamedTuple):
 
 def _feet(s: Symbols, hub: Hub, contact: Array, friction: Elementwise) -> _Feet:
     sin, cos = hub.sin, hub.cos
-    rough = jnp.where(jnp.isfinite(friction), friction, 0.0)
+    limit = friction == jnp.inf
+    rough = jnp.where(limit, 1.0, jnp.where(jnp.isfinite(friction), friction, 0.0))
+    press = jnp.where(limit, 0.0, 1.0)
     stick = _pair(lambda i: contact[i] == STICK)
     slip = _pair(lambda i: (contact[i] == SLIP_DOWN) | (contact[i] == SLIP_UP))
     drag = _pair(lambda i: jnp.where(contact[i] == SLIP_DOWN, -rough, rough))
@@ -82,8 +92,8 @@ def _feet(s: Symbols, hub: Hub, contact: Array, friction: Elementwise) -> _Feet:
     return _Feet(
         stick=stick,
         loaded=_pair(lambda i: stick[i] | slip[i]),
-        to_e=_pair(lambda i: chosen(i, 1.0, drag[i] * cos[i] - sin[i])),
-        to_u=_pair(lambda i: chosen(i, 0.0, drag[i] * sin[i] + cos[i])),
+        to_e=_pair(lambda i: chosen(i, 1.0, drag[i] * cos[i] - press * sin[i])),
+        to_u=_pair(lambda i: chosen(i, 0.0, drag[i] * sin[i] + press * cos[i])),
         row_e=_pair(lambda i: chosen(i, 1.0, -sin[i])),
         row_u=_pair(lambda i: chosen(i, 0.0, cos[i] * (1.0 / s.m))),
     )
@@ -194,7 +204,7 @@ MODES, HELD = _table()
 ORDER_WITHOUT_SLIP = np.argsort(
     [sum({STICK: 0, OFF: 2}.get(int(m), 5) for m in row) for row in MODES], kind="stable"
 )
-"""The order where friction is infinite: sliding comes last."""
+"""The order by the paper's rule: sliding comes last."""
 AT_ONCE = 8
 """Combinations looked at together: most events allow no more."""
 
@@ -250,7 +260,7 @@ def _wrong(
     on: Array,
 ) -> Array:
     """By how much a combination of contacts and held stoppers errs, over what is negligible."""
-    infinite = ~jnp.isfinite(friction)
+    infinite, limit = ~jnp.isfinite(friction), friction == jnp.inf
     rough = jnp.where(infinite, 0.0, friction)
     found = answer(s, hub, free, contact, on, friction)
     worst = jnp.zeros_like(found.hub[0])
@@ -262,7 +272,8 @@ def _wrong(
         pulls, outside = -n / small.force, unless(infinite, jnp.abs(t) - rough * n)
         rests = unless(known, jnp.maximum(pulls, outside / small.force))
         against = jnp.where(mode == SLIP_DOWN, -x, x) / small.motion
-        slides = jnp.maximum(pulls, unless(known, against))
+        along = jnp.where(mode == SLIP_DOWN, t, -t) / small.force
+        slides = jnp.maximum(jnp.where(limit, along, pulls), unless(known, against))
         loaded = jnp.where(mode == STICK, rests, slides)
         foot = jnp.where(mode == OFF, unless(known, -z / small.motion), loaded)
         opens = unless(allowed.known_open[i], found.length[i] / small.motion)
@@ -287,11 +298,11 @@ def choose(
     the one that is least wrong is taken, if that is little: two touch by rounding, or part by it.
     """
     modes, held = jnp.asarray(MODES), jnp.asarray(HELD)
-    infinite = ~jnp.isfinite(friction)
     wrong = functools.partial(_wrong, *lax.stop_gradient((s, hub, free, friction)), allowed, small)
     may = jnp.stack([allowed.contact[i][modes[:, i]] for i in range(2)])
     may = may & jnp.stack([allowed.held[i][held[:, i].astype(jnp.int32)] for i in range(2)])
-    order = jnp.where(infinite, jnp.asarray(ORDER_WITHOUT_SLIP), jnp.arange(len(MODES)))
+    by_paper = friction == THE_PAPERS
+    order = jnp.where(by_paper, jnp.asarray(ORDER_WITHOUT_SLIP), jnp.arange(len(MODES)))
     rank = jnp.cumsum(jnp.all(may, axis=0)[order].astype(jnp.int32))
     count = rank[-1]
 
@@ -344,11 +355,15 @@ def leaves(
     shift = lambda pair, by: (pair[0] - by * here[0], pair[1] - by * here[1])
     asked = free._replace(e=shift(free.e, e), u=shift(free.u, u))
     rough = jnp.where(jnp.isfinite(friction), friction, 0.0)
+    limit, mode = friction == jnp.inf, jnp.where(second, contact[1], contact[0])
+    down = mode == SLIP_DOWN
+    slides = down | (mode == SLIP_UP)
 
     def margin(given: Free) -> Array:
         found = answer(s, hub, given, contact, held, friction)
         normal = jnp.where(second, found.normal[1], found.normal[0])
         tangential = jnp.where(second, found.tangential[1], found.tangential[0])
-        return jnp.where(off, normal, rough * normal + direction * tangential)
+        pressed = jnp.where(limit & slides, jnp.where(down, -tangential, tangential), normal)
+        return jnp.where(off | limit, pressed, rough * normal + direction * tangential)
 
     return margin(asked) > margin(free)

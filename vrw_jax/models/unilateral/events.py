@@ -14,6 +14,7 @@ from vrw_jax.models.unilateral.contacts import (
     SLIP_DOWN,
     SLIP_UP,
     STICK,
+    THE_PAPERS,
     Allowed,
     Choice,
     Negligible,
@@ -217,14 +218,14 @@ def _impact(
     """Velocity level: simultaneous, inelastic, with Coulomb's law in the impulse.
 
     Also says which legs in the air are held: with one-sided stoppers those that need not pull.
-    Infinite friction keeps feet at rest planted when a leg meets its stopper, as the paper does.
+    The paper's rule keeps feet at rest planted when a leg meets its stopper.
     """
     s, friction = law.s, law.friction
     slots = slots_of((stance.contact != OFF) | event.lands)
     at_stopper = stance.locked | event.closes
     loaded = jnp.stack([jnp.any(slots.first), jnp.any(slots.second)])
     stops, before = slots.flags(at_stopper), slots.codes(stance.contact)
-    planted = (before == STICK) & ~jnp.any(event.lands) & ~jnp.isfinite(friction)
+    planted = (before == STICK) & ~jnp.any(event.lands) & (friction == THE_PAPERS)
     modes = jnp.where(loaded[:, None], jnp.ones((4,), bool), _is(OFF))
     modes = jnp.where(planted[:, None], _is(before), modes)
     allowed = Allowed(
@@ -294,7 +295,7 @@ def _support(
     slots = slots_of(contact != OFF)
     mode, stops = slots.codes(contact), slots.flags(at_stopper)
     rests = (mode == STICK) | event.stops
-    rigid = (mode == STICK) & ~jnp.isfinite(friction)  # a tangential force jumps to zero
+    rigid = (mode == STICK) & (friction == THE_PAPERS)  # a tangential force jumps to zero
     up, down = event.slides_up, event.slides_down
     second = (event.lifts | up | down)[1]
     direction = jnp.any(down).astype(jnp.int32) - jnp.any(up).astype(jnp.int32)

@@ -8,35 +8,58 @@ wheel has made its steps takes the next wheel in the queue. So hardly a lane wai
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array
 
 from vrw_jax import simd
-from vrw_jax.models.unilateral.ledger import Ledger, blank, law_of, outcome_at, passed, past
+from vrw_jax.models.unilateral.ledger import (
+    Details,
+    Ledger,
+    blank,
+    event_noted,
+    law_of,
+    no_details,
+    outcome_at,
+    passed,
+    past,
+    stretch_noted,
+)
 from vrw_jax.models.unilateral.march import (
     EVENT,
+    FORCE,
     MARCHING,
+    N_TALLIED,
     WAITING,
     March,
+    Way,
     marched,
+    marched_along,
     motion_of,
     place_of,
     set_off,
 )
 from vrw_jax.models.unilateral.mechanics import WheelMotion, place_of_landing
-from vrw_jax.models.unilateral.motion import Flow, Stance, flow_of, guards_of, unpack
-from vrw_jax.models.unilateral.section import closed, embedded, made_sound, opened
-from vrw_jax.models.unilateral.wheel import UnilateralWheel
-from vrw_jax.numerics import Options, Tableau, explicit_tableau, select, zeros_of
-from vrw_jax.runtime import fusion_emitters, lane_function
+from vrw_jax.models.unilateral.motion import Flow, Stance, Tally, flow_of, guards_of, unpack
+from vrw_jax.models.unilateral.section import closed, made_sound, opened
+from vrw_jax.models.unilateral.wheel import (
+    as_ruled,
+    section_reached,
+    step_told,
+)
+from vrw_jax.numerics import (
+    Options,
+    Tableau,
+    select,
+    without_derivative,
+    zeros_of,
+)
+from vrw_jax.runtime import lane_function
 from vrw_jax.wheel import (
-    PARAMETER_NAMES,
     Outcome,
     Symbols,
     parameters_of,
@@ -53,6 +76,14 @@ QUEUE = 2048
 """Wheels of one call of the compiled program."""
 
 
+class _Lean(NamedTuple):
+    """What a walk tells of its last step where no more is wanted."""
+
+    section_state: Array
+    durations: Array  # (3, wheels)
+    step_length: Array
+
+
 class _Queue(NamedTuple):
     """Wheels that wait, and what became of those that do no more; wheels on the last axis."""
 
@@ -60,9 +91,7 @@ class _Queue(NamedTuple):
     start: Array  # section states, (n_full, wheels)
     good: Array
     next: Array  # wheel to be taken
-    section: Array  # after the last step
-    durations: Array  # (3, wheels), of the last step
-    length: Array  # of the last step, m
+    told: Any  # of the last step: `_Lean`, or a `UnilateralStep`
     outcome: Array
     n_stepped: Array
     tried: Array
@@ -75,15 +104,19 @@ class _Lanes(NamedTuple):
     columns: Array
     ledger: Ledger  # of this step; steps tried are all of the wheel's
     n_stepped: Array
+    details: Details | None  # of this step, where they are wanted
+    tally: Array | None  # rows of `March.told`, of this step
 
 
-class _Walk(NamedTuple):
+class Walk(NamedTuple):
     """What holds for all wheels of a batch."""
 
     n: int
     n_steps: Array
     max_events: int
     one_sided: bool
+    by_paper: bool
+    detailed: bool  # everything that a step tells is wanted
     options: Options
     tableau: Tableau
 
@@ -93,75 +126,48 @@ class _Walk(NamedTuple):
 
     def flow(self, columns: Array, stance: Stance) -> Flow:
         """Of lanes in their stances."""
-        return flow_of(self.symbols(columns), columns[-1], self.one_sided, stance)
+        s, friction = self.symbols(columns), self.friction(columns)
+        return flow_of(s, friction, self.one_sided, stance, self.detailed)
+
+    def friction(self, columns: Array) -> Array:
+        """Of lanes, or of one."""
+        return as_ruled(columns[-1], self.by_paper)
+
+    def told(self, stands: tuple[WheelMotion, Stance], lane: "_Lanes", code: Array) -> Any:
+        """Of the last step of lanes that stand there."""
+        if lane.details is None or lane.tally is None:
+            section = _over_lanes(section_reached)(*stands, code)
+            length = place_of_landing(self.n, stands[0])
+            landed = jnp.where(code == Outcome.STEPPED, length, 0.0)
+            return _Lean(section, lane.ledger.durations, landed)
+        tally = Tally(jnp.zeros_like(lane.tally[0]), *lane.tally)
+        given = *stands, tally, lane.ledger, lane.details, code
+        return _over_lanes(step_told)(*given)
+
+    def untold(self, columns: Array, x: Array) -> Any:
+        """The same with zeros, of wheels at these section states."""
+
+        def told(columns: Array, x: Array) -> Any:
+            begins = lambda columns, x: opened(self.symbols(columns), x)
+            state, stance = _over_lanes(begins)(columns, x)
+            stands, none = (unpack(state)[0], stance), jnp.zeros(x.shape[1:], jnp.int32)
+            ledger, details, tally = self.blank_step(x[0])
+            return self.told(stands, _Lanes(none, columns, ledger, none, details, tally), none)
+
+        return zeros_of(told, columns, x)
+
+    def blank_step(self, like: Array) -> tuple[Ledger, Details | None, Array | None]:
+        """What a step of lanes begins with."""
+        if not self.detailed:
+            return blank(like), None, None
+        many = lambda leaf: jnp.broadcast_to(leaf[..., None], (*leaf.shape, *like.shape))
+        details = jax.tree.map(many, no_details(like.dtype))
+        return blank(like), details, jnp.zeros((N_TALLIED, *like.shape), like.dtype)
 
 
-def walk_lanes(
-    columns: np.ndarray,
-    states: np.ndarray,
-    n_steps: int,
-    model: UnilateralWheel,
-    options: Options,
-    n: int,
-) -> tuple[np.ndarray, ...]:
-    """`n_steps` steps of many wheels with `n` legs: section states, durations, outcomes, steps
-    made, steps tried and the last one's length, m. What is static of the model holds for all.
+def queue_of(columns: Array, x: Array, on: Walk) -> _Queue:
+    n = on.n
 
-    `columns` are the parameters in their order and friction, shape (10, wheels); `states` full
-    section states, shape (wheels, 4 + 3 n).
-    """
-    if model.restitution is not None:
-        raise ValueError(
-            "restitution is given, but in lanes feet don't come back: walk wheels one by one, by "
-            "vrw.walk, or map vrw.return_map over them."
-        )
-    dynamic, static = eqx.partition(options, eqx.is_array)
-    dynamic = jax.tree.map(lambda leaf: np.asarray(leaf, columns.dtype), dynamic)
-    program = _program(static, n, model.max_events, model.one_sided)
-    if not len(states):
-        none = np.zeros(0, np.int32)
-        return states, np.zeros((0, 3), states.dtype), none, none, none, np.zeros(0, states.dtype)
-    parts = []
-    # Most work first, so that no lane is left alone with much of it at the end: stability bounds
-    # the step where damping is high.
-    order = np.argsort(-columns[PARAMETER_NAMES.index("damping")], kind="stable")
-    for begin in range(0, len(states), QUEUE):
-        some = order[begin : begin + QUEUE]
-        filled = np.concatenate([some, np.repeat(some[-1:], QUEUE - len(some))])
-        given = columns[:, filled], states[filled].T.copy(), np.int32(len(some)), np.int32(n_steps)
-        out = program(*given, dynamic)
-        parts.append([np.asarray(x)[..., : len(some)] for x in out])
-    back = np.argsort(order, kind="stable")
-    return tuple(
-        np.moveaxis(np.concatenate(part, -1), -1, 0)[back] for part in zip(*parts, strict=True)
-    )
-
-
-def as_full_states(columns: np.ndarray, states: np.ndarray, n: int) -> np.ndarray:
-    """The full section states of the paper's, wheel by wheel; others are left as they are."""
-    if states.shape[1] != 3:
-        return states
-    embed = lambda values, x: embedded(symbols_of(n, *values), x)
-    return np.asarray(jax.vmap(embed, (1, 0))(columns[:-1], jnp.asarray(states)))
-
-
-@functools.cache
-def _program(
-    static: Options, n_legs: int, max_events: int, one_sided: bool
-) -> Callable[..., tuple]:
-    """The compiled walk of one queue: one program for every batch and number of steps."""
-
-    def walk(columns: Array, x: Array, wanted: Array, n_steps: Array, dynamic: Options) -> tuple:
-        options = eqx.combine(dynamic, static)
-        tableau = explicit_tableau(options.solver)
-        assert tableau is not None  # the caller looked
-        on = _Walk(n_legs, n_steps, max_events, one_sided, options, tableau)
-        return _walked(_queue_of(columns, x, n_legs), wanted, on)
-
-    return jax.jit(walk, compiler_options=fusion_emitters(False))
-
-
-def _queue_of(columns: Array, x: Array, n: int) -> _Queue:
     def sound(values: Array, x: Array) -> tuple[Array, Array, Array]:
         good, params, friction, x = made_sound(wheel_of(values[:-1], n), values[-1], x)
         return jnp.stack([*parameters_of(params), friction]), x, good
@@ -173,16 +179,14 @@ def _queue_of(columns: Array, x: Array, n: int) -> _Queue:
         start=x,
         good=good,
         next=jnp.zeros((), jnp.int32),
-        section=jnp.zeros_like(x),
-        durations=jnp.zeros((3, x.shape[-1]), x.dtype),
-        length=jnp.zeros(x.shape[-1:], x.dtype),
+        told=on.untold(columns, x),
         outcome=jnp.where(good, Outcome.STEPPED, Outcome.BAD_INPUT).astype(jnp.int32),
         n_stepped=none,
         tried=none,
     )
 
 
-def _walked(queue: _Queue, wanted: Array, on: _Walk) -> tuple:
+def walked_through(queue: _Queue, wanted: Array, on: Walk) -> tuple:
     """Every wanted wheel through its landings of the foremost foot."""
     marches = _marches(on)
 
@@ -196,8 +200,7 @@ def _walked(queue: _Queue, wanted: Array, on: _Walk) -> tuple:
         return (queue.next < wanted) | jnp.any(now.verdict != WAITING)
 
     queue, *_ = lax.while_loop(goes_on, round_, (queue, *_empty(queue, on)))
-    told = queue.section, queue.durations, queue.outcome, queue.n_stepped, queue.tried
-    return *told, queue.length
+    return queue.told, queue.outcome, queue.n_stepped, queue.tried
 
 
 class _Ended(NamedTuple):
@@ -211,17 +214,21 @@ class _Ended(NamedTuple):
     code: Array  # STEPPED, or why it is lost
     stands: tuple[WheelMotion, Stance]
     reached: Array  # section state there
-    length: Array  # of a step that ends there, m
     lane: _Lanes  # with what it told
 
 
-def _ended(on: _Walk, chosen: Array, lane: _Lanes, here: March) -> _Ended:
+def _ended(on: Walk, chosen: Array, lane: _Lanes, here: March) -> _Ended:
     place = guards_of(on.n, on.one_sided)
     came = chosen & (here.verdict != WAITING)
-    ledger = passed(lane.ledger, here.stance, here.time, here.tried)
+    lane = lane._replace(ledger=passed(lane.ledger, here.stance, here.time, here.tried))
+    if lane.details is not None and lane.tally is not None and here.told is not None:
+        contact = on.flow(lane.columns, here.stance).contact
+        given = contact, here.time, here.here.slope[FORCE]
+        details = _over_lanes(stretch_noted)(lane.details, *given)
+        lane = lane._replace(details=details, tally=lane.tally + here.told)
     at_event = here.verdict == EVENT
     landed = came & at_event & (here.guard == place.foremost)
-    known = ledger, place, at_event, here.guard, landed, here.verdict
+    known = lane.ledger, place, at_event, here.guard, landed, here.verdict
     code = outcome_at(*known, on.max_events)
     n_stepped = lane.n_stepped + landed
     stands = motion_of(here.here), here.stance
@@ -235,15 +242,16 @@ def _ended(on: _Walk, chosen: Array, lane: _Lanes, here: March) -> _Ended:
         code=code.astype(jnp.int32),
         stands=stands,
         reached=_over_lanes(closed)(*stands),
-        length=place_of_landing(on.n, stands[0]),
-        lane=lane._replace(ledger=ledger, n_stepped=n_stepped),
+        lane=lane._replace(n_stepped=n_stepped),
     )
 
 
 _over_lanes = functools.partial(jax.vmap, in_axes=-1, out_axes=-1)
 
 
-def _handed_over(queue: _Queue, wanted: Array, ended: _Ended) -> tuple[_Queue, Array, Array, Array]:
+def _handed_over(
+    on: Walk, queue: _Queue, wanted: Array, ended: _Ended
+) -> tuple[_Queue, Array, Array, Array]:
     """Wheels that are done or lost are told, and make room for the next ones.
 
     Also says which lanes are free, which of them are filled, and each lane's place in the queue.
@@ -251,15 +259,14 @@ def _handed_over(queue: _Queue, wanted: Array, ended: _Ended) -> tuple[_Queue, A
     lane = ended.lane
     to = jnp.where(ended.leaves, lane.wheel, QUEUE)
     put = lambda old, new: old.at[..., to].set(new, mode="drop")
+    told = on.told(ended.stands, lane, ended.code)
     free = ended.leaves | (ended.chosen & ~ended.came)
     following = queue.next + jnp.cumsum(free.astype(jnp.int32)) - 1
     fills = free & (following < wanted)
     wheel = jnp.where(fills, following, lane.wheel)
     queue = queue._replace(
         next=jnp.minimum(queue.next + jnp.sum(free, dtype=jnp.int32), wanted),
-        section=put(queue.section, jnp.where(ended.failed, 0.0, ended.reached)),
-        durations=put(queue.durations, lane.ledger.durations),
-        length=put(queue.length, jnp.where(ended.failed, 0.0, ended.length)),
+        told=jax.tree.map(put, queue.told, told),
         outcome=put(queue.outcome, ended.code),
         n_stepped=put(queue.n_stepped, lane.n_stepped),
         tried=put(queue.tried, lane.ledger.tried),
@@ -268,7 +275,7 @@ def _handed_over(queue: _Queue, wanted: Array, ended: _Ended) -> tuple[_Queue, A
 
 
 def _events(
-    on: _Walk, wanted: Array, queue: _Queue, lanes: _Lanes, now: March
+    on: Walk, wanted: Array, queue: _Queue, lanes: _Lanes, now: March
 ) -> tuple[_Queue, _Lanes, March]:
     """Some lanes through their events, or on to the next wheels."""
     n_lanes = now.h.shape[-1]
@@ -277,17 +284,27 @@ def _events(
     pick = lambda leaf: jnp.take(leaf, index, axis=-1, mode="clip")
     here, lane = jax.tree.map(pick, (now, lanes))
     ended = _ended(on, index < n_lanes, lane, here)
-    queue, free, fills, wheel = _handed_over(queue, wanted, ended)
+    queue, free, fills, wheel = _handed_over(on, queue, wanted, ended)
     fresh = lambda leaf: jnp.take(leaf, wheel, axis=-1, mode="clip")
 
     def begins(columns: Array, x: Array) -> tuple[WheelMotion, Stance]:
         state, stance = opened(on.symbols(columns), x)
         return unpack(state)[0], stance
 
-    def through(columns: Array, motion: WheelMotion, stance: Stance, guard: Array) -> tuple:
-        given = on.symbols(columns), columns[-1], on.options, on.one_sided
-        change, _, outcome = past(law_of(*given, counted=False), place, motion, stance, guard)
-        return change.motion, change.stance, outcome
+    def through(
+        columns: Array,
+        motion: WheelMotion,
+        stance: Stance,
+        guard: Array,
+        first: Array,
+        details: Details | None,
+    ) -> tuple:
+        given = on.symbols(columns), on.friction(columns), on.options, on.one_sided
+        law = law_of(*given, counted=on.detailed)
+        change, event, outcome = past(law, place, motion, stance, guard)
+        if details is not None:
+            details = event_noted(details, first, change, event)
+        return change.motion, change.stance, outcome, details
 
     # A landing of the foremost foot opens the next step; all go through their events.
     place = guards_of(on.n, on.one_sided)
@@ -296,39 +313,87 @@ def _events(
     x = jnp.where(fills, fresh(queue.start), ended.reached)
     motion, stance = select(opens, _over_lanes(begins)(columns, x), ended.stands)
     guard = jnp.where(opens, place.foot, here.guard)
-    motion, stance, outcome = _over_lanes(through)(columns, motion, stance, guard)
+    ledger, details, tally = ended.lane.ledger, ended.lane.details, ended.lane.tally
+    tried = jnp.where(fills, 0, ledger.tried)
+    known = on.blank_step(motion.x), (ledger, details, tally)
+    ledger, details, tally = select(opens, *known)
+    led = _over_lanes(through)(columns, motion, stance, guard, opens, details)
+    motion, stance, outcome, details = led
     outcome = jnp.where(fills & ~fresh(queue.good), Outcome.BAD_INPUT, outcome)
-    after = set_off(on.flow(columns, stance), motion, on.options.first_step)
+    after = _still(set_off(on.flow(columns, stance), motion, on.options.first_step))
     verdict = jnp.where(outcome != Outcome.STEPPED, outcome, after.verdict)
     verdict = jnp.where(free & ~fills, WAITING, verdict).astype(jnp.int32)
 
-    told = ended.lane.ledger
-    ledger = select(opens, blank(motion.x), told)
-    ledger = ledger._replace(events=ledger.events + 1, tried=jnp.where(fills, 0, told.tried))
+    if details is not None:
+        contact, none = on.flow(columns, stance).contact, jnp.zeros_like(motion.x)
+        details = _over_lanes(stretch_noted)(details, contact, none, after.here.slope[FORCE])
+    ledger = ledger._replace(events=ledger.events + 1, tried=tried)
     n_stepped = jnp.where(fills, 0, ended.lane.n_stepped)
-    kept = after._replace(verdict=verdict), _Lanes(wheel, columns, ledger, n_stepped)
+    lane = _Lanes(wheel, columns, ledger, n_stepped, details, tally)
+    kept = after._replace(verdict=verdict), lane
     put_back = lambda old, new: old.at[..., index].set(new, mode="drop")
     now, lanes = jax.tree.map(put_back, (now, lanes), kept)
     return queue, lanes, now
 
 
-def _marches(on: _Walk) -> Callable[[Array, March, Array], March]:
-    """The march by columns: by machine code each lane to its event, else until enough are."""
+def _still(now: March) -> March:
+    """Only the place moves along a direction, and what is told."""
+    q, v = now.here.q, now.here.v
+    still = lax.stop_gradient(now)
+    return still._replace(here=still.here._replace(q=q, v=v))
+
+
+def _marches(on: Walk) -> Callable[[Array, March, Array], March]:
+    """The march by columns: by machine code each lane to its event, else until enough are.
+
+    Along a direction of columns and place it is `marched_along`.
+    """
     dynamic, static = eqx.partition(on.options, eqx.is_array)
 
-    def far(columns: Array, now: March, dynamic: Options, enough: Array | None = None) -> March:
-        flow = on.flow(columns, now.stance)
-        return marched(flow, now, enough, eqx.combine(dynamic, static), on.tableau)
+    def of(
+        march: Callable, columns: Array, now: March, more: tuple, dynamic: Options, *few: Array
+    ) -> Any:
+        flow_at = lambda columns: on.flow(columns, now.stance)
+        enough = few[0] if few else None
+        return march(flow_at, columns, now, *more, enough, eqx.combine(dynamic, static), on.tableau)
 
-    if not simd.serves():
-        return lambda columns, now, enough: far(columns, now, dynamic, enough)
-    like = lambda columns, now, dynamic: now
-    settings = ("march on real ground", on.n, on.one_sided, static)
-    by_machine_code = lane_function(far, like, settings)
-    return lambda columns, now, enough: by_machine_code(columns, now, dynamic)
+    def far(columns: Array, now: March, dynamic: Options, *few: Array) -> March:
+        return of(marched, columns, now, (), dynamic, *few)
+
+    def along(
+        columns: Array, now: March, way: Way, dynamic: Options, *few: Array
+    ) -> tuple[March, Way]:
+        return of(marched_along, columns, now, (way,), dynamic, *few)
+
+    goes, goes_along, waits = far, along, True
+    if simd.serves():
+        settings, waits = (
+            ("march on real ground", on.n, on.one_sided, on.by_paper, on.detailed, static),
+            False,
+        )
+        goes = lane_function(far, lambda columns, now, dynamic: now, settings)
+        like = lambda columns, now, way, dynamic: (now, way)
+        goes_along = lane_function(along, like, ("along", *settings))
+
+    @jax.custom_jvp
+    def marches(columns: Array, now: March, dynamic: Options, *few: Array) -> March:
+        return goes(columns, now, dynamic, *few)
+
+    @marches.defjvp
+    def rule(at: tuple, along: tuple) -> tuple[March, March]:
+        columns, now, dynamic, *few = at
+        d_columns, moves, *_ = along
+        later = jnp.zeros_like(now.time)
+        way = Way(d_columns, moves.here.q, moves.here.v, moves.told, later)
+        after, way = goes_along(columns, now, way, dynamic, *few)
+        nothing = without_derivative(after)
+        here = nothing.here._replace(q=way.q, v=way.v)
+        return after, nothing._replace(here=here, told=way.told, time=way.later)
+
+    return lambda columns, now, enough: marches(columns, now, dynamic, *((enough,) * waits))
 
 
-def _empty(queue: _Queue, on: _Walk) -> tuple[_Lanes, March]:
+def _empty(queue: _Queue, on: Walk) -> tuple[_Lanes, March]:
     """Lanes without wheels, in place of which stands the first one."""
     n_lanes = TOGETHER if simd.serves() else LANES
     many = lambda value: jnp.broadcast_to(value[..., None], (*value.shape, n_lanes))
@@ -338,5 +403,6 @@ def _empty(queue: _Queue, on: _Walk) -> tuple[_Lanes, March]:
     flow = on.flow(columns, stance)
     now = zeros_of(lambda: set_off(flow, motion, on.options.first_step))
     waiting = now.verdict + WAITING
-    lanes = _Lanes(waiting * 0, columns, blank(motion.x), waiting * 0)
+    ledger, details, tally = on.blank_step(motion.x)
+    lanes = _Lanes(waiting * 0, columns, ledger, waiting * 0, details, tally)
     return lanes, now._replace(here=place_of(flow, motion), stance=stance, verdict=waiting)

@@ -13,15 +13,8 @@ from jaxtyping import Array, Float, Int
 from vrw_jax.models.unilateral.contacts import OFF
 from vrw_jax.models.unilateral.events import Change, Event, Law, event_of, resolve, settled
 from vrw_jax.models.unilateral.mechanics import WheelMotion
-from vrw_jax.models.unilateral.motion import (
-    Flow,
-    Guards,
-    Stance,
-    airborne_stopper_force,
-    forces,
-    unpack,
-)
-from vrw_jax.numerics import Elementwise, Options, PhaseEnd, Scalar, select
+from vrw_jax.models.unilateral.motion import Guards, Stance
+from vrw_jax.numerics import Elementwise, Options, Scalar, select
 from vrw_jax.wheel import Outcome, Symbols
 
 SHARE, SEEN = 1e-2, 4e2
@@ -138,32 +131,36 @@ def no_details(dtype: jnp.dtype) -> Details:
     )
 
 
-def noted(
-    details: Details, first: Array, flow: Flow, change: Change, event: Event, end: PhaseEnd
-) -> Details:
-    """After one more event, the step's `first` or not, and the stretch that followed it."""
-    motion, dtype = change.motion, end.duration.dtype
-    mode = [(jnp.arange(4) == flow.contact[i]).astype(dtype) for i in range(2)]
+def event_noted(details: Details, first: Array, change: Change, event: Event) -> Details:
+    """After one more event, the step's `first` or not."""
     opening = (
-        jnp.stack([motion.theta, motion.dtheta]),
+        jnp.stack([change.motion.theta, change.motion.dtheta]),
         jnp.stack(change.normal_impulse),
         jnp.stack(change.tangential_impulse),
     )
     known = details.post_impact, details.landing_normal, details.landing_tangential
     post_impact, normal, tangential = select(first, opening, known)
-    force = details.monitors.stopper_force
-    for at in (motion, unpack(end.state)[0]):
-        found = airborne_stopper_force(flow, forces(flow, at))
-        force = jnp.minimum(force, jnp.min(jnp.where(flow.airborne, found, jnp.inf)))
     impulse = jnp.minimum(details.monitors.stopper_impulse, change.stopper_impulse)
-    return Details(
+    return details._replace(
         post_impact=post_impact,
-        mode_durations=details.mode_durations + mode[0][:, None] * mode[1][None, :] * end.duration,
         landing_normal=normal,
         landing_tangential=tangential,
         energy_impacts=details.energy_impacts + change.energy_lost,
-        monitors=UnilateralMargins(force, impulse),
+        monitors=UnilateralMargins(details.monitors.stopper_force, impulse),
         impacts=details.impacts + event.impact,
         fewest_solutions=jnp.minimum(details.fewest_solutions, change.solutions),
         most_solutions=jnp.maximum(details.most_solutions, change.most_solutions),
+    )
+
+
+def stretch_noted(
+    details: Details, contact: Int[Array, "2"], duration: Elementwise, force: Elementwise
+) -> Details:
+    """After one more stretch: modes of its slots, and the least stopper force of legs in the air at
+    its ends."""
+    first, second = ((jnp.arange(4) == contact[i]).astype(jnp.result_type(force)) for i in range(2))
+    force = jnp.minimum(details.monitors.stopper_force, force)
+    return details._replace(
+        mode_durations=details.mode_durations + first[:, None] * second[None, :] * duration,
+        monitors=UnilateralMargins(force, details.monitors.stopper_impulse),
     )

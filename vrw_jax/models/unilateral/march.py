@@ -5,8 +5,11 @@ whose step crosses a guard takes that step again, shortened, until it ends on th
 Nothing here looks from one lane to another.
 """
 
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -20,8 +23,10 @@ from vrw_jax.models.unilateral.motion import (
     felt,
     forces,
     guard_sizes,
+    least_stopper_force,
     leg_acceleration,
     stance_guards,
+    tally_rates,
 )
 from vrw_jax.numerics import (
     ROUNDING,
@@ -36,7 +41,11 @@ from vrw_jax.wheel import Outcome
 
 N_FELT = 8
 """Rows of a slope after the accelerations: what guards need of the forces. Then, where stoppers are
-one-sided, those of legs in the air."""
+one-sided, those of legs in the air; then, where they are wanted, `N_TALLIED` and `FORCE`."""
+N_TALLIED = 3
+"""Rows that are summed up: energy lost in dampers and by sliding, slip."""
+FORCE = -1
+"""Row of the least stopper force of legs in the air."""
 MARCHING, EVENT, WAITING = -1, -2, -3
 """Where a lane stands: on its way, at an event, without a wheel; else the `Outcome` it met."""
 PARABOLAS = 3
@@ -74,6 +83,7 @@ class March(NamedTuple):
     stance: Stance
     values: Array  # guards here, (guards, lanes)
     offset: Array  # what a guard that stands on its own event reads there: rounding
+    told: Array | None  # what is summed up since the last event, (N_TALLIED, lanes), if wanted
     h: Array  # of the next try, s
     time: Array  # since the last event, s
     search: Search
@@ -102,8 +112,13 @@ def _slope(flow: Flow, q: Array, v: Array) -> Array:
     told = felt(flow, now)
     ddL = kept(leg_acceleration(flow, now), one_of(motion))
     feet = [*told.normal, *told.tangential, *told.stopper, *told.speed]
-    in_air = [] if told.in_air is None else [told.in_air]
-    return jnp.concatenate([jnp.stack(now.answer.hub), ddL, jnp.stack(feet), *in_air])
+    more = [] if told.in_air is None else [told.in_air]
+    if flow.tallied:
+        tally = tally_rates(flow, motion, now)
+        force = lax.stop_gradient(least_stopper_force(flow, now))
+        rows = tally.damping, tally.friction, tally.slip, force
+        more.append(jnp.stack(kept(rows, one_of(motion))))
+    return jnp.concatenate([jnp.stack(now.answer.hub), ddL, jnp.stack(feet), *more])
 
 
 def guards_at(flow: Flow, place: Place) -> Array:
@@ -111,7 +126,7 @@ def guards_at(flow: Flow, place: Place) -> Array:
     motion = motion_of(place)
     of_felt = place.slope[len(place.q) :]
     n1, n2, t1, t2, s1, s2, x1, x2 = of_felt[:N_FELT]
-    in_air = of_felt[N_FELT:] if flow.one_sided else None
+    in_air = of_felt[N_FELT : N_FELT + flow.s.n] if flow.one_sided else None
     now = Felt(directions(flow.s, motion.theta), (n1, n2), (t1, t2), (s1, s2), (x1, x2), in_air)
     begun = jnp.ones(place.q.shape[-1:], bool)
     return jnp.concatenate(stance_guards(flow, motion, now, begun))
@@ -147,6 +162,7 @@ def set_off(flow: Flow, motion: WheelMotion, h: Array) -> March:
         stance=flow.stance,
         values=values - offset,
         offset=offset,
+        told=jnp.zeros((N_TALLIED, *zero.shape), zero.dtype) if flow.tallied else None,
         h=zero + h,
         time=zero,
         search=Search(none > 0, jnp.zeros_like(begun), zero, zero, zero, none, zero, values),
@@ -156,23 +172,103 @@ def set_off(flow: Flow, motion: WheelMotion, h: Array) -> March:
     )
 
 
+FlowAt = Callable[[Array], Flow]
+"""By the lanes' columns: parameters and friction."""
+
+
 def marched(
-    flow: Flow, begin: March, enough: Array | None, options: Options, tableau: Tableau
+    flow_at: FlowAt,
+    columns: Array,
+    begin: March,
+    enough: Array | None,
+    options: Options,
+    tableau: Tableau,
 ) -> March:
     """On until `enough` lanes no longer march, or none does. Errors: as `integrate_phase`."""
-
+    flow = flow_at(columns)
     sizes = guard_sizes(flow)
-
-    def goes_on(now: March) -> Array:
-        if enough is None:
-            return jnp.any(now.verdict == MARCHING)
-        ended = (now.verdict != MARCHING) & (now.verdict != WAITING)
-        return jnp.any(now.verdict == MARCHING) & (jnp.sum(ended) < enough)
 
     def advance(now: March) -> March:
         return _advanced(now, _tried(flow, tableau, options, now), sizes, tableau, options)
 
-    return lax.while_loop(goes_on, advance, begin)
+    return lax.while_loop(partial(_goes_on, enough), advance, begin)
+
+
+def _goes_on(enough: Array | None, now: March) -> Array:
+    if enough is None:
+        return jnp.any(now.verdict == MARCHING)
+    ended = (now.verdict != MARCHING) & (now.verdict != WAITING)
+    return jnp.any(now.verdict == MARCHING) & (jnp.sum(ended) < enough)
+
+
+class Way(NamedTuple):
+    """A direction in which each lane moves: its columns and where it is."""
+
+    columns: Array
+    q: Array
+    v: Array
+    told: Array | None
+    later: Array  # how its time moves, s
+
+
+def marched_along(
+    flow_at: FlowAt,
+    columns: Array,
+    begin: March,
+    way: Way,
+    enough: Array | None,
+    options: Options,
+    tableau: Tableau,
+) -> tuple[March, Way]:
+    """`marched`, with the direction carried along.
+
+    Of the discrete flow at the lengths that were taken, and of the time of the event: see
+    `numerics.tangents`.
+    """
+    sizes = guard_sizes(flow_at(columns))
+
+    def advance(state: tuple[March, Way]) -> tuple[March, Way]:
+        now, way = state
+        n = len(now.here.q)
+
+        def ends(columns: Array, q: Array, v: Array) -> tuple[Array, _Try]:
+            flow = flow_at(columns)
+            here = Place(q, v, _slope(flow, q, v))
+            tried = _tried(flow, tableau, options, now._replace(here=here))
+            gained = [] if tried.told is None else [tried.told]
+            return jnp.concatenate([tried.end.q, tried.end.v, *gained]), tried
+
+        at, along = (columns, now.here.q, now.here.v), (way.columns, way.q, way.v)
+        _, moved, tried = jax.jvp(ends, at, along, has_aux=True)
+        after = _advanced(now, tried, sizes, tableau, options)
+        told = None if way.told is None else way.told + moved[2 * n :]
+        ahead = way._replace(q=moved[:n], v=moved[n : 2 * n], told=told)
+        return after, select(after.time != now.time, ahead, way)
+
+    goes_on = lambda state: _goes_on(enough, state[0])
+    now, way = lax.while_loop(goes_on, advance, (begin, way))
+    return now, _met(flow_at, columns, begin, now, way)
+
+
+def _met(flow_at: FlowAt, columns: Array, begin: March, now: March, way: Way) -> Way:
+    """The direction where the event comes later or earlier along it."""
+    flow, here, n = flow_at(columns), now.here, len(now.here.q)
+
+    def guards(columns: Array, q: Array, v: Array) -> Array:
+        flow = flow_at(columns)
+        return guards_at(flow, Place(q, v, _slope(flow, q, v)))
+
+    at, along = (columns, here.q, here.v), (way.columns, way.q, way.v)
+    moves, rates = jax.jvp(guards, at, along)[1], guard_rates(flow, here)
+    arrived = (begin.verdict == MARCHING) & (now.verdict == EVENT)
+    later = jnp.zeros_like(now.time)
+    for index in range(len(moves)):
+        own = arrived & (now.guard == index) & (rates[index] < 0.0)
+        later = jnp.where(own, -moves[index] / jnp.where(own, rates[index], -1.0), later)
+    told = None
+    if way.told is not None:
+        told = way.told + later * here.slope[-1 - N_TALLIED : FORCE]
+    return Way(way.columns, way.q + later * here.v, way.v + later * here.slope[:n], told, later)
 
 
 class _Try(NamedTuple):
@@ -183,33 +279,42 @@ class _Try(NamedTuple):
     values: Array  # guards at the end
     bend: Array  # of the guards' parabolas
     slope: Array
+    told: Array | None  # what the step adds to `March.told`
 
 
 def _tried(flow: Flow, tableau: Tableau, options: Options, now: March) -> _Try:
-    here, h, n = now.here, now.h, now.here.q.shape[0]
+    """Only the end and what is told move with anything: lengths are what they are."""
+    h, n = now.h, now.here.q.shape[0]
     last = len(tableau.places) - 1
     once, twice, places = (jnp.asarray(x) for x in (tableau.once, tableau.twice, tableau.places))
 
-    def at(i: Array | int, slopes: Array) -> tuple[Array, Array]:
+    def at(i: Array | int, here: Place, slopes: Array) -> tuple[Array, Array]:
         a, b = once[i], twice[i]
         first = sum(a[j] * slopes[j, :n] for j in range(last))
         second = sum(b[j] * slopes[j, :n] for j in range(last))
         return here.q + h * (places[i] * here.v + h * second), here.v + h * first
 
     def stage(i: Array, slopes: Array) -> Array:
-        slope = _slope(flow, *at(i, slopes))
+        slope = _slope(flow, *at(i, now.here, slopes))
         return lax.dynamic_update_index_in_dim(slopes, slope, i, 0)
 
-    others = jnp.zeros((last, *here.slope.shape), h.dtype)
-    slopes = jnp.concatenate([here.slope[None], others])
+    others = jnp.zeros((last, *now.here.slope.shape), h.dtype)
+    slopes = jnp.concatenate([now.here.slope[None], others])
     slopes = lax.fori_loop(1, last + 1, stage, slopes)
-    reached = lambda i: Place(*at(i, slopes), slopes[i])
-    end, middle = reached(last), reached(tableau.middle)
-    inside, values = (guards_at(flow, place) - now.offset for place in (middle, end))
+    end = Place(*at(last, now.here, slopes), slopes[last])
+    told = None
+    if flow.tallied:
+        told = h * sum(once[last][j] * slopes[j, -1 - N_TALLIED : FORCE] for j in range(last))
+
+    moving, rest = eqx.partition((flow, now.here, slopes), eqx.is_inexact_array)
+    flow, here, slopes = eqx.combine(lax.stop_gradient(moving), rest)
+    middle = Place(*at(tableau.middle, here, slopes), slopes[tableau.middle])
+    looked = middle, lax.stop_gradient(end)
+    inside, values = (guards_at(flow, place) - now.offset for place in looked)
     weigh = lambda weights: sum(float(w) * slopes[j, :n] for j, w in enumerate(weights) if w != 0.0)
     errors = h * h * weigh(tableau.error_twice), h * weigh(tableau.error_once)
-    squared = _squared_error(options, errors, here, end, values)
-    return _Try(end, squared, values, *parabola(tableau, now.values, inside, values))
+    squared = _squared_error(options, errors, here, looked[1], values)
+    return _Try(end, squared, values, *parabola(tableau, now.values, inside, values), told)
 
 
 def _advanced(now: March, tried: _Try, sizes: Array, tableau: Tableau, options: Options) -> March:
@@ -229,6 +334,9 @@ def _advanced(now: March, tried: _Try, sizes: Array, tableau: Tableau, options: 
     moved = jnp.where(arrived, found.shift, 0.0)
     end = Place(end.q + moved * end.v, end.v + moved * end.slope[: len(end.q)], end.slope)
     taken = accepted | arrived
+    told = now.told
+    if told is not None and tried.told is not None:
+        told = told + jnp.where(taken, tried.told, 0.0)
     time = jnp.where(taken, now.time + h + moved, now.time)
     late = accepted & (time >= options.max_phase_time)
     late = late | (arrived & (time > options.max_phase_time))
@@ -240,6 +348,7 @@ def _advanced(now: March, tried: _Try, sizes: Array, tableau: Tableau, options: 
     return now._replace(
         here=select(taken, end, here),
         values=jnp.where(accepted, tried.values, now.values),
+        told=told,
         h=jnp.where(running, following, h),
         time=time,
         search=select(running, searched, search),

@@ -6,7 +6,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from vrw_jax.models.unilateral.contacts import OFF, SLIP_DOWN, SLIP_UP, STICK, Answer, answer
+from vrw_jax.models.unilateral.contacts import (
+    OFF,
+    SLIP_DOWN,
+    SLIP_UP,
+    STICK,
+    THE_PAPERS,
+    Answer,
+    answer,
+)
 from vrw_jax.models.unilateral.mechanics import (
     FootVelocity,
     Free,
@@ -75,14 +83,17 @@ class Flow(NamedTuple):
     contact: Int[Array, "2"]  # of the slots
     held: Bool[Array, "2"]  # the slots' legs on their stoppers
     airborne: Bool[Array, " n_legs"]  # other legs on their stoppers
+    tallied: bool  # in lanes: what is summed up is wanted, too
 
 
-def flow_of(s: Symbols, friction: Elementwise, one_sided: bool, stance: Stance) -> Flow:
+def flow_of(
+    s: Symbols, friction: Elementwise, one_sided: bool, stance: Stance, tallied: bool = False
+) -> Flow:
     """The stance as seen by the equations of motion."""
     slots = slots_of(stance.contact != OFF)
     contact, held = slots.codes(stance.contact), slots.flags(stance.locked)
     airborne = stance.locked & ~slots.filled
-    return Flow(s, friction, one_sided, stance, slots, contact, held, airborne)
+    return Flow(s, friction, one_sided, stance, slots, contact, held, airborne, tallied)
 
 
 class Forces(NamedTuple):
@@ -116,6 +127,11 @@ def airborne_stopper_force(flow: Flow, now: Forces) -> Legs:
     return jnp.where(flow.airborne, flow.s.m * _outward(now), 0.0)
 
 
+def least_stopper_force(flow: Flow, now: Forces) -> Elementwise:
+    """The least of `airborne_stopper_force`; infinite where no leg in the air is locked."""
+    return jnp.min(jnp.where(flow.airborne, airborne_stopper_force(flow, now), jnp.inf), axis=0)
+
+
 def _sliding(flow: Flow) -> Pair:
     """1 for a foot that slides downhill, -1 uphill, 0 else."""
     sign = lambda mode: jnp.where(mode == SLIP_DOWN, 1.0, jnp.where(mode == SLIP_UP, -1.0, 0.0))
@@ -128,14 +144,24 @@ def leg_acceleration(flow: Flow, now: Forces) -> Legs:
     return jnp.where(flow.stance.locked, 0.0, _outward(now) - pull / flow.s.m)
 
 
+def tally_rates(flow: Flow, motion: WheelMotion, now: Forces) -> Tally:
+    """Time derivatives of what is summed up."""
+    direction = _sliding(flow)
+    speeds = [direction[i] * now.feet.x[i] for i in range(2)]
+    drag = [-now.answer.tangential[i] * direction[i] for i in range(2)]
+    return Tally(
+        clock=jnp.ones_like(motion.x),
+        damping=flow.s.c * over_legs(motion.dL * motion.dL),
+        friction=drag[0] * speeds[0] + drag[1] * speeds[1],
+        slip=speeds[0] + speeds[1],
+    )
+
+
 def field(flow: Flow, y: State) -> State:
     """Time derivative of the state."""
     motion, _ = unpack(y)
     now = forces(flow, motion)
     ddL = leg_acceleration(flow, now)
-    direction = _sliding(flow)
-    speeds = [direction[i] * now.feet.x[i] for i in range(2)]
-    drag = [-now.answer.tangential[i] * direction[i] for i in range(2)]
     rates = WheelMotion(
         motion.vx,
         motion.vz,
@@ -144,13 +170,7 @@ def field(flow: Flow, y: State) -> State:
         jnp.where(flow.stance.locked, 0.0, motion.dL),
         ddL,
     )
-    tally = Tally(
-        clock=jnp.ones_like(motion.x),
-        damping=flow.s.c * over_legs(motion.dL * motion.dL),
-        friction=drag[0] * speeds[0] + drag[1] * speeds[1],
-        slip=speeds[0] + speeds[1],
-    )
-    return kept(pack(rates, tally), one_of(motion))
+    return kept(pack(rates, tally_rates(flow, motion, now)), one_of(motion))
 
 
 class Guards(NamedTuple):
@@ -217,17 +237,23 @@ def stance_guards(flow: Flow, motion: WheelMotion, now: Felt, begun: Array) -> l
     just_slid = flow.slots.flags(stance.new_slip)
     rough = jnp.where(jnp.isfinite(flow.friction), flow.friction, 0.0)
     normal, tangential = jnp.stack(now.normal), jnp.stack(now.tangential)
-    coulomb = (flow.contact == STICK) & jnp.isfinite(flow.friction)
+    coulomb = (flow.contact == STICK) & (flow.friction != THE_PAPERS)
+    # In the limit of large friction a resting foot slides, one way or the other, where its normal
+    # force vanishes; a sliding one lifts where its friction does.
+    limit = flow.friction == jnp.inf
     direction = jnp.stack(_sliding(flow))
+    pressed = jnp.where(limit & (direction != 0.0), -direction * tangential, normal)
+    lifts = (flow.contact != OFF) & ~(limit & coulomb)
+    margin = lambda pull: jnp.where(limit, jnp.maximum(normal, pull), rough * normal + pull)
     slides = (direction != 0.0) & (begun | ~just_slid)
     watched = lambda condition, value: jnp.where(condition, value, 1.0)
     in_the_air = [] if now.in_air is None else [jnp.where(flow.airborne, now.in_air, one)]
     return [
         jnp.where(in_air, foot_heights(motion, now.legs), one),
         jnp.where(moving, s.L0 - motion.L, one),
-        watched(flow.contact != OFF, normal),
-        watched(coulomb, rough * normal - tangential),
-        watched(coulomb, rough * normal + tangential),
+        watched(lifts, pressed),
+        watched(coulomb, margin(-tangential)),
+        watched(coulomb, margin(tangential)),
         watched(slides, direction * jnp.stack(now.speed)),
         watched(flow.held, jnp.stack(now.stopper)),
         motion.dtheta[None],

@@ -12,30 +12,34 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.models.base import AbstractGroundStep, AbstractWheel, Advance
 from vrw_jax.models.paper_step import PAPER_START
+from vrw_jax.models.unilateral.contacts import THE_PAPERS
 from vrw_jax.models.unilateral.events import Law
 from vrw_jax.models.unilateral.ledger import (
     Details,
     Ledger,
     UnilateralMargins,
     blank,
+    event_noted,
     law_of,
     no_details,
-    noted,
     outcome_at,
     passed,
     past,
+    stretch_noted,
 )
-from vrw_jax.models.unilateral.mechanics import place_of_landing
+from vrw_jax.models.unilateral.mechanics import WheelMotion, place_of_landing
 from vrw_jax.models.unilateral.motion import (
     Guards,
     Stance,
     State,
+    Tally,
     field,
     flow_of,
     forces,
     guard_sizes,
     guards,
     guards_of,
+    least_stopper_force,
     pack,
     unpack,
 )
@@ -48,6 +52,7 @@ from vrw_jax.models.unilateral.section import (
     section_size,
 )
 from vrw_jax.numerics import (
+    Elementwise,
     Forward,
     Number,
     Options,
@@ -62,6 +67,8 @@ from vrw_jax.wording import chosen, reals, whole
 
 BILATERAL, ONE_SIDED = "bilateral", "one-sided"
 """What stoppers do to legs in the air: hold whatever it takes, or push alone."""
+LIMIT, PAPER = "limit", "paper"
+"""What infinite friction means: the limit of large friction, or the paper's rule (A1)-(A4)."""
 
 
 class UnilateralStep(AbstractGroundStep):
@@ -165,6 +172,8 @@ class UnilateralWheel(AbstractWheel):
     it leaves as soon as the stopper would have to pull. `max_events` bounds the events of one step.
     A foot that strikes comes back at `restitution` times its speed, as far as energy allows; in
     None's place, as of 0, is a smaller program.
+    Infinite friction is the limit of large friction, or with `infinite="paper"` the rule of the
+    paper, (A1) to (A4), continued to where it stops.
     """
 
     rung: ClassVar[str] = "unilateral"
@@ -175,6 +184,7 @@ class UnilateralWheel(AbstractWheel):
     max_events: int = eqx.field(static=True, converter=partial(whole, "max_events"), default=400)
     stoppers: str = eqx.field(static=True, default=BILATERAL)
     restitution: Scalar | None = eqx.field(converter=_restitution_of, default=None)
+    infinite: str = eqx.field(static=True, default=LIMIT)
 
     if TYPE_CHECKING:
 
@@ -184,15 +194,22 @@ class UnilateralWheel(AbstractWheel):
             max_events: int = 400,
             stoppers: Literal["bilateral", "one-sided"] = "bilateral",
             restitution: Number | None = None,
+            infinite: Literal["limit", "paper"] = "limit",
         ) -> None: ...
 
     def __check_init__(self) -> None:
         chosen("stoppers", self.stoppers, (BILATERAL, ONE_SIDED))
+        chosen("infinite", self.infinite, (LIMIT, PAPER))
 
     @property
     def one_sided(self) -> bool:
         """Whether stoppers of legs in the air may let go."""
         return self.stoppers == ONE_SIDED
+
+    @property
+    def by_paper(self) -> bool:
+        """Whether infinite friction is the paper's rule."""
+        return self.infinite == PAPER
 
     def start(self, params: WheelParams) -> FullState:
         """Close to the paper's gait of Table 1."""
@@ -224,12 +241,12 @@ class UnilateralWheel(AbstractWheel):
         log = _walk(self, params, x, options, detailed=False, logged=True).log
         assert log is not None
         begins = jnp.concatenate([jnp.zeros((1,)), jnp.cumsum(log.duration)[:-1]])
-        s = params.symbols()
+        s, friction = params.symbols(), as_ruled(self.friction, self.by_paper)
 
         def phase(inputs: tuple) -> tuple:
             state, contact, locked, duration, begin = inputs
             none = jnp.zeros((s.n,), bool)
-            flow = flow_of(s, self.friction, False, Stance(contact, locked, none, none, none))
+            flow = flow_of(s, friction, False, Stance(contact, locked, none, none, none))
             states = sample_phase(partial(field, flow), state, duration, n_samples, options)
 
             def feet(y: State) -> tuple:
@@ -245,6 +262,11 @@ class UnilateralWheel(AbstractWheel):
         )
 
 
+def as_ruled(friction: Elementwise, by_paper: bool) -> Elementwise:
+    """Friction as `contacts` takes it: see `THE_PAPERS`."""
+    return jnp.where(friction == jnp.inf, THE_PAPERS, friction) if by_paper else friction
+
+
 def _walk(
     wheel: UnilateralWheel,
     params: WheelParams,
@@ -256,6 +278,7 @@ def _walk(
     """Follow one step from event to event."""
     good, params, friction, x = made_sound(params, wheel.friction.astype(x.dtype), x)
     s, n = params.symbols(), params.n_legs
+    friction = as_ruled(friction, wheel.by_paper)
     law = law_of(s, friction, options, wheel.one_sided, True, wheel.restitution)
     place = guards_of(n, wheel.one_sided)
     state, stance = opened(s, x)
@@ -297,7 +320,10 @@ def _go_on(law: Law, place: Guards, max_events: int, options: Options, now: _Wal
     outcome = outcome_at(ledger, place, found, end.guard, lands, lost, max_events)
     details, log = now.details, now.log
     if details is not None:
-        details = noted(details, now.ledger.events == 0, flow, change, event, end)
+        details = event_noted(details, now.ledger.events == 0, change, event)
+        ends = change.motion, unpack(end.state)[0]
+        force = [least_stopper_force(flow, forces(flow, motion)) for motion in ends]
+        details = stretch_noted(details, flow.contact, end.duration, jnp.minimum(*force))
     if log is not None:
         row = _Log(start, change.stance.contact, change.stance.locked, end.duration)
         log = jax.tree.map(lambda old, new: old.at[now.ledger.events].set(new), log, row)
@@ -321,43 +347,55 @@ def _compiled(structure: Any, full: bool) -> Forward:
         wheel, params, x, options = jax.tree.unflatten(structure, leaves)
         options = options.for_derivatives() if tighten else options
         walked = _walk(wheel, params, x, options, detailed=full)
-        result = _result(walked, params.n_legs) if full else _lean(walked)
+        result = _full(walked) if full else _lean(walked)
         return eqx.partition(result, eqx.is_inexact_array)
 
     return any_mode(partial(walk, False), partial(walk, True))
 
 
-def _section_state(walked: _Walked) -> FullState:
-    motion, _ = unpack(walked.state)
-    x = closed(motion, walked.stance)
-    return jnp.where(walked.outcome == Outcome.STEPPED, x, jnp.zeros_like(x))
-
-
 def _lean(walked: _Walked) -> Advance:
     ledger = walked.ledger
-    return Advance(_section_state(walked), ledger.durations, walked.outcome, ledger.tried)
+    stands = unpack(walked.state)[0], walked.stance
+    section = section_reached(*stands, walked.outcome)
+    return Advance(section, ledger.durations, walked.outcome, ledger.tried)
 
 
-def _result(walked: _Walked, n: int) -> UnilateralStep:
-    ledger, details = walked.ledger, walked.details
-    assert details is not None
+def _full(walked: _Walked) -> UnilateralStep:
     motion, tally = unpack(walked.state)
-    stepped = walked.outcome == Outcome.STEPPED
-    landing = place_of_landing(n, motion)
+    assert walked.details is not None
+    return step_told(motion, walked.stance, tally, walked.ledger, walked.details, walked.outcome)
+
+
+def section_reached(motion: WheelMotion, stance: Stance, outcome: Array) -> FullState:
+    """The section state at a step's end; zeros where it failed."""
+    x = closed(motion, stance)
+    return jnp.where(outcome == Outcome.STEPPED, x, jnp.zeros_like(x))
+
+
+def step_told(
+    motion: WheelMotion,
+    stance: Stance,
+    tally: Tally,
+    ledger: Ledger,
+    details: Details,
+    outcome: Array,
+) -> UnilateralStep:
+    """A step by where it ended and what was noted on the way."""
+    landing = place_of_landing(motion.L.shape[0], motion)
     finite = lambda value: jnp.where(jnp.isfinite(value), value, 0.0)
     details = details._replace(
         monitors=jax.tree.map(finite, details.monitors),
         fewest_solutions=jnp.where(ledger.events > 0, details.fewest_solutions, 0),
     )
     return UnilateralStep(
-        section_state=_section_state(walked),
+        section_state=section_reached(motion, stance, outcome),
         durations=ledger.durations,
-        step_length=jnp.where(stepped, landing, 0.0),
+        step_length=jnp.where(outcome == Outcome.STEPPED, landing, 0.0),
         energy_damping=tally.damping,
         energy_friction=tally.friction,
         slip=tally.slip,
         events=ledger.events,
-        outcome=walked.outcome,
+        outcome=outcome,
         solver_steps=ledger.tried,
         **details._asdict(),
     )

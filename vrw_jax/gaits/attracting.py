@@ -1,0 +1,101 @@
+"""Which gaits of a wheel attract: walks from a stated set of starts, and Newton's method on."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vrw_jax.batches import steps
+from vrw_jax.cycles import WalkedCycle, options_towards
+from vrw_jax.wheel import Outcome, WheelParams
+
+N_STEPS = 80
+"""Steps of a walk towards a gait."""
+
+STARTS = ((1.0, 0.45), (1.0, 0.7), (1.0, 1.0), (0.5, 1.0), (0.0, 1.0))
+"""Where walks start: how much of its static contraction Leg 1 has at touchdown, and the rate of the
+hub as a share of the rigid rolling gait's. Of 143 gaits of random wheels with 5 to 16 legs walks
+from these reach all (experiments/gaits/off_the_box.py)."""
+
+NEAR = 0.1
+"""Most by which a walk that is a start may miss its own state one period ago, rad, rad/s, m/s."""
+
+APART, SAME = 0.02, 1e-5
+"""Distance above which walks have come to different gaits, and below which gaits are one."""
+
+
+def starts_of(params: WheelParams) -> np.ndarray:
+    """STARTS of each wheel, (start, lane, 3)."""
+    s = jax.tree.map(np.asarray, params.symbols())
+    weight = s.Mt * s.g * np.cos(np.asarray(params.slope))
+    static = np.asarray(params.natural_length - weight / params.stiffness) / s.L0
+    rolling = np.sqrt(4.0 * s.g / s.L0 * np.sin(0.5 * s.alpha) * np.sin(params.slope)) / s.sin_alpha
+    told = []
+    for contraction, share in STARTS:
+        length = np.clip(1.0 + contraction * (static - 1.0), s.cos_alpha + 0.02, 1.0)
+        theta = np.arctan((length - s.cos_alpha) / s.sin_alpha)
+        told.append(np.stack([theta, share * rolling, -0.1 * np.sqrt(s.g * s.L0) / 3.0], -1))
+    return np.stack(told)
+
+
+def gaits_attracting(finder: Any, params: WheelParams) -> list[WalkedCycle]:
+    """Of each wheel of a batch the gaits that attract, slowest first; a leading axis over gaits.
+
+    Where none is found one stands there that says so.
+    """
+    n = params.damping.shape[0]
+    owner, x = _walked_to(finder, params, n)
+    found: Any = finder.cycles(jax.tree.map(lambda leaf: leaf[owner], params), x)
+    good, speed = np.asarray(found.found), np.asarray(found.speed)
+    states = np.asarray(found.steps.section_state)  # of every step
+    numbers = finder.model.section_numbers(params)
+    told = []
+    for wheel in range(n):
+        kept: list[int] = []
+        for i in sorted(np.flatnonzero((owner == wheel) & good), key=lambda i: speed[i]):
+            own = states[i, :, :numbers]
+            repeats = np.abs(own[:-1] - own[-1]).max(-1) < SAME  # after fewer steps
+            known = (np.abs(states[j, :, :numbers] - own[-1]).max(-1) < SAME for j in kept)
+            if not repeats.any() and not any(same.any() for same in known):
+                kept.append(int(i))
+        shown = np.array(kept or [int(np.flatnonzero(owner == wheel)[0])])
+        gaits = jax.tree.map(lambda leaf, shown=shown: leaf[shown], found)
+        told.append(gaits if kept else _none_like(gaits))
+    return told
+
+
+def _none_like(cycle: WalkedCycle) -> WalkedCycle:
+    """No gait: what repeats does so after fewer steps, or nothing does."""
+    none = jax.tree.map(jnp.zeros_like, cycle)
+    lost = np.where(cycle.found, Outcome.NO_CYCLE_FOUND, cycle.outcome)
+    return dataclasses.replace(none, outcome=jnp.asarray(lost, jnp.int32))
+
+
+def _walked_to(finder: Any, params: WheelParams, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Where walks have come to that differ: whose, and section states; one of each wheel at least.
+
+    The walk that repeats best stands for its like.
+    """
+    starts = starts_of(params)
+    owner = np.tile(np.arange(n), len(starts))
+    wheels = jax.tree.map(lambda leaf: leaf[owner], params)
+    model, towards, numbers = finder.model, options_towards(), finder.model.section_numbers(params)
+    full = jax.vmap(model.full_section)(wheels, jnp.asarray(np.concatenate(starts)))
+    walked = steps(wheels, full, N_STEPS, model=model, options=towards)
+    states = np.asarray(walked.section_state)
+    walking = np.asarray(walked.outcome) == Outcome.STEPPED
+    begin = np.where(walking[:, None], states, np.asarray(full))
+    later = steps(wheels, begin, finder.period_n, model=model, options=towards)
+    missed = np.abs(np.asarray(later.section_state) - begin)[:, :numbers].max(-1)
+    settled = walking & (np.asarray(later.outcome) == Outcome.STEPPED) & (missed < NEAR)
+    chosen: list[int] = []
+    for wheel in range(n):
+        own, other = np.flatnonzero(owner == wheel), list[Any]()
+        for i in sorted(own[settled[own]], key=lambda i: missed[i]):
+            away = [np.abs(begin[i] - begin[j])[:numbers].max() for j in other]
+            if min(away, default=np.inf) > max(APART, 3.0 * missed[i]):
+                other.append(i)
+        chosen += other or [own[np.argmax(walking[own])]]
+    return owner[chosen], begin[chosen]
