@@ -333,6 +333,12 @@ def make() -> None:
         "vrw.start_jax()",
     )
     use(
+        "limit_cycle of a gait by another name",
+        lambda: vrw.limit_cycle(table_1, which="slow"),
+        "ValueError",
+        "slowest",
+    )
+    use(
         "sensitivities of no gait",
         lambda: vrw.sensitivities(vrw.WheelParams(slope=0.02)),
         "ValueError",
