@@ -29,8 +29,8 @@ const defaults = () => {
 const state = {
   values: defaults(), engines: {}, guess: null, result: null, took: 0,
   playing: !matchMedia("(prefers-reduced-motion: reduce)").matches,
-  map: { x: "damping", y: "slope", measure: "speed", cells: new Map(), key: "" },
-  basin: { cells: new Map(), key: "", cross: null },
+  map: { x: "damping", y: "slope", measure: "speed", cells: new Map(), key: "", held: {} },
+  basin: { cells: new Map(), key: "", cross: null, held: {} },
 };
 
 const columnOf = (values) => facts.order.map((name) => values[name]);
@@ -287,6 +287,7 @@ function news({ kind, job, stride, nodes, done }) {
       const key = node.node.join();
       picture.cells.set(key, { ...node, stride });
     }
+  picture.stale = true;
   if (!picture.waits) {
     picture.waits = true;
     requestAnimationFrame(() => {
@@ -344,8 +345,9 @@ function mapValue(cell) {
 
 const coarseFirst = (cells) => [...cells.values()].sort((a, b) => b.stride - a.stride);
 
-function showMap() {
-  const { map, values } = state, cells = coarseFirst(map.cells), found = cells.map(mapValue);
+// What of the map changes with its cells and its measure alone.
+function colored() {
+  const { map } = state, cells = coarseFirst(map.cells), found = cells.map(mapValue);
   const finite = found.filter((value) => value !== null && isFinite(value)).sort((a, b) => a - b);
   const low = finite[Math.floor(0.01 * finite.length)], high = finite[Math.ceil(0.99 * finite.length) - 1];
   const codes = new Set();
@@ -357,15 +359,22 @@ function showMap() {
     const [r, g, b] = shade(high > low ? (found[i] - low) / (high - low) : 0.5);
     return { ...cell, color: `rgb(${r},${g},${b})`, hatched: cell.radius >= 1 };
   });
-  const [x, y] = mapAxes(), last = map.given ? [x.last, y.last] : LAST;
-  map.place = drawGrid($("map"), { last, cells: drawn, x, y, dot: [values[map.x], values[map.y]] });
   const m = facts.measures[map.measure] || { label: named(map.measure), unit: "" }, unit = unitText(m.unit);
   const bar = `<span><span style="width:90px;height:12px;border-radius:3px;background:linear-gradient(90deg,${VIRIDIS.map(
     (rgb) => `rgb(${rgb})`).join(",")})"></span></span>`;
   $("map-legend").innerHTML = (finite.length ? `<span>${m.label}: ${number(low)}</span>${bar}<span>${number(high)} ${unit}</span>` : "")
     + [...codes].sort().map((code) => swatch(lostColor(code), lostName(code))).join("");
+  Object.assign(map, { drawn, drawnOf: [map.cells, map.cells.size, map.measure], label: m.label });
+}
+
+function showMap() {
+  const { map, values } = state, [x, y] = mapAxes(), last = map.given ? [x.last, y.last] : LAST;
+  const now = [map.cells, map.cells.size, map.measure];
+  if (map.stale || now.some((what, i) => what !== map.drawnOf?.[i])) colored();
+  map.stale = false;
+  map.place = drawGrid($("map"), { last, cells: map.drawn, held: map.held, x, y, dot: [values[map.x], values[map.y]] });
   $("map-state").textContent = map.given ? "From your dataset." : map.done ? `${map.cells.size.toLocaleString("en")} gaits in ${map.seconds.toFixed(1)} s.` : "Refining …";
-  $("map").setAttribute("aria-label", `Map of ${m.label} over ${named(map.x)}, now ${values[map.x]}, and ${named(map.y)}, now ${values[map.y]}`);
+  $("map").setAttribute("aria-label", `Map of ${map.label} over ${named(map.x)}, now ${values[map.x]}, and ${named(map.y)}, now ${values[map.y]}`);
 }
 
 const lostColor = (code) => (code === STEPPED ? "#9aa0a8" : OUTCOME_COLORS[code] || "#555555");
@@ -404,12 +413,14 @@ function askBasin() {
 function showBasin() {
   const { basin } = state;
   if (!basin.axes) return;
-  const codes = new Set(), cells = coarseFirst(basin.cells).map((cell) => {
-    codes.add(cell.code);
-    return { ...cell, color: cell.code === SETTLED ? "#0072b2" : lostColor(cell.code) };
-  });
+  if (basin.stale || basin.drawnOf !== basin.cells) {
+    const color = (code) => (code === SETTLED ? "#0072b2" : lostColor(code));
+    basin.drawn = coarseFirst(basin.cells).map((cell) => ({ ...cell, color: color(cell.code) }));
+    Object.assign(basin, { stale: false, drawnOf: basin.cells });
+  }
+  const codes = new Set([...basin.cells.values()].map(({ code }) => code));
   const home = [...basin.cells.values()].filter(({ code }) => code === SETTLED).length;
-  basin.place = drawGrid($("basin"), { last: LAST - 1, cells, x: basin.axes[0], y: basin.axes[1], cross: basin.cross, dot: basin.gait });
+  basin.place = drawGrid($("basin"), { last: LAST - 1, cells: basin.drawn, held: basin.held, x: basin.axes[0], y: basin.axes[1], cross: basin.cross, dot: basin.gait });
   $("basin-legend").innerHTML = [...codes].sort((a, b) => a - b).map((code) =>
     swatch(code === SETTLED ? "#0072b2" : lostColor(code), code === SETTLED ? "to the gait" : code === STEPPED ? "never settles" : lostName(code))).join("");
   const share = `${((100 * home) / Math.max(1, basin.cells.size)).toFixed(0)} % of the starts lead to the gait`;

@@ -1,7 +1,10 @@
 "use strict";
 // What is drawn, from numbers alone. Lengths in m on the slope's frame: x downhill, z off the slope.
 
-const ink = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
+// Colours of the page's style, until it turns light or dark.
+const inks = {};
+const ink = (name) => (inks[name] ||= getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim());
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => Object.keys(inks).forEach((name) => delete inks[name]));
 
 // A canvas at the screen's own resolution, and its size in CSS pixels.
 function sheet(canvas) {
@@ -230,24 +233,17 @@ function shade(share) {
 
 // `cells`: by node [column, row] a colour and whether it is hatched, coarse ones first; `x`, `y`: axes
 // with from, to, label; `last`: the last node's number, or that of each axis; `dot`: values there.
-function drawGrid(canvas, { last, cells, x, y, dot, cross }) {
+// `held` keeps the cells' picture while they stay what they are.
+function drawGrid(canvas, { last, cells, x, y, dot, cross, held }) {
   const { ctx, w, h } = sheet(canvas), box = { left: 54, right: w - 10, top: 8, bottom: h - 38 };
   const [lastX, lastY] = [last].flat().length > 1 ? last : [last, last];
   const wide = (box.right - box.left) / (lastX + 1), high = (box.bottom - box.top) / (lastY + 1);
-  ctx.fillStyle = ink("ground");
-  ctx.fillRect(box.left, box.top, box.right - box.left, box.bottom - box.top);
-  ctx.save();
-  ctx.beginPath();
-  ctx.rect(box.left, box.top, box.right - box.left, box.bottom - box.top);
-  ctx.clip();
-  for (const { node: [c, r], stride, color, hatched } of cells) {
-    // A coarse cell is drawn around its node, until finer ones lie over it.
-    const shift = (stride - 1) / 2, x0 = box.left + (c - shift) * wide, y1 = box.bottom - (r - shift) * high;
-    ctx.fillStyle = color;
-    ctx.fillRect(Math.floor(x0), Math.floor(y1 - stride * high), Math.ceil(stride * wide) + 1, Math.ceil(stride * high) + 1);
-    if (hatched) line(ctx, [[x0, y1], [x0 + stride * wide, y1 - stride * high]], ink("card"), 1);
+  const size = [box.right - box.left, box.bottom - box.top, window.devicePixelRatio || 1, ink("ground")].join();
+  if (held.cells !== cells || held.size !== size) {
+    Object.assign(held, { cells, size, picture: document.createElement("canvas") });
+    drawCells(held.picture, [box.right - box.left, box.bottom - box.top], [wide, high], cells);
   }
-  ctx.restore();
+  ctx.drawImage(held.picture, box.left, box.top, box.right - box.left, box.bottom - box.top);
   const X = (value) => box.left + wide * (0.5 + ((value - x.from) / (x.to - x.from)) * lastX);
   const Y = (value) => box.bottom - high * (0.5 + ((value - y.from) / (y.to - y.from)) * lastY);
   ctx.fillStyle = ink("soft");
@@ -282,6 +278,22 @@ function drawGrid(canvas, { last, cells, x, y, dot, cross }) {
     value(x, ((px - box.left) / wide - 0.5) / lastX),
     value(y, ((box.bottom - py) / high - 0.5) / lastY),
   ];
+}
+
+function drawCells(canvas, [w, h], [wide, high], cells) {
+  const dense = window.devicePixelRatio || 1, ctx = canvas.getContext("2d");
+  canvas.width = Math.round(w * dense);
+  canvas.height = Math.round(h * dense);
+  ctx.scale(dense, dense);
+  ctx.fillStyle = ink("ground");
+  ctx.fillRect(0, 0, w, h);
+  for (const { node: [c, r], stride, color, hatched } of cells) {
+    // A coarse cell is drawn around its node, until finer ones lie over it.
+    const shift = (stride - 1) / 2, x0 = (c - shift) * wide, y1 = h - (r - shift) * high;
+    ctx.fillStyle = color;
+    ctx.fillRect(Math.floor(x0), Math.floor(y1 - stride * high), Math.ceil(stride * wide) + 1, Math.ceil(stride * high) + 1);
+    if (hatched) line(ctx, [[x0, y1], [x0 + stride * wide, y1 - stride * high]], ink("card"), 1);
+  }
 }
 
 function ticks({ from, to }, about) {

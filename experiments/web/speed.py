@@ -1,0 +1,113 @@
+"""How long the page takes after a slider moved, for its map and its basin, in Node and in Chromium.
+
+Writes its table into docs/explore.md. Needs `node`, `chromium`, and playwright: `.[web]`.
+"""
+
+import json
+import os
+import shutil
+import subprocess
+import tempfile
+
+from experiments.shared.command import command, extra, started
+from experiments.shared.tables import markdown, replace
+from experiments.shared.timing import processor
+from experiments.web.build import CODE, FACTS, PAGE, ROOT, SOURCES, told_in
+
+MOVED = 80
+"""Places of the slider, after as many that warm up."""
+
+IN_NODE = """
+const given = JSON.parse(require("fs").readFileSync(0)), { facts, packed } = given;
+(0, eval)(given.source + ";globalThis.own = { Engine, jobs };");
+(async () => {
+  const engine = await own.Engine.load(packed, facts, 8);
+  const at = (damping) => facts.order.map(
+    (name) => (name === "damping" ? damping : facts.parameters[name].value));
+  let gait = engine.gait(at(200), [facts.start]);
+  const times = [], cpu = () => (process.cpuUsage().user + process.cpuUsage().system) / 1000;
+  for (let i = 0; i < 8 * given.moved; i++) {
+    const began = cpu(), wheel = at(150 + 50 * Math.abs(Math.sin(i)));
+    gait = engine.gait(wheel, [gait.x]);
+    engine.told(wheel, 1, gait.x);
+    times.push(cpu() - began);
+  }
+  const late = times.slice(-given.moved).sort((a, b) => a - b);
+  const found = { update: late[given.moved >> 1] }, [theta] = gait.x;
+  const x = { from: theta - 0.4, to: theta + 0.4 }, y = { from: 0, to: 3 };
+  const job = { kind: "basin", id: 1, legs: 8, wheel: at(200), gait: gait.x, x, y, last: 63 };
+  for (let i = 0; i < 2; i++) {
+    const began = cpu();
+    await own.jobs(() => {})({ job, packed, facts });
+    found.basin = cpu() - began;
+  }
+  console.log(JSON.stringify(found));
+})();
+"""
+
+IN_CHROMIUM = """async (moved) => {
+  const times = [];
+  for (let i = 0; i < 2 * moved; i++) {
+    await new Promise((go) => requestAnimationFrame(go));
+    const began = performance.now();
+    await vrw.update({ damping: 150 + 50 * Math.abs(Math.sin(i)) });
+    times.push(performance.now() - began);
+  }
+  const late = times.slice(-moved).sort((a, b) => a - b);
+  return [late[moved >> 1], late[Math.floor(0.95 * moved)]];
+}"""
+
+
+def in_node() -> dict[str, float]:
+    """CPU time of an update and of a basin, ms."""
+    page = PAGE.read_text(encoding="utf-8")
+    source = "\n".join((SOURCES / name).read_text() for name in ("engine.js", "worker.js"))
+    given = {
+        "facts": told_in(page, FACTS), "packed": told_in(page, CODE)["8"], "moved": MOVED,
+        "source": source.replace('"use strict";', ""),
+    }  # fmt: skip
+    node = ["node", "-e", IN_NODE]
+    told = subprocess.run(node, input=json.dumps(given), check=True, capture_output=True, text=True)
+    return json.loads(told.stdout)
+
+
+def in_chromium() -> tuple[list[float], float, float]:
+    """Wall time of an update with all that is drawn, median and 95 in 100, ms; basin and map, s."""
+    path = shutil.which("chromium")
+    switches = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-sync"]
+    playwright = extra("playwright.sync_api", 'pip install -e ".[web]"')
+    with playwright.sync_playwright() as machine, tempfile.TemporaryDirectory() as folder:
+        opened = machine.chromium.launch_persistent_context(
+            folder, executable_path=path, args=switches
+        )
+        page = opened.new_page()
+        page.goto(PAGE.as_uri())
+        page.evaluate("vrw.ready")
+        times = page.evaluate(IN_CHROMIUM, MOVED)
+        done = "vrw.state.map.done && vrw.state.basin.done"
+        page.wait_for_function(done, timeout=300_000)
+        # Once more, as it is when the code is warm.
+        page.evaluate("vrw.update({ stiffness: 510 })")
+        page.wait_for_timeout(1000)
+        page.wait_for_function(done, timeout=300_000)
+        pictures = page.evaluate("[vrw.state.basin.seconds, vrw.state.map.seconds]")
+        opened.close()
+    return times, *pictures
+
+
+def main() -> None:
+    started(command(__doc__))
+    node, (times, basin, whole) = in_node(), in_chromium()
+    rows = [
+        ("a slider moved: gait, multipliers, forces, margins", f"{node['update']:.1f} ms",
+         f"{times[0]:.0f} ms, 95 in 100 below {times[1]:.0f}"),
+        ("a basin of 64 × 64 starts", f"{node['basin'] / 1000:.2f} s", f"{basin:.1f} s"),
+        ("a map of 65 × 65 gaits", "", f"{whole:.1f} s"),
+    ]  # fmt: skip
+    table = markdown(("", "Node, CPU time", "Chromium, wall time, all drawn"), rows)
+    load = f"load average {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
+    replace(ROOT / "docs" / "explore.md", "speed", f"{table}\n\n{processor()}; {load}.")
+
+
+if __name__ == "__main__":
+    main()
