@@ -245,6 +245,12 @@ def test_a_long_function_is_seen_wherever_it_stands(lines, seen, tmp_path):
     assert any(" f has " in line for line in found) == seen
 
 
+def test_a_docstring_does_not_make_a_function_long(tmp_path):
+    told = '    """Told.\n' + "\n" * 50 + '    """\n'
+    body = told + "    x = 1\n" * 30
+    assert not rules.long_ones(house(tmp_path, {"wheel/told.py": "def f():\n" + body}))
+
+
 def test_an_idle_or_private_name_in_a_face_is_seen(tmp_path):
     files = {
         "wheel/__init__.py": "from house.wheel.params import Params, _table, idle, tested\n",

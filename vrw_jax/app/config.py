@@ -49,15 +49,24 @@ class ConfigError(ValueError):
 
 @dataclass(frozen=True)
 class ScanConfig:
-    """Table `[scan]`: what to report, and how many samples are written at a time."""
+    """Table `[scan]`: what to report, and how many samples are written at a time.
 
-    measures: tuple[str, ...] | None = None  # None: the scan's default
+    - `measures`: names, derivatives too; without them DLS fraction, speed and the like;
+    - `chunk`: samples written at a time; 4,096 without it.
+    """
+
+    measures: tuple[str, ...] | None = None
     chunk: int | None = None
 
 
 @dataclass(frozen=True)
 class GaitConfig:
-    """Table `[gait]`: how far to walk, and from which section state (None: the model's own)."""
+    """Table `[gait]`: how far to walk, and from where.
+
+    - `steps`: to walk;
+    - `start`: section state before the first touchdown, [rad, rad/s, m/s]; the rung's own
+      without it.
+    """
 
     steps: int = 30
     start: tuple[float, float, float] | None = None
@@ -65,22 +74,35 @@ class GaitConfig:
 
 @dataclass(frozen=True)
 class TuneConfig:
-    """Table `[tune]`: what is sought, what moves within which bounds, what is to be kept."""
+    """Table `[tune]`: what is sought, what moves within which bounds, what is to be kept.
+
+    - `objective`: a measure, or weights of several, { dls_fraction = 1.0, speed = 0.1 };
+    - `bounds`: table [tune.bounds], of the free parameters, as damping = [20.0, 215.0];
+    - `constraints`: table [tune.constraints], least values of measures; without it every premise
+      that the rung can keep;
+    - `evaluations`: gaits, at most.
+    """
 
     objective: str | Mapping[str, float] = "dls_fraction"
-    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # of free parameters
-    constraints: Mapping[str, float] | None = None  # None: every premise the rung can keep
-    evaluations: int = 200  # at most
+    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    constraints: Mapping[str, float] | None = None
+    evaluations: int = 200
 
 
 @dataclass(frozen=True)
 class BranchConfig:
-    """Table `[branch]`: along which parameter gaits are followed, and within what."""
+    """Table `[branch]`: along which parameter gaits are followed, and within what.
+
+    - `parameter`: its name;
+    - `bounds`: its range, [lower, upper];
+    - `period`: steps until the gait repeats;
+    - `largest_step`: between points, as a share of the range; 0.02 without it.
+    """
 
     parameter: str
     bounds: tuple[float, float]
-    period: int = 1  # steps until the gait repeats
-    largest_step: float | None = None  # share of the range; None: the continuation's default
+    period: int = 1
+    largest_step: float | None = None
 
 
 @dataclass(frozen=True)

@@ -79,6 +79,11 @@ class Steps(AbstractTold):
     - `engine`: that computed it: "lanes", "diffrax" or "collocation";
     - `solvers`: the named one first;
     - `derivatives`: by what was asked for.
+
+    Examples:
+        >>> params, states = vrw.WheelParams(damping=150.0), np.tile(vrw.paper_start(), (3, 1))
+        >>> vrw.steps(params, states).outcome.tolist()
+        [0, 0, 0]
     """
 
     section_state: Float[Array, "lanes section"]
@@ -142,6 +147,28 @@ def steps(
     the rung's own too, shape (lanes, 4 + 3 n), and the only engine is "lanes".
 
     Not for use inside `jax.jit`: it compiles itself, once.
+
+    Args:
+        params: the wheels; fields are scalars or of shape (lanes,).
+        states: section states, shape (lanes, 3), rad, rad/s, m/s; on real ground its own too.
+        n_steps: at most so many.
+        model: the rung; the paper's, `ViscoelasticWheel()`, by default.
+        options: numerical choices of the steps.
+        engine: "auto", "lanes", "diffrax" or "collocation", as above.
+        durations: of the phases, shape (lanes, 3), s, for "collocation".
+        derivatives: "section_state" and names of parameters.
+
+    Returns:
+        `Steps`, of the last step of each lane.
+
+    Raises:
+        TypeError, ValueError: an argument that can't be meant, in one sentence.
+
+    Examples:
+        >>> params = vrw.WheelParams(damping=np.array([120.0, 150.0, 180.0]))
+        >>> found = vrw.steps(params, np.tile(vrw.paper_start(), (3, 1)), 10)
+        >>> found.durations.shape, found.n_stepped.tolist(), found.engine
+        ((3, 3), [10, 10, 10], 'lanes')
     """
     untraced("vrw.steps", "map vrw.return_map over the lanes", params, states, durations)
     instance("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")

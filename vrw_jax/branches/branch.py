@@ -49,7 +49,14 @@ class Border:
     monitor `name` is zero) or "lost" (the order of events changes: `name` says which).
 
     - `value`: of the parameter;
-    - `point`: beside it, on the side that belongs to the branch.
+    - `point`: beside it, on the side that belongs to the branch;
+    - `ends_branch`: whether the branch goes no further;
+    - `find_cycle`: finds the gait there, as the property `cycle`.
+
+    Examples:
+        >>> branch = vrw.continue_map(lambda _, x, r: r * x * (1.0 - x), [0.6], 2.5, (2.0, 3.5))
+        >>> print(branch.borders[0].kind, branch.borders[0].ends_branch)
+        period_doubling False
     """
 
     kind: str
@@ -77,7 +84,14 @@ class Branch:
     `dataset` has the dimension `point`; the parameter is a coordinate on it, which turns back at
     folds. `ends` says for the branch's first and last point why it was followed no further.
 
+    - `parameter`: its name;
+    - `borders`: each a `Border`;
     - `outcome`: NO_CYCLE_FOUND or BAD_INPUT if there was none to start from.
+
+    Examples:
+        >>> branch = vrw.continue_map(lambda _, x, r: r * x * (1.0 - x), [0.6], 2.5, (2.0, 3.5))
+        >>> branch.parameter, branch.ends
+        ('parameter', ("The parameter's range ended.", "The parameter's range ended."))
     """
 
     parameter: str

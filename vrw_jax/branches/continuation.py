@@ -148,6 +148,28 @@ def continue_branch(
     Other rungs' gaits are fixed points of their own return map, as exact as `step_options`. On real
     ground `name` may be "friction" too, and the start is a `WalkedCycle` or, without one, where a
     walk of some steps ends; a branch goes on where the order of events changes, with a kink.
+
+    Args:
+        params: the wheel, one; the branch goes through its gait.
+        name: of the parameter that is followed.
+        bounds: its range.
+        cycle: the gait at `params`, if it is known.
+        period_n: steps until the gaits repeat.
+        model: the rung; the paper's, `ViscoelasticWheel()`, by default.
+        options: `ArclengthOptions` of the branch.
+        cycle_options: of the gaits.
+        step_options: of the checking steps, and of other rungs' gaits.
+
+    Returns:
+        A `Branch`; without a gait to start from its `outcome` says so.
+
+    Raises:
+        TypeError, ValueError: an argument that can't be meant, in one sentence.
+
+    Examples:
+        >>> branch = vrw.continue_branch(vrw.WheelParams(), "damping", (190.0, 230.0))
+        >>> print(branch.borders[-1].name, f"{branch.borders[-1].value:.6f}", branch.ends[1])
+        lambda_4_plus 219.847688 lambda 4 plus at 219.847688 ends it.
     """
     one_wheel(params, "use vrw.continue_branches for a batch")
     if cycle is not None:
@@ -176,6 +198,30 @@ def continue_branches(
     """`continue_branch` of a batch of wheels side by side; every parameter has one leading axis.
 
     A wheel without a limit cycle to start from gets a branch without points, whose outcome says so.
+
+    Args:
+        params: the wheels; every field of shape (lanes,).
+        name: of the parameter that is followed.
+        bounds: its range.
+        cycle: the gaits at `params`, if they are known.
+        period_n: steps until the gaits repeat.
+        model: the rung; the paper's, `ViscoelasticWheel()`, by default.
+        options: `ArclengthOptions` of the branches.
+        cycle_options: of the gaits.
+        step_options: as in `continue_branch`.
+
+    Returns:
+        One `Branch` for each lane.
+
+    Raises:
+        TypeError, ValueError: an argument that can't be meant, in one sentence.
+
+    Examples:
+        >>> wheel = vrw.WheelParams(damping=np.array([205.0, 210.0]))
+        >>> wheels = jax.tree.map(lambda v: jnp.broadcast_to(v, (2,)), wheel)
+        >>> branches = vrw.continue_branches(wheels, "damping", (200.0, 230.0))
+        >>> [round(branch.borders[-1].value, 4) for branch in branches]
+        [219.8477, 219.8477]
     """
     untraced("vrw.continue_branch", "differentiate vrw.limit_cycle", params, cycle)
     instance("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
@@ -336,6 +382,27 @@ def continue_map(
 
     The map must be differentiable forwards, and NaN where it is not defined. Its
     bifurcations are located as for `continue_branch`.
+
+    Args:
+        function: `function(constants, x, p)`, shape of `x`.
+        x: a fixed point, or near one, shape (n,).
+        p: the parameter there.
+        bounds: its range.
+        constants: any pytree, handed on.
+        name: of the parameter in the result.
+        options: `ArclengthOptions` of the branch.
+
+    Returns:
+        A `Branch`.
+
+    Raises:
+        TypeError, ValueError: an argument that can't be meant, in one sentence.
+
+    Examples:
+        >>> logistic = lambda _, x, r: r * x * (1.0 - x)
+        >>> branch = vrw.continue_map(logistic, [0.6], 2.5, (2.0, 3.5))
+        >>> [(border.kind, round(border.value, 6)) for border in branch.borders]
+        [('period_doubling', 3.0)]
     """
     function_of("function", function, "of constants, x and p")
     untraced("vrw.continue_map", "use vrw.newton_cycle", x, p, constants)

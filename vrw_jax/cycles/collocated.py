@@ -60,7 +60,13 @@ class LimitCycle(AbstractCycle):
     - `passes`: linearised passes that the search took;
     - `parameters`: in the order of params.PARAMETER_NAMES;
     - `located`: the solution itself: a start for neighbours;
-    - `matrix`: value of the monodromy matrix, without derivative.
+    - `matrix`: value of the monodromy matrix, without derivative;
+    - `problem`, `model`: what it is a gait of, and the rung.
+
+    Examples:
+        >>> cycle = vrw.limit_cycle(vrw.WheelParams())
+        >>> bool(cycle.found), cycle.multipliers.round(3).tolist()
+        (True, [(0.329+0j), (0.022-0j)])
     """
 
     section_state: SectionState

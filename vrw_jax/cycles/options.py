@@ -21,6 +21,10 @@ class CycleOptions:
     - `first_iterations`: after which a batch gathers the wheels that need more;
     - `stages`: of a homotopy from Table 1, where the first attempt fails;
     - `block`: wheels that are solved side by side.
+
+    Examples:
+        >>> vrw.CycleOptions(steps=(20, 16, 6)).steps  # a finer mesh, for long steps
+        (20, 16, 6)
     """
 
     steps: tuple[int, int, int] = (10, 8, 3)

@@ -55,6 +55,19 @@ def default_margins(params: WheelParams) -> Mapping[str, float]:
     """Least values of `PREMISES`: a thousandth of what their unit measures on this wheel.
 
     Not zero: at lambda_4_plus = 0, for one, the gait itself ends, and a search needs room.
+
+    Args:
+        params: the wheel, one.
+
+    Returns:
+        Measures by name, each with its least value in its unit.
+
+    Raises:
+        TypeError, ValueError: an argument that can't be meant, in one sentence.
+
+    Examples:
+        >>> round(vrw.default_margins(vrw.WheelParams())["lambda_4_plus"], 3)
+        0.177
     """
     mass = float(params.hub_mass + params.n_legs * params.leg_mass)
     length, gravity = float(params.locked_length), float(params.gravity)

@@ -40,6 +40,12 @@ class WalkedCycle(AbstractCycle):
     - `outcome`: Outcome.STEPPED, or why there is none;
     - `residual`: largest entry of map(x) - x, rad, rad/s or m/s;
     - `iterations`: of Newton's method.
+
+    Examples:
+        >>> wheel = vrw.RigidWheel(held_landing=True)
+        >>> cycle = vrw.limit_cycle(vrw.WheelParams(slope=0.1), model=wheel, guess=[0.39, 1.5, 0.0])
+        >>> print(f"{cycle.period:.3f} s")
+        0.425 s
     """
 
     section_state: Float[Array, " n_section"]

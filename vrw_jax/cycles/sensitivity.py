@@ -30,6 +30,24 @@ def sensitivities(
     measure is zero. Leaving out the measures of stability saves most of the compile time. `guess`,
     `model` and `options` are those of `limit_cycle`; "auto" takes the rung that serves the gait,
     and `attrs` say which. On real ground friction is a parameter too.
+
+    Args:
+        params: the wheel.
+        measures: their names; by default all that the rung's gait has.
+        guess: as in `limit_cycle`.
+        model: the rung; the paper's, `ViscoelasticWheel()`, by default.
+        options: as in `limit_cycle`.
+
+    Returns:
+        A dataset of `value` (measure), `derivative` and `elasticity` (measure, parameter).
+
+    Raises:
+        TypeError, ValueError: an argument that can't be meant, in one sentence.
+
+    Examples:
+        >>> table = vrw.sensitivities(vrw.WheelParams(), measures=["dls_fraction", "speed"])
+        >>> round(float(table.elasticity.sel(measure="speed", parameter="slope")), 3)
+        1.887
     """
     untraced("vrw.sensitivities", "differentiate vrw.limit_cycle", params, guess)
     model = serving(params, model)

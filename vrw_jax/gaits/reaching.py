@@ -108,6 +108,29 @@ def limit_cycle(
     "slowest", the "fastest" or a place in their list, slowest first. `limit_cycles` tells all.
     "auto" is the lowest rung whose premises the gait keeps on its ground: a `LimitCycle` is the
     paper's, a `WalkedCycle` that of real ground.
+
+    Args:
+        params: the wheel.
+        guess: a neighbour's cycle, or a section state near the gait.
+        period_n: steps until the gait repeats.
+        model: the rung; the paper's, `ViscoelasticWheel()`, by default.
+        options: `CycleOptions`; on other rungs `Options` of the step.
+        lost: what stands where there is no gait, "zeros" or "nan".
+        which: on real ground "slowest", "fastest", or a place in the list, slowest first.
+
+    Returns:
+        A `LimitCycle`; a `WalkedCycle` on other rungs.
+
+    Raises:
+        TypeError, ValueError: an argument that can't be meant, in one sentence.
+
+    Examples:
+        >>> cycle = vrw.limit_cycle(vrw.WheelParams())
+        >>> print(f"{cycle.dls_fraction:.4f} {cycle.speed:.4f} m/s")
+        0.5315 0.8700 m/s
+        >>> slope = jax.grad(lambda p: vrw.limit_cycle(p).dls_fraction)(vrw.WheelParams())
+        >>> print(f"{slope.damping:.6f} per N s/m")
+        0.000115 per N s/m
     """
     place_in_list(which)
     model = cycles.serving(params, model)
@@ -134,6 +157,24 @@ def limit_cycles(
 
     The result's fields have it too. All are told on one mesh, as fine as any of them needs. Of one
     wheel on real ground all gaits that attract, slowest first.
+
+    Args:
+        params: the wheels; fields are scalars or of shape (lanes,).
+        period_n: steps until the gaits repeat.
+        model: the rung; the paper's, `ViscoelasticWheel()`, by default.
+        options: as in `limit_cycle`.
+        which: as in `limit_cycle`, for batches.
+
+    Returns:
+        A `LimitCycle` or `WalkedCycle` whose fields have a leading axis of lanes.
+
+    Raises:
+        TypeError, ValueError: an argument that can't be meant, in one sentence.
+
+    Examples:
+        >>> cycles = vrw.limit_cycles(vrw.WheelParams(damping=np.array([100.0, 150.0, 300.0])))
+        >>> cycles.found.tolist(), cycles.period.round(3).tolist()
+        ([True, True, False], [0.595, 0.6980000000000001, 0.0])
     """
     place_in_list(which)
     shape = np.broadcast_shapes(*(np.shape(x) for x in jax.tree.leaves(params)))

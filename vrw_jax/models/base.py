@@ -43,6 +43,11 @@ class Indicators(AbstractMeasured):
     - `lambda_I4`: normal impulse of the rear foot in the landing, both feet held, N s;
     - `lambda_2`: normal force of the fore foot just after it, N;
     - `lambda_4`: normal force of the rear foot just after it, N.
+
+    Examples:
+        >>> indicators = vrw.limit_cycle(vrw.WheelParams()).indicators
+        >>> print(f"{indicators.lambda_4:.2f} N")
+        9.47 N
     """
 
     named: ClassVar = {"lambda_2": "lambda_2_plus", "lambda_4": "lambda_4_plus"}
@@ -53,7 +58,16 @@ class Indicators(AbstractMeasured):
 
 
 class EnergyLoss(AbstractMeasured):
-    """Mechanical energy lost in the step, J, each positive when lost."""
+    """Mechanical energy lost in the step, J, each positive when lost.
+
+    - `landing`, `stopper`: in the two collisions;
+    - `damping`: in the legs' dampers.
+
+    Examples:
+        >>> step = vrw.step(vrw.WheelParams(damping=150.0), vrw.paper_start())
+        >>> print(f"{step.energy.landing:.1f} J, {step.energy.damping:.1f} J")
+        7.4 J, 26.2 J
+    """
 
     named: ClassVar = {name: f"energy_lost_{name}" for name in ("landing", "stopper", "damping")}
 
@@ -85,6 +99,11 @@ class Margins(AbstractMeasured):
     - `hit_planted_impulse`: normal impulse of the planted foot then, N s;
     - `landing_friction_fore`: friction left at the fore foot in the landing impulse;
     - `landing_friction_rear`: friction left at the rear foot in the landing impulse.
+
+    Examples:
+        >>> x = vrw.limit_cycle(vrw.WheelParams()).section_state
+        >>> print(f"{vrw.step(vrw.WheelParams(), x).monitors.friction_rear:.2f}")
+        -13.22
     """
 
     named: ClassVar = {}
@@ -210,9 +229,15 @@ class StepResult(AbstractStep):
     - `post_impact`: (theta, dtheta) just after the opening landing, rad, rad/s;
     - `durations`: of DLS, SLS-I, SLS-II, s;
     - `step_length`: distance between the feet at the opening landing, m;
+    - `indicators`, `monitors`, `energy`: `Indicators`, `Margins` and `EnergyLoss` of the step;
     - `outcome`: an Outcome;
     - `solver_steps`: tried by the integrator;
     - `engine`: that took the step, see `Options`.
+
+    Examples:
+        >>> step = vrw.step(vrw.WheelParams(damping=150.0), vrw.paper_start())
+        >>> print(f"{step.dls_fraction:.3f} {step.monitors.clearance_sls1:.3f} m")
+        0.548 0.060 m
     """
 
     section_state: SectionState
@@ -274,6 +299,10 @@ class AbstractWheel(eqx.Module):
     """A rung of the model ladder. Rungs are final; the code above knows this face alone.
 
     `advance` and `step` compile themselves, once for each structure of their arguments.
+
+    Examples:
+        >>> isinstance(vrw.RigidWheel(), vrw.AbstractWheel)
+        True
     """
 
     rung: eqx.AbstractClassVar[str]

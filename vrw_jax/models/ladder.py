@@ -77,7 +77,13 @@ class ModelChoice(AbstractTold):
     and minus the paper's outcome where that rung's step does not reach a touchdown.
 
     - `rung`: VISCOELASTIC or UNILATERAL;
-    - `margins`: of PREMISES, negative where broken.
+    - `margins`: of PREMISES, negative where broken;
+    - `friction`: coefficient of the ground.
+
+    Examples:
+        >>> x = vrw.limit_cycle(vrw.WheelParams()).section_state
+        >>> vrw.choose_model(vrw.WheelParams(), x, friction=50.0).margins.shape
+        (8,)
     """
 
     rung: Int[Array, ""]
@@ -135,6 +141,7 @@ def reason_of(told: Mapping[str, Any], more_friction: Any) -> tuple[Array, Array
 class LadderStep(AbstractGroundStep):
     """One step by the lowest rung that serves, told alike for both. Batched under vmap.
 
+    - `choice`: which rung served, and why;
     - `section_state`: just before the next landing; zeros if there was none;
     - `post_impact`: (theta, dtheta) just after the opening landing, rad, rad/s;
     - `durations`: with two feet loaded, with one, with none, s;
@@ -145,6 +152,12 @@ class LadderStep(AbstractGroundStep):
     - `slip`: path of sliding feet, m;
     - `outcome`: an Outcome;
     - `solver_steps`: tried by the integrator, on both rungs.
+
+    Examples:
+        >>> x = vrw.limit_cycle(vrw.WheelParams()).section_state
+        >>> step = vrw.step(vrw.WheelParams(), x, model=vrw.LadderWheel(friction=50.0))
+        >>> print(f"{step.dls_fraction:.3f}")
+        0.532
     """
 
     choice: ModelChoice
@@ -167,6 +180,15 @@ class LadderWheel(AbstractWheel):
     """The paper's wheel where it serves, the wheel on real ground of this `friction` elsewhere.
 
     Section states are those of `UnilateralWheel`; the paper's three numbers may be given.
+
+    - `friction`: coefficient of the ground, `inf` for feet that never slide.
+
+    Examples:
+        >>> wheel = vrw.LadderWheel(friction=50.0)
+        >>> x = vrw.limit_cycle(vrw.WheelParams()).section_state
+        >>> step = vrw.step(vrw.WheelParams(), x, model=wheel)
+        >>> step.choice.why
+        "The paper's wheel serves: all its premises hold over this step."
     """
 
     rung: ClassVar[str] = "ladder"

@@ -43,10 +43,20 @@ class RigidWheel(AbstractWheel):
     """Rimless wheel with rigid legs and leg masses; the springs, dampers and L* play no part.
 
     The section state is (alpha/2, dtheta-, 0): only the rate is free, and what a start says
-    otherwise is ignored. The whole step counts as SLS-II. `held_landing` False is the classic
-    landing, whose rear foot leaves without an impulse (angular momentum about the new foot is
-    kept). True is the stiff limit of the paper's own landing (A4), whose rear foot is held during
-    the impulse: the limit of `ViscoelasticWheel` as docs/physics.md derives it.
+    otherwise is ignored. The whole step counts as SLS-II.
+
+    - `friction`: coefficient of the ground that friction margins refer to; the motion ignores it;
+    - `stop_at_lift_off`: end a step where the ground would have to pull;
+    - `held_landing`: False is the classic landing, whose rear foot leaves without an impulse
+      (angular momentum about the new foot is kept); True is the stiff limit of the paper's own
+      landing (A4), whose rear foot is held during the impulse: the limit of `ViscoelasticWheel` as
+      docs/physics.md derives it.
+
+    Examples:
+        >>> params = vrw.WheelParams(slope=0.15)
+        >>> step = vrw.step(params, [np.pi / 8, 1.5, 0.0], model=vrw.RigidWheel())
+        >>> print(f"{step.period:.3f} s")
+        0.705 s
     """
 
     rung: ClassVar[str] = "rigid"

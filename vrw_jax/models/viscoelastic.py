@@ -105,10 +105,16 @@ def _run(
 class ViscoelasticWheel(AbstractWheel):
     """The paper's rung: roles fixed, no slip, no scuffing; its premises are measured, not enforced.
 
-    `stop_at_lift_off`: end a step where the ground would have to pull on Leg 1 (bouncing, which the
-    rung can't model). False continues formally, as the paper does for scuffing, and leaves it to
-    the monitors. `friction` is the coefficient of the ground that friction margins refer to; the
-    motion does not use it.
+    - `friction`: coefficient of the ground that friction margins refer to; the motion ignores it;
+    - `stop_at_lift_off`: end a step where the ground would have to pull on Leg 1 (bouncing, which
+      the rung can't model); without it the step goes on formally, as the paper does for scuffing,
+      and the monitors tell.
+
+    Examples:
+        >>> wheel = vrw.ViscoelasticWheel(friction=20.0)
+        >>> step = vrw.step(vrw.WheelParams(), vrw.paper_start(), model=wheel)
+        >>> print(f"{step.monitors.friction_fore:.1f}")
+        19.4
     """
 
     rung: ClassVar[str] = "viscoelastic"

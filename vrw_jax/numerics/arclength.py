@@ -39,6 +39,10 @@ class ArclengthOptions:
     - `iterations`: of Newton's method for one point;
     - `tolerance`: of Newton's last correction;
     - `turn`: most that the branch may turn in one step, rad.
+
+    Examples:
+        >>> vrw.ArclengthOptions(largest_step=0.05).max_points
+        400
     """
 
     first_step: float = 0.005

@@ -44,6 +44,11 @@ class Options(AbstractTold):
     - `first_step`: of each phase, s;
     - `event_steps`: at most so many to locate an event;
     - `monitor_steps`: secant re-steps to a monitor's minimum.
+
+    Examples:
+        >>> options = vrw.Options(rtol=1e-8, atol=1e-8)
+        >>> vrw.step(vrw.WheelParams(), vrw.paper_start(), options=options).engine
+        'lanes'
     """
 
     solver: str = eqx.field(static=True, default="Dopri8")

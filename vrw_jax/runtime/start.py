@@ -13,6 +13,18 @@ def start_jax(cache: str | Path | None = None) -> None:
     To be called before the first array is made; nothing here needs it, but processes start in a
     fraction of the time. Without `cache` it is the folder that JAX_COMPILATION_CACHE_DIR names, or
     else one of the user's cache folder.
+
+    Args:
+        cache: folder of compiled code.
+
+    Returns:
+        Nothing.
+
+    Raises:
+        TypeError: a `cache` that is no path.
+
+    Examples:
+        >>> vrw.start_jax("~/.cache/vrw_jax")  # doctest: +SKIP
     """
     jax.config.update("jax_enable_x64", True)
     if cache is not None or "JAX_COMPILATION_CACHE_DIR" not in os.environ:

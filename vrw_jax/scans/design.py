@@ -123,7 +123,21 @@ class Samples(AbstractDesign):
 
 
 def grid(**values: Sequence[float] | np.ndarray) -> Grid:
-    """Every combination of the values of each parameter, e.g. `grid(damping=..., slope=...)`."""
+    """Every combination of the values of each parameter, e.g. `grid(damping=..., slope=...)`.
+
+    Args:
+        **values: of each parameter, any sequence of numbers.
+
+    Returns:
+        A design whose axes are the parameters.
+
+    Raises:
+        TypeError, ValueError: an argument that can't be meant, in one sentence.
+
+    Examples:
+        >>> vrw.grid(damping=[100.0, 150.0], slope=np.linspace(0.28, 0.32, 5)).shape
+        (2, 5)
+    """
     columns = {name: _column(name, value) for name, value in _known(values).items()}
     for name, column in columns.items():
         if len(np.unique(column)) != len(column):
@@ -138,6 +152,19 @@ def samples(values: Mapping[str, Sequence[float] | np.ndarray]) -> Samples:
     """The samples given, e.g. `samples({"damping": [100, 150], "slope": [0.29, 0.30]})`.
 
     A sample out of a parameter's domain, or not finite, gets the outcome BAD_INPUT.
+
+    Args:
+        values: of each parameter, all of one length.
+
+    Returns:
+        A design over `sample`.
+
+    Raises:
+        TypeError, ValueError: an argument that can't be meant, in one sentence.
+
+    Examples:
+        >>> vrw.samples({"damping": [100.0, 150.0], "slope": [0.29, 0.30]}).shape
+        (2,)
     """
     columns = {name: _column(name, value) for name, value in _known(values).items()}
     lengths = {name: len(column) for name, column in columns.items()}
@@ -150,7 +177,23 @@ def samples(values: Mapping[str, Sequence[float] | np.ndarray]) -> Samples:
 
 
 def sobol(ranges: Mapping[str, Range], n: int, seed: int = 0) -> Samples:
-    """`n` samples of a scrambled Sobol' sequence; even spread is best where n is a power of 2."""
+    """`n` samples of a scrambled Sobol' sequence; even spread is best where n is a power of 2.
+
+    Args:
+        ranges: lower and upper, of each parameter.
+        n: number of samples.
+        seed: of the sequence.
+
+    Returns:
+        A design over `sample`.
+
+    Raises:
+        TypeError, ValueError: an argument that can't be meant, in one sentence.
+
+    Examples:
+        >>> vrw.sobol({"damping": (100.0, 200.0), "slope": (0.28, 0.32)}, 8).shape
+        (8,)
+    """
     from scipy.stats import qmc  # only drawing needs it, and its import is slow
 
     names, lower, upper = _box(ranges, n)
@@ -160,7 +203,23 @@ def sobol(ranges: Mapping[str, Range], n: int, seed: int = 0) -> Samples:
 
 
 def uniform(ranges: Mapping[str, Range], n: int, seed: int = 0) -> Samples:
-    """`n` independent samples, uniform over the box."""
+    """`n` independent samples, uniform over the box.
+
+    Args:
+        ranges: lower and upper, of each parameter.
+        n: number of samples.
+        seed: of the sequence.
+
+    Returns:
+        A design over `sample`.
+
+    Raises:
+        TypeError, ValueError: an argument that can't be meant, in one sentence.
+
+    Examples:
+        >>> vrw.uniform({"damping": (100.0, 200.0), "slope": (0.28, 0.32)}, 8).shape
+        (8,)
+    """
     names, lower, upper = _box(ranges, n)
     points = _generator(seed).random((n, len(names)))
     return _spread(names, lower, upper, points, "uniform")
@@ -171,6 +230,21 @@ def saltelli(ranges: Mapping[str, Range], n: int, seed: int = 0) -> Samples:
 
     A row holds two independent points of the box, A and B, and A with each coordinate in turn taken
     from B. Samples are ordered A, B, then by parameter.
+
+    Args:
+        ranges: lower and upper, of each parameter.
+        n: number of rows, a power of two.
+        seed: of the sequence.
+
+    Returns:
+        A design over `sample`.
+
+    Raises:
+        TypeError, ValueError: an argument that can't be meant, in one sentence.
+
+    Examples:
+        >>> vrw.saltelli({"damping": (100.0, 180.0), "slope": (0.27, 0.29)}, 8).shape
+        (32,)
     """
     from scipy.stats import qmc  # only drawing needs it, and its import is slow
 

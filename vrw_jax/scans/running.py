@@ -70,6 +70,30 @@ def scan(
     lowest rung that serves, with `rung` and `reason`; both take `friction` as a swept parameter.
     `dask` is the address of a cluster that computes in this process' stead, "local" for one started
     here.
+
+    Args:
+        design: the samples, of `grid`, `samples`, `sobol`, `uniform` or `saltelli`.
+        measures: names of what is told; by default DLS fraction, speed and the like.
+        base: the wheel of what is not swept; Table 1 by default.
+        model: the rung; "auto" for each sample's lowest.
+        options: of the checking steps.
+        cycle_options: of the gaits.
+        store: folder to keep it in.
+        chunk: samples written at a time; 4,096 by default.
+        report: told the progress after each chunk.
+        dask: address of a cluster, or "local".
+
+    Returns:
+        A dataset over the design's axes.
+
+    Raises:
+        TypeError, ValueError: an argument that can't be meant, in one sentence.
+        StoreError: a store of other settings, or one that another process writes.
+
+    Examples:
+        >>> found = vrw.scan(vrw.grid(damping=[150.0, 300.0]), ["speed"])
+        >>> found.speed.round(3).values.tolist(), found.outcome.values.tolist()
+        ([1.018, nan], [0, 14])
     """
     planned = plan(
         design,

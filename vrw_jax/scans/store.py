@@ -231,6 +231,24 @@ def open_scan(path: str | Path, *, verify: bool = True) -> xr.Dataset:
 
     Where a scan isn't finished, samples not computed yet have the outcome -1 and NaN elsewhere. A
     store with damaged files is refused; `verify=False` opens it to read what can be read.
+
+    Args:
+        path: the store's folder.
+        verify: whether each chunk's files are compared with their digest.
+
+    Returns:
+        The dataset that `scan` returns.
+
+    Raises:
+        FileNotFoundError: no store there.
+        StoreError: a store with damaged files.
+
+    Examples:
+        >>> design = vrw.grid(damping=[150.0, 300.0])
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = f"{folder}/scan.zarr"
+        ...     found = vrw.scan(design, ["speed"], store=path).load()
+        ...     xr.testing.assert_identical(vrw.open_scan(path).speed.load(), found.speed)
     """
     group = _require_scan(Path(path))
     books = Books(Path(path), group)

@@ -78,18 +78,41 @@ def tune(
 ) -> Tuned:
     """The wheel near `params` whose gait has the largest objective and keeps its constraints.
 
-    `objective`: a measure's name, weights of several, or a function of a LimitCycle (and, if it
-    takes two arguments, of the StepResult from it); it is maximised. `free` parameters move within
-    their `bounds`. `constraints`: least values of measures by name; names alone mean zero; the
-    default is every premise that gaits of this rung can keep (`premises.default_margins`), {} is
-    none. `tolerance` is on the first-order condition, relative to the objective's gradient; a
-    constraint counts as kept within 1e-6 of what it changes over the bounds. Local: it ends at an
-    optimum of the branch that `params` lies on. With `n_starts` above 1 so many wheels, `params`
-    and random ones within the bounds, first take N_EXPLORED first-order steps side by side, and the
-    best is climbed from. On real ground (`UnilateralWheel`) the objective is a measure of a step
-    there or weights of several, without constraints by default, and the start walks to its gait.
-    "auto" climbs on the rung that serves the start's gait: on the paper's its premises are the
-    constraints, so that it still serves.
+    The default constraints are every premise that gaits of this rung can keep
+    (`premises.default_margins`), {} is none. A constraint counts as kept within 1e-6 of what it
+    changes over the bounds. Local: it ends at an optimum of the branch that `params` lies on. With
+    `n_starts` above 1 so many wheels, `params` and random ones within the bounds, first take
+    N_EXPLORED first-order steps side by side, and the best is climbed from. On real ground
+    (`UnilateralWheel`) the objective is a measure of a step there or weights of several, without
+    constraints by default, and the start walks to its gait. "auto" climbs on the rung that serves
+    the start's gait: on the paper's its premises are the constraints, so that it still serves.
+
+    Args:
+        params: the start, one wheel.
+        objective: what is maximised: a measure's name, weights of several, or a function of a
+            LimitCycle (and, if it takes two arguments, of the StepResult from it).
+        free: names of the parameters that may move.
+        bounds: lower and upper, of each free parameter.
+        constraints: least values of measures by name; names alone mean zero.
+        model: the rung; the paper's, `ViscoelasticWheel()`, by default.
+        options: of the steps.
+        cycle_options: of the gaits.
+        tolerance: on the first-order condition, relative to the objective's gradient.
+        max_evaluations: gaits at most.
+        n_starts: climbed from the best of so many.
+        seed: of the random starts.
+
+    Returns:
+        A `Tuned`, whose `ending` says whether it is an optimum.
+
+    Raises:
+        TypeError, ValueError: an argument that can't be meant, in one sentence.
+
+    Examples:
+        >>> bounds = {"damping": (100.0, 215.0)}
+        >>> tuned = vrw.tune(vrw.WheelParams(), "dls_fraction", ["damping"], bounds)
+        >>> print(tuned.ending.name, f"{tuned.value:.3f}", [active.name for active in tuned.active])
+        CONVERGED 0.534 ['damping']
     """
     untraced("vrw.tune", "climb by your own loop over vrw.limit_cycle", params)
     max_evaluations, n_starts = (

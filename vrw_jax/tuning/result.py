@@ -43,6 +43,11 @@ class Walked(NamedTuple):
 class Tuned:
     """A tuned gait, how it was come by, and what holds it there.
 
+    - `params`: the wheel;
+    - `ending`: how the climb ended;
+    - `objective`, `value`, `start_value`: its name, its value here and at the start;
+    - `active`: constraints and bounds that hold the optimum, each with its price;
+    - `walked`: what ten steps of the wheel came to;
     - `cycle`: LimitCycle, or WalkedCycle on real ground;
     - `step`: StepResult, or UnilateralStep;
     - `kkt_residual`: of the first-order condition, relative to the objective's gradient;
@@ -53,6 +58,12 @@ class Tuned:
     - `seconds`: of which `compile_seconds` went to compiling;
     - `compile_seconds`: and to exploring, if there were many starts;
     - `lanes`: where many starts got to before the climb.
+
+    Examples:
+        >>> bounds = {"damping": (100.0, 215.0)}
+        >>> tuned = vrw.tune(vrw.WheelParams(), "dls_fraction", ["damping"], bounds)
+        >>> print(f"{tuned.params.damping:.1f} N s/m, {bool(tuned.cycle.found)}")
+        215.0 N s/m, True
     """
 
     params: WheelParams

@@ -52,6 +52,28 @@ def basin(
 
     The orbits stand in `orbit_state` over (attractor_index, orbit_step), the one with most starts
     first, with their `orbit_period` in steps, DLS fraction and least margins.
+
+    Args:
+        params: the wheel.
+        grid: a value or values for each of three coordinates of a start, by name.
+        model: the rung; the paper's, `ViscoelasticWheel()`, by default.
+        options: numerical choices of the steps.
+        engine: who takes the steps, see `Options`.
+        most_steps: that a walk may take.
+        longest_period: of an orbit that is recognised, steps.
+
+    Returns:
+        A dataset over the axes of `grid`.
+
+    Raises:
+        TypeError, ValueError: an argument that can't be meant, in one sentence.
+
+    Examples:
+        >>> starts = {"theta_touchdown": 0.09, "dtheta_touchdown": [1.4, 1.6]}
+        >>> starts |= {"dL1_touchdown": -0.1}
+        >>> found = vrw.basin(vrw.WheelParams(damping=150.0), starts)
+        >>> found.attractor.values.tolist()
+        [0, 0]
     """
     model, options = _checked(params, model, options)
     options = options.by(engine)

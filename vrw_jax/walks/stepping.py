@@ -37,7 +37,15 @@ ModelLike = AbstractWheel | Literal["auto"]
 
 
 def paper_start() -> SectionState:
-    """A section state (theta-, dtheta-, dL1-) inside the basin of the gait of Table 1."""
+    """A section state (theta-, dtheta-, dL1-) inside the basin of the gait of Table 1.
+
+    Returns:
+        Shape (3,), rad, rad/s, m/s.
+
+    Examples:
+        >>> vrw.paper_start().round(4).tolist()
+        [0.1, 1.6, -0.1]
+    """
     return ViscoelasticWheel().start(WheelParams())
 
 
@@ -152,6 +160,25 @@ def step(
     `x` is (theta-, dtheta-, dL1-) just before touchdown, in rad, rad/s, m/s. How the step ended is
     its `outcome`; nothing is raised for a wheel that falls. Errors: below 1e-9 at the default
     options and 1e-12 at `Options.tight()`, for values and first derivatives.
+
+    Args:
+        params: the wheel.
+        x: section state (theta-, dtheta-, dL1-) just before touchdown, rad, rad/s, m/s.
+        model: the rung; the paper's, `ViscoelasticWheel()`, by default, "auto" for the lowest that
+            serves.
+        options: numerical choices of the steps.
+        engine: who takes the steps, see `Options`.
+
+    Returns:
+        A `StepResult`; a `UnilateralStep` on real ground, a `LadderStep` for "auto".
+
+    Raises:
+        TypeError, ValueError: an argument that can't be meant, in one sentence.
+
+    Examples:
+        >>> step = vrw.step(vrw.WheelParams(damping=150.0), vrw.paper_start())
+        >>> print(f"{step.period:.3f} s, {vrw.Outcome(int(step.outcome)).name}")
+        0.714 s, STEPPED
     """
     params, state, model, options = checked(params, x, model, options, engine)
     return model.step(params, state, options)
@@ -168,6 +195,27 @@ def return_map(
     """The section state one step later; all zeros (no section state) where the step failed.
 
     The lean path: no monitors are computed. Differentiable forwards and in reverse, to any order.
+
+    Args:
+        params: the wheel.
+        x: section state (theta-, dtheta-, dL1-) just before touchdown, rad, rad/s, m/s.
+        model: the rung; the paper's, `ViscoelasticWheel()`, by default, "auto" for the lowest that
+            serves.
+        options: numerical choices of the steps.
+        engine: who takes the steps, see `Options`.
+
+    Returns:
+        Shape of `x`.
+
+    Raises:
+        TypeError, ValueError: an argument that can't be meant, in one sentence.
+
+    Examples:
+        >>> params, x = vrw.WheelParams(damping=150.0), vrw.paper_start()
+        >>> vrw.return_map(params, x).round(4).tolist()
+        [0.091, 1.7355, -0.1587]
+        >>> jax.jacfwd(vrw.return_map, argnums=1)(params, x).shape
+        (3, 3)
     """
     params, state, model, options = checked(params, x, model, options, engine)
     return model.advance(params, state, options).section_state
@@ -176,7 +224,14 @@ def return_map(
 class Walk(AbstractTold):
     """Lean results of consecutive steps, with a leading axis over steps.
 
+    - `start`: the section state that it began with;
+    - `steps`: section state, durations and outcome of each step;
     - `n_stepped`: steps before the first that failed.
+
+    Examples:
+        >>> walk = vrw.walk(vrw.WheelParams(damping=150.0), vrw.paper_start(), 5)
+        >>> walk.steps.section_state.shape
+        (5, 3)
     """
 
     start: Array
@@ -239,7 +294,28 @@ def walk(
     options: Options | None = None,
     engine: Engine = "auto",
 ) -> Walk:
-    """`n_steps` steps, or as many as it can; the steps after a failure repeat its outcome."""
+    """`n_steps` steps, or as many as it can; the steps after a failure repeat its outcome.
+
+    Args:
+        params: the wheel.
+        x: section state (theta-, dtheta-, dL1-) just before touchdown, rad, rad/s, m/s.
+        n_steps: at most so many.
+        model: the rung; the paper's, `ViscoelasticWheel()`, by default, "auto" for the lowest that
+            serves.
+        options: numerical choices of the steps.
+        engine: who takes the steps, see `Options`.
+
+    Returns:
+        A `Walk`, whose fields have a leading axis over the steps.
+
+    Raises:
+        TypeError, ValueError: an argument that can't be meant, in one sentence.
+
+    Examples:
+        >>> walk = vrw.walk(vrw.WheelParams(damping=150.0), vrw.paper_start(), 5)
+        >>> int(walk.n_stepped), walk.steps.durations.shape
+        (5, (5, 3))
+    """
     n_steps = whole("n_steps", n_steps)
     params, state, model, options = checked(params, x, model, options, engine)
     return _walk(model, params, state, options, n_steps)

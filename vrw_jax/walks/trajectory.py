@@ -89,6 +89,28 @@ def simulate(
     Each phase has `n_samples` equal times, both ends included: an instant at which something jumps
     stands there twice, just before and just after it. A step that fails ends the trajectory at the
     event; the attributes `outcome` and `outcome_meaning` say why. Errors as in `vrw.step`.
+
+    Args:
+        params: the wheel.
+        x: section state (theta-, dtheta-, dL1-) just before touchdown, rad, rad/s, m/s.
+        n_steps: at most so many.
+        model: the rung; the paper's, `ViscoelasticWheel()`, by default, "auto" for the lowest that
+            serves.
+        options: numerical choices of the steps.
+        engine: who takes the steps, see `Options`.
+        n_samples: times of each phase, both ends included, at least 2.
+
+    Returns:
+        A dataset over `time`: coordinates, rates, feet, forces and energies, with units;
+        on real ground of each `leg`.
+
+    Raises:
+        TypeError, ValueError: an argument that can't be meant, in one sentence.
+
+    Examples:
+        >>> walk = vrw.simulate(vrw.WheelParams(damping=150.0), n_steps=1)
+        >>> walk.lambda_2.attrs["units"], walk.attrs["outcome"]
+        ('N', 'STEPPED')
     """
     untraced("vrw.simulate", "use vrw.walk", params, x)
     n_steps, n_samples = whole("n_steps", n_steps), whole("n_samples", n_samples, 2)

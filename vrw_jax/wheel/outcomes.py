@@ -4,7 +4,14 @@ from vrw_jax.numerics import Code
 
 
 class Outcome(Code):
-    """How a step ended. Only STEPPED leaves a section state; the others end the walk."""
+    """How a step ended. Only STEPPED leaves a section state; the others end the walk.
+
+    Examples:
+        >>> vrw.Outcome.FELL_BACK.meaning
+        'The wheel stopped rolling forward and would fall back.'
+        >>> vrw.Outcome(0).name
+        'STEPPED'
+    """
 
     STEPPED = 0, "The wheel stepped from touchdown to touchdown in the paper's sequence."
     TOUCHDOWN_BEFORE_STOPPER = (

@@ -94,6 +94,24 @@ class WheelParams(AbstractTold):
     All fields but `n_legs` are pytree leaves in SI units and may be swept and differentiated.
     The paper does not print g; 9.81 m/s^2 reproduces its numbers. A number out of its domain is
     refused here when it is a plain scalar; inside a batch it becomes `Outcome.BAD_INPUT`.
+
+    - `hub_mass`: m_H, mass of the body frame, in [0, 1e+09) kg;
+    - `leg_mass`: m, mass of one leg frame, a point, in [1e-15, 1e+09) kg;
+    - `leg_com`: a, distance from foot to the leg's mass, in [0, 1e+09) m;
+    - `locked_length`: L_0, length of a leg on its stopper, in [1e-15, 1e+09) m;
+    - `natural_length`: L*, length of the unloaded spring, in [1e-15, 1e+09) m;
+    - `stiffness`: k, spring constant of each leg, in [0, 1e+09) N/m;
+    - `damping`: c, viscous damping of each leg, in [0, 1e+09) N s/m;
+    - `slope`: phi, downhill slope, in (-1.5708, 1.5708) rad;
+    - `gravity`: g, gravitational acceleration, in [1e-15, 1e+09) m/s^2;
+    - `n_legs`: 5 and more, a whole number; angles between legs are 2 pi / n_legs.
+
+    Examples:
+        >>> params = vrw.WheelParams(damping=150.0)
+        >>> float(params.damping), params.n_legs
+        (150.0, 8)
+        >>> vrw.WheelParams(damping=np.linspace(100.0, 200.0, 3)).damping.shape
+        (3,)
     """
 
     hub_mass: Scalar = _quantity("hub_mass", 10.0)
@@ -231,10 +249,6 @@ def symbols_of(
         alpha=alpha,
     )
 
-
-WheelParams.__doc__ = (WheelParams.__doc__ or "").rstrip() + "\n".join(
-    ["\n"] + [f"    - `{name}`: {d.symbol}, {d.description}, in {d}" for name, d in DOMAINS.items()]
-)
 
 PARAMETER_NAMES: tuple[str, ...] = tuple(DOMAINS)
 FRICTION = "friction"

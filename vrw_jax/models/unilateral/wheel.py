@@ -90,9 +90,16 @@ class UnilateralStep(AbstractGroundStep):
     - `slip`: path of sliding feet, m;
     - `events`: contacts and stoppers that changed;
     - `impacts`: events in which velocities jumped;
-    - `fewest_solutions`: admissible combinations at an event: 1 where well posed;
+    - `fewest_solutions`, `most_solutions`: admissible combinations at an event: 1 where well posed;
+    - `monitors`: margins of what this rung presumes;
     - `outcome`: an Outcome;
     - `solver_steps`: tried by the integrator.
+
+    Examples:
+        >>> wheel = vrw.UnilateralWheel(friction=0.7)
+        >>> step = vrw.step(vrw.WheelParams(damping=300.0), vrw.paper_start(), model=wheel)
+        >>> print(f"{step.energy_friction:.1f} J lost by sliding")
+        1.3 J lost by sliding
     """
 
     section_state: FullState
@@ -167,13 +174,20 @@ def _restitution_of(value: Any) -> Array | None:
 class UnilateralWheel(AbstractWheel):
     """Feet on the ground push and slide by Coulomb's law; nothing has a fixed role.
 
-    `friction` is the coefficient of the ground, `math.inf` for feet that never slide. A leg in the
-    air that has met its stopper stays on it until its foot is loaded; with `stoppers="one-sided"`
-    it leaves as soon as the stopper would have to pull. `max_events` bounds the events of one step.
-    A foot that strikes comes back at `restitution` times its speed, as far as energy allows; in
-    None's place, as of 0, is a smaller program.
-    Infinite friction is the limit of large friction, or with `infinite="paper"` the rule of the
-    paper, (A1) to (A4), continued to where it stops.
+    - `friction`: coefficient of the ground, `inf` for feet that never slide;
+    - `max_events`: of one step;
+    - `stoppers`: "bilateral", a leg in the air that has met its stopper stays on it until its foot
+      is loaded; "one-sided", it leaves as soon as the stopper would have to pull;
+    - `restitution`: a foot that strikes comes back at so many times its speed, as far as energy
+      allows; None, as 0, is a smaller program;
+    - `infinite`: what infinite friction is: the limit of large friction, or with "paper" the rule of
+      the paper, (A1) to (A4), continued to where it stops.
+
+    Examples:
+        >>> wheel = vrw.UnilateralWheel(friction=0.7)
+        >>> step = vrw.step(vrw.WheelParams(damping=300.0), vrw.paper_start(), model=wheel)
+        >>> print(f"{step.slip:.2f} m of slip, {vrw.Outcome(int(step.outcome)).name}")
+        0.04 m of slip, STEPPED
     """
 
     rung: ClassVar[str] = "unilateral"

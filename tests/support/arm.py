@@ -1,0 +1,106 @@
+"""Machine code for arm64 run by an emulator: an object file at its place, and a call of it."""
+
+import struct
+from typing import NamedTuple
+
+import numpy as np
+
+CODE, DATA, STACK, END = 0x100000, 0x800000, 0xF00000, 0x10000
+MEMORY = 0x1000000
+PAGE = ~0xFFF
+
+
+class Section(NamedTuple):
+    """A section of an ELF file."""
+
+    kind: int
+    flags: int
+    offset: int
+    size: int
+    link: int
+    info: int
+
+
+def placed(code: bytes) -> tuple[bytes, dict[str, int]]:
+    """What lies from CODE on, addresses filled in, and where each symbol is."""
+    start, entry, count = *struct.unpack_from("<Q", code, 40), *struct.unpack_from("<HH", code, 58)
+    sections = [
+        Section(f[1], f[2], f[4], f[5], f[6], f[7])
+        for f in (struct.unpack_from("<IIQQQQIIQQ", code, start + entry * i) for i in range(count))
+    ]
+    memory, places = bytearray(), {}
+    for index, section in enumerate(sections):
+        if section.kind == 1 and section.flags & 2:  # code and data that are there at run time
+            memory += bytes(-len(memory) % 64)
+            places[index] = len(memory)
+            memory += code[section.offset : section.offset + section.size]
+    symbols = next(section for section in sections if section.kind == 2)
+    names = sections[symbols.link].offset
+    where, named = [], {}
+    for at in range(symbols.offset, symbols.offset + symbols.size, 24):
+        name, _, _, home, value, _ = struct.unpack_from("<IBBHQQ", code, at)
+        where.append(CODE + places.get(home, 0) + value if home in places else None)
+        text = code[names + name : code.index(b"\0", names + name)].decode()
+        named[text] = where[-1]
+    for section in sections:
+        if section.kind == 4 and section.info in places:
+            for at in range(section.offset, section.offset + section.size, 24):
+                offset, kind, addend = struct.unpack_from("<QQq", code, at)
+                target = where[kind >> 32]
+                assert target is not None, "the code calls a library"
+                relocate(memory, places[section.info] + offset, kind & 0xFFFFFFFF, target + addend)
+    return bytes(memory), named
+
+
+LOW = {277: 0, 278: 0, 284: 1, 285: 2, 286: 3, 299: 4}
+"""Twelve low bits of an address, in units of what is loaded: its logarithm."""
+
+
+def relocate(memory: bytearray, place: int, kind: int, target: int) -> None:
+    """One instruction, or number, that names an address."""
+    word = struct.unpack_from("<I", memory, place)[0]
+    here = CODE + place
+    if kind == 275:  # adrp
+        pages = ((target & PAGE) - (here & PAGE)) >> 12
+        word |= (pages & 3) << 29 | (pages >> 2 & 0x7FFFF) << 5
+    elif kind in LOW:
+        word |= (target & 0xFFF) >> LOW[kind] << 10
+    elif kind in (282, 283):  # b, bl
+        word |= (target - here) >> 2 & 0x3FFFFFF
+    elif kind == 261:
+        word = (target - here) & 0xFFFFFFFF
+    else:
+        raise NotImplementedError(f"relocation {kind}")
+    struct.pack_into("<I", memory, place, word)
+
+
+def run_lanes(code: bytes, given: list[np.ndarray], told: list[np.ndarray], width: int) -> None:
+    """`lanes(given, told, n, 0, n / width)` of `simd.kernel`, into the arrays `told`."""
+    from unicorn import UC_ARCH_ARM64, UC_MODE_ARM, Uc
+    from unicorn import arm64_const as arm
+
+    memory, named = placed(code)
+    emulator = Uc(UC_ARCH_ARM64, UC_MODE_ARM)
+    emulator.mem_map(0, MEMORY)
+    emulator.mem_write(CODE, memory)
+    free, lists = DATA, []
+    for arrays in (given, told):
+        pointers = []
+        for array in arrays:
+            emulator.mem_write(free, array.tobytes())
+            pointers.append(free)
+            free += array.nbytes + 64
+        lists.append(free)
+        emulator.mem_write(free, struct.pack(f"<{len(pointers)}Q", *pointers))
+        free += 8 * len(pointers) + 64
+        last = pointers
+    n = told[0].shape[-1]
+    for register, value in zip(range(5), (*lists, n, 0, n // width), strict=True):
+        emulator.reg_write(arm.UC_ARM64_REG_X0 + register, value)
+    emulator.reg_write(arm.UC_ARM64_REG_CPACR_EL1, 3 << 20)  # vectors are on
+    emulator.reg_write(arm.UC_ARM64_REG_SP, STACK)
+    emulator.reg_write(arm.UC_ARM64_REG_LR, END)
+    emulator.emu_start(named["lanes"], END)
+    for array, pointer in zip(told, last, strict=True):
+        read = np.frombuffer(emulator.mem_read(pointer, array.nbytes), array.dtype)
+        array[...] = read.reshape(array.shape)

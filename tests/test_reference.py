@@ -1,0 +1,75 @@
+"""Every public name is told: what it takes, gives and refuses, with an example that runs."""
+
+import contextlib
+import doctest
+import inspect
+import re
+import tempfile
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray as xr
+
+import vrw_jax as vrw
+from vrw_jax.numerics import Stop
+from vrw_jax.wheel import DOMAINS
+
+ROOT = Path(__file__).parent.parent
+NAMES = [name for name in vrw.__all__ if name not in ("MEASURES", "plot")]
+SLOW = {"UnilateralWheel", "UnilateralStep", "LadderWheel", "LadderStep", "continue_branches"}
+"""What compiles for a minute."""
+
+
+def told(name):
+    return inspect.getdoc(getattr(vrw, name)) or ""
+
+
+def marked(name):
+    return pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else [])
+
+
+@pytest.mark.parametrize("name", [*map(marked, NAMES)])
+def test_the_example_of_a_public_name_runs_as_it_stands(name, monkeypatch):
+    monkeypatch.setattr(vrw, "start_jax", lambda *_: None)  # it has started
+    globs = {"jax": jax, "jnp": jnp, "np": np, "xr": xr, "vrw": vrw, "tempfile": tempfile}
+    test = doctest.DocTestParser().get_doctest(told(name), globs, name, None, 0)
+    assert test.examples, f"{name} has no example"
+    out: list[str] = []
+    with contextlib.suppress(doctest.UnexpectedException):
+        doctest.DocTestRunner(verbose=False).run(test, out=out.append, clear_globs=False)
+    assert not out, "".join(out)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_argument_and_field_of_a_public_name_is_told(name):
+    thing, text = getattr(vrw, name), told(name)
+    given = [] if name == "Outcome" else list(inspect.signature(thing).parameters)
+    if inspect.isfunction(thing):
+        section = text.partition("Args:")[2].partition("\n\n")[0]
+        assert [n for n in given if not re.search(rf"^ +\*{{0,2}}{n}: ", section, re.M)] == []
+        assert "Returns:\n" in text
+        assert not given or "Raises:\n" in text
+    else:
+        assert [n for n in given if f"`{n}`" not in text] == []
+
+
+def test_every_public_name_has_a_place_in_the_reference():
+    pages = "".join(path.read_text() for path in (ROOT / "docs" / "reference").glob("*.md"))
+    shown = set(re.findall(r"^::: vrw_jax\.(\w+)$", pages, re.M))
+    assert set(NAMES) | {"MEASURES"} == shown
+
+
+def test_fields_of_the_wheel_are_told_as_its_domains_are():
+    for name, d in DOMAINS.items():
+        assert f"- `{name}`: {d.symbol}, {d.description}, in {d};" in told("WheelParams")
+
+
+@pytest.mark.parametrize("kind", [vrw.Outcome, Stop])
+def test_every_code_has_its_sentence_and_a_remedy(kind):
+    page = (ROOT / "docs" / "sharp_bits.md").read_text()
+    for code in kind:
+        told_as = f"| {code.value} `{code.name}` | {code.meaning} | "
+        assert len(page.partition(told_as)[2].partition(" |\n")[0]) > 5, code

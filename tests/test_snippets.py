@@ -1,0 +1,65 @@
+"""Every line of Python on every page runs as it stands, and prints what stands below it."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+import vrw_jax as vrw
+
+ROOT = Path(__file__).parent.parent
+ELSEWHERE = "<!-- runs elsewhere"
+"""Stands before a block that needs a cluster or an editor; it is compiled only."""
+BLOCK = re.compile(
+    r"^(?P<note><!-- runs elsewhere[^\n]*\n)?```python\n(?P<code>.*?)^```"
+    r"(?:\n\n```text\n(?P<told>.*?)^```)?",
+    re.MULTILINE | re.DOTALL,
+)
+PAGES = [
+    page
+    for page in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    if "```python" in page.read_text()
+]
+SLOW = {"docs/ladder.md", "docs/unilateral.md", "docs/howto/numpyro.md"}
+"""Pages on real ground compile for minutes, and samplers walk long."""
+
+
+def run(page, capsys, tmp_path, monkeypatch):
+    """Runs a page from top to bottom in an empty folder."""
+    monkeypatch.setattr(vrw, "start_jax", lambda: None)  # it has started
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    for block in BLOCK.finditer(page.read_text()):
+        line = page.read_text()[: block.start("code")].count("\n")
+        code = compile("\n" * line + block["code"], str(page), "exec")
+        if block["note"]:
+            continue
+        capsys.readouterr()
+        exec(code, names)
+        if block["told"]:
+            assert capsys.readouterr().out.split() == block["told"].split()
+    return names
+
+
+def marked(page):
+    name = str(page.relative_to(ROOT))
+    return pytest.param(page, id=name, marks=[pytest.mark.slow] if name in SLOW else [])
+
+
+@pytest.mark.parametrize("page", [*map(marked, PAGES)])
+def test_a_page_runs_as_it_stands(page, capsys, tmp_path, monkeypatch):
+    if page.stem == "numpyro":
+        pytest.importorskip("numpyro")
+    run(page, capsys, tmp_path, monkeypatch)
+
+
+def test_what_a_page_says_it_prints_is_compared(capsys, tmp_path, monkeypatch):
+    page = tmp_path / "page.md"
+    page.write_text("```python\nprint(1)\n```\n\n```text\n2\n```\n")
+    with pytest.raises(AssertionError):
+        run(page, capsys, tmp_path, monkeypatch)
+
+
+def test_every_block_of_python_is_seen():
+    for page in PAGES:
+        assert len(BLOCK.findall(page.read_text())) == page.read_text().count("```python")
