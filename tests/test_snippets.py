@@ -20,8 +20,12 @@ PAGES = [
     for page in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
     if "```python" in page.read_text()
 ]
-SLOW = {"docs/ladder.md", "docs/unilateral.md", "docs/howto/numpyro.md"}
-"""Pages on real ground compile for minutes, and samplers walk long."""
+SLOW = {
+    "README.md", "docs/any_system.md", "docs/own_loops.md", "docs/ladder.md", "docs/unilateral.md",
+    "docs/engine.md", "docs/howto/add_a_measure.md", "docs/howto/cluster.md",
+    "docs/howto/numpyro.md", "docs/howto/own_constraint.md",
+}  # fmt: skip
+"""Pages that compile for long, or that a test of their own runs in the quick suite."""
 
 
 def run(page, capsys, tmp_path, monkeypatch):
@@ -60,6 +64,9 @@ def test_what_a_page_says_it_prints_is_compared(capsys, tmp_path, monkeypatch):
         run(page, capsys, tmp_path, monkeypatch)
 
 
-def test_every_block_of_python_is_seen():
-    for page in PAGES:
-        assert len(BLOCK.findall(page.read_text())) == page.read_text().count("```python")
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_block_of_python_is_seen_and_is_python(page):
+    blocks = list(BLOCK.finditer(page.read_text()))
+    assert len(blocks) == page.read_text().count("```python")
+    for block in blocks:
+        compile(block["code"], str(page), "exec")

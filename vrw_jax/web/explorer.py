@@ -77,18 +77,27 @@ def explore(
     """The wheel to play with, as a widget of Jupyter, JupyterLab, VS Code and marimo.
 
     It is the page docs/wheel.html, which computes in the browser with this library's own step.
-    `params` are those it begins with, Table 1's if left out; `friction` is what its margins refer
-    to. `dataset`, of a `vrw.scan` over a grid of two parameters, becomes its map.
-
     The widget's `params` are the wheel that is shown: read them after moving a slider, set them to
     move it. `friction` likewise; `told` holds what the page says of the step, by the names of
     `vrw.MEASURES`. Needs anywidget: `pip install 'vrw-jax[explore]'`.
 
-    ```python
-    wheel = vrw.explore(vrw.WheelParams(damping=150.0))
-    wheel  # in a cell of its own
-    vrw.limit_cycle(wheel.params)  # of the wheel that was found by hand
-    ```
+    Args:
+        params: that it begins with; Table 1's by default.
+        friction: what its margins refer to.
+        dataset: of a `vrw.scan` over a grid of two parameters: its map.
+        height: of the widget, in pixels.
+
+    Returns:
+        The widget, to be shown in a cell of its own.
+
+    Raises:
+        TypeError, ValueError: an argument that can't be meant, in one sentence.
+        ModuleNotFoundError: no anywidget.
+
+    Examples:
+        >>> wheel = vrw.explore(vrw.WheelParams(damping=150.0))
+        >>> float(wheel.params.damping)
+        150.0
     """
     params = WheelParams() if params is None else params
     instance("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
