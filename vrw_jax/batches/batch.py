@@ -123,18 +123,17 @@ def steps(
 
     "lanes" is the fast engine, for the viscoelastic wheel and explicit solvers; "diffrax" maps
     `model.advance` over the lanes and takes any solver; "auto" takes the first wherever it can, and
-    `Steps.engine` says which it was. Both keep the errors of `options`, which count for each local step; between them lie some
-    ten times the tolerance. "auto" also takes another solver than the named one where the airborne
-    leg is so stiff that another is cheaper, and `Steps.solver` says which: Tsit5 where stability
-    limits the steps (c/m from 1,900 1/s up at the default options, from 300 at a tolerance of
-    1e-6), Kvaerno5 by "diffrax" where explicit ones take too many (from 4e5, from 1.4e5) or Tsit5
-    gave up.
+    `Steps.engine` says which it was. Both keep the errors of `options`, which count for each local
+    step; between them lie some ten times the tolerance. "auto" also takes another solver than the
+    named one where the airborne leg is so stiff that another is cheaper, and `Steps.solver` says
+    which: Tsit5 where stability limits the steps (c/m from 1,900 1/s up at the default options,
+    from 300 at a tolerance of 1e-6), Kvaerno5 by "diffrax" where explicit ones take too many (from
+    4e5, from 1.4e5) or Tsit5 gave up.
 
     "collocation" is faster still near a known gait: `durations` are those of DLS, SLS-I and SLS-II
-    to some per cent, as of a limit cycle or a neighbour's step; later steps
-    take those of the step before. Its error is fixed, about 1e-8 for 99 lanes in 100, whatever
-    `options` say. Each lane checks itself, and one that fails is left to the lane engine; `fixed`
-    says which was which.
+    to some per cent, as of a limit cycle or a neighbour's step; later steps take those of the step
+    before. Its error is fixed, about 1e-8 for 99 lanes in 100, whatever `options` say. Each lane
+    checks itself, and one that fails is left to the lane engine; `fixed` says which was which.
 
     Derivatives go through all steps and their events; those of a lane that fell are zero. Not by
     collocation nor on real ground (`UnilateralWheel`, its friction a scalar or of the lanes' axis),
