@@ -180,8 +180,8 @@ class UnilateralWheel(AbstractWheel):
       is loaded; "one-sided", it leaves as soon as the stopper would have to pull;
     - `restitution`: a foot that strikes comes back at so many times its speed, as far as energy
       allows; None, as 0, is a smaller program;
-    - `infinite`: what infinite friction is: the limit of large friction, or with "paper" the rule of
-      the paper, (A1) to (A4), continued to where it stops.
+    - `infinite`: what infinite friction is: the limit of large friction, or with "paper" the rule
+      of the paper, (A1) to (A4), continued to where it stops.
 
     Examples:
         >>> wheel = vrw.UnilateralWheel(friction=0.7)
