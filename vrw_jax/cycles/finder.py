@@ -148,6 +148,11 @@ class AbstractGaitFinder(eqx.Module):
     def compile(self, params: WheelParams) -> None:
         """Compile what `find` needs, as much as can be side by side."""
 
+    def step(self, params: WheelParams, x: Array) -> AbstractStep:
+        """One step of the rung, by what is compiled already."""
+        told: AbstractStep = self.model.step(params, x, self.step_options)
+        return told
+
     def cycle_of(self, values: Values, guess: Any = None) -> AbstractCycle:
         """`cycle`, of the rung's own numbers."""
         model, params = self.model.at(values, self.n_legs)

@@ -22,7 +22,13 @@ from vrw_jax.cycles.cycle import AbstractCycle
 from vrw_jax.cycles.finder import Gait, Measured, Values, leading, measured_of
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.section_cycle import WalkedCycle, cycle_from, finest, of_steps, walked_cycle
-from vrw_jax.models import AbstractWheel, step_lanes, walk_lanes
+from vrw_jax.models import (
+    AbstractStep,
+    AbstractWheel,
+    UnilateralWheel,
+    step_lanes,
+    walk_lanes,
+)
 from vrw_jax.numerics import Options, SectionCycle, SolverName, as_float_array
 from vrw_jax.results import ON_GROUND
 from vrw_jax.walks import N_TOWARDS, checked
@@ -47,6 +53,8 @@ def options_towards() -> Options:
 
 class GroundFinder(AbstractWalkingFinder):
     """On real ground, with first derivatives, friction's included."""
+
+    model: UnilateralWheel
 
     of_cycle: ClassVar[tuple[str, ...]] = ("spectral_radius", "spectral_margin")
     differentiable: ClassVar[tuple[str, ...]] = ON_GROUND
@@ -100,6 +108,11 @@ class GroundFinder(AbstractWalkingFinder):
         given = np.asarray(values), np.asarray(x)
         found = _newton(self.model, self.n_legs, self.step_options, self.period_n, *given)
         return _told_in_shapes(self.model, self.n_legs, jnp.asarray(given[0]), found)
+
+    def step(self, params: WheelParams, x: Array) -> AbstractStep:
+        columns, model = np.asarray(self.model.values(params))[:, None], self.model
+        told, _ = step_lanes(columns, np.asarray(x)[None], model, self.step_options, self.n_legs)
+        return jax.tree.map(lambda leaf: leaf[0], told)
 
     def measured(self, values: Values, guess: Any, names: tuple[str, ...]) -> Measured:
         """As everywhere; of one Jacobian of the step."""

@@ -307,9 +307,8 @@ class TuneProblem:
         cycle = np.array(gait.cycle.section_state)
         # Shrunk and not grown: no leg may lie beyond its stopper.
         x, kept, outcome, walked = cycle * (1.0 - DISPLACED), True, Outcome.STEPPED, 0
-        model, options = self.finder.model, self.finder.step_options
         for _ in range(N_WALKED):
-            one = model.step(params, jnp.asarray(x), options)
+            one = self.finder.step(params, jnp.asarray(x))
             outcome = Outcome(int(one.outcome))
             if outcome != Outcome.STEPPED:
                 break
