@@ -129,6 +129,11 @@ class Walk(NamedTuple):
         s, friction = self.symbols(columns), self.friction(columns)
         return flow_of(s, friction, self.one_sided, stance, self.detailed)
 
+    def begun(self, columns: Array, x: Array) -> tuple[WheelMotion, Stance]:
+        """One wheel at its section state, in the labels of the step that begins."""
+        state, stance = opened(self.symbols(columns), x)
+        return unpack(state)[0], stance
+
     def friction(self, columns: Array) -> Array:
         """Of lanes, or of one."""
         return as_ruled(columns[-1], self.by_paper)
@@ -148,9 +153,7 @@ class Walk(NamedTuple):
         """The same with zeros, of wheels at these section states."""
 
         def told(columns: Array, x: Array) -> Any:
-            begins = lambda columns, x: opened(self.symbols(columns), x)
-            state, stance = _over_lanes(begins)(columns, x)
-            stands, none = (unpack(state)[0], stance), jnp.zeros(x.shape[1:], jnp.int32)
+            stands, none = _over_lanes(self.begun)(columns, x), jnp.zeros(x.shape[1:], jnp.int32)
             ledger, details, tally = self.blank_step(x[0])
             return self.told(stands, _Lanes(none, columns, ledger, none, details, tally), none)
 
@@ -287,10 +290,6 @@ def _events(
     queue, free, fills, wheel = _handed_over(on, queue, wanted, ended)
     fresh = lambda leaf: jnp.take(leaf, wheel, axis=-1, mode="clip")
 
-    def begins(columns: Array, x: Array) -> tuple[WheelMotion, Stance]:
-        state, stance = opened(on.symbols(columns), x)
-        return unpack(state)[0], stance
-
     def through(
         columns: Array,
         motion: WheelMotion,
@@ -311,7 +310,7 @@ def _events(
     opens = fills | (ended.landed & ~ended.leaves)
     columns = jnp.where(fills, fresh(queue.columns), lane.columns)
     x = jnp.where(fills, fresh(queue.start), ended.reached)
-    motion, stance = select(opens, _over_lanes(begins)(columns, x), ended.stands)
+    motion, stance = select(opens, _over_lanes(on.begun)(columns, x), ended.stands)
     guard = jnp.where(opens, place.foot, here.guard)
     ledger, details, tally = ended.lane.ledger, ended.lane.details, ended.lane.tally
     tried = jnp.where(fills, 0, ledger.tried)
