@@ -1,0 +1,1 @@
+"""The wheel in a browser: the library's own step as WebAssembly, in one page."""
