@@ -150,12 +150,17 @@ def _along(place: Place, shift: Array) -> Place:
 
 
 def _newton(values: Vector, rates: Vector, crossing: Array) -> tuple[Array, Array]:
-    """Time to the earliest event by each crossing guard's own proposal, and which guard it is."""
+    """Time to the earliest event by each crossing guard's own proposal, and which guard it is.
+
+    One that rises below zero has crossed before, nobody knows when: minus infinity.
+    """
     change = jnp.full_like(values[0], jnp.inf)
     guard = jnp.zeros_like(crossing)
     for index, (g, rate) in enumerate(zip(values, rates, strict=True)):
-        falling = ((crossing >> index) & 1 == 1) & (rate < 0.0)
-        own = jnp.where(falling, -g / jnp.where(falling, rate, -1.0), jnp.inf)
+        crosses = (crossing >> index) & 1 == 1
+        falling = crosses & (rate < 0.0)
+        unknown = jnp.where(crosses & (g < 0.0), -jnp.inf, jnp.inf)
+        own = jnp.where(falling, -g / jnp.where(falling, rate, -1.0), unknown)
         guard = jnp.where(own < change, index, guard)
         change = jnp.minimum(own, change)
     return change, guard

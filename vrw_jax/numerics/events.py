@@ -384,20 +384,20 @@ order in its derivatives, the second to third order, the last evaluates the stat
 def _dips(
     here: Step, values: Array, rates: Array, length: Scalar, n_guards: int
 ) -> tuple[Array, Array]:
-    """Places in (0, 1) where a guard that falls and rises again is lowest, and whether to look.
+    """Places in (0, 1) to go to first in search of a guard that falls and rises again, and whether.
 
-    Where the lowest point of the cubic through values and rates is near or below zero, compared
-    with the guard's change over the step (the cubic's own error is a small part of that), the step
-    is taken again up to that point: either the guard has crossed there, or the march goes on from
-    its lowest point. A point no lower than the step's start by 1 % of what is left is not new.
+    The cubic through values and rates does not fall below the least of its Bernstein coefficients:
+    where that is above zero nothing dips. Else the step is taken again up to the cubic's minimum,
+    at most nine tenths of it: shorter steps have coefficients closer to the guard, until these are
+    above zero or a step ends in the dip.
     """
     v0, r0, v1, r1 = lax.stop_gradient((here.values, here.rates, values, rates))
     v0, r0, v1, r1 = v0[:n_guards], r0[:n_guards], v1[:n_guards], r1[:n_guards]
     length = lax.stop_gradient(length)
-    places, lows = cubic_minimum(v0, r0 * length, v1, r1 * length)
-    near = lows <= 0.25 * (jnp.maximum(v0, v1) - lows)
-    new = (v0 - lows > 0.01 * lows) & (here.time + places * length > here.time)
-    return places, (r0 < 0.0) & (r1 >= 0.0) & near & new
+    first, second = v0 + r0 * length / 3.0, v1 - r1 * length / 3.0
+    places = jnp.clip(cubic_minimum(v0, r0 * length, v1, r1 * length)[0], 0.1, 0.9)
+    new = here.time + places * length > here.time
+    return places, (jnp.minimum(first, second) <= 0.0) & (r1 >= 0.0) & new
 
 
 def _first_guess(
@@ -442,7 +442,9 @@ def _searched(search: _Search, guards: Array, rates: Array, length: Scalar) -> _
     """
     falling = search.crossing & (rates < 0.0)
     change = -guards / jnp.where(falling, rates, -1.0)
-    proposals = jnp.where(falling, length + change, jnp.inf)
+    # One that rises below zero has crossed before, nobody knows when.
+    unknown = jnp.where(search.crossing & (guards < 0.0), -jnp.inf, jnp.inf)
+    proposals = jnp.where(falling, length + change, unknown)
     guard = jnp.argmin(proposals).astype(jnp.int32)
     rising = (guards == 0.0) & (rates > 0.0)  # from where the step begins
     before = jnp.all(jnp.where(search.crossing, (guards > 0.0) | rising, True))

@@ -33,9 +33,8 @@ from vrw_jax.numerics.tableaus import (
     Place,
     Tableau,
     Taken,
+    below,
     change_of_length,
-    dips,
-    parabola,
     take_step,
 )
 from vrw_jax.numerics.tangents import Balance, Moving
@@ -262,19 +261,20 @@ def _march(
 ) -> _March:
     """Adaptive steps until each lane has crossed a guard, run out of time or given up."""
 
-    def judge(march: _March, taken: Taken, inside: Vector, end: Vector) -> tuple[Array, Array]:
+    def judge(march: _March, taken: Taken, inside: list[Vector], end: Vector) -> tuple:
         """Length to try next, in units of this one, and what becomes of the step."""
         squared = _squared_error(taken, march.here, end, options.rtol, options.atol)
-        to_dip = _to_earliest_dip(tableau, march.values, inside, end)
+        to_dip = _to_earliest_dip(tableau, [march.values, *inside, end])
         return _change(tableau, squared, to_dip)
 
     def advance(march: _March) -> _March:
         taken = take_step(tableau, phase.evaluate, march.here, march.h)
-        inside, end = phase.guards(taken.inside), phase.guards(taken.end)
-        change, kept = judge(march, taken, inside, end)
+        stages, end = [phase.guards(taken.stages[i]) for i in tableau.inside], phase.guards(taken.end)
+        change, kept = judge(march, taken, stages, end)
         verdict, crossing, accepted, time, length = _verdict(options, march, change, kept, end)
         here, values = select(accepted, (taken.end, end), (march.here, march.values))
         tried = march.verdict == MARCHING
+        inside = stages[tableau.inside.index(tableau.middle)] if stages else march.values
         within, beyond = select(tried, (inside, end), (march.inside, march.beyond))
         lowest, half = march.lowest, march.half
         if phase.monitors is not None and lowest is not None:
@@ -399,17 +399,16 @@ def _squared_error(taken: Taken, start: Place, guards: Vector, rtol: Array, atol
     return jnp.where(jnp.isfinite(total), total / len(before), jnp.inf)
 
 
-def _to_earliest_dip(tableau: Tableau, start: Vector, inside: Vector, end: Vector) -> Array:
-    """Share of the step up to where a guard that falls and rises again is lowest, if near zero.
+def _to_earliest_dip(tableau: Tableau, guards: list[Vector]) -> Array:
+    """Share of the step to go before a guard that may dip below zero in it; 1: there is none.
 
-    1 where there is nothing to look at. See `tableaus.dips`.
+    `guards`: at the start, inside and at the end, see `tableaus.below`.
     """
-    over, under = jnp.ones_like(start[0]), jnp.ones_like(start[0])
-    for g0, gm, g1 in zip(start, inside, end, strict=True):
-        bend, slope = parabola(tableau, g0, gm, g1)
-        first = dips(g0, g1, bend, slope) & (-slope * under < over * 2.0 * bend)
-        over, under = jnp.where(first, -slope, over), jnp.where(first, 2.0 * bend, under)
-    return over / under
+    share = jnp.ones_like(guards[0][0])
+    for values in zip(*guards, strict=True):
+        looks, at = below(tableau, list(values))
+        share = jnp.where(looks, jnp.minimum(share, at), share)
+    return share
 
 
 def _first(conditions: tuple[Array, ...]) -> Array:

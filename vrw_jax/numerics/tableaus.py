@@ -6,6 +6,7 @@ with half of the stored slopes. Tableaus are diffrax's.
 """
 
 import functools
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -28,7 +29,13 @@ class Tableau(NamedTuple):
     error_once: np.ndarray
     error_twice: np.ndarray
     middle: int
-    """A stage well inside the step, to look for guards that dip below zero and come back."""
+    """A stage well inside the step, where parabolas through guards are held."""
+    inside: tuple[int, ...]
+    """Stages apart from each other and from both ends, to look for guards that dip below zero and
+    come back."""
+    hull: np.ndarray
+    """From a guard at the start, `inside` and at the end to the inner Bernstein coefficients of
+    the polynomial through these: it does not fall below the least of its coefficients."""
 
     def __hash__(self) -> int:
         return id(self)  # `explicit_tableau` makes each once
@@ -52,6 +59,7 @@ def explicit_tableau(name: str) -> Tableau | None:
     if not ends_there:
         once[n, :n] = given.b_sol
     places = once.sum(axis=1)
+    inside = _apart(places)
     return Tableau(
         order=int(solver.order(None)),
         places=places,
@@ -59,8 +67,29 @@ def explicit_tableau(name: str) -> Tableau | None:
         twice=_without_rounding(once @ once),
         error_once=error,
         error_twice=_without_rounding(error @ once),
-        middle=int(np.argmin(np.abs(places - 0.45))),
+        middle=min(inside, key=lambda i: abs(places[i] - 0.45), default=0),
+        inside=inside,
+        hull=_hull(np.array([0.0, *places[list(inside)], 1.0])),
     )
+
+
+INSIDE = (0.15, 0.47, 0.92)
+"""Where guards are looked at inside a step, about: nearer to the ends than equally spaced, since a
+dip just after the start or before the end is the hardest to see."""
+
+
+def _apart(places: np.ndarray) -> tuple[int, ...]:
+    """The stages nearest to INSIDE, of several at one place the last, the most accurate."""
+    last = {round(float(place), 3): i for i, place in enumerate(places) if 0.05 < place < 0.95}
+    nearest = {min(last, key=lambda place, at=at: abs(place - at)) for at in INSIDE} if last else []
+    return tuple(last[place] for place in sorted(nearest))
+
+
+def _hull(nodes: np.ndarray) -> np.ndarray:
+    """Inner Bernstein coefficients of the polynomial through values at nodes of [0, 1]."""
+    n = len(nodes) - 1
+    basis = [math.comb(n, i) * nodes**i * (1.0 - nodes) ** (n - i) for i in range(n + 1)]
+    return np.linalg.inv(np.stack(basis, 1))[1:-1]
 
 
 def parabola(tableau: Tableau, start: Array, inside: Array, end: Array) -> tuple[Array, Array]:
@@ -84,6 +113,21 @@ def dips(start: Array, end: Array, bend: Array, slope: Array) -> Bool[Array, "..
     near = 5.0 * low <= 4.0 * bend * jnp.maximum(start, end)
     new = 4.0 * bend * start > 1.01 * low
     return falls_and_rises & near & new & (end > 0.0)
+
+
+def below(tableau: Tableau, values: list[Array]) -> tuple[Array, Array]:
+    """Whether a guard may fall below zero inside a step and be positive again at its end, and how
+    far to go first, in step lengths: where the lowest of its Bernstein coefficients belongs.
+
+    `values`: at the start, at the stages `inside`, at the end.
+    """
+    end, lowest, at = values[-1], values[0], jnp.zeros_like(values[0])
+    last = lowest
+    for i, row in enumerate(tableau.hull):
+        last = _weigh(row, values)
+        at = jnp.where(last < lowest, (i + 1) / len(values[1:]), at)
+        lowest = jnp.minimum(last, lowest)
+    return (lowest <= 0.0) & (at > 0.0) & (last < end) & (end > 0.0), at
 
 
 SAFETY, LEAST, MOST = 0.9, 0.2, 5.0
@@ -127,10 +171,9 @@ class Place(NamedTuple):
 
 
 class Taken(NamedTuple):
-    """A step: its end, a place inside and the error estimate."""
+    """A step: its end, the error estimate, and its stages."""
 
     end: Place
-    inside: Place
     error: Vector  # of positions, then rates
     stages: list[Place]  # the start first, the end last
 
@@ -155,7 +198,7 @@ def take_step(
         known = [[slope[d] for slope in slopes] for d in range(n)]
         of_position = [h * h * _weigh(tableau.error_twice, k) for k in known]
         error = tuple(of_position + [h * _weigh(tableau.error_once, k) for k in known])
-    return Taken(places[-1], places[tableau.middle], error, places)
+    return Taken(places[-1], error, places)
 
 
 def stage_at(
