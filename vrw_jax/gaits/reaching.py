@@ -237,8 +237,11 @@ def _wherever(finder: Any, params: WheelParams, guess: Any, adaptive: bool, whic
     if not many:
         known = jax.tree.map(lambda x: x[None], known)
     reached = _reached(finder, *known, adaptive)
-    if reached is None and finder.period_n > 1 and guess is not None:
-        reached = _from_another_step(finder, *known, np.asarray(_state(guess))[None])
+    if finder.period_n > 1 and guess is not None:
+        x = np.asarray(_state(guess))[None]
+        if reached is None:
+            reached = _from_another_step(finder, *known, x)
+        reached = _counted_as(finder, *known, x, reached)
     if reached is None:
         return cycle
     finder, located = reached
@@ -360,7 +363,7 @@ def _state(guess: Any) -> Any:
 def _from_another_step(
     finder: CollocationFinder, params: WheelParams, cycle: LimitCycle, x: np.ndarray
 ) -> tuple[CollocationFinder, Located] | None:
-    """The same orbit, counted from another of its steps.
+    """The same orbit, searched for from another of its steps.
 
     A guess holds the accelerations of all steps, and what they are wrong by adds up: where a step
     without double support, the most sensitive of all, comes first or last, it may be too much.
@@ -375,8 +378,27 @@ def _from_another_step(
         found = _in_shapes(functools.partial(_searched, finder), some, x)
         gait = np.flatnonzero(np.asarray(found.found) & (np.asarray(located.found)[lost] < 0.5))
         if len(gait):
-            back = jax.vmap(functools.partial(finder.counted_from, finder.period_n - ahead))
-            own = back(_taken(some, gait), _taken(found.located, gait))
-            located = _put(located, lost[gait], own)
+            located = _put(located, lost[gait], _taken(found.located, gait))
             best = finder, located
     return best
+
+
+def _counted_as(
+    finder: CollocationFinder,
+    params: WheelParams,
+    cycle: LimitCycle,
+    x: np.ndarray,
+    reached: tuple[CollocationFinder, Located] | None,
+) -> tuple[CollocationFinder, Located] | None:
+    """The same orbits, begun at the steps that begin nearest to x."""
+    finder, located = reached or (finder, cycle.located)
+    ends = np.asarray(located.ends)[:, :, [0, 2, 3]]
+    missed = np.abs(np.roll(ends, 1, axis=1) - x[:, None]).max(-1)
+    missed = np.where(np.asarray(located.found)[:, None] > 0.5, missed, 0.0)
+    for step in range(1, finder.period_n):
+        lanes = np.flatnonzero(np.argmin(missed, 1) == step)
+        if len(lanes):
+            again = jax.vmap(functools.partial(finder.counted_from, step))
+            located = _put(located, lanes, again(_taken(params, lanes), _taken(located, lanes)))
+            reached = finder, located
+    return reached
