@@ -6,6 +6,7 @@ with half of the stored slopes. Tableaus are diffrax's.
 """
 
 import functools
+import itertools
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -81,7 +82,7 @@ dip just after the start or before the end is the hardest to see."""
 def _apart(places: np.ndarray) -> tuple[int, ...]:
     """The stages nearest to INSIDE, of several at one place the last, the most accurate."""
     last = {round(float(place), 3): i for i, place in enumerate(places) if 0.05 < place < 0.95}
-    nearest = {min(last, key=lambda place, at=at: abs(place - at)) for at in INSIDE} if last else []
+    nearest = {min((abs(place - at), place) for place in last)[1] for at in INSIDE if last}
     return tuple(last[place] for place in sorted(nearest))
 
 
@@ -127,7 +128,10 @@ def below(tableau: Tableau, values: list[Array]) -> tuple[Array, Array]:
         last = _weigh(row, values)
         at = jnp.where(last < lowest, (i + 1) / len(values[1:]), at)
         lowest = jnp.minimum(last, lowest)
-    return (lowest <= 0.0) & (at > 0.0) & (last < end) & (end > 0.0), at
+    rises = last < end  # what only decays is no dip, however steep
+    for before, after in itertools.pairwise(values):
+        rises = rises | (before < after)
+    return (lowest <= 0.0) & (at > 0.0) & rises & (end > 0.0), at
 
 
 SAFETY, LEAST, MOST = 0.9, 0.2, 5.0
