@@ -39,18 +39,20 @@ FRICTION = {
         {"theta_touchdown": 0.1, "dtheta_touchdown": 1.6, "dL1_touchdown": -0.1},
         model=m,
     ).friction_fore.values.ravel()[0],
-    "sensitivities": lambda m: vrw.sensitivities(
-        GAIT, measures=("friction_fore",), model=m
-    ).value[0],
+    "sensitivities": lambda m: vrw.sensitivities(GAIT, measures=("friction_fore",), model=m).value[
+        0
+    ],
     "continue_branch": lambda m: of_branches(
         [vrw.continue_branch(GAIT, "damping", (149.9, 150.1), model=m)]
     ),
     "continue_branches": lambda m: of_branches(
         vrw.continue_branches(batch(GAIT), "damping", (149.9, 150.1), model=m)
     ),
-    "tune": lambda m: vrw.tune(
-        GAIT, "speed", ["damping"], {"damping": (149.9, 150.1)}, {}, model=m, max_evaluations=1
-    ).step.monitors.friction_fore,
+    "tune": lambda m: (
+        vrw.tune(
+            GAIT, "speed", ["damping"], {"damping": (149.9, 150.1)}, {}, model=m, max_evaluations=1
+        ).step.monitors.friction_fore
+    ),
 }
 """By function: the margin to the friction needed at the fore foot that it tells."""
 LONG = {"sensitivities", "continue_branch", "continue_branches", "tune", "basin"}
@@ -83,7 +85,8 @@ OUTCOMES = {
 @pytest.mark.parametrize("name", OUTCOMES)
 def test_a_ground_that_may_pull_shows(name):
     lifted, held = (
-        int(OUTCOMES[name](vrw.ViscoelasticWheel(stop_at_lift_off=stops))) for stops in (True, False)
+        int(OUTCOMES[name](vrw.ViscoelasticWheel(stop_at_lift_off=stops)))
+        for stops in (True, False)
     )
     assert lifted == Outcome.LEG_1_LIFTED_OFF
     assert held != lifted

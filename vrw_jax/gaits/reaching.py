@@ -373,7 +373,7 @@ def _from_another_step(
         return None
     some, x, best = _taken(params, lost), np.array(x[lost]), None
     located = cycle.located
-    for ahead in range(1, finder.period_n):
+    for _ in range(1, finder.period_n):
         x = np.asarray(steps(some, x, model=finder.model).section_state)
         found = _in_shapes(functools.partial(_searched, finder), some, x)
         gait = np.flatnonzero(np.asarray(found.found) & (np.asarray(located.found)[lost] < 0.5))
