@@ -5,7 +5,16 @@ import importlib.metadata
 from typing import TYPE_CHECKING, Any
 
 from vrw_jax.batches import Steps, steps
-from vrw_jax.branches import Border, Branch, continue_branch, continue_branches, continue_map
+from vrw_jax.branches import (
+    Border,
+    BorderCurve,
+    Branch,
+    border_curve,
+    border_curves,
+    continue_branch,
+    continue_branches,
+    continue_map,
+)
 from vrw_jax.cycles import (
     CycleOptions,
     LimitCycle,
@@ -43,6 +52,7 @@ __all__ = (
     "AbstractWheel",
     "ArclengthOptions",
     "Border",
+    "BorderCurve",
     "Branch",
     "CycleOptions",
     "EnergyLoss",
@@ -66,6 +76,8 @@ __all__ = (
     "WalkedCycle",
     "WheelParams",
     "basin",
+    "border_curve",
+    "border_curves",
     "choose_model",
     "continue_branch",
     "continue_branches",

@@ -15,7 +15,7 @@ import xarray as xr
 from support.scanning import Counted, arithmetic
 from typer.testing import CliRunner, Result
 
-from vrw_jax.app import cli
+from vrw_jax.app import cli, scanning
 from vrw_jax.app.cli import app
 from vrw_jax.app.config import parse
 from vrw_jax.app.printing import scan_reporter
@@ -270,7 +270,7 @@ def test_friction_is_swept_on_real_ground_and_on_the_ladder(rung: str) -> None:
         f'[model]\nrung = "{rung}"\n[grid]\nfriction = [0.4, 0.8]\nslope = [0.3]\n'
         '[scan]\nmeasures = ["slip", "d speed / d damping"]'
     )
-    planned = cli._planned(told, None)
+    planned = scanning.planned_scan(told, None)
     assert planned.design.names == ("friction", "slope")
     assert planned.asked == ("slip", "d speed / d damping")
     assert planned.model.rung == {"auto": "ladder"}.get(rung, rung)

@@ -15,16 +15,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vrw_jax.app import printing
+from vrw_jax.app import printing, scanning
 from vrw_jax.app.printing import INTERRUPTED, complain, err, out, sentences
 
 if TYPE_CHECKING:
-    import xarray as xr
-
     from vrw_jax.app.config import Config
-    from vrw_jax.scans import Plan
 
-FACT_FAILED, NOT_CONVERGED, DAMAGED = 1, 1, 1
+FACT_FAILED, NOT_CONVERGED = 1, 1
 """Exit codes, beside those of a user's mistake and of a Ctrl-C."""
 
 Folder = Annotated[
@@ -297,7 +294,7 @@ def scan(
     """
     with sentences():
         settings, folder = _asked(config, folder, "design")
-        planned, store = _planned(settings, chunk), folder / "scan.zarr"
+        planned, store = scanning.planned_scan(settings, chunk), folder / "scan.zarr"
         from vrw_jax.scans import explained
 
         if explain:
@@ -306,10 +303,10 @@ def scan(
             printing.tell_table("What this scan would do", told.items())
             return
         if verify:
-            _verify(planned, store)
+            scanning.verify_store(planned, store)
             return
         _require_place(folder)
-    dataset = _compute(planned, store, dask)
+    dataset = scanning.compute_scan(planned, store, dask)
     printing.tell_outcomes(dataset)
     out.print(f"data: {store}", highlight=False, soft_wrap=True)
     if picture:
@@ -318,50 +315,21 @@ def scan(
         printing.tell_written(write_scan(dataset, folder))
 
 
-def _planned(settings: "Config", chunk: int | None) -> "Plan":
-    from vrw_jax.scans import plan
+@app.command("map")
+def map_borders(
+    config: Annotated[Path, typer.Argument(help="TOML file with a grid over two parameters.")],
+    folder: Folder = None,
+) -> None:
+    """Draw all borders of gaits over two parameters, on a scan: `vrw map configs/map_c_k.toml`."""
+    with sentences():
+        settings, folder = _asked(config, folder, "design")
+        planned = scanning.planned_scan(settings, None)
+        _require_place(folder)
+    dataset = scanning.compute_scan(planned, folder / "scan.zarr", None)
+    from vrw_jax.app.reports import write_map
 
-    assert settings.design is not None
-    return plan(
-        settings.design,
-        settings.scan.measures,
-        base=settings.params(),
-        model=settings.wheel_model(),
-        options=settings.numerical_options(),
-        chunk=chunk or settings.scan.chunk,
-        text=settings.text,
-    )
-
-
-def _verify(planned: "Plan", store: Path) -> None:
-    from vrw_jax.scans import found_store
-
-    kept = found_store(planned, store)
-    if kept is None:
-        raise ValueError(f"there is no store {store} to verify: run the same without --verify.")
-    if kept.damage:
-        complain(f"{kept.damage}: run the same without --verify, which computes these again.")
-        raise typer.Exit(DAMAGED)
-    n, missing = planned.layout.n_chunks, len(kept.missing())
-    told = f"lacks {missing:,} of {n:,} chunks, the others are" if missing else "is complete and"
-    out.print(f"{store} {told} sound.", highlight=False, soft_wrap=True)
-
-
-def _compute(planned: "Plan", store: Path, dask: str | None) -> "xr.Dataset":
-    from vrw_jax.scans import carried, open_store, run
-
-    stopped = f"stopped; what is done stays in {store}, run the same to go on."
-    with sentences(stopped), carried(dask) as through:
-        kept = open_store(planned, store)
-        if kept.damage:
-            complain(f"{kept.damage}: computed again.")
-        elif not kept.missing():
-            out.print(f"{store} is complete: nothing to compute.", highlight=False)
-            return kept.dataset()
-        with printing.progress_bar("scan") as bar:
-            task = bar.add_task("compiling", total=None, note="")
-            report = printing.scan_reporter(bar.update, task)
-            return run(planned, kept, report=report, through=through)
+    with sentences(), err.status("following borders (the first time compiles for minutes)"):
+        printing.tell_written(write_map(dataset, settings, folder))
 
 
 @app.command()

@@ -4,15 +4,19 @@ import csv
 import io
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from vrw_jax import figures
-from vrw_jax.branches import Branch
+from vrw_jax.app.config import Config
+from vrw_jax.branches import Branch, border_curves
+from vrw_jax.gaits import limit_cycle
 from vrw_jax.results import MEASURES, as_markdown, measure_of, what_breaks
+from vrw_jax.scans import OF_CYCLE
 from vrw_jax.tuning import Tuned
-from vrw_jax.wheel import DOMAINS, PARAMETER_NAMES
+from vrw_jax.wheel import DOMAINS, PARAMETER_NAMES, Outcome
 
 
 def write_scan(scan: xr.Dataset, folder: Path) -> list[Path]:
@@ -34,6 +38,34 @@ def write_branch(branch: Branch, folder: Path, picture: bool = True) -> list[Pat
     paths = _write(folder, "branch.zarr", branch.dataset, texts)
     drawn = picture and branch.values.size > 0
     return paths + (figures.save(figures.branch_figure(branch), folder, "branch") if drawn else [])
+
+
+def write_map(scan: xr.Dataset, settings: Config, folder: Path) -> list[Path]:
+    """Every border over the two parameters of a scan, from its stable gait nearest the middle."""
+    names = tuple(map(str, scan.outcome.dims))
+    if len(names) != 2:
+        raise ValueError(
+            f"the grid sweeps {', '.join(names)}, but a map is over two parameters: sweep two."
+        )
+    good = np.argwhere(scan.outcome.values == Outcome.STEPPED)
+    if not len(good):
+        raise ValueError("no gait was found on the grid: choose another.")
+    middle = good[np.argmin(np.abs(good / scan.outcome.shape - 0.5).sum(1))]
+    at = {name: float(scan[name].values[i]) for name, i in zip(names, middle, strict=True)}
+    model: Any = settings.wheel_model()
+    cycle = limit_cycle(settings.params(at), model=model)
+    bounds = {name: (float(scan[name][0]), float(scan[name][-1])) for name in names}
+    curves = border_curves(None, (names[0], names[1]), cycle, bounds=bounds)
+    rows = [
+        [curve.name, *map("{:.12g}".format, point)] for curve in curves for point in curve.values
+    ]
+    text = "\n".join(",".join(row) for row in [["border", *names], *rows])
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "map.csv").write_text(text + "\n", encoding="utf-8")
+    (folder / "map.md").write_text("\n\n".join(map(str, curves)) + "\n", encoding="utf-8")
+    measure = next(name for name in scan if name in OF_CYCLE)
+    drawn = figures.save(figures.map_figure(scan, str(measure), curves), folder, "map")
+    return [folder / "map.csv", folder / "map.md", *drawn]
 
 
 def _write(folder: Path, store: str, data: xr.Dataset, texts: Mapping[str, str]) -> list[Path]:

@@ -358,11 +358,11 @@ def _stability(jacobians: np.ndarray) -> dict[str, xr.Variable]:
     }
 
 
-class _MapRun(AbstractRun):
+class MapRun(AbstractRun):
     """Of fixed points of any map."""
 
     def read(self, wheels: Any, points: PathPoint) -> Table:
-        return {"x": np.asarray(points.z)}
+        return {"x": np.asarray(jax.vmap(self.followed.section)(points.z))}
 
     def kept(self, table: Table) -> np.ndarray:
         return np.asarray(np.isfinite(table["x"]).all(-1))
@@ -414,7 +414,7 @@ def continue_map(
         )
     options, x = _arclength(options), reals("x", x)
     lead = lambda tree: jax.tree.map(lambda a: jnp.asarray(a, float)[None], tree)
-    run = _MapRun(MapFollowed(function), options, lead(constants), np.array([low, high]))
+    run = MapRun(MapFollowed(function), options, lead(constants), np.array([low, high]))
     (strand,) = run_all(run, lead(x), lead(p), np.array([True]), lambda owner, point: None)
     if strand is None:
         empty = xr.Dataset(coords={name: ("point", np.zeros(0))})

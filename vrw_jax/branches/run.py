@@ -80,6 +80,10 @@ class AbstractRun(abc.ABC):
         """Whether a column's zero is a border collision."""
         return False
 
+    def is_own(self, name: str) -> bool:
+        """Whether a column is zero all along what is followed."""
+        return False
+
     def name_of_loss(self, table: Table, place: int) -> str:
         """What the first point beyond the end of a branch says of it."""
         return IN_SEQUENCE
@@ -88,9 +92,10 @@ class AbstractRun(abc.ABC):
         """Every quantity at each point, bifurcation functions and IN_SEQUENCE included."""
         found = in_batches(self.read, BATCH, taken(self.wheels, owners), points)
         margins = bifurcation_functions(np.asarray(points.jacobian))
-        found |= {name: margins[:, i] for i, name in enumerate(BIFURCATIONS)}
+        others = (name for name in BIFURCATIONS if not self.is_own(name))
+        found |= {name: margins[:, BIFURCATIONS.index(name)] for name in others}
         for name, exact in self.exact.items():
-            if exact in found:
+            if exact in found and name in found:
                 found[_both(name)] = both_hold(found[name], found[exact])
         good = np.asarray(points.valid) & self.kept(found)
         return found | {IN_SEQUENCE: np.where(good, 1.0, -1.0)}
@@ -351,7 +356,10 @@ def run_all(
     """Follow, locate, and sort by wheel; None where there was no start."""
     bounds = jnp.asarray(run.bounds)
     tracks = _follow_both_ways(run.followed, run.options, run.wheels, z, p, bounds)
-    tracks = tracks._replace(n_points=jnp.where(found[:, None], tracks.n_points, 0))
+    # What comes back to its start has gone both ways at once.
+    closed = (tracks.ending == int(Ending.CLOSED)).all(1, keepdims=True) & np.array([True, False])
+    kept = found[:, None] & ~closed
+    tracks = tracks._replace(n_points=jnp.where(kept, tracks.n_points, 0))
     pieces = _collected(run, tracks)
     n_wheels = len(found)
     starts = {

@@ -64,4 +64,4 @@ class CycleOptions:
     @classmethod
     def tight(cls) -> "CycleOptions":
         """Right to about 1e-12 in values and 1e-10 in first derivatives."""
-        return cls(steps=(16, 20, 4), tolerance=1e-11)
+        return cls(steps=(16, 20, 4), tolerance=1e-13)

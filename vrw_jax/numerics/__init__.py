@@ -74,6 +74,13 @@ from vrw_jax.numerics.lanes import (
     to_blocks,
     zeros_of,
 )
+from vrw_jax.numerics.levels import (
+    AbstractLevel,
+    LevelFollowed,
+    LevelLinear,
+    LevelPoint,
+    margins_beside_fold,
+)
 from vrw_jax.numerics.march import LanePhase, integrate_lanes, sample_lanes
 from vrw_jax.numerics.minima import ROUNDING, State, Watched
 from vrw_jax.numerics.newton import SectionCycle, newton_cycle

@@ -285,6 +285,18 @@ def _next_step(options: ArclengthOptions, state: _State, judged: _Judged) -> Sca
     return jnp.where(state.track.n_points == 0, options.first_step, step)
 
 
+def _closes(
+    followed: AbstractFollowed, start: PathPoint, base: PathPoint, to: PathPoint, bounds: Array
+) -> Bool[Array, ""]:
+    """Whether the way from one point to the next leads over the branch's start."""
+    place = lambda at: jnp.append(followed.section(at.z), _share_of(at.p, bounds))
+    chord, there = place(to) - place(base), place(start) - place(base)
+    squared = chord @ chord
+    share = there @ chord / jnp.where(squared > 0.0, squared, 1.0)
+    off = there - share * chord
+    return (share >= 0.0) & (share <= 1.0) & (off @ off < 0.01 * squared)
+
+
 def _extended(
     options: ArclengthOptions,
     state: _State,
@@ -292,6 +304,7 @@ def _extended(
     reached: PathPoint,
     step: Scalar,
     ahead: Scalar,
+    closes: Bool[Array, ""],
 ) -> Track:
     """The track with the point reached, where it is accepted; `ahead`: length of what follows."""
     track, (accepted, failed, _) = state.track, judged
@@ -304,6 +317,7 @@ def _extended(
         (accepted & (count >= options.max_points), Ending.BUFFER_FULL),
         (accepted & (state.trial.final | (ahead <= 1e-12)), Ending.RANGE_ENDED),
         (accepted & ~reached.valid, Ending.LEFT_SEQUENCE),
+        (accepted & closes & (track.n_points > 2), Ending.CLOSED),
     ):
         ending = jnp.where(happened, int(code), ending)
     return Track(points, count, ending.astype(jnp.int32), track.passes + 1)
@@ -353,7 +367,9 @@ def follow(
         following = _predicted(followed, base, step, bounds)
         done = judged.accepted | judged.failed
         following = select(done, following, trial._replace(z=now.z, share=now.share))
-        track = _extended(options, state, judged, reached, step, following.length)
+        first = jax.tree.map(lambda x: x[0], state.track.points)
+        closes = _closes(followed, first, state.base, reached, bounds)
+        track = _extended(options, state, judged, reached, step, following.length, closes)
         return _State(base, step, following, jnp.where(done, 0, state.iteration + 1), track)
 
     going = lambda state: state.track.ending == int(Ending.GOING)

@@ -1,0 +1,101 @@
+"""Borders in two parameters: curves through turning points, closed ones, and what they meet."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vrw_jax as vrw
+from vrw_jax.branches.bordering import border_curve
+from vrw_jax.branches.continuation import MapRun
+from vrw_jax.branches.run import run_all
+from vrw_jax.numerics.arclength import ArclengthOptions, Ending
+from vrw_jax.numerics.levels import LevelFollowed, LevelPoint, MapLevel, margins_beside_fold
+
+OPTIONS = ArclengthOptions(max_points=400, largest_step=0.05)
+
+
+def followed(function, quantity, z, p, bounds, seconds, second):
+    """The curve through (p, second), as `border_curve` follows that of a gait."""
+    level = LevelFollowed(MapLevel(function, quantity), seconds)
+    share = (second - seconds[0]) / (seconds[1] - seconds[0])
+    lead = lambda x: jnp.asarray(x, float)[None]
+    start = LevelPoint(lead(z), lead(share))
+    run = MapRun(level, OPTIONS, jnp.zeros(1), np.array(bounds))
+    (strand,) = run_all(run, start, lead(p), np.array([True]), lambda owner, point: None)
+    second = level.second(jax.tree.map(jnp.asarray, strand.points.z))
+    return strand.points.p, np.asarray(second), strand
+
+
+def bowl(_, x, p):
+    """Its fixed point is as high as p is far from the origin, squared."""
+    return 0.5 * x + 0.5 * (p @ p)
+
+
+def test_a_closed_curve_is_followed_round_and_ends_where_it_began():
+    height = lambda jacobian, x, p: x[0] - 0.5
+    first, second, strand = followed(bowl, height, [0.5], 0.5, (-1.0, 1.0), (-1.0, 1.0), 0.5)
+    np.testing.assert_allclose(first**2 + second**2, 0.5, atol=1e-9)
+    assert strand.ends[1] == Ending.CLOSED.meaning
+    angle = np.unwrap(np.arctan2(second, first))
+    assert 2.0 * np.pi < np.ptp(angle) < 2.2 * np.pi
+
+
+def henon(_, x, p):
+    """x -> 1 - a x^2 + y, y -> b x over p = (a, b)."""
+    return jnp.stack([1.0 - p[0] * x[0] ** 2 + x[1], p[1] * x[0]])
+
+
+def fixed_point(a, b):
+    x = ((b - 1.0) + np.sqrt((1.0 - b) ** 2 + 4.0 * a)) / (2.0 * a)
+    return [x, b * x]
+
+
+def margin(place):
+    return lambda jacobian, x, p: margins_beside_fold(jacobian)[place]
+
+
+def test_period_doublings_of_henon_are_on_their_parabola():
+    b = 0.3
+    a = 0.75 * (1.0 - b) ** 2
+    ends = (0.05, 3.5), (-1.4, 0.6)
+    first, second, strand = followed(henon, margin(1), fixed_point(a, b), a, *ends, b)
+    np.testing.assert_allclose(first, 0.75 * (1.0 - second) ** 2, atol=1e-9)
+    assert np.ptp(second) > 1.0
+    # At b = -1 both multipliers are -1: a pair on the circle meets the border there.
+    (meeting,) = [border for border in strand.borders if border.name == "neimark_sacker"] or [None]
+    assert meeting is None or abs(meeting.value - 3.0) < 1e-6
+
+
+def test_folds_of_henon_are_on_their_parabola():
+    b = 0.3
+    a = -0.25 * (1.0 - b) ** 2
+    start = [(b - 1.0) / (2.0 * a), b * (b - 1.0) / (2.0 * a)]
+    ends = (-1.0, -0.02), (-0.9, 0.6)
+    first, second, _ = followed(henon, margin(0), start, a + 1e-9, *ends, b)
+    np.testing.assert_allclose(first, -0.25 * (1.0 - second) ** 2, atol=1e-9)
+    assert np.ptp(second) > 1.0
+
+
+@pytest.fixture(scope="module")
+def lifting():
+    """Where the rear foot lifts at once, over damping and stiffness."""
+    cycle = vrw.limit_cycle(vrw.WheelParams(damping=200.0))
+    bounds = {"damping": (190.0, 240.0), "stiffness": (460.0, 540.0)}
+    return border_curve("lambda_4_plus", ("damping", "stiffness"), cycle, bounds=bounds)
+
+
+@pytest.mark.slow
+def test_a_border_curve_of_the_wheel_passes_through_the_branchs_border(lifting):
+    c, k = lifting.values.T
+    assert abs(np.interp(500.0, *(x[np.argsort(k)] for x in (k, c))) - 219.847688296) < 1e-3
+
+
+@pytest.mark.slow
+def test_on_one_side_of_a_border_curve_there_are_gaits(lifting):
+    for c, k in lifting.values[::10]:
+        near = [vrw.limit_cycle(vrw.WheelParams(damping=c + d, stiffness=k)) for d in (-1e-6, 1e-6)]
+        forces = [float(cycle.indicators.lambda_4) for cycle in near]
+        assert bool(near[0].found)
+        assert 0.0 < forces[0] < 1e-4
+        assert not bool(near[1].found)
