@@ -269,7 +269,8 @@ def _march(
 
     def advance(march: _March) -> _March:
         taken = take_step(tableau, phase.evaluate, march.here, march.h)
-        stages, end = [phase.guards(taken.stages[i]) for i in tableau.inside], phase.guards(taken.end)
+        stages = [phase.guards(taken.stages[i]) for i in tableau.inside]
+        end = phase.guards(taken.end)
         change, kept = judge(march, taken, stages, end)
         verdict, crossing, accepted, time, length = _verdict(options, march, change, kept, end)
         here, values = select(accepted, (taken.end, end), (march.here, march.values))
