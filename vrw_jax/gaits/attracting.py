@@ -28,7 +28,8 @@ APART, SAME = 0.02, 1e-5
 
 def starts_of(params: WheelParams) -> np.ndarray:
     """STARTS of each wheel, (start, lane, 3)."""
-    s = jax.tree.map(np.asarray, params.symbols())
+    with jax.ensure_compile_time_eval():  # values, also where a caller differentiates
+        s = jax.tree.map(np.asarray, params.symbols())
     weight = s.Mt * s.g * np.cos(np.asarray(params.slope))
     static = np.asarray(params.natural_length - weight / params.stiffness) / s.L0
     rolling = np.sqrt(4.0 * s.g / s.L0 * np.sin(0.5 * s.alpha) * np.sin(params.slope)) / s.sin_alpha

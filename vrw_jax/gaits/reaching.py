@@ -356,7 +356,9 @@ def _reached(
 
 
 def _state(guess: Any) -> Any:
-    """Its section state, of a guess that is a cycle or one itself."""
+    """Its section state, of a guess that is a cycle, a place or one itself."""
+    if isinstance(guess, Located):
+        return guess.ends[-1][jnp.array([0, 2, 3])]
     return getattr(guess, "section_state", guess)
 
 
