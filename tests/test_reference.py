@@ -19,7 +19,10 @@ from vrw_jax.wheel import DOMAINS
 
 ROOT = Path(__file__).parent.parent
 NAMES = [name for name in vrw.__all__ if name not in ("MEASURES", "plot")]
-SLOW = {"UnilateralWheel", "UnilateralStep", "LadderWheel", "LadderStep", "continue_branches"}
+SLOW = {
+    "UnilateralWheel", "UnilateralStep", "LadderWheel", "LadderStep", "continue_branches",
+    "border_curve", "BorderCurve",
+}  # fmt: skip
 """What compiles for a minute."""
 
 

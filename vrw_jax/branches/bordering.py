@@ -227,7 +227,17 @@ class Meeting:
 class BorderCurve:
     """A border in two parameters, its points in order along the dimension `point`.
 
-    `ends` says for either end why it was followed no further; both alike where it is closed.
+    - `name`: of the border;
+    - `parameters`: names of the two;
+    - `dataset`: durations, spectral radius and section state along the curve;
+    - `meetings`: where it meets other borders, points of codimension two;
+    - `ends`: for either end why it was followed no further; both alike where it is closed.
+
+    Examples:
+        >>> cycle = vrw.limit_cycle(vrw.WheelParams(damping=150.0))
+        >>> curve = vrw.border_curve("clearance_sls1", ("damping", "stiffness"), cycle)
+        >>> curve.values.shape[1], curve.parameters
+        (2, ('damping', 'stiffness'))
     """
 
     name: str
@@ -268,6 +278,27 @@ def border_curve(
     default `branches.bordering.BOX`: through turning points, until it closes, leaves them, or the
     gaits end. Each point is exact to 1e-9; `meetings` are where other borders are met: on that of
     an indicator other indicators and bifurcations, on others margins too.
+
+    Args:
+        name: of the border.
+        parameters: names of the two.
+        cycle: the gait near which it is looked for.
+        bounds: of the parameters, by name.
+        options: `ArclengthOptions` of the curve.
+        step_options: of the steps that tell margins.
+
+    Returns:
+        A `BorderCurve`.
+
+    Raises:
+        TypeError, ValueError: an argument that can't be meant, or a border that is not met on the
+            branches, in one sentence.
+
+    Examples:
+        >>> cycle = vrw.limit_cycle(vrw.WheelParams(damping=150.0))
+        >>> curve = vrw.border_curve("clearance_sls1", ("damping", "stiffness"), cycle)
+        >>> [meeting.name for meeting in curve.meetings[-3:]]
+        ['fold', 'hit_planted_impulse', 'lambda_4_plus']
     """
     (curve,) = border_curves(
         (name,), parameters, cycle, bounds=bounds, options=options, step_options=step_options
