@@ -28,16 +28,16 @@ APART, SAME = 0.02, 1e-5
 
 def starts_of(params: WheelParams) -> np.ndarray:
     """STARTS of each wheel, (start, lane, 3)."""
-    with jax.ensure_compile_time_eval():  # values, also where a caller differentiates
-        s = jax.tree.map(np.asarray, params.symbols())
-    weight = s.Mt * s.g * np.cos(np.asarray(params.slope))
-    static = np.asarray(params.natural_length - weight / params.stiffness) / s.L0
-    rolling = np.sqrt(4.0 * s.g / s.L0 * np.sin(0.5 * s.alpha) * np.sin(params.slope)) / s.sin_alpha
+    s = params.symbols()  # whose sine of the slope is no value where a caller differentiates
+    Mt, g, L0 = (np.asarray(x) for x in (s.Mt, s.g, s.L0))
+    weight = Mt * g * np.cos(np.asarray(params.slope))
+    static = np.asarray(params.natural_length - weight / params.stiffness) / L0
+    rolling = np.sqrt(4.0 * g / L0 * np.sin(0.5 * s.alpha) * np.sin(params.slope)) / s.sin_alpha
     told = []
     for contraction, share in STARTS:
         length = np.clip(1.0 + contraction * (static - 1.0), s.cos_alpha + 0.02, 1.0)
         theta = np.arctan((length - s.cos_alpha) / s.sin_alpha)
-        told.append(np.stack([theta, share * rolling, -0.1 * np.sqrt(s.g * s.L0) / 3.0], -1))
+        told.append(np.stack([theta, share * rolling, -0.1 * np.sqrt(g * L0) / 3.0], -1))
     return np.stack(told)
 
 
