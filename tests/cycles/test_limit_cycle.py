@@ -228,6 +228,19 @@ def test_a_lost_gait_is_nan_in_value_and_derivative_where_asked_for():
     assert all(np.isnan(value) for value in told.values())
 
 
+def test_the_step_tells_the_smooth_premise_that_the_cycle_does():
+    of_cycle = lambda c: vrw.limit_cycle(vrw.WheelParams(damping=c)).takeoff_acceleration
+
+    def of_step(c):
+        params = vrw.WheelParams(damping=c)
+        cycle = vrw.limit_cycle(params)
+        return vrw.step(params, cycle.section_state).monitors.takeoff_acceleration
+
+    ours, theirs = (jax.value_and_grad(of)(150.0) for of in (of_step, of_cycle))
+    np.testing.assert_allclose(ours, theirs, rtol=1e-7)
+    assert ours[0] > 0.0 > of_step(100.0)  # where foot 2 scuffs
+
+
 def test_a_mesh_too_coarse_says_so_and_more_of_it_finds_the_gait():
     params = vrw.WheelParams(damping=190.6, stiffness=838.6, natural_length=1.0211, slope=0.126)
     coarse, fine = (vrw.CycleOptions(steps=steps) for steps in ((2, 1, 1), (30, 30, 10)))

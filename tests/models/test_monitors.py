@@ -34,8 +34,9 @@ def test_every_margin_is_that_of_the_oracle(index, by_lanes):
     np.testing.assert_allclose(m.rear_stopper_force, oracle["stopper_force_leg2"], **near)
     np.testing.assert_allclose(m.contraction, oracle["shortening"], **near)
     np.testing.assert_allclose(1.0 - m.friction_fore, oracle["friction_leg1"], **near)
-    # Algebra of the impacts: the error of the states before them.
+    # Algebra of an instant: the error of the states there.
     exact = {"rtol": 1e-9, "atol": 1e-10}
+    np.testing.assert_allclose(m.takeoff_acceleration, oracle["takeoff_acceleration"], **exact)
     np.testing.assert_allclose(1.0 - m.friction_rear, oracle["friction_leg2_landing"], **exact)
     np.testing.assert_allclose(
         m.landing_stopper_impulse, oracle["stopper_impulse_landing"], **exact

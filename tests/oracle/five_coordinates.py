@@ -378,6 +378,7 @@ def monitors(params: Params, x: Any) -> dict[str, Any]:
     - ``lambda2``, ``lambda4``: least normal force over each phase, N, by phase name;
     - ``foot2_clearance_sls1``, ``foot2_clearance_sls2``: height of Leg 2's foot, m. It is zero at
       takeoff: over SLS-I the lowest later local minimum or the end counts;
+    - ``takeoff_acceleration``: of Leg 2's foot normal to the slope at the start of SLS-I, m/s^2;
     - ``stopper_force_legs``: least stopper force of legs 3..n, N (n - 2,), over the whole step;
       ``stopper_force``: the least of them; ``stopper_force_leg2`` over SLS-II;
     - ``shortening``: lowest L0 - L1 after landing, m, without its start at zero;

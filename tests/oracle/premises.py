@@ -185,6 +185,11 @@ def margins(wheel: Wheel, result: Mapping[str, Any]) -> dict[str, Any]:
     out["foot2_clearance_sls1"] = lowest(
         lambda p, t: wheel.foot2(p.sample(t)[0])[1], "SLS-I", skip=True
     )
+    q, v, a, _ = motion(phases["SLS-I"], 0.0)
+    foot2 = mass_accelerations(wheel, q, v, a)[0] - _leg_motion(
+        (q[2] + wheel.alpha, v[2], a[2]), (q[4], v[4], a[4])
+    )
+    out["takeoff_acceleration"] = float(foot2[1])
     out["foot2_clearance_sls2"] = lowest(lambda p, t: wheel.foot2(p.sample(t)[0])[1], "SLS-II")
 
     def stopper(leg: int, name: str) -> float:

@@ -47,7 +47,8 @@ class CollocationFinder(AbstractGaitFinder):
     options_type: ClassVar[type] = CycleOptions
     of_cycle: ClassVar[tuple[str, ...]] = tuple(MEASURED)
     readable: ClassVar[tuple[str, ...]] = (
-        *of_cycle, "energy_lost_landing", "energy_lost_stopper", "energy_lost_damping", *MARGINS,
+        *of_cycle, "energy_lost_landing", "energy_lost_stopper", "energy_lost_damping",
+        *(n for n in MARGINS if n not in MEASURED),
     )  # fmt: skip
     differentiable: ClassVar[tuple[str, ...]] = tuple(n for n in readable if not MEASURES[n].axis)
     from_nothing: ClassVar[bool] = True

@@ -1,35 +1,15 @@
-"""Premises of the paper's rung as smooth functions of a gait, for whoever searches along them.
-
-The margins of a step are minima over time. Two of them are no use to a search near their border:
-foot 2 always starts single support I at height zero, so its clearance is its lowest *later* height,
-which vanishes with the cube of the distance to the border on one side and jumps on the other. What
-decides is whether the foot leaves the ground upwards: `takeoff_acceleration`, smooth throughout.
-"""
+"""Premises of the paper's rung that whoever searches along gaits keeps, and with what margin."""
 
 from collections.abc import Mapping
 
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array
-
-from vrw_jax.numerics import Passage, Scalar
+from vrw_jax.numerics import Elementwise, Passage
 from vrw_jax.results import MEASURES
-from vrw_jax.wheel import Motion, Symbols, WheelParams, dynamics, rear_foot_height
+from vrw_jax.wheel import Motion, Symbols, WheelParams, dynamics
 
 
-def takeoff_acceleration(s: Symbols, sls1: Passage) -> Scalar:
-    """Normal acceleration of foot 2 at the start of SLS-I, m/s^2, for one wheel.
-
-    The foot is at rest on the ground there, so its sign says whether it rises or scuffs; the jump
-    from zero is the tangential force that the ground no longer gives.
-    """
-    q, v = jnp.stack(sls1.start.q), jnp.stack(sls1.start.v)
-    a = jnp.stack(dynamics.single_support_1_acceleration(s, Motion.of(*q, *v)))
-
-    def height(time: Array) -> Array:
-        return rear_foot_height(s, Motion.of(*(q + time * (v + 0.5 * time * a)), *v))
-
-    return jax.jacfwd(jax.jacfwd(height))(jnp.zeros_like(q[0]))
+def takeoff_acceleration(s: Symbols, sls1: Passage) -> Elementwise:
+    """That of a gait, see `dynamics`, at the start of its passage through SLS-I."""
+    return dynamics.takeoff_acceleration(s, Motion.of(*sls1.start.q, *sls1.start.v))
 
 
 PREMISES: tuple[str, ...] = (

@@ -87,6 +87,8 @@ class Margins(AbstractMeasured):
     does not count; a step that did not begin has margins zero.
 
     - `fore_foot_force`: lambda_2, N;
+    - `takeoff_acceleration`: of foot 2 normal to the slope at the start of SLS-I, m/s^2: what
+      decides on `clearance_sls1`, and smooth at the border to scuffing, where that is not;
     - `clearance_sls1`: height of foot 2 in SLS-I, m;
     - `clearance_sls2`: height of foot 2 in SLS-II, m;
     - `locked_stopper_force`: of legs 3..n on their stoppers, N;
@@ -109,6 +111,7 @@ class Margins(AbstractMeasured):
     named: ClassVar = {}
 
     fore_foot_force: Scalar
+    takeoff_acceleration: Scalar
     clearance_sls1: Scalar
     clearance_sls2: Scalar
     locked_stopper_force: Float[Array, " n_locked"]

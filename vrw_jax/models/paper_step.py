@@ -149,7 +149,8 @@ def result_of(
     """All that a step tells, of one wheel or of lanes."""
     began = told.outcome != Outcome.BAD_INPUT
     hits, stepped = told.happened[2], told.outcome == Outcome.STEPPED
-    _, sls1, sls2 = phases_of(s, landing.distance, stop_at_lift_off=True)
+    dls, sls1, sls2 = phases_of(s, landing.distance, stop_at_lift_off=True)
+    lets_go = dls.at((told.states[0][0],), (told.states[0][1],))
     safe = jnp.asarray(SAFE_SINGLE_SUPPORT, s.L0.dtype)
     at_stopper = tuple(jnp.where(hits, told.states[1][i], value) for i, value in enumerate(safe))
     hit = transitions.hit_stopper(s, sls1.at(at_stopper[:3], at_stopper[3:]))
@@ -166,7 +167,7 @@ def result_of(
             lambda_2=jnp.where(began, fore_after.normal, 0.0),
             lambda_4=jnp.where(began, rear_after.normal, 0.0),
         ),
-        monitors=_margins(s, landing, rear_after, hit, told, friction),
+        monitors=_margins(s, landing, rear_after, lets_go, hit, told, friction),
         energy=EnergyLoss(
             landing=jnp.where(began, landing.energy_lost, 0.0),
             stopper=jnp.where(hits, hit.energy_lost, 0.0),
@@ -181,11 +182,13 @@ def _margins(
     s: Symbols,
     landing: Landing,
     rear_after: dynamics.FootForce,
+    lets_go: Motion,
     hit: transitions.StopperHit,
     told: Told,
     friction: Elementwise | float,
 ) -> Margins:
-    """`rear_after`: force on the rear foot just after the landing."""
+    """`rear_after`: force on the rear foot just after the landing; `lets_go`: motion at the end of
+    double support."""
     began = told.outcome != Outcome.BAD_INPUT
     hits = told.happened[2]
     minima = [Premises.named(tuple(row), s.n) for row in told.minima]
@@ -208,6 +211,9 @@ def _margins(
 
     return Margins(
         fore_foot_force=lowest("fore_foot_force", 0, 1, 2),
+        takeoff_acceleration=jnp.where(
+            told.happened[1] & landing.stays, dynamics.takeoff_acceleration(s, lets_go), 0.0
+        ),
         clearance_sls1=lowest("rear_clearance", 1),
         clearance_sls2=lowest("rear_clearance", 2),
         locked_stopper_force=lowest("locked_stopper_force", 0, 1, 2),

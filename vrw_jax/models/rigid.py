@@ -134,6 +134,7 @@ class RigidWheel(AbstractWheel):
             ),
             monitors=Margins(
                 fore_foot_force=walked(lowest[0]),
+                takeoff_acceleration=zero,
                 clearance_sls1=zero,
                 clearance_sls2=walked(rear_foot_height(s, roll.motion(half + zero))),
                 locked_stopper_force=walked(lowest[3:]),

@@ -119,6 +119,9 @@ MARGINS = _table(
     Measure("fore_foot_force", "N", "min λ2", "least normal force on the fore foot",
             "Negative where the ground would have to pull on Leg 1.",
             breaks="fore foot pulls"),
+    Measure("takeoff_acceleration", "m/s^2", "z̈2⁺", "normal acceleration of foot 2 at take-off",
+            "Just after the rear foot is let go, at rest on the ground; negative where it scuffs "
+            "at once.", breaks="rear foot scuffs at take-off"),
     Measure("clearance_sls1", "m", "min z2, SLS-I", "foot clearance in SLS-I",
             "Least height of foot 2 in SLS-I; negative when it scuffs.",
             breaks="rear foot scuffs in SLS-I"),
@@ -201,9 +204,6 @@ CYCLE = _table(
     Measure("stability_margin", "1", "σ", "stability margin",
             "Smooth least Jury margin: to fold, period doubling and a pair on the unit circle; "
             "negative when the gait is unstable."),
-    Measure("takeoff_acceleration", "m/s^2", "z̈2⁺", "normal acceleration of foot 2 at take-off",
-            "Just after the rear foot is let go, at rest on the ground; negative where it scuffs "
-            "at once."),
 )
 """Measures of a limit cycle."""
 

@@ -124,6 +124,23 @@ def free_acceleration(s: Symbols, L1: Elementwise, free: Terms) -> Acceleration:
     return Acceleration(ddtheta, ddL1, f3 * per_mass + q * ddtheta + s.cos_alpha * ddL1)
 
 
+def takeoff_acceleration(s: Symbols, motion: Motion) -> Elementwise:
+    """Normal acceleration of foot 2 at the start `motion` of SLS-I, m/s^2.
+
+    The foot is at rest on the ground there, so its sign says whether it rises or scuffs; the jump
+    from zero is the tangential force that the ground no longer gives. Smooth where the clearance is
+    not: that is the lowest *later* height, which vanishes with the cube of the distance to the
+    border of scuffing on one side and jumps on the other.
+    """
+    L1, L2, dtheta = motion.L1, motion.L2, motion.dtheta
+    ddtheta, ddL1, ddL2 = single_support_1_acceleration(s, motion)
+    rear = rear_direction(s, motion.sin, motion.cos)
+    inwards = (ddL1 - L1 * dtheta**2) * motion.cos - (ddL2 - L2 * dtheta**2) * rear.cos
+    across_1 = 2.0 * motion.dL1 * dtheta + L1 * ddtheta
+    across_2 = 2.0 * motion.dL2 * dtheta + L2 * ddtheta
+    return inwards - across_1 * motion.sin + across_2 * rear.sin
+
+
 def single_support_2_acceleration(s: Symbols, motion: Motion) -> Acceleration:
     """SLS-II, two degrees of freedom: Leg 2 is on its stopper, where M12 = 0. Section 3.3.3."""
     M, f1, f2, _ = terms(s, motion)
