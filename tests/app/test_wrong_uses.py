@@ -1,5 +1,8 @@
 """What can be got wrong at the command line: one sentence, exit code 2, and nothing written."""
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import jax
@@ -392,3 +395,17 @@ def test_a_misspelt_command_shows_where_help_is(mistake: str, folder: Path) -> N
     assert "Error" in told.stderr
     assert "Traceback" not in told.stderr
     assert what_is_there(folder) == before
+
+
+@pytest.mark.parametrize("command", ["gait", "scan"])
+def test_a_device_that_is_not_there_gets_one_sentence(command: str, tmp_path: Path) -> None:
+    path = Path(__file__).parents[2] / "configs" / "quickstart.toml"
+    told = subprocess.run(
+        [sys.executable, "-m", "vrw_jax", command, str(path)],
+        cwd=tmp_path, capture_output=True, text=True,
+        env=os.environ | {"JAX_PLATFORMS": "cuda"},
+    )  # fmt: skip
+    assert told.returncode == 2
+    assert told.stderr.startswith("vrw: JAX_PLATFORMS is 'cuda', but JAX finds no device")
+    assert told.stderr.count("\n") == 1
+    assert not list(tmp_path.iterdir())

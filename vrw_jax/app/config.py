@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
-import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.models import (
@@ -438,7 +437,7 @@ def _in_domain(name: str, value: object) -> float:
     if name == FRICTION:
         return number
     domain = DOMAINS[name]
-    if not bool(domain.contains(jnp.asarray(number))):
+    if not domain.contains(number):
         raise ConfigError(
             f"{name} is {number:g}, but {domain.description} must lie in {domain}: "
             "give a value in that range."

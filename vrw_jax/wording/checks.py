@@ -98,14 +98,9 @@ def reals(name: str, value: Any, advice: str = "give a number, or an array of th
         array = jnp.asarray(value)
     except (TypeError, ValueError, OverflowError):
         array = None
-    except RuntimeError as error:  # the first array of a process finds out what it may run on
-        if "backend" not in str(error):
-            raise
-        asked = os.environ.get("JAX_PLATFORMS")
-        raise RuntimeError(
-            f"JAX_PLATFORMS is {asked!r}, but JAX finds no device of that kind: unset it, or set it"
-            " to cpu, before Python starts."
-        ) from error
+    except (RuntimeError, AssertionError):
+        _require_device()  # the first array of a process finds out what it may run on
+        raise
     if array is None or not (
         jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)
     ):
@@ -113,6 +108,17 @@ def reals(name: str, value: Any, advice: str = "give a number, or an array of th
     if not jnp.issubdtype(array.dtype, jnp.floating):
         array = array.astype(jnp.result_type(float))
     return jax.lax.convert_element_type(array, np.dtype(array.dtype))
+
+
+def _require_device() -> None:
+    try:
+        jax.devices()
+    except (RuntimeError, AssertionError) as error:  # a plugin without its device asserts
+        asked = os.environ.get("JAX_PLATFORMS")
+        raise OSError(
+            f"JAX_PLATFORMS is {asked!r}, but JAX finds no device of that kind: unset it, or set it"
+            " to cpu, before Python starts."
+        ) from error
 
 
 def flag(name: str, value: Any) -> bool:
