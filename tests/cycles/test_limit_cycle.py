@@ -207,6 +207,12 @@ def test_no_cycle_is_an_outcome_with_zeros_and_disturbs_no_neighbour():
             Outcome.ORDER_DIFFERS,
             "LEG_1_LIFTED_OFF in DLS",
         ),
+        (
+            {"damping": 40.0, "stiffness": 600.0, "natural_length": 1.04, "slope": 0.33},
+            Outcome.BORDER_ON_THE_WAY,
+            "λ4⁺ says whether there is DLS",
+        ),
+        ({"slope": 0.5}, Outcome.BORDER_ON_THE_WAY, "DLS ends only once"),
         ({"slope": 0.02}, Outcome.NO_CYCLE_FOUND, "did not converge"),
     ],
 )

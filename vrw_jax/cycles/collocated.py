@@ -150,9 +150,10 @@ class LimitCycle(AbstractCycle):
 
     @property
     def why(self) -> str:
-        broken = int(self.located.broken)
-        told = f" Broken: {SIGNS[broken - 1]}." if self.outcome == Outcome.ORDER_DIFFERS else ""
-        return super().why + told
+        if self.outcome not in (Outcome.ORDER_DIFFERS, Outcome.BORDER_ON_THE_WAY):
+            return super().why
+        sign = SIGNS[int(self.located.broken - 1) % len(SIGNS)]
+        return f"{super().why} Broken: {sign}."
 
     def own_rows(self) -> list[Row]:
         forces = self.indicators
@@ -203,6 +204,7 @@ def _find_cycle(params: WheelParams, problem: Problem, guess: Located | None) ->
     durations = located.solution.durations
     code = jnp.where(located.broken > 0.0, Outcome.ORDER_DIFFERS, Outcome.NO_CYCLE_FOUND)
     code = jnp.where(located.broken == MESH, Outcome.MESH_TOO_COARSE, code)
+    code = jnp.where(located.broken > MESH, Outcome.BORDER_ON_THE_WAY, code)
     code = jnp.where(found, Outcome.STEPPED, code)
     return LimitCycle(
         section_state=masked(states[-1]),

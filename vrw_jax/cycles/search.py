@@ -101,7 +101,8 @@ class Located(NamedTuple):
     solution: Solution
     happens: LaneArray  # (n, n_phases, lanes): 1 where the phase takes place, else 0
     found: LaneArray  # (lanes,): 1 for a limit cycle, 0 where there is none and values stand in
-    broken: LaneArray  # (lanes,): 1 + place in SIGNS of what a root that is no gait breaks, else 0
+    broken: LaneArray  # (lanes,): 1 + place in SIGNS of what a root that is no gait breaks, more
+    # by ON_THE_WAY where only a wheel on the way here has that root, LOST, else 0
     ends: LaneArray  # (n, 4, lanes): theta, L1 and their rates at the end of each step
 
 
@@ -353,27 +354,50 @@ def _attempted(
     iterations = dict.fromkeys(ATTEMPTS, options.iterations) | {
         "guess": options.first_iterations, "surface": options.first_iterations
     }  # fmt: skip
-    limits = jnp.asarray([iterations[name] for name in ATTEMPTS], jnp.int32)
+    limits = [iterations[name] for name in ATTEMPTS] + [options.iterations] * (2 * PIECES)
+    pieces = [0] * len(ATTEMPTS) + [1 + i // 2 for i in range(2 * PIECES)]
+    of_now = lambda table: jnp.asarray(table, jnp.int32)[attempt]
     origin = jnp.broadcast_to(table_1[:, None], parameters.shape)
+    # Each piece is tried twice: from the wheel before it, then without double support.
+    piece, again = of_now(pieces), of_now([0] * len(ATTEMPTS) + [0, 1] * PIECES) == 1
+    in_pieces = piece > 0
+    arrived = ~in_pieces | (piece == PIECES)
+    share = piece.astype(parameters.dtype) / PIECES
+    here = jnp.where(arrived, parameters, origin + share * (parameters - origin))
     is_homotopy = _is(attempt, "homotopy")
-    place = jnp.where(is_homotopy, origin, parameters)
-    with_dls = jnp.broadcast_to(~_is(attempt, "without DLS"), parameters.shape[-1:])
+    place = jnp.where(is_homotopy, origin, here)
+    with_dls = jnp.broadcast_to(~_is(attempt, "without DLS") & ~again, parameters.shape[-1:])
     stages = jnp.where(is_homotopy, options.stages, 0)
     start = surface_start(problem, place, with_dls)
-    goes_on = _is(attempt, "guess, on", "surface, on")
+    goes_on = _is(attempt, "guess, on", "surface, on") | ((piece > 1) & ~again)
     start = jax.tree.map(lambda s, n: jnp.where(goes_on, n, s), start, now.located)
     if guess is not None:
         is_guess = _is(attempt, "guess")
         start = jax.tree.map(lambda s, g: jnp.where(is_guess, g, s), start, guess)
     pending = now.located.found < 0.5
-    tried = newton(problem, parameters, start, origin, stages, limits[attempt], pending)
+    pending &= ~in_pieces | (now.located.broken == jnp.where(again, LOST_ONCE, 0.0))
+    tried = newton(problem, here, start, origin, stages, of_now(limits), pending)
+    if problem.period_n == 1:
+        on_the_way = _on_the_way(tried.located, arrived, jnp.where(again, LOST, LOST_ONCE))
+        located = jax.tree.map(lambda a, b: jnp.where(in_pieces, a, b), on_the_way, tried.located)
+        tried = tried._replace(located=located)
     chosen = jax.tree.map(lambda a, b: jnp.where(pending, a, b), tried, now)
     # The first root that is no gait is told, unless only the mesh forbids another one.
     before, after = now.located.broken, chosen.located.broken
-    broken = jnp.where((before == 0.0) | (after == MESH), after, before)
+    broken = jnp.where((before <= 0.0) | (after == MESH), after, before)
     broken = jnp.where(chosen.located.found > 0.5, 0.0, broken)
     located = chosen.located._replace(broken=broken)
     return chosen._replace(located=located, passes=now.passes + tried.passes)
+
+
+def _on_the_way(tried: Located, arrived: Array, lost: Array) -> Located:
+    """What a wheel on the way tells of the one at its end; `lost` where it tells nothing."""
+    found, broken = tried.found, tried.broken
+    goes_on = ~arrived & ((found > 0.5) | (broken == MESH))
+    ends = jnp.where(arrived, broken, broken + ON_THE_WAY)
+    told = jnp.where((found > 0.5) | (broken > 0.0), ends, lost)
+    told = jnp.where(goes_on, 0.0, told)
+    return tried._replace(found=jnp.where(arrived, found, 0.0), broken=told)
 
 
 def search_lanes(
@@ -408,7 +432,15 @@ def search_lanes(
 
     first = jnp.asarray(ATTEMPTS.index("surface" if guess is None else "guess"), jnp.int32)
     nothing = not_searched(problem, parameters)
-    more = lambda c: (c[0] < len(ATTEMPTS)) & jnp.any(c[1].located.found < 0.5)
+    # Of several steps a repeated gait of one would be followed: that tells nothing.
+    n_attempts = len(ATTEMPTS) + 2 * PIECES * (problem.period_n == 1)
+
+    def more(carry: tuple[Array, Finding]) -> Array:
+        attempt, now = carry
+        known = (now.located.broken > 0.0) | (now.located.broken == LOST)
+        unknown = (attempt < len(ATTEMPTS)) | ~known
+        return (attempt < n_attempts) & jnp.any((now.located.found < 0.5) & unknown)
+
     _, finding = lax.while_loop(more, lambda c: (c[0] + 1, attempt_all(*c)), (first, nothing))
     return finding
 
@@ -428,6 +460,9 @@ def not_searched(problem: Problem, parameters: Parameters) -> Finding:
 MESH = len(SIGNS)
 """`Located.broken` of a root that the mesh does not resolve."""
 
+ON_THE_WAY, LOST_ONCE, LOST = float(len(SIGNS)), -1.0, -2.0
+"""In `Located.broken`: added to what breaks before the wheel is reached; Newton's method failed."""
+
 ZERO_AT_EVENT = 1e-6
 """How far below zero a guard may be at the end of the phase that it ends, N, m or rad/s."""
 
@@ -439,3 +474,7 @@ ATTEMPTS = ("guess", "guess, on", "surface", "surface, on", "homotopy", "without
 """In turn: from the guess, if any; from the gait that the stored surface predicts; by a homotopy
 from Table 1; and for a cycle without double support. The first two begin with a few iterations, so
 that in a batch the lanes that need more can be gathered in blocks of their own."""
+
+PIECES = 16
+"""Where there is no root at all, the gait of Table 1 is followed from wheel to wheel on the straight
+line to this one: either it arrives, or the way tells what ends it."""

@@ -42,7 +42,8 @@ Dash = Literal["-", "--", "-.", ":"]
 
 BORDERS: dict[str, tuple[str, Dash]] = {
     "fore_foot_force": ("black", "-"),
-    "clearance_sls1": (ORANGE, "-"),
+    "takeoff_acceleration": (ORANGE, "-"),
+    "clearance_sls1": (ORANGE, "--"),
     "clearance_sls2": (ORANGE, ":"),
     "locked_stopper_force": (PINK, "--"),
     "rear_stopper_force": (PINK, ":"),
@@ -334,6 +335,8 @@ def _borders(axes: Axes, scan: xr.Dataset, x: str, y: str) -> dict[str, Line2D]:
         margin = scan[name]
         if MARGINS[name].axis:
             margin = margin.min("leg")
+        if name == "clearance_sls1" and "takeoff_acceleration" in scan:
+            margin = margin.where(scan.takeoff_acceleration >= 0.0)  # the border's stairs
         values = margin.transpose(y, x).values
         known = values[np.isfinite(values)]
         if not len(known) or known.min() >= 0.0 or known.max() <= 0.0:

@@ -73,6 +73,7 @@ OUTCOMES: dict[Outcome, tuple[str, str]] = {
     Outcome.THREE_FEET_LOADED: ("three feet loaded", "#44AA99"),
     Outcome.MESH_TOO_COARSE: ("mesh too coarse", "#777777"),
     Outcome.ORDER_DIFFERS: ("other order of events", "#AAAAAA"),
+    Outcome.BORDER_ON_THE_WAY: ("border on the way", "#555555"),
     Outcome.FRICTION_PARADOX: ("friction paradox", "#AA4499"),
 }
 NOT_COMPUTED = ("not computed", "#FFFFFF")

@@ -31,7 +31,12 @@ from vrw_jax.walks import ModelLike
 from vrw_jax.wheel import Outcome, WheelParams, parameters_of
 from vrw_jax.wording import chosen, untraced, whole
 
-LOST = (Outcome.NO_CYCLE_FOUND, Outcome.ORDER_DIFFERS, Outcome.MESH_TOO_COARSE)
+LOST = (
+    Outcome.NO_CYCLE_FOUND,
+    Outcome.ORDER_DIFFERS,
+    Outcome.BORDER_ON_THE_WAY,
+    Outcome.MESH_TOO_COARSE,
+)
 """Outcomes of a search that may have missed a gait."""
 
 MESH_ERROR = 1e-7

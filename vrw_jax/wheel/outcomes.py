@@ -40,6 +40,9 @@ class Outcome(Code):
     ORDER_DIFFERS = (
         14, "A cycle solves the equations, but its events do not come in the paper's order."
     )  # fmt: skip
+    BORDER_ON_THE_WAY = (
+        16, "No cycle was found; followed from Table 1 to this wheel, the gait ends on the way."
+    )  # fmt: skip
     FRICTION_PARADOX = (
         15, "Friction is so high that no forces can carry the motion on (Painlevé's paradox)."
     )  # fmt: skip
