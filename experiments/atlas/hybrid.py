@@ -20,7 +20,7 @@ import optimistix as optx
 from scipy.integrate import solve_ivp
 
 import vrw_jax as vrw
-from experiments.atlas.told import RIGHT, Row, off, timed
+from experiments.atlas.told import Row, off, timed
 from experiments.shared.command import extra
 from vrw_jax.numerics import Guard, Mode, Stop, walk
 
@@ -288,13 +288,14 @@ def row(
     truth: float,
     *,
     relative: bool = False,
-    within: float = RIGHT,
+    condition: float = 1.0,
+    digits: int | None = None,
 ) -> Row:
     """What a walk says of one quantity."""
     return Row(
         quantity, walked.method, found, truth, off(found, truth, relative=relative), walked.says,
         walked.admits, walked.work, walked.seconds, walked.options, walked.version,
-        within,
+        condition, digits,
     )  # fmt: skip
 
 

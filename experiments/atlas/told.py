@@ -1,14 +1,16 @@
 """What a case tells: a row for each method, and who is right, says so, or is wrong silently."""
 
 import math
+import re
 import time
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 from matplotlib.figure import Figure
 
-RIGHT = 1e-9
-"""An error that counts as right where nothing else is said; the error itself stands beside."""
+RIGHT, EXACT, OVER = 1e-9, 1e-12, 100.0
+"""An error that counts as right at all; what is asked of a closed form times the problem's own
+condition; over the tolerance that a method was asked for: see `Row.within`."""
 
 
 class Row(NamedTuple):
@@ -25,7 +27,20 @@ class Row(NamedTuple):
     seconds: float  # CPU time of a call that has been compiled before
     options: str
     version: str
-    within: float = RIGHT  # an error that counts as right; more where only few digits are published
+    condition: float = 1.0  # by how much a unit error of the state moves the truth
+    digits: int | None = None  # of a published truth; None: a closed form, or all digits
+
+    @property
+    def asked(self) -> float:
+        """The tolerance among the method's options, 0 without one."""
+        told = re.search(r"\d\S*e-\d+", self.options)
+        return float(told[0].rstrip(",")) if told else 0.0
+
+    @property
+    def within(self) -> float:
+        """The error that counts as right, by one rule for all."""
+        published = 0.0 if self.digits is None else 0.5 * 10.0**-self.digits
+        return max(RIGHT, EXACT * self.condition, OVER * self.asked, published)
 
     @property
     def verdict(self) -> str:

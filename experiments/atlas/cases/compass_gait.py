@@ -78,13 +78,13 @@ def rows() -> Iterator[Row]:
         for name, found, truth in zip(
             ("stance angle", "its rate"), gait.x, PUBLISHED, strict=False
         ):
-            yield row(gait.walked, f"{name} as published", float(found), truth, within=5e-5)
+            yield row(gait.walked, f"{name} as published", float(found), truth, digits=4)
         if gait is not other:
             yield row(gait.walked, "stance angle as heyoka's", float(gait.x[0]), float(other.x[0]))
             modulus = float(np.abs(gait.multipliers[0]))
             yield row(
                 gait.walked, "spectral radius as heyoka's", modulus,
-                float(np.abs(other.multipliers[0])), within=1e-8,
+                float(np.abs(other.multipliers[0])), digits=8,
             )  # fmt: skip
 
 

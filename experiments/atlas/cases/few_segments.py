@@ -26,6 +26,8 @@ from vrw_jax.numerics import ENDS_ONCE, NODES, ONCE, product_multipliers, segmen
 Q = 0.97
 TRUTH = math.exp(-2.0 * math.pi)
 PERIOD = 2.0 * math.pi
+STEEP = 2.0 * (1.0 + Q) / (1.0 - Q) - 1.0
+"""Largest rate of contraction: so much an error of the phase moves the multiplier, relatively."""
 
 
 def growth(theta, m):
@@ -65,14 +67,14 @@ def rows() -> Iterator[Row]:
         name = f"ours, {n} segment{'s' * (n > 1)}"
         yield Row(
             "multiplier", name, found, TRUTH, off(found, TRUTH, relative=True), "",
-            not known, n, seconds, "Dopri8 1e-13", version("vrw-jax"),
+            not known, n, seconds, "Dopri8 1e-13", version("vrw-jax"), STEEP,
         )  # fmt: skip
     for n in (10, 40, 400):
         found, seconds = timed(lambda n=n: collocated(n))
         yield Row(
             "multiplier", f"collocation, {n} segments", found, TRUTH,
             off(found, TRUTH, relative=True), "", False, n, seconds, "4 Gauss nodes, equal",
-            version("vrw-jax"),
+            version("vrw-jax"), STEEP,
         )  # fmt: skip
     told, seconds = timed(
         lambda: solve_ivp(
@@ -87,7 +89,7 @@ def rows() -> Iterator[Row]:
     found = float(told.y[0, -1])
     yield Row(
         "multiplier", "SciPy", found, TRUTH, off(found, TRUTH, relative=True), "", False, told.nfev,
-        seconds, "DOP853 1e-13", version("scipy"),
+        seconds, "DOP853 1e-13", version("scipy"), STEEP,
     )  # fmt: skip
     solve = jax.jit(
         lambda z: diffrax.diffeqsolve(
@@ -98,7 +100,7 @@ def rows() -> Iterator[Row]:
     answer, seconds = timed(lambda: float(solve(jnp.array([1.0, 0.0]))))
     yield Row(
         "multiplier", "diffrax", answer, TRUTH, off(answer, TRUTH, relative=True), "", False, 0,
-        seconds, "Dopri8 1e-13", version("diffrax"),
+        seconds, "Dopri8 1e-13", version("diffrax"), STEEP,
     )  # fmt: skip
     names = hy.make_vars("u", "theta")
     flow = hy.taylor_adaptive(list(zip(names, varied(names, hy), strict=True)), [1.0, 0.0])
@@ -106,7 +108,7 @@ def rows() -> Iterator[Row]:
     found = float(flow.state[0])
     yield Row(
         "multiplier", "heyoka", found, TRUTH, off(found, TRUTH, relative=True), "", False, 0, 0.0,
-        "Taylor 2.2e-16", version("heyoka"),
+        "Taylor 2.2e-16", version("heyoka"), STEEP,
     )  # fmt: skip
 
 

@@ -38,9 +38,11 @@ def rows() -> Iterator[Row]:
     for depth in DEPTHS:
         for gait in gaits(resonant(depth)):
             name = f"rate after impact, depth {depth:g}"
-            yield row(gait.walked, name, float(gait.x[1]), rate(depth))
+            steep = abs(rate(depth)) / (2.0 * depth)  # of the rate over the depth
+            yield row(gait.walked, name, float(gait.x[1]), rate(depth), condition=steep)
             product = float(np.linalg.det(gait.jacobian))
-            yield row(gait.walked, f"product of multipliers, {depth:g}", product, KEPT**2)
+            name = f"product of multipliers, {depth:g}"
+            yield row(gait.walked, name, product, KEPT**2, condition=steep)
 
 
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:

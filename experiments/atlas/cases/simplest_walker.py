@@ -62,7 +62,7 @@ def rows() -> Iterator[Row]:
         parts = (("real", first.real, other.real), ("imaginary", abs(first.imag), abs(other.imag)))
         for (name, found, own), published in zip(parts, PAIR, strict=True):
             told_as = f"multipliers, {name} part"
-            yield row(walked, f"{told_as}, as published", float(found), published, within=1e-6)
+            yield row(walked, f"{told_as}, as published", float(found), published, digits=6)
             if gait is not told[-1]:
                 yield row(walked, f"{told_as}, as heyoka's", float(found), float(own))
 

@@ -44,7 +44,10 @@ def rows() -> Iterator[Row]:
         yield row(walked, "which guard (0, 1)", which, 1.0)
     for method in METHODS:
         walked = method(circle(DEPTH), (1.0, 0.0, 0.0), 1, 9.0)
-        yield row(walked, "dip of 1e-8", last_time(walked, 1), entry(DEPTH))
+        yield row(
+            walked, "dip of 1e-8", last_time(walked, 1), entry(DEPTH),
+            condition=1.0 / math.sqrt(2.0 * DEPTH),
+        )  # fmt: skip
 
 
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:

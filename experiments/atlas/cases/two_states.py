@@ -79,9 +79,8 @@ def rows() -> Iterator[Row]:
     times = truth()
     for walked in walks():
         for n in (1, EVENTS):
-            within = 1e-8 if "1e-10" in walked.options else 1e-9  # implicit ones are asked for less
             found = last_time(walked, n)
-            yield row(walked, f"switching time {n}", found, float(times[n - 1]), within=within)
+            yield row(walked, f"switching time {n}", found, float(times[n - 1]))
 
 
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
