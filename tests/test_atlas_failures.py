@@ -43,13 +43,24 @@ def test_there_are_ten_cases_and_more_and_ours_is_nowhere_silently_wrong():
     assert all(row["version"] and row["options"] for row in TABLE)
 
 
+def test_the_table_is_one_run_and_ours_keeps_1e_12_of_each_closed_form_s_condition():
+    assert len({row["run"] for row in TABLE}) == 1
+    mine = failures.exact(TABLE)
+    assert len(mine) > 20
+    assert max(float(row["error"]) / float(row["condition"]) for row in mine) <= 1e-12
+
+
 def test_a_verdict_needs_a_right_answer_or_an_admission():
     row = Row("q", "m", 1.0, 2.0, 1.0, "", False, 1, 0.0, "o", "v")
     assert row.verdict == "WRONG, silently"
     assert row._replace(admits=True).verdict == "says so"
     assert row._replace(error=1e-12, admits=True).verdict == "right"
     assert row._replace(error=math.inf).verdict == "WRONG, silently"
-    assert row._replace(error=1e-6, within=1e-5).verdict == "right"
+    assert row._replace(error=4e-6).verdict == "WRONG, silently"
+    assert row._replace(error=4e-6, digits=5).verdict == "right"
+    assert row._replace(error=4e-6, condition=1e7).verdict == "right"
+    assert row._replace(error=4e-6, options="Radau 1e-7, 3 stages").verdict == "right"
+    assert row._replace(error=4e-6, options="Taylor, 2.2e-16").verdict == "WRONG, silently"
 
 
 @pytest.mark.parametrize("method", METHODS)

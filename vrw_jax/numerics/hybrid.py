@@ -78,7 +78,8 @@ def walk(
 
     Guards are met as `integrate_phase` meets them: the earliest first, at the integrator's
     accuracy, with derivatives of event times and states. A guard within the clock's rounding of
-    zero where its mode begins counts as zero. Transforms (`jax.jit`, `jax.jacfwd`, `jax.vmap`)
+    zero where its mode begins counts as zero; one that is zero at rest there fires only if it
+    will not rise. Transforms (`jax.jit`, `jax.jacfwd`, `jax.vmap`)
     apply.
     """
     options = Options() if options is None else options
@@ -124,13 +125,17 @@ def _require_shape(name: str, function: Callable, start: Array, shape: tuple) ->
 def _entered(mode: Mode, state: Array, time: Array, options: Options) -> tuple[PhaseEnd, Array]:
     """The mode's phase from a state, and whether a guard was past there."""
     values = lambda y: jnp.stack([guard.value(y) for guard in mode.guards])
-    first, rates = jax.jvp(values, (state,), (mode.field(state),))
-    first, rates = lax.stop_gradient((first, rates))
+    rate = lambda y: jax.jvp(values, (y,), (mode.field(y),))[1]
+    first, (rates, bends) = values(state), jax.jvp(rate, (state,), (mode.field(state),))
+    first, rates, bends = lax.stop_gradient((first, rates, bends))
     clock = lax.stop_gradient(time + options.first_step)
     resolution = 1e3 * jnp.finfo(state.dtype).eps * clock
     near = -first <= jnp.abs(rates) * resolution
     past = jnp.any((first < 0.0) & ~near)
     lift = jnp.where((first < 0.0) & near & (rates > 0.0), -first, 0.0)
+    # On a guard at rest what it does next decides: it need not fire where it will rise.
+    rises = (first == 0.0) & (rates == 0.0) & (bends > 0.0)
+    lift = jnp.where(rises, jnp.finfo(state.dtype).tiny, lift)
     watched = Watched(lambda y: values(y) + lift, len(mode.guards))
     return integrate_phase(mode.field, watched, state, ~past, options), past
 

@@ -76,8 +76,8 @@ def rows() -> Iterator[Row]:
         ("logarithm of their product", sums, divergence),
     ):
         yield Row(
-            name, "ours", value, truth, off(value, truth, relative=True), "", False, SEGMENTS, seconds,
-            f"Dopri8 1e-13, {SEGMENTS} segments", version("vrw-jax"),
+            name, "ours", value, truth, off(value, truth, relative=True), "", False, SEGMENTS,
+            seconds, f"Dopri8 1e-13, {SEGMENTS} segments", version("vrw-jax"),
         )  # fmt: skip
 
 
