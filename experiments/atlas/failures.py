@@ -4,7 +4,7 @@
 
 Each case is a module of experiments/atlas/cases with its truth. The rows of the table are what each
 method gave in one run of the whole: its answer, its error, its own words, what it cost.
-docs/stability_atlas.md opens with them. With --only rows are told and pictures drawn, and no table.
+docs/stability_atlas.md opens with them. With --only these cases are run again; `run` tells when.
 """
 
 import importlib
@@ -27,7 +27,7 @@ from vrw_jax.figures import figure_style, save
 TABLE = FIGURES / "atlas_failures.csv"
 ORDER = (
     "bouncing_ball", "monodromy", "grazing", "resonant_grazing", "two_states", "pinned_pendulum",
-    "stick_slip", "painleve", "chenciner", "few_segments", "singular_field",
+    "stick_slip", "woodpecker", "painleve", "chenciner", "few_segments", "singular_field",
     "tangent_guards", "simplest_walker", "compass_gait", "rimless_wheel",
 )  # fmt: skip
 NAMES = [name for name in ORDER if name in {m.name for m in pkgutil.iter_modules(cases.__path__)}]
@@ -136,7 +136,8 @@ def main() -> None:
     if chosen.redraw:
         tell(read(TABLE))
         return
-    rows, began = [], time.strftime("%Y-%m-%dT%H:%MZ", time.gmtime())
+    rows = read(TABLE) if chosen.only and TABLE.exists() else []
+    began = time.strftime("%Y-%m-%dT%H:%MZ", time.gmtime())
     with on_one_core():
         start_cold()
         for name in names:
@@ -144,10 +145,10 @@ def main() -> None:
             for row in some:
                 print(*(x for key, x in row.items() if key not in ("options", "run")), flush=True)
             draw(name, some)
-            rows += some
-    if not chosen.only:
-        write_named(TABLE, rows)
-        tell(rows)
+            rows = [row for row in rows if row["case"] != name] + some
+    rows.sort(key=lambda row: ORDER.index(row["case"]))
+    write_named(TABLE, rows)
+    tell(rows)
 
 
 if __name__ == "__main__":

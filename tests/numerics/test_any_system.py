@@ -96,6 +96,15 @@ def test_a_start_that_is_a_rounding_off_its_guard_is_on_it(height):
     assert abs(float(told.time) - 2.0 / G) < 1e-14
 
 
+@pytest.mark.parametrize(("bend", "time"), [(1.0, 3.0), (-1.0, 0.0)])
+def test_a_guard_at_rest_on_zero_fires_only_if_it_does_not_rise(bend, time):
+    """h = bend t²/2 − t³/6, from h = h' = 0."""
+    mode = Mode(lambda y: jnp.stack([y[1], y[2], -1.0 + 0.0 * y[2]]), (Guard(lambda y: y[0]),))
+    told = walk((mode,), (0.0, 0.0, bend), events=1, options=TIGHT)
+    assert code(told) == Stop.EVENTS_DONE
+    np.testing.assert_allclose(told.times[0], time, atol=1e-12)
+
+
 def test_what_goes_wrong_on_the_way_is_a_code():
     assert code(walk([ball()], [-1.0, 0.0], events=3)) == Stop.GUARD_PAST
     short = vrw.Options(max_phase_time=0.1)
