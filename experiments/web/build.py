@@ -18,7 +18,7 @@ from typing import Any
 
 import vrw_jax as vrw
 from experiments.shared.command import command, started
-from experiments.web.programs import LEGS, SAMPLES, programs
+from experiments.web.programs import LEGS, SAMPLES, TOLD, programs
 from vrw_jax.models import PAPER_START, EnergyLoss, Indicators
 from vrw_jax.results import CYCLE, MARGINS, STEP
 from vrw_jax.wheel import DOMAINS
@@ -75,7 +75,7 @@ def told_rows(n_legs: int) -> list[str]:
     legs = range(3, n_legs + 1)
     margins = [
         [f"{name}[{leg}]" for leg in legs] if measure.axis else [name]
-        for name, measure in MARGINS.items()
+        for name, measure in TOLD.items()
     ]
     return [
         "theta_touchdown", "dtheta_touchdown", "dL1_touchdown",
@@ -121,7 +121,7 @@ def facts() -> dict[str, Any]:
         "samples": SAMPLES,
         "rows": {n: told_rows(n) for n in LEGS},
         "measures": {name: told(m) for name, m in (STEP | MARGINS | CYCLE).items()},
-        "margins": {name: bool(m.axis) for name, m in MARGINS.items()},
+        "margins": {name: bool(m.axis) for name, m in TOLD.items()},
         "outcomes": {int(o): {"name": o.name, "meaning": o.meaning} for o in vrw.Outcome},
     }
 

@@ -16,6 +16,7 @@ from vrw_jax.models.lane_step import lane_phase, walk
 from vrw_jax.models.paper_step import result_of, told_of
 from vrw_jax.models.viscoelastic import described
 from vrw_jax.numerics import Options, explicit_tableau, sample_lanes
+from vrw_jax.results import MARGINS
 from vrw_jax.wheel import PARAMETER_NAMES, WheelParams, wheel_of
 
 LEGS = (6, 8, 10)
@@ -37,6 +38,10 @@ class Program(NamedTuple):
         """As code for WebAssembly."""
         rows = len(PARAMETER_NAMES), 3
         return simd.web_object(self.function, self.numbers, rows, name, self.small)
+
+
+TOLD = {name: m for name, m in MARGINS.items() if name != "takeoff_acceleration"}
+"""Margins on the page: of scuffing the clearances tell there."""
 
 
 def programs(n_legs: int) -> dict[str, Program]:
@@ -64,7 +69,7 @@ def programs(n_legs: int) -> dict[str, Program]:
         step = result_of(walked.s, walked.landing, told_of(walked), friction)
         parts = (
             step.section_state, step.post_impact, step.durations, step.step_length,
-            *vars(step.indicators).values(), *vars(step.monitors).values(),
+            *vars(step.indicators).values(), *(getattr(step.monitors, name) for name in TOLD),
             *vars(step.energy).values(),
         )  # fmt: skip
         numbers = jnp.concatenate([jnp.atleast_2d(part) for part in parts])

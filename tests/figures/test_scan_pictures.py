@@ -45,7 +45,9 @@ def test_a_few_unstable_gaits_do_not_stretch_the_colours_of_the_stable_ones():
     assert figure.axes[0].collections[0].get_clim() == (speed[0, 1], 40.0)
 
 
-@pytest.mark.parametrize("code", [Outcome.NO_CYCLE_FOUND, Outcome.ORDER_DIFFERS, Outcome.BORDER_ON_THE_WAY])
+@pytest.mark.parametrize(
+    "code", [Outcome.NO_CYCLE_FOUND, Outcome.ORDER_DIFFERS, Outcome.BORDER_ON_THE_WAY]
+)
 def test_why_there_is_no_gait_is_told_by_colour(code):
     outcome = np.zeros((3, 2), int)
     outcome[0, 0] = code
