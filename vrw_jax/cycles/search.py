@@ -476,5 +476,5 @@ from Table 1; and for a cycle without double support. The first two begin with a
 that in a batch the lanes that need more can be gathered in blocks of their own."""
 
 PIECES = 16
-"""Where there is no root at all, the gait of Table 1 is followed from wheel to wheel on the straight
-line to this one: either it arrives, or the way tells what ends it."""
+"""Where there is no root at all, the gait of Table 1 is followed from wheel to wheel on the line to
+this one: either it arrives, or the way tells what ends it."""
