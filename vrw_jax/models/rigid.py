@@ -102,8 +102,7 @@ class RigidWheel(AbstractWheel):
         params, x = replaced_where_bad(good, params, x, safe_x)
         s = params.symbols()
         half = jnp.asarray(0.5 * s.alpha, x.dtype)
-        before = x[1]
-        rate = self._kept(s) * before
+        before, rate = x[1], self._kept(s) * x[1]
         roll = _Roll(s, rate)
 
         apex = jnp.where(s.sin_phi < jnp.sin(half), jnp.arcsin(-s.sin_phi), -half)
