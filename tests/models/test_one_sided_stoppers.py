@@ -120,10 +120,11 @@ def test_time_stepping_with_stoppers_that_only_push_converges_to_the_same_step(f
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("friction", "damping"), SCENES)
-def test_landings_with_one_sided_stoppers_repeat_between_tolerances(friction, damping):
+def test_landings_with_one_sided_stoppers_repeat_but_for_what_the_tolerances_cut(friction, damping):
     loose, tight = (stepped(friction, damping, options=o) for o in (vrw.Options(), TIGHT))
-    np.testing.assert_allclose(loose.section_state[:4], tight.section_state[:4], atol=1e-8)
-    assert abs(float(loose.period - tight.period)) < 1e-8
+    # Dips below 1e-12 and 1e-13 m stay: speeds of 4e-6 and 1e-6 m/s, in each event of a chain.
+    np.testing.assert_allclose(loose.section_state[:4], tight.section_state[:4], atol=2e-6)
+    assert abs(float(loose.period - tight.period)) < 3e-7
 
 
 @pytest.mark.slow

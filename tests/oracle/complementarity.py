@@ -46,6 +46,7 @@ class Wheel(NamedTuple):
     g: float = 9.81
     one_sided: bool = False
     restitution: float = 0.0  # of the feet
+    tilt: float = 0.0  # by which the ground ahead of the foot that landed is steeper, rad
 
     @property
     def mass(self) -> float:
@@ -114,6 +115,14 @@ def _mass_and_force(w, q, v):
     force[:2] += w.m_hub * gravity
     force[3:] += w.k * (w.Ls - q[3:]) - w.c * v[3:]
     return mass, force
+
+
+def _gaps(w, q):
+    """Heights of the feet; the last one's over its own ground, which begins under Leg 0's foot."""
+    u, _ = _legs(q[2])
+    places = q[:2] - q[3:, None] * u
+    ahead = places[-1] - [places[0, 0], 0.0]
+    return np.r_[places[:-1, 1], ahead @ [np.sin(w.tilt), np.cos(w.tilt)]]
 
 
 def _rooms(legs):
@@ -244,8 +253,7 @@ def _at_rest(w, q, v, rows):
 def _event(w, place, struck_foot, struck_leg):
     """Through an event: rates, modes and held legs after it, and how many modes would do."""
     q, v, mode, held = place
-    u, _ = _legs(q[2])
-    gaps, (rows, _) = q[1] - q[3:] * u[:, 1], _points(q, v, q[3:])
+    gaps, (rows, _) = _gaps(w, q), _points(q, v, q[3:])
     speeds = rows @ v
     near = (gaps <= TOUCH) & (speeds[:, 1] <= REST)
     feet = [j for j in range(N) if mode[j] != OFF or j == struck_foot or near[j]]
@@ -325,11 +333,10 @@ def _guards(w, place):
 
     def values(y):
         q, v = y[: 3 + N], y[3 + N :]
-        u, _ = _legs(q[2])
         on_feet, on_legs = _carried(w, q, v, mode, held)[1:]
         speeds = _points(q, v, q[3:])[0][:, 0] @ v
         told = {
-            "gap": q[1] - q[3:] * u[:, 1],
+            "gap": _gaps(w, q),
             "room": w.L0 - q[3:],
             "normal": on_feet[:, 1],
             "cone up": w.rough * on_feet[:, 1] - on_feet[:, 0],
@@ -421,7 +428,7 @@ def one_step(w: Wheel, begin: Place, most_events: int = 1000) -> Step:
         if place.v[2] <= 0.0:
             raise LostError("fell back")
         if struck == ("gap", N - 1):
-            return Step(durations, _relabelled(place), event + 1, ambiguous)
+            return Step(durations, _relabelled(w, place), event + 1, ambiguous)
         _put_back(w, place)
     raise LostError("events without end")
 
@@ -437,11 +444,12 @@ def _put_back(w, place):
             q[3 + j] = q[1] / u[j, 1]
 
 
-def _relabelled(place):
-    """The same wheel in the labels of the step that begins, its origin where that foot lands."""
+def _relabelled(w, place):
+    """The same wheel in labels and frame of the step that begins, its origin under that foot."""
     roll = lambda x: np.roll(x, 1)
-    q = np.r_[0.0, place.q[1], place.q[2] - ALPHA, roll(place.q[3:])]
-    q[0] = q[3] * np.sin(q[2])
-    v = np.r_[place.v[:3], roll(place.v[3:])]
+    q = np.r_[0.0, 0.0, place.q[2] - ALPHA - w.tilt, roll(place.q[3:])]
+    q[:2] = q[3] * np.array([np.sin(q[2]), np.cos(q[2])])
+    sin, cos = np.sin(w.tilt), np.cos(w.tilt)
+    v = np.r_[np.array([[cos, -sin], [sin, cos]]) @ place.v[:2], place.v[2], roll(place.v[3:])]
     mode, held = (tuple(roll(np.array(x)).tolist()) for x in (place.mode, place.held))
     return Place(q, v, mode, held)

@@ -5,6 +5,7 @@ from vrw_jax.models.base import (
     AbstractWheel,
     Advance,
     EnergyLoss,
+    GroundOfStep,
     Indicators,
     Margins,
     RungState,

@@ -24,6 +24,11 @@ RungState = Float[Array, " section"]
 """A `SectionState`, or the rung's own longer one."""
 
 
+GroundOfStep = tuple[Array, Array, Array, Array]
+"""Slope and friction of a landing, friction of the feet before, and by how much the ground ahead is
+steeper; or all that over steps."""
+
+
 class AbstractMeasured(AbstractTold):
     """Several measures, each field told as one of `results.MEASURES`."""
 
@@ -358,6 +363,16 @@ class AbstractWheel(eqx.Module):
     @abc.abstractmethod
     def start(self, params: WheelParams) -> SectionState:
         """A section state from which a walk may begin."""
+
+    def over_steps(self, params: WheelParams, n_steps: int) -> GroundOfStep | None:
+        """The ground of each of so many steps, if slope or friction are arrays over steps."""
+        return None
+
+    def on_ground(
+        self, params: WheelParams, ground: GroundOfStep
+    ) -> tuple["AbstractWheel", WheelParams]:
+        """Rung and wheel on the ground of one step."""
+        raise NotImplementedError
 
     def section_size(self, params: WheelParams) -> int:
         """Length of a section state."""

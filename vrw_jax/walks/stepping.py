@@ -18,6 +18,7 @@ from jaxtyping import Array, Int
 from vrw_jax.models import (
     AbstractWheel,
     Advance,
+    GroundOfStep,
     LadderStep,
     LadderWheel,
     SectionState,
@@ -264,12 +265,18 @@ class Walk(AbstractTold):
 
 @eqx.filter_jit
 def _walk(
-    model: AbstractWheel, params: WheelParams, x: Array, options: Options, n_steps: int
+    model: AbstractWheel,
+    params: WheelParams,
+    x: Array,
+    options: Options,
+    n_steps: int,
+    over_steps: GroundOfStep | None,
 ) -> Walk:
-    def one(carry: tuple, _: None) -> tuple:
+    def one(carry: tuple, ground: GroundOfStep | None) -> tuple:
         x, outcome = carry
         walking = outcome == Outcome.STEPPED
-        advance = model.advance(params, jnp.where(walking, x, jnp.nan), options)
+        here = (model, params) if ground is None else model.on_ground(params, ground)
+        advance = here[0].advance(here[1], jnp.where(walking, x, jnp.nan), options)
         outcome = jnp.where(walking, advance.outcome, outcome)
         advance = dataclasses.replace(
             advance,
@@ -281,7 +288,7 @@ def _walk(
 
     carry = (x, jnp.int32(Outcome.STEPPED))
     steps: Advance
-    _, steps = lax.scan(one, carry, None, length=n_steps)
+    _, steps = lax.scan(one, carry, over_steps, length=n_steps)
     return Walk(x, steps, jnp.sum(steps.outcome == Outcome.STEPPED))
 
 
@@ -295,6 +302,11 @@ def walk(
     engine: Engine = "auto",
 ) -> Walk:
     """`n_steps` steps, or as many as it can; the steps after a failure repeat its outcome.
+
+    On real ground `params.slope` and the model's friction may be arrays over steps, of a floor
+    whose footholds are joined by lines of these slopes: the k-th ends where the k-th step begins by
+    a landing. Each foot keeps the friction of its own landing; forces are along and off the line
+    that the last landing ended. A section state is told off the line that ends in its landing.
 
     Args:
         params: the wheel.
@@ -317,8 +329,13 @@ def walk(
         (5, (5, 3))
     """
     n_steps = whole("n_steps", n_steps)
-    params, state, model, options = checked(params, x, model, options, engine)
-    return _walk(model, params, state, options, n_steps)
+    rung, over_steps = rung_of(model), None
+    if isinstance(params, WheelParams):
+        over_steps = rung.over_steps(params, n_steps)
+    if over_steps is not None:
+        rung, params = rung.on_ground(params, jax.tree.map(lambda row: row[0], over_steps))
+    params, state, rung, options = checked(params, x, rung, options, engine)
+    return _walk(rung, params, state, options, n_steps, over_steps)
 
 
 N_TOWARDS = 100

@@ -14,6 +14,7 @@ neither is possible it slides, without friction.
 
 import functools
 import itertools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -26,6 +27,8 @@ from vrw_jax.models.unilateral.mechanics import Free, Hub, Pair, Vector3, kept
 from vrw_jax.numerics import Elementwise, Scalar
 from vrw_jax.wheel import Symbols
 
+Roughness = Elementwise | Pair
+"""Friction of all feet, or of each slot's foot."""
 OFF, STICK, SLIP_DOWN, SLIP_UP = 0, 1, 2, 3
 """Contact modes of a foot: in the air, at rest, sliding downhill, sliding uphill."""
 
@@ -67,6 +70,21 @@ def _pair(entry: Any) -> Pair:
     return entry(0), entry(1)
 
 
+def each(function: Callable[[Any], Any], friction: Roughness) -> Any:
+    """Of the friction of all feet, or of each slot's."""
+    pair = isinstance(friction, tuple)
+    return (function(friction[0]), function(friction[1])) if pair else function(friction)
+
+
+def _at(i: int, friction: Any) -> Any:
+    return friction[i] if isinstance(friction, tuple) else friction
+
+
+def rough_of(friction: Roughness) -> Any:
+    """Coulomb's coefficient; a foot that slides though friction is infinite has none."""
+    return each(lambda value: jnp.where(jnp.isfinite(value), value, 0.0), friction)
+
+
 class _Feet(NamedTuple):
     """What a combination asks of each slot's foot. Its unknown c is the force along e (it sticks)
     or the normal force (it slides; friction in the limit where it is infinite); an unloaded foot
@@ -80,20 +98,23 @@ class _Feet(NamedTuple):
     row_u: Pair  # and so much of its force on the leg's mass
 
 
-def _feet(s: Symbols, hub: Hub, contact: Array, friction: Elementwise) -> _Feet:
+def _feet(s: Symbols, hub: Hub, contact: Array, friction: Roughness) -> _Feet:
     sin, cos = hub.sin, hub.cos
-    limit = friction == jnp.inf
-    rough = jnp.where(limit, 1.0, jnp.where(jnp.isfinite(friction), friction, 0.0))
-    press = jnp.where(limit, 0.0, 1.0)
+    limit = each(lambda value: value == jnp.inf, friction)
+    rough = each(
+        lambda value: jnp.where(value == jnp.inf, 1.0, jnp.where(jnp.isfinite(value), value, 0.0)),
+        friction,
+    )
+    press = each(lambda value: jnp.where(value, 0.0, 1.0), limit)
     stick = _pair(lambda i: contact[i] == STICK)
     slip = _pair(lambda i: (contact[i] == SLIP_DOWN) | (contact[i] == SLIP_UP))
-    drag = _pair(lambda i: jnp.where(contact[i] == SLIP_DOWN, -rough, rough))
+    drag = _pair(lambda i: jnp.where(contact[i] == SLIP_DOWN, -_at(i, rough), _at(i, rough)))
     chosen = lambda i, sticks, slides: jnp.where(stick[i], sticks, jnp.where(slip[i], slides, 0.0))
     return _Feet(
         stick=stick,
         loaded=_pair(lambda i: stick[i] | slip[i]),
-        to_e=_pair(lambda i: chosen(i, 1.0, drag[i] * cos[i] - press * sin[i])),
-        to_u=_pair(lambda i: chosen(i, 0.0, drag[i] * sin[i] + press * cos[i])),
+        to_e=_pair(lambda i: chosen(i, 1.0, drag[i] * cos[i] - _at(i, press) * sin[i])),
+        to_u=_pair(lambda i: chosen(i, 0.0, drag[i] * sin[i] + _at(i, press) * cos[i])),
         row_e=_pair(lambda i: chosen(i, 1.0, -sin[i])),
         row_u=_pair(lambda i: chosen(i, 0.0, cos[i] * (1.0 / s.m))),
     )
@@ -150,7 +171,7 @@ def _carried(
 
 
 def answer(
-    s: Symbols, hub: Hub, free: Free, contact: Array, held: Array, friction: Elementwise
+    s: Symbols, hub: Hub, free: Free, contact: Array, held: Array, friction: Roughness
 ) -> Answer:
     """Solve one combination: contact modes and stoppers of the two slots, shape (2,) each.
 
@@ -253,15 +274,16 @@ def _wrong(
     s: Symbols,
     hub: Hub,
     free: Free,
-    friction: Scalar,
+    friction: Roughness,
     allowed: Allowed,
     small: Negligible,
     contact: Array,
     on: Array,
 ) -> Array:
     """By how much a combination of contacts and held stoppers errs, over what is negligible."""
-    infinite, limit = ~jnp.isfinite(friction), friction == jnp.inf
-    rough = jnp.where(infinite, 0.0, friction)
+    infinite = each(lambda value: ~jnp.isfinite(value), friction)
+    limit = each(lambda value: value == jnp.inf, friction)
+    rough = rough_of(friction)
     found = answer(s, hub, free, contact, on, friction)
     worst = jnp.zeros_like(found.hub[0])
     for i in range(2):
@@ -269,11 +291,11 @@ def _wrong(
         unless = lambda known, value: jnp.where(known, 0.0, value)
         known = jnp.take(allowed.known_contact[i], mode)
         t, n, x, z = (v[i] for v in (found.tangential, found.normal, found.foot_x, found.foot_z))
-        pulls, outside = -n / small.force, unless(infinite, jnp.abs(t) - rough * n)
+        pulls, outside = -n / small.force, unless(_at(i, infinite), jnp.abs(t) - _at(i, rough) * n)
         rests = unless(known, jnp.maximum(pulls, outside / small.force))
         against = jnp.where(mode == SLIP_DOWN, -x, x) / small.motion
         along = jnp.where(mode == SLIP_DOWN, t, -t) / small.force
-        slides = jnp.maximum(jnp.where(limit, along, pulls), unless(known, against))
+        slides = jnp.maximum(jnp.where(_at(i, limit), along, pulls), unless(known, against))
         loaded = jnp.where(mode == STICK, rests, slides)
         foot = jnp.where(mode == OFF, unless(known, -z / small.motion), loaded)
         opens = unless(allowed.known_open[i], found.length[i] / small.motion)
@@ -288,7 +310,7 @@ def choose(
     hub: Hub,
     free: Free,
     allowed: Allowed,
-    friction: Scalar,
+    friction: Roughness,
     small: Negligible,
     counted: bool,
 ) -> Choice:
@@ -301,7 +323,8 @@ def choose(
     wrong = functools.partial(_wrong, *lax.stop_gradient((s, hub, free, friction)), allowed, small)
     may = jnp.stack([allowed.contact[i][modes[:, i]] for i in range(2)])
     may = may & jnp.stack([allowed.held[i][held[:, i].astype(jnp.int32)] for i in range(2)])
-    by_paper = friction == THE_PAPERS
+    by_paper = each(lambda value: value == THE_PAPERS, friction)
+    by_paper = by_paper[0] & by_paper[1] if isinstance(by_paper, tuple) else by_paper
     order = jnp.where(by_paper, jnp.asarray(ORDER_WITHOUT_SLIP), jnp.arange(len(MODES)))
     rank = jnp.cumsum(jnp.all(may, axis=0)[order].astype(jnp.int32))
     count = rank[-1]
@@ -337,7 +360,7 @@ def leaves(
     hub: Hub,
     free: Free,
     stance: tuple[Array, Array],
-    friction: Scalar,
+    friction: Roughness,
     second: Bool[Array, ""],
     direction: Int[Array, ""],
 ) -> Bool[Array, ""]:
@@ -354,8 +377,9 @@ def leaves(
     e, u = jnp.where(off, -sin, direction * cos), jnp.where(off, cos, direction * sin)
     shift = lambda pair, by: (pair[0] - by * here[0], pair[1] - by * here[1])
     asked = free._replace(e=shift(free.e, e), u=shift(free.u, u))
-    rough = jnp.where(jnp.isfinite(friction), friction, 0.0)
-    limit, mode = friction == jnp.inf, jnp.where(second, contact[1], contact[0])
+    mine = jnp.where(second, friction[1], friction[0]) if isinstance(friction, tuple) else friction
+    rough = rough_of(mine)
+    limit, mode = mine == jnp.inf, jnp.where(second, contact[1], contact[0])
     down = mode == SLIP_DOWN
     slides = down | (mode == SLIP_UP)
 

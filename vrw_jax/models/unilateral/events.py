@@ -18,6 +18,7 @@ from vrw_jax.models.unilateral.contacts import (
     Allowed,
     Choice,
     Negligible,
+    Roughness,
     answer,
     choose,
     leaves,
@@ -35,9 +36,10 @@ from vrw_jax.models.unilateral.mechanics import (
     free_velocity,
     hub_of,
     kinetic_energy,
+    of_slots,
     slots_of,
 )
-from vrw_jax.models.unilateral.motion import Guards, Stance
+from vrw_jax.models.unilateral.motion import Guards, Stance, as_row
 from vrw_jax.numerics import Elementwise, Scalar, select, zeros_of
 from vrw_jax.wheel import Symbols
 
@@ -81,11 +83,12 @@ class Law(NamedTuple):
     """The wheel on its ground, and what is asked of all events alike."""
 
     s: Symbols
-    friction: Elementwise
+    friction: Roughness  # of all feet; or of that which landed last, and of the others
     one_sided: bool  # stoppers of legs in the air only push
     counted: bool  # whether `solutions` is the number of admissible ones, or says if there is one
     rest: Elementwise  # speed below which a contact that an impact leaves is at rest, m/s
     restitution: Elementwise | None = None  # of the feet: they come back at this share of the speed
+    tilt: Elementwise | None = None  # by which the ground ahead is steeper, rad
 
 
 AT_ONCE, IN_TURN = 8, 16
@@ -220,12 +223,12 @@ def _impact(
     Also says which legs in the air are held: with one-sided stoppers those that need not pull.
     The paper's rule keeps feet at rest planted when a leg meets its stopper.
     """
-    s, friction = law.s, law.friction
-    slots = slots_of((stance.contact != OFF) | event.lands)
+    s, slots = law.s, slots_of((stance.contact != OFF) | event.lands)
+    friction = of_slots(law.friction, slots)
     at_stopper = stance.locked | event.closes
     loaded = jnp.stack([jnp.any(slots.first), jnp.any(slots.second)])
     stops, before = slots.flags(at_stopper), slots.codes(stance.contact)
-    planted = (before == STICK) & ~jnp.any(event.lands) & (friction == THE_PAPERS)
+    planted = (before == STICK) & ~jnp.any(event.lands) & (as_row(friction) == THE_PAPERS)
     modes = jnp.where(loaded[:, None], jnp.ones((4,), bool), _is(OFF))
     modes = jnp.where(planted[:, None], _is(before), modes)
     allowed = Allowed(
@@ -291,11 +294,11 @@ def _support(
     ended is not asked again: its force is zero, and its sign rounding. It is followed by what it
     was about to become, if that goes the right way (see `leaves`).
     """
-    s, friction = law.s, law.friction
-    slots = slots_of(contact != OFF)
+    s, slots = law.s, slots_of(contact != OFF)
+    friction = of_slots(law.friction, slots)
     mode, stops = slots.codes(contact), slots.flags(at_stopper)
     rests = (mode == STICK) | event.stops
-    rigid = (mode == STICK) & (friction == THE_PAPERS)  # a tangential force jumps to zero
+    rigid = (mode == STICK) & (as_row(friction) == THE_PAPERS)  # a tangential force jumps to zero
     up, down = event.slides_up, event.slides_down
     second = (event.lifts | up | down)[1]
     direction = jnp.any(down).astype(jnp.int32) - jnp.any(up).astype(jnp.int32)

@@ -10,7 +10,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from vrw_jax.models.unilateral.contacts import OFF
+from vrw_jax.models.unilateral.contacts import OFF, Roughness
 from vrw_jax.models.unilateral.events import Change, Event, Law, event_of, resolve, settled
 from vrw_jax.models.unilateral.mechanics import WheelMotion
 from vrw_jax.models.unilateral.motion import Guards, Stance
@@ -24,15 +24,17 @@ leg's length, 1e-13 m in float64."""
 
 def law_of(
     s: Symbols,
-    friction: Elementwise,
+    friction: Roughness,
     options: Options,
     one_sided: bool,
     counted: bool,
     restitution: Elementwise | None = None,
+    tilt: Elementwise | None = None,
 ) -> Law:
     """The law of a walk; the speed of rest is that of the least dip under gravity."""
     dip = jnp.maximum(SHARE * options.atol, SEEN * jnp.finfo(s.L0.dtype).eps * s.L0)
-    return Law(s, friction, one_sided, counted, jnp.sqrt(2.0 * s.g * dip), restitution)
+    rest = jnp.sqrt(2.0 * s.g * dip)
+    return Law(s, friction, one_sided, counted, rest, restitution, tilt)
 
 
 def past(

@@ -113,6 +113,15 @@ def slots_of(touching: Bool[Array, "n_legs ..."]) -> Slots:
     return Slots(touching & (rank == 1), touching & (rank == 2))
 
 
+def of_slots(friction: Elementwise | Pair, slots: Slots) -> Elementwise | Pair:
+    """Friction of each slot's foot, given that of the foot that landed last, Leg 1's, and that of
+    all others; a single one is everybody's."""
+    if not isinstance(friction, tuple):
+        return friction
+    last, others = friction
+    return jnp.where(slots.first[0], last, others), others
+
+
 class Hub(NamedTuple):
     """Inverse inertia that the slots' forces meet, and how they answer each other."""
 

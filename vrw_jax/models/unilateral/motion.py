@@ -13,7 +13,9 @@ from vrw_jax.models.unilateral.contacts import (
     STICK,
     THE_PAPERS,
     Answer,
+    Roughness,
     answer,
+    rough_of,
 )
 from vrw_jax.models.unilateral.mechanics import (
     FootVelocity,
@@ -25,10 +27,12 @@ from vrw_jax.models.unilateral.mechanics import (
     Slots,
     WheelMotion,
     foot_heights,
+    foot_places,
     foot_velocity,
     free_acceleration,
     hub_of,
     kept,
+    of_slots,
     one_of,
     over_legs,
     slots_of,
@@ -76,7 +80,7 @@ class Flow(NamedTuple):
     """The wheel in one stance: all that the motion between two events needs."""
 
     s: Symbols
-    friction: Elementwise
+    friction: Roughness  # of the slots' feet
     one_sided: bool  # airborne legs may leave their stoppers
     stance: Stance
     slots: Slots
@@ -84,16 +88,23 @@ class Flow(NamedTuple):
     held: Bool[Array, "2"]  # the slots' legs on their stoppers
     airborne: Bool[Array, " n_legs"]  # other legs on their stoppers
     tallied: bool  # in lanes: what is summed up is wanted, too
+    tilt: Elementwise | None = None  # by which the ground ahead is steeper, rad
 
 
 def flow_of(
-    s: Symbols, friction: Elementwise, one_sided: bool, stance: Stance, tallied: bool = False
+    s: Symbols,
+    friction: Roughness,
+    one_sided: bool,
+    stance: Stance,
+    tallied: bool = False,
+    tilt: Elementwise | None = None,
 ) -> Flow:
     """The stance as seen by the equations of motion."""
     slots = slots_of(stance.contact != OFF)
     contact, held = slots.codes(stance.contact), slots.flags(stance.locked)
     airborne = stance.locked & ~slots.filled
-    return Flow(s, friction, one_sided, stance, slots, contact, held, airborne, tallied)
+    friction = of_slots(friction, slots)
+    return Flow(s, friction, one_sided, stance, slots, contact, held, airborne, tallied, tilt)
 
 
 class Forces(NamedTuple):
@@ -224,6 +235,21 @@ def felt(flow: Flow, now: Forces) -> Felt:
     return Felt(now.hub.legs, found.normal, found.tangential, found.stopper, now.feet.x, in_air)
 
 
+def as_row(friction: Roughness) -> Array:
+    """The slots' friction as one array, if it is not everybody's."""
+    return jnp.stack(friction) if isinstance(friction, tuple) else friction
+
+
+def _heights(flow: Flow, motion: WheelMotion, legs: Legwise) -> Legs:
+    """Height of every foot above its ground, m; that ahead begins under Leg 1's foot."""
+    heights = foot_heights(motion, legs)
+    if flow.tilt is None:
+        return heights
+    places = foot_places(motion, legs)
+    ahead = heights[-1] * jnp.cos(flow.tilt) + (places[-1] - places[0]) * jnp.sin(flow.tilt)
+    return heights.at[-1].set(ahead)
+
+
 def stance_guards(flow: Flow, motion: WheelMotion, now: Felt, begun: Array) -> list[Array]:
     """Guards in the order of `Guards`; `begun`: not at the stance's start.
 
@@ -235,12 +261,12 @@ def stance_guards(flow: Flow, motion: WheelMotion, now: Felt, begun: Array) -> l
     in_air = (stance.contact == OFF) & (begun | ~stance.new_foot)
     moving = ~stance.locked & (begun | ~stance.new_leg)
     just_slid = flow.slots.flags(stance.new_slip)
-    rough = jnp.where(jnp.isfinite(flow.friction), flow.friction, 0.0)
+    rough = as_row(rough_of(flow.friction))
     normal, tangential = jnp.stack(now.normal), jnp.stack(now.tangential)
-    coulomb = (flow.contact == STICK) & (flow.friction != THE_PAPERS)
+    coulomb = (flow.contact == STICK) & (as_row(flow.friction) != THE_PAPERS)
     # In the limit of large friction a resting foot slides, one way or the other, where its normal
     # force vanishes; a sliding one lifts where its friction does.
-    limit = flow.friction == jnp.inf
+    limit = as_row(flow.friction) == jnp.inf
     direction = jnp.stack(_sliding(flow))
     pressed = jnp.where(limit & (direction != 0.0), -direction * tangential, normal)
     lifts = (flow.contact != OFF) & ~(limit & coulomb)
@@ -249,7 +275,7 @@ def stance_guards(flow: Flow, motion: WheelMotion, now: Felt, begun: Array) -> l
     watched = lambda condition, value: jnp.where(condition, value, 1.0)
     in_the_air = [] if now.in_air is None else [jnp.where(flow.airborne, now.in_air, one)]
     return [
-        jnp.where(in_air, foot_heights(motion, now.legs), one),
+        jnp.where(in_air, _heights(flow, motion, now.legs), one),
         jnp.where(moving, s.L0 - motion.L, one),
         watched(lifts, pressed),
         watched(coulomb, margin(-tangential)),

@@ -9,7 +9,7 @@ from vrw_jax.models.unilateral.contacts import OFF, STICK
 from vrw_jax.models.unilateral.events import settled
 from vrw_jax.models.unilateral.mechanics import WheelMotion, directions
 from vrw_jax.models.unilateral.motion import Stance, State, Tally, pack
-from vrw_jax.numerics import Scalar
+from vrw_jax.numerics import Elementwise, Scalar
 from vrw_jax.wheel import Symbols, WheelParams, length_at_touchdown
 
 FullState = Float[Array, " n_full"]
@@ -76,12 +76,17 @@ def opened(s: Symbols, x: FullState) -> tuple[State, Stance]:
     return state, Stance(contact, locked, none, none, none)
 
 
-def closed(motion: WheelMotion, stance: Stance) -> FullState:
-    """The section state of a motion just before the next landing."""
+def closed(motion: WheelMotion, stance: Stance, tilt: Elementwise | None = None) -> FullState:
+    """The section state of a motion just before the next landing, in the frame of the slope there:
+    of the ground that lies ahead, where that is steeper by `tilt`."""
     code = stance.contact + LOCKED * stance.locked
+    theta, vx, vz = motion.theta, motion.vx, motion.vz
+    if tilt is not None:
+        sin, cos = jnp.sin(tilt), jnp.cos(tilt)
+        theta, vx, vz = theta - tilt, vx * cos - vz * sin, vz * cos + vx * sin
     return jnp.concatenate(
         [
-            jnp.stack([motion.theta, motion.dtheta, motion.vx, motion.vz]),
+            jnp.stack([theta, motion.dtheta, vx, vz]),
             motion.L,
             motion.dL,
             code.astype(motion.L.dtype),

@@ -1,5 +1,6 @@
 """The wheel on real ground: one-sided contacts with Coulomb friction, any order of events."""
 
+import dataclasses
 import functools
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
@@ -10,9 +11,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from vrw_jax.models.base import AbstractGroundStep, AbstractWheel, Advance
+from vrw_jax.models.base import AbstractGroundStep, AbstractWheel, Advance, GroundOfStep
 from vrw_jax.models.paper_step import PAPER_START
-from vrw_jax.models.unilateral.contacts import THE_PAPERS
+from vrw_jax.models.unilateral.contacts import THE_PAPERS, Roughness
 from vrw_jax.models.unilateral.events import Law
 from vrw_jax.models.unilateral.ledger import (
     Details,
@@ -159,6 +160,13 @@ class _Walked(NamedTuple):
     log: _Log | None
 
 
+class Uneven(NamedTuple):
+    """Ground that varies: what one step needs beside the ground of its own landing."""
+
+    friction: Scalar  # of the feet that landed before
+    tilt: Scalar  # by which the ground ahead is steeper, rad
+
+
 def _restitution_of(value: Any) -> Array | None:
     """Newton's coefficient; None stands for 0."""
     if value is None or (isinstance(value, float | int) and value == 0):
@@ -181,7 +189,9 @@ class UnilateralWheel(AbstractWheel):
     - `restitution`: a foot that strikes comes back at so many times its speed, as far as energy
       allows; None, as 0, is a smaller program;
     - `infinite`: what infinite friction is: the limit of large friction, or with "paper" the rule
-      of the paper, (A1) to (A4), continued to where it stops.
+      of the paper, (A1) to (A4), continued to where it stops;
+    - `uneven`: what differs from foothold to foothold, which `vrw.walk` sets, of slopes and friction
+      over steps.
 
     Examples:
         >>> wheel = vrw.UnilateralWheel(friction=0.7)
@@ -199,6 +209,7 @@ class UnilateralWheel(AbstractWheel):
     stoppers: str = eqx.field(static=True, default=BILATERAL)
     restitution: Scalar | None = eqx.field(converter=_restitution_of, default=None)
     infinite: str = eqx.field(static=True, default=LIMIT)
+    uneven: Uneven | None = None
 
     if TYPE_CHECKING:
 
@@ -209,6 +220,7 @@ class UnilateralWheel(AbstractWheel):
             stoppers: Literal["bilateral", "one-sided"] = "bilateral",
             restitution: Number | None = None,
             infinite: Literal["limit", "paper"] = "limit",
+            uneven: Uneven | None = None,
         ) -> None: ...
 
     def __check_init__(self) -> None:
@@ -241,6 +253,22 @@ class UnilateralWheel(AbstractWheel):
         """The full section state of the paper's (theta-, dtheta-, dL1-): Leg 1 planted."""
         return embedded(params.symbols(), x) if x.shape == (3,) else x
 
+    def over_steps(self, params: WheelParams, n_steps: int) -> GroundOfStep | None:
+        over, given = (n_steps,), (params.slope, self.friction)
+        if not any(value.shape == over for value in given):
+            return None
+        slope, friction = (jnp.broadcast_to(value, over) for value in given)
+        ahead = jnp.append(slope[1:], slope[-1:])
+        behind = jnp.append(friction[:1], friction[:-1])
+        return slope, friction, behind, ahead - slope
+
+    def on_ground(
+        self, params: WheelParams, ground: GroundOfStep
+    ) -> tuple["UnilateralWheel", WheelParams]:
+        slope, friction, behind, tilt = ground
+        model = dataclasses.replace(self, friction=friction, uneven=Uneven(behind, tilt))
+        return model, eqx.tree_at(lambda wheel: wheel.slope, params, slope)
+
     def advance(self, params: WheelParams, x: FullState, options: Options) -> Advance:
         leaves, structure = jax.tree.flatten((self, params, x, options))
         return eqx.combine(*_compiled(structure, False)(*leaves))
@@ -255,7 +283,7 @@ class UnilateralWheel(AbstractWheel):
         log = _walk(self, params, x, options, detailed=False, logged=True).log
         assert log is not None
         begins = jnp.concatenate([jnp.zeros((1,)), jnp.cumsum(log.duration)[:-1]])
-        s, friction = params.symbols(), as_ruled(self.friction, self.by_paper)
+        s, friction = params.symbols(), _rough(self, self.friction)
 
         def phase(inputs: tuple) -> tuple:
             state, contact, locked, duration, begin = inputs
@@ -281,6 +309,14 @@ def as_ruled(friction: Elementwise, by_paper: bool) -> Elementwise:
     return jnp.where(friction == jnp.inf, THE_PAPERS, friction) if by_paper else friction
 
 
+def _rough(wheel: UnilateralWheel, friction: Elementwise) -> Roughness:
+    """The same of all feet, or of the one that landed last and of the others."""
+    friction = as_ruled(friction, wheel.by_paper)
+    if wheel.uneven is None:
+        return friction
+    return friction, as_ruled(wheel.uneven.friction, wheel.by_paper)
+
+
 def _walk(
     wheel: UnilateralWheel,
     params: WheelParams,
@@ -292,8 +328,9 @@ def _walk(
     """Follow one step from event to event."""
     good, params, friction, x = made_sound(params, wheel.friction.astype(x.dtype), x)
     s, n = params.symbols(), params.n_legs
-    friction = as_ruled(friction, wheel.by_paper)
-    law = law_of(s, friction, options, wheel.one_sided, True, wheel.restitution)
+    tilt = None if wheel.uneven is None else wheel.uneven.tilt
+    given = s, _rough(wheel, friction), options, wheel.one_sided
+    law = law_of(*given, True, wheel.restitution, tilt)
     place = guards_of(n, wheel.one_sided)
     state, stance = opened(s, x)
     rows = lambda leaf: jnp.broadcast_to(leaf, (wheel.max_events, *leaf.shape))
@@ -316,7 +353,7 @@ def _go_on(law: Law, place: Guards, max_events: int, options: Options, now: _Wal
     """Through the event that a step stands at, and to the next one."""
     motion, tally = unpack(now.state)
     change, event, outcome = past(law, place, motion, now.stance, now.guard)
-    flow = flow_of(law.s, law.friction, law.one_sided, change.stance)
+    flow = flow_of(law.s, law.friction, law.one_sided, change.stance, tilt=law.tilt)
     sound = outcome == Outcome.STEPPED
     start = pack(change.motion, tally._replace(clock=jnp.zeros_like(tally.clock)))
     start = jnp.where(sound, start, now.state)
@@ -361,28 +398,32 @@ def _compiled(structure: Any, full: bool) -> Forward:
         wheel, params, x, options = jax.tree.unflatten(structure, leaves)
         options = options.for_derivatives() if tighten else options
         walked = _walk(wheel, params, x, options, detailed=full)
-        result = _full(walked) if full else _lean(walked)
+        tilt = None if wheel.uneven is None else wheel.uneven.tilt
+        result = _full(walked, tilt) if full else _lean(walked, tilt)
         return eqx.partition(result, eqx.is_inexact_array)
 
     return any_mode(partial(walk, False), partial(walk, True))
 
 
-def _lean(walked: _Walked) -> Advance:
+def _lean(walked: _Walked, tilt: Scalar | None) -> Advance:
     ledger = walked.ledger
     stands = unpack(walked.state)[0], walked.stance
-    section = section_reached(*stands, walked.outcome)
+    section = section_reached(*stands, walked.outcome, tilt)
     return Advance(section, ledger.durations, walked.outcome, ledger.tried)
 
 
-def _full(walked: _Walked) -> UnilateralStep:
+def _full(walked: _Walked, tilt: Scalar | None) -> UnilateralStep:
     motion, tally = unpack(walked.state)
     assert walked.details is not None
-    return step_told(motion, walked.stance, tally, walked.ledger, walked.details, walked.outcome)
+    told = walked.ledger, walked.details, walked.outcome
+    return step_told(motion, walked.stance, tally, *told, tilt)
 
 
-def section_reached(motion: WheelMotion, stance: Stance, outcome: Array) -> FullState:
+def section_reached(
+    motion: WheelMotion, stance: Stance, outcome: Array, tilt: Scalar | None = None
+) -> FullState:
     """The section state at a step's end; zeros where it failed."""
-    x = closed(motion, stance)
+    x = closed(motion, stance, tilt)
     return jnp.where(outcome == Outcome.STEPPED, x, jnp.zeros_like(x))
 
 
@@ -393,6 +434,7 @@ def step_told(
     ledger: Ledger,
     details: Details,
     outcome: Array,
+    tilt: Scalar | None = None,
 ) -> UnilateralStep:
     """A step by where it ended and what was noted on the way."""
     landing = place_of_landing(motion.L.shape[0], motion)
@@ -402,7 +444,7 @@ def step_told(
         fewest_solutions=jnp.where(ledger.events > 0, details.fewest_solutions, 0),
     )
     return UnilateralStep(
-        section_state=section_reached(motion, stance, outcome),
+        section_state=section_reached(motion, stance, outcome, tilt),
         durations=ledger.durations,
         step_length=jnp.where(outcome == Outcome.STEPPED, landing, 0.0),
         energy_damping=tally.damping,

@@ -1,0 +1,71 @@
+"""A floor whose slope and friction differ from step to step: another code, energy, plain calls."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracle import complementarity
+
+import vrw_jax as vrw
+from vrw_jax.models.unilateral.mechanics import of_slots, slots_of
+from vrw_jax.models.unilateral.motion import unpack
+from vrw_jax.models.unilateral.section import closed, opened
+
+START = (0.1, 1.6, -0.1)
+SLOPES, FRICTIONS = (0.3, 0.33, 0.27, 0.31), (0.7, 0.5, 0.9, 0.6)
+
+
+def rough_floor(slopes=SLOPES, frictions=FRICTIONS):
+    model = vrw.UnilateralWheel(friction=jnp.asarray(frictions))
+    return vrw.WheelParams(slope=jnp.asarray(slopes)), model
+
+
+def test_each_foot_keeps_the_friction_of_its_own_landing():
+    params, model = rough_floor()
+    slope, friction, others, tilt = model.over_steps(params, 4)
+    np.testing.assert_allclose(slope, SLOPES)
+    np.testing.assert_allclose(friction, FRICTIONS)
+    np.testing.assert_allclose(others, (0.7, 0.7, 0.5, 0.9))
+    np.testing.assert_allclose(tilt, (0.03, -0.06, 0.04, 0.0), atol=1e-15)
+    both, rear = slots_of(jnp.arange(8) < 2), slots_of(jnp.arange(8) == 1)
+    assert [float(x) for x in of_slots((0.7, 0.5), both)] == [0.7, 0.5]
+    assert [float(x) for x in of_slots((0.7, 0.5), rear)] == [0.5, 0.5]
+
+
+def test_a_landing_on_a_steeper_line_is_the_same_motion_in_another_frame():
+    s, model = vrw.WheelParams().symbols(), vrw.UnilateralWheel()
+    x = model.full_section(vrw.WheelParams(), jnp.asarray(START))
+    state, stance = opened(s, x)
+    motion, _ = unpack(state)
+    told, turned = closed(motion, stance), closed(motion, stance, jnp.asarray(0.05))
+    assert abs(float(told[0] - turned[0]) - 0.05) < 1e-15
+    np.testing.assert_allclose(turned[4:], told[4:])
+    frame = np.array([[np.cos(0.05), -np.sin(0.05)], [np.sin(0.05), np.cos(0.05)]])
+    np.testing.assert_allclose(turned[2:4], frame @ np.asarray(told[2:4]), atol=1e-15)
+
+
+def test_arrays_that_are_not_over_the_steps_are_refused_as_batches_are():
+    params, model = rough_floor()
+    with pytest.raises(ValueError, match="one wheel"):
+        vrw.walk(params, START, 3, model=model)
+    with pytest.raises(ValueError, match="one wheel"):
+        vrw.walk(params, START, 4)  # the paper's rung: roles do not ask for it
+
+
+@pytest.mark.slow
+def test_a_walk_over_a_rough_floor_is_that_of_another_code():
+    params, model = rough_floor()
+    walk = vrw.walk(params, START, 4, model=model, options=vrw.Options.tight())
+    place = None
+    for k in range(4):
+        rough = np.r_[FRICTIONS[k], np.full(7, FRICTIONS[max(k - 1, 0)])]
+        tilt = SLOPES[min(k + 1, 3)] - SLOPES[k]
+        wheel = complementarity.Wheel(rough, slope=SLOPES[k], tilt=tilt)
+        place = place or complementarity.paper_start(wheel, *START)
+        other = complementarity.one_step(wheel, place)
+        place = other.end
+        assert int(walk.steps.outcome[k]) == vrw.Outcome.STEPPED
+        np.testing.assert_allclose(walk.steps.durations[k], other.durations, atol=1e-9)
+    theta = place.q[2] + complementarity.ALPHA
+    assert abs(float(walk.steps.section_state[-1, 0]) - theta) < 1e-9
+    level = vrw.walk(vrw.WheelParams(), START, 4, model=vrw.UnilateralWheel())
+    assert abs(float(jnp.sum(level.steps.durations - walk.steps.durations))) > 1e-3
