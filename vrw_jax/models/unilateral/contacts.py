@@ -100,12 +100,11 @@ class _Feet(NamedTuple):
 
 def _feet(s: Symbols, hub: Hub, contact: Array, friction: Roughness) -> _Feet:
     sin, cos = hub.sin, hub.cos
-    limit = each(lambda value: value == jnp.inf, friction)
     rough = each(
         lambda value: jnp.where(value == jnp.inf, 1.0, jnp.where(jnp.isfinite(value), value, 0.0)),
         friction,
     )
-    press = each(lambda value: jnp.where(value, 0.0, 1.0), limit)
+    press = each(lambda value: jnp.where(value == jnp.inf, 0.0, 1.0), friction)
     stick = _pair(lambda i: contact[i] == STICK)
     slip = _pair(lambda i: (contact[i] == SLIP_DOWN) | (contact[i] == SLIP_UP))
     drag = _pair(lambda i: jnp.where(contact[i] == SLIP_DOWN, -_at(i, rough), _at(i, rough)))
