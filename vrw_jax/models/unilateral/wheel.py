@@ -190,8 +190,8 @@ class UnilateralWheel(AbstractWheel):
       allows; None, as 0, is a smaller program;
     - `infinite`: what infinite friction is: the limit of large friction, or with "paper" the rule
       of the paper, (A1) to (A4), continued to where it stops;
-    - `uneven`: what differs from foothold to foothold, which `vrw.walk` sets, of slopes and friction
-      over steps.
+    - `uneven`: what differs between footholds, which `vrw.walk` sets of slopes and friction over
+      steps.
 
     Examples:
         >>> wheel = vrw.UnilateralWheel(friction=0.7)
