@@ -1,7 +1,9 @@
 """`vrw.explore`: the wheel that is shown is read and set from Python."""
 
+import re
 import subprocess
 import sys
+from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
@@ -86,6 +88,15 @@ def test_without_anywidget_it_says_what_to_install(monkeypatch):
     with pytest.raises(ImportError, match=r"pip install 'vrw-jax\[explore\]'"):
         vrw.explore()
     explorer._widget.cache_clear()
+
+
+def test_the_page_of_it_runs_as_it_is_written():
+    pytest.importorskip("anywidget", reason="widgets are anywidget's")
+    text = (Path(__file__).parents[2] / "docs" / "explore.md").read_text()
+    known = {}
+    exec(re.search(r"```python\n(.*?)```", text, re.DOTALL)[1], known)
+    assert float(known["wheel"].params.damping) == 160.0
+    assert int(known["cycle"].outcome) == vrw.Outcome.STEPPED
 
 
 def test_the_address_holds_the_wheel():
