@@ -61,11 +61,13 @@ def same_steps(n, n_legs):
     told = [((6,), np.float64), ((2,), np.int32)]
     numbers, codes = code(n_legs)("advance", [tolerance], [wheels, starts], told)
     steps = vrw.steps(wheels_of(wheels, n_legs), starts.T)
-    known = steps.solver == 0  # stiff legs go to other solvers there
+    known = np.asarray(steps.solver == 0)  # stiff legs go to other solvers there
     assert np.mean(known) > 0.9
     assert np.array_equal(codes[0][known], steps.outcome[known])
     assert len(np.unique(codes[0])) > 4  # of many outcomes
     expected = np.concatenate([steps.section_state.T, steps.durations.T])
+    # Where an integrator gave up is no property of the wheel.
+    known = known & (codes[0] != vrw.Outcome.SOLVER_GAVE_UP)
     assert same(numbers[:, known], expected[:, known], 1.0) < SAME
 
 
