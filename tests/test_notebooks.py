@@ -17,7 +17,9 @@ LARGEST = 400_000
 
 
 def test_there_are_notebooks():
-    assert {path.stem for path in NOTEBOOKS} >= {"branch", "ground", "sensitivities", "tuning"}
+    assert {path.stem for path in NOTEBOOKS} >= {
+        "branch", "ground", "identification", "sensitivities", "tolerances", "tuning",
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
