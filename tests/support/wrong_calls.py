@@ -420,7 +420,6 @@ def make() -> None:
         "TypeError",
         "CycleOptions",
     )
-    use("continue_branch on the ladder", lambda: along(model="auto"), "TypeError", "ladder")
     a_map = lambda constants, x, p: p * x
     family(
         "continue_map bounds", lambda v: vrw.continue_map(a_map, [0.1], 150.0, v), bounds, "bounds"
@@ -472,12 +471,6 @@ def make() -> None:
         "basin most_steps", lambda v: vrw.basin(table_1, grid, most_steps=v), whole, "most_steps"
     )
     use("basin of a batch", lambda: vrw.basin(several, grid), "ValueError", "one wheel")
-    use(
-        "basin on real ground",
-        lambda: vrw.basin(table_1, grid, model=vrw.UnilateralWheel()),
-        "TypeError",
-        "three numbers",
-    )
     use(
         "basin by options of a cycle",
         lambda: vrw.basin(table_1, grid, options=vrw.CycleOptions()),

@@ -28,6 +28,7 @@ from vrw_jax.cycles import (
     LimitCycle,
     WalkedCycle,
     finder_of,
+    serving,
 )
 from vrw_jax.models import AbstractWheel, refuse_ladder
 from vrw_jax.numerics import (
@@ -49,7 +50,7 @@ from vrw_jax.results import (
     variables,
 )
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.walks import one_wheel, options_of, rung_of
+from vrw_jax.walks import ModelLike, one_wheel, options_of, rung_of
 from vrw_jax.wheel import FRICTION, Outcome, WheelParams
 from vrw_jax.wording import (
     function_of,
@@ -129,7 +130,7 @@ def continue_branch(
     *,
     cycle: LimitCycle | WalkedCycle | None = None,
     period_n: int = 1,
-    model: AbstractWheel | None = None,
+    model: ModelLike | None = None,
     options: ArclengthOptions | None = None,
     cycle_options: CycleOptions | None = None,
     step_options: Options | None = None,
@@ -147,7 +148,9 @@ def continue_branch(
 
     Other rungs' gaits are fixed points of their own return map, as exact as `step_options`. On real
     ground `name` may be "friction" too, and the start is a `WalkedCycle` or, without one, where a
-    walk of some steps ends; a branch goes on where the order of events changes, with a kink.
+    walk of some steps ends; a branch goes on where the order of events changes, with a kink. "auto"
+    is the rung that serves the start: where a premise of the paper's breaks stands as a border of
+    that name, and beyond it real ground serves.
 
     Args:
         params: the wheel, one; the branch goes through its gait.
@@ -177,7 +180,8 @@ def continue_branch(
     batch = jax.tree.map(lambda x: x[None], params)
     cycle = None if cycle is None else jax.tree.map(lambda x: x[None], cycle)
     (branch,) = continue_branches(
-        batch, name, bounds, cycle=cycle, period_n=period_n, model=model, options=options,
+        batch, name, bounds, cycle=cycle, period_n=period_n, options=options,
+        model=rung_of(serving(params, model)),
         cycle_options=cycle_options, step_options=step_options,
     )  # fmt: skip
     return branch

@@ -55,8 +55,10 @@ def serving(params: WheelParams, model: ModelLike | None) -> ModelLike | None:
     The paper's gait is looked for first. Where it is not found, or breaks a premise on this ground,
     it is the rung above. Any other rung is itself; so is the ladder where nothing has a value.
     """
+    if model is None or rung_of(model).rung != "ladder" or not isinstance(params, WheelParams):
+        return model
     traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((params, model)))
-    if model is None or traced or params.damping.ndim or rung_of(model).rung != "ladder":
+    if traced or params.damping.ndim:
         return model
     ladder: Any = rung_of(model)
     cycle = finder_of(None, params.n_legs).cycle(params)
