@@ -1,8 +1,8 @@
 """Which gaits of a wheel attract: walks from a stated set of starts, and Newton's method on."""
 
-import dataclasses
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -70,8 +70,8 @@ def gaits_attracting(finder: Any, params: WheelParams) -> list[WalkedCycle]:
 def _none_like(cycle: WalkedCycle) -> WalkedCycle:
     """No gait: what repeats does so after fewer steps, or nothing does."""
     none = jax.tree.map(jnp.zeros_like, cycle)
-    lost = np.where(cycle.found, Outcome.NO_CYCLE_FOUND, cycle.outcome)
-    return dataclasses.replace(none, outcome=jnp.asarray(lost, jnp.int32))
+    lost = jnp.where(cycle.found, Outcome.NO_CYCLE_FOUND, cycle.outcome).astype(jnp.int32)
+    return eqx.tree_at(lambda cycle: cycle.outcome, none, lost)
 
 
 def _walked_to(finder: Any, params: WheelParams, n: int) -> tuple[np.ndarray, np.ndarray]:
