@@ -22,6 +22,7 @@ NAMES = [name for name in vrw.__all__ if name not in ("MEASURES", "plot")]
 SLOW = {
     "UnilateralWheel", "UnilateralStep", "LadderWheel", "LadderStep", "continue_branches",
     "border_curve", "BorderCurve",
+    "answer", "Answer", "average", "Average",
 }  # fmt: skip
 """What compiles for a minute."""
 

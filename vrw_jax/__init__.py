@@ -4,6 +4,7 @@ import importlib
 import importlib.metadata
 from typing import TYPE_CHECKING, Any
 
+from vrw_jax.answers import Answer, Average, answer, average
 from vrw_jax.batches import Steps, steps
 from vrw_jax.branches import (
     Border,
@@ -49,7 +50,9 @@ from vrw_jax.wording import nearest
 __all__ = (
     "MEASURES",
     "AbstractWheel",
+    "Answer",
     "ArclengthOptions",
+    "Average",
     "Border",
     "BorderCurve",
     "Branch",
@@ -74,6 +77,8 @@ __all__ = (
     "Walk",
     "WalkedCycle",
     "WheelParams",
+    "answer",
+    "average",
     "basin",
     "border_curve",
     "choose_model",

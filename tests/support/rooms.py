@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 FLOW = (
     ("simd",), ("runtime",), ("wording",), ("numerics",), ("wheel",), ("results",),
-    ("models",), ("walks",), ("batches", "cycles"), ("gaits",),
+    ("models",), ("walks",), ("batches", "cycles"), ("gaits",), ("answers",),
     ("branches", "tuning", "scans"), ("figures", "web"), ("paper",), ("app",),
 )  # fmt: skip
 """Rooms in the order in which they may know each other; those of one row do not."""

@@ -258,7 +258,7 @@ def _searched(finder: AbstractGaitFinder, params: WheelParams, guess: Any) -> An
     return (finder.cycles if params.damping.ndim else finder.cycle)(params, guess)
 
 
-def _in_shapes(function: Any, *trees: Any) -> Any:
+def in_shapes(function: Any, *trees: Any) -> Any:
     """`function` of trees with a leading axis, filled up to one of `SHAPES` lanes at a time."""
     n, parts = len(jax.tree.leaves(trees)[0]), []
     for begin in range(0, n, SHAPES[-1]):
@@ -316,7 +316,7 @@ def _begun(
     along = np.flatnonzero(walks.reached & ~has)
     if len(along):
         walk = jax.vmap(finder.after)
-        start = _put(start, along, _in_shapes(walk, _taken(params, along), walks.x[along]))
+        start = _put(start, along, in_shapes(walk, _taken(params, along), walks.x[along]))
     return jax.vmap(select)(jnp.asarray(has), located, start)
 
 
@@ -349,7 +349,7 @@ def _reached(
             continue
         some, own = _taken(params, places), _Walks(*(part[places] for part in walks))
         begin = _begun(finder, some, _taken(located, places), has[places], own)
-        again = _in_shapes(functools.partial(_searched, finder), some, begin)
+        again = in_shapes(functools.partial(_searched, finder), some, begin)
         gait, error = np.asarray(again.found), np.asarray(again.mesh_error)
         located = _put(located, places[gait], _taken(again.located, gait))
         if gait.any():
@@ -382,7 +382,7 @@ def _from_another_step(
     located = cycle.located
     for _ in range(1, finder.period_n):
         x = np.asarray(steps(some, x, model=finder.model).section_state)
-        found = _in_shapes(functools.partial(_searched, finder), some, x)
+        found = in_shapes(functools.partial(_searched, finder), some, x)
         gait = np.flatnonzero(np.asarray(found.found) & (np.asarray(located.found)[lost] < 0.5))
         if len(gait):
             located = _put(located, lost[gait], _taken(found.located, gait))

@@ -1,0 +1,1 @@
+"""Answers to within a tolerance: what they claim, what is true, what they cost."""

@@ -1,0 +1,121 @@
+"""Answers to within a tolerance: by which rung, how wrong, and what is refused."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vrw_jax as vrw
+
+TABLE_1 = vrw.WheelParams(damping=150.0)
+NEAR = vrw.WheelParams(damping=jnp.linspace(120.0, 200.0, 24))
+FRICTIONS = np.geomspace(8.0, 80.0, 24)
+
+
+@pytest.fixture(scope="module")
+def exact():
+    """What the iteration on real ground converges to, as the truth of looser answers."""
+    return vrw.answer(["speed", "dls_fraction", "period"], NEAR, 1e-10, friction=FRICTIONS)
+
+
+def test_where_feet_can_not_slide_the_papers_value_stands():
+    told = vrw.answer("speed", TABLE_1, 1e-6, friction=math.inf)
+    assert told.rung == "viscoelastic"
+    assert abs(told.value - float(vrw.limit_cycle(TABLE_1).speed)) < 1e-8
+    assert told.error <= 1e-6
+    assert abs(told.model_error) < 1e-8
+
+
+def test_a_converged_answer_repeats_on_real_ground():
+    names = ["theta_touchdown", "dtheta_touchdown", "dL1_touchdown"]
+    told = vrw.answer(names, TABLE_1, 1e-9, friction=20.0)
+    assert told.rung == "unilateral"
+    x = np.array([[told.value[name] for name in names]])
+    step = vrw.steps(TABLE_1, x, model=vrw.UnilateralWheel(friction=20.0))
+    assert np.max(np.abs(np.asarray(step.section_state)[0, [0, 1, 12]] - x[0])) < 1e-8
+
+
+@pytest.mark.parametrize("tol", [1e-2, 1e-3, 1e-5])
+def test_answers_keep_their_stated_errors(tol, exact):
+    told = vrw.answer(["speed", "dls_fraction", "period"], NEAR, tol, friction=FRICTIONS)
+    assert np.all(told.found)
+    assert np.all(exact.found)
+    assert np.all(told.errors <= tol)
+    wrong = np.abs(told.values - exact.values)
+    assert np.all(wrong <= told.errors + exact.errors)
+
+
+def test_one_step_tells_the_model_error_with_its_sign(exact):
+    told = vrw.answer(["speed", "dls_fraction", "period"], NEAR, 1.0, friction=FRICTIONS)
+    assert set(told.rung) == {"viscoelastic"}
+    assert np.all(told.n_steps == 1)
+    effectivity = told.model_errors / (told.values - exact.values)
+    assert np.mean((effectivity > 0.5) & (effectivity < 2.0)) > 0.9
+
+
+def test_looser_answers_cost_less():
+    steps = [vrw.answer("speed", NEAR, tol, friction=FRICTIONS).n_steps for tol in (1e-2, 1e-7)]
+    assert np.mean(steps[0]) < 0.5 * np.mean(steps[1])
+
+
+def test_a_lane_is_answered_as_it_is_alone(exact):
+    one = jax.tree.map(lambda x: x[5] if x.ndim else x, NEAR)
+    alone = vrw.answer(["speed", "dls_fraction", "period"], one, 1e-10, friction=FRICTIONS[5])
+    assert np.array_equal(alone.values, exact.values[5])
+
+
+def test_at_low_friction_another_gait_is_walked_to():
+    told = vrw.answer("period", vrw.WheelParams(), 1e-3, friction=0.7)
+    assert told.rung == "unilateral"
+    assert abs(told.value - 0.360) < 2e-3  # docs/ladder.md
+    assert "another gait" in told.why
+
+
+def test_no_gait_is_said_and_no_small_number():
+    told = vrw.answer("speed", vrw.WheelParams(slope=0.02), 1e-3, friction=0.7)
+    assert not told.found
+    assert math.isnan(told.value)
+    assert math.isinf(told.error)
+    assert told.why.startswith("no such gait on real ground: ")
+
+
+def test_stiff_wheels_are_answered_in_closed_form():
+    e = 1.0 / 64.0  # docs/physics.md: the limit that leads to the rigid wheel
+    stiff = vrw.WheelParams(
+        stiffness=500.0 / e**2, damping=200.0 / e, natural_length=1.0 + 0.02 * e**2, slope=0.15
+    )
+    told = vrw.answer("period", stiff, 3e-3, friction=20.0)
+    assert told.rung == "rigid"
+    assert abs(told.model_error) <= told.error <= 3e-3
+
+
+def test_an_answer_prints_itself_in_one_line():
+    text = repr(vrw.answer(["speed", "dls_fraction"], TABLE_1, 1e-2, friction=50.0))
+    assert "\n" not in text
+    assert "m/s ± " in text
+    assert "checked by one step on real ground" in text
+    assert text.endswith(" ms")
+
+
+def test_what_can_not_be_answered_is_refused_in_one_sentence():
+    with pytest.raises(ValueError, match="'spead' is no measure that every rung tells"):
+        vrw.answer("spead", TABLE_1, 1e-3)
+    with pytest.raises(ValueError, match="tol is 0, but it must be positive"):
+        vrw.answer("speed", TABLE_1, 0.0)
+    with pytest.raises(ValueError, match="lanes have one axis"):
+        vrw.answer("speed", NEAR, 1e-3, friction=np.ones(3))
+    with pytest.raises(TypeError, match="inside jit"):
+        jax.jit(lambda c: vrw.answer("speed", vrw.WheelParams(damping=c), 1e-3).value)(150.0)
+
+
+def test_few_gaits_on_real_ground_and_all_of_the_papers_make_a_mean():
+    rng = np.random.default_rng(3)
+    wheels = vrw.WheelParams(damping=jnp.asarray(rng.uniform(120.0, 200.0, 200)))
+    every = vrw.answer("speed", wheels, 1e-6, friction=15.0)
+    mean = vrw.average("speed", wheels, 1e-3, friction=15.0, pilot=12)
+    assert abs(mean.value - np.mean(every.value)) < 1.5 * mean.error
+    assert mean.error < 2e-3
+    assert mean.n_top < 60
+    assert mean.steps < mean.steps_alone

@@ -1,0 +1,276 @@
+"""An answer to within a tolerance, by the lowest rung that can be shown to give it.
+
+The lower rung's gait takes one step on real ground. The defect, carried to the measure by the lower
+rung's derivatives, is that rung's error to second order: a dual-weighted residual (R. Becker and
+R. Rannacher, Acta Numerica 10, 2001) with the next model in place of the finer mesh. Within the
+tolerance the lower rung's value stands; else the same step is the first of an iteration to the gait
+on real ground, and what does not contract is another gait: it is walked to.
+"""
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vrw_jax.answers.climbing import Chord, Settled, settled
+from vrw_jax.answers.lower import (
+    GROUND,
+    NONE,
+    Lower,
+    contraction,
+    no_gaits,
+    paper_gaits,
+    put,
+    rigid_gaits,
+)
+from vrw_jax.answers.quantities import MADE, measured
+from vrw_jax.answers.result import Answer, How
+from vrw_jax.answers.top import Ground
+from vrw_jax.gaits import starts_of
+from vrw_jax.numerics import Options
+from vrw_jax.wheel import FRICTION, Outcome, WheelParams, friction_of
+from vrw_jax.wording import (
+    chosen,
+    flag,
+    instance,
+    names_of,
+    positive,
+    require_known,
+    untraced,
+)
+
+SAFETY = 4.0
+"""What one step says of an error, times this, bounds it: as long as corrections contract to 3/4."""
+TIGHT, TIGHTER = 1e-10, 1e-12
+"""Tolerances of steps. Looser ones save a seventh of the time and miss events; the tighter one
+costs a third more."""
+FINE = 1e-7
+"""Tolerance of an answer below which steps are taken at TIGHTER."""
+WALKS = (20, 60)
+"""Steps of a walk towards a gait, one after the other, until an iteration from there contracts."""
+BALL = 2.0
+"""How far, in first corrections, the gait on real ground may lie from the lower one that it
+continues: so far a contraction to a half leads at most."""
+TRIES = 3
+"""Steps from a lower gait with its own derivatives, before differences take their place."""
+
+
+def answer(
+    measures: str | Sequence[str],
+    params: WheelParams,
+    tol: float,
+    *,
+    friction: Any = 0.7,
+    relative: bool = False,
+    stoppers: str = "bilateral",
+) -> Answer:
+    """Measures of the wheel's gait on ground of this friction, each to within `tol`.
+
+    The truth that is meant is `UnilateralWheel(friction, stoppers=stoppers)`; the gait is the one
+    that continues the paper's, or where none does the one that a walk from the paper's reaches, and
+    `Answer.why` says which. Fields of `params` and
+    `friction` may have one axis, of lanes: each is answered by itself.
+
+    Not for use inside `jax.jit`: it goes by values.
+
+    Args:
+        measures: one name or several of speed, period, dls_fraction, step_length, duration_dls,
+            duration_single, duration_flight, theta_touchdown, dtheta_touchdown, dL1_touchdown.
+        params: the wheel, or lanes of them.
+        tol: error allowed, in the measure's unit or by the value.
+        friction: of the ground.
+        relative: whether `tol` counts by the value itself.
+        stoppers: of the wheel that is meant, "bilateral" or "one-sided".
+
+    Returns:
+        An `Answer`.
+
+    Raises:
+        TypeError, ValueError: an argument that can't be meant, in one sentence.
+
+    Examples:
+        >>> told = vrw.answer("speed", vrw.WheelParams(damping=150.0), 1e-3, friction=50.0)
+        >>> print(f"{told.value:.2f} m/s", told.error <= 1e-3)
+        1.02 m/s True
+    """
+    began = time.perf_counter()
+    untraced("vrw.answer", "it on numbers, and give lanes as arrays", params, friction)
+    instance("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
+    names = names_of("measures", measures)
+    for name in names:
+        require_known(name, tuple(MADE), "measure that every rung tells")
+    if not names:
+        raise ValueError("measures are none, but an answer needs a question: give 'speed', say.")
+    tol, relative = positive("tol", tol), flag("relative", relative)
+    chosen("stoppers", stoppers, ("bilateral", "one-sided"))
+    params, mu, shape = known_lanes(params, friction_of(friction))
+    tolerance = TIGHT if tol >= FINE else TIGHTER
+    options = Options(rtol=tolerance, atol=tolerance)
+    asked = _Asked(names, tol, relative, Ground.of(params, mu, stoppers, options), params)
+    asked.by_rigid()
+    asked.by_paper()
+    asked.by_walks()
+    told = jax.tree.map(lambda x: x.reshape(shape + x.shape[1:]), asked.told)
+    return Answer(
+        **told, names=names, single=isinstance(measures, str), cost=time.perf_counter() - began
+    )
+
+
+def known_lanes(
+    params: WheelParams, friction: Any
+) -> tuple[WheelParams, np.ndarray, tuple[int, ...]]:
+    """Wheels and friction with one axis of lanes each, and the shape that they were given in."""
+    shapes = {np.shape(x) for x in (*jax.tree.leaves(params), friction)}
+    shape = max(shapes, key=len)
+    if len(shape) > 1 or shapes - {(), shape}:
+        given = ", ".join(map(str, sorted(shapes - {()})))
+        raise ValueError(
+            f"parameters and {FRICTION} have shapes {given}, but lanes have one axis, the same for "
+            "all: give one value for all, or one for each lane."
+        )
+    n = shape[0] if shape else 1
+    lanes = lambda x: np.broadcast_to(np.asarray(x, float), (n,))
+    return jax.tree.map(lambda x: jnp.asarray(lanes(x)), params), lanes(friction), shape
+
+
+class _Asked:
+    """A question in lanes, and what has been answered of it."""
+
+    def __init__(
+        self,
+        names: tuple[str, ...],
+        tol: float,
+        relative: bool,
+        ground: Ground,
+        params: WheelParams,
+    ) -> None:
+        n, m = len(ground.columns.T), len(names)
+        self.names, self.tol, self.relative = names, tol, relative
+        self.ground, self.params, self.lower = ground, params, no_gaits(n)
+        many = lambda fill: np.full((n, m), fill)
+        self.told = {
+            "values": many(np.nan), "errors": many(np.inf), "model_errors": many(np.nan),
+            "numerical_errors": many(np.inf), "rungs": np.full(n, NONE),
+            "hows": np.full(n, int(How.NO_GAIT)), "n_steps": np.zeros(n, int),
+            "outcomes": np.full(n, int(Outcome.NO_CYCLE_FOUND)),
+        }  # fmt: skip
+
+    def goal(self, values: np.ndarray) -> np.ndarray:
+        """The tolerance of measures with about these values."""
+        return self.tol * (np.abs(values) if self.relative else np.ones_like(values))
+
+    @property
+    def open(self) -> np.ndarray:
+        """Lanes without an answer."""
+        return np.flatnonzero(self.told["rungs"] == NONE)
+
+    def by_rigid(self) -> None:
+        """Wheels whose legs yield so little that the rigid gait may do."""
+        with np.errstate(all="ignore"):
+            lanes = np.flatnonzero(SAFETY * contraction(self.params) <= self.tol)
+        if not len(lanes):
+            return
+        put(self.lower, lanes, rigid_gaits(self._wheels(lanes)))
+        lanes = lanes[np.isfinite(self.lower.told[lanes]).all(1)]
+        self._from_gaits(lanes, corrected=False)
+
+    def by_paper(self) -> None:
+        """The paper's gaits, and where their values don't do, real ground near them."""
+        lanes = self.open
+        if not len(lanes):
+            return
+        put(self.lower, lanes, paper_gaits(self._wheels(lanes), self.ground.options))
+        self._from_gaits(lanes[self.lower.rung[lanes] != NONE], corrected=True)
+
+    def by_walks(self) -> None:
+        """Gaits on real ground that are far from the paper's, or that it has none for."""
+        lanes = self.open
+        has = self.lower.rung[lanes] != NONE
+        begin = self.ground.embedded(lanes[has], self.lower.x[lanes[has]])
+        self._walk(lanes[has], begin, How.WALKED)
+        lanes = lanes[~has]
+        if not len(lanes):
+            return
+        for start in starts_of(self._wheels(lanes)):
+            still = self.told["rungs"][lanes] == NONE
+            begin = self.ground.embedded(lanes[still], start[still])
+            self._walk(lanes[still], begin, How.FROM_START)
+
+    def _wheels(self, lanes: np.ndarray) -> WheelParams:
+        return jax.tree.map(lambda leaf: leaf[lanes], self.params)
+
+    def _from_gaits(self, lanes: np.ndarray, corrected: bool) -> None:
+        """One step on real ground from the lower gaits, and more where that is not enough."""
+        if not len(lanes):
+            return
+        lower = Lower(*(part[lanes] for part in self.lower))
+        x = self.ground.embedded(lanes, lower.x)
+        first = self.ground.step(lanes, x)
+        chord = Chord(self.ground, lanes, x, lower)
+        seen = chord.see(np.arange(len(lanes)), first, self.names)
+        d = chord.correction.copy()
+        value = measured(self.names, lower.told)
+        with np.errstate(all="ignore"):
+            size = np.abs(measured(self.names, first.told) - value) + seen.size
+            error = value - seen.values
+            plane = self.ground.plane()
+            along = np.abs(seen.direct @ chord.moved[:, :, plane])
+            numerical = np.einsum("ijk,ik->ij", along, np.abs(lower.own)) + seen.numerical
+            bound = np.abs(error) + (SAFETY - 1.0) * size + numerical
+            stands = seen.same & np.all(bound <= self.goal(value), axis=1)
+        self.told["n_steps"][lanes] += 1
+        self._tell(lanes[stands], lower.rung[stands], How.CHECKED, {
+            "values": value[stands], "errors": bound[stands], "model_errors": error[stands],
+            "numerical_errors": numerical[stands],
+        })  # fmt: skip
+        rest = np.flatnonzero(~stands & seen.same)
+        if not corrected or not len(rest):
+            return
+        chord = Chord(self.ground, lanes[rest], x[rest], Lower(*(part[rest] for part in lower)))
+        begun = type(first)(*(part[rest] for part in first))
+        found = settled(chord, self.names, self.goal, TRIES, begun)
+        away, first_away = (
+            np.linalg.norm(d, axis=1) for d in (found.x[:, plane] - x[rest][:, plane], d[rest])
+        )
+        near = away <= BALL * first_away
+        self.told["n_steps"][lanes[rest]] -= 1
+        self._take(lanes[rest], found._replace(done=found.done & near), How.CORRECTED)
+
+    def _walk(self, lanes: np.ndarray, x: np.ndarray, how: How) -> None:
+        """To where walks lead, and from there by corrections."""
+        for n_steps in WALKS:
+            if not len(lanes):
+                return
+            step = self.ground.step(lanes, x, n_steps)
+            self.told["n_steps"][lanes] += n_steps
+            lost = np.where(step.outcome == Outcome.STEPPED, Outcome.NO_CYCLE_FOUND, step.outcome)
+            self.told["outcomes"][lanes] = lost
+            on = step.outcome == Outcome.STEPPED
+            lanes, x = lanes[on], step.x[on]
+            chord = Chord(self.ground, lanes, x, None)
+            found = settled(chord, self.names, self.goal, 0)
+            self._take(lanes, found, how)
+            lanes, x = lanes[~found.done], x[~found.done]
+
+    def _take(self, lanes: np.ndarray, found: Settled, how: How) -> None:
+        """Gaits on real ground."""
+        self.told["n_steps"][lanes] += found.n_steps
+        lanes, found = lanes[found.done], Settled(*(part[found.done] for part in found))
+        has = (self.lower.rung[lanes] != NONE)[:, None]
+        value = measured(self.names, np.where(has, self.lower.told[lanes], np.nan))
+        self._tell(lanes, np.full(len(lanes), GROUND), how, {
+            "values": found.values, "errors": found.left + found.numerical,
+            "model_errors": value - found.values,
+            "numerical_errors": found.left + found.numerical,
+        })  # fmt: skip
+
+    def _tell(
+        self, lanes: np.ndarray, rung: np.ndarray, how: How, told: dict[str, np.ndarray]
+    ) -> None:
+        for name, values in told.items():
+            self.told[name][lanes] = values
+        self.told["rungs"][lanes], self.told["hows"][lanes] = rung, how
+        self.told["outcomes"][lanes] = Outcome.STEPPED

@@ -1,0 +1,244 @@
+"""Gaits on the top rung by quasi-Newton steps that need its values alone, lane by lane.
+
+One step of the top rung from a state x tells the defect r = P(x) - x. Carried by the inverse of
+I - DP it is Newton's correction d, and the gait's quantities are near those of this step plus what
+they move by along d. Here both matrices are at first the lower rung's, where it has a gait, and
+learn from each further step by Broyden's update of rank one (C. G. Broyden, Math. Comp. 19, 1965).
+Where that is slow, differences of a few more steps take their place. How much smaller d becomes
+from one step to the next is measured, q, the worse of two, and bounds what is left: as for a
+contraction (Kantorovich), with a factor of two, by 2q/(1 - q) of what the last but one moved.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from vrw_jax.answers.lower import Lower
+from vrw_jax.answers.quantities import N_QUANTITIES, measured, slopes
+from vrw_jax.answers.top import Ground, Stepped
+from vrw_jax.wheel import Outcome
+
+SLOWEST, QUICKEST = 0.5, 0.05
+"""Contraction that is trusted at most, and at least counted on."""
+CURVED = 5.0
+"""Contraction over the length of a correction that is counted on at least: how curved maps are."""
+FARTHEST = 1.0
+"""Longest correction, rad, rad/s, m/s: farther off nothing is known."""
+PATIENCE = 4
+"""Corrections that do not contract, or changes of the legs' codes, before a lane gives up."""
+PER_TOLERANCE = 10.0
+"""Error of a step over the tolerance of its local steps: 99 of 100 keep it."""
+Goal = Callable[[np.ndarray], np.ndarray]
+"""Errors wanted of measures with about these values, (lanes, names)."""
+SINGULAR = 1e-3
+"""Share of a direction that must be left of it after a step for the inverse to learn from it."""
+DIFFERENCE = 1e-6
+"""Of a number of the section state, for derivatives, rad, rad/s, m, m/s."""
+CORRECTIONS, AGAIN = 24, 8
+"""Most corrections of one iteration, and after how many matrices are taken anew."""
+ROUNDING = 100.0
+"""Corrections of so many tolerances are the integrator's."""
+RESOLVED = 1e-13
+"""Changes as short as this tell nothing."""
+
+
+class Seen(NamedTuple):
+    """What one step of the top rung tells; lanes lead."""
+
+    same: np.ndarray  # it ended with the legs' codes that it began with
+    values: np.ndarray  # (lanes, names): the measures of the gait, as far as is known
+    size: np.ndarray  # (lanes, names): what the correction moves them by, nothing cancelled
+    direct: np.ndarray  # (lanes, names, 7): how they move with the step's quantities
+    numerical: np.ndarray  # (lanes, names): bound of what the integrator's tolerance leaves
+
+
+class Settled(NamedTuple):
+    """What became of lanes."""
+
+    done: np.ndarray
+    values: np.ndarray
+    left: np.ndarray  # (lanes, names): bound of what the iteration leaves
+    numerical: np.ndarray
+    n_steps: np.ndarray  # of the top rung
+    x: np.ndarray  # (lanes, 4 + 3 n)
+
+
+class Chord:
+    """Lanes on their way to a fixed point of the top rung, whose matrices learn."""
+
+    def __init__(
+        self, ground: Ground, lanes: np.ndarray, x: np.ndarray, lower: Lower | None
+    ) -> None:
+        self.ground, self.lanes, self.x = ground, lanes, x.copy()
+        n, m = len(lanes), x.shape[1] - ground.n
+        self.inverse = np.tile(np.eye(m), (n, 1, 1))
+        self.moved = np.zeros((n, N_QUANTITIES, m))
+        if lower is not None:
+            plane = ground.plane()
+            self.inverse[:, plane[:, None], plane] = lower.carry
+            self.moved[:, :, plane] = lower.moved
+        self.free = ground.free(self.x)
+        self.has = np.zeros(n, bool)  # whether the step before had the same codes
+        self.before = (np.zeros((n, m)), np.zeros((n, m)), np.zeros((n, N_QUANTITIES)))
+        self.correction = np.zeros((n, m))
+
+    def see(self, some: np.ndarray, step: Stepped, names: Sequence[str]) -> Seen:
+        """Learn from a step of `some` lanes, and tell what it says of the gait."""
+        m = self.free.shape[1]
+        x, y = self.x[some], step.x
+        stepped = step.outcome == Outcome.STEPPED
+        same = stepped & np.all(x[:, m:] == y[:, m:], axis=1)
+        defect = np.where(self.free[some] & same[:, None], y[:, :m] - x[:, :m], 0.0)
+        self._learn(some, x[:, :m], defect, step.told, same)
+        inverse, moved = self.inverse[some], self.moved[some]
+        d = np.where(self.free[some], np.einsum("ijk,ik->ij", inverse, defect), 0.0)
+        self.correction[some] = d
+        for kept, now in zip(self.before, (x[:, :m], defect, step.told), strict=True):
+            kept[some] = now
+        with np.errstate(all="ignore"):
+            estimate = step.told + np.einsum("ijk,ik->ij", moved, d)
+            direct = slopes(names, estimate)
+            along = np.abs(direct @ moved)
+            size = np.einsum("ijk,ik->ij", along, np.abs(d))
+            tolerance = PER_TOLERANCE * float(self.ground.options.rtol)
+            felt = np.abs(direct).sum(-1) + np.sum(along @ np.abs(inverse), axis=-1)
+            return Seen(same, measured(names, estimate), size, direct, tolerance * felt)
+
+    def _learn(
+        self,
+        some: np.ndarray,
+        x: np.ndarray,
+        defect: np.ndarray,
+        told: np.ndarray,
+        same: np.ndarray,
+    ) -> None:
+        """Broyden's updates of both matrices, where the step before can be compared with."""
+        x_before, defect_before, told_before = (kept[some] for kept in self.before)
+        s = np.where(self.free[some], x - x_before, 0.0)
+        z = defect_before - defect
+        inverse, moved = self.inverse[some], self.moved[some]
+        squared = np.einsum("ij,ij->i", s, s)
+        reached = np.einsum("ijk,ik->ij", inverse, z)
+        share = np.einsum("ij,ij->i", s, reached)
+        can = self.has[some] & same & (squared > RESOLVED**2)
+        sound = can & (np.abs(share) > SINGULAR * squared)
+        row = np.einsum("ij,ijk->ik", s, inverse) / np.where(sound, share, 1.0)[:, None]
+        learnt = inverse + (s - reached)[:, :, None] * row[:, None, :]
+        self.inverse[some] = np.where(sound[:, None, None], learnt, inverse)
+        missed = told - told_before - np.einsum("ijk,ik->ij", moved, s)
+        row = s / np.where(can, squared, 1.0)[:, None]
+        learnt = moved + missed[:, :, None] * row[:, None, :]
+        self.moved[some] = np.where(can[:, None, None], learnt, moved)
+        self.has[some] = same
+
+    def step(self, some: np.ndarray) -> Stepped:
+        """From where `some` lanes are."""
+        return self.ground.step(self.lanes[some], self.x[some])
+
+    def go_on(self, some: np.ndarray, y: np.ndarray, same: np.ndarray) -> None:
+        """To where the correction leads; along the step itself where codes have changed."""
+        m = self.free.shape[1]
+        there = np.where(self.free[some], self.x[some, :m] + self.correction[some], y[:, :m])
+        self.x[some] = y
+        self.x[some[same], :m] = there[same]
+        self.x[some[same]] = self.ground.consistent(self.x[some[same]])
+        changed = some[~same]
+        self.inverse[changed] = np.eye(m)
+        self.moved[changed] = 0.0
+        self.free[changed] = self.ground.free(self.x[changed])
+
+    def differentiate(self, some: np.ndarray, step: Stepped) -> np.ndarray:
+        """Both matrices anew, by differences of one step more for each free number.
+
+        `step` is the one from where the lanes are; tells how many steps were taken for each lane.
+        """
+        m = self.free.shape[1]
+        lane, number = np.nonzero(self.free[some])
+        x = self.x[some][lane]
+        x[np.arange(len(lane)), number] += DIFFERENCE
+        there = self.ground.step(self.lanes[some][lane], self.ground.consistent(x))
+        same = np.all(there.x[:, m:] == step.x[lane, m:], axis=1)
+        jacobian, moved = np.zeros((len(some), m, m)), np.zeros((len(some), N_QUANTITIES, m))
+        change = np.where(same[:, None], there.x[:, :m] - step.x[lane, :m], 0.0)
+        jacobian[lane, :, number] = np.where(self.free[some][lane], change, 0.0) / DIFFERENCE
+        moved[lane, :, number] = (
+            np.where(same[:, None], there.told - step.told[lane], 0.0) / DIFFERENCE
+        )
+        regular = np.eye(m) - jacobian
+        flat = np.abs(np.linalg.det(regular)) < RESOLVED
+        regular[flat] = np.eye(m)
+        self.inverse[some], self.moved[some] = np.linalg.inv(regular), moved
+        self.has[some] = False
+        return np.bincount(lane, minlength=len(some))
+
+
+class _Trust:
+    """How far each lane's corrections can be trusted, by how they have come down so far."""
+
+    def __init__(self, n: int, m: int, rounding: float) -> None:
+        self.rounding = rounding  # corrections as short as this are of the integrator
+        self.length, self.ratio = np.full(n, np.inf), np.zeros(n)
+        self.size, self.values = np.full((n, m), np.inf), np.full((n, m), np.nan)
+
+    def left(self, some: np.ndarray, seen: Seen, length: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Bound of what the corrections leave, (lanes, names), and how they contracted."""
+        with np.errstate(all="ignore"):
+            q = np.where(seen.same, length / self.length[some], np.inf)
+            q = np.where(seen.same & (length <= self.rounding), 0.0, q)
+            # Nothing is trusted where there is no correction yet to compare with.
+            least = np.clip(CURVED * self.length[some], QUICKEST, SLOWEST)
+            least = np.where(np.isfinite(self.length[some]), least, np.inf)
+            worst = np.maximum(np.maximum(q, self.ratio[some]), least)
+            change = np.abs(seen.values - self.values[some])
+            effect = np.fmax(np.fmax(seen.size, self.size[some]), change)
+            share = np.where(worst <= SLOWEST, 2.0 * worst / (1.0 - worst), np.inf)
+            left = np.nan_to_num(share[:, None] * effect, nan=np.inf, posinf=np.inf)
+        compared = np.isfinite(self.length[some])
+        self.ratio[some] = np.where(compared, np.where(seen.same, q, 0.0), self.ratio[some])
+        self.length[some] = np.where(seen.same, length, np.inf)
+        self.size[some], self.values[some] = seen.size, seen.values
+        return left, q
+
+
+def settled(
+    chord: Chord,
+    names: Sequence[str],
+    goal: Goal,
+    patient: int,
+    first: Stepped | None = None,
+) -> Settled:
+    """Corrections until what is left is below the `goal`, CORRECTIONS at most.
+
+    Differences take the matrices' place after so many steps, `patient`. `first` is the step from
+    where the lanes are, if it has been taken.
+    """
+    n, m = len(chord.lanes), len(names)
+    told = Settled(
+        np.zeros(n, bool), np.full((n, m), np.nan), np.full((n, m), np.inf), np.zeros((n, m)),
+        np.zeros(n, int), chord.x,
+    )  # fmt: skip
+    tolerance = float(chord.ground.options.rtol)
+    trust, strikes, open_ = _Trust(n, m, ROUNDING * tolerance), np.zeros(n, int), np.arange(n)
+    for k in range(CORRECTIONS):
+        if not len(open_):
+            break
+        step = first if first is not None and k == 0 else chord.step(open_)
+        told.n_steps[open_] += 1
+        if k >= patient and (k - patient) % AGAIN == 0:
+            told.n_steps[open_] += chord.differentiate(open_, step)
+            trust.length[open_], trust.ratio[open_] = np.inf, 0.0 if patient else np.inf
+        seen = chord.see(open_, step, names)
+        length = np.linalg.norm(chord.correction[open_], axis=1)
+        left, q = trust.left(open_, seen, length)
+        done = np.all(
+            left <= np.maximum(goal(seen.values) - seen.numerical, seen.numerical), axis=1
+        )
+        told.values[open_], told.left[open_] = seen.values, left
+        told.numerical[open_], told.done[open_] = seen.numerical, done
+        strikes[open_] += ~seen.same | (np.isfinite(q) & (q > SLOWEST))
+        goes_on = ~done & (step.outcome == Outcome.STEPPED) & (length <= FARTHEST)
+        goes_on &= strikes[open_] < PATIENCE
+        chord.go_on(open_[goes_on], step.x[goes_on], seen.same[goes_on])
+        open_ = open_[goes_on]
+    return told

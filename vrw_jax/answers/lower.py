@@ -1,0 +1,125 @@
+"""Gaits of the rungs below real ground, with what carries a defect to their measures; in lanes."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vrw_jax.answers.quantities import N_QUANTITIES
+from vrw_jax.batches import steps
+from vrw_jax.gaits import in_shapes, limit_cycles
+from vrw_jax.models import RigidWheel
+from vrw_jax.numerics import Options, with_jacobian
+from vrw_jax.wheel import Outcome, WheelParams
+
+NONE, RIGID, PAPER, GROUND = 0, 1, 2, 3
+RUNGS = ("none", "rigid", "viscoelastic", "unilateral")
+"""Names of the rungs, by number."""
+
+START = "section_state"
+
+
+class Lower(NamedTuple):
+    """One gait of each lane, on a rung whose section state is the paper's; lanes lead."""
+
+    rung: np.ndarray  # NONE: there is no gait
+    x: np.ndarray  # (lanes, 3): section state
+    told: np.ndarray  # (lanes, 7): quantities of the step from it
+    carry: np.ndarray  # (lanes, 3, 3): (I - DP)^-1
+    moved: np.ndarray  # (lanes, 7, 3): how the quantities move with x
+    own: np.ndarray  # (lanes, 3): the gait's own defect, carried: what numbers leave it wrong by
+    outcome: np.ndarray
+
+
+def no_gaits(n: int) -> Lower:
+    """Of lanes in which nothing is known yet."""
+    return Lower(
+        np.full(n, NONE), np.zeros((n, 3)), np.zeros((n, N_QUANTITIES)), np.zeros((n, 3, 3)),
+        np.zeros((n, N_QUANTITIES, 3)), np.zeros((n, 3)), np.full(n, int(Outcome.NO_CYCLE_FOUND)),
+    )  # fmt: skip
+
+
+def put(into: Lower, lanes: np.ndarray, some: Lower) -> None:
+    """Those gaits in their lanes."""
+    for whole, part in zip(into, some, strict=True):
+        whole[lanes] = part
+
+
+def paper_gaits(params: WheelParams, options: Options) -> Lower:
+    """By collocation, and one step by machine code, which tells what a gait moves with."""
+
+    def found(params: WheelParams) -> tuple[jax.Array, jax.Array]:
+        cycles = limit_cycles(params)
+        return cycles.section_state, cycles.outcome
+
+    x, outcome = map(np.array, in_shapes(found, params))
+    lower = no_gaits(len(x))
+    lower.outcome[:] = outcome
+    (good,) = np.nonzero(outcome == Outcome.STEPPED)
+    if not len(good):
+        return lower
+    some = jax.tree.map(lambda leaf: leaf[good], params)
+    step = steps(some, x[good], options=options, derivatives=[START])
+    by = jax.tree.map(np.asarray, step.derivatives[START])
+    y, d = np.asarray(step.section_state), np.asarray(step.durations)
+    stepped = np.asarray(step.outcome) == Outcome.STEPPED
+    reach = _reach(some) / np.cos(y[:, 0])
+    none = np.zeros(len(good))
+    told = np.column_stack([d[:, 0], d[:, 1] + d[:, 2], none, reach, y])
+    longer = (reach * np.tan(y[:, 0]))[:, None] * by.section_state[:, 0]
+    both, first, second = np.moveaxis(by.durations, 1, 0)
+    rows = [both, first + second, 0.0 * both, longer]
+    moved = np.concatenate([np.stack(rows, 1), by.section_state], 1)
+    gaits = _gaits(PAPER, x[good], y, told, by.section_state, moved)
+    put(lower, good[stepped], Lower(*(part[stepped] for part in gaits)))
+    lower.outcome[good[~stepped]] = np.asarray(step.outcome)[~stepped]
+    return lower
+
+
+def rigid_gaits(params: WheelParams) -> Lower:
+    """In closed form: the stiff limit's rolling gait, with the paper's landing."""
+    x, y, length, duration, jacobian, slope = map(np.asarray, in_shapes(_rolling, params))
+    none = np.zeros_like(duration)
+    told = np.column_stack([none, duration, none, length, y])
+    flat = 0.0 * slope
+    moved = np.concatenate([np.stack([flat, slope, flat, flat], 1), jacobian], 1)
+    return _gaits(RIGID, x, y, told, jacobian, moved)
+
+
+def contraction(params: WheelParams) -> np.ndarray:
+    """Share of its length by which weight contracts a leg: the order of the rigid rung's error."""
+    s = jax.tree.map(np.asarray, params.symbols())
+    return s.Mt * s.g / (np.asarray(params.stiffness) * s.L0)
+
+
+def _reach(params: WheelParams) -> np.ndarray:
+    """Distance between both feet at touchdown, times cos(theta-): L0 sin(alpha), m."""
+    return np.asarray(params.locked_length) * np.sin(params.leg_angle)
+
+
+def _gaits(
+    rung: int, x: np.ndarray, y: np.ndarray, told: np.ndarray, jacobian: np.ndarray,
+    moved: np.ndarray,
+) -> Lower:  # fmt: skip
+    with np.errstate(all="ignore"):
+        carry = np.linalg.inv(np.eye(3) - jacobian)
+    own = np.einsum("ijk,ik->ij", carry, y - x)
+    stepped = np.full(len(x), int(Outcome.STEPPED))
+    return Lower(np.full(len(x), rung), x, told, carry, moved, own, stepped)
+
+
+@jax.jit
+def _rolling(params: WheelParams) -> tuple:
+    model, options = RigidWheel(held_landing=True, stop_at_lift_off=False), Options()
+
+    def one(params: WheelParams) -> tuple:
+        def take(x: jax.Array) -> tuple:
+            step = model.step(params, x, options)
+            return step.section_state, step.step_length, jnp.sum(step.durations)
+
+        x = model.start(params)
+        (y, length, duration), (jacobian, _, slope) = with_jacobian(take, x)
+        return x, y, length, duration, jacobian, slope
+
+    return jax.vmap(one)(params)

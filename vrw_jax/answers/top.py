@@ -1,0 +1,85 @@
+"""Real ground, the top rung, as values of one step in lanes; nothing here is differentiated."""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+
+from vrw_jax.models import UnilateralWheel, as_full_states, walk_lanes
+from vrw_jax.numerics import Options
+from vrw_jax.wheel import PARAMETER_NAMES, WheelParams
+
+STICKS, LOCKED = 1, 4
+"""Codes of a section state: a foot at rest; what a leg on its stopper adds."""
+
+
+class Stepped(NamedTuple):
+    """A step of some lanes."""
+
+    x: np.ndarray  # (lanes, 4 + 3 n): section state after it; zeros where it failed
+    told: np.ndarray  # (lanes, 7): its quantities
+    outcome: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Ground:
+    """Wheels on ground of their own friction, lane by lane."""
+
+    columns: np.ndarray  # (10, lanes): parameters and friction
+    n: int  # legs
+    model: UnilateralWheel
+    options: Options
+
+    @classmethod
+    def of(
+        cls, params: WheelParams, friction: np.ndarray, stoppers: str, options: Options
+    ) -> "Ground":
+        columns = [*(np.asarray(getattr(params, name)) for name in PARAMETER_NAMES), friction]
+        model = UnilateralWheel(stoppers=stoppers)  # type: ignore[arg-type]
+        return cls(np.stack(columns), params.n_legs, model, options)
+
+    def embedded(self, lanes: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Full section states of the paper's, (lanes, 3)."""
+        return as_full_states(self.columns[:, lanes], x, self.n)
+
+    def step(self, lanes: np.ndarray, x: np.ndarray, n_steps: int = 1) -> Stepped:
+        """From full section states."""
+        columns = self.columns[:, lanes]
+        y, durations, outcome, *_, length = walk_lanes(
+            columns, x, n_steps, self.model, self.options, self.n
+        )
+        paper = y[:, [0, 1, 4 + self.n]]
+        return Stepped(y, np.column_stack([durations, length, paper]), outcome)
+
+    def free(self, x: np.ndarray) -> np.ndarray:
+        """Numbers of section states that are free where their legs' codes hold, (lanes, 4 + 2 n).
+
+        The others follow from them: the hub's rates from a foot that sticks, Leg 1's length from
+        touchdown, those of legs on their stoppers from these.
+        """
+        n = self.n
+        code = np.round(x[:, 4 + 2 * n :]).astype(int)
+        free = np.zeros((len(x), 4 + 2 * n), bool)
+        free[:, :2] = free[:, 4 + n] = True
+        free[:, 2] = code[:, 0] != STICKS
+        free[:, 3] = free[:, 4] = code[:, 0] % LOCKED == 0
+        off = code[:, 1:] < LOCKED
+        free[:, 5 : 4 + n], free[:, 5 + n :] = off, off
+        return free
+
+    def consistent(self, x: np.ndarray) -> np.ndarray:
+        """Section states with what follows from the free numbers: see `free`."""
+        n, x = self.n, x.copy()
+        theta, code = x[:, 0], np.round(x[:, 4 + 2 * n]).astype(int)
+        foot = code % LOCKED
+        height = x[:, 3 + n] * np.cos(theta - 2.0 * np.pi / n)  # of the hub, by the landing leg
+        sin, cos, rate, along = np.sin(theta), np.cos(theta), x[:, 1], x[:, 4 + n]
+        x[:, 4] = np.where((foot != 0) & (code < LOCKED), height / cos, x[:, 4])
+        length = x[:, 4]
+        x[:, 2] = np.where(foot == STICKS, along * sin + length * rate * cos, x[:, 2])
+        x[:, 3] = np.where(foot != 0, along * cos - length * rate * sin, x[:, 3])
+        return x
+
+    def plane(self) -> np.ndarray:
+        """Places of the paper's section state among the numbers of a full one."""
+        return np.array([0, 1, 4 + self.n])
