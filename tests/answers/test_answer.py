@@ -81,16 +81,6 @@ def test_no_gait_is_said_and_no_small_number():
     assert told.why.startswith("no such gait on real ground: ")
 
 
-def test_stiff_wheels_are_answered_in_closed_form():
-    e = 1.0 / 64.0  # docs/physics.md: the limit that leads to the rigid wheel
-    stiff = vrw.WheelParams(
-        stiffness=500.0 / e**2, damping=200.0 / e, natural_length=1.0 + 0.02 * e**2, slope=0.15
-    )
-    told = vrw.answer("period", stiff, 3e-3, friction=20.0)
-    assert told.rung == "rigid"
-    assert abs(told.model_error) <= told.error <= 3e-3
-
-
 def test_an_answer_prints_itself_in_one_line():
     text = repr(vrw.answer(["speed", "dls_fraction"], TABLE_1, 1e-2, friction=50.0))
     assert "\n" not in text
