@@ -6,7 +6,8 @@ from pathlib import Path
 
 from hatchling.metadata.plugin.interface import MetadataHookInterface
 
-LINK = re.compile(r"(!?)\[([^\]]*)\]\((?!https?:|#)([^)]+)\)")
+LINK = re.compile(r"(!?)\[((?:!\[[^\]]*\]\([^)]*\)|[^\]])*)\]\((?!https?:|#)([^)]+)\)")
+"""A link, whose label may be an image."""
 
 
 def for_index(text: str, url: str) -> str:
@@ -14,6 +15,7 @@ def for_index(text: str, url: str) -> str:
 
     def absolute(found: re.Match[str]) -> str:
         image, label, path = found.groups()
+        label = LINK.sub(absolute, label)
         if url:
             kind = "raw" if image else "blob"
             return f"{image}[{label}]({url.rstrip('/')}/{kind}/HEAD/{path})"

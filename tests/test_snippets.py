@@ -52,8 +52,9 @@ def marked(page):
 
 @pytest.mark.parametrize("page", [*map(marked, PAGES)])
 def test_a_page_runs_as_it_stands(page, capsys, tmp_path, monkeypatch):
-    if page.stem == "numpyro":
-        pytest.importorskip("numpyro")
+    for stem, library in (("numpyro", "numpyro"), ("explore", "anywidget")):
+        if page.stem == stem:
+            pytest.importorskip(library)
     run(page, capsys, tmp_path, monkeypatch)
 
 
