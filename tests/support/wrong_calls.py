@@ -472,12 +472,6 @@ def make() -> None:
     )
     use("basin of a batch", lambda: vrw.basin(several, grid), "ValueError", "one wheel")
     use(
-        "basin on real ground",
-        lambda: vrw.basin(table_1, grid, model=vrw.UnilateralWheel()),
-        "TypeError",
-        "three numbers",
-    )
-    use(
         "basin by options of a cycle",
         lambda: vrw.basin(table_1, grid, options=vrw.CycleOptions()),
         "TypeError",

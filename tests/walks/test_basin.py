@@ -94,3 +94,19 @@ def test_a_grid_that_names_no_plane_is_told_what_to_name():
 def test_a_basin_draws_itself(basins):
     figure = basin_figure([basins[100.0], basins[200.0]], ["a", "b"])
     assert len(figure.axes) == 3
+
+
+@pytest.mark.slow
+def test_starts_on_real_ground_are_sorted_onto_its_slow_and_its_fast_gait():
+    params, ground = vrw.WheelParams(damping=300.0), vrw.UnilateralWheel(friction=0.7)
+    grid = {"theta_touchdown": 0.1, "dtheta_touchdown": [0.3, 1.6, 2.6], "dL1_touchdown": -0.1}
+    found = vrw.basin(params, grid, model=ground, options=OPTIONS)
+    gaits = vrw.limit_cycles(params, model=ground)
+    for start, gait in ((1, 0), (2, 1)):
+        orbit = found.orbit_state[int(found.attractor[start]), 0]
+        np.testing.assert_allclose(orbit, gaits.section_state[gait], atol=1e-5)
+    shares = found.orbit_dls_fraction.values[found.attractor.values[1:]]
+    np.testing.assert_allclose(shares, gaits.dls_fraction, atol=1e-6)
+    # "auto" is real ground: its starts may lie anywhere.
+    again = vrw.basin(params, grid, model=vrw.LadderWheel(friction=0.7), options=OPTIONS)
+    np.testing.assert_array_equal(again.attractor, found.attractor)

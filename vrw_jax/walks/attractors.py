@@ -5,14 +5,21 @@ the next one, so that long transients cost little.
 """
 
 import functools
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array
 
-from vrw_jax.models import AbstractWheel
+from vrw_jax.models import (
+    AbstractWheel,
+    UnilateralWheel,
+    as_full_states,
+    step_lanes,
+    walk_lanes,
+)
 from vrw_jax.numerics import Options, in_batches, taken
 from vrw_jax.walks.stepping import walk
 from vrw_jax.wheel import Outcome, WheelParams
@@ -39,7 +46,7 @@ class Settled(NamedTuple):
     outcome: np.ndarray  # STEPPED where it still walked
     period: np.ndarray  # of the orbit that it settled on, in steps; 0 where it did not settle
     steps: np.ndarray  # until it was at its orbit, or fell
-    orbit: np.ndarray  # (start, longest period, 3): section states, lowest dtheta- first, then NaN
+    orbit: np.ndarray  # (start, longest period, m): section states, lowest dtheta- first, then NaN
 
 
 @eqx.filter_jit
@@ -49,6 +56,26 @@ def _walk_block(
     one = lambda params, x: walk(params, x, ROUND, model=model, options=options)
     walks = jax.vmap(one)(params, x)
     return walks.steps.section_state, walks.steps.outcome
+
+
+def _by_lanes(
+    model: Any, options: Options, params: WheelParams, x: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The same on real ground, any number of wheels at once."""
+    n, columns = params.n_legs, np.asarray(jax.vmap(model.values)(params)).T
+    x = as_full_states(columns, np.asarray(x), n)
+    states, codes = list[np.ndarray](), list[np.ndarray]()
+    for _ in range(ROUND):
+        x, _, outcome, *_ = walk_lanes(columns, x, 1, model, options, n)
+        # A wheel that fell is at no section state: its code stays.
+        outcome = outcome if not codes else np.where(codes[-1] > 0, codes[-1], outcome)
+        states.append(x)
+        codes.append(outcome)
+    return np.stack(states, 1), np.stack(codes, 1)
+
+
+WALKS: dict[str, Callable[..., tuple]] = {"unilateral": _by_lanes}
+"""Rounds of many starts by rung, where it is not by blocks of the rung's own steps."""
 
 
 def settle(
@@ -64,16 +91,18 @@ def settle(
     fill = lambda x: np.broadcast_to(np.asarray(x), n)
     wheels = jax.tree.map(fill, params)
     n_rounds = -(-most_steps // ROUND)
-    history = np.full((n, 1 + n_rounds * ROUND, 3), np.nan)
+    history = np.full((n, 1 + n_rounds * ROUND, starts.shape[1]), np.nan)
     history[:, 0] = starts
     outcome = np.full(n, int(Outcome.STEPPED))
     period, walked = np.zeros(n, int), np.zeros(n, int)
     open_ = np.arange(n)
-    step_on = functools.partial(_walk_block, model, options)
+    by_rung = WALKS.get(model.rung)
+    walked_on = functools.partial(by_rung or _walk_block, model, options)
+    step_on = walked_on if by_rung else functools.partial(in_batches, walked_on, BLOCK)
     for k in range(n_rounds):
         now = slice(1 + k * ROUND, 1 + (k + 1) * ROUND)
         here = taken(wheels, open_), history[open_, k * ROUND]
-        states, codes = in_batches(step_on, BLOCK, *here)
+        states, codes = step_on(*here)
         history[open_, now], outcome[open_] = states, codes[:, -1]
         walked[open_] = k * ROUND + np.sum(codes == Outcome.STEPPED, 1)
         known = (k + 1) * ROUND
@@ -82,7 +111,7 @@ def settle(
         open_ = open_[(outcome[open_] == Outcome.STEPPED) & (period[open_] == 0)]
         if not len(open_):
             break
-    orbit = np.full((n, longest_period, 3), np.nan)
+    orbit = np.full((n, longest_period, starts.shape[1]), np.nan)
     for i in np.flatnonzero(period):
         last = history[i, walked[i] + 1 - period[i] : walked[i] + 1]
         orbit[i, : period[i]] = np.roll(last, -int(np.argmin(last[:, 1])), axis=0)
@@ -106,7 +135,7 @@ class Attractors(NamedTuple):
     """The different orbits among many starts, the one with most starts first."""
 
     of_start: np.ndarray  # index of each start's orbit; -1 where it did not settle
-    orbits: list[np.ndarray]  # (period, 3) each
+    orbits: list[np.ndarray]  # (period, m) each
 
 
 def distinct(settled: Settled) -> Attractors:
@@ -139,7 +168,11 @@ def _measure_block(
 def orbit_measures(
     params: WheelParams, states: np.ndarray, model: AbstractWheel, options: Options
 ) -> dict[str, np.ndarray]:
-    """All measures of the step from each of `states` (n, 3); `params` as in `settle`."""
+    """All measures of the step from each of `states` (n, m); `params` as in `settle`."""
     n = len(states)
     wheels = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), n), params)
+    if model.rung in WALKS:
+        columns, rung = np.asarray(jax.vmap(model.values)(wheels)).T, cast(UnilateralWheel, model)
+        told, _ = step_lanes(columns, states, rung, options, params.n_legs)
+        return jax.tree.map(np.asarray, told.measures())
     return in_batches(functools.partial(_measure_block, model, options), BLOCK, wheels, states)

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
+from typing import cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.models import AbstractWheel
+from vrw_jax.models import AbstractWheel, LadderWheel
 from vrw_jax.numerics import Engine, Options
 from vrw_jax.results import MARGINS, MEASURES, attrs_of, provenance
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.walks.attractors import distinct, orbit_measures, settle
-from vrw_jax.walks.stepping import one_wheel, options_of, rung_of
+from vrw_jax.walks.stepping import ModelLike, one_wheel, options_of, rung_of
 from vrw_jax.wheel import Outcome, WheelParams, transitions
 from vrw_jax.wording import instance, reals, untraced, whole
 
@@ -34,7 +36,7 @@ def basin(
     params: WheelParams,
     grid: Grid,
     *,
-    model: AbstractWheel | None = None,
+    model: ModelLike | None = None,
     options: Options | None = None,
     engine: Engine = "auto",
     most_steps: int = 200,
@@ -51,7 +53,8 @@ def basin(
     - `steps`: steps until it is within 1e-3 of the orbit for good, or until it fell.
 
     The orbits stand in `orbit_state` over (attractor_index, orbit_step), the one with most starts
-    first, with their `orbit_period` in steps, DLS fraction and least margins.
+    first, with their `orbit_period` in steps, DLS fraction and, on the paper's rung, least margins.
+    On real ground section states are full ones; "auto" is real ground, which serves all starts.
 
     Args:
         params: the wheel.
@@ -88,6 +91,8 @@ def basin(
     starts = places if names == BEFORE else _before_landing(params, places)
     reachable = np.isfinite(starts).all(-1)
     starts = np.where(reachable[:, None], starts, np.nan)
+    full = functools.partial(model.full_section, params)
+    starts = np.asarray(jax.vmap(full)(jnp.asarray(starts)))
     settled = settle(params, starts, model, options, most_steps, longest_period)
     attractors = distinct(settled)
 
@@ -120,16 +125,13 @@ def _label(name: str, values: np.ndarray, is_axis: bool) -> xr.Variable:
 
 
 def _checked(
-    params: WheelParams, model: AbstractWheel | None, options: Options | None
+    params: WheelParams, model: ModelLike | None, options: Options | None
 ) -> tuple[AbstractWheel, Options]:
     untraced("vrw.basin", "map vrw.walk over the starts", params, options)
     one_wheel(params, "ask for one basin after the other")
     rung, options = rung_of(model), options_of(options)
-    if rung.section_size(params) != 3:
-        raise TypeError(
-            f"model is {type(rung).__name__}, but basins are those of section states of three "
-            "numbers: give vrw.ViscoelasticWheel() or vrw.RigidWheel()."
-        )
+    if rung.rung == "ladder":
+        rung = cast(LadderWheel, rung).ground  # starts may lie anywhere: the upper rung serves all
     options.require_reachable(np.dtype(params.damping.dtype))
     return rung, options
 
@@ -181,13 +183,14 @@ def _orbits(
     options: Options,
 ) -> dict[str, xr.Variable]:
     n = len(orbits)
-    states = np.full((n, longest, 3), np.nan)
-    fractions, least = np.zeros(n), {name: np.zeros(n) for name in MARGINS}
+    states = np.full((n, longest, model.section_size(params)), np.nan)
+    margins = MARGINS if model.section_size(params) == 3 else ()
+    fractions, least = np.zeros(n), {name: np.zeros(n) for name in margins}
     for i, orbit in enumerate(orbits):
         states[i, : len(orbit)] = orbit
         told = orbit_measures(params, orbit, model, options)
         fractions[i] = told["duration_dls"].sum() / told["period"].sum()
-        for name in MARGINS:
+        for name in margins:
             least[name][i] = told[name].min()
     return {
         "orbit_state": xr.Variable(
