@@ -37,11 +37,12 @@ def marked(name):
 
 @pytest.mark.parametrize("name", [*map(marked, NAMES)])
 def test_the_example_of_a_public_name_runs_as_it_stands(name, monkeypatch):
+    text = told(name)
     monkeypatch.setattr(vrw, "start_jax", lambda *_: None)  # it has started
     globs = {"jax": jax, "jnp": jnp, "np": np, "xr": xr, "vrw": vrw, "tempfile": tempfile}
     if name == "explore":
         pytest.importorskip("anywidget")
-    test = doctest.DocTestParser().get_doctest(told(name), globs, name, None, 0)
+    test = doctest.DocTestParser().get_doctest(text, globs, name, None, 0)
     assert test.examples, f"{name} has no example"
     out: list[str] = []
     with contextlib.suppress(doctest.UnexpectedException):
