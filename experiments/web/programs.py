@@ -24,7 +24,7 @@ LEGS = (6, 8, 10)
 SAMPLES = 24
 """Times of each phase that the animation knows, ends included."""
 
-TABLEAU = explicit_tableau(Options().solver)
+SOLVER = Options.__dataclass_fields__["solver"].default
 
 
 class Program(NamedTuple):
@@ -65,7 +65,7 @@ def programs(n_legs: int) -> dict[str, Program]:
     def told(tolerance: Array, friction: Array, parameters: Array, x: Array) -> tuple:
         """All that the step tells, in `result_of`'s order, and its motion phase by phase."""
         params, options = wheel(parameters), _options(tolerance)
-        walked = walk(params, tuple(x), options, TABLEAU, True, monitored=True)
+        walked = walk(params, tuple(x), options, explicit_tableau(SOLVER), True, monitored=True)
         step = result_of(walked.s, walked.landing, told_of(walked), friction)
         parts = (
             step.section_state, step.post_impact, step.durations, step.step_length,
@@ -76,7 +76,9 @@ def programs(n_legs: int) -> dict[str, Program]:
         motion = []
         for phase, start, end in zip(walked.phases, walked.starts, walked.ends, strict=True):
             flow = lane_phase(phase, monitored=False)
-            samples = sample_lanes(flow, TABLEAU, *start, end.duration, SAMPLES, options)
+            samples = sample_lanes(
+                flow, explicit_tableau(SOLVER), *start, end.duration, SAMPLES, options
+            )
             motion.append(jnp.concatenate(described(phase, jnp.moveaxis(samples, 1, 0))))
         codes = jnp.stack([step.outcome, step.solver_steps]).astype(jnp.int32)
         return numbers, codes, *motion
@@ -89,7 +91,7 @@ def programs(n_legs: int) -> dict[str, Program]:
 
 
 def _advance(params: WheelParams, x: tuple[Array, ...], options: Options) -> tuple[tuple, tuple]:
-    step = gait_step(params, x, options, TABLEAU, stop_at_lift_off=True)
+    step = gait_step(params, x, options, explicit_tableau(SOLVER), stop_at_lift_off=True)
     return (*step.section_state, *step.durations), (step.outcome, step.solver_steps)
 
 

@@ -98,7 +98,8 @@ def test_without_premises_double_support_is_bought_by_scuffing(most_dls, most_dl
     for name in PREMISES:
         if name in MARGINS:
             least = float(jnp.min(getattr(most_dls.step.monitors, name)))
-            assert least >= margins[name] - 1e-6
+            # 1e-6 of what the bounds' width changes: of take-off, 22 m/s^2.
+            assert least >= margins[name] * (1.0 - 3e-3)
 
 
 def test_the_tuned_wheel_walks_and_keeps_its_premises_on_every_step(most_dls):

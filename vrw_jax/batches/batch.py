@@ -169,7 +169,7 @@ def steps(
     states = np.asarray(state_of(states, "states"))
     wheels = _wheels(params, states, rung, n_steps, options)
     states = states.astype(wheels.dtype)
-    by_legs = rung.rung == "unilateral"
+    by_legs = rung.lanes == "legs"
     moved = _moved(derivatives, by_legs or engine == "collocation")
     given = rung, wheels, states, n_steps, options, engine, params.n_legs
     return _on_ground(*given) if by_legs else _by_phases(*given, durations, moved)
@@ -370,7 +370,7 @@ class _Engine(eqx.Module):
 def _chosen(
     engine: str, model: Any, options: Options, n_legs: int, moved: tuple[int, ...]
 ) -> _Engine:
-    fits = model.rung == "viscoelastic" and explicit_tableau(options.solver) is not None
+    fits = model.lanes == "phases" and explicit_tableau(options.solver) is not None
     if engine in ("lanes", "collocation") and not fits:
         raise ValueError(
             f"the lane engine can't run {type(model).__name__} with {options.solver}: it knows "

@@ -319,8 +319,15 @@ class AbstractWheel(eqx.Module):
     """What its motion depends on: the wheel's parameters, and where it feels it, friction."""
     tells_contacts: eqx.AbstractClassVar[bool]
     """Whether trajectories tell every leg's contact instead of the paper's phases."""
+    lanes: ClassVar[str] = ""
+    """What machine code walks in batches: the paper's "phases", "legs", or nothing."""
     legs_yield: ClassVar[bool] = True
     """Whether springs and dampers play a part: what is tuned and scanned."""
+
+    @property
+    def upper(self) -> "AbstractWheel":
+        """What serves wherever a step may start: itself, or a ladder's upper rung."""
+        return self
 
     def values(self, params: WheelParams) -> Float[Array, " n_values"]:
         """Numbers of `parameter_names`, of one wheel on this ground."""

@@ -206,6 +206,10 @@ class LadderWheel(AbstractWheel):
         """The upper rung."""
         return UnilateralWheel(friction=self.friction)
 
+    @property
+    def upper(self) -> UnilateralWheel:
+        return self.ground
+
     def start(self, params: WheelParams) -> FullState:
         return self.ground.start(params)
 

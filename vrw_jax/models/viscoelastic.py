@@ -120,6 +120,7 @@ class ViscoelasticWheel(AbstractWheel):
     rung: ClassVar[str] = "viscoelastic"
     parameter_names: ClassVar[tuple[str, ...]] = PARAMETER_NAMES
     tells_contacts: ClassVar[bool] = False
+    lanes: ClassVar[str] = "phases"
 
     friction: float = eqx.field(static=True, converter=known_friction, default=1.0)
     stop_at_lift_off: bool = eqx.field(

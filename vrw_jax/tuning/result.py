@@ -30,7 +30,8 @@ class Walked(NamedTuple):
     """What walking the tuned wheel showed, from a start displaced a little.
 
     - `distance`: from the limit cycle after the last step, rad, rad/s and m/s;
-    - `kept`: whether every step kept every constraint on a monitor, within 1e-3 of its scale.
+    - `kept`: whether every step kept every constraint on a monitor, within 1e-3 of its value and
+      1e-2 of its default margin.
     """
 
     steps: int

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
-from typing import cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.models import AbstractWheel, LadderWheel
+from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import Engine, Options
 from vrw_jax.results import MARGINS, MEASURES, attrs_of, provenance
 from vrw_jax.runtime import xarray as xr
@@ -129,9 +128,7 @@ def _checked(
 ) -> tuple[AbstractWheel, Options]:
     untraced("vrw.basin", "map vrw.walk over the starts", params, options)
     one_wheel(params, "ask for one basin after the other")
-    rung, options = rung_of(model), options_of(options)
-    if rung.rung == "ladder":
-        rung = cast(LadderWheel, rung).ground  # starts may lie anywhere: the upper rung serves all
+    rung, options = rung_of(model).upper, options_of(options)  # starts may lie anywhere
     options.require_reachable(np.dtype(params.damping.dtype))
     return rung, options
 

@@ -6,7 +6,7 @@ restitution 1/2, friction is 0.3 everywhere. One period is ten events: the slidi
 breaks loose, lets go, hits above and leaves at once, the beak hits, the sleeve hits above and
 slides up, lets go, hits below and leaves at once, hits below and slides. Where it leaves at once,
 a mode begins on its own guard with rate zero. An impact slides in one direction as Moreau's law
-says; time stepping by that law (the test's own code) gives the same order of events.
+says; time stepping by that law, written apart and not kept here, gave the same order of events.
 """
 
 from collections.abc import Iterator

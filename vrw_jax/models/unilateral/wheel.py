@@ -203,6 +203,7 @@ class UnilateralWheel(AbstractWheel):
     rung: ClassVar[str] = "unilateral"
     parameter_names: ClassVar[tuple[str, ...]] = (*PARAMETER_NAMES, FRICTION)
     tells_contacts: ClassVar[bool] = True
+    lanes: ClassVar[str] = "legs"
 
     friction: Scalar = eqx.field(converter=friction_of, default=0.7)
     max_events: int = eqx.field(static=True, converter=partial(whole, "max_events"), default=400)
