@@ -1,5 +1,7 @@
 """docs/wheel.html: the wheel in a browser, one file with the library's own step inside.
 
+    python -m experiments.web.build [--page]
+
 `--page` takes the step's code from the page that stands there, which is quick; without it the step
 is traced and compiled anew, some minutes. `wasm-ld` is Debian's `lld`, or `pip install ziglang`.
 """

@@ -1,5 +1,7 @@
 """How long the page takes after a slider moved, for its map and its basin, in Node and in Chromium.
 
+    python -m experiments.web.speed
+
 Writes its table into docs/explore.md. Needs `node`, `chromium`, and playwright: `.[web]`.
 """
 
