@@ -9,6 +9,8 @@ import numpy as np
 
 from vrw_jax.batches import steps
 from vrw_jax.cycles import WalkedCycle, options_towards
+from vrw_jax.models import AbstractWheel
+from vrw_jax.numerics import Options
 from vrw_jax.wheel import Outcome, WheelParams
 
 N_STEPS = 80
@@ -39,6 +41,27 @@ def starts_of(params: WheelParams) -> np.ndarray:
         theta = np.arctan((length - s.cos_alpha) / s.sin_alpha)
         told.append(np.stack([theta, share * rolling, -0.1 * np.sqrt(g * L0) / 3.0], -1))
     return np.stack(told)
+
+
+def walked(
+    params: WheelParams,
+    x: Any,
+    model: AbstractWheel,
+    period_n: int,
+    options: Options | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of each lane where N_STEPS lead, whether it still walks there, and by how much it misses that
+    state a period later; infinite where a walk ended before."""
+    there = steps(params, x, N_STEPS, model=model, options=options)
+    states, walking = np.array(there.section_state), np.asarray(there.outcome) == Outcome.STEPPED
+    missed, (on,) = np.full(len(states), np.inf), np.nonzero(walking)
+    if len(on):
+        own = jax.tree.map(lambda leaf: leaf[on], params)
+        later = steps(own, states[on], period_n, model=model, options=options)
+        away = np.abs(np.asarray(later.section_state) - states[on])
+        away = away[:, : model.section_numbers(params)].max(-1)
+        missed[on] = np.where(np.asarray(later.outcome) == Outcome.STEPPED, away, np.inf)
+    return states, walking, missed
 
 
 def gaits_attracting(finder: Any, params: WheelParams) -> list[WalkedCycle]:
@@ -84,13 +107,8 @@ def _walked_to(finder: Any, params: WheelParams, n: int) -> tuple[np.ndarray, np
     wheels = jax.tree.map(lambda leaf: leaf[owner], params)
     model, towards, numbers = finder.model, options_towards(), finder.model.section_numbers(params)
     full = jax.vmap(model.full_section)(wheels, jnp.asarray(np.concatenate(starts)))
-    walked = steps(wheels, full, N_STEPS, model=model, options=towards)
-    states = np.asarray(walked.section_state)
-    walking = np.asarray(walked.outcome) == Outcome.STEPPED
-    begin = np.where(walking[:, None], states, np.asarray(full))
-    later = steps(wheels, begin, finder.period_n, model=model, options=towards)
-    missed = np.abs(np.asarray(later.section_state) - begin)[:, :numbers].max(-1)
-    settled = walking & (np.asarray(later.outcome) == Outcome.STEPPED) & (missed < NEAR)
+    states, walking, missed = walked(wheels, full, model, finder.period_n, towards)
+    begin, settled = np.where(walking[:, None], states, np.asarray(full)), missed < NEAR
     chosen: list[int] = []
     for wheel in range(n):
         own, other = np.flatnonzero(owner == wheel), list[Any]()

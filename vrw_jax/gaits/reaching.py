@@ -25,7 +25,7 @@ from vrw_jax.cycles import (
     Located,
     WalkedCycle,
 )
-from vrw_jax.gaits.attracting import N_STEPS, NEAR, gaits_attracting, starts_of
+from vrw_jax.gaits.attracting import NEAR, gaits_attracting, starts_of, walked
 from vrw_jax.numerics import Options, select
 from vrw_jax.walks import ModelLike
 from vrw_jax.wheel import Outcome, WheelParams, parameters_of
@@ -293,17 +293,10 @@ def _walked(finder: CollocationFinder, params: WheelParams, wanted: np.ndarray) 
         return _Walks(wanted, x)
     own, model = _taken(params, places), finder.model
     for start in starts_of(own):
-        there = steps(own, start, N_STEPS, model=model)
-        states = np.array(there.section_state)
-        walking = np.flatnonzero(np.asarray(there.outcome) == Outcome.STEPPED)
-        if not len(walking):
-            continue
-        later = steps(_taken(own, walking), states[walking], finder.period_n, model=model)
-        missed = np.abs(np.asarray(later.section_state) - states[walking]).max(-1)
-        missed = np.where(np.asarray(later.outcome) == Outcome.STEPPED, missed, np.inf)
-        nearer = missed < best[places[walking]]
-        lanes = places[walking[nearer]]
-        best[lanes], x[lanes] = missed[nearer], states[walking[nearer]]
+        states, _, missed = walked(own, start, model, finder.period_n)
+        nearer = missed < best[places]
+        lanes = places[nearer]
+        best[lanes], x[lanes] = missed[nearer], states[nearer]
     return _Walks(best < NEAR, x)
 
 
