@@ -19,8 +19,8 @@ from vrw_jax.cycles.search import (
     Parameters,
     Problem,
     columns_of,
+    in_stages,
     name_for_export,
-    not_searched,
     search_lanes,
 )
 from vrw_jax.numerics import (
@@ -59,7 +59,7 @@ def _over_lanes(
     if simd.serves():
         return lane_function(function, like, settings)
     name_for_export()
-    return remembered(in_blocks(function, block) if block else function, settings)
+    return remembered(in_blocks(function, block), settings)
 
 
 def _in_form(name: str, likes: tuple[Callable, ...], problem: Problem) -> InForm:
@@ -86,9 +86,10 @@ def solve_cycle(
     problem: Problem, parameters: Array, guess: Located | None
 ) -> tuple[Located, tuple]:
     """Search for one wheel, differentiable in its parameters; the guess has no derivative."""
-    nothing = lambda parameters, *_: not_searched(problem, parameters)
     search = functools.partial(search_lanes, problem)
-    find = one_wheel(_over_lanes(search, nothing, ("search", problem), block=0))
+    like = lambda parameters, now, *_: now
+    lanes = _over_lanes(search, like, ("search", problem), problem.options.block)
+    find = one_wheel(functools.partial(in_stages, problem, lanes))
     columns_of = _columns_of(problem)
 
     @jax.custom_jvp

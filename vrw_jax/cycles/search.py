@@ -8,7 +8,7 @@ Wheels still without a cycle after an attempt are packed together for the next o
 import functools
 import operator
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ from vrw_jax.numerics import (
     N_NODES,
     Constants,
     LaneArray,
+    LaneFunction,
     Linearised,
     Mesh,
     Passage,
@@ -31,10 +32,8 @@ from vrw_jax.numerics import (
     Point,
     Solution,
     Vector,
-    from_blocks,
     linearised_pass,
     mesh_error,
-    to_blocks,
     walk_through,
 )
 from vrw_jax.wheel import WheelParams, parameters_of, wheel_of
@@ -403,46 +402,62 @@ def _on_the_way(tried: Located, arrived: Array, lost: Array) -> Located:
 def search_lanes(
     problem: Problem,
     parameters: Parameters,
+    now: Finding,
+    attempt: Int[Array, ""],
+    end: Int[Array, ""],
     guess: Located | None = None,
 ) -> Finding:
-    """A limit cycle for each lane, by several attempts in turn; see ATTEMPTS.
+    """The attempts from `attempt` to before `end`, in turn, on the lanes without a cycle so far.
 
     Parameters must be usable.
     """
-    n_lanes = parameters.shape[-1]
-    block = min(problem.options.block, n_lanes)
-
-    def attempt_all(attempt: Array, now: Finding) -> Finding:
-        if n_lanes <= block or simd.tracing():
-            return _attempted(problem, attempt, parameters, now, guess)
-        order = jnp.argsort(now.located.found, stable=True)
-        everything = jax.tree.map(lambda x: x[..., order], (parameters, now, guess))
-
-        def one(inputs: tuple) -> Finding:
-            parameters, now, guess = inputs
-            return lax.cond(
-                jnp.any(now.located.found < 0.5),
-                lambda: _attempted(problem, attempt, parameters, now, guess),
-                lambda: now,
-            )
-
-        after = from_blocks(lax.map(one, to_blocks(everything, block)), n_lanes)
-        back = jnp.argsort(order)
-        return jax.tree.map(lambda x: x[..., back], after)
-
-    first = jnp.asarray(ATTEMPTS.index("surface" if guess is None else "guess"), jnp.int32)
-    nothing = not_searched(problem, parameters)
-    # Of several steps a repeated gait of one would be followed: that tells nothing.
-    n_attempts = len(ATTEMPTS) + 2 * PIECES * (problem.period_n == 1)
 
     def more(carry: tuple[Array, Finding]) -> Array:
         attempt, now = carry
-        known = (now.located.broken > 0.0) | (now.located.broken == LOST)
-        unknown = (attempt < len(ATTEMPTS)) | ~known
-        return (attempt < n_attempts) & jnp.any((now.located.found < 0.5) & unknown)
+        return (attempt < end) & jnp.any(_open(attempt, now))
 
-    _, finding = lax.while_loop(more, lambda c: (c[0] + 1, attempt_all(*c)), (first, nothing))
-    return finding
+    def go_on(carry: tuple[Array, Finding]) -> tuple[Array, Finding]:
+        attempt, now = carry
+        return attempt + 1, _attempted(problem, attempt, parameters, now, guess)
+
+    return lax.while_loop(more, go_on, (attempt, now))[1]
+
+
+def in_stages(problem: Problem, search: LaneFunction, *given: Any) -> Finding:
+    """A limit cycle for each lane of (parameters, guess if any), by all attempts of `search`.
+
+    Lanes are searched a few side by side, which wait for each other: before each stage those that
+    are still without a cycle are gathered.
+    """
+    parameters, n_lanes = given[0], given[0].shape[-1]
+    # Of several steps a repeated gait of one would be followed: that tells nothing.
+    n_attempts = len(ATTEMPTS) + 2 * PIECES * (problem.period_n == 1)
+    first = jnp.asarray(ATTEMPTS.index("surface" if len(given) == 1 else "guess"), jnp.int32)
+    now = not_searched(problem, parameters)
+    if n_lanes <= FEW:
+        return search(parameters, now, first, jnp.asarray(n_attempts, jnp.int32), *given[1:])
+
+    def more(carry: tuple) -> Array:
+        attempt, _, now, _ = carry
+        return (attempt < n_attempts) & jnp.any(_open(attempt, now))
+
+    def stage(carry: tuple) -> tuple:
+        attempt, places, *lanes = carry
+        order = jnp.argsort(~_open(attempt, lanes[0]), stable=True)
+        places, now, given = jax.tree.map(lambda x: x[..., order], (places, *lanes))
+        end = jnp.where(attempt < len(ATTEMPTS), attempt + 1, n_attempts)
+        return end, places, search(given[0], now, attempt, end, *given[1:]), given
+
+    begin = first, jnp.arange(n_lanes), now, given
+    _, places, found, _ = lax.while_loop(more, stage, begin)
+    back = jnp.argsort(places)
+    return jax.tree.map(lambda x: x[..., back], found)
+
+
+def _open(attempt: Int[Array, ""], now: Finding) -> Bool[Array, " lanes"]:
+    """Whether this attempt may still tell something of a lane."""
+    known = (now.located.broken > 0.0) | (now.located.broken == LOST)
+    return (now.located.found < 0.5) & ((attempt < len(ATTEMPTS)) | ~known)
 
 
 def not_searched(problem: Problem, parameters: Parameters) -> Finding:
@@ -474,6 +489,9 @@ ATTEMPTS = ("guess", "guess, on", "surface", "surface, on", "homotopy", "without
 """In turn: from the guess, if any; from the gait that the stored surface predicts; by a homotopy
 from Table 1; and for a cycle without double support. The first two begin with a few iterations, so
 that in a batch the lanes that need more can be gathered in blocks of their own."""
+
+FEW = 16
+"""Lanes of which none are gathered."""
 
 PIECES = 16
 """Where there is no root at all, the gait of Table 1 is followed from wheel to wheel on the line to

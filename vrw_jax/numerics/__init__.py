@@ -64,14 +64,12 @@ from vrw_jax.numerics.lane_minima import Monitors
 from vrw_jax.numerics.lanes import (
     LaneFunction,
     compiled_by_caller,
-    from_blocks,
     in_batches,
     in_blocks,
     joined,
     one_wheel,
     select,
     taken,
-    to_blocks,
     zeros_of,
 )
 from vrw_jax.numerics.levels import (

@@ -43,37 +43,36 @@ def one_wheel(function: LaneFunction) -> LaneFunction:
 
 
 def in_blocks(function: LaneFunction, block: int) -> LaneFunction:
-    """`function` applied to `block` lanes at a time, so that its arrays stay in cache."""
+    """`function` applied to `block` lanes at a time, so that its arrays stay in cache.
+
+    The first array has lanes; numbers without an axis are the same for all.
+    """
 
     def blocked(*arrays: PyTree) -> PyTree:
-        n_lanes = jax.tree.leaves(arrays)[0].shape[-1]
+        leaves, structure = jax.tree.flatten(arrays)
+        n_lanes = leaves[0].shape[-1]
         if n_lanes <= block:
             return function(*arrays)
-        out = lax.map(lambda some: function(*some), to_blocks(arrays, block))
-        return from_blocks(out, n_lanes)
+        has_lanes = [jnp.ndim(x) > 0 for x in leaves]
+
+        def cut(x: Array) -> Array:  # the last lane fills up the last block
+            missing = -n_lanes % block
+            filled = jnp.concatenate([x, jnp.repeat(x[..., -1:], missing, -1)], -1)
+            return jnp.moveaxis(filled.reshape(*x.shape[:-1], -1, block), -2, 0)
+
+        def of_block(some: list[Array]) -> PyTree:
+            parts = iter(some)
+            own = [next(parts) if has else x for x, has in zip(leaves, has_lanes, strict=True)]
+            return function(*jax.tree.unflatten(structure, own))
+
+        def join(x: Array) -> Array:
+            moved = jnp.moveaxis(x, 0, -2)
+            return moved.reshape(*moved.shape[:-2], -1)[..., :n_lanes]
+
+        cuts = [cut(x) for x, has in zip(leaves, has_lanes, strict=True) if has]
+        return jax.tree.map(join, lax.map(of_block, cuts))
 
     return blocked
-
-
-def to_blocks(tree: PyTree, block: int) -> PyTree:
-    """Lanes cut into blocks along a new first axis; the last lane fills up the last block."""
-
-    def cut(x: Array) -> Array:
-        missing = -x.shape[-1] % block
-        filled = jnp.concatenate([x, jnp.repeat(x[..., -1:], missing, -1)], -1) if missing else x
-        return jnp.moveaxis(filled.reshape(*x.shape[:-1], -1, block), -2, 0)
-
-    return jax.tree.map(cut, tree)
-
-
-def from_blocks(tree: PyTree, n_lanes: int) -> PyTree:
-    """The inverse of `to_blocks`."""
-
-    def join(x: Array) -> Array:
-        moved = jnp.moveaxis(x, 0, -2)
-        return moved.reshape(*moved.shape[:-2], -1)[..., :n_lanes]
-
-    return jax.tree.map(join, tree)
 
 
 def compiled_by_caller() -> bool:
