@@ -5,7 +5,8 @@
 Wheels near their own cycles (1 % off), as in `engine_benchmark`; values and Jacobians of states
 and durations in one run. Errors: 99th percentile over lanes of the largest entry, against the
 diffrax engine at `Options.tight()`. Times in batches are CPU time of one core, the least of the
-repeats; alone and to a first answer they are wall time. Writes two tables into `docs/engine.md`.
+repeats; alone and to a first answer they are wall time. Then the seven columns of state, c, k, L*
+and phi beside peers, speed over error. Writes three tables into `docs/engine.md`, and a chart.
 """
 
 import itertools
@@ -14,16 +15,19 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import jax
+import matplotlib.pyplot as plt
 import numpy as np
 
 import vrw_jax as vrw
 from experiments.shared.command import command, started
-from experiments.shared.tables import DOCS, markdown, replace
+from experiments.shared.tables import DOCS, FIGURES, markdown, replace
 from experiments.shared.timing import on_one_core, processor, seconds
 from experiments.shared.wheels import near_gaits, wheels
+from experiments.speed.derivative_peers import HeyokaVariations, numba_differences
+from vrw_jax import figures as plots
 from vrw_jax.wheel import PARAMETER_NAMES
 
 COLUMNS = {
@@ -31,6 +35,14 @@ COLUMNS = {
     "state, c, k, L\\*, φ": ("section_state", "damping", "stiffness", "natural_length", "slope"),
     "all twelve": ("section_state", *PARAMETER_NAMES),
 }
+LABELS = (
+    "lanes' machine code",
+    "heyoka, variational equations",
+    "numba, central differences",
+    "diffrax engine, forward mode",
+)
+CLAIMED = 1e-8
+"""Error at which methods are compared."""
 FIRST = """
 import time; began = time.perf_counter()
 import jax, vrw_jax as vrw
@@ -88,6 +100,81 @@ def in_batches(n: int, repeats: int) -> list[tuple]:
     return table
 
 
+def candidates(rows: np.ndarray, states: np.ndarray) -> Iterator[tuple[str, str, int, Callable]]:
+    """(method, its tolerance, lanes, a run that tells seven columns of each)."""
+    asked = COLUMNS["state, c, k, L\\*, φ"]
+
+    def by_library(engine: str, tolerance: float, n: int) -> Callable:
+        options = vrw.Options(rtol=tolerance, atol=tolerance)
+        params, some = wheels(rows[:n]), states[:n]
+        told = lambda: vrw.steps(params, some, options=options, engine=engine, derivatives=asked)
+        return lambda: flat(told().derivatives, asked)
+
+    few = len(rows) // 16
+    for tolerance in (1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10):
+        yield LABELS[0], f"{tolerance:.0e}", len(rows), by_library("lanes", tolerance, len(rows))
+    for tolerance in (1e-4, 1e-6, 1e-7, 1e-9, 1e-11):
+        run = HeyokaVariations(tolerance).of(rows[:few], states[:few])
+        yield LABELS[1], f"{tolerance:.0e}", few, run
+    for tolerance, share in ((1e-8, 1e-4), (1e-10, 1e-5), (1e-12, 1e-6), (1e-13, 1e-6)):
+        run = numba_differences(rows[:few], states[:few], tolerance, share)
+        yield LABELS[2], f"{tolerance:.0e}, moved by {share:.0e}", few, run
+    for tolerance in (1e-6, 1e-8, 3e-9, 1e-10):
+        yield LABELS[3], f"{tolerance:.0e}", few, by_library("diffrax", tolerance, few)
+
+
+def beside_others(n: int, repeats: int) -> list[dict]:
+    """Of each candidate its error and the steps with seven columns per second and core."""
+    rows, states, _ = near_gaits(n)
+    asked, some = COLUMNS["state, c, k, L\\*, φ"], slice(n // 16)
+    exact = flat(
+        vrw.steps(
+            wheels(rows[some]), states[some], options=vrw.Options.tight(), engine="diffrax",
+            derivatives=asked,
+        ).derivatives,
+        asked,
+    )  # fmt: skip
+    table, runs = list[dict](), []
+    for method, at, lanes, run in candidates(rows, states):
+        error = np.quantile(np.max(np.abs(run()[some] - exact), (1, 2)), 0.99)
+        table.append({"method": method, "at": at, "error": error, "lanes": lanes, "taken": []})
+        runs.append(run)
+    with on_one_core():
+        for _ in range(repeats):  # in turns: a shared machine's clock changes
+            for entry, run in zip(table, runs, strict=True):
+                entry["taken"].append(seconds(run, 1))
+    return [x | {"speed": x["lanes"] / np.median(x["taken"])} for x in table]
+
+
+def drawn(table: list[dict]) -> None:
+    """Speed over error."""
+    with plots.figure_style():
+        figure, axes = plt.subplots(figsize=(plots.PAGE, 3.6))
+        for label, marker in zip(LABELS, "osD^", strict=True):
+            some = sorted((x for x in table if x["method"] == label), key=lambda x: x["error"])
+            told = [x["error"] for x in some], [x["speed"] for x in some]
+            axes.loglog(*told, marker=marker, ms=4, label=label)
+        axes.set(
+            xlabel="p99 error of derivatives",
+            ylabel="gait steps with seven columns\nper second and core",
+        )
+        figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2)
+        plots.save(figure, FIGURES, "derivatives")
+
+
+def fastest(table: list[dict]) -> list[tuple]:
+    """Rows of each method's quickest entry whose error is at most CLAIMED."""
+    best = {}
+    for entry in sorted(table, key=lambda x: x["speed"]):
+        if entry["error"] <= CLAIMED:
+            best[entry["method"]] = entry
+    of = best[LABELS[0]]["speed"]
+    return [
+        (x["method"], x["at"], f"{x['error']:.1e}", f"{x['speed']:,.0f}", f"{x['speed'] / of:.2g}")
+        for x in (best[label] for label in LABELS if label in best)
+    ]
+
+
 def alone() -> list[tuple]:
     """(call, microseconds, seconds to a first answer with an empty cache, the same cached)."""
     params, x, table = vrw.WheelParams(), vrw.paper_start(), []
@@ -123,8 +210,13 @@ def main() -> None:
     )  # fmt: skip
     batches = markdown(header, in_batches(chosen.lanes, chosen.repeats))
     one = markdown(("one wheel", "µs", "first answer, s", "the same, cached, s"), alone())
+    others = beside_others(chosen.lanes, chosen.repeats)
+    drawn(others)
+    header = ("method", "tolerance", "p99 error", "steps with 7 columns per second and core",
+              "of the lanes'")  # fmt: skip
+    compared = markdown(header, fastest(others))
     told = f"{processor()}; load average {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores."
-    replace(DOCS / "engine.md", "derivatives", f"{batches}\n\n{one}\n\n{told}")
+    replace(DOCS / "engine.md", "derivatives", f"{batches}\n\n{one}\n\n{compared}\n\n{told}")
 
 
 if __name__ == "__main__":
