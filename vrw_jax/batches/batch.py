@@ -15,9 +15,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array
 
 from vrw_jax.batches.fixed_work import fixed_gait_step
+from vrw_jax.batches.ground import ON_GROUND, on_ground
 from vrw_jax.batches.programs import run_lanes
 from vrw_jax.batches.stiffness import (
     IMPLICIT,
@@ -28,26 +29,21 @@ from vrw_jax.batches.stiffness import (
     TIGHTER,
     cheapest_solver,
 )
+from vrw_jax.batches.walked import START, Steps, Walked
 from vrw_jax.models import (
     DIRECTIONS,
     AbstractWheel,
     Advance,
     along_units,
-    as_full_states,
     gait_step,
-    walk_lanes,
 )
 from vrw_jax.numerics import Options, explicit_tableau
 from vrw_jax.walks import options_of, rung_of, state_of
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, wheel_of
 from vrw_jax.wording import (
-    AbstractTold,
-    Row,
     chosen,
-    counted,
     instance,
     reals,
-    told,
     untraced,
     whole,
 )
@@ -55,57 +51,11 @@ from vrw_jax.wording import (
 BatchEngine = Literal["auto", "lanes", "diffrax", "collocation"]
 ENGINES: tuple[str, ...] = get_args(BatchEngine)
 
+BY_PHASES = (START, *PARAMETER_NAMES)
+"""What a step of the paper's phases moves with."""
+
 MAPPED = 256
 """Lanes that the diffrax engine takes at a time."""
-
-
-class By(eqx.Module):
-    """How the end of a walk moves with its start, which has an axis of its own, or a parameter."""
-
-    section_state: Float[Array, "lanes 3 *start"]
-    durations: Float[Array, "lanes 3 *start"]
-
-
-class Steps(AbstractTold):
-    """Lean results of walks of some steps, leading axis: lanes; each tells of its last step.
-
-    - `section_state`: before the next touchdown; zeros if it failed;
-    - `durations`: of DLS, SLS-I, SLS-II, s; on real ground see its step;
-    - `outcome`: an Outcome; the walk ends at the first that is not STEPPED;
-    - `n_stepped`: steps that ended in a touchdown;
-    - `solver_steps`: tried by the integrator, over all steps;
-    - `fixed`: whether the last step was taken in fixed work, by collocation;
-    - `solver`: which of `solvers` took the lane: "auto" goes by stiffness;
-    - `engine`: that computed it: "lanes", "diffrax" or "collocation";
-    - `solvers`: the named one first;
-    - `derivatives`: by what was asked for.
-
-    Examples:
-        >>> params, states = vrw.WheelParams(damping=150.0), np.tile(vrw.paper_start(), (3, 1))
-        >>> vrw.steps(params, states).outcome.tolist()
-        [0, 0, 0]
-    """
-
-    section_state: Float[Array, "lanes section"]
-    durations: Float[Array, "lanes 3"]
-    outcome: Int[Array, " lanes"]
-    n_stepped: Int[Array, " lanes"]
-    solver_steps: Int[Array, " lanes"]
-    fixed: Bool[Array, " lanes"]
-    solver: Int[Array, " lanes"]
-    engine: str = eqx.field(static=True)
-    solvers: tuple[str, ...] = eqx.field(static=True)
-    derivatives: dict[str, By] = eqx.field(default_factory=dict)
-
-    def rows(self) -> list[Row]:
-        n = np.bincount(np.ravel(self.solver), minlength=len(self.solvers))
-        by = (f"{count:,} by {name}" for count, name in zip(n, self.solvers, strict=True) if count)
-        return [
-            ("lanes", counted(self.outcome, Outcome)),
-            ("steps each", told(self.n_stepped, "")),
-            ("engine", f"{self.engine}; {', '.join(by)}"),
-            ("duration of the last step", told(jnp.sum(self.durations, -1), "s")),
-        ]
 
 
 def steps(
@@ -136,8 +86,8 @@ def steps(
     checks itself, and one that fails is left to the lane engine; `fixed` says which was which.
 
     Derivatives go through all steps and their events; those of a lane that fell are zero. Not by
-    collocation nor on real ground (`UnilateralWheel`, its friction a scalar or of the lanes' axis),
-    where the only engine is "lanes". Not for use inside `jax.jit`: it compiles itself, once.
+    collocation. On real ground (`UnilateralWheel`, its friction a scalar or of the lanes' axis) the
+    only engine is "lanes". Not for use inside `jax.jit`: it compiles itself, once.
 
     Args:
         params: the wheels; fields are scalars or of shape (lanes,).
@@ -147,7 +97,7 @@ def steps(
         options: numerical choices of the steps.
         engine: "auto", "lanes", "diffrax" or "collocation", as above.
         durations: of the phases, shape (lanes, 3), s, for "collocation".
-        derivatives: "section_state" and names of parameters.
+        derivatives: "section_state" and names of parameters, on real ground "friction" too.
 
     Returns:
         `Steps`, of the last step of each lane.
@@ -170,27 +120,23 @@ def steps(
     wheels = _wheels(params, states, rung, n_steps, options)
     states = states.astype(wheels.dtype)
     by_legs = rung.lanes == "legs"
-    moved = _moved(derivatives, by_legs or engine == "collocation")
+    moved = _moved(derivatives, ON_GROUND if by_legs else BY_PHASES, engine)
     given = rung, wheels, states, n_steps, options, engine, params.n_legs
-    return _on_ground(*given) if by_legs else _by_phases(*given, durations, moved)
+    return on_ground(*given, moved) if by_legs else _by_phases(*given, durations, moved)
 
 
-START = "section_state"
-
-
-def _moved(derivatives: Sequence[str], refused: bool) -> list[str]:
+def _moved(derivatives: Sequence[str], known: tuple[str, ...], engine: str) -> list[str]:
     """What the end is to be told to move with; one clear sentence for what it can't be."""
     names = [derivatives] if isinstance(derivatives, str) else list(derivatives)
-    known = (START, *PARAMETER_NAMES)
     for name in names:
         if name not in known:
             raise ValueError(
                 f"derivatives name {name!r}, but a step moves with one of {', '.join(known)}."
             )
-    if names and refused:
+    if names and engine == "collocation":
         raise ValueError(
-            "derivatives are asked of collocation or real ground, which have none in batches: take "
-            "engine='lanes' on the paper's wheel, or jax.jacfwd of vrw.return_map."
+            "derivatives are asked of collocation, which has none in batches: take "
+            "engine='lanes', or jax.jacfwd of vrw.return_map."
         )
     return names
 
@@ -233,7 +179,7 @@ def _by_phases(
     asked: Sequence[str],
 ) -> Steps:
     """Of rungs that step through the paper's phases."""
-    walked = _Walked(states, asked)
+    walked = Walked(states, asked, PARAMETER_NAMES)
     some = n_legs, walked.moved
     runs = {NAMED: _chosen(engine, model, options, *some)}
     solver = np.full(len(states), NAMED, np.int32)
@@ -271,32 +217,6 @@ def _by_phases(
     return walked.told(solver, name, solvers)
 
 
-def _on_ground(
-    model: Any,
-    wheels: np.ndarray,
-    states: np.ndarray,
-    n_steps: int,
-    options: Options,
-    engine: str,
-    n_legs: int,
-) -> Steps:
-    if engine not in ("auto", "lanes") or explicit_tableau(options.solver) is None:
-        raise ValueError(
-            f"engine is {engine!r} and solver {options.solver}, but batches on real ground need "
-            "'lanes' and an explicit Runge-Kutta solver: map vrw.return_map over the wheels."
-        )
-    friction = np.broadcast_to(np.asarray(model.friction, wheels.dtype), (len(states),))
-    columns = np.concatenate([wheels, friction[None]])
-    states = as_full_states(columns, states, n_legs)
-    told = walk_lanes(columns, states, n_steps, model, options, n_legs)
-    section_state, durations, outcome, n_stepped, tried, _ = map(jnp.asarray, told)
-    none = jnp.zeros(len(states), bool)
-    return Steps(
-        section_state, durations, outcome, n_stepped, tried, none, none.astype(jnp.int32),
-        engine="lanes", solvers=(options.solver,),
-    )  # fmt: skip
-
-
 def _expected(durations: Any, states: np.ndarray, dtype: np.dtype) -> np.ndarray:
     if durations is None or np.shape(durations) != states.shape:
         shape = None if durations is None else np.shape(durations)
@@ -305,56 +225,6 @@ def _expected(durations: Any, states: np.ndarray, dtype: np.dtype) -> np.ndarray
             "to some per cent, shape (lanes, 3): give those of a limit cycle, or take 'lanes'."
         )
     return np.asarray(reals("durations", durations), dtype)
-
-
-class _Walked:
-    """Results so far, as numpy arrays."""
-
-    def __init__(self, states: np.ndarray, asked: Sequence[str]) -> None:
-        n = len(states)
-        self.section_state, self.durations = states.copy(), np.zeros_like(states)
-        self.outcome, self.n_stepped, self.solver_steps = (np.zeros(n, np.int32) for _ in range(3))
-        self.fixed = np.zeros(n, bool)
-        # Of a step, and of the walk: by the start and then by the other names asked for.
-        self.asked, self.names = asked, [name for name in asked if name != START]
-        self.moved = (*(PARAMETER_NAMES.index(x) for x in self.names), *STATE) if asked else ()
-        self.jacobian = np.zeros((n if asked else 0, 6, 3 + len(self.names)), states.dtype)
-        self.jacobian[:, :3, :3] = np.eye(3)
-
-    def told(self, solver: np.ndarray, engine: str, solvers: tuple[str, ...]) -> Steps:
-        states, outcome = jnp.asarray(self.section_state), jnp.asarray(self.outcome)
-        counts = jnp.asarray(self.n_stepped), jnp.asarray(self.solver_steps)
-        fixed, which = jnp.asarray(self.fixed), jnp.asarray(solver)
-        durations = jnp.asarray(self.durations)
-        by = self.derivatives()
-        return Steps(states, durations, outcome, *counts, fixed, which, engine, solvers, by)
-
-    def derivatives(self) -> dict[str, By]:
-        """Of the walk, by what was asked for; zero where it failed."""
-        if not self.asked:
-            return {}
-        stepped = (self.outcome == Outcome.STEPPED)[:, None, None]
-        by = jnp.asarray(np.where(stepped, self.jacobian, 0.0))
-        columns: dict[str, Any] = {name: 3 + i for i, name in enumerate(self.names)}
-        columns[START] = slice(3)
-        return {name: By(by[:, :3, columns[name]], by[:, 3:, columns[name]]) for name in self.asked}
-
-    def take(self, lanes: np.ndarray, told: tuple[np.ndarray, ...], fixed: bool) -> None:
-        state, durations, outcome, tried, *jacobian = told
-        self.section_state[lanes], self.durations[lanes] = state, durations
-        self.outcome[lanes] = outcome
-        self.n_stepped[lanes] += outcome == Outcome.STEPPED
-        self.solver_steps[lanes] += tried
-        self.fixed[lanes] = fixed
-        if jacobian:
-            (by,), n = jacobian, len(self.names)
-            before = self.jacobian[lanes, :3]
-            self.jacobian[lanes] = by[:, :, n:] @ before
-            self.jacobian[lanes, :, 3:] += by[:, :, :n]
-
-
-STATE = tuple(range(len(PARAMETER_NAMES), len(PARAMETER_NAMES) + 3))
-"""Places of the section state among the numbers of a lane, which parameters lead."""
 
 
 class _Engine(eqx.Module):

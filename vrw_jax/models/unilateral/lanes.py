@@ -1,4 +1,4 @@
-"""Gait steps of many wheels on real ground at once: values only, no derivatives.
+"""Gait steps of many wheels on real ground at once, and along a direction of each.
 
 The laws are those of one wheel, element by element over lanes. All lanes march
 (`march`) until some, on a CPU all, have come to events; these are taken through them

@@ -4,7 +4,7 @@ Wheels wait in queues of one length, for which the walk (`lanes`) is compiled.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -42,13 +42,18 @@ def walk_lanes(
 
 
 def step_lanes(
-    columns: np.ndarray, states: np.ndarray, model: UnilateralWheel, options: Options, n: int
+    columns: np.ndarray,
+    states: np.ndarray,
+    model: UnilateralWheel,
+    options: Options,
+    n: int,
+    wanted: Sequence[int] | None = None,
 ) -> tuple[UnilateralStep, UnilateralStep]:
     """One step of many wheels, as `walk_lanes` takes them, and how what it tells moves.
 
     Leading axis: wheels; derivatives have a last one over the columns, then the section state.
-    Each direction is a lane of its own beside the wheel's motion. What cannot move, lengths of
-    legs on their stoppers and codes, has zeros.
+    Each direction is a lane of its own beside the wheel's motion. What is not `wanted` and what
+    cannot move, lengths of legs on their stoppers and codes, has zeros.
     """
     program = _Run.of(model, options.for_derivatives(), n, columns.dtype, True)
     code = np.round(states[:, 4 + 2 * n :])
@@ -56,6 +61,8 @@ def step_lanes(
     moves = np.ones(numbers.shape, bool)
     free = np.concatenate([code < LOCKED, code < LOCKED, np.zeros(code.shape, bool)], 1)
     moves[:, len(columns) + 4 :] = free
+    if wanted is not None:
+        moves &= np.isin(np.arange(numbers.shape[1]), wanted)
     owner, place = np.nonzero(moves)
     ways = np.zeros((len(owner), numbers.shape[1]))
     ways[np.arange(len(owner)), place] = 1.0

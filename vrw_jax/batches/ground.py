@@ -1,0 +1,54 @@
+"""Walks of batches on real ground."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from vrw_jax.batches.walked import START, Steps, Walked
+from vrw_jax.models import as_full_states, step_lanes, walk_lanes
+from vrw_jax.numerics import Options, explicit_tableau
+from vrw_jax.wheel import PARAMETER_NAMES, Outcome
+
+VALUES = (*PARAMETER_NAMES, "friction")
+ON_GROUND = (START, *VALUES)
+"""What a step moves with."""
+
+
+def on_ground(
+    model: Any,
+    wheels: np.ndarray,
+    states: np.ndarray,
+    n_steps: int,
+    options: Options,
+    engine: str,
+    n_legs: int,
+    asked: Sequence[str],
+) -> Steps:
+    """See `steps`; without derivatives all steps of a lane are one walk."""
+    if engine not in ("auto", "lanes") or explicit_tableau(options.solver) is None:
+        raise ValueError(
+            f"engine is {engine!r} and solver {options.solver}, but batches on real ground need "
+            "'lanes' and an explicit Runge-Kutta solver: map vrw.return_map over the wheels."
+        )
+    friction = np.broadcast_to(np.asarray(model.friction, wheels.dtype), (len(states),))
+    columns = np.concatenate([wheels, friction[None]])
+    states = as_full_states(columns, states, n_legs)
+    none = np.zeros(len(states), np.int32)
+    if not asked:
+        walk = walk_lanes(columns, states, n_steps, model, options, n_legs)
+        section_state, durations, outcome, n_stepped, tried, _ = map(jnp.asarray, walk)
+        told = section_state, durations, outcome, n_stepped, tried, jnp.asarray(none > 0)
+        return Steps(*told, jnp.asarray(none), engine="lanes", solvers=(options.solver,))
+    walked = Walked(states, asked, VALUES)
+    for _ in range(n_steps):
+        lanes = np.flatnonzero(walked.outcome == Outcome.STEPPED)
+        if not len(lanes):
+            break
+        given = columns[:, lanes], walked.section_state[lanes], model, options, n_legs
+        step, moves = step_lanes(*given, walked.moved)
+        by = np.concatenate([moves.section_state, moves.durations], 1)[:, :, list(walked.moved)]
+        values = step.section_state, step.durations, step.outcome, step.solver_steps, by
+        walked.take(lanes, values, fixed=False)
+    return walked.told(none, "lanes", (options.solver,))
