@@ -49,6 +49,6 @@ def on_ground(
         given = columns[:, lanes], walked.section_state[lanes], model, options, n_legs
         step, moves = step_lanes(*given, walked.moved)
         by = np.concatenate([moves.section_state, moves.durations], 1)[:, :, list(walked.moved)]
-        values = step.section_state, step.durations, step.outcome, step.solver_steps, by
-        walked.take(lanes, values, fixed=False)
+        values = step.section_state, step.durations, step.outcome, step.solver_steps
+        walked.take(lanes, (*map(np.asarray, values), by), fixed=False)
     return walked.told(none, "lanes", (options.solver,))
