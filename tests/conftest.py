@@ -6,10 +6,20 @@ from pathlib import Path
 import pytest
 from jaxtyping import install_import_hook
 
-with install_import_hook("vrw_jax", "beartype.beartype"):
+ROOT = Path(__file__).parent.parent
+UNCHECKED = os.environ.get("VRW_TEST_UNCHECKED", "simd")
+"""Writes code call by call, which takes eight times as long where each is checked; has no shapes in
+its signatures. `tests/simd/test_checked.py` runs it checked."""
+ROOMS = [
+    f"vrw_jax.{place.name}"
+    for place in (ROOT / "vrw_jax").iterdir()
+    if place.is_dir() and place.name != UNCHECKED
+]
+
+with install_import_hook(ROOMS, "beartype.beartype"):
     import vrw_jax  # imported here so that its annotations are checked
 
-vrw_jax.start_jax(os.environ.get("VRW_TEST_CACHE", Path(__file__).parent.parent / ".jax_cache"))
+vrw_jax.start_jax(os.environ.get("VRW_TEST_CACHE", ROOT / ".jax_cache"))
 
 COMPILE_LONGEST = (
     "test_continuation", "test_limit_cycle", "test_derivatives", "test_tune", "test_unilateral",
