@@ -5,12 +5,14 @@
 4,096 wheels near their own limit cycles (1 % off) take one gait step each, by every engine and at
 several tolerances, in turns. Error: largest of section state and durations, against the diffrax
 engine at `Options.tight()`; its 99th percentile over lanes counts. Time: CPU time of one core,
-median over turns. Peers start after the landing and watch three events alone. Writes a table (csv,
-markdown) and two charts: speed over error, and cost over the share of lanes that fail.
+median over turns. Peers start after the landing and watch three events alone; C++ is there where
+g++ is. Writes a table (csv, markdown) and two charts: speed over error, and cost over the share of
+lanes that fail.
 """
 
 import os
 import platform
+import shutil
 import time
 from importlib.metadata import version
 from pathlib import Path
@@ -30,6 +32,7 @@ from vrw_jax.wheel import transitions
 LABELS = {
     "collocation": "lanes by collocation, durations known to 3 %",
     "lanes": "lane engine, any start",
+    "by hand": "C++ by hand, eight lanes side by side",
     "diffrax": "vmapped diffrax engine",
     "numba": "numba, scalar Dormand-Prince 5(4)",
     "heyoka": "heyoka, scalar Taylor",
@@ -40,34 +43,38 @@ CLAIMED = 1e-8
 
 
 def by_library(engine, solver, tolerance):
-    """A run of the library's engine: rows, states -> states and durations."""
+    """Runs of the library's engine over rows and states: to states and durations."""
     options = vrw.Options(solver=solver, rtol=tolerance, atol=tolerance)
 
-    def run(rows, states):
-        found = vrw.steps(wheels(rows), states, options=options, engine=engine)
-        return np.concatenate([found.section_state, found.durations], 1)
+    def prepare(rows, states):
+        params = wheels(rows)
 
-    return run
+        def run():
+            found = vrw.steps(params, states, options=options, engine=engine)
+            return np.concatenate([found.section_state, found.durations], 1)
+
+        return run
+
+    return prepare
 
 
 def by_collocation(options, expected):
-    """A run in fixed work, lanes that fail their check by the lane engine."""
+    """Runs in fixed work, lanes that fail their check by the lane engine."""
 
-    def run(rows, states):
-        found = vrw.steps(
-            wheels(rows),
-            states,
-            options=options,
-            engine="collocation",
-            durations=expected[: len(rows)],
-        )
-        return np.concatenate([found.section_state, found.durations], 1)
+    def prepare(rows, states):
+        params, near = wheels(rows), expected[: len(rows)]
 
-    return run
+        def run():
+            found = vrw.steps(params, states, options=options, engine="collocation", durations=near)
+            return np.concatenate([found.section_state, found.durations], 1)
+
+        return run
+
+    return prepare
 
 
 def by_peer(function):
-    """A run of a peer, which starts after the landing."""
+    """Runs of a peer, which starts after the landing."""
 
     def prepare(rows, states):
         params = wheels(rows)
@@ -90,6 +97,13 @@ def candidates(durations):
     for solver in ("Tsit5", "Dopri8"):
         for tolerance in (6e-8, 1.5e-8, 1e-10):
             yield "diffrax", solver, tolerance, 0.25, by_library("diffrax", solver, tolerance)
+    for solver in ("Tsit5", "Dopri8") if shutil.which("g++") else ():
+        step = peers.ByHand(solver)
+        for tolerance in (1e-6, 1e-7, 6e-8, 1.5e-8, 1e-9, 1e-10):
+            yield (
+                "by hand", solver, tolerance, 1.0,
+                by_peer(lambda s, p, tol=tolerance, step=step: step(s, p, tol)),
+            )  # fmt: skip
     for tolerance in (1e-6, 1e-7, 8e-9, 1e-9, 1e-10):
         yield (
             "numba", "Dopri5", tolerance, 0.25,
@@ -109,10 +123,7 @@ def compare(rows, states, truth, repeats):
     table, runs = [], []
     for engine, method, tolerance, share, make in candidates(truth[:, 3:]):
         n = max(int(share * len(rows)), 16)
-        if engine in ("collocation", "lanes", "diffrax"):
-            run = lambda make=make, n=n: make(rows[:n], states[:n])
-        else:
-            run = make(rows[:n], states[:n])
+        run = make(rows[:n], states[:n])
         begin = time.perf_counter()
         found = run()
         first = time.perf_counter() - begin
@@ -155,9 +166,10 @@ def cost_of_failures(rows, states, repeats):
             fails = random.permutation(len(rows)) < share * len(rows)
             some = np.where(fails[:, None], failing_rows, rows)
             start = np.where(fails[:, None], failing, states)
-            for name, (run, n) in runs.items():
+            for name, (prepare, n) in runs.items():
+                run = prepare(some[:n], start[:n])
                 begin = time.process_time()
-                run(some[:n], start[:n])
+                run()
                 cost[name][repeat, k] = (time.process_time() - begin) / n * 1e6
     return shares, {name: np.median(x, 0) for name, x in cost.items()}
 
@@ -207,7 +219,7 @@ def draw_charts(table, shares, cost):
         for method in dict.fromkeys(e["method"] for e in table if e["engine"] == name):
             some = [e for e in table if (e["engine"], e["method"]) == (name, method)]
             some.sort(key=lambda e: e["p99_error"])
-            several = name in ("lanes", "diffrax")
+            several = name in ("lanes", "by hand", "diffrax")
             left.loglog(
                 [e["p99_error"] for e in some],
                 [e["steps_per_s"] for e in some],

@@ -1,4 +1,4 @@
-"""The same gait step by other integrators: numba, SciPy and heyoka, beside the library's engines.
+"""The same gait step by others: numba, SciPy, heyoka and C++, beside the library's engines.
 
 Each starts just after the landing and ends at the next touchdown, watching the paper's own three
 events alone: a little less than what the library's engines do. Each returns, lane by lane,
@@ -6,13 +6,18 @@ events alone: a little less than what the library's engines do. Each returns, la
 of docs/physics.md, written out for numbers and for heyoka's expressions alike.
 """
 
+import ctypes
 import math
+import subprocess
+import tempfile
 import types
+from pathlib import Path
 
 import numpy as np
 from scipy.integrate import solve_ivp
 
 from experiments.shared.command import extra
+from vrw_jax.numerics import explicit_tableau
 
 hy, numba = extra("heyoka"), extra("numba")
 
@@ -306,6 +311,38 @@ def torch_steps(starts, parameters, tol, method="dopri5"):
             y = handed_on(phase, y, D, P)
         out[lane, :3] = y[0], y[2], y[3]
     return out
+
+
+class ByHand:
+    """`peer.cpp`, eight wheels side by side in C++, by a tableau of explicit Runge-Kutta."""
+
+    def __init__(self, solver):
+        tableau, made = explicit_tableau(solver), Path(tempfile.mkdtemp())
+        parts = {
+            "PLACES": tableau.places, "ONCE": tableau.once, "TWICE": tableau.twice,
+            "ERROR_ONCE": tableau.error_once, "ERROR_TWICE": tableau.error_twice,
+        }  # fmt: skip
+        lines = [f"static constexpr int S = {len(tableau.places)};"]
+        lines.append(f"static constexpr float EXPONENT = {-0.5 / tableau.order};")
+        for name, values in parts.items():
+            shape = "".join(f"[{n}]" for n in values.shape)
+            numbers = str(values.tolist()).replace("[", "{").replace("]", "}")
+            lines.append(f"static constexpr double {name}{shape} = {numbers};")
+        (made / "method.h").write_text("\n".join(lines))
+        source, library = Path(__file__).with_name("peer.cpp"), made / "peer.so"
+        method = f'-DMETHOD="{made}/method.h"'
+        flags = ["-O3", "-march=native", "-ffast-math", "-fno-finite-math-only", "-shared", "-fPIC"]
+        subprocess.run(["g++", *flags, method, str(source), "-o", str(library)], check=True)
+        self.steps = ctypes.CDLL(str(library)).steps
+        pointer = ctypes.c_void_p
+        self.steps.argtypes = [pointer, pointer, pointer, ctypes.c_long, ctypes.c_double]
+
+    def __call__(self, starts, parameters, tol):
+        """Lanes: a multiple of eight."""
+        given = [np.ascontiguousarray(x.T) for x in (parameters, starts)]
+        told = np.empty((6, len(starts)))
+        self.steps(*(x.ctypes.data for x in (*given, told)), len(starts), tol)
+        return told.T
 
 
 class Heyoka:

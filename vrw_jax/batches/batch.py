@@ -9,7 +9,7 @@ alone, among others, and in any order. Wheels of similar work go side by side.
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import equinox as eqx
 import jax
@@ -151,10 +151,10 @@ def _wheels(
             f"states have shape {states.shape}, but they are section states, shape (lanes, "
             f"{' or '.join(map(str, sizes))}): write states[None] for a single one."
         )
-    options.require_reachable(jnp.result_type(*jax.tree.leaves(params)))
-    dtype = np.dtype(jnp.result_type(params.damping, states.dtype))
-    options.require_reachable(dtype)
     columns = [getattr(params, name) for name in PARAMETER_NAMES]
+    held = np.result_type(*(column.dtype for column in columns))
+    options.require_reachable(held)
+    dtype = np.promote_types(held, states.dtype)
     for name, column in zip(PARAMETER_NAMES, columns, strict=True):
         if column.shape not in ((), states.shape[:1]):
             raise ValueError(
@@ -206,14 +206,16 @@ def _by_phases(
             fixed, told = _by_collocation(model, n_legs, *given)
             walked.take(open_[fixed], tuple(part[fixed] for part in told), fixed=True)
         open_ = open_[~fixed]
-        for which, solve in runs.items():
+        for which, run in runs.items():
             lanes = open_[solver[open_] == which]
             if len(lanes) > 0:
-                told = solve(wheels[:, lanes], walked.section_state[lanes])
-                # A phase may last longer than `cheapest_solver` expects: IMPLICIT comes next.
-                lost = (which == STABLE) & (told[2] == Outcome.SOLVER_GAVE_UP)
-                solver[lanes[lost]] = IMPLICIT
-                walked.take(lanes[~lost], tuple(part[~lost] for part in told), fixed=False)
+                told = run.step(wheels[:, lanes], walked.section_state[lanes])
+                if which == STABLE:
+                    # A phase may last longer than `cheapest_solver` expects: IMPLICIT comes next.
+                    lost = told[2] == Outcome.SOLVER_GAVE_UP
+                    solver[lanes[lost]] = IMPLICIT
+                    lanes, told = lanes[~lost], tuple(part[~lost] for part in told)
+                walked.take(lanes, told, fixed=False)
     return walked.told(solver, name, solvers)
 
 
@@ -227,14 +229,11 @@ def _expected(durations: Any, states: np.ndarray, dtype: np.dtype) -> np.ndarray
     return np.asarray(reals("durations", durations), dtype)
 
 
-class _Engine(eqx.Module):
+class _Engine(NamedTuple):
     """One gait step of any number of lanes, numpy in and out."""
 
-    name: str = eqx.field(static=True)
-    call: Callable = eqx.field(static=True)
-
-    def __call__(self, wheels: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, ...]:
-        return self.call(wheels, states)
+    name: str
+    step: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, ...]]
 
 
 def _chosen(
@@ -287,18 +286,18 @@ def _by_lanes(
     # The airborne leg's fast rate, near c/m, sets the step where stability does.
     damping, mass = (wheels[PARAMETER_NAMES.index(name)] for name in ("damping", "leg_mass"))
     with np.errstate(all="ignore"):
-        order = np.argsort(damping / mass, kind="stable")
+        order = np.argsort(damping / mass)
     lanes = [*wheels[:, order], *states[order].T]
     settings = ("gait step", n_legs, stop_at_lift_off, static, moved)
     small = (DIRECTIONS,) if moved else ()
     told = run_lanes(step, uniform, lanes, settings, *small)
     back = np.empty_like(order)
     back[order] = np.arange(len(order))
-    outcome, tried, *numbers = (x[back] for x in told[1:])
-    values = np.stack(numbers[:3], 1), np.stack(numbers[3:6], 1), outcome, tried
+    numbers = np.stack(told[3:], 1)[back]
+    values = numbers[:, :3], numbers[:, 3:6], told[1][back], told[2][back]
     if not moved:
         return values
-    return *values, np.stack(numbers[6:], 1).reshape(len(order), 6, len(moved))
+    return *values, numbers[:, 6:].reshape(len(order), 6, len(moved))
 
 
 def _by_collocation(

@@ -84,12 +84,9 @@ class Walked:
         self.jacobian[:, :size, :size] = np.eye(size)
 
     def told(self, solver: np.ndarray, engine: str, solvers: tuple[str, ...]) -> Steps:
-        states, outcome = jnp.asarray(self.section_state), jnp.asarray(self.outcome)
-        counts = jnp.asarray(self.n_stepped), jnp.asarray(self.solver_steps)
-        fixed, which = jnp.asarray(self.fixed), jnp.asarray(solver)
-        durations = jnp.asarray(self.durations)
-        by = self.derivatives()
-        return Steps(states, durations, outcome, *counts, fixed, which, engine, solvers, by)
+        fields = self.section_state, self.durations, self.outcome, self.n_stepped
+        fields += self.solver_steps, self.fixed, solver
+        return Steps(*map(jnp.asarray, fields), engine, solvers, self.derivatives())
 
     def derivatives(self) -> dict[str, By]:
         """Of the walk, by what was asked for; zero where it failed."""

@@ -5,6 +5,7 @@ differentiation. A model compiles its own step once.
 """
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any, Literal, overload
 
@@ -53,7 +54,7 @@ def paper_start() -> SectionState:
 def rung_of(model: ModelLike | None) -> AbstractWheel:
     """The rung that a caller names: the paper's by default, the lowest that serves for "auto"."""
     if model is None:
-        return ViscoelasticWheel()
+        return _paper_wheel()
     if isinstance(model, str) and model == "auto":
         return LadderWheel()
     if not isinstance(model, AbstractWheel):
@@ -62,6 +63,9 @@ def rung_of(model: ModelLike | None) -> AbstractWheel:
             'vrw.ViscoelasticWheel(), vrw.RigidWheel(), vrw.UnilateralWheel() or "auto".'
         )
     return model
+
+
+_paper_wheel = functools.cache(ViscoelasticWheel)
 
 
 def one_wheel(params: Any, instead: str) -> None:
