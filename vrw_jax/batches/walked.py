@@ -85,8 +85,10 @@ class Walked:
 
     def told(self, solver: np.ndarray, engine: str, solvers: tuple[str, ...]) -> Steps:
         fields = self.section_state, self.durations, self.outcome, self.n_stepped
-        fields += self.solver_steps, self.fixed, solver
-        return Steps(*map(jnp.asarray, fields), engine, solvers, self.derivatives())
+        state, durations, outcome, n_stepped = map(jnp.asarray, fields)
+        tried, fixed, which = map(jnp.asarray, (self.solver_steps, self.fixed, solver))
+        told = state, durations, outcome, n_stepped, tried, fixed, which
+        return Steps(*told, engine, solvers, self.derivatives())
 
     def derivatives(self) -> dict[str, By]:
         """Of the walk, by what was asked for; zero where it failed."""
