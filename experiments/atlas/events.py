@@ -8,6 +8,7 @@ and their order are those of `vrw_jax.models.viscoelastic`.
 import math
 from collections.abc import Iterator
 
+import jax
 import numpy as np
 from rich.progress import track
 
@@ -15,11 +16,12 @@ import vrw_jax as vrw
 from experiments.speed import peers
 from experiments.speed.peers import hy
 from vrw_jax import Outcome
+from vrw_jax.numerics import taken
 from vrw_jax.wheel import Motion, Symbols, dynamics, geometry, transitions
 
 Rows = Iterator[dict[str, object]]
 START = np.array([0.1, 1.6, -0.1])  # near the gait of Table 1
-CHUNK = 10_000
+CHUNK, MANY = 10_000, 250_000
 LATE = 1e-8  # s: a hundred times the engine's error at its default tolerance
 TOLERANCE = 1e-15
 LIMIT = 20.0  # s, of a phase, as in vrw.Options
@@ -165,9 +167,11 @@ def isolated(made: tuple, params: vrw.WheelParams, starts: np.ndarray) -> tuple:
     return outcomes, durations, ends
 
 
-def drawn(box: dict, random: np.random.Generator) -> tuple[vrw.WheelParams, np.ndarray]:
+def drawn(
+    box: dict, random: np.random.Generator, count: int = CHUNK
+) -> tuple[vrw.WheelParams, np.ndarray]:
     """Wheels and starts."""
-    draw = lambda limits: random.uniform(*limits, CHUNK)
+    draw = lambda limits: random.uniform(*limits, count)
     fields = {name: draw(limits) for name, limits in box.items() if name != "start"}
     return vrw.WheelParams(**fields), np.stack([draw(limits) for limits in box["start"]], 1)
 
@@ -197,4 +201,38 @@ def compare(cases: int, done: int) -> Rows:
             "late": int((both & (gap > LATE)).sum()),
             "largest_time_difference": f"{np.max(gap[both], initial=0.0):.2e}",
             "ours/isolated": "; ".join(counts),
+        }
+
+
+def dips(cases: int, done: int) -> Rows:
+    """Steps at the defaults against `Options.tight()`, chunk by chunk; isolated roots decide.
+
+    Where a rate or a height decays to rounding, "fell back" and "still there" can't be told apart,
+    and either may give up: counted by themselves.
+    """
+    made = phases()
+    n_chunks = cases // len(KINDS) // MANY
+    places = [(i, kind, chunk) for chunk in range(n_chunks) for i, kind in enumerate(KINDS)]
+    for i, kind, chunk in track(places[done:], "dips"):
+        params, starts = drawn(KINDS[kind], np.random.default_rng((11, i, chunk)), MANY)
+        mine, tight = (
+            np.asarray(vrw.steps(params, starts, options=options).outcome)
+            for options in (vrw.Options(), vrw.Options.tight())
+        )
+        gave_up = (mine == Outcome.SOLVER_GAVE_UP) | (tight == Outcome.SOLVER_GAVE_UP)
+        asked = np.flatnonzero((mine != tight) & ~gave_up)
+        few = taken(jax.tree.map(lambda x: np.broadcast_to(x, MANY), params), asked)
+        codes = isolated(made, few, starts[asked])[0] if len(asked) else mine[asked]
+        missed = asked[mine[asked] != codes]
+        pairs = zip(mine[missed], codes[mine[asked] != codes], strict=True)
+        yield {
+            "kind": kind,
+            "chunk": chunk,
+            "cases": MANY,
+            "stepped": int((mine == Outcome.STEPPED).sum()),
+            "gave_up": int(gave_up.sum()),
+            "differ": len(asked),
+            "missed": len(missed),
+            "missed_by_tight": int((tight[asked] != codes).sum()),
+            "ours/isolated": "; ".join(f"{Outcome(a).name}/{Outcome(b).name}" for a, b in pairs),
         }

@@ -3,7 +3,8 @@
     python -m experiments.atlas.run [--only NAME] [--cases 1000000] [--redraw]
 
 Each map is a function that fills one small table (csv) and one that draws it. A table that exists
-is kept; that of events goes on where it was stopped. docs/stability_atlas.md reads them.
+is kept; those of events and of dips go on where they were stopped. docs/stability_atlas.md reads
+them.
 """
 
 import csv
@@ -28,6 +29,7 @@ MAPS: dict[str, Callable[..., Rows]] = {
     "formulations": formulations.penalty,
     "drift": formulations.drift,
     "events": events.compare,
+    "dips": events.dips,
     "between": limits.between,
     "limits": limits.limits,
     "first_order": limits.first_order,
@@ -41,6 +43,10 @@ MAPS: dict[str, Callable[..., Rows]] = {
     "long_walk": walks.long_walk,
     "stiffness": stiffness.over_rates,
 }
+
+
+GO_ON = {"events": 1, "dips": 20}
+"""Maps that are filled chunk by chunk, and how many times the cases asked for they take."""
 
 
 def table_of(name: str) -> Path:
@@ -63,7 +69,12 @@ def fill(name: str, rows: Rows, append: bool = False) -> None:
 def main() -> None:
     parser = command(__doc__)
     parser.add_argument("--only", choices=MAPS, help="one map")
-    parser.add_argument("--cases", type=int, default=1_000_000, help="of the map of events")
+    parser.add_argument(
+        "--cases",
+        type=int,
+        default=1_000_000,
+        help="of the map of events; 20 times as many of dips",
+    )
     parser.add_argument("--redraw", action="store_true", help="compute nothing")
     chosen = parser.parse_args()
     with on_one_core():
@@ -72,8 +83,8 @@ def main() -> None:
             if chosen.redraw or chosen.only not in (None, name):
                 continue
             kept = len(read(table_of(name))) if table_of(name).exists() else 0
-            if name == "events":  # goes on, chunk by chunk
-                fill(name, rows(chosen.cases, kept), append=kept > 0)
+            if name in GO_ON:
+                fill(name, rows(GO_ON[name] * chosen.cases, kept), append=kept > 0)
             elif kept == 0:
                 fill(name, rows())
     charts.draw({name: table_of(name) for name in MAPS}, stiffness.real_axis_limit)

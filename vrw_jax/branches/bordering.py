@@ -6,8 +6,7 @@ for together with the gait, so that a point of a curve is as exact as the gait i
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -15,39 +14,32 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from vrw_jax.branches.branch import Border
-from vrw_jax.branches.continuation import ENDING, INDICATORS, GaitRun, continue_branch
-from vrw_jax.branches.followed import CycleFollowed, Wheel, gait_measures
-from vrw_jax.branches.run import BRANCH_POINT, AbstractRun, Strand, Table, run_all
-from vrw_jax.cycles import (
-    LimitCycle,
-    Located,
-    Problem,
-    correction_size,
-    nothing_known,
+from vrw_jax.branches.continuation import (
+    ENDING,
+    INDICATORS,
+    GaitRun,
+    continue_branches,
+    is_rough,
 )
+from vrw_jax.branches.followed import Wheel
+from vrw_jax.branches.gait_levels import EXACT, FORMAL, GaitAt, GaitLevel, formal_at, quantities_of
+from vrw_jax.branches.run import BRANCH_POINT, AbstractRun, Strand, Table, run_all
+from vrw_jax.cycles import LimitCycle, Problem, on_mesh
 from vrw_jax.models import ViscoelasticWheel
 from vrw_jax.numerics import (
     BIFURCATIONS,
-    AbstractLevel,
     ArclengthOptions,
     LevelFollowed,
-    LevelLinear,
     LevelPoint,
     Options,
     PathPoint,
-    Scalar,
-    Section,
     Solution,
-    margins_beside_fold,
-    multipliers,
-    one_wheel,
 )
 from vrw_jax.results import MARGINS, attrs_of, provenance, require_known
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.wheel import PARAMETER_NAMES, WheelParams, parameters_of, transitions, wheel_of
+from vrw_jax.wheel import Outcome, WheelParams, wheel_of
 from vrw_jax.wording import instance, range_of
 
 Box = Mapping[str, tuple[float, float]]
@@ -60,112 +52,20 @@ BOX: Box = {
 }
 """Where borders are followed if nothing else is said; of a wheel with legs of 1 m."""
 
-EXACT = GaitRun.exact
-FORMAL = (*INDICATORS, *EXACT.values())
-"""Quantities of the collocated gait itself, which go on beyond the border."""
-
 EDGE = "edge of the box"
 """Column that is zero where the second parameter leaves its range."""
 
+ROUNDS = 3
+"""How often what was met on the way to borders is followed in its turn, for a map of all."""
 
-class GaitAt(NamedTuple):
-    """The wheel whose border is followed, and which of the level's quantities is its border."""
+SIDE_BY_SIDE = 4
+"""Curves in a batch, both ways each: one group of lanes of machine code, one shape to compile."""
 
-    gait: Wheel
-    place: Array
+FINER = 1
+"""How often a curve is followed again on a mesh twice as fine, where its gaits ask for one."""
 
-
-class GaitLevel(AbstractLevel):
-    """One of `quantities` of collocated gaits over two parameters."""
-
-    problem: Problem = eqx.field(static=True)
-    names: tuple[str, str] = eqx.field(static=True)
-    quantities: tuple[str, ...] = eqx.field(static=True)  # BIFURCATIONS, FORMAL or a step's
-    model: ViscoelasticWheel
-    step_options: Options
-
-    def linearise(self, wheel: GaitAt, z: Solution, p: Array) -> LevelLinear:
-        gait = wheel.gait
-        wanted = tuple(PARAMETER_NAMES.index(name) for name in self.names)
-        over_lanes = functools.partial(_linearised, self.problem, wanted)
-        parameters = parameters_of(self.at(gait, p).params)
-        correction, columns, monodromy = one_wheel(over_lanes)(parameters, gait.happens, z)
-        first, second = (jax.tree.map(lambda x, i=i: x[i], columns) for i in range(2))
-        units = jnp.concatenate([jnp.zeros((1, 2), p.dtype), jnp.eye(2, dtype=p.dtype)])
-        along = jax.tree.map(lambda *x: jnp.stack(x), correction, first, second)
-        if self.quantities == BIFURCATIONS:
-            value, slopes = self._of_multipliers(gait, z, p, monodromy, along, units)
-        else:
-            told = functools.partial(self.told, gait)
-            push = lambda dz, dp: jax.jvp(told, (z, p), (dz, dp))
-            value, slopes = jax.vmap(push, out_axes=(None, 0))(along, units)
-        value, slopes = value[wheel.place], slopes[:, wheel.place]
-        return LevelLinear(correction, (first, second), monodromy, value + slopes[0], slopes[1:])
-
-    def at(self, gait: Wheel, p: Array) -> Wheel:
-        """The wheel with both parameters as they are at p."""
-        params = gait.params
-        for name, value in zip(self.names, p, strict=True):
-            params = self.model.moved(params, name, value)[1]
-        return gait._replace(params=params)
-
-    @property
-    def gaits(self) -> CycleFollowed:
-        """The gaits along the first parameter alone."""
-        return CycleFollowed(problem=self.problem, name=self.names[0])
-
-    def told(self, gait: Wheel, z: Solution, p: Array) -> Array:
-        """The quantities at a point, one after another."""
-        there = self.at(gait, p)
-        x, formal = self.gaits.read(there, z, p[0])
-        if self.quantities == FORMAL:
-            s = there.params.symbols()
-            landing = transitions.land(s, *x)
-            fore, rear = transitions.landing_forces(s, landing)
-            forces = landing.rear.normal, fore.normal, rear.normal
-            return jnp.stack([*forces, *(formal[name] for name in EXACT.values())])
-        told = gait_measures(self.model, there.params, x, self.step_options, 1)
-        rows = [(told[name.partition("[")[0]], name.partition("[")[2]) for name in self.quantities]
-        return jnp.stack([row[int(leg[:-1]) - 3] if leg else row for row, leg in rows])
-
-    def _of_multipliers(
-        self, gait: Wheel, z: Solution, p: Array, monodromy: Array, along: Solution, units: Array
-    ) -> tuple[Array, Array]:
-        """By complex step: see `cycles.derivatives`."""
-        step = jnp.finfo(p.dtype).eps ** 2
-        at = lambda p: parameters_of(self.at(gait, p).params)
-        moves = jax.vmap(lambda dp: jax.jvp(at, (p,), (dp,))[1])(units)
-        lanes = lambda x, dx: jnp.moveaxis(x + 1j * step * dx, 0, -1)
-        moved = jax.tree.map(lambda x, dx: lanes(x[None], dx), z, along)
-        happens = jnp.broadcast_to(gait.happens[..., None], (*gait.happens.shape, 3))
-        located = Located(moved, happens, *nothing_known(self.problem, moved.section))
-        passed = self.problem.pass_at(lanes(at(p)[None], moves), located)
-        slopes = jnp.moveaxis(passed.monodromy.imag / step, -1, 0)
-        push = lambda d: jax.jvp(margins_beside_fold, (monodromy,), (d,))
-        return jax.vmap(push, out_axes=(None, 0))(slopes)
-
-    def section(self, z: Solution) -> Section:
-        return z.section
-
-    def size(self, z: Solution, correction: Solution) -> Scalar:
-        return one_wheel(correction_size)(z, correction)
-
-    def valid(self, wheel: GaitAt, z: Solution, p: Array) -> Array:
-        return self.gaits.valid(self.at(wheel.gait, p), z, p[0])
-
-
-@functools.partial(jax.jit, static_argnums=(0, 1))
-def _linearised(
-    problem: Problem, wanted: tuple[int, ...], parameters: Array, happens: Array, z: Solution
-) -> tuple[Solution, Solution, Array]:
-    located = Located(z, happens, *nothing_known(problem, z.section))
-    passed = problem.pass_at(parameters, located, wanted)
-    return passed.correction, passed.columns, passed.monodromy
-
-
-@eqx.filter_jit
-def _formal(level: GaitLevel, wheels: Wheel, z: Solution, p: Array) -> Array:
-    return jax.vmap(level.told)(wheels, z, p)
+SAME = 2e-3
+"""How near to a curve a point lies on it, lengths measured as along the curve."""
 
 
 @dataclass(frozen=True)
@@ -173,7 +73,7 @@ class BorderRun(AbstractRun):
     """Of borders: read as gaits are, but for the border itself."""
 
     followed: LevelFollowed
-    name: str
+    names: tuple[str, ...]  # of the borders, one for each wheel
     formal: GaitLevel  # of FORMAL
     gaits: GaitRun  # along the first parameter
 
@@ -186,25 +86,33 @@ class BorderRun(AbstractRun):
         here = lambda params: getattr(params, self.formal.names[1])
         gaits = wheels.gait._replace(params=eqx.tree_at(here, wheels.gait.params, second))
         table = self.gaits.read(gaits, points._replace(z=z))
-        told = _formal(self.formal, gaits, z, jnp.stack([points.p, second], -1))
+        told = formal_at(self.formal, gaits, z, jnp.stack([points.p, second], -1))
         formal = dict(zip(FORMAL, np.asarray(told).T, strict=True))
-        if self.name in INDICATORS:
-            # On the border the step itself goes one way or the other: what it says is void.
-            margins = {name for name in table if name.partition("[")[0] in MARGINS}
-            table = {name: x for name, x in table.items() if name not in margins}
         shares = {EDGE: np.asarray(jnp.minimum(share, 1.0 - share)), "second": np.asarray(second)}
-        return {n: x for n, x in (table | formal | shares).items() if not self.is_own(n)}
+        return table | formal | shares
+
+    def known(self, table: Table, owners: np.ndarray) -> Table:
+        """What vanishes all along a curve has no zeros on it. On an indicator's the step itself
+        goes one way or the other: what it says is void."""
+        names = np.array(self.names)[owners]
+        void = np.isin(names, INDICATORS)
+        by_step = {name for name in table if name.partition("[")[0] in MARGINS} - set(FORMAL)
+        blank = {name: names == name for name in {*self.names} & {*table}}
+        blank |= {exact: names == name for name, exact in EXACT.items()}
+        blank |= {name: void | blank.get(name, False) for name in by_step}
+        table = table | {
+            name: np.where(rows if table[name].ndim == 1 else rows[:, None], np.nan, table[name])
+            for name, rows in blank.items()
+        }
+        stepped = np.where(void, Outcome.STEPPED, table["outcome"])
+        return table | {"outcome": stepped, "closure": np.where(void, 0.0, table["closure"])}
 
     def kept(self, table: Table) -> np.ndarray:
-        known = [name for name in self.ending if name in table]
-        good = np.all([~(table[name] <= 0.0) for name in known], axis=0)
-        return good if self.name in INDICATORS else good & self.gaits.kept(table)
+        good = np.all([~(table[name] <= 0.0) for name in self.ending], axis=0)
+        return good & self.gaits.kept(table)
 
     def is_margin(self, name: str) -> bool:
         return self.gaits.is_margin(name)
-
-    def is_own(self, name: str) -> bool:
-        return name in (self.name, EXACT.get(self.name))
 
     def name_of_loss(self, table: Table, place: int) -> str:
         return self.gaits.name_of_loss(table, place)
@@ -315,7 +223,7 @@ def border_curves(
     options: ArclengthOptions | None = None,
     step_options: Options | None = None,
 ) -> tuple[BorderCurve, ...]:
-    """`border_curve` of several; with None of all that the two branches through the gait meet."""
+    """`border_curve` of several; with None of all that branches through the box and curves meet."""
     box = {**BOX, **(bounds or {})}
     first, second = parameters
     for parameter in parameters:
@@ -324,102 +232,229 @@ def border_curves(
     instance("cycle", cycle, LimitCycle, "give vrw.limit_cycle(params)")
     if first == second or cycle.period_n != 1:
         raise ValueError("a border's curve needs two different parameters and a gait of one step.")
+    map_of = _Map(
+        parameters,
+        np.array([box[name] for name in parameters], float),
+        cycle.model,
+        ArclengthOptions(max_points=1000) if options is None else options,
+        Options.tight() if step_options is None else step_options,
+    )
     params = wheel_of(cycle.parameters, cycle.problem.n_legs)
-    found: dict[str, Border] = {}
-    for parameter in parameters:
-        if names is None or set(names) - set(found):
+    if names is None:
+        traced: list[_Traced] = []
+        seeds = map_of.across(params, LINES)
+        for _ in range(ROUNDS):
+            more = map_of.followed(seeds, traced)
+            traced, seeds = [*traced, *more], [seed for one in more for seed in one.met]
+        return tuple(one.curve for one in traced)
+    found: dict[str, _Seed] = {}
+    for axis, parameter in enumerate(parameters):
+        if set(names) - set(found):
+            seeds = map_of.along(axis, jax.tree.map(lambda x: x[None], params))
             at = float(getattr(params, parameter))
-            branch = continue_branch(params, parameter, box[parameter], model=cycle.model)
-            nearest = sorted(branch.borders, key=lambda border: -abs(border.value - at))
-            found = {border.name: border for border in nearest if _can_follow(border.name)} | found
-    missing = sorted(set(names or ()) - set(found))
+            nearest = sorted(seeds, key=lambda seed, axis=axis: -abs(seed.at[axis] - at))
+            found = {seed.name: seed for seed in nearest} | found
+    missing = sorted(set(names) - set(found))
     if missing:
         raise ValueError(
             f"no border {missing[0]!r} on the branches along {first} and {second} within their "
             f"bounds, but {', '.join(sorted(found)) or 'none'}: give a gait nearer to it, or wider "
             "bounds."
         )
-    limits = np.array(box[first]), (float(box[second][0]), float(box[second][1]))
-    options = ArclengthOptions(max_points=1000) if options is None else options
-    step_options = Options.tight() if step_options is None else step_options
-    return tuple(
-        _curve(name, found[name], parameters, limits, options, step_options, cycle.model)
-        for name in (found if names is None else names)
-    )
+    told = {one.curve.name: one.curve for one in map_of.followed([found[n] for n in names], ())}
+    lost = sorted(set(names) - set(told))
+    if lost:
+        raise ValueError(
+            f"the border {lost[0]} at {found[lost[0]].at[0]:.9g} can't be followed from there."
+        )
+    return tuple(told[name] for name in names)
+
+
+LINES = 5
+"""Branches along each parameter on which a map of all borders begins."""
+
+
+class _Seed(NamedTuple):
+    """A point of a border from which it is followed."""
+
+    name: str
+    at: tuple[float, float]  # the two parameters
+    problem: Problem
+    gait: Wheel
+    z: Solution
+
+
+class _Traced(NamedTuple):
+    """A curve, and what was met on it."""
+
+    curve: BorderCurve
+    path: np.ndarray  # the section's numbers and both parameters' shares, (point, number)
+    met: tuple[_Seed, ...]
+
+
+class _Map(NamedTuple):
+    """Where borders are followed, and how."""
+
+    parameters: tuple[str, str]
+    box: np.ndarray  # (parameter, end)
+    model: ViscoelasticWheel
+    options: ArclengthOptions
+    step_options: Options
+
+    def across(self, params: WheelParams, count: int) -> list[_Seed]:
+        """Of the branches through `count` wheels on either middle line of the box."""
+        seeds = []
+        middle = self.box.mean(1)
+        for axis, name in enumerate(self.parameters):
+            low, high = self.box[1 - axis]
+            at = low + (np.arange(count) + 0.5) / count * (high - low)
+            other = self.parameters[1 - axis]
+            wheels = [self._moved(params, {name: middle[axis], other: x}) for x in at]
+            seeds += self.along(axis, jax.tree.map(lambda *x: jnp.stack(x), params, *wheels))
+        return seeds
+
+    def _moved(self, params: WheelParams, values: Mapping[str, float]) -> WheelParams:
+        for name, value in values.items():
+            params = self.model.moved(params, name, jnp.asarray(value))[1]
+        return params
+
+    def along(self, axis: int, params: WheelParams) -> list[_Seed]:
+        """Borders on the branches of these wheels along one of the parameters."""
+        name, seeds = self.parameters[axis], []
+        low, high = self.box[axis]
+        for branch in continue_branches(params, name, (low, high), model=self.model):
+            for border in branch.borders:
+                if _can_follow(border.name):
+                    seeds.append(self._seed(border))
+        return seeds
+
+    def _seed(self, border: Border) -> _Seed:
+        start = border.cycle
+        params = wheel_of(start.parameters, start.problem.n_legs)
+        first, second = (float(getattr(params, name)) for name in self.parameters)
+        gait, z = Wheel(params, start.located.happens), start.located.solution
+        return _Seed(border.name, (first, second), start.problem, gait, z)
+
+    def followed(self, seeds: Sequence[_Seed], known: Sequence[_Traced]) -> list[_Traced]:
+        """The curves through all that lie on none of the curves known."""
+        new: list[_Traced] = []
+        fresh = [seed for seed in seeds if not any(self._on(seed, one) for one in known)]
+        kinds = {quantities_of(seed.name, seed.problem.n_legs) for seed in fresh}
+        for kind in sorted(kinds):
+            of_kind = [s for s in fresh if quantities_of(s.name, s.problem.n_legs) == kind]
+            while of_kind:
+                some: list[_Seed] = []
+                for seed in of_kind:  # in one batch each name once: others may lie on its curve
+                    if seed.name not in {s.name for s in some} and len(some) < SIDE_BY_SIDE:
+                        some.append(seed)
+                told = self._batch(kind, some)
+                new += told
+                of_kind = [
+                    seed for seed in of_kind
+                    if not any(seed is s for s in some) and not any(self._on(seed, t) for t in told)
+                ]  # fmt: skip
+        return new
+
+    def _on(self, seed: _Seed, traced: _Traced) -> bool:
+        if seed.name != traced.curve.name:
+            return False
+        here = np.append(seed.z.section, (np.array(seed.at) - self.box[:, 0]) / np.ptp(self.box, 1))
+        begin, chord = traced.path[:-1], np.diff(traced.path, axis=0)
+        squared = np.maximum(np.sum(chord**2, 1), 1e-300)
+        share = np.clip(np.sum((here - begin) * chord, 1) / squared, 0.0, 1.0)
+        off = np.linalg.norm(begin + share[:, None] * chord - here, axis=1)
+        return bool(np.min(off, initial=np.inf) < SAME)
+
+    def _batch(self, kind: tuple[str, ...], seeds: list[_Seed]) -> list[_Traced]:
+        """A curve through each that has one, on a mesh that is fine enough for it."""
+        told: list[_Traced] = []
+        for refinement in range(1 + FINER):
+            strands = self._strands(kind, seeds)
+            rough = []
+            for seed, (strand, problem) in zip(seeds, strands, strict=True):
+                if strand is not None and is_rough(strand) and refinement < FINER:
+                    options = problem.options.finer()
+                    rough.append(self._on_mesh(seed, problem._replace(options=options)))
+                elif strand is not None:
+                    told.append(self._told(seed._replace(problem=problem), strand))
+            if not rough:
+                break
+            seeds = rough
+        return told
+
+    @staticmethod
+    def _on_mesh(seed: _Seed, problem: Problem) -> _Seed:
+        if seed.problem == problem:
+            return seed
+        return seed._replace(problem=problem, z=on_mesh(seed.problem, problem, seed.z))
+
+    def _strands(
+        self, kind: tuple[str, ...], seeds: list[_Seed]
+    ) -> list[tuple[Strand | None, Problem]]:
+        problem = max((seed.problem for seed in seeds), key=lambda p: p.options.steps)
+        seeds = [self._on_mesh(seed, problem) for seed in seeds]
+        filled = [*seeds, *seeds[-1:] * (-len(seeds) % SIDE_BY_SIDE)]
+        level = GaitLevel(problem, self.parameters, kind, self.model, self.step_options)
+        formal = GaitLevel(problem, self.parameters, FORMAL, self.model, self.step_options)
+        stack = lambda *trees: jax.tree.map(lambda *x: jnp.stack(x), *trees)
+        places = [jnp.asarray(kind.index(EXACT.get(seed.name, seed.name))) for seed in filled]
+        wheels = stack(*(GaitAt(s.gait, place) for s, place in zip(filled, places, strict=True)))
+        low, high = map(float, self.box[1])
+        share = lambda seed: jnp.asarray((seed.at[1] - low) / (high - low))
+        z = stack(*(LevelPoint(seed.z, share(seed)) for seed in filled))
+        rest = self.model, self.step_options, problem.n_legs
+        gaits = GaitRun(level.gaits, self.options, wheels.gait, self.box[0], *rest)
+        names = tuple(seed.name for seed in filled)
+        run = BorderRun(
+            LevelFollowed(level, (low, high)),
+            self.options,
+            wheels,
+            self.box[0],
+            names,
+            formal,
+            gaits,
+        )
+        p, wanted = jnp.asarray([s.at[0] for s in filled]), np.arange(len(filled)) < len(seeds)
+        strands = run_all(run, z, p, wanted, lambda owner, point: lambda: point)
+        return [(strand, problem) for strand in strands[: len(seeds)]]
+
+    def _told(self, seed: _Seed, strand: Strand) -> _Traced:
+        low, high = self.box[1]
+        second = lambda point: float(low + (high - low) * point.z.share)
+        name_of = lambda name: "fold" if name == BRANCH_POINT else name  # it need not turn there
+        meetings, met = [], []
+        for border in strand.borders:
+            if border.name == EDGE:
+                continue
+            beside = border.cycle
+            values, name = (border.value, second(beside)), name_of(border.name)
+            meetings.append(Meeting(name, values, border.ends_branch))
+            if _can_follow(name):
+                z = jax.tree.map(jnp.asarray, beside.z.z)
+                met.append(_Seed(name, (float(beside.p), values[1]), seed.problem, seed.gait, z))
+        z = strand.points.z
+        first = (strand.points.p - self.box[0, 0]) / np.ptp(self.box[0])
+        path = np.column_stack([z.z.section, first, z.share])
+        curve = self._labelled(seed, strand, tuple(meetings))
+        return _Traced(curve, path, tuple(met))
+
+    def _labelled(self, seed: _Seed, strand: Strand, meetings: tuple[Meeting, ...]) -> BorderCurve:
+        radius = np.abs(np.linalg.eigvals(np.asarray(strand.points.jacobian))).max(-1)
+        table = strand.table | {"spectral_radius": radius}
+        rows = ("duration_dls", "duration_sls1", "duration_sls2", "spectral_radius")
+        data: dict[str, Any] = {n: ("point", table[n], attrs_of(n)) for n in rows}
+        data["mesh_error"] = ("point", table["mesh_error"])
+        data["section_state"] = (("point", "component"), table["section_state"])
+        values = np.asarray(strand.points.p), table["second"]
+        labels = {
+            parameter: ("point", value, attrs_of(parameter))
+            for parameter, value in zip(self.parameters, values, strict=True)
+        }
+        origin = provenance(seed.gait.params, self.model, self.step_options)
+        title = {"title": f"Border {seed.name} over {' and '.join(self.parameters)}"}
+        dataset = xr.Dataset(data, labels, title | origin)
+        return BorderCurve(seed.name, self.parameters, dataset, meetings, strand.ends)
 
 
 def _can_follow(name: str) -> bool:
     return name in (*BIFURCATIONS, *INDICATORS) or name.partition("[")[0] in MARGINS
-
-
-def _quantities(name: str) -> tuple[str, ...]:
-    """The quantities that are told together with the one that vanishes at a border."""
-    several = tuple(n for n, margin in MARGINS.items() if not margin.axis)
-    kinds = BIFURCATIONS, FORMAL, several, (name,)
-    return next(kind for kind in kinds if name in kind)
-
-
-def _curve(
-    name: str,
-    border: Border,
-    parameters: tuple[str, str],
-    limits: tuple[np.ndarray, tuple[float, float]],
-    options: ArclengthOptions,
-    step_options: Options,
-    model: ViscoelasticWheel,
-) -> BorderCurve:
-    start, (low, high) = border.cycle, limits[1]
-    params = wheel_of(start.parameters, start.problem.n_legs)
-    vanishing = EXACT.get(name, name)
-    quantities = _quantities(vanishing)
-    level = GaitLevel(start.problem, parameters, quantities, model, step_options)
-    formal = GaitLevel(start.problem, parameters, FORMAL, model, step_options)
-    lead = functools.partial(jax.tree.map, lambda x: jnp.asarray(x)[None])
-    wheels = lead(
-        GaitAt(Wheel(params, start.located.happens), jnp.asarray(quantities.index(vanishing)))
-    )
-    p, second = (float(getattr(params, parameter)) for parameter in parameters)
-    z = lead(LevelPoint(start.located.solution, jnp.asarray((second - low) / (high - low))))
-    gaits = GaitRun(
-        level.gaits, options, wheels.gait, limits[0], model, step_options, params.n_legs
-    )
-    run = BorderRun(
-        LevelFollowed(level, limits[1]), options, wheels, limits[0], name, formal, gaits
-    )
-    (strand,) = run_all(run, z, jnp.asarray([p]), np.array([True]), lambda owner, point: None)
-    if strand is None:
-        raise ValueError(f"the border {name} at {border.value:.9g} can't be followed from there.")
-    return _labelled(name, parameters, limits[1], strand, params, model, step_options)
-
-
-def _labelled(
-    name: str,
-    parameters: tuple[str, str],
-    seconds: tuple[float, float],
-    strand: Strand,
-    params: WheelParams,
-    model: ViscoelasticWheel,
-    step_options: Options,
-) -> BorderCurve:
-    radius = np.abs(np.asarray(multipliers(jnp.asarray(strand.points.jacobian)))).max(-1)
-    table = strand.table | {"spectral_radius": radius}
-    rows = ("duration_dls", "duration_sls1", "duration_sls2", "spectral_radius")
-    data: dict[str, Any] = {n: ("point", table[n], attrs_of(n)) for n in rows}
-    data["mesh_error"] = ("point", table["mesh_error"])
-    data["section_state"] = (("point", "component"), table["section_state"])
-    values = np.asarray(strand.points.p), table["second"]
-    labels = {
-        parameter: ("point", value, attrs_of(parameter))
-        for parameter, value in zip(parameters, values, strict=True)
-    }
-    origin = provenance(params, model, step_options)
-    title = {"title": f"Border {name} over {' and '.join(parameters)}"}
-    low, high = seconds
-    told = lambda name: "fold" if name == BRANCH_POINT else name  # the curve need not turn there
-    meetings = tuple(
-        Meeting(told(met.name), (met.value, low + (high - low) * float(met.point.section[-1])),
-                met.ends_branch)
-        for met in strand.borders if met.name != EDGE
-    )  # fmt: skip
-    dataset = xr.Dataset(data, labels, title | origin)
-    return BorderCurve(name, parameters, dataset, meetings, strand.ends)

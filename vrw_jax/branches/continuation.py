@@ -267,14 +267,14 @@ def _followed(
         )  # fmt: skip
         good = start.outcomes == Outcome.STEPPED
         strands = run_all(run, start.z, wanted.p, good, start.make_cycle)
-        rough = any(strand is not None and _is_rough(strand) for strand in strands)
+        rough = any(strand is not None and is_rough(strand) for strand in strands)
         if not (adaptive and rough) or start.finer is None or refinement == REFINEMENTS:
             break
         wanted, cycle = wanted._replace(cycle_options=start.finer), start.cycle
     return start.outcomes, strands
 
 
-def _is_rough(strand: Strand) -> bool:
+def is_rough(strand: Strand) -> bool:
     """Whether the mesh, not the wheel, says how far the branch goes or how exact it is."""
     ended = any(border.ends_branch and border.name == COARSE for border in strand.borders)
     return ended or bool(np.max(strand.table.get("mesh_error", 0.0)) > MESH_ERROR)

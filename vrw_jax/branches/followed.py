@@ -6,12 +6,13 @@ and differentiated forwards.
 """
 
 import abc
-import functools
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
@@ -20,6 +21,7 @@ from vrw_jax.cycles import (
     Problem,
     correction_size,
     nothing_known,
+    over_lanes,
     takeoff_acceleration,
 )
 from vrw_jax.models import AbstractWheel, RungState
@@ -84,9 +86,9 @@ class CycleFollowed(AbstractFollowedWheel):
         return parameters_of(eqx.tree_at(lambda w: getattr(w, self.name), wheel.params, p))
 
     def linearise(self, wheel: Wheel, z: Unknown, p: Scalar) -> Linear:
-        index = PARAMETER_NAMES.index(self.name)
-        over_lanes = functools.partial(_linearised, self.problem, index)
-        return Linear(*one_wheel(over_lanes)(self._moved(wheel, p), wheel.happens, z))
+        linearised = linearised_along(self.problem, (PARAMETER_NAMES.index(self.name),))
+        correction, column, monodromy, *_ = linearised(self._moved(wheel, p), wheel.happens, z)
+        return Linear(correction, jax.tree.map(lambda x: x[0], column), monodromy)
 
     def _mesh_error(self, z: Solution) -> Array:
         lanes = jax.tree.map(lambda x: x[..., None], z)
@@ -121,17 +123,35 @@ class CycleFollowed(AbstractFollowedWheel):
         return jnp.stack([end.q[0], *end.v]), formal
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1))
-def _linearised(
-    problem: Problem, index: int, parameters: Array, happens: Array, z: Solution
-) -> tuple[Solution, Solution, Array]:
-    """Correction, column of one parameter and monodromy, lanes last.
+Told = Callable[[Problem, Array, Array, Solution], Array]
+"""Quantities of collocated gaits over lanes: of the problem, parameters, `happens` and solution."""
 
-    Jitted so that it is traced once, however often a loop over lanes looks at its body.
+
+def linearised_along(problem: Problem, wanted: tuple[int, ...], told: Told | None = None) -> Any:
+    """Correction, columns of the parameters `wanted` and monodromy of one wheel's trial.
+
+    With `told` also that there, and its slopes along the correction and each of the columns. Over
+    (parameters, happens, solution); `jax.vmap` maps it onto lanes.
     """
-    located = Located(z, happens, *nothing_known(problem, z.section))
-    passed = problem.pass_at(parameters, located, (index,))
-    return passed.correction, jax.tree.map(lambda x: x[0], passed.columns), passed.monodromy
+
+    def linearised(parameters: Array, happens: Array, z: Solution) -> tuple:
+        located = Located(z, happens, *nothing_known(problem, z.section))
+        passed = problem.pass_at(parameters, located, wanted)
+        found = passed.correction, passed.columns, passed.monodromy
+        if told is None:
+            return found
+        rows = np.eye(parameters.shape[0], dtype=parameters.dtype)[list(wanted)]
+        units = np.concatenate([np.zeros_like(rows[:1]), rows])[:, :, None]
+        lead = lambda a, b: jnp.concatenate([a[None], b])
+        columns = jax.tree.map(lead, passed.correction, passed.columns)
+        ways = jnp.broadcast_to(units, (len(units), *parameters.shape)), columns
+        at = lambda parameters, z: told(problem, parameters, happens, z)
+        along = lambda way: jax.jvp(at, (parameters, z), way)[1]
+        return *found, at(parameters, z), lax.map(along, ways)
+
+    like = lambda parameters, happens, z: (z, z, *(parameters,) * (1 if told is None else 3))
+    settings = "followed", problem, wanted, told.__name__ if told else ""
+    return one_wheel(over_lanes(linearised, like, settings, block=0))
 
 
 class RungFollowed(AbstractFollowedWheel):

@@ -40,7 +40,7 @@ ACCURACY = 1e-10
 AT_FOLD = 1e-6
 """The same as a share of the bracket, where the parameter turns back: it enters squared."""
 
-BATCH = 32
+BATCH = 8
 """Points that are measured or located side by side: one shape, compiled once."""
 
 IN_SEQUENCE = "sequence"
@@ -80,9 +80,9 @@ class AbstractRun(abc.ABC):
         """Whether a column's zero is a border collision."""
         return False
 
-    def is_own(self, name: str) -> bool:
-        """Whether a column is zero all along what is followed."""
-        return False
+    def known(self, table: Table, owners: np.ndarray) -> Table:
+        """The table without what says nothing at a point, by whose it is."""
+        return table
 
     def name_of_loss(self, table: Table, place: int) -> str:
         """What the first point beyond the end of a branch says of it."""
@@ -91,9 +91,9 @@ class AbstractRun(abc.ABC):
     def table(self, points: PathPoint, owners: np.ndarray) -> Table:
         """Every quantity at each point, bifurcation functions and IN_SEQUENCE included."""
         found = in_batches(self.read, BATCH, taken(self.wheels, owners), points)
-        margins = bifurcation_functions(np.asarray(points.jacobian))
-        others = (name for name in BIFURCATIONS if not self.is_own(name))
-        found |= {name: margins[:, BIFURCATIONS.index(name)] for name in others}
+        margins = in_batches(bifurcation_functions, BATCH, points.jacobian)
+        found |= {name: margins[:, i] for i, name in enumerate(BIFURCATIONS)}
+        found = self.known(found, owners)
         for name, exact in self.exact.items():
             if exact in found and name in found:
                 found[_both(name)] = both_hold(found[name], found[exact])
@@ -114,19 +114,14 @@ def both_hold(margin: np.ndarray, exact: np.ndarray) -> np.ndarray:
     return np.where(exact < 0.0, exact, np.minimum(exact, margin))
 
 
-@eqx.filter_jit
-def _follow_both_ways(
-    followed: AbstractFollowed,
-    options: ArclengthOptions,
-    wheels: Any,
-    z: Any,
-    p: Array,
-    bounds: Array,
-) -> arclength.Track:
+def _follow_both_ways(run: AbstractRun, z: Any, p: Array) -> arclength.Track:
     """Tracks of all wheels, axes (wheel, direction): first towards smaller values."""
-    ways = jnp.asarray([-1.0, 1.0], bounds.dtype)
-    one = lambda wheel, z, p, way: arclength.follow(followed, options, wheel, z, p, bounds, way)
-    return jax.vmap(jax.vmap(one, (None, None, None, 0)), (0, 0, 0, None))(wheels, z, p, ways)
+    twice = functools.partial(jax.tree.map, lambda x: jnp.repeat(x, 2, axis=0))
+    bounds = jnp.asarray(run.bounds)
+    ways = jnp.tile(jnp.asarray([-1.0, 1.0], bounds.dtype), p.shape[0])
+    given = twice(run.wheels), twice(z), twice(p), bounds, ways
+    tracks = arclength.follow(run.followed, run.options, *given)
+    return jax.tree.map(lambda x: np.asarray(x).reshape(-1, 2, *x.shape[1:]), tracks)
 
 
 @eqx.filter_jit
@@ -354,12 +349,11 @@ def run_all(
     run: AbstractRun, z: Any, p: Array, found: np.ndarray, make_cycle: MakeCycle
 ) -> list[Strand | None]:
     """Follow, locate, and sort by wheel; None where there was no start."""
-    bounds = jnp.asarray(run.bounds)
-    tracks = _follow_both_ways(run.followed, run.options, run.wheels, z, p, bounds)
+    tracks = _follow_both_ways(run, z, p)
     # What comes back to its start has gone both ways at once.
     closed = (tracks.ending == int(Ending.CLOSED)).all(1, keepdims=True) & np.array([True, False])
     kept = found[:, None] & ~closed
-    tracks = tracks._replace(n_points=jnp.where(kept, tracks.n_points, 0))
+    tracks = tracks._replace(n_points=np.where(kept, tracks.n_points, 0))
     pieces = _collected(run, tracks)
     n_wheels = len(found)
     starts = {

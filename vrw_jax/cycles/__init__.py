@@ -3,6 +3,7 @@
 from vrw_jax.cycles.by_collocation import CollocationFinder
 from vrw_jax.cycles.collocated import LimitCycle, on_mesh
 from vrw_jax.cycles.cycle import MEASURED, ON_STABILITY, AbstractCycle
+from vrw_jax.cycles.derivatives import over_lanes
 from vrw_jax.cycles.finder import (
     AGREEMENT,
     AbstractGaitFinder,

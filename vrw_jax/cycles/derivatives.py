@@ -52,9 +52,7 @@ def _where_found(located: Located, tree: Any) -> Any:
     return jax.tree.map(lambda x: jnp.where(located.found > 0.5, x, 0.0), tree)
 
 
-def _over_lanes(
-    function: LaneFunction, like: Callable, settings: tuple, block: int
-) -> LaneFunction:
+def over_lanes(function: LaneFunction, like: Callable, settings: tuple, block: int) -> LaneFunction:
     """A function over lanes in its quickest form: machine code on a CPU."""
     if simd.serves():
         return lane_function(function, like, settings)
@@ -63,12 +61,12 @@ def _over_lanes(
 
 
 def _in_form(name: str, likes: tuple[Callable, ...], problem: Problem) -> InForm:
-    """The first derivatives, a form of results for each, by `_over_lanes`; higher ones by XLA."""
+    """The first derivatives, a form of results for each, by `over_lanes`; higher ones by XLA."""
     block = problem.options.block
 
     def in_form(function: LaneFunction, order: int) -> LaneFunction:
         if order < len(likes):
-            return _over_lanes(function, likes[order], (name, order, problem), block)
+            return over_lanes(function, likes[order], (name, order, problem), block)
         return in_blocks(function, block)
 
     return in_form
@@ -88,7 +86,7 @@ def solve_cycle(
     """Search for one wheel, differentiable in its parameters; the guess has no derivative."""
     search = functools.partial(search_lanes, problem)
     like = lambda parameters, now, *_: now
-    lanes = _over_lanes(search, like, ("search", problem), problem.options.block)
+    lanes = over_lanes(search, like, ("search", problem), problem.options.block)
     find = one_wheel(functools.partial(in_stages, problem, lanes))
     columns_of = _columns_of(problem)
 

@@ -1,5 +1,6 @@
 """Pictures of borders as curves over two parameters, on the measure that a scan found."""
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -37,11 +38,16 @@ def map_figure(scan: xr.Dataset, measure: str, curves: Sequence[BorderCurve]) ->
         scan[x].values, scan[y].values, values, shading="nearest", cmap="cividis", rasterized=True
     )
     figure.colorbar(image, ax=axes, aspect=30, pad=0.01).set_label(axis_label(measure))
-    for (color, dash), curve in zip(STYLES, curves, strict=False):
-        told = what_breaks(curve.name)
-        axes.plot(*curve.values.T, color=color, linestyle=dash, label=told)
-        met = np.array([meeting.values for meeting in curve.meetings]).reshape(-1, 2)
-        axes.plot(*met.T, "o", color=color, markersize=3.0, markerfacecolor="white")
+    names = sorted({curve.name for curve in curves})
+    styles = dict(zip(names, itertools.cycle(STYLES), strict=False))
+    labels = {name: what_breaks(name) for name in names}
+    for curve in curves:
+        color, dash = styles[curve.name]
+        told = labels.pop(curve.name, None)  # several pieces of a border are told once
+        axes.plot(*curve.values.T, color=color, linestyle=dash, linewidth=1.0, label=told)
+    met = np.array([meeting.values for curve in curves for meeting in curve.meetings])
+    points = {"markersize": 2.5, "markerfacecolor": "white", "markeredgewidth": 0.6}
+    axes.plot(*met.reshape(-1, 2).T, "o", color="black", **points, label="two borders at once")
     axes.set_xlim(*scan[x].values[[0, -1]])
     axes.set_ylim(*scan[y].values[[0, -1]])
     axes.set_xlabel(axis_label(x))

@@ -1,8 +1,8 @@
 """Pseudo-arclength continuation of fixed points in one parameter, through folds.
 
 Knows nothing of wheels: what is followed is an `AbstractFollowed`, which says how Newton's method
-corrects an unknown z at a parameter p and how z moves with p. All is written for one branch with
-buffers of fixed size, so that `jax.vmap` follows many side by side and `jax.jit` compiles it once.
+corrects an unknown z at a parameter p and how z moves with p. Many branches run side by side, each
+with buffers of fixed size for its points.
 
 Lengths are measured in the section's numbers and in the parameter as a share of its range.
 """
@@ -148,19 +148,19 @@ class PathPoint(NamedTuple):
 
     z: Unknown
     p: Scalar
-    slope: Unknown  # dz over length along the branch
+    slope: Unknown  # dz over length along the branch; () of a point that is kept
     share_slope: Scalar  # the same of the parameter as a share of its range
     jacobian: Float[Array, "n n"]
     valid: Bool[Array, ""]
 
 
 class Track(NamedTuple):
-    """Points in buffers of `max_points`, the first `n_points` of them set."""
+    """Of branches side by side: points in buffers of `max_points`, the first `n_points` set."""
 
     points: PathPoint
-    n_points: Int[Array, ""]
-    ending: Int[Array, ""]  # an Ending
-    passes: Int[Array, ""]  # linearisations spent
+    n_points: Int[Array, " branches"]
+    ending: Int[Array, " branches"]  # an Ending
+    passes: Int[Array, " branches"]  # linearisations spent
 
 
 class Plane(NamedTuple):
@@ -237,10 +237,13 @@ def _predicted(followed: AbstractFollowed, base: PathPoint, step: Scalar, bounds
 
 class _State(NamedTuple):
     base: PathPoint
+    first: PathPoint  # of the branch, once there is one
     step: Scalar
     trial: _Trial
     iteration: Int[Array, ""]
-    track: Track
+    n_points: Int[Array, ""]
+    ending: Int[Array, ""]
+    passes: Int[Array, ""]
 
 
 class _Judged(NamedTuple):
@@ -258,7 +261,7 @@ def _judged(
     now: _Corrected,
     direction: Scalar,
 ) -> _Judged:
-    base, trial, starting = state.base, state.trial, state.track.n_points == 0
+    base, trial, starting = state.base, state.trial, state.n_points == 0
     off = jnp.maximum(
         jnp.max(jnp.abs(followed.section(now.z) - trial.plane.x)),
         jnp.abs(now.share - trial.plane.share),
@@ -282,7 +285,7 @@ def _next_step(options: ArclengthOptions, state: _State, judged: _Judged) -> Sca
     longer = jnp.minimum(state.step * growth, options.largest_step)
     shorter = jnp.where(judged.failed, 0.5 * state.step, state.step)
     step = jnp.where(judged.accepted, longer, shorter)
-    return jnp.where(state.track.n_points == 0, options.first_step, step)
+    return jnp.where(state.n_points == 0, options.first_step, step)
 
 
 def _closes(
@@ -297,7 +300,7 @@ def _closes(
     return (share >= 0.0) & (share <= 1.0) & (off @ off < 0.01 * squared)
 
 
-def _extended(
+def _ending(
     options: ArclengthOptions,
     state: _State,
     judged: _Judged,
@@ -305,56 +308,51 @@ def _extended(
     step: Scalar,
     ahead: Scalar,
     closes: Bool[Array, ""],
-) -> Track:
-    """The track with the point reached, where it is accepted; `ahead`: length of what follows."""
-    track, (accepted, failed, _) = state.track, judged
-    place = jnp.where(accepted, track.n_points, options.max_points)
-    points = jax.tree.map(lambda b, a: b.at[place].set(a, mode="drop"), track.points, reached)
-    count, ending = track.n_points + accepted, track.ending
+) -> Int[Array, ""]:
+    """Whether and why it ends with the trial as judged; `ahead`: length of what follows."""
+    accepted, failed, _ = judged
+    count, ending = state.n_points + accepted, state.ending
     for happened, code in (
         (failed & (step < options.smallest_step), Ending.STALLED),
-        (failed & (track.n_points == 0), Ending.NO_START),
+        (failed & (state.n_points == 0), Ending.NO_START),
         (accepted & (count >= options.max_points), Ending.BUFFER_FULL),
         (accepted & (state.trial.final | (ahead <= 1e-12)), Ending.RANGE_ENDED),
         (accepted & ~reached.valid, Ending.LEFT_SEQUENCE),
-        (accepted & closes & (track.n_points > 2), Ending.CLOSED),
+        (accepted & closes & (state.n_points > 2), Ending.CLOSED),
     ):
         ending = jnp.where(happened, int(code), ending)
-    return Track(points, count, ending.astype(jnp.int32), track.passes + 1)
+    return ending.astype(jnp.int32)
 
 
 @eqx.filter_jit
 def follow(
     followed: AbstractFollowed,
     options: ArclengthOptions,
-    wheel: Any,
+    wheels: Any,
     z: Unknown,
-    p: Scalar,
+    p: Float[Array, " branches"],
     bounds: Float[Array, "2"],
-    direction: Scalar,
+    directions: Float[Array, " branches"],
 ) -> Track:
-    """The branch from the point near (z, p), towards growing p if `direction` is 1, falling if -1.
+    """The branches from the points near (z, p), towards growing p if the direction is 1, else -1.
 
-    Ends at the range's end, or with the first point that is not `valid`, which is kept. Each turn
-    of the loop is one linearisation: of the running trial, whatever point it is for.
+    Each ends at the range's end, or with its first point that is not `valid`, which is kept. Each
+    turn of the loop is one linearisation: of the running trials, whatever points they are for.
     """
-    x = followed.section(z)
-    n, dtype = x.shape[0], x.dtype
-    zero, none, no = jnp.zeros((), dtype), jnp.zeros((), jnp.int32), jnp.asarray(False)
-    flat = jax.tree.map(jnp.zeros_like, z)
-    here = PathPoint(z, p, flat, zero + direction, jnp.zeros((n, n), dtype), no)
-    buffers = jax.tree.map(lambda a: jnp.zeros((options.max_points, *a.shape), a.dtype), here)
-    share = _share_of(p, bounds)
-    at_start = Plane(x, share, jnp.zeros_like(x), zero + 1.0)
-    state = _State(
-        base=here,
-        step=zero + options.first_step,
-        trial=_Trial(at_start, z, share, zero, no),
-        iteration=none,
-        track=Track(buffers, none, none + int(Ending.GOING), none),
-    )
 
-    def iterate(state: _State) -> _State:
+    def started(z: Unknown, p: Scalar, direction: Scalar) -> _State:
+        x = followed.section(z)
+        n, dtype = x.shape[0], x.dtype
+        zero, none, no = jnp.zeros((), dtype), jnp.zeros((), jnp.int32), jnp.asarray(False)
+        flat, share = jax.tree.map(jnp.zeros_like, z), _share_of(p, bounds)
+        here = PathPoint(z, p, flat, zero + direction, jnp.zeros((n, n), dtype), no)
+        trial = _Trial(Plane(x, share, jnp.zeros_like(x), zero + 1.0), z, share, zero, no)
+        going = none + int(Ending.GOING)
+        return _State(here, here, zero + options.first_step, trial, none, none, going, none)
+
+    def iterate(
+        wheel: Any, direction: Scalar, state: _State
+    ) -> tuple[_State, PathPoint, Bool[Array, ""]]:
         trial = state.trial
         now = _correct(followed, wheel, bounds, trial.plane, trial.z, trial.share)
         judged = _judged(followed, options, state, now, direction)
@@ -363,17 +361,35 @@ def follow(
         slope = jax.tree.map(lambda x: judged.share_slope * x, now.column)
         reached = PathPoint(now.z, p, slope, judged.share_slope, now.jacobian, valid)
         base = select(judged.accepted, reached, state.base)
+        first = select(judged.accepted & (state.n_points == 0), reached, state.first)
         step = _next_step(options, state, judged)
         following = _predicted(followed, base, step, bounds)
         done = judged.accepted | judged.failed
         following = select(done, following, trial._replace(z=now.z, share=now.share))
-        first = jax.tree.map(lambda x: x[0], state.track.points)
         closes = _closes(followed, first, state.base, reached, bounds)
-        track = _extended(options, state, judged, reached, step, following.length, closes)
-        return _State(base, step, following, jnp.where(done, 0, state.iteration + 1), track)
+        ending = _ending(options, state, judged, reached, step, following.length, closes)
+        iteration = jnp.where(done, 0, state.iteration + 1)
+        counts = state.n_points + judged.accepted, ending, state.passes + 1
+        return _State(base, first, step, following, iteration, *counts), reached, judged.accepted
 
-    going = lambda state: state.track.ending == int(Ending.GOING)
-    return lax.while_loop(going, iterate, state).track
+    branches = jnp.arange(p.shape[0])
+
+    def turn(carry: tuple[_State, PathPoint]) -> tuple[_State, PathPoint]:
+        # Buffers stay out of what is selected by branch: that would copy them at every turn.
+        state, points = carry
+        going = state.ending == int(Ending.GOING)
+        after, reached, accepted = jax.vmap(iterate)(wheels, directions, state)
+        place = jnp.where(going & accepted, state.n_points, options.max_points)
+        put = lambda buffer, row: buffer.at[branches, place].set(row, mode="drop")
+        points = jax.tree.map(put, points, reached._replace(slope=()))
+        return jax.vmap(select)(going, after, state), points
+
+    states = jax.vmap(started)(z, p, directions)
+    room = lambda x: jnp.zeros((x.shape[0], options.max_points, *x.shape[1:]), x.dtype)
+    going = lambda carry: jnp.any(carry[0].ending == int(Ending.GOING))
+    kept = jax.tree.map(room, states.base._replace(slope=()))
+    last, points = lax.while_loop(going, turn, (states, kept))
+    return Track(points, last.n_points, last.ending, last.passes)
 
 
 @eqx.filter_jit
@@ -412,7 +428,5 @@ def solve(
     none = jnp.zeros((), jnp.int32)
     now, _, settled = lax.while_loop(going, iterate, (first, none, none))
     p = _parameter_at(now.share, bounds)
-    point = PathPoint(
-        now.z, p, now.column, jnp.ones_like(p), now.jacobian, followed.valid(wheel, now.z, p)
-    )
+    point = PathPoint(now.z, p, (), jnp.ones_like(p), now.jacobian, followed.valid(wheel, now.z, p))
     return point, settled >= 1

@@ -6,6 +6,7 @@ The places are sought for all brackets at once: one evaluation per round, whatev
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -21,11 +22,14 @@ ON_CIRCLE = 1e-4
 
 def bifurcation_functions(jacobians: np.ndarray) -> np.ndarray:
     """`BIFURCATIONS` on the last axis, from Jacobians (..., n, n); NaN where n has none such."""
-    margins = np.asarray(bifurcation_margins(jnp.asarray(jacobians)))
+    margins = np.asarray(_margins(jnp.asarray(jacobians)))
     values = np.full((*margins.shape[:-1], len(BIFURCATIONS)), np.nan)
     n = min(margins.shape[-1], len(BIFURCATIONS))
     values[..., :n] = margins[..., :n]
     return values
+
+
+_margins = jax.jit(bifurcation_margins)
 
 
 def turns(jacobian: np.ndarray) -> bool:

@@ -1,0 +1,143 @@
+"""Quantities of collocated gaits over two parameters, each of whose zeros is a border.
+
+Trial, columns, quantities and their slopes come from one call of machine code; margins that only an
+event-driven step tells, and their slopes, from the step and its derivatives.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from vrw_jax.branches.continuation import INDICATORS, GaitRun
+from vrw_jax.branches.followed import CycleFollowed, Wheel, gait_measures, linearised_along
+from vrw_jax.cycles import (
+    Located,
+    Problem,
+    correction_size,
+    nothing_known,
+    takeoff_acceleration,
+)
+from vrw_jax.models import ViscoelasticWheel
+from vrw_jax.numerics import (
+    BIFURCATIONS,
+    AbstractLevel,
+    LevelLinear,
+    Options,
+    Scalar,
+    Section,
+    Solution,
+    margins_beside_fold,
+    one_wheel,
+)
+from vrw_jax.results import MARGINS
+from vrw_jax.wheel import PARAMETER_NAMES, parameters_of, transitions, wheel_of
+
+EXACT: Mapping[str, str] = GaitRun.exact
+FORMAL = (*INDICATORS, *EXACT.values())
+"""Quantities of the collocated gait itself, which go on beyond the border."""
+
+
+def quantities_of(name: str, n_legs: int) -> tuple[str, ...]:
+    """The quantities that are told together with the one that vanishes at a border."""
+    legs = [f"[{leg}]" for leg in range(3, n_legs + 1)]
+    by_step = [n + leg for n, margin in MARGINS.items() for leg in (legs if margin.axis else [""])]
+    kinds = BIFURCATIONS, FORMAL, tuple(name for name in by_step if name not in FORMAL)
+    return next(kind for kind in kinds if EXACT.get(name, name) in kind)
+
+
+class GaitAt(NamedTuple):
+    """The wheel whose border is followed, and which of the level's quantities is its border."""
+
+    gait: Wheel
+    place: Array
+
+
+class GaitLevel(AbstractLevel):
+    """One of `quantities` of collocated gaits over two parameters."""
+
+    problem: Problem = eqx.field(static=True)
+    names: tuple[str, str] = eqx.field(static=True)
+    quantities: tuple[str, ...] = eqx.field(static=True)  # BIFURCATIONS, FORMAL or a step's
+    model: ViscoelasticWheel
+    step_options: Options
+
+    def linearise(self, wheel: GaitAt, z: Solution, p: Array) -> LevelLinear:
+        gait = wheel.gait
+        wanted = tuple(PARAMETER_NAMES.index(name) for name in self.names)
+        linearised = linearised_along(self.problem, wanted, TOLD.get(self.quantities))
+        given = parameters_of(self.at(gait, p).params), gait.happens, z
+        correction, columns, monodromy, *told = linearised(*given)
+        units = jnp.concatenate([jnp.zeros((1, 2), p.dtype), jnp.eye(2, dtype=p.dtype)])
+        if told:
+            value, slopes = told
+            if self.quantities == BIFURCATIONS:
+                push = lambda d: jax.jvp(margins_beside_fold, (value,), (d,))
+                value, slopes = jax.vmap(push, out_axes=(None, 0))(slopes)
+        else:
+            along = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), correction, columns)
+            push = lambda dz, dp: jax.jvp(lambda z, p: self.told(gait, z, p), (z, p), (dz, dp))
+            value, slopes = jax.vmap(push, out_axes=(None, 0))(along, units)
+        value, slopes = value[wheel.place], slopes[:, wheel.place]
+        first, second = (jax.tree.map(lambda x, i=i: x[i], columns) for i in range(2))
+        return LevelLinear(correction, (first, second), monodromy, value + slopes[0], slopes[1:])
+
+    def at(self, gait: Wheel, p: Array) -> Wheel:
+        """The wheel with both parameters as they are at p."""
+        params = gait.params
+        for name, value in zip(self.names, p, strict=True):
+            params = self.model.moved(params, name, value)[1]
+        return gait._replace(params=params)
+
+    @property
+    def gaits(self) -> CycleFollowed:
+        """The gaits along the first parameter alone."""
+        return CycleFollowed(problem=self.problem, name=self.names[0])
+
+    def told(self, gait: Wheel, z: Solution, p: Array) -> Array:
+        """Those of the quantities that the step tells, one after another."""
+        params = self.at(gait, p).params
+        x = self.gaits.read(gait._replace(params=params), z, p[0])[0]
+        told = gait_measures(self.model, params, x, self.step_options, 1)
+        rows = [(told[name.partition("[")[0]], name.partition("[")[2]) for name in self.quantities]
+        return jnp.stack([row[int(leg[:-1]) - 3] if leg else row for row, leg in rows])
+
+    def section(self, z: Solution) -> Section:
+        return z.section
+
+    def size(self, z: Solution, correction: Solution) -> Scalar:
+        return one_wheel(correction_size)(z, correction)
+
+    def valid(self, wheel: GaitAt, z: Solution, p: Array) -> Array:
+        return self.gaits.valid(self.at(wheel.gait, p), z, p[0])
+
+
+def _formal(problem: Problem, parameters: Array, happens: Array, z: Solution) -> Array:
+    """FORMAL of one wheel or of lanes."""
+    s = wheel_of(parameters, problem.n_legs).symbols()
+    ((_, sls1, sls2),) = problem.passages(parameters, z)[1]
+    landing = transitions.land(s, sls2.end.q[0], *sls2.end.v)
+    fore, rear = transitions.landing_forces(s, landing)
+    forces = landing.rear.normal, fore.normal, rear.normal
+    return jnp.stack([*forces, takeoff_acceleration(s, sls1)])
+
+
+def _monodromy(problem: Problem, parameters: Array, happens: Array, z: Solution) -> Array:
+    located = Located(z, happens, *nothing_known(problem, z.section))
+    return problem.pass_at(parameters, located).monodromy
+
+
+TOLD = {FORMAL: _formal, BIFURCATIONS: _monodromy}
+"""By what a level's quantities are read, where it is not the step."""
+
+
+@eqx.filter_jit
+def formal_at(level: GaitLevel, wheels: Wheel, z: Solution, p: Array) -> Array:
+    def one(wheel: Wheel, z: Solution, p: Array) -> Array:
+        params = level.at(wheel, p).params
+        return _formal(level.problem, parameters_of(params), wheel.happens, z)
+
+    return jax.vmap(one)(wheels, z, p)
