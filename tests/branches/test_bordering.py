@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.branches.bordering import border_curve
+from vrw_jax.branches.bordering import border_curves
 from vrw_jax.branches.continuation import MapRun
 from vrw_jax.branches.run import run_all
 from vrw_jax.numerics.arclength import ArclengthOptions, Ending
@@ -77,25 +77,83 @@ def test_folds_of_henon_are_on_their_parabola():
     assert np.ptp(second) > 1.0
 
 
+OVER = ("damping", "stiffness")
+MARGINS_OF_JURY = ("fold", "period_doubling", "neimark_sacker")
+DISTANCE = 1e-9
+"""From a curve, as a share of the ranges of the parameters."""
+
+
+def beside(curve, places, box):
+    """Values of the two parameters at the distance to either side, (side, place, parameter)."""
+    widths = np.array([np.ptp(box[name]) for name in curve.parameters])
+    shares = curve.values / widths
+    along = shares[places + 1] - shares[places - 1]
+    across = np.stack([-along[:, 1], along[:, 0]], -1)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    return curve.values[places] + np.array([-1.0, 1.0])[:, None, None] * DISTANCE * across * widths
+
+
+def of_gaits(curve, places, values):
+    """Whether there are gaits there, near the curve's own, and the quantity of each."""
+    params = vrw.WheelParams(**dict(zip(curve.parameters, values.T, strict=True)))
+    params = jax.tree.map(lambda x: jnp.broadcast_to(x, len(values)), params)
+    near = jnp.asarray(curve.dataset.section_state.values[places])
+    options = vrw.CycleOptions.tight()
+    gait = jax.vmap(lambda p, x: vrw.limit_cycle(p, guess=x, options=options))(params, near)
+    if curve.name in MARGINS_OF_JURY:
+        told = gait.jury_margins[:, MARGINS_OF_JURY.index(curve.name)]
+    elif curve.name.startswith("lambda_"):
+        told = getattr(gait.indicators, curve.name.removesuffix("_plus"))
+    elif curve.name == "clearance_sls1":
+        told = gait.takeoff_acceleration
+    else:
+        tight = vrw.Options.tight()
+        steps = jax.vmap(lambda p, x: vrw.step(p, x, options=tight))(params, gait.section_state)
+        name, _, leg = curve.name.partition("[")
+        told = getattr(steps.monitors, name)
+        told = told[:, int(leg[:-1]) - 3] if leg else told
+    return np.asarray(gait.found), np.asarray(told)
+
+
+def assert_exact(curve, box, count, random):
+    """At random points the quantity has opposite signs on both sides, or a side has no gaits."""
+    places = np.sort(random.choice(np.arange(1, len(curve.values) - 1), count, replace=False))
+    (found, told), (found_there, there) = (
+        of_gaits(curve, places, values) for values in beside(curve, places, box)
+    )
+    if curve.name.startswith("lambda_"):  # its gaits are on one side alone
+        assert np.all(found != found_there), curve.name
+        force = np.where(found, told, there)
+        assert np.all((force > 0.0) & (force < 1e-4)), curve.name
+    elif curve.name != "fold":
+        assert np.all(found & found_there), curve.name
+        assert np.all(told * there < 0.0), curve.name
+
+
+BOX = {"damping": (95.0, 235.0), "stiffness": (420.0, 560.0)}
+
+
 @pytest.fixture(scope="module")
-def lifting():
-    """Where the rear foot lifts at once, over damping and stiffness."""
-    cycle = vrw.limit_cycle(vrw.WheelParams(damping=200.0))
-    bounds = {"damping": (190.0, 240.0), "stiffness": (460.0, 540.0)}
-    return border_curve("lambda_4_plus", ("damping", "stiffness"), cycle, bounds=bounds)
+def curves():
+    """Borders of all three kinds: of the gait's own quantities, of a step's, of an instant's."""
+    cycle = vrw.limit_cycle(vrw.WheelParams(damping=150.0))
+    names = ("clearance_sls1", "lambda_4_plus", "hit_planted_impulse", "friction_rear")
+    return border_curves(names, OVER, cycle, bounds=BOX)
 
 
-@pytest.mark.slow
-def test_a_border_curve_of_the_wheel_passes_through_the_branchs_border(lifting):
-    c, k = lifting.values.T
-    assert abs(np.interp(500.0, *(x[np.argsort(k)] for x in (k, c))) - 219.847688296) < 1e-3
+def test_gaits_on_both_sides_of_a_curve_differ_in_its_sign(curves):
+    random = np.random.default_rng(3)
+    for curve in curves:
+        assert_exact(curve, BOX, 3, random)
 
 
-@pytest.mark.slow
-def test_on_one_side_of_a_border_curve_there_are_gaits(lifting):
-    for c, k in lifting.values[::10]:
-        near = [vrw.limit_cycle(vrw.WheelParams(damping=c + d, stiffness=k)) for d in (-1e-6, 1e-6)]
-        forces = [float(cycle.indicators.lambda_4) for cycle in near]
-        assert bool(near[0].found)
-        assert 0.0 < forces[0] < 1e-4
-        assert not bool(near[1].found)
+def test_border_curves_pass_through_the_borders_of_the_branch(curves):
+    known = {
+        "clearance_sls1": 108.444834914,
+        "lambda_4_plus": 219.847688296,
+        "hit_planted_impulse": 167.754920847,
+        "friction_rear": 102.892041687,
+    }
+    for curve in curves:
+        off = np.abs(curve.values - (known[curve.name], 500.0)).max(1)
+        assert np.min(off) < 1e-7, curve.name

@@ -246,20 +246,29 @@ def test_scuffing_begins_between_100_and_120(branch, gait_at):
         assert (float(clearance.monitors.clearance_sls1) < 0.0) == scuffs
 
 
-def test_borders_do_not_depend_on_the_bounds_or_the_step_that_are_asked_for(branch):
+def assert_alike_in_random_bounds(branch, count):
     # Just below the scuffing border the foot dips so little that no step of a solver shows it.
     random = np.random.default_rng(19)
-    ranges = np.column_stack([random.uniform(20.0, 100.0, 8), random.uniform(115.0, 215.0, 8)])
+    ends = random.uniform(20.0, 100.0, count), random.uniform(115.0, 215.0, count)
     wheel = vrw.WheelParams(damping=110.0)
     cycle = vrw.limit_cycle(wheel)
     coarse = vrw.ArclengthOptions(first_step=0.011, largest_step=0.05)
-    for i, (low, high) in enumerate(ranges):
+    for i, (low, high) in enumerate(zip(*ends, strict=True)):
         options = coarse if i < 3 else None
         asked = vrw.continue_branch(wheel, "damping", (low, high), cycle=cycle, options=options)
         known = {b.name: b.value for b in branch.borders if low < b.value < high}
         assert {b.name for b in asked.borders} == set(known)
         for border in asked.borders:
             assert abs(border.value / known[border.name] - 1.0) < WITHIN, (low, high, border)
+
+
+def test_borders_do_not_depend_on_the_bounds_or_the_step_that_are_asked_for(branch):
+    assert_alike_in_random_bounds(branch, 8)
+
+
+@pytest.mark.slow
+def test_borders_do_not_depend_on_any_of_a_hundred_bounds(branch):
+    assert_alike_in_random_bounds(branch, 100)
 
 
 def test_each_border_is_located_to_1e_9(branch, gait_at):

@@ -1,9 +1,10 @@
 """Quantities of collocated gaits over two parameters, each of whose zeros is a border.
 
 Trial, columns, quantities and their slopes come from one call of machine code; margins that only an
-event-driven step tells, and their slopes, from the step and its derivatives.
+event-driven step tells come from steps.
 """
 
+import functools
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -71,19 +72,26 @@ class GaitLevel(AbstractLevel):
         linearised = linearised_along(self.problem, wanted, TOLD.get(self.quantities))
         given = parameters_of(self.at(gait, p).params), gait.happens, z
         correction, columns, monodromy, *told = linearised(*given)
-        units = jnp.concatenate([jnp.zeros((1, 2), p.dtype), jnp.eye(2, dtype=p.dtype)])
+        first, second = (jax.tree.map(lambda x, i=i: x[i], columns) for i in range(2))
         if told:
             value, slopes = told
             if self.quantities == BIFURCATIONS:
                 push = lambda d: jax.jvp(margins_beside_fold, (value,), (d,))
                 value, slopes = jax.vmap(push, out_axes=(None, 0))(slopes)
+            value, slopes = value + slopes[0], slopes[1:]
         else:
-            along = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), correction, columns)
-            push = lambda dz, dp: jax.jvp(lambda z, p: self.told(gait, z, p), (z, p), (dz, dp))
-            value, slopes = jax.vmap(push, out_axes=(None, 0))(along, units)
+            # Newton's method needs slopes to few digits: steps beside the trial have them for less
+            # than derivatives of the step, and on the same machine code as the step itself.
+            corrected, h = jax.tree.map(jnp.add, z, correction), DIFFERENCE * p
+            beside = lambda way, i: jax.tree.map(lambda a, b: a + h[i] * b, corrected, way)
+            trials = corrected, beside(first, 0), beside(second, 1)
+            values = jax.vmap(functools.partial(self.told, gait))(
+                jax.tree.map(lambda *x: jnp.stack(x), *trials),
+                p + jnp.concatenate([jnp.zeros((1, 2), p.dtype), jnp.diag(h)]),
+            )
+            value, slopes = values[0], (values[1:] - values[0]) / h[:, None]
         value, slopes = value[wheel.place], slopes[:, wheel.place]
-        first, second = (jax.tree.map(lambda x, i=i: x[i], columns) for i in range(2))
-        return LevelLinear(correction, (first, second), monodromy, value + slopes[0], slopes[1:])
+        return LevelLinear(correction, (first, second), monodromy, value, slopes)
 
     def at(self, gait: Wheel, p: Array) -> Wheel:
         """The wheel with both parameters as they are at p."""
@@ -129,6 +137,9 @@ def _monodromy(problem: Problem, parameters: Array, happens: Array, z: Solution)
     located = Located(z, happens, *nothing_known(problem, z.section))
     return problem.pass_at(parameters, located).monodromy
 
+
+DIFFERENCE = 1e-6
+"""Of a parameter, over its value, for slopes of what only a step tells."""
 
 TOLD = {FORMAL: _formal, BIFURCATIONS: _monodromy}
 """By what a level's quantities are read, where it is not the step."""
