@@ -384,6 +384,15 @@ def events(rows: list[Row]) -> list[Row]:
     return told
 
 
+def dips(rows: list[Row]) -> list[Row]:
+    """Counts by kind of case, over all chunks."""
+    counts = ("cases", "stepped", "gave_up", "differ", "missed", "missed_by_tight")
+    return [
+        {"kind": kind} | {name: str(sum(int(row[name]) for row in some)) for name in counts}
+        for kind, some in groups(rows, "kind").items()
+    ]
+
+
 def as_table(rows: list[Row]) -> str:
     """All columns."""
     return markdown([name.replace("_", " ") for name in rows[0]], [row.values() for row in rows])
@@ -396,6 +405,7 @@ def draw(tables: dict[str, Path], limit: Callable[[str], float]) -> None:
     told = {
         "switch": ("stiffness", automatic),
         "events": ("events", lambda rows: as_table(events(rows))),
+        "dips": ("dips", lambda rows: as_table(dips(rows))),
         "between": ("between", corners),
         "limits": ("limits", limits),
         "long_walk": ("long_walk", lambda rows: as_table(last_by(rows, "tolerance"))),

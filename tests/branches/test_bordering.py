@@ -131,14 +131,34 @@ def assert_exact(curve, box, count, random):
 
 
 BOX = {"damping": (95.0, 235.0), "stiffness": (420.0, 560.0)}
+KNOWN = {
+    "clearance_sls1": 108.444834914,
+    "lambda_4_plus": 219.847688296,
+    "hit_planted_impulse": 167.754920847,
+    "friction_rear": 102.892041687,
+}
+"""Borders of the branch along the damping."""
+
+
+def assert_through_the_branch(curve):
+    off = np.abs(curve.values - (KNOWN[curve.name], 500.0)).max(1)
+    assert np.min(off) < 1e-7, curve.name
 
 
 @pytest.fixture(scope="module")
-def curves():
-    """Borders of all three kinds: of the gait's own quantities, of a step's, of an instant's."""
-    cycle = vrw.limit_cycle(vrw.WheelParams(damping=150.0))
-    names = ("clearance_sls1", "lambda_4_plus", "hit_planted_impulse", "friction_rear")
-    return border_curves(names, OVER, cycle, bounds=BOX)
+def cycle():
+    return vrw.limit_cycle(vrw.WheelParams(damping=150.0))
+
+
+@pytest.fixture(scope="module")
+def curves(cycle):
+    """Of the gait's own quantities, which are told together."""
+    return border_curves(("clearance_sls1", "lambda_4_plus"), OVER, cycle, bounds=BOX)
+
+
+def test_border_curves_pass_through_the_borders_of_the_branch(curves):
+    for curve in curves:
+        assert_through_the_branch(curve)
 
 
 def test_gaits_on_both_sides_of_a_curve_differ_in_its_sign(curves):
@@ -147,13 +167,31 @@ def test_gaits_on_both_sides_of_a_curve_differ_in_its_sign(curves):
         assert_exact(curve, BOX, 3, random)
 
 
-def test_border_curves_pass_through_the_borders_of_the_branch(curves):
-    known = {
-        "clearance_sls1": 108.444834914,
-        "lambda_4_plus": 219.847688296,
-        "hit_planted_impulse": 167.754920847,
-        "friction_rear": 102.892041687,
-    }
+def test_the_scuffing_border_ends_with_double_support(curves):
+    scuffing, _ = curves
+    (end,) = [met for met in scuffing.meetings if met.ends_curve and met.values[0] < 100.0]
+    assert end.name in ("lambda_4_plus", "duration_dls")  # both vanish at once
+
+
+@pytest.mark.slow
+def test_margins_of_steps_are_as_exact_as_quantities_of_the_gait(cycle):
+    random = np.random.default_rng(4)
+    names = ("hit_planted_impulse", "friction_rear")
+    for curve in border_curves(names, OVER, cycle, bounds=BOX):
+        assert_through_the_branch(curve)
+        assert_exact(curve, BOX, 8, random)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("other", "ends"),
+    [("stiffness", (350.0, 700.0)), ("natural_length", (1.004, 1.05)), ("slope", (0.1, 0.45))],
+)
+def test_every_curve_of_a_map_is_exact(cycle, other, ends):
+    box = {"damping": (4.0, 240.0), other: ends}
+    random, over = np.random.default_rng(5), ("damping", other)
+    curves = border_curves(None, over, cycle, bounds=box)
+    assert len({curve.name for curve in curves}) >= 8
     for curve in curves:
-        off = np.abs(curve.values - (known[curve.name], 500.0)).max(1)
-        assert np.min(off) < 1e-7, curve.name
+        if len(curve.values) > 10:
+            assert_exact(curve, box, 4, random)

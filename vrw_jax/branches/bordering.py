@@ -18,13 +18,20 @@ import numpy as np
 from vrw_jax.branches.branch import Border
 from vrw_jax.branches.continuation import (
     ENDING,
-    INDICATORS,
     GaitRun,
     continue_branches,
     is_rough,
 )
 from vrw_jax.branches.followed import Wheel
-from vrw_jax.branches.gait_levels import EXACT, FORMAL, GaitAt, GaitLevel, formal_at, quantities_of
+from vrw_jax.branches.gait_levels import (
+    EXACT,
+    FORMAL,
+    VOID,
+    GaitAt,
+    GaitLevel,
+    formal_at,
+    quantities_of,
+)
 from vrw_jax.branches.run import BRANCH_POINT, AbstractRun, Strand, Table, run_all
 from vrw_jax.cycles import LimitCycle, Problem, on_mesh
 from vrw_jax.models import ViscoelasticWheel
@@ -92,10 +99,9 @@ class BorderRun(AbstractRun):
         return table | formal | shares
 
     def known(self, table: Table, owners: np.ndarray) -> Table:
-        """What vanishes all along a curve has no zeros on it. On an indicator's the step itself
-        goes one way or the other: what it says is void."""
+        """What vanishes all along a curve has no zeros on it."""
         names = np.array(self.names)[owners]
-        void = np.isin(names, INDICATORS)
+        void = np.isin(names, VOID)
         by_step = {name for name in table if name.partition("[")[0] in MARGINS} - set(FORMAL)
         blank = {name: names == name for name in {*self.names} & {*table}}
         blank |= {exact: names == name for name, exact in EXACT.items()}
@@ -252,8 +258,8 @@ def border_curves(
         if set(names) - set(found):
             seeds = map_of.along(axis, jax.tree.map(lambda x: x[None], params))
             at = float(getattr(params, parameter))
-            nearest = sorted(seeds, key=lambda seed, axis=axis: -abs(seed.at[axis] - at))
-            found = {seed.name: seed for seed in nearest} | found
+            away = np.argsort([-abs(seed.at[axis] - at) for seed in seeds])
+            found = {seeds[i].name: seeds[i] for i in away} | found
     missing = sorted(set(names) - set(found))
     if missing:
         raise ValueError(
@@ -457,4 +463,4 @@ class _Map(NamedTuple):
 
 
 def _can_follow(name: str) -> bool:
-    return name in (*BIFURCATIONS, *INDICATORS) or name.partition("[")[0] in MARGINS
+    return name in (*BIFURCATIONS, *VOID) or name.partition("[")[0] in MARGINS

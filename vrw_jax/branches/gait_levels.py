@@ -38,7 +38,11 @@ from vrw_jax.results import MARGINS
 from vrw_jax.wheel import PARAMETER_NAMES, parameters_of, transitions, wheel_of
 
 EXACT: Mapping[str, str] = GaitRun.exact
-FORMAL = (*INDICATORS, *EXACT.values())
+VOID = (*INDICATORS, "duration_sls1", "duration_sls2")
+"""Where one of these vanishes the step itself goes one way or the other: what it says is void. That
+of double support vanishes with the rear foot's force alone."""
+
+FORMAL = (*VOID, *EXACT.values())
 """Quantities of the collocated gait itself, which go on beyond the border."""
 
 
@@ -120,7 +124,7 @@ class GaitLevel(AbstractLevel):
         return one_wheel(correction_size)(z, correction)
 
     def valid(self, wheel: GaitAt, z: Solution, p: Array) -> Array:
-        return self.gaits.valid(self.at(wheel.gait, p), z, p[0])
+        return jnp.all((z.durations > -ROUNDING) | (wheel.gait.happens < 0.5))
 
 
 def _formal(problem: Problem, parameters: Array, happens: Array, z: Solution) -> Array:
@@ -130,13 +134,16 @@ def _formal(problem: Problem, parameters: Array, happens: Array, z: Solution) ->
     landing = transitions.land(s, sls2.end.q[0], *sls2.end.v)
     fore, rear = transitions.landing_forces(s, landing)
     forces = landing.rear.normal, fore.normal, rear.normal
-    return jnp.stack([*forces, takeoff_acceleration(s, sls1)])
+    return jnp.stack([*forces, *z.durations[0, 1:], takeoff_acceleration(s, sls1)])
 
 
 def _monodromy(problem: Problem, parameters: Array, happens: Array, z: Solution) -> Array:
     located = Located(z, happens, *nothing_known(problem, z.section))
     return problem.pass_at(parameters, located).monodromy
 
+
+ROUNDING = 1e-9
+"""Of a duration that is zero all along a curve, s."""
 
 DIFFERENCE = 1e-6
 """Of a parameter, over its value, for slopes of what only a step tells."""

@@ -197,7 +197,7 @@ def _zeros(run: AbstractRun, pieces: _Pieces, asked: list[tuple[int, int, str]])
     return [
         _Zero(
             asked[i],
-            float(best.p[i]),
+            float(best.p[i] if np.isfinite(best.p[i]) else left.p[i]),
             float(found.place[i]),
             taken(beside, slice(i, i + 1)),
             taken(table, slice(i, i + 1)),
@@ -352,8 +352,8 @@ def run_all(
     tracks = _follow_both_ways(run, z, p)
     # What comes back to its start has gone both ways at once.
     closed = (tracks.ending == int(Ending.CLOSED)).all(1, keepdims=True) & np.array([True, False])
-    kept = found[:, None] & ~closed
-    tracks = tracks._replace(n_points=np.where(kept, tracks.n_points, 0))
+    counts: Any = np.where(found[:, None] & ~closed, tracks.n_points, 0)
+    tracks = tracks._replace(n_points=counts)
     pieces = _collected(run, tracks)
     n_wheels = len(found)
     starts = {

@@ -19,6 +19,7 @@ from vrw_jax.figures.style import (
     SKY,
     axis_label,
     figure_style,
+    typeset,
 )
 from vrw_jax.results import what_breaks
 
@@ -28,7 +29,10 @@ STYLES = [(color, dash) for dash in ("-", "--", ":") for color in (
 
 @figure_style()
 def map_figure(scan: xr.Dataset, measure: str, curves: Sequence[BorderCurve]) -> Figure:
-    """The measure of the scan's gaits in colours, grey where there is none, and every border."""
+    """The measure of the scan's gaits in colours, grey where there is none, and every border.
+
+    Thin where the gaits on it are not stable.
+    """
     x, y = curves[0].parameters if curves else tuple(map(str, scan.dims))
     figure = Figure(figsize=(PAGE, 0.62 * PAGE))
     axes = figure.subplots()
@@ -40,14 +44,21 @@ def map_figure(scan: xr.Dataset, measure: str, curves: Sequence[BorderCurve]) ->
     figure.colorbar(image, ax=axes, aspect=30, pad=0.01).set_label(axis_label(measure))
     names = sorted({curve.name for curve in curves})
     styles = dict(zip(names, itertools.cycle(STYLES), strict=False))
-    labels = {name: what_breaks(name) for name in names}
+    labels = {name: typeset(what_breaks(name)) for name in names}
     for curve in curves:
         color, dash = styles[curve.name]
-        told = labels.pop(curve.name, None)  # several pieces of a border are told once
-        axes.plot(*curve.values.T, color=color, linestyle=dash, linewidth=1.0, label=told)
+        stable = curve.dataset.spectral_radius.values < 1.0
+        for there, width in ((stable, 1.2), (~stable, 0.5)):
+            # A point of what follows joins them; several pieces of a border are told once.
+            joined = there | np.append(False, there[:-1])
+            drawn = np.where(joined[:, None], curve.values, np.nan)
+            told = labels.pop(curve.name, None) if there.any() else None
+            axes.plot(*drawn.T, color=color, linestyle=dash, linewidth=width, label=told)
     met = np.array([meeting.values for curve in curves for meeting in curve.meetings])
-    points = {"markersize": 2.5, "markerfacecolor": "white", "markeredgewidth": 0.6}
-    axes.plot(*met.reshape(-1, 2).T, "o", color="black", **points, label="two borders at once")
+    axes.plot(
+        *met.reshape(-1, 2).T, "o", color="black", markersize=2.5, markerfacecolor="white",
+        markeredgewidth=0.6, label="two borders at once",
+    )  # fmt: skip
     axes.set_xlim(*scan[x].values[[0, -1]])
     axes.set_ylim(*scan[y].values[[0, -1]])
     axes.set_xlabel(axis_label(x))

@@ -9,6 +9,7 @@ Lengths are measured in the section's numbers and in the parameter as a share of
 
 import abc
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -324,6 +325,24 @@ def _ending(
     return ending.astype(jnp.int32)
 
 
+def _started(
+    followed: AbstractFollowed,
+    options: ArclengthOptions,
+    bounds: Array,
+    z: Unknown,
+    p: Scalar,
+    direction: Scalar,
+) -> _State:
+    x = followed.section(z)
+    n, dtype = x.shape[0], x.dtype
+    zero, none, no = jnp.zeros((), dtype), jnp.zeros((), jnp.int32), jnp.asarray(False)
+    flat, share = jax.tree.map(jnp.zeros_like, z), _share_of(p, bounds)
+    here = PathPoint(z, p, flat, zero + direction, jnp.zeros((n, n), dtype), no)
+    trial = _Trial(Plane(x, share, jnp.zeros_like(x), zero + 1.0), z, share, zero, no)
+    going = none + int(Ending.GOING)
+    return _State(here, here, zero + options.first_step, trial, none, none, going, none)
+
+
 @eqx.filter_jit
 def follow(
     followed: AbstractFollowed,
@@ -339,16 +358,6 @@ def follow(
     Each ends at the range's end, or with its first point that is not `valid`, which is kept. Each
     turn of the loop is one linearisation: of the running trials, whatever points they are for.
     """
-
-    def started(z: Unknown, p: Scalar, direction: Scalar) -> _State:
-        x = followed.section(z)
-        n, dtype = x.shape[0], x.dtype
-        zero, none, no = jnp.zeros((), dtype), jnp.zeros((), jnp.int32), jnp.asarray(False)
-        flat, share = jax.tree.map(jnp.zeros_like, z), _share_of(p, bounds)
-        here = PathPoint(z, p, flat, zero + direction, jnp.zeros((n, n), dtype), no)
-        trial = _Trial(Plane(x, share, jnp.zeros_like(x), zero + 1.0), z, share, zero, no)
-        going = none + int(Ending.GOING)
-        return _State(here, here, zero + options.first_step, trial, none, none, going, none)
 
     def iterate(
         wheel: Any, direction: Scalar, state: _State
@@ -384,6 +393,7 @@ def follow(
         points = jax.tree.map(put, points, reached._replace(slope=()))
         return jax.vmap(select)(going, after, state), points
 
+    started = functools.partial(_started, followed, options, bounds)
     states = jax.vmap(started)(z, p, directions)
     room = lambda x: jnp.zeros((x.shape[0], options.max_points, *x.shape[1:]), x.dtype)
     going = lambda carry: jnp.any(carry[0].ending == int(Ending.GOING))

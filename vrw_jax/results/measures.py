@@ -302,6 +302,8 @@ def locked_legs(n_legs: int) -> xr.Variable:
 def what_breaks(name: str) -> str:
     """What happens where a margin or an indicator is zero; `name` may end in its leg, "[5]"."""
     base, _, leg = name.partition("[")
+    if base in STEP and not MEASURES[base].breaks:
+        return f"{MEASURES[base].long_name} is zero"
     if base not in MEASURES or not MEASURES[base].breaks:
         return name.replace("_", " ")
     symbol = f"{MEASURES[base].symbol} = 0: " if base in STEP else ""
