@@ -386,7 +386,7 @@ def events(rows: list[Row]) -> list[Row]:
 
 def dips(rows: list[Row]) -> list[Row]:
     """Counts by kind of case, over all chunks."""
-    counts = ("cases", "stepped", "gave_up", "differ", "missed", "missed_by_tight")
+    counts = ("cases", "stepped", "gave_up", "differ", "other_outcome", "other_by_tight")
     return [
         {"kind": kind} | {name: str(sum(int(row[name]) for row in some)) for name in counts}
         for kind, some in groups(rows, "kind").items()

@@ -223,8 +223,8 @@ def dips(cases: int, done: int) -> Rows:
         asked = np.flatnonzero((mine != tight) & ~gave_up)
         few = taken(jax.tree.map(lambda x: np.broadcast_to(x, MANY), params), asked)
         codes = isolated(made, few, starts[asked])[0] if len(asked) else mine[asked]
-        missed = asked[mine[asked] != codes]
-        pairs = zip(mine[missed], codes[mine[asked] != codes], strict=True)
+        other = asked[mine[asked] != codes]
+        pairs = zip(mine[other], codes[mine[asked] != codes], strict=True)
         yield {
             "kind": kind,
             "chunk": chunk,
@@ -232,7 +232,7 @@ def dips(cases: int, done: int) -> Rows:
             "stepped": int((mine == Outcome.STEPPED).sum()),
             "gave_up": int(gave_up.sum()),
             "differ": len(asked),
-            "missed": len(missed),
-            "missed_by_tight": int((tight[asked] != codes).sum()),
+            "other_outcome": len(other),
+            "other_by_tight": int((tight[asked] != codes).sum()),
             "ours/isolated": "; ".join(f"{Outcome(a).name}/{Outcome(b).name}" for a, b in pairs),
         }
