@@ -22,9 +22,11 @@ with install_import_hook(ROOMS, "beartype.beartype"):
 vrw_jax.start_jax(os.environ.get("VRW_TEST_CACHE", ROOT / ".jax_cache"))
 
 COMPILE_LONGEST = (
-    "test_continuation", "test_limit_cycle", "test_derivatives", "test_tune", "test_unilateral",
-    "test_ground_gaits", "test_scan", "test_reproduction", "test_outcomes", "test_model_choice",
-    "test_basin",
+    "test_continuation", "test_limit_cycle", "test_reaching", "test_engines", "test_unilateral",
+    "test_tune", "test_answer", "test_ground_gaits", "test_derivatives", "test_reproduction",
+    "test_model_choice", "test_step_accuracy", "test_scan", "test_models_used", "test_outcomes",
+    "test_web_digits", "test_inputs", "test_second_formulation", "test_basin", "test_printing",
+    "test_wrong_calls", "test_own_loops", "test_types", "test_experiments",
 )  # fmt: skip
 
 

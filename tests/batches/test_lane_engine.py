@@ -10,6 +10,7 @@ from support.batched import IN_TIME, wheels_like
 import vrw_jax as vrw
 from vrw_jax import Outcome, simd
 from vrw_jax.batches import batch as lane_batch
+from vrw_jax.batches import programs
 from vrw_jax.batches.stiffness import cheapest_solver
 from vrw_jax.numerics.march import LanePhase, integrate_lanes
 from vrw_jax.numerics.tableaus import (
@@ -140,13 +141,13 @@ def test_blocks_of_xla_as_on_a_gpu_go_as_the_machine_code(monkeypatch):
     vectors, states = hard_starts(300)
     found, codes = told(vectors, states, COARSE)
     monkeypatch.setattr(simd, "serves", lambda: False)
-    monkeypatch.setattr(lane_batch, "BLOCK", 64)
-    monkeypatch.setattr(lane_batch, "FEW", 10**9)  # waits for all
+    monkeypatch.setattr(programs, "BLOCK", 64)
+    monkeypatch.setattr(programs, "FEW", 10**9)  # waits for all
     patient, code = told(vectors, states, COARSE)
     np.testing.assert_array_equal(code, codes)
     # Their step control takes powers that differ in the sixth digit: both keep their tolerance.
     np.testing.assert_allclose(patient, found, rtol=1e-4, atol=1e-4)
-    monkeypatch.setattr(lane_batch, "FEW", 2)  # late lanes run again, and change no bit
+    monkeypatch.setattr(programs, "FEW", 2)  # late lanes run again, and change no bit
     again, code = told(vectors, states, COARSE)
     np.testing.assert_array_equal(again, patient)
     np.testing.assert_array_equal(code, codes)
@@ -403,8 +404,8 @@ def test_a_stiff_wheel_whose_phase_lasts_longer_than_expected_goes_to_an_implici
     starts = np.tile([0.1, 1.6, -0.1], (2, 1))
     options = vrw.Options(rtol=1e-6, atol=1e-6, max_solver_steps=1000)
     found = vrw.steps(truth.wheels(vectors), starts, options=options)
-    told = [found.solvers[i] for i in found.solver]
-    assert told == [lane_batch.IMPLICIT_SOLVER, lane_batch.STABLE_SOLVER]
+    solvers = [found.solvers[i] for i in found.solver]
+    assert solvers == [lane_batch.IMPLICIT_SOLVER, lane_batch.STABLE_SOLVER]
     assert list(found.outcome) == [Outcome.FELL_BACK, Outcome.FELL_BACK]
     _, code = told(vectors[1:], starts[1:], options)
     assert code[0] == Outcome.FELL_BACK

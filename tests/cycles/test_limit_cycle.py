@@ -248,12 +248,13 @@ def test_the_step_tells_the_smooth_premise_that_the_cycle_does():
 
 
 def test_a_mesh_too_coarse_says_so_and_more_of_it_finds_the_gait():
-    params = vrw.WheelParams(damping=190.6, stiffness=838.6, natural_length=1.0211, slope=0.126)
-    coarse, fine = (vrw.CycleOptions(steps=steps) for steps in ((2, 1, 1), (30, 30, 10)))
-    cycle = vrw.limit_cycle(params, options=coarse)
-    assert int(cycle.outcome) == Outcome.MESH_TOO_COARSE
-    assert "more steps" in cycle.why
-    assert int(vrw.limit_cycle(params, options=fine).outcome) == Outcome.STEPPED
+    row = table_1(slope=0.12)
+    coarse, fine = (
+        jax.tree.map(lambda x: x[0], differentiated(row, options)[1]) for options in (None, TIGHT)
+    )
+    assert int(coarse.outcome) == Outcome.MESH_TOO_COARSE
+    assert "more steps" in coarse.why
+    assert int(fine.outcome) == Outcome.STEPPED
 
 
 def test_gait_without_double_support_is_found_though_unstable():

@@ -44,8 +44,10 @@ def test_no_touchdown_in_time_is_a_code():
 
 
 def test_a_solver_that_runs_out_of_steps_is_a_code():
-    result = vrw.step(vrw.WheelParams(), GAIT, options=vrw.Options(max_solver_steps=4))
+    stiff = vrw.WheelParams(damping=1e8)  # explicit steps of nanoseconds
+    result = vrw.step(stiff, GAIT)
     assert int(result.outcome) == Outcome.SOLVER_GAVE_UP
+    assert int(result.solver_steps) >= vrw.Options().max_solver_steps
 
 
 @pytest.mark.parametrize(
