@@ -10,12 +10,14 @@ from oracle import moreau_jean
 
 import vrw_jax as vrw
 from vrw_jax.models.unilateral.contacts import (
+    ANY_MODE,
     OFF,
     SLIP_DOWN,
     SLIP_UP,
     STICK,
     Allowed,
     Negligible,
+    answer,
     choose,
 )
 from vrw_jax.models.unilateral.mechanics import (
@@ -100,17 +102,18 @@ def chosen(q, v, at_stopper, locked, friction, moving):
     hub = hub_of(s, motion, slots, locked)
     levels = free_acceleration(s, resting, slots, hub), free_velocity(s, motion, slots, hub)
     free = jax.tree.map(lambda a, b: jnp.where(moving, a, b), *levels)
-    never = jnp.zeros((2, 4), bool)
+    none = jnp.zeros(2, jnp.int32)
     allowed = Allowed(
-        contact=~never,
-        held=jnp.stack([jnp.ones((2,), bool), at_stopper], axis=1),
-        stays=never[:, 0],
-        known_contact=never,
+        contact=none + ANY_MODE,
+        held=at_stopper,
+        stays=none > 0,
+        known_contact=none,
         known_open=~at_stopper,
     )
     small = Negligible(jnp.asarray(1e-12), jnp.asarray(1e-12))  # no case is near a border
     choice = choose(s, hub, free, allowed, friction, small, True)
-    rates = jnp.stack([*choice.answer.hub, *choice.answer.length])
+    found = answer(s, hub, free, choice.contact, choice.held, friction)
+    rates = jnp.stack([*found.hub, *found.length])
     return choice.contact, choice.held, rates, choice.solutions
 
 

@@ -23,8 +23,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Int
 
+from vrw_jax import simd
 from vrw_jax.models.unilateral.mechanics import Free, Hub, Pair, Vector3, kept
-from vrw_jax.numerics import Elementwise, Scalar
+from vrw_jax.numerics import Elementwise, select
 from vrw_jax.wheel import Symbols
 
 Roughness = Elementwise | Pair
@@ -226,27 +227,76 @@ ORDER_WITHOUT_SLIP = np.argsort(
 )
 """The order by the paper's rule: sliding comes last."""
 AT_ONCE = 8
-"""Combinations looked at together: most events allow no more."""
+"""Combinations that XLA looks at together: most events allow no more. Machine code takes one after
+the other."""
+ANY_MODE = (1 << 4) - 1
+"""The set of all modes, each a bit."""
+
+Rows = tuple[Any, Any]
+"""A set of the table's rows: bits of two words."""
+
+
+class _Order(NamedTuple):
+    """The table in one order, by the sets of its rows that have something in common."""
+
+    contact: list[list[Rows]]  # by slot and mode
+    held: list[Rows]  # by slot
+
+    @classmethod
+    def of(cls, rows: np.ndarray) -> "_Order":
+        def packed(flags: np.ndarray) -> Rows:
+            words = np.packbits(np.append(flags, False), bitorder="little").view("<i4")
+            return words[0], words[1]
+
+        modes, held = MODES[rows].T, HELD[rows].T
+        contact = [[packed(own == mode) for mode in range(4)] for own in modes]
+        return cls(contact, [packed(own) for own in held])
+
+
+_ORDERS = _Order.of(ORDER_WITHOUT_SLIP), _Order.of(np.arange(len(MODES)))
+
+
+def _order(by_paper: Array) -> _Order:
+    """By the rule of each wheel."""
+    return jax.tree.map(lambda yes, no: jnp.where(by_paper, yes, no), *_ORDERS)
 
 
 class Allowed(NamedTuple):
-    """What may be chosen, and which signs are known without looking."""
+    """What may be chosen, and which signs are known without looking. Sets of modes are bits."""
 
-    contact: Bool[Array, "2 4"]  # modes of each slot's foot
-    held: Bool[Array, "2 2"]  # stopper open, held
-    stays: Bool[Array, "2"]  # the foot keeps its mode whatever it takes
-    known_contact: Bool[Array, "2 4"]  # lifts, sticks or slides that way without a test
-    known_open: Bool[Array, "2"]  # an open stopper needs no test: the leg is away from it
+    contact: Int[Array, "2 ..."]  # modes of each slot's foot
+    held: Bool[Array, "2 ..."]  # the stopper may hold; it may always be open
+    stays: Bool[Array, "2 ..."]  # the foot keeps its mode whatever it takes
+    known_contact: Int[Array, "2 ..."]  # lifts, sticks or slides that way without a test
+    known_open: Bool[Array, "2 ..."]  # an open stopper needs no test: the leg is away from it
+
+    def rows(self, order: _Order) -> Rows:
+        """Of the table, those that may be chosen."""
+
+        def word(w: int) -> Array:
+            left = jnp.full_like(self.contact[0], -1, jnp.int32)
+            for i in range(2):
+                by_mode = enumerate(order.contact[i])
+                mine = [jnp.where(has(self.contact[i], m), rows[w], 0) for m, rows in by_mode]
+                may_hold = jnp.where(self.held[i], -1, ~order.held[i][w])
+                left = left & (mine[0] | mine[1] | mine[2] | mine[3]) & may_hold
+            return left
+
+        return word(0), word(1)
 
 
-class Choice(NamedTuple):
-    """The combination taken."""
+def has(modes: Array, mode: Array | int) -> Bool[Array, "..."]:
+    """Whether a set of modes has this one."""
+    return ((modes >> mode) & 1) > 0
 
-    contact: Int[Array, "2"]
-    held: Bool[Array, "2"]
-    answer: Answer
+
+class Chosen(NamedTuple):
+    """What the table says."""
+
+    contact: Int[Array, "2 ..."]
+    held: Bool[Array, "2 ..."]
     wrong: Elementwise  # how far its worst sign is off, see `Negligible`; 0 where it is admissible
-    solutions: Int[Array, ""]  # admissible combinations, no less than 1 where `wrong` is small
+    solutions: Int[Array, "..."]  # admissible combinations, no less than 1 where `wrong` is small
 
 
 class Negligible(NamedTuple):
@@ -263,10 +313,10 @@ ACCEPTED = 1e3
 class _Looked(NamedTuple):
     """How far the table has been gone through."""
 
-    next: Int[Array, ""]  # of the combinations that may be chosen
-    best: Int[Array, ""]  # the first admissible one, else the one that is least wrong
-    wrong: Scalar
-    solutions: Int[Array, ""]
+    left: Rows  # of those that may be chosen
+    best: Rows  # the first admissible one, else the one that is least wrong
+    wrong: Elementwise
+    solutions: Int[Array, "..."]
 
 
 def _wrong(
@@ -288,7 +338,7 @@ def _wrong(
     for i in range(2):
         mode = contact[i]
         unless = lambda known, value: jnp.where(known, 0.0, value)
-        known = jnp.take(allowed.known_contact[i], mode)
+        known = has(allowed.known_contact[i], mode)
         t, n, x, z = (v[i] for v in (found.tangential, found.normal, found.foot_x, found.foot_z))
         pulls, outside = -n / small.force, unless(_at(i, infinite), jnp.abs(t) - _at(i, rough) * n)
         rests = unless(known, jnp.maximum(pulls, outside / small.force))
@@ -312,46 +362,46 @@ def choose(
     friction: Roughness,
     small: Negligible,
     counted: bool,
-) -> Choice:
+) -> Chosen:
     """The first admissible combination of the table; `solutions` is 0 where there is none.
 
     All admissible ones are counted, or else none is looked at once one is found. Where none is,
     the one that is least wrong is taken, if that is little: two touch by rounding, or part by it.
     """
-    modes, held = jnp.asarray(MODES), jnp.asarray(HELD)
     wrong = functools.partial(_wrong, *lax.stop_gradient((s, hub, free, friction)), allowed, small)
-    may = jnp.stack([allowed.contact[i][modes[:, i]] for i in range(2)])
-    may = may & jnp.stack([allowed.held[i][held[:, i].astype(jnp.int32)] for i in range(2)])
     by_paper = each(lambda value: value == THE_PAPERS, friction)
-    by_paper = by_paper[0] & by_paper[1] if isinstance(by_paper, tuple) else by_paper
-    order = jnp.where(by_paper, jnp.asarray(ORDER_WITHOUT_SLIP), jnp.arange(len(MODES)))
-    rank = jnp.cumsum(jnp.all(may, axis=0)[order].astype(jnp.int32))
-    count = rank[-1]
+    order = _order(by_paper[0] & by_paper[1] if isinstance(by_paper, tuple) else by_paper)
+
+    def told(row: Rows) -> tuple[Array, Array]:
+        """Modes and stoppers of a row."""
+        within = lambda rows: ((row[0] & rows[0]) | (row[1] & rows[1])) != 0
+        modes = [sum(jnp.where(within(own[m]), m, 0) for m in range(1, 4)) for own in order.contact]
+        return jnp.stack(modes).astype(jnp.int32), jnp.stack([within(own) for own in order.held])
+
+    def goes_on(looked: _Looked) -> Array:
+        return ((looked.left[0] | looked.left[1]) != 0) & (counted | (looked.solutions == 0))
 
     def look(looked: _Looked) -> _Looked:
         """At the next few combinations that may be chosen."""
-        nth = looked.next + jnp.arange(AT_ONCE)
-        row = order[jnp.minimum(jnp.sum(rank[None] <= nth[:, None], axis=1), len(MODES) - 1)]
-        off = jnp.where(nth < count, jax.vmap(wrong)(modes[row], held[row]), jnp.inf)
-        least = jnp.argmin(off)
-        better = off[least] < looked.wrong
-        return _Looked(
-            looked.next + AT_ONCE,
-            jnp.where(better, row[least], looked.best).astype(jnp.int32),
-            jnp.where(better, off[least], looked.wrong),
-            looked.solutions + jnp.sum(off == 0.0, dtype=jnp.int32),
-        )
+        (left, best, least, solutions), rows = looked, []
+        for _ in range(1 if simd.tracing() else AT_ONCE):
+            row = left[0] & -left[0], jnp.where(left[0] == 0, left[1] & -left[1], 0)
+            left = left[0] ^ row[0], left[1] ^ row[1]
+            rows.append(row)
+        contact, on = (jnp.stack(parts) for parts in zip(*map(told, rows), strict=True))
+        offs = jax.vmap(wrong)(contact, on) if len(rows) > 1 else [wrong(contact[0], on[0])]
+        for row, off in zip(rows, offs, strict=True):
+            off = jnp.where((row[0] | row[1]) != 0, off, jnp.inf)
+            best, least = select(off < least, (row, off), (best, least))
+            solutions = solutions + (off == 0.0)
+        return select(goes_on(looked), _Looked(left, best, least, solutions), looked)
 
-    def goes_on(looked: _Looked) -> Array:
-        return (looked.next < count) & (counted | (looked.solutions == 0))
-
-    none = 0 * count
-    far = jnp.full_like(lax.stop_gradient(free.hub[0]), jnp.inf)
-    looked = lax.while_loop(goes_on, look, _Looked(none, none, far, none))
-    contact, on = modes[looked.best], held[looked.best]
-    found = answer(s, hub, free, contact, on, friction)
-    solutions = jnp.maximum(looked.solutions, looked.wrong <= ACCEPTED)
-    return Choice(contact, on, found, looked.wrong, solutions)
+    left = allowed.rows(order)
+    far = jnp.full_like(lax.stop_gradient(free.hub[2]), jnp.inf)
+    begin = _Looked(left, (0 * left[0] + 1, 0 * left[1]), far, 0 * left[0])
+    looked = lax.while_loop(lambda looked: jnp.any(goes_on(looked)), look, begin)
+    solutions = jnp.maximum(looked.solutions, (looked.wrong <= ACCEPTED).astype(jnp.int32))
+    return Chosen(*told(looked.best), looked.wrong, solutions)
 
 
 def leaves(
@@ -360,9 +410,9 @@ def leaves(
     free: Free,
     stance: tuple[Array, Array],
     friction: Roughness,
-    second: Bool[Array, ""],
-    direction: Int[Array, ""],
-) -> Bool[Array, ""]:
+    second: Bool[Array, "..."],
+    direction: Int[Array, "..."],
+) -> Bool[Array, "..."]:
     """Whether a slot's foot, just let go by its present mode, would move the way it is let go.
 
     `second`: which slot's; `direction`: 0 off the ground, 1 downhill, -1 uphill. The mode's margin

@@ -1,22 +1,28 @@
-"""What an event changes: impacts by momentum, then which feet and stoppers carry the motion on."""
+"""What an event changes: impacts by momentum, then which feet and stoppers carry the motion on.
+
+Of one wheel or, element by element, of lanes.
+"""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Int
 
 from vrw_jax.models.unilateral.contacts import (
     ACCEPTED,
+    ANY_MODE,
     OFF,
     SLIP_DOWN,
     SLIP_UP,
     STICK,
     THE_PAPERS,
     Allowed,
-    Choice,
+    Answer,
+    Chosen,
     Negligible,
     Roughness,
     answer,
@@ -27,6 +33,7 @@ from vrw_jax.models.unilateral.mechanics import (
     Free,
     Hub,
     Legs,
+    Pair,
     Slots,
     WheelMotion,
     directions,
@@ -38,35 +45,41 @@ from vrw_jax.models.unilateral.mechanics import (
     kinetic_energy,
     of_slots,
     slots_of,
+    stilled,
 )
 from vrw_jax.models.unilateral.motion import Guards, Stance, as_row
-from vrw_jax.numerics import Elementwise, Scalar, select, zeros_of
+from vrw_jax.numerics import Elementwise, select
 from vrw_jax.wheel import Symbols
 
 
 class Event(NamedTuple):
     """What happened: one flag is set."""
 
-    lands: Bool[Array, " n_legs"]  # its foot met the ground
-    closes: Bool[Array, " n_legs"]  # it met its stopper
-    loosens: Bool[Array, " n_legs"]  # in the air, its stopper force vanished
-    lifts: Bool[Array, "2"]  # the slot's normal force vanished
-    slides_up: Bool[Array, "2"]  # friction no longer holds the slot's foot
-    slides_down: Bool[Array, "2"]
-    stops: Bool[Array, "2"]  # the slot's foot no longer slides
-    releases: Bool[Array, "2"]  # the stopper force of the slot's leg vanished
+    lands: Bool[Array, "n_legs ..."]  # its foot met the ground
+    closes: Bool[Array, "n_legs ..."]  # it met its stopper
+    loosens: Bool[Array, "n_legs ..."]  # in the air, its stopper force vanished
+    lifts: Bool[Array, "2 ..."]  # the slot's normal force vanished
+    slides_up: Bool[Array, "2 ..."]  # friction no longer holds the slot's foot
+    slides_down: Bool[Array, "2 ..."]
+    stops: Bool[Array, "2 ..."]  # the slot's foot no longer slides
+    releases: Bool[Array, "2 ..."]  # the stopper force of the slot's leg vanished
 
     @property
-    def impact(self) -> Bool[Array, ""]:
+    def impact(self) -> Bool[Array, "..."]:
         """Whether velocities jump."""
-        return jnp.any(self.lands) | jnp.any(self.closes)
+        return jnp.any(self.lands, axis=0) | jnp.any(self.closes, axis=0)
 
 
-def event_of(place: Guards, guard: Int[Array, ""]) -> Event:
+def _counted(n: int, like: Array) -> np.ndarray:
+    """0 ... n - 1 on the first axis, of numbers of this shape."""
+    return np.arange(n, dtype=np.int32).reshape(-1, *(1,) * jnp.ndim(like))
+
+
+def event_of(place: Guards, guard: Int[Array, "..."]) -> Event:
     """The event of a guard's index."""
     n = place.n_legs
-    flags = lambda start, count: guard == start + jnp.arange(count)
-    loosens = flags(place.loosen, n) if place.total > place.loosen else jnp.zeros((n,), bool)
+    flags = lambda start, count: guard == start + _counted(count, guard)
+    loosens = flags(place.loosen, n) if place.total > place.loosen else flags(place.foot, n) & False
     return Event(
         lands=flags(place.foot, n),
         closes=flags(place.leg, n),
@@ -100,14 +113,24 @@ MOST_LEGS = 8
 class _Solved(NamedTuple):
     """What a guess of the legs held in the air leads to."""
 
-    choice: Choice
+    chosen: Chosen
+    answer: Answer
     push: Legs  # of the stoppers, N or N s
     outward: Legs  # of the legs, m/s^2 or m/s
-    more: Any
+    motion: WheelMotion  # of an impact: after it
+
+
+_Solve = Callable[[Law, WheelMotion, Array, Chosen | None], _Solved]
+"""By the legs in the air that are held, and by what is chosen, if that is known."""
 
 
 def _that_push(
-    solve: Callable[[Array], _Solved], at_stopper: Array, asked: Array, small: Negligible
+    solve: _Solve,
+    law: Law,
+    motion: WheelMotion,
+    at_stopper: Array,
+    asked: Array,
+    small: Negligible,
 ) -> tuple[_Solved, Array]:
     """What `solve` finds for the legs in the air that are held, and which those are.
 
@@ -117,34 +140,39 @@ def _that_push(
     all combinations are gone through. The least wrong one is taken; it is admissible if that is
     little, see `ACCEPTED`.
     """
-    place, rank = jnp.arange(at_stopper.shape[0]), jnp.cumsum(asked.astype(jnp.int32)) - 1
-    many = 2 ** jnp.minimum(jnp.sum(asked, dtype=jnp.int32), MOST_LEGS)
-
-    def switch(now: tuple) -> tuple:
-        held, code, tries, best = now
-        found = solve(held)
-        off = jnp.where(held, -found.push / small.force, found.outward / small.motion)
-        off = jnp.where(asked, lax.stop_gradient(off), 0.0)
-        wrong = off > 1.0
-        worst = jnp.maximum(jnp.max(off), found.choice.wrong)
-        best = select(worst < best[0], (worst, held, found), best)
-        last = place == jnp.max(jnp.where(wrong, place, -1))
-        pivoted = held ^ jnp.where(tries < AT_ONCE, wrong, last)
-        pivots = (code < 0) & jnp.any(wrong) & (tries < AT_ONCE + IN_TURN)
-        code = jnp.where(pivots, code, code + 1)
-        counted = jnp.where(asked, ((code >> rank) & 1) == 1, at_stopper)
-        return jnp.where(pivots, pivoted, counted), code, tries + 1, best
+    still = stilled((law, motion))
+    rank = jnp.cumsum(asked.astype(jnp.int32), axis=0) - 1
+    many = 1 << jnp.minimum(jnp.sum(asked, axis=0, dtype=jnp.int32), MOST_LEGS)
+    place = _counted(len(at_stopper), many)
 
     def goes_on(now: tuple) -> Array:
         _, code, tries, best = now
         return (tries == 0) | ((best[0] > 1.0) & (code < many))
 
-    empty, none = zeros_of(solve, at_stopper), jnp.zeros((), jnp.int32)
-    unknown = jnp.full_like(empty.choice.wrong, jnp.inf), at_stopper, empty
-    begin = at_stopper, none - 1, none, unknown
-    worst, held, found = lax.while_loop(goes_on, switch, begin)[3]
-    solutions = jnp.where(worst <= ACCEPTED, found.choice.solutions, 0)
-    return found._replace(choice=found.choice._replace(solutions=solutions)), held
+    def switch(now: tuple) -> tuple:
+        held, code, tries, best = now
+        found = solve(*still, held, None)
+        off = jnp.where(held, -found.push / small.force, found.outward / small.motion)
+        off = jnp.where(asked, lax.stop_gradient(off), 0.0)
+        wrong = off > 1.0
+        worst = jnp.maximum(jnp.max(off, axis=0), found.chosen.wrong)
+        best = select(worst < best[0], (worst, held, found.chosen), best)
+        last = place == jnp.max(jnp.where(wrong, place, -1), axis=0)
+        pivoted = held ^ jnp.where(tries < AT_ONCE, wrong, last)
+        pivots = (code < 0) & jnp.any(wrong, axis=0) & (tries < AT_ONCE + IN_TURN)
+        code = jnp.where(pivots, code, code + 1)
+        counted = jnp.where(asked, ((code >> rank) & 1) == 1, at_stopper)
+        return select(
+            goes_on(now), (jnp.where(pivots, pivoted, counted), code, tries + 1, best), now
+        )
+
+    none, two = jnp.zeros_like(many), jnp.stack([many, many]) * 0
+    far = jnp.full_like(still[1].theta, jnp.inf)
+    begin = at_stopper, none - 1, none, (far, at_stopper, Chosen(two, two > 0, far, none))
+    found = lax.while_loop(lambda now: jnp.any(goes_on(now)), switch, begin)
+    worst, held, chosen = found[3]
+    chosen = chosen._replace(solutions=jnp.where(worst <= ACCEPTED, chosen.solutions, 0))
+    return solve(law, motion, held, chosen), held
 
 
 class Change(NamedTuple):
@@ -152,25 +180,25 @@ class Change(NamedTuple):
 
     motion: WheelMotion
     stance: Stance
-    energy_lost: Scalar  # J
-    normal_impulse: tuple[Scalar, Scalar]  # on the slots' feet, N s
-    tangential_impulse: tuple[Scalar, Scalar]
-    stopper_impulse: Scalar  # least of the locked legs in the air, N s; inf without an impact
-    solutions: Int[Array, ""]  # admissible combinations: the worse of both levels
-    paradox: Bool[Array, ""]  # no forces carry the motion on
-    most_solutions: Int[Array, ""]
-    third_foot: Bool[Array, ""]  # three feet would have to be loaded
+    energy_lost: Elementwise  # J
+    normal_impulse: Pair  # on the slots' feet, N s
+    tangential_impulse: Pair
+    stopper_impulse: Elementwise  # least of the locked legs in the air, N s; inf without an impact
+    solutions: Int[Array, "..."]  # admissible combinations: the worse of both levels
+    paradox: Bool[Array, "..."]  # no forces carry the motion on
+    most_solutions: Int[Array, "..."]
+    third_foot: Bool[Array, "..."]  # three feet would have to be loaded
 
 
 def moved_by(
-    s: Symbols, motion: WheelMotion, slots: Slots, hub: Hub, airborne: Array, choice: Choice
+    s: Symbols, motion: WheelMotion, slots: Slots, hub: Hub, airborne: Array, found: Answer
 ) -> WheelMotion:
     """The motion with the velocities of an impact's answer."""
     free = free_velocity(s, motion, slots, hub)
-    vx, vz, dtheta = choice.answer.hub
+    vx, vz, dtheta = found.hub
     dL = free.legs + hub.legs.sin * vx + hub.legs.cos * vz
     held = jnp.where(airborne, 0.0, dL)
-    dL = jnp.where(slots.filled, slots.spread(choice.answer.length), held)
+    dL = jnp.where(slots.filled, slots.spread(found.length), held)
     return motion._replace(vx=vx, vz=vz, dtheta=dtheta, dL=dL)
 
 
@@ -194,30 +222,20 @@ def _without_gain(law: Law, motion: WheelMotion, thrown: _Solved, inelastic: _So
     stay in the cone, which is convex.
     """
     energy = lambda at: kinetic_energy(law.s, at)
-    low, high = energy(inelastic.more), energy(thrown.more)
-    half = energy(jax.tree.map(lambda a, b: 0.5 * (a + b), inelastic.more, thrown.more))
+    low, high = energy(inelastic.motion), energy(thrown.motion)
+    half = energy(jax.tree.map(lambda a, b: 0.5 * (a + b), inelastic.motion, thrown.motion))
     bend, slope = 2.0 * (low - 2.0 * half + high), 4.0 * half - 3.0 * low - high
     room = jnp.maximum(energy(motion) - low, 0.0)
     gains = high > energy(motion)
     root = jnp.sqrt(jnp.where(gains, slope * slope + 4.0 * bend * room, 1.0))
     share = jnp.where(gains, 2.0 * room / jnp.where(gains, slope + root, 1.0), 1.0)
     mixed = lambda a, b: jnp.where(gains, a + share * (b - a), b)
-    answer, push, outward, more = jax.tree.map(
-        mixed,
-        (inelastic.choice.answer, inelastic.push, inelastic.outward, inelastic.more),
-        (thrown.choice.answer, thrown.push, thrown.outward, thrown.more),
-    )
-    return _Solved(thrown.choice._replace(answer=answer), push, outward, more)
-
-
-def _is(mode: Array | int) -> Bool[Array, "... 4"]:
-    """A flag for each of the four contact modes: whether it is this one."""
-    return jnp.arange(4) == jnp.asarray(mode)[..., None]
+    return _Solved(thrown.chosen, *jax.tree.map(mixed, inelastic[1:], thrown[1:]))
 
 
 def _impact(
     law: Law, motion: WheelMotion, stance: Stance, event: Event
-) -> tuple[_Solved, Slots, Bool[Array, " n"]]:
+) -> tuple[_Solved, Slots, Bool[Array, "n ..."]]:
     """Velocity level: simultaneous, inelastic, with Coulomb's law in the impulse.
 
     Also says which legs in the air are held: with one-sided stoppers those that need not pull.
@@ -226,58 +244,62 @@ def _impact(
     s, slots = law.s, slots_of((stance.contact != OFF) | event.lands)
     friction = of_slots(law.friction, slots)
     at_stopper = stance.locked | event.closes
-    loaded = jnp.stack([jnp.any(slots.first), jnp.any(slots.second)])
+    loaded = jnp.stack([jnp.any(slots.first, axis=0), jnp.any(slots.second, axis=0)])
     stops, before = slots.flags(at_stopper), slots.codes(stance.contact)
-    planted = (before == STICK) & ~jnp.any(event.lands) & (as_row(friction) == THE_PAPERS)
-    modes = jnp.where(loaded[:, None], jnp.ones((4,), bool), _is(OFF))
-    modes = jnp.where(planted[:, None], _is(before), modes)
+    lands = jnp.any(event.lands, axis=0)
+    planted = (before == STICK) & ~lands & (as_row(friction) == THE_PAPERS)
+    modes = jnp.where(loaded, ANY_MODE, 1 << OFF).astype(jnp.int32)
+    modes = jnp.where(planted, 1 << before, modes)
     allowed = Allowed(
-        contact=modes & event.impact,  # else nothing is to be looked at
-        held=jnp.stack([jnp.ones((2,), bool), stops], axis=1),
+        contact=jnp.where(event.impact, modes, 0),  # else nothing is to be looked at
+        held=stops,
         stays=planted,
-        known_contact=~loaded[:, None] & _is(OFF),
+        known_contact=jnp.where(loaded, 0, 1 << OFF).astype(jnp.int32),
         known_open=~stops,
     )
     small = Negligible(s.m * law.rest / ACCEPTED, law.rest / ACCEPTED)
 
-    def solve(airborne: Array) -> _Solved:
+    def solve(law: Law, motion: WheelMotion, airborne: Array, chosen: Chosen | None) -> _Solved:
+        s, friction = law.s, of_slots(law.friction, slots)
         hub = hub_of(s, motion, slots, airborne)
         free = free_velocity(s, motion, slots, hub)
         given = _thrown_back(law, motion, slots, hub, free)
-        choice = choose(s, hub, given, allowed, friction, small, law.counted)
-        after = moved_by(s, motion, slots, hub, airborne, choice)
+        if chosen is None:
+            chosen = choose(s, hub, given, allowed, friction, small, law.counted)
+        found = answer(s, hub, given, chosen.contact, chosen.held, friction)
+        after = moved_by(s, motion, slots, hub, airborne, found)
         jump_x, jump_z = after.vx - motion.vx, after.vz - motion.vz
         impulse = s.m * (hub.legs.sin * jump_x + hub.legs.cos * jump_z + motion.dL)
-        return _Solved(choice, impulse, after.dL, after)
+        return _Solved(chosen, found, impulse, after.dL, after)
 
     airborne = at_stopper & ~slots.filled
     if not law.one_sided:
-        return solve(airborne), slots, airborne
-    found, held = _that_push(solve, airborne, airborne & event.impact, small)
+        return solve(law, motion, airborne, None), slots, airborne
+    asked = airborne & event.impact
+    found, held = _that_push(solve, law, motion, airborne, asked, small)
     return found, slots, held
 
 
 def _following(
     event: Event, mode: Array, goes: Array, rigid: Array
-) -> tuple[Bool[Array, "2 4"], Bool[Array, "2 4"]]:
-    """Modes that may follow an event in each slot, and those of them that need no test.
+) -> tuple[Int[Array, "2 ..."], Int[Array, "2 ..."]]:
+    """Modes that may follow an event in each slot, and those of them that need no test: as bits.
 
     `goes`: what a slot's foot was about to become goes the right way (see `leaves`).
     """
-    rests = (mode == STICK) | event.stops
-    modes = jnp.where((mode == STICK)[:, None], jnp.ones((4,), bool), _is(mode) | _is(OFF))
-    back = jnp.where(mode == SLIP_DOWN, SLIP_UP, SLIP_DOWN)
-    modes = jnp.where(event.stops[:, None], _is(STICK) | _is(OFF) | _is(back), modes)
-    known = _is(mode) & ~rests[:, None]
-    stuck = jnp.full((2,), STICK)
-    for flags, forced, ended in (
-        (event.lifts, OFF, mode),
-        (event.slides_up, SLIP_UP, stuck),
-        (event.slides_down, SLIP_DOWN, stuck),
+    own, off = 1 << mode, 1 << OFF
+    modes = jnp.where(mode == STICK, ANY_MODE, own | off)
+    back = jnp.where(mode == SLIP_DOWN, 1 << SLIP_UP, 1 << SLIP_DOWN)
+    modes = jnp.where(event.stops, 1 << STICK | off | back, modes)
+    known = jnp.where((mode == STICK) | event.stops, 0, own)
+    for flags, following, ended in (
+        (event.lifts, off, own),
+        (event.slides_up, 1 << SLIP_UP, 1 << STICK),
+        (event.slides_down, 1 << SLIP_DOWN, 1 << STICK),
     ):
-        tested = ~_is(ended) & (goes | rigid | ~_is(forced))
-        modes = jnp.where(flags[:, None], jnp.where(goes, _is(forced), tested), modes)
-        known = jnp.where(flags[:, None], goes & _is(forced), known)
+        tested = ANY_MODE & ~ended & jnp.where(goes | rigid, ANY_MODE, ~following)
+        modes = jnp.where(flags, jnp.where(goes, following, tested), modes)
+        known = jnp.where(flags, jnp.where(goes, following, 0), known)
     return modes, known
 
 
@@ -286,14 +308,16 @@ SOUND = 1e-9
 
 
 def _support(
-    law: Law, motion: WheelMotion, contact: Int[Array, " n"], at_stopper: Array, event: Event
-) -> tuple[Choice, Slots, Array, Bool[Array, " n"]]:
+    law: Law, motion: WheelMotion, contact: Int[Array, "n ..."], at_stopper: Array, event: Event
+) -> tuple[Chosen, Slots, Array, Bool[Array, "n ..."]]:
     """Acceleration level: who carries the motion that follows.
 
     Also says which feet were at rest, and which legs in the air are held. What an event has just
     ended is not asked again: its force is zero, and its sign rounding. It is followed by what it
-    was about to become, if that goes the right way (see `leaves`).
+    was about to become, if that goes the right way (see `leaves`). Nothing here moves with
+    anything.
     """
+    law, motion = stilled((law, motion))
     s, slots = law.s, slots_of(contact != OFF)
     friction = of_slots(law.friction, slots)
     mode, stops = slots.codes(contact), slots.flags(at_stopper)
@@ -301,32 +325,29 @@ def _support(
     rigid = (mode == STICK) & (as_row(friction) == THE_PAPERS)  # a tangential force jumps to zero
     up, down = event.slides_up, event.slides_down
     second = (event.lifts | up | down)[1]
-    direction = jnp.any(down).astype(jnp.int32) - jnp.any(up).astype(jnp.int32)
+    one_of = lambda flags: jnp.any(flags, axis=0).astype(jnp.int32)
+    direction = one_of(down) - one_of(up)
     opens = ~stops | event.releases
     small = Negligible(SOUND * s.Mt * s.g, SOUND * s.g)
 
-    def solve(airborne: Array) -> _Solved:
+    def solve(law: Law, motion: WheelMotion, airborne: Array, chosen: Chosen | None) -> _Solved:
         hub = hub_of(s, motion, slots, airborne)
         free = free_acceleration(s, motion, slots, hub)
-        leaving = leaves(s, hub, free, (mode, stops), friction, second, direction)
-        modes, known = _following(event, mode, (leaving & ~rigid)[:, None], rigid[:, None])
-        allowed = Allowed(
-            contact=modes,
-            held=jnp.stack([jnp.ones((2,), bool), ~opens], axis=1),
-            stays=rests & False,
-            known_contact=known,
-            known_open=opens,
-        )
-        choice = choose(s, hub, free, allowed, friction, small, law.counted)
-        ax, az, _ = choice.answer.hub
+        if chosen is None:
+            leaving = leaves(s, hub, free, (mode, stops), friction, second, direction)
+            modes, known = _following(event, mode, leaving & ~rigid, rigid)
+            allowed = Allowed(modes, ~opens, rests & False, known, opens)
+            chosen = choose(s, hub, free, allowed, friction, small, law.counted)
+        found = answer(s, hub, free, chosen.contact, chosen.held, friction)
+        ax, az, _ = found.hub
         outward = free.legs + hub.legs.sin * ax + hub.legs.cos * az
-        return _Solved(choice, s.m * outward, outward, None)
+        return _Solved(chosen, found, s.m * outward, outward, motion)
 
     airborne = at_stopper & ~slots.filled
     if not law.one_sided:
-        return solve(airborne).choice, slots, rests, airborne
-    found, held = _that_push(solve, airborne, airborne, small)
-    return found.choice, slots, rests, held
+        return solve(law, motion, airborne, None).chosen, slots, rests, airborne
+    found, held = _that_push(solve, law, motion, airborne, airborne, small)
+    return found.chosen, slots, rests, held
 
 
 def _at_rest(
@@ -347,7 +368,7 @@ def _at_rest(
     mode = jnp.where(jnp.abs(foot_x) < law.rest, STICK, slips)
     mode = jnp.where(stays, jnp.where(contact == STICK, STICK, mode), OFF)
     on = at_stopper | (struck & (jnp.abs(motion.dL) < law.rest))
-    new = jnp.any(mode != contact) | jnp.any(on != at_stopper)
+    new = jnp.any((mode != contact) | (on != at_stopper), axis=0)
     return select(new, settled(law.s, motion, mode, on), motion), mode, on
 
 
@@ -359,7 +380,7 @@ def _joined(law: Law, motion: WheelMotion, stance: Stance, event: Event) -> Even
     rising = motion.vz - motion.dL * legs.cos + motion.L * motion.dtheta * legs.sin
     low = (foot_heights(motion, legs) <= near) & (rising <= law.rest)
     lands = event.lands | (low & (stance.contact == OFF) & event.impact)
-    few = jnp.sum(lands | (stance.contact != OFF)) <= 2
+    few = jnp.sum(lands | (stance.contact != OFF), axis=0, dtype=jnp.int32) <= 2
     out = (near >= s.L0 - motion.L) & (motion.dL >= -law.rest)
     closes = event.closes | (out & ~stance.locked & event.impact)
     return event._replace(lands=jnp.where(few, lands, event.lands), closes=closes)
@@ -375,11 +396,11 @@ def resolve(law: Law, motion: WheelMotion, stance: Stance, event: Event) -> Chan
     if law.restitution is not None:
         inelastic = _impact(law._replace(restitution=None), motion, stance, event)[0]
         shock = _without_gain(law, motion, shock, inelastic)
-    struck = slots.spread(shock.choice.contact).astype(jnp.int32)
-    kept = jnp.where(slots.filled, slots.spread(shock.choice.held) > 0, was_locked & held)
+    struck = slots.spread(shock.chosen.contact).astype(jnp.int32)
+    kept = jnp.where(slots.filled, slots.spread(shock.chosen.held) > 0, was_locked & held)
     if law.restitution is not None:  # only a part of what holds a leg may have been taken
-        kept = kept & (jnp.abs(shock.more.dL) < law.rest)
-    left = _at_rest(law, shock.more, slots, struck, kept, was_locked)
+        kept = kept & (jnp.abs(shock.motion.dL) < law.rest)
+    left = _at_rest(law, shock.motion, slots, struck, kept, was_locked)
     after, contact, at_stopper = select(impact, left, (motion, stance.contact, was_locked))
     legs = directions(s, motion.theta)
     dropped = touched & ~slots.filled
@@ -398,7 +419,7 @@ def resolve(law: Law, motion: WheelMotion, stance: Stance, event: Event) -> Chan
         new_leg=(stance.locked | event.closes) & ~locked,
         new_slip=slots.spread(slides & rests) > 0,
     )
-    shocked, stands = shock.choice.solutions, support.solutions
+    shocked, stands = shock.chosen.solutions, support.solutions
     blank = lambda pair: (jnp.where(impact, pair[0], 0.0), jnp.where(impact, pair[1], 0.0))
     return Change(
         motion=after._replace(
@@ -406,18 +427,18 @@ def resolve(law: Law, motion: WheelMotion, stance: Stance, event: Event) -> Chan
         ),
         stance=stance,
         energy_lost=jnp.where(impact, lost, 0.0),
-        normal_impulse=blank(shock.choice.answer.normal),
-        tangential_impulse=blank(shock.choice.answer.tangential),
-        stopper_impulse=jnp.where(impact, jnp.min(impulse), jnp.inf),
+        normal_impulse=blank(shock.answer.normal),
+        tangential_impulse=blank(shock.answer.tangential),
+        stopper_impulse=jnp.where(impact, jnp.min(impulse, axis=0), jnp.inf),
         solutions=jnp.where(impact, jnp.minimum(shocked, stands), stands),
         paradox=(stands == 0) & ((shocked > 0) | ~impact),
         most_solutions=jnp.where(impact, jnp.maximum(shocked, stands), stands),
-        third_foot=jnp.any(dropped & (foot_z < 0.0)) & impact,
+        third_foot=jnp.any(dropped & (foot_z < 0.0), axis=0) & impact,
     )
 
 
 def settled(
-    s: Symbols, motion: WheelMotion, contact: Int[Array, " n"], locked: Bool[Array, " n"]
+    s: Symbols, motion: WheelMotion, contact: Int[Array, "n ..."], locked: Bool[Array, "n ..."]
 ) -> WheelMotion:
     """The motion that keeps to its contacts: loaded feet on the slope, sticking ones at rest.
 
@@ -434,8 +455,7 @@ def settled(
     free = free_velocity(s, motion, slots, hub)
     modes, held = slots.codes(contact), slots.flags(locked)
     # Two resting feet on two held legs would fix the hub twice over.
-    held = held & ~(jnp.all(modes == STICK) & jnp.all(held) & jnp.asarray([False, True]))
-    zero = jnp.zeros_like(motion.theta)
-    found = answer(s, hub, free, modes, held, zero)
-    choice = Choice(modes, held, found, zero, jnp.ones((), jnp.int32))
-    return moved_by(s, motion, slots, hub, airborne, choice)
+    twice = jnp.all((modes == STICK) & held, axis=0)
+    held = jnp.stack([held[0], held[1] & ~twice])
+    found = answer(s, hub, free, modes, held, jnp.zeros_like(motion.theta))
+    return moved_by(s, motion, slots, hub, airborne, found)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vrw_jax.models.unilateral.contacts import OFF, Roughness
@@ -38,8 +39,8 @@ def law_of(
 
 
 def past(
-    law: Law, place: Guards, motion: WheelMotion, stance: Stance, guard: Int[Array, ""]
-) -> tuple[Change, Event, Int[Array, ""]]:
+    law: Law, place: Guards, motion: WheelMotion, stance: Stance, guard: Int[Array, "..."]
+) -> tuple[Change, Event, Int[Array, "..."]]:
     """Through the event of a guard: what it changes, what it was, and STEPPED where all went well.
 
     The integrator lets feet drift by its error. One that lifts rises like the third power of time,
@@ -105,15 +106,15 @@ def outcome_at(
 class Details(NamedTuple):
     """What a step tells of one wheel beside its ledger, named as in `UnilateralStep`."""
 
-    post_impact: Float[Array, "2"]
-    mode_durations: Float[Array, "4 4"]
-    landing_normal: Float[Array, "2"]
-    landing_tangential: Float[Array, "2"]
+    post_impact: Float[Array, "2 ..."]
+    mode_durations: Float[Array, "4 4 ..."]
+    landing_normal: Float[Array, "2 ..."]
+    landing_tangential: Float[Array, "2 ..."]
     energy_impacts: Scalar
     monitors: UnilateralMargins
-    impacts: Int[Array, ""]
-    fewest_solutions: Int[Array, ""]
-    most_solutions: Int[Array, ""]
+    impacts: Int[Array, "..."]
+    fewest_solutions: Int[Array, "..."]
+    most_solutions: Int[Array, "..."]
 
 
 def no_details(dtype: jnp.dtype) -> Details:
@@ -156,11 +157,12 @@ def event_noted(details: Details, first: Array, change: Change, event: Event) ->
 
 
 def stretch_noted(
-    details: Details, contact: Int[Array, "2"], duration: Elementwise, force: Elementwise
+    details: Details, contact: Int[Array, "2 ..."], duration: Elementwise, force: Elementwise
 ) -> Details:
     """After one more stretch: modes of its slots, and the least stopper force of legs in the air at
     its ends."""
-    first, second = ((jnp.arange(4) == contact[i]).astype(jnp.result_type(force)) for i in range(2))
+    places = np.arange(4).reshape(-1, *(1,) * jnp.ndim(force))
+    first, second = ((places == contact[i]).astype(jnp.result_type(force)) for i in range(2))
     force = jnp.minimum(details.monitors.stopper_force, force)
     return details._replace(
         mode_durations=details.mode_durations + first[:, None] * second[None, :] * duration,

@@ -6,16 +6,14 @@ Nothing here looks from one lane to another.
 """
 
 from collections.abc import Callable
-from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from vrw_jax.models.unilateral.mechanics import WheelMotion, directions, kept, one_of
+from vrw_jax.models.unilateral.mechanics import WheelMotion, directions, kept, one_of, stilled
 from vrw_jax.models.unilateral.motion import (
     Felt,
     Flow,
@@ -48,6 +46,8 @@ FORCE = -1
 """Row of the least stopper force of legs in the air."""
 MARCHING, EVENT, WAITING = -1, -2, -3
 """Where a lane stands: on its way, at an event, without a wheel; else the `Outcome` it met."""
+BURST = 8
+"""Tries after which lanes at events no longer wait for those beside them."""
 PARABOLAS = 3
 """Tries at an event by parabolas; then by secants, which in stiff dips are better."""
 CLOSE = 30.0
@@ -100,9 +100,14 @@ def motion_of(place: Place) -> WheelMotion:
 
 def place_of(flow: Flow, motion: WheelMotion) -> Place:
     """The inverse of `motion_of`, with the slope there."""
-    q = jnp.concatenate([jnp.stack([motion.x, motion.z, motion.theta]), motion.L])
-    v = jnp.concatenate([jnp.stack([motion.vx, motion.vz, motion.dtheta]), motion.dL])
+    q, v = coordinates(motion)
     return Place(q, v, _slope(flow, q, v))
+
+
+def coordinates(motion: WheelMotion) -> tuple[Array, Array]:
+    """Coordinates and rates as `Place` has them."""
+    q = jnp.concatenate([jnp.stack([motion.x, motion.z, motion.theta]), motion.L])
+    return q, jnp.concatenate([jnp.stack([motion.vx, motion.vz, motion.dtheta]), motion.dL])
 
 
 def _slope(flow: Flow, q: Array, v: Array) -> Array:
@@ -167,9 +172,17 @@ def set_off(flow: Flow, motion: WheelMotion, h: Array) -> March:
         time=zero,
         search=Search(none > 0, jnp.zeros_like(begun), zero, zero, zero, none, zero, values),
         verdict=jnp.where(jnp.any(past, axis=0), EVENT, MARCHING).astype(jnp.int32),
-        guard=jnp.argmax(past, axis=0).astype(jnp.int32),
+        guard=_first(past),
         tried=none,
     )
+
+
+def _first(flags: Array) -> Array:
+    """The first row whose flag is set; 0 where none is."""
+    first = jnp.zeros(flags.shape[1:], jnp.int32)
+    for row in reversed(range(len(flags))):
+        first = jnp.where(flags[row], row, first)
+    return first
 
 
 FlowAt = Callable[[Array], Flow]
@@ -180,25 +193,30 @@ def marched(
     flow_at: FlowAt,
     columns: Array,
     begin: March,
-    enough: Array | None,
+    walks: Array,
     options: Options,
     tableau: Tableau,
 ) -> March:
-    """On until `enough` lanes no longer march, or none does. Errors: as `integrate_phase`."""
+    """On until none marches; or, after a burst, any that `walks` has come to an event. Errors: as
+    `integrate_phase`."""
     flow = flow_at(columns)
     sizes = guard_sizes(flow)
 
     def advance(now: March) -> March:
         return _advanced(now, _tried(flow, tableau, options, now), sizes, tableau, options)
 
-    return lax.while_loop(partial(_goes_on, enough), advance, begin)
+    return _while(lambda now: now.verdict == MARCHING, walks, advance, begin)
 
 
-def _goes_on(enough: Array | None, now: March) -> Array:
-    if enough is None:
-        return jnp.any(now.verdict == MARCHING)
-    ended = (now.verdict != MARCHING) & (now.verdict != WAITING)
-    return jnp.any(now.verdict == MARCHING) & (jnp.sum(ended) < enough)
+def _while(marching: Callable[[Any], Array], walks: Array, advance: Callable, begin: Any) -> Any:
+    def goes_on(state: tuple) -> Array:
+        now, tries = state
+        still = marching(now)
+        return jnp.any(still) & ((tries < BURST) | ~jnp.any(walks & ~still))
+
+    none = jnp.zeros((), jnp.int32)
+    turn = lambda state: (advance(state[0]), state[1] + 1)
+    return lax.while_loop(goes_on, turn, (begin, none))[0]
 
 
 class Way(NamedTuple):
@@ -216,7 +234,7 @@ def marched_along(
     columns: Array,
     begin: March,
     way: Way,
-    enough: Array | None,
+    walks: Array,
     options: Options,
     tableau: Tableau,
 ) -> tuple[March, Way]:
@@ -245,8 +263,8 @@ def marched_along(
         ahead = way._replace(q=moved[:n], v=moved[n : 2 * n], told=told)
         return after, select(after.time != now.time, ahead, way)
 
-    goes_on = lambda state: _goes_on(enough, state[0])
-    now, way = lax.while_loop(goes_on, advance, (begin, way))
+    marching = lambda state: state[0].verdict == MARCHING
+    now, way = _while(marching, walks, advance, (begin, way))
     return now, _met(flow_at, columns, begin, now, way)
 
 
@@ -306,8 +324,7 @@ def _tried(flow: Flow, tableau: Tableau, options: Options, now: March) -> _Try:
     if flow.tallied:
         told = h * sum(once[last][j] * slopes[j, -1 - N_TALLIED : FORCE] for j in range(last))
 
-    moving, rest = eqx.partition((flow, now.here, slopes), eqx.is_inexact_array)
-    flow, here, slopes = eqx.combine(lax.stop_gradient(moving), rest)
+    flow, here, slopes = stilled((flow, now.here, slopes))
     middle = Place(*at(tableau.middle, here, slopes), slopes[tableau.middle])
     looked = middle, lax.stop_gradient(end)
     inside, values = (guards_at(flow, place) - now.offset for place in looked)

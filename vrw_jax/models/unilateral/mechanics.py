@@ -11,6 +11,7 @@ element by element over lanes too, one more axis behind that of the legs.
 import math
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -73,6 +74,12 @@ def kept(tree: Any, one: Array) -> Any:
 def one_of(motion: "WheelMotion") -> Array:
     """1, in a form that no compiler can know."""
     return lax.stop_gradient(1.0 + 0.0 * motion.theta)
+
+
+def stilled(tree: Any) -> Any:
+    """The same, which moves with nothing."""
+    moving, rest = eqx.partition(tree, eqx.is_inexact_array)
+    return eqx.combine(lax.stop_gradient(moving), rest)
 
 
 class Slots(NamedTuple):

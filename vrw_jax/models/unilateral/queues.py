@@ -1,9 +1,7 @@
-"""What is asked of lanes on real ground: walks of many steps, and one step with all that moves it.
-
-Wheels wait in queues of one length, for which the walk (`lanes`) is compiled.
-"""
+"""What is asked of lanes on real ground: walks of many steps, and one step with all that moves it."""
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -13,12 +11,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from vrw_jax.models.unilateral.lanes import QUEUE, Walk, queue_of, walked_through
-from vrw_jax.models.unilateral.section import LOCKED, embedded
-from vrw_jax.models.unilateral.wheel import UnilateralStep, UnilateralWheel
+from vrw_jax import simd
+from vrw_jax.models.unilateral.lanes import Lean, Walk, Walked, walked, walked_along
+from vrw_jax.models.unilateral.ledger import blank, no_details
+from vrw_jax.models.unilateral.mechanics import WheelMotion
+from vrw_jax.models.unilateral.motion import Stance, Tally
+from vrw_jax.models.unilateral.section import LOCKED, closed, embedded, section_size
+from vrw_jax.models.unilateral.wheel import UnilateralStep, UnilateralWheel, step_told
 from vrw_jax.numerics import Options, explicit_tableau
-from vrw_jax.runtime import fusion_emitters
+from vrw_jax.runtime import lane_program
 from vrw_jax.wheel import PARAMETER_NAMES, symbols_of
+
+BLOCK = 2048
+"""Lanes that walk side by side where XLA compiles the walk."""
 
 
 def walk_lanes(
@@ -35,10 +40,11 @@ def walk_lanes(
     `columns` are the parameters in their order and friction, shape (10, wheels); `states` full
     section states, shape (wheels, 4 + 3 n).
     """
-    program = _Run.of(model, options, n, columns.dtype, False)
-    given = [columns, states.T]
-    lean, outcome, n_stepped, tried = _in_queues(program, given, n_steps)
-    return lean.section_state, lean.durations, outcome, n_stepped, tried, lean.step_length
+    run = _Run.of(model, options, n, False)
+    walk = _walked(run, [columns, states.T], n_steps, options)
+    lean = walk.told
+    rest = walk.outcome, walk.n_stepped, walk.tried
+    return lean.section_state, lean.durations, *rest, lean.step_length
 
 
 def step_lanes(
@@ -55,7 +61,7 @@ def step_lanes(
     Each direction is a lane of its own beside the wheel's motion. What is not `wanted` and what
     cannot move, lengths of legs on their stoppers and codes, has zeros.
     """
-    program = _Run.of(model, options.for_derivatives(), n, columns.dtype, True)
+    run = _Run.of(model, options, n, True)
     code = np.round(states[:, 4 + 2 * n :])
     numbers = np.concatenate([columns.T, states], 1)
     moves = np.ones(numbers.shape, bool)
@@ -68,7 +74,7 @@ def step_lanes(
     ways[np.arange(len(owner)), place] = 1.0
     given = [numbers[owner].T, ways.T]
     split = [part for x in given for part in (x[: len(columns)], x[len(columns) :])]
-    (step, moved), *_ = _in_queues(program, split, 1)
+    walk, moved = _walked(run, split, 1, options.for_derivatives())
     first = np.searchsorted(owner, np.arange(len(columns.T)))
 
     def jacobian(leaf: np.ndarray) -> np.ndarray:
@@ -76,26 +82,7 @@ def step_lanes(
         full[owner, place] = leaf
         return np.moveaxis(full, 1, -1)
 
-    return jax.tree.map(lambda x: x[first], step), jax.tree.map(jacobian, moved)
-
-
-def _in_queues(program: Callable[..., Any], given: list[np.ndarray], n_steps: int) -> Any:
-    """What the program tells of lanes, which these arrays have on their last axis, now leading."""
-    parts = []
-    # Most work first, so that no lane is left alone with much of it at the end: stability bounds
-    # the step where damping is high.
-    order = np.argsort(-given[0][PARAMETER_NAMES.index("damping")], kind="stable")
-    for begin in range(0, max(len(order), 1), QUEUE):
-        some = order[begin : begin + QUEUE]
-        filled = np.resize(some, QUEUE) if len(some) else np.zeros(QUEUE, int)
-        filled[len(some) :] = filled[len(some) - 1]
-        lanes = [np.ascontiguousarray(x[:, filled]) for x in given]
-        out = program(*lanes, np.int32(len(some)), np.int32(n_steps))
-        n = len(some)
-        parts.append(jax.tree.map(lambda x, n=n: np.asarray(x)[..., :n], out))
-    back = np.argsort(order, kind="stable")
-    together = lambda *x: np.moveaxis(np.concatenate(x, -1), -1, 0)[back]
-    return jax.tree.map(together, *parts)
+    return jax.tree.map(lambda x: x[first], walk.told), jax.tree.map(jacobian, moved)
 
 
 class _Run(NamedTuple):
@@ -109,19 +96,66 @@ class _Run(NamedTuple):
     moved: bool  # all that a step tells, and along a direction of each lane
 
     @classmethod
-    def of(
-        cls, model: UnilateralWheel, options: Options, n: int, dtype: Any, moved: bool
-    ) -> Callable[..., Any]:
-        """The program with these options."""
+    def of(cls, model: UnilateralWheel, options: Options, n: int, moved: bool) -> "_Run":
+        """Of these options."""
         if model.restitution is not None:
             raise ValueError(
                 "restitution is given, but in lanes feet don't come back: walk wheels one by one, "
                 "by vrw.walk, or map vrw.return_map over them."
             )
-        dynamic, static = eqx.partition(options, eqx.is_array)
-        dynamic = jax.tree.map(lambda leaf: np.asarray(leaf, dtype), dynamic)
-        run = _program(cls(static, n, model.max_events, model.one_sided, model.by_paper, moved))
-        return lambda *given: run(*given, dynamic)
+        static = eqx.filter(options, eqx.is_array, inverse=True)
+        return cls(static, n, model.max_events, model.one_sided, model.by_paper, moved)
+
+    def on(self, dynamic: Options, n_steps: Array) -> Walk:
+        """The walk of lanes."""
+        options = eqx.combine(dynamic, self.static)
+        tableau = explicit_tableau(options.solver)
+        assert tableau is not None  # the caller looked
+        rules = self.one_sided, self.by_paper, self.moved
+        return Walk(self.n_legs, n_steps, self.max_events, *rules, options, tableau)
+
+    def rows(self) -> tuple[int, ...]:
+        """Of the arrays that are given: columns and states, then a direction of both."""
+        sizes = len(PARAMETER_NAMES) + 1, section_size(self.n_legs)
+        return sizes * 2 if self.moved else sizes
+
+    def told(self, dtype: Any) -> Any:
+        """Shapes and types of what is told of one wheel."""
+        n, zero, none = self.n_legs, jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
+        legs, off = jnp.zeros(n, dtype), jnp.zeros(n, jnp.int32)
+        motion = WheelMotion(*(zero,) * 6, legs, legs)
+        stands = motion, Stance(off, *(off > 0,) * 4)
+        if not self.moved:
+            of_step = lambda: Lean(closed(*stands), jnp.zeros(3, dtype), zero)
+            return jax.eval_shape(lambda: Walked(of_step(), none, none, none))
+        tally = Tally(zero, zero, zero, zero)
+        given = *stands, tally, blank(zero), no_details(dtype), none
+        of_step = lambda: step_told(*given)
+        walk = jax.eval_shape(lambda: Walked(of_step(), none, none, none))
+        return walk, eqx.filter(walk.told, lambda x: jnp.issubdtype(x.dtype, jnp.inexact))
+
+
+def _walked(run: _Run, given: list[np.ndarray], n_steps: int, options: Options) -> Any:
+    """What is told of lanes, which these arrays have on their last axis, now leading."""
+    dtype = given[0].dtype
+    # Those beside each other wait for each other: stability bounds the step where damping is high.
+    order = np.argsort(-given[0][PARAMETER_NAMES.index("damping")], kind="stable")
+    dynamic, form = jax.tree.flatten(eqx.filter(options, eqx.is_array))
+    uniform = [np.int32(n_steps), *(np.asarray(leaf, dtype) for leaf in dynamic)]
+    lanes = [row[order] for x in given for row in x]
+    rows = _program(run, dtype, form)(uniform, lanes) if len(order) else None
+    back = np.argsort(order, kind="stable")
+    leaves, structure = jax.tree.flatten(run.told(dtype))
+    found, taken = [], 0
+    for leaf in leaves:
+        size = math.prod(leaf.shape)
+        if rows is None:
+            found.append(np.zeros((0, *leaf.shape), leaf.dtype))
+        else:
+            own = np.stack(rows[taken : taken + size], 1)[back]
+            found.append(own.reshape(-1, *leaf.shape))
+        taken += size
+    return jax.tree.unflatten(structure, found)
 
 
 def as_full_states(columns: np.ndarray, states: np.ndarray, n: int) -> np.ndarray:
@@ -133,28 +167,28 @@ def as_full_states(columns: np.ndarray, states: np.ndarray, n: int) -> np.ndarra
 
 
 @functools.cache
-def _program(run: _Run) -> Callable[..., tuple]:
-    """The compiled walk of one queue: one program for every batch and number of steps."""
+def _program(run: _Run, dtype: np.dtype, form: Any) -> Callable[..., Any]:
+    """The compiled walk, of numbers and of rows with lanes: one for any number of steps."""
+    def walk(uniform: tuple, lanes: tuple) -> tuple:
+        n_steps, *dynamic = uniform
+        on = run.on(jax.tree.unflatten(form, dynamic), n_steps)
+        rows = iter(lanes)
+        given = [jnp.stack([next(rows) for _ in range(size)]) for size in run.rows()]
+        told = walked_along(on, *given) if run.moved else walked(on, *given)
+        flat = lambda leaf: leaf.reshape(-1, leaf.shape[-1])
+        return tuple(row for leaf in jax.tree.leaves(told) for row in flat(leaf))
 
-    def walk(columns: Array, x: Array, wanted: Array, n_steps: Array, dynamic: Options) -> tuple:
-        options = eqx.combine(dynamic, run.static)
-        tableau = explicit_tableau(options.solver)
-        assert tableau is not None  # the caller looked
-        legs, events = run.n_legs, run.max_events
-        rules = run.one_sided, run.by_paper, run.moved
-        on = Walk(legs, n_steps, events, *rules, options, tableau)
-        return walked_through(queue_of(columns, x, on), wanted, on)
+    if simd.serves():
+        kinds = [np.dtype(np.int32), *[dtype] * form.num_leaves]
+        return lane_program(walk, kinds, sum(run.rows()), dtype, ("walk on real ground", run))
+    by_xla = jax.jit(walk)
 
-    def along(
-        columns: Array, x: Array, d_columns: Array, d_x: Array, *others: Any
-    ) -> tuple[Any, ...]:
-        def told(columns: Array, x: Array) -> tuple:
-            step, *rest = walk(columns, x, *others)
-            floats, fixed = eqx.partition(step, eqx.is_inexact_array)
-            return floats, (fixed, *rest)
+    def in_blocks(uniform: list, lanes: list) -> list:
+        n, parts = len(lanes[0]), []
+        for begin in range(0, n, BLOCK):
+            place = np.minimum(np.arange(begin, begin + BLOCK), n - 1)
+            told = by_xla(tuple(uniform), tuple(row[place] for row in lanes))
+            parts.append([np.asarray(row)[: n - begin] for row in told])
+        return [np.concatenate(rows) for rows in zip(*parts, strict=True)]
 
-        at, way = (columns, x), (d_columns, d_x)
-        floats, moved, (fixed, *rest) = jax.jvp(told, at, way, has_aux=True)
-        return (eqx.combine(floats, fixed), moved), *rest
-
-    return jax.jit(along if run.moved else walk, compiler_options=fusion_emitters(False))
+    return in_blocks

@@ -8,11 +8,11 @@ from vrw_jax.models.paper_step import PAPER_START
 from vrw_jax.models.unilateral.contacts import OFF, STICK
 from vrw_jax.models.unilateral.events import settled
 from vrw_jax.models.unilateral.mechanics import WheelMotion, directions
-from vrw_jax.models.unilateral.motion import Stance, State, Tally, pack
-from vrw_jax.numerics import Elementwise, Scalar
+from vrw_jax.models.unilateral.motion import Stance
+from vrw_jax.numerics import Elementwise
 from vrw_jax.wheel import Symbols, WheelParams, length_at_touchdown
 
-FullState = Float[Array, " n_full"]
+FullState = Float[Array, "n_full ..."]
 """(theta-, dtheta-, vx-, vz-, L_1 ... L_n, dL_1 ... dL_n, code_1 ... code_n) just before the foot
 ahead of all others lands, in the labels of the step that ends: rad, rad/s, hub m/s, m, m/s.
 
@@ -45,35 +45,35 @@ def embedded(s: Symbols, x: Float[Array, "3"]) -> FullState:
 
 
 def made_sound(
-    params: WheelParams, friction: Scalar, x: FullState
-) -> tuple[Bool[Array, ""], WheelParams, Scalar, FullState]:
+    params: WheelParams, friction: Elementwise, x: FullState
+) -> tuple[Bool[Array, "..."], WheelParams, Elementwise, FullState]:
     """Whether a step may begin there, and the same, or what one always may begin with."""
-    safe_x = embedded(
+    safe = embedded(
         WheelParams(n_legs=params.n_legs).symbols(), jnp.asarray(PAPER_START, x.dtype)
     )
+    safe_x = safe.reshape(-1, *(1,) * (x.ndim - 1))
     good = usable(params, x) & (friction >= 0.0)
     params, x = replaced_where_bad(good, params, x, safe_x)
     return good, params, jnp.where(good, friction, 1.0), x
 
 
-def opened(s: Symbols, x: FullState) -> tuple[State, Stance]:
-    """State and stance just before the landing, in the labels of the step that begins.
+def opened(s: Symbols, x: FullState) -> tuple[WheelMotion, Stance]:
+    """Motion and stance just before the landing, in the labels of the step that begins.
 
     The landing foot is the origin; loaded feet are put on the slope and sticking ones to rest, so
     that every vector near a section state is one.
     """
     n = s.n
     theta, dtheta, vx, vz = x[0] - s.alpha, x[1], x[2], x[3]
-    L, dL, code = (jnp.roll(x[4 + i * n : 4 + (i + 1) * n], 1) for i in range(3))
-    code = jnp.round(code).astype(jnp.int32)
-    contact, locked = code % LOCKED, code >= LOCKED
+    of_legs = (x[4 + i * n : 4 + (i + 1) * n] for i in range(3))
+    L, dL, code = (jnp.concatenate([own[-1:], own[:-1]]) for own in of_legs)
+    code = jnp.floor(code + 0.5).astype(jnp.int32)
+    contact, locked = code & (LOCKED - 1), code >= LOCKED
     L = jnp.where(locked, s.L0, L)
     legs = directions(s, theta)
     motion = WheelMotion(L[0] * legs.sin[0], L[0] * legs.cos[0], theta, vx, vz, dtheta, L, dL)
-    none = jnp.zeros((n,), bool)
-    zero = jnp.zeros_like(theta)
-    state = pack(settled(s, motion, contact, locked), Tally(zero, zero, zero, zero))
-    return state, Stance(contact, locked, none, none, none)
+    none = locked & False
+    return settled(s, motion, contact, locked), Stance(contact, locked, none, none, none)
 
 
 def closed(motion: WheelMotion, stance: Stance, tilt: Elementwise | None = None) -> FullState:

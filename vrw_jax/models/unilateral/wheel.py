@@ -333,7 +333,9 @@ def _walk(
     given = s, _rough(wheel, friction), options, wheel.one_sided
     law = law_of(*given, True, wheel.restitution, tilt)
     place = guards_of(n, wheel.one_sided)
-    state, stance = opened(s, x)
+    motion, stance = opened(s, x)
+    zero = jnp.zeros_like(motion.theta)
+    state = pack(motion, Tally(zero, zero, zero, zero))
     rows = lambda leaf: jnp.broadcast_to(leaf, (wheel.max_events, *leaf.shape))
     first = _Log(state, jnp.zeros((n,), jnp.int32), jnp.zeros((n,), bool), jnp.zeros_like(x[0]))
     begin = _Walked(
