@@ -394,7 +394,7 @@ class AbstractWheel(eqx.Module):
         return x
 
 
-Numbers = Float[Array, " section"] | tuple[Array, ...]
+Numbers = Float[Array, "section ..."] | tuple[Array, ...]
 """A section state, or its numbers one by one: then each may be an array of lanes."""
 
 

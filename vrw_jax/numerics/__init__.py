@@ -90,7 +90,7 @@ from vrw_jax.numerics.tableaus import (
     Slope,
     Tableau,
     change_of_length,
-    dips,
+    below,
     explicit_tableau,
     parabola,
     real_stability_limit,

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array
 
 from vrw_jax.numerics.events import solver_named
 from vrw_jax.numerics.options import Options
@@ -101,19 +101,6 @@ def parabola(tableau: Tableau, start: Array, inside: Array, end: Array) -> tuple
     place = float(tableau.places[tableau.middle])
     bend = (end - start - (inside - start) / place) / (1.0 - place)
     return bend, end - start - bend
-
-
-def dips(start: Array, end: Array, bend: Array, slope: Array) -> Bool[Array, "..."]:
-    """Whether a guard's parabola falls and rises again so low that the step is to end there first.
-
-    Then the guard has crossed there, or the march goes on from its lowest point, -slope / (2 bend).
-    A point no lower than the start by 1 % is not new.
-    """
-    falls_and_rises = (slope < 0.0) & (slope + 2.0 * bend > 0.0)
-    low = 4.0 * bend * start - slope * slope  # the lowest value, times 4 bend > 0
-    near = 5.0 * low <= 4.0 * bend * jnp.maximum(start, end)
-    new = 4.0 * bend * start > 1.01 * low
-    return falls_and_rises & near & new & (end > 0.0)
 
 
 def below(tableau: Tableau, values: list[Array]) -> tuple[Array, Array]:

@@ -2,5 +2,5 @@
 
 from vrw_jax.runtime.lazy import library, xarray
 from vrw_jax.runtime.programs import compiled, lane_function, lane_program, remembered
-from vrw_jax.runtime.start import fusion_emitters, start_jax
+from vrw_jax.runtime.start import start_jax
 from vrw_jax.runtime.store import code_digest

@@ -174,7 +174,7 @@ class Walk(NamedTuple):
         ledger, details, tally = select(opens, (fresh, *others), (ledger, details, tally))
         guard = jnp.where(opens, place.foot, now.guard)
         law = law_of(s, friction, self.options, self.one_sided, counted=self.detailed)
-        change, event, code = past(law, place, motion, stance, guard)
+        change, event, code = past(law, place, motion, stance, guard, ledger.events)
         flow = self.flow(columns, change.stance)
         after = set_off(*stilled((flow, change.motion, self.options.first_step)))
         q, v = coordinates(change.motion)

@@ -15,12 +15,16 @@ from vrw_jax.models.unilateral.contacts import OFF, Roughness
 from vrw_jax.models.unilateral.events import Change, Event, Law, event_of, resolve, settled
 from vrw_jax.models.unilateral.mechanics import WheelMotion
 from vrw_jax.models.unilateral.motion import Guards, Stance
-from vrw_jax.numerics import Elementwise, Options, Scalar, select
+from vrw_jax.numerics import Elementwise, Options, select
 from vrw_jax.wheel import Outcome, Symbols
 
 SHARE, SEEN = 1e-2, 4e2
 """Least dip that is followed: this share of the tolerance, and no less than so many roundings of a
 leg's length, 1e-13 m in float64."""
+PATIENCE = 100
+"""Events of a step after each of which more is at rest: the speed of rest grows by its own size.
+Walks make 4 to 60. A chain of ever smaller dips ends by this where a tolerance lets it go on; of
+400 events the last dip is as large as a tolerance of 1e-6 leaves from the first."""
 
 
 def law_of(
@@ -39,13 +43,20 @@ def law_of(
 
 
 def past(
-    law: Law, place: Guards, motion: WheelMotion, stance: Stance, guard: Int[Array, "..."]
+    law: Law,
+    place: Guards,
+    motion: WheelMotion,
+    stance: Stance,
+    guard: Int[Array, "..."],
+    events: Int[Array, "..."],
 ) -> tuple[Change, Event, Int[Array, "..."]]:
     """Through the event of a guard: what it changes, what it was, and STEPPED where all went well.
+    `events`: of this step, before it.
 
     The integrator lets feet drift by its error. One that lifts rises like the third power of time,
     from the slope and from rest: else it would land again at once.
     """
+    law = law._replace(rest=law.rest * (1 + jnp.maximum(events - PATIENCE, 0)))
     motion, event = settled(law.s, motion, stance.contact, stance.locked), event_of(place, guard)
     change = resolve(law, motion, stance, event)
     outcome = jnp.where(change.solutions > 0, Outcome.STEPPED, Outcome.NO_ADMISSIBLE_CONTACT)
@@ -60,8 +71,8 @@ class UnilateralMargins(eqx.Module):
     Negative where a one-sided stopper would have let a leg in the air go.
     """
 
-    stopper_force: Scalar  # least stopper force of a locked leg in the air, N
-    stopper_impulse: Scalar  # least stopper impulse of a locked leg in the air, N s
+    stopper_force: Elementwise  # least stopper force of a locked leg in the air, N
+    stopper_impulse: Elementwise  # least stopper impulse of a locked leg in the air, N s
 
 
 class Ledger(NamedTuple):
@@ -110,7 +121,7 @@ class Details(NamedTuple):
     mode_durations: Float[Array, "4 4 ..."]
     landing_normal: Float[Array, "2 ..."]
     landing_tangential: Float[Array, "2 ..."]
-    energy_impacts: Scalar
+    energy_impacts: Elementwise
     monitors: UnilateralMargins
     impacts: Int[Array, "..."]
     fewest_solutions: Int[Array, "..."]

@@ -30,8 +30,8 @@ from vrw_jax.numerics import (
     ROUNDING,
     Options,
     Tableau,
+    below,
     change_of_length,
-    dips,
     parabola,
     select,
 )
@@ -297,6 +297,7 @@ class _Try(NamedTuple):
     values: Array  # guards at the end
     bend: Array  # of the guards' parabolas
     slope: Array
+    to_dip: Array  # share of the step up to where a guard may dip below zero and come back, else 1
     told: Array | None  # what the step adds to `March.told`
 
 
@@ -325,13 +326,16 @@ def _tried(flow: Flow, tableau: Tableau, options: Options, now: March) -> _Try:
         told = h * sum(once[last][j] * slopes[j, -1 - N_TALLIED : FORCE] for j in range(last))
 
     flow, here, slopes = stilled((flow, now.here, slopes))
-    middle = Place(*at(tableau.middle, here, slopes), slopes[tableau.middle])
-    looked = middle, lax.stop_gradient(end)
-    inside, values = (guards_at(flow, place) - now.offset for place in looked)
+    inside = {i: Place(*at(i, here, slopes), slopes[i]) for i in tableau.inside}
+    looked = *inside.values(), stilled(end)
+    *within, values = (guards_at(flow, place) - now.offset for place in looked)
     weigh = lambda weights: sum(float(w) * slopes[j, :n] for j, w in enumerate(weights) if w != 0.0)
     errors = h * h * weigh(tableau.error_twice), h * weigh(tableau.error_once)
-    squared = _squared_error(options, errors, here, looked[1], values)
-    return _Try(end, squared, values, *parabola(tableau, now.values, inside, values), told)
+    squared = _squared_error(options, errors, here, looked[-1], values)
+    middle = within[tableau.inside.index(tableau.middle)] if within else now.values
+    bent = parabola(tableau, now.values, middle, values)
+    to_dip = _to_earliest_dip(tableau, [now.values, *within, values])
+    return _Try(end, squared, values, *bent, to_dip, told)
 
 
 def _advanced(now: March, tried: _Try, sizes: Array, tableau: Tableau, options: Options) -> March:
@@ -339,13 +343,12 @@ def _advanced(now: March, tried: _Try, sizes: Array, tableau: Tableau, options: 
     here, h, search, end = now.here, now.h, now.search, tried.end
     running = now.verdict == MARCHING
     keep = running & ~search.on & (tried.squared <= 1.0)
-    to_dip = _to_earliest_dip(now.values, tried)
-    retry = keep & (to_dip < 1.0) & (now.time + h * to_dip > now.time)
+    retry = keep & (tried.to_dip < 1.0) & (now.time + h * tried.to_dip > now.time)
     crossed = keep & ~retry & jnp.any(tried.values <= 0.0, axis=0)
     accepted = keep & ~retry & ~crossed
     searched, found = _searched(now, tried, crossed, sizes, options)
     arrived = found.arrived
-    change = jnp.where(retry, to_dip, change_of_length(tableau, tried.squared, h.dtype))
+    change = jnp.where(retry, tried.to_dip, change_of_length(tableau, tried.squared, h.dtype))
     following = jnp.where(search.on | crossed, found.following, h * change)
 
     moved = jnp.where(arrived, found.shift, 0.0)
@@ -429,14 +432,11 @@ def _squared_error(
     return jnp.where(jnp.isfinite(total), total / (2 * here.q.shape[0]), jnp.inf)
 
 
-def _to_earliest_dip(values: Array, tried: _Try) -> Array:
-    """Share of the step up to where a guard that falls and rises again is lowest, if near zero.
-
-    See `numerics.dips`. A guard that stands on its own event at the start has no such place.
-    """
-    low = dips(values, tried.values, tried.bend, tried.slope) & (values > 0.0)
-    place = -tried.slope / jnp.where(low, 2.0 * tried.bend, 1.0)
-    return jnp.min(jnp.where(low, place, 1.0), axis=0)
+def _to_earliest_dip(tableau: Tableau, values: list[Array]) -> Array:
+    """Share of the step to go before a guard that may dip below zero in it, see `numerics.below`;
+    1: there is none. A guard that stands on its own event at the start has no such place."""
+    looks, at = below(tableau, values)
+    return jnp.min(jnp.where(looks & (values[0] > 0.0), at, 1.0), axis=0)
 
 
 def _lowest(values: Array, crossing: Array) -> tuple[Array, Array]:

@@ -287,7 +287,7 @@ def place_of_landing(n: int, motion: WheelMotion) -> Elementwise:
     return motion.x - motion.L[n - 1] * jnp.sin(turned)
 
 
-def kinetic_energy(s: Symbols, motion: WheelMotion) -> Scalar:
+def kinetic_energy(s: Symbols, motion: WheelMotion) -> Elementwise:
     """Of the hub and all legs' masses, J."""
     legs = directions(s, motion.theta)
     across = (motion.L - s.a) * motion.dtheta

@@ -169,6 +169,7 @@ def as_full_states(columns: np.ndarray, states: np.ndarray, n: int) -> np.ndarra
 @functools.cache
 def _program(run: _Run, dtype: np.dtype, form: Any) -> Callable[..., Any]:
     """The compiled walk, of numbers and of rows with lanes: one for any number of steps."""
+
     def walk(uniform: tuple, lanes: tuple) -> tuple:
         n_steps, *dynamic = uniform
         on = run.on(jax.tree.unflatten(form, dynamic), n_steps)

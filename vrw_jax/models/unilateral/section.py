@@ -48,9 +48,7 @@ def made_sound(
     params: WheelParams, friction: Elementwise, x: FullState
 ) -> tuple[Bool[Array, "..."], WheelParams, Elementwise, FullState]:
     """Whether a step may begin there, and the same, or what one always may begin with."""
-    safe = embedded(
-        WheelParams(n_legs=params.n_legs).symbols(), jnp.asarray(PAPER_START, x.dtype)
-    )
+    safe = embedded(WheelParams(n_legs=params.n_legs).symbols(), jnp.asarray(PAPER_START, x.dtype))
     safe_x = safe.reshape(-1, *(1,) * (x.ndim - 1))
     good = usable(params, x) & (friction >= 0.0)
     params, x = replaced_where_bad(good, params, x, safe_x)

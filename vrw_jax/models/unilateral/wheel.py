@@ -104,23 +104,23 @@ class UnilateralStep(AbstractGroundStep):
     """
 
     section_state: FullState
-    post_impact: Float[Array, "2"]
-    durations: Float[Array, "3"]
-    mode_durations: Float[Array, "4 4"]
-    step_length: Scalar
-    landing_normal: Float[Array, "2"]
-    landing_tangential: Float[Array, "2"]
-    energy_impacts: Scalar
-    energy_damping: Scalar
-    energy_friction: Scalar
-    slip: Scalar
+    post_impact: Float[Array, "2 ..."]
+    durations: Float[Array, "3 ..."]
+    mode_durations: Float[Array, "4 4 ..."]
+    step_length: Elementwise
+    landing_normal: Float[Array, "2 ..."]
+    landing_tangential: Float[Array, "2 ..."]
+    energy_impacts: Elementwise
+    energy_damping: Elementwise
+    energy_friction: Elementwise
+    slip: Elementwise
     monitors: UnilateralMargins
-    events: Int[Array, ""]
-    impacts: Int[Array, ""]
-    fewest_solutions: Int[Array, ""]
-    most_solutions: Int[Array, ""]
-    outcome: Int[Array, ""]
-    solver_steps: Int[Array, ""]
+    events: Int[Array, "..."]
+    impacts: Int[Array, "..."]
+    fewest_solutions: Int[Array, "..."]
+    most_solutions: Int[Array, "..."]
+    outcome: Int[Array, "..."]
+    solver_steps: Int[Array, "..."]
 
 
 class UnilateralTrajectory(eqx.Module):
@@ -355,7 +355,7 @@ def _walk(
 def _go_on(law: Law, place: Guards, max_events: int, options: Options, now: _Walked) -> _Walked:
     """Through the event that a step stands at, and to the next one."""
     motion, tally = unpack(now.state)
-    change, event, outcome = past(law, place, motion, now.stance, now.guard)
+    change, event, outcome = past(law, place, motion, now.stance, now.guard, now.ledger.events)
     flow = flow_of(law.s, law.friction, law.one_sided, change.stance, tilt=law.tilt)
     sound = outcome == Outcome.STEPPED
     start = pack(change.motion, tally._replace(clock=jnp.zeros_like(tally.clock)))
@@ -408,14 +408,14 @@ def _compiled(structure: Any, full: bool) -> Forward:
     return any_mode(partial(walk, False), partial(walk, True))
 
 
-def _lean(walked: _Walked, tilt: Scalar | None) -> Advance:
+def _lean(walked: _Walked, tilt: Elementwise | None) -> Advance:
     ledger = walked.ledger
     stands = unpack(walked.state)[0], walked.stance
     section = section_reached(*stands, walked.outcome, tilt)
     return Advance(section, ledger.durations, walked.outcome, ledger.tried)
 
 
-def _full(walked: _Walked, tilt: Scalar | None) -> UnilateralStep:
+def _full(walked: _Walked, tilt: Elementwise | None) -> UnilateralStep:
     motion, tally = unpack(walked.state)
     assert walked.details is not None
     told = walked.ledger, walked.details, walked.outcome
@@ -423,7 +423,7 @@ def _full(walked: _Walked, tilt: Scalar | None) -> UnilateralStep:
 
 
 def section_reached(
-    motion: WheelMotion, stance: Stance, outcome: Array, tilt: Scalar | None = None
+    motion: WheelMotion, stance: Stance, outcome: Array, tilt: Elementwise | None = None
 ) -> FullState:
     """The section state at a step's end; zeros where it failed."""
     x = closed(motion, stance, tilt)
@@ -437,7 +437,7 @@ def step_told(
     ledger: Ledger,
     details: Details,
     outcome: Array,
-    tilt: Scalar | None = None,
+    tilt: Elementwise | None = None,
 ) -> UnilateralStep:
     """A step by where it ended and what was noted on the way."""
     landing = place_of_landing(motion.L.shape[0], motion)
