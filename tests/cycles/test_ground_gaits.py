@@ -210,6 +210,17 @@ def test_lanes_walk_on_real_ground_as_single_wheels_do(lanes):
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(found))
 
 
+@pytest.mark.slow
+def test_lanes_at_the_tightest_tolerances_walk_as_single_wheels_do():
+    params, ground = vrw.WheelParams(damping=100.0), vrw.UnilateralWheel(friction=1.0)
+    given = {"model": ground, "options": vrw.Options.tight()}
+    found = vrw.steps(params, np.asarray([START]), 10, **given)
+    walk = vrw.walk(params, START, 10, **given)
+    assert int(found.n_stepped[0]) == int(walk.n_stepped) == 10
+    np.testing.assert_allclose(found.durations[0], walk.steps.durations[-1], atol=1e-9)
+    np.testing.assert_allclose(found.section_state[0], walk.steps.section_state[-1], atol=1e-8)
+
+
 def test_what_a_lane_gives_does_not_depend_on_its_company(lanes):
     *_, walked = lanes
     together, alone = walked(slice(None)), walked(slice(1, 2))

@@ -142,7 +142,7 @@ def test_energy_lost_in_a_step_is_told_by_its_causes(traces):
     params, friction, trace = traces["lands sliding"]
     s = params.symbols()
     wheel = vrw.UnilateralWheel(friction=friction)
-    before, _ = unpack(opened(s, wheel.full_section(params, jnp.asarray(START)))[0])
+    before, _ = opened(s, wheel.full_section(params, jnp.asarray(START)))
     begin = float(kinetic_energy(s, before) + sum(potential_energy(s, before)))
     *_, (_, motion, _) = phases(params, trace)
     step = stepped(friction)

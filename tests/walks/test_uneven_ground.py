@@ -7,7 +7,6 @@ from oracle import complementarity
 
 import vrw_jax as vrw
 from vrw_jax.models.unilateral.mechanics import of_slots, slots_of
-from vrw_jax.models.unilateral.motion import unpack
 from vrw_jax.models.unilateral.section import closed, opened
 
 START = (0.1, 1.6, -0.1)
@@ -34,8 +33,7 @@ def test_each_foot_keeps_the_friction_of_its_own_landing():
 def test_a_landing_on_a_steeper_line_is_the_same_motion_in_another_frame():
     s, model = vrw.WheelParams().symbols(), vrw.UnilateralWheel()
     x = model.full_section(vrw.WheelParams(), jnp.asarray(START))
-    state, stance = opened(s, x)
-    motion, _ = unpack(state)
+    motion, stance = opened(s, x)
     told, turned = closed(motion, stance), closed(motion, stance, jnp.asarray(0.05))
     assert abs(float(told[0] - turned[0]) - 0.05) < 1e-15
     np.testing.assert_allclose(turned[4:], told[4:])

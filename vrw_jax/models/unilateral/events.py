@@ -151,7 +151,7 @@ def _that_push(
 
     def switch(now: tuple) -> tuple:
         held, code, tries, best = now
-        found = solve(*still, held, None)
+        found = solve(still[0], still[1], held, None)
         off = jnp.where(held, -found.push / small.force, found.outward / small.motion)
         off = jnp.where(asked, lax.stop_gradient(off), 0.0)
         wrong = off > 1.0

@@ -1,4 +1,4 @@
-"""What is asked of lanes on real ground: walks of many steps, and one step with all that moves it."""
+"""What is asked of lanes on real ground: walks of many steps, one step with all that moves it."""
 
 import functools
 import math
@@ -126,12 +126,11 @@ class _Run(NamedTuple):
         motion = WheelMotion(*(zero,) * 6, legs, legs)
         stands = motion, Stance(off, *(off > 0,) * 4)
         if not self.moved:
-            of_step = lambda: Lean(closed(*stands), jnp.zeros(3, dtype), zero)
-            return jax.eval_shape(lambda: Walked(of_step(), none, none, none))
+            lean = Lean(closed(*stands), jnp.zeros(3, dtype), zero)
+            return jax.eval_shape(lambda: Walked(lean, none, none, none))
         tally = Tally(zero, zero, zero, zero)
         given = *stands, tally, blank(zero), no_details(dtype), none
-        of_step = lambda: step_told(*given)
-        walk = jax.eval_shape(lambda: Walked(of_step(), none, none, none))
+        walk = jax.eval_shape(lambda: Walked(step_told(*given), none, none, none))
         return walk, eqx.filter(walk.told, lambda x: jnp.issubdtype(x.dtype, jnp.inexact))
 
 
