@@ -30,10 +30,11 @@ def test_reverse_mode_equals_forward_mode(forward):
 
 
 def test_grad_of_a_scalar_is_a_row_of_the_jacobian(forward):
-    rate = lambda params: vrw.return_map(params, START, options=TIGHT)[1]
-    gradient = jax.grad(rate)(PARAMS)
+    rate = lambda params, x: vrw.return_map(params, x, options=TIGHT)[1]
+    gradient, by_start = jax.grad(rate, argnums=(0, 1))(PARAMS, START)
     np.testing.assert_allclose(gradient.damping, forward[0].damping[1], rtol=1e-13)
     np.testing.assert_allclose(gradient.slope, forward[0].slope[1], rtol=1e-13)
+    np.testing.assert_allclose(by_start, forward[1][1], rtol=1e-13)
 
 
 @pytest.mark.parametrize("name", ["damping", "natural_length", "slope", "leg_mass"])
