@@ -70,7 +70,8 @@ def test_a_served_step_is_the_rungs_own_step(stepped):
             x = step.section_state[i, jnp.asarray([0, 1, 4 + n])]
             lost = own.energy.landing + own.energy.stopper
         else:
-            own = vrw.step(params, START, model=vrw.UnilateralWheel(friction=friction[i]))
+            ground = vrw.UnilateralWheel(friction=friction[i], infinite="paper")  # it is finite
+            own = vrw.step(params, START, model=ground)
             x, lost = step.section_state[i], own.energy_impacts
         np.testing.assert_allclose(x, own.section_state, atol=1e-12)
         np.testing.assert_allclose(step.period[i], own.period, atol=1e-12)
