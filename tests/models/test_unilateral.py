@@ -3,6 +3,7 @@
 import math
 from functools import partial
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -326,13 +327,11 @@ def test_a_foot_that_lands_sliding_takes_coulombs_impulse(friction):
 
 
 def test_bad_input_is_a_code_and_never_nan():
-    # Friction is refused in a sentence as a plain number, and is a code within a batch.
+    # Friction is refused in a sentence as a plain number, and is a code where no one saw it.
+    model = vrw.UnilateralWheel(infinite="paper")
     for friction, x in ((0.7, (math.nan, 1.0, 0.0)), (-1.0, START), (math.nan, START)):
-        start = jnp.asarray(x)
-        step = jax.tree.map(
-            lambda leaf: leaf[0],
-            jax.vmap(lambda mu, x=start: stepped(mu, x=x))(jnp.asarray([friction])),
-        )
+        unseen = eqx.tree_at(lambda model: model.friction, model, jnp.asarray(friction))
+        step = vrw.step(TABLE_1, x, model=unseen, options=TIGHT)
         assert int(step.outcome) == vrw.Outcome.BAD_INPUT
         assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(step))
         assert not np.any(np.asarray(step.section_state))
@@ -362,8 +361,8 @@ def test_events_without_end_are_bounded_and_told():
 
 
 def test_a_slope_that_is_too_flat_ends_the_walk_with_a_code():
-    params = vrw.WheelParams(slope=0.0)
-    walk = vrw.walk(params, (0.1, 1.0, -0.1), 40, model=vrw.UnilateralWheel(), options=TIGHT)
+    params, model = vrw.WheelParams(slope=0.0), vrw.UnilateralWheel(infinite="paper")
+    walk = vrw.walk(params, (0.1, 1.0, -0.1), 40, model=model, options=TIGHT)
     assert int(walk.outcome) in (vrw.Outcome.FELL_BACK, vrw.Outcome.NO_TOUCHDOWN_IN_TIME)
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(walk.steps))
 
