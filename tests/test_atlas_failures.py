@@ -113,3 +113,58 @@ def test_closed_forms_of_the_impact_oscillator_repeat_themselves():
         np.testing.assert_allclose(told.read(walked.end), x, atol=1e-9)
     resonant = module("resonant_grazing")
     assert abs(case.repeating(2.0 + 1e-7, 0.01)[1] / resonant.rate(0.01) - 1.0) < 1e-3
+
+
+def test_a_guard_that_rises_from_a_rounding_above_zero_does_not_fire_again():
+    # Gaps as differences of lengths, at the slider's eighth impact: 3e-18 m and opening.
+    case = module("slider_crank")
+    flying = lambda q, m: (*q[3:], *case.moved(q, m, case.forces(q, m)))
+    edges = [
+        Edge(lambda q, m, x=x: case.gap(q, m, x, case.ABOVE)) for x in (case.BEHIND, case.AHEAD)
+    ]
+    start = (
+        0.8883344562557088, -0.3949295953577779, 7.986389780903734e-17,
+        69.04453234833802, -23.590254395213915, -2.0545409891643685e-16,
+    )  # fmt: skip
+    walked = ours((Part(flying, tuple(edges)),), start, 1, 0.05)
+    assert walked.says == "GUARD_PAST" or abs(walked.times[0] - 1.17795e-5) < 1e-9
+
+
+def test_corners_hit_one_by_one_are_told_and_both_at_once_walked():
+    case = module("slider_crank")
+    walked = ours(case.TOGETHER, case.begun(), case.BOUNCES, case.LIMIT)
+    assert walked.says == "EVENTS_PILE_UP"
+    assert abs(walked.times[-1] - case.TRUTH["end of the bounces"]) < 1e-14
+    alone = ours(case.ONE_BY_ONE, case.begun(), 20, case.LIMIT)
+    assert alone.says == "EVENTS_PILE_UP"
+    assert abs(alone.times[-1] - case.TRUTH["first impact"]) < 1e-14
+
+
+def test_both_formulations_of_the_slider_crank_keep_the_energy_up_to_the_first_impact():
+    case = module("slider_crank")
+
+    def energy(q):
+        pairs = ((case.CRANK_SELF, q[3] ** 2), (case.ROD_SELF, q[4] ** 2))
+        moving = 0.5 * sum(a * b for a, b in pairs)
+        moving += case.COUPLED * math.cos(q[1] - q[0]) * q[3] * q[4]
+        crank = (0.5 * case.CRANK_MASS + case.ROD_MASS + case.SLIDER_MASS) * case.CRANK
+        rod = (0.5 * case.ROD_MASS + case.SLIDER_MASS) * case.ROD
+        return moving + case.GRAVITY * (crank * math.sin(q[0]) + rod * math.sin(q[1]))
+
+    begin = case.begun()
+    end = ours(case.TOGETHER, begin, 1, case.LIMIT).states[0]
+    first, last = (energy(case.plain(y, math)) for y in (begin, end))
+    assert abs(last / first - 1.0) < 1e-13
+
+
+@pytest.mark.slow
+def test_the_slider_crank_s_truth_is_that_of_forty_digits_in_other_coordinates():
+    from mpmath import mp
+
+    from experiments.atlas.absolute import march
+
+    case = module("slider_crank")
+    with mp.workdps(40):
+        told = march()
+    for name, truth in case.TRUTH.items():
+        assert abs(float(told[name]) / truth - 1.0) < 1e-15, name

@@ -27,8 +27,8 @@ from vrw_jax.figures import figure_style, save
 TABLE = FIGURES / "atlas_failures.csv"
 ORDER = (
     "bouncing_ball", "monodromy", "grazing", "resonant_grazing", "two_states", "pinned_pendulum",
-    "stick_slip", "woodpecker", "painleve", "chenciner", "few_segments", "singular_field",
-    "tangent_guards", "simplest_walker", "compass_gait", "rimless_wheel",
+    "stick_slip", "woodpecker", "slider_crank", "painleve", "chenciner", "few_segments",
+    "singular_field", "tangent_guards", "simplest_walker", "compass_gait", "rimless_wheel",
 )  # fmt: skip
 NAMES = [name for name in ORDER if name in {m.name for m in pkgutil.iter_modules(cases.__path__)}]
 TEXT = DOCS / "stability_atlas.md"

@@ -47,7 +47,7 @@ class Stop(Code):
     EVENTS_PILE_UP = 2, "Events follow each other so fast that the clock no longer moves (Zeno)."
     GUARD_PAST = 3, "A mode begins with a guard below zero: begin on it or inside, or elsewhere."
     STEPS_SPENT = 4, "The solver's steps are spent: raise Options.max_solver_steps."
-    STUCK = 5, "The solver's steps became too short, or no event settled: the field is singular."
+    STUCK = 5, "Steps too short, or no event settled: a singular field or a guard lost in rounding."
 
 
 class Walk(NamedTuple):

@@ -106,7 +106,7 @@ CASE = Case(
     "Two states that switch",
     "events in a stiff phase (rate 2.7e6)",
     "sums of two exponentials, roots in 40 digits",
-    "ARGESIM benchmark C5 (argesim.org/benchmarks/c05)",
+    "ARGESIM benchmark C5 (argesim.org/benchmarks/c05 describes it); its numbers from memory",
     rows,
     draw,
 )

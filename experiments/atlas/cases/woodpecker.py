@@ -175,7 +175,8 @@ CASE = Case(
     "Woodpecker toy",
     "friction, impacts, modes begun on their guards at rate zero",
     "published to few digits; heyoka's beyond",
-    "Glocker's thesis (1995) and Glocker and Studer's toy; parameters as in codes of others",
+    "Glocker's thesis (1995) and Glocker and Studer's toy; parameters and the cycle's state as in "
+    "Siconos' example Woodpecker",
     rows,
     draw,
 )
