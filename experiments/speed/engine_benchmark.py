@@ -1,6 +1,6 @@
 """The lane engine takes more gait steps per second and core than its peers, at equal error.
 
-    python -m experiments.speed.engine_benchmark [--lanes 4096] [--repeats 5]
+    python -m experiments.speed.engine_benchmark [--lanes 4096] [--repeats 5] [--redraw]
 
 4,096 wheels near their own limit cycles (1 % off) take one gait step each, by every engine and at
 several tolerances, in turns. Error: largest of section state and durations, against the diffrax
@@ -22,7 +22,7 @@ import numpy as np
 
 import vrw_jax as vrw
 from experiments.shared.command import command
-from experiments.shared.tables import DOCS, markdown, replace, write_named
+from experiments.shared.tables import DOCS, markdown, read, replace, write_named
 from experiments.shared.timing import on_one_core, processor, start_cold
 from experiments.shared.wheels import near_gaits, wheels
 from experiments.speed import peers
@@ -180,6 +180,11 @@ def write(table, shares, cost, out):
     shown = {"p99_error": ".2e", "steps_per_s": ".0f", "first_call_s": ".1f"}
     rounded = [entry | {k: format(entry[k], form) for k, form in shown.items()} for entry in table]
     write_named(figures / "engine.csv", rounded)
+    lines = [
+        {"share": f"{share:g}"} | {name: f"{values[k]:.4g}" for name, values in cost.items()}
+        for k, share in enumerate(shares)
+    ]
+    write_named(figures / "engine_failures.csv", lines)
     best = at_claimed_error(table)
     fastest = best["lanes"]["steps_per_s"]
     header = ("engine", "method, tolerance", "p99 error", "gait steps per second and core")
@@ -204,8 +209,25 @@ def write(table, shares, cost, out):
     )
     print(text)
     replace(out / "engine.md", "speeds", text)
+    draw(table, shares, cost, figures)
+
+
+def draw(table, shares, cost, figures):
     with plots.figure_style():
         plots.save(draw_charts(table, shares, cost), figures, "engine")
+
+
+def redraw(figures):
+    """From the numbers kept."""
+    numbers = ("p99_error", "steps_per_s")
+    table = [
+        entry | {name: float(entry[name]) for name in numbers}
+        for entry in read(figures / "engine.csv")
+    ]
+    lines = read(figures / "engine_failures.csv")
+    kept = {name: [float(line[name]) for line in lines] for name in lines[0]}
+    shares = np.array(kept.pop("share"))
+    draw(table, shares, kept, figures)
 
 
 def draw_charts(table, shares, cost):
@@ -245,7 +267,11 @@ def main():
     parser.add_argument("--lanes", type=int, default=4096)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--out", type=Path, default=DOCS)
+    parser.add_argument("--redraw", action="store_true", help="the charts alone, measure nothing")
     chosen = parser.parse_args()
+    if chosen.redraw:
+        redraw(chosen.out / "figures")
+        return
     with on_one_core():
         start_cold()
         rows, states, truth = near_gaits(chosen.lanes)

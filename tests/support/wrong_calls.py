@@ -188,7 +188,7 @@ def make() -> None:
         "step by options of a cycle",
         lambda: vrw.step(table_1, start, options=vrw.CycleOptions()),
         "TypeError",
-        "vrw.Options",
+        "must be an Options: give vrw.Options",
     )
     use(
         "a rung that is a class",

@@ -151,8 +151,9 @@ def names_of(name: str, value: Any) -> tuple[str, ...]:
 def instance(name: str, value: Any, kind: type | tuple[type, ...], advice: str) -> None:
     """Refuse what is not of this kind."""
     if not isinstance(value, kind):
-        one = kind[0] if isinstance(kind, tuple) else kind
-        raise TypeError(f"{name} is {shown(value)}, but it must be a {one.__name__}: {advice}.")
+        one = (kind[0] if isinstance(kind, tuple) else kind).__name__
+        article = "an" if one[0] in "AEIOU" else "a"
+        raise TypeError(f"{name} is {shown(value)}, but it must be {article} {one}: {advice}.")
 
 
 def function_of(name: str, value: Any, what: str) -> None:

@@ -56,12 +56,11 @@ def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
     for k, (method, marker) in enumerate(zip(METHODS, "o^sD", strict=True)):
         errors = []
         for depth in depths:
-            time = last_time(method(circle(depth), (1.0, 0.0, 0.0), 1, 9.0), 1)
-            errors.append(abs(time - entry(depth)) + 1e-17)
+            walked = method(circle(depth), (1.0, 0.0, 0.0), 1, 9.0)
+            errors.append(abs(last_time(walked, 1) - entry(depth)) + 1e-17)
         missed = np.array(errors) > 0.5
-        name = method.__name__.removeprefix("by_")
         line = axes.loglog(
-            depths[~missed], np.array(errors)[~missed], marker + "-", ms=4, label=name
+            depths[~missed], np.array(errors)[~missed], marker + "-", ms=4, label=walked.method
         )
         axes.loglog(
             depths[missed], np.full(missed.sum(), 3.0 ** (1 + k)), "x", color=line[0].get_color()
