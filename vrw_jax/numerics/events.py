@@ -408,8 +408,7 @@ def _first_guess(
     v0, r0, v1, r1 = v0[:n_guards], r0[:n_guards], v1[:n_guards], r1[:n_guards]
     fall = jnp.where(crossing & (v0 > v1), v0 - v1, 1.0)
     at = jnp.where(crossing, jnp.clip(v0 / fall, 0.0, 1.0), 1.0)
-    # One that rises from zero, or from a rounding above, is there where the step begins: the
-    # secant lands on the rise, and the cubic over x has the root.
+    # One that rises from zero, or a rounding above: the cubic over x has the root.
     linear, square = 3.0 * v1 - 2.0 * r0 - r1, r0 - 2.0 * v1 + r1
     root = jnp.sqrt(jnp.maximum(linear * linear - 4.0 * r0 * square, 0.0)) - linear
     other = jnp.clip(2.0 * r0 / jnp.where(root > 0.0, root, 1.0), 0.0, 1.0)
@@ -421,8 +420,7 @@ def _first_guess(
     climbs = crossing & (r0 > 0.0) & ((v0 == 0.0) | (slope(at) >= 0.0))
     at = jnp.where(climbs, other, at)
     for _ in range(3):
-        steep = slope(at)
-        falls = steep < 0.0
+        falls = (steep := slope(at)) < 0.0
         change = cubic(at, v0, r0, v1, r1) / jnp.where(falls, steep, 1.0)
         at = jnp.where(crossing & falls, jnp.clip(at - change, 0.0, 1.0), at)
     return lax.stop_gradient(length) * jnp.min(jnp.where(crossing, at, 1.0))
