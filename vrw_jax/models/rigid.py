@@ -4,7 +4,6 @@ from functools import partial
 from typing import ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
@@ -21,7 +20,7 @@ from vrw_jax.models.base import (
     replaced_where_bad,
     usable,
 )
-from vrw_jax.numerics import Options, Scalar
+from vrw_jax.numerics import Elementwise, Options, select
 from vrw_jax.wheel import (
     PARAMETER_NAMES,
     Motion,
@@ -84,7 +83,7 @@ class RigidWheel(AbstractWheel):
         result = self.step(params, x, options)
         return Advance(result.section_state, result.durations, result.outcome, result.solver_steps)
 
-    def _kept(self, s: Symbols) -> Scalar:
+    def _kept(self, s: Symbols) -> Elementwise:
         """Rate after over rate before the landing."""
         foot_inertia = _foot_inertia(s)
         if not self.held_landing:
@@ -96,16 +95,21 @@ class RigidWheel(AbstractWheel):
 
     @eqx.filter_jit
     def step(self, params: WheelParams, x: SectionState, options: Options) -> StepResult:
-        x = jnp.stack([0.5 * params.leg_angle + 0.0 * x[0], x[1], 0.0 * x[2]])
-        good = usable(params, x)
-        safe_x = jnp.asarray([0.5 * params.leg_angle, 1.0, 0.0])
-        params, x = replaced_where_bad(good, params, x, safe_x)
-        s = params.symbols()
-        half = jnp.asarray(0.5 * s.alpha, x.dtype)
-        before, rate = x[1], self._kept(s) * x[1]
-        roll = _Roll(s, rate)
+        return self.rolled(params, tuple(x), jnp.asarray(self.friction, x.dtype))
 
-        apex = jnp.where(s.sin_phi < jnp.sin(half), jnp.arcsin(-s.sin_phi), -half)
+    def rolled(
+        self, params: WheelParams, x: tuple[Elementwise, ...], friction: Elementwise
+    ) -> StepResult:
+        """The step element by element: of one wheel or of lanes."""
+        half = jnp.asarray(0.5 * params.leg_angle, x[1].dtype)
+        x = (half + 0.0 * x[0], x[1], 0.0 * x[2])
+        good = usable(params, x)
+        params, x = replaced_where_bad(good, params, x, (half, 1.0, 0.0))
+        s = params.symbols()
+        before, rate = x[1], self._kept(s) * x[1]
+        roll = _Roll(s, params.slope, rate)
+
+        apex = jnp.where(s.sin_phi < jnp.sin(half), -params.slope, -half)
         passes = roll.rate_squared(apex) > 0.0
         lowest = roll.lowest_premises()
         lifts = (lowest[0] <= 0.0) & passes & self.stop_at_lift_off
@@ -113,14 +117,14 @@ class RigidWheel(AbstractWheel):
         outcome = jnp.where(lifts, jnp.int32(Outcome.LEG_1_LIFTED_OFF), outcome)
         outcome = jnp.where(good, outcome, jnp.int32(Outcome.BAD_INPUT))
         stepped = outcome == Outcome.STEPPED
-        reach = _Roll(s, jnp.where(passes, rate, 10.0))
+        reach = _Roll(s, params.slope, jnp.where(passes, rate, 10.0))
         after = jnp.sqrt(reach.rate_squared(half))
         duration = reach.time(half)
 
         zero = jnp.zeros_like(before)
         tell = lambda value: jnp.where(good, value, jnp.zeros_like(value))
         walked = lambda value: jnp.where(stepped, value, jnp.zeros_like(value))
-        rear, friction_left, stopper_impulse = self._landing(s, x, roll)
+        rear, friction_left, stopper_impulse = self._landing(s, x, roll, friction)
         return StepResult(
             section_state=walked(jnp.stack([half + zero, after, zero])),
             post_impact=tell(jnp.stack([-half + zero, rate])),
@@ -139,10 +143,10 @@ class RigidWheel(AbstractWheel):
                 locked_stopper_force=walked(lowest[3:]),
                 rear_stopper_force=walked(lowest[2]),
                 contraction=zero,
-                friction_fore=walked(self.friction + lowest[1]),
-                friction_rear=tell(self.friction + zero),
+                friction_fore=walked(friction + lowest[1]),
+                friction_rear=tell(friction + zero),
                 landing_stopper_impulse=tell(stopper_impulse),
-                hit_stopper_impulse=jnp.zeros((s.n - 2,), zero.dtype),
+                hit_stopper_impulse=jnp.zeros_like(stopper_impulse),
                 hit_planted_impulse=zero,
                 landing_friction_fore=tell(friction_left[0]),
                 landing_friction_rear=tell(friction_left[1]),
@@ -156,11 +160,13 @@ class RigidWheel(AbstractWheel):
             solver_steps=jnp.zeros((), jnp.int32),
         )
 
-    def _landing(self, s: Symbols, x: SectionState, roll: "_Roll") -> tuple:
+    def _landing(
+        self, s: Symbols, x: tuple[Array, ...], roll: "_Roll", friction: Elementwise
+    ) -> tuple:
         """Impulse at the rear foot, friction left at the fore and the rear foot, and impulses of
         the stoppers of legs 3..n."""
         zero = jnp.zeros_like(x[1])
-        first = roll.motion(-jnp.asarray(0.5 * s.alpha, x.dtype) + zero)
+        first = roll.motion(-jnp.asarray(0.5 * s.alpha, zero.dtype) + zero)
         hub_after = transitions.hub_velocity(first)
         hub_before = transitions.hub_velocity(transitions.motion_before_landing(s, *x))
         jump = (hub_after[0] - hub_before[0], hub_after[1] - hub_before[1])
@@ -168,7 +174,7 @@ class RigidWheel(AbstractWheel):
         rear = transitions.land(s, *x).rear if held else dynamics.FootForce(zero, zero)
         # Impulse at the fore foot: the jump of total momentum Mt v_hub (the mass centre).
         fore = dynamics.FootForce(s.Mt * jump[0] - rear.tangential, s.Mt * jump[1] - rear.normal)
-        left = tuple(self.friction - dynamics.friction_needed(foot) for foot in (fore, rear))
+        left = tuple(friction - dynamics.friction_needed(foot) for foot in (fore, rear))
         impulse = transitions.locked_leg_impulses(s, first, jump, range(3, s.n + 1))
         return rear, left, impulse
 
@@ -178,7 +184,7 @@ class RigidWheel(AbstractWheel):
         """Equal angles instead of equal times."""
         result = self.step(params, x, options)
         s = params.symbols()
-        roll = _Roll(s, result.post_impact[1])
+        roll = _Roll(s, params.slope, result.post_impact[1])
         stands = jnp.full((n_samples,), -0.5 * s.alpha)
         rolls = jnp.where(
             result.outcome == Outcome.STEPPED,
@@ -187,32 +193,25 @@ class RigidWheel(AbstractWheel):
         )
         angles = jnp.stack([stands, stands, rolls])
 
-        def describe(theta: Scalar) -> tuple:
-            m = roll.motion(theta)
-            force = roll.foot_force(theta)
-            zero = 0.0 * theta
-            state = jnp.stack([theta, m.L1, m.L2, m.dtheta, m.dL1, m.dL2])
-            forces = jnp.stack([force.tangential, force.normal, zero, zero])
-            return roll.time(theta), state, forces, jnp.stack(dynamics.energy(s, m))
-
-        time, state, forces, energy = jax.vmap(jax.vmap(describe))(angles)
+        state, forces, energy = (jnp.moveaxis(rows, 0, -1) for rows in roll.described(angles))
         ends = result.section_state, result.durations, result.outcome
-        return Trajectory(time, state, forces, energy, *ends)
+        return Trajectory(roll.time(angles), state, forces, energy, *ends)
 
 
 class _Roll(eqx.Module):
     """Rolling over one foot from theta = -alpha/2 with the given rate, by energy."""
 
     s: Symbols
-    rate: Scalar  # at theta = -alpha/2, rad/s
+    phi: Elementwise  # slope, rad
+    rate: Elementwise  # at theta = -alpha/2, rad/s
 
-    def rate_squared(self, theta: Scalar) -> Scalar:
+    def rate_squared(self, theta: Elementwise) -> Elementwise:
         """Square of dtheta at theta; negative where the wheel does not get."""
         s = self.s
         fallen = _cos_sum(s, -0.5 * s.alpha) - _cos_sum(s, theta)
         return self.rate**2 + 2.0 * _stiffness_of_gravity(s) * fallen
 
-    def time(self, theta: Scalar) -> Scalar:
+    def time(self, theta: Elementwise) -> Elementwise:
         """Time from theta = -alpha/2, s, by Carlson's R_F.
 
         With t = sin^2 of half the angle from the vertical the rate is a square root of a linear
@@ -220,8 +219,7 @@ class _Roll(eqx.Module):
         """
         s = self.s
         kappa = 2.0 * _stiffness_of_gravity(s)
-        phi = jnp.arcsin(s.sin_phi)
-        begin, end = 0.5 * (phi - 0.5 * s.alpha), 0.5 * (phi + theta)
+        begin, end = 0.5 * (self.phi - 0.5 * s.alpha), 0.5 * (self.phi + theta)
         least = self.rate**2 + kappa * (jnp.cos(2.0 * begin) - 1.0)  # rate^2 at the vertical
         apart = begin * end < 0.0
         from_vertical = jnp.zeros_like(end)
@@ -234,7 +232,7 @@ class _Roll(eqx.Module):
         first = _cubic_time(from_vertical, jnp.where(apart, begin**2, 0.0), least, kappa)
         return direct + first
 
-    def motion(self, theta: Scalar) -> Motion:
+    def motion(self, theta: Elementwise) -> Motion:
         """Posture and rates at theta."""
         zero = 0.0 * theta
         speed_squared = self.rate_squared(theta)
@@ -243,71 +241,81 @@ class _Roll(eqx.Module):
         length = self.s.L0 + zero
         return Motion.of(theta, length, length, rate, zero, zero)
 
-    def acceleration(self, theta: Scalar) -> dynamics.Acceleration:
+    def acceleration(self, theta: Elementwise) -> dynamics.Acceleration:
         """Angular acceleration under gravity; the legs don't move."""
         zero = 0.0 * theta
         sin_p = jnp.sin(theta) * self.s.cos_phi + jnp.cos(theta) * self.s.sin_phi
         return dynamics.Acceleration(_stiffness_of_gravity(self.s) * sin_p, zero, zero)
 
-    def foot_force(self, theta: Scalar) -> dynamics.FootForce:
+    def foot_force(self, theta: Elementwise) -> dynamics.FootForce:
         """Force of the ground on the standing foot, N."""
         return dynamics.fore_foot_force(self.s, self.motion(theta), self.acceleration(theta))
 
-    def stopper_force(self, theta: Scalar, legs: range) -> Float[Array, " n"]:
+    def stopper_force(self, theta: Elementwise, legs: range) -> Float[Array, "n ..."]:
         """Force of the stoppers of `legs`, N."""
         return dynamics.stopper_force(self.s, self.motion(theta), self.acceleration(theta), legs)
 
-    def premises(self, theta: Scalar) -> Float[Array, " n_premises"]:
-        """Normal force, minus friction needed, stopper forces of legs 2..n at theta."""
-        force = self.foot_force(theta)
-        stoppers = self.stopper_force(theta, range(2, self.s.n + 1))
-        return jnp.concatenate(
-            [jnp.stack([force.normal, -dynamics.friction_needed(force)]), stoppers]
-        )
+    def described(self, theta: Elementwise) -> tuple[Array, Array, Array]:
+        """Coordinates with their rates, forces of both feet and energies at theta, as rows."""
+        m, force, zero = self.motion(theta), self.foot_force(theta), 0.0 * theta
+        state = jnp.stack([theta, m.L1, m.L2, m.dtheta, m.dL1, m.dL2])
+        forces = jnp.stack([force.tangential, force.normal, zero, zero])
+        return state, forces, jnp.stack(dynamics.energy(self.s, m))
+
+    def premises(self, theta: Array) -> Array:
+        """Normal force, minus friction needed, stopper forces of legs 2..n, at an angle each."""
+        stoppers = [
+            self.stopper_force(theta[leg], range(leg, leg + 1))[0] for leg in range(2, self.s.n + 1)
+        ]
+        needed = dynamics.friction_needed(self.foot_force(theta[1]))
+        return jnp.stack([self.foot_force(theta[0]).normal, -needed, *stoppers])
 
     def lowest_premises(self) -> Array:
         """Minima of `premises` from landing to landing, to round-off.
 
-        Each is zoomed in on twice; what is left of the angle's error counts squared.
+        Each is zoomed in on several times; what is left of the angle's error counts squared.
         """
         half = jnp.asarray(0.5 * self.s.alpha, self.rate.dtype)
-        spread = jnp.linspace(-1.0, 1.0, GRID)
 
-        def lowest(index: Array) -> Scalar:
-            def zoom(carry: tuple[Scalar, Scalar], _round: None) -> tuple:
-                center, width = carry
-                angles = jnp.clip(center + width * spread, -half, half)
-                values = jax.vmap(lambda theta: self.premises(theta)[index])(angles)
-                return (angles[jnp.argmin(values)], width * 2.5 / GRID), None
+        def zoom(_round: Array, around: tuple[Array, Array]) -> tuple[Array, Array]:
+            center, width = around
 
-            start = (0.0 * self.rate, half + 0.0 * self.rate)
-            (theta, _), _ = lax.scan(zoom, start, None, length=5)
-            return self.premises(lax.stop_gradient(theta))[index]
+            def look(i: Array, best: tuple[Array, Array]) -> tuple[Array, Array]:
+                theta = jnp.clip(center + width * (i * (2.0 / (GRID - 1)) - 1.0), -half, half)
+                value = self.premises(theta)
+                return select(value < best[1], (theta, value), best)
 
-        return jax.vmap(lowest)(jnp.arange(2 + self.s.n - 1))
+            nothing = center, jnp.full_like(center, jnp.inf)
+            return lax.fori_loop(0, GRID, look, nothing)[0], width * (2.5 / GRID)
+
+        begin = jnp.stack([0.0 * self.rate] * (1 + self.s.n))
+        theta, _ = lax.fori_loop(0, 5, zoom, (begin, half))
+        return self.premises(lax.stop_gradient(theta))
 
 
-def _hub_inertia(s: Symbols) -> Scalar:
+def _hub_inertia(s: Symbols) -> Elementwise:
     """Moment of inertia of all leg masses about the hub, n m (L0 - a)^2, kg m^2."""
     return s.n * s.m * s.c0**2
 
 
-def _foot_inertia(s: Symbols) -> Scalar:
+def _foot_inertia(s: Symbols) -> Elementwise:
     """Moment of inertia of the wheel about a foot, kg m^2."""
     return s.Mt * s.L0**2 + _hub_inertia(s)
 
 
-def _stiffness_of_gravity(s: Symbols) -> Scalar:
+def _stiffness_of_gravity(s: Symbols) -> Elementwise:
     """Mt g L0 over the inertia about the foot, 1/s^2: g/l of a rimless wheel without leg masses."""
     return s.Mt * s.g * s.L0 / _foot_inertia(s)
 
 
-def _cos_sum(s: Symbols, theta: Scalar | float) -> Scalar:
+def _cos_sum(s: Symbols, theta: Elementwise | float) -> Elementwise:
     """Cosine of theta + phi."""
     return jnp.cos(theta) * s.cos_phi - jnp.sin(theta) * s.sin_phi
 
 
-def _cubic_time(begin_squared: Scalar, end_squared: Scalar, least: Scalar, kappa: Scalar) -> Scalar:
+def _cubic_time(
+    begin_squared: Elementwise, end_squared: Elementwise, least: Elementwise, kappa: Elementwise
+) -> Elementwise:
     """Time between two half-angles on one side of the vertical, given by their squares, s.
 
     Integral of dt / sqrt(t (1 - t) (least + 2 kappa t)) over t = sin^2, as 2 R_F (DLMF 19.29.4);
@@ -330,7 +338,7 @@ def _cubic_time(begin_squared: Scalar, end_squared: Scalar, least: Scalar, kappa
     return jnp.where(apart, 2.0 * carlson_rf(u12**2, u13**2, u23**2), 0.0)
 
 
-def carlson_rf(x: Scalar, y: Scalar, z: Scalar) -> Scalar:
+def carlson_rf(x: Elementwise, y: Elementwise, z: Elementwise) -> Elementwise:
     """Carlson's symmetric elliptic integral R_F to round-off, by duplication (DLMF 19.36.1).
 
     Each duplication brings the arguments four times closer; after 12 the fifth-order series is
