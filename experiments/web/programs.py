@@ -11,9 +11,10 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from vrw_jax import simd
-from vrw_jax.models import DIRECTIONS, along_units, gait_step
+from vrw_jax.models import DIRECTIONS, RigidWheel, StepResult, along_units, gait_step
 from vrw_jax.models.lane_step import lane_phase, walk
 from vrw_jax.models.paper_step import result_of, told_of
+from vrw_jax.models.rigid import Roll
 from vrw_jax.models.viscoelastic import described
 from vrw_jax.numerics import Options, explicit_tableau, sample_lanes
 from vrw_jax.results import MARGINS
@@ -67,12 +68,6 @@ def programs(n_legs: int) -> dict[str, Program]:
         params, options = wheel(parameters), _options(tolerance)
         walked = walk(params, tuple(x), options, explicit_tableau(SOLVER), True, monitored=True)
         step = result_of(walked.s, walked.landing, told_of(walked), friction)
-        parts = (
-            step.section_state, step.post_impact, step.durations, step.step_length,
-            *vars(step.indicators).values(), *(getattr(step.monitors, name) for name in TOLD),
-            *vars(step.energy).values(),
-        )  # fmt: skip
-        numbers = jnp.concatenate([jnp.atleast_2d(part) for part in parts])
         motion = []
         for phase, start, end in zip(walked.phases, walked.starts, walked.ends, strict=True):
             flow = lane_phase(phase, monitored=False)
@@ -81,13 +76,58 @@ def programs(n_legs: int) -> dict[str, Program]:
             )
             motion.append(jnp.concatenate(described(phase, jnp.moveaxis(samples, 1, 0))))
         codes = jnp.stack([step.outcome, step.solver_steps]).astype(jnp.int32)
-        return numbers, codes, *motion
+        return _numbers_of(step), codes, *motion
 
     return {
         "advance": Program(advance, 1),
         "linearised": Program(linearised, 1, DIRECTIONS),
         "told": Program(told, 2),
+        **_of_rigid_legs(wheel),
     }
+
+
+def _of_rigid_legs(wheel: Callable[[Array], WheelParams]) -> dict[str, Program]:
+    """The same of the lowest rung, in whose formulas no tolerance stands."""
+
+    def rolled(parameters: Array, x: tuple) -> tuple[tuple, tuple]:
+        step = RigidWheel().rolled(wheel(parameters), x, jnp.ones_like(x[0]))
+        return (*step.section_state, *step.durations), (step.outcome, step.solver_steps)
+
+    def advance(tolerance: Array, parameters: Array, x: Array) -> tuple:
+        numbers, codes = rolled(parameters, tuple(x))
+        return jnp.stack(numbers), jnp.stack(codes)
+
+    def linearised(tolerance: Array, parameters: Array, x: Array) -> tuple:
+        moved = lambda *start: rolled(parameters, start)
+        columns, numbers, codes = along_units(moved, tuple(x), range(3))
+        return jnp.stack(numbers), jnp.stack(codes), jnp.stack(columns, 1)
+
+    def told(tolerance: Array, friction: Array, parameters: Array, x: Array) -> tuple:
+        params = wheel(parameters)
+        step = RigidWheel().rolled(params, tuple(x), friction + 0.0 * x[0])
+        half = 0.5 * params.leg_angle
+        share = jnp.arange(SAMPLES)[:, None] * (1.0 / (SAMPLES - 1))
+        roll = Roll(params.symbols(), params.slope, step.post_impact[1])
+        theta = half * (2.0 * share - 1.0) + 0.0 * x[0]
+        rows = jnp.concatenate([*roll.described(theta), roll.time(theta)[None]])
+        codes = jnp.stack([step.outcome, step.solver_steps])
+        return _numbers_of(step), codes, rows
+
+    return {
+        "rigid_advance": Program(advance, 1),
+        "rigid_linearised": Program(linearised, 1, DIRECTIONS),
+        "rigid_told": Program(told, 2),
+    }
+
+
+def _numbers_of(step: StepResult) -> Array:
+    """What a step tells, row by row."""
+    parts = (
+        step.section_state, step.post_impact, step.durations, step.step_length,
+        *vars(step.indicators).values(), *(getattr(step.monitors, name) for name in TOLD),
+        *vars(step.energy).values(),
+    )  # fmt: skip
+    return jnp.concatenate([jnp.atleast_2d(part) for part in parts])
 
 
 def _advance(params: WheelParams, x: tuple[Array, ...], options: Options) -> tuple[tuple, tuple]:

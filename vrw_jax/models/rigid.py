@@ -107,7 +107,7 @@ class RigidWheel(AbstractWheel):
         params, x = replaced_where_bad(good, params, x, (half, 1.0, 0.0))
         s = params.symbols()
         before, rate = x[1], self._kept(s) * x[1]
-        roll = _Roll(s, params.slope, rate)
+        roll = Roll(s, params.slope, rate)
 
         apex = jnp.where(s.sin_phi < jnp.sin(half), -params.slope, -half)
         passes = roll.rate_squared(apex) > 0.0
@@ -117,7 +117,7 @@ class RigidWheel(AbstractWheel):
         outcome = jnp.where(lifts, jnp.int32(Outcome.LEG_1_LIFTED_OFF), outcome)
         outcome = jnp.where(good, outcome, jnp.int32(Outcome.BAD_INPUT))
         stepped = outcome == Outcome.STEPPED
-        reach = _Roll(s, params.slope, jnp.where(passes, rate, 10.0))
+        reach = Roll(s, params.slope, jnp.where(passes, rate, 10.0))
         after = jnp.sqrt(reach.rate_squared(half))
         duration = reach.time(half)
 
@@ -157,11 +157,11 @@ class RigidWheel(AbstractWheel):
                 damping=zero,
             ),
             outcome=outcome,
-            solver_steps=jnp.zeros((), jnp.int32),
+            solver_steps=jnp.zeros_like(outcome),
         )
 
     def _landing(
-        self, s: Symbols, x: tuple[Array, ...], roll: "_Roll", friction: Elementwise
+        self, s: Symbols, x: tuple[Array, ...], roll: "Roll", friction: Elementwise
     ) -> tuple:
         """Impulse at the rear foot, friction left at the fore and the rear foot, and impulses of
         the stoppers of legs 3..n."""
@@ -184,7 +184,7 @@ class RigidWheel(AbstractWheel):
         """Equal angles instead of equal times."""
         result = self.step(params, x, options)
         s = params.symbols()
-        roll = _Roll(s, params.slope, result.post_impact[1])
+        roll = Roll(s, params.slope, result.post_impact[1])
         stands = jnp.full((n_samples,), -0.5 * s.alpha)
         rolls = jnp.where(
             result.outcome == Outcome.STEPPED,
@@ -198,7 +198,7 @@ class RigidWheel(AbstractWheel):
         return Trajectory(roll.time(angles), state, forces, energy, *ends)
 
 
-class _Roll(eqx.Module):
+class Roll(eqx.Module):
     """Rolling over one foot from theta = -alpha/2 with the given rate, by energy."""
 
     s: Symbols
