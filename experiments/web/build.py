@@ -45,6 +45,9 @@ SLIDERS = {
 }
 """What a slider spans, parameters that one turns first first."""
 
+RUNGS = {"viscoelastic": "springs and dampers", "rigid": "rigid legs"}
+"""What a wheel's legs may be, by the rungs' names."""
+
 
 def linked(objects: dict[str, bytes]) -> bytes:
     """One module of functions by name, that imports `sin` and `cos`."""
@@ -120,6 +123,7 @@ def facts() -> dict[str, Any]:
         },
         "start": list(PAPER_START),
         "legs": list(LEGS),
+        "rungs": RUNGS,
         "samples": SAMPLES,
         "rows": {n: told_rows(n) for n in LEGS},
         "measures": {name: told(m) for name, m in (STEP | MARGINS | CYCLE).items()},

@@ -34,6 +34,10 @@ def test_parameters_are_read_and_set(widget):
     assert widget.friction == 0.8
     widget.friction = 0.7
     assert widget.values["friction"] == 0.7
+    assert widget.rung == "viscoelastic"
+    widget.rung = "rigid"
+    widget.params = vrw.WheelParams(slope=0.2)
+    assert widget.values["rung"] == "rigid"
 
 
 def test_the_page_is_inside(widget):
@@ -73,6 +77,7 @@ def test_a_dataset_becomes_the_map():
         ({"params": vrw.WheelParams(damping=np.ones(3))}, "show one after the other"),
         ({"friction": -1.0}, "a coefficient of friction is at least 0"),
         ({"height": 0}, "height"),
+        ({"rung": "rigit"}, "did you mean 'rigid'|must be one of"),
     ],
 )
 def test_what_is_given_wrongly_gets_one_sentence(wrong, sentence):
@@ -103,6 +108,7 @@ def test_the_address_holds_the_wheel():
     assert page_address(vrw.WheelParams()).endswith("wheel.html")
     address = urlsplit(page_address(vrw.WheelParams(damping=150.0, n_legs=6)))
     assert parse_qs(address.fragment) == {"damping": ["150.0"], "n_legs": ["6"]}
+    assert page_address(vrw.WheelParams(), "rigid").endswith("wheel.html#rung=rigid")
 
 
 def test_the_command_opens_the_page(monkeypatch):

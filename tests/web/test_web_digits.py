@@ -126,6 +126,39 @@ def test_all_that_a_step_tells_is_the_librarys():
         assert same(found, walked[name].values, 1.0) < SAME, name
 
 
+@pytest.mark.parametrize("n_legs", [6, 8, 10])
+def test_a_step_on_rigid_legs_is_the_librarys(n_legs):
+    """Values, its slope, and all that it tells."""
+    n, model = 300, vrw.RigidWheel(friction=0.9)
+    wheels, starts = drawn(n)
+    starts[0] = np.pi / n_legs
+    facts, rows = code(n_legs).facts, told_rows(n_legs)
+    told = [((len(rows),), np.float64), ((2,), np.int32), ((14, facts["samples"]), np.float64)]
+    numbers, codes, motion = code(n_legs)("rigid_told", [0.0, 0.9], [wheels, starts], told)
+    step = jax.vmap(functools.partial(vrw.step, model=model))
+    expected = step(wheels_of(wheels, n_legs), jnp.asarray(starts.T))
+    assert np.array_equal(codes[0], expected.outcome)
+    assert len(np.unique(codes[0])) > 2
+    measures = expected.measures()
+    for name, row in zip(rows, numbers, strict=True):
+        base, _, leg = name.partition("[")
+        known = np.asarray(measures[base])
+        known = known[:, int(leg[:-1]) - 3] if leg else known
+        assert same(row, known, 1.0) < SAME, name
+    one = int(np.flatnonzero(codes[0] == 0)[0])
+    params = wheels_of(wheels[:, one], n_legs)
+    walked = vrw.simulate(
+        params, starts[:, one], n_steps=1, n_samples=facts["samples"], model=model
+    )
+    for name, row in (("theta", 0), ("lambda_1", 6), ("kinetic_energy", 10), ("time", 13)):
+        found = motion[row, :, one]
+        assert same(found, walked[name].values[-len(found) :], 1.0) < SAME, name
+    told = [((6,), np.float64), ((2,), np.int32), ((3, 6), np.float64)]
+    _, _, columns = code(n_legs)("rigid_linearised", [0.0], [wheels, starts], told)
+    by = jax.jacfwd(lambda x: vrw.return_map(params, x, model=model))(jnp.asarray(starts[:, one]))
+    assert same(columns[1, 1, one], by[1, 1], 1.0) < SAME
+
+
 def test_the_page_is_one_file_below_a_megabyte_that_fetches_nothing():
     page = PAGE.read_text(encoding="utf-8")
     assert len(page.encode()) <= 1_000_000

@@ -104,6 +104,40 @@ def test_a_slider_moves_the_numbers(page):
     assert "damping=300" in page.inner_text("#python")
 
 
+@pytest.mark.parametrize("held", [True, False])
+def test_rigid_legs_roll_as_the_librarys_do(page, held):
+    """At a slope of 0.45 rad the ground would have to pull."""
+    params = vrw.WheelParams(slope=0.2 if held else 0.45, n_legs=8)
+    page.evaluate("s => vrw.update({ rung: 'rigid', slope: s })", float(params.slope))
+    model = vrw.RigidWheel()
+    assert "RigidWheel()" in page.inner_text("#python")
+    result = page.evaluate("vrw.state.result")
+    if not held:
+        assert result["gait"] is None
+        assert "lost" in page.inner_text("#verdict")
+        return
+    x, multipliers = gait_of(page)
+    cycle = vrw.limit_cycle(params, model=model)
+    assert np.max(np.abs(x - cycle.section_state)) < 1e-9
+    assert abs(abs(multipliers[0]) - float(cycle.spectral_radius)) < 1e-9
+    for name, value in vrw.step(params, jnp.asarray(x), model=model).measures().items():
+        if np.ndim(value) == 0 and name in result["measures"]:
+            assert abs(result["measures"][name] - float(value)) < 1e-9 * (1.0 + abs(value)), name
+    trace = vrw.simulate(params, x, n_steps=1, n_samples=24, model=model)
+    [shown] = result["steps"]
+    for row, name in (("times", "time"), (0, "theta"), (7, "lambda_2")):
+        found = np.array(shown[row] if row == "times" else shown["rows"][row])
+        assert np.max(np.abs(found - trace[name].values[-24:])) < 1e-8, name
+
+
+def test_friction_that_would_not_do_is_told(page):
+    assert "would slide" not in page.inner_text("#verdict")
+    page.evaluate("vrw.update({ friction: 0.3 })")
+    assert "they would slide" in page.inner_text("#verdict")
+    step = vrw.limit_cycle(vrw.WheelParams(), model=vrw.ViscoelasticWheel(friction=0.3)).step
+    assert float(step.monitors.friction_fore) < 0.0
+
+
 def test_a_wheel_can_be_sent_as_an_address(browser):
     shown = browser.new_page()
     shown.goto(PAGE.as_uri() + "#damping=40&n_legs=8")
@@ -169,7 +203,7 @@ def test_a_widgets_frame_passes_values_on_in_both_directions(browser):
     shown = browser.new_page()
     shown.set_content("<div id='cell'></div>")
     traits = {"page": PAGE.read_text(encoding="utf-8"), "height": 800, "map": {}, "told": {}}
-    traits["values"] = explorer._values(vrw.WheelParams(damping=150.0), 0.9)
+    traits["values"] = explorer._values(vrw.WheelParams(damping=150.0), 0.9, "viscoelastic")
     shown.evaluate(
         """traits => {
           const listeners = {};

@@ -166,13 +166,15 @@ def explore(
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Begin there; may be repeated."),
     ] = None,
+    rung: Annotated[str, typer.Option(help="viscoelastic, or rigid.")] = "viscoelastic",
 ) -> None:
     """Open the wheel to play with in your browser: one page, which computes by itself."""
     with sentences():
         from vrw_jax.app.config import assignment
         from vrw_jax.web import page_address
 
-        address = page_address(_settings(None).params(dict(assignment(t) for t in changes or [])))
+        params = _settings(None).params(dict(assignment(t) for t in changes or []))
+        address = page_address(params, rung)
         webbrowser.open(address)
         print(address)
 

@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlencode
 
 from vrw_jax.wheel import DOMAINS, FRICTION, WheelParams, friction_of
-from vrw_jax.wording import instance, untraced, whole
+from vrw_jax.wording import chosen, instance, untraced, whole
 
 if TYPE_CHECKING:
     import xarray as xr
 
+RUNGS = "viscoelastic", "rigid"
+"""Of the ladder, those that the page walks on."""
 HEIGHT = 900
 """Of the widget, in pixels of the screen."""
 
@@ -61,9 +63,11 @@ def page_path() -> Path:
     )
 
 
-def page_address(params: WheelParams) -> str:
+def page_address(params: WheelParams, rung: str = RUNGS[0]) -> str:
     """Where a browser finds the page, opened at this wheel."""
-    values = {k: v for k, v in _values(params, 1.0).items() if v != _values(WheelParams(), 1.0)[k]}
+    usual = _values(WheelParams(), 1.0, RUNGS[0])
+    given = _values(params, 1.0, chosen("rung", rung, RUNGS))
+    values = {name: value for name, value in given.items() if value != usual[name]}
     return page_path().as_uri() + (f"#{urlencode(values)}" if values else "")
 
 
@@ -71,6 +75,7 @@ def explore(
     params: WheelParams | None = None,
     *,
     friction: float = 1.0,
+    rung: str = RUNGS[0],
     dataset: "xr.Dataset | None" = None,
     height: int = HEIGHT,
 ) -> Any:
@@ -78,12 +83,13 @@ def explore(
 
     It is the page docs/wheel.html, which computes in the browser with this library's own step.
     The widget's `params` are the wheel that is shown: read them after moving a slider, set them to
-    move it. `friction` likewise; `told` holds what the page says of the step, by the names of
-    `vrw.MEASURES`. Needs anywidget: `pip install 'vrw-jax[explore]'`.
+    move it. `friction` and `rung` likewise; `told` holds what the page says of the step, by the
+    names of `vrw.MEASURES`. Needs anywidget: `pip install 'vrw-jax[explore]'`.
 
     Args:
         params: that it begins with; Table 1's by default.
         friction: what its margins refer to.
+        rung: "viscoelastic", or "rigid" for legs without springs.
         dataset: of a `vrw.scan` over a grid of two parameters: its map.
         height: of the widget, in pixels.
 
@@ -106,7 +112,7 @@ def explore(
     given = {} if dataset is None else _map_of(dataset)
     return _widget()(
         page=page_path().read_text(encoding="utf-8"),
-        values=_values(params, float(friction_of(friction))),
+        values=_values(params, float(friction_of(friction)), chosen("rung", rung, RUNGS)),
         map=given,
         height=whole("height", height),
     )
@@ -142,7 +148,7 @@ def _widget() -> type:
 
         @params.setter
         def params(self, params: WheelParams) -> None:
-            self.values = _values(params, self.friction)
+            self.values = _values(params, self.friction, self.rung)
 
         @property
         def friction(self) -> float:
@@ -153,13 +159,22 @@ def _widget() -> type:
         def friction(self, value: float) -> None:
             self.values = {**self.values, FRICTION: float(friction_of(value))}
 
+        @property
+        def rung(self) -> str:
+            """Of the model that walks."""
+            return str(self.values["rung"])
+
+        @rung.setter
+        def rung(self, value: str) -> None:
+            self.values = {**self.values, "rung": chosen("rung", value, RUNGS)}
+
     return Explorer
 
 
-def _values(params: WheelParams, friction: float) -> dict[str, float]:
+def _values(params: WheelParams, friction: float, rung: str) -> dict[str, float | str]:
     """As the page names them."""
     numbers = {name: float(getattr(params, name)) for name in DOMAINS}
-    return {**numbers, FRICTION: friction, "n_legs": params.n_legs}
+    return {**numbers, FRICTION: friction, "n_legs": params.n_legs, "rung": rung}
 
 
 def _map_of(dataset: "xr.Dataset") -> dict[str, Any]:

@@ -17,14 +17,21 @@ class Engine {
     return new Engine(instance.exports, facts, legs);
   }
 
-  constructor(code, facts, legs) {
-    this.code = code;
-    this.legs = legs;
+  constructor(code, facts, legs, rung = "viscoelastic") {
+    Object.assign(this, { code, facts, legs, rung });
+    this.prefix = rung === "rigid" ? "rigid_" : "";
     this.alpha = (2 * Math.PI) / legs;
     this.samples = facts.samples;
     this.rows = facts.rows[legs];
     this.start = facts.start;
     this.free = Math.ceil(code.__heap_base.value / 16) * 16;
+    // Of each phase the motion: thirteen rows, with rigid legs one phase and its times.
+    this.motion = rung === "rigid" ? [14] : [13, 13, 13];
+  }
+
+  // The same code for another rung.
+  as(rung) {
+    return new Engine(this.code, this.facts, this.legs, rung);
   }
 
   // Numbers; arrays as lists of columns, one for each lane; results as [rows, is it of floats].
@@ -54,7 +61,7 @@ class Engine {
     });
     [...single, ...arrays].forEach((where, i) => (pointers[given / 4 + i] = where));
     results.forEach((where, i) => (pointers[out / 4 + i] = where));
-    this.code[name](given, out, BigInt(lanes), 0n, BigInt(lanes / 2));
+    this.code[this.prefix + name](given, out, BigInt(lanes), 0n, BigInt(lanes / 2));
     return told.map(([rows, isFloat], i) => {
       const kind = isFloat ? Float64Array : Int32Array;
       return new kind(memory.buffer, results[i], rows * lanes);
@@ -84,10 +91,7 @@ class Engine {
 
   // Everything about a step: measures by name, and the motion of each phase, 13 rows of samples.
   told(wheel, friction, x) {
-    const rows = this.rows.length, motion = [13 * this.samples, true];
-    const [numbers, codes, ...phases] = this.run(
-      "told", [SHOWN, friction], [[wheel], [x]], [[rows, true], [2], motion, motion, motion],
-    );
+    const [numbers, codes, ...phases] = this.allTold([wheel], friction, [x]);
     const measures = {};
     this.rows.forEach((name, i) => (measures[name] = numbers[2 * i]));
     const own = (all) => Float64Array.from({ length: all.length / 2 }, (_, i) => all[2 * i]);
@@ -98,13 +102,16 @@ class Engine {
     return { measures, outcome: codes[0], motion: phases.map(own) };
   }
 
+  allTold(wheels, friction, starts) {
+    const motion = this.motion.map((rows) => [rows * this.samples, true]);
+    const results = [[this.rows.length, true], [2], ...motion];
+    return this.run("told", [SHOWN, friction], [wheels, starts], results);
+  }
+
   // The same measures of many wheels.
   measured(wheels, friction, starts) {
-    const n = wheels.length, lanes = n + (n % 2), rows = this.rows.length;
-    const motion = [13 * this.samples, true];
-    const [numbers] = this.run(
-      "told", [SHOWN, friction], [wheels, starts], [[rows, true], [2], motion, motion, motion],
-    );
+    const n = wheels.length, lanes = n + (n % 2);
+    const [numbers] = this.allTold(wheels, friction, starts);
     return starts.map((_, i) => this.rows.map((_, row) => numbers[row * lanes + i]));
   }
 

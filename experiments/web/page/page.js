@@ -16,13 +16,15 @@ const PRESETS = {
   "touches early": { damping: 300 },
   "leaps off": { stiffness: 1000 },
   "falls back": { slope: 0.1 },
+  "would slide": { friction: 0.3 },
+  "rigid legs": { rung: "rigid", slope: 0.2 },
 };
 const OUTCOME_COLORS = { 1: "#e69f00", 2: "#009e73", 3: "#56b4e9", 4: "#d55e00", 5: "#cc79a7", 6: "#999933", 7: "#882255",
   8: "#000000", 9: "#bbbbbb" };
 const LAST = 64, LOST_STEPS = 60;
 
 const defaults = () => {
-  const values = { friction: 1, n_legs: 8 };
+  const values = { friction: 1, n_legs: 8, rung: "viscoelastic" };
   for (const [name, parameter] of Object.entries(facts.parameters)) values[name] = parameter.value;
   return values;
 };
@@ -49,9 +51,9 @@ const named = (name) => name.replaceAll("_", " ");
 
 // ---- what a wheel gives
 
-async function engineOf(legs) {
+async function engineOf({ n_legs: legs, rung }) {
   state.engines[legs] ||= Engine.load(packed[legs], facts, legs);
-  return state.engines[legs];
+  return (await state.engines[legs]).as(rung);
 }
 
 // The gait, or the walk that loses it, and all that is told of a step.
@@ -72,6 +74,10 @@ function walkedFrom(engine, values, start, most) {
   return { gait: null, outcome, taken: states.length - 1, steps: shown.map((step) => stepOf(engine, step)), measures };
 }
 
+// Feet neither slide nor leave the ground here: where friction would not do, a word says so.
+const FRICTIONS = ["friction_fore", "friction_rear", "landing_friction_fore", "landing_friction_rear"];
+const frictionNeeded = ({ measures }, { friction }) => friction - Math.min(...FRICTIONS.map((name) => measures[name] || friction));
+
 const allowed = (values) => values.leg_com < values.locked_length;
 
 // A step's samples over all of its phases, row by row: theta, L1, L2, their rates, forces, energies.
@@ -81,12 +87,19 @@ function stepOf(engine, { measures, motion }) {
   let begin = 0;
   durations.forEach((duration, phase) => {
     if (!(duration > 0)) return;
+    const known = motion[motion.length - 3 + phase];
     for (let i = 0; i < n; i++) {
-      times.push(begin + (duration * i) / (n - 1));
-      rows.forEach((row, k) => row.push(motion[phase][k * n + i]));
+      times.push(begin + (known.length > 13 * n ? known[13 * n + i] : (duration * i) / (n - 1)));
+      rows.forEach((row, k) => row.push(known[k * n + i]));
     }
     begin += duration;
   });
+  if (!begin && motion.length === 1) {
+    // A rigid wheel that does not get over its foot is shown where it landed.
+    times.push(0, 0.2);
+    rows.forEach((row, k) => row.push(motion[0][k * n], motion[0][k * n]));
+    begin = 0.2;
+  }
   return { durations, times, rows, period: begin };
 }
 
@@ -194,9 +207,13 @@ function tellVerdict() {
   if (gait) {
     const broken = Object.keys(facts.margins).filter((name) => leastOf(name)[0] < 0).length;
     const premises = broken ? ` <a href="#margins-title">${broken} of 13 premises don't hold.</a>` : " All 13 premises hold.";
-    const how = `${number(measures.speed)} m/s, ${number(measures.period)} s a step, both feet on the ground for ${(100 * measures.dls_fraction).toFixed(1)} % of it.`;
+    const both = values.rung === "rigid" ? "." : `, both feet on the ground for ${(100 * measures.dls_fraction).toFixed(1)} % of it.`;
+    const needs = frictionNeeded(result, values), slides = needs > values.friction;
+    const ground = slides ? ` Feet need a friction of ${number(needs)}: on ground of ${number(values.friction)} they would slide.` : "";
+    const how = `${number(measures.speed)} m/s, ${number(measures.period)} s a step${both}${ground}`;
     if (outcome !== STEPPED) return say("bad", "Lost", facts.outcomes[outcome].meaning);
     if (!isStable(gait)) return say("warn", "An unstable gait", `${how} It repeats itself, but a touch grows by a factor of ${radius(gait).toFixed(3)} with each step.${premises}`);
+    if (slides) return say("warn", "A stable gait, if the feet held", `${how}${premises}`);
     if (measures.clearance_sls1 < 0 || measures.clearance_sls2 < 0)
       return say("warn", "A stable gait, but the rear foot scuffs", `${how} The model lets it pass through the ground.${premises}`);
     return say("good", "A stable gait", `${how} A touch shrinks to ${(100 * radius(gait)).toFixed(1)} % of it with each step.${premises}`);
@@ -245,7 +262,9 @@ function tellMargins() {
 function tellPython() {
   const base = defaults(), { values } = state;
   const changed = facts.order.concat("n_legs").filter((name) => values[name] !== base[name]).map((name) => `${name}=${values[name]}`);
-  $("python").textContent = `vrw.limit_cycle(vrw.WheelParams(${changed.join(", ")}))`;
+  const friction = values.friction === base.friction ? "" : `friction=${values.friction}`, rigid = values.rung === "rigid";
+  const model = rigid || friction ? `, model=vrw.${rigid ? "Rigid" : "Viscoelastic"}Wheel(${friction})` : "";
+  $("python").textContent = `vrw.limit_cycle(vrw.WheelParams(${changed.join(", ")})${model})`;
 }
 
 // ---- maps and basins
@@ -258,7 +277,7 @@ function send(kind, job) {
   const known = (workers[kind].known ||= new Set()), legs = state.values.n_legs;
   const first = known.has(legs) ? {} : { packed: packed[legs], facts };
   known.add(legs);
-  workers[kind].post({ job: { ...job, legs }, ...first });
+  workers[kind].post({ job: { ...job, legs, rung: state.values.rung }, ...first });
   return job.id;
 }
 send.count = 0;
@@ -315,7 +334,7 @@ const mapAxes = () => {
 
 function askMap() {
   const { map, values, result } = state;
-  const others = facts.order.concat("n_legs", "friction").filter((name) => name !== map.x && name !== map.y);
+  const others = facts.order.concat("n_legs", "friction", "rung").filter((name) => name !== map.x && name !== map.y);
   const key = JSON.stringify([map.x, map.y, others.map((name) => values[name])]);
   if (key === map.key || !result || map.given) return showMap();
   map.key = key;
@@ -403,7 +422,7 @@ function askBasin() {
     return;
   }
   canvas.hidden = false;
-  const key = JSON.stringify([columnOf(values), values.n_legs]);
+  const key = JSON.stringify([columnOf(values), values.n_legs, values.rung]);
   if (key === basin.key) return showBasin();
   const [x, y] = basinAxes();
   Object.assign(basin, { key, axes: [x, y], done: false, began: performance.now(), cells: new Map(), cross: result.gait.x.slice(0, 2), gait: result.gait.x });
@@ -450,11 +469,11 @@ function tell() {
 
 async function update(changes = {}) {
   Object.assign(state.values, changes);
-  const { values } = state, legs = values.n_legs, began = performance.now();
-  const engine = await engineOf(legs);
-  if (state.values.n_legs !== legs) return;
-  if (state.legs !== legs) state.guess = null;
-  state.legs = legs;
+  const { values } = state, { n_legs: legs, rung } = values, began = performance.now();
+  const engine = await engineOf(values);
+  if (values.n_legs !== legs || values.rung !== rung) return;
+  if (state.legs !== legs || state.rung !== rung) state.guess = null;
+  Object.assign(state, { legs, rung });
   state.result = computed(engine, values, state.guess);
   if (state.result.gait && isStable(state.result.gait)) state.guess = state.result.gait.x;
   state.took = performance.now() - began;
@@ -480,8 +499,12 @@ const spoken = ({ measures, gait, outcome }) =>
   ({ ...measures, outcome, ...(gait ? { spectral_radius: radius(gait), gait: gait.x } : {}) });
 
 function known(given) {
-  const names = Object.keys(given).filter((name) => name in state.values && isFinite(Number(given[name])));
-  return Object.fromEntries(names.map((name) => [name, Number(given[name])]));
+  const values = {};
+  for (const [name, text] of Object.entries(given)) {
+    if (name === "rung" ? text in facts.rungs : name in state.values && isFinite(Number(text)))
+      values[name] = name === "rung" ? text : Number(text);
+  }
+  return values;
 }
 
 // A scan's dataset in place of what the page computes: two axes, and rows of measures over them.
@@ -504,7 +527,7 @@ function giveMap(given) {
 
 function showValue(name, value) {
   const number = $(`number-${name}`), slider = $(`slider-${name}`);
-  if (document.activeElement !== number) number.value = +value.toPrecision(6);
+  if (document.activeElement !== number) number.value = typeof value === "string" ? value : +value.toPrecision(6);
   if (slider && Number(slider.value) !== value) slider.value = value;
 }
 
@@ -513,7 +536,7 @@ async function walkFrom(place) {
   const { basin, values } = state;
   if (!basin.gait) return;
   basin.cross = place;
-  const engine = await engineOf(values.n_legs);
+  const engine = await engineOf(values);
   state.result = { ...walkedFrom(engine, values, [...place, basin.gait[2]], 7), from: place };
   restart();
   walk.lost = true;
@@ -532,9 +555,7 @@ function remember() {
 }
 
 function fromAddress() {
-  const values = {};
-  for (const [name, text] of new URLSearchParams(location.hash.slice(1)))
-    if (name in state.values && isFinite(Number(text))) values[name] = Number(text);
+  const values = known(Object.fromEntries(new URLSearchParams(location.hash.slice(1))));
   if (!facts.legs.includes(values.n_legs ?? 8)) delete values.n_legs;
   return values;
 }
@@ -549,7 +570,8 @@ function built() {
     `<div class="slider" title="${meaning}"><label for="slider-${name}">${named(name)} <i>${sign}</i></label>`
     + `<input type="number" id="number-${name}" step="any" aria-label="${named(name)}, a number, ${unit}"><span class="unit">${unitText(unit)}</span>`
     + `<input type="range" id="slider-${name}" min="${from}" max="${to}" step="${step(from, to)}" aria-describedby="about-${name}"><span id="about-${name}" class="unseen">${meaning}</span></div>`).join("")
-    + `<div class="slider"><label for="number-n_legs">number of legs <i>n</i></label><select id="number-n_legs">${facts.legs.map((n) => `<option>${n}</option>`).join("")}</select></div>`;
+    + `<div class="slider"><label for="number-n_legs">number of legs <i>n</i></label><select id="number-n_legs">${facts.legs.map((n) => `<option>${n}</option>`).join("")}</select></div>`
+    + `<div class="slider"><label for="number-rung">rung of the model</label><select id="number-rung" aria-describedby="about-rung">${Object.entries(facts.rungs).map(([name, text]) => `<option value="${name}">${text}</option>`).join("")}</select><span id="about-rung" class="unseen">what of the legs is modelled</span></div>`;
   for (const [name] of rows) {
     const least = facts.parameters[name]?.least ?? 0, above = name === "slope" ? -1.5 : least;
     $(`slider-${name}`).addEventListener("input", (event) => update({ [name]: Number(event.target.value) }));
@@ -560,6 +582,7 @@ function built() {
     });
   }
   $("number-n_legs").addEventListener("change", (event) => update({ n_legs: Number(event.target.value) }));
+  $("number-rung").addEventListener("change", (event) => update({ rung: event.target.value }));
   $("presets").innerHTML = Object.keys(PRESETS).map((name) => `<button type="button">${name}</button>`).join("");
   [...$("presets").children].forEach((button) => button.addEventListener("click", () => {
     state.guess = null;

@@ -131,7 +131,7 @@ function jobs(post) {
   return async ({ job, packed, facts }) => {
     latest[job.kind] = job.id;
     if (packed) engines[job.legs] = Engine.load(packed, facts, job.legs);
-    const engine = await engines[job.legs];
+    const engine = (await engines[job.legs]).as(job.rung);
     if (!current(job)) return;
     const tell = (news) => current(job) && post({ kind: job.kind, ...news });
     await (job.kind === "map" ? mapped : starts)(engine, job, tell, current);
