@@ -73,3 +73,18 @@ def test_what_is_not_there_is_seen():
 def test_the_page_of_the_house_tells_every_room_in_the_flow_s_order():
     text = (ROOT / "docs" / "architecture.md").read_text()
     assert tuple(re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE)) == HOUSE.rooms
+
+
+def test_every_page_is_in_the_navigation():
+    told = (ROOT / "zensical.toml").read_text()
+    pages = [page.relative_to(ROOT / "docs").as_posix() for page in (ROOT / "docs").rglob("*.md")]
+    assert [page for page in pages if f'"{page}"' not in told] == []
+
+
+def test_every_formula_of_the_measures_page_is_seen_as_one():
+    pytest.importorskip("latex2mathml", reason="formulas become MathML by it")
+    from website.formulas import INLINE
+    from website.reference import measures_page
+
+    page = measures_page()
+    assert page.count("$") == 2 * len(re.findall(INLINE, page)) > 0

@@ -3,6 +3,7 @@
 import contextlib
 import doctest
 import inspect
+import operator
 import re
 import tempfile
 from pathlib import Path
@@ -19,7 +20,13 @@ from vrw_jax.wheel import DOMAINS
 
 ROOT = Path(__file__).parent.parent
 NAMES = [name for name in vrw.__all__ if name not in ("MEASURES", "plot")]
+PICTURES = [
+    f"plot.{name}"
+    for name, thing in vars(vrw.plot).items()
+    if inspect.isfunction(thing) and thing.__module__.startswith("vrw_jax.figures")
+]
 SLOW = {
+    "plot.branch_figure", "plot.scan_figures", "plot.map_figure", "plot.tuning_figure",
     "UnilateralWheel", "UnilateralStep", "LadderWheel", "LadderStep", "continue_branches",
     "border_curve", "BorderCurve",
     "answer", "Answer", "average", "Average",
@@ -28,18 +35,19 @@ SLOW = {
 
 
 def told(name):
-    return inspect.getdoc(getattr(vrw, name)) or ""
+    return inspect.getdoc(operator.attrgetter(name)(vrw)) or ""
 
 
 def marked(name):
     return pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else [])
 
 
-@pytest.mark.parametrize("name", [*map(marked, NAMES)])
+@pytest.mark.parametrize("name", [*map(marked, [*NAMES, *PICTURES])])
 def test_the_example_of_a_public_name_runs_as_it_stands(name, monkeypatch):
     text = told(name)
     monkeypatch.setattr(vrw, "start_jax", lambda *_: None)  # it has started
-    globs = {"jax": jax, "jnp": jnp, "np": np, "xr": xr, "vrw": vrw, "tempfile": tempfile}
+    globs = {"jax": jax, "jnp": jnp, "np": np, "xr": xr, "vrw": vrw}
+    globs |= {"tempfile": tempfile, "Path": Path}
     if name == "explore":
         pytest.importorskip("anywidget")
     test = doctest.DocTestParser().get_doctest(text, globs, name, None, 0)
@@ -50,15 +58,15 @@ def test_the_example_of_a_public_name_runs_as_it_stands(name, monkeypatch):
     assert not out, "".join(out)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES, *PICTURES])
 def test_every_argument_and_field_of_a_public_name_is_told(name):
-    thing, text = getattr(vrw, name), told(name)
+    thing, text = operator.attrgetter(name)(vrw), told(name)
     given = [] if name == "Outcome" else list(inspect.signature(thing).parameters)
     if inspect.isfunction(thing):
         section = text.partition("Args:")[2].partition("\n\n")[0]
         assert [n for n in given if not re.search(rf"^ +\*{{0,2}}{n}: ", section, re.M)] == []
         assert "Returns:\n" in text
-        assert not given or "Raises:\n" in text
+        assert not given or "Raises:\n" in text or name in PICTURES
     else:
         assert [n for n in given if f"`{n}`" not in text] == []
 
@@ -67,6 +75,8 @@ def test_every_public_name_has_a_place_in_the_reference():
     pages = "".join(path.read_text() for path in (ROOT / "docs" / "reference").glob("*.md"))
     shown = set(re.findall(r"^::: vrw_jax\.(\w+)$", pages, re.M))
     assert set(NAMES) | {"MEASURES"} == shown
+    drawn = set(re.findall(r"^::: vrw_jax\.figures\.(\w+)$", pages, re.M))
+    assert {name.removeprefix("plot.") for name in PICTURES} == drawn
 
 
 def test_fields_of_the_wheel_are_told_as_its_domains_are():

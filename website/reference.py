@@ -113,7 +113,8 @@ def measures_page() -> str:
     for title, table, what in _GROUPS:
         lines += ["", f"## {title}", "", what, ""]
         rows = [
-            (f"`{m.name}`", f"${m.tex}$", m.unit, _meaning(m), m.equation) for m in table.values()
+            (f"`{m.name}`", f"${m.tex.strip()}$", m.unit, _meaning(m), m.equation)
+            for m in table.values()
         ]
         lines += as_markdown(("name", "symbol", "unit", "meaning", "in the paper"), rows)
     return "\n".join(lines) + "\n"

@@ -131,11 +131,18 @@ def test_rigid_legs_roll_as_the_librarys_do(page, held):
 
 
 def test_friction_that_would_not_do_is_told(page):
-    assert "would slide" not in page.inner_text("#verdict")
-    page.evaluate("vrw.update({ friction: 0.3 })")
-    assert "they would slide" in page.inner_text("#verdict")
-    step = vrw.limit_cycle(vrw.WheelParams(), model=vrw.ViscoelasticWheel(friction=0.3)).step
-    assert float(step.monitors.friction_fore) < 0.0
+    margins = vrw.limit_cycle(vrw.WheelParams()).step.monitors
+    left = [margins.friction_fore, margins.landing_friction_fore]
+    needed = f"{1.0 - float(min(left)):.4g}"
+    told = lambda mu: (
+        page.evaluate("mu => vrw.update({ friction: mu })", mu) or page.inner_text("#verdict")
+    )
+    assert f"The fore foot needs a friction of {needed}" in told(1.0)
+    assert "where it is 1.2 the rear foot would slide" in told(1.2)
+    assert page.get_attribute("#verdict", "class") == "good"
+    assert "both feet would slide" in told(0.3)
+    assert page.get_attribute("#verdict", "class") == "warn"
+    assert "100 is enough" in told(100.0)
 
 
 def test_a_wheel_can_be_sent_as_an_address(browser):

@@ -62,6 +62,16 @@ def branch_figure(branch: Branch) -> Figure:
     """DLS fraction, multipliers, indicators and clearance along a branch, with its borders.
 
     Solid: stable; dashed: unstable. Borders are numbered from left to right.
+
+    Args:
+        branch: of `vrw.continue_branch` over one of the wheel's parameters.
+
+    Returns:
+        Figure: four panels over the parameter, in SI units.
+
+    Examples:
+        >>> branch = vrw.continue_branch(vrw.WheelParams(), "damping", (190.0, 230.0))
+        >>> figure = vrw.plot.branch_figure(branch)
     """
     values, data = branch.values, branch.dataset
     borders = sorted(branch.borders, key=lambda border: border.value)
@@ -145,6 +155,22 @@ def orbit_figure(orbits: xr.Dataset, border: float | None = None) -> Figure:
     """Post-impact rates and periods of all that attracts over a parameter.
 
     Open: the foot scuffs somewhere in that step; a cross: a step without double support.
+
+    Args:
+        orbits: a row a step, with the parameter, `dtheta_post_impact` (rad/s), `period` (steps),
+            `duration_dls` (s) and `clearance` (m); the attribute `parameter` says which, `tried`
+            where there may be gaps.
+        border: value of the parameter that is marked: where λ4⁺ = 0.
+
+    Returns:
+        Figure: rates above, periods below.
+
+    Examples:
+        >>> columns = {"damping": [100.0, 120.0], "dtheta_post_impact": [1.2, 1.3]}
+        >>> columns |= {"period": [1, 1], "duration_dls": [0.1, 0.1], "clearance": [0.01, -0.01]}
+        >>> orbits = xr.Dataset({name: ("step", values) for name, values in columns.items()})
+        >>> orbits = orbits.assign_attrs(parameter="damping", tried=[100.0, 120.0])
+        >>> figure = vrw.plot.orbit_figure(orbits)
     """
     parameter = str(orbits.attrs["parameter"])
     value = orbits[parameter].values
@@ -198,6 +224,19 @@ def basin_figure(results: list[xr.Dataset], titles: list[str]) -> Figure:
     """Which starts of a plane end where, one panel per result; crosses are the gaits' own states.
 
     Shades of grey count the steps until the gait is reached; colours are the falls.
+
+    Args:
+        results: of `vrw.basin`, each over a plane of starts.
+        titles: one for each.
+
+    Returns:
+        Figure: the panels side by side.
+
+    Examples:
+        >>> starts = {"theta_touchdown": [0.1], "dtheta_touchdown": [1.4, 1.6]}
+        >>> starts |= {"dL1_touchdown": [-0.1, 0.0]}
+        >>> found = vrw.basin(vrw.WheelParams(), starts)
+        >>> figure = vrw.plot.basin_figure([found], ["Table 1"])
     """
     codes = sorted({int(c) for r in results for c in np.unique(r.outcome) if c != Outcome.STEPPED})
     figure = Figure(figsize=(PAGE, 3.3))

@@ -32,6 +32,18 @@ def map_figure(scan: xr.Dataset, measure: str, curves: Sequence[BorderCurve]) ->
     """The measure of the scan's gaits in colours, grey where there is none, and every border.
 
     Thin where the gaits on it are not stable.
+
+    Args:
+        scan: of `vrw.scan` over a grid of two parameters.
+        measure: one of its columns.
+        curves: of `vrw.border_curve` over the same two; may be empty.
+
+    Returns:
+        Figure: one panel, in SI units.
+
+    Examples:
+        >>> grid = vrw.grid(damping=[150.0, 200.0], slope=[0.28, 0.3])
+        >>> figure = vrw.plot.map_figure(vrw.scan(grid, ["speed"]), "speed", [])
     """
     x, y = curves[0].parameters if curves else tuple(map(str, scan.dims))
     figure = Figure(figsize=(PAGE, 0.62 * PAGE))

@@ -58,7 +58,19 @@ MOST_COLUMNS, MOST_PAIRED, MOST_DRAWN = 4, 6, 20_000
 
 
 def scan_figures(scan: xr.Dataset) -> dict[str, Figure]:
-    """Pictures of a scan by name: one for each axis that can be set side by side."""
+    """Pictures of a scan by name: one for each axis that can be set side by side.
+
+    Args:
+        scan: of `vrw.scan`, over a grid or samples, or of `vrw.sobol_indices`.
+
+    Returns:
+        dict[str, Figure]: the pictures; which there are follows from the design.
+
+    Examples:
+        >>> found = vrw.scan(vrw.grid(damping=[150.0, 200.0]), ["speed", "dls_fraction"])
+        >>> sorted(vrw.plot.scan_figures(found))
+        ['scan_over_damping']
+    """
     names = [name for name in dict.fromkeys(PREFERRED) if name in scan.coords]
     if "sample" in scan.dims:
         swept = [name for name in names if np.ptp(scan[name].values) > 0.0] or names

@@ -83,13 +83,40 @@ UNSTABLE = 100
 
 @contextmanager
 def figure_style() -> Iterator[None]:
-    """The style of every figure, for the time of a `with` block."""
+    """The style of every figure, for the time of a `with` block.
+
+    Returns:
+        A context in which matplotlib draws so; `with`, or as a decorator.
+
+    Examples:
+        >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
+        >>> with vrw.plot.figure_style():
+        ...     figure = vrw.plot.sticks(gait)
+    """
     with mpl.rc_context(STYLE):
         yield
 
 
 def save(figure: Figure, folder: Path, name: str) -> list[Path]:
-    """Write `figure` as SVG and PNG into `folder`; returns the paths."""
+    """Write `figure` as SVG and PNG into `folder`; returns the paths.
+
+    Args:
+        figure: of matplotlib.
+        folder: which exists.
+        name: of the files, without an ending.
+
+    Returns:
+        list[Path]: `name`.svg and `name`.png.
+
+    Raises:
+        OSError: they can't be written.
+
+    Examples:
+        >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
+        >>> figure = vrw.plot.sticks(gait)
+        >>> [path.suffix for path in vrw.plot.save(figure, Path(tempfile.mkdtemp()), "sticks")]
+        ['.svg', '.png']
+    """
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"{name}.svg", folder / f"{name}.png"]
     with figure_style():

@@ -30,6 +30,17 @@ def tuning_figure(tuned: Tuned) -> Figure:
 
     Filled symbols keep every constraint, open ones break one; crosses are trials that lost the gait
     and were shortened.
+
+    Args:
+        tuned: of `vrw.tune`.
+
+    Returns:
+        Figure: its way, and what it keeps.
+
+    Examples:
+        >>> bounds = {"damping": (100.0, 215.0)}
+        >>> tuned = vrw.tune(vrw.WheelParams(), "dls_fraction", ["damping"], bounds)
+        >>> figure = vrw.plot.tuning_figure(tuned)
     """
     path = tuned.path
     n = path.sizes["constraint"]

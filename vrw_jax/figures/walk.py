@@ -59,6 +59,16 @@ def gait_panels(gait: xr.Dataset) -> Figure:
     """Angle, leg lengths, share of the load, height of foot 2 and ground forces over time (Fig. 6).
 
     Grey bands are double support; dotted lines are collision II.
+
+    Args:
+        gait: of `vrw.simulate` on springs, of one wheel.
+
+    Returns:
+        Figure: panels over time, s, in SI units.
+
+    Examples:
+        >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
+        >>> figure = vrw.plot.gait_panels(gait)
     """
     time, theta, L1, L2, z2, *forces = broken_at_events(
         gait, "theta", "L1", "L2", "foot_2_z", *FORCES
@@ -105,7 +115,19 @@ def gait_panels(gait: xr.Dataset) -> Figure:
 
 @figure_style()
 def sticks(gait: xr.Dataset, interval: float = 0.05) -> Figure:
-    """Stick diagram in the X-Z plane each `interval`, s: Leg 1 solid, Leg 2 dotted (Fig. 7)."""
+    """Stick diagram in the X-Z plane each `interval`, s: Leg 1 solid, Leg 2 dotted (Fig. 7).
+
+    Args:
+        gait: of `vrw.simulate`.
+        interval: between two sticks, s.
+
+    Returns:
+        Figure: one panel, m.
+
+    Examples:
+        >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
+        >>> figure = vrw.plot.sticks(gait, interval=0.1)
+    """
     tones = ("#A0A0A0", SKY, "#000000")
     time = gait.time.values
     figure = Figure(figsize=(PAGE, 2.8))
@@ -153,7 +175,19 @@ def _name_of(gait: xr.Dataset, vary: str) -> str:
 
 @figure_style()
 def foot_height(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
-    """Height of foot 2 over one step for each gait, and around take-off in mm (Fig. 8)."""
+    """Height of foot 2 over one step for each gait, and around take-off in mm (Fig. 8).
+
+    Args:
+        gaits: of `vrw.simulate` over one step, one for each line.
+        vary: the parameter in which they differ, which the legend names.
+
+    Returns:
+        Figure: over the time since the landing, s.
+
+    Examples:
+        >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
+        >>> figure = vrw.plot.foot_height([gait])
+    """
     figure = Figure(figsize=(PAGE, 2.6))
     whole, near = figure.subplots(1, 2)
     for gait, line in zip(gaits, LINES, strict=False):
@@ -182,7 +216,19 @@ def foot_height(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
 
 @figure_style()
 def rear_force(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
-    """Normal force of the ground on foot 2 over double support for each gait (Fig. 9)."""
+    """Normal force of the ground on foot 2 over double support for each gait (Fig. 9).
+
+    Args:
+        gaits: of `vrw.simulate` over one step, one for each line.
+        vary: the parameter in which they differ, which the legend names.
+
+    Returns:
+        Figure: over the time since the landing, s.
+
+    Examples:
+        >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
+        >>> figure = vrw.plot.rear_force([gait])
+    """
     figure = Figure(figsize=(COLUMN, 2.5))
     axes = figure.subplots()
     for gait, line in zip(gaits, LINES, strict=False):
@@ -204,6 +250,23 @@ def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
     """The DLS indicators over a parameter, where the gait is period-1 and λ2⁺ >= 0 (Fig. 10).
 
     Filled symbols: foot 2 stays clear; open ones: it scuffs. One symbol for each `every`-th gait.
+
+    Args:
+        gaits: over one parameter, with `settled`, `lambda_I4` (N s), `lambda_2_plus` and
+            `lambda_4_plus` (N), `clearance_sls1` and `clearance_sls2` (m); the attribute
+            `parameter_slope` is the slope, rad.
+        every: which values have symbols: multiples of it, and the ends.
+
+    Returns:
+        Figure: the impulse and the two forces over the parameter.
+
+    Examples:
+        >>> columns = {"lambda_I4": [5.0, 4.0], "lambda_2_plus": [90.0, 80.0]}
+        >>> columns |= {"lambda_4_plus": [50.0, 60.0], "settled": [True, True]}
+        >>> columns |= {"clearance_sls1": [0.01, 0.02], "clearance_sls2": [0.01, 0.02]}
+        >>> over = {name: ("damping", values) for name, values in columns.items()}
+        >>> gaits = xr.Dataset(over, {"damping": [80.0, 120.0]}, {"parameter_slope": 0.3})
+        >>> figure = vrw.plot.indicators(gaits)
     """
     vary = str(gaits.settled.dims[0])
     kept = gaits.where(gaits.settled & (gaits.lambda_2_plus >= 0.0), drop=True)
@@ -252,6 +315,20 @@ def walk_frames(
 
     The camera travels with the mean speed; arrows are ground forces, 1 m for 300 N. `slow` is how
     many times slower than life it plays.
+
+    Args:
+        step: of `vrw.simulate` over one step of a gait.
+        n_frames: of the step.
+        slow: 2 plays at half speed.
+
+    Returns:
+        tuple[list[Image], int]: pictures of Pillow's, and milliseconds for each.
+
+    Examples:
+        >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
+        >>> frames, milliseconds = vrw.plot.walk_frames(gait, n_frames=2)
+        >>> len(frames)
+        2
     """
     slope, time = step.attrs["parameter_slope"], step.time.values
     period = time[-1]
@@ -327,7 +404,26 @@ def _draw_ground(axes: Axes, slope: float, centre: float, stride: float) -> None
 
 
 def save_animation(frames: Sequence[Image.Image], milliseconds: int, path: Path) -> Path:
-    """Write frames as a looping GIF with one shared palette of 32 colours."""
+    """Write frames as a looping GIF with one shared palette of 32 colours.
+
+    Args:
+        frames: as `walk_frames` gives them.
+        milliseconds: that each is shown.
+        path: of the GIF.
+
+    Returns:
+        Path: the same.
+
+    Raises:
+        OSError: it can't be written.
+
+    Examples:
+        >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
+        >>> frames, milliseconds = vrw.plot.walk_frames(gait, n_frames=2)
+        >>> path = Path(tempfile.mkdtemp(), "walk.gif")
+        >>> vrw.plot.save_animation(frames, milliseconds, path).name
+        'walk.gif'
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     palette = frames[0].quantize(32)
     reduced = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]

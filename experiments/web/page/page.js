@@ -74,9 +74,9 @@ function walkedFrom(engine, values, start, most) {
   return { gait: null, outcome, taken: states.length - 1, steps: shown.map((step) => stepOf(engine, step)), measures };
 }
 
-// Feet neither slide nor leave the ground here: where friction would not do, a word says so.
-const FRICTIONS = ["friction_fore", "friction_rear", "landing_friction_fore", "landing_friction_rear"];
-const frictionNeeded = ({ measures }, { friction }) => friction - Math.min(...FRICTIONS.map((name) => measures[name] || friction));
+// Feet neither slide nor leave the ground here: the friction that the fore and the rear foot need.
+const frictionNeeded = ({ measures }, { friction }) => ["fore", "rear"].map((foot) =>
+  Math.max(...[`friction_${foot}`, `landing_friction_${foot}`].map((name) => friction - (measures[name] || friction))));
 
 const allowed = (values) => values.leg_com < values.locked_length;
 
@@ -208,12 +208,14 @@ function tellVerdict() {
     const broken = Object.keys(facts.margins).filter((name) => leastOf(name)[0] < 0).length;
     const premises = broken ? ` <a href="#margins-title">${broken} of 13 premises don't hold.</a>` : " All 13 premises hold.";
     const both = values.rung === "rigid" ? "." : `, both feet on the ground for ${(100 * measures.dls_fraction).toFixed(1)} % of it.`;
-    const needs = frictionNeeded(result, values), slides = needs > values.friction;
-    const ground = slides ? ` Feet need a friction of ${number(needs)}: on ground of ${number(values.friction)} they would slide.` : "";
+    const needs = frictionNeeded(result, values), slides = needs.map((need) => need > values.friction);
+    const which = slides[0] ? (slides[1] ? "both feet would" : "the fore foot would") : "the rear foot would";
+    const enough = slides.some((foot) => foot) ? `where it is ${number(values.friction)} ${which} slide` : `${number(values.friction)} is enough`;
+    const ground = ` The fore foot needs a friction of ${number(needs[0])}${needs[1] ? `, the rear foot of ${number(needs[1])}` : ""}: ${enough}.`;
     const how = `${number(measures.speed)} m/s, ${number(measures.period)} s a step${both}${ground}`;
     if (outcome !== STEPPED) return say("bad", "Lost", facts.outcomes[outcome].meaning);
     if (!isStable(gait)) return say("warn", "An unstable gait", `${how} It repeats itself, but a touch grows by a factor of ${radius(gait).toFixed(3)} with each step.${premises}`);
-    if (slides) return say("warn", "A stable gait, if the feet held", `${how}${premises}`);
+    if (measures.friction_fore < 0) return say("warn", "A stable gait, if the fore foot held", `${how}${premises}`);
     if (measures.clearance_sls1 < 0 || measures.clearance_sls2 < 0)
       return say("warn", "A stable gait, but the rear foot scuffs", `${how} The model lets it pass through the ground.${premises}`);
     return say("good", "A stable gait", `${how} A touch shrinks to ${(100 * radius(gait)).toFixed(1)} % of it with each step.${premises}`);
