@@ -233,7 +233,7 @@ def basin_figure(results: list[xr.Dataset], titles: list[str]) -> Figure:
         Figure: the panels side by side.
 
     Examples:
-        >>> starts = {"theta_touchdown": [0.1], "dtheta_touchdown": [1.4, 1.6]}
+        >>> starts = {"theta_touchdown": 0.09, "dtheta_touchdown": [1.4, 1.6]}
         >>> starts |= {"dL1_touchdown": [-0.1, 0.0]}
         >>> found = vrw.basin(vrw.WheelParams(), starts)
         >>> figure = vrw.plot.basin_figure([found], ["Table 1"])
