@@ -14,6 +14,7 @@ from vrw_jax.models.base import (
     EnergyLoss,
     Indicators,
     Margins,
+    Numbers,
     SectionState,
     StepResult,
     Trajectory,
@@ -97,9 +98,7 @@ class RigidWheel(AbstractWheel):
     def step(self, params: WheelParams, x: SectionState, options: Options) -> StepResult:
         return self.rolled(params, tuple(x), jnp.asarray(self.friction, x.dtype))
 
-    def rolled(
-        self, params: WheelParams, x: tuple[Elementwise, ...], friction: Elementwise
-    ) -> StepResult:
+    def rolled(self, params: WheelParams, x: Numbers, friction: Elementwise) -> StepResult:
         """The step element by element: of one wheel or of lanes."""
         half = jnp.asarray(0.5 * params.leg_angle, x[1].dtype)
         x = (half + 0.0 * x[0], x[1], 0.0 * x[2])
@@ -118,8 +117,7 @@ class RigidWheel(AbstractWheel):
         outcome = jnp.where(good, outcome, jnp.int32(Outcome.BAD_INPUT))
         stepped = outcome == Outcome.STEPPED
         reach = Roll(s, params.slope, jnp.where(passes, rate, 10.0))
-        after = jnp.sqrt(reach.rate_squared(half))
-        duration = reach.time(half)
+        after, duration = jnp.sqrt(reach.rate_squared(half)), reach.time(half)
 
         zero = jnp.zeros_like(before)
         tell = lambda value: jnp.where(good, value, jnp.zeros_like(value))
@@ -160,9 +158,7 @@ class RigidWheel(AbstractWheel):
             solver_steps=jnp.zeros_like(outcome),
         )
 
-    def _landing(
-        self, s: Symbols, x: tuple[Array, ...], roll: "Roll", friction: Elementwise
-    ) -> tuple:
+    def _landing(self, s: Symbols, x: Numbers, roll: "Roll", friction: Elementwise) -> tuple:
         """Impulse at the rear foot, friction left at the fore and the rear foot, and impulses of
         the stoppers of legs 3..n."""
         zero = jnp.zeros_like(x[1])

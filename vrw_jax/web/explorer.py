@@ -3,7 +3,7 @@
 import functools
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlencode
 
 from vrw_jax.wheel import DOMAINS, FRICTION, WheelParams, friction_of
@@ -75,7 +75,7 @@ def explore(
     params: WheelParams | None = None,
     *,
     friction: float = 1.0,
-    rung: Literal["viscoelastic", "rigid"] = "viscoelastic",
+    rung: str = "viscoelastic",
     dataset: "xr.Dataset | None" = None,
     height: int = HEIGHT,
 ) -> Any:
