@@ -45,8 +45,8 @@ SLIDERS = {
 }
 """What a slider spans, parameters that one turns first first."""
 
-RUNGS = {"viscoelastic": "springs and dampers", "rigid": "rigid legs"}
-"""What a wheel's legs may be, by the rungs' names."""
+RUNGS = {"viscoelastic": "springs", "rigid": "rigid"}
+"""What legs are, by the rungs' names."""
 
 
 def linked(objects: dict[str, bytes]) -> bytes:

@@ -131,7 +131,8 @@ def test_rigid_legs_roll_as_the_librarys_do(page, held):
 
 
 def test_friction_that_would_not_do_is_told(page):
-    margins = vrw.limit_cycle(vrw.WheelParams()).step.monitors
+    params = vrw.WheelParams()
+    margins = vrw.step(params, vrw.limit_cycle(params).section_state).monitors
     left = [margins.friction_fore, margins.landing_friction_fore]
     needed = f"{1.0 - float(min(left)):.4g}"
     told = lambda mu: (

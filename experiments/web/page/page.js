@@ -573,7 +573,7 @@ function built() {
     + `<input type="number" id="number-${name}" step="any" aria-label="${named(name)}, a number, ${unit}"><span class="unit">${unitText(unit)}</span>`
     + `<input type="range" id="slider-${name}" min="${from}" max="${to}" step="${step(from, to)}" aria-describedby="about-${name}"><span id="about-${name}" class="unseen">${meaning}</span></div>`).join("")
     + `<div class="slider"><label for="number-n_legs">number of legs <i>n</i></label><select id="number-n_legs">${facts.legs.map((n) => `<option>${n}</option>`).join("")}</select></div>`
-    + `<div class="slider"><label for="number-rung">rung of the model</label><select id="number-rung" aria-describedby="about-rung">${Object.entries(facts.rungs).map(([name, text]) => `<option value="${name}">${text}</option>`).join("")}</select><span id="about-rung" class="unseen">what of the legs is modelled</span></div>`;
+    + `<div class="slider"><label for="number-rung">legs</label><select id="number-rung" aria-describedby="about-rung">${Object.entries(facts.rungs).map(([name, text]) => `<option value="${name}">${text}</option>`).join("")}</select><span id="about-rung" class="unseen">what of the legs is modelled</span></div>`;
   for (const [name] of rows) {
     const least = facts.parameters[name]?.least ?? 0, above = name === "slope" ? -1.5 : least;
     $(`slider-${name}`).addEventListener("input", (event) => update({ [name]: Number(event.target.value) }));
