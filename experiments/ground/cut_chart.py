@@ -1,11 +1,11 @@
-"""What a tolerance leaves of a step's time on real ground: rounding of dips beside integration.
+"""What a tolerance leaves of a step's time on real ground, by either kind of stoppers.
 
     python -m experiments.ground.cut_chart [--wheels 256] [--redraw]
 
 Dips that an impact would leave shallower than a hundredth of the absolute tolerance are not
 followed (1e-13 m at least). Wheels over friction and damping walk ten steps; from there one step by
 each tolerance is held against the tightest. With stoppers that hold hardly a contact dips, and what
-is left is the integration; with those that only push it is the cut.
+is left is the integration; with those that only push it is more, see docs/unilateral.md.
 """
 
 import matplotlib.pyplot as plt
