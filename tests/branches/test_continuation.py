@@ -8,7 +8,10 @@ from support.files import kept_by_netcdf
 
 import vrw_jax as vrw
 from vrw_jax.app.reports import write_branch
+from vrw_jax.branches.continuation import MapRun
+from vrw_jax.branches.run import run_all
 from vrw_jax.figures.branch import branch_figure
+from vrw_jax.numerics.arclength import AbstractFollowed, MapFollowed
 from vrw_jax.numerics.events import integrate_phase
 from vrw_jax.numerics.minima import Watched
 from vrw_jax.numerics.roots import locate
@@ -38,6 +41,37 @@ def delayed_logistic(_, x, r):
 def stretched(_, x, p):
     """Three numbers: a fold in the first at p = 0 beside two that contract."""
     return jnp.stack([x[0] + p - x[0] ** 2, 0.5 * x[1] + x[0], -0.3 * x[2]])
+
+
+class FromOutside(AbstractFollowed):
+    """The fold of `stretched`, linearised for many points at once outside of compiled code."""
+
+    inside: MapFollowed
+    traced = False
+
+    def linearise(self, wheels, z, p):
+        told = jax.vmap(self.inside.linearise)(wheels, z, p)
+        return jax.tree.map(np.asarray, told)
+
+    def section(self, z):
+        return z
+
+
+def test_a_branch_linearised_from_outside_of_programs_is_the_same():
+    def followed(how):
+        given = jnp.zeros(1), np.array([-0.5, 1.0])
+        run = MapRun(how, vrw.ArclengthOptions(largest_step=0.1), *given)
+        begin = jnp.array([[-1.0, -2.0, 0.0]]), jnp.array([1.0])
+        (strand,) = run_all(run, *begin, np.array([True]), lambda owner, point: None)
+        return strand
+
+    inside = MapFollowed(stretched)
+    one, other = followed(inside), followed(FromOutside(inside))
+    np.testing.assert_allclose(other.points.p, one.points.p, rtol=0, atol=1e-12)
+    assert [border.name for border in other.borders] == [border.name for border in one.borders]
+    (fold,) = (border.value for border in other.borders if border.kind == "fold")
+    assert fold == pytest.approx(0.0, abs=1e-9)
+    assert other.ends == one.ends
 
 
 def borders_of(branch):

@@ -302,6 +302,10 @@ def test_a_step_of_lanes_tells_what_a_single_wheel_does_and_how_it_moves(scene, 
     x = np.asarray(ground.full_section(params, jnp.asarray([0.1, rate, -0.1])))
     values = np.asarray(ground.values(params))
     step, moved = step_lanes(values[:, None], x[None], ground, OPTIONS, 8)
+    same, only = step_lanes(values[:, None], x[None], ground, OPTIONS, 8, [0])  # by damping
+    np.testing.assert_array_equal(same.section_state, step.section_state)
+    np.testing.assert_array_equal(only.slip[:, 0], moved.slip[:, 0])
+    assert not only.slip[:, 1:].any()
     alone = vrw.step(params, x, model=ground, options=vrw.Options.tight())
     for name in ("section_state", "durations", "post_impact", "slip", "energy_impacts",
                  "energy_damping", "energy_friction", "step_length", "mode_durations"):  # fmt: skip
@@ -340,12 +344,18 @@ def test_newtons_method_on_lanes_goes_back_where_no_step_ends(monkeypatch):
 
     monkeypatch.setattr(on_ground, "step_lanes", step)
     a, begin = np.array([[0.25], [0.75], [-9.0]]), np.array([[1.9, 0.0], [1.5, 0.0], [0.0, 0.0]])
-    found = on_ground._newton(None, 1, vrw.Options(), 1, a, begin)
+    found = on_ground._newton(None, 1, vrw.Options(), 1, a, begin, True)
     assert found.converged.tolist() == [True, True, False]  # the last has no fixed point
     exact = 2.0 - 2.0 * np.sqrt(a[:2, 0])
     np.testing.assert_allclose(found.x[:2, 0], exact, atol=1e-12)
     np.testing.assert_allclose(found.residual[:2], 0.0, atol=1e-12)
     assert max(np.abs(x).max() for x in calls) > 3.0  # where it was sent back from
+
+
+def test_of_many_systems_one_that_is_singular_spoils_no_other():
+    matrix = np.stack([np.eye(2), np.zeros((2, 2)), 2.0 * np.eye(2)])
+    found = on_ground.solved(matrix, np.ones((3, 2, 1)))[..., 0]
+    np.testing.assert_array_equal(found, [[1.0, 1.0], [np.nan, np.nan], [0.5, 0.5]])
 
 
 class _Told(NamedTuple):

@@ -119,6 +119,12 @@ def test_a_chunk_whose_writing_broke_off_is_computed_again(
     assert broke_off > 10
 
 
+@pytest.mark.parametrize("wheel", [vrw.UnilateralWheel(), vrw.LadderWheel(friction=0.7)])
+def test_every_rungs_settings_can_be_written_down(wheel):
+    attrs = plan(vrw.grid(friction=[0.5, 0.7]), model=wheel).attrs
+    assert json.loads(attrs[scan_store.MANIFEST])["model"]["kind"] == type(wheel).__name__
+
+
 @pytest.mark.parametrize("kind", ["ViscoelasticWheel", "UnilateralWheel", "LadderWheel"])
 def test_a_store_of_version_0_1_tells_its_two_stability_margins_apart(
     tmp_path: Path, kind: str

@@ -8,9 +8,9 @@ import numpy as np
 
 from vrw_jax.answers.quantities import N_QUANTITIES
 from vrw_jax.batches import steps
-from vrw_jax.gaits import in_shapes, limit_cycles
+from vrw_jax.gaits import SHAPES, limit_cycles
 from vrw_jax.models import RigidWheel
-from vrw_jax.numerics import Options, with_jacobian
+from vrw_jax.numerics import Options, in_batches, with_jacobian
 from vrw_jax.wheel import Outcome, WheelParams
 
 NONE, RIGID, PAPER, GROUND = 0, 1, 2, 3
@@ -53,7 +53,7 @@ def paper_gaits(params: WheelParams, options: Options) -> Lower:
         cycles = limit_cycles(params)
         return cycles.section_state, cycles.outcome
 
-    x, outcome = map(np.array, in_shapes(found, params))
+    x, outcome = map(np.array, in_batches(found, SHAPES, params))
     lower = no_gaits(len(x))
     lower.outcome[:] = outcome
     (good,) = np.nonzero(outcome == Outcome.STEPPED)
@@ -79,7 +79,7 @@ def paper_gaits(params: WheelParams, options: Options) -> Lower:
 
 def rigid_gaits(params: WheelParams) -> Lower:
     """In closed form: the stiff limit's rolling gait, with the paper's landing."""
-    x, y, length, duration, jacobian, slope = map(np.asarray, in_shapes(_rolling, params))
+    x, y, length, duration, jacobian, slope = map(np.asarray, in_batches(_rolling, SHAPES, params))
     none = np.zeros_like(duration)
     told = np.column_stack([none, duration, none, length, y])
     flat = 0.0 * slope

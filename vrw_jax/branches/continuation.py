@@ -11,14 +11,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from vrw_jax.branches.branch import Branch
-from vrw_jax.branches.followed import Wheel, gait_measures
+from vrw_jax.branches.followed import Wheel
 from vrw_jax.branches.run import IN_SEQUENCE, AbstractRun, Strand, Table, run_all
 from vrw_jax.branches.starts import STARTS, Wanted, start_by_walking
 from vrw_jax.cycles import (
@@ -73,19 +72,6 @@ MESH_ERROR, REFINEMENTS = 1e-8, 3
 """Estimate of the mesh's error on a branch above which a finer one is taken, and how often."""
 
 
-@eqx.filter_jit
-def _read_gaits(
-    followed: Any, model: AbstractWheel, options: Options, wheels: Wheel, points: PathPoint
-) -> dict[str, Array]:
-    def one(wheel: Wheel, z: Any, p: Array) -> dict[str, Array]:
-        x, beyond = followed.read(wheel, z, p)
-        rung, params = model.moved(wheel.params, followed.name, p)
-        measures = gait_measures(rung, params, x, options, followed.n_steps)
-        return measures | beyond | {"section_state": x}
-
-    return jax.vmap(one)(wheels, points.z, points.p)
-
-
 @dataclass(frozen=True)
 class GaitRun(AbstractRun):
     """Of gaits: read by event-driven steps, kept where these go on and come back."""
@@ -102,7 +88,8 @@ class GaitRun(AbstractRun):
 
     def read(self, wheels: Wheel, points: PathPoint) -> Table:
         """One column more for each leg of a margin that has several."""
-        found = _read_gaits(self.followed, self.model, self.step_options, wheels, points)
+        followed: Any = self.followed
+        found = followed.told(self.model, self.step_options, wheels, points)
         table = jax.tree.map(np.asarray, found)
         for name, margin in MARGINS.items():
             if margin.axis and name in table:

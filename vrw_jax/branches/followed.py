@@ -1,13 +1,13 @@
 """The wheel's gaits as something that a continuation can follow, and their measures.
 
 `CycleFollowed` is the fast way: the collocation system of the paper's sequence of phases, one
-linearised pass per Newton iteration. `RungFollowed` works for every rung: its own step, iterated
-and differentiated forwards.
+linearised pass per Newton iteration. `GroundFollowed` takes real ground's lanes, and `RungFollowed`
+works for every rung: its own step, iterated and differentiated forwards.
 """
 
 import abc
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,17 +18,20 @@ from jaxtyping import Array, Bool, Float
 
 from vrw_jax.cycles import (
     Located,
+    Periods,
     Problem,
     correction_size,
     nothing_known,
     over_lanes,
+    solved,
     takeoff_acceleration,
 )
-from vrw_jax.models import AbstractWheel, RungState
+from vrw_jax.models import AbstractStep, AbstractWheel, RungState, UnilateralWheel
 from vrw_jax.numerics import (
     AbstractFollowed,
     Linear,
     Options,
+    PathPoint,
     Scalar,
     Section,
     Solution,
@@ -37,7 +40,7 @@ from vrw_jax.numerics import (
     mesh_error,
     one_wheel,
 )
-from vrw_jax.results import MARGINS
+from vrw_jax.results import MARGINS, STOPPERS
 from vrw_jax.wheel import (
     PARAMETER_NAMES,
     Outcome,
@@ -67,6 +70,29 @@ class AbstractFollowedWheel(AbstractFollowed):
     @abc.abstractmethod
     def read(self, wheel: Wheel, z: Unknown, p: Scalar) -> tuple[RungState, dict[str, Array]]:
         """Section state before the first landing, and quantities that go on beyond a border."""
+
+    def told(
+        self, model: AbstractWheel, options: Options, wheels: Wheel, points: PathPoint
+    ) -> dict[str, Array]:
+        """All measures of the gaits at many points, by event-driven steps, `read`'s included."""
+        return _told(self, model, options, wheels, points)
+
+
+@eqx.filter_jit
+def _told(
+    followed: AbstractFollowedWheel,
+    model: AbstractWheel,
+    options: Options,
+    wheels: Wheel,
+    points: PathPoint,
+) -> dict[str, Array]:
+    def one(wheel: Wheel, z: Any, p: Array) -> dict[str, Array]:
+        x, beyond = followed.read(wheel, z, p)
+        rung, params = model.moved(wheel.params, followed.name, p)
+        measures = gait_measures(rung, params, x, options, followed.n_steps)
+        return measures | beyond | {"section_state": x}
+
+    return jax.vmap(one)(wheels, points.z, points.p)
 
 
 class CycleFollowed(AbstractFollowedWheel):
@@ -186,13 +212,84 @@ class RungFollowed(AbstractFollowedWheel):
         return z[: self.numbers]
 
     def between(self, left: Unknown, right: Unknown, place: Scalar) -> Unknown:
-        """Codes are those of the nearer point."""
-        codes = jnp.where(place < 0.5, left, right)[self.numbers :]
-        return jnp.concatenate([(left + place * (right - left))[: self.numbers], codes])
+        return between_states(left, right, place, self.numbers)
 
     def read(self, wheel: Wheel, z: Unknown, p: Scalar) -> tuple[RungState, dict[str, Array]]:
         """The section state; a step's own measures hold all there is."""
         return z, {}
+
+
+class GroundFollowed(AbstractFollowedWheel):
+    """Fixed points on real ground by lanes, which take many at once; z as of `RungFollowed`."""
+
+    model: UnilateralWheel
+    options: Options
+    name: str = eqx.field(static=True)
+    period_n: int = eqx.field(static=True)
+    n_legs: int = eqx.field(static=True)
+
+    traced: ClassVar[bool] = False
+
+    @property
+    def n_steps(self) -> int:
+        return self.period_n
+
+    @property
+    def numbers(self) -> int:
+        return self.model.section_numbers(WheelParams(n_legs=self.n_legs))
+
+    def values(self, wheels: Wheel, p: Array) -> Array:
+        """The rung's numbers of many wheels with the parameter at p."""
+
+        def one(wheel: Wheel, p: Array) -> Array:
+            model, params = self.model.moved(wheel.params, self.name, p)
+            return model.values(params)
+
+        return jax.vmap(one)(wheels, p)
+
+    def _periods(self, wheels: Wheel, p: Array) -> Periods:
+        values = np.asarray(self.values(wheels, p))
+        return Periods(self.model, self.n_legs, self.period_n, values)
+
+    def linearise(self, wheel: Wheel, z: Unknown, p: Scalar) -> Linear:
+        """Of many."""
+        x, n = np.asarray(z), self.numbers
+        own = np.asarray(self.model.parameter_names) == self.name
+        now = self._periods(wheel, p).around(self.options, x, own)
+        bad = np.where(now.good, 0.0, np.nan)[:, None]
+        miss, by_x = now.image - x + bad, now.by_start[:, :n, :n]
+        right = np.concatenate([miss[:, :n, None], now.by_values[:, :n, own]], -1)
+        found, codes = solved(np.eye(n) - by_x, right), miss[:, n:]
+        correction = np.concatenate([found[..., 0], codes], 1)
+        column = np.concatenate([found[..., 1], 0.0 * codes], 1)
+        return Linear(correction, column, jnp.asarray(by_x))
+
+    def section(self, z: Unknown) -> Section:
+        return z[: self.numbers]
+
+    def between(self, left: Unknown, right: Unknown, place: Scalar) -> Unknown:
+        return between_states(left, right, place, self.numbers)
+
+    def read(self, wheel: Wheel, z: Unknown, p: Scalar) -> tuple[RungState, dict[str, Array]]:
+        return z, {}
+
+    def told(
+        self, model: AbstractWheel, options: Options, wheels: Wheel, points: PathPoint
+    ) -> dict[str, Array]:
+        now = self._periods(wheels, points.p).around(options, np.asarray(points.z), False, False)
+        return _of_period(now.steps, points.z) | {"section_state": jnp.asarray(points.z)}
+
+
+@jax.jit
+@jax.vmap
+def _of_period(steps: AbstractStep, x: RungState) -> dict[str, Array]:
+    return period_measures(steps.section_state[-1], jax.vmap(lambda s: s.measures())(steps), x)
+
+
+def between_states(left: Array, right: Array, place: Scalar, numbers: int) -> Array:
+    """Of section states; codes are those of the nearer one."""
+    codes = jnp.where(place < 0.5, left, right)[numbers:]
+    return jnp.concatenate([(left + place * (right - left))[:numbers], codes])
 
 
 def gait_measures(
@@ -210,9 +307,14 @@ def gait_measures(
         return result.section_state, result.measures()
 
     end, steps = lax.scan(one, x, None, length=period_n)
+    return period_measures(end, steps, x)
+
+
+def period_measures(end: RungState, steps: dict[str, Array], x: RungState) -> dict[str, Array]:
+    """`gait_measures` from those of each step, and the section state where they end."""
     told = {}
     for name, values in steps.items():
-        if name in MARGINS or name.startswith("lambda_"):
+        if name in MARGINS | STOPPERS or name.startswith("lambda_"):
             told[name] = jnp.min(values, 0)
         elif name.endswith("_touchdown"):
             told[name] = values[-1]

@@ -27,9 +27,12 @@ from vrw_jax.numerics import (
     arclength,
     bifurcation_functions,
     brackets,
+    follow_many,
     in_batches,
     joined,
     locate,
+    solve,
+    solve_many,
     taken,
     turns,
 )
@@ -40,8 +43,8 @@ ACCURACY = 1e-10
 AT_FOLD = 1e-6
 """The same as a share of the bracket, where the parameter turns back: it enters squared."""
 
-BATCH = 8
-"""Points that are measured or located side by side: one shape, compiled once."""
+SHAPES = (1, 8)
+"""Points that are measured or located side by side; one shape where much is compiled for it."""
 
 IN_SEQUENCE = "sequence"
 """Column that is 1 where a point is what it stands for, else -1."""
@@ -88,10 +91,16 @@ class AbstractRun(abc.ABC):
         """What the first point beyond the end of a branch says of it."""
         return IN_SEQUENCE
 
+    @property
+    def shapes(self) -> tuple[int, ...]:
+        """Of `SHAPES`, those that are used."""
+        return SHAPES[-1:] if self.followed.traced else SHAPES
+
     def table(self, points: PathPoint, owners: np.ndarray) -> Table:
         """Every quantity at each point, bifurcation functions and IN_SEQUENCE included."""
-        found = in_batches(self.read, BATCH, taken(self.wheels, owners), points)
-        margins = in_batches(bifurcation_functions, BATCH, points.jacobian)
+        wheels = taken(self.wheels, owners)
+        found = jax.tree.map(np.asarray, in_batches(self.read, self.shapes, wheels, points))
+        margins = np.asarray(in_batches(bifurcation_functions, SHAPES[-1:], points.jacobian))
         found |= {name: margins[:, i] for i, name in enumerate(BIFURCATIONS)}
         found = self.known(found, owners)
         for name, exact in self.exact.items():
@@ -120,7 +129,8 @@ def _follow_both_ways(run: AbstractRun, z: Any, p: Array) -> arclength.Track:
     bounds = jnp.asarray(run.bounds)
     ways = jnp.tile(jnp.asarray([-1.0, 1.0], bounds.dtype), p.shape[0])
     given = twice(run.wheels), twice(z), twice(p), bounds, ways
-    tracks = arclength.follow(run.followed, run.options, *given)
+    follow = arclength.follow if run.followed.traced else follow_many
+    tracks = follow(run.followed, run.options, *given)
     return jax.tree.map(lambda x: np.asarray(x).reshape(-1, 2, *x.shape[1:]), tracks)
 
 
@@ -137,15 +147,39 @@ def _solve_on(
     """Points of the branch between neighbours, at `places` in [0, 1] of the chord."""
 
     def one(wheel: Any, left: PathPoint, right: PathPoint, place: Array) -> tuple[PathPoint, Array]:
-        z = followed.between(left.z, right.z, place)
-        scale = bounds[1] - bounds[0]
-        row_x = followed.section(right.z) - followed.section(left.z)
-        row_share = (right.p - left.p) / scale
-        share = (left.p + place * (right.p - left.p) - bounds[0]) / scale
-        plane = Plane(followed.section(z), share, row_x, row_share)
-        return arclength.solve(followed, options, wheel, z, plane, bounds)
+        z, plane = _begin_on(followed, bounds, left, right, place)
+        return solve(followed, options, wheel, z, plane, bounds)
 
     return jax.vmap(one)(wheels, left, right, places)
+
+
+def _begin_on(
+    followed: AbstractFollowed, bounds: Array, left: PathPoint, right: PathPoint, place: Array
+) -> tuple[Any, Plane]:
+    """Where a search between neighbours starts, and the plane that it stays on."""
+    z = followed.between(left.z, right.z, place)
+    scale = bounds[1] - bounds[0]
+    row_x = followed.section(right.z) - followed.section(left.z)
+    row_share = (right.p - left.p) / scale
+    share = (left.p + place * (right.p - left.p) - bounds[0]) / scale
+    return z, Plane(followed.section(z), share, row_x, row_share)
+
+
+_begin_many = eqx.filter_jit(eqx.filter_vmap(_begin_on, in_axes=(None, None, 0, 0, 0)))
+
+
+def _solve_many(
+    followed: AbstractFollowed,
+    options: ArclengthOptions,
+    bounds: Array,
+    wheels: Any,
+    left: PathPoint,
+    right: PathPoint,
+    places: Array,
+) -> tuple[PathPoint, Array]:
+    """`_solve_on`, from outside of compiled code."""
+    z, planes = _begin_many(followed, bounds, left, right, places)
+    return solve_many(followed, options, wheels, z, planes, bounds)
 
 
 class _Pieces(NamedTuple):
@@ -175,10 +209,12 @@ def _zeros(run: AbstractRun, pieces: _Pieces, asked: list[tuple[int, int, str]])
     left, right = taken(pieces.points, lefts), taken(pieces.points, rights)
     owners = pieces.owners[lefts]
     wheels = taken(run.wheels, owners)
-    solve = functools.partial(_solve_on, run.followed, run.options, jnp.asarray(run.bounds))
+    on = _solve_on if run.followed.traced else _solve_many
+    search = functools.partial(on, run.followed, run.options, jnp.asarray(run.bounds))
 
     def evaluated(places: np.ndarray, which: np.ndarray) -> tuple[PathPoint, Table]:
-        points, found = in_batches(solve, BATCH, *taken((wheels, left, right), which), places)
+        some = *taken((wheels, left, right), which), places
+        points, found = jax.tree.map(np.asarray, in_batches(search, run.shapes, *some))
         points = points._replace(valid=points.valid & found)
         table = run.table(points, owners[which])
         return points, {k: np.where(_along(found, v), v, np.nan) for k, v in table.items()}

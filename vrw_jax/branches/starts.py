@@ -12,6 +12,7 @@ from jaxtyping import Array
 from vrw_jax.branches.followed import (
     AbstractFollowedWheel,
     CycleFollowed,
+    GroundFollowed,
     RungFollowed,
     Wheel,
 )
@@ -112,5 +113,39 @@ def start_by_walking(wanted: Wanted, cycle: Any) -> Start:
     )
 
 
-STARTS: dict[str, Callable[[Wanted, Any], Start]] = {"viscoelastic": start_by_collocation}
+def start_by_lanes(wanted: Wanted, cycle: Any) -> Start:
+    """Gaits on real ground, those given or the slowest that attracts each wheel."""
+    params, options = wanted.params, wanted.step_options
+    model: Any = wanted.model
+    finder: Any = finder_of(model, params.n_legs, step_options=options, period_n=wanted.period_n)
+    if not finder.coexisting:  # no lanes, but the step of the definition
+        return start_by_walking(wanted, cycle)
+    wheels = Wheel(params, jnp.ones((*wanted.p.shape, 1, 1), wanted.p.dtype))
+    followed = GroundFollowed(
+        model=model,
+        options=options,
+        name=wanted.name,
+        period_n=wanted.period_n,
+        n_legs=params.n_legs,
+    )
+    values = followed.values(wheels, wanted.p)
+    if cycle is None:
+        cycle = finder.near(values, finder.first_guesses(values))
+
+    def make_cycle(owner: int, point: PathPoint) -> Callable[[], Any]:
+        def find() -> Any:
+            wheel = jax.tree.map(lambda x: x[owner : owner + 1], wheels)
+            there = followed.values(wheel, jnp.asarray(point.p)[None])
+            return jax.tree.map(lambda x: x[0], finder.near(there, np.asarray(point.z)[None]))
+
+        return find
+
+    outcomes = np.asarray(cycle.outcome)
+    return Start(followed, wheels, cycle.section_state, outcomes, make_cycle)
+
+
+STARTS: dict[str, Callable[[Wanted, Any], Start]] = {
+    "viscoelastic": start_by_collocation,
+    "unilateral": start_by_lanes,
+}
 """By rung, where it is not `start_by_walking`."""

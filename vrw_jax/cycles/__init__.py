@@ -15,7 +15,7 @@ from vrw_jax.cycles.finder import (
     same_branch,
 )
 from vrw_jax.cycles.finding import Guess, finder_for, finder_of, near, serving
-from vrw_jax.cycles.on_ground import options_towards
+from vrw_jax.cycles.on_ground import Periods, options_towards, solved
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.premises import default_margins, takeoff_acceleration
 from vrw_jax.cycles.search import Located, Problem, correction_size, nothing_known

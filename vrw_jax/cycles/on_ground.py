@@ -4,6 +4,7 @@ Every direction in which a step moves is a lane of the same machine code, so tha
 searched side by side and nothing large is compiled for the derivatives.
 """
 
+import functools
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -29,13 +30,19 @@ from vrw_jax.models import (
     step_lanes,
     walk_lanes,
 )
-from vrw_jax.numerics import Options, SectionCycle, SolverName, as_float_array
-from vrw_jax.results import ON_GROUND
+from vrw_jax.numerics import Options, SectionCycle, SolverName, as_float_array, in_batches
+from vrw_jax.results import ON_GROUND, STOPPERS
 from vrw_jax.walks import N_TOWARDS, checked
 from vrw_jax.wheel import Outcome, WheelParams
 
-ITERATIONS, HALVINGS = 30, 6
+ITERATIONS, HALVINGS = 15, 6
 """Of Newton's method, and of a correction that leads where no step ends, at most."""
+
+LOOSE, ROUGH = 1e-6, 1e-4
+"""Tolerance of the steps far from a gait, and the correction below which one is near."""
+
+CLEAR = 0.01
+"""A correction so much smaller than need be shows the gait where it is made."""
 
 SHAPES = (1, 8, 64, 512)
 """Numbers of gaits that are told together: each is compiled for once."""
@@ -55,11 +62,12 @@ class GroundFinder(AbstractWalkingFinder):
     """On real ground, with first derivatives, friction's included."""
 
     model: UnilateralWheel
+    shapes: tuple[int, ...] = eqx.field(static=True, default=SHAPES)
 
     of_cycle: ClassVar[tuple[str, ...]] = ("spectral_radius", "spectral_margin")
     differentiable: ClassVar[tuple[str, ...]] = ON_GROUND
     usual: ClassVar[tuple[str, ...]] = ON_GROUND
-    readable: ClassVar[tuple[str, ...]] = ON_GROUND
+    readable: ClassVar[tuple[str, ...]] = (*ON_GROUND, *STOPPERS)
     coexisting: ClassVar[bool] = True
 
     @classmethod
@@ -75,14 +83,18 @@ class GroundFinder(AbstractWalkingFinder):
         params, x, model, options = where_walks_begin(self, params, guess)
         if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((params, x, model))):
             return walked_cycle(params, x, model, options, self.period_n)
-        return self.find(model.values(params), x).cycle  # type: ignore[return-value]
+        return jax.tree.map(lambda x: x[0], self.near(model.values(params)[None], x[None]))
 
     def cycles(self, params: WheelParams, guess: Any = None) -> Any:
         """Side by side."""
         if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((params, guess))):
             return eqx.filter_vmap(self.cycle)(params, guess)
         values = jax.vmap(self.model.values)(params)
-        return self.find_many(values, _states(self.model, params, guess)).cycle
+        return self.near(values, _states(self.model, params, guess))
+
+    def near(self, values: Any, states: Any) -> WalkedCycle:
+        """The gaits near section states, wheel by wheel, without derivatives."""
+        return self._told(_cycles, values, states, by_values=False)
 
     def first_guess(self, values: Values) -> Array:
         return self.first_guesses(values[None])[0]
@@ -104,14 +116,18 @@ class GroundFinder(AbstractWalkingFinder):
         return jax.tree.map(lambda x: x[0], self.find_many(values[None], guess[None]))
 
     def find_many(self, values: Array, guess: Any) -> Gait:
-        x = getattr(guess, "section_state", guess)
-        given = np.asarray(values), np.asarray(x)
+        return self._told(_gaits, values, getattr(guess, "section_state", guess), by_values=True)
+
+    def _told(self, program: Any, values: Any, states: Any, by_values: bool) -> Any:
+        given = np.asarray(values), np.asarray(states), by_values
         found = _newton(self.model, self.n_legs, self.step_options, self.period_n, *given)
-        return _told_in_shapes(self.model, self.n_legs, jnp.asarray(given[0]), found)
+        told = functools.partial(program, self.model, self.n_legs)
+        return in_batches(told, self.shapes, given[0], found)
 
     def step(self, params: WheelParams, x: Array) -> AbstractStep:
         columns, model = np.asarray(self.model.values(params))[:, None], self.model
-        told, _ = step_lanes(columns, np.asarray(x)[None], model, self.step_options, self.n_legs)
+        given = columns, np.asarray(x)[None], model, self.step_options, self.n_legs
+        told, _ = step_lanes(*given, ())
         return jax.tree.map(lambda leaf: leaf[0], told)
 
     def measured(self, values: Values, guess: Any, names: tuple[str, ...]) -> Measured:
@@ -142,95 +158,179 @@ class _Found(NamedTuple):
     iterations: Any
 
 
-def _around(
-    model: Any, n_legs: int, options: Options, period_n: int, values: np.ndarray, x: np.ndarray
-) -> tuple[Any, Any, np.ndarray, np.ndarray, np.ndarray]:
-    """Steps of one period, their derivatives, where they lead, by what of x, and which arrive."""
-    told, n = [], values.shape[1]
-    by_start, good = np.eye(x.shape[1])[None], np.ones(len(x), bool)
-    for _ in range(period_n):
-        told.append(step_lanes(values.T, x, model, options, n_legs))
-        step, moves = told[-1]
-        good &= np.asarray(step.outcome) == Outcome.STEPPED
-        x = np.asarray(step.section_state)
-        by_start = np.asarray(moves.section_state)[:, :, n:] @ by_start
-    steps, moved = (
-        jax.tree.map(lambda *leaves: np.stack(leaves, 1), *each) for each in zip(*told, strict=True)
-    )
-    return steps, moved, x, by_start, good
+class Periods(NamedTuple):
+    """Periods of wheels, as Newton's method asks for them; by lanes, from outside of programs."""
+
+    model: Any
+    n_legs: int
+    period_n: int
+    values: np.ndarray  # wheel by wheel
+
+    def of(self, some: np.ndarray) -> "Periods":
+        return self._replace(values=self.values[some])
+
+    def around(
+        self, options: Options, x: np.ndarray, by_values: Any = True, by_start: bool = True
+    ) -> "Period":
+        """From there; derivatives by values, all or some, and by the section state."""
+        told, (n, m) = [], (self.values.shape[1], x.shape[1])
+        along, good = np.concatenate([np.zeros((m, n)), np.eye(m)], 1)[None], np.ones(len(x), bool)
+        asked = np.concatenate([np.broadcast_to(by_values, n), np.broadcast_to(by_start, m)])
+        wanted = np.flatnonzero(asked).tolist()
+        for _ in range(self.period_n):
+            given = self.values.T, x, self.model, options, self.n_legs, wanted
+            told.append(step_lanes(*given))
+            step, moves = told[-1]
+            good &= np.asarray(step.outcome) == Outcome.STEPPED
+            x = np.asarray(step.section_state)
+            by = np.asarray(moves.section_state)
+            along = by[:, :, n:] @ along
+            along[:, :, :n] += by[:, :, :n]
+        steps, moved = (
+            jax.tree.map(lambda *leaves: np.stack(leaves, 1), *each)
+            for each in zip(*told, strict=True)
+        )
+        return Period(steps, moved, x, along[:, :, :n], along[:, :, n:], good)
+
+
+class Period(NamedTuple):
+    """Steps of one period, their derivatives, where they lead, by what of it, and which arrive."""
+
+    steps: Any
+    moves: Any
+    image: np.ndarray
+    by_values: np.ndarray
+    by_start: np.ndarray
+    good: np.ndarray
+
+    def change(self, x: np.ndarray, by_start: np.ndarray) -> np.ndarray:
+        """Newton's correction of x; zeros where no period ends."""
+        change, good = np.zeros_like(x), self.good
+        matrix = np.eye(x.shape[1]) - by_start[good]
+        change[good] = solved(matrix, (self.image - x)[good][..., None])[..., 0]
+        return change
+
+
+def solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """`numpy.linalg.solve` of many, which refuses all where one is singular: that one is NaN."""
+    try:
+        return np.linalg.solve(matrix, right)
+    except np.linalg.LinAlgError:
+        regular = np.abs(np.linalg.det(matrix)) > 0.0
+        one = np.where(regular[:, None, None], matrix, np.eye(matrix.shape[-1]))
+        return np.where(regular[:, None, None], np.linalg.solve(one, right), np.nan)
 
 
 def _newton(
-    model: Any, n_legs: int, options: Options, period_n: int, values: np.ndarray, start: np.ndarray
+    model: Any,
+    n_legs: int,
+    options: Options,
+    period_n: int,
+    values: np.ndarray,
+    start: np.ndarray,
+    by_values: bool,
 ) -> _Found:
     """Fixed points near `start`; codes at the end of a section state are those of the image.
 
-    A correction that leads where no step ends is halved. Once one is small enough another
-    evaluation tells the gait there.
+    First by loose steps until corrections are small, then by a step as exact as `options` with the
+    same Jacobian, which leads so near that one more, with all derivatives, tells the gait.
     """
-    wheels, one = len(values), np.eye(start.shape[1])
-    x, last, tolerance = start.copy(), start.copy(), float(finest(options))
+    maps = Periods(model, n_legs, period_n, values)
+    looser = [jnp.maximum(tolerance, LOOSE) for tolerance in (options.rtol, options.atol)]
+    loose = eqx.tree_at(lambda o: (o.rtol, o.atol), options, looser)
+    tolerance, every = float(finest(options)), np.ones(len(values), bool)
+    rough, by_start = _corrected(maps, loose, start, False, ROUGH, every)
+    x, near = np.where(rough.converged[:, None], rough.x, start), rough.converged
+    exact = maps.around(options, x, False, False)
+    change = exact.change(x, by_start)
+    x[near] += change[near] * (np.abs(change[near]).max(-1, keepdims=True) < ROUGH)
+    told, _ = _corrected(maps, options, x, by_values, tolerance, near, ends=False)
+    return told._replace(iterations=rough.iterations + near + told.iterations)
+
+
+def _corrected(
+    maps: Periods,
+    options: Options,
+    start: np.ndarray,
+    by_values: bool,
+    tolerance: float,
+    wanted: np.ndarray,
+    ends: bool = True,
+) -> tuple[_Found, np.ndarray]:
+    """Newton's method on the `wanted` until a correction is small enough, and the last Jacobians.
+
+    A correction that leads where no period ends is halved. A small correction `ends` it, or else
+    another evaluation, which tells the gait that it leads to.
+    """
+    wheels, n_legs = len(start), maps.n_legs
+    x, last = start.copy(), start.copy()
     residual, count = np.full(wheels, np.inf), np.zeros(wheels, np.int32)
-    small, halved = np.zeros(wheels, bool), np.zeros(wheels, int)
+    small, found, halved = (np.zeros(wheels, kind) for kind in (bool, bool, int))
+    by_start = np.zeros((wheels, start.shape[1], start.shape[1]))
     open_, kept = np.arange(wheels), None
     for _ in range(ITERATIONS + HALVINGS):
-        given = model, n_legs, options, period_n, values[open_], x[open_]
-        steps, moves, image, by_start, good = _around(*given)
+        now = maps.of(open_).around(options, x[open_], by_values)
         if kept is None:
-            kept = jax.tree.map(np.array, (steps, moves))
-        for old, new in zip(jax.tree.leaves(kept), jax.tree.leaves((steps, moves)), strict=True):
+            kept = jax.tree.map(np.array, (now.steps, now.moves))
+        for old, new in zip(jax.tree.leaves(kept), jax.tree.leaves(now[:2]), strict=True):
             old[open_] = new
-        miss = image - x[open_]
-        change = np.zeros_like(miss)
-        change[good] = np.linalg.solve(one - by_start[good], miss[good][..., None])[..., 0]
-        good &= np.isfinite(change).all(-1)
-        residual[open_] = np.abs(miss).max(-1)
-        lanes, done = open_[good], small[open_] & good
-        tight = np.abs(change).max(-1) <= tolerance
-        count[lanes] += 1
-        small[open_] = (small[open_] | tight) & good
-        moving = good & ~done
-        last[open_[moving]] = x[open_[moving]]
-        x[open_[moving]] += change[moving]
-        halved[open_[moving]] = 0
+        change = now.change(x[open_], now.by_start)
+        size, good = np.abs(change).max(-1), now.good & np.isfinite(change).all(-1)
+        residual[open_] = np.abs(now.image - x[open_]).max(-1)
+        by_start[open_] = now.by_start
+        count[open_] += 1
+        done = good & (small[open_] | (size <= CLEAR * tolerance)) & (not ends)
+        small[open_] = good & (size <= tolerance)
+        moving = open_[good & ~done]
+        last[moving], halved[moving] = x[moving], 0
+        x[moving] += change[good & ~done]
         bad = open_[~good]
         x[bad], halved[bad] = 0.5 * (x[bad] + last[bad]), halved[bad] + 1
         x[bad, -n_legs:] = last[bad, -n_legs:]
-        lost = (halved > HALVINGS) | (count > ITERATIONS)
-        open_ = open_[~done & ~lost[open_]]
+        found[open_] = wanted[open_] & (small[open_] if ends else done)
+        lost = (halved > HALVINGS) | (count > ITERATIONS) | ~wanted
+        open_ = open_[~found[open_] & ~lost[open_]]
         if not len(open_):
             break
     assert kept is not None
-    converged = small & ~np.isin(np.arange(wheels), open_)
-    steps, moves = kept
-    return _Found(x, steps, moves, residual, converged, count)
-
-
-def _told_in_shapes(model: AbstractWheel, n_legs: int, values: Array, found: _Found) -> Gait:
-    """Gaits of any number of wheels by programs of few shapes."""
-    parts, n = [], len(values)
-    for begin in range(0, n, SHAPES[-1]):
-        size = min(n - begin, SHAPES[-1])
-        wide = next(shape for shape in SHAPES if shape >= size)
-        some = np.minimum(np.arange(begin, begin + wide), begin + size - 1)
-        given = jax.tree.map(lambda x, some=some: jnp.asarray(x)[some], (values, found))
-        told = _told_many(model, n_legs, *given)
-        parts.append(jax.tree.map(lambda x, size=size: x[:size], told))
-    return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
+    return _Found(x, kept[0], kept[1], residual, found, count), by_start
 
 
 @eqx.filter_jit
-def _told_many(model: AbstractWheel, n_legs: int, values: Array, found: _Found) -> Gait:
-    return eqx.filter_vmap(lambda values, found: _told(model, n_legs, values, found))(values, found)
+def _gaits(model: AbstractWheel, n_legs: int, values: Array, found: _Found) -> Gait:
+    return eqx.filter_vmap(lambda values, found: _gait(model, n_legs, values, found))(values, found)
 
 
-def _told(model: AbstractWheel, n_legs: int, values: Array, found: _Found) -> Gait:
+@eqx.filter_jit
+def _cycles(model: AbstractWheel, n_legs: int, values: Array, found: _Found) -> WalkedCycle:
+    told = lambda values, found: _cycle(
+        model, n_legs, values, found, _by_section(found, len(values))
+    )
+    return eqx.filter_vmap(told)(values, found)
+
+
+def _by_section(found: _Found, n: int) -> Array:
+    """How one period's end moves with its beginning."""
+    by_section = jnp.eye(found.x.shape[0], dtype=found.x.dtype)
+    for jacobian in found.moves.section_state:
+        by_section = jacobian[:, n:] @ by_section
+    return by_section
+
+
+def _cycle(
+    model: AbstractWheel, n_legs: int, values: Array, found: _Found, by_section: Array
+) -> WalkedCycle:
+    told = found.residual, found.converged, found.iterations
+    params = model.at(values, n_legs)[1]
+    return cycle_from(params, SectionCycle(found.x, by_section, *told), found.steps)
+
+
+def _gait(model: AbstractWheel, n_legs: int, values: Array, found: _Found) -> Gait:
     """The gait through a fixed point, and its derivatives along the branch."""
     n, one = values.shape[0], jnp.eye(found.x.shape[0], dtype=found.x.dtype)
-    by_values, by_section = jnp.zeros((len(one), n), one.dtype), one
+    by_values, by_section = jnp.zeros((len(one), n), one.dtype), _by_section(found, n)
     for jacobian in found.moves.section_state:
         by_values = jacobian[:, :n] + jacobian[:, n:] @ by_values
-        by_section = jacobian[:, n:] @ by_section
     regular = jnp.where(found.converged, one - by_section, one)
     moved = jnp.linalg.solve(regular, by_values)
 
@@ -242,9 +342,7 @@ def _told(model: AbstractWheel, n_legs: int, values: Array, found: _Found) -> Ga
         here = along.section_state
     d_step = jax.tree.map(lambda *leaves: jnp.stack(leaves, 1), *d_steps)
 
-    params = model.at(values, n_legs)[1]
-    told = found.residual, found.converged, found.iterations
-    cycle = cycle_from(params, SectionCycle(found.x, by_section, *told), found.steps)
+    cycle = _cycle(model, n_legs, values, found, by_section)
     # Nothing here tells how the Jacobian itself moves: what depends on it is not `differentiable`.
     floating = eqx.filter(cycle, eqx.is_inexact_array)
     still = jax.tree.map(lambda x: jnp.zeros((n, *x.shape), x.dtype), floating)

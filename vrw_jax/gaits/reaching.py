@@ -26,7 +26,7 @@ from vrw_jax.cycles import (
     WalkedCycle,
 )
 from vrw_jax.gaits.attracting import NEAR, gaits_attracting, starts_of, walked
-from vrw_jax.numerics import Options, select
+from vrw_jax.numerics import Options, in_batches, select
 from vrw_jax.walks import ModelLike
 from vrw_jax.wheel import Outcome, WheelParams, parameters_of
 from vrw_jax.wording import chosen, untraced, whole
@@ -258,18 +258,6 @@ def _searched(finder: AbstractGaitFinder, params: WheelParams, guess: Any) -> An
     return (finder.cycles if params.damping.ndim else finder.cycle)(params, guess)
 
 
-def in_shapes(function: Any, *trees: Any) -> Any:
-    """`function` of trees with a leading axis, filled up to one of `SHAPES` lanes at a time."""
-    n, parts = len(jax.tree.leaves(trees)[0]), []
-    for begin in range(0, n, SHAPES[-1]):
-        some = np.arange(begin, min(begin + SHAPES[-1], n))
-        size = next(size for size in SHAPES if size >= len(some))
-        filled = np.pad(some, (0, size - len(some)), mode="edge")
-        found = function(*_taken(trees, filled))
-        parts.append(_taken(found, slice(0, len(some))))
-    return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
-
-
 def _taken(tree: Any, places: Any) -> Any:
     return jax.tree.map(lambda x: jnp.asarray(x)[places], tree)
 
@@ -309,7 +297,7 @@ def _begun(
     along = np.flatnonzero(walks.reached & ~has)
     if len(along):
         walk = jax.vmap(finder.after)
-        start = _put(start, along, in_shapes(walk, _taken(params, along), walks.x[along]))
+        start = _put(start, along, in_batches(walk, SHAPES, _taken(params, along), walks.x[along]))
     return jax.vmap(select)(jnp.asarray(has), located, start)
 
 
@@ -342,7 +330,7 @@ def _reached(
             continue
         some, own = _taken(params, places), _Walks(*(part[places] for part in walks))
         begin = _begun(finder, some, _taken(located, places), has[places], own)
-        again = in_shapes(functools.partial(_searched, finder), some, begin)
+        again = in_batches(functools.partial(_searched, finder), SHAPES, some, begin)
         gait, error = np.asarray(again.found), np.asarray(again.mesh_error)
         located = _put(located, places[gait], _taken(again.located, gait))
         if gait.any():
@@ -375,7 +363,7 @@ def _from_another_step(
     located = cycle.located
     for _ in range(1, finder.period_n):
         x = np.asarray(steps(some, x, model=finder.model).section_state)
-        found = in_shapes(functools.partial(_searched, finder), some, x)
+        found = in_batches(functools.partial(_searched, finder), SHAPES, some, x)
         gait = np.flatnonzero(np.asarray(found.found) & (np.asarray(located.found)[lost] < 0.5))
         if len(gait):
             located = _put(located, lost[gait], _taken(found.located, gait))

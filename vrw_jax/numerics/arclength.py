@@ -11,7 +11,7 @@ import abc
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -77,6 +77,9 @@ class Linear(NamedTuple):
 
 class AbstractFollowed(eqx.Module):
     """What can be followed; `wheel` is whatever else a branch's equations need, a pytree."""
+
+    traced: ClassVar[bool] = True
+    """Whether `linearise` can be compiled into a loop; else it is called for many from outside."""
 
     @abc.abstractmethod
     def linearise(self, wheel: Any, z: Unknown, p: Scalar) -> Linear:
@@ -173,7 +176,9 @@ class Plane(NamedTuple):
     row_share: Scalar
 
 
-class _Corrected(NamedTuple):
+class Corrected(NamedTuple):
+    """After one iteration."""
+
     z: Unknown
     share: Scalar
     size: Scalar
@@ -181,26 +186,37 @@ class _Corrected(NamedTuple):
     jacobian: Float[Array, "n n"]
 
 
-def _correct(
-    followed: AbstractFollowed, wheel: Any, bounds: Array, plane: Plane, z: Unknown, share: Scalar
-) -> _Corrected:
+def linear_at(
+    followed: AbstractFollowed, wheel: Any, bounds: Array, z: Unknown, share: Scalar
+) -> Linear:
+    """At a share of the parameter's range."""
+    return followed.linearise(wheel, z, bounds[0] + (bounds[1] - bounds[0]) * share)
+
+
+def corrected(
+    followed: AbstractFollowed,
+    linear: Linear,
+    bounds: Array,
+    plane: Plane,
+    z: Unknown,
+    share: Scalar,
+) -> Corrected:
     """One Newton iteration on the branch's equations and the plane at once."""
     scale = bounds[1] - bounds[0]
-    linear = followed.linearise(wheel, z, bounds[0] + scale * share)
     column = jax.tree.map(lambda x: scale * x, linear.column)
     x = followed.section(z) + followed.section(linear.correction)
     ahead = plane.row_x @ (x - plane.x) + plane.row_share * (share - plane.share)
     d_share = -ahead / (plane.row_x @ followed.section(column) + plane.row_share)
     dz = jax.tree.map(lambda a, b: a + d_share * b, linear.correction, column)
     size = jnp.maximum(followed.size(z, dz), jnp.abs(d_share))
-    return _Corrected(jax.tree.map(jnp.add, z, dz), share + d_share, size, column, linear.jacobian)
+    return Corrected(jax.tree.map(jnp.add, z, dz), share + d_share, size, column, linear.jacobian)
 
 
 def _share_of(p: Array, bounds: Array) -> Array:
     return (p - bounds[0]) / (bounds[1] - bounds[0])
 
 
-def _parameter_at(share: Array, bounds: Array) -> Array:
+def parameter_at(share: Array, bounds: Array) -> Array:
     """The inverse; exact at both ends."""
     p = bounds[0] + (bounds[1] - bounds[0]) * share
     return jnp.where(share == 1.0, bounds[1], p)
@@ -236,7 +252,7 @@ def _predicted(followed: AbstractFollowed, base: PathPoint, step: Scalar, bounds
     return _Trial(plane, z, at, length, final)
 
 
-class _State(NamedTuple):
+class State(NamedTuple):
     base: PathPoint
     first: PathPoint  # of the branch, once there is one
     step: Scalar
@@ -258,8 +274,8 @@ class _Judged(NamedTuple):
 def _judged(
     followed: AbstractFollowed,
     options: ArclengthOptions,
-    state: _State,
-    now: _Corrected,
+    state: State,
+    now: Corrected,
     direction: Scalar,
 ) -> _Judged:
     base, trial, starting = state.base, state.trial, state.n_points == 0
@@ -279,7 +295,7 @@ def _judged(
     return _Judged(accepted, failed, jnp.where(facing >= 0.0, 1.0, -1.0) / norm)
 
 
-def _next_step(options: ArclengthOptions, state: _State, judged: _Judged) -> Scalar:
+def _next_step(options: ArclengthOptions, state: State, judged: _Judged) -> Scalar:
     """Longer where Newton's method was quick, shorter where it was slow, half where it failed."""
     quick, slow = state.iteration < 4, state.iteration >= 6
     growth = jnp.where(quick, 1.4, jnp.where(slow, 0.6, 1.0))
@@ -303,7 +319,7 @@ def _closes(
 
 def _ending(
     options: ArclengthOptions,
-    state: _State,
+    state: State,
     judged: _Judged,
     reached: PathPoint,
     step: Scalar,
@@ -332,7 +348,7 @@ def _started(
     z: Unknown,
     p: Scalar,
     direction: Scalar,
-) -> _State:
+) -> State:
     x = followed.section(z)
     n, dtype = x.shape[0], x.dtype
     zero, none, no = jnp.zeros((), dtype), jnp.zeros((), jnp.int32), jnp.asarray(False)
@@ -340,7 +356,79 @@ def _started(
     here = PathPoint(z, p, flat, zero + direction, jnp.zeros((n, n), dtype), no)
     trial = _Trial(Plane(x, share, jnp.zeros_like(x), zero + 1.0), z, share, zero, no)
     going = none + int(Ending.GOING)
-    return _State(here, here, zero + options.first_step, trial, none, none, going, none)
+    return State(here, here, zero + options.first_step, trial, none, none, going, none)
+
+
+Followed = tuple[State, PathPoint]
+"""Branches side by side, and the points that they have reached."""
+
+
+def begun(
+    followed: AbstractFollowed,
+    options: ArclengthOptions,
+    z: Unknown,
+    p: Array,
+    bounds: Array,
+    directions: Array,
+) -> Followed:
+    """Before any point."""
+    states = jax.vmap(functools.partial(_started, followed, options, bounds))(z, p, directions)
+    room = lambda x: jnp.zeros((x.shape[0], options.max_points, *x.shape[1:]), x.dtype)
+    return states, jax.tree.map(room, states.base._replace(slope=()))
+
+
+def going(on: Followed) -> Array:
+    """Which are still followed."""
+    return on[0].ending == int(Ending.GOING)
+
+
+def turned(
+    followed: AbstractFollowed,
+    options: ArclengthOptions,
+    wheels: Any,
+    bounds: Array,
+    directions: Array,
+    on: Followed,
+    linears: Linear,
+) -> Followed:
+    """After one linearisation of each: of the running trials, whatever points they are for."""
+
+    def iterate(
+        wheel: Any, direction: Scalar, state: State, linear: Linear
+    ) -> tuple[State, PathPoint, Bool[Array, ""]]:
+        trial = state.trial
+        now = corrected(followed, linear, bounds, trial.plane, trial.z, trial.share)
+        judged = _judged(followed, options, state, now, direction)
+        p = parameter_at(jnp.where(trial.final, trial.plane.share, now.share), bounds)
+        valid = followed.valid(wheel, now.z, p)
+        slope = jax.tree.map(lambda x: judged.share_slope * x, now.column)
+        reached = PathPoint(now.z, p, slope, judged.share_slope, now.jacobian, valid)
+        base = select(judged.accepted, reached, state.base)
+        first = select(judged.accepted & (state.n_points == 0), reached, state.first)
+        step = _next_step(options, state, judged)
+        following = _predicted(followed, base, step, bounds)
+        done = judged.accepted | judged.failed
+        following = select(done, following, trial._replace(z=now.z, share=now.share))
+        closes = _closes(followed, first, state.base, reached, bounds)
+        ending = _ending(options, state, judged, reached, step, following.length, closes)
+        iteration = jnp.where(done, 0, state.iteration + 1)
+        counts = state.n_points + judged.accepted, ending, state.passes + 1
+        return State(base, first, step, following, iteration, *counts), reached, judged.accepted
+
+    # Buffers stay out of what is selected by branch: that would copy them at every turn.
+    state, points = on
+    after, reached, accepted = jax.vmap(iterate)(wheels, directions, state, linears)
+    place = jnp.where(going(on) & accepted, state.n_points, options.max_points)
+    branches = jnp.arange(directions.shape[0])
+    put = lambda buffer, row: buffer.at[branches, place].set(row, mode="drop")
+    points = jax.tree.map(put, points, reached._replace(slope=()))
+    return jax.vmap(select)(going(on), after, state), points
+
+
+def track_of(on: Followed) -> Track:
+    """What has become of them."""
+    last, points = on
+    return Track(points, last.n_points, last.ending, last.passes)
 
 
 @eqx.filter_jit
@@ -356,87 +444,13 @@ def follow(
     """The branches from the points near (z, p), towards growing p if the direction is 1, else -1.
 
     Each ends at the range's end, or with its first point that is not `valid`, which is kept. Each
-    turn of the loop is one linearisation: of the running trials, whatever points they are for.
+    turn of the loop is one linearisation of each.
     """
 
-    def iterate(
-        wheel: Any, direction: Scalar, state: _State
-    ) -> tuple[_State, PathPoint, Bool[Array, ""]]:
-        trial = state.trial
-        now = _correct(followed, wheel, bounds, trial.plane, trial.z, trial.share)
-        judged = _judged(followed, options, state, now, direction)
-        p = _parameter_at(jnp.where(trial.final, trial.plane.share, now.share), bounds)
-        valid = followed.valid(wheel, now.z, p)
-        slope = jax.tree.map(lambda x: judged.share_slope * x, now.column)
-        reached = PathPoint(now.z, p, slope, judged.share_slope, now.jacobian, valid)
-        base = select(judged.accepted, reached, state.base)
-        first = select(judged.accepted & (state.n_points == 0), reached, state.first)
-        step = _next_step(options, state, judged)
-        following = _predicted(followed, base, step, bounds)
-        done = judged.accepted | judged.failed
-        following = select(done, following, trial._replace(z=now.z, share=now.share))
-        closes = _closes(followed, first, state.base, reached, bounds)
-        ending = _ending(options, state, judged, reached, step, following.length, closes)
-        iteration = jnp.where(done, 0, state.iteration + 1)
-        counts = state.n_points + judged.accepted, ending, state.passes + 1
-        return _State(base, first, step, following, iteration, *counts), reached, judged.accepted
+    def turn(on: Followed) -> Followed:
+        one = lambda wheel, trial: linear_at(followed, wheel, bounds, trial.z, trial.share)
+        linears = jax.vmap(one)(wheels, on[0].trial)
+        return turned(followed, options, wheels, bounds, directions, on, linears)
 
-    branches = jnp.arange(p.shape[0])
-
-    def turn(carry: tuple[_State, PathPoint]) -> tuple[_State, PathPoint]:
-        # Buffers stay out of what is selected by branch: that would copy them at every turn.
-        state, points = carry
-        going = state.ending == int(Ending.GOING)
-        after, reached, accepted = jax.vmap(iterate)(wheels, directions, state)
-        place = jnp.where(going & accepted, state.n_points, options.max_points)
-        put = lambda buffer, row: buffer.at[branches, place].set(row, mode="drop")
-        points = jax.tree.map(put, points, reached._replace(slope=()))
-        return jax.vmap(select)(going, after, state), points
-
-    started = functools.partial(_started, followed, options, bounds)
-    states = jax.vmap(started)(z, p, directions)
-    room = lambda x: jnp.zeros((x.shape[0], options.max_points, *x.shape[1:]), x.dtype)
-    going = lambda carry: jnp.any(carry[0].ending == int(Ending.GOING))
-    kept = jax.tree.map(room, states.base._replace(slope=()))
-    last, points = lax.while_loop(going, turn, (states, kept))
-    return Track(points, last.n_points, last.ending, last.passes)
-
-
-@eqx.filter_jit
-def solve(
-    followed: AbstractFollowed,
-    options: ArclengthOptions,
-    wheel: Any,
-    z: Unknown,
-    plane: Plane,
-    bounds: Float[Array, "2"],
-) -> tuple[PathPoint, Bool[Array, ""]]:
-    """The point of the branch on a plane, from the plane's place and z near it; whether found.
-
-    Once converged, Newton's method goes on for one more iteration: the Jacobian is then as exact
-    as the point.
-    """
-
-    def iterate(carry: tuple) -> tuple:
-        now, count, settled = carry
-        following = _correct(followed, wheel, bounds, plane, now.z, now.share)
-        # A trial that went astray stands still: no lane may hand its neighbours a NaN.
-        sound = jnp.isfinite(following.size)
-        following = select(sound, following, now)._replace(size=following.size)
-        settled = jnp.where(following.size < options.tolerance, settled + 1, 0)
-        return following, count + 1, settled
-
-    def going(carry: tuple) -> Array:
-        now, count, settled = carry
-        return (settled < 2) & (count < options.iterations) & jnp.isfinite(now.size)
-
-    n = plane.x.shape[0]
-    flat = jax.tree.map(jnp.zeros_like, z)
-    first = _Corrected(
-        z, plane.share, jnp.ones_like(plane.share), flat, jnp.zeros((n, n), plane.x.dtype)
-    )
-    none = jnp.zeros((), jnp.int32)
-    now, _, settled = lax.while_loop(going, iterate, (first, none, none))
-    p = _parameter_at(now.share, bounds)
-    point = PathPoint(now.z, p, (), jnp.ones_like(p), now.jacobian, followed.valid(wheel, now.z, p))
-    return point, settled >= 1
+    on = begun(followed, options, z, p, bounds, directions)
+    return track_of(lax.while_loop(lambda on: jnp.any(going(on)), turn, on))

@@ -104,9 +104,15 @@ def joined(*trees: PyTree) -> PyTree:
     return jax.tree.map(lambda *parts: np.concatenate([np.asarray(p) for p in parts]), *trees)
 
 
-def in_batches(function: Callable, size: int, *trees: PyTree) -> PyTree:
-    """`function` of trees with a leading axis, `size` rows at a time: one shape, compiled once."""
-    n = len(jax.tree.leaves(trees)[0])
-    rows = [np.minimum(np.arange(begin, begin + size), n - 1) for begin in range(0, n, size)]
-    parts = [function(*taken(trees, places)) for places in rows]
-    return taken(joined(*parts), slice(0, n))
+def in_batches(function: Callable, sizes: tuple[int, ...], *trees: PyTree) -> PyTree:
+    """`function` of trees with a leading axis, filled up to one of `sizes` rows at a time.
+
+    So it is compiled for few shapes. Arrays are JAX's, going in and coming out.
+    """
+    n, parts = len(jax.tree.leaves(trees)[0]), []
+    for begin in range(0, n, sizes[-1]):
+        wanted = min(n - begin, sizes[-1])
+        wide = next(size for size in sizes if size >= wanted)
+        rows = taken(trees, np.minimum(np.arange(begin, begin + wide), n - 1))
+        parts.append(taken(function(*jax.tree.map(jnp.asarray, rows)), slice(0, wanted)))
+    return jax.tree.map(jnp.asarray, joined(*parts))

@@ -9,6 +9,7 @@ from vrw_jax.results.measures import (
     ON_GROUND,
     PHASES,
     STEP,
+    STOPPERS,
     TRAJECTORY,
     attrs_of,
     flags,

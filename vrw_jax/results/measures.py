@@ -175,6 +175,17 @@ GROUND = _table(
 )
 """Measures of a step on real ground, beside those of `STEP` that it shares (`SHARED`)."""
 
+STOPPERS = _table(
+    Measure("stopper_force", "N", "min F_stop", "least force of a stopper on a leg in the air",
+            "Negative where a stopper that only pushes would let a leg go.",
+            breaks="a leg in the air leaves its stopper"),
+    Measure("stopper_impulse", "N s", "min I_stop",
+            "least impulse of a stopper on a leg in the air",
+            "Negative where a stopper that only pushes would let an impact throw a leg off.",
+            breaks="an impact throws a leg off its stopper"),
+)
+"""Premises of a step on real ground whose stoppers hold legs in the air, negative where broken."""
+
 SHARED = (
     "dls_fraction",
     "period",
@@ -269,7 +280,9 @@ PARAMETERS = _table(
 )
 """The wheel's parameters, for the axes of a scan."""
 
-MEASURES: dict[str, Measure] = STEP | MARGINS | GROUND | CYCLE | TRAJECTORY | CONTACTS | PARAMETERS
+MEASURES: dict[str, Measure] = (
+    STEP | MARGINS | GROUND | STOPPERS | CYCLE | TRAJECTORY | CONTACTS | PARAMETERS
+)
 """Every quantity by name."""
 
 PHASES: tuple[str, ...] = ("DLS", "SLS-I", "SLS-II")
@@ -283,8 +296,11 @@ def flags(names: Iterable[str]) -> dict[str, object]:
 
 
 def measure_of(name: str) -> Measure:
-    """The measure that a number belongs to; its name may end in its leg, as "[5]"."""
-    return MEASURES[name.partition("[")[0]]
+    """The measure that a number belongs to.
+
+    Its name may end in its leg, as "[5]", and begin with the minus of a bound from above.
+    """
+    return MEASURES[name.removeprefix("-").partition("[")[0]]
 
 
 def variables(columns: Mapping[str, np.ndarray], along: str) -> dict[str, xr.Variable]:

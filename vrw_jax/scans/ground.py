@@ -1,23 +1,25 @@
 """The steady gait of many wheels on real ground, and of many wheels each on its lowest rung.
 
-On real ground a sample walks from the rung's start towards a gait, which Newton's method then
-solves for on the full section state. On the ladder the paper's engine goes first, over all samples;
-those whose premises break on this ground are gathered and walk on the upper rung, so that no sample
-pays for another.
+On real ground a sample walks from the rung's start towards a gait, until it all but repeats, and
+Newton's method then solves for it on the full section state. On the ladder the paper's engine goes
+first, over all samples; those whose premises break on this ground are gathered and walk on the
+upper rung, so that no sample pays for another.
 """
 
+import dataclasses
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Array
 
 from vrw_jax.cycles import (
     CycleOptions,
-    Gait,
     Readings,
+    WalkedCycle,
     finder_of,
     options_towards,
     read_along_lanes,
@@ -34,14 +36,20 @@ from vrw_jax.models import (
     reason_of,
     walk_lanes,
 )
-from vrw_jax.numerics import Options
-from vrw_jax.scans.evaluate import Engine, filled_up, masked, n_cores, numbers
+from vrw_jax.numerics import Options, in_batches
+from vrw_jax.scans.evaluate import Engine, masked, n_cores, numbers
 from vrw_jax.scans.offer import derivative
-from vrw_jax.walks import N_TOWARDS
-from vrw_jax.wheel import FRICTION, Outcome, WheelParams
+from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, WheelParams
 
-LANES = 16
-"""Wheels that are searched together: a number of its own, so that a sample has no company."""
+SHARE, LANES = 512, 64
+"""Samples that a thread takes at a time, and gaits that are told together: a number of its own, so
+that a sample has no company."""
+
+ROUNDS = (20, 30, 50, 100)
+"""Steps towards a gait, after each of which those that all but repeat are searched from there."""
+
+SETTLED, AWAY = 1e-3, 0.03
+"""Most by which a state may miss its own a step before, and a gait that state, to be the walk's."""
 
 Columns = Mapping[str, np.ndarray]
 Told = dict[str, np.ndarray]
@@ -64,43 +72,98 @@ class GroundEngine:
         wanted = tuple(d for name in measures if (d := derivative(name)) is not None)
         plain = (*(n for n in measures if derivative(n) is None), "spectral_radius")
 
-        self._finder: Any = finder_of(model, base.n_legs, step_options=options)
-        read = type(self._finder).read
+        finder: Any = finder_of(model, base.n_legs, step_options=options)
+        self._finder = dataclasses.replace(finder, shapes=(LANES,))
+        read = type(finder).read
         self._plain, self._wanted = Readings(read, plain), wanted
         self._moved = Readings(read, tuple(dict.fromkeys(d.measure for d in wanted)))
 
     def __call__(self, columns: Columns) -> Told:
         """Results of the samples in `columns` (one value per sample of each swept parameter)."""
         values = numbers(columns, self._model, self._base)
-        n_legs = self._base.n_legs
-        paper = np.tile(np.asarray(PAPER_START, values.dtype), (len(values), 1))
-        start = as_full_states(values.T, paper, n_legs)
-        states, _, outcome, *_ = walk_lanes(
-            values.T, start, N_TOWARDS, self._model, options_towards(), n_legs
-        )
-        batches = [slice(begin, begin + LANES) for begin in range(0, len(values), LANES)]
-        told = lambda b: self._batch(values[b], states[b], outcome[b])
-        parts = [told(batches[0])]  # alone, lest each thread compile its own
+        parts = np.array_split(values, max(self._threads, -(-len(values) // SHARE)))
+        alone, *others = (part for part in parts if len(part))
+        told = [self._part(alone)]  # lest each thread compile its own
         with ThreadPoolExecutor(self._threads) as pool:
-            parts += pool.map(told, batches[1:])
-        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+            told += pool.map(self._part, others)
+        return {name: np.concatenate([part[name] for part in told]) for name in told[0]}
 
-    def _batch(self, values: np.ndarray, states: np.ndarray, walked: np.ndarray) -> Told:
-        gait = self._finder.find_many(filled_up(values, LANES), filled_up(states, LANES))
-        told = dict(_read_lanes(self._plain, gait))
+    def _part(self, values: np.ndarray) -> Told:
+        """Walks, and the gaits that they come to; who has not settled walks on."""
+        n, n_legs = len(values), self._base.n_legs
+        paper = np.tile(np.asarray(PAPER_START, values.dtype), (n, 1))
+        x = np.array(as_full_states(values.T, paper, n_legs))
+        outcome = np.full(n, int(Outcome.STEPPED))
+        # Over a period friction carries all weight along the slope: with less no gait repeats.
+        friction, slope = values[:, -1], values[:, PARAMETER_NAMES.index("slope")]
+        holds = friction >= np.tan(slope)
+        outcome[~holds] = Outcome.NO_CYCLE_FOUND
+        open_, found = np.flatnonzero(holds), list[tuple[np.ndarray, Told]]()
+
+        def walked(n_steps: int) -> np.ndarray:
+            """By how much they moved, of those that still walk."""
+            nonlocal open_
+            if not len(open_):
+                return np.zeros(0)
+            given = self._model, options_towards(), n_legs
+            there, _, codes, *_ = walk_lanes(values[open_].T, x[open_], n_steps, *given)
+            moved = np.abs(there - x[open_])[:, : self._numbers].max(-1)
+            x[open_], outcome[open_] = there, codes
+            walking = codes == Outcome.STEPPED
+            open_ = open_[walking]
+            return moved[walking]
+
+        for n_steps in ROUNDS:
+            walked(n_steps - 1)
+            moved = walked(1)
+            settled = open_[moved < SETTLED]
+            if not len(settled):
+                continue
+            told, away = self._gaits(values[settled], x[settled])
+            own = (told["outcome"] == Outcome.STEPPED) & (away < AWAY)
+            own &= told["spectral_radius"] < 1.0  # else no walk comes to it
+            found.append((settled[own], {name: leaf[own] for name, leaf in told.items()}))
+            open_ = np.setdiff1d(open_, settled[own])
+        if not found:
+            found.append((np.zeros(1, int), self._gaits(values[:1], x[:1])[0]))
+        outcome[open_] = Outcome.NO_CYCLE_FOUND
+        return self._together(outcome, found)
+
+    @property
+    def _numbers(self) -> int:
+        return self._model.section_numbers(self._base)
+
+    def _together(self, outcome: np.ndarray, found: list[tuple[np.ndarray, Told]]) -> Told:
+        """In the samples' order; `outcome` is that of the walk where it failed."""
+        whole: Told = {}
+        for places, told in found:
+            for name, leaf in told.items():
+                blank = np.zeros((len(outcome), *leaf.shape[1:]), leaf.dtype)
+                whole.setdefault(name, blank)[places] = leaf
+        outcome = np.where(outcome == Outcome.STEPPED, whole.pop("outcome"), outcome)
+        return masked(outcome, whole)
+
+    def _gaits(self, values: np.ndarray, states: np.ndarray) -> tuple[Told, np.ndarray]:
+        """What is told of the gaits near section states, and how far away they are."""
         if self._wanted:
-            _, slopes = read_along_lanes(self._moved, gait)
-            names = self._model.parameter_names
-            for d in self._wanted:
-                told[d.name] = slopes[d.measure][:, names.index(d.parameter)]
-        walked = filled_up(walked, LANES)
-        outcome = np.where(walked == Outcome.STEPPED, np.asarray(gait.cycle.outcome), walked)
-        return {name: x[: len(values)] for name, x in masked(outcome, told).items()}
+            gait = self._finder.find_many(values, states)
+            cycle = gait.cycle
+            _, slopes = in_batches(lambda some: read_along_lanes(self._moved, some), (LANES,), gait)
+        else:
+            cycle, slopes = self._finder.near(values, states), {}
+        told = in_batches(lambda some: _read_lanes(self._plain, some), (LANES,), cycle)
+        names = self._model.parameter_names
+        for d in self._wanted:
+            told[d.name] = slopes[d.measure][:, names.index(d.parameter)]
+        away = np.abs(np.asarray(cycle.section_state) - states)[:, : self._numbers].max(-1)
+        told["outcome"] = cycle.outcome
+        return {name: np.asarray(leaf) for name, leaf in told.items()}, away
 
 
 @eqx.filter_jit
-def _read_lanes(readings: Readings, gait: Gait) -> dict[str, Array]:
-    return eqx.filter_vmap(readings)(gait.cycle, gait.step)
+def _read_lanes(readings: Readings, cycle: WalkedCycle) -> dict[str, Array]:
+    first = jax.tree.map(lambda leaf: leaf[:, 0], cycle.steps)
+    return eqx.filter_vmap(readings)(cycle, first)
 
 
 OF_PAPER: dict[str, tuple[str, ...]] = {

@@ -225,7 +225,7 @@ def _fields(settings: object) -> dict[str, object]:
         value = getattr(settings, name)
         if isinstance(value, Options):
             continue  # recorded by itself
-        if isinstance(value, bool | int | str):
+        if value is None or isinstance(value, bool | int | str):
             told[name] = value
         elif isinstance(value, tuple):
             told[name] = list(value)

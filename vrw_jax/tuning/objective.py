@@ -14,6 +14,9 @@ from vrw_jax.wording import reals
 Reader = Callable[[AbstractCycle, AbstractStep], Array]
 Read = Callable[[str, AbstractCycle, AbstractStep], Array]
 
+MOST = "-"
+"""Before the name of a measure that is bounded from above: its negative is, from below."""
+
 
 @dataclass(frozen=True)
 class Weighted:
@@ -39,7 +42,10 @@ class OfCycle:
 
 @dataclass(frozen=True)
 class Sought:
-    """Objective, then constraints, as one array of numbers of a gait."""
+    """Objective, then constraints, as one array of numbers of a gait.
+
+    A constraint is a measure that is to be large, or after a minus one that is to be small.
+    """
 
     objective: Reader
     read: Read
@@ -52,8 +58,13 @@ class Sought:
                 f"objective returns an array of shape {jnp.shape(told)}, but what is maximised is "
                 "one number: reduce it, as by jnp.min or jnp.sum."
             )
-        kept = [jnp.ravel(self.read(name, cycle, step)) for name in self.constraints]
+        kept = [self._kept(name, cycle, step) for name in self.constraints]
         return jnp.concatenate([jnp.ravel(told), *kept])
+
+    def _kept(self, name: str, cycle: AbstractCycle, step: AbstractStep) -> Array:
+        measure = name.removeprefix(MOST)
+        value = jnp.ravel(self.read(measure, cycle, step))
+        return value if measure == name else -value
 
 
 class Evaluated(NamedTuple):

@@ -38,7 +38,8 @@ from vrw_jax.results import (
 )
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.tuning.climbing import Climb, Kind, Trial, breach, climb, optimality, slack_scales
-from vrw_jax.tuning.objective import Engine, Evaluated, OfCycle, Reader, Sought, Weighted
+from vrw_jax.tuning.constraints import Margins, bound_of, margins_of
+from vrw_jax.tuning.objective import MOST, Engine, Evaluated, OfCycle, Reader, Sought, Weighted
 from vrw_jax.tuning.result import Active, Tuned, Walked
 from vrw_jax.tuning.starts import Lanes, explore
 from vrw_jax.walks import ModelLike, one_wheel, rung_of
@@ -55,7 +56,6 @@ from vrw_jax.wording import (
 )
 
 Objective = str | Mapping[str, float] | Callable[..., Array]
-Margins = Mapping[str, float] | Sequence[str]
 
 
 DISPLACED, N_WALKED, N_EXPLORED = 1e-5, 10, 25
@@ -83,9 +83,11 @@ def tune(
     changes over the bounds. Local: it ends at an optimum of the branch that `params` lies on. With
     `n_starts` above 1 so many wheels, `params` and random ones within the bounds, first take
     N_EXPLORED first-order steps side by side, and the best is climbed from. On real ground
-    (`UnilateralWheel`) the objective is a measure of a step there or weights of several, without
-    constraints by default, and the start walks to its gait. "auto" climbs on the rung that serves
-    the start's gait: on the paper's its premises are the constraints, so that it still serves.
+    (`UnilateralWheel`) the objective is a measure of a step there or weights of several, and the
+    start walks to its gait; constraints, none by default, are of such measures, `stopper_force` and
+    `stopper_impulse`: {"slip": (0.0, 0.05), "stopper_force": 0.0}, say. "auto" climbs on the rung
+    that serves the start's gait: on the paper's its premises are the constraints, so that it still
+    serves.
 
     Args:
         params: the start, one wheel.
@@ -93,7 +95,8 @@ def tune(
             LimitCycle (and, if it takes two arguments, of the StepResult from it).
         free: names of the parameters that may move.
         bounds: lower and upper, of each free parameter.
-        constraints: least values of measures by name; names alone mean zero.
+        constraints: least values of measures by name, or pairs of least and most; names alone mean
+            zero.
         model: the rung; the paper's, `ViscoelasticWheel()`, by default.
         options: of the steps.
         cycle_options: of the gaits.
@@ -166,7 +169,7 @@ class TuneProblem:
         """One name for each number that is constrained: monitors of the locked legs have six."""
         names: list[str] = []
         for name in self.margins:
-            if MEASURES[name].axis:
+            if measure_of(name).axis:
                 names += [f"{name}[leg {leg}]" for leg in range(3, self.params.n_legs + 1)]
             else:
                 names.append(name)
@@ -175,7 +178,7 @@ class TuneProblem:
     @property
     def least(self) -> np.ndarray:
         """Margins, one for each of `constraint_names`."""
-        return np.array([self.margins[measure_of(name).name] for name in self.constraint_names])
+        return np.array([self.margins[name.partition("[")[0]] for name in self.constraint_names])
 
     def parameters(self, u: np.ndarray) -> np.ndarray:
         """All float parameters where the free ones are `u` widths above their lower bounds."""
@@ -265,9 +268,9 @@ class TuneProblem:
         params = self.wheel(best.u)
         conditions = optimality(best)
         active = [
-            Active(name, float(limit), measure_of(name).unit, float(price))
+            Active(name.removeprefix(MOST), bound_of(name, limit), measure_of(name).unit, price)
             for name, limit, price in zip(
-                self.constraint_names, self.least, conditions.prices, strict=True
+                self.constraint_names, self.least, map(float, conditions.prices), strict=True
             )
             if price > 0.0
         ]
@@ -316,8 +319,8 @@ class TuneProblem:
             walked, x = walked + 1, np.array(one.section_state)
             monitored = {name: np.asarray(value) for name, value in one.measures().items()}
             for name, least in self.margins.items():
-                if name in monitored:
-                    value = monitored[name]
+                if (measure := name.removeprefix(MOST)) in monitored:
+                    value = monitored[measure] if measure == name else -monitored[measure]
                     # The optimum keeps it within 1e-6 of what the bounds' width changes, and the
                     # start is displaced: of a margin of take-off each is some thousandths.
                     scale = 1e-3 * np.max(np.abs(value)) + 1e-2 * abs(default.get(name, 0.0))
@@ -402,7 +405,7 @@ def tuning_problem(
     reader, label = _objective(objective, finder)
     if constraints is None and asked.upper is not asked and finder.from_nothing:
         constraints = tuple(PREMISES)
-    margins = _margins(params, constraints, finder)
+    margins = margins_of(params, constraints, finder)
     sought = Sought(reader, type(finder).read, tuple(margins))
     if callable(objective):  # looked at before anything is compiled
         cycle = jax.eval_shape(finder.cycle, params)
@@ -480,21 +483,3 @@ def _bounds(
             )
     ends = np.array([[float(v) for v in bounds[name]] for name in names])
     return names, ends[:, 0], ends[:, 1]
-
-
-def _margins(
-    params: WheelParams, constraints: Margins | None, finder: AbstractGaitFinder
-) -> dict[str, float]:
-    if constraints is None:
-        premises = default_margins(params)
-        return {name: least for name, least in premises.items() if finder.from_nothing}
-    if isinstance(constraints, Mapping):
-        margins = {n: real(f"the margin of {n}", least) for n, least in constraints.items()}
-    else:
-        margins = dict.fromkeys(names_of("constraints", constraints), 0.0)
-    if "clearance_sls1" in margins:
-        # It has a slope where the clearance has none.
-        margins.setdefault("takeoff_acceleration", 0.0)
-    for name in margins:
-        require_known(name, finder.readable, "measure for a constraint")
-    return margins

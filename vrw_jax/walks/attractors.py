@@ -98,11 +98,11 @@ def settle(
     open_ = np.arange(n)
     by_rung = WALKS.get(model.rung)
     walked_on = functools.partial(by_rung or _walk_block, model, options)
-    step_on = walked_on if by_rung else functools.partial(in_batches, walked_on, BLOCK)
+    step_on = walked_on if by_rung else functools.partial(in_batches, walked_on, (BLOCK,))
     for k in range(n_rounds):
         now = slice(1 + k * ROUND, 1 + (k + 1) * ROUND)
         here = taken(wheels, open_), history[open_, k * ROUND]
-        states, codes = step_on(*here)
+        states, codes = map(np.asarray, step_on(*here))
         history[open_, now], outcome[open_] = states, codes[:, -1]
         walked[open_] = k * ROUND + np.sum(codes == Outcome.STEPPED, 1)
         known = (k + 1) * ROUND
@@ -173,6 +173,7 @@ def orbit_measures(
     wheels = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), n), params)
     if model.rung in WALKS:
         columns, rung = np.asarray(jax.vmap(model.values)(wheels)).T, cast(UnilateralWheel, model)
-        told, _ = step_lanes(columns, states, rung, options, params.n_legs)
+        told, _ = step_lanes(columns, states, rung, options, params.n_legs, ())
         return jax.tree.map(np.asarray, told.measures())
-    return in_batches(functools.partial(_measure_block, model, options), BLOCK, wheels, states)
+    measured = functools.partial(_measure_block, model, options)
+    return jax.tree.map(np.asarray, in_batches(measured, (BLOCK,), wheels, states))

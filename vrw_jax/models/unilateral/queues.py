@@ -69,6 +69,7 @@ def step_lanes(
     moves[:, len(columns) + 4 :] = free
     if wanted is not None:
         moves &= np.isin(np.arange(numbers.shape[1]), wanted)
+        moves[~moves.any(1), 0] = True  # the step itself is told beside a direction
     owner, place = np.nonzero(moves)
     ways = np.zeros((len(owner), numbers.shape[1]))
     ways[np.arange(len(owner)), place] = 1.0

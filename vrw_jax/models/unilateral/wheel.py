@@ -63,6 +63,7 @@ from vrw_jax.numerics import (
     integrate_phase,
     sample_phase,
 )
+from vrw_jax.results import STOPPERS
 from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, WheelParams, friction_of
 from vrw_jax.wording import chosen, reals, whole
 
@@ -121,6 +122,11 @@ class UnilateralStep(AbstractGroundStep):
     most_solutions: Int[Array, "..."]
     outcome: Int[Array, "..."]
     solver_steps: Int[Array, "..."]
+
+    def own_measures(self) -> dict[str, Array]:
+        return AbstractGroundStep.own_measures(self) | {
+            name: getattr(self.monitors, name) for name in STOPPERS
+        }
 
 
 class UnilateralTrajectory(eqx.Module):

@@ -1,0 +1,99 @@
+"""The atlas of gaits on real ground over damping and friction: which exist, and where they end.
+
+python -m experiments.ground.atlas [--redraw]
+
+One scan looks for all gaits that attract each wheel (`gaits_attracting`: walks from slow and fast
+starts, then Newton's method). From the slow gaits at the highest friction branches in friction go
+down, side by side, through the folds that end them and back on the unstable gaits between.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import vrw_jax as vrw
+from experiments.shared.command import command, started
+from experiments.shared.tables import FIGURES, Row, write_named
+from vrw_jax.cycles import finder_of
+from vrw_jax.gaits.attracting import gaits_attracting
+
+FRICTION = (0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9, 0.95, 1.0, 1.1, 1.2,
+            1.3, 1.4, 1.5, 1.6)  # fmt: skip
+DAMPING = tuple(float(c) for c in range(20, 401, 10))
+FOLLOWED = (195.0, 200.0, 205.0, 210.0, 215.0, 220.0, 240.0, 270.0, 300.0, 340.0, 380.0)
+DOWN = (0.32, 1.4)  # friction along the branches, which begin at its upper end
+STEPS = vrw.ArclengthOptions(first_step=0.02, largest_step=0.06, max_points=80)
+WALKS_SLOWLY = 1.6  # m/s: gaits are slower or faster, and hardly any are near it
+GREY, TABLE, BRANCHES = "0.85", FIGURES / "ground_atlas.csv", FIGURES / "ground_atlas_branches.csv"
+MEASURES = ("period", "dls_fraction", "speed", "slip", "energy_lost_friction")
+
+
+def scanned(frictions: tuple[float, ...] = FRICTION) -> list[Row]:
+    """A row for each gait that attracts a wheel, one for a wheel without any."""
+    rows = []
+    for friction in frictions:
+        finder = finder_of(vrw.UnilateralWheel(friction=friction), 8)
+        wheels = vrw.WheelParams(damping=jnp.asarray(DAMPING))
+        wheels = jax.tree.map(lambda x: jnp.broadcast_to(x, len(DAMPING)), wheels)
+        for damping, gaits in zip(DAMPING, gaits_attracting(finder, wheels), strict=True):
+            found = np.asarray(gaits.found)
+            where = {"friction": friction, "damping": damping, "gaits": int(found.sum())}
+            if not found.any():
+                code = vrw.Outcome(int(gaits.outcome[0])).name
+                rows.append(where | {"outcome": code})
+                continue
+            told = jax.vmap(lambda steps: steps.measures())(
+                jax.tree.map(lambda x: x[:, 0], gaits.steps)
+            )
+            for k in range(len(found)):
+                rows.append(
+                    where
+                    | {"outcome": "STEPPED"}
+                    | {name: f"{float(told[name][k]):.6g}" for name in MEASURES}
+                    | {
+                        "flight": f"{float(told['duration_flight'][k] / told['period'][k]):.5g}",
+                        "spectral_radius": f"{float(gaits.spectral_radius[k]):.5g}",
+                        "stopper_force": f"{float(gaits.monitors.stopper_force[k]):.5g}",
+                        "solutions": int(gaits.steps.most_solutions[k].max()),
+                    }
+                )
+        print(f"mu = {friction:g}", flush=True)
+    return rows
+
+
+def followed() -> list[Row]:
+    """Points of branches down in friction from the slow gaits at its upper end."""
+    ground = vrw.UnilateralWheel(friction=DOWN[1])
+    wheels = vrw.WheelParams(damping=jnp.asarray(FOLLOWED))
+    wheels = jax.tree.map(lambda x: jnp.broadcast_to(x, len(FOLLOWED)), wheels)
+    slow = vrw.limit_cycles(wheels, model=ground)
+    told = {"cycle": slow, "model": ground, "options": STEPS}
+    branches = vrw.continue_branches(wheels, "friction", DOWN, **told)
+    rows = []
+    for damping, speed, branch in zip(FOLLOWED, slow.speed, branches, strict=True):
+        print(damping, float(speed), branch, flush=True)
+        for k, friction in enumerate(branch.values):
+            at = branch.dataset.isel(point=k)
+            row = {"damping": damping, "kind": "gait", "friction": f"{friction:.6g}"}
+            told = {name: f"{float(at[name]):.6g}" for name in (*MEASURES, "spectral_radius")}
+            rows.append(row | told)
+        for border in branch.borders:
+            kind = border.kind if border.kind != "lost" else border.name
+            rows.append({"damping": damping, "kind": kind, "friction": f"{border.value:.9g}"})
+    return rows
+
+
+def compute() -> None:
+    write_named(TABLE, scanned())
+    write_named(BRANCHES, followed())
+
+
+def main() -> None:
+    parser = command(__doc__)
+    parser.add_argument("--redraw", action="store_true", help="compute nothing")
+    if not started(parser).redraw:
+        compute()
+
+
+if __name__ == "__main__":
+    main()
