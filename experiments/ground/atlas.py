@@ -9,11 +9,16 @@ down, side by side, through the folds that end them and back on the unstable gai
 
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 import vrw_jax as vrw
 from experiments.shared.command import command, started
-from experiments.shared.tables import FIGURES, Row, write_named
+from experiments.shared.tables import FIGURES, Row, numbers, read, write_named
+from vrw_jax import figures as plots
 from vrw_jax.cycles import finder_of
 from vrw_jax.gaits.attracting import gaits_attracting
 
@@ -23,7 +28,6 @@ DAMPING = tuple(float(c) for c in range(20, 401, 10))
 FOLLOWED = (195.0, 200.0, 205.0, 210.0, 215.0, 220.0, 240.0, 270.0, 300.0, 340.0, 380.0)
 DOWN = (0.32, 1.4)  # friction along the branches, which begin at its upper end
 STEPS = vrw.ArclengthOptions(first_step=0.02, largest_step=0.06, max_points=80)
-WALKS_SLOWLY = 1.6  # m/s: gaits are slower or faster, and hardly any are near it
 GREY, TABLE, BRANCHES = "0.85", FIGURES / "ground_atlas.csv", FIGURES / "ground_atlas_branches.csv"
 MEASURES = ("period", "dls_fraction", "speed", "slip", "energy_lost_friction")
 
@@ -88,11 +92,72 @@ def compute() -> None:
     write_named(BRANCHES, followed())
 
 
+def field(rows: list[Row], name: str, place: int) -> np.ndarray:
+    """(friction, damping) of the slowest gait (0) or the faster one where there are two (1)."""
+    told = np.full((len(FRICTION), len(DAMPING)), np.nan)
+    counted: dict[tuple[int, int], int] = {}
+    for row in rows:  # of a wheel slowest first
+        at = FRICTION.index(float(row["friction"])), DAMPING.index(float(row["damping"]))
+        if row["outcome"] == "STEPPED" and counted.setdefault(at, 0) == place:
+            told[at] = float(row[name])
+        counted[at] = counted.get(at, 0) + 1
+    return told
+
+
+def folds() -> tuple[np.ndarray, np.ndarray]:
+    """Damping and friction at which the slow gait ends in a fold."""
+    rows = [row for row in read(BRANCHES) if row["kind"] == "fold"]
+    c, mu = numbers(rows, "damping"), numbers(rows, "friction")
+    ends = c < 220.0  # beyond, two folds a hair apart end nothing
+    return c[ends], mu[ends]
+
+
+def draw() -> None:
+    """Maps of the slower gait above, of the faster one where two attract below."""
+    rows, (c_fold, mu_fold) = read(TABLE), folds()
+    shown = {  # label, how to colour
+        "speed": ("speed [m/s]", Normalize(0.0, 3.0)),
+        "dls_fraction": ("DLS fraction", Normalize(0.0, 0.9)),
+        "slip": ("slip per step [m]", LogNorm(0.01, 1.0)),
+    }
+    figure, axes = plt.subplots(2, 3, figsize=(plots.PAGE, 4.8), sharex=True, sharey=True)
+    corners = [edges(np.array(values)) for values in (DAMPING, FRICTION)]
+    for column, (name, (label, norm)) in enumerate(shown.items()):
+        for place, axis in enumerate(axes[:, column]):
+            axis.set_facecolor(GREY)
+            image = axis.pcolormesh(*corners, field(rows, name, place), norm=norm, rasterized=True)
+            axis.plot(c_fold, mu_fold, "o-", color="white", markersize=2.5, linewidth=1.0)
+            axis.axhline(np.tan(0.3), color="black", linewidth=0.8)
+            axis.set_ylim(0.28, corners[1][-1])
+        axes[0, column].set_title(label)
+        axes[-1, column].set_xlabel("damping $c$ [N·s/m]")
+        figure.colorbar(image, ax=axes[:, column], location="bottom", extend="both", aspect=18)
+    for axis, text in zip(axes[:, 0], ("slower", "faster of two"), strict=True):
+        axis.set_ylabel(f"{text}: friction $\\mu$")
+    lines = [
+        Line2D(
+            [], [], marker="o", markersize=2.5, color="0.5", label="fold that ends the slow gait"
+        ),
+        Line2D([], [], color="black", linewidth=0.8, label="$\\tan\\varphi$: no gait below"),
+        Patch(color=GREY, label="one gait attracts"),
+    ]
+    figure.legend(handles=lines, loc="outside lower center", ncols=3)
+    plots.save(figure, FIGURES, "ground_atlas")
+
+
+def edges(values: np.ndarray) -> np.ndarray:
+    """Of cells around them."""
+    middle = 0.5 * (values[1:] + values[:-1])
+    return np.concatenate([[2.0 * values[0] - middle[0]], middle, [2.0 * values[-1] - middle[-1]]])
+
+
 def main() -> None:
     parser = command(__doc__)
     parser.add_argument("--redraw", action="store_true", help="compute nothing")
     if not started(parser).redraw:
         compute()
+    with plots.figure_style():
+        draw()
 
 
 if __name__ == "__main__":

@@ -100,7 +100,8 @@ class AbstractRun(abc.ABC):
         """Every quantity at each point, bifurcation functions and IN_SEQUENCE included."""
         wheels = taken(self.wheels, owners)
         found = jax.tree.map(np.asarray, in_batches(self.read, self.shapes, wheels, points))
-        margins = np.asarray(in_batches(bifurcation_functions, SHAPES[-1:], points.jacobian))
+        bifurcations = lambda jacobians: bifurcation_functions(np.asarray(jacobians))
+        margins = np.asarray(in_batches(bifurcations, SHAPES[-1:], points.jacobian))
         found |= {name: margins[:, i] for i, name in enumerate(BIFURCATIONS)}
         found = self.known(found, owners)
         for name, exact in self.exact.items():
