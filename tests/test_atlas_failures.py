@@ -168,3 +168,45 @@ def test_the_slider_crank_s_truth_is_that_of_forty_digits_in_other_coordinates()
         told = march()
     for name, truth in case.TRUTH.items():
         assert abs(float(told[name]) / truth - 1.0) < 1e-15, name
+
+
+@pytest.mark.slow
+def test_the_published_torus_point_is_not_itself_the_chenciner_point():
+    # Kuznetsov's cubic coefficient of the return map, in coordinates of like size.
+    import jax
+    import jax.numpy as jnp
+
+    from experiments.atlas.hybrid import modes
+    from vrw_jax import Options
+    from vrw_jax.numerics import newton_cycle, walk
+
+    case = module("chenciner")
+    parts, options = modes(case.SYSTEM), Options(rtol=1e-12, atol=1e-12, max_phase_time=60.0)
+    sizes = jnp.array([1.0, 1e-3, 1e-2])
+
+    def back(x):
+        y = jnp.stack(case.CYCLE.begin(x, jnp))
+        return jnp.stack(case.CYCLE.read(walk(parts, y, events=2, options=options).state))
+
+    x = newton_cycle(back, jnp.array(case.PUBLISHED), tolerance=1e-11).x
+    scaled = lambda z: (back(x + sizes * z) - x) / sizes
+    first = jax.jacfwd(scaled)
+    second = jax.jacfwd(first)
+    origin = jnp.zeros(3)
+    A, B, C = (
+        np.asarray(f(origin))
+        for f in (jax.jit(first), jax.jit(second), jax.jit(jax.jacfwd(second)))
+    )
+    values, vectors = np.linalg.eig(A)
+    at = np.argmax(values.imag)
+    turn, q = values[at] / abs(values[at]), vectors[:, at]
+    lefts, adjoint = np.linalg.eig(A.T)
+    p = adjoint[:, np.argmin(abs(lefts - np.conj(values[at])))]
+    p = p / np.conj(np.vdot(p, q))
+    b = lambda u, v: np.einsum("ijk,j,k->i", B, u, v)
+    cubic = np.vdot(p, np.einsum("ijkl,j,k,l->i", C, q, q, q.conj()))
+    cubic += 2.0 * np.vdot(p, b(q, np.linalg.solve(np.eye(3) - A, b(q, q.conj()))))
+    square = np.linalg.solve(turn**2 * np.eye(3) - A, b(q, q))
+    cubic += np.vdot(p, b(q.conj(), square))
+    coefficient = 0.5 * np.conj(turn) * cubic
+    assert coefficient.real < -0.5 * abs(coefficient)

@@ -1,9 +1,11 @@
-"""Steinmetz and Larter's reaction beside a Chenciner point: a cycle whose pair is on the circle.
+"""Steinmetz and Larter's reaction near a Chenciner point: a cycle whose pair is on the circle.
 
-Published (De Witte, Della Rossa, Govaerts, Kuznetsov 2013): at k7 = 1.5163129, k8 = 0.83200664 a
-pair of multipliers has modulus 1 and the cycle's first nonlinear coefficient vanishes. Beside it a
-walk neither settles nor leaves, so that only Newton's method finds the cycle. Along any cycle one
-multiplier is 1, and the product of all is the exponential of the divergence's integral.
+Published (MatCont's manual, 2012): at k7 = 1.5163129, k8 = 0.83200664 a pair of multipliers has
+modulus 1, and the cycle passes through `PUBLISHED`. On that curve of such points lies the Chenciner
+point, where the return map's cubic coefficient vanishes too; its numbers could not be read, and
+here the coefficient does not vanish. A walk neither settles nor leaves, so that only Newton's
+method finds the cycle. Along any cycle one multiplier is 1, and the product of all is the
+exponential of the divergence's integral.
 """
 
 from collections.abc import Iterator
@@ -95,9 +97,9 @@ def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
 
 
 CASE = Case(
-    "Chenciner point",
+    "Near a Chenciner point",
     "a cycle that no walk reaches; its pair on the circle",
-    "published parameters; trivial multiplier 1; Liouville",
+    "published point and state; trivial multiplier 1; Liouville",
     "MatCont's manual (2012), its second point for this reaction, as its users quote it; constants "
     "as in the tutorials of BifurcationKit and COCO; De Witte et al., Physica D 267 (2013)",
     rows,
