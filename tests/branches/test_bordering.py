@@ -184,18 +184,3 @@ def test_margins_of_steps_are_as_exact_as_quantities_of_the_gait(cycle):
     for curve in border_curves(names, OVER, cycle, bounds=BOX):
         assert_through_the_branch(curve)
         assert_exact(curve, BOX, 8, random)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("other", "ends"),
-    [("stiffness", (350.0, 700.0)), ("natural_length", (1.004, 1.05)), ("slope", (0.1, 0.45))],
-)
-def test_every_curve_of_a_map_is_exact(cycle, other, ends):
-    box = {"damping": (4.0, 240.0), other: ends}
-    random, over = np.random.default_rng(5), ("damping", other)
-    curves = border_curves(None, over, cycle, bounds=box)
-    assert len({curve.name for curve in curves}) >= 8
-    for curve in curves:
-        if len(curve.values) > 10:
-            assert_exact(curve, box, 4, random)
