@@ -31,7 +31,7 @@ from vrw_jax.models import (
     walk_lanes,
 )
 from vrw_jax.numerics import Options, SectionCycle, SolverName, as_float_array, in_batches
-from vrw_jax.results import ON_GROUND, STOPPERS
+from vrw_jax.results import ON_GROUND
 from vrw_jax.walks import N_TOWARDS, checked
 from vrw_jax.wheel import Outcome, WheelParams
 
@@ -67,7 +67,7 @@ class GroundFinder(AbstractWalkingFinder):
     of_cycle: ClassVar[tuple[str, ...]] = ("spectral_radius", "spectral_margin")
     differentiable: ClassVar[tuple[str, ...]] = ON_GROUND
     usual: ClassVar[tuple[str, ...]] = ON_GROUND
-    readable: ClassVar[tuple[str, ...]] = (*ON_GROUND, *STOPPERS)
+    readable: ClassVar[tuple[str, ...]] = ON_GROUND
     coexisting: ClassVar[bool] = True
 
     @classmethod
@@ -128,7 +128,7 @@ class GroundFinder(AbstractWalkingFinder):
         columns, model = np.asarray(self.model.values(params))[:, None], self.model
         given = columns, np.asarray(x)[None], model, self.step_options, self.n_legs
         told, _ = step_lanes(*given, ())
-        return jax.tree.map(lambda leaf: leaf[0], told)
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), told)
 
     def measured(self, values: Values, guess: Any, names: tuple[str, ...]) -> Measured:
         """As everywhere; of one Jacobian of the step."""

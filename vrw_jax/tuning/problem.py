@@ -84,8 +84,8 @@ def tune(
     `n_starts` above 1 so many wheels, `params` and random ones within the bounds, first take
     N_EXPLORED first-order steps side by side, and the best is climbed from. On real ground
     (`UnilateralWheel`) the objective is a measure of a step there or weights of several, and the
-    start walks to its gait; constraints, none by default, are of such measures, `stopper_force` and
-    `stopper_impulse`: {"slip": (0.0, 0.05), "stopper_force": 0.0}, say. "auto" climbs on the rung
+    start walks to its gait; constraints, none by default, are of such measures:
+    {"slip": (0.0, 0.05)}, say. "auto" climbs on the rung
     that serves the start's gait: on the paper's its premises are the constraints, so that it still
     serves.
 

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -174,6 +175,6 @@ def orbit_measures(
     if model.rung in WALKS:
         columns, rung = np.asarray(jax.vmap(model.values)(wheels)).T, cast(UnilateralWheel, model)
         told, _ = step_lanes(columns, states, rung, options, params.n_legs, ())
-        return jax.tree.map(np.asarray, told.measures())
+        return jax.tree.map(np.asarray, jax.tree.map(jnp.asarray, told).measures())
     measured = functools.partial(_measure_block, model, options)
     return jax.tree.map(np.asarray, in_batches(measured, (BLOCK,), wheels, states))
