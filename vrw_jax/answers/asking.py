@@ -28,7 +28,7 @@ from vrw_jax.answers.lower import (
 )
 from vrw_jax.answers.quantities import MADE, measured
 from vrw_jax.answers.result import Answer, How
-from vrw_jax.answers.top import Ground
+from vrw_jax.answers.top import TIGHT, TIGHTER, Ground
 from vrw_jax.gaits import starts_of
 from vrw_jax.numerics import Options
 from vrw_jax.wheel import FRICTION, Outcome, WheelParams, friction_of
@@ -44,9 +44,6 @@ from vrw_jax.wording import (
 
 SAFETY = 4.0
 """What one step says of an error, times this, bounds it: as long as corrections contract to 3/4."""
-TIGHT, TIGHTER = 1e-10, 1e-12
-"""Tolerances of steps. Looser ones save a seventh of the time and miss events; the tighter one
-costs a third more."""
 FINE = 1e-7
 """Tolerance of an answer below which steps are taken at TIGHTER."""
 WALKS = (20, 60)
@@ -208,17 +205,18 @@ class _Asked:
             return
         lower = Lower(*(part[lanes] for part in self.lower))
         x = self.ground.embedded(lanes, lower.x)
-        first = self.ground.step(lanes, x)
-        chord = Chord(self.ground, lanes, x, lower)
-        seen = chord.see(np.arange(len(lanes)), first, self.names)
-        d = chord.correction.copy()
+        chord = Chord.of(self.ground, lanes, x, lower)
+        every = np.arange(len(lanes))
+        first = chord.step(every)
+        seen = chord.see(every, first, self.names)
         value = measured(self.names, lower.told)
         with np.errstate(all="ignore"):
             size = np.abs(measured(self.names, first.told) - value) + seen.size
             error = value - seen.values
             plane = self.ground.plane()
             along = np.abs(seen.direct @ chord.moved[:, :, plane])
-            numerical = np.einsum("ijk,ik->ij", along, np.abs(lower.own)) + seen.numerical
+            own = np.einsum("ijk,ik->ij", along, np.abs(lower.own))
+            numerical = own + seen.numerical + seen.brief
             bound = np.abs(error) + (SAFETY - 1.0) * size + numerical
             stands = seen.same & np.all(bound <= self.goal(value), axis=1)
         self.told["n_steps"][lanes] += 1
@@ -229,14 +227,10 @@ class _Asked:
         rest = np.flatnonzero(~stands & seen.same)
         if not corrected or not len(rest):
             return
-        chord = Chord(self.ground, lanes[rest], x[rest], Lower(*(part[rest] for part in lower)))
-        begun = type(first)(*(part[rest] for part in first))
-        found = settled(chord, self.names, self.goal, TRIES, begun)
-        away, first_away = (
-            np.linalg.norm(d, axis=1) for d in (found.x[:, plane] - x[rest][:, plane], d[rest])
-        )
-        near = away <= BALL * first_away
-        self.told["n_steps"][lanes[rest]] -= 1
+        reach = BALL * np.linalg.norm(chord.correction[rest][:, plane], axis=1)
+        begun = jax.tree.map(lambda part: part[rest], (first, seen))
+        found = settled(chord.some(rest), self.names, self.goal, TRIES, begun)
+        near = np.linalg.norm((found.x - x[rest])[:, plane], axis=1) <= reach
         self._take(lanes[rest], found._replace(done=found.done & near), How.CORRECTED)
 
     def _walk(self, lanes: np.ndarray, x: np.ndarray, how: How) -> None:
@@ -250,7 +244,7 @@ class _Asked:
             self.told["outcomes"][lanes] = lost
             on = step.outcome == Outcome.STEPPED
             lanes, x = lanes[on], step.x[on]
-            chord = Chord(self.ground, lanes, x, None)
+            chord = Chord.of(self.ground, lanes, x, None)
             found = settled(chord, self.names, self.goal, 0)
             self._take(lanes, found, how)
             lanes, x = lanes[~found.done], x[~found.done]

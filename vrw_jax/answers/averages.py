@@ -191,7 +191,7 @@ class _Wheels(NamedTuple):
             ground = Ground.of(self.some(of), self.friction[of], self.stoppers, options)
             every = np.arange(len(of))
             x = ground.embedded(every, lower.x)
-            chord = Chord(ground, every, x, lower)
+            chord = Chord.of(ground, every, x, lower)
             seen = chord.see(every, ground.step(every, x), [self.measure])
             values = np.where(seen.same, seen.values[:, 0], values)
         told[has] = values

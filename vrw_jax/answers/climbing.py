@@ -4,18 +4,22 @@ One step of the top rung from a state x tells the defect r = P(x) - x. Carried b
 I - DP it is Newton's correction d, and the gait's quantities are near those of this step plus what
 they move by along d. Here both matrices are at first the lower rung's, where it has a gait, and
 learn from each further step by Broyden's update of rank one (C. G. Broyden, Math. Comp. 19, 1965).
-Where that is slow, differences of a few more steps take their place. How much smaller d becomes
+Where that is slow, and wherever the legs' codes have changed, differences of a few more steps take
+their place: by matrices of another motion a slow direction moves the correction little, and
+nothing that follows from it can be believed. How much smaller d becomes
 from one step to the next is measured, q, the worse of two, and bounds what is left: as for a
 contraction (Kantorovich), with a factor of two, by 2q/(1 - q) of what the last but one moved.
 """
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from vrw_jax.answers.lower import Lower
-from vrw_jax.answers.quantities import N_QUANTITIES, measured, slopes
+from vrw_jax.answers.quantities import N_DURATIONS, N_QUANTITIES, measured, slopes
 from vrw_jax.answers.top import Ground, Stepped
 from vrw_jax.wheel import Outcome
 
@@ -37,8 +41,14 @@ DIFFERENCE = 1e-6
 """Of a number of the section state, for derivatives, rad, rad/s, m, m/s."""
 CORRECTIONS, AGAIN = 24, 8
 """Most corrections of one iteration, and after how many matrices are taken anew."""
-ROUNDING = 100.0
-"""Corrections of so many tolerances are the integrator's."""
+ROUNDING, NOISE = 1e2, 1e4
+"""Corrections of so many tolerances are the integrator's; and where they come down no more."""
+BRIEF = 3.0
+"""Dips of a foot of the shortest kind that a step may miss or add."""
+BRIEFLY = 0.1
+"""Share of what is wanted that such dips may be presumed to cost: else it is measured."""
+AT_REST = 4.0
+"""How far corrections that come down no more may leave one off, in their own effect."""
 RESOLVED = 1e-13
 """Changes as short as this tell nothing."""
 
@@ -51,6 +61,7 @@ class Seen(NamedTuple):
     size: np.ndarray  # (lanes, names): what the correction moves them by, nothing cancelled
     direct: np.ndarray  # (lanes, names, 7): how they move with the step's quantities
     numerical: np.ndarray  # (lanes, names): bound of what the integrator's tolerance leaves
+    brief: np.ndarray  # (lanes, names): and of dips too short to be followed
 
 
 class Settled(NamedTuple):
@@ -64,31 +75,47 @@ class Settled(NamedTuple):
     x: np.ndarray  # (lanes, 4 + 3 n)
 
 
+@dataclasses.dataclass
 class Chord:
     """Lanes on their way to a fixed point of the top rung, whose matrices learn."""
 
-    def __init__(
-        self, ground: Ground, lanes: np.ndarray, x: np.ndarray, lower: Lower | None
-    ) -> None:
-        self.ground, self.lanes, self.x = ground, lanes, x.copy()
+    ground: Ground
+    lanes: np.ndarray
+    x: np.ndarray
+    inverse: np.ndarray  # (lanes, m, m): of I - DP
+    moved: np.ndarray  # (lanes, 7, m): how the quantities move with x
+    known: np.ndarray  # whether the matrices are of this motion
+    free: np.ndarray
+    has: np.ndarray  # whether the step before had the same codes
+    before: tuple[np.ndarray, ...]  # where that began, its defect and quantities
+    correction: np.ndarray
+
+    @classmethod
+    def of(cls, ground: Ground, lanes: np.ndarray, x: np.ndarray, lower: Lower | None) -> "Chord":
+        """From `x`, with the matrices of the gaits there, if a lower rung has any."""
         n, m = len(lanes), x.shape[1] - ground.n
-        self.inverse = np.tile(np.eye(m), (n, 1, 1))
-        self.moved = np.zeros((n, N_QUANTITIES, m))
+        inverse, moved = np.tile(np.eye(m), (n, 1, 1)), np.zeros((n, N_QUANTITIES, m))
         if lower is not None:
             plane = ground.plane()
-            self.inverse[:, plane[:, None], plane] = lower.carry
-            self.moved[:, :, plane] = lower.moved
-        self.free = ground.free(self.x)
-        self.has = np.zeros(n, bool)  # whether the step before had the same codes
-        self.before = (np.zeros((n, m)), np.zeros((n, m)), np.zeros((n, N_QUANTITIES)))
-        self.correction = np.zeros((n, m))
+            inverse[:, plane[:, None], plane] = lower.carry
+            moved[:, :, plane] = lower.moved
+        before = np.zeros((n, m)), np.zeros((n, m)), np.zeros((n, N_QUANTITIES))
+        known, has = np.full(n, lower is not None), np.zeros(n, bool)
+        free = ground.free(x)
+        return cls(
+            ground, lanes, x.copy(), inverse, moved, known, free, has, before, np.zeros((n, m))
+        )
+
+    def some(self, part: np.ndarray) -> "Chord":
+        """Of these lanes alone."""
+        ground, *arrays = (getattr(self, field.name) for field in dataclasses.fields(self))
+        return Chord(ground, *jax.tree.map(lambda x: x[part], arrays))
 
     def see(self, some: np.ndarray, step: Stepped, names: Sequence[str]) -> Seen:
         """Learn from a step of `some` lanes, and tell what it says of the gait."""
         m = self.free.shape[1]
         x, y = self.x[some], step.x
-        stepped = step.outcome == Outcome.STEPPED
-        same = stepped & np.all(x[:, m:] == y[:, m:], axis=1)
+        same = self.alike(some, step)
         defect = np.where(self.free[some] & same[:, None], y[:, :m] - x[:, :m], 0.0)
         self._learn(some, x[:, :m], defect, step.told, same)
         inverse, moved = self.inverse[some], self.moved[some]
@@ -103,7 +130,11 @@ class Chord:
             size = np.einsum("ijk,ik->ij", along, np.abs(d))
             tolerance = PER_TOLERANCE * float(self.ground.options.rtol)
             felt = np.abs(direct).sum(-1) + np.sum(along @ np.abs(inverse), axis=-1)
-            return Seen(same, measured(names, estimate), size, direct, tolerance * felt)
+            # What a dip takes from one duration it adds to another.
+            spread = np.ptp(direct[:, :, :N_DURATIONS], axis=-1)
+            brief = BRIEF * self.ground.shortest(self.lanes[some])[:, None] * spread
+            values = measured(names, estimate)
+            return Seen(same, values, size, direct, tolerance * felt, brief)
 
     def _learn(
         self,
@@ -136,6 +167,26 @@ class Chord:
         """From where `some` lanes are."""
         return self.ground.step(self.lanes[some], self.x[some])
 
+    def alike(self, some: np.ndarray, step: Stepped) -> np.ndarray:
+        """Whether these lanes' step ended with the codes that it began with."""
+        m = self.free.shape[1]
+        same = np.all(self.x[some, m:] == step.x[:, m:], axis=1)
+        return same & (step.outcome == Outcome.STEPPED)
+
+    def second_opinion(
+        self, some: np.ndarray, names: Sequence[str], told: "Settled"
+    ) -> np.ndarray:
+        """Numerical errors by one step more, at another tolerance, in place of what dips may cost:
+        the shortest that are followed are shorter, or longer, there."""
+        if not len(some):
+            return told.numerical[some]
+        ground = self.ground.otherwise()
+        chord = dataclasses.replace(self.some(some), ground=ground, has=np.zeros(len(some), bool))
+        seen = chord.see(np.arange(len(some)), chord.step(np.arange(len(some))), names)
+        apart = np.abs(seen.values - told.values[some])
+        least = np.minimum(seen.numerical, told.numerical[some])
+        return np.where(seen.same[:, None], apart + least, told.numerical[some])
+
     def go_on(self, some: np.ndarray, y: np.ndarray, same: np.ndarray) -> None:
         """To where the correction leads; along the step itself where codes have changed."""
         m = self.free.shape[1]
@@ -146,6 +197,7 @@ class Chord:
         changed = some[~same]
         self.inverse[changed] = np.eye(m)
         self.moved[changed] = 0.0
+        self.known[changed] = False
         self.free[changed] = self.ground.free(self.x[changed])
 
     def differentiate(self, some: np.ndarray, step: Stepped) -> np.ndarray:
@@ -155,6 +207,8 @@ class Chord:
         """
         m = self.free.shape[1]
         lane, number = np.nonzero(self.free[some])
+        if not len(lane):
+            return np.zeros(0, int)
         x = self.x[some][lane]
         x[np.arange(len(lane)), number] += DIFFERENCE
         there = self.ground.step(self.lanes[some][lane], self.ground.consistent(x))
@@ -169,36 +223,45 @@ class Chord:
         flat = np.abs(np.linalg.det(regular)) < RESOLVED
         regular[flat] = np.eye(m)
         self.inverse[some], self.moved[some] = np.linalg.inv(regular), moved
-        self.has[some] = False
+        self.has[some], self.known[some] = False, True
         return np.bincount(lane, minlength=len(some))
 
 
 class _Trust:
     """How far each lane's corrections can be trusted, by how they have come down so far."""
 
-    def __init__(self, n: int, m: int, rounding: float) -> None:
-        self.rounding = rounding  # corrections as short as this are of the integrator
+    def __init__(self, n: int, m: int, tolerance: float) -> None:
+        self.tolerance = tolerance
         self.length, self.ratio = np.full(n, np.inf), np.zeros(n)
         self.size, self.values = np.full((n, m), np.inf), np.full((n, m), np.nan)
 
+    def anew(self, some: np.ndarray, ratio: float) -> None:
+        """Matrices of these lanes are others."""
+        self.length[some], self.ratio[some] = np.inf, ratio
+
     def left(self, some: np.ndarray, seen: Seen, length: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Bound of what the corrections leave, (lanes, names), and how they contracted."""
+        """Bound of what the corrections leave, (lanes, names), how they contracted, and whether
+        they come down no more, as the integrator allows."""
+        before = self.length[some]
         with np.errstate(all="ignore"):
-            q = np.where(seen.same, length / self.length[some], np.inf)
-            q = np.where(seen.same & (length <= self.rounding), 0.0, q)
+            q = np.where(seen.same, length / before, np.inf)
+            stalls = seen.same & (q > SLOWEST) & np.isfinite(before)
+            stalls &= np.maximum(length, before) <= NOISE * self.tolerance
+            q = np.where(seen.same & (length <= ROUNDING * self.tolerance), 0.0, q)
             # Nothing is trusted where there is no correction yet to compare with.
-            least = np.clip(CURVED * self.length[some], QUICKEST, SLOWEST)
-            least = np.where(np.isfinite(self.length[some]), least, np.inf)
+            least = np.clip(CURVED * before, QUICKEST, SLOWEST)
+            least = np.where(np.isfinite(before), least, np.inf)
             worst = np.maximum(np.maximum(q, self.ratio[some]), least)
             change = np.abs(seen.values - self.values[some])
             effect = np.fmax(np.fmax(seen.size, self.size[some]), change)
             share = np.where(worst <= SLOWEST, 2.0 * worst / (1.0 - worst), np.inf)
+            share = np.where(stalls, np.minimum(share, AT_REST), share)
             left = np.nan_to_num(share[:, None] * effect, nan=np.inf, posinf=np.inf)
-        compared = np.isfinite(self.length[some])
+        compared = np.isfinite(before)
         self.ratio[some] = np.where(compared, np.where(seen.same, q, 0.0), self.ratio[some])
         self.length[some] = np.where(seen.same, length, np.inf)
         self.size[some], self.values[some] = seen.size, seen.values
-        return left, q
+        return left, q, stalls
 
 
 def settled(
@@ -206,39 +269,51 @@ def settled(
     names: Sequence[str],
     goal: Goal,
     patient: int,
-    first: Stepped | None = None,
+    first: tuple[Stepped, Seen] | None = None,
 ) -> Settled:
     """Corrections until what is left is below the `goal`, CORRECTIONS at most.
 
-    Differences take the matrices' place after so many steps, `patient`. `first` is the step from
-    where the lanes are, if it has been taken.
+    Differences take the matrices' place after so many steps, `patient`, and at once where they are
+    of another motion. `first` is the step from where the lanes are, and what the chord has seen of
+    it, if it has been taken.
     """
     n, m = len(chord.lanes), len(names)
     told = Settled(
         np.zeros(n, bool), np.full((n, m), np.nan), np.full((n, m), np.inf), np.zeros((n, m)),
         np.zeros(n, int), chord.x,
     )  # fmt: skip
-    tolerance = float(chord.ground.options.rtol)
-    trust, strikes, open_ = _Trust(n, m, ROUNDING * tolerance), np.zeros(n, int), np.arange(n)
+    trust = _Trust(n, m, float(chord.ground.options.rtol))
+    strikes, age, open_ = np.zeros(n, int), np.full(n, AGAIN - patient), np.arange(n)
+    doubted = np.zeros(n, bool)
     for k in range(CORRECTIONS):
         if not len(open_):
             break
-        step = first if first is not None and k == 0 else chord.step(open_)
-        told.n_steps[open_] += 1
-        if k >= patient and (k - patient) % AGAIN == 0:
-            told.n_steps[open_] += chord.differentiate(open_, step)
-            trust.length[open_], trust.ratio[open_] = np.inf, 0.0 if patient else np.inf
-        seen = chord.see(open_, step, names)
+        if first is not None and k == 0:
+            step, seen = first
+        else:
+            step = chord.step(open_)
+            told.n_steps[open_] += 1
+            old = chord.alike(open_, step) & ((age[open_] >= AGAIN) | ~chord.known[open_])
+            some = open_[old]
+            told.n_steps[some] += chord.differentiate(some, Stepped(*(x[old] for x in step)))
+            trust.anew(some, 0.0 if patient else np.inf)
+            age[some] = 0
+            seen = chord.see(open_, step, names)
         length = np.linalg.norm(chord.correction[open_], axis=1)
-        left, q = trust.left(open_, seen, length)
-        done = np.all(
-            left <= np.maximum(goal(seen.values) - seen.numerical, seen.numerical), axis=1
-        )
-        told.values[open_], told.left[open_] = seen.values, left
-        told.numerical[open_], told.done[open_] = seen.numerical, done
-        strikes[open_] += ~seen.same | (np.isfinite(q) & (q > SLOWEST))
+        left, q, stalls = trust.left(open_, seen, length)
+        wanted = goal(seen.values)
+        done = stalls | np.all(left <= np.maximum(wanted - seen.numerical, seen.numerical), axis=1)
+        told.values[open_], told.left[open_], told.done[open_] = seen.values, left, done
+        told.numerical[open_] = seen.numerical + seen.brief
+        doubted[open_] = done & np.any(seen.brief > BRIEFLY * wanted, axis=1)
+        slow = np.isfinite(q) & (q > SLOWEST)
+        strikes[open_] += ~seen.same | slow
+        age[open_] = np.where(slow, AGAIN, age[open_] + 1)
         goes_on = ~done & (step.outcome == Outcome.STEPPED) & (length <= FARTHEST)
         goes_on &= strikes[open_] < PATIENCE
         chord.go_on(open_[goes_on], step.x[goes_on], seen.same[goes_on])
         open_ = open_[goes_on]
+    some = np.flatnonzero(doubted)
+    told.numerical[some] = chord.second_opinion(some, names, told)
+    told.n_steps[some] += 1
     return told

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-N_QUANTITIES = 7
+N_QUANTITIES, N_DURATIONS = 7, 3
 """Time on two feet, on one, in flight, s; step length, m; section state of the paper's."""
 
 

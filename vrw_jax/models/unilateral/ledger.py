@@ -27,6 +27,11 @@ Walks make 4 to 60. A chain of ever smaller dips ends by this where a tolerance 
 400 events the last dip is as large as a tolerance of 1e-6 leaves from the first."""
 
 
+def least_dip(L0: Elementwise, options: Options) -> Array:
+    """Least depth of a dip that a step follows, m."""
+    return jnp.maximum(SHARE * options.atol, SEEN * jnp.finfo(L0.dtype).eps * L0)
+
+
 def law_of(
     s: Symbols,
     friction: Roughness,
@@ -37,8 +42,7 @@ def law_of(
     tilt: Elementwise | None = None,
 ) -> Law:
     """The law of a walk; the speed of rest is that of the least dip under gravity."""
-    dip = jnp.maximum(SHARE * options.atol, SEEN * jnp.finfo(s.L0.dtype).eps * s.L0)
-    rest = jnp.sqrt(2.0 * s.g * dip)
+    rest = jnp.sqrt(2.0 * s.g * least_dip(s.L0, options))
     return Law(s, friction, one_sided, counted, rest, restitution, tilt)
 
 
