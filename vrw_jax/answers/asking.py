@@ -19,6 +19,7 @@ from vrw_jax.answers.climbing import Chord, Settled, settled
 from vrw_jax.answers.lower import (
     GROUND,
     NONE,
+    RIGID,
     Lower,
     contraction,
     no_gaits,
@@ -204,7 +205,7 @@ class _Asked:
         if not len(lanes):
             return
         lower = Lower(*(part[lanes] for part in self.lower))
-        x = self.ground.embedded(lanes, lower.x)
+        x = self.ground.embedded(lanes, lower.x, lower.rung == RIGID)
         chord = Chord.of(self.ground, lanes, x, lower)
         every = np.arange(len(lanes))
         first = chord.step(every)

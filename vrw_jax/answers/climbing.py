@@ -173,9 +173,7 @@ class Chord:
         same = np.all(self.x[some, m:] == step.x[:, m:], axis=1)
         return same & (step.outcome == Outcome.STEPPED)
 
-    def second_opinion(
-        self, some: np.ndarray, names: Sequence[str], told: "Settled"
-    ) -> np.ndarray:
+    def second_opinion(self, some: np.ndarray, names: Sequence[str], told: "Settled") -> np.ndarray:
         """Numerical errors by one step more, at another tolerance, in place of what dips may cost:
         the shortest that are followed are shorter, or longer, there."""
         if not len(some):

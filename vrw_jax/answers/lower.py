@@ -78,7 +78,11 @@ def paper_gaits(params: WheelParams, options: Options) -> Lower:
 
 
 def rigid_gaits(params: WheelParams) -> Lower:
-    """In closed form: the stiff limit's rolling gait, with the paper's landing."""
+    """In closed form: the rolling gait of the classic landing, whose rear foot leaves.
+
+    That is what stiff legs come near to on real ground; the paper's landing, whose rear foot is
+    held, has a gait half as fast again.
+    """
     x, y, length, duration, jacobian, slope = map(np.asarray, in_batches(_rolling, SHAPES, params))
     none = np.zeros_like(duration)
     told = np.column_stack([none, duration, none, length, y])
@@ -111,7 +115,7 @@ def _gaits(
 
 @jax.jit
 def _rolling(params: WheelParams) -> tuple:
-    model, options = RigidWheel(held_landing=True, stop_at_lift_off=False), Options()
+    model, options = RigidWheel(stop_at_lift_off=False), Options()
 
     def one(params: WheelParams) -> tuple:
         def take(x: jax.Array) -> tuple:

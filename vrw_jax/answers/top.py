@@ -1,7 +1,7 @@
 """Real ground, the top rung, as values of one step in lanes; nothing here is differentiated."""
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -39,9 +39,12 @@ class Ground:
         model = UnilateralWheel(stoppers=stoppers)  # type: ignore[arg-type]
         return cls(np.stack(columns), params.n_legs, model, options)
 
-    def embedded(self, lanes: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """Full section states of the paper's, (lanes, 3)."""
-        return as_full_states(self.columns[:, lanes], x, self.n)
+    def embedded(self, lanes: np.ndarray, x: np.ndarray, rigid: Any = False) -> np.ndarray:
+        """Full section states of the paper's, (lanes, 3), where `rigid` with Leg 1 on its stopper,
+        too."""
+        full = np.array(as_full_states(self.columns[:, lanes], x, self.n))
+        full[:, 4 + 2 * self.n] += np.where(rigid, LOCKED, 0)
+        return full
 
     def step(self, lanes: np.ndarray, x: np.ndarray, n_steps: int = 1) -> Stepped:
         """From full section states."""
@@ -59,10 +62,9 @@ class Ground:
 
     def shortest(self, lanes: np.ndarray) -> np.ndarray:
         """Of each lane the time that a foot is off the ground in the least dip that is followed."""
-        gravity, length = (
-            self.columns[PARAMETER_NAMES.index(name), lanes] for name in ("gravity", "locked_length")
-        )
-        return np.sqrt(8.0 * np.asarray(least_dip(length, self.options)) / gravity)
+        value = lambda name: self.columns[PARAMETER_NAMES.index(name), lanes]
+        dip = np.asarray(least_dip(value("locked_length"), self.options))
+        return np.sqrt(8.0 * dip / value("gravity"))
 
     def free(self, x: np.ndarray) -> np.ndarray:
         """Numbers of section states that are free where their legs' codes hold, (lanes, 4 + 2 n).
