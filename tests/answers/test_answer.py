@@ -73,6 +73,36 @@ def test_at_low_friction_another_gait_is_walked_to():
     assert "another gait" in told.why
 
 
+HARD = {
+    "damping": [178.5877, 153.6807, 193.5374, 198.3578, 190.0653],
+    "stiffness": [515.5376, 534.7467, 536.8101, 464.9508, 428.9538],
+    "natural_length": [1.0197, 1.0133, 1.0228, 1.0303, 1.0338],
+    "slope": [0.3150, 0.3332, 0.3386, 0.3115, 0.3197],
+}
+"""Three whose legs change what they do on the way, with a slow direction; two whose feet dip for a
+microsecond."""
+
+
+def test_errors_are_kept_where_motions_change_and_feet_hardly_leave_the_ground():
+    wheels = vrw.WheelParams(**{name: jnp.asarray(x) for name, x in HARD.items()})
+    friction = np.array([2.3666, 0.9022, 25.7033, 8.0085, 6.8608])
+    names = ["speed", "dls_fraction"]
+    exact = vrw.answer(names, wheels, 1e-8, friction=friction)
+    for tol in (1e-2, 1e-4):
+        told = vrw.answer(names, wheels, tol, friction=friction)
+        assert np.all(told.found & exact.found)
+        assert np.all(np.abs(told.values - exact.values) <= told.errors + exact.errors)
+
+
+def test_which_takes_one_of_the_gaits_that_attract():
+    slowest = vrw.answer("speed", TABLE_1, 1e-4, friction=20.0, which="slowest")
+    assert abs(slowest.value - vrw.answer("speed", TABLE_1, 1e-6, friction=20.0).value) < 1e-4
+    assert slowest.why.endswith("one of those that attract, 1 in all")
+    none = vrw.answer("speed", TABLE_1, 1e-4, friction=20.0, which=1)
+    assert not none.found
+    assert none.why.endswith("gaits that attract: 1")
+
+
 def test_no_gait_is_said_and_no_small_number():
     told = vrw.answer("speed", vrw.WheelParams(slope=0.02), 1e-3, friction=0.7)
     assert not told.found

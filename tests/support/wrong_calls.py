@@ -281,6 +281,39 @@ def make() -> None:
     )
     use("lost gaits as a number", lambda: vrw.limit_cycle(table_1, lost=0.0), "TypeError", "lost")
     use("lost gaits misspelt", lambda: vrw.limit_cycle(table_1, lost="NaN"), "ValueError", "lost")
+    asks = lambda **given: vrw.answer(
+        **{"measures": "speed", "params": table_1, "tol": 1e-3, "friction": 20.0} | given
+    )
+    family("answer tol", lambda v: asks(tol=v), positive, "tol")
+    wrong = (
+        ("measure misspelt", {"measures": "spead"}, "ValueError", "did you mean 'speed'"),
+        ("measure of a step alone", {"measures": "slip"}, "ValueError", "every rung tells"),
+        ("no measure", {"measures": []}, "ValueError", "measures are none"),
+        ("measures as numbers", {"measures": [1.0]}, "TypeError", "measures"),
+        ("a number as the wheel", {"params": 150.0}, "TypeError", "WheelParams"),
+        ("frictions of other lanes", {"friction": [1.0, 2.0], "params": several}, "ValueError",
+         "lanes have one axis"),
+        ("negative friction", {"friction": -1.0}, "ValueError", "friction"),
+        ("relative as text", {"relative": "yes"}, "TypeError", "relative"),
+        ("stoppers misspelt", {"stoppers": "onesided"}, "ValueError", "stoppers"),
+        ("which misspelt", {"which": "quickest"}, "ValueError", "which is 'quickest'"),
+        ("which between places", {"which": 0.5}, "ValueError", "which is 0.5"),
+    )  # fmt: skip
+    for label, given, kind, words in wrong:
+        use(f"answer: {label}", lambda given=given: asks(**given), kind, words)
+    mean = lambda params=several, **given: vrw.average(
+        given.pop("measure", "speed"), params, given.pop("tol", 1e-3), friction=20.0, **given
+    )
+    use("average of one wheel", lambda: mean(table_1), "ValueError", "more wheels than its pilot")
+    use("average of few wheels", mean, "ValueError", "there are 3 wheels")
+    use("average: a small pilot", lambda: mean(pilot=2), "ValueError", "pilot")
+    use("average: tol negative", lambda: mean(tol=-1.0), "ValueError", "tol")
+    use("average: unknown measure", lambda: mean(measure="sped"), "ValueError", "every rung tells")
+    use("average: several", lambda: mean(measure=["speed"]), "TypeError", "measure")
+    use("average: a state", lambda: mean(start), "TypeError", "WheelParams")
+    use("average: stoppers", lambda: mean(stoppers="none"), "ValueError", "stoppers")
+    use("average: seed", lambda: mean(seed="one"), "TypeError", "seed")
+
     use("limit_cycle of a batch", lambda: vrw.limit_cycle(several), "ValueError", "jax.vmap")
     use("limit_cycle of a state", lambda: vrw.limit_cycle(start), "TypeError", "WheelParams")
     use(

@@ -30,7 +30,7 @@ from vrw_jax.answers.lower import (
 from vrw_jax.answers.quantities import MADE, measured
 from vrw_jax.answers.result import Answer, How
 from vrw_jax.answers.top import TIGHT, TIGHTER, Ground
-from vrw_jax.gaits import starts_of
+from vrw_jax.gaits import Which, place_in_list, starts_of
 from vrw_jax.numerics import Options
 from vrw_jax.wheel import FRICTION, Outcome, WheelParams, friction_of
 from vrw_jax.wording import (
@@ -64,6 +64,7 @@ def answer(
     friction: Any = 0.7,
     relative: bool = False,
     stoppers: str = "bilateral",
+    which: Which | None = None,
 ) -> Answer:
     """Measures of the wheel's gait on ground of this friction, each to within `tol`.
 
@@ -82,6 +83,8 @@ def answer(
         friction: of the ground.
         relative: whether `tol` counts by the value itself.
         stoppers: of the wheel that is meant, "bilateral" or "one-sided".
+        which: "slowest", "fastest" or a place, slowest first, among the gaits on real ground that
+            walks from a stated set of starts lead to, in place of the gait above.
 
     Returns:
         An `Answer`.
@@ -96,7 +99,6 @@ def answer(
     """
     began = time.perf_counter()
     untraced("vrw.answer", "it on numbers, and give lanes as arrays", params, friction)
-    instance("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
     names = names_of("measures", measures)
     for name in names:
         require_known(name, tuple(MADE), "measure that every rung tells")
@@ -105,13 +107,18 @@ def answer(
     tol, relative = positive("tol", tol), flag("relative", relative)
     chosen("stoppers", stoppers, ("bilateral", "one-sided"))
     params, mu, shape = known_lanes(params, friction_of(friction))
+    place = None if which is None else place_in_list(which)
     tolerance = TIGHT if tol >= FINE else TIGHTER
     options = Options(rtol=tolerance, atol=tolerance)
     asked = _Asked(names, tol, relative, Ground.of(params, mu, stoppers, options), params)
-    asked.by_rigid()
-    asked.by_paper()
-    asked.by_walks()
+    if place is None:
+        asked.by_rigid()
+        asked.by_paper()
+        asked.by_walks()
+    else:
+        asked.by_list(place)
     told = jax.tree.map(lambda x: x.reshape(shape + x.shape[1:]), asked.told)
+    del told["speeds"]
     return Answer(
         **told, names=names, single=isinstance(measures, str), cost=time.perf_counter() - began
     )
@@ -121,6 +128,7 @@ def known_lanes(
     params: WheelParams, friction: Any
 ) -> tuple[WheelParams, np.ndarray, tuple[int, ...]]:
     """Wheels and friction with one axis of lanes each, and the shape that they were given in."""
+    instance("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
     shapes = {np.shape(x) for x in (*jax.tree.leaves(params), friction)}
     shape = max(shapes, key=len)
     if len(shape) > 1 or shapes - {(), shape}:
@@ -153,7 +161,8 @@ class _Asked:
             "values": many(np.nan), "errors": many(np.inf), "model_errors": many(np.nan),
             "numerical_errors": many(np.inf), "rungs": np.full(n, NONE),
             "hows": np.full(n, int(How.NO_GAIT)), "n_steps": np.zeros(n, int),
-            "outcomes": np.full(n, int(Outcome.NO_CYCLE_FOUND)),
+            "outcomes": np.full(n, int(Outcome.NO_CYCLE_FOUND)), "n_gaits": np.zeros(n, int),
+            "speeds": np.full(n, np.nan),
         }  # fmt: skip
 
     def goal(self, values: np.ndarray) -> np.ndarray:
@@ -196,6 +205,22 @@ class _Asked:
             still = self.told["rungs"][lanes] == NONE
             begin = self.ground.embedded(lanes[still], start[still])
             self._walk(lanes[still], begin, How.FROM_START)
+
+    def by_list(self, place: int) -> None:
+        """The gait at a place, slowest first, of those that walks from all starts lead to."""
+        lanes, blank, each = self.open, self.told, []
+        for start in starts_of(self.params):
+            self.told = {name: x.copy() for name, x in blank.items()}
+            self._walk(lanes, self.ground.embedded(lanes, start), How.CHOSEN)
+            each.append(self.told)
+        self.told = blank
+        blank["n_steps"][:] = np.sum([told["n_steps"] for told in each], axis=0)
+        for lane in lanes:
+            gaits = _apart([{name: x[lane] for name, x in told.items()} for told in each])
+            blank["n_gaits"][lane] = len(gaits)
+            if -len(gaits) <= place < len(gaits):
+                for name in blank.keys() - {"n_steps", "n_gaits"}:
+                    blank[name][lane] = gaits[place][name]
 
     def _wheels(self, lanes: np.ndarray) -> WheelParams:
         return jax.tree.map(lambda leaf: leaf[lanes], self.params)
@@ -259,7 +284,7 @@ class _Asked:
         self._tell(lanes, np.full(len(lanes), GROUND), how, {
             "values": found.values, "errors": found.left + found.numerical,
             "model_errors": value - found.values,
-            "numerical_errors": found.left + found.numerical,
+            "numerical_errors": found.left + found.numerical, "speeds": found.speed,
         })  # fmt: skip
 
     def _tell(
@@ -269,3 +294,16 @@ class _Asked:
             self.told[name][lanes] = values
         self.told["rungs"][lanes], self.told["hows"][lanes] = rung, how
         self.told["outcomes"][lanes] = Outcome.STEPPED
+
+
+def _apart(told: list[dict[str, np.ndarray]]) -> list[dict[str, np.ndarray]]:
+    """Of one wheel what differs by more than it may be wrong by, slowest first."""
+    kept: list[dict[str, np.ndarray]] = []
+    for one in told:
+        apart = (
+            np.any(np.abs(one["values"] - other["values"]) > one["errors"] + other["errors"])
+            for other in kept
+        )
+        if one["rungs"] != NONE and all(apart):
+            kept.append(one)
+    return sorted(kept, key=lambda one: one["speeds"])

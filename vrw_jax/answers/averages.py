@@ -18,13 +18,22 @@ import numpy as np
 from vrw_jax.answers.asking import answer, known_lanes
 from vrw_jax.answers.climbing import Chord
 from vrw_jax.answers.lower import Lower, paper_gaits
-from vrw_jax.answers.quantities import measured
+from vrw_jax.answers.quantities import MADE, measured
 from vrw_jax.answers.result import Answer
 from vrw_jax.answers.top import Ground
 from vrw_jax.numerics import Options
 from vrw_jax.results import MEASURES
 from vrw_jax.wheel import WheelParams, friction_of
-from vrw_jax.wording import AbstractTold, Row, positive, whole
+from vrw_jax.wording import (
+    AbstractTold,
+    Row,
+    chosen,
+    instance,
+    positive,
+    require_known,
+    untraced,
+    whole,
+)
 
 DEVIATIONS = 2.0
 """Standard errors that a stated error of a mean holds."""
@@ -122,7 +131,12 @@ def average(
         >>> bool(mean.error < 1.1e-2)
         True
     """
+    untraced("vrw.average", "it on numbers, and give wheels as arrays", params, friction)
+    instance("measure", measure, str, "give the name of one, 'speed', say")
+    require_known(measure, tuple(MADE), "measure that every rung tells")
+    chosen("stoppers", stoppers, ("bilateral", "one-sided"))
     tol, pilot = positive("tol", tol), whole("pilot", pilot, FEWEST, ", to tell a spread")
+    seed = whole("seed", seed, 0)
     params, mu, shape = known_lanes(params, friction_of(friction))
     n = len(mu)
     if not shape or n <= pilot:

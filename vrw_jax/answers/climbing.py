@@ -73,6 +73,7 @@ class Settled(NamedTuple):
     numerical: np.ndarray
     n_steps: np.ndarray  # of the top rung
     x: np.ndarray  # (lanes, 4 + 3 n)
+    speed: np.ndarray  # m/s, of the last step
 
 
 @dataclasses.dataclass
@@ -278,7 +279,7 @@ def settled(
     n, m = len(chord.lanes), len(names)
     told = Settled(
         np.zeros(n, bool), np.full((n, m), np.nan), np.full((n, m), np.inf), np.zeros((n, m)),
-        np.zeros(n, int), chord.x,
+        np.zeros(n, int), chord.x, np.full(n, np.nan),
     )  # fmt: skip
     trust = _Trust(n, m, float(chord.ground.options.rtol))
     strikes, age, open_ = np.zeros(n, int), np.full(n, AGAIN - patient), np.arange(n)
@@ -303,6 +304,7 @@ def settled(
         done = stalls | np.all(left <= np.maximum(wanted - seen.numerical, seen.numerical), axis=1)
         told.values[open_], told.left[open_], told.done[open_] = seen.values, left, done
         told.numerical[open_] = seen.numerical + seen.brief
+        told.speed[open_] = measured(("speed",), step.told)[:, 0]
         doubted[open_] = done & np.any(seen.brief > BRIEFLY * wanted, axis=1)
         slow = np.isfinite(q) & (q > SLOWEST)
         strikes[open_] += ~seen.same | slow

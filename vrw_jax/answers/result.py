@@ -21,6 +21,7 @@ class How(Code):
     WALKED = 2, "another gait than the lower rung's: a walk from there leads to it"
     FROM_START = 3, "the paper's wheel has no gait here: a walk from its start leads to this one"
     NO_GAIT = 4, "no such gait on real ground"
+    CHOSEN = 5, "one of those that attract"
 
 
 CALLED = ("no rung", "the rigid wheel", "the paper's wheel", "real ground")
@@ -36,6 +37,7 @@ class Answer(AbstractTold):
     - `values`, `errors`, `model_errors`, `numerical_errors`: measures on the last axis;
     - `rungs`, `hows`: numbers of the rungs and of how the answers came about;
     - `n_steps`: taken on real ground;
+    - `n_gaits`: among which the gait was chosen, 0 where none was to be;
     - `outcomes`: STEPPED, or why there is no gait;
     - `names`, `single`: what was asked;
     - `cost`: of the whole call, s.
@@ -54,6 +56,7 @@ class Answer(AbstractTold):
     hows: np.ndarray
     n_steps: np.ndarray  # taken on real ground
     outcomes: np.ndarray
+    n_gaits: np.ndarray
     names: tuple[str, ...] = eqx.field(static=True)
     single: bool = eqx.field(static=True)
     cost: float = eqx.field(static=True)  # s, of the whole call
@@ -103,7 +106,7 @@ class Answer(AbstractTold):
     def why(self) -> Any:
         """Why the answer is of that rung, a sentence; of lanes an array of them."""
         told = np.vectorize(_sentence, otypes=[object])
-        return told(self.rungs, self.hows, self.n_steps, self.outcomes)[()]
+        return told(self.rungs, self.hows, self.n_steps, self.outcomes, self.n_gaits)[()]
 
     @property
     def title(self) -> str:
@@ -134,10 +137,13 @@ class Answer(AbstractTold):
         return f"{shown} ± {_short(error)} ({parts})"
 
 
-def _sentence(rung: int, how: int, n_steps: int, outcome: int) -> str:
+def _sentence(rung: int, how: int, n_steps: int, outcome: int, n_gaits: int) -> str:
     meaning = How(int(how)).meaning
     if how == How.NO_GAIT:
-        return f"{meaning}: {Outcome(int(outcome)).meaning[:-1]}"
+        among = f"; gaits that attract: {n_gaits}" if n_gaits else ""
+        return f"{meaning}: {Outcome(int(outcome)).meaning[:-1]}{among}"
+    if how == How.CHOSEN:
+        meaning = f"{meaning}, {n_gaits} in all"
     if how == How.CHECKED:
         return f"{CALLED[int(rung)]}, {meaning}"
     return f"{CALLED[int(rung)]}, {n_steps} steps, {meaning}"
