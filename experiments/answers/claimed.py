@@ -1,8 +1,8 @@
 """Claimed against true errors of `vrw.answer`, what it costs, and which rung answers where.
 
-    python -m experiments.answers.claimed [--parts 20] [--folder results/answers] [--redraw]
+    python -m experiments.answers.claimed [--parts 25] [--folder results/answers] [--redraw]
 
-A part is 500 wheels of a wide box and 125 hostile ones: of eight times as many the paper's gaits
+A part is 400 wheels of a wide box and 100 hostile ones: of eight times as many the paper's gaits
 that are nearest to a fold, to a border (an indicator at zero) or without double support. Friction
 is 0.5 to 100. Each wheel is asked once, to a tolerance of its own between 1e-2 and 1e-8. Its truth
 is what the answer at a tolerance of 1e-9 tells: it is the iteration's own limit, and proves no
@@ -23,7 +23,7 @@ from experiments.shared.tables import FIGURES, markdown, numbers, read, write
 from experiments.shared.wheels import WIDE_BOX
 from vrw_jax import figures as plots
 
-BOX, HOSTILE, OF = 500, 125, 8
+BOX, HOSTILE, OF = 400, 100, 8
 EXACT = 1e-9
 TOLERANCES = 10.0 ** -np.arange(2, 9)
 MAPPED = (1e-2, 1e-4, 1e-6)
@@ -33,6 +33,8 @@ CLOUD, MAP = FIGURES / "answers_cloud.npz", FIGURES / "answers_map.csv"
 SEEN = 1e-9
 """True model error from which on its estimate counts."""
 KINDS = ("lower stands", "continued", "walked to", "from a start")
+COLOURS = ("#0072B2", "#56B4E9", "#E69F00", "#CC79A7", "#DDDDDD")
+"""Of these kinds, and where no gait is found."""
 Columns = dict[str, np.ndarray]
 
 
@@ -95,7 +97,7 @@ def gathered(folder: Path) -> None:
     small = {
         "wrong": told["values"] - told["exact_values"],
         "allowed": told["errors"] + told["exact_errors"],
-        "effectivity": told["model_errors"] / (lower - told["exact_values"]),
+        "effectivity": _over(told["model_errors"], lower - told["exact_values"]),
         "model_error": lower - told["exact_values"],
         **{name: told[name] for name in (
             "errors", "hows", "n_steps", "exact_hows", "exact_n_steps", "hostile", "friction",
@@ -103,6 +105,10 @@ def gathered(folder: Path) -> None:
         )},
     }  # fmt: skip
     np.savez_compressed(CLOUD, **{name: x.astype(np.float32) for name, x in small.items()})
+
+
+def _over(above: np.ndarray, below: np.ndarray) -> np.ndarray:
+    return np.divide(above, below, out=np.full_like(above, np.nan), where=below != 0.0)
 
 
 def mapped() -> None:
@@ -162,8 +168,9 @@ def draw() -> None:
         outside = np.abs(cloud["wrong"]) > cloud["allowed"]
         for how, kind in enumerate(KINDS):
             some = (cloud["hows"] == how)[:, None] & ~outside
-            axis.plot(cloud["errors"][some], wrong[some], ",", color=f"C{how}", rasterized=True)
-            axis.plot([], [], "o", ms=3, color=f"C{how}", label=kind)
+            axis.plot(cloud["errors"][some], wrong[some], ".", ms=1.5, color=COLOURS[how],
+                      rasterized=True)  # fmt: skip
+            axis.plot([], [], "o", ms=3, color=COLOURS[how], label=kind)
         axis.plot(cloud["errors"][outside], wrong[outside], "kx", ms=4, label="outside")
         axis.plot(ends, ends, "k", lw=0.6)
         axis.set(xscale="log", yscale="log", xlabel="claimed error", ylabel="true error",
@@ -178,10 +185,10 @@ def draw() -> None:
         cost.axhline(1.0, color=plots.GREY, lw=0.6)
         cost.set(xscale="log", yscale="log", xlabel="tolerance", ylabel="steps on real ground")
         cost.invert_xaxis()
-        cost.legend(fontsize=6)
+        cost.legend(fontsize=6, loc="lower right", bbox_to_anchor=(1.0, 0.06))
         points = read(MAP)
         names = (*KINDS, "no gait found")
-        colours = ListedColormap(["#0072B2", "#56B4E9", "#E69F00", "#F0E442", "#DDDDDD"])
+        colours = ListedColormap(COLOURS)
         for axis, tol in zip(below.subplots(1, 3, sharey=True), MAPPED, strict=True):
             some = [r for r in points if float(r["tol"]) == tol]
             how = numbers(some, "how").reshape(len(FRICTION), len(DAMPING))
@@ -196,7 +203,7 @@ def draw() -> None:
 
 def main() -> None:
     parser = command(__doc__)
-    parser.add_argument("--parts", type=int, default=20)
+    parser.add_argument("--parts", type=int, default=25)
     parser.add_argument("--folder", type=Path, default=Path("results/answers"))
     parser.add_argument("--redraw", action="store_true", help="compute nothing")
     asked = started(parser)

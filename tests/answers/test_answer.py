@@ -103,6 +103,20 @@ def test_which_takes_one_of_the_gaits_that_attract():
     assert none.why.endswith("gaits that attract: 1")
 
 
+def test_the_rigid_wheel_answers_for_stiff_damped_legs_and_loose_tolerances():
+    stiffness, mass, gravity = 1e6, 18.0, 9.81
+    wheel = vrw.WheelParams(
+        stiffness=stiffness, damping=4.0 * math.sqrt(stiffness * mass), slope=0.1,
+        natural_length=1.0 + mass * gravity / stiffness,
+    )  # fmt: skip
+    told = vrw.answer(["speed", "period"], wheel, 0.1, friction=50.0)
+    exact = vrw.answer(["speed", "period"], wheel, 1e-3, friction=50.0)
+    assert (told.rung, exact.rung) == ("rigid", "unilateral")
+    wrong = told.values - exact.values
+    assert np.all(np.abs(wrong) < told.errors)
+    assert np.all(np.abs(told.model_errors / wrong - 1.0) < 0.3)
+
+
 def test_no_gait_is_said_and_no_small_number():
     told = vrw.answer("speed", vrw.WheelParams(slope=0.02), 1e-3, friction=0.7)
     assert not told.found

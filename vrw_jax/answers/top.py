@@ -3,6 +3,7 @@
 import dataclasses
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.models import LOCKED, STICK, UnilateralWheel, as_full_states, least_dip, walk_lanes
@@ -63,7 +64,7 @@ class Ground:
     def shortest(self, lanes: np.ndarray) -> np.ndarray:
         """Of each lane the time that a foot is off the ground in the least dip that is followed."""
         value = lambda name: self.columns[PARAMETER_NAMES.index(name), lanes]
-        dip = np.asarray(least_dip(value("locked_length"), self.options))
+        dip = np.asarray(least_dip(jnp.asarray(value("locked_length")), self.options))
         return np.sqrt(8.0 * dip / value("gravity"))
 
     def free(self, x: np.ndarray) -> np.ndarray:
