@@ -1,4 +1,4 @@
-"""The slider–crank with play in nine absolute coordinates, 30 digits: its case's truth.
+"""The slider–crank with play in nine absolute coordinates, 40 digits: its case's truth.
 
     python -m experiments.atlas.absolute
 
@@ -14,6 +14,7 @@ from typing import NamedTuple
 from mpmath import cos, mp, mpf, sin
 
 from experiments.atlas.cases import slider_crank as given
+from experiments.shared.command import command, started
 
 Row = list  # of mpf
 LEVELS, STEP = 11, mpf("2e-4")
@@ -229,7 +230,12 @@ def march(bounces: int = 60) -> dict[str, mpf]:
     return told
 
 
-if __name__ == "__main__":
+def main() -> None:
+    started(command(__doc__))
     mp.dps = 40
     for name, number in march().items():
         print(f"{name}: {mp.nstr(number, 22)}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

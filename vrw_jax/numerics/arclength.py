@@ -437,15 +437,19 @@ def follow(
     options: ArclengthOptions,
     wheels: Any,
     z: Unknown,
-    p: Float[Array, " branches"],
+    p: Float[Array, "*branches"],
     bounds: Float[Array, "2"],
-    directions: Float[Array, " branches"],
+    directions: Float[Array, "*branches"],
 ) -> Track:
     """The branches from the points near (z, p), towards growing p if the direction is 1, else -1.
 
-    Each ends at the range's end, or with its first point that is not `valid`, which is kept. Each
-    turn of the loop is one linearisation of each.
+    One branch, or several with a leading axis. Each ends at the range's end, or with its first
+    point that is not `valid`, which is kept. Each turn of the loop is one linearisation of each.
     """
+    if not p.ndim:
+        alone = jax.tree.map(lambda x: x[None], (wheels, z, p, directions))
+        told = follow(followed, options, *alone[:3], bounds, alone[3])
+        return jax.tree.map(lambda x: x[0], told)
 
     def turn(on: Followed) -> Followed:
         one = lambda wheel, trial: linear_at(followed, wheel, bounds, trial.z, trial.share)
