@@ -446,10 +446,9 @@ def follow(
     One branch, or several with a leading axis. Each ends at the range's end, or with its first
     point that is not `valid`, which is kept. Each turn of the loop is one linearisation of each.
     """
-    if not p.ndim:
-        alone = jax.tree.map(lambda x: x[None], (wheels, z, p, directions))
-        told = follow(followed, options, *alone[:3], bounds, alone[3])
-        return jax.tree.map(lambda x: x[0], told)
+    alone = p.ndim == 0
+    if alone:
+        wheels, z, p, directions = jax.tree.map(lambda x: x[None], (wheels, z, p, directions))
 
     def turn(on: Followed) -> Followed:
         one = lambda wheel, trial: linear_at(followed, wheel, bounds, trial.z, trial.share)
@@ -457,4 +456,5 @@ def follow(
         return turned(followed, options, wheels, bounds, directions, on, linears)
 
     on = begun(followed, options, z, p, bounds, directions)
-    return track_of(lax.while_loop(lambda on: jnp.any(going(on)), turn, on))
+    told = track_of(lax.while_loop(lambda on: jnp.any(going(on)), turn, on))
+    return jax.tree.map(lambda x: x[0], told) if alone else told
