@@ -23,7 +23,7 @@ from vrw_jax.cycles import finder_of
 from vrw_jax.gaits.attracting import gaits_attracting
 
 FRICTION = (0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9, 0.95, 1.0, 1.1, 1.2,
-            1.3, 1.5, 1.6)  # fmt: skip
+            1.3, 1.4, 1.5, 1.6)  # fmt: skip
 DAMPING = tuple(float(c) for c in range(20, 401, 10))
 FOLLOWED = (195.0, 200.0, 205.0, 210.0, 215.0, 220.0, 240.0, 270.0, 300.0, 340.0, 380.0)
 DOWN = (0.32, 1.4)  # friction along the branches, which begin at its upper end
