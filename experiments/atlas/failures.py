@@ -109,7 +109,7 @@ def tell(rows: list[dict[str, str]]) -> None:
         lines.append(
             [
                 f"[{case.title}](#{anchor(case.title)})", case.breaks, case.truth,
-                f"{max(errors, default=math.nan):.0e}", *told, f"`--only {name}`",
+                f"{max(errors):.0e}" if errors else "-", *told, f"`--only {name}`",
             ]
         )  # fmt: skip
         header = ["method", "worst verdict", "right", "worst question", "error", "says", "work",

@@ -234,9 +234,8 @@ def draw_charts(table, shares, cost):
     """Speed over error of every engine, and cost over the share of lanes that fall back."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(plots.PAGE, 3.9))
     markers = dict(zip(("Tsit5", "Dopri5", "Dopri8"), "os^", strict=True))
-    colours = dict(
-        zip(LABELS, [*plt.rcParams["axes.prop_cycle"].by_key()["color"], plots.GREY], strict=True)
-    )
+    cycled = plt.rcParams["axes.prop_cycle"].by_key()["color"]
+    colours = dict(zip(LABELS, [*cycled, plots.GREY, "black"], strict=True))
     for name, label in LABELS.items():
         for method in dict.fromkeys(e["method"] for e in table if e["engine"] == name):
             some = [e for e in table if (e["engine"], e["method"]) == (name, method)]
