@@ -44,8 +44,8 @@ N_TALLIED = 3
 """Rows that are summed up: energy lost in dampers and by sliding, slip."""
 FORCE = -1
 """Row of the least stopper force of legs in the air."""
-MARCHING, EVENT, WAITING = -1, -2, -3
-"""Where a lane stands: on its way, at an event, without a wheel; else the `Outcome` it met."""
+MARCHING, EVENT = -1, -2
+"""Where a lane stands: on its way, at an event; else the `Outcome` it met."""
 BURST = 8
 """Tries after which lanes at events no longer wait for those beside them."""
 PARABOLAS = 3
@@ -87,7 +87,7 @@ class March(NamedTuple):
     h: Array  # of the next try, s
     time: Array  # since the last event, s
     search: Search
-    verdict: Array  # MARCHING, EVENT, WAITING or an Outcome
+    verdict: Array  # MARCHING, EVENT or an Outcome
     guard: Array  # at which it stands
     tried: Array  # steps since the last event
 
