@@ -251,7 +251,7 @@ class GroundFollowed(AbstractFollowedWheel):
         values = np.asarray(self.values(wheels, p))
         return Periods(self.model, self.n_legs, self.period_n, values)
 
-    def linearise(self, wheel: Wheel, z: Unknown, p: Scalar) -> Linear:
+    def linearise(self, wheel: Wheel, z: Unknown, p: Array) -> Linear:
         """Of many."""
         x, n = np.asarray(z), self.numbers
         own = np.asarray(self.model.parameter_names) == self.name

@@ -13,6 +13,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -146,7 +147,7 @@ class GroundEngine:
     def _gaits(self, values: np.ndarray, states: np.ndarray) -> tuple[Told, np.ndarray]:
         """What is told of the gaits near section states, and how far away they are."""
         if self._wanted:
-            gait = self._finder.find_many(values, states)
+            gait = self._finder.find_many(jnp.asarray(values), states)
             cycle = gait.cycle
             _, slopes = in_batches(lambda some: read_along_lanes(self._moved, some), (LANES,), gait)
         else:
