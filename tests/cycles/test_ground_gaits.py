@@ -328,7 +328,7 @@ def test_a_step_of_lanes_tells_what_a_single_wheel_does_and_how_it_moves(scene, 
     for name, column in zip(("damping", "friction", "dtheta"), exact, strict=True):
         place = names.index(name)
         found = np.concatenate([moved.section_state[0, :20, place], moved.durations[0, :, place]])
-        atol = 1e-8 if stoppers == "bilateral" else 1e-7
+        atol = 1e-8 if stoppers == "bilateral" else 1e-5  # other dips, see above
         np.testing.assert_allclose(found, column, rtol=1e-6, atol=atol, err_msg=name)
 
 
