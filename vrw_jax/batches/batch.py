@@ -37,7 +37,7 @@ from vrw_jax.models import (
     along_units,
     gait_step,
 )
-from vrw_jax.numerics import Options, explicit_tableau
+from vrw_jax.numerics import Options, explicit_tableau, in_batches
 from vrw_jax.walks import options_of, rung_of, state_of
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, wheel_of
 from vrw_jax.wording import (
@@ -333,20 +333,14 @@ def _by_diffrax(
 ) -> tuple[np.ndarray, ...]:
     """By the model's own step under `jax.vmap`, MAPPED at a time."""
     options = jax.tree.map(lambda leaf: np.asarray(leaf, wheels.dtype), options)
-    columns, parts = np.concatenate([wheels, states.T]), []
-    for begin in range(0, len(states), MAPPED):
-        some = np.arange(begin, min(begin + MAPPED, len(states)))
-        filled = np.minimum(np.arange(begin, begin + MAPPED), len(states) - 1)
-        out = _mapped(model, options, n_legs, moved, columns[:, filled])
-        used = slice(len(some))
-        parts.append(jax.tree.map(lambda leaf, used=used: np.asarray(leaf)[used], out))
-    whole: list[np.ndarray] = [np.concatenate(leaves) for leaves in zip(*parts, strict=True)]
-    return tuple(whole)
+    rows = np.concatenate([wheels.T, states], 1)
+    mapped = functools.partial(_mapped, model, options, n_legs, moved)
+    return jax.tree.map(np.asarray, in_batches(mapped, (MAPPED,), rows))
 
 
 @eqx.filter_jit
 def _mapped(
-    model: AbstractWheel, options: Options, n_legs: int, moved: tuple[int, ...], columns: Any
+    model: AbstractWheel, options: Options, n_legs: int, moved: tuple[int, ...], rows: Array
 ) -> tuple[Array, ...]:
     n = len(PARAMETER_NAMES)
 
@@ -364,4 +358,4 @@ def _mapped(
         values = taken.section_state, taken.durations, taken.outcome, taken.solver_steps
         return *values, jacobian
 
-    return jax.vmap(one, 1)(columns)
+    return jax.vmap(one)(rows)

@@ -18,7 +18,7 @@ from vrw_jax.models.unilateral.mechanics import WheelMotion
 from vrw_jax.models.unilateral.motion import Stance, Tally
 from vrw_jax.models.unilateral.section import LOCKED, closed, embedded, section_size
 from vrw_jax.models.unilateral.wheel import UnilateralStep, UnilateralWheel, step_told
-from vrw_jax.numerics import Options, explicit_tableau
+from vrw_jax.numerics import Options, explicit_tableau, in_batches
 from vrw_jax.runtime import lane_program
 from vrw_jax.wheel import PARAMETER_NAMES, symbols_of
 
@@ -184,12 +184,7 @@ def _program(run: _Run, dtype: np.dtype, form: Any) -> Callable[..., Any]:
         return lane_program(walk, kinds, sum(run.rows()), dtype, ("walk on real ground", run))
     by_xla = jax.jit(walk)
 
-    def in_blocks(uniform: list, lanes: list) -> list:
-        n, parts = len(lanes[0]), []
-        for begin in range(0, n, BLOCK):
-            place = np.minimum(np.arange(begin, begin + BLOCK), n - 1)
-            told = by_xla(tuple(uniform), tuple(row[place] for row in lanes))
-            parts.append([np.asarray(row)[: n - begin] for row in told])
-        return [np.concatenate(rows) for rows in zip(*parts, strict=True)]
+    def in_blocks(uniform: list, lanes: list) -> tuple:
+        return in_batches(lambda *rows: by_xla(tuple(uniform), rows), (BLOCK,), *lanes)
 
     return in_blocks
