@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mpmath import mp, mpf
 
 pytest.importorskip("heyoka", exc_type=ImportError)
 
-from experiments.atlas import failures
+from experiments.atlas import failures, many_digits
 from experiments.atlas.hybrid import METHODS, Edge, Part, by_scipy, last_time, ours
 from experiments.atlas.told import Row
 
@@ -48,6 +49,14 @@ def test_methods_met_in_one_run_and_ours_keeps_1e_12_of_each_closed_form_s_condi
     mine = failures.exact(TABLE)
     assert len(mine) > 20
     assert max(float(row["error"]) / float(row["condition"]) for row in mine) <= 1e-12
+
+
+def test_a_closed_form_s_time_is_within_1e_12_or_the_walk_tells_how_far_tolerance_reaches():
+    times = [row for row in failures.exact(TABLE) if row["quantity"].startswith(("time", "dip"))]
+    late = [row for row in times if float(row["error"]) > 1e-12]
+    assert {row["case"] for row in late} <= {"grazing", "tangent_guards"}
+    for row in late:
+        assert float(row["error"]) <= float(row["says"].removeprefix("tolerance in time: "))
 
 
 def test_a_verdict_needs_a_right_answer_or_an_admission():
@@ -157,10 +166,29 @@ def test_both_formulations_of_the_slider_crank_keep_the_energy_up_to_the_first_i
     assert abs(last / first - 1.0) < 1e-13
 
 
+@pytest.mark.parametrize("name", ["simplest_walker", "compass_gait"])
+def test_the_map_in_40_digits_takes_a_walker_s_stored_gait_to_itself(name):
+    place, step = many_digits.CASES[name]
+    told, x = getattr(module(name), place), module(name).EXACT.x
+    with mp.workdps(40):
+        there, period = many_digits.back(told, [mpf(v) for v in x], step)
+    np.testing.assert_allclose([float(v) for v in there], x, rtol=0.0, atol=2e-16)
+    assert abs(float(period) - module(name).EXACT.period) < 1e-15  # a rounding of x moves it
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", many_digits.CASES)
+def test_gaits_without_a_closed_form_are_those_of_forty_digits(name):
+    place, step = many_digits.CASES[name]
+    with mp.workdps(40):
+        told = many_digits.gait(getattr(module(name), place), step)
+    stored = module(name).EXACT
+    assert (told.x, told.period) == (stored.x, stored.period)
+    np.testing.assert_allclose(told.multipliers, stored.multipliers, rtol=1e-15, atol=1e-20)
+
+
 @pytest.mark.slow
 def test_the_slider_crank_s_truth_is_that_of_forty_digits_in_other_coordinates():
-    from mpmath import mp
-
     from experiments.atlas.absolute import march
 
     case = module("slider_crank")

@@ -68,7 +68,10 @@ def refused(folder: Path, command: list[str], line: str) -> dict[str, set[int]]:
             ["mypy", "--ignore-missing-imports", "--follow-imports=silent", "good.py", "bad.py"],
             r"^(\w+\.py):(\d+): error",
         ),
-        (["basedpyright", "--level", "error", "."], r"/(\w+\.py):(\d+):\d+ - error"),
+        (
+            ["basedpyright", "--pythonpath", sys.executable, "--level", "error", "."],
+            r"/(\w+\.py):(\d+):\d+ - error",
+        ),
     ],
     ids=("mypy", "pyright"),
 )

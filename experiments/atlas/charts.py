@@ -314,7 +314,7 @@ def modes(rows: list[Row]) -> Figure:
     for row, line in zip([row for row in rows if row["steps"] == "0"], ("--", ":"), strict=True):
         for axes, name in ((left, "median_error"), (right, "ms")):
             axes.axhline(float(row[name]), color=COLOURS[2], ls=line, lw=1.2, label=row["way"])
-    left.set(xlabel="steps of the walk", ylabel="relative error of d(period), median")
+    left.set(xlabel="steps of the walk", ylabel="relative error of the period's derivative, median")
     right.set(xlabel="steps of the walk", ylabel="CPU time per gait [ms]")
     right.legend(fontsize=6)
     return figure

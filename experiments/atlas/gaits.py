@@ -34,6 +34,14 @@ class Return(NamedTuple):
     limit: float = 20.0
 
 
+class Exact(NamedTuple):
+    """A gait as many_digits.py finds it: section, time until it is back, multipliers by size."""
+
+    x: tuple[float, ...]
+    period: float
+    multipliers: tuple[complex, ...]
+
+
 class Gait(NamedTuple):
     """What a method found; `walked` is its last step."""
 

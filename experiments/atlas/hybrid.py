@@ -20,7 +20,7 @@ import optimistix as optx
 from scipy.integrate import solve_ivp
 
 import vrw_jax as vrw
-from experiments.atlas.told import Row, off, timed
+from experiments.atlas.told import EXACT, Row, off, timed
 from experiments.shared.command import extra
 from vrw_jax.numerics import Guard, Mode, Stop, walk
 
@@ -60,6 +60,7 @@ class Walked(NamedTuple):
     options: str
     version: str
     end: np.ndarray  # the last state, past the reset
+    resolution: float = 0.0  # of the last time: what the tolerances are in it, where a method tells
 
 
 JAX = types.SimpleNamespace(sin=jnp.sin, cos=jnp.cos, exp=jnp.exp, sqrt=jnp.sqrt, stack=jnp.stack)
@@ -102,6 +103,7 @@ def ours(
         f"{solver} {tolerance:g}",
         version("vrw-jax"),
         np.asarray(told.state),
+        float(told.resolution[n - 1]) if n else 0.0,
     )
 
 
@@ -291,9 +293,12 @@ def row(
     condition: float = 1.0,
     digits: int | None = None,
 ) -> Row:
-    """What a walk says of one quantity."""
+    """What a walk says of one quantity; also that its last time is badly conditioned."""
+    says = walked.says
+    if not says and walked.resolution > EXACT:
+        says = f"tolerance in time: {walked.resolution:.0e}"
     return Row(
-        quantity, walked.method, found, truth, off(found, truth, relative=relative), walked.says,
+        quantity, walked.method, found, truth, off(found, truth, relative=relative), says,
         walked.admits, walked.work, walked.seconds, walked.options, walked.version,
         condition, digits,
     )  # fmt: skip

@@ -138,7 +138,7 @@ def draw() -> None:
         Line2D(
             [], [], marker="o", markersize=2.5, color="0.5", label="fold that ends the slow gait"
         ),
-        Line2D([], [], color="black", linewidth=0.8, label="$\\tan\\varphi$: no gait below"),
+        Line2D([], [], color="black", linewidth=0.8, label="$\\tan\\phi$: no gait below"),
         Patch(color=GREY, label="one gait attracts"),
     ]
     figure.legend(handles=lines, loc="outside lower center", ncols=3)

@@ -33,7 +33,7 @@ LABELS = {
     "collocation": "lanes by collocation, durations known to 3 %",
     "lanes": "lane engine, any start",
     "by hand": "C++ by hand, eight lanes side by side",
-    "diffrax": "vmapped diffrax engine",
+    "diffrax": "diffrax engine, in batches",
     "numba": "numba, scalar Dormand-Prince 5(4)",
     "heyoka": "heyoka, scalar Taylor",
     "scipy": "SciPy DOP853, compiled right-hand side",

@@ -32,6 +32,28 @@ def test_grey_stays_grey_and_the_colours_of_okabe_and_ito_stay_apart_without_gre
             assert np.linalg.norm(seen(one) - seen(other)) > APART, (one, other)
 
 
+def test_outcomes_have_colours_that_stay_apart_with_and_without_green_cones():
+    told = [colour for _, colour in style.OUTCOMES.values()]
+    told += [style.YELLOW, style.NOT_COMPUTED[1]]  # of unstable gaits, and of what is missing
+    for i, one in enumerate(told):
+        for other in told[:i]:
+            plain = np.array(mpl.colors.to_rgb(one)) - mpl.colors.to_rgb(other)
+            assert np.linalg.norm(plain) > APART, (one, other)
+            assert np.linalg.norm(seen(one) - seen(other)) > APART, (one, other)
+
+
+NAMED = (
+    r"""["'](red|green|blue|[bgrcy](?:[.o*s^x]|--?|[.o]--?))["']|color=["'](?:[bgrcmy]["']|tab:)"""
+)
+
+
+@pytest.mark.parametrize("folder", ["experiments", "vrw_jax/figures"])
+def test_pictures_take_no_colours_but_those_of_the_set(folder: str):
+    """Okabe and Ito's, greys, black and white; matplotlib's own red, green and blue are others."""
+    for path in (ROOT / folder).rglob("*.py"):
+        assert not re.search(NAMED, path.read_text()), path
+
+
 def test_shades_of_a_basin_are_apart_from_the_colours_of_its_falls():
     over = ("dtheta_touchdown", "dL1_touchdown")
     falls = [Outcome.FELL_BACK, Outcome.LEG_1_LIFTED_OFF, Outcome.TOUCHDOWN_BEFORE_STOPPER]

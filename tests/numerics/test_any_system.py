@@ -96,6 +96,17 @@ def test_a_start_that_is_a_rounding_off_its_guard_is_on_it(height):
     assert abs(float(told.time) - 2.0 / G) < 1e-14
 
 
+@pytest.mark.parametrize("depth", [0.5, 1e-4, 1e-8])
+def test_the_resolution_of_a_grazed_guard_s_time_follows_the_closed_form(depth):
+    # The height of a throw at g = 1 above a ceiling that it passes by `depth`: 1/2 - depth.
+    throw = lambda y: jnp.stack([y[1], -1.0 + 0.0 * y[1]])
+    mode = Mode(throw, (Guard(lambda y: 0.5 - depth - y[0]),))
+    told = jax.vmap(lambda y: walk((mode,), y, events=2, options=TIGHT))(jnp.array([[0.0, 1.0]]))
+    rate, tolerance = np.sqrt(2.0 * depth), 1e-13 * (1.0 + 0.5 - depth)
+    np.testing.assert_allclose(told.resolution[0, 0], tolerance / rate, rtol=1e-6)
+    assert abs(float(told.times[0, 0]) - (1.0 - rate)) <= float(told.resolution[0, 0])
+
+
 @pytest.mark.parametrize(("bend", "time"), [(1.0, 3.0), (-1.0, 0.0)])
 def test_a_guard_at_rest_on_zero_fires_only_if_it_does_not_rise(bend, time):
     """h = bend t²/2 − t³/6, from h = h' = 0."""

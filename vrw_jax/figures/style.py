@@ -65,16 +65,16 @@ OUTCOMES: dict[Outcome, tuple[str, str]] = {
     Outcome.COLLAPSED: ("collapsed", ORANGE),
     Outcome.LEG_1_LIFTED_OFF: ("Leg 1 lifted off", PINK),
     Outcome.NO_TOUCHDOWN_IN_TIME: ("no touchdown in time", "#999933"),
-    Outcome.SOLVER_GAVE_UP: ("solver gave up", "#882255"),
+    Outcome.SOLVER_GAVE_UP: ("solver gave up", "#7A1F7B"),
     Outcome.BAD_INPUT: ("bad input", "#000000"),
     Outcome.NO_CYCLE_FOUND: ("no cycle found", "#DDDDDD"),
     Outcome.TOO_MANY_EVENTS: ("too many events", "#332288"),
     Outcome.NO_ADMISSIBLE_CONTACT: ("no admissible contact", "#661100"),
-    Outcome.THREE_FEET_LOADED: ("three feet loaded", "#44AA99"),
-    Outcome.MESH_TOO_COARSE: ("mesh too coarse", "#777777"),
-    Outcome.ORDER_DIFFERS: ("other order of events", "#AAAAAA"),
-    Outcome.BORDER_ON_THE_WAY: ("border on the way", "#555555"),
-    Outcome.FRICTION_PARADOX: ("friction paradox", "#AA4499"),
+    Outcome.THREE_FEET_LOADED: ("three feet loaded", "#3B8FBB"),
+    Outcome.MESH_TOO_COARSE: ("mesh too coarse", "#646464"),
+    Outcome.ORDER_DIFFERS: ("other order of events", "#BABABA"),
+    Outcome.BORDER_ON_THE_WAY: ("border on the way", "#454545"),
+    Outcome.FRICTION_PARADOX: ("friction paradox", "#862DB8"),
 }
 NOT_COMPUTED = ("not computed", "#FFFFFF")
 UNSTABLE = 100

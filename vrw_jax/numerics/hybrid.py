@@ -54,6 +54,7 @@ class Walk(NamedTuple):
     """Events in order of time; rows past `n_events` are zero."""
 
     times: Float[Array, " events"]
+    resolution: Float[Array, " events"]  # of each time: the state's tolerances in it
     before: Float[Array, "events dim"]  # states on the guard
     after: Float[Array, "events dim"]  # and past the reset
     modes: Int[Array, " events"]  # that ended
@@ -140,6 +141,15 @@ def _entered(mode: Mode, state: Array, time: Array, options: Options) -> tuple[P
     return integrate_phase(mode.field, watched, state, ~past, options), past
 
 
+def _resolution(mode: Mode, end: PhaseEnd, options: Options) -> Array:
+    """What the tolerances of the state are in the event's time: large where a guard is grazed."""
+    state = lax.stop_gradient(end.state)
+    values = lambda y: jnp.stack([guard.value(y) for guard in mode.guards])
+    across = jax.jacfwd(values)(state)[jnp.maximum(end.guard, 0)]
+    tolerance = options.atol + options.rtol * jnp.abs(state)
+    return lax.stop_gradient(jnp.abs(across) @ tolerance / jnp.abs(across @ mode.field(state)))
+
+
 def _left(mode: Mode, guard: Array, state: Array, own: int) -> tuple[Array, Array]:
     """State after the reset of the guard that ended the mode, and the mode that follows."""
     index = jnp.maximum(guard, 0)
@@ -153,7 +163,8 @@ def _walk(modes: tuple[Mode, ...], events: int, options: Options, start: Array, 
     def visit(own: int) -> Callable:
         def visited(state: Array, time: Array) -> tuple:
             end, past = _entered(modes[own], state, time, options)
-            return end, past, *_left(modes[own], end.guard, end.state, own)
+            seen = _resolution(modes[own], end, options)
+            return end, past, seen, *_left(modes[own], end.guard, end.state, own)
 
         return visited
 
@@ -161,7 +172,9 @@ def _walk(modes: tuple[Mode, ...], events: int, options: Options, start: Array, 
 
     def event(carry: tuple) -> tuple:
         walked, still = carry
-        end, past, after, following = lax.switch(walked.mode, visits, walked.state, walked.time)
+        end, past, seen, after, following = lax.switch(
+            walked.mode, visits, walked.state, walked.time
+        )
         happened = ~past & (end.guard >= 0)
         time = walked.time + end.duration
         still = jnp.where(time > walked.time, 0, still + 1)
@@ -176,6 +189,7 @@ def _walk(modes: tuple[Mode, ...], events: int, options: Options, start: Array, 
         return (
             Walk(
                 times=put(walked.times, time),
+                resolution=put(walked.resolution, seen),
                 before=put(walked.before, end.state),
                 after=put(walked.after, after),
                 modes=put(walked.modes, walked.mode),
@@ -192,10 +206,11 @@ def _walk(modes: tuple[Mode, ...], events: int, options: Options, start: Array, 
 
     none, zero = jnp.zeros((), jnp.int32), 0.0 * start[0]
     rows, places = jnp.zeros((events, start.size)) + zero, jnp.zeros((events,), jnp.int32)
+    none_yet = jnp.zeros(events) + zero
     first = Walk(
-        times=jnp.zeros(events) + zero, before=rows, after=rows, modes=places, guards=places,
-        n_events=none, time=zero, state=start, mode=none + mode, solver_steps=none,
-        stop=none + _GOING,
+        times=none_yet, resolution=lax.stop_gradient(none_yet), before=rows, after=rows,
+        modes=places, guards=places, n_events=none, time=zero, state=start, mode=none + mode,
+        solver_steps=none, stop=none + _GOING,
     )  # fmt: skip
     return lax.while_loop(lambda carry: carry[0].stop == _GOING, event, (first, none))[0]
 

@@ -90,7 +90,7 @@ def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
     rising = walked.states[1::2]
     axes.plot(rising[:, 0], rising[:, 2], ".-", ms=3, lw=0.3, label="returns of a walk")
     cycle = gaits(CYCLE._replace(limit=60.0))[0].x
-    axes.plot(cycle[0], cycle[1], "r*", ms=9, label="the cycle, by Newton")
+    axes.plot(cycle[0], cycle[1], "*", color="C1", ms=9, label="the cycle, by Newton")
     axes.set_xlabel("A")
     axes.set_ylabel("X")
     axes.legend()

@@ -122,7 +122,7 @@ def rows() -> Iterator[Row]:
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
     axes = figure.subplots()
     depths = 10.0 ** -np.arange(1.0, 14.0)
-    for method, marker in zip(METHODS, "o^sD", strict=True):
+    for k, (method, marker) in enumerate(zip(METHODS, "o^sD", strict=True)):
         errors = []
         for depth in depths:
             walked = method(stopped(W), (-(1.0 + depth), 0.0, 0.0, 1.0 + depth), 1, 4.0)
@@ -130,11 +130,11 @@ def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
         missed = np.array([not error < 0.5 for error in errors])
         found = np.array(errors)[~missed]
         line = axes.loglog(depths[~missed], found, marker + "-", ms=4, label=walked.method)
-        axes.loglog(depths[missed], np.full(missed.sum(), 1.0), "x", color=line[0].get_color())
+        axes.loglog(depths[missed], np.full(missed.sum(), 30.0**k), "x", color=line[0].get_color())
     axes.loglog(depths, 1e-16 / (W * np.sqrt(2.0 * depths)), "k-", lw=0.7, label="rounding")
     axes.set_xlabel("depth of touching")
     axes.set_ylabel("error of its time (×: missed)")
-    axes.legend()
+    axes.legend(loc="center right", bbox_to_anchor=(1.0, 0.6))
 
 
 CASE = Case(

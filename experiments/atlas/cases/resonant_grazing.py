@@ -50,13 +50,13 @@ def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
     depths = np.geomspace(1e-6, 0.1, 40)
     for w in (2.6, 2.2, 2.02):
         rates = [-repeating(w, d)[1] for d in depths]
-        axes.loglog(depths, rates, label=f"w = {w}")
-    axes.loglog(depths, [-rate(d) for d in depths], "k-", label="w = 2, resonance")
+        axes.loglog(depths, rates, label=f"$w = {w}$")
+    axes.loglog(depths, [-rate(d) for d in depths], "k-", label="$w = 2$, resonance")
     found = {(r["quantity"], r["found"]) for r in rows if r["method"] == "ours"}
     for depth in DEPTHS:
         for quantity, value in found:
             if quantity == f"rate after impact, depth {depth:g}":
-                axes.loglog(depth, -float(value), "ro")
+                axes.loglog(depth, -float(value), "o", color="k")
     axes.set_xlabel("depth of grazing")
     axes.set_ylabel("rate after impact")
     axes.legend()

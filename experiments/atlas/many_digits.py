@@ -1,0 +1,78 @@
+"""Gaits without a closed form in 40 digits: the truth of walkers and of the woodpecker.
+
+    python -m experiments.atlas.many_digits
+
+A case's own field, guards and resets on numbers of 40 digits, by extrapolated steps of the midpoint
+rule that keep 26; Newton's method on the map, with central differences of fourth order. Prints what
+`EXACT` in each case holds; minutes.
+"""
+
+from collections.abc import Sequence
+from importlib import import_module
+
+import mpmath
+from mpmath import mp, mpf
+
+from experiments.atlas.absolute import until
+from experiments.atlas.gaits import Exact, Return
+from experiments.shared.command import command, started
+
+CASES = {
+    "simplest_walker": ("WALKER", mpf("0.02")),
+    "compass_gait": ("COMPASS", mpf("0.01")),
+    "woodpecker": ("CYCLE", mpf("2e-4")),
+}
+"""What each case calls its map, and a step in which no guard falls and rises again, s."""
+DIFFERENCE, NEAR = mpf("1e-8"), mpf("1e-21")
+
+
+def back(told: Return, x: Sequence[mpf], step: mpf) -> tuple[mpmath.matrix, mpf]:
+    """The map, and how long it takes."""
+    y, mode, time = list(told.begin(x, mpmath)), 0, mpf(0)
+    for _ in range(told.events):
+        part = told.system[mode]
+        field = lambda y, part=part: part.field(y, mpmath)
+        met = [until(field, lambda y, e=e: e.value(y, mpmath), y, step) for e in part.edges[:1]]
+        time += met[0].time
+        for other in part.edges[1:]:
+            assert other.value(met[0].state, mpmath) > 0
+        y, mode = list(part.edges[0].reset(met[0].state, mpmath)), part.edges[0].to
+    return mpmath.matrix(told.read(y)), time
+
+
+def slopes(told: Return, x: mpmath.matrix, step: mpf) -> mpmath.matrix:
+    columns = []
+    for k in range(len(x)):
+        shift = mpmath.matrix([DIFFERENCE if i == k else 0 for i in range(len(x))])
+        at = lambda n, shift=shift: back(told, list(x + n * shift), step)[0]
+        columns.append((8 * (at(1) - at(-1)) - at(2) + at(-2)) / (12 * DIFFERENCE))
+    return mpmath.matrix([[column[i] for column in columns] for i in range(len(x))])
+
+
+def gait(told: Return, step: mpf) -> Exact:
+    x = mpmath.matrix([mpf(v) for v in told.guess])
+    identity = mpmath.eye(len(x))
+    while True:
+        jacobian = slopes(told, x, step)
+        there, period = back(told, list(x), step)
+        change = mpmath.lu_solve(jacobian - identity, x - there)
+        if mpmath.norm(change) < NEAR:
+            break
+        x = x + change
+    values = sorted(mpmath.eig(jacobian)[0], key=lambda v: (-abs(v), -v.imag))
+    return Exact(tuple(map(float, x)), float(period), tuple(map(complex, values)))
+
+
+def main() -> None:
+    parser = command(__doc__)
+    parser.add_argument("--only", choices=CASES, nargs="*", default=list(CASES))
+    chosen = started(parser)
+    mp.dps = 40
+    for name in chosen.only:
+        place, step = CASES[name]
+        case = import_module(f"experiments.atlas.cases.{name}")
+        print(f"{name}: {gait(getattr(case, place), step)}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
