@@ -1,49 +1,49 @@
 """Every gait that walks reach is found cold, with 5 to 16 legs and parameters far off the box.
 
-    python -m experiments.gaits.off_the_box [folder]
+    python -m experiments.gaits.off_the_box [folder] [--legs 5 6 8 16] [--wheels 40] [--seed 0]
 
-Random wheels walk from several starts until they repeat; `vrw.limit_cycles` then gets the wheels
-alone. Writes `off_the_box.csv` to `results/` or the folder given: by number of legs how many walk,
-how many of these are found, by the search alone and by `limit_cycles`, and the time it took.
+Random wheels walk from several starts until they repeat; `vrw.limit_cycles` then gets those that
+do, their parameters alone. Writes `off_the_box.csv` to `results/` or the folder given: by number of
+legs how many walk, how many of these are found, by the search alone and by `limit_cycles`, and the
+time it took; and `off_the_box_missed.csv`, those that are not.
 """
 
+import argparse
 import time
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
 
 import vrw_jax as vrw
-from experiments.shared.command import started_with_folder
+from experiments.shared import tables
+from experiments.shared.command import command, started
 
-LEGS = (5, 6, 8, 16)
-WHEELS = 40
-"""For each number of legs; of all 160 some 27 walk, and it takes three minutes of one core."""
 RANGES = {"damping": (5, 250), "stiffness": (200, 1200), "natural_length": (1.005, 1.06),
           "slope": (0.05, 0.5)}  # fmt: skip
 STEPS, SAME = 150, 1e-7
 
 
-def wheels(n_legs: int) -> vrw.WheelParams:
+def wheels(n_legs: int, count: int, seed: int) -> vrw.WheelParams:
     """Random ones; the same at every run."""
-    draw = np.random.default_rng(n_legs).uniform
+    draw = np.random.default_rng(n_legs + seed).uniform
     table_1 = vrw.WheelParams(n_legs=n_legs)
-    drawn = {name: jnp.asarray(draw(*ends, WHEELS)) for name, ends in RANGES.items()}
-    return jax.tree.map(lambda x: jnp.broadcast_to(x, WHEELS), vrw.WheelParams(
+    drawn = {name: jnp.asarray(draw(*ends, count)) for name, ends in RANGES.items()}
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, count), vrw.WheelParams(
         n_legs=n_legs, hub_mass=table_1.hub_mass, **drawn
     ))  # fmt: skip
 
 
 def walked(params: vrw.WheelParams) -> np.ndarray:
     """Section states that each wheel's walks repeat, (lanes, 3), NaN where none does."""
-    s, random = params.symbols(), np.random.default_rng(0)
-    states = np.full((WHEELS, 3), np.nan)
+    s, random, count = params.symbols(), np.random.default_rng(0), len(params.damping)
+    states = np.full((count, 3), np.nan)
     for _ in range(9):
-        theta = random.uniform(0.0, 0.5 * float(s.alpha), WHEELS)
+        theta = random.uniform(0.0, 0.5 * float(s.alpha), count)
         rolling = np.sqrt(4.0 * 9.81 * np.sin(0.5 * s.alpha) * np.sin(params.slope)) / s.sin_alpha
-        rate = random.uniform(0.3, 1.1, WHEELS) * rolling
-        x = np.stack([theta, rate, np.full(WHEELS, -0.1)], 1)
+        rate = random.uniform(0.3, 1.1, count) * rolling
+        x = np.stack([theta, rate, np.full(count, -0.1)], 1)
         before = vrw.steps(params, x, STEPS)
         after = vrw.steps(params, np.asarray(before.section_state), 1)
         moved = np.abs(np.asarray(after.section_state - before.section_state)).max(1)
@@ -53,32 +53,50 @@ def walked(params: vrw.WheelParams) -> np.ndarray:
     return states
 
 
+def surveyed(n_legs: int, count: int, seed: int) -> tuple[tables.Row, list[tables.Row]]:
+    """A row of counts, and the wheels that walk and were not found."""
+    every = wheels(n_legs, count, seed)
+    states = walked(every)
+    (walking,) = np.nonzero(np.isfinite(states[:, 0]))
+    params = jax.tree.map(lambda x: x[walking], every)
+    alone = np.asarray(jax.vmap(vrw.limit_cycle)(params).found)
+    begin = time.perf_counter()
+    cycles = vrw.limit_cycles(params)
+    found = np.asarray(cycles.found)
+    seconds = time.perf_counter() - begin
+    there = np.abs(np.asarray(cycles.section_state) - states[walking]).max(1) < 1e-3
+    row = {
+        "legs": n_legs, "wheels": count, "walk": len(walking),
+        "found by the search alone": alone.sum(), "found": found.sum(),
+        "found where the walk is": (found & there).sum(),
+        "seconds, compiling included": f"{seconds:.1f}",
+    }  # fmt: skip
+    missed = [
+        {"legs": n_legs, "why": vrw.Outcome(int(cycles.outcome[i])).name}
+        | {name: float(getattr(params, name)[i]) for name in RANGES}
+        | dict(zip(("theta", "dtheta", "dL1"), states[walking[i]], strict=True))
+        for i in np.flatnonzero(~found)
+    ]
+    return {name: str(value) for name, value in row.items()}, missed
+
+
 def main() -> None:
-    folder, rows = started_with_folder(__doc__), []
-    for n_legs in LEGS:
-        params = wheels(n_legs)
-        states = walked(params)
-        reached = np.isfinite(states[:, 0])
-        alone = np.asarray(jax.vmap(vrw.limit_cycle)(params).found)
-        begin = time.perf_counter()
-        cycles = vrw.limit_cycles(params)
-        seconds = time.perf_counter() - begin
-        found = np.asarray(cycles.found)
-        there = np.abs(np.asarray(cycles.section_state) - states).max(1) < 1e-3
-        rows.append(
-            {
-                "legs": n_legs,
-                "wheels": WHEELS,
-                "walk": int(reached.sum()),
-                "found by the search alone": int((reached & alone).sum()),
-                "found": int((reached & found).sum()),
-                "found where the walk is": int((reached & found & there).sum()),
-                "found beside": int((found & ~reached).sum()),
-                "seconds, compiling included": round(seconds, 1),
-            }
-        )
-        print(rows[-1], flush=True)
-    pd.DataFrame(rows).to_csv(folder / "off_the_box.csv", index=False)
+    parser = command(__doc__)
+    parser.add_argument("folder", type=Path, nargs="?", default="results")
+    parser.add_argument("--legs", type=int, nargs="+", default=(5, 6, 8, 16))
+    parser.add_argument("--wheels", type=int, default=40, help="for each number of legs")
+    parser.add_argument("--seed", type=int, default=0, help="of the wheels")
+    chosen: argparse.Namespace = started(parser)
+    rows: list[tables.Row] = []
+    lost: list[tables.Row] = []
+    for n_legs in chosen.legs:
+        row, missed = surveyed(n_legs, chosen.wheels, chosen.seed)
+        rows.append(row)
+        lost += missed
+        print(row, *missed, sep="\n", flush=True)
+        tables.write_named(chosen.folder / "off_the_box.csv", rows)
+        tables.write_named(chosen.folder / "off_the_box_missed.csv", lost)
+        jax.clear_caches()  # of programs for this number of legs
 
 
 if __name__ == "__main__":

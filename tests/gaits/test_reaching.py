@@ -52,6 +52,18 @@ def test_a_gait_of_16_legs_is_walked_to():
     np.testing.assert_allclose(cycle.durations, (0.366, 0.0056, 0.0329), atol=1e-3)
 
 
+def test_a_gait_that_rolls_from_double_support_into_double_support_is_walked_to():
+    # Leg 1 is all but normal to the slope at touchdown: few walks begin that far down.
+    params = vrw.WheelParams(
+        n_legs=16, damping=24.445, stiffness=1185.05, natural_length=1.02303, slope=0.202537
+    )
+    cycle = vrw.limit_cycle(params)
+    assert int(cycle.outcome) == vrw.Outcome.STEPPED
+    np.testing.assert_allclose(cycle.durations, (0.22908, 0.00814, 0.02849), atol=1e-4)
+    walked = vrw.steps(jax.tree.map(lambda x: x[None], params), cycle.section_state[None], 1)
+    assert np.abs(walked.section_state[0] - cycle.section_state).max() < 1e-8
+
+
 def test_what_a_finer_mesh_found_has_its_derivatives():
     period = lambda slope: vrw.limit_cycle(vrw.WheelParams(slope=slope)).period
     at, step = 0.12, 1e-6

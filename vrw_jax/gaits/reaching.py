@@ -25,7 +25,13 @@ from vrw_jax.cycles import (
     Located,
     WalkedCycle,
 )
-from vrw_jax.gaits.attracting import NEAR, gaits_attracting, starts_of, walked
+from vrw_jax.gaits.attracting import (
+    NEAR,
+    further_starts_of,
+    gaits_attracting,
+    starts_of,
+    walked,
+)
 from vrw_jax.numerics import Options, in_batches, select
 from vrw_jax.walks import ModelLike
 from vrw_jax.wheel import Outcome, WheelParams, parameters_of
@@ -277,14 +283,14 @@ def _walked(finder: CollocationFinder, params: WheelParams, wanted: np.ndarray) 
     """Walks of the wheels that are `wanted`."""
     n, places = len(wanted), np.flatnonzero(wanted)
     best, x = np.full(n, np.inf), np.zeros((n, 3))
-    if not len(places):
-        return _Walks(wanted, x)
-    own, model = _taken(params, places), finder.model
-    for start in starts_of(own):
-        states, _, missed = walked(own, start, model, finder.period_n)
-        nearer = missed < best[places]
-        lanes = places[nearer]
-        best[lanes], x[lanes] = missed[nearer], states[nearer]
+    for begin in (starts_of, further_starts_of):
+        own = _taken(params, places)
+        for start in begin(own) if len(places) else ():
+            states, _, missed = walked(own, start, finder.model, finder.period_n)
+            nearer = missed < best[places]
+            lanes = places[nearer]
+            best[lanes], x[lanes] = missed[nearer], states[nearer]
+        places = np.flatnonzero(wanted & (best >= NEAR))
     return _Walks(best < NEAR, x)
 
 
