@@ -1,5 +1,7 @@
 """Whatever takes a model uses it: an option of the model shows in what every function tells."""
 
+import inspect
+
 import jax
 import numpy as np
 import pytest
@@ -99,3 +101,88 @@ def test_the_return_map_goes_on_where_the_ground_may_pull():
     )
     assert np.all(np.asarray(lifted) == 0.0)
     assert np.all(np.asarray(held) != 0.0)
+
+
+PULLED = vrw.WheelParams(damping=41.2, stiffness=684.0, natural_length=1.066, slope=0.124)
+"""In its gait the ground would have to pull on Leg 1 for a while in double support."""
+NEAR = (683.0, 685.0)
+
+
+def goes(call):
+    """Whether it does not refuse for want of a gait."""
+    try:
+        call()
+    except ValueError as refusal:
+        if "no gait" not in str(refusal):
+            raise
+        return False
+    return True
+
+
+def branch_of(branch):
+    return branch.outcome == Outcome.STEPPED
+
+
+GAITS = {
+    "limit_cycle": lambda m: vrw.limit_cycle(PULLED, model=m).found,
+    "limit_cycles": lambda m: vrw.limit_cycles(batch(PULLED), model=m).found[0],
+    "scan": lambda m: (
+        not vrw.scan(
+            vrw.grid(damping=[41.2], stiffness=[684.0], natural_length=[1.066], slope=[0.124]),
+            ["speed"],
+            model=m,
+        ).outcome.values.ravel()[0]
+    ),
+    "sensitivities": lambda m: goes(
+        lambda: vrw.sensitivities(PULLED, measures=("speed",), model=m)
+    ),
+    "continue_branch": lambda m: branch_of(vrw.continue_branch(PULLED, "stiffness", NEAR, model=m)),
+    "continue_branches": lambda m: branch_of(
+        vrw.continue_branches(batch(PULLED), "stiffness", NEAR, model=m)[0]
+    ),
+    "tune": lambda m: goes(
+        lambda: vrw.tune(
+            PULLED, "speed", ["stiffness"], {"stiffness": NEAR}, {}, model=m, max_evaluations=1
+        )
+    ),
+}
+"""By function: whether it tells of that gait."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n in LONG)) for n in GAITS]
+)
+def test_a_gait_on_ground_that_pulls_is_one_where_the_ground_may(name):
+    lifted, held = (
+        bool(GAITS[name](vrw.ViscoelasticWheel(stop_at_lift_off=stops))) for stops in (True, False)
+    )
+    assert held
+    assert not lifted
+
+
+def test_every_function_that_takes_a_model_is_tried_with_both_of_its_options():
+    public = {name: getattr(vrw, name) for name in vrw.__all__ if name != "plot"}
+    functions = {name: f for name, f in public.items() if inspect.isfunction(f)}
+    taking = {name for name, f in functions.items() if "model" in inspect.signature(f).parameters}
+    assert taking - {"return_map"} == set(OUTCOMES) | set(GAITS)
+    measured = {"steps", "walk", "simulate", "return_map"}  # tell no margin of friction
+    assert taking - measured == set(FRICTION)
+
+
+@pytest.mark.slow
+def test_a_curve_of_a_border_is_that_of_the_model_of_its_gait():
+    # The need of friction at the fore foot that this border of the gait's ground marks.
+    rough = vrw.ViscoelasticWheel(friction=1.05)
+    gait = vrw.limit_cycle(vrw.WheelParams(damping=40.0), model=rough)
+    (border,) = [
+        border
+        for border in vrw.continue_branch(
+            vrw.WheelParams(damping=40.0), "damping", (20.0, 45.0), model=rough
+        ).borders
+        if border.name == "friction_fore"
+    ]
+    curve = vrw.border_curve(
+        "friction_fore", ("damping", "stiffness"), gait, bounds={"stiffness": (498.0, 502.0)}
+    )
+    off = np.abs(curve.values - (border.value, 500.0)).max(1)
+    assert np.min(off) < 1e-6
