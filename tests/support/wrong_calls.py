@@ -36,6 +36,7 @@ def make() -> None:
     import jax
     import jax.numpy as jnp
     import numpy as np
+    import xarray as xr
 
     import vrw_jax as vrw
 
@@ -643,6 +644,69 @@ def make() -> None:
         "ValueError",
         "saltelli",
     )
+    many = {"table": ({}, "TypeError"), "nothing": (None, "TypeError")}
+    family("default_margins", lambda v: vrw.default_margins(v), many, "params")
+    use(
+        "default_margins of a batch",
+        lambda: vrw.default_margins(several),
+        "ValueError",
+        "one wheel",
+    )
+    family("open_scan", lambda v: vrw.open_scan(v), many | {"number": (3, "TypeError")}, "path")
+    use("explore a table", lambda: vrw.explore(dataset={}), "TypeError", "dataset is {}")
+    family(
+        "newton_cycle tolerance",
+        lambda v: vrw.newton_cycle(lambda x: x, start, tolerance=v),
+        positive,
+        "tolerance",
+    )
+
+    # Borders in two parameters: all but the gait itself is looked at first
+    def curve(name="lambda_4_plus", parameters=("damping", "slope"), cycle=table_1, **given):
+        return vrw.border_curve(name, parameters, cycle, **given)
+
+    pairs = {
+        "one": ("damping", "ValueError"),
+        "three": (("damping", "slope", "stiffness"), "ValueError"),
+        "twice one": (("slope", "slope"), "ValueError"), "number": (3, "TypeError"),
+        "misspelt": (("dampin", "slope"), "ValueError"),
+        "friction": (("slope", "friction"), "ValueError"),
+    }  # fmt: skip
+    family("border_curve of", lambda v: curve(parameters=v), pairs, "parameter")
+    boxes = {
+        "list": ([1.0, 2.0], "TypeError"), "one number": ({"slope": 0.3}, "TypeError"),
+        "misspelt": ({"slop": (0.1, 0.2)}, "ValueError"),
+        "empty": ({"slope": (0.3, 0.3)}, "ValueError"),
+    }  # fmt: skip
+    family("border_curve bounds", lambda v: curve(bounds=v), boxes, "")
+    use("border_curve of a wheel", curve, "TypeError", "cycle is")
+
+    # Pictures
+    plot = vrw.plot
+    nothing = many | {"another's dataset": (xr.Dataset(), "ValueError")}
+    pictures = {
+        "gait_panels": plot.gait_panels, "sticks": plot.sticks, "indicators": plot.indicators,
+        "walk_frames": plot.walk_frames, "scan_figures": plot.scan_figures,
+        "orbit_figure": plot.orbit_figure,
+        "map_figure": lambda v: plot.map_figure(v, "speed", []),
+    }  # fmt: skip
+    for name, draw in pictures.items():
+        family(f"plot {name}", draw, nothing, "")
+    lists = many | {
+        "one alone": (xr.Dataset(), "TypeError"),
+        "none": ([], "ValueError"),
+    }
+    for name, draw in {
+        "foot_height": plot.foot_height, "rear_force": plot.rear_force,
+        "basin_figure": lambda v: plot.basin_figure(v, ["any"]),
+    }.items():  # fmt: skip
+        family(f"plot {name}", draw, lists, "")
+    for name, draw in {
+        "branch_figure": plot.branch_figure,
+        "tuning_figure": plot.tuning_figure,
+    }.items():
+        family(f"plot {name}", draw, many, "")
+
     use("a name that is not there", lambda: vrw.limit_cycel, "AttributeError", "limit_cycle")
     use("indices of a table", lambda: vrw.sobol_indices({}), "TypeError", "scan")
 

@@ -344,7 +344,8 @@ def tune(
 
     Climbs along the branch of gaits with exact gradients, then walks the tuned wheel. Writes
     path.zarr (every gait evaluated), summary.md, wheel.toml (the tuned wheel) and pictures (PNG and
-    SVG) into the folder. Exit code 1 if it did not end at an optimum.
+    SVG) into the folder. Exit code 1 if it did not end at an optimum, 2, with
+    nothing written, if its start has no gait.
 
     [bold]Examples[/bold]
 

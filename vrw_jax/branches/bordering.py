@@ -46,8 +46,8 @@ from vrw_jax.numerics import (
 )
 from vrw_jax.results import MARGINS, attrs_of, provenance, require_known
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.wheel import Outcome, WheelParams, wheel_of
-from vrw_jax.wording import instance, range_of
+from vrw_jax.wheel import DOMAINS, Outcome, WheelParams, wheel_of
+from vrw_jax.wording import instance, names_of, range_of
 
 Box = Mapping[str, tuple[float, float]]
 
@@ -220,6 +220,24 @@ def border_curve(
     return curve
 
 
+def _plane(parameters: Any, bounds: Any) -> tuple[tuple[str, str], np.ndarray]:
+    """The two parameters and their ranges, or one sentence."""
+    instance("bounds", bounds, (Mapping, type(None)), "write {'damping': (100.0, 200.0)}")
+    box = {**BOX, **(bounds or {})}
+    pair = names_of("parameters", parameters)
+    for name in box:
+        require_known(name, tuple(DOMAINS), "parameter that has bounds")
+    for name in pair:
+        require_known(name, tuple(box), "parameter with bounds")
+    if len(pair) != 2 or len(set(pair)) != 2:
+        raise ValueError(
+            f"parameters are {pair}, but a border's curve needs two different ones: write "
+            "('damping', 'slope')."
+        )
+    ranges = {name: range_of(f"bounds[{name!r}]", ends) for name, ends in box.items()}
+    return (pair[0], pair[1]), np.array([ranges[name] for name in pair], float)
+
+
 def border_curves(
     names: tuple[str, ...] | None,
     parameters: tuple[str, str],
@@ -230,20 +248,21 @@ def border_curves(
     step_options: Options | None = None,
 ) -> tuple[BorderCurve, ...]:
     """`border_curve` of several; with None of all that branches through the box and curves meet."""
-    box = {**BOX, **(bounds or {})}
+    parameters, box = _plane(parameters, bounds)
     first, second = parameters
-    for parameter in parameters:
-        require_known(parameter, tuple(box), "parameter with bounds")
-        range_of(f"bounds[{parameter!r}]", box[parameter])
     instance("cycle", cycle, LimitCycle, "give vrw.limit_cycle(params)")
-    if first == second or cycle.period_n != 1:
-        raise ValueError("a border's curve needs two different parameters and a gait of one step.")
+    if cycle.period_n != 1:
+        raise ValueError(f"the gait has {cycle.period_n} steps: a border's curve takes one step.")
+    options = ArclengthOptions(max_points=1000) if options is None else options
+    step_options = Options.tight() if step_options is None else step_options
+    instance("options", options, ArclengthOptions, "give vrw.ArclengthOptions()")
+    instance("step_options", step_options, Options, "give vrw.Options()")
     map_of = _Map(
         parameters,
-        np.array([box[name] for name in parameters], float),
+        box,
         cycle.model,
-        ArclengthOptions(max_points=1000) if options is None else options,
-        Options.tight() if step_options is None else step_options,
+        options,
+        step_options,
     )
     params = wheel_of(cycle.parameters, cycle.problem.n_legs)
     if names is None:

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from vrw_jax.numerics import Elementwise, Passage
 from vrw_jax.results import MEASURES
 from vrw_jax.wheel import Motion, Symbols, WheelParams, dynamics
+from vrw_jax.wording import instance
 
 
 def takeoff_acceleration(s: Symbols, sls1: Passage) -> Elementwise:
@@ -49,6 +50,8 @@ def default_margins(params: WheelParams) -> Mapping[str, float]:
         >>> round(vrw.default_margins(vrw.WheelParams())["lambda_4_plus"], 3)
         0.177
     """
+    instance("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
+    params.require_one("take one after the other")
     mass = float(params.hub_mass + params.n_legs * params.leg_mass)
     length, gravity = float(params.locked_length), float(params.gravity)
     natural = {

@@ -16,8 +16,10 @@ from vrw_jax.figures.style import (
     PAGE,
     PINK,
     YELLOW,
+    all_drawable,
     axis_label,
     draw_marks,
+    drawable,
     figure_style,
     outcome_cells,
     outcome_patches,
@@ -28,6 +30,7 @@ from vrw_jax.figures.style import (
 from vrw_jax.results import MEASURES, what_breaks
 from vrw_jax.walks import BEFORE
 from vrw_jax.wheel import Outcome
+from vrw_jax.wording import instance
 
 ENDS, BORDER = PINK, (0, (1, 1.2))
 COLOURS = {"lost": ENDS, "border_collision": GREEN}
@@ -73,6 +76,7 @@ def branch_figure(branch: Branch) -> Figure:
         >>> branch = vrw.continue_branch(vrw.WheelParams(), "damping", (190.0, 230.0))
         >>> figure = vrw.plot.branch_figure(branch)
     """
+    instance("branch", branch, Branch, "give vrw.continue_branch(params, name, bounds)")
     values, data = branch.values, branch.dataset
     borders = sorted(branch.borders, key=lambda border: border.value)
     rows = -(-len(borders) // 2)
@@ -172,6 +176,7 @@ def orbit_figure(orbits: xr.Dataset, border: float | None = None) -> Figure:
         >>> orbits = orbits.assign_attrs(parameter="damping", tried=[100.0, 120.0])
         >>> figure = vrw.plot.orbit_figure(orbits)
     """
+    drawable("orbits", orbits, ("parameter", "clearance"), "give a row a step, as its page tells")
     parameter = str(orbits.attrs["parameter"])
     value = orbits[parameter].values
     lifts, scuffs = orbits.duration_dls.values == 0.0, orbits.clearance.values < 0.0
@@ -238,6 +243,7 @@ def basin_figure(results: list[xr.Dataset], titles: list[str]) -> Figure:
         >>> found = vrw.basin(vrw.WheelParams(), starts)
         >>> figure = vrw.plot.basin_figure([found], ["Table 1"])
     """
+    all_drawable("results", results, ("outcome", "attractor"), "give vrw.basin(params, grid)")
     codes = sorted({int(c) for r in results for c in np.unique(r.outcome) if c != Outcome.STEPPED})
     figure = Figure(figsize=(PAGE, 3.3))
     panels = figure.subplots(1, len(results), sharey=True, squeeze=False)[0]

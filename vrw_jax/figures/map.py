@@ -18,6 +18,7 @@ from vrw_jax.figures.style import (
     PINK,
     SKY,
     axis_label,
+    drawable,
     figure_style,
     typeset,
 )
@@ -45,6 +46,7 @@ def map_figure(scan: xr.Dataset, measure: str, curves: Sequence[BorderCurve]) ->
         >>> grid = vrw.grid(damping=[150.0, 200.0], slope=[0.28, 0.3])
         >>> figure = vrw.plot.map_figure(vrw.scan(grid, ["speed"]), "speed", [])
     """
+    drawable("scan", scan, ("outcome", measure), "give vrw.scan of two parameters and the measure")
     x, y = curves[0].parameters if curves else tuple(map(str, scan.dims))
     figure = Figure(figsize=(PAGE, 0.62 * PAGE))
     axes = figure.subplots()

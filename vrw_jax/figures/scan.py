@@ -24,6 +24,7 @@ from vrw_jax.figures.style import (
     SKY,
     UNSTABLE,
     axis_label,
+    drawable,
     figure_style,
     outcome_cells,
     outcome_patches,
@@ -71,6 +72,7 @@ def scan_figures(scan: xr.Dataset) -> dict[str, Figure]:
         >>> sorted(vrw.plot.scan_figures(found))
         ['scan_over_damping']
     """
+    drawable("scan", scan, ("outcome",), "give vrw.scan(design)")
     names = [name for name in dict.fromkeys(PREFERRED) if name in scan.coords]
     if "sample" in scan.dims:
         swept = [name for name in names if np.ptp(scan[name].values) > 0.0] or names

@@ -12,6 +12,7 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+import xarray as xr
 from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
@@ -20,6 +21,7 @@ from matplotlib.patches import Patch
 
 from vrw_jax.results import MEASURES, as_tex
 from vrw_jax.wheel import Outcome
+from vrw_jax.wording import instance
 
 BLUE, ORANGE, GREEN, PINK, SKY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9"
 AMBER, YELLOW = "#E69F00", "#F0E442"
@@ -123,6 +125,23 @@ def save(figure: Figure, folder: Path, name: str) -> list[Path]:
         figure.savefig(paths[0], metadata={"Date": None})
         figure.savefig(paths[1], metadata={"Software": None})
     return paths
+
+
+def drawable(name: str, data: Any, needed: Sequence[str], advice: str) -> None:
+    """Refuse what is no dataset, or one of something else."""
+    instance(name, data, xr.Dataset, advice)
+    missing = [one for one in needed if one not in data.variables and one not in data.attrs]
+    if missing:
+        raise ValueError(f"{name} holds no {missing[0]!r}, which is to be drawn: {advice}.")
+
+
+def all_drawable(name: str, several: Any, needed: Sequence[str], advice: str) -> None:
+    """Refuse what is no list of such datasets."""
+    instance(name, several, (list, tuple), f"{advice}, several in a list")
+    if not several:
+        raise ValueError(f"{name} is empty, but something is to be drawn: {advice}.")
+    for i, data in enumerate(several):
+        drawable(f"{name}[{i}]", data, needed, advice)
 
 
 def typeset(text: str) -> str:

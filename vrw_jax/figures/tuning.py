@@ -19,6 +19,7 @@ from vrw_jax.figures.style import (
 )
 from vrw_jax.results import MEASURES
 from vrw_jax.tuning import ACTIVE, Kind, Tuned
+from vrw_jax.wording import instance
 
 ROW = 0.19
 """Height of a constraint's row, inches."""
@@ -42,6 +43,7 @@ def tuning_figure(tuned: Tuned) -> Figure:
         >>> tuned = vrw.tune(vrw.WheelParams(), "dls_fraction", ["damping"], bounds)
         >>> figure = vrw.plot.tuning_figure(tuned)
     """
+    instance("tuned", tuned, Tuned, "give vrw.tune(params, objective, free, bounds)")
     path = tuned.path
     n = path.sizes["constraint"]
     figure = Figure(figsize=(PAGE, max(3.2, ROW * n + 1.0)))

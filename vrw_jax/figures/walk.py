@@ -18,17 +18,23 @@ from vrw_jax.figures.style import (
     LIGHT,
     PAGE,
     SKY,
+    all_drawable,
     axis_label,
     draw_marks,
+    drawable,
     figure_style,
     panel_letter,
     value_label,
 )
 from vrw_jax.results import MEASURES, PHASES
+from vrw_jax.wording import instance
 
 Coordinate = float | np.ndarray
 
 FORCES = ("lambda_1", "lambda_2", "lambda_3", "lambda_4")
+
+
+GAIT = "give vrw.simulate(params)"
 
 
 def phase_spans(gait: xr.Dataset) -> list[tuple[float, float, int]]:
@@ -70,6 +76,7 @@ def gait_panels(gait: xr.Dataset) -> Figure:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
         >>> figure = vrw.plot.gait_panels(gait)
     """
+    drawable("gait", gait, ("phase", *FORCES), GAIT)
     time, theta, L1, L2, z2, *forces = broken_at_events(
         gait, "theta", "L1", "L2", "foot_2_z", *FORCES
     )
@@ -128,6 +135,7 @@ def sticks(gait: xr.Dataset, interval: float = 0.05) -> Figure:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
         >>> figure = vrw.plot.sticks(gait, interval=0.1)
     """
+    drawable("gait", gait, ("phase", "foot_1_x"), GAIT)
     tones = ("#A0A0A0", SKY, "#000000")
     time = gait.time.values
     figure = Figure(figsize=(PAGE, 2.8))
@@ -188,6 +196,7 @@ def foot_height(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
         >>> figure = vrw.plot.foot_height([gait])
     """
+    all_drawable("gaits", gaits, ("phase", "foot_2_z"), GAIT)
     figure = Figure(figsize=(PAGE, 2.6))
     whole, near = figure.subplots(1, 2)
     for gait, line in zip(gaits, LINES, strict=False):
@@ -229,6 +238,7 @@ def rear_force(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
         >>> figure = vrw.plot.rear_force([gait])
     """
+    all_drawable("gaits", gaits, ("phase", "lambda_4"), GAIT)
     figure = Figure(figsize=(COLUMN, 2.5))
     axes = figure.subplots()
     for gait, line in zip(gaits, LINES, strict=False):
@@ -268,6 +278,9 @@ def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
         >>> gaits = xr.Dataset(over, {"damping": [80.0, 120.0]}, {"parameter_slope": 0.3})
         >>> figure = vrw.plot.indicators(gaits)
     """
+    drawable(
+        "gaits", gaits, ("settled", "lambda_I4"), "give gaits over one parameter, as its page tells"
+    )
     vary = str(gaits.settled.dims[0])
     kept = gaits.where(gaits.settled & (gaits.lambda_2_plus >= 0.0), drop=True)
     scuffs = np.minimum(kept.clearance_sls1, kept.clearance_sls2).values < 0.0
@@ -330,6 +343,7 @@ def walk_frames(
         >>> len(frames)
         2
     """
+    drawable("step", step, ("parameter_slope", "phase", "foot_2_x"), GAIT)
     slope, time = step.attrs["parameter_slope"], step.time.values
     period = time[-1]
     stride = float(step.hub_x[-1] - step.hub_x[0])
@@ -424,6 +438,7 @@ def save_animation(frames: Sequence[Image.Image], milliseconds: int, path: Path)
         >>> vrw.plot.save_animation(frames, milliseconds, path).name
         'walk.gif'
     """
+    instance("frames", frames, (list, tuple), "give those of vrw.plot.walk_frames")
     path.parent.mkdir(parents=True, exist_ok=True)
     palette = frames[0].quantize(32)
     reduced = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.numerics.derivatives import with_jacobian
 from vrw_jax.numerics.types import Scalar
-from vrw_jax.wording import function_of, reals, whole
+from vrw_jax.wording import function_of, positive, reals, whole
 
 
 class SectionCycle(NamedTuple):
@@ -120,6 +120,8 @@ def newton_cycle(
     function_of("function", function, "that maps a state to the next")
     start, period_n = reals("start", start), whole("period_n", period_n)
     iterations = whole("iterations", iterations)
+    if not isinstance(tolerance, jax.Array):
+        positive("tolerance", tolerance)
 
     def iterate(x: Array) -> Array:
         for _ in range(period_n):

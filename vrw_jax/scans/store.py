@@ -39,6 +39,7 @@ from vrw_jax.scans.soundness import (
     manifest_of,
     told_damage,
 )
+from vrw_jax.wording import instance
 
 if TYPE_CHECKING:
     import zarr
@@ -250,6 +251,7 @@ def open_scan(path: str | Path, *, verify: bool = True) -> xr.Dataset:
         ...     found = vrw.scan(design, ["speed"], store=path).load()
         ...     xr.testing.assert_identical(vrw.open_scan(path).speed.load(), found.speed)
     """
+    instance("path", path, (str, Path), "give the folder that a scan wrote")
     group = _require_scan(Path(path))
     books = Books(Path(path), group)
     if verify:

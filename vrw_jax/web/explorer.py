@@ -179,6 +179,9 @@ def _values(params: WheelParams, friction: float, rung: str) -> dict[str, float 
 
 def _map_of(dataset: "xr.Dataset") -> dict[str, Any]:
     """A scan over a grid of two parameters as the page's map takes it; None for no number."""
+    import xarray
+
+    instance("dataset", dataset, xarray.Dataset, "give a scan of vrw.grid over two parameters")
     axes = [str(name) for name in dataset.sizes if name in DOMAINS and dataset.sizes[name] > 1]
     if len(axes) != 2:
         raise ValueError(
