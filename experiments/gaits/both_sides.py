@@ -1,0 +1,120 @@
+"""Gaits at 1e-9 to both sides of a border's curve, found cold, differ in the sign of what vanishes.
+
+    python -m experiments.gaits.both_sides [folder]
+
+The eight borders of the branch along the damping (docs/branches.md) are followed over the damping
+and each of stiffness, natural length and slope; beside random points of each curve gaits are
+searched for from their parameters alone. An indicator's gaits are on one side only. Writes
+`both_sides.csv` to `results/` or the folder given: by curve how many points were asked, at how many
+the signs are right with the gaits found cold (which may be none, or another gait of the wheel), at
+how many with the curve's own gait as a guess, and at how many neither. Some minutes of one core.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import vrw_jax as vrw
+from experiments.shared import tables
+from experiments.shared.command import started_with_folder
+from vrw_jax.branches.bordering import BOX, Box, border_curves
+
+BORDERS = ("lambda_2_plus", "lambda_4_plus", "clearance_sls1", "clearance_sls2", "friction_fore",
+           "friction_rear", "landing_friction_fore", "hit_planted_impulse")  # fmt: skip
+SECONDS = ("stiffness", "natural_length", "slope")
+POINTS = 24
+"""Of each curve."""
+
+DISTANCE = 1e-9
+"""From a curve, as a share of the ranges of the parameters."""
+
+SAME = 1e-3
+"""Distance of section states below which gaits are one; beside a fold they part like its root."""
+
+MARGINS_OF_JURY = ("fold", "period_doubling", "neimark_sacker")
+
+
+def beside(curve: vrw.BorderCurve, places: np.ndarray, box: Box) -> np.ndarray:
+    """Values of the two parameters at the distance to either side, (side, place, parameter)."""
+    widths = np.array([np.ptp(box[name]) for name in curve.parameters])
+    shares = curve.values / widths
+    along = shares[places + 1] - shares[places - 1]
+    across = np.stack([-along[:, 1], along[:, 0]], -1)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    return curve.values[places] + np.array([-1.0, 1.0])[:, None, None] * DISTANCE * across * widths
+
+
+class Beside(NamedTuple):
+    """Gaits at some parameters."""
+
+    there: np.ndarray  # whether there is the gait that the curve has
+    told: np.ndarray  # what vanishes on the curve
+
+
+def of_gaits(curve: vrw.BorderCurve, places: np.ndarray, values: np.ndarray, cold: bool) -> Beside:
+    """The gaits there, from nothing or from the curve's own."""
+    params = vrw.WheelParams(**dict(zip(curve.parameters, values.T, strict=True)))
+    params = jax.tree.map(lambda x: jnp.broadcast_to(x, len(values)), params)
+    near = jnp.asarray(curve.dataset.section_state.values[places])
+    options, tight = vrw.CycleOptions.tight(), vrw.Options.tight()
+    if cold:
+        gait = jax.vmap(lambda p: vrw.limit_cycle(p, options=options))(params)
+    else:
+        gait = jax.vmap(lambda p, x: vrw.limit_cycle(p, guess=x, options=options))(params, near)
+    if curve.name in MARGINS_OF_JURY:
+        told = gait.jury_margins[:, MARGINS_OF_JURY.index(curve.name)]
+    elif curve.name.startswith("lambda_"):
+        told = getattr(gait.indicators, curve.name.removesuffix("_plus"))
+    elif curve.name == "clearance_sls1":
+        told = gait.takeoff_acceleration
+    else:
+        steps = jax.vmap(lambda p, x: vrw.step(p, x, options=tight))(params, gait.section_state)
+        name, _, leg = curve.name.partition("[")
+        told = getattr(steps.monitors, name)
+        told = told[:, int(leg[:-1]) - 3] if leg else told
+    same = np.abs(np.asarray(gait.section_state - near)).max(1) < SAME
+    return Beside(np.asarray(gait.found) & same, np.asarray(told))
+
+
+def right(name: str, one: Beside, other: Beside) -> np.ndarray:
+    """Whether signs differ; an indicator, with gaits on one side alone, is to vanish there."""
+    if name.startswith("lambda_"):
+        force = np.where(one.there, one.told, other.told)
+        return (one.there != other.there) & (force > 0.0) & (force < 1e-4)
+    return one.there & other.there & (one.told * other.told < 0.0)
+
+
+def judged(curve: vrw.BorderCurve, box: Box, count: int, random: np.random.Generator) -> dict:
+    """A row of the table."""
+    inner = np.arange(1, len(curve.values) - 1)
+    places = np.sort(random.choice(inner, min(count, len(inner)), replace=False))
+    sides = beside(curve, places, box)
+    good = {}
+    for cold in (True, False):
+        one, other = (of_gaits(curve, places, values, cold) for values in sides)
+        good[cold] = right(curve.name, one, other)
+    at = curve.values[places][~good[True] & ~good[False]]
+    return {
+        "over": curve.parameters[1], "border": curve.name, "points of the curve": len(curve.values),
+        "asked": len(places), "right, found cold": good[True].sum(),
+        "right, from the curve's own gait": good[False].sum(),
+        "neither": (~good[True] & ~good[False]).sum(),
+        "where neither": " ".join(f"{v:.6g}" for v in at.ravel()[:4]),
+    }  # fmt: skip
+
+
+def main() -> None:
+    folder, rows = started_with_folder(__doc__), []
+    cycle = vrw.limit_cycle(vrw.WheelParams(damping=150.0))
+    random = np.random.default_rng(19)
+    for second in SECONDS:
+        for curve in border_curves(BORDERS, ("damping", second), cycle):
+            rows.append(judged(curve, BOX, POINTS, random))
+            print(rows[-1], flush=True)
+            tables.write_named(folder / "both_sides.csv", rows)
+
+
+if __name__ == "__main__":
+    main()
