@@ -307,14 +307,11 @@ def test_a_step_of_lanes_tells_what_a_single_wheel_does_and_how_it_moves(scene, 
     np.testing.assert_array_equal(only.slip[:, 0], moved.slip[:, 0])
     assert not only.slip[:, 1:].any()
     alone = vrw.step(params, x, model=ground, options=vrw.Options.tight())
-    # With one-sided stoppers dips that are cut leave some 1e-6 s of a step, and energy with them.
-    near = 1e-8 if stoppers == "bilateral" else 5e-5
     for name in ("section_state", "durations", "post_impact", "slip", "energy_impacts",
                  "energy_damping", "energy_friction", "step_length", "mode_durations"):  # fmt: skip
         told = getattr(step, name)[0]
-        np.testing.assert_allclose(told, getattr(alone, name), rtol=near, atol=near, err_msg=name)
-    # Lanes look for dips by a bound that misses none, the single wheel by a parabola.
-    assert int(step.events[0]) == int(alone.events) or stoppers == "one-sided"
+        np.testing.assert_allclose(told, getattr(alone, name), rtol=1e-8, atol=1e-8, err_msg=name)
+    assert int(step.events[0]) == int(alone.events)
 
     def told(c, mu, rate):
         wheel, model = vrw.WheelParams(damping=c), eqx.tree_at(lambda m: m.friction, ground, mu)
@@ -328,7 +325,9 @@ def test_a_step_of_lanes_tells_what_a_single_wheel_does_and_how_it_moves(scene, 
     for name, column in zip(("damping", "friction", "dtheta"), exact, strict=True):
         place = names.index(name)
         found = np.concatenate([moved.section_state[0, :20, place], moved.durations[0, :, place]])
-        atol = 1e-8 if stoppers == "bilateral" else 1e-5  # other dips, see above
+        # Of chains of 60 to 85 dips: lanes at two tolerances differ by 2e-7, that of a single
+        # wheel has not been held against a second one.
+        atol = 1e-8 if stoppers == "bilateral" else 1e-5
         np.testing.assert_allclose(found, column, rtol=1e-6, atol=atol, err_msg=name)
 
 

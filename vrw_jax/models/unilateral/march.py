@@ -50,6 +50,8 @@ BURST = 8
 """Tries after which lanes at events no longer wait for those beside them."""
 PARABOLAS = 3
 """Tries at an event by parabolas; then by secants, which in stiff dips are better."""
+PATIENT = 15
+"""Tries at an event after which a guard that stands on its own event may be what is met."""
 CLOSE = 30.0
 """An event is found where the last correction to its time is no more than so many tolerances of the
 step: the proposal is a parabola's, whose own error is about a hundredth of the correction."""
@@ -82,7 +84,7 @@ class March(NamedTuple):
     here: Place
     stance: Stance
     values: Array  # guards here, (guards, lanes)
-    offset: Array  # what a guard that stands on its own event reads there: rounding
+    offset: Array  # what a guard that stands on its own event reads there, less rounding
     told: Array | None  # what is summed up since the last event, (N_TALLIED, lanes), if wanted
     h: Array  # of the next try, s
     time: Array  # since the last event, s
@@ -159,8 +161,11 @@ def set_off(flow: Flow, motion: WheelMotion, h: Array) -> March:
     """Lanes at the start of a stance, at an event again where a guard falls at once."""
     here, begun = place_of(flow, motion), begun_guards(flow)
     values, rates = guards_at(flow, here), guard_rates(flow, here)
+    # What is let go from rest reads rounding for 1e-8 s and longer: no event before it is below.
+    unread = guard_sizes(flow) * (ROUNDING * jnp.finfo(values.dtype).eps)
+    begun = begun | ((jnp.abs(values) <= unread) & (rates > 0.0))
     past = ~begun & ((values < 0.0) | ((values == 0.0) & (rates <= 0.0)))
-    offset = jnp.where(begun, values, 0.0)
+    offset = jnp.where(begun, values - 2.0 * unread, 0.0)
     zero, none = jnp.zeros_like(motion.x), jnp.zeros(motion.x.shape, jnp.int32)
     return March(
         here=here,
@@ -334,7 +339,7 @@ def _tried(flow: Flow, tableau: Tableau, options: Options, now: March) -> _Try:
     squared = _squared_error(options, errors, here, looked[-1], values)
     middle = within[tableau.inside.index(tableau.middle)] if within else now.values
     bent = parabola(tableau, now.values, middle, values)
-    to_dip = _to_earliest_dip(tableau, [now.values, *within, values])
+    to_dip = _to_earliest_dip(tableau, [now.values, *within, values], _stands(now))
     return _Try(end, squared, values, *bent, to_dip, told)
 
 
@@ -394,7 +399,8 @@ def _searched(
     h, search = now.h, now.search
     crosses = tried.values <= 0.0
     crossing = jnp.where(search.on, search.crossing | crosses, crosses)
-    first, guard = _earliest_root(now.values, tried.slope, tried.bend, crossing)
+    parabolas = now.values, tried.slope, tried.bend
+    first, guard = _earliest_root(*parabolas, crossing, _stands(now))
     by_ends, guard_by_ends = _earliest_secant(search, tried.values, h, crossing)
     slow = search.on & (search.tries >= PARABOLAS)
     proposal, guard = jnp.where(slow, by_ends, h * first), jnp.where(slow, guard_by_ends, guard)
@@ -412,7 +418,9 @@ def _searched(
     shift = following - h
     # Where a guard reads no more than its rounding, no length is better than this one.
     beside, lowest = _lowest(tried.values / sizes, crossing)
-    at_rest = search.on & (jnp.abs(lowest) <= ROUNDING * jnp.finfo(h.dtype).eps)
+    # What stands on its own event reads twice that: where no event is found it is this one.
+    reads = ROUNDING * jnp.where(search.tries < PATIENT, 1.0, 3.0) * jnp.finfo(h.dtype).eps
+    at_rest = search.on & (jnp.abs(lowest) <= reads)
     shift, guard = jnp.where(at_rest, 0.0, shift), jnp.where(at_rest, beside, guard)
     close = search.on & (jnp.abs(shift) <= accuracy)
     tries = jnp.where(search.on, search.tries + 1, 0)
@@ -432,11 +440,16 @@ def _squared_error(
     return jnp.where(jnp.isfinite(total), total / (2 * here.q.shape[0]), jnp.inf)
 
 
-def _to_earliest_dip(tableau: Tableau, values: list[Array]) -> Array:
+def _stands(now: March) -> Array:
+    """Guards on their own event, where the lane is just past it."""
+    return (now.time == 0.0) & (now.offset != 0.0)
+
+
+def _to_earliest_dip(tableau: Tableau, values: list[Array], stands: Array) -> Array:
     """Share of the step to go before a guard that may dip below zero in it, see `numerics.below`;
-    1: there is none. A guard that stands on its own event at the start has no such place."""
+    1: there is none. A guard that `stands` on its own event at the start has no such place."""
     looks, at = below(tableau, values)
-    return jnp.min(jnp.where(looks & (values[0] > 0.0), at, 1.0), axis=0)
+    return jnp.min(jnp.where(looks & (values[0] > 0.0) & ~stands, at, 1.0), axis=0)
 
 
 def _lowest(values: Array, crossing: Array) -> tuple[Array, Array]:
@@ -463,9 +476,12 @@ def _earliest_secant(
     return first, guard
 
 
-def _earliest_root(g0: Array, slope: Array, bend: Array, crossing: Array) -> tuple[Array, Array]:
+def _earliest_root(
+    g0: Array, slope: Array, bend: Array, crossing: Array, stands: Array
+) -> tuple[Array, Array]:
     """Where the first of the crossing guards' parabolas falls through zero, in step lengths, and
-    which; infinite where none does ahead."""
+    which; infinite where none does ahead. One that `stands` on its own event rises: where its
+    parabola falls at once the step is too long for parabolas."""
     discriminant = slope * slope - 4.0 * bend * g0
     root = jnp.sqrt(jnp.maximum(discriminant, 0.0))
     falling = slope < 0.0
@@ -473,6 +489,7 @@ def _earliest_root(g0: Array, slope: Array, bend: Array, crossing: Array) -> tup
     under = jnp.where(falling, root - slope, 2.0 * bend)
     place = over / jnp.where(under == 0.0, 1.0, under)
     exists = crossing & (discriminant >= 0.0) & (under != 0.0) & (place > 0.0)
+    exists = exists & ~(stands & falling)
     first, guard = jnp.full_like(place[0], jnp.inf), jnp.zeros(place.shape[-1:], jnp.int32)
     for index in reversed(range(len(place))):
         guard = jnp.where(crossing[index], index, guard)
