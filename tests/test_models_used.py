@@ -40,7 +40,7 @@ FRICTION = {
         GAIT,
         {"theta_touchdown": 0.1, "dtheta_touchdown": 1.6, "dL1_touchdown": -0.1},
         model=m,
-    ).friction_fore.values.ravel()[0],
+    ).orbit_friction_fore.values.ravel()[0],
     "sensitivities": lambda m: vrw.sensitivities(GAIT, measures=("friction_fore",), model=m).value[
         0
     ],

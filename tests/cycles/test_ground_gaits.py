@@ -307,28 +307,33 @@ def test_a_step_of_lanes_tells_what_a_single_wheel_does_and_how_it_moves(scene, 
     np.testing.assert_array_equal(only.slip[:, 0], moved.slip[:, 0])
     assert not only.slip[:, 1:].any()
     alone = vrw.step(params, x, model=ground, options=vrw.Options.tight())
+    shared = stoppers == "one-sided"
+    times = lambda durations: durations.sum(keepdims=True) if shared else durations
     for name in ("section_state", "durations", "post_impact", "slip", "energy_impacts",
                  "energy_damping", "energy_friction", "step_length", "mode_durations"):  # fmt: skip
         told = getattr(step, name)[0]
-        np.testing.assert_allclose(told, getattr(alone, name), rtol=1e-8, atol=1e-8, err_msg=name)
+        # One-sided, shares of modes and losses: the least dip lasts 3e-7 s, and rounding says in
+        # which mode. Where the step leads, and when, does not feel it.
+        share = shared and name.startswith(("durations", "mode", "energy", "slip"))
+        near = 5e-7 if share else 1e-8
+        np.testing.assert_allclose(told, getattr(alone, name), rtol=near, atol=near, err_msg=name)
+    assert abs(float(step.durations[0].sum()) - float(alone.period)) < 1e-10
     assert int(step.events[0]) == int(alone.events)
 
     def told(c, mu, rate):
         wheel, model = vrw.WheelParams(damping=c), eqx.tree_at(lambda m: m.friction, ground, mu)
         start = jnp.asarray(x).at[1].set(rate)
         advance = model.advance(wheel, start, vrw.Options.tight())
-        return jnp.concatenate([advance.section_state[:20], advance.durations])
+        return jnp.concatenate([advance.section_state[:20], times(advance.durations)])
 
     at = [jnp.asarray(v) for v in (damping, friction, x[1])]
     exact = jax.jacfwd(told, argnums=(0, 1, 2))(*at)
     names = (*ground.parameter_names, "theta", "dtheta")
     for name, column in zip(("damping", "friction", "dtheta"), exact, strict=True):
         place = names.index(name)
-        found = np.concatenate([moved.section_state[0, :20, place], moved.durations[0, :, place]])
-        # Of chains of 60 to 85 dips: lanes at two tolerances differ by 2e-7, that of a single
-        # wheel has not been held against a second one.
-        atol = 1e-8 if stoppers == "bilateral" else 1e-5
-        np.testing.assert_allclose(found, column, rtol=1e-6, atol=atol, err_msg=name)
+        found = moved.section_state[0, :20, place], times(moved.durations[0, :, place])
+        found = np.concatenate(found)
+        np.testing.assert_allclose(found, column, rtol=1e-6, atol=1e-8, err_msg=name)
 
 
 def test_newtons_method_on_lanes_goes_back_where_no_step_ends(monkeypatch):

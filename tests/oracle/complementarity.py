@@ -19,6 +19,7 @@ ALPHA = 2.0 * np.pi / N
 OFF, STICK, DOWN, UP = 0, 1, 2, 3
 ALONG = {DOWN: 1.0, UP: -1.0}
 REST = 1.4e-6  # m/s: what parts or closes more slowly is at rest, a dip of 1e-13 m
+BOUNCE = 1e-5  # m/s: a foot that would come back more slowly stays, it would rise 1e-13 m
 TOUCH = 1e-13  # m
 SOUND = 1e-9  # of weight and gravity, of momentum and speed: a sign is rounding
 ARMED = {"gap": 1e-14, "room": 1e-14, "speed": 1e-12, "force": 1e-10}
@@ -233,8 +234,8 @@ def _level(w, q, v, feet, may, at_stopper, moving):
     if moving:
         bias[: 2 * len(feet)] = more[feet].ravel()
     else:  # Newton's law: what strikes comes back
-        struck = np.minimum(of_feet[feet, 1] @ v, 0.0)
-        bias[1 : 2 * len(feet) : 2] = w.restitution * np.where(struck < -REST, struck, 0.0)
+        back = w.restitution * np.minimum(of_feet[feet, 1] @ v, 0.0)
+        bias[1 : 2 * len(feet) : 2] = np.where(back < -BOUNCE, back, 0.0)
     scales = (w.mass * w.g, w.g) if moving else (w.mass, 1.0)
     free = inverse @ force if moving else v
     return _Problem(inverse, free, feet, may, unilateral, locked, rows, bias, scales)

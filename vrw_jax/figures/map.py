@@ -23,6 +23,7 @@ from vrw_jax.figures.style import (
     typeset,
 )
 from vrw_jax.results import what_breaks
+from vrw_jax.scans import SWEPT
 
 STYLES = [(color, dash) for dash in ("-", "--", ":") for color in (
     "black", ORANGE, BLUE, GREEN, PINK, SKY, AMBER)]  # fmt: skip
@@ -47,7 +48,7 @@ def map_figure(scan: xr.Dataset, measure: str, curves: Sequence[BorderCurve]) ->
         >>> figure = vrw.plot.map_figure(vrw.scan(grid, ["speed"]), "speed", [])
     """
     drawable("scan", scan, ("outcome", measure), "give vrw.scan of two parameters and the measure")
-    x, y = curves[0].parameters if curves else tuple(map(str, scan.dims))
+    x, y = curves[0].parameters if curves else [n for n in SWEPT if n in scan.dims]
     figure = Figure(figsize=(PAGE, 0.62 * PAGE))
     axes = figure.subplots()
     axes.set_facecolor(LIGHT)

@@ -70,7 +70,7 @@ def scan_figures(scan: xr.Dataset) -> dict[str, Figure]:
     Examples:
         >>> found = vrw.scan(vrw.grid(damping=[150.0, 200.0]), ["speed", "dls_fraction"])
         >>> sorted(vrw.plot.scan_figures(found))
-        ['scan_over_damping']
+        ['scan']
     """
     drawable("scan", scan, ("outcome",), "give vrw.scan(design)")
     names = [name for name in dict.fromkeys(PREFERRED) if name in scan.coords]

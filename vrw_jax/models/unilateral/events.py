@@ -4,7 +4,7 @@ Of one wheel or, element by element, of lanes.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -206,8 +206,8 @@ def _thrown_back(law: Law, motion: WheelMotion, slots: Slots, hub: Hub, free: Fr
     """The same velocities, with what feet that strike keep of theirs by Newton's law."""
     if law.restitution is None:
         return free
-    speed = foot_velocity(motion, slots, hub).z
-    back = [law.restitution * jnp.where(z < -law.rest, z, 0.0) for z in speed]
+    back = [law.restitution * z for z in foot_velocity(motion, slots, hub).z]
+    back = [jnp.where(z < -law.rest, z, 0.0) for z in back]  # what leaves no faster is at rest
     return free._replace(
         e=(free.e[0] - hub.sin[0] * back[0], free.e[1] - hub.sin[1] * back[1]),
         u=(free.u[0] + hub.cos[0] * back[0], free.u[1] + hub.cos[1] * back[1]),
@@ -369,7 +369,7 @@ def _at_rest(
     mode = jnp.where(stays, jnp.where(contact == STICK, STICK, mode), OFF)
     on = at_stopper | (struck & (jnp.abs(motion.dL) < law.rest))
     new = jnp.any((mode != contact) | (on != at_stopper), axis=0)
-    return select(new, settled(law.s, motion, mode, on), motion), mode, on
+    return select(new, settled(law.s, motion, mode, on, law.friction), motion), mode, on
 
 
 def _joined(law: Law, motion: WheelMotion, stance: Stance, event: Event) -> Event:
@@ -438,7 +438,11 @@ def resolve(law: Law, motion: WheelMotion, stance: Stance, event: Event) -> Chan
 
 
 def settled(
-    s: Symbols, motion: WheelMotion, contact: Int[Array, "n ..."], locked: Bool[Array, "n ..."]
+    s: Symbols,
+    motion: WheelMotion,
+    contact: Int[Array, "n ..."],
+    locked: Bool[Array, "n ..."],
+    friction: Any = None,
 ) -> WheelMotion:
     """The motion that keeps to its contacts: loaded feet on the slope, sticking ones at rest.
 
@@ -447,8 +451,7 @@ def settled(
     """
     legs = directions(s, motion.theta)
     L = jnp.where((contact != OFF) & ~locked, motion.z / legs.cos, motion.L)
-    L = jnp.where(locked, s.L0, L)
-    motion = motion._replace(L=L, dL=jnp.where(locked, 0.0, motion.dL))
+    motion = motion._replace(L=jnp.where(locked, s.L0, L))
     slots = slots_of(contact != OFF)
     airborne = locked & ~slots.filled
     hub = hub_of(s, motion, slots, airborne)
@@ -457,5 +460,7 @@ def settled(
     # Two resting feet on two held legs would fix the hub twice over.
     twice = jnp.all((modes == STICK) & held, axis=0)
     held = jnp.stack([held[0], held[1] & ~twice])
-    found = answer(s, hub, free, modes, held, jnp.zeros_like(motion.theta))
-    return moved_by(s, motion, slots, hub, airborne, found)
+    rough = jnp.zeros_like(motion.theta) if friction is None else of_slots(friction, slots)
+    found = answer(s, hub, free, modes, held, rough)
+    moved = moved_by(s, motion, slots, hub, airborne, found)
+    return moved._replace(dL=jnp.where(locked, 0.0, moved.dL))
