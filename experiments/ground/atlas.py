@@ -19,8 +19,7 @@ import vrw_jax as vrw
 from experiments.shared.command import command, started
 from experiments.shared.tables import FIGURES, Row, numbers, read, write_named
 from vrw_jax import figures as plots
-from vrw_jax.cycles import finder_of
-from vrw_jax.gaits.attracting import gaits_attracting
+from vrw_jax.cycles import finder_of, gaits_attracting
 
 FRICTION = (0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9, 0.95, 1.0, 1.1, 1.2,
             1.3, 1.4, 1.5, 1.6)  # fmt: skip
@@ -39,7 +38,9 @@ def scanned(frictions: tuple[float, ...] = FRICTION) -> list[Row]:
         finder = finder_of(vrw.UnilateralWheel(friction=friction), 8)
         wheels = vrw.WheelParams(damping=jnp.asarray(DAMPING))
         wheels = jax.tree.map(lambda x: jnp.broadcast_to(x, len(DAMPING)), wheels)
-        for damping, gaits in zip(DAMPING, gaits_attracting(finder, wheels), strict=True):
+        owner, every = gaits_attracting(finder, jax.vmap(finder.model.values)(wheels))
+        for wheel, damping in enumerate(DAMPING):
+            gaits = jax.tree.map(lambda leaf, own=owner == wheel: leaf[own], every)
             found = np.asarray(gaits.found)
             where = {"friction": friction, "damping": damping, "gaits": int(found.sum())}
             if not found.any():

@@ -90,6 +90,22 @@ def test_a_scan_puts_each_sample_on_its_lowest_rung():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("damping", "friction"), [(182.5, 1.2), (204.2, 0.6), (193.3, 2.4)])
+def test_whoever_asks_for_a_gait_from_nothing_is_told_the_same(damping, friction):
+    """Walks from the rung's own start settle late here, or Newton's method goes elsewhere."""
+    params, model = vrw.WheelParams(damping=damping), vrw.UnilateralWheel(friction=friction)
+    slowest = vrw.limit_cycle(params, model=model)
+    assert bool(slowest.found)
+    every = np.atleast_1d(vrw.limit_cycles(params, model=model).spectral_radius)
+    assert np.all(every < 1.0)
+    design = vrw.grid(damping=[damping], friction=[friction])
+    scan = vrw.scan(design, ("period",), model=vrw.UnilateralWheel())
+    told = vrw.sensitivities(params, model=model, measures=("period",))
+    for period in (scan.period.values[0, 0], told.value.values[0]):
+        assert period == pytest.approx(float(slowest.period), abs=1e-8)
+
+
+@pytest.mark.slow
 def test_a_branch_on_real_ground_holds_gaits_that_repeat(near):
     cycle = vrw.limit_cycle(SLOW, guess=near, model=GROUND, options=OPTIONS)
     branch = vrw.continue_branch(

@@ -30,7 +30,8 @@ from vrw_jax.answers.lower import (
 from vrw_jax.answers.quantities import MADE, measured
 from vrw_jax.answers.result import Answer, How
 from vrw_jax.answers.top import TIGHT, TIGHTER, Ground
-from vrw_jax.gaits import Which, place_in_list, starts_of
+from vrw_jax.cycles import starts_of
+from vrw_jax.gaits import Which, place_in_list
 from vrw_jax.numerics import Options
 from vrw_jax.wheel import FRICTION, Outcome, WheelParams, friction_of
 from vrw_jax.wording import (

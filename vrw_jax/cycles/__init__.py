@@ -1,5 +1,13 @@
 """Gaits that repeat: found, checked and differentiated, each rung by its own means."""
 
+from vrw_jax.cycles.attracting import (
+    NEAR,
+    further_starts_of,
+    gaits_attracting,
+    slow_gaits,
+    slowest,
+    starts_of,
+)
 from vrw_jax.cycles.by_collocation import CollocationFinder
 from vrw_jax.cycles.collocated import LimitCycle, on_mesh
 from vrw_jax.cycles.cycle import MEASURED, ON_STABILITY, AbstractCycle
@@ -15,7 +23,7 @@ from vrw_jax.cycles.finder import (
     same_branch,
 )
 from vrw_jax.cycles.finding import Guess, finder_for, finder_of, near, serving
-from vrw_jax.cycles.on_ground import Periods, options_towards, solved
+from vrw_jax.cycles.on_ground import Periods, solved
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.premises import default_margins, takeoff_acceleration
 from vrw_jax.cycles.search import Located, Problem, correction_size, nothing_known

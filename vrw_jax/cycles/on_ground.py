@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from vrw_jax.cycles.attracting import slow_gaits
 from vrw_jax.cycles.by_walking import (
     AbstractWalkingFinder,
     SectionFinder,
@@ -28,11 +29,10 @@ from vrw_jax.models import (
     AbstractWheel,
     UnilateralWheel,
     step_lanes,
-    walk_lanes,
 )
-from vrw_jax.numerics import Options, SectionCycle, SolverName, as_float_array, in_batches
+from vrw_jax.numerics import Options, SectionCycle, in_batches
 from vrw_jax.results import ON_GROUND
-from vrw_jax.walks import N_TOWARDS, checked
+from vrw_jax.walks import checked
 from vrw_jax.wheel import Outcome, WheelParams
 
 ITERATIONS, HALVINGS = 15, 6
@@ -46,16 +46,6 @@ CLEAR = 0.01
 
 SHAPES = (1, 8, 64, 512)
 """Numbers of gaits that are told together: each is compiled for once."""
-
-SOLVER_TOWARDS: SolverName = "Tsit5"
-TOLERANCE_TOWARDS = 1e-8
-"""Of the steps towards a gait, whatever those of the gait itself."""
-
-
-def options_towards() -> Options:
-    """Of walks towards a gait."""
-    tolerance = as_float_array(TOLERANCE_TOWARDS)
-    return Options(solver=SOLVER_TOWARDS, rtol=tolerance, atol=tolerance)
 
 
 class GroundFinder(AbstractWalkingFinder):
@@ -100,17 +90,9 @@ class GroundFinder(AbstractWalkingFinder):
         return self.first_guesses(values[None])[0]
 
     def first_guesses(self, values: Array) -> Array:
-        """Where walks from the rung's start end, wheel by wheel."""
-        starts = np.asarray(jax.vmap(self._start)(values))
-        columns = np.asarray(values).T
-        model: Any = self.model
-        given = columns, starts, N_TOWARDS, model, options_towards(), self.n_legs
-        reached, _, outcome, *_ = walk_lanes(*given)
-        return jnp.asarray(np.where(outcome[:, None] == Outcome.STEPPED, reached, starts))
-
-    def _start(self, values: Values) -> Array:
-        model, params = self.model.at(values, self.n_legs)
-        return model.start(params)
+        """A slow gait that attracts each wheel; without one no state of any."""
+        gaits = slow_gaits(self, values)
+        return jnp.where(gaits.found[:, None], gaits.section_state, jnp.nan)
 
     def find(self, values: Values, guess: Array) -> Gait:
         return jax.tree.map(lambda x: x[0], self.find_many(values[None], guess[None]))
@@ -134,7 +116,7 @@ class GroundFinder(AbstractWalkingFinder):
         """As everywhere; of one Jacobian of the step."""
         model, params = self.model.at(values, self.n_legs)
         start = guess.section_state if isinstance(guess, AbstractCycle) else guess
-        start = model.start(params) if start is None else start
+        start = self.first_guess(values) if start is None else start
         _, x, _, _ = checked(params, start, model, self.step_options)
         return measured_of(self.find(values, x), type(self).read, names)
 

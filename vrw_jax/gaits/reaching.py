@@ -17,6 +17,7 @@ from jax import lax
 from vrw_jax import cycles
 from vrw_jax.batches import steps
 from vrw_jax.cycles import (
+    NEAR,
     AbstractGaitFinder,
     CollocationFinder,
     CycleOptions,
@@ -24,13 +25,10 @@ from vrw_jax.cycles import (
     LimitCycle,
     Located,
     WalkedCycle,
-)
-from vrw_jax.gaits.attracting import (
-    NEAR,
     further_starts_of,
     gaits_attracting,
+    slowest,
     starts_of,
-    walked,
 )
 from vrw_jax.numerics import Options, in_batches, select
 from vrw_jax.walks import ModelLike
@@ -48,6 +46,9 @@ LOST = (
 MESH_ERROR = 1e-7
 """Estimate of the mesh's error above which a finer mesh is taken: the errors themselves are a
 hundredth of it, and what the options promise."""
+
+N_STEPS = 80
+"""Steps of a walk towards a gait of the paper's rung."""
 
 REFINEMENTS = 3
 """How often a mesh is made twice as fine at most."""
@@ -115,7 +116,7 @@ def limit_cycle(
 
     Any other rung as `model` is solved on its own return map, with `Options` of its step: a
     `WalkedCycle`, to the step's errors. On real ground several gaits may attract: without a `guess`
-    walks from a stated set of starts tell them apart (`gaits.attracting`), and `which` takes the
+    walks from a stated set of starts tell them apart (`cycles.attracting`), and `which` takes the
     "slowest", the "fastest" or a place in their list, slowest first. `limit_cycles` tells all.
     "auto" is the lowest rung whose premises the gait keeps on its ground: a `LimitCycle` is the
     paper's, a `WalkedCycle` that of real ground.
@@ -194,7 +195,7 @@ def limit_cycles(
         finder = cycles.finder_for(params, model, options, whole("period_n", period_n))
         if finder.coexisting:
             untraced("vrw.limit_cycles", "give vrw.limit_cycle a guess", params)
-            return gaits_attracting(finder, jax.tree.map(lambda x: x[None], params))[0]
+            return gaits_attracting(finder, finder.model.values(params)[None])[1]
     if len(shape) != 1:
         raise ValueError(f"the wheels' batch has shape {shape}, but it must have one axis.")
     params = jax.tree.map(lambda x: jnp.broadcast_to(x, shape), params)
@@ -218,16 +219,17 @@ def place_in_list(which: Which) -> int:
 
 def _chosen(finder: Any, params: WheelParams, which: Which) -> Any:
     """Of each wheel of a batch one of the gaits that attract."""
-    told = []
-    for gaits in gaits_attracting(finder, params):
-        n, place = len(gaits.outcome), place_in_list(which)
-        if not -n <= place < n:
-            raise ValueError(
-                f"which is {which}, but {n} gait{'s' * (n > 1)} of this wheel attract"
-                f"{'s' * (n == 1)}: vrw.limit_cycles(params, model=...) tells them."
-            )
-        told.append(jax.tree.map(lambda x, place=place: x[place], gaits))
-    return jax.tree.map(lambda *x: jnp.stack(x), *told)
+    wheels, place = params.damping.shape[0], place_in_list(which)
+    owner, gaits = gaits_attracting(finder, jax.vmap(finder.model.values)(params))
+    counts = np.bincount(owner, minlength=wheels)
+    few = counts[(place >= counts) | (place < -counts)]
+    if len(few):
+        n = int(few[0])
+        raise ValueError(
+            f"which is {which}, but {n} gait{'s' * (n > 1)} of this wheel attract"
+            f"{'s' * (n == 1)}: vrw.limit_cycles(params, model=...) tells them."
+        )
+    return _taken(gaits, slowest(owner, wheels) + place % counts)
 
 
 def _wherever(finder: Any, params: WheelParams, guess: Any, adaptive: bool, which: Which) -> Any:
@@ -272,6 +274,21 @@ def _put(tree: Any, places: np.ndarray, values: Any) -> Any:
     return jax.tree.map(lambda x, v: jnp.asarray(x).at[places].set(v), tree, values)
 
 
+def _walked_from(
+    finder: CollocationFinder, params: WheelParams, x: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Of each lane where N_STEPS lead, and by how much it misses that state a period later;
+    infinite where a walk ended before."""
+    there = steps(params, x, N_STEPS, model=finder.model)
+    states, (on,) = np.array(there.section_state), np.nonzero(there.outcome == Outcome.STEPPED)
+    missed = np.full(len(states), np.inf)
+    if len(on):
+        later = steps(_taken(params, on), states[on], finder.period_n, model=finder.model)
+        away = np.abs(np.asarray(later.section_state) - states[on]).max(-1)
+        missed[on] = np.where(np.asarray(later.outcome) == Outcome.STEPPED, away, np.inf)
+    return states, missed
+
+
 class _Walks(NamedTuple):
     """Where walks of a batch of wheels are after N_STEPS."""
 
@@ -286,7 +303,7 @@ def _walked(finder: CollocationFinder, params: WheelParams, wanted: np.ndarray) 
     for begin in (starts_of, further_starts_of):
         own = _taken(params, places)
         for start in begin(own) if len(places) else ():
-            states, _, missed = walked(own, start, finder.model, finder.period_n)
+            states, missed = _walked_from(finder, own, start)
             nearer = missed < best[places]
             lanes = places[nearer]
             best[lanes], x[lanes] = missed[nearer], states[nearer]

@@ -1,9 +1,8 @@
 """The steady gait of many wheels on real ground, and of many wheels each on its lowest rung.
 
-On real ground a sample walks from the rung's start towards a gait, until it all but repeats, and
-Newton's method then solves for it on the full section state. On the ladder the paper's engine goes
-first, over all samples; those whose premises break on this ground are gathered and walk on the
-upper rung, so that no sample pays for another.
+On real ground it is the gait that a slow start walks to, or the slowest that any comes to. On the
+ladder the paper's engine goes first, over all samples; those whose premises break on this ground
+are gathered and walk on the upper rung, so that no sample pays for another.
 """
 
 import dataclasses
@@ -22,20 +21,17 @@ from vrw_jax.cycles import (
     Readings,
     WalkedCycle,
     finder_of,
-    options_towards,
     read_along_lanes,
+    slow_gaits,
 )
 from vrw_jax.models import (
-    PAPER_START,
     UNILATERAL,
     VISCOELASTIC,
     AbstractWheel,
     LadderWheel,
     UnilateralWheel,
     ViscoelasticWheel,
-    as_full_states,
     reason_of,
-    walk_lanes,
 )
 from vrw_jax.numerics import Options, in_batches
 from vrw_jax.scans.evaluate import Engine, masked, n_cores, numbers
@@ -45,12 +41,6 @@ from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, WheelParams
 SHARE, LANES = 512, 64
 """Samples that a thread takes at a time, and gaits that are told together: a number of its own, so
 that a sample has no company."""
-
-ROUNDS = (20, 30, 50, 100)
-"""Steps towards a gait, after each of which those that all but repeat are searched from there."""
-
-SETTLED, AWAY = 1e-3, 0.03
-"""Most by which a state may miss its own a step before, and a gait that state, to be the walk's."""
 
 Columns = Mapping[str, np.ndarray]
 Told = dict[str, np.ndarray]
@@ -90,75 +80,34 @@ class GroundEngine:
         return {name: np.concatenate([part[name] for part in told]) for name in told[0]}
 
     def _part(self, values: np.ndarray) -> Told:
-        """Walks, and the gaits that they come to; who has not settled walks on."""
-        n, n_legs = len(values), self._base.n_legs
-        paper = np.tile(np.asarray(PAPER_START, values.dtype), (n, 1))
-        x = np.array(as_full_states(values.T, paper, n_legs))
-        outcome = np.full(n, int(Outcome.STEPPED))
+        """Of each sample the gait that slow starts walk to."""
         # Over a period friction carries all weight along the slope: with less no gait repeats.
         friction, slope = values[:, -1], values[:, PARAMETER_NAMES.index("slope")]
-        holds = friction >= np.tan(slope)
-        outcome[~holds] = Outcome.NO_CYCLE_FOUND
-        open_, found = np.flatnonzero(holds), list[tuple[np.ndarray, Told]]()
-
-        def walked(n_steps: int) -> np.ndarray:
-            """By how much they moved, of those that still walk."""
-            nonlocal open_
-            if not len(open_):
-                return np.zeros(0)
-            given = self._model, options_towards(), n_legs
-            there, _, codes, *_ = walk_lanes(values[open_].T, x[open_], n_steps, *given)
-            moved = np.abs(there - x[open_])[:, : self._numbers].max(-1)
-            x[open_], outcome[open_] = there, codes
-            walking = codes == Outcome.STEPPED
-            open_ = open_[walking]
-            return moved[walking]
-
-        for n_steps in ROUNDS:
-            walked(n_steps - 1)
-            moved = walked(1)
-            settled = open_[moved < SETTLED]
-            if not len(settled):
-                continue
-            told, away = self._gaits(values[settled], x[settled])
-            own = (told["outcome"] == Outcome.STEPPED) & (away < AWAY)
-            own &= told["spectral_radius"] < 1.0  # else no walk comes to it
-            found.append((settled[own], {name: leaf[own] for name, leaf in told.items()}))
-            open_ = np.setdiff1d(open_, settled[own])
-        if not found:
-            found.append((np.zeros(1, int), self._gaits(values[:1], x[:1])[0]))
-        outcome[open_] = Outcome.NO_CYCLE_FOUND
-        return self._together(outcome, found)
-
-    @property
-    def _numbers(self) -> int:
-        return self._model.section_numbers(self._base)
-
-    def _together(self, outcome: np.ndarray, found: list[tuple[np.ndarray, Told]]) -> Told:
-        """In the samples' order; `outcome` is that of the walk where it failed."""
-        whole: Told = {}
-        for places, told in found:
+        holds = np.flatnonzero(friction >= np.tan(slope))
+        outcome = np.full(len(values), int(Outcome.NO_CYCLE_FOUND))
+        told = self._gaits(values[holds] if len(holds) else values[:1])
+        whole = {n: np.zeros((len(values), *x.shape[1:]), x.dtype) for n, x in told.items()}
+        if len(holds):
+            outcome[holds] = told.pop("outcome")
             for name, leaf in told.items():
-                blank = np.zeros((len(outcome), *leaf.shape[1:]), leaf.dtype)
-                whole.setdefault(name, blank)[places] = leaf
-        outcome = np.where(outcome == Outcome.STEPPED, whole.pop("outcome"), outcome)
+                whole[name][holds] = leaf
+        whole.pop("outcome")
         return masked(outcome, whole)
 
-    def _gaits(self, values: np.ndarray, states: np.ndarray) -> tuple[Told, np.ndarray]:
-        """What is told of the gaits near section states, and how far away they are."""
-        if self._wanted:
-            gait = self._finder.find_many(jnp.asarray(values), states)
-            cycle = gait.cycle
-            _, slopes = in_batches(lambda some: read_along_lanes(self._moved, some), (LANES,), gait)
-        else:
-            cycle, slopes = self._finder.near(values, states), {}
+    def _gaits(self, values: np.ndarray) -> Told:
+        """What is told of them."""
+        cycle = slow_gaits(self._finder, values)
         told = in_batches(lambda some: _read_lanes(self._plain, some), (LANES,), cycle)
-        names = self._model.parameter_names
-        for d in self._wanted:
-            told[d.name] = slopes[d.measure][:, names.index(d.parameter)]
-        away = np.abs(np.asarray(cycle.section_state) - states)[:, : self._numbers].max(-1)
+        if self._wanted:
+            found = self._finder.find_many(jnp.asarray(values), cycle.section_state)
+            _, slopes = in_batches(
+                lambda some: read_along_lanes(self._moved, some), (LANES,), found
+            )
+            names = self._model.parameter_names
+            for d in self._wanted:
+                told[d.name] = slopes[d.measure][:, names.index(d.parameter)]
         told["outcome"] = cycle.outcome
-        return {name: np.asarray(leaf) for name, leaf in told.items()}, away
+        return {name: np.asarray(leaf) for name, leaf in told.items()}
 
 
 @eqx.filter_jit

@@ -3,7 +3,6 @@
 from vrw_jax.walks.basins import BEFORE, basin
 from vrw_jax.walks.choice import choose_model
 from vrw_jax.walks.stepping import (
-    N_TOWARDS,
     ModelLike,
     Walk,
     checked,

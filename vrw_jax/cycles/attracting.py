@@ -1,0 +1,198 @@
+"""Which gaits of a wheel attract: walks from a stated set of starts, and Newton's method on."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vrw_jax.models import as_full_states, walk_lanes
+from vrw_jax.numerics import Options, SolverName, as_float_array
+from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, wheel_of
+
+ROUNDS = (8, 12, 30, 50, 100)
+"""Steps towards a gait, after each of which walks that have settled stop, and like ones are one."""
+
+SETTLED = 1e-3
+"""By how much a walk that has settled may miss its own state one period ago."""
+
+STARTS = ((1.0, 0.45), (1.0, 0.7), (1.0, 1.0), (0.5, 1.0), (0.0, 1.0))
+"""Where walks start: how much of its static contraction Leg 1 has at touchdown, and the rate of the
+hub as a share of the rigid rolling gait's. Of 4,800 random wheels with 5 to 16 legs 1,240 walk from
+one of these or of 78 on a grid, 1,175 from these (ranges: experiments/gaits/off_the_box.py)."""
+
+FURTHER = ((0.002, 0.4), (0.002, 0.3), (0.002, 0.5), (0.5, 1.1), (0.2, 0.4), (0.2, 1.1), (0.2, 0.8),
+           (0.35, 1.0), (0.35, 1.1))  # fmt: skip
+"""Where walks on the paper's rung start if none from STARTS came to a gait: Leg 1's angle to the
+slope's normal at touchdown as a share of that between legs, and the rate as above. They reach the
+other 65: with many legs gaits roll from double support into double support, the angle near 0."""
+
+NEAR = 0.1
+"""The same of a walk that has not, but is a start: rad, rad/s, m/s."""
+
+APART, SAME = 0.02, 1e-5
+"""Distance above which walks have come to different gaits, and below which gaits are one."""
+
+SOLVER_TOWARDS: SolverName = "Tsit5"
+TOLERANCE_TOWARDS = 1e-8
+"""Of the steps towards a gait, whatever those of the gait itself."""
+
+
+def options_towards() -> Options:
+    """Of walks towards a gait."""
+    tolerance = as_float_array(TOLERANCE_TOWARDS)
+    return Options(solver=SOLVER_TOWARDS, rtol=tolerance, atol=tolerance)
+
+
+def starts_of(params: WheelParams) -> np.ndarray:
+    """STARTS of each wheel, (start, lane, 3)."""
+    s = params.symbols()  # whose sine of the slope is no value where a caller differentiates
+    Mt, g, L0 = (np.asarray(x) for x in (s.Mt, s.g, s.L0))
+    weight = Mt * g * np.cos(np.asarray(params.slope))
+    static = np.asarray(params.natural_length - weight / params.stiffness) / L0
+    lengths = [np.clip(1.0 + c * (static - 1.0), s.cos_alpha + 0.02, 1.0) for c, _ in STARTS]
+    thetas = [np.arctan((length - s.cos_alpha) / s.sin_alpha) for length in lengths]
+    return _at(params, thetas, [share for _, share in STARTS])
+
+
+def further_starts_of(params: WheelParams) -> np.ndarray:
+    """FURTHER of each wheel, (start, lane, 3)."""
+    thetas = [
+        np.full(np.shape(params.slope), a * float(params.symbols().alpha)) for a, _ in FURTHER
+    ]
+    return _at(params, thetas, [share for _, share in FURTHER])
+
+
+def _at(params: WheelParams, thetas: list[np.ndarray], shares: list[float]) -> np.ndarray:
+    """Section states with these angles and rates, as shares of the rigid rolling gait's."""
+    s = params.symbols()
+    g, L0 = np.asarray(s.g), np.asarray(s.L0)
+    rolling = np.sqrt(4.0 * g / L0 * np.sin(0.5 * s.alpha) * np.sin(params.slope)) / s.sin_alpha
+    each = zip(thetas, shares, strict=True)
+    return np.stack(
+        [np.stack([x, share * rolling, -0.1 * np.sqrt(g * L0) / 3.0], -1) for x, share in each]
+    )
+
+
+def _walked(
+    finder: Any, columns: np.ndarray, x: np.ndarray, n_steps: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of each lane where `n_steps` lead, whether it still walks there, and by how much it misses
+    that state a period later; infinite where a walk ended before."""
+    given = finder.model, options_towards(), finder.n_legs
+    states, _, outcome, *_ = walk_lanes(columns, x, n_steps, *given)
+    later, _, ends, *_ = walk_lanes(columns, states, finder.period_n, *given)
+    walking = outcome == Outcome.STEPPED
+    away = np.abs(later - states)[:, : _numbers(finder)].max(-1)
+    return states, walking, np.where(walking & (ends == Outcome.STEPPED), away, np.inf)
+
+
+def gaits_attracting(
+    finder: Any, values: Any, n_starts: int = len(STARTS)
+) -> tuple[np.ndarray, Any]:
+    """Of wheels the gaits that attract: whose each is, in order, and the gaits, slowest first.
+
+    Of a wheel without any one stands there that says so.
+
+    Args:
+        finder: of gaits on real ground.
+        values: of each wheel, (wheels, n_values); see `AbstractWheel.values`.
+        n_starts: how many of STARTS, slow ones first.
+
+    Returns:
+        Index of the wheel of each gait, (gaits,), and a cycle with that leading axis.
+    """
+    wheels = len(values)
+    owner, x = _walked_to(finder, np.asarray(values), n_starts)
+    found = finder.near(np.asarray(values)[owner], x)
+    good = np.asarray(found.found) & (np.asarray(found.spectral_radius) < 1.0)
+    states, speed = np.asarray(found.steps.section_state), np.asarray(found.speed)  # every step's
+    own = states[:, :, : _numbers(finder)]
+    good &= ~(np.abs(own[:, :-1] - own[:, -1:]).max(-1) < SAME).any(1)  # after fewer steps
+    kept: list[int] = []
+    for places in np.split(np.arange(len(owner)), slowest(owner, wheels)[1:]):
+        first = len(kept)
+        for i in sorted(places[good[places]], key=lambda i: speed[i]):
+            known = (np.abs(own[j] - own[i, -1]).max(-1) < SAME for j in kept[first:])
+            if not any(same.any() for same in known):
+                kept.append(int(i))
+        kept += [] if len(kept) > first else [int(places[0])]
+    gaits = jax.tree.map(lambda leaf: jnp.asarray(leaf)[np.array(kept)], found)
+    return owner[kept], _none_where(~good[kept], gaits)
+
+
+def slow_gaits(finder: Any, values: Any) -> Any:
+    """The gait that a slow start walks to, wheel by wheel; else the slowest that any comes to.
+
+    Of 1,200 random wheels it is the slowest that attracts of each.
+    """
+    values = np.asarray(values)
+    _, gaits = gaits_attracting(finder, values, 1)
+    lost = np.flatnonzero(~np.asarray(gaits.found))
+    if len(lost):
+        owner, others = gaits_attracting(finder, values[lost])
+        first = slowest(owner, len(lost))
+        gaits = jax.tree.map(lambda all_, some: all_.at[lost].set(some[first]), gaits, others)
+    return gaits
+
+
+def slowest(owner: np.ndarray, wheels: int) -> np.ndarray:
+    """The first of each wheel's gaits."""
+    return np.searchsorted(owner, np.arange(wheels))
+
+
+def _none_where(lost: np.ndarray, cycle: Any) -> Any:
+    """No gait there: what repeats does so sooner, or does not attract, or nothing does."""
+    fits = lambda leaf: lost.reshape(-1, *[1] * (leaf.ndim - 1))
+    none = jax.tree.map(lambda leaf: jnp.where(fits(leaf), jnp.zeros_like(leaf), leaf), cycle)
+    code = jnp.where(cycle.found, Outcome.NO_CYCLE_FOUND, cycle.outcome)
+    code = jnp.where(lost, code, cycle.outcome).astype(jnp.int32)
+    return eqx.tree_at(lambda cycle: cycle.outcome, none, code)
+
+
+def _numbers(finder: Any) -> int:
+    return int(finder.model.section_numbers(WheelParams(n_legs=finder.n_legs)))
+
+
+def _walked_to(finder: Any, values: np.ndarray, n_starts: int) -> tuple[np.ndarray, np.ndarray]:
+    """Where walks have come to that differ: whose, in order, and section states; one of each wheel
+    at least. The walk that repeats best stands for its like.
+    """
+    starts = starts_of(wheel_of(jnp.asarray(values.T[: len(PARAMETER_NAMES)]), finder.n_legs))[
+        :n_starts
+    ]
+    n, m, owner = len(values), _numbers(finder), np.tile(np.arange(len(values)), len(starts))
+    columns = values.T[:, owner]
+    begun = as_full_states(columns, np.concatenate(starts), finder.n_legs)
+    x, missed, open_ = np.array(begun), np.full(len(owner), np.inf), np.arange(len(owner))
+    walking, like = np.ones(len(owner), bool), np.zeros(len(owner), bool)
+    for n_steps in ROUNDS:
+        there = _walked(finder, columns[:, open_], x[open_], n_steps)
+        x[open_], walking[open_], missed[open_] = there
+        like |= _like(x[:, :m], missed, n, SETTLED)
+        open_ = np.flatnonzero(walking & ~like & (missed >= SETTLED))
+        if not len(open_):
+            break
+    chosen = ~_like(x[:, :m], missed, n, NEAR) & (missed < NEAR)
+    chosen[np.setdiff1d(np.arange(n), owner[chosen])] = True  # the first start of who has none
+    some = np.flatnonzero(chosen)
+    some = some[np.argsort(owner[some], kind="stable")]
+    return owner[some], np.where(walking[some, None], x[some], begun[some])
+
+
+def _like(x: np.ndarray, missed: np.ndarray, wheels: int, settled: float) -> np.ndarray:
+    """Walks that have come to where another of the same wheel is that repeats better: within APART,
+    or what they themselves may still miss where that one has settled.
+
+    All have wheels on their last axis but one of numbers, starts before.
+    """
+    x, missed = x.reshape(-1, wheels, x.shape[-1]), missed.reshape(-1, wheels)
+    place = np.arange(len(x))[:, None]
+    like = np.zeros(missed.shape, bool)
+    for other in range(len(x)):
+        better = (missed[other] < missed) | ((missed[other] == missed) & (other < place))
+        away = np.abs(x - x[other]).max(-1)
+        near = away <= np.where(missed[other] < settled, np.maximum(APART, 3.0 * missed), APART)
+        like |= better & near & (missed < NEAR)
+    return like.ravel()
