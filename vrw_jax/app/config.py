@@ -21,7 +21,7 @@ from vrw_jax.models import (
 )
 from vrw_jax.numerics import Options, solver_named
 from vrw_jax.results import nearest
-from vrw_jax.scans import LONGEST, OFFERS, check_measures
+from vrw_jax.scans import LONGEST, OFFERS, TO_TOLERANCE, check_measures
 from vrw_jax.scans import design as designs
 from vrw_jax.wheel import DOMAINS, FRICTION, PARAMETER_NAMES, WheelParams
 
@@ -51,11 +51,14 @@ class ScanConfig:
     """Table `[scan]`: what to report, and how many samples are written at a time.
 
     - `measures`: names, derivatives too; without them DLS fraction, speed and the like;
-    - `chunk`: samples written at a time; 4,096 without it.
+    - `chunk`: samples written at a time; 4,096 without it;
+    - `tol`: error allowed of each measure on real ground (`rung = "unilateral"`), in its unit, by
+      the lowest rung that keeps it for a sample.
     """
 
     measures: tuple[str, ...] | None = None
     chunk: int | None = None
+    tol: float | None = None
 
 
 @dataclass(frozen=True)
@@ -292,10 +295,16 @@ def _scan(table: Mapping[str, object], rung: str) -> ScanConfig:
         if not (isinstance(measures, list) and all(isinstance(m, str) for m in measures)):
             must = 'a list of names: write measures = ["dls_fraction", "speed"]'
             raise _wrong("measures", measures, must)
-        check_measures(measures, OFFERS.get(rung, OFFERS["viscoelastic"]))
+        offer = OFFERS.get(rung, OFFERS["viscoelastic"]) if "tol" not in table else TO_TOLERANCE
+        check_measures(measures, offer)
         measures = tuple(measures)
     chunk = table.get("chunk")
-    return ScanConfig(measures, None if chunk is None else _whole(chunk, "chunk", 1))
+    tol = table.get("tol")
+    return ScanConfig(
+        measures,
+        None if chunk is None else _whole(chunk, "chunk", 1),
+        None if tol is None else _number(tol, "tol", positive=True),
+    )
 
 
 def _gait(table: Mapping[str, object]) -> GaitConfig:

@@ -31,6 +31,7 @@ def planned_scan(settings: "Config", chunk: int | None) -> "Plan":
         options=settings.numerical_options(),
         chunk=chunk or settings.scan.chunk,
         text=settings.text,
+        tol=settings.scan.tol,
     )
 
 

@@ -31,7 +31,7 @@ from vrw_jax.results import MARGINS
 from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, WheelParams, friction_of
 from vrw_jax.wording import AbstractTold, Row
 
-VISCOELASTIC, UNILATERAL = 1, 2
+RIGID, VISCOELASTIC, UNILATERAL = 0, 1, 2
 """Numbers of the rungs; 0 is the rigid one."""
 
 PREMISES: dict[str, str] = {
@@ -56,8 +56,8 @@ OFF_THE_PLANE = 1 + len(PREMISES)
 SERVED: dict[str, dict[str, object]] = {
     "rung": {
         "long_name": "rung that served",
-        "flag_values": [VISCOELASTIC, UNILATERAL],
-        "flag_meanings": "ViscoelasticWheel UnilateralWheel",
+        "flag_values": [RIGID, VISCOELASTIC, UNILATERAL],
+        "flag_meanings": "RigidWheel ViscoelasticWheel UnilateralWheel",
     },
     "reason": {
         "long_name": "why that rung served",

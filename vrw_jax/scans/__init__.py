@@ -4,7 +4,7 @@ from vrw_jax.scans import design
 from vrw_jax.scans.design import LONGEST, SALTELLI, SWEPT, grid, saltelli, samples, sobol, uniform
 from vrw_jax.scans.forecast import explained, in_words
 from vrw_jax.scans.indices import sobol_indices
-from vrw_jax.scans.offer import OF_CYCLE, OFFERS, check_measures
+from vrw_jax.scans.offer import OF_CYCLE, OFFERS, TO_TOLERANCE, check_measures
 from vrw_jax.scans.running import (
     Plan,
     Progress,

@@ -9,16 +9,16 @@ import contextlib
 import functools
 import itertools
 import pickle
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vrw_jax.runtime import start_jax
 from vrw_jax.scans.design import Columns
-from vrw_jax.scans.evaluate import Engine, n_cores
-from vrw_jax.scans.ground import GroundEngine, LadderEngine, engine_for
-from vrw_jax.scans.planning import Chunk, Plan, Through, difference, origin
+from vrw_jax.scans.evaluate import n_cores
+from vrw_jax.scans.ground import engine_for
+from vrw_jax.scans.planning import Chunk, Evaluate, Plan, Through, difference, origin
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -63,7 +63,7 @@ def _chunks(client: "Client", planned: Plan, missing: Sequence[int]) -> Iterator
     from distributed import Future, KilledWorker, as_completed
 
     of = planned
-    recipe = pickle.dumps((of.measures, of.base, of.model, of.options, of.cycle_options))
+    recipe = pickle.dumps((of.measures, of.base, of.model, of.options, of.cycle_options, of.tol))
     here, waiting = origin(), iter(missing)
     held: dict[Future, int] = {}
     coming = as_completed(loop=client.loop)
@@ -99,16 +99,18 @@ def _chunks(client: "Client", planned: Plan, missing: Sequence[int]) -> Iterator
         client.cancel(list(held))
 
 
-def _computed(recipe: bytes, columns: Columns) -> tuple[dict[str, object], dict[str, np.ndarray]]:
+def _computed(
+    recipe: bytes, columns: Columns
+) -> tuple[dict[str, object], Mapping[str, np.ndarray]]:
     """In a worker: by what means, and the results of a chunk."""
     start_jax()
     return origin(), _engine(recipe)(columns)
 
 
 @functools.cache
-def _engine(recipe: bytes) -> Engine | GroundEngine | LadderEngine:
+def _engine(recipe: bytes) -> Evaluate:
     from distributed import get_worker
 
-    measures, base, model, options, cycle_options = pickle.loads(recipe)
+    measures, base, model, options, cycle_options, tol = pickle.loads(recipe)
     threads = get_worker().state.nthreads
-    return engine_for(measures, base, model, options, cycle_options, threads)
+    return engine_for(measures, base, model, options, cycle_options, threads, tol)

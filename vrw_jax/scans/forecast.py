@@ -42,7 +42,7 @@ def explained(
     told = {
         "samples": f"{size:,} ({axes})",
         "measures": ", ".join(planned.asked),
-        "always included": ", ".join(offer_of(planned.model).always),
+        "always included": ", ".join(offer_of(planned.model, planned.tol).always),
         "chunks": f"{layout.n_chunks:,} of up to {chunk:,} samples, {len(missing):,} to compute",
         "result": f"{_bytes(size * layout.bytes_per_sample)} before compression",
     }

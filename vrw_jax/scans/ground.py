@@ -8,7 +8,7 @@ are gathered and walk on the upper rung, so that no sample pays for another.
 import dataclasses
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -34,6 +34,7 @@ from vrw_jax.models import (
     reason_of,
 )
 from vrw_jax.numerics import Options, in_batches
+from vrw_jax.scans.answered import AnswerEngine
 from vrw_jax.scans.evaluate import Engine, masked, n_cores, numbers
 from vrw_jax.scans.offer import derivative
 from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, WheelParams
@@ -183,8 +184,11 @@ def engine_for(
     options: Options,
     cycle_options: CycleOptions,
     threads: int | None = None,
-) -> Engine | GroundEngine | LadderEngine:
-    """What computes the samples of a scan of this rung."""
+    tol: float | None = None,
+) -> Engine | GroundEngine | LadderEngine | AnswerEngine:
+    """What computes the samples of a scan of this rung, or to within a tolerance."""
+    if tol is not None:
+        return AnswerEngine(measures, base, cast(UnilateralWheel, model), tol)
     make: Any = ENGINES[model.rung]
     return make(measures, base, model, options, cycle_options, threads)
 

@@ -4,6 +4,7 @@ import re
 from collections.abc import Iterable
 from typing import NamedTuple
 
+from vrw_jax.answers import MADE
 from vrw_jax.cycles import CollocationFinder
 from vrw_jax.models import SERVED, AbstractWheel
 from vrw_jax.results import MARGINS, MEASURES, ON_GROUND, STEP, attrs_of, nearest
@@ -59,11 +60,19 @@ LADDER = Offer(
 )
 OFFERS = {"viscoelastic": PAPER, "unilateral": REAL_GROUND, "ladder": LADDER}
 """By rung: those with compliant legs."""
+TO_TOLERANCE = Offer(tuple(MADE), ("outcome", "rung"), (), (), ("dls_fraction", "speed", "period"))
+"""To within a tolerance, each measure with its error."""
+ERROR = "_error"
 
 
-def offer_of(model: AbstractWheel) -> Offer:
-    """What a scan of this rung can tell."""
-    return OFFERS[model.rung]
+def offer_of(model: AbstractWheel, tol: float | None = None) -> Offer:
+    """What a scan of this rung can tell, or one to within a tolerance."""
+    return OFFERS[model.rung] if tol is None else TO_TOLERANCE
+
+
+def error_of(measure: str) -> str:
+    """The variable of what a measure may be wrong by."""
+    return measure + ERROR
 
 
 _DERIVATIVE = re.compile(r"d[ _](\w+?)(?: */ *d |_d_)(\w+)")
@@ -122,6 +131,11 @@ def check_measures(names: Iterable[str], offer: Offer = PAPER) -> tuple[str, ...
             if name not in offer.always:
                 checked[name] = None
             continue
+        if not offer.differentiable:
+            raise ValueError(
+                f"{name!r} is a derivative, but a scan to within a tolerance tells measures: "
+                "drop it, or scan without tol."
+            )
         if wanted.measure not in offer.differentiable:
             raise ValueError(
                 f"{name!r} asks for a derivative of {wanted.measure!r}"
@@ -142,5 +156,8 @@ def variable_attrs(name: str) -> dict[str, object]:
     """Attributes of a scan's variable, measure or derivative."""
     if name in SERVED:
         return dict(SERVED[name])
+    if name.removesuffix(ERROR) in MADE and name.endswith(ERROR):
+        of = MEASURES[name.removesuffix(ERROR)]
+        return {"units": of.unit, "long_name": f"bound of the error of {of.long_name}"}
     wanted = derivative(name)
     return attrs_of(name) if wanted is None else wanted.attrs

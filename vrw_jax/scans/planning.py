@@ -6,6 +6,7 @@ import json
 import platform
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import numpy as np
@@ -17,9 +18,8 @@ from vrw_jax.numerics import Options
 from vrw_jax.results import MARGINS, attrs_of, locked_legs, provenance
 from vrw_jax.runtime import code_digest
 from vrw_jax.scans.design import AbstractDesign, Columns
-from vrw_jax.scans.evaluate import Engine
-from vrw_jax.scans.ground import GroundEngine, LadderEngine, engine_for
-from vrw_jax.scans.offer import canonical, check_measures, offer_of, variable_attrs
+from vrw_jax.scans.ground import engine_for
+from vrw_jax.scans.offer import canonical, check_measures, error_of, offer_of, variable_attrs
 from vrw_jax.scans.store import (
     ASKED,
     MANIFEST,
@@ -31,13 +31,16 @@ from vrw_jax.scans.store import (
 )
 from vrw_jax.walks import ModelLike, options_of, rung_of
 from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, WheelParams
-from vrw_jax.wording import instance, names_of, whole
+from vrw_jax.wording import instance, names_of, positive, whole
 
 MOST_SAMPLES = 1_000_000_000
 """Of a scan: a day and more of computing, and some hundred GB."""
 
 CHUNK = 4096
 """Most samples of a chunk, unless asked for otherwise: what a killed scan can lose."""
+
+ANSWERABLE = {"unilateral": ("restitution", "infinite", "uneven", "max_events")}
+"""By rung: what a tolerance can be kept towards, and settings that must be the usual ones."""
 
 Evaluate = Callable[[Columns], Mapping[str, np.ndarray]]
 """Results of a block of samples by variable, samples first."""
@@ -60,6 +63,7 @@ class Plan:
     layout: Layout
     asked: tuple[str, ...]  # measures by the names that they were asked for
     text: str = ""
+    tol: float | None = None  # of the measures, in their units
 
     @property
     def settings(self) -> dict[str, object]:
@@ -79,7 +83,7 @@ class Plan:
             "cycle_options": _fields(self.cycle_options),
             "dtype": str(self.base.damping.dtype),
             "chunk": list(self.layout.chunk),
-        }
+        } | ({} if self.tol is None else {"tol": self.tol})
 
     @property
     def attrs(self) -> dict[str, object]:
@@ -94,9 +98,10 @@ class Plan:
             "config": self.text,
         }
 
-    def engine(self) -> Engine | GroundEngine | LadderEngine:
+    def engine(self) -> Evaluate:
         """The function that computes samples."""
-        return engine_for(self.measures, self.base, self.model, self.options, self.cycle_options)
+        given = self.measures, self.base, self.model, self.options, self.cycle_options
+        return engine_for(*given, tol=self.tol)
 
 
 def plan(
@@ -109,6 +114,7 @@ def plan(
     cycle_options: CycleOptions | None = None,
     chunk: int | None = None,
     text: str = "",
+    tol: float | None = None,
 ) -> Plan:
     """Check what is asked for and lay out the result, without computing anything."""
     if not isinstance(design, AbstractDesign):
@@ -139,10 +145,12 @@ def plan(
             "the design sweeps friction, which the paper's wheel does not feel: give "
             'model=vrw.UnilateralWheel() or "auto".'
         )
-    offer = offer_of(model)
+    tol = None if tol is None else _towards(model, positive("tol", tol))
+    offer = offer_of(model, tol)
     asked = offer.default if measures is None else names_of("measures", measures)
     names = check_measures(asked, offer)
-    first = dict.fromkeys(canonical(name) for name in asked)
+    own = (canonical(name) for name in asked)
+    first = dict.fromkeys(x for name in own for x in (name, error_of(name))[: 1 + bool(tol)])
     return Plan(
         design=design,
         measures=names,
@@ -153,7 +161,21 @@ def plan(
         layout=_layout(design, tuple(first | dict.fromkeys(offer.always)), base, chunk),
         asked=asked,
         text=text,
+        tol=tol,
     )
+
+
+def _towards(model: AbstractWheel, tol: float) -> float:
+    """The tolerance; one clear sentence for a model towards which none can be kept."""
+    usual: dict[str, Any] = type(model).__dataclass_fields__
+    own = ANSWERABLE.get(model.rung)
+    if own is None or any(getattr(model, name) != usual[name].default for name in own):
+        raise ValueError(
+            f"tol is given and model is {model!r}, but a tolerance is kept towards real ground "
+            "without settings but friction and stoppers: give "
+            "model=vrw.UnilateralWheel(friction=...)."
+        )
+    return tol
 
 
 def origin() -> dict[str, object]:

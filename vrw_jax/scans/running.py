@@ -57,6 +57,7 @@ def scan(
     chunk: int | None = None,
     report: Report | None = None,
     dask: str | None = None,
+    tol: float | None = None,
 ) -> xr.Dataset:
     """The steady gait of every sample, labelled, with outcome and premise margins of each.
 
@@ -82,6 +83,9 @@ def scan(
         chunk: samples written at a time; 4,096 by default.
         report: told the progress after each chunk.
         dask: address of a cluster, or "local".
+        tol: error allowed of each measure, in its unit, towards a `model` of real ground: each
+            sample is answered by the lowest rung that can be shown to keep it (`vrw.answer`), and
+            `rung` and `speed_error` (of speed) stand beside the values.
 
     Returns:
         A dataset over the design's axes.
@@ -103,6 +107,7 @@ def scan(
         options=options,
         cycle_options=cycle_options,
         chunk=chunk,
+        tol=tol,
     )
     with carried(dask) as through:
         return run(planned, store, report=report, through=through)
