@@ -81,6 +81,8 @@ HARD = {
 }
 """Three whose legs change what they do on the way, with a slow direction; two whose feet dip for a
 microsecond."""
+UNSTABLE = [1, 2]
+"""Of these, with multipliers of 1.36 and 1.011: no walk leads to their gaits."""
 
 
 def test_errors_are_kept_where_motions_change_and_feet_hardly_leave_the_ground():
@@ -91,7 +93,8 @@ def test_errors_are_kept_where_motions_change_and_feet_hardly_leave_the_ground()
     for tol in (1e-2, 1e-4):
         told = vrw.answer(names, wheels, tol, friction=friction)
         both = told.found & exact.found
-        assert np.sum(both) >= 4  # a step at a dip may fail: no answer, and none that is wrong
+        assert np.sum(both) >= 2  # a step at a dip may fail: no answer, and none that is wrong
+        assert not np.any(told.found[UNSTABLE])
         wrong = np.abs(told.values - exact.values)
         assert np.all((wrong <= told.errors + exact.errors)[both])
 

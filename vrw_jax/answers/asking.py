@@ -163,7 +163,7 @@ class _Asked:
             "numerical_errors": many(np.inf), "rungs": np.full(n, NONE),
             "hows": np.full(n, int(How.NO_GAIT)), "n_steps": np.zeros(n, int),
             "outcomes": np.full(n, int(Outcome.NO_CYCLE_FOUND)), "n_gaits": np.zeros(n, int),
-            "speeds": np.full(n, np.nan),
+            "speeds": np.full(n, np.nan), "states": ground.embedded(np.arange(n), np.zeros((n, 3))),
         }  # fmt: skip
 
     def goal(self, values: np.ndarray) -> np.ndarray:
@@ -249,7 +249,7 @@ class _Asked:
         self.told["n_steps"][lanes] += 1
         self._tell(lanes[stands], lower.rung[stands], How.CHECKED, {
             "values": value[stands], "errors": bound[stands], "model_errors": error[stands],
-            "numerical_errors": numerical[stands],
+            "numerical_errors": numerical[stands], "states": x[stands],
         })  # fmt: skip
         rest = np.flatnonzero(~stands & seen.same)
         if not corrected or not len(rest):
@@ -273,6 +273,7 @@ class _Asked:
             lanes, x = lanes[on], step.x[on]
             chord = Chord.of(self.ground, lanes, x, None)
             found = settled(chord, self.names, self.goal, 0)
+            found.done[found.done] = chord.some(found.done).attract()
             self._take(lanes, found, how)
             lanes, x = lanes[~found.done], x[~found.done]
 
@@ -286,6 +287,7 @@ class _Asked:
             "values": found.values, "errors": found.left + found.numerical,
             "model_errors": value - found.values,
             "numerical_errors": found.left + found.numerical, "speeds": found.speed,
+            "states": found.x,
         })  # fmt: skip
 
     def _tell(

@@ -23,16 +23,18 @@ from vrw_jax.answers.quantities import N_DURATIONS, N_QUANTITIES, measured, slop
 from vrw_jax.answers.top import Ground, Stepped
 from vrw_jax.wheel import Outcome
 
-SLOWEST, QUICKEST = 0.5, 0.05
-"""Contraction that is trusted at most, and at least counted on."""
+SLOWEST, TRUSTED, QUICKEST = 0.5, 0.25, 0.1
+"""Contraction from which on matrices are taken anew, that is trusted at most to bound what is left,
+and at least counted on. A slow direction hides behind quick ones: where corrections came down by a
+third each, one gait was four times as far off as their bound."""
 CURVED = 5.0
 """Contraction over the length of a correction that is counted on at least: how curved maps are."""
 FARTHEST = 1.0
 """Longest correction, rad, rad/s, m/s: farther off nothing is known."""
 PATIENCE = 4
 """Corrections that do not contract, or changes of the legs' codes, before a lane gives up."""
-PER_TOLERANCE = 10.0
-"""Error of a step over the tolerance of its local steps: 99 of 100 keep it."""
+PER_TOLERANCE = 30.0
+"""Error of a step over the tolerance of its local steps: 99 of 100 keep a third of it."""
 Goal = Callable[[np.ndarray], np.ndarray]
 """Errors wanted of measures with about these values, (lanes, names)."""
 SINGULAR = 1e-3
@@ -47,6 +49,8 @@ BRIEF = 3.0
 """Dips of a foot of the shortest kind that a step may miss or add."""
 BRIEFLY = 0.1
 """Share of what is wanted that such dips may be presumed to cost: else it is measured."""
+TWICE = 2.0
+"""Of the difference that another tolerance makes: either step may be the worse one."""
 AT_REST = 4.0
 """How far corrections that come down no more may leave one off, in their own effect."""
 RESOLVED = 1e-13
@@ -176,15 +180,21 @@ class Chord:
 
     def second_opinion(self, some: np.ndarray, names: Sequence[str], told: "Settled") -> np.ndarray:
         """Numerical errors by one step more, at another tolerance, in place of what dips may cost:
-        the shortest that are followed are shorter, or longer, there."""
+        the shortest that are followed are shorter, or longer, there. Infinite where that step has
+        another motion."""
         if not len(some):
             return told.numerical[some]
         ground = self.ground.otherwise()
         chord = dataclasses.replace(self.some(some), ground=ground, has=np.zeros(len(some), bool))
         seen = chord.see(np.arange(len(some)), chord.step(np.arange(len(some))), names)
-        apart = np.abs(seen.values - told.values[some])
+        apart = TWICE * np.abs(seen.values - told.values[some])
         least = np.minimum(seen.numerical, told.numerical[some])
-        return np.where(seen.same[:, None], apart + least, told.numerical[some])
+        return np.where(seen.same[:, None], apart + least, np.inf)
+
+    def attract(self) -> np.ndarray:
+        """Whether walks near by come to where the lanes are: no multiplier is beyond one, which is
+        that no eigenvalue of (I - DP)^-1 has a real part below a half."""
+        return np.linalg.eigvals(self.inverse).real.min(-1) > 0.5
 
     def go_on(self, some: np.ndarray, y: np.ndarray, same: np.ndarray) -> None:
         """To where the correction leads; along the step itself where codes have changed."""
@@ -248,12 +258,12 @@ class _Trust:
             stalls &= np.maximum(length, before) <= NOISE * self.tolerance
             q = np.where(seen.same & (length <= ROUNDING * self.tolerance), 0.0, q)
             # Nothing is trusted where there is no correction yet to compare with.
-            least = np.clip(CURVED * before, QUICKEST, SLOWEST)
+            least = np.clip(CURVED * before, QUICKEST, TRUSTED)
             least = np.where(np.isfinite(before), least, np.inf)
             worst = np.maximum(np.maximum(q, self.ratio[some]), least)
             change = np.abs(seen.values - self.values[some])
             effect = np.fmax(np.fmax(seen.size, self.size[some]), change)
-            share = np.where(worst <= SLOWEST, 2.0 * worst / (1.0 - worst), np.inf)
+            share = np.where(worst <= TRUSTED, 2.0 * worst / (1.0 - worst), np.inf)
             share = np.where(stalls, np.minimum(share, AT_REST), share)
             left = np.nan_to_num(share[:, None] * effect, nan=np.inf, posinf=np.inf)
         compared = np.isfinite(before)
@@ -305,7 +315,8 @@ def settled(
         told.values[open_], told.left[open_], told.done[open_] = seen.values, left, done
         told.numerical[open_] = seen.numerical + seen.brief
         told.speed[open_] = measured(("speed",), step.told)[:, 0]
-        doubted[open_] = done & np.any(seen.brief > BRIEFLY * wanted, axis=1)
+        # A walk may have come to where feet dip more often than is presumed.
+        doubted[open_] = done & (np.any(seen.brief > BRIEFLY * wanted, axis=1) | (patient == 0))
         slow = np.isfinite(q) & (q > SLOWEST)
         strikes[open_] += ~seen.same | slow
         age[open_] = np.where(slow, AGAIN, age[open_] + 1)
@@ -316,4 +327,5 @@ def settled(
     some = np.flatnonzero(doubted)
     told.numerical[some] = chord.second_opinion(some, names, told)
     told.n_steps[some] += 1
+    told.done[some] &= np.isfinite(told.numerical[some]).all(1)
     return told

@@ -1,5 +1,6 @@
 """Gaits of the rungs below real ground, with what carries a defect to their measures; in lanes."""
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -8,6 +9,7 @@ import numpy as np
 
 from vrw_jax.answers.quantities import N_QUANTITIES
 from vrw_jax.batches import steps
+from vrw_jax.cycles import finder_of
 from vrw_jax.gaits import SHAPES, limit_cycles
 from vrw_jax.models import RigidWheel
 from vrw_jax.numerics import Options, in_batches, with_jacobian
@@ -49,11 +51,15 @@ def put(into: Lower, lanes: np.ndarray, some: Lower) -> None:
 def paper_gaits(params: WheelParams, options: Options) -> Lower:
     """By collocation, and one step by machine code, which tells what a gait moves with."""
 
-    def found(params: WheelParams) -> tuple[jax.Array, jax.Array]:
-        cycles = limit_cycles(params)
-        return cycles.section_state, cycles.outcome
-
-    x, outcome = map(np.array, in_batches(found, SHAPES, params))
+    finder = finder_of(None, params.n_legs)
+    cycles = in_batches(finder.cycles, SHAPES, params)
+    x, outcome = np.array(cycles.section_state), np.array(cycles.outcome)
+    (lost,) = np.nonzero(outcome != Outcome.STEPPED)
+    if len(lost):  # on one mesh, for another lane's would move this one's last digits
+        some = jax.tree.map(lambda leaf: leaf[lost], params)
+        reach = functools.partial(limit_cycles, options=finder.options_used)
+        cycles = in_batches(reach, SHAPES, some)
+        x[lost], outcome[lost] = cycles.section_state, cycles.outcome
     lower = no_gaits(len(x))
     lower.outcome[:] = outcome
     (good,) = np.nonzero(outcome == Outcome.STEPPED)

@@ -19,7 +19,10 @@ class How(Code):
     CHECKED = 0, "checked by one step on real ground"
     CORRECTED = 1, "the gait that continues the lower rung's"
     WALKED = 2, "another gait than the lower rung's: a walk from there leads to it"
-    FROM_START = 3, "the paper's wheel has no gait here: a walk from its start leads to this one"
+    FROM_START = (
+        3,
+        "no gait of the paper's wheel was found: a walk from its start leads to this one",
+    )
     NO_GAIT = 4, "no such gait on real ground"
     CHOSEN = 5, "one of those that attract"
 
@@ -36,6 +39,8 @@ class Answer(AbstractTold):
 
     - `values`, `errors`, `model_errors`, `numerical_errors`: measures on the last axis;
     - `rungs`, `hows`: numbers of the rungs and of how the answers came about;
+    - `states`: section states of real ground next to the gait, from which walks and searches for
+      it may start;
     - `n_steps`: taken on real ground;
     - `n_gaits`: among which the gait was chosen, 0 where none was to be;
     - `outcomes`: STEPPED, or why there is no gait;
@@ -52,6 +57,7 @@ class Answer(AbstractTold):
     errors: np.ndarray
     model_errors: np.ndarray
     numerical_errors: np.ndarray
+    states: np.ndarray  # (*lanes, 4 + 3 n)
     rungs: np.ndarray  # (*lanes,), numbers of RUNGS
     hows: np.ndarray
     n_steps: np.ndarray  # taken on real ground
