@@ -39,7 +39,7 @@ Goal = Callable[[np.ndarray], np.ndarray]
 """Errors wanted of measures with about these values, (lanes, names)."""
 SINGULAR = 1e-3
 """Share of a direction that must be left of it after a step for the inverse to learn from it."""
-DIFFERENCE = 1e-6
+DIFFERENCE = 1e-5
 """Of a number of the section state, for derivatives, rad, rad/s, m, m/s."""
 CORRECTIONS, AGAIN = 24, 8
 """Most corrections of one iteration, and after how many matrices are taken anew."""
@@ -49,10 +49,9 @@ BRIEF = 3.0
 """Dips of a foot of the shortest kind that a step may miss or add."""
 BRIEFLY = 0.1
 """Share of what is wanted that such dips may be presumed to cost: else it is measured."""
-TWICE = 2.0
-"""Of the difference that another tolerance makes: either step may be the worse one."""
 AT_REST = 4.0
-"""How far corrections that come down no more may leave one off, in their own effect."""
+"""How far corrections that come down no more may leave one off, in their own effect, and a step, in
+the difference that another tolerance makes: twice was too little for one of 830 answers."""
 RESOLVED = 1e-13
 """Changes as short as this tell nothing."""
 
@@ -187,7 +186,7 @@ class Chord:
         ground = self.ground.otherwise()
         chord = dataclasses.replace(self.some(some), ground=ground, has=np.zeros(len(some), bool))
         seen = chord.see(np.arange(len(some)), chord.step(np.arange(len(some))), names)
-        apart = TWICE * np.abs(seen.values - told.values[some])
+        apart = AT_REST * np.abs(seen.values - told.values[some])
         least = np.minimum(seen.numerical, told.numerical[some])
         return np.where(seen.same[:, None], apart + least, np.inf)
 
@@ -254,13 +253,16 @@ class _Trust:
         before = self.length[some]
         with np.errstate(all="ignore"):
             q = np.where(seen.same, length / before, np.inf)
-            stalls = seen.same & (q > SLOWEST) & np.isfinite(before)
+            # By differences across a dip ever shorter corrections move measures as far as before.
+            felt = np.max(seen.size / np.maximum(self.size[some], RESOLVED), axis=1)
+            stalls = seen.same & (np.maximum(q, felt) > SLOWEST) & np.isfinite(before)
             stalls &= np.maximum(length, before) <= NOISE * self.tolerance
             q = np.where(seen.same & (length <= ROUNDING * self.tolerance), 0.0, q)
             # Nothing is trusted where there is no correction yet to compare with.
             least = np.clip(CURVED * before, QUICKEST, TRUSTED)
             least = np.where(np.isfinite(before), least, np.inf)
             worst = np.maximum(np.maximum(q, self.ratio[some]), least)
+            worst = np.maximum(worst, np.where(q > 0.0, felt, 0.0))
             change = np.abs(seen.values - self.values[some])
             effect = np.fmax(np.fmax(seen.size, self.size[some]), change)
             share = np.where(worst <= TRUSTED, 2.0 * worst / (1.0 - worst), np.inf)
