@@ -375,6 +375,7 @@ def test_a_rigid_wheel_is_followed_by_its_own_step():
     keep = (total * s.cos_alpha + inertia) / (total + inertia)
     np.testing.assert_allclose(branch.dataset.spectral_radius, keep**2, atol=1e-9)
     assert branch.values[[0, -1]].tolist() == [0.2, 0.35]
+    assert len(branch_figure(branch).axes) == 4  # without indicators
 
 
 def test_what_is_asked_wrongly_is_said_in_a_sentence():

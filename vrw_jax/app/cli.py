@@ -119,7 +119,8 @@ def gait(
     """Walk a wheel and tell its gait: durations, speed, indicators, and which premises hold.
 
     Walks step by step from a start near the gait of Table 1 (or the config's), then looks for the
-    limit cycle next to where it got to. Writes no file.
+    limit cycle: on real ground the slowest that attracts, or with a start of the config's the one
+    next to where it got to. Writes no file.
 
     [bold]Examples[/bold]
 
@@ -134,11 +135,13 @@ def gait(
         params = settings.params(dict(assignment(text) for text in changes or []))
         import jax.numpy as jnp
 
+        from vrw_jax.cycles import serving_and_why
         from vrw_jax.gaits import limit_cycle
         from vrw_jax.walks import step
         from vrw_jax.wheel import Outcome
 
-        model, options = settings.wheel_model(), settings.numerical_options()
+        model: Any = settings.wheel_model()
+        options = settings.numerical_options()
         start = settings.gait.start
         state = model.start(params) if start is None else jnp.asarray(start)
         state = model.full_section(params, state)
@@ -151,13 +154,12 @@ def gait(
                 if not stepped or walked == n_steps:
                     break
                 state = result.section_state
-            if settings.rung == "auto":
-                model = result.choice.model
-            cold = model.rung == "viscoelastic"  # the other rungs' gaits need a guess
+            model, why = serving_and_why(params, model)
+            cold = start is None or model.rung == "viscoelastic"
             cycle: Any = limit_cycle(params, guess=None if cold else state, model=model)
         printing.tell_gait(params, result, state, walked, cycle)
-        if settings.rung == "auto":
-            out.print(result.choice.why)
+        if why:
+            out.print(why)
 
 
 @app.command()

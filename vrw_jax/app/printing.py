@@ -198,24 +198,20 @@ def _tell_step(result: "AbstractStep") -> None:
 def _tell_cycle(cycle: "LimitCycle | WalkedCycle") -> None:
     import numpy as np
 
+    from vrw_jax.cycles import multipliers_told
     from vrw_jax.wheel import Outcome
 
     if not bool(cycle.found):
         end = Outcome(int(cycle.outcome))
         out.print(f"[bold]Limit cycle[/]  {end.name}: {end.meaning}")
         return
-    multipliers = ", ".join(_complex(complex(z)) for z in np.asarray(cycle.multipliers))
-    radius = float(cycle.spectral_radius)
+    radius, multipliers = multipliers_told(np.asarray(cycle.matrix))
     verdict = "stable" if radius < 1.0 else "unstable"
     out.print(
         f"[bold]Limit cycle[/]  {verdict}: multipliers {multipliers}; period "
         f"{float(cycle.period):.5f} s, speed {float(cycle.speed):.5f} m/s, "
         f"DLS {100 * float(cycle.dls_fraction):.2f} %."
     )
-
-
-def _complex(z: complex) -> str:
-    return f"{z.real:.4f}" if abs(z.imag) < 1e-12 else f"{z.real:.4f}{z.imag:+.4f}i"
 
 
 def _tell_premises(result: "StepResult") -> None:

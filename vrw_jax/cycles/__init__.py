@@ -10,7 +10,7 @@ from vrw_jax.cycles.attracting import (
 )
 from vrw_jax.cycles.by_collocation import CollocationFinder
 from vrw_jax.cycles.collocated import LimitCycle, on_mesh
-from vrw_jax.cycles.cycle import MEASURED, ON_STABILITY, AbstractCycle
+from vrw_jax.cycles.cycle import MEASURED, ON_STABILITY, AbstractCycle, multipliers_told
 from vrw_jax.cycles.derivatives import over_lanes
 from vrw_jax.cycles.finder import (
     AGREEMENT,
@@ -22,7 +22,14 @@ from vrw_jax.cycles.finder import (
     read_along_lanes,
     same_branch,
 )
-from vrw_jax.cycles.finding import Guess, finder_for, finder_of, near, serving
+from vrw_jax.cycles.finding import (
+    Guess,
+    finder_for,
+    finder_of,
+    near,
+    serving,
+    serving_and_why,
+)
 from vrw_jax.cycles.on_ground import Periods, solved
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.premises import default_margins, takeoff_acceleration

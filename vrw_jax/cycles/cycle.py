@@ -142,10 +142,7 @@ class AbstractCycle(AbstractTold):
             ]
         if outcome != Outcome.STEPPED:
             return [("outcome", f"{Outcome(int(outcome)).name}: {self.why}")]
-        multipliers = sorted(np.linalg.eigvals(np.asarray(self.matrix)), key=abs, reverse=True)
-        radius = float(np.max(np.abs(multipliers)))
-        shown = [z for z in multipliers[:4] if abs(z) > 1e-9] or multipliers[:1]
-        told = ", ".join(f"{z:.5f}" if z.imag else f"{z.real:.5f}" for z in shown)
+        radius, told = multipliers_told(np.asarray(self.matrix))
         often = f"{self.period_n} steps" if self.period_n > 1 else "one step"
         stable = "stable" if radius < 1.0 else "unstable"
         return [
@@ -161,6 +158,15 @@ class AbstractCycle(AbstractTold):
     @abc.abstractmethod
     def own_rows(self) -> list[Row]:
         """Those of `rows` that not every rung tells."""
+
+
+def multipliers_told(matrix: np.ndarray) -> tuple[float, str]:
+    """The spectral radius, and the multipliers that five digits show, largest first."""
+    multipliers = sorted(np.linalg.eigvals(matrix), key=abs, reverse=True)
+    shown = [z for z in multipliers if abs(z) >= 5e-6]
+    rest = f"{len(multipliers) - len(shown)} below 5e-6" if len(shown) < len(multipliers) else ""
+    told = [f"{z:.5f}" if z.imag else f"{z.real:.5f}" for z in shown]
+    return float(np.abs(multipliers[0])), ", ".join([*told, *([rest] if rest else [])])
 
 
 MASKED = (

@@ -55,17 +55,25 @@ def serving(params: WheelParams, model: ModelLike | None) -> ModelLike | None:
     The paper's gait is looked for first. Where it is not found, or breaks a premise on this ground,
     it is the rung above. Any other rung is itself; so is the ladder where nothing has a value.
     """
+    return serving_and_why(params, model)[0]
+
+
+def serving_and_why(
+    params: WheelParams, model: ModelLike | None
+) -> tuple[ModelLike | None, str | None]:
+    """`serving`, and of the ladder in one sentence why."""
     if model is None or rung_of(model).rung != "ladder" or not isinstance(params, WheelParams):
-        return model
+        return model, None
     traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((params, model)))
     if traced or params.damping.ndim:
-        return model
+        return model, None
     ladder: Any = rung_of(model)
-    cycle = finder_of(None, params.n_legs).cycle(params)
+    cycle: Any = finder_of(None, params.n_legs).cycle(params)
     if not bool(cycle.found):
-        return ladder.ground
+        return ladder.ground, f"The paper's wheel has no gait: {cycle.why}"
     x = ladder.full_section(params, cycle.section_state)
-    return ladder.choose(params, x, Options())[0].model
+    choice = ladder.choose(params, x, Options())[0]
+    return choice.model, choice.why
 
 
 def near(guess: Any) -> Any:

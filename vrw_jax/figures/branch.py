@@ -37,9 +37,12 @@ COLOURS = {"lost": ENDS, "border_collision": GREEN}
 """Of borders, by kind; where the gait's own stability changes: black. What ends a branch: ENDS.
 Neither colours nor dots are those of a curve."""
 
-PANELS = (
+EVERY = (
     ("DLS fraction", {"dls_fraction": LEG_1}),
     ("moduli of multipliers", {"spectral_radius": "black"}),
+)
+PANELS = (
+    *EVERY,
     (
         f"${MEASURES['lambda_2_plus'].tex}$, ${MEASURES['lambda_4_plus'].tex}$ [N]",
         {"lambda_2_plus": LEG_1, "lambda_4_plus": LEG_2},
@@ -47,6 +50,12 @@ PANELS = (
     ("clearance in SLS-I [mm]", {"clearance_sls1": LEG_2}),
 )
 """Label, and the colour of each measure, of the panels of a branch."""
+OTHERS = (
+    *EVERY,
+    ("walking speed [m/s]", {"speed": "black"}),
+    ("step period [s]", {"period": "black"}),
+)
+"""Those of a rung without the paper's indicators."""
 
 
 def _pieces(branch: Branch) -> list[tuple[np.ndarray, bool]]:
@@ -64,7 +73,8 @@ def _pieces(branch: Branch) -> list[tuple[np.ndarray, bool]]:
 def branch_figure(branch: Branch) -> Figure:
     """DLS fraction, multipliers, indicators and clearance along a branch, with its borders.
 
-    Solid: stable; dashed: unstable. Borders are numbered from left to right.
+    Of other rungs than the paper's speed and period in place of the last two. Solid: stable;
+    dashed: unstable. Borders are numbered from left to right.
 
     Args:
         branch: of `vrw.continue_branch` over one of the wheel's parameters.
@@ -82,7 +92,9 @@ def branch_figure(branch: Branch) -> Figure:
     rows = -(-len(borders) // 2)
     figure = Figure(figsize=(PAGE, 4.0 + 0.16 * rows))
     panels = figure.subplots(2, 2, sharex=True)
-    for axes, (label, series), letter in zip(panels.ravel(), PANELS, "abcd", strict=True):
+    papers = "lambda_2_plus" in data
+    told = PANELS if papers else OTHERS
+    for axes, (label, series), letter in zip(panels.ravel(), told, "abcd", strict=True):
         panel_letter(axes, letter)
         for name, colour in series.items():
             scale = 1e3 if name == "clearance_sls1" else 1.0
@@ -97,18 +109,23 @@ def branch_figure(branch: Branch) -> Figure:
         axes.set_ylabel(label)
     panels[0, 1].axhline(1.0, color=GREY, linewidth=0.5)
     panels[0, 1].set_ylim(0.0, None)
-    panels[1, 0].axhline(0.0, color=GREY, linewidth=0.5)
-    panels[1, 1].axhline(0.0, color=GREY, linewidth=0.5)
-    for name, colour in PANELS[2][1].items():
-        panels[1, 0].plot([], [], color=colour, label=f"${MEASURES[name].tex}$")
-    panels[1, 0].legend(loc="center left")
-    clearance = 1e3 * data.clearance_sls1.values
-    panels[1, 1].set_yscale("symlog", linthresh=0.1)
-    panels[1, 1].set_ylim(2.0 * min(clearance.min(), -0.1), 2.0 * max(clearance.max(), 0.1))
+    if papers:
+        _indicators(panels[1], 1e3 * data.clearance_sls1.values)
     for axes in panels[1]:
         axes.set_xlabel(axis_label(branch.parameter))
     _name_borders(figure, borders, branch.parameter)
     return figure
+
+
+def _indicators(panels: np.ndarray, clearance: np.ndarray) -> None:
+    """Zero, names and scale of the panels that only the paper's rung has; clearance in mm."""
+    for axes in panels:
+        axes.axhline(0.0, color=GREY, linewidth=0.5)
+    for name, colour in PANELS[2][1].items():
+        panels[0].plot([], [], color=colour, label=f"${MEASURES[name].tex}$")
+    panels[0].legend(loc="center left")
+    panels[1].set_yscale("symlog", linthresh=0.1)
+    panels[1].set_ylim(2.0 * min(clearance.min(), -0.1), 2.0 * max(clearance.max(), 0.1))
 
 
 def _broken(name: str, values: np.ndarray) -> np.ndarray:

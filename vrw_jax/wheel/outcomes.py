@@ -13,7 +13,7 @@ class Outcome(Code):
         'STEPPED'
     """
 
-    STEPPED = 0, "The wheel stepped from touchdown to touchdown in the paper's sequence."
+    STEPPED = 0, "The wheel stepped from touchdown to touchdown."
     TOUCHDOWN_BEFORE_STOPPER = (
         1, "The next foot met the ground before Leg 2 was back at its stopper."
     )  # fmt: skip
