@@ -264,6 +264,21 @@ COMMANDS: dict[str, tuple[tuple[str, ...], str, str]] = {
         GRID + '[model]\nrung = "rigid"',
         "this command takes viscoelastic",
     ),
+    "a map of real ground": (
+        ("map", "my.toml"),
+        GRID + '[model]\nrung = "unilateral"',
+        "this command takes viscoelastic: write that",
+    ),
+    "a map over one parameter": (
+        ("map", "my.toml"),
+        "[grid]\ndamping = [150.0, 200.0]",
+        "a map is a grid over two parameters",
+    ),
+    "a map of samples": (
+        ("map", "my.toml"),
+        "[uniform]\nn = 4\ndamping = [150.0, 200.0]\nslope = [0.28, 0.3]",
+        "a map is a grid over two parameters",
+    ),
     "rigid legs tuned": (
         ("tune", "my.toml"),
         TUNE.format("speed", BOUNDS) + '[model]\nrung = "rigid"',

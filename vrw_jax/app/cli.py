@@ -326,11 +326,13 @@ def map_borders(
 ) -> None:
     """Draw all borders of gaits over two parameters, on a scan: `vrw map configs/map_c_k.toml`."""
     with sentences():
-        settings, folder = _asked(config, folder, "design")
+        settings, folder = _asked(config, folder, "design", "map")
         planned = scanning.planned_scan(settings, None)
+        from vrw_jax.app.reports import require_map, write_map
+
+        require_map(planned.design)
         _require_place(folder)
     dataset = scanning.compute_scan(planned, folder / "scan.zarr", None)
-    from vrw_jax.app.reports import write_map
 
     with sentences(), err.status("following borders (the first time compiles for minutes)"):
         printing.tell_written(write_map(dataset, settings, folder))
@@ -453,20 +455,25 @@ NEEDED = {
 
 SERVES = {
     "design": ("viscoelastic", "unilateral", "auto"),
+    "map": ("viscoelastic",),
     "tune": ("viscoelastic", "unilateral"),
     "branch": ("viscoelastic", "unilateral", "rigid"),
 }
 """The rungs that a command takes."""
 
 
-def _asked(path: Path, folder: Path | None, needed: str) -> tuple["Config", Path]:
+def _asked(
+    path: Path, folder: Path | None, needed: str, command: str = ""
+) -> tuple["Config", Path]:
     """The config, which says what is `needed`, and the folder of the result."""
     settings = _settings(path)
     if getattr(settings, needed) is None:
         raise ValueError(f"{settings.name} {NEEDED[needed]}")
-    if settings.rung not in SERVES[needed]:
+    serves = SERVES[command or needed]
+    if settings.rung not in serves:
         raise ValueError(
             f"{settings.name} names the rung {settings.rung}, but this command takes "
-            f"{', '.join(SERVES[needed])}: write one of these below [model]."
+            f"{', '.join(serves)}: write {'one of these' if len(serves) > 1 else 'that'} below "
+            "[model]."
         )
     return settings, Path("results") / path.stem if folder is None else folder

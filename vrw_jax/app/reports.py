@@ -14,7 +14,7 @@ from vrw_jax.app.config import Config
 from vrw_jax.branches import Branch, border_curves
 from vrw_jax.gaits import limit_cycle
 from vrw_jax.results import MEASURES, as_markdown, measure_of, what_breaks
-from vrw_jax.scans import OF_CYCLE
+from vrw_jax.scans import OF_CYCLE, design
 from vrw_jax.tuning import Tuned
 from vrw_jax.wheel import DOMAINS, PARAMETER_NAMES, Outcome
 
@@ -40,13 +40,18 @@ def write_branch(branch: Branch, folder: Path, picture: bool = True) -> list[Pat
     return paths + (figures.save(figures.branch_figure(branch), folder, "branch") if drawn else [])
 
 
+def require_map(samples: design.AbstractDesign) -> None:
+    """One sentence where samples are no grid over two parameters."""
+    if len(samples.shape) != 2:
+        raise ValueError(
+            f"the design sweeps {', '.join(samples.names)}, but a map is a grid over two "
+            "parameters: sweep two below [grid]."
+        )
+
+
 def write_map(scan: xr.Dataset, settings: Config, folder: Path) -> list[Path]:
     """Every border over the two parameters of a scan, from its stable gait nearest the middle."""
     names = tuple(map(str, scan.outcome.dims))
-    if len(names) != 2:
-        raise ValueError(
-            f"the grid sweeps {', '.join(names)}, but a map is over two parameters: sweep two."
-        )
     good = np.argwhere(scan.outcome.values == Outcome.STEPPED)
     if not len(good):
         raise ValueError("no gait was found on the grid: choose another.")
