@@ -212,12 +212,16 @@ def draw() -> None:
         axis.set(xscale="log", yscale="log", xlabel="claimed error", ylabel="true error",
                  xlim=ends, ylim=ends)  # fmt: skip
         axis.legend(fontsize=6)
-        groups = (("all", (0, 1, 2, 3)), ("continue the paper's", (0, 1)), ("walked to", (2, 3)))
-        for name, hows in groups:
+        groups = (
+            ("all", (0, 1, 2, 3), "black"),
+            ("continue the paper's", (0, 1), COLOURS[1]),
+            ("walked to", (2, 3), COLOURS[2]),
+        )
+        for name, hows, colour in groups:
             kept = np.isin(cloud["hows"], hows)
             here = [kept & (np.abs(cloud["tol"] / tol - 1.0) < 1e-3) for tol in TOLERANCES]
             cost.plot(TOLERANCES, [np.nanmean(cloud["n_steps"][i]) for i in here], "o-", ms=3,
-                      label=name)  # fmt: skip
+                      color=colour, label=name)  # fmt: skip
         cost.axhline(1.0, color=plots.GREY, lw=0.6)
         cost.set(xscale="log", yscale="log", xlabel="tolerance", ylabel="steps on real ground")
         cost.invert_xaxis()
@@ -231,7 +235,7 @@ def draw() -> None:
             axis.pcolormesh(DAMPING, FRICTION, how, vmin=-0.5, vmax=4.5, cmap=colours)
             axis.set(yscale="log", xlabel="damping $c$ [N·s/m]", title=f"tolerance {tol:g}")
             if tol == MAPPED[0]:
-                axis.set_ylabel("friction")
+                axis.set_ylabel("friction coefficient $\\mu$")
         patches = [Patch(color=colours(i), label=name) for i, name in enumerate(names)]
         below.legend(handles=patches, loc="outside lower center", ncols=len(names), fontsize=6)
     plots.save(page, FIGURES, "answers")

@@ -28,6 +28,10 @@ FOLLOWED = (195.0, 200.0, 205.0, 210.0, 215.0, 220.0, 240.0, 270.0, 300.0, 340.0
 DOWN = (0.32, 1.4)  # friction along the branches, which begin at its upper end
 STEPS = vrw.ArclengthOptions(first_step=0.02, largest_step=0.06, max_points=80)
 GREY, TABLE, BRANCHES = "0.85", FIGURES / "ground_atlas.csv", FIGURES / "ground_atlas_branches.csv"
+FOLD = {
+    "marker": "o", "markersize": 3.5, "markerfacecolor": "white", "color": "black", "linewidth": 1.2
+}  # fmt: skip
+"""Seen on every colour of the maps, and in the legend as there."""
 MEASURES = ("period", "dls_fraction", "speed", "slip", "energy_lost_friction")
 
 
@@ -127,18 +131,16 @@ def draw() -> None:
         for place, axis in enumerate(axes[:, column]):
             axis.set_facecolor(GREY)
             image = axis.pcolormesh(*corners, field(rows, name, place), norm=norm, rasterized=True)
-            axis.plot(c_fold, mu_fold, "o-", color="white", markersize=2.5, linewidth=1.0)
+            axis.plot(c_fold, mu_fold, **FOLD)
             axis.axhline(np.tan(0.3), color="black", linewidth=0.8)
             axis.set_ylim(0.28, corners[1][-1])
         axes[0, column].set_title(label)
         axes[-1, column].set_xlabel("damping $c$ [N·s/m]")
         figure.colorbar(image, ax=axes[:, column], location="bottom", extend="both", aspect=18)
     for axis, text in zip(axes[:, 0], ("slower", "faster of two"), strict=True):
-        axis.set_ylabel(f"{text}: friction $\\mu$")
+        axis.set_ylabel(f"{text}: friction coefficient $\\mu$")
     lines = [
-        Line2D(
-            [], [], marker="o", markersize=2.5, color="0.5", label="fold that ends the slow gait"
-        ),
+        Line2D([], [], **FOLD, label="fold that ends the slow gait"),
         Line2D([], [], color="black", linewidth=0.8, label="$\\tan\\phi$: no gait below"),
         Patch(color=GREY, label="one gait attracts"),
     ]

@@ -227,7 +227,7 @@ def draw() -> None:
     figure, axes = plt.subplots(
         2, 4, figsize=(1.5 * plots.PAGE, 4.6), width_ratios=(1.0, 1.0, 1.0, 1.1)
     )
-    held = {"damping": f"$\\mu$ = {FRICTION}", "friction": f"$c$ = {DAMPING:g} N·s/m"}
+    held = {"damping": f"friction $\\mu$ = {FRICTION}", "friction": f"$c$ = {DAMPING:g} N·s/m"}
     axis_names = {"damping": "damping $c$ [N·s/m]", "friction": "friction coefficient $\\mu$"}
     for line, (along, text) in zip(axes, held.items(), strict=True):
         for axis, (key, label) in zip(line, SHOWN.items(), strict=False):
@@ -260,7 +260,7 @@ def draw() -> None:
         axis.remove()
     beside = figure.add_subplot(grid[:, 3])
     for (column, mu), line in zip(enumerate(header[1:], 1), ("-", "--", "-."), strict=True):
-        label = f"$\\mu$ = {float(mu):.4f}"
+        label = f"friction $\\mu$ = {float(mu):.4f}"
         beside.plot(walks[:, 0], walks[:, column], color="black", ls=line, label=label)
     title = f"walks beyond the fold, $c$ = {DAMPING:g} N·s/m"
     beside.set(xlabel="step", ylabel="period [s]", title=title)

@@ -107,7 +107,7 @@ def draw() -> None:
             if column == 0:
                 axis.set_ylabel(f"{name} start\ndamping $c$ [N·s/m]")
         axes[0, column].set_title(label)
-        axes[-1, column].set_xlabel("friction coefficient")
+        axes[-1, column].set_xlabel("friction coefficient $\\mu$")
         figure.colorbar(image, ax=axes[:, column], location="bottom", extend="max")
     figure.legend(
         handles=[

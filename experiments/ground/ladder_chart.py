@@ -73,7 +73,7 @@ def draw() -> None:
     axes[2].set(ylabel="time per step, mean over gaits [µs]", title="what it costs")
     for axis in axes:
         axis.set_xticks(at, ticks, rotation=90)
-        axis.set_xlabel("friction coefficient")
+        axis.set_xlabel("friction coefficient $\\mu$")
     handles = [axis.get_legend_handles_labels() for axis in (axes[0], axes[1], axes[2])]
     told = dict(pair for h, names in handles for pair in zip(names, h, strict=True))
     figure.legend(told.values(), told.keys(), loc="outside lower center", ncols=3)

@@ -27,6 +27,7 @@ from experiments.shared.tables import DOCS, FIGURES, markdown, replace
 from experiments.shared.timing import on_one_core, processor, seconds
 from experiments.shared.wheels import near_gaits, wheels
 from experiments.speed.derivative_peers import HeyokaVariations, numba_differences
+from experiments.work_precision.charts import COLOURS
 from vrw_jax import figures as plots
 from vrw_jax.wheel import PARAMETER_NAMES
 
@@ -150,12 +151,13 @@ def drawn(table: list[dict]) -> None:
     """Speed over error."""
     with plots.figure_style():
         figure, axes = plt.subplots(figsize=(plots.PAGE, 3.6))
-        for label, marker in zip(LABELS, "osD^", strict=True):
+        known_as = ("lane engine", "heyoka", "numba", "diffrax engine")
+        for label, known, marker in zip(LABELS, known_as, "osD^", strict=True):
             some = sorted((x for x in table if x["method"] == label), key=lambda x: x["error"])
             told = [x["error"] for x in some], [x["speed"] for x in some]
-            axes.loglog(*told, marker=marker, ms=4, label=label)
+            axes.loglog(*told, marker=marker, ms=4, color=COLOURS[known], label=label)
         axes.set(
-            xlabel="p99 error of derivatives",
+            xlabel="error of derivatives, 99 % of lanes below it",
             ylabel="gait steps with seven columns\nper second and core",
         )
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2)

@@ -26,6 +26,7 @@ from experiments.shared.tables import DOCS, markdown, read, replace, write_named
 from experiments.shared.timing import on_one_core, processor, start_cold
 from experiments.shared.wheels import near_gaits, wheels
 from experiments.speed import peers
+from experiments.work_precision.charts import COLOURS
 from vrw_jax import figures as plots
 from vrw_jax.wheel import transitions
 
@@ -38,6 +39,10 @@ LABELS = {
     "heyoka": "heyoka, scalar Taylor",
     "scipy": "SciPy DOP853, compiled right-hand side",
 }
+KNOWN_AS = (
+    "collocation", "lane engine", "diffrax by hand", "diffrax engine", "numba", "heyoka", "SciPy"
+)  # fmt: skip
+"""Whose colour each has: those of work_precision/charts."""
 CLAIMED = 1e-8
 """Error at which engines are compared."""
 
@@ -234,8 +239,7 @@ def draw_charts(table, shares, cost):
     """Speed over error of every engine, and cost over the share of lanes that fall back."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(plots.PAGE, 3.9))
     markers = dict(zip(("Tsit5", "Dopri5", "Dopri8"), "os^", strict=True))
-    cycled = plt.rcParams["axes.prop_cycle"].by_key()["color"]
-    colours = dict(zip(LABELS, [*cycled, plots.GREY, "black"], strict=True))
+    colours = {name: COLOURS[known] for name, known in zip(LABELS, KNOWN_AS, strict=True)}
     for name, label in LABELS.items():
         for method in dict.fromkeys(e["method"] for e in table if e["engine"] == name):
             some = [e for e in table if (e["engine"], e["method"]) == (name, method)]
@@ -251,7 +255,7 @@ def draw_charts(table, shares, cost):
                 label=f"{label}, {method}" if several else label,
             )
     left.axvline(CLAIMED, color="0.7", lw=1)
-    left.set(xlabel="p99 error over lanes", ylabel="gait steps per second and core")
+    left.set(xlabel="error, 99 % of lanes below it", ylabel="gait steps per second and core")
     figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=2)
     for name, values in cost.items():
         right.semilogy(100.0 * shares, values, "o-", ms=4, color=colours[name], label=LABELS[name])

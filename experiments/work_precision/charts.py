@@ -30,7 +30,7 @@ COLOURS = {  # of Okabe and Ito
     "numba": "#000000",
     "heyoka": "#E69F00",
     "SciPy": "#56B4E9",
-    "torchdiffeq": "#999999",
+    "torchdiffeq": "#555555",
 }
 OURS = ("lane engine", "diffrax engine", "collocation")
 PAGE_TEXT = Path(__file__).parent / "page.html"
@@ -157,7 +157,7 @@ def panels(rows: list[Row], quantities: list[str], x_of, x_label: str) -> Figure
     for quantity, axes in zip(quantities, grid, strict=True):
         draw_panel(axes, rows, quantity, x_of)
         axes.set_xlabel(x_label)
-    grid[0].set_ylabel("error: p99, bar from p50 to worst")
+    grid[0].set_ylabel("error, 99 % of lanes below it;\nbar from the median to the worst")
     found: dict[str, object] = {}
     for axes in grid:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):

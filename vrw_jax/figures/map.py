@@ -1,7 +1,7 @@
 """Pictures of borders as curves over two parameters, on the measure that a scan found."""
 
-import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -25,8 +25,16 @@ from vrw_jax.figures.style import (
 from vrw_jax.results import what_breaks
 from vrw_jax.scans import SWEPT
 
-STYLES = [(color, dash) for dash in ("-", "--", ":") for color in (
-    "black", ORANGE, BLUE, GREEN, PINK, SKY, AMBER)]  # fmt: skip
+DASHES = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 4)))
+KINDS = {
+    "black": ("fold", "period_doubling", "neimark_sacker", "branch_point"),
+    BLUE: ("lambda_2_plus", "lambda_4_plus", "lambda_I4", "fore_foot_force"),
+    GREEN: ("clearance_sls1", "clearance_sls2", "takeoff_acceleration"),
+    ORANGE: ("friction_fore", "friction_rear", "landing_friction_fore", "landing_friction_rear"),
+    PINK: ("hit_planted_impulse", "hit_stopper_impulse", "landing_stopper_impulse", "contraction"),
+    AMBER: ("duration_dls", "duration_sls1", "duration_sls2", "rear_stopper_force"),
+}
+"""Of a border's name the colour, and by its place the dash: the same in every map."""
 
 
 @figure_style()
@@ -58,10 +66,9 @@ def map_figure(scan: xr.Dataset, measure: str, curves: Sequence[BorderCurve]) ->
     )
     figure.colorbar(image, ax=axes, aspect=30, pad=0.01).set_label(axis_label(measure))
     names = sorted({curve.name for curve in curves})
-    styles = dict(zip(names, itertools.cycle(STYLES), strict=False))
     labels = {name: typeset(what_breaks(name)) for name in names}
     for curve in curves:
-        color, dash = styles[curve.name]
+        color, dash = _style(curve.name)
         stable = curve.dataset.spectral_radius.values < 1.0
         for there, width in ((stable, 1.2), (~stable, 0.5)):
             # A point of what follows joins them; several pieces of a border are told once.
@@ -81,3 +88,12 @@ def map_figure(scan: xr.Dataset, measure: str, curves: Sequence[BorderCurve]) ->
     if curves:
         figure.legend(loc="outside lower center", ncols=2)
     return figure
+
+
+def _style(name: str) -> tuple[str, Any]:
+    """Colour and dash of a border; those of locked legs by leg, of names unheard of by length."""
+    for color, names in KINDS.items():
+        if name in names:
+            return color, DASHES[names.index(name)]
+    leg = name.partition("[")[2]
+    return SKY, DASHES[(int(leg[:-1]) if leg else len(name)) % len(DASHES)]
