@@ -149,10 +149,11 @@ def test_what_goes_wrong_on_the_way_is_a_code():
         ([Mode(fall, (Guard(lambda y: y[0], to=3),))], [1.0, 0.0], "leads to mode 3"),
         ([ball()], [[1.0, 0.0]], "one row of numbers"),
         ([ball()], [np.nan, 0.0], "not finite"),
+        ([Mode(fall, (fall,))], [1.0, 0.0], "a guard is .* give Guard"),
     ],
 )
 def test_what_can_not_be_walked_is_one_sentence(modes, start, sentence):
-    with pytest.raises(ValueError, match=sentence):
+    with pytest.raises((ValueError, TypeError), match=sentence):
         walk(modes, start, events=2)
 
 
@@ -220,3 +221,6 @@ def test_contacts_have_one_answer_several_or_none():
         np.testing.assert_allclose(told.gap, matrix @ told.force + free, atol=1e-12)
     with pytest.raises(ValueError, match=r"free \(2,\)"):
         complementary(np.eye(3), np.zeros(2))
+    with pytest.raises(ValueError, match="not finite"):
+        complementary([[np.nan]], [1.0])
+    assert np.isnan(jax.jit(complementary)(jnp.full((1, 1), np.nan), jnp.ones(1)).force).all()

@@ -39,6 +39,7 @@ def make() -> None:
     import xarray as xr
 
     import vrw_jax as vrw
+    from vrw_jax import numerics
 
     table_1, start = vrw.WheelParams(), vrw.paper_start()
     several = vrw.WheelParams(damping=np.linspace(100.0, 200.0, 3))
@@ -390,6 +391,33 @@ def make() -> None:
     use(
         "newton_cycle from text", lambda: vrw.newton_cycle(lambda x: x, "abc"), "TypeError", "start"
     )
+
+    # Any field, guards and resets
+    fall = lambda y: jnp.stack([y[1], -9.81 + 0.0 * y[1]])
+    floor = numerics.Guard(lambda y: y[0], lambda y: jnp.stack([0.0 * y[0], -0.8 * y[1]]))
+    ball = numerics.Mode(fall, (floor,))
+    walked = lambda modes, **other: numerics.walk(modes, [1.0, 0.0], **{"events": 2} | other)
+    family("walk events", lambda v: walked([ball], events=v), whole, "events is")
+    for name, call, kind, words in (
+        ("more events than fit", lambda: walked([ball], events=10**12), "ValueError", "fewer"),
+        ("options of a cycle", lambda: walked([ball], options=vrw.CycleOptions()), "TypeError",
+         "vrw.Options()"),
+        ("a mode that there isn't", lambda: walked([ball], mode=3), "ValueError", "mode is 3"),
+        ("a mode in no list", lambda: walked(ball), "TypeError", "a mode is"),
+        ("a field as mode", lambda: walked([fall]), "TypeError", "give Mode(field, guards)"),
+        ("no field", lambda: walked([ball._replace(field=None)]), "TypeError", "a function"),
+        ("a guard in no tuple", lambda: walked([ball._replace(guards=floor)]), "TypeError",
+         "give Guard("),
+        ("a function as guard", lambda: walked([ball._replace(guards=(fall,))]), "TypeError",
+         "give Guard("),
+        ("a field of one row less", lambda: walked([ball._replace(field=lambda y: y[:1])]),
+         "ValueError", "the field of mode 0"),
+    ):  # fmt: skip
+        use(f"walk with {name}", call, kind, words)
+    use("newton_cycle of a map elsewhere", lambda: vrw.newton_cycle(lambda x: x[:1], start),
+        "ValueError", "its like")  # fmt: skip
+    use("contacts that are no number", lambda: numerics.complementary([[np.nan]], [1.0]),
+        "ValueError", "not finite")  # fmt: skip
 
     # Branches
     bounds = {

@@ -50,6 +50,9 @@ def complementary(
             f"matrix has shape {matrix.shape} and free {free.shape}, but they must be (n, n) and "
             f"(n,) with n from 1 to {MOST_CONTACTS}."
         )
+    traced = any(isinstance(x, jax.core.Tracer) for x in (matrix, free))
+    if not traced and not np.isfinite(np.append(matrix, free)).all():
+        raise ValueError("matrix or free holds a number that is not finite: nothing can be told.")
     largest = jnp.max(jnp.abs(matrix))
     scale = jnp.where(largest > 0.0, largest, 1.0)
     free, matrix = free / scale, matrix / scale
@@ -72,6 +75,7 @@ def complementary(
     same = jnp.max(jnp.abs(forces[:, None] - forces[None]), -1) <= reach
     again = jnp.any(jnp.tril(same & fits[None], -1), 1)
     fits = fits & ~again
-    force = jnp.where(jnp.any(fits), forces[jnp.argmax(fits)], 0.0)
+    nothing = 0.0 * (largest + jnp.sum(free))  # not a number under transforms, if given none
+    force = jnp.where(jnp.any(fits), forces[jnp.argmax(fits)], nothing)
     count = jnp.minimum(jnp.sum(fits), int(Answers.SEVERAL)).astype(jnp.int32)
     return Contact(force, scale * (matrix @ force + free), count, fits, forces)

@@ -22,6 +22,10 @@ from vrw_jax.numerics.events import Field, PhaseEnd, integrate_phase
 from vrw_jax.numerics.minima import State, Watched
 from vrw_jax.numerics.options import Options
 from vrw_jax.numerics.types import Scalar, as_float_array
+from vrw_jax.wording import function_of, instance, whole
+
+MOST_NUMBERS = 100_000_000
+"""In all events of a walk: 2.4 GB for times, states before and states after."""
 
 
 class Guard(NamedTuple):
@@ -84,7 +88,8 @@ def walk(
     apply.
     """
     options = Options() if options is None else options
-    start = as_float_array(start)
+    instance("options", options, Options, "give vrw.Options()")
+    start, events = as_float_array(start), whole("events", events)
     _require(modes, start, events, mode)
     options.require_reachable(start.dtype)
     return _walk(tuple(modes), events, options, start, mode)
@@ -96,30 +101,39 @@ def _require(modes: Sequence[Mode], start: Array, events: int, mode: int) -> Non
         raise ValueError(f"start has shape {start.shape}, but a state is one row of numbers.")
     if not isinstance(start, jax.core.Tracer) and not np.all(np.isfinite(start)):
         raise ValueError("start holds a number that is not finite.")
-    if events < 1:
-        raise ValueError(f"events is {events}, but it must be at least 1.")
+    if events * start.size > MOST_NUMBERS:
+        raise ValueError(f"events is {events}, but so many states don't fit: ask for fewer.")
+    instance("modes", modes, (list, tuple), "give Modes in a list")
+    for one in modes:
+        instance("a mode", one, Mode, "give Mode(field, guards)")
+        instance("guards", one.guards, (list, tuple), "give Guards in a tuple")
+        for guard in one.guards:
+            instance("a guard", guard, Guard, "give Guard(value, reset, to)")
     if not 0 <= mode < len(modes):
-        raise ValueError(f"mode is {mode}, but there are {len(modes)} modes, counted from 0.")
+        raise ValueError(f"mode is {mode}, but there are {len(modes)} modes: count from 0.")
     for i, (field, guards) in enumerate(modes):
         if not guards:
-            raise ValueError(f"mode {i} has no guard, but only a guard can end it.")
+            raise ValueError(f"mode {i} has no guard, but only a guard can end it: give one.")
         _require_shape(f"the field of mode {i}", field, start, start.shape)
         for k, guard in enumerate(guards):
             name = f"guard {k} of mode {i}"
             _require_shape(name, guard.value, start, ())
             _require_shape(f"the reset of {name}", guard.reset, start, start.shape)
             if guard.to is not None and not 0 <= guard.to < len(modes):
-                raise ValueError(f"{name} leads to mode {guard.to}, but there are {len(modes)}.")
+                raise ValueError(
+                    f"{name} leads to mode {guard.to}, but there are {len(modes)}: count from 0."
+                )
 
 
 def _require_shape(name: str, function: Callable, start: Array, shape: tuple) -> None:
+    function_of(name, function, "of the state")
     told: Any = jax.eval_shape(function, start)
     found = getattr(told, "shape", None)
     if found != shape or not jnp.issubdtype(told.dtype, jnp.floating):
         what = f"{told.dtype} of shape {found}" if found is not None else type(told).__name__
         raise ValueError(
             f"{name} gives {what} for a state of shape {start.shape}, but it must give floats of "
-            f"shape {shape}."
+            f"shape {shape}: fields and resets give the state's shape, guards one number."
         )
 
 

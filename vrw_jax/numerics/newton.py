@@ -129,6 +129,13 @@ def newton_cycle(
         return x
 
     start = lax.stop_gradient(start)
+    told = jax.eval_shape(function, start)
+    if getattr(told, "shape", None) != start.shape:
+        what = getattr(told, "shape", type(told).__name__)
+        raise ValueError(
+            f"the map gives {what} for a start of shape {start.shape}, but it must give its like: "
+            "take a map of a state to the next."
+        )
     image, closed_over = jax.closure_convert(iterate, start)
     tolerance = lax.stop_gradient(jnp.asarray(tolerance, start.dtype))
     return _found(image, iterations, start, tolerance, *closed_over)

@@ -2,13 +2,14 @@
 
 Published (MatCont's manual, 2012): at k7 = 1.5163129, k8 = 0.83200664 a pair of multipliers has
 modulus 1, and the cycle passes through `PUBLISHED`. On that curve of such points lies the Chenciner
-point, where the return map's cubic coefficient vanishes too; its numbers could not be read, and
-here the coefficient does not vanish. A walk neither settles nor leaves, so that only Newton's
-method finds the cycle. Along any cycle one multiplier is 1, and the product of all is the
-exponential of the divergence's integral.
+point, where the return map's cubic coefficient vanishes too: its k7 is told as 1.752 by the author
+of BifurcationKit (issue 222), and found here from two sections. A walk neither settles nor leaves,
+so that only Newton's method finds the cycle. Along any cycle one multiplier is 1, and the product
+of all is the exponential of the divergence's integral.
 """
 
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from importlib.metadata import version
 
 import jax.numpy as jnp
@@ -16,24 +17,29 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import vrw_jax as vrw
+from experiments.atlas.chenciner_point import Point, chenciner_point
 from experiments.atlas.gaits import Return, gaits
 from experiments.atlas.hybrid import JAX, METHODS, Edge, Part, row
 from experiments.atlas.told import Case, Row, off, timed
-from vrw_jax.numerics import product_multipliers, segment_maps
+from vrw_jax.numerics import Guard, Mode, product_multipliers, segment_maps, walk
 
 K1, K2, K3, K4, K5, K6, K9 = 0.1631021, 1250.0, 0.046875, 20.0, 1.104, 0.001, 0.1175
 K7, K8 = 1.5163129, 0.83200664
 LEVEL = 9.1855407
 PUBLISHED = (6.1231735, 5.4271408e-3, 2.4602951e-2)  # of A, X, Y where B rises through LEVEL
 SEGMENTS = 600
+TOLD, NEAR = (1.752, 0.9113), (9.2149, 1.9652e-3, 2.4941e-3)
+"""The Chenciner point's k7 as told and k8 on the curve there, and A, X, Y on the cycle."""
+OTHER_LEVEL = 11.0
+LONG = vrw.Options(rtol=1e-13, atol=1e-13, max_phase_time=60.0)
 
 
-def field(y, m):
+def field(y, m, k7=K7, k8=K8):
     A, B, X, Y = y
     first, third, second = K1 * A * B * X, K3 * A * B * Y, 2.0 * K2 * X * X
     return (
-        K7 - K9 * A - first - third,
-        K8 - first - third,
+        k7 - K9 * A - first - third,
+        k8 - first - third,
         first - second + 2.0 * third - K4 * X + K6,
         second - third - K5 * Y,
     )
@@ -51,6 +57,38 @@ CYCLE = Return(
     guess=PUBLISHED,
     limit=60.0,
 )
+
+
+def modes(k: jnp.ndarray, level: float) -> tuple[Mode, Mode]:
+    """B rises through a level, and falls through it."""
+    flow = lambda y: jnp.stack(field(y, JAX, k[0], k[1]))
+    onto = lambda y: jnp.stack([y[0], level + 0.0 * y[1], y[2], y[3]])
+    return (
+        Mode(flow, (Guard(lambda y: y[1] - level, onto, 1),)),
+        Mode(flow, (Guard(lambda y: level - y[1], onto, 0),)),
+    )
+
+
+def returned(level: float) -> Callable:
+    """From where B rises through a level to where it does next, (A, X, Y) by (k7, k8)."""
+
+    def there(x, k):
+        start = jnp.stack([x[0], level + 0.0 * x[0], x[1], x[2]])
+        return walk(modes(k, level), start, events=2, options=LONG).state[jnp.array([0, 2, 3])]
+
+    return there
+
+
+def found_on(level: float) -> tuple[Point, float]:
+    """The Chenciner point by the section at a level, and CPU seconds, compiling among them."""
+    k, begin = jnp.array(TOLD), jnp.array([NEAR[0], LEVEL, *NEAR[1:]])
+    began = time.process_time()
+    if level > LEVEL:
+        rising = (Guard(lambda y: level - y[1]),)
+        begin = walk([modes(k, level)[0]._replace(guards=rising)], begin, events=1, options=LONG)
+        begin = begin.state
+    point = chenciner_point(returned(level), np.asarray(begin)[[0, 2, 3]], np.asarray(k))
+    return point, time.process_time() - began
 
 
 def rows() -> Iterator[Row]:
@@ -81,6 +119,14 @@ def rows() -> Iterator[Row]:
         yield Row(
             name, "ours", value, truth, off(value, truth, relative=True), "", False, SEGMENTS,
             seconds, f"Dopri8 1e-13, {SEGMENTS} segments", version("vrw-jax"),
+        )  # fmt: skip
+
+    (point, seconds), (other, _) = found_on(LEVEL), found_on(OTHER_LEVEL)
+    for name, value, truth in zip(("k7", "k8"), point.parameters, other.parameters, strict=True):
+        yield Row(
+            f"{name} of the Chenciner point, by another section", "ours", value, truth,
+            off(value, truth), "", False, 1, seconds,
+            "Dopri8 1e-13, three derivatives, compiling counted", version("vrw-jax"),
         )  # fmt: skip
 
 

@@ -2,8 +2,8 @@
 
 From one spoke to the next it is a pendulum that falls over, then an impact keeps cos 2 alpha of the
 rate: energy gives the gait, w^2 = 4 g sin(alpha) sin(slope) cos^2(2 alpha) / (1 - cos^2(2 alpha)),
-its multiplier is cos^2(2 alpha) = 1/2, its period an integral. Drake adds a small angle after its
-reset so that its guard does not fire again.
+its multiplier is cos^2(2 alpha) = 1/2, its period an integral. Drake's reset takes 2 alpha off an
+angle just past its guard, which leaves its guard above zero.
 """
 
 import math
