@@ -20,7 +20,6 @@ from vrw_jax.branches.continuation import (
     ENDING,
     GaitRun,
     continue_branches,
-    is_rough,
 )
 from vrw_jax.branches.followed import Wheel
 from vrw_jax.branches.gait_levels import (
@@ -88,14 +87,14 @@ class BorderRun(AbstractRun):
     exact: ClassVar[Mapping[str, str]] = EXACT
 
     def read(self, wheels: GaitAt, points: PathPoint) -> Table:
-        at = jax.tree.map(jnp.asarray, points.z)
-        (z, share), second = at, self.followed.second(at)
+        z, share = points.z
+        second = np.asarray(self.followed.second(LevelPoint(z, jnp.asarray(share))))
         here = lambda params: getattr(params, self.formal.names[1])
         gaits = wheels.gait._replace(params=eqx.tree_at(here, wheels.gait.params, second))
         table = self.gaits.read(gaits, points._replace(z=z))
-        told = formal_at(self.formal, gaits, z, jnp.stack([points.p, second], -1))
+        told = formal_at(self.formal, gaits, z, np.stack([points.p, second], -1))
         formal = dict(zip(FORMAL, np.asarray(told).T, strict=True))
-        shares = {EDGE: np.asarray(jnp.minimum(share, 1.0 - share)), "second": np.asarray(second)}
+        shares = {EDGE: np.minimum(share, 1.0 - share), "second": second}
         return table | formal | shares
 
     def known(self, table: Table, owners: np.ndarray) -> Table:
@@ -119,6 +118,9 @@ class BorderRun(AbstractRun):
 
     def is_margin(self, name: str) -> bool:
         return self.gaits.is_margin(name)
+
+    def is_rough(self, table: Table, ends: tuple[str, ...]) -> bool:
+        return self.gaits.is_rough(table, ends)
 
     def name_of_loss(self, table: Table, place: int) -> str:
         return self.gaits.name_of_loss(table, place)
@@ -394,10 +396,11 @@ class _Map(NamedTuple):
         """A curve through each that has one, on a mesh that is fine enough for it."""
         told: list[_Traced] = []
         for refinement in range(1 + FINER):
-            strands = self._strands(kind, seeds)
+            finest = refinement == FINER
+            strands = self._strands(kind, seeds, finest)
             rough = []
             for seed, (strand, problem) in zip(seeds, strands, strict=True):
-                if strand is not None and is_rough(strand) and refinement < FINER:
+                if strand is not None and strand.rough and not finest:
                     options = problem.options.finer()
                     rough.append(self._on_mesh(seed, problem._replace(options=options)))
                 elif strand is not None:
@@ -414,7 +417,7 @@ class _Map(NamedTuple):
         return seed._replace(problem=problem, z=on_mesh(seed.problem, problem, seed.z))
 
     def _strands(
-        self, kind: tuple[str, ...], seeds: list[_Seed]
+        self, kind: tuple[str, ...], seeds: list[_Seed], finest: bool
     ) -> list[tuple[Strand | None, Problem]]:
         problem = max((seed.problem for seed in seeds), key=lambda p: p.options.steps)
         seeds = [self._on_mesh(seed, problem) for seed in seeds]
@@ -440,7 +443,7 @@ class _Map(NamedTuple):
             gaits,
         )
         p, wanted = jnp.asarray([s.at[0] for s in filled]), np.arange(len(filled)) < len(seeds)
-        strands = run_all(run, z, p, wanted, lambda owner, point: lambda: point)
+        strands = run_all(run, z, p, wanted, lambda owner, point: lambda: point, finest)
         return [(strand, problem) for strand in strands[: len(seeds)]]
 
     def _told(self, seed: _Seed, strand: Strand) -> _Traced:

@@ -109,6 +109,9 @@ class GaitRun(AbstractRun):
             return outcome.name.lower()
         return COARSE if "mesh_error" in table else IN_SEQUENCE
 
+    def is_rough(self, table: Table, ends: tuple[str, ...]) -> bool:
+        return COARSE in ends or bool(np.max(table.get("mesh_error", 0.0)) > MESH_ERROR)
+
 
 def continue_branch(
     params: WheelParams,
@@ -253,18 +256,12 @@ def _followed(
             wanted.params.n_legs,
         )  # fmt: skip
         good = start.outcomes == Outcome.STEPPED
-        strands = run_all(run, start.z, wanted.p, good, start.make_cycle)
-        rough = any(strand is not None and is_rough(strand) for strand in strands)
-        if not (adaptive and rough) or start.finer is None or refinement == REFINEMENTS:
+        finest = not adaptive or start.finer is None or refinement == REFINEMENTS
+        strands = run_all(run, start.z, wanted.p, good, start.make_cycle, finest)
+        if finest or not any(strand is not None and strand.rough for strand in strands):
             break
         wanted, cycle = wanted._replace(cycle_options=start.finer), start.cycle
     return start.outcomes, strands
-
-
-def is_rough(strand: Strand) -> bool:
-    """Whether the mesh, not the wheel, says how far the branch goes or how exact it is."""
-    ended = any(border.ends_branch and border.name == COARSE for border in strand.borders)
-    return ended or bool(np.max(strand.table.get("mesh_error", 0.0)) > MESH_ERROR)
 
 
 UNTOLD = ("outcome", "solver_steps")

@@ -6,7 +6,7 @@ event-driven step tells come from steps.
 
 import functools
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -153,7 +153,7 @@ TOLD = {FORMAL: _formal, BIFURCATIONS: _monodromy}
 
 
 @eqx.filter_jit
-def formal_at(level: GaitLevel, wheels: Wheel, z: Solution, p: Array) -> Array:
+def formal_at(level: GaitLevel, wheels: Wheel, z: Solution, p: Any) -> Array:
     def one(wheel: Wheel, z: Solution, p: Array) -> Array:
         params = level.at(wheel, p).params
         return _formal(level.problem, parameters_of(params), wheel.happens, z)

@@ -29,6 +29,7 @@ from vrw_jax.numerics import (
     brackets,
     follow_many,
     in_batches,
+    in_batches_of_numpy,
     joined,
     locate,
     solve,
@@ -91,17 +92,26 @@ class AbstractRun(abc.ABC):
         """What the first point beyond the end of a branch says of it."""
         return IN_SEQUENCE
 
+    def is_rough(self, table: Table, ends: tuple[str, ...]) -> bool:
+        """Whether a mesh says how far a branch goes or how exact it is; `ends`: names of losses."""
+        return False
+
     @property
     def shapes(self) -> tuple[int, ...]:
         """Of `SHAPES`, those that are used."""
         return SHAPES[-1:] if self.followed.traced else SHAPES
 
+    def batched(self, function: Callable, *trees: Any) -> Any:
+        """Of many rows, which are numpy's here."""
+        if self.followed.traced:
+            return in_batches_of_numpy(function, self.shapes, *trees)
+        return jax.tree.map(np.asarray, in_batches(function, self.shapes, *trees))
+
     def table(self, points: PathPoint, owners: np.ndarray) -> Table:
         """Every quantity at each point, bifurcation functions and IN_SEQUENCE included."""
         wheels = taken(self.wheels, owners)
-        found = jax.tree.map(np.asarray, in_batches(self.read, self.shapes, wheels, points))
-        bifurcations = lambda jacobians: bifurcation_functions(np.asarray(jacobians))
-        margins = np.asarray(in_batches(bifurcations, SHAPES[-1:], points.jacobian))
+        found = self.batched(self.read, wheels, points)
+        margins = in_batches_of_numpy(bifurcation_functions, SHAPES[-1:], points.jacobian)
         found |= {name: margins[:, i] for i, name in enumerate(BIFURCATIONS)}
         found = self.known(found, owners)
         for name, exact in self.exact.items():
@@ -215,7 +225,7 @@ def _zeros(run: AbstractRun, pieces: _Pieces, asked: list[tuple[int, int, str]])
 
     def evaluated(places: np.ndarray, which: np.ndarray) -> tuple[PathPoint, Table]:
         some = *taken((wheels, left, right), which), places
-        points, found = jax.tree.map(np.asarray, in_batches(search, run.shapes, *some))
+        points, found = run.batched(search, *some)
         points = points._replace(valid=points.valid & found)
         table = run.table(points, owners[which])
         return points, {k: np.where(_along(found, v), v, np.nan) for k, v in table.items()}
@@ -293,6 +303,20 @@ def _reaches(pieces: _Pieces, starts: Mapping[int, int]) -> list[_Reach]:
     return reaches
 
 
+def _is_rough(run: AbstractRun, pieces: _Pieces, reach: _Reach) -> bool:
+    """`AbstractRun.is_rough` before its borders are located."""
+    lost = [i for i in reach.beyond if i >= 0 and not _crossing(run, pieces, reach, i)]
+    names = tuple(run.name_of_loss(pieces.table, i) for i in lost)
+    return run.is_rough(taken(pieces.table, reach.points), names)
+
+
+def _crossing(run: AbstractRun, pieces: _Pieces, reach: _Reach, beyond: int) -> list[str]:
+    """What changes sign from the last point to the first one beyond."""
+    last = reach.points[0 if beyond < reach.points[0] else -1]
+    known = [name for name in run.ending if name in pieces.table]
+    return [n for n in known if pieces.table[n][last] * pieces.table[n][beyond] < 0.0]
+
+
 def _located_ends(
     run: AbstractRun, pieces: _Pieces, reaches: list[_Reach]
 ) -> dict[tuple[int, int], _Zero]:
@@ -303,13 +327,7 @@ def _located_ends(
             if beyond < 0:
                 continue
             last = int(reach.points[0 if end == 0 else -1])
-            crossing = [
-                name
-                for name in run.ending
-                if name in pieces.table
-                and pieces.table[name][last] * pieces.table[name][beyond] < 0.0
-            ]
-            for name in crossing or [IN_SEQUENCE]:
+            for name in _crossing(run, pieces, reach, beyond) or [IN_SEQUENCE]:
                 asked.append((last, beyond, name))
                 keys.append((reach.owner, end))
     nearest: dict[tuple[int, int], _Zero] = {}
@@ -376,16 +394,37 @@ class Strand(NamedTuple):
     table: Table
     borders: tuple[Border, ...]
     ends: tuple[str, str]
+    rough: bool  # `AbstractRun.is_rough`
 
 
 MakeCycle = Callable[[int, PathPoint], Callable[[], Any] | None]
 """From a wheel's place and a point to what computes its limit cycle."""
 
 
-def run_all(
-    run: AbstractRun, z: Any, p: Array, found: np.ndarray, make_cycle: MakeCycle
+def _left_rough(
+    run: AbstractRun, pieces: _Pieces, reaches: list[_Reach], n_wheels: int
 ) -> list[Strand | None]:
-    """Follow, locate, and sort by wheel; None where there was no start."""
+    """What is rough, as it was followed."""
+    strands: list[Strand | None] = [None] * n_wheels
+    for reach in reaches:
+        if _is_rough(run, pieces, reach):
+            points, table = taken((pieces.points, pieces.table), reach.points)
+            strands[reach.owner] = Strand(points, table, (), ("", ""), True)
+    return strands
+
+
+def run_all(
+    run: AbstractRun,
+    z: Any,
+    p: Array,
+    found: np.ndarray,
+    make_cycle: MakeCycle,
+    finest: bool = True,
+) -> list[Strand | None]:
+    """Follow, locate, and sort by wheel; None where there was no start.
+
+    Without `finest`, of what is rough no border is located: it will be followed again.
+    """
     tracks = _follow_both_ways(run, z, p)
     # What comes back to its start has gone both ways at once.
     closed = (tracks.ending == int(Ending.CLOSED)).all(1, keepdims=True) & np.array([True, False])
@@ -397,8 +436,12 @@ def run_all(
         w: max(int(tracks.n_points[w, 0]) - 1, 0) for w in range(n_wheels) if w in pieces.owners
     }
     reaches = _reaches(pieces, starts)
+    strands: list[Strand | None] = [None] * n_wheels
+    if not finest:
+        strands = _left_rough(run, pieces, reaches, n_wheels)
+        reaches = [reach for reach in reaches if strands[reach.owner] is None]
     if not reaches:
-        return [None] * n_wheels
+        return strands
     ends = _located_ends(run, pieces, reaches)
     whole = _with_ends(pieces, reaches, ends)
     inner = _inner_zeros(run, whole)
@@ -413,7 +456,6 @@ def run_all(
             _kind(run, name), name, zero.value, point, ends_branch, make_cycle(owner, beside)
         )
 
-    strands: list[Strand | None] = [None] * n_wheels
     for reach in reaches:
         own = np.flatnonzero(whole.owners == reach.owner)
         placed = [
@@ -431,7 +473,8 @@ def run_all(
             placed.append((own[0] - 1.0 if end == 0 else own[-1] + 1.0, last))
             endings.append(f"{last.name.replace('_', ' ')} at {last.value:.9g} ends it.")
         borders = tuple(b for _, b in sorted(placed, key=lambda pair: pair[0]))
-        strands[reach.owner] = Strand(
-            taken(whole.points, own), taken(whole.table, own), borders, (endings[0], endings[1])
-        )
+        table = taken(whole.table, own)
+        lost = tuple(b.name for b in borders if b.ends_branch)
+        told = taken(whole.points, own), table, borders, (endings[0], endings[1])
+        strands[reach.owner] = Strand(*told, run.is_rough(table, lost))
     return strands

@@ -65,6 +65,7 @@ from vrw_jax.numerics.lanes import (
     LaneFunction,
     compiled_by_caller,
     in_batches,
+    in_batches_of_numpy,
     in_blocks,
     joined,
     one_wheel,

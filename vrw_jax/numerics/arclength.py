@@ -330,7 +330,7 @@ def _ending(
     accepted, failed, _ = judged
     count, ending = state.n_points + accepted, state.ending
     for happened, code in (
-        (failed & (step < options.smallest_step), Ending.STALLED),
+        (step < options.smallest_step, Ending.STALLED),
         (failed & (state.n_points == 0), Ending.NO_START),
         (accepted & (count >= options.max_points), Ending.BUFFER_FULL),
         (accepted & (state.trial.final | (ahead <= 1e-12)), Ending.RANGE_ENDED),

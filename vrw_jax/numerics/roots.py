@@ -15,7 +15,10 @@ from vrw_jax.numerics.floquet import bifurcation_margins, multipliers
 BIFURCATIONS = ("fold", "period_doubling", "neimark_sacker")
 """Each vanishes where a multiplier is 1, where one is -1, where a pair of modulus 1 is."""
 
-ROUNDS = 100
+ROUNDS = 12
+"""In which what is smooth is located. What is not jumps: from then on it is cut in SECTIONS."""
+
+SECTIONS = 9
 ON_CIRCLE = 1e-4
 """How far from modulus 1 the pair of a located Neimark-Sacker bifurcation may be."""
 
@@ -76,9 +79,9 @@ def locate(
     """Zeros of functions that have opposite signs at 0 and 1, by Chandrupatla's method.
 
     `function` takes places and which brackets they are of. Inverse quadratic interpolation where it
-    can be trusted, bisection else: a jump is found as surely as a smooth zero. Ends when each
-    bracket is narrower than `width`. A place where the function is not a number counts to the side
-    of 1, whose values are `at_one`.
+    can be trusted, bisection else, and many sections at once where that goes on: a jump is found as
+    surely as a smooth zero. Ends when each bracket is narrower than `width`. A place where the
+    function is not a number counts to the side of 1, whose values are `at_one`.
     """
     from scipy.optimize.elementwise import find_root  # only borders need it, its import is slow
 
@@ -92,4 +95,16 @@ def locate(
     found = find_root(
         signed, inside, args=(np.arange(len(width)),), tolerances=tolerances, maxiter=ROUNDS
     )
-    return Located(*(place * width for place in (found.x, *found.bracket)))
+    best, left, right = np.array((found.x, *found.bracket))
+    open_ = np.flatnonzero(right - left > 1.0)
+    while len(open_):
+        cuts = np.linspace(left[open_], right[open_], SECTIONS + 1, axis=-1)
+        inner = cuts[:, 1:-1]
+        values = signed(inner.ravel(), np.repeat(open_, SECTIONS - 1)).reshape(inner.shape)
+        ours = np.sign(values) != np.sign(at_one[open_])[:, None]
+        last = np.sum(np.cumprod(ours, 1), 1)  # before the first place on the side of 1
+        left[open_] = np.take_along_axis(cuts, last[:, None], 1)[:, 0]
+        right[open_] = np.take_along_axis(cuts, last[:, None] + 1, 1)[:, 0]
+        best[open_] = left[open_]
+        open_ = open_[right[open_] - left[open_] > 1.0]
+    return Located(*(place * width for place in (best, left, right)))
