@@ -20,7 +20,7 @@ import numpy as np
 
 from vrw_jax.answers.lower import Lower
 from vrw_jax.answers.quantities import N_DURATIONS, N_QUANTITIES, measured, slopes
-from vrw_jax.answers.top import Ground, Stepped
+from vrw_jax.answers.top import OPINIONS, Ground, Stepped
 from vrw_jax.wheel import Outcome
 
 SLOWEST, TRUSTED, QUICKEST = 0.5, 0.25, 0.1
@@ -177,18 +177,20 @@ class Chord:
         same = np.all(self.x[some, m:] == step.x[:, m:], axis=1)
         return same & (step.outcome == Outcome.STEPPED)
 
-    def second_opinion(self, some: np.ndarray, names: Sequence[str], told: "Settled") -> np.ndarray:
-        """Numerical errors by one step more, at another tolerance, in place of what dips may cost:
-        the shortest that are followed are shorter, or longer, there. Infinite where that step has
-        another motion."""
-        if not len(some):
-            return told.numerical[some]
-        ground = self.ground.otherwise()
-        chord = dataclasses.replace(self.some(some), ground=ground, has=np.zeros(len(some), bool))
-        seen = chord.see(np.arange(len(some)), chord.step(np.arange(len(some))), names)
-        apart = AT_REST * np.abs(seen.values - told.values[some])
-        least = np.minimum(seen.numerical, told.numerical[some])
-        return np.where(seen.same[:, None], apart + least, np.inf)
+    def other_opinions(self, some: np.ndarray, names: Sequence[str], told: "Settled") -> np.ndarray:
+        """Numerical errors by steps at other tolerances, in place of what dips may cost: the
+        shortest that are followed are shorter, or longer, there. Infinite where one of these steps
+        has another motion."""
+        worst = np.zeros_like(told.numerical[some])
+        for ground in self.ground.otherwise():
+            chord = dataclasses.replace(
+                self.some(some), ground=ground, has=np.zeros(len(some), bool)
+            )
+            seen = chord.see(np.arange(len(some)), chord.step(np.arange(len(some))), names)
+            apart = AT_REST * np.abs(seen.values - told.values[some])
+            error = apart + np.minimum(seen.numerical, told.numerical[some])
+            worst = np.maximum(worst, np.where(seen.same[:, None], error, np.inf))
+        return worst
 
     def attract(self) -> np.ndarray:
         """Whether walks near by come to where the lanes are: no multiplier is beyond one, which is
@@ -327,7 +329,8 @@ def settled(
         chord.go_on(open_[goes_on], step.x[goes_on], seen.same[goes_on])
         open_ = open_[goes_on]
     some = np.flatnonzero(doubted)
-    told.numerical[some] = chord.second_opinion(some, names, told)
-    told.n_steps[some] += 1
+    if len(some):
+        told.numerical[some] = chord.other_opinions(some, names, told)
+        told.n_steps[some] += len(OPINIONS)
     told.done[some] &= np.isfinite(told.numerical[some]).all(1)
     return told

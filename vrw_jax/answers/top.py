@@ -13,6 +13,8 @@ from vrw_jax.wheel import PARAMETER_NAMES, WheelParams
 TIGHT, TIGHTER = 1e-10, 1e-12
 """Tolerances of steps. Looser ones save a seventh of the time and miss events; the tighter one
 costs a third more."""
+OPINIONS = TIGHTER, 1e-9, 1e-11
+"""Of others, where feet may dip: the first changes places with TIGHT."""
 
 
 class Stepped(NamedTuple):
@@ -56,10 +58,12 @@ class Ground:
         told = np.column_stack([durations, length, y[:, self.plane()]])
         return Stepped(y, told, outcome)
 
-    def otherwise(self) -> "Ground":
-        """With steps at the other tolerance."""
-        tolerance = TIGHT if float(self.options.rtol) < TIGHT else TIGHTER
-        return dataclasses.replace(self, options=Options(rtol=tolerance, atol=tolerance))
+    def otherwise(self) -> list["Ground"]:
+        """With steps at other tolerances."""
+        own = float(self.options.rtol)
+        tolerances = (TIGHT if own < TIGHT else TIGHTER, *OPINIONS[1:])
+        options = [Options(rtol=tolerance, atol=tolerance) for tolerance in tolerances]
+        return [dataclasses.replace(self, options=each) for each in options]
 
     def shortest(self, lanes: np.ndarray) -> np.ndarray:
         """Of each lane the time that a foot is off the ground in the least dip that is followed."""

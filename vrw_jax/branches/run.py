@@ -431,10 +431,8 @@ def run_all(
     counts: Any = np.where(found[:, None] & ~closed, tracks.n_points, 0)
     tracks = tracks._replace(n_points=counts)
     pieces = _collected(run, tracks)
-    n_wheels = len(found)
-    starts = {
-        w: max(int(tracks.n_points[w, 0]) - 1, 0) for w in range(n_wheels) if w in pieces.owners
-    }
+    n_wheels, before = len(found), np.maximum(tracks.n_points[:, 0] - 1, 0)
+    starts = {w: int(before[w]) for w in range(n_wheels) if w in pieces.owners}
     reaches = _reaches(pieces, starts)
     strands: list[Strand | None] = [None] * n_wheels
     if not finest:

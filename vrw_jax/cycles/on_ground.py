@@ -215,7 +215,8 @@ def _newton(
     """Fixed points near `start`; codes at the end of a section state are those of the image.
 
     First by loose steps until corrections are small, then by a step as exact as `options` with the
-    same Jacobian, which leads so near that one more, with all derivatives, tells the gait.
+    same Jacobian, which leads so near that one more, with all derivatives, tells the gait. Where
+    loose steps lead away from what an exact one hardly moves, all are exact.
     """
     maps = Periods(model, n_legs, period_n, values)
     looser = [jnp.maximum(tolerance, LOOSE) for tolerance in (options.rtol, options.atol)]
@@ -226,8 +227,9 @@ def _newton(
     exact = maps.around(options, x, False, False)
     change = exact.change(x, by_start)
     x[near] += change[near] * (np.abs(change[near]).max(-1, keepdims=True) < ROUGH)
+    near = near | (exact.good & (np.abs(exact.image - x).max(-1) < ROUGH))
     told, _ = _corrected(maps, options, x, by_values, tolerance, near, ends=False)
-    return told._replace(iterations=rough.iterations + near + told.iterations)
+    return told._replace(iterations=rough.iterations + 1 + told.iterations)
 
 
 def _corrected(
