@@ -135,7 +135,7 @@ class ViscoelasticWheel(AbstractWheel):
         told = self._told(params, x, options, monitored=False)
         tried = jnp.sum(told.tried, axis=0)
         return Advance(
-            section_state_of(told), told.durations, told.outcome, tried, engine=_engine(options)
+            _section_state_of(told), told.durations, told.outcome, tried, engine=_engine(options)
         )
 
     def step(self, params: WheelParams, x: SectionState, options: Options) -> StepResult:
@@ -213,7 +213,7 @@ def _full_step(
     return dataclasses.replace(result, engine=_engine(options))
 
 
-_compiled_full_step = eqx.filter_jit(_full_step)
+_compiled_full_step, _section_state_of = eqx.filter_jit(_full_step), jax.jit(section_state_of)
 
 
 def _landed(params: WheelParams, x: SectionState) -> tuple[Symbols, Landing]:

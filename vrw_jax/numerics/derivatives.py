@@ -52,8 +52,7 @@ def any_mode(
             out, other = wrapped(*primals)
             return (out, other), (jax.tree.map(jnp.zeros_like, out), _no_tangent(other))
         (jacobian, out), other = differentiated(moved)(*primals)
-        pushed = [_push(out, part, tangents[i]) for part, i in zip(jacobian, moved, strict=True)]
-        tangent = jax.tree.map(lambda *parts: sum(parts[1:], start=parts[0]), *pushed)
+        tangent = _pushed(out, jacobian, tuple(tangents[i] for i in moved))
         return (out, other), (tangent, _no_tangent(other))
 
     wrapped.defjvp(rule, symbolic_zeros=True)
@@ -77,10 +76,18 @@ def _jacobian(function: Forward, moved: tuple[int, ...]) -> Forward:
     return jacobian
 
 
-def _push(out: PyTree, jacobian: PyTree, tangent: Array) -> PyTree:
-    """Jacobian times tangent, leaf by leaf: as sums, since products of small arrays are calls."""
-    axes = tuple(range(-jnp.ndim(tangent), 0))
-    return jax.tree.map(lambda _, part: jnp.sum(part * tangent, axis=axes), out, jacobian)
+@jax.jit
+def _pushed(out: PyTree, by_argument: PyTree, tangents: tuple) -> PyTree:
+    """Jacobians times tangents, leaf by leaf: as sums, since products of small arrays are calls."""
+
+    def push(_: Array, *parts: Array) -> Array:
+        pushed = [
+            jnp.sum(part * tangent, axis=tuple(range(-jnp.ndim(tangent), 0)))
+            for part, tangent in zip(parts, tangents, strict=True)
+        ]
+        return sum(pushed[1:], start=pushed[0])
+
+    return jax.tree.map(push, out, *by_argument)
 
 
 def _no_tangent(tree: PyTree) -> PyTree:
