@@ -32,7 +32,7 @@ CLOSE = 0.1
 WALKS = (40, 200)
 """Steps of a walk to it, where Newton's method from there leads elsewhere."""
 TOLD = ("values", "errors", "model_errors", "rungs", "hows", "n_steps", "states", "outcomes")
-TRUE = tuple(vrw.Options(rtol=tol, atol=tol) for tol in (1e-12, 1e-11, 1e-10, 1e-9))
+TRUE = (1e-12, 1e-11, 1e-10, 1e-9)
 TOLERANCES = 10.0 ** -np.arange(2, 9)
 MAPPED = (1e-2, 1e-4, 1e-6)
 MEASURES = ("speed", "dls_fraction", "period")
@@ -97,7 +97,8 @@ def truth(
     """
     exact, open_ = np.full((len(friction), len(MEASURES)), np.nan), np.flatnonzero(found)
     legs = vrw.WheelParams().n_legs
-    for n_steps, options in [(n, TRUE[0]) for n in (0, *WALKS)] + [(0, o) for o in TRUE[1:]]:
+    for n_steps, tol in [(n, TRUE[0]) for n in (0, *WALKS)] + [(0, tol) for tol in TRUE[1:]]:
+        options = vrw.Options(rtol=tol, atol=tol)
         if not len(open_):
             break
         finder = finder_of(vrw.UnilateralWheel(), legs, step_options=options)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
+from matplotlib.patheffects import Normal, Stroke
 
 from vrw_jax.branches import BorderCurve
 from vrw_jax.figures.style import (
@@ -25,14 +26,14 @@ from vrw_jax.figures.style import (
 from vrw_jax.results import what_breaks
 from vrw_jax.scans import SWEPT
 
-DASHES = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 4)))
+DASHES = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 3)))
 KINDS = {
     "black": ("fold", "period_doubling", "neimark_sacker", "branch_point"),
     BLUE: ("lambda_2_plus", "lambda_4_plus", "lambda_I4", "fore_foot_force"),
     GREEN: ("clearance_sls1", "clearance_sls2", "takeoff_acceleration"),
     ORANGE: ("friction_fore", "friction_rear", "landing_friction_fore", "landing_friction_rear"),
     PINK: ("hit_planted_impulse", "hit_stopper_impulse", "landing_stopper_impulse", "contraction"),
-    AMBER: ("duration_dls", "duration_sls1", "duration_sls2", "rear_stopper_force"),
+    AMBER: ("duration_sls2", "duration_sls1", "duration_dls", "rear_stopper_force"),
 }
 """Of a border's name the colour, and by its place the dash: the same in every map."""
 
@@ -75,7 +76,11 @@ def map_figure(scan: xr.Dataset, measure: str, curves: Sequence[BorderCurve]) ->
             joined = there | np.append(False, there[:-1])
             drawn = np.where(joined[:, None], curve.values, np.nan)
             told = labels.pop(curve.name, None) if there.any() else None
-            axes.plot(*drawn.T, color=color, linestyle=dash, linewidth=width, label=told)
+            halo = [Stroke(linewidth=width + 1.0, foreground="white"), Normal()]
+            axes.plot(
+                *drawn.T, color=color, linestyle=dash, linewidth=width, label=told,
+                path_effects=halo,
+            )  # fmt: skip
     met = np.array([meeting.values for curve in curves for meeting in curve.meetings])
     axes.plot(
         *met.reshape(-1, 2).T, "o", color="black", markersize=2.5, markerfacecolor="white",
@@ -96,4 +101,4 @@ def _style(name: str) -> tuple[str, Any]:
         if name in names:
             return color, DASHES[names.index(name)]
     leg = name.partition("[")[2]
-    return SKY, DASHES[(int(leg[:-1]) if leg else len(name)) % len(DASHES)]
+    return SKY, DASHES[(int(leg[:-1]) - 3 if leg else len(name)) % len(DASHES)]

@@ -11,10 +11,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.atlas.hybrid import METHODS, Edge, Part, last_time, row
+from experiments.atlas.others import rows_of
 from experiments.atlas.told import Case, Row
 
 G, R = 9.81, 0.8
 FALL = math.sqrt(2.0 / G)
+LAST = FALL * (1.0 + R) / (1.0 - R)
 EVENTS = 250
 BALL = (Part(lambda y, m: (y[1], -G), (Edge(lambda y, m: y[0], lambda y, m: (0.0, -R * y[1])),)),)
 
@@ -31,7 +33,9 @@ def rows() -> Iterator[Row]:
         yield row(early, "time of bounce 20", last_time(walked, 20), float(times(20)[-1]))
         end = float(walked.times[-1]) if len(walked.times) else math.nan
         told = walked._replace(says=walked.says or f"goes on: {len(walked.times)} bounces")
-        yield row(told, "time of the last bounce", end, FALL * (1.0 + R) / (1.0 - R))
+        yield row(told, "time of the last bounce", end, LAST)
+    truths = {"time of bounce 20": float(times(20)[-1]), "time of the last bounce": LAST}
+    yield from rows_of("siconos", "bouncing_ball", truths)
 
 
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:

@@ -31,7 +31,6 @@ SEGMENTS = 600
 TOLD, NEAR = (1.752, 0.9113), (9.2149, 1.9652e-3, 2.4941e-3)
 """The Chenciner point's k7 as told and k8 on the curve there, and A, X, Y on the cycle."""
 OTHER_LEVEL = 11.0
-LONG = vrw.Options(rtol=1e-13, atol=1e-13, max_phase_time=60.0)
 
 
 def field(y, m, k7=K7, k8=K8):
@@ -69,12 +68,16 @@ def modes(k: jnp.ndarray, level: float) -> tuple[Mode, Mode]:
     )
 
 
+def long() -> vrw.Options:
+    return vrw.Options(rtol=1e-13, atol=1e-13, max_phase_time=60.0)
+
+
 def returned(level: float) -> Callable:
     """From where B rises through a level to where it does next, (A, X, Y) by (k7, k8)."""
 
     def there(x, k):
         start = jnp.stack([x[0], level + 0.0 * x[0], x[1], x[2]])
-        return walk(modes(k, level), start, events=2, options=LONG).state[jnp.array([0, 2, 3])]
+        return walk(modes(k, level), start, events=2, options=long()).state[jnp.array([0, 2, 3])]
 
     return there
 
@@ -85,7 +88,7 @@ def found_on(level: float) -> tuple[Point, float]:
     began = time.process_time()
     if level > LEVEL:
         rising = (Guard(lambda y: level - y[1]),)
-        begin = walk([modes(k, level)[0]._replace(guards=rising)], begin, events=1, options=LONG)
+        begin = walk([modes(k, level)[0]._replace(guards=rising)], begin, events=1, options=long())
         begin = begin.state
     point = chenciner_point(returned(level), np.asarray(begin)[[0, 2, 3]], np.asarray(k))
     return point, time.process_time() - began

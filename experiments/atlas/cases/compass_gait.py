@@ -15,6 +15,7 @@ from scipy.integrate import solve_ivp
 
 from experiments.atlas.gaits import Exact, Return, gaits
 from experiments.atlas.hybrid import METHODS, Edge, Part, row
+from experiments.atlas.others import rows_of
 from experiments.atlas.told import Case, Row
 
 G, LEG, HALF, MASS, HIP = 9.8, 1.0, 0.5, 5.0, 10.0
@@ -90,6 +91,8 @@ def rows() -> Iterator[Row]:
         yield row(gait.walked, "period", gait.duration, EXACT.period)
         radius = abs(EXACT.multipliers[0])
         yield row(gait.walked, "spectral radius", float(np.abs(gait.multipliers[0])), radius)
+    truths = {"stance angle": EXACT.x[0], "period": EXACT.period}
+    yield from rows_of("drake", "compass_gait", truths)
 
 
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:

@@ -7,6 +7,7 @@ exclude each other: for A < 0 there are two answers if b > 0, and none if b < 0.
 at m = 4/3 and tan a = 2.
 """
 
+import json
 import math
 from collections.abc import Iterator
 from importlib.metadata import version
@@ -19,6 +20,7 @@ from matplotlib.figure import Figure
 from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve, nnls
 
+from experiments.atlas.others import rows_of
 from experiments.atlas.told import Case, Row, off, timed
 from vrw_jax.numerics import Answers, complementary, newton_cycle
 
@@ -65,6 +67,10 @@ def rows() -> Iterator[Row]:
             name, "SciPy, penalty ground", 1, count, off(1, count), f"force {force:.3g}", False,
             work, seconds, f"Radau 1e-8, stiffness {STIFF:g}", version("scipy"),
         )  # fmt: skip
+
+    rod = json.dumps({name: contact(*state[:2], FRICTION) for name, state in STATES.items()})
+    counts = {name: float(count) for name, (_, _, count) in STATES.items()}
+    yield from rows_of("siconos", "painleve", counts, "--rod", rod)
 
     def border(x: jax.Array) -> jax.Array:
         value, slope = jax.value_and_grad(lambda a: contact(a, 0.0, x[1], jnp)[0])(x[0])

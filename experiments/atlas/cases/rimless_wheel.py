@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 
 from experiments.atlas.gaits import Return, gaits
 from experiments.atlas.hybrid import METHODS, Edge, Part, row
+from experiments.atlas.others import rows_of
 from experiments.atlas.told import Case, Row
 
 G, SLOPE, ALPHA = 9.81, 0.08, math.pi / 8
@@ -49,6 +50,8 @@ def rows() -> Iterator[Row]:
         yield row(gait.walked, "rate after impact", float(gait.x[0]), RATE)
         yield row(gait.walked, "period", gait.duration, period())
         yield row(gait.walked, "multiplier", float(gait.jacobian[0, 0]), KEPT**2)
+    truths = {"rate after impact": RATE, "period": period(), "multiplier": KEPT**2}
+    yield from rows_of("drake", "rimless_wheel", truths)
 
 
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
