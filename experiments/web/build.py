@@ -72,7 +72,18 @@ def linked(objects: dict[str, bytes]) -> bytes:
 def compiled(n_legs: int) -> str:
     """The step's code for so many legs, packed as the page holds it."""
     code = linked({name: program.object(name) for name, program in programs(n_legs).items()})
-    return base64.b64encode(gzip.compress(code, 9, mtime=0)).decode()
+    return packed(gzip.compress(code, 9, mtime=0))
+
+
+def packed(code: bytes) -> str:
+    """As text that may stand in a page: how many zeros follow, and base 85, where `.` is `<`."""
+    return f"{-len(code) % 4}{base64.b85encode(code, pad=True).decode().replace('<', '.')}"
+
+
+def unpacked(text: str) -> bytes:
+    """The inverse."""
+    code = base64.b85decode(text[1:].replace(".", "<"))
+    return code[: len(code) - int(text[0])]
 
 
 def told_rows(n_legs: int) -> list[str]:
@@ -143,7 +154,8 @@ def written(code: dict[str, str]) -> str:
     part = lambda name: (SOURCES / name).read_text(encoding="utf-8")
     page, held = part("page.html"), {}
     for name in ("page.css", "engine.js", "worker.js", "pictures.js", "page.js"):
-        held[f"/*{name}*/"] = part(name)
+        lines = (line.strip() for line in part(name).splitlines())
+        held[f"/*{name}*/"] = "\n".join(x for x in lines if x and not x.startswith("// "))
     held[f"/*{FACTS}*/"] = json.dumps(facts(), ensure_ascii=False)
     held[f"/*{CODE}*/"] = json.dumps(code)
     for mark, text in held.items():

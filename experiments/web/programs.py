@@ -11,10 +11,19 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from vrw_jax import simd
-from vrw_jax.models import DIRECTIONS, RigidWheel, StepResult, along_units, gait_step
+from vrw_jax.models import (
+    DIRECTIONS,
+    RigidWheel,
+    StepResult,
+    UnilateralWheel,
+    along_units,
+    gait_step,
+)
 from vrw_jax.models.lane_step import lane_phase, walk
 from vrw_jax.models.paper_step import result_of, told_of
 from vrw_jax.models.rigid import Roll
+from vrw_jax.models.unilateral.lanes import Walk, walked
+from vrw_jax.models.unilateral.section import embedded, section_size
 from vrw_jax.models.viscoelastic import described
 from vrw_jax.numerics import Options, explicit_tableau, sample_lanes
 from vrw_jax.results import MARGINS
@@ -34,10 +43,11 @@ class Program(NamedTuple):
     function: Callable[..., tuple]
     numbers: int
     small: int = simd.SMALL
+    section: int = 3
 
     def object(self, name: str) -> bytes:
         """As code for WebAssembly."""
-        rows = len(PARAMETER_NAMES), 3
+        rows = len(PARAMETER_NAMES), self.section
         return simd.web_object(self.function, self.numbers, rows, name, self.small)
 
 
@@ -51,13 +61,9 @@ def programs(n_legs: int) -> dict[str, Program]:
     def wheel(parameters: Array) -> WheelParams:
         return wheel_of(tuple(parameters), n_legs)
 
-    def advance(tolerance: Array, parameters: Array, x: Array) -> tuple:
-        """Section state and durations; outcome and solver's steps."""
-        numbers, codes = _advance(wheel(parameters), tuple(x), _options(tolerance))
-        return jnp.stack(numbers), jnp.stack(codes)
-
     def linearised(tolerance: Array, parameters: Array, x: Array) -> tuple:
-        """The same, and how state and durations move with each of the start's numbers."""
+        """Section state and durations; outcome and solver's steps; how the first two move with each
+        of the start's numbers."""
         params, options = wheel(parameters), _options(tolerance)
         moved = lambda *start: _advance(params, start, options)
         columns, numbers, codes = along_units(moved, tuple(x), range(3))
@@ -79,11 +85,31 @@ def programs(n_legs: int) -> dict[str, Program]:
         return _numbers_of(step), codes, *motion
 
     return {
-        "advance": Program(advance, 1),
         "linearised": Program(linearised, 1, DIRECTIONS),
         "told": Program(told, 2),
         **_of_rigid_legs(wheel),
+        **_on_ground(wheel, n_legs),
     }
+
+
+def _on_ground(wheel: Callable[[Array], WheelParams], n_legs: int) -> dict[str, Program]:
+    """The section state of real ground that a state of the paper's is, and a step from there."""
+    model = UnilateralWheel()
+
+    def begun(parameters: Array, x: Array) -> tuple:
+        return (embedded(wheel(parameters).symbols(), x),)
+
+    def advance(tolerance: Array, friction: Array, parameters: Array, x: Array) -> tuple:
+        """Section state, durations and length; outcome and solver's steps."""
+        rules = jnp.int32(1), model.max_events, model.one_sided, model.by_paper, False
+        walk = Walk(n_legs, *rules, _options(tolerance), explicit_tableau(SOLVER))
+        columns = jnp.concatenate([parameters, (friction + 0.0 * x[0])[None]])
+        end = walked(walk, columns, x)
+        codes = jnp.stack([end.outcome, end.tried])
+        return jnp.concatenate([*end.told[:2], end.told.step_length[None]]), codes
+
+    size = section_size(n_legs)
+    return {"ground_begun": Program(begun, 0), "ground_advance": Program(advance, 2, section=size)}
 
 
 def _of_rigid_legs(wheel: Callable[[Array], WheelParams]) -> dict[str, Program]:
@@ -92,10 +118,6 @@ def _of_rigid_legs(wheel: Callable[[Array], WheelParams]) -> dict[str, Program]:
     def rolled(parameters: Array, x: tuple) -> tuple[tuple, tuple]:
         step = RigidWheel().rolled(wheel(parameters), x, jnp.ones_like(x[0]))
         return (*step.section_state, *step.durations), (step.outcome, step.solver_steps)
-
-    def advance(tolerance: Array, parameters: Array, x: Array) -> tuple:
-        numbers, codes = rolled(parameters, tuple(x))
-        return jnp.stack(numbers), jnp.stack(codes)
 
     def linearised(tolerance: Array, parameters: Array, x: Array) -> tuple:
         moved = lambda *start: rolled(parameters, start)
@@ -114,7 +136,6 @@ def _of_rigid_legs(wheel: Callable[[Array], WheelParams]) -> dict[str, Program]:
         return _numbers_of(step), codes, rows
 
     return {
-        "rigid_advance": Program(advance, 1),
         "rigid_linearised": Program(linearised, 1, DIRECTIONS),
         "rigid_told": Program(told, 2),
     }

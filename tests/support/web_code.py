@@ -1,6 +1,5 @@
 """The code inside docs/wheel.html, run here by wasmtime as a browser runs it."""
 
-import base64
 import ctypes
 import gzip
 import math
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments.web.build import CODE, FACTS, told_in
+from experiments.web.build import CODE, FACTS, told_in, unpacked
 
 PAGE = Path(__file__).parents[2] / "docs" / "wheel.html"
 
@@ -24,7 +23,7 @@ class WebCode:
         wasmtime = pytest.importorskip("wasmtime", reason="wasmtime runs the page's code here")
         page = PAGE.read_text(encoding="utf-8")
         self.facts = told_in(page, FACTS)
-        code = gzip.decompress(base64.b64decode(told_in(page, CODE)[str(n_legs)]))
+        code = gzip.decompress(unpacked(told_in(page, CODE)[str(n_legs)]))
         self._store, self._kept = wasmtime.Store(), []  # what it calls must outlive it
         module = wasmtime.Module(self._store.engine, code)
         real = wasmtime.FuncType([wasmtime.ValType.f64()], [wasmtime.ValType.f64()])

@@ -7,19 +7,17 @@ const LIMITS = [0.15, 0.6, 0.6]; // of a correction: rad, rad/s, m/s
 const STEPPED = 0;
 
 class Engine {
-  // `packed`: base64 of the code, gzipped.
+  // `packed`: the code, gzipped, by `unpacked`.
   static async load(packed, facts, legs) {
-    const bytes = Uint8Array.from(atob(packed), (c) => c.charCodeAt(0));
-    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+    const stream = new Blob([unpacked(packed)]).stream().pipeThrough(new DecompressionStream("gzip"));
     const code = await new Response(stream).arrayBuffer();
-    const env = { sin: Math.sin, cos: Math.cos };
-    const { instance } = await WebAssembly.instantiate(code, { env });
+    const { instance } = await WebAssembly.instantiate(code, { env: Math });
     return new Engine(instance.exports, facts, legs);
   }
 
   constructor(code, facts, legs, rung = "viscoelastic") {
     Object.assign(this, { code, facts, legs, rung });
-    this.prefix = rung === "rigid" ? "rigid_" : "";
+    this.prefix = rung === "viscoelastic" ? "" : `${rung}_`;
     this.alpha = (2 * Math.PI) / legs;
     this.samples = facts.samples;
     this.rows = facts.rows[legs];
@@ -68,17 +66,21 @@ class Engine {
     });
   }
 
-  // One step of each lane: section states, and outcomes.
-  advance(tolerance, wheels, starts) {
-    const n = wheels.length, lanes = n + (n % 2);
-    const [numbers, codes] = this.run("advance", [tolerance], [wheels, starts], [[6, true], [2]]);
-    return starts.map((_, i) => ({
-      x: [numbers[i], numbers[lanes + i], numbers[2 * lanes + i]],
-      outcome: codes[i],
-    }));
+  // The section state of real ground that a state of the paper's is, and one step from there.
+  begunOnGround(wheel, x) {
+    const size = 4 + 3 * this.legs, [state] = this.run("begun", [], [[wheel], [x]], [[size, true]]);
+    return Array.from({ length: size }, (_, i) => state[2 * i]);
   }
 
-  // The same with the Jacobian of the section state by itself.
+  steppedOnGround(wheel, friction, x) {
+    const told = [[x.length + 4, true], [2]];
+    const [numbers, codes] = this.run("advance", [SHOWN, friction], [[wheel], [x]], told);
+    const own = Array.from({ length: x.length + 4 }, (_, i) => numbers[2 * i]);
+    const durations = own.slice(x.length, -1), step_length = own[own.length - 1];
+    return { x: own.slice(0, x.length), durations, step_length, outcome: codes[0] };
+  }
+
+  // One step of each lane: section states, outcomes and the Jacobian of the state by itself.
   linearised(tolerance, wheels, starts) {
     const n = wheels.length, lanes = n + (n % 2), told = [[6, true], [2], [18, true]];
     const [numbers, codes, columns] = this.run("linearised", [tolerance], [wheels, starts], told);
@@ -151,7 +153,7 @@ class Engine {
     let open = starts.map((_, i) => i);
     for (let step = 0; step < most && open.length; step++) {
       const last = open.map((i) => states[i][states[i].length - 1]);
-      const steps = this.advance(tolerance, open.map((i) => wheels[i]), last);
+      const steps = this.linearised(tolerance, open.map((i) => wheels[i]), last);
       open = open.filter((i, k) => {
         outcomes[i] = steps[k].outcome;
         if (steps[k].outcome === STEPPED) states[i].push(steps[k].x);
@@ -179,6 +181,19 @@ class Engine {
     const all = this.gaits(apart.map(() => wheel), apart).filter((found) => found);
     return all.find(isStable) || unstable || all[0] || null;
   }
+}
+
+// Bytes of base 85, where "." is "<", less as many as the first digit says.
+function unpacked(text) {
+  const digits = "0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz!#$%&()*+-;.=>?@^_`{|}~";
+  const value = new Map([...digits].map((digit, i) => [digit, i]));
+  const view = new DataView(new ArrayBuffer(((text.length - 1) / 5) * 4));
+  for (let i = 1; i < text.length; i += 5) {
+    let word = 0;
+    for (let k = i; k < i + 5; k++) word = word * 85 + value.get(text[k]);
+    view.setUint32(((i - 1) / 5) * 4, word);
+  }
+  return view.buffer.slice(0, view.byteLength - text[0]);
 }
 
 const radius = (gait) => Math.hypot(gait.multipliers[0].re, gait.multipliers[0].im);

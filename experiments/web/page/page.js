@@ -33,6 +33,7 @@ const state = {
   playing: !matchMedia("(prefers-reduced-motion: reduce)").matches,
   map: { x: "damping", y: "slope", measure: "speed", cells: new Map(), key: "", held: {} },
   basin: { cells: new Map(), key: "", cross: null, held: {} },
+  ground: { key: "" },
 };
 
 const columnOf = (values) => facts.order.map((name) => values[name]);
@@ -297,9 +298,13 @@ function worker(hear) {
   }
 }
 
-function news({ kind, job, stride, nodes, done }) {
+function news({ kind, job, stride, nodes, done, walk }) {
   const picture = state[kind];
   if (picture.job !== job) return;
+  if (kind === "ground") {
+    Object.assign(picture, { done, walk });
+    return tellGround();
+  }
   if (done) {
     picture.done = true;
     picture.seconds = (performance.now() - picture.began) / 1000;
@@ -449,6 +454,29 @@ function showBasin() {
   $("basin").setAttribute("aria-label", `Basin of the gait: ${share}`);
 }
 
+// ---- on real ground
+
+function askGround() {
+  const { ground, values, result } = state, start = result.gait?.x || facts.start;
+  const key = JSON.stringify([columnOf(values), values.n_legs, values.friction, start]);
+  if (key === ground.key) return;
+  Object.assign(ground, { key, start, done: false, walk: null });
+  if (allowed(values)) ground.job = send("ground", { wheel: columnOf(values), friction: values.friction, start });
+  tellGround();
+}
+
+function tellGround() {
+  const { walk, start } = state.ground, { rung, friction } = state.values;
+  const from = start === facts.start ? "the start of Table 1" : `the gait of ${rung === "rigid" ? "rigid legs" : "the springs above"}`;
+  const pace = walk && `${number(walk.speed)} m/s, ${number(walk.period)} s a step, both feet on the ground for ${(100 * walk.dls_fraction).toFixed(1)} % of it.`;
+  const how = !walk ? "Walking …"
+    : walk.outcome !== STEPPED ? `It is lost after ${walk.taken === 1 ? "one step" : `${walk.taken} steps`}: ${facts.outcomes[walk.outcome].meaning}`
+      : walk.settled ? `It walks: after ${walk.taken + 1} steps each repeats the one before. ${pace}`
+        : `It goes on for ${walk.taken + 1} steps that do not repeat themselves; the last: ${pace}`;
+  $("ground").className = !walk || walk.settled ? "" : walk.outcome === STEPPED ? "warn" : "bad";
+  $("ground").innerHTML = `From ${from}, friction ${number(friction)}. <b>${how}</b>`;
+}
+
 // ---- what is chosen
 
 let asked = 0;
@@ -457,6 +485,7 @@ function later() {
   asked = setTimeout(() => {
     askMap();
     askBasin();
+    askGround();
     remember();
   }, 120);
 }
@@ -566,7 +595,7 @@ function fromAddress() {
 
 function built() {
   const rows = Object.entries(facts.parameters).map(([name, p]) => [name, signOf(name), p.unit, p.meaning, p.from, p.to]);
-  rows.push(["friction", "μ", "", "coefficient of friction that margins refer to", 0, 2]);
+  rows.push(["friction", "μ", "", "coefficient of friction, of real ground and of margins", 0, 2]);
   const step = (from, to) => 10 ** Math.floor(Math.log10((to - from) / 400));
   $("sliders").innerHTML = rows.map(([name, sign, unit, meaning, from, to]) =>
     `<div class="slider" title="${meaning}"><label for="slider-${name}">${named(name)} <i>${sign}</i></label>`

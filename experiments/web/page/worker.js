@@ -106,7 +106,7 @@ async function starts(engine, job, post, current) {
       const some = nodes.slice(begin, begin + 512), codes = some.map(() => STEPPED);
       let open = some.map(([c, r], i) => ({ i, at: [value(x, c), value(y, r), gait[2]] }));
       for (let step = 0; step < MOST && open.length; step++) {
-        const taken = engine.advance(ROUGH, open.map(() => wheel), open.map(({ at }) => at));
+        const taken = engine.linearised(ROUGH, open.map(() => wheel), open.map(({ at }) => at));
         open = open.filter((one, k) => {
           codes[one.i] = taken[k].outcome;
           one.at = taken[k].x;
@@ -124,16 +124,33 @@ async function starts(engine, job, post, current) {
   post({ job: job.id, done: true });
 }
 
-// The same two behind one door, wherever they run: a later job of a kind ends the one before.
+const GROUND_STEPS = 80, REPEATS = 1e-8;
+
+// A walk on real ground from a state: what became of it.
+async function walkedOnGround(engine, job, post, current) {
+  const { wheel, friction } = job;
+  let state = engine.begunOnGround(wheel, job.start);
+  for (let taken = 0; taken < GROUND_STEPS; taken++) {
+    const { x, durations, step_length, outcome } = engine.steppedOnGround(wheel, friction, state);
+    const away = Math.max(...x.map((value, i) => Math.abs(value - state[i]))), settled = outcome === STEPPED && away < REPEATS;
+    const period = durations.reduce((a, b) => a + b), ends = outcome !== STEPPED || settled || taken === GROUND_STEPS - 1;
+    if (ends) return post({ job: job.id, done: true, walk: { x, outcome, settled, taken, period, speed: step_length / period, dls_fraction: durations[0] / period } });
+    state = x;
+    await pause();
+    if (!current(job)) return;
+  }
+}
+
+// The same behind one door, wherever they run: a later job of a kind ends the one before.
 function jobs(post) {
   const latest = {}, engines = {};
   const current = (job) => latest[job.kind] === job.id;
   return async ({ job, packed, facts }) => {
     latest[job.kind] = job.id;
     if (packed) engines[job.legs] = Engine.load(packed, facts, job.legs);
-    const engine = (await engines[job.legs]).as(job.rung);
+    const engine = (await engines[job.legs]).as(job.kind === "ground" ? "ground" : job.rung);
     if (!current(job)) return;
     const tell = (news) => current(job) && post({ kind: job.kind, ...news });
-    await (job.kind === "map" ? mapped : starts)(engine, job, tell, current);
+    await { map: mapped, basin: starts, ground: walkedOnGround }[job.kind](engine, job, tell, current);
   };
 }

@@ -28,18 +28,18 @@ def section_size(n: int) -> int:
     return 4 + 3 * n
 
 
-def embedded(s: Symbols, x: Float[Array, "3"]) -> FullState:
+def embedded(s: Symbols, x: Float[Array, "3 ..."]) -> FullState:
     """The paper's section state: Leg 1 planted, all other legs on their stoppers."""
     theta, dtheta, dL1 = x
     sin, cos, L1 = jnp.sin(theta), jnp.cos(theta), length_at_touchdown(s, theta)
-    first = jnp.arange(s.n) == 0
+    first = (jnp.arange(s.n) == 0).reshape(-1, *(1,) * theta.ndim)
     vx, vz = dL1 * sin + L1 * dtheta * cos, dL1 * cos - L1 * dtheta * sin
     return jnp.concatenate(
         [
             jnp.stack([theta, dtheta, vx, vz]),
             jnp.where(first, L1, s.L0),
             jnp.where(first, dL1, 0.0),
-            jnp.where(first, float(STICK), float(LOCKED + OFF)),
+            jnp.where(first, float(STICK), LOCKED + OFF + 0.0 * theta),
         ]
     )
 
