@@ -217,7 +217,8 @@ def test_lanes_walk_on_real_ground_as_single_wheels_do(lanes):
             continue  # a lone wheel of that friction is refused
         ground = vrw.UnilateralWheel(friction=friction[i])
         params = vrw.WheelParams(damping=damping[i])
-        walk = vrw.walk(params, states[i], 3, model=ground, options=OPTIONS)
+        how = {"model": ground, "options": OPTIONS, "engine": "diffrax"}
+        walk = vrw.walk(params, states[i], 3, **how)
         assert int(found.outcome[i]) == int(walk.outcome)
         assert int(found.n_stepped[i]) == int(walk.n_stepped)
         np.testing.assert_allclose(found.section_state[i], walk.steps.section_state[-1], atol=2e-7)
@@ -231,7 +232,7 @@ def test_lanes_at_the_tightest_tolerances_walk_as_single_wheels_do():
     params, ground = vrw.WheelParams(damping=100.0), vrw.UnilateralWheel(friction=1.0)
     given = {"model": ground, "options": vrw.Options.tight()}
     found = vrw.steps(params, np.asarray([START]), 10, **given)
-    walk = vrw.walk(params, START, 10, **given)
+    walk = vrw.walk(params, START, 10, engine="diffrax", **given)
     assert int(found.n_stepped[0]) == int(walk.n_stepped) == 10
     np.testing.assert_allclose(found.durations[0], walk.steps.durations[-1], atol=1e-9)
     np.testing.assert_allclose(found.section_state[0], walk.steps.section_state[-1], atol=1e-8)
@@ -322,7 +323,8 @@ def test_a_step_of_lanes_tells_what_a_single_wheel_does_and_how_it_moves(scene, 
     np.testing.assert_array_equal(same.section_state, step.section_state)
     np.testing.assert_array_equal(only.slip[:, 0], moved.slip[:, 0])
     assert not only.slip[:, 1:].any()
-    alone = vrw.step(params, x, model=ground, options=vrw.Options.tight())
+    definition = vrw.Options.tight().by("diffrax")
+    alone = vrw.step(params, x, model=ground, options=definition)
     shared = stoppers == "one-sided"
     times = lambda durations: durations.sum(keepdims=True) if shared else durations
     for name in ("section_state", "durations", "post_impact", "slip", "energy_impacts",
@@ -339,7 +341,7 @@ def test_a_step_of_lanes_tells_what_a_single_wheel_does_and_how_it_moves(scene, 
     def told(c, mu, rate):
         wheel, model = vrw.WheelParams(damping=c), eqx.tree_at(lambda m: m.friction, ground, mu)
         start = jnp.asarray(x).at[1].set(rate)
-        advance = model.advance(wheel, start, vrw.Options.tight())
+        advance = model.advance(wheel, start, definition)
         return jnp.concatenate([advance.section_state[:20], times(advance.durations)])
 
     at = [jnp.asarray(v) for v in (damping, friction, x[1])]

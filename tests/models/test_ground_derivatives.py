@@ -81,6 +81,22 @@ def test_derivatives_through_the_events_of_a_step_match_differences(name):
         np.testing.assert_allclose(column, difference, atol=2e-6, rtol=2e-6)
 
 
+def test_wheels_side_by_side_have_the_gradients_that_differences_have():
+    """Machine code within `jit`, `vmap` and `grad`; each of these wheels has events of its own."""
+    wheels = [SCENES[name][0] for name in ("lands sliding", "reverses", "flies")]
+    mu, c, dtheta = (jnp.asarray(column) for column in list(zip(*wheels, strict=True))[:3])
+
+    def period(mu, c, dtheta):
+        return jnp.sum(told(mu, c, dtheta, "bilateral")[20:])
+
+    at, periods = (mu, c, dtheta), jax.jit(jax.vmap(period))
+    slopes = jax.jit(jax.vmap(jax.grad(period, argnums=(0, 1, 2))))(*at)
+    for i, slope in enumerate(slopes):
+        size = 1e-5 * jnp.maximum(1.0, at[i])
+        ends = [periods(*at[:i], at[i] + d, *at[i + 1 :]) for d in (size, -size)]
+        np.testing.assert_allclose(slope, (ends[0] - ends[1]) / (2.0 * size), atol=1e-7)
+
+
 def test_every_kind_of_event_is_differentiated_through():
     kinds = set.union(*(kinds for _, kinds in SCENES.values()))
     assert kinds == {

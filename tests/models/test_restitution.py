@@ -66,6 +66,8 @@ def test_restitution_outside_of_its_domain_is_refused_in_a_sentence():
     model = vrw.UnilateralWheel(restitution=0.5)
     with pytest.raises(ValueError, match="in lanes"):
         vrw.steps(vrw.WheelParams(), np.array([START]), model=model)
+    with pytest.raises(ValueError, match="engine='auto' or 'diffrax'"):
+        vrw.step(vrw.WheelParams(), START, model=model, engine="lanes")
 
 
 @pytest.mark.slow

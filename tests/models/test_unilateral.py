@@ -345,7 +345,7 @@ def test_bad_input_is_a_code_and_never_nan():
     ],
 )
 def test_what_the_model_does_not_cover_ends_a_step_with_its_code(friction, damping, x, outcome):
-    step = stepped(friction, damping, x)
+    step = stepped(friction, damping, x, TIGHT.by("diffrax"))
     assert int(step.outcome) == outcome
     assert not np.any(np.asarray(step.section_state))
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(step))

@@ -30,7 +30,7 @@ from vrw_jax.models.lane_step import DIRECTIONS, along_units, gait_step
 from vrw_jax.models.paper_step import PAPER_START
 from vrw_jax.models.rigid import RigidWheel
 from vrw_jax.models.unilateral.contacts import STICK
-from vrw_jax.models.unilateral.ledger import least_dip
+from vrw_jax.models.unilateral.ledger import UnilateralStep, least_dip
 from vrw_jax.models.unilateral.mechanics import (
     directions,
     foot_heights,
@@ -41,5 +41,5 @@ from vrw_jax.models.unilateral.mechanics import (
 from vrw_jax.models.unilateral.motion import State, unpack
 from vrw_jax.models.unilateral.queues import as_full_states, step_lanes, walk_lanes
 from vrw_jax.models.unilateral.section import LOCKED
-from vrw_jax.models.unilateral.wheel import UnilateralStep, UnilateralTrajectory, UnilateralWheel
+from vrw_jax.models.unilateral.wheel import UnilateralTrajectory, UnilateralWheel
 from vrw_jax.models.viscoelastic import ViscoelasticWheel

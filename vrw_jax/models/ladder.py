@@ -23,8 +23,9 @@ from vrw_jax.models.base import (
 )
 from vrw_jax.models.paper_step import PAPER_START
 from vrw_jax.models.unilateral.contacts import OFF, STICK
+from vrw_jax.models.unilateral.ledger import UnilateralStep
 from vrw_jax.models.unilateral.section import LOCKED, FullState, embedded
-from vrw_jax.models.unilateral.wheel import UnilateralStep, UnilateralTrajectory, UnilateralWheel
+from vrw_jax.models.unilateral.wheel import UnilateralTrajectory, UnilateralWheel
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
 from vrw_jax.numerics import Number, Options, Scalar
 from vrw_jax.results import MARGINS

@@ -241,18 +241,23 @@ def moved_by_lanes(
 
     def jacobian(*leaves: Array) -> tuple:
         columns, value, other = call(*tightened(*leaves))
-        by_argument, begin = [], 0
-        for i in moved:
-            shape = jnp.shape(leaves[i])
-            some = slice(begin, begin + int(np.prod(shape)))
-            take = lambda x, some=some, shape=shape: jnp.moveaxis(x[some], 0, -1).reshape(
-                *x.shape[1:], *shape
-            )
-            by_argument.append(jax.tree.map(take, columns))
-            begin = some.stop
-        return (tuple(by_argument), value), other
+        return (by_argument(columns, leaves, moved), value), other
 
     return jacobian
+
+
+def by_argument(columns: Any, leaves: Sequence[Array], moved: Sequence[int]) -> tuple:
+    """A Jacobian, whose leading axis is over all numbers of the leaves `moved`, leaf by leaf."""
+    parts, begin = [], 0
+    for i in moved:
+        shape = jnp.shape(leaves[i])
+        some = slice(begin, begin + int(np.prod(shape)))
+        take = lambda x, some=some, shape=shape: jnp.moveaxis(x[some], 0, -1).reshape(
+            *x.shape[1:], *shape
+        )
+        parts.append(jax.tree.map(take, columns))
+        begin = some.stop
+    return tuple(parts)
 
 
 DIRECTIONS = len(PARAMETER_NAMES) + 3

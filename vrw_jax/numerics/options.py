@@ -20,7 +20,7 @@ SolverName = Literal[
 SOLVERS: tuple[str, ...] = get_args(SolverName)
 
 Engine = Literal["auto", "lanes", "diffrax"]
-"""Who takes the steps of the paper's wheel."""
+"""Who takes the steps of wheels with compliant legs."""
 
 FLOOR = 90.0
 """Smallest useful tolerance in units of round-off (2e-14 in float64): below it rounding rules."""

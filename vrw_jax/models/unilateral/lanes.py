@@ -17,6 +17,7 @@ from jaxtyping import Array
 from vrw_jax.models.unilateral.ledger import (
     Details,
     Ledger,
+    as_ruled,
     blank,
     event_noted,
     law_of,
@@ -24,6 +25,8 @@ from vrw_jax.models.unilateral.ledger import (
     outcome_at,
     passed,
     past,
+    section_reached,
+    step_told,
     stretch_noted,
 )
 from vrw_jax.models.unilateral.march import (
@@ -43,7 +46,6 @@ from vrw_jax.models.unilateral.march import (
 from vrw_jax.models.unilateral.mechanics import WheelMotion, place_of_landing, stilled
 from vrw_jax.models.unilateral.motion import Flow, Stance, Tally, flow_of, guards_of
 from vrw_jax.models.unilateral.section import closed, made_sound, opened
-from vrw_jax.models.unilateral.wheel import as_ruled, section_reached, step_told
 from vrw_jax.numerics import Options, Tableau, select, zeros_of
 from vrw_jax.wheel import Outcome, Symbols, parameters_of, symbols_of, wheel_of
 
@@ -66,6 +68,18 @@ class Walked(NamedTuple):
     outcome: Array
     n_stepped: Array
     tried: Array
+
+
+def told_like(n: int, dtype: Any, detailed: bool) -> Walked:
+    """Zeros in place of what is told of one wheel with n legs."""
+    zero, none = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
+    legs, off = jnp.zeros(n, dtype), jnp.zeros(n, jnp.int32)
+    stands = WheelMotion(*(zero,) * 6, legs, legs), Stance(off, *(off > 0,) * 4)
+    told: Any = Lean(closed(*stands), jnp.zeros(3, dtype), zero)
+    if detailed:
+        tally = Tally(zero, zero, zero, zero)
+        told = step_told(*stands, tally, blank(zero), no_details(dtype), none, "lanes")
+    return Walked(told, none, none, none)
 
 
 class _Moves(NamedTuple):
@@ -112,7 +126,7 @@ class Walk(NamedTuple):
     """What holds for all wheels of a batch."""
 
     n: int
-    n_steps: Array
+    n_steps: Array | int
     max_events: int
     one_sided: bool
     by_paper: bool
@@ -194,7 +208,7 @@ class Walk(NamedTuple):
         stands, code = (motion_of(lane.now.here), lane.now.stance), lane.outcome
         if lane.details is not None and lane.tally is not None:
             tally = Tally(jnp.zeros_like(lane.tally[0]), *lane.tally)
-            return step_told(*stands, tally, lane.ledger, lane.details, code)
+            return step_told(*stands, tally, lane.ledger, lane.details, code, "lanes")
         return self.lean(stands, lane.ledger, code)
 
     def lean(self, stands: tuple[WheelMotion, Stance], ledger: Ledger, code: Array) -> Lean:

@@ -7,15 +7,19 @@ is the landing that opened it; it is complete where the foot ahead of all others
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from vrw_jax.models.unilateral.contacts import OFF, Roughness
+from vrw_jax.models.base import AbstractGroundStep
+from vrw_jax.models.unilateral.contacts import OFF, THE_PAPERS, Roughness
 from vrw_jax.models.unilateral.events import Change, Event, Law, event_of, resolve, settled
-from vrw_jax.models.unilateral.mechanics import WheelMotion
-from vrw_jax.models.unilateral.motion import Guards, Stance
+from vrw_jax.models.unilateral.mechanics import WheelMotion, place_of_landing
+from vrw_jax.models.unilateral.motion import Guards, Stance, Tally
+from vrw_jax.models.unilateral.section import FullState, closed
 from vrw_jax.numerics import Elementwise, Options, select
+from vrw_jax.results import STOPPERS
 from vrw_jax.wheel import Outcome, Symbols
 
 SHARE, SEEN = 1e-2, 4e2
@@ -30,6 +34,11 @@ Walks make 4 to 60. A chain of ever smaller dips ends by this where a tolerance 
 def least_dip(L0: Elementwise, options: Options) -> Array:
     """Least depth of a dip that a step follows, m."""
     return jnp.maximum(SHARE * options.atol, SEEN * jnp.finfo(L0.dtype).eps * L0)
+
+
+def as_ruled(friction: Elementwise, by_paper: bool) -> Elementwise:
+    """Friction as `contacts` takes it: see `THE_PAPERS`."""
+    return jnp.where(friction == jnp.inf, THE_PAPERS, friction) if by_paper else friction
 
 
 def law_of(
@@ -182,4 +191,102 @@ def stretch_noted(
     return details._replace(
         mode_durations=details.mode_durations + first[:, None] * second[None, :] * duration,
         monitors=UnilateralMargins(force, details.monitors.stopper_impulse),
+    )
+
+
+class UnilateralStep(AbstractGroundStep):
+    """One step, from the landing of the foremost foot to the next. Batched under vmap.
+
+    Fields of a step whose outcome is not STEPPED are finite and describe how far it came; its
+    `section_state` is all zeros, which is no section state.
+
+    - `section_state`: just before the next landing;
+    - `post_impact`: (theta, dtheta) just after the opening landing, rad, rad/s;
+    - `durations`: with two feet loaded, with one, with none, s;
+    - `mode_durations`: by mode of the first and second loaded foot, s;
+    - `step_length`: between the places of the two landings, m;
+    - `landing_normal`: normal impulses of the opening landing, N s;
+    - `landing_tangential`: tangential ones; fore and rear foot;
+    - `energy_impacts`: lost in impacts, J;
+    - `energy_damping`: lost in the dampers, J;
+    - `energy_friction`: lost by sliding between impacts, J;
+    - `slip`: path of sliding feet, m;
+    - `events`: contacts and stoppers that changed;
+    - `impacts`: events in which velocities jumped;
+    - `fewest_solutions`, `most_solutions`: admissible combinations at an event: 1 where well posed;
+    - `monitors`: margins of what this rung presumes;
+    - `outcome`: an Outcome;
+    - `solver_steps`: tried by the integrator;
+    - `engine`: that took the step, see `Options`.
+
+    Examples:
+        >>> wheel = vrw.UnilateralWheel(friction=0.7)
+        >>> step = vrw.step(vrw.WheelParams(damping=300.0), vrw.paper_start(), model=wheel)
+        >>> print(f"{step.energy_friction:.1f} J lost by sliding")
+        1.3 J lost by sliding
+    """
+
+    section_state: FullState
+    post_impact: Float[Array, "2 ..."]
+    durations: Float[Array, "3 ..."]
+    mode_durations: Float[Array, "4 4 ..."]
+    step_length: Elementwise
+    landing_normal: Float[Array, "2 ..."]
+    landing_tangential: Float[Array, "2 ..."]
+    energy_impacts: Elementwise
+    energy_damping: Elementwise
+    energy_friction: Elementwise
+    slip: Elementwise
+    monitors: UnilateralMargins
+    events: Int[Array, "..."]
+    impacts: Int[Array, "..."]
+    fewest_solutions: Int[Array, "..."]
+    most_solutions: Int[Array, "..."]
+    outcome: Int[Array, "..."]
+    solver_steps: Int[Array, "..."]
+    engine: str = eqx.field(static=True, default="")
+
+    def own_measures(self) -> dict[str, Array]:
+        return AbstractGroundStep.own_measures(self) | {
+            name: getattr(self.monitors, name) for name in STOPPERS
+        }
+
+
+def section_reached(
+    motion: WheelMotion, stance: Stance, outcome: Array, tilt: Elementwise | None = None
+) -> FullState:
+    """The section state at a step's end; zeros where it failed."""
+    x = closed(motion, stance, tilt)
+    return jnp.where(outcome == Outcome.STEPPED, x, jnp.zeros_like(x))
+
+
+def step_told(
+    motion: WheelMotion,
+    stance: Stance,
+    tally: Tally,
+    ledger: Ledger,
+    details: Details,
+    outcome: Array,
+    engine: str,
+    tilt: Elementwise | None = None,
+) -> UnilateralStep:
+    """A step by where it ended and what was noted on the way."""
+    landing = place_of_landing(motion.L.shape[0], motion)
+    finite = lambda value: jnp.where(jnp.isfinite(value), value, 0.0)
+    details = details._replace(
+        monitors=jax.tree.map(finite, details.monitors),
+        fewest_solutions=jnp.where(ledger.events > 0, details.fewest_solutions, 0),
+    )
+    return UnilateralStep(
+        section_state=section_reached(motion, stance, outcome, tilt),
+        durations=ledger.durations,
+        step_length=jnp.where(outcome == Outcome.STEPPED, landing, 0.0),
+        energy_damping=tally.damping,
+        energy_friction=tally.friction,
+        slip=tally.slip,
+        events=ledger.events,
+        outcome=outcome,
+        solver_steps=ledger.tried,
+        engine=engine,
+        **details._asdict(),
     )

@@ -12,12 +12,10 @@ import numpy as np
 from jaxtyping import Array
 
 from vrw_jax import simd
-from vrw_jax.models.unilateral.lanes import Lean, Walk, Walked, walked, walked_along
-from vrw_jax.models.unilateral.ledger import blank, no_details
-from vrw_jax.models.unilateral.mechanics import WheelMotion
-from vrw_jax.models.unilateral.motion import Stance, Tally
-from vrw_jax.models.unilateral.section import LOCKED, closed, embedded, section_size
-from vrw_jax.models.unilateral.wheel import UnilateralStep, UnilateralWheel, step_told
+from vrw_jax.models.unilateral.lanes import Walk, told_like, walked, walked_along
+from vrw_jax.models.unilateral.ledger import UnilateralStep
+from vrw_jax.models.unilateral.section import LOCKED, embedded, section_size
+from vrw_jax.models.unilateral.wheel import UnilateralWheel
 from vrw_jax.numerics import Options, explicit_tableau, in_batches
 from vrw_jax.runtime import lane_program
 from vrw_jax.wheel import PARAMETER_NAMES, symbols_of
@@ -122,16 +120,9 @@ class _Run(NamedTuple):
 
     def told(self, dtype: Any) -> Any:
         """Shapes and types of what is told of one wheel."""
-        n, zero, none = self.n_legs, jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
-        legs, off = jnp.zeros(n, dtype), jnp.zeros(n, jnp.int32)
-        motion = WheelMotion(*(zero,) * 6, legs, legs)
-        stands = motion, Stance(off, *(off > 0,) * 4)
+        walk = jax.eval_shape(lambda: told_like(self.n_legs, dtype, self.moved))
         if not self.moved:
-            lean = Lean(closed(*stands), jnp.zeros(3, dtype), zero)
-            return jax.eval_shape(lambda: Walked(lean, none, none, none))
-        tally = Tally(zero, zero, zero, zero)
-        given = *stands, tally, blank(zero), no_details(dtype), none
-        walk = jax.eval_shape(lambda: Walked(step_told(*given), none, none, none))
+            return walk
         return walk, eqx.filter(walk.told, lambda x: jnp.issubdtype(x.dtype, jnp.inexact))
 
 

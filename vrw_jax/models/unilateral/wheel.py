@@ -11,14 +11,16 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from vrw_jax.models.base import AbstractGroundStep, AbstractWheel, Advance, GroundOfStep
+from vrw_jax.models.base import AbstractWheel, Advance, GroundOfStep
+from vrw_jax.models.lane_step import lanes_can
 from vrw_jax.models.paper_step import PAPER_START
-from vrw_jax.models.unilateral.contacts import THE_PAPERS, Roughness
+from vrw_jax.models.unilateral.contacts import Roughness
 from vrw_jax.models.unilateral.events import Law
 from vrw_jax.models.unilateral.ledger import (
     Details,
     Ledger,
-    UnilateralMargins,
+    UnilateralStep,
+    as_ruled,
     blank,
     event_noted,
     law_of,
@@ -26,9 +28,10 @@ from vrw_jax.models.unilateral.ledger import (
     outcome_at,
     passed,
     past,
+    section_reached,
+    step_told,
     stretch_noted,
 )
-from vrw_jax.models.unilateral.mechanics import WheelMotion, place_of_landing
 from vrw_jax.models.unilateral.motion import (
     Guards,
     Stance,
@@ -46,12 +49,12 @@ from vrw_jax.models.unilateral.motion import (
 )
 from vrw_jax.models.unilateral.section import (
     FullState,
-    closed,
     embedded,
     made_sound,
     opened,
     section_size,
 )
+from vrw_jax.models.unilateral.single import moved_by_lanes, told_by_lanes
 from vrw_jax.numerics import (
     Elementwise,
     Forward,
@@ -63,7 +66,6 @@ from vrw_jax.numerics import (
     integrate_phase,
     sample_phase,
 )
-from vrw_jax.results import STOPPERS
 from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, WheelParams, friction_of
 from vrw_jax.wording import chosen, reals, whole
 
@@ -71,62 +73,6 @@ BILATERAL, ONE_SIDED = "bilateral", "one-sided"
 """What stoppers do to legs in the air: hold whatever it takes, or push alone."""
 LIMIT, PAPER = "limit", "paper"
 """What infinite friction means: the limit of large friction, or the paper's rule (A1)-(A4)."""
-
-
-class UnilateralStep(AbstractGroundStep):
-    """One step, from the landing of the foremost foot to the next. Batched under vmap.
-
-    Fields of a step whose outcome is not STEPPED are finite and describe how far it came; its
-    `section_state` is all zeros, which is no section state.
-
-    - `section_state`: just before the next landing;
-    - `post_impact`: (theta, dtheta) just after the opening landing, rad, rad/s;
-    - `durations`: with two feet loaded, with one, with none, s;
-    - `mode_durations`: by mode of the first and second loaded foot, s;
-    - `step_length`: between the places of the two landings, m;
-    - `landing_normal`: normal impulses of the opening landing, N s;
-    - `landing_tangential`: tangential ones; fore and rear foot;
-    - `energy_impacts`: lost in impacts, J;
-    - `energy_damping`: lost in the dampers, J;
-    - `energy_friction`: lost by sliding between impacts, J;
-    - `slip`: path of sliding feet, m;
-    - `events`: contacts and stoppers that changed;
-    - `impacts`: events in which velocities jumped;
-    - `fewest_solutions`, `most_solutions`: admissible combinations at an event: 1 where well posed;
-    - `monitors`: margins of what this rung presumes;
-    - `outcome`: an Outcome;
-    - `solver_steps`: tried by the integrator.
-
-    Examples:
-        >>> wheel = vrw.UnilateralWheel(friction=0.7)
-        >>> step = vrw.step(vrw.WheelParams(damping=300.0), vrw.paper_start(), model=wheel)
-        >>> print(f"{step.energy_friction:.1f} J lost by sliding")
-        1.3 J lost by sliding
-    """
-
-    section_state: FullState
-    post_impact: Float[Array, "2 ..."]
-    durations: Float[Array, "3 ..."]
-    mode_durations: Float[Array, "4 4 ..."]
-    step_length: Elementwise
-    landing_normal: Float[Array, "2 ..."]
-    landing_tangential: Float[Array, "2 ..."]
-    energy_impacts: Elementwise
-    energy_damping: Elementwise
-    energy_friction: Elementwise
-    slip: Elementwise
-    monitors: UnilateralMargins
-    events: Int[Array, "..."]
-    impacts: Int[Array, "..."]
-    fewest_solutions: Int[Array, "..."]
-    most_solutions: Int[Array, "..."]
-    outcome: Int[Array, "..."]
-    solver_steps: Int[Array, "..."]
-
-    def own_measures(self) -> dict[str, Array]:
-        return AbstractGroundStep.own_measures(self) | {
-            name: getattr(self.monitors, name) for name in STOPPERS
-        }
 
 
 class UnilateralTrajectory(eqx.Module):
@@ -277,12 +223,32 @@ class UnilateralWheel(AbstractWheel):
         return model, eqx.tree_at(lambda wheel: wheel.slope, params, slope)
 
     def advance(self, params: WheelParams, x: FullState, options: Options) -> Advance:
-        leaves, structure = jax.tree.flatten((self, params, x, options))
-        return eqx.combine(*_compiled(structure, False)(*leaves))
+        told, engine = self._taken(params, x, options, detailed=False)
+        section_state, durations, outcome, tried = told
+        return Advance(section_state, durations, outcome, tried, engine=engine)
 
     def step(self, params: WheelParams, x: FullState, options: Options) -> UnilateralStep:
-        leaves, structure = jax.tree.flatten((self, params, x, options))
-        return eqx.combine(*_compiled(structure, True)(*leaves))
+        return self._taken(params, x, options, detailed=True)[0]
+
+    def _taken(
+        self, params: WheelParams, x: FullState, options: Options, detailed: bool
+    ) -> tuple[Any, str]:
+        """What is told of a step, and the engine that took it."""
+        # Not by `replace`: friction was checked, and may be traced by now.
+        model = eqx.tree_at(lambda wheel: wheel.friction, self, self.friction.astype(x.dtype))
+        leaves, structure = jax.tree.flatten((model, params, x, options))
+        engine = "lanes" if self._like_lanes(options) and lanes_can(options) else "diffrax"
+        return eqx.combine(*_compiled(structure, detailed, engine)(*leaves)), engine
+
+    def _like_lanes(self, options: Options) -> bool:
+        """Whether the ground is such as lanes know."""
+        plain = self.restitution is None and self.uneven is None
+        if options.engine == "lanes" and not plain:
+            raise ValueError(
+                "engine is 'lanes', but lanes know neither feet that come back nor ground that "
+                "varies from step to step: take engine='auto' or 'diffrax'."
+            )
+        return plain
 
     def trace(
         self, params: WheelParams, x: FullState, options: Options, n_samples: int
@@ -311,11 +277,6 @@ class UnilateralWheel(AbstractWheel):
         )
 
 
-def as_ruled(friction: Elementwise, by_paper: bool) -> Elementwise:
-    """Friction as `contacts` takes it: see `THE_PAPERS`."""
-    return jnp.where(friction == jnp.inf, THE_PAPERS, friction) if by_paper else friction
-
-
 def _rough(wheel: UnilateralWheel, friction: Elementwise) -> Roughness:
     """The same of all feet, or of the one that landed last and of the others."""
     friction = as_ruled(friction, wheel.by_paper)
@@ -333,7 +294,7 @@ def _walk(
     logged: bool = False,
 ) -> _Walked:
     """Follow one step from event to event."""
-    good, params, friction, x = made_sound(params, wheel.friction.astype(x.dtype), x)
+    good, params, friction, x = made_sound(params, wheel.friction, x)
     s, n = params.symbols(), params.n_legs
     tilt = None if wheel.uneven is None else wheel.uneven.tilt
     given = s, _rough(wheel, friction), options, wheel.one_sided
@@ -400,67 +361,33 @@ def _go_on(law: Law, place: Guards, max_events: int, options: Options, now: _Wal
 
 
 @functools.cache
-def _compiled(structure: Any, full: bool) -> Forward:
+def _compiled(structure: Any, detailed: bool, engine: str) -> Forward:
     """A step over the leaves of (wheel, params, x, options), differentiable in any mode."""
 
     def walk(tighten: bool, *leaves: Array) -> tuple:
         wheel, params, x, options = jax.tree.unflatten(structure, leaves)
         options = options.for_derivatives() if tighten else options
-        walked = _walk(wheel, params, x, options, detailed=full)
+        walked = _walk(wheel, params, x, options, detailed)
         tilt = None if wheel.uneven is None else wheel.uneven.tilt
-        result = _full(walked, tilt) if full else _lean(walked, tilt)
-        return eqx.partition(result, eqx.is_inexact_array)
+        told = _full(walked, engine, tilt) if detailed else _lean(walked, tilt)
+        return eqx.partition(told, eqx.is_inexact_array)
 
-    return any_mode(partial(walk, False), partial(walk, True))
+    values, tighter = partial(walk, False), partial(walk, True)
+    if engine == "diffrax":
+        return any_mode(values, tighter)
+    given = structure, detailed
+    return any_mode(told_by_lanes(*given), tighter, partial(moved_by_lanes, *given))
 
 
-def _lean(walked: _Walked, tilt: Elementwise | None) -> Advance:
+def _lean(walked: _Walked, tilt: Elementwise | None) -> tuple:
     ledger = walked.ledger
     stands = unpack(walked.state)[0], walked.stance
     section = section_reached(*stands, walked.outcome, tilt)
-    return Advance(section, ledger.durations, walked.outcome, ledger.tried)
+    return section, ledger.durations, walked.outcome, ledger.tried
 
 
-def _full(walked: _Walked, tilt: Elementwise | None) -> UnilateralStep:
+def _full(walked: _Walked, engine: str, tilt: Elementwise | None) -> UnilateralStep:
     motion, tally = unpack(walked.state)
     assert walked.details is not None
     told = walked.ledger, walked.details, walked.outcome
-    return step_told(motion, walked.stance, tally, *told, tilt)
-
-
-def section_reached(
-    motion: WheelMotion, stance: Stance, outcome: Array, tilt: Elementwise | None = None
-) -> FullState:
-    """The section state at a step's end; zeros where it failed."""
-    x = closed(motion, stance, tilt)
-    return jnp.where(outcome == Outcome.STEPPED, x, jnp.zeros_like(x))
-
-
-def step_told(
-    motion: WheelMotion,
-    stance: Stance,
-    tally: Tally,
-    ledger: Ledger,
-    details: Details,
-    outcome: Array,
-    tilt: Elementwise | None = None,
-) -> UnilateralStep:
-    """A step by where it ended and what was noted on the way."""
-    landing = place_of_landing(motion.L.shape[0], motion)
-    finite = lambda value: jnp.where(jnp.isfinite(value), value, 0.0)
-    details = details._replace(
-        monitors=jax.tree.map(finite, details.monitors),
-        fewest_solutions=jnp.where(ledger.events > 0, details.fewest_solutions, 0),
-    )
-    return UnilateralStep(
-        section_state=section_reached(motion, stance, outcome, tilt),
-        durations=ledger.durations,
-        step_length=jnp.where(outcome == Outcome.STEPPED, landing, 0.0),
-        energy_damping=tally.damping,
-        energy_friction=tally.friction,
-        slip=tally.slip,
-        events=ledger.events,
-        outcome=outcome,
-        solver_steps=ledger.tried,
-        **details._asdict(),
-    )
+    return step_told(motion, walked.stance, tally, *told, engine, tilt)
