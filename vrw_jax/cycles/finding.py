@@ -81,7 +81,7 @@ def near(guess: Any) -> Any:
     if guess is None or isinstance(guess, AbstractCycle | Located):
         return guess
     state = state_of(guess, "guess")
-    if not isinstance(state, jax.core.Tracer) and not jnp.isfinite(state).all():
+    if not isinstance(state, jax.core.Tracer) and not np.isfinite(state).all():
         raise ValueError(
             f"guess is {listed(state)}, but a search can begin at finite numbers only: give a "
             "neighbour's cycle, or a section state near the gait."
