@@ -31,7 +31,6 @@ from vrw_jax.models.unilateral.ledger import (
 )
 from vrw_jax.models.unilateral.march import (
     EVENT,
-    FORCE,
     MARCHING,
     N_TALLIED,
     March,
@@ -44,7 +43,15 @@ from vrw_jax.models.unilateral.march import (
     set_off,
 )
 from vrw_jax.models.unilateral.mechanics import WheelMotion, place_of_landing, stilled
-from vrw_jax.models.unilateral.motion import Flow, Stance, Tally, flow_of, guards_of
+from vrw_jax.models.unilateral.motion import (
+    Flow,
+    Stance,
+    Tally,
+    flow_of,
+    forces,
+    guards_of,
+    least_stopper_force,
+)
 from vrw_jax.models.unilateral.section import closed, made_sound, opened
 from vrw_jax.numerics import Options, Tableau, select, zeros_of
 from vrw_jax.wheel import Outcome, Symbols, parameters_of, symbols_of, wheel_of
@@ -168,8 +175,8 @@ class Walk(NamedTuple):
         ledger = passed(lane.ledger, now.stance, now.time, now.tried)
         details, tally = lane.details, lane.tally
         if details is not None and tally is not None and now.told is not None:
-            contact = self.flow(columns, now.stance).contact
-            details = stretch_noted(details, contact, now.time, now.here.slope[FORCE])
+            before = self.flow(columns, now.stance)
+            details = stretched(details, before, motion_of(now.here), now.time)
             tally = tally + now.told
         at_event = now.verdict == EVENT
         landed = at_event & (now.guard == place.foremost)
@@ -197,7 +204,7 @@ class Walk(NamedTuple):
         if details is not None:
             details = event_noted(details, ledger.events == 0, change, event)
             none = jnp.zeros_like(motion.x)
-            details = stretch_noted(details, flow.contact, none, after.here.slope[FORCE])
+            details = stretched(details, flow, change.motion, none)
         ledger = ledger._replace(events=ledger.events + 1)
         goes = _Lane(after, ledger, details, tally, n_stepped, lane.outcome)
         ended = (now.verdict != MARCHING) & (lane.outcome == UNDER_WAY)
@@ -224,6 +231,12 @@ class Walk(NamedTuple):
     def barred(self, lane: _Lane, good: Array) -> _Lane:
         """Without those that can't begin."""
         return lane._replace(outcome=jnp.where(good, lane.outcome, Outcome.BAD_INPUT))
+
+
+def stretched(details: Details, flow: Flow, motion: WheelMotion, duration: Array) -> Details:
+    """With the stretch that ends, or begins, at this motion."""
+    force = least_stopper_force(flow, forces(flow, motion))
+    return stretch_noted(details, flow.contact, duration, force)
 
 
 def walked(on: Walk, columns: Array, x: Array) -> Walked:

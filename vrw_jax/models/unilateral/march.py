@@ -21,7 +21,6 @@ from vrw_jax.models.unilateral.motion import (
     felt,
     forces,
     guard_sizes,
-    least_stopper_force,
     leg_acceleration,
     stance_guards,
     tally_rates,
@@ -39,11 +38,9 @@ from vrw_jax.wheel import Outcome
 
 N_FELT = 8
 """Rows of a slope after the accelerations: what guards need of the forces. Then, where stoppers are
-one-sided, those of legs in the air; then, where they are wanted, `N_TALLIED` and `FORCE`."""
+one-sided, those of legs in the air; then, where they are wanted, `N_TALLIED`."""
 N_TALLIED = 3
 """Rows that are summed up: energy lost in dampers and by sliding, slip."""
-FORCE = -1
-"""Row of the least stopper force of legs in the air."""
 MARCHING, EVENT = -1, -2
 """Where a lane stands: on its way, at an event; else the `Outcome` it met."""
 BURST = 8
@@ -122,8 +119,7 @@ def _slope(flow: Flow, q: Array, v: Array) -> Array:
     more = [] if told.in_air is None else [told.in_air]
     if flow.tallied:
         tally = tally_rates(flow, motion, now)
-        force = lax.stop_gradient(least_stopper_force(flow, now))
-        rows = tally.damping, tally.friction, tally.slip, force
+        rows = tally.damping, tally.friction, tally.slip
         more.append(jnp.stack(kept(rows, one_of(motion))))
     return jnp.concatenate([jnp.stack(now.answer.hub), ddL, jnp.stack(feet), *more])
 
@@ -290,7 +286,7 @@ def _met(flow_at: FlowAt, columns: Array, begin: March, now: March, way: Way) ->
         later = jnp.where(own, -moves[index] / jnp.where(own, rates[index], -1.0), later)
     told = None
     if way.told is not None:
-        told = way.told + later * here.slope[-1 - N_TALLIED : FORCE]
+        told = way.told + later * here.slope[-N_TALLIED:]
     return Way(way.columns, way.q + later * here.v, way.v + later * here.slope[:n], told, later)
 
 
@@ -328,7 +324,7 @@ def _tried(flow: Flow, tableau: Tableau, options: Options, now: March) -> _Try:
     end = Place(*at(last, now.here, slopes), slopes[last])
     told = None
     if flow.tallied:
-        told = h * sum(once[last][j] * slopes[j, -1 - N_TALLIED : FORCE] for j in range(last))
+        told = h * sum(once[last][j] * slopes[j, -N_TALLIED:] for j in range(last))
 
     flow, here, slopes = stilled((flow, now.here, slopes))
     inside = {i: Place(*at(i, here, slopes), slopes[i]) for i in tableau.inside}
