@@ -16,9 +16,11 @@ from vrw_jax.numerics import Scalar
 from vrw_jax.wheel import Motion, Symbols, WheelParams, length_at_touchdown, mass_matrix, momentum
 
 
-def _reach(s: Symbols, theta: float) -> float:
-    """Length of Leg 1 at touchdown, m."""
-    return float(length_at_touchdown(s, jnp.asarray(theta)))
+@jax.jit
+def _touchdown(params: WheelParams, theta: float) -> tuple[Symbols, Array]:
+    """The paper's symbols, and the length of Leg 1 at touchdown, m."""
+    s = params.symbols()
+    return s, length_at_touchdown(s, jnp.asarray(theta))
 
 
 def double_support_jacobian(
@@ -60,9 +62,8 @@ class LandingByThePaper(NamedTuple):
 
 def landing(params: WheelParams, section_state: np.ndarray) -> LandingByThePaper:
     """Collision I from the section state (theta-, dtheta-, dL1-) in five coordinates."""
-    s = params.symbols()
     theta, dtheta, dL1 = (float(v) for v in section_state)
-    reach = _reach(s, theta)
+    s, reach = jax.tree.map(float, _touchdown(params, theta))
     foot = landing_foot_velocity(params, section_state, bare_rate=dL1)
     before = np.array([*foot, dtheta, 0.0, dL1])
     new = np.asarray(theta - s.alpha)
@@ -93,9 +94,8 @@ def landing_foot_velocity(
     params: WheelParams, section_state: np.ndarray, bare_rate: float
 ) -> np.ndarray:
     """Velocity of the landing foot by eqs (16), (17), with `bare_rate` for their bare L1 rate."""
-    s = params.symbols()
     theta, dtheta, _ = (float(v) for v in section_state)
-    reach = _reach(s, theta)
+    s, reach = jax.tree.map(float, _touchdown(params, theta))
     L0, alpha = float(s.L0), float(s.alpha)
     x = (reach * np.cos(theta) - L0 * np.cos(alpha - theta)) * dtheta + bare_rate * np.sin(theta)
     z = -(reach * np.sin(theta) + L0 * np.sin(alpha - theta)) * dtheta + bare_rate * np.cos(theta)
@@ -106,9 +106,8 @@ def landing_foot_velocity_by_differences(
     params: WheelParams, section_state: np.ndarray, h: float = 1e-6
 ) -> np.ndarray:
     """The same from the foot's position a moment before and after; right to h^2, some 1e-11 m/s."""
-    s = params.symbols()
     theta, dtheta, dL1 = (float(v) for v in section_state)
-    reach = _reach(s, theta)
+    s, reach = jax.tree.map(float, _touchdown(params, theta))
 
     def position(t: float) -> np.ndarray:
         angle, length = theta + dtheta * t, reach + dL1 * t
