@@ -59,7 +59,7 @@ class Options(AbstractTold):
     max_phase_time: Scalar = _positive("max_phase_time", 20.0)
     max_solver_steps: int = eqx.field(static=True, default=20_000)
     first_step: Scalar = _positive("first_step", 5e-3)
-    event_steps: int = eqx.field(static=True, default=30)
+    event_steps: int = eqx.field(static=True, default=100)
     monitor_steps: int = eqx.field(static=True, default=5)
 
     if TYPE_CHECKING:
@@ -74,7 +74,7 @@ class Options(AbstractTold):
             max_phase_time: Number = 20.0,
             max_solver_steps: int = 20_000,
             first_step: Number = 5e-3,
-            event_steps: int = 30,
+            event_steps: int = 100,
             monitor_steps: int = 5,
         ) -> None: ...
 
