@@ -20,7 +20,7 @@ import numpy as np
 
 from vrw_jax.answers.lower import Lower
 from vrw_jax.answers.quantities import N_DURATIONS, N_QUANTITIES, measured, slopes
-from vrw_jax.answers.top import OPINIONS, Ground, Stepped
+from vrw_jax.answers.top import Ground, Stepped
 from vrw_jax.wheel import Outcome
 
 SLOWEST, TRUSTED, QUICKEST = 0.5, 0.25, 0.1
@@ -331,6 +331,6 @@ def settled(
     some = np.flatnonzero(doubted)
     if len(some):
         told.numerical[some] = chord.other_opinions(some, names, told)
-        told.n_steps[some] += len(OPINIONS)
+        told.n_steps[some] += len(chord.ground.otherwise())
     told.done[some] &= np.isfinite(told.numerical[some]).all(1)
     return told

@@ -34,8 +34,9 @@ TINY = 1e-30
 
 
 def measured(names: Sequence[str], t: np.ndarray) -> np.ndarray:
-    """(lanes, names) of quantities (lanes, 7)."""
-    return np.stack([MADE[name](t) for name in names], -1)
+    """(lanes, names) of quantities (lanes, 7); NaN, and no warning, where a step failed."""
+    with np.errstate(invalid="ignore"):
+        return np.stack([MADE[name](t) for name in names], -1)
 
 
 def slopes(names: Sequence[str], t: np.ndarray) -> np.ndarray:

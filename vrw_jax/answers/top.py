@@ -13,8 +13,8 @@ from vrw_jax.wheel import PARAMETER_NAMES, WheelParams
 TIGHT, TIGHTER = 1e-10, 1e-12
 """Tolerances of steps. Looser ones save a seventh of the time and miss events; the tighter one
 costs a third more."""
-OPINIONS = TIGHTER, 1e-9, 1e-11
-"""Of others, where feet may dip: the first changes places with TIGHT."""
+OPINIONS = {TIGHT: (TIGHTER, 1e-11, 3e-11), TIGHTER: (1e-13, 3e-12, 1e-11)}
+"""Tolerances of others, where feet may dip."""
 
 
 class Stepped(NamedTuple):
@@ -60,9 +60,8 @@ class Ground:
 
     def otherwise(self) -> list["Ground"]:
         """With steps at other tolerances."""
-        own = float(self.options.rtol)
-        tolerances = (TIGHT if own < TIGHT else TIGHTER, *OPINIONS[1:])
-        options = [Options(rtol=tolerance, atol=tolerance) for tolerance in tolerances]
+        own = TIGHTER if float(self.options.rtol) < 0.5 * TIGHT else TIGHT
+        options = [Options(rtol=tolerance, atol=tolerance) for tolerance in OPINIONS[own]]
         return [dataclasses.replace(self, options=each) for each in options]
 
     def shortest(self, lanes: np.ndarray) -> np.ndarray:
