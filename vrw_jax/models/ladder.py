@@ -6,6 +6,7 @@ wheel serves does no work on the upper rung. The rigid wheel never serves: its p
 not yield, fails for every finite stiffness.
 """
 
+import dataclasses
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -103,6 +104,10 @@ class ModelChoice(AbstractTold):
         margins = [(MARGINS[n].label, MARGINS[n].text(value)) for n, value in told_margins]
         return [("rung", type(self.model).__name__), ("why", self.why), *margins]
 
+    def served(self) -> dict[str, Array]:
+        """See `AbstractStep.served`."""
+        return {"rung": self.rung, "reason": self.reason}
+
     @property
     def model(self) -> AbstractWheel:
         """The rung itself, for one wheel."""
@@ -174,7 +179,7 @@ class LadderStep(AbstractGroundStep):
     solver_steps: Int[Array, ""]
 
     def served(self) -> dict[str, Array]:
-        return {"rung": self.choice.rung, "reason": self.choice.reason}
+        return self.choice.served()
 
 
 class LadderWheel(AbstractWheel):
@@ -277,9 +282,9 @@ class LadderWheel(AbstractWheel):
         """The motion as the upper rung tells it: without slip it is the paper's."""
         choice, _ = self.choose(params, x, options)
         friction = jnp.where(choice.rung == VISCOELASTIC, jnp.inf, self.friction)
-        return UnilateralWheel(friction=friction, infinite="paper").trace(
-            params, x, options, n_samples
-        )
+        wheel = UnilateralWheel(friction=friction, infinite="paper")
+        trace = wheel.trace(params, x, options, n_samples)
+        return dataclasses.replace(trace, served=choice.served())
 
 
 def _of_plane(x: FullState, n: int) -> Float[Array, "3"]:

@@ -80,7 +80,7 @@ from vrw_jax.numerics.levels import (
     LevelPoint,
     margins_beside_fold,
 )
-from vrw_jax.numerics.march import LanePhase, integrate_lanes, sample_lanes
+from vrw_jax.numerics.march import LanePhase, integrate_lanes, sample_lanes, sampled
 from vrw_jax.numerics.minima import ROUNDING, State, Watched
 from vrw_jax.numerics.newton import SectionCycle, newton_cycle
 from vrw_jax.numerics.on_plane import solve

@@ -430,21 +430,43 @@ def sample_lanes(
     options: Options,
 ) -> Array:
     """Positions, then rates, at equal times of a phase, ends included: (samples, ., lanes)."""
+
+    def take(place: Place, length: Array) -> tuple[Place, Array]:
+        taken = take_step(tableau, phase.evaluate, place, length)
+        return taken.end, _squared_error(taken, place, (), options.rtol, options.atol)
+
+    told = lambda place: jnp.stack([*place.q, *place.v])
     start = Place(q, v, phase.evaluate(q, v))
+    return sampled(take, told, start, tableau, duration, n_samples, options)
+
+
+def sampled(
+    take: Callable[[Any, Array], tuple[Any, Array]],
+    told: Callable[[Any], Array],
+    start: Any,
+    tableau: Tableau,
+    duration: Array,
+    n_samples: int,
+    options: Options,
+) -> Array:
+    """What is `told` of places at equal times, ends included, samples first.
+
+    `take(place, length)` gives the end of a step of the tableau, and the square of its error over
+    what is allowed.
+    """
     none = jnp.zeros((), jnp.int32)
 
     def advance(now: tuple) -> tuple:
         place, h, left, tried = now
         length = jnp.minimum(h, left)
-        taken = take_step(tableau, phase.evaluate, place, length)
-        squared = _squared_error(taken, place, (), options.rtol, options.atol)
+        end, squared = take(place, length)
         change = change_of_length(tableau, squared, length.dtype)
         keep = squared <= 1.0
         # A step that a sample has cut short says nothing against the length before.
         h = jnp.where(keep & (length < h), jnp.maximum(h, length * change), length * change)
         going = left > 0.0
         return (
-            select(going & keep, taken.end, place),
+            select(going & keep, end, place),
             jnp.where(going, h, now[1]),
             jnp.where(going & keep, jnp.where(length == left, 0.0, left - length), left),
             tried + 1,
@@ -454,8 +476,8 @@ def sample_lanes(
         unsettled = lambda now: jnp.any(now[2] > 0.0) & (now[3] < options.max_solver_steps)
         begin = (*now, duration / (n_samples - 1), none)
         place, h, _, _ = lax.while_loop(unsettled, advance, begin)
-        return (place, h), jnp.stack([*place.q, *place.v])
+        return (place, h), told(place)
 
     first = start, options.first_step + jnp.zeros_like(duration)
     later = lax.scan(to_next, first, None, length=n_samples - 1)[1]
-    return jnp.concatenate([jnp.stack([*q, *v])[None], later])
+    return jnp.concatenate([told(start)[None], later])

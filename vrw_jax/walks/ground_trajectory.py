@@ -9,6 +9,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -72,20 +73,19 @@ def over_contacts(params: WheelParams, model: Any, options: Options, n_samples: 
     """
 
     def stretches(x: Array) -> Stretches:
-        result = model.step(params, x, options)
         trace, columns = jax.tree.map(np.array, _columns(model, params, x, options, n_samples))
         shape = (len(trace.duration), n_samples)
         over_samples = lambda legs: np.repeat(legs[:, None], n_samples, axis=1)
         columns |= {"time": trace.time, "contact": over_samples(trace.contact)}
-        columns |= {name: np.full(shape, int(value)) for name, value in result.served().items()}
+        columns |= {name: np.full(shape, int(value)) for name, value in trace.served.items()}
         columns["on_stopper"] = over_samples(trace.locked)
         return Stretches(
             columns,
             trace.duration,
-            Outcome(int(result.outcome)),
-            result.section_state,
-            float(result.period),
-            float(result.step_length),
+            Outcome(int(trace.outcome)),
+            jnp.asarray(trace.section_state),
+            float(trace.duration.sum()),
+            float(trace.step_length),
         )
 
     attrs: dict[str, object] = {

@@ -239,18 +239,27 @@ def stretched(details: Details, flow: Flow, motion: WheelMotion, duration: Array
     return stretch_noted(details, flow.contact, duration, force)
 
 
+def started(on: Walk, columns: Array, x: Array) -> tuple[Array, _Lane]:
+    """Columns that a walk may have, and lanes before its first landing."""
+    columns, x, good = on.sound(columns, x)
+    return columns, on.barred(on.begun(columns, x), good)
+
+
+def turned(on: Walk, columns: Array, lane: _Lane, waits: bool = False) -> tuple[_Lane, _Lane]:
+    """Lanes past their events, and on from there: to the next one where it `waits` for that."""
+    past = on.past_events(columns, lane)
+    hurry, flow_at = past.outcome == UNDER_WAY, lambda c: on.flow(c, past.now.stance)
+    hurry = hurry & (not waits)
+    now = marched(flow_at, columns, past.now, hurry, on.options, on.tableau)
+    return past, past._replace(now=now)
+
+
 def walked(on: Walk, columns: Array, x: Array) -> Walked:
     """Every lane through its landings of the foremost foot."""
-    columns, x, good = on.sound(columns, x)
-
-    def turn(lane: _Lane) -> _Lane:
-        lane = on.past_events(columns, lane)
-        under_way, flow_at = lane.outcome == UNDER_WAY, lambda c: on.flow(c, lane.now.stance)
-        now = marched(flow_at, columns, lane.now, under_way, on.options, on.tableau)
-        return lane._replace(now=now)
-
+    columns, lane = started(on, columns, x)
+    turn = lambda lane: turned(on, columns, lane)[1]
     goes_on = lambda lane: jnp.any(lane.outcome == UNDER_WAY)
-    lane = lax.while_loop(goes_on, turn, on.barred(on.begun(columns, x), good))
+    lane = lax.while_loop(goes_on, turn, lane)
     return Walked(on.told(lane), lane.outcome, lane.n_stepped, lane.ledger.tried)
 
 

@@ -204,7 +204,7 @@ def marched(
     sizes = guard_sizes(flow)
 
     def advance(now: March) -> March:
-        return _advanced(now, _tried(flow, tableau, options, now), sizes, tableau, options)
+        return _advanced(now, tried_step(flow, tableau, options, now), sizes, tableau, options)
 
     return _while(lambda now: now.verdict == MARCHING, walks, advance, begin)
 
@@ -250,10 +250,10 @@ def marched_along(
         now, way = state
         n = len(now.here.q)
 
-        def ends(columns: Array, q: Array, v: Array) -> tuple[Array, _Try]:
+        def ends(columns: Array, q: Array, v: Array) -> tuple[Array, Try]:
             flow = flow_at(columns)
             here = Place(q, v, _slope(flow, q, v))
-            tried = _tried(flow, tableau, options, now._replace(here=here))
+            tried = tried_step(flow, tableau, options, now._replace(here=here))
             gained = [] if tried.told is None else [tried.told]
             return jnp.concatenate([tried.end.q, tried.end.v, *gained]), tried
 
@@ -290,7 +290,7 @@ def _met(flow_at: FlowAt, columns: Array, begin: March, now: March, way: Way) ->
     return Way(way.columns, way.q + later * here.v, way.v + later * here.slope[:n], told, later)
 
 
-class _Try(NamedTuple):
+class Try(NamedTuple):
     """One Runge-Kutta step of every lane."""
 
     end: Place
@@ -302,7 +302,7 @@ class _Try(NamedTuple):
     told: Array | None  # what the step adds to `March.told`
 
 
-def _tried(flow: Flow, tableau: Tableau, options: Options, now: March) -> _Try:
+def tried_step(flow: Flow, tableau: Tableau, options: Options, now: March) -> Try:
     """Only the end and what is told move with anything: lengths are what they are."""
     h, n = now.h, now.here.q.shape[0]
     last = len(tableau.places) - 1
@@ -336,10 +336,10 @@ def _tried(flow: Flow, tableau: Tableau, options: Options, now: March) -> _Try:
     middle = within[tableau.inside.index(tableau.middle)] if within else now.values
     bent = parabola(tableau, now.values, middle, values)
     to_dip = _to_earliest_dip(tableau, [now.values, *within, values], _stands(now))
-    return _Try(end, squared, values, *bent, to_dip, told)
+    return Try(end, squared, values, *bent, to_dip, told)
 
 
-def _advanced(now: March, tried: _Try, sizes: Array, tableau: Tableau, options: Options) -> March:
+def _advanced(now: March, tried: Try, sizes: Array, tableau: Tableau, options: Options) -> March:
     """The lane takes its step, tries another length, or has come to an event."""
     here, h, search, end = now.here, now.h, now.search, tried.end
     running = now.verdict == MARCHING
@@ -389,7 +389,7 @@ class _Found(NamedTuple):
 
 
 def _searched(
-    now: March, tried: _Try, crossed: Array, sizes: Array, options: Options
+    now: March, tried: Try, crossed: Array, sizes: Array, options: Options
 ) -> tuple[Search, _Found]:
     """One more look for the earliest event, from where the guards' parabolas fall through zero."""
     h, search = now.h, now.search

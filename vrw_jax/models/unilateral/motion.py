@@ -40,7 +40,7 @@ from vrw_jax.models.unilateral.mechanics import (
 from vrw_jax.numerics import Elementwise, Scalar
 from vrw_jax.wheel import Symbols
 
-State = Float[Array, " dim"]
+State = Float[Array, "dim ..."]
 """Hub (x, z, theta) and rates, lengths, rates of lengths, then the tallies: see `Tally`."""
 
 

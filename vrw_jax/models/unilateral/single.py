@@ -19,7 +19,7 @@ from vrw_jax.runtime import lane_function
 from vrw_jax.wheel import parameters_of
 
 
-class _Setting(NamedTuple):
+class Setting(NamedTuple):
     """What a step depends on besides its arrays."""
 
     structure: Any  # of (wheel, params, x, options), whose leaves are the arrays
@@ -65,14 +65,14 @@ def _parted(walk: Walked) -> tuple[Any, Any]:
 
 def told_by_lanes(structure: Any, detailed: bool) -> Forward:
     """The step over the leaves of (wheel, params, x, options), as `any_mode` takes it."""
-    setting = _Setting(structure, detailed)
+    setting = Setting(structure, detailed)
     key = "step on real ground", str(structure), detailed
     return one_wheel(lane_function(setting.told, setting.like, key))
 
 
 def moved_by_lanes(structure: Any, detailed: bool, moved: tuple[int, ...]) -> Forward:
     """(Jacobian by the leaves `moved`, floats) and the other outputs of `told_by_lanes`."""
-    setting = _Setting(structure, detailed)
+    setting = Setting(structure, detailed)
 
     def like(leaves: tuple[Array, ...], _ways: tuple[Array, ...]) -> tuple:
         value, other = setting.like(*leaves)

@@ -16,6 +16,7 @@ from vrw_jax.models.lane_step import lanes_can
 from vrw_jax.models.paper_step import PAPER_START
 from vrw_jax.models.unilateral.contacts import Roughness
 from vrw_jax.models.unilateral.events import Law
+from vrw_jax.models.unilateral.lanes import Lean
 from vrw_jax.models.unilateral.ledger import (
     Details,
     Ledger,
@@ -32,6 +33,7 @@ from vrw_jax.models.unilateral.ledger import (
     step_told,
     stretch_noted,
 )
+from vrw_jax.models.unilateral.mechanics import place_of_landing
 from vrw_jax.models.unilateral.motion import (
     Guards,
     Stance,
@@ -47,6 +49,7 @@ from vrw_jax.models.unilateral.motion import (
     pack,
     unpack,
 )
+from vrw_jax.models.unilateral.sampling import Log, Sampled, sampled_by_lanes
 from vrw_jax.models.unilateral.section import (
     FullState,
     embedded,
@@ -88,15 +91,10 @@ class UnilateralTrajectory(eqx.Module):
     tangential: Float[Array, "phases n legs"]  # force on every foot, N
     normal: Float[Array, "phases n legs"]
     duration: Float[Array, " phases"]  # s
-
-
-class _Log(NamedTuple):
-    """Starts of all phases, kept where a trajectory is wanted."""
-
-    state: Float[Array, "phases dim"]
-    contact: Int[Array, "phases legs"]
-    locked: Array
-    duration: Float[Array, " phases"]
+    section_state: FullState  # after it, and what else the step tells
+    step_length: Scalar
+    outcome: Int[Array, ""]
+    served: dict[str, Array] = eqx.field(default_factory=dict)  # see `AbstractStep.served`
 
 
 class _Walked(NamedTuple):
@@ -109,7 +107,7 @@ class _Walked(NamedTuple):
     running: Bool[Array, ""]
     ledger: Ledger
     details: Details | None
-    log: _Log | None
+    log: Log | None
 
 
 class Uneven(NamedTuple):
@@ -234,11 +232,18 @@ class UnilateralWheel(AbstractWheel):
         self, params: WheelParams, x: FullState, options: Options, detailed: bool
     ) -> tuple[Any, str]:
         """What is told of a step, and the engine that took it."""
+        (leaves, structure), engine = self._leaves(params, x, options), self._engine(options)
+        return eqx.combine(*_compiled(structure, detailed, engine)(*leaves)), engine
+
+    def _leaves(self, params: WheelParams, x: FullState, options: Options) -> tuple[list, Any]:
+        """All that a step depends on, and its structure."""
         # Not by `replace`: friction was checked, and may be traced by now.
         model = eqx.tree_at(lambda wheel: wheel.friction, self, self.friction.astype(x.dtype))
-        leaves, structure = jax.tree.flatten((model, params, x, options))
-        engine = "lanes" if self._like_lanes(options) and lanes_can(options) else "diffrax"
-        return eqx.combine(*_compiled(structure, detailed, engine)(*leaves)), engine
+        return jax.tree.flatten((model, params, x, options))
+
+    def _engine(self, options: Options) -> str:
+        """Who takes the step."""
+        return "lanes" if self._like_lanes(options) and lanes_can(options) else "diffrax"
 
     def _like_lanes(self, options: Options) -> bool:
         """Whether the ground is such as lanes know."""
@@ -253,28 +258,52 @@ class UnilateralWheel(AbstractWheel):
     def trace(
         self, params: WheelParams, x: FullState, options: Options, n_samples: int
     ) -> UnilateralTrajectory:
-        log = _walk(self, params, x, options, detailed=False, logged=True).log
-        assert log is not None
+        if self._engine(options) == "lanes":
+            leaves, structure = self._leaves(params, x, options)
+            found = sampled_by_lanes(structure, n_samples)(*leaves)
+        else:
+            found = self._sampled_by_diffrax(params, x, options, n_samples)
+        log, ends = found.log, found.ends
         begins = jnp.concatenate([jnp.zeros((1,)), jnp.cumsum(log.duration)[:-1]])
+        return UnilateralTrajectory(
+            time=begins[:, None] + jnp.linspace(0.0, 1.0, n_samples) * log.duration[:, None],
+            state=found.state,
+            contact=log.contact,
+            locked=log.locked,
+            tangential=found.tangential,
+            normal=found.normal,
+            duration=log.duration,
+            section_state=ends.section_state,
+            step_length=ends.step_length,
+            outcome=found.outcome,
+        )
+
+    def _sampled_by_diffrax(
+        self, params: WheelParams, x: FullState, options: Options, n_samples: int
+    ) -> Sampled:
+        walked = _walk(self, params, x, options, detailed=False, logged=True)
+        log, outcome = walked.log, walked.outcome
+        assert log is not None
+        tilt = None if self.uneven is None else self.uneven.tilt
         s, friction = params.symbols(), _rough(self, self.friction)
 
-        def phase(inputs: tuple) -> tuple:
-            state, contact, locked, duration, begin = inputs
+        def phase(log: Log) -> tuple:
             none = jnp.zeros((s.n,), bool)
-            flow = flow_of(s, friction, False, Stance(contact, locked, none, none, none))
-            states = sample_phase(partial(field, flow), state, duration, n_samples, options)
+            flow = flow_of(s, friction, False, Stance(log.contact, log.locked, none, none, none))
+            given = partial(field, flow), log.state, log.duration, n_samples, options
 
             def feet(y: State) -> tuple:
                 found = forces(flow, unpack(y)[0]).answer
                 return flow.slots.spread(found.tangential), flow.slots.spread(found.normal)
 
-            tangential, normal = jax.vmap(feet)(states)
-            return begin + jnp.linspace(0.0, 1.0, n_samples) * duration, states, tangential, normal
+            states = sample_phase(*given)
+            return states, *jax.vmap(feet)(states)
 
-        time, states, tangential, normal = lax.map(phase, (*log, begins))
-        return UnilateralTrajectory(
-            time, states, log.contact, log.locked, tangential, normal, log.duration
-        )
+        section_state, durations, *_ = _lean(walked, tilt)
+        landing = place_of_landing(s.n, unpack(walked.state)[0])
+        landed = jnp.where(outcome == Outcome.STEPPED, landing, 0.0)
+        ends = Lean(section_state, durations, landed)
+        return Sampled(log, ends, outcome, *lax.map(phase, log))
 
 
 def _rough(wheel: UnilateralWheel, friction: Elementwise) -> Roughness:
@@ -304,7 +333,7 @@ def _walk(
     zero = jnp.zeros_like(motion.theta)
     state = pack(motion, Tally(zero, zero, zero, zero))
     rows = lambda leaf: jnp.broadcast_to(leaf, (wheel.max_events, *leaf.shape))
-    first = _Log(state, jnp.zeros((n,), jnp.int32), jnp.zeros((n,), bool), jnp.zeros_like(x[0]))
+    first = Log(state, jnp.zeros((n,), jnp.int32), jnp.zeros((n,), bool), jnp.zeros_like(x[0]))
     begin = _Walked(
         state=state,
         stance=stance,
@@ -346,7 +375,7 @@ def _go_on(law: Law, place: Guards, max_events: int, options: Options, now: _Wal
         force = [least_stopper_force(flow, forces(flow, motion)) for motion in ends]
         details = stretch_noted(details, flow.contact, end.duration, jnp.minimum(*force))
     if log is not None:
-        row = _Log(start, change.stance.contact, change.stance.locked, end.duration)
+        row = Log(start, change.stance.contact, change.stance.locked, end.duration)
         log = jax.tree.map(lambda old, new: old.at[now.ledger.events].set(new), log, row)
     return _Walked(
         state=end.state,
