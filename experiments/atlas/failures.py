@@ -27,7 +27,7 @@ from vrw_jax.figures import figure_style, save
 TABLE = FIGURES / "atlas_failures.csv"
 ORDER = (
     "bouncing_ball", "monodromy", "grazing", "resonant_grazing", "two_states", "pinned_pendulum",
-    "stick_slip", "woodpecker", "slider_crank", "painleve", "chenciner", "few_segments",
+    "clutches", "stick_slip", "woodpecker", "slider_crank", "painleve", "chenciner", "few_segments",
     "singular_field", "tangent_guards", "simplest_walker", "compass_gait", "rimless_wheel",
 )  # fmt: skip
 NAMES = [name for name in ORDER if name in {m.name for m in pkgutil.iter_modules(cases.__path__)}]
@@ -116,7 +116,7 @@ def tell(rows: list[dict[str, str]]) -> None:
         table = markdown(header, methods)
         replace(TEXT, f"failure {name}", f"{table}\n\nSource: {case.source}.")
     header = ["case", "what breaks", "truth", "our largest error over the condition", "right",
-              "says so", "wrong silently", "command"]  # fmt: skip
+              "says so", "wrong silently", "`python -m experiments.atlas.failures`"]  # fmt: skip
     replace(TEXT, "failures", markdown(header, lines))
 
 

@@ -75,7 +75,7 @@ def by_newton(told: Return) -> Gait:
     says = walked.says if found.converged else "Newton did not converge"
     walked = walked._replace(
         says=says, admits=bool(~found.converged) or walked.admits, seconds=seconds,
-        work=int(found.iterations),
+        work=int(found.iterations), options=f"{walked.options}; Newton 1e-11",
     )  # fmt: skip
     return Gait(walked, x, np.asarray(found.jacobian), _duration(walked, told))
 
@@ -100,8 +100,9 @@ def by_differences(method: Callable[..., Walked], told: Return) -> Gait:
     last = walked(x)
     says = last.says or ("" if flag == 1 else f"fsolve: {' '.join(message.split())[:70]}")
     last = last._replace(
-        says=says, admits=last.admits or flag != 1, seconds=seconds, work=int(info["nfev"])
-    )
+        says=says, admits=last.admits or flag != 1, seconds=seconds, work=int(info["nfev"]),
+        options=f"{last.options}; fsolve 1e-12, differences over {DIFFERENCE:g}",
+    )  # fmt: skip
     return Gait(last, x, np.stack(columns, 1), _duration(last, told))
 
 

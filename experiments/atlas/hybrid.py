@@ -60,7 +60,7 @@ class Walked(NamedTuple):
     options: str
     version: str
     end: np.ndarray  # the last state, past the reset
-    resolution: float = 0.0  # of the last time: what the tolerances are in it, where a method tells
+    resolution: np.ndarray = np.zeros(0)  # of each time: what the tolerances are in it, if told
 
 
 JAX = types.SimpleNamespace(sin=jnp.sin, cos=jnp.cos, exp=jnp.exp, sqrt=jnp.sqrt, stack=jnp.stack)
@@ -103,7 +103,7 @@ def ours(
         f"{solver} {tolerance:g}",
         version("vrw-jax"),
         np.asarray(told.state),
-        float(told.resolution[n - 1]) if n else 0.0,
+        np.asarray(told.resolution[:n]),
     )
 
 
@@ -292,11 +292,12 @@ def row(
     relative: bool = False,
     condition: float = 1.0,
     digits: int | None = None,
+    event: int = 0,
 ) -> Row:
-    """What a walk says of one quantity; also that its last time is badly conditioned."""
-    says = walked.says
-    if not says and walked.resolution > EXACT:
-        says = f"tolerance in time: {walked.resolution:.0e}"
+    """What a walk says of one quantity, of the last event or another: also a bad condition."""
+    says, told = walked.says, walked.resolution[:event] if event else walked.resolution
+    if not says and len(told) and told[-1] > EXACT:
+        says = f"tolerance in time: {told[-1]:.0e}"
     return Row(
         quantity, walked.method, found, truth, off(found, truth, relative=relative), says,
         walked.admits, walked.work, walked.seconds, walked.options, walked.version,

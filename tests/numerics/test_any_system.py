@@ -209,6 +209,7 @@ def test_contacts_have_one_answer_several_or_none():
     assert answers([[1.0]], [-1.0]) == Answers.ONE
     assert answers([[-1.0]], [1.0]) == Answers.SEVERAL
     assert answers([[-1.0]], [-1.0]) == Answers.NONE
+    assert np.isnan(complementary([[-1.0]], [-1.0]).force).all()
     random = np.random.default_rng(0)
     for _ in range(10):  # a positive definite matrix: one answer, by the quadratic programme
         root = random.normal(size=(3, 3))

@@ -27,7 +27,7 @@ class Answers(Code):
 class Contact(NamedTuple):
     """Forces z >= 0 and what they leave, w = matrix z + free >= 0, with z w = 0 in each contact."""
 
-    force: Float[Array, " n"]  # of the answer with most closed contacts; zero without any
+    force: Float[Array, " n"]  # of the answer with most closed contacts; not a number without any
     gap: Float[Array, " n"]
     answers: Int[Array, ""]  # an Answers
     fits: Bool[Array, " combinations"]  # which combinations of closed contacts are answers
@@ -75,7 +75,6 @@ def complementary(
     same = jnp.max(jnp.abs(forces[:, None] - forces[None]), -1) <= reach
     again = jnp.any(jnp.tril(same & fits[None], -1), 1)
     fits = fits & ~again
-    nothing = 0.0 * (largest + jnp.sum(free))  # not a number under transforms, if given none
-    force = jnp.where(jnp.any(fits), forces[jnp.argmax(fits)], nothing)
+    force = jnp.where(jnp.any(fits), forces[jnp.argmax(fits)], jnp.nan)
     count = jnp.minimum(jnp.sum(fits), int(Answers.SEVERAL)).astype(jnp.int32)
     return Contact(force, scale * (matrix @ force + free), count, fits, forces)

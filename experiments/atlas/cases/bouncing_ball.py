@@ -30,7 +30,8 @@ def rows() -> Iterator[Row]:
     for method in METHODS:
         walked = method(BALL, (1.0, 0.0), EVENTS, 10.0)
         early = walked._replace(says="", admits=False)
-        yield row(early, "time of bounce 20", last_time(walked, 20), float(times(20)[-1]))
+        truth = float(times(20)[-1])
+        yield row(early, "time of bounce 20", last_time(walked, 20), truth, event=20)
         end = float(walked.times[-1]) if len(walked.times) else math.nan
         told = walked._replace(says=walked.says or f"goes on: {len(walked.times)} bounces")
         yield row(told, "time of the last bounce", end, LAST)

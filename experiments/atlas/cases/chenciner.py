@@ -1,27 +1,32 @@
 """Steinmetz and Larter's reaction near a Chenciner point: a cycle whose pair is on the circle.
 
 Published (MatCont's manual, 2012): at k7 = 1.5163129, k8 = 0.83200664 a pair of multipliers has
-modulus 1, and the cycle passes through `PUBLISHED`. On that curve of such points lies the Chenciner
-point, where the return map's cubic coefficient vanishes too: its k7 is told as 1.752 by the author
-of BifurcationKit (issue 222), and found here from two sections. A walk neither settles nor leaves,
-so that only Newton's method finds the cycle. Along any cycle one multiplier is 1, and the product
-of all is the exponential of the divergence's integral.
+modulus 1, and the cycle passes through `PUBLISHED`; so at `FIRST`. BifurcationKit's pages tell k8
+at k7 = 1.5, where the pair's exponent reaches their `tol_stability`. On that curve of such points
+lies the Chenciner point, where the return map's cubic coefficient vanishes too: its k7 is told as
+1.752 by the author of BifurcationKit (issue 222), 1.7465 to 1.7475 by its pages, and 1.855 there by
+collocation; it is found here from two sections. A walk neither settles nor leaves, so that only
+Newton's method finds the cycle. Along any cycle one multiplier is 1, and the product of all is the
+exponential of the divergence's integral.
 """
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from importlib.metadata import version
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
+from scipy.optimize import brentq
 
 import vrw_jax as vrw
 from experiments.atlas.chenciner_point import Point, chenciner_point
 from experiments.atlas.gaits import Return, gaits
 from experiments.atlas.hybrid import JAX, METHODS, Edge, Part, row
 from experiments.atlas.told import Case, Row, off, timed
-from vrw_jax.numerics import Guard, Mode, product_multipliers, segment_maps, walk
+from vrw_jax.numerics import Guard, Mode, newton_cycle, product_multipliers, segment_maps, walk
 
 K1, K2, K3, K4, K5, K6, K9 = 0.1631021, 1250.0, 0.046875, 20.0, 1.104, 0.001, 0.1175
 K7, K8 = 1.5163129, 0.83200664
@@ -31,6 +36,11 @@ SEGMENTS = 600
 TOLD, NEAR = (1.752, 0.9113), (9.2149, 1.9652e-3, 2.4941e-3)
 """The Chenciner point's k7 as told and k8 on the curve there, and A, X, Y on the cycle."""
 OTHER_LEVEL = 11.0
+FIRST_K, FIRST_LEVEL = (0.71643356, 0.5), 25.678306
+FIRST = (1.8609653, 1.0838258e-2, 9.4707061e-2)
+"""The manual's first point: k7 and k8, B, and A, X, Y on the cycle."""
+AT_K7, STABLE, PAGES_K8 = 1.5, 1e-3, 0.82521357
+"""BifurcationKit's point: k7, the exponent that it takes for zero, and k8 by its page of 0.3.2."""
 
 
 def field(y, m, k7=K7, k8=K8):
@@ -94,6 +104,34 @@ def found_on(level: float) -> tuple[Point, float]:
     return point, time.process_time() - began
 
 
+@jax.jit
+def cycle_at(x, k, level):
+    return newton_cycle(lambda x: returned(level)(x, k), x, tolerance=1e-11)
+
+
+def torus_points() -> Iterator[Row]:
+    """Two more published points with a pair on the circle."""
+    largest = lambda cycle: float(np.abs(np.linalg.eigvals(cycle.jacobian)).max())
+    options = "Dopri8 1e-13; Newton 1e-11"
+    first, seconds = timed(
+        lambda: jax.block_until_ready(cycle_at(jnp.array(FIRST), jnp.array(FIRST_K), FIRST_LEVEL))
+    )
+    x, guess = float(first.x[0]), jnp.array(PUBLISHED)
+    began = time.process_time()
+    guess = cycle_at(guess, jnp.array([AT_K7, PAGES_K8]), LEVEL).x
+    exponent = lambda k8: math.log(largest(cycle_at(guess, jnp.array([AT_K7, k8]), LEVEL)))
+    k8 = brentq(lambda k8: exponent(k8) - STABLE, PAGES_K8 - 1e-4, PAGES_K8 + 1e-4, xtol=1e-12)
+    for name, found, truth, digits, took in (
+        ("modulus at the first point, as published", largest(first), 1.0, 6, seconds),
+        ("A at the first point, as published", x, FIRST[0], 6, seconds),
+        ("k8 of exponent 1e-3, as published", k8, PAGES_K8, 8, time.process_time() - began),
+    ):
+        yield Row(
+            name, "ours", found, truth, off(found, truth), "", not bool(first.converged),
+            int(first.iterations), took, options, version("vrw-jax"), digits=digits,
+        )  # fmt: skip
+
+
 def rows() -> Iterator[Row]:
     told = gaits(CYCLE)
     other = told[-1]
@@ -124,6 +162,7 @@ def rows() -> Iterator[Row]:
             seconds, f"Dopri8 1e-13, {SEGMENTS} segments", version("vrw-jax"),
         )  # fmt: skip
 
+    yield from torus_points()
     (point, seconds), (other, _) = found_on(LEVEL), found_on(OTHER_LEVEL)
     for name, value, truth in zip(("k7", "k8"), point.parameters, other.parameters, strict=True):
         yield Row(

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 import vrw_jax as vrw
 from experiments.atlas.gaits import Return, by_differences, by_newton, gaits
-from experiments.atlas.hybrid import METHODS, Edge, Part, last_time, modes, row
+from experiments.atlas.hybrid import METHODS, Edge, Part, last_time, modes, ours, row
 from experiments.atlas.told import Case, Row, off, timed
 from vrw_jax.numerics import walk
 
@@ -60,6 +60,8 @@ def repeating(w: float, depth: float) -> tuple[float, float]:
 W, DEPTH = 2.6, 0.05
 NEAR = 1e-6
 """By how much the stop is touched."""
+NORDMARK = (1.0 + KEPT) * math.sqrt(1.0 + 0.5 * NEAR)
+"""1 + r, the coefficient of the map's square root over sqrt(2 a), where the touch is shallow."""
 
 
 def of_impact(w: float, depth: float) -> Return:
@@ -106,6 +108,18 @@ def rows() -> Iterator[Row]:
             walked, "time of touching by 1e-6", found, touches(W, NEAR),
             condition=1.0 / (W * math.sqrt(2.0 * NEAR)),
         )  # fmt: skip
+        last = walked.states[-1][1] if len(walked.times) else math.nan
+        jump = walked.end[1] - last  # of the rate; over the square root of twice a = w^2 and d
+        yield row(
+            walked, "jump over √(2 a d)", -jump / (W * math.sqrt(2.0 * NEAR)), NORDMARK,
+            condition=0.5 / NEAR,
+        )  # fmt: skip
+    fine = ours(stopped(W), (-(1.0 + NEAR), 0.0, 0.0, 1.0 + NEAR), 1, 20.0, tolerance=1e-15)
+    fine = fine._replace(method="ours, 1e-15")
+    yield row(
+        fine, "time of touching by 1e-6", last_time(fine, 1), touches(W, NEAR),
+        condition=1.0 / (W * math.sqrt(2.0 * NEAR)),
+    )  # fmt: skip
     yield from derivative()
     _, rate = repeating(W, DEPTH)
     for gait in gaits(of_impact(W, DEPTH)):

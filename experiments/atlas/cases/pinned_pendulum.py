@@ -56,7 +56,8 @@ def rows() -> Iterator[Row]:
     for method in METHODS:
         walked = method(SYSTEM, START, EVENTS, 10.0)
         for n in (1, 2, EVENTS):
-            yield row(walked, f"time of event {n}", last_time(walked, n), float(times[n - 1]))
+            truth_n = float(times[n - 1])
+            yield row(walked, f"time of event {n}", last_time(walked, n), truth_n, event=n)
 
 
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:

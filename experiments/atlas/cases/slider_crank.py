@@ -8,6 +8,7 @@ both lower ones hit. Truth: experiments/atlas/absolute.py, other coordinates and
 example stores steps of 0.1 ms: both meet above in the 28th and below in the 259th.
 """
 
+import json
 import math
 from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import version
@@ -17,6 +18,7 @@ from matplotlib.figure import Figure
 from scipy.integrate import solve_ivp
 
 from experiments.atlas.hybrid import METHODS, Edge, Numbers, Part, last_time, ours, row
+from experiments.atlas.others import rows_of
 from experiments.atlas.told import Case, Row, off, timed
 from vrw_jax.numerics import Answers, complementary
 
@@ -223,13 +225,18 @@ def first_impulses() -> Iterator[Row]:
         )  # fmt: skip
 
 
-def siconos() -> Row:
-    """Its place in the table; its stored steps are told in `STORED`."""
-    says = "not run: its example wants compiled plugins; its stored steps stand beside ours"
-    truth = TRUTH["first impact"]
-    return Row(
-        "first impact", "Siconos", math.nan, truth, math.inf, says, True, 0, 0.0, "none", "none"
-    )
+def siconos() -> Iterator[Row]:
+    """Time stepping of the same mechanism: Moreau's law, both corners at once."""
+    numbers = {
+        name: globals()[name]
+        for name in (
+            "CRANK", "ROD", "HALF", "HEIGHT", "PLAY", "CRANK_MASS", "ROD_MASS", "SLIDER_MASS",
+            "CRANK_INERTIA", "ROD_INERTIA", "SLIDER_INERTIA", "GRAVITY", "KEPT", "FRICTION",
+        )
+    }  # fmt: skip
+    numbers |= {"BEGINS": RATES[0], "ROD_BEGINS": RATES[1]}
+    truths = {name: truth for name, truth in TRUTH.items() if name != "crank's rate after it"}
+    yield from rows_of("siconos", "slider_crank", truths, "--crank", json.dumps(numbers))
 
 
 def rows() -> Iterator[Row]:
@@ -237,7 +244,7 @@ def rows() -> Iterator[Row]:
         walked = method(TOGETHER, begun(), BOUNCES, LIMIT)
         early = walked._replace(says="", admits=False)
         for name, event in (("first impact", 1), ("second impact", 2)):
-            yield row(early, name, last_time(walked, event), TRUTH[name])
+            yield row(early, name, last_time(walked, event), TRUTH[name], event=event)
         once = method(TOGETHER, begun(), 1, LIMIT)
         name = "crank's rate after it"
         yield row(once, name, float(once.end[3]), TRUTH[name])
@@ -260,7 +267,7 @@ def rows() -> Iterator[Row]:
                 once, f"{name}, as Siconos stored", last_time(once, 1), STORED[name], digits=3
             )
             yield from first_impulses()
-    yield siconos()
+    yield from siconos()
 
 
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:

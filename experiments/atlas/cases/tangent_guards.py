@@ -12,7 +12,7 @@ import mpmath
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.atlas.hybrid import METHODS, Edge, Part, last_time, row
+from experiments.atlas.hybrid import METHODS, Edge, Part, last_time, ours, row
 from experiments.atlas.told import Case, Row
 
 DEPTH = 1e-8
@@ -42,8 +42,9 @@ def rows() -> Iterator[Row]:
         yield row(walked, "time of the first guard", last_time(walked, 1), math.pi / 6)
         which = float(walked.edges[0]) if len(walked.edges) else math.nan
         yield row(walked, "which guard (0, 1)", which, 1.0)
-    for method in METHODS:
-        walked = method(circle(DEPTH), (1.0, 0.0, 0.0), 1, 9.0)
+    walks = [method(circle(DEPTH), (1.0, 0.0, 0.0), 1, 9.0) for method in METHODS]
+    fine = ours(circle(DEPTH), (1.0, 0.0, 0.0), 1, 9.0, tolerance=1e-15)
+    for walked in (*walks, fine._replace(method="ours, 1e-15")):
         yield row(
             walked, "dip of 1e-8", last_time(walked, 1), entry(DEPTH),
             condition=1.0 / math.sqrt(2.0 * DEPTH),

@@ -80,7 +80,7 @@ def rows() -> Iterator[Row]:
     for walked in walks():
         for n in (1, EVENTS):
             found = last_time(walked, n)
-            yield row(walked, f"switching time {n}", found, float(times[n - 1]))
+            yield row(walked, f"switching time {n}", found, float(times[n - 1]), event=n)
 
 
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 
 import numpy as np
 from matplotlib.figure import Figure
+from scipy.integrate import solve_ivp
 
 from experiments.atlas.gaits import Exact, Return, gaits
 from experiments.atlas.hybrid import Edge, Part, row
@@ -168,7 +169,18 @@ def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
     axes = figure.subplots()
     start = CYCLE.begin(PUBLISHED, np)
     walked = ours(SYSTEM, start, 3 * CYCLE.events, CYCLE.limit)
-    axes.plot(walked.states[:, 3], walked.states[:, 4], ".", color="C0", label="events")
+    begins = np.append(0.0, walked.times[:-1])
+    for k, (begin, end) in enumerate(zip(begins, walked.times, strict=True)):
+        part = SYSTEM[k % CYCLE.events]
+        if k:
+            before = SYSTEM[(k - 1) % CYCLE.events].edges[0]
+            start = before.reset(walked.states[k - 1], np)
+        told = solve_ivp(
+            lambda t, y, part=part: part.field(y, np), (begin, end), start, rtol=1e-8, atol=1e-10,
+            max_step=1e-3,
+        )  # fmt: skip
+        axes.plot(told.y[3], told.y[4], color="C0", lw=0.8, label="motion" if not k else None)
+    axes.plot(walked.states[:, 3], walked.states[:, 4], "k.", label="events")
     axes.plot(SECTION, PUBLISHED[1], "*", color="C1", ms=9, label="published")
     axes.set_xlabel("angle of the bird [rad]")
     axes.set_ylabel("its rate [rad/s]")

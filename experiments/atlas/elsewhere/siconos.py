@@ -1,16 +1,21 @@
-"""Siconos' time stepping on the bouncing ball, and its Lemke on the contact of Painlevé's rod.
+"""Siconos' time stepping on the bouncing ball and the slider–crank, its Lemke on Painlevé's rod.
 
-    python -m experiments.atlas.elsewhere.siconos [--step 1e-5] [--rod '{"name": [1.0, -1.0]}']
+    python -m experiments.atlas.elsewhere.siconos [--step 1e-5] [--rod JSON] [--crank JSON]
 
 With a Python that has Siconos: Debian's python3-siconos and python3; Python's index has none.
-A bounce is told at the end of the step whose impulse is not zero. The contact's matrix and free
-rate are given by cases/painleve; Lemke's method tells one answer or, by its code, none.
+A bounce is told at the end of the step whose impulse is not zero. The rod's matrix and free rate by
+name are given by cases/painleve; Lemke's method tells one answer or, by its code, none. The numbers
+of the slider–crank by name are given by its case, its functions are a plugin that `cc` compiles.
 """
 
 import argparse
 import json
+import subprocess
 import sys
+import tempfile
 import time
+from pathlib import Path
+from typing import Any
 
 
 def bounces(step: float) -> tuple[list[float], float, int]:
@@ -26,28 +31,80 @@ def bounces(step: float) -> tuple[list[float], float, int]:
     system.link(floor, ball)
     clock = sk.TimeDiscretisation(0.0, step)
     stepping = sk.TimeStepping(system, clock, sk.MoreauJeanOSI(0.5), sk.LCP())
-    pushed, began, n = [], time.process_time(), 0
+    pushes, seconds = pushed(stepping, [floor])
+    firsts = begun([bool(push[0] > 0.0) for push in pushes])
+    return [(k + 1) * step for k in firsts], seconds, len(pushes)
+
+
+def pushed(stepping: Any, contacts: list) -> tuple[list[list[float]], float]:
+    """Normal impulses of the contacts in each step, and CPU seconds."""
+    told, began = [], time.process_time()
     while stepping.hasNextEvent():
         stepping.computeOneStep()
-        if floor.lambda_(1)[0] > 0.0:
-            pushed.append(n)
+        told.append([float(contact.lambda_(1)[0]) for contact in contacts])
         stepping.nextStep()
-        n += 1
-    firsts = [k for i, k in enumerate(pushed) if i == 0 or k > pushed[i - 1] + 1]
-    return [(k + 1) * step for k in firsts], time.process_time() - began, n
+    return told, time.process_time() - began
+
+
+def begun(pushes: list[bool]) -> list[int]:
+    """Steps that push and follow one that does not."""
+    return [k for k, push in enumerate(pushes) if push and not (k and pushes[k - 1])]
+
+
+CORNERS = ("upper_behind", "upper_ahead", "lower_behind", "lower_ahead")
+PLUGIN = Path(__file__).with_name("slider_crank.c")
+
+
+def crank(numbers: dict[str, float], step: float) -> tuple[dict[str, float], float, int]:
+    """What the slider–crank does until both lower corners hit, CPU seconds, and steps."""
+    import numpy as np
+    from siconos import kernel as sk
+
+    with tempfile.TemporaryDirectory() as folder:
+        plugin = f"{folder}/slider_crank"
+        macros = [f"-D{name}={value!r}" for name, value in numbers.items()]
+        compiler = ["cc", "-O2", "-shared", "-fPIC", "-o", f"{plugin}.so", str(PLUGIN), *macros]
+        subprocess.run([*compiler, "-lm"], check=True)
+        rates = np.array([numbers["BEGINS"], numbers["ROD_BEGINS"], 0.0])
+        mechanism = sk.LagrangianDS(np.zeros(3), rates, f"{plugin}:mass")
+        mechanism.setComputeFGyrFunction(plugin, "turning")
+        system = sk.NonSmoothDynamicalSystem(0.0, 0.027)
+        system.insertDynamicalSystem(mechanism)
+        law = sk.NewtonImpactFrictionNSL(numbers["KEPT"], 0.0, numbers["FRICTION"], 2)
+        contacts = []
+        for corner in CORNERS:
+            names = f"{plugin}:{corner}_gap", f"{plugin}:{corner}_rates"
+            contacts.append(sk.Interaction(law, sk.LagrangianScleronomousR(*names)))
+            system.link(contacts[-1], mechanism)
+        clock, contact_law = sk.TimeDiscretisation(0.0, step), sk.FrictionContact(2)
+        contact_law.numericsSolverOptions().dparam[0] = 1e-12
+        stepping = sk.TimeStepping(system, clock, sk.MoreauJeanOSI(0.5), contact_law)
+        stepping.setNewtonTolerance(1e-10)
+        pushes, seconds = pushed(stepping, contacts)
+    above = begun([max(push[:2]) > 0.0 for push in pushes])
+    last = max(k for k, push in enumerate(pushes) if max(push[:2]) > 0.0)
+    below = begun([max(push[2:]) > 0.0 for push in pushes])
+    steps = {
+        "first impact": above[0], "second impact": above[1], "end of the bounces": above[-1],
+        "letting go": last, "touch of the other face": below[0],
+    }  # fmt: skip
+    told = {name: (k + 1) * step for name, k in steps.items()}
+    told |= dict(zip(("impulse behind", "impulse ahead"), pushes[above[0]], strict=False))
+    return told, seconds, len(pushes)
 
 
 def forces(rod: dict) -> dict:
-    """How many answers Lemke's method gives, 1 or 0, and its own code."""
+    """How many answers Lemke's method gives, 1 or 0, its own code, and CPU seconds."""
     import numpy as np
     from siconos import numerics as sn
 
     told = {}
     for name, (matrix, free) in rod.items():
         problem = sn.LCP(np.array([[matrix]]), np.array([free]))
-        force, gap = np.zeros(1), np.zeros(1)
+        force, gap, began = np.zeros(1), np.zeros(1), time.process_time()
         code = sn.lcp_lexicolemke(problem, force, gap, sn.SolverOptions(sn.SICONOS_LCP_LEMKE))
-        told[name] = 1 - int(code != 0), f"code {code}, force {force[0]:.3g}", bool(code)
+        seconds = time.process_time() - began
+        told[name] = 1 - int(code != 0), f"code {code}, force {force[0]:.3g}", bool(code), seconds
     return told
 
 
@@ -58,24 +115,35 @@ def main() -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     parser.add_argument("--step", type=float, default=1e-5)
-    parser.add_argument("--rod", type=json.loads, default={}, help="matrix and free rate by name")
+    parser.add_argument("--rod", type=json.loads, help="matrix and free rate by name")
+    parser.add_argument("--crank", type=json.loads, help="numbers by name")
     asked = parser.parse_args()
-    times, seconds, work = bounces(asked.step)
+    stepped = {"admits": False, "options": f"Moreau-Jean, step {asked.step:g}"}
+    if asked.rod:
+        told = [
+            {"case": "painleve", "name": name, "value": count, "work": 1, "seconds": seconds,
+             "says": says, "admits": admits, "options": "lexicographic Lemke"}
+            for name, (count, says, admits, seconds) in forces(asked.rod).items()
+        ]  # fmt: skip
+    elif asked.crank:
+        found, seconds, work = crank(asked.crank, asked.step)
+        told = [
+            {"case": "slider_crank", "name": name, "value": value, "work": work, "says": "",
+             "seconds": seconds, "admits": False,
+             "options": f"{stepped['options']}, contacts to 1e-12, Newton to 1e-10"}
+            for name, value in found.items()
+        ]  # fmt: skip
+    else:
+        times, seconds, work = bounces(asked.step)
+        told = [
+            {"case": "bouncing_ball", "name": name, "value": value, "work": work,
+             "seconds": seconds, "says": f"{len(times)} bounces"} | stepped
+            for name, value in (
+                ("time of bounce 20", times[19]), ("time of the last bounce", times[-1])
+            )
+        ]  # fmt: skip
     from importlib.metadata import version
 
-    told = [
-        {"case": "bouncing_ball", "name": name, "value": value, "work": work, "seconds": seconds,
-         "says": f"{len(times)} bounces", "admits": False,
-         "options": f"Moreau-Jean, step {asked.step:g}"}
-        for name, value in (
-            ("time of bounce 20", times[19]), ("time of the last bounce", times[-1])
-        )
-    ]  # fmt: skip
-    told += [
-        {"case": "painleve", "name": name, "value": count, "work": 1, "seconds": 0.0,
-         "says": says, "admits": admits, "options": "lexicographic Lemke"}
-        for name, (count, says, admits) in forces(asked.rod).items()
-    ]  # fmt: skip
     print(json.dumps({"answers": told, "version": version("siconos")}))
 
 

@@ -1,0 +1,172 @@
+"""Four wheels and three clutches in a row: locking, breaking loose, and locking again.
+
+The Modelica library's CoupledClutches: inertias of 1 kg m^2, the first turns with 10 rad/s and is
+driven by 10 sin(10 pi t) N m. A clutch that slides passes 10 N m times its pressure, a locked one
+holds 1.1 times that; pressures are cos(0.4 pi t), and 1 from 0.4 s and from 0.9 s. Rates are sums
+of sines, so that each time is the root of a closed form, here in 30 digits. Published: the times of
+the library's own reference result (MAP-LIB_ReferenceResults), which 4 digits of hold.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import mpmath
+import numpy as np
+from matplotlib.figure import Figure
+
+from experiments.atlas.hybrid import METHODS, Edge, Numbers, Part, last_time, ours, row
+from experiments.atlas.told import Case, Row
+
+SLIDING, HELD = 10.0, 1.1
+FAST, SLOW = 10.0 * mpmath.pi, 0.4 * mpmath.pi
+TIMES = (0.4, 0.9, 1.25)
+"""When the second and third clutch are pressed, and the first no longer is, s."""
+START = (10.0, 0.0, 0.0, 0.0, 0.0)
+"""Rates of the wheels, rad/s, and the clock, s."""
+
+
+def drive(t: Any, m: Any) -> Any:
+    return 10.0 * m.sin(float(FAST) * t)
+
+
+def passed(t: Any, m: Any) -> Any:
+    """By the first clutch while it slides, N m."""
+    return SLIDING * m.cos(float(SLOW) * t)
+
+
+SHARES = (  # of the drive, of the first clutch, and a constant, in each wheel's acceleration
+    ((1, -1, 0), (0, 1, 0), (0, 0, 0), (0, 0, 0)),
+    ((1, -1, 0), (0, 1, -10), (0, 0, 10), (0, 0, 0)),
+    ((1, -1, 0), (0, 1 / 2, 0), (0, 1 / 2, 0), (0, 0, 0)),
+    ((1 / 3, 0, 0), (1 / 3, 0, 0), (1 / 3, 0, 0), (0, 0, 0)),
+    ((1, -1, 0), (0, 1 / 2, 0), (0, 1 / 2, 0), (0, 0, 0)),
+    ((1, -1, 0), (0, 1 / 2, -5), (0, 1 / 2, -5), (0, 0, 10)),
+    ((1 / 3, 0, -10 / 3), (1 / 3, 0, -10 / 3), (1 / 3, 0, -10 / 3), (0, 0, 10)),
+    ((1, -1, 0), (0, 1 / 2, -5), (0, 1 / 2, -5), (0, 0, 10)),
+    ((1, -1, 0), (0, 1 / 3, 0), (0, 1 / 3, 0), (0, 1 / 3, 0)),
+    ((1, 0, 0), (0, 0, 0), (0, 0, 0), (0, 0, 0)),
+)
+"""Mode after mode."""
+
+
+def clock(end: float) -> Callable:
+    return lambda y, m: end - y[4]
+
+
+def gap(first: int, second: int) -> Callable:
+    return lambda y, m: y[first] - y[second]
+
+
+def grip(mode: int) -> Callable:
+    """What the first clutch holds beyond what it passes while it is locked."""
+    a, _, c = SHARES[mode][0]
+    return lambda y, m: HELD * passed(y[4], m) - ((1 - a) * drive(y[4], m) - c)
+
+
+ENDS = (
+    clock(TIMES[0]), gap(1, 2), gap(0, 1), grip(3), clock(TIMES[1]), gap(0, 1), grip(6), gap(2, 3),
+    clock(TIMES[2]), clock(1.5),
+)  # fmt: skip
+NAMES = {
+    2: "clutch 2 locks", 3: "clutch 1 locks", 4: "clutch 1 breaks loose", 6: "clutch 1 locks again",
+    7: "clutch 1 breaks loose again", 8: "clutch 3 locks",
+}  # fmt: skip
+PUBLISHED = {
+    2: 0.70962146383288, 3: 0.79165828432025, 4: 0.83110850627034, 6: 0.90684913754438,
+    7: 1.00029586011387, 8: 1.14396963043371,
+}  # fmt: skip
+"""By the number of the event, s."""
+RATE = 3.2470345652406571
+"""Of the first wheel at 1.5 s, as published."""
+
+
+def part(mode: int) -> Part:
+    def field(y: Numbers, m: Any) -> tuple:
+        pushes = drive(y[4], m), passed(y[4], m)
+        return (*(a * pushes[0] + b * pushes[1] + c for a, b, c in SHARES[mode]), 1.0 + 0.0 * y[4])
+
+    return Part(field, (Edge(ENDS[mode], to=(mode + 1) % len(ENDS)),))
+
+
+SYSTEM = tuple(part(mode) for mode in range(len(ENDS)))
+
+
+def truth() -> tuple[np.ndarray, float]:
+    """Times of the events, and the rate of the first wheel at the last."""
+    with mpmath.workdps(30):
+        fast, slow = mpmath.mpf(float(FAST)), mpmath.mpf(float(SLOW))
+        y, begin, told = [mpmath.mpf(x) for x in START], mpmath.mpf(0), []
+        for mode, end in enumerate(ENDS):
+
+            def at(t, y=y, begin=begin, mode=mode):
+                sums = (
+                    10 * (mpmath.cos(fast * begin) - mpmath.cos(fast * t)) / fast,
+                    SLIDING * (mpmath.sin(slow * t) - mpmath.sin(slow * begin)) / slow,
+                    t - begin,
+                )
+                shares = zip(y, SHARES[mode], strict=False)
+                rates = [
+                    w + sum(a * s for a, s in zip(own, sums, strict=True)) for w, own in shares
+                ]
+                return [*rates, t]
+
+            value = lambda t, at=at, end=end: end(at(t), mpmath)
+            t, step = begin + mpmath.mpf("1e-4"), mpmath.mpf("1e-3")
+            while value(t + step) > 0:
+                t += step
+            t = mpmath.findroot(value, (t, t + step), solver="anderson", tol=1e-50)
+            y, begin = at(t), t
+            told.append(float(t))
+        return np.array(told), float(y[0])
+
+
+def rows() -> Iterator[Row]:
+    times, rate = truth()
+    for method in METHODS:
+        walked = method(SYSTEM, START, len(ENDS), 2.0)
+        for event in (3, 7, 8):
+            found = last_time(walked, event)
+            yield row(walked, NAMES[event], found, times[event - 1], event=event)
+        whole = len(walked.times) == len(ENDS)
+        yield row(walked, "rate at 1.5 s", float(walked.end[0]) if whole else np.nan, rate)
+        if method is ours:
+            for event, told in PUBLISHED.items():
+                found, name = last_time(walked, event), f"{NAMES[event]}, as published"
+                yield row(walked, name, found, told, digits=4, event=event)
+            yield row(walked, "rate, as published", float(walked.end[0]), RATE, digits=4)
+
+
+def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
+    axes = figure.subplots()
+    walked = ours(SYSTEM, START, len(ENDS), 2.0)
+    begin, y = 0.0, np.array(START[:4])
+    for wheel, style in enumerate(("-", "--", "-.", ":")):
+        axes.plot([], [], style, color=f"C{wheel}", label=f"wheel {wheel + 1}")
+    for mode, (end, after) in enumerate(zip(walked.times, walked.states, strict=True)):
+        t = np.linspace(begin, end, 60)
+        sums = np.stack(
+            [
+                10 * (np.cos(float(FAST) * begin) - np.cos(float(FAST) * t)) / float(FAST),
+                SLIDING * (np.sin(float(SLOW) * t) - np.sin(float(SLOW) * begin)) / float(SLOW),
+                t - begin,
+            ]
+        )
+        for wheel, style in enumerate(("-", "--", "-.", ":")):
+            axes.plot(t, y[wheel] + np.array(SHARES[mode][wheel]) @ sums, style, color=f"C{wheel}")
+        begin, y = end, after[:4]
+    for event, time in PUBLISHED.items():
+        axes.plot(time, walked.states[event - 1, 1], "ko", ms=4, mfc="w")
+    axes.plot([], [], "ko", ms=4, mfc="w", label="published times")
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel("rate [rad/s]")
+    axes.legend(ncols=2)
+
+
+CASE = Case(
+    "Clutches in a row",
+    "ten modes; each lock is broken by its own guard",
+    "sums of sines, roots in 30 digits; published to 4 digits",
+    "Modelica's Mechanics.Rotational.Examples.CoupledClutches and its reference result",
+    rows,
+    draw,
+)
