@@ -100,6 +100,7 @@ class CollocationFinder(AbstractGaitFinder):
         walked = sampled_walk(self.model, params, x, self.period_n)
         return guess_along(self.problem, params, walked)
 
+    @eqx.filter_jit
     def counted_from(self, step: int, params: WheelParams, located: Located) -> Located:
         """The same cycle, counted from another of its steps."""
         before = located.ends[step - 1]
@@ -112,11 +113,13 @@ class CollocationFinder(AbstractGaitFinder):
             solution=solution._replace(section=section), happens=happens, ends=ends
         )
 
+    @eqx.filter_jit
     def on_mesh(self, problem: Problem, located: Located) -> Located:
         """A start from what was located on the mesh of `problem`."""
         solution = on_mesh(problem, self.problem, located.solution)
         return located._replace(solution=solution)
 
+    @eqx.filter_jit
     def first_guess(self, values: Values) -> Located:
         lane = surface_start(self.problem, values[:, None], jnp.ones((1,), bool))
         return jax.tree.map(lambda x: x[..., 0], lane)

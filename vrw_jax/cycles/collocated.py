@@ -125,12 +125,8 @@ class LimitCycle(AbstractCycle):
 
         Above 1e-5 a gait does not count as found: give `CycleOptions` more steps.
         """
-
-        def of_one(solution: Solution) -> Array:
-            lanes = jax.tree.map(lambda x: x[..., None], solution)
-            return mesh_error(self.problem.sequence, self.problem.meshes, lanes)[0]
-
-        return jnp.where(self.found, self._mapped(of_one)(self.located.solution), 0.0)
+        of_one = functools.partial(_mesh_error, self.problem)
+        return self._mapped(of_one)(self.found, self.located.solution)
 
     @property
     def takeoff_acceleration(self) -> Array:
@@ -162,6 +158,12 @@ class LimitCycle(AbstractCycle):
             ("durations of DLS, SLS-I, SLS-II", f"{listed(self.durations)} s"),
             ("indicators λ_I4, λ2⁺, λ4⁺", f"{told}, {listed(forces.lambda_4)} N"),
         ]
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _mesh_error(problem: Problem, found: Array, solution: Solution) -> Array:
+    lanes = jax.tree.map(lambda x: x[..., None], solution)
+    return jnp.where(found, mesh_error(problem.sequence, problem.meshes, lanes)[0], 0.0)
 
 
 def _takeoff(problem: Problem, parameters: Array, located: Located) -> Array:

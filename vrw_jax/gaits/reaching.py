@@ -30,7 +30,7 @@ from vrw_jax.cycles import (
     slowest,
     starts_of,
 )
-from vrw_jax.numerics import Options, in_batches, select
+from vrw_jax.numerics import Options, in_batches, taken
 from vrw_jax.walks import ModelLike
 from vrw_jax.wheel import Outcome, WheelParams, parameters_of
 from vrw_jax.wording import chosen, untraced, whole
@@ -53,8 +53,8 @@ N_STEPS = 80
 REFINEMENTS = 3
 """How often a mesh is made twice as fine at most."""
 
-SHAPES = (1, 8, 64, 512, 4096)
-"""Numbers of lanes that programs are compiled for."""
+SHAPES = (8, 64, 512, 4096)
+"""Numbers of lanes that programs are compiled for: one alone takes the time of eight."""
 
 
 Lost = Literal["zeros", "nan"]
@@ -234,21 +234,20 @@ def _chosen(finder: Any, params: WheelParams, which: Which) -> Any:
 
 def _wherever(finder: Any, params: WheelParams, guess: Any, adaptive: bool, which: Which) -> Any:
     """The cycle of one wheel or of a batch, by all means."""
+    traced = lambda tree: any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
     many = params.damping.ndim > 0
     still = lax.stop_gradient(params)
-    hidden = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(still))
+    hidden, plain = traced(still), not traced(params)
     if finder.coexisting and guess is None and not hidden:
         cycle = _chosen(finder, still if many else jax.tree.map(lambda x: x[None], still), which)
         cycle = cycle if many else jax.tree.map(lambda x: x[0], cycle)
-        plain = not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(params))
         return cycle if plain else _searched(finder, params, cycle.section_state)
     cycle = _searched(finder, params, guess)
     known = lax.stop_gradient((params, cycle))  # what derivatives are taken of has values, too
-    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(known))
-    if not finder.from_nothing or traced:
+    if not finder.from_nothing or traced(known):
         return cycle
     if not many:
-        known = jax.tree.map(lambda x: x[None], known)
+        known = _taken(known, None)
     reached = _reached(finder, *known, adaptive)
     if finder.period_n > 1 and guess is not None:
         x = np.asarray(_state(guess))[None]
@@ -258,7 +257,10 @@ def _wherever(finder: Any, params: WheelParams, guess: Any, adaptive: bool, whic
     if reached is None:
         return cycle
     finder, located = reached
-    return _searched(finder, params, located if many else jax.tree.map(lambda x: x[0], located))
+    if plain:
+        cycle = in_batches(finder.cycles, SHAPES, known[0], located)  # a program that is there
+        return cycle if many else _taken(cycle, 0)
+    return _searched(finder, params, jax.device_put(located) if many else _taken(located, 0))
 
 
 def _searched(finder: AbstractGaitFinder, params: WheelParams, guess: Any) -> Any:
@@ -267,11 +269,19 @@ def _searched(finder: AbstractGaitFinder, params: WheelParams, guess: Any) -> An
 
 
 def _taken(tree: Any, places: Any) -> Any:
-    return jax.tree.map(lambda x: jnp.asarray(x)[places], tree)
+    """Rows of a tree by numpy: JAX would compile a program for each shape."""
+    return jax.device_put(taken(tree, places))
 
 
 def _put(tree: Any, places: np.ndarray, values: Any) -> Any:
-    return jax.tree.map(lambda x, v: jnp.asarray(x).at[places].set(v), tree, values)
+    """Rows replaced, likewise."""
+
+    def put(x: Any, v: Any) -> np.ndarray:
+        x = np.array(x)
+        x[places] = v
+        return x
+
+    return jax.tree.map(put, tree, values)
 
 
 def _walked_from(
@@ -280,9 +290,9 @@ def _walked_from(
     """Of each lane where N_STEPS lead, and by how much it misses that state a period later;
     infinite where a walk ended before."""
     there = steps(params, x, N_STEPS, model=finder.model)
-    states, (on,) = np.array(there.section_state), np.nonzero(there.outcome == Outcome.STEPPED)
+    states, on = np.array(there.section_state), np.asarray(there.outcome) == Outcome.STEPPED
     missed = np.full(len(states), np.inf)
-    if len(on):
+    if on.any():
         later = steps(_taken(params, on), states[on], finder.period_n, model=finder.model)
         away = np.abs(np.asarray(later.section_state) - states[on]).max(-1)
         missed[on] = np.where(np.asarray(later.outcome) == Outcome.STEPPED, away, np.inf)
@@ -315,13 +325,12 @@ def _begun(
     finder: CollocationFinder, params: WheelParams, located: Located, has: np.ndarray, walks: _Walks
 ) -> Located:
     """Where searches begin: at what was located, else along walks, else on the surface of gaits."""
-    values = jnp.moveaxis(parameters_of(params), 0, -1)
-    start = jax.vmap(finder.first_guess)(values)
+    start = in_batches(lambda own: finder.first_guesses(parameters_of(own).T), SHAPES, params)
     along = np.flatnonzero(walks.reached & ~has)
     if len(along):
         walk = jax.vmap(finder.after)
         start = _put(start, along, in_batches(walk, SHAPES, _taken(params, along), walks.x[along]))
-    return jax.vmap(select)(jnp.asarray(has), located, start)
+    return _put(start, has, _taken(located, has))
 
 
 def _reached(
@@ -345,7 +354,8 @@ def _reached(
     for refinement in range(1 + REFINEMENTS * adaptive):
         if refinement:
             before, finder = finder, finder.finer()
-            located = jax.vmap(functools.partial(finder.on_mesh, before.problem))(located)
+            moved = jax.vmap(functools.partial(finder.on_mesh, before.problem))
+            located = in_batches(moved, SHAPES, located)
         # The search's own mesh has been tried without walks; without reason, one finer mesh is.
         promising = walks.reached | has | (coarse & (refinement > 0)) | (refinement == 1)
         places = np.flatnonzero(open_ & promising)
@@ -353,7 +363,7 @@ def _reached(
             continue
         some, own = _taken(params, places), _Walks(*(part[places] for part in walks))
         begin = _begun(finder, some, _taken(located, places), has[places], own)
-        again = in_batches(functools.partial(_searched, finder), SHAPES, some, begin)
+        again = in_batches(finder.cycles, SHAPES, some, begin)
         gait, error = np.asarray(again.found), np.asarray(again.mesh_error)
         located = _put(located, places[gait], _taken(again.located, gait))
         if gait.any():
@@ -386,7 +396,7 @@ def _from_another_step(
     located = cycle.located
     for _ in range(1, finder.period_n):
         x = np.asarray(steps(some, x, model=finder.model).section_state)
-        found = in_batches(functools.partial(_searched, finder), SHAPES, some, x)
+        found = in_batches(finder.cycles, SHAPES, some, x)
         gait = np.flatnonzero(np.asarray(found.found) & (np.asarray(located.found)[lost] < 0.5))
         if len(gait):
             located = _put(located, lost[gait], _taken(found.located, gait))

@@ -109,8 +109,8 @@ def in_batches(function: Callable, sizes: tuple[int, ...], *trees: PyTree) -> Py
 
     So it is compiled for few shapes. Arrays are JAX's, going in and coming out.
     """
-    of_jax = lambda *rows: function(*jax.tree.map(jnp.asarray, rows))
-    return jax.tree.map(jnp.asarray, in_batches_of_numpy(of_jax, sizes, *trees))
+    of_jax = lambda *rows: function(*jax.device_put(rows))
+    return jax.device_put(in_batches_of_numpy(of_jax, sizes, *trees))
 
 
 def in_batches_of_numpy(function: Callable, sizes: tuple[int, ...], *trees: PyTree) -> PyTree:
