@@ -48,6 +48,31 @@ def test_sensitivities_on_real_ground_are_the_difference_quotients_friction_incl
         np.testing.assert_allclose(found, difference, rtol=2e-5, atol=1e-7)
 
 
+@pytest.mark.slow
+def test_a_gait_within_a_callers_program_moves_as_sensitivities_say(near):
+    """By Newton's method within JAX's programs; sensitivities have it beside them."""
+
+    def speed(params, friction):
+        model = vrw.UnilateralWheel(friction=friction)
+        return vrw.limit_cycle(params, guess=near, model=model, options=OPTIONS).speed
+
+    slopes = jax.jit(jax.value_and_grad(speed, argnums=(0, 1)))
+    value, (by_params, by_friction) = slopes(SLOW, 0.7)
+    table = vrw.sensitivities(
+        SLOW, measures=("speed",), guess=near, model=GROUND, options=OPTIONS
+    ).sel(measure="speed")
+    assert float(value) == pytest.approx(float(table.value), abs=1e-11)
+    told = jax.tree.leaves(by_params), by_friction
+    np.testing.assert_allclose(jnp.stack([*told[0], told[1]]), table.derivative, rtol=1e-8)
+    matrix = lambda c: (
+        vrw.limit_cycle(
+            vrw.WheelParams(damping=c), guess=near, model=GROUND, options=OPTIONS
+        ).matrix
+    )
+    unknown = jax.jacfwd(matrix)(300.0)
+    assert np.isnan(unknown).all()  # told, and not by a zero
+
+
 def test_what_real_ground_does_not_measure_is_refused_in_one_sentence():
     with pytest.raises(ValueError, match="choose among these"):
         vrw.sensitivities(SLOW, measures=("lambda_4",), model=GROUND)

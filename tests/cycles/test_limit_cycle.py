@@ -13,7 +13,7 @@ from support.files import kept_by_netcdf
 
 import vrw_jax as vrw
 from vrw_jax import simd
-from vrw_jax.numerics import floquet
+from vrw_jax.numerics import floquet, moved_cycle
 from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import PARAMETER_NAMES, wheel_of
 
@@ -425,6 +425,19 @@ def test_section_newton_differentiates_fixed_point_and_multiplier():
     np.testing.assert_allclose(jax.jit(jax.grad(lambda a: told(a)[0]))(a), expected[1], rtol=1e-13)
     many = jax.vmap(first)(jnp.asarray([0.1, a, 2.0]))
     np.testing.assert_allclose(many[1], [expected[1], -2.0 * expected[1]], rtol=1e-13)
+
+
+def test_a_fixed_point_moves_without_second_derivatives_of_its_map():
+    """Of the same map: its point to third order, its multiplier's derivative is told as unknown."""
+    found = lambda a: moved_cycle(lambda x: a - x**2, jnp.asarray([0.5]))
+    point, a = lambda a: found(a).x[0], 0.7
+    root = math.sqrt(1.0 + 4.0 * a)
+    expected = [(root - 1.0) / 2.0, 1.0 / root, -2.0 / root**3, 12.0 / root**5]
+    for value in expected:
+        np.testing.assert_allclose(point(a), value, rtol=1e-12)
+        point = jax.jacrev(point) if value > 0.7 else jax.jacfwd(point)
+    assert np.isnan(jax.jacfwd(lambda a: found(a).jacobian)(a)).all()
+    np.testing.assert_allclose(found(a).jacobian, [[1.0 - root]], rtol=1e-13)
 
 
 def test_a_start_from_which_section_newton_does_not_converge_comes_back():

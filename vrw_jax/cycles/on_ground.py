@@ -23,7 +23,7 @@ from vrw_jax.cycles.by_walking import (
 from vrw_jax.cycles.cycle import AbstractCycle
 from vrw_jax.cycles.finder import Gait, Measured, Values, leading, measured_of
 from vrw_jax.cycles.options import CycleOptions
-from vrw_jax.cycles.section_cycle import WalkedCycle, cycle_from, finest, of_steps, walked_cycle
+from vrw_jax.cycles.section_cycle import WalkedCycle, cycle_from, finest, of_steps, stepped_cycle
 from vrw_jax.models import (
     AbstractStep,
     AbstractWheel,
@@ -72,7 +72,7 @@ class GroundFinder(AbstractWalkingFinder):
         """By lanes where everything has a value, else by the step's own derivatives."""
         params, x, model, options = where_walks_begin(self, params, guess)
         if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((params, x, model))):
-            return walked_cycle(params, x, model, options, self.period_n)
+            return stepped_cycle(params, x, model, options, self.period_n)
         return jax.tree.map(lambda x: x[0], self.near(model.values(params)[None], x[None]))
 
     def cycles(self, params: WheelParams, guess: Any = None) -> Any:

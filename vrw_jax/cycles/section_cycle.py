@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from vrw_jax.cycles.cycle import AbstractCycle
 from vrw_jax.models import AbstractWheel
-from vrw_jax.numerics import Options, Scalar, SectionCycle, newton_cycle
+from vrw_jax.numerics import Options, Scalar, SectionCycle, moved_cycle, newton_cycle
 from vrw_jax.results import Row, listed
 from vrw_jax.wheel import Outcome, WheelParams
 
@@ -93,12 +93,27 @@ class WalkedCycle(AbstractCycle):
 def walked_cycle(
     params: WheelParams, x: Array, model: AbstractWheel, options: Options, period_n: int
 ) -> WalkedCycle:
-    found = newton_cycle(
-        lambda x: model.advance(params, x, options).section_state,
-        x,
-        period_n=period_n,
-        tolerance=finest(options),
-    )
+    image = lambda x: model.advance(params, x, options).section_state
+    found = newton_cycle(image, x, period_n=period_n, tolerance=finest(options))
+    return _from_its_point(params, found, model, options, period_n)
+
+
+@eqx.filter_jit
+def stepped_cycle(
+    params: WheelParams, x: Array, model: AbstractWheel, options: Options, period_n: int
+) -> WalkedCycle:
+    """The same where second derivatives of a step are dear, as on real ground: see `moved_cycle`.
+
+    Searched for by the step that tells the gait, so that one program is compiled, not two.
+    """
+    image = lambda x: model.step(params, x, options).section_state
+    found = moved_cycle(image, x, period_n=period_n, tolerance=finest(options))
+    return _from_its_point(params, found, model, options, period_n)
+
+
+def _from_its_point(
+    params: WheelParams, found: SectionCycle, model: AbstractWheel, options: Options, period_n: int
+) -> WalkedCycle:
     x, results = found.x, []
     for _ in range(period_n):
         results.append(model.step(params, x, options))

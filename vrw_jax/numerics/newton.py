@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from vrw_jax.numerics.derivatives import with_jacobian
+from vrw_jax.numerics.derivatives import with_jacobian, without_derivative
 from vrw_jax.numerics.types import Scalar
 from vrw_jax.wording import function_of, positive, reals, whole
 
@@ -117,6 +117,33 @@ def newton_cycle(
         0.739085 True
     """
 
+    return _cycle_of(_found, function, start, period_n, tolerance, iterations)
+
+
+def moved_cycle(
+    function: Callable[[Array], Array],
+    start: Float[Array, " n"],
+    *,
+    period_n: int = 1,
+    tolerance: float | Scalar = 1e-12,
+) -> SectionCycle:
+    """`newton_cycle` for a map whose second derivatives are dear.
+
+    The point's first derivatives need but first ones of `function`, its second ones second ones.
+    Derivatives of the Jacobian are NaN.
+    """
+    return _cycle_of(_found_apart, function, start, period_n, tolerance, ITERATIONS)
+
+
+def _cycle_of(
+    found: Callable[..., SectionCycle],
+    function: Callable[[Array], Array],
+    start: Any,
+    period_n: int,
+    tolerance: float | Scalar,
+    iterations: int,
+) -> SectionCycle:
+    """What is asked made sound, and `found` by one of the two ways below."""
     function_of("function", function, "that maps a state to the next")
     start, period_n = reals("start", start), whole("period_n", period_n)
     iterations = whole("iterations", iterations)
@@ -138,7 +165,7 @@ def newton_cycle(
         )
     image, closed_over = jax.closure_convert(iterate, start)
     tolerance = lax.stop_gradient(jnp.asarray(tolerance, start.dtype))
-    return _found(image, iterations, start, tolerance, *closed_over)
+    return found(image, iterations, start, tolerance, *closed_over)
 
 
 Map = Callable[..., Array]
@@ -188,3 +215,26 @@ def _found_and_moved(
         return SectionCycle(x, jacobians[-1], residuals[-1], found.converged, found.iterations)
 
     return jax.jvp(polished, tuple(closed_over), tuple(tangents[2:]))
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _found_apart(
+    image: Map, iterations: int, start: Array, tolerance: Array, *closed_over: Any
+) -> SectionCycle:
+    return _found(image, iterations, start, tolerance, *closed_over)
+
+
+@_found_apart.defjvp
+def _point_moved(
+    image: Map, iterations: int, primals: tuple, tangents: tuple
+) -> tuple[SectionCycle, SectionCycle]:
+    """By the implicit function theorem, at a point that moves by this rule itself."""
+    found = _found_apart(image, iterations, *primals)
+    closed_over, moves = tuple(primals[2:]), tuple(tangents[2:])
+    _, by_map = jax.jvp(lambda *some: image(found.x, *some), closed_over, moves)
+    _, jacobian = with_jacobian(lambda x: image(x, *closed_over), found.x)
+    moved = jnp.linalg.solve(jnp.eye(found.x.size, dtype=found.x.dtype) - jacobian, by_map)
+    moved = jnp.where(found.converged, moved, 0.0)
+    unknown = jnp.full_like(jacobian, jnp.nan) * jnp.sum(moved)
+    nothing = without_derivative(found)
+    return found, nothing._replace(x=moved, jacobian=unknown)

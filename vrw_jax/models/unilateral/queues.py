@@ -12,9 +12,11 @@ import numpy as np
 from jaxtyping import Array
 
 from vrw_jax import simd
+from vrw_jax.models.unilateral.contacts import OFF
 from vrw_jax.models.unilateral.lanes import Walk, told_like, walked, walked_along
 from vrw_jax.models.unilateral.ledger import UnilateralStep
-from vrw_jax.models.unilateral.section import LOCKED, embedded, section_size
+from vrw_jax.models.unilateral.march import coordinates
+from vrw_jax.models.unilateral.section import LOCKED, embedded, opened, section_size
 from vrw_jax.models.unilateral.wheel import UnilateralWheel
 from vrw_jax.numerics import Options, explicit_tableau, in_batches
 from vrw_jax.runtime import lane_program
@@ -57,17 +59,22 @@ def step_lanes(
 
     Leading axis: wheels; derivatives have a last one over the columns, then the section state.
     Each direction is a lane of its own beside the wheel's motion. What is not `wanted` and what
-    cannot move, lengths of legs on their stoppers and codes, has zeros.
+    cannot move, lengths of legs on their stoppers or with loaded feet and codes, has zeros. Of the
+    rates only so many are lanes as loaded feet leave (see `_Rates`).
     """
     run = _Run.of(model, options, n, True)
-    code = np.round(states[:, 4 + 2 * n :])
+    code = np.round(states[:, 4 + 2 * n :]).astype(int)
     numbers = np.concatenate([columns.T, states], 1)
     moves = np.ones(numbers.shape, bool)
-    free = np.concatenate([code < LOCKED, code < LOCKED, np.zeros(code.shape, bool)], 1)
-    moves[:, len(columns) + 4 :] = free
+    free = code < LOCKED
+    places = [free & ((code & (LOCKED - 1)) == OFF), free, np.zeros(code.shape, bool)]
+    moves[:, len(columns) + 4 :] = np.concatenate(places, 1)
     if wanted is not None:
         moves &= np.isin(np.arange(numbers.shape[1]), wanted)
-        moves[~moves.any(1), 0] = True  # the step itself is told beside a direction
+    rates = len(columns) + np.array([1, 2, 3, *range(4 + n, 4 + 2 * n)])
+    left = _Rates.of(_settled_rates(columns, states, n), moves[:, rates])
+    moves[:, rates] = left.kept()
+    moves[~moves.any(1), 0] = True  # the step itself is told beside a direction
     owner, place = np.nonzero(moves)
     ways = np.zeros((len(owner), numbers.shape[1]))
     ways[np.arange(len(owner)), place] = 1.0
@@ -79,9 +86,98 @@ def step_lanes(
     def jacobian(leaf: np.ndarray) -> np.ndarray:
         full = np.zeros((*numbers.shape, *leaf.shape[1:]), leaf.dtype)
         full[owner, place] = leaf
+        full[:, rates] = left.all_of(full[:, rates])
         return np.moveaxis(full, 1, -1)
 
     return jax.tree.map(lambda x: x[first], walk.told), jax.tree.map(jacobian, moved)
+
+
+SAME = 1e-10
+"""What is left of a rate beside others, as a share of the largest, that is rounding: else it is of
+the order of one, as the projection is."""
+
+
+class _Rates(NamedTuple):
+    """Which rates of section states move wheels, and the others by these.
+
+    A loaded foot holds the wheel: of the hub's and its leg's four rates a resting one leaves two.
+    """
+
+    places: np.ndarray  # of the rates that are kept, (wheels, kept)
+    counts: np.ndarray  # which of these there are
+    shares: np.ndarray  # all rates by these, (wheels, kept, rates)
+
+    @classmethod
+    def of(cls, settled: np.ndarray, asked: np.ndarray) -> "_Rates":
+        """By what a start makes of each rate, (wheels, rates after, rates), of those `asked`: one
+        after another that of which the others leave most."""
+        asked_for = np.nan_to_num(settled) * asked[:, None]
+        left, wheels = asked_for.copy(), np.arange(len(asked))
+        largest = np.sqrt(np.sum(left**2, 1)).max(-1)
+        places: list[np.ndarray] = []
+        counts: list[np.ndarray] = []
+        along: list[np.ndarray] = []
+        for _ in range(int(asked.sum(1).max(initial=0))):
+            size = np.sqrt(np.sum(left**2, 1))
+            most = size.argmax(-1)
+            there = size[wheels, most] > SAME * largest
+            if not there.any():
+                break
+            way = left[wheels, :, most] / np.where(there, size[wheels, most], np.inf)[:, None]
+            left = left - way[:, :, None] * np.sum(way[:, :, None] * left, 1)[:, None]
+            places, counts, along = [*places, most], [*counts, there], [*along, way]
+        if not places:
+            none = np.zeros((len(asked), 0), int)
+            return cls(none, none > 0, np.zeros((len(asked), 0, asked.shape[1])))
+        picked, there = np.stack(places, 1), np.stack(counts, 1)
+        by_way = np.stack([np.sum(way[:, :, None] * asked_for, 1) for way in along], 1)
+        corner = np.take_along_axis(by_way, picked[:, None], 2)
+        corner = np.where(there[:, :, None] & there[:, None], corner, np.eye(len(places)))
+        return cls(picked, there, np.linalg.solve(corner, by_way))
+
+    def kept(self) -> np.ndarray:
+        """Whether a rate is among those, (wheels, rates)."""
+        flags = np.zeros((len(self.places), self.shares.shape[2]), bool)
+        wheel, which = np.nonzero(self.counts)
+        flags[wheel, self.places[wheel, which]] = True
+        return flags
+
+    def all_of(self, moved: np.ndarray) -> np.ndarray:
+        """How things move with all rates, (wheels, rates, ...), by those that are kept."""
+        wheels, shape = np.arange(len(moved)), (1,) * (moved.ndim - 2)
+        total = np.zeros_like(moved)
+        for k in range(self.places.shape[1]):
+            share = self.shares[:, k].reshape(*self.shares[:, k].shape, *shape)
+            total += share * moved[wheels, self.places[:, k]][:, None]
+        return total
+
+
+def _settled_rates(columns: np.ndarray, states: np.ndarray, n: int) -> np.ndarray:
+    """What a step's start makes of each rate of the section state, which it does linearly:
+    (wheels, rates after, rates)."""
+    units = np.eye(3 + n)
+    lanes = np.repeat(states, 3 + n, 0)
+    every = np.tile(units, (len(states), 1))
+    lanes[:, 1:4], lanes[:, 4 + n : 4 + 2 * n] = every[:, :3], every[:, 3:]
+    rows = [*np.repeat(columns[:-1], 3 + n, 1), *lanes.T]
+    given = [np.ascontiguousarray(row) for row in rows]
+    told = np.stack(_opening(n, states.dtype)([], given), 1)
+    return np.swapaxes(told.reshape(len(states), 3 + n, 3 + n), 1, 2)
+
+
+@functools.cache
+def _opening(n: int, dtype: np.dtype) -> Callable[..., Any]:
+    """Rates at the start of a step, of rows of parameters and section states."""
+
+    def rates(uniform: tuple, lanes: tuple) -> tuple:
+        values, x = lanes[: len(PARAMETER_NAMES)], jnp.stack(lanes[len(PARAMETER_NAMES) :])
+        return tuple(coordinates(opened(symbols_of(n, *values), x)[0])[1])
+
+    if simd.serves():
+        size = len(PARAMETER_NAMES) + section_size(n)
+        return lane_program(rates, [], size, dtype, ("rates at a start on real ground", n))
+    by_xla = jax.jit(lambda lanes: rates((), lanes))
+    return lambda uniform, lanes: by_xla(tuple(lanes))
 
 
 class _Run(NamedTuple):
