@@ -263,6 +263,21 @@ def test_lanes_at_the_tightest_tolerances_walk_as_single_wheels_do():
     np.testing.assert_allclose(found.section_state[0], walk.steps.section_state[-1], atol=1e-8)
 
 
+def test_a_start_that_no_wheel_can_have_is_refused_by_its_code():
+    """By geometry: Leg 1 at an angle below 0 leaves the next foot in the ground, above half of that
+    between legs Leg 1 would be longer than its stopper lets it be."""
+    starts = [(0.1, 1.6, -0.1), (-0.05, 1.6, -0.1), (0.4, 1.6, -0.1)]
+    full = np.array([GROUND.full_section(SLOW, jnp.asarray(x)) for x in starts])
+    free, held, near = (full[0].copy() for _ in range(3))
+    free[4 + 2 * 8 + 2], free[4 + 2] = 0.0, 1.01  # a leg in the air off its stopper, too long
+    held[4 + 2 * 8] = 5.0  # the loaded leg on its stopper: its foot is in the ground
+    near[4 + 2 * 8 + 2], near[4 + 2] = 0.0, 1.0005  # by no more than Newton's method may be wrong
+    found = vrw.steps(SLOW, np.stack([*full, free, held, near]), 1, model=GROUND, options=OPTIONS)
+    refused = [False, True, True, True, True, False]
+    assert np.array_equal(found.outcome == vrw.Outcome.BAD_INPUT, refused)
+    assert np.array_equal(found.outcome == vrw.Outcome.STEPPED, np.logical_not(refused))
+
+
 def test_what_a_lane_gives_does_not_depend_on_its_company(lanes):
     *_, walked = lanes
     together, alone = walked(slice(None)), walked(slice(1, 2))

@@ -45,14 +45,47 @@ def embedded(s: Symbols, x: Float[Array, "3 ..."]) -> FullState:
 
 
 def made_sound(
-    params: WheelParams, friction: Elementwise, x: FullState
+    params: WheelParams, friction: Elementwise, x: FullState, even: bool = True
 ) -> tuple[Bool[Array, "..."], WheelParams, Elementwise, FullState]:
-    """Whether a step may begin there, and the same, or what one always may begin with."""
+    """Whether a step may begin there, and the same, or what one always may begin with.
+
+    Where the ground is not `even` feet may be below the line that the next foothold continues.
+    """
     safe = embedded(WheelParams(n_legs=params.n_legs).symbols(), jnp.asarray(PAPER_START, x.dtype))
     safe_x = safe.reshape(-1, *(1,) * (x.ndim - 1))
     good = usable(params, x) & (friction >= 0.0)
+    good = good & _possible(params.symbols(), x) if even else good
     params, x = replaced_where_bad(good, params, x, safe_x)
     return good, params, jnp.where(good, friction, 1.0), x
+
+
+NEAR = 1e-3
+"""Share of a leg's length by which a start may be wrong: more than integration and Newton's method
+leave, and little enough for the first events to put it right."""
+
+
+def _posture(s: Symbols, x: FullState) -> tuple[Elementwise, tuple, Array, Array, Array, Array]:
+    """Angle, the hub's place and lengths in the labels of the step that begins, the legs' rates,
+    modes and stoppers: loaded feet are on the slope, and the landing foot is the origin."""
+    n = s.n
+    theta = x[0] - s.alpha
+    of_legs = (x[4 + i * n : 4 + (i + 1) * n] for i in range(3))
+    L, dL, code = (jnp.concatenate([own[-1:], own[:-1]]) for own in of_legs)
+    code = jnp.floor(code + 0.5).astype(jnp.int32)
+    contact, locked = code & (LOCKED - 1), code >= LOCKED
+    L = jnp.where(locked, s.L0, L)
+    legs = directions(s, theta)
+    hub = L[0] * legs.sin[0], L[0] * legs.cos[0]
+    L = jnp.where((contact != OFF) & ~locked, hub[1] / legs.cos, L)
+    return theta, hub, L, dL, contact, locked
+
+
+def _possible(s: Symbols, x: FullState) -> Bool[Array, "..."]:
+    """Whether no foot is below the ground, loaded ones are on it, and no leg is too long."""
+    theta, (_, z), L, _, contact, _ = _posture(s, x)
+    height, near = z - L * directions(s, theta).cos, NEAR * s.L0
+    apart = (contact == OFF) | (height <= near)
+    return jnp.all((height >= -near) & apart & (near >= L - s.L0), axis=0)
 
 
 def opened(s: Symbols, x: FullState) -> tuple[WheelMotion, Stance]:
@@ -61,15 +94,9 @@ def opened(s: Symbols, x: FullState) -> tuple[WheelMotion, Stance]:
     The landing foot is the origin; loaded feet are put on the slope and sticking ones to rest, so
     that every vector near a section state is one.
     """
-    n = s.n
-    theta, dtheta, vx, vz = x[0] - s.alpha, x[1], x[2], x[3]
-    of_legs = (x[4 + i * n : 4 + (i + 1) * n] for i in range(3))
-    L, dL, code = (jnp.concatenate([own[-1:], own[:-1]]) for own in of_legs)
-    code = jnp.floor(code + 0.5).astype(jnp.int32)
-    contact, locked = code & (LOCKED - 1), code >= LOCKED
-    L = jnp.where(locked, s.L0, L)
-    legs = directions(s, theta)
-    motion = WheelMotion(L[0] * legs.sin[0], L[0] * legs.cos[0], theta, vx, vz, dtheta, L, dL)
+    theta, (hub_x, hub_z), L, dL, contact, locked = _posture(s, x)
+    dtheta, vx, vz = x[1], x[2], x[3]
+    motion = WheelMotion(hub_x, hub_z, theta, vx, vz, dtheta, L, dL)
     none = locked & False
     return settled(s, motion, contact, locked), Stance(contact, locked, none, none, none)
 

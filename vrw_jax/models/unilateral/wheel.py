@@ -323,7 +323,8 @@ def _walk(
     logged: bool = False,
 ) -> _Walked:
     """Follow one step from event to event."""
-    good, params, friction, x = made_sound(params, wheel.friction, x)
+    even = wheel.uneven is None
+    good, params, friction, x = made_sound(params, wheel.friction, x, even)
     s, n = params.symbols(), params.n_legs
     tilt = None if wheel.uneven is None else wheel.uneven.tilt
     given = s, _rough(wheel, friction), options, wheel.one_sided
