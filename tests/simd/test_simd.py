@@ -133,6 +133,7 @@ def arrays_in_loops(x):
         0, 1
     )  # (3, 19, lanes)
     flat = lax.optimization_barrier(shifted).reshape(57, -1)[2:50]
+    first, *_, last = jnp.unstack(shifted[:, :4], axis=1)
 
     def turn(carry, given):
         total, seen = carry
@@ -154,6 +155,7 @@ def arrays_in_loops(x):
     halved, _ = lax.while_loop(going, halve, (large, jnp.int32(0)))
     return {
         "stacked": stacked,
+        "apart": first * last + sum(jnp.unstack(x[:3])),
         "rest": (seen, jnp.min(flat, 0), jnp.min(stacked, (0, 2)), total),
         "halved": halved - jnp.max(large, 0),
         "found": jnp.any(large > 1.5, (0, 1)),

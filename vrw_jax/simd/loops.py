@@ -34,7 +34,7 @@ def while_(traces: Traces, equation: Any, values: list[Entries]) -> list[Entries
 def scan(traces: Traces, equation: Any, values: list[Entries]) -> list[Entries]:
     """A loop of known length; what it reads and writes turn by turn lies in memory."""
     arrays, params = traces.arrays, equation.params
-    n_fixed, n_carried = params["num_consts"], params["num_carry"]
+    n_fixed, n_carried = _fixed_and_carried(params)
     inner, length = params["jaxpr"], params["length"]
     told = [variable.aval for variable in equation.outvars[n_carried:]]
     if length == LANES and (told or len(values) > n_fixed + n_carried):
@@ -67,6 +67,14 @@ def scan(traces: Traces, equation: Any, values: list[Entries]) -> list[Entries]:
     last = carry.arrays(arrays.counted(length, body, start))
     arrays.written_out = outside
     return [*last, *written]
+
+
+def _fixed_and_carried(params: dict[str, Any]) -> tuple[int, int]:
+    """How many values a loop of known length is given once, and how many go from turn to turn."""
+    if "ft_in" in params:  # jax from 0.11 or 0.12 on
+        fixed, carried, _ = params["ft_in"].unpack()
+        return len(fixed), len(carried)
+    return params["num_consts"], params["num_carry"]
 
 
 class _Carry:

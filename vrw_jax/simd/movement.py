@@ -10,6 +10,7 @@ from vrw_jax.simd.arithmetic import converted
 from vrw_jax.simd.arrays import Arrays, Asked, has_lanes, moved, shape_of
 from vrw_jax.simd.fields import Entries, Field, Index, Updated
 from vrw_jax.simd.numbers import LONG, Value
+from vrw_jax.simd.trace import Traces
 
 
 def broadcast_in_dim(arrays: Arrays, asked: Asked, array: Entries, *_: Any) -> Entries:
@@ -65,6 +66,22 @@ def stack(arrays: Arrays, asked: Asked, *values: Entries) -> Entries:
     axis = asked.params["axis"]
     longer = [arrays.reshaped(x, (*x.shape[:axis], 1, *x.shape[axis:])) for x in values]
     return _joined(arrays, asked, axis, longer)
+
+
+def unstack(traces: Traces, equation: Any, values: list[Entries]) -> list[Entries]:
+    """Arrays of one shape, taken apart along an axis."""
+    (array,), axis, arrays = values, equation.params["axis"], traces.arrays
+    if axis == len(array.shape):
+        raise moved("unstack")
+
+    def part(place: int) -> Entries:
+        shape = (*array.shape[:axis], *array.shape[axis + 1 :])
+        if isinstance(array, np.ndarray):
+            return array.take([place], axis).reshape(shape)
+        at = lambda index: arrays.entry(array, (*index[:axis], place, *index[axis:]))
+        return Field(shape, array.kind, at)
+
+    return [part(place) for place in range(len(equation.outvars))]
 
 
 def _joined(arrays: Arrays, asked: Asked, axis: int, values: Sequence[Entries]) -> Entries:

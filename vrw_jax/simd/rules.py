@@ -55,6 +55,7 @@ RULES: dict[str, Rule] = {
     "slice": _single(movement.slice_),
     "squeeze": _single(movement.reshape),
     "stack": _single(movement.stack),
+    "unstack": movement.unstack,
     "transpose": _single(movement.transpose),
     "cumsum": _single(sums.cumsum),
     "dot_general": _single(sums.dot_general),
