@@ -216,10 +216,15 @@ class _Run(NamedTuple):
 
     def told(self, dtype: Any) -> Any:
         """Shapes and types of what is told of one wheel."""
-        walk = jax.eval_shape(lambda: told_like(self.n_legs, dtype, self.moved))
+        walk = _shapes(self.n_legs, dtype, self.moved)
         if not self.moved:
             return walk
         return walk, eqx.filter(walk.told, lambda x: jnp.issubdtype(x.dtype, jnp.inexact))
+
+
+@functools.cache
+def _shapes(n_legs: int, dtype: Any, moved: bool) -> Any:
+    return jax.eval_shape(lambda: told_like(n_legs, dtype, moved))
 
 
 def _walked(run: _Run, given: list[np.ndarray], n_steps: int, options: Options) -> Any:
@@ -249,8 +254,8 @@ def as_full_states(columns: np.ndarray, states: np.ndarray, n: int) -> np.ndarra
     """The full section states of the paper's, wheel by wheel; others are left as they are."""
     if states.shape[1] != 3:
         return states
-    embed = lambda values, x: embedded(symbols_of(n, *values), x)
-    return np.asarray(jax.vmap(embed, (1, 0))(columns[:-1], jnp.asarray(states)))
+    s = symbols_of(n, *map(jnp.asarray, columns[:-1]))  # number by number: a map would trace
+    return np.asarray(embedded(s, jnp.asarray(states.T))).T
 
 
 @functools.cache
