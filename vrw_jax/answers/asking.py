@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.answers.climbing import Chord, Settled, settled
+from vrw_jax.answers.climbing import STRAY, Chord, Settled, settled
 from vrw_jax.answers.lower import (
     GROUND,
     NONE,
@@ -279,6 +279,9 @@ class _Asked:
             chord = Chord.of(self.ground, lanes, x, None)
             found = settled(chord, self.names, self.goal, 0)
             found.done[found.done] = chord.some(found.done).attract()
+            far = np.flatnonzero(found.done & (chord.away(x) > STRAY))
+            found.done[far] = chord.some(far).stay(WALKS[-1])
+            found.n_steps[far] += WALKS[-1]
             self._take(lanes, found, how)
             lanes, x = lanes[~found.done], x[~found.done]
 

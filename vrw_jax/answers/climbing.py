@@ -49,9 +49,12 @@ BRIEF = 3.0
 """Dips of a foot of the shortest kind that a step may miss or add."""
 BRIEFLY = 0.1
 """Share of what is wanted that such dips may be presumed to cost: else it is measured."""
-AT_REST = 4.0
+AT_REST = 6.0
 """How far corrections that come down no more may leave one off, in their own effect, and a step, in
-the difference that another tolerance makes: twice was too little for one of 830 answers."""
+the difference that another tolerance makes: four times was too little for 4 of 10,365 answers."""
+STRAY, STAYS = 1e-3, 1e-3
+"""How far from a walk's end its gait may lie without being walked to again, and how far a walk may
+then lead away, rad, rad/s, m, m/s."""
 RESOLVED = 1e-13
 """Changes as short as this tell nothing."""
 
@@ -196,6 +199,15 @@ class Chord:
         """Whether walks near by come to where the lanes are: no multiplier is beyond one, which is
         that no eigenvalue of (I - DP)^-1 has a real part below a half."""
         return np.linalg.eigvals(self.inverse).real.min(-1) > 0.5
+
+    def away(self, x: np.ndarray) -> np.ndarray:
+        """How far the lanes are from there."""
+        return np.abs(self.x - x)[:, : self.free.shape[1]].max(-1)
+
+    def stay(self, n_steps: int) -> np.ndarray:
+        """Whether a walk stays where the lanes are: multipliers by differences across a dip lie."""
+        end = self.ground.step(self.lanes, self.x, n_steps)
+        return (end.outcome == Outcome.STEPPED) & (self.away(end.x) <= STAYS)
 
     def go_on(self, some: np.ndarray, y: np.ndarray, same: np.ndarray) -> None:
         """To where the correction leads; along the step itself where codes have changed."""
