@@ -158,3 +158,17 @@ def test_few_gaits_on_real_ground_and_all_of_the_papers_make_a_mean():
     assert mean.error < 2e-3
     assert mean.n_top < 60
     assert mean.steps < mean.steps_alone
+
+
+def test_a_mean_is_of_the_wheels_that_have_a_gait():
+    """Whether some are asked, or all: then it is theirs and nothing but theirs."""
+    rng = np.random.default_rng(1)
+    drawn = (rng.uniform(*ends, 60) for ends in ((120.0, 200.0), (450.0, 550.0), (0.26, 0.34)))
+    wheels = vrw.WheelParams(**dict(zip(("damping", "stiffness", "slope"), drawn, strict=True)))
+    every = vrw.answer("speed", wheels, 1e-5, friction=30.0)
+    assert 40 < np.sum(every.found) < 60
+    for tol, some in ((3e-2, True), (1e-4, False)):
+        mean = vrw.average("speed", wheels, tol, friction=30.0, pilot=16, seed=1)
+        assert (mean.n_top < 60) == some
+        wrong = abs(mean.value - np.mean(every.value[every.found]))
+        assert wrong < (mean.error if some else 1e-4 * tol)  # the same answers, summed otherwise

@@ -5,7 +5,8 @@ from real ground is sampled (M. B. Giles, Acta Numerica 24, 2015; B. Peherstorfe
 M. Gunzburger, SIAM Review 60, 2018). A pilot of wheels drawn first tells the weight, which control
 is worth its price, and how many more are needed. Its own wheels count as known and the others are
 drawn from those that are left, so that nothing is estimated from the numbers that it is applied to,
-and the mean is unbiased.
+and the mean is unbiased; where some wheels have no gait it is a ratio, of sums over all, and right
+to the order of one over the wheels asked.
 """
 
 import math
@@ -41,6 +42,8 @@ SHARE = 0.1
 """Share of the mean's error that each gait may take."""
 FEWEST = 8
 """Wheels with a gait from which a spread is told."""
+FLAT = 1e-12
+"""Share of the largest singular value below which the pilot tells nothing of a direction."""
 CONTROLS = ("no control", "the paper's gaits", "the paper's gaits with one step on real ground")
 LOWER_COST = (0.0, 1.0, 2.0)
 """Price of a control, in steps on real ground: in lanes the paper's gait costs what one does."""
@@ -91,7 +94,7 @@ class _Plan(NamedTuple):
 
     steps: float  # expected
     n: int  # wheels to be drawn
-    weight: float
+    weights: np.ndarray  # of what the control tells, and of its telling anything
     control: int
 
 
@@ -154,24 +157,39 @@ def average(
             f"{np.sum(found)} of the pilot's {pilot} wheels have a gait on real ground, but a mean "
             f"needs {FEWEST}: give other wheels, or a larger pilot."
         )
-    y, price = exact.value[found], float(np.mean(exact.n_steps))
-    known = [wheels.known(first, control)[found] for control in range(len(CONTROLS))]
-    plans = [_planned(i, y, x, tol, len(rest), price) for i, x in enumerate(known)]
+    pilots = _Asked.of(exact)
+    known = [_columns(wheels.known(first, control)) for control in range(len(CONTROLS))]
+    plans = [_planned(i, pilots, x, tol, len(rest)) for i, x in enumerate(known)]
     plan = min(plans, key=lambda plan: plan.steps)
-    mean_of_rest, variance, more = _estimated(wheels, plan, rest, tol, float(np.mean(y)))
-    kept, share = more.found, len(rest) / n
-    gaits = np.concatenate([exact.error[found], more.error[kept]])
+    drawn = wheels.asked(rest[: plan.n], SHARE * tol)
+    value, deviation = _estimated(
+        plan, pilots, _Asked.of(drawn), _columns(wheels.known(rest, plan.control))
+    )
+    gaits = np.concatenate([exact.error[found], drawn.error[drawn.found]])
     return Average(
-        value=(1.0 - share) * float(np.mean(y)) + share * mean_of_rest,
-        error=DEVIATIONS * share * math.sqrt(variance) + float(np.mean(gaits)),
-        n=float(np.sum(found) + np.sum(kept)),
+        value=value,
+        error=DEVIATIONS * deviation + float(np.mean(gaits)),
+        n=float(len(gaits)),
         n_top=float(pilot + plan.n),
-        weight=plan.weight,
-        steps=float(np.sum(exact.n_steps) + np.sum(more.n_steps)) + LOWER_COST[plan.control] * n,
-        steps_alone=price * pilot + plans[0].steps,
+        weight=float(plan.weights[0]),
+        steps=float(np.sum(exact.n_steps) + np.sum(drawn.n_steps)) + LOWER_COST[plan.control] * n,
+        steps_alone=pilots.price * pilot + plans[0].steps,
         measure=measure,
         control=CONTROLS[plan.control],
     )
+
+
+class _Asked(NamedTuple):
+    """What wheels that were asked tell."""
+
+    total: np.ndarray  # the measure, zero where there is no gait
+    has: np.ndarray  # whether there is one
+    price: float  # steps of each
+
+    @classmethod
+    def of(cls, told: Answer) -> "_Asked":
+        has = told.found.astype(float)
+        return cls(np.where(told.found, told.value, 0.0), has, float(np.mean(told.n_steps)))
 
 
 class _Wheels(NamedTuple):
@@ -194,7 +212,7 @@ class _Wheels(NamedTuple):
         """What a control tells of them; NaN where nothing."""
         told = np.full(len(lanes), np.nan)
         if not control:
-            return 0.0 * lanes
+            return told
         options = Options()
         lower = paper_gaits(self.some(lanes), options)
         (has,) = np.nonzero(lower.rung)
@@ -212,33 +230,42 @@ class _Wheels(NamedTuple):
         return told
 
 
-def _estimated(
-    wheels: _Wheels, plan: _Plan, rest: np.ndarray, tol: float, usual: float
-) -> tuple[float, float, Answer]:
-    """Mean over the `rest`, its variance, and what was asked for it."""
-    drawn = rest[: plan.n]
-    more = wheels.asked(drawn, SHARE * tol)
-    known = wheels.known(rest, plan.control)
-    # Where the lower rung tells nothing, any number that was known before serves.
-    known = plan.weight * np.where(np.isfinite(known), known, usual)
-    left = (more.value - known[: plan.n])[more.found]
-    if len(left) < 2:
-        raise ValueError(
-            f"{len(left)} of {plan.n} wheels drawn have a gait on real ground, but a mean needs 2: "
-            "give a larger pilot, or other wheels."
-        )
-    variance = float(np.var(left, ddof=1)) / len(left) * (1.0 - plan.n / len(rest))
-    return float(np.mean(known) + np.mean(left)), variance, more
+def _columns(known: np.ndarray) -> np.ndarray:
+    """Of each wheel what a control tells, and whether it tells anything."""
+    has = np.isfinite(known)
+    return np.column_stack([np.where(has, known, 0.0), has])
 
 
-def _planned(
-    control: int, y: np.ndarray, x: np.ndarray, tol: float, n_rest: int, price: float
-) -> _Plan:
-    """Weight and number of wheels by the pilot, for a mean to within `tol`."""
-    x = np.where(np.isfinite(x), x, np.mean(y))
-    spread = float(np.var(x))
-    weight = float(np.cov(x, y, ddof=0)[0, 1]) / spread if control and spread > 0.0 else 0.0
-    left = float(np.var(y - weight * x, ddof=1 + (control > 0)))
-    wanted = left * (DEVIATIONS / ((1.0 - SHARE) * tol)) ** 2
+def _planned(control: int, pilot: _Asked, x: np.ndarray, tol: float, n_rest: int) -> _Plan:
+    """Weights and number of wheels by the pilot, for a mean to within `tol`.
+
+    The mean M is of those with a gait, a ratio: what is controlled is each wheel's measure less M,
+    zero where it has none, of which the sum is zero.
+    """
+    share = float(np.mean(pilot.has))
+    z = pilot.total - np.mean(pilot.total) / share * pilot.has
+    centred = x - np.mean(x, axis=0)
+    weights, _, rank, _ = np.linalg.lstsq(centred, z, rcond=FLAT)
+    squares = float(np.sum((z - centred @ weights) ** 2)) + _unseen(pilot, z)
+    left = squares / (len(z) - 1 - int(rank))
+    wanted = left * (DEVIATIONS / ((1.0 - SHARE) * tol * share)) ** 2
     n = min(n_rest, max(FEWEST, math.ceil(wanted / (1.0 + wanted / n_rest))))
-    return _Plan(n * price + LOWER_COST[control] * n_rest, n, weight, control)
+    return _Plan(n * pilot.price + LOWER_COST[control] * n_rest, n, weights, control)
+
+
+def _estimated(plan: _Plan, pilot: _Asked, drawn: _Asked, x: np.ndarray) -> tuple[float, float]:
+    """The mean and its standard error: `x` of all but the pilot, the first of which were drawn."""
+    n, known = len(x), x @ plan.weights
+    count = np.sum(pilot.has) + n * np.mean(drawn.has)
+    less = drawn.total - known[: plan.n]
+    mean = (np.sum(pilot.total) + n * (np.mean(known) + np.mean(less))) / count
+    squares = plan.n * np.var(less - mean * drawn.has)
+    squares += _unseen(pilot, pilot.total - mean * pilot.has)
+    variance = squares / (plan.n - 1) / plan.n * (1.0 - plan.n / n)
+    return float(mean), float(n / count * math.sqrt(variance))
+
+
+def _unseen(pilot: _Asked, z: np.ndarray) -> float:
+    """Where gaits are lost, one more wheel counts that the control says nothing right of: few may
+    have met none that has the paper's gait and no other."""
+    return 0.0 if np.all(pilot.has) else float(np.var(z))
