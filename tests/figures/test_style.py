@@ -62,3 +62,11 @@ def test_a_style_ends_with_its_figure():
     with figures.figure_style():
         assert mpl.rcParams["font.serif"] == ["STIXGeneral"]
     assert dict(mpl.rcParams) == before
+
+
+def test_borders_that_some_eyes_see_in_one_grey_have_no_dash_in_common():
+    names = {color: [name for name in style.KINDS[color] if name] for color in style.KINDS}
+    dashes = lambda color: {style.border_style(name)[1] for name in names[color]}
+    assert not dashes(style.GREEN) & dashes(style.PINK)
+    looks = [style.border_style(name) for own in names.values() for name in own]
+    assert len(set(looks)) == len(looks)

@@ -50,6 +50,29 @@ def test_a_result_prints_numbers_and_units(make, words):
     assert table.startswith("<table>")
 
 
+@pytest.mark.parametrize(
+    ("make", "line"),
+    [
+        (lambda: vrw.UnilateralWheel(friction=0.55), "UnilateralWheel(friction=0.55, max_events="),
+        (lambda: vrw.RigidWheel(), "RigidWheel(friction=1.0, stop_at_lift_off=True"),
+        (lambda: vrw.grid(damping=np.linspace(1, 2, 1000)), "grid of 1,000: damping 1000 values"),
+        (lambda: vrw.sobol({"slope": (0.2, 0.3)}, 64), "sobol of 64: slope 64 values from 0.2"),
+        (lambda: vrw.newton_cycle(lambda x: 0.5 * x + 1.0, jnp.zeros(1)), "multipliers: 0.5"),
+    ],
+)
+def test_what_a_result_is_made_of_prints_numbers_in_a_line_or_a_few(make, line):
+    text = repr(make())
+    assert line in text
+    assert len(text) < 200
+    assert "Array" not in text
+
+
+def test_a_lost_cycle_as_a_guess_is_no_guess():
+    lost = vrw.limit_cycle(vrw.WheelParams(damping=300.0), lost="nan")
+    found = jax.jit(lambda p: vrw.limit_cycle(p, guess=lost).speed)(TABLE_1)
+    np.testing.assert_allclose(found, vrw.limit_cycle(TABLE_1).speed, rtol=1e-12)
+
+
 def test_what_is_traced_prints_its_shapes():
     assert "float64" in repr(jax.eval_shape(lambda p: vrw.step(p, START), TABLE_1))
     assert "None" in repr(vrw.WheelParams(damping=np.ones(3)).in_axes)

@@ -41,7 +41,7 @@ class FixedPoint(NamedTuple):
         return float(np.max(np.abs(self.multipliers)))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Border:
     """Where a branch changes its nature.
 
@@ -75,6 +75,9 @@ class Border:
         name = "" if self.name == self.kind else f" {self.name}"
         ends = ", ends the branch" if self.ends_branch else ""
         return f"{self.value:.9g}: {self.kind.replace('_', ' ')}{name}{ends}"
+
+    def __repr__(self) -> str:
+        return f"Border at {self}"
 
 
 @dataclass(frozen=True, repr=False)

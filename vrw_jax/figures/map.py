@@ -1,7 +1,6 @@
 """Pictures of borders as curves over two parameters, on the measure that a scan found."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -10,32 +9,16 @@ from matplotlib.patheffects import Normal, Stroke
 
 from vrw_jax.branches import BorderCurve
 from vrw_jax.figures.style import (
-    AMBER,
-    BLUE,
-    GREEN,
     LIGHT,
-    ORANGE,
     PAGE,
-    PINK,
-    SKY,
     axis_label,
+    border_style,
     drawable,
     figure_style,
     typeset,
 )
 from vrw_jax.results import what_breaks
 from vrw_jax.scans import SWEPT
-
-DASHES = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 3)))
-KINDS = {
-    "black": ("fold", "period_doubling", "neimark_sacker", "branch_point"),
-    BLUE: ("lambda_2_plus", "lambda_4_plus", "lambda_I4", "fore_foot_force"),
-    GREEN: ("clearance_sls1", "clearance_sls2", "takeoff_acceleration"),
-    ORANGE: ("friction_fore", "friction_rear", "landing_friction_fore", "landing_friction_rear"),
-    PINK: ("hit_planted_impulse", "hit_stopper_impulse", "landing_stopper_impulse", "contraction"),
-    AMBER: ("duration_sls2", "duration_sls1", "duration_dls", "rear_stopper_force"),
-}
-"""Of a border's name the colour, and by its place the dash: the same in every map."""
 
 
 @figure_style()
@@ -69,7 +52,7 @@ def map_figure(scan: xr.Dataset, measure: str, curves: Sequence[BorderCurve]) ->
     names = sorted({curve.name for curve in curves})
     labels = {name: typeset(what_breaks(name)) for name in names}
     for curve in curves:
-        color, dash = _style(curve.name)
+        color, dash = border_style(curve.name)
         stable = curve.dataset.spectral_radius.values < 1.0
         for there, width in ((stable, 1.2), (~stable, 0.5)):
             # A point of what follows joins them; several pieces of a border are told once.
@@ -93,12 +76,3 @@ def map_figure(scan: xr.Dataset, measure: str, curves: Sequence[BorderCurve]) ->
     if curves:
         figure.legend(loc="outside lower center", ncols=2)
     return figure
-
-
-def _style(name: str) -> tuple[str, Any]:
-    """Colour and dash of a border; those of locked legs by leg, of names unheard of by length."""
-    for color, names in KINDS.items():
-        if name in names:
-            return color, DASHES[names.index(name)]
-    leg = name.partition("[")[2]
-    return SKY, DASHES[(int(leg[:-1]) - 3 if leg else len(name)) % len(DASHES)]

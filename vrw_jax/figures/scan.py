@@ -10,20 +10,18 @@ from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
+from matplotlib.patheffects import Normal, Stroke
 
 from vrw_jax.figures.style import (
     AMBER,
     BLUE,
     COLUMN,
-    GREEN,
     LIGHT,
-    ORANGE,
     OUTCOMES,
     PAGE,
-    PINK,
-    SKY,
     UNSTABLE,
     axis_label,
+    border_style,
     drawable,
     figure_style,
     outcome_cells,
@@ -39,21 +37,12 @@ from vrw_jax.wheel import Outcome
 PREFERRED = ("damping", "slope", "stiffness", "natural_length", *SWEPT)
 """Which axes a picture takes first: across, then up, then side by side."""
 
-Dash = Literal["-", "--", "-.", ":"]
-
-BORDERS: dict[str, tuple[str, Dash]] = {
-    "fore_foot_force": ("black", "-"),
-    "takeoff_acceleration": (ORANGE, "-"),
-    "clearance_sls1": (ORANGE, "--"),
-    "clearance_sls2": (ORANGE, ":"),
-    "locked_stopper_force": (PINK, "--"),
-    "rear_stopper_force": (PINK, ":"),
-    "contraction": (GREEN, "--"),
-    "friction_fore": (SKY, "-."),
-    "landing_friction_fore": (SKY, ":"),
-    "hit_planted_impulse": (GREEN, ":"),
-}
-"""Premises whose borders are drawn: colour and line."""
+BORDERS = (
+    "fore_foot_force", "takeoff_acceleration", "clearance_sls1", "clearance_sls2",
+    "locked_stopper_force", "rear_stopper_force", "contraction", "friction_fore",
+    "landing_friction_fore", "hit_planted_impulse",
+)  # fmt: skip
+"""Premises whose borders are drawn."""
 
 MOST_COLUMNS, MOST_PAIRED, MOST_DRAWN = 4, 6, 20_000
 
@@ -343,7 +332,7 @@ def _codes(scan: xr.Dataset) -> xr.DataArray:
 def _borders(axes: Axes, scan: xr.Dataset, x: str, y: str) -> dict[str, Line2D]:
     """Lines where a premise's margin is zero; returns what a legend needs."""
     drawn = {}
-    for name, (color, line) in BORDERS.items():
+    for name in BORDERS:
         if name not in scan or scan.sizes[x] < 2 or scan.sizes[y] < 2:
             continue
         margin = scan[name]
@@ -355,15 +344,11 @@ def _borders(axes: Axes, scan: xr.Dataset, x: str, y: str) -> dict[str, Line2D]:
         known = values[np.isfinite(values)]
         if not len(known) or known.min() >= 0.0 or known.max() <= 0.0:
             continue
+        color, line = border_style(name)
         axes.contour(
-            scan[x].values,
-            scan[y].values,
-            np.ma.masked_invalid(values),
-            levels=[0.0],
-            colors=[color],
-            linestyles=[line],
-            linewidths=1.2,
-        )
+            scan[x].values, scan[y].values, np.ma.masked_invalid(values), levels=[0.0],
+            colors=[color], linestyles=[line], linewidths=1.4,
+        ).set_path_effects([Stroke(linewidth=2.6, foreground="white"), Normal()])  # fmt: skip
         drawn[name] = Line2D([], [], color=color, linestyle=line, label=MARGINS[name].breaks)
     return drawn
 

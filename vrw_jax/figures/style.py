@@ -78,6 +78,21 @@ OUTCOMES: dict[Outcome, tuple[str, str]] = {
     Outcome.BORDER_ON_THE_WAY: ("border on the way", "#454545"),
     Outcome.FRICTION_PARADOX: ("friction paradox", "#862DB8"),
 }
+DASHES = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 3)))
+KINDS = {
+    "black": ("fold", "period_doubling", "neimark_sacker", "branch_point"),
+    BLUE: ("lambda_2_plus", "lambda_4_plus", "lambda_I4", "fore_foot_force"),
+    GREEN: ("clearance_sls1", "clearance_sls2", "", "", "", "takeoff_acceleration"),
+    SKY: ("", "locked_stopper_force"),
+    ORANGE: ("friction_fore", "friction_rear", "landing_friction_fore", "landing_friction_rear"),
+    PINK: ("", "", "", "hit_planted_impulse", "hit_stopper_impulse"),
+    AMBER: (
+        "duration_sls2", "duration_sls1", "duration_dls", "rear_stopper_force", "contraction",
+        "landing_stopper_impulse",
+    ),
+}  # fmt: skip
+"""Of a border's name the colour, and by its place the dash: the same in every picture. Green and
+pink, one grey to some eyes, have no dash in common."""
 NOT_COMPUTED = ("not computed", "#FFFFFF")
 UNSTABLE = 100
 """Stands for a cycle whose spectral radius is 1 or more, beside the codes of `Outcome`."""
@@ -185,6 +200,15 @@ def draw_marks(
     """Symbols without a line, whose inside may have another colour: open ones are "white"."""
     look: dict[str, Any] = {"markersize": 3.2, "markeredgewidth": 0.7, "linestyle": "none"} | more
     axes.plot(x, y, marker, color=color, markerfacecolor=fill, **look)
+
+
+def border_style(name: str) -> tuple[str, Any]:
+    """Colour and dash of a border; those of locked legs by leg, of names unheard of by length."""
+    for color, names in KINDS.items():
+        if name in names:
+            return color, DASHES[names.index(name)]
+    leg = name.partition("[")[2]
+    return SKY, DASHES[(int(leg[:-1]) - 3 if leg else len(name)) % len(DASHES)]
 
 
 def outcome_style(code: int) -> tuple[str, str]:

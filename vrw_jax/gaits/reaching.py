@@ -123,7 +123,7 @@ def limit_cycle(
 
     Args:
         params: the wheel.
-        guess: a neighbour's cycle, or a section state near the gait.
+        guess: a neighbour's cycle, or a section state near the gait; a lost cycle counts as none.
         period_n: steps until the gait repeats.
         model: the rung; the paper's, `ViscoelasticWheel()`, by default.
         options: `CycleOptions`; on other rungs `Options` of the step.

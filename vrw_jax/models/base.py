@@ -324,6 +324,14 @@ class AbstractWheel(eqx.Module):
     legs_yield: ClassVar[bool] = True
     """Whether springs and dampers play a part: what is tuned and scanned."""
 
+    def __repr__(self) -> str:
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(self)):
+            return eqx.tree_pformat(self)
+        number = lambda x: repr(float(x)) if x.ndim == 0 else told(x, "")
+        shown = lambda x: number(x) if eqx.is_array(x) else repr(x)
+        fields = ", ".join(f"{name}={shown(value)}" for name, value in vars(self).items())
+        return f"{type(self).__name__}({fields})"
+
     @property
     def upper(self) -> "AbstractWheel":
         """What serves wherever a step may start: itself, or a ladder's upper rung."""

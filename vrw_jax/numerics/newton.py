@@ -6,12 +6,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.numerics.derivatives import with_jacobian, without_derivative
 from vrw_jax.numerics.types import Scalar
-from vrw_jax.wording import function_of, positive, reals, whole
+from vrw_jax.wording import as_text, function_of, listed, positive, reals, told, whole
 
 
 class SectionCycle(NamedTuple):
@@ -33,6 +34,17 @@ class SectionCycle(NamedTuple):
     residual: Scalar
     converged: Bool[Array, ""]
     iterations: Int[Array, ""]
+
+    def __repr__(self) -> str:
+        if isinstance(self.x, jax.core.Tracer) or np.ndim(self.x) != 1:
+            return f"SectionCycle{tuple(self)}"
+        rows = (
+            ("converged", f"{bool(self.converged)}, after {int(self.iterations)} iterations"),
+            ("x", listed(self.x)),
+            ("residual", told(self.residual, "")),
+            ("multipliers", listed(np.linalg.eigvals(self.jacobian))),
+        )
+        return as_text("SectionCycle", rows)
 
 
 class Corrected(NamedTuple):

@@ -26,8 +26,8 @@ FLOOR = 90.0
 """Tolerances are not tightened below this, in units of round-off (2e-14 in float64): a walk of many
 steps gains nothing there."""
 LEAST = 4.5
-"""Least tolerance that can be asked for, in the same units: a walk of few steps that grazes a guard
-gains down to it."""
+"""Least tolerance that float64 can be asked for, in the same units: a walk of few steps that grazes
+a guard gains down to it."""
 
 
 def _positive(name: str, default: float) -> Any:
@@ -123,7 +123,7 @@ class Options(AbstractTold):
 
     def require_reachable(self, dtype: np.dtype) -> None:
         """Refuse, in one sentence, a tolerance below what the number format can resolve."""
-        floor = LEAST * float(jnp.finfo(dtype).eps)
+        floor = (LEAST if dtype == np.float64 else FLOOR) * float(jnp.finfo(dtype).eps)
         for name in ("rtol", "atol"):
             value = getattr(self, name)
             if isinstance(value, jax.core.Tracer) or jnp.ndim(value) > 0 or float(value) >= floor:

@@ -10,7 +10,7 @@ import numpy as np
 
 from vrw_jax.results import require_known
 from vrw_jax.wheel import FRICTION, PARAMETER_NAMES
-from vrw_jax.wording import instance, range_of, shown, untraced, whole
+from vrw_jax.wording import instance, range_of, shown, told, untraced, whole
 
 Columns = dict[str, np.ndarray]
 """One value per sample of each parameter that is swept."""
@@ -28,6 +28,10 @@ class AbstractDesign(abc.ABC):
 
     kind: str
     values: Mapping[str, np.ndarray]
+
+    def __repr__(self) -> str:
+        columns = (f"{name} {told(values, '')}" for name, values in self.values.items())
+        return f"{self.kind} of {self.size:,}: {', '.join(columns)}"
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -75,7 +79,7 @@ def digest_of(kind: str, values: Mapping[str, np.ndarray]) -> str:
     return digest.hexdigest()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Grid(AbstractDesign):
     """Every combination of the values given for each parameter; one axis per parameter."""
 
@@ -99,7 +103,7 @@ class Grid(AbstractDesign):
         return {name: (name, column) for name, column in self.values.items()}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Samples(AbstractDesign):
     """Samples one by one, along the axis `sample`; all parameters may vary at once."""
 
