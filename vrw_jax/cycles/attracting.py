@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.models import as_full_states, walk_lanes
-from vrw_jax.numerics import Options, SolverName, as_float_array
+from vrw_jax.numerics import Options, SolverName, as_float_array, joined, taken
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, wheel_of
 
 ROUNDS = (8, 12, 30, 50, 100)
@@ -118,8 +118,7 @@ def gaits_attracting(
             if not any(same.any() for same in known):
                 kept.append(int(i))
         kept += [] if len(kept) > first else [int(places[0])]
-    gaits = jax.tree.map(lambda leaf: jnp.asarray(leaf)[np.array(kept)], found)
-    return owner[kept], _none_where(~good[kept], gaits)
+    return owner[kept], _none_where(~good[kept], taken(found, kept))
 
 
 def slow_gaits(finder: Any, values: Any) -> Any:
@@ -132,8 +131,9 @@ def slow_gaits(finder: Any, values: Any) -> Any:
     lost = np.flatnonzero(~np.asarray(gaits.found))
     if len(lost):
         owner, others = gaits_attracting(finder, values[lost])
-        first = slowest(owner, len(lost))
-        gaits = jax.tree.map(lambda all_, some: all_.at[lost].set(some[first]), gaits, others)
+        places = np.arange(len(values))
+        places[lost] = len(values) + slowest(owner, len(lost))
+        gaits = jax.tree.map(jnp.asarray, taken(joined(gaits, others), places))
     return gaits
 
 
@@ -144,11 +144,13 @@ def slowest(owner: np.ndarray, wheels: int) -> np.ndarray:
 
 def _none_where(lost: np.ndarray, cycle: Any) -> Any:
     """No gait there: what repeats does so sooner, or does not attract, or nothing does."""
+    # In numpy, here and above: JAX compiles each operation for every number of wheels.
     fits = lambda leaf: lost.reshape(-1, *[1] * (leaf.ndim - 1))
-    none = jax.tree.map(lambda leaf: jnp.where(fits(leaf), jnp.zeros_like(leaf), leaf), cycle)
-    code = jnp.where(cycle.found, Outcome.NO_CYCLE_FOUND, cycle.outcome)
-    code = jnp.where(lost, code, cycle.outcome).astype(jnp.int32)
-    return eqx.tree_at(lambda cycle: cycle.outcome, none, code)
+    none = jax.tree.map(lambda leaf: np.where(fits(leaf), np.zeros_like(leaf), leaf), cycle)
+    code = np.where(cycle.outcome == Outcome.STEPPED, Outcome.NO_CYCLE_FOUND, cycle.outcome)
+    code = np.where(lost, code, cycle.outcome).astype(np.int32)
+    none = eqx.tree_at(lambda cycle: cycle.outcome, none, code)
+    return jax.tree.map(jnp.asarray, none)
 
 
 def _numbers(finder: Any) -> int:

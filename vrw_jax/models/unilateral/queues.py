@@ -20,10 +20,10 @@ from vrw_jax.models.unilateral.section import LOCKED, embedded, opened, section_
 from vrw_jax.models.unilateral.wheel import UnilateralWheel
 from vrw_jax.numerics import Options, explicit_tableau, in_batches
 from vrw_jax.runtime import lane_program
-from vrw_jax.wheel import PARAMETER_NAMES, symbols_of
+from vrw_jax.wheel import PARAMETER_NAMES, Symbols, symbols_of
 
 BLOCK = 2048
-"""Lanes that walk side by side where XLA compiles the walk."""
+"""Lanes side by side where XLA compiles what they do."""
 
 
 def walk_lanes(
@@ -160,24 +160,43 @@ def _settled_rates(columns: np.ndarray, states: np.ndarray, n: int) -> np.ndarra
     every = np.tile(units, (len(states), 1))
     lanes[:, 1:4], lanes[:, 4 + n : 4 + 2 * n] = every[:, :3], every[:, 3:]
     rows = [*np.repeat(columns[:-1], 3 + n, 1), *lanes.T]
-    given = [np.ascontiguousarray(row) for row in rows]
-    told = np.stack(_opening(n, states.dtype)([], given), 1)
+    told = _of_rows(n, "rates at a start", rows).T
     return np.swapaxes(told.reshape(len(states), 3 + n, 3 + n), 1, 2)
 
 
-@functools.cache
-def _opening(n: int, dtype: np.dtype) -> Callable[..., Any]:
-    """Rates at the start of a step, of rows of parameters and section states."""
+OF_ROWS: dict[str, Callable[[Symbols, Array], Array]] = {
+    "full states": embedded,
+    "rates at a start": lambda s, x: coordinates(opened(s, x)[0])[1],
+}
+"""What is asked of section states alone, with lanes last."""
 
-    def rates(uniform: tuple, lanes: tuple) -> tuple:
+
+def _of_rows(n: int, asked: str, rows: list[np.ndarray]) -> np.ndarray:
+    """One of `OF_ROWS`, of rows of parameters and section states; of any number of wheels one
+    program, which JAX alone would compile anew for each."""
+    program = _program_of_rows(n, asked, len(rows), rows[0].dtype)
+    return np.stack(program([], [np.ascontiguousarray(row) for row in rows]))
+
+
+@functools.cache
+def _program_of_rows(n: int, asked: str, size: int, dtype: np.dtype) -> Callable[..., Any]:
+    def told(_: tuple, lanes: tuple) -> tuple:
         values, x = lanes[: len(PARAMETER_NAMES)], jnp.stack(lanes[len(PARAMETER_NAMES) :])
-        return tuple(coordinates(opened(symbols_of(n, *values), x)[0])[1])
+        return tuple(OF_ROWS[asked](symbols_of(n, *values), x))
 
     if simd.serves():
-        size = len(PARAMETER_NAMES) + section_size(n)
-        return lane_program(rates, [], size, dtype, ("rates at a start on real ground", n))
-    by_xla = jax.jit(lambda lanes: rates((), lanes))
-    return lambda uniform, lanes: by_xla(tuple(lanes))
+        return lane_program(told, [], size, dtype, ("on real ground", asked, n))
+    return _by_xla(told)
+
+
+def _by_xla(function: Callable[[tuple, tuple], tuple]) -> Callable[..., Any]:
+    """Of numbers and rows, where there is no machine code: compiled for few numbers of lanes."""
+    compiled = jax.jit(function)
+
+    def in_blocks(uniform: list, lanes: list) -> tuple:
+        return in_batches(lambda *rows: compiled(tuple(uniform), rows), (BLOCK,), *lanes)
+
+    return in_blocks
 
 
 class _Run(NamedTuple):
@@ -237,7 +256,7 @@ def _walked(run: _Run, given: list[np.ndarray], n_steps: int, options: Options) 
     lanes = [row[order] for x in given for row in x]
     rows = _program(run, dtype, form)(uniform, lanes) if len(order) else None
     back = np.argsort(order, kind="stable")
-    leaves, structure = jax.tree.flatten(run.told(dtype))
+    leaves, structure = _form(run, dtype)
     found, taken = [], 0
     for leaf in leaves:
         size = math.prod(leaf.shape)
@@ -250,12 +269,17 @@ def _walked(run: _Run, given: list[np.ndarray], n_steps: int, options: Options) 
     return jax.tree.unflatten(structure, found)
 
 
+@functools.cache
+def _form(run: _Run, dtype: np.dtype) -> tuple[list[Any], Any]:
+    """What is told of one wheel, and its structure."""
+    return jax.tree.flatten(run.told(dtype))
+
+
 def as_full_states(columns: np.ndarray, states: np.ndarray, n: int) -> np.ndarray:
     """The full section states of the paper's, wheel by wheel; others are left as they are."""
     if states.shape[1] != 3:
         return states
-    s = symbols_of(n, *map(jnp.asarray, columns[:-1]))  # number by number: a map would trace
-    return np.asarray(embedded(s, jnp.asarray(states.T))).T
+    return _of_rows(n, "full states", [*columns[:-1], *states.T]).T
 
 
 @functools.cache
@@ -274,9 +298,4 @@ def _program(run: _Run, dtype: np.dtype, form: Any) -> Callable[..., Any]:
     if simd.serves():
         kinds = [np.dtype(np.int32), *[dtype] * form.num_leaves]
         return lane_program(walk, kinds, sum(run.rows()), dtype, ("walk on real ground", run))
-    by_xla = jax.jit(walk)
-
-    def in_blocks(uniform: list, lanes: list) -> tuple:
-        return in_batches(lambda *rows: by_xla(tuple(uniform), rows), (BLOCK,), *lanes)
-
-    return in_blocks
+    return _by_xla(walk)
