@@ -69,6 +69,8 @@ def of_gaits(curve: vrw.BorderCurve, places: np.ndarray, values: np.ndarray, col
         told = getattr(gait.indicators, curve.name.removesuffix("_plus"))
     elif curve.name == "clearance_sls1":
         told = gait.takeoff_acceleration
+    elif curve.name == "duration_dls":
+        told = jnp.where(gait.durations[..., 0] > 0.0, 1.0, -1.0)
     else:
         steps = jax.vmap(lambda p, x: vrw.step(p, x, options=tight))(params, gait.section_state)
         name, _, leg = curve.name.partition("[")

@@ -327,9 +327,10 @@ def map_borders(
     """Draw all borders of gaits over two parameters, on a scan: `vrw map configs/map_c_k.toml`."""
     with sentences():
         settings, folder = _asked(config, folder, "design", "map")
-        planned = scanning.planned_scan(settings, None)
         from vrw_jax.app.reports import require_map, write_map
+        from vrw_jax.branches import SCANNED
 
+        planned = scanning.planned_scan(settings, None, SCANNED)
         require_map(planned.design)
         _require_place(folder)
     dataset = scanning.compute_scan(planned, folder / "scan.zarr", None)

@@ -2,7 +2,7 @@
 
 import csv
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +11,7 @@ import xarray as xr
 
 from vrw_jax import figures
 from vrw_jax.app.config import Config
-from vrw_jax.branches import Branch, border_curves
-from vrw_jax.gaits import limit_cycle
+from vrw_jax.branches import Branch, Change, border_map
 from vrw_jax.results import MEASURES, as_markdown, measure_of, what_breaks
 from vrw_jax.scans import OF_CYCLE, design
 from vrw_jax.tuning import Tuned
@@ -50,27 +49,32 @@ def require_map(samples: design.AbstractDesign) -> None:
 
 
 def write_map(scan: xr.Dataset, settings: Config, folder: Path) -> list[Path]:
-    """Every border over the two parameters of a scan, from its stable gait nearest the middle."""
+    """Every border over the two parameters of a scan."""
     names = tuple(map(str, scan.outcome.dims))
-    good = np.argwhere(scan.outcome.values == Outcome.STEPPED)
-    if not len(good):
+    if not np.any(scan.outcome.values == Outcome.STEPPED):
         raise ValueError("no gait was found on the grid: choose another.")
-    middle = good[np.argmin(np.abs(good / scan.outcome.shape - 0.5).sum(1))]
-    at = {name: float(scan[name].values[i]) for name, i in zip(names, middle, strict=True)}
     model: Any = settings.wheel_model()
-    cycle = limit_cycle(settings.params(at), model=model)
-    bounds = {name: (float(scan[name][0]), float(scan[name][-1])) for name in names}
-    curves = border_curves(None, (names[0], names[1]), cycle, bounds=bounds)
+    curves, unexplained = border_map(scan, settings.params(), model)
     rows = [
         [curve.name, *map("{:.12g}".format, point)] for curve in curves for point in curve.values
     ]
     text = "\n".join(",".join(row) for row in [["border", *names], *rows])
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "map.csv").write_text(text + "\n", encoding="utf-8")
-    (folder / "map.md").write_text("\n\n".join(map(str, curves)) + "\n", encoding="utf-8")
+    told = [*map(str, curves), _unexplained_text(unexplained, scan)]
+    (folder / "map.md").write_text("\n\n".join(told) + "\n", encoding="utf-8")
     measure = next(name for name in scan if name in OF_CYCLE)
     drawn = figures.save(figures.map_figure(scan, str(measure), curves), folder, "map")
     return [folder / "map.csv", folder / "map.md", *drawn]
+
+
+def _unexplained_text(changes: Sequence[Change], scan: xr.Dataset) -> str:
+    """Where neighbouring samples differ in a sign, and no curve says why."""
+    lines = [f"Changes between neighbouring samples beside which no curve runs: {len(changes)}"]
+    for change in changes:
+        at = [float(scan[n][i]) for n, i in zip(scan.outcome.dims, change.sample, strict=True)]
+        lines.append(f"    {change.name} at ({at[0]:.6g}, {at[1]:.6g})")
+    return "\n".join(lines)
 
 
 def _write(folder: Path, store: str, data: xr.Dataset, texts: Mapping[str, str]) -> list[Path]:

@@ -18,14 +18,17 @@ DAMAGED = 1
 """Exit code where a store is damaged."""
 
 
-def planned_scan(settings: "Config", chunk: int | None) -> "Plan":
-    """What the config asks to scan, checked."""
+def planned_scan(settings: "Config", chunk: int | None, also: tuple[str, ...] = ()) -> "Plan":
+    """What the config asks to scan, checked, and the measures `also` wanted."""
     from vrw_jax.scans import plan
 
     assert settings.design is not None
+    measures = settings.scan.measures
+    if also:
+        measures = tuple(dict.fromkeys((*(measures or ("dls_fraction",)), *also)))
     return plan(
         settings.design,
-        settings.scan.measures,
+        measures,
         base=settings.params(),
         model=settings.wheel_model(),
         options=settings.numerical_options(),

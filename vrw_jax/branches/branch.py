@@ -1,4 +1,4 @@
-"""What a continuation hands back: a labelled branch, and the borders on it."""
+"""What a continuation hands back: a labelled branch with its borders, and a border as a curve."""
 
 from __future__ import annotations
 
@@ -147,3 +147,54 @@ class Branch:
              for b in self.borders),
             (self.parameter, "kind", "name", ""),
         )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Meeting:
+    """A point of codimension two: a border's curve meets another border there."""
+
+    name: str  # of the other border
+    values: tuple[float, float]  # of the two parameters
+    ends_curve: bool  # whether gaits end there
+
+    def __str__(self) -> str:
+        ends = ", ends the curve" if self.ends_curve else ""
+        return f"({self.values[0]:.9g}, {self.values[1]:.9g}): meets {self.name}{ends}"
+
+
+@dataclass(frozen=True, repr=False)
+class BorderCurve:
+    """A border in two parameters, its points in order along the dimension `point`.
+
+    - `name`: of the border;
+    - `parameters`: names of the two;
+    - `dataset`: durations, spectral radius and section state along the curve;
+    - `meetings`: where it meets other borders, points of codimension two;
+    - `ends`: for either end why it was followed no further; both alike where it is closed.
+
+    Examples:
+        >>> cycle = vrw.limit_cycle(vrw.WheelParams(damping=150.0))
+        >>> curve = vrw.border_curve("clearance_sls1", ("damping", "stiffness"), cycle)
+        >>> curve.values.shape[1], curve.parameters
+        (2, ('damping', 'stiffness'))
+    """
+
+    name: str
+    parameters: tuple[str, str]
+    dataset: xr.Dataset
+    meetings: tuple[Meeting, ...]
+    ends: tuple[str, str]
+
+    @property
+    def values(self) -> np.ndarray:
+        """The two parameters at each point, (point, 2)."""
+        return np.stack([self.dataset[name].values for name in self.parameters], -1)
+
+    def __str__(self) -> str:
+        first, second = self.parameters
+        lines = [f"Border {self.name} over {first} and {second}: {len(self.values)} points."]
+        for end, text in zip((0, -1), self.ends, strict=True):
+            lines.append(f"  at ({self.values[end][0]:.6g}, {self.values[end][1]:.6g}): {text}")
+        return "\n".join([*lines, *(f"    {meeting}" for meeting in self.meetings)])
+
+    __repr__ = __str__

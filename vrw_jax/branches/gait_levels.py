@@ -28,6 +28,7 @@ from vrw_jax.numerics import (
     AbstractLevel,
     LevelLinear,
     Options,
+    Passage,
     Scalar,
     Section,
     Solution,
@@ -35,15 +36,37 @@ from vrw_jax.numerics import (
     one_wheel,
 )
 from vrw_jax.results import MARGINS
-from vrw_jax.wheel import PARAMETER_NAMES, parameters_of, transitions, wheel_of
+from vrw_jax.wheel import (
+    PARAMETER_NAMES,
+    Instant,
+    Symbols,
+    parameters_of,
+    phases_of,
+    transitions,
+    wheel_of,
+)
 
 EXACT: Mapping[str, str] = GaitRun.exact
 VOID = (*INDICATORS, "duration_sls1", "duration_sls2")
-"""Where one of these vanishes the step itself goes one way or the other: what it says is void. That
-of double support vanishes with the rear foot's force alone."""
+"""Where one of these vanishes the step itself goes one way or the other: what it says is void."""
 
-FORMAL = (*VOID, *EXACT.values())
+ROLLS_OFF = "duration_dls"
+"""The border where double support comes to last no time: the rear foot's force vanishes there and
+falls. Where it vanishes and rises, at that of `lambda_4_plus`, the step jumps."""
+
+FALLS, JUMPS = "fall of the rear foot's force at first", "its mean fall in double support"
+"""N/s. The first is positive on `ROLLS_OFF`, which ends where it is zero. The second vanishes on
+the border of `lambda_4_plus`, and not on `ROLLS_OFF`, which solves the same equations besides."""
+
+FORMAL = (*VOID, *EXACT.values(), FALLS, JUMPS)
 """Quantities of the collocated gait itself, which go on beyond the border."""
+
+
+def level_of(name: str, rolls: bool) -> str:
+    """The quantity that is solved for at a border; `rolls`: of gaits with double support."""
+    if name == "lambda_4_plus" and rolls:
+        return JUMPS
+    return "lambda_4_plus" if name == ROLLS_OFF else EXACT.get(name, name)
 
 
 def quantities_of(name: str, n_legs: int) -> tuple[str, ...]:
@@ -51,7 +74,7 @@ def quantities_of(name: str, n_legs: int) -> tuple[str, ...]:
     legs = [f"[{leg}]" for leg in range(3, n_legs + 1)]
     by_step = [n + leg for n, margin in MARGINS.items() for leg in (legs if margin.axis else [""])]
     kinds = BIFURCATIONS, FORMAL, tuple(name for name in by_step if name not in FORMAL)
-    return next(kind for kind in kinds if EXACT.get(name, name) in kind)
+    return next(kind for kind in kinds if level_of(name, True) in kind)
 
 
 class GaitAt(NamedTuple):
@@ -130,11 +153,27 @@ class GaitLevel(AbstractLevel):
 def _formal(problem: Problem, parameters: Array, happens: Array, z: Solution) -> Array:
     """FORMAL of one wheel or of lanes."""
     s = wheel_of(parameters, problem.n_legs).symbols()
-    ((_, sls1, sls2),) = problem.passages(parameters, z)[1]
+    ((dls, sls1, sls2),) = problem.passages(parameters, z)[1]
     landing = transitions.land(s, sls2.end.q[0], *sls2.end.v)
     fore, rear = transitions.landing_forces(s, landing)
     forces = landing.rear.normal, fore.normal, rear.normal
-    return jnp.stack([*forces, *z.durations[0, 1:], takeoff_acceleration(s, sls1)])
+    lasts, *others = z.durations[0]
+    return jnp.stack([*forces, *others, takeoff_acceleration(s, sls1), *_falls(s, dls, lasts)])
+
+
+def _falls(s: Symbols, dls: Passage, lasts: Array) -> tuple[Array, Array]:
+    """FALLS and JUMPS, of one wheel or of lanes."""
+    phase = phases_of(s, dls.start.held[0], stop_at_lift_off=False)[0]
+
+    def instant(theta: Array, dtheta: Array) -> Instant:
+        return Instant(phase, phase.at((theta,), (dtheta,)), None)
+
+    force = lambda *at: phase.end(instant(*at))
+    begin, end = (*dls.start.q, *dls.start.v), (*dls.end.q, *dls.end.v)
+    rates = begin[1], instant(*begin).acceleration.ddtheta
+    at_first, rises = jax.jvp(force, begin, rates)
+    mean = (at_first - force(*end)) / jnp.where(lasts == 0.0, 1.0, lasts)
+    return -rises, mean
 
 
 def _monodromy(problem: Problem, parameters: Array, happens: Array, z: Solution) -> Array:

@@ -44,6 +44,9 @@ ACCURACY = 1e-10
 AT_FOLD = 1e-6
 """The same as a share of the bracket, where the parameter turns back: it enters squared."""
 
+SHARES_WHERE_LOST = (0.99, 0.9)
+"""Of the way to a zero so ill-conditioned that no point is found beside it."""
+
 SHAPES = (1, 8)
 """Points that are measured or located side by side; one shape where much is compiled for it."""
 
@@ -241,6 +244,12 @@ def _zeros(run: AbstractRun, pieces: _Pieces, asked: list[tuple[int, int, str]])
     best, _ = evaluated(found.place, every)
     # A little to the left even of an exact zero: there it is still what the branch stands for.
     beside, table = evaluated(np.maximum(found.left - width, 0.0), every)
+    for share in SHARES_WHERE_LOST:
+        lost, rows = np.flatnonzero(~(table[IN_SEQUENCE] > 0.0)), np.arange(len(asked))
+        if len(lost):
+            there = evaluated(share * found.left[lost], lost)
+            rows[lost] = len(rows) + np.arange(len(lost))
+            beside, table = taken(joined((beside, table), there), rows)
     return [
         _Zero(
             asked[i],
@@ -290,8 +299,11 @@ def _reaches(pieces: _Pieces, starts: Mapping[int, int]) -> list[_Reach]:
     for owner, start in starts.items():
         own = np.flatnonzero(pieces.owners == owner)
         good = pieces.table[IN_SEQUENCE][own] > 0.0
-        if not good[start]:
+        # A start on a border is as often beyond it as not: then it is beside the branch's end.
+        near = [i for i in (start, start + 1, start - 1) if 0 <= i < len(own) and good[i]]
+        if not near:
             continue
+        start = near[0]
         low = high = start
         while low > 0 and good[low - 1]:
             low -= 1
