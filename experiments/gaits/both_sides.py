@@ -53,12 +53,18 @@ class Beside(NamedTuple):
     told: np.ndarray  # what vanishes on the curve
 
 
-def of_gaits(curve: vrw.BorderCurve, places: np.ndarray, values: np.ndarray, cold: bool) -> Beside:
+def of_gaits(
+    curve: vrw.BorderCurve,
+    places: np.ndarray,
+    values: np.ndarray,
+    options: vrw.CycleOptions,
+    cold: bool,
+) -> Beside:
     """The gaits there, from nothing or from the curve's own."""
     params = vrw.WheelParams(**dict(zip(curve.parameters, values.T, strict=True)))
     params = jax.tree.map(lambda x: jnp.broadcast_to(x, len(values)), params)
     near = jnp.asarray(curve.dataset.section_state.values[places])
-    options, tight = vrw.CycleOptions.tight(), vrw.Options.tight()
+    tight = vrw.Options.tight()
     if cold:
         gait = jax.vmap(lambda p: vrw.limit_cycle(p, options=options))(params)
     else:
@@ -88,14 +94,21 @@ def right(name: str, one: Beside, other: Beside) -> np.ndarray:
     return one.there & other.there & (one.told * other.told < 0.0)
 
 
-def judged(curve: vrw.BorderCurve, box: Box, count: int, random: np.random.Generator) -> dict:
-    """A row of the table."""
+def judged(
+    curve: vrw.BorderCurve,
+    box: Box,
+    count: int,
+    random: np.random.Generator,
+    options: vrw.CycleOptions | None = None,
+) -> dict:
+    """A row of the table; by gaits of `CycleOptions.tight()`, if none are given."""
+    options = vrw.CycleOptions.tight() if options is None else options
     inner = np.arange(1, len(curve.values) - 1)
     places = np.sort(random.choice(inner, min(count, len(inner)), replace=False))
     sides = beside(curve, places, box)
     good = {}
     for cold in (True, False):
-        one, other = (of_gaits(curve, places, values, cold) for values in sides)
+        one, other = (of_gaits(curve, places, values, options, cold) for values in sides)
         good[cold] = right(curve.name, one, other)
     at = curve.values[places][~good[True] & ~good[False]]
     return {
@@ -110,10 +123,10 @@ def judged(curve: vrw.BorderCurve, box: Box, count: int, random: np.random.Gener
 def main() -> None:
     folder, rows = started_with_folder(__doc__), []
     cycle = vrw.limit_cycle(vrw.WheelParams(damping=150.0))
-    random = np.random.default_rng(19)
+    random, fine = np.random.default_rng(19), vrw.CycleOptions.tight().finer().finer()
     for second in SECONDS:
         for curve in border_curves(BORDERS, ("damping", second), cycle):
-            rows.append(judged(curve, BOX, POINTS, random))
+            rows.append(judged(curve, BOX, POINTS, random, fine))
             print(rows[-1], flush=True)
             tables.write_named(folder / "both_sides.csv", rows)
 

@@ -295,6 +295,19 @@ def test_neighbours_cycle_is_a_quicker_start():
 
 
 @pytest.mark.slow
+def test_long_double_support_is_found_where_rounding_exceeds_the_tolerance():
+    draw, n = np.random.default_rng(5).uniform, 64
+    wheel = vrw.WheelParams(damping=draw(50.0, 130.0, n), stiffness=draw(203.0, 215.0, n))
+    params = jax.tree.map(lambda x: jnp.broadcast_to(x, n), wheel)
+    known = vrw.limit_cycles(params)
+    assert np.max(known.durations[:, 0]) > 3.0
+    fine = vrw.CycleOptions.tight().finer().finer()
+    again = jax.vmap(lambda p, x: vrw.limit_cycle(p, guess=x, options=fine))
+    found = again(params, known.section_state).found
+    np.testing.assert_array_equal(found, known.found)
+
+
+@pytest.mark.slow
 def test_a_cycle_walked_twice_has_the_multipliers_squared():
     once = vrw.limit_cycle(vrw.WheelParams())
     twice = vrw.limit_cycle(vrw.WheelParams(), guess=once, period_n=2)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.branches.branch import Border, BorderCurve, Meeting
-from vrw_jax.branches.continuation import ENDING, GaitRun, continue_branches
+from vrw_jax.branches.continuation import ENDING, REFINEMENTS, GaitRun, continue_branches
 from vrw_jax.branches.followed import Wheel
 from vrw_jax.branches.gait_levels import (
     EXACT,
@@ -52,9 +52,6 @@ OF_CURVES = ArclengthOptions(first_step=5e-4, max_points=1000)
 
 SIDE_BY_SIDE = 4
 """Curves in a batch, both ways each: one group of lanes of machine code, one shape to compile."""
-
-FINER = 1
-"""How often a curve is followed again on a mesh twice as fine, where its gaits ask for one."""
 
 SAME = 2e-3
 """How near to a curve a point lies on it, lengths measured as along the curve."""
@@ -214,8 +211,8 @@ class Tracer(NamedTuple):
     def _batch(self, kind: tuple[str, ...], seeds: list[Seed]) -> list[Traced]:
         """A curve through each that has one, on a mesh that is fine enough for it."""
         told: list[Traced] = []
-        for refinement in range(1 + FINER):
-            finest = refinement == FINER
+        for refinement in range(1 + REFINEMENTS):
+            finest = refinement == REFINEMENTS
             strands = self._strands(kind, seeds, finest)
             rough = []
             for seed, (strand, problem) in zip(seeds, strands, strict=True):

@@ -244,11 +244,11 @@ def newton(
     """Newton's method with limited steps on the lanes that are `pending`.
 
     During the first `stages` iterations the parameters move from `origin` to where they belong. A
-    lane that converged stands still, so that its result does not depend on its neighbours.
+    lane that converged, or whose corrections rounding keeps from shrinking, stands still, so that
+    its result does not depend on its neighbours.
     """
     options = problem.options
-    floor = 1e3 * jnp.finfo(parameters.dtype).eps
-    tolerance = max(options.tolerance, float(floor))
+    tolerance = max(options.tolerance, 1e3 * float(jnp.finfo(parameters.dtype).eps))
 
     def iterate(now: _Iterate) -> _Iterate:
         share = jnp.minimum(1.0, (now.iteration + 1) / jnp.maximum(stages, 1)).astype(
@@ -268,7 +268,8 @@ def newton(
         def moved(x: Array, change: Array) -> Array:
             return jnp.where(moves, x + share_of_step * jnp.where(moves, change, 0.0), x)
 
-        converged = moves & arrived & (step_size < tolerance)
+        at_rounding = (step_size < CycleOptions.tolerance) & (step_size > 0.5 * now.residual)
+        converged = moves & arrived & ((step_size < tolerance) | at_rounding)
         located = now.located._replace(
             solution=jax.tree.map(moved, solution, correction),
             ends=take(passed.ends, now.located.ends),
