@@ -12,11 +12,12 @@ import pytest
 import vrw_jax as vrw
 from vrw_jax import simd
 from vrw_jax.cycles import on_ground
-from vrw_jax.models import step_lanes
+from vrw_jax.models import as_full_states, step_lanes
 from vrw_jax.models.ladder import UNILATERAL, VISCOELASTIC
 from vrw_jax.models.unilateral import queues as ground_lanes
 from vrw_jax.numerics.arclength import ArclengthOptions
 from vrw_jax.numerics.floquet import bifurcation_margins, jury_margins, multipliers
+from vrw_jax.wheel import PARAMETER_NAMES
 
 START = (0.1, 1.6, -0.1)
 SLOW = vrw.WheelParams(damping=300.0)
@@ -283,6 +284,23 @@ def test_what_a_lane_gives_does_not_depend_on_its_company(lanes):
     together, alone = walked(slice(None)), walked(slice(1, 2))
     for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
         np.testing.assert_array_equal(a[1], b[0])
+
+
+@pytest.mark.slow
+def test_how_a_lane_moves_does_not_depend_on_its_company(lanes):
+    """Beside wheels with other events, and with more directions than one lane carries."""
+    damping, friction, states, _ = lanes
+    some = [0, 1, 2, 4, 6]
+
+    values = np.tile(np.asarray(GROUND.values(SLOW))[:, None], len(damping))
+    values[PARAMETER_NAMES.index("damping")], values[-1] = damping, friction
+    x = as_full_states(values, states, 8)
+    x[:, 4 + 16 + 3 : 4 + 16 + 6] = 0.0  # legs off their stoppers
+    moved = lambda places: step_lanes(values[:, places], x[places], GROUND, LANES, 8)
+    together, alone = moved(some), moved([2])
+    assert (np.abs(together[1].section_state).sum(1) > 0.0).sum(1).max() > ground_lanes.DIRECTIONS
+    for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
+        np.testing.assert_array_equal(a[2], b[0])
 
 
 @pytest.mark.slow

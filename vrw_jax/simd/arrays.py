@@ -160,7 +160,7 @@ class Arrays:
             self.fill(memory, array.whole)
             array.store_into(memory)
             return
-        if isinstance(array, np.ndarray):
+        if isinstance(array, np.ndarray) and any(array.strides):
             for index in np.ndindex(memory.shape):
                 memory.store(index, array[index])
             return

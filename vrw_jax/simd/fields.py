@@ -26,10 +26,11 @@ class Field:
 
 
 class Updated(Field):
-    """An array in memory, but for a part of it."""
+    """An array in memory, or of one number, but for a part of it."""
 
-    def __init__(self, arrays: Any, whole: "Memory", part: "Entries", begin: Index) -> None:
-        super().__init__(whole.shape, whole.kind, self.load)
+    def __init__(self, arrays: Any, whole: "Entries", part: "Entries", begin: Index) -> None:
+        kind = part.kind if isinstance(part, Field) else part.ravel()[0].type
+        super().__init__(whole.shape, kind, self.load)
         self.arrays, self.whole, self.part, self.begin = arrays, whole, part, begin
 
     def load(self, index: Index) -> Value:

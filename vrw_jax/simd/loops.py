@@ -113,8 +113,10 @@ class _Carry:
         for array, place in zip(arrays, self.places, strict=True):
             if place is None or (isinstance(array, Memory) and array.base is place.base):
                 continue
-            if isinstance(array, Updated) and array.whole.base is place.base:
+            if isinstance(array, Updated) and getattr(array.whole, "base", None) is place.base:
                 moves.append((place, array.ready()))
+            elif isinstance(array, Memory) and self._apart(array):
+                moves.append((place, array))
             else:
                 copy = self.owner.room(place.shape, place.kind)
                 self.owner.fill(copy, array)
@@ -125,6 +127,11 @@ class _Carry:
             else:
                 self.owner.fill(place, fresh)
         return flat
+
+    def _apart(self, array: Memory) -> bool:
+        """Whether it lies in a room of its own."""
+        rooms = [place.base for place in self.places if place is not None]
+        return isinstance(array.base, ir.AllocaInstr) and array.base not in rooms
 
     def _in_registers(self, arrays: Sequence[Entries]) -> list[Value]:
         triples = zip(arrays, self.avals, self.places, strict=True)

@@ -145,7 +145,8 @@ def dynamic_update_slice(
     if has_lanes(asked.out) and not has_lanes(asked.given[1]):
         raise moved(asked.name)
     begin = _starts(arrays, asked.given[1:], array.shape, update.shape, starts)
-    return Updated(arrays, arrays.in_memory(array), update, begin)
+    same = isinstance(array, np.ndarray) and not any(array.strides)
+    return Updated(arrays, array if same else arrays.in_memory(array), update, begin)
 
 
 def _starts(

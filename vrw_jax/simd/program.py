@@ -45,9 +45,9 @@ def lane_program(
     """`function(uniform, lanes)` compiled: `uniform` numbers, `lanes` arrays of the float `dtype`.
 
     It must be elementwise over lanes, but for loops that end where no lane goes on, and return a
-    flat tuple of arrays of the lanes' length. `key` says by `repr` what its trace depends on but
-    shapes: what it closes over, and its text. Code is kept in `store`, if there is one; parts of
-    large arrays with up to `small` entries are registers. The result
+    flat tuple of arrays whose last axis are lanes. `key` says by `repr` what its trace depends on
+    but shapes: what it closes over, and its text. Code is kept in `store`, if there is one; parts
+    of large arrays with up to `small` entries are registers. The result
     takes numpy arrays of any equal length and gives bitwise the same for a lane in any
     company; it uses all cores that the process may.
     """
@@ -130,7 +130,7 @@ class _Program:
     """Machine code for numpy's arrays."""
 
     def __init__(self, code: Code, width: int) -> None:
-        self.out, self.width = [kind for _, kind in code.out], width
+        self.out, self.width = code.out, width
         self._loaded = Loaded(code.code)
         pointer, count = ctypes.c_void_p, ctypes.c_int64
         signature = ctypes.CFUNCTYPE(None, pointer, pointer, count, count, count)
@@ -141,7 +141,7 @@ class _Program:
         groups = -(-n // self.width)
         filled = [_filled(x, groups * self.width) for x in lanes]
         numbers = [np.asarray(x) for x in uniform]
-        out = [np.empty(groups * self.width, kind) for kind in self.out]
+        out = [np.empty((*shape, groups * self.width), kind) for shape, kind in self.out]
         given, told = _pointers([*numbers, *filled]), _pointers(out)
         length = groups * self.width
         run = lambda begin: self._run(given, told, length, begin, min(begin + TOGETHER, groups))
@@ -152,7 +152,7 @@ class _Program:
         else:
             for begin in pieces:
                 run(begin)
-        return [x[:n] for x in out]
+        return [x[..., :n] for x in out]
 
 
 def _filled(x: np.ndarray, length: int) -> np.ndarray:

@@ -12,6 +12,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Int
 
+from vrw_jax.models.unilateral.carrying import Carried, Stand, in_impact, told_by
 from vrw_jax.models.unilateral.contacts import (
     ACCEPTED,
     ANY_MODE,
@@ -21,11 +22,9 @@ from vrw_jax.models.unilateral.contacts import (
     STICK,
     THE_PAPERS,
     Allowed,
-    Answer,
     Chosen,
     Negligible,
     Roughness,
-    answer,
     choose,
     leaves,
 )
@@ -114,7 +113,7 @@ class _Solved(NamedTuple):
     """What a guess of the legs held in the air leads to."""
 
     chosen: Chosen
-    answer: Answer
+    answer: Carried
     push: Legs  # of the stoppers, N or N s
     outward: Legs  # of the legs, m/s^2 or m/s
     motion: WheelMotion  # of an impact: after it
@@ -190,16 +189,10 @@ class Change(NamedTuple):
     third_foot: Bool[Array, "..."]  # three feet would have to be loaded
 
 
-def moved_by(
-    s: Symbols, motion: WheelMotion, slots: Slots, hub: Hub, airborne: Array, found: Answer
-) -> WheelMotion:
+def _after(motion: WheelMotion, found: Carried) -> WheelMotion:
     """The motion with the velocities of an impact's answer."""
-    free = free_velocity(s, motion, slots, hub)
     vx, vz, dtheta = found.hub
-    dL = free.legs + hub.legs.sin * vx + hub.legs.cos * vz
-    held = jnp.where(airborne, 0.0, dL)
-    dL = jnp.where(slots.filled, slots.spread(found.length), held)
-    return motion._replace(vx=vx, vz=vz, dtheta=dtheta, dL=dL)
+    return motion._replace(vx=vx, vz=vz, dtheta=dtheta, dL=found.lengths)
 
 
 def _thrown_back(law: Law, motion: WheelMotion, slots: Slots, hub: Hub, free: Free) -> Free:
@@ -261,15 +254,16 @@ def _impact(
 
     def solve(law: Law, motion: WheelMotion, airborne: Array, chosen: Chosen | None) -> _Solved:
         s, friction = law.s, of_slots(law.friction, slots)
-        hub = hub_of(s, motion, slots, airborne)
+        legs, hub = directions(s, motion.theta), hub_of(s, motion, slots, airborne)
         free = free_velocity(s, motion, slots, hub)
         given = _thrown_back(law, motion, slots, hub, free)
         if chosen is None:
             chosen = choose(s, hub, given, allowed, friction, small, law.counted)
-        found = answer(s, hub, given, chosen.contact, chosen.held, friction)
-        after = moved_by(s, motion, slots, hub, airborne, found)
+        stand = Stand(s, motion, friction, slots, chosen.contact, chosen.held, airborne)
+        found = in_impact(stand) if law.restitution is None else told_by(stand, hub, given)
+        after = _after(motion, found)
         jump_x, jump_z = after.vx - motion.vx, after.vz - motion.vz
-        impulse = s.m * (hub.legs.sin * jump_x + hub.legs.cos * jump_z + motion.dL)
+        impulse = s.m * (legs.sin * jump_x + legs.cos * jump_z + motion.dL)
         return _Solved(chosen, found, impulse, after.dL, after)
 
     airborne = at_stopper & ~slots.filled
@@ -338,7 +332,8 @@ def _support(
             modes, known = _following(event, mode, leaving & ~rigid, rigid)
             allowed = Allowed(modes, ~opens, rests & False, known, opens)
             chosen = choose(s, hub, free, allowed, friction, small, law.counted)
-        found = answer(s, hub, free, chosen.contact, chosen.held, friction)
+        stand = Stand(s, motion, friction, slots, chosen.contact, chosen.held, airborne)
+        found = told_by(stand, hub, free)
         ax, az, _ = found.hub
         outward = free.legs + hub.legs.sin * ax + hub.legs.cos * az
         return _Solved(chosen, found, s.m * outward, outward, motion)
@@ -454,13 +449,11 @@ def settled(
     motion = motion._replace(L=jnp.where(locked, s.L0, L))
     slots = slots_of(contact != OFF)
     airborne = locked & ~slots.filled
-    hub = hub_of(s, motion, slots, airborne)
-    free = free_velocity(s, motion, slots, hub)
     modes, held = slots.codes(contact), slots.flags(locked)
     # Two resting feet on two held legs would fix the hub twice over.
     twice = jnp.all((modes == STICK) & held, axis=0)
     held = jnp.stack([held[0], held[1] & ~twice])
     rough = jnp.zeros_like(motion.theta) if friction is None else of_slots(friction, slots)
-    found = answer(s, hub, free, modes, held, rough)
-    moved = moved_by(s, motion, slots, hub, airborne, found)
+    stand = Stand(s, motion, rough, slots, modes, held, airborne)
+    moved = _after(motion, in_impact(stand))
     return moved._replace(dL=jnp.where(locked, 0.0, moved.dL))

@@ -35,10 +35,8 @@ from vrw_jax.models.unilateral.march import (
     N_TALLIED,
     March,
     Place,
-    Way,
     coordinates,
     marched,
-    marched_along,
     motion_of,
     set_off,
 )
@@ -89,7 +87,7 @@ def told_like(n: int, dtype: Any, detailed: bool) -> Walked:
     return Walked(told, none, none, none)
 
 
-class _Moves(NamedTuple):
+class Moves(NamedTuple):
     """What of a lane moves with its columns and its start."""
 
     q: Array
@@ -100,7 +98,7 @@ class _Moves(NamedTuple):
     details: Any  # its floats
 
 
-class _Lane(NamedTuple):
+class Lane(NamedTuple):
     """A wheel on its way."""
 
     now: March
@@ -110,13 +108,13 @@ class _Lane(NamedTuple):
     n_stepped: Array
     outcome: Array
 
-    def moves(self) -> _Moves:
+    def moves(self) -> Moves:
         """The part that moves."""
         here, details = self.now.here, eqx.filter(self.details, eqx.is_inexact_array)
         told = self.tally, self.now.told
-        return _Moves(here.q, here.v, told, self.now.time, self.ledger.durations, details)
+        return Moves(here.q, here.v, told, self.now.time, self.ledger.durations, details)
 
-    def moved(self, moves: _Moves) -> "_Lane":
+    def moved(self, moves: Moves) -> "Lane":
         """The same with that part."""
         tally, told = moves.told
         here = self.now.here._replace(q=moves.q, v=moves.v)
@@ -150,7 +148,7 @@ class Walk(NamedTuple):
         """Symbols and friction of lanes."""
         return symbols_of(self.n, *columns[:-1]), as_ruled(columns[-1], self.by_paper)
 
-    def begun(self, columns: Array, x: Array) -> _Lane:
+    def begun(self, columns: Array, x: Array) -> Lane:
         """Lanes that stand where the first landing of their walk is to be resolved."""
         motion, stance = opened(self.of(columns)[0], x)
         flow = self.flow(columns, stance)
@@ -158,7 +156,7 @@ class Walk(NamedTuple):
         q, v = coordinates(motion)
         here = Place(q, v, jnp.full_like(now.here.slope, jnp.inf))
         now = now._replace(here=here, stance=stance, verdict=now.verdict + EVENT)
-        return _Lane(now, *self._blank(x[0]), now.guard * 0, now.guard * 0 + UNDER_WAY)
+        return Lane(now, *self._blank(x[0]), now.guard * 0, now.guard * 0 + UNDER_WAY)
 
     def _blank(self, like: Array) -> tuple[Ledger, Details | None, Array | None]:
         """What a step of lanes begins with."""
@@ -168,7 +166,7 @@ class Walk(NamedTuple):
         details = jax.tree.map(many, no_details(like.dtype))
         return blank(like), details, jnp.zeros((N_TALLIED, *like.shape), like.dtype)
 
-    def past_events(self, columns: Array, lane: _Lane) -> _Lane:
+    def past_events(self, columns: Array, lane: Lane) -> Lane:
         """Lanes that no longer march through their events, or to the end of their walk."""
         now, place = lane.now, guards_of(self.n, self.one_sided)
         s, friction = self.of(columns)
@@ -184,7 +182,7 @@ class Walk(NamedTuple):
         outcome = outcome_at(*known, self.max_events).astype(jnp.int32)
         n_stepped = lane.n_stepped + landed
         ends = (outcome != Outcome.STEPPED) | (landed & (n_stepped >= self.n_steps))
-        over = _Lane(now, ledger, details, tally, n_stepped, outcome)
+        over = Lane(now, ledger, details, tally, n_stepped, outcome)
 
         # A landing of the foremost foot opens the next step; all go through their events.
         opens, motion = landed & ~ends, motion_of(now.here)
@@ -206,11 +204,11 @@ class Walk(NamedTuple):
             none = jnp.zeros_like(motion.x)
             details = stretched(details, flow, change.motion, none)
         ledger = ledger._replace(events=ledger.events + 1)
-        goes = _Lane(after, ledger, details, tally, n_stepped, lane.outcome)
+        goes = Lane(after, ledger, details, tally, n_stepped, lane.outcome)
         ended = (now.verdict != MARCHING) & (lane.outcome == UNDER_WAY)
         return select(ended, select(ends, over, goes), lane)
 
-    def told(self, lane: _Lane) -> Any:
+    def told(self, lane: Lane) -> Any:
         """Of the last step of lanes that go no further."""
         stands, code = (motion_of(lane.now.here), lane.now.stance), lane.outcome
         if lane.details is not None and lane.tally is not None:
@@ -228,7 +226,7 @@ class Walk(NamedTuple):
         good, params, friction, x = made_sound(wheel_of(columns[:-1], self.n), columns[-1], x)
         return jnp.stack([*parameters_of(params), friction]), x, good
 
-    def barred(self, lane: _Lane, good: Array) -> _Lane:
+    def barred(self, lane: Lane, good: Array) -> Lane:
         """Without those that can't begin."""
         return lane._replace(outcome=jnp.where(good, lane.outcome, Outcome.BAD_INPUT))
 
@@ -239,13 +237,13 @@ def stretched(details: Details, flow: Flow, motion: WheelMotion, duration: Array
     return stretch_noted(details, flow.contact, duration, force)
 
 
-def started(on: Walk, columns: Array, x: Array) -> tuple[Array, _Lane]:
+def started(on: Walk, columns: Array, x: Array) -> tuple[Array, Lane]:
     """Columns that a walk may have, and lanes before its first landing."""
     columns, x, good = on.sound(columns, x)
     return columns, on.barred(on.begun(columns, x), good)
 
 
-def turned(on: Walk, columns: Array, lane: _Lane, waits: bool = False) -> tuple[_Lane, _Lane]:
+def turned(on: Walk, columns: Array, lane: Lane, waits: bool = False) -> tuple[Lane, Lane]:
     """Lanes past their events, and on from there: to the next one where it `waits` for that."""
     past = on.past_events(columns, lane)
     hurry, flow_at = past.outcome == UNDER_WAY, lambda c: on.flow(c, past.now.stance)
@@ -261,42 +259,3 @@ def walked(on: Walk, columns: Array, x: Array) -> Walked:
     goes_on = lambda lane: jnp.any(lane.outcome == UNDER_WAY)
     lane = lax.while_loop(goes_on, turn, lane)
     return Walked(on.told(lane), lane.outcome, lane.n_stepped, lane.ledger.tried)
-
-
-def walked_along(
-    on: Walk, columns: Array, x: Array, d_columns: Array, d_x: Array
-) -> tuple[Walked, Any]:
-    """The same, and how what is told moves along a direction of each lane: its floats."""
-    columns, x, good = on.sound(columns, x)
-    moving = lambda tree: eqx.partition(tree, eqx.is_inexact_array)
-
-    def begun(columns: Array, x: Array) -> tuple[_Moves, _Lane]:
-        lane = on.barred(on.begun(columns, x), good)
-        return lane.moves(), lane
-
-    def turn(state: tuple[_Lane, _Moves]) -> tuple[_Lane, _Moves]:
-        lane, ways = state
-
-        def past_events(columns: Array, moves: _Moves) -> tuple[_Moves, _Lane]:
-            after = on.past_events(columns, lane.moved(moves))
-            return after.moves(), after
-
-        at, along = (columns, lane.moves()), (d_columns, ways)
-        _, ways, after = jax.jvp(past_events, at, along, has_aux=True)
-        under_way, flow_at = after.outcome == UNDER_WAY, lambda c: on.flow(c, after.now.stance)
-        tally, told = ways.told
-        way = Way(d_columns, ways.q, ways.v, told, jnp.zeros_like(ways.time))
-        given = flow_at, columns, after.now, way, under_way, on.options, on.tableau
-        now, way = marched_along(*given)
-        ways = ways._replace(q=way.q, v=way.v, told=(tally, way.told), time=way.later)
-        return after._replace(now=now), ways
-
-    def told(moves: _Moves) -> tuple[Any, Any]:
-        return moving(on.told(lane.moved(moves)))
-
-    _, ways, lane = jax.jvp(begun, (columns, x), (d_columns, d_x), has_aux=True)
-    goes_on = lambda state: jnp.any(state[0].outcome == UNDER_WAY)
-    lane, ways = lax.while_loop(goes_on, turn, (lane, ways))
-    floats, moved, rest = jax.jvp(told, (lane.moves(),), (ways,), has_aux=True)
-    step = eqx.combine(floats, rest)
-    return Walked(step, lane.outcome, lane.n_stepped, lane.ledger.tried), moved

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from vrw_jax.models.unilateral.mechanics import WheelMotion, directions, kept, one_of, stilled
+from vrw_jax.models.unilateral.mechanics import WheelMotion, directions, kept, one_of
 from vrw_jax.models.unilateral.motion import (
     Felt,
     Flow,
@@ -21,7 +21,6 @@ from vrw_jax.models.unilateral.motion import (
     felt,
     forces,
     guard_sizes,
-    leg_acceleration,
     stance_guards,
     tally_rates,
 )
@@ -100,7 +99,7 @@ def motion_of(place: Place) -> WheelMotion:
 def place_of(flow: Flow, motion: WheelMotion) -> Place:
     """The inverse of `motion_of`, with the slope there."""
     q, v = coordinates(motion)
-    return Place(q, v, _slope(flow, q, v))
+    return Place(q, v, slope_at(flow, q, v))
 
 
 def coordinates(motion: WheelMotion) -> tuple[Array, Array]:
@@ -109,19 +108,18 @@ def coordinates(motion: WheelMotion) -> tuple[Array, Array]:
     return q, jnp.concatenate([jnp.stack([motion.vx, motion.vz, motion.dtheta]), motion.dL])
 
 
-def _slope(flow: Flow, q: Array, v: Array) -> Array:
+def slope_at(flow: Flow, q: Array, v: Array) -> Array:
     """Accelerations of all coordinates, then `Felt` without the directions."""
     motion = motion_of(Place(q, v, q))
     now = forces(flow, motion)
     told = felt(flow, now)
-    ddL = kept(leg_acceleration(flow, now), one_of(motion))
     feet = [*told.normal, *told.tangential, *told.stopper, *told.speed]
     more = [] if told.in_air is None else [told.in_air]
     if flow.tallied:
         tally = tally_rates(flow, motion, now)
         rows = tally.damping, tally.friction, tally.slip
         more.append(jnp.stack(kept(rows, one_of(motion))))
-    return jnp.concatenate([jnp.stack(now.answer.hub), ddL, jnp.stack(feet), *more])
+    return jnp.concatenate([jnp.stack(now.answer.hub), now.answer.lengths, jnp.stack(feet), *more])
 
 
 def guards_at(flow: Flow, place: Place) -> Array:
@@ -139,7 +137,7 @@ def guard_rates(flow: Flow, place: Place) -> Array:
     """Derivatives of the guards in time along the motion."""
 
     def along(q: Array, v: Array) -> Array:
-        return guards_at(flow, Place(q, v, _slope(flow, q, v)))
+        return guards_at(flow, Place(q, v, slope_at(flow, q, v)))
 
     return jax.jvp(along, (place.q, place.v), (place.v, place.slope[: len(place.q)]))[1]
 
@@ -204,12 +202,16 @@ def marched(
     sizes = guard_sizes(flow)
 
     def advance(now: March) -> March:
-        return _advanced(now, tried_step(flow, tableau, options, now), sizes, tableau, options)
+        return advanced(now, tried_step(flow, tableau, options, now), sizes, tableau, options)
 
-    return _while(lambda now: now.verdict == MARCHING, walks, advance, begin)
+    return until_none_marches(lambda now: now.verdict == MARCHING, walks, advance, begin)
 
 
-def _while(marching: Callable[[Any], Array], walks: Array, advance: Callable, begin: Any) -> Any:
+def until_none_marches(
+    marching: Callable[[Any], Array], walks: Array, advance: Callable, begin: Any
+) -> Any:
+    """`advance` until none is `marching`, or, after a burst, any that `walks` has come to rest."""
+
     def goes_on(state: tuple) -> Array:
         now, tries = state
         still = marching(now)
@@ -218,76 +220,6 @@ def _while(marching: Callable[[Any], Array], walks: Array, advance: Callable, be
     none = jnp.zeros((), jnp.int32)
     turn = lambda state: (advance(state[0]), state[1] + 1)
     return lax.while_loop(goes_on, turn, (begin, none))[0]
-
-
-class Way(NamedTuple):
-    """A direction in which each lane moves: its columns and where it is."""
-
-    columns: Array
-    q: Array
-    v: Array
-    told: Array | None
-    later: Array  # how its time moves, s
-
-
-def marched_along(
-    flow_at: FlowAt,
-    columns: Array,
-    begin: March,
-    way: Way,
-    walks: Array,
-    options: Options,
-    tableau: Tableau,
-) -> tuple[March, Way]:
-    """`marched`, with the direction carried along.
-
-    Of the discrete flow at the lengths that were taken, and of the time of the event: see
-    `numerics.tangents`.
-    """
-    sizes = guard_sizes(flow_at(columns))
-
-    def advance(state: tuple[March, Way]) -> tuple[March, Way]:
-        now, way = state
-        n = len(now.here.q)
-
-        def ends(columns: Array, q: Array, v: Array) -> tuple[Array, Try]:
-            flow = flow_at(columns)
-            here = Place(q, v, _slope(flow, q, v))
-            tried = tried_step(flow, tableau, options, now._replace(here=here))
-            gained = [] if tried.told is None else [tried.told]
-            return jnp.concatenate([tried.end.q, tried.end.v, *gained]), tried
-
-        at, along = (columns, now.here.q, now.here.v), (way.columns, way.q, way.v)
-        _, moved, tried = jax.jvp(ends, at, along, has_aux=True)
-        after = _advanced(now, tried, sizes, tableau, options)
-        told = None if way.told is None else way.told + moved[2 * n :]
-        ahead = way._replace(q=moved[:n], v=moved[n : 2 * n], told=told)
-        return after, select(after.time != now.time, ahead, way)
-
-    marching = lambda state: state[0].verdict == MARCHING
-    now, way = _while(marching, walks, advance, (begin, way))
-    return now, _met(flow_at, columns, begin, now, way)
-
-
-def _met(flow_at: FlowAt, columns: Array, begin: March, now: March, way: Way) -> Way:
-    """The direction where the event comes later or earlier along it."""
-    flow, here, n = flow_at(columns), now.here, len(now.here.q)
-
-    def guards(columns: Array, q: Array, v: Array) -> Array:
-        flow = flow_at(columns)
-        return guards_at(flow, Place(q, v, _slope(flow, q, v)))
-
-    at, along = (columns, here.q, here.v), (way.columns, way.q, way.v)
-    moves, rates = jax.jvp(guards, at, along)[1], guard_rates(flow, here)
-    arrived = (begin.verdict == MARCHING) & (now.verdict == EVENT)
-    later = jnp.zeros_like(now.time)
-    for index in range(len(moves)):
-        own = arrived & (now.guard == index) & (rates[index] < 0.0)
-        later = jnp.where(own, -moves[index] / jnp.where(own, rates[index], -1.0), later)
-    told = None
-    if way.told is not None:
-        told = way.told + later * here.slope[-N_TALLIED:]
-    return Way(way.columns, way.q + later * here.v, way.v + later * here.slope[:n], told, later)
 
 
 class Try(NamedTuple):
@@ -302,33 +234,44 @@ class Try(NamedTuple):
     told: Array | None  # what the step adds to `March.told`
 
 
-def tried_step(flow: Flow, tableau: Tableau, options: Options, now: March) -> Try:
-    """Only the end and what is told move with anything: lengths are what they are."""
-    h, n = now.h, now.here.q.shape[0]
-    last = len(tableau.places) - 1
-    once, twice, places = (jnp.asarray(x) for x in (tableau.once, tableau.twice, tableau.places))
+def stage_at(
+    tableau: Tableau, i: Array | int, q: Array, v: Array, slopes: Array, h: Array
+) -> tuple[Array, Array]:
+    """Coordinates and rates at a stage, by the accelerations at those before it."""
+    a, b, place = (jnp.asarray(x)[i] for x in (tableau.once, tableau.twice, tableau.places))
+    n, last = len(q), len(tableau.places) - 1
+    first = sum(a[j] * slopes[j, :n] for j in range(last))
+    second = sum(b[j] * slopes[j, :n] for j in range(last))
+    return q + h * (place * v + h * second), v + h * first
 
-    def at(i: Array | int, here: Place, slopes: Array) -> tuple[Array, Array]:
-        a, b = once[i], twice[i]
-        first = sum(a[j] * slopes[j, :n] for j in range(last))
-        second = sum(b[j] * slopes[j, :n] for j in range(last))
-        return here.q + h * (places[i] * here.v + h * second), here.v + h * first
+
+def tried_step(flow: Flow, tableau: Tableau, options: Options, now: March) -> Try:
+    """One step of the lanes from where they are."""
+    h, here, last = now.h, now.here, len(tableau.places) - 1
 
     def stage(i: Array, slopes: Array) -> Array:
-        slope = _slope(flow, *at(i, now.here, slopes))
+        slope = slope_at(flow, *stage_at(tableau, i, here.q, here.v, slopes, h))
         return lax.dynamic_update_index_in_dim(slopes, slope, i, 0)
 
-    others = jnp.zeros((last, *now.here.slope.shape), h.dtype)
-    slopes = jnp.concatenate([now.here.slope[None], others])
+    others = jnp.zeros((last, *here.slope.shape), h.dtype)
+    slopes = jnp.concatenate([here.slope[None], others])
     slopes = lax.fori_loop(1, last + 1, stage, slopes)
-    end = Place(*at(last, now.here, slopes), slopes[last])
+    return tried_by(flow, tableau, options, now, slopes)
+
+
+def tried_by(flow: Flow, tableau: Tableau, options: Options, now: March, slopes: Array) -> Try:
+    """The step with these slopes at its stages."""
+    h, here, last = now.h, now.here, len(tableau.places) - 1
+    n = len(here.q)
+    end = Place(*stage_at(tableau, last, here.q, here.v, slopes, h), slopes[last])
     told = None
     if flow.tallied:
-        told = h * sum(once[last][j] * slopes[j, -N_TALLIED:] for j in range(last))
-
-    flow, here, slopes = stilled((flow, now.here, slopes))
-    inside = {i: Place(*at(i, here, slopes), slopes[i]) for i in tableau.inside}
-    looked = *inside.values(), stilled(end)
+        told = h * sum(tableau.once[last][j] * slopes[j, -N_TALLIED:] for j in range(last))
+    inside = {
+        i: Place(*stage_at(tableau, i, here.q, here.v, slopes, h), slopes[i])
+        for i in tableau.inside
+    }
+    looked = *inside.values(), end
     *within, values = (guards_at(flow, place) - now.offset for place in looked)
     weigh = lambda weights: sum(float(w) * slopes[j, :n] for j, w in enumerate(weights) if w != 0.0)
     errors = h * h * weigh(tableau.error_twice), h * weigh(tableau.error_once)
@@ -339,7 +282,7 @@ def tried_step(flow: Flow, tableau: Tableau, options: Options, now: March) -> Tr
     return Try(end, squared, values, *bent, to_dip, told)
 
 
-def _advanced(now: March, tried: Try, sizes: Array, tableau: Tableau, options: Options) -> March:
+def advanced(now: March, tried: Try, sizes: Array, tableau: Tableau, options: Options) -> March:
     """The lane takes its step, tries another length, or has come to an event."""
     here, h, search, end = now.here, now.h, now.search, tried.end
     running = now.verdict == MARCHING

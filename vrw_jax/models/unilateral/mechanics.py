@@ -176,12 +176,26 @@ def _inverse_inertia(s: Symbols, legs: Legwise, b: Legs, released: Array) -> tup
     )
 
 
+class Posture(NamedTuple):
+    """Directions of all legs, and where the slots' are."""
+
+    legs: Legwise
+    sin: Pair
+    cos: Pair
+    L: Pair
+
+
+def posture_of(s: Symbols, motion: WheelMotion, slots: Slots) -> Posture:
+    """At this motion."""
+    legs = directions(s, motion.theta)
+    return Posture(legs, slots.of(legs.sin), slots.of(legs.cos), slots.of(motion.L))
+
+
 def hub_of(s: Symbols, motion: WheelMotion, slots: Slots, locked: Array) -> Hub:
     """How hub and slots answer forces at this posture; `locked`: airborne legs on stoppers."""
-    legs = directions(s, motion.theta)
+    legs, sin, cos, L = posture_of(s, motion, slots)
     released = slots.filled | ~locked
     inverse = _inverse_inertia(s, legs, motion.L - s.a, released)
-    sin, cos, L = slots.of(legs.sin), slots.of(legs.cos), slots.of(motion.L)
     e = [(cos[i], -sin[i], -L[i]) for i in range(2)]
     u = [(sin[i], cos[i], jnp.zeros_like(sin[i])) for i in range(2)]
     z = (times(inverse, e[0]), times(inverse, e[1]))
@@ -213,14 +227,20 @@ class Free(NamedTuple):
     u: Pair  # along u
 
 
+def free_legs(s: Symbols, motion: WheelMotion, legs: Legwise) -> Legs:
+    """Acceleration of a leg's length that no force holds, less the hub's share, m/s^2."""
+    gx, gz = s.g * s.sin_phi, -s.g * s.cos_phi
+    spin = (motion.L - s.a) * motion.dtheta * motion.dtheta
+    spring = s.k * (s.Ls - motion.L) - s.c * motion.dL
+    return spin - (legs.sin * gx + legs.cos * gz) + spring / s.m
+
+
 def free_acceleration(s: Symbols, motion: WheelMotion, slots: Slots, hub: Hub) -> Free:
     """Gravity, springs, dampers and rotation, with no force on the slots' feet and stoppers."""
     sin, cos = hub.legs
     b, dtheta = motion.L - s.a, motion.dtheta
     gx, gz = s.g * s.sin_phi, -s.g * s.cos_phi
-    spin = b * dtheta * dtheta
-    spring = s.k * (s.Ls - motion.L) - s.c * motion.dL
-    legs = spin - (sin * gx + cos * gz) + spring / s.m
+    spin, legs = b * dtheta * dtheta, free_legs(s, motion, hub.legs)
     coriolis = 2.0 * motion.dL * dtheta
     radial = jnp.where(hub.released, legs, 0.0) - spin
     force_x = s.Mt * gx + s.m * over_legs(radial * sin + coriolis * cos)
@@ -263,7 +283,7 @@ class FootVelocity(NamedTuple):
     z: Pair
 
 
-def foot_velocity(motion: WheelMotion, slots: Slots, hub: Hub) -> FootVelocity:
+def foot_velocity(motion: WheelMotion, slots: Slots, hub: Hub | Posture) -> FootVelocity:
     """Velocity of the slots' feet along the slope and off it."""
     dL = slots.of(motion.dL)
     x = [motion.vx - dL[i] * hub.sin[i] - hub.L[i] * motion.dtheta * hub.cos[i] for i in range(2)]

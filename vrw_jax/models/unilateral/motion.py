@@ -6,21 +6,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from vrw_jax.models.unilateral.carrying import (
+    Carried,
+    Stand,
+    in_motion,
+    sliding,
+)
 from vrw_jax.models.unilateral.contacts import (
     OFF,
-    SLIP_DOWN,
-    SLIP_UP,
     STICK,
     THE_PAPERS,
-    Answer,
     Roughness,
-    answer,
     rough_of,
 )
 from vrw_jax.models.unilateral.mechanics import (
     FootVelocity,
-    Free,
-    Hub,
     Legs,
     Legwise,
     Pair,
@@ -29,12 +29,12 @@ from vrw_jax.models.unilateral.mechanics import (
     foot_heights,
     foot_places,
     foot_velocity,
-    free_acceleration,
-    hub_of,
+    free_legs,
     kept,
     of_slots,
     one_of,
     over_legs,
+    posture_of,
     slots_of,
 )
 from vrw_jax.numerics import Elementwise, Scalar
@@ -90,6 +90,11 @@ class Flow(NamedTuple):
     tallied: bool  # in lanes: what is summed up is wanted, too
     tilt: Elementwise | None = None  # by which the ground ahead is steeper, rad
 
+    def stand(self, motion: WheelMotion) -> Stand:
+        """The wheel there."""
+        slots = self.slots, self.contact, self.held, self.airborne
+        return Stand(self.s, motion, self.friction, *slots)
+
 
 def flow_of(
     s: Symbols,
@@ -110,27 +115,25 @@ def flow_of(
 class Forces(NamedTuple):
     """Everything that acts at an instant."""
 
-    hub: Hub
-    free: Free
-    answer: Answer
+    legs: Legwise
+    free: Legs  # see `free_legs`
+    answer: Carried
     feet: FootVelocity
 
 
 def forces(flow: Flow, motion: WheelMotion) -> Forces:
     """Contact and stopper forces with the accelerations they leave."""
-    s, slots = flow.s, flow.slots
-    one = one_of(motion)
-    hub = kept(hub_of(s, motion, slots, flow.airborne), one)
-    free = kept(free_acceleration(s, motion, slots, hub), one)
-    found = kept(answer(s, hub, free, flow.contact, flow.held, flow.friction), one)
-    return Forces(hub, free, found, kept(foot_velocity(motion, slots, hub), one))
+    one, posture = one_of(motion), posture_of(flow.s, motion, flow.slots)
+    free = kept(free_legs(flow.s, motion, posture.legs), one)
+    feet = kept(foot_velocity(motion, flow.slots, posture), one)
+    return Forces(posture.legs, free, in_motion(flow.stand(motion)), feet)
 
 
 def _outward(now: Forces) -> Legs:
     """Acceleration of each leg's length that would be, were no force of slots or stoppers there."""
-    sin, cos = now.hub.legs
+    sin, cos = now.legs
     ax, az, _ = now.answer.hub
-    return now.free.legs + sin * ax + cos * az
+    return now.free + sin * ax + cos * az
 
 
 def airborne_stopper_force(flow: Flow, now: Forces) -> Legs:
@@ -143,21 +146,9 @@ def least_stopper_force(flow: Flow, now: Forces) -> Elementwise:
     return jnp.min(jnp.where(flow.airborne, airborne_stopper_force(flow, now), jnp.inf), axis=0)
 
 
-def _sliding(flow: Flow) -> Pair:
-    """1 for a foot that slides downhill, -1 uphill, 0 else."""
-    sign = lambda mode: jnp.where(mode == SLIP_DOWN, 1.0, jnp.where(mode == SLIP_UP, -1.0, 0.0))
-    return sign(flow.contact[0]), sign(flow.contact[1])
-
-
-def leg_acceleration(flow: Flow, now: Forces) -> Legs:
-    """Second derivative of every leg's length, m/s^2."""
-    pull = flow.slots.spread(now.answer.pull)
-    return jnp.where(flow.stance.locked, 0.0, _outward(now) - pull / flow.s.m)
-
-
 def tally_rates(flow: Flow, motion: WheelMotion, now: Forces) -> Tally:
     """Time derivatives of what is summed up."""
-    direction = _sliding(flow)
+    direction = sliding(flow.contact)
     speeds = [direction[i] * now.feet.x[i] for i in range(2)]
     drag = [-now.answer.tangential[i] * direction[i] for i in range(2)]
     return Tally(
@@ -172,14 +163,13 @@ def field(flow: Flow, y: State) -> State:
     """Time derivative of the state."""
     motion, _ = unpack(y)
     now = forces(flow, motion)
-    ddL = leg_acceleration(flow, now)
     rates = WheelMotion(
         motion.vx,
         motion.vz,
         motion.dtheta,
         *now.answer.hub,
         jnp.where(flow.stance.locked, 0.0, motion.dL),
-        ddL,
+        now.answer.lengths,
     )
     return kept(pack(rates, tally_rates(flow, motion, now)), one_of(motion))
 
@@ -232,7 +222,7 @@ def felt(flow: Flow, now: Forces) -> Felt:
     """What `stance_guards` needs of the forces."""
     found = now.answer
     in_air = airborne_stopper_force(flow, now) if flow.one_sided else None
-    return Felt(now.hub.legs, found.normal, found.tangential, found.stopper, now.feet.x, in_air)
+    return Felt(now.legs, found.normal, found.tangential, found.stopper, now.feet.x, in_air)
 
 
 def as_row(friction: Roughness) -> Array:
@@ -267,7 +257,7 @@ def stance_guards(flow: Flow, motion: WheelMotion, now: Felt, begun: Array) -> l
     # In the limit of large friction a resting foot slides, one way or the other, where its normal
     # force vanishes; a sliding one lifts where its friction does.
     limit = as_row(flow.friction) == jnp.inf
-    direction = jnp.stack(_sliding(flow))
+    direction = jnp.stack(sliding(flow.contact))
     pressed = jnp.where(limit & (direction != 0.0), -direction * tangential, normal)
     lifts = (flow.contact != OFF) & ~(limit & coulomb)
     margin = lambda pull: jnp.where(limit, jnp.maximum(normal, pull), rough * normal + pull)

@@ -1,7 +1,6 @@
 """What is asked of lanes on real ground: walks of many steps, one step with all that moves it."""
 
 import functools
-import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -9,13 +8,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array
 
 from vrw_jax import simd
+from vrw_jax.models.unilateral.along import walked_along
 from vrw_jax.models.unilateral.contacts import OFF
-from vrw_jax.models.unilateral.lanes import Walk, told_like, walked, walked_along
+from vrw_jax.models.unilateral.events import settled
+from vrw_jax.models.unilateral.lanes import Walk, told_like, walked
 from vrw_jax.models.unilateral.ledger import UnilateralStep
 from vrw_jax.models.unilateral.march import coordinates
+from vrw_jax.models.unilateral.mechanics import WheelMotion
 from vrw_jax.models.unilateral.section import LOCKED, embedded, opened, section_size
 from vrw_jax.models.unilateral.wheel import UnilateralWheel
 from vrw_jax.numerics import Options, explicit_tableau, in_batches
@@ -74,22 +77,33 @@ def step_lanes(
     rates = len(columns) + np.array([1, 2, 3, *range(4 + n, 4 + 2 * n)])
     left = _Rates.of(_settled_rates(columns, states, n), moves[:, rates])
     moves[:, rates] = left.kept()
-    moves[~moves.any(1), 0] = True  # the step itself is told beside a direction
-    owner, place = np.nonzero(moves)
-    ways = np.zeros((len(owner), numbers.shape[1]))
-    ways[np.arange(len(owner)), place] = 1.0
-    given = [numbers[owner].T, ways.T]
-    split = [part for x in given for part in (x[: len(columns)], x[len(columns) :])]
-    walk, moved = _walked(run, split, 1, options.for_derivatives())
-    first = np.searchsorted(owner, np.arange(len(columns.T)))
+    wheel, place = np.nonzero(moves)
+    lane, slot, owner = _shared_out(moves.sum(1))
+    ways = np.full((DIRECTIONS, len(owner)), -1.0)
+    ways[slot, lane] = place
+    given = [columns[:, owner], states[owner].T, ways]
+    walk, moved = _walked(run, given, 1, options.for_derivatives())
+    first = np.searchsorted(owner, np.arange(len(states)))
 
     def jacobian(leaf: np.ndarray) -> np.ndarray:
-        full = np.zeros((*numbers.shape, *leaf.shape[1:]), leaf.dtype)
-        full[owner, place] = leaf
+        full = np.zeros((*numbers.shape, *leaf.shape[2:]), leaf.dtype)
+        full[wheel, place] = leaf[lane, slot]
         full[:, rates] = left.all_of(full[:, rates])
         return np.moveaxis(full, 1, -1)
 
     return jax.tree.map(lambda x: x[first], walk.told), jax.tree.map(jacobian, moved)
+
+
+DIRECTIONS = 16
+"""That one lane carries at most: more are shared out to several."""
+
+
+def _shared_out(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Lane and place there of each wheel's directions, one after the other, and whose lanes are."""
+    lanes = np.maximum(-(-counts // DIRECTIONS), 1)
+    first, own = np.cumsum(lanes) - lanes, np.concatenate([np.arange(n) for n in counts])
+    lane = np.repeat(first, counts) + own // DIRECTIONS
+    return lane, own % DIRECTIONS, np.repeat(np.arange(len(counts)), lanes)
 
 
 SAME = 1e-10
@@ -164,9 +178,14 @@ def _settled_rates(columns: np.ndarray, states: np.ndarray, n: int) -> np.ndarra
     return np.swapaxes(told.reshape(len(states), 3 + n, 3 + n), 1, 2)
 
 
+def _landing(s: Symbols, x: Array) -> WheelMotion:
+    motion, stance = opened(s, x)
+    return settled(s, motion, stance.contact, stance.locked)
+
+
 OF_ROWS: dict[str, Callable[[Symbols, Array], Array]] = {
     "full states": embedded,
-    "rates at a start": lambda s, x: coordinates(opened(s, x)[0])[1],
+    "rates at a start": lambda s, x: coordinates(_landing(s, x))[1],
 }
 """What is asked of section states alone, with lanes last."""
 
@@ -207,7 +226,7 @@ class _Run(NamedTuple):
     max_events: int
     one_sided: bool
     by_paper: bool
-    moved: bool  # all that a step tells, and along a direction of each lane
+    moved: bool  # all that a step tells, and along directions of each lane
 
     @classmethod
     def of(cls, model: UnilateralWheel, options: Options, n: int, moved: bool) -> "_Run":
@@ -229,16 +248,18 @@ class _Run(NamedTuple):
         return Walk(self.n_legs, n_steps, self.max_events, *rules, options, tableau)
 
     def rows(self) -> tuple[int, ...]:
-        """Of the arrays that are given: columns and states, then a direction of both."""
+        """Of the arrays that are given: columns, states, and which of these directions are."""
         sizes = len(PARAMETER_NAMES) + 1, section_size(self.n_legs)
-        return sizes * 2 if self.moved else sizes
+        return (*sizes, DIRECTIONS) if self.moved else sizes
 
     def told(self, dtype: Any) -> Any:
         """Shapes and types of what is told of one wheel."""
         walk = _shapes(self.n_legs, dtype, self.moved)
         if not self.moved:
             return walk
-        return walk, eqx.filter(walk.told, lambda x: jnp.issubdtype(x.dtype, jnp.inexact))
+        floats = eqx.filter(walk.told, lambda x: jnp.issubdtype(x.dtype, jnp.inexact))
+        several = lambda x: jax.ShapeDtypeStruct((DIRECTIONS, *x.shape), x.dtype)
+        return walk, jax.tree.map(several, floats)
 
 
 @functools.cache
@@ -257,16 +278,9 @@ def _walked(run: _Run, given: list[np.ndarray], n_steps: int, options: Options) 
     rows = _program(run, dtype, form)(uniform, lanes) if len(order) else None
     back = np.argsort(order, kind="stable")
     leaves, structure = _form(run, dtype)
-    found, taken = [], 0
-    for leaf in leaves:
-        size = math.prod(leaf.shape)
-        if rows is None:
-            found.append(np.zeros((0, *leaf.shape), leaf.dtype))
-        else:
-            own = np.stack(rows[taken : taken + size], 1)[back]
-            found.append(own.reshape(-1, *leaf.shape))
-        taken += size
-    return jax.tree.unflatten(structure, found)
+    if rows is None:
+        rows = [np.zeros((*leaf.shape, 0), leaf.dtype) for leaf in leaves]
+    return jax.tree.unflatten(structure, [np.moveaxis(x, -1, 0)[back] for x in rows])
 
 
 @functools.cache
@@ -291,9 +305,15 @@ def _program(run: _Run, dtype: np.dtype, form: Any) -> Callable[..., Any]:
         on = run.on(jax.tree.unflatten(form, dynamic), n_steps)
         rows = iter(lanes)
         given = [jnp.stack([next(rows) for _ in range(size)]) for size in run.rows()]
-        told = walked_along(on, *given) if run.moved else walked(on, *given)
-        flat = lambda leaf: leaf.reshape(-1, leaf.shape[-1])
-        return tuple(row for leaf in jax.tree.leaves(told) for row in flat(leaf))
+        if not run.moved:
+            return tuple(jax.tree.leaves(walked(on, *given)))
+        columns, x, ways = given
+        place = np.arange(len(columns) + len(x), dtype=np.int32)[:, None]
+        units = (ways[:, None] == place).astype(x.dtype)
+        units = lax.optimization_barrier(units)
+        by = units[:, : len(columns)], units[:, len(columns) :]
+        count = jnp.sum(ways >= 0, axis=0, dtype=jnp.int32)
+        return tuple(jax.tree.leaves(walked_along(on, columns, x, *by, count)))
 
     if simd.serves():
         kinds = [np.dtype(np.int32), *[dtype] * form.num_leaves]

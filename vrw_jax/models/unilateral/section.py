@@ -6,7 +6,6 @@ from jaxtyping import Array, Bool, Float
 from vrw_jax.models.base import replaced_where_bad, usable
 from vrw_jax.models.paper_step import PAPER_START
 from vrw_jax.models.unilateral.contacts import OFF, STICK
-from vrw_jax.models.unilateral.events import settled
 from vrw_jax.models.unilateral.mechanics import WheelMotion, directions
 from vrw_jax.models.unilateral.motion import Stance
 from vrw_jax.numerics import Elementwise
@@ -91,14 +90,14 @@ def _possible(s: Symbols, x: FullState) -> Bool[Array, "..."]:
 def opened(s: Symbols, x: FullState) -> tuple[WheelMotion, Stance]:
     """Motion and stance just before the landing, in the labels of the step that begins.
 
-    The landing foot is the origin; loaded feet are put on the slope and sticking ones to rest, so
-    that every vector near a section state is one.
+    The landing foot is the origin; loaded feet are put on the slope, so that every vector near a
+    section state is one. The landing brings sticking ones to rest.
     """
     theta, (hub_x, hub_z), L, dL, contact, locked = _posture(s, x)
     dtheta, vx, vz = x[1], x[2], x[3]
     motion = WheelMotion(hub_x, hub_z, theta, vx, vz, dtheta, L, dL)
     none = locked & False
-    return settled(s, motion, contact, locked), Stance(contact, locked, none, none, none)
+    return motion, Stance(contact, locked, none, none, none)
 
 
 def closed(motion: WheelMotion, stance: Stance, tilt: Elementwise | None = None) -> FullState:

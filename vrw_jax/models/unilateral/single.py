@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Array
 
 from vrw_jax.models.lane_step import by_argument
-from vrw_jax.models.unilateral.lanes import Lean, Walk, Walked, told_like, walked, walked_along
+from vrw_jax.models.unilateral.along import walked_along
+from vrw_jax.models.unilateral.lanes import Lean, Walk, Walked, told_like, walked
 from vrw_jax.numerics import Forward, explicit_tableau, one_wheel
 from vrw_jax.runtime import lane_function
 from vrw_jax.wheel import parameters_of
@@ -51,7 +52,10 @@ class Setting(NamedTuple):
     def told_along(self, leaves: tuple[Array, ...], ways: tuple[Array, ...]) -> tuple:
         """How its floats move along a direction of each lane, the floats, and the rest."""
         columns, x, others = self.given(leaves)
-        walk, moves = walked_along(self.walk(others), columns, x, *self.given(ways)[:2])
+        d_columns, d_x = (rows[None] for rows in self.given(ways)[:2])
+        one = jnp.ones_like(columns[0], jnp.int32)
+        walk, moves = walked_along(self.walk(others), columns, x, d_columns, d_x, one)
+        moves = jax.tree.map(lambda leaf: leaf[0], moves)
         return _parted(walk._replace(told=moves))[0], *_parted(walk)
 
 

@@ -1,0 +1,276 @@
+"""How walks of lanes on real ground move along many directions, all beside one motion.
+
+What decides the motion (events, contacts, lengths of steps) is done once; at each stage of a
+Runge-Kutta step, and where an event is passed, what all directions share is computed once, and each
+direction then goes through what is linear. Derivatives are of the discrete flow at the lengths that
+were taken, and of the times of its events: see `numerics.tangents`.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from vrw_jax.models.unilateral.lanes import UNDER_WAY, Lane, Moves, Walk, Walked
+from vrw_jax.models.unilateral.march import (
+    EVENT,
+    MARCHING,
+    N_TALLIED,
+    FlowAt,
+    March,
+    Place,
+    advanced,
+    guard_rates,
+    guards_at,
+    slope_at,
+    stage_at,
+    tried_by,
+    until_none_marches,
+)
+from vrw_jax.models.unilateral.motion import guard_sizes
+from vrw_jax.numerics import Options, Tableau, select
+
+
+class _March(NamedTuple):
+    """Of a direction, what moves as lanes march."""
+
+    q: Array
+    v: Array
+    told: Array
+    slope: Array  # of accelerations and what is summed up, where it stands
+    later: Array  # how its time moves, s
+
+
+class _Way(NamedTuple):
+    """A direction."""
+
+    march: _March
+    rest: Moves  # but for what the march has
+
+    @classmethod
+    def of(cls, moves: Moves, slope: Array) -> "_Way":
+        """In two parts."""
+        tally, told = moves.told
+        assert told is not None
+        rest: Any = moves._asdict() | {"q": None, "v": None, "told": (tally, None), "time": None}
+        return cls(_March(moves.q, moves.v, told, slope, moves.time), Moves(**rest))
+
+    def moves(self) -> Moves:
+        """In one."""
+        q, v, told, _, later = self.march
+        return self.rest._replace(q=q, v=v, told=(self.rest.told[0], told), time=later)
+
+
+class Ways(NamedTuple):
+    """Directions of each lane: arrays have them on the first axis, lanes on the last."""
+
+    many: Array  # how many a lane has
+    columns: Array
+    rows: Array  # all numbers of a `_Way` behind each other: few loops are quickly compiled
+
+    def each(self, function: Callable[[Array], Any], size: int) -> Array:
+        """So many rows of what `function` tells of each direction by its place."""
+        goes_on = lambda state: jnp.any(state[0] < self.many)
+
+        def turn(state: tuple[Array, Array]) -> tuple[Array, Array]:
+            k, rows = state
+            told = _packed(function(k))
+            told = jnp.stack([told[i] for i in range(size)])  # in registers
+            return k + 1, lax.dynamic_update_index_in_dim(rows, told, k, 0)
+
+        blank = jnp.zeros((len(self.columns), size, *self.many.shape), self.columns.dtype)
+        return lax.while_loop(goes_on, turn, (jnp.zeros((), jnp.int32), blank))[1]
+
+
+def _packed(tree: Any) -> Array:
+    return jnp.concatenate([x.reshape(-1, x.shape[-1]) for x in jax.tree.leaves(tree)])
+
+
+def _unpacked(rows: Array, like: Any) -> Any:
+    leaves, structure = jax.tree.flatten(like)
+    found, begin = [], 0
+    for leaf in leaves:
+        size = math.prod(leaf.shape[:-1])
+        own = rows[..., begin : begin + size, :]
+        found.append(own.reshape(*rows.shape[:-2], *leaf.shape))
+        begin += size
+    return jax.tree.unflatten(structure, found)
+
+
+def _at(rows: Array, k: Array, like: Any) -> Any:
+    """The direction of that place, as a tree of that form."""
+    return _unpacked(lax.dynamic_index_in_dim(rows, k, 0, False), like)
+
+
+def walked_along(
+    on: Walk, columns: Array, x: Array, d_columns: Array, d_x: Array, many: Array
+) -> tuple[Walked, Any]:
+    """`lanes.walked`, and how what is told moves along directions of each lane: its floats.
+
+    Directions, of which a lane has `many`, are a first axis of `d_columns`, `d_x` and the latter.
+    """
+    columns, x, good = on.sound(columns, x)
+    n_rows = lambda tree: len(_packed(tree))
+
+    def begun(columns: Array, x: Array) -> tuple[Moves, Lane]:
+        lane = on.barred(on.begun(columns, x), good)
+        return lane.moves(), lane
+
+    moves, push, lane = jax.linearize(begun, columns, x, has_aux=True)
+    slope = jnp.zeros((len(moves.q) + N_TALLIED, *many.shape), x.dtype)
+    like = _Way.of(moves, slope)
+    ways = Ways(many, d_columns, d_columns)
+    start = lambda k: _Way.of(push(_at(d_columns, k, columns), _at(d_x, k, x)), slope)
+    ways = ways._replace(rows=ways.each(start, n_rows(like)))
+
+    def turn(state: tuple[Lane, Ways]) -> tuple[Lane, Ways]:
+        lane, ways = state
+
+        def past_events(columns: Array, moves: Moves) -> tuple[Moves, Lane]:
+            after = on.past_events(columns, lane.moved(moves))
+            return after.moves(), after
+
+        _, push, after = jax.linearize(past_events, columns, lane.moves(), has_aux=True)
+
+        def passed(k: Array) -> _Way:
+            way = _at(ways.rows, k, like)
+            return _Way.of(push(_at(d_columns, k, columns), way.moves()), way.march.slope)
+
+        ways = ways._replace(rows=ways.each(passed, n_rows(like)))
+        under_way, flow_at = after.outcome == UNDER_WAY, lambda c: on.flow(c, after.now.stance)
+        given = flow_at, columns, after.now, ways, like.march, under_way, on.options, on.tableau
+        now, march = _marched(*given)
+        rows = lax.dynamic_update_slice(ways.rows, march, (0, 0, 0))
+        return after._replace(now=now), ways._replace(rows=rows)
+
+    goes_on = lambda state: jnp.any(state[0].outcome == UNDER_WAY)
+    lane, ways = lax.while_loop(goes_on, turn, (lane, ways))
+
+    def told(moves: Moves) -> tuple[Any, Any]:
+        return eqx.partition(on.told(lane.moved(moves)), eqx.is_inexact_array)
+
+    floats, push, rest = jax.linearize(told, lane.moves(), has_aux=True)
+    moved = ways.each(lambda k: push(_at(ways.rows, k, like).moves()), n_rows(floats))
+    step = eqx.combine(floats, rest)
+    walk = Walked(step, lane.outcome, lane.n_stepped, lane.ledger.tried)
+    return walk, _unpacked(moved, floats)
+
+
+def _marched(
+    flow_at: FlowAt,
+    columns: Array,
+    begin: March,
+    ways: Ways,
+    like: _March,
+    walks: Array,
+    options: Options,
+    tableau: Tableau,
+) -> tuple[March, Array]:
+    """`march.marched`, with the directions carried along and on to the event: their first rows."""
+    flow, n_rows = flow_at(columns), len(_packed(like))
+    sizes, last = guard_sizes(flow), len(tableau.places) - 1
+
+    def advance(state: tuple[March, Array]) -> tuple[March, Array]:
+        now, rows = state
+        slopes, moved = _stages(flow_at, columns, now, ways._replace(rows=rows), like, tableau)
+        tried = tried_by(flow, tableau, options, now, slopes)
+        after = advanced(now, tried, sizes, tableau, options)
+        taken, n = after.time != now.time, len(now.here.q)
+
+        def end(k: Array) -> _March:
+            here, known = _at(rows, k, like), lax.dynamic_index_in_dim(moved, k, 1, False)
+            q, v = stage_at(tableau, last, here.q, here.v, known, now.h)
+            told = here.told + now.h * sum(
+                tableau.once[last][j] * known[j, n:] for j in range(last)
+            )
+            there = _March(q, v, told, known[last], here.later)
+            return select(taken, there, here._replace(slope=known[0]))
+
+        return after, ways.each(end, n_rows)
+
+    marching = lambda state: state[0].verdict == MARCHING
+    now, rows = until_none_marches(marching, walks, advance, (begin, ways.rows[:, :n_rows]))
+    met = _met(flow_at, columns, begin, now, ways, rows, like)
+    return now, ways.each(met, n_rows)
+
+
+def _stages(
+    flow_at: FlowAt, columns: Array, now: March, ways: Ways, like: _March, tableau: Tableau
+) -> tuple[Array, Array]:
+    """Slopes at the stages of a step, and how they move: (stages, directions, ., lanes)."""
+    here, h = now.here, now.h
+    n, last = len(here.q), len(tableau.places) - 1
+    fresh = (now.verdict == MARCHING) & (now.time == 0.0)
+
+    def stage(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        i, slopes, moved = state
+
+        def rows(columns: Array, q: Array, v: Array) -> tuple[Array, Array]:
+            slope = slope_at(flow_at(columns), q, v)
+            return jnp.concatenate([slope[:n], slope[-N_TALLIED:]]), slope
+
+        place = stage_at(tableau, i, here.q, here.v, slopes, h)
+        _, push, slope = jax.linearize(rows, columns, *place, has_aux=True)
+
+        def along(k: Array) -> Array:
+            way, known = _at(ways.rows, k, like), lax.dynamic_index_in_dim(moved, k, 1, False)
+            ends = stage_at(tableau, i, way.q, way.v, known, h)
+            row = push(_at(ways.columns, k, columns), *ends)
+            return jnp.where((i > 0) | fresh, row, known[0])
+
+        put = lambda rows, row: lax.dynamic_update_index_in_dim(rows, row, i, 0)
+        slope = jnp.where(i > 0, slope, here.slope)
+        return i + 1, put(slopes, slope), put(moved, ways.each(along, len(like.slope)))
+
+    others = jnp.zeros((last, *here.slope.shape), h.dtype)
+    slopes = jnp.concatenate([here.slope[None], others])
+    begin = 2 * n + N_TALLIED
+    slope = ways.rows[:, begin : begin + len(like.slope)]
+    moved = jnp.zeros((last + 1, *slope.shape), h.dtype)
+    moved = lax.dynamic_update_index_in_dim(moved, slope, 0, 0)
+    # The first stage is the last one of the step before, but where an event was passed.
+    first = jnp.where(jnp.any(fresh), 0, 1).astype(jnp.int32)
+    goes_on = lambda state: state[0] <= last
+    return lax.while_loop(goes_on, stage, (first, slopes, moved))[1:]
+
+
+def _met(
+    flow_at: FlowAt,
+    columns: Array,
+    begin: March,
+    now: March,
+    ways: Ways,
+    rows: Array,
+    like: _March,
+) -> Callable[[Array], _March]:
+    """Directions where the event comes later or earlier along them."""
+    flow, here, n = flow_at(columns), now.here, len(now.here.q)
+
+    def guards(columns: Array, q: Array, v: Array) -> Array:
+        flow = flow_at(columns)
+        return guards_at(flow, Place(q, v, slope_at(flow, q, v)))
+
+    _, push = jax.linearize(guards, columns, here.q, here.v)
+    rates = guard_rates(flow, here)
+    arrived = (begin.verdict == MARCHING) & (now.verdict == EVENT)
+
+    def met(k: Array) -> _March:
+        way, later = _at(rows, k, like), jnp.zeros_like(now.time)
+        moves = push(_at(ways.columns, k, columns), way.q, way.v)
+        for index in range(len(moves)):
+            at = arrived & (now.guard == index) & (rates[index] < 0.0)
+            later = jnp.where(at, -moves[index] / jnp.where(at, rates[index], -1.0), later)
+        return _March(
+            q=way.q + later * here.v,
+            v=way.v + later * here.slope[:n],
+            told=way.told + later * here.slope[-N_TALLIED:],
+            slope=way.slope,
+            later=later,
+        )
+
+    return met

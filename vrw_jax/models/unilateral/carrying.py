@@ -1,0 +1,222 @@
+"""What carries the motion on, by forces or by impulses, and how it moves with anything.
+
+The equations are linear in accelerations and forces, or in velocities after an impact and impulses.
+So along a direction these change as the same equations say of what is left over where they stay:
+nothing but that is differentiated.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from vrw_jax.models.unilateral.contacts import SLIP_DOWN, SLIP_UP, Roughness, answer, rough_of
+from vrw_jax.models.unilateral.mechanics import (
+    Free,
+    Hub,
+    Legs,
+    Pair,
+    Slots,
+    Vector3,
+    WheelMotion,
+    free_acceleration,
+    free_velocity,
+    hub_of,
+    kept,
+    one_of,
+    over_legs,
+    times,
+)
+from vrw_jax.wheel import Symbols
+
+
+class Stand(NamedTuple):
+    """A wheel whose contacts and stoppers are known."""
+
+    s: Symbols
+    motion: WheelMotion
+    friction: Roughness  # of the slots' feet
+    slots: Slots
+    contact: Array  # of the slots
+    held: Array  # the slots' legs on their stoppers
+    airborne: Array  # other legs on their stoppers
+
+
+class Carried(NamedTuple):
+    """What ground, the slots' stoppers and the hub do: see `contacts.Answer`."""
+
+    tangential: Pair
+    normal: Pair
+    stopper: Pair
+    pull: Pair
+    hub: Vector3
+    lengths: Legs  # accelerations of the legs' lengths, or rates after an impact
+
+
+def sliding(contact: Array) -> Pair:
+    """1 for a slot's foot that slides downhill, -1 uphill, 0 else."""
+    sign = lambda mode: jnp.where(mode == SLIP_DOWN, 1.0, jnp.where(mode == SLIP_UP, -1.0, 0.0))
+    return sign(contact[0]), sign(contact[1])
+
+
+class _Stays(NamedTuple):
+    """At the wheel: accelerations, or jumps of velocities."""
+
+    along: Legs  # of legs' masses, beyond the hub's: along their legs, and across
+    across: Legs
+    hub: Pair  # beyond gravity's
+
+
+class _Moves(NamedTuple):
+    """How rows of the equations move along a direction in which those stay."""
+
+    along: Legs
+    across: Legs
+    hub: Pair
+    springs: Legs | float  # N
+    foot_e: Pair
+    foot_u: Pair
+
+
+_Rows = Callable[[Stand, Stand, Hub, Carried], tuple[_Stays, _Moves]]
+
+
+def in_motion(stand: Stand) -> Carried:
+    """Forces, and accelerations that they leave."""
+    return _carried(free_acceleration, _rows_of_motion, stand)
+
+
+def in_impact(stand: Stand) -> Carried:
+    """Impulses, and velocities that they leave."""
+    return _carried(free_velocity, _rows_of_impact, stand)
+
+
+def told_by(stand: Stand, hub: Hub, free: Free) -> Carried:
+    """By what would be free of them."""
+    s, _, friction, slots, contact, held, airborne = stand
+    found = answer(s, hub, free, contact, held, friction)
+    out = free.legs + hub.legs.sin * found.hub[0] + hub.legs.cos * found.hub[1]
+    stays = airborne | (slots.spread(held) > 0)
+    lengths = jnp.where(stays, 0.0, out - slots.spread(found.pull) / s.m)
+    return Carried(found.tangential, found.normal, found.stopper, found.pull, found.hub, lengths)
+
+
+def _carried(free_of: Callable[..., Free], rows: _Rows, stand: Stand) -> Carried:
+    floats, rest = eqx.partition(stand, eqx.is_inexact_array)
+    arrays, rest = eqx.partition(rest, eqx.is_array)
+    whole = lambda floats, arrays: eqx.combine(floats, arrays, rest)
+
+    def solved(stand: Stand) -> tuple[Hub, Free, Carried]:
+        s, motion, one = stand.s, stand.motion, one_of(stand.motion)
+        hub = kept(hub_of(s, motion, stand.slots, stand.airborne), one)
+        free = kept(free_of(s, motion, stand.slots, hub), one)
+        return hub, free, kept(told_by(stand, hub, free), one)
+
+    found = jax.custom_jvp(lambda *given: solved(whole(*given))[2])
+
+    @found.defjvp
+    def rule(at: tuple, ways: tuple) -> tuple[Carried, Carried]:
+        stand, way = whole(*at), whole(ways[0], at[1])
+        hub, free, told = solved(stand)
+        left, grip, pull = _left_over(stand, way, hub, told, *rows(stand, way, hub, told))
+        _, moved = jax.jvp(lambda free: told_by(stand, hub, free), (free,), (left,))
+        sum_of = lambda one, other: (one[0] + other[0], one[1] + other[1])
+        return told, moved._replace(
+            tangential=sum_of(moved.tangential, grip), pull=sum_of(moved.pull, pull)
+        )
+
+    return found(floats, arrays)
+
+
+def _left_over(
+    stand: Stand, way: Stand, hub: Hub, told: Carried, stays: _Stays, moves: _Moves
+) -> tuple[Free, Pair, Pair]:
+    """What the equations are left with, as forces and legs would move the hub and feet; and how
+    friction moves by its coefficient, and the slots' pulls by that and as their legs turn."""
+    s, ds, slots, (sin, cos), two = stand.s, way.s, stand.slots, hub.legs, range(2)
+    b, db, dtheta = stand.motion.L - s.a, way.motion.L - ds.a, way.motion.theta
+    slides, rough = sliding(stand.contact), jax.jvp(rough_of, (stand.friction,), (way.friction,))[1]
+    rough = rough if isinstance(rough, tuple) else (rough, rough)
+    t, n, L, dL = told.tangential, told.normal, hub.L, slots.of(way.motion.L)
+    grip = [-slides[i] * rough[i] * n[i] for i in two]
+    across = [t[i] * hub.cos[i] - n[i] * hub.sin[i] for i in two]
+    along = [t[i] * hub.sin[i] + n[i] * hub.cos[i] for i in two]
+    pull = [grip[i] * hub.sin[i] + across[i] * dtheta for i in two]
+    drag = [dL[i] * across[i] + L[i] * (grip[i] * hub.cos[i] - along[i] * dtheta) for i in two]
+
+    (ax, az), (dx, dz) = stays.hub, moves.hub
+    outward, lever = sin * ax + cos * az, stays.across - cos * ax + sin * az
+    legs = (cos * ax - sin * az) * dtheta - moves.along + sin * dx + cos * dz
+    legs = legs + (moves.springs - slots.spread(pull) + (outward - stays.along) * ds.m) / s.m
+    legs = jnp.where(hub.released, legs, 0.0)
+    net = legs + moves.along
+    x = over_legs(stays.along * sin + stays.across * cos)
+    z = over_legs(stays.along * cos - stays.across * sin)
+    by_x = over_legs(net * sin + moves.across * cos) + z * dtheta
+    by_z = over_legs(net * cos - moves.across * sin) - x * dtheta
+    torque = over_legs(db * lever + b * (moves.across + outward * dtheta - cos * dx + sin * dz))
+    force = (
+        ds.m * x + s.m * by_x - ds.Mt * ax - s.Mt * dx + grip[0] + grip[1],
+        ds.m * z + s.m * by_z - ds.Mt * az - s.Mt * dz,
+        -ds.m * over_legs(b * lever) - s.m * torque - drag[0] - drag[1],
+    )
+    to, own = times(hub.inverse, force), slots.of(legs)
+    e = [hub.cos[i] * to[0] - hub.sin[i] * to[1] - L[i] * to[2] + moves.foot_e[i] for i in two]
+    free = Free(to, legs, own, (e[0], e[1]), (moves.foot_u[0] - own[0], moves.foot_u[1] - own[1]))
+    return free, (grip[0], grip[1]), (pull[0], pull[1])
+
+
+def _rows_of_motion(stand: Stand, way: Stand, hub: Hub, told: Carried) -> tuple[_Stays, _Moves]:
+    s, motion, slots = stand.s, stand.motion, stand.slots
+    ds, moved, dtheta = way.s, way.motion, way.motion.theta
+    b, db, turn = motion.L - s.a, moved.L - ds.a, told.hub[2]
+    spin, twice = motion.dtheta * motion.dtheta, 2.0 * motion.dtheta
+    dspin, dtwice = twice * moved.dtheta, 2.0 * moved.dtheta
+    springs = ds.k * (s.Ls - motion.L) - ds.c * motion.dL
+    springs = springs + s.k * (ds.Ls - moved.L) - s.c * moved.dL
+    stays = _Stays(
+        along=told.lengths - b * spin,
+        across=twice * motion.dL + b * turn,
+        hub=(told.hub[0] - s.g * s.sin_phi, told.hub[1] + s.g * s.cos_phi),
+    )
+    L, dL, back, dback = hub.L, *map(slots.of, (moved.L, motion.dL, moved.dL))
+    own = slots.of(told.lengths)
+    foot_e = [
+        (L[i] * spin - own[i]) * dtheta - twice * dback[i] - back[i] * dtwice - turn * dL[i]
+        for i in range(2)
+    ]
+    foot_u = [
+        (twice * back[i] + turn * L[i]) * dtheta + spin * dL[i] + L[i] * dspin for i in range(2)
+    ]
+    return stays, _Moves(
+        along=-(db * spin + b * dspin),
+        across=twice * moved.dL + motion.dL * dtwice + turn * db,
+        hub=(-ds.g * s.sin_phi - s.g * ds.sin_phi, ds.g * s.cos_phi + s.g * ds.cos_phi),
+        springs=springs,
+        foot_e=(foot_e[0], foot_e[1]),
+        foot_u=(foot_u[0], foot_u[1]),
+    )
+
+
+def _rows_of_impact(stand: Stand, way: Stand, hub: Hub, told: Carried) -> tuple[_Stays, _Moves]:
+    s, motion, moved, slots = stand.s, stand.motion, way.motion, stand.slots
+    turn = told.hub[2]
+    jump, b = turn - motion.dtheta, motion.L - s.a
+    stays = _Stays(
+        along=told.lengths - motion.dL,
+        across=b * jump,
+        hub=(told.hub[0] - motion.vx, told.hub[1] - motion.vz),
+    )
+    own, dL = slots.of(told.lengths), slots.of(moved.L)
+    foot_e = [-turn * dL[i] - own[i] * moved.theta for i in range(2)]
+    return stays, _Moves(
+        along=-moved.dL,
+        across=(moved.L - way.s.a) * jump - b * moved.dtheta,
+        hub=(-moved.vx, -moved.vz),
+        springs=0.0,
+        foot_e=(foot_e[0], foot_e[1]),
+        foot_u=(hub.L[0] * turn * moved.theta, hub.L[1] * turn * moved.theta),
+    )
