@@ -40,6 +40,7 @@ cma = extra("cma")
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 LABELS = {"tune": "this library"}
+DASHES = ("-", "--", "-.", ":")  # of the methods, in their order
 PROBLEMS = {"most double support": "tune_dls", "largest stability margin": "tune_stability"}
 ALLOWED = 400  # gaits per start and method
 SEED = 1
@@ -239,14 +240,14 @@ def drawn(results: dict[str, dict]) -> Figure:
         figure = Figure(figsize=(plots.PAGE, 2.9))
         panels = figure.subplots(1, len(results), sharey=True)
         for axes, (name, result) in zip(panels, results.items(), strict=True):
-            for method, curves in result["curves"].items():
+            for (method, curves), dash in zip(result["curves"].items(), DASHES, strict=True):
                 gaits = np.arange(1, ALLOWED + 1)
                 table = np.array(
                     [np.r_[c, np.full(ALLOWED - len(c), c[-1])][:ALLOWED] for c in curves]
                 )
                 gap = np.clip((result["best"] - table) / abs(result["best"]), 1e-9, 1.0)
                 low, middle, high = np.quantile(gap, (0.25, 0.5, 0.75), axis=0)
-                (line,) = axes.plot(gaits, middle, label=LABELS.get(method, method))
+                (line,) = axes.plot(gaits, middle, dash, label=LABELS.get(method, method))
                 axes.fill_between(gaits, low, high, color=line.get_color(), alpha=0.15, linewidth=0)
             axes.set_xscale("log")
             axes.set_yscale("log")
