@@ -32,7 +32,7 @@ from vrw_jax.answers.result import Answer, How
 from vrw_jax.answers.top import TIGHT, TIGHTER, Ground
 from vrw_jax.cycles import starts_of
 from vrw_jax.gaits import Which, place_in_list
-from vrw_jax.numerics import Options
+from vrw_jax.numerics import Options, taken
 from vrw_jax.wheel import FRICTION, Outcome, WheelParams, friction_of
 from vrw_jax.wording import (
     chosen,
@@ -229,7 +229,7 @@ class _Asked:
                     blank[name][lane] = gaits[place][name]
 
     def _wheels(self, lanes: np.ndarray) -> WheelParams:
-        return jax.tree.map(lambda leaf: leaf[lanes], self.params)
+        return jax.device_put(taken(self.params, lanes))
 
     def _from_gaits(self, lanes: np.ndarray, corrected: bool) -> None:
         """One step on real ground from the lower gaits, and more where that is not enough."""

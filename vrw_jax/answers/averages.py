@@ -22,7 +22,7 @@ from vrw_jax.answers.lower import Lower, paper_gaits
 from vrw_jax.answers.quantities import MADE, measured
 from vrw_jax.answers.result import Answer
 from vrw_jax.answers.top import Ground
-from vrw_jax.numerics import Options
+from vrw_jax.numerics import Options, taken
 from vrw_jax.results import MEASURES
 from vrw_jax.wheel import WheelParams, friction_of
 from vrw_jax.wording import (
@@ -201,7 +201,7 @@ class _Wheels(NamedTuple):
     stoppers: str
 
     def some(self, lanes: np.ndarray) -> WheelParams:
-        return jax.tree.map(lambda x: x[lanes], self.params)
+        return jax.device_put(taken(self.params, lanes))
 
     def asked(self, lanes: np.ndarray, tol: float) -> Answer:
         """On real ground."""

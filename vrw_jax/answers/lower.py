@@ -12,7 +12,7 @@ from vrw_jax.batches import steps
 from vrw_jax.cycles import finder_of
 from vrw_jax.gaits import SHAPES, limit_cycles
 from vrw_jax.models import RigidWheel
-from vrw_jax.numerics import Options, in_batches, with_jacobian
+from vrw_jax.numerics import Options, in_batches, taken, with_jacobian
 from vrw_jax.wheel import Outcome, WheelParams
 
 NONE, RIGID, PAPER, GROUND = 0, 1, 2, 3
@@ -56,7 +56,7 @@ def paper_gaits(params: WheelParams, options: Options) -> Lower:
     x, outcome = np.array(cycles.section_state), np.array(cycles.outcome)
     (lost,) = np.nonzero(outcome != Outcome.STEPPED)
     if len(lost):  # on one mesh, for another lane's would move this one's last digits
-        some = jax.tree.map(lambda leaf: leaf[lost], params)
+        some = jax.device_put(taken(params, lost))
         reach = functools.partial(limit_cycles, options=finder.options_used)
         cycles = in_batches(reach, SHAPES, some)
         x[lost], outcome[lost] = cycles.section_state, cycles.outcome
@@ -65,7 +65,7 @@ def paper_gaits(params: WheelParams, options: Options) -> Lower:
     (good,) = np.nonzero(outcome == Outcome.STEPPED)
     if not len(good):
         return lower
-    some = jax.tree.map(lambda leaf: leaf[good], params)
+    some = jax.device_put(taken(params, good))
     step = steps(some, x[good], options=options, derivatives=[START])
     by = jax.tree.map(np.asarray, step.derivatives[START])
     y, d = np.asarray(step.section_state), np.asarray(step.durations)

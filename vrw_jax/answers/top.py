@@ -66,9 +66,9 @@ class Ground:
 
     def shortest(self, lanes: np.ndarray) -> np.ndarray:
         """Of each lane the time that a foot is off the ground in the least dip that is followed."""
-        value = lambda name: self.columns[PARAMETER_NAMES.index(name), lanes]
+        value = lambda name: self.columns[PARAMETER_NAMES.index(name)]
         dip = np.asarray(least_dip(jnp.asarray(value("locked_length")), self.options))
-        return np.sqrt(8.0 * dip / value("gravity"))
+        return np.sqrt(8.0 * dip / value("gravity"))[lanes]
 
     def free(self, x: np.ndarray) -> np.ndarray:
         """Numbers of section states that are free where their legs' codes hold, (lanes, 4 + 2 n).

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 from vrw_jax.batches.walked import START, Steps, Walked
@@ -38,9 +38,8 @@ def on_ground(
     none = np.zeros(len(states), np.int32)
     if not asked:
         walk = walk_lanes(columns, states, n_steps, model, options, n_legs)
-        section_state, durations, outcome, n_stepped, tried, _ = map(jnp.asarray, walk)
-        told = section_state, durations, outcome, n_stepped, tried, jnp.asarray(none > 0)
-        return Steps(*told, jnp.asarray(none), engine="lanes", solvers=(options.solver,))
+        told = jax.device_put((*walk[:-1], none > 0, none))
+        return Steps(*told, engine="lanes", solvers=(options.solver,))
     walked = Walked(states, asked, VALUES)
     for _ in range(n_steps):
         lanes = np.flatnonzero(walked.outcome == Outcome.STEPPED)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
@@ -57,7 +57,7 @@ class Steps(AbstractTold):
             ("lanes", counted(self.outcome, Outcome)),
             ("steps each", told(self.n_stepped, "")),
             ("engine", f"{self.engine}; {', '.join(by)}"),
-            ("duration of the last step", told(jnp.sum(self.durations, -1), "s")),
+            ("duration of the last step", told(self.durations.sum(-1), "s")),
         ]
 
 
@@ -85,9 +85,7 @@ class Walked:
 
     def told(self, solver: np.ndarray, engine: str, solvers: tuple[str, ...]) -> Steps:
         fields = self.section_state, self.durations, self.outcome, self.n_stepped
-        state, durations, outcome, n_stepped = map(jnp.asarray, fields)
-        tried, fixed, which = map(jnp.asarray, (self.solver_steps, self.fixed, solver))
-        told = state, durations, outcome, n_stepped, tried, fixed, which
+        told = jax.device_put((*fields, self.solver_steps, self.fixed, solver))
         return Steps(*told, engine, solvers, self.derivatives())
 
     def derivatives(self) -> dict[str, By]:
@@ -95,12 +93,12 @@ class Walked:
         if not self.asked:
             return {}
         stepped = (self.outcome == Outcome.STEPPED)[:, None, None]
-        by = jnp.asarray(np.where(stepped, self.jacobian, 0.0))
+        by = np.where(stepped, self.jacobian, 0.0)
         size = self.section_state.shape[1]
         columns: dict[str, Any] = {name: size + i for i, name in enumerate(self.names)}
         columns[START] = slice(size)
         told = {name: by[:, :, columns[name]] for name in self.asked}
-        return {name: By(x[:, :size], x[:, size:]) for name, x in told.items()}
+        return {name: By(*jax.device_put((x[:, :size], x[:, size:]))) for name, x in told.items()}
 
     def take(self, lanes: np.ndarray, told: tuple[np.ndarray, ...], fixed: bool) -> None:
         state, durations, outcome, tried, *jacobian = told

@@ -166,6 +166,7 @@ def _mesh_error(problem: Problem, found: Array, solution: Solution) -> Array:
     return jnp.where(found, mesh_error(problem.sequence, problem.meshes, lanes)[0], 0.0)
 
 
+@functools.partial(jax.jit, static_argnums=0)
 def _takeoff(problem: Problem, parameters: Array, located: Located) -> Array:
     s = wheel_of(parameters, problem.n_legs).symbols()
     _, steps = problem.passages(parameters, located.solution)

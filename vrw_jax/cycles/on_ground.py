@@ -30,7 +30,7 @@ from vrw_jax.models import (
     UnilateralWheel,
     step_lanes,
 )
-from vrw_jax.numerics import Options, SectionCycle, in_batches
+from vrw_jax.numerics import Options, SectionCycle, in_batches, taken
 from vrw_jax.results import ON_GROUND
 from vrw_jax.walks import checked
 from vrw_jax.wheel import Outcome, WheelParams
@@ -110,7 +110,7 @@ class GroundFinder(AbstractWalkingFinder):
         columns, model = np.asarray(self.model.values(params))[:, None], self.model
         given = columns, np.asarray(x)[None], model, self.step_options, self.n_legs
         told, _ = step_lanes(*given, ())
-        return jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), told)
+        return jax.device_put(taken(told, 0))
 
     def measured(self, values: Values, guess: Any, names: tuple[str, ...]) -> Measured:
         """As everywhere; of one Jacobian of the step."""

@@ -9,6 +9,7 @@ matrix, are.
 import functools
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -110,6 +111,7 @@ def _parts(matrix: Matrix) -> tuple[list[Array], _Pair | None]:
     return [alone], _quadratic(a1 + alone * slope, slope)
 
 
+@jax.jit
 def multipliers(matrix: Matrix) -> Complex[Array, "... n"]:
     """All eigenvalues, the one of largest modulus first."""
     if matrix.shape[-1] > LARGEST_CLOSED:
@@ -128,6 +130,7 @@ def _by_modulus(values: Array) -> Array:
     return jnp.take_along_axis(values, order, -1)
 
 
+@jax.jit
 def spectral_radius(matrix: Matrix) -> Float[Array, "..."]:
     """Largest modulus of an eigenvalue; where two meet its derivative is one-sided or zero."""
     if matrix.shape[-1] > LARGEST_CLOSED:
@@ -140,6 +143,7 @@ def spectral_radius(matrix: Matrix) -> Float[Array, "..."]:
     return functools.reduce(jnp.maximum, moduli)
 
 
+@jax.jit
 def jury_margins(matrix: Matrix) -> Float[Array, "... n_margins"]:
     """Polynomials of the matrix, all positive exactly where all multipliers are inside the circle.
 
@@ -158,6 +162,7 @@ def jury_margins(matrix: Matrix) -> Float[Array, "... n_margins"]:
     return jnp.stack([1.0 + a2 + a1 + a0, 1.0 - a2 + a1 - a0, pair, 1.0 - a0 * a0], -1)
 
 
+@jax.jit
 def bifurcation_margins(matrix: Matrix) -> Float[Array, "... n_margins"]:
     """The first three Jury margins (two for n = 1), of a matrix of any size.
 
@@ -173,6 +178,7 @@ def bifurcation_margins(matrix: Matrix) -> Float[Array, "... n_margins"]:
     return jnp.stack([jnp.linalg.det(one - matrix), jnp.linalg.det(one + matrix), pairs], -1)
 
 
+@jax.jit
 def stability_margin(matrix: Matrix) -> Float[Array, "..."]:
     """Smooth minimum of the Jury margins, never above the smallest: positive means stable."""
     margins = SHARPNESS * jury_margins(matrix)
@@ -181,6 +187,7 @@ def stability_margin(matrix: Matrix) -> Float[Array, "..."]:
     return (lowest - jnp.log(excess)) / SHARPNESS
 
 
+@jax.jit
 def at_double_multiplier(matrix: Matrix, tolerance: float = 1e-6) -> Bool[Array, "..."]:
     """Whether two moduli tie at the top to `tolerance`: there the spectral radius has a kink.
 
