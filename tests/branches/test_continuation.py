@@ -1,5 +1,6 @@
 """Branches pass folds, and every bifurcation and border on them is located to 1e-9."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -43,6 +44,11 @@ def stretched(_, x, p):
     return jnp.stack([x[0] + p - x[0] ** 2, 0.5 * x[1] + x[0], -0.3 * x[2]])
 
 
+@eqx.filter_jit
+def side_by_side(inside, *points):
+    return jax.vmap(inside.linearise)(*points)
+
+
 class FromOutside(AbstractFollowed):
     """The fold of `stretched`, linearised for many points at once outside of compiled code."""
 
@@ -50,8 +56,7 @@ class FromOutside(AbstractFollowed):
     traced = False
 
     def linearise(self, wheels, z, p):
-        told = jax.vmap(self.inside.linearise)(wheels, z, p)
-        return jax.tree.map(np.asarray, told)
+        return jax.tree.map(np.asarray, side_by_side(self.inside, wheels, z, p))
 
     def section(self, z):
         return z

@@ -38,8 +38,8 @@ def on_ground(
     none = np.zeros(len(states), np.int32)
     if not asked:
         walk = walk_lanes(columns, states, n_steps, model, options, n_legs)
-        told = jax.device_put((*walk[:-1], none > 0, none))
-        return Steps(*told, engine="lanes", solvers=(options.solver,))
+        told: Any = jax.device_put((*walk[:-1], none > 0, none))
+        return Steps(*told, "lanes", (options.solver,))
     walked = Walked(states, asked, VALUES)
     for _ in range(n_steps):
         lanes = np.flatnonzero(walked.outcome == Outcome.STEPPED)

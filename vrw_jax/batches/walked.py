@@ -85,7 +85,7 @@ class Walked:
 
     def told(self, solver: np.ndarray, engine: str, solvers: tuple[str, ...]) -> Steps:
         fields = self.section_state, self.durations, self.outcome, self.n_stepped
-        told = jax.device_put((*fields, self.solver_steps, self.fixed, solver))
+        told: Any = jax.device_put((*fields, self.solver_steps, self.fixed, solver))
         return Steps(*told, engine, solvers, self.derivatives())
 
     def derivatives(self) -> dict[str, By]:

@@ -36,6 +36,7 @@ from vrw_jax.numerics import (
     Options,
     PathPoint,
     multipliers,
+    taken,
 )
 from vrw_jax.results import (
     CYCLE,
@@ -167,8 +168,7 @@ def continue_branch(
     one_wheel(params, "use vrw.continue_branches for a batch")
     if cycle is not None:
         instance("cycle", cycle, AbstractCycle, "give vrw.limit_cycle(params)")
-    batch = jax.tree.map(lambda x: x[None], params)
-    cycle = None if cycle is None else jax.tree.map(lambda x: x[None], cycle)
+    batch, cycle = jax.device_put(taken((params, cycle), None))
     (branch,) = continue_branches(
         batch, name, bounds, cycle=cycle, period_n=period_n, options=options,
         model=rung_of(serving(params, model)),

@@ -139,7 +139,7 @@ def both_hold(margin: np.ndarray, exact: np.ndarray) -> np.ndarray:
 
 def _follow_both_ways(run: AbstractRun, z: Any, p: Array) -> arclength.Track:
     """Tracks of all wheels, axes (wheel, direction): first towards smaller values."""
-    twice = functools.partial(jax.tree.map, lambda x: jnp.repeat(x, 2, axis=0))
+    twice = lambda tree: jax.device_put(taken(tree, np.repeat(np.arange(len(p)), 2)))
     bounds = jnp.asarray(run.bounds)
     ways = jnp.tile(jnp.asarray([-1.0, 1.0], bounds.dtype), p.shape[0])
     given = twice(run.wheels), twice(z), twice(p), bounds, ways

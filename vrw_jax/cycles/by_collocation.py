@@ -113,7 +113,6 @@ class CollocationFinder(AbstractGaitFinder):
             solution=solution._replace(section=section), happens=happens, ends=ends
         )
 
-    @eqx.filter_jit
     def on_mesh(self, problem: Problem, located: Located) -> Located:
         """A start from what was located on the mesh of `problem`."""
         solution = on_mesh(problem, self.problem, located.solution)

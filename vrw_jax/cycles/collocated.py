@@ -274,6 +274,7 @@ def guess_along(problem: Problem, params: WheelParams, walked: SampledWalk) -> L
     return lax.stop_gradient(Located(solution, happens, *nothing))
 
 
+@functools.partial(jax.jit, static_argnums=(0, 1))
 def on_mesh(known: Problem, wanted: Problem, found: Solution) -> Solution:
     """A start on another mesh: each step's accelerations are a polynomial of their own."""
     accelerations = []

@@ -8,7 +8,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -26,7 +25,7 @@ from vrw_jax.numerics.arclength import (
     track_of,
     turned,
 )
-from vrw_jax.numerics.lanes import select
+from vrw_jax.numerics.lanes import select, taken
 from vrw_jax.numerics.on_plane import Solving, nearer, solution, to_solve, unsolved
 
 
@@ -41,7 +40,7 @@ def follow_many(
 ) -> Track:
     """`arclength.follow`."""
     on = begun(followed, options, z, p, bounds, directions)
-    while np.any(open_ := np.asarray(going(on))):
+    while np.any(open_ := np.asarray(_going(on))):
         trial = on[0].trial
         linears = _linear_of(followed, wheels, bounds, trial.z, trial.share, open_)
         on = _turned(followed, options, wheels, bounds, directions, on, linears)
@@ -57,13 +56,14 @@ def _linear_of(
     followed: AbstractFollowed, wheels: Any, bounds: Array, z: Unknown, share: Array, some: Any
 ) -> Linear:
     """Of `some` of many, the others without numbers."""
-    p = bounds[0] + (bounds[1] - bounds[0]) * share
-    there = followed.linearise(*jax.tree.map(lambda x: jnp.asarray(x)[some], (wheels, z, p)))
+    low, high = np.asarray(bounds)
+    p = low + (high - low) * np.asarray(share)
+    there = followed.linearise(*jax.device_put(taken((wheels, z, p), some)))
     blank = lambda x: np.full((len(some), *x.shape[1:]), np.nan)
     whole = jax.tree.map(blank, there)
     for to, x in zip(jax.tree.leaves(whole), jax.tree.leaves(there), strict=True):
         to[some] = x
-    return jax.tree.map(jnp.asarray, whole)
+    return jax.device_put(whole)
 
 
 def solve_many(
@@ -75,10 +75,20 @@ def solve_many(
     bounds: Float[Array, "2"],
 ) -> tuple[PathPoint, Bool[Array, " many"]]:
     """`solve` side by side, all arrays with a leading axis."""
-    on = jax.vmap(to_solve)(z, planes)
-    while np.any(open_ := np.asarray(unsolved(options, on))):
+    on = _to_solve_many(z, planes)
+    while np.any(open_ := np.asarray(_unsolved(options, on))):
         linear = _linear_of(followed, wheels, bounds, on.now.z, on.now.share, open_)
         on = _nearer_many(followed, options, bounds, planes, on, linear)
+    return _solutions(followed, wheels, bounds, on)
+
+
+_going: Any = eqx.filter_jit(going)
+_to_solve_many: Any = eqx.filter_jit(jax.vmap(to_solve))
+_unsolved: Any = eqx.filter_jit(unsolved)
+
+
+@eqx.filter_jit
+def _solutions(followed: AbstractFollowed, wheels: Any, bounds: Array, on: Solving) -> Any:
     return jax.vmap(lambda wheel, on: solution(followed, wheel, bounds, on))(wheels, on)
 
 
