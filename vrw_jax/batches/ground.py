@@ -3,10 +3,9 @@
 from collections.abc import Sequence
 from typing import Any
 
-import jax
 import numpy as np
 
-from vrw_jax.batches.walked import START, Steps, Walked
+from vrw_jax.batches.walked import START, Steps, Walked, told_steps
 from vrw_jax.models import as_full_states, step_lanes, walk_lanes
 from vrw_jax.numerics import Options, explicit_tableau
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome
@@ -38,8 +37,7 @@ def on_ground(
     none = np.zeros(len(states), np.int32)
     if not asked:
         walk = walk_lanes(columns, states, n_steps, model, options, n_legs)
-        told: Any = jax.device_put((*walk[:-1], none > 0, none))
-        return Steps(*told, "lanes", (options.solver,))
+        return told_steps((*walk[:-1], none > 0, none), "lanes", (options.solver,), {})
     walked = Walked(states, asked, VALUES)
     for _ in range(n_steps):
         lanes = np.flatnonzero(walked.outcome == Outcome.STEPPED)

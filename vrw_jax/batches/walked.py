@@ -85,8 +85,8 @@ class Walked:
 
     def told(self, solver: np.ndarray, engine: str, solvers: tuple[str, ...]) -> Steps:
         fields = self.section_state, self.durations, self.outcome, self.n_stepped
-        told: Any = jax.device_put((*fields, self.solver_steps, self.fixed, solver))
-        return Steps(*told, engine, solvers, self.derivatives())
+        told = *fields, self.solver_steps, self.fixed, solver
+        return told_steps(told, engine, solvers, self.derivatives())
 
     def derivatives(self) -> dict[str, By]:
         """Of the walk, by what was asked for; zero where it failed."""
@@ -112,3 +112,11 @@ class Walked:
             before = self.jacobian[lanes, :size]
             self.jacobian[lanes] = by[:, :, n:] @ before
             self.jacobian[lanes, :, size:] += by[:, :, :n]
+
+
+def told_steps(
+    told: tuple[Any, ...], engine: str, solvers: tuple[str, ...], by: dict[str, By]
+) -> Steps:
+    """Of numpy's arrays, which are put side by side: one by one JAX compiles a copy of each."""
+    x, durations, outcome, n_stepped, tried, fixed, solver = jax.device_put(told)
+    return Steps(x, durations, outcome, n_stepped, tried, fixed, solver, engine, solvers, by)
