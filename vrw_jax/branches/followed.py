@@ -103,6 +103,7 @@ class CycleFollowed(AbstractFollowedWheel):
 
     problem: Problem = eqx.field(static=True)
     name: str = eqx.field(static=True)
+    more: Callable | None = eqx.field(static=True)  # of the first step's passages and z: `read` too
 
     @property
     def n_steps(self) -> int:
@@ -146,6 +147,8 @@ class CycleFollowed(AbstractFollowedWheel):
             "takeoff_acceleration": jnp.min(jnp.stack(takeoffs)),
             "mesh_error": self._mesh_error(z),
         }
+        if self.more is not None:
+            formal |= self.more(s, steps[0], z)
         return jnp.stack([end.q[0], *end.v]), formal
 
 

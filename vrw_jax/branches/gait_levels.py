@@ -130,7 +130,7 @@ class GaitLevel(AbstractLevel):
     @property
     def gaits(self) -> CycleFollowed:
         """The gaits along the first parameter alone."""
-        return CycleFollowed(problem=self.problem, name=self.names[0])
+        return CycleFollowed(problem=self.problem, name=self.names[0], more=_named)
 
     def told(self, gait: Wheel, z: Solution, p: Array) -> Array:
         """Those of the quantities that the step tells, one after another."""
@@ -153,12 +153,19 @@ class GaitLevel(AbstractLevel):
 def _formal(problem: Problem, parameters: Array, happens: Array, z: Solution) -> Array:
     """FORMAL of one wheel or of lanes."""
     s = wheel_of(parameters, problem.n_legs).symbols()
-    ((dls, sls1, sls2),) = problem.passages(parameters, z)[1]
+    (passages,) = problem.passages(parameters, z)[1]
+    return jnp.stack(list(_named(s, passages, z).values()))
+
+
+def _named(s: Symbols, passages: Any, z: Solution) -> dict[str, Array]:
+    """The same, by their names."""
+    dls, sls1, sls2 = passages
     landing = transitions.land(s, sls2.end.q[0], *sls2.end.v)
     fore, rear = transitions.landing_forces(s, landing)
-    forces = landing.rear.normal, fore.normal, rear.normal
     lasts, *others = z.durations[0]
-    return jnp.stack([*forces, *others, takeoff_acceleration(s, sls1), *_falls(s, dls, lasts)])
+    forces = landing.rear.normal, fore.normal, rear.normal
+    told = *forces, *others, takeoff_acceleration(s, sls1), *_falls(s, dls, lasts)
+    return dict(zip(FORMAL, told, strict=True))
 
 
 def _falls(s: Symbols, dls: Passage, lasts: Array) -> tuple[Array, Array]:
@@ -189,12 +196,3 @@ DIFFERENCE = 1e-6
 
 TOLD = {FORMAL: _formal, BIFURCATIONS: _monodromy}
 """By what a level's quantities are read, where it is not the step."""
-
-
-@eqx.filter_jit
-def formal_at(level: GaitLevel, wheels: Wheel, z: Solution, p: Any) -> Array:
-    def one(wheel: Wheel, z: Solution, p: Array) -> Array:
-        params = level.at(wheel, p).params
-        return _formal(level.problem, parameters_of(params), wheel.happens, z)
-
-    return jax.vmap(one)(wheels, z, p)

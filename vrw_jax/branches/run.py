@@ -226,9 +226,11 @@ def _zeros(run: AbstractRun, pieces: _Pieces, asked: list[tuple[int, int, str]])
     on = _solve_on if run.followed.traced else _solve_many
     search = functools.partial(on, run.followed, run.options, jnp.asarray(run.bounds))
 
+    def solved(places: np.ndarray, which: np.ndarray) -> tuple[PathPoint, np.ndarray]:
+        return run.batched(search, *taken((wheels, left, right), which), places)
+
     def evaluated(places: np.ndarray, which: np.ndarray) -> tuple[PathPoint, Table]:
-        some = *taken((wheels, left, right), which), places
-        points, found = run.batched(search, *some)
+        points, found = solved(places, which)
         points = points._replace(valid=points.valid & found)
         table = run.table(points, owners[which])
         return points, {k: np.where(_along(found, v), v, np.nan) for k, v in table.items()}
@@ -237,11 +239,12 @@ def _zeros(run: AbstractRun, pieces: _Pieces, asked: list[tuple[int, int, str]])
         table = evaluated(places, which)[1]
         return np.array([table[names[k]][i] for i, k in enumerate(which)])
 
-    at_right = np.array([pieces.table[n][i] for n, i in zip(names, rights, strict=True)])
+    known = lambda rows: np.array([pieces.table[n][i] for n, i in zip(names, rows, strict=True)])
     reach = np.maximum(np.abs(right.p - left.p), ACCURACY)
     width = np.minimum(ACCURACY / reach, AT_FOLD)
-    found, every = locate(asked_at, at_right, width), np.arange(len(asked))
-    best, _ = evaluated(found.place, every)
+    found = locate(asked_at, (known(lefts), known(rights)), width)
+    every = np.arange(len(asked))
+    best, _ = solved(found.place, every)
     # A little to the left even of an exact zero: there it is still what the branch stands for.
     beside, table = evaluated(np.maximum(found.left - width, 0.0), every)
     for share in SHARES_WHERE_LOST:

@@ -77,7 +77,7 @@ def start_by_collocation(wanted: Wanted, cycle: Any) -> Start:
         return find
 
     return Start(
-        CycleFollowed(problem=problem, name=name),
+        CycleFollowed(problem=problem, name=name, more=None),
         Wheel(params, start.located.happens),
         jax.vmap(lambda found: on_mesh(start.problem, problem, found))(start.located.solution),
         np.asarray(start.outcome),

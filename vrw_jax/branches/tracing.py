@@ -24,7 +24,6 @@ from vrw_jax.branches.gait_levels import (
     VOID,
     GaitAt,
     GaitLevel,
-    formal_at,
     level_of,
     quantities_of,
 )
@@ -69,8 +68,8 @@ class BorderRun(AbstractRun):
     """Of borders: read as gaits are, but for the border itself."""
 
     followed: LevelFollowed
+    second: str  # of the parameters
     names: tuple[str, ...]  # of the borders, one for each wheel
-    formal: GaitLevel  # of FORMAL
     gaits: GaitRun  # along the first parameter
 
     ending: ClassVar[tuple[str, ...]] = (*ENDING, EDGE, FALLS)
@@ -78,17 +77,15 @@ class BorderRun(AbstractRun):
 
     def read(self, wheels: GaitAt, points: PathPoint) -> Table:
         z, share = points.z
-        second = np.asarray(self.followed.second(LevelPoint(z, jnp.asarray(share))))
-        here = lambda params: getattr(params, self.formal.names[1])
+        (low, high), share = self.followed.bounds, np.asarray(share)
+        second = low + (high - low) * share
+        here = lambda params: getattr(params, self.second)
         gaits = wheels.gait._replace(params=eqx.tree_at(here, wheels.gait.params, second))
         table = self.gaits.read(gaits, points._replace(z=z))
-        told = formal_at(self.formal, gaits, z, np.stack([points.p, second], -1))
-        formal = dict(zip(FORMAL, np.asarray(told).T, strict=True))
         # Of gaits without double support the rear foot's force is what must not be positive.
         rear = np.where(wheels.gait.happens[:, 0, 0] > 0.5, 1.0, -1.0)
-        formal["lambda_4_plus"] = rear * formal["lambda_4_plus"]
-        shares = {EDGE: np.minimum(share, 1.0 - share), "second": second}
-        return table | formal | shares
+        told = {"lambda_4_plus": rear * table["lambda_4_plus"], "second": second}
+        return table | told | {EDGE: np.minimum(share, 1.0 - share)}
 
     def known(self, table: Table, owners: np.ndarray) -> Table:
         """What vanishes all along a curve has no zeros on it."""
@@ -239,7 +236,6 @@ class Tracer(NamedTuple):
         seeds = [self._on_mesh(seed, problem) for seed in seeds]
         filled = [*seeds, *seeds[-1:] * (-len(seeds) % SIDE_BY_SIDE)]
         level = GaitLevel(problem, self.parameters, kind, self.model, self.step_options)
-        formal = GaitLevel(problem, self.parameters, FORMAL, self.model, self.step_options)
         stack = lambda *trees: jax.tree.map(lambda *x: jnp.stack(x), *trees)
         levels = [level_of(seed.name, bool(seed.gait.happens[0, 0] > 0.5)) for seed in filled]
         places = [jnp.asarray(kind.index(name)) for name in levels]
@@ -255,8 +251,8 @@ class Tracer(NamedTuple):
             self.options,
             wheels,
             self.box[0],
+            self.parameters[1],
             names,
-            formal,
             gaits,
         )
         p, wanted = jnp.asarray([s.at[0] for s in filled]), np.arange(len(filled)) < len(seeds)

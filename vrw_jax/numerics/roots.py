@@ -73,7 +73,7 @@ class Located(NamedTuple):
 
 def locate(
     function: Callable[[np.ndarray, np.ndarray], np.ndarray],
-    at_one: np.ndarray,
+    ends: tuple[np.ndarray, np.ndarray],
     width: np.ndarray,
 ) -> Located:
     """Zeros of functions that have opposite signs at 0 and 1, by Chandrupatla's method.
@@ -81,16 +81,21 @@ def locate(
     `function` takes places and which brackets they are of. Inverse quadratic interpolation where it
     can be trusted, bisection else, and many sections at once where that goes on: a jump is found as
     surely as a smooth zero. Ends when each bracket is narrower than `width`. A place where the
-    function is not a number counts to the side of 1, whose values are `at_one`.
+    function is not a number counts to the side of 1; `ends` are its values at 0 and 1.
     """
     from scipy.optimize.elementwise import find_root  # only borders need it, its import is slow
 
+    # Places in widths: the tolerance is one for all.
+    at_zero, at_one = ends
+    inside = (np.zeros(len(width)), 1.0 / width)
+
     def signed(place: np.ndarray, which: np.ndarray) -> np.ndarray:
-        value = np.asarray(function(place * width[which], which), float)
+        value = np.where(place > 0.0, at_one[which], at_zero[which])
+        inner = np.flatnonzero((place > 0.0) & (place < inside[1][which]))
+        if len(inner):
+            value[inner] = function(place[inner] * width[which[inner]], which[inner])
         return np.where(np.isnan(value), at_one[which], value)
 
-    # Places in widths: the tolerance is one for all.
-    inside = (np.zeros(len(width)), 1.0 / width)
     tolerances = {"xatol": 1.0, "xrtol": 0.0, "fatol": 0.0}
     found = find_root(
         signed, inside, args=(np.arange(len(width)),), tolerances=tolerances, maxiter=ROUNDS
