@@ -1,7 +1,7 @@
 """Gaits on real ground, by Newton's method on steps of lanes and their derivatives.
 
-Every direction in which a step moves is a lane of the same machine code, so that many wheels are
-searched side by side and nothing large is compiled for the derivatives.
+All directions in which a step moves go beside its motion in the same machine code, so that many
+wheels are searched side by side and nothing large is compiled for the derivatives.
 """
 
 import functools

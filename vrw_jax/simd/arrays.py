@@ -16,7 +16,7 @@ import llvmlite.ir as ir
 import numpy as np
 
 from vrw_jax.simd.arithmetic import elementwise
-from vrw_jax.simd.fields import Entries, Field, Index, Memory, Updated
+from vrw_jax.simd.fields import Entries, Field, Index, Memory, Unset, Updated
 from vrw_jax.simd.numbers import LONG, NUMBERS, Numbers, Value
 
 LANES = 1021
@@ -155,7 +155,9 @@ class Arrays:
         return Memory(self, shape, kind, base)
 
     def fill(self, memory: Memory, array: Entries) -> None:
-        """Stores all entries."""
+        """Stores all entries that are known."""
+        if isinstance(array, Unset):
+            return
         if isinstance(array, Updated):
             self.fill(memory, array.whole)
             array.store_into(memory)

@@ -25,6 +25,10 @@ class Field:
         self.shape, self.kind, self.at = tuple(shape), kind, at
 
 
+class Unset(Field):
+    """A large array of whose entries none is read before it is overwritten."""
+
+
 class Updated(Field):
     """An array in memory, or of one number, but for a part of it."""
 

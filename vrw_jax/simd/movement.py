@@ -8,7 +8,7 @@ import numpy as np
 
 from vrw_jax.simd.arithmetic import converted
 from vrw_jax.simd.arrays import Arrays, Asked, has_lanes, moved, shape_of
-from vrw_jax.simd.fields import Entries, Field, Index, Updated
+from vrw_jax.simd.fields import Entries, Field, Index, Unset, Updated
 from vrw_jax.simd.numbers import LONG, Value
 from vrw_jax.simd.trace import Traces
 
@@ -124,6 +124,12 @@ def pad(arrays: Arrays, asked: Asked, array: Entries, value: Entries) -> Entries
     inside = tuple(slice(low, low + n) for (low, _, _), n in zip(around, array.shape, strict=False))
     filled[inside] = arrays.entries(array)
     return filled
+
+
+def empty(arrays: Arrays, asked: Asked) -> Entries:
+    """Whatever lies there: zeros, but for what loops carry in memory."""
+    kind = arrays.kind_of(asked.out)
+    return Unset(shape_of(asked.out), kind, lambda _: arrays.zero(kind))
 
 
 def iota(arrays: Arrays, asked: Asked) -> Entries:

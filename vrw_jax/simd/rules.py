@@ -20,7 +20,7 @@ def _single(write: Callable[..., Entries]) -> Rule:
         lanes, before = has_lanes(out), any(map(has_lanes, given))
         if before and not lanes and name not in ("reduce_and", "reduce_or"):
             raise moved(name)
-        if lanes and not before and name != "broadcast_in_dim":
+        if lanes and not before and name not in ("broadcast_in_dim", "empty"):
             raise taken_for_lanes(f"The result of {name}", out)
         number_of(out)  # refuses those of no known kind
         result = write(traces.arrays, Asked(name, equation.params, given, out), *values)
@@ -48,6 +48,7 @@ RULES: dict[str, Rule] = {
     "concatenate": _single(movement.concatenate),
     "dynamic_slice": _single(movement.dynamic_slice),
     "dynamic_update_slice": _single(movement.dynamic_update_slice),
+    "empty": _single(movement.empty),
     "expand_dims": _single(movement.reshape),
     "iota": _single(movement.iota),
     "pad": _single(movement.pad),

@@ -41,8 +41,8 @@ class _March(NamedTuple):
 
     q: Array
     v: Array
-    told: Array
-    slope: Array  # of accelerations and what is summed up, where it stands
+    told: Array | None
+    slope: Array  # of accelerations and, if wanted, what is summed up, where it stands
     later: Array  # how its time moves, s
 
 
@@ -56,7 +56,6 @@ class _Way(NamedTuple):
     def of(cls, moves: Moves, slope: Array) -> "_Way":
         """In two parts."""
         tally, told = moves.told
-        assert told is not None
         rest: Any = moves._asdict() | {"q": None, "v": None, "told": (tally, None), "time": None}
         return cls(_March(moves.q, moves.v, told, slope, moves.time), Moves(**rest))
 
@@ -83,7 +82,7 @@ class Ways(NamedTuple):
             told = jnp.stack([told[i] for i in range(size)])  # in registers
             return k + 1, lax.dynamic_update_index_in_dim(rows, told, k, 0)
 
-        blank = jnp.zeros((len(self.columns), size, *self.many.shape), self.columns.dtype)
+        blank = lax.empty((len(self.columns), size, *self.many.shape), self.columns.dtype)
         return lax.while_loop(goes_on, turn, (jnp.zeros((), jnp.int32), blank))[1]
 
 
@@ -122,7 +121,7 @@ def walked_along(
         return lane.moves(), lane
 
     moves, push, lane = jax.linearize(begun, columns, x, has_aux=True)
-    slope = jnp.zeros((len(moves.q) + N_TALLIED, *many.shape), x.dtype)
+    slope = jnp.zeros((len(moves.q) + N_TALLIED * on.detailed, *many.shape), x.dtype)
     like = _Way.of(moves, slope)
     ways = Ways(many, d_columns, d_columns)
     start = lambda k: _Way.of(push(_at(d_columns, k, columns), _at(d_x, k, x)), slope)
@@ -185,9 +184,10 @@ def _marched(
         def end(k: Array) -> _March:
             here, known = _at(rows, k, like), lax.dynamic_index_in_dim(moved, k, 1, False)
             q, v = stage_at(tableau, last, here.q, here.v, known, now.h)
-            told = here.told + now.h * sum(
-                tableau.once[last][j] * known[j, n:] for j in range(last)
-            )
+            told = here.told
+            if told is not None:
+                once = tableau.once[last]
+                told = told + now.h * sum(once[j] * known[j, n:] for j in range(last))
             there = _March(q, v, told, known[last], here.later)
             return select(taken, there, here._replace(slope=known[0]))
 
@@ -205,14 +205,14 @@ def _stages(
     """Slopes at the stages of a step, and how they move: (stages, directions, ., lanes)."""
     here, h = now.here, now.h
     n, last = len(here.q), len(tableau.places) - 1
-    fresh = (now.verdict == MARCHING) & (now.time == 0.0)
+    fresh, tallied = (now.verdict == MARCHING) & (now.time == 0.0), len(like.slope) - n
 
     def stage(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         i, slopes, moved = state
 
         def rows(columns: Array, q: Array, v: Array) -> tuple[Array, Array]:
             slope = slope_at(flow_at(columns), q, v)
-            return jnp.concatenate([slope[:n], slope[-N_TALLIED:]]), slope
+            return jnp.concatenate([slope[:n], slope[len(slope) - tallied :]]), slope
 
         place = stage_at(tableau, i, here.q, here.v, slopes, h)
         _, push, slope = jax.linearize(rows, columns, *place, has_aux=True)
@@ -229,7 +229,7 @@ def _stages(
 
     others = jnp.zeros((last, *here.slope.shape), h.dtype)
     slopes = jnp.concatenate([here.slope[None], others])
-    begin = 2 * n + N_TALLIED
+    begin = 2 * n + tallied
     slope = ways.rows[:, begin : begin + len(like.slope)]
     moved = jnp.zeros((last + 1, *slope.shape), h.dtype)
     moved = lax.dynamic_update_index_in_dim(moved, slope, 0, 0)
@@ -265,10 +265,13 @@ def _met(
         for index in range(len(moves)):
             at = arrived & (now.guard == index) & (rates[index] < 0.0)
             later = jnp.where(at, -moves[index] / jnp.where(at, rates[index], -1.0), later)
+        told = way.told
+        if told is not None:
+            told = told + later * here.slope[-N_TALLIED:]
         return _March(
             q=way.q + later * here.v,
             v=way.v + later * here.slope[:n],
-            told=way.told + later * here.slope[-N_TALLIED:],
+            told=told,
             slope=way.slope,
             later=later,
         )

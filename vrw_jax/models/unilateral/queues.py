@@ -61,9 +61,9 @@ def step_lanes(
     """One step of many wheels, as `walk_lanes` takes them, and how what it tells moves.
 
     Leading axis: wheels; derivatives have a last one over the columns, then the section state.
-    Each direction is a lane of its own beside the wheel's motion. What is not `wanted` and what
-    cannot move, lengths of legs on their stoppers or with loaded feet and codes, has zeros. Of the
-    rates only so many are lanes as loaded feet leave (see `_Rates`).
+    Directions go beside the wheel's motion. What is not `wanted` and what cannot move, lengths of
+    legs on their stoppers or with loaded feet and codes, has zeros. Of the rates only so many are
+    directions as loaded feet leave (see `_Rates`).
     """
     run = _Run.of(model, options, n, True)
     code = np.round(states[:, 4 + 2 * n :]).astype(int)
