@@ -210,10 +210,12 @@ def _program_of_rows(n: int, asked: str, size: int, dtype: np.dtype) -> Callable
 
 def _by_xla(function: Callable[[tuple, tuple], tuple]) -> Callable[..., Any]:
     """Of numbers and rows, where there is no machine code: compiled for few numbers of lanes."""
-    compiled = jax.jit(function)
+    moved = lambda told, here, there: tuple(jnp.moveaxis(x, here, there) for x in told)
+    compiled = jax.jit(lambda uniform, lanes: moved(function(uniform, lanes), -1, 0))
 
     def in_blocks(uniform: list, lanes: list) -> tuple:
-        return in_batches(lambda *rows: compiled(tuple(uniform), rows), (BLOCK,), *lanes)
+        own = lambda *rows: compiled(tuple(uniform), rows)
+        return moved(in_batches(own, (BLOCK,), *lanes), 0, -1)
 
     return in_blocks
 
@@ -280,7 +282,7 @@ def _walked(run: _Run, given: list[np.ndarray], n_steps: int, options: Options) 
     leaves, structure = _form(run, dtype)
     if rows is None:
         rows = [np.zeros((*leaf.shape, 0), leaf.dtype) for leaf in leaves]
-    return jax.tree.unflatten(structure, [np.moveaxis(x, -1, 0)[back] for x in rows])
+    return jax.tree.unflatten(structure, [np.moveaxis(np.asarray(x), -1, 0)[back] for x in rows])
 
 
 @functools.cache
