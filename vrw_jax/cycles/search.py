@@ -248,7 +248,8 @@ def newton(
     its result does not depend on its neighbours.
     """
     options = problem.options
-    tolerance = max(options.tolerance, 1e3 * float(jnp.finfo(parameters.dtype).eps))
+    eps = float(jnp.finfo(parameters.dtype).eps)
+    tight, loose = max(options.tolerance, 1e3 * eps), CycleOptions.tolerance
 
     def iterate(now: _Iterate) -> _Iterate:
         share = jnp.minimum(1.0, (now.iteration + 1) / jnp.maximum(stages, 1)).astype(
@@ -268,8 +269,8 @@ def newton(
         def moved(x: Array, change: Array) -> Array:
             return jnp.where(moves, x + share_of_step * jnp.where(moves, change, 0.0), x)
 
-        at_rounding = (step_size < CycleOptions.tolerance) & (step_size > 0.5 * now.residual)
-        converged = moves & arrived & ((step_size < tolerance) | at_rounding)
+        enough = jnp.where(2.0 * step_size > now.residual, loose, tight) if tight < loose else tight
+        converged = moves & arrived & (step_size < enough)
         located = now.located._replace(
             solution=jax.tree.map(moved, solution, correction),
             ends=take(passed.ends, now.located.ends),
