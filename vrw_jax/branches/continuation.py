@@ -66,6 +66,9 @@ INDICATORS = ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
 ENDING = (*INDICATORS, "duration_dls", "duration_sls1", "duration_sls2")
 """Where one of these reaches zero the order of events changes, and the branch ends."""
 
+INSTEAD = "differentiate vrw.limit_cycle"
+"""What a caller who differentiates may do."""
+
 COARSE = Outcome.MESH_TOO_COARSE.name.lower()
 """What an end is called where the gaits, not repeating when walked, are the mesh's alone."""
 
@@ -168,6 +171,7 @@ def continue_branch(
     one_wheel(params, "use vrw.continue_branches for a batch")
     if cycle is not None:
         instance("cycle", cycle, AbstractCycle, "give vrw.limit_cycle(params)")
+    untraced("vrw.continue_branch", INSTEAD, params, cycle)
     batch, cycle = jax.device_put(taken((params, cycle), None))
     (branch,) = continue_branches(
         batch, name, bounds, cycle=cycle, period_n=period_n, options=options,
@@ -217,7 +221,7 @@ def continue_branches(
         >>> [round(branch.borders[-1].value, 4) for branch in branches]
         [219.8477, 219.8477]
     """
-    untraced("vrw.continue_branch", "differentiate vrw.limit_cycle", params, cycle)
+    untraced("vrw.continue_branch", INSTEAD, params, cycle)
     instance("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
     model, step_options = rung_of(model), options_of(step_options or Options.tight())
     _check_followed(model, name, whole("period_n", period_n), cycle)
