@@ -20,9 +20,18 @@ from typing import Any
 
 import vrw_jax as vrw
 from experiments.shared.command import command, started
-from experiments.web.programs import LEGS, SAMPLES, TOLD, programs
+from experiments.web.programs import (
+    GROUND_TOLD,
+    LEGS,
+    SAMPLES,
+    TOLD,
+    Program,
+    ground_rows,
+    programs,
+    shared,
+)
 from vrw_jax.models import PAPER_START, EnergyLoss, Indicators
-from vrw_jax.results import CYCLE, MARGINS, STEP
+from vrw_jax.results import CYCLE, GROUND, MARGINS, STEP, STOPPERS
 from vrw_jax.wheel import DOMAINS
 
 ROOT = Path(__file__).parents[2]
@@ -45,8 +54,14 @@ SLIDERS = {
 }
 """What a slider spans, parameters that one turns first first."""
 
-RUNGS = {"viscoelastic": "springs", "rigid": "rigid"}
-"""What legs are, by the rungs' names."""
+RUNGS = {
+    "viscoelastic": "springs",
+    "rigid": "rigid legs",
+    "unilateral": "real ground",
+}
+"""What is modelled, by the rungs' names."""
+SHARED = "shared"
+"""Name of the code that is the same for any number of legs."""
 
 
 def linked(objects: dict[str, bytes]) -> bytes:
@@ -69,9 +84,9 @@ def linked(objects: dict[str, bytes]) -> bytes:
         return out.read_bytes()
 
 
-def compiled(n_legs: int) -> str:
-    """The step's code for so many legs, packed as the page holds it."""
-    code = linked({name: program.object(name) for name, program in programs(n_legs).items()})
+def compiled(some: dict[str, Program]) -> str:
+    """Programs' code, packed as the page holds it."""
+    code = linked({name: program.object(name) for name, program in some.items()})
     return packed(gzip.compress(code, 9, mtime=0))
 
 
@@ -137,7 +152,12 @@ def facts() -> dict[str, Any]:
         "rungs": RUNGS,
         "samples": SAMPLES,
         "rows": {n: told_rows(n) for n in LEGS},
-        "measures": {name: told(m) for name, m in (STEP | MARGINS | CYCLE).items()},
+        "ground": {n: ground_rows(n) for n in LEGS},
+        "groundTold": GROUND_TOLD,
+        "stoppers": list(STOPPERS),
+        "measures": {
+            name: told(m) for name, m in (STEP | MARGINS | GROUND | STOPPERS | CYCLE).items()
+        },
         "margins": {name: bool(m.axis) for name, m in TOLD.items()},
         "outcomes": {int(o): {"name": o.name, "meaning": o.meaning} for o in vrw.Outcome},
     }
@@ -153,7 +173,7 @@ def written(code: dict[str, str]) -> str:
     """The page with all that it needs inside."""
     part = lambda name: (SOURCES / name).read_text(encoding="utf-8")
     page, held = part("page.html"), {}
-    for name in ("page.css", "engine.js", "worker.js", "pictures.js", "page.js"):
+    for name in ("page.css", "engine.js", "ground.js", "worker.js", "pictures.js", "page.js"):
         lines = (line.strip() for line in part(name).splitlines())
         held[f"/*{name}*/"] = "\n".join(x for x in lines if x and not x.startswith("// "))
     held[f"/*{FACTS}*/"] = json.dumps(facts(), ensure_ascii=False)
@@ -172,7 +192,7 @@ def main() -> int:
     if only_page:
         code = told_in(PAGE.read_text(encoding="utf-8"), CODE)
     else:
-        code = {str(n): compiled(n) for n in LEGS}
+        code = {SHARED: compiled(shared())} | {str(n): compiled(programs(n)) for n in LEGS}
     page = written(code)
     PAGE.write_text(page, encoding="utf-8")
     print(f"{PAGE}: {len(page.encode()):,} bytes, {sum(map(len, code.values())):,} of them code")

@@ -3,10 +3,12 @@
 A wheel is a column of nine parameters in the order of `WheelParams`, a start one of three numbers.
 """
 
+import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -22,17 +24,25 @@ from vrw_jax.models import (
 from vrw_jax.models.lane_step import lane_phase, walk
 from vrw_jax.models.paper_step import result_of, told_of
 from vrw_jax.models.rigid import Roll
-from vrw_jax.models.unilateral.lanes import Walk, walked
+from vrw_jax.models.unilateral.lanes import Walk, started, turned
+from vrw_jax.models.unilateral.march import N_TALLIED, Place, motion_of
+from vrw_jax.models.unilateral.mechanics import kinetic_energy, potential_energy
+from vrw_jax.models.unilateral.motion import Stance
+from vrw_jax.models.unilateral.sampling import samples
 from vrw_jax.models.unilateral.section import embedded, section_size
 from vrw_jax.models.viscoelastic import described
-from vrw_jax.numerics import Options, explicit_tableau, sample_lanes
-from vrw_jax.results import MARGINS
-from vrw_jax.wheel import PARAMETER_NAMES, WheelParams, wheel_of
+from vrw_jax.numerics import Options, explicit_tableau, sample_lanes, sine_cosine
+from vrw_jax.results import MARGINS, STOPPERS
+from vrw_jax.wheel import PARAMETER_NAMES, Symbols, WheelParams, wheel_of
 
 LEGS = (6, 8, 10)
 """Numbers of legs that the page offers: each is code of its own."""
 SAMPLES = 24
 """Times of each phase that the animation knows, ends included."""
+
+WHOLE = 64
+"""Arrays so small are kept whole where a walk on real ground is taken apart: of ten legs the code
+is else five times as long."""
 
 SOLVER = Options.__dataclass_fields__["solver"].default
 
@@ -55,19 +65,53 @@ TOLD = {name: m for name, m in MARGINS.items() if name != "takeoff_acceleration"
 """Margins on the page: of scuffing the clearances tell there."""
 
 
+class _OfAnyLegs(WheelParams):
+    """A wheel whose number of legs only the program's run knows."""
+
+    legs: Array | float = 8.0
+
+    @property
+    def leg_angle(self) -> Any:
+        return 2.0 * math.pi / self.legs
+
+    def symbols(self) -> Symbols:
+        """Those of a step's motion, in which legs in the air are not told one by one."""
+        alpha = self.leg_angle
+        sin, cos = sine_cosine(alpha)
+        return (
+            super()
+            .symbols()
+            ._replace(
+                Mh=self.hub_mass + (self.legs - 1.0) * self.leg_mass,
+                Mt=self.hub_mass + self.legs * self.leg_mass,
+                n=self.legs,
+                sin_alpha=sin,
+                cos_alpha=cos,
+                alpha=alpha,
+            )
+        )
+
+
+def shared() -> dict[str, Program]:
+    """By name: what is the same code for wheels with any number of legs."""
+
+    def linearised(tolerance: Array, legs: Array, parameters: Array, x: Array) -> tuple:
+        """Section state and durations; outcome and solver's steps; how the first two move with each
+        of the start's numbers."""
+        given = dict(zip(PARAMETER_NAMES, tuple(parameters), strict=True))
+        params, options = _OfAnyLegs(**given, legs=legs), _options(tolerance)
+        moved = lambda *start: _advance(params, start, options)
+        columns, numbers, codes = along_units(moved, tuple(x), range(3))
+        return jnp.stack(numbers), jnp.stack(codes), jnp.stack(columns, 1)
+
+    return {"linearised": Program(linearised, 2, DIRECTIONS)}
+
+
 def programs(n_legs: int) -> dict[str, Program]:
     """By name: what of a step is told, of wheels with so many legs."""
 
     def wheel(parameters: Array) -> WheelParams:
         return wheel_of(tuple(parameters), n_legs)
-
-    def linearised(tolerance: Array, parameters: Array, x: Array) -> tuple:
-        """Section state and durations; outcome and solver's steps; how the first two move with each
-        of the start's numbers."""
-        params, options = wheel(parameters), _options(tolerance)
-        moved = lambda *start: _advance(params, start, options)
-        columns, numbers, codes = along_units(moved, tuple(x), range(3))
-        return jnp.stack(numbers), jnp.stack(codes), jnp.stack(columns, 1)
 
     def told(tolerance: Array, friction: Array, parameters: Array, x: Array) -> tuple:
         """All that the step tells, in `result_of`'s order, and its motion phase by phase."""
@@ -77,39 +121,124 @@ def programs(n_legs: int) -> dict[str, Program]:
         motion = []
         for phase, start, end in zip(walked.phases, walked.starts, walked.ends, strict=True):
             flow = lane_phase(phase, monitored=False)
-            samples = sample_lanes(
+            known = sample_lanes(
                 flow, explicit_tableau(SOLVER), *start, end.duration, SAMPLES, options
             )
-            motion.append(jnp.concatenate(described(phase, jnp.moveaxis(samples, 1, 0))))
+            motion.append(jnp.concatenate(described(phase, jnp.moveaxis(known, 1, 0))))
         codes = jnp.stack([step.outcome, step.solver_steps]).astype(jnp.int32)
         return _numbers_of(step), codes, *motion
 
-    return {
-        "linearised": Program(linearised, 1, DIRECTIONS),
-        "told": Program(told, 2),
-        **_of_rigid_legs(wheel),
-        **_on_ground(wheel, n_legs),
-    }
+    return {"told": Program(told, 2), **_of_rigid_legs(wheel), **_on_ground(wheel, n_legs)}
+
+
+GROUND_TOLD = (
+    "duration_dls", "duration_single", "duration_flight", "step_length",
+    "theta_post_impact", "dtheta_post_impact", "slip",
+    "energy_lost_impacts", "energy_lost_damping", "energy_lost_friction", *STOPPERS,
+)  # fmt: skip
+"""What of a step on real ground is told after its section state, by the measures' names."""
 
 
 def _on_ground(wheel: Callable[[Array], WheelParams], n_legs: int) -> dict[str, Program]:
-    """The section state of real ground that a state of the paper's is, and a step from there."""
-    model = UnilateralWheel()
+    """A walk on real ground from event to event, and the motion between two.
+
+    Where it stands is a column of numbers, flags and codes among them.
+    """
+    model, tableau = UnilateralWheel(), explicit_tableau(SOLVER)
+    size, n = section_size(n_legs), 3 + n_legs
+
+    def on(tolerance: Array) -> Walk:
+        rules = jnp.int32(1), model.max_events, model.one_sided, model.by_paper, True
+        return Walk(n_legs, *rules, _options(tolerance), tableau)
+
+    def columns(parameters: Array, friction: Array) -> Array:
+        return jnp.concatenate([parameters, (friction + 0.0 * parameters[0])[None]])
 
     def begun(parameters: Array, x: Array) -> tuple:
+        """The section state that a state of the paper's is."""
         return (embedded(wheel(parameters).symbols(), x),)
 
-    def advance(tolerance: Array, friction: Array, parameters: Array, x: Array) -> tuple:
-        """Section state, durations and length; outcome and solver's steps."""
-        rules = jnp.int32(1), model.max_events, model.one_sided, model.by_paper, False
-        walk = Walk(n_legs, *rules, _options(tolerance), explicit_tableau(SOLVER))
-        columns = jnp.concatenate([parameters, (friction + 0.0 * x[0])[None]])
-        end = walked(walk, columns, x)
-        codes = jnp.stack([end.outcome, end.tried])
-        return jnp.concatenate([*end.told[:2], end.told.step_length[None]]), codes
+    def opened(tolerance: Array, friction: Array, parameters: Array, x: Array) -> tuple:
+        """Where a step from there stands before its first event."""
+        return (_flat(started(on(tolerance), columns(parameters, friction), x)[1]),)
 
-    size = section_size(n_legs)
-    return {"ground_begun": Program(begun, 0), "ground_advance": Program(advance, 2, section=size)}
+    lane = jax.ShapeDtypeStruct((size, 1), float)
+    number, given = jax.ShapeDtypeStruct((), float), jax.ShapeDtypeStruct((9, 1), float)
+    form = jax.eval_shape(
+        lambda t, mu, p, x: started(on(t), columns(p, mu), x)[1], number, number, given, lane
+    )
+
+    def onward(tolerance: Array, friction: Array, parameters: Array, lane: Array) -> tuple:
+        """Through an event and on to the next: where it stands then; the stretch between, from its
+        coordinates, rates, contacts and stoppers, and how long it lasted; what the step tells so
+        far; and its outcome, -1 while it goes on."""
+        walk = on(tolerance)
+        past, after = turned(walk, columns(parameters, friction), _formed(lane, form), waits=True)
+        (q, v, _), stance = past.now.here, past.now.stance
+        codes = [stance.contact.astype(float), stance.locked.astype(float)]
+        step = walk.told(after)
+        told = (
+            step.durations, step.step_length, step.post_impact, step.slip, step.energy_impacts,
+            step.energy_damping, step.energy_friction,
+            *(getattr(step.monitors, name) for name in STOPPERS),
+        )  # fmt: skip
+        stretch = jnp.concatenate([q, v, *codes, after.now.time[None]])
+        return _flat(after), stretch, _flat((step.section_state, *told)), after.outcome
+
+    def between(tolerance: Array, friction: Array, parameters: Array, stretch: Array) -> tuple:
+        """Of a stretch, sample by sample: coordinates, normal and tangential forces of the first
+        two loaded feet, kinetic energy, that of height, that of springs."""
+        q, v = stretch[:n], stretch[n : 2 * n]
+        contact = stretch[2 * n : 2 * n + n_legs].astype(jnp.int32)
+        locked = stretch[2 * n + n_legs : -1] > 0.5
+        walk, none = on(tolerance), locked & False
+        stance = Stance(contact, locked, none, none, none)
+        flow = walk.flow(columns(parameters, friction), stance)
+        blank = jnp.zeros((N_TALLIED, *q.shape[1:]), q.dtype)
+        motion = motion_of(Place(q, v, q))
+        rows = samples(flow, motion, blank, stretch[-1], SAMPLES, walk.options, tableau)
+
+        def row(now: Array) -> Array:
+            motion = motion_of(Place(now[:n], now[n : 2 * n], now))
+            energies = kinetic_energy(flow.s, motion), *potential_energy(flow.s, motion)
+            return jnp.concatenate([now[:n], now[2 * n + N_TALLIED :], jnp.stack(energies)])
+
+        return (jnp.moveaxis(jax.vmap(row)(rows), 1, 0),)
+
+    return {
+        "ground_begun": Program(begun, 0),
+        "ground_opened": Program(opened, 2, section=size),
+        "ground_onward": Program(onward, 2, WHOLE, _size(form)),
+        "ground_between": Program(between, 2, section=2 * n + 2 * n_legs + 1),
+    }
+
+
+def ground_rows(n_legs: int) -> dict[str, int]:
+    """How many numbers there are: of a section state, and of where a walk stands."""
+    onward = _on_ground(lambda p: wheel_of(tuple(p), n_legs), n_legs)["ground_onward"]
+    return {"section": section_size(n_legs), "lane": onward.section}
+
+
+def _size(form: Any) -> int:
+    return sum(math.prod(leaf.shape[:-1]) for leaf in jax.tree.leaves(form))
+
+
+def _flat(tree: Any) -> Array:
+    """All arrays of a tree as rows of floats."""
+    rows = [x.astype(float).reshape(-1, x.shape[-1]) for x in jax.tree.leaves(tree)]
+    return jnp.concatenate(rows)
+
+
+def _formed(rows: Array, form: Any) -> Any:
+    """The inverse, by a tree of that form."""
+    leaves, structure = jax.tree.flatten(form)
+    found, begin = [], 0
+    for leaf in leaves:
+        end = begin + math.prod(leaf.shape[:-1])
+        own = rows[begin:end].reshape(*leaf.shape[:-1], rows.shape[-1])
+        found.append(own > 0.5 if leaf.dtype == bool else own.astype(leaf.dtype))
+        begin = end
+    return jax.tree.unflatten(structure, found)
 
 
 def _of_rigid_legs(wheel: Callable[[Array], WheelParams]) -> dict[str, Program]:

@@ -15,14 +15,14 @@ from typing import Any
 from experiments.shared.command import command, extra, started
 from experiments.shared.tables import markdown, replace
 from experiments.shared.timing import processor
-from experiments.web.build import CODE, FACTS, PAGE, ROOT, SOURCES, told_in
+from experiments.web.build import CODE, FACTS, PAGE, ROOT, SHARED, SOURCES, told_in
 
 MOVED = 80
 """Places of the slider, after as many that warm up."""
 
 IN_NODE = """
 const given = JSON.parse(require("fs").readFileSync(0)), { facts, packed } = given;
-(0, eval)(given.source + ";globalThis.own = { Engine, jobs };");
+(0, eval)(given.source + ";globalThis.own = { Engine, Ground, jobs, motionOnGround };");
 (async () => {
   const engine = await own.Engine.load(packed, facts, 8);
   const at = (damping) => facts.order.map(
@@ -50,21 +50,33 @@ const given = JSON.parse(require("fs").readFileSync(0)), { facts, packed } = giv
   found.lost = [0.5, 0.95, 0.99].map((share) => sorted(lost)[Math.floor(share * given.moved)]);
   const x = { from: theta - 0.4, to: theta + 0.4 }, y = { from: 0, to: 3 };
   const job = { kind: "basin", id: 1, legs: 8, wheel: at(200), gait: gait.x, x, y, last: 63 };
+  job.rate = gait.x[2];
   for (let i = 0; i < 2; i++) {
     const began = cpu();
     await own.jobs(() => {})({ job, packed, facts });
     found.basin = cpu() - began;
   }
+  const real = [];
+  let x0 = null;
+  for (let i = 0; i < 2 * given.moved; i++) {
+    const began = cpu(), wheel = at(150 + 50 * Math.abs(Math.sin(i / 10)));
+    const ground = new own.Ground(engine, wheel, 0.7);
+    const walk = ground.found([() => x0 || ground.begun(facts.start)]);
+    x0 = walk.gait && walk.gait.x;
+    own.motionOnGround(ground, ground.step(x0 || walk.states[0]));
+    real.push(cpu() - began);
+  }
+  found.real = [0.5, 0.95].map((share) => sorted(real)[Math.floor(share * given.moved)]);
   console.log(JSON.stringify(found));
 })();
 """
 
-IN_CHROMIUM = """async (moved) => {
+IN_CHROMIUM = """async ([moved, rung, pace]) => {
   const times = [];
   for (let i = 0; i < 2 * moved; i++) {
     await new Promise((go) => requestAnimationFrame(go));
     const began = performance.now();
-    await vrw.update({ damping: 150 + 50 * Math.abs(Math.sin(i)) });
+    await vrw.update({ rung, friction: 0.7, damping: 150 + 50 * Math.abs(Math.sin(pace * i)) });
     times.push(performance.now() - began);
   }
   const late = times.slice(-moved).sort((a, b) => a - b);
@@ -75,9 +87,12 @@ IN_CHROMIUM = """async (moved) => {
 def in_node() -> dict[str, Any]:
     """CPU time of an update, of one without a gait (three quantiles) and of a basin, ms."""
     page = PAGE.read_text(encoding="utf-8")
-    source = "\n".join((SOURCES / name).read_text() for name in ("engine.js", "worker.js"))
+    source = "\n".join(
+        (SOURCES / name).read_text() for name in ("engine.js", "ground.js", "worker.js")
+    )
+    code = told_in(page, CODE)
     given = {
-        "facts": told_in(page, FACTS), "packed": told_in(page, CODE)["8"], "moved": MOVED,
+        "facts": told_in(page, FACTS), "packed": [code[SHARED], code["8"]], "moved": MOVED,
         "source": source.replace('"use strict";', ""),
     }  # fmt: skip
     node = ["node", "-e", IN_NODE]
@@ -85,8 +100,10 @@ def in_node() -> dict[str, Any]:
     return json.loads(told.stdout)
 
 
-def in_chromium() -> tuple[list[float], float, float]:
-    """Wall time of an update with all that is drawn, median and 95 in 100, ms; basin and map, s."""
+def in_chromium() -> dict[str, tuple[list[float], float, float]]:
+    """By rung the wall time of an update with all that is drawn, median and 95 in 100, ms; of basin
+    and map, s."""
+    found = {}
     path = shutil.which("chromium")
     switches = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-sync"]
     playwright = extra("playwright.sync_api", 'pip install -e ".[web]"')
@@ -97,21 +114,25 @@ def in_chromium() -> tuple[list[float], float, float]:
         page = opened.new_page()
         page.goto(PAGE.as_uri())
         page.evaluate("vrw.ready")
-        times = page.evaluate(IN_CHROMIUM, MOVED)
         done = "vrw.state.map.done && vrw.state.basin.done"
-        page.wait_for_function(done, timeout=300_000)
-        # Once more, as it is when the code is warm.
-        page.evaluate("vrw.update({ stiffness: 510 })")
-        page.wait_for_timeout(1000)
-        page.wait_for_function(done, timeout=300_000)
-        pictures = page.evaluate("[vrw.state.basin.seconds, vrw.state.map.seconds]")
+        for rung, pace in (("viscoelastic", 1.0), ("unilateral", 0.1)):
+            times = page.evaluate(IN_CHROMIUM, [MOVED, rung, pace])
+            page.wait_for_timeout(1000)
+            page.wait_for_function(done, timeout=300_000)
+            # Once more, as it is when the code is warm.
+            page.evaluate(f"vrw.update({{ stiffness: {500 + 10 * pace} }})")
+            page.wait_for_timeout(1000)
+            page.wait_for_function(done, timeout=300_000)
+            pictures = page.evaluate("[vrw.state.basin.seconds, vrw.state.map.seconds]")
+            found[rung] = times, *pictures
         opened.close()
-    return times, *pictures
+    return found
 
 
 def main() -> None:
     started(command(__doc__))
-    node, (times, basin, whole) = in_node(), in_chromium()
+    node, chromium = in_node(), in_chromium()
+    (times, basin, whole), (real, slow, wide) = chromium["viscoelastic"], chromium["unilateral"]
     rows = [
         ("a slider moved: gait, multipliers, forces, margins", f"{node['update']:.1f} ms",
          f"{times[0]:.0f} ms, 95 in 100 below {times[1]:.0f}"),
@@ -119,6 +140,11 @@ def main() -> None:
          "{:.0f} ms, 95 in 100 below {:.0f}, none above {:.0f}".format(*node["lost"]), ""),
         ("a basin of 64 × 64 starts", f"{node['basin'] / 1000:.2f} s", f"{basin:.1f} s"),
         ("a map of 65 × 65 gaits", "", f"{whole:.1f} s"),
+        ("real ground: a slider moved a little",
+         "{:.0f} ms, 95 in 100 below {:.0f}".format(*node["real"]),
+         f"{real[0]:.0f} ms, 95 in 100 below {real[1]:.0f}"),
+        ("real ground: a basin of 32 × 32 starts", "", f"{slow:.0f} s"),
+        ("real ground: a map of 33 × 33 gaits", "", f"{wide:.0f} s"),
     ]  # fmt: skip
     table = markdown(("", "Node, CPU time", "Chromium, wall time, all drawn"), rows)
     load = f"load average {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"

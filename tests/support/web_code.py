@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments.web.build import CODE, FACTS, told_in, unpacked
+from experiments.web.build import CODE, FACTS, SHARED, told_in, unpacked
 
 PAGE = Path(__file__).parents[2] / "docs" / "wheel.html"
 
@@ -20,18 +20,34 @@ class WebCode:
     """The page's functions for wheels with so many legs; lanes are the last axis."""
 
     def __init__(self, n_legs: int) -> None:
+        self.modules = Module(str(n_legs)), Module(SHARED)
+        self.facts = self.modules[0].facts
+
+    def __call__(self, name: str, *given: Any) -> list[np.ndarray]:
+        """See `Module`."""
+        [owner] = [module for module in self.modules if name in module]
+        return owner(name, *given)
+
+
+class Module:
+    """One of the page's codes."""
+
+    def __init__(self, name: str) -> None:
         wasmtime = pytest.importorskip("wasmtime", reason="wasmtime runs the page's code here")
         page = PAGE.read_text(encoding="utf-8")
         self.facts = told_in(page, FACTS)
-        code = gzip.decompress(unpacked(told_in(page, CODE)[str(n_legs)]))
+        code = gzip.decompress(unpacked(told_in(page, CODE)[name]))
         self._store, self._kept = wasmtime.Store(), []  # what it calls must outlive it
         module = wasmtime.Module(self._store.engine, code)
         real = wasmtime.FuncType([wasmtime.ValType.f64()], [wasmtime.ValType.f64()])
         self.imports = [needed.name for needed in module.imports]
-        given = [self._lent(real, getattr(math, name)) for name in self.imports]
+        given = [self._lent(real, getattr(math, one)) for one in self.imports]
         self._exports = wasmtime.Instance(self._store, module, given).exports(self._store)
         self._memory = self._exports["memory"]
         self._free = self._exports["__heap_base"].value(self._store)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._exports
 
     def _lent(self, kind: Any, function: Callable[[float], float]) -> Any:
         """A function of a number, called without the checks of `wasmtime.Func`: these take thirty

@@ -130,6 +130,48 @@ def test_rigid_legs_roll_as_the_librarys_do(page, held):
         assert np.max(np.abs(found - trace[name].values[-24:])) < 1e-8, name
 
 
+def test_on_real_ground_the_gait_its_multipliers_and_its_motion_are_the_librarys(page):
+    """Feet slide there; multipliers are differences, right to five digits."""
+    params, model = vrw.WheelParams(damping=150.0), vrw.UnilateralWheel(friction=0.5)
+    page.evaluate("vrw.update({ rung: 'unilateral', damping: 150, friction: 0.5 })")
+    assert "real ground" in page.inner_text("#verdict")
+    assert "UnilateralWheel(friction=0.5)" in page.inner_text("#python")
+    assert not page.is_visible("#ground-card")
+    x, multipliers = gait_of(page)
+    taken = vrw.steps(params, x[None], model=model, derivatives="section_state")
+    assert np.max(np.abs(taken.section_state[0] - x)) < 1e-8
+    expected = np.linalg.eigvals(taken.derivatives["section_state"].section_state[0])
+    expected = expected[np.argsort(-np.abs(expected))][: len(multipliers)]
+    apart = np.stack(
+        [multipliers.real - expected.real, np.abs(multipliers.imag) - np.abs(expected.imag)]
+    )
+    assert np.max(np.abs(apart)) < 1e-5
+    told = page.evaluate("vrw.state.result.measures")
+    assert told["slip"] > 0.01
+    for name, value in vrw.step(params, jnp.asarray(x), model=model).measures().items():
+        if np.ndim(value) == 0 and name in told:
+            assert abs(told[name] - float(value)) < 1e-8 * (1.0 + abs(float(value))), name
+    [step] = page.evaluate("vrw.state.result.steps")
+    assert abs(step["length"] - told["step_length"]) < 1e-12
+    assert abs(sum(band["duration"] for band in step["bands"]) - told["period"]) < 1e-12
+    assert any("slid" in band["texts"][0] for band in step["bands"])
+    page.wait_for_function("vrw.state.basin.cells.size > 16 && vrw.state.map.cells.size > 16")
+    assert "to the gait" in page.inner_text("#basin-legend")
+    page.select_option("#map-x", "friction")  # what real ground alone has an axis for
+    page.wait_for_function("vrw.state.map.x === 'friction' && vrw.state.map.cells.size > 16")
+    page.evaluate("vrw.update({ rung: 'viscoelastic' })")
+    assert page.evaluate("vrw.state.map.x") != "friction"
+    assert page.is_visible("#ground-card")
+
+
+def test_a_walk_that_slides_to_a_halt_is_shown_until_it_does(page):
+    page.evaluate("vrw.update({ rung: 'unilateral', friction: 0.05 })")
+    result = page.evaluate("vrw.state.result")
+    assert result["gait"] is None
+    assert "lost" in page.inner_text("#verdict")
+    assert len(result["steps"][-1]["times"]) > 24
+
+
 def test_friction_that_would_not_do_is_told(page):
     params = vrw.WheelParams()
     margins = vrw.step(params, vrw.limit_cycle(params).section_state).monitors

@@ -168,7 +168,9 @@ def explore(
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Begin there; may be repeated."),
     ] = None,
-    rung: Annotated[str, typer.Option(help="viscoelastic, or rigid.")] = "viscoelastic",
+    rung: Annotated[
+        str, typer.Option(help="viscoelastic, rigid or unilateral (real ground).")
+    ] = "viscoelastic",
 ) -> None:
     """Open the wheel to play with in your browser: one page, which computes by itself."""
     with sentences():

@@ -424,5 +424,5 @@ def replaced_where_bad(
     return jax.tree.map(
         lambda value, default: jnp.where(good, value, jnp.asarray(default, value.dtype)),
         (params, x),
-        (WheelParams(n_legs=params.n_legs), safe_x),
+        (type(params)(n_legs=params.n_legs), safe_x),
     )

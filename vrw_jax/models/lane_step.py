@@ -86,9 +86,9 @@ def lane_phase(phase: AbstractPhase, monitored: bool) -> LanePhase:
         lambda place: phase.residual(motion(place), place.slope.acceleration),
         lambda place, rows: phase.solve(motion(place), rows),
     )
-    watched = Monitors(lambda place: phase.premises(instant(place)), phase.counts_at_start)
-    guards = lambda place: phase.guards(instant(place))
-    return LanePhase(evaluate, guards, watched if monitored else None, balance)
+    premises = lambda place: phase.premises(instant(place))
+    watched = Monitors(premises, phase.counts_at_start) if monitored else None
+    return LanePhase(evaluate, lambda place: phase.guards(instant(place)), watched, balance)
 
 
 def gait_step(

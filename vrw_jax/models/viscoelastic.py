@@ -98,7 +98,7 @@ def _run(
     state = tuple(end.state)
     return End(
         state[: phase.n], state[phase.n :], end.duration, end.guard, end.timed_out,
-        end.solver_steps, end.minima,
+        end.solver_steps, end.minima if monitored else None,
     )  # fmt: skip
 
 

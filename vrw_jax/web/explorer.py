@@ -12,7 +12,7 @@ from vrw_jax.wording import chosen, instance, untraced, whole
 if TYPE_CHECKING:
     import xarray as xr
 
-RUNGS = "viscoelastic", "rigid"
+RUNGS = "viscoelastic", "rigid", "unilateral"
 """Of the ladder, those that the page walks on."""
 HEIGHT = 900
 """Of the widget, in pixels of the screen."""
@@ -88,8 +88,8 @@ def explore(
 
     Args:
         params: that it begins with; Table 1's by default.
-        friction: what its margins refer to.
-        rung: "viscoelastic", or "rigid" for legs without springs.
+        friction: of real ground, and what margins refer to.
+        rung: "viscoelastic", "rigid" for legs without springs, or "unilateral" for real ground.
         dataset: of a `vrw.scan` over a grid of two parameters: its map.
         height: of the widget, in pixels.
 

@@ -7,50 +7,53 @@ const LIMITS = [0.15, 0.6, 0.6]; // of a correction: rad, rad/s, m/s
 const STEPPED = 0;
 
 class Engine {
-  // `packed`: the code, gzipped, by `unpacked`.
+  // `packed`: the codes, that of any number of legs and that of so many, gzipped, by `unpacked`.
   static async load(packed, facts, legs) {
-    const stream = new Blob([unpacked(packed)]).stream().pipeThrough(new DecompressionStream("gzip"));
-    const code = await new Response(stream).arrayBuffer();
-    const { instance } = await WebAssembly.instantiate(code, { env: Math });
-    return new Engine(instance.exports, facts, legs);
+    const codes = packed.map(async (text) => {
+      const stream = new Blob([unpacked(text)]).stream().pipeThrough(new DecompressionStream("gzip"));
+      const code = await new Response(stream).arrayBuffer();
+      return (await WebAssembly.instantiate(code, { env: Math })).instance.exports;
+    });
+    return new Engine(await Promise.all(codes), facts, legs);
   }
 
-  constructor(code, facts, legs, rung = "viscoelastic") {
-    Object.assign(this, { code, facts, legs, rung });
-    this.prefix = rung === "viscoelastic" ? "" : `${rung}_`;
+  constructor(codes, facts, legs, rung = "viscoelastic") {
+    Object.assign(this, { codes, facts, legs, rung });
+    this.prefix = { viscoelastic: "", rigid: "rigid_", unilateral: "ground_" }[rung];
     this.alpha = (2 * Math.PI) / legs;
     this.samples = facts.samples;
     this.rows = facts.rows[legs];
     this.start = facts.start;
-    this.free = Math.ceil(code.__heap_base.value / 16) * 16;
     // Of each phase the motion: thirteen rows, with rigid legs one phase and its times.
     this.motion = rung === "rigid" ? [14] : [13, 13, 13];
   }
 
   // The same code for another rung.
   as(rung) {
-    return new Engine(this.code, this.facts, this.legs, rung);
+    return new Engine(this.codes, this.facts, this.legs, rung);
   }
 
-  // Numbers; arrays as lists of columns, one for each lane; results as [rows, is it of floats].
-  // Results lie row after row, `lanes` numbers each.
+  // Numbers; arrays as lists of columns, one for each lane, or as results; these as [rows, is it of
+  // floats]. They lie row after row, `lanes` numbers each, until the next call.
   run(name, numbers, columns, told) {
-    const n = columns[0].length, lanes = n + (n % 2);
-    let end = this.free;
+    const n = columns[0].length, lanes = n + (n % 2), called = this.prefix + name;
+    const code = this.codes.find((one) => one[called]);
+    let end = Math.ceil(code.__heap_base.value / 16) * 16;
     const place = (bytes) => {
       const here = end;
       end += Math.ceil(bytes / 16) * 16;
       return here;
     };
     const single = numbers.map(() => place(8));
-    const arrays = columns.map((some) => place(8 * some[0].length * lanes));
+    const arrays = columns.map((some) => place(8 * (some[0].length * lanes || some.length)));
     const results = told.map(([rows, floats]) => place((floats ? 8 : 4) * rows * lanes));
     const given = place(4 * (single.length + arrays.length)), out = place(4 * results.length);
-    const memory = this.code.memory, missing = end - memory.buffer.byteLength;
+    const memory = code.memory, missing = end - memory.buffer.byteLength;
     if (missing > 0) memory.grow(Math.ceil(missing / 65536));
     const pointers = new Int32Array(memory.buffer), floats = new Float64Array(memory.buffer);
     numbers.forEach((x, i) => (floats[single[i] / 8] = x));
     columns.forEach((some, i) => {
+      if (some instanceof Float64Array) return floats.set(some, arrays[i] / 8);
       for (let lane = 0; lane < lanes; lane++) {
         const column = some[Math.min(lane, n - 1)];
         for (let row = 0; row < column.length; row++)
@@ -59,31 +62,18 @@ class Engine {
     });
     [...single, ...arrays].forEach((where, i) => (pointers[given / 4 + i] = where));
     results.forEach((where, i) => (pointers[out / 4 + i] = where));
-    this.code[this.prefix + name](given, out, BigInt(lanes), 0n, BigInt(lanes / 2));
+    code[called](given, out, BigInt(lanes), 0n, BigInt(lanes / 2));
     return told.map(([rows, isFloat], i) => {
       const kind = isFloat ? Float64Array : Int32Array;
       return new kind(memory.buffer, results[i], rows * lanes);
     });
   }
 
-  // The section state of real ground that a state of the paper's is, and one step from there.
-  begunOnGround(wheel, x) {
-    const size = 4 + 3 * this.legs, [state] = this.run("begun", [], [[wheel], [x]], [[size, true]]);
-    return Array.from({ length: size }, (_, i) => state[2 * i]);
-  }
-
-  steppedOnGround(wheel, friction, x) {
-    const told = [[x.length + 4, true], [2]];
-    const [numbers, codes] = this.run("advance", [SHOWN, friction], [[wheel], [x]], told);
-    const own = Array.from({ length: x.length + 4 }, (_, i) => numbers[2 * i]);
-    const durations = own.slice(x.length, -1), step_length = own[own.length - 1];
-    return { x: own.slice(0, x.length), durations, step_length, outcome: codes[0] };
-  }
-
   // One step of each lane: section states, outcomes and the Jacobian of the state by itself.
   linearised(tolerance, wheels, starts) {
     const n = wheels.length, lanes = n + (n % 2), told = [[6, true], [2], [18, true]];
-    const [numbers, codes, columns] = this.run("linearised", [tolerance], [wheels, starts], told);
+    const given = this.rung === "rigid" ? [tolerance] : [tolerance, this.legs];
+    const [numbers, codes, columns] = this.run("linearised", given, [wheels, starts], told);
     return starts.map((_, i) => ({
       x: [0, 1, 2].map((row) => numbers[row * lanes + i]),
       outcome: codes[i],
@@ -196,54 +186,81 @@ function unpacked(text) {
   return view.buffer.slice(0, view.byteLength - text[0]);
 }
 
-const radius = (gait) => Math.hypot(gait.multipliers[0].re, gait.multipliers[0].im);
+const size = ({ re, im }) => Math.hypot(re, im);
+const radius = (gait) => Math.max(0, ...gait.multipliers.map(size));
 const isStable = (gait) => radius(gait) < 1;
+const dot = (a, b) => a.reduce((sum, value, i) => sum + value * b[i], 0);
 
-// (1 - J)^-1 r of three numbers; null where it has none.
+// (1 - J)^-1 r; null where it has none.
 function solved(J, r) {
-  const rows = J.map((row, i) => [...row.map((value, k) => (i === k ? 1 : 0) - value), r[i]]);
-  for (let k = 0; k < 3; k++) {
+  const n = r.length, rows = J.map((row, i) => [...row.map((value, k) => (i === k ? 1 : 0) - value), r[i]]);
+  for (let k = 0; k < n; k++) {
     let best = k;
-    for (let i = k + 1; i < 3; i++) if (Math.abs(rows[i][k]) > Math.abs(rows[best][k])) best = i;
+    for (let i = k + 1; i < n; i++) if (Math.abs(rows[i][k]) > Math.abs(rows[best][k])) best = i;
     [rows[k], rows[best]] = [rows[best], rows[k]];
     if (!(Math.abs(rows[k][k]) > 1e-14)) return null;
-    for (let i = 0; i < 3; i++) {
+    for (let i = 0; i < n; i++) {
       if (i === k) continue;
       const factor = rows[i][k] / rows[k][k];
-      for (let j = k; j < 4; j++) rows[i][j] -= factor * rows[k][j];
+      for (let j = k; j <= n; j++) rows[i][j] -= factor * rows[k][j];
     }
   }
-  return rows.map((row, i) => row[3] / row[i]);
+  return rows.map((row, i) => row[n] / row[i]);
 }
 
-// Eigenvalues of three by three, the largest first: roots of z³ - t z² + s z - d.
-function multipliers(J) {
-  const minor = (i, k) => J[i][i] * J[k][k] - J[i][k] * J[k][i];
-  const t = J[0][0] + J[1][1] + J[2][2], s = minor(0, 1) + minor(0, 2) + minor(1, 2);
-  const d =
-    J[0][0] * minor(1, 2) -
-    J[0][1] * (J[1][0] * J[2][2] - J[1][2] * J[2][0]) +
-    J[0][2] * (J[1][0] * J[2][1] - J[1][1] * J[2][0]);
-  // A real root: the outermost one, towards which Newton's method goes without turning back.
-  const bend = t / 3, at = (z) => ((z - t) * z + s) * z - d;
-  const bound = 1 + Math.max(Math.abs(t), Math.abs(s), Math.abs(d));
-  let z = at(bend) > 0 ? -bound : bound;
-  for (let i = 0; i < 200; i++) {
-    const next = z - at(z) / ((3 * z - 2 * t) * z + s);
-    if (!(Math.abs(next - z) > 1e-17 * bound)) break;
-    z = next;
+// Eigenvalues that are not 0, the largest first; `noise`: what of a column's size is rounding.
+function multipliers(J, noise = 1e-13) {
+  // Where J leads to, as orthonormal columns: within it lies all that is not forgotten.
+  const length = (column) => Math.sqrt(dot(column, column)), Q = [];
+  let rest = J.map((_, k) => J.map((row) => row[k]));
+  const most = Math.max(...rest.map(length));
+  while (Q.length < J.length) {
+    const lengths = rest.map(length), longest = Math.max(...lengths);
+    if (!(longest > noise * most)) break;
+    const q = rest[lengths.indexOf(longest)].map((value) => value / longest);
+    Q.push(q);
+    rest = rest.map((column) => {
+      const along = dot(q, column);
+      return column.map((value, i) => value - along * q[i]);
+    });
   }
-  // The others: z² + p z + q, by dividing from the end that keeps digits.
-  const p = z - t, q = Math.abs(z) > 1e-3 ? d / z : s + z * p;
-  const inside = (p * p) / 4 - q;
-  let pair;
-  if (inside >= 0) {
-    const far = -p / 2 - Math.sign(p || 1) * Math.sqrt(inside);
-    pair = [{ re: far, im: 0 }, { re: far === 0 ? 0 : q / far, im: 0 }];
-  } else {
-    const im = Math.sqrt(-inside);
-    pair = [{ re: -p / 2, im }, { re: -p / 2, im: -im }];
+  const M = Q.map((q) => Q.map((p) => dot(q, J.map((row) => dot(row, p)))));
+  return roots(characteristic(M)).sort((a, b) => size(b) - size(a));
+}
+
+// Coefficients after the leading 1 of a matrix's characteristic polynomial, by Faddeev and LeVerrier.
+function characteristic(M) {
+  let N = M.map((row) => row.map(() => 0)), last = 1;
+  return M.map((_, k) => {
+    const before = N.map((row, i) => row.map((value, j) => value + (i === j ? last : 0)));
+    N = M.map((row) => M.map((_, j) => row.reduce((sum, value, l) => sum + value * before[l][j], 0)));
+    last = -N.reduce((sum, row, i) => sum + row[i], 0) / (k + 1);
+    return last;
+  });
+}
+
+// Roots of a polynomial of real coefficients, all at once, by Weierstrass.
+function roots(coefficients) {
+  const times = (a, b) => ({ re: a.re * b.re - a.im * b.im, im: a.re * b.im + a.im * b.re });
+  const less = (a, b) => ({ re: a.re - b.re, im: a.im - b.im });
+  const over = (a, b) => {
+    const whole = b.re * b.re + b.im * b.im;
+    return { re: (a.re * b.re + a.im * b.im) / whole, im: (a.im * b.re - a.re * b.im) / whole };
+  };
+  const scale = Math.max(...coefficients.map((value, i) => Math.abs(value) ** (1 / (i + 1))), 0);
+  const found = coefficients.map((_, i) => ({ re: scale * Math.cos(2.4 * i + 0.4), im: scale * Math.sin(2.4 * i + 0.4) }));
+  for (let turn = 0; turn < 300; turn++) {
+    let moved = 0;
+    found.forEach((z, i) => {
+      let value = { re: 1, im: 0 }, apart = { re: 1, im: 0 };
+      for (const c of coefficients) (value = times(value, z)).re += c;
+      found.forEach((other, k) => k !== i && (apart = times(apart, less(z, other))));
+      const step = over(value, apart);
+      if (!isFinite(step.re + step.im)) return;
+      found[i] = less(z, step);
+      moved = Math.max(moved, size(step));
+    });
+    if (!(moved > 1e-16 * scale)) break;
   }
-  const size = (m) => Math.hypot(m.re, m.im);
-  return [{ re: z, im: 0 }, ...pair].sort((a, b) => size(b) - size(a));
+  return found.map(({ re, im }) => ({ re, im: Math.abs(im) > 1e-9 * scale ? im : 0 }));
 }

@@ -7,7 +7,11 @@ const facts = told("facts"), packed = told("code");
 const MEASURED = ["speed", "dls_fraction", "period", "step_length", "duration_dls", "duration_sls1", "duration_sls2",
   "theta_touchdown", "dtheta_touchdown", "energy_lost_landing", "energy_lost_stopper", "energy_lost_damping"];
 const INDICATORS = ["lambda_I4", "lambda_2_plus", "lambda_4_plus"];
-const MAPPED = ["speed", "dls_fraction", "period", "spectral_radius", ...INDICATORS, ...Object.keys(facts.margins)];
+const ON_GROUND = ["speed", "dls_fraction", "period", "step_length", "duration_dls", "duration_single", "duration_flight",
+  "theta_touchdown", "dtheta_touchdown", "slip", "energy_lost_impacts", "energy_lost_damping", "energy_lost_friction"];
+const ALIKE = ["speed", "dls_fraction", "period", "spectral_radius"];
+const MAPPED = [...ALIKE, ...INDICATORS, ...Object.keys(facts.margins)];
+const MAPPED_ON_GROUND = [...ALIKE, "slip", "energy_lost_friction", "duration_flight", ...facts.stoppers];
 const PRESETS = {
   "Table 1": {},
   "foot scuffs": { damping: 40 },
@@ -18,10 +22,12 @@ const PRESETS = {
   "falls back": { slope: 0.1 },
   "would slide": { friction: 0.3 },
   "rigid legs": { rung: "rigid", slope: 0.2 },
+  "real ground": { rung: "unilateral" },
+  "on ice": { rung: "unilateral", friction: 0.2 },
 };
 const OUTCOME_COLORS = { 1: "#e69f00", 2: "#009e73", 3: "#56b4e9", 4: "#d55e00", 5: "#cc79a7", 6: "#999933", 7: "#882255",
   8: "#000000", 9: "#bbbbbb" };
-const LAST = 64, LOST_STEPS = 60;
+const LAST = 64, FEWER = 32, LOST_STEPS = 60; // nodes of a picture's side, and on real ground
 
 const defaults = () => {
   const values = { friction: 1, n_legs: 8, rung: "viscoelastic" };
@@ -43,22 +49,26 @@ const number = (value) => {
 };
 const unitText = (unit) => unit.replaceAll(" ", "·").replace("^2", "²").replace("/s²", "/s²");
 const symbol = (name) => (name === "friction" ? "μ" : facts.parameters[name].symbol.replace("phi", "φ").replace("_", ""));
-const set = (text) => text.replace("phi", "φ").replace(/_([A-Za-z0-9-]+)/g, "<sub>$1</sub>");
+const set = (text) => text.replace("phi", "φ").replace(/_([A-Za-z0-9μ-]+)/g, "<sub>$1</sub>");
 const signOf = (name) => (name === "friction" ? "μ" : set(facts.parameters[name].symbol));
 const table = (caption, rows) => `<table><caption class="unseen">${caption}</caption><tbody>${rows.join("")}</tbody></table>`;
 const parts = (list, count) => Array.from({ length: count }, (_, i) =>
   list.slice(Math.ceil((i * list.length) / count), Math.ceil(((i + 1) * list.length) / count)));
 const named = (name) => name.replaceAll("_", " ");
 
+const isReal = ({ rung }) => rung === "unilateral";
+const codesOf = (legs) => [packed.shared, packed[legs]];
+
 // ---- what a wheel gives
 
 async function engineOf({ n_legs: legs, rung }) {
-  state.engines[legs] ||= Engine.load(packed[legs], facts, legs);
+  state.engines[legs] ||= Engine.load(codesOf(legs), facts, legs);
   return (await state.engines[legs]).as(rung);
 }
 
 // The gait, or the walk that loses it, and all that is told of a step.
 function computed(engine, values, guess) {
+  if (isReal(values) && allowed(values)) return computedOnGround(engine, values, guess);
   const wheel = columnOf(values), guesses = guess ? [guess, facts.start] : [facts.start];
   const gait = allowed(values) ? engine.gait(wheel, guesses) : null;
   if (!gait) return walkedFrom(engine, values, guess || facts.start, LOST_STEPS);
@@ -73,6 +83,19 @@ function walkedFrom(engine, values, start, most) {
   const shown = states.slice(-8).map((x) => engine.told(wheel, values.friction, x));
   const { measures } = shown[shown.length - 1];
   return { gait: null, outcome, taken: states.length - 1, steps: shown.map((step) => stepOf(engine, step)), measures };
+}
+
+// The same on real ground: from the gait of the wheel before, from that of feet that stay, from Table 1's.
+function computedOnGround(engine, values, guess) {
+  const ground = new Ground(engine, columnOf(values), values.friction), springs = engine.as("viscoelastic");
+  const stay = () => ground.begun(springs.gait(ground.wheel, [facts.start])?.x || facts.start);
+  return shownOnGround(ground, ground.found([...(guess ? [() => guess] : []), stay, () => ground.begun(facts.start)]));
+}
+
+function shownOnGround(ground, { gait, states, outcome }) {
+  const shown = (gait ? [gait.x] : states.slice(-8)).map((x) => ground.step(x));
+  const steps = shown.map((step) => motionOnGround(ground, step)), measures = ground.measures(shown[shown.length - 1]);
+  return { gait, outcome, taken: states.length - 1, steps, measures };
 }
 
 // Feet neither slide nor leave the ground here: the friction that the fore and the rear foot need.
@@ -101,7 +124,9 @@ function stepOf(engine, { measures, motion }) {
     rows.forEach((row, k) => row.push(motion[0][k * n], motion[0][k * n]));
     begin = 0.2;
   }
-  return { durations, times, rows, period: begin };
+  const bands = durations.flatMap((duration, i) =>
+    duration > 0 ? [{ duration, texts: [`${PHASES[i]}: ${PHASE_NAMES[i]}`, PHASES[i]], shade: [0.5, 0.32, 0.18][i] }] : []);
+  return { bands, times, rows, period: begin, length: measures.step_length };
 }
 
 // ---- the walk on the screen
@@ -121,9 +146,6 @@ function sampleAt(step, time) {
   return rows.map((row) => row[i] + (row[i + 1] - row[i]) * share);
 }
 
-const landsAhead = (values, sample) =>
-  sample[1] * Math.sin(sample[0]) - values.locked_length * Math.sin(sample[0] - (2 * Math.PI) / values.n_legs);
-
 function moved(seconds) {
   const { steps, gait } = state.result;
   if (walk.held > 0) {
@@ -140,10 +162,8 @@ function moved(seconds) {
       walk.held = 1.6;
       return;
     }
-    const end = sampleAt(step, step.period);
-    if (!end) break;
     walk.time -= step.period;
-    walk.place += landsAhead(state.values, end);
+    walk.place += step.length;
     walk.prints = [...walk.prints.slice(-12), walk.place];
     walk.count++;
     walk.index = last ? 0 : walk.index + 1;
@@ -158,15 +178,18 @@ function moved(seconds) {
 function show() {
   const { result, values } = state, step = result.steps[walk.index], sample = sampleAt(step, walk.time);
   if (!sample) return;
-  const [theta, L1, L2] = sample, alpha = (2 * Math.PI) / values.n_legs;
-  const hub = [walk.place + L1 * Math.sin(theta), L1 * Math.cos(theta)];
-  const rear = [hub[0] - L2 * Math.sin(theta + alpha), hub[1] - L2 * Math.cos(theta + alpha)];
+  const [theta, ...more] = sample, alpha = (2 * Math.PI) / values.n_legs, real = sample.length > 13;
+  const lengths = Array.from({ length: values.n_legs }, (_, i) => (i < 2 ? more[i] : real ? sample[13 + i] : values.locked_length));
+  const along = real ? [sample[13], sample[14]] : [lengths[0] * Math.sin(theta), lengths[0] * Math.cos(theta)];
+  const hub = [walk.place + along[0], along[1]];
+  const foot = (leg) => [hub[0] - lengths[leg] * Math.sin(theta + leg * alpha), hub[1] - lengths[leg] * Math.cos(theta + leg * alpha)];
+  const rear = foot(real ? Math.round(sample[sample.length - 1]) : 1);
   const last = walk.trail[walk.trail.length - 1];
   if (!last || Math.hypot(last[0] - hub[0], last[1] - hub[1]) > 0.02) walk.trail = [...walk.trail.slice(-120), hub];
   const lost = walk.held > 0 && result.outcome !== STEPPED;
   drawWalk($("walk"), {
-    wheel: values, legs: values.n_legs, theta, L1, L2, x: walk.place, step: walk.count,
-    feet: [[walk.place, 0, sample[6], sample[7]], [...rear, sample[8], sample[9]]],
+    wheel: values, theta, lengths, hub, step: walk.count,
+    feet: [[...foot(0), sample[6], sample[7]], [...rear, sample[8], sample[9]]],
     prints: walk.prints, trail: walk.trail,
     caption: lost ? named(facts.outcomes[result.outcome].name.toLowerCase()) : `step ${walk.count + 1}`,
   });
@@ -205,6 +228,7 @@ function tellVerdict() {
     box.innerHTML = `<b>${title}</b> <span>${text}</span>`;
   };
   if (!allowed(values)) return say("bad", "No such wheel", "A leg's mass sits between foot and hub: a must be below L₀.");
+  if (isReal(values)) return tellVerdictOnGround(say);
   if (gait) {
     const broken = Object.keys(facts.margins).filter((name) => leastOf(name)[0] < 0).length;
     const premises = broken ? ` <a href="#margins-title">${broken} of 13 premises don't hold.</a>` : " All 13 premises hold.";
@@ -221,26 +245,42 @@ function tellVerdict() {
       return say("warn", "A stable gait, but the rear foot scuffs", `${how} The model lets it pass through the ground.${premises}`);
     return say("good", "A stable gait", `${how} A touch shrinks to ${(100 * radius(gait)).toFixed(1)} % of it with each step.${premises}`);
   }
+  tellLost(say);
+}
+
+// Of a walk without a gait.
+function tellLost(say) {
+  const { result } = state, { outcome } = result;
   if (result.from && outcome === STEPPED)
     return say("good", "From there it walks on", "Seven steps are shown, again and again. Move a slider to return to the gait.");
   if (outcome === STEPPED)
-    return say("warn", "It walks, but never settles", `No gait of one step was found; ${LOST_STEPS} steps went on without repeating.`);
+    return say("warn", "It walks, but never settles", `No gait of one step was found; ${result.taken} steps went on without repeating.`);
   const steps = result.taken === 1 ? "one step" : `${result.taken} steps`;
   say("bad", `${result.from ? "From there" : "No gait"}: lost after ${result.taken ? steps : "no whole step"}`, facts.outcomes[outcome].meaning);
+}
+
+function tellVerdictOnGround(say) {
+  const { gait, measures } = state.result;
+  if (!gait) return tellLost(say);
+  const slides = measures.slip > 1e-9 ? `, its feet slide ${number(100 * measures.slip)} cm of a step` : ", no foot slides";
+  const how = `${number(measures.speed)} m/s, ${number(measures.period)} s a step, both feet on the ground for ${(100 * measures.dls_fraction).toFixed(1)} % of it${slides}.`;
+  const pulled = facts.stoppers.some((name) => measures[name] < 0);
+  const stoppers = pulled ? ` <a href="#margins-title">A stopper pulls</a>: one that only pushes would let a leg go.` : "";
+  if (isStable(gait)) return say("good", "A stable gait on real ground", `${how} A touch shrinks to ${(100 * radius(gait)).toFixed(1)} % of it with each step.${stoppers}`);
+  say("warn", "An unstable gait on real ground", `${how} A touch grows by a factor of ${radius(gait).toFixed(3)} with each step.${stoppers}`);
 }
 
 function tellGait() {
   const { measures, gait } = state.result;
   $("gait-hint").textContent = gait ? "Of the step that repeats itself." : "No step repeats itself: of the last step, as far as it came.";
-  const rows = MEASURED.map((name) => {
+  const rows = (isReal(state.values) ? ON_GROUND : MEASURED).map((name) => {
     const m = facts.measures[name];
     return `<tr title="${m.meaning}"><th scope="row">${m.label} <i>${set(m.symbol)}</i></th><td data-measure="${name}">${measures[name] === 0 ? "–" : `${number(measures[name])} ${unitText(m.unit)}`}</td></tr>`;
   });
   $("gait").innerHTML = parts(rows, 3).map((some) => table("Measures of the step", some)).join("");
-  // One is zero: where both feet land the rate of Leg 1 is forgotten.
-  const list = gait ? gait.multipliers.filter((m) => Math.hypot(m.re, m.im) > 1e-10) : [];
+  const list = gait ? gait.multipliers : [];
   drawCircle($("circle"), list);
-  const text = ({ re, im }) => (im ? `${number(re)} ${im < 0 ? "−" : "+"} ${number(Math.abs(im))}i` : Math.abs(re) < 1e-12 ? "0" : number(re));
+  const text = ({ re, im }) => (im ? `${number(re)} ${im < 0 ? "−" : "+"} ${number(Math.abs(im))}i` : number(re));
   $("multipliers").innerHTML = gait
     ? `Multipliers of the gait: ${list.map(text).join(", ")}. Spectral radius ρ = <b data-measure="spectral_radius">${number(radius(gait))}</b>.`
     : "Multipliers need a gait.";
@@ -248,9 +288,12 @@ function tellGait() {
 }
 
 function tellMargins() {
-  const { values } = state, L = values.locked_length, mass = values.hub_mass + values.n_legs * values.leg_mass;
+  const { values } = state, real = isReal(values), L = values.locked_length, mass = values.hub_mass + values.n_legs * values.leg_mass;
   const scale = { N: mass * values.gravity, "N s": 0.2 * mass * Math.sqrt(values.gravity * L), m: 0.2 * L, "": 1 };
-  const rows = [...INDICATORS, ...Object.keys(facts.margins)].map((name) => {
+  $("margins-hint").textContent = real
+    ? "That its stoppers hold legs in the air, and pull where they must: two margins. Feet slide, lift and land as the laws of contact say."
+    : "Three indicators of double support, and thirteen margins that the model measures but does not act on: negative means that the real wheel would do otherwise.";
+  const rows = (real ? facts.stoppers : [...INDICATORS, ...Object.keys(facts.margins)]).map((name) => {
     const m = facts.measures[name], [value, leg] = INDICATORS.includes(name) ? [state.result.measures[name], ""] : leastOf(name);
     const broken = value < 0, share = 50 * Math.tanh(Math.abs(value) / scale[m.unit]);
     const bar = `<div class="bar" aria-hidden="true"><i style="${broken ? `right:50%` : `left:50%`};width:${share}%"></i></div>`;
@@ -266,7 +309,8 @@ function tellPython() {
   const base = defaults(), { values } = state;
   const changed = facts.order.concat("n_legs").filter((name) => values[name] !== base[name]).map((name) => `${name}=${values[name]}`);
   const friction = values.friction === base.friction ? "" : `friction=${values.friction}`, rigid = values.rung === "rigid";
-  const model = rigid || friction ? `, model=vrw.${rigid ? "Rigid" : "Viscoelastic"}Wheel(${friction})` : "";
+  const real = isReal(values), kind = real ? "Unilateral" : rigid ? "Rigid" : "Viscoelastic";
+  const model = real || rigid || friction ? `, model=vrw.${kind}Wheel(${real ? `friction=${values.friction}` : friction})` : "";
   $("python").textContent = `vrw.limit_cycle(vrw.WheelParams(${changed.join(", ")})${model})`;
 }
 
@@ -278,7 +322,7 @@ function send(kind, job) {
   job.id = `${kind} ${++send.count}`;
   workers[kind] ||= worker(news);
   const known = (workers[kind].known ||= new Set()), legs = state.values.n_legs;
-  const first = known.has(legs) ? {} : { packed: packed[legs], facts };
+  const first = known.has(legs) ? {} : { packed: codesOf(legs), facts };
   known.add(legs);
   workers[kind].post({ job: { ...job, legs, rung: state.values.rung }, ...first });
   return job.id;
@@ -287,7 +331,7 @@ send.count = 0;
 
 // Beside the page, or where that is forbidden, within it, piece by piece.
 function worker(hear) {
-  const source = [$("engine"), $("worker")].map((script) => script.textContent).join("\n");
+  const source = [$("engine"), $("on-ground"), $("worker")].map((script) => script.textContent).join("\n");
   const door = "\nconst hear = jobs((news) => postMessage(news)); onmessage = (event) => hear(event.data);";
   try {
     const own = new Worker(URL.createObjectURL(new Blob([source + door], { type: "text/javascript" })));
@@ -324,11 +368,12 @@ function news({ kind, job, stride, nodes, done, walk }) {
 }
 
 function axisOf(name) {
+  if (name === "friction") return { name, from: 0, to: 2, index: facts.order.length, label: "friction μ" };
   const { from, to, unit } = facts.parameters[name];
   return { name, from, to, index: facts.order.indexOf(name), label: `${named(name)} ${symbol(name)}${unit ? ` [${unitText(unit)}]` : ""}` };
 }
 
-const ZOOM = { damping: [20, 320], slope: [0.15, 0.45], stiffness: [250, 900], natural_length: [0.97, 1.12] };
+const ZOOM = { friction: [0.1, 1.5], damping: [20, 320], slope: [0.15, 0.45], stiffness: [250, 900], natural_length: [0.97, 1.12] };
 const mapAxis = (name) => {
   const axis = axisOf(name);
   return ZOOM[name] ? { ...axis, from: ZOOM[name][0], to: ZOOM[name][1] } : axis;
@@ -348,10 +393,11 @@ function askMap() {
   map.done = false;
   map.began = performance.now();
   map.cells = new Map();
-  const x = mapAxis(map.x), y = mapAxis(map.y), share = (axis) => (LAST * (values[axis.name] - axis.from)) / (axis.to - axis.from);
+  map.last = isReal(values) ? FEWER : LAST;
+  const x = mapAxis(map.x), y = mapAxis(map.y), share = (axis) => (map.last * (values[axis.name] - axis.from)) / (axis.to - axis.from);
   map.job = send("map", {
-    wheel: columnOf(values), x, y, friction: values.friction, last: LAST, batch: 32,
-    guess: state.guess || facts.start, dot: [share(x), share(y)],
+    wheel: columnOf(values), x, y, friction: values.friction, last: map.last, batch: 32,
+    guess: state.guess || (isReal(values) ? null : facts.start), dot: [share(x), share(y)],
   });
 }
 
@@ -360,6 +406,7 @@ function mapValue(cell) {
   if (given) return given.measures[measure][cell.node[1]][cell.node[0]];
   if (!cell.told) return null;
   if (measure === "spectral_radius") return cell.radius;
+  if (!Array.isArray(cell.told)) return cell.told[measure] ?? null;
   const rows = facts.rows[state.values.n_legs], at = (name) => cell.told[rows.indexOf(name)];
   const period = at("duration_dls") + at("duration_sls1") + at("duration_sls2");
   if (measure === "period") return period;
@@ -394,7 +441,7 @@ function colored() {
 }
 
 function showMap() {
-  const { map, values } = state, [x, y] = mapAxes(), last = map.given ? [x.last, y.last] : LAST;
+  const { map, values } = state, [x, y] = mapAxes(), last = map.given ? [x.last, y.last] : map.last;
   const now = [map.cells, map.cells.size, map.measure];
   if (map.stale || now.some((what, i) => what !== map.drawnOf?.[i])) colored();
   map.stale = false;
@@ -411,8 +458,10 @@ function basinAxes() {
   const [theta, rate] = state.result.gait.x;
   const symbols = ["theta_touchdown", "dtheta_touchdown"].map((name) => facts.measures[name]);
   const label = ({ symbol, unit }) => `${symbol} [${unit}]`;
+  // On real ground no foot begins below it, nor a leg beyond its stopper.
+  const [from, to] = isReal(state.values) ? [0, Math.PI / state.values.n_legs] : [theta - 0.4, theta + 0.4];
   return [
-    { from: theta - 0.4, to: theta + 0.4, label: label(symbols[0]) },
+    { from, to, label: label(symbols[0]) },
     { from: 0, to: Math.max(3, 1.6 * rate), label: label(symbols[1]) },
   ];
 }
@@ -429,11 +478,12 @@ function askBasin() {
     return;
   }
   canvas.hidden = false;
-  const key = JSON.stringify([columnOf(values), values.n_legs, values.rung]);
+  const real = isReal(values), last = (real ? FEWER : LAST) - 1, rate = result.gait.x[real ? 4 + values.n_legs : 2];
+  const key = JSON.stringify([columnOf(values), values.n_legs, values.rung, real && values.friction]);
   if (key === basin.key) return showBasin();
   const [x, y] = basinAxes();
-  Object.assign(basin, { key, axes: [x, y], done: false, began: performance.now(), cells: new Map(), cross: result.gait.x.slice(0, 2), gait: result.gait.x });
-  basin.job = send("basin", { wheel: columnOf(values), gait: result.gait.x, x, y, last: LAST - 1 });
+  Object.assign(basin, { key, axes: [x, y], done: false, began: performance.now(), cells: new Map(), cross: result.gait.x.slice(0, 2), gait: result.gait.x, last, rate });
+  basin.job = send("basin", { wheel: columnOf(values), friction: values.friction, gait: result.gait.x, x, y, last, rate });
 }
 
 function showBasin() {
@@ -446,9 +496,9 @@ function showBasin() {
   }
   const codes = new Set([...basin.cells.values()].map(({ code }) => code));
   const home = [...basin.cells.values()].filter(({ code }) => code === SETTLED).length;
-  basin.place = drawGrid($("basin"), { last: LAST - 1, cells: basin.drawn, held: basin.held, x: basin.axes[0], y: basin.axes[1], cross: basin.cross, dot: basin.gait });
+  basin.place = drawGrid($("basin"), { last: basin.last, cells: basin.drawn, held: basin.held, x: basin.axes[0], y: basin.axes[1], cross: basin.cross, dot: basin.gait });
   $("basin-legend").innerHTML = [...codes].sort((a, b) => a - b).map((code) =>
-    swatch(code === SETTLED ? "#0072b2" : lostColor(code), code === SETTLED ? "to the gait" : code === STEPPED ? "never settles" : lostName(code))).join("");
+    swatch(code === SETTLED ? "#0072b2" : lostColor(code), code === SETTLED ? "to the gait" : code === STEPPED ? (isReal(state.values) ? "walks on, not to it" : "never settles") : lostName(code))).join("");
   const share = `${((100 * home) / Math.max(1, basin.cells.size)).toFixed(0)} % of the starts lead to the gait`;
   $("basin-state").textContent = basin.done ? `${share}; ${basin.cells.size.toLocaleString("en")} starts in ${basin.seconds.toFixed(1)} s.` : `${share} so far.`;
   $("basin").setAttribute("aria-label", `Basin of the gait: ${share}`);
@@ -457,6 +507,7 @@ function showBasin() {
 // ---- on real ground
 
 function askGround() {
+  if (isReal(state.values)) return;
   const { ground, values, result } = state, start = result.gait?.x || facts.start;
   const key = JSON.stringify([columnOf(values), values.n_legs, values.friction, start]);
   if (key === ground.key) return;
@@ -471,9 +522,9 @@ function tellGround() {
   const pace = walk && `${number(walk.speed)} m/s, ${number(walk.period)} s a step, both feet on the ground for ${(100 * walk.dls_fraction).toFixed(1)} % of it.`;
   const how = !walk ? "Walking …"
     : walk.outcome !== STEPPED ? `It is lost after ${walk.taken === 1 ? "one step" : `${walk.taken} steps`}: ${facts.outcomes[walk.outcome].meaning}`
-      : walk.settled ? `It walks: after ${walk.taken + 1} steps each repeats the one before. ${pace}`
-        : `It goes on for ${walk.taken + 1} steps that do not repeat themselves; the last: ${pace}`;
-  $("ground").className = !walk || walk.settled ? "" : walk.outcome === STEPPED ? "warn" : "bad";
+      : walk.gait ? `It walks: after ${walk.taken} steps each repeats the one before. ${pace}`
+        : `It goes on for ${walk.taken} steps that do not repeat themselves; the last: ${pace}`;
+  $("ground").className = !walk || walk.gait ? "" : walk.outcome === STEPPED ? "warn" : "bad";
   $("ground").innerHTML = `From ${from}, friction ${number(friction)}. <b>${how}</b>`;
 }
 
@@ -491,6 +542,7 @@ function later() {
 }
 
 function tell() {
+  $("ground-card").hidden = isReal(state.values);
   tellVerdict();
   tellGait();
   tellMargins();
@@ -516,6 +568,7 @@ async function update(changes = {}) {
   walk.index = Math.min(walk.index, state.result.steps.length - 1);
   walk.step = state.result.steps[walk.index];
   for (const [name, value] of Object.entries(values)) showValue(name, value);
+  offerMaps();
   tell();
   showMap();
   document.querySelector("[data-told=legs]").textContent = { 6: "six", 8: "eight", 10: "ten" }[legs];
@@ -556,6 +609,24 @@ function giveMap(given) {
   showMap();
 }
 
+// What the map may show, by the rung.
+function offerMaps() {
+  const { map, values } = state, real = isReal(values), measures = real ? MAPPED_ON_GROUND : MAPPED;
+  if (map.given || map.offered === real) return;
+  map.offered = real;
+  const options = (names, text) => names.map((name) => `<option value="${name}">${text(name)}</option>`).join("");
+  const axes = [...Object.keys(facts.parameters), ...(real ? ["friction"] : [])];
+  if (!measures.includes(map.measure)) map.measure = "speed";
+  for (const [side, usual] of [["x", "damping"], ["y", "slope"]]) if (!axes.includes(map[side])) map[side] = usual;
+  if (map.x === map.y) map.x = map.y === "damping" ? "slope" : "damping";
+  $("map-measure").innerHTML = options(measures, (name) => facts.measures[name].label);
+  $("map-measure").value = map.measure;
+  for (const side of ["x", "y"]) {
+    $(`map-${side}`).innerHTML = options(axes, (name) => `${named(name)} ${symbol(name)}`);
+    $(`map-${side}`).value = map[side];
+  }
+}
+
 function showValue(name, value) {
   const number = $(`number-${name}`), slider = $(`slider-${name}`);
   if (document.activeElement !== number) number.value = typeof value === "string" ? value : +value.toPrecision(6);
@@ -568,7 +639,9 @@ async function walkFrom(place) {
   if (!basin.gait) return;
   basin.cross = place;
   const engine = await engineOf(values);
-  state.result = { ...walkedFrom(engine, values, [...place, basin.gait[2]], 7), from: place };
+  const start = [...place, basin.rate], ground = isReal(values) && new Ground(engine, columnOf(values), values.friction);
+  const walked = ground ? shownOnGround(ground, { ...ground.walk(ground.begun(start), 7), gait: null }) : walkedFrom(engine, values, start, 7);
+  state.result = { ...walked, from: place };
   restart();
   walk.lost = true;
   tell();
@@ -602,7 +675,7 @@ function built() {
     + `<input type="number" id="number-${name}" step="any" aria-label="${named(name)}, a number, ${unit}"><span class="unit">${unitText(unit)}</span>`
     + `<input type="range" id="slider-${name}" min="${from}" max="${to}" step="${step(from, to)}" aria-describedby="about-${name}"><span id="about-${name}" class="unseen">${meaning}</span></div>`).join("")
     + `<div class="slider"><label for="number-n_legs">number of legs <i>n</i></label><select id="number-n_legs">${facts.legs.map((n) => `<option>${n}</option>`).join("")}</select></div>`
-    + `<div class="slider"><label for="number-rung">legs</label><select id="number-rung" aria-describedby="about-rung">${Object.entries(facts.rungs).map(([name, text]) => `<option value="${name}">${text}</option>`).join("")}</select><span id="about-rung" class="unseen">what of the legs is modelled</span></div>`;
+    + `<div class="slider"><label for="number-rung">model</label><select id="number-rung" aria-describedby="about-rung">${Object.entries(facts.rungs).map(([name, text]) => `<option value="${name}">${text}</option>`).join("")}</select><span id="about-rung" class="unseen">springs or rigid legs with feet that stay, or springs on real ground</span></div>`;
   for (const [name] of rows) {
     const least = facts.parameters[name]?.least ?? 0, above = name === "slope" ? -1.5 : least;
     $(`slider-${name}`).addEventListener("input", (event) => update({ [name]: Number(event.target.value) }));
@@ -620,11 +693,7 @@ function built() {
     restart();
     update({ ...defaults(), ...PRESETS[button.textContent] });
   }));
-  const options = (names, text) => names.map((name) => `<option value="${name}">${text(name)}</option>`).join("");
-  $("map-measure").innerHTML = options(MAPPED, (name) => facts.measures[name].label);
   for (const side of ["x", "y"]) {
-    $(`map-${side}`).innerHTML = options(Object.keys(facts.parameters), (name) => `${named(name)} ${symbol(name)}`);
-    $(`map-${side}`).value = state.map[side];
     $(`map-${side}`).addEventListener("change", (event) => {
       const other = side === "x" ? "y" : "x";
       if (state.map[other] === event.target.value) {

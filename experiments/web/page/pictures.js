@@ -56,13 +56,12 @@ function arrow(ctx, [x, y], [dx, dy], color) {
   ctx.fill();
 }
 
-// `scene`: wheel (parameters by name), legs, theta, L1, L2, forces of feet 1 and 2, place of Leg 1's
-// foot, steps taken, footprints, trail of the hub.
+// `scene`: wheel (parameters by name), theta, lengths of legs, place of the hub, places and forces of two
+// feet, steps taken, footprints, trail of the hub.
 function drawWalk(canvas, scene) {
-  const { ctx, w, h } = sheet(canvas), { wheel, legs } = scene, L0 = wheel.locked_length;
+  const { ctx, w, h } = sheet(canvas), { wheel, hub } = scene, L0 = wheel.locked_length, legs = scene.lengths.length;
   const scale = Math.min(h / (2.62 * L0), w / (2.4 * L0));
   const [sin, cos] = [Math.sin(wheel.slope), Math.cos(wheel.slope)];
-  const hub = [scene.x + scene.L1 * Math.sin(scene.theta), scene.L1 * Math.cos(scene.theta)];
   const foot = hub[0]; // the camera looks at the slope below the hub
   const ground = h - 0.34 * L0 * scale - 0.05 * w * sin;
   const at = ([x, z]) => [
@@ -99,7 +98,7 @@ function drawWalk(canvas, scene) {
 
   const middle = at(hub), mass = (m) => Math.max(2.2, 0.052 * scale * L0 * Math.cbrt(m));
   for (let i = legs; i >= 1; i--) {
-    const length = i === 1 ? scene.L1 : i === 2 ? scene.L2 : L0;
+    const length = scene.lengths[i - 1];
     const angle = scene.theta + ((i - 1) * 2 * Math.PI) / legs;
     const along = [-Math.sin(angle), -Math.cos(angle)]; // from the hub to the foot
     const place = (r) => at([hub[0] + along[0] * r, hub[1] + along[1] * r]);
@@ -142,15 +141,14 @@ function drawLeg(ctx, place, length, L0, color, width, com) {
 const PHASES = ["DLS", "SLS-I", "SLS-II"];
 const PHASE_NAMES = ["both feet", "one foot, spring free", "one foot, stopper"];
 
-// `step`: durations, times, samples by row over all phases; `now`: s since the landing.
+// `step`: bands, times, samples by row over all of them; `now`: s since the landing.
 function drawStrips(canvas, step, weight, now) {
   const { ctx, w, h } = sheet(canvas), left = 46, right = w - 8, total = step.period || 1;
   const X = (t) => left + ((right - left) * t) / total, band = 20;
   let begin = 0;
-  step.durations.forEach((duration, i) => {
-    if (!(duration > 0)) return;
+  step.bands.forEach(({ duration, texts, shade }, i) => {
     const [x0, x1] = [X(begin), X(begin + duration)];
-    ctx.globalAlpha = [0.5, 0.32, 0.18][i];
+    ctx.globalAlpha = shade;
     ctx.fillStyle = ink("accent");
     ctx.fillRect(x0, 0, x1 - x0 - 1, band);
     ctx.globalAlpha = 0.07 * (i % 2 ? 0 : 1);
@@ -158,8 +156,7 @@ function drawStrips(canvas, step, weight, now) {
     ctx.globalAlpha = 1;
     ctx.fillStyle = ink("ink");
     ctx.textAlign = "center";
-    const long = `${PHASES[i]}: ${PHASE_NAMES[i]}`, room = x1 - x0 - 8;
-    const text = [long, PHASES[i]].find((some) => ctx.measureText(some).width < room);
+    const room = x1 - x0 - 8, text = texts.find((some) => ctx.measureText(some).width < room);
     if (text) ctx.fillText(text, (x0 + x1) / 2, 14);
     begin += duration;
   });
