@@ -151,6 +151,39 @@ def make() -> None:
         "friction",
     )
 
+    # Several grounds where one is meant
+    grounds = vrw.UnilateralWheel(friction=np.array([0.5, 0.7]))
+    for name, call in {
+        "step": lambda: vrw.step(table_1, start, model=grounds),
+        "return_map": lambda: vrw.return_map(table_1, start, model=grounds),
+        "walk of three steps": lambda: vrw.walk(table_1, start, 3, model=grounds),
+        "simulate": lambda: vrw.simulate(table_1, start, model=grounds),
+        "steps of three lanes": lambda: vrw.steps(several, np.tile(start, (3, 1)), model=grounds),
+        "limit_cycle": lambda: vrw.limit_cycle(table_1, model=grounds),
+        "limit_cycles": lambda: vrw.limit_cycles(several, model=grounds),
+        "sensitivities": lambda: vrw.sensitivities(table_1, model=grounds),
+        "continue_branch": lambda: vrw.continue_branch(
+            table_1, "damping", (150.0, 230.0), model=grounds
+        ),
+        "tune": lambda: vrw.tune(
+            table_1, "speed", ["damping"], {"damping": (100.0, 300.0)}, model=grounds
+        ),
+        "basin": lambda: vrw.basin(
+            table_1, {"theta_post_impact": [-0.6], "dtheta_post_impact": [1.0]}, model=grounds
+        ),
+        "scan": lambda: vrw.scan(vrw.grid(damping=[100.0, 150.0]), ["speed"], model=grounds),
+        "ladder": lambda: vrw.step(
+            table_1, start, model=vrw.LadderWheel(friction=np.array([0.5, 0.7]))
+        ),
+    }.items():  # fmt: skip
+        use(f"{name} on two grounds", call, "ValueError", "friction has shape (2,)")
+    use(
+        "explore on two grounds",
+        lambda: vrw.explore(table_1, friction=np.array([0.5, 0.7])),
+        "TypeError",
+        "one known number",
+    )
+
     # States
     states = {
         "text": ("abc", "TypeError"),

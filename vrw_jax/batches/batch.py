@@ -39,7 +39,7 @@ from vrw_jax.models import (
 )
 from vrw_jax.numerics import Options, explicit_tableau, in_batches
 from vrw_jax.walks import options_of, rung_of, state_of
-from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, wheel_of
+from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, WheelParams, wheel_of
 from vrw_jax.wording import (
     chosen,
     instance,
@@ -113,7 +113,7 @@ def steps(
     """
     untraced("vrw.steps", "map vrw.return_map over the lanes", params, states, durations)
     instance("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
-    rung, options = rung_of(model), options_of(options)
+    rung, options = rung_of(model, many=True), options_of(options)
     chosen("engine", engine, ENGINES)
     n_steps = whole("n_steps", n_steps)
     states = np.asarray(state_of(states, "states"))
@@ -155,11 +155,12 @@ def _wheels(
     held = np.result_type(*(column.dtype for column in columns))
     options.require_reachable(held)
     dtype = np.promote_types(held, states.dtype)
-    for name, column in zip(PARAMETER_NAMES, columns, strict=True):
-        if column.shape not in ((), states.shape[:1]):
+    of_ground = getattr(model, FRICTION, np.zeros(()))
+    for name, column in zip((*PARAMETER_NAMES, FRICTION), (*columns, of_ground), strict=True):
+        if np.shape(column) not in ((), states.shape[:1]):
             raise ValueError(
-                f"{name} has shape {column.shape}, but there are {len(states)} states: give one "
-                "value for all, or one for each."
+                f"{name} has shape {np.shape(column)}, but there are {len(states)} states: give "
+                "one value for all, or one for each."
             )
     wheels = np.empty((len(columns), len(states)), dtype)
     for row, column in zip(wheels, columns, strict=True):

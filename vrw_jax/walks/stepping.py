@@ -51,8 +51,11 @@ def paper_start() -> SectionState:
     return ViscoelasticWheel().start(WheelParams())
 
 
-def rung_of(model: ModelLike | None) -> AbstractWheel:
-    """The rung that a caller names: the paper's by default, the lowest that serves for "auto"."""
+def rung_of(model: ModelLike | None, many: bool = False) -> AbstractWheel:
+    """The rung that a caller names: the paper's by default, the lowest that serves for "auto".
+
+    Its ground is one, unless there may be `many`: of lanes, or of steps.
+    """
     if model is None:
         return _paper_wheel()
     if isinstance(model, str) and model == "auto":
@@ -61,6 +64,12 @@ def rung_of(model: ModelLike | None) -> AbstractWheel:
         raise TypeError(
             f"model is {model!r}, but a rung of the ladder is needed: give "
             'vrw.ViscoelasticWheel(), vrw.RigidWheel(), vrw.UnilateralWheel() or "auto".'
+        )
+    if not many and (shape := jnp.shape(getattr(model, "friction", 0.0))):
+        raise ValueError(
+            f"friction has shape {shape}, but this is about one ground: give one number, or vary "
+            "it in a design of vrw.scan; vrw.steps takes one for each lane, vrw.walk one for each "
+            "of its steps."
         )
     return model
 
@@ -333,7 +342,7 @@ def walk(
         (5, (5, 3))
     """
     n_steps = whole("n_steps", n_steps)
-    rung, over_steps = rung_of(model), None
+    rung, over_steps = rung_of(model, many=True), None
     if isinstance(params, WheelParams):
         over_steps = rung.over_steps(params, n_steps)
     if over_steps is not None:

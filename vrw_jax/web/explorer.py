@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlencode
 
-from vrw_jax.wheel import DOMAINS, FRICTION, WheelParams, friction_of
+from vrw_jax.wheel import DOMAINS, FRICTION, WheelParams, known_friction
 from vrw_jax.wording import chosen, instance, untraced, whole
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ def explore(
     given = {} if dataset is None else _map_of(dataset)
     return _widget()(
         page=page_path().read_text(encoding="utf-8"),
-        values=_values(params, float(friction_of(friction)), chosen("rung", rung, RUNGS)),
+        values=_values(params, known_friction(friction), chosen("rung", rung, RUNGS)),
         map=given,
         height=whole("height", height),
     )
@@ -157,7 +157,7 @@ def _widget() -> type:
 
         @friction.setter
         def friction(self, value: float) -> None:
-            self.values = {**self.values, FRICTION: float(friction_of(value))}
+            self.values = {**self.values, FRICTION: known_friction(value)}
 
         @property
         def rung(self) -> str:

@@ -268,11 +268,11 @@ def friction_of(value: object) -> Array:
 
 
 def known_friction(value: Any) -> float:
-    """The same as a plain number, for rungs whose motion does not feel it."""
+    """The same as a plain number, where the motion does not feel it."""
     if friction_of(value).ndim or isinstance(value, jax.core.Tracer):
         raise TypeError(
-            f"friction is {shown(value)}, but this rung takes one known number, which its margins "
-            "refer to: give a float, or take vrw.UnilateralWheel."
+            f"friction is {shown(value)}, but one known number is needed here: give a float; "
+            "several grounds, or a traced one, vrw.UnilateralWheel takes."
         )
     return float(value)
 
