@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array
 
@@ -25,14 +26,15 @@ from vrw_jax.models.unilateral.march import (
     March,
     Place,
     advanced,
-    guard_rates,
     guards_at,
+    motion_of,
     slope_at,
     stage_at,
     tried_by,
     until_none_marches,
 )
-from vrw_jax.models.unilateral.motion import guard_sizes
+from vrw_jax.models.unilateral.motion import Stance, guard_sizes
+from vrw_jax.models.unilateral.shares import FEW, Shares, if_any
 from vrw_jax.numerics import Options, Tableau, select
 
 
@@ -69,6 +71,7 @@ class Ways(NamedTuple):
     """Directions of each lane: arrays have them on the first axis, lanes on the last."""
 
     many: Array  # how many a lane has
+    by_columns: Array  # how many of these, the first ones, may move with columns
     columns: Array
     rows: Array  # all numbers of a `_Way` behind each other: few loops are quickly compiled
 
@@ -123,7 +126,10 @@ def walked_along(
     moves, push, lane = jax.linearize(begun, columns, x, has_aux=True)
     slope = jnp.zeros((len(moves.q) + N_TALLIED * on.detailed, *many.shape), x.dtype)
     like = _Way.of(moves, slope)
-    ways = Ways(many, d_columns, d_columns)
+    by_columns = jnp.zeros_like(many)
+    for k in range(len(d_columns)):
+        by_columns = jnp.where(jnp.any(d_columns[k] != 0.0, axis=0), k + 1, by_columns)
+    ways = Ways(many, by_columns, d_columns, d_columns)
     start = lambda k: _Way.of(push(_at(d_columns, k, columns), _at(d_x, k, x)), slope)
     ways = ways._replace(rows=ways.each(start, n_rows(like)))
 
@@ -173,17 +179,26 @@ def _marched(
     """`march.marched`, with the directions carried along and on to the event: their first rows."""
     flow, n_rows = flow_at(columns), len(_packed(like))
     sizes, last = guard_sizes(flow), len(tableau.places) - 1
+    more = _more(ways, like, begin.stance)
 
     def advance(state: tuple[March, Array]) -> tuple[March, Array]:
         now, rows = state
-        slopes, moved = _stages(flow_at, columns, now, ways._replace(rows=rows), like, tableau)
+        slopes, moved = _stages(
+            flow_at, columns, now, ways._replace(rows=rows), like, tableau, more
+        )
         tried = tried_by(flow, tableau, options, now, slopes)
         after = advanced(now, tried, sizes, tableau, options)
         taken, n = after.time != now.time, len(now.here.q)
 
         def end(k: Array) -> _March:
             here, known = _at(rows, k, like), lax.dynamic_index_in_dim(moved, k, 1, False)
-            q, v = stage_at(tableau, last, here.q, here.v, known, now.h)
+            at = lambda some: stage_at(
+                tableau, last, here.q[some], here.v[some], known[:, :n][:, some], now.h
+            )
+            few, others = slice(0, 3 + FEW), slice(3 + FEW, None)
+            still = here.q[others], here.v[others]
+            ends = zip(at(few), if_any(more, lambda: at(others), still), strict=True)
+            q, v = map(jnp.concatenate, ends)
             told = here.told
             if told is not None:
                 once = tableau.once[last]
@@ -200,7 +215,13 @@ def _marched(
 
 
 def _stages(
-    flow_at: FlowAt, columns: Array, now: March, ways: Ways, like: _March, tableau: Tableau
+    flow_at: FlowAt,
+    columns: Array,
+    now: March,
+    ways: Ways,
+    like: _March,
+    tableau: Tableau,
+    more: Array,
 ) -> tuple[Array, Array]:
     """Slopes at the stages of a step, and how they move: (stages, directions, ., lanes)."""
     here, h = now.here, now.h
@@ -210,21 +231,22 @@ def _stages(
     def stage(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         i, slopes, moved = state
 
-        def rows(columns: Array, q: Array, v: Array) -> tuple[Array, Array]:
-            slope = slope_at(flow_at(columns), q, v)
-            return jnp.concatenate([slope[:n], slope[len(slope) - tallied :]]), slope
-
         place = stage_at(tableau, i, here.q, here.v, slopes, h)
-        _, push, slope = jax.linearize(rows, columns, *place, has_aux=True)
+        flow = flow_at(columns)
+        shares = Shares.at(flow, motion_of(Place(*place, place[0])), more)
+        none = shares.nothing()
+        by = lambda k: shares.by_columns(flow_at, columns, _at(ways.columns, k, columns))
+        own = ways._replace(many=ways.by_columns).each(by, len(_packed(none)))
 
         def along(k: Array) -> Array:
             way, known = _at(ways.rows, k, like), lax.dynamic_index_in_dim(moved, k, 1, False)
-            ends = stage_at(tableau, i, way.q, way.v, known, h)
-            row = push(_at(ways.columns, k, columns), *ends)
+            ends = lambda some: _ends(tableau, i, way, known, h, some)
+            column = if_any(jnp.any(k < ways.by_columns), lambda: _at(own, k, none), none)
+            row = shares.along(ends, column, more)
             return jnp.where((i > 0) | fresh, row, known[0])
 
         put = lambda rows, row: lax.dynamic_update_index_in_dim(rows, row, i, 0)
-        slope = jnp.where(i > 0, slope, here.slope)
+        slope = jnp.where(i > 0, slope_at(flow, *place), here.slope)
         return i + 1, put(slopes, slope), put(moved, ways.each(along, len(like.slope)))
 
     others = jnp.zeros((last, *here.slope.shape), h.dtype)
@@ -239,6 +261,39 @@ def _stages(
     return lax.while_loop(goes_on, stage, (first, slopes, moved))[1:]
 
 
+def _ends(
+    tableau: Tableau, i: Array, way: _March, known: Array, h: Array, some: slice
+) -> tuple[Array, Array]:
+    """`stage_at` of some coordinates, by the stages before it alone."""
+    rows = [jnp.asarray(np.reshape(x, -1)) for x in (tableau.once, tableau.twice)]
+    width, place = len(tableau.once[0]), jnp.asarray(tableau.places)[i]
+
+    def turn(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        j, first, second = state
+        a, b = (lax.dynamic_index_in_dim(row, i * width + j, 0, False) for row in rows)
+        slope = lax.dynamic_index_in_dim(known, j, 0, False)[: len(way.q)][some]
+        return j + 1, first + a * slope, second + b * slope
+
+    q, v = way.q[some], way.v[some]
+    begin = jnp.zeros((), jnp.int32), jnp.zeros_like(q), jnp.zeros_like(q)
+    _, first, second = lax.while_loop(lambda state: state[0] < i, turn, begin)
+    return q + h * (place * v + h * second), v + h * first
+
+
+def _more(ways: Ways, like: _March, stance: Stance) -> Array:
+    """Whether any other leg moves, of any lane along any direction."""
+
+    def turn(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        k, moves = state
+        way = _at(ways.rows, k, like)
+        lengths = jnp.concatenate([way.q[3 + FEW :], way.v[3 + FEW :]])
+        return k + 1, moves | jnp.any(lengths != 0.0, axis=0)
+
+    begin = jnp.zeros((), jnp.int32), jnp.any(~stance.locked[FEW:], axis=0)
+    goes_on = lambda state: jnp.any(state[0] < ways.many)
+    return jnp.any(lax.while_loop(goes_on, turn, begin)[1])
+
+
 def _met(
     flow_at: FlowAt,
     columns: Array,
@@ -249,14 +304,14 @@ def _met(
     like: _March,
 ) -> Callable[[Array], _March]:
     """Directions where the event comes later or earlier along them."""
-    flow, here, n = flow_at(columns), now.here, len(now.here.q)
+    here, n = now.here, len(now.here.q)
 
     def guards(columns: Array, q: Array, v: Array) -> Array:
         flow = flow_at(columns)
         return guards_at(flow, Place(q, v, slope_at(flow, q, v)))
 
     _, push = jax.linearize(guards, columns, here.q, here.v)
-    rates = guard_rates(flow, here)
+    rates = push(jnp.zeros_like(columns), here.v, here.slope[:n])
     arrived = (begin.verdict == MARCHING) & (now.verdict == EVENT)
 
     def met(k: Array) -> _March:

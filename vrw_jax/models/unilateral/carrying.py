@@ -44,6 +44,11 @@ class Stand(NamedTuple):
     held: Array  # the slots' legs on their stoppers
     airborne: Array  # other legs on their stoppers
 
+    @property
+    def stays(self) -> Array:
+        """Legs whose length does not change."""
+        return self.airborne | (self.slots.spread(self.held) > 0)
+
 
 class Carried(NamedTuple):
     """What ground, the slots' stoppers and the hub do: see `contacts.Answer`."""
@@ -86,7 +91,7 @@ _Rows = Callable[[Stand, Stand, Hub, Carried], tuple[_Stays, _Moves]]
 
 def in_motion(stand: Stand) -> Carried:
     """Forces, and accelerations that they leave."""
-    return _carried(free_acceleration, _rows_of_motion, stand)
+    return _carried(free_acceleration, rows_of_motion, stand)
 
 
 def in_impact(stand: Stand) -> Carried:
@@ -96,46 +101,61 @@ def in_impact(stand: Stand) -> Carried:
 
 def told_by(stand: Stand, hub: Hub, free: Free) -> Carried:
     """By what would be free of them."""
-    s, _, friction, slots, contact, held, airborne = stand
+    s, _, friction, slots, contact, held, _ = stand
     found = answer(s, hub, free, contact, held, friction)
     out = free.legs + hub.legs.sin * found.hub[0] + hub.legs.cos * found.hub[1]
-    stays = airborne | (slots.spread(held) > 0)
-    lengths = jnp.where(stays, 0.0, out - slots.spread(found.pull) / s.m)
+    lengths = jnp.where(stand.stays, 0.0, out - slots.spread(found.pull) / s.m)
     return Carried(found.tangential, found.normal, found.stopper, found.pull, found.hub, lengths)
+
+
+def _solved(free_of: Callable[..., Free], stand: Stand) -> tuple[Hub, Free, Carried]:
+    s, motion, one = stand.s, stand.motion, one_of(stand.motion)
+    hub = kept(hub_of(s, motion, stand.slots, stand.airborne), one)
+    free = kept(free_of(s, motion, stand.slots, hub), one)
+    return hub, free, kept(told_by(stand, hub, free), one)
+
+
+def solved_motion(stand: Stand) -> tuple[Hub, Free, Carried]:
+    """Inertia, what would be free of forces, and what is with them."""
+    return _solved(free_acceleration, stand)
 
 
 def _carried(free_of: Callable[..., Free], rows: _Rows, stand: Stand) -> Carried:
     floats, rest = eqx.partition(stand, eqx.is_inexact_array)
     arrays, rest = eqx.partition(rest, eqx.is_array)
     whole = lambda floats, arrays: eqx.combine(floats, arrays, rest)
-
-    def solved(stand: Stand) -> tuple[Hub, Free, Carried]:
-        s, motion, one = stand.s, stand.motion, one_of(stand.motion)
-        hub = kept(hub_of(s, motion, stand.slots, stand.airborne), one)
-        free = kept(free_of(s, motion, stand.slots, hub), one)
-        return hub, free, kept(told_by(stand, hub, free), one)
-
-    found = jax.custom_jvp(lambda *given: solved(whole(*given))[2])
+    found = jax.custom_jvp(lambda *given: _solved(free_of, whole(*given))[2])
 
     @found.defjvp
     def rule(at: tuple, ways: tuple) -> tuple[Carried, Carried]:
         stand, way = whole(*at), whole(ways[0], at[1])
-        hub, free, told = solved(stand)
-        left, grip, pull = _left_over(stand, way, hub, told, *rows(stand, way, hub, told))
-        _, moved = jax.jvp(lambda free: told_by(stand, hub, free), (free,), (left,))
+        hub, free, told = _solved(free_of, stand)
+        left = left_over(stand, way, hub, told, *rows(stand, way, hub, told))
+        given = asked(hub, left.legs, in_all(stand.slots, left))
+        _, moved = jax.jvp(lambda free: told_by(stand, hub, free), (free,), (given,))
         sum_of = lambda one, other: (one[0] + other[0], one[1] + other[1])
         return told, moved._replace(
-            tangential=sum_of(moved.tangential, grip), pull=sum_of(moved.pull, pull)
+            tangential=sum_of(moved.tangential, left.grip), pull=sum_of(moved.pull, left.pull)
         )
 
     return found(floats, arrays)
 
 
-def _left_over(
+class Left(NamedTuple):
+    """What the equations are left with along a direction, as it would move the rest."""
+
+    legs: Legs  # their lengths
+    hub: tuple[Legs, Legs, Legs]  # each leg's part of the forces there
+    rest: Vector3  # of them beside the legs'
+    foot_e: Pair
+    foot_u: Pair
+    grip: Pair  # how friction moves by its coefficient
+    pull: Pair  # how the slots' pulls move by that, and as their legs turn
+
+
+def left_over(
     stand: Stand, way: Stand, hub: Hub, told: Carried, stays: _Stays, moves: _Moves
-) -> tuple[Free, Pair, Pair]:
-    """What the equations are left with, as forces and legs would move the hub and feet; and how
-    friction moves by its coefficient, and the slots' pulls by that and as their legs turn."""
+) -> Left:
     s, ds, slots, (sin, cos), two = stand.s, way.s, stand.slots, hub.legs, range(2)
     b, db, dtheta = stand.motion.L - s.a, way.motion.L - ds.a, way.motion.theta
     slides, rough = sliding(stand.contact), jax.jvp(rough_of, (stand.friction,), (way.friction,))[1]
@@ -153,23 +173,47 @@ def _left_over(
     legs = legs + (moves.springs - slots.spread(pull) + (outward - stays.along) * ds.m) / s.m
     legs = jnp.where(hub.released, legs, 0.0)
     net = legs + moves.along
-    x = over_legs(stays.along * sin + stays.across * cos)
-    z = over_legs(stays.along * cos - stays.across * sin)
-    by_x = over_legs(net * sin + moves.across * cos) + z * dtheta
-    by_z = over_legs(net * cos - moves.across * sin) - x * dtheta
-    torque = over_legs(db * lever + b * (moves.across + outward * dtheta - cos * dx + sin * dz))
-    force = (
-        ds.m * x + s.m * by_x - ds.Mt * ax - s.Mt * dx + grip[0] + grip[1],
-        ds.m * z + s.m * by_z - ds.Mt * az - s.Mt * dz,
-        -ds.m * over_legs(b * lever) - s.m * torque - drag[0] - drag[1],
+    x, z = stays.along * sin + stays.across * cos, stays.along * cos - stays.across * sin
+    torque = db * lever + b * (moves.across + outward * dtheta - cos * dx + sin * dz)
+    return Left(
+        legs=legs,
+        hub=(
+            s.m * (net * sin + moves.across * cos + z * dtheta) + ds.m * x,
+            s.m * (net * cos - moves.across * sin - x * dtheta) + ds.m * z,
+            -s.m * torque - ds.m * (b * lever) - slots.spread(drag),
+        ),
+        rest=(grip[0] + grip[1] - ds.Mt * ax - s.Mt * dx, -ds.Mt * az - s.Mt * dz, 0.0),
+        foot_e=moves.foot_e,
+        foot_u=moves.foot_u,
+        grip=(grip[0], grip[1]),
+        pull=(pull[0], pull[1]),
     )
-    to, own = times(hub.inverse, force), slots.of(legs)
-    e = [hub.cos[i] * to[0] - hub.sin[i] * to[1] - L[i] * to[2] + moves.foot_e[i] for i in two]
-    free = Free(to, legs, own, (e[0], e[1]), (moves.foot_u[0] - own[0], moves.foot_u[1] - own[1]))
-    return free, (grip[0], grip[1]), (pull[0], pull[1])
 
 
-def _rows_of_motion(stand: Stand, way: Stand, hub: Hub, told: Carried) -> tuple[_Stays, _Moves]:
+class Acts(NamedTuple):
+    """The same, of all legs together and of the slots'."""
+
+    hub: Vector3
+    own: Pair
+    foot_e: Pair
+    foot_u: Pair
+    grip: Pair
+
+
+def in_all(slots: Slots, left: Left) -> Acts:
+    x, z, turn = (over_legs(legs) + rest for legs, rest in zip(left.hub, left.rest, strict=True))
+    return Acts((x, z, turn), slots.of(left.legs), left.foot_e, left.foot_u, left.grip)
+
+
+def asked(hub: Hub, legs: Legs, left: Acts) -> Free:
+    """What that asks of contacts and stoppers."""
+    to, own, (u, v) = times(hub.inverse, left.hub), left.own, left.foot_u
+    e = [hub.cos[i] * to[0] - hub.sin[i] * to[1] - hub.L[i] * to[2] for i in range(2)]
+    e = [e[i] + left.foot_e[i] for i in range(2)]
+    return Free(to, legs, own, (e[0], e[1]), (u - own[0], v - own[1]))
+
+
+def rows_of_motion(stand: Stand, way: Stand, hub: Hub, told: Carried) -> tuple[_Stays, _Moves]:
     s, motion, slots = stand.s, stand.motion, stand.slots
     ds, moved, dtheta = way.s, way.motion, way.motion.theta
     b, db, turn = motion.L - s.a, moved.L - ds.a, told.hub[2]

@@ -17,6 +17,7 @@ import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -170,6 +171,7 @@ def _carried(
     return kept((stopper, along_e, along_u), one)
 
 
+@eqx.filter_jit  # traced once, wherever it is called
 def answer(
     s: Symbols, hub: Hub, free: Free, contact: Array, held: Array, friction: Roughness
 ) -> Answer:
