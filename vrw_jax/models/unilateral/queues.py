@@ -145,9 +145,14 @@ class _Rates(NamedTuple):
             return cls(none, none > 0, np.zeros((len(asked), 0, asked.shape[1])))
         picked, there = np.stack(places, 1), np.stack(counts, 1)
         by_way = np.stack([np.sum(way[:, :, None] * asked_for, 1) for way in along], 1)
-        corner = np.take_along_axis(by_way, picked[:, None], 2)
-        corner = np.where(there[:, :, None] & there[:, None], corner, np.eye(len(places)))
-        return cls(picked, there, np.linalg.solve(corner, by_way))
+        shares = np.zeros_like(by_way)
+        for i in reversed(range(len(places))):  # each way is what the kept ones before leave of one
+            rest = by_way[:, i].copy()
+            for j in range(i + 1, len(places)):
+                rest -= by_way[wheels, i, picked[:, j]][:, None] * shares[:, j]
+            size = by_way[wheels, i, picked[:, i]]
+            shares[:, i] = rest / np.where(there[:, i], size, np.inf)[:, None]
+        return cls(picked, there, shares)
 
     def kept(self) -> np.ndarray:
         """Whether a rate is among those, (wheels, rates)."""
