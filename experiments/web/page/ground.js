@@ -86,20 +86,27 @@ class Ground {
     return felt.map((_, row) => columns.map((column) => column[row]));
   }
 
-  // The gait near a state, by Newton's method, whose Jacobian stays the same once it is near; null without.
-  near(x) {
-    let J = null, at = x, before = Infinity;
+  // The gait near a state, by Newton's method, whose Jacobian, that of a gait beside if it is known, learns
+  // from its steps (Broyden); null without.
+  near(x, known) {
+    let J = known, at = x, before = Infinity, last = null;
     for (let turn = 0; turn < TURNS; turn++) {
       const { x: image, outcome } = this.step(at, before < CLOSE ? SOUGHT : LOOSE), felt = this.felt(at);
       const away = outcome === STEPPED ? this.moved(at, image) : Infinity;
       if (before < CLOSE && away < REPEATS) {
         J = this.jacobian(image, DIFFERED);
-        return J && { x: image, multipliers: multipliers(J, FELT) };
+        return J && { x: image, J, multipliers: multipliers(J, FELT) };
       }
       if (!(away < 0.5 * before) && away > CLOSE) return null;
-      if (!J || J.length !== felt.length || away > CLOSE) J = this.jacobian(at, LOOSE);
+      if (J?.length !== felt.length || !(away < 0.2 * before)) J = this.jacobian(at, LOOSE);
+      else if (last) {
+        const whole = dot(last.change, last.change);
+        const miss = felt.map((i, k) => image[i] - last.image[i] - dot(J[k], last.change));
+        J = J.map((row, k) => row.map((value, l) => value + (miss[k] * last.change[l]) / whole));
+      }
       const change = J && solved(J, felt.map((i) => image[i] - at[i]));
       if (!change) return null;
+      last = { image, change };
       const next = [...image];
       felt.forEach((i, k) => (next[i] = at[i] + change[k]));
       before = away;

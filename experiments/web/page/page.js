@@ -89,7 +89,9 @@ function walkedFrom(engine, values, start, most) {
 function computedOnGround(engine, values, guess) {
   const ground = new Ground(engine, columnOf(values), values.friction), springs = engine.as("viscoelastic");
   const stay = () => ground.begun(springs.gait(ground.wheel, [facts.start])?.x || facts.start);
-  return shownOnGround(ground, ground.found([...(guess ? [() => guess] : []), stay, () => ground.begun(facts.start)]));
+  const gait = guess && ground.near(guess.x, guess.J), begins = [stay, () => ground.begun(facts.start)];
+  if (gait) return shownOnGround(ground, { gait, outcome: STEPPED, states: [gait.x] });
+  return shownOnGround(ground, ground.found(guess ? [() => guess.x, ...begins] : begins));
 }
 
 function shownOnGround(ground, { gait, states, outcome }) {
@@ -558,7 +560,8 @@ async function update(changes = {}) {
   if (state.legs !== legs || state.rung !== rung) state.guess = null;
   Object.assign(state, { legs, rung });
   state.result = computed(engine, values, state.guess);
-  if (state.result.gait && isStable(state.result.gait)) state.guess = state.result.gait.x;
+  const { gait } = state.result;
+  if (gait && isStable(gait)) state.guess = isReal(values) ? gait : gait.x;
   state.took = performance.now() - began;
   // The walk goes on where it was, unless its steps are others.
   const share = walk.step ? walk.time / (walk.step.period || 1) : 0;

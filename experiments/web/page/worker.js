@@ -36,7 +36,8 @@ async function mapped(engine, job, post, current) {
       const some = nodes.slice(begin, begin + few), columns = some.map(wheelAt);
       const near = [false, true].map((backwards) => some.map(([c, r]) => nearest(known, width, c, r, stride, backwards)));
       const found = (rung === "unilateral" ? onGround : onFeetThatStay)(engine, columns, near, guess);
-      found.forEach(({ gait }, i) => (known[some[i][1] * width + some[i][0]] = gait && gait.x));
+      const kept = ({ gait }) => gait && (rung === "unilateral" ? gait : gait.x);
+      found.forEach((one, i) => (known[some[i][1] * width + some[i][0]] = kept(one)));
       post({
         job: job.id,
         stride,
@@ -80,10 +81,10 @@ const FEW = 80; // steps of a walk that looks for one gait of many
 function onGround(engine, columns, near, guess) {
   return columns.map((column, i) => {
     const ground = new Ground(engine, column.slice(0, -1), column[column.length - 1]);
-    const states = [...new Set([near[0][i], near[1][i], guess])].filter((x) => x);
+    const gaits = [...new Set([near[0][i], near[1][i], guess])].filter((one) => one);
     let [gait, outcome] = [null, STEPPED];
-    for (const x of states) gait ||= ground.near(x);
-    if (!gait) ({ gait, outcome } = ground.found([...states.slice(0, 1).map((x) => () => x), () => ground.begun(engine.start)], FEW));
+    for (const { x, J } of gaits) gait ||= ground.near(x, J);
+    if (!gait) ({ gait, outcome } = ground.found([...gaits.slice(0, 1).map(({ x }) => () => x), () => ground.begun(engine.start)], FEW));
     return { gait, outcome, told: gait && ground.measures(ground.step(gait.x)) };
   });
 }
