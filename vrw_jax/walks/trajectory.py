@@ -118,7 +118,8 @@ def simulate(
     start = rung_of(model).start(params) if x is None else x
     params, x, model, options = checked(params, start, model, options, engine)
     sampled = over_contacts if model.tells_contacts else over_phases
-    telling, s = sampled(params, model, options, n_samples), params.symbols()
+    telling = sampled(params, model, options, n_samples)
+    s = jax.tree.map(float, params).symbols()
     told = joined(telling, x, n_steps, float(s.Mt * s.g * s.sin_phi))
     columns = told.columns
     data = variables({name: columns[name] for name in telling.names}, "time")
