@@ -192,14 +192,17 @@ def stepped_on_ground(n_legs, friction, wheels, state, stretches=None):
     rows = [form["lane"], 7 + 4 * n_legs, form["section"] + len(page.facts["groundTold"])]
     told = [((n,), np.float64) for n in rows]
     [lane] = page("ground_opened", given, [wheels, state], told[:1])
-    while True:
-        lane, stretch, numbers, outcome = page(
-            "ground_onward", given, [wheels, lane], [*told, ((), np.int32)]
+    numbers, outcome = np.zeros((rows[-1], state.shape[1])), np.full(state.shape[1], -1)
+    while len(under_way := np.flatnonzero(outcome == -1)):
+        lane, stretch, numbers[:, under_way], outcome[under_way] = page(
+            "ground_onward", given, [wheels[:, under_way], lane], [*told, ((), np.int32)]
         )
-        if not np.any(outcome == -1):
-            return numbers, outcome
+        goes_on = outcome[under_way] == -1
+        lane = lane[:, goes_on]
         if stretches is not None:
-            stretches.append(np.where(outcome == -1, stretch, 0.0))  # an ended lane has no more
+            stretches.append(np.zeros((rows[1], len(outcome))))  # an ended lane has no more
+            stretches[-1][:, under_way[goes_on]] = stretch[:, goes_on]
+    return numbers, outcome
 
 
 def same_on_ground(n, n_legs):
