@@ -30,6 +30,7 @@ from vrw_jax.answers.lower import (
 from vrw_jax.answers.quantities import MADE, measured
 from vrw_jax.answers.result import Answer, How
 from vrw_jax.answers.top import TIGHT, TIGHTER, Ground
+from vrw_jax.answers.walking import led
 from vrw_jax.cycles import starts_of
 from vrw_jax.gaits import Which, place_in_list
 from vrw_jax.numerics import Options, taken
@@ -48,8 +49,10 @@ SAFETY = 4.0
 """What one step says of an error, times this, bounds it: as long as corrections contract to 3/4."""
 FINE = 1e-7
 """Tolerance of an answer below which steps are taken at TIGHTER."""
-WALKS = (20, 60)
-"""Steps of a walk towards a gait, one after the other, until an iteration from there contracts."""
+EXACT = 3
+"""Steps of a walk after the loose ones, before corrections: looser steps may end in other modes."""
+STAYING = 60
+"""Steps of a walk that must stay at a gait which lies off where the walk to it ended."""
 COLD = 2
 """Starts, slow ones first, of wheels without a lower gait: of 232 the first two led 100 to a gait,
 the others none of the rest."""
@@ -267,23 +270,25 @@ class _Asked:
 
     def _walk(self, lanes: np.ndarray, x: np.ndarray, how: How) -> None:
         """To where walks lead, and from there by corrections."""
-        for n_steps in WALKS:
-            if not len(lanes):
-                return
-            step = self.ground.step(lanes, x, n_steps)
-            self.told["n_steps"][lanes] += n_steps
-            lost = np.where(step.outcome == Outcome.STEPPED, Outcome.NO_CYCLE_FOUND, step.outcome)
-            self.told["outcomes"][lanes] = lost
-            on = step.outcome == Outcome.STEPPED
-            lanes, x = lanes[on], step.x[on]
-            chord = Chord.of(self.ground, lanes, x, None)
-            found = settled(chord, self.names, self.goal, 0)
-            found.done[found.done] = chord.some(found.done).attract()
-            far = np.flatnonzero(found.done & (chord.away(x) > STRAY))
-            found.done[far] = chord.some(far).stay(WALKS[-1])
-            found.n_steps[far] += WALKS[-1]
-            self._take(lanes, found, how)
-            lanes, x = lanes[~found.done], x[~found.done]
+        walk = led(self.ground, lanes, x)
+        self.told["n_steps"][lanes] += walk.n_steps
+        # No step begins where a wheel has turned more than once in flight.
+        walks = np.isin(walk.outcome, (Outcome.STEPPED, Outcome.BAD_INPUT))
+        self.told["outcomes"][lanes] = np.where(walks, Outcome.NO_CYCLE_FOUND, walk.outcome)
+        lanes, x = lanes[walk.rests], walk.x[walk.rests]
+        if not len(lanes):
+            return
+        step = self.ground.step(lanes, x, EXACT)
+        self.told["n_steps"][lanes] += EXACT
+        on = step.outcome == Outcome.STEPPED
+        lanes, x = lanes[on], step.x[on]
+        chord = Chord.of(self.ground, lanes, x, None)
+        found = settled(chord, self.names, self.goal, 0)
+        found.done[found.done] = chord.some(found.done).attract()
+        far = np.flatnonzero(found.done & (chord.away(x) > STRAY))
+        found.done[far] = chord.some(far).stay(STAYING)
+        found.n_steps[far] += STAYING
+        self._take(lanes, found, how)
 
     def _take(self, lanes: np.ndarray, found: Settled, how: How) -> None:
         """Gaits on real ground."""

@@ -374,6 +374,16 @@ def _reached(
     return best
 
 
+def reached(finder: Any, params: WheelParams, searched: LimitCycle) -> LimitCycle:
+    """What the paper's finder has searched of a batch, and where it found none what walks lead to
+    besides, on the same mesh."""
+    found = _reached(finder, params, searched, adaptive=False)
+    if found is None:
+        return searched
+    cycle: LimitCycle = in_batches(finder.cycles, SHAPES, params, found[1])
+    return cycle
+
+
 def _state(guess: Any) -> Any:
     """Its section state, of a guess that is a cycle, a place or one itself."""
     if isinstance(guess, Located):
