@@ -28,6 +28,7 @@ def test_two_functions_in_one_module_give_jaxs_numbers():
     store = wasmtime.Store()
     exports = wasmtime.Instance(store, wasmtime.Module(store.engine, code), []).exports(store)
     memory, place = exports["memory"], exports["__heap_base"].value(store)
+    memory.grow(store, 1)
     x = np.random.default_rng(3).uniform(0.1, 50.0, (2, 6))
     least, array, told, pointers = (place + step for step in (0, 8, 128, 256))
     memory.write(store, struct.pack("<d", 0.3), least)

@@ -14,6 +14,7 @@ from vrw_jax.numerics.tableaus import (
     Evaluate,
     Place,
     Tableau,
+    Take,
     explicit_tableau,
     parabola,
     take_step,
@@ -50,6 +51,7 @@ class Located(NamedTuple):
 def locate(
     guards: Callable[[Place], Vector],
     evaluate: Evaluate,
+    take: Take,
     tableau: Tableau,
     step: Crossing,
     options: Options,
@@ -66,8 +68,8 @@ def locate(
     bits = [(step.guards >> i) & 1 == 1 for i in range(len(step.values))]
 
     def improve(search: Located) -> Located:
-        taken = take_step(tableau, evaluate, step.here, search.length, with_error=False)
-        values, rates = with_rates(guards, evaluate, taken.end)
+        end = take(step.here, search.length).end
+        values, rates = with_rates(guards, evaluate, end)
         change, guard = _newton(values, rates, step.guards)
         before, straight = jnp.ones(h.shape, bool), jnp.ones(h.shape, bool)
         for g0, g, rate, crosses in zip(step.values, values, rates, bits, strict=True):
@@ -87,7 +89,7 @@ def locate(
             low=low,
             high=high,
             open=search.open & ~arrived,
-            end=select(arrived, taken.end, search.end),
+            end=select(arrived, end, search.end),
             shift=jnp.where(arrived, change, search.shift),
             guard=jnp.where(arrived, guard, search.guard),
             tried=search.tried + search.open,

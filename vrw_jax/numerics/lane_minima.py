@@ -17,7 +17,7 @@ from jaxtyping import Array
 from vrw_jax.numerics.lanes import select
 from vrw_jax.numerics.minima import AT_MINIMUM, cubic_minimum
 from vrw_jax.numerics.options import Options
-from vrw_jax.numerics.tableaus import Evaluate, Place, Tableau, take_step
+from vrw_jax.numerics.tableaus import Evaluate, Place, Tableau, Take
 from vrw_jax.numerics.tangents import Moving
 from vrw_jax.numerics.types import Vector
 
@@ -121,7 +121,7 @@ class _Search(NamedTuple):
 
 def settled(
     monitors: Monitors,
-    tableau: Tableau,
+    take: Take,
     evaluate: Evaluate,
     lowest: Lowest,
     start: Array,
@@ -143,7 +143,7 @@ def settled(
             return jnp.sum(jnp.where(chosen[:, None], jnp.stack(monitors.values(place)), 0.0), 0)
 
         def improve(search: _Search) -> _Search:
-            end = take_step(tableau, evaluate, begin, search.length, with_error=False).end
+            end = take(begin, search.length).end
             (value,), (rate,) = with_rates(lambda place: (own(place),), evaluate, end)
             gap = search.length - search.at
             slope = (rate - search.rate_at) / jnp.where(gap == 0.0, 1.0, gap)
@@ -179,6 +179,7 @@ def settled(
 
 def moved(
     monitors_of: Callable[..., tuple[Monitors, Evaluate]],
+    take: Take,
     tableau: Tableau,
     moving: Moving,
     lowest: Lowest,
@@ -202,7 +203,7 @@ def moved(
         index, held, length = given
         q, v = tuple(held.q), tuple(held.v)
         begin = Place(q, v, evaluate(q, v))
-        taken = take_step(tableau, evaluate, begin, length, with_error=False)
+        taken = take(begin, length)
         way = moving.along(tableau, taken.stages, held.direction, length)
         chosen = jnp.arange(len(monitors.counts_at_start)) == index
         return None, jnp.sum(jnp.where(chosen[:, None], along(taken.end, way), 0.0), 0)

@@ -32,6 +32,7 @@ from vrw_jax.numerics.tableaus import (
     Evaluate,
     Place,
     Tableau,
+    Take,
     Taken,
     below,
     change_of_length,
@@ -133,9 +134,9 @@ def integrate_lanes(
 
 
 class _Ended(NamedTuple):
-    """A phase with its end, and what was found on the way there."""
+    """A phase's steps and end, and what was found on the way there."""
 
-    phase: LanePhase
+    take: Take
     start: Place
     end: LanePhaseEnd
     march: _March
@@ -145,9 +146,9 @@ class _Ended(NamedTuple):
 
 def _end_moved(phase_of: PhaseOf, tableau: Tableau, moving: Moving, ended: _Ended) -> LanePhaseEnd:
     """How the phase's end moves along a direction of its start and constants."""
-    phase, start, end, march, lowest, least = ended
+    take, start, end, march, lowest, least = ended
     n, h = len(start.q), jnp.where(march.verdict == CROSSED, end.duration - march.time, 0.0)
-    taken = take_step(tableau, phase.evaluate, march.here, h, with_error=False)
+    taken = take(march.here, h)
     assert march.direction is not None
     direction = moving.along(tableau, taken.stages, march.direction, h)
 
@@ -165,7 +166,7 @@ def _end_moved(phase_of: PhaseOf, tableau: Tableau, moving: Moving, ended: _Ende
             return phase.monitors, phase.evaluate
 
         ends, way = (start, end.place), jnp.stack([*told, *numbers[2 * n :]])
-        minima = moved_minima(monitors_of, tableau, moving, lowest, least, ends, way)
+        minima = moved_minima(monitors_of, take, tableau, moving, lowest, least, ends, way)
     place_moved = nothing.place._replace(q=told[:n], v=told[n:])
     return nothing._replace(place=place_moved, duration=later, minima=minima)
 
@@ -202,19 +203,21 @@ def _ended(
     options: Options,
     few: Array | None,
 ) -> _Ended:
-    whole = phase = _traced_once(phase_of(constants, held))
+    phase = _traced_once(phase_of(constants, held))
+    take = _steps_of(phase, tableau)
     start = Place(q, v, phase.evaluate(q, v))
     values, rates = with_rates(phase.guards, phase.evaluate, start)
     past = tuple((g < 0.0) | ((g == 0.0) & (r <= 0.0)) for g, r in zip(values, rates, strict=True))
     at_once = _first(past)
     begins = active & (at_once < 0)
 
-    march = _march(phase, tableau, start, values, begins, first_step, options, few, moving)
+    march = _march(phase, take, tableau, start, values, begins, first_step, options, few, moving)
     crossed = march.verdict == CROSSED
-    if phase.monitors is not None:  # a long program, which what follows makes longer
-        phase = _traced_once(phase, apart)
+    if phase.monitors is not None or moving is not None:
+        phase = _traced_once(phase, apart)  # a long program, which what follows makes longer
+        take = _steps_of(phase, tableau)
     step = Crossing(*march[:2], march.inside, march.beyond, march.h, march.crossing, crossed)
-    found = locate(phase.guards, phase.evaluate, tableau, step, options)
+    found = locate(phase.guards, phase.evaluate, take, tableau, step, options)
     lost = crossed & found.open
     duration = march.time + jnp.where(crossed, found.length, 0.0)
     place = select(crossed, found.end, march.here)
@@ -224,7 +227,7 @@ def _ended(
         taken = Passed(march.here, place, found.length, crossed, march.direction)
         lowest = lowered(*given, lowest, taken)
         first_values = jnp.stack(phase.monitors.values(start))
-        least = settled(phase.monitors, tableau, phase.evaluate, lowest, first_values, options)
+        least = settled(phase.monitors, take, phase.evaluate, lowest, first_values, options)
     late = crossed & ~found.open & (duration > options.max_phase_time)
     guard = jnp.where(active & (at_once >= 0), at_once, jnp.where(crossed, found.guard, -1))
     end = LanePhaseEnd(
@@ -237,7 +240,12 @@ def _ended(
         next_step=march.h,
         minima=None if least is None else least.lowest,
     )
-    return _Ended(whole, start, end, march, lowest, least)
+    return _Ended(take, start, end, march, lowest, least)
+
+
+def _steps_of(phase: LanePhase, tableau: Tableau) -> Take:
+    """Its steps, which are traced once however often they are taken."""
+    return jax.jit(lambda here, h: take_step(tableau, phase.evaluate, here, h))
 
 
 def _traced_once(phase: LanePhase, how: Callable = jax.jit) -> LanePhase:
@@ -250,6 +258,7 @@ def _traced_once(phase: LanePhase, how: Callable = jax.jit) -> LanePhase:
 
 def _march(
     phase: LanePhase,
+    take: Take,
     tableau: Tableau,
     start: Place,
     values: Vector,
@@ -268,7 +277,7 @@ def _march(
         return _change(tableau, squared, to_dip)
 
     def advance(march: _March) -> _March:
-        taken = take_step(tableau, phase.evaluate, march.here, march.h)
+        taken = take(march.here, march.h)
         stages = [phase.guards(taken.stages[i]) for i in tableau.inside]
         end = phase.guards(taken.end)
         change, kept = judge(march, taken, stages, end)
@@ -277,12 +286,11 @@ def _march(
         tried = march.verdict == MARCHING
         inside = stages[tableau.inside.index(tableau.middle)] if stages else march.values
         within, beyond = select(tried, (inside, end), (march.inside, march.beyond))
-        lowest, half = march.lowest, march.half
+        lowest, half, direction = march.lowest, march.half, march.direction
         if phase.monitors is not None and lowest is not None:
             given = phase.monitors, phase.evaluate
             step = Passed(march.here, taken.end, march.h, accepted, march.direction)
             lowest = lowered(*given, lowest, step)
-        direction = march.direction
         if moving is not None and direction is not None:
             along = moving.along(tableau, taken.stages, direction, march.h)
             direction = jnp.where(accepted, along, direction)

@@ -170,6 +170,7 @@ class Taken(NamedTuple):
 
 
 Evaluate = Callable[[Vector, Vector], Slope]
+Take = Callable[[Place, Array], Taken]
 
 
 def take_step(

@@ -51,7 +51,7 @@ def _slopes_of(
     """At each stage; `moved`: the direction of `constants`."""
 
     def at(row: Array) -> tuple[Array, Array]:
-        place, balance = _unpacked(row), of(constants, held)
+        place, balance = _unpacked(row), _traced_once(of(constants, held))
         residual = lambda constants, held: of(constants, held).residual(place)
         along = lambda *way: _accelerated(balance, place, jax.jvp(residual, *way)[1])
         still = jax.tree.map(jnp.zeros_like, constants)
@@ -62,6 +62,10 @@ def _slopes_of(
         return jnp.stack(by_state, 1), by_constants
 
     return Slopes(*lax.map(at, jnp.stack([_packed(place) for place in stages[:-1]])))
+
+
+def _traced_once(balance: Balance) -> Balance:
+    return Balance(jax.jit(balance.residual), jax.jit(balance.solve))
 
 
 def _packed(place: Place) -> Array:

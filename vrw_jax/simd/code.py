@@ -118,8 +118,9 @@ def _told(name: str, content: bytes) -> Code:
 def traced(function: Callable, *shapes: Any) -> ClosedJaxpr:
     """The trace of a function that is to be machine code."""
     outside = _tracing.set(True)
-    try:
-        return jax.make_jaxpr(function)(*shapes)
+    try:  # in what loops are traced in, for JAX to know again what it has traced
+        with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
+            return jax.make_jaxpr(function)(*shapes)
     finally:
         _tracing.reset(outside)
 

@@ -32,6 +32,7 @@ def add_handler(module: ir.Module, kernel: ir.Function, n_in: int, n_out: int, w
     """
     pointer = ir.PointerType()
     handler = ir.Function(module, ir.FunctionType(pointer, [pointer]), HANDLER)
+    handler.attributes.add("nounwind")
     build = ir.IRBuilder(handler.append_basic_block("entry"))
     asked, called = (handler.append_basic_block(name) for name in ("asked", "called"))
     frame, none = handler.args[0], ir.Constant(pointer, None)

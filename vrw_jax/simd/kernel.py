@@ -27,6 +27,7 @@ def module_text(closed: ClosedJaxpr, width: int, small: int = SMALL) -> str:
     kernel = ir.Function(
         module, ir.FunctionType(ir.VoidType(), [pointer, pointer, LONG, LONG, LONG]), NAME
     )
+    kernel.attributes.add("nounwind")
     build = ir.IRBuilder(kernel.append_basic_block("entry"))
     arrays = Arrays(Numbers(build, width), small=small)
     given, told, n_lanes, begin, end = kernel.args

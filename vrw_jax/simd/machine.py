@@ -7,9 +7,16 @@ from typing import Any
 import llvmlite.binding as llvm
 
 LEVEL = 2
-"""How hard LLVM tries."""
-VECTORIZES = False
-"""Whether it looks for vectors: they are there."""
+"""How hard LLVM tries to place values in registers and instructions in time."""
+PASSES = (
+    "global_dead_code_eliminate",
+    "instruction_combine",
+    "simplify_cfg",
+    "aggressive_dce",
+    "sinking",
+)
+"""What is left for it to simplify: nothing is written twice, and vectors are there. Its usual list
+takes as long as all the rest, to code no faster."""
 
 
 @functools.cache
@@ -21,7 +28,7 @@ def processor() -> tuple[str, str, str]:
 
 def how_compiled() -> str:
     """All that object code depends on besides LLVM's text."""
-    return repr((llvm.llvm_version_info, processor(), LEVEL, VECTORIZES))
+    return repr((llvm.llvm_version_info, processor(), LEVEL, PASSES))
 
 
 def wide() -> bool:
@@ -54,10 +61,10 @@ def compiled_for_web(text: str, begins: str, name: str) -> bytes:
 
 def _emitted(module: llvm.ModuleRef, machine: llvm.TargetMachine) -> bytes:
     module.triple, module.data_layout = machine.triple, str(machine.target_data)
-    choices = llvm.create_pipeline_tuning_options(LEVEL)
-    choices.loop_vectorization = choices.slp_vectorization = VECTORIZES
-    builder = llvm.create_pass_builder(machine, choices)
-    builder.getModulePassManager().run(module, builder)
+    passes = llvm.create_new_module_pass_manager()
+    for name in PASSES:
+        getattr(passes, f"add_{name}_pass")()
+    passes.run(module, llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options()))
     return machine.emit_object(module)
 
 

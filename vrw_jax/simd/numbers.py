@@ -23,6 +23,13 @@ NUMBERS = {
 }
 
 
+class _Repeated(ir.Constant):
+    """A constant that is the same for all lanes, written once."""
+
+    def _get_reference(self) -> str:
+        return f"splat ({self.constant[0]})"
+
+
 class Numbers:
     """Writes values into a function of `builder`'s module."""
 
@@ -51,7 +58,7 @@ class Numbers:
         if isinstance(value, ir.Constant):
             key = (str(kind), str(value))
             if key not in self.constants:
-                self.constants[key] = ir.Constant(kind, [value] * kind.count)
+                self.constants[key] = _Repeated(kind, [value] * kind.count)
             return self.constants[key]
         return self.once(("spread", id(value)), lambda: self._spread(value, kind))
 

@@ -98,7 +98,8 @@ class Traces:
         kind = ir.FunctionType(told, kinds(closed.in_avals))
         function = ir.Function(module, kind, module.get_unique_name(APART))
         function.linkage = "internal"
-        function.attributes.add("noinline")
+        for attribute in ("noinline", "nounwind"):
+            function.attributes.add(attribute)
         build = ir.IRBuilder(function.append_basic_block("entry"))
         outer = self.arrays
         arrays = Arrays(Numbers(build, outer.numbers.width), outer.written_out, outer.small)
