@@ -141,12 +141,27 @@ def test_where_two_borders_meet_both_vanish(curves):
     assert abs(step.monitors.friction_rear) < 1e-8
 
 
+@pytest.fixture(scope="module")
+def margins_of_steps(cycle):
+    return border_curves(("hit_planted_impulse", "friction_rear"), OVER, cycle, bounds=BOX)
+
+
 @pytest.mark.slow
-def test_margins_of_steps_are_as_exact_as_quantities_of_the_gait(cycle):
+def test_margins_of_steps_are_as_exact_as_quantities_of_the_gait(margins_of_steps):
     random = np.random.default_rng(4)
-    names = ("hit_planted_impulse", "friction_rear")
-    for curve in border_curves(names, OVER, cycle, bounds=BOX):
+    for curve in margins_of_steps:
         assert_through_the_branch(curve)
         told = judged(curve, BOX, 8, random)
         assert told["right, from the curve's own gait"] == 8, told
         assert told["right, found cold"] > 0, told
+
+
+@pytest.mark.slow
+def test_where_a_margin_of_the_step_meets_a_fold_branches_turn_back(margins_of_steps):
+    for curve in margins_of_steps:
+        (damping, stiffness) = next(met.values for met in curve.meetings if met.name == "fold")
+        before = vrw.WheelParams(damping=damping, stiffness=stiffness - 10.0)
+        bounds = stiffness - 20.0, stiffness + 20.0
+        branch = vrw.continue_branch(before, "stiffness", bounds)
+        (fold,) = [border.value for border in branch.borders if border.name == "fold"]
+        assert abs(fold - stiffness) < 1e-9

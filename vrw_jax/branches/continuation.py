@@ -7,6 +7,7 @@ so that it is as exact as the gaits are.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -18,7 +19,7 @@ from jaxtyping import Array
 
 from vrw_jax.branches.branch import Branch
 from vrw_jax.branches.followed import Wheel
-from vrw_jax.branches.run import IN_SEQUENCE, AbstractRun, Strand, Table, run_all
+from vrw_jax.branches.run import IN_SEQUENCE, READ, AbstractRun, Strand, Table, run_all
 from vrw_jax.branches.starts import STARTS, Wanted, start_by_walking
 from vrw_jax.cycles import (
     AGREEMENT,
@@ -93,8 +94,8 @@ class GaitRun(AbstractRun):
     def read(self, wheels: Wheel, points: PathPoint) -> Table:
         """One column more for each leg of a margin that has several."""
         followed: Any = self.followed
-        found = followed.told(self.model, self.step_options, wheels, points)
-        table = jax.tree.map(np.asarray, found)
+        told = functools.partial(followed.told, self.model, self.step_options)
+        table = self.batched(told, READ, wheels, points)
         for name, margin in MARGINS.items():
             if margin.axis and name in table:
                 legs = enumerate(range(3, self.n_legs + 1))
@@ -354,7 +355,7 @@ class MapRun(AbstractRun):
     """Of fixed points of any map."""
 
     def read(self, wheels: Any, points: PathPoint) -> Table:
-        return {"x": np.asarray(jax.vmap(self.followed.section)(points.z))}
+        return {"x": self.batched(jax.vmap(self.followed.section), READ, points.z)}
 
     def kept(self, table: Table) -> np.ndarray:
         return np.asarray(np.isfinite(table["x"]).all(-1))

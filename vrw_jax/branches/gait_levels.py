@@ -4,7 +4,6 @@ Trial, columns, quantities and their slopes come from one call of machine code; 
 event-driven step tells come from steps.
 """
 
-import functools
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -107,18 +106,34 @@ class GaitLevel(AbstractLevel):
                 value, slopes = jax.vmap(push, out_axes=(None, 0))(slopes)
             value, slopes = value + slopes[0], slopes[1:]
         else:
-            # Newton's method needs slopes to few digits: steps beside the trial have them for less
-            # than derivatives of the step, and on the same machine code as the step itself.
-            corrected, h = jax.tree.map(jnp.add, z, correction), DIFFERENCE * p
-            beside = lambda way, i: jax.tree.map(lambda a, b: a + h[i] * b, corrected, way)
-            trials = corrected, beside(first, 0), beside(second, 1)
-            values = jax.vmap(functools.partial(self.told, gait))(
-                jax.tree.map(lambda *x: jnp.stack(x), *trials),
-                p + jnp.concatenate([jnp.zeros((1, 2), p.dtype), jnp.diag(h)]),
-            )
-            value, slopes = values[0], (values[1:] - values[0]) / h[:, None]
+            value, slopes = self._by_steps(gait, z, p, correction, (first, second))
         value, slopes = value[wheel.place], slopes[:, wheel.place]
         return LevelLinear(correction, (first, second), monodromy, value, slopes)
+
+    def _by_steps(
+        self, gait: Wheel, z: Solution, p: Array, correction: Solution, columns: tuple
+    ) -> tuple[Array, Array]:
+        """What steps tell of the corrected gait, and its slopes by both parameters.
+
+        Newton's method needs slopes to few digits: steps beside the trial have them for less than
+        derivatives of the step, and on the same machine code as the step itself. Beside a fold
+        columns grow beyond bounds and turn parallel, and corrections follow them: steps are taken
+        along an orthonormal basis, from where the columns' plane is nearest to the trial.
+        """
+        ahead = jnp.stack([p[i] * self.section(column) for i, column in enumerate(columns)])
+        basis, triangle = jnp.linalg.qr(jnp.concatenate([ahead, jnp.eye(2, dtype=p.dtype)], 1).T)
+        mixed = p[:, None] * jnp.linalg.inv(triangle)
+        here = basis[:-2].T @ self.section(correction)
+
+        def beside(place: Array) -> Array:
+            by = mixed @ (place - here)
+            along = lambda x, dx, a, b: x + dx + by[0] * a + by[1] * b
+            return self.told(gait, jax.tree.map(along, z, correction, *columns), p + by)
+
+        places = DIFFERENCE * jnp.eye(3, 2, -1, p.dtype)
+        told = jax.vmap(beside)(places)
+        slopes = (told[1:] - told[0]) / DIFFERENCE
+        return told[0] + here @ slopes, triangle.T @ slopes / p[:, None]
 
     def at(self, gait: Wheel, p: Array) -> Wheel:
         """The wheel with both parameters as they are at p."""
@@ -192,7 +207,7 @@ ROUNDING = 1e-9
 """Of a duration that is zero all along a curve, s."""
 
 DIFFERENCE = 1e-6
-"""Of a parameter, over its value, for slopes of what only a step tells."""
+"""Of section and parameters, these over their values, for slopes of what only a step tells."""
 
 TOLD = {FORMAL: _formal, BIFURCATIONS: _monodromy}
 """By what a level's quantities are read, where it is not the step."""

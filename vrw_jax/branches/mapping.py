@@ -68,7 +68,7 @@ def border_map(
     names = tuple(map(str, scan.outcome.dims))
     box = np.array([(scan[name].values[0], scan[name].values[-1]) for name in names], float)
     tracer = Tracer((names[0], names[1]), box, model, OF_CURVES, Options.tight())
-    traced = _followed(tracer, _across(tracer, params), [])
+    traced = _followed(tracer, across(tracer, params), [])
     changes = changes_of(scan, tracer.parameters)
     looked: list[Change] = []
     left = lambda: unexplained(changes, [one.curve for one in traced], scan)
@@ -90,7 +90,7 @@ def _followed(tracer: Tracer, seeds: list[Seed], traced: list[Traced]) -> list[T
     return traced
 
 
-def _across(tracer: Tracer, params: WheelParams) -> list[Seed]:
+def across(tracer: Tracer, params: WheelParams) -> list[Seed]:
     """Of the branches through wheels on either middle line of the box."""
     seeds, middle = [], tracer.box.mean(1)
     for axis, name in enumerate(tracer.parameters):

@@ -48,7 +48,10 @@ SHARES_WHERE_LOST = (0.99, 0.9)
 """Of the way to a zero so ill-conditioned that no point is found beside it."""
 
 SHAPES = (1, 8)
-"""Points that are measured or located side by side; one shape where much is compiled for it."""
+"""Points that are located side by side; one shape where much is compiled for it."""
+
+READ = 32
+"""Points that one program reads: fewer take it as long."""
 
 IN_SEQUENCE = "sequence"
 """Column that is 1 where a point is what it stands for, else -1."""
@@ -99,22 +102,17 @@ class AbstractRun(abc.ABC):
         """Whether a mesh says how far a branch goes or how exact it is; `ends`: names of losses."""
         return False
 
-    @property
-    def shapes(self) -> tuple[int, ...]:
-        """Of `SHAPES`, those that are used."""
-        return SHAPES[-1:] if self.followed.traced else SHAPES
-
-    def batched(self, function: Callable, *trees: Any) -> Any:
-        """Of many rows, which are numpy's here."""
+    def batched(self, function: Callable, size: int, *trees: Any) -> Any:
+        """Of many rows, which are numpy's here, `size` of them at once where that is compiled."""
         if self.followed.traced:
-            return in_batches_of_numpy(function, self.shapes, *trees)
-        return jax.tree.map(np.asarray, in_batches(function, self.shapes, *trees))
+            return in_batches_of_numpy(function, (size,), *trees)
+        return jax.tree.map(np.asarray, in_batches(function, SHAPES, *trees))
 
     def table(self, points: PathPoint, owners: np.ndarray) -> Table:
         """Every quantity at each point, bifurcation functions and IN_SEQUENCE included."""
         wheels = taken(self.wheels, owners)
-        found = self.batched(self.read, wheels, points)
-        margins = in_batches_of_numpy(bifurcation_functions, SHAPES[-1:], points.jacobian)
+        found = self.read(wheels, points)
+        margins = in_batches_of_numpy(bifurcation_functions, (READ,), points.jacobian)
         found |= {name: margins[:, i] for i, name in enumerate(BIFURCATIONS)}
         found = self.known(found, owners)
         for name, exact in self.exact.items():
@@ -226,11 +224,13 @@ def _zeros(run: AbstractRun, pieces: _Pieces, asked: list[tuple[int, int, str]])
     on = _solve_on if run.followed.traced else _solve_many
     search = functools.partial(on, run.followed, run.options, jnp.asarray(run.bounds))
 
-    def solved(places: np.ndarray, which: np.ndarray) -> tuple[PathPoint, np.ndarray]:
-        return run.batched(search, *taken((wheels, left, right), which), places)
+    parameter = {(i, 1.0 * end): side.p[i]
+                 for end, side in enumerate((left, right)) for i in range(len(asked))}  # fmt: skip
 
     def evaluated(places: np.ndarray, which: np.ndarray) -> tuple[PathPoint, Table]:
-        points, found = solved(places, which)
+        rows = taken((wheels, left, right), which)
+        points, found = run.batched(search, SHAPES[-1], *rows, places)
+        parameter.update(zip(zip(which, places, strict=True), points.p, strict=True))
         points = points._replace(valid=points.valid & found)
         table = run.table(points, owners[which])
         return points, {k: np.where(_along(found, v), v, np.nan) for k, v in table.items()}
@@ -244,7 +244,6 @@ def _zeros(run: AbstractRun, pieces: _Pieces, asked: list[tuple[int, int, str]])
     width = np.minimum(ACCURACY / reach, AT_FOLD)
     found = locate(asked_at, (known(lefts), known(rights)), width)
     every = np.arange(len(asked))
-    best, _ = solved(found.place, every)
     # A little to the left even of an exact zero: there it is still what the branch stands for.
     beside, table = evaluated(np.maximum(found.left - width, 0.0), every)
     for share in SHARES_WHERE_LOST:
@@ -256,7 +255,7 @@ def _zeros(run: AbstractRun, pieces: _Pieces, asked: list[tuple[int, int, str]])
     return [
         _Zero(
             asked[i],
-            float(best.p[i] if np.isfinite(best.p[i]) else left.p[i]),
+            float(parameter[i, found.place[i]]),
             float(found.place[i]),
             taken(beside, slice(i, i + 1)),
             taken(table, slice(i, i + 1)),
@@ -461,7 +460,7 @@ def run_all(
 
     def border(name: str, zero: _Zero, owner: int, ends_branch: bool) -> Border:
         beside = taken(zero.beside, 0)
-        section = np.asarray(run.followed.section(jax.tree.map(jnp.asarray, beside.z)))
+        section = np.asarray(run.followed.section(jax.device_put(beside.z)))
         point = FixedPoint(section, float(beside.p), beside.jacobian)
         if name == IN_SEQUENCE:
             name = run.name_of_loss(pieces.table, zero.bracket[1])

@@ -236,7 +236,7 @@ class Tracer(NamedTuple):
         seeds = [self._on_mesh(seed, problem) for seed in seeds]
         filled = [*seeds, *seeds[-1:] * (-len(seeds) % SIDE_BY_SIDE)]
         level = GaitLevel(problem, self.parameters, kind, self.model, self.step_options)
-        stack = lambda *trees: jax.tree.map(lambda *x: jnp.stack(x), *trees)
+        stack = lambda *trees: jax.tree.map(lambda *x: np.stack(x), *trees)
         levels = [level_of(seed.name, bool(seed.gait.happens[0, 0] > 0.5)) for seed in filled]
         places = [jnp.asarray(kind.index(name)) for name in levels]
         wheels = stack(*(GaitAt(s.gait, place) for s, place in zip(filled, places, strict=True)))
@@ -273,8 +273,8 @@ class Tracer(NamedTuple):
             if {name, seed.name} == {"lambda_4_plus", ROLLS_OFF}:
                 met.append(self._beyond(name, seed, path, values, strand.points.z.z, at))
             elif can_follow(name):
-                z = jax.tree.map(jnp.asarray, beside.z.z)
-                met.append(Seed(name, (float(beside.p), at[1]), seed.problem, seed.gait, z))
+                there = float(beside.p), at[1]
+                met.append(Seed(name, there, seed.problem, seed.gait, beside.z.z))
         curve = self._labelled(seed, strand, tuple(meetings))
         return Traced(curve, path, tuple(met))
 

@@ -23,6 +23,9 @@ from vrw_jax.numerics.arclength import (
 )
 from vrw_jax.numerics.lanes import select
 
+AT_ONCE = 1e-2
+"""Of the tolerance: after a correction as small the Jacobian, of the trial before it, is exact."""
+
 
 class Solving(NamedTuple):
     """Where Newton's method is on a plane."""
@@ -59,7 +62,8 @@ def nearer(
     # A trial that went astray stands still: no lane may hand its neighbours a NaN.
     sound = jnp.isfinite(following.size)
     following = select(sound, following, now)._replace(size=following.size)
-    settled = jnp.where(following.size < options.tolerance, on.settled + 1, 0)
+    counts = jnp.where(following.size < AT_ONCE * options.tolerance, 2, 1)
+    settled = jnp.where(following.size < options.tolerance, on.settled + counts, 0)
     return Solving(following, on.tries + 1, settled)
 
 
@@ -83,8 +87,8 @@ def solve(
 ) -> tuple[PathPoint, Bool[Array, ""]]:
     """The point of the branch on a plane, from the plane's place and z near it; whether found.
 
-    Once converged, Newton's method goes on for one more iteration: the Jacobian is then as exact
-    as the point.
+    Once converged, Newton's method goes on for one more iteration, unless its correction has
+    become nothing: the Jacobian is then as exact as the point.
     """
 
     def iterate(on: Solving) -> Solving:

@@ -16,7 +16,7 @@ BIFURCATIONS = ("fold", "period_doubling", "neimark_sacker")
 """Each vanishes where a multiplier is 1, where one is -1, where a pair of modulus 1 is."""
 
 ROUNDS = 12
-"""In which what is smooth is located. What is not jumps: from then on it is cut in SECTIONS."""
+"""In which what is smooth is located; what is still open then counts as a jump."""
 
 SECTIONS = 9
 ON_CIRCLE = 1e-4
@@ -79,37 +79,47 @@ def locate(
     """Zeros of functions that have opposite signs at 0 and 1, by Chandrupatla's method.
 
     `function` takes places and which brackets they are of. Inverse quadratic interpolation where it
-    can be trusted, bisection else, and many sections at once where that goes on: a jump is found as
-    surely as a smooth zero. Ends when each bracket is narrower than `width`. A place where the
-    function is not a number counts to the side of 1; `ends` are its values at 0 and 1.
+    can be trusted, bisection else, and SECTIONS at once from where a function jumps or goes
+    nowhere: a jump is found as surely as a smooth zero. Ends when each bracket is narrower than
+    `width`, or at a zero itself. A place where the function is not a number counts to the side of
+    1; `ends` are its values at 0 and 1.
     """
-    from scipy.optimize.elementwise import find_root  # only borders need it, its import is slow
-
-    # Places in widths: the tolerance is one for all.
     at_zero, at_one = ends
-    inside = (np.zeros(len(width)), 1.0 / width)
-
-    def signed(place: np.ndarray, which: np.ndarray) -> np.ndarray:
-        value = np.where(place > 0.0, at_one[which], at_zero[which])
-        inner = np.flatnonzero((place > 0.0) & (place < inside[1][which]))
-        if len(inner):
-            value[inner] = function(place[inner] * width[which[inner]], which[inner])
-        return np.where(np.isnan(value), at_one[which], value)
-
-    tolerances = {"xatol": 1.0, "xrtol": 0.0, "fatol": 0.0}
-    found = find_root(
-        signed, inside, args=(np.arange(len(width)),), tolerances=tolerances, maxiter=ROUNDS
-    )
-    best, left, right = np.array((found.x, *found.bracket))
-    open_ = np.flatnonzero(right - left > 1.0)
-    while len(open_):
-        cuts = np.linspace(left[open_], right[open_], SECTIONS + 1, axis=-1)
-        inner = cuts[:, 1:-1]
-        values = signed(inner.ravel(), np.repeat(open_, SECTIONS - 1)).reshape(inner.shape)
-        ours = np.sign(values) != np.sign(at_one[open_])[:, None]
+    # Rows: the newest place, the end of the other sign, and the place that the newest replaced.
+    x = np.outer((0.0, 1.0, 1.0), np.ones_like(width))
+    f = np.stack([at_zero, at_one, at_one])
+    jumps, rounds = np.zeros(len(width), bool), 0
+    while len(open_ := np.flatnonzero(np.abs(x[0] - x[1]) > width)):
+        some, cut = open_[~jumps[open_]], open_[jumps[open_]]
+        near = _proposed(x[:, some], f[:, some], width[some])
+        low, high = np.sort(x[:2, cut], 0)
+        cuts = np.linspace(low, high, SECTIONS + 1, axis=-1)
+        which = np.concatenate([some, np.repeat(cut, SECTIONS - 1)])
+        values = function(np.concatenate([near, cuts[:, 1:-1].ravel()]), which)
+        lost = np.isnan(values)
+        values = np.where(lost, at_one[which], values)
+        value, inner = values[: len(some)], values[len(some) :].reshape(-1, SECTIONS - 1)
+        same = np.sign(value) == np.sign(f[0, some])
+        for rows, newest in ((x, near), (f, value)):
+            first, other, _ = rows[:, some]
+            rows[:, some] = newest, np.where(same, other, first), np.where(same, first, other)
+        x[1, some[value == 0.0]] = near[value == 0.0]
+        ours = np.sign(inner) != np.sign(at_one[cut])[:, None]
         last = np.sum(np.cumprod(ours, 1), 1)  # before the first place on the side of 1
-        left[open_] = np.take_along_axis(cuts, last[:, None], 1)[:, 0]
-        right[open_] = np.take_along_axis(cuts, last[:, None] + 1, 1)[:, 0]
-        best[open_] = left[open_]
-        open_ = open_[right[open_] - left[open_] > 1.0]
-    return Located(*(place * width for place in (best, left, right)))
+        x[:2, cut] = cuts[np.arange(len(cut)), np.stack([last, last + 1])]
+        rounds += 1
+        jumps[some] = lost[: len(some)] | (value == f[2, some]) | (rounds >= ROUNDS)
+    best = np.where(jumps, np.min(x[:2], 0), np.where(np.abs(f[0]) < np.abs(f[1]), x[0], x[1]))
+    return Located(best, *np.sort(x[:2], 0))
+
+
+def _proposed(x: np.ndarray, f: np.ndarray, width: np.ndarray) -> np.ndarray:
+    """Where Chandrupatla's method goes from its three places (1997, doi 10/d9zjj8)."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        xi, phi = (x[0] - x[1]) / (x[2] - x[1]), (f[0] - f[1]) / (f[2] - f[1])
+        trusted = (1.0 - np.sqrt(1.0 - xi) < phi) & (phi < np.sqrt(xi))
+        share = f[0] / (f[0] - f[1]) * f[2] / (f[2] - f[1])
+        share -= (x[2] - x[0]) / (x[1] - x[0]) * f[0] / (f[2] - f[0]) * f[1] / (f[1] - f[2])
+    span = x[1] - x[0]
+    margin = 0.5 * width / np.abs(span)
+    return x[0] + np.clip(np.where(trusted, share, 0.5), margin, 1.0 - margin) * span
