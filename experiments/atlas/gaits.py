@@ -4,6 +4,7 @@ This library solves its map by Newton's method and differentiates it; a peer's m
 SciPy's `fsolve` and differentiated by central differences, as its users do.
 """
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -16,7 +17,7 @@ from scipy.optimize import fsolve
 import vrw_jax as vrw
 from experiments.atlas.hybrid import METHODS, Part, Walked, modes
 from experiments.atlas.told import timed
-from vrw_jax.numerics import newton_cycle, walk
+from vrw_jax.numerics import newton_cycle, volume_change, walk
 
 DIFFERENCE = 1e-5
 """Of a peer's central differences, of fourth order: those of second are off in the sixth digit
@@ -48,6 +49,7 @@ class Gait(NamedTuple):
     walked: Walked
     x: np.ndarray
     jacobian: np.ndarray
+    product: float  # of its multipliers: ours by Liouville's formula, a peer's the determinant
     duration: float
 
     @property
@@ -61,9 +63,14 @@ def by_newton(told: Return) -> Gait:
     parts = modes(told.system)
     options = vrw.Options(rtol=1e-13, atol=1e-13, max_phase_time=told.limit)
 
+    begin = lambda x: jnp.stack([jnp.asarray(v, float) for v in told.begin(x, jnp)])
+    once = functools.partial(walk, parts, events=told.events, options=options)
+
     def back(x: jax.Array) -> jax.Array:
-        y = jnp.stack([jnp.asarray(v, float) for v in told.begin(x, jnp)])
-        return jnp.stack(told.read(walk(parts, y, events=told.events, options=options).state))
+        return jnp.stack(told.read(once(begin(x)).state))
+
+    def product(x: jax.Array) -> jax.Array:
+        return volume_change(parts, begin(x), once(begin(x)), options)
 
     found, seconds = timed(
         lambda: jax.block_until_ready(
@@ -77,7 +84,8 @@ def by_newton(told: Return) -> Gait:
         says=says, admits=bool(~found.converged) or walked.admits, seconds=seconds,
         work=int(found.iterations), options=f"{walked.options}; Newton 1e-11",
     )  # fmt: skip
-    return Gait(walked, x, np.asarray(found.jacobian), _duration(walked, told))
+    jacobian, around = np.asarray(found.jacobian), float(jax.jit(product)(found.x))
+    return Gait(walked, x, jacobian, around, _duration(walked, told))
 
 
 def by_differences(method: Callable[..., Walked], told: Return) -> Gait:
@@ -103,7 +111,8 @@ def by_differences(method: Callable[..., Walked], told: Return) -> Gait:
         says=says, admits=last.admits or flag != 1, seconds=seconds, work=int(info["nfev"]),
         options=f"{last.options}; fsolve 1e-12, differences over {DIFFERENCE:g}",
     )  # fmt: skip
-    return Gait(last, x, np.stack(columns, 1), _duration(last, told))
+    jacobian = np.stack(columns, 1)
+    return Gait(last, x, jacobian, float(np.linalg.det(jacobian)), _duration(last, told))
 
 
 def _duration(walked: Walked, told: Return) -> float:

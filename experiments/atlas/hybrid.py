@@ -61,6 +61,7 @@ class Walked(NamedTuple):
     version: str
     end: np.ndarray  # the last state, past the reset
     resolution: np.ndarray = np.zeros(0)  # of each time: what the tolerances are in it, if told
+    rounding: np.ndarray = np.zeros(0)  # and one rounding of the state
 
 
 JAX = types.SimpleNamespace(sin=jnp.sin, cos=jnp.cos, exp=jnp.exp, sqrt=jnp.sqrt, stack=jnp.stack)
@@ -104,6 +105,7 @@ def ours(
         version("vrw-jax"),
         np.asarray(told.state),
         np.asarray(told.resolution[:n]),
+        np.asarray(told.rounding[:n]),
     )
 
 
@@ -295,9 +297,12 @@ def row(
     event: int = 0,
 ) -> Row:
     """What a walk says of one quantity, of the last event or another: also a bad condition."""
-    says, told = walked.says, walked.resolution[:event] if event else walked.resolution
+    of, says = slice(event or None), walked.says
+    told, rounding = walked.resolution[of], walked.rounding[of]
     if not says and len(told) and told[-1] > EXACT:
         says = f"tolerance in time: {told[-1]:.0e}"
+        if rounding[-1] > EXACT:
+            says += f", one rounding: {rounding[-1]:.1e}"
     return Row(
         quantity, walked.method, found, truth, off(found, truth, relative=relative), says,
         walked.admits, walked.work, walked.seconds, walked.options, walked.version,

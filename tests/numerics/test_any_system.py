@@ -5,6 +5,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import mpmath
 import numpy as np
 import pytest
 
@@ -15,8 +16,10 @@ from vrw_jax.numerics import (
     Mode,
     Stop,
     complementary,
+    newton_cycle,
     product_multipliers,
     segment_maps,
+    volume_change,
     walk,
 )
 
@@ -107,6 +110,70 @@ def test_the_resolution_of_a_grazed_guard_s_time_follows_the_closed_form(depth):
     assert abs(float(told.times[0, 0]) - (1.0 - rate)) <= float(told.resolution[0, 0])
 
 
+@pytest.mark.parametrize("depth", [1e-4, 1e-8])
+def test_where_one_rounding_moves_an_event_more_than_its_digits_the_walk_says_so(depth):
+    """A point of the unit circle dips below a line; 50 digits, about data a rounding off."""
+    turn = Mode(lambda y: jnp.stack([-y[1], y[0]]), (Guard(lambda y: y[1] + (1.0 - depth)),))
+    options = vrw.Options(rtol=1e-15, atol=1e-15)
+    told = walk([turn], [1.0, 0.0], events=1, options=options)
+    with mpmath.workdps(50):
+        line = 1 - mpmath.mpf(depth)
+        met = lambda radius: mpmath.mpf(3) / 2 * mpmath.pi - mpmath.acos(line / radius)
+        moved = float(abs(met(1 + mpmath.mpf(2) ** -52) - met(1)))
+        wrong = float(abs(mpmath.mpf(float(told.times[0])) - met(1)))
+    np.testing.assert_allclose(told.rounding[0], moved, rtol=1e-3)
+    assert (moved > 1e-12) == (depth == 1e-8)
+    assert wrong < max(1e-12, 2.0 * float(told.rounding[0]))
+
+
+def impacting(depth):
+    """x'' + x = -(1 - w²) c cos wt with a stop at x = 1 that keeps 0.8 of the rate, c = 1 + depth,
+    forced at twice its own frequency, and its motion with one impact each period: the rate behind
+    the stop is 2 w √(c² - 1)/(1 - r) of it (Nordmark, J. Sound Vib. 145, 1991)."""
+    c, w, r = 1.0 + depth, 2.0, 0.8
+    force = (1.0 - w * w) * c
+    field = lambda y: jnp.stack([y[1], -force * jnp.cos(w * y[2]) - y[0], 1.0 + 0.0 * y[0]])
+    stop = Guard(lambda y: 1.0 - y[0], lambda y: jnp.stack([1.0 + 0.0 * y[0], -r * y[1], y[2]]))
+    sine = np.sqrt(depth * (2.0 + depth))
+    rate = -r * 2.0 * w * sine / (1.0 - r)
+    return [Mode(field, (stop,))], jnp.array([1.0, rate, (np.pi - np.arctan(sine)) / w]), r
+
+
+@pytest.mark.parametrize("depth", [1e-2, 1e-6])
+def test_at_a_graze_the_product_of_multipliers_keeps_its_digits(depth):
+    modes, start, kept = impacting(depth)
+
+    def back(x):
+        return walk(modes, jnp.stack([1.0 + 0.0 * x[0], *x]), events=1, options=TIGHT).state[1:]
+
+    found = newton_cycle(lambda x: back(x) - jnp.array([0.0, np.pi]), start[1:], tolerance=1e-11)
+    assert found.converged
+    start = jnp.stack([1.0, *found.x])
+    told = walk(modes, start, events=1, options=TIGHT)
+    # Area shrinks by the restitution twice: of the rate, and of the time at which it passes.
+    assert abs(float(volume_change(modes, start, told, TIGHT)) - kept**2) < 1e-15
+    lost = abs(float(jnp.linalg.det(found.jacobian)) - kept**2)
+    assert (lost > 1e-12) == (depth == 1e-6)
+
+
+def test_volumes_shrink_by_friction_and_by_every_bounce():
+    """x' = v, v' = -g - v: exp(-t) in all, and r² at each bounce."""
+    drag = lambda y: jnp.stack([y[1], -G - y[1]])
+    floor = Guard(lambda y: y[0], lambda y: jnp.stack([0.0 * y[0], -0.5 * y[1]]))
+    start = jnp.array([1.0, 0.0])
+    told = walk([Mode(drag, (floor,))], start, events=5, options=TIGHT)
+    found = jax.jit(lambda y: volume_change([Mode(drag, (floor,))], y, told, TIGHT))(start)
+
+    def moved(y):
+        """With the time held: states past the fifth event flow for a moment more."""
+        own = walk([Mode(drag, (floor,))], y, events=5, options=TIGHT)
+        late = told.time - own.time
+        return own.state + late * drag(own.state)
+
+    # The saltation matrix of each event, by differentiating through its time.
+    np.testing.assert_allclose(found, jnp.linalg.det(jax.jacfwd(moved)(start)), rtol=1e-9)
+
+
 @pytest.mark.parametrize(("bend", "time"), [(1.0, 3.0), (-1.0, 0.0)])
 def test_a_guard_at_rest_on_zero_fires_only_if_it_does_not_rise(bend, time):
     """h = bend t²/2 − t³/6, from h = h' = 0."""
@@ -172,6 +239,21 @@ def test_multipliers_of_a_product_keep_every_digit_or_say_that_they_do_not():
     np.testing.assert_array_equal(whole.known, [True, False])
     assert abs(whole.values[0] - 1.0) < 1e-12
     assert np.isnan(whole.values[1])
+
+
+@pytest.mark.parametrize("n_segments", [1, 2, 7, 10, 100])
+def test_a_narrow_contraction_keeps_its_digits_in_one_segment(n_segments):
+    """r' = g(t) (r² - 1)/(2 r) about r = 1: exp of the mean of g, 1 - 2 times Poisson's kernel."""
+    q = 0.97
+
+    def poisson(t):
+        half = jnp.sin(0.5 * (t - np.pi))
+        return 1.0 - 2.0 * (1.0 - q) * (1.0 + q) / ((1.0 - q) ** 2 + 4.0 * q * half * half)
+
+    field = lambda y: jnp.stack([0.5 * poisson(y[1]) * (y[0] ** 2 - 1.0) / y[0], 1.0 + 0.0 * y[1]])
+    cut = segment_maps(field, [1.0, 0.0], 2.0 * np.pi, n_segments, TIGHT, directions=1)
+    told = product_multipliers(cut.maps)
+    np.testing.assert_allclose(told.values[0].real, np.exp(-2.0 * np.pi), rtol=1e-12)
 
 
 @pytest.mark.parametrize("size", [1, 2, 4, 6])

@@ -1,7 +1,7 @@
 """Numerical methods that know no wheel: flows with events, collocation, Newton, continuation.
 
 For any field, guards and resets: `walk`, `newton_cycle`, `segment_maps` with `product_multipliers`,
-`arclength`, `complementary`; docs/any_system.md tells them by examples.
+`volume_change`, `arclength`, `complementary`; docs/any_system.md tells them by examples.
 """
 
 from vrw_jax.numerics import arclength, floquet
@@ -86,6 +86,7 @@ from vrw_jax.numerics.newton import SectionCycle, moved_cycle, newton_cycle
 from vrw_jax.numerics.on_plane import solve
 from vrw_jax.numerics.options import Engine, Options, SolverName
 from vrw_jax.numerics.roots import BIFURCATIONS, bifurcation_functions, brackets, locate, turns
+from vrw_jax.numerics.saltation import volume_change
 from vrw_jax.numerics.segments import product_multipliers, segment_maps
 from vrw_jax.numerics.side_by_side import follow_many, solve_many
 from vrw_jax.numerics.tableaus import (

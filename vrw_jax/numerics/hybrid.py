@@ -59,6 +59,7 @@ class Walk(NamedTuple):
 
     times: Float[Array, " events"]
     resolution: Float[Array, " events"]  # of each time: the state's tolerances in it
+    rounding: Float[Array, " events"]  # and one rounding of the state, which no tolerance betters
     before: Float[Array, "events dim"]  # states on the guard
     after: Float[Array, "events dim"]  # and past the reset
     modes: Int[Array, " events"]  # that ended
@@ -155,13 +156,17 @@ def _entered(mode: Mode, state: Array, time: Array, options: Options) -> tuple[P
     return integrate_phase(mode.field, watched, state, ~past, options), past
 
 
-def _resolution(mode: Mode, end: PhaseEnd, options: Options) -> Array:
-    """What the tolerances of the state are in the event's time: large where a guard is grazed."""
+def _in_time(mode: Mode, end: PhaseEnd, options: Options) -> tuple[Array, Array]:
+    """What the tolerances of the state, and its rounding, are in the event's time: much where a
+    guard is grazed."""
     state = lax.stop_gradient(end.state)
     values = lambda y: jnp.stack([guard.value(y) for guard in mode.guards])
     across = jax.jacfwd(values)(state)[jnp.maximum(end.guard, 0)]
+    rounding = jnp.finfo(state.dtype).eps * jnp.abs(state)
     tolerance = options.atol + options.rtol * jnp.abs(state)
-    return lax.stop_gradient(jnp.abs(across) @ tolerance / jnp.abs(across @ mode.field(state)))
+    rate = jnp.abs(across @ mode.field(state))
+    told = [jnp.abs(across) @ error / rate for error in (tolerance, rounding)]
+    return lax.stop_gradient((told[0], told[1]))
 
 
 def _left(mode: Mode, guard: Array, state: Array, own: int) -> tuple[Array, Array]:
@@ -177,7 +182,7 @@ def _walk(modes: tuple[Mode, ...], events: int, options: Options, start: Array, 
     def visit(own: int) -> Callable:
         def visited(state: Array, time: Array) -> tuple:
             end, past = _entered(modes[own], state, time, options)
-            seen = _resolution(modes[own], end, options)
+            seen = _in_time(modes[own], end, options)
             return end, past, seen, *_left(modes[own], end.guard, end.state, own)
 
         return visited
@@ -203,7 +208,8 @@ def _walk(modes: tuple[Mode, ...], events: int, options: Options, start: Array, 
         return (
             Walk(
                 times=put(walked.times, time),
-                resolution=put(walked.resolution, seen),
+                resolution=put(walked.resolution, seen[0]),
+                rounding=put(walked.rounding, seen[1]),
                 before=put(walked.before, end.state),
                 after=put(walked.after, after),
                 modes=put(walked.modes, walked.mode),
@@ -221,8 +227,9 @@ def _walk(modes: tuple[Mode, ...], events: int, options: Options, start: Array, 
     none, zero = jnp.zeros((), jnp.int32), 0.0 * start[0]
     rows, places = jnp.zeros((events, start.size)) + zero, jnp.zeros((events,), jnp.int32)
     none_yet = jnp.zeros(events) + zero
+    still = lax.stop_gradient(none_yet)
     first = Walk(
-        times=none_yet, resolution=lax.stop_gradient(none_yet), before=rows, after=rows,
+        times=none_yet, resolution=still, rounding=still, before=rows, after=rows,
         modes=places, guards=places, n_events=none, time=zero, state=start, mode=none + mode,
         solver_steps=none, stop=none + _GOING,
     )  # fmt: skip

@@ -38,7 +38,9 @@ def segment_maps(
 ) -> Segments:
     """The flow of `field` with its derivative by the first `directions` coordinates (all).
 
-    Derivatives take part in the control of steps. A segment whose steps are spent is not a number.
+    Derivatives take part in the control of steps. Each column is a direction of about constant
+    length and the logarithm of its growth, so that what decays keeps its digits. A segment whose
+    steps are spent is not a number.
     A clock among the coordinates is no direction: it stands behind those that are.
     """
     start = jnp.asarray(start, float)
@@ -61,15 +63,18 @@ def segment_maps(
         y, columns = z[:dim], z[dim:size].reshape(n, dim)
         push = lambda tangent: jax.jvp(field, (y,), (tangent,))[1]
         moved = jax.vmap(push)(columns)
+        growth = jnp.sum(columns * moved, axis=1) / jnp.sum(columns * columns, axis=1)
+        turned = moved - growth[:, None] * columns
         own = jax.vmap(push)(jnp.eye(n, dim, dtype=z.dtype))
         clock = jnp.ones_like(y[:1])
-        return jnp.concatenate([field(y), moved.ravel(), jnp.trace(own)[None], clock])
+        return jnp.concatenate([field(y), turned.ravel(), growth, jnp.trace(own)[None], clock])
 
     def passed(state: Array, _: None) -> tuple[Array, tuple]:
-        begin = jnp.concatenate([state, jnp.eye(n, dim).ravel(), jnp.zeros(2)])
+        begin = jnp.concatenate([state, jnp.eye(n, dim).ravel(), jnp.zeros(n + 2)])
         end = sample_phase(along, begin, length, 2, options)[-1]
         reached = jnp.abs(end[-1] - length) <= 1e-9 * length  # else the steps were spent
-        one = jnp.where(reached, end[dim:size].reshape(n, dim)[:, :n].T, jnp.nan)
+        columns, grown = end[dim:size].reshape(n, dim), jnp.exp(end[size : size + n])
+        one = jnp.where(reached, columns[:, :n].T * grown, jnp.nan)
         return end[:dim], (end[:dim], one, end[-2])
 
     _, (states, maps, divergences) = lax.scan(passed, start, None, length=n_segments)

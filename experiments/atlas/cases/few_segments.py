@@ -33,7 +33,9 @@ STEEP = 2.0 * (1.0 + Q) / (1.0 - Q) - 1.0
 
 def growth(theta, m):
     """Rate at which a disturbance of the radius grows."""
-    return 1.0 - 2.0 * (1.0 - Q * Q) / (1.0 - 2.0 * Q * m.cos(theta - math.pi) + Q * Q)
+    # 1 - 2 q cos + q^2 would cancel at the peak, and cost 8e-13 of the multiplier.
+    half = m.sin(0.5 * (theta - math.pi))
+    return 1.0 - 2.0 * (1.0 - Q) * (1.0 + Q) / ((1.0 - Q) * (1.0 - Q) + 4.0 * Q * half * half)
 
 
 def field(y, m):

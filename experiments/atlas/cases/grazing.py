@@ -124,8 +124,7 @@ def rows() -> Iterator[Row]:
     _, rate = repeating(W, DEPTH)
     for gait in gaits(of_impact(W, DEPTH)):
         yield row(gait.walked, "rate after impact", float(gait.x[1]), rate)
-        product = float(np.linalg.det(gait.jacobian))
-        yield row(gait.walked, "product of multipliers", product, KEPT**2)
+        yield row(gait.walked, "product of multipliers", gait.product, KEPT**2)
     graze = of_impact(W, 1e-9)._replace(guess=(math.pi / W, -1e-4))
     truth = repeating(W, 1e-9)[1]
     for gait in (by_newton(graze), by_differences(METHODS[3], graze)):

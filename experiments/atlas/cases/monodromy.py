@@ -113,7 +113,7 @@ def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
     axes = figure.subplots()
     counts = (4, 8, 16, 30, 60, 120, 250, 500)
     told = [by_segments(n) for n in counts]
-    gap = [abs(t.logarithms[1] + 48.0 * math.pi) for t, _ in told]
+    gap = [max(abs(t.logarithms[1] + 48.0 * math.pi), 1e-16) for t, _ in told]
     axes.loglog(counts, gap, "o-", label="triangular factors")
     axes.loglog(
         counts, [t.uncertainty[1] for t, _ in told], "o--", mfc="w", label="its own estimate"

@@ -40,9 +40,8 @@ def rows() -> Iterator[Row]:
             name = f"rate after impact, depth {depth:g}"
             steep = abs(rate(depth)) / (2.0 * depth)  # of the rate over the depth
             yield row(gait.walked, name, float(gait.x[1]), rate(depth), condition=steep)
-            product = float(np.linalg.det(gait.jacobian))
             name = f"product of multipliers, {depth:g}"
-            yield row(gait.walked, name, product, KEPT**2, condition=steep)
+            yield row(gait.walked, name, gait.product, KEPT**2, condition=steep)
 
 
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
