@@ -1,11 +1,11 @@
 """What repeats: steps, walks, trajectories, and what they settle on."""
 
 from vrw_jax.walks.basins import BEFORE, basin
-from vrw_jax.walks.choice import choose_model
 from vrw_jax.walks.stepping import (
     ModelLike,
     Walk,
     checked,
+    choose_model,
     one_wheel,
     options_of,
     paper_start,

@@ -22,6 +22,7 @@ from vrw_jax.models import (
     GroundOfStep,
     LadderStep,
     LadderWheel,
+    ModelChoice,
     SectionState,
     StepResult,
     UnilateralStep,
@@ -263,9 +264,7 @@ class Walk(AbstractTold):
     def rows(self) -> list[Row]:
         outcome = np.asarray(self.outcome)
         if outcome.ndim:
-            return [
-                ("walks", f"{outcome.size} in shape {outcome.shape}: {counted(outcome, Outcome)}")
-            ]
+            return [("walks", counted(outcome, Outcome))]
         last = max(int(self.n_stepped) - 1, 0)
         return [
             ("outcome", Outcome(int(outcome)).meaning),
@@ -358,3 +357,37 @@ N_TOWARDS = 100
 def walk_towards(model: AbstractWheel, params: WheelParams, options: Options) -> Walk:
     """Towards a gait that attracts, from the rung's own start."""
     return walk(params, model.start(params), N_TOWARDS, model=model, options=options)
+
+
+def choose_model(
+    params: WheelParams,
+    start: SectionLike,
+    *,
+    friction: float | Array = 0.7,
+    options: Options | None = None,
+) -> ModelChoice:
+    """The lowest rung whose premises hold over one step from `start`, on ground of `friction`.
+
+    `start` is the paper's section state (theta-, dtheta-, dL1-) or the full one of the unilateral
+    rung. Maps over lanes by `jax.vmap`.
+
+    Args:
+        params: the wheel.
+        start: section state, shape (3,), or the ground's own.
+        friction: coefficient of the ground.
+        options: numerical choices of the steps.
+
+    Returns:
+        A `ModelChoice`: `rung`, `why`, and the `model` to go on with.
+
+    Raises:
+        TypeError, ValueError: an argument that can't be meant, in one sentence.
+
+    Examples:
+        >>> choice = vrw.choose_model(vrw.WheelParams(), vrw.paper_start(), friction=0.7)
+        >>> type(choice.model).__name__
+        'UnilateralWheel'
+    """
+    model = LadderWheel(friction=friction)
+    params, x, _, options = checked(params, start, model, options)
+    return model.choose(params, x, options)[0]

@@ -6,18 +6,32 @@ Angles and leg labels are those of the present step, so theta and the lengths ju
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from vrw_jax.models import SERVED, AbstractWheel, SectionState, Trajectory
+from vrw_jax.models import (
+    SERVED,
+    AbstractWheel,
+    SectionState,
+    State,
+    Trajectory,
+    UnilateralTrajectory,
+    directions,
+    foot_heights,
+    foot_places,
+    kinetic_energy,
+    potential_energy,
+    unpack,
+)
 from vrw_jax.numerics import Engine, Options
-from vrw_jax.results import TRAJECTORY, provenance, variables
+from vrw_jax.results import CONTACTS, TRAJECTORY, provenance, variables
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.walks.ground_trajectory import over_contacts
-from vrw_jax.walks.samples import Stretches, Telling, joined
 from vrw_jax.walks.stepping import ModelLike, SectionLike, checked, one_wheel, rung_of
 from vrw_jax.wheel import (
     Motion,
@@ -28,48 +42,6 @@ from vrw_jax.wheel import (
     rear_direction,
 )
 from vrw_jax.wording import untraced, whole
-
-
-@eqx.filter_jit
-def _columns(
-    model: AbstractWheel, params: WheelParams, x: SectionState, options: Options, n_samples: int
-) -> tuple[Trajectory, dict[str, Array]]:
-    """One step, also by the names of `TRAJECTORY`, (phase, sample), Leg 1's foot at the origin.
-
-    `ahead` is added: where the landing leg stands or will stand, m.
-    """
-    s, moved = params.symbols(), model.trace(params, x, options, n_samples)
-    theta, L1, L2, dtheta, dL1, dL2 = jnp.moveaxis(moved.state, -1, 0)
-    kinetic, gravitational, elastic = jnp.moveaxis(moved.energy, -1, 0)
-    motion = Motion.of(theta, L1, L2, dtheta, dL1, dL2)
-    rear = rear_direction(s, motion.sin, motion.cos)
-    hub_x, hub_z, zero = L1 * motion.sin, L1 * motion.cos, jnp.zeros_like(L1)
-    return moved, {
-        "time": moved.time,
-        "x": zero,
-        "z": zero,
-        "theta": theta,
-        "L1": L1,
-        "L2": L2,
-        "dx": zero,
-        "dz": zero,
-        "dtheta": dtheta,
-        "dL1": dL1,
-        "dL2": dL2,
-        **{f"lambda_{i + 1}": moved.forces[..., i] for i in range(4)},
-        "kinetic_energy": kinetic,
-        "gravitational_energy": gravitational,
-        "elastic_energy": elastic,
-        "total_energy": kinetic + gravitational + elastic,
-        "damping_power": damping_power(s, motion),
-        "foot_1_x": zero,
-        "foot_1_z": zero,
-        "foot_2_x": hub_x - L2 * rear.sin,
-        "foot_2_z": hub_z - L2 * rear.cos,
-        "hub_x": hub_x,
-        "hub_z": hub_z,
-        "ahead": hub_x - s.L0 * landing_direction(s, motion.sin, motion.cos).sin,
-    }
 
 
 def simulate(
@@ -137,6 +109,111 @@ def simulate(
     return walked.set_coords([name for name in ("step", "phase") if name in data])
 
 
+class Stretches(NamedTuple):
+    """One step, sampled between its events."""
+
+    columns: dict[str, np.ndarray]  # (stretch, sample, ...), time in s from the landing
+    durations: np.ndarray  # of each stretch, s; 0: it did not happen
+    outcome: Outcome
+    following: Array  # section state after it
+    period: float  # s
+    length: float  # from this step's landing to the next, m
+
+
+class Telling(NamedTuple):
+    """How a rung's steps are sampled, and what of them is told."""
+
+    stretches_of: Callable[[Array], Stretches]  # of the step from a section state
+    names: tuple[str, ...]  # measures that are told over time
+    along: tuple[str, ...]  # of these, places along the slope
+    labels: dict[str, Any]  # coordinates beside those among the names
+    attrs: dict[str, object]
+
+
+class Joined(NamedTuple):
+    """A walk, sampled."""
+
+    columns: dict[str, np.ndarray]  # (time, ...), with `step`; empty where nothing happened
+    n_stepped: int
+    outcome: Outcome
+
+
+FALLING = ("gravitational_energy", "total_energy")
+"""Energies that count from the walk's first foot."""
+
+
+def joined(telling: Telling, x: Array, n_steps: int, weight_along: float) -> Joined:
+    """Steps from the section state x, as many as it can.
+
+    Places along the slope, m, count from the first landing; energies that are `FALLING`, J, lose
+    `weight_along`, N, times the way.
+    """
+    parts: list[dict[str, np.ndarray]] = []
+    outcome, stepped, time, place = Outcome.STEPPED, 0, 0.0, 0.0
+    while outcome == Outcome.STEPPED and stepped < n_steps:
+        told = telling.stretches_of(x)
+        for stretch in np.flatnonzero(told.durations > 0.0):
+            part = {name: values[stretch].copy() for name, values in told.columns.items()}
+            for name in telling.along:
+                part[name] += place
+            for name in part.keys() & FALLING:
+                part[name] -= weight_along * place
+            part["time"] += time
+            part["step"] = np.full(len(part["time"]), stepped)
+            parts.append(part)
+        outcome = told.outcome
+        if outcome == Outcome.STEPPED:
+            stepped, time, place = stepped + 1, time + told.period, place + told.length
+            x = told.following
+    none = {name: values[:0].reshape(0, *values.shape[2:]) for name, values in told.columns.items()}
+    columns = {
+        name: np.concatenate([part[name] for part in parts]) for name in (parts[0] if parts else ())
+    }
+    return Joined(columns or none | {"step": np.zeros(0)}, stepped, outcome)
+
+
+@eqx.filter_jit
+def _columns(
+    model: AbstractWheel, params: WheelParams, x: SectionState, options: Options, n_samples: int
+) -> tuple[Trajectory, dict[str, Array]]:
+    """One step, also by the names of `TRAJECTORY`, (phase, sample), Leg 1's foot at the origin.
+
+    `ahead` is added: where the landing leg stands or will stand, m.
+    """
+    s, moved = params.symbols(), model.trace(params, x, options, n_samples)
+    theta, L1, L2, dtheta, dL1, dL2 = jnp.moveaxis(moved.state, -1, 0)
+    kinetic, gravitational, elastic = jnp.moveaxis(moved.energy, -1, 0)
+    motion = Motion.of(theta, L1, L2, dtheta, dL1, dL2)
+    rear = rear_direction(s, motion.sin, motion.cos)
+    hub_x, hub_z, zero = L1 * motion.sin, L1 * motion.cos, jnp.zeros_like(L1)
+    return moved, {
+        "time": moved.time,
+        "x": zero,
+        "z": zero,
+        "theta": theta,
+        "L1": L1,
+        "L2": L2,
+        "dx": zero,
+        "dz": zero,
+        "dtheta": dtheta,
+        "dL1": dL1,
+        "dL2": dL2,
+        **{f"lambda_{i + 1}": moved.forces[..., i] for i in range(4)},
+        "kinetic_energy": kinetic,
+        "gravitational_energy": gravitational,
+        "elastic_energy": elastic,
+        "total_energy": kinetic + gravitational + elastic,
+        "damping_power": damping_power(s, motion),
+        "foot_1_x": zero,
+        "foot_1_z": zero,
+        "foot_2_x": hub_x - L2 * rear.sin,
+        "foot_2_z": hub_z - L2 * rear.cos,
+        "hub_x": hub_x,
+        "hub_z": hub_z,
+        "ahead": hub_x - s.L0 * landing_direction(s, motion.sin, motion.cos).sin,
+    }
+
+
 def over_phases(
     params: WheelParams, model: AbstractWheel, options: Options, n_samples: int
 ) -> Telling:
@@ -167,3 +244,70 @@ def over_phases(
 
 ALONG = ("x", "foot_1_x", "foot_2_x", "hub_x")
 """Columns that are places along the slope."""
+
+
+OF_WALK = ("time", "step", "hub_x", "hub_z", "theta", "dtheta")
+ENERGIES = ("kinetic_energy", "gravitational_energy", "elastic_energy")
+
+
+@eqx.filter_jit
+def _contact_columns(
+    model: Any, params: WheelParams, x: Array, options: Options, n_samples: int
+) -> tuple[UnilateralTrajectory, dict[str, Array]]:
+    """One step's trace and its quantities, shape (phase, sample) or (phase, sample, leg)."""
+    s, trace = params.symbols(), model.trace(params, x, options, n_samples)
+
+    def describe(y: State) -> dict[str, Array]:
+        motion, _ = unpack(y)
+        legs = directions(s, motion.theta)
+        gravitational, elastic = potential_energy(s, motion)
+        return {
+            "hub_x": motion.x,
+            "hub_z": motion.z,
+            "theta": motion.theta,
+            "dtheta": motion.dtheta,
+            "kinetic_energy": kinetic_energy(s, motion),
+            "gravitational_energy": gravitational,
+            "elastic_energy": elastic,
+            "length": motion.L,
+            "length_rate": motion.dL,
+            "foot_x": foot_places(motion, legs),
+            "foot_z": foot_heights(motion, legs),
+        }
+
+    told = jax.vmap(jax.vmap(describe))(trace.state)
+    return trace, told | {"tangential": trace.tangential, "normal": trace.normal}
+
+
+def over_contacts(params: WheelParams, model: Any, options: Options, n_samples: int) -> Telling:
+    """Of rungs that walk on contacts, over time and leg; legs bear the labels of their step.
+
+    Each stretch between two events has `n_samples` times, both ends included. Of the ladder,
+    `rung` and `reason` say for each time which rung served and why (see `ModelChoice`).
+    """
+
+    def stretches(x: Array) -> Stretches:
+        trace, columns = jax.tree.map(
+            np.array, _contact_columns(model, params, x, options, n_samples)
+        )
+        shape = (len(trace.duration), n_samples)
+        over_samples = lambda legs: np.repeat(legs[:, None], n_samples, axis=1)
+        columns |= {"time": trace.time, "contact": over_samples(trace.contact)}
+        columns |= {name: np.full(shape, int(value)) for name, value in trace.served.items()}
+        columns["on_stopper"] = over_samples(trace.locked)
+        return Stretches(
+            columns,
+            trace.duration,
+            Outcome(int(trace.outcome)),
+            jnp.asarray(trace.section_state),
+            float(trace.duration.sum()),
+            float(trace.step_length),
+        )
+
+    attrs: dict[str, object] = {
+        "frame": "x downhill along the slope, z normal to it, first landing at the origin",
+        "friction": float(model.friction),
+    }
+    names = (*OF_WALK, *ENERGIES, *CONTACTS)
+    legs = {"leg": np.arange(1, params.n_legs + 1)}
+    return Telling(stretches, names, ("hub_x", "foot_x"), legs, attrs)

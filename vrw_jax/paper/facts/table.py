@@ -8,11 +8,9 @@ from dataclasses import asdict
 from pathlib import Path
 
 from vrw_jax.paper.facts.base import Evidence, Fact
-from vrw_jax.paper.facts.gait import THREE_DAMPINGS, TYPICAL_GAIT
-from vrw_jax.paper.facts.indicators import INDICATORS
+from vrw_jax.paper.facts.claims import INDICATORS, PREMISES, THREE_DAMPINGS, TYPICAL_GAIT
 from vrw_jax.paper.facts.misprints import MISPRINTS
-from vrw_jax.paper.facts.premises import PREMISES
-from vrw_jax.results import as_markdown
+from vrw_jax.wording import as_markdown
 
 INTRODUCTION = (
     "“independent code” is a solver in the paper's own five constrained coordinates: where the "
