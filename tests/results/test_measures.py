@@ -3,7 +3,8 @@
 import pytest
 
 from vrw_jax.models.ladder import PREMISES, told_why
-from vrw_jax.results import MARGINS, STEP, as_html, as_markdown, as_tex, as_text, what_breaks
+from vrw_jax.results import MARGINS, STEP, what_breaks
+from vrw_jax.wording import as_html, as_markdown, as_tex, as_text
 
 INDICATORS = ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
 

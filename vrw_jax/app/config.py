@@ -5,10 +5,10 @@ Whatever is wrong with a file is said in one sentence: what was given, what is a
 
 import math
 import tomllib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -20,10 +20,10 @@ from vrw_jax.models import (
     ViscoelasticWheel,
 )
 from vrw_jax.numerics import Options, solver_named
-from vrw_jax.results import nearest
 from vrw_jax.scans import LONGEST, OFFERS, TO_TOLERANCE, check_measures
 from vrw_jax.scans import design as designs
 from vrw_jax.wheel import DOMAINS, FRICTION, PARAMETER_NAMES, WheelParams
+from vrw_jax.wording import nearest, range_of, require_known
 
 DRAWN = {"sobol": designs.sobol, "uniform": designs.uniform, "saltelli": designs.saltelli}
 DESIGNS = ("grid", "samples", *DRAWN)
@@ -37,9 +37,6 @@ RUNGS: dict[str, type[AbstractWheel]] = {
 """Rungs as a config names them."""
 _OPTION_KEYS = tuple(Options.__dataclass_fields__)
 _AXIS_KEYS = ("from", "to", "count")
-
-
-T = TypeVar("T")
 
 
 class ConfigError(ValueError):
@@ -125,15 +122,17 @@ class Config:
 
     def params(self, changed: Mapping[str, float | int] | None = None) -> WheelParams:
         """The wheel: Table 1 with the config's values, then with those `changed`."""
-        return _sentence(WheelParams, **{**self.wheel, **(changed or {})})
+        values: dict[str, Any] = {**self.wheel, **(changed or {})}
+        return WheelParams(**values)
 
     def wheel_model(self) -> AbstractWheel:
         """The rung with the config's settings."""
-        return _sentence(RUNGS[self.rung], **self.model)
+        return RUNGS[self.rung](**self.model)
 
     def numerical_options(self) -> Options:
         """The defaults with the config's values."""
-        return _sentence(Options, **self.options)
+        options: dict[str, Any] = {**self.options}
+        return Options(**options)
 
 
 def load(path: str | Path) -> Config:
@@ -209,8 +208,8 @@ def _config(tables: Mapping[str, object], text: str, name: str) -> Config:
     config.params()
     config.wheel_model()
     options = config.numerical_options()
-    _sentence(options.require_reachable, np.dtype(float))
-    _sentence(solver_named, options.solver, options)
+    options.require_reachable(np.dtype(float))
+    solver_named(options.solver, options)
     return config
 
 
@@ -246,12 +245,8 @@ def _wheel(table: Mapping[str, object]) -> dict[str, float | int]:
 def _model(table: Mapping[str, object]) -> tuple[str, dict[str, float | int | str | bool]]:
     """The rung, and its settings."""
     rung = table.get("rung", Config.rung)
-    if not isinstance(rung, str) or rung not in RUNGS:
-        near = nearest(rung, RUNGS) if isinstance(rung, str) else ""
-        raise ConfigError(
-            f"rung is {_shown(rung)}{near}, but it must be one of {', '.join(RUNGS)}: "
-            'write rung = "unilateral", say.'
-        )
+    require_known(rung, tuple(RUNGS), "rung")
+    assert isinstance(rung, str)
     settings = RUNGS[rung].__dataclass_fields__
     _only(table, ("rung", *settings), f"[model] of the rung {rung}", "settings")
     given = {name: value for name, value in table.items() if name != "rung"}
@@ -352,19 +347,11 @@ def _tune(table: Mapping[str, object]) -> TuneConfig:
 def _branch(table: Mapping[str, object], names: tuple[str, ...]) -> BranchConfig:
     _only(table, BranchConfig.__dataclass_fields__, "[branch]", "settings")
     parameter = table.get("parameter")
-    if not isinstance(parameter, str) or parameter not in names:
-        near = nearest(parameter, names) if isinstance(parameter, str) else ""
-        raise ConfigError(
-            f"parameter is {_shown(parameter)}{near}, but a branch of this rung runs along one of "
-            f'{", ".join(names)}: write parameter = "damping".'
-        )
+    require_known(parameter, names, "parameter that a branch of this rung runs along")
+    assert isinstance(parameter, str)
     if "bounds" not in table:
         raise ConfigError("[branch] has no bounds: write bounds = [4.0, 230.0], say.")
-    lower, upper = _range("bounds of " + parameter, table["bounds"], parameter)
-    if not lower < upper:
-        raise ConfigError(
-            f"bounds are [{lower:g}, {upper:g}], but the lower must come first: swap them."
-        )
+    bounds = range_of("bounds", _range("bounds of " + parameter, table["bounds"], parameter))
     step = table.get("largest_step")
     if step is not None and _number(step, "largest_step", positive=True) > 1.0:
         raise ConfigError(
@@ -372,7 +359,7 @@ def _branch(table: Mapping[str, object], names: tuple[str, ...]) -> BranchConfig
         )
     return BranchConfig(
         parameter=parameter,
-        bounds=(lower, upper),
+        bounds=bounds,
         period=_whole(table.get("period", BranchConfig.period), "period", 1),
         largest_step=None if step is None else _number(step, "largest_step", positive=True),
     )
@@ -389,11 +376,6 @@ def _design(
         )
     _only(table, (*own, *names), f"[{kind}]", "settings")
     swept = {name: value for name, value in table.items() if name not in own}
-    if not swept:
-        raise ConfigError(
-            f"[{kind}] sweeps no parameter, but a scan needs at least one: "
-            f"choose from {', '.join(names)}."
-        )
     if own:
         if "n" not in table:
             raise ConfigError(f"[{kind}] says not how many samples: write n = 4096, say.")
@@ -428,8 +410,6 @@ def _axis(name: str, value: object) -> np.ndarray:
 def _list(name: str, value: object, otherwise: str = "") -> np.ndarray:
     if not isinstance(value, list):
         raise _wrong(name, value, f"a list of numbers{otherwise}")
-    if not value:
-        raise ConfigError(f"{name} is an empty list, but a scan needs at least one value: add one.")
     return np.asarray([_in_domain(name, item) for item in value])
 
 
@@ -487,11 +467,3 @@ def _shown(value: object) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     return repr(value).replace("'", '"') if isinstance(value, str) else repr(value)
-
-
-def _sentence(make: Callable[..., T], *arguments: object, **values: object) -> T:
-    """`make(**values)`, whose own complaints are sentences already."""
-    try:
-        return make(*arguments, **values)
-    except ValueError as error:
-        raise ConfigError(str(error)) from error

@@ -12,10 +12,11 @@ import xarray as xr
 from vrw_jax import figures
 from vrw_jax.app.config import Config
 from vrw_jax.branches import Branch, Change, border_map
-from vrw_jax.results import MEASURES, as_markdown, measure_of, what_breaks
+from vrw_jax.results import MEASURES, measure_of, what_breaks
 from vrw_jax.scans import OF_CYCLE, design
 from vrw_jax.tuning import Tuned
 from vrw_jax.wheel import DOMAINS, PARAMETER_NAMES, Outcome
+from vrw_jax.wording import as_markdown
 
 
 def write_scan(scan: xr.Dataset, folder: Path) -> list[Path]:

@@ -10,9 +10,8 @@ from vrw_jax.branches.branch import BorderCurve
 from vrw_jax.branches.tracing import OF_CURVES, Seed, Tracer
 from vrw_jax.cycles import LimitCycle
 from vrw_jax.numerics import ArclengthOptions, Options
-from vrw_jax.results import require_known
 from vrw_jax.wheel import DOMAINS, wheel_of
-from vrw_jax.wording import instance, names_of, range_of
+from vrw_jax.wording import instance, names_of, range_of, require_known
 
 Box = Mapping[str, tuple[float, float]]
 

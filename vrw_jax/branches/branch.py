@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.numerics import floquet
-from vrw_jax.results import MEASURES, as_html
+from vrw_jax.results import MEASURES
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.wheel import Outcome
+from vrw_jax.wording import as_html
 
 MOST_SHOWN = 20
 """Borders that a branch prints of itself."""

@@ -47,7 +47,6 @@ from vrw_jax.results import (
     attrs_of,
     locked_legs,
     provenance,
-    require_known,
     variables,
 )
 from vrw_jax.runtime import xarray as xr
@@ -59,6 +58,7 @@ from vrw_jax.wording import (
     range_of,
     real,
     reals,
+    require_known,
     untraced,
     whole,
 )

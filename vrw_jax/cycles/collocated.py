@@ -31,7 +31,6 @@ from vrw_jax.numerics import (
     mesh_error,
     transfer_matrix,
 )
-from vrw_jax.results import Row, listed
 from vrw_jax.walks import step
 from vrw_jax.wheel import (
     Motion,
@@ -43,6 +42,7 @@ from vrw_jax.wheel import (
     transitions,
     wheel_of,
 )
+from vrw_jax.wording import Row, listed
 
 
 class LimitCycle(AbstractCycle):

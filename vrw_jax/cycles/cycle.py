@@ -12,9 +12,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from vrw_jax.numerics import floquet
-from vrw_jax.results import Row, listed
 from vrw_jax.wheel import Outcome, WheelParams
-from vrw_jax.wording import AbstractTold, chosen, counted
+from vrw_jax.wording import AbstractTold, Row, chosen, counted, listed
 
 
 class AbstractCycle(AbstractTold):
@@ -137,9 +136,7 @@ class AbstractCycle(AbstractTold):
         """What the cycle says of itself; of many, how many were found."""
         outcome = np.asarray(self.outcome)
         if outcome.ndim:
-            return [
-                ("wheels", f"{outcome.size} in shape {outcome.shape}: {counted(outcome, Outcome)}")
-            ]
+            return [("wheels", counted(outcome, Outcome))]
         if outcome != Outcome.STEPPED:
             return [("outcome", f"{Outcome(int(outcome)).name}: {self.why}")]
         radius, told = multipliers_told(np.asarray(self.matrix))

@@ -18,10 +18,9 @@ from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.search import Located
 from vrw_jax.cycles.section_cycle import WalkedCycle
 from vrw_jax.numerics import Options
-from vrw_jax.results import listed
 from vrw_jax.walks import ModelLike, one_wheel, options_of, rung_of, state_of
 from vrw_jax.wheel import WheelParams
-from vrw_jax.wording import instance
+from vrw_jax.wording import instance, listed, traced
 
 Guess = LimitCycle | WalkedCycle | Array | np.ndarray | Sequence[float]
 """A neighbour's cycle, or a section state near the one that is wanted."""
@@ -64,8 +63,7 @@ def serving_and_why(
     """`serving`, and of the ladder in one sentence why."""
     if model is None or rung_of(model).rung != "ladder" or not isinstance(params, WheelParams):
         return model, None
-    traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((params, model)))
-    if traced or params.damping.ndim:
+    if traced(params, model) or params.damping.ndim:
         return model, None
     ladder: Any = rung_of(model)
     cycle: Any = finder_of(None, params.n_legs).cycle(params)
@@ -81,7 +79,7 @@ def near(guess: Any) -> Any:
     if guess is None or isinstance(guess, AbstractCycle | Located):
         return guess
     state = state_of(guess, "guess")
-    if not isinstance(state, jax.core.Tracer) and not np.isfinite(state).all():
+    if not traced(state) and not np.isfinite(state).all():
         raise ValueError(
             f"guess is {listed(state)}, but a search can begin at finite numbers only: give a "
             "neighbour's cycle, or a section state near the gait."

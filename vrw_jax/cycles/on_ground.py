@@ -34,6 +34,7 @@ from vrw_jax.numerics import Options, SectionCycle, in_batches, taken
 from vrw_jax.results import ON_GROUND
 from vrw_jax.walks import checked
 from vrw_jax.wheel import Outcome, WheelParams
+from vrw_jax.wording import traced
 
 ITERATIONS, HALVINGS = 15, 6
 """Of Newton's method, and of a correction that leads where no step ends, at most."""
@@ -71,13 +72,13 @@ class GroundFinder(AbstractWalkingFinder):
     def cycle(self, params: WheelParams, guess: Any = None) -> WalkedCycle:
         """By lanes where everything has a value, else by the step's own derivatives."""
         params, x, model, options = where_walks_begin(self, params, guess)
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((params, x, model))):
+        if traced(params, x, model):
             return stepped_cycle(params, x, model, options, self.period_n)
         return jax.tree.map(lambda x: x[0], self.near(model.values(params)[None], x[None]))
 
     def cycles(self, params: WheelParams, guess: Any = None) -> Any:
         """Side by side."""
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((params, guess))):
+        if traced(params, guess):
             return eqx.filter_vmap(self.cycle)(params, guess)
         values = jax.vmap(self.model.values)(params)
         return self.near(values, _states(self.model, params, guess))

@@ -13,8 +13,8 @@ from jaxtyping import Array, Float, Int
 from vrw_jax.cycles.cycle import AbstractCycle
 from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import Options, Scalar, SectionCycle, moved_cycle, newton_cycle
-from vrw_jax.results import Row, listed
 from vrw_jax.wheel import Outcome, WheelParams
+from vrw_jax.wording import Row, listed
 
 FINEST = 1e-12
 """Newton's last correction need not be smaller, nor than the step's own tolerance."""

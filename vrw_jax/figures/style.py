@@ -19,9 +19,9 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from vrw_jax.results import MEASURES, as_tex
+from vrw_jax.results import MEASURES
 from vrw_jax.wheel import Outcome
-from vrw_jax.wording import instance
+from vrw_jax.wording import as_tex, instance
 
 BLUE, ORANGE, GREEN, PINK, SKY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9"
 AMBER, YELLOW = "#E69F00", "#F0E442"

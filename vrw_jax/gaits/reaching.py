@@ -33,7 +33,7 @@ from vrw_jax.cycles import (
 from vrw_jax.numerics import Options, in_batches, taken
 from vrw_jax.walks import ModelLike
 from vrw_jax.wheel import Outcome, WheelParams, parameters_of
-from vrw_jax.wording import chosen, untraced, whole
+from vrw_jax.wording import chosen, traced, untraced, whole
 
 LOST = (
     Outcome.NO_CYCLE_FOUND,
@@ -234,7 +234,6 @@ def _chosen(finder: Any, params: WheelParams, which: Which) -> Any:
 
 def _wherever(finder: Any, params: WheelParams, guess: Any, adaptive: bool, which: Which) -> Any:
     """The cycle of one wheel or of a batch, by all means."""
-    traced = lambda tree: any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
     many = params.damping.ndim > 0
     still = lax.stop_gradient(params)
     hidden, plain = traced(still), not traced(params)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 from vrw_jax.numerics import Elementwise, Options, Scalar
 from vrw_jax.results import MARGINS, MEASURES
 from vrw_jax.wheel import FRICTION, LARGEST, PARAMETER_NAMES, Outcome, WheelParams, wheel_of
-from vrw_jax.wording import AbstractTold, Row, counted, told
+from vrw_jax.wording import AbstractTold, Row, counted, told, traced
 
 SectionState = Float[Array, "3"]
 """(theta-, dtheta-, dL1-) just before touchdown, in the labels of the step that ends: rad, rad/s,
@@ -182,9 +182,7 @@ class AbstractStep(AbstractTold):
         """What the step says of itself: measures, then premises and whether they hold."""
         outcome, values = np.asarray(self.outcome), self.measures()
         if outcome.ndim:
-            return [
-                ("steps", f"{outcome.size} in shape {outcome.shape}: {counted(outcome, Outcome)}")
-            ]
+            return [("steps", counted(outcome, Outcome))]
         code = Outcome(int(outcome))
         rows = [("outcome", f"{code.name}: {code.meaning}")]
         for name, value in values.items():
@@ -325,7 +323,7 @@ class AbstractWheel(eqx.Module):
     """Whether springs and dampers play a part: what is tuned and scanned."""
 
     def __repr__(self) -> str:
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(self)):
+        if traced(self):
             return eqx.tree_pformat(self)
         number = lambda x: repr(float(x)) if x.ndim == 0 else told(x, "")
         shown = lambda x: number(x) if eqx.is_array(x) else repr(x)

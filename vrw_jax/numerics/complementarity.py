@@ -11,6 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.numerics.codes import Code
+from vrw_jax.wording import traced
 
 MOST_CONTACTS = 10
 """Two to the power of that many combinations are solved."""
@@ -50,8 +51,7 @@ def complementary(
             f"matrix has shape {matrix.shape} and free {free.shape}, but they must be (n, n) and "
             f"(n,) with n from 1 to {MOST_CONTACTS}."
         )
-    traced = any(isinstance(x, jax.core.Tracer) for x in (matrix, free))
-    if not traced and not np.isfinite(np.append(matrix, free)).all():
+    if not traced(matrix, free) and not np.isfinite(np.append(matrix, free)).all():
         raise ValueError("matrix or free holds a number that is not finite: nothing can be told.")
     largest = jnp.max(jnp.abs(matrix))
     scale = jnp.where(largest > 0.0, largest, 1.0)

@@ -19,13 +19,3 @@ from vrw_jax.results.measures import (
     what_breaks,
 )
 from vrw_jax.results.origin import provenance
-from vrw_jax.wording import (
-    Row,
-    as_html,
-    as_markdown,
-    as_tex,
-    as_text,
-    listed,
-    nearest,
-    require_known,
-)

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vrw_jax.results import require_known
 from vrw_jax.wheel import FRICTION, PARAMETER_NAMES
-from vrw_jax.wording import instance, range_of, shown, told, untraced, whole
+from vrw_jax.wording import instance, range_of, require_known, shown, told, untraced, whole
 
 Columns = dict[str, np.ndarray]
 """One value per sample of each parameter that is swept."""

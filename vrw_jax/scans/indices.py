@@ -10,12 +10,11 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from vrw_jax.results import nearest
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.scans.design import SALTELLI
 from vrw_jax.scans.soundness import manifest_of
 from vrw_jax.wheel import Outcome
-from vrw_jax.wording import instance, names_of
+from vrw_jax.wording import instance, names_of, nearest
 
 FEWEST = 64
 """Rows below which indices are noise."""

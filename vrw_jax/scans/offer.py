@@ -7,8 +7,9 @@ from typing import NamedTuple
 from vrw_jax.answers import MADE
 from vrw_jax.cycles import CollocationFinder
 from vrw_jax.models import SERVED, AbstractWheel
-from vrw_jax.results import MARGINS, MEASURES, ON_GROUND, STEP, attrs_of, nearest
+from vrw_jax.results import MARGINS, MEASURES, ON_GROUND, STEP, attrs_of
 from vrw_jax.wheel import FRICTION, PARAMETER_NAMES
+from vrw_jax.wording import nearest
 
 ALWAYS = ("outcome", "spectral_radius", *MARGINS)
 """In every scan, asked for or not: is there a cycle, is it stable, what does it break."""

@@ -3,10 +3,9 @@
 from collections.abc import Mapping, Sequence
 
 from vrw_jax.cycles import AbstractGaitFinder, default_margins
-from vrw_jax.results import require_known
 from vrw_jax.tuning.objective import MOST
 from vrw_jax.wheel import WheelParams
-from vrw_jax.wording import names_of, range_of, real
+from vrw_jax.wording import names_of, range_of, real, require_known
 
 Margins = Mapping[str, float | tuple[float, float]] | Sequence[str]
 

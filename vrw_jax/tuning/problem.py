@@ -27,15 +27,7 @@ from vrw_jax.cycles import (
 )
 from vrw_jax.models import PREMISES
 from vrw_jax.numerics import Options
-from vrw_jax.results import (
-    MARGINS,
-    MEASURES,
-    attrs_of,
-    flags,
-    measure_of,
-    provenance,
-    require_known,
-)
+from vrw_jax.results import MARGINS, MEASURES, attrs_of, flags, measure_of, provenance
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.tuning.climbing import Climb, Kind, Trial, breach, climb, optimality, slack_scales
 from vrw_jax.tuning.constraints import Margins, bound_of, margins_of
@@ -50,6 +42,7 @@ from vrw_jax.wording import (
     positive,
     range_of,
     real,
+    require_known,
     shown,
     untraced,
     whole,

@@ -5,11 +5,12 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, NamedTuple
 
-from vrw_jax.results import MEASURES, as_html, as_text, measure_of
+from vrw_jax.results import MEASURES, measure_of
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.tuning.climbing import Ending
 from vrw_jax.tuning.starts import Lanes
 from vrw_jax.wheel import Outcome, WheelParams
+from vrw_jax.wording import as_html, as_text
 
 
 class Active(NamedTuple):

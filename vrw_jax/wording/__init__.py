@@ -13,6 +13,7 @@ from vrw_jax.wording.checks import (
     reals,
     require_known,
     shown,
+    traced,
     untraced,
     whole,
 )

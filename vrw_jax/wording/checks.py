@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array
 
 
-def nearest(name: str, allowed: Iterable[str]) -> str:
+def nearest(name: object, allowed: Iterable[str]) -> str:
     """' (did you mean ...?)' where a name like it is allowed, else nothing."""
     close = difflib.get_close_matches(str(name), list(allowed), n=1, cutoff=0.5)
     return f" (did you mean '{close[0]}'?)" if close else ""
@@ -162,9 +162,14 @@ def function_of(name: str, value: Any, what: str) -> None:
         raise TypeError(f"{name} is {shown(value)}, but it must be a function: give one {what}.")
 
 
+def traced(*trees: Any) -> bool:
+    """Whether numbers are unknown here, as inside `jit`, `vmap` or `grad`."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
+
+
 def untraced(function: str, instead: str, *trees: Any) -> None:
     """Refuse to run inside `jit`, `vmap` or `grad`, for what runs on the host."""
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees)):
+    if traced(*trees):
         raise TypeError(
             f"{function} is called inside jit, vmap or grad, but it runs on known numbers: call it "
             f"outside, or {instead}."
