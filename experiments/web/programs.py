@@ -28,8 +28,8 @@ from vrw_jax.models.unilateral.lanes import Walk, started, turned
 from vrw_jax.models.unilateral.march import N_TALLIED, Place, motion_of
 from vrw_jax.models.unilateral.mechanics import kinetic_energy, potential_energy
 from vrw_jax.models.unilateral.motion import Stance
-from vrw_jax.models.unilateral.sampling import samples
 from vrw_jax.models.unilateral.section import embedded, section_size
+from vrw_jax.models.unilateral.single import samples
 from vrw_jax.models.viscoelastic import described
 from vrw_jax.numerics import Options, explicit_tableau, sample_lanes, sine_cosine
 from vrw_jax.results import MARGINS, STOPPERS

@@ -12,7 +12,7 @@ from vrw_jax.cycles import finder_of
 from vrw_jax.cycles.premises import PREMISES, default_margins
 from vrw_jax.results.measures import MARGINS
 from vrw_jax.tuning.climbing import ACTIVE, Ending, Kind, breach, slack_scales
-from vrw_jax.tuning.constraints import bound_of, margins_of
+from vrw_jax.tuning.objective import bound_of, margins_of
 from vrw_jax.tuning.problem import Tuned, TuneProblem, tune, tuning_problem
 
 BOX = {

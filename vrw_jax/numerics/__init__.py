@@ -83,12 +83,11 @@ from vrw_jax.numerics.levels import (
 from vrw_jax.numerics.march import LanePhase, integrate_lanes, sample_lanes, sampled
 from vrw_jax.numerics.minima import ROUNDING, State, Watched
 from vrw_jax.numerics.newton import SectionCycle, moved_cycle, newton_cycle
-from vrw_jax.numerics.on_plane import solve
 from vrw_jax.numerics.options import Engine, Options, SolverName
 from vrw_jax.numerics.roots import BIFURCATIONS, bifurcation_functions, brackets, locate, turns
 from vrw_jax.numerics.saltation import volume_change
 from vrw_jax.numerics.segments import product_multipliers, segment_maps
-from vrw_jax.numerics.side_by_side import follow_many, solve_many
+from vrw_jax.numerics.side_by_side import follow_many, solve, solve_many
 from vrw_jax.numerics.tableaus import (
     Place,
     Slope,

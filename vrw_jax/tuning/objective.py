@@ -1,17 +1,26 @@
-"""Objective and constraints of a gait with exact gradients, read off what a finder found."""
+"""Objective and constraints of a gait, as callers say them and with exact gradients."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from vrw_jax.cycles import AbstractCycle, AbstractGaitFinder, Gait, read_along, read_along_lanes
+from vrw_jax.cycles import (
+    AbstractCycle,
+    AbstractGaitFinder,
+    Gait,
+    default_margins,
+    read_along,
+    read_along_lanes,
+)
 from vrw_jax.models import AbstractStep
-from vrw_jax.wording import reals
+from vrw_jax.wheel import WheelParams
+from vrw_jax.wording import names_of, range_of, real, reals, require_known
 
 Reader = Callable[[AbstractCycle, AbstractStep], Array]
+Margins = Mapping[str, float | tuple[float, float]] | Sequence[str]
 Read = Callable[[str, AbstractCycle, AbstractStep], Array]
 
 MOST = "-"
@@ -91,3 +100,32 @@ class Engine:
         """The gaits of many wheels side by side."""
         gait = self.finder.find_many(parameters, guess)
         return Evaluated(gait, *read_along_lanes(self.sought, gait))
+
+
+def margins_of(
+    params: WheelParams, constraints: Margins | None, finder: AbstractGaitFinder
+) -> dict[str, float]:
+    """Least values by measure, or by `MOST` and a measure of its negative."""
+    if constraints is None:
+        premises = default_margins(params)
+        return {name: least for name, least in premises.items() if finder.from_nothing}
+    margins: dict[str, float] = {}
+    if isinstance(constraints, Mapping):
+        for name, least in constraints.items():
+            if isinstance(least, tuple):
+                least, most = range_of(f"the range of {name}", least)
+                margins[MOST + name] = -most
+            margins[name] = real(f"the margin of {name}", least)
+    else:
+        margins = dict.fromkeys(names_of("constraints", constraints), 0.0)
+    if "clearance_sls1" in margins:
+        # It has a slope where the clearance has none.
+        margins.setdefault("takeoff_acceleration", 0.0)
+    for name in margins:
+        require_known(name.removeprefix(MOST), finder.readable, "measure for a constraint")
+    return margins
+
+
+def bound_of(name: str, least: float) -> float:
+    """A constraint's bound as it was given."""
+    return float(-least if name.startswith(MOST) else least)

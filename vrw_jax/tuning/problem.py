@@ -30,8 +30,18 @@ from vrw_jax.numerics import Options
 from vrw_jax.results import MARGINS, MEASURES, attrs_of, flags, measure_of, provenance
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.tuning.climbing import Climb, Kind, Trial, breach, climb, optimality, slack_scales
-from vrw_jax.tuning.constraints import Margins, bound_of, margins_of
-from vrw_jax.tuning.objective import MOST, Engine, Evaluated, OfCycle, Reader, Sought, Weighted
+from vrw_jax.tuning.objective import (
+    MOST,
+    Engine,
+    Evaluated,
+    Margins,
+    OfCycle,
+    Reader,
+    Sought,
+    Weighted,
+    bound_of,
+    margins_of,
+)
 from vrw_jax.tuning.result import Active, Tuned, Walked
 from vrw_jax.tuning.starts import Lanes, explore
 from vrw_jax.walks import ModelLike, one_wheel, rung_of

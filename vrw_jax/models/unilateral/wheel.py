@@ -49,7 +49,6 @@ from vrw_jax.models.unilateral.motion import (
     pack,
     unpack,
 )
-from vrw_jax.models.unilateral.sampling import Log, Sampled, sampled_by_lanes
 from vrw_jax.models.unilateral.section import (
     FullState,
     embedded,
@@ -57,7 +56,13 @@ from vrw_jax.models.unilateral.section import (
     opened,
     section_size,
 )
-from vrw_jax.models.unilateral.single import moved_by_lanes, told_by_lanes
+from vrw_jax.models.unilateral.single import (
+    Log,
+    Sampled,
+    moved_by_lanes,
+    sampled_by_lanes,
+    told_by_lanes,
+)
 from vrw_jax.numerics import (
     Elementwise,
     Forward,
