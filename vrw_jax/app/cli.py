@@ -41,7 +41,6 @@ app = typer.Typer(
 
 
 def main() -> None:
-    """Entry point of `vrw`."""
     # Traces are many small objects that live on: looking for dead ones among them as often as
     # Python does by itself takes a tenth of a cold start.
     gc.set_threshold(200_000, 20, 20)

@@ -126,11 +126,9 @@ class Config:
         return WheelParams(**values)
 
     def wheel_model(self) -> AbstractWheel:
-        """The rung with the config's settings."""
         return RUNGS[self.rung](**self.model)
 
     def numerical_options(self) -> Options:
-        """The defaults with the config's values."""
         options: dict[str, Any] = {**self.options}
         return Options(**options)
 
@@ -243,7 +241,6 @@ def _wheel(table: Mapping[str, object]) -> dict[str, float | int]:
 
 
 def _model(table: Mapping[str, object]) -> tuple[str, dict[str, float | int | str | bool]]:
-    """The rung, and its settings."""
     rung = table.get("rung", Config.rung)
     require_known(rung, tuple(RUNGS), "rung")
     assert isinstance(rung, str)

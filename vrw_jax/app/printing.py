@@ -44,7 +44,6 @@ def sentences(stopped: str = "stopped; nothing was written.") -> Iterator[None]:
 
 
 def complain(sentence: str) -> None:
-    """One sentence on stderr."""
     err.print(f"[bold red]vrw:[/] {escape(sentence)}", highlight=False, soft_wrap=True)
 
 
@@ -54,7 +53,6 @@ def _of_system(error: OSError) -> str:
 
 
 def tell_written(paths: Iterable[Path]) -> None:
-    """Where files were written."""
     for path in paths:
         out.print(f"written: {path}", highlight=False, soft_wrap=True)
 
@@ -82,7 +80,6 @@ def tell_table(
 
 
 def tell_facts(facts: "list[Fact]", folder: Path) -> None:
-    """The paper's facts, published against found."""
     verdict = ("[bold red]does not hold[/]", "[green]holds[/]")
     tell_table(
         None,

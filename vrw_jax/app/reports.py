@@ -100,7 +100,6 @@ def _wheel_toml(tuned: Tuned) -> str:
 
 
 def tuned_summary(tuned: Tuned) -> str:
-    """The result for a reader, in Markdown."""
     held = [(a.name, measure_of(a.name).text(a.limit), f"{a.price:.4g}") for a in tuned.active]
     moved = [
         (name, f"{float(tuned.path[name][0]):.6g}", f"{float(getattr(tuned.params, name)):.6g}",
@@ -133,7 +132,6 @@ def _borders_csv(branch: Branch) -> str:
 
 
 def branch_summary(branch: Branch) -> str:
-    """The branch for a reader, in Markdown."""
     head, *_ = str(branch).split("\n")
     lines = [f"# Branch along {branch.parameter}", "", head, ""]
     if not branch.values.size:

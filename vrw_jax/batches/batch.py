@@ -179,7 +179,6 @@ def _by_phases(
     durations: Any,
     asked: Sequence[str],
 ) -> Steps:
-    """Of rungs that step through the paper's phases."""
     walked = Walked(states, asked, PARAMETER_NAMES)
     some = n_legs, walked.moved
     runs = {NAMED: _chosen(engine, model, options, *some)}

@@ -194,7 +194,6 @@ def _solve(
 
 
 def _middle(q: Vector, v: Vector, a: Vector, h: Array) -> tuple[Vector, Vector]:
-    """About where the step's middle is."""
     n = range(len(q))
     return (
         tuple(q[d] + 0.5 * h * (v[d] + 0.25 * h * a[d]) for d in n),
@@ -303,7 +302,6 @@ def _to_pair(weights: np.ndarray, left: tuple[Vector, ...]) -> list[Complex]:
 
 
 def _apply(inverse: Any, right: list[Complex]) -> list[Complex]:
-    """Matrix times vector."""
     products = [[_times(entry, x) for entry, x in zip(row, right, strict=True)] for row in inverse]
     return [_plus(row) for row in products]
 

@@ -65,8 +65,6 @@ START = "section_state"
 
 
 class Walked:
-    """Results so far, as numpy arrays."""
-
     def __init__(
         self, states: np.ndarray, asked: Sequence[str], parameters: tuple[str, ...]
     ) -> None:

@@ -140,7 +140,6 @@ class Branch:
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
-        """For notebooks."""
         ends = ("", "ends the branch")
         return as_html(
             str(self).split("\n  ")[0],

@@ -166,14 +166,12 @@ class GaitLevel(AbstractLevel):
 
 
 def _formal(problem: Problem, parameters: Array, happens: Array, z: Solution) -> Array:
-    """FORMAL of one wheel or of lanes."""
     s = wheel_of(parameters, problem.n_legs).symbols()
     (passages,) = problem.passages(parameters, z)[1]
     return jnp.stack(list(_named(s, passages, z).values()))
 
 
 def _named(s: Symbols, passages: Any, z: Solution) -> dict[str, Array]:
-    """The same, by their names."""
     dls, sls1, sls2 = passages
     landing = transitions.land(s, sls2.end.q[0], *sls2.end.v)
     fore, rear = transitions.landing_forces(s, landing)
@@ -184,7 +182,6 @@ def _named(s: Symbols, passages: Any, z: Solution) -> dict[str, Array]:
 
 
 def _falls(s: Symbols, dls: Passage, lasts: Array) -> tuple[Array, Array]:
-    """FALLS and JUMPS, of one wheel or of lanes."""
     phase = phases_of(s, dls.start.held[0], stop_at_lift_off=False)[0]
 
     def instant(theta: Array, dtheta: Array) -> Instant:

@@ -203,8 +203,6 @@ class _Pieces(NamedTuple):
 
 
 class _Zero(NamedTuple):
-    """A located sign change."""
-
     bracket: tuple[int, int, str]  # left and right point, quantity
     value: float
     place: float
@@ -418,7 +416,6 @@ MakeCycle = Callable[[int, PathPoint], Callable[[], Any] | None]
 def _left_rough(
     run: AbstractRun, pieces: _Pieces, reaches: list[_Reach], n_wheels: int
 ) -> list[Strand | None]:
-    """What is rough, as it was followed."""
     strands: list[Strand | None] = [None] * n_wheels
     for reach in reaches:
         if _is_rough(run, pieces, reach):

@@ -40,7 +40,6 @@ TOLERANCE_TOWARDS = 1e-8
 
 
 def options_towards() -> Options:
-    """Of walks towards a gait."""
     tolerance = as_float_array(TOLERANCE_TOWARDS)
     return Options(solver=SOLVER_TOWARDS, rtol=tolerance, atol=tolerance)
 
@@ -138,7 +137,6 @@ def slow_gaits(finder: Any, values: Any) -> Any:
 
 
 def slowest(owner: np.ndarray, wheels: int) -> np.ndarray:
-    """The first of each wheel's gaits."""
     return np.searchsorted(owner, np.arange(wheels))
 
 

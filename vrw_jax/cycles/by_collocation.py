@@ -66,11 +66,9 @@ class CollocationFinder(AbstractGaitFinder):
 
     @property
     def problem(self) -> Problem:
-        """What is static in the search."""
         return Problem(self.n_legs, self.period_n, self.options, self.model.stop_at_lift_off)
 
     def finer(self) -> "CollocationFinder":
-        """The same on a mesh about twice as fine."""
         return dataclasses.replace(self, options=self.options.finer())
 
     @classmethod

@@ -43,7 +43,6 @@ def _tangent_space(problem: Problem, parameters: Parameters, located: Located) -
 
 
 def _monodromy(problem: Problem, parameters: Parameters, located: Located) -> Array:
-    """The monodromy matrix at the solution."""
     return _where_found(located, problem.pass_at(parameters, located).monodromy)
 
 

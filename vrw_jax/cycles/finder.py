@@ -64,7 +64,6 @@ class OnBranch(NamedTuple):
     returns: np.ndarray
 
     def lane(self, i: int) -> "OnBranch":
-        """One of a batch."""
         return OnBranch(*(x[i] for x in self))
 
 
@@ -133,7 +132,6 @@ class AbstractGaitFinder(eqx.Module):
         """Where a search begins that knows no neighbour."""
 
     def first_guesses(self, values: Float[Array, "lanes n_values"]) -> Any:
-        """The same of many wheels."""
         return jax.vmap(self.first_guess)(values)
 
     @abc.abstractmethod
@@ -172,8 +170,6 @@ class AbstractGaitFinder(eqx.Module):
 
 
 class Measured(NamedTuple):
-    """Several measures of one gait."""
-
     values: Float[Array, " n_names"]
     slopes: Float[Array, "n_names n_values"]
     outcome: Array
@@ -213,7 +209,6 @@ def read_along(function: Callable, gait: Gait) -> tuple[Any, Any]:
 
 @eqx.filter_jit
 def read_along_lanes(function: Callable, gait: Gait) -> tuple[Any, Any]:
-    """The same of a batch."""
     told = (gait.cycle, gait.step), (gait.d_cycle, gait.d_step)
     return eqx.filter_vmap(lambda told, d_told: along(function, told, d_told))(*told)
 

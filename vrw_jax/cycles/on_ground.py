@@ -77,7 +77,6 @@ class GroundFinder(AbstractWalkingFinder):
         return jax.tree.map(lambda x: x[0], self.near(model.values(params)[None], x[None]))
 
     def cycles(self, params: WheelParams, guess: Any = None) -> Any:
-        """Side by side."""
         if traced(params, guess):
             return eqx.filter_vmap(self.cycle)(params, guess)
         values = jax.vmap(self.model.values)(params)
@@ -295,7 +294,6 @@ def _cycles(model: AbstractWheel, n_legs: int, values: Array, found: _Found) -> 
 
 
 def _by_section(found: _Found, n: int) -> Array:
-    """How one period's end moves with its beginning."""
     by_section = jnp.eye(found.x.shape[0], dtype=found.x.dtype)
     for jacobian in found.moves.section_state:
         by_section = jacobian[:, n:] @ by_section
@@ -311,7 +309,6 @@ def _cycle(
 
 
 def _gait(model: AbstractWheel, n_legs: int, values: Array, found: _Found) -> Gait:
-    """The gait through a fixed point, and its derivatives along the branch."""
     n, one = values.shape[0], jnp.eye(found.x.shape[0], dtype=found.x.dtype)
     by_values, by_section = jnp.zeros((len(one), n), one.dtype), _by_section(found, n)
     for jacobian in found.moves.section_state:

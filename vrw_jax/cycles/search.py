@@ -66,7 +66,6 @@ class Problem(NamedTuple):
     def pass_at(
         self, parameters: Parameters, located: "Located", wanted: tuple[int, ...] = ()
     ) -> Linearised:
-        """The linearised pass at a located solution."""
         return linearised_pass(
             self.sequence,
             self.meshes,
@@ -342,14 +341,12 @@ def first_broken(problem: Problem, parameters: Parameters, located: Located) -> 
 
 
 def _is(attempt: Array, *names: str) -> Array:
-    """Whether it is one of these of ATTEMPTS."""
     return functools.reduce(operator.or_, [attempt == ATTEMPTS.index(name) for name in names])
 
 
 def _attempted(
     problem: Problem, attempt: Array, parameters: Parameters, now: Finding, guess: Located | None
 ) -> Finding:
-    """One attempt on the lanes that have no cycle yet."""
     options = problem.options
     table_1 = parameters_of(WheelParams(n_legs=problem.n_legs)).astype(parameters.dtype)
     iterations = dict.fromkeys(ATTEMPTS, options.iterations) | {
@@ -463,7 +460,6 @@ def _open(attempt: Int[Array, ""], now: Finding) -> Bool[Array, " lanes"]:
 
 
 def not_searched(problem: Problem, parameters: Parameters) -> Finding:
-    """What is known before a search: nothing."""
     size, n_phases = problem.sequence.section_size, len(problem.sequence.phases)
     zeros = lambda *shape: jnp.zeros((*shape, parameters.shape[-1]), parameters.dtype)
     return Finding(

@@ -37,7 +37,6 @@ class Surface(NamedTuple):
 
 @functools.cache
 def stored_surface() -> Surface:
-    """The stored surface."""
     file = importlib.resources.files(__package__) / "surface.npz"
     with file.open("rb") as stream, np.load(stream) as arrays:
         return Surface(**{name: arrays[name] for name in Surface._fields})
@@ -61,7 +60,6 @@ def coordinates(params: WheelParams) -> tuple[Elementwise, ...]:
 
 
 def monomials(centred: tuple[Elementwise, ...]) -> list[Elementwise]:
-    """All products of up to DEGREE coordinates."""
     one = jnp.ones_like(centred[0])
     return [
         functools.reduce(operator.mul, factors, one)

@@ -276,7 +276,6 @@ def curve_figure(scan: xr.Dataset, x: str) -> Figure:
 
 
 def _shown(scan: xr.Dataset) -> list[str]:
-    """Which measures are drawn."""
     return [name for name in ("dls_fraction", "speed") if name in scan]
 
 

@@ -190,7 +190,6 @@ def value_label(name: str, value: float, digits: int = 4) -> str:
 
 
 def panel_letter(axes: Axes, letter: str) -> None:
-    """The letter of a panel, beside its upper left corner."""
     axes.text(-0.12, 1.02, f"({letter})", transform=axes.transAxes, ha="right", va="bottom")
 
 
@@ -229,7 +228,6 @@ def outcome_cells(
 
 
 def outcome_patches(codes: Iterable[int]) -> list[Patch]:
-    """What a legend needs of the colours of outcomes."""
     return [
         Patch(facecolor=color, edgecolor="#888888", linewidth=0.4, label=label)
         for label, color in (outcome_style(int(code)) for code in codes)

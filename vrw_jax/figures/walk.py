@@ -370,7 +370,6 @@ def walk_frames(
 
 
 def _draw_wheel(axes: Axes, step: xr.Dataset, t: float) -> None:
-    """Legs and hub at time t, s."""
     slope, n = step.attrs["parameter_slope"], step.attrs["parameter_n_legs"]
     names = ("theta", "L1", "L2", "hub_x", "hub_z")
     theta, L1, L2, x, z = (float(np.interp(t, step.time, step[name])) for name in names)
@@ -393,7 +392,6 @@ def _draw_wheel(axes: Axes, step: xr.Dataset, t: float) -> None:
 
 
 def _draw_forces(axes: Axes, now: xr.Dataset, foot_2_x: float) -> None:
-    """Arrows for what the ground does to both feet."""
     slope, push = now.attrs["parameter_slope"], [float(now[name]) for name in FORCES]
     for foot, tangential, normal in ((0.0, *push[:2]), (foot_2_x, *push[2:])):
         if normal != 0.0:

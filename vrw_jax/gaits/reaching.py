@@ -218,7 +218,6 @@ def place_in_list(which: Which) -> int:
 
 
 def _chosen(finder: Any, params: WheelParams, which: Which) -> Any:
-    """Of each wheel of a batch one of the gaits that attract."""
     wheels, place = params.damping.shape[0], place_in_list(which)
     owner, gaits = gaits_attracting(finder, jax.vmap(finder.model.values)(params))
     counts = np.bincount(owner, minlength=wheels)
@@ -263,7 +262,6 @@ def _wherever(finder: Any, params: WheelParams, guess: Any, adaptive: bool, whic
 
 
 def _searched(finder: AbstractGaitFinder, params: WheelParams, guess: Any) -> Any:
-    """The cycle of one wheel, or of each of a batch."""
     return (finder.cycles if params.damping.ndim else finder.cycle)(params, guess)
 
 
@@ -273,8 +271,6 @@ def _taken(tree: Any, places: Any) -> Any:
 
 
 def _put(tree: Any, places: np.ndarray, values: Any) -> Any:
-    """Rows replaced, likewise."""
-
     def put(x: Any, v: Any) -> np.ndarray:
         x = np.array(x)
         x[places] = v
@@ -306,7 +302,6 @@ class _Walks(NamedTuple):
 
 
 def _walked(finder: CollocationFinder, params: WheelParams, wanted: np.ndarray) -> _Walks:
-    """Walks of the wheels that are `wanted`."""
     n, places = len(wanted), np.flatnonzero(wanted)
     best, x = np.full(n, np.inf), np.zeros((n, 3))
     for begin in (starts_of, further_starts_of):

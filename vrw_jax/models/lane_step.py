@@ -52,8 +52,6 @@ leg's fast mode, which dies within 0.05 s."""
 
 
 class LaneStep(NamedTuple):
-    """One gait step of a block of lanes."""
-
     section_state: Vector  # three arrays
     durations: Vector  # of DLS, SLS-I, SLS-II, s
     outcome: Int[Array, " lanes"]  # an Outcome
@@ -121,8 +119,6 @@ def walk(
     monitored: bool,
     few: Array | None = None,
 ) -> Walked:
-    """One gait step of every lane, phase by phase."""
-
     def run(phase: AbstractPhase, q: Vector, v: Vector, active: Array, before: End | None) -> End:
         first = options.first_step + jnp.zeros_like(q[0])
         if before is not None:
@@ -185,7 +181,6 @@ class _Setting(NamedTuple):
         return walk(*given), tableau, options
 
     def told(self, *leaves: Array) -> Told:
-        """What the step tells, over lanes."""
         return told_of(self.walked(*leaves)[0])
 
 
@@ -298,7 +293,6 @@ def _directions(leaves: Sequence[Array]) -> list[Array]:
 
 
 def _like(monitored: bool, leaves: Sequence[Array]) -> Told:
-    """A tree of `Told`'s form."""
     x = leaves[0]
     other = jnp.zeros_like(x, jnp.int32)
     return Told((x, x, x), x, other, (x, x, x) if monitored else (), other, other)

@@ -60,8 +60,6 @@ Run = Callable[[AbstractPhase, Vector, Vector, Array, End | None], End]
 
 
 class Walked(NamedTuple):
-    """A step, phase by phase."""
-
     s: Symbols
     landing: Landing
     phases: tuple[AbstractPhase, ...]
@@ -118,7 +116,6 @@ def through_phases(
 
 
 def _safe(like: Elementwise) -> tuple[Elementwise, Motion]:
-    """SAFE_SINGLE_SUPPORT as angle and motion."""
     theta, *others = (jnp.asarray(value, jnp.result_type(like)) for value in SAFE_SINGLE_SUPPORT)
     return theta, Motion(*sine_cosine(theta), *others)
 

@@ -229,7 +229,6 @@ class Roll(eqx.Module):
         return direct + first
 
     def motion(self, theta: Elementwise) -> Motion:
-        """Posture and rates at theta."""
         zero = 0.0 * theta
         speed_squared = self.rate_squared(theta)
         moving = speed_squared > 0.0
@@ -305,7 +304,6 @@ def _stiffness_of_gravity(s: Symbols) -> Elementwise:
 
 
 def _cos_sum(s: Symbols, theta: Elementwise | float) -> Elementwise:
-    """Cosine of theta + phi."""
     return jnp.cos(theta) * s.cos_phi - jnp.sin(theta) * s.sin_phi
 
 

@@ -177,8 +177,6 @@ class Plane(NamedTuple):
 
 
 class Corrected(NamedTuple):
-    """After one iteration."""
-
     z: Unknown
     share: Scalar
     size: Scalar
@@ -223,8 +221,6 @@ def parameter_at(share: Array, bounds: Array) -> Array:
 
 
 class _Trial(NamedTuple):
-    """What Newton's method works on."""
-
     plane: Plane
     z: Unknown
     share: Scalar
@@ -371,7 +367,6 @@ def begun(
     bounds: Array,
     directions: Array,
 ) -> Followed:
-    """Before any point."""
     states = jax.vmap(functools.partial(_started, followed, options, bounds))(z, p, directions)
     room = lambda x: jnp.zeros((x.shape[0], options.max_points, *x.shape[1:]), x.dtype)
     return states, jax.tree.map(room, states.base._replace(slope=()))
@@ -426,7 +421,6 @@ def turned(
 
 
 def track_of(on: Followed) -> Track:
-    """What has become of them."""
     last, points = on
     return Track(points, last.n_points, last.ending, last.passes)
 

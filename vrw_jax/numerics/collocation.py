@@ -129,7 +129,6 @@ class _Task(NamedTuple):
 
     @property
     def of_section(self) -> slice:
-        """The section's columns."""
         return slice(1, 1 + self.section_size)
 
     def push(self, function: Callable, place: tuple, d_place: tuple) -> tuple:
@@ -183,8 +182,6 @@ def _with_column(front: _Front) -> _Front:
 
 
 class _Interval(NamedTuple):
-    """One step of a mesh."""
-
     fraction: Array  # of the phase's duration
     h: LaneArray  # length, s
     a: LaneArray  # accelerations, (node, coordinate, lane)
@@ -336,7 +333,6 @@ def _leave_phase(
 def _pass_step(
     task: _Task, sequence: PhaseSequence, meshes: tuple[Mesh, ...], carry: tuple, inputs: tuple
 ) -> tuple:
-    """Through all phases of one step, from section to section."""
     section, d_section = carry
     durations, accelerations, happens = inputs
 

@@ -46,8 +46,6 @@ Field = Callable[[State], State]
 
 
 class PhaseEnd(NamedTuple):
-    """Where and how a phase ended."""
-
     state: State
     duration: Scalar  # s
     guard: Int[Array, ""]  # index of the guard that ended it; -1 if none did
@@ -250,7 +248,6 @@ def _begin(task: _Task, start: State, active: Bool[Array, ""]) -> _Loop:
 
 
 def _advance(task: _Task, loop: _Loop) -> _Loop:
-    """Take one step and judge it by the loop's mode."""
     _, watched, options = task
     n, here, length, search = watched.n_guards, loop.step, loop.length, loop.search
     starting, searching = loop.mode == STARTING, loop.mode == SEARCHING
@@ -327,8 +324,6 @@ def _taken(task: _Task, loop: _Loop) -> tuple[Step, Array]:
 
 
 class _Marched(NamedTuple):
-    """What marching makes of a step."""
-
     accepted: Bool[Array, ""]  # it counts; so does the start
     crossed: Bool[Array, ""]  # it brackets an event
     crossing: Bool[Array, " n_guards"]  # of which guards

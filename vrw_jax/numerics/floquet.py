@@ -61,7 +61,6 @@ class _Pair(NamedTuple):
 
     @property
     def modulus(self) -> Array:
-        """Of complex ones."""
         return _root(self.mean * self.mean + self.turn * self.turn)
 
 

@@ -97,7 +97,6 @@ def walk(
 
 
 def _require(modes: Sequence[Mode], start: Array, events: int, mode: int) -> None:
-    """Refuse, in one sentence, what can't be walked."""
     if start.ndim != 1 or not start.size:
         raise ValueError(f"start has shape {start.shape}, but a state is one row of numbers.")
     if not isinstance(start, jax.core.Tracer) and not np.all(np.isfinite(start)):
@@ -139,7 +138,6 @@ def _require_shape(name: str, function: Callable, start: Array, shape: tuple) ->
 
 
 def _entered(mode: Mode, state: Array, time: Array, options: Options) -> tuple[PhaseEnd, Array]:
-    """The mode's phase from a state, and whether a guard was past there."""
     values = lambda y: jnp.stack([guard.value(y) for guard in mode.guards])
     rate = lambda y: jax.jvp(values, (y,), (mode.field(y),))[1]
     first, (rates, bends) = values(state), jax.jvp(rate, (state,), (mode.field(state),))

@@ -45,7 +45,6 @@ def mix(matrix: np.ndarray, x: Array) -> Array:
 
 
 def weigh(weights: np.ndarray, x: Array) -> Array:
-    """Weighted sum over the leading axis."""
     terms = [float(weights[j]) * x[j] for j in range(len(weights))]
     return sum(terms[1:], start=terms[0])
 

@@ -80,7 +80,6 @@ class Passed(NamedTuple):
 
 
 def lowered(monitors: Monitors, evaluate: Evaluate, lowest: Lowest, step: Passed) -> Lowest:
-    """After a step."""
     here, end, length, taken, direction = step
     values, rates = map(jnp.stack, with_rates(monitors.values, evaluate, end))
     x, value = cubic_minimum(lowest.values, lowest.rates * length, values, rates * length)
@@ -138,7 +137,6 @@ def settled(
         begin = Place(q, v, evaluate(q, v))
 
         def own(place: Place) -> Array:
-            """The monitor in question alone."""
             chosen = jnp.arange(len(monitors.counts_at_start)) == index
             return jnp.sum(jnp.where(chosen[:, None], jnp.stack(monitors.values(place)), 0.0), 0)
 

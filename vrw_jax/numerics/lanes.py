@@ -100,7 +100,6 @@ def taken(tree: PyTree, places: Any) -> PyTree:
 
 
 def joined(*trees: PyTree) -> PyTree:
-    """Such arrays one behind the other."""
     return jax.tree.map(lambda *parts: np.concatenate([np.asarray(p) for p in parts]), *trees)
 
 

@@ -53,8 +53,6 @@ class AbstractLevel(eqx.Module):
 
 
 class LevelPoint(NamedTuple):
-    """What Newton's method moves on a curve."""
-
     z: Unknown
     share: Elementwise  # of the second parameter in its range
 
@@ -69,7 +67,6 @@ class LevelFollowed(AbstractFollowed):
     bounds: tuple[float, float] = eqx.field(static=True)  # of the second parameter
 
     def second(self, z: LevelPoint) -> Elementwise:
-        """The second parameter."""
         low, high = self.bounds
         return low + (high - low) * z.share
 

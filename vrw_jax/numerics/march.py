@@ -57,8 +57,6 @@ class LanePhase(NamedTuple):
 
 
 class LanePhaseEnd(NamedTuple):
-    """Where and how each lane ended; the start where it was not active."""
-
     place: Place
     duration: Array  # s
     guard: Array  # index of the guard that ended it; -1 if none did: it gave up

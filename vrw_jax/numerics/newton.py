@@ -48,8 +48,6 @@ class SectionCycle(NamedTuple):
 
 
 class Corrected(NamedTuple):
-    """Where Newton's method has come to."""
-
     x: Float[Array, " n"]  # after the last correction
     at: Float[Array, " n"]  # before it
     told: Any  # what was told there

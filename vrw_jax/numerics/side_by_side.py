@@ -39,15 +39,12 @@ AT_ONCE = 1e-2
 
 
 class Solving(NamedTuple):
-    """Where Newton's method is on a plane."""
-
     now: Corrected
     tries: Int[Array, ""]
     settled: Int[Array, ""]
 
 
 def to_solve(z: Unknown, plane: Plane) -> Solving:
-    """Before its first iteration."""
     n, flat, none = plane.x.shape[0], jax.tree.map(jnp.zeros_like, z), jnp.zeros((), jnp.int32)
     nothing = jnp.zeros((n, n), plane.x.dtype)
     first = Corrected(z, plane.share, jnp.ones_like(plane.share), flat, nothing)
@@ -55,7 +52,6 @@ def to_solve(z: Unknown, plane: Plane) -> Solving:
 
 
 def unsolved(options: ArclengthOptions, on: Solving) -> Array:
-    """Whether another one is wanted."""
     return (on.settled < 2) & (on.tries < options.iterations) & jnp.isfinite(on.now.size)
 
 
@@ -67,7 +63,6 @@ def nearer(
     on: Solving,
     linear: Linear,
 ) -> Solving:
-    """After it."""
     now = on.now
     following = corrected(followed, linear, bounds, plane, now.z, now.share)
     # A trial that went astray stands still: no lane may hand its neighbours a NaN.
@@ -81,7 +76,6 @@ def nearer(
 def solution(
     followed: AbstractFollowed, wheel: Any, bounds: Array, on: Solving
 ) -> tuple[PathPoint, Bool[Array, ""]]:
-    """The point that it has come to, and whether that is one."""
     now, p = on.now, parameter_at(on.now.share, bounds)
     valid = followed.valid(wheel, now.z, p)
     return PathPoint(now.z, p, (), jnp.ones_like(p), now.jacobian, valid), on.settled >= 1

@@ -48,8 +48,6 @@ class Slopes(NamedTuple):
 def _slopes_of(
     of: BalanceOf, constants: Any, moved: Any, held: Vector, stages: list[Place]
 ) -> Slopes:
-    """At each stage; `moved`: the direction of `constants`."""
-
     def at(row: Array) -> tuple[Array, Array]:
         place, balance = _unpacked(row), _traced_once(of(constants, held))
         residual = lambda constants, held: of(constants, held).residual(place)
@@ -82,13 +80,11 @@ def _unpacked(row: Array) -> Place:
 
 
 def _unit_rows(like: Vector) -> list[Vector]:
-    """Each number by itself."""
     n = len(like)
     return [tuple(jnp.full_like(like[j], float(i == j)) for j in range(n)) for i in range(n)]
 
 
 def _units(place: Place) -> list[tuple[Vector, Vector]]:
-    """Each position and each rate by itself."""
     rows, n = _unit_rows((*place.q, *place.v)), len(place.q)
     return [(row[:n], row[n:]) for row in rows]
 

@@ -35,12 +35,10 @@ LAST = 5
 
 
 def paper_wheel() -> ViscoelasticWheel:
-    """The rung that all of it walks on."""
     return ViscoelasticWheel(stop_at_lift_off=False)
 
 
 def changed(params: WheelParams, name: str, value: float) -> WheelParams:
-    """The same wheel with one parameter changed."""
     change: dict[str, Any] = {name: value}
     return dataclasses.replace(params, **change)
 

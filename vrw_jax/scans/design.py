@@ -71,7 +71,6 @@ class AbstractDesign(abc.ABC):
 
 
 def digest_of(kind: str, values: Mapping[str, np.ndarray]) -> str:
-    """A digest of every number of a design."""
     digest = hashlib.sha256(json.dumps([kind, *values]).encode())
     for column in values.values():
         digest.update(np.ascontiguousarray(column, dtype="<f8").tobytes())

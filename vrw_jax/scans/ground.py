@@ -96,7 +96,6 @@ class GroundEngine:
         return masked(outcome, whole)
 
     def _gaits(self, values: np.ndarray) -> Told:
-        """What is told of them."""
         cycle = slow_gaits(self._finder, values)
         told = in_batches(lambda some: _read_lanes(self._plain, some), (LANES,), cycle)
         if self._wanted:

@@ -72,7 +72,6 @@ def offer_of(model: AbstractWheel, tol: float | None = None) -> Offer:
 
 
 def error_of(measure: str) -> str:
-    """The variable of what a measure may be wrong by."""
     return measure + ERROR
 
 
@@ -87,12 +86,10 @@ class Derivative(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name of the variable that holds it."""
         return f"d_{self.measure}_d_{self.parameter}"
 
     @property
     def attrs(self) -> dict[str, object]:
-        """Attributes of that variable."""
         above, below = MEASURES[self.measure], MEASURES[self.parameter]
         units = {unit for unit in (above.unit, below.unit) if unit != "1"}
         unit = "1" if not units else above.unit if below.unit == "1" else None
@@ -154,7 +151,6 @@ def check_measures(names: Iterable[str], offer: Offer = PAPER) -> tuple[str, ...
 
 
 def variable_attrs(name: str) -> dict[str, object]:
-    """Attributes of a scan's variable, measure or derivative."""
     if name in SERVED:
         return dict(SERVED[name])
     if name.removesuffix(ERROR) in MADE and name.endswith(ERROR):

@@ -87,7 +87,6 @@ class Plan:
 
     @property
     def attrs(self) -> dict[str, object]:
-        """Attributes of the whole result."""
         return {
             "title": f"Steady gaits of the viscoelastic-legged rimless wheel over "
             f"{', '.join(self.design.names)}",
@@ -99,7 +98,6 @@ class Plan:
         }
 
     def engine(self) -> Evaluate:
-        """The function that computes samples."""
         given = self.measures, self.base, self.model, self.options, self.cycle_options
         return engine_for(*given, tol=self.tol)
 
@@ -241,7 +239,6 @@ def _layout(
 
 
 def _fields(settings: object) -> dict[str, object]:
-    """The fields of a settings object as plain values."""
     told: dict[str, object] = {"kind": type(settings).__name__}
     for name in type(settings).__dataclass_fields__:  # type: ignore[attr-defined]
         value = getattr(settings, name)

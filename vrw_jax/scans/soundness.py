@@ -51,7 +51,6 @@ class Books:
         self._counts = tuple(-(-n // c) for n, c in zip(shape, chunk, strict=True))
 
     def done(self) -> np.ndarray:
-        """Which chunks are marked."""
         marks = np.asarray(self._marks[:])
         return np.any(marks.reshape(len(marks), -1) != 0, axis=1)
 

@@ -82,7 +82,6 @@ class Layout:
 
     @property
     def n_chunks(self) -> int:
-        """Number of chunks."""
         return math.prod(self._counts)
 
     @property
@@ -90,7 +89,6 @@ class Layout:
         return tuple(-(-n // c) for n, c in zip(self.shape, self.chunk, strict=True))
 
     def region(self, index: int) -> Region:
-        """The samples of a chunk."""
         places = np.unravel_index(index, self._counts)
         return tuple(
             slice(int(i) * c, min((int(i) + 1) * c, n))
@@ -139,8 +137,6 @@ class AbstractStore(abc.ABC):
 
 
 class MemoryStore(AbstractStore):
-    """Results as arrays in memory."""
-
     def __init__(self, layout: Layout, attrs: Mapping[str, object]) -> None:
         self._layout, self._attrs = layout, attrs
         self._done = np.zeros(layout.n_chunks, bool)

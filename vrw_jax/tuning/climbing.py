@@ -54,8 +54,6 @@ class Trial(NamedTuple):
 
 
 class Climb(NamedTuple):
-    """Where a climb got to and how."""
-
     best: Trial
     ending: Ending
     trials: list[Trial]

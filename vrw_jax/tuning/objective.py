@@ -86,8 +86,6 @@ class Evaluated(NamedTuple):
 
 @dataclass(frozen=True)
 class Engine:
-    """Evaluates gaits of one tuning problem."""
-
     finder: AbstractGaitFinder
     sought: Sought
 
@@ -127,5 +125,4 @@ def margins_of(
 
 
 def bound_of(name: str, least: float) -> float:
-    """A constraint's bound as it was given."""
     return float(-least if name.startswith(MOST) else least)

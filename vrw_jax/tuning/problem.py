@@ -164,7 +164,6 @@ class TuneProblem:
 
     @property
     def moved(self) -> list[int]:
-        """Places of the free parameters among all."""
         return [PARAMETER_NAMES.index(name) for name in self.free]
 
     @property
@@ -190,7 +189,6 @@ class TuneProblem:
         return values
 
     def wheel(self, u: np.ndarray) -> WheelParams:
-        """The wheel there."""
         return self.finder.model.at(jnp.asarray(self.parameters(u)), self.params.n_legs)[1]
 
     @property
@@ -264,7 +262,6 @@ class TuneProblem:
     def result(
         self, done: Climb, began: float, compiled: float, lanes: Lanes | None = None
     ) -> Tuned:
-        """The result of a climb, confirmed by walking."""
         best = done.best
         assert best.told is not None
         gait = best.told.gait
@@ -332,7 +329,6 @@ class TuneProblem:
         return Walked(walked, outcome, distance, kept and outcome == Outcome.STEPPED)
 
     def _path(self, done: Climb) -> xr.Dataset:
-        """Every evaluated gait, labelled."""
         along = "evaluation"
         u = np.array([trial.u for trial in done.trials])
         values = self.lower + u * self.widths

@@ -85,14 +85,12 @@ def one_wheel(params: Any, instead: str) -> None:
 
 
 def options_of(options: Options | None) -> Options:
-    """The options of a step as a caller gives them."""
     if options is not None:
         instance("options", options, Options, "give vrw.Options(), or vrw.Options.tight()")
     return Options() if options is None else options
 
 
 def state_of(x: Any, what: str = "the section state") -> Array:
-    """A section state as a caller gives it."""
     return reals(
         what,
         x,

@@ -131,8 +131,6 @@ class Telling(NamedTuple):
 
 
 class Joined(NamedTuple):
-    """A walk, sampled."""
-
     columns: dict[str, np.ndarray]  # (time, ...), with `step`; empty where nothing happened
     n_stepped: int
     outcome: Outcome

@@ -172,7 +172,6 @@ def _widget() -> type:
 
 
 def _values(params: WheelParams, friction: float, rung: str) -> dict[str, float | str]:
-    """As the page names them."""
     numbers = {name: float(getattr(params, name)) for name in DOMAINS}
     return {**numbers, FRICTION: friction, "n_legs": params.n_legs, "rung": rung}
 

@@ -42,7 +42,6 @@ class MassMatrix(NamedTuple):
     M33: Elementwise  # kg
 
     def times(self, x: tuple[Elementwise, Elementwise, Elementwise]) -> Vector:
-        """The product with a vector over (theta, L1, L2)."""
         return (
             self.M11 * x[0] + self.M12 * x[1] + self.M13 * x[2],
             self.M12 * x[0] + self.M22 * x[1] + self.M23 * x[2],

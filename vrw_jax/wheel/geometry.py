@@ -38,8 +38,6 @@ class Motion(NamedTuple):
 
 
 class Trig(NamedTuple):
-    """Sine and cosine of an angle."""
-
     sin: Elementwise
     cos: Elementwise
 

@@ -110,7 +110,6 @@ class AbstractPhase(abc.ABC):
         """The motion just after the phase's own end."""
 
     def at(self, q: Vector, v: Vector) -> Motion:
-        """The motion at the phase's own coordinates and rates."""
         return self.motion(*sine_cosine(q[0]), q, v)
 
     def rear(self, motion: Motion, acceleration: Acceleration) -> FootForce | None:
@@ -125,11 +124,9 @@ class AbstractPhase(abc.ABC):
 
     @property
     def outcomes(self) -> tuple[Outcome, ...]:
-        """What each guard means."""
         return self.own_outcomes + (FALLS if self.stop_at_lift_off else FALLS[:-1])
 
     def premises(self, at: "Instant") -> Vector:
-        """Values of `Premises`, in a row."""
         s, m = self.s, at.motion
         locked = dynamics.stopper_force(s, m, at.acceleration, range(3, s.n + 1))
         shared = (at.fore.normal, s.L0 - m.L1, -dynamics.friction_needed(at.fore))
@@ -150,7 +147,6 @@ class AbstractPhase(abc.ABC):
 
     @classmethod
     def own(cls, theta: Elementwise, motion: Motion) -> tuple[Vector, Vector]:
-        """The phase's own coordinates and rates of a motion."""
         q, v = (theta, motion.L1, motion.L2), (motion.dtheta, motion.dL1, motion.dL2)
         return q[: cls.n], v[: cls.n]
 

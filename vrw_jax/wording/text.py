@@ -31,7 +31,6 @@ class AbstractTold(eqx.Module):
 
     @property
     def title(self) -> str:
-        """Stands above them."""
         return type(self).__name__
 
     def __repr__(self) -> str:
@@ -59,7 +58,6 @@ def counted(outcomes: Any, code: type[enum.IntEnum]) -> str:
 
 
 def as_text(title: str, rows: Iterable[Row]) -> str:
-    """The rows under a title."""
     return "\n".join([title, *(f"  {name}: {text}" for name, text in rows)])
 
 
@@ -110,5 +108,4 @@ def _token_as_tex(found: re.Match[str]) -> str:
 
 
 def listed(values: object) -> str:
-    """Numbers in a row."""
     return ", ".join(f"{v:.5g}" for v in np.ravel(np.asarray(values)))

@@ -49,20 +49,16 @@ class _March(NamedTuple):
 
 
 class _Way(NamedTuple):
-    """A direction."""
-
     march: _March
     rest: Moves  # but for what the march has
 
     @classmethod
     def of(cls, moves: Moves, slope: Array) -> "_Way":
-        """In two parts."""
         tally, told = moves.told
         rest: Any = moves._asdict() | {"q": None, "v": None, "told": (tally, None), "time": None}
         return cls(_March(moves.q, moves.v, told, slope, moves.time), Moves(**rest))
 
     def moves(self) -> Moves:
-        """In one."""
         q, v, told, _, later = self.march
         return self.rest._replace(q=q, v=v, told=(self.rest.told[0], told), time=later)
 
@@ -105,7 +101,6 @@ def _unpacked(rows: Array, like: Any) -> Any:
 
 
 def _at(rows: Array, k: Array, like: Any) -> Any:
-    """The direction of that place, as a tree of that form."""
     return _unpacked(lax.dynamic_index_in_dim(rows, k, 0, False), like)
 
 

@@ -100,7 +100,6 @@ def in_impact(stand: Stand) -> Carried:
 
 
 def told_by(stand: Stand, hub: Hub, free: Free) -> Carried:
-    """By what would be free of them."""
     s, _, friction, slots, contact, held, _ = stand
     found = answer(s, hub, free, contact, held, friction)
     out = free.legs + hub.legs.sin * found.hub[0] + hub.legs.cos * found.hub[1]

@@ -259,7 +259,6 @@ _ORDERS = _Order.of(ORDER_WITHOUT_SLIP), _Order.of(np.arange(len(MODES)))
 
 
 def _order(by_paper: Array) -> _Order:
-    """By the rule of each wheel."""
     return jax.tree.map(lambda yes, no: jnp.where(by_paper, yes, no), *_ORDERS)
 
 
@@ -273,8 +272,6 @@ class Allowed(NamedTuple):
     known_open: Bool[Array, "2 ..."]  # an open stopper needs no test: the leg is away from it
 
     def rows(self, order: _Order) -> Rows:
-        """Of the table, those that may be chosen."""
-
         def word(w: int) -> Array:
             left = jnp.full_like(self.contact[0], -1, jnp.int32)
             for i in range(2):
@@ -288,13 +285,10 @@ class Allowed(NamedTuple):
 
 
 def has(modes: Array, mode: Array | int) -> Bool[Array, "..."]:
-    """Whether a set of modes has this one."""
     return ((modes >> mode) & 1) > 0
 
 
 class Chosen(NamedTuple):
-    """What the table says."""
-
     contact: Int[Array, "2 ..."]
     held: Bool[Array, "2 ..."]
     wrong: Elementwise  # how far its worst sign is off, see `Negligible`; 0 where it is admissible
@@ -375,7 +369,6 @@ def choose(
     order = _order(by_paper[0] & by_paper[1] if isinstance(by_paper, tuple) else by_paper)
 
     def told(row: Rows) -> tuple[Array, Array]:
-        """Modes and stoppers of a row."""
         within = lambda rows: ((row[0] & rows[0]) | (row[1] & rows[1])) != 0
         modes = [sum(jnp.where(within(own[m]), m, 0) for m in range(1, 4)) for own in order.contact]
         return jnp.stack(modes).astype(jnp.int32), jnp.stack([within(own) for own in order.held])

@@ -75,7 +75,6 @@ def _counted(n: int, like: Array) -> np.ndarray:
 
 
 def event_of(place: Guards, guard: Int[Array, "..."]) -> Event:
-    """The event of a guard's index."""
     n = place.n_legs
     flags = lambda start, count: guard == start + _counted(count, guard)
     loosens = flags(place.loosen, n) if place.total > place.loosen else flags(place.foot, n) & False
@@ -382,7 +381,6 @@ def _joined(law: Law, motion: WheelMotion, stance: Stance, event: Event) -> Even
 
 
 def resolve(law: Law, motion: WheelMotion, stance: Stance, event: Event) -> Change:
-    """Everything that an event changes."""
     event = _joined(law, motion, stance, event)
     s, impact = law.s, event.impact
     touched = (stance.contact != OFF) | event.lands

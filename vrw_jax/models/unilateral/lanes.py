@@ -99,8 +99,6 @@ class Moves(NamedTuple):
 
 
 class Lane(NamedTuple):
-    """A wheel on its way."""
-
     now: March
     ledger: Ledger  # of this step; steps tried are all of the wheel's
     details: Details | None  # of this step, where they are wanted
@@ -109,13 +107,11 @@ class Lane(NamedTuple):
     outcome: Array
 
     def moves(self) -> Moves:
-        """The part that moves."""
         here, details = self.now.here, eqx.filter(self.details, eqx.is_inexact_array)
         told = self.tally, self.now.told
         return Moves(here.q, here.v, told, self.now.time, self.ledger.durations, details)
 
     def moved(self, moves: Moves) -> "Lane":
-        """The same with that part."""
         tally, told = moves.told
         here = self.now.here._replace(q=moves.q, v=moves.v)
         rest = eqx.filter(self.details, eqx.is_inexact_array, inverse=True)
@@ -140,12 +136,10 @@ class Walk(NamedTuple):
     tableau: Tableau
 
     def flow(self, columns: Array, stance: Stance) -> Flow:
-        """Of lanes in their stances."""
         s, friction = self.of(columns)
         return flow_of(s, friction, self.one_sided, stance, self.detailed)
 
     def of(self, columns: Array) -> tuple[Symbols, Array]:
-        """Symbols and friction of lanes."""
         return symbols_of(self.n, *columns[:-1]), as_ruled(columns[-1], self.by_paper)
 
     def begun(self, columns: Array, x: Array) -> Lane:
@@ -159,7 +153,6 @@ class Walk(NamedTuple):
         return Lane(now, *self._blank(x[0]), now.guard * 0, now.guard * 0 + UNDER_WAY)
 
     def _blank(self, like: Array) -> tuple[Ledger, Details | None, Array | None]:
-        """What a step of lanes begins with."""
         if not self.detailed:
             return blank(like), None, None
         many = lambda leaf: jnp.broadcast_to(leaf[..., None], (*leaf.shape, *like.shape))
@@ -217,7 +210,6 @@ class Walk(NamedTuple):
         return self.lean(stands, lane.ledger, code)
 
     def lean(self, stands: tuple[WheelMotion, Stance], ledger: Ledger, code: Array) -> Lean:
-        """The least of it."""
         landed = jnp.where(code == Outcome.STEPPED, place_of_landing(self.n, stands[0]), 0.0)
         return Lean(section_reached(*stands, code), ledger.durations, landed)
 

@@ -103,7 +103,6 @@ def blank(like: Array) -> Ledger:
 
 
 def passed(ledger: Ledger, stance: Stance, duration: Elementwise, tried: Array) -> Ledger:
-    """After one more stretch."""
     loaded = jnp.sum(stance.contact != OFF, axis=0)
     share = jnp.stack([loaded == feet for feet in (2, 1, 0)])
     durations = ledger.durations + jnp.where(share, duration, 0.0)
@@ -142,7 +141,6 @@ class Details(NamedTuple):
 
 
 def no_details(dtype: jnp.dtype) -> Details:
-    """Of a step that is about to begin."""
     zero, none = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
     two = jnp.zeros((2,), dtype)
     return Details(

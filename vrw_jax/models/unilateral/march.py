@@ -91,7 +91,6 @@ class March(NamedTuple):
 
 
 def motion_of(place: Place) -> WheelMotion:
-    """The lanes' motions."""
     x, z, theta, L = place.q[0], place.q[1], place.q[2], place.q[3:]
     return WheelMotion(x, z, theta, place.v[0], place.v[1], place.v[2], L, place.v[3:])
 
@@ -103,7 +102,6 @@ def place_of(flow: Flow, motion: WheelMotion) -> Place:
 
 
 def coordinates(motion: WheelMotion) -> tuple[Array, Array]:
-    """Coordinates and rates as `Place` has them."""
     q = jnp.concatenate([jnp.stack([motion.x, motion.z, motion.theta]), motion.L])
     return q, jnp.concatenate([jnp.stack([motion.vx, motion.vz, motion.dtheta]), motion.dL])
 
@@ -223,8 +221,6 @@ def until_none_marches(
 
 
 class Try(NamedTuple):
-    """One Runge-Kutta step of every lane."""
-
     end: Place
     squared: Array  # error over tolerance
     values: Array  # guards at the end
@@ -246,7 +242,6 @@ def stage_at(
 
 
 def tried_step(flow: Flow, tableau: Tableau, options: Options, now: March) -> Try:
-    """One step of the lanes from where they are."""
     h, here, last = now.h, now.here, len(tableau.places) - 1
 
     def stage(i: Array, slopes: Array) -> Array:

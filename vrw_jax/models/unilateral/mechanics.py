@@ -49,7 +49,6 @@ class Legwise(NamedTuple):
 
 
 def directions(s: Symbols, theta: Elementwise) -> Legwise:
-    """Sine and cosine of every leg's angle, from one sine and one cosine."""
     turn = (s.alpha * np.arange(s.n)).reshape(-1, *(1,) * jnp.ndim(theta))
     sin, cos = sine_cosine(theta)
     sin_turn, cos_turn = np.sin(turn), np.cos(turn)
@@ -90,11 +89,9 @@ class Slots(NamedTuple):
 
     @property
     def filled(self) -> Bool[Array, "n_legs ..."]:
-        """Legs that are in a slot."""
         return self.first | self.second
 
     def codes(self, values: Array) -> Int[Array, "2 ..."]:
-        """The slots' entries of a code of all legs."""
         return jnp.stack(self.of(values))
 
     def flags(self, values: Array) -> Bool[Array, "2 ..."]:
@@ -115,7 +112,6 @@ class Slots(NamedTuple):
 
 
 def slots_of(touching: Bool[Array, "n_legs ..."]) -> Slots:
-    """The first two of the touching legs."""
     rank = jnp.cumsum(touching.astype(jnp.int32), axis=0)
     return Slots(touching & (rank == 1), touching & (rank == 2))
 
@@ -146,7 +142,6 @@ class Hub(NamedTuple):
 
 
 def times(inverse: tuple[Any, ...], f: Vector3) -> Vector3:
-    """Symmetric 3 x 3 matrix times vector."""
     xx, xz, xt, zz, zt, tt = inverse
     return (
         xx * f[0] + xz * f[1] + xt * f[2],
@@ -186,7 +181,6 @@ class Posture(NamedTuple):
 
 
 def posture_of(s: Symbols, motion: WheelMotion, slots: Slots) -> Posture:
-    """At this motion."""
     legs = directions(s, motion.theta)
     return Posture(legs, slots.of(legs.sin), slots.of(legs.cos), slots.of(motion.L))
 

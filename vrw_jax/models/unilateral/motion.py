@@ -59,7 +59,6 @@ def pack(motion: WheelMotion, tally: Tally) -> State:
 
 
 def unpack(y: State) -> tuple[WheelMotion, Tally]:
-    """The inverse of `pack`."""
     n = (y.shape[0] - 10) // 2
     L, dL, tally = y[6 : 6 + n], y[6 + n : 6 + 2 * n], y[6 + 2 * n :]
     motion = WheelMotion(y[0], y[1], y[2], y[3], y[4], y[5], L, dL)
@@ -91,7 +90,6 @@ class Flow(NamedTuple):
     tilt: Elementwise | None = None  # by which the ground ahead is steeper, rad
 
     def stand(self, motion: WheelMotion) -> Stand:
-        """The wheel there."""
         slots = self.slots, self.contact, self.held, self.airborne
         return Stand(self.s, motion, self.friction, *slots)
 
@@ -113,8 +111,6 @@ def flow_of(
 
 
 class Forces(NamedTuple):
-    """Everything that acts at an instant."""
-
     legs: Legwise
     free: Legs  # see `free_legs`
     answer: Carried
@@ -147,7 +143,6 @@ def least_stopper_force(flow: Flow, now: Forces) -> Elementwise:
 
 
 def tally_rates(flow: Flow, motion: WheelMotion, now: Forces) -> Tally:
-    """Time derivatives of what is summed up."""
     direction = sliding(flow.contact)
     speeds = [direction[i] * now.feet.x[i] for i in range(2)]
     drag = [-now.answer.tangential[i] * direction[i] for i in range(2)]
@@ -160,7 +155,6 @@ def tally_rates(flow: Flow, motion: WheelMotion, now: Forces) -> Tally:
 
 
 def field(flow: Flow, y: State) -> State:
-    """Time derivative of the state."""
     motion, _ = unpack(y)
     now = forces(flow, motion)
     rates = WheelMotion(
@@ -201,7 +195,6 @@ class Guards(NamedTuple):
 
 
 def guards_of(n: int, one_sided: bool) -> Guards:
-    """Places of the guards of a wheel with n legs."""
     sizes = (n, n, 2, 2, 2, 2, 2, 1, 1, n if one_sided else 0)
     places = np.concatenate([[0], np.cumsum(sizes)])
     return Guards(*(int(p) for p in places))

@@ -226,8 +226,6 @@ def _by_xla(function: Callable[[tuple, tuple], tuple]) -> Callable[..., Any]:
 
 
 class _Run(NamedTuple):
-    """What a compiled walk depends on besides its arrays."""
-
     static: Options
     n_legs: int
     max_events: int
@@ -237,7 +235,6 @@ class _Run(NamedTuple):
 
     @classmethod
     def of(cls, model: UnilateralWheel, options: Options, n: int, moved: bool) -> "_Run":
-        """Of these options."""
         if model.restitution is not None:
             raise ValueError(
                 "restitution is given, but in lanes feet don't come back: walk wheels one by one, "
@@ -247,7 +244,6 @@ class _Run(NamedTuple):
         return cls(static, n, model.max_events, model.one_sided, model.by_paper, moved)
 
     def on(self, dynamic: Options, n_steps: Array) -> Walk:
-        """The walk of lanes."""
         options = eqx.combine(dynamic, self.static)
         tableau = explicit_tableau(options.solver)
         assert tableau is not None  # the caller looked
@@ -260,7 +256,6 @@ class _Run(NamedTuple):
         return (*sizes, DIRECTIONS) if self.moved else sizes
 
     def told(self, dtype: Any) -> Any:
-        """Shapes and types of what is told of one wheel."""
         walk = _shapes(self.n_legs, dtype, self.moved)
         if not self.moved:
             return walk
@@ -292,7 +287,6 @@ def _walked(run: _Run, given: list[np.ndarray], n_steps: int, options: Options) 
 
 @functools.cache
 def _form(run: _Run, dtype: np.dtype) -> tuple[list[Any], Any]:
-    """What is told of one wheel, and its structure."""
     return jax.tree.flatten(run.told(dtype))
 
 

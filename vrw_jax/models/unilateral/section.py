@@ -23,7 +23,6 @@ LOCKED = 4
 
 
 def section_size(n: int) -> int:
-    """Length of the section state of a wheel with n legs."""
     return 4 + 3 * n
 
 

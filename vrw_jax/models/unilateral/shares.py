@@ -94,8 +94,6 @@ class _Lengths(NamedTuple):
 
 
 class _Moving(NamedTuple):
-    """The wheel at a place."""
-
     flow: Flow
     motion: WheelMotion
     stand: Stand
@@ -127,7 +125,6 @@ class _Moving(NamedTuple):
         return lambda way: (left(way), stand.slots)
 
     def speed(self, way: WheelMotion) -> Pair:
-        """Of the slots' feet."""
         s, slots = self.flow.s, self.flow.slots
         speeds = lambda motion: foot_velocity(motion, slots, posture_of(s, motion, slots)).x
         return jax.jvp(speeds, (self.motion,), (way,))[1]
@@ -241,7 +238,6 @@ class Shares(NamedTuple):
         return total
 
     def nothing(self) -> Share:
-        """The share of what does not move."""
         return jax.tree.map(jnp.zeros_like, self.angle[0])
 
     def along(self, ends: Ends, column: Share, more: Array) -> Array:
@@ -285,7 +281,6 @@ class Shares(NamedTuple):
     def _legs(
         self, which: int, hub: Vector3, pull: Pair, at: Callable, column: Any, L: Any, dL: Any
     ) -> Array:
-        """Accelerations of some legs' lengths."""
         (longer, faster), some, moving = self.metres[which], _LEGS[which], self.moving
         by_angle = at(*(share.legs[some] for share in self.angle), column[some])
         stand = _part_of(moving.stand, some)

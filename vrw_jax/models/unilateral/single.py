@@ -39,8 +39,6 @@ from vrw_jax.wheel import parameters_of
 
 
 class Setting(NamedTuple):
-    """What a step depends on besides its arrays."""
-
     structure: Any  # of (wheel, params, x, options), whose leaves are the arrays
     detailed: bool
 
@@ -50,7 +48,6 @@ class Setting(NamedTuple):
         return jnp.stack([*parameters_of(params), wheel.friction]), x, (wheel, params, options)
 
     def walk(self, others: Any) -> Walk:
-        """One step of lanes."""
         wheel, params, options = others
         tableau = explicit_tableau(options.solver)
         assert tableau is not None  # the caller looked
@@ -58,7 +55,6 @@ class Setting(NamedTuple):
         return Walk(params.n_legs, 1, *rules, options, tableau)
 
     def like(self, *leaves: Array) -> tuple:
-        """Trees of what is told."""
         params = self.given(leaves)[2][1]
         return _parted(told_like(params.n_legs, leaves[0].dtype, self.detailed))
 

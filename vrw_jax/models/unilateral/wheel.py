@@ -198,11 +198,9 @@ class UnilateralWheel(AbstractWheel):
         return embedded(params.symbols(), jnp.asarray(PAPER_START, params.damping.dtype))
 
     def section_size(self, params: WheelParams) -> int:
-        """4 + 3 n, see `FullState`."""
         return section_size(params.n_legs)
 
     def section_numbers(self, params: WheelParams) -> int:
-        """All but the legs' codes."""
         return section_size(params.n_legs) - params.n_legs
 
     def full_section(self, params: WheelParams, x: Array) -> FullState:
@@ -241,13 +239,11 @@ class UnilateralWheel(AbstractWheel):
         return eqx.combine(*_compiled(structure, detailed, engine)(*leaves)), engine
 
     def _leaves(self, params: WheelParams, x: FullState, options: Options) -> tuple[list, Any]:
-        """All that a step depends on, and its structure."""
         # Not by `replace`: friction was checked, and may be traced by now.
         model = eqx.tree_at(lambda wheel: wheel.friction, self, self.friction.astype(x.dtype))
         return jax.tree.flatten((model, params, x, options))
 
     def _engine(self, options: Options) -> str:
-        """Who takes the step."""
         return "lanes" if self._like_lanes(options) and lanes_can(options) else "diffrax"
 
     def _like_lanes(self, options: Options) -> bool:
@@ -327,7 +323,6 @@ def _walk(
     detailed: bool,
     logged: bool = False,
 ) -> _Walked:
-    """Follow one step from event to event."""
     even = wheel.uneven is None
     good, params, friction, x = made_sound(params, wheel.friction, x, even)
     s, n = params.symbols(), params.n_legs
@@ -355,7 +350,6 @@ def _walk(
 
 
 def _go_on(law: Law, place: Guards, max_events: int, options: Options, now: _Walked) -> _Walked:
-    """Through the event that a step stands at, and to the next one."""
     motion, tally = unpack(now.state)
     change, event, outcome = past(law, place, motion, now.stance, now.guard, now.ledger.events)
     flow = flow_of(law.s, law.friction, law.one_sided, change.stance, tilt=law.tilt)

@@ -31,7 +31,6 @@ class Fact:
 
     @property
     def verdict(self) -> str:
-        """Holds, or does not hold."""
         return "holds" if self.holds else "does not hold"
 
 
@@ -51,7 +50,6 @@ class Evidence:
 
     @property
     def table_1(self) -> xr.Dataset:
-        """Measures of the gait of Table 1."""
         return self.branch.sel(damping=200.0)
 
 
@@ -85,7 +83,6 @@ class Group:
     claims: tuple[Claim, ...]
 
     def facts(self, evidence: Evidence) -> list[Fact]:
-        """The rows of the table."""
         numbers = self.numbers(evidence)
         told = SimpleNamespace(**numbers)
         return [

@@ -22,7 +22,6 @@ GROUPS = (TYPICAL_GAIT, THREE_DAMPINGS, INDICATORS, PREMISES, MISPRINTS)
 
 
 def all_facts(evidence: Evidence) -> list[Fact]:
-    """The whole table, in the paper's order."""
     return [fact for group in GROUPS for fact in group.facts(evidence)]
 
 
@@ -39,7 +38,6 @@ def held(table: Sequence[Fact]) -> str:
 
 
 def as_page(table: Sequence[Fact]) -> str:
-    """The table for a reader, in Markdown."""
     missing = [fact for fact in table if not fact.holds]
     lines = [
         "# The paper's facts, published against found",
@@ -65,7 +63,6 @@ def as_page(table: Sequence[Fact]) -> str:
 
 
 def write(table: Sequence[Fact], folder: Path) -> list[Path]:
-    """The table as Markdown and CSV in `folder`; returns the paths."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / "facts.md", folder / "facts.csv"]
     paths[0].write_text(as_page(table), encoding="utf-8")
