@@ -71,15 +71,31 @@ def test_what_a_finer_mesh_found_has_its_derivatives():
     np.testing.assert_allclose(jax.jacfwd(period)(at), quotient, rtol=1e-6)
 
 
-def test_an_orbit_of_ten_steps_is_found_from_each_of_its_points_and_begins_there():
-    # One of the ten steps has no double support; the start may lie on either side of it.
-    params = vrw.WheelParams(damping=219.85)
-    x = vrw.steps(params, np.asarray([[0.1, 1.6, -0.1]]), 600).section_state
+ORBITS = vrw.WheelParams(damping=219.85)
+
+
+@pytest.fixture(scope="module")
+def points_of_ten():
+    """Of an orbit in which one of ten steps has no double support."""
+    x = vrw.steps(ORBITS, np.asarray([[0.1, 1.6, -0.1]]), 600).section_state
     points = [np.asarray(x[0])]
     for _ in range(9):
-        points.append(np.asarray(vrw.steps(params, points[-1][None]).section_state[0]))
-    for point in points:
-        cycle = vrw.limit_cycle(params, guess=point, period_n=10)
+        points.append(np.asarray(vrw.steps(ORBITS, points[-1][None]).section_state[0]))
+    return points
+
+
+def test_an_orbit_of_ten_steps_is_found_from_each_of_its_points_and_begins_there(points_of_ten):
+    # The start may lie on either side of the step without double support.
+    for point in points_of_ten:
+        cycle = vrw.limit_cycle(ORBITS, guess=point, period_n=10)
         assert int(cycle.outcome) == vrw.Outcome.STEPPED
         assert np.max(np.abs(point - cycle.section_state)) < 1e-7
         assert np.sum(np.asarray(cycle.durations)[:, 0] == 0.0) == 1
+
+
+def test_on_a_finer_mesh_that_orbit_is_found_from_each_point_under_vmap_too(points_of_ten):
+    options = vrw.CycleOptions.tight()
+    find = lambda x: vrw.limit_cycle(ORBITS, guess=x, period_n=10, options=options)
+    cycles = jax.vmap(find)(np.stack(points_of_ten))
+    assert np.all(np.asarray(cycles.outcome) == vrw.Outcome.STEPPED)
+    assert np.abs(cycles.section_state - np.stack(points_of_ten)).max() < 1e-7
