@@ -1,5 +1,6 @@
 """Which gaits of a wheel attract: walks from a stated set of starts, and Newton's method on."""
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import equinox as eqx
@@ -167,13 +168,15 @@ def _walked_to(finder: Any, values: np.ndarray, n_starts: int) -> tuple[np.ndarr
     begun = as_full_states(columns, np.concatenate(starts), finder.n_legs)
     x, missed, open_ = np.array(begun), np.full(len(owner), np.inf), np.arange(len(owner))
     walking, like = np.ones(len(owner), bool), np.zeros(len(owner), bool)
-    for n_steps in ROUNDS:
-        there = _walked(finder, columns[:, open_], x[open_], n_steps)
-        x[open_], walking[open_], missed[open_] = there
-        like |= _like(x[:, :m], missed, n, SETTLED)
-        open_ = np.flatnonzero(walking & ~like & (missed >= SETTLED))
-        if not len(open_):
-            break
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(finder.prepare, values[:1], begun[:1])
+        for n_steps in ROUNDS:
+            there = _walked(finder, columns[:, open_], x[open_], n_steps)
+            x[open_], walking[open_], missed[open_] = there
+            like |= _like(x[:, :m], missed, n, SETTLED)
+            open_ = np.flatnonzero(walking & ~like & (missed >= SETTLED))
+            if not len(open_):
+                break
     chosen = ~_like(x[:, :m], missed, n, NEAR) & (missed < NEAR)
     chosen[np.setdiff1d(np.arange(n), owner[chosen])] = True  # the first start of who has none
     some = np.flatnonzero(chosen)

@@ -86,6 +86,11 @@ class GroundFinder(AbstractWalkingFinder):
         """The gaits near section states, wheel by wheel, without derivatives."""
         return self._told(_cycles, values, states, by_values=False)
 
+    def prepare(self, values: np.ndarray, states: np.ndarray) -> None:
+        """What Newton's method asks for, compiled while another thread walks towards its start."""
+        maps = Periods(self.model, self.n_legs, self.period_n, values)
+        maps.around(self.step_options, states, False)
+
     def first_guess(self, values: Values) -> Array:
         return self.first_guesses(values[None])[0]
 

@@ -87,7 +87,14 @@ def one_wheel(params: Any, instead: str) -> None:
 def options_of(options: Options | None) -> Options:
     if options is not None:
         instance("options", options, Options, "give vrw.Options(), or vrw.Options.tight()")
-    return Options() if options is None else options
+    return _usual(jnp.result_type(float)) if options is None else options
+
+
+@functools.cache
+def _usual(dtype: np.dtype) -> Options:
+    """Made once for each of JAX's default types; numbers, whatever is being traced."""
+    with jax.ensure_compile_time_eval():
+        return Options()
 
 
 def state_of(x: Any, what: str = "the section state") -> Array:
@@ -123,7 +130,7 @@ def checked(
     options.require_reachable(jnp.result_type(*jax.tree.leaves(params)))
     dtype = jnp.result_type(state, params.damping)
     options.require_reachable(dtype)
-    convert = lambda leaf: leaf.astype(dtype)
+    convert = lambda leaf: leaf if leaf.dtype == dtype else leaf.astype(dtype)
     return jax.tree.map(convert, params), convert(state), model, jax.tree.map(convert, options)
 
 
