@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.batches import lane_collocation
+from vrw_jax.batches import fixed_work
 from vrw_jax.cycles import sequence
 from vrw_jax.models import lane_step
 from vrw_jax.models.viscoelastic import flow_of
@@ -168,10 +168,8 @@ def by_lanes():
 
 def by_collocation_of_a_step():
     phase, q, v = at(2)
-    scheme = lane_collocation.Scheme(Mesh(2, 1.0), sweeps=4, rounds=8)
-    end = jax.jit(lambda q, v: lane_collocation.collocate(phase, q, v, jnp.asarray(0.2), scheme))(
-        q, v
-    )
+    scheme = fixed_work.Scheme(Mesh(2, 1.0), sweeps=4, rounds=8)
+    end = jax.jit(lambda q, v: fixed_work.collocate(phase, q, v, jnp.asarray(0.2), scheme))(q, v)
     return end.q, end.v
 
 

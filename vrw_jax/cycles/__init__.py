@@ -9,6 +9,7 @@ from vrw_jax.cycles.attracting import (
     starts_of,
 )
 from vrw_jax.cycles.by_collocation import CollocationFinder
+from vrw_jax.cycles.by_walking import WalkedCycle
 from vrw_jax.cycles.collocated import LimitCycle, on_mesh
 from vrw_jax.cycles.cycle import MEASURED, ON_STABILITY, AbstractCycle, multipliers_told
 from vrw_jax.cycles.derivatives import over_lanes
@@ -34,5 +35,4 @@ from vrw_jax.cycles.on_ground import Periods, solved
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.premises import default_margins, takeoff_acceleration
 from vrw_jax.cycles.search import Located, Problem, correction_size, nothing_known
-from vrw_jax.cycles.section_cycle import WalkedCycle
 from vrw_jax.cycles.sensitivity import sensitivities

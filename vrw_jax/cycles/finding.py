@@ -9,14 +9,13 @@ import numpy as np
 from jaxtyping import Array
 
 from vrw_jax.cycles.by_collocation import CollocationFinder
-from vrw_jax.cycles.by_walking import SectionFinder
+from vrw_jax.cycles.by_walking import SectionFinder, WalkedCycle
 from vrw_jax.cycles.collocated import LimitCycle
 from vrw_jax.cycles.cycle import AbstractCycle
 from vrw_jax.cycles.finder import AbstractGaitFinder
 from vrw_jax.cycles.on_ground import GroundFinder
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.search import Located
-from vrw_jax.cycles.section_cycle import WalkedCycle
 from vrw_jax.numerics import Options
 from vrw_jax.walks import ModelLike, one_wheel, options_of, rung_of, state_of
 from vrw_jax.wheel import WheelParams

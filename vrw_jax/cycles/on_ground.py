@@ -17,13 +17,17 @@ from vrw_jax.cycles.attracting import slow_gaits
 from vrw_jax.cycles.by_walking import (
     AbstractWalkingFinder,
     SectionFinder,
+    WalkedCycle,
+    cycle_from,
+    finest,
     gait_of,
+    of_steps,
+    stepped_cycle,
     where_walks_begin,
 )
 from vrw_jax.cycles.cycle import AbstractCycle
 from vrw_jax.cycles.finder import Gait, Measured, Values, leading, measured_of
 from vrw_jax.cycles.options import CycleOptions
-from vrw_jax.cycles.section_cycle import WalkedCycle, cycle_from, finest, of_steps, stepped_cycle
 from vrw_jax.models import (
     AbstractStep,
     AbstractWheel,

@@ -56,6 +56,7 @@ from vrw_jax.numerics.gauss import (
     ONCE,
     TWICE,
     Mesh,
+    lagrange,
     transfer_matrix,
 )
 from vrw_jax.numerics.hybrid import Guard, Mode, Stop, walk

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from vrw_jax.answers import RIGID, answer
 from vrw_jax.cycles import (
     CycleOptions,
     Readings,
@@ -34,10 +35,9 @@ from vrw_jax.models import (
     reason_of,
 )
 from vrw_jax.numerics import Options, in_batches
-from vrw_jax.scans.answered import AnswerEngine
 from vrw_jax.scans.evaluate import Engine, masked, n_cores, numbers
-from vrw_jax.scans.offer import derivative
-from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, WheelParams
+from vrw_jax.scans.offer import derivative, error_of
+from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, WheelParams, wheel_of
 
 SHARE, LANES = 512, 64
 """Samples that a thread takes at a time, and gaits that are told together: a number of its own, so
@@ -174,6 +174,26 @@ class LadderEngine:
         """`ModelChoice.reason` of each of the paper's gaits, over the step that it repeats."""
         reason, _ = reason_of(lower, friction - self._paper.friction)
         return np.asarray(reason, np.int8)
+
+
+class AnswerEngine:
+    """Measures to within a tolerance, by the lowest rung that gives them; see `vrw.answer`."""
+
+    def __init__(
+        self, measures: tuple[str, ...], base: WheelParams, model: UnilateralWheel, tol: float
+    ) -> None:
+        self._measures, self._base, self._model, self._tol = measures, base, model, tol
+
+    def __call__(self, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Results of the samples in `columns` (one value per sample of each swept parameter)."""
+        *own, friction = numbers(columns, self._model, self._base).T
+        params = wheel_of(tuple(map(jnp.asarray, own)), self._base.n_legs)
+        stoppers = self._model.stoppers
+        told = answer(self._measures, params, self._tol, friction=friction, stoppers=stoppers)
+        results = {name: told.values[:, i] for i, name in enumerate(self._measures)}
+        results |= {error_of(name): told.errors[:, i] for i, name in enumerate(self._measures)}
+        rung = np.maximum(told.rungs - RIGID, 0).astype(np.int8)
+        return masked(told.outcomes, results | {"rung": rung})
 
 
 def engine_for(
