@@ -346,8 +346,7 @@ def test_a_wrong_design_gets_one_sentence(make, expected: str) -> None:
 
 @pytest.fixture(scope="module")
 def engine() -> Engine:
-    of = planned()
-    return Engine(of.measures, of.base, of.model, of.options, of.cycle_options, threads=2)
+    return Engine(planned().for_engine, threads=2)
 
 
 @pytest.fixture(scope="module")
@@ -482,7 +481,7 @@ vrw_jax.start_jax(os.environ["JAX_COMPILATION_CACHE_DIR"])
 sys.path.insert(0, {tests!r})
 from support import scanning
 of = scanning.planned()
-engine = scanning.Engine(of.measures, of.base, of.model, of.options, of.cycle_options)
+engine = scanning.Engine(of.for_engine)
 columns = scanning.GRID.block((slice(None), slice(None)))
 size = LANES + scanning.GRID.size
 told = engine({{name: np.resize(column, size) for name, column in columns.items()}})
@@ -547,10 +546,9 @@ def test_a_cluster_that_loses_a_worker_gives_bitwise_the_serial_scan(
 
 def test_a_worker_names_its_traces_as_the_process_that_asked() -> None:
     """Otherwise each would trace and compile what the cache holds."""
-    of = planned()
-    here = (of.measures, of.base, of.model, of.options, of.cycle_options)
+    here = planned().for_engine
     there = pickle.loads(pickle.dumps(here))
-    assert repr(Engine(*here)._settings) == repr(Engine(*there)._settings)
+    assert repr(Engine(here)._settings) == repr(Engine(there)._settings)
 
 
 def backwards(planned: Plan, missing: Sequence[int]) -> Iterator[Chunk]:

@@ -62,8 +62,7 @@ def _chunks(client: "Client", planned: Plan, missing: Sequence[int]) -> Iterator
     """Results of the missing chunks, in the order in which they come."""
     from distributed import Future, KilledWorker, as_completed
 
-    of = planned
-    recipe = pickle.dumps((of.measures, of.base, of.model, of.options, of.cycle_options, of.tol))
+    recipe = pickle.dumps(planned.for_engine)
     here, waiting = origin(), iter(missing)
     held: dict[Future, int] = {}
     coming = as_completed(loop=client.loop)
@@ -111,6 +110,4 @@ def _computed(
 def _engine(recipe: bytes) -> Evaluate:
     from distributed import get_worker
 
-    measures, base, model, options, cycle_options, tol = pickle.loads(recipe)
-    threads = get_worker().state.nthreads
-    return engine_for(measures, base, model, options, cycle_options, threads, tol)
+    return engine_for(pickle.loads(recipe), get_worker().state.nthreads)

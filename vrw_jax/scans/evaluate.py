@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array
 
 from vrw_jax.cycles import AbstractCycle, CycleOptions, confirmed, finder_of
-from vrw_jax.models import AbstractWheel, ViscoelasticWheel
+from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import Options
 from vrw_jax.results import MARGINS
 from vrw_jax.runtime import compiled
@@ -33,6 +33,17 @@ Told = tuple[Array, Array, dict[str, Array]]
 """Outcome, section state, and measures by name."""
 
 
+class Asked(NamedTuple):
+    """What samples are computed for, and by which choices."""
+
+    measures: tuple[str, ...]
+    base: WheelParams
+    model: Any  # the rung
+    options: Options
+    cycle_options: CycleOptions
+    tol: float | None = None  # of the measures, in their units
+
+
 class Engine:
     """Evaluates samples of one wheel for a fixed set of measures; compiled at the first call.
 
@@ -40,15 +51,9 @@ class Engine:
     step from it, for the margins and as a check. They are compiled side by side.
     """
 
-    def __init__(
-        self,
-        measures: tuple[str, ...],
-        base: WheelParams,
-        model: ViscoelasticWheel,
-        options: Options,
-        cycle_options: CycleOptions,
-        threads: int | None = None,  # at work side by side on a CPU; None: one for each core
-    ) -> None:
+    def __init__(self, asked: Asked, threads: int | None = None) -> None:
+        """`threads`: at work side by side on a CPU; None: one for each core."""
+        measures, base, model, options, cycle_options, _ = asked
         self._threads = n_cores() if threads is None else threads
         self._base, self._model, self._options = base, model, options
         wanted = tuple(d for name in measures if (d := derivative(name)) is not None)

@@ -8,7 +8,7 @@ are gathered and walk on the upper rung, so that no sample pays for another.
 import dataclasses
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, cast
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -18,7 +18,6 @@ from jaxtyping import Array
 
 from vrw_jax.answers import RIGID, answer
 from vrw_jax.cycles import (
-    CycleOptions,
     Readings,
     WalkedCycle,
     finder_of,
@@ -28,16 +27,13 @@ from vrw_jax.cycles import (
 from vrw_jax.models import (
     UNILATERAL,
     VISCOELASTIC,
-    AbstractWheel,
-    LadderWheel,
-    UnilateralWheel,
     ViscoelasticWheel,
     reason_of,
 )
-from vrw_jax.numerics import Options, in_batches
-from vrw_jax.scans.evaluate import Engine, masked, n_cores, numbers
+from vrw_jax.numerics import in_batches
+from vrw_jax.scans.evaluate import Asked, Engine, masked, n_cores, numbers
 from vrw_jax.scans.offer import derivative, error_of
-from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, WheelParams, wheel_of
+from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, wheel_of
 
 SHARE, LANES = 512, 64
 """Samples that a thread takes at a time, and gaits that are told together: a number of its own, so
@@ -50,15 +46,8 @@ Told = dict[str, np.ndarray]
 class GroundEngine:
     """Evaluates samples on real ground for a fixed set of measures."""
 
-    def __init__(
-        self,
-        measures: tuple[str, ...],
-        base: WheelParams,
-        model: UnilateralWheel,
-        options: Options,
-        _cycle_options: CycleOptions | None = None,  # gaits here are walked
-        threads: int | None = None,
-    ) -> None:
+    def __init__(self, asked: Asked, threads: int | None = None) -> None:
+        measures, base, model, options, *_ = asked  # gaits here are walked
         self._base, self._model = base, model
         self._threads = n_cores() if threads is None else threads
         wanted = tuple(d for name in measures if (d := derivative(name)) is not None)
@@ -129,22 +118,13 @@ OF_PAPER: dict[str, tuple[str, ...]] = {
 class LadderEngine:
     """Evaluates samples on the lowest rung that serves each of them."""
 
-    def __init__(
-        self,
-        measures: tuple[str, ...],
-        base: WheelParams,
-        model: LadderWheel,
-        options: Options,
-        cycle_options: CycleOptions,
-        threads: int | None = None,
-    ) -> None:
-        self._measures, self._base, self._model = measures, base, model
+    def __init__(self, asked: Asked, threads: int | None = None) -> None:
+        self._measures, self._base, self._model, *_ = asked
         self._paper = ViscoelasticWheel()
-        asked = [part for name in measures for part in OF_PAPER.get(name, (name,))]
-        self._lower = Engine(
-            tuple(dict.fromkeys(asked)), base, self._paper, options, cycle_options, threads
-        )
-        self._upper = GroundEngine(measures, base, model.ground, options, None, threads)
+        parts = (part for name in asked.measures for part in OF_PAPER.get(name, (name,)))
+        of_paper = asked._replace(measures=tuple(dict.fromkeys(parts)), model=self._paper)
+        self._lower = Engine(of_paper, threads)
+        self._upper = GroundEngine(asked._replace(model=asked.model.ground), threads)
 
     def __call__(self, columns: Columns) -> Told:
         """Results of the samples in `columns`, with `rung` and `reason` of each."""
@@ -179,10 +159,10 @@ class LadderEngine:
 class AnswerEngine:
     """Measures to within a tolerance, by the lowest rung that gives them; see `vrw.answer`."""
 
-    def __init__(
-        self, measures: tuple[str, ...], base: WheelParams, model: UnilateralWheel, tol: float
-    ) -> None:
-        self._measures, self._base, self._model, self._tol = measures, base, model, tol
+    def __init__(self, asked: Asked) -> None:
+        self._measures, self._base, self._model, *_, tol = asked
+        assert tol is not None  # the caller looked
+        self._tol = tol
 
     def __call__(self, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Results of the samples in `columns` (one value per sample of each swept parameter)."""
@@ -197,19 +177,13 @@ class AnswerEngine:
 
 
 def engine_for(
-    measures: tuple[str, ...],
-    base: WheelParams,
-    model: AbstractWheel,
-    options: Options,
-    cycle_options: CycleOptions,
-    threads: int | None = None,
-    tol: float | None = None,
+    asked: Asked, threads: int | None = None
 ) -> Engine | GroundEngine | LadderEngine | AnswerEngine:
     """What computes the samples of a scan of this rung, or to within a tolerance."""
-    if tol is not None:
-        return AnswerEngine(measures, base, cast(UnilateralWheel, model), tol)
-    make: Any = ENGINES[model.rung]
-    return make(measures, base, model, options, cycle_options, threads)
+    if asked.tol is not None:
+        return AnswerEngine(asked)
+    make: Any = ENGINES[asked.model.rung]
+    return make(asked, threads)
 
 
 ENGINES = {"viscoelastic": Engine, "unilateral": GroundEngine, "ladder": LadderEngine}

@@ -18,6 +18,7 @@ from vrw_jax.numerics import Options
 from vrw_jax.results import MARGINS, attrs_of, locked_legs, provenance
 from vrw_jax.runtime import code_digest
 from vrw_jax.scans.design import AbstractDesign, Columns
+from vrw_jax.scans.evaluate import Asked
 from vrw_jax.scans.ground import engine_for
 from vrw_jax.scans.offer import canonical, check_measures, error_of, offer_of, variable_attrs
 from vrw_jax.scans.store import (
@@ -97,9 +98,14 @@ class Plan:
             "config": self.text,
         }
 
-    def engine(self) -> Evaluate:
+    @property
+    def for_engine(self) -> Asked:
+        """What samples are computed for."""
         given = self.measures, self.base, self.model, self.options, self.cycle_options
-        return engine_for(*given, tol=self.tol)
+        return Asked(*given, self.tol)
+
+    def engine(self) -> Evaluate:
+        return engine_for(self.for_engine)
 
 
 def plan(
