@@ -49,11 +49,11 @@ def any_mode(
     def rule(primals: tuple, tangents: tuple) -> tuple:
         moved = tuple(i for i, t in enumerate(tangents) if not isinstance(t, SymbolicZero))
         if not moved:
-            out, other = wrapped(*primals)
-            return (out, other), (jax.tree.map(jnp.zeros_like, out), _no_tangent(other))
+            told = wrapped(*primals)
+            return told, without_derivative(told)
         (jacobian, out), other = differentiated(moved)(*primals)
         tangent = _pushed(out, jacobian, tuple(tangents[i] for i in moved))
-        return (out, other), (tangent, _no_tangent(other))
+        return (out, other), (tangent, without_derivative(other))
 
     wrapped.defjvp(rule, symbolic_zeros=True)
     return wrapped
@@ -88,11 +88,6 @@ def _pushed(out: PyTree, by_argument: PyTree, tangents: tuple) -> PyTree:
         return sum(pushed[1:], start=pushed[0])
 
     return jax.tree.map(push, out, *by_argument)
-
-
-def _no_tangent(tree: PyTree) -> PyTree:
-    """The tangent of integers and booleans."""
-    return jax.tree.map(lambda x: np.zeros(jnp.shape(x), jax.dtypes.float0), tree)
 
 
 InForm = Callable[[LaneFunction, int], LaneFunction]

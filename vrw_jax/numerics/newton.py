@@ -47,51 +47,8 @@ class SectionCycle(NamedTuple):
         return as_text("SectionCycle", rows)
 
 
-class Corrected(NamedTuple):
-    x: Float[Array, " n"]  # after the last correction
-    at: Float[Array, " n"]  # before it
-    told: Any  # what was told there
-    converged: Bool[Array, ""]
-    iterations: Int[Array, ""]  # until a change was small enough
-
-
 ITERATIONS = 30
 """Of Newton's method, at most."""
-
-
-def corrected(
-    correct: Callable[[Array], tuple[Array, Any]],
-    start: Float[Array, " n"],
-    blank: Any,
-    tolerance: Scalar,
-    further: int,
-    iterations: int = ITERATIONS,
-) -> Corrected:
-    """Newton's method: `correct(x)` gives its change, and tells something in the form of `blank`.
-
-    Once a change is within `tolerance`, `further` corrections follow. All are turns of one loop, so
-    that `correct`, often a large program, is compiled once.
-    """
-
-    def searches(size: Array, count: Array) -> Array:
-        return (size > tolerance) & (count < iterations) & jnp.isfinite(size)
-
-    def going(state: tuple) -> Array:
-        _, size, count, followed, *_ = state
-        return searches(size, count) | ((size <= tolerance) & (followed < further))
-
-    def step(state: tuple) -> tuple:
-        x, size, count, followed, *_ = state
-        searching = searches(size, count)
-        change, told = correct(x)
-        size = jnp.where(searching, jnp.max(jnp.abs(change)), size)
-        moved = jnp.where(jnp.all(jnp.isfinite(change)), x + change, x)
-        return moved, size, count + searching, followed + ~searching, x, told
-
-    zero, one = jnp.zeros((), jnp.int32), jnp.ones((), start.dtype)
-    begin = (start, one, zero, zero, start, blank)
-    x, size, count, _, at, told = lax.while_loop(going, step, begin)
-    return Corrected(x, at, told, size <= tolerance, count)
 
 
 def newton_cycle(
@@ -196,14 +153,29 @@ POLISHED = 2
 def _found(
     image: Map, iterations: int, start: Array, tolerance: Array, *closed_over: Any
 ) -> SectionCycle:
-    def correct(x: Array) -> tuple[Array, tuple[Array, Array]]:
-        change, jacobian, miss = _correction(image, x, closed_over)
-        return change, (jacobian, jnp.max(jnp.abs(miss)))
+    """All corrections are turns of one loop: the map, often a large program, is compiled once."""
 
-    blank = jnp.zeros((start.size,) * 2, start.dtype), jnp.ones((), start.dtype)
-    found = corrected(correct, start, blank, tolerance, POLISHED, iterations)
-    x, (jacobian, residual) = jnp.where(found.converged, found.x, start), found.told
-    return SectionCycle(x, jacobian, residual, found.converged, found.iterations)
+    def searches(size: Array, count: Array) -> Array:
+        return (size > tolerance) & (count < iterations) & jnp.isfinite(size)
+
+    def going(state: tuple) -> Array:
+        _, size, count, followed, *_ = state
+        return searches(size, count) | ((size <= tolerance) & (followed < POLISHED))
+
+    def step(state: tuple) -> tuple:
+        x, size, count, followed, *_ = state
+        searching = searches(size, count)
+        change, jacobian, miss = _correction(image, x, closed_over)
+        size = jnp.where(searching, jnp.max(jnp.abs(change)), size)
+        moved = jnp.where(jnp.all(jnp.isfinite(change)), x + change, x)
+        told = jacobian, jnp.max(jnp.abs(miss))
+        return moved, size, count + searching, followed + ~searching, *told
+
+    zero, one = jnp.zeros((), jnp.int32), jnp.ones((), start.dtype)
+    begin = start, one, zero, zero, jnp.zeros((start.size,) * 2, start.dtype), one
+    x, size, count, _, jacobian, residual = lax.while_loop(going, step, begin)
+    converged = size <= tolerance
+    return SectionCycle(jnp.where(converged, x, start), jacobian, residual, converged, count)
 
 
 @_found.defjvp

@@ -12,7 +12,7 @@ import numpy as np
 from vrw_jax.scans.design import AbstractDesign, Columns
 from vrw_jax.scans.evaluate import n_cores
 from vrw_jax.scans.offer import offer_of
-from vrw_jax.scans.planning import Evaluate, Plan
+from vrw_jax.scans.planning import Plan
 from vrw_jax.scans.running import found_store
 
 MEASURED = {"viscoelastic": 1024, "ladder": 64, "unilateral": 16}
@@ -26,9 +26,7 @@ TYPICAL = 0.5e9
 """Bytes of code and arrays: docs/scans.md."""
 
 
-def explained(
-    planned: Plan, store: str | Path | None = None, evaluate: Evaluate | None = None
-) -> dict[str, str]:
+def explained(planned: Plan, store: str | Path | None = None) -> dict[str, str]:
     """Sizes, chunks, memory and time of a scan, as lines for a reader; writes nothing.
 
     Time and memory are measured on samples spread over the design, which are computed for that.
@@ -49,7 +47,7 @@ def explained(
     if not left:
         return told | {"time": "none: the store is complete"}
     n = min(left, MEASURED[planned.model.rung] * n_cores())
-    engine = planned.engine() if evaluate is None else evaluate
+    engine = planned.engine()
     began = perf_counter()
     engine(_spread(planned.design, 1))
     ready = perf_counter()

@@ -212,9 +212,7 @@ class Optimality(NamedTuple):
     """Which constraints and bounds hold a gait where it is, and what each one costs."""
 
     prices: np.ndarray  # objective gained per unit of a constraint's margin given up
-    low: (
-        np.ndarray
-    )  # objective lost per width of a free parameter's lower bound given up, < 0: gain
+    low: np.ndarray  # objective lost per width of a lower bound given up, < 0: gain
     high: np.ndarray
     residual: float  # of the first-order condition, relative to the objective's gradient
 
