@@ -55,6 +55,14 @@ def test_started_processes_compute_in_64_bits_by_the_quick_compiler(tmp_path):
     assert told[2:] == ["--xla_cpu_enable_fast_math=false", *quick]
 
 
+def test_the_folder_of_compiled_code_may_be_told_from_home(tmp_path):
+    code = (
+        "import jax, vrw_jax as vrw; vrw.start_jax('~/code'); "
+        "print(jax.config.jax_compilation_cache_dir)"
+    )
+    assert told_by(code, HOME=str(tmp_path)) == [str(tmp_path / "code")]
+
+
 def test_a_flag_that_the_user_set_stays():
     flag = "--xla_cpu_use_fusion_emitters=true"
     code = "import os, vrw_jax as vrw; vrw.start_jax(); print(os.environ['XLA_FLAGS'])"

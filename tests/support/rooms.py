@@ -15,7 +15,7 @@ from textwrap import dedent
 from typing import NamedTuple
 
 FLOW = (
-    ("simd",), ("runtime",), ("wording",), ("numerics",), ("wheel",), ("results",),
+    ("simd",), ("wording",), ("runtime",), ("numerics",), ("wheel",), ("results",),
     ("models",), ("walks",), ("batches", "cycles"), ("gaits",), ("answers",),
     ("branches", "tuning", "scans"), ("figures", "web"), ("paper",), ("app",),
 )  # fmt: skip

@@ -67,6 +67,12 @@ def make() -> None:
         "infinite": (float("inf"), "ValueError"),
     }
 
+    use("a number as the folder of compiled code", lambda: vrw.start_jax(3), "TypeError", "cache")
+    use(
+        "a file as the folder of compiled code",
+        lambda: vrw.start_jax(__file__), "NotADirectoryError", "a file",
+    )  # fmt: skip
+
     # Parameters
     for name in ("damping", "slope", "leg_mass"):
         bad = not_numbers | {

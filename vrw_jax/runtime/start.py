@@ -6,6 +6,8 @@ from pathlib import Path
 
 import jax
 
+from vrw_jax.wording import instance
+
 
 def start_jax(cache: str | Path | None = None) -> None:
     """64-bit numbers, compiled code kept in `cache`, and on a CPU the quicker of XLA's two ways.
@@ -15,17 +17,25 @@ def start_jax(cache: str | Path | None = None) -> None:
     else one of the user's cache folder.
 
     Args:
-        cache: folder of compiled code.
+        cache: folder of compiled code; `~` is the user's own.
 
     Returns:
         Nothing.
 
     Raises:
         TypeError: a `cache` that is no path.
+        NotADirectoryError: a `cache` that is a file.
 
     Examples:
         >>> vrw.start_jax("~/.cache/vrw_jax")  # doctest: +SKIP
     """
+    if cache is not None:
+        instance("cache", cache, (str, Path), "give a folder, or nothing for the user's own")
+        cache = Path(cache).expanduser()
+        if cache.is_file():
+            raise NotADirectoryError(
+                f"cache is {cache}, a file, but compiled code is kept in a folder: give a folder."
+            )
     jax.config.update("jax_enable_x64", True)
     if cache is not None or "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         folder = _cache_folder() / "vrw_jax" if cache is None else cache
