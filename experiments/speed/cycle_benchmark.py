@@ -23,10 +23,12 @@ from experiments.shared.tables import DOCS, markdown
 from experiments.shared.timing import on_one_core, processor, seconds
 from experiments.shared.wheels import WIDE_BOX, rows_of
 from experiments.shared.wheels import wheels as wheels_of_rows
-from vrw_jax.cycles import MEASURED, ON_STABILITY
+from vrw_jax.cycles import MEASURED
 from vrw_jax.wheel import parameters_of, wheel_of
 
 N_SETS, N_STAGES, LANES = 2048, 48, 1024
+ON_STABILITY = ("spectral_radius", "spectral_margin", "stability_margin")
+"""Derivatives of these are second derivatives of the motion."""
 FIRST = """
 import time; began = time.time(), time.process_time()
 import jax

@@ -1,5 +1,9 @@
 """Borders in two parameters: curves through turning points, closed ones, and what they meet."""
 
+import functools
+from collections.abc import Callable
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,9 +15,36 @@ from vrw_jax.branches.bordering import border_curves
 from vrw_jax.branches.continuation import MapRun
 from vrw_jax.branches.run import run_all
 from vrw_jax.numerics.arclength import ArclengthOptions, Ending
-from vrw_jax.numerics.levels import LevelFollowed, LevelPoint, MapLevel, margins_beside_fold
+from vrw_jax.numerics.levels import (
+    AbstractLevel,
+    LevelFollowed,
+    LevelLinear,
+    LevelPoint,
+    margins_beside_fold,
+)
 
 OPTIONS = ArclengthOptions(max_points=400, largest_step=0.05)
+
+
+class MapLevel(AbstractLevel):
+    """Of any map x -> `function(wheel, x, p)`: `quantity(jacobian, x, p)` is zero."""
+
+    function: Callable = eqx.field(static=True)
+    quantity: Callable = eqx.field(static=True)
+
+    def linearise(self, wheel, z, p):
+        image = functools.partial(self.function, wheel)
+        by_x, by_p = jax.jacfwd(image, argnums=(0, 1))(z, p)
+        right = jnp.concatenate([(image(z, p) - z)[:, None], by_p], 1)
+        solved = jnp.linalg.solve(jnp.eye(len(z)) - by_x, right)
+        value = lambda z, p: self.quantity(jax.jacfwd(image)(z, p), z, p)
+        gz, gp = jax.jacfwd(value, argnums=(0, 1))(z, p)
+        told = value(z, p) + gz @ solved[:, 0]
+        columns = solved[:, 1], solved[:, 2]
+        return LevelLinear(solved[:, 0], columns, by_x, told, gp + gz @ solved[:, 1:])
+
+    def section(self, z):
+        return z
 
 
 def followed(function, quantity, z, p, bounds, seconds, second):

@@ -11,7 +11,7 @@ from vrw_jax.cycles.attracting import (
 from vrw_jax.cycles.by_collocation import CollocationFinder
 from vrw_jax.cycles.by_walking import WalkedCycle
 from vrw_jax.cycles.collocated import LimitCycle, on_mesh
-from vrw_jax.cycles.cycle import MEASURED, ON_STABILITY, AbstractCycle, multipliers_told
+from vrw_jax.cycles.cycle import MEASURED, AbstractCycle, multipliers_told
 from vrw_jax.cycles.derivatives import over_lanes
 from vrw_jax.cycles.finder import (
     AGREEMENT,

@@ -213,5 +213,3 @@ MEASURED: dict[str, Callable[[AbstractCycle], Array]] = {
 }
 """How a cycle tells its measures: the one table of them. Derivatives of those on stability are
 second derivatives of the motion: one more machine code to compile, and twice the time to run."""
-
-ON_STABILITY = ("spectral_radius", "spectral_margin", "stability_margin")

@@ -5,8 +5,6 @@ then a branch along the first, through turning points as through folds.
 """
 
 import abc
-import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -101,25 +99,3 @@ the equations are singular. The parameters, turning back there, are off by the s
 def margins_beside_fold(jacobian: Float[Array, "n n"]) -> Array:
     """Zero where one of `BIFURCATIONS` is."""
     return bifurcation_margins(jacobian).at[0].add(-BESIDE_FOLD)
-
-
-class MapLevel(AbstractLevel):
-    """Of any map x -> `function(wheel, x, p)`: `quantity(jacobian, x, p)` is zero."""
-
-    function: Callable[[Any, Section, Pair], Section] = eqx.field(static=True)
-    quantity: Callable[[Array, Section, Pair], Scalar] = eqx.field(static=True)
-
-    def linearise(self, wheel: Any, z: Unknown, p: Pair) -> LevelLinear:
-        image = functools.partial(self.function, wheel)
-        eye = jnp.eye(z.shape[0], dtype=z.dtype)
-        by_x, by_p = jax.jacfwd(image, argnums=(0, 1))(z, p)
-        right = jnp.concatenate([(image(z, p) - z)[:, None], by_p], 1)
-        solved = jnp.linalg.solve(eye - by_x, right)
-        value = lambda z, p: self.quantity(jax.jacfwd(image)(z, p), z, p)
-        gz, gp = jax.jacfwd(value, argnums=(0, 1))(z, p)
-        told = value(z, p) + gz @ solved[:, 0]
-        columns = solved[:, 1], solved[:, 2]
-        return LevelLinear(solved[:, 0], columns, by_x, told, gp + gz @ solved[:, 1:])
-
-    def section(self, z: Unknown) -> Section:
-        return z

@@ -3,10 +3,9 @@
 The places are sought for all brackets at once: one evaluation per round, whatever their number.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -25,14 +24,11 @@ ON_CIRCLE = 1e-4
 
 def bifurcation_functions(jacobians: np.ndarray) -> np.ndarray:
     """`BIFURCATIONS` on the last axis, from Jacobians (..., n, n); NaN where n has none such."""
-    margins = np.asarray(_margins(jnp.asarray(jacobians)))
+    margins = np.asarray(bifurcation_margins(jnp.asarray(jacobians)))
     values = np.full((*margins.shape[:-1], len(BIFURCATIONS)), np.nan)
     n = min(margins.shape[-1], len(BIFURCATIONS))
     values[..., :n] = margins[..., :n]
     return values
-
-
-_margins = jax.jit(bifurcation_margins)
 
 
 def turns(jacobian: np.ndarray) -> bool:
@@ -52,15 +48,14 @@ class Bracket(NamedTuple):
     column: int
 
 
-def brackets(values: np.ndarray, columns: Sequence[int] | None = None) -> list[Bracket]:
+def brackets(values: np.ndarray) -> list[Bracket]:
     """Where neighbours in `values` (point, quantity) differ in sign; NaN and zero differ in none.
 
     Two changes between neighbours are not seen: the continuation's steps decide what is found.
     """
     signs = np.sign(np.nan_to_num(values))
     found = np.argwhere(signs[:-1] * signs[1:] < 0.0)
-    wanted = range(values.shape[1]) if columns is None else columns
-    return [Bracket(int(i), int(i) + 1, int(q)) for i, q in found if q in wanted]
+    return [Bracket(int(i), int(i) + 1, int(q)) for i, q in found]
 
 
 class Located(NamedTuple):

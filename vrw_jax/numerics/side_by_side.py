@@ -18,7 +18,6 @@ from vrw_jax.numerics.arclength import (
     AbstractFollowed,
     ArclengthOptions,
     Corrected,
-    Followed,
     Linear,
     PathPoint,
     Plane,
@@ -122,11 +121,6 @@ def follow_many(
     return track_of(on)
 
 
-@eqx.filter_jit
-def _turned(followed: Any, options: Any, wheels: Any, bounds: Array, *of: Any) -> Followed:
-    return turned(followed, options, wheels, bounds, *of)
-
-
 def _linear_of(
     followed: AbstractFollowed, wheels: Any, bounds: Array, z: Unknown, share: Array, some: Any
 ) -> Linear:
@@ -158,6 +152,7 @@ def solve_many(
 
 
 _going: Any = eqx.filter_jit(going)
+_turned: Any = eqx.filter_jit(turned)
 _to_solve_many: Any = eqx.filter_jit(jax.vmap(to_solve))
 _unsolved: Any = eqx.filter_jit(unsolved)
 
