@@ -16,7 +16,7 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
-from support.scanning import GRID, MEASURES, Counted, arithmetic, planned
+from support.scanning import GRID, MEASURES, Counted, arithmetic, planned, run
 
 import vrw_jax as vrw
 from vrw_jax.cycles import finder
@@ -27,7 +27,7 @@ from vrw_jax.scans.dask import workers
 from vrw_jax.scans.evaluate import LANES, Engine
 from vrw_jax.scans.offer import ALWAYS
 from vrw_jax.scans.planning import Chunk, Plan, plan
-from vrw_jax.scans.running import Progress, run
+from vrw_jax.scans.running import Progress
 from vrw_jax.scans.store import chunk_shape, first_difference, open_scan
 from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams

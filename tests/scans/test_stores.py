@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 import xarray as xr
 import zarr
-from support.scanning import GRID, MEASURES, Counted, arithmetic, planned
+from support.scanning import GRID, MEASURES, Counted, arithmetic, planned, run
 
 import vrw_jax as vrw
 from vrw_jax.scans import design as designs
 from vrw_jax.scans import planning, soundness
 from vrw_jax.scans import store as scan_store
 from vrw_jax.scans.planning import plan
-from vrw_jax.scans.running import run
 from vrw_jax.scans.store import open_scan
 
 

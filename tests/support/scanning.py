@@ -1,15 +1,16 @@
 """A small design, and a stand-in for the engine that computes its samples."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
+import xarray as xr
 
 from vrw_jax.results.measures import MARGINS
 from vrw_jax.scans import design as designs
+from vrw_jax.scans import running
 from vrw_jax.scans.design import Columns
 from vrw_jax.scans.evaluate import Engine as Engine
-from vrw_jax.scans.planning import Plan, plan
-from vrw_jax.scans.running import run as run
+from vrw_jax.scans.planning import Chunk, Plan, plan
 from vrw_jax.wheel.outcomes import Outcome
 
 MEASURES = ("dls_fraction", "speed", "d dls_fraction / d damping")
@@ -39,6 +40,18 @@ class Counted:
         if self.calls == self.fails_at:
             raise self.error
         return arithmetic(columns)
+
+
+def run(
+    planned: Plan, store: object = None, evaluate: Callable | None = None, **more: object
+) -> xr.Dataset:
+    """A scan whose samples `evaluate` computes in the engine's stead, in turn."""
+
+    def in_turn(planned: Plan, missing: Sequence[int]) -> Iterator[Chunk]:
+        for index in missing:
+            yield index, evaluate(planned.design.block(planned.layout.region(index)))
+
+    return running.run(planned, store, **({"through": in_turn} if evaluate else {}) | more)
 
 
 def planned(chunk: int = 4, **changes: object) -> Plan:

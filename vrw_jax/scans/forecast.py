@@ -21,7 +21,6 @@ MEASURED = {"viscoelastic": 1024, "ladder": 64, "unilateral": 16}
 START = 5.0
 """Seconds until the first sample of a process that finds its code in the cache: docs/scans.md."""
 
-
 TYPICAL = 0.5e9
 """Bytes of code and arrays: docs/scans.md."""
 
@@ -34,7 +33,7 @@ def explained(planned: Plan, store: str | Path | None = None) -> dict[str, str]:
     layout, size = planned.layout, planned.design.size
     kept = None if store is None else found_store(planned, Path(store), verify=False)
     missing = list(range(layout.n_chunks)) if kept is None else kept.missing()
-    left = sum(math.prod(s.stop - s.start for s in layout.region(i)) for i in missing)
+    left = sum(math.prod(layout.shape_of(i)) for i in missing)
     chunk = math.prod(layout.chunk)
     axes = " x ".join(f"{n} {name}" for name, n in zip(layout.dims, layout.shape, strict=True))
     told = {

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import math
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from vrw_jax.cycles import CycleOptions
 from vrw_jax.numerics import Options
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.scans.design import AbstractDesign
-from vrw_jax.scans.planning import Chunk, Evaluate, Plan, Through, difference, origin, plan
+from vrw_jax.scans.planning import Chunk, Plan, Through, difference, origin, plan
 from vrw_jax.scans.store import (
     MANIFEST,
     PROVENANCE,
@@ -127,15 +128,14 @@ def run(
     store: str | Path | AbstractStore | None = None,
     *,
     report: Report | None = None,
-    evaluate: Evaluate | None = None,
     through: Through | None = None,
 ) -> xr.Dataset:
-    """Carry out a plan, here or `through` others; `evaluate` stands in for the plan's engine."""
+    """Carry out a plan, here or `through` others."""
     kept = store if isinstance(store, AbstractStore) else _kept(planned, store)
     missing = kept.missing()
     if missing or kept.damage:
         with kept.at_work():
-            _compute(planned, kept, missing, report, evaluate, through)
+            _compute(planned, kept, missing, report, through or _in_turn)
     return kept.dataset()
 
 
@@ -153,30 +153,27 @@ def _compute(
     kept: AbstractStore,
     missing: list[int],
     report: Report | None,
-    evaluate: Evaluate | None,
-    through: Through | None,
+    through: Through,
 ) -> None:
-    sizes = {index: _size(planned.layout.region(index)) for index in missing}
-    total, done, failed = sum(sizes.values()), 0, 0
+    shapes = {index: planned.layout.shape_of(index) for index in missing}
+    total, done, failed = sum(map(math.prod, shapes.values())), 0, 0
     if report is not None:
         report(Progress(total, 0, 0, planned.design.size - total))
-    through = _in_turn(evaluate) if through is None else through
     for index, results in through(planned, missing):
+        shape = shapes[index]
+        block = {name: x.reshape(*shape, *x.shape[1:]) for name, x in results.items()}
         with _disk_full_explained(kept, planned.layout.n_chunks):
-            kept.write(index, _shaped(results, planned.layout.region(index)))
-        done += sizes[index]
+            kept.write(index, block)
+        done += math.prod(shape)
         failed += int(np.count_nonzero(results["outcome"] != Outcome.STEPPED))
         if report is not None:
             report(Progress(total, done, failed, planned.design.size - total))
 
 
-def _in_turn(evaluate: Evaluate | None) -> Through:
-    def through(planned: Plan, missing: Sequence[int]) -> Iterator[Chunk]:
-        engine = planned.engine() if evaluate is None else evaluate
-        for index in missing:
-            yield index, engine(planned.design.block(planned.layout.region(index)))
-
-    return through
+def _in_turn(planned: Plan, missing: Sequence[int]) -> Iterator[Chunk]:
+    engine = planned.engine()
+    for index in missing:
+        yield index, engine(planned.design.block(planned.layout.region(index)))
 
 
 def open_store(planned: Plan, path: Path) -> ZarrStore:
@@ -190,8 +187,9 @@ def open_store(planned: Plan, path: Path) -> ZarrStore:
     other = difference(there[PROVENANCE], origin())
     missing = len(kept.missing())
     if other and missing:
+        damaged = f" ({len(kept.damaged)} of them damaged)" if kept.damaged else ""
         raise ValueError(
-            f"{path} lacks {missing} of {planned.layout.n_chunks} chunks{_damaged_among(kept)} and "
+            f"{path} lacks {missing} of {planned.layout.n_chunks} chunks{damaged} and "
             f"was begun by other means, so that its last digits might not fit: {other}. "
             "Go on with what it was begun with, or begin anew in another place."
         )
@@ -210,19 +208,6 @@ def found_store(planned: Plan, path: Path, verify: bool = True) -> ZarrStore | N
             "Give another place for this scan, or go back to those settings, or delete the store."
         )
     return ZarrStore(path, planned.layout, verify)
-
-
-def _damaged_among(kept: ZarrStore) -> str:
-    return f" ({len(kept.damaged)} of them damaged)" if kept.damaged else ""
-
-
-def _size(region: tuple[slice, ...]) -> int:
-    return int(np.prod([part.stop - part.start for part in region]))
-
-
-def _shaped(results: Mapping[str, np.ndarray], region: tuple[slice, ...]) -> dict[str, np.ndarray]:
-    shape = tuple(part.stop - part.start for part in region)
-    return {name: value.reshape(*shape, *value.shape[1:]) for name, value in results.items()}
 
 
 @contextlib.contextmanager

@@ -60,7 +60,7 @@ class Variable:
     name: str
     dtype: str
     missing: float | int
-    attrs: Mapping[str, object]
+    attrs: Mapping[str, Any]
     dims: tuple[str, ...] = ()
     shape: tuple[int, ...] = ()
 
@@ -78,7 +78,7 @@ class Layout:
     shape: tuple[int, ...]
     chunk: tuple[int, ...]
     variables: tuple[Variable, ...]
-    coordinates: Mapping[str, tuple[str, np.ndarray, Mapping[str, object]]]
+    coordinates: Mapping[str, tuple[str, np.ndarray, Mapping[str, Any]]]
 
     @property
     def n_chunks(self) -> int:
@@ -94,6 +94,9 @@ class Layout:
             slice(int(i) * c, min((int(i) + 1) * c, n))
             for i, c, n in zip(places, self.chunk, self.shape, strict=True)
         )
+
+    def shape_of(self, index: int) -> tuple[int, ...]:
+        return tuple(part.stop - part.start for part in self.region(index))
 
     @property
     def bytes_per_sample(self) -> int:
@@ -379,7 +382,7 @@ def _fill(path: Path, layout: Layout, attrs: Mapping[str, object]) -> None:
             dtype=values.dtype,
             dimension_names=(dim,),
             compressors=compressors,
-            attributes=_json(coordinate_attrs),
+            attributes=dict(coordinate_attrs),
         )
         array[:] = values
     for variable in layout.variables:
@@ -391,7 +394,7 @@ def _fill(path: Path, layout: Layout, attrs: Mapping[str, object]) -> None:
             fill_value=variable.missing,
             dimension_names=(*layout.dims, *variable.dims),
             compressors=compressors,
-            attributes=_json(variable.attrs),
+            attributes=dict(variable.attrs),
         )
     chunks = (layout.n_chunks, SIZE)
     group.create_group(BOOKS).create_array(
@@ -407,8 +410,3 @@ def _consolidate(path: Path, names: list[str]) -> None:
     parts = {name: json.loads((path / name / "zarr.json").read_text()) for name in names}
     whole = {"kind": "inline", "must_understand": False, "metadata": parts}
     place.write_text(json.dumps(told | {"consolidated_metadata": whole}, indent=2))
-
-
-def _json(attrs: Mapping[str, object]) -> dict[str, Any]:
-    """Attributes as Zarr takes them; all are plain values already."""
-    return dict(attrs)
