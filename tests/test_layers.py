@@ -196,6 +196,8 @@ QUESTIONS = {
     "its class": "x.__class__ == Stiff",
     "its type in a list": "type(x) in (Stiff, int)",
     "a table": "{Stiff: 1}[type(x)]",
+    "its name": "x.rung == 'stiff'",
+    "its name among others": "x.rung in ('stiff', 'other')",
 }
 
 

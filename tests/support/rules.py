@@ -110,6 +110,8 @@ def asked_rungs(house: House) -> list[str]:
             if isinstance(target, ast.Name)
         }
         for node in ast.walk(tree):
+            if _asks_by_name(node):
+                found.append(f"{module}:{node.lineno} asks for {ast.unparse(node)}")
             for asked in _asked(node):
                 for name in _named(asked, constants):
                     if house.defined(module, name) in rungs:
@@ -144,6 +146,16 @@ def _asked(node: ast.AST) -> Iterator[ast.AST]:
         yield node.cls
     elif isinstance(node, ast.Dict):
         yield from (key for key in node.keys if key is not None)
+
+
+def _asks_by_name(node: ast.AST) -> bool:
+    """Whether it compares the name that a rung bears with one written out."""
+    if not isinstance(node, ast.Compare):
+        return False
+    sides = [node.left, *node.comparators]
+    written = any(isinstance(part, ast.Constant) and isinstance(part.value, str)
+                  for side in sides for part in ast.walk(side))  # fmt: skip
+    return written and any(isinstance(x, ast.Attribute) and x.attr == "rung" for x in sides)
 
 
 def _named(node: ast.AST, constants: dict[str, ast.expr]) -> Iterator[ast.Name | ast.Attribute]:

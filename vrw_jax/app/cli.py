@@ -134,7 +134,7 @@ def gait(
         params = settings.params(dict(assignment(text) for text in changes or []))
         import jax.numpy as jnp
 
-        from vrw_jax.cycles import serving_and_why
+        from vrw_jax.cycles import finder_of, serving_and_why
         from vrw_jax.gaits import limit_cycle
         from vrw_jax.walks import step
         from vrw_jax.wheel import Outcome
@@ -154,7 +154,7 @@ def gait(
                     break
                 state = result.section_state
             model, why = serving_and_why(params, model)
-            cold = start is None or model.rung == "viscoelastic"
+            cold = start is None or finder_of(model, params.n_legs).from_nothing
             cycle: Any = limit_cycle(params, guess=None if cold else state, model=model)
         printing.tell_gait(params, result, state, walked, cycle)
         if why:

@@ -60,14 +60,14 @@ def serving_and_why(
     params: WheelParams, model: ModelLike | None
 ) -> tuple[ModelLike | None, str | None]:
     """`serving`, and of the ladder in one sentence why."""
-    if model is None or rung_of(model).rung != "ladder" or not isinstance(params, WheelParams):
+    ladder: Any = rung_of(model)
+    if ladder.upper is ladder or not isinstance(params, WheelParams):
         return model, None
     if traced(params, model) or params.damping.ndim:
         return model, None
-    ladder: Any = rung_of(model)
     cycle: Any = finder_of(None, params.n_legs).cycle(params)
     if not bool(cycle.found):
-        return ladder.ground, f"The paper's wheel has no gait: {cycle.why}"
+        return ladder.upper, f"The paper's wheel has no gait: {cycle.why}"
     x = ladder.full_section(params, cycle.section_state)
     choice = ladder.choose(params, x, Options())[0]
     return choice.model, choice.why

@@ -15,9 +15,6 @@ from vrw_jax.scans.offer import offer_of
 from vrw_jax.scans.planning import Plan
 from vrw_jax.scans.running import found_store
 
-MEASURED = {"viscoelastic": 1024, "ladder": 64, "unilateral": 16}
-"""Samples for each core that are computed for a forecast, by rung."""
-
 START = 5.0
 """Seconds until the first sample of a process that finds its code in the cache: docs/scans.md."""
 
@@ -31,6 +28,7 @@ def explained(planned: Plan, store: str | Path | None = None) -> dict[str, str]:
     Time and memory are measured on samples spread over the design, which are computed for that.
     """
     layout, size = planned.layout, planned.design.size
+    offer = offer_of(planned.model, planned.tol)
     kept = None if store is None else found_store(planned, Path(store), verify=False)
     missing = list(range(layout.n_chunks)) if kept is None else kept.missing()
     left = sum(math.prod(layout.shape_of(i)) for i in missing)
@@ -39,13 +37,13 @@ def explained(planned: Plan, store: str | Path | None = None) -> dict[str, str]:
     told = {
         "samples": f"{size:,} ({axes})",
         "measures": ", ".join(planned.asked),
-        "always included": ", ".join(offer_of(planned.model, planned.tol).always),
+        "always included": ", ".join(offer.always),
         "chunks": f"{layout.n_chunks:,} of up to {chunk:,} samples, {len(missing):,} to compute",
         "result": f"{_bytes(size * layout.bytes_per_sample)} before compression",
     }
     if not left:
         return told | {"time": "none: the store is complete"}
-    n = min(left, MEASURED[planned.model.rung] * n_cores())
+    n = min(left, offer.tried * n_cores())
     engine = planned.engine()
     began = perf_counter()
     engine(_spread(planned.design, 1))

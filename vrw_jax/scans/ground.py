@@ -124,7 +124,7 @@ class LadderEngine:
         parts = (part for name in asked.measures for part in OF_PAPER.get(name, (name,)))
         of_paper = asked._replace(measures=tuple(dict.fromkeys(parts)), model=self._paper)
         self._lower = Engine(of_paper, threads)
-        self._upper = GroundEngine(asked._replace(model=asked.model.ground), threads)
+        self._upper = GroundEngine(asked._replace(model=asked.model.upper), threads)
 
     def __call__(self, columns: Columns) -> Told:
         """Results of the samples in `columns`, with `rung` and `reason` of each."""

@@ -41,16 +41,18 @@ class Offer(NamedTuple):
     differentiable: tuple[str, ...]
     by: tuple[str, ...]  # parameters that derivatives may be taken by
     default: tuple[str, ...]
+    tried: int  # samples for each core that a forecast computes
 
 
 _DEFAULT = ("dls_fraction", "speed", "period", "step_length", "slip", "energy_lost_impacts")
-PAPER = Offer(ON_REQUEST, ALWAYS, OF_CYCLE, PARAMETER_NAMES, DEFAULT_MEASURES)
+PAPER = Offer(ON_REQUEST, ALWAYS, OF_CYCLE, PARAMETER_NAMES, DEFAULT_MEASURES, 1024)
 REAL_GROUND = Offer(
     (*ON_GROUND, "spectral_margin"),
     ("outcome", "spectral_radius"),
     ON_GROUND,
     (*PARAMETER_NAMES, FRICTION),
     _DEFAULT,
+    16,
 )
 LADDER = Offer(
     (*ON_GROUND, "spectral_margin"),
@@ -58,10 +60,13 @@ LADDER = Offer(
     tuple(name for name in ON_GROUND if name in OF_CYCLE),
     PARAMETER_NAMES,
     _DEFAULT,
+    64,
 )
 OFFERS = {"viscoelastic": PAPER, "unilateral": REAL_GROUND, "ladder": LADDER}
 """By rung: those with compliant legs."""
-TO_TOLERANCE = Offer(tuple(MADE), ("outcome", "rung"), (), (), ("dls_fraction", "speed", "period"))
+TO_TOLERANCE = Offer(
+    tuple(MADE), ("outcome", "rung"), (), (), ("dls_fraction", "speed", "period"), 16
+)
 """To within a tolerance, each measure with its error."""
 ERROR = "_error"
 
