@@ -32,7 +32,7 @@ from vrw_jax import figures as plots
 from vrw_jax.app.config import load
 from vrw_jax.cycles import AGREEMENT
 from vrw_jax.tuning import tune
-from vrw_jax.tuning.climbing import slack_scales
+from vrw_jax.tuning.objective import slack_scales
 from vrw_jax.tuning.problem import TuneProblem, tuning_problem
 from vrw_jax.wheel import wheel_of
 
@@ -96,7 +96,7 @@ class Counter:
 
 def values_of(problem: TuneProblem) -> Callable:
     """Whether there is a gait, and objective and constraints, compiled without derivatives."""
-    sought, finder = problem.engine.sought, problem.finder
+    sought, finder = problem.sought, problem.finder
 
     def values(parameters: jax.Array) -> tuple[jax.Array, jax.Array]:
         wheel = wheel_of(parameters, problem.params.n_legs)
@@ -152,7 +152,7 @@ def by_tune(problem: TuneProblem, u: np.ndarray, scales: np.ndarray) -> Seen:
     began = time.perf_counter()
     tuned = tune(
         problem.wheel(u),
-        problem.engine.sought.objective,
+        problem.sought.objective,
         problem.free,
         dict(zip(problem.free, zip(problem.lower, problem.upper, strict=True), strict=True)),
         problem.margins,
@@ -207,7 +207,8 @@ def compared(problem: TuneProblem, n_starts: int, rows: list[dict], name: str) -
     values = values_of(problem)
     starts = starts_of(problem, values, n_starts)
     # What a constraint changes over the box makes breaches comparable; once, at the config's wheel.
-    scales = slack_scales(problem.start())
+    first = problem.start()
+    scales = slack_scales(first.slack, first.slopes)
     seen: dict[str, list[Seen]] = {"tune": [by_tune(problem, u, scales) for u in starts]}
     for method, run in OTHERS.items():
         seen[method] = [

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vrw_jax.numerics import Code
-from vrw_jax.tuning.objective import Evaluated
+from vrw_jax.tuning.objective import Evaluated, breach, slack_scales
 from vrw_jax.wheel import Outcome
 
 
@@ -129,10 +129,10 @@ def climb(evaluate: Evaluate, start: Trial, *, tolerance: float, max_evaluations
 
     record = _Record(evaluate, start, max_evaluations)
     size = max(float(np.linalg.norm(start.gradient)), 1e-12)
-    scales = slack_scales(start)
+    scales = slack_scales(start.slack, start.slopes)
 
     def arrive(trial: Trial) -> Trial:
-        if breach(trial, scales) <= ACTIVE and optimality(trial).residual <= tolerance:
+        if breach(trial.slack, scales) <= ACTIVE and optimality(trial).residual <= tolerance:
             raise _ArrivedError(trial)
         return trial
 
@@ -180,30 +180,18 @@ def climb(evaluate: Evaluate, start: Trial, *, tolerance: float, max_evaluations
             break
         radius = min(2.0 * radius, WHOLE) if at_wall.any() else WHOLE
     best = centre if ending == Ending.CONVERGED else _best(record, scales, centre)
-    if ending == Ending.CONVERGED and breach(best, scales) > 10.0 * ACTIVE:
+    if ending == Ending.CONVERGED and breach(best.slack, scales) > 10.0 * ACTIVE:
         best, ending = _best(record, scales, centre), Ending.NO_FEASIBLE_GAIT
     return Climb(best, ending, record.trials, record.kinds)
-
-
-def slack_scales(trial: Trial) -> np.ndarray:
-    """Slack that a width of the bounds changes: what makes constraints comparable."""
-    if not trial.slack.size:
-        return np.ones(0)
-    return np.maximum(np.linalg.norm(trial.slopes, axis=1), 1e-3 * np.abs(trial.slack) + 1e-12)
-
-
-def breach(trial: Trial, scales: np.ndarray) -> float:
-    """Largest breach of a constraint, in widths of the bounds; 0 if all are kept, NaN if lost."""
-    return float(np.max(-trial.slack / scales, initial=0.0))
 
 
 def _best(record: _Record, scales: np.ndarray, last: Trial) -> Trial:
     """The best gait that keeps all constraints; else the one that comes nearest to it."""
     found = [trial for trial in record.trials if trial.found]
-    kept = [trial for trial in found if breach(trial, scales) <= ACTIVE]
+    kept = [trial for trial in found if breach(trial.slack, scales) <= ACTIVE]
     if not kept:
-        return min(found, key=lambda trial: breach(trial, scales))
-    if breach(last, scales) <= ACTIVE:
+        return min(found, key=lambda trial: breach(trial.slack, scales))
+    if breach(last.slack, scales) <= ACTIVE:
         kept.append(last)
     return max(kept, key=lambda trial: trial.objective)
 
@@ -222,7 +210,7 @@ def optimality(trial: Trial) -> Optimality:
     from scipy.optimize import nnls  # as above
 
     n = trial.u.size
-    scales = slack_scales(trial)
+    scales = slack_scales(trial.slack, trial.slopes)
     active = np.flatnonzero(np.abs(trial.slack) <= 10.0 * ACTIVE * scales)
     low, high = np.flatnonzero(trial.u <= ACTIVE), np.flatnonzero(trial.u >= 1.0 - ACTIVE)
     unit = np.eye(n)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from vrw_jax.cycles import (
@@ -12,8 +13,6 @@ from vrw_jax.cycles import (
     AbstractGaitFinder,
     Gait,
     default_margins,
-    read_along,
-    read_along_lanes,
 )
 from vrw_jax.models import AbstractStep
 from vrw_jax.wheel import WheelParams
@@ -84,22 +83,6 @@ class Evaluated(NamedTuple):
     columns: Array  # (n_parameters, 1 + n_constraints)
 
 
-@dataclass(frozen=True)
-class Engine:
-    finder: AbstractGaitFinder
-    sought: Sought
-
-    def __call__(self, parameters: Array, guess: Any) -> Evaluated:
-        """The gait of one wheel near `guess`."""
-        gait = self.finder.find(parameters, guess)
-        return Evaluated(gait, *read_along(self.sought, gait))
-
-    def batch(self, parameters: Array, guess: Any) -> Evaluated:
-        """The gaits of many wheels side by side."""
-        gait = self.finder.find_many(parameters, guess)
-        return Evaluated(gait, *read_along_lanes(self.sought, gait))
-
-
 def margins_of(
     params: WheelParams, constraints: Margins | None, finder: AbstractGaitFinder
 ) -> dict[str, float]:
@@ -126,3 +109,13 @@ def margins_of(
 
 def bound_of(name: str, least: float) -> float:
     return float(-least if name.startswith(MOST) else least)
+
+
+def slack_scales(slack: np.ndarray, slopes: np.ndarray) -> np.ndarray:
+    """Slack that a width of the bounds changes: what makes constraints comparable."""
+    return np.maximum(np.linalg.norm(slopes, axis=-1), 1e-3 * np.abs(slack) + 1e-12)
+
+
+def breach(slack: np.ndarray, scales: np.ndarray) -> Any:
+    """Largest breach of a constraint, in widths of the bounds; 0 if all are kept, NaN if lost."""
+    return np.max(-slack / scales, axis=-1, initial=0.0)

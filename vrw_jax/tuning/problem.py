@@ -22,6 +22,8 @@ from vrw_jax.cycles import (
     Gait,
     default_margins,
     finder_of,
+    read_along,
+    read_along_lanes,
     same_branch,
     serving,
 )
@@ -32,7 +34,6 @@ from vrw_jax.runtime import xarray as xr
 from vrw_jax.tuning.climbing import Climb, Kind, Trial, breach, climb, optimality, slack_scales
 from vrw_jax.tuning.objective import (
     MOST,
-    Engine,
     Evaluated,
     Margins,
     OfCycle,
@@ -155,7 +156,7 @@ class TuneProblem:
     upper: np.ndarray
     margins: dict[str, float]
     label: str
-    engine: Engine
+    sought: Sought
     finder: AbstractGaitFinder
 
     @property
@@ -211,7 +212,8 @@ class TuneProblem:
         parameters = jnp.asarray(self.parameters(u))
         before = None if near is None else near.told
         guess = self.finder.first_guess(parameters) if before is None else before.gait.cycle.near
-        told = self.engine(parameters, guess)
+        gait = self.finder.find(parameters, guess)
+        told = Evaluated(gait, *read_along(self.sought, gait))
         outcome, on_branch = Outcome(int(told.gait.outcome)), True
         if outcome == Outcome.STEPPED and near is not None and before is not None:
             change = self.parameters(u) - self.parameters(near.u)
@@ -251,7 +253,9 @@ class TuneProblem:
     def _batch(self, u: np.ndarray, near: Evaluated | None) -> Evaluated:
         parameters = jnp.asarray([self.parameters(row) for row in u])
         first = self.finder.first_guesses(parameters)
-        return self.engine.batch(parameters, first if near is None else near.gait.cycle.near)
+        guess = first if near is None else near.gait.cycle.near
+        gait = self.finder.find_many(parameters, guess)
+        return Evaluated(gait, *read_along_lanes(self.sought, gait))
 
     def _change(self, difference: np.ndarray) -> np.ndarray:
         """Differences of all parameters by differences of u, row by row."""
@@ -334,7 +338,8 @@ class TuneProblem:
         values = self.lower + u * self.widths
         least = self.least
         constraints = np.array([trial.slack + least for trial in done.trials])
-        scales = slack_scales(done.trials[0])
+        start = done.trials[0]
+        scales = slack_scales(start.slack, start.slopes)
         outcomes = [
             trial.outcome if trial.on_branch else Outcome.NO_CYCLE_FOUND for trial in done.trials
         ]
@@ -347,7 +352,7 @@ class TuneProblem:
             "margin": ("constraint", least, {"long_name": "least value allowed"}),
             "breach": (
                 along,
-                np.array([breach(trial, scales) for trial in done.trials]),
+                np.array([breach(trial.slack, scales) for trial in done.trials]),
                 {"long_name": "largest breach of a constraint, in widths of the bounds"},
             ),
             "kind": (along, np.array(done.kinds, int), flags(kind.name for kind in Kind)),
@@ -411,7 +416,7 @@ def tuning_problem(
         x = jax.ShapeDtypeStruct((finder.model.section_size(params),), params.damping.dtype)
         step = jax.eval_shape(finder.model.step, params, x, finder.step_options)
         jax.eval_shape(sought, cycle, step)
-    return TuneProblem(params, names, lower, upper, margins, label, Engine(finder, sought), finder)
+    return TuneProblem(params, names, lower, upper, margins, label, sought, finder)
 
 
 def _objective(objective: Objective, finder: AbstractGaitFinder) -> tuple[Reader, str]:

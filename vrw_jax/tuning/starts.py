@@ -13,7 +13,7 @@ import numpy as np
 
 from vrw_jax.cycles import same_branch
 from vrw_jax.runtime import library
-from vrw_jax.tuning.objective import Evaluated
+from vrw_jax.tuning.objective import Evaluated, breach, slack_scales
 from vrw_jax.wheel import Outcome
 
 optax = library("optax")
@@ -59,8 +59,8 @@ def explore(
     gait = evaluate(starts, None)
     good = found(gait)
     slack, slopes = _constraints(gait, free, widths, least)
-    scales = np.maximum(np.linalg.norm(slopes, axis=2), 1e-3 * np.abs(slack) + 1e-12)
-    scales = np.median(scales[good], axis=0) if good.any() else np.ones(least.size)
+    scales = slack_scales(slack, slopes)[good]
+    scales = np.median(scales, axis=0) if good.any() else np.ones(least.size)
     size = _gradient(gait, free, widths)[good]
     size = np.median(np.linalg.norm(size, axis=1)) if good.any() else 1.0
     rates = np.full((n_lanes, 1), RATE)
@@ -70,9 +70,9 @@ def explore(
     u, kept, lost = starts.copy(), gait, np.zeros(n_lanes, int)
     for i in range(n_steps):
         slack, slopes = _constraints(kept, free, widths, least)
-        breach = np.maximum(0.0, prices - STIFFNESS * slack / scales)
-        prices = np.where(good[:, None], breach, prices)
-        pull = np.einsum("lc,lcf->lf", breach / scales, slopes)
+        weights = np.maximum(0.0, prices - STIFFNESS * slack / scales)
+        prices = np.where(good[:, None], weights, prices)
+        pull = np.einsum("lc,lcf->lf", weights / scales, slopes)
         uphill = _gradient(kept, free, widths) / size + pull
         uphill = np.where(good[:, None], uphill, 0.0)
         step, memory = optimiser.update(jnp.asarray(uphill), memory)
@@ -86,8 +86,8 @@ def explore(
         kept = jax.tree.map(lambda new, old, h=holds: _chosen(h, new, old), gait, kept)
     slack, _ = _constraints(kept, free, widths, least)
     objective = np.where(good, np.asarray(kept.values)[:, 0], np.nan)
-    breach = np.max(-slack / scales, axis=1, initial=0.0)
-    return Lanes(starts, u, objective, breach, lost, n_lanes * (n_steps + 1))
+    evaluated = n_lanes * (n_steps + 1)
+    return Lanes(starts, u, objective, breach(slack, scales), lost, evaluated)
 
 
 def found(told: Evaluated) -> np.ndarray:
