@@ -51,5 +51,5 @@ def test_a_config_names_the_tolerance(tmp_path: Path) -> None:
     path.write_text(text + "[grid]\ndamping = [150.0]\n")
     assert config.load(path).scan.tol == 1e-3
     path.write_text(text.replace("1e-3", "-1.0"))
-    with pytest.raises(config.ConfigError, match="tol is -1, but it must be positive"):
+    with pytest.raises(ValueError, match="tol is -1, but it must be positive"):
         config.load(path)

@@ -39,10 +39,6 @@ _OPTION_KEYS = tuple(Options.__dataclass_fields__)
 _AXIS_KEYS = ("from", "to", "count")
 
 
-class ConfigError(ValueError):
-    """A config that can't be used; its message is the sentence to show."""
-
-
 @dataclass(frozen=True)
 class ScanConfig:
     """Table `[scan]`: what to report, and how many samples are written at a time.
@@ -137,24 +133,20 @@ def load(path: str | Path) -> Config:
     """Read and check a config file."""
     path = Path(path)
     if not path.exists():
-        near = nearest(path.name, (p.name for p in _siblings(path)))
-        raise ConfigError(
+        near = nearest(path.name, (beside.name for beside in path.parent.glob("*.toml")))
+        raise ValueError(
             f"there is no config file {path}{near}: give the path of a TOML file, "
             "such as configs/quickstart.toml, which `vrw init` writes."
         )
     if path.is_dir():
-        raise ConfigError(f"{path} is a folder, but a config is a TOML file: give its path.")
+        raise ValueError(f"{path} is a folder, but a config is a TOML file: give its path.")
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(
+        raise ValueError(
             f"{path} can't be read ({error}): give a readable text file in UTF-8."
         ) from error
     return parse(text, path.name)
-
-
-def _siblings(path: Path) -> Iterable[Path]:
-    return path.parent.glob("*.toml") if path.parent.is_dir() else ()
 
 
 def parse(text: str, name: str = "config") -> Config:
@@ -162,11 +154,11 @@ def parse(text: str, name: str = "config") -> Config:
     try:
         tables = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{name}: this is not valid TOML ({error}): mend that line.") from error
+        raise ValueError(f"{name}: this is not valid TOML ({error}): mend that line.") from error
     try:
         return _config(tables, text, name)
     except ValueError as error:
-        raise ConfigError(f"{name}: {error}") from error
+        raise ValueError(f"{name}: {error}") from error
 
 
 def _config(tables: Mapping[str, object], text: str, name: str) -> Config:
@@ -177,7 +169,7 @@ def _config(tables: Mapping[str, object], text: str, name: str) -> Config:
             raise _wrong(f"[{key}]", table, must)
     given = [kind for kind in DESIGNS if kind in tables]
     if len(given) > 1:
-        raise ConfigError(
+        raise ValueError(
             f"[{given[0]}] and [{given[1]}] are both given, but a scan has one design: keep one."
         )
     rung, model = _model(_table(tables, "model"))
@@ -186,7 +178,7 @@ def _config(tables: Mapping[str, object], text: str, name: str) -> Config:
     wheel = _wheel(_table(tables, "wheel"))
     both = [key for key in wheel if design is not None and key in design.names]
     if both:
-        raise ConfigError(
+        raise ValueError(
             f"{both[0]} is fixed in [wheel] and swept in [{given[0]}], but it can only be one: "
             "drop one of the two."
         )
@@ -221,7 +213,7 @@ def assignment(text: str) -> tuple[str, float | int]:
     """A parameter and its value from `name=value`, as given on the command line."""
     name, equals, value = (part.strip() for part in text.partition("="))
     if not equals:
-        raise ConfigError(f"--set {text} has no '=': write a parameter and its value, damping=150.")
+        raise ValueError(f"--set {text} has no '=': write a parameter and its value, damping=150.")
     try:
         number = int(value) if name == "n_legs" else float(value)
     except ValueError:
@@ -322,7 +314,7 @@ def _tune(table: Mapping[str, object]) -> TuneConfig:
         raise _wrong("objective", objective, must + "{ dls_fraction = 1.0, speed = 0.1 }")
     bounds = table.get("bounds")
     if not isinstance(bounds, dict) or not bounds:
-        raise ConfigError(
+        raise ValueError(
             "[tune] lets no parameter move, but at least one must: add [tune.bounds] with lines "
             "such as damping = [20.0, 215.0]."
         )
@@ -347,11 +339,11 @@ def _branch(table: Mapping[str, object], names: tuple[str, ...]) -> BranchConfig
     require_known(parameter, names, "parameter that a branch of this rung runs along")
     assert isinstance(parameter, str)
     if "bounds" not in table:
-        raise ConfigError("[branch] has no bounds: write bounds = [4.0, 230.0], say.")
+        raise ValueError("[branch] has no bounds: write bounds = [4.0, 230.0], say.")
     bounds = range_of("bounds", _range("bounds of " + parameter, table["bounds"], parameter))
     step = table.get("largest_step")
     if step is not None and _number(step, "largest_step", positive=True) > 1.0:
-        raise ConfigError(
+        raise ValueError(
             f"largest_step is {step:g}, but it is a share of the range: give 0.02, say."
         )
     return BranchConfig(
@@ -367,7 +359,7 @@ def _design(
 ) -> designs.AbstractDesign:
     own = ("n", "seed") if kind in DRAWN else ()
     if FRICTION in table and FRICTION not in names:
-        raise ConfigError(
+        raise ValueError(
             f"[{kind}] sweeps friction, which the motion of this rung does not feel: write [model] "
             'and below it rung = "unilateral" or rung = "auto".'
         )
@@ -375,7 +367,7 @@ def _design(
     swept = {name: value for name, value in table.items() if name not in own}
     if own:
         if "n" not in table:
-            raise ConfigError(f"[{kind}] says not how many samples: write n = 4096, say.")
+            raise ValueError(f"[{kind}] says not how many samples: write n = 4096, say.")
         n, seed = _whole(table["n"], "n", 1), _whole(table.get("seed", 0), "seed", 0)
         ranges = {name: _range(name, value) for name, value in swept.items()}
         return DRAWN[kind](ranges, n, seed)
@@ -391,14 +383,14 @@ def _axis(name: str, value: object) -> np.ndarray:
     _only(value, _AXIS_KEYS, f"the axis of {name}", "keys")
     missing = [key for key in _AXIS_KEYS if key not in value]
     if missing:
-        raise ConfigError(
+        raise ValueError(
             f"the axis of {name} has no '{missing[0]}': "
             f"write {name} = {{ from = ..., to = ..., count = ... }}."
         )
     first, last = (_in_domain(name, value[key]) for key in ("from", "to"))
     count = _whole(value["count"], f"count of {name}", 1)
     if count > LONGEST:
-        raise ConfigError(
+        raise ValueError(
             f"the axis of {name} has {count:,} values, but {LONGEST:,} is the most: give fewer."
         )
     return np.linspace(first, last, count)
@@ -420,14 +412,8 @@ def _range(name: str, value: object, parameter: str = "") -> tuple[float, float]
 
 def _in_domain(name: str, value: object) -> float:
     number = _number(value, name, positive=name == FRICTION)
-    if name == FRICTION:
-        return number
-    domain = DOMAINS[name]
-    if not domain.contains(number):
-        raise ConfigError(
-            f"{name} is {number:g}, but {domain.description} must lie in {domain}: "
-            "give a value in that range."
-        )
+    if name != FRICTION:
+        DOMAINS[name].require(name, number)
     return number
 
 
@@ -435,7 +421,7 @@ def _number(value: object, name: str, positive: bool = False) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise _wrong(name, value, "a finite number")
     if positive and not value > 0:
-        raise ConfigError(f"{name} is {value:g}, but it must be positive.")
+        raise ValueError(f"{name} is {value:g}, but it must be positive.")
     return float(value)
 
 
@@ -449,14 +435,14 @@ def _only(table: Mapping[str, object], allowed: Iterable[str], where: str, kind:
     allowed = tuple(allowed)
     for key in table:
         if key not in allowed:
-            raise ConfigError(
+            raise ValueError(
                 f"{where} has the unknown key '{key}'{nearest(key, allowed)}: "
                 f"its {kind} are {', '.join(allowed)}."
             )
 
 
-def _wrong(name: str, value: object, must: str) -> ConfigError:
-    return ConfigError(f"{name} is {_shown(value)}, but it must be {must}.")
+def _wrong(name: str, value: object, must: str) -> ValueError:
+    return ValueError(f"{name} is {_shown(value)}, but it must be {must}.")
 
 
 def _shown(value: object) -> str:

@@ -29,6 +29,14 @@ class Domain(NamedTuple):
         above = value >= self.lower if self.lower_is_allowed else value > self.lower
         return above & (value < self.upper)
 
+    def require(self, name: str, value: float) -> None:
+        """Refuse a number outside."""
+        if not self.contains(value):
+            raise ValueError(
+                f"{name} is {value:g}, but {self.description} must lie in {self}: "
+                "give a value in that range."
+            )
+
     def __str__(self) -> str:
         bracket = "[" if self.lower_is_allowed else "("
         unit = f" {self.unit}" if self.unit else ""
@@ -148,12 +156,7 @@ class WheelParams(AbstractTold):
             if not isinstance(value := getattr(self, name), jax.core.Tracer) and value.ndim == 0
         }
         for name, value in plain.items():
-            domain = DOMAINS[name]
-            if not domain.contains(value):
-                raise ValueError(
-                    f"{name} is {value:g}, but {domain.description} must lie in {domain}: "
-                    "give a value in that range."
-                )
+            DOMAINS[name].require(name, value)
         com, length = (plain.get(name) for name in ("leg_com", "locked_length"))
         if com is not None and length is not None and not com < length:
             raise ValueError(
