@@ -163,9 +163,7 @@ class RigidWheel(AbstractWheel):
         the stoppers of legs 3..n."""
         zero = jnp.zeros_like(x[1])
         first = roll.motion(-jnp.asarray(0.5 * s.alpha, zero.dtype) + zero)
-        hub_after = transitions.hub_velocity(first)
-        hub_before = transitions.hub_velocity(transitions.motion_before_landing(s, *x))
-        jump = (hub_after[0] - hub_before[0], hub_after[1] - hub_before[1])
+        jump = transitions.jump_of_hub(transitions.motion_before_landing(s, *x), first)
         held = self.held_landing
         rear = transitions.land(s, *x).rear if held else dynamics.FootForce(zero, zero)
         # Impulse at the fore foot: the jump of total momentum Mt v_hub (the mass centre).

@@ -14,9 +14,11 @@ from vrw_jax.numerics import Elementwise
 from vrw_jax.wheel.dynamics import (
     FootForce,
     MassMatrix,
+    Terms,
     double_support_acceleration,
     foot_force_from_residual,
     fore_foot_force,
+    free_acceleration,
     kinetic_energy,
     mass_matrix,
     momentum,
@@ -117,20 +119,12 @@ def land(s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise) 
     rear_impulse = foot_force_from_residual(s, on_both, row[1] * held - p2, row[2] * held - p3)
     stays = rear_impulse.normal >= 0.0
 
-    # (A3) only the landing foot held: M rates = p, Leg 2 eliminated by its own row.
-    q = s.sin_alpha * s.L0
-    A11, A12 = M.M11 + M.M13 * q, M.M12 + M.M13 * s.cos_alpha
-    A22 = M.M22 + M.M23 * s.cos_alpha
-    F1, F2 = p1 + q * p3, p2 + s.cos_alpha * p3
-    inverse = 1.0 / (A11 * A22 - A12 * A12)
-    free_dtheta = (A22 * F1 - A12 * F2) * inverse
-    free_dL1 = (A11 * F2 - A12 * F1) * inverse
-    free_dL2 = p3 / s.m + q * free_dtheta + s.cos_alpha * free_dL1
-
+    # (A3) only the landing foot held: M rates = p.
+    free = free_acceleration(s, s.L0, Terms(M, p1, p2, p3))
     after = on_both._replace(
-        dtheta=jnp.where(stays, held, free_dtheta),
-        dL1=jnp.where(stays, on_both.dL1, free_dL1),
-        dL2=jnp.where(stays, on_both.dL2, free_dL2),
+        dtheta=jnp.where(stays, held, free.ddtheta),
+        dL1=jnp.where(stays, on_both.dL1, free.ddL1),
+        dL2=jnp.where(stays, on_both.dL2, free.ddL2),
     )
     # Impulses of the ground: the jump of total momentum, less what the rear foot took.
     px, pz = momentum(s, after)
@@ -143,7 +137,6 @@ def land(s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise) 
         px - before_x - s.Mt * foot_x - taken.tangential,
         pz - before_z - s.Mt * foot_z - taken.normal,
     )
-    hub_before, hub_after = hub_velocity(before), hub_velocity(after)
     return Landing(
         theta=theta - s.alpha,
         motion=after,
@@ -152,7 +145,7 @@ def land(s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise) 
         fore=fore,
         rear=rear_impulse,
         energy_lost=kinetic_energy(s, before) - kinetic_energy(s, after),
-        hub_jump=(hub_after[0] - hub_before[0], hub_after[1] - hub_before[1]),
+        hub_jump=jump_of_hub(before, after),
     )
 
 
@@ -183,8 +176,7 @@ def hit_stopper(s: Symbols, motion: Motion) -> StopperHit:
     """
     before = motion._replace(L2=s.L0 + 0.0 * motion.L2)
     after = stopped(s, before)
-    hub_before, hub_after = hub_velocity(before), hub_velocity(after)
-    jump = (hub_after[0] - hub_before[0], hub_after[1] - hub_before[1])
+    jump = jump_of_hub(before, after)
     rear = rear_direction(s, before.sin, before.cos)
     before_x, before_z = momentum(s, before)
     after_x, after_z = momentum(s, after)
@@ -204,6 +196,12 @@ def hub_velocity(motion: Motion) -> tuple[Elementwise, Elementwise]:
         motion.dL1 * motion.sin + across * motion.cos,
         motion.dL1 * motion.cos - across * motion.sin,
     )
+
+
+def jump_of_hub(before: Motion, after: Motion) -> tuple[Elementwise, Elementwise]:
+    """By how much its velocity along (x, z) changes, m/s."""
+    (x, z), (after_x, after_z) = hub_velocity(before), hub_velocity(after)
+    return after_x - x, after_z - z
 
 
 def locked_leg_impulses(
