@@ -125,7 +125,9 @@ class CollocationFinder(AbstractGaitFinder):
         cycle, d_cycle = cycle_and_columns(self.problem, values, guess)
         x, dx = cycle.section_state, d_cycle.section_state
         step, d_step = step_and_columns(self.model, self.n_legs, values, x, dx, self.step_options)
-        return _gait(cycle, step, d_cycle, d_step)
+        posture = lambda cycle: jnp.concatenate([cycle.section_state, cycle.durations], -1)
+        told = posture(cycle), posture(d_cycle), cycle.located.happens, cycle.matrix
+        return Gait(cycle, step, d_cycle, d_step, *told)
 
     def measured(self, values: Values, guess: Any, names: tuple[str, ...]) -> Measured:
         if set(names) <= set(self.of_cycle):
@@ -144,12 +146,6 @@ class CollocationFinder(AbstractGaitFinder):
                 step_and_columns, self.model, self.n_legs, values, x, dx, self.step_options
             )
             cycle.result(), step.result()
-
-
-def _gait(cycle: LimitCycle, step: StepResult, d_cycle: LimitCycle, d_step: StepResult) -> Gait:
-    posture = lambda c: jnp.concatenate([c.section_state, c.durations], -1)
-    told = posture(cycle), posture(d_cycle), cycle.located.happens, cycle.matrix
-    return Gait(cycle, step, d_cycle, d_step, *told)
 
 
 @eqx.filter_jit

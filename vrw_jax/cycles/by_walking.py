@@ -200,19 +200,13 @@ class SectionFinder(AbstractWalkingFinder):
     usual: ClassVar[tuple[str, ...]] = tuple(n for n in of_cycle if n != "spectral_margin")
     readable: ClassVar[tuple[str, ...]] = of_cycle
 
+    @eqx.filter_jit
     def find(self, values: Values, guess: Array) -> Gait:
-        return _differentiated(self, values, guess)
-
-
-@eqx.filter_jit
-def _differentiated(finder: SectionFinder, values: Values, guess: Array) -> Gait:
-    """The gait and all of its derivatives, those of the map's Jacobian included."""
-
-    cycle, jacobian = with_jacobian(lambda values: finder.cycle_of(values, guess), values)
-    d_cycle = leading(jacobian)
-    step = jax.tree.map(lambda x: x[0], cycle.steps)
-    d_step = jax.tree.map(lambda x: x[:, 0], d_cycle.steps)
-    return gait_of(finder.model, finder.n_legs, cycle, step, d_cycle, d_step)
+        cycle, jacobian = with_jacobian(lambda values: self.cycle_of(values, guess), values)
+        d_cycle: Any = leading(jacobian)
+        step = jax.tree.map(lambda x: x[0], cycle.steps)
+        d_step = jax.tree.map(lambda x: x[:, 0], d_cycle.steps)
+        return gait_of(self.model, self.n_legs, cycle, step, d_cycle, d_step)
 
 
 def where_walks_begin(

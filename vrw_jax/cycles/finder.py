@@ -123,8 +123,6 @@ class AbstractGaitFinder(eqx.Module):
 
     def cycles(self, params: WheelParams, guess: Any = None) -> Any:
         """Those of a batch of wheels; every array gains a leading axis."""
-        if guess is None:
-            return jax.vmap(self.cycle)(params)
         return jax.vmap(self.cycle)(params, guess)
 
     @abc.abstractmethod

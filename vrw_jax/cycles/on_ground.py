@@ -5,6 +5,7 @@ wheels are searched side by side and nothing large is compiled for the derivativ
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -88,7 +89,7 @@ class GroundFinder(AbstractWalkingFinder):
 
     def near(self, values: Any, states: Any) -> WalkedCycle:
         """The gaits near section states, wheel by wheel, without derivatives."""
-        return self._told(_cycles, values, states, by_values=False)
+        return self._told(_cycle, values, states, by_values=False)
 
     def prepare(self, values: np.ndarray, states: np.ndarray) -> None:
         """What Newton's method asks for, compiled while another thread walks towards its start."""
@@ -107,12 +108,12 @@ class GroundFinder(AbstractWalkingFinder):
         return jax.tree.map(lambda x: x[0], self.find_many(values[None], guess[None]))
 
     def find_many(self, values: Array, guess: Any) -> Gait:
-        return self._told(_gaits, values, getattr(guess, "section_state", guess), by_values=True)
+        return self._told(_gait, values, getattr(guess, "section_state", guess), by_values=True)
 
-    def _told(self, program: Any, values: Any, states: Any, by_values: bool) -> Any:
+    def _told(self, one: Callable, values: Any, states: Any, by_values: bool) -> Any:
         given = np.asarray(values), np.asarray(states), by_values
         found = _newton(self.model, self.n_legs, self.step_options, self.period_n, *given)
-        told = functools.partial(program, self.model, self.n_legs)
+        told = functools.partial(_many, one, self.model, self.n_legs)
         return in_batches(told, self.shapes, given[0], found)
 
     def step(self, params: WheelParams, x: Array) -> AbstractStep:
@@ -290,16 +291,8 @@ def _corrected(
 
 
 @eqx.filter_jit
-def _gaits(model: AbstractWheel, n_legs: int, values: Array, found: _Found) -> Gait:
-    return eqx.filter_vmap(lambda values, found: _gait(model, n_legs, values, found))(values, found)
-
-
-@eqx.filter_jit
-def _cycles(model: AbstractWheel, n_legs: int, values: Array, found: _Found) -> WalkedCycle:
-    told = lambda values, found: _cycle(
-        model, n_legs, values, found, _by_section(found, len(values))
-    )
-    return eqx.filter_vmap(told)(values, found)
+def _many(one: Callable, model: AbstractWheel, n_legs: int, values: Array, found: _Found) -> Any:
+    return eqx.filter_vmap(lambda values, found: one(model, n_legs, values, found))(values, found)
 
 
 def _by_section(found: _Found, n: int) -> Array:
@@ -309,12 +302,11 @@ def _by_section(found: _Found, n: int) -> Array:
     return by_section
 
 
-def _cycle(
-    model: AbstractWheel, n_legs: int, values: Array, found: _Found, by_section: Array
-) -> WalkedCycle:
+def _cycle(model: AbstractWheel, n_legs: int, values: Array, found: _Found) -> WalkedCycle:
     told = found.residual, found.converged, found.iterations
     params = model.at(values, n_legs)[1]
-    return cycle_from(params, SectionCycle(found.x, by_section, *told), found.steps)
+    located = SectionCycle(found.x, _by_section(found, len(values)), *told)
+    return cycle_from(params, located, found.steps)
 
 
 def _gait(model: AbstractWheel, n_legs: int, values: Array, found: _Found) -> Gait:
@@ -333,7 +325,7 @@ def _gait(model: AbstractWheel, n_legs: int, values: Array, found: _Found) -> Ga
         here = along.section_state
     d_step = jax.tree.map(lambda *leaves: jnp.stack(leaves, 1), *d_steps)
 
-    cycle = _cycle(model, n_legs, values, found, by_section)
+    cycle = _cycle(model, n_legs, values, found)
     # Nothing here tells how the Jacobian itself moves: what depends on it is not `differentiable`.
     floating = eqx.filter(cycle, eqx.is_inexact_array)
     still = jax.tree.map(lambda x: jnp.zeros((n, *x.shape), x.dtype), floating)
