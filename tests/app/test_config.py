@@ -12,16 +12,16 @@ CONFIGS = Path(__file__).parents[2] / "configs"
 
 
 def test_a_missing_file_is_named_with_its_neighbour() -> None:
-    with pytest.raises(match=r"no config file .*did you mean 'quickstart.toml'"):
+    with pytest.raises(ValueError, match=r"no config file .*did you mean 'quickstart.toml'"):
         load(CONFIGS / "quikstart.toml")
 
 
 def test_a_folder_or_a_binary_file_is_no_config(tmp_path: Path) -> None:
-    with pytest.raises(match="is a folder"):
+    with pytest.raises(ValueError, match="is a folder"):
         load(tmp_path)
     binary = tmp_path / "binary.toml"
     binary.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(match="can't be read"):
+    with pytest.raises(ValueError, match="can't be read"):
         load(binary)
 
 
