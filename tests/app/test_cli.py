@@ -273,7 +273,7 @@ def test_friction_is_swept_on_real_ground_and_on_the_ladder(rung: str) -> None:
     planned = scanning.planned_scan(told, None)
     assert planned.design.names == ("friction", "slope")
     assert planned.asked == ("slip", "d speed / d damping")
-    assert planned.model.rung == {"auto": "ladder"}.get(rung, rung)
+    assert planned.for_engine.model.rung == {"auto": "ladder"}.get(rung, rung)
 
 
 def test_a_gait_of_rigid_legs_is_told(config: Path) -> None:

@@ -164,13 +164,9 @@ def typeset(text: str) -> str:
     return re.sub(r"[θλ]\S*", lambda found: f"${as_tex(found[0])}$", text)
 
 
-def unit_text(unit: str) -> str:
-    """A unit as all pictures write it: "N s/m" is "N·s/m"."""
-    return unit.replace(" ", "·").replace("^2", "²")
-
-
 def _unit(name: str) -> str:
-    return unit_text(MEASURES[name].plain_unit)
+    """As all pictures write it: "N s/m" is "N·s/m"."""
+    return MEASURES[name].plain_unit.replace(" ", "·").replace("^2", "²")
 
 
 def axis_label(name: str, form: str = "{name} {symbol}") -> str:

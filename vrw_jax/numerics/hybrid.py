@@ -42,6 +42,9 @@ class Mode(NamedTuple):
     field: Field
     guards: tuple[Guard, ...]
 
+    def values(self, y: State) -> Array:
+        return jnp.stack([guard.value(y) for guard in self.guards])
+
 
 class Stop(Code):
     """Why a walk ended."""
@@ -138,9 +141,8 @@ def _require_shape(name: str, function: Callable, start: Array, shape: tuple) ->
 
 
 def _entered(mode: Mode, state: Array, time: Array, options: Options) -> tuple[PhaseEnd, Array]:
-    values = lambda y: jnp.stack([guard.value(y) for guard in mode.guards])
-    rate = lambda y: jax.jvp(values, (y,), (mode.field(y),))[1]
-    first, (rates, bends) = values(state), jax.jvp(rate, (state,), (mode.field(state),))
+    rate = lambda y: jax.jvp(mode.values, (y,), (mode.field(y),))[1]
+    first, (rates, bends) = mode.values(state), jax.jvp(rate, (state,), (mode.field(state),))
     first, rates, bends = lax.stop_gradient((first, rates, bends))
     clock = lax.stop_gradient(time + options.first_step)
     resolution = 1e3 * jnp.finfo(state.dtype).eps * clock
@@ -150,7 +152,7 @@ def _entered(mode: Mode, state: Array, time: Array, options: Options) -> tuple[P
     # On a guard at rest what it does next decides: it need not fire where it will rise.
     rises = (first == 0.0) & (rates == 0.0) & (bends > 0.0)
     lift = jnp.where(rises, jnp.finfo(state.dtype).tiny, lift)
-    watched = Watched(lambda y: values(y) + lift, len(mode.guards))
+    watched = Watched(lambda y: mode.values(y) + lift, len(mode.guards))
     return integrate_phase(mode.field, watched, state, ~past, options), past
 
 
@@ -158,8 +160,7 @@ def _in_time(mode: Mode, end: PhaseEnd, options: Options) -> tuple[Array, Array]
     """What the tolerances of the state, and its rounding, are in the event's time: much where a
     guard is grazed."""
     state = lax.stop_gradient(end.state)
-    values = lambda y: jnp.stack([guard.value(y) for guard in mode.guards])
-    across = jax.jacfwd(values)(state)[jnp.maximum(end.guard, 0)]
+    across = jax.jacfwd(mode.values)(state)[jnp.maximum(end.guard, 0)]
     rounding = jnp.finfo(state.dtype).eps * jnp.abs(state)
     tolerance = options.atol + options.rtol * jnp.abs(state)
     rate = jnp.abs(across @ mode.field(state))

@@ -13,6 +13,7 @@ import numpy as np
 
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.wheel import DOMAINS, Outcome
+from vrw_jax.wheel import PHASES as OF_STEP
 from vrw_jax.wording import as_tex
 
 
@@ -285,7 +286,7 @@ MEASURES: dict[str, Measure] = (
 )
 """Every quantity by name."""
 
-PHASES: tuple[str, ...] = ("DLS", "SLS-I", "SLS-II")
+PHASES = tuple(phase.name for phase in OF_STEP)
 """Names of the phases of a step, in order: values 0, 1, 2 of `phase`."""
 
 

@@ -41,7 +41,7 @@ class Asked(NamedTuple):
     model: Any  # the rung
     options: Options
     cycle_options: CycleOptions
-    tol: float | None = None  # of the measures, in their units
+    tol: float | None  # of the measures, in their units
 
 
 class Engine:

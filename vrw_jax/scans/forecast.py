@@ -28,7 +28,7 @@ def explained(planned: Plan, store: str | Path | None = None) -> dict[str, str]:
     Time and memory are measured on samples spread over the design, which are computed for that.
     """
     layout, size = planned.layout, planned.design.size
-    offer = offer_of(planned.model, planned.tol)
+    offer = offer_of(planned.for_engine.model, planned.for_engine.tol)
     kept = None if store is None else found_store(planned, Path(store), verify=False)
     missing = list(range(layout.n_chunks)) if kept is None else kept.missing()
     left = sum(math.prod(layout.shape_of(i)) for i in missing)

@@ -118,7 +118,7 @@ def canonical(name: str) -> str:
     return name.strip() if wanted is None else wanted.name
 
 
-def check_measures(names: Iterable[str], offer: Offer = PAPER) -> tuple[str, ...]:
+def check_measures(names: Iterable[str], offer: Offer) -> tuple[str, ...]:
     """Names of variables, each once, without what is always there; a sentence for a wrong one."""
     checked: dict[str, None] = {}
     known = (*offer.on_request, *offer.always)

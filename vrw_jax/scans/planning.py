@@ -56,35 +56,26 @@ class Plan:
     """Everything about a scan that is known before it runs."""
 
     design: AbstractDesign
-    measures: tuple[str, ...]
-    base: WheelParams
-    model: AbstractWheel
-    options: Options
-    cycle_options: CycleOptions
+    for_engine: Asked
     layout: Layout
     asked: tuple[str, ...]  # measures by the names that they were asked for
-    text: str = ""
-    tol: float | None = None  # of the measures, in their units
+    text: str
 
     @property
     def settings(self) -> dict[str, object]:
         """What a store must have been made with to be gone on with."""
-        swept = self.design.names
+        measures, base, model, options, cycle_options, tol = self.for_engine
+        fixed = (name for name in PARAMETER_NAMES if name not in self.design.names)
         return {
             "design": self.design.description(),
-            "wheel": {
-                name: float(getattr(self.base, name))
-                for name in PARAMETER_NAMES
-                if name not in swept
-            }
-            | {"n_legs": self.base.n_legs},
-            "measures": list(self.measures),
-            "model": _fields(self.model),
-            "options": _fields(self.options),
-            "cycle_options": _fields(self.cycle_options),
-            "dtype": str(self.base.damping.dtype),
+            "wheel": {name: float(getattr(base, name)) for name in fixed} | {"n_legs": base.n_legs},
+            "measures": list(measures),
+            "model": _fields(model),
+            "options": _fields(options),
+            "cycle_options": _fields(cycle_options),
+            "dtype": str(base.damping.dtype),
             "chunk": list(self.layout.chunk),
-        } | ({} if self.tol is None else {"tol": self.tol})
+        } | ({} if tol is None else {"tol": tol})
 
     @property
     def attrs(self) -> dict[str, object]:
@@ -97,12 +88,6 @@ class Plan:
             ASKED: ", ".join(self.asked),
             "config": self.text,
         }
-
-    @property
-    def for_engine(self) -> Asked:
-        """What samples are computed for."""
-        given = self.measures, self.base, self.model, self.options, self.cycle_options
-        return Asked(*given, self.tol)
 
     def engine(self) -> Evaluate:
         return engine_for(self.for_engine)
@@ -155,18 +140,10 @@ def plan(
     names = check_measures(asked, offer)
     own = (canonical(name) for name in asked)
     first = dict.fromkeys(x for name in own for x in (name, error_of(name))[: 1 + bool(tol)])
-    return Plan(
-        design=design,
-        measures=names,
-        base=base,
-        model=model,
-        options=options,
-        cycle_options=CycleOptions() if cycle_options is None else cycle_options,
-        layout=_layout(design, tuple(first | dict.fromkeys(offer.always)), base, chunk),
-        asked=asked,
-        text=text,
-        tol=tol,
-    )
+    cycle_options = CycleOptions() if cycle_options is None else cycle_options
+    sought = Asked(names, base, model, options, cycle_options, tol)
+    layout = _layout(design, tuple(first | dict.fromkeys(offer.always)), base, chunk)
+    return Plan(design, sought, layout, asked, text)
 
 
 def _towards(model: AbstractWheel, tol: float) -> float:

@@ -103,9 +103,10 @@ def landing_foot_velocity(
 
 
 def landing_foot_velocity_by_differences(
-    params: WheelParams, section_state: np.ndarray, h: float = 1e-6
+    params: WheelParams, section_state: np.ndarray
 ) -> np.ndarray:
-    """The same from the foot's position a moment before and after; right to h^2, some 1e-11 m/s."""
+    """The same from the foot's position a moment before and after; right to some 1e-11 m/s."""
+    h = 1e-6  # s, whose square it is right to
     theta, dtheta, dL1 = (float(v) for v in section_state)
     s, reach = jax.tree.map(float, _touchdown(params, theta))
 
