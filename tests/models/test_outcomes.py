@@ -5,28 +5,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import truth
-from support.batched import IN_TIME, TABLE_1, full_steps, jacobians, lean_steps, wheels_like
+from support.batched import (
+    GAIT,
+    IN_TIME,
+    PROVOKED,
+    TABLE_1,
+    full_steps,
+    jacobians,
+    lean_steps,
+    wheels_like,
+)
 
 import vrw_jax as vrw
 from vrw_jax import Outcome
-
-GAIT = truth.table("cycle", "section_state")[0]
-
-PROVOKED = {
-    Outcome.STEPPED: (wheels_like(), GAIT),
-    Outcome.TOUCHDOWN_BEFORE_STOPPER: (wheels_like(), [0.1027, 2.3, -0.109]),
-    Outcome.STOPPER_IN_DOUBLE_SUPPORT: (
-        wheels_like(damping=157.864, stiffness=464.623, natural_length=1.137, slope=0.315),
-        [0.298, 0.543, -0.589],
-    ),
-    Outcome.FELL_BACK: (wheels_like(slope=0.05), [0.1027, 1.0, -0.109]),
-    Outcome.COLLAPSED: (
-        wheels_like(damping=56.866, stiffness=78.927, natural_length=0.963, slope=0.5),
-        [-0.33, 5.4, -1.989],
-    ),
-    Outcome.LEG_1_LIFTED_OFF: (wheels_like(), [0.1027, 6.0, -0.109]),
-    Outcome.BAD_INPUT: (wheels_like(damping=np.nan), GAIT),
-}
 
 
 @pytest.mark.parametrize("outcome", PROVOKED, ids=lambda o: o.name)

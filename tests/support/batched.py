@@ -11,6 +11,7 @@ from vrw_jax.wheel import PARAMETER_NAMES, Outcome
 
 SIZE = 16
 TABLE_1 = truth.PARAMETERS[0]
+GAIT = truth.table("cycle", "section_state")[0]
 NAMES = PARAMETER_NAMES
 IN_TIME = (
     (0.3, Outcome.NO_TOUCHDOWN_IN_TIME),
@@ -27,6 +28,24 @@ def wheels_like(**changes):
     for name, value in changes.items():
         rows[:, NAMES.index(name)] = value
     return rows
+
+
+PROVOKED = {
+    Outcome.STEPPED: (wheels_like(), GAIT),
+    Outcome.TOUCHDOWN_BEFORE_STOPPER: (wheels_like(), [0.1027, 2.3, -0.109]),
+    Outcome.STOPPER_IN_DOUBLE_SUPPORT: (
+        wheels_like(damping=157.864, stiffness=464.623, natural_length=1.137, slope=0.315),
+        [0.298, 0.543, -0.589],
+    ),
+    Outcome.FELL_BACK: (wheels_like(slope=0.05), [0.1027, 1.0, -0.109]),
+    Outcome.COLLAPSED: (
+        wheels_like(damping=56.866, stiffness=78.927, natural_length=0.963, slope=0.5),
+        [-0.33, 5.4, -1.989],
+    ),
+    Outcome.LEG_1_LIFTED_OFF: (wheels_like(), [0.1027, 6.0, -0.109]),
+    Outcome.BAD_INPUT: (wheels_like(damping=np.nan), GAIT),
+}
+"""Of each outcome a wheel and a start that end so."""
 
 
 def padded(rows, width):
