@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.models import as_full_states, walk_lanes
-from vrw_jax.numerics import Options, SolverName, as_float_array, joined, taken
+from vrw_jax.numerics import Options, joined, taken
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, wheel_of
 
 ROUNDS = (8, 12, 30, 50, 100)
@@ -35,14 +35,8 @@ NEAR = 0.1
 APART, SAME = 0.02, 1e-5
 """Distance above which walks have come to different gaits, and below which gaits are one."""
 
-SOLVER_TOWARDS: SolverName = "Tsit5"
 TOLERANCE_TOWARDS = 1e-8
-"""Of the steps towards a gait, whatever those of the gait itself."""
-
-
-def options_towards() -> Options:
-    tolerance = as_float_array(TOLERANCE_TOWARDS)
-    return Options(solver=SOLVER_TOWARDS, rtol=tolerance, atol=tolerance)
+"""Of the steps towards a gait, by Tsit5, whatever those of the gait itself."""
 
 
 def starts_of(params: WheelParams) -> np.ndarray:
@@ -80,7 +74,8 @@ def _walked(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of each lane where `n_steps` lead, whether it still walks there, and by how much it misses
     that state a period later; infinite where a walk ended before."""
-    given = finder.model, options_towards(), finder.n_legs
+    loose = Options(solver="Tsit5", rtol=TOLERANCE_TOWARDS, atol=TOLERANCE_TOWARDS)
+    given = finder.model, loose, finder.n_legs
     states, _, outcome, *_ = walk_lanes(columns, x, n_steps, *given)
     later, _, ends, *_ = walk_lanes(columns, states, finder.period_n, *given)
     walking = outcome == Outcome.STEPPED

@@ -35,11 +35,13 @@ class AbstractMeasured(AbstractTold):
     named: eqx.AbstractClassVar[Mapping[str, str]]
     """Names there, where they are not the fields' own."""
 
+    def measures(self) -> dict[str, Array]:
+        """Its fields by the names of `results.MEASURES`."""
+        return {self.named.get(name, name): value for name, value in vars(self).items()}
+
     def rows(self) -> list[Row]:
-        told_as = [
-            (MEASURES[type(self).named.get(name, name)], x) for name, x in vars(self).items()
-        ]
-        return [(m.label, told(value, m.unit)) for m, value in told_as]
+        measures = self.measures().items()
+        return [(MEASURES[name].label, told(x, MEASURES[name].unit)) for name, x in measures]
 
 
 class Indicators(AbstractMeasured):
@@ -262,13 +264,10 @@ class StepResult(AbstractStep):
             "duration_sls1": self.durations[..., 1],
             "duration_sls2": self.durations[..., 2],
             "dL1_touchdown": self.section_state[..., 2],
-            "lambda_I4": self.indicators.lambda_I4,
-            "lambda_2_plus": self.indicators.lambda_2,
-            "lambda_4_plus": self.indicators.lambda_4,
-            "energy_lost_landing": self.energy.landing,
-            "energy_lost_stopper": self.energy.stopper,
-            "energy_lost_damping": self.energy.damping,
-        } | {name: getattr(self.monitors, name) for name in MARGINS}
+            **self.indicators.measures(),
+            **self.energy.measures(),
+            **self.monitors.measures(),
+        }
 
 
 class Advance(eqx.Module):

@@ -101,4 +101,4 @@ from vrw_jax.numerics.tableaus import (
 )
 from vrw_jax.numerics.tangents import Balance, by_directions
 from vrw_jax.numerics.trig import sine_cosine
-from vrw_jax.numerics.types import Elementwise, Number, Scalar, Vector, as_float_array
+from vrw_jax.numerics.types import Elementwise, Number, Scalar, Vector

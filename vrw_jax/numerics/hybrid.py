@@ -21,8 +21,8 @@ from vrw_jax.numerics.codes import Code
 from vrw_jax.numerics.events import Field, PhaseEnd, integrate_phase
 from vrw_jax.numerics.minima import State, Watched
 from vrw_jax.numerics.options import Options
-from vrw_jax.numerics.types import Scalar, as_float_array
-from vrw_jax.wording import function_of, instance, whole
+from vrw_jax.numerics.types import Scalar
+from vrw_jax.wording import function_of, instance, reals, whole
 
 MOST_NUMBERS = 100_000_000
 """In all events of a walk: 2.4 GB for times, states before and states after."""
@@ -93,7 +93,7 @@ def walk(
     """
     options = Options() if options is None else options
     instance("options", options, Options, "give vrw.Options()")
-    start, events = as_float_array(start), whole("events", events)
+    start, events = reals("start", start), whole("events", events)
     _require(modes, start, events, mode)
     options.require_reachable(start.dtype)
     return _walk(tuple(modes), events, options, start, mode)

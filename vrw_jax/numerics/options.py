@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.numerics.types import Number, Scalar, as_float_array
+from vrw_jax.numerics.types import Number, Scalar
 from vrw_jax.wording import AbstractTold, Row, chosen, positive, reals, told, whole
 
 SolverName = Literal[
@@ -107,7 +107,7 @@ class Options(AbstractTold):
     @classmethod
     def tight(cls) -> "Options":
         """The tightest useful tolerances in float64: a step is right to about 1e-12."""
-        return cls(rtol=as_float_array(1e-13), atol=as_float_array(1e-13))
+        return cls(rtol=1e-13, atol=1e-13)
 
     def for_derivatives(self) -> "Options":
         """The same choices with tolerances tightened for derivatives, down to round-off."""

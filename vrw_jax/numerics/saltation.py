@@ -11,7 +11,8 @@ from jaxtyping import Array
 from vrw_jax.numerics.events import sample_phase
 from vrw_jax.numerics.hybrid import Guard, Mode, Walk
 from vrw_jax.numerics.options import Options
-from vrw_jax.numerics.types import Scalar, as_float_array
+from vrw_jax.numerics.types import Scalar
+from vrw_jax.wording import reals
 
 
 def volume_change(
@@ -28,7 +29,7 @@ def volume_change(
     Not a number where steps are spent. Transforms apply.
     """
     options = Options() if options is None else options
-    start = as_float_array(start)
+    start = reals("start", start)
     pairs = [_factor(mode, guard, options) for mode in modes for guard in mode.guards]
     firsts = jnp.cumsum(jnp.asarray([0, *(len(mode.guards) for mode in modes)]))[:-1]
     begin = jnp.concatenate([start[None], told.after[:-1]])

@@ -5,8 +5,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Array, Float, Inexact
 
-from vrw_jax.wording import reals
-
 Scalar = Float[Array, ""]
 if TYPE_CHECKING:
     Elementwise = Array
@@ -22,8 +20,3 @@ Vector = tuple[Elementwise, ...]
 
 Number = float | Array | np.ndarray
 """A number as a caller gives it, or an array of them."""
-
-
-def as_float_array(value: object) -> Array:
-    """A strongly typed floating-point array; Python numbers take JAX's default float type."""
-    return reals("the value", value)
