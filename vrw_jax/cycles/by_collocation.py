@@ -21,6 +21,7 @@ from vrw_jax.cycles.finder import (
     AbstractGaitFinder,
     Gait,
     Measured,
+    OnBranch,
     Values,
     leading,
     measured_by_cycle,
@@ -127,7 +128,7 @@ class CollocationFinder(AbstractGaitFinder):
         step, d_step = step_and_columns(self.model, self.n_legs, values, x, dx, self.step_options)
         posture = lambda cycle: jnp.concatenate([cycle.section_state, cycle.durations], -1)
         told = posture(cycle), posture(d_cycle), cycle.located.happens, cycle.matrix
-        return Gait(cycle, step, d_cycle, d_step, *told)
+        return Gait(cycle, step, d_cycle, d_step, OnBranch(*told))
 
     def measured(self, values: Values, guess: Any, names: tuple[str, ...]) -> Measured:
         if set(names) <= set(self.of_cycle):

@@ -14,6 +14,7 @@ from vrw_jax.cycles.cycle import MEASURED, AbstractCycle
 from vrw_jax.cycles.finder import (
     AbstractGaitFinder,
     Gait,
+    OnBranch,
     Values,
     along,
     leading,
@@ -226,4 +227,4 @@ def gait_of(
     posture = lambda cycle, step: jnp.concatenate([cycle.section_state[:numbers], step.durations])
     told = along(posture, (cycle, step), (d_cycle, d_step))
     returns = cycle.matrix[:numbers, :numbers]
-    return Gait(cycle, step, d_cycle, d_step, *told, jnp.ones(1), returns)
+    return Gait(cycle, step, d_cycle, d_step, OnBranch(*told, jnp.ones(1), returns))

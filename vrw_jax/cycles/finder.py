@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from vrw_jax.cycles.cycle import AbstractCycle
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.models import AbstractStep, AbstractWheel
-from vrw_jax.numerics import Options, with_jacobian
+from vrw_jax.numerics import Options, taken, with_jacobian
 from vrw_jax.wheel import Outcome, WheelParams
 
 AGREEMENT = 1e-8
@@ -24,6 +24,15 @@ while steps last some 1.5 s."""
 
 Values = Float[Array, " n_values"]
 """Numbers of `AbstractWheel.parameter_names`."""
+
+
+class OnBranch(NamedTuple):
+    """A gait as a point of a branch: what `same_branch` looks at."""
+
+    posture: Any  # section state and durations
+    d_posture: Any  # leading axis: the rung's numbers
+    order: Any  # what may not change along a branch: which phases happen
+    returns: Any  # derivative of the return to the section
 
 
 class Gait(eqx.Module):
@@ -37,34 +46,13 @@ class Gait(eqx.Module):
     step: AbstractStep  # event by event, from the cycle's section state
     d_cycle: AbstractCycle
     d_step: AbstractStep
-    posture: Float[Array, "*lanes n"]  # section state and durations, which tell branches apart
-    d_posture: Float[Array, "*lanes n_values n"]
-    order: Array  # what may not change along a branch: which phases happen
-    returns: Float[Array, "*lanes m m"]  # derivative of the return to the section
+    on_branch: OnBranch
 
     @property
     def outcome(self) -> np.ndarray:
         """The cycle's outcome, unless the step from it fails or ends elsewhere."""
         cycle, step = self.cycle, self.step
         return confirmed(cycle.outcome, cycle.section_state, step.outcome, step.section_state)
-
-    @property
-    def on_branch(self) -> "OnBranch":
-        """What `same_branch` looks at."""
-        told = self.posture, self.d_posture, self.order, self.returns
-        return OnBranch(*(np.asarray(x) for x in told))
-
-
-class OnBranch(NamedTuple):
-    """A gait as a point of a branch: see the fields of `Gait`."""
-
-    posture: np.ndarray
-    d_posture: np.ndarray
-    order: np.ndarray
-    returns: np.ndarray
-
-    def lane(self, i: int) -> "OnBranch":
-        return OnBranch(*(x[i] for x in self))
 
 
 def same_branch(here: OnBranch, there: OnBranch, change: np.ndarray) -> bool:
@@ -73,6 +61,7 @@ def same_branch(here: OnBranch, there: OnBranch, change: np.ndarray) -> bool:
     The mean of both ends' slopes must account for most of the way between the gaits, the same
     phases must happen, and no multiplier may have passed through 1.
     """
+    here, there = taken((here, there), ...)
     predicted = change @ (0.5 * (here.d_posture + there.d_posture))
     missed = np.linalg.norm(there.posture - here.posture - predicted)
     if missed > 0.5 * np.linalg.norm(predicted) + 1e-6:

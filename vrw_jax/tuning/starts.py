@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.cycles import same_branch
+from vrw_jax.numerics import taken
 from vrw_jax.runtime import library
 from vrw_jax.tuning.objective import Evaluated, breach, slack_scales
 from vrw_jax.wheel import Outcome
@@ -113,5 +114,5 @@ def _constraints(
 
 def _on_branch(here: Evaluated, there: Evaluated, change: np.ndarray) -> np.ndarray:
     first, second = here.gait.on_branch, there.gait.on_branch
-    pairs = ((first.lane(i), second.lane(i), row) for i, row in enumerate(change))
+    pairs = ((*taken((first, second), i), row) for i, row in enumerate(change))
     return np.array([same_branch(*pair) for pair in pairs])
