@@ -15,7 +15,6 @@ import json
 import math
 import os
 import shutil
-import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -345,7 +344,8 @@ def create(path: Path, layout: Layout, attrs: Mapping[str, object]) -> None:
     """Make an empty store at `path`, at once or not at all; there may be one in the meantime."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        building = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+        building = path.parent / f".{path.name}.{os.urandom(8).hex()}"
+        building.mkdir()
     except OSError as error:
         reason = error.strerror or "no folder can be made there"
         raise OSError(
@@ -353,18 +353,11 @@ def create(path: Path, layout: Layout, attrs: Mapping[str, object]) -> None:
         ) from error
     try:
         _fill(building, layout, attrs)
-        building.chmod(0o777 & ~_umask())
         building.rename(path)
     except BaseException as error:
         shutil.rmtree(building, ignore_errors=True)
         if not (isinstance(error, OSError) and stored_manifest(path) is not None):
             raise
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 def _fill(path: Path, layout: Layout, attrs: Mapping[str, object]) -> None:
