@@ -10,10 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import xarray as xr
+from matplotlib.figure import Figure
 
 import vrw_jax as vrw
 from experiments.shared.command import command, started
 from vrw_jax import figures as plots
+from vrw_jax.figures.branch import BORDER, ENDS
+from vrw_jax.figures.style import axis_label, draw_marks
 from vrw_jax.walks.attractors import Settled, distinct, orbit_measures, settle
 
 DAMPINGS = np.round(np.arange(215.0, 225.001, 0.1), 3)  # N s/m
@@ -38,9 +42,59 @@ def main() -> None:
     if not chosen.redraw:
         compute().to_csv(made(chosen.folder) / TABLE, index=False, float_format="%.7g")
     table = pd.read_csv(chosen.folder / TABLE)
-    points = table.to_xarray().assign_attrs(parameter="damping", tried=DAMPINGS.tolist())
     border = vrw.continue_branch(vrw.WheelParams(), "damping", (190.0, 230.0)).borders[-1]
-    plots.save(plots.orbit_figure(points, border.value), chosen.folder, "orbit_diagram")
+    figure = orbit_figure(table.to_xarray(), border.value)
+    plots.save(figure, chosen.folder, "orbit_diagram")
+
+
+@plots.figure_style()
+def orbit_figure(orbits: xr.Dataset, border: float) -> Figure:
+    """Post-impact rates and periods of all that attracts, a row a step, over damping.
+
+    Open: the foot scuffs somewhere in that step; a cross: a step without double support. `border`:
+    where λ4⁺ = 0.
+    """
+    value = orbits.damping.values
+    lifts, scuffs = orbits.duration_dls.values == 0.0, orbits.clearance.values < 0.0
+    figure = Figure(figsize=(plots.PAGE, 3.9))
+    rates, periods = figure.subplots(2, 1, sharex=True, height_ratios=[2.2, 1.0])
+    groups = (
+        (~lifts & ~scuffs, "o", plots.LEG_1, plots.LEG_1, "with DLS"),
+        (~lifts & scuffs, "o", plots.LEG_1, "white", "with DLS, foot 2 scuffs"),
+        (lifts, "x", plots.LEG_2, plots.LEG_2, "rear foot lifts at once ($\\lambda_4^+ < 0$)"),
+        (lifts & scuffs, "o", plots.LEG_2, "none", "the same, foot 2 scuffs"),
+    )
+    for chosen, marker, colour, fill, text in groups:
+        if chosen.any():
+            size = 2.4 if marker == "o" else 3.4
+            x, y = value[chosen], orbits.dtheta_post_impact.values[chosen]
+            draw_marks(rates, x, y, marker, colour, fill, markersize=size, label=text)
+    periods.plot(value, orbits.period.values, "s", color="black", markersize=2.0)
+    for axes in (rates, periods):
+        axes.axvline(border, color=ENDS, linewidth=0.7, linestyle=BORDER, zorder=0)
+        for left, right in _empty_stretches(orbits):
+            axes.axvspan(left, right, color=plots.LIGHT, linewidth=0.0, zorder=0)
+    for left, right in _empty_stretches(orbits)[-1:]:
+        rates.text(0.5 * (left + right), 0.5, "falls", rotation=90, ha="center", va="center",
+                   transform=rates.get_xaxis_transform(), color=plots.GREY)  # fmt: skip
+    rates.text(border, 0.4, " $\\lambda_4^+ = 0$", color=ENDS,
+               transform=rates.get_xaxis_transform())  # fmt: skip
+    rates.set_ylabel("rate after landing, $\\dot\\theta^+$ [rad/s]")
+    rates.legend(loc="lower left", fontsize=7.5)
+    periods.set_ylabel("period [steps]")
+    periods.set_ylim(0.0, 1.0 + float(orbits.period.max()))
+    periods.yaxis.get_major_locator().set_params(integer=True)
+    periods.set_xlabel(axis_label("damping"))
+    return figure
+
+
+def _empty_stretches(orbits: xr.Dataset) -> list[tuple[float, float]]:
+    """Stretches of the damping where no start settled."""
+    empty = ~np.isin(DAMPINGS, orbits.damping.values)
+    half = 0.5 * (DAMPINGS[1] - DAMPINGS[0])
+    cuts = np.flatnonzero(np.diff(empty.astype(int))) + 1
+    parts = [part for part in np.split(np.arange(len(DAMPINGS)), cuts) if empty[part[0]]]
+    return [(DAMPINGS[part[0]] - half, DAMPINGS[part[-1]] + half) for part in parts]
 
 
 def made(folder: Path) -> Path:

@@ -754,7 +754,6 @@ def make() -> None:
     pictures = {
         "gait_panels": plot.gait_panels, "sticks": plot.sticks, "indicators": plot.indicators,
         "walk_frames": plot.walk_frames, "scan_figures": plot.scan_figures,
-        "orbit_figure": plot.orbit_figure,
         "map_figure": lambda v: plot.map_figure(v, "speed", []),
     }  # fmt: skip
     for name, draw in pictures.items():

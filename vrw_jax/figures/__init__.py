@@ -1,6 +1,6 @@
 """Pictures of labelled results; the only room that knows matplotlib."""
 
-from vrw_jax.figures.branch import basin_figure, branch_figure, orbit_figure
+from vrw_jax.figures.branch import basin_figure, branch_figure
 from vrw_jax.figures.scan import map_figure, scan_figures
 from vrw_jax.figures.style import GREY, LEG_1, LEG_2, LIGHT, PAGE, figure_style, save
 from vrw_jax.figures.tuning import tuning_figure

@@ -1,4 +1,4 @@
-"""Figures of branches with their borders, of orbit diagrams and of basins of attraction."""
+"""Figures of branches with their borders, and of basins of attraction."""
 
 import numpy as np
 import xarray as xr
@@ -12,14 +12,11 @@ from vrw_jax.figures.style import (
     GREY,
     LEG_1,
     LEG_2,
-    LIGHT,
     PAGE,
     PINK,
     YELLOW,
     all_drawable,
     axis_label,
-    draw_marks,
-    drawable,
     figure_style,
     outcome_cells,
     outcome_patches,
@@ -169,76 +166,6 @@ def _name_borders(figure: Figure, borders: list[Border], parameter: str) -> None
     handles.append(Line2D([], [], color="black", linestyle="-", label="stable"))
     handles.append(Line2D([], [], color="black", linestyle="--", label="unstable"))
     figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=7.5)
-
-
-@figure_style()
-def orbit_figure(orbits: xr.Dataset, border: float | None = None) -> Figure:
-    """Post-impact rates and periods of all that attracts over a parameter.
-
-    Open: the foot scuffs somewhere in that step; a cross: a step without double support.
-
-    Args:
-        orbits: a row a step, with the parameter, `dtheta_post_impact` (rad/s), `period` (steps),
-            `duration_dls` (s) and `clearance` (m); the attribute `parameter` says which, `tried`
-            where there may be gaps.
-        border: value of the parameter that is marked: where λ4⁺ = 0.
-
-    Returns:
-        Figure: rates above, periods below.
-
-    Examples:
-        >>> columns = {"damping": [100.0, 120.0], "dtheta_post_impact": [1.2, 1.3]}
-        >>> columns |= {"period": [1, 1], "duration_dls": [0.1, 0.1], "clearance": [0.01, -0.01]}
-        >>> orbits = xr.Dataset({name: ("step", values) for name, values in columns.items()})
-        >>> orbits = orbits.assign_attrs(parameter="damping", tried=[100.0, 120.0])
-        >>> figure = vrw.plot.orbit_figure(orbits)
-    """
-    drawable("orbits", orbits, ("parameter", "clearance"), "give a row a step, as its page tells")
-    parameter = str(orbits.attrs["parameter"])
-    value = orbits[parameter].values
-    lifts, scuffs = orbits.duration_dls.values == 0.0, orbits.clearance.values < 0.0
-    figure = Figure(figsize=(PAGE, 3.9))
-    rates, periods = figure.subplots(2, 1, sharex=True, height_ratios=[2.2, 1.0])
-    groups = (
-        (~lifts & ~scuffs, "o", LEG_1, LEG_1, "with DLS"),
-        (~lifts & scuffs, "o", LEG_1, "white", "with DLS, foot 2 scuffs"),
-        (lifts, "x", LEG_2, LEG_2, "rear foot lifts at once ($\\lambda_4^+ < 0$)"),
-        (lifts & scuffs, "o", LEG_2, "none", "the same, foot 2 scuffs"),
-    )
-    for chosen, marker, colour, fill, text in groups:
-        if chosen.any():
-            size = 2.4 if marker == "o" else 3.4
-            x, y = value[chosen], orbits.dtheta_post_impact.values[chosen]
-            draw_marks(rates, x, y, marker, colour, fill, markersize=size, label=text)
-    periods.plot(value, orbits.period.values, "s", color="black", markersize=2.0)
-    for axes in (rates, periods):
-        if border is not None:
-            axes.axvline(border, color=ENDS, linewidth=0.7, linestyle=BORDER, zorder=0)
-        for left, right in _empty_stretches(orbits):
-            axes.axvspan(left, right, color=LIGHT, linewidth=0.0, zorder=0)
-    for left, right in _empty_stretches(orbits)[-1:]:
-        rates.text(0.5 * (left + right), 0.5, "falls", rotation=90, ha="center", va="center",
-                   transform=rates.get_xaxis_transform(), color=GREY)  # fmt: skip
-    if border is not None:
-        rates.text(border, 0.4, " $\\lambda_4^+ = 0$", color=ENDS,
-                   transform=rates.get_xaxis_transform())  # fmt: skip
-    rates.set_ylabel("rate after landing, $\\dot\\theta^+$ [rad/s]")
-    rates.legend(loc="lower left", fontsize=7.5)
-    periods.set_ylabel("period [steps]")
-    periods.set_ylim(0.0, 1.0 + float(orbits.period.max()))
-    periods.yaxis.get_major_locator().set_params(integer=True)
-    periods.set_xlabel(axis_label(parameter))
-    return figure
-
-
-def _empty_stretches(orbits: xr.Dataset) -> list[tuple[float, float]]:
-    """Stretches of the parameter where no start settled."""
-    tried = np.asarray(orbits.attrs["tried"], float)
-    empty = ~np.isin(tried, orbits[orbits.attrs["parameter"]].values)
-    half = 0.5 * (tried[1] - tried[0])
-    cuts = np.flatnonzero(np.diff(empty.astype(int))) + 1
-    parts = [part for part in np.split(np.arange(len(tried)), cuts) if empty[part[0]]]
-    return [(tried[part[0]] - half, tried[part[-1]] + half) for part in parts]
 
 
 @figure_style()
