@@ -108,29 +108,15 @@ class WalkedCycle(AbstractCycle):
 
 @eqx.filter_jit
 def walked_cycle(
-    params: WheelParams, x: Array, model: AbstractWheel, options: Options, period_n: int
+    params: WheelParams, x: Array, model: AbstractWheel, options: Options, period_n: int, dear: bool
 ) -> WalkedCycle:
-    image = lambda x: model.advance(params, x, options).section_state
-    found = newton_cycle(image, x, period_n=period_n, tolerance=finest(options))
-    return _from_its_point(params, found, model, options, period_n)
+    """`dear`: second derivatives of a step are, as on real ground: see `moved_cycle`.
 
-
-@eqx.filter_jit
-def stepped_cycle(
-    params: WheelParams, x: Array, model: AbstractWheel, options: Options, period_n: int
-) -> WalkedCycle:
-    """The same where second derivatives of a step are dear, as on real ground: see `moved_cycle`.
-
-    Searched for by the step that tells the gait, so that one program is compiled, not two.
+    Searched for by the step that tells the gait then, so that one program is compiled, not two.
     """
-    image = lambda x: model.step(params, x, options).section_state
-    found = moved_cycle(image, x, period_n=period_n, tolerance=finest(options))
-    return _from_its_point(params, found, model, options, period_n)
-
-
-def _from_its_point(
-    params: WheelParams, found: SectionCycle, model: AbstractWheel, options: Options, period_n: int
-) -> WalkedCycle:
+    take, search = (model.step, moved_cycle) if dear else (model.advance, newton_cycle)
+    image = lambda x: take(params, x, options).section_state
+    found = search(image, x, period_n=period_n, tolerance=finest(options))
     x, results = found.x, []
     for _ in range(period_n):
         results.append(model.step(params, x, options))
@@ -182,7 +168,8 @@ class AbstractWalkingFinder(AbstractGaitFinder):
         return cls(model, n_legs, step, period_n)
 
     def cycle(self, params: WheelParams, guess: Any = None) -> WalkedCycle:
-        return walked_cycle(*where_walks_begin(self, params, guess), self.period_n)
+        given = where_walks_begin(self, params, guess)
+        return walked_cycle(*given, self.period_n, dear=False)
 
     def first_guess(self, values: Values) -> Array:
         """Where a walk from the rung's start ends."""

@@ -23,7 +23,7 @@ from vrw_jax.cycles.by_walking import (
     finest,
     gait_of,
     of_steps,
-    stepped_cycle,
+    walked_cycle,
     where_walks_begin,
 )
 from vrw_jax.cycles.cycle import AbstractCycle
@@ -78,7 +78,7 @@ class GroundFinder(AbstractWalkingFinder):
         """By lanes where everything has a value, else by the step's own derivatives."""
         params, x, model, options = where_walks_begin(self, params, guess)
         if traced(params, x, model):
-            return stepped_cycle(params, x, model, options, self.period_n)
+            return walked_cycle(params, x, model, options, self.period_n, dear=True)
         return jax.tree.map(lambda x: x[0], self.near(model.values(params)[None], x[None]))
 
     def cycles(self, params: WheelParams, guess: Any = None) -> Any:
