@@ -84,7 +84,7 @@ from vrw_jax.numerics.levels import (
 from vrw_jax.numerics.march import LanePhase, integrate_lanes, sample_lanes, sampled
 from vrw_jax.numerics.minima import ROUNDING, State, Watched
 from vrw_jax.numerics.newton import SectionCycle, moved_cycle, newton_cycle
-from vrw_jax.numerics.options import Engine, Options, SolverName
+from vrw_jax.numerics.options import Engine, Options
 from vrw_jax.numerics.roots import BIFURCATIONS, bifurcation_functions, brackets, locate, turns
 from vrw_jax.numerics.saltation import volume_change
 from vrw_jax.numerics.segments import product_multipliers, segment_maps
