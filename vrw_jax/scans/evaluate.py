@@ -94,23 +94,18 @@ class Engine:
 
     def __call__(self, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Results of the samples in `columns` (one value per sample of each swept parameter)."""
-        n = len(next(iter(columns.values())))
-        batches = [slice(begin, min(begin + LANES, n)) for begin in range(0, n, LANES)]
+        rows = numbers(columns, self._model, self._base)
         with self._compiling:
             if not self._workers:
                 self._compile()
+        batches = (rows[begin : begin + LANES] for begin in range(0, len(rows), LANES))
         with ThreadPoolExecutor(self._workers) as pool:
-            told = pool.map(
-                lambda batch: self._batch({name: x[batch] for name, x in columns.items()}), batches
-            )
-            parts = [
-                {name: value[: batch.stop - batch.start] for name, value in part.items()}
-                for batch, part in zip(batches, told, strict=True)
-            ]
-        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+            parts = list(pool.map(self._batch, batches))
+        return {n: np.concatenate([part[n] for part in parts])[: len(rows)] for n in parts[0]}
 
-    def _batch(self, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        filled = filled_up(numbers(columns, self._model, self._base), LANES)
+    def _batch(self, rows: np.ndarray) -> dict[str, np.ndarray]:
+        """Of LANES wheels: the first stands in for those that are missing."""
+        filled = np.concatenate([rows, np.repeat(rows[:1], LANES - len(rows), 0)])
         programs = self._free.get()
         try:
             values = jax.device_put(filled, programs.device)
@@ -178,11 +173,6 @@ def numbers(
         ],
         axis=-1,
     )
-
-
-def filled_up(rows: np.ndarray, n: int) -> np.ndarray:
-    """`n` rows: the first stands in for those that are missing."""
-    return np.concatenate([rows, np.repeat(rows[:1], n - len(rows), 0)])
 
 
 def masked(outcome: np.ndarray, told: Mapping[str, Any]) -> dict[str, np.ndarray]:

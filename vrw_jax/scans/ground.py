@@ -73,15 +73,11 @@ class GroundEngine:
         """Of each sample the gait that slow starts walk to."""
         # Over a period friction carries all weight along the slope: with less no gait repeats.
         friction, slope = values[:, -1], values[:, PARAMETER_NAMES.index("slope")]
-        holds = np.flatnonzero(friction >= np.tan(slope))
-        outcome = np.full(len(values), int(Outcome.NO_CYCLE_FOUND))
-        told = self._gaits(values[holds] if len(holds) else values[:1])
-        whole = {n: np.zeros((len(values), *x.shape[1:]), x.dtype) for n, x in told.items()}
-        if len(holds):
-            outcome[holds] = told.pop("outcome")
-            for name, leaf in told.items():
-                whole[name][holds] = leaf
-        whole.pop("outcome")
+        holds = friction >= np.tan(slope)
+        told = self._gaits(values[holds] if holds.any() else values[:1])
+        place = np.maximum(np.cumsum(holds) - 1, 0)  # another stands in for who has none
+        whole = {name: leaf[place] for name, leaf in told.items()}
+        outcome = np.where(holds, whole.pop("outcome"), Outcome.NO_CYCLE_FOUND)
         return masked(outcome, whole)
 
     def _gaits(self, values: np.ndarray) -> Told:
