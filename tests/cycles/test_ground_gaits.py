@@ -450,6 +450,28 @@ def test_newtons_method_on_lanes_goes_back_where_no_step_ends(monkeypatch):
     assert max(np.abs(x).max() for x in calls) > 3.0  # where it was sent back from
 
 
+def test_what_newtons_method_on_lanes_tells_repeats_where_the_map_jumps_next_to_it(monkeypatch):
+    """A map of one number, x to x / 2, but below a jump to x / 2 - 1, whose one point is -2. What
+    corrections come down to lies behind the jump and repeats nothing: without wheels."""
+    jump, begin = 4e-11, 3.6e-9
+
+    def step(columns, states, *_):
+        x = states[:, 0]
+        behind = x < jump
+        by = np.zeros((len(x), 2, 3))
+        # Before it a wrong slope, by which each correction leaves a sixth: 1e-10 is left of two.
+        by[:, 0, 1] = np.where(behind, 0.5, 0.4)
+        outcome = np.full(len(x), int(vrw.Outcome.STEPPED))
+        return _Told(np.stack([0.5 * x - behind, 0.0 * x], 1), outcome), _Told(by, None)
+
+    monkeypatch.setattr(on_ground, "step_lanes", step)
+    given = np.zeros((1, 1)), np.array([[begin, 0.0]]), True
+    found = on_ground._newton(None, 1, vrw.Options(rtol=1e-10, atol=1e-10), 1, *given)
+    assert found.converged[0]
+    assert found.residual[0] < 1e-10
+    assert abs(found.x[0, 0] + 2.0) < 1e-10
+
+
 def test_of_many_systems_one_that_is_singular_spoils_no_other():
     matrix = np.stack([np.eye(2), np.zeros((2, 2)), 2.0 * np.eye(2)])
     found = on_ground.solved(matrix, np.ones((3, 2, 1)))[..., 0]

@@ -156,6 +156,15 @@ def test_at_a_graze_the_product_of_multipliers_keeps_its_digits(depth):
     assert (lost > 1e-12) == (depth == 1e-6)
 
 
+def test_what_newton_s_method_tells_repeats_where_the_map_jumps_next_to_it():
+    """x to x^2, whose points are 0 and 1, with a hole around 0 in which x leads to 7."""
+    leaps = lambda x: jnp.where(jnp.abs(x) < 1e-15, 7.0, x**2)
+    cycle = newton_cycle(leaps, jnp.array([1e-5]), tolerance=1e-9)
+    assert cycle.converged
+    assert abs(cycle.x[0] - 1.0) < 1e-12
+    assert cycle.residual < 1e-12
+
+
 def test_volumes_shrink_by_friction_and_by_every_bounce():
     """x' = v, v' = -g - v: exp(-t) in all, and r² at each bounce."""
     drag = lambda y: jnp.stack([y[1], -G - y[1]])

@@ -254,7 +254,8 @@ def _corrected(
     """Newton's method on the `wanted` until a correction is small enough, and the last Jacobians.
 
     A correction that leads where no period ends is halved. A small correction `ends` it, or else
-    another evaluation, which tells the gait that it leads to.
+    another evaluation, which tells the gait that it leads to: a period that repeats as well, for
+    where feet dip the map may jump between the two.
     """
     wheels, n_legs = len(start), maps.n_legs
     x, last = start.copy(), start.copy()
@@ -273,8 +274,9 @@ def _corrected(
         residual[open_] = np.abs(now.image - x[open_]).max(-1)
         by_start[open_] = now.by_start
         count[open_] += 1
-        done = good & (small[open_] | (size <= CLEAR * tolerance)) & (not ends)
-        small[open_] = good & (size <= tolerance)
+        fits = good & (size <= tolerance)
+        done = fits & (small[open_] | (size <= CLEAR * tolerance)) & (not ends)
+        small[open_] = fits
         moving = open_[good & ~done]
         last[moving], halved[moving] = x[moving], 0
         x[moving] += change[good & ~done]

@@ -166,7 +166,7 @@ def _found(
         x, size, count, followed, *_ = state
         searching = searches(size, count)
         change, jacobian, miss = _correction(image, x, closed_over)
-        size = jnp.where(searching, jnp.max(jnp.abs(change)), size)
+        size = jnp.max(jnp.abs(change))  # of the last ones too: the map may jump next to its point
         moved = jnp.where(jnp.all(jnp.isfinite(change)), x + change, x)
         told = jacobian, jnp.max(jnp.abs(miss))
         return moved, size, count + searching, followed + ~searching, *told
