@@ -40,7 +40,7 @@ class Lowest(NamedTuple):
     length: Array  # of that step, (monitors, lanes), s
     offset: Array  # of the minimum from its beginning, s
     rate: Array  # there
-    direction: Array | None = None  # in which that beginning moves, (monitors, ., lanes)
+    direction: Array | None = None  # that beginning moves, (monitors, directions, ., lanes)
 
 
 def with_rates(
@@ -80,7 +80,7 @@ class Passed(NamedTuple):
 
 
 def lowered(monitors: Monitors, evaluate: Evaluate, lowest: Lowest, step: Passed) -> Lowest:
-    here, end, length, taken, direction = step
+    here, end, length, taken, _ = step
     values, rates = map(jnp.stack, with_rates(monitors.values, evaluate, end))
     x, value = cubic_minimum(lowest.values, lowest.rates * length, values, rates * length)
     value = jnp.where(jnp.isfinite(value), value, jnp.minimum(lowest.values, values))
@@ -88,6 +88,9 @@ def lowered(monitors: Monitors, evaluate: Evaluate, lowest: Lowest, step: Passed
     better = taken & turns & (value < lowest.so_far)
     keep = lambda new, old: jnp.where(better, new, old)
     held = lambda new, old: jnp.where(better[:, None], jnp.stack(new), old)
+    direction = lowest.direction
+    if direction is not None and step.direction is not None:
+        direction = jnp.where(better[:, None, None], step.direction[None], direction)
     return Lowest(
         values=jnp.where(taken, values, lowest.values),
         rates=jnp.where(taken, rates, lowest.rates),
@@ -97,7 +100,7 @@ def lowered(monitors: Monitors, evaluate: Evaluate, lowest: Lowest, step: Passed
         length=keep(length, lowest.length),
         offset=keep(x * length, lowest.offset),
         rate=keep(lowest.rates, lowest.rate),
-        direction=None if direction is None else held(direction[None], lowest.direction),
+        direction=direction,
     )
 
 
@@ -187,7 +190,7 @@ def moved(
 ) -> Array:
     """How minima move: along the motion there, since their place takes no part in first order.
 
-    `ends`: of the phase; `direction`: in which the last of them moves.
+    `ends`: of the phase; `direction`: in which the last of them moves. Directions first.
     """
     monitors, evaluate = monitors_of(moving.constants, moving.held)
 
@@ -204,10 +207,10 @@ def moved(
         taken = take(begin, length)
         way = moving.along(tableau, taken.stages, held.direction, length)
         chosen = jnp.arange(len(monitors.counts_at_start)) == index
-        return None, jnp.sum(jnp.where(chosen[:, None], along(taken.end, way), 0.0), 0)
+        return None, jnp.sum(jnp.where(chosen[:, None], along(taken.end, way), 0.0), 1)
 
     indices = jnp.arange(len(found.lowest), dtype=jnp.int32)
-    inside = lax.scan(one, None, (indices, lowest, found.length))[1]
+    inside = jnp.moveaxis(lax.scan(one, None, (indices, lowest, found.length))[1], 0, 1)
     first, last = along(ends[0], moving.start), along(ends[1], direction)
     at_end = jnp.where(lowest.values <= found.lowest, last, first)
     return jnp.where(found.inside <= found.lowest, inside, at_end)

@@ -38,7 +38,7 @@ from vrw_jax.numerics.tableaus import (
     change_of_length,
     take_step,
 )
-from vrw_jax.numerics.tangents import Balance, Moving
+from vrw_jax.numerics.tangents import Balance, Moving, in_directions, stacked
 from vrw_jax.numerics.types import Vector
 from vrw_jax.simd import apart
 
@@ -80,7 +80,7 @@ class _March(NamedTuple):
     half: Array  # iterations after which half of the lanes had finished
     iterations: Array
     lowest: Lowest | None
-    direction: Array | None  # in which it moves here, (2 n, lanes), see `tangents`
+    direction: Array | None  # in which it moves here, (directions, ., lanes), see `tangents`
 
 
 MARCHING, TIMED_OUT, GAVE_UP, CROSSED, IDLE = range(5)
@@ -116,17 +116,22 @@ def integrate_lanes(
 
     @run.defjvp
     def rule(primals: tuple, tangents: tuple) -> tuple[LanePhaseEnd, LanePhaseEnd]:
-        moved, held, q, v, *_ = tangents
-
         def balance_of(*constants: Any) -> Balance:
             balance = phase_of(*constants).balance
             assert balance is not None
             return balance
 
-        start = jnp.stack([*q, *v, *held])
-        moving = Moving(balance_of, primals[0], primals[1], moved, start)
-        ended = _ended(phase_of, tableau, moving, *primals)
-        return ended.end, _end_moved(phase_of, tableau, moving, ended)
+        def both(primals: tuple, ways: tuple) -> tuple[LanePhaseEnd, tuple]:
+            moved, held, q, v = ways
+            start = stacked((*q, *v, *held))
+            moving = Moving(balance_of, primals[0], primals[1], moved, start)
+            ended = _ended(phase_of, tableau, moving, *primals)
+            return ended.end, _end_moved(phase_of, tableau, moving, ended)
+
+        end, (q, v, later, minima) = in_directions(both, primals, tangents[:4])
+        nothing = without_derivative(end)
+        place = nothing.place._replace(q=q, v=v)
+        return end, nothing._replace(place=place, duration=later, minima=minima)
 
     return run(constants, held, q, v, active, first_step, options, few)
 
@@ -142,19 +147,21 @@ class _Ended(NamedTuple):
     least: Settled | None
 
 
-def _end_moved(phase_of: PhaseOf, tableau: Tableau, moving: Moving, ended: _Ended) -> LanePhaseEnd:
-    """How the phase's end moves along a direction of its start and constants."""
+def _end_moved(
+    phase_of: PhaseOf, tableau: Tableau, moving: Moving, ended: _Ended
+) -> tuple[Vector, Vector, Array, Array | None]:
+    """How the phase's end moves along directions of its start and constants: positions, rates,
+    its duration, minima of its monitors."""
     take, start, end, march, lowest, least = ended
     n, h = len(start.q), jnp.where(march.verdict == CROSSED, end.duration - march.time, 0.0)
     taken = take(march.here, h)
     assert march.direction is not None
     direction = moving.along(tableau, taken.stages, march.direction, h)
 
-    place, numbers = taken.end, tuple(direction)
+    place, numbers = taken.end, tuple(jnp.moveaxis(direction, 1, 0))
     later = _event_moved(phase_of, moving, place, direction, march, end.guard)
     motion = (*place.v, *place.slope.acceleration[:n])
     told = tuple(x + later * y for x, y in zip(numbers[: 2 * n], motion, strict=True))
-    nothing = without_derivative(end)
     minima = None
     if lowest is not None and least is not None:
 
@@ -163,10 +170,9 @@ def _end_moved(phase_of: PhaseOf, tableau: Tableau, moving: Moving, ended: _Ende
             assert phase.monitors is not None
             return phase.monitors, phase.evaluate
 
-        ends, way = (start, end.place), jnp.stack([*told, *numbers[2 * n :]])
+        ends, way = (start, end.place), jnp.stack([*told, *numbers[2 * n :]], 1)
         minima = moved_minima(monitors_of, take, tableau, moving, lowest, least, ends, way)
-    place_moved = nothing.place._replace(q=told[:n], v=told[n:])
-    return nothing._replace(place=place_moved, duration=later, minima=minima)
+    return told[:n], told[n:], later, minima
 
 
 def _event_moved(
