@@ -12,10 +12,10 @@ import jax
 
 @functools.cache
 def code_digest() -> str:
-    """A digest of the library's source: other code may give other digits."""
+    """A digest of the library's source and methods: other ones may give other digits."""
     digest = hashlib.sha256()
     folder = Path(__file__).parents[1]
-    for path in sorted(folder.rglob("*.py")):
+    for path in sorted((*folder.rglob("*.py"), *folder.rglob("*.json"))):
         digest.update(path.relative_to(folder).as_posix().encode())
         digest.update(path.read_bytes())
     return digest.hexdigest()
