@@ -154,11 +154,9 @@ def _floats(name: str, dtype: Any) -> None:
 
 
 def _both(n: Numbers, dtype: Any, methods: tuple[str, str], x: Value, y: Value) -> Value:
-    """The builder's method for floats, or that for integers."""
+    """An instruction for floats, or that for integers."""
     x, y = n.alike(x, y)
-    if dtype.kind == "f":
-        return getattr(n.builder, methods[0])(x, y, flags=FUSED)
-    return getattr(n.builder, methods[1])(x, y)
+    return n.operation(f"{methods[0]} {' '.join(FUSED)}" if dtype.kind == "f" else methods[1], x, y)
 
 
 def _compare(n: Numbers, how: str, dtype: Any, x: Value, y: Value) -> Value:

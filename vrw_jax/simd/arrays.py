@@ -196,12 +196,14 @@ class Arrays:
     def mapped(self, asked: Asked, values: Sequence[Entries]) -> Entries:
         """An elementwise primitive."""
         name, params, given, out = asked
-        shape = shape_of(out)
+        shape, before = shape_of(out), given[0].dtype
+        if not shape and all(isinstance(x, np.ndarray) and not x.shape for x in values):
+            some = [x.item() for x in values]  # type: ignore[union-attr]
+            return array_of((), [elementwise(self.numbers, name, params, before, out.dtype, some)])
         if any(x.shape != shape for x in values):
             # One number for all lanes may have an axis for them, or be the same anywhere.
             values = [self.fitted(x, x.shape[:-1], len(x.shape) > len(shape)) for x in values]
             values = [self.broadcast(x, shape, range(len(x.shape))) for x in values]
-        before = given[0].dtype
         make = lambda some: elementwise(self.numbers, name, params, before, out.dtype, some)
         if any(isinstance(x, Field) for x in values):
             at = lambda index: make([self.entry(x, index) for x in values])
