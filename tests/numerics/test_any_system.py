@@ -19,6 +19,7 @@ from vrw_jax.numerics import (
     newton_cycle,
     product_multipliers,
     segment_maps,
+    time_errors,
     volume_change,
     walk,
 )
@@ -124,6 +125,86 @@ def test_where_one_rounding_moves_an_event_more_than_its_digits_the_walk_says_so
     np.testing.assert_allclose(told.rounding[0], moved, rtol=1e-3)
     assert (moved > 1e-12) == (depth == 1e-8)
     assert wrong < max(1e-12, 2.0 * float(told.rounding[0]))
+
+
+def switching(rate):
+    """ARGESIM's C5: a fast state that follows a slow one and switches it at 5.8 and 2.5. What is
+    left of the fast exponential at a switch is below exp(-900)."""
+    slow, levels = 3.5651205, ((0.4, 5.5, 5.8), (-0.3, 2.73, 2.5))
+    modes = [
+        Mode(
+            lambda y, a=a, b=b: jnp.stack([rate * (y[1] + a - y[0]), slow * (b - y[1])]),
+            (Guard(lambda y, at=at, sign=1.0 - 2.0 * k: sign * (at - y[0]), to=1 - k),),
+        )
+        for k, (a, b, at) in enumerate(levels)
+    ]
+    y, times = 0.3, []
+    for k in range(6):
+        a, b, at = levels[k % 2]
+        times.append(np.log((y - b) * rate / (rate - slow) / (at - a - b)) / slow)
+        y = b + (y - b) * np.exp(-slow * times[-1])
+    return modes, [4.2, 0.3], np.cumsum(times)
+
+
+def crossing(field, start, behind, angle, events):
+    """Guards on y[0] = 1/2 both ways, of y[0] that falls there at `behind` + `angle` + 2 pi k."""
+    halves = [Guard(lambda y: y[0] - 0.5, to=1), Guard(lambda y: 0.5 - y[0], to=0)]
+    turns = 2.0 * np.pi * np.repeat(np.arange(events), 2)[1 : events + 1]
+    signs = np.tile([angle, -angle], events)[:events]
+    return [Mode(field, (half,)) for half in halves], start, turns + signs + behind
+
+
+def following(rate):
+    """y' = rate (cos t - y) of a rotation: its cosine, a little smaller and later."""
+    field = lambda y: jnp.stack([rate * (y[1] - y[0]), -y[2], y[1]])
+    size = rate**2 / (1.0 + rate**2)  # cos of the lag times the amplitude
+    angle = np.arccos(0.5 / np.sqrt(size))
+    return crossing(field, [size, 1.0, 0.0], np.arctan(1.0 / rate), angle, 20)
+
+
+def attracted(rate):
+    """Prothero and Robinson's: y = cos t, to which the field pulls."""
+    field = lambda y: jnp.stack([-rate * (y[0] - jnp.cos(y[1])) - jnp.sin(y[1]), 1.0 + 0.0 * y[1]])
+    return crossing(field, [1.0, 0.0], 0.0, np.pi / 3.0, 10)
+
+
+@pytest.mark.parametrize(
+    ("stiff", "rate", "solver"),
+    [
+        (switching, 2.7e6, "Kvaerno5"),
+        (switching, 1e3, "Kvaerno5"),
+        (following, 1e6, "Kvaerno5"),
+        (attracted, 1e3, "Kvaerno4"),
+    ],
+)
+def test_event_times_of_implicit_solvers_are_within_what_is_stated(stiff, rate, solver):
+    modes, start, truth = stiff(rate)
+
+    @jax.jit
+    def both(tolerance):
+        options = vrw.Options(solver, rtol=tolerance, atol=tolerance, max_phase_time=100.0)
+        told = walk(modes, start, events=len(truth), options=options)
+        return told, time_errors(modes, start, told, options)
+
+    beyond = []
+    for tolerance in (1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10):
+        told, stated = both(jnp.asarray(tolerance))
+        n = int(told.n_events)  # one of the walks ends early: a rounding off its guard, GUARD_PAST
+        wrong = np.abs(told.times[:n] - truth[:n])
+        assert n > 1
+        assert np.all(wrong <= stated[:n]), tolerance
+        beyond.append(np.max(wrong / told.resolution[:n]))
+    # One event's resolution is no bound: errors add up, and the solver's estimate leaves some out.
+    assert max(beyond) > 3.0
+
+
+def test_an_event_time_s_error_is_twice_its_resolution_at_least_and_infinite_past_another_event():
+    told = walk([ball()], [1.0, 0.0], events=4, options=TIGHT)
+    stated = lambda told: time_errors([ball()], [1.0, 0.0], told, TIGHT)
+    np.testing.assert_array_equal(stated(told), 2.0 * told.resolution)  # a fall has no error
+    other = told._replace(guards=told.guards.at[2].set(1), n_events=told.n_events - 1)
+    np.testing.assert_array_equal(np.isinf(stated(other)), [False, False, True, False])
+    assert stated(other)[3] == 0.0  # no event
 
 
 def impacting(depth):

@@ -59,7 +59,7 @@ from vrw_jax.numerics.gauss import (
     lagrange,
     transfer_matrix,
 )
-from vrw_jax.numerics.hybrid import Guard, Mode, Stop, walk
+from vrw_jax.numerics.hybrid import Guard, Mode, Stop, time_errors, walk
 from vrw_jax.numerics.lane_algebra import LaneArray
 from vrw_jax.numerics.lane_minima import Monitors
 from vrw_jax.numerics.lanes import (
