@@ -116,7 +116,7 @@ def time_errors(
     times the tolerance does not meet. Measured, not proved; `options` are those of the walk.
     """
     options = Options() if options is None else options
-    start, told = lax.stop_gradient((as_float_array(start), told))
+    start, told = lax.stop_gradient((reals("start", start), told))
     count = jnp.arange(len(told.times))
 
     def moved(factor: Array) -> Array:
