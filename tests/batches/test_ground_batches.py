@@ -74,3 +74,10 @@ def test_a_lane_that_falls_has_zeros_and_its_neighbours_do_not_notice(found):
         assert not np.any(mine.section_state[1])
         assert not np.any(mine.durations[1])
         assert np.array_equal(mine.section_state[0], whole.section_state[0])
+
+
+def test_what_was_given_is_left_as_it_was():
+    states = np.array(walked().section_state)
+    before = states.copy()
+    walked(states=states, derivatives=("section_state",))
+    np.testing.assert_array_equal(states, before)

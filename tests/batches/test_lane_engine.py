@@ -160,6 +160,20 @@ def test_the_engine_is_chosen_by_model_and_solver_and_named():
         vrw.steps(params, states, options=vrw.Options(solver="Kvaerno5"), engine="lanes")
 
 
+@pytest.mark.parametrize("engine", ["lanes", "collocation"])
+def test_results_are_arrays_of_their_own_and_what_was_given_is_left_as_it_was(engine):
+    states, near = STARTS.copy(), VALUES[:, 3:].copy()
+    params = truth.wheels(truth.PARAMETERS)
+    for n_steps in (1, 3):
+        found = vrw.steps(params, states, n_steps, engine=engine, durations=near)
+        for array in jax.tree.leaves(found):
+            assert type(array) is np.ndarray
+            array[:] = 0  # its owner may
+        np.testing.assert_array_equal(states, STARTS)
+        np.testing.assert_array_equal(near, VALUES[:, 3:])
+        np.testing.assert_array_equal(params.damping, truth.wheels(truth.PARAMETERS).damping)
+
+
 def test_what_can_be_seen_to_be_wrong_is_said_in_one_sentence():
     params = vrw.WheelParams()
     with pytest.raises(ValueError, match=r"shape \(lanes, 3\)"):

@@ -29,7 +29,7 @@ from vrw_jax.batches.stiffness import (
     TIGHTER,
     cheapest_solver,
 )
-from vrw_jax.batches.walked import START, Steps, Walked
+from vrw_jax.batches.walked import START, Steps, Walked, only
 from vrw_jax.models import (
     DIRECTIONS,
     AbstractWheel,
@@ -43,7 +43,7 @@ from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, WheelParams, wheel
 from vrw_jax.wording import (
     chosen,
     instance,
-    reals,
+    known_reals,
     untraced,
     whole,
 )
@@ -116,12 +116,12 @@ def steps(
     rung, options = rung_of(model, many=True), options_of(options)
     chosen("engine", engine, ENGINES)
     n_steps = whole("n_steps", n_steps)
-    states = np.asarray(state_of(states, "states"))
-    wheels = _wheels(params, states, rung, n_steps, options)
-    states = states.astype(wheels.dtype)
+    x: np.ndarray = state_of(states, "states", known_reals)
+    columns = _columns(params, x, rung, options)
+    x = x.astype(columns[0].dtype, copy=False)
     by_legs = rung.lanes == "legs"
     moved = _moved(derivatives, ON_GROUND if by_legs else BY_PHASES, engine)
-    given = rung, wheels, states, n_steps, options, engine, params.n_legs
+    given = rung, columns, x, n_steps, options, engine, params.n_legs
     return on_ground(*given, moved) if by_legs else _by_phases(*given, durations, moved)
 
 
@@ -141,11 +141,13 @@ def _moved(derivatives: Sequence[str], known: tuple[str, ...], engine: str) -> l
     return names
 
 
-def _wheels(
-    params: WheelParams, states: np.ndarray, model: AbstractWheel, n_steps: int, options: Options
-) -> np.ndarray:
-    """Parameters of each lane, (parameters, lanes); one clear sentence for what can't be walked."""
-    sizes = sorted({3, model.section_size(params)})
+def _columns(
+    params: WheelParams, states: np.ndarray, model: AbstractWheel, options: Options
+) -> list[np.ndarray]:
+    """Parameters, one for all or of each lane; one clear sentence for what can't be walked."""
+    sizes = [3]
+    if states.ndim != 2 or states.shape[1] != 3:
+        sizes = sorted({3, model.section_size(params)})
     if states.ndim != 2 or states.shape[1] not in sizes:
         raise ValueError(
             f"states have shape {states.shape}, but they are section states, shape (lanes, "
@@ -153,8 +155,7 @@ def _wheels(
         )
     columns = [getattr(params, name) for name in PARAMETER_NAMES]
     held = np.result_type(*(column.dtype for column in columns))
-    options.require_reachable(held)
-    dtype = np.promote_types(held, states.dtype)
+    Options.require_reachable(options, held)  # a bound method takes equinox 0.1 ms to make
     of_ground = getattr(model, FRICTION, np.zeros(()))
     for name, column in zip((*PARAMETER_NAMES, FRICTION), (*columns, of_ground), strict=True):
         if np.shape(column) not in ((), states.shape[:1]):
@@ -162,15 +163,13 @@ def _wheels(
                 f"{name} has shape {np.shape(column)}, but there are {len(states)} states: give "
                 "one value for all, or one for each."
             )
-    wheels = np.empty((len(columns), len(states)), dtype)
-    for row, column in zip(wheels, columns, strict=True):
-        row[:] = np.asarray(column)
-    return wheels
+    dtype = np.promote_types(held, states.dtype)
+    return [np.asarray(column, dtype) for column in columns]
 
 
 def _by_phases(
     model: Any,
-    wheels: np.ndarray,
+    columns: list[np.ndarray],
     states: np.ndarray,
     n_steps: int,
     options: Options,
@@ -179,7 +178,11 @@ def _by_phases(
     durations: Any,
     asked: Sequence[str],
 ) -> Steps:
-    walked = Walked(states, asked, PARAMETER_NAMES)
+    order = _by_work(columns, len(states))
+    wheels = np.empty((len(columns), len(states)), states.dtype)
+    for row, column in zip(wheels, columns, strict=True):
+        row[:] = column[order] if column.ndim else column
+    walked = Walked(states.T.take(order, -1), asked, PARAMETER_NAMES)
     some = n_legs, walked.moved
     runs = {NAMED: _chosen(engine, model, options, *some)}
     solver = np.full(len(states), NAMED, np.int32)
@@ -197,26 +200,36 @@ def _by_phases(
         runs[IMPLICIT] = _chosen("diffrax", model, by(IMPLICIT_SOLVER), *some)
     if engine == "collocation":
         name = engine
-        walked.durations[:] = _expected(durations, states, wheels.dtype)
+        walked.durations[:] = _expected(durations, states, wheels.dtype).T.take(order, -1)
     for _ in range(n_steps):
-        open_ = np.flatnonzero(walked.outcome == Outcome.STEPPED)
-        fixed = np.zeros(len(open_), bool)
-        if engine == "collocation":
-            given = wheels[:, open_], walked.section_state[open_], walked.durations[open_]
-            fixed, told = _by_collocation(model, n_legs, *given)
-            walked.take(open_[fixed], tuple(part[fixed] for part in told), fixed=True)
-        open_ = open_[~fixed]
+        open_ = walked.on()
+        if engine == "collocation" and len(open_):
+            all_ = only(open_, walked)
+            given = wheels[:, all_], walked.section_state[:, all_], walked.durations[:, all_]
+            walked.take(open_, *_by_collocation(runs[NAMED], model, n_legs, *given))
+            continue
         for which, run in runs.items():
             lanes = open_[solver[open_] == which]
             if len(lanes) > 0:
-                told = run.step(wheels[:, lanes], walked.section_state[lanes])
+                all_ = only(lanes, walked)
+                told = run.step(wheels[:, all_], walked.section_state[:, all_])
                 if which == STABLE:
                     # A phase may last longer than `cheapest_solver` expects: IMPLICIT comes next.
                     lost = told[2] == Outcome.SOLVER_GAVE_UP
                     solver[lanes[lost]] = IMPLICIT
-                    lanes, told = lanes[~lost], tuple(part[~lost] for part in told)
-                walked.take(lanes, told, fixed=False)
-    return walked.told(solver, name, solvers)
+                    lanes, told = lanes[~lost], tuple(part[..., ~lost] for part in told)
+                walked.take(lanes, told, np.zeros(len(lanes), bool))
+    return walked.told(order, solver, name, solvers)
+
+
+def _by_work(columns: list[np.ndarray], n: int) -> np.ndarray:
+    """An order of lanes in which wheels of like work are side by side.
+
+    The airborne leg's fast rate, near c/m, sets the step where stability does.
+    """
+    damping, mass = (columns[PARAMETER_NAMES.index(name)] for name in ("damping", "leg_mass"))
+    with np.errstate(all="ignore"):
+        return np.argsort(np.broadcast_to(damping / mass, (n,)))
 
 
 def _expected(durations: Any, states: np.ndarray, dtype: np.dtype) -> np.ndarray:
@@ -226,11 +239,11 @@ def _expected(durations: Any, states: np.ndarray, dtype: np.dtype) -> np.ndarray
             f"durations have shape {shape}, but collocation needs those of DLS, SLS-I and SLS-II "
             "to some per cent, shape (lanes, 3): give those of a limit cycle, or take 'lanes'."
         )
-    return np.asarray(reals("durations", durations), dtype)
+    return known_reals("durations", durations).astype(dtype, copy=False)
 
 
 class _Engine(NamedTuple):
-    """One gait step of any number of lanes, numpy in and out."""
+    """One gait step of any number of lanes, numpy in and out, lanes on the last axis."""
 
     name: str
     step: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, ...]]
@@ -260,67 +273,61 @@ def _by_lanes(
     wheels: np.ndarray,
     states: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
-    """By the lane engine: wheels of like work side by side."""
-    options = options.for_derivatives() if moved else options
-    dynamic, static = eqx.partition(options, eqx.is_array)
-    uniform = [np.asarray(leaf, wheels.dtype) for leaf in jax.tree.leaves(dynamic)]
-    tableau = explicit_tableau(options.solver)
+    """By the lane engine."""
+    dynamic, structure = jax.tree.flatten(options)
+    uniform = [np.asarray(leaf, wheels.dtype) for leaf in dynamic]
+    tableau, n = explicit_tableau(options.solver), len(PARAMETER_NAMES)
     assert tableau is not None  # `_chosen` looked
-    structure, n = jax.tree.structure(dynamic), len(PARAMETER_NAMES)
 
     def step(uniform: Any, lanes: Any, few: Array | None = None) -> tuple:
-        known = eqx.combine(jax.tree.unflatten(structure, uniform), static)
+        known = jax.tree.unflatten(structure, uniform)
+        known = known.for_derivatives() if moved else known
 
         def told(*lanes: Array) -> tuple:
             params, x = wheel_of(lanes[:n], n_legs), lanes[n:]
             step = gait_step(params, x, known, tableau, stop_at_lift_off, few)
             others = step.unfinished, step.outcome, step.solver_steps
-            return (*step.section_state, *step.durations), others
+            return jnp.stack([*step.section_state, *step.durations]), others
 
         if not moved:
             numbers, others = told(*lanes)
-            return (*others, *numbers)
+            return (*others, numbers)
         columns, numbers, others = along_units(told, lanes, moved)
-        return (*others, *numbers, *(column for moves in columns for column in moves))
+        return (*others, numbers, columns)
 
-    # The airborne leg's fast rate, near c/m, sets the step where stability does.
-    damping, mass = (wheels[PARAMETER_NAMES.index(name)] for name in ("damping", "leg_mass"))
-    with np.errstate(all="ignore"):
-        order = np.argsort(damping / mass)
-    lanes = [*wheels[:, order], *states[order].T]
-    settings = ("gait step", n_legs, stop_at_lift_off, static, moved)
+    settings = ("gait step", n_legs, stop_at_lift_off, structure, moved)
     small = (DIRECTIONS,) if moved else ()
-    told = run_lanes(step, uniform, lanes, settings, *small)
-    back = np.empty_like(order)
-    back[order] = np.arange(len(order))
-    numbers = np.stack(told[3:], 1)[back]
-    values = numbers[:, :3], numbers[:, 3:6], told[1][back], told[2][back]
-    if not moved:
-        return values
-    return *values, numbers[:, 6:].reshape(len(order), 6, len(moved))
+    told = run_lanes(step, uniform, [*wheels, *states], settings, *small)
+    _, outcome, tried, numbers, *columns = told
+    return numbers[:3], numbers[3:], outcome, tried, *columns
 
 
 def _by_collocation(
+    by_lanes: _Engine,
     model: Any,
     n_legs: int,
     wheels: np.ndarray,
     states: np.ndarray,
     durations: np.ndarray,
-) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
-    """Which lanes can be trusted, and their states, durations, outcomes and solver steps."""
+) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
+    """A step of all lanes, and which were trusted; the others go by the lane engine."""
     stop_at_lift_off, n = model.stop_at_lift_off, len(PARAMETER_NAMES)
 
     def step(uniform: Any, lanes: Any, few: Array | None = None) -> tuple:
         params, rest = wheel_of(lanes[:n], n_legs), tuple(lanes[n:])
         told = fixed_gait_step(params, rest[:3], rest[3:], stop_at_lift_off)
         never = jnp.zeros_like(told.trusted)
-        return never, told.trusted, *told.section_state, *told.durations
+        return never, told.trusted, jnp.stack([*told.section_state, *told.durations])
 
-    lanes = [*wheels, *states.T, *durations.T]
     settings = ("gait step by collocation", n_legs, stop_at_lift_off)
-    _, trusted, *numbers = run_lanes(step, [], lanes, settings)
-    none = np.zeros(len(states), np.int32)
-    return trusted, (np.stack(numbers[:3], 1), np.stack(numbers[3:], 1), none, none)
+    _, trusted, numbers = run_lanes(step, [], [*wheels, *states, *durations], settings)
+    outcome, tried = np.zeros((2, len(trusted)), np.int32)
+    told = numbers[:3], numbers[3:], outcome, tried
+    rest = np.flatnonzero(~trusted)
+    if len(rest) > 0:
+        for whole_, part in zip(told, by_lanes.step(wheels[:, rest], states[:, rest]), strict=True):
+            whole_[..., rest] = part
+    return told, trusted
 
 
 def _by_diffrax(
@@ -333,9 +340,9 @@ def _by_diffrax(
 ) -> tuple[np.ndarray, ...]:
     """By the model's own step under `jax.vmap`, MAPPED at a time."""
     options = jax.tree.map(lambda leaf: np.asarray(leaf, wheels.dtype), options)
-    rows = np.concatenate([wheels.T, states], 1)
+    rows = np.concatenate([wheels, states]).T
     mapped = functools.partial(_mapped, model, options, n_legs, moved)
-    return jax.tree.map(np.asarray, in_batches(mapped, (MAPPED,), rows))
+    return jax.tree.map(lambda x: np.array(x).T, in_batches(mapped, (MAPPED,), rows))
 
 
 @eqx.filter_jit

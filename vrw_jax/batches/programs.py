@@ -30,8 +30,6 @@ def run_lanes(
 
     `settings`: all that `step` depends on but its arguments.
     """
-    if len(lanes[0]) == 0:
-        return [np.empty(0)] * 9  # only collocation asks for none
     dtype, cpu = lanes[0].dtype, simd.serves()
     key = (settings, dtype, cpu, BLOCK)
     if key not in _programs:
@@ -56,10 +54,10 @@ def _by_xla(
             some = open_[begin : begin + BLOCK]
             filled = np.concatenate([some, np.repeat(some[-1:], BLOCK - len(some))])
             given = tuple(x[filled] for x in lanes)
-            out = [np.asarray(x)[: len(some)] for x in program(tuple(uniform), given, few)]
-            told = told or [np.empty(len(lanes[0]), x.dtype) for x in out]
+            out = [np.asarray(x)[..., : len(some)] for x in program(tuple(uniform), given, few)]
+            told = told or [np.empty((*x.shape[:-1], len(lanes[0])), x.dtype) for x in out]
             for told_whole, part in zip(told, out, strict=True):
-                told_whole[some[~out[0]]] = part[~out[0]]
+                told_whole[..., some[~out[0]]] = part[..., ~out[0]]
             late.append(some[out[0]])
         open_ = np.concatenate(late)
     return told

@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
-import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from vrw_jax.wheel import Outcome
 from vrw_jax.wording import AbstractTold, Row, counted, told
@@ -15,12 +14,14 @@ from vrw_jax.wording import AbstractTold, Row, counted, told
 class By(eqx.Module):
     """How the end of a walk moves with its start, which has an axis of its own, or a parameter."""
 
-    section_state: Float[Array, "lanes section *start"]
-    durations: Float[Array, "lanes 3 *start"]
+    section_state: Float[np.ndarray, "lanes section *start"]
+    durations: Float[np.ndarray, "lanes 3 *start"]
 
 
 class Steps(AbstractTold):
     """Lean results of walks of some steps, leading axis: lanes; each tells of its last step.
+
+    Arrays are numpy's: handing thousands of numbers to JAX takes as long as some hundred steps.
 
     - `section_state`: before the next touchdown; zeros if it failed;
     - `durations`: of DLS, SLS-I, SLS-II, s; on real ground see its step;
@@ -39,13 +40,13 @@ class Steps(AbstractTold):
         [0, 0, 0]
     """
 
-    section_state: Float[Array, "lanes section"]
-    durations: Float[Array, "lanes 3"]
-    outcome: Int[Array, " lanes"]
-    n_stepped: Int[Array, " lanes"]
-    solver_steps: Int[Array, " lanes"]
-    fixed: Bool[Array, " lanes"]
-    solver: Int[Array, " lanes"]
+    section_state: Float[np.ndarray, "lanes section"]
+    durations: Float[np.ndarray, "lanes 3"]
+    outcome: Int[np.ndarray, " lanes"]
+    n_stepped: Int[np.ndarray, " lanes"]
+    solver_steps: Int[np.ndarray, " lanes"]
+    fixed: Bool[np.ndarray, " lanes"]
+    solver: Int[np.ndarray, " lanes"]
     engine: str = eqx.field(static=True)
     solvers: tuple[str, ...] = eqx.field(static=True)
     derivatives: dict[str, By] = eqx.field(default_factory=dict)
@@ -65,56 +66,92 @@ START = "section_state"
 
 
 class Walked:
+    """A batch of walks under way; of every array lanes are the last axis."""
+
     def __init__(
         self, states: np.ndarray, asked: Sequence[str], parameters: tuple[str, ...]
     ) -> None:
         """`asked`: START and names of these parameters, which lead the numbers of a lane."""
-        n, size = states.shape
-        self.section_state, self.durations = states.copy(), np.zeros((n, 3), states.dtype)
-        self.outcome, self.n_stepped, self.solver_steps = (np.zeros(n, np.int32) for _ in range(3))
+        size, n = states.shape
+        self.section_state, self.durations = states, np.zeros((3, n), states.dtype)
+        self.outcome, self.n_stepped, self.solver_steps = np.zeros((3, n), np.int32)
         self.fixed = np.zeros(n, bool)
-        # Of a step, and of the walk: by the start and then by the other names asked for.
+        # Of a step, and of the walk: by the other names asked for and then by the start.
         self.asked, self.names = asked, [name for name in asked if name != START]
         state = range(len(parameters), len(parameters) + size)
         self.moved = (*(parameters.index(x) for x in self.names), *state) if asked else ()
-        shape = (n if asked else 0, size + 3, size + len(self.names))
-        self.jacobian = np.zeros(shape, states.dtype)
-        self.jacobian[:, :size, :size] = np.eye(size)
+        self.jacobian = np.zeros((len(self.moved), size + 3, n), states.dtype)
 
-    def told(self, solver: np.ndarray, engine: str, solvers: tuple[str, ...]) -> Steps:
-        fields = self.section_state, self.durations, self.outcome, self.n_stepped
-        told = *fields, self.solver_steps, self.fixed, solver
-        return told_steps(told, engine, solvers, self.derivatives())
+    def on(self) -> np.ndarray:
+        """Lanes that go on."""
+        return np.flatnonzero(self.outcome == Outcome.STEPPED)
 
-    def derivatives(self) -> dict[str, By]:
+    def told(
+        self, order: np.ndarray, solver: np.ndarray, engine: str, solvers: tuple[str, ...]
+    ) -> Steps:
+        """Each lane at the place that `order` says."""
+        back = np.empty_like(order)
+        back[order] = np.arange(len(order))
+        there = lambda x: x.take(back, -1).T
+        return Steps(
+            there(self.section_state),
+            there(self.durations),
+            there(self.outcome),
+            there(self.n_stepped),
+            there(self.solver_steps),
+            there(self.fixed),
+            there(solver),
+            engine,
+            solvers,
+            self.derivatives(back),
+        )
+
+    def derivatives(self, back: np.ndarray) -> dict[str, By]:
         """Of the walk, by what was asked for; zero where it failed."""
         if not self.asked:
             return {}
-        stepped = (self.outcome == Outcome.STEPPED)[:, None, None]
-        by = np.where(stepped, self.jacobian, 0.0)
-        size = self.section_state.shape[1]
-        columns: dict[str, Any] = {name: size + i for i, name in enumerate(self.names)}
-        columns[START] = slice(size)
+        self.jacobian[..., self.outcome != Outcome.STEPPED] = 0.0
+        by, n, size = self.jacobian.take(back, -1).T, len(self.names), len(self.section_state)
+        columns: dict[str, Any] = {name: i for i, name in enumerate(self.names)}
+        columns[START] = slice(n, None)
         told = {name: by[:, :, columns[name]] for name in self.asked}
-        return {name: By(*jax.device_put((x[:, :size], x[:, size:]))) for name, x in told.items()}
+        return {name: By(x[:, :size], x[:, size:]) for name, x in told.items()}
 
-    def take(self, lanes: np.ndarray, told: tuple[np.ndarray, ...], fixed: bool) -> None:
-        state, durations, outcome, tried, *jacobian = told
-        self.section_state[lanes], self.durations[lanes] = state, durations
-        self.outcome[lanes] = outcome
-        self.n_stepped[lanes] += outcome == Outcome.STEPPED
-        self.solver_steps[lanes] += tried
-        self.fixed[lanes] = fixed
-        if jacobian:
-            (by,), n, size = jacobian, len(self.names), state.shape[1]
-            before = self.jacobian[lanes, :size]
-            self.jacobian[lanes] = by[:, :, n:] @ before
-            self.jacobian[lanes, :, size:] += by[:, :, :n]
+    def take(self, lanes: np.ndarray, told: tuple[np.ndarray, ...], fixed: np.ndarray) -> None:
+        """A step of these lanes: state, durations, outcome, solver steps, and how both move."""
+        state, durations, outcome, tried, *by = told
+        some = only(lanes, self)
+        if by:
+            self.jacobian = _put(self.jacobian, some, self._after(some, *by))
+        self.section_state = _put(self.section_state, some, state)
+        self.durations = _put(self.durations, some, durations)
+        self.outcome = _put(self.outcome, some, outcome)
+        self.fixed = _put(self.fixed, some, fixed)
+        self.n_stepped[some] += outcome == Outcome.STEPPED
+        self.solver_steps[some] += tried
+
+    def _after(self, some: Any, by: np.ndarray) -> np.ndarray:
+        """Columns of the walk from those of its last step, (columns, rows, lanes).
+
+        Sums of products one by one: so a lane's digits are its own in any company.
+        """
+        n, size = len(self.names), len(self.section_state)
+        if not self.n_stepped[some].any():
+            return by
+        before = self.jacobian[:, :size, some]
+        moved = sum(by[n + i] * before[:, i, None] for i in range(size))
+        moved[:n] += by[:n]
+        return moved
 
 
-def told_steps(
-    told: tuple[Any, ...], engine: str, solvers: tuple[str, ...], by: dict[str, By]
-) -> Steps:
-    """Of numpy's arrays, which are put side by side: one by one JAX compiles a copy of each."""
-    x, durations, outcome, n_stepped, tried, fixed, solver = jax.device_put(told)
-    return Steps(x, durations, outcome, n_stepped, tried, fixed, solver, engine, solvers, by)
+def only(lanes: np.ndarray, walked: Walked) -> Any:
+    """An index to these lanes: of all of them one that copies nothing."""
+    return slice(None) if len(lanes) == len(walked.outcome) else lanes
+
+
+def _put(values: np.ndarray, some: Any, part: np.ndarray) -> np.ndarray:
+    """`values` with those of some lanes in place of theirs."""
+    if isinstance(some, slice):
+        return part
+    values[..., some] = part
+    return values

@@ -126,7 +126,7 @@ class Options(AbstractTold):
         floor = (LEAST if dtype == np.float64 else FLOOR) * float(jnp.finfo(dtype).eps)
         for name in ("rtol", "atol"):
             value = getattr(self, name)
-            if isinstance(value, jax.core.Tracer) or jnp.ndim(value) > 0 or float(value) >= floor:
+            if isinstance(value, jax.core.Tracer) or np.ndim(value) or np.asarray(value) >= floor:
                 continue
             enough = 1e2 * floor
             hint = f"ask for no less, as with Options(rtol={enough:.0e}, atol={enough:.0e})"

@@ -6,7 +6,7 @@ differentiation. A model compiles its own step once.
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, overload
 
 import equinox as eqx
@@ -97,8 +97,9 @@ def _usual(dtype: np.dtype) -> Options:
         return Options()
 
 
-def state_of(x: Any, what: str = "the section state") -> Array:
-    return reals(
+def state_of(x: Any, what: str = "the section state", read: Callable = reals) -> Any:
+    """`read` it: by `reals`, or by `known_reals`."""
+    return read(
         what,
         x,
         "give (theta-, dtheta-, dL1-), as vrw.paper_start(), or that of a cycle, "
@@ -130,8 +131,13 @@ def checked(
     options.require_reachable(jnp.result_type(*jax.tree.leaves(params)))
     dtype = jnp.result_type(state, params.damping)
     options.require_reachable(dtype)
-    convert = lambda leaf: leaf if leaf.dtype == dtype else leaf.astype(dtype)
-    return jax.tree.map(convert, params), convert(state), model, jax.tree.map(convert, options)
+
+    def convert(tree: Any) -> Any:
+        if all(leaf.dtype == dtype for leaf in jax.tree.leaves(tree)):
+            return tree
+        return jax.tree.map(lambda leaf: leaf.astype(dtype), tree)
+
+    return convert(params), convert(state), model, convert(options)
 
 
 @overload

@@ -5,6 +5,7 @@ from vrw_jax.wording.checks import (
     flag,
     function_of,
     instance,
+    known_reals,
     names_of,
     nearest,
     positive,

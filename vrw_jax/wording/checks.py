@@ -110,6 +110,15 @@ def reals(name: str, value: Any, advice: str = "give a number, or an array of th
     return jax.lax.convert_element_type(array, np.dtype(array.dtype))
 
 
+def known_reals(
+    name: str, value: Any, advice: str = "give a number, or an array of them"
+) -> np.ndarray:
+    """`reals` where numbers are known, as numpy holds them: JAX need not see what is sound."""
+    if isinstance(value, np.ndarray) and value.dtype == jax.dtypes.canonicalize_dtype(float):
+        return value
+    return np.asarray(reals(name, value, advice))
+
+
 def _require_device() -> None:
     try:
         jax.devices()
