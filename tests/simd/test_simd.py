@@ -161,8 +161,24 @@ def arrays_in_loops(x):
         "found": jnp.any(large > 1.5, (0, 1)),
         "summed": (jnp.cumsum(flat[:5], 0), lax.cumsum(flat[:5], 0, reverse=True)),
         "picked": picked(x, large),
+        "exchanged": exchanged(x),
         "turned": large.reshape(4, 9, -1).transpose(1, 0, 2)[:, :, None],
     }
+
+
+def exchanged(x):
+    """Loops that read, axes exchanged, what another wrote and what an outer one carries."""
+    write = lambda c, row: (c + row[0], jnp.stack([row * c, row + 1.0, row - c, row * row]))
+    written = lax.scan(write, x[0, 0], x)[1]  # (20, 4, 3, lanes)
+    sums = lax.scan(lambda c, part: (c - part[1, 2], part), x[1, 1], written.swapaxes(0, 1))
+
+    def turn(_, held):
+        field, other = held
+        rows = lax.scan(lambda c, row: (c + row[0], row * 0.5 + c), x[0, 0], field.swapaxes(0, 1))
+        return jnp.sin(other) + rows[1].swapaxes(0, 1), field.swapaxes(0, 1)
+
+    square = written.reshape(20, 12, -1)[:7, :7]
+    return sums, lax.fori_loop(0, 3, turn, (square, 2.0 * square))
 
 
 def picked(x, large):

@@ -296,8 +296,7 @@ def _march(
             step = Passed(march.here, taken.end, march.h, accepted, march.direction)
             lowest = lowered(*given, lowest, step)
         if moving is not None and direction is not None:
-            along = moving.along(tableau, taken.stages, direction, march.h)
-            direction = jnp.where(accepted, along, direction)
+            direction = moving.onward(tableau, taken.stages, direction, march.h, accepted)
         if few is not None:
             left = jnp.sum(verdict == MARCHING, dtype=jnp.int32)
             half = jnp.where(2 * left > verdict.size, march.iterations + 1, half)

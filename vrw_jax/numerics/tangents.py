@@ -250,6 +250,18 @@ class Moving(NamedTuple):
         slopes = _slopes_of(self.of, self.constants, self.moved, self.held, stages)
         return _carried(tableau, slopes, starts, h)
 
+    def onward(
+        self, tableau: Tableau, stages: list[Place], starts: Array, h: Array, accepted: Array
+    ) -> Array:
+        """The same where the step is accepted, by a loop of at most one turn: a group of which no
+        lane goes on skips it."""
+
+        def turn(now: tuple[Array, Array]) -> tuple[Array, Array]:
+            along = self.along(tableau, stages, now[1], h)
+            return jnp.zeros_like(now[0]), jnp.where(accepted, along, now[1])
+
+        return lax.while_loop(lambda now: now[0], turn, (jnp.any(accepted), starts))[1]
+
     def of_values(self, values: Callable[..., Any], place: Place, directions: Array) -> Any:
         """How `values(constants, held, q, v)` move with the directions there."""
         n, numbers = len(place.q), tuple(jnp.moveaxis(directions, 1, 0))

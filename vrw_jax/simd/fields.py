@@ -83,5 +83,13 @@ class Memory(Field):
         return Memory(self.arrays, self.shape[1:], self.kind, self.place((first, *rest)))
 
 
+class Turned(Field):
+    """What lies in memory, its axes in another order."""
+
+    def part(self, first: Value) -> Field:
+        """What lies at an index of the first axis."""
+        return Field(self.shape[1:], self.kind, lambda index: self.at((first, *index)))
+
+
 Entries = np.ndarray | Field
 """LLVM values in an array, the axis of lanes left out."""

@@ -7,7 +7,7 @@ from typing import Any
 import llvmlite.ir as ir
 
 from vrw_jax.simd.arrays import HELD, HELD_INSIDE, LANES, Arrays, arrays_of, shape_of
-from vrw_jax.simd.fields import Entries, Memory, Updated
+from vrw_jax.simd.fields import Entries, Memory, Turned, Updated
 from vrw_jax.simd.numbers import LONG, Value
 from vrw_jax.simd.trace import CALLS, Traces
 
@@ -42,14 +42,15 @@ def scan(traces: Traces, equation: Any, values: list[Entries]) -> list[Entries]:
             f"scan reads or writes along an axis of {LANES}, which is the lanes': do the same to "
             "each by itself, and give other axes another length."
         )
-    read = [arrays.in_memory(x) for x in values[n_fixed + n_carried :]]
+    given = values[n_fixed + n_carried :]
+    read = [x if isinstance(x, Turned) else arrays.in_memory(x) for x in given]
     written = [arrays.room(shape_of(aval), arrays.kind_of(aval)) for aval in told]
     outside, arrays.written_out = arrays.written_out, not _has_loops(inner.jaxpr)
     fixed = values[:n_fixed]
     limit = HELD_INSIDE if arrays.written_out else HELD
     carry = _Carry(arrays, inner.out_avals[:n_carried], limit)
 
-    def part(memory: Memory, turn: Value) -> Entries:
+    def part(memory: Memory | Turned, turn: Value) -> Entries:
         some = memory.part(turn)
         inside = arrays.written_out or math.prod(some.shape) <= HELD
         return arrays.entries(some) if inside else some

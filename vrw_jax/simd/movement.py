@@ -8,7 +8,7 @@ import numpy as np
 
 from vrw_jax.simd.arithmetic import converted
 from vrw_jax.simd.arrays import Arrays, Asked, has_lanes, moved, shape_of
-from vrw_jax.simd.fields import Entries, Field, Index, Unset, Updated
+from vrw_jax.simd.fields import Entries, Field, Index, Memory, Turned, Unset, Updated
 from vrw_jax.simd.numbers import LONG, Value
 from vrw_jax.simd.trace import Traces
 
@@ -38,7 +38,8 @@ def transpose(arrays: Arrays, asked: Asked, array: Entries) -> Entries:
         return array.transpose(order)
     back = np.argsort(order)
     at = lambda index: arrays.entry(array, tuple(index[i] for i in back))
-    return Field(shape_of(asked.out), array.kind, at)
+    form = Turned if isinstance(array, Memory | Turned) else Field
+    return form(shape_of(asked.out), array.kind, at)
 
 
 def slice_(arrays: Arrays, asked: Asked, array: Entries) -> Entries:
