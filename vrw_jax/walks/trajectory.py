@@ -6,6 +6,7 @@ Angles and leg labels are those of the present step, so theta and the lengths ju
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -105,8 +106,8 @@ def simulate(
         "start": [float(v) for v in x],
     }
     origin = telling.attrs | provenance(params, model, options)
-    walked = xr.Dataset(data, telling.labels, attrs | origin)
-    return walked.set_coords([name for name in ("step", "phase") if name in data])
+    labels = {name: data.pop(name) for name in ("step", "phase") if name in data}
+    return xr.Dataset(data, telling.labels | labels, attrs | origin)
 
 
 class Stretches(NamedTuple):
@@ -150,27 +151,42 @@ def joined(telling: Telling, x: Array, n_steps: int, weight_along: float) -> Joi
     outcome, stepped, time, place = Outcome.STEPPED, 0, 0.0, 0.0
     while outcome == Outcome.STEPPED and stepped < n_steps:
         told = telling.stretches_of(x)
-        for stretch in np.flatnonzero(told.durations > 0.0):
-            part = {name: values[stretch].copy() for name, values in told.columns.items()}
-            for name in telling.along:
-                part[name] += place
-            for name in part.keys() & FALLING:
-                part[name] -= weight_along * place
-            part["time"] += time
-            part["step"] = np.full(len(part["time"]), stepped)
-            parts.append(part)
+        happened, part = told.durations > 0.0, dict[str, np.ndarray]()
+        for name, values in told.columns.items():
+            part[name] = values[happened].reshape(-1, *values.shape[2:])
+        for name in telling.along:
+            part[name] += place
+        for name in part.keys() & FALLING:
+            part[name] -= weight_along * place
+        part["time"] += time
+        part["step"] = np.full(len(part["time"]), stepped)
+        parts.append(part)
         outcome = told.outcome
         if outcome == Outcome.STEPPED:
             stepped, time, place = stepped + 1, time + told.period, place + told.length
             x = told.following
-    none = {name: values[:0].reshape(0, *values.shape[2:]) for name, values in told.columns.items()}
-    columns = {
-        name: np.concatenate([part[name] for part in parts]) for name in (parts[0] if parts else ())
-    }
-    return Joined(columns or none | {"step": np.zeros(0)}, stepped, outcome)
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return Joined(columns, stepped, outcome)
 
 
-@eqx.filter_jit
+SAMPLED = (*(name for name in TRAJECTORY if name not in ("step", "phase")), "ahead")
+"""What `_columns` tells."""
+
+
+@functools.cache
+def _stepped(model: AbstractWheel, structure: Any, n_samples: int) -> Callable[..., Any]:
+    """One step over x and the leaves of (params, options): durations, outcome, what follows it, and
+    `SAMPLED` as one array, which is handed over faster than many."""
+
+    def told(x: Array, *leaves: Array) -> tuple[Array, ...]:
+        params, options = jax.tree.unflatten(structure, leaves)
+        moved, columns = _columns(model, params, x, options, n_samples)
+        rows = jnp.stack([columns[name] for name in SAMPLED])
+        return moved.durations, moved.outcome, moved.section_state, rows
+
+    return jax.jit(told)
+
+
 def _columns(
     model: AbstractWheel, params: WheelParams, x: SectionState, options: Options, n_samples: int
 ) -> tuple[Trajectory, dict[str, Array]]:
@@ -217,21 +233,21 @@ def over_phases(
 ) -> Telling:
     """Of rungs that step through the paper's phases."""
 
+    leaves, structure = jax.tree.flatten((params, options))
+    step = _stepped(model, structure, n_samples)
+
     def stretches(x: Array) -> Stretches:
-        moved, told = _columns(model, params, x, options, n_samples)
-        columns, durations = jax.tree.map(np.array, told), np.asarray(moved.durations)
+        durations, outcome, following, rows = step(x, *leaves)
+        columns, durations = (
+            dict(zip(SAMPLED, np.asarray(rows), strict=True)),
+            np.asarray(durations),
+        )
         ahead = columns.pop("ahead")
         columns["phase"] = np.tile(np.arange(len(durations))[:, None], (1, n_samples))
         happened = np.flatnonzero(durations > 0.0)
         length = float(ahead[happened[-1], -1]) if happened.size else 0.0
-        return Stretches(
-            columns,
-            durations,
-            Outcome(int(moved.outcome)),
-            moved.section_state,
-            float(durations.sum()),
-            length,
-        )
+        outcome = Outcome(int(outcome))
+        return Stretches(columns, durations, outcome, following, float(durations.sum()), length)
 
     attrs: dict[str, object] = {
         "frame": "x downhill along the slope, z normal to it, first foot at the origin",
