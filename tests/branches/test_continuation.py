@@ -12,7 +12,7 @@ from vrw_jax.app.reports import write_branch
 from vrw_jax.branches.continuation import MapRun
 from vrw_jax.branches.run import run_all
 from vrw_jax.figures.branch import branch_figure
-from vrw_jax.numerics.arclength import AbstractFollowed, MapFollowed
+from vrw_jax.numerics.arclength import AbstractFollowed, MapFollowed, follow
 from vrw_jax.numerics.events import integrate_phase
 from vrw_jax.numerics.minima import Watched
 from vrw_jax.numerics.roots import locate
@@ -77,6 +77,30 @@ def test_a_branch_linearised_from_outside_of_programs_is_the_same():
     (fold,) = (border.value for border in other.borders if border.kind == "fold")
     assert fold == pytest.approx(0.0, abs=1e-9)
     assert other.ends == one.ends
+
+
+def test_branches_that_wait_for_others_are_followed_as_if_alone_in_two_iterations_a_point():
+    """Eleven, of which the third is none: more than go side by side, and of each length.
+
+    Newton's method ends with a correction of nothing: from the tangent alone three would be needed.
+    """
+    b, a = np.linspace(-0.4, 0.5, 11), np.linspace(1.0, 0.4, 11)
+    z = np.stack([0.6 + 0.0 * b, 0.6 * b], 1)
+    options = vrw.ArclengthOptions()
+
+    def tracks(some, wanted):
+        given = map(jnp.asarray, (b[some], z[some], a[some], (-1.0, 2.0), 0.0 * a[some] + 1.0))
+        return follow(MapFollowed(henon), options, *given, jnp.asarray(wanted))
+
+    every = tracks(np.arange(11), np.arange(11) != 2)
+    assert every.n_points[2] == 0
+    assert np.ptp(every.n_points[3:]) > 10
+    for i in (0, 5, 10):
+        alone = tracks(np.array([i]), np.array([True]))
+        np.testing.assert_array_equal(every.n_points[i], alone.n_points[0])
+        # One program is for one branch, the other for eight: last digits may differ.
+        np.testing.assert_allclose(every.points.p[i], alone.points.p[0], rtol=0, atol=1e-10)
+    assert every.passes.sum() < 2.3 * every.n_points.sum()
 
 
 def borders_of(branch):

@@ -135,12 +135,12 @@ def both_hold(margin: np.ndarray, exact: np.ndarray) -> np.ndarray:
     return np.where(exact < 0.0, exact, np.minimum(exact, margin))
 
 
-def _follow_both_ways(run: AbstractRun, z: Any, p: Array) -> arclength.Track:
+def _follow_both_ways(run: AbstractRun, z: Any, p: Array, wanted: np.ndarray) -> arclength.Track:
     """Tracks of all wheels, axes (wheel, direction): first towards smaller values."""
     twice = lambda tree: jax.device_put(taken(tree, np.repeat(np.arange(len(p)), 2)))
     bounds = jnp.asarray(run.bounds)
     ways = jnp.tile(jnp.asarray([-1.0, 1.0], bounds.dtype), p.shape[0])
-    given = twice(run.wheels), twice(z), twice(p), bounds, ways
+    given = twice(run.wheels), twice(z), twice(p), bounds, ways, twice(wanted)
     follow = arclength.follow if run.followed.traced else follow_many
     tracks = follow(run.followed, run.options, *given)
     return jax.tree.map(lambda x: np.asarray(x).reshape(-1, 2, *x.shape[1:]), tracks)
@@ -436,10 +436,10 @@ def run_all(
 
     Without `finest`, of what is rough no border is located: it will be followed again.
     """
-    tracks = _follow_both_ways(run, z, p)
+    tracks = _follow_both_ways(run, z, p, found)
     # What comes back to its start has gone both ways at once.
     closed = (tracks.ending == int(Ending.CLOSED)).all(1, keepdims=True) & np.array([True, False])
-    counts: Any = np.where(found[:, None] & ~closed, tracks.n_points, 0)
+    counts: Any = np.where(closed, 0, tracks.n_points)
     tracks = tracks._replace(n_points=counts)
     pieces = _collected(run, tracks)
     n_wheels, before = len(found), np.maximum(tracks.n_points[:, 0] - 1, 0)

@@ -46,11 +46,11 @@ from vrw_jax.wheel import Outcome, WheelParams, wheel_of
 EDGE = "edge of the box"
 """Column that is zero where the second parameter leaves its range."""
 
-OF_CURVES = ArclengthOptions(first_step=5e-4, max_points=1000)
+OF_CURVES = ArclengthOptions(first_step=5e-4)
 """The first step is short: some curves are, too."""
 
-SIDE_BY_SIDE = 4
-"""Curves in a batch, both ways each: one group of lanes of machine code, one shape to compile."""
+AT_ONCE = 8
+"""Curves in a batch: one shape to compile."""
 
 SAME = 2e-3
 """How near to a curve a point lies on it, lengths measured as along the curve."""
@@ -182,7 +182,7 @@ class Tracer(NamedTuple):
             while of_kind:
                 some: list[Seed] = []
                 for seed in of_kind:  # in one batch each name once: others may lie on its curve
-                    if seed.name not in {s.name for s in some} and len(some) < SIDE_BY_SIDE:
+                    if seed.name not in {s.name for s in some} and len(some) < AT_ONCE:
                         some.append(seed)
                 told: list[Traced] = []
                 for one in self._batch(kind, some):  # a start may have led to a curve known
@@ -234,7 +234,7 @@ class Tracer(NamedTuple):
     ) -> list[tuple[Strand | None, Problem]]:
         problem = max((seed.problem for seed in seeds), key=lambda p: p.options.steps)
         seeds = [self._on_mesh(seed, problem) for seed in seeds]
-        filled = [*seeds, *seeds[-1:] * (-len(seeds) % SIDE_BY_SIDE)]
+        filled = [*seeds, *seeds[-1:] * (-len(seeds) % AT_ONCE)]
         level = GaitLevel(problem, self.parameters, kind, self.model, self.step_options)
         stack = lambda *trees: jax.tree.map(lambda *x: np.stack(x), *trees)
         levels = [level_of(seed.name, bool(seed.gait.happens[0, 0] > 0.5)) for seed in filled]

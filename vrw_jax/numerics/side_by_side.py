@@ -111,13 +111,14 @@ def follow_many(
     p: Float[Array, " branches"],
     bounds: Float[Array, "2"],
     directions: Float[Array, " branches"],
+    wanted: Bool[Array, " branches"],
 ) -> Track:
     """`arclength.follow`."""
-    on = begun(followed, options, z, p, bounds, directions)
+    on, rows = begun(followed, options, z, p, bounds, directions, wanted), jnp.arange(len(p))
     while np.any(open_ := np.asarray(_going(on))):
         trial = on[0].trial
         linears = _linear_of(followed, wheels, bounds, trial.z, trial.share, open_)
-        on = _turned(followed, options, wheels, bounds, directions, on, linears)
+        on = _turned(followed, options, wheels, bounds, directions, rows, on, linears)
     return track_of(on)
 
 
