@@ -162,6 +162,19 @@ def test_where_double_support_begins_to_last_gaits_double_their_period(curves):
     assert abs(one[1] + share * (other[1] - one[1]) - 571.4737) < 4e-3
 
 
+def test_where_double_support_that_stops_becomes_one_of_no_time_both_curves_tell_the_same(curves):
+    """And the polynomial through six points at which it still lasts says where it does not."""
+    _, jumps, rolls = curves
+    (one,) = [met.values for met in jumps.meetings if met.name == "duration_dls"]
+    (other,) = [met.values for met in rolls.meetings if met.name == "lambda_4_plus"]
+    np.testing.assert_allclose(one, other, rtol=1e-12)
+    lasts = jumps.dataset.duration_dls.values
+    few = [i for i in np.argsort(lasts) if lasts[i] > 1e-3][:6]
+    nowhere = [np.polyfit(lasts[few], values, 5)[-1] for values in jumps.values[few].T]
+    np.testing.assert_allclose(one, nowhere, rtol=1e-5)  # itself off by less than 1e-6
+    assert f"{one[0]:.9g}" in jumps.ends[0] + jumps.ends[1]
+
+
 def test_where_two_borders_meet_both_vanish(curves):
     scuffing, *_ = curves
     (met,) = [met for met in scuffing.meetings if met.name == "friction_rear"]

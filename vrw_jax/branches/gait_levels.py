@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array
 
 from vrw_jax.branches.continuation import INDICATORS, GaitRun
@@ -165,6 +166,30 @@ class GaitLevel(AbstractLevel):
         return jnp.all((z.durations > -ROUNDING) | (wheel.gait.happens < 0.5))
 
 
+@eqx.filter_jit
+def where_jumps_begin(level: GaitLevel, gait: Wheel, z: Solution, p: Array) -> tuple[Array, Array]:
+    """Both parameters where `ROLLS_OFF` meets the border of `lambda_4_plus`, and how they settled.
+
+    From a gait and parameters near there. The equations of both are singular where double support
+    lasts no time; those of the same gait without it are not, and the rear foot's force and its fall
+    vanish there at once.
+    """
+    gait = gait._replace(happens=gait.happens.at[0, 0].set(0.0))
+    z = z._replace(durations=z.durations.at[0, 0].set(0.0))
+    both = [jnp.asarray(FORMAL.index(name)) for name in ("lambda_4_plus", FALLS)]
+
+    def nearer(at: tuple, _: None) -> tuple[tuple, Array]:
+        z, p = at
+        force, falls = (level.linearise(GaitAt(gait, place), z, p) for place in both)
+        slopes = jnp.stack([force.slopes, falls.slopes])
+        by = -jnp.linalg.solve(slopes, jnp.stack([force.value, falls.value]))
+        along = lambda x, dx, a, b: x + dx + by[0] * a + by[1] * b
+        return (jax.tree.map(along, z, force.correction, *force.columns), p + by), by / p
+
+    (_, p), changes = lax.scan(nearer, (z, p), None, length=ITERATIONS)
+    return p, jnp.max(jnp.abs(changes[-1]))
+
+
 def _formal(problem: Problem, parameters: Array, happens: Array, z: Solution) -> Array:
     s = wheel_of(parameters, problem.n_legs).symbols()
     (passages,) = problem.passages(parameters, z)[1]
@@ -199,6 +224,9 @@ def _monodromy(problem: Problem, parameters: Array, happens: Array, z: Solution)
     located = Located(z, happens, *nothing_known(problem, z.section))
     return problem.pass_at(parameters, located).monodromy
 
+
+ITERATIONS = 8
+"""Of Newton's method for one point."""
 
 ROUNDING = 1e-9
 """Of a duration that is zero all along a curve, s."""

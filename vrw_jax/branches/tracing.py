@@ -26,6 +26,7 @@ from vrw_jax.branches.gait_levels import (
     GaitLevel,
     level_of,
     quantities_of,
+    where_jumps_begin,
 )
 from vrw_jax.branches.run import BRANCH_POINT, AbstractRun, Strand, Table, run_all
 from vrw_jax.cycles import Problem, on_mesh
@@ -57,6 +58,9 @@ SAME = 2e-3
 
 BEYOND = 3e-3
 """How far from where two of its kinds meet a border is followed on."""
+
+EXACTLY = 1e-9
+"""Of parameters, over their values: Newton's last step to a point where two borders meet."""
 
 BRIEF, LASTS = 1e-4, 0.1
 """Double support that lasts no time but for what is ill-conditioned where it comes to last some,
@@ -262,21 +266,30 @@ class Tracer(NamedTuple):
     def _told(self, seed: Seed, strand: Strand) -> Traced:
         values = np.stack([strand.points.p, strand.table["second"]], -1)
         path = np.column_stack([strand.points.z.z.section, self.shares(values)])
-        meetings, met = [], []
+        meetings, met, ends = [], [], strand.ends
         for border in strand.borders:
             if border.name == EDGE:
                 continue
             beside = border.cycle
             at = border.value, float(self.box[1, 0] + np.ptp(self.box[1]) * beside.z.share)
             name = named(border.name, seed.gait, beside.z.z)
-            meetings.append(Meeting(name, at, border.ends_branch))
             if {name, seed.name} == {"lambda_4_plus", ROLLS_OFF}:
+                at = self._where_jumps_begin(seed, beside.z.z, at)
                 met.append(self._beyond(name, seed, path, values, strand.points.z.z, at))
+                told = f"{border.value:.9g}", f"{at[0]:.9g}"
+                ends = ends[0].replace(*told), ends[1].replace(*told)
             elif can_follow(name):
                 there = float(beside.p), at[1]
                 met.append(Seed(name, there, seed.problem, seed.gait, beside.z.z))
-        curve = self._labelled(seed, strand, tuple(meetings))
+            meetings.append(Meeting(name, at, border.ends_branch))
+        curve = self._labelled(seed, strand._replace(ends=ends), tuple(meetings))
         return Traced(curve, path, tuple(met))
+
+    def _where_jumps_begin(self, seed: Seed, z: Solution, at: Any) -> tuple[float, float]:
+        level = GaitLevel(seed.problem, self.parameters, FORMAL, self.model, self.step_options)
+        exact, settled = where_jumps_begin(level, seed.gait, jax.device_put(z), jnp.asarray(at))
+        first, second = exact if settled < EXACTLY else at
+        return float(first), float(second)
 
     def _beyond(
         self, name: str, seed: Seed, path: np.ndarray, values: np.ndarray, z: Solution, at: Any
