@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array
 
 from vrw_jax.numerics.types import Vector
@@ -209,6 +210,11 @@ def stage_at(
 
 
 def _weigh(weights: np.ndarray, terms: list[Array]) -> Any:
-    """A weighted sum; None where all weights vanish."""
-    parts = [float(w) * x for w, x in zip(weights, terms, strict=False) if w != 0.0]
-    return sum(parts[1:], start=parts[0]) if parts else None
+    """A weighted sum; None where all weights vanish.
+
+    By `lax`: half of a step's operations are these, and operators take three times as long to
+    trace.
+    """
+    pairs = zip(weights, terms, strict=False)
+    parts = [lax.mul(x.dtype.type(w), x) for w, x in pairs if w != 0.0]
+    return functools.reduce(lax.add, parts) if parts else None

@@ -198,10 +198,9 @@ def _carried(tableau: Tableau, slopes: Slopes, starts: Array, h: Array) -> Array
         known: list[Vector] = []
         for i in range(len(tableau.places) - 1):
             q, v = stage_at(tableau, i, q0, v0, known, h) if i else (q0, v0)
-            rows = [
-                [by_state[i, d, e] * x for e, x in enumerate((*q, *v, *held))] for d in range(n)
-            ]
-            known.append(tuple(sum(row, start=by_constants[i, d]) for d, row in enumerate(rows)))
+            moved = (*q, *v, *held)
+            rows = [[by_constants[i, d], *map(lax.mul, by_state[i, d], moved)] for d in range(n)]
+            known.append(tuple(functools.reduce(lax.add, row) for row in rows))
         q, v = stage_at(tableau, len(tableau.places) - 1, q0, v0, known, h)
         return jnp.stack([*q, *v, *held])
 
