@@ -22,7 +22,7 @@ from scipy.integrate import solve_ivp
 import vrw_jax as vrw
 from experiments.atlas.told import EXACT, Row, off, timed
 from experiments.shared.command import extra
-from vrw_jax.numerics import Guard, Mode, Stop, walk
+from vrw_jax.numerics import Guard, Mode, Stop, time_errors, walk
 
 hy = extra("heyoka")
 Numbers = Sequence[Any]
@@ -62,6 +62,7 @@ class Walked(NamedTuple):
     end: np.ndarray  # the last state, past the reset
     resolution: np.ndarray = np.zeros(0)  # of each time: what the tolerances are in it, if told
     rounding: np.ndarray = np.zeros(0)  # and one rounding of the state
+    stated: np.ndarray = np.zeros(0)  # and what it may be off by in all
 
 
 JAX = types.SimpleNamespace(sin=jnp.sin, cos=jnp.cos, exp=jnp.exp, sqrt=jnp.sqrt, stack=jnp.stack)
@@ -78,9 +79,13 @@ def modes(system: Sequence[Part]) -> tuple[Mode, ...]:
 
 
 @functools.lru_cache
-def _our_run(system: tuple[Part, ...], events: int, options: tuple) -> Callable:
+def _our_run(system: tuple[Part, ...], events: int, options: tuple) -> tuple[Callable, Callable]:
+    """The walk, and what its event times may be off by."""
     parts, chosen = modes(system), vrw.Options(**dict(options))
-    return jax.jit(lambda y: walk(parts, y, events=events, options=chosen))
+    return (
+        jax.jit(lambda y: walk(parts, y, events=events, options=chosen)),
+        jax.jit(lambda y, told: time_errors(parts, y, told, chosen)),
+    )
 
 
 def ours(
@@ -88,7 +93,7 @@ def ours(
     tolerance: float = 1e-13, **changed: Any,
 ) -> Walked:  # fmt: skip
     chosen = {"rtol": tolerance, "atol": tolerance, "max_phase_time": limit, **changed}
-    run = _our_run(tuple(system), events, (("solver", solver), *chosen.items()))
+    run, errors = _our_run(tuple(system), events, (("solver", solver), *chosen.items()))
     y = jnp.asarray(start, float)
     told, seconds = timed(lambda: jax.block_until_ready(run(y)))
     n, stop = int(told.n_events), Stop(int(told.stop))
@@ -106,6 +111,7 @@ def ours(
         np.asarray(told.state),
         np.asarray(told.resolution[:n]),
         np.asarray(told.rounding[:n]),
+        np.asarray(errors(y, told)[:n]),
     )
 
 
@@ -298,9 +304,9 @@ def row(
 ) -> Row:
     """What a walk says of one quantity, of the last event or another: also a bad condition."""
     of, says = slice(event or None), walked.says
-    told, rounding = walked.resolution[of], walked.rounding[of]
-    if not says and len(told) and told[-1] > EXACT:
-        says = f"tolerance in time: {told[-1]:.0e}"
+    stated, rounding = walked.stated[of], walked.rounding[of]
+    if not says and len(stated) and stated[-1] > EXACT:
+        says = f"time to {stated[-1]:.0e}"
         if rounding[-1] > EXACT:
             says += f", one rounding: {rounding[-1]:.1e}"
     return Row(
