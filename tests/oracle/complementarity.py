@@ -130,9 +130,8 @@ def _rooms(legs):
     return -np.eye(3 + N)[3 + np.array(legs, int)]
 
 
-def _carried(w, q, v, mode, held):
-    """Accelerations in these modes; forces (tangential, normal) of feet; stopper forces."""
-    mass, force = _mass_and_force(w, q, v)
+def _loaded(w, q, v, mode):
+    """Of loaded feet: rows of what is at rest, along what forces act, and which these are."""
     feet, more = _points(q, v, q[3:])
     rows, along, bias, where = [], [], [], []
     for j in range(N):
@@ -148,6 +147,21 @@ def _carried(w, q, v, mode, held):
             along.append(feet[j, 0])
             bias.append(more[j, 0])
             where.append((j, 1.0, 0.0))
+    return rows, along, bias, where
+
+
+def singular(w, q, v, mode, held):
+    """Vanishes where no forces keep a sliding foot on the ground: Painlevé's singularity."""
+    mass, _ = _mass_and_force(w, q, v)
+    rows, along, *_ = _loaded(w, q, v, mode)
+    stops = list(_rooms(np.flatnonzero(held)))
+    return np.linalg.det(np.array(rows + stops) @ np.linalg.solve(mass, np.array(along + stops).T))
+
+
+def _carried(w, q, v, mode, held):
+    """Accelerations in these modes; forces (tangential, normal) of feet; stopper forces."""
+    mass, force = _mass_and_force(w, q, v)
+    rows, along, bias, where = _loaded(w, q, v, mode)
     legs = np.flatnonzero(held)
     rows = np.array(rows + list(_rooms(legs))).reshape(-1, 3 + N)
     along = np.array(along + list(_rooms(legs))).reshape(-1, 3 + N)
@@ -241,12 +255,12 @@ def _level(w, q, v, feet, may, at_stopper, moving):
     return _Problem(inverse, free, feet, may, unilateral, locked, rows, bias, scales)
 
 
-def _at_rest(w, q, v, rows):
-    """Rates with these rows exactly at rest."""
+def _at_rest(w, q, v, rows, along):
+    """Rates with these rows exactly at rest, by impulses along those."""
     if not len(rows):
         return v
     mass, _ = _mass_and_force(w, q, v)
-    turned = np.linalg.solve(mass, rows.T)
+    turned = np.linalg.solve(mass, along.T)
     p, *_ = np.linalg.lstsq(rows @ turned, rows @ v, rcond=1e-11)
     return v - turned @ p
 
@@ -273,7 +287,10 @@ def _event(w, place, struck_foot, struck_leg):
         kept = {*problem.locked, *itertools.compress(problem.legs, on)}
         legs = [j for j in legs if j in kept or v[3 + j] > -REST]
     still = [j for j in feet if abs(speeds[j, 0]) < REST]
-    v = _at_rest(w, q, v, np.concatenate([rows[feet, 1], rows[still, 0], _rooms(legs)]))
+    drag = [0.0 if j in still else -np.sign(speeds[j, 0]) * w.rough[j] for j in feet]
+    pushed = rows[feet, 1] + np.array(drag).reshape(-1, 1) * rows[feet, 0]
+    others = [rows[still, 0], _rooms(legs)]
+    v = _at_rest(w, q, v, *(np.concatenate([own, *others]) for own in (rows[feet, 1], pushed)))
     may = [
         (STICK, DOWN, UP, OFF) if j in still else (DOWN if speeds[j, 0] > 0 else UP, OFF)
         for j in feet

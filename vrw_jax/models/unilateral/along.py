@@ -33,8 +33,9 @@ from vrw_jax.models.unilateral.march import (
     tried_by,
     until_none_marches,
 )
+from vrw_jax.models.unilateral.mechanics import if_any
 from vrw_jax.models.unilateral.motion import Stance, guard_sizes
-from vrw_jax.models.unilateral.shares import FEW, Shares, if_any
+from vrw_jax.models.unilateral.shares import FEW, Shares
 from vrw_jax.numerics import Options, Tableau, select
 
 

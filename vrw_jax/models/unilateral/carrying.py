@@ -58,6 +58,7 @@ class Carried(NamedTuple):
     stopper: Pair
     pull: Pair
     hub: Vector3
+    regular: Array
     lengths: Legs  # accelerations of the legs' lengths, or rates after an impact
 
 
@@ -104,7 +105,8 @@ def told_by(stand: Stand, hub: Hub, free: Free) -> Carried:
     found = answer(s, hub, free, contact, held, friction)
     out = free.legs + hub.legs.sin * found.hub[0] + hub.legs.cos * found.hub[1]
     lengths = jnp.where(stand.stays, 0.0, out - slots.spread(found.pull) / s.m)
-    return Carried(found.tangential, found.normal, found.stopper, found.pull, found.hub, lengths)
+    forces = found.tangential, found.normal, found.stopper, found.pull
+    return Carried(*forces, found.hub, found.regular, lengths)
 
 
 def _solved(free_of: Callable[..., Free], stand: Stand) -> tuple[Hub, Free, Carried]:

@@ -50,6 +50,7 @@ class Answer(NamedTuple):
     length: Pair  # of each slot's leg
     foot_x: Pair  # of each slot's foot
     foot_z: Pair
+    regular: Any  # vanishes where no force holds a sliding foot: Painlevé's singularity
 
 
 Matrix = tuple[tuple[Any, Any], tuple[Any, Any]]
@@ -147,9 +148,9 @@ def _stoppers(
 
 def _carried(
     s: Symbols, hub: Hub, free: Free, feet: _Feet, alone: Pair, columns: Matrix, one: Array
-) -> tuple[Pair, Pair, Pair]:
+) -> tuple[Pair, Pair, Pair, Any]:
     """Forces of the stoppers, and of the feet along e and u: the feet's rows with the stoppers, as
-    `_stoppers` gives them, inserted."""
+    `_stoppers` gives them, inserted; and the determinant of what is solved."""
     row_e, row_u, to_e, to_u = feet.row_e, feet.row_u, feet.to_e, feet.to_u
     G, H = ((hub.G[0], hub.G[1]), hub.G[1:]), ((hub.H[0], hub.H[1]), (hub.H[2], hub.H[3]))
     R = _matrix(lambda i, k: _same(i, k) * row_u[i] - row_e[i] * H[k][i])
@@ -168,7 +169,8 @@ def _carried(
     along_e = _pair(lambda i: to_e[i] * c[i])
     sticks = _pair(lambda i: -s.m * free.u[i] - stopper[i])
     along_u = _pair(lambda i: jnp.where(feet.stick[i], sticks[i], to_u[i] * c[i]))
-    return kept((stopper, along_e, along_u), one)
+    regular = s.m * s.m * (C[0][0] * C[1][1] - C[0][1] * C[1][0])
+    return kept((stopper, along_e, along_u, regular), one)
 
 
 @eqx.filter_jit  # traced once, wherever it is called
@@ -184,7 +186,7 @@ def answer(
     one = 1.0 + 0.0 * lax.stop_gradient(free.hub[2])
     feet = _feet(s, hub, contact, friction)
     stoppers = _stoppers(s, hub, free, held, feet, one)
-    stopper, along_e, along_u = _carried(s, hub, free, feet, *stoppers, one)
+    stopper, along_e, along_u, regular = _carried(s, hub, free, feet, *stoppers, one)
     pull = _pair(lambda i: along_u[i] + stopper[i])
     z, y = hub.along_e, hub.along_u
     by_feet = [free.hub[k] + z[0][k] * along_e[0] + z[1][k] * along_e[1] for k in range(3)]
@@ -202,6 +204,7 @@ def answer(
         length=_pair(lambda i: jnp.where(held[i], 0.0, grows[i])),
         foot_x=_pair(lambda i: foot_e[i] * cos[i] + foot_u[i] * sin[i]),
         foot_z=_pair(lambda i: foot_u[i] * cos[i] - foot_e[i] * sin[i]),
+        regular=regular,
     )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Int
 
-from vrw_jax.models.unilateral.carrying import Carried, Stand, in_impact, told_by
+from vrw_jax.models.unilateral.carrying import Carried, Stand, in_impact, in_motion, told_by
 from vrw_jax.models.unilateral.contacts import (
     ACCEPTED,
     ANY_MODE,
@@ -37,10 +37,12 @@ from vrw_jax.models.unilateral.mechanics import (
     WheelMotion,
     directions,
     foot_heights,
+    foot_speeds,
     foot_velocity,
     free_acceleration,
     free_velocity,
     hub_of,
+    if_any,
     kinetic_energy,
     of_slots,
     slots_of,
@@ -354,15 +356,22 @@ def _at_rest(
     were at their stoppers. What carries it from there is for the forces to say.
     """
     legs = directions(law.s, motion.theta)
-    turn = motion.L * motion.dtheta
-    foot_x = motion.vx - motion.dL * legs.sin - turn * legs.cos
-    foot_z = motion.vz - motion.dL * legs.cos + turn * legs.sin
-    stays = slots.filled & (foot_z < law.rest)
-    slips = jnp.where(foot_x > 0.0, SLIP_DOWN, SLIP_UP)
-    mode = jnp.where(jnp.abs(foot_x) < law.rest, STICK, slips)
+    along, off = foot_speeds(motion, legs)
+    stays = slots.filled & (off < law.rest)
+    slips = jnp.where(along > 0.0, SLIP_DOWN, SLIP_UP)
+    mode = jnp.where(jnp.abs(along) < law.rest, STICK, slips)
     mode = jnp.where(stays, jnp.where(contact == STICK, STICK, mode), OFF)
     on = at_stopper | (struck & (jnp.abs(motion.dL) < law.rest))
     new = jnp.any((mode != contact) | (on != at_stopper), axis=0)
+    s, still, friction = stilled((law.s, motion, law.friction))
+
+    def turned() -> Array:
+        """Feet whose slide that would turn round: they come to rest, too."""
+        after, _ = foot_speeds(settled(s, still, mode, on, friction), legs)
+        return ((mode == SLIP_DOWN) & (after < 0.0)) | ((mode == SLIP_UP) & (after > 0.0))
+
+    turns = new & if_any(jnp.any(new), turned, on & False)
+    mode = jnp.where(turns, STICK, mode)
     return select(new, settled(law.s, motion, mode, on, law.friction), motion), mode, on
 
 
@@ -371,8 +380,7 @@ def _joined(law: Law, motion: WheelMotion, stance: Stance, event: Event) -> Even
     a dip that is followed, and does not part. In turns they would throw each other off for ever."""
     s, legs = law.s, directions(law.s, motion.theta)
     near = law.rest**2 / (2.0 * s.g)
-    rising = motion.vz - motion.dL * legs.cos + motion.L * motion.dtheta * legs.sin
-    low = (foot_heights(motion, legs) <= near) & (rising <= law.rest)
+    low = (foot_heights(motion, legs) <= near) & (foot_speeds(motion, legs)[1] <= law.rest)
     lands = event.lands | (low & (stance.contact == OFF) & event.impact)
     few = jnp.sum(lands | (stance.contact != OFF), axis=0, dtype=jnp.int32) <= 2
     out = (near >= s.L0 - motion.L) & (motion.dL >= -law.rest)
@@ -380,8 +388,26 @@ def _joined(law: Law, motion: WheelMotion, stance: Stance, event: Event) -> Even
     return event._replace(lands=jnp.where(few, lands, event.lands), closes=closes)
 
 
+def _sided(law: Law, motion: WheelMotion, stance: Stance, event: Event) -> Event:
+    """In the limit of large friction a resting foot whose normal force vanishes begins to slide,
+    the way that its tangential force no longer holds."""
+    law, motion = stilled((law, motion))
+    slots = slots_of(stance.contact != OFF)
+    friction, mode = of_slots(law.friction, slots), slots.codes(stance.contact)
+    slides = event.lifts & (mode == STICK) & (as_row(friction) == jnp.inf)
+    stops = slots, mode, slots.flags(stance.locked), stance.locked & ~slots.filled
+    forces = lambda: in_motion(Stand(law.s, motion, friction, *stops)).tangential
+    none = jnp.zeros_like(motion.theta), jnp.zeros_like(motion.theta)
+    uphill = jnp.stack(if_any(jnp.any(slides), forces, none)) > 0.0
+    return event._replace(
+        lifts=event.lifts & ~slides,
+        slides_up=event.slides_up | (slides & uphill),
+        slides_down=event.slides_down | (slides & ~uphill),
+    )
+
+
 def resolve(law: Law, motion: WheelMotion, stance: Stance, event: Event) -> Change:
-    event = _joined(law, motion, stance, event)
+    event = _joined(law, motion, stance, _sided(law, motion, stance, event))
     s, impact = law.s, event.impact
     touched = (stance.contact != OFF) | event.lands
     was_locked = (stance.locked | event.closes) & ~event.loosens
@@ -397,7 +423,6 @@ def resolve(law: Law, motion: WheelMotion, stance: Stance, event: Event) -> Chan
     after, contact, at_stopper = select(impact, left, (motion, stance.contact, was_locked))
     legs = directions(s, motion.theta)
     dropped = touched & ~slots.filled
-    foot_z = after.vz - after.dL * legs.cos + after.L * after.dtheta * legs.sin
     lost = kinetic_energy(s, motion) - kinetic_energy(s, after)
     impulse = jnp.where(held, shock.push, jnp.inf)
 
@@ -426,7 +451,7 @@ def resolve(law: Law, motion: WheelMotion, stance: Stance, event: Event) -> Chan
         solutions=jnp.where(impact, jnp.minimum(shocked, stands), stands),
         paradox=(stands == 0) & ((shocked > 0) | ~impact),
         most_solutions=jnp.where(impact, jnp.maximum(shocked, stands), stands),
-        third_foot=jnp.any(dropped & (foot_z < 0.0), axis=0) & impact,
+        third_foot=jnp.any(dropped & (foot_speeds(after, legs)[1] < 0.0), axis=0) & impact,
     )
 
 

@@ -35,7 +35,7 @@ from vrw_jax.numerics import (
 )
 from vrw_jax.wheel import Outcome
 
-N_FELT = 8
+N_FELT = 9
 """Rows of a slope after the accelerations: what guards need of the forces. Then, where stoppers are
 one-sided, those of legs in the air; then, where they are wanted, `N_TALLIED`."""
 N_TALLIED = 3
@@ -44,10 +44,15 @@ MARCHING, EVENT = -1, -2
 """Where a lane stands: on its way, at an event; else the `Outcome` it met."""
 BURST = 8
 """Tries after which lanes at events no longer wait for those beside them."""
+SINGULAR = 1e-8, 1e2
+"""Of what vanishes at Painlevé's singularity, and of the tolerance: forces there are a share of two
+that vanish, told by neither rounding nor integration (with 18 tolerances left one was lost)."""
 PARABOLAS = 3
 """Tries at an event by parabolas; then by secants, which in stiff dips are better."""
 PATIENT = 15
 """Tries at an event after which a guard that stands on its own event may be what is met."""
+STILL = 1e-3
+"""s; a guard that takes longer to fall by its own rounding does not fall."""
 CLOSE = 30.0
 """An event is found where the last correction to its time is no more than so many tolerances of the
 step: the proposal is a parabola's, whose own error is about a hundredth of the correction."""
@@ -111,7 +116,7 @@ def slope_at(flow: Flow, q: Array, v: Array) -> Array:
     motion = motion_of(Place(q, v, q))
     now = forces(flow, motion)
     told = felt(flow, now)
-    feet = [*told.normal, *told.tangential, *told.stopper, *told.speed]
+    feet = [*told.normal, *told.tangential, *told.stopper, *told.speed, told.regular]
     more = [] if told.in_air is None else [told.in_air]
     if flow.tallied:
         tally = tally_rates(flow, motion, now)
@@ -124,9 +129,10 @@ def guards_at(flow: Flow, place: Place) -> Array:
     """All guards, in the order of `Guards`, whether or not the stance has just begun."""
     motion = motion_of(place)
     of_felt = place.slope[len(place.q) :]
-    n1, n2, t1, t2, s1, s2, x1, x2 = of_felt[:N_FELT]
+    n1, n2, t1, t2, s1, s2, x1, x2, regular = of_felt[:N_FELT]
     in_air = of_felt[N_FELT : N_FELT + flow.s.n] if flow.one_sided else None
-    now = Felt(directions(flow.s, motion.theta), (n1, n2), (t1, t2), (s1, s2), (x1, x2), in_air)
+    legs, pairs = directions(flow.s, motion.theta), ((n1, n2), (t1, t2), (s1, s2), (x1, x2))
+    now = Felt(legs, *pairs, regular, in_air)
     begun = jnp.ones(place.q.shape[-1:], bool)
     return jnp.concatenate(stance_guards(flow, motion, now, begun))
 
@@ -153,9 +159,10 @@ def set_off(flow: Flow, motion: WheelMotion, h: Array) -> March:
     """Lanes at the start of a stance, at an event again where a guard falls at once."""
     here, begun = place_of(flow, motion), begun_guards(flow)
     values, rates = guards_at(flow, here), guard_rates(flow, here)
-    # What is let go from rest reads rounding for 1e-8 s and longer: no event before it is below.
+    # What is let go from rest reads rounding for 1e-8 s and longer, and what rises from below has
+    # no event before it falls: events that take no time leave several such.
     unread = guard_sizes(flow) * (ROUNDING * jnp.finfo(values.dtype).eps)
-    begun = begun | ((jnp.abs(values) <= unread) & (rates > 0.0))
+    begun = begun | ((values <= unread) & (rates > -unread / STILL))
     past = ~begun & ((values < 0.0) | ((values == 0.0) & (rates <= 0.0)))
     offset = jnp.where(begun, values - 2.0 * unread, 0.0)
     zero, none = jnp.zeros_like(motion.x), jnp.zeros(motion.x.shape, jnp.int32)
@@ -301,9 +308,14 @@ def advanced(now: March, tried: Try, sizes: Array, tableau: Tableau, options: Op
     late = late | (arrived & (time > options.max_phase_time))
     stuck = (searched.tries >= options.event_steps) | (now.tried + 1 >= options.max_solver_steps)
     stuck = stuck | (~search.on & (now.time + following == now.time))
+    regular = len(here.q) + N_FELT - 1
+    before, after = here.slope[regular], end.slope[regular]
     verdict = jnp.where(stuck, Outcome.SOLVER_GAVE_UP, MARCHING)
     verdict = jnp.where(arrived, EVENT, verdict)
     verdict = jnp.where(late, Outcome.NO_TOUCHDOWN_IN_TIME, verdict)
+    nothing = SINGULAR[0] + SINGULAR[1] * options.rtol
+    singular = taken & ((before * after <= 0.0) | (jnp.abs(after) <= nothing))
+    verdict = jnp.where(singular, Outcome.FRICTION_PARADOX, verdict)
     return now._replace(
         here=select(taken, end, here),
         values=jnp.where(accepted, tried.values, now.values),
@@ -348,7 +360,9 @@ def _searched(
     within = (proposal >= low - accuracy) & (proposal <= high + accuracy)
     # In a dip of microseconds rounding throws proposals out of the bracket: its middle is as good.
     halve = ~within | (slow & ((search.tries & 3) == 3))
-    following = jnp.where(halve, 0.5 * (low + high), proposal)
+    # What stands on its own event falls again soon, if it does.
+    middle = jnp.where((low == 0.0) & jnp.isinf(proposal), 0.125 * high, 0.5 * (low + high))
+    following = jnp.where(halve, middle, proposal)
     shift = following - h
     # Where a guard reads no more than its rounding, no length is better than this one.
     beside, lowest = _lowest(tried.values / sizes, crossing)
@@ -399,13 +413,16 @@ def _earliest_secant(
     search: Search, values: Array, h: Array, crossing: Array
 ) -> tuple[Array, Array]:
     """Where the first of the crossing guards falls through zero by the last two tries, and which;
-    infinite where none does. Their ends are as right as the march, the inner stage is not."""
+    infinite where none does, the other way where one is below and falls no more: it fell before.
+    Their ends are as right as the march, the inner stage is not."""
     rate = (values - search.values) / jnp.where(h == search.last, jnp.inf, h - search.last)
     first, guard = jnp.full_like(h, jnp.inf), jnp.zeros(h.shape, jnp.int32)
     for index in range(len(values)):
         falls = crossing[index] & (rate[index] < 0.0)
         place = h - values[index] / jnp.where(falls, rate[index], 1.0)
-        earlier = falls & (place < first)
+        fell = crossing[index] & ~falls & (values[index] < 0.0)
+        place = jnp.where(fell, -jnp.inf, place)
+        earlier = (falls | fell) & (place < first)
         first, guard = jnp.where(earlier, place, first), jnp.where(earlier, index, guard)
     return first, guard
 
@@ -415,7 +432,7 @@ def _earliest_root(
 ) -> tuple[Array, Array]:
     """Where the first of the crossing guards' parabolas falls through zero, in step lengths, and
     which; infinite where none does ahead. One that `stands` on its own event rises: where its
-    parabola falls at once the step is too long for parabolas."""
+    parabola falls at once the step is too long for parabolas, the other way if it ends below."""
     discriminant = slope * slope - 4.0 * bend * g0
     root = jnp.sqrt(jnp.maximum(discriminant, 0.0))
     falling = slope < 0.0
@@ -424,6 +441,8 @@ def _earliest_root(
     place = over / jnp.where(under == 0.0, 1.0, under)
     exists = crossing & (discriminant >= 0.0) & (under != 0.0) & (place > 0.0)
     exists = exists & ~(stands & falling)
+    fell = crossing & ~exists & (g0 + slope + bend < 0.0)
+    place, exists = jnp.where(fell, -jnp.inf, place), exists | fell
     first, guard = jnp.full_like(place[0], jnp.inf), jnp.zeros(place.shape[-1:], jnp.int32)
     for index in reversed(range(len(place))):
         guard = jnp.where(crossing[index], index, guard)

@@ -9,6 +9,7 @@ element by element over lanes too, one more axis behind that of the legs.
 """
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -49,8 +50,11 @@ class Legwise(NamedTuple):
 
 
 def directions(s: Symbols, theta: Elementwise) -> Legwise:
+    """Of a wheel that may have turned any number of times since it landed."""
     turn = (s.alpha * np.arange(s.n)).reshape(-1, *(1,) * jnp.ndim(theta))
-    sin, cos = sine_cosine(theta)
+    halves = lax.stop_gradient(jnp.floor(theta / math.pi + 0.5))
+    odd = halves - 2.0 * jnp.floor(0.5 * halves)
+    sin, cos = (x - 2.0 * odd * x for x in sine_cosine(theta - math.pi * halves))
     sin_turn, cos_turn = np.sin(turn), np.cos(turn)
     return Legwise(sin * cos_turn + cos * sin_turn, cos * cos_turn - sin * sin_turn)
 
@@ -79,6 +83,12 @@ def stilled(tree: Any) -> Any:
     """The same, which moves with nothing."""
     moving, rest = eqx.partition(tree, eqx.is_inexact_array)
     return eqx.combine(lax.stop_gradient(moving), rest)
+
+
+def if_any(flag: Array, function: Callable[[], Any], otherwise: Any) -> Any:
+    """What `function` tells where the flag, one for all lanes, is set."""
+    turn = lambda _: (jnp.zeros((), bool), function())
+    return lax.while_loop(lambda state: state[0], turn, (flag, otherwise))[1]
 
 
 class Slots(NamedTuple):
@@ -288,6 +298,13 @@ def foot_velocity(motion: WheelMotion, slots: Slots, hub: Hub | Posture) -> Foot
 def foot_heights(motion: WheelMotion, legs: Legwise) -> Legs:
     """Height of every foot above the slope, m."""
     return motion.z - motion.L * legs.cos
+
+
+def foot_speeds(motion: WheelMotion, legs: Legwise) -> tuple[Legs, Legs]:
+    """Of every foot, along the slope and off it, m/s."""
+    turn = motion.L * motion.dtheta
+    along = motion.vx - motion.dL * legs.sin - turn * legs.cos
+    return along, motion.vz - motion.dL * legs.cos + turn * legs.sin
 
 
 def foot_places(motion: WheelMotion, legs: Legwise) -> Legs:

@@ -12,13 +12,7 @@ from vrw_jax.models.unilateral.carrying import (
     in_motion,
     sliding,
 )
-from vrw_jax.models.unilateral.contacts import (
-    OFF,
-    STICK,
-    THE_PAPERS,
-    Roughness,
-    rough_of,
-)
+from vrw_jax.models.unilateral.contacts import OFF, STICK, Roughness, rough_of
 from vrw_jax.models.unilateral.mechanics import (
     FootVelocity,
     Legs,
@@ -208,6 +202,7 @@ class Felt(NamedTuple):
     tangential: Pair
     stopper: Pair
     speed: Pair  # of the slots' feet along the slope
+    regular: Array  # see `contacts.Answer`
     in_air: Legs | None  # stopper force of legs in the air, where stoppers are one-sided
 
 
@@ -215,7 +210,8 @@ def felt(flow: Flow, now: Forces) -> Felt:
     """What `stance_guards` needs of the forces."""
     found = now.answer
     in_air = airborne_stopper_force(flow, now) if flow.one_sided else None
-    return Felt(now.legs, found.normal, found.tangential, found.stopper, now.feet.x, in_air)
+    forces = found.normal, found.tangential, found.stopper
+    return Felt(now.legs, *forces, now.feet.x, found.regular, in_air)
 
 
 def as_row(friction: Roughness) -> Array:
@@ -246,23 +242,21 @@ def stance_guards(flow: Flow, motion: WheelMotion, now: Felt, begun: Array) -> l
     just_slid = flow.slots.flags(stance.new_slip)
     rough = as_row(rough_of(flow.friction))
     normal, tangential = jnp.stack(now.normal), jnp.stack(now.tangential)
-    coulomb = (flow.contact == STICK) & (as_row(flow.friction) != THE_PAPERS)
     # In the limit of large friction a resting foot slides, one way or the other, where its normal
-    # force vanishes; a sliding one lifts where its friction does.
+    # force vanishes, see `events.resolve`; a sliding one lifts where its friction does.
     limit = as_row(flow.friction) == jnp.inf
     direction = jnp.stack(sliding(flow.contact))
     pressed = jnp.where(limit & (direction != 0.0), -direction * tangential, normal)
-    lifts = (flow.contact != OFF) & ~(limit & coulomb)
-    margin = lambda pull: jnp.where(limit, jnp.maximum(normal, pull), rough * normal + pull)
+    coned = (flow.contact == STICK) & jnp.isfinite(as_row(flow.friction))
     slides = (direction != 0.0) & (begun | ~just_slid)
     watched = lambda condition, value: jnp.where(condition, value, 1.0)
     in_the_air = [] if now.in_air is None else [jnp.where(flow.airborne, now.in_air, one)]
     return [
         jnp.where(in_air, _heights(flow, motion, now.legs), one),
         jnp.where(moving, s.L0 - motion.L, one),
-        watched(lifts, pressed),
-        watched(coulomb, margin(-tangential)),
-        watched(coulomb, margin(tangential)),
+        watched(flow.contact != OFF, pressed),
+        watched(coned, rough * normal - tangential),
+        watched(coned, rough * normal + tangential),
         watched(slides, direction * jnp.stack(now.speed)),
         watched(flow.held, jnp.stack(now.stopper)),
         motion.dtheta[None],

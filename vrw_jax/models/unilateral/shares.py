@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array
 
 from vrw_jax.models.unilateral.carrying import (
@@ -39,6 +38,7 @@ from vrw_jax.models.unilateral.mechanics import (
     Vector3,
     WheelMotion,
     foot_velocity,
+    if_any,
     over_legs,
     posture_of,
 )
@@ -59,12 +59,6 @@ ALIKE = [
 
 Ends = Callable[[slice], tuple[Array, Array]]
 """Some coordinates and rates of a direction at a place."""
-
-
-def if_any(flag: Array, function: Callable[[], Any], otherwise: Any) -> Any:
-    """What `function` tells where the flag, one for all lanes, is set."""
-    turn = lambda _: (jnp.zeros((), bool), function())
-    return lax.while_loop(lambda state: state[0], turn, (flag, otherwise))[1]
 
 
 class Share(NamedTuple):
