@@ -465,16 +465,22 @@ def follow(
     options: ArclengthOptions,
     wheels: Any,
     z: Unknown,
-    p: Float[Array, " branches"],
+    p: Float[Array, "*branches"],
     bounds: Float[Array, "2"],
-    directions: Float[Array, " branches"],
-    wanted: Bool[Array, " branches"],
+    directions: Float[Array, "*branches"],
+    wanted: Bool[Array, "*branches"] | None = None,
 ) -> Track:
     """The branches from the points near (z, p), towards growing p if the direction is 1, else -1.
 
-    Each ends at the range's end, or with its first point that is not `valid`, which is kept. Some
-    go side by side, with one linearisation of each at every turn; where one ends the next begins.
+    One branch, or several with a leading axis; all of them, or those that are `wanted`. Each ends
+    at the range's end, or with its first point that is not `valid`, which is kept. Some go side by
+    side, with one linearisation of each at every turn; where one ends the next begins.
     """
+    if p.ndim == 0:
+        one = lambda tree: jax.tree.map(lambda x: x[None], tree)
+        track = follow(followed, options, one(wheels), one(z), p[None], bounds, directions[None])
+        return jax.tree.map(lambda x: x[0], track)
+    wanted = jnp.ones(p.shape, bool) if wanted is None else wanted
 
     def some_further(on: Followed) -> Followed:
         rows = jnp.argsort(~going(on), stable=True)[:SIDE_BY_SIDE]
@@ -486,9 +492,7 @@ def follow(
             linears = jax.vmap(one)(own, on[0].trial)
             return turned(followed, options, own, bounds, along, rows, on, linears)
 
-        def more(on: Followed) -> Array:
-            return jnp.where(waiting, jnp.all(going(on)), jnp.any(going(on)))
-
+        more = lambda on: jnp.where(waiting, jnp.all(going(on)), jnp.any(going(on)))
         state, points = lax.while_loop(more, turn, (state, on[1]))
         return jax.tree.map(lambda x, new: x.at[rows].set(new), on[0], state), points
 
