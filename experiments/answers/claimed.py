@@ -31,8 +31,6 @@ CLOSE = 0.1
 """How near to an answer's section state its gait must be, rad, rad/s, m, m/s."""
 WALKS = (40, 200)
 """Steps of a walk to it, where Newton's method from there leads elsewhere."""
-REPEATS = 1e-5
-"""How near to where it began a step of such a walk must end to tell the gait by itself."""
 TOLD = ("values", "errors", "model_errors", "rungs", "hows", "n_steps", "states", "outcomes")
 TRUE = (1e-12, 1e-11, 1e-10, 1e-9)
 TOLERANCES = 10.0 ** -np.arange(2, 9)
@@ -93,10 +91,9 @@ def truth(
     """Measures of the gaits next to the answers' section states.
 
     By Newton's method with the derivatives of steps at 1e-12 from there, where it leads farther
-    than CLOSE from where walks of WALKS steps end, and then at looser tolerances: nothing
-    but the step is shared with what `vrw.answer` does. Where feet dip so often that it converges
-    nowhere, by that of so many steps from there which repeats best. NaN where there is none: then
-    the answer is wrong.
+    than CLOSE from where walks of WALKS steps end, and at last at looser tolerances: nothing
+    but the step is shared with what `vrw.answer` does. NaN where there is none: then the answer
+    is wrong.
     """
     exact, open_ = np.full((len(friction), len(MEASURES)), np.nan), np.flatnonzero(found)
     legs = vrw.WheelParams().n_legs
@@ -115,22 +112,7 @@ def truth(
         hit = np.asarray(gait.found) & (missed < CLOSE)
         exact[open_[hit]] = np.stack([np.asarray(getattr(gait, m)) for m in MEASURES], 1)[hit]
         open_ = open_[~hit]
-    if len(open_):
-        exact[open_] = [walked(of(columns, lane), friction[lane], near[lane]) for lane in open_]
     return exact
-
-
-def walked(params: vrw.WheelParams, friction: float, near: np.ndarray) -> list[float]:
-    """Measures of the step of a walk from there that repeats best, NaN where none does."""
-    options = vrw.Options(rtol=TRUE[0], atol=TRUE[0])
-    on = {"model": vrw.UnilateralWheel(friction=friction), "options": options}
-    states = np.asarray(vrw.walk(params, near, WALKS[-1], **on).steps.section_state)
-    missed = np.abs(np.diff(states, axis=0)).max(1)
-    best = np.argmin(np.where(np.abs(states[:-1] - near).max(1) < CLOSE, missed, np.inf))
-    stays = missed[best] < REPEATS
-    print(f"friction {friction:.4f}: a walk alone tells of a gait: {stays}", flush=True)
-    step = vrw.step(params, states[best], **on)
-    return [float(getattr(step, name)) if stays else np.nan for name in MEASURES]
 
 
 def compute(parts: int, folder: Path) -> None:

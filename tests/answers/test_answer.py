@@ -74,29 +74,29 @@ def test_at_low_friction_another_gait_is_walked_to():
 
 
 HARD = {
-    "damping": [178.5877, 153.6807, 193.5374, 198.3578, 190.0653],
-    "stiffness": [515.5376, 534.7467, 536.8101, 464.9508, 428.9538],
-    "natural_length": [1.0197, 1.0133, 1.0228, 1.0303, 1.0338],
-    "slope": [0.3150, 0.3332, 0.3386, 0.3115, 0.3197],
+    "damping": [178.5877, 153.6807, 193.5374, 151.5455, 114.5147, 98.5177],
+    "stiffness": [515.5376, 534.7467, 536.8101, 532.1883, 584.6127, 576.7884],
+    "natural_length": [1.0197, 1.0133, 1.0228, 1.0248, 1.0297, 1.0195],
+    "slope": [0.3150, 0.3332, 0.3386, 0.3125, 0.2809, 0.2942],
 }
-"""Three whose legs change what they do on the way, with a slow direction; two whose feet dip for a
-microsecond."""
-UNSTABLE = [1, 2]
-"""Of these, with multipliers of 1.36 and 1.011: no walk leads to their gaits."""
+"""Three whose legs change what they do on the way, with a slow direction; three whose errors are
+the largest, of what was asked, in 10,157 answers: their feet dip for a microsecond."""
+HARD_FRICTION = np.array([2.3666, 0.9022, 25.7033, 15.3909, 1.7096, 1.1505])
+NONE = {1: vrw.Outcome.NO_CYCLE_FOUND, 2: vrw.Outcome.FRICTION_PARADOX}
+"""A multiplier of 1.36, so that no walk leads to the gait; walks to Painlevé's singularity."""
 
 
 def test_errors_are_kept_where_motions_change_and_feet_hardly_leave_the_ground():
     wheels = vrw.WheelParams(**{name: jnp.asarray(x) for name, x in HARD.items()})
-    friction = np.array([2.3666, 0.9022, 25.7033, 8.0085, 6.8608])
     names = ["speed", "dls_fraction"]
-    exact = vrw.answer(names, wheels, 1e-8, friction=friction)
+    exact = vrw.answer(names, wheels, 1e-8, friction=HARD_FRICTION)
     for tol in (1e-2, 1e-4):
-        told = vrw.answer(names, wheels, tol, friction=friction)
-        both = told.found & exact.found
-        assert np.sum(both) >= 2  # a step at a dip may fail: no answer, and none that is wrong
-        assert not np.any(told.found[UNSTABLE])
+        told = vrw.answer(names, wheels, tol, friction=HARD_FRICTION)
+        for each in (told, exact):
+            lost = np.flatnonzero(~each.found)
+            assert {int(i): each.outcomes[i] for i in lost} == NONE
         wrong = np.abs(told.values - exact.values)
-        assert np.all((wrong <= told.errors + exact.errors)[both])
+        assert np.all((wrong <= told.errors + exact.errors)[told.found])
 
 
 def test_which_takes_one_of_the_gaits_that_attract():
