@@ -80,7 +80,7 @@ HARD = {
     "slope": [0.3150, 0.3332, 0.3386, 0.3125, 0.2809, 0.2942],
 }
 """Three whose legs change what they do on the way, with a slow direction; three whose errors are
-the largest, of what was asked, in 10,157 answers: their feet dip for a microsecond."""
+the largest, of what was asked, in 10,152 answers: their feet dip for a microsecond."""
 HARD_FRICTION = np.array([2.3666, 0.9022, 25.7033, 15.3909, 1.7096, 1.1505])
 NONE = {1: vrw.Outcome.NO_CYCLE_FOUND, 2: vrw.Outcome.FRICTION_PARADOX}
 """A multiplier of 1.36, so that no walk leads to the gait; walks to Painlevé's singularity."""

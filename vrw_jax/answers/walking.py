@@ -19,6 +19,9 @@ STEPS, ROUNDS, BETWEEN = 20, 10, 7
 gait of the paper's, with five steps after a leap three gaits in 118 are missed."""
 LEAP = 0.15
 """Longest leap, rad, rad/s, m, m/s: pairs of gaits that are nearer to each other are leapt over."""
+FARTHER, LATE = 2.0, 3
+"""A walk ends where its drift would fade farther off than so many times what is left of leaps, once
+so few are left: before, drifts may grow for a while and yet fade."""
 RESTS = 5e-4
 """Drift of a step, and way to where it would fade, below which a walk has come to rest."""
 STILL = 1e-5
@@ -57,8 +60,10 @@ def led(ground: Ground, lanes: np.ndarray, x: np.ndarray) -> Led:
         told.outcome[open_] = ends[first, np.arange(len(open_))]
         open_ = open_[on]
         told.x[open_] = here.x[on]
-        told.rests[open_], leap = _drift(before.x[on], last.x[on], here.x[on], m)
-        open_, leap = (part[~told.rests[open_]] for part in (open_, leap))
+        told.rests[open_], leap, way = _drift(before.x[on], last.x[on], here.x[on], m)
+        left = ROUNDS - k
+        goes_on = ~told.rests[open_] & ((left > LATE) | (way <= FARTHER * LEAP * left))
+        open_, leap = (part[goes_on] for part in (open_, leap))
         start = told.x[open_]
         leaps = np.any(leap != 0.0, axis=1)
         start[leaps, :m] += leap[leaps]
@@ -74,9 +79,9 @@ def _put(whole: np.ndarray, places: np.ndarray, part: np.ndarray) -> np.ndarray:
 
 def _drift(
     before: np.ndarray, last: np.ndarray, here: np.ndarray, m: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Whether three section states in a row have come to rest, and how far to leap from the last;
-    nowhere where the legs' codes change."""
+) -> tuple[np.ndarray, ...]:
+    """Whether three section states in a row have come to rest, how far to leap from the last, and
+    how far off the drift would fade; no leap and no way where the legs' codes change."""
     same = np.all((before[:, m:] == here[:, m:]) & (last[:, m:] == here[:, m:]), axis=1)
     u, v = (last - before)[:, :m], (here - last)[:, :m]
     speed = np.abs(v).max(1)
@@ -88,4 +93,4 @@ def _drift(
     # What turns round at each step is on its way to a gait of two.
     rests = same & (way < RESTS) & (speed < RESTS)
     goes = same & ~rests & (share > 0.0)
-    return rests, np.where(goes, steps, 0.0)[:, None] * v
+    return rests, np.where(goes, steps, 0.0)[:, None] * v, np.where(same, way, 0.0)
