@@ -22,7 +22,7 @@ from vrw_jax.models import (
     gait_step,
 )
 from vrw_jax.models.lane_step import lane_phase, walk
-from vrw_jax.models.paper_step import result_of, told_of
+from vrw_jax.models.paper_step import described, result_of
 from vrw_jax.models.rigid import Roll
 from vrw_jax.models.unilateral.lanes import Walk, started, turned
 from vrw_jax.models.unilateral.march import N_TALLIED, Place, motion_of
@@ -30,7 +30,6 @@ from vrw_jax.models.unilateral.mechanics import kinetic_energy, potential_energy
 from vrw_jax.models.unilateral.motion import Stance
 from vrw_jax.models.unilateral.section import embedded, section_size
 from vrw_jax.models.unilateral.single import samples
-from vrw_jax.models.viscoelastic import described
 from vrw_jax.numerics import Options, explicit_tableau, sample_lanes, sine_cosine
 from vrw_jax.results import MARGINS, STOPPERS
 from vrw_jax.wheel import PARAMETER_NAMES, Symbols, WheelParams, wheel_of
@@ -117,7 +116,7 @@ def programs(n_legs: int) -> dict[str, Program]:
         """All that the step tells, in `result_of`'s order, and its motion phase by phase."""
         params, options = wheel(parameters), _options(tolerance)
         walked = walk(params, tuple(x), options, explicit_tableau(SOLVER), True, monitored=True)
-        step = result_of(walked.s, walked.landing, told_of(walked), friction)
+        step = result_of(walked, friction, "lanes")
         motion = []
         for phase, start, end in zip(walked.phases, walked.starts, walked.ends, strict=True):
             flow = lane_phase(phase, monitored=False)

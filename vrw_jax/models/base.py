@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from vrw_jax.numerics import Elementwise, Options, Scalar
+from vrw_jax.numerics import Elementwise, Options
 from vrw_jax.results import MARGINS, MEASURES
 from vrw_jax.wheel import FRICTION, LARGEST, PARAMETER_NAMES, Outcome, WheelParams, wheel_of
 from vrw_jax.wording import AbstractTold, Row, counted, told, traced
@@ -20,8 +20,10 @@ from vrw_jax.wording import AbstractTold, Row, counted, told, traced
 SectionState = Float[Array, "3"]
 """(theta-, dtheta-, dL1-) just before touchdown, in the labels of the step that ends: rad, rad/s,
 m/s. The length of Leg 1 follows from touchdown itself, Leg 2 is on its stopper."""
-RungState = Float[Array, " section"]
-"""A `SectionState`, or the rung's own longer one."""
+RungState = Float[Array, "section ..."]
+"""A `SectionState`, or the rung's own longer one; of lanes, which have the last axis, too."""
+Measured = Float[Array, "..."]
+"""A number that a step tells; of lanes, one for each."""
 
 
 GroundOfStep = tuple[Array, Array, Array, Array]
@@ -59,9 +61,9 @@ class Indicators(AbstractMeasured):
 
     named: ClassVar = {"lambda_2": "lambda_2_plus", "lambda_4": "lambda_4_plus"}
 
-    lambda_I4: Float[Array, "*steps"]
-    lambda_2: Float[Array, "*steps"]
-    lambda_4: Float[Array, "*steps"]
+    lambda_I4: Measured
+    lambda_2: Measured
+    lambda_4: Measured
 
 
 class EnergyLoss(AbstractMeasured):
@@ -78,9 +80,9 @@ class EnergyLoss(AbstractMeasured):
 
     named: ClassVar = {name: f"energy_lost_{name}" for name in ("landing", "stopper", "damping")}
 
-    landing: Scalar
-    stopper: Scalar
-    damping: Scalar
+    landing: Measured
+    stopper: Measured
+    damping: Measured
 
 
 class Margins(AbstractMeasured):
@@ -117,31 +119,31 @@ class Margins(AbstractMeasured):
 
     named: ClassVar = {}
 
-    fore_foot_force: Scalar
-    takeoff_acceleration: Scalar
-    clearance_sls1: Scalar
-    clearance_sls2: Scalar
-    locked_stopper_force: Float[Array, " n_locked"]
-    rear_stopper_force: Scalar
-    contraction: Scalar
-    friction_fore: Scalar
-    friction_rear: Scalar
-    landing_stopper_impulse: Float[Array, " n_locked"]
-    hit_stopper_impulse: Float[Array, " n_locked"]
-    hit_planted_impulse: Scalar
-    landing_friction_fore: Scalar
-    landing_friction_rear: Scalar
+    fore_foot_force: Measured
+    takeoff_acceleration: Measured
+    clearance_sls1: Measured
+    clearance_sls2: Measured
+    locked_stopper_force: Float[Array, "n_locked ..."]
+    rear_stopper_force: Measured
+    contraction: Measured
+    friction_fore: Measured
+    friction_rear: Measured
+    landing_stopper_impulse: Float[Array, "n_locked ..."]
+    hit_stopper_impulse: Float[Array, "n_locked ..."]
+    hit_planted_impulse: Measured
+    landing_friction_fore: Measured
+    landing_friction_rear: Measured
 
 
 class AbstractStep(AbstractTold):
     """What every rung's step tells alike. Batched under vmap."""
 
     section_state: eqx.AbstractVar[Array]  # just before the next touchdown
-    post_impact: eqx.AbstractVar[Float[Array, "2"]]  # (theta, dtheta), rad, rad/s
-    durations: eqx.AbstractVar[Float[Array, "3"]]  # of double support first, s
-    step_length: eqx.AbstractVar[Scalar]  # m
-    outcome: eqx.AbstractVar[Int[Array, ""]]  # an Outcome
-    solver_steps: eqx.AbstractVar[Int[Array, ""]]  # tried by the integrator
+    post_impact: eqx.AbstractVar[Float[Array, "2 ..."]]  # (theta, dtheta), rad, rad/s
+    durations: eqx.AbstractVar[Float[Array, "3 ..."]]  # of double support first, s
+    step_length: eqx.AbstractVar[Measured]  # m
+    outcome: eqx.AbstractVar[Int[Array, "..."]]  # an Outcome
+    solver_steps: eqx.AbstractVar[Int[Array, "..."]]  # tried by the integrator
 
     @property
     def period(self) -> Array:
@@ -211,10 +213,10 @@ class AbstractStep(AbstractTold):
 class AbstractGroundStep(AbstractStep):
     """A step over contacts of any order; `durations` are with two feet loaded, with one, none."""
 
-    energy_impacts: eqx.AbstractVar[Scalar]  # lost in impacts, J
-    energy_damping: eqx.AbstractVar[Scalar]  # lost in the dampers, J
-    energy_friction: eqx.AbstractVar[Scalar]  # lost by sliding between impacts, J
-    slip: eqx.AbstractVar[Scalar]  # path of sliding feet, m
+    energy_impacts: eqx.AbstractVar[Measured]  # lost in impacts, J
+    energy_damping: eqx.AbstractVar[Measured]  # lost in the dampers, J
+    energy_friction: eqx.AbstractVar[Measured]  # lost by sliding between impacts, J
+    slip: eqx.AbstractVar[Measured]  # path of sliding feet, m
 
     def own_measures(self) -> dict[str, Array]:
         return {
@@ -248,15 +250,15 @@ class StepResult(AbstractStep):
         0.548 0.060 m
     """
 
-    section_state: SectionState
-    post_impact: Float[Array, "2"]
-    durations: Float[Array, "3"]
-    step_length: Scalar
+    section_state: Float[Array, "3 ..."]
+    post_impact: Float[Array, "2 ..."]
+    durations: Float[Array, "3 ..."]
+    step_length: Measured
     indicators: Indicators
     monitors: Margins
     energy: EnergyLoss
-    outcome: Int[Array, ""]
-    solver_steps: Int[Array, ""]
+    outcome: Int[Array, "..."]
+    solver_steps: Int[Array, "..."]
     engine: str = eqx.field(static=True, default="")
 
     def own_measures(self) -> dict[str, Array]:
@@ -274,11 +276,11 @@ class Advance(eqx.Module):
     """The lean result of a step: what repeats."""
 
     section_state: RungState
-    durations: Float[Array, "3"]  # of DLS, SLS-I, SLS-II, s
-    outcome: Int[Array, ""]  # an Outcome
-    solver_steps: Int[Array, ""]  # tried by the integrator
-    rung: Int[Array, ""] | None = None  # that took the step, of a model that chooses: see ladder
-    reason: Int[Array, ""] | None = None  # why that one
+    durations: Float[Array, "3 ..."]  # of DLS, SLS-I, SLS-II, s
+    outcome: Int[Array, "..."]  # an Outcome
+    solver_steps: Int[Array, "..."]  # tried by the integrator
+    rung: Int[Array, "..."] | None = None  # that took the step, of a model that chooses: see ladder
+    reason: Int[Array, "..."] | None = None  # why that one
     engine: str = eqx.field(static=True, default="")  # that took it, see `Options`
 
 
@@ -291,13 +293,13 @@ class Trajectory(eqx.Module):
     its start. Coordinates are in the labels of this step; the origin is Leg 1's foot.
     """
 
-    time: Float[Array, "3 n"]  # from the landing, s
-    state: Float[Array, "3 n 6"]  # theta, L1, L2 and their rates
-    forces: Float[Array, "3 n 4"]  # lambda_1 ... lambda_4, N
-    energy: Float[Array, "3 n 3"]  # kinetic, gravitational, elastic, J
+    time: Float[Array, "3 n ..."]  # from the landing, s
+    state: Float[Array, "3 n 6 ..."]  # theta, L1, L2 and their rates
+    forces: Float[Array, "3 n 4 ..."]  # lambda_1 ... lambda_4, N
+    energy: Float[Array, "3 n 3 ..."]  # kinetic, gravitational, elastic, J
     section_state: RungState
-    durations: Float[Array, "3"]  # s
-    outcome: Int[Array, ""]  # an Outcome
+    durations: Float[Array, "3 ..."]  # s
+    outcome: Int[Array, "..."]  # an Outcome
 
 
 class AbstractWheel(eqx.Module):

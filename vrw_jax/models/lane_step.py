@@ -16,7 +16,15 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from vrw_jax import simd
-from vrw_jax.models.paper_step import End, Told, Walked, through_phases, told_of
+from vrw_jax.models.base import Advance, EnergyLoss, Indicators, Margins, StepResult, Trajectory
+from vrw_jax.models.paper_step import (
+    End,
+    Walked,
+    advance_of,
+    result_of,
+    through_phases,
+    trajectory_of,
+)
 from vrw_jax.numerics import (
     Balance,
     Forward,
@@ -165,41 +173,71 @@ class _Setting(NamedTuple):
 
     structure: Any  # of (params, x, options), whose leaves are the arrays
     stop_at_lift_off: bool
-    monitored: bool
+    friction: float | None  # that margins refer to; None where the lean result is told
 
     @property
     def key(self) -> tuple:
         """By `repr`: what the trace depends on."""
-        return str(self.structure), self.stop_at_lift_off, self.monitored
+        return str(self.structure), self.stop_at_lift_off, self.friction
 
     def walked(self, *leaves: Array) -> tuple[Walked, Tableau, Options]:
         """The step over lanes, which the leaves have on their last axis, and what made it."""
         params, x, options = jax.tree.unflatten(self.structure, leaves)
         tableau = explicit_tableau(options.solver)
         assert tableau is not None  # `lanes_can` looked
-        given = params, tuple(x), options, tableau, self.stop_at_lift_off, self.monitored
+        monitored = self.friction is not None
+        given = params, tuple(x), options, tableau, self.stop_at_lift_off, monitored
         return walk(*given), tableau, options
 
-    def told(self, *leaves: Array) -> Told:
-        return told_of(self.walked(*leaves)[0])
+    def told(self, *leaves: Array) -> tuple:
+        """What the step tells, its floats first."""
+        walked, friction = self.walked(*leaves)[0], self.friction
+        if friction is None:
+            return eqx.partition(advance_of(walked, "lanes"), eqx.is_inexact_array)
+        ends = tuple(end._replace(own=None) for end in walked.ends)
+        alone = walked._replace(phases=(), starts=(), ends=ends)  # nothing but what moves
+        told = by_directions(lambda walked: result_of(walked, friction, "lanes"))(alone)
+        return eqx.partition(told, eqx.is_inexact_array)
+
+    def like(self, *leaves: Array) -> tuple:
+        """The form of `told`."""
+        x = leaves[0]
+        i = jnp.zeros_like(x, jnp.int32)
+        two, three = (jnp.broadcast_to(x, (n, *x.shape)) for n in (2, 3))
+        told: Any = Advance(three, three, i, i, engine="lanes")
+        if self.friction is not None:
+            told = StepResult(
+                section_state=three,
+                post_impact=two,
+                durations=three,
+                step_length=x,
+                indicators=_every(Indicators, x),
+                monitors=_every(Margins, x),
+                energy=_every(EnergyLoss, x),
+                outcome=i,
+                solver_steps=i,
+                engine="lanes",
+            )
+        return eqx.partition(told, eqx.is_inexact_array)
 
 
-def told_by_lanes(structure: Any, stop_at_lift_off: bool, monitored: bool) -> Forward:
+def _every(kind: Any, x: Array) -> Any:
+    """With `x` in all fields."""
+    return kind(*(x for _ in dataclasses.fields(kind)))
+
+
+def told_by_lanes(structure: Any, stop_at_lift_off: bool, friction: float | None) -> Forward:
     """The step over the leaves of (params, x, options), as `any_mode` takes it."""
-    setting = _Setting(structure, stop_at_lift_off, monitored)
-
-    def over_lanes(*leaves: Array) -> tuple:
-        return eqx.partition(setting.told(*leaves), eqx.is_inexact_array)
-
-    like = lambda *leaves: eqx.partition(_like(monitored, leaves), eqx.is_inexact_array)
-    return one_wheel(lane_function(over_lanes, like, ("gait step", *setting.key)))
+    setting = _Setting(structure, stop_at_lift_off, friction)
+    settings = ("gait step", *setting.key)
+    return one_wheel(lane_function(setting.told, setting.like, settings))
 
 
 def sampled_by_lanes(structure: Any, stop_at_lift_off: bool, n_samples: int) -> LaneFunction:
-    """What the step tells, and states at equal times of each phase, over the same leaves."""
-    setting = _Setting(structure, stop_at_lift_off, monitored=False)
+    """The step sampled at equal times of each phase, over the same leaves."""
+    setting = _Setting(structure, stop_at_lift_off, None)
 
-    def over_lanes(*leaves: Array) -> tuple:
+    def over_lanes(*leaves: Array) -> Trajectory:
         walked, tableau, options = setting.walked(*leaves)
         samples = [
             sample_lanes(
@@ -207,30 +245,32 @@ def sampled_by_lanes(structure: Any, stop_at_lift_off: bool, n_samples: int) -> 
             )
             for phase, start, end in zip(walked.phases, walked.starts, walked.ends, strict=True)
         ]
-        return told_of(walked), tuple(samples)
+        return trajectory_of(walked, samples)
 
-    like = lambda *leaves: (_like(False, leaves), (leaves[0],) * 3)
+    def like(x: Array, *_: Array) -> Trajectory:
+        rows = lambda *n: jnp.broadcast_to(x, (3, *n, *x.shape))
+        n = n_samples
+        along = rows(n), rows(n, 6), rows(n, 4), rows(n, 3)
+        return Trajectory(*along, rows(), rows(), jnp.zeros_like(x, jnp.int32))
+
     return one_wheel(lane_function(over_lanes, like, ("samples", *setting.key, n_samples)))
 
 
 def moved_by_lanes(
-    structure: Any, stop_at_lift_off: bool, monitored: bool, moved: tuple[int, ...]
+    structure: Any, stop_at_lift_off: bool, friction: float | None, moved: tuple[int, ...]
 ) -> Forward:
     """(Jacobian by the leaves `moved`, floats) and the other outputs of `told_by_lanes`."""
-    setting = _Setting(structure, stop_at_lift_off, monitored)
+    setting = _Setting(structure, stop_at_lift_off, friction)
 
     def tightened(*leaves: Array) -> list[Array]:
         params, x, options = jax.tree.unflatten(structure, leaves)
         return jax.tree.leaves((params, x, options.for_derivatives()))
 
-    def over_lanes(*leaves: Array) -> tuple:
-        floats = lambda *full: eqx.partition(setting.told(*full), eqx.is_inexact_array)
-        return along_units(floats, leaves, moved)
-
     def like(*leaves: Array) -> tuple:
-        value, other = eqx.partition(_like(monitored, leaves), eqx.is_inexact_array)
+        value, other = setting.like(*leaves)
         return value, value, other
 
+    over_lanes = lambda *leaves: along_units(setting.told, leaves, moved)
     settings = ("gait step with derivatives", *setting.key, moved)
     call = one_wheel(lane_function(over_lanes, like, settings, DIRECTIONS))
 
@@ -290,9 +330,3 @@ def _directions(leaves: Sequence[Array]) -> list[Array]:
         told.append(wide[0] if leaf.ndim == 1 else jnp.stack(wide, 1))
         begin += size
     return told
-
-
-def _like(monitored: bool, leaves: Sequence[Array]) -> Told:
-    x = leaves[0]
-    other = jnp.zeros_like(x, jnp.int32)
-    return Told((x, x, x), x, other, (x, x, x) if monitored else (), other, other)

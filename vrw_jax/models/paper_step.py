@@ -4,25 +4,27 @@ An engine brings `run`, which takes one phase to its end. Which phases take plac
 how the step ended and what it tells is written here, element by element.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from vrw_jax.models.base import (
+    Advance,
     EnergyLoss,
     Indicators,
     Margins,
     Numbers,
-    SectionState,
     StepResult,
+    Trajectory,
     replaced_where_bad,
     usable,
 )
 from vrw_jax.numerics import Elementwise, Vector, select, sine_cosine
 from vrw_jax.wheel import (
     AbstractPhase,
+    Instant,
     Landing,
     Motion,
     Outcome,
@@ -69,17 +71,6 @@ class Walked(NamedTuple):
     outcome: Int[Array, "..."]  # an Outcome
 
 
-class Told(NamedTuple):
-    """What `result_of` needs of a step's phases, whoever integrated them."""
-
-    states: tuple[Array, ...]  # by phase: coordinates, then rates, at its end
-    durations: Array  # (3, ...), s
-    happened: Array  # (3, ...)
-    minima: tuple[Array, ...]  # by phase: of its premises
-    outcome: Array
-    tried: Array  # (3, ...)
-
-
 def through_phases(
     run: Run,
     params: WheelParams,
@@ -120,82 +111,115 @@ def _safe(like: Elementwise) -> tuple[Elementwise, Motion]:
     return theta, Motion(*sine_cosine(theta), *others)
 
 
-def told_of(walked: Walked) -> Told:
-    """The step without what can be computed again."""
-    ends = walked.ends
-    return Told(
-        states=tuple(jnp.stack([*end.q, *end.v]) for end in ends),
-        durations=jnp.stack([end.duration for end in ends]),
-        happened=jnp.stack(walked.happened),
-        minima=tuple(end.minima for end in ends if end.minima is not None),
+def advance_of(walked: Walked, engine: str) -> Advance:
+    """The lean result; its section state is zeros where there is none."""
+    theta, _, dtheta, dL1 = (*walked.ends[2].q, *walked.ends[2].v)
+    stepped = walked.outcome == Outcome.STEPPED
+    tried = [end.tried for end in walked.ends]
+    return Advance(
+        section_state=jnp.stack([jnp.where(stepped, x, 0.0) for x in (theta, dtheta, dL1)]),
+        durations=jnp.stack([end.duration for end in walked.ends]),
         outcome=walked.outcome,
-        tried=jnp.stack([end.tried for end in ends]),
+        solver_steps=tried[0] + tried[1] + tried[2],
+        engine=engine,
     )
 
 
-def section_state_of(told: Told) -> SectionState:
-    """The state at the next touchdown; zeros where there is none."""
-    theta, _, dtheta, dL1 = told.states[2]
-    state = jnp.stack([theta, dtheta, dL1])
-    return jnp.where(told.outcome == Outcome.STEPPED, state, jnp.zeros_like(state))
-
-
-def result_of(
-    s: Symbols, landing: Landing, told: Told, friction: Elementwise | float
-) -> StepResult:
-    """All that a step tells, of one wheel or of lanes."""
-    began = told.outcome != Outcome.BAD_INPUT
-    hits, stepped = told.happened[2], told.outcome == Outcome.STEPPED
+def result_of(walked: Walked, friction: Elementwise | float, engine: str) -> StepResult:
+    """All that a step tells, of one wheel or of lanes; its premises were watched."""
+    s, landing, ends = walked.s, walked.landing, walked.ends
+    began = walked.outcome != Outcome.BAD_INPUT
+    hits, stepped = walked.happened[2], walked.outcome == Outcome.STEPPED
     dls, sls1, sls2 = phases_of(s, landing.distance, stop_at_lift_off=True)
-    lets_go = dls.at((told.states[0][0],), (told.states[0][1],))
-    safe = jnp.asarray(SAFE_SINGLE_SUPPORT, s.L0.dtype)
-    at_stopper = tuple(jnp.where(hits, told.states[1][i], value) for i, value in enumerate(safe))
-    hit = transitions.hit_stopper(s, sls1.at(at_stopper[:3], at_stopper[3:]))
-    last = sls2.at(tuple(told.states[2][:2]), tuple(told.states[2][2:]))
+    lets_go = dls.at(ends[0].q, ends[0].v)
+    at_stopper = [
+        jnp.where(hits, x, jnp.asarray(safe, x.dtype))
+        for x, safe in zip((*ends[1].q, *ends[1].v), SAFE_SINGLE_SUPPORT, strict=True)
+    ]
+    hit = transitions.hit_stopper(s, sls1.at(tuple(at_stopper[:3]), tuple(at_stopper[3:])))
+    last = sls2.at(ends[2].q, ends[2].v)
     begins, finishes = (dynamics.energy(s, m).total for m in (landing.motion, last))
     fore_after, rear_after = transitions.landing_forces(s, landing)
+    lean = advance_of(walked, engine)
     return StepResult(
-        section_state=section_state_of(told),
-        post_impact=jnp.where(began, jnp.stack([landing.theta, landing.motion.dtheta]), 0.0),
-        durations=told.durations,
+        section_state=lean.section_state,
+        post_impact=jnp.stack(
+            [jnp.where(began, x, 0.0) for x in (landing.theta, landing.motion.dtheta)]
+        ),
+        durations=lean.durations,
         step_length=jnp.where(began, landing.distance, 0.0),
         indicators=Indicators(
             lambda_I4=jnp.where(began, landing.rear.normal, 0.0),
             lambda_2=jnp.where(began, fore_after.normal, 0.0),
             lambda_4=jnp.where(began, rear_after.normal, 0.0),
         ),
-        monitors=_margins(s, landing, rear_after, lets_go, hit, told, friction),
+        monitors=_margins(walked, rear_after, lets_go, hit, friction),
         energy=EnergyLoss(
             landing=jnp.where(began, landing.energy_lost, 0.0),
             stopper=jnp.where(hits, hit.energy_lost, 0.0),
             damping=jnp.where(stepped, begins - finishes - hit.energy_lost, 0.0),
         ),
-        outcome=told.outcome,
-        solver_steps=jnp.sum(told.tried, axis=0),
+        outcome=lean.outcome,
+        solver_steps=lean.solver_steps,
+        engine=engine,
+    )
+
+
+def trajectory_of(walked: Walked, samples: Sequence[Array]) -> Trajectory:
+    """The step with states at equal times of each phase: (samples, coordinates and rates, ...)."""
+    lean = advance_of(walked, "")
+    durations, n = lean.durations, len(samples[0])
+    begins = jnp.stack([0.0 * durations[0], durations[0], durations[0] + durations[1]])
+    shares = jnp.linspace(0.0, 1.0, n).reshape(-1, *(1 for _ in durations.shape[1:]))
+    parts = [
+        described(phase, jnp.moveaxis(states, 1, 0))
+        for phase, states in zip(walked.phases, samples, strict=True)
+    ]
+    states, forces, energies = (
+        jnp.stack([jnp.moveaxis(rows, 0, 1) for rows in part]) for part in zip(*parts, strict=True)
+    )
+    times = begins[:, None] + shares * durations[:, None]
+    ends = lean.section_state, durations, lean.outcome
+    return Trajectory(times, states, forces, energies, *ends)
+
+
+def described(phase: AbstractPhase, y: Array) -> tuple[Array, Array, Array]:
+    """Coordinates and rates, forces of the ground and energies at states of the phase.
+
+    `y`: the phase's own coordinates, then their rates, on the first axis; its other axes stay.
+    """
+    numbers = tuple(y)
+    m = phase.at(numbers[: phase.n], numbers[phase.n :])
+    at = Instant(phase, m, None)
+    zero = 0.0 * m.L1
+    rear = at.rear or dynamics.FootForce(zero, zero)
+    return (
+        jnp.stack([y[0], m.L1, m.L2, m.dtheta, m.dL1, m.dL2]),
+        jnp.stack([*at.fore, *rear]),
+        jnp.stack(dynamics.energy(phase.s, m)),
     )
 
 
 def _margins(
-    s: Symbols,
-    landing: Landing,
+    walked: Walked,
     rear_after: dynamics.FootForce,
     lets_go: Motion,
     hit: transitions.StopperHit,
-    told: Told,
     friction: Elementwise | float,
 ) -> Margins:
     """`rear_after`: force on the rear foot just after the landing; `lets_go`: motion at the end of
     double support."""
-    began = told.outcome != Outcome.BAD_INPUT
-    hits = told.happened[2]
-    minima = [Premises.named(tuple(row), s.n) for row in told.minima]
+    s, landing, happened = walked.s, walked.landing, walked.happened
+    began, hits = walked.outcome != Outcome.BAD_INPUT, happened[2]
+    watched = [end.minima for end in walked.ends if end.minima is not None]
+    minima = [Premises.named(tuple(rows), s.n) for rows in watched]
 
     def lowest(name: str, *indices: int) -> Array:
         """Over those phases that happened; 0 if none did."""
         value: Any = jnp.inf
         for index in indices:
             least = jnp.asarray(getattr(minima[index], name))
-            value = jnp.minimum(value, jnp.where(told.happened[index], least, jnp.inf))
+            value = jnp.minimum(value, jnp.where(happened[index], least, jnp.inf))
         return jnp.where(jnp.isfinite(value), value, 0.0)
 
     def friction_left(force: dynamics.FootForce, loaded: Array) -> Array:
@@ -209,7 +233,7 @@ def _margins(
     return Margins(
         fore_foot_force=lowest("fore_foot_force", 0, 1, 2),
         takeoff_acceleration=jnp.where(
-            told.happened[1] & landing.stays, dynamics.takeoff_acceleration(s, lets_go), 0.0
+            happened[1] & landing.stays, dynamics.takeoff_acceleration(s, lets_go), 0.0
         ),
         clearance_sls1=lowest("rear_clearance", 1),
         clearance_sls2=lowest("rear_clearance", 2),
@@ -217,7 +241,7 @@ def _margins(
         rear_stopper_force=lowest("rear_stopper_force", 2),
         contraction=lowest("contraction", 0, 1, 2),
         friction_fore=jnp.where(began, friction + lowest("friction", 0, 1, 2), 0.0),
-        friction_rear=friction_left(rear_after, told.happened[0]),
+        friction_rear=friction_left(rear_after, happened[0]),
         landing_stopper_impulse=impulses(landing.motion, landing.hub_jump, began),
         hit_stopper_impulse=impulses(hit.motion, hit.hub_jump, hits),
         hit_planted_impulse=jnp.where(hits, hit.planted.normal, 0.0),

@@ -1,6 +1,5 @@
 """The paper's wheel: landing, double support, single support I, stopper, single support II."""
 
-import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
@@ -16,19 +15,16 @@ from vrw_jax.models.base import (
     SectionState,
     StepResult,
     Trajectory,
-    replaced_where_bad,
-    usable,
 )
 from vrw_jax.models.lane_step import lanes_can, moved_by_lanes, sampled_by_lanes, told_by_lanes
 from vrw_jax.models.paper_step import (
     PAPER_START,
     End,
-    Told,
     Walked,
+    advance_of,
     result_of,
-    section_state_of,
     through_phases,
-    told_of,
+    trajectory_of,
 )
 from vrw_jax.numerics import (
     Field,
@@ -38,7 +34,6 @@ from vrw_jax.numerics import (
     Vector,
     Watched,
     any_mode,
-    compiled_by_caller,
     integrate_phase,
     sample_phase,
 )
@@ -46,14 +41,9 @@ from vrw_jax.wheel import (
     PARAMETER_NAMES,
     AbstractPhase,
     Instant,
-    Landing,
     Motion,
-    Symbols,
     WheelParams,
-    dynamics,
     known_friction,
-    phases_of,
-    transitions,
 )
 from vrw_jax.wording import flag
 
@@ -132,22 +122,14 @@ class ViscoelasticWheel(AbstractWheel):
         return jnp.asarray(PAPER_START, params.damping.dtype)
 
     def advance(self, params: WheelParams, x: SectionState, options: Options) -> Advance:
-        told = self._told(params, x, options, monitored=False)
-        tried = jnp.sum(told.tried, axis=0)
-        return Advance(
-            _section_state_of(told), told.durations, told.outcome, tried, engine=_engine(options)
-        )
+        return self._told(params, x, options, detailed=False)
 
     def step(self, params: WheelParams, x: SectionState, options: Options) -> StepResult:
-        # Under a caller's derivative a jit of its own would have the values' machine code too.
-        full_step = _full_step if compiled_by_caller() else _compiled_full_step
-        return full_step(self, params, x, options)
+        return self._told(params, x, options, detailed=True)
 
-    def _told(
-        self, params: WheelParams, x: SectionState, options: Options, monitored: bool
-    ) -> Told:
+    def _told(self, params: WheelParams, x: SectionState, options: Options, detailed: bool) -> Any:
         leaves, structure = jax.tree.flatten((params, x, options))
-        return eqx.combine(*_compiled(self, structure, monitored)(*leaves))
+        return eqx.combine(*_compiled(self, structure, detailed)(*leaves))
 
     def trace(
         self, params: WheelParams, x: SectionState, options: Options, n_samples: int
@@ -157,30 +139,15 @@ class ViscoelasticWheel(AbstractWheel):
             sampled = sampled_by_lanes(structure, self.stop_at_lift_off, n_samples)
         else:
             sampled = functools.partial(self._sampled_by_diffrax, structure, n_samples)
-        told, samples = sampled(*leaves)
-        s, landing = _landed(params, x)
-        durations = told.durations
-        times = jnp.linspace(0.0, 1.0, n_samples) * durations[:, None]
-        begins = jnp.concatenate([jnp.zeros_like(durations[:1]), jnp.cumsum(durations)[:-1]])
-        parts = [
-            jax.vmap(functools.partial(described, phase))(states)
-            for phase, states in zip(
-                phases_of(s, landing.distance, self.stop_at_lift_off), samples, strict=True
-            )
-        ]
-        states, forces, energies = (jnp.stack(part) for part in zip(*parts, strict=True))
-        ends = section_state_of(told), durations, told.outcome
-        return Trajectory(begins[:, None] + times, states, forces, energies, *ends)
+        return sampled(*leaves)
 
-    def _sampled_by_diffrax(
-        self, structure: Any, n_samples: int, *leaves: Array
-    ) -> tuple[Told, tuple[Array, ...]]:
+    def _sampled_by_diffrax(self, structure: Any, n_samples: int, *leaves: Array) -> Trajectory:
         params, x, options = jax.tree.unflatten(structure, leaves)
         walked, samples = self._walk(params, x, options, monitored=False), []
         for phase, start, end in zip(walked.phases, walked.starts, walked.ends, strict=True):
             field, y = flow_of(phase, monitored=False).field, jnp.stack([*start[0], *start[1]])
             samples.append(sample_phase(field, y, end.duration, n_samples, options))
-        return told_of(walked), tuple(samples)
+        return trajectory_of(walked, samples)
 
     def _walk(
         self, params: WheelParams, x: SectionState, options: Options, monitored: bool
@@ -189,58 +156,21 @@ class ViscoelasticWheel(AbstractWheel):
         return through_phases(run, params, tuple(x), self.stop_at_lift_off)
 
 
-def described(phase: AbstractPhase, y: State) -> tuple[Array, Array, Array]:
-    """Coordinates and rates, forces of the ground and energies at a state of the phase.
-
-    Axes of `y` beyond its first stay last.
-    """
-    m = flow_of(phase, monitored=False).motion(y)
-    at = Instant(phase, m, None)
-    zero = 0.0 * m.L1
-    rear = at.rear or dynamics.FootForce(zero, zero)
-    return (
-        jnp.stack([y[0], m.L1, m.L2, m.dtheta, m.dL1, m.dL2]),
-        jnp.stack([*at.fore, *rear]),
-        jnp.stack(dynamics.energy(phase.s, m)),
-    )
-
-
-def _full_step(
-    model: ViscoelasticWheel, params: WheelParams, x: SectionState, options: Options
-) -> StepResult:
-    told = model._told(params, x, options, monitored=True)
-    result = result_of(*_landed(params, x), told, model.friction)
-    return dataclasses.replace(result, engine=_engine(options))
-
-
-_compiled_full_step, _section_state_of = eqx.filter_jit(_full_step), jax.jit(section_state_of)
-
-
-def _landed(params: WheelParams, x: SectionState) -> tuple[Symbols, Landing]:
-    """The landing that a step begins with; Table 1's where its input is unusable."""
-    safe = jnp.asarray(PAPER_START)
-    params, x = replaced_where_bad(usable(params, x), params, x, safe)
-    s = params.symbols()
-    return s, transitions.land(s, *x)
-
-
-def _engine(options: Options) -> str:
-    return "lanes" if lanes_can(options) else "diffrax"
-
-
 @functools.cache
-def _compiled(model: ViscoelasticWheel, structure: Any, monitored: bool) -> Forward:
+def _compiled(model: ViscoelasticWheel, structure: Any, detailed: bool) -> Forward:
     """What a step tells, over the leaves of (params, x, options), differentiable in any mode."""
 
     def by_diffrax(tighten: bool, *leaves: Array) -> tuple:
         params, x, options = jax.tree.unflatten(structure, leaves)
         options = options.for_derivatives() if tighten else options
-        walked = model._walk(params, x, options, monitored=monitored)
-        return eqx.partition(told_of(walked), eqx.is_inexact_array)
+        walked = model._walk(params, x, options, monitored=detailed)
+        if detailed:
+            return eqx.partition(result_of(walked, model.friction, "diffrax"), eqx.is_inexact_array)
+        return eqx.partition(advance_of(walked, "diffrax"), eqx.is_inexact_array)
 
     values, tighter = (functools.partial(by_diffrax, tighten) for tighten in (False, True))
     static = jax.tree.unflatten(structure, [0.0] * structure.num_leaves)[2]
     if not lanes_can(static):
         return any_mode(values, tighter)
-    given = structure, model.stop_at_lift_off, monitored
+    given = structure, model.stop_at_lift_off, model.friction if detailed else None
     return any_mode(told_by_lanes(*given), tighter, functools.partial(moved_by_lanes, *given))

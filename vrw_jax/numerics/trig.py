@@ -18,9 +18,10 @@ def sine_cosine(angle: Elementwise) -> tuple[Elementwise, Elementwise]:
     """Sine and cosine by their Taylor series, right to rounding for |angle| < 1.8 rad.
 
     The standard functions are scalar calls in float64 on CPU; these are fused and vectorised.
-    Of a plain number they are plain numbers, a tenth of the time of JAX one by one.
+    Of numpy's and plain numbers they are such, a tenth of the time of JAX one by one.
     """
-    return _by_series(np, angle) if isinstance(angle, float) else _moving(angle)
+    known = isinstance(angle, (float, np.ndarray))
+    return _by_series(np, angle) if known else _moving(angle)
 
 
 def _by_series(numbers: ModuleType, angle: Any) -> tuple[Any, Any]:

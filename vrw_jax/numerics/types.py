@@ -9,7 +9,7 @@ Scalar = Float[Array, ""]
 if TYPE_CHECKING:
     Elementwise = Array
 else:
-    Elementwise = Inexact[Array, "..."] | float
+    Elementwise = Inexact[Array, "..."] | Inexact[np.ndarray, "..."] | float
 """A quantity that may carry any leading axes: formulas below `scans` act element by element.
 
 Complex numbers go through too, as for a complex step."""

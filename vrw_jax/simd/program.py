@@ -97,7 +97,8 @@ def lane_function(
                     f"An argument has the shape {shape}, but the first one {n_lanes} lanes: they "
                     "are the last axis of every array; what has no axis is the same for all."
                 )
-        width = VECTOR[np.dtype(leaves[0].dtype)] * (2 if wide() else 1)
+        several = VECTOR[np.dtype(leaves[0].dtype)] * (2 if wide() else 1)
+        width = 1 if n_lanes == 1 else several  # a lone lane would wait for all that is computed
         missing = -n_lanes % width
         shapes = [
             jax.ShapeDtypeStruct((*x.shape[:-1], LANES) if jnp.ndim(x) else (), jnp.result_type(x))

@@ -19,7 +19,6 @@ from jaxtyping import Array
 from vrw_jax.models import (
     SERVED,
     AbstractWheel,
-    SectionState,
     State,
     Trajectory,
     UnilateralTrajectory,
@@ -37,6 +36,7 @@ from vrw_jax.walks.stepping import ModelLike, SectionLike, checked, one_wheel, r
 from vrw_jax.wheel import (
     Motion,
     Outcome,
+    Symbols,
     WheelParams,
     damping_power,
     landing_direction,
@@ -91,8 +91,8 @@ def simulate(
     start = rung_of(model).start(params) if x is None else x
     params, x, model, options = checked(params, start, model, options, engine)
     sampled = over_contacts if model.tells_contacts else over_phases
-    telling = sampled(params, model, options, n_samples)
     s = jax.tree.map(float, params).symbols()
+    telling = sampled(params, s, model, options, n_samples)
     told = joined(telling, x, n_steps, float(s.Mt * s.g * s.sin_phi))
     columns = told.columns
     data = variables({name: columns[name] for name in telling.names}, "time")
@@ -169,39 +169,30 @@ def joined(telling: Telling, x: Array, n_steps: int, weight_along: float) -> Joi
     return Joined(columns, stepped, outcome)
 
 
-SAMPLED = (*(name for name in TRAJECTORY if name not in ("step", "phase")), "ahead")
-"""What `_columns` tells."""
-
-
 @functools.cache
-def _stepped(model: AbstractWheel, structure: Any, n_samples: int) -> Callable[..., Any]:
-    """One step over x and the leaves of (params, options): durations, outcome, what follows it, and
-    `SAMPLED` as one array, which is handed over faster than many."""
+def _traced(model: AbstractWheel, structure: Any, n_samples: int) -> Callable[..., Trajectory]:
+    """A step's trace over x and the leaves of (params, options)."""
 
-    def told(x: Array, *leaves: Array) -> tuple[Array, ...]:
+    def trace(x: Array, *leaves: Array) -> Trajectory:
         params, options = jax.tree.unflatten(structure, leaves)
-        moved, columns = _columns(model, params, x, options, n_samples)
-        rows = jnp.stack([columns[name] for name in SAMPLED])
-        return moved.durations, moved.outcome, moved.section_state, rows
+        return model.trace(params, x, options, n_samples)
 
-    return jax.jit(told)
+    return jax.jit(trace)
 
 
-def _columns(
-    model: AbstractWheel, params: WheelParams, x: SectionState, options: Options, n_samples: int
-) -> tuple[Trajectory, dict[str, Array]]:
-    """One step, also by the names of `TRAJECTORY`, (phase, sample), Leg 1's foot at the origin.
+def _columns(s: Symbols, moved: Trajectory) -> dict[str, np.ndarray]:
+    """A step by the names of `TRAJECTORY`, (phase, sample), Leg 1's foot at the origin.
 
     `ahead` is added: where the landing leg stands or will stand, m.
     """
-    s, moved = params.symbols(), model.trace(params, x, options, n_samples)
-    theta, L1, L2, dtheta, dL1, dL2 = jnp.moveaxis(moved.state, -1, 0)
-    kinetic, gravitational, elastic = jnp.moveaxis(moved.energy, -1, 0)
+    theta, L1, L2, dtheta, dL1, dL2 = np.moveaxis(np.asarray(moved.state), -1, 0)
+    kinetic, gravitational, elastic = np.moveaxis(np.asarray(moved.energy), -1, 0)
+    forces = np.moveaxis(np.asarray(moved.forces), -1, 0)
     motion = Motion.of(theta, L1, L2, dtheta, dL1, dL2)
     rear = rear_direction(s, motion.sin, motion.cos)
-    hub_x, hub_z, zero = L1 * motion.sin, L1 * motion.cos, jnp.zeros_like(L1)
-    return moved, {
-        "time": moved.time,
+    hub_x, hub_z, zero = L1 * motion.sin, L1 * motion.cos, np.zeros_like(L1)
+    return {
+        "time": np.array(moved.time),
         "x": zero,
         "z": zero,
         "theta": theta,
@@ -212,7 +203,7 @@ def _columns(
         "dtheta": dtheta,
         "dL1": dL1,
         "dL2": dL2,
-        **{f"lambda_{i + 1}": moved.forces[..., i] for i in range(4)},
+        **{f"lambda_{i + 1}": force for i, force in enumerate(forces)},
         "kinetic_energy": kinetic,
         "gravitational_energy": gravitational,
         "elastic_energy": elastic,
@@ -229,25 +220,21 @@ def _columns(
 
 
 def over_phases(
-    params: WheelParams, model: AbstractWheel, options: Options, n_samples: int
+    params: WheelParams, s: Symbols, model: AbstractWheel, options: Options, n_samples: int
 ) -> Telling:
     """Of rungs that step through the paper's phases."""
-
     leaves, structure = jax.tree.flatten((params, options))
-    step = _stepped(model, structure, n_samples)
+    trace = _traced(model, structure, n_samples)
 
     def stretches(x: Array) -> Stretches:
-        durations, outcome, following, rows = step(x, *leaves)
-        columns, durations = (
-            dict(zip(SAMPLED, np.asarray(rows), strict=True)),
-            np.asarray(durations),
-        )
+        moved = trace(x, *leaves)
+        columns, durations = _columns(s, moved), np.asarray(moved.durations)
         ahead = columns.pop("ahead")
         columns["phase"] = np.tile(np.arange(len(durations))[:, None], (1, n_samples))
         happened = np.flatnonzero(durations > 0.0)
         length = float(ahead[happened[-1], -1]) if happened.size else 0.0
-        outcome = Outcome(int(outcome))
-        return Stretches(columns, durations, outcome, following, float(durations.sum()), length)
+        outcome, period = Outcome(int(moved.outcome)), float(durations.sum())
+        return Stretches(columns, durations, outcome, moved.section_state, period, length)
 
     attrs: dict[str, object] = {
         "frame": "x downhill along the slope, z normal to it, first foot at the origin",
@@ -293,7 +280,9 @@ def _contact_columns(
     return trace, told | {"tangential": trace.tangential, "normal": trace.normal}
 
 
-def over_contacts(params: WheelParams, model: Any, options: Options, n_samples: int) -> Telling:
+def over_contacts(
+    params: WheelParams, s: Symbols, model: Any, options: Options, n_samples: int
+) -> Telling:
     """Of rungs that walk on contacts, over time and leg; legs bear the labels of their step.
 
     Each stretch between two events has `n_samples` times, both ends included. Of the ladder,
