@@ -101,9 +101,11 @@ def test_another_batch_is_neither_traced_nor_compiled_again_without_a_store():
         return 2.0 * x
 
     call = simd.lane_function(double, lambda x: x, "batches", None)
-    for n in (1, 5, 8):
+    for n in (5, 8, 11):
         np.testing.assert_array_equal(jax.jit(call)(jnp.arange(n) + 1.0), 2.0 * (np.arange(n) + 1))
     assert len(traced) == 1
+    jax.jit(call)(jnp.ones(1))
+    assert len(traced) == 2  # a lone lane has code of its own
 
 
 def test_code_is_at_hand_by_its_name_alone(process):

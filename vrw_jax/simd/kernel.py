@@ -19,7 +19,8 @@ NAME = "lanes"
 def module_text(closed: ClosedJaxpr, width: int, small: int = SMALL) -> str:
     """`void lanes(const void **given, void **told, int64 lanes, int64 begin, int64 end)`.
 
-    Over groups of lanes.
+    Over groups of `width` lanes. A lone lane is computed twice, as a vector: what LLVM makes of
+    plain numbers differs in the last digits.
     """
     _check(closed)
     module = ir.Module(NAME)
@@ -29,7 +30,7 @@ def module_text(closed: ClosedJaxpr, width: int, small: int = SMALL) -> str:
     )
     kernel.attributes.add("nounwind")
     build = ir.IRBuilder(kernel.append_basic_block("entry"))
-    arrays = Arrays(Numbers(build, width), small=small)
+    arrays = Arrays(Numbers(build, max(width, 2)), small=small)
     given, told, n_lanes, begin, end = kernel.args
     inputs, outputs = closed.in_avals, closed.out_avals
 
@@ -41,7 +42,7 @@ def module_text(closed: ClosedJaxpr, width: int, small: int = SMALL) -> str:
     targets = [entry(told, i) for i in range(len(outputs))]
 
     def group(first: Value, _: Any) -> list[Value]:
-        rows = _Rows(arrays, n_lanes, build.mul(first, ir.Constant(LONG, width)))
+        rows = _Rows(arrays, width == 1, n_lanes, build.mul(first, ir.Constant(LONG, width)))
         values = [rows.read(*pair) for pair in zip(sources, inputs, strict=True)]
         results = Traces(arrays, RULES).closed(closed, values)
         for target, aval, value in zip(targets, outputs, results, strict=True):
@@ -71,8 +72,8 @@ def _check(closed: ClosedJaxpr) -> None:
 class _Rows:
     """Arrays outside, for a group of lanes: they lie there row after row, lanes last."""
 
-    def __init__(self, arrays: Arrays, n_lanes: Value, lane: Value) -> None:
-        self.arrays, self.n_lanes, self.lane = arrays, n_lanes, lane
+    def __init__(self, arrays: Arrays, alone: bool, n_lanes: Value, lane: Value) -> None:
+        self.arrays, self.alone, self.n_lanes, self.lane = arrays, alone, n_lanes, lane
 
     def read(self, base: Value, aval: Any) -> Entries:
         """An argument; a number without axes is the same for all lanes."""
@@ -81,9 +82,9 @@ class _Rows:
         def at(index: Index) -> Value:
             where, kind = self._place(base, aval, index)
             value = build.load(where, typ=kind, align=aval.dtype.itemsize)
-            if aval.dtype.kind != "b":
-                return value
-            return build.icmp_signed("!=", value, self.arrays.numbers.constant(kind, 0))
+            if aval.dtype.kind == "b":
+                value = build.icmp_signed("!=", value, self.arrays.numbers.constant(kind, 0))
+            return self.arrays.numbers.spread(value) if self.alone and aval.shape else value
 
         field = Field(aval.shape[:-1], self.arrays.kind_of(aval), at)
         return self.arrays.entries(field) if math.prod(field.shape) <= HELD else field
@@ -95,7 +96,8 @@ class _Rows:
         def store(index: Index, _: Any) -> list[Value]:
             where, kind = self._place(base, aval, index)
             whole = self.arrays.numbers.spread(self.arrays.entry(value, index))
-            whole = build.zext(whole, kind) if kind.element == BYTE else whole
+            whole = build.extract_element(whole, ir.Constant(LONG, 0)) if self.alone else whole
+            whole = build.zext(whole, kind) if aval.dtype.kind == "b" else whole
             build.store(whole, where, align=aval.dtype.itemsize)
             return []
 
@@ -109,4 +111,5 @@ class _Rows:
             return base, number
         row = self.arrays.linear(index, aval.shape[:-1])
         where = build.add(build.mul(row, self.n_lanes), self.lane)
-        return build.gep(base, [where], source_etype=number), self.arrays.numbers.vector(number)
+        kind = number if self.alone else self.arrays.numbers.vector(number)
+        return build.gep(base, [where], source_etype=number), kind

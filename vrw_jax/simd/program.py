@@ -84,7 +84,8 @@ def lane_function(
     """`function` of trees of arrays, lanes on their last axis, as one call within JAX's programs.
 
     The first array has lanes; numbers without an axis are the same for all.
-    As with `lane_program`; but results form a tree, that of `like`, which is quick to trace.
+    As with `lane_program`; but results form a tree, that of `like`, which is quick to trace, and a
+    lone lane has code of its own, which waits for no others and gives the same bits.
     Without derivatives, on CPUs only, and on the one core that runs the program.
     """
 
@@ -98,7 +99,7 @@ def lane_function(
                     "are the last axis of every array; what has no axis is the same for all."
                 )
         several = VECTOR[np.dtype(leaves[0].dtype)] * (2 if wide() else 1)
-        width = 1 if n_lanes == 1 else several  # a lone lane would wait for all that is computed
+        width = 1 if n_lanes == 1 else several  # alone it would wait for the others
         missing = -n_lanes % width
         shapes = [
             jax.ShapeDtypeStruct((*x.shape[:-1], LANES) if jnp.ndim(x) else (), jnp.result_type(x))
