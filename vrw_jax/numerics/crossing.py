@@ -1,8 +1,10 @@
 """Where in a step of many wheels the earliest of their guards vanishes."""
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
@@ -73,11 +75,8 @@ def locate(
         change, guard = _newton(values, rates, step.guards)
         before, straight = jnp.ones(h.shape, bool), jnp.ones(h.shape, bool)
         for g0, g, rate, crosses in zip(step.values, values, rates, bits, strict=True):
-            past = (g < 0.0) | ((g == 0.0) & (rate <= 0.0))  # one that rises has yet to come back
-            before = before & ~(crosses & past)
-            fall = rate * search.length
-            bent = jnp.abs(2.0 * (g0 - g + fall) * g) > 0.25 * fall * fall
-            straight = straight & ~(crosses & bent)
+            past, bent = _passed_or_bent(g0, g, rate, search.length)
+            before, straight = before & ~(crosses & past), straight & ~(crosses & bent)
         low = jnp.where(before, search.length, search.low)
         high = jnp.where(before, search.high, search.length)
         proposal = search.length + change
@@ -151,6 +150,14 @@ def _along(place: Place, shift: Array) -> Place:
     return place._replace(q=q, v=v)
 
 
+@jax.jit  # traced once, for whichever guard
+def _passed_or_bent(start: Array, g: Array, rate: Array, length: Array) -> tuple[Array, Array]:
+    """Whether a guard has crossed so far, and whether it is too bent for Newton's method alone."""
+    past = (g < 0.0) | ((g == 0.0) & (rate <= 0.0))  # one that rises has yet to come back
+    fall = rate * length
+    return past, jnp.abs(2.0 * (start - g + fall) * g) > 0.25 * fall * fall
+
+
 def _newton(values: Vector, rates: Vector, crossing: Array) -> tuple[Array, Array]:
     """Time to the earliest event by each crossing guard's own proposal, and which guard it is.
 
@@ -159,13 +166,18 @@ def _newton(values: Vector, rates: Vector, crossing: Array) -> tuple[Array, Arra
     change = jnp.full_like(values[0], jnp.inf)
     guard = jnp.zeros_like(crossing)
     for index, (g, rate) in enumerate(zip(values, rates, strict=True)):
-        crosses = (crossing >> index) & 1 == 1
-        falling = crosses & (rate < 0.0)
-        unknown = jnp.where(crosses & (g < 0.0), -jnp.inf, jnp.inf)
-        own = jnp.where(falling, -g / jnp.where(falling, rate, -1.0), unknown)
+        own = _to_zero((crossing >> index) & 1 == 1, g, rate)
         guard = jnp.where(own < change, index, guard)
         change = jnp.minimum(own, change)
     return change, guard
+
+
+@jax.jit  # traced once, for whichever guard
+def _to_zero(crosses: Array, g: Array, rate: Array) -> Array:
+    """Time to a guard's zero along its tangent; infinite for one that does not cross."""
+    falling = crosses & (rate < 0.0)
+    unknown = jnp.where(crosses & (g < 0.0), -jnp.inf, jnp.inf)
+    return jnp.where(falling, -g / jnp.where(falling, rate, -1.0), unknown)
 
 
 def _first_guess(
@@ -173,18 +185,25 @@ def _first_guess(
 ) -> Array:
     """Share of the step to the earliest zero of the guards' parabolas: secant, then Newton."""
     earliest = jnp.ones_like(start[0])
-    for index, (g0, gm, g1) in enumerate(zip(start, inside, end, strict=True)):
+    for index, values in enumerate(zip(start, inside, end, strict=True)):
         crosses = (crossing >> index) & 1 == 1
-        bend, slope = parabola(tableau, g0, gm, g1)
-        fall = jnp.where(crosses & (g0 > g1), g0 - g1, 1.0)
-        at = jnp.clip(g0 / fall, 0.0, 1.0)
-        # One that rises from zero is at zero where the step begins: the other root counts.
-        rises = crosses & (g0 == 0.0) & (slope > 0.0)
-        at = jnp.where(rises, jnp.clip(-slope / jnp.where(rises, bend, -1.0), 0.0, 1.0), at)
-        for _ in range(3):
-            rate = slope + 2.0 * bend * at
-            falls = rate < 0.0
-            step = (g0 + at * (slope + bend * at)) / jnp.where(falls, rate, 1.0)
-            at = jnp.where(falls, jnp.clip(at - step, 0.0, 1.0), at)
+        at = _first_zero(tableau, crosses, *values)
         earliest = jnp.where(crosses, jnp.minimum(earliest, at), earliest)
     return earliest
+
+
+@functools.partial(jax.jit, static_argnums=0)  # traced once, for whichever guard
+def _first_zero(tableau: Tableau, crosses: Array, g0: Array, gm: Array, g1: Array) -> Array:
+    """Share of the step to the zero of a guard's parabola."""
+    bend, slope = parabola(tableau, g0, gm, g1)
+    fall = jnp.where(crosses & (g0 > g1), g0 - g1, 1.0)
+    at = jnp.clip(g0 / fall, 0.0, 1.0)
+    # One that rises from zero is at zero where the step begins: the other root counts.
+    rises = crosses & (g0 == 0.0) & (slope > 0.0)
+    at = jnp.where(rises, jnp.clip(-slope / jnp.where(rises, bend, -1.0), 0.0, 1.0), at)
+    for _ in range(3):
+        rate = slope + 2.0 * bend * at
+        falls = rate < 0.0
+        step = (g0 + at * (slope + bend * at)) / jnp.where(falls, rate, 1.0)
+        at = jnp.where(falls, jnp.clip(at - step, 0.0, 1.0), at)
+    return at

@@ -7,6 +7,7 @@ ended, secant steps on the monitor's rate find it, one monitor after the other.
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
@@ -93,6 +94,7 @@ def cubic(x: Array, v0: Array, r0: Array, v1: Array, r1: Array) -> Array:
     )
 
 
+@jax.jit  # traced once, for whichever monitor
 def cubic_minimum(v0: Array, r0: Array, v1: Array, r1: Array) -> tuple[Array, Array]:
     """Place in (0, 1) and value of the cubic's interior minimum; value inf where there is none."""
     a = 3.0 * (2.0 * v0 + r0 - 2.0 * v1 + r1)

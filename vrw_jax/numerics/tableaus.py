@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -105,6 +106,7 @@ def parabola(tableau: Tableau, start: Array, inside: Array, end: Array) -> tuple
     return bend, end - start - bend
 
 
+@functools.partial(jax.jit, static_argnums=0)  # traced once, for whichever guard
 def below(tableau: Tableau, values: list[Array]) -> tuple[Array, Array]:
     """Whether a guard may fall below zero inside a step and be positive again at its end, and how
     far to go first, in step lengths: where the lowest of its Bernstein coefficients belongs.
@@ -195,6 +197,7 @@ def take_step(
     return Taken(places[-1], error, places)
 
 
+@functools.partial(jax.jit, static_argnums=(0, 1))  # traced once, in however many steps
 def stage_at(
     tableau: Tableau, i: int, q0: Vector, v0: Vector, slopes: list[Vector], h: Array
 ) -> tuple[Vector, Vector]:

@@ -36,7 +36,7 @@ def _by_series(numbers: ModuleType, angle: Any) -> tuple[Any, Any]:
     return angle * series(_SINE), series(_COSINE)
 
 
-_moving = jax.custom_jvp(lambda angle: _by_series(jnp, angle))
+_moving = jax.custom_jvp(jax.jit(lambda angle: _by_series(jnp, angle)))  # traced once
 
 
 @_moving.defjvp
