@@ -75,7 +75,7 @@ class _Handed(NamedTuple):
     unfinished: Bool[Array, " lanes"]
 
 
-def lane_phase(phase: AbstractPhase, monitored: bool) -> LanePhase:
+def lane_phase(phase: AbstractPhase, monitored: bool, called: bool = False) -> LanePhase:
     """A phase as the march takes it. `monitored`: watch its premises as well as its guards."""
 
     def evaluate(q: Vector, v: Vector) -> Slope:
@@ -94,7 +94,8 @@ def lane_phase(phase: AbstractPhase, monitored: bool) -> LanePhase:
     )
     premises = lambda place: phase.premises(instant(place))
     watched = Monitors(premises, phase.counts_at_start) if monitored else None
-    return LanePhase(evaluate, lambda place: phase.guards(instant(place)), watched, balance)
+    guards = lambda place: phase.guards(instant(place))
+    return LanePhase(evaluate, guards, watched, balance, called)
 
 
 def gait_step(
@@ -126,7 +127,10 @@ def walk(
     stop_at_lift_off: bool,
     monitored: bool,
     few: Array | None = None,
+    called: bool = False,
 ) -> Walked:
+    """The phases of every lane's step; `called`: see `LanePhase`."""
+
     def run(phase: AbstractPhase, q: Vector, v: Vector, active: Array, before: End | None) -> End:
         first = options.first_step + jnp.zeros_like(q[0])
         if before is not None:
@@ -138,7 +142,7 @@ def walk(
 
         def phase_of(floats: Any, held: Vector) -> LanePhase:
             s = eqx.combine(floats, fixed)
-            return lane_phase(dataclasses.replace(phase, s=s, held=held), monitored)
+            return lane_phase(dataclasses.replace(phase, s=s, held=held), monitored, called)
 
         end = integrate_lanes(
             phase_of, floats, phase.held, tableau, q, v, active, first, options, few
@@ -187,7 +191,7 @@ class _Setting(NamedTuple):
         assert tableau is not None  # `lanes_can` looked
         monitored = self.friction is not None
         given = params, tuple(x), options, tableau, self.stop_at_lift_off, monitored
-        return walk(*given), tableau, options
+        return walk(*given, called=True), tableau, options
 
     def told(self, *leaves: Array) -> tuple:
         """What the step tells, its floats first."""

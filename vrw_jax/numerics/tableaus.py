@@ -40,8 +40,11 @@ class Tableau(NamedTuple):
     """From a guard at the start, `inside` and at the end to the inner Bernstein coefficients of
     the polynomial through these: it does not fall below the least of its coefficients."""
 
+    def __eq__(self, other: object) -> bool:
+        return self is other  # `explicit_tableau` makes each once
+
     def __hash__(self) -> int:
-        return id(self)  # `explicit_tableau` makes each once
+        return id(self)
 
 
 @functools.cache
