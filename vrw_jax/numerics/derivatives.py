@@ -39,7 +39,8 @@ def any_mode(
     forward mode, reverse mode and single directions all call the same compiled Jacobian.
     """
     tighter = function if to_differentiate is None else to_differentiate
-    wrapped = jax.custom_jvp(jax.jit(function))
+    compiled = jax.jit(function)
+    wrapped = jax.custom_jvp(compiled)
 
     @functools.cache
     def differentiated(moved: tuple[int, ...]) -> Forward:
@@ -56,7 +57,12 @@ def any_mode(
         return (out, other), (tangent, without_derivative(other))
 
     wrapped.defjvp(rule, symbolic_zeros=True)
-    return wrapped
+
+    def call(*arrays: Any) -> tuple:
+        traced = any(isinstance(x, jax.core.Tracer) for x in arrays)
+        return wrapped(*arrays) if traced else compiled(*arrays)  # a rule costs as much as a step
+
+    return call
 
 
 def _jacobian(function: Forward, moved: tuple[int, ...]) -> Forward:

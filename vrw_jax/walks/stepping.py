@@ -81,7 +81,7 @@ _paper_wheel = functools.cache(ViscoelasticWheel)
 def one_wheel(params: Any, instead: str) -> None:
     """Refuse what is no wheel, or more than one."""
     instance("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
-    params.require_one(instead)
+    WheelParams.require_one(params, instead)  # a bound method takes equinox as long as a step
 
 
 def options_of(options: Options | None) -> Options:
@@ -116,7 +116,7 @@ def checked(
 ) -> tuple[WheelParams, Array, AbstractWheel, Options]:
     """Arguments with their defaults; one clear sentence for what can be seen to be wrong."""
     one_wheel(params, "map over batches of parameters with jax.vmap, or use vrw.scan")
-    model, options = rung_of(model), options_of(options).by(engine)
+    model, options = rung_of(model), Options.by(options_of(options), engine)
     state = state_of(x)
     size = model.section_size(params)
     if state.shape == (3,) and size != 3:
@@ -128,9 +128,9 @@ def checked(
             "for batches map over it with jax.vmap."
         )
     # Numbers made before 64 bits were asked for stay coarse, whatever they are mixed with.
-    options.require_reachable(jnp.result_type(*jax.tree.leaves(params)))
+    Options.require_reachable(options, jnp.result_type(*jax.tree.leaves(params)))
     dtype = jnp.result_type(state, params.damping)
-    options.require_reachable(dtype)
+    Options.require_reachable(options, dtype)
 
     def convert(tree: Any) -> Any:
         if all(leaf.dtype == dtype for leaf in jax.tree.leaves(tree)):
