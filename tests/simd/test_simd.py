@@ -166,6 +166,47 @@ def arrays_in_loops(x):
     }
 
 
+def overwritten(x):
+    """Large arrays that loops within loops go on with, while others read what was there."""
+    zero = jnp.zeros((), jnp.int32)
+
+    def each(rows, function):
+        """Rows one after the other, each by what it was."""
+
+        def turn(state):
+            k, rows = state
+            row = lax.dynamic_index_in_dim(rows, k, 0, False)
+            told = function(jnp.concatenate([row[6:], row[:6]]), k)
+            told = jnp.stack([told[i] for i in range(len(told))])
+            return k + 1, lax.dynamic_update_slice(rows, told[None], (k, zero, zero))
+
+        return lax.while_loop(lambda s: jnp.any(s[0] < len(rows)), turn, (zero, rows))[1]
+
+    def turn(state):
+        count, here, there, total = state
+        seen = here[1]  # read after `here` is overwritten
+        moved = each(each(here, lambda row, k: 0.5 * row + 0.1 * k), lambda row, _: row[:5] + 1.0)
+        fresh = each(still, lambda row, k: row - 0.2 * count)  # the same begin at each turn
+        part = lax.dynamic_update_index_in_dim(there, moved[0] + fresh[3], count & 1, 0)
+        late = part[1]  # likewise
+        gone = each(part, lambda row, k: 0.5 * row + count)
+        total = total + seen + moved[2] - fresh[1] + late
+        return count + 1, gone, moved, total
+
+    whole = each(jnp.concatenate([x, 2.0 * x, x * x]), lambda row, _: row + 1.0)
+    still = each(whole, lambda row, _: row + 2.0)
+    begin = zero, each(whole, lambda row, _: row + 1.0), whole, 0.0 * x[0]
+    _, here, there, total = lax.while_loop(lambda s: s[0] < 5, turn, begin)
+    return here + whole, there, total
+
+
+def test_what_loops_overwrite_where_it_lies_is_read_by_others_as_it_was():
+    x = DRAW.uniform(0.0, 6.0, (2, 12, 37))
+    call = simd.lane_function(overwritten, overwritten, ("simd", next(KEYS)), None)
+    for found, expected in zip(jax.jit(call)(x), overwritten(x), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+
+
 def exchanged(x):
     """Loops that read, axes exchanged, what another wrote and what an outer one carries."""
     write = lambda c, row: (c + row[0], jnp.stack([row * c, row + 1.0, row - c, row * row]))

@@ -239,7 +239,7 @@ class Arrays:
         if isinstance(array, np.ndarray):
             return array.reshape(shape)
         if isinstance(array, Memory):
-            return Memory(self, shape, array.kind, array.base)
+            return Memory(self, shape, array.kind, array.base, array.free)
         before = array.shape
 
         def at(index: Index) -> Value:

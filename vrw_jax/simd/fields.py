@@ -43,25 +43,36 @@ class Updated(Field):
 
     def ready(self) -> "Updated":
         """With the part computed: it may depend on what it takes the place of."""
+        if isinstance(self.part, np.ndarray):
+            return self
         return Updated(self.arrays, self.whole, self.arrays.in_memory(self.part), self.begin)
 
     def store_into(self, memory: "Memory") -> None:
         """Overwrites the part there, which is `ready`."""
         arrays = self.arrays
 
-        def store(index: Index, _: Any) -> list[Value]:
+        def store(index: Index, _: Any = None) -> list[Value]:
             memory.store(arrays.further(index, self.begin), arrays.entry(self.part, index))
             return []
 
-        arrays.each(self.part.shape, store)
+        if isinstance(self.part, np.ndarray) and any(self.part.strides):
+            for index in np.ndindex(self.part.shape):
+                store(index)
+        else:
+            arrays.each(self.part.shape, store)
 
 
 class Memory(Field):
-    """A large array that lies in memory, entry after entry."""
+    """A large array that lies in memory, entry after entry.
 
-    def __init__(self, arrays: Any, shape: Sequence[int], kind: ir.Type, base: Value) -> None:
+    It is `free` where nothing else lies there or reads what does: who takes it may overwrite it.
+    """
+
+    def __init__(
+        self, arrays: Any, shape: Sequence[int], kind: ir.Type, base: Value, free: bool = False
+    ) -> None:
         super().__init__(shape, kind, self.load)
-        self.arrays, self.base = arrays, base
+        self.arrays, self.base, self.free = arrays, base, free
 
     def place(self, index: Index) -> Value:
         """Where an entry is."""
@@ -93,3 +104,12 @@ class Turned(Field):
 
 Entries = np.ndarray | Field
 """LLVM values in an array, the axis of lanes left out."""
+
+
+def shared(array: Entries) -> Entries:
+    """The same, which others read too: not to be overwritten."""
+    if isinstance(array, Updated):
+        return Updated(array.arrays, shared(array.whole), array.part, array.begin)
+    if isinstance(array, Memory) and array.free:
+        return Memory(array.arrays, array.shape, array.kind, array.base)
+    return array

@@ -7,7 +7,7 @@ from typing import Any
 import llvmlite.ir as ir
 
 from vrw_jax.simd.arrays import HELD, HELD_INSIDE, LANES, Arrays, arrays_of, shape_of
-from vrw_jax.simd.fields import Entries, Memory, Turned, Updated
+from vrw_jax.simd.fields import Entries, Memory, Turned, Updated, shared
 from vrw_jax.simd.numbers import LONG, Value
 from vrw_jax.simd.trace import CALLS, Traces
 
@@ -16,18 +16,20 @@ def while_(traces: Traces, equation: Any, values: list[Entries]) -> list[Entries
     """A loop that goes on while a number says so, of which each group has its own."""
     arrays, params = traces.arrays, equation.params
     n_goes, n_body = params["cond_nconsts"], params["body_nconsts"]
-    fixed, own = values[:n_goes], values[n_goes : n_goes + n_body]
-    carry = _Carry(arrays, params["body_jaxpr"].out_avals, HELD)
+    read = list(map(shared, values[: n_goes + n_body]))  # at each turn
+    fixed, own = read[:n_goes], read[n_goes:]
+    begin = values[n_goes + n_body :]
+    carry = _Carry(arrays, params["body_jaxpr"].out_avals, HELD, begin)
 
     def goes_on(flat: list[Value]) -> Value:
-        told = traces.closed(params["cond_jaxpr"], [*fixed, *carry.arrays(flat)])
+        told = traces.closed(params["cond_jaxpr"], [*fixed, *map(shared, carry.arrays(flat))])
         return arrays.entries(told[0]).item()
 
     def body(flat: list[Value]) -> list[Value]:
         told = traces.closed(params["body_jaxpr"], [*own, *carry.arrays(flat)])
         return carry.on(told)
 
-    start = carry.start(values[n_goes + n_body :])
+    start = carry.start(begin)
     return carry.arrays(arrays.numbers.loop(start, goes_on, body))
 
 
@@ -46,9 +48,9 @@ def scan(traces: Traces, equation: Any, values: list[Entries]) -> list[Entries]:
     read = [x if isinstance(x, Turned) else arrays.in_memory(x) for x in given]
     written = [arrays.room(shape_of(aval), arrays.kind_of(aval)) for aval in told]
     outside, arrays.written_out = arrays.written_out, not _has_loops(inner.jaxpr)
-    fixed = values[:n_fixed]
+    fixed, begin = list(map(shared, values[:n_fixed])), values[n_fixed : n_fixed + n_carried]
     limit = HELD_INSIDE if arrays.written_out else HELD
-    carry = _Carry(arrays, inner.out_avals[:n_carried], limit)
+    carry = _Carry(arrays, inner.out_avals[:n_carried], limit, begin)
 
     def part(memory: Memory | Turned, turn: Value) -> Entries:
         some = memory.part(turn)
@@ -64,7 +66,7 @@ def scan(traces: Traces, equation: Any, values: list[Entries]) -> list[Entries]:
             arrays.fill(memory.part(turn), value)
         return carry.on(results[:n_carried])
 
-    start = carry.start(values[n_fixed : n_fixed + n_carried])
+    start = carry.start(begin)
     last = carry.arrays(arrays.counted(length, body, start))
     arrays.written_out = outside
     return [*last, *written]
@@ -79,16 +81,24 @@ def _fixed_and_carried(params: dict[str, Any]) -> tuple[int, int]:
 
 
 class _Carry:
-    """Arrays between the turns of a loop: in registers up to `limit` entries, else in memory."""
+    """Arrays between the turns of a loop: in registers up to `limit` entries, else in memory, that
+    of its own or where `begin`, what they begin with, lies and nothing else does."""
 
-    def __init__(self, arrays: Arrays, avals: Sequence[Any], limit: int | float) -> None:
+    def __init__(
+        self, arrays: Arrays, avals: Sequence[Any], limit: int | float, begin: Sequence[Entries]
+    ) -> None:
         self.owner, self.avals = arrays, avals
         self.places = [
-            arrays.room(shape_of(aval), arrays.kind_of(aval))
-            if math.prod(shape_of(aval)) > limit
-            else None
-            for aval in avals
+            self._place(aval, array) if math.prod(shape_of(aval)) > limit else None
+            for aval, array in zip(avals, begin, strict=True)
         ]
+
+    def _place(self, aval: Any, begin: Entries) -> Memory:
+        kind = self.owner.kind_of(aval)
+        begin = begin.whole if isinstance(begin, Updated) else begin
+        if isinstance(begin, Memory) and begin.free and begin.kind == kind:
+            return begin
+        return self.owner.room(shape_of(aval), kind)
 
     def arrays(self, flat: Sequence[Value]) -> list[Entries]:
         """What is carried, in a turn or after the last one."""
@@ -96,14 +106,20 @@ class _Carry:
         left = iter(arrays_of(flat, held))
         # A field of its own each time: what was known of it is past.
         return [
-            next(left) if place is None else Memory(self.owner, place.shape, place.kind, place.base)
+            next(left)
+            if place is None
+            else Memory(self.owner, place.shape, place.kind, place.base, free=True)
             for place in self.places
         ]
 
     def start(self, arrays: Sequence[Entries]) -> list[Value]:
         """Values for registers are returned, the others stored."""
         for array, place in zip(arrays, self.places, strict=True):
-            if place is not None:
+            if place is None or array is place:
+                continue
+            if isinstance(array, Updated) and array.whole is place:
+                array.ready().store_into(place)
+            else:
                 self.owner.fill(place, array)
         return self._in_registers(arrays)
 

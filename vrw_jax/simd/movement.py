@@ -1,5 +1,6 @@
 """Primitives that move entries: which one stands where, and in arrays of what shape."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -19,6 +20,9 @@ def broadcast_in_dim(arrays: Arrays, asked: Asked, array: Entries, *_: Any) -> E
     array = arrays.fitted(array, array.shape[:-1], len(array.shape) > len(shape))
     if has_lanes(asked.out) and len(array.shape) == len(axes) and axes[-1:] == (len(shape),):
         array = arrays.reshaped(array, array.shape[:-1])  # one number has the axis of lanes
+    alike = isinstance(array, Memory) and array.kind == arrays.kind_of(asked.out)
+    if alike and math.prod(array.shape) == math.prod(shape):
+        return arrays.reshaped(array, shape)
     result = arrays.broadcast(array, shape, axes[: len(array.shape)])
     if isinstance(result, Field):
         return Field(shape, arrays.kind_of(asked.out), result.at)
@@ -153,7 +157,8 @@ def dynamic_update_slice(
         raise moved(asked.name)
     begin = _starts(arrays, asked.given[1:], array.shape, update.shape, starts)
     same = isinstance(array, np.ndarray) and not any(array.strides)
-    return Updated(arrays, array if same else arrays.in_memory(array), update, begin)
+    plain = same or isinstance(array, Unset)
+    return Updated(arrays, array if plain else arrays.in_memory(array), update, begin)
 
 
 def _starts(

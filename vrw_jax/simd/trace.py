@@ -10,7 +10,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 
 from vrw_jax.simd.arrays import LANES, Arrays, arrays_of, shape_of, taken_for_lanes
-from vrw_jax.simd.fields import Entries
+from vrw_jax.simd.fields import Entries, shared
 from vrw_jax.simd.numbers import Numbers, Value
 
 Rule = Callable[["Traces", Any, list[Entries]], list[Entries]]
@@ -26,6 +26,9 @@ CALLS = {  # primitive: the parameter that is the trace it calls
     "custom_vmap_call": "call",
     "custom_vjp_call": "call_jaxpr",
 }
+
+
+LOOPS = "while", "scan"
 
 
 def apart(function: Callable) -> Callable:
@@ -50,21 +53,27 @@ class Traces:
     def closed(self, closed: ClosedJaxpr, values: Sequence[Entries]) -> list[Entries]:
         """The results of a trace for these values."""
         jaxpr, constants_of = closed.jaxpr, self.arrays.constants_of
-        places: dict[Any, Entries] = dict(zip(jaxpr.invars, values, strict=True))
+        takers, places = _takers(jaxpr), dict[Any, Entries]()
+
+        def put(variables: Sequence[Any], values: Sequence[Entries]) -> None:
+            for variable, value in zip(variables, values, strict=True):
+                places[variable] = shared(value) if takers.get(variable) is None else value
+
+        put(jaxpr.invars, values)
         for variable, value in zip(jaxpr.constvars, closed.consts, strict=True):
             places[variable] = constants_of(np.asarray(value), variable.aval)
 
-        def read(atom: Any) -> Entries:
+        def read(atom: Any, place: int) -> Entries:
             if isinstance(atom, Literal):
                 return constants_of(np.asarray(atom.val), atom.aval)
-            return places[atom]
+            return places[atom] if takers[atom] == place else shared(places[atom])
 
-        for equation in jaxpr.eqns:
+        for place, equation in enumerate(jaxpr.eqns):
             if all(variable.aval.dtype == jax.dtypes.float0 for variable in equation.outvars):
                 continue  # the derivative of a whole number, which nothing reads
-            results = self._results(equation, [read(atom) for atom in equation.invars])
-            places.update(zip(equation.outvars, results, strict=True))
-        return [read(atom) for atom in jaxpr.outvars]
+            results = self._results(equation, [read(x, place) for x in equation.invars])
+            put(equation.outvars, results)
+        return [read(atom, len(jaxpr.eqns)) for atom in jaxpr.outvars]
 
     def _results(self, equation: Any, values: list[Entries]) -> list[Entries]:
         name = equation.primitive.name
@@ -111,6 +120,20 @@ class Traces:
             whole = build.insert_value(whole, value, i)
         build.ret(whole)
         return function
+
+
+def _takers(jaxpr: Any) -> dict[Any, int | None]:
+    """By variable the place of the equation that may overwrite it: the last one that reads it,
+    where those before are loops, after which nothing is left to be read."""
+    takers: dict[Any, int | None] = {}
+    loops = [equation.primitive.name in LOOPS for equation in jaxpr.eqns]
+    for place, atoms in enumerate([*(equation.invars for equation in jaxpr.eqns), jaxpr.outvars]):
+        for atom in atoms:
+            if not isinstance(atom, Literal):
+                before = takers.get(atom, -1)
+                ends = before == -1 or (before not in (None, place) and loops[before])
+                takers[atom] = place if ends else None
+    return takers
 
 
 def called(parameter: str) -> Rule:

@@ -72,18 +72,25 @@ class Ways(NamedTuple):
     columns: Array
     rows: Array  # all numbers of a `_Way` behind each other: few loops are quickly compiled
 
-    def each(self, function: Callable[[Array], Any], size: int) -> Array:
-        """So many rows of what `function` tells of each direction by its place."""
+    def blank(self, size: int) -> Array:
+        """So many rows of each direction, to be written."""
+        return lax.empty((len(self.columns), size, *self.many.shape), self.columns.dtype)
+
+    def each(
+        self, function: Callable[[Array, Array], Any], rows: Array, begin: Array | int = 0
+    ) -> Array:
+        """Rows of each direction, from `begin` on overwritten by what `function` tells of its place
+        and of its own rows."""
         goes_on = lambda state: jnp.any(state[0] < self.many)
 
         def turn(state: tuple[Array, Array]) -> tuple[Array, Array]:
             k, rows = state
-            told = _packed(function(k))
-            told = jnp.stack([told[i] for i in range(size)])  # in registers
-            return k + 1, lax.dynamic_update_index_in_dim(rows, told, k, 0)
+            told = _packed(function(k, lax.dynamic_index_in_dim(rows, k, 0, False)))
+            told = jnp.stack([told[i] for i in range(len(told))])  # in registers
+            place = k, jnp.int32(begin), jnp.int32(0)
+            return k + 1, lax.dynamic_update_slice(rows, told[None], place)
 
-        blank = lax.empty((len(self.columns), size, *self.many.shape), self.columns.dtype)
-        return lax.while_loop(goes_on, turn, (jnp.zeros((), jnp.int32), blank))[1]
+        return lax.while_loop(goes_on, turn, (jnp.zeros((), jnp.int32), rows))[1]
 
 
 def _packed(tree: Any) -> Array:
@@ -126,8 +133,8 @@ def walked_along(
     for k in range(len(d_columns)):
         by_columns = jnp.where(jnp.any(d_columns[k] != 0.0, axis=0), k + 1, by_columns)
     ways = Ways(many, by_columns, d_columns, d_columns)
-    start = lambda k: _Way.of(push(_at(d_columns, k, columns), _at(d_x, k, x)), slope)
-    ways = ways._replace(rows=ways.each(start, n_rows(like)))
+    start = lambda k, _: _Way.of(push(_at(d_columns, k, columns), _at(d_x, k, x)), slope)
+    ways = ways._replace(rows=ways.each(start, ways.blank(n_rows(like))))
 
     def turn(state: tuple[Lane, Ways]) -> tuple[Lane, Ways]:
         lane, ways = state
@@ -138,15 +145,14 @@ def walked_along(
 
         _, push, after = jax.linearize(past_events, columns, lane.moves(), has_aux=True)
 
-        def passed(k: Array) -> _Way:
-            way = _at(ways.rows, k, like)
+        def passed(k: Array, row: Array) -> _Way:
+            way = _unpacked(row, like)
             return _Way.of(push(_at(d_columns, k, columns), way.moves()), way.march.slope)
 
-        ways = ways._replace(rows=ways.each(passed, n_rows(like)))
+        ways = ways._replace(rows=ways.each(passed, ways.rows))
         under_way, flow_at = after.outcome == UNDER_WAY, lambda c: on.flow(c, after.now.stance)
         given = flow_at, columns, after.now, ways, like.march, under_way, on.options, on.tableau
-        now, march = _marched(*given)
-        rows = lax.dynamic_update_slice(ways.rows, march, (0, 0, 0))
+        now, rows = _marched(*given)
         return after._replace(now=now), ways._replace(rows=rows)
 
     goes_on = lambda state: jnp.any(state[0].outcome == UNDER_WAY)
@@ -156,7 +162,8 @@ def walked_along(
         return eqx.partition(on.told(lane.moved(moves)), eqx.is_inexact_array)
 
     floats, push, rest = jax.linearize(told, lane.moves(), has_aux=True)
-    moved = ways.each(lambda k: push(_at(ways.rows, k, like).moves()), n_rows(floats))
+    push_at = lambda k, _: push(_at(ways.rows, k, like).moves())
+    moved = ways.each(push_at, ways.blank(n_rows(floats)))
     step = eqx.combine(floats, rest)
     walk = Walked(step, lane.outcome, lane.n_stepped, lane.ledger.tried)
     return walk, _unpacked(moved, floats)
@@ -172,8 +179,8 @@ def _marched(
     options: Options,
     tableau: Tableau,
 ) -> tuple[March, Array]:
-    """`march.marched`, with the directions carried along and on to the event: their first rows."""
-    flow, n_rows = flow_at(columns), len(_packed(like))
+    """`march.marched`, with the directions carried along and on to the event."""
+    flow = flow_at(columns)
     sizes, last = guard_sizes(flow), len(tableau.places) - 1
     more = _more(ways, like, begin.stance)
 
@@ -186,8 +193,9 @@ def _marched(
         after = advanced(now, tried, sizes, tableau, options)
         taken, n = after.time != now.time, len(now.here.q)
 
-        def end(k: Array) -> _March:
-            here, known = _at(rows, k, like), lax.dynamic_index_in_dim(moved, k, 1, False)
+        def end(k: Array, row: Array) -> _March:
+            here = _unpacked(row, like)
+            known = lax.dynamic_index_in_dim(moved, k, 0, False).reshape(-1, *like.slope.shape)
             at = lambda some: stage_at(
                 tableau, last, here.q[some], here.v[some], known[:, :n][:, some], now.h
             )
@@ -202,12 +210,11 @@ def _marched(
             there = _March(q, v, told, known[last], here.later)
             return select(taken, there, here._replace(slope=known[0]))
 
-        return after, ways.each(end, n_rows)
+        return after, ways.each(end, rows)
 
     marching = lambda state: state[0].verdict == MARCHING
-    now, rows = until_none_marches(marching, walks, advance, (begin, ways.rows[:, :n_rows]))
-    met = _met(flow_at, columns, begin, now, ways, rows, like)
-    return now, ways.each(met, n_rows)
+    now, rows = until_none_marches(marching, walks, advance, (begin, ways.rows))
+    return now, ways.each(_met(flow_at, columns, begin, now, ways, like), rows)
 
 
 def _stages(
@@ -219,10 +226,10 @@ def _stages(
     tableau: Tableau,
     more: Array,
 ) -> tuple[Array, Array]:
-    """Slopes at the stages of a step, and how they move: (stages, directions, ., lanes)."""
+    """Slopes at the stages of a step, and how they move: of each direction one after the other."""
     here, h = now.here, now.h
-    n, last = len(here.q), len(tableau.places) - 1
-    fresh, tallied = (now.verdict == MARCHING) & (now.time == 0.0), len(like.slope) - n
+    size, last = len(like.slope), len(tableau.places) - 1
+    fresh = (now.verdict == MARCHING) & (now.time == 0.0)
 
     def stage(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         i, slopes, moved = state
@@ -231,26 +238,24 @@ def _stages(
         flow = flow_at(columns)
         shares = Shares.at(flow, motion_of(Place(*place, place[0])), more)
         none = shares.nothing()
-        by = lambda k: shares.by_columns(flow_at, columns, _at(ways.columns, k, columns))
-        own = ways._replace(many=ways.by_columns).each(by, len(_packed(none)))
+        by = lambda k, _: shares.by_columns(flow_at, columns, _at(ways.columns, k, columns))
+        own = ways._replace(many=ways.by_columns).each(by, ways.blank(len(_packed(none))))
 
-        def along(k: Array) -> Array:
-            way, known = _at(ways.rows, k, like), lax.dynamic_index_in_dim(moved, k, 1, False)
-            ends = lambda some: _ends(tableau, i, way, known, h, some)
+        def along(k: Array, known: Array) -> Array:
+            way = _at(ways.rows, k, like)
+            before = known.reshape(-1, *like.slope.shape)
+            ends = lambda some: _ends(tableau, i, way, before, h, some)
             column = if_any(jnp.any(k < ways.by_columns), lambda: _at(own, k, none), none)
             row = shares.along(ends, column, more)
-            return jnp.where((i > 0) | fresh, row, known[0])
+            return jnp.where((i > 0) | fresh, row, known[:size])
 
-        put = lambda rows, row: lax.dynamic_update_index_in_dim(rows, row, i, 0)
         slope = jnp.where(i > 0, slope_at(flow, *place), here.slope)
-        return i + 1, put(slopes, slope), put(moved, ways.each(along, len(like.slope)))
+        slopes = lax.dynamic_update_index_in_dim(slopes, slope, i, 0)
+        return i + 1, slopes, ways.each(along, moved, i * size)
 
     others = jnp.zeros((last, *here.slope.shape), h.dtype)
     slopes = jnp.concatenate([here.slope[None], others])
-    begin = 2 * n + tallied
-    slope = ways.rows[:, begin : begin + len(like.slope)]
-    moved = jnp.zeros((last + 1, *slope.shape), h.dtype)
-    moved = lax.dynamic_update_index_in_dim(moved, slope, 0, 0)
+    moved = ways.each(lambda k, _: _at(ways.rows, k, like).slope, ways.blank((last + 1) * size))
     # The first stage is the last one of the step before, but where an event was passed.
     first = jnp.where(jnp.any(fresh), 0, 1).astype(jnp.int32)
     goes_on = lambda state: state[0] <= last
@@ -296,9 +301,8 @@ def _met(
     begin: March,
     now: March,
     ways: Ways,
-    rows: Array,
     like: _March,
-) -> Callable[[Array], _March]:
+) -> Callable[[Array, Array], _March]:
     """Directions where the event comes later or earlier along them."""
     here, n = now.here, len(now.here.q)
 
@@ -310,8 +314,8 @@ def _met(
     rates = push(jnp.zeros_like(columns), here.v, here.slope[:n])
     arrived = (begin.verdict == MARCHING) & (now.verdict == EVENT)
 
-    def met(k: Array) -> _March:
-        way, later = _at(rows, k, like), jnp.zeros_like(now.time)
+    def met(k: Array, row: Array) -> _March:
+        way, later = _unpacked(row, like), jnp.zeros_like(now.time)
         moves = push(_at(ways.columns, k, columns), way.q, way.v)
         for index in range(len(moves)):
             at = arrived & (now.guard == index) & (rates[index] < 0.0)
