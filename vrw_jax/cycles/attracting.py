@@ -1,11 +1,12 @@
 """Which gaits of a wheel attract: walks from a stated set of starts, and Newton's method on."""
 
+import math
 from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.models import as_full_states, walk_lanes
@@ -41,32 +42,32 @@ TOLERANCE_TOWARDS = 1e-8
 
 def starts_of(params: WheelParams) -> np.ndarray:
     """STARTS of each wheel, (start, lane, 3)."""
-    s = params.symbols()  # whose sine of the slope is no value where a caller differentiates
-    Mt, g, L0 = (np.asarray(x) for x in (s.Mt, s.g, s.L0))
-    weight = Mt * g * np.cos(np.asarray(params.slope))
-    static = np.asarray(params.natural_length - weight / params.stiffness) / L0
-    lengths = [np.clip(1.0 + c * (static - 1.0), s.cos_alpha + 0.02, 1.0) for c, _ in STARTS]
-    thetas = [np.arctan((length - s.cos_alpha) / s.sin_alpha) for length in lengths]
+    p, sin, cos = _in_numpy(params), math.sin(params.leg_angle), math.cos(params.leg_angle)
+    weight = (p.hub_mass + params.n_legs * p.leg_mass) * p.gravity * np.cos(p.slope)
+    static = (p.natural_length - weight / p.stiffness) / p.locked_length
+    lengths = [np.clip(1.0 + c * (static - 1.0), cos + 0.02, 1.0) for c, _ in STARTS]
+    thetas = [np.arctan((length - cos) / sin) for length in lengths]
     return _at(params, thetas, [share for _, share in STARTS])
 
 
 def further_starts_of(params: WheelParams) -> np.ndarray:
     """FURTHER of each wheel, (start, lane, 3)."""
-    thetas = [
-        np.full(np.shape(params.slope), a * float(params.symbols().alpha)) for a, _ in FURTHER
-    ]
+    thetas = [np.full(np.shape(params.slope), a * params.leg_angle) for a, _ in FURTHER]
     return _at(params, thetas, [share for _, share in FURTHER])
+
+
+def _in_numpy(params: WheelParams) -> Any:
+    """Its numbers, for which JAX would compile each operation."""
+    return SimpleNamespace(**{name: np.asarray(getattr(params, name)) for name in PARAMETER_NAMES})
 
 
 def _at(params: WheelParams, thetas: list[np.ndarray], shares: list[float]) -> np.ndarray:
     """Section states with these angles and rates, as shares of the rigid rolling gait's."""
-    s = params.symbols()
-    g, L0 = np.asarray(s.g), np.asarray(s.L0)
-    rolling = np.sqrt(4.0 * g / L0 * np.sin(0.5 * s.alpha) * np.sin(params.slope)) / s.sin_alpha
+    p, alpha = _in_numpy(params), params.leg_angle
+    stiff = np.sqrt(4.0 * p.gravity / p.locked_length * np.sin(0.5 * alpha) * np.sin(p.slope))
+    rolling, fall = stiff / np.sin(alpha), -0.1 * np.sqrt(p.gravity * p.locked_length) / 3.0
     each = zip(thetas, shares, strict=True)
-    return np.stack(
-        [np.stack([x, share * rolling, -0.1 * np.sqrt(g * L0) / 3.0], -1) for x, share in each]
-    )
+    return np.stack([np.stack([x, share * rolling, fall], -1) for x, share in each])
 
 
 def _walked(
@@ -101,8 +102,12 @@ def gaits_attracting(
     wheels = len(values)
     owner, x = _walked_to(finder, np.asarray(values), n_starts)
     found = finder.near(np.asarray(values)[owner], x)
-    good = np.asarray(found.found) & (np.asarray(found.spectral_radius) < 1.0)
-    states, speed = np.asarray(found.steps.section_state), np.asarray(found.speed)  # every step's
+    # In numpy, here and below: JAX compiles each operation for every number of wheels.
+    attracts = np.abs(np.linalg.eigvals(found.matrix)).max(-1) < 1.0
+    good = (np.asarray(found.outcome) == Outcome.STEPPED) & attracts
+    states = np.asarray(found.steps.section_state)  # every step's
+    of_all = lambda x: np.asarray(x).reshape(len(owner), -1).sum(-1)
+    speed = of_all(found.step_length) / np.where(good, of_all(found.durations), 1.0)
     own = states[:, :, : _numbers(finder)]
     good &= ~(np.abs(own[:, :-1] - own[:, -1:]).max(-1) < SAME).any(1)  # after fewer steps
     kept: list[int] = []
@@ -123,12 +128,12 @@ def slow_gaits(finder: Any, values: Any) -> Any:
     """
     values = np.asarray(values)
     _, gaits = gaits_attracting(finder, values, 1)
-    lost = np.flatnonzero(~np.asarray(gaits.found))
+    lost = np.flatnonzero(np.asarray(gaits.outcome) != Outcome.STEPPED)
     if len(lost):
         owner, others = gaits_attracting(finder, values[lost])
         places = np.arange(len(values))
         places[lost] = len(values) + slowest(owner, len(lost))
-        gaits = jax.tree.map(jnp.asarray, taken(joined(gaits, others), places))
+        gaits = jax.device_put(taken(joined(gaits, others), places))
     return gaits
 
 
@@ -138,13 +143,12 @@ def slowest(owner: np.ndarray, wheels: int) -> np.ndarray:
 
 def _none_where(lost: np.ndarray, cycle: Any) -> Any:
     """No gait there: what repeats does so sooner, or does not attract, or nothing does."""
-    # In numpy, here and above: JAX compiles each operation for every number of wheels.
     fits = lambda leaf: lost.reshape(-1, *[1] * (leaf.ndim - 1))
     none = jax.tree.map(lambda leaf: np.where(fits(leaf), np.zeros_like(leaf), leaf), cycle)
     code = np.where(cycle.outcome == Outcome.STEPPED, Outcome.NO_CYCLE_FOUND, cycle.outcome)
     code = np.where(lost, code, cycle.outcome).astype(np.int32)
     none = eqx.tree_at(lambda cycle: cycle.outcome, none, code)
-    return jax.tree.map(jnp.asarray, none)
+    return jax.device_put(none)
 
 
 def _numbers(finder: Any) -> int:
@@ -155,9 +159,8 @@ def _walked_to(finder: Any, values: np.ndarray, n_starts: int) -> tuple[np.ndarr
     """Where walks have come to that differ: whose, in order, and section states; one of each wheel
     at least. The walk that repeats best stands for its like.
     """
-    starts = starts_of(wheel_of(jnp.asarray(values.T[: len(PARAMETER_NAMES)]), finder.n_legs))[
-        :n_starts
-    ]
+    rows = jax.device_put(list(values.T[: len(PARAMETER_NAMES)]))
+    starts = starts_of(wheel_of(tuple(rows), finder.n_legs))[:n_starts]
     n, m, owner = len(values), _numbers(finder), np.tile(np.arange(len(values)), len(starts))
     columns = values.T[:, owner]
     begun = as_full_states(columns, np.concatenate(starts), finder.n_legs)

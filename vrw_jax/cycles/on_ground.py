@@ -16,11 +16,11 @@ from jaxtyping import Array
 
 from vrw_jax.cycles.attracting import slow_gaits
 from vrw_jax.cycles.by_walking import (
+    FINEST,
     AbstractWalkingFinder,
     SectionFinder,
     WalkedCycle,
     cycle_from,
-    finest,
     gait_of,
     of_steps,
     walked_cycle,
@@ -97,15 +97,16 @@ class GroundFinder(AbstractWalkingFinder):
         maps.around(self.step_options, states, False)
 
     def first_guess(self, values: Values) -> Array:
-        return self.first_guesses(values[None])[0]
+        return _first(self.first_guesses(_alone(values)))
 
     def first_guesses(self, values: Array) -> Array:
         """A slow gait that attracts each wheel; without one no state of any."""
         gaits = slow_gaits(self, values)
-        return jnp.where(gaits.found[:, None], gaits.section_state, jnp.nan)
+        found = np.asarray(gaits.outcome) == Outcome.STEPPED
+        return jax.device_put(np.where(found[:, None], gaits.section_state, np.nan))
 
     def find(self, values: Values, guess: Array) -> Gait:
-        return jax.tree.map(lambda x: x[0], self.find_many(values[None], guess[None]))
+        return _first(self.find_many(_alone(values), _alone(guess)))
 
     def find_many(self, values: Array, guess: Any) -> Gait:
         return self._told(_gait, values, getattr(guess, "section_state", guess), by_values=True)
@@ -119,16 +120,25 @@ class GroundFinder(AbstractWalkingFinder):
     def step(self, params: WheelParams, x: Array) -> AbstractStep:
         columns, model = np.asarray(self.model.values(params))[:, None], self.model
         given = columns, np.asarray(x)[None], model, self.step_options, self.n_legs
-        told, _ = step_lanes(*given, ())
-        return jax.device_put(taken(told, 0))
+        return _first(step_lanes(*given, ())[0])
 
     def measured(self, values: Values, guess: Any, names: tuple[str, ...]) -> Measured:
         """As everywhere; of one Jacobian of the step."""
-        model, params = self.model.at(values, self.n_legs)
+        model, params = self.model.at(tuple(jax.device_put(list(np.asarray(values)))), self.n_legs)
         start = guess.section_state if isinstance(guess, AbstractCycle) else guess
         start = self.first_guess(values) if start is None else start
         _, x, _, _ = checked(params, start, model, self.step_options)
         return measured_of(self.find(values, x), type(self).read, names)
+
+
+def _alone(x: Array) -> Array:
+    """As the one row of many; by numpy, as JAX compiles a program for each shape."""
+    return jax.device_put(np.asarray(x)[None])
+
+
+def _first(tree: Any) -> Any:
+    """The inverse, of many rows and trees too."""
+    return jax.device_put(taken(tree, 0))
 
 
 def _states(model: AbstractWheel, params: WheelParams, guess: Any) -> Array:
@@ -229,9 +239,9 @@ def _newton(
     loose steps lead away from what an exact one hardly moves, all are exact.
     """
     maps = Periods(model, n_legs, period_n, values)
-    looser = [jnp.maximum(tolerance, LOOSE) for tolerance in (options.rtol, options.atol)]
-    loose = eqx.tree_at(lambda o: (o.rtol, o.atol), options, looser)
-    tolerance, every = float(finest(options)), np.ones(len(values), bool)
+    looser = [np.maximum(tolerance, LOOSE) for tolerance in (options.rtol, options.atol)]
+    loose = eqx.tree_at(lambda o: (o.rtol, o.atol), options, jax.device_put(looser))
+    tolerance, every = max(FINEST, float(options.rtol)), np.ones(len(values), bool)
     rough, by_start = _corrected(maps, loose, start, False, ROUGH, every)
     x, near = np.where(rough.converged[:, None], rough.x, start), rough.converged
     exact = maps.around(options, x, False, False)

@@ -237,8 +237,8 @@ def _wherever(finder: Any, params: WheelParams, guess: Any, adaptive: bool, whic
     still = lax.stop_gradient(params)
     hidden, plain = traced(still), not traced(params)
     if finder.coexisting and guess is None and not hidden:
-        cycle = _chosen(finder, still if many else jax.tree.map(lambda x: x[None], still), which)
-        cycle = cycle if many else jax.tree.map(lambda x: x[0], cycle)
+        cycle = _chosen(finder, still if many else _taken(still, None), which)
+        cycle = cycle if many else _taken(cycle, 0)
         return cycle if plain else _searched(finder, params, cycle.section_state)
     cycle = _searched(finder, params, guess)
     known = lax.stop_gradient((params, cycle))  # what derivatives are taken of has values, too

@@ -343,7 +343,9 @@ class AbstractWheel(eqx.Module):
         ]
         return jnp.stack([jnp.asarray(value, params.damping.dtype) for value in held])
 
-    def at(self, values: Array, n_legs: int) -> tuple["AbstractWheel", WheelParams]:
+    def at(
+        self, values: Array | tuple[Array, ...], n_legs: int
+    ) -> tuple["AbstractWheel", WheelParams]:
         """Rung and wheel of other numbers: the inverse of `values`; works on tracers."""
         n = len(PARAMETER_NAMES)
         model = self

@@ -115,11 +115,8 @@ class Options(AbstractTold):
 
     def tightened(self, factor: Scalar | float) -> "Options":
         """The same choices with tolerances divided by `factor`, down to round-off."""
-        floor = FLOOR * jnp.finfo(self.rtol.dtype).eps
-        tighten = lambda tolerance: jnp.maximum(tolerance / factor, jnp.minimum(floor, tolerance))
-        return eqx.tree_at(
-            lambda o: (o.rtol, o.atol), self, (tighten(self.rtol), tighten(self.atol))
-        )
+        both = self.rtol, self.atol
+        return eqx.tree_at(lambda o: (o.rtol, o.atol), self, _tightened(both, factor))
 
     def require_reachable(self, dtype: np.dtype) -> None:
         """Refuse, in one sentence, a tolerance below what the number format can resolve."""
@@ -136,3 +133,9 @@ class Options(AbstractTold):
                 f"{name} is {float(value):g}, but {np.dtype(dtype).name} numbers can't resolve "
                 f"less than {floor:.0e}: {hint}."
             )
+
+
+@jax.jit
+def _tightened(tolerances: tuple[Scalar, ...], factor: Scalar | float) -> tuple[Scalar, ...]:
+    floor = FLOOR * jnp.finfo(tolerances[0].dtype).eps
+    return tuple(jnp.maximum(x / factor, jnp.minimum(floor, x)) for x in tolerances)

@@ -262,7 +262,7 @@ def friction_of(value: object) -> Array:
     """A coefficient of friction, or an array of them."""
     friction = reals(FRICTION, value)
     plain = not isinstance(friction, jax.core.Tracer) and friction.ndim == 0
-    if plain and not friction >= 0.0:
+    if plain and not float(friction) >= 0.0:
         raise ValueError(
             f"friction is {float(friction):g}, but a coefficient of friction is at least 0: give "
             "0.7, say, or math.inf for feet that never slide."

@@ -90,11 +90,13 @@ class _Moves(NamedTuple):
 _Rows = Callable[[Stand, Stand, Hub, Carried], tuple[_Stays, _Moves]]
 
 
+@eqx.filter_jit  # traced once, wherever it is called
 def in_motion(stand: Stand) -> Carried:
     """Forces, and accelerations that they leave."""
     return _carried(free_acceleration, rows_of_motion, stand)
 
 
+@eqx.filter_jit
 def in_impact(stand: Stand) -> Carried:
     """Impulses, and velocities that they leave."""
     return _carried(free_velocity, _rows_of_impact, stand)

@@ -8,6 +8,7 @@ Nothing here looks from one lane to another.
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -155,6 +156,7 @@ def begun_guards(flow: Flow) -> Array:
     return jnp.concatenate([stance.new_foot, stance.new_leg, no, no, no, slid, no, no, *in_air])
 
 
+@eqx.filter_jit  # traced once, wherever it is called
 def set_off(flow: Flow, motion: WheelMotion, h: Array) -> March:
     """Lanes at the start of a stance, at an event again where a guard falls at once."""
     here, begun = place_of(flow, motion), begun_guards(flow)

@@ -66,6 +66,8 @@ def step_lanes(
     directions as loaded feet leave (see `_Rates`).
     """
     run = _Run.of(model, options, n, True)
+    if len(states):  # before others are asked for: it is long in coming
+        _program(run, columns.dtype, jax.tree.structure(eqx.filter(options, eqx.is_array)))
     code = np.round(states[:, 4 + 2 * n :]).astype(int)
     numbers = np.concatenate([columns.T, states], 1)
     moves = np.ones(numbers.shape, bool)
