@@ -23,7 +23,8 @@ BOUNCE = 1e-5  # m/s: a foot that would come back more slowly stays, it would ri
 TOUCH = 1e-13  # m
 SOUND = 1e-9  # of weight and gravity, of momentum and speed: a sign is rounding
 ARMED = {"gap": 1e-14, "room": 1e-14, "speed": 1e-12, "force": 1e-10}
-"""A guard that has read more than this is one that may fall: m, m/s, N."""
+"""A guard that has read more than this is one that may fall: m, m/s, N. So is what an impact has
+thrown off, whose flight may rise by less: its speed says that it leaves."""
 MOMENT = 1e-6  # s, for which modes are followed that rounding cannot tell apart
 RTOL = ATOL = 1e-13
 
@@ -217,7 +218,9 @@ def _solutions(w, problem, signs):
     for i, j in enumerate(feet):
         m, t, n = modes[:, i], 2 * i, 2 * i + 1
         wrong = worse(m == OFF, -after[:, n] / A)
-        wrong = worse(m != OFF, -p[:, n] / F)
+        wrong = worse(m == STICK, -p[:, n] / F)
+        dragged = -max(1.0, w.rough[j]) * p[:, n]  # a pull of rounding may drag by more
+        wrong = worse((m == DOWN) | (m == UP), dragged / F)
         wrong = worse(m == STICK, (np.abs(p[:, t]) - w.rough[j] * p[:, n]) / F)
         if STICK in may[i]:  # else it slides, and may speed up or slow down
             wrong = worse(m == DOWN, -after[:, t] / A)
@@ -340,8 +343,9 @@ def _moments_margin(w, q, v, mode, held, feet, still, legs):
 
 
 def _guards(w, place):
-    """Names of what is watched in these modes, and their values at a state."""
-    _, _, mode, held = place
+    """Names of what is watched in these modes, their values at a state, the least that arms each,
+    and which leave zero at a speed."""
+    q, v, mode, held = place
     names = [("gap", j) for j in range(N) if mode[j] == OFF]
     names += [("room", j) for j in range(N) if not held[j]]
     names += [("normal", j) for j in range(N) if mode[j] != OFF]
@@ -365,7 +369,15 @@ def _guards(w, place):
         return np.array([told[name][j] for name, j in names])
 
     armed = np.array([ARMED.get(name, ARMED["force"]) for name, _ in names])
-    return names, values, armed
+    speeds = {"gap": _points(q, v, q[3:])[0][:, 1] @ v, "room": -v[3:]}
+    leaves = np.array([name in speeds and speeds[name][j] > REST for name, j in names])
+    return names, values, armed, leaves
+
+
+def _lowest(reads, low, high):
+    return minimize_scalar(
+        reads, bounds=(low, high), method="bounded", options={"xatol": 1e-6 * (high - low)}
+    )
 
 
 def _first_fall(values, inside, times, told, armed, least):
@@ -377,10 +389,12 @@ def _first_fall(values, inside, times, told, armed, least):
         for k in range(1, len(times)):
             low, high = times[k - 1], times[k]
             if armed[i] and k < len(times) - 1 and 0.0 < g[k] < min(g[k - 1], g[k + 1]):
-                dip = minimize_scalar(reads, bounds=(low, times[k + 1]), method="bounded")
+                dip = _lowest(reads, low, times[k + 1])
                 high, g[k] = (dip.x, dip.fun) if dip.fun < 0.0 else (high, g[k])
             if armed[i] and g[k] <= 0.0:
-                root = low if g[k - 1] <= 0.0 else brentq(reads, low, high, xtol=1e-16)
+                if g[k - 1] <= least[i]:  # it has just left
+                    low = _lowest(lambda t, reads=reads: -reads(t), low, high).x
+                root = low if reads(low) <= 0.0 else brentq(reads, low, high, xtol=1e-16)
                 first, which = (root, i) if root < first else (first, which)
                 break
             armed[i] |= g[k] > least[i]
@@ -391,7 +405,7 @@ def _first_fall(values, inside, times, told, armed, least):
 
 def _to_event(w, place):
     """The motion in these modes to the first guard that falls: time, state, what fell."""
-    names, values, least = _guards(w, place)
+    names, values, least, leaves = _guards(w, place)
 
     def rates(_, y):
         q, v = y[: 3 + N], y[3 + N :]
@@ -402,7 +416,7 @@ def _to_event(w, place):
 
     y = np.r_[place.q, place.v]
     solver, now = by(0.0, y, 5.0, 1e-7), values(y)
-    armed = now > least
+    armed = (now > least) | leaves
     while solver.status == "running":
         begin, y = solver.t, solver.y.copy()
         solver.step()
