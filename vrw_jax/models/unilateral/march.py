@@ -286,6 +286,11 @@ def tried_by(flow: Flow, tableau: Tableau, options: Options, now: March, slopes:
     return Try(end, squared, values, *bent, to_dip, told)
 
 
+def at_singularity(before: Array, after: Array, options: Options) -> Array:
+    """Whether what vanishes at Painlevé's singularity has done so, by its values at both ends."""
+    return (before * after <= 0.0) | (jnp.abs(after) <= SINGULAR[0] + SINGULAR[1] * options.rtol)
+
+
 def advanced(now: March, tried: Try, sizes: Array, tableau: Tableau, options: Options) -> March:
     """The lane takes its step, tries another length, or has come to an event."""
     here, h, search, end = now.here, now.h, now.search, tried.end
@@ -315,8 +320,7 @@ def advanced(now: March, tried: Try, sizes: Array, tableau: Tableau, options: Op
     verdict = jnp.where(stuck, Outcome.SOLVER_GAVE_UP, MARCHING)
     verdict = jnp.where(arrived, EVENT, verdict)
     verdict = jnp.where(late, Outcome.NO_TOUCHDOWN_IN_TIME, verdict)
-    nothing = SINGULAR[0] + SINGULAR[1] * options.rtol
-    singular = taken & ((before * after <= 0.0) | (jnp.abs(after) <= nothing))
+    singular = taken & at_singularity(before, after, options)
     verdict = jnp.where(singular, Outcome.FRICTION_PARADOX, verdict)
     return now._replace(
         here=select(taken, end, here),

@@ -33,6 +33,7 @@ from vrw_jax.models.unilateral.ledger import (
     step_told,
     stretch_noted,
 )
+from vrw_jax.models.unilateral.march import at_singularity
 from vrw_jax.models.unilateral.mechanics import place_of_landing
 from vrw_jax.models.unilateral.motion import (
     Guards,
@@ -361,18 +362,18 @@ def _go_on(law: Law, place: Guards, max_events: int, options: Options, now: _Wal
 
     ledger = now.ledger._replace(events=now.ledger.events + 1)
     ledger = passed(ledger, change.stance, end.duration, end.solver_steps)
-    # At a Painlevé singularity forces change sign without passing zero: no guard is found there.
-    watched = guards(flow, end.state)[jnp.maximum(end.guard, 0)] != 1.0
+    at_ends = forces(flow, change.motion), forces(flow, unpack(end.state)[0])
+    before, after = (lax.stop_gradient(at.answer.regular) for at in at_ends)
+    drawn = at_singularity(before, after, options)  # forces change sign there without passing zero
     lost = jnp.where(end.timed_out, Outcome.NO_TOUCHDOWN_IN_TIME, Outcome.SOLVER_GAVE_UP)
-    lost = jnp.where(sound, lost, outcome)
-    found = sound & (end.guard >= 0) & watched
+    lost = jnp.where(sound, jnp.where(drawn, Outcome.FRICTION_PARADOX, lost), outcome)
+    found = sound & (end.guard >= 0) & ~drawn
     lands = found & (end.guard == place.foremost)
     outcome = outcome_at(ledger, place, found, end.guard, lands, lost, max_events)
     details, log = now.details, now.log
     if details is not None:
         details = event_noted(details, now.ledger.events == 0, change, event)
-        ends = change.motion, unpack(end.state)[0]
-        force = [least_stopper_force(flow, forces(flow, motion)) for motion in ends]
+        force = [least_stopper_force(flow, at) for at in at_ends]
         details = stretch_noted(details, flow.contact, end.duration, jnp.minimum(*force))
     if log is not None:
         row = Log(start, change.stance.contact, change.stance.locked, end.duration)
