@@ -34,6 +34,7 @@ from vrw_jax.models import (
     DIRECTIONS,
     AbstractWheel,
     Advance,
+    along_all,
     along_units,
     gait_step,
 )
@@ -178,7 +179,8 @@ def _by_phases(
     durations: Any,
     asked: Sequence[str],
 ) -> Steps:
-    order = _by_work(columns, len(states))
+    work_differs = engine != "collocation"
+    order = _by_work(columns, len(states)) if work_differs else np.arange(len(states))
     wheels = np.empty((len(columns), len(states)), states.dtype)
     for row, column in zip(wheels, columns, strict=True):
         row[:] = column[order] if column.ndim else column
@@ -292,7 +294,8 @@ def _by_lanes(
         if not moved:
             numbers, others = told(*lanes)
             return (*others, numbers)
-        columns, numbers, others = along_units(told, lanes, moved)
+        by_all = along_all if len(moved) == DIRECTIONS else along_units
+        columns, numbers, others = by_all(told, lanes, moved)
         return (*others, numbers, columns)
 
     settings = ("gait step", n_legs, stop_at_lift_off, structure, moved)

@@ -29,6 +29,7 @@ from vrw_jax.models.ladder import (
 from vrw_jax.models.lane_step import DIRECTIONS, along_units, gait_step
 from vrw_jax.models.paper_step import PAPER_START
 from vrw_jax.models.rigid import RigidWheel
+from vrw_jax.models.scales import along_all
 from vrw_jax.models.unilateral.contacts import STICK
 from vrw_jax.models.unilateral.ledger import UnilateralStep, least_dip
 from vrw_jax.models.unilateral.mechanics import (
