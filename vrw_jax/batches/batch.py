@@ -179,8 +179,7 @@ def _by_phases(
     durations: Any,
     asked: Sequence[str],
 ) -> Steps:
-    work_differs = engine != "collocation"
-    order = _by_work(columns, len(states)) if work_differs else np.arange(len(states))
+    order = _by_work(columns, len(states))
     wheels = np.empty((len(columns), len(states)), states.dtype)
     for row, column in zip(wheels, columns, strict=True):
         row[:] = column[order] if column.ndim else column
