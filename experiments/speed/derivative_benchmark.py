@@ -178,12 +178,17 @@ def fastest(table: list[dict]) -> list[tuple]:
 
 
 def alone() -> list[tuple]:
-    """(call, microseconds, seconds to a first answer with an empty cache, the same cached)."""
+    """(call, microseconds, seconds to a first answer with an empty cache, the same cached).
+
+    Python has its own bytecode of every module, as after any installation.
+    """
     params, x, table = vrw.WheelParams(), vrw.paper_start(), []
+    installed = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
+    subprocess.run([sys.executable, "-c", "import vrw_jax, xarray"], env=installed, check=True)
     for name, call in ALONE.items():
         with tempfile.TemporaryDirectory() as folder:
             command = [sys.executable, "-c", FIRST.format(call=call)]
-            where = os.environ | {"JAX_COMPILATION_CACHE_DIR": folder}
+            where = installed | {"JAX_COMPILATION_CACHE_DIR": folder}
             told = lambda command=command, where=where: (
                 subprocess.run(
                     command, env=where, check=True, capture_output=True, text=True
