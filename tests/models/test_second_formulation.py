@@ -23,10 +23,10 @@ CHAINS = 1e-9
 """s; the same of ten steps, eight hundred events together, and of chains of up to two hundred."""
 
 
-def told(friction, damping, slope, x, stoppers, n_steps=1):
+def told(friction, damping, slope, x, stoppers, n_steps=1, max_events=400):
     """Durations over all steps and the last section state, by the library and by the oracle."""
     # Friction is finite: what infinite friction would be chooses the program of test_unilateral.
-    model = vrw.UnilateralWheel(friction=friction, stoppers=stoppers, infinite="paper")
+    model = vrw.UnilateralWheel(friction, max_events, stoppers, infinite="paper")
     params = vrw.WheelParams(damping=damping, slope=slope)
     wheel = complementarity.Wheel(
         friction, c=damping, slope=slope, one_sided=stoppers == "one-sided"
@@ -94,6 +94,17 @@ def test_steps_over_a_wide_box_with_stoppers_that_only_push(friction):
     x = (draw(0.05, 0.15), draw(1.4, 2.2), draw(-0.3, 0.0))
     durations, _, oracle, _ = told(friction, draw(20.0, 400.0), draw(0.2, 0.34), x, "one-sided")
     assert abs(durations.sum() - oracle.sum()) < CHAINS
+
+
+@pytest.mark.slow
+def test_a_chain_of_five_hundred_events_is_cut_by_their_bound_alone():
+    """At 0.2723 s and eight times more three combinations of forces are admissible: both codes take
+    the one with most feet at rest."""
+    whole, _, oracle, _ = told(1e4, 200.0, 0.3, START, "one-sided", max_events=4000)
+    assert abs(whole.sum() - oracle.sum()) < CUT
+    model = vrw.UnilateralWheel(1e4, stoppers="one-sided", infinite="paper")
+    cut = vrw.step(vrw.WheelParams(damping=200.0, slope=0.3), START, model=model, options=TIGHT)
+    assert 1e-5 < abs(cut.period - oracle.sum()) < 1e-4  # 4.2e-5 s: 264 of 558 events are made
 
 
 def test_a_wheel_on_two_stiff_legs_slides_like_a_block_in_the_oracle_too():

@@ -186,7 +186,8 @@ class Walk(NamedTuple):
         ledger, details, tally = select(opens, (fresh, *others), (ledger, details, tally))
         guard = jnp.where(opens, place.foot, now.guard)
         law = law_of(s, friction, self.options, self.one_sided, counted=self.detailed)
-        change, event, code = past(law, place, motion, stance, guard, ledger.events)
+        at = guard, ledger.events, self.max_events
+        change, event, code = past(law, place, motion, stance, *at)
         flow = self.flow(columns, change.stance)
         after = set_off(*stilled((flow, change.motion, self.options.first_step)))
         q, v = coordinates(change.motion)

@@ -26,9 +26,10 @@ SHARE, SEEN = 1e-2, 4e2
 """Least dip that is followed: this share of the tolerance, and no less than so many roundings of a
 leg's length, 1e-13 m in float64."""
 PATIENCE = 100
-"""Events of a step after each of which more is at rest: the speed of rest grows by its own size.
-Walks make 4 to 60. A chain of ever smaller dips ends by this where a tolerance lets it go on; of
-400 events the last dip is as large as a tolerance of 1e-6 leaves from the first."""
+"""Events of a step after each of which more is at rest, or a quarter of those that it may make: the
+speed of rest grows by its own size. Walks make 4 to 60, chains of ever smaller dips hundreds: they
+end by this where a tolerance lets them go on. Of 400 events the last dip is as large as a tolerance
+of 1e-6 leaves from the first."""
 
 
 def least_dip(L0: Elementwise, options: Options) -> Array:
@@ -62,14 +63,16 @@ def past(
     stance: Stance,
     guard: Int[Array, "..."],
     events: Int[Array, "..."],
+    max_events: int,
 ) -> tuple[Change, Event, Int[Array, "..."]]:
     """Through the event of a guard: what it changes, what it was, and STEPPED where all went well.
-    `events`: of this step, before it.
+    `events`: of this step, before it, of `max_events`.
 
     The integrator lets feet drift by its error. One that lifts rises like the third power of time,
     from the slope and from rest: else it would land again at once.
     """
-    law = law._replace(rest=law.rest * (1 + jnp.maximum(events - PATIENCE, 0)))
+    patience = max(PATIENCE, max_events // 4)
+    law = law._replace(rest=law.rest * (1 + jnp.maximum(events - patience, 0)))
     motion, event = settled(law.s, motion, stance.contact, stance.locked), event_of(place, guard)
     change = resolve(law, motion, stance, event)
     outcome = jnp.where(change.solutions > 0, Outcome.STEPPED, Outcome.NO_ADMISSIBLE_CONTACT)

@@ -139,7 +139,7 @@ class UnilateralWheel(AbstractWheel):
     """Feet on the ground push and slide by Coulomb's law; nothing has a fixed role.
 
     - `friction`: coefficient of the ground, `inf` for feet that never slide;
-    - `max_events`: of one step;
+    - `max_events`: of one step; after a quarter of them, 100 at least, ever more is at rest;
     - `stoppers`: "bilateral", a leg in the air that has met its stopper stays on it until its foot
       is loaded; "one-sided", it leaves as soon as the stopper would have to pull;
     - `restitution`: a foot that strikes comes back at so many times its speed, as far as energy
@@ -352,7 +352,8 @@ def _walk(
 
 def _go_on(law: Law, place: Guards, max_events: int, options: Options, now: _Walked) -> _Walked:
     motion, tally = unpack(now.state)
-    change, event, outcome = past(law, place, motion, now.stance, now.guard, now.ledger.events)
+    at = now.guard, now.ledger.events, max_events
+    change, event, outcome = past(law, place, motion, now.stance, *at)
     flow = flow_of(law.s, law.friction, law.one_sided, change.stance, tilt=law.tilt)
     sound = outcome == Outcome.STEPPED
     start = pack(change.motion, tally._replace(clock=jnp.zeros_like(tally.clock)))
