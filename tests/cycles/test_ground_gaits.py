@@ -366,6 +366,21 @@ def test_infinite_friction_walks_as_large_friction_does():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("stoppers", ["bilateral", "one-sided"])
+def test_infinite_friction_is_the_limit_that_growing_friction_nears_as_its_inverse(stoppers):
+    """Ten steps, over all of which one combination of contacts is admissible."""
+    damping, friction = np.array([20.0, 50.0, 100.0, 150.0, 400.0]), 10.0 ** np.arange(4, 7)
+    wheels = vrw.WheelParams(damping=np.repeat(damping, 4))
+    ground = vrw.UnilateralWheel(np.tile([*friction, math.inf], 5), 4000, stoppers)
+    starts, options = np.tile(START, (20, 1)), vrw.Options.tight()
+    found = vrw.steps(wheels, starts, 10, model=ground, options=options)
+    assert np.all(np.asarray(found.outcome) == vrw.Outcome.STEPPED)
+    period = np.asarray(found.durations).sum(-1).reshape(5, 4)
+    shares = friction * (period[:, :3] - period[:, 3:])  # s, of the first order in 1 / friction
+    np.testing.assert_allclose(shares[:, 1:], shares[:, :2], rtol=0.03)
+
+
+@pytest.mark.slow
 def test_gaits_on_real_ground_are_found_cold_slow_and_fast_ones(near):
     both = vrw.limit_cycles(SLOW, model=GROUND)
     assert np.asarray(both.found).tolist() == [True, True]

@@ -107,6 +107,16 @@ def test_a_chain_of_five_hundred_events_is_cut_by_their_bound_alone():
     assert 1e-5 < abs(cut.period - oracle.sum()) < 1e-4  # 4.2e-5 s: 264 of 558 events are made
 
 
+@pytest.mark.parametrize("x", [START, (0.1, 4.0, -0.1)])
+def test_without_friction_a_wheel_falls_back_in_both_codes(x):
+    wheel = complementarity.Wheel(0.0)
+    with pytest.raises(complementarity.LostError, match="fell back"):
+        complementarity.one_step(wheel, complementarity.paper_start(wheel, *x))
+    model = vrw.UnilateralWheel(friction=0.0, infinite="paper")
+    step = vrw.step(vrw.WheelParams(), x, model=model, options=TIGHT)
+    assert int(step.outcome) == vrw.Outcome.FELL_BACK
+
+
 def test_a_wheel_on_two_stiff_legs_slides_like_a_block_in_the_oracle_too():
     wheel = complementarity.Wheel(0.2, slope=0.3)
     q, v = np.r_[0.0, np.cos(np.pi / 8), -np.pi / 8, np.ones(8)], np.zeros(11)
