@@ -42,7 +42,8 @@ class Options(AbstractTold):
       its machine code for explicit solvers on CPUs; "auto", the latter wherever it can;
     - `rtol`, `atol`: relative and absolute tolerance of each local step, in m, rad, m/s, rad/s;
     - `derivative_tightening`: derivatives are computed so much tighter, since they take no part in
-      the step-size control; so they err at most ten times as much as values do without it;
+      the step-size control; so they err at most ten times as much as values do without it, on real
+      ground up to 300 times;
     - `max_phase_time`: of one phase, s;
     - `max_solver_steps`: of one phase, tried steps;
     - `first_step`: of each phase, s;

@@ -17,6 +17,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from vrw_jax.models.unilateral.contacts import OFF
 from vrw_jax.models.unilateral.lanes import UNDER_WAY, Lane, Moves, Walk, Walked
 from vrw_jax.models.unilateral.march import (
     EVENT,
@@ -34,9 +35,9 @@ from vrw_jax.models.unilateral.march import (
     until_none_marches,
 )
 from vrw_jax.models.unilateral.mechanics import if_any
-from vrw_jax.models.unilateral.motion import Stance, guard_sizes
+from vrw_jax.models.unilateral.motion import Flow, Stance, guard_sizes
 from vrw_jax.models.unilateral.shares import FEW, Shares
-from vrw_jax.numerics import Options, Tableau, select
+from vrw_jax.numerics import Options, Tableau, real_stability_limit, select
 
 
 class _March(NamedTuple):
@@ -182,10 +183,12 @@ def _marched(
     """`march.marched`, with the directions carried along and on to the event."""
     flow = flow_at(columns)
     sizes, last = guard_sizes(flow), len(tableau.places) - 1
-    more = _more(ways, like, begin.stance)
+    more, longest = _more(ways, like, begin.stance), _longest(flow, tableau)
 
     def advance(state: tuple[March, Array]) -> tuple[March, Array]:
         now, rows = state
+        h = jnp.where(now.search.on, now.h, jnp.minimum(now.h, longest))
+        now = now._replace(h=h)
         slopes, moved = _stages(
             flow_at, columns, now, ways._replace(rows=rows), like, tableau, more
         )
@@ -279,6 +282,19 @@ def _ends(
     begin = jnp.zeros((), jnp.int32), jnp.zeros_like(q), jnp.zeros_like(q)
     _, first, second = lax.while_loop(lambda state: state[0] < i, turn, begin)
     return q + h * (place * v + h * second), v + h * first
+
+
+CALM = 0.85
+"""Share of the longest stable step that directions take in a leg that swings."""
+
+
+def _longest(flow: Flow, tableau: Tableau) -> Array:
+    """Step beyond which directions grow in a leg that swings, whose damper stops it within m / c:
+    step control knows the motion alone, in which such a leg may be all but at rest.
+    """
+    swings = jnp.any(~flow.stance.locked & (flow.stance.contact == OFF), axis=0)
+    steps = CALM * real_stability_limit(tableau)
+    return jnp.where(swings, steps * flow.s.m / flow.s.c, jnp.inf)
 
 
 def _more(ways: Ways, like: _March, stance: Stance) -> Array:
