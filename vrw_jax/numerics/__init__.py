@@ -65,6 +65,7 @@ from vrw_jax.numerics.lane_minima import Monitors
 from vrw_jax.numerics.lanes import (
     LaneFunction,
     compiled_by_caller,
+    if_any,
     in_batches,
     in_batches_of_numpy,
     in_blocks,

@@ -83,6 +83,15 @@ def compiled_by_caller() -> bool:
     return isinstance(jnp.zeros(()), jax.core.Tracer)
 
 
+def if_any(flag: Array, function: Callable[[PyTree], PyTree], otherwise: PyTree) -> PyTree:
+    """`function` of `otherwise` where the flag, one for all lanes, is set.
+
+    A loop of at most one turn: elsewhere machine code skips it.
+    """
+    turn = lambda now: (jnp.zeros((), bool), function(now[1]))
+    return lax.while_loop(lambda now: now[0], turn, (flag, otherwise))[1]
+
+
 def select(condition: Array, yes: PyTree, no: PyTree) -> PyTree:
     """`jnp.where`, leaf by leaf."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)

@@ -24,6 +24,7 @@ from jax.interpreters import batching
 from jaxtyping import Array
 
 from vrw_jax.numerics.derivatives import without_derivative
+from vrw_jax.numerics.lanes import if_any
 from vrw_jax.numerics.tableaus import Place, Slope, Tableau, stage_at
 from vrw_jax.numerics.types import Vector
 
@@ -252,14 +253,12 @@ class Moving(NamedTuple):
     def onward(
         self, tableau: Tableau, stages: list[Place], starts: Array, h: Array, accepted: Array
     ) -> Array:
-        """The same where the step is accepted, by a loop of at most one turn: a group of which no
-        lane goes on skips it."""
+        """The same where the step is accepted; a group of which no lane goes on skips it."""
 
-        def turn(now: tuple[Array, Array]) -> tuple[Array, Array]:
-            along = self.along(tableau, stages, now[1], h)
-            return jnp.zeros_like(now[0]), jnp.where(accepted, along, now[1])
+        def carried(starts: Array) -> Array:
+            return jnp.where(accepted, self.along(tableau, stages, starts, h), starts)
 
-        return lax.while_loop(lambda now: now[0], turn, (jnp.any(accepted), starts))[1]
+        return if_any(jnp.any(accepted), carried, starts)
 
     def of_values(self, values: Callable[..., Any], place: Place, directions: Array) -> Any:
         """How `values(constants, held, q, v)` move with the directions there."""

@@ -34,10 +34,9 @@ from vrw_jax.models.unilateral.march import (
     tried_by,
     until_none_marches,
 )
-from vrw_jax.models.unilateral.mechanics import if_any
 from vrw_jax.models.unilateral.motion import Flow, Stance, guard_sizes
 from vrw_jax.models.unilateral.shares import FEW, Shares
-from vrw_jax.numerics import Options, Tableau, real_stability_limit, select
+from vrw_jax.numerics import Options, Tableau, if_any, real_stability_limit, select
 
 
 class _March(NamedTuple):
@@ -204,7 +203,7 @@ def _marched(
             )
             few, others = slice(0, 3 + FEW), slice(3 + FEW, None)
             still = here.q[others], here.v[others]
-            ends = zip(at(few), if_any(more, lambda: at(others), still), strict=True)
+            ends = zip(at(few), if_any(more, lambda _: at(others), still), strict=True)
             q, v = map(jnp.concatenate, ends)
             told = here.told
             if told is not None:
@@ -248,7 +247,7 @@ def _stages(
             way = _at(ways.rows, k, like)
             before = known.reshape(-1, *like.slope.shape)
             ends = lambda some: _ends(tableau, i, way, before, h, some)
-            column = if_any(jnp.any(k < ways.by_columns), lambda: _at(own, k, none), none)
+            column = if_any(jnp.any(k < ways.by_columns), lambda _: _at(own, k, none), none)
             row = shares.along(ends, column, more)
             return jnp.where((i > 0) | fresh, row, known[:size])
 

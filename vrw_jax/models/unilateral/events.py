@@ -42,14 +42,13 @@ from vrw_jax.models.unilateral.mechanics import (
     free_acceleration,
     free_velocity,
     hub_of,
-    if_any,
     kinetic_energy,
     of_slots,
     slots_of,
     stilled,
 )
 from vrw_jax.models.unilateral.motion import Guards, Stance, as_row
-from vrw_jax.numerics import Elementwise, select
+from vrw_jax.numerics import Elementwise, if_any, select
 from vrw_jax.wheel import Symbols
 
 
@@ -365,7 +364,7 @@ def _at_rest(
     new = jnp.any((mode != contact) | (on != at_stopper), axis=0)
     s, still, friction = stilled((law.s, motion, law.friction))
 
-    def turned() -> Array:
+    def turned(_: Array) -> Array:
         """Feet whose slide that would turn round: they come to rest, too."""
         after, _ = foot_speeds(settled(s, still, mode, on, friction), legs)
         return ((mode == SLIP_DOWN) & (after < 0.0)) | ((mode == SLIP_UP) & (after > 0.0))
@@ -396,7 +395,7 @@ def _sided(law: Law, motion: WheelMotion, stance: Stance, event: Event) -> Event
     friction, mode = of_slots(law.friction, slots), slots.codes(stance.contact)
     slides = event.lifts & (mode == STICK) & (as_row(friction) == jnp.inf)
     stops = slots, mode, slots.flags(stance.locked), stance.locked & ~slots.filled
-    forces = lambda: in_motion(Stand(law.s, motion, friction, *stops)).tangential
+    forces = lambda _: in_motion(Stand(law.s, motion, friction, *stops)).tangential
     none = jnp.zeros_like(motion.theta), jnp.zeros_like(motion.theta)
     uphill = jnp.stack(if_any(jnp.any(slides), forces, none)) > 0.0
     return event._replace(

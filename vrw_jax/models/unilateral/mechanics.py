@@ -9,7 +9,6 @@ element by element over lanes too, one more axis behind that of the legs.
 """
 
 import math
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -83,12 +82,6 @@ def stilled(tree: Any) -> Any:
     """The same, which moves with nothing."""
     moving, rest = eqx.partition(tree, eqx.is_inexact_array)
     return eqx.combine(lax.stop_gradient(moving), rest)
-
-
-def if_any(flag: Array, function: Callable[[], Any], otherwise: Any) -> Any:
-    """What `function` tells where the flag, one for all lanes, is set."""
-    turn = lambda _: (jnp.zeros((), bool), function())
-    return lax.while_loop(lambda state: state[0], turn, (flag, otherwise))[1]
 
 
 class Slots(NamedTuple):

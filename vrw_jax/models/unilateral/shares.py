@@ -38,11 +38,11 @@ from vrw_jax.models.unilateral.mechanics import (
     Vector3,
     WheelMotion,
     foot_velocity,
-    if_any,
     over_legs,
     posture_of,
 )
 from vrw_jax.models.unilateral.motion import Flow, Forces, forces, tally_rates
+from vrw_jax.numerics import if_any
 from vrw_jax.wheel import PARAMETER_NAMES
 
 FEW = 3
@@ -182,7 +182,7 @@ class Shares(NamedTuple):
         whole = moving.left(slice(None))
         few, n = moving.metres(_LEGS[0]), len(motion.L)
         none = lambda x: jnp.zeros((n - FEW, *x.shape[1:]) if x.ndim > 1 else x.shape, x.dtype)
-        others = if_any(more, lambda: moving.metres(_LEGS[1]), jax.tree.map(none, few))
+        others = if_any(more, lambda _: moving.metres(_LEGS[1]), jax.tree.map(none, few))
 
         def slid(x: Pair, tangential: Pair) -> Array:
             answer = now.answer._replace(tangential=tangential)
@@ -221,7 +221,7 @@ class Shares(NamedTuple):
         for which in ALIKE:
             some = jnp.stack([row if i in which else 0.0 * row for i, row in enumerate(way)])
 
-            def add(total: Share = total, some: Array = some) -> Share:
+            def add(total: Share, some: Array = some) -> Share:
                 stand, damping = push(some)
                 left, slots = self.whole(stand)
                 share = Share(left.legs, in_all(slots, left), none.speed, damping)
@@ -241,7 +241,7 @@ class Shares(NamedTuple):
         others = lambda: ends(slice(3 + FEW, None))
         plus = lambda one, other: jax.tree.map(operator.add, one, other)
         lengths = self._lengths(0, *few)
-        lengths = if_any(more, lambda: plus(lengths, self._lengths(1, *others())), lengths)
+        lengths = if_any(more, lambda _: plus(lengths, self._lengths(1, *others())), lengths)
         at = lambda a, b, c: a * theta + b * dtheta + c
         parts = [jax.tree.map(at, *rows) for rows in zip(*self.angle, column, strict=True)][1:]
         acts, speed, damping = parts
@@ -256,7 +256,7 @@ class Shares(NamedTuple):
         hub, pull, tangential = self.answered(free)
         legs = lambda which, *way: self._legs(which, hub, pull, at, column.legs, *way)
         none = jnp.zeros((len(self.damping) - FEW, *theta.shape), theta.dtype)
-        moved = [jnp.stack(hub), legs(0, *few), if_any(more, lambda: legs(1, *others()), none)]
+        moved = [jnp.stack(hub), legs(0, *few), if_any(more, lambda _: legs(1, *others()), none)]
         if self.moving.flow.tallied:
             speed = speed[0] + v[0], speed[1] + v[0]
             tangential = tuple(map(operator.add, tangential, acts.grip))
