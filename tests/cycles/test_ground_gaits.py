@@ -411,9 +411,16 @@ def test_a_step_of_lanes_tells_what_a_single_wheel_does_and_how_it_moves(scene, 
     np.testing.assert_array_equal(only.slip[:, 0], moved.slip[:, 0])
     assert not only.slip[:, 1:].any()
     definition = vrw.Options.tight().by("diffrax")
-    alone = vrw.step(params, x, model=ground, options=definition)
     shared = stoppers == "one-sided"
     times = lambda durations: durations.sum(keepdims=True) if shared else durations
+
+    def told(c, mu, rate):
+        wheel, model = vrw.WheelParams(damping=c), eqx.tree_at(lambda m: m.friction, ground, mu)
+        alone = model.step(wheel, jnp.asarray(x).at[1].set(rate), definition)
+        return jnp.concatenate([alone.section_state[:20], times(alone.durations)]), alone
+
+    at = [jnp.asarray(v) for v in (damping, friction, x[1])]
+    exact, alone = jax.jacfwd(told, argnums=(0, 1, 2), has_aux=True)(*at)
     for name in ("section_state", "durations", "post_impact", "slip", "energy_impacts",
                  "energy_damping", "energy_friction", "step_length", "mode_durations"):  # fmt: skip
         told = getattr(step, name)[0]
@@ -424,15 +431,6 @@ def test_a_step_of_lanes_tells_what_a_single_wheel_does_and_how_it_moves(scene, 
         np.testing.assert_allclose(told, getattr(alone, name), rtol=near, atol=near, err_msg=name)
     assert abs(float(step.durations[0].sum()) - float(alone.period)) < 1e-10
     assert int(step.events[0]) == int(alone.events)
-
-    def told(c, mu, rate):
-        wheel, model = vrw.WheelParams(damping=c), eqx.tree_at(lambda m: m.friction, ground, mu)
-        start = jnp.asarray(x).at[1].set(rate)
-        advance = model.advance(wheel, start, definition)
-        return jnp.concatenate([advance.section_state[:20], times(advance.durations)])
-
-    at = [jnp.asarray(v) for v in (damping, friction, x[1])]
-    exact = jax.jacfwd(told, argnums=(0, 1, 2))(*at)
     names = (*ground.parameter_names, "theta", "dtheta")
     for name, column in zip(("damping", "friction", "dtheta"), exact, strict=True):
         place = names.index(name)

@@ -179,17 +179,3 @@ def test_high_friction_from_any_start_has_an_admissible_contact_at_every_impact(
     assert lost.sum() <= n // 50
     assert not np.any(np.asarray(found.section_state)[outcome != vrw.Outcome.STEPPED])
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(found))
-
-
-@pytest.mark.slow
-def test_a_chain_of_dips_ends_where_a_tight_tolerance_lets_it_go_on():
-    """Wheels of `experiments.ground.survey`: without patience ten of 6,827 steps were lost here."""
-    draw, wheels = np.random.default_rng(0).uniform, 128
-    params = vrw.WheelParams(damping=draw(20.0, 400.0, wheels), slope=draw(0.1, 0.34, wheels))
-    starts = np.stack([draw(*some, wheels) for some in ((0.05, 0.15), (0.8, 2.2), (-0.3, 0.0))], 1)
-    ground = wheel_of(np.linspace(1.0, 3.0, wheels))
-    options = vrw.Options(solver="Tsit5", rtol=1e-12, atol=1e-12)
-    found = vrw.steps(params, starts, 60, model=ground, options=options)
-    lost = lambda *codes: np.sum(np.isin(np.asarray(found.outcome), codes))
-    assert lost(vrw.Outcome.TOO_MANY_EVENTS, vrw.Outcome.NO_ADMISSIBLE_CONTACT) == 0
-    assert lost(vrw.Outcome.SOLVER_GAVE_UP) == 0
