@@ -333,9 +333,10 @@ def _wrong(
     limit = each(lambda value: value == jnp.inf, friction)
     rough = rough_of(friction)
     found = answer(s, hub, free, contact, on, friction)
-    worst = jnp.zeros_like(found.hub[0])
+    worst, along_slope = jnp.zeros_like(found.hub[0]), []
     for i in range(2):
         mode = contact[i]
+        along_slope.append(on[i] & (mode != OFF) & ((mode == STICK) | _at(i, limit)))
         unless = lambda known, value: jnp.where(known, 0.0, value)
         known = has(allowed.known_contact[i], mode)
         t, n, x, z = (v[i] for v in (found.tangential, found.normal, found.foot_x, found.foot_z))
@@ -350,7 +351,8 @@ def _wrong(
         stopper = jnp.where(on[i], -found.stopper[i] / small.force, opens)
         worst = jnp.maximum(worst, jnp.maximum(unless(allowed.stays[i], foot), stopper))
         worst = jnp.where(jnp.isfinite(n) & jnp.isfinite(t), worst, jnp.inf)
-    return worst
+    # Both feet have a force of its own along the slope, which of a rigid wheel are one told twice.
+    return jnp.where(along_slope[0] & along_slope[1], jnp.inf, worst)
 
 
 def choose(
