@@ -103,7 +103,7 @@ def simulate(
         "n_steps": told.n_stepped,
         "outcome": told.outcome.name,
         "outcome_meaning": told.outcome.meaning,
-        "start": [float(v) for v in x],
+        "start": np.asarray(x).tolist(),
     }
     origin = telling.attrs | provenance(params, model, options)
     labels = {name: data.pop(name) for name in ("step", "phase") if name in data}
@@ -152,13 +152,14 @@ def joined(telling: Telling, x: Array, n_steps: int, weight_along: float) -> Joi
     while outcome == Outcome.STEPPED and stepped < n_steps:
         told = telling.stretches_of(x)
         happened, part = told.durations > 0.0, dict[str, np.ndarray]()
+        some = slice(None) if happened.all() else happened  # of all nothing is copied
         for name, values in told.columns.items():
-            part[name] = values[happened].reshape(-1, *values.shape[2:])
+            part[name] = values[some].reshape(-1, *values.shape[2:])
         for name in telling.along:
-            part[name] += place
+            part[name] = part[name] + place
         for name in part.keys() & FALLING:
-            part[name] -= weight_along * place
-        part["time"] += time
+            part[name] = part[name] - weight_along * place
+        part["time"] = part["time"] + time
         part["step"] = np.full(len(part["time"]), stepped)
         parts.append(part)
         outcome = told.outcome
