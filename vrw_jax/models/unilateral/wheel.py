@@ -206,7 +206,7 @@ class UnilateralWheel(AbstractWheel):
 
     def full_section(self, params: WheelParams, x: Array) -> FullState:
         """The full section state of the paper's (theta-, dtheta-, dL1-): Leg 1 planted."""
-        return embedded(params.symbols(), x) if x.shape == (3,) else x
+        return _embedded(params, x) if x.shape == (3,) else x
 
     def over_steps(self, params: WheelParams, n_steps: int) -> GroundOfStep | None:
         over, given = (n_steps,), (params.slope, self.friction)
@@ -389,6 +389,9 @@ def _go_on(law: Law, place: Guards, max_events: int, options: Options, now: _Wal
         details=details,
         log=log,
     )
+
+
+_embedded = jax.jit(lambda params, x: embedded(params.symbols(), x))
 
 
 @functools.cache
