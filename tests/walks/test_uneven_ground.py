@@ -67,3 +67,41 @@ def test_a_walk_over_a_rough_floor_is_that_of_another_code():
     assert abs(float(walk.steps.section_state[-1, 0]) - theta) < 1e-9
     level = vrw.walk(vrw.WheelParams(), START, 4, model=vrw.UnilateralWheel())
     assert abs(float(jnp.sum(level.steps.durations - walk.steps.durations))) > 1e-3
+
+
+FLOORS = 0.3 + 0.02 * np.array([[0.0, 1.0, -1.0], [1.0, -1.0, 2.0], [-2.0, 0.5, 0.0]])
+GROUNDS = np.array([[0.7, 0.5, 0.9], [0.6, 0.8, 0.7], [1.0, 0.6, 0.6]])
+MANY = np.tile((0.1, 1.6, -0.1), (3, 1))
+
+
+@pytest.mark.slow
+def test_a_batch_walks_over_its_floors_as_wheels_do_one_by_one():
+    damping = np.array([250.0, 270.0, 300.0])
+    params, ground = vrw.WheelParams(damping=damping, slope=FLOORS), vrw.UnilateralWheel
+    found = vrw.steps(params, MANY, 3, model=ground(friction=GROUNDS))
+    assert found.n_stepped.tolist() == [3, 3, 3]
+    for i, (c, slope, friction) in enumerate(zip(damping, FLOORS, GROUNDS, strict=True)):
+        one = vrw.WheelParams(damping=c, slope=slope)
+        walk = vrw.walk(one, MANY[i], 3, model=ground(friction=friction))
+        # The same program for many and for one; XLA sums in another order.
+        np.testing.assert_allclose(found.durations[i], walk.steps.durations[-1], atol=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"n_steps": 4}, r"slope has shape \(3, 3\), but there are 3 states and 4 steps: give one"),
+        ({"params": vrw.WheelParams(damping=[1.0, 2.0])}, r"damping has shape \(2,\), but there"),
+        ({"derivatives": ("slope",)}, "without derivatives: leave engine and derivatives out"),
+        ({"engine": "lanes"}, "is walked by vrw.UnilateralWheel and 'diffrax'"),
+        ({"model": None}, "is walked by vrw.UnilateralWheel and 'diffrax'"),
+    ],
+)
+def test_floors_that_a_batch_can_not_walk_over_are_one_sentence(changes, sentence):
+    given = {
+        "params": vrw.WheelParams(slope=FLOORS),
+        "n_steps": 3,
+        "model": vrw.UnilateralWheel(friction=GROUNDS),
+    }
+    with pytest.raises(ValueError, match=sentence):
+        vrw.steps(states=MANY, **given | changes)

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array
 
 from vrw_jax.batches.fixed_work import fixed_gait_step
+from vrw_jax.batches.floors import floors_of, over_floors
 from vrw_jax.batches.ground import ON_GROUND, on_ground
 from vrw_jax.batches.programs import run_lanes
 from vrw_jax.batches.stiffness import (
@@ -88,7 +89,8 @@ def steps(
 
     Derivatives go through all steps and their events; those of a lane that fell are zero. Not by
     collocation. On real ground (`UnilateralWheel`, its friction a scalar or of the lanes' axis) the
-    only engine is "lanes". Not for use inside `jax.jit`: it compiles itself, once.
+    only engine is "lanes", and "diffrax" where slope or friction, of shape (lanes, n_steps), differ
+    from step to step as in `walk`. Not for use inside `jax.jit`: it compiles itself, once.
 
     Args:
         params: the wheels; fields are scalars or of shape (lanes,).
@@ -118,6 +120,8 @@ def steps(
     chosen("engine", engine, ENGINES)
     n_steps = whole("n_steps", n_steps)
     x: np.ndarray = state_of(states, "states", known_reals)
+    if floors_of(params, rung):
+        return over_floors(params, x, n_steps, rung, options, engine, derivatives)
     columns = _columns(params, x, rung, options)
     x = x.astype(columns[0].dtype, copy=False)
     by_legs = rung.lanes == "legs"
