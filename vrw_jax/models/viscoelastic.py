@@ -160,17 +160,21 @@ class ViscoelasticWheel(AbstractWheel):
 def _compiled(model: ViscoelasticWheel, structure: Any, detailed: bool) -> Forward:
     """What a step tells, over the leaves of (params, x, options), differentiable in any mode."""
 
+    static = jax.tree.unflatten(structure, [0.0] * structure.num_leaves)[2]
+    engine = "lanes" if lanes_can(static) else "diffrax"
+
     def by_diffrax(tighten: bool, *leaves: Array) -> tuple:
+        """Beside lanes derivatives of their derivatives alone, under the same engine's name."""
         params, x, options = jax.tree.unflatten(structure, leaves)
         options = options.for_derivatives() if tighten else options
         walked = model._walk(params, x, options, monitored=detailed)
+        result: Any = advance_of(walked, engine)
         if detailed:
-            return eqx.partition(result_of(walked, model.friction, "diffrax"), eqx.is_inexact_array)
-        return eqx.partition(advance_of(walked, "diffrax"), eqx.is_inexact_array)
+            result = result_of(walked, model.friction, engine)
+        return eqx.partition(result, eqx.is_inexact_array)
 
     values, tighter = (functools.partial(by_diffrax, tighten) for tighten in (False, True))
-    static = jax.tree.unflatten(structure, [0.0] * structure.num_leaves)[2]
-    if not lanes_can(static):
+    if engine == "diffrax":
         return any_mode(values, tighter)
     given = structure, model.stop_at_lift_off, model.friction if detailed else None
     return any_mode(told_by_lanes(*given), tighter, functools.partial(moved_by_lanes, *given))
