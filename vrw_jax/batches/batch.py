@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array
 
 from vrw_jax.batches.fixed_work import fixed_gait_step
-from vrw_jax.batches.floors import floors_of, over_floors
+from vrw_jax.batches.floors import over_floors
 from vrw_jax.batches.ground import ON_GROUND, on_ground
 from vrw_jax.batches.programs import run_lanes
 from vrw_jax.batches.stiffness import (
@@ -120,13 +120,13 @@ def steps(
     chosen("engine", engine, ENGINES)
     n_steps = whole("n_steps", n_steps)
     x: np.ndarray = state_of(states, "states", known_reals)
-    if floors_of(params, rung):
-        return over_floors(params, x, n_steps, rung, options, engine, derivatives)
-    columns = _columns(params, x, rung, options)
+    columns = _columns(params, x, rung, options, n_steps)
     x = x.astype(columns[0].dtype, copy=False)
     by_legs = rung.lanes == "legs"
-    moved = _moved(derivatives, ON_GROUND if by_legs else BY_PHASES, engine)
     given = rung, columns, x, n_steps, options, engine, params.n_legs
+    if any(np.ndim(column) == 2 for column in (*columns, getattr(rung, FRICTION, 0.0))):
+        return over_floors(*given, derivatives)
+    moved = _moved(derivatives, ON_GROUND if by_legs else BY_PHASES, engine)
     return on_ground(*given, moved) if by_legs else _by_phases(*given, durations, moved)
 
 
@@ -147,9 +147,10 @@ def _moved(derivatives: Sequence[str], known: tuple[str, ...], engine: str) -> l
 
 
 def _columns(
-    params: WheelParams, states: np.ndarray, model: AbstractWheel, options: Options
+    params: WheelParams, states: np.ndarray, model: AbstractWheel, options: Options, n_steps: int
 ) -> list[np.ndarray]:
-    """Parameters, one for all or of each lane; one clear sentence for what can't be walked."""
+    """Parameters, one for all or of each lane, slopes of each step too; one clear sentence for what
+    can't be walked."""
     sizes = [3]
     if states.ndim != 2 or states.shape[1] != 3:
         sizes = sorted({3, model.section_size(params)})
@@ -158,15 +159,17 @@ def _columns(
             f"states have shape {states.shape}, but they are section states, shape (lanes, "
             f"{' or '.join(map(str, sizes))}): write states[None] for a single one."
         )
-    columns = [getattr(params, name) for name in PARAMETER_NAMES]
+    n, columns = len(states), [getattr(params, name) for name in PARAMETER_NAMES]
     held = np.result_type(*(column.dtype for column in columns))
     Options.require_reachable(options, held)  # a bound method takes equinox 0.1 ms to make
     of_ground = getattr(model, FRICTION, np.zeros(()))
     for name, column in zip((*PARAMETER_NAMES, FRICTION), (*columns, of_ground), strict=True):
-        if np.shape(column) not in ((), states.shape[:1]):
+        of_steps = name in ("slope", FRICTION) and np.ndim(column) == 2
+        if np.shape(column) not in ((), (n,), *[(n, n_steps)] * of_steps):
             raise ValueError(
-                f"{name} has shape {np.shape(column)}, but there are {len(states)} states: give "
-                "one value for all, or one for each."
+                f"{name} has shape {np.shape(column)}, but there are {n} states"
+                f"{f' and {n_steps} steps' * of_steps}: give one value for all, or one for each"
+                f"{' and each of its steps' * of_steps}."
             )
     dtype = np.promote_types(held, states.dtype)
     return [np.asarray(column, dtype) for column in columns]

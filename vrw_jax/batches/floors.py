@@ -11,44 +11,31 @@ import numpy as np
 from vrw_jax.batches.walked import Steps
 from vrw_jax.numerics import Options, in_batches_of_numpy
 from vrw_jax.walks import walk
-from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, WheelParams, wheel_of
+from vrw_jax.wheel import wheel_of
 
 SIZES = 16, 256
 """Lanes at a time."""
 
 
-def floors_of(params: WheelParams, model: Any) -> dict[str, Any]:
-    """Slope and friction, if either differs from step to step."""
-    ground = {"slope": params.slope, FRICTION: getattr(model, FRICTION, 0.0)}
-    return ground if any(np.ndim(x) == 2 for x in ground.values()) else {}
-
-
 def over_floors(
-    params: WheelParams,
+    model: Any,
+    wheels: list[np.ndarray],
     states: np.ndarray,
     n_steps: int,
-    model: Any,
     options: Options,
     engine: str,
+    n_legs: int,
     asked: Sequence[str],
 ) -> Steps:
     """See `steps`."""
-    n = len(states)
     if model.lanes != "legs" or engine not in ("auto", "diffrax") or len(asked):
         raise ValueError(
             "ground that differs from step to step is walked by vrw.UnilateralWheel and 'diffrax', "
             "without derivatives: leave engine and derivatives out, or map vrw.walk over lanes."
         )
-    given = *(getattr(params, name) for name in PARAMETER_NAMES), model.friction
-    for name, x in zip((*PARAMETER_NAMES, FRICTION), given, strict=True):
-        over = ((n, n_steps),) if name in ("slope", FRICTION) else ()
-        if np.shape(x) not in ((), (n,), *over):
-            raise ValueError(
-                f"{name} has shape {np.shape(x)}, but there are {n} states and {n_steps} steps: "
-                f"give one value, one for each lane{', or its row over the steps' * len(over)}."
-            )
-    columns = [np.broadcast_to(x, (n, *np.shape(x)[1:])) for x in given]
-    walked = lambda x, *columns: _mapped(model, options, params.n_legs, n_steps, x, columns)
+    n, given = len(states), (*wheels, np.asarray(model.friction, states.dtype))
+    columns = [np.broadcast_to(x, (n, *x.shape[1:])) for x in given]
+    walked = lambda x, *columns: _mapped(model, options, n_legs, n_steps, x, columns)
     x, durations, outcome, n_stepped, tried = in_batches_of_numpy(walked, SIZES, states, *columns)
     none = np.zeros(n, np.int32)
     told = x, durations, outcome, n_stepped, tried, none > 0, none

@@ -16,11 +16,11 @@ from jaxtyping import Array
 
 from vrw_jax.cycles.attracting import slow_gaits
 from vrw_jax.cycles.by_walking import (
-    FINEST,
     AbstractWalkingFinder,
     SectionFinder,
     WalkedCycle,
     cycle_from,
+    finest,
     gait_of,
     of_steps,
     walked_cycle,
@@ -241,7 +241,7 @@ def _newton(
     maps = Periods(model, n_legs, period_n, values)
     looser = [np.maximum(tolerance, LOOSE) for tolerance in (options.rtol, options.atol)]
     loose = eqx.tree_at(lambda o: (o.rtol, o.atol), options, jax.device_put(looser))
-    tolerance, every = max(FINEST, float(options.rtol)), np.ones(len(values), bool)
+    tolerance, every = float(finest(options)), np.ones(len(values), bool)
     rough, by_start = _corrected(maps, loose, start, False, ROUGH, every)
     x, near = np.where(rough.converged[:, None], rough.x, start), rough.converged
     exact = maps.around(options, x, False, False)

@@ -168,10 +168,10 @@ def _compiled(model: ViscoelasticWheel, structure: Any, detailed: bool) -> Forwa
         params, x, options = jax.tree.unflatten(structure, leaves)
         options = options.for_derivatives() if tighten else options
         walked = model._walk(params, x, options, monitored=detailed)
-        result: Any = advance_of(walked, engine)
-        if detailed:
-            result = result_of(walked, model.friction, engine)
-        return eqx.partition(result, eqx.is_inexact_array)
+        told: Advance | StepResult = (
+            result_of(walked, model.friction, engine) if detailed else advance_of(walked, engine)
+        )
+        return eqx.partition(told, eqx.is_inexact_array)
 
     values, tighter = (functools.partial(by_diffrax, tighten) for tighten in (False, True))
     if engine == "diffrax":
