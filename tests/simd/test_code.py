@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import threading
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ from support.machine_code import Forgetful
 from vrw_jax import simd
 from vrw_jax.simd import code
 
-LANES = [np.arange(4.0)]
+LANES, X = [np.arange(4.0)], np.arange(4.0)
 
 
 class Folder(dict):
@@ -69,6 +70,11 @@ def test_the_same_trace_under_another_key_is_not_compiled(monkeypatch, process, 
     assert len(traces) == 2
 
 
+def run_two(x, key, *functions):
+    calls = [simd.lane_function(f, f, (key, i), None) for i, f in enumerate(functions)]
+    return sum(call(x) for call in calls)
+
+
 def test_other_traces_and_other_ways_of_compiling_have_code_of_their_own(monkeypatch):
     store = Folder()
     assert run(counted(2.0)[0], 2, store)[3] == 6.0
@@ -79,6 +85,23 @@ def test_other_traces_and_other_ways_of_compiling_have_code_of_their_own(monkeyp
     assert len(traces) == 1
     names = [name.split("_")[1] for name in store]
     assert (names.count("code"), names.count("index")) == (3, 3)
+
+
+def test_python_traces_on_while_llvm_is_at_work_and_hears_of_its_failure(monkeypatch):
+    may, compiled = threading.Event(), code.compiled
+    monkeypatch.setattr(code, "compiled", lambda text: may.wait(60) and compiled(text))
+    both = lambda x: run_two(x, "at work", lambda x: 2.5 * x, lambda x: 3.5 * x)
+    traced = jax.jit(both).trace(X)
+    may.set()
+    np.testing.assert_array_equal(traced.lower().compile()(X), 6.0 * X)
+
+    def refuse(text):
+        raise RuntimeError("no such instruction")
+
+    monkeypatch.setattr(code, "compiled", refuse)
+    traced = jax.jit(lambda x: run_two(x, "refused", lambda x: 4.5 * x, lambda x: x / 7.0)).trace(X)
+    with pytest.raises(RuntimeError, match="no such instruction"):
+        traced.lower()
 
 
 def test_an_index_whose_code_is_gone_is_made_anew(process):

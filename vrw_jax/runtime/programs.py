@@ -101,7 +101,7 @@ def _exported(function: Callable, arguments: tuple, settings: object) -> export.
 def _calls(trace: Any) -> set[str]:
     """Names of the machine code that a trace calls."""
     trace = getattr(trace, "jaxpr", trace)
-    names = {e.params["target_name"] for e in trace.eqns if e.primitive.name == "ffi_call"}
+    names = {e.params["code"].name for e in trace.eqns if e.primitive is simd.CALLED}
     for equation in trace.eqns:
         for leaf in jax.tree.leaves(list(equation.params.values())):
             if hasattr(getattr(leaf, "jaxpr", leaf), "eqns"):

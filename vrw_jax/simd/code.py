@@ -10,6 +10,7 @@ import gc
 import hashlib
 import json
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextvars import ContextVar
 from threading import RLock
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -36,9 +37,13 @@ class Store(Protocol):
 class Code(NamedTuple):
     """A function of lanes as machine code."""
 
-    name: str  # a digest of what LLVM compiled, by which programs of JAX call it
+    name: str  # a digest of what LLVM compiles, by which programs of JAX call it
     out: tuple[tuple[tuple[int, ...], np.dtype], ...]  # of each result: axes before lanes, numbers
-    code: bytes
+    made: Future[bytes]
+
+    def ready(self) -> bytes:
+        """The code, which LLVM may still be at work on."""
+        return self.made.result()
 
 
 def code_of(
@@ -57,7 +62,7 @@ def code_of(
 def _written(
     function: Callable, shapes: Any, width: int, index: str, store: Store | None, small: int
 ) -> Code:
-    """Traced; compiled only if nothing of the same text was."""
+    """Traced; compiled only if nothing of the same text was, while Python goes on."""
     with _python, _uncollected():
         closed = traced(function, *shapes)
         text = module_text(closed, width, small)
@@ -65,11 +70,17 @@ def _written(
     name = f"lanes_code_{_digest(f'{out}{how_compiled()}{text}'.encode())}"
     code = kept_code(name, store)
     if code is None:
-        content = out.encode() + b"\n" + compiled(text)
-        code = _made[name] = _told(name, content)
-        if store is not None:
-            store.keep(name, content)
+        made = _llvm.submit(_made_of, text, out, name, index, store)
+        code = _made[name] = Code(name, _results(out), made)
+    elif store is not None:
+        store.keep(index, name.encode())
+    return code
+
+
+def _made_of(text: str, out: str, name: str, index: str, store: Store | None) -> bytes:
+    code = compiled(text)
     if store is not None:
+        store.keep(name, out.encode() + b"\n" + code)
         store.keep(index, name.encode())
     return code
 
@@ -80,7 +91,10 @@ def kept_code(name: str, store: Store | None) -> Code | None:
         content = store.kept(name) if store is not None else None
         if content is None:
             return None
-        _made[name] = _told(name, content)
+        out, _, code = content.partition(b"\n")
+        made: Future[bytes] = Future()
+        made.set_result(code)
+        _made[name] = Code(name, _results(out), made)
     return _made[name]
 
 
@@ -109,10 +123,12 @@ _python = RLock()
 """Threads write their programs in turn: the first is soon with LLVM, which needs no lock."""
 
 
-def _told(name: str, content: bytes) -> Code:
-    """What is kept under a name."""
-    out, _, code = content.partition(b"\n")
-    return Code(name, tuple((tuple(n), np.dtype(kind)) for n, kind in json.loads(out)), code)
+_llvm = ThreadPoolExecutor(1, "llvm")
+"""Compiles what is written while Python traces on; for two at a time it has one lock."""
+
+
+def _results(told: str | bytes) -> tuple[tuple[tuple[int, ...], np.dtype], ...]:
+    return tuple((tuple(n), np.dtype(kind)) for n, kind in json.loads(told))
 
 
 def traced(function: Callable, *shapes: Any) -> ClosedJaxpr:

@@ -1,73 +1,60 @@
-"""Machine code as a function that XLA calls from afar, by a name."""
+"""Machine code as a function that programs of JAX call, by a name."""
 
+import functools
+from collections.abc import Sequence
 from threading import Lock
 from typing import Any
 
 import jax
-import llvmlite.ir as ir
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
 
+from vrw_jax.simd.code import Code
+from vrw_jax.simd.handler import HANDLER
 from vrw_jax.simd.machine import Loaded
-from vrw_jax.simd.numbers import BYTE, INT, LONG
-
-HANDLER = "handler"
 
 registered: dict[str, Loaded] = {}
 """Machine code that JAX's programs may call, by name; XLA never lets go of it."""
 _registering = Lock()
 
 
-def register(name: str, code: bytes) -> None:
+def register(code: Code) -> None:
     """From now on JAX's programs may call this code by its name."""
+    made = code.ready()
     with _registering:
-        if name not in registered:
-            loaded = Loaded(code)
-            jax.ffi.register_ffi_target(name, loaded.capsule(HANDLER), platform="cpu")
-            registered[name] = loaded
+        if code.name not in registered:
+            loaded = Loaded(made)
+            jax.ffi.register_ffi_target(code.name, loaded.capsule(HANDLER), platform="cpu")
+            registered[code.name] = loaded
 
 
-def add_handler(module: ir.Module, kernel: ir.Function, n_in: int, n_out: int, width: int) -> None:
-    """`XLA_FFI_Error *handler(XLA_FFI_CallFrame *)`: the kernel as XLA calls functions from afar.
+CALLED = Primitive("machine_code")
+"""A call of machine code by programs of JAX, which need it only when they are compiled themselves:
+until then LLVM may be at work on it."""
+CALLED.multiple_results = True
 
-    Offsets in bytes from its xla/ffi/api/c_api.h, whose structs only ever grow at their ends.
-    """
-    pointer = ir.PointerType()
-    handler = ir.Function(module, ir.FunctionType(pointer, [pointer]), HANDLER)
-    handler.attributes.add("nounwind")
-    build = ir.IRBuilder(handler.append_basic_block("entry"))
-    asked, called = (handler.append_basic_block(name) for name in ("asked", "called"))
-    frame, none = handler.args[0], ir.Constant(pointer, None)
 
-    def at(base: Any, offset: int) -> Any:
-        return build.gep(base, [ir.Constant(LONG, offset)], source_etype=BYTE)
+@CALLED.def_abstract_eval
+def _results(*given: Any, code: Code, out: Sequence[jax.ShapeDtypeStruct]) -> list[Any]:
+    return [jax.core.ShapedArray(x.shape, x.dtype) for x in out]
 
-    def read(base: Any, offset: int, kind: ir.Type = pointer) -> Any:
-        return build.load(at(base, offset), typ=kind)
 
-    extension = read(frame, 8)
-    build.cbranch(build.icmp_unsigned("==", extension, none), called, asked)
-    build.position_at_end(asked)  # for the version of the interface: it is the caller's own
-    metadata, version = read(extension, 24), at(read(frame, 16), 16)
-    for field in (16, 20):
-        build.store(read(version, field, INT), at(metadata, 8 + field))
-    build.ret(none)
-    build.position_at_end(called)
+@CALLED.def_impl
+def _call(*given: Any, **params: Any) -> Any:
+    return jax.jit(functools.partial(CALLED.bind, **params))(*given)
 
-    def buffers(offset: int, count: int) -> tuple[Any, Any]:
-        """Pointers to the data of a list of buffers, and the last of them."""
-        listed, buffer = read(frame, offset), None
-        pointers = build.alloca(pointer, ir.Constant(LONG, count))
-        for i in range(count):
-            buffer = read(listed, 8 * i)
-            build.store(
-                read(buffer, 24), build.gep(pointers, [ir.Constant(LONG, i)], source_etype=pointer)
-            )
-        return pointers, buffer
 
-    given, _ = buffers(72, n_in)
-    told, first = buffers(112, n_out)
-    rank = read(first, 32, LONG)
-    last = build.sub(rank, ir.Constant(LONG, 1))
-    n_lanes = build.load(build.gep(read(first, 40), [last], source_etype=LONG), typ=LONG)
-    groups = build.sdiv(n_lanes, ir.Constant(LONG, width))
-    build.call(kernel, [given, told, n_lanes, ir.Constant(LONG, 0), groups])
-    build.ret(none)
+def _lowered(context: Any, *given: Any, code: Code, out: Sequence[jax.ShapeDtypeStruct]) -> Any:
+    register(code)
+    return jax.ffi.ffi_lowering(code.name)(context, *given)
+
+
+def _refused(*_: Any, **__: Any) -> Any:
+    raise NotImplementedError(
+        "Machine code can neither be mapped by `jax.vmap` nor differentiated from outside: give "
+        "all lanes at once, on the last axis, and for derivatives the function that tells them."
+    )
+
+
+mlir.register_lowering(CALLED, _lowered, platform="cpu")
+batching.primitive_batchers[CALLED] = ad.primitive_jvps[CALLED] = _refused

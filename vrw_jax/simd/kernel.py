@@ -7,8 +7,8 @@ import llvmlite.ir as ir
 from jax.extend.core import ClosedJaxpr
 
 from vrw_jax.simd.arrays import HELD, LANES, SMALL, Arrays, has_lanes, taken_for_lanes
-from vrw_jax.simd.ffi import add_handler
 from vrw_jax.simd.fields import Entries, Field, Index
+from vrw_jax.simd.handler import add_handler
 from vrw_jax.simd.numbers import BYTE, LONG, NUMBERS, TRUTH, Numbers, Value
 from vrw_jax.simd.rules import RULES
 from vrw_jax.simd.trace import Traces

@@ -18,7 +18,7 @@ import numpy as np
 
 from vrw_jax.simd.arrays import LANES, SMALL
 from vrw_jax.simd.code import Code, Store, code_of, kept_code, traced
-from vrw_jax.simd.ffi import register, registered
+from vrw_jax.simd.ffi import CALLED, register, registered
 from vrw_jax.simd.kernel import NAME, module_text
 from vrw_jax.simd.machine import Loaded, compiled_for_web, wide
 
@@ -107,12 +107,11 @@ def lane_function(
         ]
         flat = lambda *leaves: jax.tree.leaves(function(*jax.tree.unflatten(structure, leaves)))
         code = code_of(flat, shapes, (key, str(structure)), width, store, small)
-        register(code.name, code.code)
         if missing:
             fill = lambda x: jnp.concatenate([x, jnp.repeat(x[..., -1:], missing, -1)], -1)
             leaves = [fill(x) if jnp.ndim(x) else x for x in leaves]
         out = [jax.ShapeDtypeStruct((*n, n_lanes + missing), kind) for n, kind in code.out]
-        results = jax.ffi.ffi_call(code.name, out)(*leaves)
+        results = CALLED.bind(*leaves, code=code, out=tuple(out))
         told = jax.tree.structure(jax.eval_shape(like, *arrays))
         return jax.tree.unflatten(told, [x[..., :n_lanes] for x in results])
 
@@ -124,7 +123,7 @@ def at_hand(names: Sequence[str], store: Store | None) -> bool:
     for name in names:
         code = None if name in registered else kept_code(name, store)
         if code is not None:
-            register(name, code.code)
+            register(code)
     return all(name in registered for name in names)
 
 
@@ -133,7 +132,7 @@ class _Program:
 
     def __init__(self, code: Code, width: int) -> None:
         self.out, self.width = code.out, width
-        self._loaded = Loaded(code.code)
+        self._loaded = Loaded(code.ready())
         pointer, count = ctypes.c_void_p, ctypes.c_int64
         signature = ctypes.CFUNCTYPE(None, pointer, pointer, count, count, count)
         self._run = signature(self._loaded.address(NAME))
