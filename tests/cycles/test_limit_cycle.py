@@ -18,6 +18,7 @@ from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import PARAMETER_NAMES, wheel_of
 
 TIGHT = vrw.CycleOptions.tight()
+MASSES = [PARAMETER_NAMES.index(name) for name in ("hub_mass", "leg_mass")]
 VALUES = ("section_state", "post_impact", "durations", "period", "dls_fraction", "speed")
 DIFFERENTIATED = ("post_impact", "durations", "period", "dls_fraction", "speed", "step_length")
 
@@ -114,6 +115,20 @@ def test_derivatives_of_the_spectral_radius_agree_with_the_truth():
         [truth.floats(case["cycle"]["d_params"]["spectral_radius"]) for case in truth.CASES]
     )
     assert relative_error(found, expected) < 1e-8
+
+
+def test_a_hub_lighter_than_a_leg_keeps_the_slopes_by_both_masses():
+    """Of the two, units tell that by which both grow: neither may be divided by alone."""
+    row, step = table_1(hub_mass=1.8, leg_mass=2.025), 1e-5
+    ways = [step * np.eye(len(PARAMETER_NAMES))[i] for i in MASSES]
+    rows = [row, *(row + sign * way for way in ways for sign in (1.0, -1.0))]
+    slopes, found = differentiated(rows, None, ("spectral_radius",))
+    radius = np.abs(np.linalg.eigvals(found.matrix)).max(-1)
+    differences = (radius[1::2] - radius[2::2]) / (2.0 * step)
+    # Errors of differences: the step squared, and the search's 1e-13 over the step.
+    own = np.asarray(slopes["spectral_radius"])[0, MASSES]
+    np.testing.assert_allclose(own, differences, rtol=0, atol=1e-7 * np.abs(own).max())
+    assert np.all(np.abs(own) > 1e-3)
 
 
 @pytest.mark.slow
@@ -229,6 +244,8 @@ def test_a_lost_gait_is_nan_in_value_and_derivative_where_asked_for():
     assert all(map(np.isnan, both(240.0)))
     np.testing.assert_array_equal(both(150.0), jax.value_and_grad(fraction)(150.0))
     assert [float(x) for x in jax.value_and_grad(fraction)(240.0)] == [0.0, 0.0]
+    margin = lambda c: vrw.limit_cycle(vrw.WheelParams(damping=c), lost="nan").spectral_margin
+    assert all(map(np.isnan, jax.value_and_grad(margin)(240.0)))
     cycle = vrw.limit_cycle(vrw.WheelParams(damping=240.0), lost="nan")
     told = cycle.measures(("spectral_margin", "stability_margin", "takeoff_acceleration", "speed"))
     assert all(np.isnan(value) for value in told.values())

@@ -47,12 +47,12 @@ def test_a_step_is_the_same_in_other_units():
     np.testing.assert_allclose(same.durations / time[:, None], one.durations, rtol=0, atol=1e-11)
 
 
-@pytest.mark.parametrize("scale", SCALES, ids=lambda scale: PARAMETER_NAMES[scale.last])
-def test_columns_that_units_tell_are_those_of_the_step(scale):
+@pytest.mark.parametrize("name", [PARAMETER_NAMES[last] for last in SCALES])
+def test_columns_that_units_tell_are_those_of_the_step(name):
     """Asked for by itself a column is carried through the step; with all others it is not."""
     table, start, length, time = crowd()
     other, moved = in_units(table, start, length, time)
-    params, name = vrw.WheelParams(**other), PARAMETER_NAMES[scale.last]
+    params = vrw.WheelParams(**other)
     every = vrw.steps(params, moved, options=TIGHT, derivatives=EVERY)
     alone = vrw.steps(params, moved, options=TIGHT, derivatives=(name,))
     both = every.derivatives[name], alone.derivatives[name]

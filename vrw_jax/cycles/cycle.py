@@ -58,8 +58,10 @@ class AbstractCycle(AbstractTold):
         return dataclasses.replace(self, **values)
 
     def _if_found(self, value: Array) -> Array:
-        """Zero where there is no cycle, or NaN after `or_nan`."""
-        return jnp.where(self.found, value, 0.0 * self.period)
+        """Zero where there is no cycle, or NaN after `or_nan`, in derivatives too."""
+        return jnp.where(
+            self.found, value, 0.0 * self.matrix[..., 0, 0]
+        )  # which moves with nothing
 
     def over_steps(self, values: Array, combine: Callable[[Array, int], Array]) -> Array:
         """One value for the whole cycle, of one for each step on the last axis."""

@@ -11,6 +11,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array
 
 from vrw_jax import simd
@@ -23,6 +24,7 @@ from vrw_jax.cycles.search import (
     name_for_export,
     search_lanes,
 )
+from vrw_jax.models import scales
 from vrw_jax.numerics import (
     InForm,
     LaneFunction,
@@ -34,6 +36,7 @@ from vrw_jax.numerics import (
     without_derivative,
 )
 from vrw_jax.runtime import lane_function, remembered
+from vrw_jax.wheel import PARAMETER_NAMES
 
 
 def _tangent_space(problem: Problem, parameters: Parameters, located: Located) -> Located:
@@ -44,6 +47,46 @@ def _tangent_space(problem: Problem, parameters: Parameters, located: Located) -
 
 def _monodromy(problem: Problem, parameters: Parameters, located: Located) -> Array:
     return _where_found(located, problem.pass_at(parameters, located).monodromy)
+
+
+def _slopes_of_monodromy(
+    problem: Problem, parameters: Parameters, known: tuple[Located, Located]
+) -> Array:
+    """d monodromy / d parameters along the branch, with a leading axis; `known`: z and dz/dp.
+
+    One direction after another: the code is as short as for one. Units tell three of the nine: of
+    mass that in which both masses grow, of which the ground's and the legs' forces know nothing.
+    """
+    located, columns = known
+    hub, leg = (PARAMETER_NAMES.index(name) for name in ("hub_mass", "leg_mass"))
+    whole = parameters[hub] + parameters[leg]
+    of_hub, of_leg = parameters[hub] / whole, parameters[leg] / whole
+    plain = [i for i in range(len(parameters)) if i not in (hub, leg, *scales.SCALES)]
+    one, none = jnp.ones_like(whole), jnp.zeros_like(whole)
+    first, second = jnp.asarray([*plain, leg]), jnp.asarray([*plain, hub])
+    shares = jnp.stack([one] * len(plain) + [of_hub]), jnp.stack([none] * len(plain) + [-of_leg])
+    unit = jnp.eye(len(parameters), dtype=parameters.dtype)[..., None]
+    units = jnp.broadcast_to(unit, (len(parameters), *parameters.shape))
+
+    def along(way: tuple) -> tuple[Array, Array]:
+        i, j, a, b = way
+        at = lambda x, i: lax.dynamic_index_in_dim(x, i, keepdims=False)
+        way = jax.tree.map(lambda x: a * at(x, i) + b * at(x, j), (units, columns))
+        return jax.jvp(functools.partial(_monodromy, problem), (parameters, located), way)
+
+    matrices, turns = lax.map(along, (first, second, *shares))
+    by = dict(zip(plain, turns[:-1], strict=True))
+    grown = scales.MASS.left(jnp.zeros_like(turns[0]), tuple(parameters), by) / whole
+    length = of_hub * of_hub + of_leg * of_leg
+    by[hub] = (of_hub * grown - of_leg * turns[-1]) / length
+    by[leg] = (of_leg * grown + of_hub * turns[-1]) / length
+    rates = jnp.asarray([[0, 1], [-1, 0]])[..., None] * matrices[0]  # over angle and rate
+    told = {
+        i: rates if scale is scales.TIME else jnp.zeros_like(rates)
+        for i, scale in scales.SCALES.items()
+    }
+    by = scales.with_scales(tuple(parameters), by, told)
+    return jnp.stack([by[i] for i in range(len(parameters))])
 
 
 def _where_found(located: Located, tree: Any) -> Any:
@@ -108,7 +151,8 @@ def attach_monodromy(problem: Problem, matrix: Array, parameters: Array, located
     alike = lambda parameters, known: parameters
     form = _in_form("monodromy", (alike, alike), problem)
     matrix_of = functools.partial(_monodromy, problem)
-    slopes_of = slopes_on_branch(matrix_of, _columns_of(problem), form)
+    along = functools.partial(_slopes_of_monodromy, problem)
+    slopes_of = slopes_on_branch(matrix_of, _columns_of(problem), form, along=along)
 
     @jax.custom_jvp
     def attach(matrix: Array, parameters: Array, located: Located) -> Array:

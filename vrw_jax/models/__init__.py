@@ -1,5 +1,6 @@
 """The model ladder: one rung a file, one face."""
 
+from vrw_jax.models import scales
 from vrw_jax.models.base import (
     AbstractStep,
     AbstractWheel,

@@ -121,11 +121,18 @@ def on_branch(
 
 
 def slopes_on_branch(
-    function: LaneFunction, tangents_of: Callable, in_form: InForm, order: int = 1
+    function: LaneFunction,
+    tangents_of: Callable,
+    in_form: InForm,
+    order: int = 1,
+    along: LaneFunction | None = None,
 ) -> Callable:
-    """d function(p, z(p)) / dp with a leading axis over p, itself as `on_branch`."""
+    """d function(p, z(p)) / dp with a leading axis over p, itself as `on_branch`.
 
-    def along(p: Array, known: tuple[PyTree, PyTree]) -> PyTree:
+    `along(p, (z, dz/dp))` may be a quicker way to it.
+    """
+
+    def in_turns(p: Array, known: tuple[PyTree, PyTree]) -> PyTree:
         """Over lanes, one direction after another: the code is as short as for one."""
         n, (z, dz) = p.shape[0], known
         units = jnp.broadcast_to(jnp.eye(n, dtype=p.dtype)[:, :, None], (n, *p.shape))
@@ -136,7 +143,7 @@ def slopes_on_branch(
         by_p = jax.jacfwd(tangents_of)(p, z)
         return dz, jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), by_p)
 
-    slopes = on_branch(along, known_moves, in_form, order)
+    slopes = on_branch(along or in_turns, known_moves, in_form, order)
     return lambda p, z: slopes(p, lax.stop_gradient((z, tangents_of(p, z))))
 
 
