@@ -348,7 +348,9 @@ def test_what_the_model_does_not_cover_ends_a_step_with_its_code(friction, dampi
     """By both engines alike, in time too: to what is left of the singularity where lanes see it."""
     times = []
     for engine in ("lanes", "diffrax"):
-        step = stepped(friction, damping, x, TIGHT.by(engine))
+        given = vrw.WheelParams(damping=damping), x
+        model = vrw.UnilateralWheel(friction=friction)  # other tests have the program
+        step = vrw.step(*given, model=model, options=TIGHT, engine=engine)
         assert int(step.outcome) == outcome
         assert not np.any(np.asarray(step.section_state))
         assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(step))
