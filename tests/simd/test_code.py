@@ -9,10 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import lax
 from support.machine_code import Forgetful
 
 from vrw_jax import simd
-from vrw_jax.simd import code
+from vrw_jax.simd import code, kernel
 
 LANES, X = [np.arange(4.0)], np.arange(4.0)
 
@@ -163,3 +164,17 @@ def test_the_text_that_llvm_compiles_is_the_same_in_every_process():
         for way in ways
     )
     assert first.stdout == second.stdout != b""
+
+
+def test_what_repeats_itself_along_an_axis_is_written_once():
+    def sampled(n, x):
+        alike = jnp.broadcast_to(jnp.sqrt(x), (n, *x.shape))
+        turns = lax.scan(lambda y, _: (0.5 * y, y), x, None, length=n)[1]
+        return jnp.stack([2.0 * alike + 1.0, turns])
+
+    def length(n):
+        shape = jax.ShapeDtypeStruct((1021,), jnp.float64)
+        closed = code.traced(lambda x: sampled(n, x), shape)
+        return len(kernel.module_text(closed, 8))
+
+    assert length(900) < 1.1 * length(100)

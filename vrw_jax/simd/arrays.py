@@ -208,8 +208,13 @@ class Arrays:
         if any(isinstance(x, Field) for x in values):
             at = lambda index: make([self.entry(x, index) for x in values])
             return Field(shape, self.kind_of(out), at)
-        entries = zip(*(x.ravel() for x in values), strict=True)  # type: ignore[union-attr]
-        return array_of(shape, [make(some) for some in entries])
+        # What no operand changes along an axis is computed once, and repeats itself there.
+        moves = (any(x.strides[axis] for x in values) for axis in range(len(shape)))  # type: ignore[union-attr]
+        own = (*(slice(None if moving else 1) for moving in moves), ...)
+        parts = [x[own] for x in values]  # type: ignore[index]
+        entries = zip(*(x.ravel() for x in parts), strict=True)
+        told = array_of(parts[0].shape, [make(some) for some in entries])
+        return np.broadcast_to(told, shape)
 
     def fitted(self, array: Entries, shape: tuple[int, ...], needed: bool) -> Entries:
         """Reshaped, if that is needed."""
