@@ -196,13 +196,13 @@ def _find_cycle(params: WheelParams, problem: Problem, guess: Located | None) ->
     s = wheel_of(parameters, problem.n_legs).symbols()
     n = problem.period_n
     # theta, its rate and that of L1: L1 itself follows from theta at touchdown.
-    states = [jnp.stack([end[0], *end[2:]]) for end in located.ends]
-    # The landing that opens step k follows the state at the end of the step before.
-    landings = [transitions.land(s, *states[k - 1]) for k in range(n)]
-    forces = [transitions.landing_forces(s, landing) for landing in landings]
+    states = jnp.concatenate([located.ends[:, :1], located.ends[:, 2:]], 1)
+    # The landing that opens a step follows the state at the end of the step before.
+    landings = jax.vmap(lambda x: transitions.land(s, *x))(jnp.roll(states, 1, 0))
+    fore, rear = jax.vmap(lambda landing: transitions.landing_forces(s, landing))(landings)
 
-    def over_steps(values: list[Array]) -> Array:
-        return masked(values[0] if n == 1 else jnp.stack(values))
+    def over_steps(values: Array) -> Array:
+        return masked(values[0] if n == 1 else values)
 
     durations = located.solution.durations
     code = jnp.where(located.broken > 0.0, Outcome.ORDER_DIFFERS, Outcome.NO_CYCLE_FOUND)
@@ -212,12 +212,12 @@ def _find_cycle(params: WheelParams, problem: Problem, guess: Located | None) ->
     return LimitCycle(
         section_state=masked(states[-1]),
         post_impact=masked(located.solution.section),
-        durations=masked(durations[0] if n == 1 else durations),
-        step_length=over_steps([landing.distance for landing in landings]),
+        durations=over_steps(durations),
+        step_length=over_steps(landings.distance),
         indicators=Indicators(
-            lambda_I4=over_steps([landing.rear.normal for landing in landings]),
-            lambda_2=over_steps([fore.normal for fore, _ in forces]),
-            lambda_4=over_steps([rear.normal for _, rear in forces]),
+            lambda_I4=over_steps(landings.rear.normal),
+            lambda_2=over_steps(fore.normal),
+            lambda_4=over_steps(rear.normal),
         ),
         outcome=jnp.where(usable, code, Outcome.BAD_INPUT).astype(jnp.int32),
         residual=jnp.where(jnp.isfinite(residual), residual, 1.0),
