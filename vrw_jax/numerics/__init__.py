@@ -73,6 +73,7 @@ from vrw_jax.numerics.lanes import (
     one_wheel,
     select,
     taken,
+    two_fold,
     zeros_of,
 )
 from vrw_jax.numerics.levels import (

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from vrw_jax.numerics.lanes import select
+from vrw_jax.numerics.lanes import select, two_fold
 from vrw_jax.numerics.minima import (
     Minimum,
     Settling,
@@ -194,7 +194,7 @@ def integrate_phase(
     """
     task = _Task(_stepper(field, options), watched, options)
     loop = lax.while_loop(
-        lambda loop: loop.mode != DONE,
+        lambda loop: two_fold(loop.mode != DONE, loop.tried),
         functools.partial(_advance, task),
         _begin(task, start, active),
     )

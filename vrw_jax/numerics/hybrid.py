@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, Int
 
 from vrw_jax.numerics.codes import Code
 from vrw_jax.numerics.events import Field, PhaseEnd, integrate_phase
+from vrw_jax.numerics.lanes import two_fold
 from vrw_jax.numerics.minima import State, Watched
 from vrw_jax.numerics.options import Options
 from vrw_jax.numerics.types import Scalar
@@ -266,7 +267,8 @@ def _walk(
         modes=places, guards=places, n_events=none, time=zero, state=start, mode=none + mode,
         solver_steps=none, stop=none + _GOING,
     )  # fmt: skip
-    return lax.while_loop(lambda carry: carry[0].stop == _GOING, event, (first, none))[0]
+    going = lambda carry: two_fold(carry[0].stop == _GOING, carry[0].n_events)
+    return lax.while_loop(going, event, (first, none))[0]
 
 
 _GOING = -1

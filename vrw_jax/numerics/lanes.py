@@ -92,6 +92,15 @@ def if_any(flag: Array, function: Callable[[PyTree], PyTree], otherwise: PyTree)
     return lax.while_loop(lambda now: now[0], turn, (flag, otherwise))[1]
 
 
+def two_fold(goes_on: Array, count: Array) -> Array:
+    """`goes_on` as the condition of a loop, which reads a count beside it, never negative.
+
+    In a condition that reads one number alone XLA looks for a counter of turns, with a copy of all
+    that the loop does: a fifth of the time that it compiles a step on real ground.
+    """
+    return goes_on & (count >= 0)
+
+
 def select(condition: Array, yes: PyTree, no: PyTree) -> PyTree:
     """`jnp.where`, leaf by leaf."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)

@@ -74,6 +74,7 @@ from vrw_jax.numerics import (
     any_mode,
     integrate_phase,
     sample_phase,
+    two_fold,
 )
 from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, WheelParams, friction_of
 from vrw_jax.wording import chosen, reals, whole
@@ -347,7 +348,7 @@ def _walk(
         log=jax.tree.map(rows, first) if logged else None,
     )
     go_on = partial(_go_on, law, place, wheel.max_events, options)
-    return lax.while_loop(lambda now: now.running, go_on, begin)
+    return lax.while_loop(lambda now: two_fold(now.running, now.ledger.events), go_on, begin)
 
 
 def _go_on(law: Law, place: Guards, max_events: int, options: Options, now: _Walked) -> _Walked:
