@@ -16,11 +16,6 @@ ROOMS = [
     if place.is_dir() and place.name != UNCHECKED
 ]
 
-with install_import_hook(ROOMS, "beartype.beartype"):
-    import vrw_jax  # imported here so that its annotations are checked
-
-vrw_jax.start_jax(os.environ.get("VRW_TEST_CACHE", ROOT / ".jax_cache"))
-
 COMPILE_LONGEST = (
     "test_continuation", "test_limit_cycle", "test_reaching", "test_engines", "test_unilateral",
     "test_tune", "test_answer", "test_ground_gaits", "test_derivatives", "test_reproduction",
@@ -28,6 +23,17 @@ COMPILE_LONGEST = (
     "test_web_digits", "test_inputs", "test_second_formulation", "test_basin", "test_printing",
     "test_wrong_calls", "test_own_loops", "test_types", "test_experiments",
 )  # fmt: skip
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """The library, imported here so that its annotations are checked; not where tests are only
+    handed out to other processes, which takes as long."""
+    hands_out = config.getoption("numprocesses", None) and not hasattr(config, "workerinput")
+    if hands_out and not config.getoption("collectonly"):
+        return
+    with install_import_hook(ROOMS, "beartype.beartype"):
+        import vrw_jax
+    vrw_jax.start_jax(os.environ.get("VRW_TEST_CACHE", ROOT / ".jax_cache"))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
