@@ -71,6 +71,15 @@ def test_what_a_finer_mesh_found_has_its_derivatives():
     np.testing.assert_allclose(jax.jacfwd(period)(at), quotient, rtol=1e-6)
 
 
+def test_a_gait_near_a_section_state_has_the_derivatives_of_the_one_found_cold():
+    period = lambda params, guess: vrw.limit_cycle(params, guess=guess).period
+    for transform in (jax.jacfwd, jax.grad):
+        near, cold = (transform(period)(vrw.WheelParams(), x) for x in (vrw.paper_start(), None))
+        # Newton's last correction, 1e-10, as a share of each.
+        for one, other in zip(jax.tree.leaves(near), jax.tree.leaves(cold), strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-9)
+
+
 ORBITS = vrw.WheelParams(damping=219.85)
 
 

@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array
 
 from vrw_jax.cycles.collocated import (
@@ -91,7 +92,7 @@ class CollocationFinder(AbstractGaitFinder):
         elif guess is not None and not isinstance(guess, Located):
             x = guess.section_state if isinstance(guess, AbstractCycle) else guess
             params, state, _, _ = checked(params, x, None, None)
-            guess = self.after(params, state)
+            guess = self.after(*lax.stop_gradient((params, state)))
         return dataclasses.replace(solved(params, self.problem, guess), model=self.model)
 
     def after(self, params: WheelParams, x: SectionState) -> Located:
