@@ -10,12 +10,31 @@ import numpy as np
 
 from vrw_jax.numerics.types import Elementwise
 
-_SINE = tuple((-1) ** k / math.factorial(2 * k + 1) for k in range(10))
-_COSINE = tuple((-1) ** k / math.factorial(2 * k) for k in range(11))
+LARGEST = 1.6
+"""Angle up to which the polynomials are right to rounding, rad."""
+
+
+def _economised(offset: int) -> tuple[float, ...]:
+    """Nine coefficients over the angle's square: of its cosine, or of its sine over itself.
+
+    Taylor's series from its second term on, with the last terms exchanged for Chebyshev polynomials
+    of lower degree: three terms fewer at the same error.
+    """
+    factorial, square = math.factorial, LARGEST * LARGEST
+    series = [(-1) ** k / factorial(2 * k + offset) for k in range(1, 14)]
+    while len(series) > 8:
+        n, last = len(series) - 1, series.pop()
+        for k in range(n):  # of the polynomial of degree n over [0, square], scaled to end with 1
+            chebyshev = n * factorial(n + k - 1) / (factorial(n - k) * factorial(2 * k))
+            series[k] -= last * (-1) ** (n - k) * chebyshev * (square / 4.0) ** (n - k) * 2.0
+    return 1.0, *series
+
+
+_SINE, _COSINE = _economised(1), _economised(0)
 
 
 def sine_cosine(angle: Elementwise) -> tuple[Elementwise, Elementwise]:
-    """Sine and cosine by their Taylor series, right to rounding for |angle| < 1.8 rad.
+    """Sine and cosine as polynomials, right to rounding for |angle| < 1.6 rad, to 1e-13 at 1.8.
 
     The standard functions are scalar calls in float64 on CPU; these are fused and vectorised.
     Of numpy's and plain numbers they are such, a tenth of the time of JAX one by one.

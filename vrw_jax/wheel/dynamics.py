@@ -60,17 +60,21 @@ class Terms(NamedTuple):
 
 def mass_matrix(s: Symbols, L1: Elementwise, L2: Elementwise) -> MassMatrix:
     """M(q) of eq. (1) restricted to a planted Leg 1."""
-    b = L2 - s.a
-    inertia = s.m * (s.a * s.a + b * b + (s.n - 2) * s.c0 * s.c0)
-    coupling = s.m * (s.c0 * (1.0 + s.cos_alpha) - b * s.cos_alpha)
+    b, coupling = L2 - s.a, _coupling(s, L2)
+    still = s.m * (s.a * s.a + (s.n - 2) * s.c0 * s.c0)  # the wheel's numbers first: known at once
     return MassMatrix(
-        M11=L1 * (s.Mh * L1 + 2.0 * coupling) + inertia,
+        M11=L1 * (s.Mh * L1 + 2.0 * coupling) + (still + s.m * b * b),
         M12=s.m * s.sin_alpha * (L2 - s.L0),
         M13=-s.m * s.sin_alpha * L1,
         M22=s.Mh,
         M23=-s.m * s.cos_alpha,
         M33=s.m,
     )
+
+
+def _coupling(s: Symbols, L2: Elementwise) -> Elementwise:
+    """Moment of mass that turns with the hub, kg m."""
+    return s.m * (s.c0 + s.cos_alpha * s.L0) - s.m * s.cos_alpha * L2
 
 
 def terms(s: Symbols, motion: Motion) -> Terms:
@@ -81,20 +85,20 @@ def terms(s: Symbols, motion: Motion) -> Terms:
     cos_p = cos * s.cos_phi - sin * s.sin_phi
     rear_sin_p = sin_p * s.cos_alpha + cos_p * s.sin_alpha  # of theta + alpha + phi
     rear_cos_p = cos_p * s.cos_alpha - sin_p * s.sin_alpha
-    b = L2 - s.a
-    P1 = s.Mh * L1 + s.m * (s.c0 * (1.0 + s.cos_alpha) - b * s.cos_alpha)  # half dM11/dL1
-    P2 = s.m * (b - s.cos_alpha * L1)  # half dM11/dL2
+    P1 = s.Mh * L1 + _coupling(s, L2)  # half dM11/dL1
+    P2 = s.m * (L2 - s.a) - s.m * s.cos_alpha * L1  # half dM11/dL2
     coriolis = 2.0 * s.m * s.sin_alpha * dtheta
+    fore, rear = s.g * s.m * s.L0 + s.g * s.Mh * L1, s.g * s.m * s.L0 - s.g * s.m * L2
+    tense = s.k * s.Ls
     return Terms(
         mass=mass,
-        f1=s.g * ((s.Mh * L1 + s.m * s.L0) * sin_p + s.m * (s.L0 - L2) * rear_sin_p)
-        - 2.0 * (P1 * dL1 + P2 * dL2) * dtheta,
-        f2=s.k * (s.Ls - L1)
+        f1=fore * sin_p + rear * rear_sin_p - 2.0 * (P1 * dL1 + P2 * dL2) * dtheta,
+        f2=(tense - s.k * L1)
         - s.c * dL1
         + P1 * dtheta * dtheta
         - coriolis * dL2
         - s.g * s.Mh * cos_p,
-        f3=s.k * (s.Ls - L2)
+        f3=(tense - s.k * L2)
         - s.c * dL2
         + P2 * dtheta * dtheta
         + coriolis * dL1
@@ -147,17 +151,41 @@ def single_support_2_acceleration(s: Symbols, motion: Motion) -> Acceleration:
     return Acceleration(f1 / M.M11, f2 * per_mass, 0.0 * f1)
 
 
+class OneDegree(NamedTuple):
+    """The equation of motion of a single degree of freedom: inertia * ddtheta = force."""
+
+    inertia: Elementwise  # kg m^2
+    force: Elementwise  # N m
+
+
+def double_support(s: Symbols, distance: Elementwise, motion: Motion) -> OneDegree:
+    """DLS, one degree of freedom: the hub moves on a circle over both feet. Section 3.3.1.
+
+    `terms` restricted to that circle. Over the bisector of both legs, whose sine and cosine are in
+    proportion to the sums of theirs, all is a trigonometric polynomial whose numbers are the
+    wheel's: half the work of the restriction itself.
+    """
+    size, per = distance / s.sin_alpha, 1.0 / (1.0 + s.cos_alpha)  # diameter of the circle
+    light, swing = s.g * (s.Mh - s.m) * size, s.m * s.c0 * size
+    leg, spring, damper = s.g * s.m * s.L0, s.k * size, s.c * size * size
+    at_rest = size * size * (s.Mh - s.m) + s.m * (2.0 * s.a * s.a + (s.n - 2) * s.c0 * s.c0)
+    by_sin = leg * s.cos_phi - s.Ls * spring
+    by_product = per * (s.cos_alpha * size * spring + light * s.cos_phi)
+    by_square = -per * light * s.sin_phi
+
+    rear, dtheta = rear_direction(s, motion.sin, motion.cos), motion.dtheta
+    sin, cos = motion.sin + rear.sin, motion.cos + rear.cos
+    turning = by_sin + by_product * cos + by_square * sin + swing * dtheta * dtheta
+    held = light * s.sin_phi + leg * s.sin_phi * cos
+    damping = (1.0 - s.cos_alpha) * damper + per * s.cos_alpha * damper * (sin * sin)
+    return OneDegree(at_rest + 2.0 * swing * cos, held + sin * turning - damping * dtheta)
+
+
 def double_support_acceleration(s: Symbols, distance: Elementwise, motion: Motion) -> Acceleration:
-    """DLS, one degree of freedom: the hub moves on a circle over both feet. Section 3.3.1."""
-    M, f1, f2, f3 = terms(s, motion)
+    """DLS: all accelerations of `double_support`."""
+    inertia, force = double_support(s, distance, motion)
     circle = double_support_circle(s, distance, motion.sin, motion.cos)
-    tangent = (jnp.ones_like(circle.G1), circle.G1, circle.G2)
-    row = M.times(tangent)
-    centripetal = motion.dtheta * motion.dtheta
-    force = f1 + circle.G1 * f2 + circle.G2 * f3
-    inertia = row[0] + circle.G1 * row[1] + circle.G2 * row[2]
-    ddtheta = (force + centripetal * (circle.L1 * row[1] + circle.L2 * row[2])) / inertia
-    return along_circle(circle, motion.dtheta, ddtheta)
+    return along_circle(circle, motion.dtheta, force / inertia)
 
 
 def along_circle(

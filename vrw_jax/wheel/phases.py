@@ -188,6 +188,9 @@ class DoubleSupport(AbstractPhase):
     def _circle(self, sin: Elementwise, cos: Elementwise) -> CircleOfDoubleSupport:
         return double_support_circle(self.s, self.held[0], sin, cos)
 
+    def _own(self, motion: Motion) -> dynamics.OneDegree:
+        return dynamics.double_support(self.s, self.held[0], motion)
+
     def motion(self, sin: Elementwise, cos: Elementwise, q: Vector, v: Vector) -> Motion:
         circle, (dtheta,) = self._circle(sin, cos), v
         rates = (dtheta, circle.G1 * dtheta, circle.G2 * dtheta)
@@ -200,17 +203,11 @@ class DoubleSupport(AbstractPhase):
         return dynamics.along_circle(self._circle(motion.sin, motion.cos), motion.dtheta, own[0])
 
     def residual(self, motion: Motion, own: Vector) -> Vector:
-        circle = self._circle(motion.sin, motion.cos)
-        along = dynamics.along_circle(circle, motion.dtheta, own[0])
-        rows = _left_over(self.s, motion, along)
-        return (rows[0] + circle.G1 * rows[1] + circle.G2 * rows[2],)
+        inertia, force = self._own(motion)
+        return (inertia * own[0] - force,)
 
     def solve(self, motion: Motion, rows: Vector) -> Vector:
-        circle = self._circle(motion.sin, motion.cos)
-        M = dynamics.mass_matrix(self.s, motion.L1, motion.L2)
-        row = M.times((jnp.ones_like(circle.G1), circle.G1, circle.G2))
-        inverse = 1.0 / (row[0] + circle.G1 * row[1] + circle.G2 * row[2])
-        return (inverse * rows[0],)
+        return (rows[0] / self._own(motion).inertia,)
 
     def rear(self, motion: Motion, acceleration: Acceleration) -> FootForce:
         return dynamics.rear_foot_force(self.s, motion, acceleration)
