@@ -23,6 +23,7 @@ from vrw_jax.wheel import (
     rear_foot_height,
     transitions,
 )
+from vrw_jax.wheel.geometry import double_support_circle
 
 PARAMS = vrw.WheelParams()
 SYMBOLS = PARAMS.symbols()
@@ -106,6 +107,31 @@ def test_guards_have_meanings_and_premises_names(index, stop_at_lift_off):
         assert named.rear_clearance == rear_foot_height(SYMBOLS, now.motion)
 
 
+@pytest.mark.parametrize("n_legs", [5, 8])
+def test_double_support_is_the_three_equations_restricted_to_its_circle(n_legs):
+    """w M w ddtheta = w (f + M (0, L1, L2) dtheta^2) with w = (1, G1, G2), whose second slopes are
+    -L1 and -L2; rounding alone lies between."""
+    random = np.random.default_rng(0)
+    of = lambda low, high: random.uniform(low, high, 1000)
+    s = vrw.WheelParams(
+        damping=of(5, 400), stiffness=of(200, 1200), natural_length=of(1, 1.1), slope=of(0, 0.5),
+        leg_mass=of(0.3, 2), leg_com=of(0.1, 0.9), hub_mass=of(1, 20), n_legs=n_legs,
+    ).symbols()  # fmt: skip
+    distance, theta, dtheta = of(0.3, 1.2), of(-1, 0.5), of(-2, 3)
+    motion = PHASES[0](s, (distance,), True).at((theta,), (dtheta,))
+    circle = double_support_circle(s, distance, motion.sin, motion.cos)
+    mass, *force = dynamics.terms(s, motion)
+    w = np.stack([np.ones(1000), circle.G1, circle.G2])
+    restricted = np.stack(mass.times(tuple(w)))
+    inertia = np.sum(w * restricted, 0)
+    turning = np.sum(w * np.stack(force), 0)
+    turning += dtheta**2 * (circle.L1 * restricted[1] + circle.L2 * restricted[2])
+    told = dynamics.double_support(s, distance, motion)
+    np.testing.assert_allclose(told.inertia, inertia, rtol=1e-14)
+    size = np.sum(np.abs(w * np.stack(force)), 0)  # of what cancels in the sum
+    assert np.max(np.abs(told.force - turning) / size) < 1e-13
+
+
 @each
 def test_the_code_of_an_end_is_what_its_guard_means(index):
     phase, _, _ = at(index)
@@ -167,9 +193,13 @@ def by_lanes():
 
 
 def by_collocation_of_a_step():
+    """Again and again, as the duration is not known beforehand."""
     phase, q, v = at(2)
-    scheme = fixed_work.Scheme(Mesh(2, 1.0), sweeps=4, rounds=8)
-    end = jax.jit(lambda q, v: fixed_work.collocate(phase, q, v, jnp.asarray(0.2), scheme))(q, v)
+    run = jax.jit(lambda q, v, T: fixed_work.collocate(phase, q, v, T, Mesh(2, 1.0)))
+    duration = jnp.asarray(0.2)
+    for _ in range(3):
+        end = run(q, v, duration)
+        duration = end.duration
     return end.q, end.v
 
 

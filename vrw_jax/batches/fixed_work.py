@@ -3,8 +3,8 @@
 Gauss collocation of order 8 on a few graded steps: unknown are the accelerations at four nodes of a
 step. The airborne leg's fast mode, near c/m, which an explicit method must follow by small steps,
 costs nothing extra here. The node equations are solved by a fixed number of sweeps of Newton's
-method with the Jacobian at the step's start, in the eigenvectors of the rule: two complex systems
-of the phase's size. In the last step each sweep corrects the duration too, towards the event.
+method with one Jacobian, in the eigenvectors of the rule: two complex systems of the phase's size.
+In the last step the duration is corrected too, towards the event.
 
 No lane waits for another. A fixed amount of work notices nothing by itself, so each phase says how
 far it can be trusted: the last corrections, the mismatch of the collocation polynomial with the
@@ -33,7 +33,10 @@ from vrw_jax.numerics import (
     TWICE,
     Mesh,
     Vector,
+    differentiation,
+    integrated,
     lagrange,
+    partials_of,
 )
 from vrw_jax.wheel import AbstractPhase, Instant, WheelParams, phases_of, transitions
 
@@ -46,17 +49,17 @@ def _eigenvectors() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 VALUES, TO_PAIRS, FROM_PAIRS = _eigenvectors()
-AT_START, AT_END = lagrange(0.0), lagrange(1.0)
+_SLOPE = differentiation()
+SLOPES, BENDS = NODES[:, None] * _SLOPE, 0.5 * (NODES * NODES)[:, None] * (_SLOPE @ _SLOPE)
+AT_START, AT_MIDDLE, AT_END = lagrange(0.0), lagrange(0.5), lagrange(1.0)
+MIDDLE = integrated(0.5)
 """Weights that extrapolate node values to both ends of a step."""
 
 
-class Scheme(NamedTuple):
-    """Steps of one phase, sweeps in each but the last, and rounds of two sweeps in the last, each
-    followed by a correction of the duration."""
-
-    mesh: Mesh
-    sweeps: int
-    rounds: int
+SWEEPS = 3
+"""In each step but a phase's last."""
+ROUNDS, SWEEPS_OF_A_ROUND = 2, 2
+"""In the last one: a correction of the duration, and sweeps after it."""
 
 
 class Collocated(NamedTuple):
@@ -71,9 +74,13 @@ class Collocated(NamedTuple):
     least: Array  # of all guards at nodes and ends but the event itself; not positive: broken
 
 
+Nodes = tuple[Vector, ...]
+"""Accelerations at the nodes of a step."""
+
+
 class _Step(NamedTuple):
     h: Array
-    nodes: tuple[Vector, ...]  # accelerations
+    nodes: Nodes
     correction: Array
     before: Array  # the correction of the sweep before
 
@@ -83,41 +90,44 @@ class _Solved(NamedTuple):
     end: tuple[Vector, Vector]
     shift: Array  # s
     mismatch: Array
+    bent: Nodes  # what its equations, linear about its middle, leave out
 
 
 def collocate(
-    phase: AbstractPhase, q: Vector, v: Vector, expected: Array, scheme: Scheme
+    phase: AbstractPhase, q: Vector, v: Vector, expected: Array, mesh: Mesh
 ) -> Collocated:
     """From (q, v) to the phase's own end, which is its first guard, near the expected duration."""
-    fractions = scheme.mesh.fractions
-    zero = jnp.zeros_like(expected)
+    fractions, zero = mesh.fractions, jnp.zeros_like(expected)
+    wider = float(fractions[-1] / fractions[0]) ** (2.0 / max(mesh.n_steps - 1, 1))
 
     def march(carry: tuple, fraction: Array) -> tuple[tuple, None]:
-        q, v, correction, mismatch, least = carry
-        solved = _solve(phase, q, v, fraction * expected, (1, scheme.sweeps))
-        low = _least(phase, q, v, solved, 0)
+        q, v, correction, mismatch, least, guards, bent = carry
+        solved = _solve(phase, q, v, fraction * expected, bent)
+        low, guards = _least(phase, q, v, solved, guards, 0)
         carry = (
             *solved.end,
             jnp.maximum(correction, _remaining(solved.step)),
             jnp.maximum(mismatch, solved.mismatch),
             jnp.minimum(least, low),
+            guards,
+            tuple(tuple(wider * x for x in node) for node in solved.bent),
         )
         return carry, None
 
-    carry = (q, v, zero, zero, zero + jnp.inf)
+    guards = phase.guards(Instant(phase, phase.at(q, v), None))
+    carry = (q, v, zero, zero, zero + jnp.inf, guards, ((zero,) * len(q),) * N_NODES)
     if len(fractions) > 1:
         carry, _ = lax.scan(march, carry, jnp.asarray(fractions[:-1], expected.dtype))
-    q, v, correction, mismatch, least = carry
-    h = float(fractions[-1]) * expected
-    last = _solve(phase, q, v, h, (scheme.rounds, 2), lands=True)
-    low = jnp.minimum(_least(phase, q, v, last, 1), last.step.h)
+    q, v, correction, mismatch, least, guards, bent = carry
+    last = _solve(phase, q, v, float(fractions[-1]) * expected, bent, lands=True)
+    low, _ = _least(phase, q, v, last, guards, 1)
     return Collocated(
         *last.end,
         duration=float(1.0 - fractions[-1]) * expected + last.step.h + last.shift,
         correction=jnp.maximum(correction, _remaining(last.step)),
         shift=jnp.abs(last.shift),
         mismatch=jnp.maximum(mismatch, last.mismatch),
-        least=jnp.minimum(least, low),
+        least=jnp.minimum(jnp.minimum(least, low), last.step.h),
     )
 
 
@@ -127,11 +137,11 @@ def _remaining(step: _Step) -> Array:
     return step.correction * jnp.minimum(ratio, 1.0)
 
 
-def _weigh(weights: np.ndarray, nodes: tuple[Vector, ...], d: int) -> Any:
+def _weigh(weights: np.ndarray, nodes: Nodes, d: int) -> Any:
     return sum(float(w) * a[d] for w, a in zip(weights, nodes, strict=True))
 
 
-def _end(q: Vector, v: Vector, h: Array, nodes: tuple[Vector, ...]) -> tuple[Vector, Vector]:
+def _end(q: Vector, v: Vector, h: Array, nodes: Nodes) -> tuple[Vector, Vector]:
     n = range(len(q))
     return (
         tuple(q[d] + h * (v[d] + h * _weigh(ENDS_TWICE, nodes, d)) for d in n),
@@ -139,7 +149,7 @@ def _end(q: Vector, v: Vector, h: Array, nodes: tuple[Vector, ...]) -> tuple[Vec
     )
 
 
-def _node(j: int, q: Vector, v: Vector, h: Array, nodes: tuple[Vector, ...]) -> tuple:
+def _node(j: int, q: Vector, v: Vector, h: Array, nodes: Nodes) -> tuple:
     n, place = range(len(q)), float(NODES[j])
     return (
         tuple(q[d] + h * (place * v[d] + h * _weigh(TWICE[j], nodes, d)) for d in n),
@@ -148,51 +158,69 @@ def _node(j: int, q: Vector, v: Vector, h: Array, nodes: tuple[Vector, ...]) -> 
 
 
 def _solve(
-    phase: AbstractPhase,
-    q: Vector,
-    v: Vector,
-    h: Array,
-    rounds_of_sweeps: tuple[int, int],
-    lands: bool = False,
+    phase: AbstractPhase, q: Vector, v: Vector, h: Array, bent: Nodes, lands: bool = False
 ) -> _Solved:
     """The node accelerations of one step, by sweeps; where it lands, its length as well.
 
-    The Jacobian is taken about the step's middle: a sweep then gains some two digits.
+    The Jacobian is taken about the step's middle: a sweep then gains some two digits. They begin
+    where the equations are linear about it, plus `bent`, what that left out a step before. Where
+    the length changes, so do the places of the nodes on the polynomial through them.
     """
     n = len(q)
-    rounds, sweeps = rounds_of_sweeps
     a0 = phase.acceleration(phase.at(q, v))[:n]
-    by_q, by_v, by_a = _partials(phase, *_middle(q, v, a0, h), a0)
+    left, by_q, by_v, by_a = _linear(phase, *_middle(q, v, a0, h), a0)
     inverses = [_factor(complex(value), h, by_q, by_v, by_a) for value in VALUES]
+
+    def corrected(nodes: Nodes, h: Array, pairs: list) -> tuple[Nodes, Array]:
+        solved = [_apply(inverse, pair) for inverse, pair in zip(inverses, pairs, strict=True)]
+        return _corrected(nodes, tuple(solved), h)
 
     def sweep(step: _Step, _: None) -> tuple[_Step, None]:
         left = []
         for j in range(N_NODES):
             Q, V = _node(j, q, v, step.h, step.nodes)
             left.append(phase.residual(phase.at(Q, V), step.nodes[j]))
-        pairs = [
-            _apply(inverse, _to_pair(weights, tuple(left)))
-            for inverse, weights in zip(inverses, TO_PAIRS, strict=True)
-        ]
-        nodes, largest = _corrected(step.nodes, tuple(pairs), step.h)
+        pairs = [_to_pair(weights, tuple(left)) for weights in TO_PAIRS]
+        nodes, largest = corrected(step.nodes, step.h, pairs)
         return _Step(step.h, nodes, largest, step.correction), None
 
-    def turn(carry: tuple[_Step, Array], _: None) -> tuple[tuple[_Step, Array], None]:
-        step, shift = carry
-        step = step._replace(h=step.h + shift)
-        step, _ = lax.scan(sweep, step, None, length=sweeps)
-        if lands:
-            shift = _to_event(phase, *_end(q, v, step.h, step.nodes))
-            shift = jnp.clip(shift, -0.5 * step.h, 0.5 * step.h)
-        return (step, shift), None
+    def to_event(step: _Step) -> Array:
+        shift = _to_event(phase, *_end(q, v, step.h, step.nodes))
+        return jnp.clip(shift, -0.5 * step.h, 0.5 * step.h)
 
-    unknown = jnp.full_like(h, jnp.inf)
-    start = _Step(h, (a0,) * N_NODES, unknown, unknown)
-    (step, shift), _ = lax.scan(turn, (start, jnp.zeros_like(h)), None, length=rounds)
+    def turn(now: tuple[_Step, Array], _: None) -> tuple[tuple[_Step, Array], None]:
+        step, shift = now
+        step = step._replace(h=step.h + shift, nodes=_moved(step.nodes, shift / step.h))
+        step, _ = lax.scan(sweep, step, None, length=SWEEPS_OF_A_ROUND)
+        return (step, to_event(step)), None
+
+    linear, largest = corrected((a0,) * N_NODES, h, _pairs_about_middle(left, by_q, by_v, v, a0, h))
+    step, shift = _Step(h, _sum(linear, bent, 1.0), largest, largest), jnp.zeros_like(h)
+    if lands:
+        (step, shift), _ = lax.scan(turn, (step, to_event(step)), None, length=ROUNDS)
+    else:
+        step, _ = lax.scan(sweep, step, None, length=SWEEPS)
     missed = [jnp.abs(_weigh(AT_START, step.nodes, d) - a0[d]) for d in range(n)]
     mismatch = step.h * functools.reduce(jnp.maximum, missed)
     end = _end_shifted(q, v, step.h, step.nodes, shift)
-    return _Solved(step, end, shift, mismatch)
+    return _Solved(step, end, shift, mismatch, _sum(step.nodes, linear, -1.0))
+
+
+def _sum(nodes: Nodes, others: Nodes, factor: float) -> Nodes:
+    pairs = zip(nodes, others, strict=True)
+    return tuple(tuple(x + factor * y for x, y in zip(*pair, strict=True)) for pair in pairs)
+
+
+def _moved(nodes: Nodes, by: Array) -> Nodes:
+    """Accelerations at the nodes of a step longer by a small part of itself."""
+    n = range(len(nodes[0]))
+    return tuple(
+        tuple(
+            nodes[j][d] + by * (_weigh(SLOPES[j], nodes, d) + by * _weigh(BENDS[j], nodes, d))
+            for d in n
+        )
+        for j in range(N_NODES)
+    )
 
 
 def _middle(q: Vector, v: Vector, a: Vector, h: Array) -> tuple[Vector, Vector]:
@@ -204,7 +232,7 @@ def _middle(q: Vector, v: Vector, a: Vector, h: Array) -> tuple[Vector, Vector]:
 
 
 def _end_shifted(
-    q: Vector, v: Vector, h: Array, nodes: tuple[Vector, ...], shift: Array
+    q: Vector, v: Vector, h: Array, nodes: Nodes, shift: Array
 ) -> tuple[Vector, Vector]:
     """The step's end, moved on along its slope by a time so short that its square is nothing."""
     Q, V = _end(q, v, h, nodes)
@@ -215,24 +243,17 @@ def _end_shifted(
     )
 
 
-def _partials(phase: AbstractPhase, q: Vector, v: Vector, a: Vector) -> tuple:
-    """Columns of the residual's derivatives by q, v and a."""
-    whole = lambda q, v, a: phase.residual(phase.at(q, v), a)
-    arguments = (q, v, a)
+def _linear(phase: AbstractPhase, q: Vector, v: Vector, a: Vector) -> tuple:
+    """The residual, and columns of its derivatives by q, v and a."""
+    n = len(q)
 
-    def column(which: int, d: int) -> Vector:
-        def along(x: Array) -> Vector:
-            moved = list(arguments)
-            moved[which] = (*moved[which][:d], x, *moved[which][d + 1 :])
-            return whole(*moved)
+    def left_over(*arguments: Array) -> Vector:
+        q, v, a = (arguments[i * n : (i + 1) * n] for i in range(3))
+        return phase.residual(phase.at(q, v), a)
 
-        x = arguments[which][d]
-        return jax.jvp(along, (x,), (jnp.ones_like(x),))[1]
-
-    full = lambda x: jnp.broadcast_to(x, q[0].shape)
-    return tuple(
-        tuple(tuple(full(x) for x in column(which, d)) for d in range(len(q))) for which in range(3)
-    )
+    left, rows = partials_of(left_over, (*q, *v, *a))
+    columns = list(zip(*rows, strict=True))
+    return left, *(columns[i * n : (i + 1) * n] for i in range(3))
 
 
 Complex = tuple[Array, Array]
@@ -295,7 +316,7 @@ def _adjugate(m: list[list[Complex]]) -> tuple[Any, Complex]:
     return rows, _plus(parts)
 
 
-def _to_pair(weights: np.ndarray, left: tuple[Vector, ...]) -> list[Complex]:
+def _to_pair(weights: np.ndarray, left: Nodes) -> list[Complex]:
     """What the nodes leave over, in one pair of eigenvectors, with the sign of a correction."""
     return [
         (_weigh(-weights.real, left, d), _weigh(-weights.imag, left, d))
@@ -303,14 +324,38 @@ def _to_pair(weights: np.ndarray, left: tuple[Vector, ...]) -> list[Complex]:
     ]
 
 
+def _pairs_about_middle(
+    left: Vector, by_q: Any, by_v: Any, v: Vector, a: Vector, h: Array
+) -> list[list[Complex]]:
+    """As `_to_pair`, where accelerations are `a` and the equations linear about the middle."""
+    n = range(len(v))
+    times = lambda columns, x: tuple(sum(columns[j][i] * x[j] for j in n) for i in n)
+    by_v_a, once, twice = times(by_v, a), times(by_q, v), times(by_q, a)
+    pairs = []
+    for weights in TO_PAIRS:
+        flat, first, second = (
+            -complex(np.sum(weights * power))
+            for power in (np.ones(N_NODES), NODES - 0.5, 0.5 * NODES * NODES - 0.125)
+        )
+        pairs.append(
+            [
+                tuple(
+                    part(flat) * left[i]
+                    + h * (part(first) * (once[i] + by_v_a[i]) + part(second) * h * twice[i])
+                    for part in (lambda x: x.real, lambda x: x.imag)
+                )
+                for i in n
+            ]
+        )
+    return pairs
+
+
 def _apply(inverse: Any, right: list[Complex]) -> list[Complex]:
     products = [[_times(entry, x) for entry, x in zip(row, right, strict=True)] for row in inverse]
     return [_plus(row) for row in products]
 
 
-def _corrected(
-    nodes: tuple[Vector, ...], pairs: tuple[list[Complex], ...], h: Array
-) -> tuple[tuple[Vector, ...], Array]:
+def _corrected(nodes: Nodes, pairs: tuple[list[Complex], ...], h: Array) -> tuple[Nodes, Array]:
     """Accelerations after the correction, and the largest rate that it changed."""
     corrected, largest = [], jnp.zeros_like(h)
     for j in range(N_NODES):
@@ -339,44 +384,49 @@ def _to_event(phase: AbstractPhase, q: Vector, v: Vector) -> Array:
     return -value / jnp.where(rate < 0.0, rate, -jnp.inf)
 
 
-def _least(phase: AbstractPhase, q: Vector, v: Vector, solved: _Solved, skipped: int) -> Array:
-    """Least guard at two nodes and the step's end, -1 where one may be broken in between.
+def _least(
+    phase: AbstractPhase, q: Vector, v: Vector, solved: _Solved, first: Vector, skipped: int
+) -> tuple[Array, Vector]:
+    """Least guard at the step's middle and end, -1 where one may be broken in between; all at the
+    end.
 
-    Between them a guard may dip by a quarter of its second difference. `skipped` is 1 in the last
-    step, whose first guard is the event itself and zero at the end.
+    `first` are those at the start. Between the three a guard may dip by a quarter of its second
+    difference. `skipped` is 1 in the last step, whose first guard is the event itself and zero at
+    the end.
     """
-    step = solved.step
-    at_end = tuple(_weigh(AT_END, step.nodes, d) for d in range(len(q)))
-    places = [(*_node(j, q, v, step.h, step.nodes), step.nodes[j]) for j in (0, 2)]
-    values = [
-        phase.guards(Instant(phase, phase.at(q, v), a))
-        for q, v, a in (*places, (*solved.end, at_end))
-    ]
+    step, d = solved.step, range(len(q))
+    in_middle = tuple(_weigh(AT_MIDDLE, step.nodes, i) for i in d)
+    at_end = tuple(_weigh(AT_END, step.nodes, i) for i in d)
+    once, twice = (tuple(_weigh(w, step.nodes, i) for i in d) for w in MIDDLE)
+    half = (
+        tuple(q[i] + step.h * (0.5 * v[i] + step.h * twice[i]) for i in d),
+        tuple(v[i] + step.h * once[i] for i in d),
+    )
+    guards = lambda q, v, a: phase.guards(Instant(phase, phase.at(q, v), a))
+    middle, last = guards(*half, in_middle), guards(*solved.end, at_end)
 
     least = jnp.full_like(step.h, jnp.inf)
-    for i, (first, middle, last) in enumerate(zip(*values, strict=True)):
-        low = jnp.minimum(first, middle)
+    for i, (begin, between, end) in enumerate(zip(first, middle, last, strict=True)):
+        low = jnp.minimum(begin, between)
         if i >= skipped:
-            low = jnp.minimum(low, last)
-            hidden = 0.25 * jnp.abs(first - 2.0 * middle + last)
+            low = jnp.minimum(low, end)
+        hidden = 0.25 * jnp.abs(begin - 2.0 * between + end)
+        if i >= skipped:
             low = jnp.where(low > hidden, low, -1.0)
         least = jnp.minimum(least, low)
-    return least
+    return least, last
 
 
-SCHEMES = (
-    Scheme(Mesh(4, 1.0), sweeps=4, rounds=4),
-    Scheme(Mesh(5, 3.0), sweeps=4, rounds=4),
-    Scheme(Mesh(1, 1.0), sweeps=0, rounds=3),
-)
-"""Of DLS, SLS-I and SLS-II: the cheapest of those tried whose 99th percentile of errors over lanes
-near their gaits is about 1e-8 (experiments/speed/engine_benchmark.py)."""
+MESHES = Mesh(4, 1.0), Mesh(5, 4.0), Mesh(2, 1.0)
+"""Of DLS, SLS-I and SLS-II: of those tried the cheapest, with what the lanes that it leaves to the
+adaptive engine cost, whose 99th percentile of errors over lanes near their gaits is below 1e-8
+(experiments/speed/engine_benchmark.py)."""
 
 MOST_CORRECTION = 5e-8
-MOST_SHIFT = 1e-6
+MOST_SHIFT = 1e-5
 MOST_MISMATCH = (2e-3, 1.2e-1, 8e-5)
 """What a trusted lane may show at most, see `Collocated`; errors are the square of a mismatch and
-less. Some three in a hundred lanes show more near their gaits."""
+less. One in a hundred lanes shows more near its gait."""
 
 
 class FixedStep(NamedTuple):
@@ -403,11 +453,9 @@ def fixed_gait_step(
     trusted = good & landing.stays
     theta, motion = landing.theta, landing.motion
     phases = phases_of(s, landing.distance, stop_at_lift_off)
-    for value in phases[0].guards(Instant(phases[0], motion, None)):
-        trusted = trusted & (value > 0.0)
     durations = []
-    for phase, duration, scheme, most in zip(phases, expected, SCHEMES, MOST_MISMATCH, strict=True):
-        end = collocate(phase, *phase.own(theta, motion), duration, scheme)
+    for phase, duration, mesh, most in zip(phases, expected, MESHES, MOST_MISMATCH, strict=True):
+        end = collocate(phase, *phase.own(theta, motion), duration, mesh)
         trusted = trusted & (end.correction <= MOST_CORRECTION) & (end.shift <= MOST_SHIFT)
         trusted = trusted & (end.mismatch <= most) & (end.least > 0.0)
         theta, motion = end.q[0], phase.after(phase.at(end.q, end.v))

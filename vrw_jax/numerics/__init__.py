@@ -56,11 +56,13 @@ from vrw_jax.numerics.gauss import (
     ONCE,
     TWICE,
     Mesh,
+    differentiation,
+    integrated,
     lagrange,
     transfer_matrix,
 )
 from vrw_jax.numerics.hybrid import Guard, Mode, Stop, time_errors, walk
-from vrw_jax.numerics.lane_algebra import LaneArray
+from vrw_jax.numerics.lane_algebra import LaneArray, partials_of
 from vrw_jax.numerics.lane_minima import Monitors
 from vrw_jax.numerics.lanes import (
     LaneFunction,

@@ -91,3 +91,18 @@ def transfer_matrix(source: Mesh, target: Mesh) -> np.ndarray:
         place = (time - borders[step]) / source.fractions[step]
         matrix[row, step * N_NODES : (step + 1) * N_NODES] = lagrange(place)
     return matrix
+
+
+def differentiation() -> np.ndarray:
+    """From a step's node values to the slopes of their polynomial there, per step."""
+    powers = np.arange(N_NODES)
+    to_polynomial = np.linalg.inv(NODES[:, None] ** powers)
+    return (powers[1:] * NODES[:, None] ** (powers[1:] - 1)) @ to_polynomial[1:]
+
+
+def integrated(place: float) -> tuple[np.ndarray, np.ndarray]:
+    """Once and twice from a step's start to `place`, in steps."""
+    powers = np.arange(N_NODES)
+    to_polynomial = np.linalg.inv(NODES[:, None] ** powers)
+    once = place ** (powers + 1) / (powers + 1)
+    return once @ to_polynomial, place * once / (powers + 2) @ to_polynomial
