@@ -34,9 +34,9 @@ from vrw_jax.numerics.tableaus import (
     Tableau,
     Take,
     Taken,
-    below,
     change_of_length,
     take_step,
+    to_earliest_dip,
 )
 from vrw_jax.numerics.tangents import Balance, Moving, in_directions, stacked
 from vrw_jax.numerics.types import Vector
@@ -281,7 +281,7 @@ def _march(
     def judge(march: _March, taken: Taken, inside: list[Vector], end: Vector) -> tuple:
         """Length to try next, in units of this one, and what becomes of the step."""
         squared = _squared_error(taken, march.here, end, options.rtol, options.atol)
-        to_dip = _to_earliest_dip(tableau, [march.values, *inside, end])
+        to_dip = to_earliest_dip(tableau, [march.values, *inside, end])
         return _change(tableau, squared, to_dip)
 
     def advance(march: _March) -> _March:
@@ -413,18 +413,6 @@ def _squared_error(taken: Taken, start: Place, guards: Vector, rtol: Array, atol
     for value in guards:
         total = total + single(0.0 * value)
     return jnp.where(jnp.isfinite(total), total / len(before), jnp.inf)
-
-
-def _to_earliest_dip(tableau: Tableau, guards: list[Vector]) -> Array:
-    """Share of the step to go before a guard that may dip below zero in it; 1: there is none.
-
-    `guards`: at the start, inside and at the end, see `tableaus.below`.
-    """
-    share = jnp.ones_like(guards[0][0])
-    for values in zip(*guards, strict=True):
-        looks, at = below(tableau, list(values))
-        share = jnp.where(looks, jnp.minimum(share, at), share)
-    return share
 
 
 def _first(conditions: tuple[Array, ...]) -> Array:

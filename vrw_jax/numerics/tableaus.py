@@ -9,6 +9,7 @@ import functools
 import itertools
 import json
 import math
+import operator
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +20,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from vrw_jax.numerics.lanes import if_any
 from vrw_jax.numerics.types import Vector
 
 
@@ -110,6 +112,15 @@ def parabola(tableau: Tableau, start: Array, inside: Array, end: Array) -> tuple
 
 
 @functools.partial(jax.jit, static_argnums=0)  # traced once, for whichever guard
+def lowest(tableau: Tableau, values: list[Array]) -> Array:
+    """The least of a guard's Bernstein coefficients: where it is positive, so is the guard.
+
+    `values`: at the start, at the stages `inside`, at the end.
+    """
+    return functools.reduce(jnp.minimum, (_weigh(row, values) for row in tableau.hull), values[0])
+
+
+@functools.partial(jax.jit, static_argnums=0)  # traced once, for whichever guard
 def below(tableau: Tableau, values: list[Array]) -> tuple[Array, Array]:
     """Whether a guard may fall below zero inside a step and be positive again at its end, and how
     far to go first, in step lengths: where the lowest of its Bernstein coefficients belongs.
@@ -126,6 +137,25 @@ def below(tableau: Tableau, values: list[Array]) -> tuple[Array, Array]:
     for before, after in itertools.pairwise(values):
         rises = rises | (before < after)
     return (lowest <= 0.0) & (at > 0.0) & rises & (end > 0.0), at
+
+
+def to_earliest_dip(tableau: Tableau, guards: list[Vector]) -> Array:
+    """Share of the step to go before a guard that may dip below zero in it; 1: there is none.
+
+    `guards`: at the start, inside and at the end, see `below`. How far is asked only where a
+    lane of the group has one.
+    """
+    columns = [list(values) for values in zip(*guards, strict=True)]
+    may = [(lowest(tableau, values) <= 0.0) & (values[-1] > 0.0) for values in columns]
+
+    def to_first(share: Array) -> Array:
+        for values in columns:
+            looks, at = below(tableau, values)
+            share = jnp.where(looks, jnp.minimum(share, at), share)
+        return share
+
+    none = jnp.ones_like(guards[0][0])
+    return if_any(jnp.any(functools.reduce(operator.or_, may)), to_first, none)
 
 
 SAFETY, LEAST, MOST = 0.9, 0.2, 5.0
