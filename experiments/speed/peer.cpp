@@ -17,10 +17,20 @@ static inline bool any(M m) {
     for (int i = 0; i < W; i++) r |= m[i];
     return r != 0;
 }
-static inline V root(V x) {
-    V r;
-    for (int i = 0; i < W; i++) r[i] = std::sqrt(x[i]);
-    return r;
+// x to the power of `exponent`, right to 5e-4, for x from 1e-30: step-size control asks no more, and
+// the library's powf is a call for each wheel.
+typedef float F __attribute__((vector_size(32)));
+typedef int I __attribute__((vector_size(32)));
+static inline V power(V x, float exponent) {
+    F y = __builtin_convertvector(x, F);
+    I bits = (I)y, whole = (bits >> 23) - 127;
+    F m = (F)((bits & 0x7fffff) | 0x3f800000);
+    F log2 = __builtin_convertvector(whole, F)
+             + (-2.496927f + m * (4.028742f + m * (-2.081385f + m * (0.628938f - m * 0.079167f))));
+    F z = exponent * log2, floor = __builtin_convertvector(__builtin_convertvector(z + 64.0f, I), F) - 64.0f;
+    F f = z - floor, e = 0.999813f + f * (0.696834f + f * (0.224131f + f * 0.079021f));
+    F two = (F)((__builtin_convertvector(floor, I) + 127) << 23);
+    return __builtin_convertvector(e * two, V);
 }
 // |x| below 1: to rounding by series.
 static inline void sine_cosine(V x, V &s, V &c) {
@@ -32,6 +42,7 @@ static inline void sine_cosine(V x, V &s, V &c) {
 }
 
 static const double SA = std::sqrt(0.5), CA = SA;
+static const double HS = std::sin(0.125 * M_PI), HC = std::cos(0.125 * M_PI);  // half of an angle between legs
 
 struct Wheel { V m, a, L0, Ls, k, c, g, sf, cf, Mh, D; };
 struct Terms { V M11, M12, M13, f1, f2, f3; };
@@ -59,10 +70,16 @@ struct Double {
         sine_cosine(q[0], s, c);
         V rs = s * CA + c * SA, rc = c * CA - s * SA;
         V L1 = scale * rc, L2 = scale * c, G1 = -scale * rs, G2 = -scale * s;
+        // Over the bisector of the legs all is a trigonometric polynomial (docs/physics.md).
+        V light = p.g * (p.Mh - p.m) * scale, swing = 2 * HC * p.m * (p.L0 - p.a) * scale, spring = p.k * scale;
+        V leg = 2 * HC * p.g * p.m * p.L0, damper = p.c * scale * scale, c0 = p.L0 - p.a;
+        V S = s * HC + c * HS, C = c * HC - s * HS, square = S * S;
+        V inertia = scale * scale * (p.Mh - p.m) + p.m * (2 * p.a * p.a + 6 * c0 * c0) + 2 * swing * C;
+        V turning = leg * p.cf - 2 * HC * p.Ls * spring + 2 * (CA * scale * spring + light * p.cf) * C
+                    - 2 * light * p.sf * S + swing * w * w;
+        V x1 = (light * p.sf + leg * p.sf * C + S * turning - ((1 - CA) * damper + 2 * CA * damper * square) * w)
+               / inertia;
         Terms t = terms(s, c, L1, L2, w, G1 * w, G2 * w, p);
-        V w1 = t.M12 + p.Mh * G1 - p.m * CA * G2, w2 = t.M13 - p.m * CA * G1 + p.m * G2;
-        V inertia = t.M11 + G1 * (t.M12 + w1) + G2 * (t.M13 + w2);
-        V x1 = (t.f1 + G1 * t.f2 + G2 * t.f3 + w * w * (L1 * w1 + L2 * w2)) / inertia;
         V x2 = G1 * x1 - L1 * w * w, x3 = G2 * x1 - L2 * w * w;
         V r2 = t.M12 * x1 + p.Mh * x2 - p.m * CA * x3 - t.f2;
         V r3 = t.M13 * x1 - p.m * CA * x2 + p.m * x3 - t.f3;
@@ -159,9 +176,8 @@ template <class P> static void phase(V *q, V *v, V &h, V &time, const Wheel &p, 
         before = pick(on, step.guard, before);
         rate = pick(crossed, step.guard, rate);  // kept for the first guess
         time += pick(on, h, all(0));
-        V change;
-        for (int i = 0; i < W; i++)
-            change[i] = std::fmin(5.0f, std::fmax(0.2f, 0.9f * powf((float)total[i] + 1e-30f, EXPONENT)));
+        V change = 0.9 * power(total + 1e-30, EXPONENT);
+        change = larger(all(0.2), pick(change < 5.0, change, all(5.0)));
         marching &= ~crossed;
         h = pick(marching, h * change, h);
     }
@@ -204,7 +220,8 @@ extern "C" void steps(const double *parameters, const double *starts, double *to
         phase<Double>(q, v, h, time[0], p, tol);
         Double::at(q, v, p, x, guard, rate, legs);
         q[1] = legs[0]; q[2] = legs[1]; v[1] = legs[2]; v[2] = legs[3];
-        h *= 0.3;
+        V fast = 7.0 * std::pow(tol, -2.0 * EXPONENT) * p.m / p.c;  // the airborne leg's mode
+        h = pick(0.3 * h < fast, 0.3 * h, fast);
         phase<Single1>(q, v, h, time[1], p, tol);
         Terms t = terms(all(0), all(1), q[1], p.L0, all(0), all(0), all(0), p);
         v[0] -= p.m * SA * q[1] * v[2] / t.M11;
