@@ -8,16 +8,13 @@ from numpy.polynomial import legendre
 N_NODES = 4
 
 
-def _gauss_rule() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Nodes, integration matrix and weights of the Gauss collocation on [0, 1]."""
-    nodes = (legendre.leggauss(N_NODES)[0] + 1.0) / 2.0
-    powers = np.arange(N_NODES)
-    to_polynomial = np.linalg.inv(nodes[:, None] ** powers)
-    matrix = (nodes[:, None] ** (powers + 1) / (powers + 1)) @ to_polynomial
-    return nodes, matrix, (1.0 / (powers + 1)) @ to_polynomial
-
-
-NODES, ONCE, ENDS_ONCE = _gauss_rule()
+NODES = (legendre.leggauss(N_NODES)[0] + 1.0) / 2.0
+"""Of the Gauss collocation on [0, 1]."""
+_POWERS = np.arange(N_NODES)
+_TO_POLYNOMIAL = np.linalg.inv(NODES[:, None] ** _POWERS)
+"""From values at the nodes to the coefficients of their polynomial, the constant first."""
+ONCE = (NODES[:, None] ** (_POWERS + 1) / (_POWERS + 1)) @ _TO_POLYNOMIAL
+ENDS_ONCE = (1.0 / (_POWERS + 1)) @ _TO_POLYNOMIAL
 TWICE, ENDS_TWICE = ONCE @ ONCE, ENDS_ONCE @ ONCE
 """Once and twice integrated from a step's start to its nodes, and to its end."""
 
@@ -95,14 +92,11 @@ def transfer_matrix(source: Mesh, target: Mesh) -> np.ndarray:
 
 def differentiation() -> np.ndarray:
     """From a step's node values to the slopes of their polynomial there, per step."""
-    powers = np.arange(N_NODES)
-    to_polynomial = np.linalg.inv(NODES[:, None] ** powers)
-    return (powers[1:] * NODES[:, None] ** (powers[1:] - 1)) @ to_polynomial[1:]
+    higher = _POWERS[1:]
+    return (higher * NODES[:, None] ** (higher - 1)) @ _TO_POLYNOMIAL[1:]
 
 
 def integrated(place: float) -> tuple[np.ndarray, np.ndarray]:
-    """Once and twice from a step's start to `place`, in steps."""
-    powers = np.arange(N_NODES)
-    to_polynomial = np.linalg.inv(NODES[:, None] ** powers)
-    once = place ** (powers + 1) / (powers + 1)
-    return once @ to_polynomial, place * once / (powers + 2) @ to_polynomial
+    """Weights of a step's nodes for their polynomial once and twice integrated up to `place`."""
+    once = place ** (_POWERS + 1) / (_POWERS + 1)
+    return once @ _TO_POLYNOMIAL, place * once / (_POWERS + 2) @ _TO_POLYNOMIAL

@@ -111,42 +111,46 @@ def parabola(tableau: Tableau, start: Array, inside: Array, end: Array) -> tuple
     return bend, end - start - bend
 
 
-@functools.partial(jax.jit, static_argnums=0)  # traced once, for whichever guard
-def lowest(tableau: Tableau, values: list[Array]) -> Array:
-    """The least of a guard's Bernstein coefficients: where it is positive, so is the guard.
+def _bernstein(tableau: Tableau, values: list[Array]) -> list[Array]:
+    """A guard's Bernstein coefficients but the last: where all are positive, so is the guard.
 
     `values`: at the start, at the stages `inside`, at the end.
     """
-    return functools.reduce(jnp.minimum, (_weigh(row, values) for row in tableau.hull), values[0])
+    return [values[0], *(_weigh(row, values) for row in tableau.hull)]
+
+
+@functools.partial(jax.jit, static_argnums=0)  # traced once, for whichever guard
+def _may_dip(tableau: Tableau, values: list[Array]) -> Array:
+    """Whether a guard may fall below zero inside a step and be positive again at its end."""
+    return (functools.reduce(jnp.minimum, _bernstein(tableau, values)) <= 0.0) & (values[-1] > 0.0)
 
 
 @functools.partial(jax.jit, static_argnums=0)  # traced once, for whichever guard
 def below(tableau: Tableau, values: list[Array]) -> tuple[Array, Array]:
-    """Whether a guard may fall below zero inside a step and be positive again at its end, and how
+    """Whether it may, and rises somewhere, since what only decays is no dip, however steep; and how
     far to go first, in step lengths: where the lowest of its Bernstein coefficients belongs.
 
     `values`: at the start, at the stages `inside`, at the end.
     """
-    end, lowest, at = values[-1], values[0], jnp.zeros_like(values[0])
-    last = lowest
-    for i, row in enumerate(tableau.hull):
-        last = _weigh(row, values)
-        at = jnp.where(last < lowest, (i + 1) / len(values[1:]), at)
-        lowest = jnp.minimum(last, lowest)
-    rises = last < end  # what only decays is no dip, however steep
+    lowest, *inner = _bernstein(tableau, values)
+    at = jnp.zeros_like(lowest)
+    for i, coefficient in enumerate(inner):
+        at = jnp.where(coefficient < lowest, (i + 1) / len(values[1:]), at)
+        lowest = jnp.minimum(coefficient, lowest)
+    rises = inner[-1] < values[-1]
     for before, after in itertools.pairwise(values):
         rises = rises | (before < after)
-    return (lowest <= 0.0) & (at > 0.0) & rises & (end > 0.0), at
+    return (lowest <= 0.0) & (at > 0.0) & rises & (values[-1] > 0.0), at
 
 
 def to_earliest_dip(tableau: Tableau, guards: list[Vector]) -> Array:
     """Share of the step to go before a guard that may dip below zero in it; 1: there is none.
 
-    `guards`: at the start, inside and at the end, see `below`. How far is asked only where a
+    `guards`: at the start, at the stages `inside` and at the end. How far is asked only where a
     lane of the group has one.
     """
     columns = [list(values) for values in zip(*guards, strict=True)]
-    may = [(lowest(tableau, values) <= 0.0) & (values[-1] > 0.0) for values in columns]
+    may = functools.reduce(operator.or_, (_may_dip(tableau, values) for values in columns))
 
     def to_first(share: Array) -> Array:
         for values in columns:
@@ -155,7 +159,7 @@ def to_earliest_dip(tableau: Tableau, guards: list[Vector]) -> Array:
         return share
 
     none = jnp.ones_like(guards[0][0])
-    return if_any(jnp.any(functools.reduce(operator.or_, may)), to_first, none)
+    return if_any(jnp.any(may), to_first, none)
 
 
 SAFETY, LEAST, MOST = 0.9, 0.2, 5.0
