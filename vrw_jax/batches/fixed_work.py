@@ -49,11 +49,12 @@ def _eigenvectors() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 VALUES, TO_PAIRS, FROM_PAIRS = _eigenvectors()
+AT_START, AT_MIDDLE, AT_END = lagrange(0.0), lagrange(0.5), lagrange(1.0)
+"""Weights that carry node values to both ends and to the middle of a step."""
+TO_MIDDLE = integrated(0.5)
 _SLOPE = differentiation()
 SLOPES, BENDS = NODES[:, None] * _SLOPE, 0.5 * (NODES * NODES)[:, None] * (_SLOPE @ _SLOPE)
-AT_START, AT_MIDDLE, AT_END = lagrange(0.0), lagrange(0.5), lagrange(1.0)
-MIDDLE = integrated(0.5)
-"""Weights that extrapolate node values to both ends of a step."""
+"""How values at the nodes move as the step, and the nodes with it, grows by a share of itself."""
 
 
 SWEEPS = 3
@@ -71,7 +72,7 @@ class Collocated(NamedTuple):
     correction: Array  # rate that one more sweep would still change, about; rad/s and m/s
     shift: Array  # the last correction of the duration, s
     mismatch: Array  # rate that the polynomial misses at the start of a step, at most
-    least: Array  # of all guards at nodes and ends but the event itself; not positive: broken
+    least: Array  # of all guards at ends and middles but the event itself; not positive: broken
 
 
 Nodes = tuple[Vector, ...]
@@ -98,6 +99,7 @@ def collocate(
 ) -> Collocated:
     """From (q, v) to the phase's own end, which is its first guard, near the expected duration."""
     fractions, zero = mesh.fractions, jnp.zeros_like(expected)
+    # Of a step's length to that of the one before, squared: as what its equations leave out grows.
     wider = float(fractions[-1] / fractions[0]) ** (2.0 / max(mesh.n_steps - 1, 1))
 
     def march(carry: tuple, fraction: Array) -> tuple[tuple, None]:
@@ -397,7 +399,7 @@ def _least(
     step, d = solved.step, range(len(q))
     in_middle = tuple(_weigh(AT_MIDDLE, step.nodes, i) for i in d)
     at_end = tuple(_weigh(AT_END, step.nodes, i) for i in d)
-    once, twice = (tuple(_weigh(w, step.nodes, i) for i in d) for w in MIDDLE)
+    once, twice = (tuple(_weigh(w, step.nodes, i) for i in d) for w in TO_MIDDLE)
     half = (
         tuple(q[i] + step.h * (0.5 * v[i] + step.h * twice[i]) for i in d),
         tuple(v[i] + step.h * once[i] for i in d),
@@ -409,9 +411,7 @@ def _least(
     for i, (begin, between, end) in enumerate(zip(first, middle, last, strict=True)):
         low = jnp.minimum(begin, between)
         if i >= skipped:
-            low = jnp.minimum(low, end)
-        hidden = 0.25 * jnp.abs(begin - 2.0 * between + end)
-        if i >= skipped:
+            low, hidden = jnp.minimum(low, end), 0.25 * jnp.abs(begin - 2.0 * between + end)
             low = jnp.where(low > hidden, low, -1.0)
         least = jnp.minimum(least, low)
     return least, last
@@ -426,7 +426,8 @@ MOST_CORRECTION = 5e-8
 MOST_SHIFT = 1e-5
 MOST_MISMATCH = (2e-3, 1.2e-1, 8e-5)
 """What a trusted lane may show at most, see `Collocated`; errors are the square of a mismatch and
-less. One in a hundred lanes shows more near its gait."""
+less. The end moves along its slope by the last shift: half of its square times a rate is left. One
+in a hundred lanes shows more near its gait."""
 
 
 class FixedStep(NamedTuple):
