@@ -72,6 +72,27 @@ def test_a_damaged_chunk_is_computed_again_and_said(store: Path, what: str, vari
     assert files(store) == whole
 
 
+def test_a_scan_at_work_may_be_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a scan writes between two looks at its store is no damage."""
+    path, read = tmp_path / "s.zarr", zarr.Array.__getitem__
+    with pytest.raises(KeyboardInterrupt):
+        run(planned(), path, evaluate=Counted(fails_at=3))
+
+    def and_meanwhile(array: zarr.Array, where: object) -> object:
+        told = read(array, where)
+        if array.path == soundness.DIGEST:
+            with monkeypatch.context() as as_before:
+                as_before.setattr(zarr.Array, "__getitem__", read)
+                with pytest.raises(KeyboardInterrupt):
+                    run(planned(), path, evaluate=Counted(fails_at=2))
+        return told
+
+    monkeypatch.setattr(zarr.Array, "__getitem__", and_meanwhile)
+    open_scan(path)
+    monkeypatch.undo()
+    assert np.sum(open_scan(path).outcome.values[:, 0] != -1) > 2  # it did go on
+
+
 def test_damage_beside_an_unfinished_scan_is_found_too(tmp_path: Path) -> None:
     store = tmp_path / "s.zarr"
     run(planned(), tmp_path / "whole.zarr", evaluate=arithmetic)

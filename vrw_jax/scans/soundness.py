@@ -51,18 +51,20 @@ class Books:
         self._counts = tuple(-(-n // c) for n, c in zip(shape, chunk, strict=True))
 
     def done(self) -> np.ndarray:
-        marks = np.asarray(self._marks[:])
-        return np.any(marks.reshape(len(marks), -1) != 0, axis=1)
+        return _marked(np.asarray(self._marks[:]))
 
     def mark(self, index: int) -> None:
         """Say that a chunk's files are written."""
         self._marks[index : index + 1] = 1 if self._old else self._digest(index)[None]
 
     def damaged(self) -> list[int]:
-        """Chunks that are marked, and whose files are not what was written."""
+        """Chunks that are marked, and whose files are not what was written.
+
+        The marks are read once, before any file: a scan at work marks a chunk after its files.
+        """
         marks = np.asarray(self._marks[:])
         sound = self._readable if self._old else lambda i: bool((self._digest(i) == marks[i]).all())
-        return [int(i) for i in np.flatnonzero(self.done()) if not sound(int(i))]
+        return [int(i) for i in np.flatnonzero(_marked(marks)) if not sound(int(i))]
 
     def damaged_coordinates(self) -> list[str]:
         """The swept parameters, if their values are not those that the samples were taken at."""
@@ -107,6 +109,10 @@ class Books:
             gone and not _meant(x[gaits]) for gone, x in zip(absent, told.values(), strict=True)
         ]
         return bool(np.all(outcome >= 0)) and not any(lost)
+
+
+def _marked(marks: np.ndarray) -> np.ndarray:
+    return np.any(marks.reshape(len(marks), -1) != 0, axis=1)
 
 
 def _meant(values: np.ndarray) -> bool:
