@@ -1,5 +1,6 @@
 """JAX as `start_jax` starts it, with a compilation cache; shapes checked against signatures."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -31,6 +32,7 @@ def pytest_configure(config: pytest.Config) -> None:
     hands_out = config.getoption("numprocesses", None) and not hasattr(config, "workerinput")
     if hands_out and not config.getoption("collectonly"):
         return
+    gc.set_threshold(20_000, 10, 10)  # what JAX keeps of programs is looked through less often
     with install_import_hook(ROOMS, "beartype.beartype"):
         import vrw_jax
     vrw_jax.start_jax(os.environ.get("VRW_TEST_CACHE", ROOT / ".jax_cache"))
