@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import truth
-from support.batched import GAIT, IN_TIME, PROVOKED, wheels_like
+from support.batched import GAIT, IN_TIME, NAMES, PROVOKED, wheels_like
 
 import vrw_jax as vrw
 from vrw_jax import Outcome, simd
@@ -113,6 +113,31 @@ def test_the_order_of_lanes_changes_no_bit(crowd):
     again, code = told(vectors[some], states[some])
     np.testing.assert_array_equal(again, found[some])
     np.testing.assert_array_equal(code, codes[some])
+
+
+def test_lanes_stand_beside_those_that_take_about_as_long():
+    """Eight wait for the slowest of them: for less than half as much as where any stand together,
+    and for less than in order of the airborne leg's fast rate alone."""
+    n, draw = 1024, np.random.default_rng(2).uniform
+    vectors = wheels_like(
+        damping=draw(100.0, 215.0, n),
+        stiffness=draw(400.0, 600.0, n),
+        natural_length=draw(1.01, 1.04, n),
+        slope=draw(0.28, 0.34, n),
+    )
+    states = GAIT * draw(0.95, 1.05, (n, 3))
+    tried = np.asarray(vrw.steps(truth.wheels(vectors), states).solver_steps)
+    waits = lambda order: tried[order].reshape(-1, 8).max(1).mean() / tried.mean() - 1.0
+    ours = waits(lane_batch.work_order(list(vectors.T), states))
+    assert ours < 0.5 * waits(np.arange(n))
+    assert ours < 0.8 * waits(np.argsort(vectors[:, NAMES.index("damping")]))
+
+
+def test_what_no_wheel_can_be_has_its_place_in_that_order_too():
+    vectors, states = wheels_like(damping=[200.0, np.nan, -1.0, 0.0, 1e300]), np.tile(GAIT, (5, 1))
+    states[:, 1] = [1.6, 1e300, np.inf, -1.0, 0.0]
+    order = lane_batch.work_order(list(vectors.T), states)
+    np.testing.assert_array_equal(np.sort(order), np.arange(5))
 
 
 COARSE = vrw.Options(solver="Bosh3", max_solver_steps=60, rtol=1e-4, atol=1e-4)

@@ -186,7 +186,7 @@ def _by_phases(
     durations: Any,
     asked: Sequence[str],
 ) -> Steps:
-    order = _by_work(columns, len(states))
+    order = work_order(columns, states)
     wheels = np.empty((len(columns), len(states)), states.dtype)
     for row, column in zip(wheels, columns, strict=True):
         row[:] = column[order] if column.ndim else column
@@ -230,14 +230,23 @@ def _by_phases(
     return walked.told(order, solver, name, solvers)
 
 
-def _by_work(columns: list[np.ndarray], n: int) -> np.ndarray:
-    """An order of lanes in which wheels of like work are side by side.
+def work_order(columns: list[np.ndarray], states: np.ndarray) -> np.ndarray:
+    """An order of lanes in which wheels of like work are side by side: a group waits for its last.
 
-    The airborne leg's fast rate, near c/m, sets the step where stability does.
+    Most of a step's work is SLS-I's, in which stability bounds the solver's steps by m/c and Leg 2
+    extends at the pace of k (Ls - L)/c from where it was let go. The powers are rounded from a fit
+    to the solver's steps of wheels near their gaits and away from them
+    (`python -m experiments.speed.lanes_that_wait`).
     """
-    damping, mass = (columns[PARAMETER_NAMES.index(name)] for name in ("damping", "leg_mass"))
+    own = dict(zip(PARAMETER_NAMES, columns, strict=True))
+    single = lambda name: np.asarray(own[name], np.float32)
     with np.errstate(all="ignore"):
-        return np.argsort(np.broadcast_to(damping / mass, (n,)))
+        theta, dtheta = states.T[:2].astype(np.float32)
+        length, mass = single("locked_length"), single("leg_mass")
+        work = np.log(single("damping") / mass) - 0.25 * np.log(single("stiffness") / mass)
+        work = work + 0.8 * np.log(dtheta) + 0.65 * np.log(length / single("gravity"))
+        work = work + theta - 7.0 * single("natural_length") / length
+    return np.argsort(work)
 
 
 def _expected(durations: Any, states: np.ndarray, dtype: np.dtype) -> np.ndarray:

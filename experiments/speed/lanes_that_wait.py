@@ -1,0 +1,96 @@
+"""How many steps of the solver lanes wait for the slowest of their group, by the order they are in.
+
+    python -m experiments.speed.lanes_that_wait [--lanes 4096] [--tolerance 6e-8]
+
+A group of eight lanes goes through each phase together. Told is how many steps its slowest lane
+tries over how many its lanes do on average: 1 where none waits. Orders are as given, by c/m, that
+of `vrw.steps`, and by the steps of SLS-I themselves, which no one knows before. Printed are also
+fits of SLS-I's steps, of which `work_order` has the powers rounded, over that of c/m. Writes a
+table into `docs/engine.md`.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import vrw_jax as vrw
+from experiments.shared.command import command, started
+from experiments.shared.tables import DOCS, markdown, replace
+from experiments.shared.wheels import near_gaits, wheels
+from experiments.speed.engines_agree import drawn
+from vrw_jax.batches.batch import work_order
+from vrw_jax.models.lane_step import walk
+from vrw_jax.numerics import explicit_tableau
+from vrw_jax.wheel import PARAMETER_NAMES, wheel_of
+
+GROUP, N_LEGS = 8, 8
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def tried(rows: jax.Array, states: jax.Array, solver: str, options: vrw.Options) -> jax.Array:
+    """Steps that each lane tries in each phase, (3, lanes)."""
+    tableau = explicit_tableau(solver)
+    assert tableau is not None
+    walked = walk(wheel_of(rows.T, N_LEGS), tuple(states.T), options, tableau, True, False)
+    return jnp.stack([end.tried for end in walked.ends])
+
+
+def scenes(n: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Parameters, (lanes, 9), and section states."""
+    some, states, _ = near_gaits(n)
+    params, random = wheels(some), np.random.default_rng(5)
+    rows = np.stack([np.broadcast_to(getattr(params, name), n) for name in PARAMETER_NAMES], 1)
+    return {
+        "1 % from their gaits": (rows, states),
+        "15 % from them": (rows, states * random.uniform(0.85, 1.15, states.shape)),
+        "a wide box, of which a third steps": drawn(n, 0),
+    }
+
+
+def waited(steps: np.ndarray, order: np.ndarray) -> float:
+    groups = steps[:, order[: len(order) // GROUP * GROUP]].reshape(3, -1, GROUP)
+    return float(groups.max(2).mean(1).sum() / steps.mean(1).sum())
+
+
+def powers(rows: np.ndarray, states: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Of c/m, dtheta and k/m, and what multiplies theta and Ls, in the log of SLS-I's steps."""
+    mass, length, stiffness, damping = (
+        rows[:, PARAMETER_NAMES.index(name)]
+        for name in ("leg_mass", "natural_length", "stiffness", "damping")
+    )
+    logs = [np.log(damping / mass), np.log(states[:, 1]), np.log(stiffness / mass)]
+    columns = np.stack([*logs, states[:, 0], length, np.ones(len(rows))], 1)
+    own = steps[1] > 0
+    return np.linalg.lstsq(columns[own], np.log(steps[1][own]), rcond=None)[0][:5]
+
+
+def main() -> None:
+    parser = command(__doc__)
+    parser.add_argument("--lanes", type=int, default=4096)
+    parser.add_argument("--tolerance", type=float, default=6e-8)
+    chosen = started(parser)
+    solver = vrw.Options().solver
+    options = vrw.Options(rtol=chosen.tolerance, atol=chosen.tolerance)
+    told, fits = [], []
+    for scene, (rows, states) in scenes(chosen.lanes).items():
+        steps = np.asarray(tried(jnp.asarray(rows), jnp.asarray(states), solver, options))
+        by = lambda name, rows=rows: rows[:, PARAMETER_NAMES.index(name)]
+        orders = (
+            np.arange(len(rows)),
+            np.argsort(by("damping") / by("leg_mass")),
+            work_order(list(rows.T), states),
+            np.argsort(steps[1], kind="stable"),
+        )
+        told.append((scene, *(f"{waited(steps, order):.2f}" for order in orders)))
+        fit = powers(rows, states, steps)
+        fits.append((scene, *(f"{x / fit[0]:.2f}" for x in fit)))
+    table = markdown(("wheels", "as given", "c/m", "`vrw.steps`", "SLS-I's steps"), told)
+    replace(DOCS / "engine.md", "waiting", table)
+    print(table)
+    print(markdown(("wheels", "c/m", "dtheta", "k/m", "theta", "Ls"), fits))
+
+
+if __name__ == "__main__":
+    main()
