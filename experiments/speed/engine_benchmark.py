@@ -28,7 +28,8 @@ from experiments.shared.wheels import near_gaits, wheels
 from experiments.speed import peers
 from experiments.work_precision.charts import COLOURS
 from vrw_jax import figures as plots
-from vrw_jax.wheel import transitions
+from vrw_jax.batches.batch import work_order
+from vrw_jax.wheel import PARAMETER_NAMES, transitions
 
 LABELS = {
     "collocation": "lanes by collocation, durations known to 3 %",
@@ -78,15 +79,23 @@ def by_collocation(options, expected):
     return prepare
 
 
-def by_peer(function):
-    """Runs of a peer, which starts after the landing."""
+def by_peer(function, side_by_side=False):
+    """Runs of a peer, which starts after the landing.
+
+    One with wheels `side_by_side` gets them in the order in which they wait least, for nothing.
+    """
 
     def prepare(rows, states):
         params = wheels(rows)
+        back = slice(None)
+        if side_by_side:
+            columns = [np.asarray(getattr(params, name)) for name in PARAMETER_NAMES]
+            order = work_order(columns, states)
+            params, states, back = wheels(rows[order]), states[order], np.argsort(order)
         landing = transitions.land(params.symbols(), *np.asarray(states).T)
         starts = np.asarray(np.stack([landing.theta, landing.motion.dtheta], 1))
         packed = peers.pack(params)
-        return lambda: function(starts, packed)[:, :6]
+        return lambda: function(starts, packed)[back, :6]
 
     return prepare
 
@@ -107,7 +116,7 @@ def candidates(durations):
         for tolerance in (1e-6, 1e-7, 6e-8, 1.5e-8, 1e-9, 1e-10):
             yield (
                 "by hand", solver, tolerance, 1.0,
-                by_peer(lambda s, p, tol=tolerance, step=step: step(s, p, tol)),
+                by_peer(lambda s, p, tol=tolerance, step=step: step(s, p, tol), True),
             )  # fmt: skip
     for tolerance in (1e-6, 1e-7, 8e-9, 1e-9, 1e-10):
         yield (
