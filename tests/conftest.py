@@ -18,11 +18,14 @@ ROOMS = [
 ]
 
 COMPILE_LONGEST = (
-    "test_continuation", "test_limit_cycle", "test_reaching", "test_engines", "test_unilateral",
-    "test_tune", "test_answer", "test_ground_gaits", "test_derivatives", "test_reproduction",
-    "test_model_choice", "test_step_accuracy", "test_scan", "test_models_used", "test_outcomes",
-    "test_web_digits", "test_inputs", "test_second_formulation", "test_basin", "test_printing",
-    "test_wrong_calls", "test_own_loops", "test_types", "test_experiments",
+    "test_continuation", "test_limit_cycle", "test_unilateral", "test_any_system", "test_reaching",
+    "test_web_digits", "test_answer", "test_step_accuracy", "test_bordering", "test_models_used",
+    "test_rigid", "test_reference", "test_one_sided_stoppers", "test_scan", "test_engines",
+    "test_atlas_failures", "test_events", "test_scales", "test_ground_derivatives", "test_monitors",
+    "test_lane_engine", "test_outcomes", "test_reproduction", "test_ground_batches",
+    "test_snippets", "test_oracle", "test_simd", "test_cli", "test_stores", "test_walking",
+    "test_restitution", "test_layers", "test_phases", "test_robustness", "test_wrong_calls",
+    "test_inputs", "test_checked",
 )  # fmt: skip
 
 

@@ -196,7 +196,7 @@ def by_collocation_of_a_step():
     """Again and again, as the duration is not known beforehand."""
     phase, q, v = at(2)
     run = jax.jit(lambda q, v, T: fixed_work.collocate(phase, q, v, T, Mesh(2, 1.0)))
-    duration = jnp.asarray(0.2)
+    duration = jnp.asarray(0.2, float)  # of no weak type, as what comes back
     for _ in range(3):
         end = run(q, v, duration)
         duration = end.duration
