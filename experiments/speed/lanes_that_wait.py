@@ -49,6 +49,11 @@ def scenes(n: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     }
 
 
+def parameters(rows: np.ndarray) -> dict[str, np.ndarray]:
+    """By name, (lanes,)."""
+    return dict(zip(PARAMETER_NAMES, rows.T, strict=True))
+
+
 def waited(steps: np.ndarray, order: np.ndarray) -> float:
     groups = steps[:, order[: len(order) // GROUP * GROUP]].reshape(3, -1, GROUP)
     return float(groups.max(2).mean(1).sum() / steps.mean(1).sum())
@@ -56,14 +61,12 @@ def waited(steps: np.ndarray, order: np.ndarray) -> float:
 
 def powers(rows: np.ndarray, states: np.ndarray, steps: np.ndarray) -> np.ndarray:
     """Of c/m, dtheta and k/m, and what multiplies theta and Ls, in the log of SLS-I's steps."""
-    mass, length, stiffness, damping = (
-        rows[:, PARAMETER_NAMES.index(name)]
-        for name in ("leg_mass", "natural_length", "stiffness", "damping")
-    )
-    logs = [np.log(damping / mass), np.log(states[:, 1]), np.log(stiffness / mass)]
-    columns = np.stack([*logs, states[:, 0], length, np.ones(len(rows))], 1)
-    own = steps[1] > 0
-    return np.linalg.lstsq(columns[own], np.log(steps[1][own]), rcond=None)[0][:5]
+    own = parameters(rows)
+    mass = own["leg_mass"]
+    logs = [np.log(own["damping"] / mass), np.log(states[:, 1]), np.log(own["stiffness"] / mass)]
+    columns = np.stack([*logs, states[:, 0], own["natural_length"], np.ones(len(rows))], 1)
+    went = steps[1] > 0
+    return np.linalg.lstsq(columns[went], np.log(steps[1][went]), rcond=None)[0][:5]
 
 
 def main() -> None:
@@ -76,10 +79,10 @@ def main() -> None:
     told, fits = [], []
     for scene, (rows, states) in scenes(chosen.lanes).items():
         steps = np.asarray(tried(jnp.asarray(rows), jnp.asarray(states), solver, options))
-        by = lambda name, rows=rows: rows[:, PARAMETER_NAMES.index(name)]
+        own = parameters(rows)
         orders = (
             np.arange(len(rows)),
-            np.argsort(by("damping") / by("leg_mass")),
+            np.argsort(own["damping"] / own["leg_mass"]),
             work_order(list(rows.T), states),
             np.argsort(steps[1], kind="stable"),
         )
