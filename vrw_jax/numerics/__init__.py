@@ -1,7 +1,8 @@
-"""Numerical methods that know no wheel: flows with events, collocation, Newton, continuation.
+"""Numerical methods for any system: hybrid flows, collocation, fixed points and continuation.
 
-For any field, guards and resets: `walk`, `newton_cycle`, `segment_maps` with `product_multipliers`,
-`volume_change`, `arclength`, `complementary`; docs/any_system.md tells them by examples.
+The entry points for any vector field, guards and resets are `simulate_hybrid`, `solve_fixed_point`,
+`linearize_segments` with `product_multipliers`, `flow_jacobian_determinant`, `arclength` and
+`enumerate_lcp_solutions`. The page docs/any_system.md shows examples.
 """
 
 from vrw_jax.numerics import arclength, floquet

@@ -1,10 +1,10 @@
 """Pseudo-arclength continuation of fixed points in one parameter, through folds.
 
-Knows nothing of wheels: what is followed is an `AbstractFollowed`, which says how Newton's method
-corrects an unknown z at a parameter p and how z moves with p. Many branches run side by side, each
-with buffers of fixed size for its points.
+A problem is an `AbstractContinuationProblem`, which defines how Newton's method corrects the
+unknowns z at a parameter p and how z changes with p. Many branches run concurrently, each with
+buffers of fixed size for its points.
 
-Lengths are measured in the section's numbers and in the parameter as a share of its range.
+Lengths are measured in the section state and in the parameter as a fraction of its range.
 """
 
 import abc
@@ -26,23 +26,23 @@ from vrw_jax.numerics.types import Scalar
 from vrw_jax.wording import positive, whole
 
 Unknown = Any
-"""A pytree of float arrays: all that Newton's method moves."""
+"""A pytree of float arrays with everything that Newton's method corrects."""
 Section = Float[Array, " n"]
 
 
 @dataclasses.dataclass(frozen=True)
 class ArclengthOptions:
-    """Numerical choices of a continuation; each change compiles again.
+    """Numerical options of a continuation; each change compiles again.
 
-    - `first_step`, `largest_step`, `smallest_step`: along the branch, in the section's numbers and
-      in the parameter as a share of its range;
-    - `max_points`: in each direction;
-    - `iterations`: of Newton's method for one point;
-    - `tolerance`: of Newton's last correction;
-    - `turn`: most that the branch may turn in one step, rad.
+    - `initial_ds`, `max_ds`, `min_ds`: continuation step along the branch, in the section state and
+      in the parameter as a fraction of its range;
+    - `max_points`: limit of points in each direction;
+    - `max_newton_iterations`: limit of Newton's iterations for one point;
+    - `tolerance`: limit of the norm of Newton's last correction;
+    - `max_turn_angle`: largest turn of the branch in one continuation step, rad.
 
     Examples:
-        >>> vrw.ArclengthOptions(largest_step=0.05).max_points
+        >>> vrw.ArclengthOptions(max_ds=0.05).max_points
         400
     """
 
@@ -68,46 +68,56 @@ class ArclengthOptions:
 
 
 class Linear(NamedTuple):
-    """Newton's method at a trial (z, p)."""
+    """Correction and tangent of Newton's method at a trial point (z, p)."""
 
     correction: Unknown  # of z at fixed p
-    column: Unknown  # dz/dp along the branch
+    column: Unknown  # dz/dp, the tangent of the branch
     jacobian: Float[Array, "n n"]  # of the return map over the section's numbers
 
 
 class AbstractFollowed(eqx.Module):
-    """What can be followed; `wheel` is whatever else a branch's equations need, a pytree."""
+    """Base class of continuation problems; `args` is a pytree with all other inputs of the
+    equations.
+    """
 
     traced: ClassVar[bool] = True
-    """Whether `linearise` can be compiled into a loop; else it is called for many from outside."""
+    """Whether `linearize` can be compiled into a loop; otherwise it is called for many points at
+    once from outside of compiled code."""
 
     @abc.abstractmethod
     def linearise(self, wheel: Any, z: Unknown, p: Scalar) -> Linear:
-        """Correction, column and Jacobian; not finite where the map can't be evaluated."""
+        """Return correction, tangent and Jacobian; they are not finite where the map
+        is undefined.
+        """
 
     @abc.abstractmethod
     def section(self, z: Unknown) -> Section:
-        """The section's numbers, a part of z."""
+        """Return the section state, a part of z."""
 
     def between(self, left: Unknown, right: Unknown, place: Scalar) -> Unknown:
-        """Where Newton's method starts for a point at `place` in [0, 1] between two others."""
+        """Return the initial guess of Newton's method at a fraction in [0, 1] between
+        two points.
+        """
         return jax.tree.map(lambda a, b: a + place * (b - a), left, right)
 
     def size(self, z: Unknown, correction: Unknown) -> Scalar:
-        """Size of a correction, to be compared with the tolerance: its largest entry."""
+        """Return the norm of a correction, its largest entry, which is compared with
+        the tolerance.
+        """
         return jnp.max(jnp.abs(correction))
 
     def valid(self, wheel: Any, z: Unknown, p: Scalar) -> Bool[Array, ""]:
-        """Whether a converged z is what it stands for."""
+        """Return whether a converged z satisfies the conditions of its branch."""
         return jnp.all(jnp.isfinite(z))
 
 
 def at_fixed_point(
     image: Callable[[Array, Scalar], Array], z: Array, p: Scalar, numbers: int
 ) -> Linear:
-    """Newton's method on `image(z, p)` = z, of which the first `numbers` move continuously.
+    """Return the Newton step of `return_map(z, p)` = z, whose first `n_continuous` entries are
+    continuous.
 
-    The others are codes: those of the image are taken over.
+    The other entries are codes, which are copied from the image.
     """
     beside = lambda x, p: image(jnp.concatenate([x, z[numbers:]]), p)
     reached, slopes = with_jacobian(beside, z[:numbers], p)
@@ -121,9 +131,9 @@ def at_fixed_point(
 
 
 class MapFollowed(AbstractFollowed):
-    """Fixed points of any map x -> `function(wheel, x, p)` that JAX differentiates forwards.
+    """Fixed points of a map x -> `function(args, x, p)` that JAX differentiates in forward mode.
 
-    Where the map is not defined it returns NaN.
+    The map returns NaN where it is not defined.
     """
 
     function: Callable[[Any, Section, Scalar], Section] = eqx.field(static=True)
@@ -136,7 +146,7 @@ class MapFollowed(AbstractFollowed):
 
 
 class Ending(Code):
-    """Why a branch was followed no further in one direction."""
+    """Reason why the continuation of a branch ended in one direction."""
 
     GOING = 0, "It was still being followed."
     RANGE_ENDED = 1, "The parameter's range ended."
@@ -148,27 +158,31 @@ class Ending(Code):
 
 
 class PathPoint(NamedTuple):
-    """A point of a branch with the unit tangent to it."""
+    """A point of a branch with the unit tangent to the branch."""
 
     z: Unknown
     p: Scalar
-    slope: Unknown  # dz over length along the branch; () of a point that is kept
-    share_slope: Scalar  # the same of the parameter as a share of its range
+    slope: Unknown  # dz per length along the branch; () for stored points
+    share_slope: Scalar  # rate of the parameter, as a fraction of its range, per length
     jacobian: Float[Array, "n n"]
     valid: Bool[Array, ""]
 
 
 class Track(NamedTuple):
-    """Of branches side by side: points in buffers of `max_points`, the first `n_points` set."""
+    """Points of one or more branches in buffers of `max_points`, of which the first `n_points` are
+    set.
+    """
 
     points: PathPoint
     n_points: Int[Array, " branches"]
-    ending: Int[Array, " branches"]  # an Ending
-    passes: Int[Array, " branches"]  # linearisations spent
+    ending: Int[Array, " branches"]  # a ContinuationStatus
+    passes: Int[Array, " branches"]  # calls of `linearize`
 
 
 class Plane(NamedTuple):
-    """The condition that picks a point: row . (section, share) is that of the place named."""
+    """The condition that selects a point: the projection on the normal equals that of the given
+    point.
+    """
 
     x: Section
     share: Scalar
@@ -177,17 +191,19 @@ class Plane(NamedTuple):
 
 
 class Corrected(NamedTuple):
+    """State of the corrector after one Newton iteration."""
+
     z: Unknown
     share: Scalar
     size: Scalar
-    column: Unknown  # dz over the share
+    column: Unknown  # dz per fraction of the parameter's range
     jacobian: Float[Array, "n n"]
 
 
 def linear_at(
     followed: AbstractFollowed, wheel: Any, bounds: Array, z: Unknown, share: Scalar
 ) -> Linear:
-    """At a share of the parameter's range."""
+    """Return the Newton step at a fraction of the parameter's range."""
     return followed.linearise(wheel, z, bounds[0] + (bounds[1] - bounds[0]) * share)
 
 
@@ -199,7 +215,7 @@ def corrected(
     z: Unknown,
     share: Scalar,
 ) -> Corrected:
-    """One Newton iteration on the branch's equations and the plane at once."""
+    """Apply one Newton iteration to the branch's equations and the constraint plane together."""
     scale = bounds[1] - bounds[0]
     column = jax.tree.map(lambda x: scale * x, linear.column)
     x = followed.section(z) + followed.section(linear.correction)
@@ -215,7 +231,7 @@ def _share_of(p: Array, bounds: Array) -> Array:
 
 
 def parameter_at(share: Array, bounds: Array) -> Array:
-    """The inverse; exact at both ends."""
+    """Return the parameter at a fraction of its range; it is exact at both ends."""
     p = bounds[0] + (bounds[1] - bounds[0]) * share
     return jnp.where(share == 1.0, bounds[1], p)
 
@@ -224,8 +240,8 @@ class _Trial(NamedTuple):
     plane: Plane
     z: Unknown
     share: Scalar
-    length: Scalar  # from the last point, as predicted
-    final: Bool[Array, ""]  # it is to lie on the end of the range
+    length: Scalar  # predicted arc length from the last point
+    final: Bool[Array, ""]  # whether it lies on the end of the range
 
 
 def _predicted(
@@ -236,10 +252,12 @@ def _predicted(
     step: Scalar,
     bounds: Array,
 ) -> _Trial:
-    """One step along the tangent, or on the end of the range if that is nearer.
+    """Return the predicted point one step along the tangent, or on the end of the range if it is
+    nearer.
 
-    Newton's method starts on the cubic through the last two points and along their tangents, once
-    there are `two`: that is nearer to the branch by two orders, and saves an iteration of three.
+    With `has_two_points`, Newton's method starts on the cubic through the last two points and along
+    their tangents. The cubic is nearer to the branch by two orders and saves one iteration of
+    three.
     """
     share, ahead = _share_of(base.p, bounds), base.share_slope
     edge = jnp.where(ahead > 0.0, 1.0, 0.0)
@@ -270,9 +288,11 @@ def _predicted(
 
 
 class State(NamedTuple):
+    """State of the continuation of one branch."""
+
     before: PathPoint
     base: PathPoint
-    first: PathPoint  # of the branch, once there is one
+    first: PathPoint  # of the branch, if it exists
     step: Scalar
     trial: _Trial
     iteration: Int[Array, ""]
@@ -282,11 +302,13 @@ class State(NamedTuple):
 
 
 class _Judged(NamedTuple):
-    """What an iteration of Newton's method makes of a trial; neither: it goes on."""
+    """Assessment of a trial after one Newton iteration; if neither flag is set, the iteration goes
+    on.
+    """
 
     accepted: Bool[Array, ""]
     failed: Bool[Array, ""]
-    share_slope: Scalar  # along the branch, the way it is followed
+    share_slope: Scalar  # along the branch, in the direction of the continuation
 
 
 def _judged(
@@ -296,6 +318,9 @@ def _judged(
     now: Corrected,
     direction: Scalar,
 ) -> _Judged:
+    """Return whether a trial is accepted or has failed, and the parameter's rate along
+    the branch.
+    """
     base, trial, starting = state.base, state.trial, state.n_points == 0
     off = jnp.maximum(
         jnp.max(jnp.abs(followed.section(now.z) - trial.plane.x)),
@@ -314,7 +339,10 @@ def _judged(
 
 
 def _next_step(options: ArclengthOptions, state: State, judged: _Judged) -> Scalar:
-    """Longer where Newton's method was quick, shorter where it was slow, half where it failed."""
+    """Return the next continuation step.
+
+    The step grows after few Newton iterations, shrinks after many, and halves after a failure.
+    """
     quick, slow = state.iteration < 4, state.iteration >= 6
     growth = jnp.where(quick, 1.4, jnp.where(slow, 0.6, 1.0))
     longer = jnp.minimum(state.step * growth, options.largest_step)
@@ -326,7 +354,7 @@ def _next_step(options: ArclengthOptions, state: State, judged: _Judged) -> Scal
 def _closes(
     followed: AbstractFollowed, start: PathPoint, base: PathPoint, to: PathPoint, bounds: Array
 ) -> Bool[Array, ""]:
-    """Whether the way from one point to the next leads over the branch's start."""
+    """Return whether the segment from one point to the next passes over the branch's start."""
     place = lambda at: jnp.append(followed.section(at.z), _share_of(at.p, bounds))
     chord, there = place(to) - place(base), place(start) - place(base)
     squared = chord @ chord
@@ -344,7 +372,9 @@ def _ending(
     ahead: Scalar,
     closes: Bool[Array, ""],
 ) -> Int[Array, ""]:
-    """Whether and why it ends with the trial as judged; `ahead`: length of what follows."""
+    """Return whether and why the branch ends at this trial; `next_length` is the next step's
+    length.
+    """
     accepted, failed, _ = judged
     count, ending = state.n_points + accepted, state.ending
     for happened, code in (
@@ -378,10 +408,11 @@ def _started(
 
 
 SIDE_BY_SIDE = 8
-"""Branches that are followed at once: one group of lanes of machine code."""
+"""Branches that are continued concurrently, chosen because they fill one group of lanes of machine
+code."""
 
 Followed = tuple[State, PathPoint]
-"""Branches side by side, and the points that they have reached."""
+"""States of concurrent branches, and the buffers of points that they have reached."""
 
 
 def begun(
@@ -393,6 +424,7 @@ def begun(
     directions: Array,
     wanted: Array,
 ) -> Followed:
+    """Return the initial states of the branches and their empty buffers of points."""
     states = jax.vmap(functools.partial(_started, followed, options, bounds))(z, p, directions)
     ending = jnp.where(wanted, states.ending, int(Ending.NO_START))
     states = states._replace(ending=ending.astype(jnp.int32))
@@ -401,7 +433,7 @@ def begun(
 
 
 def going(on: Followed) -> Array:
-    """Which are still followed."""
+    """Return which branches still run."""
     return on[0].ending == int(Ending.GOING)
 
 
@@ -415,9 +447,9 @@ def turned(
     on: Followed,
     linears: Linear,
 ) -> Followed:
-    """After one linearisation of each: of the running trials, whatever points they are for.
+    """Advance each branch by one linearization of its trial, and store the accepted points.
 
-    `rows` of the buffers are theirs.
+    The branches own the rows `buffer_rows` of the buffers.
     """
 
     def iterate(
@@ -445,7 +477,7 @@ def turned(
         later = State(before, base, first, step, following, iteration, *counts)
         return later, reached, judged.accepted
 
-    # Buffers stay out of what is selected by branch: that would copy them at every turn.
+    # Buffers are updated outside of `tree_where`, which would copy them at every iteration.
     state, points = on
     after, reached, accepted = jax.vmap(iterate)(wheels, directions, state, linears)
     place = jnp.where(going(on) & accepted, state.n_points, options.max_points)
@@ -455,6 +487,7 @@ def turned(
 
 
 def track_of(on: Followed) -> Track:
+    """Return the result of a continuation from the states of its branches."""
     last, points = on
     return Track(points, last.n_points, last.ending, last.passes)
 
@@ -470,11 +503,13 @@ def follow(
     directions: Float[Array, "*branches"],
     wanted: Bool[Array, "*branches"] | None = None,
 ) -> Track:
-    """The branches from the points near (z, p), towards growing p if the direction is 1, else -1.
+    """Continue the branches from the points near (z, p) in the given directions.
 
-    One branch, or several with a leading axis; all of them, or those that are `wanted`. Each ends
-    at the range's end, or with its first point that is not `valid`, which is kept. Some go side by
-    side, with one linearisation of each at every turn; where one ends the next begins.
+    The parameter grows if the direction is 1 and shrinks if it is -1. The input is one branch, or
+    several with a leading axis, of which only those that are requested run. Each branch ends at the
+    end of the range, or with its first point that is not admissible, which is kept. Groups of
+    branches run concurrently with one linearization of each per iteration; when a branch ends, the
+    next one starts.
     """
     if p.ndim == 0:
         one = lambda tree: jax.tree.map(lambda x: x[None], tree)

@@ -1,10 +1,13 @@
-"""What a lane carries of how something ended: a code, with one sentence for a reader."""
+"""Status codes with one sentence for a reader, which each batch element can carry as an integer."""
 
 import enum
 
 
 class Code(enum.IntEnum):
-    """Members are `NAME = number, "sentence"`; the number is the value."""
+    """Base class of status codes, whose members are `NAME = number, "sentence"`.
+
+    The number is the value of the member.
+    """
 
     meaning: str
 

@@ -1,14 +1,15 @@
-"""A limit cycle as one algebraic system: all phases, their durations and the section at once.
+"""Collocation of a limit cycle: all phases, their durations and the section state together.
 
-Each phase is cut into steps of four Gauss nodes (order 8). Unknown are the section's numbers, the
-durations of the phases and the accelerations at all nodes; positions and rates follow from them
-explicitly. One `linearised_pass` walks through the steps once, carrying a few columns: the Newton
-correction, one column for each number of the section, one for each parameter that is asked for, and
-one for the duration of the running phase. A step's node equations are eliminated on the spot, a
-phase's duration at its event, the section's numbers at the closing of the cycle. So the monodromy
-matrix and the sensitivities of everything to the parameters are columns of the same pass.
+Each phase is divided into mesh intervals of four Gauss nodes (order 8). The unknowns are the
+section state, the durations of the phases and the accelerations at all nodes; positions and rates
+follow from them explicitly. One pass of `linearize_cycle` goes through the intervals once and
+propagates a few tangents: the Newton correction, one tangent for each entry of the section state,
+one for each requested parameter, and one for the duration of the running phase. The node equations
+of an interval are eliminated immediately, the duration of a phase at its event, the section state
+at the closing of the cycle. The monodromy matrix and the sensitivities of all unknowns to the
+parameters are therefore tangents of the same pass.
 
-Arrays carry lanes (independent wheels) on their last axis; nothing branches.
+Arrays have batch elements (independent wheels) on their last axis, and no code branches.
 """
 
 import functools
@@ -47,10 +48,11 @@ from vrw_jax.numerics.lane_algebra import (
 from vrw_jax.numerics.types import Elementwise, Vector
 
 Constants = tuple[Elementwise, ...]
+"""The constants of the phases' equations, one array for each."""
 
 
 class Point(NamedTuple):
-    """Where a phase is: what it holds constant, coordinates and rates."""
+    """State within a phase: its held constants, coordinates and rates."""
 
     held: Vector
     q: Vector
@@ -58,13 +60,13 @@ class Point(NamedTuple):
 
 
 class Phase(NamedTuple):
-    """One phase as data; every function is elementwise over the lanes.
+    """One phase as data, whose functions are elementwise over the batch.
 
-    `residual` is what the equations of motion leave over at (constants, point, acceleration),
-    linear in the acceleration: multiplied out it costs far less to differentiate than solved for.
-    `event` (zero at the end) and `guards` (positive inside) read (constants, point); `reset` turns
-    the phase's end into the next phase's start, and the last one's into the section's numbers (in
-    `q`).
+    `residual` is the residual of the equations of motion at (constants, point, acceleration), which
+    is linear in the acceleration; this form costs far less to differentiate than the solved form.
+    `event` (zero at the end) and `guards` (positive inside) take (constants, point). `reset` maps
+    the end of the phase to the start of the next phase, and the end of the last phase to the
+    section state (in `q`).
     """
 
     name: str
@@ -73,14 +75,15 @@ class Phase(NamedTuple):
     event: Callable[[Constants, Point], Elementwise]
     reset: Callable[[Constants, Point], Point]
     guards: Callable[[Constants, Point], Vector]
-    smooth: bool = True  # False: a fast mode that dies at once is left to the first step
+    smooth: bool = True  # False: the first interval leaves a fast decaying mode unresolved
 
 
 class PhaseSequence(NamedTuple):
-    """The phases between two passages of the section, whose size is the number of unknowns there.
+    """The phases between two crossings of the section, which has `section_size` unknowns.
 
-    `start` turns the section's numbers into the first phase's start. `border_checks` reads the
-    passages of a step and which phases happened, and returns what must be positive there.
+    `start` maps the section state to the start of the first phase. `admissibility_margins` takes
+    the passages of a gait step and the flags of active phases, and returns the quantities that must
+    be positive there.
     """
 
     section_size: int
@@ -90,28 +93,34 @@ class PhaseSequence(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """The unknowns of a cycle of n steps, lanes last; a step is one passage of the sequence."""
+    """The unknowns of a cycle of n gait steps, batch last; a gait step is one run of
+    the sequence.
+    """
 
-    section: LaneArray  # (section_size, lanes), at the start of the first step
-    durations: LaneArray  # (n, n_phases, lanes), s
-    accelerations: tuple[LaneArray, ...]  # by phase: (n, n_steps, N_NODES, dim, lanes)
+    section: LaneArray  # (section_size, batch), at the start of the first gait step
+    durations: LaneArray  # (n, n_phases, batch), s
+    accelerations: tuple[
+        LaneArray, ...
+    ]  # by phase: (n, n_intervals, N_GAUSS_NODES, n_coordinates, batch)
 
 
 class Linearised(NamedTuple):
-    """What one pass finds out at a trial solution."""
+    """Results of one pass at a trial solution."""
 
     correction: Solution  # of Newton's method
-    columns: Solution  # leading axis: derivatives with respect to each parameter asked for
-    ends: LaneArray  # (n, 2 dim, lanes): coordinates and rates at each step's end, corrected
-    d_ends: LaneArray  # leading axis: their derivatives with respect to each parameter
-    monodromy: LaneArray  # (row, column, lanes): derivative of the return to the section
+    columns: Solution  # leading axis: derivatives with respect to each requested parameter
+    ends: (
+        LaneArray  # (n, 2 n_coordinates, batch): corrected coordinates and rates at each step's end
+    )
+    d_ends: LaneArray  # leading axis: their derivatives with respect to each parameter requested
+    monodromy: LaneArray  # (row, column, batch): Jacobian of the return map on the section
 
 
 class _Task(NamedTuple):
-    """What a whole pass reads, and the columns that it carries, in this order.
+    """Inputs of a whole pass, and the layout of the tangents that it propagates.
 
-    The correction; one for each number of the section; one for each parameter `wanted`; and, as
-    long as a phase runs, one for its duration.
+    The order is: the correction; one tangent for each entry of the section state; one for each
+    parameter in `parameter_indices`; and, within a phase, one for its duration.
     """
 
     section_size: int
@@ -119,20 +128,21 @@ class _Task(NamedTuple):
     parameters: LaneArray
     constants_of: Callable[..., Constants]
     constants: Constants
-    d_constants: tuple[LaneArray, ...]  # each's columns, of the parameters alone
+    d_constants: tuple[LaneArray, ...]  # the tangents of each, only with respect to the parameters
     hold: Hold
 
     @property
     def n_columns(self) -> int:
-        """Outside of a phase."""
+        """Number of tangents outside of a phase."""
         return 1 + self.section_size + len(self.wanted)
 
     @property
     def of_section(self) -> slice:
+        """Slice of the tangents with respect to the section state."""
         return slice(1, 1 + self.section_size)
 
     def push(self, function: Callable, place: tuple, d_place: tuple) -> tuple:
-        """Value and columns of `function(*place, *constants)`."""
+        """Return the value and the tangents of `function(*point, *constants)`."""
         if not self.wanted:
             return push_columns(lambda *place: function(*place, *self.constants), place, d_place)
         after = d_place[0].shape[0] - self.n_columns
@@ -147,6 +157,7 @@ def _task(
     parameters: LaneArray,
     constants_of: Callable[..., Constants],
 ) -> _Task:
+    """Return the context of a pass with the constants and their tangents."""
     hold = fusion_barrier(parameters)
     dtype, lanes = parameters.dtype, parameters.shape[1:]
     units = np.eye(parameters.shape[0], dtype=dtype)[list(wanted)]
@@ -159,13 +170,13 @@ def _task(
 
 
 def _stacked(point: Point, like: Array) -> tuple[Array, ...]:
-    """Its parts as arrays, of which some may be empty."""
+    """Return the parts of a point as arrays, some of which may be empty."""
     empty = jnp.zeros((0, *like.shape[1:]), like.dtype)
     return tuple(jnp.stack(x) if x else empty for x in point)
 
 
 class _Front(NamedTuple):
-    """Where the pass is, with the columns of everything there (leading axis: columns)."""
+    """State of the pass with its tangents (leading axis: tangents)."""
 
     held: LaneArray
     q: LaneArray
@@ -176,24 +187,26 @@ class _Front(NamedTuple):
 
 
 def _with_column(front: _Front) -> _Front:
-    """One more column, zero so far, for the duration of the phase that begins."""
+    """Append one zero tangent for the duration of the phase that begins."""
     more = lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])])
     return front._replace(d_held=more(front.d_held), dq=more(front.dq), dv=more(front.dv))
 
 
 class _Interval(NamedTuple):
+    """One mesh interval of a phase."""
+
     fraction: Array  # of the phase's duration
     h: LaneArray  # length, s
-    a: LaneArray  # accelerations, (node, coordinate, lane)
+    a: LaneArray  # accelerations, (node, coordinate, batch)
 
 
 def _unit(n_columns: int, column: int, dtype: Any) -> np.ndarray:
-    """1 in that column, to be multiplied with what stands behind."""
+    """Return a unit vector over the tangents, with trailing axes for multiplication."""
     return np.eye(n_columns, dtype=dtype)[column][:, None, None, None]
 
 
 def _to_nodes(front: _Front, step: _Interval) -> tuple[Array, ...]:
-    """Coordinates and rates at the nodes of a step, and their columns."""
+    """Return coordinates and rates at the nodes of an interval, and their tangents."""
     fraction, h, a = step
     v, dq, dv = front.v, front.dq, front.dv
     c = NODES.astype(h.dtype)[:, None, None]
@@ -207,7 +220,7 @@ def _to_nodes(front: _Front, step: _Interval) -> tuple[Array, ...]:
 
 
 def _to_end(front: _Front, step: _Interval, da: LaneArray) -> _Front:
-    """The step's end, from its accelerations and their columns `da`."""
+    """Return the state at the end of an interval from its accelerations and their tangents."""
     fraction, h, a = step
     _, q, v, _, dq, dv = front
     duration = _unit(dq.shape[0], -1, h.dtype)[:, 0]
@@ -223,9 +236,11 @@ def _to_end(front: _Front, step: _Interval, da: LaneArray) -> _Front:
 def _equations(
     task: _Task, phase: Phase, front: _Front, Q: LaneArray, V: LaneArray, a: LaneArray
 ) -> tuple[Array, Array, Any]:
-    """Residual at the nodes, its Jacobian by (q, v, acceleration, held), and by the parameters.
+    """Return the residual at the nodes and its partial derivatives.
 
-    Axes: node, equation, argument, lane; that of the parameters leads.
+    The Jacobian is with respect to (q, v, acceleration, held constants); the derivatives with
+    respect to the parameters are separate. Axes: node, equation, argument, batch; the axis of the
+    parameters leads.
     """
     dim, n_held = phase.dim, front.held.shape[0]
 
@@ -240,7 +255,7 @@ def _equations(
     n_moving = len(arguments)
     if task.wanted:
         arguments += [jnp.broadcast_to(x, Q[:, 0].shape) for x in task.parameters]
-    # As separate arrays first: each is a small kernel; stacking them is a copy.
+    # The partials stay separate arrays first: each is a small kernel; stacking them is a copy.
     value, partials = task.hold(partials_of(left_over, arguments))
     by_argument = list(zip(*partials, strict=True))
     jacobian = jnp.stack([jnp.stack(p, 1) for p in by_argument[:n_moving]], 2)
@@ -251,7 +266,9 @@ def _equations(
 def _node_system(
     task: _Task, front: _Front, h: LaneArray, equations: tuple, d_moving: LaneArray
 ) -> tuple[Array, Array]:
-    """Matrix and right-hand sides, a column each, of what corrects a step's accelerations."""
+    """Return matrix and right-hand sides, one per tangent, for the corrections of the
+    accelerations.
+    """
     value, jacobian, forced = equations
     n_columns, dim, dtype = d_moving.shape[0], value.shape[1], h.dtype
     terms = [jacobian[:, :, s] * d_moving[:, :, s, None] for s in range(2 * dim)]
@@ -278,7 +295,10 @@ def _pass_phase(
     duration: LaneArray,
     accelerations: LaneArray,
 ) -> tuple[_Front, LaneArray]:
-    """Through all steps of a phase; returns its end and the columns of its accelerations."""
+    """Propagate the state through all intervals of a phase.
+
+    Return the state at its end and the tangents of its accelerations.
+    """
 
     def step(moving: tuple, inputs: tuple) -> tuple[tuple, Array]:
         a, fraction = inputs
@@ -286,9 +306,9 @@ def _pass_phase(
         here = front._replace(**dict(zip(MOVING, moving, strict=True)))
         Q, V, dQ, dV = task.hold(_to_nodes(here, step))
         equations = _equations(task, phase, here, Q, V, a)
-        d_moving = jnp.concatenate([dQ, dV], 2)  # (column, node, argument, lane)
+        d_moving = jnp.concatenate([dQ, dV], 2)  # (tangent, node, argument, batch)
         system = task.hold(_node_system(task, here, step.h, equations, d_moving))
-        da = task.hold(eliminate(*system, task.parameters))  # (node, row, column, lane)
+        da = task.hold(eliminate(*system, task.parameters))  # (node, row, tangent, batch)
         end = _to_end(here, step, da)
         return tuple(getattr(end, name) for name in MOVING), jnp.moveaxis(da, 2, 0)
 
@@ -299,16 +319,17 @@ def _pass_phase(
 
 
 MOVING = ("q", "v", "dq", "dv")
-"""What a step of a phase changes of the front."""
+"""Fields of the pass state that change within a phase."""
 
 
 def _leave_phase(
     task: _Task, phase: Phase, front: _Front, duration: LaneArray, happens: Bool[Array, " lanes"]
 ) -> tuple[_Front, LaneArray, Callable[[Array], Array]]:
-    """Eliminate the duration by the event and reset.
+    """Eliminate the duration of a phase by its event, and apply the reset.
 
-    Returns the next phase's front, the columns of the duration, and the function that eliminates
-    the duration's column from other columns. A phase that does not happen has duration zero.
+    Return the state of the next phase, the tangents of the duration, and the function that
+    eliminates the duration's tangent from other tangents. A phase that is not active has duration
+    zero.
     """
 
     def end(held: Array, q: Array, v: Array, *constants: Array) -> tuple:
@@ -333,6 +354,7 @@ def _leave_phase(
 def _pass_step(
     task: _Task, sequence: PhaseSequence, meshes: tuple[Mesh, ...], carry: tuple, inputs: tuple
 ) -> tuple:
+    """Propagate the section state and its tangents through one gait step."""
     section, d_section = carry
     durations, accelerations, happens = inputs
 
@@ -349,10 +371,10 @@ def _pass_step(
         end, d_end = (jnp.concatenate(x, -2) for x in ((front.q, front.v), (front.dq, front.dv)))
         front, d_duration, eliminated = _leave_phase(task, phase, front, durations[i], happens[i])
         d_durations.append(d_duration)
-        # Columns first, then steps: (column, step, node, row, lane).
+        # Axes: (tangent, interval, node, row, batch).
         d_accelerations.append(eliminated(jnp.swapaxes(columns, 0, 1)))
         front = task.hold(front)
-    # The end is that of the last phase.
+    # The end state and its tangents are those of the last phase.
     traced = end, eliminated(d_end), jnp.stack(d_durations, 1), tuple(d_accelerations)
     return (front.q, front.dq), traced
 
@@ -366,9 +388,10 @@ def linearised_pass(
     happens: Bool[Array, "n n_phases lanes"],
     wanted: tuple[int, ...] = (),
 ) -> Linearised:
-    """Newton's correction, monodromy and the columns of the parameters `wanted`, at `solution`.
+    """Return Newton's correction, the monodromy matrix and the requested tangents at `solution`.
 
-    `happens` says which phases take place: one that does not has duration zero and only resets.
+    `phase_active` marks the phases that take place: an inactive phase has duration zero and only
+    applies its reset.
     """
     task = _task(sequence.section_size, wanted, parameters, constants_of)
     section, dtype, n = solution.section, parameters.dtype, task.n_columns
@@ -390,7 +413,9 @@ def linearised_pass(
     d_closed = jnp.swapaxes(contract(closing, jnp.swapaxes(right, 0, 1)), 0, 1)
 
     def close(columns: Array) -> Array:
-        """From (n, column, ...) to (other column, n, ...): without the section's columns."""
+        """Return (tangent, n, ...) from (n, tangent, ...), without the tangents of the section
+        state.
+        """
         columns = jnp.swapaxes(columns, 0, 1)
         shape = (-1, *(1,) * (columns.ndim - 2), *section.shape[1:])
         own = columns[task.of_section]
@@ -410,7 +435,7 @@ def linearised_pass(
 
 
 class Passage(NamedTuple):
-    """Points of one phase: its start, its end and all nodes (as a leading axis)."""
+    """Points of one phase: its start, its end and all nodes (on a leading axis)."""
 
     start: Point
     nodes: Point
@@ -425,9 +450,10 @@ def walk_through(
     durations: Array,
     accelerations: tuple[Array, ...],
 ) -> tuple[Vector, tuple[Passage, ...]]:
-    """Through one step with known durations and accelerations: the section after it, its passages.
+    """Reconstruct one gait step from known durations and accelerations.
 
-    No equation is solved and nothing has lanes in particular: trailing axes go through.
+    Return the section state after the step and the passages of its phases. No equation is solved;
+    any trailing axes are allowed.
     """
     point = sequence.start(constants, section)
     passages = []
@@ -447,13 +473,14 @@ def walk_through(
 
 
 def mesh_error(sequence: PhaseSequence, meshes: tuple[Mesh, ...], solution: Solution) -> LaneArray:
-    """Estimate of what the mesh leaves of error in a cycle, rad, m and parts of the period.
+    """Return an estimate of the discretization error of a cycle, in rad, m and fractions of the
+    period.
 
-    Each step's accelerations are a polynomial of their own; where two steps meet they differ by
-    what neither resolves. That jump times the longer step squared is a displacement; times
-    JUMP_TO_ERROR it bounds the error of all but some of rounding, among 346 random gaits with
-    periods to 10 s, on two meshes, and stands far above it in most. Phases that are not smooth do
-    not count: what they leave to one step hardly reaches the next.
+    Each interval's accelerations are a separate polynomial, and at an interval boundary both differ
+    by what neither resolves. That jump times the longer interval squared is a displacement. Times
+    ERROR_PER_JUMP it bounds the error, except for some round-off, and is far above it in most
+    cases. This was found for 346 random gaits with periods to 10 s, on two meshes. Phases with
+    `is_smooth` False do not count, because their error in one interval hardly reaches the next.
     """
     largest = jnp.zeros(solution.section.shape[-1], solution.section.dtype)
     for i, mesh in enumerate(meshes):
@@ -474,3 +501,4 @@ def mesh_error(sequence: PhaseSequence, meshes: tuple[Mesh, ...], solution: Solu
 
 
 JUMP_TO_ERROR = 0.05
+"""Ratio of the estimated error to the displacement of a jump at an interval boundary."""

@@ -1,4 +1,4 @@
-"""Contacts that push or open: all answers of a linear complementarity problem, by enumeration."""
+"""Unilateral contacts: all solutions of a linear complementarity problem (LCP), by enumeration."""
 
 import itertools
 from collections.abc import Sequence
@@ -14,11 +14,11 @@ from vrw_jax.numerics.codes import Code
 from vrw_jax.wording import traced
 
 MOST_CONTACTS = 10
-"""Two to the power of that many combinations are solved."""
+"""Most contacts of an LCP, chosen because two to the power of it combinations are solved."""
 
 
 class Answers(Code):
-    """How many answers there are."""
+    """Number of solutions of an LCP."""
 
     NONE = 0, "No force fits: a rigid body would have to jump at once."
     ONE = 1, "One answer."
@@ -26,22 +26,22 @@ class Answers(Code):
 
 
 class Contact(NamedTuple):
-    """Forces z >= 0 and what they leave, w = matrix z + free >= 0, with z w = 0 in each contact."""
+    """Forces z >= 0 and gaps w = matrix z + free_gap >= 0, with z w = 0 in each contact."""
 
-    force: Float[Array, " n"]  # of the answer with most closed contacts; not a number without any
+    force: Float[Array, " n"]  # of the solution with most closed contacts; NaN if there is none
     gap: Float[Array, " n"]
-    answers: Int[Array, ""]  # an Answers
-    fits: Bool[Array, " combinations"]  # which combinations of closed contacts are answers
+    answers: Int[Array, ""]  # an LCPStatus
+    fits: Bool[Array, " combinations"]  # which combinations of closed contacts are solutions
     forces: Float[Array, "combinations n"]
 
 
 def complementary(
     matrix: ArrayLike | Sequence, free: ArrayLike | Sequence, slack: float = 1e-12
 ) -> Contact:
-    """All answers for any matrix, symmetric or not; signs hold to `slack` of the largest entry.
+    """Return all solutions of an LCP with any matrix, symmetric or not.
 
-    Combinations that differ only by contacts without force count once. Differentiable where one
-    answer stays.
+    Signs hold to `tolerance` of the largest entry. Combinations that differ only by contacts
+    without force count once. The result is differentiable where one solution persists.
     """
     free = jnp.asarray(free, float)
     matrix = jnp.asarray(matrix, free.dtype)
@@ -52,7 +52,7 @@ def complementary(
             f"(n,) with n from 1 to {MOST_CONTACTS}."
         )
     if not traced(matrix, free) and not np.isfinite(np.append(matrix, free)).all():
-        raise ValueError("matrix or free holds a number that is not finite: nothing can be told.")
+        raise ValueError("matrix or free holds a number that is not finite: give finite numbers.")
     largest = jnp.max(jnp.abs(matrix))
     scale = jnp.where(largest > 0.0, largest, 1.0)
     free, matrix = free / scale, matrix / scale

@@ -1,4 +1,4 @@
-"""Where in a step of many wheels the earliest of their guards vanishes."""
+"""Location of the earliest zero of the guards within a solver step, for a batch."""
 
 import functools
 from collections.abc import Callable
@@ -25,26 +25,26 @@ from vrw_jax.numerics.types import Vector
 
 
 class Crossing(NamedTuple):
-    """Steps within which guards cross zero."""
+    """Solver steps within which guards cross zero."""
 
-    here: Place  # where they begin
-    values: Vector  # of the guards there
+    here: Place  # at the start of the step
+    values: Vector  # of the guards at the start
     inside: Vector  # at the tableau's stage `middle`
     beyond: Vector  # at the end
     h: Array
-    guards: Array  # bits of those that cross
-    crossed: Array  # in which lanes there is such a step
+    guards: Array  # bits of the guards that cross
+    crossed: Array  # batch elements with such a step
 
 
 class Located(NamedTuple):
-    """The search, and what it found."""
+    """State and result of the event search."""
 
-    length: Array  # the next try; the event's, once found
+    length: Array  # of the next try, or of the event once it is found
     low: Array
     high: Array
     open: Array
     end: Place
-    shift: Array  # from there to the event, by Newton's method
+    shift: Array  # from `end` to the event, by Newton's method
     guard: Array
     tried: Array
     tries: Array
@@ -58,12 +58,12 @@ def locate(
     step: Crossing,
     options: Options,
 ) -> Located:
-    """The earliest event inside each crossing step, by Newton's method on the step's length.
+    """Return the earliest event inside each crossing step, by Newton's method on the step's length.
 
-    The first try is where the guards' parabolas cross. Every guard that crossed proposes its own
-    time and the earliest is taken, inside a bracket that bisection shrinks. Once a proposal is
-    near, and no guard so bent that Newton's method might still miss, a short step of low order goes
-    there; what is left moves the end along its slope.
+    The first try is the crossing of the guards' parabolas. Every guard that crossed proposes its
+    own time and the earliest proposal is taken, inside a bracket that bisection shrinks. Once a
+    proposal is near, and no guard is too curved for Newton's method, a short step of low order
+    reaches it; the remainder is an extrapolation along the state's rate.
     """
     h, root = step.h, jnp.sqrt(options.rtol)
     enough, near = 0.1 * root * h, 0.3 * jnp.sqrt(root) * h
@@ -113,13 +113,14 @@ def _closed_in(
     limits: tuple[Array, Array],
     options: Options,
 ) -> Located:
-    """From a place near the event to the event, by short steps of low order.
+    """Return the event from a state near it, by short steps of low order.
 
-    One, but for guards that touch zero more than cross it; lost where Newton's method goes away.
-    `limits`: how much is left to a move along the slope, and how much to such a step, s.
+    One step suffices, except for guards that graze zero; the event stays unresolved if Newton's
+    method diverges. `limits`: the largest time left to the extrapolation, and the largest time of a
+    short step, s.
     """
     enough, near = limits
-    short = explicit_tableau("Bosh3")  # over a thousandth of a step exact to rounding
+    short = explicit_tableau("Bosh3")  # exact to round-off over a thousandth of a step
     assert short is not None
 
     def goes(far: Array, shift: Array) -> Array:
@@ -144,7 +145,7 @@ def _closed_in(
 
 
 def _along(place: Place, shift: Array) -> Place:
-    """A little later, along the slope."""
+    """Return the state a time step later, extrapolated along its rate."""
     q = tuple(x + shift * y for x, y in zip(place.q, place.v, strict=True))
     v = tuple(x + shift * y for x, y in zip(place.v, place.slope.acceleration, strict=False))
     return place._replace(q=q, v=v)
@@ -152,16 +153,20 @@ def _along(place: Place, shift: Array) -> Place:
 
 @jax.jit  # traced once, for whichever guard
 def _passed_or_bent(start: Array, g: Array, rate: Array, length: Array) -> tuple[Array, Array]:
-    """Whether a guard has crossed so far, and whether it is too bent for Newton's method alone."""
-    past = (g < 0.0) | ((g == 0.0) & (rate <= 0.0))  # one that rises has yet to come back
+    """Return whether a guard has crossed, and whether it is too curved for Newton's
+    method alone.
+    """
+    past = (g < 0.0) | ((g == 0.0) & (rate <= 0.0))  # a guard that rises from zero has not crossed
     fall = rate * length
     return past, jnp.abs(2.0 * (start - g + fall) * g) > 0.25 * fall * fall
 
 
 def _newton(values: Vector, rates: Vector, crossing: Array) -> tuple[Array, Array]:
-    """Time to the earliest event by each crossing guard's own proposal, and which guard it is.
+    """Return the time to the earliest event proposed by a crossing guard, and the index of that
+    guard.
 
-    One that rises below zero has crossed before, nobody knows when: minus infinity.
+    A guard that rises below zero has crossed at an unknown earlier time, which counts as minus
+    infinity.
     """
     change = jnp.full_like(values[0], jnp.inf)
     guard = jnp.zeros_like(crossing)
@@ -174,7 +179,7 @@ def _newton(values: Vector, rates: Vector, crossing: Array) -> tuple[Array, Arra
 
 @jax.jit  # traced once, for whichever guard
 def _to_zero(crosses: Array, g: Array, rate: Array) -> Array:
-    """Time to a guard's zero along its tangent; infinite for one that does not cross."""
+    """Return the time to a guard's zero along its tangent, infinite if the guard does not cross."""
     falling = crosses & (rate < 0.0)
     unknown = jnp.where(crosses & (g < 0.0), -jnp.inf, jnp.inf)
     return jnp.where(falling, -g / jnp.where(falling, rate, -1.0), unknown)
@@ -183,7 +188,10 @@ def _to_zero(crosses: Array, g: Array, rate: Array) -> Array:
 def _first_guess(
     tableau: Tableau, start: Vector, inside: Vector, end: Vector, crossing: Array
 ) -> Array:
-    """Share of the step to the earliest zero of the guards' parabolas: secant, then Newton."""
+    """Return the fraction of the step to the earliest zero of the guards' parabolas.
+
+    The root is found by the secant, then by Newton's method.
+    """
     earliest = jnp.ones_like(start[0])
     for index, values in enumerate(zip(start, inside, end, strict=True)):
         crosses = (crossing >> index) & 1 == 1
@@ -194,11 +202,11 @@ def _first_guess(
 
 @functools.partial(jax.jit, static_argnums=0)  # traced once, for whichever guard
 def _first_zero(tableau: Tableau, crosses: Array, g0: Array, gm: Array, g1: Array) -> Array:
-    """Share of the step to the zero of a guard's parabola."""
+    """Return the fraction of the step to the zero of a guard's parabola."""
     bend, slope = parabola(tableau, g0, gm, g1)
     fall = jnp.where(crosses & (g0 > g1), g0 - g1, 1.0)
     at = jnp.clip(g0 / fall, 0.0, 1.0)
-    # One that rises from zero is at zero where the step begins: the other root counts.
+    # A guard that rises from zero vanishes at the start of the step: the other root counts.
     rises = crosses & (g0 == 0.0) & (slope > 0.0)
     at = jnp.where(rises, jnp.clip(-slope / jnp.where(rises, bend, -1.0), 0.0, 1.0), at)
     for _ in range(3):

@@ -1,9 +1,9 @@
-"""Derivatives of any order and in any mode of a function that only differentiates forwards.
+"""Derivatives of any order and mode of a function that supports only forward-mode AD.
 
 Loops of unknown length (adaptive steps until an event) have no reverse mode. The rule here forms
-the Jacobian forwards, over the inputs that are really perturbed, and returns Jacobian times
-tangent: linear in the tangent, so `jax.grad` transposes a small matrix instead of a loop. The
-Jacobian itself is wrapped again, so that Hessians work in every combination of modes.
+the Jacobian in forward mode, over the inputs that are perturbed, and returns Jacobian times
+tangent. This is linear in the tangent, so `jax.grad` transposes a small matrix instead of a loop.
+The Jacobian itself is wrapped again, so Hessians work in every combination of modes.
 """
 
 import functools
@@ -21,7 +21,7 @@ from jaxtyping import Array, PyTree
 from vrw_jax.numerics.lanes import LaneFunction, one_wheel
 
 Forward = Callable[..., tuple[PyTree[Array], PyTree[Array]]]
-"""Maps float arrays to (float outputs, other outputs that carry no derivative)."""
+"""A map from float arrays to (float outputs, other outputs without derivative)."""
 
 
 def any_mode(
@@ -29,14 +29,14 @@ def any_mode(
     to_differentiate: Forward | None = None,
     jacobian_of: Callable[[tuple[int, ...]], Forward] | None = None,
 ) -> Forward:
-    """`function` with derivatives in forward and reverse mode, to any order.
+    """Return `function` with derivatives in forward and reverse mode, to any order.
 
-    `function(*arrays)` must take floating-point arrays only and be differentiable by `jax.jvp` to
-    the order wanted. It must not close over values that are themselves differentiated. Where
-    derivatives are asked for, `to_differentiate` (the same function computed more tightly, say)
-    takes its place; `jacobian_of` may give (Jacobian by each of these arguments, value) and the
-    other outputs in another way. Function and Jacobians are compiled once each: outside of `jit`,
-    forward mode, reverse mode and single directions all call the same compiled Jacobian.
+    `function(*arrays)` must take only floating-point arrays, be differentiable by `jax.jvp` to the
+    requested order, and not close over values that are themselves differentiated. For derivatives,
+    `function_to_differentiate` replaces it, for example the same function with tighter tolerances.
+    `make_jacobian` may return (Jacobian with respect to these arguments, value) and the other
+    outputs in another way. Function and Jacobians are compiled once each: outside of `jit`, forward
+    mode, reverse mode and single directions all call the same compiled Jacobian.
     """
     tighter = function if to_differentiate is None else to_differentiate
     compiled = jax.jit(function)
@@ -60,13 +60,15 @@ def any_mode(
 
     def call(*arrays: Any) -> tuple:
         traced = any(isinstance(x, jax.core.Tracer) for x in arrays)
-        return wrapped(*arrays) if traced else compiled(*arrays)  # a rule costs as much as a step
+        return (
+            wrapped(*arrays) if traced else compiled(*arrays)
+        )  # the custom rule costs as much as a solver step
 
     return call
 
 
 def _jacobian(function: Forward, moved: tuple[int, ...]) -> Forward:
-    """Float outputs (Jacobian by moved argument, value) of `function`, in one evaluation."""
+    """Return a function with the float outputs (Jacobian by argument, value) in one evaluation."""
 
     def both(*arrays: Any) -> tuple[PyTree, PyTree]:
         out, other = function(*arrays)
@@ -84,7 +86,10 @@ def _jacobian(function: Forward, moved: tuple[int, ...]) -> Forward:
 
 @jax.jit
 def _pushed(out: PyTree, by_argument: PyTree, tangents: tuple) -> PyTree:
-    """Jacobians times tangents, leaf by leaf: as sums, since products of small arrays are calls."""
+    """Return Jacobians times tangents, leaf by leaf.
+
+    The products are sums, because products of small arrays are library calls.
+    """
 
     def push(_: Array, *parts: Array) -> Array:
         pushed = [
@@ -97,17 +102,20 @@ def _pushed(out: PyTree, by_argument: PyTree, tangents: tuple) -> PyTree:
 
 
 InForm = Callable[[LaneFunction, int], LaneFunction]
-"""The form in which a function over lanes is computed, which is a derivative of this order."""
+"""A wrapper that selects the execution of a batch function, given the order of the derivative it
+is."""
 
 
 def on_branch(
     function: LaneFunction, tangents_of: Callable, in_form: InForm, order: int = 0
 ) -> Callable:
-    """`function(p, z)` of one wheel, differentiable along z = z(p) to any order and in any mode.
+    """Return `function(p, z)` of one wheel, differentiable along z = z(p) to any order and in any
+    mode.
 
-    `function(p, z)` is over lanes; `tangents_of(p, z)` is dz/dp of one wheel with a leading axis
-    over p, right wherever z = z(p), and made by this function too. The rule ignores the tangent of
-    z, which can only be dz/dp times that of p, and returns the total derivative times that of p.
+    `function(p, z)` acts on a batch. `tangents_of(p, z)` is dz/dp of one wheel with a leading axis
+    over p, correct wherever z = z(p), and itself made by this function. The rule ignores the
+    tangent of z, which can only be dz/dp times that of p, and returns the total derivative times
+    the tangent of p.
     """
     of_one_wheel = one_wheel(in_form(function, order))
     wrapped = jax.custom_jvp(lambda p, z: of_one_wheel(p, z))
@@ -127,13 +135,16 @@ def slopes_on_branch(
     order: int = 1,
     along: LaneFunction | None = None,
 ) -> Callable:
-    """d function(p, z(p)) / dp with a leading axis over p, itself as `on_branch`.
+    """Return d function(p, z(p)) / dp with a leading axis over p, differentiable as in
+    `with_implicit_derivative`.
 
-    `along(p, (z, dz/dp))` may be a quicker way to it.
+    `make_jacobian(p, (z, dz/dp))` may be a faster evaluation of it.
     """
 
     def in_turns(p: Array, known: tuple[PyTree, PyTree]) -> PyTree:
-        """Over lanes, one direction after another: the code is as short as for one."""
+        """Return the derivatives over a batch, one direction after another, which keeps the code
+        short.
+        """
         n, (z, dz) = p.shape[0], known
         units = jnp.broadcast_to(jnp.eye(n, dtype=p.dtype)[:, :, None], (n, *p.shape))
         return lax.map(lambda way: jax.jvp(function, (p, z), way)[1], (units, dz))
@@ -148,9 +159,10 @@ def slopes_on_branch(
 
 
 def with_jacobian(function: Callable, *arguments: Array) -> tuple[Any, Any]:
-    """What `function` tells, and the derivatives of its floats on last axes, in one program.
+    """Return the outputs of `function`, and the derivatives of its floats on last axes, in one
+    program.
 
-    A leaf's derivatives are a tuple, one for each argument, where there are several.
+    With several arguments, a leaf's derivatives are a tuple with one entry for each argument.
     """
 
     def floats_of(*arguments: Array) -> tuple:
@@ -163,12 +175,12 @@ def with_jacobian(function: Callable, *arguments: Array) -> tuple[Any, Any]:
 
 
 def push(jacobian: PyTree, tangent: Array) -> PyTree:
-    """Jacobian (leading axis: inputs) times tangent, leaf by leaf."""
+    """Return the Jacobian (leading axis: inputs) times the tangent, leaf by leaf."""
     return jax.tree.map(lambda part: jnp.tensordot(tangent, part, 1), jacobian)
 
 
 def without_derivative(tree: PyTree) -> PyTree:
-    """The zero tangent of any outputs."""
+    """Return the zero tangent of any outputs."""
     zero = lambda x: (
         jnp.zeros_like(x)
         if jnp.issubdtype(jnp.result_type(x), jnp.inexact)

@@ -1,9 +1,10 @@
-"""One phase from its start to the earliest of its events: the only room that knows diffrax.
+"""Integration of one phase from its start to its earliest event; the only module that uses diffrax.
 
-diffrax's solvers and step-size controller are stepped by hand, so that an event's state has the
-accuracy of the integrator and not of an interpolant: an accepted step that brackets an event is
-taken again, shortened by Newton's method until it ends on the event. Those last re-steps are
-differentiated, hence first and second derivatives of event state and time hold as well.
+diffrax's solvers and step-size controller are called step by step, so that an event's state has the
+accuracy of the integrator and not of an interpolant. An accepted step that brackets an event is
+repeated with a length that Newton's method shortens until it ends on the event. These last steps
+are differentiated, so first and second derivatives of the event's state and time are accurate as
+well.
 """
 
 from __future__ import annotations
@@ -46,34 +47,38 @@ Field = Callable[[State], State]
 
 
 class PhaseEnd(NamedTuple):
+    """End of a phase: state, duration, the guard that ended it and failure flags."""
+
     state: State
     duration: Scalar  # s
     guard: Int[Array, ""]  # index of the guard that ended it; -1 if none did
     timed_out: Bool[Array, ""]
     gave_up: Bool[Array, ""]
     solver_steps: Int[Array, ""]  # tried, accepted or not
-    minima: Float[Array, " n_monitors"]  # of the monitors, empty without
+    minima: Float[Array, " n_monitors"]  # of the margins, empty if there are none
 
 
 STARTING, MARCHING, SEARCHING, SETTLING, DONE = range(5)
-"""What the next step is for: to look at the start; to go on; to find the event inside a step that
-brackets one; to find a monitor's minimum; nothing."""
+"""Purposes of the next solver step, in order: to evaluate the start; to integrate; to locate a
+bracketed event; to find the minimum of a margin; none."""
 
 
 class _Search(NamedTuple):
-    """Newton's search for the earliest event inside a step that brackets one."""
+    """State of Newton's search for the earliest event inside a step that brackets one."""
 
     crossing: Bool[Array, " n_guards"]
     low: Scalar  # bracket of the event, s from the step's start
     high: Scalar
     accuracy: Scalar  # of the event's time, s
     tries: Int[Array, ""]
-    settled: Int[Array, ""]  # tries that no longer moved the event
+    settled: Int[Array, ""]  # consecutive tries that left the event unchanged
 
 
 class _Loop(NamedTuple):
+    """State of the integration of a phase."""
+
     mode: Int[Array, ""]
-    step: Step  # the last that counts
+    step: Step  # the last accepted step
     length: Scalar  # of the next step to try, s
     controller_state: Any
     search: _Search
@@ -86,7 +91,7 @@ class _Loop(NamedTuple):
 
 
 class _Stepper(NamedTuple):
-    """A diffrax solver with its controller, seen as a function from state and length to state."""
+    """A diffrax solver with its controller, as a function from state and length to state."""
 
     field: Field
     solver: diffrax.AbstractAdaptiveSolver
@@ -94,7 +99,7 @@ class _Stepper(NamedTuple):
     term: diffrax.ODETerm
 
     def start(self, state: State, options: Options) -> tuple[Any, Any]:
-        """Solver state and controller state at the start of a phase."""
+        """Return the solver state and the controller state at the start of a phase."""
         zero = jnp.zeros((), state.dtype)
         _, controller_state = self.controller.init(
             self.term,
@@ -109,12 +114,12 @@ class _Stepper(NamedTuple):
         return self.solver_state(state, options), controller_state
 
     def solver_state(self, state: State, options: Options) -> Any:
-        """What the solver keeps from step to step, at a state."""
+        """Return the solver's internal state at a state of the system."""
         zero = jnp.zeros((), state.dtype)
         return self.solver.init(self.term, zero, options.first_step, state, None)
 
     def step(self, state: State, solver_state: Any, length: Scalar) -> tuple[State, State, Any]:
-        """State after `length`, its error estimate and the solver state there."""
+        """Return the state after `length`, its error estimate and the solver state there."""
         zero = jnp.zeros_like(length)
         end, error, _, solver_state, result = self.solver.step(
             self.term, zero, length, state, None, solver_state, jnp.asarray(False)
@@ -127,7 +132,7 @@ class _Stepper(NamedTuple):
     def judge(
         self, start: State, end: State, error: State, length: Scalar, controller_state: Any
     ) -> tuple[Bool[Array, ""], Scalar, Any]:
-        """Whether to keep the step, the length of the next, and the controller's state.
+        """Return whether the step is kept, the length of the next step, and the controller's state.
 
         Nothing here is differentiated: derivatives are those of the steps taken.
         """
@@ -147,7 +152,7 @@ class _Stepper(NamedTuple):
 
 
 def solver_named(name: str, options: Options) -> diffrax.AbstractAdaptiveSolver:
-    """The diffrax solver of that name, ready for forward-mode derivatives."""
+    """Return the diffrax solver with this name, configured for forward-mode derivatives."""
     solver_class = getattr(diffrax, name, None)
     if not (
         isinstance(solver_class, type) and issubclass(solver_class, diffrax.AbstractAdaptiveSolver)
@@ -184,13 +189,14 @@ def integrate_phase(
     active: Bool[Array, ""],
     options: Options,
 ) -> PhaseEnd:
-    """Follow `field` from `start` until the earliest guard reaches zero from above.
+    """Integrate `field` from `start` until the earliest guard reaches zero from above.
 
-    A guard that is negative at the start, or zero and not rising, ends the phase at once with
-    duration 0; one that is zero and rising does not fire. A guard that dips below zero and comes
-    back within one step is found: where the step's cubic through values and rates dips, the step
-    is retried up to the dip. With `active` False nothing is integrated. Two guards at once: the
-    first in the list wins. Errors are those of the solver at `options`' tolerances.
+    A guard that is negative at the start, or zero and not rising, ends the phase immediately with
+    duration 0; a guard that is zero and rising does not fire. A guard that dips below zero and
+    returns within one step is detected: where the step's cubic through values and rates dips, the
+    step is repeated up to the dip. With `active` False nothing is integrated. If two guards vanish
+    together, the first in the list counts. Errors are those of the solver at the tolerances in
+    `options`.
     """
     task = _Task(_stepper(field, options), watched, options)
     loop = lax.while_loop(
@@ -211,7 +217,7 @@ def integrate_phase(
 
 
 class _Task(NamedTuple):
-    """What a phase's loop does not change."""
+    """Constants of a phase's loop."""
 
     stepper: _Stepper
     watched: Watched
@@ -219,10 +225,10 @@ class _Task(NamedTuple):
 
 
 def _begin(task: _Task, start: State, active: Bool[Array, ""]) -> _Loop:
-    """Before the first step.
+    """Return the state of the loop before the first step.
 
-    Every number that the loop carries is batched, and perturbed where it will be, from the start:
-    JAX would otherwise trace the loop again for each round in which that spreads.
+    Every number of the loop's state is batched, and perturbed where it will be, from the start.
+    Otherwise JAX would trace the loop again for each round in which these properties spread.
     """
     stepper, watched, options = task
     zero = 0.0 * start[0]
@@ -235,7 +241,7 @@ def _begin(task: _Task, start: State, active: Bool[Array, ""]) -> _Loop:
     return _Loop(
         mode=jnp.where(active, STARTING, DONE).astype(jnp.int32),
         step=Step(zero, start, solver_state, nothing, nothing),
-        length=zero,  # the first step has no length: it evaluates the start
+        length=zero,  # the first step has length zero: it evaluates the start
         controller_state=jax.tree.map(lambda x: x + fixed, controller_state),
         search=_Search(crossing, fixed, fixed, fixed, none, none),
         minimum=no_minimum(watched, start),
@@ -248,6 +254,7 @@ def _begin(task: _Task, start: State, active: Bool[Array, ""]) -> _Loop:
 
 
 def _advance(task: _Task, loop: _Loop) -> _Loop:
+    """Take one solver step, and update the search for the event and for minima."""
     _, watched, options = task
     n, here, length, search = watched.n_guards, loop.step, loop.length, loop.search
     starting, searching = loop.mode == STARTING, loop.mode == SEARCHING
@@ -307,9 +314,10 @@ def _advance(task: _Task, loop: _Loop) -> _Loop:
 
 
 def _taken(task: _Task, loop: _Loop) -> tuple[Step, Array]:
-    """The step to try, with what is watched at its end, and its error.
+    """Return the step to try, with the monitored functions at its end, and its error.
 
-    One call of solver and watch serves every mode: code compiled once.
+    One call of the solver and of the monitored functions serves every mode, so that the code is
+    compiled once.
     """
     stepper, watched, options = task
     left = loop.step.state, loop.step.solver_state
@@ -324,7 +332,9 @@ def _taken(task: _Task, loop: _Loop) -> tuple[Step, Array]:
 
 
 class _Marched(NamedTuple):
-    accepted: Bool[Array, ""]  # it counts; so does the start
+    """Assessment of a tried solver step."""
+
+    accepted: Bool[Array, ""]  # the start counts as accepted
     crossed: Bool[Array, ""]  # it brackets an event
     crossing: Bool[Array, " n_guards"]  # of which guards
     stuck: Bool[Array, ""]
@@ -335,7 +345,7 @@ class _Marched(NamedTuple):
 
 
 def _marched(task: _Task, loop: _Loop, step: Step, error: Array) -> _Marched:
-    """Keep the step, or try another; look for crossings, and for dips within."""
+    """Accept or reject the step, and detect crossings and dips within it."""
     stepper, watched, options = task
     n, here, length = watched.n_guards, loop.step, loop.length
     starting, marching = loop.mode == STARTING, loop.mode == MARCHING
@@ -368,23 +378,30 @@ def _marched(task: _Task, loop: _Loop, step: Step, error: Array) -> _Marched:
 
 
 STEP_GROWTH = 2.0
-"""Most that a step may outgrow the one before it. The error estimate of a step far shorter than
-needed is rounding, and so would be a length grown from it without bound: a lane would then differ
-from itself alone by 1e-12, more than a hundred times its round-off."""
+"""Largest factor by which a step may exceed the one before it.
+
+It is chosen because the error estimate of a step far shorter than needed is round-off, and so would
+be a length grown from it without bound. A batch element would then differ from the same element
+alone by 1e-12, more than a hundred times its round-off.
+"""
 SETTLED = 3
-"""Tries at the located event before it counts: the first makes the event's time right to first
-order in its derivatives, the second to third order, the last evaluates the state there."""
+"""Number of tries at the located event before it counts.
+
+It is chosen because the first try makes the event's time accurate to first order in its derivatives
+and the second to third order; the last evaluates the state there.
+"""
 
 
 def _dips(
     here: Step, values: Array, rates: Array, length: Scalar, n_guards: int
 ) -> tuple[Array, Array]:
-    """Places in (0, 1) to go to first in search of a guard that falls and rises again, and whether.
+    """Return fractions in (0, 1) to step to first for guards that may dip, and whether they may
+    dip.
 
-    The cubic through values and rates does not fall below the least of its Bernstein coefficients:
-    where that is above zero nothing dips. Else the step is taken again up to the cubic's minimum,
-    at most nine tenths of it: shorter steps have coefficients closer to the guard, until these are
-    above zero or a step ends in the dip.
+    The cubic through values and rates does not fall below the least of its Bernstein coefficients,
+    so a guard with positive coefficients does not dip. Otherwise the step is repeated up to the
+    cubic's minimum, at most nine tenths of it. Shorter steps have coefficients closer to the guard,
+    until these are positive or a step ends in the dip.
     """
     v0, r0, v1, r1 = lax.stop_gradient((here.values, here.rates, values, rates))
     v0, r0, v1, r1 = v0[:n_guards], r0[:n_guards], v1[:n_guards], r1[:n_guards]
@@ -398,12 +415,14 @@ def _dips(
 def _first_guess(
     here: Step, values: Array, rates: Array, length: Scalar, n_guards: int, crossing: Array
 ) -> Scalar:
-    """Length to the earliest crossing by the guards' cubics: secant, then Newton's method."""
+    """Return the length to the earliest crossing of the guards' cubics: secant, then Newton's
+    method.
+    """
     v0, r0, v1, r1 = lax.stop_gradient((here.values, here.rates * length, values, rates * length))
     v0, r0, v1, r1 = v0[:n_guards], r0[:n_guards], v1[:n_guards], r1[:n_guards]
     fall = jnp.where(crossing & (v0 > v1), v0 - v1, 1.0)
     at = jnp.where(crossing, jnp.clip(v0 / fall, 0.0, 1.0), 1.0)
-    # One that rises from zero, or a rounding above: the cubic over x has the root.
+    # A guard that rises from zero, or from round-off above it: the cubic over x has the root.
     linear, square = 3.0 * v1 - 2.0 * r0 - r1, r0 - 2.0 * v1 + r1
     root = jnp.sqrt(jnp.maximum(linear * linear - 4.0 * r0 * square, 0.0)) - linear
     other = jnp.clip(2.0 * r0 / jnp.where(root > 0.0, root, 1.0), 0.0, 1.0)
@@ -422,7 +441,7 @@ def _first_guess(
 
 
 class _Found(NamedTuple):
-    """Newton's next proposal for an event's time, and the bracket that is left."""
+    """Newton's next proposal for an event's time, and the remaining bracket."""
 
     length: Scalar
     guard: Int[Array, ""]
@@ -431,25 +450,25 @@ class _Found(NamedTuple):
 
 
 def _searched(search: _Search, guards: Array, rates: Array, length: Scalar) -> _Found:
-    """Every guard that crosses proposes its own time and the earliest is taken.
+    """Return the earliest of the times that the crossing guards propose.
 
-    Kept inside the shrinking bracket by bisection. The proposal carries derivatives: after k of
-    them in the quadratic regime, derivatives are right to order 2^k - 1.
+    Bisection keeps the proposal inside the shrinking bracket. The proposal carries derivatives:
+    after k proposals in the quadratic regime, derivatives are accurate to order 2^k - 1.
     """
     falling = search.crossing & (rates < 0.0)
     change = -guards / jnp.where(falling, rates, -1.0)
-    # One that rises below zero has crossed before, nobody knows when.
+    # A guard that rises below zero has crossed at an unknown earlier time.
     unknown = jnp.where(search.crossing & (guards < 0.0), -jnp.inf, jnp.inf)
     proposals = jnp.where(falling, length + change, unknown)
     guard = jnp.argmin(proposals).astype(jnp.int32)
-    rising = (guards == 0.0) & (rates > 0.0)  # from where the step begins
+    rising = (guards == 0.0) & (rates > 0.0)  # at the start of the step
     before = jnp.all(jnp.where(search.crossing, (guards > 0.0) | rising, True))
     low = jnp.where(before, lax.stop_gradient(length), search.low)
     high = jnp.where(before, search.high, lax.stop_gradient(length))
     proposal = proposals[guard]
-    # Within rounding of a collapsed bracket counts as inside.
+    # A proposal within round-off of a collapsed bracket counts as inside.
     inside = (proposal >= low - search.accuracy) & (proposal <= high + search.accuracy)
-    # Where rounding throws Newton's method out of the bracket, its derivative still holds.
+    # If round-off moves Newton's proposal out of the bracket, its derivative is still valid.
     known = jnp.where(jnp.isfinite(proposal), proposal, 0.0)
     halved = 0.5 * (low + high) + (known - lax.stop_gradient(known))
     following = jnp.where(inside, known, halved)
@@ -459,7 +478,9 @@ def _searched(search: _Search, guards: Array, rates: Array, length: Scalar) -> _
 def sample_phase(
     field: Field, start: State, duration: Scalar, n_samples: int, options: Options
 ) -> Float[Array, "n_samples dim"]:
-    """States at `n_samples` equal times of a phase, both ends included, at solver accuracy."""
+    """Return the states at `n_samples` equal times of a phase, both ends included, at solver
+    accuracy.
+    """
     stepper = _stepper(field, options)
     interval = duration / (n_samples - 1)
 
@@ -472,7 +493,7 @@ def sample_phase(
 
 
 def _march(stepper: _Stepper, state: State, interval: Scalar, options: Options) -> State:
-    """State after `interval`, by adaptive steps of which the last ends exactly there."""
+    """Return the state after `interval`, by adaptive steps of which the last ends exactly there."""
 
     def advance(carry: tuple) -> tuple:
         time, state, solver_state, length, controller_state, tried = carry

@@ -1,7 +1,7 @@
-"""Floquet multipliers of small real maps in closed form: they differentiate, batch, run anywhere.
+"""Floquet multipliers of small real maps in closed form, differentiable and batched on any device.
 
-Matrices are the derivative of a return map, shape (..., n, n) with n = 1, 2 or 3; multipliers,
-spectral radius and what vanishes at a bifurcation are told of larger ones too, by LAPACK, on a CPU.
+Matrices are Jacobians of a return map, shape (..., n, n) with n = 1, 2 or 3. For larger matrices,
+LAPACK computes the multipliers, the spectral radius and the bifurcation margins on a CPU.
 Eigenvalues are not differentiable where two of them meet; the Jury margins, polynomials of the
 matrix, are.
 """
@@ -21,11 +21,12 @@ LARGEST_CLOSED = 3
 """Size of the largest matrix whose characteristic polynomial is solved in closed form."""
 
 SHARPNESS = 50.0
-"""Of the smooth minimum in `stability_margin`, which lies at most log(4)/SHARPNESS below."""
+"""Sharpness of the smooth minimum in `stability_margin`, which is at most
+log(4)/SMOOTH_MIN_SHARPNESS below the minimum."""
 
 
 def characteristic_polynomial(matrix: Matrix) -> tuple[Array, ...]:
-    """Coefficients (a_0, ..., a_{n-1}) of z^n + ... + a_1 z + a_0 = det(z - matrix)."""
+    """Return the coefficients (a_0, ..., a_{n-1}) of z^n + ... + a_1 z + a_0 = det(z - matrix)."""
     m = lambda i, j: matrix[..., i, j]
     n = matrix.shape[-1]
     if matrix.shape[-2:] != (n, n) or n not in (1, 2, 3):
@@ -47,13 +48,15 @@ def characteristic_polynomial(matrix: Matrix) -> tuple[Array, ...]:
 
 
 def _root(x: Array) -> Array:
-    """Square root of max(x, 0) with derivative zero where x <= 0."""
+    """Return the square root of max(x, 0), with derivative zero where x <= 0."""
     positive = x > 0.0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
 
 
 class _Pair(NamedTuple):
-    """Two eigenvalues: mean +- split if they are real, else mean +- i turn."""
+    """Two eigenvalues: mean +- real_offset if they are real, otherwise mean +-
+    i imaginary_offset.
+    """
 
     mean: Array
     split: Array
@@ -61,20 +64,22 @@ class _Pair(NamedTuple):
 
     @property
     def modulus(self) -> Array:
+        """Modulus of both eigenvalues if they are complex."""
         return _root(self.mean * self.mean + self.turn * self.turn)
 
 
 def _quadratic(a0: Array, a1: Array) -> _Pair:
-    """Roots of z^2 + a1 z + a0."""
+    """Return the roots of z^2 + a1 z + a0."""
     mean = -0.5 * a1
     discriminant = mean * mean - a0
     return _Pair(mean, _root(discriminant), _root(-discriminant))
 
 
 def _real_root_of_cubic(a0: Array, a1: Array, a2: Array) -> Array:
-    """The real root of z^3 + a2 z^2 + a1 z + a0 that lies farthest from the others.
+    """Return the real root of z^3 + a2 z^2 + a1 z + a0 that is farthest from the others.
 
-    Found without derivative; then Newton's method makes it exact, derivatives to order 3 included.
+    The root is found without derivative; then Newton's method makes it exact, including derivatives
+    to order 3.
     """
     b0, b1, b2 = map(lax.stop_gradient, (a0, a1, a2))
     shift = -b2 / 3.0
@@ -85,7 +90,7 @@ def _real_root_of_cubic(a0: Array, a1: Array, a2: Array) -> Array:
     # One real root: the sum of cube roots without cancellation.
     larger = jnp.cbrt(-0.5 * q - jnp.where(q >= 0.0, 1.0, -1.0) * _root(discriminant))
     one_root = larger - jnp.where(larger == 0.0, 0.0, p / (3.0 * jnp.where(larger == 0, 1, larger)))
-    # Three: the extreme one on the side where it stands alone.
+    # Three real roots: the extreme one on the side where it is isolated.
     radius = 2.0 * _root(-p / 3.0)
     cosine = -4.0 * q / jnp.where(radius == 0.0, 1.0, radius**3)
     extreme = radius * jnp.cos(jnp.arccos(jnp.clip(jnp.abs(cosine), 0.0, 1.0)) / 3.0)
@@ -98,7 +103,7 @@ def _real_root_of_cubic(a0: Array, a1: Array, a2: Array) -> Array:
 
 
 def _parts(matrix: Matrix) -> tuple[list[Array], _Pair | None]:
-    """Isolated real eigenvalues, then the remaining pair."""
+    """Return the isolated real eigenvalues, and the remaining pair."""
     coefficients = characteristic_polynomial(matrix)
     if len(coefficients) == 1:
         return [-coefficients[0]], None
@@ -112,7 +117,7 @@ def _parts(matrix: Matrix) -> tuple[list[Array], _Pair | None]:
 
 @jax.jit
 def multipliers(matrix: Matrix) -> Complex[Array, "... n"]:
-    """All eigenvalues, the one of largest modulus first."""
+    """Return all eigenvalues, the one of largest modulus first."""
     if matrix.shape[-1] > LARGEST_CLOSED:
         return _by_modulus(jnp.linalg.eigvals(matrix))
     alone, pair = _parts(matrix)
@@ -124,6 +129,7 @@ def multipliers(matrix: Matrix) -> Complex[Array, "... n"]:
 
 
 def _by_modulus(values: Array) -> Array:
+    """Return the eigenvalues sorted by modulus, the largest first."""
     modulus = jnp.square(values.real) + jnp.square(values.imag)
     order = jnp.argsort(-lax.stop_gradient(modulus), axis=-1)
     return jnp.take_along_axis(values, order, -1)
@@ -131,7 +137,10 @@ def _by_modulus(values: Array) -> Array:
 
 @jax.jit
 def spectral_radius(matrix: Matrix) -> Float[Array, "..."]:
-    """Largest modulus of an eigenvalue; where two meet its derivative is one-sided or zero."""
+    """Return the largest modulus of an eigenvalue.
+
+    Where two eigenvalues meet, its derivative is one-sided or zero.
+    """
     if matrix.shape[-1] > LARGEST_CLOSED:
         return jnp.abs(multipliers(matrix)[..., 0])
     alone, pair = _parts(matrix)
@@ -144,7 +153,8 @@ def spectral_radius(matrix: Matrix) -> Float[Array, "..."]:
 
 @jax.jit
 def jury_margins(matrix: Matrix) -> Float[Array, "... n_margins"]:
-    """Polynomials of the matrix, all positive exactly where all multipliers are inside the circle.
+    """Return polynomials of the matrix, all positive exactly if all multipliers are inside the
+    circle.
 
     The first vanishes at a fold (multiplier 1), the second at a period doubling (-1), the third,
     for n > 1, where a pair crosses the circle; for n = 3 the fourth completes the criterion.
@@ -163,10 +173,10 @@ def jury_margins(matrix: Matrix) -> Float[Array, "... n_margins"]:
 
 @jax.jit
 def bifurcation_margins(matrix: Matrix) -> Float[Array, "... n_margins"]:
-    """The first three Jury margins (two for n = 1), of a matrix of any size.
+    """Return the first three Jury margins (two for n = 1) of a matrix of any size.
 
-    Beyond closed forms: det(1 - matrix), det(1 + matrix), and the product of 1 - z_i z_j over all
-    pairs of eigenvalues.
+    Beyond closed forms they are det(1 - matrix), det(1 + matrix), and the product of 1 - z_i z_j
+    over all pairs of eigenvalues.
     """
     n = matrix.shape[-1]
     if n <= LARGEST_CLOSED:
@@ -179,7 +189,9 @@ def bifurcation_margins(matrix: Matrix) -> Float[Array, "... n_margins"]:
 
 @jax.jit
 def stability_margin(matrix: Matrix) -> Float[Array, "..."]:
-    """Smooth minimum of the Jury margins, never above the smallest: positive means stable."""
+    """Return a smooth minimum of the Jury margins, never above the smallest: positive
+    means stable.
+    """
     margins = SHARPNESS * jury_margins(matrix)
     lowest = lax.stop_gradient(jnp.min(margins, -1))
     excess = jnp.sum(jnp.exp(lowest[..., None] - margins), -1)
@@ -188,9 +200,11 @@ def stability_margin(matrix: Matrix) -> Float[Array, "..."]:
 
 @jax.jit
 def at_double_multiplier(matrix: Matrix, tolerance: float = 1e-6) -> Bool[Array, "..."]:
-    """Whether two moduli tie at the top to `tolerance`: there the spectral radius has a kink.
+    """Return whether the two largest moduli agree to `tolerance`: the spectral radius has a kink
+    there.
 
-    A complex pair ties by nature and is smooth; it counts only where it is about to become real.
+    The moduli of a complex pair always agree and are smooth; the pair counts only where it is about
+    to become real.
     """
     alone, pair = _parts(matrix)
     if pair is None:

@@ -1,4 +1,4 @@
-"""Time cut into steps of Gauss nodes: the numbers of the collocation that know no wheel."""
+"""Gauss nodes and integration matrices of a mesh in time, independent of the model."""
 
 from typing import NamedTuple
 
@@ -6,27 +6,34 @@ import numpy as np
 from numpy.polynomial import legendre
 
 N_NODES = 4
+"""Number of Gauss nodes in a mesh interval."""
 
 
 NODES = (legendre.leggauss(N_NODES)[0] + 1.0) / 2.0
-"""Of the Gauss collocation on [0, 1]."""
+"""Nodes of the Gauss collocation on [0, 1]."""
 _POWERS = np.arange(N_NODES)
 _TO_POLYNOMIAL = np.linalg.inv(NODES[:, None] ** _POWERS)
-"""From values at the nodes to the coefficients of their polynomial, the constant first."""
+"""Matrix from values at the nodes to the coefficients of their polynomial, the constant first."""
 ONCE = (NODES[:, None] ** (_POWERS + 1) / (_POWERS + 1)) @ _TO_POLYNOMIAL
+"""Matrix that integrates node values from an interval's start to its nodes."""
 ENDS_ONCE = (1.0 / (_POWERS + 1)) @ _TO_POLYNOMIAL
+"""Weights that integrate node values over an interval."""
 TWICE, ENDS_TWICE = ONCE @ ONCE, ENDS_ONCE @ ONCE
-"""Once and twice integrated from a step's start to its nodes, and to its end."""
+"""Matrix and weights that integrate node values twice, to the nodes and to the end."""
 
 
 class Mesh(NamedTuple):
-    """Steps of one phase as fractions of its duration, growing by `growth` from first to last."""
+    """Mesh intervals of one phase as fractions of its duration.
+
+    Their lengths grow by the factor `grading` from first to last.
+    """
 
     n_steps: int
     growth: float
 
     @property
     def fractions(self) -> np.ndarray:
+        """Length of each interval as a fraction of the phase's duration."""
         places = np.linspace(0.0, 1.0, self.n_steps + 1)
         rate = np.log(self.growth)
         if abs(rate) > 1e-12:
@@ -41,9 +48,10 @@ class Mesh(NamedTuple):
 
 
 def node_weights(mesh: Mesh) -> tuple[np.ndarray, ...]:
-    """Matrices from a phase's accelerations to rates and positions at its nodes and its end.
+    """Return matrices from a phase's accelerations to rates and positions at its nodes and its end.
 
-    For a phase of duration 1 from rest at the origin, nodes in order; the end is the last row.
+    They hold for a phase of duration 1 from rest at the origin. Nodes are in order; the end is the
+    last row.
     """
     n = mesh.n_steps * N_NODES
     rates, places = np.zeros((n + 1, n)), np.zeros((n + 1, n))
@@ -65,16 +73,18 @@ def node_weights(mesh: Mesh) -> tuple[np.ndarray, ...]:
 
 
 def lagrange(place: float) -> np.ndarray:
-    """Weights of a step's nodes for the value of their polynomial at `place`, in steps."""
+    """Return the weights of an interval's nodes for their polynomial at `location`,
+    in intervals.
+    """
     gaps = NODES[:, None] - NODES + np.eye(N_NODES)
     others = np.where(np.eye(N_NODES, dtype=bool), 1.0, (place - NODES) / gaps)
     return np.prod(others, axis=1)
 
 
 def transfer_matrix(source: Mesh, target: Mesh) -> np.ndarray:
-    """From accelerations at the nodes of one mesh to those of another, (target, source) nodes.
+    """Return the (target, source) matrix from node accelerations of one mesh to those of another.
 
-    Exact where the accelerations are cubic in each step of the source.
+    It is exact where the accelerations are cubic in each interval of the source.
     """
 
     def ends(mesh: Mesh) -> np.ndarray:
@@ -91,12 +101,12 @@ def transfer_matrix(source: Mesh, target: Mesh) -> np.ndarray:
 
 
 def differentiation() -> np.ndarray:
-    """From a step's node values to the slopes of their polynomial there, per step."""
+    """Return the matrix from an interval's node values to the derivatives there, per interval."""
     higher = _POWERS[1:]
     return (higher * NODES[:, None] ** (higher - 1)) @ _TO_POLYNOMIAL[1:]
 
 
 def integrated(place: float) -> tuple[np.ndarray, np.ndarray]:
-    """Weights of a step's nodes for their polynomial once and twice integrated up to `place`."""
+    """Return node weights for the once and twice integrated polynomial up to `location`."""
     once = place ** (_POWERS + 1) / (_POWERS + 1)
     return once @ _TO_POLYNOMIAL, place * once / (_POWERS + 2) @ _TO_POLYNOMIAL

@@ -1,10 +1,10 @@
-"""Walks through modes: any field, the guards that end it and the resets that follow.
+"""Simulation of hybrid systems: any vector fields, the guards that end modes, and the resets.
 
-    ball = Mode(lambda y: jnp.stack([y[1], -9.81 + 0.0 * y[1]]), (Guard(height, bounced),))
-    walk((ball,), start, events=10)
+    ball = Mode(lambda y: jnp.stack([y[1], -9.81 + 0.0 * y[1]]), (Guard(height, bounce),))
+    simulate_hybrid((ball,), start, events=10)
 
-What is wrong with a mode's shapes is one sentence at the edge; what goes wrong on the way is one
-code, `Stop`, with all events before it.
+A mode with wrong shapes raises an error of one sentence. A failure during the simulation is one
+code, `Termination`, and the result keeps all events before it.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,29 +26,36 @@ from vrw_jax.numerics.types import Scalar
 from vrw_jax.wording import function_of, instance, reals, whole
 
 MOST_NUMBERS = 100_000_000
-"""In all events of a walk: 2.4 GB for times, states before and states after."""
+"""Most numbers stored in all events of a simulation, chosen because times, states before and states
+after then take 2.4 GB."""
 
 
 class Guard(NamedTuple):
-    """Ends its mode where `value`, positive inside, falls to zero; then the reset, then `to`."""
+    """A function that ends its mode where `value`, positive inside, falls to zero.
+
+    Then `reset` is applied, and `target_mode` follows.
+    """
 
     value: Callable[[State], Scalar]
     reset: Callable[[State], State] = lambda y: y
-    to: int | None = None  # index of the mode that follows; None: the same again
+    to: int | None = None  # index of the next mode; None: the same mode
 
 
 class Mode(NamedTuple):
-    """An autonomous field, shape (dim,) to (dim,), and its guards; time is a coordinate if any."""
+    """An autonomous vector field, shape (dim,) to (dim,), and its guards; time is a coordinate if
+    needed.
+    """
 
     field: Field
     guards: tuple[Guard, ...]
 
     def values(self, y: State) -> Array:
+        """Return the values of all guards at a state."""
         return jnp.stack([guard.value(y) for guard in self.guards])
 
 
 class Stop(Code):
-    """Why a walk ended."""
+    """Reason why a simulation ended."""
 
     EVENTS_DONE = 0, "It has as many events as were asked for."
     TIME_OVER = 1, "No guard ended the mode within Options.max_phase_time."
@@ -59,21 +66,21 @@ class Stop(Code):
 
 
 class Walk(NamedTuple):
-    """Events in order of time; rows past `n_events` are zero."""
+    """Events of a simulation in order of time; rows past `n_events` are zero."""
 
     times: Float[Array, " events"]
-    resolution: Float[Array, " events"]  # of each time: the state's tolerances in it, no bound
-    rounding: Float[Array, " events"]  # and one rounding of the state, which no tolerance betters
+    resolution: Float[Array, " events"]  # the state's tolerances as an error of each time, no bound
+    rounding: Float[Array, " events"]  # the state's round-off as an error of each time
     before: Float[Array, "events dim"]  # states on the guard
-    after: Float[Array, "events dim"]  # and past the reset
-    modes: Int[Array, " events"]  # that ended
-    guards: Int[Array, " events"]  # of those modes, that ended them
+    after: Float[Array, "events dim"]  # states after the reset
+    modes: Int[Array, " events"]  # modes that ended
+    guards: Int[Array, " events"]  # guards that ended them
     n_events: Int[Array, ""]
     time: Scalar  # of the last state
-    state: State  # where it stopped
+    state: State  # at the end of the simulation
     mode: Int[Array, ""]
     solver_steps: Int[Array, ""]
-    stop: Int[Array, ""]  # a Stop
+    stop: Int[Array, ""]  # a Termination
 
 
 def walk(
@@ -84,13 +91,12 @@ def walk(
     mode: int = 0,
     options: Options | None = None,
 ) -> Walk:
-    """Follow `modes` from `start` through at most `events` events.
+    """Simulate `modes` from `start` through at most `events` events.
 
-    Guards are met as `integrate_phase` meets them: the earliest first, at the integrator's
-    accuracy, with derivatives of event times and states. A guard within the clock's rounding of
-    zero where its mode begins counts as zero; one that is zero at rest there fires only if it
-    will not rise. Transforms (`jax.jit`, `jax.jacfwd`, `jax.vmap`)
-    apply.
+    Guards are treated as in `integrate_phase`: the earliest first, at the integrator's accuracy,
+    with derivatives of event times and states. A guard within the clock's round-off of zero at the
+    start of its mode counts as zero. A guard that is zero at rest there fires only if it will not
+    rise. Transforms (`jax.jit`, `jax.jacfwd`, `jax.vmap`) apply.
     """
     options = Options() if options is None else options
     instance("options", options, Options, "give vrw.Options()")
@@ -101,20 +107,22 @@ def walk(
 
 
 LOOSER = (0.1, 0.01)
-"""Of the tolerances of the walks that `time_errors` takes beside a walk: so much tighter."""
+"""Factors by which the tolerances are divided in the simulations that `estimate_event_time_errors`
+compares with."""
 
 
 def time_errors(
     modes: Sequence[Mode], start: ArrayLike | Sequence, told: Walk, options: Options | None = None
 ) -> Float[Array, " events"]:
-    """What event times of a walk may be off by, s: shown by walks at two looser tolerances.
+    """Return estimated errors of the event times, s, from simulations at two looser tolerances.
 
-    The same events are walked to again with tolerances ten and a hundred times as large. Each time
-    is stated to twice the most that any event so far moved by, in units of its `resolution`, and to
-    twice its `resolution` at least. That holds what `resolution` alone does not know: errors of
-    steps that add up, what earlier events hand on to later ones, and what an implicit solver's own
-    estimate leaves out where the field is stiff. Infinite from the first event that the walk at ten
-    times the tolerance does not meet. Measured, not proved; `options` are those of the walk.
+    The same events are computed again with tolerances ten and a hundred times as large. Each error
+    is twice the largest change of any event so far, in units of its `time_tolerance`, and at least
+    twice its `time_tolerance`. It includes what `time_tolerance` alone omits: accumulated errors of
+    steps and errors that earlier events transfer to later ones. It also includes the part that an
+    implicit solver's own estimate omits in a stiff field. It is infinite from the first event that
+    the simulation at ten times the tolerance does not reach. The estimate is measured, not proved;
+    `options` are those of the simulation.
     """
     options = Options() if options is None else options
     start, told = lax.stop_gradient((reals("start", start), told))
@@ -174,6 +182,7 @@ def _require_shape(name: str, function: Callable, start: Array, shape: tuple) ->
 
 
 def _entered(mode: Mode, state: Array, time: Array, options: Options) -> tuple[PhaseEnd, Array]:
+    """Integrate a mode, and return its end and whether a guard is violated at its start."""
     rate = lambda y: jax.jvp(mode.values, (y,), (mode.field(y),))[1]
     first, (rates, bends) = mode.values(state), jax.jvp(rate, (state,), (mode.field(state),))
     first, rates, bends = lax.stop_gradient((first, rates, bends))
@@ -182,7 +191,7 @@ def _entered(mode: Mode, state: Array, time: Array, options: Options) -> tuple[P
     near = -first <= jnp.abs(rates) * resolution
     past = jnp.any((first < 0.0) & ~near)
     lift = jnp.where((first < 0.0) & near & (rates > 0.0), -first, 0.0)
-    # On a guard at rest what it does next decides: it need not fire where it will rise.
+    # For a guard at rest the second derivative decides: it does not fire if it will rise.
     rises = (first == 0.0) & (rates == 0.0) & (bends > 0.0)
     lift = jnp.where(rises, jnp.finfo(state.dtype).tiny, lift)
     watched = Watched(lambda y: mode.values(y) + lift, len(mode.guards))
@@ -190,8 +199,9 @@ def _entered(mode: Mode, state: Array, time: Array, options: Options) -> tuple[P
 
 
 def _in_time(mode: Mode, end: PhaseEnd, options: Options) -> tuple[Array, Array]:
-    """What the tolerances of the state, and its rounding, are in the event's time: much where a
-    guard is grazed."""
+    """Return tolerance and round-off of the state as times of the event, large where a guard is
+    grazed.
+    """
     state = lax.stop_gradient(end.state)
     across = jax.jacfwd(mode.values)(state)[jnp.maximum(end.guard, 0)]
     rounding = jnp.finfo(state.dtype).eps * jnp.abs(state)
@@ -202,7 +212,7 @@ def _in_time(mode: Mode, end: PhaseEnd, options: Options) -> tuple[Array, Array]
 
 
 def _left(mode: Mode, guard: Array, state: Array, own: int) -> tuple[Array, Array]:
-    """State after the reset of the guard that ended the mode, and the mode that follows."""
+    """Return the state after the reset of the guard that ended the mode, and the next mode."""
     index = jnp.maximum(guard, 0)
     after = lax.switch(index, [g.reset for g in mode.guards], state)
     return after, jnp.asarray([own if g.to is None else g.to for g in mode.guards], jnp.int32)[

@@ -1,8 +1,8 @@
-"""Linear algebra of many small systems at once, lanes last, as sums of elementwise products.
+"""Linear algebra of many small systems together, batch last, as sums of elementwise products.
 
 XLA on CPU computes cheap producers again for each consumer, which costs more than all arithmetic
-here; `lax.cond` on a predicate that is always true, but only known at run time, is the barrier that
-it can't remove.
+here. `lax.cond` on a predicate that is always true, but only known at run time, is a barrier that
+XLA can't remove.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,9 +23,9 @@ Hold = Callable[[Any], Any]
 
 
 def fusion_barrier(lanes: Float[Array, "... lanes"]) -> Hold:
-    """A function that returns its argument and that XLA can't fuse across.
+    """Return an identity function that XLA can't fuse across.
 
-    `lanes` must not hold NaN; that it does not is what XLA can't know.
+    `lanes` must not hold NaN, which XLA can't prove.
     """
     if simd.tracing():
         return lax.optimization_barrier
@@ -38,26 +38,29 @@ def fusion_barrier(lanes: Float[Array, "... lanes"]) -> Hold:
 
 
 def mix(matrix: np.ndarray, x: Array) -> Array:
-    """Matrix product over the leading axis as a sum of elementwise products."""
+    """Return a matrix product over the leading axis as a sum of elementwise products."""
     shape = (-1,) + (1,) * (x.ndim - 1)
     terms = [x[j] * matrix[:, j].astype(x.dtype).reshape(shape) for j in range(matrix.shape[1])]
     return sum(terms[1:], start=terms[0])
 
 
 def weigh(weights: np.ndarray, x: Array) -> Array:
+    """Return the weighted sum over the leading axis."""
     terms = [float(weights[j]) * x[j] for j in range(len(weights))]
     return sum(terms[1:], start=terms[0])
 
 
 def contract(left: Array, right: Array) -> Array:
-    """Sum over s of left[..., s, lanes] * right[s, ..., lanes], elementwise over lanes."""
+    """Return the sum over s of left[..., s, lanes] * right[s, ..., lanes], elementwise over the
+    batch.
+    """
     gap = (slice(None),) * (left.ndim - 2) + (None,) * (right.ndim - 2)
     terms = [left[..., s, :][(*gap, slice(None))] * right[s] for s in range(right.shape[0])]
     return sum(terms[1:], start=terms[0])
 
 
 def inverse(matrix: Float[Array, "n n lanes"]) -> Float[Array, "n n lanes"]:
-    """Inverse of a 1x1, 2x2 or 3x3 matrix by cofactors."""
+    """Return the inverse of a 1x1, 2x2 or 3x3 matrix by cofactors."""
     m = matrix
     if m.shape[0] == 1:
         return 1.0 / m
@@ -83,7 +86,7 @@ def eliminate(
     right: Float[Array, "nodes dim columns lanes"],
     for_barrier: LaneArray,
 ) -> Float[Array, "nodes dim columns lanes"]:
-    """Solve the node equations of one step, block by block without pivoting.
+    """Solve the node equations of one mesh interval, block by block without pivoting.
 
     The matrix is the mass matrix plus terms of order h; its diagonal blocks stay regular.
     """
@@ -108,7 +111,9 @@ def eliminate(
 
 @eliminate.defjvp
 def _eliminate_jvp(primals: tuple, tangents: tuple) -> tuple:
-    """A second solve, where differentiating the elimination itself would double all of it."""
+    """Return the tangent by a second solve; differentiating the elimination would double
+    its work.
+    """
     (matrix, _, for_barrier), (d_matrix, d_right, _) = primals, tangents
     solved = eliminate(*primals)
     n, dim = matrix.shape[:2]
@@ -118,7 +123,7 @@ def _eliminate_jvp(primals: tuple, tangents: tuple) -> tuple:
 
 
 def push_columns(function: Callable, primals: tuple, tangents: tuple) -> tuple:
-    """Value and derivatives of `function` along tangents with a leading axis of columns."""
+    """Return value and JVPs of `function` along tangents with a leading axis of directions."""
     columns = lambda *t: jax.jvp(function, primals, t)
     return jax.vmap(columns, in_axes=0, out_axes=(None, 0))(*tangents)
 
@@ -126,9 +131,9 @@ def push_columns(function: Callable, primals: tuple, tangents: tuple) -> tuple:
 def partials_of(
     function: Callable[..., Vector], arguments: Sequence[Array]
 ) -> tuple[Vector, list[Vector]]:
-    """Value of an elementwise function, and each output's derivatives by all arguments.
+    """Return the value of an elementwise function, and each output's derivatives by all arguments.
 
-    Backwards: a phase has fewer equations than arguments.
+    The derivatives use reverse mode, because a phase has fewer equations than arguments.
     """
     value, forward = jax.linearize(function, *arguments)
     by_output = []

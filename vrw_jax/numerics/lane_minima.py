@@ -1,7 +1,8 @@
-"""Lowest values that monitors take along a phase of many wheels, to the integrator's accuracy.
+"""Minima of margins along a phase, for a batch, at the integrator's accuracy.
 
-As `minima` does it for one wheel: the march keeps, for each monitor, the step that holds its lowest
-minimum; when it has ended, secant steps on the monitor's rate find it, one monitor after the other.
+The method is that of `minima` for one wheel. During the integration, the step that holds the lowest
+minimum of each margin is stored; afterwards, secant steps on the margin's rate locate it, one
+margin after the other.
 """
 
 import functools
@@ -23,30 +24,30 @@ from vrw_jax.numerics.types import Vector
 
 
 class Monitors(NamedTuple):
-    """What is watched; `counts_at_start`: see `minima.Watched`."""
+    """Margins whose minima are searched; `includes_start`: see `minima.MonitoredFunctions`."""
 
     values: Callable[[Place], Vector]
     counts_at_start: tuple[bool, ...]
 
 
 class Lowest(NamedTuple):
-    """Monitors where a lane stands, and the step that holds the lowest minimum of each so far."""
+    """Margins at the present state, and the step that holds the lowest minimum of each so far."""
 
-    values: Array  # (monitors, lanes)
+    values: Array  # (margins, batch)
     rates: Array
-    so_far: Array  # lowest interior minimum, (monitors, lanes); infinite before there is one
-    q: Array  # where that step begins, (monitors, coordinates, lanes)
+    so_far: Array  # lowest interior minimum, (margins, batch); infinite if there is none
+    q: Array  # start of that step, (margins, coordinates, batch)
     v: Array
-    length: Array  # of that step, (monitors, lanes), s
-    offset: Array  # of the minimum from its beginning, s
-    rate: Array  # there
-    direction: Array | None = None  # that beginning moves, (monitors, directions, ., lanes)
+    length: Array  # of that step, (margins, batch), s
+    offset: Array  # of the minimum from the step's start, s
+    rate: Array  # at the step's start
+    direction: Array | None = None  # of that start, (margins, directions, ., batch)
 
 
 def with_rates(
     function: Callable[[Place], Vector], evaluate: Evaluate, place: Place
 ) -> tuple[Vector, Vector]:
-    """A function of the place and its derivatives in time along the motion."""
+    """Return a function of the state and its time derivatives along the motion."""
     n = len(place.q)
 
     def along(q: Vector, v: Vector) -> Vector:
@@ -56,9 +57,10 @@ def with_rates(
 
 
 def at_start(monitors: Monitors, evaluate: Evaluate, place: Place, moving: Moving | None) -> Lowest:
-    """Before the first step.
+    """Return the minima before the first step.
 
-    What is zero at the start rests there: rounding must not make it fall.
+    A margin that is zero at the start by construction rests there: its negative rates are round-off
+    and count as zero.
     """
     values, rates = map(jnp.stack, with_rates(monitors.values, evaluate, place))
     counts = jnp.asarray(monitors.counts_at_start)[:, None]
@@ -70,16 +72,17 @@ def at_start(monitors: Monitors, evaluate: Evaluate, place: Place, moving: Movin
 
 
 class Passed(NamedTuple):
-    """A step of those lanes that have taken it."""
+    """A solver step of the batch elements that accepted it."""
 
     here: Place
     end: Place
     length: Array
     taken: Array
-    direction: Array | None  # in which its beginning moves
+    direction: Array | None  # of the step's start
 
 
 def lowered(monitors: Monitors, evaluate: Evaluate, lowest: Lowest, step: Passed) -> Lowest:
+    """Return the minima, updated with the interior minima of an accepted step."""
     here, end, length, taken, _ = step
     values, rates = map(jnp.stack, with_rates(monitors.values, evaluate, end))
     x, value = cubic_minimum(lowest.values, lowest.rates * length, values, rates * length)
@@ -105,11 +108,11 @@ def lowered(monitors: Monitors, evaluate: Evaluate, lowest: Lowest, step: Passed
 
 
 class Settled(NamedTuple):
-    """Minima of monitors over a phase, each (monitors, lanes)."""
+    """Minima of margins over a phase, each of shape (margins, batch)."""
 
     lowest: Array  # ends included
-    inside: Array  # infinite where there is none
-    length: Array  # of the step to that one, from where it is held
+    inside: Array  # infinite if there is none
+    length: Array  # of the step to the interior minimum, from the stored start
 
 
 class _Search(NamedTuple):
@@ -129,9 +132,10 @@ def settled(
     start: Array,
     options: Options,
 ) -> Settled:
-    """Minima over the phase; `start`: values where it began.
+    """Return the minima over the phase; `start_values` are the margins at its start.
 
-    At most `monitor_steps` secant steps for each, all from where the step begins that holds it.
+    Each minimum takes at most `max_margin_search_iterations` secant steps, all from the start of
+    the step that holds it.
     """
 
     def one(_: None, given: tuple) -> tuple[None, tuple[Array, Array]]:
@@ -188,9 +192,11 @@ def moved(
     ends: tuple[Place, Place],
     direction: Array,
 ) -> Array:
-    """How minima move: along the motion there, since their place takes no part in first order.
+    """Return the tangents of the minima, directions first.
 
-    `ends`: of the phase; `direction`: in which the last of them moves. Directions first.
+    They are tangents along the motion at each minimum, because its location has no first-order
+    effect. `phase_ends`: the start and the end of the phase; `end_tangents`: tangents of the end
+    state.
     """
     monitors, evaluate = monitors_of(moving.constants, moving.held)
 

@@ -1,7 +1,8 @@
-"""Curves in two parameters on which a quantity of fixed points is zero, for `arclength` to follow.
+"""Curves in two parameters on which a test function of fixed points is zero, for `arclength`.
 
-The second parameter joins what Newton's method moves, and the quantity its equations: a curve is
-then a branch along the first, through turning points as through folds.
+The second parameter joins the unknowns of Newton's method, and the test function joins its
+equations. A curve is then a branch along the first parameter, through turning points as through
+folds.
 """
 
 import abc
@@ -17,54 +18,63 @@ from vrw_jax.numerics.floquet import bifurcation_margins
 from vrw_jax.numerics.types import Elementwise, Scalar
 
 Pair = Float[Array, "2"]
-"""Numbers of the two parameters."""
+"""Values of the two parameters."""
 
 
 class LevelLinear(NamedTuple):
-    """Newton's method at a trial (z, p), and the quantity whose zero is followed."""
+    """Newton step at a trial (z, p), and the test function whose zero is continued."""
 
     correction: Unknown  # of z at fixed p
-    columns: tuple[Unknown, Unknown]  # dz/dp along the fixed points
+    columns: tuple[Unknown, Unknown]  # dz/dp along the curve of fixed points
     jacobian: Float[Array, "n n"]  # of the return map
-    value: Scalar  # of the quantity, z corrected
-    slopes: Pair  # of it by p, z following
+    value: Scalar  # of the test function at the corrected z
+    slopes: Pair  # derivatives of the value by p along the fixed points
 
 
 class AbstractLevel(eqx.Module):
-    """A quantity of fixed points in two parameters; `wheel` is whatever else they need."""
+    """Base class of test functions of fixed points in two parameters.
+
+    `args` is a pytree with all other inputs.
+    """
 
     @abc.abstractmethod
     def linearise(self, wheel: Any, z: Unknown, p: Pair) -> LevelLinear:
-        """All that one iteration needs; not finite where the map can't be evaluated."""
+        """Return all that one iteration needs; it is not finite where the map is undefined."""
 
     @abc.abstractmethod
     def section(self, z: Unknown) -> Section:
-        """The section's numbers, a part of z."""
+        """Return the section state, a part of z."""
 
     def size(self, z: Unknown, correction: Unknown) -> Scalar:
-        """Size of a correction, to be compared with the tolerance: its largest entry."""
+        """Return the norm of a correction, its largest entry, which is compared with
+        the tolerance.
+        """
         return jnp.max(jnp.abs(correction))
 
     def valid(self, wheel: Any, z: Unknown, p: Pair) -> Bool[Array, ""]:
-        """Whether a converged z is what it stands for."""
+        """Return whether a converged z satisfies the conditions of its branch."""
         return jnp.all(jnp.isfinite(self.section(z)))
 
 
 class LevelPoint(NamedTuple):
+    """Unknowns of a point of the curve: those of the fixed point, and the second parameter."""
+
     z: Unknown
-    share: Elementwise  # of the second parameter in its range
+    share: Elementwise  # of the second parameter's range
 
 
 class LevelFollowed(AbstractFollowed):
-    """The curve on which a level's quantity is zero, along the first of its parameters.
+    """The curve on which a test function is zero, along the first of its parameters.
 
-    Lengths along it count the second as a share of its range too; it stays within that.
+    Lengths along it include the second parameter as a fraction of its range, which it must not
+    leave.
     """
 
     level: AbstractLevel
     bounds: tuple[float, float] = eqx.field(static=True)  # of the second parameter
 
     def second(self, z: LevelPoint) -> Elementwise:
+        """Return the second parameter at a point of the curve."""
         low, high = self.bounds
         return low + (high - low) * z.share
 
@@ -77,7 +87,9 @@ class LevelFollowed(AbstractFollowed):
         beside = lambda change: lambda a, b: a + scale * change * b
         correction = jax.tree.map(beside(share), told.correction, second)
         column = jax.tree.map(beside(along), first, second)
-        jacobian = jnp.pad(told.jacobian, (0, 1))  # a multiplier of zero for the share: no bearing
+        jacobian = jnp.pad(
+            told.jacobian, (0, 1)
+        )  # a zero multiplier for the fraction has no effect
         return Linear(LevelPoint(correction, share), LevelPoint(column, along), jacobian)
 
     def section(self, z: LevelPoint) -> Section:
@@ -92,10 +104,13 @@ class LevelFollowed(AbstractFollowed):
 
 
 BESIDE_FOLD = 1e-6
-"""How far from a fold its curve is followed, in the margin that vanishes there: at the fold itself
-the equations are singular. The parameters, turning back there, are off by the square of this."""
+"""Value of the fold's margin on the curve that represents the fold.
+
+It is chosen because the equations are singular at the fold itself. The parameters turn at the fold
+and are wrong by the square of this value.
+"""
 
 
 def margins_beside_fold(jacobian: Float[Array, "n n"]) -> Array:
-    """Zero where one of `BIFURCATIONS` is."""
+    """Return the bifurcation margins, each zero where one of `BIFURCATION_NAMES` occurs."""
     return bifurcation_margins(jacobian).at[0].add(-BESIDE_FOLD)

@@ -1,8 +1,9 @@
-"""One phase of many wheels at once, each with its own step size, to the earliest of its events.
+"""Integration of one phase for a batch, each element with its own step size, to the earliest event.
 
-The lanes march side by side until every one has ended or holds a step that crosses a guard; then
-they locate their events together, taking that step again with its length corrected by Newton's
-method. What a lane gives never depends on its neighbours: a lane that has ended is left alone.
+The elements are integrated together until each has ended or holds a step that crosses a guard. Then
+they locate their events together: that step is repeated with its length corrected by Newton's
+method. The result of an element never depends on the other elements, because an element that has
+ended does not change.
 """
 
 from collections.abc import Callable
@@ -44,57 +45,62 @@ from vrw_jax.simd import apart
 
 
 class LanePhase(NamedTuple):
-    """A phase as data; functions are elementwise over lanes.
+    """A phase as data, whose functions are elementwise over the batch.
 
-    `guards` are positive inside the phase and watched on the way down. The earliest wins, of two at
-    once the first in the list.
+    `guards` are positive inside the phase, and an event is a zero from above. The earliest event
+    counts; of two at the same time, the first in the list.
     """
 
     evaluate: Evaluate
     guards: Callable[[Place], Vector]
-    monitors: Monitors | None = None  # whose minima are wanted
+    monitors: Monitors | None = None  # margins whose minima are searched
     balance: Balance | None = None  # for derivatives
     called: bool = False
-    """Whether machine code calls its functions instead of containing them wherever they are needed:
-    compiled in half of the time, and a sixth slower."""
+    """Whether machine code calls the phase's functions instead of inlining them at each use; it
+    then compiles in half of the time and runs a sixth slower."""
 
 
 class LanePhaseEnd(NamedTuple):
+    """End of a phase for each batch element."""
+
     place: Place
     duration: Array  # s
-    guard: Array  # index of the guard that ended it; -1 if none did: it gave up
+    guard: Array  # index of the guard that ended it; -1 if none did
     timed_out: Array
-    unfinished: Array  # left for a run with its like, see `integrate_lanes`
+    unfinished: Array  # cut off as a straggler, see `integrate_batch_phase`
     tried: Array  # steps, accepted or not
-    next_step: Array  # length that the controller would try next, s
-    minima: Array | None  # of the monitors, (monitors, lanes)
+    next_step: Array  # next length of the controller, s
+    minima: Array | None  # of the margins, (margins, batch)
 
 
 class _March(NamedTuple):
+    """State of the integrator."""
+
     here: Place
-    values: Vector  # guards here
+    values: Vector  # guards at the state
     h: Array
     time: Array
-    verdict: Array  # on the last step tried
-    crossing: Array  # bits of the guards that crossed in it
-    inside: Vector  # guards within the step that crossed, and at its end
+    verdict: Array  # after the last tried step
+    crossing: Array  # bits of the guards that crossed in that step
+    inside: Vector  # guards within the crossing step
     beyond: Vector
     tried: Array
-    half: Array  # iterations after which half of the lanes had finished
+    half: Array  # iterations after which half of the batch had finished
     iterations: Array
     lowest: Lowest | None
-    direction: Array | None  # in which it moves here, (directions, ., lanes), see `tangents`
+    direction: Array | None  # of the state, (directions, ., batch), see `tangents`
 
 
 MARCHING, TIMED_OUT, GAVE_UP, CROSSED, IDLE = range(5)
-"""Verdicts: where a lane's march stands."""
+"""Status codes of a batch element in the integration."""
 
 LATE = 2
-"""Times the iterations after which half of the lanes had finished."""
+"""Ratio of iterations at which stragglers are cut off to the iterations after which half of the
+batch had finished."""
 
 
 PhaseOf = Callable[[Any, Vector], LanePhase]
-"""By what it holds constant, see `tangents.BalanceOf`."""
+"""A function that returns a phase for its constants, see `tangents.ImplicitDynamicsFn`."""
 
 
 def integrate_lanes(
@@ -109,11 +115,12 @@ def integrate_lanes(
     options: Options,
     few: Array | None = None,
 ) -> LanePhaseEnd:
-    """Every active lane from (q, v) to the earliest of its guards. Errors: as `integrate_phase`.
+    """Integrate every active element from (q, v) to the earliest of its guards.
 
-    Where many lanes march together, as on a GPU, they don't wait for their last `few` if these take
-    `LATE` times as long as half of them: these are marked unfinished, to run again from their start
-    among their like. Derivatives: by `constants`, `held`, `q` and `v`, see `tangents`.
+    Errors are those of `integrate_phase`. In a large batch, as on a GPU, the last `straggler_count`
+    elements are cut off if they take `STRAGGLER_FACTOR` times as long as half of the batch. They
+    are marked unfinished, to be run again from their start together with other stragglers.
+    Derivatives: with respect to `constants`, `held_constants`, `q` and `v`, see `tangents`.
     """
     run = jax.custom_jvp(lambda *given: _ended(phase_of, tableau, None, *given).end)
 
@@ -140,7 +147,7 @@ def integrate_lanes(
 
 
 class _Ended(NamedTuple):
-    """A phase's steps and end, and what was found on the way there."""
+    """Steps and end of a phase, and the intermediate results."""
 
     take: Take
     start: Place
@@ -153,8 +160,10 @@ class _Ended(NamedTuple):
 def _end_moved(
     phase_of: PhaseOf, tableau: Tableau, moving: Moving, ended: _Ended
 ) -> tuple[Vector, Vector, Array, Array | None]:
-    """How the phase's end moves along directions of its start and constants: positions, rates,
-    its duration, minima of its monitors."""
+    """Return the tangents of a phase's end for tangents of its start and constants.
+
+    They are those of the positions, the rates, the duration, and the minima of the margins.
+    """
     take, start, end, march, lowest, least = ended
     n, h = len(start.q), jnp.where(march.verdict == CROSSED, end.duration - march.time, 0.0)
     taken = take(march.here, h)
@@ -181,7 +190,7 @@ def _end_moved(
 def _event_moved(
     phase_of: PhaseOf, moving: Moving, place: Place, direction: Array, march: _March, guard: Array
 ) -> Array:
-    """How much later the event comes, s: where its guard vanishes along the moved motion."""
+    """Return the tangent of the event's time, s: the guard vanishes along the perturbed motion."""
 
     def guards(constants: Any, held: Vector, q: Vector, v: Vector) -> Vector:
         phase = phase_of(constants, held)
@@ -210,6 +219,7 @@ def _ended(
     options: Options,
     few: Array | None,
 ) -> _Ended:
+    """Integrate a phase and locate its event and the minima of its margins."""
     phase = phase_of(constants, held)
     phase = _traced_once(phase, apart if phase.called else jax.jit)
     take = _steps_of(phase, tableau)
@@ -222,7 +232,9 @@ def _ended(
     march = _march(phase, take, tableau, start, values, begins, first_step, options, few, moving)
     crossed = march.verdict == CROSSED
     if phase.monitors is not None or moving is not None:
-        phase = _traced_once(phase, apart)  # a long program, which what follows makes longer
+        phase = _traced_once(
+            phase, apart
+        )  # a long program, which the search for minima makes longer
         take = _steps_of(phase, tableau)
     step = Crossing(*march[:2], march.inside, march.beyond, march.h, march.crossing, crossed)
     found = locate(phase.guards, phase.evaluate, take, tableau, step, options)
@@ -252,12 +264,12 @@ def _ended(
 
 
 def _steps_of(phase: LanePhase, tableau: Tableau) -> Take:
-    """Its steps, which are traced once however often they are taken."""
+    """Return the phase's step function, which is traced once for all its calls."""
     return jax.jit(lambda here, h: take_step(tableau, phase.evaluate, here, h))
 
 
 def _traced_once(phase: LanePhase, how: Callable) -> LanePhase:
-    """Its functions, of which each is traced once however often it is called."""
+    """Return the phase with wrapped functions, each of which is traced once for all its calls."""
     monitors = phase.monitors
     if monitors is not None:
         monitors = monitors._replace(values=how(monitors.values))
@@ -276,10 +288,10 @@ def _march(
     few: Array | None,
     moving: Moving | None,
 ) -> _March:
-    """Adaptive steps until each lane has crossed a guard, run out of time or given up."""
+    """Take adaptive steps until each element has crossed a guard, run out of time or failed."""
 
     def judge(march: _March, taken: Taken, inside: list[Vector], end: Vector) -> tuple:
-        """Length to try next, in units of this one, and what becomes of the step."""
+        """Return the length to try next, in units of this one, and the decision on the step."""
         squared = _squared_error(taken, march.here, end, options.rtol, options.atol)
         to_dip = to_earliest_dip(tableau, [march.values, *inside, end])
         return _change(tableau, squared, to_dip)
@@ -333,6 +345,7 @@ def _at_start(
     lowest: Lowest | None,
     moving: Moving | None,
 ) -> _March:
+    """Return the state of the integrator before the first step."""
     none, count = jnp.zeros(first_step.shape, jnp.int32), jnp.zeros((), jnp.int32)
     return _March(
         here=start,
@@ -352,7 +365,7 @@ def _at_start(
 
 
 def _waits(march: _March, few: Array | None) -> Array:
-    """Whether enough lanes march on to go on with."""
+    """Return whether enough elements still run to continue the loop."""
     marching = march.verdict == MARCHING
     if few is None:
         return jnp.any(marching)
@@ -362,7 +375,9 @@ def _waits(march: _March, few: Array | None) -> Array:
 
 
 def _change(tableau: Tableau, squared: Array, to_dip: Array) -> tuple[Array, Array]:
-    """Length of the next try over this one's, and whether the step is kept (1) or retried (2)."""
+    """Return the length of the next try over this one's, and the decision: keep (1) or
+    retry (2).
+    """
     keep = squared <= 1.0
     retry = keep & (to_dip < 1.0)
     kept = jnp.where(retry, 2, jnp.where(keep, 1, 0)).astype(jnp.int32)
@@ -372,9 +387,9 @@ def _change(tableau: Tableau, squared: Array, to_dip: Array) -> tuple[Array, Arr
 def _verdict(
     options: Options, march: _March, change: Array, kept: Array, end: Vector
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """What becomes of each lane: verdict, crossing guards, accepted, time, length of its next try.
+    """Return status, crossing guards, acceptance, time and next length of each element.
 
-    A dip that would not move the time on is no reason to stay.
+    A dip that would not advance the time does not delay the element.
     """
     running = march.verdict == MARCHING
     keep = running & (kept == 1)
@@ -399,9 +414,10 @@ def _verdict(
 
 
 def _squared_error(taken: Taken, start: Place, guards: Vector, rtol: Array, atol: Array) -> Array:
-    """Mean square of the error over its tolerance; infinite where the step went nowhere.
+    """Return the mean square of the error over its tolerance, infinite where the step is not
+    finite.
 
-    float32 says enough about an error.
+    float32 is precise enough for an error estimate.
     """
     before, after = (*start.q, *start.v), (*taken.end.q, *taken.end.v)
     single = lambda x: x.astype(jnp.float32)
@@ -416,7 +432,7 @@ def _squared_error(taken: Taken, start: Place, guards: Vector, rtol: Array, atol
 
 
 def _first(conditions: tuple[Array, ...]) -> Array:
-    """Index of the first condition that holds; -1 where none does."""
+    """Return the index of the first condition that holds, -1 if none does."""
     index = jnp.full(conditions[0].shape, -1, jnp.int32)
     for i in range(len(conditions) - 1, -1, -1):
         index = jnp.where(conditions[i], i, index)
@@ -432,7 +448,9 @@ def sample_lanes(
     n_samples: int,
     options: Options,
 ) -> Array:
-    """Positions, then rates, at equal times of a phase, ends included: (samples, ., lanes)."""
+    """Return positions, then rates, at equal times of a phase, ends included: (samples,
+    ., batch).
+    """
 
     def take(place: Place, length: Array) -> tuple[Place, Array]:
         taken = take_step(tableau, phase.evaluate, place, length)
@@ -452,10 +470,10 @@ def sampled(
     n_samples: int,
     options: Options,
 ) -> Array:
-    """What is `told` of places at equal times, ends included, samples first.
+    """Return `sample_of` the states at equal times, ends included, samples first.
 
-    `take(place, length)` gives the end of a step of the tableau, and the square of its error over
-    what is allowed.
+    `step_function(state, length)` returns the end of a step of the tableau, and the square of its
+    error over its tolerance.
     """
     none = jnp.zeros((), jnp.int32)
 
@@ -465,7 +483,7 @@ def sampled(
         end, squared = take(place, length)
         change = change_of_length(tableau, squared, length.dtype)
         keep = squared <= 1.0
-        # A step that a sample has cut short says nothing against the length before.
+        # A step shortened to end at a sample is no reason to reduce the previous length.
         h = jnp.where(keep & (length < h), jnp.maximum(h, length * change), length * change)
         going = left > 0.0
         return (

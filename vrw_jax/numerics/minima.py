@@ -1,7 +1,7 @@
-"""Lowest values that monitors take along a phase, to the integrator's accuracy.
+"""Minima of margins along a phase, at the integrator's accuracy.
 
-While the march goes on, the step that holds the lowest minimum of each monitor is kept; when it has
-ended, secant steps on the monitor's rate find it, one monitor after the other.
+During the integration, the step that holds the lowest minimum of each margin is stored. After it,
+secant steps on the margin's rate locate the minimum, one margin after the other.
 """
 
 from collections.abc import Callable
@@ -16,17 +16,19 @@ from vrw_jax.numerics.types import Scalar
 
 State = Float[Array, " dim"]
 Watch = Callable[[State], Float[Array, " n_watched"]]
-"""Guards and monitors as functions of the state."""
+"""Guards and margins as functions of the state."""
 
 
 class Watched(NamedTuple):
-    """What to watch along a phase: guards that end it, then monitors whose minimum is wanted.
+    """Functions monitored along a phase: guards that end it, then margins whose minimum is
+    searched.
 
-    `values` returns the `n_guards` guards followed by the monitors. A monitor's minimum is sought
-    at every interior local minimum and at the phase's end; at its start too (`count_start`), unless
-    the quantity is zero there by construction, like the height of a foot that leaves the ground.
-    `sizes`: what guards are differences of. One within some roundings of it is at zero: in a dip
-    of microseconds no time brings it closer.
+    `values` returns the `n_guards` guards followed by the margins. A margin's minimum is searched
+    at every interior local minimum and at the phase's end. The phase's start counts too
+    (`includes_start`), unless the margin is zero there by construction, like the height of a foot
+    that leaves the ground. `guard_scales`: magnitudes of the terms whose difference is the guard. A
+    guard within some round-off of its scale is at zero, because in a dip of microseconds no other
+    time brings it closer.
     """
 
     values: Watch
@@ -36,13 +38,13 @@ class Watched(NamedTuple):
 
 
 ROUNDING = 32.0
-"""Roundings of its size in a guard's value."""
+"""Round-off of a guard's value, in units of round-off of its scale."""
 
 
 def at_rounding(
     watched: Watched, crossing: Bool[Array, " n_guards"], guards: Float[Array, " n_guards"]
 ) -> tuple[Bool[Array, ""], Int[Array, ""]]:
-    """Whether the lowest of the guards that cross reads only rounding, and which one it is."""
+    """Return whether the lowest crossing guard is only round-off, and the index of that guard."""
     sizes = jnp.ones_like(guards) if watched.sizes is None else watched.sizes
     lowest = jnp.where(crossing, guards / sizes, jnp.inf)
     near = jnp.abs(jnp.min(lowest)) <= ROUNDING * jnp.finfo(lowest.dtype).eps
@@ -51,7 +53,7 @@ def at_rounding(
 
 
 class Step(NamedTuple):
-    """The end of the last accepted step: what a rejected step leaves as it is."""
+    """The end of the last accepted step, which a rejected step does not change."""
 
     time: Scalar
     state: State
@@ -61,31 +63,32 @@ class Step(NamedTuple):
 
 
 class Minimum(NamedTuple):
-    """Lowest interior minimum so far of each monitor, and the step that holds it."""
+    """Lowest interior minimum so far of each margin, and the step that holds it."""
 
     value: Float[Array, " n"]
     left: Float[Array, "n dim"]
-    length: Float[Array, " n"]  # of the step from `left`, s
-    offset: Float[Array, " n"]  # of the minimum from `left`, s
+    length: Float[Array, " n"]  # of the step from its start, s
+    offset: Float[Array, " n"]  # of the minimum from the step's start, s
     rate_left: Float[Array, " n"]
 
     @property
     def found(self) -> Bool[Array, " n"]:
+        """Whether each margin has an interior minimum."""
         return jnp.isfinite(self.value)
 
 
 class Settling(NamedTuple):
-    """After the march: secant steps on a monitor's rate, one monitor after the other."""
+    """State of the secant steps on a margin's rate after the integration, one margin at a time."""
 
     monitor: Int[Array, ""]
     tries: Int[Array, ""]
-    at: Scalar  # place with the smallest rate so far, from the step's left end, s
+    at: Scalar  # time with the smallest rate so far, from the step's start, s
     rate_at: Scalar
-    lowest: Float[Array, " n"]  # settled minima, and the values at the phase's start
+    lowest: Float[Array, " n"]  # refined minima, and the values at the phase's start
 
 
 def cubic(x: Array, v0: Array, r0: Array, v1: Array, r1: Array) -> Array:
-    """Cubic Hermite interpolant on [0, 1]; the rates are already times the length."""
+    """Return the cubic Hermite interpolant on [0, 1]; the rates are multiplied by the length."""
     return (
         (1 + 2 * x) * (1 - x) ** 2 * v0
         + x * (1 - x) ** 2 * r0
@@ -94,9 +97,11 @@ def cubic(x: Array, v0: Array, r0: Array, v1: Array, r1: Array) -> Array:
     )
 
 
-@jax.jit  # traced once, for whichever monitor
+@jax.jit  # traced once for all margins
 def cubic_minimum(v0: Array, r0: Array, v1: Array, r1: Array) -> tuple[Array, Array]:
-    """Place in (0, 1) and value of the cubic's interior minimum; value inf where there is none."""
+    """Return location in (0, 1) and value of the cubic's interior minimum; the value is inf if none
+    exists.
+    """
     a = 3.0 * (2.0 * v0 + r0 - 2.0 * v1 + r1)
     b = 2.0 * (-3.0 * v0 - 2.0 * r0 + 3.0 * v1 - r1)
     discriminant = b * b - 4.0 * a * r0
@@ -112,6 +117,7 @@ def cubic_minimum(v0: Array, r0: Array, v1: Array, r1: Array) -> tuple[Array, Ar
 
 
 def no_minimum(watched: Watched, start: State) -> Minimum:
+    """Return the state without interior minima."""
     n = len(watched.count_start)
     zeros = jnp.zeros((n,), start.dtype)
     return Minimum(zeros + jnp.inf, jnp.tile(start, (n, 1)), zeros, zeros, zeros)
@@ -125,9 +131,11 @@ def lower(
     length: Scalar,
     counts: Bool[Array, ""],
 ) -> Minimum:
-    """Keep the step in which a monitor turns from falling to rising, if it is the lowest yet.
+    """Return the minima, with the step in which a margin turns from falling to rising if it is the
+    lowest.
 
-    A monitor that is zero at the phase's start is at rest there: rounding must not make it fall.
+    A margin that is zero at the phase's start by construction is at rest there: a negative rate is
+    round-off and counts as zero.
     """
     if not watched.count_start:
         return minimum
@@ -151,7 +159,7 @@ def lower(
 
 
 def row_of(index: Int[Array, ""], rows: Array) -> Array:
-    """The row of that index; a gather would cost more in a batch."""
+    """Return the row with this index; a gather would cost more in a batch."""
     chosen = jnp.arange(rows.shape[0]) == index
     return jnp.sum(jnp.where(chosen.reshape(-1, *(1,) * (rows.ndim - 1)), rows, 0.0), axis=0)
 
@@ -167,11 +175,12 @@ def settle(
     ends: Bool[Array, ""],
     n_steps: int,
 ) -> tuple[Settling, Bool[Array, ""], Scalar]:
-    """Each monitor's minimum to the integrator's accuracy, by re-steps once the march `ends`.
+    """Locate each margin's minimum at the integrator's accuracy, by steps after the integration
+    ends.
 
-    At most `n_steps` secant steps on the rate, each a step of `length` from the left end of the
-    march's step that holds the minimum. Returns where that stands, whether another step is wanted
-    (this one was if `on`), and its length.
+    At most `max_iterations` secant steps on the rate are taken, each a step of `length` from the
+    start of the step that holds the minimum. Return the state of the refinement, whether another
+    step is needed (this one was a refinement if `is_refining`), and its length.
     """
     values, rates = step.values[watched.n_guards :], step.rates[watched.n_guards :]
     monitor, tries = settling.monitor, settling.tries + on
@@ -208,7 +217,8 @@ def settle(
 
 
 FEWEST = 3
-"""Tries at a minimum, at least: each makes the place's derivatives right to some digits more."""
+"""Least number of tries at a minimum, chosen because each makes the location's derivatives accurate
+to more digits."""
 AT_MINIMUM = 1e-6
-"""How near a minimum's place is known when it counts, in lengths of the step that holds it: the
-value is then off by the square of that."""
+"""Accuracy of a minimum's location, in lengths of the step that holds it, chosen because the error
+of the value is the square of it."""

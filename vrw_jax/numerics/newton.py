@@ -1,4 +1,4 @@
-"""Limit cycles of any return map by Newton's method on the section: it needs nothing else."""
+"""Fixed points of any return map, by Newton's method on the section."""
 
 import functools
 from collections.abc import Callable
@@ -16,16 +16,16 @@ from vrw_jax.wording import as_text, function_of, listed, positive, reals, told,
 
 
 class SectionCycle(NamedTuple):
-    """A point that a map repeats, and how disturbances of it grow.
+    """A fixed point of a map, and the map's Jacobian there.
 
     - `x`: the point, shape (n,);
     - `jacobian`: of the map, or of its period_n-th iterate;
     - `residual`: largest entry of map(x) - x;
-    - `converged`, `iterations`: of Newton's method.
+    - `converged`, `n_iterations`: of Newton's method.
 
     Examples:
-        >>> found = vrw.newton_cycle(lambda x: 0.5 * x + 1.0, jnp.zeros(1))
-        >>> float(found.x[0]), float(found.jacobian[0, 0])
+        >>> result = vrw.solve_fixed_point(lambda x: 0.5 * x + 1.0, jnp.zeros(1))
+        >>> float(result.x[0]), float(result.jacobian[0, 0])
         (2.0, 0.5)
     """
 
@@ -48,7 +48,7 @@ class SectionCycle(NamedTuple):
 
 
 ITERATIONS = 30
-"""Of Newton's method, at most."""
+"""Default limit of Newton's iterations."""
 
 
 def newton_cycle(
@@ -59,28 +59,29 @@ def newton_cycle(
     tolerance: float | Scalar = 1e-12,
     iterations: int = ITERATIONS,
 ) -> SectionCycle:
-    """A fixed point of `function` applied `period_n` times, by Newton's method from `start`.
+    """Solve for a fixed point of `function` applied `period_n` times, by Newton's method from
+    `start`.
 
-    Differentiable in whatever `function` closes over, by two further iterations that carry
-    derivatives: the point to third order, the Jacobian to first. A start that does not converge is
-    returned as it is, without derivative.
+    The result is differentiable in whatever `function` closes over, by two further iterations that
+    carry derivatives: the point to third order, the Jacobian to first. A start that does not
+    converge is returned unchanged, without derivative.
 
     Args:
-        function: a map of a vector onto its like, differentiable forwards.
-        start: shape (n,), near the point that is looked for.
-        period_n: how often the map is applied.
+        function: a map of a vector to a vector of the same shape, differentiable in forward mode.
+        start: shape (n,), near the fixed point.
+        period_n: number of times the map is applied.
         tolerance: of Newton's last correction, in units of `start`.
-        iterations: at most so many.
+        max_iterations: limit of Newton's iterations.
 
     Returns:
-        A `SectionCycle`.
+        A `FixedPointResult`.
 
     Raises:
-        TypeError, ValueError: an argument that can't be meant, in one sentence.
+        TypeError, ValueError: an invalid argument, in one sentence.
 
     Examples:
-        >>> found = vrw.newton_cycle(lambda x: jnp.cos(x), jnp.array([0.7]))
-        >>> print(f"{found.x[0]:.6f} {bool(found.converged)}")
+        >>> result = vrw.solve_fixed_point(lambda x: jnp.cos(x), jnp.array([0.7]))
+        >>> print(f"{result.x[0]:.6f} {bool(result.converged)}")
         0.739085 True
     """
 
@@ -94,10 +95,10 @@ def moved_cycle(
     period_n: int = 1,
     tolerance: float | Scalar = 1e-12,
 ) -> SectionCycle:
-    """`newton_cycle` for a map whose second derivatives are dear.
+    """Solve for a fixed point of a map whose second derivatives are expensive.
 
-    The point's first derivatives need but first ones of `function`, its second ones second ones.
-    Derivatives of the Jacobian are NaN.
+    The point's first derivatives require only first derivatives of `function`, and its second
+    derivatives second ones. Derivatives of the Jacobian are NaN.
     """
     return _cycle_of(_found_apart, function, start, period_n, tolerance, ITERATIONS)
 
@@ -110,7 +111,7 @@ def _cycle_of(
     tolerance: float | Scalar,
     iterations: int,
 ) -> SectionCycle:
-    """What is asked made sound, and `found` by one of the two ways below."""
+    """Validate the arguments, and solve with one of the two methods below."""
     function_of("function", function, "that maps a state to the next")
     start, period_n = reals("start", start), whole("period_n", period_n)
     iterations = whole("iterations", iterations)
@@ -139,21 +140,22 @@ Map = Callable[..., Array]
 
 
 def _correction(image: Map, x: Array, closed_over: tuple) -> tuple[Array, Array, Array]:
-    """Newton's change, the map's Jacobian, and by how much the map misses."""
+    """Return Newton's correction, the map's Jacobian, and the defect of the map."""
     reached, jacobian = with_jacobian(lambda y: image(y, *closed_over), x)
     miss = reached - x
     return jnp.linalg.solve(jnp.eye(x.size, dtype=x.dtype) - jacobian, miss), jacobian, miss
 
 
 POLISHED = 2
-"""Iterations after convergence. One from a point without derivatives leaves it with its first."""
+"""Number of iterations with derivatives, chosen because one from a point without derivatives yields
+only its first."""
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _found(
     image: Map, iterations: int, start: Array, tolerance: Array, *closed_over: Any
 ) -> SectionCycle:
-    """All corrections are turns of one loop: the map, often a large program, is compiled once."""
+    """Run Newton's method in one loop, so that the map, often a large program, is compiled once."""
 
     def searches(size: Array, count: Array) -> Array:
         return (size > tolerance) & (count < iterations) & jnp.isfinite(size)
@@ -166,7 +168,9 @@ def _found(
         x, size, count, followed, *_ = state
         searching = searches(size, count)
         change, jacobian, miss = _correction(image, x, closed_over)
-        size = jnp.max(jnp.abs(change))  # of the last ones too: the map may jump next to its point
+        size = jnp.max(
+            jnp.abs(change)
+        )  # checked in the last iterations too: the map may jump next to the point
         moved = jnp.where(jnp.all(jnp.isfinite(change)), x + change, x)
         told = jacobian, jnp.max(jnp.abs(miss))
         return moved, size, count + searching, followed + ~searching, *told
@@ -182,7 +186,7 @@ def _found(
 def _found_and_moved(
     image: Map, iterations: int, primals: tuple, tangents: tuple
 ) -> tuple[SectionCycle, SectionCycle]:
-    """The derivative, by iterations from the fixed point that carry it along."""
+    """Return the tangent, by iterations from the fixed point that carry derivatives."""
     start, _, *closed_over = primals
     found = _found(image, iterations, *lax.stop_gradient(primals))
 
@@ -210,7 +214,9 @@ def _found_apart(
 def _point_moved(
     image: Map, iterations: int, primals: tuple, tangents: tuple
 ) -> tuple[SectionCycle, SectionCycle]:
-    """By the implicit function theorem, at a point that moves by this rule itself."""
+    """Return the tangent by the implicit function theorem, at a point that is differentiated by
+    this rule.
+    """
     found = _found_apart(image, iterations, *primals)
     closed_over, moves = tuple(primals[2:]), tuple(tangents[2:])
     _, by_map = jax.jvp(lambda *some: image(found.x, *some), closed_over, moves)

@@ -1,4 +1,4 @@
-"""Every numerical choice of the event-driven step in one visible object."""
+"""Numerical options of the event-driven step."""
 
 import dataclasses
 import functools
@@ -16,18 +16,23 @@ SolverName = Literal[
     "Dopri8", "Tsit5", "Dopri5", "Bosh3", "Heun", "Midpoint", "Ralston",
     "Kvaerno3", "Kvaerno4", "Kvaerno5", "ImplicitEuler",
 ]  # fmt: skip
-"""diffrax's Runge-Kutta solvers with an error estimate: explicit ones, then implicit ones."""
+"""Names of diffrax's Runge-Kutta solvers with an error estimate: explicit ones, then implicit
+ones."""
 SOLVERS: tuple[str, ...] = get_args(SolverName)
 
 Engine = Literal["auto", "lanes", "diffrax"]
-"""Who takes the steps of wheels with compliant legs."""
+"""Names of the engines that integrate the steps of wheels with compliant legs."""
 
 FLOOR = 90.0
-"""Tolerances are not tightened below this, in units of round-off (2e-14 in float64): a walk of many
-steps gains nothing there."""
+"""Units of round-off below which tolerances are not tightened (2e-14 in float64).
+
+It is chosen because a walk of many steps gains nothing below it.
+"""
 LEAST = 4.5
-"""Least tolerance that float64 can be asked for, in the same units: a walk of few steps that grazes
-a guard gains down to it."""
+"""Least tolerance allowed in float64, in units of round-off.
+
+It is chosen because a walk of few steps that grazes a guard gains accuracy down to it.
+"""
 
 
 def _positive(name: str, default: float) -> Any:
@@ -35,23 +40,23 @@ def _positive(name: str, default: float) -> Any:
 
 
 class Options(AbstractTold):
-    """Numerical choices of an event-driven step. The tolerances may change without recompiling.
+    """Numerical options of an event-driven step; the tolerances may change without recompiling.
 
-    - `solver`: one of `SOLVERS`, diffrax's Runge-Kutta solvers with an error estimate;
-    - `engine`: "diffrax", the definition, for any solver, device and order of derivative; "lanes",
-      its machine code for explicit solvers on CPUs; "auto", the latter wherever it can;
-    - `rtol`, `atol`: relative and absolute tolerance of each local step, in m, rad, m/s, rad/s;
-    - `derivative_tightening`: derivatives are computed so much tighter, since they take no part in
-      the step-size control; so they err at most ten times as much as values do without it, on real
-      ground up to 300 times;
-    - `max_phase_time`: of one phase, s;
-    - `max_solver_steps`: of one phase, tried steps;
-    - `first_step`: of each phase, s;
-    - `event_steps`: at most so many to locate an event;
-    - `monitor_steps`: secant re-steps to a monitor's minimum.
+    - `solver`: one of `SOLVER_NAMES`, diffrax's Runge-Kutta solvers with an error estimate;
+    - `engine`: "diffrax" is the reference for any solver, device and order of derivative; "lanes"
+      is its machine code for explicit solvers on CPUs; "auto" takes "lanes" if it is available;
+    - `rtol`, `atol`: relative and absolute tolerance of each solver step, in m, rad, m/s, rad/s;
+    - `derivative_tightening`: factor by which tolerances are divided for derivatives, because
+      derivatives take no part in the step-size control; their error is then at most ten times that
+      of values without it, with unilateral contact up to 300 times;
+    - `max_phase_time`: limit of one phase, s;
+    - `max_solver_steps`: limit of tried solver steps in one phase;
+    - `dt0`: first solver step of each phase, s;
+    - `max_event_iterations`: limit of iterations to locate an event;
+    - `max_margin_search_iterations`: limit of secant steps to the minimum of a margin.
 
     Examples:
-        >>> options = vrw.Options(rtol=1e-8, atol=1e-8)
+        >>> options = vrw.StepOptions(rtol=1e-8, atol=1e-8)
         >>> vrw.step(vrw.WheelParams(), vrw.paper_start(), options=options).engine
         'lanes'
     """
@@ -101,26 +106,28 @@ class Options(AbstractTold):
         ]
 
     def by(self, engine: Engine) -> "Options":
-        """The same choices for that engine; "auto" leaves theirs."""
+        """Return these options with another engine; "auto" leaves the engine as it is."""
         chosen("engine", engine, get_args(Engine))
         return self if engine == "auto" else dataclasses.replace(self, engine=engine)
 
     @classmethod
     def tight(cls) -> "Options":
-        """The tightest useful tolerances in float64: a step is right to about 1e-12."""
+        """Return options with the tightest useful tolerances in float64: steps accurate to about
+        1e-12.
+        """
         return cls(rtol=1e-13, atol=1e-13)
 
     def for_derivatives(self) -> "Options":
-        """The same choices with tolerances tightened for derivatives, down to round-off."""
+        """Return these options with tolerances tightened for derivatives, down to round-off."""
         return self.tightened(self.derivative_tightening)
 
     def tightened(self, factor: Scalar | float) -> "Options":
-        """The same choices with tolerances divided by `factor`, down to round-off."""
+        """Return these options with tolerances divided by `factor`, down to round-off."""
         both = self.rtol, self.atol
         return eqx.tree_at(lambda o: (o.rtol, o.atol), self, _tightened(both, factor))
 
     def require_reachable(self, dtype: np.dtype) -> None:
-        """Refuse, in one sentence, a tolerance below what the number format can resolve."""
+        """Raise a ValueError for a tolerance below the resolution of the number format."""
         floor = (LEAST if dtype == np.float64 else FLOOR) * float(jnp.finfo(dtype).eps)
         for name in ("rtol", "atol"):
             value = getattr(self, name)

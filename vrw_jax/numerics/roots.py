@@ -1,6 +1,6 @@
-"""Where quantities along a branch change sign, and exactly at which place each of them does.
+"""Sign changes of quantities along a branch, and their exact locations.
 
-The places are sought for all brackets at once: one evaluation per round, whatever their number.
+All brackets are searched together: each round has one evaluation, whatever their number.
 """
 
 from collections.abc import Callable
@@ -12,18 +12,23 @@ import numpy as np
 from vrw_jax.numerics.floquet import bifurcation_margins, multipliers
 
 BIFURCATIONS = ("fold", "period_doubling", "neimark_sacker")
-"""Each vanishes where a multiplier is 1, where one is -1, where a pair of modulus 1 is."""
+"""Names of the bifurcations: a multiplier is 1, one is -1, or a pair has modulus 1."""
 
 ROUNDS = 12
-"""In which what is smooth is located; what is still open then counts as a jump."""
+"""Limit of rounds to locate a smooth zero; an unresolved bracket then counts as a jump."""
 
 SECTIONS = 9
+"""Number of equal sections into which a bracket with a jump is divided per round."""
 ON_CIRCLE = 1e-4
-"""How far from modulus 1 the pair of a located Neimark-Sacker bifurcation may be."""
+"""Largest distance from modulus 1 of the pair of a located Neimark-Sacker bifurcation."""
 
 
 def bifurcation_functions(jacobians: np.ndarray) -> np.ndarray:
-    """`BIFURCATIONS` on the last axis, from Jacobians (..., n, n); NaN where n has none such."""
+    """Return the test functions of `BIFURCATION_NAMES` on the last axis, from Jacobians (..., n,
+    n).
+
+    They are NaN where n admits no such bifurcation.
+    """
     margins = np.asarray(bifurcation_margins(jnp.asarray(jacobians)))
     values = np.full((*margins.shape[:-1], len(BIFURCATIONS)), np.nan)
     n = min(margins.shape[-1], len(BIFURCATIONS))
@@ -32,16 +37,17 @@ def bifurcation_functions(jacobians: np.ndarray) -> np.ndarray:
 
 
 def turns(jacobian: np.ndarray) -> bool:
-    """Whether a complex pair of multipliers lies on the unit circle.
+    """Return whether a complex pair of multipliers lies on the unit circle.
 
-    The product of two multipliers is 1 also where they are real and reciprocal: no bifurcation.
+    The product of two multipliers is also 1 if they are real and reciprocal, which is no
+    bifurcation.
     """
     values = np.asarray(multipliers(jnp.asarray(jacobian)))
     return bool(np.any((np.abs(np.abs(values) - 1.0) < ON_CIRCLE) & (values.imag != 0.0)))
 
 
 class Bracket(NamedTuple):
-    """Between the points `left` and `right` of a branch, quantity `column` changes sign."""
+    """A sign change of the quantity with index `quantity_index` between two points of a branch."""
 
     left: int
     right: int
@@ -49,9 +55,10 @@ class Bracket(NamedTuple):
 
 
 def brackets(values: np.ndarray) -> list[Bracket]:
-    """Where neighbours in `values` (point, quantity) differ in sign; NaN and zero differ in none.
+    """Return the sign changes between neighbors in `values` (point, quantity); NaN and zero have
+    none.
 
-    Two changes between neighbours are not seen: the continuation's steps decide what is found.
+    Two changes between neighbors are not detected: the continuation step decides what is found.
     """
     signs = np.sign(np.nan_to_num(values))
     found = np.argwhere(signs[:-1] * signs[1:] < 0.0)
@@ -59,11 +66,11 @@ def brackets(values: np.ndarray) -> list[Bracket]:
 
 
 class Located(NamedTuple):
-    """Where the functions change sign, as places in [0, 1], one of each per bracket."""
+    """Locations of sign changes in [0, 1], one per bracket."""
 
-    place: np.ndarray  # the better of both sides
-    left: np.ndarray  # with the sign at place 0
-    right: np.ndarray  # with the sign at place 1
+    place: np.ndarray  # the side with the smaller value
+    left: np.ndarray  # with the sign at location 0
+    right: np.ndarray  # with the sign at location 1
 
 
 def locate(
@@ -71,16 +78,17 @@ def locate(
     ends: tuple[np.ndarray, np.ndarray],
     width: np.ndarray,
 ) -> Located:
-    """Zeros of functions that have opposite signs at 0 and 1, by Chandrupatla's method.
+    """Return zeros of functions with opposite signs at 0 and 1, by Chandrupatla's method.
 
-    `function` takes places and which brackets they are of. Inverse quadratic interpolation where it
-    can be trusted, bisection else, and SECTIONS at once from where a function jumps or goes
-    nowhere: a jump is found as surely as a smooth zero. Ends when each bracket is narrower than
-    `width`, or at a zero itself. A place where the function is not a number counts to the side of
-    1; `ends` are its values at 0 and 1.
+    `function` takes locations and the indices of their brackets. A round uses inverse quadratic
+    interpolation where it is reliable and bisection elsewhere. A bracket in which the function
+    jumps or stalls is divided into N_BRACKET_SECTIONS sections together: a jump is located as
+    reliably as a smooth zero. The search ends when each bracket is narrower than `width`, or at a
+    zero itself. A location where the function is NaN counts to the side of 1; `end_values` are its
+    values at 0 and 1.
     """
     at_zero, at_one = ends
-    # Rows: the newest place, the end of the other sign, and the place that the newest replaced.
+    # Rows: the newest location, the end of the other sign, and the location that it replaced.
     x = np.outer((0.0, 1.0, 1.0), np.ones_like(width))
     f = np.stack([at_zero, at_one, at_one])
     jumps, rounds = np.zeros(len(width), bool), 0
@@ -100,7 +108,7 @@ def locate(
             rows[:, some] = newest, np.where(same, other, first), np.where(same, first, other)
         x[1, some[value == 0.0]] = near[value == 0.0]
         ours = np.sign(inner) != np.sign(at_one[cut])[:, None]
-        last = np.sum(np.cumprod(ours, 1), 1)  # before the first place on the side of 1
+        last = np.sum(np.cumprod(ours, 1), 1)  # before the first location on the side of 1
         x[:2, cut] = cuts[np.arange(len(cut)), np.stack([last, last + 1])]
         rounds += 1
         jumps[some] = lost[: len(some)] | (value == f[2, some]) | (rounds >= ROUNDS)
@@ -109,7 +117,9 @@ def locate(
 
 
 def _proposed(x: np.ndarray, f: np.ndarray, width: np.ndarray) -> np.ndarray:
-    """Where Chandrupatla's method goes from its three places (1997, doi 10/d9zjj8)."""
+    """Return the next locations of Chandrupatla's method from its three points (1997, doi
+    10/d9zjj8).
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         xi, phi = (x[0] - x[1]) / (x[2] - x[1]), (f[0] - f[1]) / (f[2] - f[1])
         trusted = (1.0 - np.sqrt(1.0 - xi) < phi) & (phi < np.sqrt(xi))

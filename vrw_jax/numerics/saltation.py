@@ -1,4 +1,6 @@
-"""By how much a walk through modes stretches volumes of states: Liouville's formula with events."""
+"""Determinant of the flow's Jacobian through modes and events: Liouville's formula
+with saltation.
+"""
 
 from collections.abc import Callable, Sequence
 
@@ -18,15 +20,17 @@ from vrw_jax.wording import reals
 def volume_change(
     modes: Sequence[Mode], start: ArrayLike | Sequence, told: Walk, options: Options | None = None
 ) -> Scalar:
-    """Volume of states about the walk's last, past its event, over that of theirs about `start`.
+    """Return the determinant of the final state's Jacobian with respect to `start`, past the last
+    event.
 
-    exp of the field's divergence along each mode (Liouville), times the determinant of each event's
-    saltation matrix (R. I. Leine and H. Nijmeijer, Dynamics and Bifurcations of Non-Smooth
-    Mechanical Systems, 2004, section 7). Of an orbit that is back after these events that is the
-    product of all its multipliers, the 1 along itself included. A return map's Jacobian loses that
-    product's digits where a guard is grazed: its entries grow as one over the guard's rate.
+    It is exp of the field's integrated divergence along each mode (Liouville), times the
+    determinant of each event's saltation matrix (R. I. Leine and H. Nijmeijer, Dynamics and
+    Bifurcations of Non-Smooth Mechanical Systems, 2004, section 7). For an orbit that is periodic
+    after these events, it is the product of all its multipliers, including the 1 along the orbit. A
+    return map's Jacobian loses that product's digits where a guard is grazed, because its entries
+    grow as one over the guard's rate.
 
-    Not a number where steps are spent. Transforms apply.
+    The result is NaN if the solver steps are spent. Transforms apply.
     """
     options = Options() if options is None else options
     start = reals("start", start)
@@ -53,7 +57,7 @@ def volume_change(
 
 
 def _factor(mode: Mode, guard: Guard, options: Options) -> Callable:
-    """Of one mode that this guard ends."""
+    """Return the factor of one mode that this guard ends."""
 
     def along(z: Array) -> Array:
         y = z[:-2]
@@ -62,7 +66,9 @@ def _factor(mode: Mode, guard: Guard, options: Options) -> Callable:
 
     def factor(begin: Array, before: Array, flow: Array, duration: Array) -> Array:
         end = sample_phase(along, jnp.append(begin, jnp.zeros(2)), duration, 2, options)[-1]
-        reached = jnp.abs(end[-1] - duration) <= 1e-9 * duration  # else the steps were spent
+        reached = (
+            jnp.abs(end[-1] - duration) <= 1e-9 * duration
+        )  # otherwise the solver steps were spent
         reset, across = jax.jacfwd(guard.reset)(before), jax.jacfwd(guard.value)(before)
         moves = mode.field(before)
         saltation = reset + jnp.outer(flow - reset @ moves, across) / (across @ moves)

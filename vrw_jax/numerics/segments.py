@@ -1,8 +1,8 @@
-"""Multipliers of a periodic orbit from its segments, whose product is not formed.
+"""Multipliers of a periodic orbit from its segments, without forming their product.
 
 A product of matrices keeps what grows and loses what decays: a multiplier of 1e-20 beside one of 1
 has no correct digit in it. Orthogonal iteration around the period makes every factor triangular
-instead (a periodic Schur form); a multiplier is then a product of diagonal entries, each correct.
+instead (a periodic Schur form). A multiplier is then a product of diagonal entries, each correct.
 """
 
 from collections.abc import Sequence
@@ -21,11 +21,11 @@ from vrw_jax.numerics.types import Scalar
 
 
 class Segments(NamedTuple):
-    """A flow in equal segments of time."""
+    """A flow in segments of equal time."""
 
-    states: Float[Array, "n_ends dim"]  # at their ends, the start first
-    maps: Float[Array, "n_segments n n"]  # derivative of each segment's end by its start
-    divergence: Scalar  # integral of the field's over all: the logarithm of the determinant
+    states: Float[Array, "n_ends dim"]  # at the segments' ends, the start first
+    maps: Float[Array, "n_segments n n"]  # Jacobian of each segment's end with respect to its start
+    divergence: Scalar  # integrated over all segments: logarithm of the determinant
 
 
 def segment_maps(
@@ -36,12 +36,13 @@ def segment_maps(
     options: Options,
     directions: int | None = None,
 ) -> Segments:
-    """The flow of `field` with its derivative by the first `directions` coordinates (all).
+    """Return the flow of `field` with its Jacobians by the first `n_directions` coordinates
+    (default all).
 
-    Derivatives take part in the control of steps. Each column is a direction of about constant
-    length and the logarithm of its growth, so that what decays keeps its digits. A segment whose
-    steps are spent is not a number.
-    A clock among the coordinates is no direction: it stands behind those that are.
+    Derivatives take part in the step-size control. Each tangent is a direction of about constant
+    length and the logarithm of its growth, so that decaying directions keep their digits. A segment
+    whose solver steps are spent is NaN. A clock among the coordinates is no direction and must
+    follow those that are.
     """
     start = jnp.asarray(start, float)
     told = jax.eval_shape(field, start)
@@ -72,7 +73,9 @@ def segment_maps(
     def passed(state: Array, _: None) -> tuple[Array, tuple]:
         begin = jnp.concatenate([state, jnp.eye(n, dim).ravel(), jnp.zeros(n + 2)])
         end = sample_phase(along, begin, length, 2, options)[-1]
-        reached = jnp.abs(end[-1] - length) <= 1e-9 * length  # else the steps were spent
+        reached = (
+            jnp.abs(end[-1] - length) <= 1e-9 * length
+        )  # otherwise the solver steps were spent
         columns, grown = end[dim:size].reshape(n, dim), jnp.exp(end[size : size + n])
         one = jnp.where(reached, columns[:, :n].T * grown, jnp.nan)
         return end[:dim], (end[:dim], one, end[-2])
@@ -82,25 +85,29 @@ def segment_maps(
 
 
 class Multipliers(NamedTuple):
-    """Of a product of matrices, the largest first."""
+    """Eigenvalues of a product of matrices, the largest first."""
 
-    values: np.ndarray  # complex; not a number where `known` is False
-    logarithms: np.ndarray  # of their moduli, known where the value itself is below any number
-    uncertainty: np.ndarray  # estimate of their relative error
-    known: np.ndarray  # whether that is within what was asked for
+    values: np.ndarray  # complex; NaN where `is_known` is False
+    logarithms: np.ndarray  # of their moduli, finite even if the value underflows
+    uncertainty: np.ndarray  # estimated
+    known: np.ndarray  # whether the relative error is within `accuracy`
 
 
 SWEEPS = 60
-"""Around the period. Moduli apart by a factor of two are then apart to the last digit; those nearer
-stay together in one block, whose product loses few digits."""
+"""Number of sweeps around the period.
+
+It is chosen because moduli that differ by a factor of two are then separated to the last digit.
+Closer moduli stay together in one block, whose product loses few digits.
+"""
 
 
 def product_multipliers(
     maps: ArrayLike | Sequence, accuracy: float = 1e-6, tolerance: float = 1e-15
 ) -> Multipliers:
-    """Eigenvalues of maps[-1] @ ... @ maps[0], each known to `accuracy` or said not to be.
+    """Return the eigenvalues of jacobians[-1] @ ... @ jacobians[0] and whether each has `accuracy`.
 
-    `tolerance` is the error of each map compared with its norm. Runs on concrete matrices only.
+    `tolerance` is the error of each Jacobian relative to its norm. The function accepts concrete
+    matrices only.
     """
     maps = np.asarray(maps, float)
     if maps.ndim != 3 or maps.shape[1] != maps.shape[2] or not maps.size:
@@ -137,7 +144,7 @@ def product_multipliers(
 def _of_block(
     triangles: np.ndarray, close: np.ndarray, block: slice, norms: np.ndarray, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Multipliers of one block on the diagonal, their logarithms and relative errors."""
+    """Return the multipliers of one diagonal block, their logarithms and relative errors."""
     part, size = triangles[:, block, block], block.stop - block.start
     diagonal = np.abs(np.diagonal(part, axis1=1, axis2=2))
     with np.errstate(divide="ignore", invalid="ignore"):

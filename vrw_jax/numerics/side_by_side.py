@@ -1,7 +1,7 @@
-"""Points of branches on planes across them, and branches side by side outside of compiled code.
+"""Points of branches on constraint planes, and concurrent branches outside of compiled code.
 
-Where a map is machine code that takes many points at once, nothing is to be traced: linearisations
-are called from outside of compiled code, and the rest of each iteration is `arclength`'s.
+Where a map is machine code for many points together, nothing is traced: linearizations are called
+from outside of compiled code, and `arclength` performs the rest of each iteration.
 """
 
 import functools
@@ -34,16 +34,22 @@ from vrw_jax.numerics.arclength import (
 from vrw_jax.numerics.lanes import select, taken
 
 AT_ONCE = 1e-2
-"""Of the tolerance: after a correction as small the Jacobian, of the trial before it, is exact."""
+"""Fraction of the tolerance below which the last Jacobian is reused.
+
+It is chosen because after a correction this small, the Jacobian of the trial before it is exact.
+"""
 
 
 class Solving(NamedTuple):
+    """State of Newton's method for a point on a plane."""
+
     now: Corrected
     tries: Int[Array, ""]
     settled: Int[Array, ""]
 
 
 def to_solve(z: Unknown, plane: Plane) -> Solving:
+    """Return the initial state of Newton's method on a plane."""
     n, flat, none = plane.x.shape[0], jax.tree.map(jnp.zeros_like, z), jnp.zeros((), jnp.int32)
     nothing = jnp.zeros((n, n), plane.x.dtype)
     first = Corrected(z, plane.share, jnp.ones_like(plane.share), flat, nothing)
@@ -51,6 +57,7 @@ def to_solve(z: Unknown, plane: Plane) -> Solving:
 
 
 def unsolved(options: ArclengthOptions, on: Solving) -> Array:
+    """Return whether Newton's method needs another iteration."""
     return (on.settled < 2) & (on.tries < options.iterations) & jnp.isfinite(on.now.size)
 
 
@@ -62,9 +69,10 @@ def nearer(
     on: Solving,
     linear: Linear,
 ) -> Solving:
+    """Return the state after one Newton iteration."""
     now = on.now
     following = corrected(followed, linear, bounds, plane, now.z, now.share)
-    # A trial that went astray stands still: no lane may hand its neighbours a NaN.
+    # A trial that is not finite keeps its state, so that no NaN reaches other batch elements.
     sound = jnp.isfinite(following.size)
     following = select(sound, following, now)._replace(size=following.size)
     counts = jnp.where(following.size < AT_ONCE * options.tolerance, 2, 1)
@@ -75,6 +83,7 @@ def nearer(
 def solution(
     followed: AbstractFollowed, wheel: Any, bounds: Array, on: Solving
 ) -> tuple[PathPoint, Bool[Array, ""]]:
+    """Return the point of a finished solve, and whether it converged."""
     now, p = on.now, parameter_at(on.now.share, bounds)
     valid = followed.valid(wheel, now.z, p)
     return PathPoint(now.z, p, (), jnp.ones_like(p), now.jacobian, valid), on.settled >= 1
@@ -89,10 +98,11 @@ def solve(
     plane: Plane,
     bounds: Float[Array, "2"],
 ) -> tuple[PathPoint, Bool[Array, ""]]:
-    """The point of the branch on a plane, from the plane's place and z near it; whether found.
+    """Solve for the point of the branch on a plane, from z near it; return it and whether it
+    converged.
 
-    Once converged, Newton's method goes on for one more iteration, unless its correction has
-    become nothing: the Jacobian is then as exact as the point.
+    Once converged, Newton's method takes one more iteration, unless its correction is negligible:
+    the Jacobian is then as exact as the point.
     """
 
     def iterate(on: Solving) -> Solving:
@@ -113,7 +123,7 @@ def follow_many(
     directions: Float[Array, " branches"],
     wanted: Bool[Array, " branches"],
 ) -> Track:
-    """`arclength.follow`."""
+    """Continue branches as `arclength.continue_from` does, outside of compiled code."""
     on, rows = begun(followed, options, z, p, bounds, directions, wanted), jnp.arange(len(p))
     while np.any(open_ := np.asarray(_going(on))):
         trial = on[0].trial
@@ -125,7 +135,7 @@ def follow_many(
 def _linear_of(
     followed: AbstractFollowed, wheels: Any, bounds: Array, z: Unknown, share: Array, some: Any
 ) -> Linear:
-    """Of `some` of many, the others without numbers."""
+    """Return the Newton steps of the selected branches; those of the others are NaN."""
     low, high = np.asarray(bounds)
     p = low + (high - low) * np.asarray(share)
     there = followed.linearise(*jax.device_put(taken((wheels, z, p), some)))
@@ -144,7 +154,7 @@ def solve_many(
     planes: Plane,
     bounds: Float[Array, "2"],
 ) -> tuple[PathPoint, Bool[Array, " many"]]:
-    """`solve` side by side, all arrays with a leading axis."""
+    """Solve for many points as `solve_on_plane` does; all arrays have a leading axis."""
     on = _to_solve_many(z, planes)
     while np.any(open_ := np.asarray(_unsolved(options, on))):
         linear = _linear_of(followed, wheels, bounds, on.now.z, on.now.share, open_)

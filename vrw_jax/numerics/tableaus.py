@@ -1,8 +1,8 @@
-"""One explicit Runge-Kutta step of many wheels at once, lane by lane in separate arrays.
+"""One explicit Runge-Kutta step for a batch, with separate arrays per component.
 
-The equations of motion are of second order, q'' = f(q, q'), so that a step keeps the accelerations
-of its stages alone: positions take the tableau's matrix twice, rates once. That is the same method
-with half of the stored slopes. Tableaus are diffrax's.
+The equations of motion are of second order, q'' = f(q, q'), so a step stores only the accelerations
+of its stages. Positions use the square of the tableau's matrix, rates the matrix. The method is the
+same, with half of the stored derivatives. The tableaus are those of diffrax.
 """
 
 import functools
@@ -25,25 +25,28 @@ from vrw_jax.numerics.types import Vector
 
 
 class Tableau(NamedTuple):
-    """An explicit method whose last stage is the step's end, and so the next step's first."""
+    """An explicit method whose last stage is the step's end and the first stage of the
+    next step.
+    """
 
     order: int
-    places: np.ndarray  # of the stages, in step lengths
-    once: np.ndarray  # the method's matrix: from accelerations to rates
-    twice: np.ndarray  # its square: from accelerations to positions
+    places: np.ndarray  # Butcher's c: of the stages, in step lengths
+    once: np.ndarray  # Butcher's A: from accelerations to rates
+    twice: np.ndarray  # A squared: from accelerations to positions
     error_once: np.ndarray
     error_twice: np.ndarray
     middle: int
-    """A stage well inside the step, where parabolas through guards are held."""
+    """Index of a stage well inside the step, at which the parabolas through guards are fitted."""
     inside: tuple[int, ...]
-    """Stages apart from each other and from both ends, to look for guards that dip below zero and
-    come back."""
+    """Stages separated from each other and from both ends, at which guards are sampled to find
+    dips."""
     hull: np.ndarray
-    """From a guard at the start, `inside` and at the end to the inner Bernstein coefficients of
-    the polynomial through these: it does not fall below the least of its coefficients."""
+    """Matrix from guard values to the inner Bernstein coefficients of the polynomial through them,
+    which does not fall below its least coefficient. The values are those at the start, at
+    `guard_stages` and at the end."""
 
     def __eq__(self, other: object) -> bool:
-        return self is other  # `explicit_tableau` makes each once
+        return self is other  # `load_explicit_tableau` creates each tableau once
 
     def __hash__(self) -> int:
         return id(self)
@@ -51,9 +54,10 @@ class Tableau(NamedTuple):
 
 @functools.cache
 def explicit_tableau(name: str) -> Tableau | None:
-    """diffrax's tableau of that name; None where the method is not explicit Runge-Kutta.
+    """Return diffrax's tableau of that name; None if the method is not explicit Runge-Kutta.
 
-    The numbers lie beside this file: to load diffrax for them takes a fifth of a cached start.
+    The numbers are stored beside this file, because loading diffrax takes a fifth of a cached
+    start.
     """
     known = json.loads(Path(__file__).with_name("tableaus.json").read_text(encoding="utf-8"))
     if name not in known:
@@ -83,28 +87,33 @@ def explicit_tableau(name: str) -> Tableau | None:
 
 
 INSIDE = (0.15, 0.47, 0.92)
-"""Where guards are looked at inside a step, about: nearer to the ends than equally spaced, since a
-dip just after the start or before the end is the hardest to see."""
+"""Approximate nodes at which guards are sampled inside a step.
+
+They are chosen nearer to the ends than equally spaced nodes, because a dip just after the start or
+before the end is the hardest to detect.
+"""
 
 
 def _apart(places: np.ndarray) -> tuple[int, ...]:
-    """The stages nearest to INSIDE, of several at one place the last, the most accurate."""
+    """Return the stages nearest to GUARD_STAGE_NODES; of several at one node the last, most
+    accurate.
+    """
     last = {round(float(place), 3): i for i, place in enumerate(places) if 0.05 < place < 0.95}
     nearest = {min((abs(place - at), place) for place in last)[1] for at in INSIDE if last}
     return tuple(last[place] for place in sorted(nearest))
 
 
 def _hull(nodes: np.ndarray) -> np.ndarray:
-    """Inner Bernstein coefficients of the polynomial through values at nodes of [0, 1]."""
+    """Return the matrix of inner Bernstein coefficients for values at nodes of [0, 1]."""
     n = len(nodes) - 1
     basis = [math.comb(n, i) * nodes**i * (1.0 - nodes) ** (n - i) for i in range(n + 1)]
     return np.linalg.inv(np.stack(basis, 1))[1:-1]
 
 
 def parabola(tableau: Tableau, start: Array, inside: Array, end: Array) -> tuple[Array, Array]:
-    """Bend and slope, in step lengths, of the one through a guard's values along a step.
+    """Return curvature and rate, in step lengths, of the parabola through a guard's values.
 
-    `inside`: at the stage `middle`.
+    `middle_value` is the guard at the stage `middle_stage`.
     """
     place = float(tableau.places[tableau.middle])
     bend = (end - start - (inside - start) / place) / (1.0 - place)
@@ -112,25 +121,27 @@ def parabola(tableau: Tableau, start: Array, inside: Array, end: Array) -> tuple
 
 
 def _bernstein(tableau: Tableau, values: list[Array]) -> list[Array]:
-    """A guard's Bernstein coefficients but the last: where all are positive, so is the guard.
+    """Return a guard's Bernstein coefficients except the last: if all are positive, so is the
+    guard.
 
-    `values`: at the start, at the stages `inside`, at the end.
+    `values` are those at the start, at the `guard_stages`, and at the end.
     """
     return [values[0], *(_weigh(row, values) for row in tableau.hull)]
 
 
 @functools.partial(jax.jit, static_argnums=0)  # traced once, for whichever guard
 def _may_dip(tableau: Tableau, values: list[Array]) -> Array:
-    """Whether a guard may fall below zero inside a step and be positive again at its end."""
+    """Return whether a guard may fall below zero inside a step and be positive again at its end."""
     return (functools.reduce(jnp.minimum, _bernstein(tableau, values)) <= 0.0) & (values[-1] > 0.0)
 
 
 @functools.partial(jax.jit, static_argnums=0)  # traced once, for whichever guard
 def below(tableau: Tableau, values: list[Array]) -> tuple[Array, Array]:
-    """Whether it may, and rises somewhere, since what only decays is no dip, however steep; and how
-    far to go first, in step lengths: where the lowest of its Bernstein coefficients belongs.
+    """Return whether a guard may dip and rises somewhere, and the fraction of the step to try
+    first.
 
-    `values`: at the start, at the stages `inside`, at the end.
+    A guard that only decays is no dip, however steep. The fraction is the node of the lowest
+    Bernstein coefficient. `values`: at the start, at the `guard_stages`, at the end.
     """
     lowest, *inner = _bernstein(tableau, values)
     at = jnp.zeros_like(lowest)
@@ -144,10 +155,11 @@ def below(tableau: Tableau, values: list[Array]) -> tuple[Array, Array]:
 
 
 def to_earliest_dip(tableau: Tableau, guards: list[Vector]) -> Array:
-    """Share of the step to go before a guard that may dip below zero in it; 1: there is none.
+    """Return the fraction of the step before a guard that may dip below zero in it; 1 if there is
+    none.
 
-    `guards`: at the start, at the stages `inside` and at the end. How far is asked only where a
-    lane of the group has one.
+    `guard_values`: at the start, at the `guard_stages` and at the end. The dip is located only if
+    some batch element of the group may have one.
     """
     columns = [list(values) for values in zip(*guards, strict=True)]
     may = functools.reduce(operator.or_, (_may_dip(tableau, values) for values in columns))
@@ -163,39 +175,40 @@ def to_earliest_dip(tableau: Tableau, guards: list[Vector]) -> Array:
 
 
 SAFETY, LEAST, MOST = 0.9, 0.2, 5.0
-"""Of the step-size controller: the usual safety factor, and the limits of a step's change."""
+"""Parameters of the step-size controller: the usual safety factor, and the limits of the change of
+a step's length."""
 
 
 def change_of_length(tableau: Tableau, squared: Array, dtype: Any) -> Array:
-    """Length of the next step over this one's, by the squared error of this one over tolerance."""
+    """Return the next step's length over this one's, from its squared error over tolerance."""
     power = jnp.exp(jnp.log(jnp.clip(squared, 1e-20, 1e20)) * (-0.5 / tableau.order)).astype(dtype)
     return jnp.clip(SAFETY * power, LEAST, jnp.where(squared <= 1.0, MOST, 1.0))
 
 
 def _without_rounding(x: np.ndarray) -> np.ndarray:
-    """Products of a tableau that vanish but for rounding, as zeros."""
+    """Return the products of a tableau with entries that are only round-off set to zero."""
     return np.where(np.abs(x) < 1e-14 * np.max(np.abs(x)), 0.0, x)
 
 
 class Slope(NamedTuple):
-    """What the equations of motion say at one point."""
+    """Accelerations at one state, with the sine and cosine of theta."""
 
     sin: Array  # of theta
     cos: Array
-    acceleration: Vector  # of all three coordinates; the phase's own come first
+    acceleration: Vector  # of all three coordinates, those of the phase first
 
 
 def real_stability_limit(tableau: Tableau) -> float:
-    """Largest z with |R(-z)| <= 1: a mode that decays at rate r bears steps up to z / r."""
+    """Return the largest z with |R(-z)| <= 1: a mode of decay rate r allows steps up to z / r."""
     z, stages, growth = np.linspace(0.01, 20.0, 2000), np.ones(len(tableau.places)), 1.0
-    for power in range(1, len(stages) + 1):  # R is a polynomial: 1 - z w (1 - z A + ...)
+    for power in range(1, len(stages) + 1):  # R is the polynomial 1 - z w (1 - z A + ...)
         growth = growth + (-z) ** power * (tableau.once[-1] @ stages)
         stages = tableau.once @ stages
     return float(z[np.argmax(np.abs(growth) > 1.0 + 1e-12)])
 
 
 class Place(NamedTuple):
-    """Positions, rates and slope of one stage."""
+    """Positions, rates and accelerations of one stage."""
 
     q: Vector
     v: Vector
@@ -203,7 +216,7 @@ class Place(NamedTuple):
 
 
 class Taken(NamedTuple):
-    """A step: its end, the error estimate, and its stages."""
+    """A Runge-Kutta step: its end, the error estimate, and its stages."""
 
     end: Place
     error: Vector  # of positions, then rates
@@ -217,7 +230,7 @@ Take = Callable[[Place, Array], Taken]
 def take_step(
     tableau: Tableau, evaluate: Evaluate, start: Place, h: Array, with_error: bool = True
 ) -> Taken:
-    """From `start` by `h` (lane by lane)."""
+    """Take one Runge-Kutta step of length `h` from `start`, elementwise over the batch."""
     n = len(start.q)
     places, slopes = [start], [start.slope.acceleration[:n]]
     for i in range(1, len(tableau.places)):
@@ -234,11 +247,11 @@ def take_step(
     return Taken(places[-1], error, places)
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1))  # traced once, in however many steps
+@functools.partial(jax.jit, static_argnums=(0, 1))  # traced once for all steps
 def stage_at(
     tableau: Tableau, i: int, q0: Vector, v0: Vector, slopes: list[Vector], h: Array
 ) -> tuple[Vector, Vector]:
-    """Positions and rates of stage `i`, from the accelerations of those before."""
+    """Return positions and rates of one stage, from the accelerations of those before."""
     position, rate = [], []
     for d in range(len(q0)):
         known = [slope[d] for slope in slopes]
@@ -250,10 +263,10 @@ def stage_at(
 
 
 def _weigh(weights: np.ndarray, terms: list[Array]) -> Any:
-    """A weighted sum; None where all weights vanish.
+    """Return a weighted sum, None if all weights vanish.
 
-    By `lax`: half of a step's operations are these, and operators take three times as long to
-    trace.
+    It uses `lax`, because half of a step's operations are such sums, and operators take three times
+    as long to trace.
     """
     pairs = zip(weights, terms, strict=False)
     parts = [lax.mul(x.dtype.type(w), x) for w, x in pairs if w != 0.0]

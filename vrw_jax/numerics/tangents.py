@@ -1,13 +1,14 @@
-"""How the ends of a lane's phase move with its start and with what its equations hold constant.
+"""Tangents of a phase's end with respect to its start and the constants of its equations, per
+batch.
 
-Beside each Runge-Kutta step the same step is made of the linearised equations, for as many
-directions as are asked for: what all directions share, the slopes' derivatives at the stages, is
-computed once, and each direction then costs some hundred products. Step sizes and what an event's
-search tried take no part: the derivative is that of the discrete flow at the lengths that were
-taken, and of the time at which its guard vanishes.
+Each Runge-Kutta step is repeated for the linearized equations, for all requested directions. The
+part shared by all directions, the Jacobians at the stages, is computed once, and each direction
+then costs some hundred products. Step sizes and the tries of an event's search take no part. The
+derivative is that of the discrete flow at the lengths that were taken, and of the time at which its
+guard vanishes.
 
-`jax.vmap` around a derivative gives its directions. Here they are an axis of arrays instead, the
-first: loops are traced as they are, not once more for the vmap.
+`jax.vmap` around a derivative supplies its directions. Here they are the first axis of arrays
+instead: loops are traced once, not again for the vmap.
 """
 
 import functools
@@ -30,26 +31,28 @@ from vrw_jax.numerics.types import Vector
 
 
 class Balance(NamedTuple):
-    """The equations of motion near a place, whose slope is known."""
+    """The equations of motion near a state whose accelerations are known."""
 
     residual: Callable[[Place], Vector]
-    """What they leave over there: their left side at the place's accelerations less the right."""
+    """Residual of the equations of motion: left side at the state's accelerations less the right
+    side."""
     solve: Callable[[Place, Vector], Vector]
-    """Accelerations that the left side turns into these rows."""
+    """Accelerations for which the left side equals these rows."""
 
 
 BalanceOf = Callable[[Any, Vector], Balance]
-"""By what the equations hold constant: a tree of arrays that moves in few directions, and numbers
-that move in any, as a phase's start does."""
+"""A function of the constants of the equations: a tree of arrays with few tangent directions, and
+numbers with any tangent, like the start of a phase."""
 
 
 def in_directions(
     function: Callable[[Any, Any], tuple[Any, Any]], at: Any, way: Any
 ) -> tuple[Any, Any]:
-    """(values, tangents) as a rule tells them, from a `function` that takes all directions at once.
+    """Return (values, tangents) of a JVP rule from a `function` that takes all directions together.
 
-    `at`, `way`: primals and tangents as the rule is given them. `function` takes the second with
-    the axis of directions first, of length 1 where all have the same, and tells tangents so.
+    `primals` and `tangents` are the arguments of the rule. `function` takes tangents with the axis
+    of directions first, of length 1 where all directions agree, and returns tangents in the same
+    form.
     """
     leaves, structure = jax.tree.flatten((at, way))
     n_at, size = len(jax.tree.leaves(at)), len(_around(way))
@@ -79,7 +82,7 @@ def in_directions(
 
 @custom_vmap
 def _around(_: Any) -> Array:
-    """As many zeros as there are directions of a `jax.vmap` around; none without one."""
+    """Return as many zeros as an enclosing `jax.vmap` has directions, none without one."""
     return jnp.zeros(0)
 
 
@@ -92,10 +95,12 @@ _BEYOND = Primitive("beyond")
 """What is traced outside of the `jax.vmap` around: within, its loops would be traced again."""
 _BEYOND.multiple_results = True
 batching.primitive_batchers[_BEYOND] = lambda values, axes, mapped: mapped(values, axes)
+"""Primitive whose function is traced outside of the enclosing `jax.vmap`, which would trace its
+loops again."""
 
 
 def _one_by_one(function: Callable[[Any], Any], ways: Any) -> Any:
-    """`function` of each direction, in a loop: each lives in registers."""
+    """Return `function` of each direction, in a loop, so that each direction stays in registers."""
     leaves, structure = jax.tree.flatten(ways)
     several = [len(x) > 1 for x in leaves]
 
@@ -110,15 +115,15 @@ def _one_by_one(function: Callable[[Any], Any], ways: Any) -> Any:
 
 
 def stacked(ways: Vector) -> Array:
-    """Directions of several numbers, (directions, numbers, lanes)."""
+    """Return tangents of several numbers stacked as (directions, numbers, batch)."""
     return jnp.stack(jnp.broadcast_arrays(*ways), 1)
 
 
 class Slopes(NamedTuple):
-    """Derivatives of the accelerations at the stages of a step."""
+    """Jacobians of the accelerations at the stages of a step."""
 
-    by_state: Array  # (stages, n, ., lanes): by positions, rates, then what is held
-    by_constants: Array  # (stages, directions, n, lanes)
+    by_state: Array  # (stages, n, ., batch): by positions, rates, then held constants
+    by_constants: Array  # (stages, directions, n, batch)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -140,7 +145,7 @@ def _slopes_of(
 
 
 def _side_by_side(function: Callable[[Any], Array], ways: Any) -> Array:
-    """`function` of each direction, none in a loop: what is known of each is left out."""
+    """Return `function` of each direction without a loop, so that known zeros are dropped."""
     leaves, structure = jax.tree.flatten(ways)
     if all(len(x) == 1 for x in leaves):
         return function(jax.tree.unflatten(structure, [x[0] for x in leaves]))[None]
@@ -177,7 +182,7 @@ def _units(place: Place) -> list[tuple[Vector, Vector]]:
 
 
 def _moved(balance: Balance, place: Place, dq: Vector, dv: Vector) -> Vector:
-    """Change of the accelerations along a direction of positions and rates."""
+    """Return the tangent of the accelerations along a direction of positions and rates."""
     sin, cos, acceleration = place.slope
     still = tuple(jnp.zeros_like(x) for x in acceleration)
     change = Place(dq, dv, Slope(cos * dq[0], -sin * dq[0], still))
@@ -190,7 +195,7 @@ def _accelerated(balance: Balance, place: Place, rows: Vector) -> Array:
 
 @functools.partial(jax.jit, static_argnums=0)  # traced once, wherever it is called
 def _carried(tableau: Tableau, slopes: Slopes, starts: Array, h: Array) -> Array:
-    """Directions (positions, rates, what is held) at a step's start, carried to its end."""
+    """Propagate tangents (positions, rates, held constants) from a step's start to its end."""
     by_state, n = slopes.by_state, slopes.by_state.shape[1]
 
     def carried(way: tuple[Array, Array]) -> Array:
@@ -209,15 +214,15 @@ def _carried(tableau: Tableau, slopes: Slopes, starts: Array, h: Array) -> Array
 
 
 def pushed(function: Callable[..., Any], at: tuple, directions: tuple) -> Any:
-    """`jax.jvp` along each of the directions, without the value.
+    """Return `jax.jvp` along each of the directions, without the value.
 
-    The code is as short as for one.
+    The code is as short as for one direction.
     """
     return _one_by_one(lambda way: jax.jvp(function, at, way)[1], directions)
 
 
 def by_directions(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`function` of trees, whose derivative by their floats is `pushed`."""
+    """Return `function` of trees, whose derivative with respect to their floats is `jvp_each`."""
 
     def call(*arguments: Any) -> Any:
         floats, others = eqx.partition(arguments, eqx.is_inexact_array)
@@ -237,23 +242,28 @@ def by_directions(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class Moving(NamedTuple):
-    """Directions in which a phase moves: its constants, its start and what it holds since then."""
+    """Tangent directions of a phase: of its constants, its start and the constants held
+    since then.
+    """
 
     of: BalanceOf
     constants: Any
     held: Vector
-    moved: Any  # like the constants, directions first
-    start: Array  # positions, rates, what is held, (directions, ., lanes)
+    moved: Any  # structure of the constants, directions first
+    start: Array  # of positions, rates, held constants, (directions, ., batch)
 
     def along(self, tableau: Tableau, stages: list[Place], starts: Array, h: Array) -> Array:
-        """The directions at a step's start, carried to its end."""
+        """Return the tangents at a step's start, propagated to its end."""
         slopes = _slopes_of(self.of, self.constants, self.moved, self.held, stages)
         return _carried(tableau, slopes, starts, h)
 
     def onward(
         self, tableau: Tableau, stages: list[Place], starts: Array, h: Array, accepted: Array
     ) -> Array:
-        """The same where the step is accepted; a group of which no lane goes on skips it."""
+        """Return the tangents propagated where the step is accepted; otherwise they are unchanged.
+
+        A group without accepted steps skips the computation.
+        """
 
         def carried(starts: Array) -> Array:
             return jnp.where(accepted, self.along(tableau, stages, starts, h), starts)
@@ -261,7 +271,9 @@ class Moving(NamedTuple):
         return if_any(jnp.any(accepted), carried, starts)
 
     def of_values(self, values: Callable[..., Any], place: Place, directions: Array) -> Any:
-        """How `values(constants, held, q, v)` move with the directions there."""
+        """Return the tangents of `evaluate(constants, held_constants, q, v)` for the directions at
+        a state.
+        """
         n, numbers = len(place.q), tuple(jnp.moveaxis(directions, 1, 0))
         at = self.constants, self.held, place.q, place.v
         return pushed(values, at, (self.moved, numbers[2 * n :], numbers[:n], numbers[n : 2 * n]))

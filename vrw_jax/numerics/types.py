@@ -1,4 +1,4 @@
-"""Quantities in signatures: one number, one for each of any axes, one array for each component."""
+"""Types of quantities in signatures: a scalar, an array of any axes, a tuple of components."""
 
 from typing import TYPE_CHECKING
 
@@ -10,13 +10,13 @@ if TYPE_CHECKING:
     Elementwise = Array
 else:
     Elementwise = Inexact[Array, "..."] | Inexact[np.ndarray, "..."] | float
-"""A quantity that may carry any leading axes: formulas below `scans` act element by element.
+"""A quantity with any leading axes, because formulas below `scans` act element by element.
 
-Complex numbers go through too, as for a complex step."""
+Complex numbers are allowed too, as a complex step needs them."""
 
 Vector = tuple[Elementwise, ...]
-"""One quantity for each component."""
+"""A tuple with one array for each component."""
 
 
 Number = float | Array | np.ndarray
-"""A number as a caller gives it, or an array of them."""
+"""A number as a caller gives it, or an array of numbers."""
