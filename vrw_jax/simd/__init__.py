@@ -1,4 +1,4 @@
-"""Traces of JAX as machine code: a few lanes side by side, compiled by LLVM."""
+"""Compilation of JAX traces to machine code with LLVM, for a few lanes per vector."""
 
 from vrw_jax.simd.arrays import SMALL
 from vrw_jax.simd.code import tracing

@@ -1,7 +1,7 @@
-"""Primitives that act number by number: the table ELEMENTWISE of their rules.
+"""Elementwise primitives: the table ELEMENTWISE_RULES.
 
-A rule takes the writer of values, the primitive's parameters, the types of its first operand and of
-its result, and values; it gives the result's value.
+A rule takes the value emitter, the primitive's parameters, the types of its first operand and of
+its result, and the operands' values; it returns the result's value.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,9 +13,11 @@ import numpy as np
 from vrw_jax.simd.numbers import INT, NUMBERS, Numbers, Value
 
 FUSED = ("contract",)
-"""Products and sums may be rounded once instead of twice; nothing else may be reordered."""
+"""Flags that let products and sums be rounded once instead of twice; nothing else may be
+reordered."""
 RECIPROCAL = (*FUSED, "arcp")
-"""Divisors that stay the same may be inverted once: in float64, in float32 processors guess."""
+"""Flags that let repeated divisors be inverted once, only in float64: in float32 processors
+approximate the inverse."""
 
 Rule = Callable[..., Value]
 
@@ -23,13 +25,15 @@ Rule = Callable[..., Value]
 def elementwise(
     numbers: Numbers, name: str, params: Any, before: Any, after: Any, values: Sequence[Value]
 ) -> Value:
-    """One of JAX's primitives on numbers of type `before`, giving one of `after`; known once."""
+    """Emit a JAX primitive on numbers of `in_dtype` with a result of `out_dtype`, once per
+    operands.
+    """
     key = (name, after.num, params.get("y"), *map(id, values))
     rule = ELEMENTWISE[name]
     return numbers.once(key, lambda: rule(numbers, params, before, after, *values))
 
 
-# Sums and products, without the terms that are known to be zero and factors one.
+# Sums and products are simplified: terms known as zero and factors known as one are dropped.
 
 
 def _add(n: Numbers, params: Any, before: Any, after: Any, x: Value, y: Value) -> Value:
@@ -49,7 +53,7 @@ def _mul(n: Numbers, params: Any, before: Any, after: Any, x: Value, y: Value) -
 
 
 def _div(n: Numbers, params: Any, before: Any, after: Any, x: Value, y: Value) -> Value:
-    _floats("div", before)  # a processor stops where an integer is divided by zero
+    _floats("div", before)  # an integer division by zero would stop the process
     if _is(y, 1):
         return x
     x, y = n.alike(x, y)
@@ -61,7 +65,7 @@ def _square(n: Numbers, params: Any, before: Any, after: Any, x: Value) -> Value
 
 
 def _integer_pow(n: Numbers, params: Any, before: Any, after: Any, x: Value) -> Value:
-    """By repeated squares."""
+    """Emit a power by repeated squares."""
     times = lambda x, y: _both(n, before, ("fmul", "mul"), x, y)
     result, square, left = None, x, abs(params["y"])
     while left:
@@ -113,7 +117,7 @@ def _extreme(how: str) -> Rule:
         chosen = n.builder.select(_compare(n, how, before, x, y), x, y)
         if before.kind != "f":
             return chosen
-        # A NaN on either side is the answer.
+        # A NaN on either side is the result.
         return n.builder.select(n.builder.fcmp_unordered("uno", x, x), x, chosen)
 
     return write
@@ -139,7 +143,7 @@ def _is_finite(n: Numbers, params: Any, before: Any, after: Any, x: Value) -> Va
 
 
 def _function(name: str, single: Callable[[Numbers, Value], Value] | None = None) -> Rule:
-    """One that LLVM knows; in float32 `single`, if there is one."""
+    """Return the rule of an LLVM intrinsic; in float32 `emit_single` replaces it, if given."""
 
     def write(n: Numbers, params: Any, before: Any, after: Any, x: Value) -> Value:
         _floats(name, before)
@@ -154,13 +158,13 @@ def _floats(name: str, dtype: Any) -> None:
 
 
 def _both(n: Numbers, dtype: Any, methods: tuple[str, str], x: Value, y: Value) -> Value:
-    """An instruction for floats, or that for integers."""
+    """Emit an instruction for floats, or the one for integers."""
     x, y = n.alike(x, y)
     return n.operation(f"{methods[0]} {' '.join(FUSED)}" if dtype.kind == "f" else methods[1], x, y)
 
 
 def _compare(n: Numbers, how: str, dtype: Any, x: Value, y: Value) -> Value:
-    if dtype.kind == "b":  # with a sign, true is -1
+    if dtype.kind == "b":  # as a signed number, true is -1
         return n.builder.icmp_unsigned(how, x, y)
     if dtype.kind != "f":
         return n.builder.icmp_signed(how, x, y)
@@ -169,7 +173,7 @@ def _compare(n: Numbers, how: str, dtype: Any, x: Value, y: Value) -> Value:
 
 
 def converted(n: Numbers, value: Value, before: Any, after: Any) -> Value:
-    """A number of type `before` as one of `after`."""
+    """Convert a number of `in_dtype` to `out_dtype`."""
     build, kind = n.builder, NUMBERS[after.name]
     kind = n.vector(kind) if isinstance(value.type, ir.VectorType) else kind
     if before == after:
@@ -200,7 +204,7 @@ def _intrinsic(n: Numbers, name: str, value: Value) -> Value:
 
 
 def _series(n: Numbers, x: Value, coefficients: Sequence[float]) -> Value:
-    """A polynomial, lowest coefficient first."""
+    """Emit a polynomial, lowest coefficient first."""
     build, value = n.builder, n.constant(x.type, coefficients[-1])
     for coefficient in coefficients[-2::-1]:
         product = build.fmul(value, x, flags=FUSED)
@@ -209,7 +213,10 @@ def _series(n: Numbers, x: Value, coefficients: Sequence[float]) -> Value:
 
 
 def _logarithm(n: Numbers, value: Value) -> Value:
-    """Of positive normal float32 numbers, right to 1e-5: the library's is a call per lane."""
+    """Emit the logarithm of positive normal float32 numbers, accurate to 1e-5.
+
+    The library's logarithm is one call per lane.
+    """
     build, kind = n.builder, value.type
     whole = ir.VectorType(INT, kind.count) if isinstance(kind, ir.VectorType) else INT
     bits = build.bitcast(value, whole)
@@ -224,7 +231,9 @@ def _logarithm(n: Numbers, value: Value) -> Value:
 
 
 def _exponential(n: Numbers, value: Value) -> Value:
-    """Of float32 numbers between -87 and 88, right to 1e-6 of the result."""
+    """Emit the exponential of float32 numbers between -87 and 88, accurate to 1e-6 of
+    the result.
+    """
     build, kind = n.builder, value.type
     whole = ir.VectorType(INT, kind.count) if isinstance(kind, ir.VectorType) else INT
     doublings = build.fmul(value, n.constant(kind, 1.0 / np.log(2.0)))
@@ -236,7 +245,7 @@ def _exponential(n: Numbers, value: Value) -> Value:
 
 
 def _is(value: Value, number: int) -> bool:
-    """Whether a value is that number, in every lane."""
+    """Return whether a value is that constant in every lane."""
     return isinstance(value, ir.Constant) and _all(value.constant, number)
 
 
@@ -247,7 +256,7 @@ def _all(constant: Any, number: int) -> bool:
 
 
 def _fitted(function: Callable[[np.ndarray], np.ndarray], degree: int) -> list[float]:
-    """A polynomial on [0, 1] through Chebyshev's points, exact at neither end."""
+    """Fit a polynomial on [0, 1] through Chebyshev's points, exact at neither end."""
     x = 0.5 - 0.5 * np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
     return list(map(float, np.polynomial.polynomial.polyfit(x, function(x), degree)))
 

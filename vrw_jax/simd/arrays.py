@@ -1,11 +1,12 @@
-"""Arrays of LLVM values: entries in registers, fields that are computed where an index asks.
+"""Arrays of LLVM values: entries in registers, and lazy arrays whose entries are computed on
+access.
 
-An array whose last axis are lanes is, without that axis, an array of LLVM vectors, any other one of
-plain numbers. Small ones are taken apart into their entries, which live in registers: moving axes,
-slicing and stacking cost nothing. Large ones are fields: each entry is computed or loaded where an
-index asks for it, in a loop over the index, and they lie in memory only where a loop carries them,
-where a long sum ends and where the trace has an `optimization_barrier`. So code stays short and
-compiles quickly. Nothing may look from lane to lane but to ask whether any or all of them go on.
+An array whose last axis are lanes is, without that axis, an array of LLVM vectors; any other is one
+of scalars. Small arrays are divided into their entries, which live in registers: moving axes,
+slicing and stacking cost nothing. Large arrays are lazy: each entry is computed or loaded on
+access, in a loop over the index. They are stored in memory only where a loop carries them, where a
+long sum ends and where the trace has an `optimization_barrier`. Code therefore stays short and
+compiles fast. No operation may combine lanes, except to test whether any or all of them continue.
 """
 
 import math
@@ -20,13 +21,16 @@ from vrw_jax.simd.fields import Entries, Field, Index, Memory, Unset, Updated
 from vrw_jax.simd.numbers import LONG, NUMBERS, Numbers, Value
 
 LANES = 1021
-"""Lanes of the trace, by which their axis is known; machine code has as many as suit it."""
+"""Length of the lane axis in the trace, by which the axis is recognized; machine code has any
+number of lanes."""
 SMALL = 8
-"""Entries of fields that are taken apart after all, and terms of sums that are written out."""
+"""Most entries of a lazy array that are computed individually, and most terms of a sum that are
+unrolled."""
 HELD = 32
-"""Entries of arrays that loops carry in registers, and of constants that need no table."""
+"""Most entries of an array that a loop carries in registers, and of a constant that needs no
+table."""
 HELD_INSIDE = 64
-"""The first of these for loops that contain none: they are written out."""
+"""The same limit of carried entries for loops without inner loops, which are unrolled."""
 
 
 class Asked(NamedTuple):
@@ -34,24 +38,24 @@ class Asked(NamedTuple):
 
     name: str
     params: dict[str, Any]
-    given: Sequence[Any]  # of operands: shape and type
+    given: Sequence[Any]  # of the operands: shape and type
     out: Any  # of the result
 
 
 class Arrays:
-    """Writes operations on arrays into the function that `numbers` writes."""
+    """Emitter of operations on arrays, into the function of its value emitter."""
 
     def __init__(self, numbers: Numbers, written_out: bool = False, small: int = SMALL) -> None:
         self.numbers, self.builder, self.small = numbers, numbers.builder, small
-        self.alive: list[Any] = []  # what is known by `id`
-        self.written_out = written_out  # in a loop's body without loops: constants need no table
+        self.alive: list[Any] = []  # objects identified by `id`
+        self.written_out = written_out  # within a loop without inner loops: constants need no table
 
     def kind_of(self, aval: Any) -> ir.Type:
-        """What entries of one of the trace's arrays are."""
+        """Return the type of the entries of an array of the trace."""
         return self.numbers.vector(number_of(aval)) if has_lanes(aval) else number_of(aval)
 
     def constants_of(self, value: np.ndarray, aval: Any) -> Entries:
-        """Numbers of the program."""
+        """Return the numbers of a constant as an array."""
         if LANES in aval.shape:
             raise taken_for_lanes("A constant", aval)
         number = number_of(aval)
@@ -59,18 +63,18 @@ class Arrays:
         return entries if value.size <= HELD or self.written_out else self.table(entries)
 
     def entries(self, array: Entries) -> np.ndarray:
-        """All entries, one by one."""
+        """Return all entries, one by one."""
         if isinstance(array, np.ndarray):
             return array
         return array_of(array.shape, [self.entry(array, i) for i in np.ndindex(array.shape)])
 
     def entry(self, array: Entries, index: Index) -> Value:
-        """An entry, computed once for each index."""
+        """Return an entry, which is computed once for each index."""
         self.alive.append(array)
         if isinstance(array, Field):
             key = ("entry", id(array), *(i if isinstance(i, int) else ("at", id(i)) for i in index))
             return self.numbers.once(key, lambda: array.at(index))
-        # What repeats itself along an axis is the same at all its indices.
+        # An array with stride 0 along an axis is the same at all its indices.
         axes = zip(index, array.strides, array.shape, strict=True)
         index = tuple(0 if step == 0 or length == 1 else i for i, step, length in axes)
         moving = tuple(i for i in index if not isinstance(i, int))
@@ -83,7 +87,7 @@ class Arrays:
         return self.entry(stored, moving)
 
     def flat(self, arrays: Sequence[Entries], avals: Sequence[Any]) -> list[Value]:
-        """All entries in a row, those of lanes as vectors."""
+        """Return all entries in a row, with vectors for those that have lanes."""
         flat: list[Value] = []
         for array, aval in zip(arrays, avals, strict=True):
             full = np.broadcast_to(self.entries(array), shape_of(aval)).ravel()
@@ -91,7 +95,7 @@ class Arrays:
         return flat
 
     def linear(self, index: Index, shape: Sequence[int]) -> Value:
-        """The place of an entry among all, row after row."""
+        """Return the offset of an entry among all, row after row."""
         stride, fixed = math.prod(shape), 0
         place: Value = None
         for i, length in zip(index, shape, strict=True):
@@ -111,7 +115,7 @@ class Arrays:
         body: Callable[[Index, list[Value]], Sequence[Value]],
         carried: Sequence[Value] = (),
     ) -> list[Value]:
-        """Loops over all indices of `shape`: `carried = body(index, carried)`."""
+        """Emit loops over all indices of `shape`: `carry = body(index, carry)`."""
 
         def nest(index: Index, carried: Sequence[Value]) -> Sequence[Value]:
             if len(index) == len(shape):
@@ -129,7 +133,7 @@ class Arrays:
         turn: Callable[[Value, list[Value]], Sequence[Value]],
         carried: Sequence[Value],
     ) -> list[Value]:
-        """`for i in range(length): carried = turn(i, carried)`."""
+        """Emit `for i in range(length): carry = body(i, carry)`."""
         return self.range(ir.Constant(LONG, 0), ir.Constant(LONG, length), turn, carried)
 
     def range(
@@ -139,7 +143,7 @@ class Arrays:
         turn: Callable[[Value, list[Value]], Sequence[Value]],
         carried: Sequence[Value] = (),
     ) -> list[Value]:
-        """`for i in range(begin, end): carried = turn(i, carried)`."""
+        """Emit `for i in range(begin, end): carry = emit_body(i, carry)`."""
 
         def body(state: list[Value]) -> list[Value]:
             following = turn(state[0], state[1:])
@@ -149,13 +153,13 @@ class Arrays:
         return self.numbers.loop([begin, *carried], goes_on, body)[1:]
 
     def room(self, shape: Sequence[int], kind: ir.Type) -> Memory:
-        """Memory, taken once where the function begins."""
+        """Return memory that is allocated once, at the start of the function."""
         with self.builder.goto_entry_block():
             base = self.builder.alloca(kind, ir.Constant(LONG, max(1, math.prod(shape))))
         return Memory(self, shape, kind, base)
 
     def fill(self, memory: Memory, array: Entries) -> None:
-        """Stores all entries that are known."""
+        """Store all initialized entries."""
         if isinstance(array, Unset):
             return
         if isinstance(array, Updated):
@@ -174,7 +178,9 @@ class Arrays:
         self.each(memory.shape, store)
 
     def in_memory(self, array: Entries) -> Memory:
-        """All entries computed, where an index can reach them."""
+        """Return the array with all entries computed and stored, so that an LLVM index can access
+        them.
+        """
         if isinstance(array, Memory):
             return array
         memory = self.room(array.shape, _kind(array))
@@ -182,7 +188,9 @@ class Arrays:
         return memory
 
     def table(self, array: np.ndarray) -> Memory:
-        """Entries where an index can reach them: constants are stored with the program."""
+        """Return entries in memory, so that an LLVM index can access them; constants are stored in
+        the program.
+        """
         if not all(isinstance(x, ir.Constant) for x in array.ravel()):
             return self.in_memory(array)
         number = array.ravel()[0].type
@@ -194,21 +202,21 @@ class Arrays:
         return Memory(self, array.shape, number, table)
 
     def mapped(self, asked: Asked, values: Sequence[Entries]) -> Entries:
-        """An elementwise primitive."""
+        """Emit an elementwise primitive."""
         name, params, given, out = asked
         shape, before = shape_of(out), given[0].dtype
         if not shape and all(isinstance(x, np.ndarray) and not x.shape for x in values):
             some = [x.item() for x in values]  # type: ignore[union-attr]
             return array_of((), [elementwise(self.numbers, name, params, before, out.dtype, some)])
         if any(x.shape != shape for x in values):
-            # One number for all lanes may have an axis for them, or be the same anywhere.
+            # An operand without lanes may have an extra axis, or fewer axes.
             values = [self.fitted(x, x.shape[:-1], len(x.shape) > len(shape)) for x in values]
             values = [self.broadcast(x, shape, range(len(x.shape))) for x in values]
         make = lambda some: elementwise(self.numbers, name, params, before, out.dtype, some)
         if any(isinstance(x, Field) for x in values):
             at = lambda index: make([self.entry(x, index) for x in values])
             return Field(shape, self.kind_of(out), at)
-        # What no operand changes along an axis is computed once, and repeats itself there.
+        # Along an axis on which no operand varies, the entry is computed once and repeated.
         moves = (any(x.strides[axis] for x in values) for axis in range(len(shape)))  # type: ignore[union-attr]
         own = (*(slice(None if moving else 1) for moving in moves), ...)
         parts = [x[own] for x in values]  # type: ignore[index]
@@ -217,11 +225,11 @@ class Arrays:
         return np.broadcast_to(told, shape)
 
     def fitted(self, array: Entries, shape: tuple[int, ...], needed: bool) -> Entries:
-        """Reshaped, if that is needed."""
+        """Return the array reshaped, if needed."""
         return self.reshaped(array, shape) if needed else array
 
     def broadcast(self, array: Entries, shape: tuple[int, ...], axes: Sequence[int]) -> Entries:
-        """Its axes at these places of `shape`."""
+        """Return the array with its axes at these positions of `shape`."""
         lengths = array.shape
         if lengths == shape and tuple(axes) == tuple(range(len(shape))):
             return array
@@ -238,7 +246,7 @@ class Arrays:
         return Field(shape, array.kind, at)
 
     def reshaped(self, array: Entries, shape: tuple[int, ...]) -> Entries:
-        """Its entries in the same order."""
+        """Return an array with the same entries in the same order."""
         if array.shape == shape:
             return array
         if isinstance(array, np.ndarray):
@@ -270,20 +278,20 @@ class Arrays:
         return Field(shape, array.kind, at)
 
     def shifted(self, i: Any, start: int, step: int = 1) -> Any:
-        """start + step * i."""
+        """Return start + step * i."""
         if isinstance(i, int):
             return start + step * i
         i = i if step == 1 else self.builder.mul(i, ir.Constant(LONG, step))
         return i if start == 0 else self.builder.add(i, ir.Constant(LONG, start))
 
     def clamped(self, i: Value, last: int) -> Value:
-        """The index from 0 to `last` that is nearest."""
+        """Return the nearest index from 0 to `last`."""
         build, zero, end = self.builder, ir.Constant(LONG, 0), ir.Constant(LONG, last)
         i = build.select(build.icmp_signed("<", i, zero), zero, i)
         return build.select(build.icmp_signed(">", i, end), end, i)
 
     def further(self, index: Index, begin: Index) -> Index:
-        """The sum of two indices."""
+        """Return the sum of two indices."""
 
         def plus(i: Any, j: Any) -> Any:
             if isinstance(j, int):
@@ -293,7 +301,9 @@ class Arrays:
         return tuple(plus(i, j) for i, j in zip(index, begin, strict=True))
 
     def zero(self, kind: ir.Type) -> Value:
-        """Where a sum begins: not a constant that is known, whose terms of zero are dropped."""
+        """Return a zero as the start of a sum, which is not simplified like a known
+        constant zero.
+        """
         number = kind.element if isinstance(kind, ir.VectorType) else kind
         value = ir.Constant(number, 0.0 if isinstance(number, _FLOATS) else 0)
         if not isinstance(kind, ir.VectorType):
@@ -305,7 +315,7 @@ _FLOATS = (ir.FloatType, ir.DoubleType)
 
 
 def _kind(array: Entries) -> ir.Type:
-    """What entries are: vectors, if any of them is one."""
+    """Return the type of entries: a vector if any entry is one."""
     if isinstance(array, Field):
         return array.kind
     kinds = [x.type for x in array.ravel()]
@@ -313,17 +323,17 @@ def _kind(array: Entries) -> ir.Type:
 
 
 def has_lanes(aval: Any) -> bool:
-    """Whether an array of the trace has the lanes' axis."""
+    """Return whether an array of the trace has the axis of lanes."""
     return bool(aval.shape) and aval.shape[-1] == LANES
 
 
 def shape_of(aval: Any) -> tuple[int, ...]:
-    """Without the axis of lanes."""
+    """Return the shape without the axis of lanes."""
     return aval.shape[:-1] if has_lanes(aval) else aval.shape
 
 
 def taken_for_lanes(what: str, aval: Any) -> NotImplementedError:
-    """An axis as long as the lanes' that is another, or that they were moved to."""
+    """Return the error for an axis as long as the lanes' that is another, or is moved there."""
     return NotImplementedError(
         f"{what} has the shape {aval.str_short()}: an axis of {LANES} is the lanes', which come "
         "from arguments and stay the last; keep them there, and give other axes another length."
@@ -331,7 +341,7 @@ def taken_for_lanes(what: str, aval: Any) -> NotImplementedError:
 
 
 def moved(name: str) -> NotImplementedError:
-    """A primitive that does not do the same to each lane."""
+    """Return the error for a primitive that combines or moves lanes."""
     return NotImplementedError(
         f"{name} moves, joins or picks lanes: do the same to each by itself; only `any` and `all` "
         "may ask about all of them."
@@ -339,7 +349,7 @@ def moved(name: str) -> NotImplementedError:
 
 
 def number_of(aval: Any) -> ir.Type:
-    """What entries are, for one lane."""
+    """Return the type of an entry for one lane."""
     if aval.dtype not in _NUMBERS:
         raise NotImplementedError(
             f"{aval.str_short()} has numbers that machine code does not know: convert them to one "
@@ -348,18 +358,20 @@ def number_of(aval: Any) -> ir.Type:
     return _NUMBERS[aval.dtype]
 
 
-_NUMBERS = {np.dtype(name): kind for name, kind in NUMBERS.items()}  # names are slow to ask for
+_NUMBERS = {
+    np.dtype(name): kind for name, kind in NUMBERS.items()
+}  # dtype names are slow to compute
 
 
 def array_of(shape: tuple[int, ...], entries: Sequence[Value]) -> np.ndarray:
-    """An array of LLVM values."""
+    """Return an array of LLVM values."""
     array = np.empty(len(entries), object)
     array[:] = entries
     return array.reshape(shape)
 
 
 def arrays_of(flat: Sequence[Value], avals: Sequence[Any]) -> list[Entries]:
-    """The inverse of `Arrays.flat`."""
+    """Return the arrays whose entries `ArrayEmitter.flatten_entries` returned."""
     found: list[Entries] = []
     begin = 0
     for aval in avals:

@@ -1,8 +1,9 @@
-"""Machine code by its content: what is traced again to the same text is not compiled again.
+"""Machine code cached by its content: a trace that gives the same text is not compiled again.
 
-Two files stand for a function. An index, by all that its trace depends on, tells the name of the
-code; the code lies under a digest of what LLVM compiles. So an edit of the source that changes no
-trace costs a trace, not a compiler, and the name that programs of JAX call stays.
+Two files represent a function. An index, named by a digest of everything that the trace depends on,
+contains the name of the code; the code is stored under a digest of the text that LLVM compiles. An
+edit of the source that changes no trace therefore costs a trace but no compilation, and the name
+that JAX programs call stays the same.
 """
 
 import contextlib
@@ -25,31 +26,33 @@ from vrw_jax.simd.machine import compiled, how_compiled
 
 @runtime_checkable
 class Store(Protocol):
-    """Where code is kept between processes; a module with these two functions is one."""
+    """Storage of code between processes; a module with these two functions is one."""
 
     def kept(self, name: str) -> bytes | None:
-        """What was kept under that name; None if nothing, or damaged."""
+        """Return the content saved under that name; None if there is none, or it is damaged."""
 
     def keep(self, name: str, content: bytes) -> None:
-        """From now on `content` is what is kept there."""
+        """Save `content` under that name."""
 
 
 class Code(NamedTuple):
     """A function of lanes as machine code."""
 
-    name: str  # a digest of what LLVM compiles, by which programs of JAX call it
-    out: tuple[tuple[tuple[int, ...], np.dtype], ...]  # of each result: axes before lanes, numbers
+    name: str  # a digest of the text that LLVM compiles, used by calls in JAX programs
+    out: tuple[
+        tuple[tuple[int, ...], np.dtype], ...
+    ]  # of each result: axes before lanes, number type
     made: Future[bytes]
 
     def ready(self) -> bytes:
-        """The code, which LLVM may still be at work on."""
+        """Return the code; this blocks until LLVM has compiled it."""
         return self.made.result()
 
 
 def code_of(
     function: Callable, shapes: Any, key: object, width: int, store: Store | None, small: int
 ) -> Code:
-    """Compiled, or found where it is kept."""
+    """Return the machine code of a function, from the cache or newly compiled."""
     asked = (key, shapes, width, small, jax.__version__, how_compiled())
     index = f"lanes_index_{_digest(repr(asked).encode())}"
     if index not in _made:
@@ -62,7 +65,7 @@ def code_of(
 def _written(
     function: Callable, shapes: Any, width: int, index: str, store: Store | None, small: int
 ) -> Code:
-    """Traced; compiled only if nothing of the same text was, while Python goes on."""
+    """Trace a function; compile it in the background unless code of the same text exists."""
     with _python, _uncollected():
         closed = traced(function, *shapes)
         text = module_text(closed, width, small)
@@ -78,6 +81,7 @@ def _written(
 
 
 def _made_of(text: str, out: str, name: str, index: str, store: Store | None) -> bytes:
+    """Compile LLVM text, and save the code and its index entry."""
     code = compiled(text)
     if store is not None:
         store.keep(name, out.encode() + b"\n" + code)
@@ -86,7 +90,7 @@ def _made_of(text: str, out: str, name: str, index: str, store: Store | None) ->
 
 
 def kept_code(name: str, store: Store | None) -> Code | None:
-    """The code of that name, if there is one."""
+    """Return the code of that name, None if there is none."""
     if name not in _made:
         content = store.kept(name) if store is not None else None
         if content is None:
@@ -103,13 +107,12 @@ def _digest(content: bytes) -> str:
 
 
 _made: dict[str, Code] = {}
-"""This process's, by index and by name: a program traced for another batch finds it here."""
+"""Code of this process by index and by name, shared by programs traced for other batches."""
 
 
 @contextlib.contextmanager
 def _uncollected() -> Iterator[None]:
-    """Garbage waits: a program is many small objects that live on, and looking for dead ones among
-    them takes a sixth of the time."""
+    """Disable garbage collection, which takes a sixth of the time for many persistent objects."""
     before = gc.isenabled()
     gc.disable()
     try:
@@ -120,11 +123,12 @@ def _uncollected() -> Iterator[None]:
 
 
 _python = RLock()
-"""Threads write their programs in turn: the first is soon with LLVM, which needs no lock."""
+"""Lock under which threads trace one after the other: the first soon proceeds to LLVM, which needs
+no lock."""
 
 
 _llvm = ThreadPoolExecutor(1, "llvm")
-"""Compiles what is written while Python traces on; for two at a time it has one lock."""
+"""Background thread that compiles while Python traces; LLVM's own lock allows no second one."""
 
 
 def _results(told: str | bytes) -> tuple[tuple[tuple[int, ...], np.dtype], ...]:
@@ -132,9 +136,9 @@ def _results(told: str | bytes) -> tuple[tuple[tuple[int, ...], np.dtype], ...]:
 
 
 def traced(function: Callable, *shapes: Any) -> ClosedJaxpr:
-    """The trace of a function that is to be machine code."""
+    """Return the trace of a function that becomes machine code."""
     outside = _tracing.set(True)
-    try:  # in what loops are traced in, for JAX to know again what it has traced
+    try:  # the mesh in which JAX traces loops, so that its trace cache finds them again
         with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
             return jax.make_jaxpr(function)(*shapes)
     finally:
@@ -145,5 +149,5 @@ _tracing: ContextVar[bool] = ContextVar("_tracing", default=False)
 
 
 def tracing() -> bool:
-    """Whether what is traced now is to be machine code."""
+    """Return whether the present trace becomes machine code."""
     return _tracing.get()

@@ -1,4 +1,4 @@
-"""Machine code as a function that programs of JAX call, by a name."""
+"""Machine code as a JAX primitive, which JAX programs call by the name of the code."""
 
 import functools
 from collections.abc import Sequence
@@ -14,12 +14,12 @@ from vrw_jax.simd.handler import HANDLER
 from vrw_jax.simd.machine import Loaded
 
 registered: dict[str, Loaded] = {}
-"""Machine code that JAX's programs may call, by name; XLA never lets go of it."""
+"""Machine code by the name under which JAX programs can call it; XLA never releases it."""
 _registering = Lock()
 
 
 def register(code: Code) -> None:
-    """From now on JAX's programs may call this code by its name."""
+    """Make this code callable by its name in JAX programs."""
     made = code.ready()
     with _registering:
         if code.name not in registered:
@@ -52,9 +52,11 @@ def _lowered(context: Any, *given: Any, code: Code, out: Sequence[jax.ShapeDtype
 def _refused(*_: Any, **__: Any) -> Any:
     raise NotImplementedError(
         "Machine code can neither be mapped by `jax.vmap` nor differentiated from outside: give "
-        "all lanes at once, on the last axis, and for derivatives the function that tells them."
+        "all lanes at once, on the last axis, and for derivatives the function that returns them."
     )
 
 
 mlir.register_lowering(CALLED, _lowered, platform="cpu")
 batching.primitive_batchers[CALLED] = ad.primitive_jvps[CALLED] = _refused
+"""A call of machine code by JAX programs, which require the code only when they are compiled: LLVM
+can compile it in the meantime."""

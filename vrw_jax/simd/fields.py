@@ -1,6 +1,6 @@
-"""Large arrays of LLVM values: computed where an index asks, or in memory.
+"""Large arrays of LLVM values, whose entries are computed on access or stored in memory.
 
-Those that compute know the `Arrays` that they belong to.
+Those that compute hold the `ArrayEmitter` that they belong to.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,13 +12,14 @@ import numpy as np
 from vrw_jax.simd.numbers import Value
 
 Index = tuple[Any, ...]
-"""For each axis a plain number, or an LLVM value of type LONG."""
+"""For each axis an integer, or an LLVM value of type I64."""
 
 
 class Field:
-    """A large array: `at` an index it computes or loads an entry, a value of type `kind`.
+    """A large array whose entries, values of type `entry_type`, are computed or loaded by
+    `entry_at`.
 
-    Where `kind` is a vector an entry may also be a number, the same for all lanes.
+    If `entry_type` is a vector, an entry may also be a scalar, the same for all lanes.
     """
 
     def __init__(self, shape: Sequence[int], kind: ir.Type, at: Callable[[Index], Value]) -> None:
@@ -26,11 +27,11 @@ class Field:
 
 
 class Unset(Field):
-    """A large array of whose entries none is read before it is overwritten."""
+    """A large array whose entries are never read before they are overwritten."""
 
 
 class Updated(Field):
-    """An array in memory, or of one number, but for a part of it."""
+    """An array in memory, or of one number, with one part replaced."""
 
     def __init__(self, arrays: Any, whole: "Entries", part: "Entries", begin: Index) -> None:
         kind = part.kind if isinstance(part, Field) else part.ravel()[0].type
@@ -38,17 +39,17 @@ class Updated(Field):
         self.arrays, self.whole, self.part, self.begin = arrays, whole, part, begin
 
     def load(self, index: Index) -> Value:
-        """The entry there."""
+        """Return the entry at an index."""
         return self.arrays.entry(self.arrays.in_memory(self), index)
 
     def ready(self) -> "Updated":
-        """With the part computed: it may depend on what it takes the place of."""
+        """Return the update with its part computed, which may depend on the entries it replaces."""
         if isinstance(self.part, np.ndarray):
             return self
         return Updated(self.arrays, self.whole, self.arrays.in_memory(self.part), self.begin)
 
     def store_into(self, memory: "Memory") -> None:
-        """Overwrites the part there, which is `ready`."""
+        """Overwrite the part in memory; the update must be materialized."""
         arrays = self.arrays
 
         def store(index: Index, _: Any = None) -> list[Value]:
@@ -63,9 +64,9 @@ class Updated(Field):
 
 
 class Memory(Field):
-    """A large array that lies in memory, entry after entry.
+    """A large array stored in memory, entry after entry.
 
-    It is `free` where nothing else lies there or reads what does: who takes it may overwrite it.
+    It is `is_overwritable` if no other array uses its memory: the consumer may overwrite it.
     """
 
     def __init__(
@@ -75,39 +76,39 @@ class Memory(Field):
         self.arrays, self.base, self.free = arrays, base, free
 
     def place(self, index: Index) -> Value:
-        """Where an entry is."""
+        """Return the address of an entry."""
         where = self.arrays.linear(index, self.shape)
         return self.arrays.builder.gep(self.base, [where], source_etype=self.kind)
 
     def load(self, index: Index) -> Value:
-        """The entry there."""
+        """Return the entry at an index."""
         return self.arrays.builder.load(self.place(index), typ=self.kind)
 
     def store(self, index: Index, value: Value) -> None:
-        """Overwrites an entry."""
+        """Overwrite an entry."""
         value = self.arrays.numbers.spread(value) if isinstance(self.kind, ir.VectorType) else value
         self.arrays.builder.store(value, self.place(index))
 
     def part(self, first: Value) -> "Memory":
-        """What lies at an index of the first axis."""
+        """Return the part at an index of the first axis."""
         rest = (0,) * (len(self.shape) - 1)
         return Memory(self.arrays, self.shape[1:], self.kind, self.place((first, *rest)))
 
 
 class Turned(Field):
-    """What lies in memory, its axes in another order."""
+    """A view of an array in memory with its axes in another order."""
 
     def part(self, first: Value) -> Field:
-        """What lies at an index of the first axis."""
+        """Return the part at an index of the first axis."""
         return Field(self.shape[1:], self.kind, lambda index: self.at((first, *index)))
 
 
 Entries = np.ndarray | Field
-"""LLVM values in an array, the axis of lanes left out."""
+"""LLVM values in an array, without the axis of lanes."""
 
 
 def shared(array: Entries) -> Entries:
-    """The same, which others read too: not to be overwritten."""
+    """Return the array as one that other consumers read too, so that it is not overwritten."""
     if isinstance(array, Updated):
         return Updated(array.arrays, shared(array.whole), array.part, array.begin)
     if isinstance(array, Memory) and array.free:

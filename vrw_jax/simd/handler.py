@@ -1,4 +1,4 @@
-"""The function in machine code that XLA calls from afar."""
+"""The machine-code function that XLA calls through its foreign function interface (FFI)."""
 
 from typing import Any
 
@@ -10,9 +10,9 @@ HANDLER = "handler"
 
 
 def add_handler(module: ir.Module, kernel: ir.Function, n_in: int, n_out: int, width: int) -> None:
-    """`XLA_FFI_Error *handler(XLA_FFI_CallFrame *)`: the kernel as XLA calls functions from afar.
+    """Add `XLA_FFI_Error *handler(XLA_FFI_CallFrame *)`, which calls the kernel, to the module.
 
-    Offsets in bytes from its xla/ffi/api/c_api.h, whose structs only ever grow at their ends.
+    Offsets are in bytes, from XLA's xla/ffi/api/c_api.h, whose structs only grow at their ends.
     """
     pointer = ir.PointerType()
     handler = ir.Function(module, ir.FunctionType(pointer, [pointer]), HANDLER)
@@ -29,7 +29,9 @@ def add_handler(module: ir.Module, kernel: ir.Function, n_in: int, n_out: int, w
 
     extension = read(frame, 8)
     build.cbranch(build.icmp_unsigned("==", extension, none), called, asked)
-    build.position_at_end(asked)  # for the version of the interface: it is the caller's own
+    build.position_at_end(
+        asked
+    )  # XLA requests the version of the interface: return the caller's version
     metadata, version = read(extension, 24), at(read(frame, 16), 16)
     for field in (16, 20):
         build.store(read(version, field, INT), at(metadata, 8 + field))
@@ -37,7 +39,7 @@ def add_handler(module: ir.Module, kernel: ir.Function, n_in: int, n_out: int, w
     build.position_at_end(called)
 
     def buffers(offset: int, count: int) -> tuple[Any, Any]:
-        """Pointers to the data of a list of buffers, and the last of them."""
+        """Return pointers to the data of a list of buffers, and the last buffer."""
         listed, buffer = read(frame, offset), None
         pointers = build.alloca(pointer, ir.Constant(LONG, count))
         for i in range(count):

@@ -1,4 +1,4 @@
-"""A trace as a module of LLVM: a loop over groups of lanes, what it reads, and what it writes."""
+"""An LLVM module for a trace: a loop over groups of lanes with its inputs and outputs."""
 
 import math
 from typing import Any
@@ -17,10 +17,11 @@ NAME = "lanes"
 
 
 def module_text(closed: ClosedJaxpr, width: int, small: int = SMALL) -> str:
-    """`void lanes(const void **given, void **told, int64 lanes, int64 begin, int64 end)`.
+    """Return the LLVM text of the kernel, which computes a range of groups of lanes.
 
-    Over groups of `width` lanes. A lone lane is computed twice, as a vector: what LLVM makes of
-    plain numbers differs in the last digits.
+    Its signature is `void lanes(const void **inputs, void **outputs, int64 lanes, int64 begin,
+    int64 end)`. The function loops over groups of `width` lanes. A single lane is computed twice,
+    as a vector, because LLVM's code for scalars differs in the last digits.
     """
     _check(closed)
     module = ir.Module(NAME)
@@ -56,7 +57,9 @@ def module_text(closed: ClosedJaxpr, width: int, small: int = SMALL) -> str:
 
 
 def _check(closed: ClosedJaxpr) -> None:
-    """Lanes are the last axis of whatever comes or goes, and no other."""
+    """Raise an error unless the lanes are the last axis of every argument and result, and
+    no other.
+    """
     for what, avals in (("An argument", closed.in_avals), ("A result", closed.out_avals)):
         for aval in avals:
             if LANES in aval.shape[:-1]:
@@ -70,13 +73,13 @@ def _check(closed: ClosedJaxpr) -> None:
 
 
 class _Rows:
-    """Arrays outside, for a group of lanes: they lie there row after row, lanes last."""
+    """Access to arrays outside for a group of lanes: they are stored row after row, lanes last."""
 
     def __init__(self, arrays: Arrays, alone: bool, n_lanes: Value, lane: Value) -> None:
         self.arrays, self.alone, self.n_lanes, self.lane = arrays, alone, n_lanes, lane
 
     def read(self, base: Value, aval: Any) -> Entries:
-        """An argument; a number without axes is the same for all lanes."""
+        """Return an argument; a number without axes is the same for all lanes."""
         build = self.arrays.builder
 
         def at(index: Index) -> Value:
@@ -90,7 +93,7 @@ class _Rows:
         return self.arrays.entries(field) if math.prod(field.shape) <= HELD else field
 
     def write(self, base: Value, aval: Any, value: Entries) -> None:
-        """A result."""
+        """Store a result."""
         build = self.arrays.builder
 
         def store(index: Index, _: Any) -> list[Value]:
@@ -104,7 +107,7 @@ class _Rows:
         self.arrays.each(aval.shape[:-1], store)
 
     def _place(self, base: Value, aval: Any, index: Index) -> tuple[Value, ir.Type]:
-        """Where a row's lanes are, and as what they lie there."""
+        """Return the address of a row's lanes, and the type in which they are stored."""
         build, number = self.arrays.builder, NUMBERS[aval.dtype.name]
         number = BYTE if number == TRUTH else number
         if aval.shape == ():

@@ -1,4 +1,4 @@
-"""Loops of traces: what they carry lies in registers or, if it is much, in memory."""
+"""Lowering of loops: carried arrays are kept in registers or, if large, in memory."""
 
 import math
 from collections.abc import Sequence
@@ -13,10 +13,10 @@ from vrw_jax.simd.trace import CALLS, Traces
 
 
 def while_(traces: Traces, equation: Any, values: list[Entries]) -> list[Entries]:
-    """A loop that goes on while a number says so, of which each group has its own."""
+    """Emit a loop with a condition, of which each group of lanes has its own."""
     arrays, params = traces.arrays, equation.params
     n_goes, n_body = params["cond_nconsts"], params["body_nconsts"]
-    read = list(map(shared, values[: n_goes + n_body]))  # at each turn
+    read = list(map(shared, values[: n_goes + n_body]))  # in each iteration
     fixed, own = read[:n_goes], read[n_goes:]
     begin = values[n_goes + n_body :]
     carry = _Carry(arrays, params["body_jaxpr"].out_avals, HELD, begin)
@@ -34,7 +34,7 @@ def while_(traces: Traces, equation: Any, values: list[Entries]) -> list[Entries
 
 
 def scan(traces: Traces, equation: Any, values: list[Entries]) -> list[Entries]:
-    """A loop of known length; what it reads and writes turn by turn lies in memory."""
+    """Emit a loop of known length, whose scanned inputs and stacked outputs are in memory."""
     arrays, params = traces.arrays, equation.params
     n_fixed, n_carried = _fixed_and_carried(params)
     inner, length = params["jaxpr"], params["length"]
@@ -73,16 +73,19 @@ def scan(traces: Traces, equation: Any, values: list[Entries]) -> list[Entries]:
 
 
 def _fixed_and_carried(params: dict[str, Any]) -> tuple[int, int]:
-    """How many values a loop of known length is given once, and how many go from turn to turn."""
-    if "ft_in" in params:  # jax from 0.11 or 0.12 on
+    """Return the number of constants of a scan, and the number of values that it carries."""
+    if "ft_in" in params:  # JAX from 0.11 or 0.12 on
         fixed, carried, _ = params["ft_in"].unpack()
         return len(fixed), len(carried)
     return params["num_consts"], params["num_carry"]
 
 
 class _Carry:
-    """Arrays between the turns of a loop: in registers up to `limit` entries, else in memory, that
-    of its own or where `begin`, what they begin with, lies and nothing else does."""
+    """Arrays carried from one iteration of a loop to the next.
+
+    They are in registers up to `max_registers` entries, otherwise in memory. The memory is
+    allocated for the loop, or is that of the initial value if no other array uses it.
+    """
 
     def __init__(
         self, arrays: Arrays, avals: Sequence[Any], limit: int | float, begin: Sequence[Entries]
@@ -101,10 +104,10 @@ class _Carry:
         return self.owner.room(shape_of(aval), kind)
 
     def arrays(self, flat: Sequence[Value]) -> list[Entries]:
-        """What is carried, in a turn or after the last one."""
+        """Return the carried arrays, in an iteration or after the last one."""
         held = [aval for aval, place in zip(self.avals, self.places, strict=True) if place is None]
         left = iter(arrays_of(flat, held))
-        # A field of its own each time: what was known of it is past.
+        # A new object each time, because values cached for the old one are outdated.
         return [
             next(left)
             if place is None
@@ -113,7 +116,7 @@ class _Carry:
         ]
 
     def start(self, arrays: Sequence[Entries]) -> list[Value]:
-        """Values for registers are returned, the others stored."""
+        """Return the initial values of registers, and store the others."""
         for array, place in zip(arrays, self.places, strict=True):
             if place is None or array is place:
                 continue
@@ -124,7 +127,10 @@ class _Carry:
         return self._in_registers(arrays)
 
     def on(self, arrays: Sequence[Entries]) -> list[Value]:
-        """From one turn to the next: new values may depend on any of the old."""
+        """Return the registers of the next iteration, and store the others.
+
+        New values may depend on any of the old ones.
+        """
         flat = self._in_registers(arrays)
         moves: list[tuple[Memory, Memory | Updated]] = []
         for array, place in zip(arrays, self.places, strict=True):
@@ -146,7 +152,7 @@ class _Carry:
         return flat
 
     def _apart(self, array: Memory) -> bool:
-        """Whether it lies in a room of its own."""
+        """Return whether the array has memory that no carried array uses."""
         rooms = [place.base for place in self.places if place is not None]
         return isinstance(array.base, ir.AllocaInstr) and array.base not in rooms
 
@@ -157,7 +163,7 @@ class _Carry:
 
 
 def _has_loops(jaxpr: Any) -> bool:
-    """Whether a trace has a loop anywhere."""
+    """Return whether a trace contains a loop at any level."""
     for equation in jaxpr.eqns:
         if equation.primitive.name in ("while", "scan"):
             return True

@@ -1,4 +1,4 @@
-"""LLVM's part: what this machine is, object code for it, and such code at its place in memory."""
+"""LLVM's part: the target processor, object code for it, and code loaded into memory."""
 
 import ctypes
 import functools
@@ -7,7 +7,7 @@ from typing import Any
 import llvmlite.binding as llvm
 
 LEVEL = 2
-"""How hard LLVM tries to place values in registers and instructions in time."""
+"""LLVM's optimization level for register allocation and instruction scheduling."""
 PASSES = (
     "global_dead_code_eliminate",
     "instruction_combine",
@@ -15,35 +15,40 @@ PASSES = (
     "aggressive_dce",
     "sinking",
 )
-"""What is left for it to simplify: nothing is written twice, and vectors are there. Its usual list
-takes as long as all the rest, to code at most a twentieth faster."""
+"""LLVM passes that simplify the module.
+
+They are chosen because the emitter writes nothing twice and already uses vectors. LLVM's usual list
+takes as long as all the rest, for code that is at most a twentieth faster.
+"""
 
 
 @functools.cache
 def processor() -> tuple[str, str, str]:
-    """What machine code is made for: the kind of machine, its processor, and what that can do."""
+    """Return the target of machine code: target triple, processor, and its features."""
     features = llvm.get_host_cpu_features().flatten()
     return llvm.get_process_triple(), llvm.get_host_cpu_name(), features
 
 
 def how_compiled() -> str:
-    """All that object code depends on besides LLVM's text."""
+    """Return everything that object code depends on besides LLVM's text."""
     return repr((llvm.llvm_version_info, processor(), LEVEL, PASSES))
 
 
 def wide() -> bool:
-    """Whether vectors have 512 bits."""
+    """Return whether vectors have 512 bits."""
     return "+avx512f" in processor()[2]
 
 
 def compiled(text: str) -> bytes:
-    """Object code for this processor."""
+    """Return object code for this processor."""
     return _emitted(llvm.parse_assembly(text), _machine())
 
 
 def compiled_for_web(text: str, begins: str, name: str) -> bytes:
-    """Object code for WebAssembly, to be linked with its like: a 32-bit machine with vectors of 128
-    bits. Its one function for others is `begins`, there called `name`.
+    """Return object code for WebAssembly, a 32-bit machine with vectors of 128 bits.
+
+    The object is to be linked with others. Its one exported function is `entry_point`, renamed to
+    `name`.
     """
     module = llvm.parse_assembly(text)
     for symbol in (*module.functions, *module.global_variables):
@@ -69,7 +74,7 @@ def _emitted(module: llvm.ModuleRef, machine: llvm.TargetMachine) -> bytes:
 
 
 class Loaded:
-    """Machine code at its place in memory."""
+    """Machine code loaded into memory."""
 
     def __init__(self, code: bytes) -> None:
         self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
@@ -77,11 +82,11 @@ class Loaded:
         self._engine.finalize_object()
 
     def address(self, name: str) -> int:
-        """Where a function begins."""
+        """Return the address of a function."""
         return self._engine.get_function_address(name)
 
     def capsule(self, name: str) -> Any:
-        """A function for hands that know what it takes."""
+        """Return a function as a PyCapsule, for callers with its signature."""
         make = ctypes.pythonapi.PyCapsule_New
         make.restype, make.argtypes = (
             ctypes.py_object,

@@ -1,4 +1,4 @@
-"""Primitives that move entries: which one stands where, and in arrays of what shape."""
+"""Primitives that move entries: indexing, slicing, concatenation and reshaping."""
 
 import math
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from vrw_jax.simd.trace import Traces
 
 
 def broadcast_in_dim(arrays: Arrays, asked: Asked, array: Entries, *_: Any) -> Entries:
-    """Repeated along new axes, the lanes' too."""
+    """Repeat an array along new axes, including the lanes'."""
     shape, axes = shape_of(asked.out), tuple(map(int, asked.params["broadcast_dimensions"]))
     array = arrays.fitted(array, array.shape[:-1], len(array.shape) > len(shape))
     if has_lanes(asked.out) and len(array.shape) == len(axes) and axes[-1:] == (len(shape),):
@@ -30,12 +30,12 @@ def broadcast_in_dim(arrays: Arrays, asked: Asked, array: Entries, *_: Any) -> E
 
 
 def reshape(arrays: Arrays, asked: Asked, array: Entries) -> Entries:
-    """Entries in the same order, in another shape."""
+    """Return the entries in the same order, in another shape."""
     return arrays.reshaped(array, shape_of(asked.out))
 
 
 def transpose(arrays: Arrays, asked: Asked, array: Entries) -> Entries:
-    """Axes in another order."""
+    """Return the array with its axes in another order."""
     order = asked.params["permutation"]
     order = order[: len(array.shape)]
     if isinstance(array, np.ndarray):
@@ -47,7 +47,7 @@ def transpose(arrays: Arrays, asked: Asked, array: Entries) -> Entries:
 
 
 def slice_(arrays: Arrays, asked: Asked, array: Entries) -> Entries:
-    """From one index to another, by steps."""
+    """Return the entries from one index to another, with strides."""
     strides = asked.params["strides"] or (1,) * len(asked.params["start_indices"])
     places = zip(asked.params["start_indices"], asked.params["limit_indices"], strides, strict=True)
     slices = [slice(*place) for place in places][: len(array.shape)]
@@ -62,19 +62,19 @@ def slice_(arrays: Arrays, asked: Asked, array: Entries) -> Entries:
 
 
 def concatenate(arrays: Arrays, asked: Asked, *values: Entries) -> Entries:
-    """Arrays one after the other along an axis."""
+    """Concatenate arrays along an axis."""
     return _joined(arrays, asked, asked.params["dimension"], values)
 
 
 def stack(arrays: Arrays, asked: Asked, *values: Entries) -> Entries:
-    """Arrays of one shape along a new axis."""
+    """Stack arrays of one shape along a new axis."""
     axis = asked.params["axis"]
     longer = [arrays.reshaped(x, (*x.shape[:axis], 1, *x.shape[axis:])) for x in values]
     return _joined(arrays, asked, axis, longer)
 
 
 def unstack(traces: Traces, equation: Any, values: list[Entries]) -> list[Entries]:
-    """Arrays of one shape, taken apart along an axis."""
+    """Split an array along an axis into arrays of one shape."""
     (array,), axis, arrays = values, equation.params["axis"], traces.arrays
     if axis == len(array.shape):
         raise moved("unstack")
@@ -106,7 +106,7 @@ def _joined(arrays: Arrays, asked: Asked, axis: int, values: Sequence[Entries]) 
                 if 0 <= here <= last:
                     return arrays.entry(part, (*index[:axis], here, *index[axis + 1 :]))
                 continue
-            # Beyond its end, any entry will do: another part's is chosen there.
+            # Beyond the part's end any entry is valid, because the select below discards it.
             here = 0 if last == 0 else arrays.clamped(here, last)
             value = arrays.entry(part, (*index[:axis], here, *index[axis + 1 :]))
             inside = arrays.builder.icmp_signed(">=", i, ir.Constant(LONG, start))
@@ -121,7 +121,7 @@ def _joined(arrays: Arrays, asked: Asked, axis: int, values: Sequence[Entries]) 
 
 
 def pad(arrays: Arrays, asked: Asked, array: Entries, value: Entries) -> Entries:
-    """With more entries around, none within."""
+    """Add entries around an array, none within."""
     around = asked.params["padding_config"]
     if any(low < 0 or high < 0 or within for low, high, within in around):
         raise NotImplementedError("pad takes entries away or puts some between: slice and stack.")
@@ -132,18 +132,18 @@ def pad(arrays: Arrays, asked: Asked, array: Entries, value: Entries) -> Entries
 
 
 def empty(arrays: Arrays, asked: Asked) -> Entries:
-    """Whatever lies there: zeros, but for what loops carry in memory."""
+    """Return uninitialized entries, which read as zeros except in memory that loops carry."""
     kind = arrays.kind_of(asked.out)
     return Unset(shape_of(asked.out), kind, lambda _: arrays.zero(kind))
 
 
 def iota(arrays: Arrays, asked: Asked) -> Entries:
-    """The indices along an axis."""
+    """Return the indices along an axis."""
     return arrays.constants_of(np.indices(asked.out.shape)[asked.params["dimension"]], asked.out)
 
 
 def dynamic_slice(arrays: Arrays, asked: Asked, array: Entries, *starts: Entries) -> Entries:
-    """A part that begins where numbers say, the same for all lanes."""
+    """Return a part whose start is given by numbers, the same for all lanes."""
     begin = _starts(arrays, asked.given, array.shape, shape_of(asked.out), starts)
     at = lambda index: arrays.entry(array, arrays.further(index, begin))
     return Field(shape_of(asked.out), arrays.kind_of(asked.out), at)
@@ -152,7 +152,7 @@ def dynamic_slice(arrays: Arrays, asked: Asked, array: Entries, *starts: Entries
 def dynamic_update_slice(
     arrays: Arrays, asked: Asked, array: Entries, update: Entries, *starts: Entries
 ) -> Entries:
-    """A part overwritten that begins where numbers say, the same for all lanes."""
+    """Replace a part whose start is given by numbers, the same for all lanes."""
     if has_lanes(asked.out) and not has_lanes(asked.given[1]):
         raise moved(asked.name)
     begin = _starts(arrays, asked.given[1:], array.shape, update.shape, starts)
@@ -164,7 +164,7 @@ def dynamic_update_slice(
 def _starts(
     arrays: Arrays, given: Any, whole: Index, part: Index, starts: Sequence[Entries]
 ) -> tuple[Any, ...]:
-    """Where a part begins, moved so that it lies inside."""
+    """Return the start of a part, clamped so that the part is inside."""
     begin: list[Any] = []
     for aval, n, m, start in zip(given[1:], whole, part, starts, strict=False):
         place = arrays.entries(start).item()

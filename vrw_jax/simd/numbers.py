@@ -1,6 +1,6 @@
-"""Values of LLVM: a number, or one for each of a few lanes; what is known of them; loops.
+"""Emission of LLVM values: scalars or vectors with one entry per lane, known values, and loops.
 
-Whatever repeats itself is computed once.
+Repeated computations are emitted once.
 """
 
 import contextlib
@@ -10,7 +10,7 @@ from typing import Any
 import llvmlite.ir as ir
 
 Value = Any
-"""An LLVM value: a number or a vector of them."""
+"""An LLVM value: a scalar or a vector of lanes."""
 
 TRUTH, BYTE, INT, LONG = (ir.IntType(bits) for bits in (1, 8, 32, 64))
 NUMBERS = {
@@ -23,8 +23,11 @@ NUMBERS = {
 
 
 class Operation:
-    """An instruction on two values of one type. Most of a program are such: llvmlite's own, which
-    can be changed later, take six times as long to make and to write."""
+    """An instruction on two values of one type.
+
+    Most of a program consists of these; llvmlite's own instructions, which can be changed later,
+    take six times as long to create and to write.
+    """
 
     __slots__ = ("name", "text", "type")
 
@@ -32,7 +35,7 @@ class Operation:
         self.name, self.type, self.text = name, kind, text
 
     def get_reference(self) -> str:
-        """As other instructions name it."""
+        """Return the name by which other instructions refer to it."""
         return self.name
 
     def __str__(self) -> str:
@@ -47,29 +50,29 @@ class _Repeated(ir.Constant):
 
 
 class Numbers:
-    """Writes values into a function of `builder`'s module."""
+    """Emitter of values into a function of `builder`'s module."""
 
     def __init__(self, builder: ir.IRBuilder, width: int) -> None:
         self.builder, self.width = builder, width
-        # What was computed before, by operation and operands: traces repeat themselves a lot.
+        # Values computed so far, by operation and operands: traces contain many repetitions.
         self.known: dict[tuple, Any] = {}
-        self.lately: list[tuple] = []  # keys of what is known since `inner` began
+        self.lately: list[tuple] = []  # keys of the values emitted within the present inner context
         self.operations = 0
         self.constants: dict[tuple[str, str], ir.Constant] = {}
 
     def vector(self, number: ir.Type) -> ir.VectorType:
-        """A number of that type for each lane."""
+        """Return the type of a vector with a number of that type for each lane."""
         return ir.VectorType(number, self.width)
 
     def constant(self, kind: ir.Type, value: Any) -> ir.Constant:
-        """`value` as a constant of that type, the same for all lanes."""
+        """Return `value` as a constant of that type, the same for all lanes."""
         if isinstance(kind, ir.VectorType):
             return self.spread(self.constant(kind.element, value))
         number = int(value) if isinstance(kind, ir.IntType) else float(value)
         return self.constants.setdefault((str(kind), repr(number)), ir.Constant(kind, number))
 
     def spread(self, value: Value) -> Value:
-        """A number as a vector."""
+        """Return a scalar as a vector with equal entries."""
         if isinstance(value.type, ir.VectorType):
             return value
         kind = self.vector(value.type)
@@ -87,14 +90,17 @@ class Numbers:
         return self.builder.shuffle_vector(first, empty, order)
 
     def once(self, key: tuple, make: Callable[[], Any]) -> Any:
-        """Made where it is asked for first. What a key names by `id` must live as long as this."""
+        """Return the value under this key, which `make` creates on the first call.
+
+        An object that a key identifies by `id` must live as long as this emitter.
+        """
         if key not in self.known:
             self.known[key] = make()
             self.lately.append(key)
         return self.known[key]
 
     def operation(self, what: str, x: Value, y: Value) -> Operation:
-        """An instruction on two values alike, giving one of their type."""
+        """Emit an instruction on two values of the same type, with a result of that type."""
         self.operations += 1
         name, kind = f"%o{self.operations}", x.type
         text = f"{name} = {what} {kind} {x.get_reference()}, {y.get_reference()}"
@@ -103,14 +109,14 @@ class Numbers:
         return made
 
     def alike(self, *values: Value) -> list[Value]:
-        """Vectors where one of them is."""
+        """Return the values as vectors if one of them is a vector."""
         if any(isinstance(value.type, ir.VectorType) for value in values):
             return [self.spread(value) for value in values]
         return list(values)
 
     @contextlib.contextmanager
     def inner(self) -> Iterator[None]:
-        """What is computed within is not known after."""
+        """Discard the values computed within the context, at its end."""
         before, self.lately = self.lately, []
         yield
         for key in self.lately:
@@ -123,7 +129,7 @@ class Numbers:
         goes_on: Callable[[list[Value]], Value],
         body: Callable[[list[Value]], Sequence[Value]],
     ) -> list[Value]:
-        """`while goes_on(carried): carried = body(carried)`."""
+        """Emit a loop, `while emit_condition(values): values = emit_body(values)`."""
         build, before = self.builder, self.builder.block
         head, within, after = (build.append_basic_block(name) for name in ("head", "body", "after"))
         build.branch(head)

@@ -1,9 +1,10 @@
-"""Functions over lanes as machine code for CPUs: a few lanes side by side, from first to last line.
+"""Functions over lanes as machine code for CPUs, a few lanes at a time from start to end.
 
-XLA on CPU makes a loop over all lanes of every few operations, with results in memory between them,
-and a `while` waits for the slowest of hundreds. Here the trace of the whole function becomes one
-loop over groups of a few lanes, compiled by LLVM: a group's numbers stay in registers, and it waits
-for none but its own. What a store keeps, a later process neither traces nor compiles.
+XLA on CPU generates a loop over all lanes for every few operations, with results in memory between
+them. A `while` runs until the slowest of hundreds ends. Here the trace of the whole function
+becomes one loop over groups of a few lanes, compiled by LLVM: a group's numbers stay in registers,
+and a group ends with its own slowest lane. A later process neither traces nor compiles code that a
+store contains.
 """
 
 import ctypes
@@ -23,13 +24,13 @@ from vrw_jax.simd.kernel import NAME, module_text
 from vrw_jax.simd.machine import Loaded, compiled_for_web, wide
 
 VECTOR = {np.dtype(np.float64): 4, np.dtype(np.float32): 8}
-"""Lanes of 256 bits: a vector, or half of one where a processor has 512."""
+"""Number of lanes in 256 bits, which is a vector, or half of one on processors with 512 bits."""
 TOGETHER = 64
-"""Groups that a thread takes at a time."""
+"""Number of groups in one task of a thread."""
 
 
 def serves() -> bool:
-    """Whether there is machine code for where JAX computes: on CPUs."""
+    """Return whether machine code is available for JAX's backend, which must be the CPU."""
     return jax.default_backend() == "cpu"
 
 
@@ -42,16 +43,19 @@ def lane_program(
     store: Store | None,
     small: int = SMALL,
 ) -> Callable[[Sequence[Any], Sequence[np.ndarray]], list[np.ndarray]]:
-    """`function(uniform, lanes)` compiled: `uniform` numbers, `lanes` arrays of the float `dtype`.
+    """Compile `function(scalars, lanes)`: scalars of `scalar_dtypes`, and arrays of the float
+    `dtype`.
 
-    It must be elementwise over lanes, but for loops that end where no lane goes on, and return a
-    flat tuple of arrays whose last axis are lanes. `key` says by `repr` what its trace depends on
-    but shapes: what it closes over, and its text. Code is kept in `store`, if there is one; parts
-    of large arrays with up to `small` entries are registers. The result
-    takes numpy arrays of any equal length and gives bitwise the same for a lane in any
-    company; it uses all cores that the process may.
+    The function must be elementwise over lanes, except for loops that end when no lane continues.
+    It returns a flat tuple of arrays whose last axis are lanes. The `repr` of `key` identifies
+    everything that its trace depends on except shapes: the values in its closure, and its source.
+    Code is saved in `store`, if given; parts of large arrays with up to `max_unrolled` entries are
+    kept in registers. The result takes numpy arrays of any equal length and gives bitwise the same
+    for a lane whatever the other lanes are; it uses all cores available to the process.
     """
-    width = 2 * VECTOR[dtype]  # of 256 bits one vector computes while the other waits
+    width = (
+        2 * VECTOR[dtype]
+    )  # of two vectors of 256 bits, one computes during the latency of the other
     shapes = (
         tuple(jax.ShapeDtypeStruct((), kind) for kind in uniform),
         (jax.ShapeDtypeStruct((LANES,), dtype),) * n_lanes_in,
@@ -62,12 +66,12 @@ def lane_program(
 def web_object(
     function: Callable[..., Any], numbers: int, rows: Sequence[int], name: str, small: int = SMALL
 ) -> bytes:
-    """`function(*numbers, *arrays)` as object code for WebAssembly, two lanes at a time.
+    """Return `function(*scalars, *arrays)` as object code for WebAssembly, two lanes at a time.
 
-    Float64: so many numbers, and arrays of so many rows, lanes last. The code's function `name`
-    takes (given, told, lanes, begin, end): tables of pointers to arguments and results, the number
-    of lanes, and which pairs of them to compute. `sin` and `cos`, where a trace leaves some over,
-    are the caller's.
+    The arguments are float64: the given number of scalars, and arrays with the given numbers of
+    rows, lanes last. The code's function `name` takes (inputs, outputs, lanes, begin, end): tables
+    of pointers to arguments and results, the number of lanes, and the range of pairs of lanes to
+    compute. The caller provides `sin` and `cos` if the trace uses them.
     """
     lanes = [jax.ShapeDtypeStruct((n, LANES), np.float64) for n in rows]
     shapes = [jax.ShapeDtypeStruct((), np.float64)] * numbers + lanes
@@ -81,12 +85,14 @@ def lane_function(
     store: Store | None,
     small: int = SMALL,
 ) -> Callable[..., Any]:
-    """`function` of trees of arrays, lanes on their last axis, as one call within JAX's programs.
+    """Return `function` of trees of arrays, lanes on their last axis, as one call within JAX
+    programs.
 
-    The first array has lanes; numbers without an axis are the same for all.
-    As with `lane_program`; but results form a tree, that of `like`, which is quick to trace, and a
-    lone lane has code of its own, which waits for no others and gives the same bits.
-    Without derivatives, on CPUs only, and on the one core that runs the program.
+    The first array has lanes; numbers without an axis are the same for all lanes. It works like
+    `compile_lane_program`, with two differences. The results form a tree, that of `shape_function`,
+    which is fast to trace. A single lane has separate code, which computes no other lanes and gives
+    the same bits. The call has no derivatives, works on CPUs only, and uses the one core that runs
+    the program.
     """
 
     def call(*arrays: Any) -> Any:
@@ -99,7 +105,9 @@ def lane_function(
                     "are the last axis of every array; what has no axis is the same for all."
                 )
         several = VECTOR[np.dtype(leaves[0].dtype)] * (2 if wide() else 1)
-        width = 1 if n_lanes == 1 else several  # alone it would wait for the others
+        width = (
+            1 if n_lanes == 1 else several
+        )  # a full group would compute lanes that are not needed
         missing = -n_lanes % width
         shapes = [
             jax.ShapeDtypeStruct((*x.shape[:-1], LANES) if jnp.ndim(x) else (), jnp.result_type(x))
@@ -119,7 +127,7 @@ def lane_function(
 
 
 def at_hand(names: Sequence[str], store: Store | None) -> bool:
-    """Whether a kept program that calls machine code of these names can run, once this is said."""
+    """Register saved machine code of these names, and return whether all of it is available."""
     for name in names:
         code = None if name in registered else kept_code(name, store)
         if code is not None:
@@ -128,7 +136,7 @@ def at_hand(names: Sequence[str], store: Store | None) -> bool:
 
 
 class _Program:
-    """Machine code for numpy's arrays."""
+    """Machine code for numpy arrays."""
 
     def __init__(self, code: Code, width: int) -> None:
         self.out, self.width = code.out, width
@@ -157,7 +165,7 @@ class _Program:
 
 
 def _filled(x: np.ndarray, length: int) -> np.ndarray:
-    """Contiguous, filled up by its last number."""
+    """Return a contiguous array, padded with its last number."""
     if len(x) == length:
         return np.ascontiguousarray(x)
     filled = np.full(length, x[-1])
@@ -166,10 +174,12 @@ def _filled(x: np.ndarray, length: int) -> np.ndarray:
 
 
 def _pointers(arrays: Sequence[np.ndarray]) -> Any:
+    """Return a table of pointers to the arrays' data."""
     return (ctypes.c_void_p * len(arrays))(*(x.ctypes.data for x in arrays))
 
 
 def _cores() -> int:
+    """Return the number of cores available to the process."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

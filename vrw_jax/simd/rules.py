@@ -1,4 +1,4 @@
-"""The table of primitives: RULES, by which traces are written. A new primitive is one more row."""
+"""The table PRIMITIVE_RULES, which lowers traces; a new primitive is one more row."""
 
 import math
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from vrw_jax.simd.trace import CALLS, Rule, Traces, called
 
 
 def _single(write: Callable[..., Entries]) -> Rule:
-    """A rule of one result: `write(arrays, asked, *values)`."""
+    """Return a rule with one result: `emit(emitter, call, *values)`."""
 
     def rule(traces: Traces, equation: Any, values: list[Entries]) -> list[Entries]:
         name, out = equation.primitive.name, equation.outvars[0].aval
@@ -22,7 +22,7 @@ def _single(write: Callable[..., Entries]) -> Rule:
             raise moved(name)
         if lanes and not before and name not in ("broadcast_in_dim", "empty"):
             raise taken_for_lanes(f"The result of {name}", out)
-        number_of(out)  # refuses those of no known kind
+        number_of(out)  # raises an error for unsupported number types
         result = write(traces.arrays, Asked(name, equation.params, given, out), *values)
         if isinstance(result, Field) and math.prod(result.shape) <= traces.arrays.small:
             result = traces.arrays.entries(result)
@@ -33,12 +33,12 @@ def _single(write: Callable[..., Entries]) -> Rule:
 
 
 def _mapped(arrays: Any, asked: Asked, *values: Entries) -> Entries:
-    """Each number by itself."""
+    """Apply the primitive to each number separately."""
     return arrays.mapped(asked, values)
 
 
 def _stored(traces: Traces, equation: Any, values: list[Entries]) -> list[Entries]:
-    """Large arrays computed here, into memory."""
+    """Compute large arrays here, into memory."""
     return [traces.arrays.in_memory(x) if isinstance(x, Field) else x for x in values]
 
 
@@ -73,5 +73,5 @@ RULES: dict[str, Rule] = {
 
 
 def primitives() -> dict[str, str]:
-    """JAX's primitives that have machine code, and what their rules do."""
+    """Return the JAX primitives that have machine code, and descriptions of their rules."""
     return {name: rule.__doc__ or "" for name, rule in RULES.items()}

@@ -1,4 +1,4 @@
-"""Primitives that sum, along axes of entries; those of lanes only ask for any and all."""
+"""Primitives that reduce along axes of entries; over lanes they compute only any and all."""
 
 import functools
 import math
@@ -15,7 +15,7 @@ from vrw_jax.simd.numbers import Value
 
 
 def cumsum(arrays: Arrays, asked: Asked, array: Entries) -> Entries:
-    """Sums along an axis, from either end."""
+    """Return cumulative sums along an axis, from either end."""
     if asked.params["axis"] == len(array.shape):
         raise moved(asked.name)
     rows, dtype = np.moveaxis(arrays.entries(array), asked.params["axis"], 0), asked.out.dtype
@@ -30,7 +30,7 @@ def cumsum(arrays: Arrays, asked: Asked, array: Entries) -> Entries:
 
 
 def dot_general(arrays: Arrays, asked: Asked, left: Entries, right: Entries) -> Entries:
-    """A product of arrays, summed over one pair of axes."""
+    """Return a product of arrays, summed over one pair of axes."""
     (over_left, over_right), (both, _) = asked.params["dimension_numbers"]
     if both or len(over_left) != 1:
         raise NotImplementedError(
@@ -65,10 +65,10 @@ def dot_general(arrays: Arrays, asked: Asked, left: Entries, right: Entries) -> 
 
 
 def reduction(name: str) -> Callable[..., Entries]:
-    """The rule of a reduction by the elementwise primitive `name`."""
+    """Return the rule of a reduction by the elementwise primitive `name`."""
 
     def reduce_(arrays: Arrays, asked: Asked, array: Entries) -> Entries:
-        """Along axes; `any` and `all` over lanes too."""
+        """Reduce along axes; `any` and `all` also over lanes."""
         over_lanes = has_lanes(asked.given[0]) and not has_lanes(asked.out)
         dtype = asked.given[0].dtype
         if over_lanes and (name not in ("and", "or") or dtype.kind != "b"):
@@ -86,7 +86,7 @@ def reduction(name: str) -> Callable[..., Entries]:
             at = lambda inner: arrays.entry(array, index_of(outer, inner))
             if isinstance(array, np.ndarray) or math.prod(lengths) <= SMALL:
                 return functools.reduce(combine, map(at, np.ndindex(*lengths)))
-            first = at((0,) * len(lengths))  # counted twice: for these sums, no matter
+            first = at((0,) * len(lengths))  # counted twice, which does not change these reductions
             if name == "add":
                 first = arrays.zero(array.kind)
             elif isinstance(array.kind, ir.VectorType):

@@ -1,4 +1,4 @@
-"""What a trace of JAX says, equation by equation: the results of a trace, calls of other traces."""
+"""Lowering of JAX traces, equation by equation: results of a trace, and calls of other traces."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -14,7 +14,7 @@ from vrw_jax.simd.fields import Entries, shared
 from vrw_jax.simd.numbers import Numbers, Value
 
 Rule = Callable[["Traces", Any, list[Entries]], list[Entries]]
-"""Writes an equation with these operands, and tells its results."""
+"""A function that emits an equation with these operands, and returns its results."""
 
 APART = "apart"
 
@@ -32,7 +32,9 @@ LOOPS = "while", "scan"
 
 
 def apart(function: Callable) -> Callable:
-    """`function`, that machine code is to call rather than to contain wherever it is called."""
+    """Return `function` compiled as a separate function of the machine code, which is called, not
+    inlined.
+    """
 
     def apart(*arguments: Any) -> Any:
         return function(*arguments)
@@ -41,17 +43,17 @@ def apart(function: Callable) -> Callable:
 
 
 class Traces:
-    """Writes what traces say, by `rules` of their primitives, into the function of `arrays`."""
+    """Lowering of traces, by `rules` of their primitives, into the function of `emitter`."""
 
     def __init__(
         self, arrays: Arrays, rules: Mapping[str, Rule], functions: dict[int, Any] | None = None
     ) -> None:
         self.arrays, self.rules = arrays, rules
-        # Functions of their own by the trace's `id`, with the trace: it must live on.
+        # Separate functions by the trace's `id`, with the trace, which must stay alive.
         self.functions = {} if functions is None else functions
 
     def closed(self, closed: ClosedJaxpr, values: Sequence[Entries]) -> list[Entries]:
-        """The results of a trace for these values."""
+        """Return the results of a trace for these values."""
         jaxpr, constants_of = closed.jaxpr, self.arrays.constants_of
         takers, places = _takers(jaxpr), dict[Any, Entries]()
 
@@ -70,7 +72,7 @@ class Traces:
 
         for place, equation in enumerate(jaxpr.eqns):
             if all(variable.aval.dtype == jax.dtypes.float0 for variable in equation.outvars):
-                continue  # the derivative of a whole number, which nothing reads
+                continue  # the derivative of an integer, which no equation reads
             results = self._results(equation, [read(x, place) for x in equation.invars])
             put(equation.outvars, results)
         return [read(atom, len(jaxpr.eqns)) for atom in jaxpr.outvars]
@@ -80,7 +82,7 @@ class Traces:
         if name not in self.rules:
             raise NotImplementedError(
                 f"{name} has no machine code: write it by primitives that `simd.primitives()` "
-                "tells, or give it a rule in RULES."
+                "lists, or give it a rule in RULES."
             )
         for variable in equation.outvars:
             if LANES in variable.aval.shape[:-1]:
@@ -88,7 +90,7 @@ class Traces:
         return self.rules[name](self, equation, values)
 
     def call(self, closed: ClosedJaxpr, values: Sequence[Entries]) -> list[Entries]:
-        """A call of a function of its own, which is written once."""
+        """Emit a call of a separate function, which is defined once."""
         build = self.arrays.builder
         if id(closed) not in self.functions:
             self.functions[id(closed)] = (self._function(closed), closed)
@@ -98,7 +100,7 @@ class Traces:
         return arrays_of(results, closed.out_avals)
 
     def _function(self, closed: ClosedJaxpr) -> ir.Function:
-        """From the entries of all arguments to those of all results."""
+        """Define a function from the entries of all arguments to those of all results."""
         kinds = lambda avals: [
             self.arrays.kind_of(x) for x in avals for _ in range(math.prod(shape_of(x)))
         ]
@@ -123,8 +125,11 @@ class Traces:
 
 
 def _takers(jaxpr: Any) -> dict[Any, int | None]:
-    """By variable the place of the equation that may overwrite it: the last one that reads it,
-    where those before are loops, after which nothing is left to be read."""
+    """Return, for each variable, the position of the equation that may overwrite it.
+
+    It is the last equation that reads the variable, if all earlier ones are loops, which read
+    nothing after they end.
+    """
     takers: dict[Any, int | None] = {}
     loops = [equation.primitive.name in LOOPS for equation in jaxpr.eqns]
     for place, atoms in enumerate([*(equation.invars for equation in jaxpr.eqns), jaxpr.outvars]):
@@ -137,10 +142,10 @@ def _takers(jaxpr: Any) -> dict[Any, int | None]:
 
 
 def called(parameter: str) -> Rule:
-    """The rule of a primitive that calls the trace which is this parameter."""
+    """Return the rule of a primitive that calls the trace in this parameter."""
 
     def write(traces: Traces, equation: Any, values: list[Entries]) -> list[Entries]:
-        """Another trace: within this one or, set `apart`, as a function."""
+        """Lower another trace: inline or, if marked by `noinline`, as a function."""
         closed = equation.params[parameter]
         if equation.params.get("name") == APART:
             return traces.call(closed, values)
