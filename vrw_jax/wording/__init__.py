@@ -1,4 +1,4 @@
-"""What people read and write: values checked with one sentence each, results as text and tables."""
+"""Validation of arguments, with one sentence per error, and printing of results."""
 
 from vrw_jax.wording.checks import (
     chosen,

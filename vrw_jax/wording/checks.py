@@ -1,7 +1,7 @@
-"""What callers give: looked at once, here, for every public function.
+"""Validation of the arguments of all public functions.
 
-A sentence says what was given, what is allowed and what to do. What is no number at all is a
-TypeError, a number that can't be meant a ValueError.
+A message states the given value, the allowed values and the remedy. A value that is no number
+raises a TypeError, a number out of range a ValueError.
 """
 
 import difflib
@@ -17,13 +17,15 @@ from jaxtyping import Array
 
 
 def nearest(name: object, allowed: Iterable[str]) -> str:
-    """' (did you mean ...?)' where a name like it is allowed, else nothing."""
+    """Return ' (did you mean ...?)' if a similar name is allowed, otherwise ''."""
     close = difflib.get_close_matches(str(name), list(allowed), n=1, cutoff=0.5)
     return f" (did you mean '{close[0]}'?)" if close else ""
 
 
 def require_known(name: Any, allowed: Sequence[str], what: str) -> None:
-    """Refuse a name that is none of those `allowed`: "'dampng' is no parameter ..."."""
+    """Raise a ValueError for a name that is not in `allowed_names`: "'dampng' is no
+    parameter ...".
+    """
     if name not in allowed:
         choice = ", ".join(allowed)
         raise ValueError(
@@ -32,7 +34,7 @@ def require_known(name: Any, allowed: Sequence[str], what: str) -> None:
 
 
 def shown(value: object) -> str:
-    """A value as a sentence tells it: itself where it is short, else its kind."""
+    """Return a value as text for a message: its repr if short, otherwise its type."""
     if isinstance(value, jax.Array | np.ndarray) and np.ndim(value):
         return f"an array of shape {np.shape(value)}"
     text = " ".join(repr(value).split())
@@ -40,7 +42,7 @@ def shown(value: object) -> str:
 
 
 def _is_number(value: object) -> bool:
-    """Whether it is one real number; True and False are none."""
+    """Return whether a value is one real number; True and False are not."""
     kind = np.asarray(value).dtype.kind if isinstance(value, float | int | np.generic) else "O"
     if isinstance(value, jax.Array | np.ndarray) and np.ndim(value) == 0:
         kind = np.dtype(value.dtype).kind
@@ -48,7 +50,7 @@ def _is_number(value: object) -> bool:
 
 
 def whole(name: str, value: Any, least: int = 1, why: str = "") -> int:
-    """A whole number of at least `least`; `why` says why so many."""
+    """Return an integer of at least `min_value`; `reason` explains the limit in the message."""
     number = _is_number(value) and not isinstance(value, jax.core.Tracer)
     if not number or np.asarray(value).dtype.kind not in "iu" or value < least:
         raise (ValueError if number else TypeError)(
@@ -59,7 +61,7 @@ def whole(name: str, value: Any, least: int = 1, why: str = "") -> int:
 
 
 def real(name: str, value: Any) -> float:
-    """One finite number."""
+    """Return one finite number."""
     if not _is_number(value) or isinstance(value, jax.core.Tracer):
         raise TypeError(f"{name} is {shown(value)}, but it is one real number: give it as a float.")
     if not math.isfinite(value):
@@ -68,7 +70,7 @@ def real(name: str, value: Any) -> float:
 
 
 def positive(name: str, value: Any) -> float:
-    """One number above zero."""
+    """Return one number above zero."""
     if not real(name, value) > 0.0:
         raise ValueError(
             f"{name} is {float(value):g}, but it must be positive: give a number above 0."
@@ -77,7 +79,7 @@ def positive(name: str, value: Any) -> float:
 
 
 def range_of(name: str, pair: Any) -> tuple[float, float]:
-    """Two numbers, the lower first."""
+    """Return two numbers, the lower first."""
     try:
         low, high = pair
     except (TypeError, ValueError):
@@ -93,13 +95,16 @@ def range_of(name: str, pair: Any) -> tuple[float, float]:
 
 
 def reals(name: str, value: Any, advice: str = "give a number, or an array of them") -> Array:
-    """Real numbers of any shape as a strongly typed array; Python's take JAX's default type."""
+    """Return real numbers of any shape as a strongly typed array.
+
+    Python numbers get JAX's default type.
+    """
     try:
         array = jnp.asarray(value)
     except (TypeError, ValueError, OverflowError):
         array = None
     except (RuntimeError, AssertionError):
-        _require_device()  # the first array of a process finds out what it may run on
+        _require_device()  # the first array of a process initializes JAX's backend
         raise
     if array is None or not (
         jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)
@@ -113,13 +118,14 @@ def reals(name: str, value: Any, advice: str = "give a number, or an array of th
 def known_reals(
     name: str, value: Any, advice: str = "give a number, or an array of them"
 ) -> np.ndarray:
-    """`reals` where numbers are known, as numpy holds them: JAX need not see what is sound."""
+    """Return concrete real numbers as a numpy array, without JAX if they are already valid."""
     if isinstance(value, np.ndarray) and value.dtype == jax.dtypes.canonicalize_dtype(float):
         return value
     return np.asarray(reals(name, value, advice))
 
 
 def _require_device() -> None:
+    """Raise an OSError if JAX finds no device."""
     try:
         jax.devices()
     except (RuntimeError, AssertionError) as error:  # a plugin without its device asserts
@@ -131,14 +137,14 @@ def _require_device() -> None:
 
 
 def flag(name: str, value: Any) -> bool:
-    """True or False."""
+    """Return True or False."""
     if not isinstance(value, bool | np.bool_):
         raise TypeError(f"{name} is {shown(value)}, but it is a choice: give True or False.")
     return bool(value)
 
 
 def chosen(name: str, value: Any, allowed: Sequence[str]) -> str:
-    """One of several words."""
+    """Return one of several allowed words."""
     if not isinstance(value, str):
         raise TypeError(f"{name} is {shown(value)}, but it is a word: give '{allowed[0]}', say.")
     if value not in allowed:
@@ -150,7 +156,7 @@ def chosen(name: str, value: Any, allowed: Sequence[str]) -> str:
 
 
 def names_of(name: str, value: Any) -> tuple[str, ...]:
-    """Several names; one alone may be given as it is."""
+    """Return several names; a single string counts as one name."""
     values = (value,) if isinstance(value, str) else value
     if not isinstance(values, Iterable) or not all(isinstance(v, str) for v in (*values,)):
         raise TypeError(f'{name} is {shown(value)}, but it holds names: write ["dls_fraction"].')
@@ -158,7 +164,7 @@ def names_of(name: str, value: Any) -> tuple[str, ...]:
 
 
 def instance(name: str, value: Any, kind: type | tuple[type, ...], advice: str) -> None:
-    """Refuse what is not of this kind."""
+    """Raise a TypeError unless a value has this type."""
     if not isinstance(value, kind):
         one = (kind[0] if isinstance(kind, tuple) else kind).__name__
         article = "an" if one[0] in "AEIOU" else "a"
@@ -166,18 +172,18 @@ def instance(name: str, value: Any, kind: type | tuple[type, ...], advice: str) 
 
 
 def function_of(name: str, value: Any, what: str) -> None:
-    """Refuse what can't be called."""
+    """Raise a TypeError unless a value is callable."""
     if not callable(value):
         raise TypeError(f"{name} is {shown(value)}, but it must be a function: give one {what}.")
 
 
 def traced(*trees: Any) -> bool:
-    """Whether numbers are unknown here, as inside `jit`, `vmap` or `grad`."""
+    """Return whether some number is a tracer, as inside `jit`, `vmap` or `grad`."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
 
 
 def untraced(function: str, instead: str, *trees: Any) -> None:
-    """Refuse to run inside `jit`, `vmap` or `grad`, for what runs on the host."""
+    """Raise a TypeError inside `jit`, `vmap` or `grad`, for functions that run on the host."""
     if traced(*trees):
         raise TypeError(
             f"{function} is called inside jit, vmap or grad, but it runs on known numbers: call it "

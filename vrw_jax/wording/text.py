@@ -1,4 +1,4 @@
-"""How results show themselves: a few lines of text, tables of two kinds, symbols as mathtext."""
+"""Printing of results: lines of text, tables in HTML and Markdown, symbols as mathtext."""
 
 import abc
 import enum
@@ -16,21 +16,22 @@ Row = tuple[str, str]
 
 
 def is_concrete(tree: Any) -> bool:
-    """Whether all numbers of a module are there and known, as they aren't inside `jit`."""
+    """Return whether all numbers of a module are set and concrete, which is False inside `jit`."""
     known = lambda leaf: eqx.is_array_like(leaf) and not isinstance(leaf, int | jax.core.Tracer)
     whole = not any(value is None for value in vars(tree).values())
     return whole and all(map(known, jax.tree.leaves(tree)))
 
 
 class AbstractTold(eqx.Module):
-    """What prints itself in words and numbers, and as a table in a notebook."""
+    """Base class of results that print themselves as text, and as a table in a notebook."""
 
     @abc.abstractmethod
     def rows(self) -> list[Row]:
-        """Names and texts."""
+        """Return names and texts, one pair per line."""
 
     @property
     def title(self) -> str:
+        """Heading of the printed result."""
         return type(self).__name__
 
     def __repr__(self) -> str:
@@ -41,7 +42,7 @@ class AbstractTold(eqx.Module):
 
 
 def told(value: object, unit: str) -> str:
-    """A number with its unit, or of many how many and between which."""
+    """Return a number with its unit, or the count and range of several numbers."""
     values, unit = np.asarray(value), "" if unit == "1" else unit
     if values.ndim == 0:
         return f"{float(values):.6g} {unit}".strip()
@@ -50,7 +51,7 @@ def told(value: object, unit: str) -> str:
 
 
 def counted(outcomes: Any, code: type[enum.IntEnum]) -> str:
-    """How many there are, and how often each outcome came."""
+    """Return the number of outcomes, their shape, and the count of each outcome."""
     n, shape = np.size(outcomes), np.shape(outcomes)
     codes, counts = np.unique(np.asarray(outcomes), return_counts=True)
     each = (f"{count:,} {code(int(c)).name}" for c, count in zip(codes, counts, strict=True))
@@ -58,11 +59,12 @@ def counted(outcomes: Any, code: type[enum.IntEnum]) -> str:
 
 
 def as_text(title: str, rows: Iterable[Row]) -> str:
+    """Return a title and indented rows."""
     return "\n".join([title, *(f"  {name}: {text}" for name, text in rows)])
 
 
 def as_html(title: str, rows: Iterable[Sequence[str]], header: Sequence[str] = ()) -> str:
-    """The rows as a table for a notebook; the first cell of each names it."""
+    """Return the rows as a table for a notebook; the first cell of each row is its header."""
     cell = lambda kind, text: f"<{kind} style='text-align:left'>{escape(text)}</{kind}>"
     lines = ["".join(cell("th", text) for text in header)] if header else []
     lines += [cell("th", name) + "".join(cell("td", text) for text in rest) for name, *rest in rows]
@@ -71,7 +73,7 @@ def as_html(title: str, rows: Iterable[Sequence[str]], header: Sequence[str] = (
 
 
 def as_markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """Lines of a table for a page."""
+    """Return the lines of a Markdown table."""
     cell = lambda text: " " + text.replace("|", r"\|") + " " * bool(text)
     line = lambda cells: "|" + "|".join(map(cell, cells)) + "|"
     return [line(header), "|" + "---|" * len(header), *map(line, rows)]
@@ -90,7 +92,9 @@ _TOKEN = re.compile(
 
 
 def as_tex(symbol: str) -> str:
-    r"""A symbol as mathtext: "θ̇⁺" as \dot{\theta}^+, "T_DLS" as T_\mathrm{DLS}, "L1" as L_1."""
+    r"""Return a symbol as mathtext: "θ̇⁺" as \dot{\theta}^+, "T_DLS" as T_\mathrm{DLS}, "L1" as
+    L_1.
+    """
     return _TOKEN.sub(_token_as_tex, unicodedata.normalize("NFD", symbol))
 
 
@@ -108,4 +112,5 @@ def _token_as_tex(found: re.Match[str]) -> str:
 
 
 def listed(values: object) -> str:
+    """Return numbers separated by commas."""
     return ", ".join(f"{v:.5g}" for v in np.ravel(np.asarray(values)))
