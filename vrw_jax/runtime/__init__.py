@@ -1,4 +1,4 @@
-"""How a process computes and what it keeps: number format, libraries on demand, store, programs."""
+"""Process-wide runtime: number format, lazily imported libraries, disk cache, compiled programs."""
 
 from vrw_jax.runtime.lazy import library, xarray
 from vrw_jax.runtime.programs import compiled, lane_function, lane_program, remembered

@@ -1,4 +1,4 @@
-"""Libraries imported when they are first used: together they cost a second of every start."""
+"""Libraries imported on first use, because importing all of them takes a second of every start."""
 
 import importlib
 from typing import TYPE_CHECKING, Any
@@ -13,11 +13,11 @@ class _Library:
 
 
 def library(name: str) -> Any:
-    """That library, imported once something of it is asked for."""
+    """Return that library, imported on the first access to an attribute."""
     return _Library(name)
 
 
 if TYPE_CHECKING:
     import xarray as xarray
 else:
-    xarray = library("xarray")  # of which all results are made
+    xarray = library("xarray")  # the container of all labeled results

@@ -1,8 +1,8 @@
-"""Traced functions kept on disk beside JAX's compiled code, which saves Python's share of a start.
+"""Traced functions saved beside JAX's compilation cache, to avoid tracing at the next start.
 
-JAX's persistent cache spares the compiler but not the tracing, which for a limit cycle with
-derivatives takes longer than a scan of thousands. Where that cache is on, its folder also keeps
-traces, by a key of everything that they depend on, the library's source included.
+JAX's persistent cache avoids compilation but not tracing, which for a limit cycle with derivatives
+takes longer than a scan of thousands. If that cache is on, its folder also contains traces, under a
+key of everything that they depend on, including the library's source.
 """
 
 import hashlib
@@ -24,12 +24,12 @@ from vrw_jax.runtime.start import fusion_emitters
 def compiled(
     function: Callable, arguments: tuple, settings: object, device: jax.Device
 ) -> Callable:
-    """`function` compiled for arguments like these, on `device`.
+    """Return `function` compiled for arguments like these, on `device`.
 
-    `settings` says by `repr` what the function closes over.
+    The `repr` of `settings` identifies the values in the function's closure.
 
-    The way leads through the exported trace whether or not it is kept, so that all runs compile the
-    same program.
+    The program is always compiled from the exported trace, saved or not, so that all runs compile
+    the same program.
     """
     exported = _exported(function, arguments, settings)
     there = SingleDeviceSharding(device)
@@ -39,10 +39,11 @@ def compiled(
 
 
 def remembered(function: Callable, settings: object) -> Callable:
-    """`function`, not traced where its trace is kept; to be called while a program is traced.
+    """Return `function` without tracing it if its trace is saved; it is called while a program is
+    traced.
 
-    For functions that are neither mapped nor differentiated from outside. As with `compiled`,
-    first and later runs lead through the exported trace.
+    It is for functions that are neither mapped nor differentiated from outside. As with
+    `compile_exported`, first and later runs use the exported trace.
     """
 
     def call(*arguments: Any) -> Any:
@@ -61,7 +62,10 @@ def lane_program(
     settings: Any,
     small: int = simd.SMALL,
 ) -> Callable[[Sequence[Any], Sequence[np.ndarray]], list[np.ndarray]]:
-    """`simd.lane_program` of this library's functions, kept here; `settings` as for `compiled`."""
+    """Return `simd.compile_lane_program` of this library's functions, saved in the cache folder.
+
+    `settings` are those of `compile_exported`.
+    """
     key = (settings, store.code_digest())
     return simd.lane_program(function, uniform, n_lanes_in, dtype, key, store, small)
 
@@ -69,12 +73,14 @@ def lane_program(
 def lane_function(
     function: Callable, like: Callable, settings: object, small: int = simd.SMALL
 ) -> Callable:
-    """`simd.lane_function` of this library's functions, likewise."""
+    """Return `simd.compile_lane_function` of this library's functions, saved in the
+    cache folder.
+    """
     return simd.lane_function(function, like, (settings, store.code_digest()), store, small)
 
 
 def _exported(function: Callable, arguments: tuple, settings: object) -> export.Exported:
-    """The trace of `function` for arguments like these, as one of their leaves."""
+    """Return the exported trace of `function` for arguments like these, with flat arguments."""
     leaves, structure = jax.tree.flatten(arguments)
     shapes = [jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)) for x in leaves]
     # A trace calls the machine code of one processor: others may share the folder.
@@ -87,9 +93,11 @@ def _exported(function: Callable, arguments: tuple, settings: object) -> export.
         if simd.at_hand(names.decode().split(), store):
             return export.deserialize(bytearray(trace))
     flat = jax.jit(lambda *leaves: function(*jax.tree.unflatten(structure, leaves)))
-    outside = _exporting.set(True)  # what is remembered within is part of this trace
+    outside = _exporting.set(True)  # cached traces called within are part of this trace
     try:
-        called = sorted(_calls(flat.trace(*shapes).jaxpr))  # once: what follows finds the trace
+        called = sorted(
+            _calls(flat.trace(*shapes).jaxpr)
+        )  # traced once: the export below finds it in JAX's cache
         allowed = [export.DisabledSafetyCheck.custom_call(name) for name in called]
         exported = export.export(flat, disabled_checks=allowed)(*shapes)
     finally:
@@ -99,7 +107,7 @@ def _exported(function: Callable, arguments: tuple, settings: object) -> export.
 
 
 def _calls(trace: Any) -> set[str]:
-    """Names of the machine code that a trace calls."""
+    """Return the names of the machine code that a trace calls."""
     trace = getattr(trace, "jaxpr", trace)
     names = {e.params["code"].name for e in trace.eqns if e.primitive is simd.CALLED}
     for equation in trace.eqns:

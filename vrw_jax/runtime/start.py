@@ -1,4 +1,4 @@
-"""How a process of its own computes: 64-bit numbers, compiled code kept, a quick compiler."""
+"""Start-up configuration of a process: 64-bit numbers, a compilation cache, fast compilation."""
 
 import os
 import sys
@@ -10,14 +10,15 @@ from vrw_jax.wording import instance
 
 
 def start_jax(cache: str | Path | None = None) -> None:
-    """64-bit numbers, compiled code kept in `cache`, and on a CPU the quicker of XLA's two ways.
+    """Configure JAX: 64-bit numbers, compiled code in `cache`, and on a CPU XLA's faster
+    compilation.
 
-    To be called before the first array is made; nothing here needs it, but processes start in a
-    fraction of the time. Without `cache` it is the folder that JAX_COMPILATION_CACHE_DIR names, or
-    else one of the user's cache folder.
+    Call it before the first array is created. The library works without it, but with it processes
+    start in a fraction of the time. Without `cache` it uses the folder in
+    JAX_COMPILATION_CACHE_DIR, or else one in the user's cache folder.
 
     Args:
-        cache: folder of compiled code; `~` is the user's own.
+        cache: folder of compiled code; `~` is the user's home.
 
     Returns:
         Nothing.
@@ -42,16 +43,17 @@ def start_jax(cache: str | Path | None = None) -> None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
     flags = os.environ.get("XLA_FLAGS", "")
-    if _KNOWN and _EMITTERS not in flags:  # read when the first array is made
+    if _KNOWN and _EMITTERS not in flags:  # read when the first array is created
         os.environ["XLA_FLAGS"] = f"{flags} --{_EMITTERS}=false".strip()
 
 
 def fusion_emitters(on: bool) -> dict[str, str | bool]:
-    """Which of its two ways of making CPU code XLA takes for a program: options for `jax.jit`.
+    """Return options for `jax.jit` that select XLA's fusion emitters on or off for a program on a
+    CPU.
 
-    Without its fusion emitters it compiles in half to two thirds of the time, to code as fast or,
-    for events on real ground, slower by a seventh. Programs whose digits are promised not to depend
-    on the process always say which.
+    Without them, XLA compiles in half to two thirds of the time. The code is as fast or, for events
+    with unilateral contact, slower by a seventh. Programs whose digits must not depend on the
+    process always set the option.
     """
     return {_EMITTERS: on} if _KNOWN and jax.default_backend() == "cpu" else {}
 
@@ -59,7 +61,7 @@ def fusion_emitters(on: bool) -> dict[str, str | bool]:
 _EMITTERS = "xla_cpu_use_fusion_emitters"
 
 _KNOWN = jax.__version_info__[:2] in ((0, 9), (0, 10))
-"""Whether this XLA has been seen to know the flag: others may end the process over it."""
+"""Whether this version of XLA is known to accept the flag: others may abort the process."""
 
 
 def _cache_folder() -> Path:

@@ -1,4 +1,4 @@
-"""What is computed from code alone, kept on disk beside JAX's compiled code."""
+"""Files computed from code alone, saved beside JAX's compiled code."""
 
 import functools
 import hashlib
@@ -12,7 +12,9 @@ import jax
 
 @functools.cache
 def code_digest() -> str:
-    """A digest of the library's source and methods: other ones may give other digits."""
+    """Return a digest of the library's source and tableaus: a change of either may
+    change digits.
+    """
     digest = hashlib.sha256()
     folder = Path(__file__).parents[1]
     for path in sorted((*folder.rglob("*.py"), *folder.rglob("*.json"))):
@@ -22,12 +24,14 @@ def code_digest() -> str:
 
 
 def folder() -> Any:
-    """JAX's compilation cache; None where there is none."""
+    """Return the folder of JAX's compilation cache; None if there is none."""
     return jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
 
 
 def kept(name: str) -> bytes | None:
-    """What was kept under that name beside JAX's compiled code; None if nothing, or damaged."""
+    """Return the content saved under that name beside JAX's compiled code; None if absent or
+    damaged.
+    """
     place = folder() and Path(folder()) / name
     if not place or not place.exists():
         return None
@@ -37,7 +41,7 @@ def kept(name: str) -> bytes | None:
 
 
 def keep(name: str, content: bytes) -> None:
-    """Written beside its place and renamed; a cache that can't be written is no error."""
+    """Save `content` under that name, in a temporary file that is renamed; failures are ignored."""
     if not folder():
         return
     place = Path(folder()) / name
