@@ -1,4 +1,4 @@
-"""What quantities are called and how results show themselves."""
+"""Names, units and attributes of all quantities, and the provenance of results."""
 
 from vrw_jax.results.measures import (
     CONTACTS,

@@ -1,7 +1,7 @@
-"""What people want to know about a step or a trajectory: one table of names, units and symbols.
+"""Measures of a step, a cycle or a trajectory: one table of names, units and symbols.
 
-Every labelled result takes its units and long names from here, so that a scan, a trajectory and a
-figure name the same thing alike. Frame: x downhill along the slope, z normal to it.
+Every labeled result takes its units and long names from here, so that scans, trajectories and
+figures use the same names. Frame: x downhill along the slope, z normal to it.
 """
 
 from __future__ import annotations
@@ -19,9 +19,10 @@ from vrw_jax.wording import as_tex
 
 @dataclass(frozen=True)
 class Measure:
-    """A named quantity. `unit` is "1" for a pure number; `equation` is the paper's, "" if none.
+    """A named quantity; `unit` is "1" for a pure number, `equation` is the paper's, "" if there is
+    none.
 
-    `breaks` is a clause: what happens where it is negative, "" where nothing does.
+    `violation` is a clause with the consequence of a negative value, "" if there is none.
     """
 
     name: str
@@ -35,7 +36,7 @@ class Measure:
 
     @property
     def tex(self) -> str:
-        """The symbol as mathtext, without dollar signs."""
+        """Symbol as mathtext, without dollar signs."""
         return as_tex(self.symbol)
 
     @property
@@ -46,12 +47,12 @@ class Measure:
 
     @property
     def plain_unit(self) -> str:
-        """The unit for a reader, "" for a pure number."""
+        """Unit for a reader, "" for a pure number."""
         return "" if self.unit == "1" else self.unit
 
     @property
     def attrs(self) -> dict[str, str]:
-        """Attributes of a labelled variable that holds this quantity."""
+        """Attributes of a labeled variable that holds this quantity."""
         attrs = {
             "units": self.unit,
             "long_name": self.long_name,
@@ -61,7 +62,7 @@ class Measure:
         return attrs | ({"equation": self.equation} if self.equation else {})
 
     def text(self, value: object) -> str:
-        """A number with its unit, for a reader."""
+        """Return a number with its unit, for a reader."""
         return f"{float(np.asarray(value)):.6g} {self.plain_unit}".strip()
 
 
@@ -162,7 +163,7 @@ MARGINS = _table(
             "Friction coefficient less the one needed at the rear foot in the landing impulse.",
             breaks="rear foot slides in the landing"),
 )
-"""Premises of the rung as signed margins over one step, negative where broken: `Margins`."""
+"""Margins of the model over one step, signed, negative where violated: `Margins`."""
 
 GROUND = _table(
     Measure("duration_single", "s", "t₁", "time on one foot", "Time with one loaded foot."),
@@ -174,7 +175,7 @@ GROUND = _table(
             "Mechanical energy lost by sliding feet between impacts."),
     Measure("friction", "1", "μ", "friction coefficient", "Of the ground."),
 )
-"""Measures of a step on real ground, beside those of `STEP` that it shares (`SHARED`)."""
+"""Measures of a step with unilateral contact, beside those of `STEP_MEASURES` that it shares."""
 
 STOPPERS = _table(
     Measure("stopper_force", "N", "min F_stop", "least force of a stopper on a leg in the air",
@@ -185,7 +186,8 @@ STOPPERS = _table(
             "Negative where a stopper that only pushes would let an impact throw a leg off.",
             breaks="an impact throws a leg off its stopper"),
 )
-"""Premises of a step on real ground whose stoppers hold legs in the air, negative where broken."""
+"""Margins of a step with unilateral contact whose stoppers hold legs in the air, negative where
+violated."""
 
 SHARED = (
     "dls_fraction",
@@ -201,12 +203,12 @@ SHARED = (
     "outcome",
     "solver_steps",
 )
-"""Measures of `STEP` that every rung tells."""
+"""Measures of `STEP_MEASURES` that every model reports."""
 
 ON_GROUND = tuple(
     name for name in (*SHARED, *GROUND) if name not in ("outcome", "solver_steps", "friction")
 )
-"""Measures of a step on real ground that have derivatives."""
+"""Measures of a step with unilateral contact that have derivatives."""
 
 CYCLE = _table(
     Measure("spectral_radius", "1", "ρ", "spectral radius",
@@ -270,7 +272,7 @@ CONTACTS = _table(
     Measure("on_stopper", "1", "on stopper", "whether the leg is on its stopper", "Of each leg.",
             axis="leg"),
 )
-"""Variables of a trajectory on real ground, of each leg 1..n."""
+"""Variables of a trajectory with unilateral contact, of each leg 1..n."""
 
 # fmt: on
 PARAMETERS = _table(
@@ -279,45 +281,47 @@ PARAMETERS = _table(
         for name, domain in DOMAINS.items()
     )
 )
-"""The wheel's parameters, for the axes of a scan."""
+"""Parameters of the wheel, for the axes of a scan."""
 
 MEASURES: dict[str, Measure] = (
     STEP | MARGINS | GROUND | STOPPERS | CYCLE | TRAJECTORY | CONTACTS | PARAMETERS
 )
-"""Every quantity by name."""
+"""All quantities by name."""
 
 PHASES = tuple(phase.name for phase in OF_STEP)
 """Names of the phases of a step, in order: values 0, 1, 2 of `phase`."""
 
 
 def flags(names: Iterable[str]) -> dict[str, object]:
-    """CF attributes of an integer variable whose values 0, 1, ... have names."""
+    """Return CF attributes of an integer variable whose values 0, 1, ... have names."""
     names = [name.replace(" ", "_") for name in names]
     return {"flag_values": list(range(len(names))), "flag_meanings": " ".join(names)}
 
 
 def measure_of(name: str) -> Measure:
-    """The measure that a number belongs to.
+    """Return the measure that a number belongs to.
 
-    Its name may end in its leg, as "[5]", and begin with the minus of a bound from above.
+    The name may end in its leg, as "[5]", and begin with the minus of an upper bound.
     """
     return MEASURES[name.removeprefix("-").partition("[")[0]]
 
 
 def variables(columns: Mapping[str, np.ndarray], along: str) -> dict[str, xr.Variable]:
-    """Measures over one dimension, labelled; those of the locked legs have `leg` beside it."""
+    """Return labeled measures over one dimension; those of the locked legs have the dimension `leg`
+    too.
+    """
     dims = lambda name: (along, MEASURES[name].axis) if MEASURES[name].axis else along
     return {name: xr.Variable(dims(name), x, attrs_of(name)) for name, x in columns.items()}
 
 
 def locked_legs(n_legs: int) -> xr.Variable:
-    """The coordinate `leg` of margins of legs 3..n."""
+    """Return the coordinate `leg` of margins of legs 3..n."""
     attrs = {"long_name": "locked leg", "units": "1"}
     return xr.Variable("leg", np.arange(3, n_legs + 1), attrs)
 
 
 def what_breaks(name: str) -> str:
-    """What happens where a margin or an indicator is zero; `name` may end in its leg, "[5]"."""
+    """Return the event at which a margin or indicator is zero; `name` may end in its leg, "[5]"."""
     base, _, leg = name.partition("[")
     if base in STEP and not MEASURES[base].breaks:
         return f"{MEASURES[base].long_name} is zero"
@@ -328,7 +332,9 @@ def what_breaks(name: str) -> str:
 
 
 def attrs_of(name: str) -> dict[str, object]:
-    """Attributes of the variable `name`; phase and outcome name their values too."""
+    """Return the attributes of the variable `name`; phase, contact and outcome include their flag
+    names.
+    """
     attrs: dict[str, object] = dict(MEASURES[name].attrs)
     if name == "phase":
         attrs |= flags(PHASES)

@@ -1,4 +1,4 @@
-"""Where results come from: versions, device, number format, tolerances, parameters."""
+"""Provenance of results: versions, device, number format, tolerances, parameters."""
 
 import functools
 import importlib.metadata
@@ -13,7 +13,9 @@ from vrw_jax.wheel import PARAMETER_NAMES, WheelParams
 def provenance(
     params: WheelParams, model: object, options: Options
 ) -> dict[str, str | float | int]:
-    """Where a result comes from: versions, device, number format, tolerances, parameters."""
+    """Return the provenance of a result: versions, device, number format,
+    tolerances, parameters.
+    """
     names = ("vrw-jax", "jax", "diffrax", "numpy")
     values: dict[str, str | float | int] = {
         f"parameter_{name}": float(getattr(params, name))
@@ -33,7 +35,7 @@ def provenance(
     }
 
 
-@functools.cache  # reading it takes longer than the steps of a walk
+@functools.cache  # reading the metadata takes longer than the steps of a walk
 def _version(name: str) -> str:
     try:
         return importlib.metadata.version(name)
