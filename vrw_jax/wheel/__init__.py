@@ -1,4 +1,4 @@
-"""The wheel itself: parameters, points, accelerations and forces, phases, jumps, outcomes."""
+"""Wheel parameters, geometry, dynamics, phases, transitions and outcomes."""
 
 from vrw_jax.wheel import dynamics, transitions
 from vrw_jax.wheel.dynamics import damping_power, mass_matrix, momentum

@@ -1,10 +1,11 @@
-"""How the wheel accelerates, phase by phase, and the forces that hold it there.
+"""Accelerations of the wheel in each phase, and the contact and stopper forces.
 
-With Leg 1's foot at rest the wheel has the coordinates (theta, L1, L2). Written with the hub's
-velocity in Leg 1's own frame the mass matrix does not depend on theta, and every phase follows from
-one set of `terms`: double support restricts it to the circle of the hub (1 degree of freedom),
-single support I is its 3 x 3 solve, single support II drops L2 (2 degrees of freedom). The
-constraints of eq. (2) hold by construction. Docs: docs/physics.md derives every line.
+With the foot of Leg 1 at rest the wheel has the coordinates (theta, L1, L2). Written with the hub's
+velocity in the frame of Leg 1, the mass matrix does not depend on theta. Every phase follows from
+one set of `equation_terms`. Double support restricts them to the circle of the hub, with one degree
+of freedom. Single support I is their 3 x 3 solve. Single support II drops L2 and has two degrees of
+freedom. The constraints of eq. (2) hold by construction. The page docs/physics.md derives every
+line.
 """
 
 from typing import NamedTuple
@@ -42,6 +43,7 @@ class MassMatrix(NamedTuple):
     M33: Elementwise  # kg
 
     def times(self, x: tuple[Elementwise, Elementwise, Elementwise]) -> Vector:
+        """Return the product of the mass matrix and the vector x."""
         return (
             self.M11 * x[0] + self.M12 * x[1] + self.M13 * x[2],
             self.M12 * x[0] + self.M22 * x[1] + self.M23 * x[2],
@@ -59,9 +61,10 @@ class Terms(NamedTuple):
 
 
 def mass_matrix(s: Symbols, L1: Elementwise, L2: Elementwise) -> MassMatrix:
-    """M(q) of eq. (1) restricted to a planted Leg 1."""
+    """Return M(q) of eq. (1) restricted to a planted Leg 1."""
     b, coupling = L2 - s.a, _coupling(s, L2)
-    still = s.m * (s.a * s.a + (s.n - 2) * s.c0 * s.c0)  # the wheel's numbers first: known at once
+    # Grouped first, because it depends on parameters only.
+    still = s.m * (s.a * s.a + (s.n - 2) * s.c0 * s.c0)
     return MassMatrix(
         M11=L1 * (s.Mh * L1 + 2.0 * coupling) + (still + s.m * b * b),
         M12=s.m * s.sin_alpha * (L2 - s.L0),
@@ -73,12 +76,15 @@ def mass_matrix(s: Symbols, L1: Elementwise, L2: Elementwise) -> MassMatrix:
 
 
 def _coupling(s: Symbols, L2: Elementwise) -> Elementwise:
-    """Moment of mass that turns with the hub, kg m."""
+    """Return the moment of mass that turns with the hub, kg m."""
     return s.m * (s.c0 + s.cos_alpha * s.L0) - s.m * s.cos_alpha * L2
 
 
 def terms(s: Symbols, motion: Motion) -> Terms:
-    """Mass matrix and applied forces: gravity, springs and dampers (eq. 3), inertial forces."""
+    """Return the mass matrix and the applied forces.
+
+    The forces are gravity, springs and dampers (eq. 3) and the inertial forces.
+    """
     sin, cos, L1, L2, dtheta, dL1, dL2 = motion
     mass = mass_matrix(s, L1, L2)
     sin_p = sin * s.cos_phi + cos * s.sin_phi  # of theta + phi
@@ -107,12 +113,15 @@ def terms(s: Symbols, motion: Motion) -> Terms:
 
 
 def single_support_1_acceleration(s: Symbols, motion: Motion) -> Acceleration:
-    """SLS-I, three degrees of freedom: Leg 2 swings and telescopes freely. Section 3.3.2."""
+    """Return the accelerations in SLS-I (Section 3.3.2), with three degrees of freedom.
+
+    Leg 2 swings and telescopes freely.
+    """
     return free_acceleration(s, motion.L1, terms(s, motion))
 
 
 def free_acceleration(s: Symbols, L1: Elementwise, free: Terms) -> Acceleration:
-    """What the applied forces alone do with Leg 1's foot at rest: M q'' = f."""
+    """Return the accelerations of the applied forces alone: M q'' = f, with foot 1 at rest."""
     M, f1, f2, f3 = free
     q = s.sin_alpha * L1  # eliminates L2: its row of M is m (-q, -cos alpha, 1)
     A11 = M.M11 + M.M13 * q
@@ -123,17 +132,18 @@ def free_acceleration(s: Symbols, L1: Elementwise, free: Terms) -> Acceleration:
     inverse = 1.0 / (A11 * A22 - A12 * A12)
     ddtheta = (A22 * F1 - A12 * F2) * inverse
     ddL1 = (A11 * F2 - A12 * F1) * inverse
-    per_mass = 1.0 / s.m  # known before a loop over steps begins
+    per_mass = 1.0 / s.m  # parameters only, so XLA hoists it out of loops over steps
     return Acceleration(ddtheta, ddL1, f3 * per_mass + q * ddtheta + s.cos_alpha * ddL1)
 
 
 def takeoff_acceleration(s: Symbols, motion: Motion) -> Elementwise:
-    """Normal acceleration of foot 2 at the start `motion` of SLS-I, m/s^2.
+    """Return the normal acceleration of foot 2 at the start `motion` of SLS-I, m/s^2.
 
-    The foot is at rest on the ground there, so its sign says whether it rises or scuffs; the jump
-    from zero is the tangential force that the ground no longer gives. Smooth where the clearance is
-    not: that is the lowest *later* height, which vanishes with the cube of the distance to the
-    border of scuffing on one side and jumps on the other.
+    Foot 2 is at rest on the ground at that instant, so it rises if the value is positive and scuffs
+    if it is negative. The jump from zero is the effect of the lost tangential force of the ground.
+    The value is smooth at the boundary of scuffing. The clearance is not: it is the lowest *later*
+    height, which vanishes with the cube of the distance to the boundary on one side and jumps on
+    the other.
     """
     L1, L2, dtheta = motion.L1, motion.L2, motion.dtheta
     ddtheta, ddL1, ddL2 = single_support_1_acceleration(s, motion)
@@ -145,27 +155,31 @@ def takeoff_acceleration(s: Symbols, motion: Motion) -> Elementwise:
 
 
 def single_support_2_acceleration(s: Symbols, motion: Motion) -> Acceleration:
-    """SLS-II, two degrees of freedom: Leg 2 is on its stopper, where M12 = 0. Section 3.3.3."""
+    """Return the accelerations in SLS-II (Section 3.3.3), with two degrees of freedom.
+
+    Leg 2 is on its stopper, where M12 = 0.
+    """
     M, f1, f2, _ = terms(s, motion)
     per_mass = 1.0 / M.M22
     return Acceleration(f1 / M.M11, f2 * per_mass, 0.0 * f1)
 
 
 class OneDegree(NamedTuple):
-    """The equation of motion of a single degree of freedom: inertia * ddtheta = force."""
+    """Equation of motion of a single degree of freedom: inertia * ddtheta = force."""
 
     inertia: Elementwise  # kg m^2
     force: Elementwise  # N m
 
 
 def double_support(s: Symbols, distance: Elementwise, motion: Motion) -> OneDegree:
-    """DLS, one degree of freedom: the hub moves on a circle over both feet. Section 3.3.1.
+    """Return the equation of motion in DLS, where the hub moves on a circle (Section 3.3.1).
 
-    `terms` restricted to that circle. Over the bisector of both legs, whose sine and cosine are in
-    proportion to the sums of theirs, all is a trigonometric polynomial whose numbers are the
-    wheel's: half the work of the restriction itself.
+    It is `equation_terms` restricted to that circle. The bisector of both legs has a sine and
+    cosine proportional to the sums of theirs. Over it, everything is a trigonometric polynomial
+    whose coefficients depend on the wheel only, which halves the work of the restriction.
     """
-    size, per = distance / s.sin_alpha, 1.0 / (1.0 + s.cos_alpha)  # diameter of the circle
+    # `diameter` is that of the circle.
+    size, per = distance / s.sin_alpha, 1.0 / (1.0 + s.cos_alpha)
     light, swing = s.g * (s.Mh - s.m) * size, s.m * s.c0 * size
     leg, spring, damper = s.g * s.m * s.L0, s.k * size, s.c * size * size
     at_rest = size * size * (s.Mh - s.m) + s.m * (2.0 * s.a * s.a + (s.n - 2) * s.c0 * s.c0)
@@ -182,7 +196,7 @@ def double_support(s: Symbols, distance: Elementwise, motion: Motion) -> OneDegr
 
 
 def double_support_acceleration(s: Symbols, distance: Elementwise, motion: Motion) -> Acceleration:
-    """DLS: all accelerations of `double_support`."""
+    """Return all accelerations in DLS, from `double_support_equation`."""
     inertia, force = double_support(s, distance, motion)
     circle = double_support_circle(s, distance, motion.sin, motion.cos)
     return along_circle(circle, motion.dtheta, force / inertia)
@@ -191,7 +205,7 @@ def double_support_acceleration(s: Symbols, distance: Elementwise, motion: Motio
 def along_circle(
     circle: CircleOfDoubleSupport, dtheta: Elementwise, ddtheta: Elementwise
 ) -> Acceleration:
-    """All accelerations in double support, where the hub's circle leaves only theta free."""
+    """Return all accelerations in double support, where the hub's circle leaves only theta free."""
     centripetal = dtheta * dtheta
     return Acceleration(
         ddtheta,
@@ -208,7 +222,9 @@ class FootForce(NamedTuple):
 
 
 def friction_needed(force: FootForce) -> Elementwise:
-    """Tangential over normal force; 0 for a foot that is not pressed on the ground."""
+    """Return the ratio of tangential to normal force; 0 for a foot without a positive normal
+    force.
+    """
     pressed = force.normal > 0.0
     ratio = jnp.abs(force.tangential) / jnp.where(pressed, force.normal, 1.0)
     return jnp.where(pressed, ratio, 0.0)
@@ -217,7 +233,7 @@ def friction_needed(force: FootForce) -> Elementwise:
 def foot_force_from_residual(
     s: Symbols, motion: Motion, along_L1: Elementwise, along_L2: Elementwise
 ) -> FootForce:
-    """Rear-foot force that supplies the generalised forces along L1 and L2 (rows of eq. 1)."""
+    """Return the rear-foot force that supplies these generalized forces along L1 and L2 (eq. 1)."""
     rear = rear_direction(s, motion.sin, motion.cos)
     return FootForce(
         -(rear.cos * along_L1 + motion.cos * along_L2) / s.sin_alpha,
@@ -226,7 +242,9 @@ def foot_force_from_residual(
 
 
 def rear_foot_force(s: Symbols, motion: Motion, acceleration: Acceleration) -> FootForce:
-    """(lambda_3, lambda_4) in double support, N: what M q'' needs beyond the applied forces."""
+    """Return (lambda_3, lambda_4) in double support, N: the part of M q'' beyond the applied
+    forces.
+    """
     M, _, f2, f3 = terms(s, motion)
     needed = M.times(acceleration)
     return foot_force_from_residual(s, motion, needed[1] - f2, needed[2] - f3)
@@ -235,7 +253,7 @@ def rear_foot_force(s: Symbols, motion: Motion, acceleration: Acceleration) -> F
 def fore_foot_force(
     s: Symbols, motion: Motion, acceleration: Acceleration, rear: FootForce | None = None
 ) -> FootForce:
-    """(lambda_1, lambda_2), N: rate of total momentum less weight and rear-foot force."""
+    """Return (lambda_1, lambda_2), N: rate of total momentum minus weight and rear-foot force."""
     sin, cos, L1, L2, dtheta, dL1, dL2 = motion
     ddtheta, ddL1, ddL2 = acceleration
     A, dA, ddA = s.Mh * L1 + s.m * s.L0, s.Mh * dL1, s.Mh * ddL1
@@ -255,7 +273,7 @@ def fore_foot_force(
 
 
 def momentum(s: Symbols, motion: Motion) -> tuple[Elementwise, Elementwise]:
-    """Total linear momentum along (x, z) with Leg 1's foot at rest, kg m/s."""
+    """Return the total linear momentum along (x, z) with the foot of Leg 1 at rest, kg m/s."""
     sin, cos, L1, L2, dtheta, dL1, dL2 = motion
     leg2 = rear_direction(s, sin, cos)
     radial_1, across_1 = s.Mh * dL1, (s.Mh * L1 + s.m * s.L0) * dtheta
@@ -269,14 +287,15 @@ def momentum(s: Symbols, motion: Motion) -> tuple[Elementwise, Elementwise]:
 def stopper_force(
     s: Symbols, motion: Motion, acceleration: Acceleration, legs: range
 ) -> Float[Array, "n_legs_asked ..."]:
-    """Force of the stopper that keeps each of `legs` at L0, N; negative where it would come off.
+    """Return the force of the stopper that keeps each of `legs` at L0, N.
 
-    The spring presses with k (L* - L0); weight and acceleration of the leg's mass relieve it.
+    It is negative where the leg would come off its stopper. The spring presses with k (L* - L0);
+    weight and acceleration of the leg's mass relieve it.
     """
     turn = s.alpha * (np.asarray(legs).reshape(-1, *(1,) * jnp.ndim(motion.L1)) - 1)
     radial = acceleration.ddL1 - motion.L1 * motion.dtheta * motion.dtheta
     across = 2.0 * motion.dL1 * motion.dtheta + motion.L1 * acceleration.ddtheta
-    # Acceleration of the hub less gravity, in the frame of Leg 1.
+    # Acceleration of the hub minus gravity, in the frame of Leg 1.
     radial = radial + s.g * (motion.cos * s.cos_phi - motion.sin * s.sin_phi)
     across = across - s.g * (motion.sin * s.cos_phi + motion.cos * s.sin_phi)
     along = radial * np.cos(turn) + across * np.sin(turn)
@@ -285,7 +304,9 @@ def stopper_force(
 
 
 class Energy(NamedTuple):
-    """Mechanical energy, J; gravity counts from the present foot of Leg 1. Section 3.5."""
+    """Mechanical energy, J; the gravitational part has its zero at the present foot of Leg 1
+    (Section 3.5).
+    """
 
     kinetic: Elementwise
     gravitational: Elementwise
@@ -293,19 +314,19 @@ class Energy(NamedTuple):
 
     @property
     def total(self) -> Elementwise:
-        """E of eq. (26), J."""
+        """Total energy E of eq. (26), J."""
         return self.kinetic + self.gravitational + self.elastic
 
 
 def kinetic_energy(s: Symbols, motion: Motion) -> Elementwise:
-    """Half of q' M q', J."""
+    """Return half of q' M q', J."""
     rates = (motion.dtheta, motion.dL1, motion.dL2)
     p = mass_matrix(s, motion.L1, motion.L2).times(rates)
     return 0.5 * (p[0] * rates[0] + p[1] * rates[1] + p[2] * rates[2])
 
 
 def energy(s: Symbols, motion: Motion) -> Energy:
-    """Kinetic, gravitational and elastic energy (eqs 26, 27), J."""
+    """Return the kinetic, gravitational and elastic energy (eqs 26, 27), J."""
     sin_p = motion.sin * s.cos_phi + motion.cos * s.sin_phi
     cos_p = motion.cos * s.cos_phi - motion.sin * s.sin_phi
     rear_cos_p = cos_p * s.cos_alpha - sin_p * s.sin_alpha
@@ -316,5 +337,5 @@ def energy(s: Symbols, motion: Motion) -> Energy:
 
 
 def damping_power(s: Symbols, motion: Motion) -> Elementwise:
-    """Power lost in the dampers, c (dL1^2 + dL2^2), W (eq. 29)."""
+    """Return the power lost in the dampers, c (dL1^2 + dL2^2), W (eq. 29)."""
     return s.c * (motion.dL1 * motion.dL1 + motion.dL2 * motion.dL2)

@@ -1,10 +1,10 @@
-"""How a step can end: one integer code per lane, with a name and a sentence."""
+"""Outcomes of a step: one integer code per batch element, with a name and a sentence."""
 
 from vrw_jax.numerics import Code
 
 
 class Outcome(Code):
-    """How a step ended. Only STEPPED leaves a section state; the others end the walk.
+    """Outcome of a step. Only STEPPED leaves a section state; every other code ends the walk.
 
     Examples:
         >>> vrw.Outcome.FELL_BACK.meaning

@@ -1,4 +1,4 @@
-"""What the wheel is made of: parameters with units and domains, and the paper's symbols."""
+"""Wheel parameters with units and domains, and the symbols of the paper."""
 
 import functools
 import math
@@ -15,7 +15,7 @@ from vrw_jax.wording import AbstractTold, Row, reals, shown, told, whole
 
 
 class Domain(NamedTuple):
-    """Unit, symbol and allowed open/closed range of one parameter."""
+    """Unit, symbol and allowed open or closed range of one parameter."""
 
     symbol: str
     unit: str
@@ -25,12 +25,12 @@ class Domain(NamedTuple):
     description: str
 
     def contains(self, value: Any) -> Any:
-        """Whether value lies in the range; False for NaN."""
+        """Return whether the value lies in the range; False for NaN."""
         above = value >= self.lower if self.lower_is_allowed else value > self.lower
         return above & (value < self.upper)
 
     def require(self, name: str, value: float) -> None:
-        """Refuse a number outside."""
+        """Raise `ValueError` if the value lies outside the range."""
         if not self.contains(value):
             raise ValueError(
                 f"{name} is {value:g}, but {self.description} must lie in {self}: "
@@ -44,7 +44,7 @@ class Domain(NamedTuple):
 
 
 SMALLEST, LARGEST = 1e-15, 1e9
-"""Where SI numbers of a wheel end: beyond them, products overflow instead of telling something."""
+"""Bounds on the SI numbers of a wheel, chosen because products overflow beyond them."""
 
 DOMAINS: dict[str, Domain] = {
     "hub_mass": Domain("m_H", "kg", 0.0, LARGEST, True, "mass of the body frame"),
@@ -57,11 +57,11 @@ DOMAINS: dict[str, Domain] = {
     "slope": Domain("phi", "rad", -math.pi / 2, math.pi / 2, False, "downhill slope"),
     "gravity": Domain("g", "m/s^2", SMALLEST, LARGEST, True, "gravitational acceleration"),
 }
-"""Every float parameter of `WheelParams`, in the order of its fields."""
+"""Domain of every float parameter of `WheelParams`, in the order of its fields."""
 
 
 class Symbols(NamedTuple):
-    """The paper's symbols and the combinations that every formula needs, unpacked once."""
+    """Symbols of the paper and the combinations shared by the formulas, for local unpacking."""
 
     m: Elementwise
     a: Elementwise
@@ -73,11 +73,11 @@ class Symbols(NamedTuple):
     sin_phi: Elementwise
     cos_phi: Elementwise
     Mh: Elementwise
-    """Mass that hangs on Leg 1: hub and n - 1 legs, kg."""
+    """Mass of the hub and the n - 1 legs other than Leg 1, kg."""
     Mt: Elementwise
     """Total mass, kg."""
     c0: Elementwise
-    """Distance of a locked leg's mass from the hub, L0 - a, m."""
+    """Distance of the mass of a locked leg from the hub, L0 - a, m."""
     n: int
     sin_alpha: float
     cos_alpha: float
@@ -97,11 +97,12 @@ _n_legs = functools.partial(
 
 
 class WheelParams(AbstractTold):
-    """Parameters of the viscoelastic-legged rimless wheel; the defaults are Table 1, slope 0.30.
+    """Parameters of the viscoelastic-legged rimless wheel; the defaults are Table 1 with slope
+    0.30.
 
-    All fields but `n_legs` are pytree leaves in SI units and may be swept and differentiated.
-    The paper does not print g; 9.81 m/s^2 reproduces its numbers. A number out of its domain is
-    refused here when it is a plain scalar; inside a batch it becomes `Outcome.BAD_INPUT`.
+    All fields except `n_legs` are pytree leaves in SI units and may be swept and differentiated.
+    The paper does not print g; 9.81 m/s^2 reproduces its numbers. A plain scalar outside its domain
+    raises an error here; in a batch, such a value becomes `Outcome.BAD_INPUT`.
 
     - `hub_mass`: m_H, mass of the body frame, in [0, 1e+09) kg;
     - `leg_mass`: m, mass of one leg frame, a point, in [1e-15, 1e+09) kg;
@@ -172,14 +173,14 @@ class WheelParams(AbstractTold):
 
     @property
     def in_axes(self) -> "WheelParams":
-        """0 for each parameter with an axis, None for the others: the `in_axes` of `jax.vmap`.
+        """Return 0 for each parameter with an axis and None for the others, as `jax.vmap` expects.
 
-        As in `jax.vmap(vrw.limit_cycle, in_axes=(params.in_axes,))(params)`.
+        For example `jax.vmap(vrw.limit_cycle, in_axes=(params.in_axes,))(params)`.
         """
         return jax.tree.map(lambda x: 0 if jnp.ndim(x) else None, self)
 
     def require_one(self, instead: str) -> None:
-        """Refuse a batch where one wheel is meant."""
+        """Raise `ValueError` if any parameter has an axis, with `remedy` in the message."""
         for name in DOMAINS:
             if shape := getattr(self, name).shape:
                 raise ValueError(
@@ -192,7 +193,7 @@ class WheelParams(AbstractTold):
         return "WheelParams" + other
 
     def rows(self) -> list[Row]:
-        """Symbol, value and unit of each parameter; of a gradient, what it is by."""
+        """Return symbol, value and unit of each parameter; for a gradient, its denominators."""
         values = {name: getattr(self, name) for name in DOMAINS}
         if not np.all(self.in_domain()):
             by = lambda d: f"{d.symbol}, {d.unit}" if d.unit else d.symbol
@@ -202,11 +203,11 @@ class WheelParams(AbstractTold):
 
     @property
     def leg_angle(self) -> float:
-        """Angle between neighbouring legs, alpha = 2 pi / n_legs, rad."""
+        """Angle between neighboring legs, alpha = 2 pi / n_legs, rad."""
         return 2.0 * math.pi / self.n_legs
 
     def in_domain(self) -> Bool[Array, "..."]:
-        """Whether every parameter is finite and in its domain, lane by lane."""
+        """Return whether every parameter is finite and in its domain, elementwise."""
         inside = self.leg_com < self.locked_length
         for name, domain in DOMAINS.items():
             value = getattr(self, name)
@@ -214,7 +215,7 @@ class WheelParams(AbstractTold):
         return inside
 
     def symbols(self) -> Symbols:
-        """The paper's symbols with the combinations shared by every formula."""
+        """Return the symbols of the paper with the combinations shared by the formulas."""
         return symbols_of(self.n_legs, *(getattr(self, name) for name in DOMAINS))
 
 
@@ -230,7 +231,7 @@ def symbols_of(
     slope: Elementwise,
     gravity: Elementwise,
 ) -> Symbols:
-    """`WheelParams.symbols` of bare numbers, which may be complex too."""
+    """Return the `Symbols` of plain numbers, which may be complex."""
     alpha = 2.0 * math.pi / n_legs
     sin_phi, cos_phi = sine_cosine(slope)
     return Symbols(
@@ -255,11 +256,14 @@ def symbols_of(
 
 PARAMETER_NAMES: tuple[str, ...] = tuple(DOMAINS)
 FRICTION = "friction"
-"""What a design or a branch may move beside them: a parameter of the ground, held by its model."""
+"""Name of the ground's coefficient of friction, which designs and branches may vary as well."""
 
 
 def friction_of(value: object) -> Array:
-    """A coefficient of friction, or an array of them."""
+    """Return a coefficient of friction, or an array of them, as a JAX array.
+
+    Raises `ValueError` for a negative number or NaN.
+    """
     friction = reals(FRICTION, value)
     plain = not isinstance(friction, jax.core.Tracer) and friction.ndim == 0
     if plain and not float(friction) >= 0.0:
@@ -271,7 +275,10 @@ def friction_of(value: object) -> Array:
 
 
 def known_friction(value: Any) -> float:
-    """The same as a plain number, where the motion does not feel it."""
+    """Return the coefficient of friction as a float, for models whose motion is independent of it.
+
+    Raises `TypeError` for an array with an axis or a traced value.
+    """
     if friction_of(value).ndim or isinstance(value, jax.core.Tracer):
         raise TypeError(
             f"friction is {shown(value)}, but one known number is needed here: give a float; "
@@ -281,10 +288,10 @@ def known_friction(value: Any) -> float:
 
 
 def parameters_of(params: WheelParams) -> Array:
-    """The float parameters as one array, first axis in the order of PARAMETER_NAMES."""
+    """Return the float parameters as one array; the first axis follows `PARAMETER_NAMES`."""
     return jnp.stack([getattr(params, name) for name in PARAMETER_NAMES])
 
 
 def wheel_of(parameters: Array | tuple[Array, ...], n_legs: int) -> WheelParams:
-    """The inverse of `parameters_of`."""
+    """Return the wheel with these parameters: the inverse of `stack_parameters`."""
     return WheelParams(**dict(zip(PARAMETER_NAMES, parameters, strict=True)), n_legs=n_legs)

@@ -1,9 +1,10 @@
-"""The three phases of the paper's step, written once: every engine reads them here.
+"""The three phases of the paper's step (Section 3.3), shared by every engine.
 
-A phase moves in the first `n` of the coordinates (theta, L1, L2); the others follow. All is
-elementwise: one wheel, lanes, nodes of a collocation. Guards are positive inside the phase and
-watched on the way down; the first of them is the phase's own end, and `after` turns the motion
-there into that with which the next of PHASES begins. Section 3.3.
+A phase integrates the first `n_dof` of the coordinates (theta, L1, L2); the others follow from
+them. Everything is elementwise: for one wheel, a batch, or the nodes of a collocation. Guards are
+positive inside the phase and trigger when they fall through zero. The first guard is the regular
+end of the phase. `reset_map` turns the motion at that end into the initial motion of the next of
+`PAPER_PHASES`.
 """
 
 import abc
@@ -28,11 +29,11 @@ from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import Symbols
 
 FALLS = (Outcome.FELL_BACK, Outcome.COLLAPSED, Outcome.LEG_1_LIFTED_OFF)
-"""Ways to leave the paper's sequence that every phase shares."""
+"""Outcomes by which every phase may leave the paper's sequence."""
 
 
 class Premises(NamedTuple):
-    """What a phase measures but does not act on, in this order: negative where one breaks."""
+    """Margins of a phase, which do not affect its motion: negative where violated."""
 
     fore_foot_force: Elementwise  # N
     contraction: Elementwise  # L0 - L1, m
@@ -43,7 +44,7 @@ class Premises(NamedTuple):
 
     @classmethod
     def named(cls, row: Vector, n_legs: int) -> "Premises":
-        """From all values in a row."""
+        """Return the margins from one sequence of all values."""
         n_locked = n_legs - 2
         fore, contraction, friction, *rest = row
         locked, own = tuple(rest[:n_locked]), rest[n_locked:]
@@ -55,78 +56,89 @@ class AbstractPhase(abc.ABC):
     """A phase of the wheel `s`."""
 
     s: Symbols
-    held: Vector  # what the phase holds constant: in double support the feet's distance, m
-    stop_at_lift_off: bool  # whether a ground that would have to pull ends it
+    held: Vector  # constants of the phase: in double support the distance of the feet, m
+    stop_at_lift_off: bool  # whether a negative normal force on foot 1 ends the phase
 
     name: ClassVar[str]
     n: ClassVar[int]
-    """Degrees of freedom."""
+    """Number of degrees of freedom."""
     own_outcomes: ClassVar[tuple[Outcome, ...]]
-    """What `end` (STEPPED) and `own_guards` mean."""
+    """Outcomes of `end_guard` (STEPPED) and of `own_guards`."""
     contraction_counts: ClassVar[bool] = False
     own_premises_count: ClassVar[tuple[bool, ...]] = ()
-    """Whether Leg 1's contraction and the phase's own premises count where it starts: not what is
-    zero there by construction."""
+    """Whether Leg 1's contraction and the phase's own margins count at the start of the phase.
+
+    A margin that is zero there by construction does not count.
+    """
     stiff_start: ClassVar[bool] = False
-    """Whether it begins with the airborne leg's fast mode, near c/m, which dies at once."""
+    """Whether the phase starts with the fast mode of the airborne leg, near c/m, which decays at
+    once."""
 
     @abc.abstractmethod
     def motion(self, sin: Elementwise, cos: Elementwise, q: Vector, v: Vector) -> Motion:
-        """All coordinates from the phase's own ones and their rates; sine and cosine of theta."""
+        """Return the full motion from the phase's own coordinates and rates, and theta's sine and
+        cosine.
+        """
 
     @abc.abstractmethod
     def acceleration(self, motion: Motion) -> Acceleration:
-        """What the equations of motion say."""
+        """Return all accelerations by the equations of motion."""
 
     @abc.abstractmethod
     def residual(self, motion: Motion, own: Vector) -> Vector:
-        """What the equations of motion leave over at accelerations `own`, linear in them.
+        """Return the residual of the equations of motion at `own_acceleration`, in which it is
+        linear.
 
-        Multiplied out they cost far less to differentiate than solved for.
+        Differentiating the residual is far cheaper than differentiating its solution.
         """
 
     @abc.abstractmethod
     def solve(self, motion: Motion, rows: Vector) -> Vector:
-        """The phase's own accelerations that `residual` is linear in, where it equals `rows`."""
+        """Return the phase's own accelerations for which the linear part of the residual equals
+        `rows`.
+        """
 
     @abc.abstractmethod
     def complete(self, motion: Motion, own: Vector) -> Acceleration:
-        """All three accelerations from the phase's own ones."""
+        """Return all three accelerations from the phase's own ones."""
 
     @abc.abstractmethod
     def end(self, at: "Instant") -> Elementwise:
-        """The guard that is the phase's own end."""
+        """Return the guard of the phase's regular end."""
 
     @abc.abstractmethod
     def own_guards(self, at: "Instant") -> Vector:
-        """Guards that other phases have not."""
+        """Return the guards that other phases do not have."""
 
     @abc.abstractmethod
     def own_premises(self, at: "Instant") -> Vector:
-        """Premises beyond those of every phase."""
+        """Return the margins beyond those shared by every phase."""
 
     @abc.abstractmethod
     def after(self, motion: Motion) -> Motion:
-        """The motion just after the phase's own end."""
+        """Return the motion just after the phase's regular end."""
 
     def at(self, q: Vector, v: Vector) -> Motion:
+        """Return the full motion at the phase's own coordinates q and rates v."""
         return self.motion(*sine_cosine(q[0]), q, v)
 
     def rear(self, motion: Motion, acceleration: Acceleration) -> FootForce | None:
-        """Force of the ground on the rear foot."""
+        """Return the force of the ground on the rear foot, N; None if it is in the air."""
         return None
 
     def guards(self, at: "Instant") -> Vector:
-        """What must stay positive: the phase's own guards first, then those of FALLS."""
+        """Return all guards: those of the phase first, then those of `SHARED_FAILURES`."""
         m = at.motion
         own = (self.end(at), *self.own_guards(at), m.dtheta, jnp.minimum(m.L1, m.L2) - self.s.a)
         return (*own, at.fore.normal) if self.stop_at_lift_off else own
 
     @property
     def outcomes(self) -> tuple[Outcome, ...]:
+        """Outcomes of all guards, in their order."""
         return self.own_outcomes + (FALLS if self.stop_at_lift_off else FALLS[:-1])
 
     def premises(self, at: "Instant") -> Vector:
+        """Return all margins, in the order of `PhaseMargins`."""
         s, m = self.s, at.motion
         locked = dynamics.stopper_force(s, m, at.acceleration, range(3, s.n + 1))
         shared = (at.fore.normal, s.L0 - m.L1, -dynamics.friction_needed(at.fore))
@@ -134,12 +146,14 @@ class AbstractPhase(abc.ABC):
 
     @property
     def counts_at_start(self) -> tuple[bool, ...]:
-        """Which of them count where the phase starts."""
+        """Whether each margin counts at the start of the phase."""
         locked = (True,) * (self.s.n - 2)
         return (True, self.contraction_counts, True, *locked, *self.own_premises_count)
 
     def outcome(self, guard: Int[Array, "..."], timed_out: Bool[Array, "..."]) -> Array:
-        """The Outcome of a phase that this guard ended, none if -1: STEPPED as in the paper."""
+        """Return the `Outcome` of a phase that ended at this guard (-1: none); STEPPED is
+        regular.
+        """
         code = jnp.full_like(guard, Outcome.SOLVER_GAVE_UP)
         for index, meaning in enumerate(self.outcomes):
             code = jnp.where(guard == index, jnp.int32(meaning), code)
@@ -147,14 +161,16 @@ class AbstractPhase(abc.ABC):
 
     @classmethod
     def own(cls, theta: Elementwise, motion: Motion) -> tuple[Vector, Vector]:
+        """Return the phase's own coordinates and rates of a motion."""
         q, v = (theta, motion.L1, motion.L2), (motion.dtheta, motion.dL1, motion.dL2)
         return q[: cls.n], v[: cls.n]
 
 
 class Instant:
-    """A moment of a phase; what guards and premises read of it is computed when first asked for.
+    """State of a phase at one time; the forces that guards and margins use are computed on demand.
 
-    `own`: accelerations of the phase's own coordinates; None: those of the equations of motion.
+    - `own_acceleration`: accelerations of the phase's own coordinates; None: those of the equations
+      of motion.
     """
 
     def __init__(self, phase: AbstractPhase, motion: Motion, own: Vector | None) -> None:
@@ -162,13 +178,14 @@ class Instant:
 
     @functools.cached_property
     def acceleration(self) -> Acceleration:
+        """All accelerations."""
         if self._own is None:
             return self.phase.acceleration(self.motion)
         return self.phase.complete(self.motion, self._own)
 
     @functools.cached_property
     def rear(self) -> FootForce | None:
-        """Force of the ground on the rear foot, N; None in the air."""
+        """Force of the ground on the rear foot, N; None if it is in the air."""
         return self.phase.rear(self.motion, self.acceleration)
 
     @functools.cached_property
@@ -178,7 +195,7 @@ class Instant:
 
 
 class DoubleSupport(AbstractPhase):
-    """DLS, over theta: the hub on a circle over both feet, until the rear one lifts. 3.3.1."""
+    """DLS, over theta: the hub moves on a circle until the rear foot lifts off (Section 3.3.1)."""
 
     name, n = "DLS", 1
     own_outcomes = (
@@ -223,12 +240,14 @@ class DoubleSupport(AbstractPhase):
         return ()
 
     def after(self, motion: Motion) -> Motion:
-        """The rear foot is let go at rest."""
+        """Return the motion unchanged: the rear foot is released at rest."""
         return motion
 
 
 class SingleSupport1(AbstractPhase):
-    """SLS-I, over (theta, L1, L2): Leg 2 swings and telescopes freely, until its stopper. 3.3.2."""
+    """SLS-I, over (theta, L1, L2): Leg 2 moves freely until it meets its stopper (Section
+    3.3.2).
+    """
 
     name, n = "SLS-I", 3
     own_outcomes = Outcome.STEPPED, Outcome.TOUCHDOWN_BEFORE_STOPPER
@@ -261,12 +280,12 @@ class SingleSupport1(AbstractPhase):
         return (rear_foot_height(self.s, at.motion),)
 
     def after(self, motion: Motion) -> Motion:
-        """Leg 2 has hit its stopper, where it is at L0 exactly."""
+        """Return the motion after the collision of Leg 2 with its stopper, with L2 = L0 exactly."""
         return transitions.stopped(self.s, motion._replace(L2=self.s.L0 + 0.0 * motion.L2))
 
 
 class SingleSupport2(AbstractPhase):
-    """SLS-II, over (theta, L1): Leg 2 is on its stopper, until touchdown. Section 3.3.3."""
+    """SLS-II, over (theta, L1): Leg 2 is on its stopper until touchdown (Section 3.3.3)."""
 
     name, n = "SLS-II", 2
     own_outcomes = (Outcome.STEPPED,)
@@ -302,24 +321,26 @@ class SingleSupport2(AbstractPhase):
         return rear_foot_height(s, m), *stopper
 
     def after(self, motion: Motion) -> Motion:
-        """What comes after touchdown is the next step's `transitions.land`."""
+        """Return the motion unchanged: `transitions.land` of the next step resolves the
+        touchdown.
+        """
         return motion
 
 
 def _left_over(s: Symbols, motion: Motion, acceleration: Acceleration) -> Vector:
-    """M q'' - f over (theta, L1, L2)."""
+    """Return M q'' - f over (theta, L1, L2)."""
     M, *forces = dynamics.terms(s, motion)
     return tuple(n - f for n, f in zip(M.times(acceleration), forces, strict=True))
 
 
 PHASES: tuple[type[AbstractPhase], ...] = (DoubleSupport, SingleSupport1, SingleSupport2)
-"""The paper's step, in order."""
+"""Phases of the paper's step, in order."""
 
 
 def phases_of(
     s: Symbols, distance: Elementwise, stop_at_lift_off: bool
 ) -> tuple[AbstractPhase, ...]:
-    """The phases of a step that begins with the feet that far apart, m."""
+    """Return the phases of a step that starts with the feet `distance` m apart."""
     helds = ((distance,), (), ())
     return tuple(
         phase(s, held, stop_at_lift_off) for phase, held in zip(PHASES, helds, strict=True)

@@ -1,7 +1,8 @@
-"""When a phase ends and what jumps: each guard beside its reset.
+"""Collisions between the phases: each guard with its reset.
 
-Guards are positive inside their phase and watched on the way down. Resets are the two collisions of
-the paper, landing (Section 3.4.1 with the procedure of Section 5.1) and stopper (Section 3.4.2).
+Guards are positive inside their phase and trigger when they fall through zero. Resets are the two
+collisions of the paper: landing (Section 3.4.1 with the procedure of Section 5.1) and stopper
+(Section 3.4.2).
 """
 
 from typing import NamedTuple
@@ -35,13 +36,13 @@ from vrw_jax.wheel.params import Symbols
 
 
 class Landing(NamedTuple):
-    """What the collision of Leg 1's foot leaves behind, and what it cost."""
+    """Result of the collision of the landing foot, with its impulses and energy loss."""
 
-    theta: Elementwise  # rad, in the labels of the step that begins
+    theta: Elementwise  # rad, in the leg labels of the starting step
     motion: Motion  # just after the impact
     distance: Elementwise  # D, between both feet, m
-    stays: Bool[Array, "..."]  # lambda_I4 >= 0: the rear foot stays (A4); else it is freed (A3)
-    fore: FootForce  # (lambda_I1, lambda_I2), N s, of the impact that happened
+    stays: Bool[Array, "..."]  # lambda_I4 >= 0: the rear foot stays (A4), else (A3)
+    fore: FootForce  # (lambda_I1, lambda_I2), N s, of the actual impact
     rear: FootForce  # (lambda_I3, lambda_I4), N s, with both feet held (A1)
     energy_lost: Elementwise  # J
     hub_jump: tuple[Elementwise, Elementwise]  # jump of the hub's velocity along (x, z), m/s
@@ -50,20 +51,22 @@ class Landing(NamedTuple):
 def motion_before_landing(
     s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise
 ) -> Motion:
-    """The section state (theta-, dtheta-, dL1-) as a motion: Leg 2 locked, next foot at z = 0."""
+    """Return the motion of the section state (theta-, dtheta-, dL1-): Leg 2 locked, next foot at z
+    = 0.
+    """
     L1 = length_at_touchdown(s, theta)
     zero = 0.0 * (theta + s.L0)
     return Motion.of(theta, L1, s.L0 + zero, dtheta, dL1, zero)
 
 
 class _HeldLanding(NamedTuple):
-    """The landing that leaves both feet on the ground (A1), and what led to it."""
+    """Landing that leaves both feet on the ground (A1), with its intermediate results."""
 
     before: Motion
     after: Motion
     distance: Elementwise
-    foot: tuple[Elementwise, Elementwise]  # velocity of the landing foot before, m/s
-    mass: MassMatrix  # in the labels of the step that begins
+    foot: tuple[Elementwise, Elementwise]  # of the landing foot before the impact, m/s
+    mass: MassMatrix  # in the leg labels of the starting step
     momentum: tuple[Elementwise, ...]  # along its coordinates, about the new foot
     row: tuple[Elementwise, ...]  # mass matrix times the tangent of the hub's circle
 
@@ -71,23 +74,24 @@ class _HeldLanding(NamedTuple):
 def _held_landing(
     s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise
 ) -> _HeldLanding:
+    """Return the landing with both feet held on the ground (A1)."""
     before = motion_before_landing(s, theta, dtheta, dL1)
     reach = before.L1
-    # Velocity of the landing foot, eqs (16), (17) with the rate of L1 before the impact.
+    # Velocity of the landing foot: eqs (16), (17) with the rate of L1 before the impact.
     sin, cos = landing_direction(s, before.sin, before.cos)
     foot_x = (reach * before.cos - s.L0 * cos) * dtheta + dL1 * before.sin
     foot_z = -(reach * before.sin - s.L0 * sin) * dtheta + dL1 * before.cos
 
     rear = rear_direction(s, sin, cos)
     M = mass_matrix(s, s.L0, reach)
-    # Generalised momentum of (theta, L1, L2) about the new foot, whose velocity still counts.
+    # Generalized momentum of (theta, L1, L2) about the new foot, including its velocity.
     p = M.times((dtheta, 0.0 * dtheta, dL1))
     A, B = s.Mh * s.L0 + s.m * s.L0, s.m * (s.L0 - reach)
     p1 = p[0] + (A * cos + B * rear.cos) * foot_x - (A * sin + B * rear.sin) * foot_z
     p2 = p[1] + s.Mh * (sin * foot_x + cos * foot_z)
     p3 = p[2] - s.m * (rear.sin * foot_x + rear.cos * foot_z)
 
-    # (A1) both feet held: the hub may only move on its circle.
+    # (A1) both feet held: the hub can only move on its circle.
     distance = s.L0 * s.sin_alpha / rear.cos
     circle = double_support_circle(s, distance, sin, cos)
     row = M.times((jnp.ones_like(circle.G1), circle.G1, circle.G2))
@@ -101,15 +105,15 @@ def _held_landing(
 def land_on_both(
     s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise
 ) -> tuple[Elementwise, Elementwise]:
-    """(theta+, dtheta+) of a landing that leaves both feet on the ground: `land`, and no more."""
+    """Return (theta+, dtheta+) of a landing that leaves both feet on the ground."""
     return theta - s.alpha, _held_landing(s, theta, dtheta, dL1).after.dtheta
 
 
 def land(s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise) -> Landing:
-    """Exchange of legs and inelastic landing, eqs (15)-(21), (A1)-(A4).
+    """Return the exchange of legs and inelastic landing, eqs (15)-(21), (A1)-(A4).
 
-    theta, dtheta, dL1 are the section state just before touchdown in the labels of the step that
-    ends; the result is in the labels of the step that begins.
+    The arguments theta, dtheta, dL1 are the section state just before touchdown, in the leg labels
+    of the ending step. The result uses the leg labels of the starting step.
     """
     before, on_both, distance, (foot_x, foot_z), M, (p1, p2, p3), row = _held_landing(
         s, theta, dtheta, dL1
@@ -126,7 +130,7 @@ def land(s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise) 
         dL1=jnp.where(stays, on_both.dL1, free.ddL1),
         dL2=jnp.where(stays, on_both.dL2, free.ddL2),
     )
-    # Impulses of the ground: the jump of total momentum, less what the rear foot took.
+    # Impulses of the ground: the jump of total momentum minus the impulse at the rear foot.
     px, pz = momentum(s, after)
     moving = Motion(sin, cos, s.L0, reach, dtheta, 0.0 * dtheta, dL1)
     before_x, before_z = momentum(s, moving)
@@ -150,7 +154,7 @@ def land(s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise) 
 
 
 def stopped(s: Symbols, before: Motion) -> Motion:
-    """The motion after Leg 2, at L2 = L0, has met its stopper."""
+    """Return the motion after Leg 2, at L2 = L0, has met its stopper."""
     M = mass_matrix(s, before.L1, before.L2)
     return before._replace(
         dtheta=before.dtheta + M.M13 * before.dL2 / M.M11,
@@ -160,19 +164,19 @@ def stopped(s: Symbols, before: Motion) -> Motion:
 
 
 class StopperHit(NamedTuple):
-    """What the collision of Leg 2 with its stopper leaves behind, and what it cost."""
+    """Result of the collision of Leg 2 with its stopper, with its impulses and energy loss."""
 
     motion: Motion  # just after the impact, L2 = L0 exactly
-    stopper_impulse: Elementwise  # on Leg 2's mass, towards the hub, N s
-    planted: FootForce  # impulse of the ground on Leg 1's foot, N s
+    stopper_impulse: Elementwise  # on the mass of Leg 2, towards the hub, N s
+    planted: FootForce  # of the ground on the foot of Leg 1, N s
     energy_lost: Elementwise  # J
     hub_jump: tuple[Elementwise, Elementwise]  # m/s
 
 
 def hit_stopper(s: Symbols, motion: Motion) -> StopperHit:
-    """Inelastic collision of Leg 2 with its stopper at L2 = L0, eqs (22)-(25).
+    """Return the inelastic collision of Leg 2 with its stopper at L2 = L0, eqs (22)-(25).
 
-    M12 vanishes there, so the impact is two divisions.
+    M12 vanishes there, so the impact needs only two divisions.
     """
     before = motion._replace(L2=s.L0 + 0.0 * motion.L2)
     after = stopped(s, before)
@@ -190,7 +194,7 @@ def hit_stopper(s: Symbols, motion: Motion) -> StopperHit:
 
 
 def hub_velocity(motion: Motion) -> tuple[Elementwise, Elementwise]:
-    """Velocity of the hub along (x, z) with Leg 1's foot at rest, m/s."""
+    """Return the velocity of the hub along (x, z) with the foot of Leg 1 at rest, m/s."""
     across = motion.L1 * motion.dtheta
     return (
         motion.dL1 * motion.sin + across * motion.cos,
@@ -199,7 +203,7 @@ def hub_velocity(motion: Motion) -> tuple[Elementwise, Elementwise]:
 
 
 def jump_of_hub(before: Motion, after: Motion) -> tuple[Elementwise, Elementwise]:
-    """By how much its velocity along (x, z) changes, m/s."""
+    """Return the jump of the hub's velocity along (x, z), m/s."""
     (x, z), (after_x, after_z) = hub_velocity(before), hub_velocity(after)
     return after_x - x, after_z - z
 
@@ -210,9 +214,10 @@ def locked_leg_impulses(
     jump: tuple[Elementwise, Elementwise],
     legs: range,
 ) -> Float[Array, "n_legs_asked ..."]:
-    """Stopper impulse on the mass of each of `legs` for a jump of the hub's velocity, N s.
+    """Return the stopper impulse on the mass of each of `legs` for a jump of the hub's velocity, N
+    s.
 
-    Negative where the collision throws the leg off its stopper: a preload resists no impulse.
+    It is negative where the collision throws the leg off its stopper: a preload resists no impulse.
     """
     turn = s.alpha * (np.asarray(legs).reshape(-1, *(1,) * jnp.ndim(motion.sin)) - 1)
     radial = jump[0] * motion.sin + jump[1] * motion.cos
@@ -221,7 +226,9 @@ def locked_leg_impulses(
 
 
 def landing_forces(s: Symbols, landing: Landing) -> tuple[FootForce, FootForce]:
-    """Fore and rear foot force just after the landing with both feet planted, N (B1, eq. 38)."""
+    """Return the fore and rear foot force just after a landing with both feet planted, N (B1, eq.
+    38).
+    """
     circle = double_support_circle(s, landing.distance, landing.motion.sin, landing.motion.cos)
     dtheta = landing.motion.dtheta
     motion = landing.motion._replace(dL1=circle.G1 * dtheta, dL2=circle.G2 * dtheta)
