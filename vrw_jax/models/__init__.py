@@ -1,4 +1,4 @@
-"""The model ladder: one rung a file, one face."""
+"""The models of the wheel, one per file, with one interface."""
 
 from vrw_jax.models import scales
 from vrw_jax.models.base import (

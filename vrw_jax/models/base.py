@@ -1,4 +1,4 @@
-"""The one face of every rung: what a step takes, and what it tells."""
+"""Interface of every model: what a step takes and what it returns."""
 
 import abc
 import functools
@@ -18,36 +18,38 @@ from vrw_jax.wheel import FRICTION, LARGEST, PARAMETER_NAMES, Outcome, WheelPara
 from vrw_jax.wording import AbstractTold, Row, counted, told, traced
 
 SectionState = Float[Array, "3"]
-"""(theta-, dtheta-, dL1-) just before touchdown, in the labels of the step that ends: rad, rad/s,
-m/s. The length of Leg 1 follows from touchdown itself, Leg 2 is on its stopper."""
+"""(theta-, dtheta-, dL1-) just before touchdown, in the leg labels of the ending step: rad, rad/s,
+m/s. The length of Leg 1 follows from the touchdown condition; Leg 2 is on its stopper."""
 RungState = Float[Array, "section ..."]
-"""A `SectionState`, or the rung's own longer one; of lanes, which have the last axis, too."""
+"""A `SectionState`, or the longer one of another model; in a batch, elements are on the last
+axis."""
 Measured = Float[Array, "..."]
-"""A number that a step tells; of lanes, one for each."""
+"""One number of a step; in a batch, one number per element."""
 
 
 GroundOfStep = tuple[Array, Array, Array, Array]
-"""Slope and friction of a landing, friction of the feet before, and by how much the ground ahead is
-steeper; or all that over steps."""
+"""Slope and friction of a landing, friction of the earlier footholds, and the tilt by which the
+ground ahead is steeper; or all of these over steps."""
 
 
 class AbstractMeasured(AbstractTold):
-    """Several measures, each field told as one of `results.MEASURES`."""
+    """Several measures; each field is one of `results.ALL_MEASURES`."""
 
     named: eqx.AbstractClassVar[Mapping[str, str]]
-    """Names there, where they are not the fields' own."""
+    """Names in `results.ALL_MEASURES` of the fields whose own names differ."""
 
     def measures(self) -> dict[str, Array]:
-        """Its fields by the names of `results.MEASURES`."""
+        """Return the fields by their names in `results.ALL_MEASURES`."""
         return {self.named.get(name, name): value for name, value in vars(self).items()}
 
     def rows(self) -> list[Row]:
+        """Return label and printed value of each measure."""
         measures = self.measures().items()
         return [(MEASURES[name].label, told(x, MEASURES[name].unit)) for name, x in measures]
 
 
 class Indicators(AbstractMeasured):
-    """The double-limb-support indicators of Section 5.1, of the landing that opens the step.
+    """The double-limb-support indicators of Section 5.1, for the landing that opens the step.
 
     - `lambda_I4`: normal impulse of the rear foot in the landing, both feet held, N s;
     - `lambda_2`: normal force of the fore foot just after it, N;
@@ -67,7 +69,7 @@ class Indicators(AbstractMeasured):
 
 
 class EnergyLoss(AbstractMeasured):
-    """Mechanical energy lost in the step, J, each positive when lost.
+    """Mechanical energy lost in the step, J; each part is positive for a loss.
 
     - `landing`, `stopper`: in the two collisions;
     - `damping`: in the legs' dampers.
@@ -86,34 +88,36 @@ class EnergyLoss(AbstractMeasured):
 
 
 class Margins(AbstractMeasured):
-    """Premises of the paper's rung as signed margins over one step: negative means broken.
+    """Assumptions of the viscoelastic model as signed margins over one step: negative where
+    violated.
 
-    The model does not act on them. Forces and lengths are minima over the step, found to the
-    integrator's accuracy. What is zero by construction at a phase's start (a foot that leaves the
-    ground, Leg 1 that lands on its stopper) counts from its first later minimum on. Friction
-    margins are the model's `friction` less the coefficient needed; the rear foot's is taken just
-    after landing, since it grows without bound as the foot unloads. A phase that did not happen
-    does not count; a step that did not begin has margins zero.
+    Margins do not affect the motion. Forces and lengths are minima over the step, accurate to the
+    integrator's tolerance. A quantity may be zero by construction at the start of a phase: for a
+    foot that leaves the ground, or for Leg 1 landing on its stopper. It then counts from its first
+    later minimum on. Friction margins are the model's `friction` minus the required coefficient.
+    The rear foot's margin is taken just after landing, because it grows without bound as the foot
+    unloads. A phase that did not happen does not count. A step that did not begin has zero margins.
 
     - `fore_foot_force`: lambda_2, N;
-    - `takeoff_acceleration`: of foot 2 normal to the slope at the start of SLS-I, m/s^2: what
-      decides on `clearance_sls1`, and smooth at the border to scuffing, where that is not;
+    - `takeoff_acceleration`: of foot 2 normal to the slope at the start of SLS-I, m/s^2; it
+      determines whether the foot rises or scuffs; it is smooth at the boundary of scuffing, where
+      `clearance_sls1` is not;
     - `clearance_sls1`: height of foot 2 in SLS-I, m;
     - `clearance_sls2`: height of foot 2 in SLS-II, m;
     - `locked_stopper_force`: of legs 3..n on their stoppers, N;
     - `rear_stopper_force`: of Leg 2 on its stopper in SLS-II, N;
     - `contraction`: L0 - L1 after landing, m;
-    - `friction_fore`: friction left at the fore foot;
-    - `friction_rear`: friction left at the rear foot just after landing;
+    - `friction_fore`: friction margin of the fore foot;
+    - `friction_rear`: friction margin of the rear foot just after landing;
     - `landing_stopper_impulse`: on legs 3..n at the landing, N s;
-    - `hit_stopper_impulse`: on legs 3..n when Leg 2 hits its stopper, N s;
-    - `hit_planted_impulse`: normal impulse of the planted foot then, N s;
-    - `landing_friction_fore`: friction left at the fore foot in the landing impulse;
-    - `landing_friction_rear`: friction left at the rear foot in the landing impulse.
+    - `hit_stopper_impulse`: on legs 3..n at the collision of Leg 2 with its stopper, N s;
+    - `hit_planted_impulse`: normal impulse of the planted foot in the same collision, N s;
+    - `landing_friction_fore`: friction margin of the fore foot in the landing impulse;
+    - `landing_friction_rear`: friction margin of the rear foot in the landing impulse.
 
     Examples:
         >>> x = vrw.limit_cycle(vrw.WheelParams()).section_state
-        >>> print(f"{vrw.step(vrw.WheelParams(), x).monitors.friction_rear:.2f}")
+        >>> print(f"{vrw.step(vrw.WheelParams(), x).margins.friction_rear:.2f}")
         -13.22
     """
 
@@ -136,14 +140,14 @@ class Margins(AbstractMeasured):
 
 
 class AbstractStep(AbstractTold):
-    """What every rung's step tells alike. Batched under vmap."""
+    """Result of one step, as far as all models share it. Batched under vmap."""
 
     section_state: eqx.AbstractVar[Array]  # just before the next touchdown
     post_impact: eqx.AbstractVar[Float[Array, "2 ..."]]  # (theta, dtheta), rad, rad/s
-    durations: eqx.AbstractVar[Float[Array, "3 ..."]]  # of double support first, s
+    durations: eqx.AbstractVar[Float[Array, "3 ..."]]  # double support first, s
     step_length: eqx.AbstractVar[Measured]  # m
     outcome: eqx.AbstractVar[Int[Array, "..."]]  # an Outcome
-    solver_steps: eqx.AbstractVar[Int[Array, "..."]]  # tried by the integrator
+    solver_steps: eqx.AbstractVar[Int[Array, "..."]]  # attempted solver steps
 
     @property
     def period(self) -> Array:
@@ -152,20 +156,20 @@ class AbstractStep(AbstractTold):
 
     @property
     def dls_fraction(self) -> Array:
-        """Share of the step with two loaded feet; 0 for a step without duration."""
+        """Fraction of the step with two loaded feet; 0 for a step of zero duration."""
         period = self.period
         return self.durations[..., 0] / jnp.where(period > 0.0, period, 1.0)
 
     @property
     def speed(self) -> Array:
-        """Step length over period, m/s; 0 for a step without duration."""
+        """Step length over period, m/s; 0 for a step of zero duration."""
         period = self.period
         return jnp.where(period > 0.0, self.step_length / jnp.where(period > 0.0, period, 1.0), 0.0)
 
     def measures(self) -> dict[str, Array]:
-        """Everything that the step tells, by the names of `results.MEASURES`.
+        """Return all measures of the step by their names in `results.ALL_MEASURES`.
 
-        Batch axes lead, legs come last.
+        Batch axes lead; legs come last.
         """
         shared = {
             "dls_fraction": self.dls_fraction,
@@ -183,7 +187,7 @@ class AbstractStep(AbstractTold):
         return shared | self.own_measures()
 
     def rows(self) -> list[Row]:
-        """What the step says of itself: measures, then premises and whether they hold."""
+        """Return the printable rows: measures, then margins and whether their assumptions hold."""
         outcome, values = np.asarray(self.outcome), self.measures()
         if outcome.ndim:
             return [("steps", counted(outcome, Outcome))]
@@ -202,21 +206,25 @@ class AbstractStep(AbstractTold):
         return rows
 
     def served(self) -> dict[str, Array]:
-        """Of a model that chooses: which rung took the step and why, by the names of `SERVED`."""
+        """Return the code of the model that took the step and the reason, by names of
+        `SELECTION_ATTRS`.
+
+        It is empty for a model that does not choose.
+        """
         return {}
 
     @abc.abstractmethod
     def own_measures(self) -> dict[str, Array]:
-        """Those of `measures` that not every rung tells."""
+        """Return the measures that not every model reports."""
 
 
 class AbstractGroundStep(AbstractStep):
-    """A step over contacts of any order; `durations` are with two feet loaded, with one, none."""
+    """A step with contacts in any order; `durations` are those with two, one and no loaded feet."""
 
     energy_impacts: eqx.AbstractVar[Measured]  # lost in impacts, J
     energy_damping: eqx.AbstractVar[Measured]  # lost in the dampers, J
     energy_friction: eqx.AbstractVar[Measured]  # lost by sliding between impacts, J
-    slip: eqx.AbstractVar[Measured]  # path of sliding feet, m
+    slip: eqx.AbstractVar[Measured]  # path length of sliding feet, m
 
     def own_measures(self) -> dict[str, Array]:
         return {
@@ -232,21 +240,21 @@ class AbstractGroundStep(AbstractStep):
 class StepResult(AbstractStep):
     """One step from touchdown to touchdown. Batched under vmap: every field gains the axis.
 
-    Fields of a step whose outcome is not STEPPED are finite and describe how far it came; its
-    `section_state` is all zeros, which is no section state.
+    Fields of a step whose outcome is not STEPPED are finite and describe the partial motion; its
+    `section_state` is all zeros, which is not a valid section state.
 
     - `section_state`: just before the next touchdown;
     - `post_impact`: (theta, dtheta) just after the opening landing, rad, rad/s;
     - `durations`: of DLS, SLS-I, SLS-II, s;
     - `step_length`: distance between the feet at the opening landing, m;
-    - `indicators`, `monitors`, `energy`: `Indicators`, `Margins` and `EnergyLoss` of the step;
+    - `indicators`, `margins`, `energy`: `DoubleSupportIndicators`, `Margins` and `EnergyLoss`;
     - `outcome`: an Outcome;
-    - `solver_steps`: tried by the integrator;
-    - `engine`: that took the step, see `Options`.
+    - `solver_steps`: attempted solver steps;
+    - `engine`: name of the engine, see `StepOptions`.
 
     Examples:
         >>> step = vrw.step(vrw.WheelParams(damping=150.0), vrw.paper_start())
-        >>> print(f"{step.dls_fraction:.3f} {step.monitors.clearance_sls1:.3f} m")
+        >>> print(f"{step.dls_fraction:.3f} {step.margins.clearance_sls1:.3f} m")
         0.548 0.060 m
     """
 
@@ -273,24 +281,23 @@ class StepResult(AbstractStep):
 
 
 class Advance(eqx.Module):
-    """The lean result of a step: what repeats."""
+    """Minimal result of a step: what the next step and a walk need."""
 
     section_state: RungState
     durations: Float[Array, "3 ..."]  # of DLS, SLS-I, SLS-II, s
     outcome: Int[Array, "..."]  # an Outcome
-    solver_steps: Int[Array, "..."]  # tried by the integrator
-    rung: Int[Array, "..."] | None = None  # that took the step, of a model that chooses: see ladder
-    reason: Int[Array, "..."] | None = None  # why that one
-    engine: str = eqx.field(static=True, default="")  # that took it, see `Options`
+    solver_steps: Int[Array, "..."]  # attempted solver steps
+    rung: Int[Array, "..."] | None = None  # of the chosen model: see ladder
+    reason: Int[Array, "..."] | None = None  # of that choice
+    engine: str = eqx.field(static=True, default="")  # see `StepOptions`
 
 
 class Trajectory(eqx.Module):
     """States of one step at samples of each phase, both ends included, with the forces there.
 
-    And what its `Advance` tells, from the same integration.
-
-    Axes: phase (DLS, SLS-I, SLS-II), sample. A phase that did not happen has duration 0 and repeats
-    its start. Coordinates are in the labels of this step; the origin is Leg 1's foot.
+    It also holds the `AdvanceResult` fields of the same integration. The axes are phase (DLS,
+    SLS-I, SLS-II) and sample. A phase that did not happen has duration 0 and repeats its start.
+    Coordinates use the leg labels of this step; the origin is the foot of Leg 1.
     """
 
     time: Float[Array, "3 n ..."]  # from the landing, s
@@ -303,7 +310,7 @@ class Trajectory(eqx.Module):
 
 
 class AbstractWheel(eqx.Module):
-    """A rung of the model ladder. Rungs are final; the code above knows this face alone.
+    """A model of the wheel. Models are final; the rest of the library uses only this interface.
 
     `advance` and `step` compile themselves, once for each structure of their arguments.
 
@@ -313,15 +320,16 @@ class AbstractWheel(eqx.Module):
     """
 
     rung: eqx.AbstractClassVar[str]
-    """Name of the rung, by which the rooms above find what is its own."""
+    """Name of the model, by which other packages look up what they hold for it."""
     parameter_names: eqx.AbstractClassVar[tuple[str, ...]]
-    """What its motion depends on: the wheel's parameters, and where it feels it, friction."""
+    """Inputs of the motion: the wheel's parameters and, where the motion depends on it,
+    friction."""
     tells_contacts: eqx.AbstractClassVar[bool]
-    """Whether trajectories tell every leg's contact instead of the paper's phases."""
+    """Whether trajectories report every leg's contact instead of the paper's phases."""
     lanes: ClassVar[str] = ""
-    """What machine code walks in batches: the paper's "phases", "legs", or nothing."""
+    """Kind of the compiled batch kernel: the paper's "phases", "legs", or "" for none."""
     legs_yield: ClassVar[bool] = True
-    """Whether springs and dampers play a part: what is tuned and scanned."""
+    """Whether springs and dampers affect the motion; it selects what is tuned and scanned."""
 
     def __repr__(self) -> str:
         if traced(self):
@@ -333,11 +341,11 @@ class AbstractWheel(eqx.Module):
 
     @property
     def upper(self) -> "AbstractWheel":
-        """What serves wherever a step may start: itself, or a ladder's upper rung."""
+        """Model that is valid for any start: itself, or the upper model of a ladder."""
         return self
 
     def values(self, params: WheelParams) -> Float[Array, " n_values"]:
-        """Numbers of `parameter_names`, of one wheel on this ground."""
+        """Return the values of `parameter_names`, for one wheel on this ground."""
         held = [
             getattr(self if name == FRICTION else params, name) for name in self.parameter_names
         ]
@@ -346,7 +354,9 @@ class AbstractWheel(eqx.Module):
     def at(
         self, values: Array | tuple[Array, ...], n_legs: int
     ) -> tuple["AbstractWheel", WheelParams]:
-        """Rung and wheel of other numbers: the inverse of `values`; works on tracers."""
+        """Return model and wheel with other values: the inverse of `parameter_values`; works on
+        tracers.
+        """
         n = len(PARAMETER_NAMES)
         model = self
         if FRICTION in self.parameter_names:
@@ -356,59 +366,70 @@ class AbstractWheel(eqx.Module):
     def moved(
         self, params: WheelParams, name: str, value: Elementwise
     ) -> tuple["AbstractWheel", WheelParams]:
-        """Rung and wheel with another value of one of `parameter_names`; works on tracers."""
+        """Return model and wheel with another value of one of `parameter_names`; works on
+        tracers.
+        """
         if name == FRICTION:
             return eqx.tree_at(lambda ground: ground.friction, self, value), params
         return self, eqx.tree_at(lambda wheel: getattr(wheel, name), params, value)
 
     @abc.abstractmethod
     def advance(self, params: WheelParams, x: SectionState, options: Options) -> Advance:
-        """One step, told as leanly as possible. Differentiable in any mode, to any order."""
+        """Return one step in its minimal form. Differentiable in any mode, to any order."""
 
     @abc.abstractmethod
     def step(self, params: WheelParams, x: SectionState, options: Options) -> Any:
-        """One step with all indicators, monitors and energies. Differentiable in any mode.
+        """Return one step with all indicators, margins and energies. Differentiable in any mode.
 
-        A StepResult, or what the rung has in its place.
+        The result is a `StepResult`, or the counterpart of the model.
         """
 
     @abc.abstractmethod
     def trace(self, params: WheelParams, x: SectionState, options: Options, n_samples: int) -> Any:
-        """The step's motion at `n_samples` times of each phase: a Trajectory, or in its place."""
+        """Return the motion of the step at `n_samples` times of each phase.
+
+        The result is a `Trajectory`, or the counterpart of the model.
+        """
 
     @abc.abstractmethod
     def start(self, params: WheelParams) -> SectionState:
-        """A section state from which a walk may begin."""
+        """Return a section state from which a walk may begin."""
 
     def over_steps(self, params: WheelParams, n_steps: int) -> GroundOfStep | None:
-        """The ground of each of so many steps, if slope or friction are arrays over steps."""
+        """Return the ground of each of `n_steps` steps, if slope or friction are arrays over
+        steps.
+        """
         return None
 
     def on_ground(
         self, params: WheelParams, ground: GroundOfStep
     ) -> tuple["AbstractWheel", WheelParams]:
-        """Rung and wheel on the ground of one step."""
+        """Return model and wheel on the ground of one step."""
         raise NotImplementedError
 
     def section_size(self, params: WheelParams) -> int:
-        """Length of a section state."""
+        """Return the length of a section state."""
         return 3
 
     def section_numbers(self, params: WheelParams) -> int:
-        """How many of them, the first ones, move continuously; the others are codes."""
+        """Return the number of leading entries of a section state that vary continuously; the rest
+        are codes.
+        """
         return self.section_size(params)
 
     def full_section(self, params: WheelParams, x: Array) -> Array:
-        """The rung's section state of a paper's one; others are left as they are."""
+        """Return the model's section state for a three-number one; others are returned
+        unchanged.
+        """
         return x
 
 
 Numbers = Float[Array, "section ..."] | tuple[Array, ...]
-"""A section state, or its numbers one by one: then each may be an array of lanes."""
+"""A section state, or its entries one by one, each of which may be an array over a batch."""
 
 
 def usable(params: WheelParams, x: Numbers) -> Array:
-    """Whether parameters and start are finite, in their domains and rolling forward."""
+    """Return whether parameters and start are finite, in their domains and rolling forward."""
     theta, dtheta = x[0], x[1]
     upright = (jnp.abs(theta) < 0.5 * jnp.pi) & (jnp.abs(theta - params.leg_angle) < 0.5 * jnp.pi)
     in_reach = functools.reduce(operator.and_, [jnp.abs(value) < LARGEST for value in x])
@@ -421,7 +442,9 @@ def replaced_where_bad(
     x: Numbers,
     safe_x: Any,
 ) -> tuple[WheelParams, Any]:
-    """Table 1 and a safe start in place of unusable input, so that no NaN is ever computed."""
+    """Return Table 1 and a safe start in place of invalid input, so that no NaN is ever
+    computed.
+    """
     return jax.tree.map(
         lambda value, default: jnp.where(good, value, jnp.asarray(default, value.dtype)),
         (params, x),

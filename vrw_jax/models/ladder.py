@@ -1,9 +1,10 @@
-"""The ladder as one wheel: each step by the lowest rung whose premises hold over it.
+"""The ladder: a wheel that takes each step by the lowest model whose assumptions hold over the
+step.
 
-The paper's wheel takes the step and measures its premises; where one breaks, the wheel on real
-ground takes the step anew. Under `vmap` this is decided lane by lane, and a lane that the paper's
-wheel serves does no work on the upper rung. The rigid wheel never serves: its premise, legs that do
-not yield, fails for every finite stiffness.
+The viscoelastic model takes the step and measures its margins. If one is violated, the unilateral
+model takes the step again. Under `vmap` the choice is made per batch element, and an element for
+which the viscoelastic model holds costs no work in the unilateral model. The rigid model is never
+chosen, because its assumption of rigid legs fails for every finite stiffness.
 """
 
 import dataclasses
@@ -34,7 +35,7 @@ from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, WheelParams, frict
 from vrw_jax.wording import AbstractTold, Row
 
 RIGID, VISCOELASTIC, UNILATERAL = 0, 1, 2
-"""Numbers of the rungs; 0 is the rigid one."""
+"""Codes of the models; 0 is the rigid one."""
 
 PREMISES: dict[str, str] = {
     name: MARGINS[name].breaks
@@ -49,10 +50,11 @@ PREMISES: dict[str, str] = {
         "landing_friction_rear",
     )
 }
-"""Premises that the paper's rung needs and the unilateral rung does not, with what breaks them."""
+"""Margins of the assumptions that only the viscoelastic model makes, with the text of a
+violation."""
 
 OFF_THE_PLANE = 1 + len(PREMISES)
-"""The reason of a start that is no section state of the paper's."""
+"""Reason code of a start that is not a section state of the viscoelastic model."""
 
 
 SERVED: dict[str, dict[str, object]] = {
@@ -68,18 +70,19 @@ SERVED: dict[str, dict[str, object]] = {
         f"of {', '.join(PREMISES)}; below: minus that wheel's outcome.",
     },
 }
-"""Attributes of what the ladder tells beside them."""
+"""Attributes of the variables `model_selection` in data sets."""
 
 
 class ModelChoice(AbstractTold):
-    """Which rung serves, and why. Batched under vmap: every field gains the axis.
+    """Choice of the model, and its reason. Batched under vmap: every field gains the axis.
 
-    `reason` is 0 where the paper's rung serves, 1 + the place in PREMISES of the first premise that
-    breaks, OFF_THE_PLANE where a leg other than Leg 1 is loaded or off its stopper at the start,
-    and minus the paper's outcome where that rung's step does not reach a touchdown.
+    `reason_code` is 0 if the viscoelastic model holds. If a margin is violated, it is 1 + the index
+    of the first one in `SELECTION_MARGINS`. It is `REASON_START_NOT_EMBEDDABLE` if a leg other than
+    Leg 1 is loaded or off its stopper at the start. If the viscoelastic step does not reach a
+    touchdown, it is minus the outcome.
 
-    - `rung`: VISCOELASTIC or UNILATERAL;
-    - `margins`: of PREMISES, negative where broken;
+    - `model_code`: VISCOELASTIC_MODEL or UNILATERAL_MODEL;
+    - `margins`: of `SELECTION_MARGINS`, negative where violated;
     - `friction`: coefficient of the ground.
 
     Examples:
@@ -94,6 +97,7 @@ class ModelChoice(AbstractTold):
     friction: Scalar
 
     def rows(self) -> list[Row]:
+        """Return the printable rows: model, explanation and margins."""
         reason = np.asarray(self.reason)
         if reason.ndim:
             served = int(np.sum(reason == 0))
@@ -105,24 +109,24 @@ class ModelChoice(AbstractTold):
         return [("rung", type(self.model).__name__), ("why", self.why), *margins]
 
     def served(self) -> dict[str, Array]:
-        """See `AbstractStep.served`."""
+        """Return model and reason codes, see `AbstractStep.model_selection`."""
         return {"rung": self.rung, "reason": self.reason}
 
     @property
     def model(self) -> AbstractWheel:
-        """The rung itself, for one wheel."""
+        """The chosen model itself, for one wheel."""
         if int(self.rung) == VISCOELASTIC:
             return ViscoelasticWheel(friction=float(self.friction))
         return UnilateralWheel(friction=self.friction)
 
     @property
     def why(self) -> str:
-        """One sentence, for one wheel."""
+        """Reason of the choice as one sentence, for one wheel."""
         return told_why(int(self.reason))
 
 
 def told_why(reason: int) -> str:
-    """A reason of `ModelChoice` as a sentence."""
+    """Return a reason code of `ModelChoice` as a sentence."""
     if reason == 0:
         return "The paper's wheel serves: all its premises hold over this step."
     if reason < 0:
@@ -133,9 +137,10 @@ def told_why(reason: int) -> str:
 
 
 def reason_of(told: Mapping[str, Any], more_friction: Any) -> tuple[Array, Array]:
-    """`ModelChoice.reason` of the paper's steps, and margins of PREMISES on the last axis.
+    """Return `ModelChoice.reason_code` of viscoelastic steps, and their margins on the last axis.
 
-    `told` are measures and outcome, on a ground with that much less friction.
+    - `measures`: measures and outcome of these steps;
+    - `friction_difference`: friction of the ground minus the friction behind `measures`.
     """
     margins = [told[name] + (more_friction if "friction" in name else 0.0) for name in PREMISES]
     broken = ~(jnp.stack(margins, -1) >= 0.0)
@@ -145,9 +150,9 @@ def reason_of(told: Mapping[str, Any], more_friction: Any) -> tuple[Array, Array
 
 
 class LadderStep(AbstractGroundStep):
-    """One step by the lowest rung that serves, told alike for both. Batched under vmap.
+    """One step by the lowest valid model, in the same form for both. Batched under vmap.
 
-    - `choice`: which rung served, and why;
+    - `choice`: the chosen model, and the reason;
     - `section_state`: just before the next landing; zeros if there was none;
     - `post_impact`: (theta, dtheta) just after the opening landing, rad, rad/s;
     - `durations`: with two feet loaded, with one, with none, s;
@@ -155,9 +160,9 @@ class LadderStep(AbstractGroundStep):
     - `energy_impacts`: lost in impacts, J;
     - `energy_damping`: lost in the dampers, J;
     - `energy_friction`: lost by sliding between impacts, J;
-    - `slip`: path of sliding feet, m;
+    - `slip`: path length of sliding feet, m;
     - `outcome`: an Outcome;
-    - `solver_steps`: tried by the integrator, on both rungs.
+    - `solver_steps`: attempted solver steps, of both models.
 
     Examples:
         >>> x = vrw.limit_cycle(vrw.WheelParams()).section_state
@@ -183,9 +188,10 @@ class LadderStep(AbstractGroundStep):
 
 
 class LadderWheel(AbstractWheel):
-    """The paper's wheel where it serves, the wheel on real ground of this `friction` elsewhere.
+    """The viscoelastic model where it is valid, and the unilateral model with this `friction`
+    elsewhere.
 
-    Section states are those of `UnilateralWheel`; the paper's three numbers may be given.
+    Section states are those of `UnilateralWheel`; three-number states of the paper are accepted.
 
     - `friction`: coefficient of the ground, `inf` for feet that never slide.
 
@@ -193,7 +199,7 @@ class LadderWheel(AbstractWheel):
         >>> wheel = vrw.LadderWheel(friction=50.0)
         >>> x = vrw.limit_cycle(vrw.WheelParams()).section_state
         >>> step = vrw.step(vrw.WheelParams(), x, model=wheel)
-        >>> step.choice.why
+        >>> step.choice.explanation
         "The paper's wheel serves: all its premises hold over this step."
     """
 
@@ -209,7 +215,7 @@ class LadderWheel(AbstractWheel):
 
     @property
     def ground(self) -> UnilateralWheel:
-        """The upper rung."""
+        """The upper model."""
         return UnilateralWheel(friction=self.friction)
 
     @property
@@ -231,7 +237,7 @@ class LadderWheel(AbstractWheel):
     def choose(
         self, params: WheelParams, x: FullState, options: Options
     ) -> tuple[ModelChoice, StepResult]:
-        """Which rung serves, and the step of the paper's."""
+        """Return the chosen model, and the step of the viscoelastic model."""
         paper, ground = ViscoelasticWheel(), self.friction.astype(x.dtype)
         on_plane = _on_the_papers_plane(x, params.n_legs)
         result = paper.step(
@@ -279,7 +285,9 @@ class LadderWheel(AbstractWheel):
     def trace(
         self, params: WheelParams, x: FullState, options: Options, n_samples: int
     ) -> UnilateralTrajectory:
-        """The motion as the upper rung tells it: without slip it is the paper's."""
+        """Return the motion in the form of the upper model: without slip it equals the paper's
+        motion.
+        """
         choice, _ = self.choose(params, x, options)
         friction = jnp.where(choice.rung == VISCOELASTIC, jnp.inf, self.friction)
         wheel = UnilateralWheel(friction=friction, infinite="paper")
@@ -288,31 +296,34 @@ class LadderWheel(AbstractWheel):
 
 
 def _of_plane(x: FullState, n: int) -> Float[Array, "3"]:
-    """(theta-, dtheta-, dL1-) of a full section state."""
+    """Return (theta-, dtheta-, dL1-) of a full section state."""
     return jnp.stack([x[0], x[1], x[4 + n]])
 
 
 def _on_the_papers_plane(x: FullState, n: int) -> Bool[Array, ""]:
-    """Whether Leg 1 alone is loaded, at rest, and all other legs are on their stoppers."""
+    """Return whether Leg 1 alone is loaded and at rest, with all other legs on their stoppers."""
     papers = jnp.where(jnp.arange(n) == 0, float(STICK), float(LOCKED + OFF))
     return jnp.all(jnp.round(x[4 + 2 * n :]) == papers)
 
 
 def _embedded(serves: Array, params: WheelParams, paper: StepResult) -> FullState:
-    """The full section state of the paper's; of Table 1's start where it does not serve."""
+    """Return the full section state of a viscoelastic step.
+
+    Where the viscoelastic model is not used, it is the state of Table 1's start.
+    """
     safe = jnp.asarray(PAPER_START, paper.section_state.dtype)
     params, x = replaced_where_bad(serves, params, paper.section_state, safe)
     return embedded(params.symbols(), x)
 
 
 def _by_feet(paper: StepResult) -> Float[Array, "3"]:
-    """Durations with two feet loaded, with one and with none, s."""
+    """Return the durations with two loaded feet, with one and with none, s."""
     both, *single = paper.durations
     return jnp.stack([both, single[0] + single[1], jnp.zeros_like(both)])
 
 
 def refuse_ladder(model: object, what: str) -> None:
-    """One sentence where a rung is needed whose gaits move smoothly."""
+    """Raise `TypeError` for a ladder where a model with smoothly varying gaits is required."""
     if isinstance(model, LadderWheel | str):
         raise TypeError(
             f"the ladder can't be {what}, since its gaits jump where the rung changes: give "

@@ -1,8 +1,8 @@
-"""The paper's step by lanes: one text for machine code and GPUs, for values and derivatives.
+"""The paper's step in batches: one source for machine code and GPUs, values and derivatives.
 
-The same phases as those of the diffrax engine; arrays hold one quantity of all wheels instead of
-one wheel's quantities. `told_by_lanes` is a function of one wheel that `jax.vmap` maps onto lanes,
-within programs of JAX.
+The phases are those of the diffrax engine; arrays hold one quantity of all wheels instead of the
+quantities of one wheel. `build_step_function` returns a function of one wheel that `jax.vmap` maps
+onto lanes, for use in JAX programs.
 """
 
 import dataclasses
@@ -55,32 +55,37 @@ from vrw_jax.wheel import (
 )
 
 INTO_SINGLE_SUPPORT = 0.3
-"""First step of SLS-I over the last of DLS, at most."""
+"""Upper bound of the first solver step of SLS-I, as a fraction of the last solver step of DLS."""
 TRANSIENT = 7.0
-"""It is also at most so often the tolerance's root of the solver's order, in times m/c: dropping
-the rear foot's force excites the airborne leg's fast mode, which dies within 0.05 s. What the
-controller comes to with solvers of orders 5 to 8 at 1e-4 to 1e-10 is 7.2 to 9.5; a longer step is
-taken again."""
+"""Upper bound of the same step, in units of m/c times the tolerance's root of the solver's order.
+Dropping the rear foot's force excites the airborne leg's fast mode, which decays within 0.05 s.
+The value was chosen because the controller settles at 7.2 to 9.5. This holds for solvers of
+orders 5 to 8, at tolerances of 1e-4 to 1e-10. A longer step is repeated."""
 
 
 class LaneStep(NamedTuple):
+    """Minimal results of one gait step of every lane."""
+
     section_state: Vector  # three arrays
     durations: Vector  # of DLS, SLS-I, SLS-II, s
     outcome: Int[Array, " lanes"]  # an Outcome
     solver_steps: Int[Array, " lanes"]
-    unfinished: Bool[Array, " lanes"]  # not waited for: everything else there is void
+    unfinished: Bool[Array, " lanes"]  # stragglers not completed: their other fields are void
 
 
 class _Handed(NamedTuple):
-    """From one phase to the next."""
+    """Data passed from one phase to the next."""
 
-    next_step: Array  # that the controller would try, s
+    next_step: Array  # step size that the controller proposes next, s
     ran: Bool[Array, " lanes"]  # where the phase took place
     unfinished: Bool[Array, " lanes"]
 
 
 def lane_phase(phase: AbstractPhase, monitored: bool, called: bool = False) -> LanePhase:
-    """A phase as the march takes it. `monitored`: watch its premises as well as its guards."""
+    """Return a phase in the form of the batched integrator.
+
+    - `records_margins`: evaluate its margins in addition to its guards.
+    """
 
     def evaluate(q: Vector, v: Vector) -> Slope:
         sin, cos = sine_cosine(q[0])
@@ -110,7 +115,10 @@ def gait_step(
     stop_at_lift_off: bool,
     few: Array | None = None,
 ) -> LaneStep:
-    """One gait step of every lane, from touchdown to touchdown. `few`: see `integrate_lanes`."""
+    """Return one gait step of every lane, from touchdown to touchdown.
+
+    - `straggler_count`: see `integrate_batch_phase`.
+    """
     walked = walk(params, x, options, tableau, stop_at_lift_off, monitored=False, few=few)
     ends, stepped = walked.ends, walked.outcome == Outcome.STEPPED
     section = (ends[2].q[0], *ends[2].v)
@@ -133,7 +141,10 @@ def walk(
     few: Array | None = None,
     called: bool = False,
 ) -> Walked:
-    """The phases of every lane's step; `called`: see `LanePhase`."""
+    """Return all phases of every lane's step.
+
+    - `is_noinline`: see `BatchPhase`.
+    """
 
     def run(phase: AbstractPhase, q: Vector, v: Vector, active: Array, before: End | None) -> End:
         first = options.first_step + jnp.zeros_like(q[0])
@@ -169,7 +180,10 @@ def walk(
 
 
 def lanes_can(options: Options) -> bool:
-    """Whether the step goes by lanes here: where there is machine code, by explicit solvers."""
+    """Return whether the batch kernel can take the step: machine code and an explicit solver.
+
+    Raises `ValueError` if the options require that engine and it is not available.
+    """
     fits = explicit_tableau(options.solver) is not None
     if options.engine == "lanes" and not (fits and simd.serves()):
         raise ValueError(
@@ -180,38 +194,40 @@ def lanes_can(options: Options) -> bool:
 
 
 class _Setting(NamedTuple):
-    """What a step by lanes depends on besides its arrays."""
+    """Static configuration of a batched step: what it depends on besides its arrays."""
 
     structure: Any  # of (params, x, options), whose leaves are the arrays
     stop_at_lift_off: bool
-    friction: float | None  # that margins refer to; None where the lean result is told
+    friction: float | None  # for margins; None for the minimal result
 
     @property
     def key(self) -> tuple:
-        """By `repr`: what the trace depends on."""
+        """Cache key of the trace, by `repr`."""
         return str(self.structure), self.stop_at_lift_off, self.friction
 
     def walked(self, *leaves: Array) -> tuple[Walked, Tableau, Options]:
-        """The step over lanes, which the leaves have on their last axis, and what made it."""
+        """Return the step over lanes, which the leaves have on their last axis, with tableau and
+        options.
+        """
         params, x, options = jax.tree.unflatten(self.structure, leaves)
         tableau = explicit_tableau(options.solver)
-        assert tableau is not None  # `lanes_can` looked
+        assert tableau is not None  # checked by `can_use_lanes`
         monitored = self.friction is not None
         given = params, tuple(x), options, tableau, self.stop_at_lift_off, monitored
         return walk(*given, called=True), tableau, options
 
     def told(self, *leaves: Array) -> tuple:
-        """What the step tells, its floats first."""
+        """Return the outputs of the step, floats first."""
         walked, friction = self.walked(*leaves)[0], self.friction
         if friction is None:
             return eqx.partition(advance_of(walked, "lanes"), eqx.is_inexact_array)
         ends = tuple(end._replace(own=None) for end in walked.ends)
-        alone = walked._replace(phases=(), starts=(), ends=ends)  # nothing but what moves
+        alone = walked._replace(phases=(), starts=(), ends=ends)  # only floats
         told = by_directions(lambda walked: result_of(walked, friction, "lanes"))(alone)
         return eqx.partition(told, eqx.is_inexact_array)
 
     def like(self, *leaves: Array) -> tuple:
-        """The form of `told`."""
+        """Return arrays in the structure of `compute_outputs`."""
         x = leaves[0]
         i = jnp.zeros_like(x, jnp.int32)
         two, three = (jnp.broadcast_to(x, (n, *x.shape)) for n in (2, 3))
@@ -233,19 +249,21 @@ class _Setting(NamedTuple):
 
 
 def _every(kind: Any, x: Array) -> Any:
-    """With `x` in all fields."""
+    """Return the record with `x` in all fields."""
     return kind(*(x for _ in dataclasses.fields(kind)))
 
 
 def told_by_lanes(structure: Any, stop_at_lift_off: bool, friction: float | None) -> Forward:
-    """The step over the leaves of (params, x, options), as `any_mode` takes it."""
+    """Return the step over the leaves of (params, x, options), as a forward rule for any AD
+    mode.
+    """
     setting = _Setting(structure, stop_at_lift_off, friction)
     settings = ("gait step", *setting.key)
     return one_wheel(lane_function(setting.told, setting.like, settings))
 
 
 def sampled_by_lanes(structure: Any, stop_at_lift_off: bool, n_samples: int) -> LaneFunction:
-    """The step sampled at equal times of each phase, over the same leaves."""
+    """Return the step sampled at equal times of each phase, over the same leaves."""
     setting = _Setting(structure, stop_at_lift_off, None)
 
     def over_lanes(*leaves: Array) -> Trajectory:
@@ -270,7 +288,10 @@ def sampled_by_lanes(structure: Any, stop_at_lift_off: bool, n_samples: int) -> 
 def moved_by_lanes(
     structure: Any, stop_at_lift_off: bool, friction: float | None, moved: tuple[int, ...]
 ) -> Forward:
-    """(Jacobian by the leaves `moved`, floats) and the other outputs of `told_by_lanes`."""
+    """Return the Jacobian of `build_step_function`.
+
+    It gives (Jacobian with respect to the leaves at `input_indices`, floats) and the other outputs.
+    """
     setting = _Setting(structure, stop_at_lift_off, friction)
 
     def tightened(*leaves: Array) -> list[Array]:
@@ -293,7 +314,9 @@ def moved_by_lanes(
 
 
 def by_argument(columns: Any, leaves: Sequence[Array], moved: Sequence[int]) -> tuple:
-    """A Jacobian, whose leading axis is over all numbers of the leaves `moved`, leaf by leaf."""
+    """Return a Jacobian leaf by leaf; its leading axis runs over all entries of the selected
+    leaves.
+    """
     parts, begin = [], 0
     for i in moved:
         shape = jnp.shape(leaves[i])
@@ -307,13 +330,14 @@ def by_argument(columns: Any, leaves: Sequence[Array], moved: Sequence[int]) -> 
 
 
 DIRECTIONS = len(PARAMETER_NAMES) + 3
-"""All numbers that a step moves with: machine code keeps one of each direction in registers."""
+"""Number of all inputs of a step: machine code keeps one tangent per input in registers."""
 
 
 def along_units(function: LaneFunction, leaves: Sequence[Array], moved: Sequence[int]) -> tuple:
-    """Columns of the Jacobian of `function(*leaves)` by the leaves `moved`, and its results.
+    """Return the columns of the Jacobian of `function(*leaves)`, and its results.
 
-    It returns floats over lanes and other things; columns come first in what moves.
+    The columns are those of the leaves at `input_indices`, on the leading axis. The function
+    returns floats over lanes and auxiliary outputs.
     """
 
     def only(*some: Array) -> tuple:
@@ -329,9 +353,9 @@ def along_units(function: LaneFunction, leaves: Sequence[Array], moved: Sequence
 
 
 def _directions(leaves: Sequence[Array]) -> list[Array]:
-    """For each leaf its part of the unit vectors of all, directions first.
+    """Return, for each leaf, its part of the unit vectors of all leaves, on the leading axis.
 
-    Each number has its own ones and zeros, by which machine code leaves out what they multiply.
+    Each number has its own ones and zeros, so that machine code omits products with them.
     """
     sizes = [int(np.prod(leaf.shape[:-1])) for leaf in leaves]
     units, told, begin = np.eye(sum(sizes)), [], 0

@@ -1,7 +1,8 @@
-"""The paper's step from landing to landing, whoever integrates its phases: one wheel or lanes.
+"""The paper's step from landing to landing, for any engine that integrates its phases.
 
-An engine brings `run`, which takes one phase to its end. Which phases take place, where they start,
-how the step ended and what it tells is written here, element by element.
+An engine provides a `PhaseRunner`, which takes one phase to its end. This module determines which
+phases take place, where they start, how the step ends and what it returns. Everything is
+elementwise: for one wheel or a batch.
 """
 
 from collections.abc import Callable, Sequence
@@ -40,28 +41,30 @@ PAPER_START = (0.1, 1.6, -0.1)
 """A start near the gait of Table 1, inside its basin: rad, rad/s, m/s."""
 
 SAFE_SINGLE_SUPPORT = (-0.3, 0.9, 0.95, 1.0, 0.0, 0.0)
-"""A harmless posture (theta, L1, L2 and rates) that stands in where a wheel has already failed; it
+"""A regular posture (theta, L1, L2 and rates) in place of a wheel whose step has already failed; it
 is never integrated."""
 
 
 class End(NamedTuple):
-    """Where an engine left a phase; the phase's start where it was not active."""
+    """End of a phase; it equals the start where the phase was not active."""
 
     q: Vector
     v: Vector
     duration: Elementwise  # s
     guard: Int[Array, "..."]  # index of the guard that ended it; -1 if none did
     timed_out: Bool[Array, "..."]
-    tried: Int[Array, "..."]  # steps, accepted or not
-    minima: Array | None  # of the phase's premises, leading axis, if they were watched
-    own: Any = None  # what the engine hands on to its next phase
+    tried: Int[Array, "..."]  # attempted, accepted or not
+    minima: Array | None  # of the phase's margins, on the leading axis, if recorded
+    own: Any = None  # data that the engine passes to its next phase
 
 
 Run = Callable[[AbstractPhase, Vector, Vector, Array, End | None], End]
-"""From a phase's start (q, v), where it is active, to its end; and the end of the phase before."""
+"""Function from a phase's start (q, v), its active mask and the previous phase's end to its end."""
 
 
 class Walked(NamedTuple):
+    """Result of running all phases of a step."""
+
     s: Symbols
     landing: Landing
     phases: tuple[AbstractPhase, ...]
@@ -78,14 +81,14 @@ def through_phases(
     stop_at_lift_off: bool,
     land: Callable[..., Landing] = transitions.land,
 ) -> Walked:
-    """One step from the section state `x`, its numbers one by one."""
+    """Return all phases of one step from the section state `x`, given entry by entry."""
     good = usable(params, x)
     params, x = replaced_where_bad(good, params, x, PAPER_START)
     s = params.symbols()
     landing = land(s, *x)
     phases = phases_of(s, landing.distance, stop_at_lift_off)
     theta, motion = landing.theta, landing.motion
-    active = good & landing.stays  # a landing that frees the rear foot goes on to SLS-I
+    active = good & landing.stays  # a landing that releases the rear foot continues in SLS-I
     code = jnp.where(good, jnp.int32(Outcome.STEPPED), jnp.int32(Outcome.BAD_INPUT))
     starts, happened = [], []
     ends: list[End] = []
@@ -101,18 +104,19 @@ def through_phases(
         code = jnp.where(active, phase.outcome(end.guard, end.timed_out), code)
         starts.append(start)
         ends.append(end)
-        # The last one's start is an event of its own: Leg 2 has hit its stopper.
+        # The start of the last phase is itself an event: Leg 2 hits its stopper.
         happened.append(active if phase is phases[-1] else active & (end.duration > 0.0))
     return Walked(s, landing, phases, tuple(starts), tuple(ends), tuple(happened), code)
 
 
 def _safe(like: Elementwise) -> tuple[Elementwise, Motion]:
+    """Return `SAFE_SINGLE_SUPPORT` as an angle and a motion, in the dtype of the argument."""
     theta, *others = (jnp.asarray(value, jnp.result_type(like)) for value in SAFE_SINGLE_SUPPORT)
     return theta, Motion(*sine_cosine(theta), *others)
 
 
 def advance_of(walked: Walked, engine: str) -> Advance:
-    """The lean result; its section state is zeros where there is none."""
+    """Return the minimal result; its section state is zeros if the step failed."""
     theta, _, dtheta, dL1 = (*walked.ends[2].q, *walked.ends[2].v)
     stepped = walked.outcome == Outcome.STEPPED
     tried = [end.tried for end in walked.ends]
@@ -126,7 +130,7 @@ def advance_of(walked: Walked, engine: str) -> Advance:
 
 
 def result_of(walked: Walked, friction: Elementwise | float, engine: str) -> StepResult:
-    """All that a step tells, of one wheel or of lanes; its premises were watched."""
+    """Return the full result, for one wheel or a batch; the margins must have been recorded."""
     s, landing, ends = walked.s, walked.landing, walked.ends
     began = walked.outcome != Outcome.BAD_INPUT
     hits, stepped = walked.happened[2], walked.outcome == Outcome.STEPPED
@@ -166,7 +170,10 @@ def result_of(walked: Walked, friction: Elementwise | float, engine: str) -> Ste
 
 
 def trajectory_of(walked: Walked, samples: Sequence[Array]) -> Trajectory:
-    """The step with states at equal times of each phase: (samples, coordinates and rates, ...)."""
+    """Return the step with states at equal times of each phase.
+
+    - `samples`: of each phase, with axes (sample, coordinates and rates, ...).
+    """
     lean = advance_of(walked, "")
     durations, n = lean.durations, len(samples[0])
     begins = jnp.stack([0.0 * durations[0], durations[0], durations[0] + durations[1]])
@@ -184,9 +191,9 @@ def trajectory_of(walked: Walked, samples: Sequence[Array]) -> Trajectory:
 
 
 def described(phase: AbstractPhase, y: Array) -> tuple[Array, Array, Array]:
-    """Coordinates and rates, forces of the ground and energies at states of the phase.
+    """Return coordinates and rates, forces of the ground and energies at states of the phase.
 
-    `y`: the phase's own coordinates, then their rates, on the first axis; its other axes stay.
+    - `y`: the phase's own coordinates, then their rates, on the first axis; other axes are kept.
     """
     numbers = tuple(y)
     m = phase.at(numbers[: phase.n], numbers[phase.n :])
@@ -207,15 +214,18 @@ def _margins(
     hit: transitions.StopperHit,
     friction: Elementwise | float,
 ) -> Margins:
-    """`rear_after`: force on the rear foot just after the landing; `lets_go`: motion at the end of
-    double support."""
+    """Return the margins of the step.
+
+    - `rear_force`: force on the rear foot just after the landing;
+    - `liftoff_motion`: motion at the end of double support.
+    """
     s, landing, happened = walked.s, walked.landing, walked.happened
     began, hits = walked.outcome != Outcome.BAD_INPUT, happened[2]
     watched = [end.minima for end in walked.ends if end.minima is not None]
     minima = [Premises.named(tuple(rows), s.n) for rows in watched]
 
     def lowest(name: str, *indices: int) -> Array:
-        """Over those phases that happened; 0 if none did."""
+        """Return the minimum over those phases that happened; 0 if none did."""
         value: Any = jnp.inf
         for index in indices:
             least = jnp.asarray(getattr(minima[index], name))

@@ -1,4 +1,4 @@
-"""The lowest rung: all legs rigid. A step is a closed formula; nothing is integrated."""
+"""Rigid model: all legs are rigid. A step has a closed form; nothing is integrated."""
 
 from functools import partial
 from typing import ClassVar
@@ -36,20 +36,21 @@ from vrw_jax.wheel import (
 from vrw_jax.wording import flag
 
 GRID = 33
-"""Angles in each zoom on a force's minimum: forces are smooth over the 45 degrees of a step."""
+"""Number of angles in each zoom on the minimum of a force, chosen because forces are smooth over
+the 45 degrees of a step."""
 
 
 class RigidWheel(AbstractWheel):
-    """Rimless wheel with rigid legs and leg masses; the springs, dampers and L* play no part.
+    """Rimless wheel with rigid legs and leg masses; springs, dampers and L* have no effect.
 
-    The section state is (alpha/2, dtheta-, 0): only the rate is free, and what a start says
-    otherwise is ignored. The whole step counts as SLS-II.
+    The section state is (alpha/2, dtheta-, 0). Only the rate is free, and the other entries of a
+    start are ignored. The whole step counts as SLS-II.
 
-    - `friction`: coefficient of the ground that friction margins refer to; the motion ignores it;
-    - `stop_at_lift_off`: end a step where the ground would have to pull;
-    - `held_landing`: False is the classic landing, whose rear foot leaves without an impulse
-      (angular momentum about the new foot is kept); True is the stiff limit of the paper's own
-      landing (A4), whose rear foot is held during the impulse: the limit of `ViscoelasticWheel` as
+    - `friction`: coefficient of the ground, which enters the friction margins but not the motion;
+    - `stop_at_lift_off`: end a step where the normal force of the ground would become negative;
+    - `holds_rear_foot`: False is the classic landing, whose rear foot leaves without an impulse
+      (angular momentum about the new foot is kept). True is the stiff limit of the paper's own
+      landing (A4), whose rear foot is held during the impulse: the limit of `ViscoelasticWheel`, as
       docs/physics.md derives it.
 
     Examples:
@@ -73,7 +74,9 @@ class RigidWheel(AbstractWheel):
     )
 
     def start(self, params: WheelParams) -> SectionState:
-        """The rolling fixed point's rate, where there is one; a brisk start where there is none."""
+        """Return the rate of the rolling fixed point, or a fast start where no fixed point
+        exists.
+        """
         s = params.symbols()
         keep = self._kept(s)
         gained = 4.0 * _stiffness_of_gravity(s) * jnp.sin(0.5 * s.alpha) * s.sin_phi
@@ -85,7 +88,7 @@ class RigidWheel(AbstractWheel):
         return Advance(result.section_state, result.durations, result.outcome, result.solver_steps)
 
     def _kept(self, s: Symbols) -> Elementwise:
-        """Rate after over rate before the landing."""
+        """Return the ratio of the rate after to the rate before the landing."""
         foot_inertia = _foot_inertia(s)
         if not self.held_landing:
             return (s.Mt * s.L0**2 * s.cos_alpha + _hub_inertia(s)) / foot_inertia
@@ -99,7 +102,7 @@ class RigidWheel(AbstractWheel):
         return self.rolled(params, tuple(x), jnp.asarray(self.friction, x.dtype))
 
     def rolled(self, params: WheelParams, x: Numbers, friction: Elementwise) -> StepResult:
-        """The step element by element: of one wheel or of lanes."""
+        """Return the step elementwise: for one wheel or for a batch."""
         half = jnp.asarray(0.5 * params.leg_angle, x[1].dtype)
         x = (half + 0.0 * x[0], x[1], 0.0 * x[2])
         good = usable(params, x)
@@ -159,8 +162,11 @@ class RigidWheel(AbstractWheel):
         )
 
     def _landing(self, s: Symbols, x: Numbers, roll: "Roll", friction: Elementwise) -> tuple:
-        """Impulse at the rear foot, friction left at the fore and the rear foot, and impulses of
-        the stoppers of legs 3..n."""
+        """Return the landing impulses and friction margins.
+
+        These are the impulse at the rear foot, the friction margins of both feet (fore, rear), and
+        the impulses of the stoppers of legs 3..n.
+        """
         zero = jnp.zeros_like(x[1])
         first = roll.motion(-jnp.asarray(0.5 * s.alpha, zero.dtype) + zero)
         jump = transitions.jump_of_hub(transitions.motion_before_landing(s, *x), first)
@@ -175,7 +181,7 @@ class RigidWheel(AbstractWheel):
     def trace(
         self, params: WheelParams, x: SectionState, options: Options, n_samples: int
     ) -> Trajectory:
-        """Equal angles instead of equal times."""
+        """Return the motion at equal angles instead of equal times."""
         result = self.step(params, x, options)
         s = params.symbols()
         roll = Roll(s, params.slope, result.post_impact[1])
@@ -193,28 +199,29 @@ class RigidWheel(AbstractWheel):
 
 
 class Roll(eqx.Module):
-    """Rolling over one foot from theta = -alpha/2 with the given rate, by energy."""
+    """Rolling over one foot from theta = -alpha/2 at the given rate, by conservation of energy."""
 
     s: Symbols
     phi: Elementwise  # slope, rad
     rate: Elementwise  # at theta = -alpha/2, rad/s
 
     def rate_squared(self, theta: Elementwise) -> Elementwise:
-        """Square of dtheta at theta; negative where the wheel does not get."""
+        """Return the square of dtheta at theta; negative where the wheel does not arrive."""
         s = self.s
         fallen = _cos_sum(s, -0.5 * s.alpha) - _cos_sum(s, theta)
         return self.rate**2 + 2.0 * _stiffness_of_gravity(s) * fallen
 
     def time(self, theta: Elementwise) -> Elementwise:
-        """Time from theta = -alpha/2, s, by Carlson's R_F.
+        """Return the time from theta = -alpha/2, s, by Carlson's R_F.
 
-        With t = sin^2 of half the angle from the vertical the rate is a square root of a linear
-        function of t, and time is the complete cubic form of the elliptic integral.
+        With t = sin^2 of half the angle from the vertical, the rate is the square root of a linear
+        function of t. Time is then the complete cubic form of the elliptic integral.
         """
         s = self.s
         kappa = 2.0 * _stiffness_of_gravity(s)
         begin, end = 0.5 * (self.phi - 0.5 * s.alpha), 0.5 * (self.phi + theta)
-        least = self.rate**2 + kappa * (jnp.cos(2.0 * begin) - 1.0)  # rate^2 at the vertical
+        # Squared rate at the vertical.
+        least = self.rate**2 + kappa * (jnp.cos(2.0 * begin) - 1.0)
         apart = begin * end < 0.0
         from_vertical = jnp.zeros_like(end)
         direct = _cubic_time(
@@ -227,6 +234,7 @@ class Roll(eqx.Module):
         return direct + first
 
     def motion(self, theta: Elementwise) -> Motion:
+        """Return the motion at theta; its rate is zero where the wheel does not arrive."""
         zero = 0.0 * theta
         speed_squared = self.rate_squared(theta)
         moving = speed_squared > 0.0
@@ -235,28 +243,31 @@ class Roll(eqx.Module):
         return Motion.of(theta, length, length, rate, zero, zero)
 
     def acceleration(self, theta: Elementwise) -> dynamics.Acceleration:
-        """Angular acceleration under gravity; the legs don't move."""
+        """Return the angular acceleration under gravity; the legs do not move."""
         zero = 0.0 * theta
         sin_p = jnp.sin(theta) * self.s.cos_phi + jnp.cos(theta) * self.s.sin_phi
         return dynamics.Acceleration(_stiffness_of_gravity(self.s) * sin_p, zero, zero)
 
     def foot_force(self, theta: Elementwise) -> dynamics.FootForce:
-        """Force of the ground on the standing foot, N."""
+        """Return the force of the ground on the stance foot, N."""
         return dynamics.fore_foot_force(self.s, self.motion(theta), self.acceleration(theta))
 
     def stopper_force(self, theta: Elementwise, legs: range) -> Float[Array, "n ..."]:
-        """Force of the stoppers of `legs`, N."""
+        """Return the force of the stoppers of `legs`, N."""
         return dynamics.stopper_force(self.s, self.motion(theta), self.acceleration(theta), legs)
 
     def described(self, theta: Elementwise) -> tuple[Array, Array, Array]:
-        """Coordinates with their rates, forces of both feet and energies at theta, as rows."""
+        """Return coordinates with rates, forces of both feet and energies at theta, as rows."""
         m, force, zero = self.motion(theta), self.foot_force(theta), 0.0 * theta
         state = jnp.stack([theta, m.L1, m.L2, m.dtheta, m.dL1, m.dL2])
         forces = jnp.stack([force.tangential, force.normal, zero, zero])
         return state, forces, jnp.stack(dynamics.energy(self.s, m))
 
     def premises(self, theta: Array) -> Array:
-        """Normal force, minus friction needed, stopper forces of legs 2..n, at an angle each."""
+        """Return the margins, each at its own angle.
+
+        They are the normal force, minus the required friction, and the stopper forces of legs 2..n.
+        """
         stoppers = [
             self.stopper_force(theta[leg], range(leg, leg + 1))[0] for leg in range(2, self.s.n + 1)
         ]
@@ -264,9 +275,9 @@ class Roll(eqx.Module):
         return jnp.stack([self.foot_force(theta[0]).normal, -needed, *stoppers])
 
     def lowest_premises(self) -> Array:
-        """Minima of `premises` from landing to landing, to round-off.
+        """Return the minima of `margins` from landing to landing, to round-off.
 
-        Each is zoomed in on several times; what is left of the angle's error counts squared.
+        Each minimum is found by repeated zooming; the remaining error of the angle enters squared.
         """
         half = jnp.asarray(0.5 * self.s.alpha, self.rate.dtype)
 
@@ -287,31 +298,36 @@ class Roll(eqx.Module):
 
 
 def _hub_inertia(s: Symbols) -> Elementwise:
-    """Moment of inertia of all leg masses about the hub, n m (L0 - a)^2, kg m^2."""
+    """Return the moment of inertia of all leg masses about the hub, n m (L0 - a)^2, kg m^2."""
     return s.n * s.m * s.c0**2
 
 
 def _foot_inertia(s: Symbols) -> Elementwise:
-    """Moment of inertia of the wheel about a foot, kg m^2."""
+    """Return the moment of inertia of the wheel about a foot, kg m^2."""
     return s.Mt * s.L0**2 + _hub_inertia(s)
 
 
 def _stiffness_of_gravity(s: Symbols) -> Elementwise:
-    """Mt g L0 over the inertia about the foot, 1/s^2: g/l of a rimless wheel without leg masses."""
+    """Return Mt g L0 over the inertia about the foot, 1/s^2.
+
+    It equals g/l for a rimless wheel without leg masses.
+    """
     return s.Mt * s.g * s.L0 / _foot_inertia(s)
 
 
 def _cos_sum(s: Symbols, theta: Elementwise | float) -> Elementwise:
+    """Return cos(theta + phi)."""
     return jnp.cos(theta) * s.cos_phi - jnp.sin(theta) * s.sin_phi
 
 
 def _cubic_time(
     begin_squared: Elementwise, end_squared: Elementwise, least: Elementwise, kappa: Elementwise
 ) -> Elementwise:
-    """Time between two half-angles on one side of the vertical, given by their squares, s.
+    """Return the time between two half-angles on one side of the vertical, given by their squares,
+    s.
 
-    Integral of dt / sqrt(t (1 - t) (least + 2 kappa t)) over t = sin^2, as 2 R_F (DLMF 19.29.4);
-    zero where both ends coincide.
+    It is the integral of dt / sqrt(t (1 - t) (min_rate_squared + 2 kappa t)) over t = sin^2, as 2
+    R_F (DLMF 19.29.4); zero if both ends coincide.
     """
     apart = end_squared > begin_squared
     low = jnp.where(apart, begin_squared, 0.0)
@@ -331,10 +347,10 @@ def _cubic_time(
 
 
 def carlson_rf(x: Elementwise, y: Elementwise, z: Elementwise) -> Elementwise:
-    """Carlson's symmetric elliptic integral R_F to round-off, by duplication (DLMF 19.36.1).
+    """Return Carlson's symmetric elliptic integral R_F to round-off, by duplication (DLMF 19.36.1).
 
-    Each duplication brings the arguments four times closer; after 12 the fifth-order series is
-    exact in float64 for arguments within ten decades of each other.
+    Each duplication brings the arguments four times closer together. After 12 duplications the
+    fifth-order series is exact in float64 for arguments within ten decades of each other.
     """
 
     def double(_: object, xyz: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:

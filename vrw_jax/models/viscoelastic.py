@@ -1,4 +1,6 @@
-"""The paper's wheel: landing, double support, single support I, stopper, single support II."""
+"""Viscoelastic model of the paper: landing, double support, single support I, stopper, support
+II.
+"""
 
 import functools
 from collections.abc import Callable
@@ -49,7 +51,7 @@ from vrw_jax.wording import flag
 
 
 class Flow(NamedTuple):
-    """A phase as the integrator of one wheel takes it, over the state y = (q, v) in one vector."""
+    """A phase for the diffrax integrator, over the state y = (q, v) as one vector."""
 
     motion: Callable[[State], Motion]
     field: Field
@@ -57,7 +59,10 @@ class Flow(NamedTuple):
 
 
 def flow_of(phase: AbstractPhase, monitored: bool) -> Flow:
-    """`monitored`: watch the phase's premises as well as its guards."""
+    """Return the phase for the diffrax integrator.
+
+    - `records_margins`: evaluate the phase's margins in addition to its guards.
+    """
 
     def motion(y: State) -> Motion:
         numbers = tuple(y)
@@ -83,6 +88,7 @@ def _run(
     active: Array,
     _before: End | None,
 ) -> End:
+    """Return the end of one phase, integrated by diffrax."""
     flow = flow_of(phase, monitored)
     end = integrate_phase(flow.field, flow.watched, jnp.stack([*q, *v]), active, options)
     state = tuple(end.state)
@@ -93,17 +99,17 @@ def _run(
 
 
 class ViscoelasticWheel(AbstractWheel):
-    """The paper's rung: roles fixed, no slip, no scuffing; its premises are measured, not enforced.
+    """The paper's model: fixed leg roles, no slip, no scuffing; margins are measured, not enforced.
 
-    - `friction`: coefficient of the ground that friction margins refer to; the motion ignores it;
+    - `friction`: coefficient of the ground, which enters the friction margins but not the motion;
     - `stop_at_lift_off`: end a step where the ground would have to pull on Leg 1 (bouncing, which
-      the rung can't model); without it the step goes on formally, as the paper does for scuffing,
-      and the monitors tell.
+      the model does not describe). Without it the step continues formally, as in the paper for
+      scuffing, and the margins report the violation.
 
     Examples:
         >>> wheel = vrw.ViscoelasticWheel(friction=20.0)
         >>> step = vrw.step(vrw.WheelParams(), vrw.paper_start(), model=wheel)
-        >>> print(f"{step.monitors.friction_fore:.1f}")
+        >>> print(f"{step.margins.friction_fore:.1f}")
         19.4
     """
 
@@ -118,7 +124,7 @@ class ViscoelasticWheel(AbstractWheel):
     )
 
     def start(self, params: WheelParams) -> SectionState:
-        """Close to the gait of Table 1, inside its basin."""
+        """Return a start close to the gait of Table 1, inside its basin."""
         return jnp.asarray(PAPER_START, params.damping.dtype)
 
     def advance(self, params: WheelParams, x: SectionState, options: Options) -> Advance:
@@ -128,6 +134,7 @@ class ViscoelasticWheel(AbstractWheel):
         return self._told(params, x, options, detailed=True)
 
     def _told(self, params: WheelParams, x: SectionState, options: Options, detailed: bool) -> Any:
+        """Return the outputs of the compiled step."""
         leaves, structure = jax.tree.flatten((params, x, options))
         return eqx.combine(*_compiled(self, structure, detailed)(*leaves))
 
@@ -142,6 +149,7 @@ class ViscoelasticWheel(AbstractWheel):
         return sampled(*leaves)
 
     def _sampled_by_diffrax(self, structure: Any, n_samples: int, *leaves: Array) -> Trajectory:
+        """Return the sampled step, integrated by diffrax."""
         params, x, options = jax.tree.unflatten(structure, leaves)
         walked, samples = self._walk(params, x, options, monitored=False), []
         for phase, start, end in zip(walked.phases, walked.starts, walked.ends, strict=True):
@@ -152,19 +160,24 @@ class ViscoelasticWheel(AbstractWheel):
     def _walk(
         self, params: WheelParams, x: SectionState, options: Options, monitored: bool
     ) -> Walked:
+        """Return all phases of the step, integrated by diffrax."""
         run = functools.partial(_run, options, monitored)
         return through_phases(run, params, tuple(x), self.stop_at_lift_off)
 
 
 @functools.cache
 def _compiled(model: ViscoelasticWheel, structure: Any, detailed: bool) -> Forward:
-    """What a step tells, over the leaves of (params, x, options), differentiable in any mode."""
+    """Return the step over the leaves of (params, x, options), differentiable in any mode."""
 
     static = jax.tree.unflatten(structure, [0.0] * structure.num_leaves)[2]
     engine = "lanes" if lanes_can(static) else "diffrax"
 
     def by_diffrax(tighten: bool, *leaves: Array) -> tuple:
-        """Beside lanes derivatives of their derivatives alone, under the same engine's name."""
+        """Return the outputs of the step by diffrax.
+
+        With the batch kernel as engine, it serves only derivatives of derivatives, under that
+        engine's name.
+        """
         params, x, options = jax.tree.unflatten(structure, leaves)
         options = options.for_derivatives() if tighten else options
         walked = model._walk(params, x, options, monitored=detailed)
