@@ -1,1 +1,1 @@
-"""Real ground: one-sided contacts with friction, and stoppers that may let go."""
+"""Unilateral contact: one-sided contacts with friction, and stoppers that may be one-sided."""

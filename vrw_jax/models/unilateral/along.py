@@ -1,9 +1,9 @@
-"""How walks of lanes on real ground move along many directions, all beside one motion.
+"""Walks of a batch with unilateral contact, with tangents along many directions.
 
-What decides the motion (events, contacts, lengths of steps) is done once; at each stage of a
-Runge-Kutta step, and where an event is passed, what all directions share is computed once, and each
-direction then goes through what is linear. Derivatives are of the discrete flow at the lengths that
-were taken, and of the times of its events: see `numerics.tangents`.
+Everything that determines the motion (events, contacts, step sizes) is computed once. At each stage
+of a Runge-Kutta step and at each event, quantities that all tangents share are computed once. Each
+tangent then needs only linear operations. The derivatives are those of the discrete flow at the
+accepted step sizes, and of the times of its events: see `numerics.tangents`.
 """
 
 import math
@@ -40,53 +40,59 @@ from vrw_jax.numerics import Options, Tableau, if_any, real_stability_limit, sel
 
 
 class _March(NamedTuple):
-    """Of a direction, what moves as lanes march."""
+    """Tangent of a lane's state during an interval."""
 
     q: Array
     v: Array
     told: Array | None
-    slope: Array  # of accelerations and, if wanted, what is summed up, where it stands
-    later: Array  # how its time moves, s
+    slope: Array  # of accelerations and, if requested, accumulators
+    later: Array  # tangent of the time, s
 
 
 class _Way(NamedTuple):
+    """Tangent of all of a lane's state."""
+
     march: _March
-    rest: Moves  # but for what the march has
+    rest: Moves  # those not in the interval
 
     @classmethod
     def of(cls, moves: Moves, slope: Array) -> "_Way":
+        """Return the tangent of these lane tangents and dynamics rows."""
         tally, told = moves.told
         rest: Any = moves._asdict() | {"q": None, "v": None, "told": (tally, None), "time": None}
         return cls(_March(moves.q, moves.v, told, slope, moves.time), Moves(**rest))
 
     def moves(self) -> Moves:
+        """Return the lane tangents."""
         q, v, told, _, later = self.march
         return self.rest._replace(q=q, v=v, told=(self.rest.told[0], told), time=later)
 
 
 class Ways(NamedTuple):
-    """Directions of each lane: arrays have them on the first axis, lanes on the last."""
+    """Tangents of each lane: arrays have them on the first axis, lanes on the last."""
 
-    many: Array  # how many a lane has
-    by_columns: Array  # how many of these, the first ones, may move with columns
+    many: Array  # number of tangents of a lane
+    by_columns: Array  # number of leading ones that may have column parts
     columns: Array
-    rows: Array  # all numbers of a `_Way` behind each other: few loops are quickly compiled
+    rows: Array  # all numbers of a `_Tangent` in one array, for few loops and short compilation
 
     def blank(self, size: int) -> Array:
-        """So many rows of each direction, to be written."""
+        """Return uninitialized rows of each tangent, to be written."""
         return lax.empty((len(self.columns), size, *self.many.shape), self.columns.dtype)
 
     def each(
         self, function: Callable[[Array, Array], Any], rows: Array, begin: Array | int = 0
     ) -> Array:
-        """Rows of each direction, from `begin` on overwritten by what `function` tells of its place
-        and of its own rows."""
+        """Return the rows of each tangent, overwritten from row `first_row` on by `function(k,
+        rows)`.
+        """
         goes_on = lambda state: jnp.any(state[0] < self.many)
 
         def turn(state: tuple[Array, Array]) -> tuple[Array, Array]:
             k, rows = state
             told = _packed(function(k, lax.dynamic_index_in_dim(rows, k, 0, False)))
-            told = jnp.stack([told[i] for i in range(len(told))])  # in registers
+            # Stacking row by row keeps the rows in registers.
+            told = jnp.stack([told[i] for i in range(len(told))])
             place = k, jnp.int32(begin), jnp.int32(0)
             return k + 1, lax.dynamic_update_slice(rows, told[None], place)
 
@@ -94,10 +100,12 @@ class Ways(NamedTuple):
 
 
 def _packed(tree: Any) -> Array:
+    """Return all numbers of a tree in one array of rows."""
     return jnp.concatenate([x.reshape(-1, x.shape[-1]) for x in jax.tree.leaves(tree)])
 
 
 def _unpacked(rows: Array, like: Any) -> Any:
+    """Return the rows as a tree of the template's structure: the inverse of `_pack_rows`."""
     leaves, structure = jax.tree.flatten(like)
     found, begin = [], 0
     for leaf in leaves:
@@ -109,15 +117,17 @@ def _unpacked(rows: Array, like: Any) -> Any:
 
 
 def _at(rows: Array, k: Array, like: Any) -> Any:
+    """Return tangent k as a tree of the template's structure."""
     return _unpacked(lax.dynamic_index_in_dim(rows, k, 0, False), like)
 
 
 def walked_along(
     on: Walk, columns: Array, x: Array, d_columns: Array, d_x: Array, many: Array
 ) -> tuple[Walked, Any]:
-    """`lanes.walked`, and how what is told moves along directions of each lane: its floats.
+    """Return the result of `run_walks`, and the tangents of its floats for each lane.
 
-    Directions, of which a lane has `many`, are a first axis of `d_columns`, `d_x` and the latter.
+    Tangents are the first axis of `d_columns`, `d_x` and the returned tangents; a lane has
+    `n_tangents` of them.
     """
     columns, x, good = on.sound(columns, x)
     n_rows = lambda tree: len(_packed(tree))
@@ -179,7 +189,7 @@ def _marched(
     options: Options,
     tableau: Tableau,
 ) -> tuple[March, Array]:
-    """`march.marched`, with the directions carried along and on to the event."""
+    """Return the result of `integrate_interval`, with the tangents propagated to the event."""
     flow = flow_at(columns)
     sizes, last = guard_sizes(flow), len(tableau.places) - 1
     more, longest = _more(ways, like, begin.stance), _longest(flow, tableau)
@@ -228,7 +238,10 @@ def _stages(
     tableau: Tableau,
     more: Array,
 ) -> tuple[Array, Array]:
-    """Slopes at the stages of a step, and how they move: of each direction one after the other."""
+    """Return the dynamics rows at the stages of a step, and the tangents of these rows.
+
+    The tangents are processed one after another.
+    """
     here, h = now.here, now.h
     size, last = len(like.slope), len(tableau.places) - 1
     fresh = (now.verdict == MARCHING) & (now.time == 0.0)
@@ -258,7 +271,7 @@ def _stages(
     others = jnp.zeros((last, *here.slope.shape), h.dtype)
     slopes = jnp.concatenate([here.slope[None], others])
     moved = ways.each(lambda k, _: _at(ways.rows, k, like).slope, ways.blank((last + 1) * size))
-    # The first stage is the last one of the step before, but where an event was passed.
+    # The first stage is the last one of the previous step, except after an event.
     first = jnp.where(jnp.any(fresh), 0, 1).astype(jnp.int32)
     goes_on = lambda state: state[0] <= last
     return lax.while_loop(goes_on, stage, (first, slopes, moved))[1:]
@@ -267,7 +280,7 @@ def _stages(
 def _ends(
     tableau: Tableau, i: Array, way: _March, known: Array, h: Array, some: slice
 ) -> tuple[Array, Array]:
-    """`stage_at` of some coordinates, by the stages before it alone."""
+    """Return the tangent of `stage_state` for some coordinates, from the earlier stages."""
     rows = [jnp.asarray(np.reshape(x, -1)) for x in (tableau.once, tableau.twice)]
     width, place = len(tableau.once[0]), jnp.asarray(tableau.places)[i]
 
@@ -284,12 +297,14 @@ def _ends(
 
 
 CALM = 0.85
-"""Share of the longest stable step that directions take in a leg that swings."""
+"""Fraction of the longest stable step size that is used for tangents of a swinging leg."""
 
 
 def _longest(flow: Flow, tableau: Tableau) -> Array:
-    """Step beyond which directions grow in a leg that swings, whose damper stops it within m / c:
-    step control knows the motion alone, in which such a leg may be all but at rest.
+    """Return the step size above which tangents of a swinging leg grow.
+
+    The damper of such a leg stops it within m / c. Step-size control is based on the motion alone,
+    in which such a leg may be almost at rest.
     """
     swings = jnp.any(~flow.stance.locked & (flow.stance.contact == OFF), axis=0)
     steps = CALM * real_stability_limit(tableau)
@@ -297,7 +312,7 @@ def _longest(flow: Flow, tableau: Tableau) -> Array:
 
 
 def _more(ways: Ways, like: _March, stance: Stance) -> Array:
-    """Whether any other leg moves, of any lane along any direction."""
+    """Return whether any leg after the first ones moves, in any lane and along any tangent."""
 
     def turn(state: tuple[Array, Array]) -> tuple[Array, Array]:
         k, moves = state
@@ -318,7 +333,7 @@ def _met(
     ways: Ways,
     like: _March,
 ) -> Callable[[Array, Array], _March]:
-    """Directions where the event comes later or earlier along them."""
+    """Return the function that shifts tangents by the tangent of the event time."""
     here, n = now.here, len(now.here.q)
 
     def guards(columns: Array, q: Array, v: Array) -> Array:

@@ -1,8 +1,8 @@
-"""What carries the motion on, by forces or by impulses, and how it moves with anything.
+"""Forces or impulses of a contact configuration, and their derivatives.
 
-The equations are linear in accelerations and forces, or in velocities after an impact and impulses.
-So along a direction these change as the same equations say of what is left over where they stay:
-nothing but that is differentiated.
+The equations are linear in accelerations and forces, or in impulses and the velocities after an
+impact. So the tangents of these solve the same equations with the tangent of the residual on the
+right-hand side. Only that residual is differentiated.
 """
 
 from collections.abc import Callable
@@ -34,7 +34,7 @@ from vrw_jax.wheel import Symbols
 
 
 class Stand(NamedTuple):
-    """A wheel whose contacts and stoppers are known."""
+    """A wheel with known contact modes and stopper states."""
 
     s: Symbols
     motion: WheelMotion
@@ -46,12 +46,12 @@ class Stand(NamedTuple):
 
     @property
     def stays(self) -> Array:
-        """Legs whose length does not change."""
+        """Whether the length of a leg is fixed."""
         return self.airborne | (self.slots.spread(self.held) > 0)
 
 
 class Carried(NamedTuple):
-    """What ground, the slots' stoppers and the hub do: see `contacts.Answer`."""
+    """Forces of ground and slots' stoppers and the hub's motion: see `contacts.ContactSolution`."""
 
     tangential: Pair
     normal: Pair
@@ -63,21 +63,23 @@ class Carried(NamedTuple):
 
 
 def sliding(contact: Array) -> Pair:
-    """1 for a slot's foot that slides downhill, -1 uphill, 0 else."""
+    """Return 1 for a slot's foot that slides downhill, -1 for uphill and 0 otherwise."""
     sign = lambda mode: jnp.where(mode == SLIP_DOWN, 1.0, jnp.where(mode == SLIP_UP, -1.0, 0.0))
     return sign(contact[0]), sign(contact[1])
 
 
 class _Stays(NamedTuple):
-    """At the wheel: accelerations, or jumps of velocities."""
+    """Quantities that are frozen for a tangent of the residual: accelerations, or velocity
+    jumps.
+    """
 
-    along: Legs  # of legs' masses, beyond the hub's: along their legs, and across
-    across: Legs
+    along: Legs  # of leg masses, beyond the hub's: along the legs
+    across: Legs  # and transverse to them
     hub: Pair  # beyond gravity's
 
 
 class _Moves(NamedTuple):
-    """How rows of the equations move along a direction in which those stay."""
+    """Tangents of the equations' rows with the frozen terms fixed."""
 
     along: Legs
     across: Legs
@@ -90,19 +92,20 @@ class _Moves(NamedTuple):
 _Rows = Callable[[Stand, Stand, Hub, Carried], tuple[_Stays, _Moves]]
 
 
-@eqx.filter_jit  # traced once, wherever it is called
+@eqx.filter_jit  # traced once for all call sites
 def in_motion(stand: Stand) -> Carried:
-    """Forces, and accelerations that they leave."""
+    """Return the forces, and the resulting accelerations."""
     return _carried(free_acceleration, rows_of_motion, stand)
 
 
 @eqx.filter_jit
 def in_impact(stand: Stand) -> Carried:
-    """Impulses, and velocities that they leave."""
+    """Return the impulses, and the velocities after them."""
     return _carried(free_velocity, _rows_of_impact, stand)
 
 
 def told_by(stand: Stand, hub: Hub, free: Free) -> Carried:
+    """Return the forces of a configuration for this free motion."""
     s, _, friction, slots, contact, held, _ = stand
     found = answer(s, hub, free, contact, held, friction)
     out = free.legs + hub.legs.sin * found.hub[0] + hub.legs.cos * found.hub[1]
@@ -112,6 +115,7 @@ def told_by(stand: Stand, hub: Hub, free: Free) -> Carried:
 
 
 def _solved(free_of: Callable[..., Free], stand: Stand) -> tuple[Hub, Free, Carried]:
+    """Return inertia, free motion and forces of a configuration."""
     s, motion, one = stand.s, stand.motion, one_of(stand.motion)
     hub = kept(hub_of(s, motion, stand.slots, stand.airborne), one)
     free = kept(free_of(s, motion, stand.slots, hub), one)
@@ -119,11 +123,12 @@ def _solved(free_of: Callable[..., Free], stand: Stand) -> tuple[Hub, Free, Carr
 
 
 def solved_motion(stand: Stand) -> tuple[Hub, Free, Carried]:
-    """Inertia, what would be free of forces, and what is with them."""
+    """Return the inertia, the motion free of contact forces, and the forces."""
     return _solved(free_acceleration, stand)
 
 
 def _carried(free_of: Callable[..., Free], rows: _Rows, stand: Stand) -> Carried:
+    """Return the forces, with a derivative rule by the tangent of the residual."""
     floats, rest = eqx.partition(stand, eqx.is_inexact_array)
     arrays, rest = eqx.partition(rest, eqx.is_array)
     whole = lambda floats, arrays: eqx.combine(floats, arrays, rest)
@@ -145,20 +150,21 @@ def _carried(free_of: Callable[..., Free], rows: _Rows, stand: Stand) -> Carried
 
 
 class Left(NamedTuple):
-    """What the equations are left with along a direction, as it would move the rest."""
+    """Tangent of the residual, in the form of its effect on the unknowns."""
 
     legs: Legs  # their lengths
     hub: tuple[Legs, Legs, Legs]  # each leg's part of the forces there
-    rest: Vector3  # of them beside the legs'
+    rest: Vector3  # the forces there without the legs' part
     foot_e: Pair
     foot_u: Pair
-    grip: Pair  # how friction moves by its coefficient
-    pull: Pair  # how the slots' pulls move by that, and as their legs turn
+    grip: Pair  # tangent of friction by its coefficient
+    pull: Pair  # tangent of the slots' pulls by that, and by their legs' rotation
 
 
 def left_over(
     stand: Stand, way: Stand, hub: Hub, told: Carried, stays: _Stays, moves: _Moves
 ) -> Left:
+    """Return the tangent of the residual along a tangent of the configuration."""
     s, ds, slots, (sin, cos), two = stand.s, way.s, stand.slots, hub.legs, range(2)
     b, db, dtheta = stand.motion.L - s.a, way.motion.L - ds.a, way.motion.theta
     slides, rough = sliding(stand.contact), jax.jvp(rough_of, (stand.friction,), (way.friction,))[1]
@@ -194,7 +200,7 @@ def left_over(
 
 
 class Acts(NamedTuple):
-    """The same, of all legs together and of the slots'."""
+    """Tangent of the residual, summed over all legs and gathered for the slots."""
 
     hub: Vector3
     own: Pair
@@ -204,12 +210,13 @@ class Acts(NamedTuple):
 
 
 def in_all(slots: Slots, left: Left) -> Acts:
+    """Return the residual tangent summed over the legs."""
     x, z, turn = (over_legs(legs) + rest for legs, rest in zip(left.hub, left.rest, strict=True))
     return Acts((x, z, turn), slots.of(left.legs), left.foot_e, left.foot_u, left.grip)
 
 
 def asked(hub: Hub, legs: Legs, left: Acts) -> Free:
-    """What that asks of contacts and stoppers."""
+    """Return the tangent of the free motion that the residual tangent is equivalent to."""
     to, own, (u, v) = times(hub.inverse, left.hub), left.own, left.foot_u
     e = [hub.cos[i] * to[0] - hub.sin[i] * to[1] - hub.L[i] * to[2] for i in range(2)]
     e = [e[i] + left.foot_e[i] for i in range(2)]
@@ -217,6 +224,7 @@ def asked(hub: Hub, legs: Legs, left: Acts) -> Free:
 
 
 def rows_of_motion(stand: Stand, way: Stand, hub: Hub, told: Carried) -> tuple[_Stays, _Moves]:
+    """Return the frozen terms and the tangents of the rows of the equations of motion."""
     s, motion, slots = stand.s, stand.motion, stand.slots
     ds, moved, dtheta = way.s, way.motion, way.motion.theta
     b, db, turn = motion.L - s.a, moved.L - ds.a, told.hub[2]
@@ -249,6 +257,7 @@ def rows_of_motion(stand: Stand, way: Stand, hub: Hub, told: Carried) -> tuple[_
 
 
 def _rows_of_impact(stand: Stand, way: Stand, hub: Hub, told: Carried) -> tuple[_Stays, _Moves]:
+    """Return the frozen terms and the tangents of the rows of the impact equations."""
     s, motion, moved, slots = stand.s, stand.motion, way.motion, stand.slots
     turn = told.hub[2]
     jump, b = turn - motion.dtheta, motion.L - s.a

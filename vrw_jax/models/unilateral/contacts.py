@@ -1,15 +1,15 @@
-"""Which foot sticks, slides or lifts, and which loaded leg is on its stopper: by enumeration.
+"""Contact modes (stick, slip, lift-off) of the feet and stopper states, by enumeration.
 
-Every combination of contact modes and stoppers of the two slots is solved; admissible are those
-whose forces push, whose friction lies in Coulomb's cone and against the slip, and whose open
-constraints don't close. Among several the one with most sticking feet is taken. The same table
-serves impacts (impulses and velocities after them) and motion (forces and accelerations).
+Every combination of contact modes and stoppers of the two slots is solved. In an admissible one,
+normal forces push, friction lies in Coulomb's cone and opposes the slip, and open constraints do
+not close. Of several, the one with the most sticking feet is chosen. The same table serves impacts
+(impulses and the velocities after them) and motion (forces and accelerations).
 
-Infinite friction is the limit of large friction. Of Coulomb's |t| = mu n a finite t leaves n = 0: a
-sliding foot is carried by friction alone, against its slip, and a resting one begins to slide
-where its normal force vanishes. The paper's rule (A1)-(A4), told by a friction of minus infinity
-(`THE_PAPERS`), is another: a foot sticks if that needs no pull, else it lifts, and only where
-neither is possible it slides, without friction.
+Infinite friction is the limit of large friction. In Coulomb's |t| = mu n, a finite t leaves n = 0.
+So a sliding foot is carried by friction alone, against its slip, and a resting foot begins to slide
+where its normal force vanishes. The paper's rule (A1)-(A4) is a different one, selected by a
+friction of minus infinity (`PAPER_RULE_SENTINEL`). A foot sticks if that requires no pull, and
+lifts otherwise. Only if neither is possible, it slides without friction.
 """
 
 import functools
@@ -36,27 +36,29 @@ OFF, STICK, SLIP_DOWN, SLIP_UP = 0, 1, 2, 3
 
 
 THE_PAPERS = -np.inf
-"""Friction by which the paper's rule is told from the limit of large friction."""
+"""Friction that selects the paper's rule instead of the limit of large friction."""
 
 
 class Answer(NamedTuple):
-    """Forces (N) and accelerations they leave, or impulses (N s) and velocities after them."""
+    """Forces (N) and resulting accelerations, or impulses (N s) and the velocities after them."""
 
     tangential: Pair  # on each slot's foot, downhill positive
     normal: Pair  # pushing positive
     stopper: Pair  # of each slot's leg, pushing positive
-    pull: Pair  # sum of stopper and foot force along u: what acts on the leg's mass
+    pull: Pair  # sum of stopper and foot force along u, acting on the leg's mass
     hub: Vector3
     length: Pair  # of each slot's leg
     foot_x: Pair  # of each slot's foot
     foot_z: Pair
-    regular: Any  # vanishes where no force holds a sliding foot: Painlevé's singularity
+    regular: Any  # zero if no force holds a sliding foot: Painlevé's singularity
 
 
 Matrix = tuple[tuple[Any, Any], tuple[Any, Any]]
+"""Matrix of two rows and two columns."""
 
 
 def _solved(A: Matrix, b: Pair) -> Pair:
+    """Return the solution of a 2 x 2 system; NaN if the matrix is singular."""
     determinant = A[0][0] * A[1][1] - A[0][1] * A[1][0]
     scale = 1.0 / jnp.where(determinant == 0.0, jnp.nan, determinant)
     return (
@@ -66,42 +68,50 @@ def _solved(A: Matrix, b: Pair) -> Pair:
 
 
 def _matrix(entry: Any) -> Matrix:
+    """Return the 2 x 2 matrix of the entries `entry(i, j)`."""
     return ((entry(0, 0), entry(0, 1)), (entry(1, 0), entry(1, 1)))
 
 
 def _pair(entry: Any) -> Pair:
+    """Return the entries `entry(0)` and `entry(1)`."""
     return entry(0), entry(1)
 
 
 def each(function: Callable[[Any], Any], friction: Roughness) -> Any:
-    """Of the friction of all feet, or of each slot's."""
+    """Return the function of the friction of all feet, or of each slot's."""
     pair = isinstance(friction, tuple)
     return (function(friction[0]), function(friction[1])) if pair else function(friction)
 
 
 def _at(i: int, friction: Any) -> Any:
+    """Return the friction of slot i."""
     return friction[i] if isinstance(friction, tuple) else friction
 
 
 def rough_of(friction: Roughness) -> Any:
-    """Coulomb's coefficient; a foot that slides though friction is infinite has none."""
+    """Return Coulomb's coefficient; 0 for infinite friction, which exerts none on a sliding
+    foot.
+    """
     return each(lambda value: jnp.where(jnp.isfinite(value), value, 0.0), friction)
 
 
 class _Feet(NamedTuple):
-    """What a combination asks of each slot's foot. Its unknown c is the force along e (it sticks)
-    or the normal force (it slides; friction in the limit where it is infinite); an unloaded foot
-    has c = 0."""
+    """Conditions of a combination at each slot's foot.
+
+    The unknown c is the force along e for a sticking foot. For a sliding foot it is the normal
+    force, or the friction force in the limit of infinite friction. An unloaded foot has c = 0.
+    """
 
     stick: Pair
     loaded: Pair
-    to_e: Pair  # force of c = 1 along e
-    to_u: Pair  # along u, but for what a sticking foot's own leg asks
-    row_e: Pair  # what must vanish: so much of the foot's motion along e
-    row_u: Pair  # and so much of its force on the leg's mass
+    to_e: Pair  # force along e for c = 1
+    to_u: Pair  # along u, except for the own leg's part of a sticking foot
+    row_e: Pair  # weight of the foot's motion along e in the zero condition
+    row_u: Pair  # weight of the foot's force on the leg's mass in it
 
 
 def _feet(s: Symbols, hub: Hub, contact: Array, friction: Roughness) -> _Feet:
+    """Return the conditions of these contact modes."""
     sin, cos = hub.sin, hub.cos
     rough = each(
         lambda value: jnp.where(value == jnp.inf, 1.0, jnp.where(jnp.isfinite(value), value, 0.0)),
@@ -123,15 +133,17 @@ def _feet(s: Symbols, hub: Hub, contact: Array, friction: Roughness) -> _Feet:
 
 
 def _same(i: int, j: int) -> float:
+    """Return an entry of the identity matrix."""
     return 1.0 if i == j else 0.0
 
 
 def _stoppers(
     s: Symbols, hub: Hub, free: Free, held: Array, feet: _Feet, one: Array
 ) -> tuple[Pair, Matrix]:
-    """Stopper forces without the feet's, and what each foot's c adds to them, [foot][stopper].
+    """Return the stopper forces without the feet, and the effect of each foot's c, [foot][stopper].
 
-    Of N s = p + P c, the row of an open one being s = 0: a system that is always regular.
+    They solve N s = p + P c, where the row of an open stopper is s = 0: the system is always
+    regular.
     """
     sin, cos, m_inv = hub.sin, hub.cos, 1.0 / s.m
     H, K = ((hub.H[0], hub.H[1]), (hub.H[2], hub.H[3])), ((hub.K[0], hub.K[1]), hub.K[1:])
@@ -149,8 +161,10 @@ def _stoppers(
 def _carried(
     s: Symbols, hub: Hub, free: Free, feet: _Feet, alone: Pair, columns: Matrix, one: Array
 ) -> tuple[Pair, Pair, Pair, Any]:
-    """Forces of the stoppers, and of the feet along e and u: the feet's rows with the stoppers, as
-    `_stoppers` gives them, inserted; and the determinant of what is solved."""
+    """Return the forces of the stoppers, of the feet along e and along u, and the determinant.
+
+    The feet's equations are solved with the stoppers of `_eliminate_stoppers` inserted.
+    """
     row_e, row_u, to_e, to_u = feet.row_e, feet.row_u, feet.to_e, feet.to_u
     G, H = ((hub.G[0], hub.G[1]), hub.G[1:]), ((hub.H[0], hub.H[1]), (hub.H[2], hub.H[3]))
     R = _matrix(lambda i, k: _same(i, k) * row_u[i] - row_e[i] * H[k][i])
@@ -173,14 +187,15 @@ def _carried(
     return kept((stopper, along_e, along_u, regular), one)
 
 
-@eqx.filter_jit  # traced once, wherever it is called
+@eqx.filter_jit  # traced once for all call sites
 def answer(
     s: Symbols, hub: Hub, free: Free, contact: Array, held: Array, friction: Roughness
 ) -> Answer:
-    """Solve one combination: contact modes and stoppers of the two slots, shape (2,) each.
+    """Return the solution of one combination of contact modes and stoppers of the two slots, shape
+    (2,).
 
-    A sticking foot is at rest, a sliding one keeps its height with friction against the slip, a
-    held leg keeps its length. Stoppers are eliminated first.
+    A sticking foot is at rest, a sliding foot keeps its height with friction against the slip, and
+    a held leg keeps its length. The stoppers are eliminated first.
     """
     sin, cos, m_inv = hub.sin, hub.cos, 1.0 / s.m
     one = 1.0 + 0.0 * lax.stop_gradient(free.hub[2])
@@ -209,10 +224,11 @@ def answer(
 
 
 def _table() -> tuple[np.ndarray, np.ndarray]:
-    """All combinations of modes and stoppers, most sticking feet first, then most sliding ones.
+    """Return all combinations of modes and stoppers, most sticking feet first, then most sliding
+    ones.
 
-    Two sticking feet on two held legs are left out: they fix the hub twice over, so their forces
-    are not determined.
+    Two sticking feet on two held legs are excluded: they constrain the hub twice, so that their
+    forces are not determined.
     """
     rank = {STICK: 0, SLIP_DOWN: 1, SLIP_UP: 1, OFF: 2}
     rows = [
@@ -230,25 +246,27 @@ MODES, HELD = _table()
 ORDER_WITHOUT_SLIP = np.argsort(
     [sum({STICK: 0, OFF: 2}.get(int(m), 5) for m in row) for row in MODES], kind="stable"
 )
-"""The order by the paper's rule: sliding comes last."""
+"""Order of the combinations by the paper's rule: sliding comes last."""
 AT_ONCE = 8
-"""Combinations that XLA looks at together: most events allow no more. Machine code takes one after
-the other."""
+"""Number of combinations that XLA solves together, chosen because most events allow no more.
+Machine code solves them one after the other."""
 ANY_MODE = (1 << 4) - 1
-"""The set of all modes, each a bit."""
+"""Set of all modes, one bit per mode."""
 
 Rows = tuple[Any, Any]
-"""A set of the table's rows: bits of two words."""
+"""A set of rows of the table: the bits of two words."""
 
 
 class _Order(NamedTuple):
-    """The table in one order, by the sets of its rows that have something in common."""
+    """The table in one order, as sets of rows with a property in common."""
 
     contact: list[list[Rows]]  # by slot and mode
     held: list[Rows]  # by slot
 
     @classmethod
     def of(cls, rows: np.ndarray) -> "_Order":
+        """Return the table with its rows in this order."""
+
         def packed(flags: np.ndarray) -> Rows:
             words = np.packbits(np.append(flags, False), bitorder="little").view("<i4")
             return words[0], words[1]
@@ -262,19 +280,22 @@ _ORDERS = _Order.of(ORDER_WITHOUT_SLIP), _Order.of(np.arange(len(MODES)))
 
 
 def _order(by_paper: Array) -> _Order:
+    """Return the paper's order or the usual one, per batch element."""
     return jax.tree.map(lambda yes, no: jnp.where(by_paper, yes, no), *_ORDERS)
 
 
 class Allowed(NamedTuple):
-    """What may be chosen, and which signs are known without looking. Sets of modes are bits."""
+    """Allowed combinations, and conditions that need no test. Sets of modes are bits."""
 
     contact: Int[Array, "2 ..."]  # modes of each slot's foot
     held: Bool[Array, "2 ..."]  # the stopper may hold; it may always be open
-    stays: Bool[Array, "2 ..."]  # the foot keeps its mode whatever it takes
-    known_contact: Int[Array, "2 ..."]  # lifts, sticks or slides that way without a test
+    stays: Bool[Array, "2 ..."]  # the foot keeps its mode whatever the force
+    known_contact: Int[Array, "2 ..."]  # modes that need no test
     known_open: Bool[Array, "2 ..."]  # an open stopper needs no test: the leg is away from it
 
     def rows(self, order: _Order) -> Rows:
+        """Return the allowed rows of the table."""
+
         def word(w: int) -> Array:
             left = jnp.full_like(self.contact[0], -1, jnp.int32)
             for i in range(2):
@@ -288,32 +309,36 @@ class Allowed(NamedTuple):
 
 
 def has(modes: Array, mode: Array | int) -> Bool[Array, "..."]:
+    """Return whether the set contains the mode."""
     return ((modes >> mode) & 1) > 0
 
 
 class Chosen(NamedTuple):
+    """The chosen combination."""
+
     contact: Int[Array, "2 ..."]
     held: Bool[Array, "2 ..."]
-    wrong: Elementwise  # how far its worst sign is off, see `Negligible`; 0 where it is admissible
-    solutions: Int[Array, "..."]  # admissible combinations, no less than 1 where `wrong` is small
+    wrong: Elementwise  # worst sign violation, see `SignTolerances`; 0 if admissible
+    solutions: Int[Array, "..."]  # admissible ones; at least 1 if the violation is small
 
 
 class Negligible(NamedTuple):
-    """What signs are judged by where rounding decides: the unit of how wrong one is."""
+    """Units in which sign violations are measured where rounding decides."""
 
     force: Elementwise  # N, or N s in an impact
     motion: Elementwise  # m/s^2, or m/s
 
 
 ACCEPTED = 1e3
-"""Units of `Negligible` by which a sign may be wrong where no combination has all signs right."""
+"""Largest accepted violation, in units of `SignTolerances`, if no combination has all signs
+correct."""
 
 
 class _Looked(NamedTuple):
-    """How far the table has been gone through."""
+    """State of the enumeration of the table."""
 
-    left: Rows  # of those that may be chosen
-    best: Rows  # the first admissible one, else the one that is least wrong
+    left: Rows  # allowed rows not yet examined
+    best: Rows  # first admissible row, else the least violating one
     wrong: Elementwise
     solutions: Int[Array, "..."]
 
@@ -328,7 +353,7 @@ def _wrong(
     contact: Array,
     on: Array,
 ) -> Array:
-    """By how much a combination of contacts and held stoppers errs, over what is negligible."""
+    """Return the largest sign violation of a combination, in units of the tolerances."""
     infinite = each(lambda value: ~jnp.isfinite(value), friction)
     limit = each(lambda value: value == jnp.inf, friction)
     rough = rough_of(friction)
@@ -351,15 +376,16 @@ def _wrong(
         stopper = jnp.where(on[i], -found.stopper[i] / small.force, opens)
         worst = jnp.maximum(worst, jnp.maximum(unless(allowed.stays[i], foot), stopper))
         worst = jnp.where(jnp.isfinite(n) & jnp.isfinite(t), worst, jnp.inf)
-    # Both feet have a force of its own along the slope, which of a rigid wheel are one told twice.
+    # The tangential forces of both feet are not separately determined on a rigid wheel.
     return jnp.where(along_slope[0] & along_slope[1], jnp.inf, worst)
 
 
 def _foremost(off_of: Callable[[Rows], Array], rows: list[Rows]) -> tuple[Rows, Array, Array]:
-    """The first of those that are least wrong, by how much it is, and how many are right.
+    """Return the first of the least violating rows, its violation, and the number of admissible
+    rows.
 
-    Of several by one reduction: XLA on a CPU writes all that `off_of` does once for each place that
-    reads it, eightfold where rows are read one by one.
+    Several rows are compared by one reduction. Read row by row, XLA on a CPU would duplicate the
+    code of `violation_of` for each use, eightfold.
     """
     if len(rows) == 1:
         off = off_of(rows[0])
@@ -388,10 +414,11 @@ def choose(
     small: Negligible,
     counted: bool,
 ) -> Chosen:
-    """The first admissible combination of the table; `solutions` is 0 where there is none.
+    """Return the first admissible combination of the table; `n_solutions` is 0 if there is none.
 
-    All admissible ones are counted, or else none is looked at once one is found. Where none is,
-    the one that is least wrong is taken, if that is little: two touch by rounding, or part by it.
+    With `counts_all` all admissible combinations are counted; otherwise the search ends at the
+    first. If there is none, the least violating combination is taken, provided that its violation
+    is small: two contacts close by rounding, or open by it.
     """
     wrong = functools.partial(_wrong, *lax.stop_gradient((s, hub, free, friction)), allowed, small)
     by_paper = each(lambda value: value == THE_PAPERS, friction)
@@ -409,7 +436,7 @@ def choose(
         return ((looked.left[0] | looked.left[1]) != 0) & (counted | (looked.solutions == 0))
 
     def look(looked: _Looked) -> _Looked:
-        """At the next few combinations that may be chosen."""
+        """Return the state after the next few allowed combinations."""
         (left, best, least, solutions), rows = looked, []
         for _ in range(1 if simd.tracing() else AT_ONCE):
             row = left[0] & -left[0], jnp.where(left[0] == 0, left[1] & -left[1], 0)
@@ -437,11 +464,14 @@ def leaves(
     second: Bool[Array, "..."],
     direction: Int[Array, "..."],
 ) -> Bool[Array, "..."]:
-    """Whether a slot's foot, just let go by its present mode, would move the way it is let go.
+    """Return whether a slot's foot, just released by its mode, would move in the direction of
+    release.
 
-    `second`: which slot's; `direction`: 0 off the ground, 1 downhill, -1 uphill. The mode's margin
-    must grow with the acceleration that way: where it shrinks, the mode that follows would end
-    before it begins, and forces jump instead (Painlevé).
+    - `is_second`: which slot is meant;
+    - `direction`: 0 off the ground, 1 downhill, -1 uphill.
+
+    The margin of the mode must grow with the acceleration in that direction. If it shrinks, the
+    following mode would end before it begins, and the forces jump instead (Painlevé).
     """
     contact, held = stance
     here = jnp.stack([~second, second]).astype(hub.sin[0].dtype)

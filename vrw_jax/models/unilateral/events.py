@@ -1,6 +1,6 @@
-"""What an event changes: impacts by momentum, then which feet and stoppers carry the motion on.
+"""Effects of an event: impacts by momentum, then the contact modes that carry the motion.
 
-Of one wheel or, element by element, of lanes.
+Everything is elementwise: for one wheel or a batch.
 """
 
 from collections.abc import Callable
@@ -53,16 +53,16 @@ from vrw_jax.wheel import Symbols
 
 
 class Event(NamedTuple):
-    """What happened: one flag is set."""
+    """Kind of an event: one flag is set."""
 
-    lands: Bool[Array, "n_legs ..."]  # its foot met the ground
-    closes: Bool[Array, "n_legs ..."]  # it met its stopper
-    loosens: Bool[Array, "n_legs ..."]  # in the air, its stopper force vanished
-    lifts: Bool[Array, "2 ..."]  # the slot's normal force vanished
+    lands: Bool[Array, "n_legs ..."]  # the foot meets the ground
+    closes: Bool[Array, "n_legs ..."]  # the leg meets its stopper
+    loosens: Bool[Array, "n_legs ..."]  # in the air, the stopper force vanishes
+    lifts: Bool[Array, "2 ..."]  # the slot's normal force vanishes
     slides_up: Bool[Array, "2 ..."]  # friction no longer holds the slot's foot
     slides_down: Bool[Array, "2 ..."]
-    stops: Bool[Array, "2 ..."]  # the slot's foot no longer slides
-    releases: Bool[Array, "2 ..."]  # the stopper force of the slot's leg vanished
+    stops: Bool[Array, "2 ..."]  # the slot's foot stops sliding
+    releases: Bool[Array, "2 ..."]  # the stopper force of the slot's leg vanishes
 
     @property
     def impact(self) -> Bool[Array, "..."]:
@@ -71,11 +71,12 @@ class Event(NamedTuple):
 
 
 def _counted(n: int, like: Array) -> np.ndarray:
-    """0 ... n - 1 on the first axis, of numbers of this shape."""
+    """Return 0 ... n - 1 on the first axis, for arrays of this shape."""
     return np.arange(n, dtype=np.int32).reshape(-1, *(1,) * jnp.ndim(like))
 
 
 def event_of(place: Guards, guard: Int[Array, "..."]) -> Event:
+    """Return the event of a guard."""
     n = place.n_legs
     flags = lambda start, count: guard == start + _counted(count, guard)
     loosens = flags(place.loosen, n) if place.total > place.loosen else flags(place.foot, n) & False
@@ -92,25 +93,26 @@ def event_of(place: Guards, guard: Int[Array, "..."]) -> Event:
 
 
 class Law(NamedTuple):
-    """The wheel on its ground, and what is asked of all events alike."""
+    """The wheel on its ground, with the settings that all events share."""
 
     s: Symbols
-    friction: Roughness  # of all feet; or of that which landed last, and of the others
+    friction: Roughness  # of all feet; or (of the last landed foot, of the others)
     one_sided: bool  # stoppers of legs in the air only push
-    counted: bool  # whether `solutions` is the number of admissible ones, or says if there is one
-    rest: Elementwise  # speed below which a contact that an impact leaves is at rest, m/s
-    restitution: Elementwise | None = None  # of the feet: they come back at this share of the speed
+    counted: bool  # whether all admissible solutions are counted
+    rest: Elementwise  # contacts slower than this after an impact are at rest, m/s
+    restitution: Elementwise | None = None  # of the feet: speed ratio
     tilt: Elementwise | None = None  # by which the ground ahead is steeper, rad
 
 
 AT_ONCE, IN_TURN = 8, 16
-"""Rounds in search of the stoppers that hold; a few are enough unless friction couples the legs."""
+"""Numbers of block pivots and single pivots in the search for the holding stoppers; a few suffice
+unless friction couples the legs."""
 MOST_LEGS = 8
-"""Legs on stoppers whose every combination is tried where those rounds don't find one."""
+"""Largest number of legs on stoppers whose combinations are enumerated if pivoting fails."""
 
 
 class _Solved(NamedTuple):
-    """What a guess of the legs held in the air leads to."""
+    """Solution for an assumed set of held legs in the air."""
 
     chosen: Chosen
     answer: Carried
@@ -120,7 +122,7 @@ class _Solved(NamedTuple):
 
 
 _Solve = Callable[[Law, WheelMotion, Array, Chosen | None], _Solved]
-"""By the legs in the air that are held, and by what is chosen, if that is known."""
+"""Function of the held legs in the air and, if known, of the chosen combination."""
 
 
 def _that_push(
@@ -131,13 +133,13 @@ def _that_push(
     asked: Array,
     small: Negligible,
 ) -> tuple[_Solved, Array]:
-    """What `solve` finds for the legs in the air that are held, and which those are.
+    """Return the solution for the legs in the air that are held, and which legs are held.
 
-    Of `at_stopper` those that are `asked` are held where their stopper pushes, else they move
-    inwards. All of the wrong sign switch at once, then, against going in circles, only the last:
-    principal pivoting, finite where no friction couples the legs (Murty 1974, Kostreva 1978). Then
-    all combinations are gone through. The least wrong one is taken; it is admissible if that is
-    little, see `ACCEPTED`.
+    Of the legs `at_stopper`, those in `is_tested` are held if their stopper pushes; otherwise they
+    move inwards. All legs of the wrong sign switch together. Then, against cycling, only the last
+    one switches. This is principal pivoting, which is finite if no friction couples the legs (Murty
+    1974, Kostreva 1978). After that, all combinations are enumerated. The least violating solution
+    is taken; it is admissible if its violation is at most `MAX_VIOLATION`.
     """
     still = stilled((law, motion))
     rank = jnp.cumsum(asked.astype(jnp.int32), axis=0) - 1
@@ -175,32 +177,33 @@ def _that_push(
 
 
 class Change(NamedTuple):
-    """What an event left behind."""
+    """Result of an event."""
 
     motion: WheelMotion
     stance: Stance
     energy_lost: Elementwise  # J
     normal_impulse: Pair  # on the slots' feet, N s
     tangential_impulse: Pair
-    stopper_impulse: Elementwise  # least of the locked legs in the air, N s; inf without an impact
-    solutions: Int[Array, "..."]  # admissible combinations: the worse of both levels
-    paradox: Bool[Array, "..."]  # no forces carry the motion on
+    stopper_impulse: Elementwise  # minimum over airborne locked legs, N s; inf without an impact
+    solutions: Int[Array, "..."]  # admissible combinations: the minimum of both levels
+    paradox: Bool[Array, "..."]  # no forces can continue the motion
     most_solutions: Int[Array, "..."]
-    third_foot: Bool[Array, "..."]  # three feet would have to be loaded
+    third_foot: Bool[Array, "..."]  # a third foot would have to be loaded
 
 
 def _after(motion: WheelMotion, found: Carried) -> WheelMotion:
-    """The motion with the velocities of an impact's answer."""
+    """Return the motion with the velocities of an impact's solution."""
     vx, vz, dtheta = found.hub
     return motion._replace(vx=vx, vz=vz, dtheta=dtheta, dL=found.lengths)
 
 
 def _thrown_back(law: Law, motion: WheelMotion, slots: Slots, hub: Hub, free: Free) -> Free:
-    """The same velocities, with what feet that strike keep of theirs by Newton's law."""
+    """Return the free velocities with the rebound of striking feet by Newton's law."""
     if law.restitution is None:
         return free
     back = [law.restitution * z for z in foot_velocity(motion, slots, hub).z]
-    back = [jnp.where(z < -law.rest, z, 0.0) for z in back]  # what leaves no faster is at rest
+    # A rebound slower than the rest speed is at rest.
+    back = [jnp.where(z < -law.rest, z, 0.0) for z in back]
     return free._replace(
         e=(free.e[0] - hub.sin[0] * back[0], free.e[1] - hub.sin[1] * back[1]),
         u=(free.u[0] + hub.cos[0] * back[0], free.u[1] + hub.cos[1] * back[1]),
@@ -208,11 +211,11 @@ def _thrown_back(law: Law, motion: WheelMotion, slots: Slots, hub: Hub, free: Fr
 
 
 def _without_gain(law: Law, motion: WheelMotion, thrown: _Solved, inelastic: _Solved) -> _Solved:
-    """The part of Newton's law that energy allows.
+    """Return the part of Newton's rebound that energy allows.
 
-    With Coulomb's friction the law can create energy (Kane 1984). Between the inelastic impact,
-    which cannot, and Newton's, energy is a parabola: as far is gone as it does not grow. Impulses
-    stay in the cone, which is convex.
+    With Coulomb's friction the law can create energy (Kane 1984). Energy is a parabola between the
+    inelastic impact, which cannot create any, and Newton's. The result is the largest part without
+    a gain. Impulses stay in the cone, because it is convex.
     """
     energy = lambda at: kinetic_energy(law.s, at)
     low, high = energy(inelastic.motion), energy(thrown.motion)
@@ -229,10 +232,11 @@ def _without_gain(law: Law, motion: WheelMotion, thrown: _Solved, inelastic: _So
 def _impact(
     law: Law, motion: WheelMotion, stance: Stance, event: Event
 ) -> tuple[_Solved, Slots, Bool[Array, "n ..."]]:
-    """Velocity level: simultaneous, inelastic, with Coulomb's law in the impulse.
+    """Return the velocity-level solution: simultaneous and inelastic, with Coulomb's law for
+    impulses.
 
-    Also says which legs in the air are held: with one-sided stoppers those that need not pull.
-    The paper's rule keeps feet at rest planted when a leg meets its stopper.
+    It also returns the held legs in the air: with one-sided stoppers, those that need not pull. The
+    paper's rule keeps resting feet planted when a leg meets its stopper.
     """
     s, slots = law.s, slots_of((stance.contact != OFF) | event.lands)
     friction = of_slots(law.friction, slots)
@@ -244,7 +248,7 @@ def _impact(
     modes = jnp.where(loaded, ANY_MODE, 1 << OFF).astype(jnp.int32)
     modes = jnp.where(planted, 1 << before, modes)
     allowed = Allowed(
-        contact=jnp.where(event.impact, modes, 0),  # else nothing is to be looked at
+        contact=jnp.where(event.impact, modes, 0),  # without an impact, no mode is examined
         held=stops,
         stays=planted,
         known_contact=jnp.where(loaded, 0, 1 << OFF).astype(jnp.int32),
@@ -277,9 +281,10 @@ def _impact(
 def _following(
     event: Event, mode: Array, goes: Array, rigid: Array
 ) -> tuple[Int[Array, "2 ..."], Int[Array, "2 ..."]]:
-    """Modes that may follow an event in each slot, and those of them that need no test: as bits.
+    """Return the modes that may follow an event in each slot, and those that need no test, as bits.
 
-    `goes`: what a slot's foot was about to become goes the right way (see `leaves`).
+    - `is_consistent`: the next mode of a slot's foot has the direction of release (see
+      `is_release_consistent`).
     """
     own, off = 1 << mode, 1 << OFF
     modes = jnp.where(mode == STICK, ANY_MODE, own | off)
@@ -298,25 +303,27 @@ def _following(
 
 
 SOUND = 1e-9
-"""Share of the wheel's weight, and of gravity, that is nothing: forces are known to rounding."""
+"""Fraction of the wheel's weight, and of gravity, that counts as zero, chosen because forces are
+accurate to rounding."""
 
 
 def _support(
     law: Law, motion: WheelMotion, contact: Int[Array, "n ..."], at_stopper: Array, event: Event
 ) -> tuple[Chosen, Slots, Array, Bool[Array, "n ..."]]:
-    """Acceleration level: who carries the motion that follows.
+    """Return the acceleration-level solution: the contacts that carry the following motion.
 
-    Also says which feet were at rest, and which legs in the air are held. What an event has just
-    ended is not asked again: its force is zero, and its sign rounding. It is followed by what it
-    was about to become, if that goes the right way (see `leaves`). Nothing here moves with
-    anything.
+    It also returns the feet that were at rest, and the held legs in the air. The contact that an
+    event has just ended is not tested again: its force is zero up to rounding. It is followed by
+    the mode of its release, if that is consistent (see `is_release_consistent`). The result has no
+    derivatives.
     """
     law, motion = stilled((law, motion))
     s, slots = law.s, slots_of(contact != OFF)
     friction = of_slots(law.friction, slots)
     mode, stops = slots.codes(contact), slots.flags(at_stopper)
     rests = (mode == STICK) | event.stops
-    rigid = (mode == STICK) & (as_row(friction) == THE_PAPERS)  # a tangential force jumps to zero
+    # At the release of such a foot, its tangential force jumps to zero.
+    rigid = (mode == STICK) & (as_row(friction) == THE_PAPERS)
     up, down = event.slides_up, event.slides_down
     second = (event.lifts | up | down)[1]
     one_of = lambda flags: jnp.any(flags, axis=0).astype(jnp.int32)
@@ -348,11 +355,14 @@ def _support(
 def _at_rest(
     law: Law, motion: WheelMotion, slots: Slots, contact: Array, at_stopper: Array, struck: Array
 ) -> tuple[WheelMotion, Array, Array]:
-    """What an impact leaves: motion, modes of the touching feet, legs on their stoppers.
+    """Return the motion after an impact, the modes of the touching feet, and the legs on their
+    stoppers.
 
-    A contact that it leaves slower than `law.rest` is at rest: it would come back after a dip
-    that is no longer followed, and throw off another by less, without end. `struck`: legs that
-    were at their stoppers. What carries it from there is for the forces to say.
+    A contact slower than `ContactLaw.rest_speed` after the impact is at rest. Otherwise it would
+    return after a dip too small to follow, and separate again at a lower speed, without end. The
+    forces decide the contacts of the following motion.
+
+    - `was_locked`: legs that were at their stoppers.
     """
     legs = directions(law.s, motion.theta)
     along, off = foot_speeds(motion, legs)
@@ -365,7 +375,7 @@ def _at_rest(
     s, still, friction = stilled((law.s, motion, law.friction))
 
     def turned(_: Array) -> Array:
-        """Feet whose slide that would turn round: they come to rest, too."""
+        """Return the feet whose slip would be reversed by this: they come to rest as well."""
         after, _ = foot_speeds(settled(s, still, mode, on, friction), legs)
         return ((mode == SLIP_DOWN) & (after < 0.0)) | ((mode == SLIP_UP) & (after > 0.0))
 
@@ -375,8 +385,11 @@ def _at_rest(
 
 
 def _joined(law: Law, motion: WheelMotion, stance: Stance, event: Event) -> Event:
-    """An impact with all that touches, whether or not its own event has come: what is nearer than
-    a dip that is followed, and does not part. In turns they would throw each other off for ever."""
+    """Return the event extended to everything that touches, whether or not its own guard is zero.
+
+    A contact touches if it is closer than the smallest followed dip and does not separate. Resolved
+    one by one, such contacts would throw each other off forever.
+    """
     s, legs = law.s, directions(law.s, motion.theta)
     near = law.rest**2 / (2.0 * s.g)
     low = (foot_heights(motion, legs) <= near) & (foot_speeds(motion, legs)[1] <= law.rest)
@@ -388,8 +401,11 @@ def _joined(law: Law, motion: WheelMotion, stance: Stance, event: Event) -> Even
 
 
 def _sided(law: Law, motion: WheelMotion, stance: Stance, event: Event) -> Event:
-    """In the limit of large friction a resting foot whose normal force vanishes begins to slide,
-    the way that its tangential force no longer holds."""
+    """Return the event with lift-off replaced by slip, in the limit of large friction.
+
+    A resting foot whose normal force vanishes begins to slide in the direction that its tangential
+    force no longer resists.
+    """
     law, motion = stilled((law, motion))
     slots = slots_of(stance.contact != OFF)
     friction, mode = of_slots(law.friction, slots), slots.codes(stance.contact)
@@ -406,6 +422,7 @@ def _sided(law: Law, motion: WheelMotion, stance: Stance, event: Event) -> Event
 
 
 def resolve(law: Law, motion: WheelMotion, stance: Stance, event: Event) -> Change:
+    """Return the result of an event."""
     event = _joined(law, motion, stance, _sided(law, motion, stance, event))
     s, impact = law.s, event.impact
     touched = (stance.contact != OFF) | event.lands
@@ -416,7 +433,7 @@ def resolve(law: Law, motion: WheelMotion, stance: Stance, event: Event) -> Chan
         shock = _without_gain(law, motion, shock, inelastic)
     struck = slots.spread(shock.chosen.contact).astype(jnp.int32)
     kept = jnp.where(slots.filled, slots.spread(shock.chosen.held) > 0, was_locked & held)
-    if law.restitution is not None:  # only a part of what holds a leg may have been taken
+    if law.restitution is not None:  # only a part of the impulse may act
         kept = kept & (jnp.abs(shock.motion.dL) < law.rest)
     left = _at_rest(law, shock.motion, slots, struck, kept, was_locked)
     after, contact, at_stopper = select(impact, left, (motion, stance.contact, was_locked))
@@ -461,10 +478,11 @@ def settled(
     locked: Bool[Array, "n ..."],
     friction: Any = None,
 ) -> WheelMotion:
-    """The motion that keeps to its contacts: loaded feet on the slope, sticking ones at rest.
+    """Return the motion projected onto its contacts: loaded feet on the slope, sticking ones at
+    rest.
 
-    Velocities are projected by bilateral, frictionless impulses; a motion that keeps to its
-    contacts already is returned as it is, to round-off.
+    Velocities are projected by bilateral, frictionless impulses. A motion that already satisfies
+    its contacts is unchanged up to round-off.
     """
     legs = directions(s, motion.theta)
     L = jnp.where((contact != OFF) & ~locked, motion.z / legs.cos, motion.L)
@@ -472,7 +490,7 @@ def settled(
     slots = slots_of(contact != OFF)
     airborne = locked & ~slots.filled
     modes, held = slots.codes(contact), slots.flags(locked)
-    # Two resting feet on two held legs would fix the hub twice over.
+    # Two resting feet on two held legs would constrain the hub twice.
     twice = jnp.all((modes == STICK) & held, axis=0)
     held = jnp.stack([held[0], held[1] & ~twice])
     rough = jnp.zeros_like(motion.theta) if friction is None else of_slots(friction, slots)

@@ -1,9 +1,9 @@
-"""Walks of many wheels on real ground side by side, and how they move along a direction.
+"""Walks of many wheels with unilateral contact, in lanes side by side.
 
-The laws are those of one wheel, element by element over lanes: a lane whose wheel has come to an
-event is taken through it, then all march on (`march`). A landing of the foremost foot is an event
-like others. On a CPU all of it is one program of machine code, in which few lanes wait for each
-other; elsewhere XLA compiles the same text.
+The laws are those of one wheel, elementwise over lanes. A lane at an event is resolved, and then
+all lanes are integrated further (`integrate_interval`). A landing of the foremost foot is an event
+like any other. On a CPU all of it is one machine-code program in which few lanes are idle;
+elsewhere XLA compiles the same source.
 """
 
 from typing import Any, NamedTuple
@@ -55,11 +55,11 @@ from vrw_jax.numerics import Options, Tableau, select, zeros_of
 from vrw_jax.wheel import Outcome, Symbols, parameters_of, symbols_of, wheel_of
 
 UNDER_WAY = -1
-"""In place of a lane's outcome."""
+"""Code of an unfinished lane in place of its outcome."""
 
 
 class Lean(NamedTuple):
-    """What a walk tells of its last step where no more is wanted."""
+    """Summary of the last step of a walk."""
 
     section_state: Array
     durations: Array  # (3, lanes)
@@ -67,16 +67,16 @@ class Lean(NamedTuple):
 
 
 class Walked(NamedTuple):
-    """What became of every lane."""
+    """Result of a walk, for every lane."""
 
-    told: Any  # of the last step: `Lean`, or a `UnilateralStep`
+    told: Any  # of the last step: `StepSummary`, or a `UnilateralStep`
     outcome: Array
     n_stepped: Array
     tried: Array
 
 
 def told_like(n: int, dtype: Any, detailed: bool) -> Walked:
-    """Zeros in place of what is told of one wheel with n legs."""
+    """Return zeros in the structure of the result of one wheel with n legs."""
     zero, none = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
     legs, off = jnp.zeros(n, dtype), jnp.zeros(n, jnp.int32)
     stands = WheelMotion(*(zero,) * 6, legs, legs), Stance(off, *(off > 0,) * 4)
@@ -88,30 +88,34 @@ def told_like(n: int, dtype: Any, detailed: bool) -> Walked:
 
 
 class Moves(NamedTuple):
-    """What of a lane moves with its columns and its start."""
+    """Differentiable part of a lane's state."""
 
     q: Array
     v: Array
     told: tuple[Array | None, Array | None]  # in this step, and since the last event
     time: Array
     durations: Array
-    details: Any  # its floats
+    details: Any  # their floats
 
 
 class Lane(NamedTuple):
+    """State of a lane."""
+
     now: March
-    ledger: Ledger  # of this step; steps tried are all of the wheel's
-    details: Details | None  # of this step, where they are wanted
-    tally: Array | None  # rows of `March.told`, of this step
+    ledger: Ledger  # of this step; attempted solver steps count over the walk
+    details: Details | None  # of this step, if requested
+    tally: Array | None  # rows of `IntervalState.accumulated`, of this step
     n_stepped: Array
     outcome: Array
 
     def moves(self) -> Moves:
+        """Return the differentiable part of the state."""
         here, details = self.now.here, eqx.filter(self.details, eqx.is_inexact_array)
         told = self.tally, self.now.told
         return Moves(here.q, here.v, told, self.now.time, self.ledger.durations, details)
 
     def moved(self, moves: Moves) -> "Lane":
+        """Return the state with another differentiable part."""
         tally, told = moves.told
         here = self.now.here._replace(q=moves.q, v=moves.v)
         rest = eqx.filter(self.details, eqx.is_inexact_array, inverse=True)
@@ -124,26 +128,28 @@ class Lane(NamedTuple):
 
 
 class Walk(NamedTuple):
-    """What holds for all wheels of a batch."""
+    """Settings common to all wheels of a batch."""
 
     n: int
     n_steps: Array | int
     max_events: int
     one_sided: bool
     by_paper: bool
-    detailed: bool  # everything that a step tells is wanted
+    detailed: bool  # whether full results of the step are requested
     options: Options
     tableau: Tableau
 
     def flow(self, columns: Array, stance: Stance) -> Flow:
+        """Return the dynamics of the lanes in this contact state."""
         s, friction = self.of(columns)
         return flow_of(s, friction, self.one_sided, stance, self.detailed)
 
     def of(self, columns: Array) -> tuple[Symbols, Array]:
+        """Return symbols and friction of the columns."""
         return symbols_of(self.n, *columns[:-1]), as_ruled(columns[-1], self.by_paper)
 
     def begun(self, columns: Array, x: Array) -> Lane:
-        """Lanes that stand where the first landing of their walk is to be resolved."""
+        """Return the lanes at the first landing of their walk, before it is resolved."""
         motion, stance = opened(self.of(columns)[0], x)
         flow = self.flow(columns, stance)
         now = zeros_of(lambda: set_off(flow, motion, self.options.first_step))
@@ -153,6 +159,7 @@ class Walk(NamedTuple):
         return Lane(now, *self._blank(x[0]), now.guard * 0, now.guard * 0 + UNDER_WAY)
 
     def _blank(self, like: Array) -> tuple[Ledger, Details | None, Array | None]:
+        """Return counters, details and accumulators at the start of a step."""
         if not self.detailed:
             return blank(like), None, None
         many = lambda leaf: jnp.broadcast_to(leaf[..., None], (*leaf.shape, *like.shape))
@@ -160,7 +167,7 @@ class Walk(NamedTuple):
         return blank(like), details, jnp.zeros((N_TALLIED, *like.shape), like.dtype)
 
     def past_events(self, columns: Array, lane: Lane) -> Lane:
-        """Lanes that no longer march through their events, or to the end of their walk."""
+        """Return the stopped lanes after their events, or at the end of their walk."""
         now, place = lane.now, guards_of(self.n, self.one_sided)
         s, friction = self.of(columns)
         ledger = passed(lane.ledger, now.stance, now.time, now.tried)
@@ -177,7 +184,7 @@ class Walk(NamedTuple):
         ends = (outcome != Outcome.STEPPED) | (landed & (n_stepped >= self.n_steps))
         over = Lane(now, ledger, details, tally, n_stepped, outcome)
 
-        # A landing of the foremost foot opens the next step; all go through their events.
+        # A landing of the foremost foot opens the next step; every event is processed.
         opens, motion = landed & ~ends, motion_of(now.here)
         reopened = opened(s, closed(motion, now.stance))
         motion, stance = select(opens, reopened, (motion, now.stance))
@@ -203,7 +210,7 @@ class Walk(NamedTuple):
         return select(ended, select(ends, over, goes), lane)
 
     def told(self, lane: Lane) -> Any:
-        """Of the last step of lanes that go no further."""
+        """Return the result of the last step, for finished lanes."""
         stands, code = (motion_of(lane.now.here), lane.now.stance), lane.outcome
         if lane.details is not None and lane.tally is not None:
             tally = Tally(jnp.zeros_like(lane.tally[0]), *lane.tally)
@@ -211,33 +218,37 @@ class Walk(NamedTuple):
         return self.lean(stands, lane.ledger, code)
 
     def lean(self, stands: tuple[WheelMotion, Stance], ledger: Ledger, code: Array) -> Lean:
+        """Return the summary of a step with this final state."""
         landed = jnp.where(code == Outcome.STEPPED, place_of_landing(self.n, stands[0]), 0.0)
         return Lean(section_reached(*stands, code), ledger.durations, landed)
 
     def sound(self, columns: Array, x: Array) -> tuple[Array, Array, Array]:
-        """Columns and states that a walk may begin with, and which were so before."""
+        """Return columns and states with valid input in every lane, and which lanes were valid."""
         good, params, friction, x = made_sound(wheel_of(columns[:-1], self.n), columns[-1], x)
         return jnp.stack([*parameters_of(params), friction]), x, good
 
     def barred(self, lane: Lane, good: Array) -> Lane:
-        """Without those that can't begin."""
+        """Return the lane state with invalid lanes deactivated."""
         return lane._replace(outcome=jnp.where(good, lane.outcome, Outcome.BAD_INPUT))
 
 
 def stretched(details: Details, flow: Flow, motion: WheelMotion, duration: Array) -> Details:
-    """With the stretch that ends, or begins, at this motion."""
+    """Return the details with the stopper forces at one end of an interval."""
     force = least_stopper_force(flow, forces(flow, motion))
     return stretch_noted(details, flow.contact, duration, force)
 
 
 def started(on: Walk, columns: Array, x: Array) -> tuple[Array, Lane]:
-    """Columns that a walk may have, and lanes before its first landing."""
+    """Return valid columns, and the lanes before their first landing."""
     columns, x, good = on.sound(columns, x)
     return columns, on.barred(on.begun(columns, x), good)
 
 
 def turned(on: Walk, columns: Array, lane: Lane, waits: bool = False) -> tuple[Lane, Lane]:
-    """Lanes past their events, and on from there: to the next one where it `waits` for that."""
+    """Return the lanes after their events, and the lanes integrated further.
+
+    - `waits_for_events`: integrate every lane to its next event.
+    """
     past = on.past_events(columns, lane)
     hurry, flow_at = past.outcome == UNDER_WAY, lambda c: on.flow(c, past.now.stance)
     hurry = hurry & (not waits)
@@ -246,7 +257,7 @@ def turned(on: Walk, columns: Array, lane: Lane, waits: bool = False) -> tuple[L
 
 
 def walked(on: Walk, columns: Array, x: Array) -> Walked:
-    """Every lane through its landings of the foremost foot."""
+    """Return every lane after `n_steps` landings of the foremost foot."""
     columns, lane = started(on, columns, x)
     turn = lambda lane: turned(on, columns, lane)[1]
     goes_on = lambda lane: jnp.any(lane.outcome == UNDER_WAY)

@@ -1,7 +1,7 @@
-"""What a step on real ground tells: of one wheel or, element by element, of lanes.
+"""Record of a step with unilateral contact, for one wheel or, elementwise, for a batch.
 
-A step is a row of events, each followed by a stretch in which no contact changes. Its first event
-is the landing that opened it; it is complete where the foot ahead of all others lands.
+A step is a sequence of events, each followed by an interval in which no contact changes. Its first
+event is the opening landing; the step is complete when the foremost foot lands.
 """
 
 from typing import NamedTuple
@@ -23,22 +23,22 @@ from vrw_jax.results import STOPPERS
 from vrw_jax.wheel import Outcome, Symbols
 
 SHARE, SEEN = 1e-2, 4e2
-"""Least dip that is followed: this share of the tolerance, and no less than so many roundings of a
-leg's length, 1e-13 m in float64."""
+"""Smallest depth of a followed dip: the first as a fraction of the tolerance, the second in
+rounding units of a leg's length, 1e-13 m in float64."""
 PATIENCE = 100
-"""Events of a step after each of which more is at rest, or a quarter of those that it may make: the
-speed of rest grows by its own size. Walks make 4 to 60, chains of ever smaller dips hundreds: they
-end by this where a tolerance lets them go on. Of 400 events the last dip is as large as a tolerance
-of 1e-6 leaves from the first."""
+"""Number of events of a step after which each further event raises the rest speed by its initial
+value; a quarter of the allowed events if that is more. Walks make 4 to 60 events, and chains of
+ever smaller dips make hundreds, which this ends where a tolerance would continue them. Of 400
+events, the last dip is as large as a tolerance of 1e-6 leaves from the first."""
 
 
 def least_dip(L0: Elementwise, options: Options) -> Array:
-    """Least depth of a dip that a step follows, m."""
+    """Return the smallest depth of a dip that a step follows, m."""
     return jnp.maximum(SHARE * options.atol, SEEN * jnp.finfo(L0.dtype).eps * L0)
 
 
 def as_ruled(friction: Elementwise, by_paper: bool) -> Elementwise:
-    """Friction as `contacts` takes it: see `THE_PAPERS`."""
+    """Return friction with `PAPER_RULE_SENTINEL` in place of infinity under the paper's rule."""
     return jnp.where(friction == jnp.inf, THE_PAPERS, friction) if by_paper else friction
 
 
@@ -51,7 +51,9 @@ def law_of(
     restitution: Elementwise | None = None,
     tilt: Elementwise | None = None,
 ) -> Law:
-    """The law of a walk; the speed of rest is that of the least dip under gravity."""
+    """Return the contact law of a walk; the rest speed is that of the smallest dip under
+    gravity.
+    """
     rest = jnp.sqrt(2.0 * s.g * least_dip(s.L0, options))
     return Law(s, friction, one_sided, counted, rest, restitution, tilt)
 
@@ -65,11 +67,13 @@ def past(
     events: Int[Array, "..."],
     max_events: int,
 ) -> tuple[Change, Event, Int[Array, "..."]]:
-    """Through the event of a guard: what it changes, what it was, and STEPPED where all went well.
-    `events`: of this step, before it, of `max_events`.
+    """Return the result of a guard's event, the event, and STEPPED if it was resolved.
 
-    The integrator lets feet drift by its error. One that lifts rises like the third power of time,
-    from the slope and from rest: else it would land again at once.
+    - `n_events`: number of earlier events in this step, of at most `max_events`.
+
+    The integrator lets feet drift by its error, so the motion is projected onto its contacts first.
+    A foot that lifts off rises like the third power of time, from the slope and from rest; without
+    the projection it would land again at once.
     """
     patience = max(PATIENCE, max_events // 4)
     law = law._replace(rest=law.rest * (1 + jnp.maximum(events - patience, 0)))
@@ -82,30 +86,33 @@ def past(
 
 
 class UnilateralMargins(eqx.Module):
-    """How far the motion stayed from what bilateral stoppers do not ask, over one step.
+    """Margins of bilateral stoppers over one step.
 
-    Negative where a one-sided stopper would have let a leg in the air go.
+    Negative where a one-sided stopper would have released a leg in the air.
     """
 
-    stopper_force: Elementwise  # least stopper force of a locked leg in the air, N
-    stopper_impulse: Elementwise  # least stopper impulse of a locked leg in the air, N s
+    stopper_force: Elementwise  # minimum over locked legs in the air, N
+    stopper_impulse: Elementwise  # minimum over locked legs in the air, N s
 
 
 class Ledger(NamedTuple):
-    """What a step has told so far."""
+    """Counters and durations of a step."""
 
     events: Int[Array, "..."]  # contacts and stoppers that changed
-    durations: Float[Array, "3 ..."]  # with two feet loaded, with one, with none, s
-    tried: Int[Array, "..."]  # steps of the integrator
+    durations: Float[Array, "3 ..."]  # with two loaded feet, one, none, s
+    tried: Int[Array, "..."]  # attempted
 
 
 def blank(like: Array) -> Ledger:
-    """Of a step that is about to begin, for wheels of the shape and dtype of `like`."""
+    """Return the counters at the start of a step, for wheels of the shape and dtype of the
+    argument.
+    """
     none = jnp.zeros(like.shape, jnp.int32)
     return Ledger(none, jnp.zeros((3, *like.shape), like.dtype), none)
 
 
 def passed(ledger: Ledger, stance: Stance, duration: Elementwise, tried: Array) -> Ledger:
+    """Return the counters after one more interval in this contact state."""
     loaded = jnp.sum(stance.contact != OFF, axis=0)
     share = jnp.stack([loaded == feet for feet in (2, 1, 0)])
     durations = ledger.durations + jnp.where(share, duration, 0.0)
@@ -121,8 +128,10 @@ def outcome_at(
     lost: Array,
     max_events: int,
 ) -> Int[Array, "..."]:
-    """STEPPED where a stretch ended `at_event` of a guard that the walk goes on from, or that
-    completes the step as the foremost foot `landed`; where it ended at no event, `lost`."""
+    """Return STEPPED if the walk continues from the guard or the foremost foot `has_landed`.
+
+    If the interval ended at no event, the result is `failure`.
+    """
     code = jnp.where(ledger.events >= max_events, Outcome.TOO_MANY_EVENTS, Outcome.STEPPED)
     code = jnp.where(guard == place.rate, Outcome.FELL_BACK, code)
     code = jnp.where(guard == place.length, Outcome.COLLAPSED, code)
@@ -130,7 +139,7 @@ def outcome_at(
 
 
 class Details(NamedTuple):
-    """What a step tells of one wheel beside its ledger, named as in `UnilateralStep`."""
+    """Further results of a step, named as in `UnilateralStep`."""
 
     post_impact: Float[Array, "2 ..."]
     mode_durations: Float[Array, "4 4 ..."]
@@ -144,6 +153,7 @@ class Details(NamedTuple):
 
 
 def no_details(dtype: jnp.dtype) -> Details:
+    """Return the details of one wheel at the start of a step."""
     zero, none = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
     two = jnp.zeros((2,), dtype)
     return Details(
@@ -160,7 +170,10 @@ def no_details(dtype: jnp.dtype) -> Details:
 
 
 def event_noted(details: Details, first: Array, change: Change, event: Event) -> Details:
-    """After one more event, the step's `first` or not."""
+    """Return the details after one more event.
+
+    - `is_first`: whether the event is the first of the step.
+    """
     opening = (
         jnp.stack([change.motion.theta, change.motion.dtheta]),
         jnp.stack(change.normal_impulse),
@@ -184,8 +197,11 @@ def event_noted(details: Details, first: Array, change: Change, event: Event) ->
 def stretch_noted(
     details: Details, contact: Int[Array, "2 ..."], duration: Elementwise, force: Elementwise
 ) -> Details:
-    """After one more stretch: modes of its slots, and the least stopper force of legs in the air at
-    its ends."""
+    """Return the details after one more interval.
+
+    They gain the durations of the slots' modes, and the minimum stopper force of legs in the air at
+    the ends of the interval.
+    """
     places = np.arange(4).reshape(-1, *(1,) * jnp.ndim(force))
     first, second = ((places == contact[i]).astype(jnp.result_type(force)) for i in range(2))
     force = jnp.minimum(details.monitors.stopper_force, force)
@@ -198,8 +214,8 @@ def stretch_noted(
 class UnilateralStep(AbstractGroundStep):
     """One step, from the landing of the foremost foot to the next. Batched under vmap.
 
-    Fields of a step whose outcome is not STEPPED are finite and describe how far it came; its
-    `section_state` is all zeros, which is no section state.
+    Fields of a step whose outcome is not STEPPED are finite and describe the partial motion; its
+    `section_state` is all zeros, which is not a valid section state.
 
     - `section_state`: just before the next landing;
     - `post_impact`: (theta, dtheta) just after the opening landing, rad, rad/s;
@@ -211,14 +227,15 @@ class UnilateralStep(AbstractGroundStep):
     - `energy_impacts`: lost in impacts, J;
     - `energy_damping`: lost in the dampers, J;
     - `energy_friction`: lost by sliding between impacts, J;
-    - `slip`: path of sliding feet, m;
-    - `events`: contacts and stoppers that changed;
-    - `impacts`: events in which velocities jumped;
-    - `fewest_solutions`, `most_solutions`: admissible combinations at an event: 1 where well posed;
-    - `monitors`: margins of what this rung presumes;
+    - `slip`: path length of sliding feet, m;
+    - `events`: number of changes of contacts and stoppers;
+    - `impacts`: number of events in which velocities jumped;
+    - `fewest_solutions`, `most_solutions`: numbers of admissible combinations at an event: 1 if
+      well posed;
+    - `margins`: of the assumptions of this model;
     - `outcome`: an Outcome;
-    - `solver_steps`: tried by the integrator;
-    - `engine`: that took the step, see `Options`.
+    - `solver_steps`: attempted solver steps;
+    - `engine`: name of the engine, see `StepOptions`.
 
     Examples:
         >>> wheel = vrw.UnilateralWheel(friction=0.7)
@@ -256,7 +273,7 @@ class UnilateralStep(AbstractGroundStep):
 def section_reached(
     motion: WheelMotion, stance: Stance, outcome: Array, tilt: Elementwise | None = None
 ) -> FullState:
-    """The section state at a step's end; zeros where it failed."""
+    """Return the section state at the end of a step; zeros if it failed."""
     x = closed(motion, stance, tilt)
     return jnp.where(outcome == Outcome.STEPPED, x, jnp.zeros_like(x))
 
@@ -271,7 +288,7 @@ def step_told(
     engine: str,
     tilt: Elementwise | None = None,
 ) -> UnilateralStep:
-    """A step by where it ended and what was noted on the way."""
+    """Return the step of this final state and these records."""
     landing = place_of_landing(motion.L.shape[0], motion)
     finite = lambda value: jnp.where(jnp.isfinite(value), value, 0.0)
     details = details._replace(

@@ -1,8 +1,8 @@
-"""Many wheels on real ground marching side by side, each with its own step size and stance.
+"""Batched integration between events: each lane has its own step size and contact state.
 
-Numbers lie in arrays with lanes last. One Runge-Kutta step serves marching and searching: a lane
-whose step crosses a guard takes that step again, shortened, until it ends on the earliest event.
-Nothing here looks from one lane to another.
+Arrays have lanes on the last axis. One Runge-Kutta step serves integration and event search: a lane
+whose step crosses a guard repeats it with smaller steps until the step ends at the earliest event.
+No computation in this module combines values of different lanes.
 """
 
 from collections.abc import Callable
@@ -37,83 +37,95 @@ from vrw_jax.numerics import (
 from vrw_jax.wheel import Outcome
 
 N_FELT = 9
-"""Rows of a slope after the accelerations: what guards need of the forces. Then, where stoppers are
-one-sided, those of legs in the air; then, where they are wanted, `N_TALLIED`."""
+"""Number of rows after the accelerations that hold the contact quantities of the guards. They are
+followed by those of legs in the air, if stoppers are one-sided, and by `N_ACCUMULATOR_ROWS` rows
+if these are requested."""
 N_TALLIED = 3
-"""Rows that are summed up: energy lost in dampers and by sliding, slip."""
+"""Number of accumulated rows: energy lost in dampers and by sliding, slip."""
 MARCHING, EVENT = -1, -2
-"""Where a lane stands: on its way, at an event; else the `Outcome` it met."""
+"""Status codes of a lane that is integrating or at an event; every other status is its
+`Outcome`."""
 BURST = 8
-"""Tries after which lanes at events no longer wait for those beside them."""
+"""Number of solver-step attempts after which a lane at an event ends the loop for all lanes."""
 SINGULAR = 1e-8, 1e2
-"""Of what vanishes at Painlevé's singularity, and of the tolerance: forces there are a share of two
-that vanish, told by neither rounding nor integration (with 18 tolerances left one was lost)."""
+"""Absolute tolerance, and factor of the relative tolerance, below which the determinant counts as
+zero at Painlevé's singularity. Forces there are a ratio of two vanishing numbers, resolved
+neither by rounding nor by integration. Chosen because with 18 tolerances one singularity was
+missed."""
 PARABOLAS = 3
-"""Tries at an event by parabolas; then by secants, which in stiff dips are better."""
+"""Number of event iterations by parabolas; the later ones use secants, which converge better in
+stiff dips."""
 PATIENT = 15
-"""Tries at an event after which a guard that stands on its own event may be what is met."""
+"""Number of event iterations after which a guard that starts at its own event may be the event
+found."""
 STILL = 1e-3
-"""s; a guard that takes longer to fall by its own rounding does not fall."""
+"""Time (s) within which a guard must fall by its own rounding to count as falling."""
 CLOSE = 30.0
-"""An event is found where the last correction to its time is no more than so many tolerances of the
-step: the proposal is a parabola's, whose own error is about a hundredth of the correction."""
+"""Largest last correction to the time of an event, in tolerances of the step. Chosen because the
+proposal is a parabola's, whose own error is about a hundredth of the correction."""
 
 
 class Place(NamedTuple):
-    """Coordinates (hub x, z, theta, lengths), their rates, and the slope: accelerations, forces."""
+    """Coordinates (hub x, z, theta, lengths), their rates, and the rows of the dynamics at a
+    point.
+    """
 
     q: Array  # (3 + n, lanes)
     v: Array
-    slope: Array  # (3 + n + N_FELT or 3 + n + N_FELT + n, lanes)
+    slope: Array  # accelerations, then contact rows: (3 + n + N_CONTACT_ROWS [+ n], lanes)
 
 
 class Search(NamedTuple):
-    """For the earliest event inside a step."""
+    """Bracket of the earliest event inside a step."""
 
     on: Array
     crossing: Array  # (guards, lanes)
-    low: Array  # bracket of the event, s from the step's start
+    low: Array  # bracket of the event, s from the start of the step
     high: Array
     accuracy: Array  # s
     tries: Array
-    last: Array  # step tried before this one, s
+    last: Array  # previously attempted step, s
     values: Array  # guards at its end, (guards, lanes)
 
 
 class March(NamedTuple):
-    """All lanes, between two of their events."""
+    """State of all lanes between two of their events."""
 
     here: Place
     stance: Stance
-    values: Array  # guards here, (guards, lanes)
-    offset: Array  # what a guard that stands on its own event reads there, less rounding
-    told: Array | None  # what is summed up since the last event, (N_TALLIED, lanes), if wanted
-    h: Array  # of the next try, s
+    values: Array  # guards at the point, (guards, lanes)
+    offset: Array  # value at the own event of a guard that starts there, minus rounding
+    told: Array | None  # integrals since the last event, (N_ACCUMULATOR_ROWS, lanes)
+    h: Array  # of the next attempt, s
     time: Array  # since the last event, s
     search: Search
     verdict: Array  # MARCHING, EVENT or an Outcome
-    guard: Array  # at which it stands
-    tried: Array  # steps since the last event
+    guard: Array  # that has triggered
+    tried: Array  # attempted since the last event
 
 
 def motion_of(place: Place) -> WheelMotion:
+    """Return the motion at a point."""
     x, z, theta, L = place.q[0], place.q[1], place.q[2], place.q[3:]
     return WheelMotion(x, z, theta, place.v[0], place.v[1], place.v[2], L, place.v[3:])
 
 
 def place_of(flow: Flow, motion: WheelMotion) -> Place:
-    """The inverse of `motion_of`, with the slope there."""
+    """Return the point of a motion, with its dynamics: the inverse of `motion_from_point`."""
     q, v = coordinates(motion)
     return Place(q, v, slope_at(flow, q, v))
 
 
 def coordinates(motion: WheelMotion) -> tuple[Array, Array]:
+    """Return the coordinates of a motion, and their rates, as two arrays."""
     q = jnp.concatenate([jnp.stack([motion.x, motion.z, motion.theta]), motion.L])
     return q, jnp.concatenate([jnp.stack([motion.vx, motion.vz, motion.dtheta]), motion.dL])
 
 
 def slope_at(flow: Flow, q: Array, v: Array) -> Array:
-    """Accelerations of all coordinates, then `Felt` without the directions."""
+    """Return the accelerations of all coordinates, then `ContactQuantities` without the
+    directions.
+    """
     motion = motion_of(Place(q, v, q))
     now = forces(flow, motion)
     told = felt(flow, now)
@@ -127,7 +139,9 @@ def slope_at(flow: Flow, q: Array, v: Array) -> Array:
 
 
 def guards_at(flow: Flow, place: Place) -> Array:
-    """All guards, in the order of `Guards`, whether or not the stance has just begun."""
+    """Return all guards in the order of `GuardLayout`, as long after the start of the contact
+    state.
+    """
     motion = motion_of(place)
     of_felt = place.slope[len(place.q) :]
     n1, n2, t1, t2, s1, s2, x1, x2, regular = of_felt[:N_FELT]
@@ -139,7 +153,7 @@ def guards_at(flow: Flow, place: Place) -> Array:
 
 
 def guard_rates(flow: Flow, place: Place) -> Array:
-    """Derivatives of the guards in time along the motion."""
+    """Return the time derivatives of the guards along the motion."""
 
     def along(q: Array, v: Array) -> Array:
         return guards_at(flow, Place(q, v, slope_at(flow, q, v)))
@@ -148,7 +162,7 @@ def guard_rates(flow: Flow, place: Place) -> Array:
 
 
 def begun_guards(flow: Flow) -> Array:
-    """Guards that stand on the event which has just begun the stance, in the order of `Guards`."""
+    """Return which guards are at the event that has just started the contact state."""
     stance = flow.stance
     slid = flow.slots.flags(stance.new_slip)
     no = jnp.zeros((2, stance.contact.shape[-1]), bool)
@@ -156,13 +170,16 @@ def begun_guards(flow: Flow) -> Array:
     return jnp.concatenate([stance.new_foot, stance.new_leg, no, no, no, slid, no, no, *in_air])
 
 
-@eqx.filter_jit  # traced once, wherever it is called
+@eqx.filter_jit  # traced once for all call sites
 def set_off(flow: Flow, motion: WheelMotion, h: Array) -> March:
-    """Lanes at the start of a stance, at an event again where a guard falls at once."""
+    """Return the lanes at the start of a contact state.
+
+    A lane is at an event again if one of its guards falls at once.
+    """
     here, begun = place_of(flow, motion), begun_guards(flow)
     values, rates = guards_at(flow, here), guard_rates(flow, here)
-    # What is let go from rest reads rounding for 1e-8 s and longer, and what rises from below has
-    # no event before it falls: events that take no time leave several such.
+    # A contact released from rest has a guard within rounding for 1e-8 s and longer. One that
+    # rises from below has no event before it falls; events without duration leave several such.
     unread = guard_sizes(flow) * (ROUNDING * jnp.finfo(values.dtype).eps)
     begun = begun | ((values <= unread) & (rates > -unread / STILL))
     past = ~begun & ((values < 0.0) | ((values == 0.0) & (rates <= 0.0)))
@@ -184,7 +201,7 @@ def set_off(flow: Flow, motion: WheelMotion, h: Array) -> March:
 
 
 def _first(flags: Array) -> Array:
-    """The first row whose flag is set; 0 where none is."""
+    """Return the index of the first row whose flag is set; 0 if none is."""
     first = jnp.zeros(flags.shape[1:], jnp.int32)
     for row in reversed(range(len(flags))):
         first = jnp.where(flags[row], row, first)
@@ -192,7 +209,7 @@ def _first(flags: Array) -> Array:
 
 
 FlowAt = Callable[[Array], Flow]
-"""By the lanes' columns: parameters and friction."""
+"""Function of the lanes' columns: parameters and friction."""
 
 
 def marched(
@@ -203,8 +220,11 @@ def marched(
     options: Options,
     tableau: Tableau,
 ) -> March:
-    """On until none marches; or, after a burst, any that `walks` has come to an event. Errors: as
-    `integrate_phase`."""
+    """Return the lanes integrated until none is running.
+
+    After `MAX_WAIT_TRIES` attempts, the loop ends as soon as a lane with `is_walking` is at an
+    event.
+    """
     flow = flow_at(columns)
     sizes = guard_sizes(flow)
 
@@ -217,7 +237,10 @@ def marched(
 def until_none_marches(
     marching: Callable[[Any], Array], walks: Array, advance: Callable, begin: Any
 ) -> Any:
-    """`advance` until none is `marching`, or, after a burst, any that `walks` has come to rest."""
+    """Return the state after repeated `iterate`, until no lane is running.
+
+    After `MAX_WAIT_TRIES` attempts, the loop ends as soon as a lane with `is_walking` has stopped.
+    """
 
     def goes_on(state: tuple) -> Array:
         now, tries = state
@@ -230,19 +253,21 @@ def until_none_marches(
 
 
 class Try(NamedTuple):
+    """An attempted solver step."""
+
     end: Place
-    squared: Array  # error over tolerance
-    values: Array  # guards at the end
+    squared: Array  # of the error over the tolerance
+    values: Array  # at the end
     bend: Array  # of the guards' parabolas
     slope: Array
-    to_dip: Array  # share of the step up to where a guard may dip below zero and come back, else 1
-    told: Array | None  # what the step adds to `March.told`
+    to_dip: Array  # fraction of the step to a possible guard dip below zero, else 1
+    told: Array | None  # increment of `IntervalState.accumulated`
 
 
 def stage_at(
     tableau: Tableau, i: Array | int, q: Array, v: Array, slopes: Array, h: Array
 ) -> tuple[Array, Array]:
-    """Coordinates and rates at a stage, by the accelerations at those before it."""
+    """Return coordinates and rates at a stage, from the accelerations of the stages before it."""
     a, b, place = (jnp.asarray(x)[i] for x in (tableau.once, tableau.twice, tableau.places))
     n, last = len(q), len(tableau.places) - 1
     first = sum(a[j] * slopes[j, :n] for j in range(last))
@@ -251,6 +276,7 @@ def stage_at(
 
 
 def tried_step(flow: Flow, tableau: Tableau, options: Options, now: March) -> Try:
+    """Return an attempted step of every lane."""
     h, here, last = now.h, now.here, len(tableau.places) - 1
 
     def stage(i: Array, slopes: Array) -> Array:
@@ -264,7 +290,7 @@ def tried_step(flow: Flow, tableau: Tableau, options: Options, now: March) -> Tr
 
 
 def tried_by(flow: Flow, tableau: Tableau, options: Options, now: March, slopes: Array) -> Try:
-    """The step with these slopes at its stages."""
+    """Return the attempted step with these rows of the dynamics at its stages."""
     h, here, last = now.h, now.here, len(tableau.places) - 1
     n = len(here.q)
     end = Place(*stage_at(tableau, last, here.q, here.v, slopes, h), slopes[last])
@@ -287,12 +313,16 @@ def tried_by(flow: Flow, tableau: Tableau, options: Options, now: March, slopes:
 
 
 def at_singularity(before: Array, after: Array, options: Options) -> Array:
-    """Whether what vanishes at Painlevé's singularity has done so, by its values at both ends."""
+    """Return whether the determinant has vanished at Painlevé's singularity, from its values at
+    both ends.
+    """
     return (before * after <= 0.0) | (jnp.abs(after) <= SINGULAR[0] + SINGULAR[1] * options.rtol)
 
 
 def advanced(now: March, tried: Try, sizes: Array, tableau: Tableau, options: Options) -> March:
-    """The lane takes its step, tries another length, or has come to an event."""
+    """Return the lanes after one attempt: accepted, repeated with another step size, or at an
+    event.
+    """
     here, h, search, end = now.here, now.h, now.search, tried.end
     running = now.verdict == MARCHING
     keep = running & ~search.on & (tried.squared <= 1.0)
@@ -336,18 +366,20 @@ def advanced(now: March, tried: Try, sizes: Array, tableau: Tableau, options: Op
 
 
 class _Found(NamedTuple):
-    """Of the earliest event inside a step."""
+    """Result of one iteration of the search for the earliest event inside a step."""
 
-    following: Array  # length to be tried next, s
-    shift: Array  # from this length to the event's, s
-    arrived: Array  # the event is that close
+    following: Array  # step size of the next attempt, s
+    shift: Array  # from this step size to the event's, s
+    arrived: Array  # whether the event is within tolerance
     guard: Array
 
 
 def _searched(
     now: March, tried: Try, crossed: Array, sizes: Array, options: Options
 ) -> tuple[Search, _Found]:
-    """One more look for the earliest event, from where the guards' parabolas fall through zero."""
+    """Return one more iteration of the search, from the zeros of the guards' parabolas or
+    secants.
+    """
     h, search = now.h, now.search
     crosses = tried.values <= 0.0
     crossing = jnp.where(search.on, search.crossing | crosses, crosses)
@@ -364,15 +396,15 @@ def _searched(
     accuracy = jnp.maximum(CLOSE * options.rtol * h, resolution)
     accuracy = jnp.where(search.on, search.accuracy, accuracy)
     within = (proposal >= low - accuracy) & (proposal <= high + accuracy)
-    # In a dip of microseconds rounding throws proposals out of the bracket: its middle is as good.
+    # In a dip of microseconds, rounding moves proposals out of the bracket: bisect it instead.
     halve = ~within | (slow & ((search.tries & 3) == 3))
-    # What stands on its own event falls again soon, if it does.
+    # A guard that starts at its own event falls again soon, or not at all.
     middle = jnp.where((low == 0.0) & jnp.isinf(proposal), 0.125 * high, 0.5 * (low + high))
     following = jnp.where(halve, middle, proposal)
     shift = following - h
-    # Where a guard reads no more than its rounding, no length is better than this one.
+    # If a guard is within its rounding, no other step size is better than this one.
     beside, lowest = _lowest(tried.values / sizes, crossing)
-    # What stands on its own event reads twice that: where no event is found it is this one.
+    # A guard at its own event is within twice its rounding; without another event, it is the event.
     reads = ROUNDING * jnp.where(search.tries < PATIENT, 1.0, 3.0) * jnp.finfo(h.dtype).eps
     at_rest = search.on & (jnp.abs(lowest) <= reads)
     shift, guard = jnp.where(at_rest, 0.0, shift), jnp.where(at_rest, beside, guard)
@@ -386,7 +418,9 @@ def _searched(
 def _squared_error(
     options: Options, errors: tuple[Array, Array], here: Place, end: Place, guards: Array
 ) -> Array:
-    """Mean square of the error over its tolerance; infinite where the step went nowhere."""
+    """Return the mean square of the error over its tolerance; infinite for a step that is not
+    finite.
+    """
     total = 0.0 * jnp.sum(guards, axis=0)
     for error, a, b in zip(errors, here[:2], end[:2], strict=True):
         allowed = options.atol + options.rtol * jnp.maximum(jnp.abs(a), jnp.abs(b))
@@ -395,19 +429,22 @@ def _squared_error(
 
 
 def _stands(now: March) -> Array:
-    """Guards on their own event, where the lane is just past it."""
+    """Return the guards at their own event, for lanes at the start of the contact state."""
     return (now.time == 0.0) & (now.offset != 0.0)
 
 
 def _to_earliest_dip(tableau: Tableau, values: list[Array], stands: Array) -> Array:
-    """Share of the step to go before a guard that may dip below zero in it, see `numerics.below`;
-    1: there is none. A guard that `stands` on its own event at the start has no such place."""
+    """Return the fraction of the step before a guard that may dip below zero in it; 1 if there is
+    none.
+
+    See `numerics.find_dip`. A guard that starts at its own event is not considered.
+    """
     looks, at = below(tableau, values)
     return jnp.min(jnp.where(looks & (values[0] > 0.0) & ~stands, at, 1.0), axis=0)
 
 
 def _lowest(values: Array, crossing: Array) -> tuple[Array, Array]:
-    """Which of the crossing guards is lowest, and its value; infinite where none crosses."""
+    """Return the lowest of the crossing guards, and its value; infinite if none crosses."""
     least, guard = jnp.full_like(values[0], jnp.inf), jnp.zeros(values.shape[1:], jnp.int32)
     for index in range(len(values)):
         lower = crossing[index] & (values[index] < least)
@@ -418,9 +455,12 @@ def _lowest(values: Array, crossing: Array) -> tuple[Array, Array]:
 def _earliest_secant(
     search: Search, values: Array, h: Array, crossing: Array
 ) -> tuple[Array, Array]:
-    """Where the first of the crossing guards falls through zero by the last two tries, and which;
-    infinite where none does, the other way where one is below and falls no more: it fell before.
-    Their ends are as right as the march, the inner stage is not."""
+    """Return the earliest zero of the crossing guards' secants through the last two attempts.
+
+    It also returns the guard. The zero is infinite if no guard falls, and minus infinity if a guard
+    is below zero and no longer falls, because it fell before. The ends of attempts are as accurate
+    as the integration; the inner stage is not.
+    """
     rate = (values - search.values) / jnp.where(h == search.last, jnp.inf, h - search.last)
     first, guard = jnp.full_like(h, jnp.inf), jnp.zeros(h.shape, jnp.int32)
     for index in range(len(values)):
@@ -436,9 +476,12 @@ def _earliest_secant(
 def _earliest_root(
     g0: Array, slope: Array, bend: Array, crossing: Array, stands: Array
 ) -> tuple[Array, Array]:
-    """Where the first of the crossing guards' parabolas falls through zero, in step lengths, and
-    which; infinite where none does ahead. One that `stands` on its own event rises: where its
-    parabola falls at once the step is too long for parabolas, the other way if it ends below."""
+    """Return the earliest zero of the crossing guards' parabolas, in step lengths, and the guard.
+
+    The zero is infinite if no parabola falls ahead. A guard that starts at its own event rises: if
+    its parabola falls at once, the step is too long for parabolas. The zero is minus infinity if
+    such a parabola ends below zero.
+    """
     discriminant = slope * slope - 4.0 * bend * g0
     root = jnp.sqrt(jnp.maximum(discriminant, 0.0))
     falling = slope < 0.0

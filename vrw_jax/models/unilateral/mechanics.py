@@ -1,11 +1,11 @@
-"""The free wheel: hub and all legs as coordinates, and how its feet answer forces and impulses.
+"""Mechanics of the free wheel: hub and legs as coordinates, and the response to contact forces.
 
-Coordinates are the hub (x, z), the angle theta of Leg 1 and the n leg lengths. A leg couples with
-the hub alone, so the mass matrix is an arrow: eliminating the legs whose length is free leaves a
-3 x 3 system. Up to two *slots* hold the legs whose feet may be loaded; a foot's force acts in the
-leg's own directions u (foot to hub) and e = du/dtheta, and only its e part reaches the hub. The
-same equations serve accelerations and, with momenta in place of forces, impacts. All of it works
-element by element over lanes too, one more axis behind that of the legs.
+The coordinates are the hub (x, z), the angle theta of Leg 1 and the n leg lengths. A leg couples
+with the hub alone, so the mass matrix is an arrow. Eliminating the legs of free length leaves a 3 x
+3 system. Up to two *slots* hold the legs whose feet may be loaded. A foot's force acts in the leg's
+own directions u (foot to hub) and e = du/dtheta, and only its e part reaches the hub. The same
+equations serve accelerations and, with momenta in place of forces, impacts. Everything works
+elementwise over a batch, on one more axis behind that of the legs.
 """
 
 import math
@@ -22,6 +22,7 @@ from vrw_jax.numerics import Elementwise, Scalar, sine_cosine
 from vrw_jax.wheel import Symbols
 
 Legs = Float[Array, "n_legs ..."]
+"""One quantity of every leg."""
 Vector3 = tuple[Any, Any, Any]
 """Components along hub x, hub z and theta."""
 Pair = tuple[Any, Any]
@@ -49,7 +50,7 @@ class Legwise(NamedTuple):
 
 
 def directions(s: Symbols, theta: Elementwise) -> Legwise:
-    """Of a wheel that may have turned any number of times since it landed."""
+    """Return the directions of all legs, for any number of turns of the wheel."""
     turn = (s.alpha * np.arange(s.n)).reshape(-1, *(1,) * jnp.ndim(theta))
     halves = lax.stop_gradient(jnp.floor(theta / math.pi + 0.5))
     odd = halves - 2.0 * jnp.floor(0.5 * halves)
@@ -59,27 +60,28 @@ def directions(s: Symbols, theta: Elementwise) -> Legwise:
 
 
 def over_legs(values: Array) -> Array:
-    """Sum over legs, the first axis."""
+    """Return the sum over the legs, the first axis."""
     return jnp.sum(values, axis=0)
 
 
 def kept(tree: Any, one: Array) -> Any:
-    """The same numbers, each divided by a `one` that only the program's run knows to be 1.
+    """Return the same numbers, each divided by a `unit` that equals 1 but is known only at run
+    time.
 
-    XLA's fusions on a CPU repeat chains of cheap operations for each user, which here multiplies
-    into a hundredfold; a division it computes once.
+    XLA's fusions on a CPU repeat chains of cheap operations for each use, which multiplies their
+    number by a hundred here. A division is computed only once.
     """
     floats = lambda x: jnp.issubdtype(jnp.result_type(x), jnp.floating)
     return jax.tree.map(lambda x: x / one if floats(x) else x, tree)
 
 
 def one_of(motion: "WheelMotion") -> Array:
-    """1, in a form that no compiler can know."""
+    """Return 1 in a form that no compiler can simplify."""
     return lax.stop_gradient(1.0 + 0.0 * motion.theta)
 
 
 def stilled(tree: Any) -> Any:
-    """The same, which moves with nothing."""
+    """Return the same tree without its derivatives."""
     moving, rest = eqx.partition(tree, eqx.is_inexact_array)
     return eqx.combine(lax.stop_gradient(moving), rest)
 
@@ -92,17 +94,19 @@ class Slots(NamedTuple):
 
     @property
     def filled(self) -> Bool[Array, "n_legs ..."]:
+        """Whether a leg is in a slot."""
         return self.first | self.second
 
     def codes(self, values: Array) -> Int[Array, "2 ..."]:
+        """Return the slots' entries of an integer per leg, as one array."""
         return jnp.stack(self.of(values))
 
     def flags(self, values: Array) -> Bool[Array, "2 ..."]:
-        """The slots' entries of a flag of all legs; False for an empty slot."""
+        """Return the slots' entries of a flag per leg; False for an empty slot."""
         return self.codes(values.astype(jnp.int32)) > 0
 
     def of(self, values: Array) -> Pair:
-        """The slots' entries of a quantity of all legs; 0 for an empty slot."""
+        """Return the slots' entries of a quantity per leg; 0 for an empty slot."""
         zero = jnp.zeros_like(values)
         return (
             over_legs(jnp.where(self.first, values, zero)),
@@ -110,18 +114,22 @@ class Slots(NamedTuple):
         )
 
     def spread(self, pair: Any) -> Legs:
-        """The inverse of `of`: zero for legs in no slot."""
+        """Return the quantity per leg, zero for legs in no slot: the inverse of `gather`."""
         return jnp.where(self.first, pair[0], 0.0) + jnp.where(self.second, pair[1], 0.0)
 
 
 def slots_of(touching: Bool[Array, "n_legs ..."]) -> Slots:
+    """Return the slots of the first two touching legs."""
     rank = jnp.cumsum(touching.astype(jnp.int32), axis=0)
     return Slots(touching & (rank == 1), touching & (rank == 2))
 
 
 def of_slots(friction: Elementwise | Pair, slots: Slots) -> Elementwise | Pair:
-    """Friction of each slot's foot, given that of the foot that landed last, Leg 1's, and that of
-    all others; a single one is everybody's."""
+    """Return the friction of each slot's foot.
+
+    A pair holds the friction of the foot that landed last, Leg 1's, and that of all others; a
+    single number is the friction of all feet.
+    """
     if not isinstance(friction, tuple):
         return friction
     last, others = friction
@@ -129,7 +137,7 @@ def of_slots(friction: Elementwise | Pair, slots: Slots) -> Elementwise | Pair:
 
 
 class Hub(NamedTuple):
-    """Inverse inertia that the slots' forces meet, and how they answer each other."""
+    """Inverse inertia at the slots' forces, and their mutual responses."""
 
     legs: Legwise
     released: Bool[Array, " n_legs"]  # legs eliminated: free in length, or in a slot
@@ -137,14 +145,15 @@ class Hub(NamedTuple):
     sin: Pair
     cos: Pair
     L: Pair
-    along_e: tuple[Vector3, Vector3]  # hub's answer to a unit force along e of each foot
+    along_e: tuple[Vector3, Vector3]  # hub's response to a unit force along e of each foot
     along_u: tuple[Vector3, Vector3]  # to a unit pull of each stopper
-    G: tuple[Any, Any, Any]  # 11, 12, 22 of e to e
-    H: tuple[Any, Any, Any, Any]  # 11, 12, 21, 22 of stopper to e
-    K: tuple[Any, Any, Any]  # 11, 12, 22 of stopper to stopper
+    G: tuple[Any, Any, Any]  # 11, 12, 22: e to e
+    H: tuple[Any, Any, Any, Any]  # 11, 12, 21, 22: stopper to e
+    K: tuple[Any, Any, Any]  # 11, 12, 22: stopper to stopper
 
 
 def times(inverse: tuple[Any, ...], f: Vector3) -> Vector3:
+    """Return the product of the symmetric inverse inertia and a vector."""
     xx, xz, xt, zz, zt, tt = inverse
     return (
         xx * f[0] + xz * f[1] + xt * f[2],
@@ -154,6 +163,9 @@ def times(inverse: tuple[Any, ...], f: Vector3) -> Vector3:
 
 
 def _inverse_inertia(s: Symbols, legs: Legwise, b: Legs, released: Array) -> tuple[Any, ...]:
+    """Return the inverse of the 3 x 3 inertia that is left after the elimination of the released
+    legs.
+    """
     sin = jnp.where(released, legs.sin, 0.0)
     cos = jnp.where(released, legs.cos, 0.0)
     xx = s.Mt - s.m * over_legs(sin * sin)
@@ -175,7 +187,7 @@ def _inverse_inertia(s: Symbols, legs: Legwise, b: Legs, released: Array) -> tup
 
 
 class Posture(NamedTuple):
-    """Directions of all legs, and where the slots' are."""
+    """Directions of all legs, and directions and lengths of the slots' legs."""
 
     legs: Legwise
     sin: Pair
@@ -184,12 +196,16 @@ class Posture(NamedTuple):
 
 
 def posture_of(s: Symbols, motion: WheelMotion, slots: Slots) -> Posture:
+    """Return the directions of all legs, and the slots' directions and lengths."""
     legs = directions(s, motion.theta)
     return Posture(legs, slots.of(legs.sin), slots.of(legs.cos), slots.of(motion.L))
 
 
 def hub_of(s: Symbols, motion: WheelMotion, slots: Slots, locked: Array) -> Hub:
-    """How hub and slots answer forces at this posture; `locked`: airborne legs on stoppers."""
+    """Return the response of hub and slots to forces at this posture.
+
+    - `airborne`: legs in the air on their stoppers.
+    """
     legs, sin, cos, L = posture_of(s, motion, slots)
     released = slots.filled | ~locked
     inverse = _inverse_inertia(s, legs, motion.L - s.a, released)
@@ -215,17 +231,19 @@ def hub_of(s: Symbols, motion: WheelMotion, slots: Slots, locked: Array) -> Hub:
 
 
 class Free(NamedTuple):
-    """What would happen without the slots' forces: accelerations, or velocities in an impact."""
+    """Motion without the slots' forces: accelerations, or velocities in an impact."""
 
     hub: Vector3
-    legs: Legs  # of a released leg's length, less the hub's share u . hub
-    own: Pair  # the same of the slots' legs
+    legs: Legs  # of a released leg's length, minus the hub's share u . hub
+    own: Pair  # the same for the slots' legs
     e: Pair  # of the slots' feet along e
     u: Pair  # along u
 
 
 def free_legs(s: Symbols, motion: WheelMotion, legs: Legwise) -> Legs:
-    """Acceleration of a leg's length that no force holds, less the hub's share, m/s^2."""
+    """Return the acceleration of a leg's length without a holding force, minus the hub's share,
+    m/s^2.
+    """
     gx, gz = s.g * s.sin_phi, -s.g * s.cos_phi
     spin = (motion.L - s.a) * motion.dtheta * motion.dtheta
     spring = s.k * (s.Ls - motion.L) - s.c * motion.dL
@@ -233,7 +251,10 @@ def free_legs(s: Symbols, motion: WheelMotion, legs: Legwise) -> Legs:
 
 
 def free_acceleration(s: Symbols, motion: WheelMotion, slots: Slots, hub: Hub) -> Free:
-    """Gravity, springs, dampers and rotation, with no force on the slots' feet and stoppers."""
+    """Return the accelerations by gravity, springs, dampers and rotation alone.
+
+    The slots' feet and stoppers exert no force.
+    """
     sin, cos = hub.legs
     b, dtheta = motion.L - s.a, motion.dtheta
     gx, gz = s.g * s.sin_phi, -s.g * s.cos_phi
@@ -254,9 +275,10 @@ def free_acceleration(s: Symbols, motion: WheelMotion, slots: Slots, hub: Hub) -
 
 
 def free_velocity(s: Symbols, motion: WheelMotion, slots: Slots, hub: Hub) -> Free:
-    """Velocities that the wheel's momentum gives where no foot and no slot's stopper pushes.
+    """Return the velocities by the wheel's momentum alone, with no impulse at feet or slots'
+    stoppers.
 
-    A leg that is `locked` though its length still changes meets its stopper, inelastically.
+    An airborne leg on its stopper whose length still changes meets the stopper, inelastically.
     """
     sin, cos = hub.legs
     b, dtheta = motion.L - s.a, motion.dtheta
@@ -281,7 +303,7 @@ class FootVelocity(NamedTuple):
 
 
 def foot_velocity(motion: WheelMotion, slots: Slots, hub: Hub | Posture) -> FootVelocity:
-    """Velocity of the slots' feet along the slope and off it."""
+    """Return the velocity of the slots' feet along the slope and normal to it."""
     dL = slots.of(motion.dL)
     x = [motion.vx - dL[i] * hub.sin[i] - hub.L[i] * motion.dtheta * hub.cos[i] for i in range(2)]
     z = [motion.vz - dL[i] * hub.cos[i] + hub.L[i] * motion.dtheta * hub.sin[i] for i in range(2)]
@@ -289,30 +311,30 @@ def foot_velocity(motion: WheelMotion, slots: Slots, hub: Hub | Posture) -> Foot
 
 
 def foot_heights(motion: WheelMotion, legs: Legwise) -> Legs:
-    """Height of every foot above the slope, m."""
+    """Return the height of every foot above the slope, m."""
     return motion.z - motion.L * legs.cos
 
 
 def foot_speeds(motion: WheelMotion, legs: Legwise) -> tuple[Legs, Legs]:
-    """Of every foot, along the slope and off it, m/s."""
+    """Return the velocity of every foot along the slope and normal to it, m/s."""
     turn = motion.L * motion.dtheta
     along = motion.vx - motion.dL * legs.sin - turn * legs.cos
     return along, motion.vz - motion.dL * legs.cos + turn * legs.sin
 
 
 def foot_places(motion: WheelMotion, legs: Legwise) -> Legs:
-    """Downhill position of every foot, m."""
+    """Return the downhill position of every foot, m."""
     return motion.x - motion.L * legs.sin
 
 
 def place_of_landing(n: int, motion: WheelMotion) -> Elementwise:
-    """Downhill position of the foremost of `n` feet, m."""
+    """Return the downhill position of the foremost of `n` feet, m."""
     turned = motion.theta + (n - 1) * 2.0 * math.pi / n
     return motion.x - motion.L[n - 1] * jnp.sin(turned)
 
 
 def kinetic_energy(s: Symbols, motion: WheelMotion) -> Elementwise:
-    """Of the hub and all legs' masses, J."""
+    """Return the kinetic energy of the hub and all leg masses, J."""
     legs = directions(s, motion.theta)
     across = (motion.L - s.a) * motion.dtheta
     x = motion.vx - motion.dL * legs.sin - across * legs.cos
@@ -322,7 +344,9 @@ def kinetic_energy(s: Symbols, motion: WheelMotion) -> Elementwise:
 
 
 def potential_energy(s: Symbols, motion: WheelMotion) -> Pair:
-    """Gravitational energy from the slope's origin, and elastic energy of all springs, J."""
+    """Return the gravitational energy from the slope's origin and the elastic energy of all
+    springs, J.
+    """
     legs = directions(s, motion.theta)
     x = s.Mt * motion.x - s.m * over_legs((motion.L - s.a) * legs.sin)
     z = s.Mt * motion.z - s.m * over_legs((motion.L - s.a) * legs.cos)

@@ -1,4 +1,4 @@
-"""How the wheel moves while no contact changes, and the guards of what may change next."""
+"""Motion of the wheel between events, and the guards of the next event."""
 
 from typing import NamedTuple
 
@@ -35,24 +35,26 @@ from vrw_jax.numerics import Elementwise, Scalar
 from vrw_jax.wheel import Symbols
 
 State = Float[Array, "dim ..."]
-"""Hub (x, z, theta) and rates, lengths, rates of lengths, then the tallies: see `Tally`."""
+"""Hub (x, z, theta) and rates, lengths, rates of lengths, then the accumulators: see
+`Accumulators`."""
 
 
 class Tally(NamedTuple):
-    """What is summed up along the motion, beside the motion itself."""
+    """Integrals along the motion, besides the motion itself."""
 
     clock: Scalar  # time since the last event, s
     damping: Scalar  # energy lost in the dampers, J
     friction: Scalar  # energy lost by sliding, J
-    slip: Scalar  # path of all sliding feet, m
+    slip: Scalar  # path length of all sliding feet, m
 
 
 def pack(motion: WheelMotion, tally: Tally) -> State:
-    """Everything that is integrated, as one vector of 10 + 2 n entries."""
+    """Return everything that is integrated as one vector of 10 + 2 n entries."""
     return jnp.concatenate([jnp.stack(motion[:6]), motion.L, motion.dL, jnp.stack(tally)])
 
 
 def unpack(y: State) -> tuple[WheelMotion, Tally]:
+    """Return motion and accumulators of a vector: the inverse of `pack_state`."""
     n = (y.shape[0] - 10) // 2
     L, dL, tally = y[6 : 6 + n], y[6 + n : 6 + 2 * n], y[6 + 2 * n :]
     motion = WheelMotion(y[0], y[1], y[2], y[3], y[4], y[5], L, dL)
@@ -60,7 +62,7 @@ def unpack(y: State) -> tuple[WheelMotion, Tally]:
 
 
 class Stance(NamedTuple):
-    """Which feet are loaded and how, which legs are on their stoppers, and what has just begun."""
+    """Contact modes of the feet, stopper states of the legs, and what has just changed."""
 
     contact: Int[Array, " n_legs"]  # mode of every foot
     locked: Bool[Array, " n_legs"]  # legs on their stoppers
@@ -70,7 +72,7 @@ class Stance(NamedTuple):
 
 
 class Flow(NamedTuple):
-    """The wheel in one stance: all that the motion between two events needs."""
+    """The wheel in one contact state, with everything that the motion between two events needs."""
 
     s: Symbols
     friction: Roughness  # of the slots' feet
@@ -80,10 +82,11 @@ class Flow(NamedTuple):
     contact: Int[Array, "2"]  # of the slots
     held: Bool[Array, "2"]  # the slots' legs on their stoppers
     airborne: Bool[Array, " n_legs"]  # other legs on their stoppers
-    tallied: bool  # in lanes: what is summed up is wanted, too
+    tallied: bool  # in batches: the accumulators are integrated as well
     tilt: Elementwise | None = None  # by which the ground ahead is steeper, rad
 
     def stand(self, motion: WheelMotion) -> Stand:
+        """Return the contact configuration at this motion."""
         slots = self.slots, self.contact, self.held, self.airborne
         return Stand(self.s, motion, self.friction, *slots)
 
@@ -96,7 +99,7 @@ def flow_of(
     tallied: bool = False,
     tilt: Elementwise | None = None,
 ) -> Flow:
-    """The stance as seen by the equations of motion."""
+    """Return the dynamics of the wheel in this contact state."""
     slots = slots_of(stance.contact != OFF)
     contact, held = slots.codes(stance.contact), slots.flags(stance.locked)
     airborne = stance.locked & ~slots.filled
@@ -105,6 +108,8 @@ def flow_of(
 
 
 class Forces(NamedTuple):
+    """Contact forces with the leg directions and foot velocities that they depend on."""
+
     legs: Legwise
     free: Legs  # see `free_legs`
     answer: Carried
@@ -112,7 +117,7 @@ class Forces(NamedTuple):
 
 
 def forces(flow: Flow, motion: WheelMotion) -> Forces:
-    """Contact and stopper forces with the accelerations they leave."""
+    """Return contact and stopper forces with the resulting accelerations."""
     one, posture = one_of(motion), posture_of(flow.s, motion, flow.slots)
     free = kept(free_legs(flow.s, motion, posture.legs), one)
     feet = kept(foot_velocity(motion, flow.slots, posture), one)
@@ -120,23 +125,24 @@ def forces(flow: Flow, motion: WheelMotion) -> Forces:
 
 
 def _outward(now: Forces) -> Legs:
-    """Acceleration of each leg's length that would be, were no force of slots or stoppers there."""
+    """Return the acceleration of each leg's length without forces of slots and stoppers, m/s^2."""
     sin, cos = now.legs
     ax, az, _ = now.answer.hub
     return now.free + sin * ax + cos * az
 
 
 def airborne_stopper_force(flow: Flow, now: Forces) -> Legs:
-    """Force of the stoppers of locked legs in the air, N; 0 for the other legs."""
+    """Return the stopper force of locked legs in the air, N; 0 for the other legs."""
     return jnp.where(flow.airborne, flow.s.m * _outward(now), 0.0)
 
 
 def least_stopper_force(flow: Flow, now: Forces) -> Elementwise:
-    """The least of `airborne_stopper_force`; infinite where no leg in the air is locked."""
+    """Return the minimum of `airborne_stopper_force`; infinite if no leg in the air is locked."""
     return jnp.min(jnp.where(flow.airborne, airborne_stopper_force(flow, now), jnp.inf), axis=0)
 
 
 def tally_rates(flow: Flow, motion: WheelMotion, now: Forces) -> Tally:
+    """Return the rates of the accumulators."""
     direction = sliding(flow.contact)
     speeds = [direction[i] * now.feet.x[i] for i in range(2)]
     drag = [-now.answer.tangential[i] * direction[i] for i in range(2)]
@@ -149,6 +155,7 @@ def tally_rates(flow: Flow, motion: WheelMotion, now: Forces) -> Tally:
 
 
 def field(flow: Flow, y: State) -> State:
+    """Return the time derivative of the packed state."""
     motion, _ = unpack(y)
     now = forces(flow, motion)
     rates = WheelMotion(
@@ -163,51 +170,52 @@ def field(flow: Flow, y: State) -> State:
 
 
 class Guards(NamedTuple):
-    """Where each kind of guard begins in the list of `guards`."""
+    """Index at which each kind of guard begins in the list of `guard_values`."""
 
-    foot: int  # heights of airborne feet, one per leg: falls to zero at a landing
-    leg: int  # room before the stopper, one per leg
+    foot: int  # heights of airborne feet, one per leg: zero at a landing
+    leg: int  # distance to the stopper, one per leg
     lift: int  # normal force, one per slot
-    cone_up: int  # friction left before the foot slides uphill, one per slot
-    cone_down: int  # before it slides downhill
+    cone_up: int  # friction margin before the foot slides uphill, one per slot
+    cone_down: int  # the same before it slides downhill
     slip: int  # speed of a sliding foot, one per slot
     release: int  # stopper force of a loaded leg, one per slot
     rate: int  # dtheta
-    length: int  # shortest leg less a
-    loosen: int  # stopper force of airborne legs, one per leg, where stoppers are one-sided
+    length: int  # shortest leg minus a
+    loosen: int  # stopper force of airborne legs, one per leg, if one-sided
     total: int
 
     @property
     def n_legs(self) -> int:
-        """Legs of the wheel."""
+        """Number of legs of the wheel."""
         return self.leg - self.foot
 
     @property
     def foremost(self) -> int:
-        """Guard of the foot ahead of all others, whose landing ends a step."""
+        """Guard of the foremost foot, whose landing ends a step."""
         return self.leg - 1
 
 
 def guards_of(n: int, one_sided: bool) -> Guards:
+    """Return the guard layout of a wheel with `n` legs."""
     sizes = (n, n, 2, 2, 2, 2, 2, 1, 1, n if one_sided else 0)
     places = np.concatenate([[0], np.cumsum(sizes)])
     return Guards(*(int(p) for p in places))
 
 
 class Felt(NamedTuple):
-    """What decides how long a stance lasts, beside the motion itself."""
+    """Quantities that determine the duration of a contact state, besides the motion itself."""
 
     legs: Legwise
     normal: Pair
     tangential: Pair
     stopper: Pair
     speed: Pair  # of the slots' feet along the slope
-    regular: Array  # see `contacts.Answer`
-    in_air: Legs | None  # stopper force of legs in the air, where stoppers are one-sided
+    regular: Array  # see `contacts.ContactSolution`
+    in_air: Legs | None  # stopper force of legs in the air, if stoppers are one-sided
 
 
 def felt(flow: Flow, now: Forces) -> Felt:
-    """What `stance_guards` needs of the forces."""
+    """Return the quantities of the forces that `evaluate_guards` needs."""
     found = now.answer
     in_air = airborne_stopper_force(flow, now) if flow.one_sided else None
     forces = found.normal, found.tangential, found.stopper
@@ -215,12 +223,12 @@ def felt(flow: Flow, now: Forces) -> Felt:
 
 
 def as_row(friction: Roughness) -> Array:
-    """The slots' friction as one array, if it is not everybody's."""
+    """Return the slots' friction as one array, if it differs between slots."""
     return jnp.stack(friction) if isinstance(friction, tuple) else friction
 
 
 def _heights(flow: Flow, motion: WheelMotion, legs: Legwise) -> Legs:
-    """Height of every foot above its ground, m; that ahead begins under Leg 1's foot."""
+    """Return the height of every foot above its ground, m; the ground ahead begins under foot 1."""
     heights = foot_heights(motion, legs)
     if flow.tilt is None:
         return heights
@@ -230,10 +238,12 @@ def _heights(flow: Flow, motion: WheelMotion, legs: Legwise) -> Legs:
 
 
 def stance_guards(flow: Flow, motion: WheelMotion, now: Felt, begun: Array) -> list[Array]:
-    """Guards in the order of `Guards`; `begun`: not at the stance's start.
+    """Return the guards in the order of `GuardLayout`.
 
-    What the last event has just brought about (a foot off the ground, a leg off its stopper, a
-    sliding foot) stands on its own guard: it is not watched at that very instant.
+    - `has_begun`: False at the start of the contact state.
+
+    The last event leaves its own guard at zero: of a foot off the ground, a leg off its stopper, or
+    a sliding foot. That guard is not evaluated at that instant.
     """
     s, stance = flow.s, flow.stance
     one = jnp.ones_like(motion.L)
@@ -242,8 +252,8 @@ def stance_guards(flow: Flow, motion: WheelMotion, now: Felt, begun: Array) -> l
     just_slid = flow.slots.flags(stance.new_slip)
     rough = as_row(rough_of(flow.friction))
     normal, tangential = jnp.stack(now.normal), jnp.stack(now.tangential)
-    # In the limit of large friction a resting foot slides, one way or the other, where its normal
-    # force vanishes, see `events.resolve`; a sliding one lifts where its friction does.
+    # In the limit of large friction a resting foot begins to slide where its normal force
+    # vanishes, see `events.resolve_event`; a sliding foot lifts where its friction vanishes.
     limit = as_row(flow.friction) == jnp.inf
     direction = jnp.stack(sliding(flow.contact))
     pressed = jnp.where(limit & (direction != 0.0), -direction * tangential, normal)
@@ -266,7 +276,7 @@ def stance_guards(flow: Flow, motion: WheelMotion, now: Felt, begun: Array) -> l
 
 
 def guard_sizes(flow: Flow) -> Array:
-    """What a guard of each kind is of, in the order of `Guards`: m, N, m/s, rad/s."""
+    """Return the scale of each guard, in the order of `GuardLayout`: m, N, m/s, rad/s."""
     s = flow.s
     weight, speed = s.Mt * s.g, jnp.sqrt(s.g * s.L0)
     rows = [s.L0] * 2 * s.n + [weight] * 6 + [speed] * 2 + [weight] * 2 + [speed / s.L0, s.L0]
@@ -274,7 +284,7 @@ def guard_sizes(flow: Flow) -> Array:
 
 
 def guards(flow: Flow, y: State) -> Float[Array, " n_guards"]:
-    """All guards, positive in the stance, falling through zero where it ends; 1 if not watched."""
+    """Return all guards: positive inside the contact state, zero at its end, 1 if not evaluated."""
     motion, tally = unpack(y)
     now = felt(flow, forces(flow, motion))
     parts = stance_guards(flow, motion, now, tally.clock > 0.0)

@@ -1,4 +1,6 @@
-"""What is asked of lanes on real ground: walks of many steps, one step with all that moves it."""
+"""Batch entry points for unilateral contact: walks of many steps, and one step with its
+Jacobian.
+"""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -26,7 +28,7 @@ from vrw_jax.runtime import lane_program
 from vrw_jax.wheel import PARAMETER_NAMES, Symbols, symbols_of
 
 BLOCK = 2048
-"""Lanes side by side where XLA compiles what they do."""
+"""Number of lanes in one block if XLA compiles the walk."""
 
 
 def walk_lanes(
@@ -37,11 +39,13 @@ def walk_lanes(
     options: Options,
     n: int,
 ) -> tuple[np.ndarray, ...]:
-    """`n_steps` steps of many wheels with `n` legs: section states, durations, outcomes, steps
-    made, steps tried and the last one's length, m. What is static of the model holds for all.
+    """Return the results of `n_steps` steps of many wheels with `n` legs.
 
-    `columns` are the parameters in their order and friction, shape (10, wheels); `states` full
-    section states, shape (wheels, 4 + 3 n).
+    They are section states, durations, outcomes, completed steps, solver steps and the length of
+    the last step, m. Static fields of the model apply to all wheels.
+
+    - `columns`: the parameters in their order and friction, shape (10, wheels);
+    - `states`: full section states, shape (wheels, 4 + 3 n).
     """
     run = _Run.of(model, options, n, False)
     walk = _walked(run, [columns, states.T], n_steps, options)
@@ -58,15 +62,16 @@ def step_lanes(
     n: int,
     wanted: Sequence[int] | None = None,
 ) -> tuple[UnilateralStep, UnilateralStep]:
-    """One step of many wheels, as `walk_lanes` takes them, and how what it tells moves.
+    """Return one step of many wheels, as `walk_batch` takes them, and the Jacobian of its results.
 
-    Leading axis: wheels; derivatives have a last one over the columns, then the section state.
-    Directions go beside the wheel's motion. What is not `wanted` and what cannot move, lengths of
-    legs on their stoppers or with loaded feet and codes, has zeros. Of the rates only so many are
-    directions as loaded feet leave (see `_Rates`).
+    The leading axis is over wheels. Derivatives have a last axis over the columns, then the section
+    state. Tangents are integrated beside the wheel's motion. Entries that are not in
+    `input_indices` or cannot vary (lengths of legs on their stoppers or with loaded feet, and
+    codes) have zero derivatives. The number of rate tangents is the number that loaded feet leave
+    independent (see `_IndependentRates`).
     """
     run = _Run.of(model, options, n, True)
-    if len(states):  # before others are asked for: it is long in coming
+    if len(states):  # first, because its compilation takes longest
         _program(run, columns.dtype, jax.tree.structure(eqx.filter(options, eqx.is_array)))
     code = np.round(states[:, 4 + 2 * n :]).astype(int)
     numbers = np.concatenate([columns.T, states], 1)
@@ -97,11 +102,13 @@ def step_lanes(
 
 
 DIRECTIONS = 16
-"""That one lane carries at most: more are shared out to several."""
+"""Largest number of tangents in one lane: more tangents are distributed over several lanes."""
 
 
 def _shared_out(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Lane and place there of each wheel's directions, one after the other, and whose lanes are."""
+    """Return the lane and position of each wheel's tangents, one after another, and the lanes'
+    owners.
+    """
     lanes = np.maximum(-(-counts // DIRECTIONS), 1)
     first, own = np.cumsum(lanes) - lanes, np.concatenate([np.arange(n) for n in counts])
     lane = np.repeat(first, counts) + own // DIRECTIONS
@@ -109,24 +116,26 @@ def _shared_out(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 SAME = 1e-10
-"""What is left of a rate beside others, as a share of the largest, that is rounding: else it is of
-the order of one, as the projection is."""
+"""Remainder of a dependent rate that counts as rounding, as a fraction of the largest: an
+independent rate has a remainder of order one, like the projection."""
 
 
 class _Rates(NamedTuple):
-    """Which rates of section states move wheels, and the others by these.
+    """Independent rates of section states, and the other rates as combinations of these.
 
-    A loaded foot holds the wheel: of the hub's and its leg's four rates a resting one leaves two.
+    A loaded foot constrains the wheel: a resting foot leaves two of the four rates of hub and leg.
     """
 
-    places: np.ndarray  # of the rates that are kept, (wheels, kept)
-    counts: np.ndarray  # which of these there are
-    shares: np.ndarray  # all rates by these, (wheels, kept, rates)
+    places: np.ndarray  # of the independent rates, (wheels, independent)
+    counts: np.ndarray  # which of these exist
+    shares: np.ndarray  # of all rates by these, (wheels, independent, rates)
 
     @classmethod
     def of(cls, settled: np.ndarray, asked: np.ndarray) -> "_Rates":
-        """By what a start makes of each rate, (wheels, rates after, rates), of those `asked`: one
-        after another that of which the others leave most."""
+        """Return the independent rates of a start's projection, (wheels, projected rates, rates).
+
+        Of the rates `is_requested`, the one with the largest remainder is selected repeatedly.
+        """
         asked_for = np.nan_to_num(settled) * asked[:, None]
         left, wheels = asked_for.copy(), np.arange(len(asked))
         largest = np.sqrt(np.sum(left**2, 1)).max(-1)
@@ -148,7 +157,7 @@ class _Rates(NamedTuple):
         picked, there = np.stack(places, 1), np.stack(counts, 1)
         by_way = np.stack([np.sum(way[:, :, None] * asked_for, 1) for way in along], 1)
         shares = np.zeros_like(by_way)
-        for i in reversed(range(len(places))):  # each way is what the kept ones before leave of one
+        for i in reversed(range(len(places))):  # each direction is the remainder of one rate
             rest = by_way[:, i].copy()
             for j in range(i + 1, len(places)):
                 rest -= by_way[wheels, i, picked[:, j]][:, None] * shares[:, j]
@@ -157,14 +166,16 @@ class _Rates(NamedTuple):
         return cls(picked, there, shares)
 
     def kept(self) -> np.ndarray:
-        """Whether a rate is among those, (wheels, rates)."""
+        """Return whether each rate is independent, (wheels, rates)."""
         flags = np.zeros((len(self.places), self.shares.shape[2]), bool)
         wheel, which = np.nonzero(self.counts)
         flags[wheel, self.places[wheel, which]] = True
         return flags
 
     def all_of(self, moved: np.ndarray) -> np.ndarray:
-        """How things move with all rates, (wheels, rates, ...), by those that are kept."""
+        """Return the tangents of all rates, (wheels, rates, ...), from those of the independent
+        ones.
+        """
         wheels, shape = np.arange(len(moved)), (1,) * (moved.ndim - 2)
         total = np.zeros_like(moved)
         for k in range(self.places.shape[1]):
@@ -174,8 +185,10 @@ class _Rates(NamedTuple):
 
 
 def _settled_rates(columns: np.ndarray, states: np.ndarray, n: int) -> np.ndarray:
-    """What a step's start makes of each rate of the section state, which it does linearly:
-    (wheels, rates after, rates)."""
+    """Return the effect of each rate of the section state on the start of a step, which is linear.
+
+    The axes are (wheels, rates after, rates).
+    """
     units = np.eye(3 + n)
     lanes = np.repeat(states, 3 + n, 0)
     every = np.tile(units, (len(states), 1))
@@ -186,6 +199,7 @@ def _settled_rates(columns: np.ndarray, states: np.ndarray, n: int) -> np.ndarra
 
 
 def _landing(s: Symbols, x: Array) -> WheelMotion:
+    """Return the motion of a section state, projected onto its contacts."""
     motion, stance = opened(s, x)
     return settled(s, motion, stance.contact, stance.locked)
 
@@ -194,18 +208,22 @@ OF_ROWS: dict[str, Callable[[Symbols, Array], Array]] = {
     "full states": embedded,
     "rates at a start": lambda s, x: coordinates(_landing(s, x))[1],
 }
-"""What is asked of section states alone, with lanes last."""
+"""Functions of section states alone, with lanes on the last axis."""
 
 
 def _of_rows(n: int, asked: str, rows: list[np.ndarray]) -> np.ndarray:
-    """One of `OF_ROWS`, of rows of parameters and section states; of any number of wheels one
-    program, which JAX alone would compile anew for each."""
+    """Return one of `SECTION_STATE_FUNCTIONS` of rows of parameters and section states.
+
+    One program serves any number of wheels; JAX alone would compile a new one for each number.
+    """
     program = _program_of_rows(n, asked, len(rows), rows[0].dtype)
     return np.stack(program([], [np.ascontiguousarray(row) for row in rows]))
 
 
 @functools.cache
 def _program_of_rows(n: int, asked: str, size: int, dtype: np.dtype) -> Callable[..., Any]:
+    """Return the compiled function of rows."""
+
     def told(_: tuple, lanes: tuple) -> tuple:
         values, x = lanes[: len(PARAMETER_NAMES)], jnp.stack(lanes[len(PARAMETER_NAMES) :])
         return tuple(OF_ROWS[asked](symbols_of(n, *values), x))
@@ -216,7 +234,10 @@ def _program_of_rows(n: int, asked: str, size: int, dtype: np.dtype) -> Callable
 
 
 def _by_xla(function: Callable[[tuple, tuple], tuple]) -> Callable[..., Any]:
-    """Of numbers and rows, where there is no machine code: compiled for few numbers of lanes."""
+    """Return the function of numbers and rows, compiled by XLA in blocks of `XLA_BLOCK_SIZE` lanes.
+
+    It is used without machine code.
+    """
     moved = lambda told, here, there: tuple(jnp.moveaxis(x, here, there) for x in told)
     compiled = jax.jit(lambda uniform, lanes: moved(function(uniform, lanes), -1, 0))
 
@@ -228,15 +249,21 @@ def _by_xla(function: Callable[[tuple, tuple], tuple]) -> Callable[..., Any]:
 
 
 class _Run(NamedTuple):
+    """Static configuration of a batch walk."""
+
     static: Options
     n_legs: int
     max_events: int
     one_sided: bool
     by_paper: bool
-    moved: bool  # all that a step tells, and along directions of each lane
+    moved: bool  # full step results with the tangents of each lane
 
     @classmethod
     def of(cls, model: UnilateralWheel, options: Options, n: int, moved: bool) -> "_Run":
+        """Return the configuration of this model and these options.
+
+        Raises `ValueError` for a model with restitution.
+        """
         if model.restitution is not None:
             raise ValueError(
                 "restitution is given, but in lanes feet don't come back: walk wheels one by one, "
@@ -246,6 +273,7 @@ class _Run(NamedTuple):
         return cls(static, n, model.max_events, model.one_sided, model.by_paper, moved)
 
     def on(self, dynamic: Options, n_steps: Array) -> Walk:
+        """Return the walk settings with traced options and number of steps."""
         options = eqx.combine(dynamic, self.static)
         tableau = explicit_tableau(options.solver)
         assert tableau is not None  # the caller looked
@@ -253,11 +281,14 @@ class _Run(NamedTuple):
         return Walk(self.n_legs, n_steps, self.max_events, *rules, options, tableau)
 
     def rows(self) -> tuple[int, ...]:
-        """Of the arrays that are given: columns, states, and which of these directions are."""
+        """Return the numbers of input rows: columns, states and, with tangents, the input of each
+        tangent.
+        """
         sizes = len(PARAMETER_NAMES) + 1, section_size(self.n_legs)
         return (*sizes, DIRECTIONS) if self.moved else sizes
 
     def told(self, dtype: Any) -> Any:
+        """Return shapes and dtypes of the results."""
         walk = _shapes(self.n_legs, dtype, self.moved)
         if not self.moved:
             return walk
@@ -268,13 +299,16 @@ class _Run(NamedTuple):
 
 @functools.cache
 def _shapes(n_legs: int, dtype: Any, moved: bool) -> Any:
+    """Return shapes and dtypes of one lane's results."""
     return jax.eval_shape(lambda: told_like(n_legs, dtype, moved))
 
 
 def _walked(run: _Run, given: list[np.ndarray], n_steps: int, options: Options) -> Any:
-    """What is told of lanes, which these arrays have on their last axis, now leading."""
+    """Return the results of lanes with the lane axis, last in the input arrays, as the leading
+    one.
+    """
     dtype = given[0].dtype
-    # Those beside each other wait for each other: stability bounds the step where damping is high.
+    # Neighboring lanes run as long as the slowest; high damping bounds the step by stability.
     order = np.argsort(-given[0][PARAMETER_NAMES.index("damping")], kind="stable")
     dynamic, form = jax.tree.flatten(eqx.filter(options, eqx.is_array))
     uniform = [np.int32(n_steps), *(np.asarray(leaf, dtype) for leaf in dynamic)]
@@ -289,11 +323,12 @@ def _walked(run: _Run, given: list[np.ndarray], n_steps: int, options: Options) 
 
 @functools.cache
 def _form(run: _Run, dtype: np.dtype) -> tuple[list[Any], Any]:
+    """Return the leaves and the tree structure of the results."""
     return jax.tree.flatten(run.told(dtype))
 
 
 def as_full_states(columns: np.ndarray, states: np.ndarray, n: int) -> np.ndarray:
-    """The full section states of the paper's, wheel by wheel; others are left as they are."""
+    """Return the full section states of three-number ones; others are returned unchanged."""
     if states.shape[1] != 3:
         return states
     return _of_rows(n, "full states", [*columns[:-1], *states.T]).T
@@ -301,7 +336,7 @@ def as_full_states(columns: np.ndarray, states: np.ndarray, n: int) -> np.ndarra
 
 @functools.cache
 def _program(run: _Run, dtype: np.dtype, form: Any) -> Callable[..., Any]:
-    """The compiled walk, of numbers and of rows with lanes: one for any number of steps."""
+    """Return the compiled walk over numbers and rows of lanes, for any number of steps."""
 
     def walk(uniform: tuple, lanes: tuple) -> tuple:
         n_steps, *dynamic = uniform

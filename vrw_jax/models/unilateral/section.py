@@ -1,4 +1,6 @@
-"""The full section state of the unilateral rung as one vector, and the paper's inside it."""
+"""Full section state of the unilateral model as one vector, and the embedding of the paper's
+state.
+"""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -12,22 +14,26 @@ from vrw_jax.numerics import Elementwise
 from vrw_jax.wheel import Symbols, WheelParams, length_at_touchdown
 
 FullState = Float[Array, "n_full ..."]
-"""(theta-, dtheta-, vx-, vz-, L_1 ... L_n, dL_1 ... dL_n, code_1 ... code_n) just before the foot
-ahead of all others lands, in the labels of the step that ends: rad, rad/s, hub m/s, m, m/s.
+"""(theta-, dtheta-, vx-, vz-, L_1 ... L_n, dL_1 ... dL_n, code_1 ... code_n) just before the
+foremost foot lands, in the leg labels of the ending step: rad, rad/s, hub m/s, m, m/s.
 
 A leg's code is its foot's mode (0 in the air, 1 at rest, 2 sliding downhill, 3 uphill), plus 4 on
-its stopper. The hub's height follows from the landing foot's."""
+its stopper. The hub's height follows from the landing foot's.
+"""
 
 LOCKED = 4
-"""What a leg's code gains on its stopper."""
+"""Offset of a leg's code on its stopper."""
 
 
 def section_size(n: int) -> int:
+    """Return the length of a full section state of a wheel with `n` legs."""
     return 4 + 3 * n
 
 
 def embedded(s: Symbols, x: Float[Array, "3 ..."]) -> FullState:
-    """The paper's section state: Leg 1 planted, all other legs on their stoppers."""
+    """Return the full section state of the paper's one: Leg 1 planted, all other legs on their
+    stoppers.
+    """
     theta, dtheta, dL1 = x
     sin, cos, L1 = jnp.sin(theta), jnp.cos(theta), length_at_touchdown(s, theta)
     first = (jnp.arange(s.n) == 0).reshape(-1, *(1,) * theta.ndim)
@@ -45,9 +51,9 @@ def embedded(s: Symbols, x: Float[Array, "3 ..."]) -> FullState:
 def made_sound(
     params: WheelParams, friction: Elementwise, x: FullState, even: bool = True
 ) -> tuple[Bool[Array, "..."], WheelParams, Elementwise, FullState]:
-    """Whether a step may begin there, and the same, or what one always may begin with.
+    """Return whether a step may begin at this input, and the input or, if not, a valid substitute.
 
-    Where the ground is not `even` feet may be below the line that the next foothold continues.
+    If the ground is uneven, feet may be below the extended line of the next foothold's slope.
     """
     safe = embedded(WheelParams(n_legs=params.n_legs).symbols(), jnp.asarray(PAPER_START, x.dtype))
     safe_x = safe.reshape(-1, *(1,) * (x.ndim - 1))
@@ -58,13 +64,17 @@ def made_sound(
 
 
 NEAR = 1e-3
-"""Share of a leg's length by which a start may be wrong: more than integration and Newton's method
-leave, and little enough for the first events to put it right."""
+"""Largest accepted error of a start, as a fraction of the leg length: larger than the errors of
+integration and Newton's method, and small enough for the first events to correct it."""
 
 
 def _posture(s: Symbols, x: FullState) -> tuple[Elementwise, tuple, Array, Array, Array, Array]:
-    """Angle, the hub's place and lengths in the labels of the step that begins, the legs' rates,
-    modes and stoppers: loaded feet are on the slope, and the landing foot is the origin."""
+    """Return angle, hub position, lengths, length rates, contact modes and stoppers of a section
+    state.
+
+    Leg labels are those of the starting step. Loaded feet are on the slope, and the landing foot is
+    the origin.
+    """
     n = s.n
     theta = x[0] - s.alpha
     of_legs = (x[4 + i * n : 4 + (i + 1) * n] for i in range(3))
@@ -79,7 +89,7 @@ def _posture(s: Symbols, x: FullState) -> tuple[Elementwise, tuple, Array, Array
 
 
 def _possible(s: Symbols, x: FullState) -> Bool[Array, "..."]:
-    """Whether no foot is below the ground, loaded ones are on it, and no leg is too long."""
+    """Return whether no foot is below the ground, loaded feet are on it, and no leg is too long."""
     theta, (_, z), L, _, contact, _ = _posture(s, x)
     height, near = z - L * directions(s, theta).cos, NEAR * s.L0
     apart = (contact == OFF) | (height <= near)
@@ -87,10 +97,11 @@ def _possible(s: Symbols, x: FullState) -> Bool[Array, "..."]:
 
 
 def opened(s: Symbols, x: FullState) -> tuple[WheelMotion, Stance]:
-    """Motion and stance just before the landing, in the labels of the step that begins.
+    """Return motion and contact state just before the landing, in the leg labels of the starting
+    step.
 
-    The landing foot is the origin; loaded feet are put on the slope, so that every vector near a
-    section state is one. The landing brings sticking ones to rest.
+    The landing foot is the origin. Loaded feet are placed on the slope, so that every vector near a
+    section state is one. The landing brings sticking feet to rest.
     """
     theta, (hub_x, hub_z), L, dL, contact, locked = _posture(s, x)
     dtheta, vx, vz = x[1], x[2], x[3]
@@ -100,8 +111,11 @@ def opened(s: Symbols, x: FullState) -> tuple[WheelMotion, Stance]:
 
 
 def closed(motion: WheelMotion, stance: Stance, tilt: Elementwise | None = None) -> FullState:
-    """The section state of a motion just before the next landing, in the frame of the slope there:
-    of the ground that lies ahead, where that is steeper by `tilt`."""
+    """Return the section state of a motion just before the next landing, in the slope's frame
+    there.
+
+    - `tilt`: by which the ground ahead is steeper, if it is.
+    """
     code = stance.contact + LOCKED * stance.locked
     theta, vx, vz = motion.theta, motion.vx, motion.vz
     if tilt is not None:

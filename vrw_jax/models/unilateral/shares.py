@@ -1,8 +1,8 @@
-"""How slopes move along many directions, by what one of each coordinate and of each column does.
+"""Tangents of the dynamics along many directions, from the responses to unit coordinates.
 
-At a place all of it is linear: a radian of the angle does the same along any direction. A length
-and its rate act on their own leg, the hub and the slots alone, so that legs of which none moves are
-left out, and so are columns.
+At a point everything is linear: a unit of the angle has the same effect in every direction. A
+length and its rate affect only their own leg, the hub and the slots. So legs are skipped if none of
+them moves, and so are input columns.
 """
 
 import operator
@@ -46,7 +46,7 @@ from vrw_jax.numerics import if_any
 from vrw_jax.wheel import PARAMETER_NAMES
 
 FEW = 3
-"""Legs, the first ones, that mostly are all that move: the others are on their stoppers."""
+"""Number of leading legs that usually include all that move: the others are on their stoppers."""
 _LEGS = slice(0, FEW), slice(FEW, None)
 _BY_MASSES = "hub_mass", "leg_mass", "leg_com"
 _BY_SPRINGS = "natural_length", "stiffness", "damping"
@@ -55,31 +55,35 @@ ALIKE = [
     tuple(map(_COLUMNS.index, names))
     for names in (_BY_MASSES, _BY_SPRINGS, ("slope", "gravity"), ("friction",))
 ]
-"""Columns that act in one way; the place of stoppers acts by lengths alone."""
+"""Groups of inputs with the same kind of effect; the stoppers' position acts through lengths
+alone."""
 
 Ends = Callable[[slice], tuple[Array, Array]]
-"""Some coordinates and rates of a direction at a place."""
+"""Function that returns some coordinates and rates of a tangent at a point."""
 
 
 class Share(NamedTuple):
-    """What something does where forces and accelerations stay."""
+    """Response to a unit input, with forces and accelerations fixed."""
 
-    legs: Legs  # to their lengths
+    legs: Legs  # of their lengths
     acts: Acts
     speed: Pair  # of the slots' feet along the slope
     damping: Array  # W
 
 
 class _Metres(NamedTuple):
-    """What a metre of each leg does, or a metre a second."""
+    """Response to a unit length of each leg, or to a unit rate.
 
-    legs: Legs  # to its own length
+    - `slots`: responses of lengths, of feet along e and along u, and of foot speed.
+    """
+
+    legs: Legs  # of its own length
     hub: tuple[Legs, Legs, Legs]
-    slots: tuple[Pair, Pair, Pair, Pair]  # to their lengths, feet along e and u, feet's speed
+    slots: tuple[Pair, Pair, Pair, Pair]
 
 
 class _Lengths(NamedTuple):
-    """What lengths and rates of some legs do along a direction."""
+    """Response to the lengths and rates of some legs along a tangent."""
 
     hub: Vector3
     L: Pair  # the slots'
@@ -88,16 +92,19 @@ class _Lengths(NamedTuple):
 
 
 class _Moving(NamedTuple):
+    """Linearization at one point."""
+
     flow: Flow
     motion: WheelMotion
     stand: Stand
     hub: Hub
     free: Free
     told: Carried
-    still: Stand  # floats of a direction along which nothing moves
+    still: Stand  # floats of the zero tangent
 
     @classmethod
     def at(cls, flow: Flow, motion: WheelMotion) -> "_Moving":
+        """Return the linearization at this motion."""
         stand = flow.stand(motion)
         solved = solved_motion(stand)
         floats = eqx.filter(stand, eqx.is_inexact_array)
@@ -105,7 +112,7 @@ class _Moving(NamedTuple):
         return cls(flow, motion, stand, *solved, still)
 
     def left(self, some: slice) -> Callable[[Stand], tuple[Left, Slots]]:
-        """What some legs do along a direction, and the slots that these are in."""
+        """Return the residual tangent of some legs along a tangent, and the slots of these legs."""
         rest = eqx.filter(self.stand, eqx.is_inexact_array, inverse=True)
         stand, legs = _part_of(self.stand, some), Legwise(*(row[some] for row in self.hub.legs))
         hub = self.hub._replace(legs=legs, released=self.hub.released[some])
@@ -119,16 +126,19 @@ class _Moving(NamedTuple):
         return lambda way: (left(way), stand.slots)
 
     def speed(self, way: WheelMotion) -> Pair:
+        """Return the tangent of the foot speeds."""
         s, slots = self.flow.s, self.flow.slots
         speeds = lambda motion: foot_velocity(motion, slots, posture_of(s, motion, slots)).x
         return jax.jvp(speeds, (self.motion,), (way,))[1]
 
     def along(self, motion: WheelMotion, some: Callable[[Stand], tuple[Left, Slots]]) -> tuple:
-        """What legs do along a motion, their slots, and the feet's speed."""
+        """Return the residual tangent of legs along a motion tangent, their slots, and the feet's
+        speed.
+        """
         return *some(self.still._replace(motion=motion)), self.speed(motion)
 
     def metres(self, some: slice) -> tuple[_Metres, _Metres]:
-        """Of some legs' lengths, and of their rates."""
+        """Return the responses to some legs' lengths, and to their rates."""
         legs = self.left(some)
 
         def of(name: str) -> _Metres:
@@ -142,7 +152,9 @@ class _Moving(NamedTuple):
         return of("L"), of("dL")
 
     def answered(self) -> Callable[[Free], tuple[Vector3, Pair, Pair]]:
-        """How the hub's acceleration, pulls and tangential forces move by what is asked."""
+        """Return the tangent map from free motion to hub acceleration, pulls and tangential
+        forces.
+        """
         s, friction = self.stand.s, self.stand.friction
         contact, held = self.stand.contact, self.stand.held
 
@@ -154,6 +166,7 @@ class _Moving(NamedTuple):
 
 
 def _part_of(stand: Stand, some: slice) -> Stand:
+    """Return the configuration restricted to some legs."""
     motion, slots = stand.motion, stand.slots
     return stand._replace(
         motion=motion._replace(L=motion.L[some], dL=motion.dL[some]),
@@ -163,21 +176,26 @@ def _part_of(stand: Stand, some: slice) -> Stand:
 
 
 class Shares(NamedTuple):
-    """All that directions share at a place."""
+    """Quantities at a point that all tangents share.
+
+    - `whole_residual`: residual of all legs along any tangent;
+    - `length_responses`: those of the first legs, and of the others;
+    - `slot_responses`: the sum of these for the slots.
+    """
 
     moving: _Moving
     now: Forces
     answered: Callable[[Free], tuple[Vector3, Pair, Pair]]
-    whole: Callable[[Stand], tuple[Left, Slots]]  # along any direction
-    angle: tuple[Share, Share]  # of the angle, and of its rate
-    metres: tuple[tuple[_Metres, _Metres], tuple[_Metres, _Metres]]  # of few legs, of the others
-    slots: tuple[tuple[Pair, Pair, Pair, Pair], ...]  # what these do there, in all
-    damping: Legs  # W, of a metre a second of each leg's rate
-    slid: Callable[[Pair, Pair], Array]  # by speeds and tangential forces: energy lost, slip
+    whole: Callable[[Stand], tuple[Left, Slots]]
+    angle: tuple[Share, Share]  # to the angle, and to its rate
+    metres: tuple[tuple[_Metres, _Metres], tuple[_Metres, _Metres]]
+    slots: tuple[tuple[Pair, Pair, Pair, Pair], ...]
+    damping: Legs  # W, for a unit rate of each leg
+    slid: Callable[[Pair, Pair], Array]  # tangent of sliding loss and slip
 
     @classmethod
     def at(cls, flow: Flow, motion: WheelMotion, more: Array) -> "Shares":
-        """There; `more` than few legs move."""
+        """Return the basis at this motion; `has_more_moving`: more than the first legs move."""
         moving, now = _Moving.at(flow, motion), forces(flow, motion)
         whole = moving.left(slice(None))
         few, n = moving.metres(_LEGS[0]), len(motion.L)
@@ -208,7 +226,7 @@ class Shares(NamedTuple):
         )
 
     def by_columns(self, flow_at: FlowAt, columns: Array, way: Array) -> Share:
-        """What columns do along a direction of theirs."""
+        """Return the response to a tangent of the input columns."""
         moving, none = self.moving, self.nothing()
 
         def acting(columns: Array) -> tuple[Stand, Array]:
@@ -232,10 +250,11 @@ class Shares(NamedTuple):
         return total
 
     def nothing(self) -> Share:
+        """Return the zero response."""
         return jax.tree.map(jnp.zeros_like, self.angle[0])
 
     def along(self, ends: Ends, column: Share, more: Array) -> Array:
-        """How accelerations and, where wanted, what is summed up move along a direction."""
+        """Return the tangent of the accelerations and, if requested, of the accumulators."""
         q, v = ends(slice(0, 3 + FEW))
         theta, dtheta, few = q[2], v[2], (q[3:], v[3:])
         others = lambda: ends(slice(3 + FEW, None))

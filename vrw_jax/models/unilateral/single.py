@@ -1,9 +1,9 @@
-"""A single wheel on real ground by the machine code of lanes, within programs of JAX.
+"""One wheel with unilateral contact, by the machine code of the batch kernel within JAX programs.
 
-`told_by_lanes` is a function of one wheel that `jax.vmap` maps onto lanes; for derivatives each
-direction is a lane of its own beside the wheel's motion. For samples of a step a program of JAX
-goes from event to event and notes where each stretch begins; then every stretch is a lane that is
-walked again, sample by sample.
+`build_contact_step_function` returns a function of one wheel that `jax.vmap` maps onto lanes. For
+derivatives, each tangent is a lane of its own beside the wheel's motion. For samples of a step, a
+JAX program advances from event to event and records the start of each interval. Then every interval
+becomes a lane that is integrated again, sample by sample.
 """
 
 import functools
@@ -39,32 +39,38 @@ from vrw_jax.wheel import parameters_of
 
 
 class Setting(NamedTuple):
+    """Static configuration of a step."""
+
     structure: Any  # of (wheel, params, x, options), whose leaves are the arrays
     detailed: bool
 
     def given(self, leaves: tuple[Array, ...]) -> tuple[Array, Array, Any]:
-        """Columns and section states of lanes, and the other choices."""
+        """Return columns and section states of lanes, and the other settings."""
         wheel, params, x, options = jax.tree.unflatten(self.structure, leaves)
         return jnp.stack([*parameters_of(params), wheel.friction]), x, (wheel, params, options)
 
     def walk(self, others: Any) -> Walk:
+        """Return the batch settings of a walk of one step."""
         wheel, params, options = others
         tableau = explicit_tableau(options.solver)
-        assert tableau is not None  # the caller looked
+        assert tableau is not None  # checked by the caller
         rules = wheel.max_events, wheel.one_sided, wheel.by_paper, self.detailed
         return Walk(params.n_legs, 1, *rules, options, tableau)
 
     def like(self, *leaves: Array) -> tuple:
+        """Return arrays in the structure of `compute_outputs`."""
         params = self.given(leaves)[2][1]
         return _parted(told_like(params.n_legs, leaves[0].dtype, self.detailed))
 
     def told(self, *leaves: Array) -> tuple:
-        """Of lanes, which the leaves have on their last axis."""
+        """Return the result over lanes, which the leaves have on their last axis."""
         columns, x, others = self.given(leaves)
         return _parted(walked(self.walk(others), columns, x))
 
     def told_along(self, leaves: tuple[Array, ...], ways: tuple[Array, ...]) -> tuple:
-        """How its floats move along a direction of each lane, the floats, and the rest."""
+        """Return the tangents of the result's floats for one tangent of each lane, the floats, and
+        the rest.
+        """
         columns, x, others = self.given(leaves)
         d_columns, d_x = (rows[None] for rows in self.given(ways)[:2])
         one = jnp.ones_like(columns[0], jnp.int32)
@@ -74,7 +80,7 @@ class Setting(NamedTuple):
 
 
 def _parted(walk: Walked) -> tuple[Any, Any]:
-    """Floats of a step and the rest: of all that it tells, or of an `Advance`'s four."""
+    """Return floats and other parts of a step: of the full result, or of the four minimal ones."""
     step = walk.told
     if isinstance(step, Lean):
         step = step.section_state, step.durations, walk.outcome, walk.tried
@@ -82,14 +88,19 @@ def _parted(walk: Walked) -> tuple[Any, Any]:
 
 
 def told_by_lanes(structure: Any, detailed: bool) -> Forward:
-    """The step over the leaves of (wheel, params, x, options), as `any_mode` takes it."""
+    """Return the step over the leaves of (wheel, params, x, options), as a forward rule for any AD
+    mode.
+    """
     setting = Setting(structure, detailed)
     key = "step on real ground", str(structure), detailed
     return one_wheel(lane_function(setting.told, setting.like, key))
 
 
 def moved_by_lanes(structure: Any, detailed: bool, moved: tuple[int, ...]) -> Forward:
-    """(Jacobian by the leaves `moved`, floats) and the other outputs of `told_by_lanes`."""
+    """Return the Jacobian of `build_contact_step_function`.
+
+    It gives (Jacobian with respect to the leaves at `input_indices`, floats) and the other outputs.
+    """
     setting = Setting(structure, detailed)
 
     def like(leaves: tuple[Array, ...], _ways: tuple[Array, ...]) -> tuple:
@@ -116,22 +127,22 @@ def moved_by_lanes(structure: Any, detailed: bool, moved: tuple[int, ...]) -> Fo
 
 
 class Log(NamedTuple):
-    """Where each stretch of a step between two events begins, and how long it lasts."""
+    """Start and duration of each interval of a step between two events."""
 
-    state: Array  # (stretches, dim), see `motion.State`
-    contact: Array  # (stretches, legs)
+    state: Array  # (intervals, dim), see `motion.PackedState`
+    contact: Array  # (intervals, legs)
     locked: Array
     duration: Array  # s
 
 
 class Sampled(NamedTuple):
-    """Stretches at equal times, both ends included."""
+    """Intervals at equal times, both ends included."""
 
     log: Log
     ends: Lean
     outcome: Array
-    state: Array  # (stretches, samples, dim)
-    tangential: Array  # forces on every foot, N, (stretches, samples, legs)
+    state: Array  # (intervals, samples, dim)
+    tangential: Array  # on every foot, N, (intervals, samples, legs)
     normal: Array
 
 
@@ -144,8 +155,11 @@ def samples(
     options: Options,
     tableau: Tableau,
 ) -> Array:
-    """Of a stretch, at equal times, ends included: coordinates, rates, what is summed up, beginning
-    with `told`, normal and tangential forces of the slots; (samples, ., lanes)."""
+    """Return one interval at equal times, ends included, with axes (sample, ., lanes).
+
+    The rows are coordinates, rates, accumulators starting at `accumulated`, and normal and
+    tangential forces of the slots.
+    """
     begin = set_off(flow, motion, options.first_step)
 
     def take(now: tuple[Place, Array], length: Array) -> tuple[tuple[Place, Array], Array]:
@@ -163,7 +177,10 @@ def samples(
 
 @functools.cache
 def sampled_by_lanes(structure: Any, n_samples: int) -> Callable[..., Sampled]:
-    """The motion of a step, over the leaves of (wheel, params, x, options): without derivatives."""
+    """Return the sampled motion of a step over the leaves of (wheel, params, x, options).
+
+    It has no derivatives.
+    """
     setting = Setting(structure, True)
     key = str(structure)
 
@@ -225,7 +242,9 @@ def sampled_by_lanes(structure: Any, n_samples: int) -> Callable[..., Sampled]:
 
 
 def _spread(n: int, log: Log, rows: Array) -> tuple[Array, Array, Array]:
-    """Rows of `samples` as states, and tangential and normal forces of all legs."""
+    """Return rows of `sample_interval` as packed states, and tangential and normal forces of all
+    legs.
+    """
     n_samples, size = rows.shape[1], 3 + n
     clock = jnp.linspace(0.0, 1.0, n_samples) * log.duration[:, None]
     q, v, tally, forces = jnp.split(rows, (size, 2 * size, 2 * size + 3), -1)

@@ -1,4 +1,4 @@
-"""The wheel on real ground: one-sided contacts with Coulomb friction, any order of events."""
+"""Unilateral model: one-sided contacts with Coulomb friction, in any order of events."""
 
 import dataclasses
 import functools
@@ -80,36 +80,36 @@ from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, WheelParams, frict
 from vrw_jax.wording import chosen, reals, whole
 
 BILATERAL, ONE_SIDED = "bilateral", "one-sided"
-"""What stoppers do to legs in the air: hold whatever it takes, or push alone."""
+"""Effect of stoppers on legs in the air: they hold with any force, or only push."""
 LIMIT, PAPER = "limit", "paper"
-"""What infinite friction means: the limit of large friction, or the paper's rule (A1)-(A4)."""
+"""Meaning of infinite friction: the limit of large friction, or the paper's rule (A1)-(A4)."""
 
 
 class UnilateralTrajectory(eqx.Module):
     """The motion of one step between its events. Axes: phase, sample.
 
-    A phase that did not happen has duration 0. The origin is the place of the opening landing.
+    A phase that did not happen has duration 0. The origin is the position of the opening landing.
     """
 
     time: Float[Array, "phases n"]  # from the landing, s
-    state: Float[Array, "phases n dim"]  # see unilateral_motion.unpack
+    state: Float[Array, "phases n dim"]  # see `motion.unpack_state`
     contact: Int[Array, "phases legs"]  # mode of every foot
     locked: Bool[Array, "phases legs"]  # on the stopper
     tangential: Float[Array, "phases n legs"]  # force on every foot, N
     normal: Float[Array, "phases n legs"]
     duration: Float[Array, " phases"]  # s
-    section_state: FullState  # after it, and what else the step tells
+    section_state: FullState  # after the step
     step_length: Scalar
     outcome: Int[Array, ""]
-    served: dict[str, Array] = eqx.field(default_factory=dict)  # see `AbstractStep.served`
+    served: dict[str, Array] = eqx.field(default_factory=dict)  # see `AbstractStep`
 
 
 class _Walked(NamedTuple):
-    """Where a step stands between two of its events."""
+    """State of the event loop between two events of a step."""
 
     state: State
     stance: Stance
-    guard: Int[Array, ""]  # that ended the last phase
+    guard: Int[Array, ""]  # of the last event
     outcome: Int[Array, ""]
     running: Bool[Array, ""]
     ledger: Ledger
@@ -118,14 +118,17 @@ class _Walked(NamedTuple):
 
 
 class Uneven(NamedTuple):
-    """Ground that varies: what one step needs beside the ground of its own landing."""
+    """Uneven ground: quantities of a step besides the ground of its own landing."""
 
     friction: Scalar  # of the feet that landed before
     tilt: Scalar  # by which the ground ahead is steeper, rad
 
 
 def _restitution_of(value: Any) -> Array | None:
-    """Newton's coefficient; None stands for 0."""
+    """Return Newton's coefficient of restitution; None means 0.
+
+    Raises `ValueError` for a number outside [0, 1].
+    """
     if value is None or (isinstance(value, float | int) and value == 0):
         return None
     restitution = reals("restitution", value)
@@ -137,18 +140,19 @@ def _restitution_of(value: Any) -> Array | None:
 
 
 class UnilateralWheel(AbstractWheel):
-    """Feet on the ground push and slide by Coulomb's law; nothing has a fixed role.
+    """Feet push on the ground and slide by Coulomb's law; no leg has a fixed role.
 
     - `friction`: coefficient of the ground, `inf` for feet that never slide;
-    - `max_events`: of one step; after a quarter of them, 100 at least, ever more is at rest;
-    - `stoppers`: "bilateral", a leg in the air that has met its stopper stays on it until its foot
-      is loaded; "one-sided", it leaves as soon as the stopper would have to pull;
-    - `restitution`: a foot that strikes comes back at so many times its speed, as far as energy
-      allows; None, as 0, is a smaller program;
-    - `infinite`: what infinite friction is: the limit of large friction, or with "paper" the rule
-      of the paper, (A1) to (A4), continued to where it stops;
-    - `uneven`: what differs between footholds, which `vrw.walk` sets of slopes and friction over
-      steps.
+    - `max_events`: largest number of events of one step; after a quarter of them (at least 100),
+      the rest speed grows with each event;
+    - `stoppers`: with "bilateral", a leg in the air that has met its stopper stays on it until its
+      foot is loaded; with "one-sided", it leaves as soon as the stopper would have to pull;
+    - `restitution`: ratio of a striking foot's speed after to its speed before, as far as energy
+      allows; None has the effect of 0 and compiles to a smaller program;
+    - `infinite_friction_rule`: meaning of infinite friction: the limit of large friction, or with
+      "paper" the rule of the paper, (A1) to (A4), continued to where it stops;
+    - `uneven_ground`: what differs between footholds; `vrw.walk` sets it from slopes and friction
+      over steps.
 
     Examples:
         >>> wheel = vrw.UnilateralWheel(friction=0.7)
@@ -187,16 +191,16 @@ class UnilateralWheel(AbstractWheel):
 
     @property
     def one_sided(self) -> bool:
-        """Whether stoppers of legs in the air may let go."""
+        """Whether stoppers of legs in the air may release them."""
         return self.stoppers == ONE_SIDED
 
     @property
     def by_paper(self) -> bool:
-        """Whether infinite friction is the paper's rule."""
+        """Whether infinite friction means the paper's rule."""
         return self.infinite == PAPER
 
     def start(self, params: WheelParams) -> FullState:
-        """Close to the paper's gait of Table 1."""
+        """Return a start close to the paper's gait of Table 1."""
         return embedded(params.symbols(), jnp.asarray(PAPER_START, params.damping.dtype))
 
     def section_size(self, params: WheelParams) -> int:
@@ -206,7 +210,7 @@ class UnilateralWheel(AbstractWheel):
         return section_size(params.n_legs) - params.n_legs
 
     def full_section(self, params: WheelParams, x: Array) -> FullState:
-        """The full section state of the paper's (theta-, dtheta-, dL1-): Leg 1 planted."""
+        """Return the full section state of the paper's (theta-, dtheta-, dL1-): Leg 1 planted."""
         return _embedded(params, x) if x.shape == (3,) else x
 
     def over_steps(self, params: WheelParams, n_steps: int) -> GroundOfStep | None:
@@ -236,20 +240,25 @@ class UnilateralWheel(AbstractWheel):
     def _taken(
         self, params: WheelParams, x: FullState, options: Options, detailed: bool
     ) -> tuple[Any, str]:
-        """What is told of a step, and the engine that took it."""
+        """Return the outputs of a step, and the engine that took it."""
         (leaves, structure), engine = self._leaves(params, x, options), self._engine(options)
         return eqx.combine(*_compiled(structure, detailed, engine)(*leaves)), engine
 
     def _leaves(self, params: WheelParams, x: FullState, options: Options) -> tuple[list, Any]:
-        # Not by `replace`: friction was checked, and may be traced by now.
+        """Return the leaves and the tree structure of (wheel, params, x, options)."""
+        # Not by `replace`: friction is already validated and may be traced.
         model = eqx.tree_at(lambda wheel: wheel.friction, self, self.friction.astype(x.dtype))
         return jax.tree.flatten((model, params, x, options))
 
     def _engine(self, options: Options) -> str:
+        """Return the name of the engine for these options."""
         return "lanes" if self._like_lanes(options) and lanes_can(options) else "diffrax"
 
     def _like_lanes(self, options: Options) -> bool:
-        """Whether the ground is such as lanes know."""
+        """Return whether the batch kernel supports this ground.
+
+        Raises `ValueError` if the options require that engine and it does not.
+        """
         plain = self.restitution is None and self.uneven is None
         if options.engine == "lanes" and not plain:
             raise ValueError(
@@ -284,6 +293,7 @@ class UnilateralWheel(AbstractWheel):
     def _sampled_by_diffrax(
         self, params: WheelParams, x: FullState, options: Options, n_samples: int
     ) -> Sampled:
+        """Return the sampled step, integrated by diffrax."""
         walked = _walk(self, params, x, options, detailed=False, logged=True)
         log, outcome = walked.log, walked.outcome
         assert log is not None
@@ -310,7 +320,7 @@ class UnilateralWheel(AbstractWheel):
 
 
 def _rough(wheel: UnilateralWheel, friction: Elementwise) -> Roughness:
-    """The same of all feet, or of the one that landed last and of the others."""
+    """Return the friction of all feet, or that of the foot that landed last and of the others."""
     friction = as_ruled(friction, wheel.by_paper)
     if wheel.uneven is None:
         return friction
@@ -325,6 +335,7 @@ def _walk(
     detailed: bool,
     logged: bool = False,
 ) -> _Walked:
+    """Return the event loop's state at the end of a step, integrated by diffrax."""
     even = wheel.uneven is None
     good, params, friction, x = made_sound(params, wheel.friction, x, even)
     s, n = params.symbols(), params.n_legs
@@ -352,6 +363,7 @@ def _walk(
 
 
 def _go_on(law: Law, place: Guards, max_events: int, options: Options, now: _Walked) -> _Walked:
+    """Return the state at the next event."""
     motion, tally = unpack(now.state)
     at = now.guard, now.ledger.events, max_events
     change, event, outcome = past(law, place, motion, now.stance, *at)
@@ -366,7 +378,8 @@ def _go_on(law: Law, place: Guards, max_events: int, options: Options, now: _Wal
     ledger = passed(ledger, change.stance, end.duration, end.solver_steps)
     at_ends = forces(flow, change.motion), forces(flow, unpack(end.state)[0])
     before, after = (lax.stop_gradient(at.answer.regular) for at in at_ends)
-    drawn = at_singularity(before, after, options)  # forces change sign there without passing zero
+    # Forces change sign at the singularity without passing through zero.
+    drawn = at_singularity(before, after, options)
     lost = jnp.where(end.timed_out, Outcome.NO_TOUCHDOWN_IN_TIME, Outcome.SOLVER_GAVE_UP)
     lost = jnp.where(sound, jnp.where(drawn, Outcome.FRICTION_PARADOX, lost), outcome)
     found = sound & (end.guard >= 0) & ~drawn
@@ -397,7 +410,9 @@ _embedded = jax.jit(lambda params, x: embedded(params.symbols(), x))
 
 @functools.cache
 def _compiled(structure: Any, detailed: bool, engine: str) -> Forward:
-    """A step over the leaves of (wheel, params, x, options), differentiable in any mode."""
+    """Return the step over the leaves of (wheel, params, x, options), differentiable in any
+    mode.
+    """
 
     def walk(tighten: bool, *leaves: Array) -> tuple:
         wheel, params, x, options = jax.tree.unflatten(structure, leaves)
@@ -415,6 +430,7 @@ def _compiled(structure: Any, detailed: bool, engine: str) -> Forward:
 
 
 def _lean(walked: _Walked, tilt: Elementwise | None) -> tuple:
+    """Return the minimal result: section state, durations, outcome, solver steps."""
     ledger = walked.ledger
     stands = unpack(walked.state)[0], walked.stance
     section = section_reached(*stands, walked.outcome, tilt)
@@ -422,6 +438,7 @@ def _lean(walked: _Walked, tilt: Elementwise | None) -> tuple:
 
 
 def _full(walked: _Walked, engine: str, tilt: Elementwise | None) -> UnilateralStep:
+    """Return the full result."""
     motion, tally = unpack(walked.state)
     assert walked.details is not None
     told = walked.ledger, walked.details, walked.outcome
