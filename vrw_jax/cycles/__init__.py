@@ -1,4 +1,4 @@
-"""Gaits that repeat: found, checked and differentiated, each rung by its own means."""
+"""Limit cycles: finders, checks and derivatives for each model."""
 
 from vrw_jax.cycles.attracting import (
     NEAR,

@@ -1,4 +1,5 @@
-"""Which gaits of a wheel attract: walks from a stated set of starts, and Newton's method on."""
+"""Attracting gaits of a wheel, found by walks from a stated set of starts and refined by Newton's
+method."""
 
 import math
 from concurrent.futures import ThreadPoolExecutor
@@ -14,34 +15,39 @@ from vrw_jax.numerics import Options, joined, taken
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, wheel_of
 
 ROUNDS = (8, 12, 30, 50, 100)
-"""Steps towards a gait, after each of which walks that have settled stop, and like ones are one."""
+"""Numbers of steps towards a gait. After each round, settled walks stop and walks to the same gait
+are merged."""
 
 SETTLED = 1e-3
-"""By how much a walk that has settled may miss its own state one period ago."""
+"""Largest difference between a settled walk's state and its state one period ago, rad, rad/s and
+m/s."""
 
 STARTS = ((1.0, 0.45), (1.0, 0.7), (1.0, 1.0), (0.5, 1.0), (0.0, 1.0))
-"""Where walks start: how much of its static contraction Leg 1 has at touchdown, and the rate of the
-hub as a share of the rigid rolling gait's. Of 4,800 random wheels with 5 to 16 legs 1,240 walk from
-one of these or of 78 on a grid, 1,175 from these (ranges: experiments/gaits/off_the_box.py)."""
+"""Starts of walks: the share of Leg 1's static contraction at touchdown, and the rate of the hub as
+a share of the rigid rolling gait's rate. Of 4,800 random wheels with 5 to 16 legs, 1,240 walk from
+one of these starts or from a grid of 78. From these starts alone, 1,175 walk (ranges:
+experiments/gaits/off_the_box.py)."""
 
 FURTHER = ((0.002, 0.4), (0.002, 0.3), (0.002, 0.5), (0.5, 1.1), (0.2, 0.4), (0.2, 1.1), (0.2, 0.8),
            (0.35, 1.0), (0.35, 1.1))  # fmt: skip
-"""Where walks on the paper's rung start if none from STARTS came to a gait: Leg 1's angle to the
-slope's normal at touchdown as a share of that between legs, and the rate as above. They reach the
-other 65: with many legs gaits roll from double support into double support, the angle near 0."""
+"""Starts of walks of the paper's model that are tried if none of WALK_STARTS leads to a gait. The
+first number is Leg 1's angle to the slope's normal at touchdown as a share of the angle between
+legs. The second number is the rate, as in WALK_STARTS. These starts reach the other 65 wheels. With
+many legs, gaits roll from double support into double support, with an angle near 0."""
 
 NEAR = 0.1
-"""The same of a walk that has not, but is a start: rad, rad/s, m/s."""
+"""Largest period defect of an unsettled walk that is used as a start, rad, rad/s and m/s."""
 
 APART, SAME = 0.02, 1e-5
-"""Distance above which walks have come to different gaits, and below which gaits are one."""
+"""Distance above which walks have reached different gaits, and distance below which two gaits are
+the same one."""
 
 TOLERANCE_TOWARDS = 1e-8
-"""Of the steps towards a gait, by Tsit5, whatever those of the gait itself."""
+"""Tolerance of the Tsit5 steps towards a gait, independent of the tolerance of the gait itself."""
 
 
 def starts_of(params: WheelParams) -> np.ndarray:
-    """STARTS of each wheel, (start, lane, 3)."""
+    """Return WALK_STARTS of each wheel, section states of shape (start, wheel, 3)."""
     p, sin, cos = _in_numpy(params), math.sin(params.leg_angle), math.cos(params.leg_angle)
     weight = (p.hub_mass + params.n_legs * p.leg_mass) * p.gravity * np.cos(p.slope)
     static = (p.natural_length - weight / p.stiffness) / p.locked_length
@@ -51,18 +57,19 @@ def starts_of(params: WheelParams) -> np.ndarray:
 
 
 def further_starts_of(params: WheelParams) -> np.ndarray:
-    """FURTHER of each wheel, (start, lane, 3)."""
+    """Return FALLBACK_STARTS of each wheel, section states of shape (start, wheel, 3)."""
     thetas = [np.full(np.shape(params.slope), a * params.leg_angle) for a, _ in FURTHER]
     return _at(params, thetas, [share for _, share in FURTHER])
 
 
 def _in_numpy(params: WheelParams) -> Any:
-    """Its numbers, for which JAX would compile each operation."""
+    """Return the parameters as numpy arrays, because JAX would compile each operation on them."""
     return SimpleNamespace(**{name: np.asarray(getattr(params, name)) for name in PARAMETER_NAMES})
 
 
 def _at(params: WheelParams, thetas: list[np.ndarray], shares: list[float]) -> np.ndarray:
-    """Section states with these angles and rates, as shares of the rigid rolling gait's."""
+    """Return section states with these angles and with rates as shares of the rigid rolling gait's
+    rate."""
     p, alpha = _in_numpy(params), params.leg_angle
     stiff = np.sqrt(4.0 * p.gravity / p.locked_length * np.sin(0.5 * alpha) * np.sin(p.slope))
     rolling, fall = stiff / np.sin(alpha), -0.1 * np.sqrt(p.gravity * p.locked_length) / 3.0
@@ -73,8 +80,11 @@ def _at(params: WheelParams, thetas: list[np.ndarray], shares: list[float]) -> n
 def _walked(
     finder: Any, columns: np.ndarray, x: np.ndarray, n_steps: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of each lane where `n_steps` lead, whether it still walks there, and by how much it misses
-    that state a period later; infinite where a walk ended before."""
+    """Walk `n_steps` from each state and measure the defect of one more period.
+
+    Return the states after the walk, whether each walk still continues, and the largest change of
+    the state over the next period. The defect is infinite where a walk ended early.
+    """
     loose = Options(solver="Tsit5", rtol=TOLERANCE_TOWARDS, atol=TOLERANCE_TOWARDS)
     given = finder.model, loose, finder.n_legs
     states, _, outcome, *_ = walk_lanes(columns, x, n_steps, *given)
@@ -87,14 +97,14 @@ def _walked(
 def gaits_attracting(
     finder: Any, values: Any, n_starts: int = len(STARTS)
 ) -> tuple[np.ndarray, Any]:
-    """Of wheels the gaits that attract: whose each is, in order, and the gaits, slowest first.
+    """Return the attracting gaits of each wheel, slowest first.
 
-    Of a wheel without any one stands there that says so.
+    A wheel without an attracting gait gets one entry whose outcome is a failure.
 
     Args:
-        finder: of gaits on real ground.
-        values: of each wheel, (wheels, n_values); see `AbstractWheel.values`.
-        n_starts: how many of STARTS, slow ones first.
+        finder: finds gaits with unilateral contact.
+        values: of each wheel, (wheels, n_values); see `AbstractWheel.parameter_values`.
+        n_starts: number of WALK_STARTS to use, slow ones first.
 
     Returns:
         Index of the wheel of each gait, (gaits,), and a cycle with that leading axis.
@@ -102,14 +112,14 @@ def gaits_attracting(
     wheels = len(values)
     owner, x = _walked_to(finder, np.asarray(values), n_starts)
     found = finder.near(np.asarray(values)[owner], x)
-    # In numpy, here and below: JAX compiles each operation for every number of wheels.
+    # Numpy is used because JAX compiles each operation for every number of wheels.
     attracts = np.abs(np.linalg.eigvals(found.matrix)).max(-1) < 1.0
     good = (np.asarray(found.outcome) == Outcome.STEPPED) & attracts
-    states = np.asarray(found.steps.section_state)  # every step's
+    states = np.asarray(found.steps.section_state)  # of every step
     of_all = lambda x: np.asarray(x).reshape(len(owner), -1).sum(-1)
     speed = of_all(found.step_length) / np.where(good, of_all(found.durations), 1.0)
     own = states[:, :, : _numbers(finder)]
-    good &= ~(np.abs(own[:, :-1] - own[:, -1:]).max(-1) < SAME).any(1)  # after fewer steps
+    good &= ~(np.abs(own[:, :-1] - own[:, -1:]).max(-1) < SAME).any(1)  # shorter period
     kept: list[int] = []
     for places in np.split(np.arange(len(owner)), slowest(owner, wheels)[1:]):
         first = len(kept)
@@ -122,9 +132,10 @@ def gaits_attracting(
 
 
 def slow_gaits(finder: Any, values: Any) -> Any:
-    """The gait that a slow start walks to, wheel by wheel; else the slowest that any comes to.
+    """Return for each wheel the gait that a slow start reaches, else the slowest gait that any
+    start reaches.
 
-    Of 1,200 random wheels it is the slowest that attracts of each.
+    For 1,200 random wheels it is the slowest attracting gait of each.
     """
     values = np.asarray(values)
     _, gaits = gaits_attracting(finder, values, 1)
@@ -142,7 +153,8 @@ def slowest(owner: np.ndarray, wheels: int) -> np.ndarray:
 
 
 def _none_where(lost: np.ndarray, cycle: Any) -> Any:
-    """No gait there: what repeats does so sooner, or does not attract, or nothing does."""
+    """Mark the cycles where `is_missing` as not found: they repeat sooner, do not attract, or do
+    not exist."""
     fits = lambda leaf: lost.reshape(-1, *[1] * (leaf.ndim - 1))
     none = jax.tree.map(lambda leaf: np.where(fits(leaf), np.zeros_like(leaf), leaf), cycle)
     code = np.where(cycle.outcome == Outcome.STEPPED, Outcome.NO_CYCLE_FOUND, cycle.outcome)
@@ -156,8 +168,10 @@ def _numbers(finder: Any) -> int:
 
 
 def _walked_to(finder: Any, values: np.ndarray, n_starts: int) -> tuple[np.ndarray, np.ndarray]:
-    """Where walks have come to that differ: whose, in order, and section states; one of each wheel
-    at least. The walk that repeats best stands for its like.
+    """Walk from the starts and return the distinct end states.
+
+    Return the index of the wheel of each state, in order, and section states. Each wheel has at
+    least one state. Of equivalent walks, the one with the smallest period defect is returned.
     """
     rows = jax.device_put(list(values.T[: len(PARAMETER_NAMES)]))
     starts = starts_of(wheel_of(tuple(rows), finder.n_legs))[:n_starts]
@@ -176,17 +190,20 @@ def _walked_to(finder: Any, values: np.ndarray, n_starts: int) -> tuple[np.ndarr
             if not len(open_):
                 break
     chosen = ~_like(x[:, :m], missed, n, NEAR) & (missed < NEAR)
-    chosen[np.setdiff1d(np.arange(n), owner[chosen])] = True  # the first start of who has none
+    chosen[np.setdiff1d(np.arange(n), owner[chosen])] = True  # else the first start
     some = np.flatnonzero(chosen)
     some = some[np.argsort(owner[some], kind="stable")]
     return owner[some], np.where(walking[some, None], x[some], begun[some])
 
 
 def _like(x: np.ndarray, missed: np.ndarray, wheels: int, settled: float) -> np.ndarray:
-    """Walks that have come to where another of the same wheel is that repeats better: within APART,
-    or what they themselves may still miss where that one has settled.
+    """Return which walks reach the same state as another walk of the same wheel with a smaller
+    defect.
 
-    All have wheels on their last axis but one of numbers, starts before.
+    Two states are the same if they are within MERGE_DISTANCE. If the other walk has settled, the
+    limit is the walk's own remaining defect if that is larger. The wheels are the last axis of all
+    arrays (in `x`, the last but one, before the coordinates), and the starts are the axis before
+    it.
     """
     x, missed = x.reshape(-1, wheels, x.shape[-1]), missed.reshape(-1, wheels)
     place = np.arange(len(x))[:, None]

@@ -1,4 +1,4 @@
-"""Gaits of the paper's wheel: one algebraic system for the cycle, one step as a check."""
+"""Gaits of the paper's model: one algebraic system for the cycle, and one step as a check."""
 
 import dataclasses
 from concurrent.futures import ThreadPoolExecutor
@@ -38,7 +38,7 @@ from vrw_jax.wheel import PARAMETER_NAMES, WheelParams, parameters_of, transitio
 
 
 class CollocationFinder(AbstractGaitFinder):
-    """Finds limit cycles without a start; `period_n` counts for `cycle` alone."""
+    """Finder of limit cycles that needs no start. `period_n` applies to `find_cycle` alone."""
 
     model: ViscoelasticWheel
     n_legs: int = eqx.field(static=True)
@@ -75,10 +75,10 @@ class CollocationFinder(AbstractGaitFinder):
 
     @classmethod
     def read(cls, name: str, cycle: AbstractCycle, step: AbstractStep) -> Array:
-        """A measure of a gait by name.
+        """Return a measure of a gait by name.
 
-        The clearance in SLS-I is told as if a foot that scuffs at take-off rose: it would jump
-        there otherwise. Whoever reads it must look at `takeoff_acceleration` too.
+        If the foot scuffs at take-off, the clearance in SLS-I is that in SLS-II, because it would
+        jump otherwise. Callers must check `takeoff_acceleration` too.
         """
         value = cycle.measure(name) if name in cls.of_cycle else step.measures()[name]
         if name == "clearance_sls1":
@@ -96,13 +96,14 @@ class CollocationFinder(AbstractGaitFinder):
         return dataclasses.replace(solved(params, self.problem, guess), model=self.model)
 
     def after(self, params: WheelParams, x: SectionState) -> Located:
-        """A start from where a walk is: the next `period_n` steps of it."""
+        """Return a start of the search: the next `period_n` steps of a walk from section
+        state `x`."""
         walked = sampled_walk(self.model, params, x, self.period_n)
         return guess_along(self.problem, params, walked)
 
     @eqx.filter_jit
     def counted_from(self, step: int, params: WheelParams, located: Located) -> Located:
-        """The same cycle, counted from another of its steps."""
+        """Return the same cycle with another of its steps as the first one."""
         before = located.ends[step - 1]
         landing = transitions.land(params.symbols(), before[0], *before[2:])
         solution, happens, ends = jax.tree.map(
@@ -114,7 +115,7 @@ class CollocationFinder(AbstractGaitFinder):
         )
 
     def on_mesh(self, problem: Problem, located: Located) -> Located:
-        """A start from what was located on the mesh of `problem`."""
+        """Return a start on the mesh of `system` from a solution on this finder's mesh."""
         solution = on_mesh(problem, self.problem, located.solution)
         return located._replace(solution=solution)
 
@@ -154,7 +155,8 @@ class CollocationFinder(AbstractGaitFinder):
 def cycle_and_columns(
     problem: Problem, values: Array, guess: Located
 ) -> tuple[LimitCycle, LimitCycle]:
-    """The cycle near `guess`, and its derivatives by all parameters as a leading axis."""
+    """Return the cycle near `guess`, and its derivatives with respect to all parameters as a
+    leading axis."""
 
     find = lambda values: solved(wheel_of(values, problem.n_legs), problem, guess)
     cycle, columns = with_jacobian(find, values)
@@ -165,7 +167,8 @@ def cycle_and_columns(
 def step_and_columns(
     model: ViscoelasticWheel, n_legs: int, values: Array, x: Array, dx: Array, options: Options
 ) -> tuple[StepResult, StepResult]:
-    """One step and its derivatives by all parameters when the start moves by `dx` with them."""
+    """Return one step and its derivatives with respect to all parameters if its start moves by `dx`
+    with them."""
 
     n = values.shape[0]
     take = lambda inputs: model.step(wheel_of(inputs[:n], n_legs), inputs[n:], options)

@@ -1,6 +1,7 @@
-"""Gaits of any rung, by Newton's method on its own return map, from a start nearby.
+"""Gaits of any model, found by Newton's method on its return map from a start nearby.
 
-The paper's rung has a faster way (see `by_collocation`); this one knows the model's face alone.
+The paper's model has a faster method (see `collocation_finder`). This module uses only the
+interface of the models.
 """
 
 from typing import Any, ClassVar
@@ -34,32 +35,34 @@ from vrw_jax.wheel import Outcome, WheelParams
 from vrw_jax.wording import Row, listed
 
 FINEST = 1e-12
-"""Newton's last correction need not be smaller, nor than the step's own tolerance."""
+"""Lower limit of the tolerance of Newton's last correction. The step's own tolerance is a limit
+too."""
 
 
 def finest(options: Options) -> Scalar:
-    """Newton's last correction at these tolerances."""
+    """Return the tolerance of Newton's last correction for these step options."""
     return jnp.maximum(FINEST, options.rtol)
 
 
 class WalkedCycle(AbstractCycle):
-    """A gait that repeats after `period_n` steps, told by walking it. Batched under vmap.
+    """Gait that repeats after `period_n` steps, a fixed point of the return map. Batched under
+    vmap.
 
-    Differentiable in the parameters by the implicit function theorem, to second order. Where none
-    was found, `outcome` says so and every other number is zero.
+    It is differentiable in the parameters by the implicit function theorem, to second order. If no
+    gait is found, `outcome` gives the reason and every other number is zero.
 
     - `section_state`: fixed under `period_n` return maps;
     - `post_impact`: (theta, dtheta) after the first landing, rad, rad/s;
-    - `durations`: as the rung's step tells them, s; (n, 3) for period_n = n > 1;
+    - `durations`: as the model's step returns them, s; (n, 3) for period_n = n > 1;
     - `step_length`: distance between the feet at the landing, m;
     - `steps`: the model's step results, with an axis over the steps of one cycle;
-    - `matrix`: derivative of the return to the section;
-    - `outcome`: Outcome.STEPPED, or why there is none;
+    - `monodromy_value`: Jacobian of the return map;
+    - `outcome`: Outcome.STEPPED, or the reason of the failure;
     - `residual`: largest entry of map(x) - x, rad, rad/s or m/s;
-    - `iterations`: of Newton's method.
+    - `n_iterations`: of Newton's method.
 
     Examples:
-        >>> wheel = vrw.RigidWheel(held_landing=True)
+        >>> wheel = vrw.RigidWheel(holds_rear_foot=True)
         >>> cycle = vrw.limit_cycle(vrw.WheelParams(slope=0.1), model=wheel, guess=[0.39, 1.5, 0.0])
         >>> print(f"{cycle.period:.3f} s")
         0.425 s
@@ -80,18 +83,18 @@ class WalkedCycle(AbstractCycle):
         return self.steps.durations.shape[self.outcome.ndim]
 
     def _of_steps(self, tree: Any) -> Any:
-        """Without the axis over steps where there is only one."""
+        """Remove the axis over steps if there is only one step."""
         axis, once = self.outcome.ndim, self.period_n == 1
         return jax.tree.map(lambda leaf: jnp.squeeze(leaf, axis) if once else leaf, tree)
 
     @property
     def indicators(self) -> Any:
-        """Of each landing."""
+        """Return the indicators of each landing."""
         return self._of_steps(self.steps.indicators)
 
     @property
     def monitors(self) -> Any:
-        """The premises' margins of each step."""
+        """Return the margins of each step."""
         return self._of_steps(self.steps.monitors)
 
     @property
@@ -110,9 +113,11 @@ class WalkedCycle(AbstractCycle):
 def walked_cycle(
     params: WheelParams, x: Array, model: AbstractWheel, options: Options, period_n: int, dear: bool
 ) -> WalkedCycle:
-    """`dear`: second derivatives of a step are, as on real ground: see `moved_cycle`.
+    """Find a cycle by Newton's method on the model's return map.
 
-    Searched for by the step that tells the gait then, so that one program is compiled, not two.
+    `uses_jvp_rule` selects `solve_fixed_point_implicit`, because second derivatives of a step are
+    expensive with unilateral contact. The search then uses the same step as the result, so that
+    only one program is compiled.
     """
     take, search = (model.step, moved_cycle) if dear else (model.advance, newton_cycle)
     image = lambda x: take(params, x, options).section_state
@@ -125,7 +130,7 @@ def walked_cycle(
 
 
 def cycle_from(params: WheelParams, found: SectionCycle, steps: Any) -> WalkedCycle:
-    """The gait through a fixed point, whose steps have a leading axis."""
+    """Return the cycle of a fixed point whose steps have a leading axis."""
     # A step that fails returns zeros, which Newton's method may take for a fixed point.
     good = found.converged & jnp.all(steps.outcome == Outcome.STEPPED)
     missing = jnp.where(params.in_domain(), Outcome.NO_CYCLE_FOUND, Outcome.BAD_INPUT)
@@ -143,7 +148,8 @@ def cycle_from(params: WheelParams, found: SectionCycle, steps: Any) -> WalkedCy
 
 
 def of_steps(steps: Any) -> tuple[Array, Array, Array]:
-    """What a cycle tells of its steps, which have a leading axis: after landing, times, lengths."""
+    """Return post-impact state, durations and step lengths of a cycle from its steps, which have a
+    leading axis."""
     durations, lengths = steps.durations, steps.step_length
     if len(durations) == 1:
         durations, lengths = durations[0], lengths[0]
@@ -151,7 +157,7 @@ def of_steps(steps: Any) -> tuple[Array, Array, Array]:
 
 
 class AbstractWalkingFinder(AbstractGaitFinder):
-    """Gaits as fixed points of `period_n` steps of the rung."""
+    """Finder of gaits as fixed points of `period_n` steps of the model."""
 
     model: AbstractWheel
     n_legs: int = eqx.field(static=True)
@@ -172,7 +178,7 @@ class AbstractWalkingFinder(AbstractGaitFinder):
         return walked_cycle(*given, self.period_n, dear=False)
 
     def first_guess(self, values: Values) -> Array:
-        """Where a walk from the rung's start ends."""
+        """Return the last section state of a walk from the model's start."""
         model, params = self.model.at(values, self.n_legs)
         return walk_towards(model, params, self.step_options).steps.section_state[-1]
 
@@ -181,7 +187,7 @@ class AbstractWalkingFinder(AbstractGaitFinder):
 
 
 class SectionFinder(AbstractWalkingFinder):
-    """Of any rung; derivatives are those of Newton's method."""
+    """Finder for any model, with the derivatives of Newton's method."""
 
     of_cycle: ClassVar[tuple[str, ...]] = tuple(n for n in MEASURED if n != "takeoff_acceleration")
     differentiable: ClassVar[tuple[str, ...]] = of_cycle
@@ -200,7 +206,7 @@ class SectionFinder(AbstractWalkingFinder):
 def where_walks_begin(
     finder: AbstractWalkingFinder, params: WheelParams, guess: Any
 ) -> tuple[WheelParams, Array, AbstractWheel, Options]:
-    """Wheel, section state, rung and options of a search near `guess`."""
+    """Return wheel, section state, model and options of a search near `guess`."""
     start = guess.section_state if isinstance(guess, AbstractCycle) else guess
     begin = finder.model.start(params) if start is None else start
     return checked(params, begin, finder.model, finder.step_options)
@@ -209,7 +215,8 @@ def where_walks_begin(
 def gait_of(
     model: AbstractWheel, n_legs: int, cycle: Any, step: Any, d_cycle: Any, d_step: Any
 ) -> Gait:
-    """With what tells branches apart; on real ground the order of events may change along one."""
+    """Return a gait with the data that identify its branch. With unilateral contact the order of
+    events may change along a branch."""
     numbers = model.section_numbers(WheelParams(n_legs=n_legs))
     posture = lambda cycle, step: jnp.concatenate([cycle.section_state[:numbers], step.durations])
     told = along(posture, (cycle, step), (d_cycle, d_step))

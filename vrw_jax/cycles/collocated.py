@@ -1,8 +1,8 @@
-"""Limit cycles of the paper's wheel as differentiable functions of its parameters.
+"""Limit cycles of the paper's model as differentiable functions of its parameters.
 
-The search (see `search`) carries no derivative. Derivatives come from the implicit function
-theorem: the columns of the linearised pass at the cycle. They hold on unstable cycles, in forward
-and reverse mode, and to any order.
+The search (see `collocation_search`) carries no derivative. Derivatives come from the implicit
+function theorem: they are the tangents of the linearized pass at the cycle. They are valid on
+unstable cycles, in forward and reverse mode, and to any order.
 """
 
 import functools
@@ -46,22 +46,22 @@ from vrw_jax.wording import Row, listed
 
 
 class LimitCycle(AbstractCycle):
-    """A gait of the paper's wheel, found by collocation. Batched under vmap.
+    """Gait of the paper's model, found by collocation. Batched under vmap.
 
-    See `AbstractCycle`. Differentiable in the parameters, in every mode and to any order.
+    See `AbstractCycle`. It is differentiable in the parameters, in every mode and to any order.
 
     - `section_state`: (theta-, dtheta-, dL1-) before touchdown, fixed under return_map;
     - `post_impact`: (theta, dtheta) after the first landing, rad, rad/s;
     - `durations`: of DLS, SLS-I, SLS-II, s; (n, 3) for period_n = n > 1;
     - `step_length`: distance between the feet at the landing, m; (n,) for n > 1;
     - `indicators`: of the landing; (n,) each for n > 1;
-    - `outcome`: Outcome.STEPPED, or why there is none;
+    - `outcome`: Outcome.STEPPED, or the reason of the failure;
     - `residual`: last correction of Newton's method, rad, rad/s, s or m;
-    - `passes`: linearised passes that the search took;
+    - `n_newton_iterations`: number of linearized passes of the search;
     - `parameters`: in the order of params.PARAMETER_NAMES;
-    - `located`: the solution itself: a start for neighbours;
-    - `matrix`: value of the monodromy matrix, without derivative;
-    - `problem`, `model`: what it is a gait of, and the rung.
+    - `collocation_state`: the solution with its phases, a start for neighbors;
+    - `monodromy_value`: monodromy matrix, without derivative;
+    - `system`, `model`: the collocation system and the model.
 
     Examples:
         >>> cycle = vrw.limit_cycle(vrw.WheelParams())
@@ -83,7 +83,7 @@ class LimitCycle(AbstractCycle):
     problem: Problem = eqx.field(static=True)
     model: ViscoelasticWheel = eqx.field(
         default_factory=ViscoelasticWheel
-    )  # whose ground the monitors are for
+    )  # whose ground `margins` uses
 
     @property
     def period_n(self) -> int:
@@ -94,16 +94,17 @@ class LimitCycle(AbstractCycle):
         return self.located
 
     def _mapped(self, of_one: Callable) -> Callable:
-        """A function of one cycle, over the axes of this batch."""
+        """Map a function of one cycle over the axes of this batch."""
         for _ in range(self.outcome.ndim):
             of_one = jax.vmap(of_one)
         return of_one
 
     @property
     def monodromy(self) -> Float[Array, "... 2 2"]:
-        """Derivative of the return to the section after the impact, over (theta+, dtheta+).
+        """Return the Jacobian of the return map on the section after the impact, over (theta+,
+        dtheta+).
 
-        A third multiplier, in the section before it, is zero.
+        A third multiplier, on the section before the impact, is zero.
         """
         attach_one = attach_monodromy if compiled_by_caller() else _compiled_attach
         attach = self._mapped(functools.partial(attach_one, self.problem))
@@ -111,32 +112,35 @@ class LimitCycle(AbstractCycle):
 
     @property
     def jury_margins(self) -> Array:
-        """Margins to fold, period doubling, Neimark-Sacker: see floquet.jury_margins."""
+        """Return the margins to fold, period doubling and Neimark-Sacker: see
+        floquet.jury_margins."""
         return floquet.jury_margins(self.monodromy)
 
     @property
     def at_double_multiplier(self) -> Bool[Array, "..."]:
-        """Whether the spectral radius is at a kink, because two multipliers tie."""
+        """Return whether the spectral radius has a kink because two multipliers are equal."""
         return floquet.at_double_multiplier(self.matrix) & self.found
 
     @property
     def mesh_error(self) -> Array:
-        """Estimate, mostly too large, of the mesh's error: see collocation.mesh_error.
+        """Return an estimate of the mesh's error, mostly too large: see
+        collocation.estimate_mesh_error.
 
-        Above 1e-5 a gait does not count as found: give `CycleOptions` more steps.
+        Above 1e-5 a gait does not count as found. More mesh intervals in `CycleOptions` reduce it.
         """
         of_one = functools.partial(_mesh_error, self.problem)
         return self._mapped(of_one)(self.found, self.located.solution)
 
     @property
     def takeoff_acceleration(self) -> Array:
-        """With which the rear foot leaves the ground, m/s^2: see `premises`; least of the steps."""
+        """Return the rear foot's acceleration at take-off, m/s^2, least over the steps: see
+        `margin_defaults`."""
         of_one = functools.partial(_takeoff, self.problem)
         return self._if_found(self._mapped(of_one)(self.parameters, self.located))
 
     @property
     def monitors(self) -> Margins:
-        """The premises' margins over the (first) step, by walking it once event by event."""
+        """Return the margins over the (first) step, computed by one event-driven step."""
 
         def walk(parameters: Array, section_state: Array) -> Margins:
             wheel = wheel_of(parameters, self.problem.n_legs)
@@ -188,16 +192,16 @@ def _find_cycle(params: WheelParams, problem: Problem, guess: Located | None) ->
     parameters = parameters_of(safe)
     located, (matrix, residual, passes) = solve_cycle(problem, parameters, guess)
     found = usable & (located.found > 0.5)
-    # Zero measures and zero derivatives where there is no cycle: mask what goes in and comes out.
+    # Mask inputs and outputs: measures and derivatives are zero where there is no cycle.
     masked = lambda x: jnp.where(found, x, 0.0)
     stand_in = lambda x, d: jnp.where(found, x, d)
     parameters = jax.tree.map(stand_in, parameters, parameters_of(table_1).astype(parameters.dtype))
 
     s = wheel_of(parameters, problem.n_legs).symbols()
     n = problem.period_n
-    # theta, its rate and that of L1: L1 itself follows from theta at touchdown.
+    # theta, its rate and the rate of L1: L1 itself follows from theta at touchdown.
     states = jnp.concatenate([located.ends[:, :1], located.ends[:, 2:]], 1)
-    # The landing that opens a step follows the state at the end of the step before.
+    # The landing at the start of a step follows the state at the end of the previous step.
     landings = jax.vmap(lambda x: transitions.land(s, *x))(jnp.roll(states, 1, 0))
     fore, rear = jax.vmap(lambda landing: transitions.landing_forces(s, landing))(landings)
 
@@ -232,12 +236,12 @@ def _find_cycle(params: WheelParams, problem: Problem, guess: Located | None) ->
 _compiled_find_cycle = eqx.filter_jit(_find_cycle)
 
 N_SAMPLES = 1025
-"""Points of each phase between which a walked guess is interpolated. With too few, 33 at c = 221,
-the fast start of a step without double support is lost, and Newton with it."""
+"""Number of points of each phase between which a walked guess is interpolated. With too few (33 at
+c = 221), the fast start of a step without double support is lost and Newton's method fails."""
 
 
 class SampledWalk(NamedTuple):
-    """A walk, event by event, as a start on any mesh."""
+    """Event-driven walk, sampled as a start on any mesh."""
 
     post_impact: Float[Array, "2"]  # (theta, dtheta) after the first landing
     distances: Float[Array, " n"]  # between the feet at each landing, m
@@ -249,7 +253,7 @@ class SampledWalk(NamedTuple):
 def sampled_walk(
     model: ViscoelasticWheel, params: WheelParams, x: SectionState, n_steps: int
 ) -> SampledWalk:
-    """`n_steps` event-driven steps from a section state."""
+    """Return `n_steps` event-driven steps from a section state, sampled in time."""
     options, s = Options(), params.symbols()
     landing = transitions.land(s, *x)
     section = jnp.stack([landing.theta, landing.motion.dtheta])
@@ -265,7 +269,7 @@ def sampled_walk(
 
 @eqx.filter_jit
 def guess_along(problem: Problem, params: WheelParams, walked: SampledWalk) -> Located:
-    """The cycle's unknowns as a walk of `period_n` steps tells them."""
+    """Return the cycle's unknowns from a walk of `period_n` steps."""
     accelerations = functools.partial(_accelerations_along, problem, params.symbols())
     happens = (walked.durations > 0.0).astype(walked.durations.dtype)
     by_phase = jax.vmap(accelerations)(walked.distances, walked.states)
@@ -276,7 +280,8 @@ def guess_along(problem: Problem, params: WheelParams, walked: SampledWalk) -> L
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def on_mesh(known: Problem, wanted: Problem, found: Solution) -> Solution:
-    """A start on another mesh: each step's accelerations are a polynomial of their own."""
+    """Return a solution transferred to another mesh. The accelerations in each mesh interval are a
+    polynomial."""
     accelerations = []
     for old, new, rows in zip(known.meshes, wanted.meshes, found.accelerations, strict=True):
         matrix = jnp.asarray(transfer_matrix(old, new), found.section.dtype)
@@ -289,7 +294,8 @@ def on_mesh(known: Problem, wanted: Problem, found: Solution) -> Solution:
 def _accelerations_along(
     problem: Problem, s: Symbols, distance: Scalar, states: Float[Array, "3 n_samples 6"]
 ) -> tuple[Array, ...]:
-    """Accelerations at the nodes of each phase, (step, node, coordinate), of a sampled step."""
+    """Return accelerations at the nodes of each phase, (step, node, coordinate), of a sampled
+    step."""
     told, phases = [], phases_of(s, distance, stop_at_lift_off=False)
     known = jnp.linspace(0.0, 1.0, states.shape[1])
     for phase, mesh, sampled in zip(phases, problem.meshes, states, strict=True):

@@ -1,4 +1,4 @@
-"""What a gait that repeats tells, whichever rung it belongs to and however it was found."""
+"""Interface of limit cycles, independent of the model and of the search method."""
 
 import abc
 import dataclasses
@@ -17,38 +17,40 @@ from vrw_jax.wording import AbstractTold, Row, chosen, counted, listed
 
 
 class AbstractCycle(AbstractTold):
-    """A gait that repeats after `period_n` steps. Batched under vmap: every field gains the axis.
+    """Gait that repeats after `period_n` steps. Batched under vmap: every field gains the batch
+    axis.
 
-    Where none was found, `outcome` says so and every other number is zero, as are its derivatives.
-    What has an axis over steps lacks it for `period_n` = 1.
+    If no gait is found, `outcome` gives the reason. All other numbers and their derivatives are
+    then zero. The axis over steps is absent for `period_n` = 1.
     """
 
     section_state: eqx.AbstractVar[Array]  # before touchdown, fixed under `period_n` return maps
     post_impact: eqx.AbstractVar[Float[Array, "2"]]  # (theta, dtheta) after the first landing
-    durations: eqx.AbstractVar[Float[Array, "*n 3"]]  # of double support first, s
+    durations: eqx.AbstractVar[Float[Array, "*n 3"]]  # s, double support first
     step_length: eqx.AbstractVar[Float[Array, "*n"]]  # between the feet at the landing, m
-    matrix: eqx.AbstractVar[Array]  # value of the monodromy matrix
-    outcome: eqx.AbstractVar[Int[Array, ""]]  # Outcome.STEPPED, or why there is none
+    matrix: eqx.AbstractVar[Array]  # monodromy matrix, without derivative
+    outcome: eqx.AbstractVar[Int[Array, ""]]  # Outcome.STEPPED or the failure
 
     @property
     @abc.abstractmethod
     def period_n(self) -> int:
-        """Steps until the gait repeats."""
+        """Return the number of steps after which the gait repeats."""
 
     @property
     @abc.abstractmethod
     def monodromy(self) -> Array:
-        """Derivative of the return to the section, itself differentiable."""
+        """Return the Jacobian of the return map, itself differentiable."""
 
     @property
     @abc.abstractmethod
     def near(self) -> Any:
-        """Where the search for a neighbour's gait begins."""
+        """Return the start of a search for a neighbor's gait."""
 
     def or_nan(self, params: WheelParams) -> Any:
-        """The same, but NaN in place of zeros where there is none, in derivatives by params too."""
+        """Return the cycle with NaN in place of zeros where there is none, also in derivatives with
+        respect to params."""
         lost = jnp.where(self.found, 0.0, jnp.nan)
-        weight = 1.0 + lost * sum(jax.tree.leaves(params))  # which leads derivatives past the masks
+        weight = 1.0 + lost * sum(jax.tree.leaves(params))  # so that derivatives pass the masks
 
         def told(x: Array) -> Array:
             return x * weight.astype(x.dtype) if eqx.is_inexact_array(x) else x
@@ -58,84 +60,89 @@ class AbstractCycle(AbstractTold):
         return dataclasses.replace(self, **values)
 
     def _if_found(self, value: Array) -> Array:
-        """Zero where there is no cycle, or NaN after `or_nan`, in derivatives too."""
+        """Return `value`, or zero where there is no cycle. The result is NaN after
+        `replace_missing_by_nan`, also in derivatives."""
         return jnp.where(
             self.found, value, 0.0 * self.matrix[..., 0, 0]
-        )  # which moves with nothing
+        )  # whose derivative is zero
 
     def over_steps(self, values: Array, combine: Callable[[Array, int], Array]) -> Array:
-        """One value for the whole cycle, of one for each step on the last axis."""
+        """Combine one value per step, on the last axis, into one value for the whole cycle."""
         return combine(values, -1) if self.period_n > 1 else values
 
     @property
     def found(self) -> Bool[Array, "..."]:
-        """Whether there is a cycle."""
+        """Return whether there is a cycle."""
         return self.outcome == Outcome.STEPPED
 
     @property
     def why(self) -> str:
-        """Why there is no cycle, as a sentence; of one wheel."""
+        """Return why there is no cycle, as a sentence. The cycle must be that of one wheel."""
         return Outcome(int(self.outcome)).meaning
 
     @property
     def period(self) -> Array:
-        """Duration of the whole cycle, s."""
+        """Return the duration of the whole cycle, s."""
         return jnp.sum(self.durations, axis=(-2, -1) if self.period_n > 1 else -1)
 
     @property
     def dls_fraction(self) -> Array:
-        """Share of the period spent in double support."""
+        """Return the share of the period in double support."""
         dls, period = self.over_steps(self.durations[..., 0], jnp.sum), self.period
         return dls / jnp.where(period > 0.0, period, 1.0)
 
     @property
     def speed(self) -> Array:
-        """Distance over period, m/s."""
+        """Return distance over period, m/s."""
         distance, period = self.over_steps(self.step_length, jnp.sum), self.period
         return distance / jnp.where(period > 0.0, period, 1.0)
 
     @property
     def multipliers(self) -> Complex[Array, "... n"]:
-        """Floquet multipliers, largest first; differentiable up to a section of three numbers."""
+        """Return the Floquet multipliers, largest first. They are differentiable for sections of at
+        most three coordinates."""
         return floquet.multipliers(self.monodromy)
 
     @property
     def spectral_radius(self) -> Array:
-        """Largest modulus of a multiplier: below 1 the gait is stable."""
+        """Return the largest modulus of a multiplier. The gait is stable below 1."""
         return floquet.spectral_radius(self.monodromy)
 
     @property
     def spectral_margin(self) -> Array:
-        """1 - spectral radius, positive where stable; told of every rung."""
+        """Return 1 - spectral radius, positive for stable gaits, for every model."""
         return self._if_found(1.0 - self.spectral_radius)
 
     @property
     def stability_margin(self) -> Array:
-        """Smooth least Jury margin, positive where stable: see `floquet.stability_margin`.
+        """Return the smooth minimum of the Jury margins, positive for stable gaits: see
+        `floquet.stability_margin`.
 
-        Of sections of at most three numbers, as all are but those on real ground.
+        It is defined for sections of at most three coordinates, which excludes unilateral contact.
         """
         return self._if_found(floquet.stability_margin(self.monodromy))
 
     @property
     def condition(self) -> Array:
-        """Condition number of I - monodromy: how much the cycle magnifies a disturbance."""
+        """Return the condition number of I - monodromy: the amplification of a disturbance by the
+        cycle."""
         matrix = jnp.eye(self.matrix.shape[-1]) - self.matrix
         return self._if_found(jnp.linalg.cond(matrix))
 
     def measure(self, name: str) -> Array:
-        """One of `MEASURED`, by its name in `results.MEASURES`; batch axes lead.
+        """Return one of `CYCLE_MEASURE_FUNCTIONS`, by its name in `results.ALL_MEASURES`. Batch
+        axes come first.
 
-        Durations are summed over the cycle's steps, of indicators the least counts.
+        Durations are sums over the cycle's steps, and indicators are minima.
         """
         return MEASURED[chosen("the measure", name, tuple(MEASURED))](self)
 
     def measures(self, names: Iterable[str]) -> dict[str, Array]:
-        """Several of `measure`; what is not asked for is not traced."""
+        """Return several measures by name. Measures that are not requested are not traced."""
         return {name: self.measure(name) for name in names}
 
     def rows(self) -> list[Row]:
-        """What the cycle says of itself; of many, how many were found."""
+        """Return the printed rows of the cycle. A batch shows how many cycles are found."""
         outcome = np.asarray(self.outcome)
         if outcome.ndim:
             return [("wheels", counted(outcome, Outcome))]
@@ -156,11 +163,11 @@ class AbstractCycle(AbstractTold):
 
     @abc.abstractmethod
     def own_rows(self) -> list[Row]:
-        """Those of `rows` that not every rung tells."""
+        """Return the rows that are specific to the model."""
 
 
 def multipliers_told(matrix: np.ndarray) -> tuple[float, str]:
-    """The spectral radius, and the multipliers that five digits show, largest first."""
+    """Return the spectral radius, and the multipliers that five digits show, largest first."""
     multipliers = sorted(np.linalg.eigvals(matrix), key=abs, reverse=True)
     shown = [z for z in multipliers if abs(z) >= 5e-6]
     rest = f"{len(multipliers) - len(shown)} below 5e-6" if len(shown) < len(multipliers) else ""
@@ -213,5 +220,6 @@ MEASURED: dict[str, Callable[[AbstractCycle], Array]] = {
     "stability_margin": _own("stability_margin"),
     "takeoff_acceleration": _own("takeoff_acceleration"),
 }
-"""How a cycle tells its measures: the one table of them. Derivatives of those on stability are
-second derivatives of the motion: one more machine code to compile, and twice the time to run."""
+"""Functions of a cycle by name of the measure; the only such table. Derivatives of the stability
+measures are second derivatives of the motion. They need one more compiled program and take twice
+the time to run."""

@@ -1,8 +1,8 @@
-"""Derivatives of limit cycles: by the implicit function theorem, to any order and in any mode.
+"""Derivatives of limit cycles by the implicit function theorem, to any order and in any mode.
 
-First derivatives are the columns of the linearised pass at the cycle. Second ones are derivatives
-of that pass (of the columns themselves, of the monodromy matrix) along the directions in which the
-cycle moves with its parameters, one after another. Both are machine code on a CPU.
+First derivatives are the tangents of the linearized pass at the cycle. Second derivatives are
+derivatives of that pass, of its tangents and of the monodromy matrix. They are taken along the
+tangents of the cycle, one parameter after another. Both are machine code on a CPU.
 """
 
 import functools
@@ -40,7 +40,8 @@ from vrw_jax.wheel import PARAMETER_NAMES
 
 
 def _tangent_space(problem: Problem, parameters: Parameters, located: Located) -> Located:
-    """d located / d parameters over lanes, with a leading axis; zero where nothing was found."""
+    """Return d(state) / d(parameters) over lanes, with a leading axis; zero where nothing was
+    found."""
     passed = problem.pass_at(parameters, located, tuple(range(parameters.shape[0])))
     return _where_found(located, columns_of(passed, located))
 
@@ -52,10 +53,12 @@ def _monodromy(problem: Problem, parameters: Parameters, located: Located) -> Ar
 def _slopes_of_monodromy(
     problem: Problem, parameters: Parameters, known: tuple[Located, Located]
 ) -> Array:
-    """d monodromy / d parameters along the branch, with a leading axis; `known`: z and dz/dp.
+    """Return d(monodromy) / d(parameters) along the branch, with a leading axis.
 
-    One direction after another: the code is as short as for one. Units tell three of the nine: of
-    mass that in which both masses grow, of which the ground's and the legs' forces know nothing.
+    `solution_and_tangents` are z and dz/dp. The directions are computed one after another, which
+    keeps the compiled code as short as for one. Three of the nine follow from units. For the unit
+    of mass, both masses grow in this direction. The forces of the ground and of the legs do not
+    contain it.
     """
     located, columns = known
     hub, leg = (PARAMETER_NAMES.index(name) for name in ("hub_mass", "leg_mass"))
@@ -80,7 +83,7 @@ def _slopes_of_monodromy(
     length = of_hub * of_hub + of_leg * of_leg
     by[hub] = (of_hub * grown - of_leg * turns[-1]) / length
     by[leg] = (of_leg * grown + of_hub * turns[-1]) / length
-    rates = jnp.asarray([[0, 1], [-1, 0]])[..., None] * matrices[0]  # over angle and rate
+    rates = jnp.asarray([[0, 1], [-1, 0]])[..., None] * matrices[0]  # of angle and rate
     told = {
         i: rates if scale is scales.TIME else jnp.zeros_like(rates)
         for i, scale in scales.SCALES.items()
@@ -90,12 +93,12 @@ def _slopes_of_monodromy(
 
 
 def _where_found(located: Located, tree: Any) -> Any:
-    """Zeros in the lanes without a cycle."""
+    """Return the tree with zeros in the lanes without a cycle."""
     return jax.tree.map(lambda x: jnp.where(located.found > 0.5, x, 0.0), tree)
 
 
 def over_lanes(function: LaneFunction, like: Callable, settings: tuple, block: int) -> LaneFunction:
-    """A function over lanes in its quickest form: machine code on a CPU."""
+    """Return a batched function in its fastest form: machine code on a CPU, else XLA in blocks."""
     if simd.serves():
         return lane_function(function, like, settings)
     name_for_export()
@@ -103,7 +106,8 @@ def over_lanes(function: LaneFunction, like: Callable, settings: tuple, block: i
 
 
 def _in_form(name: str, likes: tuple[Callable, ...], problem: Problem) -> InForm:
-    """The first derivatives, a form of results for each, by `over_lanes`; higher ones by XLA."""
+    """Return a compiler for the first derivatives (`compile_batched`, one output template each).
+    XLA compiles higher ones."""
     block = problem.options.block
 
     def in_form(function: LaneFunction, order: int) -> LaneFunction:
@@ -115,7 +119,7 @@ def _in_form(name: str, likes: tuple[Callable, ...], problem: Problem) -> InForm
 
 
 def _columns_of(problem: Problem) -> Callable:
-    """`_tangent_space` of one wheel, differentiable."""
+    """Return `_collocation_tangents` of one wheel as a differentiable function."""
     likes = (lambda parameters, located: located), (lambda parameters, known: known[0])
     form = _in_form("columns", likes, problem)
     columns = on_branch(functools.partial(_tangent_space, problem), lambda *at: columns(*at), form)
@@ -125,7 +129,8 @@ def _columns_of(problem: Problem) -> Callable:
 def solve_cycle(
     problem: Problem, parameters: Array, guess: Located | None
 ) -> tuple[Located, tuple]:
-    """Search for one wheel, differentiable in its parameters; the guess has no derivative."""
+    """Search for the cycle of one wheel, differentiable in its parameters. The guess has no
+    derivative."""
     search = functools.partial(search_lanes, problem)
     like = lambda parameters, now, *_: now
     lanes = over_lanes(search, like, ("search", problem), problem.options.block)
@@ -147,7 +152,7 @@ def solve_cycle(
 
 
 def attach_monodromy(problem: Problem, matrix: Array, parameters: Array, located: Located) -> Array:
-    """`matrix`, whose derivative is that of the monodromy matrix along the branch."""
+    """Return `monodromy_value` with the derivative of the monodromy matrix along the branch."""
     alike = lambda parameters, known: parameters
     form = _in_form("monodromy", (alike, alike), problem)
     matrix_of = functools.partial(_monodromy, problem)

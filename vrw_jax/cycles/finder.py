@@ -1,4 +1,4 @@
-"""How a rung's gait is found, checked and differentiated: one face, one finder for each rung."""
+"""Interface of the gait finders: each finds, checks and differentiates the gaits of one model."""
 
 import abc
 from collections.abc import Callable
@@ -18,48 +18,48 @@ from vrw_jax.numerics import Options, taken, with_jacobian
 from vrw_jax.wheel import Outcome, WheelParams
 
 AGREEMENT = 1e-8
-"""Largest distance, rad, rad/s and m/s, between a cycle's section state and where the event-driven
-step takes it: two independent computations, whose errors at the default options are a tenth of it
-while steps last some 1.5 s."""
+"""Largest distance, rad, rad/s and m/s, between a cycle's section state and the state after the
+event-driven step. The two computations are independent. At the default options their errors are a
+tenth of it while steps last some 1.5 s."""
 
 Values = Float[Array, " n_values"]
-"""Numbers of `AbstractWheel.parameter_names`."""
+"""Values of `AbstractWheel.parameter_names`."""
 
 
 class OnBranch(NamedTuple):
-    """A gait as a point of a branch: what `same_branch` looks at."""
+    """Gait as a point of a branch: the data that `is_same_branch` compares."""
 
     posture: Any  # section state and durations
-    d_posture: Any  # leading axis: the rung's numbers
-    order: Any  # what may not change along a branch: which phases happen
-    returns: Any  # derivative of the return to the section
+    d_posture: Any  # derivatives, with a leading axis over the model's parameters
+    order: Any  # which phases take place: constant along a branch
+    returns: Any  # Jacobian of the return map
 
 
 class Gait(eqx.Module):
-    """A gait that repeats after one step, that step, and how both move with the parameters.
+    """Gait that repeats after one step, with that step and the derivatives of both.
 
-    Derivatives are along the branch of gaits and have a leading axis over the parameters' names.
-    A batch of gaits has its axis before all others.
+    Derivatives are taken along the branch of gaits and have a leading axis over the parameters'
+    names. A batch of gaits has its axis before all others.
     """
 
     cycle: AbstractCycle
-    step: AbstractStep  # event by event, from the cycle's section state
+    step: AbstractStep  # event-driven step from the cycle's section state
     d_cycle: AbstractCycle
     d_step: AbstractStep
     on_branch: OnBranch
 
     @property
     def outcome(self) -> np.ndarray:
-        """The cycle's outcome, unless the step from it fails or ends elsewhere."""
+        """Return the cycle's outcome, unless the step from it fails or ends at another state."""
         cycle, step = self.cycle, self.step
         return confirmed(cycle.outcome, cycle.section_state, step.outcome, step.section_state)
 
 
 def same_branch(here: OnBranch, there: OnBranch, change: np.ndarray) -> bool:
-    """Whether a branch leads from one gait to the other when the rung's numbers change so.
+    """Return whether a branch connects two gaits whose parameters differ by `parameter_change`.
 
-    The mean of both ends' slopes must account for most of the way between the gaits, the same
-    phases must happen, and no multiplier may have passed through 1.
+    The mean of the tangents at both ends must predict most of the distance between the gaits. The
+    same phases must take place, and no multiplier may have crossed 1.
     """
     here, there = taken((here, there), ...)
     predicted = change @ (0.5 * (here.d_posture + there.d_posture))
@@ -71,7 +71,8 @@ def same_branch(here: OnBranch, there: OnBranch, change: np.ndarray) -> bool:
 
 
 def confirmed(outcome: Any, state: Any, walked: Any, reached: Any) -> np.ndarray:
-    """Outcomes of cycles with these section states, from which a step was walked to `reached`."""
+    """Return outcomes of cycles with section states `state`, checked by a step that ends at
+    `end_state`."""
     agrees = np.max(np.abs(np.asarray(reached) - np.asarray(state)), axis=-1) <= AGREEMENT
     step = np.where(agrees, Outcome.STEPPED, Outcome.MESH_TOO_COARSE)
     step = np.where(np.asarray(walked) == Outcome.STEPPED, step, np.asarray(walked))
@@ -79,80 +80,86 @@ def confirmed(outcome: Any, state: Any, walked: Any, reached: Any) -> np.ndarray
 
 
 class AbstractGaitFinder(eqx.Module):
-    """Finds gaits of one rung. Rooms above ask this face alone, and `finder_of` which one it is."""
+    """Finder of the gaits of one model. Higher packages use this interface only; `make_finder`
+    selects the class."""
 
     model: eqx.AbstractVar[AbstractWheel]
     n_legs: eqx.AbstractVar[int]
     step_options: eqx.AbstractVar[Options]
-    options_type: eqx.AbstractClassVar[type]  # what `limit_cycle` takes as its options
-    of_cycle: eqx.AbstractClassVar[tuple[str, ...]]  # measures that the cycle tells by itself
+    options_type: eqx.AbstractClassVar[type]  # type of the options that `limit_cycle` accepts
+    of_cycle: eqx.AbstractClassVar[tuple[str, ...]]  # measures that need the cycle alone
     differentiable: eqx.AbstractClassVar[tuple[str, ...]]
-    """Measures with derivatives along the branch, one number each."""
-    usual: eqx.AbstractClassVar[tuple[str, ...]]  # of them, where nothing is asked for
-    readable: eqx.AbstractClassVar[tuple[str, ...]]  # `differentiable`, and those of several legs
-    from_nothing: eqx.AbstractClassVar[bool]  # whether a search needs no start nearby
+    """Scalar measures that have derivatives along the branch."""
+    usual: eqx.AbstractClassVar[tuple[str, ...]]  # the measures returned by default
+    readable: eqx.AbstractClassVar[tuple[str, ...]]  # and those of several legs
+    from_nothing: eqx.AbstractClassVar[bool]  # whether a search works without a start nearby
     coexisting: ClassVar[bool] = False
-    """Whether several gaits of a wheel may attract, which walks from several starts tell apart."""
+    """Whether several gaits of a wheel may attract, which walks from several starts distinguish."""
 
     @classmethod
     @abc.abstractmethod
     def of(
         cls, model: Any, n_legs: int, step: Options, period_n: int, cycle: CycleOptions
     ) -> "AbstractGaitFinder":
-        """The finder with the options of its step, and of its search if that has its own."""
+        """Return the finder with the options of its step, and of its search if that has separate
+        options."""
 
     @property
     def options_used(self) -> Any:
-        """Those of `options_type`."""
+        """Return the options of the search, of type `options_type`."""
         return self.step_options
 
     @abc.abstractmethod
     def cycle(self, params: WheelParams, guess: Any = None) -> AbstractCycle:
-        """The cycle of a wheel near `guess`: a neighbour's `near`, a section state or nothing."""
+        """Return the cycle of a wheel near `guess`: a neighbor's `warm_start`, a section state or
+        None."""
 
     def cycles(self, params: WheelParams, guess: Any = None) -> Any:
-        """Those of a batch of wheels; every array gains a leading axis."""
+        """Return the cycles of a batch of wheels; every array gains a leading axis."""
         return jax.vmap(self.cycle)(params, guess)
 
     @abc.abstractmethod
     def first_guess(self, values: Values) -> Any:
-        """Where a search begins that knows no neighbour."""
+        """Return the start of a search for a wheel without a known neighbor."""
 
     def first_guesses(self, values: Float[Array, "lanes n_values"]) -> Any:
         return jax.vmap(self.first_guess)(values)
 
     @abc.abstractmethod
     def find(self, values: Values, guess: Any) -> Gait:
-        """The gait near `guess`, with its derivatives; the large programs are compiled once."""
+        """Return the gait near `guess` with its derivatives. The large programs are compiled
+        once."""
 
     def find_many(self, values: Float[Array, "lanes n_values"], guess: Any) -> Gait:
-        """`find` of many wheels side by side; every array gains a leading axis."""
+        """Return `find_gait` of a batch of wheels; every array gains a leading axis."""
         return eqx.filter_vmap(self.find)(values, guess)
 
     @abc.abstractmethod
     def compile(self, params: WheelParams) -> None:
-        """Compile what `find` needs, as much as can be side by side."""
+        """Compile the programs that `find_gait` needs, in parallel where possible."""
 
     def step(self, params: WheelParams, x: Array) -> AbstractStep:
-        """One step of the rung, by what is compiled already."""
+        """Return one step of the model, computed by an already compiled program."""
         told: AbstractStep = self.model.step(params, x, self.step_options)
         return told
 
     def cycle_of(self, values: Values, guess: Any = None) -> AbstractCycle:
-        """`cycle`, of the rung's own numbers."""
+        """Return `find_cycle` as a function of the model's own parameter values."""
         model, params = self.model.at(values, self.n_legs)
         return eqx.tree_at(lambda finder: finder.model, self, model).cycle(params, guess)
 
     def measured(self, values: Values, guess: Any, names: tuple[str, ...]) -> "Measured":
-        """Measures of the gait near `guess` with their derivatives, and no more than is asked for.
+        """Return the requested measures of the gait near `guess` with their derivatives.
 
-        Some of `differentiable`; of those on stability they are second derivatives of the motion.
+        `names` are some of `differentiable_measures`. Derivatives of stability measures are second
+        derivatives of the motion.
         """
         return measured_by_cycle(self, values, guess, names)
 
     @classmethod
     def read(cls, name: str, cycle: AbstractCycle, step: AbstractStep) -> Array:
-        """A measure of a gait by name; margins of the locked legs have one value for each leg."""
+        """Return a measure of a gait by name. Margins of the locked legs have one value for each
+        leg."""
         return cycle.measure(name) if name in cls.of_cycle else step.measures()[name]
 
 
@@ -175,12 +182,12 @@ def measured_by_cycle(
 
 
 def leading(columns: Any) -> Any:
-    """Derivatives by the rung's numbers, these as the first axis."""
+    """Move the axis of the derivatives, which is over the model's parameters, to the front."""
     return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), columns)
 
 
 def along(function: Callable, told: tuple, d_told: tuple) -> tuple[Any, Any]:
-    """What a function of cycle and step tells of a gait, and its derivatives along the branch."""
+    """Return a function of a gait's cycle and step, and its derivatives along the branch."""
     whole, rest = eqx.partition(told, eqx.is_inexact_array)
     columns = eqx.filter(d_told, eqx.is_inexact_array)
     value = lambda floats: function(*eqx.combine(floats, rest))
@@ -190,7 +197,7 @@ def along(function: Callable, told: tuple, d_told: tuple) -> tuple[Any, Any]:
 
 @eqx.filter_jit
 def read_along(function: Callable, gait: Gait) -> tuple[Any, Any]:
-    """`along` of one gait, compiled; `function(cycle, step)`."""
+    """Return `value_and_tangents` of `function(cycle, step)` on one gait, compiled."""
     return along(function, (gait.cycle, gait.step), (gait.d_cycle, gait.d_step))
 
 
@@ -202,7 +209,7 @@ def read_along_lanes(function: Callable, gait: Gait) -> tuple[Any, Any]:
 
 @dataclass(frozen=True)
 class Readings:
-    """Several measures of a gait at once, by name, as a function of cycle and step."""
+    """Several named measures of a gait, as a function of cycle and step."""
 
     read: Callable[[str, AbstractCycle, AbstractStep], Array]
     names: tuple[str, ...]
@@ -212,7 +219,7 @@ class Readings:
 
 
 def measured_of(gait: Gait, read: Callable, names: tuple[str, ...]) -> Measured:
-    """Measures of a gait that was found with all of its derivatives."""
+    """Return measures of a gait that was found with all of its derivatives."""
     told, slopes = read_along(Readings(read, names), gait)
     stack = lambda values: jnp.stack([values[name] for name in names], -1)
     return Measured(stack(told), stack(slopes).T, gait.cycle.outcome)

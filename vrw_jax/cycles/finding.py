@@ -1,4 +1,4 @@
-"""The gait of a wheel, by the finder of its rung."""
+"""Selection of the finder for a model, and checks of the arguments for a search."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -22,12 +22,12 @@ from vrw_jax.wheel import WheelParams
 from vrw_jax.wording import instance, listed, traced
 
 Guess = LimitCycle | WalkedCycle | Array | np.ndarray | Sequence[float]
-"""A neighbour's cycle, or a section state near the one that is wanted."""
+"""A neighbor's cycle, or a section state near the wanted gait."""
 
 FINDERS: dict[str, type[AbstractGaitFinder]] = {
     "viscoelastic": CollocationFinder, "unilateral": GroundFinder
 }  # fmt: skip
-"""By rung, where it is not the one for any rung."""
+"""Finder class by name of the model; all other models use `ReturnMapFinder`."""
 
 
 def finder_of(
@@ -38,7 +38,7 @@ def finder_of(
     cycle_options: CycleOptions | None = None,
     step_options: Options | None = None,
 ) -> AbstractGaitFinder:
-    """What finds, checks and differentiates gaits of this rung."""
+    """Return the finder that finds, checks and differentiates gaits of this model."""
     if cycle_options is not None:
         instance("cycle_options", cycle_options, CycleOptions, "give vrw.CycleOptions()")
     rung = rung_of(model)
@@ -48,10 +48,12 @@ def finder_of(
 
 
 def serving(params: WheelParams, model: ModelLike | None) -> ModelLike | None:
-    """The rung of this wheel's gait: of the ladder the lowest whose premises its step keeps.
+    """Return the model of this wheel's gait: for the ladder, the lowest model whose margins are
+    met.
 
-    The paper's gait is looked for first. Where it is not found, or breaks a premise on this ground,
-    it is the rung above. Any other rung is itself; so is the ladder where nothing has a value.
+    The paper's gait is tried first. If it is not found or violates a margin on this ground, the
+    upper model is returned. Any other model is returned unchanged. The ladder is returned unchanged
+    if the parameters have no values.
     """
     return serving_and_why(params, model)[0]
 
@@ -59,7 +61,7 @@ def serving(params: WheelParams, model: ModelLike | None) -> ModelLike | None:
 def serving_and_why(
     params: WheelParams, model: ModelLike | None
 ) -> tuple[ModelLike | None, str | None]:
-    """`serving`, and of the ladder in one sentence why."""
+    """Return `resolve_model` and, for the ladder, the reason in one sentence."""
     ladder: Any = rung_of(model)
     if ladder.upper is ladder or not isinstance(params, WheelParams):
         return model, None
@@ -74,7 +76,10 @@ def serving_and_why(
 
 
 def near(guess: Any) -> Any:
-    """A guess as a caller gives it: a cycle, a place that one told, or a finite section state."""
+    """Return a user's guess: a cycle, a `CollocationState` or a finite section state.
+
+    Raises: ValueError: the section state is not finite.
+    """
     if guess is None or isinstance(guess, AbstractCycle | Located):
         return guess
     state = state_of(guess, "guess")
@@ -92,7 +97,10 @@ def finder_for(
     options: CycleOptions | Options | None,
     period_n: int = 1,
 ) -> AbstractGaitFinder:
-    """The finder that takes these options; one clear sentence for what can be seen to be wrong."""
+    """Return the finder for these options, after checks of the arguments.
+
+    Raises: TypeError, ValueError: the arguments do not fit the model.
+    """
     one_wheel(params, "map over batches with jax.vmap, in_axes=(params.in_axes,), or use vrw.scan")
     if options is not None:
         instance("options", options, (CycleOptions, Options), "give vrw.CycleOptions()")

@@ -1,7 +1,7 @@
-"""Gaits on real ground, by Newton's method on steps of lanes and their derivatives.
+"""Gaits with unilateral contact, found by Newton's method on batched steps and their derivatives.
 
-All directions in which a step moves go beside its motion in the same machine code, so that many
-wheels are searched side by side and nothing large is compiled for the derivatives.
+All tangents of a step are computed beside its motion in the same machine code. Many wheels are
+therefore searched side by side, and no large program is compiled for the derivatives.
 """
 
 import functools
@@ -42,20 +42,21 @@ from vrw_jax.wheel import Outcome, WheelParams
 from vrw_jax.wording import traced
 
 ITERATIONS, HALVINGS = 15, 6
-"""Of Newton's method, and of a correction that leads where no step ends, at most."""
+"""Largest number of Newton iterations, and of halvings of a correction after which no step ends."""
 
 LOOSE, ROUGH = 1e-6, 1e-4
-"""Tolerance of the steps far from a gait, and the correction below which one is near."""
+"""Tolerance of the steps far from a gait, and the correction below which a state is near a gait."""
 
 CLEAR = 0.01
-"""A correction so much smaller than need be shows the gait where it is made."""
+"""Factor below the tolerance at which a correction is accepted without a second one."""
 
 SHAPES = (1, 8, 64, 512)
-"""Numbers of gaits that are told together: each is compiled for once."""
+"""Numbers of gaits that are read together. Each number is compiled once."""
 
 
 class GroundFinder(AbstractWalkingFinder):
-    """On real ground, with first derivatives, friction's included."""
+    """Finder with unilateral contact, with first derivatives, including those with respect to
+    friction."""
 
     model: UnilateralWheel
     shapes: tuple[int, ...] = eqx.field(static=True, default=SHAPES)
@@ -70,12 +71,13 @@ class GroundFinder(AbstractWalkingFinder):
     def of(
         cls, model: Any, n_legs: int, step: Options, period_n: int, cycle: CycleOptions
     ) -> AbstractWalkingFinder:
-        if model.restitution is not None:  # lanes know no feet that come back
+        if model.restitution is not None:  # the batched engine has no restitution
             return SectionFinder(model, n_legs, step, period_n)
         return cls(model, n_legs, step, period_n)
 
     def cycle(self, params: WheelParams, guess: Any = None) -> WalkedCycle:
-        """By lanes where everything has a value, else by the step's own derivatives."""
+        """Return the cycle from the batched engine if all inputs are concrete, else from the step's
+        own derivatives."""
         params, x, model, options = where_walks_begin(self, params, guess)
         if traced(params, x, model):
             return walked_cycle(params, x, model, options, self.period_n, dear=True)
@@ -88,11 +90,11 @@ class GroundFinder(AbstractWalkingFinder):
         return self.near(values, _states(self.model, params, guess))
 
     def near(self, values: Any, states: Any) -> WalkedCycle:
-        """The gaits near section states, wheel by wheel, without derivatives."""
+        """Return the gaits near section states, one per wheel, without derivatives."""
         return self._told(_cycle, values, states, by_values=False)
 
     def prepare(self, values: np.ndarray, states: np.ndarray) -> None:
-        """What Newton's method asks for, compiled while another thread walks towards its start."""
+        """Compile the programs of Newton's method while another thread walks towards its start."""
         maps = Periods(self.model, self.n_legs, self.period_n, values)
         maps.around(self.step_options, states, False)
 
@@ -100,7 +102,7 @@ class GroundFinder(AbstractWalkingFinder):
         return _first(self.first_guesses(_alone(values)))
 
     def first_guesses(self, values: Array) -> Array:
-        """A slow gait that attracts each wheel; without one no state of any."""
+        """Return a slow attracting gait's section state for each wheel, NaN if there is none."""
         gaits = slow_gaits(self, values)
         found = np.asarray(gaits.outcome) == Outcome.STEPPED
         return jax.device_put(np.where(found[:, None], gaits.section_state, np.nan))
@@ -123,7 +125,7 @@ class GroundFinder(AbstractWalkingFinder):
         return _first(step_lanes(*given, ())[0])
 
     def measured(self, values: Values, guess: Any, names: tuple[str, ...]) -> Measured:
-        """As everywhere; of one Jacobian of the step."""
+        """Return measures and derivatives, as in the base class, from one Jacobian of the step."""
         model, params = self.model.at(tuple(jax.device_put(list(np.asarray(values)))), self.n_legs)
         start = guess.section_state if isinstance(guess, AbstractCycle) else guess
         start = self.first_guess(values) if start is None else start
@@ -132,17 +134,17 @@ class GroundFinder(AbstractWalkingFinder):
 
 
 def _alone(x: Array) -> Array:
-    """As the one row of many; by numpy, as JAX compiles a program for each shape."""
+    """Add a batch axis of length one, by numpy because JAX compiles a program for each shape."""
     return jax.device_put(np.asarray(x)[None])
 
 
 def _first(tree: Any) -> Any:
-    """The inverse, of many rows and trees too."""
+    """Return the first row of every leaf: the inverse of `_add_batch_axis`."""
     return jax.device_put(taken(tree, 0))
 
 
 def _states(model: AbstractWheel, params: WheelParams, guess: Any) -> Array:
-    """Full section states, wheel by wheel, of what a caller gives."""
+    """Return full section states of each wheel from a user's guess."""
     x = getattr(guess, "section_state", guess)
     if x is None:
         return jax.vmap(model.start)(params)
@@ -150,23 +152,24 @@ def _states(model: AbstractWheel, params: WheelParams, guess: Any) -> Array:
 
 
 class _Found(NamedTuple):
-    """Where Newton's method has come to; of many wheels with a leading axis."""
+    """Result of Newton's method; with a leading axis for many wheels."""
 
     x: Any  # section state
-    steps: Any  # from there, (period_n, ...)
-    moves: Any  # and their derivatives by values and section state
+    steps: Any  # from that state, (period_n, ...)
+    moves: Any  # derivatives with respect to values and section state
     residual: Any
     converged: Any
     iterations: Any
 
 
 class Periods(NamedTuple):
-    """Periods of wheels, as Newton's method asks for them; by lanes, from outside of programs."""
+    """Map over one period of each wheel for Newton's method, evaluated by the batched engine
+    outside jit."""
 
     model: Any
     n_legs: int
     period_n: int
-    values: np.ndarray  # wheel by wheel
+    values: np.ndarray  # (wheels, n_values)
 
     def of(self, some: np.ndarray) -> "Periods":
         return self._replace(values=self.values[some])
@@ -174,7 +177,8 @@ class Periods(NamedTuple):
     def around(
         self, options: Options, x: np.ndarray, by_values: Any = True, by_start: bool = True
     ) -> "Period":
-        """From there; derivatives by values, all or some, and by the section state."""
+        """Evaluate the period from `x`, with derivatives with respect to the masked values and the
+        section state."""
         told, (n, m) = [], (self.values.shape[1], x.shape[1])
         along, good = np.concatenate([np.zeros((m, n)), np.eye(m)], 1)[None], np.ones(len(x), bool)
         asked = np.concatenate([np.broadcast_to(by_values, n), np.broadcast_to(by_start, m)])
@@ -196,7 +200,7 @@ class Periods(NamedTuple):
 
 
 class Period(NamedTuple):
-    """Steps of one period, their derivatives, where they lead, by what of it, and which arrive."""
+    """Steps of one period, their Jacobians, the end state, its Jacobians, and which periods end."""
 
     steps: Any
     moves: Any
@@ -206,7 +210,7 @@ class Period(NamedTuple):
     good: np.ndarray
 
     def change(self, x: np.ndarray, by_start: np.ndarray) -> np.ndarray:
-        """Newton's correction of x; zeros where no period ends."""
+        """Return Newton's correction of x; zeros where no period ends."""
         change, good = np.zeros_like(x), self.good
         matrix = np.eye(x.shape[1]) - by_start[good]
         change[good] = solved(matrix, (self.image - x)[good][..., None])[..., 0]
@@ -214,7 +218,8 @@ class Period(NamedTuple):
 
 
 def solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """`numpy.linalg.solve` of many, which refuses all where one is singular: that one is NaN."""
+    """Return `numpy.linalg.solve` of many systems. A singular one gives NaN instead of an error for
+    all."""
     try:
         return np.linalg.solve(matrix, right)
     except np.linalg.LinAlgError:
@@ -232,11 +237,11 @@ def _newton(
     start: np.ndarray,
     by_values: bool,
 ) -> _Found:
-    """Fixed points near `start`; codes at the end of a section state are those of the image.
+    """Return fixed points near `start`. Codes at the end of a section state are those of the image.
 
-    First by loose steps until corrections are small, then by a step as exact as `options` with the
-    same Jacobian, which leads so near that one more, with all derivatives, tells the gait. Where
-    loose steps lead away from what an exact one hardly moves, all are exact.
+    The iteration uses loose steps until corrections are small. Then a step at the tolerance of
+    `options` is taken with the same Jacobian. One more step, with all derivatives, yields the gait.
+    If loose steps move away from a state that an exact one hardly changes, all steps are exact.
     """
     maps = Periods(model, n_legs, period_n, values)
     looser = [np.maximum(tolerance, LOOSE) for tolerance in (options.rtol, options.atol)]
@@ -261,11 +266,13 @@ def _corrected(
     wanted: np.ndarray,
     ends: bool = True,
 ) -> tuple[_Found, np.ndarray]:
-    """Newton's method on the `wanted` until a correction is small enough, and the last Jacobians.
+    """Run Newton's method on the `is_wanted` wheels until corrections are small; return the last
+    Jacobians too.
 
-    A correction that leads where no period ends is halved. A small correction `ends` it, or else
-    another evaluation, which tells the gait that it leads to: a period that repeats as well, for
-    where feet dip the map may jump between the two.
+    A correction after which no period ends is halved. A small correction ends the iteration if
+    `stops_at_small_correction` is set. Otherwise another evaluation follows, which gives the gait
+    at the corrected state. It also requires a period that repeats, because the map may jump between
+    the two states where feet dip.
     """
     wheels, n_legs = len(start), maps.n_legs
     x, last = start.copy(), start.copy()
@@ -338,7 +345,7 @@ def _gait(model: AbstractWheel, n_legs: int, values: Array, found: _Found) -> Ga
     d_step = jax.tree.map(lambda *leaves: jnp.stack(leaves, 1), *d_steps)
 
     cycle = _cycle(model, n_legs, values, found)
-    # Nothing here tells how the Jacobian itself moves: what depends on it is not `differentiable`.
+    # The derivative of the Jacobian is unknown: measures of it are not in `differentiable`.
     floating = eqx.filter(cycle, eqx.is_inexact_array)
     still = jax.tree.map(lambda x: jnp.zeros((n, *x.shape), x.dtype), floating)
     d_cycle = eqx.tree_at(

@@ -1,4 +1,4 @@
-"""Every numerical choice of the search for limit cycles in one visible object."""
+"""All numerical choices of the search for limit cycles in one options object."""
 
 import dataclasses
 
@@ -10,20 +10,20 @@ from vrw_jax.wording import positive, shown, whole
 
 @dataclasses.dataclass(frozen=True)
 class CycleOptions:
-    """Numerical choices of `limit_cycle`; each change compiles again.
+    """Numerical choices of `limit_cycle`. Each change compiles the search again.
 
     The defaults reach 1e-9 relative in values and 1e-8 in first derivatives.
 
-    - `steps`: of order 8 in DLS, SLS-I, SLS-II;
-    - `growth`: last over first step in SLS-I;
+    - `mesh_intervals`: of order 8, in DLS, SLS-I and SLS-II;
+    - `mesh_grading`: length of the last over the first mesh interval in SLS-I;
     - `tolerance`: of Newton's last correction, rad, rad/s, s or m;
-    - `iterations`: of Newton's method per attempt;
-    - `first_iterations`: after which a batch gathers the wheels that need more;
-    - `stages`: of a homotopy from Table 1, where the first attempt fails;
-    - `block`: wheels that are solved side by side.
+    - `max_newton_iterations`: of one attempt;
+    - `first_newton_iterations`: number after which a batch collects the wheels that need more;
+    - `homotopy_steps`: of a homotopy from Table 1, used if the first attempt fails;
+    - `batch_size`: number of wheels that are solved side by side.
 
     Examples:
-        >>> vrw.CycleOptions(steps=(20, 16, 6)).steps  # a finer mesh, for long steps
+        >>> vrw.CycleOptions(mesh_intervals=(20, 16, 6)).mesh_intervals  # a finer mesh
         (20, 16, 6)
     """
 
@@ -49,7 +49,7 @@ class CycleOptions:
         object.__setattr__(self, "steps", steps)
 
     def require_reachable(self, dtype: np.dtype) -> None:
-        """Refuse a tolerance below what the number format can resolve."""
+        """Raise a ValueError if the tolerance is below the resolution of the number format."""
         if self.tolerance < jnp.finfo(dtype).eps:
             raise ValueError(
                 f"the wheel holds {np.dtype(dtype).name} numbers, in which no limit cycle is found "
@@ -57,11 +57,12 @@ class CycleOptions:
             )
 
     def finer(self) -> "CycleOptions":
-        """With a mesh about twice as fine."""
+        """Return the options with a mesh about twice as fine."""
         dls, sls1, sls2 = self.steps
         return dataclasses.replace(self, steps=(2 * dls, 2 * sls1, max(2 * sls2, sls1)))
 
     @classmethod
     def tight(cls) -> "CycleOptions":
-        """Right to about 1e-12 in values and 1e-10 in first derivatives."""
+        """Return options that are accurate to about 1e-12 in values and 1e-10 in first
+        derivatives."""
         return cls(steps=(16, 20, 4), tolerance=1e-13)

@@ -1,4 +1,4 @@
-"""Premises of the paper's rung that whoever searches along gaits keeps, and with what margin."""
+"""Margins of the paper's model that searches along gaits keep, and their default least values."""
 
 from collections.abc import Mapping
 
@@ -9,7 +9,8 @@ from vrw_jax.wording import instance
 
 
 def takeoff_acceleration(s: Symbols, sls1: Passage) -> Elementwise:
-    """That of a gait, see `dynamics`, at the start of its passage through SLS-I."""
+    """Return the rear foot's acceleration at the start of a gait's passage through SLS-I, m/s^2;
+    see `dynamics`."""
     return dynamics.takeoff_acceleration(s, Motion.of(*sls1.start.q, *sls1.start.v))
 
 
@@ -26,25 +27,27 @@ PREMISES: tuple[str, ...] = (
     "lambda_2_plus",
     "lambda_4_plus",
 )
-"""Premises on forces, clearances and indicators that gaits of this rung can keep."""
+"""Margins on forces, clearances and indicators that gaits of this model can keep."""
 
 SHARE = 1e-3
-"""Default margin of a premise, as a share of the wheel's weight, leg length or gravity."""
+"""Default least value of a margin, as a share of the wheel's weight, leg length or gravity."""
 
 
 def default_margins(params: WheelParams) -> Mapping[str, float]:
-    """Least values of `PREMISES`: a thousandth of what their unit measures on this wheel.
+    """Return least values of `MARGIN_NAMES`: a thousandth of each unit's natural scale on this
+    wheel.
 
-    Not zero: at lambda_4_plus = 0, for one, the gait itself ends, and a search needs room.
+    The values are not zero because a search needs a distance from the limits. At lambda_4_plus = 0,
+    for example, the gait itself ends.
 
     Args:
-        params: the wheel, one.
+        params: one wheel.
 
     Returns:
-        Measures by name, each with its least value in its unit.
+        Least values by name of the measure, each in the measure's unit.
 
     Raises:
-        TypeError, ValueError: an argument that can't be meant, in one sentence.
+        TypeError, ValueError: an invalid argument, described in one sentence.
 
     Examples:
         >>> round(vrw.default_margins(vrw.WheelParams())["lambda_4_plus"], 3)

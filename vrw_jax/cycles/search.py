@@ -1,8 +1,8 @@
-"""Finding limit cycles of many wheels at once: starts, Newton's method, sign checks, retries.
+"""Search for limit cycles of many wheels at once: starts, Newton's method, sign checks, retries.
 
-Newton's method on the collocation system converges to formal solutions as gladly as to gaits, so a
-cycle counts as found only if every sign that its sequence of phases presumes holds at all nodes.
-Wheels still without a cycle after an attempt are packed together for the next one.
+Newton's method on the collocation system also converges to formal solutions that are no gaits. A
+cycle therefore counts as found only if every sign that its sequence of phases assumes holds at all
+nodes. Wheels still without a cycle after an attempt are packed together for the next one.
 """
 
 import functools
@@ -43,12 +43,12 @@ Parameters = Float[Array, "n_parameters lanes"]
 
 
 class Problem(NamedTuple):
-    """What is static in a search: which phases, how many steps, how finely cut."""
+    """Static data of a search: the phases, the number of steps and the meshes."""
 
     n_legs: int
     period_n: int
     options: CycleOptions
-    stop_at_lift_off: bool = True  # whether a ground that would have to pull is no gait
+    stop_at_lift_off: bool = True  # whether a pulling ground rules a gait out
 
     @property
     def sequence(self) -> PhaseSequence:
@@ -79,7 +79,8 @@ class Problem(NamedTuple):
     def passages(
         self, parameters: Array, solution: Solution
     ) -> tuple[Vector, list[tuple[Passage, ...]]]:
-        """Section after the last step, and the passages of each, of one wheel or of lanes."""
+        """Return the section after the last step and the passages of each step, of one wheel or of
+        lanes."""
         constants, section = self.constants_of(*parameters), tuple(solution.section)
         told = []
         for k in range(self.period_n):
@@ -94,34 +95,35 @@ class Problem(NamedTuple):
 
 
 class Located(NamedTuple):
-    """A solution of the collocation system, with what selects it. Floats only, lanes last."""
+    """Solution of the collocation system, with the data that select it. Floats only, lanes last."""
 
     solution: Solution
-    happens: LaneArray  # (n, n_phases, lanes): 1 where the phase takes place, else 0
-    found: LaneArray  # (lanes,): 1 for a limit cycle, 0 where there is none and values stand in
-    broken: LaneArray  # (lanes,): 1 + place in SIGNS of what a root that is no gait breaks, more
-    # by ON_THE_WAY where only a wheel on the way here has that root, LOST, else 0
+    happens: LaneArray  # (n, n_phases, lanes): 1 if the phase takes place, else 0
+    found: LaneArray  # (lanes,): 1 for a limit cycle, 0 if there is none and values are substitutes
+    broken: LaneArray  # (lanes,): 1 + index in ADMISSIBILITY_CHECKS of the check that a root fails;
+    # plus HOMOTOPY_OFFSET for a root of a wheel on the homotopy; NEWTON_FAILED; else 0
     ends: LaneArray  # (n, 4, lanes): theta, L1 and their rates at the end of each step
 
 
 class Finding(NamedTuple):
-    """The result of a search, lanes last."""
+    """Result of a search, lanes last."""
 
     located: Located
     monodromy: LaneArray  # (row, column, lanes)
-    residual: LaneArray  # size of Newton's last correction
-    passes: Int[Array, " lanes"]  # linearised passes spent
+    residual: LaneArray  # norm of Newton's last correction
+    passes: Int[Array, " lanes"]  # number of linearized passes
 
 
 @functools.cache
 def name_for_export() -> None:
-    """Tell JAX by what names traces on disk know these types: once in a process."""
+    """Register the names of these types for exported traces on disk, once in a process."""
     for kind in (Solution, Located, Finding):
         export.register_namedtuple_serialization(kind, serialized_name=f"vrw_jax.{kind.__name__}")
 
 
 def surface_start(problem: Problem, parameters: Parameters, with_dls: Array) -> Located:
-    """The gait that the stored surface predicts; without DLS its duration goes to SLS-I."""
+    """Return the gait that the stored surface predicts. Without DLS its duration is added to
+    SLS-I."""
     predicted = gait_on_surface(wheel_of(parameters, problem.n_legs), problem.meshes)
     first, second, third = predicted.durations[0]
     durations = jnp.stack(
@@ -136,7 +138,7 @@ def surface_start(problem: Problem, parameters: Parameters, with_dls: Array) -> 
 
 
 def start_from(problem: Problem, section: Array, durations: Array, with_dls: Array) -> Located:
-    """Section and durations of one step, repeated; accelerations zero."""
+    """Return a start with section and durations of one step, repeated, and zero accelerations."""
     n, n_phases = problem.period_n, len(problem.sequence.phases)
     lanes = section.shape[-1]
     accelerations = tuple(
@@ -152,14 +154,15 @@ def start_from(problem: Problem, section: Array, durations: Array, with_dls: Arr
 
 
 def nothing_known(problem: Problem, section: Array) -> tuple[Array, Array, Array]:
-    """`found`, `broken` and `ends` of a start."""
+    """Return `found`, `failed_check` and `ends` of a start."""
     lanes, n_ends = section.shape[1:], 2 * problem.sequence.phases[-1].dim
     zeros = lambda *shape: jnp.zeros((*shape, *lanes), section.dtype)
     return zeros(), zeros(), zeros(problem.period_n, n_ends)
 
 
 def over_rows(combine: Callable[[Array, Array], Array], x: Array) -> LaneArray:
-    """Reduction over all axes but the lanes, by halves: XLA's own runs along the wrong axis."""
+    """Reduce over all axes but the lanes, by halves, because XLA's reduction runs along the wrong
+    axis."""
     if simd.tracing():
         whole = jnp.max if combine is jnp.maximum else jnp.min
         return whole(x, axis=tuple(range(x.ndim - 1)))
@@ -172,7 +175,8 @@ def over_rows(combine: Callable[[Array, Array], Array], x: Array) -> LaneArray:
 
 
 def correction_size(solution: Solution, correction: Solution) -> LaneArray:
-    """Largest entry of a correction, accelerations weighed by their effect on positions."""
+    """Return the largest entry of a correction. Accelerations are weighted by their effect on
+    positions."""
     largest = functools.partial(over_rows, jnp.maximum)
     size = jnp.maximum(largest(jnp.abs(correction.section)), largest(jnp.abs(correction.durations)))
     for i, change in enumerate(correction.accelerations):
@@ -182,7 +186,8 @@ def correction_size(solution: Solution, correction: Solution) -> LaneArray:
 
 
 def _limited(solution: Solution, correction: Solution) -> LaneArray:
-    """The share of a correction that moves no number of the section and no duration too far."""
+    """Return the fraction of a correction that keeps all changes of section and durations within
+    limits."""
     step_time = jnp.sum(solution.durations, 1, keepdims=True)
     room = jnp.concatenate(
         [
@@ -201,7 +206,7 @@ def _limited(solution: Solution, correction: Solution) -> LaneArray:
 
 
 def columns_of(passed: Linearised, located: Located) -> Located:
-    """The columns of a pass; what selects a solution has none."""
+    """Return the tangents of a pass. The data that select a solution have zero tangents."""
     flat = lambda x: jnp.zeros((passed.d_ends.shape[0], *x.shape), x.dtype)
     found, broken = flat(located.found), flat(located.broken)
     return Located(passed.columns, flat(located.happens), found, broken, passed.d_ends)
@@ -240,11 +245,11 @@ def newton(
     iterations: Array | int,
     pending: Bool[Array, " lanes"],
 ) -> Finding:
-    """Newton's method with limited steps on the lanes that are `pending`.
+    """Run Newton's method with limited steps on the `pending` lanes.
 
-    During the first `stages` iterations the parameters move from `origin` to where they belong. A
-    lane that converged, or whose corrections rounding keeps from shrinking, stands still, so that
-    its result does not depend on its neighbours.
+    During the first `homotopy_steps` iterations the parameters move from `origin` to their final
+    values. A lane stops when it converges or when rounding keeps its corrections from decreasing.
+    Its result therefore does not depend on its neighbors.
     """
     options = problem.options
     eps = float(jnp.finfo(parameters.dtype).eps)
@@ -294,7 +299,7 @@ def newton(
 
 
 def _least_guards(phase: Phase, constants: Constants, passage: Passage) -> Vector:
-    """Each guard's least value at the phase's start and nodes, all guards in one loop."""
+    """Return each guard's minimum over the phase's start and nodes, all guards in one loop."""
 
     def lower(least: Vector, node: tuple[Array, Array]) -> tuple[Vector, None]:
         q, v = node
@@ -307,9 +312,9 @@ def _least_guards(phase: Phase, constants: Constants, passage: Passage) -> Vecto
 
 
 def first_broken(problem: Problem, parameters: Parameters, located: Located) -> LaneArray:
-    """1 + the place in SIGNS of the first that does not hold, 0 where all do.
+    """Return 1 + the index in ADMISSIBILITY_CHECKS of the first failed check, 0 if all hold.
 
-    Durations, guards at all nodes and the checks at all borders must be positive.
+    Durations, guards at all nodes and the checks at all transitions must be positive.
     """
     sequence = problem.sequence
     constants = problem.constants_of(*parameters)
@@ -356,7 +361,7 @@ def _attempted(
     pieces = [0] * len(ATTEMPTS) + [1 + i // 2 for i in range(2 * PIECES)]
     of_now = lambda table: jnp.asarray(table, jnp.int32)[attempt]
     origin = jnp.broadcast_to(table_1[:, None], parameters.shape)
-    # Each piece is tried twice: from the wheel before it, then without double support.
+    # Each segment is tried twice: from the previous wheel, then without double support.
     piece, again = of_now(pieces), of_now([0] * len(ATTEMPTS) + [0, 1] * PIECES) == 1
     in_pieces = piece > 0
     arrived = ~in_pieces | (piece == PIECES)
@@ -380,7 +385,7 @@ def _attempted(
         located = jax.tree.map(lambda a, b: jnp.where(in_pieces, a, b), on_the_way, tried.located)
         tried = tried._replace(located=located)
     chosen = jax.tree.map(lambda a, b: jnp.where(pending, a, b), tried, now)
-    # The first root that is no gait is told, unless only the mesh forbids another one.
+    # The first inadmissible root is reported, unless a later one fails only the mesh check.
     before, after = now.located.broken, chosen.located.broken
     broken = jnp.where((before <= 0.0) | (after == MESH), after, before)
     broken = jnp.where(chosen.located.found > 0.5, 0.0, broken)
@@ -389,7 +394,8 @@ def _attempted(
 
 
 def _on_the_way(tried: Located, arrived: Array, lost: Array) -> Located:
-    """What a wheel on the way tells of the one at its end; `lost` where it tells nothing."""
+    """Return what a wheel on the homotopy implies for the wheel at its end, `failure_code` if
+    nothing."""
     found, broken = tried.found, tried.broken
     goes_on = ~arrived & ((found > 0.5) | (broken == MESH))
     ends = jnp.where(arrived, broken, broken + ON_THE_WAY)
@@ -406,9 +412,10 @@ def search_lanes(
     end: Int[Array, ""],
     guess: Located | None = None,
 ) -> Finding:
-    """The attempts from `attempt` to before `end`, in turn, on the lanes without a cycle so far.
+    """Run the attempts from `attempt_index` to before `end_index`, in turn, on the lanes without a
+    cycle.
 
-    Parameters must be usable.
+    The parameters must be in their domains.
     """
 
     def more(carry: tuple[Array, Finding]) -> Array:
@@ -423,13 +430,14 @@ def search_lanes(
 
 
 def in_stages(problem: Problem, search: LaneFunction, *given: Any) -> Finding:
-    """A limit cycle for each lane of (parameters, guess if any), by all attempts of `search`.
+    """Return a limit cycle for each lane of (parameters, guess if any), by all attempts of
+    `search`.
 
-    Lanes are searched a few side by side, which wait for each other: before each stage those that
-    are still without a cycle are gathered.
+    Blocks of lanes are searched side by side, and a block takes as long as its slowest lane. Before
+    each stage, the lanes that are still without a cycle are therefore gathered.
     """
     parameters, n_lanes = given[0], given[0].shape[-1]
-    # Of several steps a repeated gait of one would be followed: that tells nothing.
+    # With several steps, a repeated gait of one step would be followed, which decides nothing.
     n_attempts = len(ATTEMPTS) + 2 * PIECES * (problem.period_n == 1)
     first = jnp.asarray(ATTEMPTS.index("surface" if len(given) == 1 else "guess"), jnp.int32)
     now = not_searched(problem, parameters)
@@ -454,7 +462,7 @@ def in_stages(problem: Problem, search: LaneFunction, *given: Any) -> Finding:
 
 
 def _open(attempt: Int[Array, ""], now: Finding) -> Bool[Array, " lanes"]:
-    """Whether this attempt may still tell something of a lane."""
+    """Return whether this attempt can still change the result of a lane."""
     known = (now.located.broken > 0.0) | (now.located.broken == LOST)
     return (now.located.found < 0.5) & ((attempt < len(ATTEMPTS)) | ~known)
 
@@ -471,26 +479,29 @@ def not_searched(problem: Problem, parameters: Parameters) -> Finding:
 
 
 MESH = len(SIGNS)
-"""`Located.broken` of a root that the mesh does not resolve."""
+"""`CollocationState.failed_check` of a root that the mesh does not resolve."""
 
 ON_THE_WAY, LOST_ONCE, LOST = float(len(SIGNS)), -1.0, -2.0
-"""In `Located.broken`: added to what breaks before the wheel is reached; Newton's method failed."""
+"""Codes in `CollocationState.failed_check`. The first is the offset of a check that fails before
+the wheel is reached. The others are failures of Newton's method at the first try and at both."""
 
 ZERO_AT_EVENT = 1e-6
-"""How far below zero a guard may be at the end of the phase that it ends, N, m or rad/s."""
+"""Tolerance below zero of a guard at the end of the phase that it ends, N, m or rad/s."""
 
 LARGEST_MESH_ERROR = 1e-5
-"""Estimate above which a solution does not count as found: the errors themselves stay below, in all
-of some hundred random wheels, and mostly by far."""
+"""Estimate of the mesh error above which a solution does not count as found. In all of some hundred
+random wheels the errors themselves are below it, and mostly by far."""
 
 ATTEMPTS = ("guess", "guess, on", "surface", "surface, on", "homotopy", "without DLS")
-"""In turn: from the guess, if any; from the gait that the stored surface predicts; by a homotopy
-from Table 1; and for a cycle without double support. The first two begin with a few iterations, so
-that in a batch the lanes that need more can be gathered in blocks of their own."""
+"""Attempts in their order. They start from the guess, if any, and from the gait that the stored
+surface predicts. A homotopy from Table 1 follows, then a cycle without double support. The first
+two begin with a few iterations, so that a batch can gather the lanes that need more in separate
+blocks."""
 
 FEW = 16
-"""Lanes of which none are gathered."""
+"""Largest number of lanes that are searched without gathering."""
 
 PIECES = 16
-"""Where there is no root at all, the gait of Table 1 is followed from wheel to wheel on the line to
-this one: either it arrives, or the way tells what ends it."""
+"""Number of segments of the homotopy. If no root is found, the gait of Table 1 is followed from
+wheel to wheel on the line to this wheel. Either it arrives, or the segment where it ends gives the
+reason."""

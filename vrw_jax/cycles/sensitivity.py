@@ -1,4 +1,4 @@
-"""How every measure of a gait answers to every parameter, as a labelled table."""
+"""Sensitivities of every measure of a gait to every parameter, as a labeled table."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ def sensitivities(
     model: ModelLike | None = None,
     options: CycleOptions | Options | None = None,
 ) -> xr.Dataset:
-    """d(measure)/d(parameter) of one gait, plain and as elasticities, with the measures' values.
+    """Return d(measure)/d(parameter) of one gait, with elasticities and the values of the measures.
 
-    An elasticity is the relative change of the measure over that of the parameter; NaN where the
-    measure is zero. Leaving out the measures of stability saves most of the compile time. `guess`,
-    `model` and `options` are those of `limit_cycle`; "auto" takes the rung that serves the gait,
-    and `attrs` say which. On real ground friction is a parameter too.
+    An elasticity is the relative change of the measure per relative change of the parameter. It is
+    NaN where the measure is zero. Leaving out the stability measures saves most of the compile
+    time. With unilateral contact, friction is a parameter too. With model "auto", `attrs` names the
+    model that was selected for the gait.
 
     Args:
         params: the wheel.
-        measures: their names; by default all that the rung's gait has.
+        measures: names of measures; by default all that the model's gait has.
         guess: as in `limit_cycle`.
-        model: the rung; the paper's, `ViscoelasticWheel()`, by default.
+        model: the model; the paper's, `ViscoelasticWheel()`, by default.
         options: as in `limit_cycle`.
 
     Returns:
         A dataset of `value` (measure), `derivative` and `elasticity` (measure, parameter).
 
     Raises:
-        TypeError, ValueError: an argument that can't be meant, in one sentence.
+        TypeError, ValueError: an invalid argument, described in one sentence.
 
     Examples:
         >>> table = vrw.sensitivities(vrw.WheelParams(), measures=["dls_fraction", "speed"])

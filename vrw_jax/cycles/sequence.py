@@ -1,8 +1,9 @@
-"""The paper's phases as data for the collocation: what moves, what ends it, what jumps.
+"""The paper's phases as data for the collocation: dynamics, end events and resets.
 
-`held_landing` has the plane section (theta+, dtheta+) just after an impact that ends with both feet
-on the ground; its double support may be left out (then the rear foot lifts at once, case B3).
-An impact that throws the rear foot off (case A3) leaves that plane: such gaits are not found here.
+`held_landing_sequence` uses the plane section (theta+, dtheta+) just after an impact that ends with
+both feet on the ground. Its double support may be absent; then the rear foot lifts at once (case
+B3). An impact that throws the rear foot off (case A3) leaves that plane, so such gaits are not
+found here.
 """
 
 import functools
@@ -35,11 +36,12 @@ from vrw_jax.wheel import (
 )
 
 N_CONSTANTS = 12
-"""Fields of `Symbols` that vary from lane to lane; the rest follows from the number of legs."""
+"""Number of fields of `Symbols` that vary between lanes. The other fields follow from the number of
+legs."""
 
 
 def constants_of(n_legs: int, *parameters: Elementwise) -> Constants:
-    """The combinations that every formula needs, from the parameters in their order."""
+    """Return the combinations that every formula needs, from the parameters in their order."""
     symbols: tuple[Any, ...] = symbols_of(n_legs, *parameters)
     return symbols[:N_CONSTANTS]
 
@@ -51,7 +53,7 @@ def _symbols(n_legs: int, constants: Constants) -> Symbols:
 
 
 def _collocated(n_legs: int, stop_at_lift_off: bool, index: int) -> Phase:
-    """A phase of the wheel over the constants of `constants_of`."""
+    """Return a phase of the wheel as a function of the constants of `compute_constants`."""
     kind = PHASES[index]
 
     def at(constants: Constants, point: Point) -> tuple[AbstractPhase, Motion]:
@@ -69,7 +71,7 @@ def _collocated(n_legs: int, stop_at_lift_off: bool, index: int) -> Phase:
     def guards(constants: Constants, point: Point) -> Vector:
         phase, motion = at(constants, point)
         guards = phase.guards(Instant(phase, motion, None))
-        # Every guard keeps its place in SIGNS, the one that nobody looks at too.
+        # Every guard keeps its index in ADMISSIBILITY_CHECKS, even a guard that is not checked.
         return guards if stop_at_lift_off else (*guards[:-1], jnp.ones_like(guards[-1]))
 
     def to_next_phase(constants: Constants, point: Point) -> Point:
@@ -95,13 +97,13 @@ def _signs() -> tuple[str, ...]:
 
 
 SIGNS = (*_signs(), "mesh")
-"""What is presumed of a gait, in the order in which it is looked at: by phase its duration and its
-guards, then the checks at the borders between phases; and that the mesh resolves it at all."""
+"""Assumptions about a gait, in the order of the checks. Each phase has its duration and its guards;
+then follow the checks at the transitions between phases and the resolution of the mesh."""
 
 
 @functools.cache
 def held_landing(n_legs: int, stop_at_lift_off: bool = True) -> PhaseSequence:
-    """DLS, SLS-I, SLS-II on the plane section (theta+, dtheta+) after the impact."""
+    """Return DLS, SLS-I and SLS-II on the plane section (theta+, dtheta+) after the impact."""
     phases = tuple(_collocated(n_legs, stop_at_lift_off, index) for index in range(len(PHASES)))
 
     def start(constants: Constants, section: Vector) -> Point:

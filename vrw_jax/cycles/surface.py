@@ -1,9 +1,11 @@
-"""Where gaits are: a cubic surface through gaits of many wheels, as the start of every search.
+"""Prediction of gaits by a cubic surface fitted to the gaits of many wheels; the start of every
+search.
 
-Lengths are in L0, times in sqrt(L0 / g), masses in the total mass, so that a wheel of any size
-finds its start here. The surface was fitted by experiments/gaits/fit_surface.py to the gaits that a
-continuation from Table 1 reaches, for Table 1's mass ratio, centre of mass and eight legs; it is
-right to about 1 % there and, clipped to its range, a start for a homotopy elsewhere.
+Lengths are in L0, times in sqrt(L0 / g) and masses in the total mass, so that wheels of any size
+are covered. The surface was fitted by experiments/gaits/fit_surface.py to the gaits that a
+continuation from Table 1 reaches. The fit uses Table 1's mass ratio, center of mass and eight legs.
+There it is accurate to about 1 %. Elsewhere it is clipped to its range and is a start for a
+homotopy.
 """
 
 import functools
@@ -20,13 +22,14 @@ from vrw_jax.numerics import N_NODES, Elementwise, Mesh, Solution, transfer_matr
 from vrw_jax.wheel import WheelParams
 
 MESHES = (Mesh(2, 1.0), Mesh(4, 2.0), Mesh(1, 1.0))
-"""Meshes that the surface's accelerations are for: DLS, SLS-I, SLS-II."""
+"""Meshes of the surface's accelerations, for DLS, SLS-I and SLS-II."""
 DIMENSIONS = (1, 3, 2)
 DEGREE = 3
 
 
 class Surface(NamedTuple):
-    """Coefficients (monomial, unknown) over centred coordinates, and the range they hold in."""
+    """Coefficients (monomial, unknown) over centered coordinates, and the range of the
+    coordinates."""
 
     centre: np.ndarray
     spread: np.ndarray
@@ -43,12 +46,12 @@ def stored_surface() -> Surface:
 
 
 def pace(params: WheelParams) -> Elementwise:
-    """The wheel's unit of time, sqrt(L0 / g), s."""
+    """Return the wheel's unit of time, sqrt(L0 / g), s."""
     return jnp.sqrt(params.locked_length / params.gravity)
 
 
 def coordinates(params: WheelParams) -> tuple[Elementwise, ...]:
-    """Root of damping, stiffness, natural length and slope, unitless."""
+    """Return the root of damping, stiffness, natural length and slope, unitless."""
     mass = params.hub_mass + params.n_legs * params.leg_mass
     length, gravity = params.locked_length, params.gravity
     return (
@@ -69,9 +72,10 @@ def monomials(centred: tuple[Elementwise, ...]) -> list[Elementwise]:
 
 
 def gait_on_surface(params: WheelParams, meshes: tuple[Mesh, ...]) -> Solution:
-    """Section, durations and accelerations on `meshes` of the surface's gait, lanes last."""
+    """Return section, durations and accelerations on `meshes` of the surface's gait, with lanes
+    last."""
     fit = stored_surface()
-    numbers = (x.tolist() for x in fit[:4])  # plain floats keep the format of the parameters
+    numbers = (x.tolist() for x in fit[:4])  # Python floats preserve the dtype of the parameters
     centred = tuple(
         (jnp.clip(x, low, high) - centre) / spread
         for x, centre, spread, low, high in zip(coordinates(params), *numbers, strict=True)
@@ -94,7 +98,7 @@ def gait_on_surface(params: WheelParams, meshes: tuple[Mesh, ...]) -> Solution:
 
 
 def _acceleration_scale(dim: int, params: WheelParams, unit: Elementwise) -> Array:
-    """Units of (theta, L1, L2) over time squared."""
+    """Return the units of the accelerations of (theta, L1, L2)."""
     angle = 1.0 / unit**2
     length = params.locked_length / unit**2
     return jnp.stack([angle, length, length][:dim])
