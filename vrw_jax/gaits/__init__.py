@@ -1,3 +1,3 @@
-"""Gaits that walks reach: the search, and where it fails finer meshes and walks."""
+"""Gaits that walks reach: the search with finer meshes and walks as fallbacks."""
 
 from vrw_jax.gaits.reaching import SHAPES, Which, limit_cycle, limit_cycles, place_in_list, reached

@@ -1,9 +1,9 @@
-"""The gait of a wheel wherever one can be reached: searched for, on a finer mesh, walked to.
+"""Limit cycles wherever a gait can be reached: by a search, on finer meshes, or from walks.
 
-The search (`cycles`) begins where gaits are in the paper's box and on a mesh that suits them. Where
-it fails, lanes walk (`batches`) from starts that scale with the wheel, and a walk that goes on is
-the start of another search; where the mesh fails, it is made finer. Only values decide: under a
-`jit` or `vmap` of the caller the search is alone.
+The search (`cycles`) starts from predicted gaits of the paper's parameter ranges, on a mesh that
+suits them. If it fails, batches of walks (`batches`) begin at starts that scale with the wheel. A
+walk that continues is the start of another search. If the mesh is too coarse, it is refined. These
+fallbacks depend on concrete values; under a `jit` or `vmap` of the caller only the search runs.
 """
 
 import functools
@@ -44,24 +44,25 @@ LOST = (
 """Outcomes of a search that may have missed a gait."""
 
 MESH_ERROR = 1e-7
-"""Estimate of the mesh's error above which a finer mesh is taken: the errors themselves are a
-hundredth of it, and what the options promise."""
+"""Estimate of the mesh's error above which a finer mesh is used. The errors themselves are a
+hundredth of it, as the options promise."""
 
 N_STEPS = 80
-"""Steps of a walk towards a gait of the paper's rung."""
+"""Number of steps of a walk towards a gait of the paper's model."""
 
 REFINEMENTS = 3
-"""How often a mesh is made twice as fine at most."""
+"""Largest number of times that a mesh is made twice as fine."""
 
 SHAPES = (8, 64, 512, 4096)
-"""Numbers of lanes that programs are compiled for: one alone takes the time of eight."""
+"""Batch sizes that programs are compiled for. A single wheel takes the time of eight."""
 
 
 Lost = Literal["zeros", "nan"]
 ZEROS_OR_NAN: tuple[str, ...] = get_args(Lost)
 
 Which = Literal["slowest", "fastest"] | int
-"""Of the gaits of a wheel that attract, by speed: an end of their list, or a place in it."""
+"""Choice among the attracting gaits of a wheel, by speed: the slowest, the fastest, or an index,
+slowest first."""
 
 
 @overload
@@ -100,48 +101,52 @@ def limit_cycle(
     lost: Lost = "zeros",
     which: Which = "slowest",
 ) -> LimitCycle | WalkedCycle:
-    """The limit cycle of this wheel: the gait that repeats after `period_n` steps.
+    """Return the limit cycle of this wheel: the gait that repeats after `period_n` steps.
 
-    Needs no start for `period_n` 1. `guess`, a neighbour's cycle or a section state (theta-,
-    dtheta-, dL1-) near the gait, makes it quicker and picks the branch. Found cycles satisfy the
-    paper's sequence of phases at all nodes, stable or not. Errors: 1e-9 relative in values, 1e-8 in
-    first derivatives; without `options` the mesh is made as fine as that needs, with them it is
-    theirs, and `mesh_error` tells what it leaves. Differentiable in every mode and order.
+    For `period_n` 1 no start is needed. With a `guess`, a neighbor's cycle or a section state
+    (theta-, dtheta-, dL1-) near the gait, the search is faster and selects that branch. Found
+    cycles satisfy the paper's sequence of phases at all nodes, stable or not. Errors are 1e-9
+    relative in values and 1e-8 in first derivatives. Without `options` the mesh is made as fine as
+    these errors require. With `options` the mesh is fixed, and `mesh_error` estimates its error.
+    The cycle is differentiable in every mode and order.
 
-    Where the search fails, walks are tried, and finer meshes. Under `jax.jit` and `jax.vmap`
-    neither can be: the search is alone there, on the mesh of the options. See `limit_cycles`.
+    If the search fails, walks and finer meshes are tried. Under `jax.jit` and `jax.vmap` neither is
+    possible; the search then runs alone, on the mesh of the options. See `limit_cycles`.
 
-    Where none was found, `outcome` and `why` say so and numbers and derivatives are zeros; with
-    `lost="nan"` they are NaN, for optimisation loops that should not stand still there in silence.
+    If no gait is found, `outcome` and `explanation` give the reason, and numbers and derivatives
+    are zero. With `on_failure="nan"` they are NaN, so that an optimization loop does not stop
+    unnoticed.
 
-    Any other rung as `model` is solved on its own return map, with `Options` of its step: a
-    `WalkedCycle`, to the step's errors. On real ground several gaits may attract: without a `guess`
-    walks from a stated set of starts tell them apart (`cycles.attracting`), and `which` takes the
-    "slowest", the "fastest" or a place in their list, slowest first. `limit_cycles` tells all.
-    "auto" is the lowest rung whose premises the gait keeps on its ground: a `LimitCycle` is the
-    paper's, a `WalkedCycle` that of real ground.
+    For any other model, the fixed point of its return map is computed, with the `StepOptions` of
+    its step. The result is a `ReturnMapCycle` with the errors of the step. With unilateral contact
+    several gaits may attract. Without a `guess`, walks from a stated set of starts distinguish them
+    (`cycles.attracting_gaits`). `which` selects the "slowest", the "fastest" or an index in their
+    list, slowest first. `limit_cycles` returns all. Model "auto" selects the lowest model whose
+    margins the gait meets on its ground. A `LimitCycle` then belongs to the paper's model, a
+    `ReturnMapCycle` to unilateral contact.
 
     Args:
         params: the wheel.
-        guess: a neighbour's cycle, or a section state near the gait; a lost cycle counts as none.
-        period_n: steps until the gait repeats.
-        model: the rung; the paper's, `ViscoelasticWheel()`, by default.
-        options: `CycleOptions`; on other rungs `Options` of the step.
-        lost: what stands where there is no gait, "zeros" or "nan".
-        which: on real ground "slowest", "fastest", or a place in the list, slowest first.
+        guess: a neighbor's cycle, or a section state near the gait; a cycle that was not found
+            counts as no guess.
+        period_n: number of steps after which the gait repeats.
+        model: the model; the paper's, `ViscoelasticWheel()`, by default.
+        options: `CycleOptions`; for other models `StepOptions`.
+        on_failure: values where there is no gait, "zeros" or "nan".
+        which: with unilateral contact "slowest", "fastest", or an index in the list, slowest first.
 
     Returns:
-        A `LimitCycle`; a `WalkedCycle` on other rungs.
+        A `LimitCycle`; a `ReturnMapCycle` for other models.
 
     Raises:
-        TypeError, ValueError: an argument that can't be meant, in one sentence.
+        TypeError, ValueError: an invalid argument, described in one sentence.
 
     Examples:
         >>> cycle = vrw.limit_cycle(vrw.WheelParams())
         >>> print(f"{cycle.dls_fraction:.4f} {cycle.speed:.4f} m/s")
         0.5315 0.8700 m/s
-        >>> slope = jax.grad(lambda p: vrw.limit_cycle(p).dls_fraction)(vrw.WheelParams())
-        >>> print(f"{slope.damping:.6f} per N s/m")
+        >>> gradient = jax.grad(lambda p: vrw.limit_cycle(p).dls_fraction)(vrw.WheelParams())
+        >>> print(f"{gradient.damping:.6f} per N s/m")
         0.000115 per N s/m
     """
     place_in_list(which)
@@ -165,23 +170,24 @@ def limit_cycles(
     options: CycleOptions | Options | None = None,
     which: Which = "slowest",
 ) -> LimitCycle | WalkedCycle:
-    """`limit_cycle` of a batch of wheels side by side; fields have one leading axis, or none.
+    """Return `limit_cycle` of a batch of wheels. Fields of `params` and of the result have one
+    leading axis.
 
-    The result's fields have it too. All are told on one mesh, as fine as any of them needs. Of one
-    wheel on real ground all gaits that attract, slowest first.
+    All cycles are computed on one mesh, as fine as any of them needs. For a single wheel with
+    unilateral contact, return all attracting gaits, slowest first.
 
     Args:
-        params: the wheels; fields are scalars or of shape (lanes,).
-        period_n: steps until the gaits repeat.
-        model: the rung; the paper's, `ViscoelasticWheel()`, by default.
+        params: the wheels; fields are scalars or of shape (wheels,).
+        period_n: number of steps after which the gaits repeat.
+        model: the model; the paper's, `ViscoelasticWheel()`, by default.
         options: as in `limit_cycle`.
         which: as in `limit_cycle`, for batches.
 
     Returns:
-        A `LimitCycle` or `WalkedCycle` whose fields have a leading axis of lanes.
+        A `LimitCycle` or `ReturnMapCycle` whose fields have a leading axis over wheels.
 
     Raises:
-        TypeError, ValueError: an argument that can't be meant, in one sentence.
+        TypeError, ValueError: an invalid argument, described in one sentence.
 
     Examples:
         >>> cycles = vrw.limit_cycles(vrw.WheelParams(damping=np.array([100.0, 150.0, 300.0])))
@@ -206,7 +212,10 @@ def limit_cycles(
 
 
 def place_in_list(which: Which) -> int:
-    """Of a list of gaits, slowest first; one clear sentence for what is none."""
+    """Return the index of a gait in a list sorted by speed, slowest first.
+
+    Raises: ValueError: the choice is neither a name nor an integer.
+    """
     if which in ("slowest", "fastest"):
         return 0 if which == "slowest" else -1
     if isinstance(which, str) or int(which) != which:
@@ -226,13 +235,13 @@ def _chosen(finder: Any, params: WheelParams, which: Which) -> Any:
         n = int(few[0])
         raise ValueError(
             f"which is {which}, but {n} gait{'s' * (n > 1)} of this wheel attract"
-            f"{'s' * (n == 1)}: vrw.limit_cycles(params, model=...) tells them."
+            f"{'s' * (n == 1)}: vrw.limit_cycles(params, model=...) returns them."
         )
     return _taken(gaits, slowest(owner, wheels) + place % counts)
 
 
 def _wherever(finder: Any, params: WheelParams, guess: Any, adaptive: bool, which: Which) -> Any:
-    """The cycle of one wheel or of a batch, by all means."""
+    """Return the cycle of one wheel or of a batch, by the search and all fallbacks."""
     many = params.damping.ndim > 0
     still = lax.stop_gradient(params)
     hidden, plain = traced(still), not traced(params)
@@ -241,7 +250,7 @@ def _wherever(finder: Any, params: WheelParams, guess: Any, adaptive: bool, whic
         cycle = cycle if many else _taken(cycle, 0)
         return cycle if plain else _searched(finder, params, cycle.section_state)
     cycle = _searched(finder, params, guess)
-    known = lax.stop_gradient((params, cycle))  # what derivatives are taken of has values, too
+    known = lax.stop_gradient((params, cycle))  # differentiated arrays have values, too
     if not finder.from_nothing or traced(known):
         return cycle
     if not many:
@@ -256,7 +265,7 @@ def _wherever(finder: Any, params: WheelParams, guess: Any, adaptive: bool, whic
         return cycle
     finder, located = reached
     if plain:
-        cycle = in_batches(finder.cycles, SHAPES, known[0], located)  # a program that is there
+        cycle = in_batches(finder.cycles, SHAPES, known[0], located)  # a compiled program
         return cycle if many else _taken(cycle, 0)
     return _searched(finder, params, jax.device_put(located) if many else _taken(located, 0))
 
@@ -266,7 +275,7 @@ def _searched(finder: AbstractGaitFinder, params: WheelParams, guess: Any) -> An
 
 
 def _taken(tree: Any, places: Any) -> Any:
-    """Rows of a tree by numpy: JAX would compile a program for each shape."""
+    """Return rows of a tree by numpy, because JAX would compile a program for each shape."""
     return jax.device_put(taken(tree, places))
 
 
@@ -282,8 +291,10 @@ def _put(tree: Any, places: np.ndarray, values: Any) -> Any:
 def _walked_from(
     finder: CollocationFinder, params: WheelParams, x: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of each lane where N_STEPS lead, and by how much it misses that state a period later;
-    infinite where a walk ended before."""
+    """Walk N_GAIT_WALK_STEPS from each state and measure the defect of one more period.
+
+    The defect is infinite where a walk ended early.
+    """
     there = steps(params, x, N_STEPS, model=finder.model)
     states, on = np.array(there.section_state), np.asarray(there.outcome) == Outcome.STEPPED
     missed = np.full(len(states), np.inf)
@@ -295,10 +306,10 @@ def _walked_from(
 
 
 class _Walks(NamedTuple):
-    """Where walks of a batch of wheels are after N_STEPS."""
+    """State of a batch of wheels after walks of N_GAIT_WALK_STEPS."""
 
-    reached: np.ndarray  # whether one goes on, and repeats to NEAR
-    x: np.ndarray  # (lanes, 3): section state of the one that repeats best
+    reached: np.ndarray  # whether a walk continues, and repeats to START_DISTANCE
+    x: np.ndarray  # (wheels, 3): section state of the walk that repeats best
 
 
 def _walked(finder: CollocationFinder, params: WheelParams, wanted: np.ndarray) -> _Walks:
@@ -318,7 +329,8 @@ def _walked(finder: CollocationFinder, params: WheelParams, wanted: np.ndarray) 
 def _begun(
     finder: CollocationFinder, params: WheelParams, located: Located, has: np.ndarray, walks: _Walks
 ) -> Located:
-    """Where searches begin: at what was located, else along walks, else on the surface of gaits."""
+    """Return the starts of searches: the known states, else states from walks, else the surface of
+    gaits."""
     start = in_batches(lambda own: finder.first_guesses(parameters_of(own).T), SHAPES, params)
     along = np.flatnonzero(walks.reached & ~has)
     if len(along):
@@ -330,9 +342,10 @@ def _begun(
 def _reached(
     finder: CollocationFinder, params: WheelParams, cycle: LimitCycle, adaptive: bool
 ) -> tuple[CollocationFinder, Located] | None:
-    """A finder and starts from which it finds more of a batch's gaits; None: there is none.
+    """Return a finder, and starts from which it finds more of a batch's gaits; None if there are
+    none.
 
-    `adaptive`: whether the mesh may be another.
+    `refines_mesh` allows a finer mesh.
     """
     outcome = np.asarray(cycle.outcome)
     rough = adaptive & (np.asarray(cycle.mesh_error) > MESH_ERROR)
@@ -341,7 +354,7 @@ def _reached(
     if not open_.any():
         return None
     walks = _walked(finder, params, lost)
-    # Each lane's best start so far, located by a search and told on the mesh of `finder`.
+    # Best start of each wheel so far, found by a search, on the mesh of `finder`.
     located, has = cycle.located, rough.copy()
     coarse = outcome == Outcome.MESH_TOO_COARSE
     best = None
@@ -350,7 +363,7 @@ def _reached(
             before, finder = finder, finder.finer()
             moved = jax.vmap(functools.partial(finder.on_mesh, before.problem))
             located = in_batches(moved, SHAPES, located)
-        # The search's own mesh has been tried without walks; without reason, one finer mesh is.
+        # The search without walks has used this mesh already. One finer mesh is always tried.
         promising = walks.reached | has | (coarse & (refinement > 0)) | (refinement == 1)
         places = np.flatnonzero(open_ & promising)
         if not len(places):
@@ -369,8 +382,8 @@ def _reached(
 
 
 def reached(finder: Any, params: WheelParams, searched: LimitCycle) -> LimitCycle:
-    """What the paper's finder has searched of a batch, and where it found none what walks lead to
-    besides, on the same mesh."""
+    """Return the search's result, with cycles from walks where the search found none, on the same
+    mesh."""
     found = _reached(finder, params, searched, adaptive=False)
     if found is None:
         return searched
@@ -379,7 +392,8 @@ def reached(finder: Any, params: WheelParams, searched: LimitCycle) -> LimitCycl
 
 
 def _state(guess: Any) -> Any:
-    """Its section state, of a guess that is a cycle, a place or one itself."""
+    """Return the section state of a guess, which is a cycle, a `CollocationState` or a section
+    state."""
     if isinstance(guess, Located):
         return guess.ends[-1][jnp.array([0, 2, 3])]
     return getattr(guess, "section_state", guess)
@@ -388,10 +402,10 @@ def _state(guess: Any) -> Any:
 def _from_another_step(
     finder: CollocationFinder, params: WheelParams, cycle: LimitCycle, x: np.ndarray
 ) -> tuple[CollocationFinder, Located] | None:
-    """The same orbit, searched for from another of its steps.
+    """Search for the same orbit with another of its steps as the first one.
 
-    A guess holds the accelerations of all steps, and what they are wrong by adds up: where a step
-    without double support, the most sensitive of all, comes first or last, it may be too much.
+    A guess contains the accelerations of all steps, whose errors accumulate. A step without double
+    support is the most sensitive. As the first or last step it may make the guess fail.
     """
     lost = np.flatnonzero(np.isin(np.asarray(cycle.outcome), LOST))
     if not len(lost):
@@ -415,7 +429,7 @@ def _counted_as(
     x: np.ndarray,
     reached: tuple[CollocationFinder, Located] | None,
 ) -> tuple[CollocationFinder, Located] | None:
-    """The same orbits, begun at the steps that begin nearest to x."""
+    """Return the same orbits with the step nearest to `first_states` as the first one."""
     finder, located = reached or (finder, cycle.located)
     ends = np.asarray(located.ends)[:, :, [0, 2, 3]]
     missed = np.abs(np.roll(ends, 1, axis=1) - x[:, None]).max(-1)
