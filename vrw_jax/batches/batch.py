@@ -1,9 +1,10 @@
-"""Gait steps of batches of wheels, by the engine that suits: one face, two engines.
+"""Gait steps of batches of wheels: one function for several engines.
 
-On a CPU the lane engine is machine code for a few lanes at a time (`simd`), on a GPU a program of
-XLA for very many, of which a few late ones run again among their like. Either way the same code
-runs for every lane, and nothing reaches from one to another: a lane's result is bitwise the same
-alone, among others, and in any order. Wheels of similar work go side by side.
+On a CPU the "lanes" engine is machine code for a few lanes at a time (`simd`). On a GPU it is an
+XLA program for very many lanes, and a few stragglers are run again in smaller batches. In both
+cases every lane runs the same code, and no data pass between lanes. The result of a batch element
+is bitwise the same alone, in any batch and in any order. Wheels of similar work are placed side by
+side.
 """
 
 import dataclasses
@@ -54,10 +55,10 @@ BatchEngine = Literal["auto", "lanes", "diffrax", "collocation"]
 ENGINES: tuple[str, ...] = get_args(BatchEngine)
 
 BY_PHASES = (START, *PARAMETER_NAMES)
-"""What a step of the paper's phases moves with."""
+"""Inputs with respect to which a step of the paper's model can be differentiated."""
 
 MAPPED = 256
-"""Lanes that the diffrax engine takes at a time."""
+"""Number of batch elements that the diffrax engine takes at a time."""
 
 
 def steps(
@@ -71,47 +72,53 @@ def steps(
     durations: Array | np.ndarray | None = None,
     derivatives: Sequence[str] = (),
 ) -> Steps:
-    """`n_steps` gait steps of many wheels, or as many as each can, and what they move with.
+    """Return the result of up to `n_steps` gait steps of many wheels, with derivatives if
+    requested.
 
-    "lanes" is the fast engine, for the viscoelastic wheel and explicit solvers; "diffrax" maps
-    `model.advance` over the lanes and takes any solver; "auto" takes the first wherever it can, and
-    `Steps.engine` says which it was. Both keep the errors of `options`, which count for each local
-    step; between them lie some ten times the tolerance. "auto" also takes another solver than the
-    named one where the airborne leg is so stiff that another is cheaper, and `Steps.solver` says
-    which: Tsit5 where stability limits the steps (c/m from 1,900 1/s up at the default options,
-    from 300 at a tolerance of 1e-6), Kvaerno5 by "diffrax" where explicit ones take too many (from
-    4e5, from 1.4e5) or Tsit5 gave up.
+    Engine "lanes" is the fast one, for the viscoelastic wheel and explicit solvers. "diffrax" maps
+    `model.advance` over the batch and accepts any solver. "auto" selects "lanes" if it is possible;
+    `StepBatchResult.engine` gives the selected one. Both have the errors of `options`, which apply
+    to each solver step. The results of the two differ by some ten times the tolerance.
 
-    "collocation" is faster still near a known gait: `durations` are those of DLS, SLS-I and SLS-II
-    to some per cent, as of a limit cycle or a neighbour's step; later steps take those of the step
-    before. Its error is fixed, about 1e-8 for 99 lanes in 100, whatever `options` say. Each lane
-    checks itself, and one that fails is left to the lane engine; `fixed` says which was which.
+    "auto" also selects another solver than the named one if the airborne leg is so stiff that
+    another is cheaper; `StepBatchResult.solver_index` gives the selected one. It is Tsit5 if
+    stability limits the steps. At the default options this is the case from c/m = 1,900 1/s; at a
+    tolerance of 1e-6, from 300 1/s. It is Kvaerno5 by "diffrax" if explicit solvers need too many
+    steps (from 4e5, or from 1.4e5) or Tsit5 failed.
 
-    Derivatives go through all steps and their events; those of a lane that fell are zero. Not by
-    collocation. On real ground (`UnilateralWheel`, its friction a scalar or of the lanes' axis) the
-    only engine is "lanes", and "diffrax" where slope or friction, of shape (lanes, n_steps), differ
-    from step to step as in `walk`. Not for use inside `jax.jit`: it compiles itself, once.
+    "collocation" is faster still near a known gait. `durations` are those of DLS, SLS-I and SLS-II
+    to some per cent, as of a limit cycle or a neighbor's step. Later steps use those of the
+    previous step. Its error is fixed, about 1e-8 for 99 elements in 100, independent of `options`.
+    Each element is checked, and an element that fails the check is stepped by the lane engine.
+    `is_collocated` marks the elements that passed.
+
+    Derivatives go through all steps and their events. They are zero for an element whose walk
+    failed, and are not available by collocation. With unilateral contact (`UnilateralWheel`, with
+    friction a scalar or one value per element) the only engine is "lanes". It is "diffrax" if slope
+    or friction differ from step to step, with shape (elements, n_steps) as in `walk`. This function
+    cannot be used inside `jax.jit`; it compiles itself, once.
 
     Args:
-        params: the wheels; fields are scalars or of shape (lanes,).
-        states: section states, shape (lanes, 3), rad, rad/s, m/s, or real ground's own.
-        n_steps: at most so many.
-        model: the rung; the paper's, `ViscoelasticWheel()`, by default.
+        params: the wheels; fields are scalars or of shape (elements,).
+        states: section states, shape (elements, 3), rad, rad/s, m/s, or full states with contact.
+        n_steps: largest number of steps.
+        model: the model; the paper's, `ViscoelasticWheel()`, by default.
         options: numerical choices of the steps.
         engine: "auto", "lanes", "diffrax" or "collocation", as above.
-        durations: of the phases, shape (lanes, 3), s, for "collocation".
-        derivatives: "section_state" and names of parameters, on real ground "friction" too.
+        durations: of the phases, shape (elements, 3), s, for "collocation".
+        derivatives: "section_state" and names of parameters; with unilateral contact "friction"
+            too.
 
     Returns:
-        `Steps`, of the last step of each lane.
+        A `StepBatchResult`, for the last step of each element.
 
     Raises:
-        TypeError, ValueError: an argument that can't be meant, in one sentence.
+        TypeError, ValueError: an invalid argument, described in one sentence.
 
     Examples:
         >>> params = vrw.WheelParams(damping=np.array([120.0, 150.0, 180.0]))
-        >>> found = vrw.steps(params, np.tile(vrw.paper_start(), (3, 1)), 10)
-        >>> found.durations.shape, found.n_stepped.tolist(), found.engine
+        >>> result = vrw.step_batch(params, np.tile(vrw.paper_start(), (3, 1)), 10)
+        >>> result.durations.shape, result.n_stepped.tolist(), result.engine
         ((3, 3), [10, 10, 10], 'lanes')
     """
     untraced("vrw.steps", "map vrw.return_map over the lanes", params, states, durations)
@@ -131,7 +138,10 @@ def steps(
 
 
 def _moved(derivatives: Sequence[str], known: tuple[str, ...], engine: str) -> list[str]:
-    """What the end is to be told to move with; one clear sentence for what it can't be."""
+    """Return the names of the inputs to differentiate by.
+
+    Raises: ValueError: a name is unknown, or the engine has no derivatives.
+    """
     names = [derivatives] if isinstance(derivatives, str) else list(derivatives)
     for name in names:
         if name not in known:
@@ -140,7 +150,7 @@ def _moved(derivatives: Sequence[str], known: tuple[str, ...], engine: str) -> l
             )
     if names and engine == "collocation":
         raise ValueError(
-            "derivatives are asked of collocation, which has none in batches: take "
+            "derivatives are not available by collocation in batches: take "
             "engine='lanes', or jax.jacfwd of vrw.return_map."
         )
     return names
@@ -149,8 +159,10 @@ def _moved(derivatives: Sequence[str], known: tuple[str, ...], engine: str) -> l
 def _columns(
     params: WheelParams, states: np.ndarray, model: AbstractWheel, options: Options, n_steps: int
 ) -> list[np.ndarray]:
-    """Parameters, one for all or of each lane, slopes of each step too; one clear sentence for what
-    can't be walked."""
+    """Return the parameters, one value for all or one per element, with slopes of each step too.
+
+    Raises: ValueError: the shapes of states or parameters do not fit.
+    """
     sizes = [3]
     if states.ndim != 2 or states.shape[1] != 3:
         sizes = sorted({3, model.section_size(params)})
@@ -161,7 +173,7 @@ def _columns(
         )
     n, columns = len(states), [getattr(params, name) for name in PARAMETER_NAMES]
     held = np.result_type(*(column.dtype for column in columns))
-    Options.require_reachable(options, held)  # a bound method takes equinox 0.1 ms to make
+    Options.require_reachable(options, held)  # equinox takes 0.1 ms for a bound method
     of_ground = getattr(model, FRICTION, np.zeros(()))
     for name, column in zip((*PARAMETER_NAMES, FRICTION), (*columns, of_ground), strict=True):
         of_steps = name in ("slope", FRICTION) and np.ndim(column) == 2
@@ -222,7 +234,7 @@ def _by_phases(
                 all_ = only(lanes, walked)
                 told = run.step(wheels[:, all_], walked.section_state[:, all_])
                 if which == STABLE:
-                    # A phase may last longer than `cheapest_solver` expects: IMPLICIT comes next.
+                    # A phase may last longer than `select_solver` assumes; the next is implicit.
                     lost = told[2] == Outcome.SOLVER_GAVE_UP
                     solver[lanes[lost]] = IMPLICIT
                     lanes, told = lanes[~lost], tuple(part[..., ~lost] for part in told)
@@ -231,12 +243,12 @@ def _by_phases(
 
 
 def work_order(columns: list[np.ndarray], states: np.ndarray) -> np.ndarray:
-    """An order of lanes in which wheels of like work are side by side: a group waits for its last.
+    """Return an order of the batch in which wheels of similar work are side by side.
 
-    Most of a step's work is SLS-I's, in which stability bounds the solver's steps by m/c and Leg 2
-    extends at the pace of k (Ls - L)/c from where it was let go. The powers are rounded from a fit
-    to the solver's steps of wheels near their gaits and away from them
-    (`python -m experiments.speed.lanes_that_wait`).
+    A group of lanes takes as long as its slowest lane. Most of a step's work is in SLS-I. There
+    stability limits the solver's steps by m/c, and Leg 2 extends at the rate k (Ls - L)/c from its
+    length at release. The exponents are rounded from a fit to the solver's steps of wheels near
+    their gaits and away from them (`python -m experiments.speed.lanes_that_wait`).
     """
     own = dict(zip(PARAMETER_NAMES, columns, strict=True))
     single = lambda name: np.asarray(own[name], np.float32)
@@ -260,7 +272,7 @@ def _expected(durations: Any, states: np.ndarray, dtype: np.dtype) -> np.ndarray
 
 
 class _Engine(NamedTuple):
-    """One gait step of any number of lanes, numpy in and out, lanes on the last axis."""
+    """One gait step of any number of lanes, from numpy to numpy, lanes on the last axis."""
 
     name: str
     step: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, ...]]
@@ -272,7 +284,7 @@ def _chosen(
     fits = model.lanes == "phases" and explicit_tableau(options.solver) is not None
     if engine in ("lanes", "collocation") and not fits:
         raise ValueError(
-            f"the lane engine can't run {type(model).__name__} with {options.solver}: it knows "
+            f"the lane engine can't run {type(model).__name__} with {options.solver}: it supports "
             "the viscoelastic wheel and explicit Runge-Kutta solvers; take engine='diffrax'."
         )
     if engine == "diffrax" or not fits:
@@ -290,11 +302,11 @@ def _by_lanes(
     wheels: np.ndarray,
     states: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
-    """By the lane engine."""
+    """Take one gait step by the lane engine."""
     dynamic, structure = jax.tree.flatten(options)
     uniform = [np.asarray(leaf, wheels.dtype) for leaf in dynamic]
     tableau, n = explicit_tableau(options.solver), len(PARAMETER_NAMES)
-    assert tableau is not None  # `_chosen` looked
+    assert tableau is not None  # checked by `_select_engine`
 
     def step(uniform: Any, lanes: Any, few: Array | None = None) -> tuple:
         known = jax.tree.unflatten(structure, uniform)
@@ -328,7 +340,8 @@ def _by_collocation(
     states: np.ndarray,
     durations: np.ndarray,
 ) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
-    """A step of all lanes, and which were trusted; the others go by the lane engine."""
+    """Take one step by collocation, and by the lane engine for lanes that fail the check; return
+    which passed."""
     stop_at_lift_off, n = model.stop_at_lift_off, len(PARAMETER_NAMES)
 
     def step(uniform: Any, lanes: Any, few: Array | None = None) -> tuple:
@@ -356,7 +369,8 @@ def _by_diffrax(
     wheels: np.ndarray,
     states: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
-    """By the model's own step under `jax.vmap`, MAPPED at a time."""
+    """Take one step by the model's own step under `jax.vmap`, DIFFRAX_BATCH_SIZE elements at a
+    time."""
     options = jax.tree.map(lambda leaf: np.asarray(leaf, wheels.dtype), options)
     rows = np.concatenate([wheels, states]).T
     mapped = functools.partial(_mapped, model, options, n_legs, moved)

@@ -1,15 +1,15 @@
 """Gait steps of many wheels in a fixed amount of work, near gaits whose durations are known.
 
-Gauss collocation of order 8 on a few graded steps: unknown are the accelerations at four nodes of a
-step. The airborne leg's fast mode, near c/m, which an explicit method must follow by small steps,
-costs nothing extra here. The node equations are solved by a fixed number of sweeps of Newton's
-method with one Jacobian, in the eigenvectors of the rule: two complex systems of the phase's size.
-In the last step the duration is corrected too, towards the event.
+The method is Gauss collocation of order 8 on a few graded steps. The unknowns are the accelerations
+at the four nodes of a step. The airborne leg's fast mode, near c/m, which forces an explicit method
+to small steps, needs no extra work here. The node equations are solved by a fixed number of Newton
+sweeps with one Jacobian. In the eigenvectors of the rule they are two complex systems of the
+phase's size. In the last step the duration is corrected too, towards the event.
 
-No lane waits for another. A fixed amount of work notices nothing by itself, so each phase says how
-far it can be trusted: the last corrections, the mismatch of the collocation polynomial with the
-equations of motion at each step's start, where it was not asked to hold, and the least of all
-guards. A lane that can't be trusted is stepped anew by the adaptive engine.
+All lanes do the same work. A fixed amount of work does not detect its own errors, so each phase
+returns indicators of its accuracy. They are the last corrections, the mismatch with the equations
+of motion at each step's start, and the minimum of all guards. The start of a step is not a node. A
+lane that fails these checks is stepped again by the adaptive engine.
 """
 
 import functools
@@ -42,7 +42,7 @@ from vrw_jax.wheel import AbstractPhase, Instant, WheelParams, phases_of, transi
 
 
 def _eigenvectors() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """One eigenvalue of each conjugate pair of the rule, with its rows and columns."""
+    """Return one eigenvalue of each conjugate pair of the rule, with its rows and columns."""
     values, vectors = np.linalg.eig(ONCE)
     upper = np.flatnonzero(values.imag > 0.0)
     return values[upper], np.linalg.inv(vectors)[upper], vectors[:, upper]
@@ -50,29 +50,30 @@ def _eigenvectors() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 VALUES, TO_PAIRS, FROM_PAIRS = _eigenvectors()
 AT_START, AT_MIDDLE, AT_END = lagrange(0.0), lagrange(0.5), lagrange(1.0)
-"""Weights that carry node values to both ends and to the middle of a step."""
+"""Weights that interpolate node values to both ends and to the middle of a step."""
 TO_MIDDLE = integrated(0.5)
 _SLOPE = differentiation()
 SLOPES, BENDS = NODES[:, None] * _SLOPE, 0.5 * (NODES * NODES)[:, None] * (_SLOPE @ _SLOPE)
-"""How values at the nodes move as the step, and the nodes with it, grows by a share of itself."""
+"""Weights of the first and second derivative of the node values as the step, with its nodes, is
+stretched."""
 
 
 SWEEPS = 3
-"""In each step but a phase's last."""
+"""Number of sweeps in each step but a phase's last."""
 ROUNDS, SWEEPS_OF_A_ROUND = 2, 2
-"""In the last one: a correction of the duration, and sweeps after it."""
+"""Number of corrections of the duration in the last step, and of sweeps after each."""
 
 
 class Collocated(NamedTuple):
-    """A phase's end, and how far it can be trusted."""
+    """End of a phase, with indicators of its accuracy."""
 
     q: Vector
     v: Vector
     duration: Array  # s
-    correction: Array  # rate that one more sweep would still change, about; rad/s and m/s
-    shift: Array  # the last correction of the duration, s
-    mismatch: Array  # rate that the polynomial misses at the start of a step, at most
-    least: Array  # of all guards at ends and middles but the event itself; not positive: broken
+    correction: Array  # estimated change of a rate by one more sweep, rad/s and m/s
+    shift: Array  # last correction of the duration, s
+    mismatch: Array  # largest error of the polynomial's rate at the start of a step
+    least: Array  # over all guards but the event, at ends and middles; positive if valid
 
 
 Nodes = tuple[Vector, ...]
@@ -83,7 +84,7 @@ class _Step(NamedTuple):
     h: Array
     nodes: Nodes
     correction: Array
-    before: Array  # the correction of the sweep before
+    before: Array  # correction of the previous sweep
 
 
 class _Solved(NamedTuple):
@@ -91,15 +92,15 @@ class _Solved(NamedTuple):
     end: tuple[Vector, Vector]
     shift: Array  # s
     mismatch: Array
-    bent: Nodes  # what its equations, linear about its middle, leave out
+    bent: Nodes  # part that the equations linearized about its middle omit
 
 
 def collocate(
     phase: AbstractPhase, q: Vector, v: Vector, expected: Array, mesh: Mesh
 ) -> Collocated:
-    """From (q, v) to the phase's own end, which is its first guard, near the expected duration."""
+    """Integrate from (q, v) to the phase's own end, its first guard, near the expected duration."""
     fractions, zero = mesh.fractions, jnp.zeros_like(expected)
-    # Of a step's length to that of the one before, squared: as what its equations leave out grows.
+    # Squared ratio of successive step lengths: the growth of the nonlinear part.
     wider = float(fractions[-1] / fractions[0]) ** (2.0 / max(mesh.n_steps - 1, 1))
 
     def march(carry: tuple, fraction: Array) -> tuple[tuple, None]:
@@ -134,7 +135,7 @@ def collocate(
 
 
 def _remaining(step: _Step) -> Array:
-    """What a further sweep would correct, from the last two."""
+    """Estimate the correction of a further sweep from the last two."""
     ratio = step.correction / jnp.maximum(step.before, 1e-300)
     return step.correction * jnp.minimum(ratio, 1.0)
 
@@ -162,11 +163,12 @@ def _node(j: int, q: Vector, v: Vector, h: Array, nodes: Nodes) -> tuple:
 def _solve(
     phase: AbstractPhase, q: Vector, v: Vector, h: Array, bent: Nodes, lands: bool = False
 ) -> _Solved:
-    """The node accelerations of one step, by sweeps; where it lands, its length as well.
+    """Solve for the node accelerations of one step by sweeps, and for its length if it ends at an
+    event.
 
-    The Jacobian is taken about the step's middle: a sweep then gains some two digits. They begin
-    where the equations are linear about it, plus `bent`, what that left out a step before. Where
-    the length changes, so do the places of the nodes on the polynomial through them.
+    The Jacobian is taken at the step's middle; a sweep then gains some two digits. The sweeps start
+    from the solution of the equations linearized there, plus `nonlinear_part`, the omitted part of
+    the previous step. If the length changes, the nodes move along the polynomial through them.
     """
     n = len(q)
     a0 = phase.acceleration(phase.at(q, v))[:n]
@@ -214,7 +216,8 @@ def _sum(nodes: Nodes, others: Nodes, factor: float) -> Nodes:
 
 
 def _moved(nodes: Nodes, by: Array) -> Nodes:
-    """Accelerations at the nodes of a step longer by a small part of itself."""
+    """Return the accelerations at the nodes of a step that is longer by a small fraction of its
+    length."""
     n = range(len(nodes[0]))
     return tuple(
         tuple(
@@ -236,7 +239,7 @@ def _middle(q: Vector, v: Vector, a: Vector, h: Array) -> tuple[Vector, Vector]:
 def _end_shifted(
     q: Vector, v: Vector, h: Array, nodes: Nodes, shift: Array
 ) -> tuple[Vector, Vector]:
-    """The step's end, moved on along its slope by a time so short that its square is nothing."""
+    """Return the step's end, extrapolated by a time whose square is negligible."""
     Q, V = _end(q, v, h, nodes)
     n = range(len(q))
     return (
@@ -246,7 +249,7 @@ def _end_shifted(
 
 
 def _linear(phase: AbstractPhase, q: Vector, v: Vector, a: Vector) -> tuple:
-    """The residual, and columns of its derivatives by q, v and a."""
+    """Return the residual, and the columns of its derivatives with respect to q, v and a."""
     n = len(q)
 
     def left_over(*arguments: Array) -> Vector:
@@ -278,7 +281,7 @@ def _plus(terms: Sequence[Complex]) -> Complex:
 
 
 def _factor(value: complex, h: Array, by_q: Any, by_v: Any, by_a: Any) -> Any:
-    """Inverse of by_a + h value by_v + (h value)^2 by_q."""
+    """Return the inverse of by_a + h value by_v + (h value)^2 by_q."""
     n, square = len(by_q), value * value
     once, twice = (h * value.real, h * value.imag), (h * h * square.real, h * h * square.imag)
     matrix: list[list[Complex]] = [
@@ -299,7 +302,7 @@ def _factor(value: complex, h: Array, by_q: Any, by_v: Any, by_a: Any) -> Any:
 
 
 def _adjugate(m: list[list[Complex]]) -> tuple[Any, Complex]:
-    """Adjugate and determinant of a matrix of one to three rows."""
+    """Return adjugate and determinant of a matrix of one to three rows."""
     n = len(m)
     if n == 1:
         one = (jnp.ones_like(m[0][0][0]), jnp.zeros_like(m[0][0][0]))
@@ -319,7 +322,8 @@ def _adjugate(m: list[list[Complex]]) -> tuple[Any, Complex]:
 
 
 def _to_pair(weights: np.ndarray, left: Nodes) -> list[Complex]:
-    """What the nodes leave over, in one pair of eigenvectors, with the sign of a correction."""
+    """Project the residuals of the nodes onto one pair of eigenvectors, with the sign of a
+    correction."""
     return [
         (_weigh(-weights.real, left, d), _weigh(-weights.imag, left, d))
         for d in range(len(left[0]))
@@ -329,7 +333,8 @@ def _to_pair(weights: np.ndarray, left: Nodes) -> list[Complex]:
 def _pairs_about_middle(
     left: Vector, by_q: Any, by_v: Any, v: Vector, a: Vector, h: Array
 ) -> list[list[Complex]]:
-    """As `_to_pair`, where accelerations are `a` and the equations linear about the middle."""
+    """Return `_project_residuals` for accelerations `a` and the equations linearized about the
+    middle."""
     n = range(len(v))
     times = lambda columns, x: tuple(sum(columns[j][i] * x[j] for j in n) for i in n)
     by_v_a, once, twice = times(by_v, a), times(by_q, v), times(by_q, a)
@@ -358,7 +363,7 @@ def _apply(inverse: Any, right: list[Complex]) -> list[Complex]:
 
 
 def _corrected(nodes: Nodes, pairs: tuple[list[Complex], ...], h: Array) -> tuple[Nodes, Array]:
-    """Accelerations after the correction, and the largest rate that it changed."""
+    """Return the accelerations after the correction, and the largest rate that it changed."""
     corrected, largest = [], jnp.zeros_like(h)
     for j in range(N_NODES):
         row = []
@@ -375,7 +380,7 @@ def _corrected(nodes: Nodes, pairs: tuple[list[Complex], ...], h: Array) -> tupl
 
 
 def _to_event(phase: AbstractPhase, q: Vector, v: Vector) -> Array:
-    """Time from (q, v) to the phase's own end, by Newton's method."""
+    """Return the time from (q, v) to the phase's own end, by Newton's method."""
 
     def event(q: Vector, v: Vector) -> tuple[Array, Vector]:
         at = Instant(phase, phase.at(q, v), None)
@@ -389,12 +394,11 @@ def _to_event(phase: AbstractPhase, q: Vector, v: Vector) -> Array:
 def _least(
     phase: AbstractPhase, q: Vector, v: Vector, solved: _Solved, first: Vector, skipped: int
 ) -> tuple[Array, Vector]:
-    """Least guard at the step's middle and end, -1 where one may be broken in between; all at the
-    end.
+    """Return the smallest guard at the step's middle and end, and all guards at the end.
 
-    `first` are those at the start. Between the three a guard may dip by a quarter of its second
-    difference. `skipped` is 1 in the last step, whose first guard is the event itself and zero at
-    the end.
+    The smallest guard is -1 if a guard may be negative in between. Between the three points a guard
+    may dip by a quarter of its second difference. `start_guards` are those at the start.
+    `n_skipped` is 1 in the last step, whose first guard is the event itself and zero at the end.
     """
     step, d = solved.step, range(len(q))
     in_middle = tuple(_weigh(AT_MIDDLE, step.nodes, i) for i in d)
@@ -418,20 +422,20 @@ def _least(
 
 
 MESHES = Mesh(4, 1.0), Mesh(5, 4.0), Mesh(2, 1.0)
-"""Of DLS, SLS-I and SLS-II: of those tried the cheapest, with what the lanes that it leaves to the
-adaptive engine cost, whose 99th percentile of errors over lanes near their gaits is below 1e-8
-(experiments/speed/engine_benchmark.py)."""
+"""Meshes of DLS, SLS-I and SLS-II, chosen because they are the cheapest of those tried with errors
+below 1e-8. The errors are the 99th percentile over lanes near their gaits. The cost includes that
+of the lanes left to the adaptive engine (experiments/speed/engine_benchmark.py)."""
 
 MOST_CORRECTION = 5e-8
 MOST_SHIFT = 1e-5
 MOST_MISMATCH = (2e-3, 1.2e-1, 8e-5)
-"""What a trusted lane may show at most, see `Collocated`; errors are the square of a mismatch and
-less. The end moves along its slope by the last shift: half of its square times a rate is left. One
-in a hundred lanes shows more near its gait."""
+"""Limits of the indicators of a trusted lane, see `CollocatedPhase`. Errors are at most the square
+of a mismatch. The end is extrapolated by the last shift, which leaves half of its square times a
+rate. One in a hundred lanes exceeds the limits near its gait."""
 
 
 class FixedStep(NamedTuple):
-    """One gait step of a block of lanes, and which of them to trust."""
+    """One gait step of a block of lanes, with the lanes that pass the checks."""
 
     section_state: Vector  # three arrays
     durations: Vector  # of DLS, SLS-I, SLS-II, s
@@ -444,7 +448,7 @@ def fixed_gait_step(
     expected: Vector,
     stop_at_lift_off: bool,
 ) -> FixedStep:
-    """One gait step of every lane, near the expected durations of DLS, SLS-I, SLS-II."""
+    """Take one gait step of every lane, near the expected durations of DLS, SLS-I and SLS-II."""
     known = [(duration > 0.0) & (duration < 10.0) for duration in expected]
     good = functools.reduce(operator.and_, known, usable(params, x))
     params, x = replaced_where_bad(good, params, x, PAPER_START)

@@ -1,4 +1,4 @@
-"""Walks of batches over ground that differs from step to step: `walk` under `jax.vmap`."""
+"""Walks of batches over uneven ground, which changes from step to step: `walk` under `jax.vmap`."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -14,7 +14,7 @@ from vrw_jax.walks import walk
 from vrw_jax.wheel import wheel_of
 
 SIZES = 16, 256
-"""Lanes at a time."""
+"""Numbers of batch elements that are compiled for."""
 
 
 def over_floors(
@@ -27,10 +27,10 @@ def over_floors(
     n_legs: int,
     asked: Sequence[str],
 ) -> Steps:
-    """See `steps`."""
+    """Return `step_batch` for slopes or friction that differ from step to step."""
     if model.lanes != "legs" or engine not in ("auto", "diffrax") or len(asked):
         raise ValueError(
-            "ground that differs from step to step is walked by vrw.UnilateralWheel and 'diffrax', "
+            "uneven ground needs vrw.UnilateralWheel and 'diffrax', "
             "without derivatives: leave engine and derivatives out, or map vrw.walk over lanes."
         )
     n, given = len(states), (*wheels, np.asarray(model.friction, states.dtype))

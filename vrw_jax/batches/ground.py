@@ -1,4 +1,4 @@
-"""Walks of batches on real ground."""
+"""Steps of batches with unilateral contact."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -12,7 +12,7 @@ from vrw_jax.wheel import PARAMETER_NAMES
 
 VALUES = (*PARAMETER_NAMES, "friction")
 ON_GROUND = (START, *VALUES)
-"""What a step moves with."""
+"""Inputs with respect to which a step can be differentiated."""
 
 
 def on_ground(
@@ -25,10 +25,11 @@ def on_ground(
     n_legs: int,
     asked: Sequence[str],
 ) -> Steps:
-    """See `steps`; without derivatives all steps of a lane are one walk."""
+    """Return `step_batch` with unilateral contact. Without derivatives, all steps of an element are
+    one walk."""
     if engine not in ("auto", "lanes") or explicit_tableau(options.solver) is None:
         raise ValueError(
-            f"engine is {engine!r} and solver {options.solver}, but batches on real ground need "
+            f"engine is {engine!r} and solver {options.solver}, but batches with contact need "
             "'lanes' and an explicit Runge-Kutta solver: map vrw.return_map over the wheels."
         )
     friction = np.asarray(model.friction, states.dtype)

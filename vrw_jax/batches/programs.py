@@ -1,4 +1,4 @@
-"""A function of lanes, compiled and run for numpy's arrays: machine code, or blocks by XLA."""
+"""Functions of lanes, compiled and run on numpy arrays: as machine code, or in blocks by XLA."""
 
 import functools
 from collections.abc import Callable
@@ -11,12 +11,12 @@ from vrw_jax import simd
 from vrw_jax.runtime import lane_program
 
 BLOCK = 32_768
-"""Lanes that march side by side where XLA compiles them, as on a GPU."""
+"""Number of lanes of a block that XLA runs side by side, as on a GPU."""
 FEW = 8
-"""A block waits no longer than usual once less than one in `FEW` of its lanes is running."""
+"""A block stops early once less than one in `STRAGGLER_DIVISOR` of its lanes is running."""
 
 _programs: dict[Any, Callable] = {}
-"""Compiled steps by what they depend on, see `run_lanes`."""
+"""Compiled steps by all that they depend on, see `run_compiled`."""
 
 
 def run_lanes(
@@ -26,9 +26,10 @@ def run_lanes(
     settings: Any,
     small: int = simd.SMALL,
 ) -> list[np.ndarray]:
-    """`step(uniform, lanes, few)` compiled and run; its first result: lanes that it left undone.
+    """Compile and run `step(uniform, lanes, few)`. Its first result marks the lanes that are
+    unfinished.
 
-    `settings`: all that `step` depends on but its arguments.
+    `cache_key` contains all that `step` depends on except its arguments.
     """
     dtype, cpu = lanes[0].dtype, simd.serves()
     key = (settings, dtype, cpu, BLOCK)
@@ -44,7 +45,7 @@ def run_lanes(
 def _by_xla(
     program: Callable, uniform: list[np.ndarray], lanes: list[np.ndarray]
 ) -> list[np.ndarray]:
-    """Block by block; late lanes run again among their like."""
+    """Run the program block by block; stragglers are run again together."""
     told: list[np.ndarray] = []
     open_ = np.arange(len(lanes[0]))
     while len(open_) > 0:

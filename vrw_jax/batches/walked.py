@@ -1,4 +1,4 @@
-"""What a batch of walks tells of its lanes, and how that moves with their starts and parameters."""
+"""Results of batches of walks, and their derivatives with respect to starts and parameters."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -12,31 +12,34 @@ from vrw_jax.wording import AbstractTold, Row, counted, told
 
 
 class By(eqx.Module):
-    """How the end of a walk moves with its start, which has an axis of its own, or a parameter."""
+    """Derivative of the end of a walk with respect to a parameter, or to the start, which adds an
+    axis."""
 
     section_state: Float[np.ndarray, "lanes section *start"]
     durations: Float[np.ndarray, "lanes 3 *start"]
 
 
 class Steps(AbstractTold):
-    """Lean results of walks of some steps, leading axis: lanes; each tells of its last step.
+    """Results of batches of walks for the last step of each element. The leading axis is the batch.
 
-    Arrays are numpy's: handing thousands of numbers to JAX takes as long as some hundred steps.
+    Arrays are numpy arrays: the conversion of thousands of values to JAX takes as long as some
+    hundred steps.
 
-    - `section_state`: before the next touchdown; zeros if it failed;
-    - `durations`: of DLS, SLS-I, SLS-II, s; on real ground see its step;
+    - `section_state`: before the next touchdown; zeros if the step failed;
+    - `durations`: of DLS, SLS-I, SLS-II, s; with unilateral contact see its step;
     - `outcome`: an Outcome; the walk ends at the first that is not STEPPED;
-    - `n_stepped`: steps that ended in a touchdown;
+    - `n_stepped`: number of steps that ended in a touchdown;
     - `solver_steps`: tried by the integrator, over all steps;
-    - `fixed`: whether the last step was taken in fixed work, by collocation;
-    - `solver`: which of `solvers` took the lane: "auto" goes by stiffness;
-    - `engine`: that computed it: "lanes", "diffrax" or "collocation";
-    - `solvers`: the named one first;
-    - `derivatives`: by what was asked for.
+    - `is_collocated`: whether the last step was taken in fixed work, by collocation;
+    - `solver_index`: index in `solver_names` of the solver of the element; "auto" selects by
+      stiffness;
+    - `engine`: "lanes", "diffrax" or "collocation";
+    - `solver_names`: the named one first;
+    - `derivatives`: by name of the requested input.
 
     Examples:
         >>> params, states = vrw.WheelParams(damping=150.0), np.tile(vrw.paper_start(), (3, 1))
-        >>> vrw.steps(params, states).outcome.tolist()
+        >>> vrw.step_batch(params, states).outcome.tolist()
         [0, 0, 0]
     """
 
@@ -66,30 +69,31 @@ START = "section_state"
 
 
 class Walked:
-    """A batch of walks under way; of every array lanes are the last axis."""
+    """Batch of walks in progress. Lanes are the last axis of every array."""
 
     def __init__(
         self, states: np.ndarray, asked: Sequence[str], parameters: tuple[str, ...]
     ) -> None:
-        """`asked`: START and names of these parameters, which lead the numbers of a lane."""
+        """Start walks. `derivative_names` are START_NAME and names of these parameters, the first
+        values of a lane."""
         size, n = states.shape
         self.section_state, self.durations = states, np.zeros((3, n), states.dtype)
         self.outcome, self.n_stepped, self.solver_steps = np.zeros((3, n), np.int32)
         self.fixed = np.zeros(n, bool)
-        # Of a step, and of the walk: by the other names asked for and then by the start.
+        # Inputs of the Jacobian: the requested parameters, then the start.
         self.asked, self.names = asked, [name for name in asked if name != START]
         state = range(len(parameters), len(parameters) + size)
         self.moved = (*(parameters.index(x) for x in self.names), *state) if asked else ()
         self.jacobian = np.zeros((len(self.moved), size + 3, n), states.dtype)
 
     def on(self) -> np.ndarray:
-        """Lanes that go on."""
+        """Return the indices of the lanes that continue."""
         return np.flatnonzero(self.outcome == Outcome.STEPPED)
 
     def told(
         self, order: np.ndarray, solver: np.ndarray, engine: str, solvers: tuple[str, ...]
     ) -> Steps:
-        """Each lane at the place that `order` says."""
+        """Return the result, with each lane at its index before sorting by `order`."""
         back = np.empty_like(order)
         back[order] = np.arange(len(order))
         there = lambda x: x.take(back, -1).T
@@ -107,7 +111,7 @@ class Walked:
         )
 
     def derivatives(self, back: np.ndarray) -> dict[str, By]:
-        """Of the walk, by what was asked for; zero where it failed."""
+        """Return the derivatives of the walk by name of the input; zero where it failed."""
         if not self.asked:
             return {}
         self.jacobian[..., self.outcome != Outcome.STEPPED] = 0.0
@@ -118,7 +122,7 @@ class Walked:
         return {name: By(x[:, :size], x[:, size:]) for name, x in told.items()}
 
     def take(self, lanes: np.ndarray, told: tuple[np.ndarray, ...], fixed: np.ndarray) -> None:
-        """A step of these lanes: state, durations, outcome, solver steps, and how both move."""
+        """Record a step of these lanes: state, durations, outcome, solver steps and Jacobian."""
         state, durations, outcome, tried, *by = told
         some = only(lanes, self)
         if by:
@@ -131,9 +135,9 @@ class Walked:
         self.solver_steps[some] += tried
 
     def _after(self, some: Any, by: np.ndarray) -> np.ndarray:
-        """Columns of the walk from those of its last step, (columns, rows, lanes).
+        """Return the Jacobian of the walk from that of its last step, (columns, rows, lanes).
 
-        Sums of products one by one: so a lane's digits are its own in any company.
+        Products are summed one by one, so that a lane's digits do not depend on the batch.
         """
         n, size = len(self.names), len(self.section_state)
         if not self.n_stepped[some].any():
@@ -145,12 +149,12 @@ class Walked:
 
 
 def only(lanes: np.ndarray, walked: Walked) -> Any:
-    """An index to these lanes: of all of them one that copies nothing."""
+    """Return an index of these lanes, which copies nothing if they are all lanes."""
     return slice(None) if len(lanes) == len(walked.outcome) else lanes
 
 
 def _put(values: np.ndarray, some: Any, part: np.ndarray) -> np.ndarray:
-    """`values` with those of some lanes in place of theirs."""
+    """Replace the values of some lanes and return the array."""
     if isinstance(some, slice):
         return part
     values[..., some] = part
