@@ -1,4 +1,4 @@
-"""Branches of gaits along one parameter, with every border on the way."""
+"""Branches of gaits along one parameter, with their special points."""
 
 from vrw_jax.branches.bordering import border_curve
 from vrw_jax.branches.branch import Border, BorderCurve, Branch

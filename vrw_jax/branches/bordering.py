@@ -1,4 +1,4 @@
-"""Borders of gaits as curves in two parameters, as a user asks for them."""
+"""Continuation of special points of gaits as curves in two parameters."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -21,7 +21,7 @@ BOX: Box = {
     "natural_length": (1.001, 1.06),
     "slope": (0.05, 0.5),
 }
-"""Where borders are followed if nothing else is said; of a wheel with legs of 1 m."""
+"""Default bounds of the parameters for the continuation, for a wheel with legs of 1 m."""
 
 
 def border_curve(
@@ -33,34 +33,37 @@ def border_curve(
     options: ArclengthOptions | None = None,
     step_options: Options | None = None,
 ) -> BorderCurve:
-    """The border `name` as a curve over two parameters, nearest to a gait of one step.
+    """Return the curve of the special point `name` over two parameters, starting nearest to a gait
+    of one step.
 
-    `name` is that of a `Border`: an indicator, a phase's duration, a margin (of a locked leg
-    "locked_stopper_force[5]") or "fold", "period_doubling", "neimark_sacker". The border is looked
-    for along the first parameter from the gait, then along the second, and followed within `bounds`
-    of the two, by default `branches.bordering.BOX`: through turning points, until it closes, leaves
-    them, or the gaits end. Each point is exact to 1e-9; `meetings` are where other borders are met:
-    on that of an indicator other indicators and bifurcations, on others margins too.
+    `name` is that of a `SpecialPoint`: an indicator, a phase's duration, a margin (of a locked leg
+    "locked_stopper_force[5]") or "fold", "period_doubling", "neimark_sacker". The special point is
+    searched for along the first parameter from the gait, then along the second. It is continued
+    within `bounds` of the two, by default `branches.special_point_curves.DEFAULT_BOUNDS`, through
+    turning points. The curve ends when it closes or leaves the bounds, or when the gaits end. Each
+    point is accurate to 1e-9. `codim2_points` are the points where other special points occur. On
+    the curve of an indicator these are other indicators and bifurcations, on other curves margins
+    too.
 
     Args:
-        name: of the border.
-        parameters: names of the two.
-        cycle: the gait near which it is looked for.
+        name: of the special point.
+        parameters: names of the two parameters.
+        cycle: the gait near which the search starts.
         bounds: of the parameters, by name.
         options: `ArclengthOptions` of the curve.
-        step_options: of the steps that tell margins.
+        step_options: of the steps that evaluate margins.
 
     Returns:
-        A `BorderCurve`.
+        A `SpecialPointCurve`.
 
     Raises:
-        TypeError, ValueError: an argument that can't be meant, or a border that is not met on the
-            branches, in one sentence.
+        TypeError, ValueError: an invalid argument, or a special point that does not occur on the
+            branches.
 
     Examples:
         >>> cycle = vrw.limit_cycle(vrw.WheelParams(damping=150.0))
-        >>> curve = vrw.border_curve("clearance_sls1", ("damping", "stiffness"), cycle)
-        >>> [meeting.name for meeting in curve.meetings[-3:-1]]
+        >>> curve = vrw.continue_special_point("clearance_sls1", ("damping", "stiffness"), cycle)
+        >>> [point.name for point in curve.codim2_points[-3:-1]]
         ['fold', 'hit_planted_impulse']
     """
     (curve,) = border_curves(
@@ -70,7 +73,10 @@ def border_curve(
 
 
 def _plane(parameters: Any, bounds: Any) -> tuple[tuple[str, str], np.ndarray]:
-    """The two parameters and their ranges, or one sentence."""
+    """Return the two parameters and their ranges.
+
+    Raises: TypeError, ValueError: the parameters or bounds are invalid.
+    """
     instance("bounds", bounds, (Mapping, type(None)), "write {'damping': (100.0, 200.0)}")
     box = {**BOX, **(bounds or {})}
     pair = names_of("parameters", parameters)
@@ -80,7 +86,7 @@ def _plane(parameters: Any, bounds: Any) -> tuple[tuple[str, str], np.ndarray]:
         require_known(name, tuple(box), "parameter with bounds")
     if len(pair) != 2 or len(set(pair)) != 2:
         raise ValueError(
-            f"parameters are {pair}, but a border's curve needs two different ones: write "
+            f"parameters are {pair}, but a curve needs two different ones: write "
             "('damping', 'slope')."
         )
     ranges = {name: range_of(f"bounds[{name!r}]", ends) for name, ends in box.items()}
@@ -96,12 +102,14 @@ def border_curves(
     options: ArclengthOptions | None = None,
     step_options: Options | None = None,
 ) -> tuple[BorderCurve, ...]:
-    """`border_curve` of several."""
+    """Return `continue_special_point` of several special points."""
     parameters, box = _plane(parameters, bounds)
     first, second = parameters
     instance("cycle", cycle, LimitCycle, "give vrw.limit_cycle(params)")
     if cycle.period_n != 1:
-        raise ValueError(f"the gait has {cycle.period_n} steps: a border's curve takes one step.")
+        raise ValueError(
+            f"the gait has {cycle.period_n} steps: a curve of special points takes one step."
+        )
     options = OF_CURVES if options is None else options
     step_options = Options.tight() if step_options is None else step_options
     instance("options", options, ArclengthOptions, "give vrw.ArclengthOptions()")
@@ -118,7 +126,7 @@ def border_curves(
     missing = sorted(set(names) - set(found))
     if missing:
         raise ValueError(
-            f"no border {missing[0]!r} on the branches along {first} and {second} within their "
+            f"no special point {missing[0]!r} on branches along {first} and {second} within their "
             f"bounds, but {', '.join(sorted(found)) or 'none'}: give a gait nearer to it, or wider "
             "bounds."
         )
@@ -126,6 +134,6 @@ def border_curves(
     lost = sorted(set(names) - set(told))
     if lost:
         raise ValueError(
-            f"the border {lost[0]} at {found[lost[0]].at[0]:.9g} can't be followed from there."
+            f"special point {lost[0]} at {found[lost[0]].at[0]:.9g} can't be followed from there."
         )
     return tuple(told[name] for name in names)

@@ -1,4 +1,5 @@
-"""What a continuation hands back: a labelled branch with its borders, and a border as a curve."""
+"""Results of a continuation: a labeled branch with its special points, and a curve of special
+points."""
 
 from __future__ import annotations
 
@@ -17,13 +18,13 @@ from vrw_jax.wheel import Outcome
 from vrw_jax.wording import as_html
 
 MOST_SHOWN = 20
-"""Borders that a branch prints of itself."""
+"""Largest number of special points in the printed form of a branch."""
 
 
 class FixedPoint(NamedTuple):
-    """A fixed point of a return map at one value of the parameter.
+    """Fixed point of a return map at one value of the parameter.
 
-    - `section`: the numbers that the map moves;
+    - `section_state`: the coordinates of the map;
     - `jacobian`: of the map.
     """
 
@@ -33,30 +34,31 @@ class FixedPoint(NamedTuple):
 
     @property
     def multipliers(self) -> np.ndarray:
-        """Eigenvalues of the Jacobian, the one of largest modulus first."""
+        """Return the eigenvalues of the Jacobian, the one of largest modulus first."""
         return np.asarray(floquet.multipliers(jnp.asarray(self.jacobian)))
 
     @property
     def spectral_radius(self) -> float:
-        """Largest modulus of a multiplier."""
+        """Return the largest modulus of a multiplier."""
         return float(np.max(np.abs(self.multipliers)))
 
 
 @dataclass(frozen=True, repr=False)
 class Border:
-    """Where a branch changes its nature.
+    """Bifurcation, border collision or end of a branch.
 
     `kind` is "fold", "period_doubling", "neimark_sacker", "border_collision" (the indicator or
-    monitor `name` is zero) or "lost" (the order of events changes: `name` says which).
+    margin `name` is zero) or "lost" (the order of events changes: `name` is the reason).
 
     - `value`: of the parameter;
-    - `point`: beside it, on the side that belongs to the branch;
-    - `ends_branch`: whether the branch goes no further;
-    - `find_cycle`: finds the gait there, as the property `cycle`.
+    - `point`: a fixed point next to it, on the valid side of the branch;
+    - `ends_branch`: whether the branch ends here;
+    - `find_cycle`: function that finds the gait there, used by the property `cycle`.
 
     Examples:
-        >>> branch = vrw.continue_map(lambda _, x, r: r * x * (1.0 - x), [0.6], 2.5, (2.0, 3.5))
-        >>> print(branch.borders[0].kind, branch.borders[0].ends_branch)
+        >>> logistic = lambda _, x, r: r * x * (1.0 - x)
+        >>> branch = vrw.continue_fixed_points(logistic, [0.6], 2.5, (2.0, 3.5))
+        >>> print(branch.special_points[0].kind, branch.special_points[0].ends_branch)
         period_doubling False
     """
 
@@ -69,7 +71,7 @@ class Border:
 
     @functools.cached_property
     def cycle(self) -> Any:
-        """The `LimitCycle` there; for models without one, the `FixedPoint`."""
+        """Return the `LimitCycle` there; for models without one, the `FixedPoint`."""
         return self.point if self.find_cycle is None else self.find_cycle()
 
     def __str__(self) -> str:
@@ -78,22 +80,24 @@ class Border:
         return f"{self.value:.9g}: {self.kind.replace('_', ' ')}{name}{ends}"
 
     def __repr__(self) -> str:
-        return f"Border at {self}"
+        return f"SpecialPoint at {self}"
 
 
 @dataclass(frozen=True, repr=False)
 class Branch:
-    """Gaits along one parameter, in the order of the branch, and its borders in the same order.
+    """Gaits along one parameter, in the order of the branch, with its special points in the same
+    order.
 
-    `dataset` has the dimension `point`; the parameter is a coordinate on it, which turns back at
-    folds. `ends` says for the branch's first and last point why it was followed no further.
+    `dataset` has the dimension `point`. The parameter is a coordinate on it, which reverses at
+    folds. `ends` gives the reasons why the branch ends at its first and last point.
 
     - `parameter`: its name;
-    - `borders`: each a `Border`;
-    - `outcome`: NO_CYCLE_FOUND or BAD_INPUT if there was none to start from.
+    - `special_points`: each a `SpecialPoint`;
+    - `outcome`: NO_CYCLE_FOUND or BAD_INPUT if there is no gait to start from.
 
     Examples:
-        >>> branch = vrw.continue_map(lambda _, x, r: r * x * (1.0 - x), [0.6], 2.5, (2.0, 3.5))
+        >>> logistic = lambda _, x, r: r * x * (1.0 - x)
+        >>> branch = vrw.continue_fixed_points(logistic, [0.6], 2.5, (2.0, 3.5))
         >>> branch.parameter, branch.ends
         ('parameter', ("The parameter's range ended.", "The parameter's range ended."))
     """
@@ -106,17 +110,17 @@ class Branch:
 
     @property
     def values(self) -> np.ndarray:
-        """The parameter at each point."""
+        """Return the parameter at each point."""
         return self.dataset[self.parameter].values
 
     @property
     def multipliers(self) -> np.ndarray:
-        """Complex multipliers, shape (point, n), the one of largest modulus first."""
+        """Return the complex multipliers, shape (point, n), the one of largest modulus first."""
         return self.dataset.multiplier_real.values + 1j * self.dataset.multiplier_imag.values
 
     @property
     def stable(self) -> np.ndarray:
-        """Whether the gait at each point attracts its neighbours."""
+        """Return whether the gait at each point is stable."""
         return self.dataset.spectral_radius.values < 1.0
 
     def __str__(self) -> str:
@@ -130,11 +134,11 @@ class Branch:
             f"{self.values[-1]:.6g}{unit}, {int(stable.sum())} stable, {int((~stable).sum())} not.",
             f"  at {self.values[0]:.6g}: {self.ends[0]}",
             f"  at {self.values[-1]:.6g}: {self.ends[1]}",
-            f"  {len(self.borders)} borders" + (":" if self.borders else "."),
+            f"  {len(self.borders)} special points" + (":" if self.borders else "."),
             *(f"    {border}" for border in self.borders[:MOST_SHOWN]),
         ]
         if len(self.borders) > MOST_SHOWN:
-            lines.append(f"    and {len(self.borders) - MOST_SHOWN} more, in .borders")
+            lines.append(f"    and {len(self.borders) - MOST_SHOWN} more, in .special_points")
         return "\n".join(lines)
 
     __repr__ = __str__
@@ -151,11 +155,11 @@ class Branch:
 
 @dataclass(frozen=True)
 class Meeting:
-    """A point of codimension two: a border's curve meets another border there."""
+    """Point of codimension two, where a curve of special points meets another special point."""
 
-    name: str  # of the other border
+    name: str  # of the other special point
     values: tuple[float, float]  # of the two parameters
-    ends_curve: bool  # whether gaits end there
+    ends_curve: bool  # whether the gaits end there
 
     def __str__(self) -> str:
         ends = ", ends the curve" if self.ends_curve else ""
@@ -164,17 +168,17 @@ class Meeting:
 
 @dataclass(frozen=True, repr=False)
 class BorderCurve:
-    """A border in two parameters, its points in order along the dimension `point`.
+    """Curve of a special point in two parameters, its points in order along the dimension `point`.
 
-    - `name`: of the border;
+    - `name`: of the special point;
     - `parameters`: names of the two;
     - `dataset`: durations, spectral radius and section state along the curve;
-    - `meetings`: where it meets other borders, points of codimension two;
-    - `ends`: for either end why it was followed no further; both alike where it is closed.
+    - `codim2_points`: where it meets other special points;
+    - `ends`: the reason why it ends at either end; both are the same for a closed curve.
 
     Examples:
         >>> cycle = vrw.limit_cycle(vrw.WheelParams(damping=150.0))
-        >>> curve = vrw.border_curve("clearance_sls1", ("damping", "stiffness"), cycle)
+        >>> curve = vrw.continue_special_point("clearance_sls1", ("damping", "stiffness"), cycle)
         >>> curve.values.shape[1], curve.parameters
         (2, ('damping', 'stiffness'))
     """
@@ -187,12 +191,12 @@ class BorderCurve:
 
     @property
     def values(self) -> np.ndarray:
-        """The two parameters at each point, (point, 2)."""
+        """Return the two parameters at each point, (point, 2)."""
         return np.stack([self.dataset[name].values for name in self.parameters], -1)
 
     def __str__(self) -> str:
         first, second = self.parameters
-        lines = [f"Border {self.name} over {first} and {second}: {len(self.values)} points."]
+        lines = [f"Curve of {self.name} over {first} and {second}: {len(self.values)} points."]
         for end, text in zip((0, -1), self.ends, strict=True):
             lines.append(f"  at ({self.values[end][0]:.6g}, {self.values[end][1]:.6g}): {text}")
         return "\n".join([*lines, *(f"    {meeting}" for meeting in self.meetings)])

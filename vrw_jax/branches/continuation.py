@@ -1,8 +1,8 @@
-"""Branches of gaits along one parameter, stable or not, with every border on the way located.
+"""Branches of gaits along one parameter, stable or not, with all special points on them located.
 
-A border is where something changes its nature: a bifurcation, or a border collision, where an
-indicator or a monitor reaches zero. Each is solved for on the branch itself, again at every trial,
-so that it is as exact as the gaits are.
+A special point is a bifurcation, or a border collision, where an indicator or a margin reaches
+zero. Each is solved for on the branch itself, with a new solution at every trial, so that it is as
+accurate as the gaits.
 """
 
 from __future__ import annotations
@@ -65,21 +65,23 @@ from vrw_jax.wording import (
 
 INDICATORS = ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
 ENDING = (*INDICATORS, "duration_dls", "duration_sls1", "duration_sls2")
-"""Where one of these reaches zero the order of events changes, and the branch ends."""
+"""Quantities at whose zeros the order of events changes and the branch ends."""
 
 INSTEAD = "differentiate vrw.limit_cycle"
-"""What a caller who differentiates may do."""
+"""Advice for a caller who differentiates."""
 
 COARSE = Outcome.MESH_TOO_COARSE.name.lower()
-"""What an end is called where the gaits, not repeating when walked, are the mesh's alone."""
+"""Name of an end where the mesh is too coarse: the gaits do not repeat in a walk."""
 
 MESH_ERROR, REFINEMENTS = 1e-8, 3
-"""Estimate of the mesh's error on a branch above which a finer one is taken, and how often."""
+"""Estimate of the mesh's error on a branch above which a finer mesh is used, and largest number of
+refinements."""
 
 
 @dataclass(frozen=True)
 class GaitRun(AbstractRun):
-    """Of gaits: read by event-driven steps, kept where these go on and come back."""
+    """Continuation of gaits: event-driven steps evaluate them, and they are admissible if these
+    repeat."""
 
     model: AbstractWheel
     step_options: Options
@@ -87,12 +89,12 @@ class GaitRun(AbstractRun):
 
     ending: ClassVar[tuple[str, ...]] = ENDING
     exact: ClassVar[Mapping[str, str]] = {"clearance_sls1": "takeoff_acceleration"}
-    """A monitor that vanishes like a cube, and the quantity that vanishes with it like a line: a
-    foot that leaves the ground ever less steeply dips ever less deep, until it rises at once. The
-    last of those dips no step of a solver shows, but the line has its sign on both sides."""
+    """Margins that vanish as a cube, with the quantity that vanishes at the same point linearly. A
+    foot that takes off less steeply dips less deeply, until it rises immediately. A solver cannot
+    resolve the last of these dips, but the linear quantity changes its sign."""
 
     def read(self, wheels: Wheel, points: PathPoint) -> Table:
-        """One column more for each leg of a margin that has several."""
+        """Return the table, with one column more for each leg of a margin with several legs."""
         followed: Any = self.followed
         told = functools.partial(followed.told, self.model, self.step_options)
         table = self.batched(told, READ, wheels, points)
@@ -130,43 +132,48 @@ def continue_branch(
     cycle_options: CycleOptions | None = None,
     step_options: Options | None = None,
 ) -> Branch:
-    """The branch of limit cycles through `params` along the parameter `name` within `bounds`.
+    """Return the branch of limit cycles through `params` along the parameter `name` within
+    `bounds`.
 
-    Starts from the limit cycle at `params` (or from `cycle`, found before at the same parameters)
-    and goes both ways, through folds, on stable and unstable gaits alike, until the bounds or the
-    end of the branch. `Branch.ends` says whose that is: the wheel's, whose events come in another
-    order, or the mesh's (`mesh_too_coarse`), which without `cycle_options` is made finer first,
-    up to eight times. Every border on the way is located to 1e-9 in the parameter, if the step
-    between points (options.largest_step) does not hide it: two changes of sign within one step
-    cancel. Gaits are those of the cycle options, at least `CycleOptions.tight()` by default, and
-    checked by one event-driven step each, from which indicators and monitors come.
+    The continuation starts from the limit cycle at `params` (or from `cycle`, found at the same
+    parameters). It goes both ways, through folds, on stable and unstable gaits alike, to the bounds
+    or the end of the branch. `Branch.ends` gives the reason. An end may belong to the wheel, if its
+    events change their order, or to the mesh (`mesh_too_coarse`). Without `cycle_options` the mesh
+    is first refined, up to eight times finer.
 
-    Other rungs' gaits are fixed points of their own return map, as exact as `step_options`. On real
-    ground `name` may be "friction" too, and the start is a `WalkedCycle` or, without one, where a
-    walk of some steps ends; a branch goes on where the order of events changes, with a kink. "auto"
-    is the rung that serves the start: where a premise of the paper's breaks stands as a border of
-    that name, and beyond it real ground serves.
+    Every special point is located to 1e-9 in the parameter, if the continuation step
+    (options.max_ds) does not hide it: two changes of sign within one step cancel. The gaits use the
+    cycle options, at least `CycleOptions.with_tight_tolerances()` by default. Each is checked by
+    one event-driven step, which also gives indicators and margins.
+
+    For other models the gaits are fixed points of their return map, as accurate as `step_options`.
+    With unilateral contact `name` may be "friction" too. The start is then a `ReturnMapCycle` or,
+    without one, the end of a walk. A branch continues where the order of events changes, with a
+    kink. "auto" uses the model that is selected for the start. A violated margin of the paper's
+    model is a special point with the name of the margin, beyond which unilateral contact is
+    selected.
 
     Args:
-        params: the wheel, one; the branch goes through its gait.
-        name: of the parameter that is followed.
-        bounds: its range.
+        params: one wheel; the branch goes through its gait.
+        name: of the parameter.
+        bounds: range of the parameter.
         cycle: the gait at `params`, if it is known.
-        period_n: steps until the gaits repeat.
-        model: the rung; the paper's, `ViscoelasticWheel()`, by default.
+        period_n: number of steps after which the gaits repeat.
+        model: the model; the paper's, `ViscoelasticWheel()`, by default.
         options: `ArclengthOptions` of the branch.
         cycle_options: of the gaits.
-        step_options: of the checking steps, and of other rungs' gaits.
+        step_options: of the checking steps, and of the gaits of other models.
 
     Returns:
-        A `Branch`; without a gait to start from its `outcome` says so.
+        A `Branch`; without a gait to start from, its `outcome` is the reason.
 
     Raises:
-        TypeError, ValueError: an argument that can't be meant, in one sentence.
+        TypeError, ValueError: an invalid argument, described in one sentence.
 
     Examples:
         >>> branch = vrw.continue_branch(vrw.WheelParams(), "damping", (190.0, 230.0))
-        >>> print(branch.borders[-1].name, f"{branch.borders[-1].value:.6f}", branch.ends[1])
+        >>> point = branch.special_points[-1]
+        >>> print(point.name, f"{point.value:.6f}", branch.ends[1])
         lambda_4_plus 219.847688 lambda 4 plus at 219.847688 ends it.
     """
     one_wheel(params, "use vrw.continue_branches for a batch")
@@ -194,32 +201,33 @@ def continue_branches(
     cycle_options: CycleOptions | None = None,
     step_options: Options | None = None,
 ) -> tuple[Branch, ...]:
-    """`continue_branch` of a batch of wheels side by side; every parameter has one leading axis.
+    """Return `continue_branch` of a batch of wheels; every parameter has one leading axis.
 
-    A wheel without a limit cycle to start from gets a branch without points, whose outcome says so.
+    A wheel without a limit cycle to start from has a branch without points, whose outcome is the
+    reason.
 
     Args:
-        params: the wheels; every field of shape (lanes,).
-        name: of the parameter that is followed.
-        bounds: its range.
+        params: the wheels; every field of shape (wheels,).
+        name: of the parameter.
+        bounds: range of the parameter.
         cycle: the gaits at `params`, if they are known.
-        period_n: steps until the gaits repeat.
-        model: the rung; the paper's, `ViscoelasticWheel()`, by default.
+        period_n: number of steps after which the gaits repeat.
+        model: the model; the paper's, `ViscoelasticWheel()`, by default.
         options: `ArclengthOptions` of the branches.
         cycle_options: of the gaits.
         step_options: as in `continue_branch`.
 
     Returns:
-        One `Branch` for each lane.
+        One `Branch` for each wheel.
 
     Raises:
-        TypeError, ValueError: an argument that can't be meant, in one sentence.
+        TypeError, ValueError: an invalid argument, described in one sentence.
 
     Examples:
         >>> wheel = vrw.WheelParams(damping=np.array([205.0, 210.0]))
         >>> wheels = jax.tree.map(lambda v: jnp.broadcast_to(v, (2,)), wheel)
         >>> branches = vrw.continue_branches(wheels, "damping", (200.0, 230.0))
-        >>> [round(branch.borders[-1].value, 4) for branch in branches]
+        >>> [round(branch.special_points[-1].value, 4) for branch in branches]
         [219.8477, 219.8477]
     """
     untraced("vrw.continue_branch", INSTEAD, params, cycle)
@@ -249,9 +257,9 @@ def continue_branches(
 def _followed(
     wanted: Wanted, cycle: Any, options: ArclengthOptions, limits: np.ndarray
 ) -> tuple[np.ndarray, list[Strand | None]]:
-    """Outcomes of the starts, and what was followed from them.
+    """Return the outcomes of the starts, and the data of the branches from them.
 
-    On the mesh of the cycle options; without any, on one as fine as the branches need.
+    The mesh is that of the cycle options. Without options it is as fine as the branches need.
     """
     adaptive = wanted.cycle_options is None
     for refinement in range(1 + REFINEMENTS):
@@ -270,7 +278,7 @@ def _followed(
 
 
 UNTOLD = ("outcome", "solver_steps")
-"""Of the checking step, and not of a branch."""
+"""Measures of the checking step that a branch omits."""
 
 
 def _check_followed(model: AbstractWheel, name: str, period_n: int, cycle: Any) -> None:
@@ -327,7 +335,8 @@ def _branch_of_gaits(
 
 
 def _components(size: int, n: int) -> list[str]:
-    """Names of a section state's numbers: the paper's, or `unilateral_section.FullState`."""
+    """Return names of a section state's components: the paper's, or
+    `unilateral_section.FullState`."""
     if size == 3:
         return ["theta", "dtheta", "dL1"]
     legs = [f"{name}{leg}" for name in ("L", "dL", "code") for leg in range(1, n + 1)]
@@ -335,7 +344,7 @@ def _components(size: int, n: int) -> list[str]:
 
 
 def _stability(jacobians: np.ndarray) -> dict[str, xr.Variable]:
-    """Multipliers and what follows from them, along the branch."""
+    """Return multipliers and stability measures along the branch."""
     values = np.asarray(multipliers(jnp.asarray(jacobians)))
     radius = np.max(np.abs(values), -1)
     names = {"multiplier_real": values.real, "multiplier_imag": values.imag}
@@ -352,7 +361,7 @@ def _stability(jacobians: np.ndarray) -> dict[str, xr.Variable]:
 
 
 class MapRun(AbstractRun):
-    """Of fixed points of any map."""
+    """Continuation of fixed points of any map."""
 
     def read(self, wheels: Any, points: PathPoint) -> Table:
         return {"x": self.batched(jax.vmap(self.followed.section), READ, points.z)}
@@ -371,17 +380,17 @@ def continue_map(
     name: str = "parameter",
     options: ArclengthOptions | None = None,
 ) -> Branch:
-    """The branch of fixed points of any map x -> `function(constants, x, p)` through (x, p).
+    """Return the branch of fixed points of any map x -> `function(constants, x, p)` through (x, p).
 
-    The map must be differentiable forwards, and NaN where it is not defined. Its
-    bifurcations are located as for `continue_branch`.
+    The map must be differentiable in forward mode, and NaN where it is undefined. Its bifurcations
+    are located as in `continue_branch`.
 
     Args:
         function: `function(constants, x, p)`, shape of `x`.
         x: a fixed point, or near one, shape (n,).
         p: the parameter there.
-        bounds: its range.
-        constants: any pytree, handed on.
+        bounds: range of the parameter.
+        constants: any pytree, passed to the function.
         name: of the parameter in the result.
         options: `ArclengthOptions` of the branch.
 
@@ -389,12 +398,12 @@ def continue_map(
         A `Branch`.
 
     Raises:
-        TypeError, ValueError: an argument that can't be meant, in one sentence.
+        TypeError, ValueError: an invalid argument, described in one sentence.
 
     Examples:
         >>> logistic = lambda _, x, r: r * x * (1.0 - x)
-        >>> branch = vrw.continue_map(logistic, [0.6], 2.5, (2.0, 3.5))
-        >>> [(border.kind, round(border.value, 6)) for border in branch.borders]
+        >>> branch = vrw.continue_fixed_points(logistic, [0.6], 2.5, (2.0, 3.5))
+        >>> [(point.kind, round(point.value, 6)) for point in branch.special_points]
         [('period_doubling', 3.0)]
     """
     function_of("function", function, "of constants, x and p")

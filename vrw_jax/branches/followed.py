@@ -1,8 +1,9 @@
-"""The wheel's gaits as something that a continuation can follow, and their measures.
+"""Continuation problems of the wheel's gaits, and the measures of their points.
 
-`CycleFollowed` is the fast way: the collocation system of the paper's sequence of phases, one
-linearised pass per Newton iteration. `GroundFollowed` takes real ground's lanes, and `RungFollowed`
-works for every rung: its own step, iterated and differentiated forwards.
+`CollocationProblem` is the fast one: the collocation system of the paper's sequence of phases, with
+one linearized pass per Newton iteration. `GroundProblem` uses batched steps with unilateral
+contact. `ReturnMapProblem` works for every model: it iterates the model's step and differentiates
+it in forward mode.
 """
 
 import abc
@@ -51,30 +52,32 @@ from vrw_jax.wheel import (
 
 
 class Wheel(NamedTuple):
-    """The wheel whose gaits are followed, whatever its value of the parameter in question."""
+    """Wheel whose gaits are continued, at any value of the continued parameter."""
 
     params: WheelParams
-    happens: Float[Array, "n n_phases"]  # 1 where a phase of the cycle takes place, else 0
+    happens: Float[Array, "n n_phases"]  # 1 if a phase of the cycle takes place, else 0
 
 
 class AbstractFollowedWheel(AbstractFollowed):
-    """Gaits of `n_steps` steps along the float parameter `name`."""
+    """Continuation problem of gaits of `n_steps` steps along the float parameter `name`."""
 
     name: eqx.AbstractVar[str]
 
     @property
     @abc.abstractmethod
     def n_steps(self) -> int:
-        """Steps until the gait repeats."""
+        """Return the number of steps after which the gait repeats."""
 
     @abc.abstractmethod
     def read(self, wheel: Wheel, z: Unknown, p: Scalar) -> tuple[RungState, dict[str, Array]]:
-        """Section state before the first landing, and quantities that go on beyond a border."""
+        """Return the section state before the first landing, and quantities that are defined beyond
+        a special point."""
 
     def told(
         self, model: AbstractWheel, options: Options, wheels: Wheel, points: PathPoint
     ) -> dict[str, Array]:
-        """All measures of the gaits at many points, by event-driven steps, `read`'s included."""
+        """Return all measures of the gaits at many points from event-driven steps, with those of
+        `read_state`."""
         return _told(self, model, options, wheels, points)
 
 
@@ -96,14 +99,16 @@ def _told(
 
 
 class CycleFollowed(AbstractFollowedWheel):
-    """Limit cycles by collocation; z is a `Solution`, without the axis over lanes.
+    """Continuation problem of limit cycles by collocation. z is a `CollocationSolution` without the
+    axis over lanes.
 
-    Beyond an indicator's zero the formal solution goes on; the step says that it is no gait.
+    Beyond an indicator's zero the formal solution continues; the event-driven step rejects it as a
+    gait.
     """
 
     problem: Problem = eqx.field(static=True)
     name: str = eqx.field(static=True)
-    more: Callable | None = eqx.field(static=True)  # of the first step's passages and z: `read` too
+    more: Callable | None = eqx.field(static=True)  # of the first step's passages and z
 
     @property
     def n_steps(self) -> int:
@@ -128,12 +133,15 @@ class CycleFollowed(AbstractFollowedWheel):
         return one_wheel(correction_size)(z, correction)
 
     def valid(self, wheel: Wheel, z: Unknown, p: Scalar) -> Bool[Array, ""]:
-        """Positive durations; the event-driven step is the judge of all else."""
+        """Return whether the durations are positive. The event-driven step checks everything
+        else."""
         return jnp.all((z.durations > 0.0) | (wheel.happens < 0.5))
 
     def read(self, wheel: Wheel, z: Unknown, p: Scalar) -> tuple[RungState, dict[str, Array]]:
-        """Beyond a border: durations, shortest over the steps, and `takeoff_acceleration`: with
-        which the rear foot leaves the ground, m/s^2, least over the steps.
+        """Return the section state, and quantities that continue beyond a special point.
+
+        These are the shortest durations over the steps, and `takeoff_acceleration`, the rear foot's
+        acceleration at take-off, m/s^2, least over the steps.
         """
         parameters = self._moved(wheel, p)
         s = wheel_of(parameters, self.problem.n_legs).symbols()
@@ -153,14 +161,17 @@ class CycleFollowed(AbstractFollowedWheel):
 
 
 Told = Callable[[Problem, Array, Array, Solution], Array]
-"""Quantities of collocated gaits over lanes: of the problem, parameters, `happens` and solution."""
+"""Function of the system, parameters, `phase_active` and solution that returns quantities of
+collocated gaits over lanes."""
 
 
 def linearised_along(problem: Problem, wanted: tuple[int, ...], told: Told | None = None) -> Any:
-    """Correction, columns of the parameters `wanted` and monodromy of one wheel's trial.
+    """Return a function for correction, tangents of the parameters and monodromy of one wheel's
+    trial.
 
-    With `told` also that there, and its slopes along the correction and each of the columns. Over
-    (parameters, happens, solution); `jax.vmap` maps it onto lanes.
+    With `quantities_of` it also returns those quantities at the trial, and their derivatives along
+    the correction and along each tangent. Its arguments are (parameters, phase_active, solution);
+    `jax.vmap` maps it over lanes.
     """
 
     def linearised(parameters: Array, happens: Array, z: Solution) -> tuple:
@@ -184,10 +195,11 @@ def linearised_along(problem: Problem, wanted: tuple[int, ...], told: Told | Non
 
 
 class RungFollowed(AbstractFollowedWheel):
-    """Fixed points of `period_n` steps of any rung; z is the section state.
+    """Continuation problem of fixed points of `period_n` steps of any model; z is the section
+    state.
 
-    Codes at its end (`AbstractWheel.section_numbers`) are carried along: they are those of the
-    image of the last iteration, and Newton's method ends only where they agree.
+    The codes at its end (`AbstractWheel.n_continuous`) are those of the image of the last
+    iteration. Newton's method ends only if they agree.
     """
 
     model: AbstractWheel
@@ -218,12 +230,13 @@ class RungFollowed(AbstractFollowedWheel):
         return between_states(left, right, place, self.numbers)
 
     def read(self, wheel: Wheel, z: Unknown, p: Scalar) -> tuple[RungState, dict[str, Array]]:
-        """The section state; a step's own measures hold all there is."""
+        """Return the section state. The step's measures contain all other quantities."""
         return z, {}
 
 
 class GroundFollowed(AbstractFollowedWheel):
-    """Fixed points on real ground by lanes, which take many at once; z as of `RungFollowed`."""
+    """Continuation problem with unilateral contact, by batched steps; z as in
+    `ReturnMapProblem`."""
 
     model: UnilateralWheel
     options: Options
@@ -242,7 +255,7 @@ class GroundFollowed(AbstractFollowedWheel):
         return self.model.section_numbers(WheelParams(n_legs=self.n_legs))
 
     def values(self, wheels: Wheel, p: Array) -> Array:
-        """The rung's numbers of many wheels with the parameter at p."""
+        """Return the model's parameter values of many wheels with the continued parameter at p."""
 
         def one(wheel: Wheel, p: Array) -> Array:
             model, params = self.model.moved(wheel.params, self.name, p)
@@ -255,7 +268,7 @@ class GroundFollowed(AbstractFollowedWheel):
         return Periods(self.model, self.n_legs, self.period_n, values)
 
     def linearise(self, wheel: Wheel, z: Unknown, p: Array) -> Linear:
-        """Of many."""
+        """Return the Newton steps of many wheels."""
         x, n = np.asarray(z), self.numbers
         own = np.asarray(self.model.parameter_names) == self.name
         now = self._periods(wheel, p).around(self.options, x, own)
@@ -290,7 +303,7 @@ def _of_period(steps: AbstractStep, x: RungState) -> dict[str, Array]:
 
 
 def between_states(left: Array, right: Array, place: Scalar, numbers: int) -> Array:
-    """Of section states; codes are those of the nearer one."""
+    """Interpolate section states. The codes are those of the nearer one."""
     codes = jnp.where(place < 0.5, left, right)[numbers:]
     return jnp.concatenate([(left + place * (right - left))[:numbers], codes])
 
@@ -298,11 +311,11 @@ def between_states(left: Array, right: Array, place: Scalar, numbers: int) -> Ar
 def gait_measures(
     model: AbstractWheel, params: WheelParams, x: RungState, options: Options, period_n: int
 ) -> dict[str, Array]:
-    """All measures of one period of a gait that passes the section at x, with `closure`.
+    """Return all measures of one period of a gait that passes the section at x, with `closure`.
 
-    Indicators and margins are the least over the steps, durations and energies their sums, section
-    and post-impact state those of the last and first step; `outcome` is that of the first step that
-    failed. `closure` is how far the section state is from x after the period.
+    Indicators and margins are minima over the steps, durations and energies are sums. Section and
+    post-impact state are those of the last and first step. `outcome` is that of the first step that
+    failed. `closure` is the distance of the section state from x after the period.
     """
 
     def one(x: RungState, _: None) -> tuple[RungState, dict[str, Array]]:
@@ -314,7 +327,7 @@ def gait_measures(
 
 
 def period_measures(end: RungState, steps: dict[str, Array], x: RungState) -> dict[str, Array]:
-    """`gait_measures` from those of each step, and the section state where they end."""
+    """Return `measure_gait` from the measures of each step and the final section state."""
     told = {}
     for name, values in steps.items():
         if name in MARGINS | STOPPERS or name.startswith("lambda_"):

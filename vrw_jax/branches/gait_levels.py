@@ -1,7 +1,7 @@
-"""Quantities of collocated gaits over two parameters, each of whose zeros is a border.
+"""Test functions of collocated gaits over two parameters, whose zeros are special points.
 
-Trial, columns, quantities and their slopes come from one call of machine code; margins that only an
-event-driven step tells come from steps.
+Trial, tangents, quantities and their derivatives come from one call of machine code. Margins that
+need an event-driven step come from steps.
 """
 
 from collections.abc import Mapping
@@ -48,29 +48,32 @@ from vrw_jax.wheel import (
 
 EXACT: Mapping[str, str] = GaitRun.exact
 VOID = (*INDICATORS, "duration_sls1", "duration_sls2")
-"""Where one of these vanishes the step itself goes one way or the other: what it says is void."""
+"""Quantities at whose zeros the step is discontinuous, so that its measures are not defined."""
 
 ROLLS_OFF = "duration_dls"
-"""The border where double support comes to last no time: the rear foot's force vanishes there and
-falls. Where it vanishes and rises, at that of `lambda_4_plus`, the step jumps."""
+"""Special point where the duration of double support reaches zero: the rear foot's force vanishes
+there and falls. If it vanishes and rises, at the zero of `lambda_4_plus`, the step jumps."""
 
 FALLS, JUMPS = "fall of the rear foot's force at first", "its mean fall in double support"
-"""N/s. The first is positive on `ROLLS_OFF`, which ends where it is zero. The second vanishes on
-the border of `lambda_4_plus`, and not on `ROLLS_OFF`, which solves the same equations besides."""
+"""Names of two rates, N/s. The first is positive on `DLS_VANISHES`, which ends at its zero. The
+second vanishes on the curve of `lambda_4_plus`, and not on `DLS_VANISHES`, which solves the same
+equations too."""
 
 FORMAL = (*VOID, *EXACT.values(), FALLS, JUMPS)
-"""Quantities of the collocated gait itself, which go on beyond the border."""
+"""Quantities of the collocated gait itself, which continue beyond the special point."""
 
 
 def level_of(name: str, rolls: bool) -> str:
-    """The quantity that is solved for at a border; `rolls`: of gaits with double support."""
+    """Return the quantity whose zero is the special point; `has_double_support` refers to the
+    gaits."""
     if name == "lambda_4_plus" and rolls:
         return JUMPS
     return "lambda_4_plus" if name == ROLLS_OFF else EXACT.get(name, name)
 
 
 def quantities_of(name: str, n_legs: int) -> tuple[str, ...]:
-    """The quantities that are told together with the one that vanishes at a border."""
+    """Return the quantities that are evaluated together with the one that vanishes at a special
+    point."""
     legs = [f"[{leg}]" for leg in range(3, n_legs + 1)]
     by_step = [n + leg for n, margin in MARGINS.items() for leg in (legs if margin.axis else [""])]
     kinds = BIFURCATIONS, FORMAL, tuple(name for name in by_step if name not in FORMAL)
@@ -78,18 +81,18 @@ def quantities_of(name: str, n_legs: int) -> tuple[str, ...]:
 
 
 class GaitAt(NamedTuple):
-    """The wheel whose border is followed, and which of the level's quantities is its border."""
+    """Wheel on a curve of special points, and the index of the quantity that vanishes on it."""
 
     gait: Wheel
     place: Array
 
 
 class GaitLevel(AbstractLevel):
-    """One of `quantities` of collocated gaits over two parameters."""
+    """One of `quantities` of collocated gaits as a test function over two parameters."""
 
     problem: Problem = eqx.field(static=True)
     names: tuple[str, str] = eqx.field(static=True)
-    quantities: tuple[str, ...] = eqx.field(static=True)  # BIFURCATIONS, FORMAL or a step's
+    quantities: tuple[str, ...] = eqx.field(static=True)  # of one quantity group
     model: ViscoelasticWheel
     step_options: Options
 
@@ -114,12 +117,14 @@ class GaitLevel(AbstractLevel):
     def _by_steps(
         self, gait: Wheel, z: Solution, p: Array, correction: Solution, columns: tuple
     ) -> tuple[Array, Array]:
-        """What steps tell of the corrected gait, and its slopes by both parameters.
+        """Return the step's quantities of the corrected gait, and their derivatives with respect to
+        both parameters.
 
-        Newton's method needs slopes to few digits: steps beside the trial have them for less than
-        derivatives of the step, and on the same machine code as the step itself. Beside a fold
-        columns grow beyond bounds and turn parallel, and corrections follow them: steps are taken
-        along an orthonormal basis, from where the columns' plane is nearest to the trial.
+        Newton's method needs the derivatives to a few digits. Finite differences of steps cost less
+        than derivatives of the step, and use the same machine code. Next to a fold the tangents
+        grow without bound and become parallel, and so do the corrections. The differences are
+        therefore taken along an orthonormal basis, from the point of the tangents' plane that is
+        nearest to the trial.
         """
         ahead = jnp.stack([p[i] * self.section(column) for i, column in enumerate(columns)])
         basis, triangle = jnp.linalg.qr(jnp.concatenate([ahead, jnp.eye(2, dtype=p.dtype)], 1).T)
@@ -137,7 +142,7 @@ class GaitLevel(AbstractLevel):
         return told[0] + here @ slopes, triangle.T @ slopes / p[:, None]
 
     def at(self, gait: Wheel, p: Array) -> Wheel:
-        """The wheel with both parameters as they are at p."""
+        """Return the wheel with both parameters at p."""
         params = gait.params
         for name, value in zip(self.names, p, strict=True):
             params = self.model.moved(params, name, value)[1]
@@ -145,11 +150,11 @@ class GaitLevel(AbstractLevel):
 
     @property
     def gaits(self) -> CycleFollowed:
-        """The gaits along the first parameter alone."""
+        """Return the continuation problem of the gaits along the first parameter alone."""
         return CycleFollowed(problem=self.problem, name=self.names[0], more=_named)
 
     def told(self, gait: Wheel, z: Solution, p: Array) -> Array:
-        """Those of the quantities that the step tells, one after another."""
+        """Return those quantities that come from the step, in order."""
         params = self.at(gait, p).params
         x = self.gaits.read(gait._replace(params=params), z, p[0])[0]
         told = gait_measures(self.model, params, x, self.step_options, 1)
@@ -168,11 +173,12 @@ class GaitLevel(AbstractLevel):
 
 @eqx.filter_jit
 def where_jumps_begin(level: GaitLevel, gait: Wheel, z: Solution, p: Array) -> tuple[Array, Array]:
-    """Both parameters where `ROLLS_OFF` meets the border of `lambda_4_plus`, and how they settled.
+    """Return both parameters where `DLS_VANISHES` meets the curve of `lambda_4_plus`, and the last
+    relative change.
 
-    From a gait and parameters near there. The equations of both are singular where double support
-    lasts no time; those of the same gait without it are not, and the rear foot's force and its fall
-    vanish there at once.
+    The start is a gait and parameters nearby. The equations of both curves are singular where
+    double support has zero duration. The equations of the same gait without double support are
+    regular, and the rear foot's force and its rate vanish there together.
     """
     gait = gait._replace(happens=gait.happens.at[0, 0].set(0.0))
     z = z._replace(durations=z.durations.at[0, 0].set(0.0))
@@ -226,13 +232,14 @@ def _monodromy(problem: Problem, parameters: Array, happens: Array, z: Solution)
 
 
 ITERATIONS = 8
-"""Of Newton's method for one point."""
+"""Number of Newton iterations for one point."""
 
 ROUNDING = 1e-9
-"""Of a duration that is zero all along a curve, s."""
+"""Round-off of a duration that is zero along a whole curve, s."""
 
 DIFFERENCE = 1e-6
-"""Of section and parameters, these over their values, for slopes of what only a step tells."""
+"""Finite difference of section and relative parameters, for derivatives of quantities of the
+step."""
 
 TOLD = {FORMAL: _formal, BIFURCATIONS: _monodromy}
-"""By what a level's quantities are read, where it is not the step."""
+"""Functions for the quantities of a test function that need no event-driven step."""

@@ -1,7 +1,7 @@
-"""All borders of gaits over two parameters, and whether a scan tells of one more.
+"""Map of all special points of gaits over two parameters, with a check against a scan.
 
-Where a quantity has different signs at neighbouring samples of a scan, a border runs between them.
-Where no curve does, branches through these samples find it.
+If a quantity has different signs at neighboring samples of a scan, a curve of special points runs
+between them. If no traced curve does, branches through these samples find it.
 """
 
 from __future__ import annotations
@@ -24,23 +24,25 @@ from vrw_jax.runtime import xarray as xr
 from vrw_jax.wheel import Outcome, WheelParams
 
 ROUNDS = 3
-"""How often what was met on the way to borders is followed in its turn."""
+"""Number of rounds in which special points met on the curves are continued in turn."""
 
 LINES = 5
-"""Branches side by side, along each parameter, on which a map begins."""
+"""Number of parallel branches along each parameter on which a map starts."""
 
 NEAR, APART = 1.0, 5.0
-"""Distances in cells of the scan: of a change of sign from the curve that it tells of, and of one
-from another that is looked at in the same round."""
+"""Distances in cells of the scan. The first is the largest one of a change of sign from a curve
+that explains it. The second is the smallest one between changes that are examined in the same
+round."""
 
 LOOKS = 8
-"""Rounds at most in which changes of sign are looked at."""
+"""Largest number of rounds in which changes of sign are examined."""
 
 NO_GAIT, STABILITY = "gait", "spectral_radius"
-"""Names of changes between a gait and none, and between one that attracts and one that doesn't."""
+"""Names of changes between a gait and none, and between a stable and an unstable gait."""
 
 SCANNED = ("lambda_4_plus", STABILITY)
-"""Measures of a scan that tell of borders, beside the margins that every scan has."""
+"""Measures of a scan that indicate special points, in addition to the margins that every scan
+has."""
 
 TOLD_BY: Mapping[str, tuple[str, ...]] = {
     NO_GAIT: (*ENDING, *BIFURCATIONS),
@@ -48,23 +50,26 @@ TOLD_BY: Mapping[str, tuple[str, ...]] = {
     "lambda_4_plus": ("lambda_4_plus", ROLLS_OFF),
     **{exact: (name,) for name, exact in EXACT.items()},
 }
-"""Names of the curves that explain a change, where it is not its own."""
+"""Names of the curves that explain a change, if it is not the curve of the same name."""
 
 
 class Change(NamedTuple):
-    """Between two neighbouring samples of a scan."""
+    """Change of sign between two neighboring samples of a scan."""
 
     name: str
     axis: int
-    sample: tuple[int, int]  # that it begins at, one with a gait
-    at: tuple[float, float]  # in cells
+    sample: tuple[int, int]  # first sample, with a gait
+    at: tuple[float, float]  # in cells of the scan
 
 
 def border_map(
     scan: xr.Dataset, params: WheelParams, model: ViscoelasticWheel
 ) -> tuple[tuple[BorderCurve, ...], list[Change]]:
-    """All curves over the two parameters of a scan of `SCANNED` measures and margins, and the
-    changes between its neighbours that none of them explains."""
+    """Return all curves of special points over the two parameters of a scan.
+
+    The scan contains `SPECIAL_POINT_MEASURES` and margins. Return also the changes between its
+    samples that no curve explains.
+    """
     names = tuple(map(str, scan.outcome.dims))
     box = np.array([(scan[name].values[0], scan[name].values[-1]) for name in names], float)
     tracer = Tracer((names[0], names[1]), box, model, OF_CURVES, Options.tight())
@@ -82,7 +87,8 @@ def border_map(
 
 
 def _followed(tracer: Tracer, seeds: list[Seed], traced: list[Traced]) -> list[Traced]:
-    """The curves known and those through the seeds, and through what these meet."""
+    """Return the known curves, the curves through the seeds, and the curves through special points
+    on these."""
     for _ in range(ROUNDS):
         more = tracer.followed(seeds, traced)
         longer = [one for one in traced if not any(tracer.lies_on(one, new) for new in more)]
@@ -91,7 +97,7 @@ def _followed(tracer: Tracer, seeds: list[Seed], traced: list[Traced]) -> list[T
 
 
 def across(tracer: Tracer, params: WheelParams) -> list[Seed]:
-    """Of the branches through wheels on either middle line of the box."""
+    """Return seeds on the branches through wheels on the middle lines of the box."""
     seeds, middle = [], tracer.box.mean(1)
     for axis, name in enumerate(tracer.parameters):
         low, high = tracer.box[1 - axis]
@@ -103,7 +109,8 @@ def across(tracer: Tracer, params: WheelParams) -> list[Seed]:
 
 
 def _along(tracer: Tracer, axis: int, wheels: list[WheelParams]) -> list[Seed]:
-    """Of branches, always as many side by side: they are compiled once."""
+    """Return seeds on branches, always the same number side by side, so that they are compiled
+    once."""
     seeds = []
     for begin in range(0, len(wheels), LINES):
         some = wheels[begin : begin + LINES]
@@ -115,7 +122,7 @@ def _along(tracer: Tracer, axis: int, wheels: list[WheelParams]) -> list[Seed]:
 def _beside(
     tracer: Tracer, params: WheelParams, scan: xr.Dataset, changes: Sequence[Change]
 ) -> list[Seed]:
-    """Of branches through the samples at which changes begin."""
+    """Return seeds on branches through the samples at which changes begin."""
     seeds = []
     for axis in range(2):
         own = [change for change in changes if change.axis == axis]
@@ -126,7 +133,7 @@ def _beside(
 
 
 def _columns(scan: xr.Dataset, dims: tuple[str, str]) -> dict[str, np.ndarray]:
-    """What may change its sign, over the two parameters."""
+    """Return the quantities whose signs may change, over the two parameters."""
     told = {"lambda_4_plus": scan.lambda_4_plus.transpose(*dims).values}
     told[STABILITY] = 1.0 - scan[STABILITY].transpose(*dims).values
     for name in (name for name in MARGINS if name not in EXACT):
@@ -139,7 +146,7 @@ def _columns(scan: xr.Dataset, dims: tuple[str, str]) -> dict[str, np.ndarray]:
 
 
 def changes_of(scan: xr.Dataset, dims: tuple[str, str]) -> list[Change]:
-    """Between all neighbours; of quantities where both samples, or none, have double support."""
+    """Return the changes between all neighbors. Both samples, or none, must have double support."""
     outcome = scan.outcome.transpose(*dims).values
     found, coarse = outcome == Outcome.STEPPED, outcome == Outcome.MESH_TOO_COARSE
     told, changes = _columns(scan, dims), []
@@ -165,7 +172,7 @@ def changes_of(scan: xr.Dataset, dims: tuple[str, str]) -> list[Change]:
 def unexplained(
     changes: Sequence[Change], curves: Sequence[BorderCurve], scan: xr.Dataset
 ) -> list[Change]:
-    """Those beside which no curve runs that they could tell of."""
+    """Return the changes that are not near any curve that could explain them."""
     left = []
     for name in sorted({change.name for change in changes}):
         own = [change for change in changes if change.name == name]
@@ -180,7 +187,7 @@ def unexplained(
 
 
 def _thinned(left: Sequence[Change], looked: Sequence[Change]) -> list[Change]:
-    """Of each name those apart from each other and from those looked at before."""
+    """Return changes of each name that are apart from each other and from those examined before."""
     chosen: list[Change] = []
     for change in left:
         alike = [c for c in (*looked, *chosen) if (c.name, c.axis) == (change.name, change.axis)]

@@ -1,7 +1,8 @@
-"""Branches followed, and every border on them located: the part that knows no wheel.
+"""Continuation of branches and location of their special points, independent of the wheel.
 
-Several branches run side by side. First each is followed both ways; then the places where it leaves
-what it stands for are located and become its ends; then every other sign change on it.
+Several branches run side by side. First, each is continued both ways. Then the points where it
+stops being admissible are located; they are its ends. Then every other change of sign on it is
+located.
 """
 
 import abc
@@ -39,26 +40,31 @@ from vrw_jax.numerics import (
 )
 
 ACCURACY = 1e-10
-"""Of a border, in the parameter: the bracket's width at which the search for it ends."""
+"""Accuracy of a special point in the parameter: the width of the bracket at which the search
+ends."""
 
 AT_FOLD = 1e-6
-"""The same as a share of the bracket, where the parameter turns back: it enters squared."""
+"""Final width of the bracket as a fraction of the initial one, used near a fold, where the
+parameter enters squared."""
 
 SHARES_WHERE_LOST = (0.99, 0.9)
-"""Of the way to a zero so ill-conditioned that no point is found beside it."""
+"""Fractions of the distance to an ill-conditioned zero at which a point beside it is tried
+again."""
 
 SHAPES = (1, 8)
-"""Points that are located side by side; one shape where much is compiled for it."""
+"""Numbers of points that are located side by side; only one of them is compiled where compilation
+is expensive."""
 
 READ = 32
-"""Points that one program reads: fewer take it as long."""
+"""Number of points that one program evaluates; fewer points take the same time."""
 
 IN_SEQUENCE = "sequence"
-"""Column that is 1 where a point is what it stands for, else -1."""
+"""Name of the column that is 1 where a point is admissible, else -1."""
 
 BRANCH_POINT = "branch_point"
-"""A multiplier passes 1 but the branch does not turn back: another branch crosses it. There the
-equations are singular, and the place is only as good as the steps are short."""
+"""Kind of a point where a multiplier crosses 1 but the branch does not turn back: another branch
+crosses it. The equations are singular there, so the location is only as accurate as the
+continuation steps are short."""
 
 Table = dict[str, np.ndarray]
 """Named quantities over a batch of points, first axis."""
@@ -66,50 +72,54 @@ Table = dict[str, np.ndarray]
 
 @dataclass(frozen=True)
 class AbstractRun(abc.ABC):
-    """One continuation of several wheels side by side, and what is asked of its points."""
+    """Continuation of several wheels side by side, with the quantities to evaluate at its
+    points."""
 
     followed: AbstractFollowed
     options: ArclengthOptions
-    wheels: Any  # leading axis over wheels
+    wheels: Any  # with a leading axis over wheels
     bounds: np.ndarray
 
     ending: ClassVar[tuple[str, ...]] = ()
-    """Columns whose zero ends a branch: the order of events changes."""
+    """Names of columns at whose zeros a branch ends because the order of events changes."""
     exact: ClassVar[Mapping[str, str]] = {}
-    """A margin that vanishes ill, and the column that it stands and falls with."""
+    """Margins that vanish ill-conditioned, each with the column that vanishes at the same point."""
 
     @abc.abstractmethod
     def read(self, wheels: Any, points: PathPoint) -> Table:
-        """What the Jacobian does not say, of the wheels with the same axis."""
+        """Return the quantities that the Jacobian does not give, of the wheels with the same
+        axis."""
 
     @abc.abstractmethod
     def kept(self, table: Table) -> np.ndarray:
-        """Which points are what they stand for, by their table."""
+        """Return which points are admissible, from their table."""
 
     def is_margin(self, name: str) -> bool:
-        """Whether a column's zero is a border collision."""
+        """Return whether a column's zero is a border collision."""
         return False
 
     def known(self, table: Table, owners: np.ndarray) -> Table:
-        """The table without what says nothing at a point, by whose it is."""
+        """Return the table with undefined quantities masked, which depend on the wheel of the
+        point."""
         return table
 
     def name_of_loss(self, table: Table, place: int) -> str:
-        """What the first point beyond the end of a branch says of it."""
+        """Return a name for the end of a branch from the first point beyond it."""
         return IN_SEQUENCE
 
     def is_rough(self, table: Table, ends: tuple[str, ...]) -> bool:
-        """Whether a mesh says how far a branch goes or how exact it is; `ends`: names of losses."""
+        """Return whether the mesh limits the extent or the accuracy of a branch; `ends` are names
+        of ends."""
         return False
 
     def batched(self, function: Callable, size: int, *trees: Any) -> Any:
-        """Of many rows, which are numpy's here, `size` of them at once where that is compiled."""
+        """Map over many numpy rows, `size` at a time if the function is compiled."""
         if self.followed.traced:
             return in_batches_of_numpy(function, (size,), *trees)
         return jax.tree.map(np.asarray, in_batches(function, SHAPES, *trees))
 
     def table(self, points: PathPoint, owners: np.ndarray) -> Table:
-        """Every quantity at each point, bifurcation functions and IN_SEQUENCE included."""
+        """Return every quantity at each point, with bifurcation functions and ADMISSIBLE_COLUMN."""
         wheels = taken(self.wheels, owners)
         found = self.read(wheels, points)
         margins = in_batches_of_numpy(bifurcation_functions, (READ,), points.jacobian)
@@ -123,20 +133,20 @@ class AbstractRun(abc.ABC):
 
 
 def _both(name: str) -> str:
-    """The column that is positive where a margin and what it stands and falls with both are."""
+    """Return the name of the column that is positive where a margin and its substitute are."""
     return f"{name} for certain"
 
 
 def both_hold(margin: np.ndarray, exact: np.ndarray) -> np.ndarray:
-    """A quantity with the sign of both, and of `exact` alone where that is negative.
+    """Return a quantity with the sign of both, and of `substitute` alone where that is negative.
 
-    It passes zero without a jump at either's border.
+    It crosses zero without a jump at the zeros of either.
     """
     return np.where(exact < 0.0, exact, np.minimum(exact, margin))
 
 
 def _follow_both_ways(run: AbstractRun, z: Any, p: Array, wanted: np.ndarray) -> arclength.Track:
-    """Tracks of all wheels, axes (wheel, direction): first towards smaller values."""
+    """Continue all wheels, axes (wheel, direction), the first direction towards smaller values."""
     twice = lambda tree: jax.device_put(taken(tree, np.repeat(np.arange(len(p)), 2)))
     bounds = jnp.asarray(run.bounds)
     ways = jnp.tile(jnp.asarray([-1.0, 1.0], bounds.dtype), p.shape[0])
@@ -156,7 +166,7 @@ def _solve_on(
     right: PathPoint,
     places: Array,
 ) -> tuple[PathPoint, Array]:
-    """Points of the branch between neighbours, at `places` in [0, 1] of the chord."""
+    """Return points of the branch between neighbors, at `fractions` in [0, 1] of the chord."""
 
     def one(wheel: Any, left: PathPoint, right: PathPoint, place: Array) -> tuple[PathPoint, Array]:
         z, plane = _begin_on(followed, bounds, left, right, place)
@@ -168,7 +178,7 @@ def _solve_on(
 def _begin_on(
     followed: AbstractFollowed, bounds: Array, left: PathPoint, right: PathPoint, place: Array
 ) -> tuple[Any, Plane]:
-    """Where a search between neighbours starts, and the plane that it stays on."""
+    """Return the start of a search between neighbors, and the plane that contains the solution."""
     z = followed.between(left.z, right.z, place)
     scale = bounds[1] - bounds[0]
     row_x = followed.section(right.z) - followed.section(left.z)
@@ -189,29 +199,30 @@ def _solve_many(
     right: PathPoint,
     places: Array,
 ) -> tuple[PathPoint, Array]:
-    """`_solve_on`, from outside of compiled code."""
+    """Return `_solve_between` outside of compiled code."""
     z, planes = _begin_many(followed, bounds, left, right, places)
     return solve_many(followed, options, wheels, z, planes, bounds)
 
 
 class _Pieces(NamedTuple):
-    """Points of all wheels in one array; each wheel's in the order of its branch."""
+    """Points of all wheels in one array; each wheel's points are in the order of its branch."""
 
     points: PathPoint
-    owners: np.ndarray  # which wheel
+    owners: np.ndarray  # of each point
     table: Table
 
 
 class _Zero(NamedTuple):
-    bracket: tuple[int, int, str]  # left and right point, quantity
+    bracket: tuple[int, int, str]  # left and right point, name of the quantity
     value: float
     place: float
-    beside: PathPoint  # on the side of the bracket's left point, leading axis 1
-    table: Table  # there
+    beside: PathPoint  # on the side of the left point, leading axis 1
+    table: Table  # at `point_beside`
 
 
 def _zeros(run: AbstractRun, pieces: _Pieces, asked: list[tuple[int, int, str]]) -> list[_Zero]:
-    """Each (left, right, quantity) whose sign differs between two points, located."""
+    """Locate the zero of each request (left, right, quantity) whose sign differs between two
+    points."""
     if not asked:
         return []
     lefts, rights = (np.array([a[i] for a in asked]) for i in (0, 1))
@@ -242,7 +253,7 @@ def _zeros(run: AbstractRun, pieces: _Pieces, asked: list[tuple[int, int, str]])
     width = np.minimum(ACCURACY / reach, AT_FOLD)
     found = locate(asked_at, (known(lefts), known(rights)), width)
     every = np.arange(len(asked))
-    # A little to the left even of an exact zero: there it is still what the branch stands for.
+    # Slightly to the left even of an exact zero, where the point is still admissible.
     beside, table = evaluated(np.maximum(found.left - width, 0.0), every)
     for share in SHARES_WHERE_LOST:
         lost, rows = np.flatnonzero(~(table[IN_SEQUENCE] > 0.0)), np.arange(len(asked))
@@ -267,7 +278,7 @@ def _along(flags: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def _collected(run: AbstractRun, tracks: arclength.Track) -> _Pieces:
-    """All points of all tracks, each wheel's two directions joined at its start."""
+    """Collect all points of all results, each wheel's two directions joined at its start."""
     parts, owners = [], []
     for wheel in range(tracks.n_points.shape[0]):
         down, up = (int(n) for n in tracks.n_points[wheel])
@@ -286,7 +297,8 @@ def _collected(run: AbstractRun, tracks: arclength.Track) -> _Pieces:
 
 
 class _Reach(NamedTuple):
-    """The valid points of one wheel, and the first one beyond at either end (-1: none)."""
+    """Admissible points of one wheel, and the first one beyond at either end (-1 if there is
+    none)."""
 
     owner: int
     points: np.ndarray
@@ -294,12 +306,12 @@ class _Reach(NamedTuple):
 
 
 def _reaches(pieces: _Pieces, starts: Mapping[int, int]) -> list[_Reach]:
-    """What of each wheel's points is connected to its start without leaving the sequence."""
+    """Return the points of each wheel that are connected to its start through admissible points."""
     reaches = []
     for owner, start in starts.items():
         own = np.flatnonzero(pieces.owners == owner)
         good = pieces.table[IN_SEQUENCE][own] > 0.0
-        # A start on a border is as often beyond it as not: then it is beside the branch's end.
+        # A start on a special point may be beyond it: then it is next to the branch's end.
         near = [i for i in (start, start + 1, start - 1) if 0 <= i < len(own) and good[i]]
         if not near:
             continue
@@ -316,14 +328,14 @@ def _reaches(pieces: _Pieces, starts: Mapping[int, int]) -> list[_Reach]:
 
 
 def _is_rough(run: AbstractRun, pieces: _Pieces, reach: _Reach) -> bool:
-    """`AbstractRun.is_rough` before its borders are located."""
+    """Return `AbstractContinuation.is_mesh_limited` before special points are located."""
     lost = [i for i in reach.beyond if i >= 0 and not _crossing(run, pieces, reach, i)]
     names = tuple(run.name_of_loss(pieces.table, i) for i in lost)
     return run.is_rough(taken(pieces.table, reach.points), names)
 
 
 def _crossing(run: AbstractRun, pieces: _Pieces, reach: _Reach, beyond: int) -> list[str]:
-    """What changes sign from the last point to the first one beyond."""
+    """Return the quantities that change sign from the last point to the first one beyond."""
     last = reach.points[0 if beyond < reach.points[0] else -1]
     known = [name for name in run.ending if name in pieces.table]
     return [n for n in known if pieces.table[n][last] * pieces.table[n][beyond] < 0.0]
@@ -332,7 +344,8 @@ def _crossing(run: AbstractRun, pieces: _Pieces, reach: _Reach, beyond: int) -> 
 def _located_ends(
     run: AbstractRun, pieces: _Pieces, reaches: list[_Reach]
 ) -> dict[tuple[int, int], _Zero]:
-    """Where each branch leaves its sequence, by (owner, end: 0 or 1): the nearest zero there."""
+    """Locate where each branch stops being admissible, by (wheel, end: 0 or 1), at the nearest
+    zero."""
     asked, keys = [], []
     for reach in reaches:
         for end, beyond in enumerate(reach.beyond):
@@ -352,7 +365,7 @@ def _located_ends(
 def _with_ends(
     pieces: _Pieces, reaches: list[_Reach], ends: Mapping[tuple[int, int], _Zero]
 ) -> _Pieces:
-    """The valid points alone, with the points beside the located ends joined to them."""
+    """Return the admissible points alone, joined with the points next to the located ends."""
     points, owners, tables = [], [], []
 
     def add(some: PathPoint, owner: int, table: Table) -> None:
@@ -371,7 +384,7 @@ def _with_ends(
 
 
 def _inner_zeros(run: AbstractRun, pieces: _Pieces) -> list[tuple[str, _Zero]]:
-    """Every quantity's sign changes between neighbours on the same branch, with its name."""
+    """Locate every change of sign between neighbors on the same branch; return names and zeros."""
     skipped = (IN_SEQUENCE, *run.exact.values())
     names = [
         name for name, values in pieces.table.items() if values.ndim == 1 and name not in skipped
@@ -400,17 +413,17 @@ def _kind(run: AbstractRun, name: str) -> str:
 
 
 class Strand(NamedTuple):
-    """One wheel's finished branch, before it is labelled."""
+    """Finished branch of one wheel, before it is labeled."""
 
     points: PathPoint
     table: Table
     borders: tuple[Border, ...]
     ends: tuple[str, str]
-    rough: bool  # `AbstractRun.is_rough`
+    rough: bool  # `AbstractContinuation.is_mesh_limited`
 
 
 MakeCycle = Callable[[int, PathPoint], Callable[[], Any] | None]
-"""From a wheel's place and a point to what computes its limit cycle."""
+"""Function of a wheel's index and a point that returns a function for its limit cycle."""
 
 
 def _left_rough(
@@ -432,12 +445,14 @@ def run_all(
     make_cycle: MakeCycle,
     finest: bool = True,
 ) -> list[Strand | None]:
-    """Follow, locate, and sort by wheel; None where there was no start.
+    """Continue the branches, locate special points, and return the branches by wheel; None without
+    a start.
 
-    Without `finest`, of what is rough no border is located: it will be followed again.
+    Without `is_finest`, special points of mesh-limited branches are not located, because these are
+    continued again.
     """
     tracks = _follow_both_ways(run, z, p, found)
-    # What comes back to its start has gone both ways at once.
+    # A closed curve has both directions in one result.
     closed = (tracks.ending == int(Ending.CLOSED)).all(1, keepdims=True) & np.array([True, False])
     counts: Any = np.where(closed, 0, tracks.n_points)
     tracks = tracks._replace(n_points=counts)

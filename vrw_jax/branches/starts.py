@@ -1,4 +1,4 @@
-"""Where a branch begins, each rung by its own means: gaits to be followed, and their wheels."""
+"""Starts of branches by model: gaits to continue, and their wheels."""
 
 import dataclasses
 from collections.abc import Callable
@@ -26,34 +26,34 @@ from vrw_jax.wheel import WheelParams
 
 
 class Wanted(NamedTuple):
-    """Branches of a batch of wheels: whose, along what, from where."""
+    """Request for branches of a batch of wheels."""
 
     params: WheelParams  # one leading axis
     model: AbstractWheel
     name: str  # of the parameter
-    p: Array  # its values where the branches begin
+    p: Array  # at the starts of the branches
     period_n: int
     cycle_options: CycleOptions | None
     step_options: Options
 
 
 class Start(NamedTuple):
-    """What a continuation needs to begin."""
+    """Data that a continuation needs to start."""
 
     followed: AbstractFollowedWheel
     wheels: Wheel
     z: Any
-    outcomes: np.ndarray  # of the gaits to begin with
+    outcomes: np.ndarray  # of the first gaits
     make_cycle: MakeCycle
     cycle: Any = None  # the gaits themselves
-    finer: CycleOptions | None = None  # options with a finer mesh; None where there is no mesh
+    finer: CycleOptions | None = None  # options with a finer mesh, None without a mesh
 
 
 def start_by_collocation(wanted: Wanted, cycle: Any) -> Start:
-    """Limit cycles as collocation finds them, from those given or from nothing."""
+    """Return starts from limit cycles by collocation, given or found."""
     params, name, period_n = wanted.params, wanted.name, wanted.period_n
     options = CycleOptions.tight() if wanted.cycle_options is None else wanted.cycle_options
-    # The start needs neither the mesh nor the accuracy of the branch.
+    # The start does not need the mesh or the accuracy of the branch.
     start = cycle
     if start is None:
         start = limit_cycles(params, period_n=period_n, model=wanted.model)
@@ -88,7 +88,7 @@ def start_by_collocation(wanted: Wanted, cycle: Any) -> Start:
 
 
 def start_by_walking(wanted: Wanted, cycle: Any) -> Start:
-    """Fixed points of the rung's own step, from those given or where walks end."""
+    """Return starts from fixed points of the model's step, given or at the ends of walks."""
     params, model, options = wanted.params, wanted.model, wanted.step_options
 
     def towards(params: WheelParams, p: Array) -> tuple[Array, Array]:
@@ -114,11 +114,11 @@ def start_by_walking(wanted: Wanted, cycle: Any) -> Start:
 
 
 def start_by_lanes(wanted: Wanted, cycle: Any) -> Start:
-    """Gaits on real ground, those given or the slowest that attracts each wheel."""
+    """Return starts from gaits with unilateral contact, given or the slowest attracting one."""
     params, options = wanted.params, wanted.step_options
     model: Any = wanted.model
     finder: Any = finder_of(model, params.n_legs, step_options=options, period_n=wanted.period_n)
-    if not finder.coexisting:  # no lanes, but the step of the definition
+    if not finder.coexisting:  # no batched engine: use the step
         return start_by_walking(wanted, cycle)
     wheels = Wheel(params, jnp.ones((*wanted.p.shape, 1, 1), wanted.p.dtype))
     followed = GroundFollowed(
@@ -140,4 +140,4 @@ STARTS: dict[str, Callable[[Wanted, Any], Start]] = {
     "viscoelastic": start_by_collocation,
     "unilateral": start_by_lanes,
 }
-"""By rung, where it is not `start_by_walking`."""
+"""Start functions by name of the model; all other models use `start_from_walks`."""

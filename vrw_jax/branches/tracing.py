@@ -1,7 +1,7 @@
-"""Borders of gaits followed as curves in two parameters, several side by side, each once.
+"""Continuation of special points as curves in two parameters, several side by side, each once.
 
-A border is solved for together with the gait, so that a point of a curve is as exact as the gait
-is. Where a curve meets another border that one begins.
+A special point is solved for together with the gait, so that a point of a curve is as accurate as
+the gait. Where a curve meets another special point, a new curve starts.
 """
 
 from collections.abc import Mapping, Sequence
@@ -45,35 +45,36 @@ from vrw_jax.runtime import xarray as xr
 from vrw_jax.wheel import Outcome, WheelParams, wheel_of
 
 EDGE = "edge of the box"
-"""Column that is zero where the second parameter leaves its range."""
+"""Name of the column that is zero where the second parameter leaves its range."""
 
 OF_CURVES = ArclengthOptions(first_step=5e-4)
-"""The first step is short: some curves are, too."""
+"""Default options of curves. The first step is short because some curves are short."""
 
 AT_ONCE = 8
-"""Curves in a batch: one shape to compile."""
+"""Number of curves in a batch, so that one shape is compiled."""
 
 SAME = 2e-3
-"""How near to a curve a point lies on it, lengths measured as along the curve."""
+"""Largest distance of a point on a curve from that curve, with lengths as along the curve."""
 
 BEYOND = 3e-3
-"""How far from where two of its kinds meet a border is followed on."""
+"""Distance from a point of codimension two at which the continuation of the other curve starts."""
 
 EXACTLY = 1e-9
-"""Of parameters, over their values: Newton's last step to a point where two borders meet."""
+"""Newton's last step to a point of codimension two, relative to the values of the parameters."""
 
 BRIEF, LASTS = 1e-4, 0.1
-"""Double support that lasts no time but for what is ill-conditioned where it comes to last some,
-and a first guess of one that does, s."""
+"""Duration of double support that counts as zero despite ill-conditioning, and a first guess of a
+nonzero duration, s."""
 
 
 @dataclass(frozen=True)
 class BorderRun(AbstractRun):
-    """Of borders: read as gaits are, but for the border itself."""
+    """Continuation of special points, evaluated as gaits are, except for the special point
+    itself."""
 
     followed: LevelFollowed
-    second: str  # of the parameters
-    names: tuple[str, ...]  # of the borders, one for each wheel
+    second: str  # of the two parameters
+    names: tuple[str, ...]  # one for each wheel
     gaits: GaitRun  # along the first parameter
 
     ending: ClassVar[tuple[str, ...]] = (*ENDING, EDGE, FALLS)
@@ -86,13 +87,13 @@ class BorderRun(AbstractRun):
         here = lambda params: getattr(params, self.second)
         gaits = wheels.gait._replace(params=eqx.tree_at(here, wheels.gait.params, second))
         table = self.gaits.read(gaits, points._replace(z=z))
-        # Of gaits without double support the rear foot's force is what must not be positive.
+        # Without double support the rear foot's force must not be positive.
         rear = np.where(wheels.gait.happens[:, 0, 0] > 0.5, 1.0, -1.0)
         told = {"lambda_4_plus": rear * table["lambda_4_plus"], "second": second}
         return table | told | {EDGE: np.minimum(share, 1.0 - share)}
 
     def known(self, table: Table, owners: np.ndarray) -> Table:
-        """What vanishes all along a curve has no zeros on it."""
+        """Mask quantities that vanish along the whole curve, which have no isolated zeros on it."""
         names = np.array(self.names)[owners]
         void, rolls_off = np.isin(names, (*VOID, ROLLS_OFF)), names == ROLLS_OFF
         by_step = {name for name in table if name.partition("[")[0] in MARGINS} - set(FORMAL)
@@ -123,7 +124,7 @@ class BorderRun(AbstractRun):
 
 
 class Seed(NamedTuple):
-    """A point of a border, or near one, from which it is followed."""
+    """Point on or near a curve of special points, from which it is continued."""
 
     name: str
     at: tuple[float, float]  # the two parameters
@@ -133,15 +134,15 @@ class Seed(NamedTuple):
 
 
 class Traced(NamedTuple):
-    """A curve, and what was met on it."""
+    """Traced curve, with the special points met on it."""
 
     curve: BorderCurve
-    path: np.ndarray  # the section's numbers and both parameters' shares, (point, number)
+    path: np.ndarray  # section state and both parameters' fractions, (point, coordinate)
     met: tuple[Seed, ...]
 
 
 class Tracer(NamedTuple):
-    """Where borders are followed, and how."""
+    """Tracer of curves of special points within two parameter ranges."""
 
     parameters: tuple[str, str]
     box: np.ndarray  # (parameter, end)
@@ -155,11 +156,12 @@ class Tracer(NamedTuple):
         return params
 
     def shares(self, values: np.ndarray) -> np.ndarray:
-        """Of both parameters, on the last axis, in their ranges."""
+        """Return both parameters, on the last axis, as fractions of their ranges."""
         return (values - self.box[:, 0]) / np.ptp(self.box, 1)
 
     def along(self, axis: int, params: WheelParams) -> list[Seed]:
-        """Borders on the branches of these wheels along one of the parameters."""
+        """Return seeds at special points on the branches of these wheels along one of the
+        parameters."""
         name, seeds = self.parameters[axis], []
         low, high = self.box[axis]
         for branch in continue_branches(params, name, (low, high), model=self.model):
@@ -177,7 +179,7 @@ class Tracer(NamedTuple):
         return Seed(name, (first, second), start.problem, gait, z)
 
     def followed(self, seeds: Sequence[Seed], known: Sequence[Traced]) -> list[Traced]:
-        """The curves through all that lie on none of the curves known."""
+        """Return the curves through all seeds that are on none of the known curves."""
         new: list[Traced] = []
         fresh = [seed for seed in seeds if not any(self._on(seed, one) for one in known)]
         kinds = {quantities_of(seed.name, seed.problem.n_legs) for seed in fresh}
@@ -185,11 +187,11 @@ class Tracer(NamedTuple):
             of_kind = [s for s in fresh if quantities_of(s.name, s.problem.n_legs) == kind]
             while of_kind:
                 some: list[Seed] = []
-                for seed in of_kind:  # in one batch each name once: others may lie on its curve
+                for seed in of_kind:  # each name once: others may be on its curve
                     if seed.name not in {s.name for s in some} and len(some) < AT_ONCE:
                         some.append(seed)
                 told: list[Traced] = []
-                for one in self._batch(kind, some):  # a start may have led to a curve known
+                for one in self._batch(kind, some):  # a curve may be known already
                     if not any(self.lies_on(one, other) for other in (*known, *new, *told)):
                         told.append(one)
                 new += told
@@ -210,7 +212,7 @@ class Tracer(NamedTuple):
         return alike and bool(np.max(distance(one.path, other.path)) < SAME)
 
     def _batch(self, kind: tuple[str, ...], seeds: list[Seed]) -> list[Traced]:
-        """A curve through each that has one, on a mesh that is fine enough for it."""
+        """Return a curve through each seed that has one, on a sufficiently fine mesh."""
         told: list[Traced] = []
         for refinement in range(1 + REFINEMENTS):
             finest = refinement == REFINEMENTS
@@ -294,9 +296,10 @@ class Tracer(NamedTuple):
     def _beyond(
         self, name: str, seed: Seed, path: np.ndarray, values: np.ndarray, z: Solution, at: Any
     ) -> Seed:
-        """Where the rear foot's force that vanishes all along begins to rise or fall.
+        """Return a seed beyond a point where the rear foot's force, zero along the curve, starts to
+        rise or fall.
 
-        Both borders cross there as curves, and go on in the same direction.
+        Both curves cross there and continue in the same direction.
         """
         way = 1 if abs(values[0] - at).max() < abs(values[-1] - at).max() else -1
         path, values, z = path[::way], values[::way], jax.tree.map(lambda x: x[::way], z)
@@ -327,7 +330,7 @@ class Tracer(NamedTuple):
 
 
 def distance(points: np.ndarray, path: np.ndarray) -> np.ndarray:
-    """Of points from a path of straight pieces, both along the first axis."""
+    """Return the distances of points from a polyline, both along the first axis."""
     begin, chord = path[:-1], np.diff(path, axis=0)
     squared = np.maximum(np.sum(chord**2, 1), 1e-300)
     there = points[:, None] - begin
@@ -337,8 +340,8 @@ def distance(points: np.ndarray, path: np.ndarray) -> np.ndarray:
 
 
 def named(name: str, gait: Wheel, z: Solution) -> str:
-    """What a border of a curve or branch is called, given the gait there."""
-    if name == BRANCH_POINT:  # a curve of folds need not turn there
+    """Return the name of a special point of a curve or branch, given the gait there."""
+    if name == BRANCH_POINT:  # a curve of folds may not turn there
         return "fold"
     if name not in ("lambda_4_plus", ROLLS_OFF, FALLS) or gait.happens[0, 0] < 0.5:
         return name
@@ -347,5 +350,5 @@ def named(name: str, gait: Wheel, z: Solution) -> str:
 
 
 def can_follow(name: str) -> bool:
-    """Whether a border's quantity is one that `GaitLevel` tells."""
+    """Return whether a special point's quantity is one of `GaitTestFunction`."""
     return name in (*BIFURCATIONS, *VOID, ROLLS_OFF) or name.partition("[")[0] in MARGINS
