@@ -1,4 +1,4 @@
-"""The best gait that keeps its premises."""
+"""Optimization of gaits under margins as constraints."""
 
 from vrw_jax.tuning.climbing import ACTIVE, Kind
 from vrw_jax.tuning.problem import tune

@@ -1,9 +1,10 @@
-"""Climbing along a branch of gaits: SciPy's SLSQP in a box that shrinks where the branch is lost.
+"""Maximization along a branch of gaits by SciPy's SLSQP, in a box that shrinks where the branch is
+lost.
 
-SLSQP (sequential quadratic programming with exact gradients) does the work; around it stands what
-it does not know: a trial wheel may have no gait, or one of another branch. Then the climb goes on
-from the last iterate within half the distance, and the path says so. Parameters are measured in
-widths of their bounds, so that every free one runs from 0 to 1.
+SLSQP is sequential quadratic programming with exact gradients. It does not handle trial wheels
+without a gait, or with a gait of another branch. After such a trial the maximization continues from
+the last iterate within half the distance, and the path records it. Parameters are measured in
+widths of their bounds, so that every free one is between 0 and 1.
 """
 
 import enum
@@ -18,16 +19,16 @@ from vrw_jax.wheel import Outcome
 
 
 class Ending(Code):
-    """How a climb ended."""
+    """Status of a maximization at its end."""
 
     CONVERGED = 0, "The gait can't be improved nearby without breaking a constraint."
-    AT_A_BORDER = 1, "The branch ends here: every smaller step on lost the gait."
+    AT_A_BORDER = 1, "The branch ends here: no smaller step finds a gait."
     OUT_OF_EVALUATIONS = 2, "The allowed number of gaits was spent before it converged."
     NO_FEASIBLE_GAIT = 3, "No gait that keeps every constraint was found from this start."
 
 
 class Kind(enum.IntEnum):
-    """What became of an evaluated gait."""
+    """Role of an evaluated gait in the maximization."""
 
     START = 0
     TRIAL = 1
@@ -36,20 +37,20 @@ class Kind(enum.IntEnum):
 
 
 class Trial(NamedTuple):
-    """An evaluated wheel; where its gait is lost the numbers are NaN."""
+    """Evaluated wheel. If its gait is lost, the numbers are NaN."""
 
     u: np.ndarray  # free parameters in widths of their bounds
     outcome: Outcome
     on_branch: bool
     objective: float
-    gradient: np.ndarray  # over u
-    slack: np.ndarray  # constraint values above their margins, in their own units
-    slopes: np.ndarray  # of slack: (n_constraints, n_free)
+    gradient: np.ndarray  # with respect to u
+    slack: np.ndarray  # constraint values minus their margins, in their own units
+    slopes: np.ndarray  # (n_constraints, n_free)
     told: Evaluated | None
 
     @property
     def found(self) -> bool:
-        """Whether there is a gait, of the same branch."""
+        """Return whether there is a gait, on the same branch."""
         return self.outcome == Outcome.STEPPED and self.on_branch
 
 
@@ -75,21 +76,23 @@ class _ArrivedError(Exception):
 
 
 WHOLE, SMALLEST_RADIUS = 1.0, 1e-7
-"""Half the side of a box that holds all bounds, and of one at which a border counts as reached."""
+"""Half the side of a box that contains all bounds, and of a box at which the end of a branch counts
+as reached."""
 
 LOOSE, STALLED = 1e-3, 1e-10
-"""Relative change of the objective at which SLSQP stops by itself: in a smaller box, whose optimum
-is only a place to go on from, and in the whole one, where gaits are known no better."""
+"""Relative change of the objective at which SLSQP stops. The first value is for a smaller box,
+whose optimum is only a point to continue from. The second is for the whole box, and the gaits are
+not more accurate than that."""
 
 ACTIVE = 1e-6
 """Slack of an active constraint, in widths of the bounds."""
 
 Evaluate = Callable[[np.ndarray, Trial | None], Trial]
-"""The gait at u, searched for from a neighbour's."""
+"""Function that returns the gait at u, searched for from a neighbor's gait."""
 
 
 class _Record:
-    """Every trial in order, each place evaluated once."""
+    """All trials in order; each point is evaluated once."""
 
     def __init__(self, evaluate: Evaluate, start: Trial, allowed: int) -> None:
         self.trials, self.kinds = [start], [Kind.START]
@@ -124,8 +127,8 @@ class _Record:
 
 
 def climb(evaluate: Evaluate, start: Trial, *, tolerance: float, max_evaluations: int) -> Climb:
-    """From `start` to a local maximum of the objective with every slack at least zero."""
-    from scipy.optimize import minimize  # only climbing needs it, and its import is slow
+    """Maximize the objective locally from `start`, with every slack at least zero."""
+    from scipy.optimize import minimize  # imported here because it is slow
 
     record = _Record(evaluate, start, max_evaluations)
     size = max(float(np.linalg.norm(start.gradient)), 1e-12)
@@ -139,7 +142,7 @@ def climb(evaluate: Evaluate, start: Trial, *, tolerance: float, max_evaluations
     centre, radius, widest = start, WHOLE, WHOLE
     ending, known = Ending.CONVERGED, 0
     while True:
-        # A round that evaluated nothing new would only be repeated: the next one sees less.
+        # A round without a new evaluation would only be repeated, so the next box is smaller.
         widest = widest if len(record.trials) > known else 0.5 * widest
         known, radius = len(record.trials), min(radius, widest)
         if radius < SMALLEST_RADIUS:
@@ -186,7 +189,8 @@ def climb(evaluate: Evaluate, start: Trial, *, tolerance: float, max_evaluations
 
 
 def _best(record: _Record, scales: np.ndarray, last: Trial) -> Trial:
-    """The best gait that keeps all constraints; else the one that comes nearest to it."""
+    """Return the best gait that satisfies all constraints, else the one with the smallest
+    breach."""
     found = [trial for trial in record.trials if trial.found]
     kept = [trial for trial in found if breach(trial.slack, scales) <= ACTIVE]
     if not kept:
@@ -197,17 +201,18 @@ def _best(record: _Record, scales: np.ndarray, last: Trial) -> Trial:
 
 
 class Optimality(NamedTuple):
-    """Which constraints and bounds hold a gait where it is, and what each one costs."""
+    """Multipliers of the constraints and bounds that hold a gait in place."""
 
-    prices: np.ndarray  # objective gained per unit of a constraint's margin given up
-    low: np.ndarray  # objective lost per width of a lower bound given up, < 0: gain
+    prices: np.ndarray  # gain of the objective per unit of a relaxed margin
+    low: np.ndarray  # loss of the objective per width of a relaxed lower bound, < 0: gain
     high: np.ndarray
     residual: float  # of the first-order condition, relative to the objective's gradient
 
 
 def optimality(trial: Trial) -> Optimality:
-    """The first-order (Karush-Kuhn-Tucker) condition at a gait, by non-negative least squares."""
-    from scipy.optimize import nnls  # as above
+    """Return the first-order (Karush-Kuhn-Tucker) condition at a gait, by non-negative least
+    squares."""
+    from scipy.optimize import nnls  # slow to import
 
     n = trial.u.size
     scales = slack_scales(trial.slack, trial.slopes)

@@ -1,4 +1,4 @@
-"""Objective and constraints of a gait, as callers say them and with exact gradients."""
+"""Objective and constraints of a gait from a user's specification, with exact gradients."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,12 +23,12 @@ Margins = Mapping[str, float | tuple[float, float]] | Sequence[str]
 Read = Callable[[str, AbstractCycle, AbstractStep], Array]
 
 MOST = "-"
-"""Before the name of a measure that is bounded from above: its negative is, from below."""
+"""Prefix of a measure that is bounded from above: its negative is bounded from below."""
 
 
 @dataclass(frozen=True)
 class Weighted:
-    """A weighted sum of measures, as an objective."""
+    """Weighted sum of measures, as an objective."""
 
     read: Read
     weights: tuple[tuple[str, float], ...]
@@ -50,9 +50,9 @@ class OfCycle:
 
 @dataclass(frozen=True)
 class Sought:
-    """Objective, then constraints, as one array of numbers of a gait.
+    """Objective and constraints of a gait as one array.
 
-    A constraint is a measure that is to be large, or after a minus one that is to be small.
+    A constraint is a measure with a lower bound, or with the prefix a measure with an upper bound.
     """
 
     objective: Reader
@@ -76,7 +76,7 @@ class Sought:
 
 
 class Evaluated(NamedTuple):
-    """A gait with what was sought of it. A batch has its axis before all others."""
+    """Gait with its objective and constraints. A batch has its axis before all others."""
 
     gait: Gait
     values: Array  # (1 + n_constraints,): the objective, then the constraints
@@ -86,7 +86,8 @@ class Evaluated(NamedTuple):
 def margins_of(
     params: WheelParams, constraints: Margins | None, finder: AbstractGaitFinder
 ) -> dict[str, float]:
-    """Least values by measure, or by `MOST` and a measure of its negative."""
+    """Return least values by name of the measure, or by `UPPER_BOUND_PREFIX` and name for its
+    negative."""
     if constraints is None:
         premises = default_margins(params)
         return {name: least for name, least in premises.items() if finder.from_nothing}
@@ -100,7 +101,7 @@ def margins_of(
     else:
         margins = dict.fromkeys(names_of("constraints", constraints), 0.0)
     if "clearance_sls1" in margins:
-        # It has a slope where the clearance has none.
+        # It has a nonzero derivative where the clearance has none.
         margins.setdefault("takeoff_acceleration", 0.0)
     for name in margins:
         require_known(name.removeprefix(MOST), finder.readable, "measure for a constraint")
@@ -112,10 +113,12 @@ def bound_of(name: str, least: float) -> float:
 
 
 def slack_scales(slack: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-    """Slack that a width of the bounds changes: what makes constraints comparable."""
+    """Return the change of slack over one width of the bounds, which makes constraints
+    comparable."""
     return np.maximum(np.linalg.norm(slopes, axis=-1), 1e-3 * np.abs(slack) + 1e-12)
 
 
 def breach(slack: np.ndarray, scales: np.ndarray) -> Any:
-    """Largest breach of a constraint, in widths of the bounds; 0 if all are kept, NaN if lost."""
+    """Return the largest breach of a constraint in widths of the bounds: 0 if none, NaN if the gait
+    is lost."""
     return np.max(-slack / scales, axis=-1, initial=0.0)

@@ -1,6 +1,6 @@
-"""Tuning a wheel: the best gait that keeps its premises, climbed to with exact gradients.
+"""Tuning a wheel: maximization of a gait's objective under margins, with exact gradients.
 
-Without premises as constraints more double support is simply bought by scuffing.
+Without margins as constraints, the maximization gains double support by scuffing.
 """
 
 from __future__ import annotations
@@ -80,45 +80,47 @@ def tune(
     n_starts: int = 1,
     seed: int = 0,
 ) -> Tuned:
-    """The wheel near `params` whose gait has the largest objective and keeps its constraints.
+    """Return the wheel near `params` whose gait maximizes the objective and satisfies its
+    constraints.
 
-    The default constraints are every premise that gaits of this rung can keep
-    (`premises.default_margins`), {} is none. A constraint counts as kept within 1e-6 of what it
-    changes over the bounds. Local: it ends at an optimum of the branch that `params` lies on. With
-    `n_starts` above 1 so many wheels, `params` and random ones within the bounds, first take
-    N_EXPLORED first-order steps side by side, and the best is climbed from. On real ground
-    (`UnilateralWheel`) the objective is a measure of a step there or weights of several, and the
-    start walks to its gait; constraints, none by default, are of such measures:
-    {"slip": (0.0, 0.05)}, say. "auto" climbs on the rung
-    that serves the start's gait: on the paper's its premises are the constraints, so that it still
-    serves.
+    The default constraints are all margins that gaits of this model can keep (`default_margins`);
+    {} is none. A constraint counts as satisfied within 1e-6 of its change over the bounds. The
+    method is local: it ends at an optimum of the branch of `params`. With `n_starts` above 1 it
+    begins with `params` and random wheels within the bounds. They take N_EXPLORATION_STEPS
+    first-order steps side by side, and the best is maximized.
+
+    With unilateral contact (`UnilateralWheel`) the objective is a measure of a step or a weighted
+    sum of several. A walk from the start finds the first gait. Constraints, none by default, are on
+    such measures, for example {"slip": (0.0, 0.05)}. Model "auto" uses the model that is selected
+    for the start's gait. If that is the paper's, its margins are the constraints, so that it stays
+    valid.
 
     Args:
         params: the start, one wheel.
-        objective: what is maximised: a measure's name, weights of several, or a function of a
+        objective: maximized quantity: a measure's name, weights of several, or a function of a
             LimitCycle (and, if it takes two arguments, of the StepResult from it).
-        free: names of the parameters that may move.
-        bounds: lower and upper, of each free parameter.
+        free: names of the free parameters.
+        bounds: lower and upper bound of each free parameter.
         constraints: least values of measures by name, or pairs of least and most; names alone mean
             zero.
-        model: the rung; the paper's, `ViscoelasticWheel()`, by default.
+        model: the model; the paper's, `ViscoelasticWheel()`, by default.
         options: of the steps.
         cycle_options: of the gaits.
         tolerance: on the first-order condition, relative to the objective's gradient.
-        max_evaluations: gaits at most.
-        n_starts: climbed from the best of so many.
+        max_evaluations: largest number of gaits.
+        n_starts: number of starts, the best of which is maximized.
         seed: of the random starts.
 
     Returns:
-        A `Tuned`, whose `ending` says whether it is an optimum.
+        A `TuneResult`, whose `status` is CONVERGED at an optimum.
 
     Raises:
-        TypeError, ValueError: an argument that can't be meant, in one sentence.
+        TypeError, ValueError: an invalid argument, described in one sentence.
 
     Examples:
         >>> bounds = {"damping": (100.0, 215.0)}
-        >>> tuned = vrw.tune(vrw.WheelParams(), "dls_fraction", ["damping"], bounds)
-        >>> print(tuned.ending.name, f"{tuned.value:.3f}", [active.name for active in tuned.active])
+        >>> result = vrw.tune(vrw.WheelParams(), "dls_fraction", ["damping"], bounds)
+        >>> print(result.status.name, f"{result.value:.3f}", [c.name for c in result.active])
         CONVERGED 0.534 ['damping']
     """
     untraced("vrw.tune", "climb by your own loop over vrw.limit_cycle", params)
@@ -148,7 +150,7 @@ def tune(
 
 @dataclasses.dataclass(frozen=True)
 class TuneProblem:
-    """A checked tuning problem: what moves, what is sought, what is to be kept."""
+    """Validated tuning problem: free parameters, objective and constraints."""
 
     params: WheelParams
     free: tuple[str, ...]
@@ -169,7 +171,7 @@ class TuneProblem:
 
     @property
     def constraint_names(self) -> tuple[str, ...]:
-        """One name for each number that is constrained: monitors of the locked legs have six."""
+        """Return one name for each constrained number: margins of the locked legs have six."""
         names: list[str] = []
         for name in self.margins:
             if measure_of(name).axis:
@@ -180,11 +182,11 @@ class TuneProblem:
 
     @property
     def least(self) -> np.ndarray:
-        """Margins, one for each of `constraint_names`."""
+        """Return the margins, one for each of `constraint_names`."""
         return np.array([self.margins[name.partition("[")[0]] for name in self.constraint_names])
 
     def parameters(self, u: np.ndarray) -> np.ndarray:
-        """All float parameters where the free ones are `u` widths above their lower bounds."""
+        """Return all float parameters for free ones `u` widths above their lower bounds."""
         values = np.array(self.finder.model.values(self.params))
         values[self.moved] = self.lower + u * self.widths
         return values
@@ -198,7 +200,10 @@ class TuneProblem:
         return np.clip((values - self.lower) / self.widths, 0.0, 1.0)
 
     def start(self) -> Trial:
-        """The gait of the start; refused if there is none."""
+        """Return the trial at the start.
+
+        Raises: ValueError: the start has no gait.
+        """
         trial = self.evaluate(self.start_u, None)
         if not trial.found:
             raise ValueError(
@@ -208,7 +213,7 @@ class TuneProblem:
         return trial
 
     def evaluate(self, u: np.ndarray, near: Trial | None) -> Trial:
-        """The gait at `u`, from a neighbour's gait if one is given."""
+        """Return the trial at `u`, searched for from a neighbor's gait if one is given."""
         parameters = jnp.asarray(self.parameters(u))
         before = None if near is None else near.told
         guess = self.finder.first_guess(parameters) if before is None else before.gait.cycle.near
@@ -221,7 +226,7 @@ class TuneProblem:
         return self.trial(u, told, outcome, on_branch)
 
     def trial(self, u: np.ndarray, told: Evaluated, outcome: Outcome, on_branch: bool) -> Trial:
-        """What a gait says about objective and constraints."""
+        """Return a trial with objective and constraints of a gait."""
         values = np.array(told.values)
         slopes = np.array(told.columns)[self.moved].T * self.widths
         if outcome != Outcome.STEPPED:
@@ -232,7 +237,7 @@ class TuneProblem:
         )  # fmt: skip
 
     def explore(self, n_starts: int, seed: int) -> Lanes:
-        """First-order steps of many starts side by side: this wheel, and random ones."""
+        """Take first-order steps from many starts side by side: this wheel, and random ones."""
         others = np.random.default_rng(seed).uniform(size=(n_starts - 1, len(self.free)))
         lanes = explore(
             self._batch,
@@ -258,7 +263,7 @@ class TuneProblem:
         return Evaluated(gait, *read_along_lanes(self.sought, gait))
 
     def _change(self, difference: np.ndarray) -> np.ndarray:
-        """Differences of all parameters by differences of u, row by row."""
+        """Return changes of all parameters from changes of u, row by row."""
         change = np.zeros((difference.shape[0], len(self.finder.model.parameter_names)))
         change[:, self.moved] = difference * self.widths
         return change
@@ -312,7 +317,7 @@ class TuneProblem:
 
     def _walk(self, params: WheelParams, gait: Gait) -> Walked:
         cycle = np.array(gait.cycle.section_state)
-        # Shrunk and not grown: no leg may lie beyond its stopper.
+        # The state is scaled down, not up: no leg may be beyond its stopper.
         x, kept, outcome, walked = cycle * (1.0 - DISPLACED), True, Outcome.STEPPED, 0
         default = default_margins(params)
         for _ in range(N_WALKED):
@@ -325,8 +330,8 @@ class TuneProblem:
             for name, least in self.margins.items():
                 if (measure := name.removeprefix(MOST)) in monitored:
                     value = monitored[measure] if measure == name else -monitored[measure]
-                    # The optimum keeps it within 1e-6 of what the bounds' width changes, and the
-                    # start is displaced: of a margin of take-off each is some thousandths.
+                    # The optimum satisfies it within 1e-6 of its change over the bounds, and the
+                    # start is displaced: each is some thousandths of a take-off margin.
                     scale = 1e-3 * np.max(np.abs(value)) + 1e-2 * abs(default.get(name, 0.0))
                     kept &= bool(np.all(value >= least - scale - 1e-9))
         distance = float(np.max(np.abs(x - cycle)))
@@ -367,7 +372,7 @@ class TuneProblem:
         }
         attrs = {
             "title": f"Path of tuning {self.label} over {', '.join(self.free)}",
-            "free": " ".join(self.free),  # as text: netCDF takes no lists of names
+            "free": " ".join(self.free),  # as text: netCDF has no lists of names
             "lower": [float(v) for v in self.lower],
             "upper": [float(v) for v in self.upper],
             "ending": done.ending.name,
@@ -387,9 +392,9 @@ def tuning_problem(
     options: Options | None = None,
     cycle_options: CycleOptions | None = None,
 ) -> TuneProblem:
-    """What `tune` solves, checked: for looking at single gaits, or for another method.
+    """Return the validated problem that `tune` solves, for single gaits or another method.
 
-    One clear sentence for what can be seen to be wrong.
+    Raises: TypeError, ValueError: an invalid argument, described in one sentence.
     """
     one_wheel(params, "tune one after the other")
     names, lower, upper = _bounds(params, free, bounds)
@@ -411,7 +416,7 @@ def tuning_problem(
         constraints = tuple(PREMISES)
     margins = margins_of(params, constraints, finder)
     sought = Sought(reader, type(finder).read, tuple(margins))
-    if callable(objective):  # looked at before anything is compiled
+    if callable(objective):  # checked before compilation
         cycle = jax.eval_shape(finder.cycle, params)
         x = jax.ShapeDtypeStruct((finder.model.section_size(params),), params.damping.dtype)
         step = jax.eval_shape(finder.model.step, params, x, finder.step_options)
@@ -428,7 +433,7 @@ def _objective(objective: Objective, finder: AbstractGaitFinder) -> tuple[Reader
     if callable(objective):
         if not finder.from_nothing:
             raise TypeError(
-                "objective is a function, but on real ground it must be a measure's name or "
+                "objective is a function, but with contact it must be a measure's name or "
                 f"weights of several: choose from {', '.join(finder.differentiable)}."
             )
         label = getattr(objective, "__name__", "objective")

@@ -1,4 +1,4 @@
-"""A tuned gait, how it was come by, and what holds it there."""
+"""Result of tuning: the gait, how it was found, and the constraints that are active."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from vrw_jax.wording import as_html, as_text
 
 
 class Active(NamedTuple):
-    """A constraint or bound that holds the optimum.
+    """Active constraint or bound at the optimum.
 
     - `name`: of the constraint (with the leg, if it has one), or of the parameter;
     - `limit`: its margin, or the bound;
-    - `price`: objective gained per unit of limit given up.
+    - `price`: gain of the objective per unit of a relaxed limit.
     """
 
     name: str
@@ -28,11 +28,11 @@ class Active(NamedTuple):
 
 
 class Walked(NamedTuple):
-    """What walking the tuned wheel showed, from a start displaced a little.
+    """Validation of the tuned wheel by a walk from a slightly displaced start.
 
     - `distance`: from the limit cycle after the last step, rad, rad/s and m/s;
-    - `kept`: whether every step kept every constraint on a monitor, within 1e-3 of its value and
-      1e-2 of its default margin.
+    - `is_feasible`: whether every step satisfied every constraint on a margin, within 1e-3 of its
+      value and 1e-2 of its default margin.
     """
 
     steps: int
@@ -43,28 +43,28 @@ class Walked(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Tuned:
-    """A tuned gait, how it was come by, and what holds it there.
+    """Result of tuning: the gait, how it was found, and the constraints that are active.
 
     - `params`: the wheel;
-    - `ending`: how the climb ended;
+    - `status`: of the maximization at its end;
     - `objective`, `value`, `start_value`: its name, its value here and at the start;
-    - `active`: constraints and bounds that hold the optimum, each with its price;
-    - `walked`: what ten steps of the wheel came to;
-    - `cycle`: LimitCycle, or WalkedCycle on real ground;
+    - `active`: constraints and bounds that are active, each with its price;
+    - `validation`: a walk of ten steps of the wheel;
+    - `cycle`: LimitCycle, or ReturnMapCycle with unilateral contact;
     - `step`: StepResult, or UnilateralStep;
     - `kkt_residual`: of the first-order condition, relative to the objective's gradient;
-    - `unkept`: premises that were no constraint and are broken;
+    - `violated_margins`: violated margins that are not constraints;
     - `path`: every gait that was evaluated, in order;
-    - `evaluations`: limit cycles, each with one step;
-    - `shortened`: trials that lost the gait or its branch;
-    - `seconds`: of which `compile_seconds` went to compiling;
-    - `compile_seconds`: and to exploring, if there were many starts;
-    - `lanes`: where many starts got to before the climb.
+    - `n_evaluations`: number of limit cycles, each with one step;
+    - `n_backtracks`: number of trials that lost the gait or its branch;
+    - `seconds`: total time;
+    - `compile_seconds`: the part for compiling, and for exploring if there are many starts;
+    - `exploration`: results of many starts before the maximization.
 
     Examples:
         >>> bounds = {"damping": (100.0, 215.0)}
-        >>> tuned = vrw.tune(vrw.WheelParams(), "dls_fraction", ["damping"], bounds)
-        >>> print(f"{tuned.params.damping:.1f} N s/m, {bool(tuned.cycle.found)}")
+        >>> result = vrw.tune(vrw.WheelParams(), "dls_fraction", ["damping"], bounds)
+        >>> print(f"{result.params.damping:.1f} N s/m, {bool(result.cycle.found)}")
         215.0 N s/m, True
     """
 
@@ -88,11 +88,11 @@ class Tuned:
 
     @property
     def converged(self) -> bool:
-        """Whether the climb ended at an optimum."""
+        """Return whether the maximization ended at an optimum."""
         return self.ending == Ending.CONVERGED
 
     def lines(self) -> dict[str, str]:
-        """The result in words, for a reader."""
+        """Return the printed lines of the result by label."""
         free = self.path.attrs["free"].split()
         wheel = [f"{n} {MEASURES[n].text(getattr(self.params, n))}" for n in free]
         kept = "every constraint kept" if self.walked.kept else "a constraint broken"

@@ -1,7 +1,8 @@
-"""Many starts at once: an augmented Lagrangian climbed by optax's Adam, all lanes in one batch.
+"""Exploration of many starts at once: an augmented Lagrangian, maximized by optax's Adam in one
+batch.
 
-First-order steps bring every lane near an optimum of its own; which one to finish is chosen then.
-A lane whose trial lost its gait goes back and steps half as far from there on.
+First-order steps bring every start near a local optimum; one of them is then selected for the
+maximization. A start whose trial lost its gait returns and takes half the step from then on.
 """
 
 from collections.abc import Callable
@@ -20,25 +21,26 @@ from vrw_jax.wheel import Outcome
 optax = library("optax")
 
 RATE, STIFFNESS = 0.06, 4.0
-"""Adam's first step in widths of the bounds; penalty on a breach of one width, in objectives."""
+"""Adam's first step in widths of the bounds, and the penalty on a breach of one width, in
+objectives."""
 
 BatchEvaluate = Callable[[np.ndarray, Evaluated | None], Evaluated]
-"""Gaits at u, one row per lane, from neighbours' gaits."""
+"""Function that returns gaits at u, one row per start, searched for from neighbors' gaits."""
 
 
 class Lanes(NamedTuple):
-    """Where each start got to."""
+    """Results of the exploration, one row per start."""
 
-    start: np.ndarray  # (n_lanes, n_free), in widths of the bounds
+    start: np.ndarray  # (n_starts, n_free), in widths of the bounds
     u: np.ndarray
-    objective: np.ndarray  # NaN where no gait was ever found
-    breach: np.ndarray  # largest, in widths of the bounds
-    lost: np.ndarray  # trials that lost the gait or its branch
-    gaits: int  # evaluated in all
+    objective: np.ndarray  # NaN if no gait was found
+    breach: np.ndarray  # in widths of the bounds
+    lost: np.ndarray  # number of trials that lost the gait or its branch
+    gaits: int  # number of evaluated gaits
 
     @property
     def best(self) -> int:
-        """The lane to go on from: of those that all but keep the constraints, the highest."""
+        """Return the index of the start to continue from: the highest objective minus penalties."""
         merit = self.objective - STIFFNESS * np.abs(self.objective) * self.breach
         return int(np.nanargmax(merit))
 
@@ -52,9 +54,10 @@ def explore(
     least: np.ndarray,
     n_steps: int,
 ) -> Lanes:
-    """`n_steps` first-order steps of every lane; `change` turns differences of u into parameters'.
+    """Take `n_steps` first-order steps of every start.
 
-    Columns of a gait are over all parameters; `free` are the places of those that move.
+    `parameter_change` converts changes of u to changes of the parameters. Jacobians of a gait are
+    with respect to all parameters; `free_indices` select the free ones.
     """
     n_lanes = starts.shape[0]
     gait = evaluate(starts, None)
@@ -92,7 +95,7 @@ def explore(
 
 
 def found(told: Evaluated) -> np.ndarray:
-    """Whether each lane has a gait that the event-driven step agrees with."""
+    """Return whether each start has a gait that the event-driven step confirms."""
     return told.gait.outcome == Outcome.STEPPED
 
 
@@ -107,7 +110,8 @@ def _gradient(gait: Evaluated, free: list[int], widths: np.ndarray) -> np.ndarra
 def _constraints(
     gait: Evaluated, free: list[int], widths: np.ndarray, least: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Slack, and its slopes over u: (lane, constraint) and (lane, constraint, free)."""
+    """Return slack, and its derivatives with respect to u: (start, constraint) and (start,
+    constraint, free)."""
     slopes = np.swapaxes(np.asarray(gait.columns)[:, free, 1:], 1, 2) * widths
     return np.asarray(gait.values)[:, 1:] - least, slopes
 
