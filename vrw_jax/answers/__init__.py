@@ -1,4 +1,4 @@
-"""Answers to within a tolerance, by the lowest rung that can be shown to give them."""
+"""Measures to within a tolerance, from the lowest model whose error can be bounded."""
 
 from vrw_jax.answers.asking import answer
 from vrw_jax.answers.averages import Average, average

@@ -1,10 +1,11 @@
-"""An answer to within a tolerance, by the lowest rung that can be shown to give it.
+"""Measures to within a tolerance, from the lowest model whose error can be bounded.
 
-The lower rung's gait takes one step on real ground. The defect, carried to the measure by the lower
-rung's derivatives, is that rung's error to second order: a dual-weighted residual (R. Becker and
-R. Rannacher, Acta Numerica 10, 2001) with the next model in place of the finer mesh. Within the
-tolerance the lower rung's value stands; else the same step is the first of an iteration to the gait
-on real ground, and what does not contract is another gait: it is walked to.
+The lower model's gait takes one step with unilateral contact. The defect, propagated to the measure
+by the lower model's derivatives, is that model's error to second order. This is a dual-weighted
+residual (R. Becker and R. Rannacher, Acta Numerica 10, 2001) with the next model in place of the
+finer mesh. If the error is within the tolerance, the lower model's value is returned. Otherwise the
+same step is the first of an iteration to the gait with unilateral contact. If the iteration does
+not contract, the gait is another one, and a walk leads to it.
 """
 
 import time
@@ -46,21 +47,25 @@ from vrw_jax.wording import (
 )
 
 SAFETY = 4.0
-"""What one step says of an error, times this, bounds it: as long as corrections contract to 3/4."""
+"""Factor from the error estimate of one step to its bound, valid as long as corrections contract by
+3/4."""
 FINE = 1e-7
-"""Tolerance of an answer below which steps are taken at TIGHTER."""
+"""Tolerance of a measure below which steps use VERY_TIGHT_TOLERANCE."""
 EXACT = 3
-"""Steps of a walk after the loose ones, before corrections: looser steps may end in other modes."""
+"""Number of steps after a loose walk, before corrections, because looser steps may end in other
+modes."""
 STAYING = 60
-"""Steps of a walk that must stay at a gait which lies off where the walk to it ended."""
+"""Number of steps of a walk that must stay near a gait if the gait is far from the end of the
+previous walk."""
 COLD = 2
-"""Starts, slow ones first, of wheels without a lower gait: of 232 the first two led 100 to a gait,
-the others none of the rest."""
+"""Number of starts, slow ones first, for wheels without a lower gait. Of 232 wheels the first two
+starts led 100 to a gait, and the other starts led none of the rest."""
 BALL = 2.0
-"""How far, in first corrections, the gait on real ground may lie from the lower one that it
-continues: so far a contraction to a half leads at most."""
+"""Largest distance of the gait with unilateral contact from the lower gait that it continues, in
+first corrections. It is chosen because a contraction by a half moves at most so far."""
 TRIES = 3
-"""Steps from a lower gait with its own derivatives, before differences take their place."""
+"""Number of steps from a lower gait with its own derivatives, before finite differences replace
+them."""
 
 
 def answer(
@@ -73,44 +78,45 @@ def answer(
     stoppers: str = "bilateral",
     which: Which | None = None,
 ) -> Answer:
-    """Measures of the wheel's gait on ground of this friction, each to within `tol`.
+    """Return measures of the wheel's gait on ground of this friction, each to within `tol`.
 
-    The truth that is meant is `UnilateralWheel(friction, stoppers=stoppers)`; the gait is the one
-    that continues the paper's, or where none does the one that a walk from the paper's reaches, and
-    `Answer.why` says which. Fields of `params` and
-    `friction` may have one axis, of lanes: each is answered by itself.
+    The reference is `UnilateralWheel(friction, stoppers=stoppers)`. Its gait is the one that
+    continues the paper's gait, or else the one that a walk from the paper's gait reaches;
+    `MeasureResult.explanation` names which. Fields of `params` and `friction` may have one batch
+    axis; each element is computed independently.
 
-    Not for use inside `jax.jit`: it goes by values.
+    This function cannot be used inside `jax.jit`, because it depends on values.
 
     Args:
         measures: one name or several of speed, period, dls_fraction, step_length, duration_dls,
             duration_single, duration_flight, theta_touchdown, dtheta_touchdown, dL1_touchdown.
-        params: the wheel, or lanes of them.
-        tol: error allowed, in the measure's unit or by the value.
-        friction: of the ground.
-        relative: whether `tol` counts by the value itself.
-        stoppers: of the wheel that is meant, "bilateral" or "one-sided".
-        which: "slowest", "fastest" or a place, slowest first, among the gaits on real ground that
-            walks from a stated set of starts lead to, in place of the gait above.
+        params: the wheel, or a batch of wheels.
+        tol: allowed error, in the measure's unit or relative to the value.
+        friction: friction coefficient of the ground.
+        relative: whether `tol` is relative to the value itself.
+        stoppers: of the reference wheel, "bilateral" or "one-sided".
+        which: "slowest", "fastest" or an index, slowest first, among the gaits with unilateral
+            contact that walks from a stated set of starts reach; replaces the gait above.
 
     Returns:
-        An `Answer`.
+        A `MeasureResult`.
 
     Raises:
-        TypeError, ValueError: an argument that can't be meant, in one sentence.
+        TypeError, ValueError: an invalid argument, described in one sentence.
 
     Examples:
-        >>> told = vrw.answer("speed", vrw.WheelParams(damping=150.0), 1e-3, friction=50.0)
-        >>> print(f"{told.value:.2f} m/s", told.error <= 1e-3)
+        >>> wheel = vrw.WheelParams(damping=150.0)
+        >>> result = vrw.measure_to_tolerance("speed", wheel, 1e-3, friction=50.0)
+        >>> print(f"{result.value:.2f} m/s", result.error <= 1e-3)
         1.02 m/s True
     """
     began = time.perf_counter()
     untraced("vrw.answer", "it on numbers, and give lanes as arrays", params, friction)
     names = names_of("measures", measures)
     for name in names:
-        require_known(name, tuple(MADE), "measure that every rung tells")
+        require_known(name, tuple(MADE), "measure that every model has")
     if not names:
-        raise ValueError("measures are none, but an answer needs a question: give 'speed', say.")
+        raise ValueError("measures is empty, but at least one is needed: give 'speed', say.")
     tol, relative = positive("tol", tol), flag("relative", relative)
     chosen("stoppers", stoppers, ("bilateral", "one-sided"))
     params, mu, shape = known_lanes(params, friction_of(friction))
@@ -134,7 +140,8 @@ def answer(
 def known_lanes(
     params: WheelParams, friction: Any
 ) -> tuple[WheelParams, np.ndarray, tuple[int, ...]]:
-    """Wheels and friction with one axis of lanes each, and the shape that they were given in."""
+    """Return wheels and friction broadcast to one batch axis, and the shape that they were given
+    in."""
     instance("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
     shapes = {np.shape(x) for x in (*jax.tree.leaves(params), friction)}
     shape = max(shapes, key=len)
@@ -150,7 +157,7 @@ def known_lanes(
 
 
 class _Asked:
-    """A question in lanes, and what has been answered of it."""
+    """Request for measures of a batch of wheels, with the results so far."""
 
     def __init__(
         self,
@@ -173,16 +180,16 @@ class _Asked:
         }  # fmt: skip
 
     def goal(self, values: np.ndarray) -> np.ndarray:
-        """The tolerance of measures with about these values."""
+        """Return the absolute tolerance of measures with about these values."""
         return self.tol * (np.abs(values) if self.relative else np.ones_like(values))
 
     @property
     def open(self) -> np.ndarray:
-        """Lanes without an answer."""
+        """Return the indices of the elements without a result."""
         return np.flatnonzero(self.told["rungs"] == NONE)
 
     def by_rigid(self) -> None:
-        """Wheels whose legs yield so little that the rigid gait may do."""
+        """Try the rigid gait for wheels whose legs are stiff enough."""
         with np.errstate(all="ignore"):
             lanes = np.flatnonzero(SAFETY * contraction(self.params) <= self.tol)
         if not len(lanes):
@@ -192,7 +199,8 @@ class _Asked:
         self._from_gaits(lanes, corrected=False)
 
     def by_paper(self) -> None:
-        """The paper's gaits, and where their values don't do, real ground near them."""
+        """Try the paper's gaits, and the nearby gaits with unilateral contact if their values are
+        not accurate enough."""
         lanes = self.open
         if not len(lanes):
             return
@@ -200,7 +208,8 @@ class _Asked:
         self._from_gaits(lanes[self.lower.rung[lanes] != NONE], corrected=True)
 
     def by_walks(self) -> None:
-        """Gaits on real ground that are far from the paper's, or that it has none for."""
+        """Walk to the gaits with unilateral contact that are far from the paper's gait, or where it
+        has none."""
         lanes = self.open
         if not len(lanes):
             return
@@ -216,7 +225,8 @@ class _Asked:
             self._walk(lanes[still], begin, How.FROM_START)
 
     def by_list(self, place: int) -> None:
-        """The gait at a place, slowest first, of those that walks from all starts lead to."""
+        """Select the gait of this rank, slowest first, among those that walks from all starts
+        reach."""
         lanes, blank, each = self.open, self.told, []
         for start in starts_of(self.params):
             self.told = {name: x.copy() for name, x in blank.items()}
@@ -235,7 +245,8 @@ class _Asked:
         return jax.device_put(taken(self.params, lanes))
 
     def _from_gaits(self, lanes: np.ndarray, corrected: bool) -> None:
-        """One step on real ground from the lower gaits, and more where that is not enough."""
+        """Take one step with unilateral contact from the lower gaits, and more steps if one is not
+        enough."""
         if not len(lanes):
             return
         lower = Lower(*(part[lanes] for part in self.lower))
@@ -269,10 +280,10 @@ class _Asked:
         self._take(lanes[rest], found._replace(done=found.done & near), How.CORRECTED)
 
     def _walk(self, lanes: np.ndarray, x: np.ndarray, how: How) -> None:
-        """To where walks lead, and from there by corrections."""
+        """Walk from the states, and correct the ends of the walks."""
         walk = led(self.ground, lanes, x)
         self.told["n_steps"][lanes] += walk.n_steps
-        # No step begins where a wheel has turned more than once in flight.
+        # A step cannot begin if a wheel has turned more than once in flight.
         walks = np.isin(walk.outcome, (Outcome.STEPPED, Outcome.BAD_INPUT))
         self.told["outcomes"][lanes] = np.where(walks, Outcome.NO_CYCLE_FOUND, walk.outcome)
         lanes, x = lanes[walk.rests], walk.x[walk.rests]
@@ -291,7 +302,7 @@ class _Asked:
         self._take(lanes, found, how)
 
     def _take(self, lanes: np.ndarray, found: Settled, how: How) -> None:
-        """Gaits on real ground."""
+        """Record gaits with unilateral contact."""
         self.told["n_steps"][lanes] += found.n_steps
         lanes, found = lanes[found.done], Settled(*(part[found.done] for part in found))
         has = (self.lower.rung[lanes] != NONE)[:, None]
@@ -313,7 +324,7 @@ class _Asked:
 
 
 def _apart(told: list[dict[str, np.ndarray]]) -> list[dict[str, np.ndarray]]:
-    """Of one wheel what differs by more than it may be wrong by, slowest first."""
+    """Return the gaits of one wheel that differ by more than their errors, slowest first."""
     kept: list[dict[str, np.ndarray]] = []
     for one in told:
         apart = (

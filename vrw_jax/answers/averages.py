@@ -1,12 +1,14 @@
-"""Means over many wheels on real ground, from few of its gaits and many of the lower rung's.
+"""Means over many wheels with unilateral contact, from few of its gaits and many of the lower
+model's.
 
-The lower rung is a control variate: what it tells of all wheels is known, and only its difference
-from real ground is sampled (M. B. Giles, Acta Numerica 24, 2015; B. Peherstorfer, K. Willcox and
-M. Gunzburger, SIAM Review 60, 2018). A pilot of wheels drawn first tells the weight, which control
-is worth its price, and how many more are needed. Its own wheels count as known and the others are
-drawn from those that are left, so that nothing is estimated from the numbers that it is applied to,
-and the mean is unbiased; where some wheels have no gait it is a ratio, of sums over all, and right
-to the order of one over the wheels asked.
+The lower model is a control variate. Its values are known for all wheels, and only the difference
+from unilateral contact is sampled (M. B. Giles, Acta Numerica 24, 2015; B. Peherstorfer, K. Willcox
+and M. Gunzburger, SIAM Review 60, 2018). A pilot sample of wheels determines the weight, the
+control that is worth its cost, and the number of further wheels. The pilot's own wheels count as
+known, and the others are drawn from the remaining ones. Nothing is therefore estimated from the
+numbers that it is applied to, and the mean is unbiased. If some wheels have no gait, the mean is a
+ratio of sums over all wheels. Its bias is then of the order of one over the number of sampled
+wheels.
 """
 
 import math
@@ -37,35 +39,36 @@ from vrw_jax.wording import (
 )
 
 DEVIATIONS = 2.0
-"""Standard errors that a stated error of a mean holds."""
+"""Number of standard errors in the stated error of a mean."""
 SHARE = 0.1
-"""Share of the mean's error that each gait may take."""
+"""Share of the mean's error that is allowed for each gait."""
 FEWEST = 8
-"""Wheels with a gait from which a spread is told."""
+"""Smallest number of wheels with a gait for an estimate of the variance."""
 FLAT = 1e-12
-"""Share of the largest singular value below which the pilot tells nothing of a direction."""
-CONTROLS = ("no control", "the paper's gaits", "the paper's gaits with one step on real ground")
+"""Share of the largest singular value below which the pilot does not determine a direction."""
+CONTROLS = ("no control", "the paper's gaits", "the paper's gaits with one contact step")
 LOWER_COST = (0.0, 1.0, 2.0)
-"""Price of a control, in steps on real ground: in lanes the paper's gait costs what one does."""
+"""Cost of a control in steps with unilateral contact: in batches, the paper's gait costs as much as
+one step."""
 
 
 class Average(AbstractTold):
-    """A measure's mean over wheels on real ground.
+    """Mean of a measure over wheels with unilateral contact.
 
     - `measure`: its name;
     - `value`: the mean, in the measure's unit;
-    - `error`: two of its standard errors, and what each gait may be wrong by;
-    - `n`: wheels with a gait on real ground, as far as they were asked;
-    - `n_top`: wheels asked on real ground, the pilot's included;
-    - `control`: what was known of all others, one of CONTROLS;
-    - `weight`: with which it counts;
-    - `steps`: on real ground, those that the control is worth included;
-    - `steps_alone`: expected of a mean of the same error from real ground alone.
+    - `error`: two of its standard errors, plus the mean error of the gaits;
+    - `n_gaits`: number of sampled wheels with a gait with unilateral contact;
+    - `n_high_fidelity`: number of wheels computed with unilateral contact, the pilot included;
+    - `control`: the control variate for the others, one of CONTROL_NAMES;
+    - `weight`: the weight of the control;
+    - `cost`: steps with unilateral contact, with the equivalent cost of the control included;
+    - `cost_high_fidelity_only`: expected cost of a mean of the same error without a control.
 
     Examples:
         >>> wheels = vrw.WheelParams(damping=jnp.linspace(120.0, 200.0, 60))
-        >>> mean = vrw.average("speed", wheels, 1e-2, friction=15.0, pilot=12)
-        >>> bool(mean.n_top < 60)
+        >>> mean = vrw.multifidelity_mean("speed", wheels, 1e-2, friction=15.0, pilot=12)
+        >>> bool(mean.n_high_fidelity < 60)
         True
     """
 
@@ -83,18 +86,21 @@ class Average(AbstractTold):
         unit = MEASURES[self.measure].plain_unit
         return [
             (f"mean {self.measure}", f"{self.value:.6g} ± {self.error:.1g} {unit}".strip()),
-            ("asked on real ground", f"{self.n_top:.0f} wheels, {self.n:.0f} of them with a gait"),
+            (
+                "with unilateral contact",
+                f"{self.n_top:.0f} wheels, {self.n:.0f} of them with a gait",
+            ),
             ("control", f"{self.control}, weight {self.weight:.3g}"),
-            ("steps on real ground", f"{self.steps:.3g}, alone {self.steps_alone:.3g}"),
+            ("contact steps", f"{self.steps:.3g}, alone {self.steps_alone:.3g}"),
         ]
 
 
 class _Plan(NamedTuple):
-    """How a mean will be taken with one of the controls."""
+    """Sampling plan for a mean with one of the controls."""
 
     steps: float  # expected
-    n: int  # wheels to be drawn
-    weights: np.ndarray  # of what the control tells, and of its telling anything
+    n: int  # number of wheels to draw
+    weights: np.ndarray  # of the control's value, and of the flag that it has one
     control: int
 
 
@@ -108,35 +114,35 @@ def average(
     seed: int = 0,
     stoppers: str = "bilateral",
 ) -> Average:
-    """The mean of a measure over these wheels on real ground, to within `tol` (two deviations).
+    """Return the mean of a measure over these wheels with unilateral contact, to within `tol`.
 
-    Fields of `params` and `friction` have one axis, of wheels: a design, or draws from what
-    manufacturing leaves. Wheels without a gait on real ground are left out.
+    Fields of `params` and `friction` have one axis, of wheels: a design, or draws from
+    manufacturing tolerances. Wheels without a gait with unilateral contact are left out.
 
     Args:
-        measure: one of those that `answer` knows.
+        measure: one of the measures of `measure_to_tolerance`.
         params: the wheels.
-        tol: two standard errors allowed, in the measure's unit.
-        friction: of the ground.
-        pilot: wheels asked first.
-        seed: says which.
-        stoppers: of the wheels that are meant, "bilateral" or "one-sided".
+        tol: allowed error (two standard errors), in the measure's unit.
+        friction: friction coefficient of the ground.
+        pilot: number of wheels in the pilot sample.
+        seed: of the random sample.
+        stoppers: of the wheels, "bilateral" or "one-sided".
 
     Returns:
-        An `Average`.
+        A `MultifidelityMean`.
 
     Raises:
-        TypeError, ValueError: an argument that can't be meant, or too few wheels with a gait.
+        TypeError, ValueError: an invalid argument, or too few wheels with a gait.
 
     Examples:
         >>> wheels = vrw.WheelParams(damping=jnp.linspace(120.0, 200.0, 60))
-        >>> mean = vrw.average("speed", wheels, 1e-2, friction=15.0, pilot=12)
+        >>> mean = vrw.multifidelity_mean("speed", wheels, 1e-2, friction=15.0, pilot=12)
         >>> bool(mean.error < 1.1e-2)
         True
     """
     untraced("vrw.average", "it on numbers, and give wheels as arrays", params, friction)
     instance("measure", measure, str, "give the name of one, 'speed', say")
-    require_known(measure, tuple(MADE), "measure that every rung tells")
+    require_known(measure, tuple(MADE), "measure that every model has")
     chosen("stoppers", stoppers, ("bilateral", "one-sided"))
     tol, pilot = positive("tol", tol), whole("pilot", pilot, FEWEST, ", to tell a spread")
     seed = whole("seed", seed, 0)
@@ -154,7 +160,7 @@ def average(
     found = exact.found
     if np.sum(found) < FEWEST:
         raise ValueError(
-            f"{np.sum(found)} of the pilot's {pilot} wheels have a gait on real ground, but a mean "
+            f"{np.sum(found)} of the pilot's {pilot} wheels have a gait with contact, but a mean "
             f"needs {FEWEST}: give other wheels, or a larger pilot."
         )
     pilots = _Asked.of(exact)
@@ -180,11 +186,11 @@ def average(
 
 
 class _Asked(NamedTuple):
-    """What wheels that were asked tell."""
+    """Measures of sampled wheels."""
 
-    total: np.ndarray  # the measure, zero where there is no gait
-    has: np.ndarray  # whether there is one
-    price: float  # steps of each
+    total: np.ndarray  # the measure, zero if there is no gait
+    has: np.ndarray  # whether there is a gait
+    price: float  # mean number of steps per wheel
 
     @classmethod
     def of(cls, told: Answer) -> "_Asked":
@@ -193,7 +199,7 @@ class _Asked(NamedTuple):
 
 
 class _Wheels(NamedTuple):
-    """What is asked of which wheels."""
+    """Wheels of a sample and the measure to evaluate."""
 
     measure: str
     params: WheelParams
@@ -204,12 +210,12 @@ class _Wheels(NamedTuple):
         return jax.device_put(taken(self.params, lanes))
 
     def asked(self, lanes: np.ndarray, tol: float) -> Answer:
-        """On real ground."""
+        """Return the measure with unilateral contact."""
         given = self.measure, self.some(lanes), tol
         return answer(*given, friction=self.friction[lanes], stoppers=self.stoppers)
 
     def known(self, lanes: np.ndarray, control: int) -> np.ndarray:
-        """What a control tells of them; NaN where nothing."""
+        """Return the values of a control; NaN where it has none."""
         told = np.full(len(lanes), np.nan)
         if not control:
             return told
@@ -231,16 +237,16 @@ class _Wheels(NamedTuple):
 
 
 def _columns(known: np.ndarray) -> np.ndarray:
-    """Of each wheel what a control tells, and whether it tells anything."""
+    """Return for each wheel the control's value, and whether it has one."""
     has = np.isfinite(known)
     return np.column_stack([np.where(has, known, 0.0), has])
 
 
 def _planned(control: int, pilot: _Asked, x: np.ndarray, tol: float, n_rest: int) -> _Plan:
-    """Weights and number of wheels by the pilot, for a mean to within `tol`.
+    """Return weights and number of wheels from the pilot, for a mean to within `tol`.
 
-    The mean M is of those with a gait, a ratio: what is controlled is each wheel's measure less M,
-    zero where it has none, of which the sum is zero.
+    The mean M is over the wheels with a gait, a ratio. The controlled quantity is each wheel's
+    measure minus M, zero for a wheel without a gait; its sum is zero.
     """
     share = float(np.mean(pilot.has))
     z = pilot.total - np.mean(pilot.total) / share * pilot.has
@@ -254,7 +260,8 @@ def _planned(control: int, pilot: _Asked, x: np.ndarray, tol: float, n_rest: int
 
 
 def _estimated(plan: _Plan, pilot: _Asked, drawn: _Asked, x: np.ndarray) -> tuple[float, float]:
-    """The mean and its standard error: `x` of all but the pilot, the first of which were drawn."""
+    """Return the mean and its standard error. `control_columns` are of all wheels but the pilot;
+    the first ones were drawn."""
     n, known = len(x), x @ plan.weights
     count = np.sum(pilot.has) + n * np.mean(drawn.has)
     less = drawn.total - known[: plan.n]
@@ -266,6 +273,9 @@ def _estimated(plan: _Plan, pilot: _Asked, drawn: _Asked, x: np.ndarray) -> tupl
 
 
 def _unseen(pilot: _Asked, z: np.ndarray) -> float:
-    """Where gaits are lost, one more wheel counts that the control says nothing right of: few may
-    have met none that has the paper's gait and no other."""
+    """Return the variance of one extra wheel that the control predicts wrongly, if gaits are lost.
+
+    A small sample may contain no wheel with a gait of the paper's model and without one of
+    unilateral contact.
+    """
     return 0.0 if np.all(pilot.has) else float(np.var(z))

@@ -1,14 +1,14 @@
-"""Gaits on the top rung by quasi-Newton steps that need its values alone, lane by lane.
+"""Refinement of gaits of the highest model by quasi-Newton steps that need only its values.
 
-One step of the top rung from a state x tells the defect r = P(x) - x. Carried by the inverse of
-I - DP it is Newton's correction d, and the gait's quantities are near those of this step plus what
-they move by along d. Here both matrices are at first the lower rung's, where it has a gait, and
-learn from each further step by Broyden's update of rank one (C. G. Broyden, Math. Comp. 19, 1965).
-Where that is slow, and wherever the legs' codes have changed, differences of a few more steps take
-their place: by matrices of another motion a slow direction moves the correction little, and
-nothing that follows from it can be believed. How much smaller d becomes
-from one step to the next is measured, q, the worse of two, and bounds what is left: as for a
-contraction (Kantorovich), with a factor of two, by 2q/(1 - q) of what the last but one moved.
+One step of the highest model from a state x gives the defect r = P(x) - x. Multiplied by the
+inverse of I - DP it is Newton's correction d. The gait's quantities are near those of this step
+plus their change along d. At first both matrices are the lower model's, if it has a gait. Each
+further step updates them by Broyden's update of rank one (C. G. Broyden, Math. Comp. 19, 1965). If
+the convergence is slow, and if the legs' codes have changed, finite differences of a few more steps
+replace the matrices. The matrices of another motion predict a small correction in a slow direction,
+and an error bound that follows from them is invalid. The contraction q of d from one step to the
+next is measured, and the larger of the last two bounds the remaining error. As for a contraction
+(Kantorovich), with a factor of two, the bound is 2q/(1 - q) times the last change but one.
 """
 
 import dataclasses
@@ -24,85 +24,93 @@ from vrw_jax.answers.top import Ground, Stepped
 from vrw_jax.wheel import Outcome
 
 SLOWEST, TRUSTED, QUICKEST = 0.5, 0.25, 0.1
-"""Contraction from which on matrices are taken anew, that is trusted at most to bound what is left,
-and at least counted on. A slow direction hides behind quick ones: where corrections came down by a
-third each, one gait was four times as far off as their bound."""
+"""Contraction rates. Above the first, matrices are recomputed. Above the second, the rate is not
+trusted to bound the remaining error. The third is the smallest rate that is assumed. A slow
+direction is hidden behind quick ones: when corrections decreased by a third each, one gait was four
+times as far away as its bound."""
 CURVED = 5.0
-"""Contraction over the length of a correction that is counted on at least: how curved maps are."""
+"""Smallest assumed contraction rate over the length of a correction, a measure of the curvature of
+the maps."""
 FARTHEST = 1.0
-"""Longest correction, rad, rad/s, m/s: farther off nothing is known."""
+"""Longest accepted correction, rad, rad/s, m/s; beyond it the linearization is unknown."""
 PATIENCE = 4
-"""Corrections that do not contract, or changes of the legs' codes, before a lane gives up."""
+"""Number of corrections that do not contract, or of changes of the legs' codes, before an element
+fails."""
 PER_TOLERANCE = 30.0
-"""Error of a step over the tolerance of its local steps: 99 of 100 keep a third of it."""
+"""Error of a step over the tolerance of its solver steps; 99 of 100 are within a third of it."""
 Goal = Callable[[np.ndarray], np.ndarray]
-"""Errors wanted of measures with about these values, (lanes, names)."""
+"""Allowed errors of measures with about these values, (elements, measures)."""
 SINGULAR = 1e-3
-"""Share of a direction that must be left of it after a step for the inverse to learn from it."""
+"""Smallest share of a direction that must remain after a step for an update of the inverse."""
 DIFFERENCE = 1e-5
-"""Of a number of the section state, for derivatives, rad, rad/s, m, m/s."""
+"""Step of finite differences in a coordinate of the section state, rad, rad/s, m, m/s."""
 STEEP = 10.0
-"""Slope by differences from which on they may lie across a jump: of 1,042 of gaits one in a hundred
-is steeper, and where they jump a correction tells nothing of what is left."""
+"""Derivative by differences above which they may cross a jump. Of 1,042 derivatives at gaits one in
+a hundred is steeper. Across a jump a correction gives no information about the remaining error."""
 CORRECTIONS, AGAIN = 24, 8
-"""Most corrections of one iteration, and after how many matrices are taken anew."""
+"""Largest number of corrections of one iteration, and the number after which matrices are
+recomputed."""
 ROUNDING, NOISE = 1e2, 1e4
-"""Corrections of so many tolerances are the integrator's; and where they come down no more."""
+"""Lengths of corrections in tolerances: the level of the integrator's errors, and the level below
+which corrections may stall."""
 BRIEF = 3.0
-"""Dips of a foot of the shortest kind that a step may miss or add."""
+"""Number of shortest dips of a foot that a step may miss or add."""
 BRIEFLY = 0.1
-"""Share of what is wanted that such dips may be presumed to cost: else it is measured."""
+"""Largest share of the allowed error that is assumed for such dips; otherwise it is measured."""
 AT_REST = 6.0
-"""How far corrections that come down no more may leave one off, in their own effect, and a step, in
-the difference that another tolerance makes: four times was too little for 4 of 10,365 answers."""
+"""Safety factor of stalled corrections, relative to their own effect, and of the difference between
+steps at two tolerances. A factor of four was too small for 4 of 10,365 results."""
 STRAY, STAYS = 1e-3, 1e-3
-"""How far from a walk's end its gait may lie without being walked to again, and how far a walk may
-then lead away, rad, rad/s, m, m/s."""
+"""Largest distance of a gait from a walk's end without a second walk, and largest drift of that
+second walk, rad, rad/s, m, m/s."""
 RESOLVED = 1e-13
-"""Changes as short as this tell nothing."""
+"""Length below which a change is not resolved."""
 
 
 class Seen(NamedTuple):
-    """What one step of the top rung tells; lanes lead."""
+    """Estimate of a gait's measures from one step of the highest model; the batch axis comes
+    first."""
 
-    same: np.ndarray  # it ended with the legs' codes that it began with
-    values: np.ndarray  # (lanes, names): the measures of the gait, as far as is known
-    size: np.ndarray  # (lanes, names): what the correction moves them by, nothing cancelled
-    direct: np.ndarray  # (lanes, names, 7): how they move with the step's quantities
-    numerical: np.ndarray  # (lanes, names): bound of what the integrator's tolerance leaves
-    brief: np.ndarray  # (lanes, names): and of dips too short to be followed
+    same: np.ndarray  # whether the legs' codes are unchanged by the step
+    values: np.ndarray  # (elements, measures): estimated measures of the gait
+    size: np.ndarray  # (elements, measures): sum of the absolute effects of the correction
+    direct: np.ndarray  # (elements, measures, 7): derivatives with respect to the step's quantities
+    numerical: np.ndarray  # (elements, measures): bound of the integrator's error
+    brief: np.ndarray  # (elements, measures): bound of the error from unresolved short dips
 
 
 class Settled(NamedTuple):
-    """What became of lanes."""
+    """Result of the refinement."""
 
     done: np.ndarray
     values: np.ndarray
-    left: np.ndarray  # (lanes, names): bound of what the iteration leaves
+    left: np.ndarray  # (elements, measures): bound of the iteration's error
     numerical: np.ndarray
-    n_steps: np.ndarray  # of the top rung
-    x: np.ndarray  # (lanes, 4 + 3 n)
-    speed: np.ndarray  # m/s, of the last step
+    n_steps: np.ndarray  # of the highest model
+    x: np.ndarray  # (elements, 4 + 3 n)
+    speed: np.ndarray  # of the last step, m/s
 
 
 @dataclasses.dataclass
 class Chord:
-    """Lanes on their way to a fixed point of the top rung, whose matrices learn."""
+    """Quasi-Newton iteration of a batch to a fixed point of the highest model, with Broyden
+    updates."""
 
     ground: Ground
     lanes: np.ndarray
     x: np.ndarray
-    inverse: np.ndarray  # (lanes, m, m): of I - DP
-    moved: np.ndarray  # (lanes, 7, m): how the quantities move with x
-    known: np.ndarray  # whether the matrices are of this motion
+    inverse: np.ndarray  # (elements, m, m): inverse of I - DP
+    moved: np.ndarray  # (elements, 7, m): derivatives of the quantities with respect to x
+    known: np.ndarray  # whether the matrices are those of this motion
     free: np.ndarray
-    has: np.ndarray  # whether the step before had the same codes
-    before: tuple[np.ndarray, ...]  # where that began, its defect and quantities
+    has: np.ndarray  # whether the previous step had the same codes
+    before: tuple[np.ndarray, ...]  # its start, defect and quantities
     correction: np.ndarray
 
     @classmethod
     def of(cls, ground: Ground, lanes: np.ndarray, x: np.ndarray, lower: Lower | None) -> "Chord":
-        """From `x`, with the matrices of the gaits there, if a lower rung has any."""
+        """Start from `section_states`, with the matrices of the lower model's gaits if there are
+        any."""
         n, m = len(lanes), x.shape[1] - ground.n
         inverse, moved = np.tile(np.eye(m), (n, 1, 1)), np.zeros((n, N_QUANTITIES, m))
         if lower is not None:
@@ -117,12 +125,13 @@ class Chord:
         )
 
     def some(self, part: np.ndarray) -> "Chord":
-        """Of these lanes alone."""
+        """Return the iteration of the selected elements."""
         ground, *arrays = (getattr(self, field.name) for field in dataclasses.fields(self))
         return Chord(ground, *jax.tree.map(lambda x: x[part], arrays))
 
     def see(self, some: np.ndarray, step: Stepped, names: Sequence[str]) -> Seen:
-        """Learn from a step of `some` lanes, and tell what it says of the gait."""
+        """Update the matrices from a step of some elements, and return the estimate of their
+        gaits."""
         m = self.free.shape[1]
         x, y = self.x[some], step.x
         same = self.alike(some, step)
@@ -140,7 +149,7 @@ class Chord:
             size = np.einsum("ijk,ik->ij", along, np.abs(d))
             tolerance = PER_TOLERANCE * float(self.ground.options.rtol)
             felt = np.abs(direct).sum(-1) + np.sum(along @ np.abs(inverse), axis=-1)
-            # What a dip takes from one duration it adds to another.
+            # A dip moves time from one duration to another.
             spread = np.ptp(direct[:, :, :N_DURATIONS], axis=-1)
             brief = BRIEF * self.ground.shortest(self.lanes[some])[:, None] * spread
             values = measured(names, estimate)
@@ -154,7 +163,7 @@ class Chord:
         told: np.ndarray,
         same: np.ndarray,
     ) -> None:
-        """Broyden's updates of both matrices, where the step before can be compared with."""
+        """Apply Broyden's updates to both matrices if the previous step is comparable."""
         x_before, defect_before, told_before = (kept[some] for kept in self.before)
         s = np.where(self.free[some], x - x_before, 0.0)
         z = defect_before - defect
@@ -174,19 +183,22 @@ class Chord:
         self.has[some] = same
 
     def step(self, some: np.ndarray) -> Stepped:
-        """From where `some` lanes are."""
+        """Take one step from the current states of some elements."""
         return self.ground.step(self.lanes[some], self.x[some])
 
     def alike(self, some: np.ndarray, step: Stepped) -> np.ndarray:
-        """Whether these lanes' step ended with the codes that it began with."""
+        """Return whether the step of these elements ended with the codes at its start."""
         m = self.free.shape[1]
         same = np.all(self.x[some, m:] == step.x[:, m:], axis=1)
         return same & (step.outcome == Outcome.STEPPED)
 
     def other_opinions(self, some: np.ndarray, names: Sequence[str], told: "Settled") -> np.ndarray:
-        """Numerical errors by steps at other tolerances, in place of what dips may cost: the
-        shortest that are followed are shorter, or longer, there. Infinite where one of these steps
-        has another motion."""
+        """Return numerical errors from steps at other tolerances, which replace the assumed error
+        of dips.
+
+        At another tolerance the shortest resolved dips are shorter or longer. The error is infinite
+        if one of these steps has another motion.
+        """
         worst = np.zeros_like(told.numerical[some])
         for ground in self.ground.otherwise():
             chord = dataclasses.replace(
@@ -199,21 +211,25 @@ class Chord:
         return worst
 
     def attract(self) -> np.ndarray:
-        """Whether walks near by come to where the lanes are: no multiplier is beyond one, which is
-        that no eigenvalue of (I - DP)^-1 has a real part below a half."""
+        """Return whether nearby walks converge to the current states: no multiplier is outside the
+        unit circle.
+
+        Equivalently, no eigenvalue of (I - DP)^-1 has a real part below a half.
+        """
         return np.linalg.eigvals(self.inverse).real.min(-1) > 0.5
 
     def away(self, x: np.ndarray) -> np.ndarray:
-        """How far the lanes are from there."""
+        """Return the largest distance of the current states from `section_states`."""
         return np.abs(self.x - x)[:, : self.free.shape[1]].max(-1)
 
     def stay(self, n_steps: int) -> np.ndarray:
-        """Whether a walk stays where the lanes are: multipliers by differences across a dip lie."""
+        """Return whether a walk stays at the current states, because finite differences across a
+        dip give wrong multipliers."""
         end = self.ground.step(self.lanes, self.x, n_steps)
         return (end.outcome == Outcome.STEPPED) & (self.away(end.x) <= STAYS)
 
     def go_on(self, some: np.ndarray, y: np.ndarray, same: np.ndarray) -> None:
-        """To where the correction leads; along the step itself where codes have changed."""
+        """Move to the corrected states, or to the end of the step if codes have changed."""
         m = self.free.shape[1]
         there = np.where(self.free[some], self.x[some, :m] + self.correction[some], y[:, :m])
         self.x[some] = y
@@ -226,10 +242,11 @@ class Chord:
         self.free[changed] = self.ground.free(self.x[changed])
 
     def differentiate(self, some: np.ndarray, step: Stepped) -> np.ndarray:
-        """Both matrices anew, by differences of one step more for each free number.
+        """Recompute both matrices by finite differences, one more step for each free coordinate.
 
-        `step` is the one from where the lanes are; tells how many steps were taken for each lane.
-        A difference that is STEEP is taken to the other side as well, and the lesser one counts.
+        `step` is the one from the current states. Return the number of steps taken for each
+        element. A difference above MAX_FD_DERIVATIVE is also taken on the other side, and the
+        smaller one is used.
         """
         m = self.free.shape[1]
         lane, number = np.nonzero(self.free[some])
@@ -254,8 +271,12 @@ class Chord:
     def _slopes(
         self, some: np.ndarray, step: Stepped, lane: np.ndarray, number: np.ndarray, change: float
     ) -> np.ndarray:
-        """How section state and quantities move, (pairs, m + 7), where the `lane`-th of `some` has
-        the `number` changed; not at all where the step ends with other codes."""
+        """Return derivatives of section state and quantities, (pairs, m + 7), for changes of single
+        coordinates.
+
+        A pair is an element position and a coordinate. The derivatives are zero if the step ends
+        with other codes.
+        """
         m = self.free.shape[1]
         x = self.x[some][lane]
         x[np.arange(len(lane)), number] += change
@@ -266,7 +287,7 @@ class Chord:
 
 
 class _Trust:
-    """How far each lane's corrections can be trusted, by how they have come down so far."""
+    """Bounds of the remaining error from the measured contraction of each element's corrections."""
 
     def __init__(self, n: int, m: int, tolerance: float) -> None:
         self.tolerance = tolerance
@@ -274,21 +295,24 @@ class _Trust:
         self.size, self.values = np.full((n, m), np.inf), np.full((n, m), np.nan)
 
     def anew(self, some: np.ndarray, ratio: float) -> None:
-        """Matrices of these lanes are others."""
+        """Reset these elements after their matrices have been replaced."""
         self.length[some], self.ratio[some] = np.inf, ratio
 
     def left(self, some: np.ndarray, seen: Seen, length: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Bound of what the corrections leave, (lanes, names), how they contracted, and whether
-        they come down no more, as the integrator allows."""
+        """Return the bound of the remaining error, (elements, measures), the contraction rates, and
+        which stall.
+
+        Corrections stall if they stop decreasing and are as small as the integrator's errors allow.
+        """
         before = self.length[some]
         with np.errstate(all="ignore"):
             q = np.where(seen.same, length / before, np.inf)
-            # By differences across a dip ever shorter corrections move measures as far as before.
+            # With differences across a dip, shorter corrections change measures as much as before.
             felt = np.max(seen.size / np.maximum(self.size[some], RESOLVED), axis=1)
             stalls = seen.same & (np.maximum(q, felt) > SLOWEST) & np.isfinite(before)
             stalls &= np.maximum(length, before) <= NOISE * self.tolerance
             q = np.where(seen.same & (length <= ROUNDING * self.tolerance), 0.0, q)
-            # Nothing is trusted where there is no correction yet to compare with.
+            # No rate is trusted before there is a previous correction.
             least = np.clip(CURVED * before, QUICKEST, TRUSTED)
             least = np.where(np.isfinite(before), least, np.inf)
             worst = np.maximum(np.maximum(q, self.ratio[some]), least)
@@ -312,11 +336,11 @@ def settled(
     patient: int,
     first: tuple[Stepped, Seen] | None = None,
 ) -> Settled:
-    """Corrections until what is left is below the `goal`, CORRECTIONS at most.
+    """Apply corrections until the remaining error is below the goal, at most MAX_ITERATIONS.
 
-    Differences take the matrices' place after so many steps, `patient`, and at once where they are
-    of another motion. `first` is the step from where the lanes are, and what the chord has seen of
-    it, if it has been taken.
+    Finite differences replace the matrices after `n_steps_before_differences` steps, and
+    immediately if the matrices are those of another motion. `first_step_and_estimate` is the step
+    from the current states with its estimate, if it has been taken.
     """
     n, m = len(chord.lanes), len(names)
     told = Settled(
@@ -347,7 +371,7 @@ def settled(
         told.values[open_], told.left[open_], told.done[open_] = seen.values, left, done
         told.numerical[open_] = seen.numerical + seen.brief
         told.speed[open_] = measured(("speed",), step.told)[:, 0]
-        # A walk may have come to where feet dip more often than is presumed.
+        # A walk may end at a gait whose feet dip more often than assumed.
         doubted[open_] = done & (np.any(seen.brief > BRIEFLY * wanted, axis=1) | (patient == 0))
         slow = np.isfinite(q) & (q > SLOWEST)
         strikes[open_] += ~seen.same | slow

@@ -1,4 +1,5 @@
-"""Gaits of the rungs below real ground, with what carries a defect to their measures; in lanes."""
+"""Gaits of the models below unilateral contact, with the matrices that propagate a defect to
+measures."""
 
 from typing import NamedTuple
 
@@ -16,29 +17,30 @@ from vrw_jax.wheel import Outcome, WheelParams
 
 NONE, RIGID, PAPER, GROUND = 0, 1, 2, 3
 RUNGS = ("none", "rigid", "viscoelastic", "unilateral")
-"""Names of the rungs, by number."""
+"""Names of the models by index."""
 
 START = "section_state"
 
 SETTLED = (Outcome.STEPPED, Outcome.ORDER_DIFFERS)
-"""Outcomes of a search after which no walk is tried: of 210 wheels with 6 to 12 legs whose solution
-has its phases in another order walks lead 3 to a gait."""
+"""Outcomes of a search after which no walk is tried. Of 210 wheels with 6 to 12 legs whose solution
+has another order of phases, walks lead 3 to a gait."""
 
 
 class Lower(NamedTuple):
-    """One gait of each lane, on a rung whose section state is the paper's; lanes lead."""
+    """One gait of each element, in a model whose section state is the paper's; the batch axis comes
+    first."""
 
-    rung: np.ndarray  # NONE: there is no gait
-    x: np.ndarray  # (lanes, 3): section state
-    told: np.ndarray  # (lanes, 7): quantities of the step from it
-    carry: np.ndarray  # (lanes, 3, 3): (I - DP)^-1
-    moved: np.ndarray  # (lanes, 7, 3): how the quantities move with x
-    own: np.ndarray  # (lanes, 3): the gait's own defect, carried: what numbers leave it wrong by
+    rung: np.ndarray  # NO_MODEL if there is no gait
+    x: np.ndarray  # (elements, 3)
+    told: np.ndarray  # (elements, 7): quantities of the step from it
+    carry: np.ndarray  # (elements, 3, 3): (I - DP)^-1
+    moved: np.ndarray  # (elements, 7, 3): derivatives of the quantities
+    own: np.ndarray  # (elements, 3): numerical defect of the gait times `newton_matrix`
     outcome: np.ndarray
 
 
 def no_gaits(n: int) -> Lower:
-    """Of lanes in which nothing is known yet."""
+    """Return empty gaits for a batch."""
     return Lower(
         np.full(n, NONE), np.zeros((n, 3)), np.zeros((n, N_QUANTITIES)), np.zeros((n, 3, 3)),
         np.zeros((n, N_QUANTITIES, 3)), np.zeros((n, 3)), np.full(n, int(Outcome.NO_CYCLE_FOUND)),
@@ -46,19 +48,19 @@ def no_gaits(n: int) -> Lower:
 
 
 def put(into: Lower, lanes: np.ndarray, some: Lower) -> None:
-    """Those gaits in their lanes."""
+    """Replace the gaits at these indices."""
     for whole, part in zip(into, some, strict=True):
         whole[lanes] = part
 
 
 def paper_gaits(params: WheelParams, options: Options) -> Lower:
-    """By collocation, and one step by machine code, which tells what a gait moves with."""
+    """Return gaits by collocation, with derivatives from one step by machine code."""
 
     finder = finder_of(None, params.n_legs)
     cycles = in_batches(finder.cycles, SHAPES, params)
     x, outcome = np.array(cycles.section_state), np.array(cycles.outcome)
     (lost,) = np.nonzero(~np.isin(outcome, SETTLED))
-    if len(lost):  # on one mesh, for another lane's would move this one's last digits
+    if len(lost):  # one mesh for all keeps digits independent of the batch
         cycles = reached(finder, *jax.device_put(taken((params, cycles), lost)))
         x[lost], outcome[lost] = cycles.section_state, cycles.outcome
     lower = no_gaits(len(x))
@@ -85,9 +87,10 @@ def paper_gaits(params: WheelParams, options: Options) -> Lower:
 
 
 def rigid_gaits(params: WheelParams) -> Lower:
-    """In closed form: the rolling gait of the classic landing, whose rear foot leaves.
+    """Return the rigid gaits in closed form: rolling with the classic landing, whose rear foot
+    leaves.
 
-    That is what stiff legs come near to on real ground; the paper's landing, whose rear foot is
+    Stiff legs with unilateral contact approach this gait. The paper's landing, whose rear foot is
     held, has a gait half as fast again.
     """
     x, y, length, duration, jacobian, slope = map(np.asarray, in_batches(_rolling, SHAPES, params))
@@ -99,13 +102,14 @@ def rigid_gaits(params: WheelParams) -> Lower:
 
 
 def contraction(params: WheelParams) -> np.ndarray:
-    """Share of its length by which weight contracts a leg: the order of the rigid rung's error."""
+    """Return the static contraction of a leg over its length, which is the order of the rigid
+    model's error."""
     s = jax.tree.map(np.asarray, params.symbols())
     return s.Mt * s.g / (np.asarray(params.stiffness) * s.L0)
 
 
 def _reach(params: WheelParams) -> np.ndarray:
-    """Distance between both feet at touchdown, times cos(theta-): L0 sin(alpha), m."""
+    """Return the distance between both feet at touchdown, times cos(theta-): L0 sin(alpha), m."""
     return np.asarray(params.locked_length) * np.sin(params.leg_angle)
 
 

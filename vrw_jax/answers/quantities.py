@@ -1,11 +1,13 @@
-"""What one step tells of a gait on any rung: seven numbers, and the measures that they make."""
+"""Quantities of one step that every model has: seven numbers, and the measures that follow from
+them."""
 
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
 N_QUANTITIES, N_DURATIONS = 7, 3
-"""Time on two feet, on one, in flight, s; step length, m; section state of the paper's."""
+"""Numbers of quantities and of durations. The quantities are times on two feet, on one and in
+flight, s; step length, m; and the paper's section state."""
 
 
 def _period(t: np.ndarray) -> np.ndarray:
@@ -28,18 +30,20 @@ MADE: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "dtheta_touchdown": _own(5),
     "dL1_touchdown": _own(6),
 }
-"""Measures that every rung tells, by their names in `results.MEASURES`."""
+"""Measures that every model has, by their names in `results.ALL_MEASURES`."""
 
 TINY = 1e-30
 
 
 def measured(names: Sequence[str], t: np.ndarray) -> np.ndarray:
-    """(lanes, names) of quantities (lanes, 7); NaN, and no warning, where a step failed."""
+    """Return measures (elements, measures) from quantities (elements, 7). They are NaN, without a
+    warning, if a step failed."""
     with np.errstate(invalid="ignore"):
         return np.stack([MADE[name](t) for name in names], -1)
 
 
 def slopes(names: Sequence[str], t: np.ndarray) -> np.ndarray:
-    """Their derivatives by the quantities, (lanes, names, 7), by complex steps."""
+    """Return derivatives of measures with respect to the quantities, (elements, measures, 7), by
+    complex steps."""
     steps = t[:, None, :] + 1j * TINY * np.eye(N_QUANTITIES)
     return np.stack([MADE[name](steps).imag / TINY for name in names], 1)

@@ -1,4 +1,4 @@
-"""What an answer tells, and how it prints itself."""
+"""Result of a measure to within a tolerance, and how it prints itself."""
 
 import math
 from typing import Any
@@ -14,58 +14,59 @@ from vrw_jax.wording import AbstractTold, Row, counted
 
 
 class How(Code):
-    """How an answer came about."""
+    """Method by which a measure was computed."""
 
-    CHECKED = 0, "checked by one step on real ground"
-    CORRECTED = 1, "the gait that continues the lower rung's"
-    WALKED = 2, "another gait than the lower rung's: a walk from there leads to it"
+    CHECKED = 0, "checked by one step with unilateral contact"
+    CORRECTED = 1, "the gait that continues the lower model's"
+    WALKED = 2, "another gait than the lower model's: a walk from there leads to it"
     FROM_START = (
         3,
         "no gait of the paper's wheel was found: a walk from its start leads to this one",
     )
-    NO_GAIT = 4, "no such gait on real ground"
+    NO_GAIT = 4, "no such gait with unilateral contact"
     CHOSEN = 5, "one of those that attract"
 
 
-CALLED = ("no rung", "the rigid wheel", "the paper's wheel", "real ground")
-"""Of the rungs, by number."""
+CALLED = ("no model", "the rigid wheel", "the paper's wheel", "unilateral contact")
+"""Labels of the models by index."""
 
 
 class Answer(AbstractTold):
-    """Measures of a gait and what they may be wrong by; of lanes, every property has their axis.
+    """Measures of a gait and bounds of their errors. For a batch, every property has its axis.
 
-    Of one measure a property is that, of several a dictionary by name. Where there is no gait the
-    value is NaN and the error infinite.
+    For one measure a property is a value, for several a dictionary by name. If there is no gait,
+    the value is NaN and the error infinite.
 
     - `values`, `errors`, `model_errors`, `numerical_errors`: measures on the last axis;
-    - `rungs`, `hows`: numbers of the rungs and of how the answers came about;
-    - `states`: section states of real ground next to the gait, from which walks and searches for
-      it may start;
-    - `n_steps`: taken on real ground;
-    - `n_gaits`: among which the gait was chosen, 0 where none was to be;
-    - `outcomes`: STEPPED, or why there is no gait;
-    - `names`, `single`: what was asked;
-    - `cost`: of the whole call, s.
+    - `models`, `statuses`: indices of the models, and codes of the methods;
+    - `states`: section states with unilateral contact near the gait, as starts for walks and
+      searches;
+    - `n_steps`: number of steps with unilateral contact;
+    - `n_gaits`: number of gaits that the gait was selected from, 0 without a selection;
+    - `outcomes`: STEPPED, or the reason why there is no gait;
+    - `names`, `is_single`: the requested measures;
+    - `seconds`: time of the whole call, s.
 
     Examples:
-        >>> told = vrw.answer("speed", vrw.WheelParams(damping=150.0), 1e-6, friction=np.inf)
-        >>> told.rung, int(told.n_steps)
+        >>> wheel = vrw.WheelParams(damping=150.0)
+        >>> result = vrw.measure_to_tolerance("speed", wheel, 1e-6, friction=np.inf)
+        >>> result.model, int(result.n_steps)
         ('viscoelastic', 1)
     """
 
-    values: np.ndarray  # (*lanes, measures)
+    values: np.ndarray  # (*batch, measures)
     errors: np.ndarray
     model_errors: np.ndarray
     numerical_errors: np.ndarray
-    states: np.ndarray  # (*lanes, 4 + 3 n)
-    rungs: np.ndarray  # (*lanes,), numbers of RUNGS
+    states: np.ndarray  # (*batch, 4 + 3 n)
+    rungs: np.ndarray  # (*batch,), indices in MODEL_NAMES
     hows: np.ndarray
-    n_steps: np.ndarray  # taken on real ground
+    n_steps: np.ndarray  # with unilateral contact
     outcomes: np.ndarray
     n_gaits: np.ndarray
     names: tuple[str, ...] = eqx.field(static=True)
     single: bool = eqx.field(static=True)
-    cost: float = eqx.field(static=True)  # s, of the whole call
+    cost: float = eqx.field(static=True)  # of the whole call, s
 
     def _told(self, table: np.ndarray) -> Any:
         columns = {name: table[..., i] for i, name in enumerate(self.names)}
@@ -75,42 +76,42 @@ class Answer(AbstractTold):
 
     @property
     def value(self) -> Any:
-        """Of the rung that answers, in the measure's unit."""
+        """Return the value from the selected model, in the measure's unit."""
         return self._told(self.values)
 
     @property
     def error(self) -> Any:
-        """Bound of what the value may be wrong by, all counted."""
+        """Return a bound of the error of the value, from all sources."""
         return self._told(self.errors)
 
     @property
     def model_error(self) -> Any:
-        """What the lower rung's value is wrong by, with sign, as real ground tells it.
+        """Return the lower model's error, with sign, relative to unilateral contact.
 
-        It is part of the value where the lower rung answers, and has been taken off where real
-        ground does; NaN where the lower rung has no gait.
+        It is contained in the value if the lower model is selected. It has been removed if
+        unilateral contact is. It is NaN if the lower model has no gait.
         """
         return self._told(self.model_errors)
 
     @property
     def numerical_error(self) -> Any:
-        """Bound of what tolerances, meshes and iterations leave."""
+        """Return a bound of the error from tolerances, meshes and iterations."""
         return self._told(self.numerical_errors)
 
     @property
     def rung(self) -> Any:
-        """Name of the rung that the value is of."""
+        """Return the name of the selected model."""
         names = np.asarray(RUNGS)[self.rungs]
         return names if self.rungs.ndim else str(names)
 
     @property
     def found(self) -> Any:
-        """Whether there is a gait."""
+        """Return whether there is a gait."""
         return (self.outcomes == Outcome.STEPPED)[()]
 
     @property
     def why(self) -> Any:
-        """Why the answer is of that rung, a sentence; of lanes an array of them."""
+        """Return why that model is selected, as a sentence. A batch has an array of them."""
         told = np.vectorize(_sentence, otypes=[object])
         return told(self.rungs, self.hows, self.n_steps, self.outcomes, self.n_gaits)[()]
 
@@ -156,7 +157,8 @@ def _sentence(rung: int, how: int, n_steps: int, outcome: int, n_gaits: int) -> 
 
 
 def _short(x: float) -> str:
-    """One digit and a power of ten, or a plain number of up to three digits."""
+    """Format a value as one digit and a power of ten, or as a plain number of up to three
+    digits."""
     if x == 0.0 or 0.1 <= abs(x) < 1e4:
         return f"{x:.3g}"
     digit, power = f"{x:.0e}".split("e")

@@ -1,4 +1,4 @@
-"""Real ground, the top rung, as values of one step in lanes; nothing here is differentiated."""
+"""Steps of the highest model, unilateral contact, in batches and without derivatives."""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -11,28 +11,29 @@ from vrw_jax.numerics import Options
 from vrw_jax.wheel import PARAMETER_NAMES, WheelParams
 
 TIGHT, TIGHTER = 1e-10, 1e-12
-"""Tolerances of steps. Looser ones save a seventh of the time and miss events; the tighter one
+"""Tolerances of steps. Looser ones save a seventh of the time but miss events; the tighter one
 costs a third more."""
 LOOSE = 3e-6
-"""Of walks, by Tsit5, whose steps cost a quarter. Three gaits in 118 are missed at 1e-5."""
+"""Tolerance of walks by Tsit5, whose steps cost a quarter. At 1e-5, three gaits in 118 are
+missed."""
 OPINIONS = {TIGHT: (TIGHTER, 1e-11, 3e-11), TIGHTER: (1e-13, 3e-12, 1e-11)}
-"""Tolerances of others, where feet may dip."""
+"""Other tolerances for comparison if feet may dip."""
 
 
 class Stepped(NamedTuple):
-    """A step of some lanes."""
+    """Result of a step of some elements."""
 
-    x: np.ndarray  # (lanes, 4 + 3 n): section state after it; zeros where it failed
-    told: np.ndarray  # (lanes, 7): its quantities
+    x: np.ndarray  # (elements, 4 + 3 n): section state after it; zeros if it failed
+    told: np.ndarray  # (elements, 7)
     outcome: np.ndarray
 
 
 @dataclasses.dataclass(frozen=True)
 class Ground:
-    """Wheels on ground of their own friction, lane by lane."""
+    """Batch of wheels with unilateral contact, each with its own friction."""
 
-    columns: np.ndarray  # (10, lanes): parameters and friction
-    n: int  # legs
+    columns: np.ndarray  # (10, elements): parameters and friction
+    n: int  # number of legs
     model: UnilateralWheel
     options: Options
 
@@ -45,14 +46,14 @@ class Ground:
         return cls(np.stack(columns), params.n_legs, model, options)
 
     def embedded(self, lanes: np.ndarray, x: np.ndarray, rigid: Any = False) -> np.ndarray:
-        """Full section states of the paper's, (lanes, 3), where `rigid` with Leg 1 on its stopper,
-        too."""
+        """Return full section states from the paper's, (elements, 3), with Leg 1 on its stopper
+        where `is_rigid`."""
         full = np.array(as_full_states(self.columns[:, lanes], x, self.n))
         full[:, 4 + 2 * self.n] += np.where(rigid, LOCKED, 0)
         return full
 
     def step(self, lanes: np.ndarray, x: np.ndarray, n_steps: int = 1) -> Stepped:
-        """From full section states."""
+        """Take steps from full section states."""
         columns = self.columns[:, lanes]
         y, durations, outcome, *_, length = walk_lanes(
             columns, x, n_steps, self.model, self.options, self.n
@@ -61,26 +62,27 @@ class Ground:
         return Stepped(y, told, outcome)
 
     def loosely(self) -> "Ground":
-        """With steps for walks."""
+        """Return the batch with steps for walks."""
         return dataclasses.replace(self, options=Options(solver="Tsit5", rtol=LOOSE, atol=LOOSE))
 
     def otherwise(self) -> list["Ground"]:
-        """With steps at other tolerances."""
+        """Return the batch with steps at other tolerances."""
         own = TIGHTER if float(self.options.rtol) < 0.5 * TIGHT else TIGHT
         options = [Options(rtol=tolerance, atol=tolerance) for tolerance in OPINIONS[own]]
         return [dataclasses.replace(self, options=each) for each in options]
 
     def shortest(self, lanes: np.ndarray) -> np.ndarray:
-        """Of each lane the time that a foot is off the ground in the least dip that is followed."""
+        """Return the time that a foot is off the ground in the smallest resolved dip, s."""
         value = lambda name: self.columns[PARAMETER_NAMES.index(name)]
         dip = np.asarray(least_dip(jnp.asarray(value("locked_length")), self.options))
         return np.sqrt(8.0 * dip / value("gravity"))[lanes]
 
     def free(self, x: np.ndarray) -> np.ndarray:
-        """Numbers of section states that are free where their legs' codes hold, (lanes, 4 + 2 n).
+        """Return which numbers of section states are free for the given legs' codes, (elements, 4 +
+        2 n).
 
-        The others follow from them: the hub's rates from a foot that sticks, Leg 1's length from
-        touchdown, those of legs on their stoppers from these.
+        The other numbers are determined by them. The hub's rates follow from a sticking foot, Leg
+        1's length from touchdown, and the lengths of legs on their stoppers from the stoppers.
         """
         n = self.n
         code = np.round(x[:, 4 + 2 * n :]).astype(int)
@@ -93,11 +95,12 @@ class Ground:
         return free
 
     def consistent(self, x: np.ndarray) -> np.ndarray:
-        """Section states with what follows from the free numbers: see `free`."""
+        """Return section states with the numbers that follow from the free ones: see
+        `free_coordinates`."""
         n, x = self.n, x.copy()
         theta, code = x[:, 0], np.round(x[:, 4 + 2 * n]).astype(int)
         foot = code % LOCKED
-        height = x[:, 3 + n] * np.cos(theta - 2.0 * np.pi / n)  # of the hub, by the landing leg
+        height = x[:, 3 + n] * np.cos(theta - 2.0 * np.pi / n)  # of the hub, from the landing leg
         sin, cos, rate, along = np.sin(theta), np.cos(theta), x[:, 1], x[:, 4 + n]
         x[:, 4] = np.where((foot != 0) & (code < LOCKED), height / cos, x[:, 4])
         length = x[:, 4]
@@ -106,5 +109,5 @@ class Ground:
         return x
 
     def plane(self) -> np.ndarray:
-        """Places of the paper's section state among the numbers of a full one."""
+        """Return the indices of the paper's section state in a full one."""
         return np.array([0, 1, 4 + self.n])
