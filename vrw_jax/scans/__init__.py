@@ -1,4 +1,4 @@
-"""The steady gait of every sample of a design, as one labelled dataset."""
+"""Scans: the steady gait of every sample of a design, as one labelled dataset."""
 
 from vrw_jax.scans import design
 from vrw_jax.scans.design import LONGEST, SALTELLI, SWEPT, grid, saltelli, samples, sobol, uniform

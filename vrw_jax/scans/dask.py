@@ -1,8 +1,8 @@
-"""Scans on the workers of a dask cluster: the chunks of `run`, each by whichever worker is free.
+"""Scans on the workers of a dask cluster: each chunk of `run_scan` is computed by a free worker.
 
-Workers only compute; the process that asked writes the store. A worker that dies loses the chunks
-it held to the others. Workers say by what means they compute, and other means than the store's are
-refused: its last digits might not fit.
+Workers only compute, and the calling process writes the store. If a worker dies, other workers
+compute its chunks. Workers return a description of their environment. A chunk from an environment
+other than that of the calling process is refused, because its last digits might differ.
 """
 
 import contextlib
@@ -24,15 +24,15 @@ if TYPE_CHECKING:
     from distributed import Client
 
 AHEAD = 2
-"""Chunks that wait at the cluster for each of its threads: enough to keep it busy, few to hold."""
+"""Number of submitted chunks per thread, chosen to keep a thread busy with little memory."""
 
 ANSWER = "10s"
-"""How long a scheduler may take to answer."""
+"""Longest time in which a scheduler must respond."""
 
 
 @contextlib.contextmanager
 def workers(address: str) -> Iterator[Through]:
-    """The workers of the scheduler at `address`, or for "local" one process for each core."""
+    """Yield an executor on the cluster at `address`; "local" starts one process per core."""
     try:
         from distributed import Client, LocalCluster
     except ImportError as error:
@@ -49,7 +49,7 @@ def workers(address: str) -> Iterator[Through]:
         else:
             try:
                 client = Client(address, timeout=ANSWER, set_as_default=False)
-            except (OSError, ValueError) as error:  # no answer, or no address
+            except (OSError, ValueError) as error:  # no response, or an invalid address
                 raise ValueError(
                     f"no dask scheduler answers at {address!r}: give the address that it printed "
                     "when it started, such as tcp://host:8786, or 'local'."
@@ -59,7 +59,7 @@ def workers(address: str) -> Iterator[Through]:
 
 
 def _chunks(client: "Client", planned: Plan, missing: Sequence[int]) -> Iterator[Chunk]:
-    """Results of the missing chunks, in the order in which they come."""
+    """Yield the results of the missing chunks in the order of completion."""
     from distributed import Future, KilledWorker, as_completed
 
     recipe = pickle.dumps(planned.for_engine)
@@ -68,6 +68,7 @@ def _chunks(client: "Client", planned: Plan, missing: Sequence[int]) -> Iterator
     coming = as_completed(loop=client.loop)
 
     def fill() -> None:
+        """Submit chunks until every thread of the cluster has enough."""
         room = AHEAD * max(1, sum(client.nthreads().values())) - len(held)
         for index in itertools.islice(waiting, max(room, 0)):
             columns = planned.design.block(planned.layout.region(index))
@@ -92,7 +93,7 @@ def _chunks(client: "Client", planned: Plan, missing: Sequence[int]) -> Iterator
                     "Start the workers from the same installation on machines of one kind."
                 )
             yield held.pop(future), results
-            del future  # the cluster may forget it
+            del future  # lets the cluster release its result
             fill()
     finally:
         client.cancel(list(held))
@@ -101,13 +102,14 @@ def _chunks(client: "Client", planned: Plan, missing: Sequence[int]) -> Iterator
 def _computed(
     recipe: bytes, columns: Columns
 ) -> tuple[dict[str, object], Mapping[str, np.ndarray]]:
-    """In a worker: by what means, and the results of a chunk."""
+    """Return the environment of the worker and the results of a chunk."""
     start_jax()
     return origin(), _engine(recipe)(columns)
 
 
 @functools.cache
 def _engine(recipe: bytes) -> Evaluate:
+    """Return the engine of a pickled request, which a worker creates once."""
     from distributed import get_worker
 
     return engine_for(pickle.loads(recipe), get_worker().state.nthreads)

@@ -1,4 +1,4 @@
-"""What a scan looks at: samples of the wheel's parameters, as a grid or as a list."""
+"""Designs of a scan: samples of the wheel's parameters, as a grid or as a list."""
 
 import abc
 import hashlib
@@ -12,18 +12,19 @@ from vrw_jax.wheel import FRICTION, PARAMETER_NAMES
 from vrw_jax.wording import instance, range_of, require_known, shown, told, untraced, whole
 
 Columns = dict[str, np.ndarray]
-"""One value per sample of each parameter that is swept."""
+"""Swept parameters by name, with one value per sample."""
 SWEPT = (*PARAMETER_NAMES, FRICTION)
-"""What may be swept: the wheel's parameters, and the friction of a ground that has one."""
+"""Parameters that a design may sweep: those of the wheel, and the ground's friction."""
 Range = tuple[float, float]
+"""Lower and upper bound of a parameter, in its unit."""
 LONGEST = 10_000_000
-"""Values of an axis, or samples of a list, at most: they are held in memory."""
+"""Largest number of values of an axis or samples of a list, chosen because memory holds them."""
 SALTELLI = "saltelli"
-"""Kind of the samples that Sobol' indices are read off."""
+"""Kind of the designs from which Sobol' indices are computed."""
 
 
 class AbstractDesign(abc.ABC):
-    """Samples laid out over `shape`; a block of that shape is one unit of work."""
+    """Samples of the wheel's parameters, laid out on an array of shape `shape`."""
 
     kind: str
     values: Mapping[str, np.ndarray]
@@ -34,34 +35,34 @@ class AbstractDesign(abc.ABC):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The parameters that are swept."""
+        """Return the names of the swept parameters."""
         return tuple(self.values)
 
     @property
     def size(self) -> int:
-        """Number of samples."""
+        """Return the number of samples."""
         return int(np.prod(self.shape, dtype=np.int64))
 
     @property
     @abc.abstractmethod
     def dims(self) -> tuple[str, ...]:
-        """Names of the axes of a labelled result."""
+        """Return the names of the axes of a labelled result."""
 
     @property
     @abc.abstractmethod
     def shape(self) -> tuple[int, ...]:
-        """Lengths of those axes."""
+        """Return the lengths of the axes."""
 
     @abc.abstractmethod
     def block(self, region: tuple[slice, ...]) -> Columns:
-        """The samples of a rectangular region, flat, the last axis fastest."""
+        """Return the samples of a rectangular region, flattened with the last axis fastest."""
 
     @abc.abstractmethod
     def coordinates(self) -> dict[str, tuple[str, np.ndarray]]:
-        """Coordinates of a labelled result: name -> (axis, values)."""
+        """Return the coordinates of a labelled result: name -> (axis, values)."""
 
     def description(self) -> dict[str, object]:
-        """What makes this design this one: kind, names, axes and a digest of every number."""
+        """Return the identity of the design: kind, names, shape and a digest of every number."""
         return {
             "kind": self.kind,
             "swept": list(self.names),
@@ -71,6 +72,7 @@ class AbstractDesign(abc.ABC):
 
 
 def digest_of(kind: str, values: Mapping[str, np.ndarray]) -> str:
+    """Return the SHA-256 digest of a kind, and of the names and values of the columns."""
     digest = hashlib.sha256(json.dumps([kind, *values]).encode())
     for column in values.values():
         digest.update(np.ascontiguousarray(column, dtype="<f8").tobytes())
@@ -79,7 +81,7 @@ def digest_of(kind: str, values: Mapping[str, np.ndarray]) -> str:
 
 @dataclass(frozen=True, repr=False)
 class Grid(AbstractDesign):
-    """Every combination of the values given for each parameter; one axis per parameter."""
+    """Design of every combination of the parameters' values, with one axis per parameter."""
 
     values: Mapping[str, np.ndarray]
     kind: str = "grid"
@@ -103,7 +105,7 @@ class Grid(AbstractDesign):
 
 @dataclass(frozen=True, repr=False)
 class Samples(AbstractDesign):
-    """Samples one by one, along the axis `sample`; all parameters may vary at once."""
+    """Design of single samples along the axis `sample`; all parameters may vary at once."""
 
     values: Mapping[str, np.ndarray]
     kind: str = "samples"
@@ -125,16 +127,16 @@ class Samples(AbstractDesign):
 
 
 def grid(**values: Sequence[float] | np.ndarray) -> Grid:
-    """Every combination of the values of each parameter, e.g. `grid(damping=..., slope=...)`.
+    """Return the design of every combination of the values, e.g. `grid(damping=..., slope=...)`.
 
     Args:
-        **values: of each parameter, any sequence of numbers.
+        **values: the values of each parameter, as any sequence of numbers.
 
     Returns:
         A design whose axes are the parameters.
 
     Raises:
-        TypeError, ValueError: an argument that can't be meant, in one sentence.
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
 
     Examples:
         >>> vrw.grid(damping=[100.0, 150.0], slope=np.linspace(0.28, 0.32, 5)).shape
@@ -151,18 +153,18 @@ def grid(**values: Sequence[float] | np.ndarray) -> Grid:
 
 
 def samples(values: Mapping[str, Sequence[float] | np.ndarray]) -> Samples:
-    """The samples given, e.g. `samples({"damping": [100, 150], "slope": [0.29, 0.30]})`.
+    """Return the design of given samples, e.g. `samples({"damping": [100], "slope": [0.29]})`.
 
-    A sample out of a parameter's domain, or not finite, gets the outcome BAD_INPUT.
+    A sample outside a parameter's domain, or not finite, gets the outcome BAD_INPUT.
 
     Args:
-        values: of each parameter, all of one length.
+        values: the values of each parameter, all of one length.
 
     Returns:
-        A design over `sample`.
+        A design over the axis `sample`.
 
     Raises:
-        TypeError, ValueError: an argument that can't be meant, in one sentence.
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
 
     Examples:
         >>> vrw.samples({"damping": [100.0, 150.0], "slope": [0.29, 0.30]}).shape
@@ -179,24 +181,26 @@ def samples(values: Mapping[str, Sequence[float] | np.ndarray]) -> Samples:
 
 
 def sobol(ranges: Mapping[str, Range], n: int, seed: int = 0) -> Samples:
-    """`n` samples of a scrambled Sobol' sequence; even spread is best where n is a power of 2.
+    """Return `n` samples of a scrambled Sobol' sequence.
+
+    The samples are spread most evenly if n is a power of 2.
 
     Args:
-        ranges: lower and upper, of each parameter.
+        ranges: lower and upper bound of each parameter.
         n: number of samples.
-        seed: of the sequence.
+        seed: seed of the scrambling.
 
     Returns:
-        A design over `sample`.
+        A design over the axis `sample`.
 
     Raises:
-        TypeError, ValueError: an argument that can't be meant, in one sentence.
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
 
     Examples:
         >>> vrw.sobol({"damping": (100.0, 200.0), "slope": (0.28, 0.32)}, 8).shape
         (8,)
     """
-    from scipy.stats import qmc  # only drawing needs it, and its import is slow
+    from scipy.stats import qmc  # imported here because the import is slow
 
     names, lower, upper = _box(ranges, n)
     exponent = max(int(n - 1).bit_length(), 0)
@@ -205,18 +209,18 @@ def sobol(ranges: Mapping[str, Range], n: int, seed: int = 0) -> Samples:
 
 
 def uniform(ranges: Mapping[str, Range], n: int, seed: int = 0) -> Samples:
-    """`n` independent samples, uniform over the box.
+    """Return `n` independent samples, uniformly distributed over the box.
 
     Args:
-        ranges: lower and upper, of each parameter.
+        ranges: lower and upper bound of each parameter.
         n: number of samples.
-        seed: of the sequence.
+        seed: seed of the random numbers.
 
     Returns:
-        A design over `sample`.
+        A design over the axis `sample`.
 
     Raises:
-        TypeError, ValueError: an argument that can't be meant, in one sentence.
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
 
     Examples:
         >>> vrw.uniform({"damping": (100.0, 200.0), "slope": (0.28, 0.32)}, 8).shape
@@ -228,27 +232,27 @@ def uniform(ranges: Mapping[str, Range], n: int, seed: int = 0) -> Samples:
 
 
 def saltelli(ranges: Mapping[str, Range], n: int, seed: int = 0) -> Samples:
-    """Samples for `indices.sobol_indices`: for d parameters, `n` rows of 2 + d, n a power of two.
+    """Return samples for `sobol_indices`: `n` rows of 2 + d samples for d parameters.
 
-    A row holds two independent points of the box, A and B, and A with each coordinate in turn taken
-    from B. Samples are ordered A, B, then by parameter.
+    A row holds two independent points of the box, A and B, and copies of A in which one coordinate
+    is taken from B. Samples are ordered A, B, then by parameter.
 
     Args:
-        ranges: lower and upper, of each parameter.
+        ranges: lower and upper bound of each parameter.
         n: number of rows, a power of two.
-        seed: of the sequence.
+        seed: seed of the sequence.
 
     Returns:
-        A design over `sample`.
+        A design over the axis `sample`.
 
     Raises:
-        TypeError, ValueError: an argument that can't be meant, in one sentence.
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
 
     Examples:
         >>> vrw.saltelli({"damping": (100.0, 180.0), "slope": (0.27, 0.29)}, 8).shape
         (32,)
     """
-    from scipy.stats import qmc  # only drawing needs it, and its import is slow
+    from scipy.stats import qmc  # imported here because the import is slow
 
     names, lower, upper = _box(ranges, n)
     if n & (n - 1):
@@ -266,15 +270,18 @@ def saltelli(ranges: Mapping[str, Range], n: int, seed: int = 0) -> Samples:
 def _spread(
     names: list[str], lower: np.ndarray, upper: np.ndarray, points: np.ndarray, kind: str
 ) -> Samples:
+    """Return the design of points of the unit cube, shape (n, d), scaled to the box."""
     values = lower + (upper - lower) * points
     return Samples(dict(zip(names, np.ascontiguousarray(values.T), strict=True)), kind)
 
 
 def _generator(seed: int) -> np.random.Generator:
+    """Return a generator of random numbers; raise if the seed is not a whole number."""
     return np.random.default_rng(whole("seed", seed, 0))
 
 
 def _box(ranges: Mapping[str, Range], n: int) -> tuple[list[str], np.ndarray, np.ndarray]:
+    """Return the names, lower bounds and upper bounds of a box; check the number of samples."""
     if whole("n", n) > LONGEST:
         raise ValueError(
             f"n is {n:,}, but a list takes {LONGEST:,} samples at most: give fewer, or a grid."
@@ -285,7 +292,7 @@ def _box(ranges: Mapping[str, Range], n: int) -> tuple[list[str], np.ndarray, np
 
 
 def _known(values: Mapping[str, object]) -> Mapping:
-    """`values`, if they name parameters that can be swept."""
+    """Return `values`; raise if a name is not a sweepable parameter or there is none."""
     instance("the design", values, Mapping, "write {'damping': (100.0, 200.0)}")
     if not values:
         raise ValueError(
@@ -298,6 +305,7 @@ def _known(values: Mapping[str, object]) -> Mapping:
 
 
 def _column(name: str, value: object) -> np.ndarray:
+    """Return the values of one parameter as an array of one axis; raise if they are not numbers."""
     untraced("a design", "use jax.vmap", value)
     column = np.atleast_1d(np.asarray(value))
     if column.dtype.kind not in "fiu" and column.size:

@@ -1,10 +1,10 @@
-"""The steady gait of many wheels at once: one compiled function over a fixed number of lanes.
+"""Steady gaits of many wheels: one compiled function over a batch of fixed size.
 
-A block of samples is cut into batches of LANES wheels, the last filled up, and every batch goes
-through the same compiled code: what a lane gives does not depend on where it stands, on its
-neighbours, or on how many samples a scan has.
+The samples are divided into batches of `WHEELS_PER_BATCH` wheels, and the last batch is padded. The
+same compiled code evaluates every batch, so the result of a sample depends neither on its position
+nor on the other samples.
 
-Batches run side by side: a thread for each core, all with one compiled program, or for each GPU.
+Batches run in parallel: one thread per core, all with one compiled program, or one thread per GPU.
 """
 
 import os
@@ -27,32 +27,33 @@ from vrw_jax.scans.offer import OF_CYCLE, derivative
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, wheel_of
 
 LANES = 512
-"""Wheels that one call of the compiled function takes."""
+"""Number of wheels that one call of the compiled function evaluates."""
 
 Told = tuple[Array, Array, dict[str, Array]]
 """Outcome, section state, and measures by name."""
 
 
 class Asked(NamedTuple):
-    """What samples are computed for, and by which choices."""
+    """Measures to compute for each sample, with the wheel, the model and the options."""
 
     measures: tuple[str, ...]
     base: WheelParams
-    model: Any  # the rung
+    model: Any
     options: Options
     cycle_options: CycleOptions
-    tol: float | None  # of the measures, in their units
+    tol: float | None  # permitted error of the measures, in their units
 
 
 class Engine:
-    """Evaluates samples of one wheel for a fixed set of measures; compiled at the first call.
+    """Engine for the paper's model and a fixed set of measures, compiled at the first call.
 
-    Two functions take turns: the limit cycle with the derivatives asked for, then one event-driven
-    step from it, for the margins and as a check. They are compiled side by side.
+    It finds the limit cycle with the requested derivatives by collocation. It then takes one
+    event-driven step from the cycle, for the margins and as a check. Both functions are compiled in
+    parallel.
     """
 
     def __init__(self, asked: Asked, threads: int | None = None) -> None:
-        """`threads`: at work side by side on a CPU; None: one for each core."""
+        """Initialize; `threads` is the number of CPU threads, by default one per core."""
         measures, base, model, options, cycle_options, _ = asked
         self._threads = n_cores() if threads is None else threads
         self._base, self._model, self._options = base, model, options
@@ -64,6 +65,8 @@ class Engine:
         finder = finder_of(model, base.n_legs, cycle_options=cycle_options, step_options=options)
 
         def gait(values: Array) -> tuple[AbstractCycle, dict[str, Array]]:
+            """Return the limit cycle of one wheel and the requested derivatives."""
+
             def along(some: Array) -> tuple[dict[str, Array], AbstractCycle]:
                 cycle = finder.cycle_of(values.at[indices].set(some))
                 return cycle.measures(d.measure for d in wanted), cycle
@@ -74,11 +77,13 @@ class Engine:
             return cycle, {d.name: jacobian[d.measure][moved.index(d.parameter)] for d in wanted}
 
         def told_by_cycle(values: Array) -> Told:
+            """Return outcome, section state and measures that the limit cycle gives."""
             cycle, derivatives = gait(values)
             names = (*(name for name in plain if name in OF_CYCLE), "spectral_radius")
             return cycle.outcome, cycle.section_state, cycle.measures(names) | derivatives
 
         def told_by_step(values: Array, state: Array, options: Options) -> Told:
+            """Return outcome, section state and measures that a step from the cycle gives."""
             result = model.step(wheel_of(values, base.n_legs), state, options)
             measures = result.measures()
             names = (*(name for name in plain if name not in OF_CYCLE), *MARGINS)
@@ -86,14 +91,14 @@ class Engine:
 
         self._cycle: Callable = jax.vmap(told_by_cycle)
         self._step: Callable = jax.vmap(told_by_step, in_axes=(0, 0, None))
-        # A model's own repr leaves out what is its default by identity, which pickling loses.
+        # The repr of a model omits defaults by identity, and pickling does not preserve identity.
         told = (type(model).__name__, *vars(model).items())
         self._settings = (measures, base.n_legs, told, cycle_options)
         self._free: SimpleQueue[_Programs] = SimpleQueue()
         self._workers, self._compiling = 0, Lock()
 
     def __call__(self, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Results of the samples in `columns` (one value per sample of each swept parameter)."""
+        """Return the results by variable; `columns` has one value per sample of each parameter."""
         rows = numbers(columns, self._model, self._base)
         with self._compiling:
             if not self._workers:
@@ -104,7 +109,7 @@ class Engine:
         return {n: np.concatenate([part[n] for part in parts])[: len(rows)] for n in parts[0]}
 
     def _batch(self, rows: np.ndarray) -> dict[str, np.ndarray]:
-        """Of LANES wheels: the first stands in for those that are missing."""
+        """Return the results of a batch, which is padded with copies of its first wheel."""
         filled = np.concatenate([rows, np.repeat(rows[:1], LANES - len(rows), 0)])
         programs = self._free.get()
         try:
@@ -119,7 +124,7 @@ class Engine:
         return masked(checked, told)
 
     def _compile(self) -> None:
-        """Programs for each device, both kinds side by side; a CPU's serve all of its cores."""
+        """Compile both functions in parallel for each device; all cores of a CPU share them."""
         devices = jax.local_devices()
         values = jax.ShapeDtypeStruct((LANES, len(PARAMETER_NAMES)), self._dtype)
         state = jax.ShapeDtypeStruct((LANES, 3), self._dtype)
@@ -142,11 +147,12 @@ class Engine:
 
     @property
     def _dtype(self) -> np.dtype:
+        """Return the floating-point type of the parameters."""
         return np.dtype(self._base.damping.dtype)
 
 
 class _Programs(NamedTuple):
-    """What a thread works with."""
+    """Compiled functions of one device."""
 
     device: jax.Device
     cycle: Callable
@@ -154,7 +160,7 @@ class _Programs(NamedTuple):
 
 
 def n_cores() -> int:
-    """Cores that this process may use."""
+    """Return the number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -163,7 +169,7 @@ def n_cores() -> int:
 def numbers(
     columns: Mapping[str, np.ndarray], model: AbstractWheel, base: WheelParams
 ) -> np.ndarray:
-    """The rung's numbers of each sample, (samples, numbers): swept ones, and those of the base."""
+    """Return the model's parameters of each sample, shape (samples, parameters)."""
     n = len(next(iter(columns.values())))
     own = np.asarray(model.values(base))
     return np.stack(
@@ -176,7 +182,7 @@ def numbers(
 
 
 def masked(outcome: np.ndarray, told: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Outcome and measures, these without numbers where there is no gait."""
+    """Return outcome and measures; a sample without a gait gets NaN, or -1 in an integer."""
     measures = {name: np.array(value) for name, value in told.items()}
     for value in measures.values():
         absent = np.nan if np.issubdtype(value.dtype, np.floating) else -1

@@ -1,4 +1,4 @@
-"""What a scan would take, measured on some of its samples, here and now."""
+"""Forecast of the time and memory of a scan, measured on some of its samples."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from vrw_jax.scans.planning import Plan
 from vrw_jax.scans.running import found_store
 
 START = 5.0
-"""Seconds until the first sample of a process that finds its code in the cache: docs/scans.md."""
+"""Time in seconds until the first sample if the compiled code is cached; see docs/scans.md."""
 
 TYPICAL = 0.5e9
-"""Bytes of code and arrays: docs/scans.md."""
+"""Typical memory in bytes of code and arrays; see docs/scans.md."""
 
 
 def explained(planned: Plan, store: str | Path | None = None) -> dict[str, str]:
-    """Sizes, chunks, memory and time of a scan, as lines for a reader; writes nothing.
+    """Return sizes, chunks, memory and time of a scan as lines of text, without writing anything.
 
-    Time and memory are measured on samples spread over the design, which are computed for that.
+    Time and memory are measured by computing samples that are spread over the design.
     """
     layout, size = planned.layout, planned.design.size
     offer = offer_of(planned.for_engine.model, planned.for_engine.tol)
@@ -62,7 +62,7 @@ def explained(planned: Plan, store: str | Path | None = None) -> dict[str, str]:
 
 
 def _spread(design: AbstractDesign, n: int) -> Columns:
-    """`n` samples from all over a design."""
+    """Return `n` samples that are spread evenly over a design."""
     numbers = np.linspace(0, design.size - 1, n).round().astype(np.int64)
     places = zip(*np.unravel_index(numbers, design.shape), strict=True)
     one = [design.block(tuple(slice(int(i), int(i) + 1) for i in place)) for place in places]
@@ -70,7 +70,7 @@ def _spread(design: AbstractDesign, n: int) -> Columns:
 
 
 def _peak() -> float:
-    """Most memory that this process has held, bytes."""
+    """Return the peak memory of this process, in bytes."""
     try:
         import resource
     except ImportError:  # on Windows
@@ -80,6 +80,7 @@ def _peak() -> float:
 
 
 def _bytes(n: int | float) -> str:
+    """Return a number of bytes as text with a unit."""
     for unit in ("B", "kB", "MB"):
         if n < 1000:
             return f"{n:.3g} {unit}"
@@ -88,7 +89,7 @@ def _bytes(n: int | float) -> str:
 
 
 def in_words(t: float) -> str:
-    """A time in seconds as a reader takes it in."""
+    """Return a time, given in seconds, as text in s, min or h."""
     if t < 90:
         return f"{t:.0f} s"
     return f"{t / 60:.0f} min" if t < 5400 else f"{t / 3600:.1f} h"

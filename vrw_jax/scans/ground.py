@@ -1,8 +1,8 @@
-"""The steady gait of many wheels on real ground, and of many wheels each on its lowest rung.
+"""Steady gaits of many wheels with unilateral contact, and with the simplest valid model for each.
 
-On real ground it is the gait that a slow start walks to, or the slowest that any comes to. On the
-ladder the paper's engine goes first, over all samples; those whose premises break on this ground
-are gathered and walk on the upper rung, so that no sample pays for another.
+With unilateral contact the result is the gait to which a slow start converges, or the slowest gait
+of all starts. For the simplest valid model, the paper's model evaluates all samples first. The
+samples that violate a margin are then evaluated with unilateral contact.
 """
 
 import dataclasses
@@ -36,18 +36,20 @@ from vrw_jax.scans.offer import derivative, error_of
 from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, wheel_of
 
 SHARE, LANES = 512, 64
-"""Samples that a thread takes at a time, and gaits that are told together: a number of its own, so
-that a sample has no company."""
+"""Number of samples per task of a thread, and number of gaits whose measures are read in one call;
+fixed, so that the result of a sample does not depend on the other samples."""
 
 Columns = Mapping[str, np.ndarray]
+"""Swept parameters by name, with one value per sample."""
 Told = dict[str, np.ndarray]
+"""Results by variable, with one value per sample."""
 
 
 class GroundEngine:
-    """Evaluates samples on real ground for a fixed set of measures."""
+    """Engine for unilateral contact and a fixed set of measures."""
 
     def __init__(self, asked: Asked, threads: int | None = None) -> None:
-        measures, base, model, options, *_ = asked  # gaits here are walked
+        measures, base, model, options, *_ = asked  # walks find these gaits
         self._base, self._model = base, model
         self._threads = n_cores() if threads is None else threads
         wanted = tuple(d for name in measures if (d := derivative(name)) is not None)
@@ -60,27 +62,28 @@ class GroundEngine:
         self._moved = Readings(read, tuple(dict.fromkeys(d.measure for d in wanted)))
 
     def __call__(self, columns: Columns) -> Told:
-        """Results of the samples in `columns` (one value per sample of each swept parameter)."""
+        """Return the results by variable; `columns` has one value per sample of each parameter."""
         values = numbers(columns, self._model, self._base)
         parts = np.array_split(values, max(self._threads, -(-len(values) // SHARE)))
         alone, *others = (part for part in parts if len(part))
-        told = [self._part(alone)]  # lest each thread compile its own
+        told = [self._part(alone)]  # the first call compiles for all threads
         with ThreadPoolExecutor(self._threads) as pool:
             told += pool.map(self._part, others)
         return {name: np.concatenate([part[name] for part in told]) for name in told[0]}
 
     def _part(self, values: np.ndarray) -> Told:
-        """Of each sample the gait that slow starts walk to."""
-        # Over a period friction carries all weight along the slope: with less no gait repeats.
+        """Return the results of the gait to which slow starts of each sample converge."""
+        # Friction balances the weight along the slope over a period; with less there is no gait.
         friction, slope = values[:, -1], values[:, PARAMETER_NAMES.index("slope")]
         holds = friction >= np.tan(slope)
         told = self._gaits(values[holds] if holds.any() else values[:1])
-        place = np.maximum(np.cumsum(holds) - 1, 0)  # another stands in for who has none
+        place = np.maximum(np.cumsum(holds) - 1, 0)  # any row if there is no gait
         whole = {name: leaf[place] for name, leaf in told.items()}
         outcome = np.where(holds, whole.pop("outcome"), Outcome.NO_CYCLE_FOUND)
         return masked(outcome, whole)
 
     def _gaits(self, values: np.ndarray) -> Told:
+        """Return outcome, measures and derivatives of the gaits of wheels, shape (wheels,)."""
         cycle = slow_gaits(self._finder, values)
         told = in_batches(lambda some: _read_lanes(self._plain, some), (LANES,), cycle)
         if self._wanted:
@@ -97,6 +100,7 @@ class GroundEngine:
 
 @eqx.filter_jit
 def _read_lanes(readings: Readings, cycle: WalkedCycle) -> dict[str, Array]:
+    """Return the measures of a batch of gaits."""
     first = jax.tree.map(lambda leaf: leaf[:, 0], cycle.steps)
     return eqx.filter_vmap(readings)(cycle, first)
 
@@ -108,11 +112,11 @@ OF_PAPER: dict[str, tuple[str, ...]] = {
     "energy_lost_impacts": ("energy_lost_landing", "energy_lost_stopper"),
     "energy_lost_friction": (),
 }
-"""Measures of real ground as sums of the paper's."""
+"""Measures with unilateral contact as sums of measures of the paper's model."""
 
 
 class LadderEngine:
-    """Evaluates samples on the lowest rung that serves each of them."""
+    """Engine that evaluates each sample with the simplest valid model."""
 
     def __init__(self, asked: Asked, threads: int | None = None) -> None:
         self._measures, self._base, self._model, *_ = asked
@@ -123,7 +127,7 @@ class LadderEngine:
         self._upper = GroundEngine(asked._replace(model=asked.model.upper), threads)
 
     def __call__(self, columns: Columns) -> Told:
-        """Results of the samples in `columns`, with `rung` and `reason` of each."""
+        """Return the results by variable, with `rung` and `reason` of each sample."""
         n = len(next(iter(columns.values())))
         friction = columns.get(FRICTION, np.full(n, float(self._model.friction)))
         lower = self._lower(
@@ -147,21 +151,21 @@ class LadderEngine:
         return results | {"rung": rung, "reason": reason}
 
     def reasons(self, lower: Told, friction: np.ndarray) -> np.ndarray:
-        """`ModelChoice.reason` of each of the paper's gaits, over the step that it repeats."""
+        """Return `ModelChoice.reason` of each gait of the paper's model, over its repeated step."""
         reason, _ = reason_of(lower, friction - self._paper.friction)
         return np.asarray(reason, np.int8)
 
 
 class AnswerEngine:
-    """Measures to within a tolerance, by the lowest rung that gives them; see `vrw.answer`."""
+    """Engine of measures to a tolerance; see `vrw.measure_to_tolerance`."""
 
     def __init__(self, asked: Asked) -> None:
         self._measures, self._base, self._model, *_, tol = asked
-        assert tol is not None  # the caller looked
+        assert tol is not None  # the caller has checked it
         self._tol = tol
 
     def __call__(self, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Results of the samples in `columns` (one value per sample of each swept parameter)."""
+        """Return the results by variable; `columns` has one value per sample of each parameter."""
         *own, friction = numbers(columns, self._model, self._base).T
         params = wheel_of(tuple(map(jnp.asarray, own)), self._base.n_legs)
         stoppers = self._model.stoppers
@@ -175,7 +179,7 @@ class AnswerEngine:
 def engine_for(
     asked: Asked, threads: int | None = None
 ) -> Engine | GroundEngine | LadderEngine | AnswerEngine:
-    """What computes the samples of a scan of this rung, or to within a tolerance."""
+    """Return the engine for the samples of a scan of this model, or to a tolerance."""
     if asked.tol is not None:
         return AnswerEngine(asked)
     make: Any = ENGINES[asked.model.rung]
@@ -183,4 +187,4 @@ def engine_for(
 
 
 ENGINES = {"viscoelastic": Engine, "unilateral": GroundEngine, "ladder": LadderEngine}
-"""By rung: those that a scan has an offer of."""
+"""Engine classes by model, for the models that a scan supports."""

@@ -1,7 +1,7 @@
-"""Global sensitivity: which parameter's spread makes a measure spread, by Sobol' indices.
+"""Global sensitivity: the shares of a measure's variance by parameter, as Sobol' indices.
 
-`design.saltelli` lays out the samples, `scan` computes them like any others, `sobol_indices` reads
-the indices off the result by `scipy.stats.sobol_indices` (Saltelli et al. 2010).
+`design.saltelli` generates the samples and `scan` computes them like any others. `sobol_indices`
+computes the indices from the result with `scipy.stats.sobol_indices` (Saltelli et al. 2010).
 """
 
 from __future__ import annotations
@@ -17,32 +17,34 @@ from vrw_jax.wheel import Outcome
 from vrw_jax.wording import instance, names_of, nearest
 
 FEWEST = 64
-"""Rows below which indices are noise."""
+"""Least number of rows, chosen because indices of fewer rows are noise."""
 
 RESAMPLES, QUANTILES = 200, (0.025, 0.975)
-"""Rows are drawn again this often for an interval between these quantiles."""
+"""Number of bootstrap resamples of the rows, and quantiles that bound the interval."""
 
 
 def sobol_indices(
     scan: xr.Dataset, measures: Iterable[str] = ("dls_fraction", "speed")
 ) -> xr.Dataset:
-    """First-order and total Sobol' indices of measures, shape (measure, parameter), pure numbers.
+    """Return first-order and total Sobol' indices, shape (measure, parameter), dimensionless.
 
-    The first-order index is the share of a measure's variance that one parameter makes by itself,
-    the total index the share that would vanish if it were known; each with `lower` and `upper` of a
-    95 % bootstrap interval. Rows with a sample that has no gait are left out, then as many more as
-    leave a power of two: `rows` of them count, and `left_out` is the share without a gait. Where it
-    is not small, the indices are those of gaits only, whose parameters are no longer independent.
+    The first-order index is the share of a measure's variance that one parameter causes by itself.
+    The total index is the share that vanishes if the parameter is fixed. Each has the bounds
+    `lower` and `upper` of a 95 % bootstrap interval.
+
+    Rows with a sample that has no gait are omitted, and then as many more as leave a power of two.
+    The attribute `rows` is the number of rows used, and `left_out` is the share without a gait. If
+    that share is not small, the indices refer to gaits only, whose parameters are not independent.
 
     Args:
-        scan: of a `saltelli` design.
-        measures: names of its variables.
+        scan: dataset of a scan over a `saltelli` design.
+        measures: names of variables of the scan.
 
     Returns:
         A dataset of `first_order`, `total` and their intervals.
 
     Raises:
-        TypeError, ValueError: an argument that can't be meant, in one sentence.
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
 
     Examples:
         >>> design = vrw.saltelli({"damping": (100.0, 180.0), "slope": (0.27, 0.29)}, 64)
@@ -79,13 +81,13 @@ def sobol_indices(
     told = np.stack([scan[name].values.reshape(blocks, -1)[:, rows] for name in wanted], axis=1)
 
     def indices(some: np.ndarray) -> np.ndarray:
-        """First-order and total, over measures and parameters, from rows."""
+        """Return both indices from some rows, shape (2, measures, parameters)."""
         drawn = told[..., some]
         found = indices_of(func={"f_A": drawn[0], "f_B": drawn[1], "f_AB": drawn[2:]}, n=n)
         both, shape = (found.first_order, found.total_order), (len(wanted), len(parameters))
         return np.stack([np.reshape(some, shape) for some in both])
 
-    generator = np.random.default_rng(0)  # the same scan gives the same intervals
+    generator = np.random.default_rng(0)  # seeded, so that the same scan gives the same intervals
     found = indices(np.arange(n))
     spread = [indices(generator.integers(0, n, n)) for _ in range(RESAMPLES)]
     lower, upper = np.quantile(spread, QUANTILES, axis=0)

@@ -1,4 +1,4 @@
-"""What a scan may be asked for: measures of the steady gait, and their derivatives, by name."""
+"""Measures that a scan can compute: those of the steady gait, and their derivatives, by name."""
 
 import re
 from collections.abc import Iterable
@@ -12,10 +12,10 @@ from vrw_jax.wheel import FRICTION, PARAMETER_NAMES
 from vrw_jax.wording import nearest
 
 ALWAYS = ("outcome", "spectral_radius", *MARGINS)
-"""In every scan, asked for or not: is there a cycle, is it stable, what does it break."""
+"""Variables of every scan, requested or not: outcome, stability and margins of the gait."""
 
 OF_CYCLE = CollocationFinder.of_cycle
-"""Measures that the limit cycle itself tells; these have derivatives."""
+"""Measures that are computed from the limit cycle itself; these have derivatives."""
 
 ON_REQUEST = (*OF_CYCLE, *(name for name in STEP if name not in (*OF_CYCLE, "outcome")))
 
@@ -34,14 +34,14 @@ DEFAULT_MEASURES = (
 
 
 class Offer(NamedTuple):
-    """What a scan of a rung can tell."""
+    """Names of the variables that a scan of one model can compute."""
 
     on_request: tuple[str, ...]
-    always: tuple[str, ...]  # in every scan, asked for or not
+    always: tuple[str, ...]  # in every scan, requested or not
     differentiable: tuple[str, ...]
-    by: tuple[str, ...]  # parameters that derivatives may be taken by
+    by: tuple[str, ...]  # parameters with respect to which derivatives are taken
     default: tuple[str, ...]
-    tried: int  # samples for each core that a forecast computes
+    tried: int  # samples per core that a forecast computes
 
 
 _DEFAULT = ("dls_fraction", "speed", "period", "step_length", "slip", "energy_lost_impacts")
@@ -63,20 +63,22 @@ LADDER = Offer(
     64,
 )
 OFFERS = {"viscoelastic": PAPER, "unilateral": REAL_GROUND, "ladder": LADDER}
-"""By rung: those with compliant legs."""
+"""Catalogs by model, for the models with compliant legs."""
 TO_TOLERANCE = Offer(
     tuple(MADE), ("outcome", "rung"), (), (), ("dls_fraction", "speed", "period"), 16
 )
-"""To within a tolerance, each measure with its error."""
+"""Catalog of scans to a tolerance, in which each measure has an error."""
 ERROR = "_error"
+"""Suffix of the variable that holds the error of a measure."""
 
 
 def offer_of(model: AbstractWheel, tol: float | None = None) -> Offer:
-    """What a scan of this rung can tell, or one to within a tolerance."""
+    """Return the catalog of a model, or that of scans to a tolerance if `tol` is given."""
     return OFFERS[model.rung] if tol is None else TO_TOLERANCE
 
 
 def error_of(measure: str) -> str:
+    """Return the name of the variable that holds the error of a measure."""
     return measure + ERROR
 
 
@@ -84,17 +86,19 @@ _DERIVATIVE = re.compile(r"d[ _](\w+?)(?: */ *d |_d_)(\w+)")
 
 
 class Derivative(NamedTuple):
-    """The derivative of a measure by a parameter, the gait staying a limit cycle."""
+    """Derivative of a measure with respect to a parameter, along the branch of limit cycles."""
 
     measure: str
     parameter: str
 
     @property
     def name(self) -> str:
+        """Return the name of the variable that holds the derivative."""
         return f"d_{self.measure}_d_{self.parameter}"
 
     @property
     def attrs(self) -> dict[str, object]:
+        """Return unit, name, symbol and description of the derivative."""
         above, below = MEASURES[self.measure], MEASURES[self.parameter]
         units = {unit for unit in (above.unit, below.unit) if unit != "1"}
         unit = "1" if not units else above.unit if below.unit == "1" else None
@@ -107,19 +111,19 @@ class Derivative(NamedTuple):
 
 
 def derivative(name: str) -> Derivative | None:
-    """The derivative that 'd dls_fraction / d damping' asks for; None if it names a measure."""
+    """Return the derivative named as in 'd dls_fraction / d damping', or None for a measure."""
     found = _DERIVATIVE.fullmatch(name.strip())
     return Derivative(*found.groups()) if found else None
 
 
 def canonical(name: str) -> str:
-    """The name of the variable that holds what `name` asks for, as files can hold it."""
+    """Return the name of the variable that holds `name`, as a name that a file system accepts."""
     wanted = derivative(name)
     return name.strip() if wanted is None else wanted.name
 
 
 def check_measures(names: Iterable[str], offer: Offer) -> tuple[str, ...]:
-    """Names of variables, each once, without what is always there; a sentence for a wrong one."""
+    """Return the variables' names, each once and without those in every scan; raise if unknown."""
     checked: dict[str, None] = {}
     known = (*offer.on_request, *offer.always)
     for name in names:
@@ -136,7 +140,7 @@ def check_measures(names: Iterable[str], offer: Offer) -> tuple[str, ...]:
             continue
         if not offer.differentiable:
             raise ValueError(
-                f"{name!r} is a derivative, but a scan to within a tolerance tells measures: "
+                f"{name!r} is a derivative, but a scan to a tolerance computes only measures: "
                 "drop it, or scan without tol."
             )
         if wanted.measure not in offer.differentiable:
@@ -156,6 +160,7 @@ def check_measures(names: Iterable[str], offer: Offer) -> tuple[str, ...]:
 
 
 def variable_attrs(name: str) -> dict[str, object]:
+    """Return unit, name and description of the variable `name` of a scan."""
     if name in SERVED:
         return dict(SERVED[name])
     if name.removesuffix(ERROR) in MADE and name.endswith(ERROR):

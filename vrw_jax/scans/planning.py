@@ -1,4 +1,4 @@
-"""What a scan is, before it runs: checked, laid out, and told apart from any other."""
+"""Plan of a scan before it runs: checked arguments, layout and identifying settings."""
 
 from __future__ import annotations
 
@@ -35,35 +35,35 @@ from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, WheelParams
 from vrw_jax.wording import instance, names_of, positive, whole
 
 MOST_SAMPLES = 1_000_000_000
-"""Of a scan: a day and more of computing, and some hundred GB."""
+"""Largest number of samples, chosen because it takes over a day and some hundred GB."""
 
 CHUNK = 4096
-"""Most samples of a chunk, unless asked for otherwise: what a killed scan can lose."""
+"""Default number of samples per chunk; a killed scan can lose so many."""
 
 ANSWERABLE = {"unilateral": ("restitution", "infinite", "uneven", "max_events")}
-"""By rung: what a tolerance can be kept towards, and settings that must be the usual ones."""
+"""Models that a tolerance can refer to, and their fields that must have the default value."""
 
 Evaluate = Callable[[Columns], Mapping[str, np.ndarray]]
-"""Results of a block of samples by variable, samples first."""
+"""Function that returns the results of samples by variable, with the axis of samples first."""
 Chunk = tuple[int, Mapping[str, np.ndarray]]
-"""Number of a chunk and its results."""
+"""Index of a chunk and its results."""
 Through = Callable[["Plan", Sequence[int]], Iterator[Chunk]]
-"""Carries out chunks of a plan, by number, in any order."""
+"""Function that computes chunks of a plan, given by index, and yields them in any order."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Everything about a scan that is known before it runs."""
+    """Checked arguments and layout of a scan."""
 
     design: AbstractDesign
     for_engine: Asked
     layout: Layout
-    asked: tuple[str, ...]  # measures by the names that they were asked for
+    asked: tuple[str, ...]  # measures by the names that the caller gave
     text: str
 
     @property
     def settings(self) -> dict[str, object]:
-        """What a store must have been made with to be gone on with."""
+        """Return the settings that a store must share so that the scan can continue in it."""
         measures, base, model, options, cycle_options, tol = self.for_engine
         fixed = (name for name in PARAMETER_NAMES if name not in self.design.names)
         return {
@@ -79,17 +79,19 @@ class Plan:
 
     @property
     def attrs(self) -> dict[str, object]:
+        """Return the attributes of the labelled result."""
         return {
             "title": f"Steady gaits of the viscoelastic-legged rimless wheel over "
             f"{', '.join(self.design.names)}",
             "rule": "NaN, or -1 in an integer, where the outcome is not STEPPED.",
-            MANIFEST: json.dumps(self.settings),  # as text: other files take no tables
+            MANIFEST: json.dumps(self.settings),  # text: other formats take no tables
             PROVENANCE: json.dumps(origin()),
             ASKED: ", ".join(self.asked),
             "config": self.text,
         }
 
     def engine(self) -> Evaluate:
+        """Return the engine that computes the samples."""
         return engine_for(self.for_engine)
 
 
@@ -105,7 +107,7 @@ def plan(
     text: str = "",
     tol: float | None = None,
 ) -> Plan:
-    """Check what is asked for and lay out the result, without computing anything."""
+    """Return the checked plan of a scan, with the layout of its result, without computing it."""
     if not isinstance(design, AbstractDesign):
         raise TypeError(
             f"design is a {type(design).__name__}, but it must say which samples: write "
@@ -131,7 +133,7 @@ def plan(
         )
     if FRICTION in design.names and FRICTION not in model.parameter_names:
         raise ValueError(
-            "the design sweeps friction, which the paper's wheel does not feel: give "
+            "the design sweeps friction, which does not affect the paper's wheel: give "
             'model=vrw.UnilateralWheel() or "auto".'
         )
     tol = None if tol is None else _towards(model, positive("tol", tol))
@@ -147,20 +149,20 @@ def plan(
 
 
 def _towards(model: AbstractWheel, tol: float) -> float:
-    """The tolerance; one clear sentence for a model towards which none can be kept."""
+    """Return the tolerance; raise if no tolerance can refer to the model."""
     usual: dict[str, Any] = type(model).__dataclass_fields__
     own = ANSWERABLE.get(model.rung)
     if own is None or any(getattr(model, name) != usual[name].default for name in own):
         raise ValueError(
-            f"tol is given and model is {model!r}, but a tolerance is kept towards real ground "
-            "without settings but friction and stoppers: give "
+            f"tol is given and model is {model!r}, but a tolerance refers to unilateral contact "
+            "with no settings other than friction and stoppers: give "
             "model=vrw.UnilateralWheel(friction=...)."
         )
     return tol
 
 
 def origin() -> dict[str, object]:
-    """Where numbers of this process come from: code, versions, device."""
+    """Return the code digest, the versions and the device of this process."""
     told = provenance(WheelParams(), ViscoelasticWheel(), Options())
     return {
         "code": code_digest(),
@@ -170,17 +172,17 @@ def origin() -> dict[str, object]:
 
 
 VECTOR_SETS = ("avx", "fma", "avx2", "avx512f", "avx512dq", "neon", "sve")
-"""Instruction sets that decide which sums the compiler fuses, and so the last digits."""
+"""Instruction sets that decide which sums the compiler fuses, and thus the last digits."""
 
 
 def _processor() -> str:
-    """The kind of processor, as far as last digits depend on it."""
+    """Return the kind of processor, as far as the last digits depend on it."""
     able = simd.processor()[2].split(",")
     return " ".join([platform.machine(), *(name for name in VECTOR_SETS if f"+{name}" in able)])
 
 
 def difference(there: object, here: object) -> str:
-    """The first setting that differs, in words; empty where none does."""
+    """Return a description of the first setting that differs, or an empty string."""
     name, old, new = first_difference(there, here)
     if not name:
         return ""
@@ -194,10 +196,12 @@ def difference(there: object, here: object) -> str:
 def _layout(
     design: AbstractDesign, names: tuple[str, ...], base: WheelParams, chunk: int
 ) -> Layout:
+    """Return the layout of the variables `names` over a design, in chunks of at most `chunk`."""
     dtype = str(base.damping.dtype)
     legs = locked_legs(base.n_legs)
 
     def variable(name: str) -> Variable:
+        """Return type, missing value and attributes of one variable."""
         attrs = variable_attrs(name)
         if name in ("outcome", "rung", "reason"):
             return Variable(name, "int8", -1, attrs)
@@ -222,11 +226,12 @@ def _layout(
 
 
 def _fields(settings: object) -> dict[str, object]:
+    """Return the class name and the fields of settings, as values of JSON."""
     told: dict[str, object] = {"kind": type(settings).__name__}
     for name in type(settings).__dataclass_fields__:  # type: ignore[attr-defined]
         value = getattr(settings, name)
         if isinstance(value, Options):
-            continue  # recorded by itself
+            continue  # recorded separately
         if value is None or isinstance(value, bool | int | str):
             told[name] = value
         elif isinstance(value, tuple):

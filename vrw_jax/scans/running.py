@@ -1,7 +1,7 @@
 """Scans: the steady gait of every sample of a design, as one labelled dataset.
 
-A scan is cut into chunks, each computed by the same compiled function and, where a store is given,
-written at once: a scan that was interrupted goes on with the chunks that are missing.
+A scan is divided into chunks, which the same compiled function computes. If a store is given, each
+chunk is written as soon as it is computed. An interrupted scan continues with the missing chunks.
 """
 
 from __future__ import annotations
@@ -34,16 +34,17 @@ from vrw_jax.walks import ModelLike
 from vrw_jax.wheel import Outcome, WheelParams
 
 Report = Callable[["Progress"], None]
+"""Function that is called with the progress after each chunk."""
 
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a scan is."""
+    """Progress of a scan, as numbers of samples."""
 
-    samples: int  # to do in this run
-    done: int  # of them
-    failed: int  # of those, without a steady gait
-    kept: int  # samples that an earlier run had computed
+    samples: int  # samples to compute in this run
+    done: int  # samples computed in this run
+    failed: int  # computed samples without a steady gait
+    kept: int  # samples that an earlier run computed
 
 
 def scan(
@@ -60,44 +61,46 @@ def scan(
     dask: str | None = None,
     tol: float | None = None,
 ) -> xr.Dataset:
-    """The steady gait of every sample, labelled, with outcome and premise margins of each.
+    """Return the steady gait of every sample with its outcome and margins, as a labelled dataset.
 
-    `measures` are names (see `vrw_jax.scans.offer`), derivatives included as in
-    'd dls_fraction / d damping'; variables have the names that were asked for, in that order. With
-    `store` the result is kept there chunk by chunk: a scan that was interrupted goes on where it
-    stopped and ends with bitwise the same data, a finished one is only opened, and chunks whose
-    files are damaged are computed again, with a warning. `report` is told the progress after each
-    chunk. What a sample gives does not depend on the others, nor on `chunk`. `model` may be the
-    wheel on real ground, whose samples walk towards their gait, or "auto", each sample on the
-    lowest rung that serves, with `rung` and `reason`; both take `friction` as a swept parameter.
-    `dask` is the address of a cluster that computes in this process' stead, "local" for one started
-    here.
+    `measures` are names (see `vrw_jax.scans.measure_catalog`), including derivatives as in
+    'd dls_fraction / d damping'. The variables have the requested names and order. The result of a
+    sample depends neither on other samples nor on `chunk`.
+
+    If `store` is given, the result is written there chunk by chunk. An interrupted scan continues
+    where it stopped and ends with bitwise the same data. A finished scan is only opened, but its
+    damaged chunks are computed again, with a warning.
+
+    `model` may be a `UnilateralWheel`, for which each sample walks to its gait. It may be "auto",
+    which gives each sample the simplest valid model and adds the variables `rung` and `reason`.
+    Both accept `friction` as a swept parameter.
 
     Args:
-        design: the samples, of `grid`, `samples`, `sobol`, `uniform` or `saltelli`.
-        measures: names of what is told; by default DLS fraction, speed and the like.
-        base: the wheel of what is not swept; Table 1 by default.
-        model: the rung; "auto" for each sample's lowest.
-        options: of the checking steps.
-        cycle_options: of the gaits.
-        store: folder to keep it in.
-        chunk: samples written at a time; 4,096 by default.
-        report: told the progress after each chunk.
-        dask: address of a cluster, or "local".
-        tol: error allowed of each measure, in its unit, towards a `model` of real ground: each
-            sample is answered by the lowest rung that can be shown to keep it (`vrw.answer`), and
-            `rung` and `speed_error` (of speed) stand beside the values.
+        design: the samples, from `grid`, `samples`, `sobol`, `uniform` or `saltelli`.
+        measures: names of the measures; by default DLS fraction, speed and the like.
+        base: the wheel whose parameters are not swept; Table 1 by default.
+        model: the model; "auto" for the simplest valid model of each sample.
+        options: numerical options of the steps that check the gaits.
+        cycle_options: numerical options of the gaits.
+        store: folder that holds the result.
+        chunk: number of samples that are written at a time; 4,096 by default.
+        on_progress: function that is called with the `ScanProgress` after each chunk.
+        dask: address of a dask cluster that computes the chunks, or "local" to start one.
+        tol: permitted error of each measure, in its unit, with respect to a `UnilateralWheel`. Each
+            sample is computed by the simplest model whose error bound permits it (see
+            `vrw.measure_to_tolerance`). The dataset holds `rung` and the errors, such as
+            `speed_error`.
 
     Returns:
-        A dataset over the design's axes.
+        A dataset over the axes of the design.
 
     Raises:
-        TypeError, ValueError: an argument that can't be meant, in one sentence.
-        StoreError: a store of other settings, or one that another process writes.
+        TypeError, ValueError: if an argument is invalid, or if the store holds another scan or is
+            locked by another process; the message names the remedy.
 
     Examples:
-        >>> found = vrw.scan(vrw.grid(damping=[150.0, 300.0]), ["speed"])
-        >>> found.speed.round(3).values.tolist(), found.outcome.values.tolist()
+        >>> gaits = vrw.scan(vrw.grid(damping=[150.0, 300.0]), ["speed"])
+        >>> gaits.speed.round(3).values.tolist(), gaits.outcome.values.tolist()
         ([1.018, nan], [0, 14])
     """
     planned = plan(
@@ -115,7 +118,7 @@ def scan(
 
 
 def carried(dask: str | None) -> contextlib.AbstractContextManager[Through | None]:
-    """The workers of a dask cluster; None where this process computes by itself."""
+    """Return the context of a dask cluster's workers, or of None if this process computes."""
     if dask is None:
         return contextlib.nullcontext()
     from vrw_jax.scans.dask import workers
@@ -130,7 +133,7 @@ def run(
     report: Report | None = None,
     through: Through | None = None,
 ) -> xr.Dataset:
-    """Carry out a plan, here or `through` others."""
+    """Return the dataset of a plan, computed in this process or by `executor`."""
     kept = store if isinstance(store, AbstractStore) else _kept(planned, store)
     missing = kept.missing()
     if missing or kept.damage:
@@ -140,6 +143,7 @@ def run(
 
 
 def _kept(planned: Plan, store: str | Path | None) -> AbstractStore:
+    """Return the storage of a scan; warn if some of its chunks are damaged."""
     if store is None:
         return MemoryStore(planned.layout, planned.attrs)
     kept = open_store(planned, Path(store))
@@ -155,6 +159,7 @@ def _compute(
     report: Report | None,
     through: Through,
 ) -> None:
+    """Compute the missing chunks and write them, with a report after each."""
     shapes = {index: planned.layout.shape_of(index) for index in missing}
     total, done, failed = sum(map(math.prod, shapes.values())), 0, 0
     if report is not None:
@@ -171,13 +176,14 @@ def _compute(
 
 
 def _in_turn(planned: Plan, missing: Sequence[int]) -> Iterator[Chunk]:
+    """Yield the missing chunks, computed one after another in this process."""
     engine = planned.engine()
     for index in missing:
         yield index, engine(planned.design.block(planned.layout.region(index)))
 
 
 def open_store(planned: Plan, path: Path) -> ZarrStore:
-    """The store at `path`, made now if nothing is there; refused if it holds another scan."""
+    """Return the store at `path`, created if there is none; raise if it holds another scan."""
     kept = found_store(planned, path)
     if kept is None:
         create(path, planned.layout, planned.attrs)
@@ -197,7 +203,7 @@ def open_store(planned: Plan, path: Path) -> ZarrStore:
 
 
 def found_store(planned: Plan, path: Path, verify: bool = True) -> ZarrStore | None:
-    """The store at `path`, None if nothing is there; refused if it holds another scan."""
+    """Return the store at `path`, or None if there is none; raise if it holds another scan."""
     there = stored_manifest(path)
     if there is None:
         return None
@@ -212,6 +218,7 @@ def found_store(planned: Plan, path: Path, verify: bool = True) -> ZarrStore | N
 
 @contextlib.contextmanager
 def _disk_full_explained(kept: AbstractStore, n_chunks: int) -> Iterator[None]:
+    """Replace the error of a full disk by one that names the number of complete chunks."""
     try:
         yield
     except OSError as error:

@@ -1,10 +1,10 @@
-"""Where a scan's results are kept: in memory, or in a Zarr store that survives being killed.
+"""Storage of a scan's results: in memory, or in a Zarr store that survives a killed process.
 
-A store is a Zarr group with one array per variable, cut into the scan's chunks, so that
-`xarray.open_zarr` reads it. It appears whole (built beside its place, then renamed). A chunk's data
-is written first and its mark after, a digest of what was written (`soundness`); every file is
-written beside its place and renamed, so whatever moment the process dies at, a chunk is either
-marked and complete or computed again.
+A store is a Zarr group with one array per variable, divided into the scan's chunks, so that
+`xarray.open_zarr` reads it. It is built in a temporary folder and then renamed. The data of a chunk
+is written before its mark, which is a digest of the data (see `integrity`). Every file is written
+under a temporary name and renamed. Whenever the process dies, a chunk is therefore either marked
+and complete, or it is computed again.
 """
 
 from __future__ import annotations
@@ -46,15 +46,17 @@ else:
     zarr = library("zarr")
 
 PROVENANCE, ASKED = "provenance", "asked"
+"""Names of the attributes that hold the origin of the numbers and the requested measures."""
 
 Region = tuple[slice, ...]
+"""Slices of a chunk along the axes of the samples."""
 Block = Mapping[str, np.ndarray]
-"""Results of one chunk by variable; the samples' axes first."""
+"""Results of one chunk by variable; the axes of the samples come first."""
 
 
 @dataclass(frozen=True)
 class Variable:
-    """One variable of the result. `dims` and `shape` are those beyond the samples' own."""
+    """Description of one variable; `dims` and `shape` leave out the axes of the samples."""
 
     name: str
     dtype: str
@@ -65,13 +67,13 @@ class Variable:
 
     @property
     def bytes_per_sample(self) -> int:
-        """Size of one sample's value."""
+        """Return the size of the value of one sample, in bytes."""
         return np.dtype(self.dtype).itemsize * math.prod(self.shape)
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Axes, chunks, variables and coordinates of a result."""
+    """Description of a result: its axes, chunks, variables and coordinates."""
 
     dims: tuple[str, ...]
     shape: tuple[int, ...]
@@ -81,13 +83,16 @@ class Layout:
 
     @property
     def n_chunks(self) -> int:
+        """Return the number of chunks."""
         return math.prod(self._counts)
 
     @property
     def _counts(self) -> tuple[int, ...]:
+        """Return the number of chunks along each axis."""
         return tuple(-(-n // c) for n, c in zip(self.shape, self.chunk, strict=True))
 
     def region(self, index: int) -> Region:
+        """Return the slices of a chunk along the axes of the samples."""
         places = np.unravel_index(index, self._counts)
         return tuple(
             slice(int(i) * c, min((int(i) + 1) * c, n))
@@ -95,16 +100,17 @@ class Layout:
         )
 
     def shape_of(self, index: int) -> tuple[int, ...]:
+        """Return the shape of a chunk, which is smaller at the end of an axis."""
         return tuple(part.stop - part.start for part in self.region(index))
 
     @property
     def bytes_per_sample(self) -> int:
-        """Size of one sample's results, uncompressed."""
+        """Return the size of the results of one sample, uncompressed, in bytes."""
         return sum(variable.bytes_per_sample for variable in self.variables)
 
 
 def chunk_shape(shape: tuple[int, ...], most: int) -> tuple[int, ...]:
-    """A box of at most `most` samples that is a slab of the array: the last axes are whole."""
+    """Return the shape of a slab of at most `max_samples` samples with whole last axes."""
     chunk, room = [1] * len(shape), most
     for axis in range(len(shape) - 1, -1, -1):
         chunk[axis] = min(shape[axis], max(room, 1))
@@ -115,30 +121,32 @@ def chunk_shape(shape: tuple[int, ...], most: int) -> tuple[int, ...]:
 
 
 class AbstractStore(abc.ABC):
-    """Takes chunks, tells which are missing, gives the labelled whole."""
+    """Storage that accepts chunks, lists the missing ones and returns the labelled result."""
 
     place: str = "memory"
     damage: str = ""
-    """What is damaged, in words; empty where nothing is."""
+    """Description of the damage; an empty string if there is none."""
 
     @abc.abstractmethod
     def missing(self) -> list[int]:
-        """Chunks still to compute, in order."""
+        """Return the chunks that are still to be computed, in ascending order."""
 
     @abc.abstractmethod
     def write(self, index: int, block: Block) -> None:
-        """Keep a chunk's results; when this returns the chunk is done."""
+        """Write the results of a chunk and mark it as done."""
 
     @abc.abstractmethod
     def dataset(self) -> xr.Dataset:
-        """The labelled whole."""
+        """Return the labelled result."""
 
     @abc.abstractmethod
     def at_work(self) -> contextlib.AbstractContextManager[None]:
-        """Around all writing: clears away what was left unfinished, lets no other work here."""
+        """Return the context of all writing, which removes unfinished files and holds the lock."""
 
 
 class MemoryStore(AbstractStore):
+    """Storage of a scan's results in memory."""
+
     def __init__(self, layout: Layout, attrs: Mapping[str, object]) -> None:
         self._layout, self._attrs = layout, attrs
         self._done = np.zeros(layout.n_chunks, bool)
@@ -183,7 +191,7 @@ class MemoryStore(AbstractStore):
 
 
 class ZarrStore(AbstractStore):
-    """Results in a folder, chunk by chunk. `verify`: look for damage, to be computed again."""
+    """Storage of a scan's results in a folder; `verify` finds damaged chunks."""
 
     def __init__(self, path: Path, layout: Layout, verify: bool = True) -> None:
         self._path, self._layout, self.place = path, layout, str(path)
@@ -220,34 +228,35 @@ class ZarrStore(AbstractStore):
 
 
 def _array(group: zarr.Group, name: str) -> zarr.Array:
+    """Return the array `name` of a Zarr group."""
     array = group[name]
     assert isinstance(array, zarr.Array)
     return array
 
 
 def open_scan(path: str | Path, *, verify: bool = True) -> xr.Dataset:
-    """The labelled result of a scan, finished or not; values are read when they are used.
+    """Return the labelled result of a scan, finished or not; values are read when they are used.
 
-    Where a scan isn't finished, samples not computed yet have the outcome -1 and NaN elsewhere. A
-    store with damaged files is refused; `verify=False` opens it to read what can be read.
+    In an unfinished scan, samples that are not yet computed have the outcome -1 and the measures
+    NaN. A store with damaged files is refused; `verify=False` opens it without that check.
 
     Args:
-        path: the store's folder.
-        verify: whether each chunk's files are compared with their digest.
+        path: folder of the store.
+        verify: whether the files of each chunk are compared with their digest.
 
     Returns:
         The dataset that `scan` returns.
 
     Raises:
-        FileNotFoundError: no store there.
-        StoreError: a store with damaged files.
+        TypeError: if `path` is not a path.
+        ValueError: if there is no store of a scan at `path`, or if its files are damaged.
 
     Examples:
         >>> design = vrw.grid(damping=[150.0, 300.0])
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     path = f"{folder}/scan.zarr"
-        ...     found = vrw.scan(design, ["speed"], store=path).load()
-        ...     xr.testing.assert_identical(vrw.open_scan(path).speed.load(), found.speed)
+        ...     gaits = vrw.scan(design, ["speed"], store=path).load()
+        ...     xr.testing.assert_identical(vrw.open_scan(path).speed.load(), gaits.speed)
     """
     instance("path", path, (str, Path), "give the folder that a scan wrote")
     group = _require_scan(Path(path))
@@ -270,9 +279,9 @@ def open_scan(path: str | Path, *, verify: bool = True) -> xr.Dataset:
 
 
 def _as_asked(dataset: xr.Dataset) -> xr.Dataset:
-    """Variables in the order and by the names that they were asked for, then the others.
+    """Return the dataset with the requested variables first, in their order and by their names.
 
-    A file can't hold the name "d speed / d damping", so that in a store its array has another.
+    A file name cannot be "d speed / d damping", so in a store the array of it has another name.
     """
     asked = dataset.attrs.get(ASKED)
     names = str(asked).split(", ") if asked else manifest_of(dataset.attrs).get("measures", [])
@@ -283,9 +292,10 @@ def _as_asked(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def _told_apart(dataset: xr.Dataset) -> xr.Dataset:
-    """Stores of version 0.1 told two quantities as `stability_margin`, by rung: each by its name.
+    """Return the dataset of a store of version 0.1 with its two stability margins named apart.
 
-    It was the smooth Jury margin of the paper's wheel, and 1 - spectral radius on real ground.
+    The name `stability_margin` meant the smooth Jury margin for the paper's wheel, and 1 - spectral
+    radius with unilateral contact.
     """
     old = dataset.get("stability_margin")
     if old is None or old.attrs.get("symbol") != MEASURES["spectral_margin"].symbol:
@@ -303,6 +313,7 @@ def _told_apart(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def _require_scan(path: Path) -> zarr.Group:
+    """Return the Zarr group of the scan at `path`; raise if there is none."""
     try:
         group = zarr.open_group(path, mode="r", zarr_format=3)
         attrs = dict(group.attrs)
@@ -318,7 +329,7 @@ def _require_scan(path: Path) -> zarr.Group:
 
 
 def stored_manifest(path: Path) -> dict | None:
-    """Settings and provenance of the store at `path`; None where nothing is."""
+    """Return the settings and provenance of the store at `path`, or None if there is no store."""
     if not path.exists() or (path.is_dir() and not any(path.iterdir())):
         return None
     attrs = dict(_require_scan(path).attrs)
@@ -328,7 +339,7 @@ def stored_manifest(path: Path) -> dict | None:
 
 
 def first_difference(there: object, here: object, name: str = "") -> tuple[str, object, object]:
-    """Name and values of the first setting that differs; ("", ...) where none does."""
+    """Return the name and both values of the first setting that differs, or ("", None, None)."""
     if isinstance(there, dict) and isinstance(here, dict):
         for key in [*there, *(k for k in here if k not in there)]:
             below = first_difference(
@@ -341,7 +352,7 @@ def first_difference(there: object, here: object, name: str = "") -> tuple[str, 
 
 
 def create(path: Path, layout: Layout, attrs: Mapping[str, object]) -> None:
-    """Make an empty store at `path`, at once or not at all; there may be one in the meantime."""
+    """Create an empty store at `path` atomically; keep a store that appears in the meantime."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         building = path.parent / f".{path.name}.{os.urandom(8).hex()}"
@@ -361,12 +372,13 @@ def create(path: Path, layout: Layout, attrs: Mapping[str, object]) -> None:
 
 
 def _fill(path: Path, layout: Layout, attrs: Mapping[str, object]) -> None:
+    """Create the Zarr group at `path` with its coordinates, empty variables and marks."""
     from zarr.codecs import Crc32cCodec, ZstdCodec
 
-    # The attribute tells xarray which arrays are coordinates; it takes it off again when it opens.
+    # xarray reads from this attribute which arrays are coordinates, and removes it on opening.
     told = {**attrs, "coordinates": " ".join(layout.coordinates)}
     group = zarr.create_group(path, zarr_format=3, attributes=told)
-    compressors = [ZstdCodec(level=3), Crc32cCodec()]  # a damaged file is noticed when read
+    compressors = [ZstdCodec(level=3), Crc32cCodec()]  # the checksum reveals damage
     for name, (dim, values, coordinate_attrs) in layout.coordinates.items():
         array = group.create_array(
             name,
@@ -397,7 +409,7 @@ def _fill(path: Path, layout: Layout, attrs: Mapping[str, object]) -> None:
 
 
 def _consolidate(path: Path, names: list[str]) -> None:
-    """All metadata in one file, in this order: zarr's own way sorts by name, and warns."""
+    """Write all metadata into one file in the given order; zarr's own function sorts and warns."""
     place = path / "zarr.json"
     told = json.loads(place.read_text())
     parts = {name: json.loads((path / name / "zarr.json").read_text()) for name in names}
