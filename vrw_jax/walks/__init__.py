@@ -1,4 +1,4 @@
-"""What repeats: steps, walks, trajectories, and what they settle on."""
+"""Steps, walks, trajectories, and the attractors that walks reach."""
 
 from vrw_jax.walks.basins import BEFORE, basin
 from vrw_jax.walks.stepping import (

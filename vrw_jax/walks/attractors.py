@@ -1,7 +1,7 @@
-"""What attracts: many starts walked until each repeats itself or falls.
+"""Attractors: many starts, each walked until its motion is periodic or the wheel falls.
 
-Starts may belong to different wheels. Those still undecided after a round are packed together for
-the next one, so that long transients cost little.
+Starts may belong to different wheels. Starts without a result after a round are packed together
+for the next round, so that long transients cost little.
 """
 
 import functools
@@ -26,34 +26,35 @@ from vrw_jax.walks.stepping import walk
 from vrw_jax.wheel import Outcome, WheelParams
 
 ROUND = 10
-"""Steps between two looks at who has settled."""
+"""Number of steps between two tests for periodic motion."""
 
 BLOCK = 128
-"""Starts walked side by side: one shape, compiled once."""
+"""Number of starts per compiled call; one shape is compiled once."""
 
 REPEATS = 1e-7
-"""Most by which a settled walk may miss its own section states one period ago."""
+"""Largest change of the section states over one period in periodic motion."""
 
 ARRIVED = 1e-3
-"""Distance from its orbit below which a walk counts as having got there."""
+"""Distance from its orbit below which a walk has reached the orbit."""
 
 SAME = 1e-4
-"""Distance below which two orbits are one."""
+"""Distance below which two orbits are the same."""
 
 
 class Settled(NamedTuple):
-    """How each start ended; numpy arrays with a leading axis over starts."""
+    """Ends of walks, as numpy arrays with a leading axis over starts."""
 
-    outcome: np.ndarray  # STEPPED where it still walked
-    period: np.ndarray  # of the orbit that it settled on, in steps; 0 where it did not settle
-    steps: np.ndarray  # until it was at its orbit, or fell
-    orbit: np.ndarray  # (start, longest period, m): section states, lowest dtheta- first, then NaN
+    outcome: np.ndarray  # STEPPED if it still walks
+    period: np.ndarray  # of its orbit, in steps; 0 if the motion is not periodic
+    steps: np.ndarray  # until it reached its orbit, or fell
+    orbit: np.ndarray  # (start, max_period, m): section states, lowest dtheta- first, then NaN
 
 
 @eqx.filter_jit
 def _walk_block(
     model: AbstractWheel, options: Options, params: WheelParams, x: Array
 ) -> tuple[Array, Array]:
+    """Return section states and outcomes of one round of steps from a block of starts."""
     one = lambda params, x: walk(params, x, ROUND, model=model, options=options)
     walks = jax.vmap(one)(params, x)
     return walks.steps.section_state, walks.steps.outcome
@@ -62,13 +63,13 @@ def _walk_block(
 def _by_lanes(
     model: Any, options: Options, params: WheelParams, x: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The same on real ground, any number of wheels at once."""
+    """Return the same for unilateral contact and any number of wheels, by the batch kernel."""
     n, columns = params.n_legs, np.asarray(jax.vmap(model.values)(params)).T
     x = as_full_states(columns, np.asarray(x), n)
     states, codes = list[np.ndarray](), list[np.ndarray]()
     for _ in range(ROUND):
         x, _, outcome, *_ = walk_lanes(columns, x, 1, model, options, n)
-        # A wheel that fell is at no section state: its code stays.
+        # A wheel that fell has no section state, so its outcome is kept.
         outcome = outcome if not codes else np.where(codes[-1] > 0, codes[-1], outcome)
         states.append(x)
         codes.append(outcome)
@@ -76,7 +77,7 @@ def _by_lanes(
 
 
 WALKS: dict[str, Callable[..., tuple]] = {"unilateral": _by_lanes}
-"""Rounds of many starts by rung, where it is not by blocks of the rung's own steps."""
+"""Functions that walk one round of many starts, for models that do not walk it by blocks."""
 
 
 def settle(
@@ -87,7 +88,7 @@ def settle(
     most_steps: int,
     longest_period: int,
 ) -> Settled:
-    """Walk every start; `params` are those of one wheel or have the starts' leading axis."""
+    """Return how each walk ends; `params` is one wheel or has the leading axis of the starts."""
     n = len(starts)
     fill = lambda x: np.broadcast_to(np.asarray(x), n)
     wheels = jax.tree.map(fill, params)
@@ -123,7 +124,7 @@ def settle(
 
 
 def _periods(history: np.ndarray, longest: int) -> np.ndarray:
-    """The shortest period of the last states, over as many steps as two of it; 0 for none."""
+    """Return the shortest period, in steps, that the last two periods confirm, or 0."""
     found = np.zeros(len(history), int)
     last = history.shape[1]
     for p in range(min(longest, (last - 1) // 3), 0, -1):
@@ -133,14 +134,14 @@ def _periods(history: np.ndarray, longest: int) -> np.ndarray:
 
 
 class Attractors(NamedTuple):
-    """The different orbits among many starts, the one with most starts first."""
+    """Distinct orbits of many starts, ordered by decreasing number of starts."""
 
-    of_start: np.ndarray  # index of each start's orbit; -1 where it did not settle
+    of_start: np.ndarray  # index of the orbit of each start; -1 without an orbit
     orbits: list[np.ndarray]  # (period, m) each
 
 
 def distinct(settled: Settled) -> Attractors:
-    """Orbits told apart, whatever the step at which they were entered."""
+    """Return the distinct orbits, compared without regard to their first step."""
     index = np.full(len(settled.period), -1)
     orbits: list[np.ndarray] = []
     for i in np.flatnonzero(settled.period):
@@ -163,13 +164,14 @@ def distinct(settled: Settled) -> Attractors:
 def _measure_block(
     model: AbstractWheel, options: Options, params: WheelParams, x: Array
 ) -> dict[str, Array]:
+    """Return all measures of one step from each start of a block."""
     return jax.vmap(lambda p, x: model.step(p, x, options).measures())(params, x)
 
 
 def orbit_measures(
     params: WheelParams, states: np.ndarray, model: AbstractWheel, options: Options
 ) -> dict[str, np.ndarray]:
-    """All measures of the step from each of `states` (n, m); `params` as in `settle`."""
+    """Return all measures of one step from each of `states`, shape (n, m)."""
     n = len(states)
     wheels = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), n), params)
     if model.rung in WALKS:

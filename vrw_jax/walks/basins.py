@@ -1,4 +1,4 @@
-"""Which starts end on which gait, and how the others fail: basins of attraction on a grid."""
+"""Basins of attraction: the gait that each start of a grid reaches, or how it fails."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from vrw_jax.wheel import Outcome, WheelParams, transitions
 from vrw_jax.wording import instance, reals, untraced, whole
 
 BEFORE = ("theta_touchdown", "dtheta_touchdown", "dL1_touchdown")
-"""The section state just before the first touchdown: rad, rad/s, m/s."""
+"""Names of the components of a section state just before touchdown, in rad, rad/s, m/s."""
 
 AFTER = ("theta_post_impact", "dtheta_post_impact")
-"""The state just after the first landing with both feet on the ground: rad, rad/s."""
+"""Names of the components of a state just after a landing on both feet, in rad, rad/s."""
 
 Grid = Mapping[str, float | Sequence[float] | np.ndarray]
-"""Values of each of `BEFORE`, or of each of `AFTER`; a single number is not an axis."""
+"""Values of each component of a start, by name; a single number is not an axis."""
 
 NONE = -1
-"""Index of no attractor."""
+"""Index of a start that reaches no attractor."""
 
 
 def basin(
@@ -41,40 +41,42 @@ def basin(
     most_steps: int = 200,
     longest_period: int = 16,
 ) -> xr.Dataset:
-    """Where a walk from each start of `grid` ends.
+    """Return where a walk from each start of `grid` ends, as a labelled dataset.
 
-    `grid` names all of `BEFORE`, such as {"theta_touchdown": 0.09, "dtheta_touchdown": np.linspace(
-    1.0, 2.5, 60), "dL1_touchdown": np.linspace(-0.5, 0.2, 60)}, or all of `AFTER`; those with
-    several values are the axes of the result, in this order. Each start is told by
+    `grid` names all components of a start before touchdown, such as {"theta_touchdown": 0.09,
+    "dtheta_touchdown": np.linspace(1.0, 2.5, 60), "dL1_touchdown": np.linspace(-0.5, 0.2, 60)}, or
+    all of "theta_post_impact" and "dtheta_post_impact". Components with several values are the axes
+    of the result, in this order. The variables over these axes are
 
-    - `attractor`: index of the orbit that it settles on within `most_steps`, -1 for none;
-    - `outcome`: STEPPED, or how it fell; BAD_INPUT where no landing leads to a state of `AFTER`;
-    - `steps`: steps until it is within 1e-3 of the orbit for good, or until it fell.
+    - `attractor`: index of the orbit that the walk reaches within `max_steps`, or -1;
+    - `outcome`: STEPPED, or how the wheel fell; BAD_INPUT if no landing leads to the start;
+    - `steps`: number of steps until the walk stays within 1e-3 of the orbit, or until the fall.
 
-    The orbits stand in `orbit_state` over (attractor_index, orbit_step), the one with most starts
-    first, with their `orbit_period` in steps, DLS fraction and, on the paper's rung, least margins.
-    On real ground section states are full ones; "auto" is real ground, which serves all starts.
+    The orbits are in `orbit_state` over (attractor_index, orbit_step), ordered by decreasing number
+    of starts. Each has an `orbit_period` in steps, a DLS fraction and, for the paper's model, its
+    least margins. With unilateral contact, section states are full states. "auto" means unilateral
+    contact, which is valid for all starts.
 
     Args:
         params: the wheel.
-        grid: a value or values for each of three coordinates of a start, by name.
-        model: the rung; the paper's, `ViscoelasticWheel()`, by default.
-        options: numerical choices of the steps.
-        engine: who takes the steps, see `Options`.
-        most_steps: that a walk may take.
-        longest_period: of an orbit that is recognised, steps.
+        grid: one or more values of each component of a start, by name.
+        model: the model; by default that of the paper, `ViscoelasticWheel()`.
+        options: numerical options of the steps.
+        engine: engine that computes the steps; see `StepOptions`.
+        max_steps: largest number of steps of a walk.
+        max_period: longest period, in steps, that is recognized.
 
     Returns:
         A dataset over the axes of `grid`.
 
     Raises:
-        TypeError, ValueError: an argument that can't be meant, in one sentence.
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
 
     Examples:
         >>> starts = {"theta_touchdown": 0.09, "dtheta_touchdown": [1.4, 1.6]}
         >>> starts |= {"dL1_touchdown": -0.1}
-        >>> found = vrw.basin(vrw.WheelParams(damping=150.0), starts)
-        >>> found.attractor.values.tolist()
+        >>> basins = vrw.basin(vrw.WheelParams(damping=150.0), starts)
+        >>> basins.attractor.values.tolist()
         [0, 0]
     """
     model, options = _checked(params, model, options)
@@ -119,6 +121,7 @@ def basin(
 
 
 def _label(name: str, values: np.ndarray, is_axis: bool) -> xr.Variable:
+    """Return the coordinate of a component of the starts."""
     dims, told = (name, values) if is_axis else ((), values[0])
     return xr.Variable(dims, told, dict(MEASURES[name].attrs))
 
@@ -126,14 +129,16 @@ def _label(name: str, values: np.ndarray, is_axis: bool) -> xr.Variable:
 def _checked(
     params: WheelParams, model: ModelLike | None, options: Options | None
 ) -> tuple[AbstractWheel, Options]:
+    """Return model and options with their defaults; raise if an argument is invalid."""
     untraced("vrw.basin", "map vrw.walk over the starts", params, options)
     one_wheel(params, "ask for one basin after the other")
-    rung, options = rung_of(model).upper, options_of(options)  # starts may lie anywhere
+    rung, options = rung_of(model).upper, options_of(options)  # valid for any start
     options.require_reachable(np.dtype(params.damping.dtype))
     return rung, options
 
 
 def _values(grid: Grid) -> dict[str, np.ndarray]:
+    """Return the values of each component as an array of one axis; raise for other shapes."""
     values = {name: np.asarray(reals(name, grid[name]), float) for name in _names(grid)}
     for name, value in values.items():
         if value.ndim > 1 or not value.size:
@@ -145,6 +150,7 @@ def _values(grid: Grid) -> dict[str, np.ndarray]:
 
 
 def _names(grid: Grid) -> tuple[str, ...]:
+    """Return the names of the components; raise unless the grid names all of one kind."""
     instance("grid", grid, Mapping, "write {'theta_touchdown': 0.09, 'dtheta_touchdown': ...}")
     for names in (BEFORE, AFTER):
         if set(grid) == set(names):
@@ -156,9 +162,9 @@ def _names(grid: Grid) -> tuple[str, ...]:
 
 
 def _before_landing(params: WheelParams, places: np.ndarray) -> np.ndarray:
-    """Section states with dL1- = 0 whose landing leads to (theta+, dtheta+); NaN where none does.
+    """Return section states with dL1- = 0 whose landing leads to (theta+, dtheta+), or NaN.
 
-    The rate after the landing is proportional to that before.
+    The angular rate after the landing is proportional to that before the landing.
     """
     s = params.symbols()
 
@@ -179,6 +185,7 @@ def _orbits(
     model: AbstractWheel,
     options: Options,
 ) -> dict[str, xr.Variable]:
+    """Return states, periods, DLS fractions and least margins of the orbits."""
     n = len(orbits)
     states = np.full((n, longest, model.section_size(params)), np.nan)
     margins = MARGINS if model.section_size(params) == 3 else ()
@@ -211,7 +218,7 @@ def _orbits(
 
 
 def share(result: xr.Dataset) -> dict[str, float]:
-    """Share of starts by how they ended: "attractor 0", ..., or the name of the outcome."""
+    """Return the share of starts by end: "attractor 0", ..., or the name of the outcome."""
     told = result.attractor.values.ravel()
     codes = result.outcome.values.ravel()
     names = [

@@ -1,6 +1,6 @@
-"""What repeats: one step, the return map, a walk of many steps.
+"""Single steps, the return map, and walks of many steps.
 
-Everything here is pure and single-wheel, and works under `jit`, `vmap` and every mode of
+All functions are pure, take a single wheel, and work with `jit`, `vmap` and every mode of
 differentiation. A model compiles its own step once.
 """
 
@@ -34,16 +34,16 @@ from vrw_jax.wheel import Outcome, WheelParams
 from vrw_jax.wording import AbstractTold, Row, counted, instance, listed, reals, told, whole
 
 SectionLike = Array | np.ndarray | Sequence[float]
-"""A section state as given by a caller; `checked` makes it an array of shape (3,)."""
+"""Section state as a caller gives it; `validate_arguments` converts it to an array."""
 ModelLike = AbstractWheel | Literal["auto"]
-"""A rung as given by a caller; "auto" is `LadderWheel()`, the lowest rung that serves."""
+"""Model as a caller gives it; "auto" is `LadderWheel()`, the simplest valid model."""
 
 
 def paper_start() -> SectionState:
-    """A section state (theta-, dtheta-, dL1-) inside the basin of the gait of Table 1.
+    """Return a section state (theta-, dtheta-, dL1-) in the basin of the gait of Table 1.
 
     Returns:
-        Shape (3,), rad, rad/s, m/s.
+        The section state, shape (3,), in rad, rad/s, m/s.
 
     Examples:
         >>> vrw.paper_start().round(4).tolist()
@@ -53,9 +53,9 @@ def paper_start() -> SectionState:
 
 
 def rung_of(model: ModelLike | None, many: bool = False) -> AbstractWheel:
-    """The rung that a caller names: the paper's by default, the lowest that serves for "auto".
+    """Return the model of an argument: by default the paper's, for "auto" a `LadderWheel`.
 
-    Its ground is one, unless there may be `many`: of lanes, or of steps.
+    Raise if the argument is no model, or if its friction is an array although that is not allowed.
     """
     if model is None:
         return _paper_wheel()
@@ -79,12 +79,13 @@ _paper_wheel = functools.cache(ViscoelasticWheel)
 
 
 def one_wheel(params: Any, instead: str) -> None:
-    """Refuse what is no wheel, or more than one."""
+    """Raise unless `params` is a single wheel; `remedy` completes the message."""
     instance("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
-    WheelParams.require_one(params, instead)  # a bound method takes equinox as long as a step
+    WheelParams.require_one(params, instead)  # binding it takes as long as a step
 
 
 def options_of(options: Options | None) -> Options:
+    """Return the options, by default `StepOptions()`; raise if they are of another type."""
     if options is not None:
         instance("options", options, Options, "give vrw.Options(), or vrw.Options.tight()")
     return _usual(jnp.result_type(float)) if options is None else options
@@ -92,13 +93,13 @@ def options_of(options: Options | None) -> Options:
 
 @functools.cache
 def _usual(dtype: np.dtype) -> Options:
-    """Made once for each of JAX's default types; numbers, whatever is being traced."""
+    """Return the default options, made once per type and concrete even under a trace."""
     with jax.ensure_compile_time_eval():
         return Options()
 
 
 def state_of(x: Any, what: str = "the section state", read: Callable = reals) -> Any:
-    """`read` it: by `reals`, or by `known_reals`."""
+    """Return the section state that `converter` makes of an argument; raise if it is invalid."""
     return read(
         what,
         x,
@@ -114,7 +115,7 @@ def checked(
     options: Options | None,
     engine: Engine = "auto",
 ) -> tuple[WheelParams, Array, AbstractWheel, Options]:
-    """Arguments with their defaults; one clear sentence for what can be seen to be wrong."""
+    """Return wheel, section state, model and options of one type; raise if one is invalid."""
     one_wheel(params, "map over batches of parameters with jax.vmap, or use vrw.scan")
     model, options = rung_of(model), Options.by(options_of(options), engine)
     state = state_of(x)
@@ -127,12 +128,13 @@ def checked(
             f"(3,){'' if size == 3 else f', or this rung’s own of shape ({size},)'}: "
             "for batches map over it with jax.vmap."
         )
-    # Numbers made before 64 bits were asked for stay coarse, whatever they are mixed with.
+    # Parameters made in single precision stay inaccurate after a conversion to double precision.
     Options.require_reachable(options, jnp.result_type(*jax.tree.leaves(params)))
     dtype = jnp.result_type(state, params.damping)
     Options.require_reachable(options, dtype)
 
     def convert(tree: Any) -> Any:
+        """Return the tree with all leaves of the common type."""
         if all(leaf.dtype == dtype for leaf in jax.tree.leaves(tree)):
             return tree
         return jax.tree.map(lambda leaf: leaf.astype(dtype), tree)
@@ -181,25 +183,25 @@ def step(
     options: Options | None = None,
     engine: Engine = "auto",
 ) -> StepResult | UnilateralStep | LadderStep:
-    """One step from touchdown to touchdown, with indicators, monitors and energies.
+    """Return one step from touchdown to touchdown, with indicators, margins and energies.
 
-    `x` is (theta-, dtheta-, dL1-) just before touchdown, in rad, rad/s, m/s. How the step ended is
-    its `outcome`; nothing is raised for a wheel that falls. Errors: below 1e-9 at the default
-    options and 1e-12 at `Options.tight()`, for values and first derivatives.
+    The `outcome` of the result describes how the step ended; a fall raises no error. Errors of
+    values and first derivatives are below 1e-9 at the default options and below 1e-12 at
+    `StepOptions.tight()`.
 
     Args:
         params: the wheel.
-        x: section state (theta-, dtheta-, dL1-) just before touchdown, rad, rad/s, m/s.
-        model: the rung; the paper's, `ViscoelasticWheel()`, by default, "auto" for the lowest that
-            serves.
-        options: numerical choices of the steps.
-        engine: who takes the steps, see `Options`.
+        x: section state (theta-, dtheta-, dL1-) just before touchdown, in rad, rad/s, m/s.
+        model: the model; by default that of the paper, `ViscoelasticWheel()`. "auto" chooses the
+            simplest valid model.
+        options: numerical options of the steps.
+        engine: engine that computes the steps; see `StepOptions`.
 
     Returns:
-        A `StepResult`; a `UnilateralStep` on real ground, a `LadderStep` for "auto".
+        A `StepResult`; a `UnilateralStep` with unilateral contact, or a `LadderStep` for "auto".
 
     Raises:
-        TypeError, ValueError: an argument that can't be meant, in one sentence.
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
 
     Examples:
         >>> step = vrw.step(vrw.WheelParams(damping=150.0), vrw.paper_start())
@@ -218,23 +220,23 @@ def return_map(
     options: Options | None = None,
     engine: Engine = "auto",
 ) -> Array:
-    """The section state one step later; all zeros (no section state) where the step failed.
+    """Return the section state one step later; all zeros (no section state) if the step failed.
 
-    The lean path: no monitors are computed. Differentiable forwards and in reverse, to any order.
+    No margins are computed. The map is differentiable in forward and reverse mode, to any order.
 
     Args:
         params: the wheel.
-        x: section state (theta-, dtheta-, dL1-) just before touchdown, rad, rad/s, m/s.
-        model: the rung; the paper's, `ViscoelasticWheel()`, by default, "auto" for the lowest that
-            serves.
-        options: numerical choices of the steps.
-        engine: who takes the steps, see `Options`.
+        x: section state (theta-, dtheta-, dL1-) just before touchdown, in rad, rad/s, m/s.
+        model: the model; by default that of the paper, `ViscoelasticWheel()`. "auto" chooses the
+            simplest valid model.
+        options: numerical options of the steps.
+        engine: engine that computes the steps; see `StepOptions`.
 
     Returns:
-        Shape of `x`.
+        The section state just before the next touchdown, of the shape of `x`.
 
     Raises:
-        TypeError, ValueError: an argument that can't be meant, in one sentence.
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
 
     Examples:
         >>> params, x = vrw.WheelParams(damping=150.0), vrw.paper_start()
@@ -248,11 +250,11 @@ def return_map(
 
 
 class Walk(AbstractTold):
-    """Lean results of consecutive steps, with a leading axis over steps.
+    """Results of consecutive steps without margins, with a leading axis over steps.
 
-    - `start`: the section state that it began with;
+    - `start`: section state at the start;
     - `steps`: section state, durations and outcome of each step;
-    - `n_stepped`: steps before the first that failed.
+    - `n_stepped`: number of steps before the first failure.
 
     Examples:
         >>> walk = vrw.walk(vrw.WheelParams(damping=150.0), vrw.paper_start(), 5)
@@ -266,13 +268,14 @@ class Walk(AbstractTold):
 
     @property
     def outcome(self) -> Array:
-        """Outcome of the whole walk: of its first failing step, or STEPPED."""
+        """Return the outcome of the walk: that of the first failed step, or STEPPED."""
         last = self.steps.outcome.shape[-1] - 1
         return jnp.take_along_axis(
             self.steps.outcome, jnp.minimum(self.n_stepped, last)[..., None], axis=-1
         )[..., 0]
 
     def rows(self) -> list[Row]:
+        """Return names and texts of outcome, steps, start, last state and time."""
         outcome = np.asarray(self.outcome)
         if outcome.ndim:
             return [("walks", counted(outcome, Outcome))]
@@ -295,7 +298,10 @@ def _walk(
     n_steps: int,
     over_steps: GroundOfStep | None,
 ) -> Walk:
+    """Return a walk of `n_steps` steps; the steps after a failure repeat its outcome."""
+
     def one(carry: tuple, ground: GroundOfStep | None) -> tuple:
+        """Return the next carry and one step, which is not taken after a failure."""
         x, outcome = carry
         walking = outcome == Outcome.STEPPED
         here = (model, params) if ground is None else model.on_ground(params, ground)
@@ -324,27 +330,28 @@ def walk(
     options: Options | None = None,
     engine: Engine = "auto",
 ) -> Walk:
-    """`n_steps` steps, or as many as it can; the steps after a failure repeat its outcome.
+    """Return a walk of `n_steps` steps; the steps after a failure repeat its outcome.
 
-    On real ground `params.slope` and the model's friction may be arrays over steps, of a floor
-    whose footholds are joined by lines of these slopes: the k-th ends where the k-th step begins by
-    a landing. Each foot keeps the friction of its own landing; forces are along and off the line
-    that the last landing ended. A section state is told off the line that ends in its landing.
+    With unilateral contact, `params.slope` and the friction of the model may be arrays over steps,
+    which describe uneven ground. Lines of these slopes connect the footholds: the k-th line ends
+    where the k-th step begins with a landing. Each foot has the friction of its own landing. Forces
+    are along and normal to the line that ends at the last landing. A section state refers to the
+    line that ends at its landing.
 
     Args:
         params: the wheel.
-        x: section state (theta-, dtheta-, dL1-) just before touchdown, rad, rad/s, m/s.
-        n_steps: at most so many.
-        model: the rung; the paper's, `ViscoelasticWheel()`, by default, "auto" for the lowest that
-            serves.
-        options: numerical choices of the steps.
-        engine: who takes the steps, see `Options`.
+        x: section state (theta-, dtheta-, dL1-) just before touchdown, in rad, rad/s, m/s.
+        n_steps: largest number of steps.
+        model: the model; by default that of the paper, `ViscoelasticWheel()`. "auto" chooses the
+            simplest valid model.
+        options: numerical options of the steps.
+        engine: engine that computes the steps; see `StepOptions`.
 
     Returns:
-        A `Walk`, whose fields have a leading axis over the steps.
+        A `Walk` whose fields have a leading axis over the steps.
 
     Raises:
-        TypeError, ValueError: an argument that can't be meant, in one sentence.
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
 
     Examples:
         >>> walk = vrw.walk(vrw.WheelParams(damping=150.0), vrw.paper_start(), 5)
@@ -362,11 +369,11 @@ def walk(
 
 
 N_TOWARDS = 100
-"""Steps towards a gait, from the rung's start, where its search needs a place nearby."""
+"""Number of steps toward a gait, for a search that needs a state near the gait."""
 
 
 def walk_towards(model: AbstractWheel, params: WheelParams, options: Options) -> Walk:
-    """Towards a gait that attracts, from the rung's own start."""
+    """Return a walk toward an attracting gait from the default start of the model."""
     return walk(params, model.start(params), N_TOWARDS, model=model, options=options)
 
 
@@ -377,22 +384,22 @@ def choose_model(
     friction: float | Array = 0.7,
     options: Options | None = None,
 ) -> ModelChoice:
-    """The lowest rung whose premises hold over one step from `start`, on ground of `friction`.
+    """Return the simplest model whose margins hold over one step from `start`.
 
-    `start` is the paper's section state (theta-, dtheta-, dL1-) or the full one of the unilateral
-    rung. Maps over lanes by `jax.vmap`.
+    `start` is the section state (theta-, dtheta-, dL1-) of the paper's model, or the full one of
+    `UnilateralWheel`. The function can be mapped over batches with `jax.vmap`.
 
     Args:
         params: the wheel.
-        start: section state, shape (3,), or the ground's own.
-        friction: coefficient of the ground.
-        options: numerical choices of the steps.
+        start: section state, shape (3,), or a full state of `UnilateralWheel`.
+        friction: friction coefficient of the ground.
+        options: numerical options of the steps.
 
     Returns:
-        A `ModelChoice`: `rung`, `why`, and the `model` to go on with.
+        A `ModelChoice` with the chosen `model` and the reason.
 
     Raises:
-        TypeError, ValueError: an argument that can't be meant, in one sentence.
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
 
     Examples:
         >>> choice = vrw.choose_model(vrw.WheelParams(), vrw.paper_start(), friction=0.7)

@@ -1,7 +1,7 @@
-"""A walk as a labelled trajectory: motion, forces, energy and points, with units and origin.
+"""A walk as a labelled trajectory: motion, forces, energy and points, with units and provenance.
 
-The slope's frame: x downhill along the slope, z normal to it; the first foot stands at the origin.
-Angles and leg labels are those of the present step, so theta and the lengths jump at a landing.
+Frame: x downhill along the slope, z normal to it, with the first foot at the origin. Angles and leg
+labels refer to the present step, so theta and the lengths jump at a landing.
 """
 
 from __future__ import annotations
@@ -55,30 +55,31 @@ def simulate(
     engine: Engine = "auto",
     n_samples: int = 100,
 ) -> xr.Dataset:
-    """Walk `n_steps` steps from the section state `x`, as a labelled trajectory over time.
+    """Return a walk from the section state `x` as a labelled trajectory over time.
 
-    Without `x` the walk begins at the rung's own start, near the gait of Table 1.
+    By default the walk starts at the default start of the model, near the gait of Table 1.
 
-    Each phase has `n_samples` equal times, both ends included: an instant at which something jumps
-    stands there twice, just before and just after it. A step that fails ends the trajectory at the
-    event; the attributes `outcome` and `outcome_meaning` say why. Errors as in `vrw.step`.
+    Each phase has `n_samples` equidistant times, including both ends. A time at which a quantity
+    jumps is therefore listed twice, with the values before and after the jump. A failed step ends
+    the trajectory at the event, and the attributes `outcome` and `outcome_meaning` give the cause.
+    Errors are those of `vrw.step`.
 
     Args:
         params: the wheel.
-        x: section state (theta-, dtheta-, dL1-) just before touchdown, rad, rad/s, m/s.
-        n_steps: at most so many.
-        model: the rung; the paper's, `ViscoelasticWheel()`, by default, "auto" for the lowest that
-            serves.
-        options: numerical choices of the steps.
-        engine: who takes the steps, see `Options`.
-        n_samples: times of each phase, both ends included, at least 2.
+        x: section state (theta-, dtheta-, dL1-) just before touchdown, in rad, rad/s, m/s.
+        n_steps: largest number of steps.
+        model: the model; by default that of the paper, `ViscoelasticWheel()`. "auto" chooses the
+            simplest valid model.
+        options: numerical options of the steps.
+        engine: engine that computes the steps; see `StepOptions`.
+        n_samples: number of times per phase, including both ends, at least 2.
 
     Returns:
-        A dataset over `time`: coordinates, rates, feet, forces and energies, with units;
-        on real ground of each `leg`.
+        A dataset over `time` of coordinates, rates, feet, forces and energies, with units. With
+        unilateral contact it is also over `leg`.
 
     Raises:
-        TypeError, ValueError: an argument that can't be meant, in one sentence.
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
 
     Examples:
         >>> walk = vrw.simulate(vrw.WheelParams(damping=150.0), n_steps=1)
@@ -111,48 +112,50 @@ def simulate(
 
 
 class Stretches(NamedTuple):
-    """One step, sampled between its events."""
+    """One step, sampled in each interval between two events."""
 
-    columns: dict[str, np.ndarray]  # (stretch, sample, ...), time in s from the landing
-    durations: np.ndarray  # of each stretch, s; 0: it did not happen
+    columns: dict[str, np.ndarray]  # (interval, sample, ...), time in s since the landing
+    durations: np.ndarray  # of each interval, s; 0 if it did not occur
     outcome: Outcome
-    following: Array  # section state after it
+    following: Array  # section state at the end of the step
     period: float  # s
-    length: float  # from this step's landing to the next, m
+    length: float  # distance from the landing of this step to the next landing, m
 
 
 class Telling(NamedTuple):
-    """How a rung's steps are sampled, and what of them is told."""
+    """Specification of a trajectory: how a model samples a step, and the variables."""
 
-    stretches_of: Callable[[Array], Stretches]  # of the step from a section state
-    names: tuple[str, ...]  # measures that are told over time
-    along: tuple[str, ...]  # of these, places along the slope
-    labels: dict[str, Any]  # coordinates beside those among the names
+    stretches_of: Callable[[Array], Stretches]  # samples the step from a section state
+    names: tuple[str, ...]  # measures over time
+    along: tuple[str, ...]  # those of the measures that are positions along the slope
+    labels: dict[str, Any]  # coordinates other than those among the measures
     attrs: dict[str, object]
 
 
 class Joined(NamedTuple):
-    columns: dict[str, np.ndarray]  # (time, ...), with `step`; empty where nothing happened
+    """Samples of a walk, with the outcome of its last step."""
+
+    columns: dict[str, np.ndarray]  # (time, ...), with `step`; empty if no interval occurred
     n_stepped: int
     outcome: Outcome
 
 
 FALLING = ("gravitational_energy", "total_energy")
-"""Energies that count from the walk's first foot."""
+"""Energies that are measured relative to the height of the first foot of the walk."""
 
 
 def joined(telling: Telling, x: Array, n_steps: int, weight_along: float) -> Joined:
-    """Steps from the section state x, as many as it can.
+    """Return the samples of up to `n_steps` steps from the section state x.
 
-    Places along the slope, m, count from the first landing; energies that are `FALLING`, J, lose
-    `weight_along`, N, times the way.
+    Positions along the slope, in m, are relative to the first landing. Energies that depend on the
+    height, in J, decrease by `downslope_weight`, in N, times the distance.
     """
     parts: list[dict[str, np.ndarray]] = []
     outcome, stepped, time, place = Outcome.STEPPED, 0, 0.0, 0.0
     while outcome == Outcome.STEPPED and stepped < n_steps:
         told = telling.stretches_of(x)
         happened, part = told.durations > 0.0, dict[str, np.ndarray]()
-        some = slice(None) if happened.all() else happened  # of all nothing is copied
+        some = slice(None) if happened.all() else happened  # a full slice copies nothing
         for name, values in told.columns.items():
             part[name] = values[some].reshape(-1, *values.shape[2:])
         for name in telling.along:
@@ -172,7 +175,7 @@ def joined(telling: Telling, x: Array, n_steps: int, weight_along: float) -> Joi
 
 @functools.cache
 def _traced(model: AbstractWheel, structure: Any, n_samples: int) -> Callable[..., Trajectory]:
-    """A step's trace over x and the leaves of (params, options)."""
+    """Return the compiled function that samples a step from x and the leaves of its inputs."""
 
     def trace(x: Array, *leaves: Array) -> Trajectory:
         params, options = jax.tree.unflatten(structure, leaves)
@@ -182,9 +185,9 @@ def _traced(model: AbstractWheel, structure: Any, n_samples: int) -> Callable[..
 
 
 def _columns(s: Symbols, moved: Trajectory) -> dict[str, np.ndarray]:
-    """A step by the names of `TRAJECTORY`, (phase, sample), Leg 1's foot at the origin.
+    """Return a step by the names of `TRAJECTORY`, shape (phase, sample), from Leg 1's foot.
 
-    `ahead` is added: where the landing leg stands or will stand, m.
+    The column `ahead` is the position along the slope of the leg that lands next, in m.
     """
     theta, L1, L2, dtheta, dL1, dL2 = np.moveaxis(np.asarray(moved.state), -1, 0)
     kinetic, gravitational, elastic = np.moveaxis(np.asarray(moved.energy), -1, 0)
@@ -223,11 +226,12 @@ def _columns(s: Symbols, moved: Trajectory) -> dict[str, np.ndarray]:
 def over_phases(
     params: WheelParams, s: Symbols, model: AbstractWheel, options: Options, n_samples: int
 ) -> Telling:
-    """Of rungs that step through the paper's phases."""
+    """Return the specification for models whose steps consist of the paper's phases."""
     leaves, structure = jax.tree.flatten((params, options))
     trace = _traced(model, structure, n_samples)
 
     def stretches(x: Array) -> Stretches:
+        """Return the samples of the step from x."""
         moved = trace(x, *leaves)
         columns, durations = _columns(s, moved), np.asarray(moved.durations)
         ahead = columns.pop("ahead")
@@ -245,7 +249,7 @@ def over_phases(
 
 
 ALONG = ("x", "foot_1_x", "foot_2_x", "hub_x")
-"""Columns that are places along the slope."""
+"""Columns that are positions along the slope."""
 
 
 OF_WALK = ("time", "step", "hub_x", "hub_z", "theta", "dtheta")
@@ -256,10 +260,11 @@ ENERGIES = ("kinetic_energy", "gravitational_energy", "elastic_energy")
 def _contact_columns(
     model: Any, params: WheelParams, x: Array, options: Options, n_samples: int
 ) -> tuple[UnilateralTrajectory, dict[str, Array]]:
-    """One step's trace and its quantities, shape (phase, sample) or (phase, sample, leg)."""
+    """Return the samples of a step and its quantities, shape (phase, sample[, leg])."""
     s, trace = params.symbols(), model.trace(params, x, options, n_samples)
 
     def describe(y: State) -> dict[str, Array]:
+        """Return positions, rates and energies of one state."""
         motion, _ = unpack(y)
         legs = directions(s, motion.theta)
         gravitational, elastic = potential_energy(s, motion)
@@ -284,13 +289,15 @@ def _contact_columns(
 def over_contacts(
     params: WheelParams, s: Symbols, model: Any, options: Options, n_samples: int
 ) -> Telling:
-    """Of rungs that walk on contacts, over time and leg; legs bear the labels of their step.
+    """Return the specification for models with contacts, over time and leg.
 
-    Each stretch between two events has `n_samples` times, both ends included. Of the ladder,
-    `rung` and `reason` say for each time which rung served and why (see `ModelChoice`).
+    Legs have the labels of their step. Each interval between two events has `n_samples` times,
+    including both ends. For a `LadderWheel`, `rung` and `reason` give the model used at each time
+    and the cause (see `ModelChoice`).
     """
 
     def stretches(x: Array) -> Stretches:
+        """Return the samples of the step from x."""
         trace, columns = jax.tree.map(
             np.array, _contact_columns(model, params, x, options, n_samples)
         )
