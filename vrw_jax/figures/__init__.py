@@ -1,4 +1,4 @@
-"""Pictures of labelled results; the only room that knows matplotlib."""
+"""Figures of labelled results; the only package that imports matplotlib."""
 
 from vrw_jax.figures.branch import basin_figure, branch_figure
 from vrw_jax.figures.scan import map_figure, scan_figures

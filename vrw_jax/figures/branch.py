@@ -1,4 +1,4 @@
-"""Figures of branches with their borders, and of basins of attraction."""
+"""Figures of branches with their special points, and of basins of attraction."""
 
 import numpy as np
 import xarray as xr
@@ -31,13 +31,14 @@ from vrw_jax.wording import instance
 
 ENDS, BORDER = PINK, (0, (1, 1.2))
 COLOURS = {"lost": ENDS, "border_collision": GREEN}
-"""Of borders, by kind; where the gait's own stability changes: black. What ends a branch: ENDS.
-Neither colours nor dots are those of a curve."""
+"""Colors of special points by kind; black for a change of stability, `BRANCH_END_COLOR` for the end
+of a branch. Neither the colors nor the dots are those of a curve."""
 
 EVERY = (
     ("DLS fraction", {"dls_fraction": LEG_1}),
     ("moduli of multipliers", {"spectral_radius": "black"}),
 )
+"""Label, and the color of each measure, of the panels of every branch."""
 PANELS = (
     *EVERY,
     (
@@ -46,17 +47,17 @@ PANELS = (
     ),
     ("clearance in SLS-I [mm]", {"clearance_sls1": LEG_2}),
 )
-"""Label, and the colour of each measure, of the panels of a branch."""
+"""Panels of a branch of the paper's model."""
 OTHERS = (
     *EVERY,
     ("walking speed [m/s]", {"speed": "black"}),
     ("step period [s]", {"period": "black"}),
 )
-"""Those of a rung without the paper's indicators."""
+"""Panels of a branch of a model without the paper's indicators."""
 
 
 def _pieces(branch: Branch) -> list[tuple[np.ndarray, bool]]:
-    """Indices of stretches of one stability; each shares its last point with the next."""
+    """Return indices and stability of pieces of a branch; a piece ends where the next starts."""
     cuts = np.flatnonzero(np.diff(branch.stable.astype(int))) + 1
     parts = np.split(np.arange(branch.values.size), cuts)
     return [
@@ -68,20 +69,21 @@ def _pieces(branch: Branch) -> list[tuple[np.ndarray, bool]]:
 
 @figure_style()
 def branch_figure(branch: Branch) -> Figure:
-    """DLS fraction, multipliers, indicators and clearance along a branch, with its borders.
+    """Return a figure of a branch with its special points.
 
-    Of other rungs than the paper's speed and period in place of the last two. Solid: stable;
-    dashed: unstable. Borders are numbered from left to right.
+    The panels show DLS fraction, multipliers, indicators and clearance. For models other than the
+    paper's, speed and period replace the last two. Stable gaits are solid, unstable gaits dashed.
+    Special points are numbered from left to right.
 
     Args:
-        branch: of `vrw.continue_branch` over one of the wheel's parameters.
+        branch: result of `vrw.continue_branch` over a parameter of the wheel.
 
     Returns:
         Figure: four panels over the parameter, in SI units.
 
     Examples:
         >>> branch = vrw.continue_branch(vrw.WheelParams(), "damping", (190.0, 230.0))
-        >>> figure = vrw.plot.branch_figure(branch)
+        >>> figure = vrw.plot.draw_branch(branch)
     """
     instance("branch", branch, Branch, "give vrw.continue_branch(params, name, bounds)")
     values, data = branch.values, branch.dataset
@@ -115,7 +117,7 @@ def branch_figure(branch: Branch) -> Figure:
 
 
 def _indicators(panels: np.ndarray, clearance: np.ndarray) -> None:
-    """Zero, names and scale of the panels that only the paper's rung has; clearance in mm."""
+    """Draw zero lines, legend and scale of the panels of the paper's model; clearance in mm."""
     for axes in panels:
         axes.axhline(0.0, color=GREY, linewidth=0.5)
     for name, colour in PANELS[2][1].items():
@@ -126,7 +128,7 @@ def _indicators(panels: np.ndarray, clearance: np.ndarray) -> None:
 
 
 def _broken(name: str, values: np.ndarray) -> np.ndarray:
-    """A clearance with a gap where it jumps: as the dip at take-off vanishes, the end counts."""
+    """Return the values, for a clearance with a gap where it jumps because a dip vanishes."""
     if name.startswith("clearance"):
         values = values.copy()
         values[1:][values[:-1] * values[1:] < 0.0] = np.nan
@@ -134,10 +136,12 @@ def _broken(name: str, values: np.ndarray) -> np.ndarray:
 
 
 def _colour(border: Border) -> str:
+    """Return the color of a special point."""
     return ENDS if border.ends_branch else COLOURS.get(border.kind, "black")
 
 
 def _draw_borders(axes: Axes, borders: list[Border], numbered: bool) -> None:
+    """Draw vertical lines at the special points, with numbers if wanted."""
     low, high = axes.get_xlim()
     last = -np.inf
     for i, border in enumerate(borders):
@@ -156,6 +160,7 @@ def _draw_borders(axes: Axes, borders: list[Border], numbered: bool) -> None:
 
 
 def _name_borders(figure: Figure, borders: list[Border], parameter: str) -> None:
+    """Add a legend of the special points and of the line styles."""
     handles = []
     for i, border in enumerate(borders):
         text = f"{value_label(parameter, border.value, 6)}: {typeset(what_breaks(border.name))}"
@@ -170,13 +175,14 @@ def _name_borders(figure: Figure, borders: list[Border], parameter: str) -> None
 
 @figure_style()
 def basin_figure(results: list[xr.Dataset], titles: list[str]) -> Figure:
-    """Which starts of a plane end where, one panel per result; crosses are the gaits' own states.
+    """Return a figure of basins of attraction, one panel per result.
 
-    Shades of grey count the steps until the gait is reached; colours are the falls.
+    Crosses mark the section states of the gaits. Shades of gray give the number of steps until the
+    gait is reached, and colors the falls.
 
     Args:
-        results: of `vrw.basin`, each over a plane of starts.
-        titles: one for each.
+        results: results of `vrw.basin`, each over a plane of starts.
+        titles: title of each panel.
 
     Returns:
         Figure: the panels side by side.
@@ -184,8 +190,8 @@ def basin_figure(results: list[xr.Dataset], titles: list[str]) -> Figure:
     Examples:
         >>> starts = {"theta_touchdown": 0.09, "dtheta_touchdown": [1.4, 1.6]}
         >>> starts |= {"dL1_touchdown": [-0.1, 0.0]}
-        >>> found = vrw.basin(vrw.WheelParams(), starts)
-        >>> figure = vrw.plot.basin_figure([found], ["Table 1"])
+        >>> basins = vrw.basin(vrw.WheelParams(), starts)
+        >>> figure = vrw.plot.draw_basins([basins], ["Table 1"])
     """
     all_drawable("results", results, ("outcome", "attractor"), "give vrw.basin(params, grid)")
     codes = sorted({int(c) for r in results for c in np.unique(r.outcome) if c != Outcome.STEPPED})
@@ -213,6 +219,7 @@ def basin_figure(results: list[xr.Dataset], titles: list[str]) -> Figure:
 
 
 def _mark_orbits(axes: Axes, result: xr.Dataset, x: str, y: str) -> None:
+    """Draw crosses at the section states of the gaits if the plane is one of section states."""
     if not {x, y} <= set(BEFORE):
         return
     columns = [BEFORE.index(x), BEFORE.index(y)]

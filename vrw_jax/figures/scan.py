@@ -1,4 +1,4 @@
-"""Pictures of scans: DLS fraction, speed and outcome over two parameters, and borders on them."""
+"""Figures of scans: DLS fraction, speed and outcome over parameters, with borders of gaits."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
@@ -36,30 +36,31 @@ from vrw_jax.scans import OF_CYCLE, SALTELLI, SWEPT, manifest_of, sobol_indices
 from vrw_jax.wheel import Outcome
 
 PREFERRED = ("damping", "slope", "stiffness", "natural_length", *SWEPT)
-"""Which axes a picture takes first: across, then up, then side by side."""
+"""Parameters in the order in which figures use them: horizontal, vertical, then columns."""
 
 BORDERS = (
     "fore_foot_force", "takeoff_acceleration", "clearance_sls1", "clearance_sls2",
     "locked_stopper_force", "rear_stopper_force", "contraction", "friction_fore",
     "landing_friction_fore", "hit_planted_impulse",
 )  # fmt: skip
-"""Premises whose borders are drawn."""
+"""Margins whose zero lines are drawn."""
 
 MOST_COLUMNS, MOST_PAIRED, MOST_DRAWN = 4, 6, 20_000
+"""Largest numbers of columns, of parameters in pairs, and of drawn samples."""
 
 
 def scan_figures(scan: xr.Dataset) -> dict[str, Figure]:
-    """Pictures of a scan by name: one for each axis that can be set side by side.
+    """Return the figures of a scan by name, one for each axis beyond the first two.
 
     Args:
-        scan: of `vrw.scan`, over a grid or samples, or of `vrw.sobol_indices`.
+        scan: dataset of `vrw.scan` over a grid or samples.
 
     Returns:
-        dict[str, Figure]: the pictures; which there are follows from the design.
+        dict[str, Figure]: the figures, whose names depend on the design.
 
     Examples:
-        >>> found = vrw.scan(vrw.grid(damping=[150.0, 200.0]), ["speed", "dls_fraction"])
-        >>> sorted(vrw.plot.scan_figures(found))
+        >>> gaits = vrw.scan(vrw.grid(damping=[150.0, 200.0]), ["speed", "dls_fraction"])
+        >>> sorted(vrw.plot.draw_scan(gaits))
         ['scan']
     """
     drawable("scan", scan, ("outcome",), "give vrw.scan(design)")
@@ -84,9 +85,10 @@ def scan_figures(scan: xr.Dataset) -> dict[str, Figure]:
 
 @figure_style()
 def slice_figure(scan: xr.Dataset, x: str, y: str, across: str | None = None) -> Figure:
-    """DLS fraction, speed and outcome over (x, y), one column for each value of `across`.
+    """Return a figure over (x, y), with one column for each value of the parameter `across`.
 
-    Axes that are not shown are cut at their middle value, which the title names. Grey: no gait.
+    It shows DLS fraction, speed and outcome. Other axes are cut at their middle value, which is in
+    the title. Gray cells have no gait.
     """
     cut = {n: scan.sizes[n] // 2 for n in SWEPT if n in scan.dims}
     cut = {name: place for name, place in cut.items() if name not in (x, y, across)}
@@ -133,7 +135,7 @@ def slice_figure(scan: xr.Dataset, x: str, y: str, across: str | None = None) ->
 
 @figure_style()
 def sample_figure(scan: xr.Dataset, names: Sequence[str]) -> Figure:
-    """DLS fraction, speed and outcome of single samples over the first two parameters."""
+    """Return a figure of single samples over the first two parameters."""
     x, y = (names[0], names[1]) if len(names) > 1 else (names[0], "sample")
     rows = _shown(scan)
     size = float(np.clip(3000.0 / max(scan.sizes["sample"], 1), 1.0, 12.0))
@@ -155,10 +157,11 @@ def sample_figure(scan: xr.Dataset, names: Sequence[str]) -> Figure:
 
 @figure_style()
 def pairs_figure(scan: xr.Dataset, names: Sequence[str]) -> Figure:
-    """Samples over each pair of parameters: DLS fraction below the diagonal, outcome above.
+    """Return a figure of samples over each pair of parameters.
 
-    On the diagonal the share that walks on a stable cycle, along each parameter. Of large designs
-    the first MOST_DRAWN samples are drawn, which are as well spread as all.
+    It shows the DLS fraction below the diagonal and the outcome above it. The diagonal shows the
+    share of samples with a stable cycle. Of a large design only the first `MAX_DRAWN_SAMPLES`
+    samples are drawn, which are as evenly spread as all.
     """
     shown = scan.isel(sample=slice(MOST_DRAWN))
     value = next(iter(_shown(scan)), None)
@@ -195,7 +198,7 @@ def pairs_figure(scan: xr.Dataset, names: Sequence[str]) -> Figure:
 def _draw_values(
     axes: Axes, scan: xr.Dataset, x: str, y: str, name: str, size: float
 ) -> PathCollection:
-    """Samples in the colours of a measure, in grey where there is none to tell."""
+    """Draw samples in the colors of a measure, and in gray if they have no gait."""
     dot: dict[str, Any] = {"s": size, "linewidths": 0.0, "rasterized": True}
     walks, values = scan.outcome.values == Outcome.STEPPED, scan[name].values
     low, high = _limits([values], [_codes(scan).values == Outcome.STEPPED])
@@ -207,12 +210,13 @@ def _draw_values(
 def _draw_outcomes(
     axes: Axes, x: np.ndarray, y: np.ndarray, codes: np.ndarray, size: float
 ) -> None:
+    """Draw samples in the colors of their outcomes."""
     colors = [outcome_style(int(code))[1] for code in codes]
     axes.scatter(x, y, s=size, color=colors, linewidths=0.0, rasterized=True)
 
 
 def _share_along(axes: Axes, x: np.ndarray, walks: np.ndarray) -> None:
-    """The share of samples with a stable gait, along a parameter."""
+    """Draw the share of samples with a stable gait along a parameter."""
     edges = np.linspace(x.min(), x.max(), 13)
     every, good = (np.histogram(some, edges)[0] for some in (x, x[walks]))
     axes.stairs(good / np.maximum(every, 1), edges, fill=True, color=OUTCOMES[Outcome.STEPPED][1])
@@ -221,7 +225,7 @@ def _share_along(axes: Axes, x: np.ndarray, walks: np.ndarray) -> None:
 
 @figure_style()
 def indices_figure(indices: xr.Dataset) -> Figure:
-    """First-order and total Sobol' indices of each measure, with their intervals."""
+    """Return a figure of the Sobol' indices of each measure with their intervals."""
     measures, parameters = indices.measure.values, [str(p) for p in indices.parameter.values]
     n_columns = min(len(measures), 3)
     n_rows = -(-len(measures) // n_columns)
@@ -259,7 +263,7 @@ def indices_figure(indices: xr.Dataset) -> Figure:
 
 @figure_style()
 def curve_figure(scan: xr.Dataset, x: str) -> Figure:
-    """DLS fraction and speed along one parameter; grey where there is no gait."""
+    """Return a figure of DLS fraction and speed along one parameter; gray without a gait."""
     scan = scan.isel({n: 0 for n in SWEPT if n in scan.dims and n != x}).sortby(x)
     rows = _shown(scan) or ["fore_foot_force"]
     figure = Figure(figsize=(COLUMN, 1.6 * len(rows) + 0.6))
@@ -276,13 +280,14 @@ def curve_figure(scan: xr.Dataset, x: str) -> Figure:
 
 
 def _shown(scan: xr.Dataset) -> list[str]:
+    """Return the names of the measures that figures show."""
     return [name for name in ("dls_fraction", "speed") if name in scan]
 
 
 def _limits(values: Sequence[np.ndarray], stable: Sequence[np.ndarray]) -> tuple[float, float]:
-    """Range of colours that all panels of a row share: that of stable gaits, if there are any.
+    """Return the color range of a row of panels: the range of stable gaits, if there are any.
 
-    A few unstable ones, far from the others, would leave these one colour.
+    A few distant unstable gaits would otherwise leave all others in one color.
     """
     every = [value[np.isfinite(value)] for value in values]
     walked = [v[s & np.isfinite(v)] for v, s in zip(values, stable, strict=True)]
@@ -293,7 +298,7 @@ def _limits(values: Sequence[np.ndarray], stable: Sequence[np.ndarray]) -> tuple
 def _extended(
     values: Sequence[np.ndarray], limits: tuple[float, float]
 ) -> Literal["neither", "min", "max", "both"]:
-    """At which ends of a colour bar there are values beyond it."""
+    """Return the ends of a color bar beyond which there are values."""
     known = np.concatenate([value[np.isfinite(value)] for value in values])
     below, above = np.any(known < limits[0]), np.any(known > limits[1])
     return ("both" if above else "min") if below else ("max" if above else "neither")
@@ -302,18 +307,18 @@ def _extended(
 def _cells(
     axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, limits: tuple[float, float]
 ) -> AxesImage:
-    """One coloured cell per sample, so that nothing is seen that was not computed."""
+    """Draw one colored cell per sample, without interpolation."""
     axes.set_facecolor(LIGHT)
     masked = np.ma.masked_invalid(values)
     mesh = axes.pcolormesh(
         _edges(x), _edges(y), masked, cmap="viridis", vmin=limits[0], vmax=limits[1]
     )
     mesh.set_rasterized(True)
-    return mesh  # type: ignore[return-value]  # whatever a colour bar accepts
+    return mesh  # type: ignore[return-value]  # a color bar accepts it
 
 
 def _edges(places: np.ndarray) -> np.ndarray:
-    """Borders of cells around sample places."""
+    """Return the edges of the cells around sample positions."""
     if len(places) == 1:
         return places[0] + np.array([-0.5, 0.5]) * max(abs(places[0]) * 0.01, 1e-6)
     middle = 0.5 * (places[1:] + places[:-1])
@@ -322,7 +327,7 @@ def _edges(places: np.ndarray) -> np.ndarray:
 
 
 def _codes(scan: xr.Dataset) -> xr.DataArray:
-    """Outcomes, with unstable cycles told apart where the scan knows."""
+    """Return the outcomes, with a code of their own for unstable cycles if these are known."""
     codes = scan.outcome.astype(int)
     if "spectral_radius" not in scan:
         return codes
@@ -330,7 +335,7 @@ def _codes(scan: xr.Dataset) -> xr.DataArray:
 
 
 def _borders(axes: Axes, scan: xr.Dataset, x: str, y: str) -> dict[str, Line2D]:
-    """Lines where a premise's margin is zero; returns what a legend needs."""
+    """Draw lines of zero margin, and return their legend entries by name."""
     drawn = {}
     for name in BORDERS:
         if name not in scan or scan.sizes[x] < 2 or scan.sizes[y] < 2:
@@ -339,7 +344,7 @@ def _borders(axes: Axes, scan: xr.Dataset, x: str, y: str) -> dict[str, Line2D]:
         if MARGINS[name].axis:
             margin = margin.min("leg")
         if name == "clearance_sls1" and "takeoff_acceleration" in scan:
-            margin = margin.where(scan.takeoff_acceleration >= 0.0)  # the border's stairs
+            margin = margin.where(scan.takeoff_acceleration >= 0.0)  # avoids steps in the line
         values = margin.transpose(y, x).values
         known = values[np.isfinite(values)]
         if not len(known) or known.min() >= 0.0 or known.max() <= 0.0:
@@ -354,6 +359,7 @@ def _borders(axes: Axes, scan: xr.Dataset, x: str, y: str) -> dict[str, Line2D]:
 
 
 def _legend(figure: Figure, codes: np.ndarray, drawn: Mapping[str, Line2D], n_columns: int) -> None:
+    """Add the legend of outcomes and lines below a figure."""
     lines = [drawn[name] for name in BORDERS if name in drawn]
     figure.legend(
         handles=[*outcome_patches(codes), *lines],
@@ -366,21 +372,21 @@ def _legend(figure: Figure, codes: np.ndarray, drawn: Mapping[str, Line2D], n_co
 
 @figure_style()
 def map_figure(scan: xr.Dataset, measure: str, curves: Sequence[BorderCurve]) -> Figure:
-    """The measure of the scan's gaits in colours, grey where there is none, and every border.
+    """Return a map of a measure over two parameters, with curves of special points.
 
-    Thin where the gaits on it are not stable.
+    Gray cells have no gait. A curve is thin where its gaits are unstable.
 
     Args:
-        scan: of `vrw.scan` over a grid of two parameters.
-        measure: one of its columns.
-        curves: of `vrw.border_curve` over the same two; may be empty.
+        scan: dataset of `vrw.scan` over a grid of two parameters.
+        measure: name of a variable of the scan.
+        curves: results of `vrw.continue_special_point` over the same parameters; may be empty.
 
     Returns:
         Figure: one panel, in SI units.
 
     Examples:
         >>> grid = vrw.grid(damping=[150.0, 200.0], slope=[0.28, 0.3])
-        >>> figure = vrw.plot.map_figure(vrw.scan(grid, ["speed"]), "speed", [])
+        >>> figure = vrw.plot.draw_map(vrw.scan(grid, ["speed"]), "speed", [])
     """
     drawable("scan", scan, ("outcome", measure), "give vrw.scan of two parameters and the measure")
     x, y = curves[0].parameters if curves else [n for n in SWEPT if n in scan.dims]
@@ -398,7 +404,7 @@ def map_figure(scan: xr.Dataset, measure: str, curves: Sequence[BorderCurve]) ->
         color, dash = border_style(curve.name)
         stable = curve.dataset.spectral_radius.values < 1.0
         for there, width in ((stable, 1.2), (~stable, 0.5)):
-            # A point of what follows joins them; several pieces of a border are told once.
+            # The next piece contributes one point; a curve of several pieces has one legend entry.
             joined = there | np.append(False, there[:-1])
             drawn = np.where(joined[:, None], curve.values, np.nan)
             told = labels.pop(curve.name, None) if there.any() else None

@@ -1,7 +1,7 @@
-"""The look of all figures: journal widths, colours for every eye, vector output, labels with units.
+"""Style of all figures: journal widths, colors for every eye, vector output, labels with units.
 
-No global setting of matplotlib is touched and no window is opened: figures are made inside
-`figure_style()` and written by `save`.
+Figures are created inside `figure_style()` and written by `save_figure`. No global setting of
+matplotlib changes, and no window opens.
 """
 
 import re
@@ -25,13 +25,14 @@ from vrw_jax.wording import as_tex, instance
 
 BLUE, ORANGE, GREEN, PINK, SKY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9"
 AMBER, YELLOW = "#E69F00", "#F0E442"
-"""Colours of Okabe and Ito."""
+"""Colors of Okabe and Ito."""
 
 LEG_1, LEG_2, GREY, LIGHT = BLUE, ORANGE, "#555555", "#E9E9E9"
+"""Colors of the two legs, and two grays."""
 
 STYLE: dict[Any, Any] = {
     "font.family": "serif",
-    "font.serif": ["STIXGeneral"],  # comes with matplotlib
+    "font.serif": ["STIXGeneral"],  # included in matplotlib
     "mathtext.fontset": "stix",
     "font.size": 9.0,
     "axes.titlesize": 9.0,
@@ -52,12 +53,12 @@ STYLE: dict[Any, Any] = {
     "axes.prop_cycle": cycler(color=[BLUE, ORANGE, GREEN, PINK, SKY]),
     "figure.constrained_layout.use": True,
     "savefig.dpi": 200,
-    "svg.hashsalt": "vrw_jax",  # the same figure gives the same file
+    "svg.hashsalt": "vrw_jax",  # makes the same figure the same file
 }
-"""Serif type as in the journal; nothing that the system must have."""
+"""Settings of matplotlib: a serif font as in the journal, without fonts of the system."""
 
 COLUMN, PAGE = 3.4, 6.9
-"""Widths of one column and of the page, inches."""
+"""Widths of one column and of the page, in inches."""
 
 OUTCOMES: dict[Outcome, tuple[str, str]] = {
     Outcome.STEPPED: ("stable limit cycle", BLUE),
@@ -78,7 +79,9 @@ OUTCOMES: dict[Outcome, tuple[str, str]] = {
     Outcome.BORDER_ON_THE_WAY: ("border on the way", "#454545"),
     Outcome.FRICTION_PARADOX: ("friction paradox", "#862DB8"),
 }
+"""Label and color of each outcome."""
 DASHES = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 3)))
+"""Line styles of special points, of which `BORDER_NAMES_BY_COLOR` gives the index."""
 KINDS = {
     "black": ("fold", "period_doubling", "neimark_sacker", "branch_point"),
     BLUE: ("lambda_2_plus", "lambda_4_plus", "lambda_I4", "fore_foot_force"),
@@ -91,47 +94,48 @@ KINDS = {
         "landing_stopper_impulse",
     ),
 }  # fmt: skip
-"""Of a border's name the colour, and by its place the dash: the same in every picture. Green and
-pink, one grey to some eyes, have no dash in common."""
+"""Names of special points by color; the index of a name gives its line style, the same in every
+figure. Green and pink, which some eyes cannot distinguish, share no line style."""
 NOT_COMPUTED = ("not computed", "#FFFFFF")
+"""Label and color of a sample that is not computed."""
 UNSTABLE = 100
-"""Stands for a cycle whose spectral radius is 1 or more, beside the codes of `Outcome`."""
+"""Code of a cycle whose spectral radius is 1 or more, in addition to the codes of `Outcome`."""
 
 
 @contextmanager
 def figure_style() -> Iterator[None]:
-    """The style of every figure, for the time of a `with` block.
+    """Apply the style of all figures within a `with` block.
 
     Returns:
-        A context in which matplotlib draws so; `with`, or as a decorator.
+        A context manager, which is also a decorator, with the settings of matplotlib.
 
     Examples:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
         >>> with vrw.plot.figure_style():
-        ...     figure = vrw.plot.sticks(gait)
+        ...     figure = vrw.plot.draw_sticks(gait)
     """
     with mpl.rc_context(STYLE):
         yield
 
 
 def save(figure: Figure, folder: Path, name: str) -> list[Path]:
-    """Write `figure` as SVG and PNG into `folder`; returns the paths.
+    """Write `figure` as SVG and PNG into `folder`, and return the paths.
 
     Args:
-        figure: of matplotlib.
-        folder: which exists.
-        name: of the files, without an ending.
+        figure: a figure of matplotlib.
+        folder: folder of the files, created if it does not exist.
+        name: name of the files without the suffix.
 
     Returns:
-        list[Path]: `name`.svg and `name`.png.
+        list[Path]: the paths of `name`.svg and `name`.png.
 
     Raises:
-        OSError: they can't be written.
+        OSError: if a file cannot be written.
 
     Examples:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
-        >>> figure = vrw.plot.sticks(gait)
-        >>> [path.suffix for path in vrw.plot.save(figure, Path(tempfile.mkdtemp()), "sticks")]
+        >>> figure, folder = vrw.plot.draw_sticks(gait), Path(tempfile.mkdtemp())
+        >>> [path.suffix for path in vrw.plot.save_figure(figure, folder, "sticks")]
         ['.svg', '.png']
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -143,7 +147,7 @@ def save(figure: Figure, folder: Path, name: str) -> list[Path]:
 
 
 def drawable(name: str, data: Any, needed: Sequence[str], advice: str) -> None:
-    """Refuse what is no dataset, or one of something else."""
+    """Raise unless `data` is a dataset that holds the needed variables or attributes."""
     instance(name, data, xr.Dataset, advice)
     missing = [one for one in needed if one not in data.variables and one not in data.attrs]
     if missing:
@@ -151,7 +155,7 @@ def drawable(name: str, data: Any, needed: Sequence[str], advice: str) -> None:
 
 
 def all_drawable(name: str, several: Any, needed: Sequence[str], advice: str) -> None:
-    """Refuse what is no list of such datasets."""
+    """Raise unless `several` is a nonempty list of datasets that hold the needed variables."""
     instance(name, several, (list, tuple), f"{advice}, several in a list")
     if not several:
         raise ValueError(f"{name} is empty, but something is to be drawn: {advice}.")
@@ -160,17 +164,17 @@ def all_drawable(name: str, several: Any, needed: Sequence[str], advice: str) ->
 
 
 def typeset(text: str) -> str:
-    """Text whose Greek symbols, "λ2⁺", are set as formulas: the type lacks some of their signs."""
+    """Return text with symbols such as "λ2⁺" as formulas, because the font lacks some of them."""
     return re.sub(r"[θλ]\S*", lambda found: f"${as_tex(found[0])}$", text)
 
 
 def _unit(name: str) -> str:
-    """As all pictures write it: "N s/m" is "N·s/m"."""
+    """Return the unit of a quantity as figures write it, such as "N·s/m"."""
     return MEASURES[name].plain_unit.replace(" ", "·").replace("^2", "²")
 
 
 def axis_label(name: str, form: str = "{name} {symbol}") -> str:
-    """A quantity's name and symbol, as `form` says, and its unit; a name unknown here as it is."""
+    """Return the label of a quantity, formatted by `form`, with its unit; keep an unknown name."""
     if name not in MEASURES:
         return name
     measure = MEASURES[name]
@@ -179,26 +183,27 @@ def axis_label(name: str, form: str = "{name} {symbol}") -> str:
 
 
 def value_label(name: str, value: float, digits: int = 4) -> str:
-    """A quantity with a value, as in "c = 50 N·s/m"."""
+    """Return the text of a quantity with a value, as in "c = 50 N·s/m"."""
     if name not in MEASURES:
         return f"{name} = {value:.{digits}g}"
     return f"${MEASURES[name].tex}$ = {value:.{digits}g} {_unit(name)}".rstrip()
 
 
 def panel_letter(axes: Axes, letter: str) -> None:
+    """Write the letter of a panel to the left of its top."""
     axes.text(-0.12, 1.02, f"({letter})", transform=axes.transAxes, ha="right", va="bottom")
 
 
 def draw_marks(
     axes: Axes, x: np.ndarray, y: np.ndarray, marker: str, color: str, fill: str, **more: Any
 ) -> None:
-    """Symbols without a line, whose inside may have another colour: open ones are "white"."""
+    """Draw markers without a line, filled with the color `fill`; "white" makes them open."""
     look: dict[str, Any] = {"markersize": 3.2, "markeredgewidth": 0.7, "linestyle": "none"} | more
     axes.plot(x, y, marker, color=color, markerfacecolor=fill, **look)
 
 
 def border_style(name: str) -> tuple[str, Any]:
-    """Colour and dash of a border; those of locked legs by leg, of names unheard of by length."""
+    """Return color and line style of a special point; those of locked legs differ by leg."""
     for color, names in KINDS.items():
         if name in names:
             return color, DASHES[names.index(name)]
@@ -207,7 +212,7 @@ def border_style(name: str) -> tuple[str, Any]:
 
 
 def outcome_style(code: int) -> tuple[str, str]:
-    """Name and colour of an outcome, of an unstable cycle, or of what was not computed."""
+    """Return label and color of an outcome, of an unstable cycle, or of a sample not computed."""
     if code == UNSTABLE:
         return "unstable limit cycle", YELLOW
     return OUTCOMES[Outcome(code)] if code >= 0 else NOT_COMPUTED
@@ -216,7 +221,7 @@ def outcome_style(code: int) -> tuple[str, str]:
 def outcome_cells(
     axes: Axes, x: np.ndarray, y: np.ndarray, codes: np.ndarray, known: Sequence[int] | np.ndarray
 ) -> None:
-    """Cells over (x, y) in the colours of their outcomes; those not among `known` stay empty."""
+    """Draw cells over (x, y) in the colors of their outcomes, except codes not in `known_codes`."""
     colors = ListedColormap([outcome_style(int(code))[1] for code in known])
     places = np.ma.masked_where(~np.isin(codes, known), np.searchsorted(known, codes))
     norm = BoundaryNorm(np.arange(len(known) + 1) - 0.5, len(known)) if len(known) > 1 else None
@@ -224,6 +229,7 @@ def outcome_cells(
 
 
 def outcome_patches(codes: Iterable[int]) -> list[Patch]:
+    """Return the legend entries of outcomes."""
     return [
         Patch(facecolor=color, edgecolor="#888888", linewidth=0.4, label=label)
         for label, color in (outcome_style(int(code)) for code in codes)

@@ -1,4 +1,4 @@
-"""Pictures of tuning: the path, and what every constraint had left at its start and end."""
+"""Figures of tuning: the path, and the slack of every constraint at its start and end."""
 
 import numpy as np
 import xarray as xr
@@ -22,26 +22,26 @@ from vrw_jax.tuning import ACTIVE, Kind, Tuned
 from vrw_jax.wording import instance
 
 ROW = 0.19
-"""Height of a constraint's row, inches."""
+"""Height of the row of a constraint, in inches."""
 
 
 @figure_style()
 def tuning_figure(tuned: Tuned) -> Figure:
-    """Objective and parameters over the gaits evaluated; slack of the constraints before and after.
+    """Return a figure of a tuning run: objective, parameters, and slack of the constraints.
 
-    Filled symbols keep every constraint, open ones break one; crosses are trials that lost the gait
-    and were shortened.
+    Filled symbols satisfy every constraint, and open ones violate one. Dotted lines are trials that
+    lost the gait, after which the step was shortened.
 
     Args:
-        tuned: of `vrw.tune`.
+        tuned: result of `vrw.tune`.
 
     Returns:
-        Figure: its way, and what it keeps.
+        Figure: the path over the evaluated gaits, and the slack at start and end.
 
     Examples:
         >>> bounds = {"damping": (100.0, 215.0)}
         >>> tuned = vrw.tune(vrw.WheelParams(), "dls_fraction", ["damping"], bounds)
-        >>> figure = vrw.plot.tuning_figure(tuned)
+        >>> figure = vrw.plot.draw_tuning(tuned)
     """
     instance("tuned", tuned, Tuned, "give vrw.tune(params, objective, free, bounds)")
     path = tuned.path
@@ -58,6 +58,7 @@ def tuning_figure(tuned: Tuned) -> Figure:
 
 
 def _objective(axes: Axes, path: xr.Dataset) -> None:
+    """Draw the objective over the evaluated gaits."""
     number, value = path.evaluation.values, path.objective.values
     lost = path.kind.values == Kind.LOST
     axes.plot(number[~lost], value[~lost], color=GREY, linewidth=0.7, zorder=1)
@@ -73,6 +74,7 @@ def _objective(axes: Axes, path: xr.Dataset) -> None:
 
 
 def _parameters(axes: Axes, path: xr.Dataset) -> None:
+    """Draw the parameters over the evaluated gaits, scaled to their bounds."""
     lower, upper = np.asarray(path.attrs["lower"]), np.asarray(path.attrs["upper"])
     for i, name in enumerate(path.attrs["free"].split()):
         u = (path[name].values - lower[i]) / (upper[i] - lower[i])
@@ -85,6 +87,7 @@ def _parameters(axes: Axes, path: xr.Dataset) -> None:
 
 
 def _slack(axes: Axes, tuned: Tuned) -> None:
+    """Draw the slack of each constraint at the start and at the tuned gait."""
     path = tuned.path
     names = [str(name) for name in path.constraint.values]
     values = path.constraint_value.values

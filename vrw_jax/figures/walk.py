@@ -1,4 +1,4 @@
-"""Figures of walks: the paper's figures 6 to 10, and the walk itself as moving frames."""
+"""Figures of walks: the paper's figures 6 to 10, and an animation of the walk."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -30,15 +30,18 @@ from vrw_jax.results import MEASURES, PHASES
 from vrw_jax.wording import instance
 
 Coordinate = float | np.ndarray
+"""One coordinate of points, in m."""
 
 FORCES = ("lambda_1", "lambda_2", "lambda_3", "lambda_4")
+"""Names of the ground forces on the feet of Leg 1 and Leg 2, in N."""
 
 
 GAIT = "give vrw.simulate(params)"
+"""Remedy that completes the message about a wrong dataset."""
 
 
 def phase_spans(gait: xr.Dataset) -> list[tuple[float, float, int]]:
-    """(begin, end, phase) of every phase of a trajectory, s."""
+    """Return (begin, end, phase) of every phase of a trajectory, times in s."""
     key = 3 * gait.step.values + gait.phase.values
     cuts = np.flatnonzero(np.diff(key)) + 1
     times = np.split(gait.time.values, cuts)
@@ -47,12 +50,13 @@ def phase_spans(gait: xr.Dataset) -> list[tuple[float, float, int]]:
 
 
 def broken_at_events(gait: xr.Dataset, *names: str) -> list[np.ndarray]:
-    """Time and variables with a gap at each landing, where the labels of the legs change."""
+    """Return time and variables with a gap at each landing, where the labels of the legs change."""
     cuts = np.flatnonzero(np.diff(gait.step.values)) + 1
     return [np.insert(gait[name].values.astype(float), cuts, np.nan) for name in ("time", *names)]
 
 
 def _shade_double_support(axes: Axes, gait: xr.Dataset) -> None:
+    """Draw gray bands over double support and dotted lines at collision II."""
     for begin, end, phase in phase_spans(gait):
         if phase == 0:
             axes.axvspan(begin, end, color=LIGHT, linewidth=0.0, zorder=0)
@@ -62,19 +66,19 @@ def _shade_double_support(axes: Axes, gait: xr.Dataset) -> None:
 
 @figure_style()
 def gait_panels(gait: xr.Dataset) -> Figure:
-    """Angle, leg lengths, share of the load, height of foot 2 and ground forces over time (Fig. 6).
+    """Return a figure of angle, leg lengths, load share, foot height and ground forces (Fig. 6).
 
-    Grey bands are double support; dotted lines are collision II.
+    Gray bands are double support, and dotted lines are collision II.
 
     Args:
-        gait: of `vrw.simulate` on springs, of one wheel.
+        gait: dataset of `vrw.simulate` with the paper's model.
 
     Returns:
-        Figure: panels over time, s, in SI units.
+        Figure: panels over time in s, in SI units.
 
     Examples:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
-        >>> figure = vrw.plot.gait_panels(gait)
+        >>> figure = vrw.plot.draw_gait(gait)
     """
     drawable("gait", gait, ("phase", *FORCES), GAIT)
     time, theta, L1, L2, z2, *forces = broken_at_events(
@@ -122,18 +126,18 @@ def gait_panels(gait: xr.Dataset) -> Figure:
 
 @figure_style()
 def sticks(gait: xr.Dataset, interval: float = 0.05) -> Figure:
-    """Stick diagram in the X-Z plane each `interval`, s: Leg 1 solid, Leg 2 dotted (Fig. 7).
+    """Return a stick diagram in the X-Z plane (Fig. 7); Leg 1 is solid and Leg 2 dotted.
 
     Args:
-        gait: of `vrw.simulate`.
-        interval: between two sticks, s.
+        gait: dataset of `vrw.simulate` with the paper's model.
+        interval: time between two sticks, in s.
 
     Returns:
-        Figure: one panel, m.
+        Figure: one panel, in m.
 
     Examples:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
-        >>> figure = vrw.plot.sticks(gait, interval=0.1)
+        >>> figure = vrw.plot.draw_sticks(gait, interval=0.1)
     """
     drawable("gait", gait, ("phase", "foot_1_x"), GAIT)
     tones = ("#A0A0A0", SKY, "#000000")
@@ -174,27 +178,30 @@ def sticks(gait: xr.Dataset, interval: float = 0.05) -> Figure:
 
 
 LINES = ("-", "--", (0, (4, 1, 1, 1)), ":")
+"""Line styles of the gaits of one figure."""
 
 
 def _name_of(gait: xr.Dataset, vary: str) -> str:
-    """What sets this gait apart, as in "c = 50 N·s/m"."""
+    """Return the label of a gait by its varied parameter, as in "c = 50 N·s/m"."""
     return value_label(vary, gait.attrs[f"parameter_{vary}"])
 
 
 @figure_style()
 def foot_height(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
-    """Height of foot 2 over one step for each gait, and around take-off in mm (Fig. 8).
+    """Return a figure of the height of foot 2 over one step of each gait (Fig. 8).
+
+    A second panel shows the height around take-off, in mm.
 
     Args:
-        gaits: of `vrw.simulate` over one step, one for each line.
-        vary: the parameter in which they differ, which the legend names.
+        gaits: datasets of `vrw.simulate` over one step, one per line.
+        varied: name of the parameter in which the gaits differ, used in the legend.
 
     Returns:
-        Figure: over the time since the landing, s.
+        Figure: two panels over the time since the landing, in s.
 
     Examples:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
-        >>> figure = vrw.plot.foot_height([gait])
+        >>> figure = vrw.plot.draw_foot_height([gait])
     """
     all_drawable("gaits", gaits, ("phase", "foot_2_z"), GAIT)
     figure = Figure(figsize=(PAGE, 2.6))
@@ -225,18 +232,18 @@ def foot_height(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
 
 @figure_style()
 def rear_force(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
-    """Normal force of the ground on foot 2 over double support for each gait (Fig. 9).
+    """Return a figure of the normal force on foot 2 over double support of each gait (Fig. 9).
 
     Args:
-        gaits: of `vrw.simulate` over one step, one for each line.
-        vary: the parameter in which they differ, which the legend names.
+        gaits: datasets of `vrw.simulate` over one step, one per line.
+        varied: name of the parameter in which the gaits differ, used in the legend.
 
     Returns:
-        Figure: over the time since the landing, s.
+        Figure: one panel over the time since the landing, in s.
 
     Examples:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
-        >>> figure = vrw.plot.rear_force([gait])
+        >>> figure = vrw.plot.draw_rear_force([gait])
     """
     all_drawable("gaits", gaits, ("phase", "lambda_4"), GAIT)
     figure = Figure(figsize=(COLUMN, 2.5))
@@ -257,15 +264,16 @@ def rear_force(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
 
 @figure_style()
 def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
-    """The DLS indicators over a parameter, where the gait is period-1 and λ2⁺ >= 0 (Fig. 10).
+    """Return a figure of the DLS indicators of period-1 gaits with λ2⁺ >= 0 (Fig. 10).
 
-    Filled symbols: foot 2 stays clear; open ones: it scuffs. One symbol for each `every`-th gait.
+    Symbols are filled if foot 2 stays clear of the ground, and open if it scuffs.
 
     Args:
-        gaits: over one parameter, with `settled`, `lambda_I4` (N s), `lambda_2_plus` and
-            `lambda_4_plus` (N), `clearance_sls1` and `clearance_sls2` (m); the attribute
-            `parameter_slope` is the slope, rad.
-        every: which values have symbols: multiples of it, and the ends.
+        gaits: dataset over one parameter, with `settled`, `lambda_I4` (N s), `lambda_2_plus` and
+            `lambda_4_plus` (N), `clearance_sls1` and `clearance_sls2` (m). Its attribute
+            `parameter_slope` is the slope in rad.
+        marker_interval: parameter values that are multiples of it have symbols, and so have both
+            ends.
 
     Returns:
         Figure: the impulse and the two forces over the parameter.
@@ -276,7 +284,7 @@ def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
         >>> columns |= {"clearance_sls1": [0.01, 0.02], "clearance_sls2": [0.01, 0.02]}
         >>> over = {name: ("damping", values) for name, values in columns.items()}
         >>> gaits = xr.Dataset(over, {"damping": [80.0, 120.0]}, {"parameter_slope": 0.3})
-        >>> figure = vrw.plot.indicators(gaits)
+        >>> figure = vrw.plot.draw_indicators(gaits)
     """
     drawable(
         "gaits", gaits, ("settled", "lambda_I4"), "give gaits over one parameter, as its page tells"
@@ -307,13 +315,13 @@ def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
         axes.set_xlabel(axis_label(vary, "{symbol}"))
         axes.set_ylabel(kind)
         axes.legend(loc="lower right" if letter == "a" else "upper right", ncols=len(series))
-    slope = gaits.attrs["parameter_slope"]  # the paper's caption has another: a misprint
+    slope = gaits.attrs["parameter_slope"]  # the slope in the caption of the paper is a misprint
     panels[0].text(0.02, 0.05, value_label("slope", slope), transform=panels[0].transAxes)
     return figure
 
 
 def _rotated(x: Coordinate, z: Coordinate, slope: float) -> tuple[Coordinate, Coordinate]:
-    """From the slope's frame to one with gravity straight down."""
+    """Return coordinates in a frame with vertical gravity, from those in the slope's frame."""
     return (
         x * np.cos(slope) + z * np.sin(slope),
         z * np.cos(slope) - x * np.sin(slope),
@@ -324,22 +332,21 @@ def _rotated(x: Coordinate, z: Coordinate, slope: float) -> tuple[Coordinate, Co
 def walk_frames(
     step: xr.Dataset, n_frames: int = 36, slow: float = 2.0
 ) -> tuple[list[Image.Image], int]:
-    """The wheel over one step of a steady gait as frames that loop, and ms per frame.
+    """Return looping frames of one step of a steady gait, and the duration of a frame in ms.
 
-    The camera travels with the mean speed; arrows are ground forces, 1 m for 300 N. `slow` is how
-    many times slower than life it plays.
+    The camera moves at the mean speed. Arrows are ground forces, 1 m for 300 N.
 
     Args:
-        step: of `vrw.simulate` over one step of a gait.
-        n_frames: of the step.
-        slow: 2 plays at half speed.
+        step: dataset of `vrw.simulate` over one step of a gait.
+        n_frames: number of frames of the step.
+        slowdown: factor of slow motion; 2 plays at half speed.
 
     Returns:
-        tuple[list[Image], int]: pictures of Pillow's, and milliseconds for each.
+        tuple[list[Image], int]: images of Pillow, and the milliseconds per frame.
 
     Examples:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
-        >>> frames, milliseconds = vrw.plot.walk_frames(gait, n_frames=2)
+        >>> frames, milliseconds = vrw.plot.draw_walk_frames(gait, n_frames=2)
         >>> len(frames)
         2
     """
@@ -370,6 +377,7 @@ def walk_frames(
 
 
 def _draw_wheel(axes: Axes, step: xr.Dataset, t: float) -> None:
+    """Draw hub and legs of the wheel at the time t, in s."""
     slope, n = step.attrs["parameter_slope"], step.attrs["parameter_n_legs"]
     names = ("theta", "L1", "L2", "hub_x", "hub_z")
     theta, L1, L2, x, z = (float(np.interp(t, step.time, step[name])) for name in names)
@@ -392,6 +400,7 @@ def _draw_wheel(axes: Axes, step: xr.Dataset, t: float) -> None:
 
 
 def _draw_forces(axes: Axes, now: xr.Dataset, foot_2_x: float) -> None:
+    """Draw arrows of the ground forces on both feet."""
     slope, push = now.attrs["parameter_slope"], [float(now[name]) for name in FORCES]
     for foot, tangential, normal in ((0.0, *push[:2]), (foot_2_x, *push[2:])):
         if normal != 0.0:
@@ -405,7 +414,7 @@ def _draw_forces(axes: Axes, now: xr.Dataset, foot_2_x: float) -> None:
 
 
 def _draw_ground(axes: Axes, slope: float, centre: float, stride: float) -> None:
-    """The slope with marks that repeat each half stride, so that the walk loops."""
+    """Draw the slope with marks that repeat every half stride, so that the animation loops."""
     ends = np.array([centre - 3.0, centre + 3.0])
     axes.plot(*_rotated(ends, 0.0 * ends, slope), color="black", linewidth=1.2)
     spacing = 0.5 * stride
@@ -416,22 +425,22 @@ def _draw_ground(axes: Axes, slope: float, centre: float, stride: float) -> None
 
 
 def save_animation(frames: Sequence[Image.Image], milliseconds: int, path: Path) -> Path:
-    """Write frames as a looping GIF with one shared palette of 32 colours.
+    """Write frames as a looping GIF with one shared palette of 32 colors.
 
     Args:
-        frames: as `walk_frames` gives them.
-        milliseconds: that each is shown.
-        path: of the GIF.
+        frames: images as `draw_walk_frames` returns them.
+        milliseconds: duration of a frame, in ms.
+        path: path of the GIF.
 
     Returns:
-        Path: the same.
+        Path: the path of the GIF.
 
     Raises:
-        OSError: it can't be written.
+        OSError: if the file cannot be written.
 
     Examples:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
-        >>> frames, milliseconds = vrw.plot.walk_frames(gait, n_frames=2)
+        >>> frames, milliseconds = vrw.plot.draw_walk_frames(gait, n_frames=2)
         >>> path = Path(tempfile.mkdtemp(), "walk.gif")
         >>> vrw.plot.save_animation(frames, milliseconds, path).name
         'walk.gif'
