@@ -1,4 +1,4 @@
-"""What the paper publishes, set beside what is computed here."""
+"""Comparison of the published results of the paper with the results of this library."""
 
 from vrw_jax.paper.facts.base import Fact
 from vrw_jax.paper.facts.table import held

@@ -1,9 +1,9 @@
-"""Which gait a wheel settles into by walking, and along a parameter from neighbour to neighbour.
+"""Gaits that a wheel reaches by walking, also along a parameter from one gait to the next.
 
-No equation is solved for a fixed point: what stands here has been walked to, so it is stable, and
-it checks the Newton search independently. The rung continues formally where the ground would have
-to pull on Leg 1, as it does for scuffing, so that gaits can be followed past the c at which λ2⁺
-vanishes; elsewhere that changes nothing.
+No equation is solved for a fixed point. Every gait here is the limit of a walk, so it is stable and
+checks the Newton search independently. The model continues formally if the ground would have to
+pull on Leg 1, as it does for scuffing. Gaits can therefore be followed past the c at which λ2⁺
+vanishes; other gaits are unaffected.
 """
 
 from __future__ import annotations
@@ -24,30 +24,32 @@ from vrw_jax.walks import step, walk
 from vrw_jax.wheel import Outcome, WheelParams
 
 N_STEPS = 30
-"""Steps of each walk: the slowest gait on the branch, c = 70, settles to rounding in them."""
+"""Number of steps per walk, chosen because the slowest gait, c = 70, converges to round-off."""
 
 SETTLED = 1e-8
-"""Largest change of the section state from step to step in a settled gait: ten times the error of
+"""Largest change of the section state per step in a settled gait, chosen as ten times the error of
 a step at the default options."""
 
 LAST = 5
-"""Steps that must not change it: a gait of longer period may by chance repeat once."""
+"""Number of steps below the tolerance, because a longer period may repeat once by chance."""
 
 
 def paper_wheel() -> ViscoelasticWheel:
+    """Return the paper's model, which continues after Leg 1 lifts off."""
     return ViscoelasticWheel(stop_at_lift_off=False)
 
 
 def changed(params: WheelParams, name: str, value: float) -> WheelParams:
+    """Return the wheel with another value of one parameter."""
     change: dict[str, Any] = {name: value}
     return dataclasses.replace(params, **change)
 
 
 def approach(params: WheelParams, x: SectionState) -> xr.Dataset:
-    """Section states of a walk and how much each step still changes them.
+    """Return the section states of a walk and their change per step.
 
-    `change` is the Euclidean distance to the section state before, over (rad, rad/s, m/s); the
-    walk has `settled` into a period-1 gait when each of the last five is below `SETTLED`.
+    `change` is the Euclidean distance to the previous section state in (rad, rad/s, m/s). The walk
+    is `settled` in a period-1 gait if each of the last five changes is below `SETTLED_TOLERANCE`.
     """
     walked = walk(params, x, N_STEPS, model=paper_wheel())
     stepped = int(walked.n_stepped)
@@ -76,10 +78,10 @@ def approach(params: WheelParams, x: SectionState) -> xr.Dataset:
 def states_along(
     params: WheelParams, name: str, values: Sequence[float], x: SectionState
 ) -> Iterator[xr.Dataset]:
-    """The walks at each of `values` of the parameter `name`, each begun from its neighbour's gait.
+    """Yield the walks at each of `values` of the parameter `name`, each from the previous gait.
 
-    The start is extrapolated from the last two settled gaits; a walk that fails or does not settle
-    leaves no start behind. See `approach`; `settled` is added to its attributes.
+    The start is extrapolated from the last two settled gaits. A walk that fails or does not settle
+    is not used for it. See `walk_into_gait` for the datasets.
     """
     settled_values: list[float] = []
     settled_states: list[np.ndarray] = []
@@ -99,10 +101,11 @@ def along(
     x: SectionState,
     progress: Callable[[float], None] | None = None,
 ) -> xr.Dataset:
-    """The gaits of `states_along` with all measures of one more step, over the parameter `name`.
+    """Return the gaits of `walk_along_parameter` with all measures, over the parameter `name`.
 
-    `settled` says whether the walk had come to a period-1 gait, `change` how much its last steps
-    still changed it. `progress` is told the share that is done.
+    The measures are those of one more step. `settled` is whether the walk reached a period-1 gait,
+    and `change` is the largest change of its last steps. `on_progress` is called with the completed
+    share.
     """
     rows: list[dict[str, np.ndarray]] = []
     for value, walked in zip(values, states_along(params, name, values, x), strict=True):
@@ -123,7 +126,7 @@ def along(
 def _extrapolated(
     values: list[float], states: list[np.ndarray], value: float, x: SectionState
 ) -> SectionState:
-    """A start at `value` on the line through the last two settled gaits."""
+    """Return a start at `value` on the line through the last two settled gaits."""
     if not states:
         return x
     if len(states) == 1:
@@ -135,6 +138,7 @@ def _extrapolated(
 def _table(
     params: WheelParams, name: str, values: Sequence[float], columns: dict[str, np.ndarray]
 ) -> xr.Dataset:
+    """Return the labelled dataset of columns over the parameter `name`."""
     data = variables({key: columns[key] for key in STEP | MARGINS}, name)
     told = {"units": "1", "long_name": "largest change of the last five steps"}
     data |= {

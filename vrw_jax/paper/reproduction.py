@@ -1,6 +1,6 @@
-"""The paper, reproduced: its figures, and the table of its facts published against found.
+"""Reproduction of the paper: its figures, and the table of its facts, published and computed.
 
-Everything is walked to from one start; no fixed point is solved for.
+All gaits are limits of walks from one start; no equation is solved for a fixed point.
 """
 
 import math
@@ -19,31 +19,31 @@ from vrw_jax.walks import paper_start, simulate
 from vrw_jax.wheel import WheelParams
 
 Progress = Callable[[float, str], None]
-"""Told the share that is done, 0 to 1, and what is being done."""
+"""Function that is called with the completed share, 0 to 1, and the present task."""
 
 DAMPINGS = (50.0, 100.0, 200.0)
-"""Of figures 8 and 9, N s/m."""
+"""Damping values of figures 8 and 9, in N s/m."""
 
 
 def silent(share: float, what: str) -> None:
-    """Progress for nobody."""
+    """Ignore the progress."""
 
 
 def settle_at_table_1() -> xr.Dataset:
-    """The walk from the start for Table 1 into its gait."""
+    """Return the walk from the start for Table 1 into its gait."""
     return approach(WheelParams(), paper_start())
 
 
 def gait_at_table_1(n_steps: int = 3) -> xr.Dataset:
-    """Trajectory of the gait of Table 1 at slope 0.30: figures 6 and 7."""
+    """Return the trajectory of the gait of Table 1 at slope 0.30, for figures 6 and 7."""
     state = jnp.asarray(settle_at_table_1().section_state.values[-1])
     return simulate(WheelParams(), state, n_steps, model=paper_wheel())
 
 
 def gaits_at(dampings: Sequence[float]) -> list[xr.Dataset]:
-    """One step of the gait at each of `dampings`, N s/m, 1 to 219: figures 8 and 9.
+    """Return one step of the gait at each of `dampings`, 1 to 219 N s/m, for figures 8 and 9.
 
-    Walked to from Table 1 in steps of at most 10 N s/m.
+    Walks lead there from Table 1 with changes of at most 10 N s/m.
     """
     start = jnp.asarray(settle_at_table_1().section_state.values[-1])
     table_1, gaits = WheelParams(), []
@@ -60,7 +60,7 @@ def gaits_at(dampings: Sequence[float]) -> list[xr.Dataset]:
 
 
 def gaits_along_damping(progress: Callable[[float], None] | None = None) -> xr.Dataset:
-    """The gaits at every whole c from 1 to 219, and the walks up to 224: figure 10."""
+    """Return the gaits at every integer c from 1 to 219, and the walks up to 224, for figure 10."""
     params = WheelParams()
     start = jnp.asarray(settle_at_table_1().section_state.values[-1])
     down = along(params, "damping", range(200, 0, -1), start, progress)
@@ -69,7 +69,7 @@ def gaits_along_damping(progress: Callable[[float], None] | None = None) -> xr.D
 
 
 def collect(progress: Progress = silent) -> Evidence:
-    """Walk everything that the facts and figures are read off."""
+    """Compute all walks that the facts and figures use, and return them."""
     table_1 = WheelParams()
     progress(0.0, "walk from the start for Table 1")
     settling = settle_at_table_1()
@@ -104,7 +104,7 @@ def collect(progress: Progress = silent) -> Evidence:
 
 
 def draw(evidence: Evidence, folder: Path) -> list[Path]:
-    """Figures 6 to 10 as SVG and PNG, and the walk as a GIF, in `folder`; returns the paths."""
+    """Write figures 6 to 10 as SVG and PNG, and the walk as a GIF, and return the paths."""
     two_steps = evidence.gait.isel(time=evidence.gait.step.values < 2)
     figures = {
         "fig06_gait": plots.gait_panels(evidence.gait),
@@ -119,9 +119,9 @@ def draw(evidence: Evidence, folder: Path) -> list[Path]:
 
 
 def reproduce(folder: str | Path, progress: Progress = silent) -> list[Fact]:
-    """Write all figures and the table of facts into `folder`; the facts, each of which may fail.
+    """Write all figures and the table of facts into `folder`, and return the facts.
 
-    `facts.md` and `facts.csv` hold the table, `indicators.csv` the numbers behind Figure 10.
+    `facts.md` and `facts.csv` hold the table, and `indicators.csv` the numbers of Figure 10.
     """
     folder = Path(folder)
     evidence = collect(progress)

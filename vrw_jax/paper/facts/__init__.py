@@ -1,3 +1,3 @@
-"""The paper's facts, published against found."""
+"""Facts of the paper, published and computed."""
 
 from vrw_jax.paper.facts.table import all_facts, as_page, write

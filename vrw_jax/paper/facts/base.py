@@ -1,4 +1,4 @@
-"""One row of the table, the evidence it is read off, and how claims are held against numbers."""
+"""Rows of the table of facts, the evidence for them, and the comparison of claims with numbers."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from vrw_jax.wheel import WheelParams
 
 @dataclass(frozen=True)
 class Fact:
-    """One row: what is claimed, where, what was published, what was found, whether it holds."""
+    """Row of the table: claim, source, published and computed value, and whether they agree."""
 
     group: str
     claim: str
@@ -22,67 +22,74 @@ class Fact:
     published: str
     found: str
     holds: bool
-    reason: str  # for the tolerance, or what would make it fail
+    reason: str  # reason for the tolerance, or what makes the fact fail
 
     @property
     def by_code(self) -> bool:
-        """Whether the number to meet is not printed, but an independent code's."""
+        """Return whether an independent code gives the reference number, not the paper."""
         return CODE in self.where or CODE in self.published
 
     @property
     def verdict(self) -> str:
+        """Return whether the fact holds, as text."""
         return "holds" if self.holds else "does not hold"
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Labelled results that the facts are read off; nothing else goes into the table."""
+    """Labelled results from which all facts are computed."""
 
     params: WheelParams  # of Table 1
-    settling: xr.Dataset  # `gaits.approach` from the start for Table 1
+    settling: xr.Dataset  # `gaits.walk_into_gait` from the start for Table 1
     gait: xr.Dataset  # three steps of the gait of Table 1, `simulate`
     by_damping: Sequence[xr.Dataset]  # one step at c = 50, 100, 200
-    branch: xr.Dataset  # `gaits.along` damping 1, 2, ..., 224 at slope 0.30
-    gentler: xr.Dataset  # `gaits.along` slope down to 0.10 at c = 100
-    gentle: xr.Dataset  # `gaits.along` damping up to 220 at slope 0.10
-    gentle_low: xr.Dataset  # `gaits.along` damping down to 4 at slope 0.10
-    too_fast: xr.Dataset  # `gaits.approach` from a start with 2 rad/s at Table 1
+    branch: xr.Dataset  # `gaits.measure_gaits_along` damping 1, 2, ..., 224 at slope 0.30
+    gentler: xr.Dataset  # `gaits.measure_gaits_along` slope down to 0.10 at c = 100
+    gentle: xr.Dataset  # `gaits.measure_gaits_along` damping up to 220 at slope 0.10
+    gentle_low: xr.Dataset  # `gaits.measure_gaits_along` damping down to 4 at slope 0.10
+    too_fast: xr.Dataset  # `gaits.walk_into_gait` from a start with 2 rad/s at Table 1
 
     @property
     def table_1(self) -> xr.Dataset:
+        """Return the gait of Table 1."""
         return self.branch.sel(damping=200.0)
 
 
 CODE = "independent code"
+"""Source of a number that the paper does not print."""
 DIGIT = "half a unit of the last digit published"
+"""Reason for the usual tolerance."""
 SIGN = "a sign: no tolerance"
+"""Reason for a comparison without a tolerance."""
 ROUND_OFF = 1e-9
+"""Tolerance of numbers that differ by the error of a step, in SI units."""
 
 Numbers = Mapping[str, Any]
-"""What a group of claims speaks of, read off the evidence."""
+"""Numbers of a group of claims by name, computed from the evidence."""
 
 
 @dataclass(frozen=True)
 class Claim:
-    """What is published, how the numbers tell what was found, and when the two agree."""
+    """Published statement, text of the computed value, and condition of their agreement."""
 
     claim: str
     where: str
     published: str
-    found: str  # a format of the group's numbers
-    holds: Callable[[Any], bool]  # asked with the group's numbers as attributes
+    found: str  # format string of the numbers of the group
+    holds: Callable[[Any], bool]  # takes the numbers of the group as attributes
     reason: str = DIGIT
 
 
 @dataclass(frozen=True)
 class Group:
-    """Claims under one heading that speak of the same numbers."""
+    """Claims under one heading that use the same numbers."""
 
     title: str
     numbers: Callable[[Evidence], Numbers]
     claims: tuple[Claim, ...]
 
     def facts(self, evidence: Evidence) -> list[Fact]:
+        """Return the facts of the claims."""
         numbers = self.numbers(evidence)
         told = SimpleNamespace(**numbers)
         return [
@@ -100,7 +107,7 @@ class Group:
 
 
 def near(**published: tuple[float | tuple[float, ...], float]) -> Callable[[Any], bool]:
-    """Holds where every number named lies at its published value, within the tolerance."""
+    """Return the condition that each named number is within a tolerance of its published value."""
     return lambda n: all(
         bool(np.all(np.abs(np.asarray(getattr(n, name)) - value) <= tolerance))
         for name, (value, tolerance) in published.items()
@@ -108,9 +115,10 @@ def near(**published: tuple[float | tuple[float, ...], float]) -> Callable[[Any]
 
 
 def first_step(gait: xr.Dataset) -> xr.Dataset:
+    """Return the first step of a trajectory."""
     return gait.isel(time=gait.step.values == 0)
 
 
 def by_phase(gait: xr.Dataset) -> list[xr.Dataset]:
-    """Its DLS, SLS-I and SLS-II."""
+    """Return the DLS, SLS-I and SLS-II of a trajectory."""
     return [gait.isel(time=gait.phase.values == phase) for phase in range(len(PHASES))]

@@ -1,4 +1,4 @@
-"""Sections 4 and 5.2, the gait of Table 1 and its indicators, and what the model assumes unsaid."""
+"""Claims of Sections 4 and 5.2: the gait of Table 1, its indicators, and implicit assumptions."""
 
 import math
 
@@ -23,6 +23,7 @@ from vrw_jax.wheel import Outcome
 
 
 def _of_table_1(e: Evidence) -> Numbers:
+    """Return numbers of the gait of Table 1."""
     step = first_step(e.gait)
     phases = dls, sls1, sls2 = by_phase(step)
     change = e.settling.change.values[1:]
@@ -61,11 +62,12 @@ def _of_table_1(e: Evidence) -> Numbers:
 
 
 def _n_maxima(values: np.ndarray) -> int:
-    """Samples larger than both neighbours."""
+    """Return the number of samples that are larger than both neighbors."""
     return int(np.sum((values[1:-1] > values[:-2]) & (values[1:-1] >= values[2:])))
 
 
 def _of_three_dampings(e: Evidence) -> Numbers:
+    """Return numbers of foot height and rear force at three dampings."""
     gaits = {g.attrs["parameter_damping"]: g for g in e.by_damping}
     lowest = {c: float(gaits[c].foot_2_z.min()) for c in sorted(gaits)}
     first = {c: float(gaits[c].lambda_4[0]) for c in sorted(gaits)}
@@ -146,6 +148,7 @@ THREE_DAMPINGS = Group("Foot 2 and rear force for three dampings", _of_three_dam
 
 
 def _along_damping(e: Evidence) -> Numbers:
+    """Return numbers of the indicators along the damping."""
     branch = e.branch
     regular = branch.sel(damping=slice(1.0, 219.0))
     beyond = branch.sel(damping=slice(220.0, None))
@@ -226,6 +229,7 @@ INDICATORS = Group("DLS indicators over c, slope 0.30 rad", _along_damping, (
 
 
 def _premises_of_table_1(e: Evidence) -> Numbers:
+    """Return numbers of the assumptions of the model at Table 1."""
     one, step = e.table_1, first_step(e.gait)
     dls, *_ = by_phase(step)
     natural, locked = float(e.params.natural_length), float(e.params.locked_length)

@@ -1,4 +1,4 @@
-"""Where the paper is misprinted, each with the numbers that show it."""
+"""Misprints of the paper, each with numbers that show it."""
 
 import math
 
@@ -10,6 +10,7 @@ from vrw_jax.wheel import Outcome
 
 
 def _printed_and_mended(e: Evidence) -> Numbers:
+    """Return numbers of the equations as printed and as corrected."""
     state, here = e.table_1.section_state.values, float(e.table_1.lambda_I4)
     landing = printed.landing(e.params, state)
     reference = printed.landing_foot_velocity_by_differences(e.params, state)

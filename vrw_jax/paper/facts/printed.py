@@ -1,7 +1,7 @@
-"""The paper's equations as printed beside their mended form, where numbers can tell them apart.
+"""Equations of the paper as printed and in corrected form, if numbers can distinguish the two.
 
-In the paper's five coordinates q = (x, z, theta, L1, L2): it shares only the mass
-matrix and the momentum with the simulator.
+They use the five coordinates q = (x, z, theta, L1, L2) of the paper, and share only the mass matrix
+and the momentum with the simulator.
 """
 
 from typing import NamedTuple
@@ -18,7 +18,7 @@ from vrw_jax.wheel import Motion, Symbols, WheelParams, length_at_touchdown, mas
 
 @jax.jit
 def _touchdown(params: WheelParams, theta: float) -> tuple[Symbols, Array]:
-    """The paper's symbols, and the length of Leg 1 at touchdown, m."""
+    """Return the symbols of the paper, and the length of Leg 1 at touchdown in m."""
     s = params.symbols()
     return s, length_at_touchdown(s, jnp.asarray(theta))
 
@@ -26,7 +26,7 @@ def _touchdown(params: WheelParams, theta: float) -> tuple[Symbols, Array]:
 def double_support_jacobian(
     theta: np.ndarray, L1: np.ndarray, L2: np.ndarray, alpha: float, as_printed: bool
 ) -> np.ndarray:
-    """J_DLS of eq. (11), shape (..., 4, 5); the misprint is the sign in J43."""
+    """Return J_DLS of eq. (11), shape (..., 4, 5); the misprint is the sign in J43."""
     zero, one = np.zeros_like(theta), np.ones_like(theta)
     sin, cos = np.sin(theta), np.cos(theta)
     rear_sin, rear_cos = np.sin(theta + alpha), np.cos(theta + alpha)
@@ -41,7 +41,7 @@ def double_support_jacobian(
 
 
 def constraint_violation(gait: xr.Dataset, as_printed: bool) -> float:
-    """Largest speed that J q' of eq. (2) gives the feet in the double support of a walk, m/s."""
+    """Return the largest foot speed J q' of eq. (2) in the double support of a walk, in m/s."""
     held = gait.isel(time=gait.phase.values == 0)
     alpha = 2.0 * np.pi / gait.attrs["parameter_n_legs"]
     J = double_support_jacobian(
@@ -52,7 +52,7 @@ def constraint_violation(gait: xr.Dataset, as_printed: bool) -> float:
 
 
 class LandingByThePaper(NamedTuple):
-    """Collision I by eqs (15)-(21) and (33)-(35), mended or as printed."""
+    """Collision I by eqs (15)-(21) and (33)-(35), corrected and as printed."""
 
     after: np.ndarray  # q'+ of eq. (20)
     impulse: np.ndarray  # lambda_I = -X^-1 J q'
@@ -61,7 +61,7 @@ class LandingByThePaper(NamedTuple):
 
 
 def landing(params: WheelParams, section_state: np.ndarray) -> LandingByThePaper:
-    """Collision I from the section state (theta-, dtheta-, dL1-) in five coordinates."""
+    """Return collision I from the section state (theta-, dtheta-, dL1-) in five coordinates."""
     theta, dtheta, dL1 = (float(v) for v in section_state)
     s, reach = jax.tree.map(float, _touchdown(params, theta))
     foot = landing_foot_velocity(params, section_state, bare_rate=dL1)
@@ -80,7 +80,7 @@ def landing(params: WheelParams, section_state: np.ndarray) -> LandingByThePaper
 
 @jax.jit
 def five_coordinate_mass_matrix(s: Symbols, theta: Scalar, L1: Scalar, L2: Scalar) -> Array:
-    """M(q) of eq. (1): the planted wheel's, and the momentum that a moving foot adds."""
+    """Return M(q) of eq. (1), from the planted wheel's and the momentum of a moving foot."""
     planted = mass_matrix(s, L1, L2)
     units = jnp.eye(3)
     angular = jnp.stack([jnp.stack(planted.times(tuple(unit))) for unit in units])
@@ -93,7 +93,7 @@ def five_coordinate_mass_matrix(s: Symbols, theta: Scalar, L1: Scalar, L2: Scala
 def landing_foot_velocity(
     params: WheelParams, section_state: np.ndarray, bare_rate: float
 ) -> np.ndarray:
-    """Velocity of the landing foot by eqs (16), (17), with `bare_rate` for their bare L1 rate."""
+    """Return the velocity of the landing foot by eqs (16) and (17) with `bare_rate` as L1 rate."""
     theta, dtheta, _ = (float(v) for v in section_state)
     s, reach = jax.tree.map(float, _touchdown(params, theta))
     L0, alpha = float(s.L0), float(s.alpha)
@@ -105,12 +105,13 @@ def landing_foot_velocity(
 def landing_foot_velocity_by_differences(
     params: WheelParams, section_state: np.ndarray
 ) -> np.ndarray:
-    """The same from the foot's position a moment before and after; right to some 1e-11 m/s."""
-    h = 1e-6  # s, whose square it is right to
+    """Return the same by central differences of the foot's position, accurate to 1e-11 m/s."""
+    h = 1e-6  # s; the error is proportional to its square
     theta, dtheta, dL1 = (float(v) for v in section_state)
     s, reach = jax.tree.map(float, _touchdown(params, theta))
 
     def position(t: float) -> np.ndarray:
+        """Return the position of the landing foot at the time t, in m."""
         angle, length = theta + dtheta * t, reach + dL1 * t
         hub = length * np.array([np.sin(angle), np.cos(angle)])
         ahead = angle - float(s.alpha)

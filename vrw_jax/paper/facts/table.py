@@ -1,4 +1,4 @@
-"""The whole table: every fact that the paper publishes, beside what is found; each can fail."""
+"""Table of every fact that the paper publishes, with the computed value; each fact can fail."""
 
 import csv
 import itertools
@@ -22,22 +22,24 @@ GROUPS = (TYPICAL_GAIT, THREE_DAMPINGS, INDICATORS, PREMISES, MISPRINTS)
 
 
 def all_facts(evidence: Evidence) -> list[Fact]:
+    """Return the facts of all groups."""
     return [fact for group in GROUPS for fact in group.facts(evidence)]
 
 
 def _cell(text: str) -> str:
-    """Text with minus signs for hyphens before numbers."""
+    """Return text with minus signs in place of hyphens before numbers."""
     return re.sub(r"(?<![\w.])-(?=\d)", "−", text)
 
 
 def held(table: Sequence[Fact]) -> str:
-    """How many hold, and whose numbers they are."""
+    """Return a sentence on how many facts hold and where their numbers come from."""
     n, by_code = len(table), sum(fact.by_code for fact in table)
     by_whom = f"{n - by_code} that the paper publishes, {by_code} by independent code"
     return f"{sum(fact.holds for fact in table)} of {n} hold: {by_whom}"
 
 
 def as_page(table: Sequence[Fact]) -> str:
+    """Return the table as a page of Markdown."""
     missing = [fact for fact in table if not fact.holds]
     lines = [
         "# The paper's facts, published against found",
@@ -63,6 +65,7 @@ def as_page(table: Sequence[Fact]) -> str:
 
 
 def write(table: Sequence[Fact], folder: Path) -> list[Path]:
+    """Write the table as facts.md and facts.csv, and return the paths."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / "facts.md", folder / "facts.csv"]
     paths[0].write_text(as_page(table), encoding="utf-8")
