@@ -1,3 +1,3 @@
-"""The command line: configurations in, reports out."""
+"""The command line: reads configurations and writes reports."""
 
 from vrw_jax.app.cli import main

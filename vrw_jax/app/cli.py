@@ -1,7 +1,7 @@
 """The command line: walk a wheel, reproduce the paper, scan parameters.
 
-Nothing heavy is imported before a command runs, so that help comes at once. What a user got wrong
-is said in one sentence on stderr, with exit code 2.
+Slow imports are made inside commands, so that help appears at once. A user's mistake is reported in
+one sentence on stderr, with exit code 2.
 """
 
 import gc
@@ -22,13 +22,14 @@ if TYPE_CHECKING:
     from vrw_jax.app.config import Config
 
 FACT_FAILED, NOT_CONVERGED = 1, 1
-"""Exit codes, beside those of a user's mistake and of a Ctrl-C."""
+"""Exit codes of a failed fact and of a run that did not converge."""
 
 Folder = Annotated[
     Path | None,
     typer.Option("--out", help="Folder for the result; results/NAME of the config by default."),
 ]
 Picture = Annotated[bool, typer.Option(help="Draw the result.")]
+"""Options that several commands share."""
 
 app = typer.Typer(
     name="vrw",
@@ -41,25 +42,28 @@ app = typer.Typer(
 
 
 def main() -> None:
-    # Traces are many small objects that live on: looking for dead ones among them as often as
-    # Python does by itself takes a tenth of a cold start.
+    """Run the command line."""
+    # Traces consist of many small, long-lived objects. With Python's default thresholds the garbage
+    # collector takes a tenth of a cold start.
     gc.set_threshold(200_000, 20, 20)
     signal.signal(signal.SIGINT, _stop)
     app()
 
 
 def _stop(_signal: int, _frame: object) -> None:
-    """A first Ctrl-C ends the command in order; a second one need not wait for that."""
+    """Handle the first Ctrl-C: end the command in order, and let a second one end it at once."""
     signal.signal(signal.SIGINT, _stop_at_once)
     raise KeyboardInterrupt
 
 
 def _stop_at_once(_signal: int, _frame: object) -> None:
+    """Handle the second Ctrl-C: end the process at once."""
     os.write(2, b"vrw: stopped at once; run the same to go on.\n")
     os._exit(INTERRUPTED)
 
 
 def _version(wanted: bool) -> None:
+    """Print the version and exit, if wanted."""
     if wanted:
         try:
             number = importlib.metadata.version("vrw-jax")
@@ -115,11 +119,11 @@ def gait(
     ] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Steps to walk.")] = None,
 ) -> None:
-    """Walk a wheel and tell its gait: durations, speed, indicators, and which premises hold.
+    """Walk a wheel and print its gait: durations, speed, indicators and margins.
 
-    Walks step by step from a start near the gait of Table 1 (or the config's), then looks for the
-    limit cycle: on real ground the slowest that attracts, or with a start of the config's the one
-    next to where it got to. Writes no file.
+    Walks step by step from a start near the gait of Table 1, or from the start in the config. Then
+    finds the limit cycle near the last step. With unilateral contact and no start in the config,
+    finds the slowest attracting gait instead. Writes no file.
 
     [bold]Examples[/bold]
 
@@ -167,11 +171,9 @@ def explore(
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Begin there; may be repeated."),
     ] = None,
-    rung: Annotated[
-        str, typer.Option(help="viscoelastic, rigid or unilateral (real ground).")
-    ] = "viscoelastic",
+    rung: Annotated[str, typer.Option(help="viscoelastic, rigid or unilateral.")] = "viscoelastic",
 ) -> None:
-    """Open the wheel to play with in your browser: one page, which computes by itself."""
+    """Open an interactive page of the wheel in your browser; the page computes by itself."""
     with sentences():
         from vrw_jax.app.config import assignment
         from vrw_jax.web import page_address
@@ -186,9 +188,9 @@ def explore(
 def init(
     folder: Annotated[Path, typer.Argument(help="Where to write them.")] = Path("configs"),
 ) -> None:
-    """Write the example configs: start from one of them and change what you like.
+    """Write the example configs as a start for your own.
 
-    Files that are there already stay as they are; one that differs is named, and nothing written.
+    Existing files are kept. If an existing file differs, the command names it and writes nothing.
     """
     with sentences():
         source = _examples()
@@ -208,13 +210,13 @@ def init(
 
 
 def _examples() -> Path:
-    """The folder of the example configs: in an installed package inside it, else beside it."""
+    """Return the folder of the example configs, inside an installed package or beside it."""
     package = Path(__file__).parents[1]
     return next(p for p in (package / "configs", package.parent / "configs") if p.is_dir())
 
 
 def _require_place(folder: Path) -> None:
-    """Refuse, before anything is computed, a folder that can't be written; leave none behind."""
+    """Raise if the folder cannot be written to, without creating it."""
     there = folder
     while not there.exists():
         there = there.parent
@@ -233,10 +235,10 @@ def reproduce(
         Path, typer.Option("--out", help="Folder for the figures and the table.")
     ] = Path("results/reproduction"),
 ) -> None:
-    """Reproduce the paper: figures 6 to 10, and every published fact beside what is found.
+    """Reproduce the paper: figures 6 to 10, and every published fact with the computed value.
 
-    Prints the table of facts and writes it beside the figures, with tolerances and their reasons.
-    Exit code 1 if a fact does not hold.
+    Prints the table of facts and writes it with the figures, including tolerances and their
+    reasons. The exit code is 1 if a fact does not hold.
     """
     from vrw_jax.runtime import start_jax
 
@@ -265,14 +267,14 @@ def scan(
     explain: Annotated[
         bool,
         typer.Option(
-            "--explain", help="Only tell sizes, and memory and time as measured on some samples."
+            "--explain", help="Only print sizes, and memory and time measured on some samples."
         ),
     ] = False,
     verify: Annotated[
-        bool, typer.Option("--verify", help="Only tell whether the store is complete and sound.")
+        bool, typer.Option("--verify", help="Only print whether the store is complete and intact.")
     ] = False,
     chunk: Annotated[
-        int | None, typer.Option(min=1, help="Most samples that are written at a time.")
+        int | None, typer.Option(min=1, help="Largest number of samples written at a time.")
     ] = None,
     dask: Annotated[
         str | None,
@@ -283,11 +285,11 @@ def scan(
     ] = None,
     picture: Picture = True,
 ) -> None:
-    """Find the steady gait of every sample of a design, with outcome and premises of each.
+    """Find the steady gait of every sample of a design, with its outcome and margins.
 
-    Writes scan.zarr and pictures (PNG and SVG) into the folder. Interrupt it as you like: the same
-    command goes on where it stopped, and ends with bitwise the same data. A finished scan is not
-    computed again, but for chunks whose files are damaged. Exit code 1 if --verify finds damage.
+    Writes scan.zarr and figures (PNG and SVG) into the folder. After an interruption the same
+    command continues where it stopped, and ends with bitwise the same data. Of a finished scan only
+    chunks with damaged files are computed again. The exit code is 1 if --verify finds damage.
 
     [bold]Examples[/bold]
 
@@ -325,7 +327,7 @@ def map_borders(
     config: Annotated[Path, typer.Argument(help="TOML file with a grid over two parameters.")],
     folder: Folder = None,
 ) -> None:
-    """Draw all borders of gaits over two parameters, on a scan: `vrw map configs/map_c_k.toml`."""
+    """Draw all special points of gaits over two parameters: `vrw map configs/map_c_k.toml`."""
     with sentences():
         settings, folder = _asked(config, folder, "design", "map")
         from vrw_jax.app.reports import require_map, write_map
@@ -346,12 +348,12 @@ def tune(
     folder: Folder = None,
     picture: Picture = True,
 ) -> None:
-    """Tune a wheel: the best gait within bounds that keeps its premises.
+    """Tune a wheel: find the best gait within bounds that satisfies its constraints.
 
-    Climbs along the branch of gaits with exact gradients, then walks the tuned wheel. Writes
-    path.zarr (every gait evaluated), summary.md, wheel.toml (the tuned wheel) and pictures (PNG and
-    SVG) into the folder. Exit code 1 if it did not end at an optimum, 2, with
-    nothing written, if its start has no gait.
+    Optimizes along the branch of gaits with exact gradients, then walks the tuned wheel. Writes
+    path.zarr (every gait evaluated), summary.md, wheel.toml (the tuned wheel) and figures (PNG and
+    SVG) into the folder. The exit code is 1 if the run does not end at an optimum. It is 2, and
+    nothing is written, if the start has no gait.
 
     [bold]Examples[/bold]
 
@@ -393,10 +395,11 @@ def continue_(
     folder: Folder = None,
     picture: Picture = True,
 ) -> None:
-    """Follow a branch of gaits along a parameter, stable or not, and locate every border on it.
+    """Continue a branch of stable and unstable gaits along a parameter, with its special points.
 
-    Writes branch.zarr (open it with xarray.open_zarr), borders.csv, summary.md and pictures (PNG
-    and SVG) into the folder. Exit code 1, and nothing written, if there is no gait to start from.
+    Writes branch.zarr (open it with xarray.open_zarr), borders.csv, summary.md and figures (PNG and
+    SVG) into the folder. The exit code is 1, and nothing is written, if there is no gait to start
+    from.
 
     [bold]Examples[/bold]
 
@@ -437,6 +440,7 @@ def continue_(
 
 
 def _settings(path: Path | None) -> "Config":
+    """Start JAX, and return the config at `path` or the default config."""
     from vrw_jax.runtime import start_jax
 
     start_jax()
@@ -453,7 +457,7 @@ NEEDED = {
     "branch": "names no branch, but continuation needs a parameter and bounds: add a table "
     "[branch], as in configs/branch_damping.toml of `vrw init`.",
 }
-"""What to say of a config that lacks what a command works on."""
+"""Messages about a config that lacks the table that a command needs."""
 
 SERVES = {
     "design": ("viscoelastic", "unilateral", "auto"),
@@ -461,13 +465,13 @@ SERVES = {
     "tune": ("viscoelastic", "unilateral"),
     "branch": ("viscoelastic", "unilateral", "rigid"),
 }
-"""The rungs that a command takes."""
+"""Models that each command supports."""
 
 
 def _asked(
     path: Path, folder: Path | None, needed: str, command: str = ""
 ) -> tuple["Config", Path]:
-    """The config, which says what is `needed`, and the folder of the result."""
+    """Return the config and the folder of the result; raise if the needed table is missing."""
     settings = _settings(path)
     if getattr(settings, needed) is None:
         raise ValueError(f"{settings.name} {NEEDED[needed]}")

@@ -1,6 +1,6 @@
-"""Configs: TOML files that say which wheel, which samples, which measures.
+"""Configs: TOML files that define a wheel, samples and measures.
 
-Whatever is wrong with a file is said in one sentence: what was given, what is allowed, what to do.
+An error in a file is reported in one sentence: what was given, what is allowed and what to do.
 """
 
 import math
@@ -34,19 +34,19 @@ RUNGS: dict[str, type[AbstractWheel]] = {
     "rigid": RigidWheel,
     "auto": LadderWheel,
 }
-"""Rungs as a config names them."""
+"""Model classes by the name in a config."""
 _OPTION_KEYS = tuple(Options.__dataclass_fields__)
 _AXIS_KEYS = ("from", "to", "count")
 
 
 @dataclass(frozen=True)
 class ScanConfig:
-    """Table `[scan]`: what to report, and how many samples are written at a time.
+    """Table `[scan]`: measures of a scan, and number of samples that are written at a time.
 
-    - `measures`: names, derivatives too; without them DLS fraction, speed and the like;
-    - `chunk`: samples written at a time; 4,096 without it;
-    - `tol`: error allowed of each measure on real ground (`rung = "unilateral"`), in its unit, by
-      the lowest rung that keeps it for a sample.
+    - `measures`: names of measures and derivatives; by default DLS fraction, speed and the like;
+    - `chunk`: number of samples that are written at a time; 4,096 by default;
+    - `tol`: permitted error of each measure with unilateral contact (`rung = "unilateral"`), in its
+      unit. Each sample uses the simplest model that permits it.
     """
 
     measures: tuple[str, ...] | None = None
@@ -56,11 +56,11 @@ class ScanConfig:
 
 @dataclass(frozen=True)
 class GaitConfig:
-    """Table `[gait]`: how far to walk, and from where.
+    """Table `[gait]`: length and start of a walk.
 
-    - `steps`: to walk;
-    - `start`: section state before the first touchdown, [rad, rad/s, m/s]; the rung's own
-      without it.
+    - `steps`: number of steps;
+    - `start`: section state before the first touchdown, [rad, rad/s, m/s]; by default that of the
+      model.
     """
 
     steps: int = 30
@@ -69,13 +69,13 @@ class GaitConfig:
 
 @dataclass(frozen=True)
 class TuneConfig:
-    """Table `[tune]`: what is sought, what moves within which bounds, what is to be kept.
+    """Table `[tune]`: objective, bounds and constraints of a tuning run.
 
     - `objective`: a measure, or weights of several, { dls_fraction = 1.0, speed = 0.1 };
-    - `bounds`: table [tune.bounds], of the free parameters, as damping = [20.0, 215.0];
-    - `constraints`: table [tune.constraints], least values of measures; without it every premise
-      that the rung can keep;
-    - `evaluations`: gaits, at most.
+    - `bounds`: table [tune.bounds] of the free parameters, such as damping = [20.0, 215.0];
+    - `constraints`: table [tune.constraints] of the least values of measures; by default every
+      margin that the model can satisfy;
+    - `evaluations`: largest number of evaluated gaits.
     """
 
     objective: str | Mapping[str, float] = "dls_fraction"
@@ -86,12 +86,12 @@ class TuneConfig:
 
 @dataclass(frozen=True)
 class BranchConfig:
-    """Table `[branch]`: along which parameter gaits are followed, and within what.
+    """Table `[branch]`: parameter and range of a branch of gaits.
 
-    - `parameter`: its name;
-    - `bounds`: its range, [lower, upper];
-    - `period`: steps until the gait repeats;
-    - `largest_step`: between points, as a share of the range; 0.02 without it.
+    - `parameter`: name of the parameter;
+    - `bounds`: range of the parameter, [lower, upper];
+    - `period`: number of steps until the gait repeats;
+    - `max_ds`: largest distance between points, as a share of the range; 0.02 by default.
     """
 
     parameter: str
@@ -117,20 +117,22 @@ class Config:
     name: str = ""
 
     def params(self, changed: Mapping[str, float | int] | None = None) -> WheelParams:
-        """The wheel: Table 1 with the config's values, then with those `changed`."""
+        """Return the wheel: Table 1 with the values of the config, and then with `changes`."""
         values: dict[str, Any] = {**self.wheel, **(changed or {})}
         return WheelParams(**values)
 
     def wheel_model(self) -> AbstractWheel:
+        """Return the model with its settings."""
         return RUNGS[self.rung](**self.model)
 
     def numerical_options(self) -> Options:
+        """Return the numerical options of the steps."""
         options: dict[str, Any] = {**self.options}
         return Options(**options)
 
 
 def load(path: str | Path) -> Config:
-    """Read and check a config file."""
+    """Read and check a config file; raise if it is invalid."""
     path = Path(path)
     if not path.exists():
         near = nearest(path.name, (beside.name for beside in path.parent.glob("*.toml")))
@@ -150,7 +152,7 @@ def load(path: str | Path) -> Config:
 
 
 def parse(text: str, name: str = "config") -> Config:
-    """Check the text of a config; `name` stands before every complaint."""
+    """Parse and check the text of a config; `name` begins every message about an error."""
     try:
         tables = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -162,6 +164,7 @@ def parse(text: str, name: str = "config") -> Config:
 
 
 def _config(tables: Mapping[str, object], text: str, name: str) -> Config:
+    """Return the config of the tables of a file; raise if a table is invalid."""
     _only(tables, TABLES, "the file", "tables")
     for key, table in tables.items():
         if not isinstance(table, dict):
@@ -204,24 +207,26 @@ def _config(tables: Mapping[str, object], text: str, name: str) -> Config:
 
 
 def _table(tables: Mapping[str, object], key: str) -> dict[str, object]:
+    """Return a table of the file, empty if it is missing."""
     table = tables.get(key, {})
     assert isinstance(table, dict)
     return table
 
 
 def assignment(text: str) -> tuple[str, float | int]:
-    """A parameter and its value from `name=value`, as given on the command line."""
+    """Return a parameter and its value from `name=value` of the command line."""
     name, equals, value = (part.strip() for part in text.partition("="))
     if not equals:
         raise ValueError(f"--set {text} has no '=': write a parameter and its value, damping=150.")
     try:
         number = int(value) if name == "n_legs" else float(value)
     except ValueError:
-        number = value  # type: ignore[assignment]  # the check below says what is wrong with it
+        number = value  # type: ignore[assignment]  # the check below reports the error
     return name, _wheel({name: number})[name]
 
 
 def _wheel(table: Mapping[str, object]) -> dict[str, float | int]:
+    """Return the parameters of `[wheel]`."""
     _only(table, (*PARAMETER_NAMES, "n_legs"), "[wheel]", "parameters")
     values: dict[str, float | int] = {}
     for name, value in table.items():
@@ -233,6 +238,7 @@ def _wheel(table: Mapping[str, object]) -> dict[str, float | int]:
 
 
 def _model(table: Mapping[str, object]) -> tuple[str, dict[str, float | int | str | bool]]:
+    """Return the name and the settings of the model of `[model]`."""
     rung = table.get("rung", Config.rung)
     require_known(rung, tuple(RUNGS), "rung")
     assert isinstance(rung, str)
@@ -243,6 +249,7 @@ def _model(table: Mapping[str, object]) -> tuple[str, dict[str, float | int | st
 
 
 def _options(table: Mapping[str, object]) -> dict[str, float | int | str | bool]:
+    """Return the options of `[options]`."""
     _only(table, _OPTION_KEYS, "[options]", "options")
     defaults = Options()
     return _like(table, {key: getattr(defaults, key) for key in _OPTION_KEYS})
@@ -251,7 +258,7 @@ def _options(table: Mapping[str, object]) -> dict[str, float | int | str | bool]
 def _like(
     table: Mapping[str, object], defaults: Mapping[str, object]
 ) -> dict[str, float | int | str | bool]:
-    """Settings of the kinds of their defaults: switches, names, whole or positive numbers."""
+    """Return settings of the types of their defaults: flags, names, whole or positive numbers."""
     values: dict[str, float | int | str | bool] = {}
     for key, value in table.items():
         default = defaults[key]
@@ -266,13 +273,14 @@ def _like(
         elif isinstance(default, int):
             values[key] = _whole(value, key, 1)
         elif key == FRICTION and value == math.inf:
-            values[key] = math.inf  # feet that never slide
+            values[key] = math.inf  # feet do not slip
         else:
             values[key] = _number(value, key, positive=True)
     return values
 
 
 def _scan(table: Mapping[str, object], rung: str) -> ScanConfig:
+    """Return the settings of `[scan]`; raise if the model does not have a measure."""
     _only(table, ScanConfig.__dataclass_fields__, "[scan]", "settings")
     measures = table.get("measures")
     if measures is not None:
@@ -292,6 +300,7 @@ def _scan(table: Mapping[str, object], rung: str) -> ScanConfig:
 
 
 def _gait(table: Mapping[str, object]) -> GaitConfig:
+    """Return the settings of `[gait]`."""
     _only(table, GaitConfig.__dataclass_fields__, "[gait]", "settings")
     steps = _whole(table.get("steps", GaitConfig.steps), "steps", 1)
     start = table.get("start")
@@ -305,6 +314,7 @@ def _gait(table: Mapping[str, object]) -> GaitConfig:
 
 
 def _tune(table: Mapping[str, object]) -> TuneConfig:
+    """Return the settings of `[tune]` and its tables."""
     _only(table, TuneConfig.__dataclass_fields__, "[tune]", "settings")
     objective = table.get("objective", TuneConfig.objective)
     if isinstance(objective, dict):
@@ -315,7 +325,7 @@ def _tune(table: Mapping[str, object]) -> TuneConfig:
     bounds = table.get("bounds")
     if not isinstance(bounds, dict) or not bounds:
         raise ValueError(
-            "[tune] lets no parameter move, but at least one must: add [tune.bounds] with lines "
+            "[tune] has no free parameter, but it needs at least one: add [tune.bounds] with lines "
             "such as damping = [20.0, 215.0]."
         )
     _only(bounds, PARAMETER_NAMES, "[tune.bounds]", "parameters")
@@ -334,6 +344,7 @@ def _tune(table: Mapping[str, object]) -> TuneConfig:
 
 
 def _branch(table: Mapping[str, object], names: tuple[str, ...]) -> BranchConfig:
+    """Return the settings of `[branch]` along one of the parameters `names`."""
     _only(table, BranchConfig.__dataclass_fields__, "[branch]", "settings")
     parameter = table.get("parameter")
     require_known(parameter, names, "parameter that a branch of this rung runs along")
@@ -357,17 +368,18 @@ def _branch(table: Mapping[str, object], names: tuple[str, ...]) -> BranchConfig
 def _design(
     kind: str, table: Mapping[str, object], names: tuple[str, ...]
 ) -> designs.AbstractDesign:
+    """Return the design of a table that sweeps some of the parameters `names`."""
     own = ("n", "seed") if kind in DRAWN else ()
     if FRICTION in table and FRICTION not in names:
         raise ValueError(
-            f"[{kind}] sweeps friction, which the motion of this rung does not feel: write [model] "
+            f"[{kind}] sweeps friction, which does not affect this model: write [model] "
             'and below it rung = "unilateral" or rung = "auto".'
         )
     _only(table, (*own, *names), f"[{kind}]", "settings")
     swept = {name: value for name, value in table.items() if name not in own}
     if own:
         if "n" not in table:
-            raise ValueError(f"[{kind}] says not how many samples: write n = 4096, say.")
+            raise ValueError(f"[{kind}] has no number of samples: write n = 4096, say.")
         n, seed = _whole(table["n"], "n", 1), _whole(table.get("seed", 0), "seed", 0)
         ranges = {name: _range(name, value) for name, value in swept.items()}
         return DRAWN[kind](ranges, n, seed)
@@ -377,7 +389,7 @@ def _design(
 
 
 def _axis(name: str, value: object) -> np.ndarray:
-    """Values of a grid's axis: a list, or from, to and count."""
+    """Return the values of a grid's axis, given as a list or as from, to and count."""
     if not isinstance(value, dict):
         return _list(name, value, " or { from = ..., to = ..., count = ... }")
     _only(value, _AXIS_KEYS, f"the axis of {name}", "keys")
@@ -397,13 +409,14 @@ def _axis(name: str, value: object) -> np.ndarray:
 
 
 def _list(name: str, value: object, otherwise: str = "") -> np.ndarray:
+    """Return a list of values in the domain of the parameter `name`."""
     if not isinstance(value, list):
         raise _wrong(name, value, f"a list of numbers{otherwise}")
     return np.asarray([_in_domain(name, item) for item in value])
 
 
 def _range(name: str, value: object, parameter: str = "") -> tuple[float, float]:
-    """Two values in the domain of `parameter`, `name` itself if not given."""
+    """Return two values in the domain of `parameter`, by default `name` itself."""
     if not (isinstance(value, list) and len(value) == 2):
         raise _wrong(name, value, f"a range of two numbers: write {name} = [lower, upper]")
     lower, upper = (_in_domain(parameter or name, item) for item in value)
@@ -411,6 +424,7 @@ def _range(name: str, value: object, parameter: str = "") -> tuple[float, float]
 
 
 def _in_domain(name: str, value: object) -> float:
+    """Return a value as a number; raise if it is not in the domain of the parameter."""
     number = _number(value, name, positive=name == FRICTION)
     if name != FRICTION:
         DOMAINS[name].require(name, number)
@@ -418,6 +432,7 @@ def _in_domain(name: str, value: object) -> float:
 
 
 def _number(value: object, name: str, positive: bool = False) -> float:
+    """Return a value as a finite number; raise if it is not one."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise _wrong(name, value, "a finite number")
     if positive and not value > 0:
@@ -426,12 +441,14 @@ def _number(value: object, name: str, positive: bool = False) -> float:
 
 
 def _whole(value: object, name: str, least: int) -> int:
+    """Return a value as a whole number of at least `minimum`; raise if it is not one."""
     if isinstance(value, bool) or not isinstance(value, int) or value < least:
         raise _wrong(name, value, f"a whole number of at least {least}")
     return value
 
 
 def _only(table: Mapping[str, object], allowed: Iterable[str], where: str, kind: str) -> None:
+    """Raise if a table has a key that is not allowed."""
     allowed = tuple(allowed)
     for key in table:
         if key not in allowed:
@@ -442,11 +459,12 @@ def _only(table: Mapping[str, object], allowed: Iterable[str], where: str, kind:
 
 
 def _wrong(name: str, value: object, must: str) -> ValueError:
+    """Return the error about a value that does not satisfy a requirement."""
     return ValueError(f"{name} is {_shown(value)}, but it must be {must}.")
 
 
 def _shown(value: object) -> str:
-    """The value as a reader of TOML would write it."""
+    """Return a value as it is written in TOML."""
     if isinstance(value, bool):
         return str(value).lower()
     return repr(value).replace("'", '"') if isinstance(value, str) else repr(value)

@@ -1,4 +1,4 @@
-"""What commands say: tables, progress, and one sentence for what a user got wrong."""
+"""Output of commands: tables, progress, and one sentence for a user's mistake."""
 
 import contextlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -22,14 +22,15 @@ if TYPE_CHECKING:
     from vrw_jax.wheel import WheelParams
 
 USER_ERROR, INTERRUPTED = 2, 130
-"""Exit codes."""
+"""Exit codes of a user's mistake and of a Ctrl-C."""
 
 out, err = Console(), Console(stderr=True)
+"""Consoles of stdout and stderr."""
 
 
 @contextlib.contextmanager
 def sentences(stopped: str = "stopped; nothing was written.") -> Iterator[None]:
-    """What the user got wrong as one sentence on stderr and exit code 2; a Ctrl-C and 130."""
+    """Report an error in one sentence on stderr with exit code 2, and a Ctrl-C with 130."""
     try:
         yield
     except KeyboardInterrupt:
@@ -44,15 +45,18 @@ def sentences(stopped: str = "stopped; nothing was written.") -> Iterator[None]:
 
 
 def complain(sentence: str) -> None:
+    """Print a sentence about an error on stderr."""
     err.print(f"[bold red]vrw:[/] {escape(sentence)}", highlight=False, soft_wrap=True)
 
 
 def _of_system(error: OSError) -> str:
+    """Return the sentence about an error of the system."""
     place = f"{error.filename}: " if error.filename else ""
     return f"{place}{str(error.strerror or error).rstrip('.')}."
 
 
 def tell_written(paths: Iterable[Path]) -> None:
+    """Print the paths of files that were written."""
     for path in paths:
         out.print(f"written: {path}", highlight=False, soft_wrap=True)
 
@@ -63,9 +67,9 @@ def tell_table(
     headings: Sequence[str] = (),
     right: Sequence[str] = (),
 ) -> None:
-    """Print rows under their headings, those of `right` to the right; without any, names in bold.
+    """Print a table; columns in `right` are right-aligned, and without headings names are bold.
 
-    Texts are shown as they are; of the marks for colours only those of a "" column count.
+    Texts are printed literally, except that a column with the heading "" may contain color markup.
     """
     table = Table(title=title, title_justify="left", show_header=bool(headings), box=None)
     for heading in headings or ("name", "text"):
@@ -80,6 +84,7 @@ def tell_table(
 
 
 def tell_facts(facts: "list[Fact]", folder: Path) -> None:
+    """Print the table of facts and how many hold."""
     verdict = ("[bold red]does not hold[/]", "[green]holds[/]")
     tell_table(
         None,
@@ -88,11 +93,11 @@ def tell_facts(facts: "list[Fact]", folder: Path) -> None:
     )
     from vrw_jax.paper import held
 
-    out.print(f"{held(facts)}; figures and {folder / 'facts.md'} tell more.")
+    out.print(f"{held(facts)}; see the figures and {folder / 'facts.md'}.")
 
 
 def progress_bar(what: str) -> "Bar":
-    """A bar on stderr; that of a scan counts chunks and has a note beside it."""
+    """Return a progress bar on stderr; that of a scan counts samples and shows a note."""
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
 
@@ -106,7 +111,10 @@ def progress_bar(what: str) -> "Bar":
 
 
 def scan_reporter(update: Callable, task: int) -> Callable[["Progress"], None]:
-    """Shows rate, share without a gait and time left; the first chunk's time is compiling too."""
+    """Return the callback that shows rate, share without a gait and time left.
+
+    The rate is measured from the second chunk on, because the first one includes compilation.
+    """
     import time
 
     from vrw_jax.scans import in_words
@@ -114,6 +122,7 @@ def scan_reporter(update: Callable, task: int) -> Callable[["Progress"], None]:
     first: list[tuple[float, int]] = []
 
     def report(progress: "Progress") -> None:
+        """Update the bar."""
         now, done = time.monotonic(), progress.done
         note = ""
         if done:
@@ -136,7 +145,7 @@ def scan_reporter(update: Callable, task: int) -> Callable[["Progress"], None]:
 
 
 def tell_outcomes(scan: "xr.Dataset") -> None:
-    """How many samples of a scan ended in which way."""
+    """Print the number of samples of a scan by outcome."""
     import numpy as np
 
     from vrw_jax.wheel import Outcome
@@ -156,12 +165,12 @@ def tell_outcomes(scan: "xr.Dataset") -> None:
 
 def tell_gait(
     params: "WheelParams",
-    result: Any,  # of any rung's step
+    result: Any,  # the step of any model
     start: "ArrayLike | tuple[float, ...]",
     walked: int,
     cycle: "LimitCycle | WalkedCycle",
 ) -> None:
-    """A wheel, the last step of its walk from the section state `start`, and its limit cycle."""
+    """Print a wheel, the last step of its walk, from the state `start`, and its limit cycle."""
     import numpy as np
 
     from vrw_jax.wheel import DOMAINS, Outcome
@@ -176,11 +185,12 @@ def tell_gait(
     else:
         out.print(f"[bold]Step {walked + 1} ended as {outcome.name}:[/] {outcome.meaning}")
     _tell_cycle(cycle)
-    if outcome == Outcome.STEPPED and "lambda_4_plus" in result.measures():  # not on real ground
+    if outcome == Outcome.STEPPED and "lambda_4_plus" in result.measures():  # the paper's model
         _tell_premises(result)
 
 
 def _tell_step(result: "AbstractStep") -> None:
+    """Print the measures of a step."""
     from vrw_jax.results import MARGINS, MEASURES
 
     values = result.measures()
@@ -193,6 +203,7 @@ def _tell_step(result: "AbstractStep") -> None:
 
 
 def _tell_cycle(cycle: "LimitCycle | WalkedCycle") -> None:
+    """Print stability, period, speed and DLS fraction of a limit cycle."""
     import numpy as np
 
     from vrw_jax.cycles import multipliers_told
@@ -212,6 +223,7 @@ def _tell_cycle(cycle: "LimitCycle | WalkedCycle") -> None:
 
 
 def _tell_premises(result: "StepResult") -> None:
+    """Print the margins of a step."""
     import numpy as np
 
     from vrw_jax.results import MARGINS

@@ -1,4 +1,4 @@
-"""What commands leave behind in a folder: labelled data, tables, a summary, pictures."""
+"""Files that commands write into a folder: labelled data, tables, a summary, figures."""
 
 import csv
 import io
@@ -20,20 +20,20 @@ from vrw_jax.wording import as_markdown
 
 
 def write_scan(scan: xr.Dataset, folder: Path) -> list[Path]:
-    """Write the pictures of a scan into `folder`; returns the paths."""
+    """Write the figures of a scan into `folder`, and return the paths."""
     drawn = figures.scan_figures(scan)
     return [path for name, figure in drawn.items() for path in figures.save(figure, folder, name)]
 
 
 def write_tuned(tuned: Tuned, folder: Path, picture: bool = True) -> list[Path]:
-    """Write everything about a tuned gait into `folder`; returns the paths."""
+    """Write everything about a tuned gait into `folder`, and return the paths."""
     texts = {"wheel.toml": _wheel_toml(tuned), "summary.md": tuned_summary(tuned)}
     paths = _write(folder, "path.zarr", tuned.path, texts)
     return paths + (figures.save(figures.tuning_figure(tuned), folder, "tuning") if picture else [])
 
 
 def write_branch(branch: Branch, folder: Path, picture: bool = True) -> list[Path]:
-    """Write everything about a branch into `folder`; returns the paths."""
+    """Write everything about a branch into `folder`, and return the paths."""
     texts = {"borders.csv": _borders_csv(branch), "summary.md": branch_summary(branch)}
     paths = _write(folder, "branch.zarr", branch.dataset, texts)
     drawn = picture and branch.values.size > 0
@@ -41,7 +41,7 @@ def write_branch(branch: Branch, folder: Path, picture: bool = True) -> list[Pat
 
 
 def require_map(samples: design.AbstractDesign) -> None:
-    """One sentence where samples are no grid over two parameters."""
+    """Raise unless the design is a grid over two parameters."""
     if len(samples.shape) != 2:
         raise ValueError(
             f"the design sweeps {', '.join(samples.names)}, but a map is a grid over two "
@@ -50,7 +50,7 @@ def require_map(samples: design.AbstractDesign) -> None:
 
 
 def write_map(scan: xr.Dataset, settings: Config, folder: Path) -> list[Path]:
-    """Every border over the two parameters of a scan."""
+    """Write every curve of special points over the two parameters of a scan; return the paths."""
     names = tuple(map(str, scan.outcome.dims))
     if not np.any(scan.outcome.values == Outcome.STEPPED):
         raise ValueError("no gait was found on the grid: choose another.")
@@ -70,7 +70,7 @@ def write_map(scan: xr.Dataset, settings: Config, folder: Path) -> list[Path]:
 
 
 def _unexplained_text(changes: Sequence[Change], scan: xr.Dataset) -> str:
-    """Where neighbouring samples differ in a sign, and no curve says why."""
+    """Return a list of neighboring samples that differ in a sign without a curve between them."""
     lines = [f"Changes between neighbouring samples beside which no curve runs: {len(changes)}"]
     for change in changes:
         at = [float(scan[n][i]) for n, i in zip(scan.outcome.dims, change.sample, strict=True)]
@@ -79,6 +79,7 @@ def _unexplained_text(changes: Sequence[Change], scan: xr.Dataset) -> str:
 
 
 def _write(folder: Path, store: str, data: xr.Dataset, texts: Mapping[str, str]) -> list[Path]:
+    """Write a dataset and texts into `folder`, and return the paths."""
     folder.mkdir(parents=True, exist_ok=True)
     data.to_zarr(folder / store, mode="w", zarr_format=2)
     for name, text in texts.items():
@@ -87,6 +88,7 @@ def _write(folder: Path, store: str, data: xr.Dataset, texts: Mapping[str, str])
 
 
 def _wheel_toml(tuned: Tuned) -> str:
+    """Return a config of the tuned wheel."""
     lines = [
         f"# Tuned: {tuned.objective} {tuned.value:.6g}. Walk it with `vrw gait`.",
         "",
@@ -100,6 +102,7 @@ def _wheel_toml(tuned: Tuned) -> str:
 
 
 def tuned_summary(tuned: Tuned) -> str:
+    """Return the summary of a tuning run in Markdown."""
     held = [(a.name, measure_of(a.name).text(a.limit), f"{a.price:.4g}") for a in tuned.active]
     moved = [
         (name, f"{float(tuned.path[name][0]):.6g}", f"{float(getattr(tuned.params, name)):.6g}",
@@ -122,6 +125,7 @@ def tuned_summary(tuned: Tuned) -> str:
 
 
 def _borders_csv(branch: Branch) -> str:
+    """Return the table of the special points of a branch as CSV."""
     text = io.StringIO(newline="")
     rows = csv.writer(text)
     rows.writerow([branch.parameter, "kind", "name", "ends_branch", "spectral_radius"])
@@ -132,6 +136,7 @@ def _borders_csv(branch: Branch) -> str:
 
 
 def branch_summary(branch: Branch) -> str:
+    """Return the summary of a branch in Markdown."""
     head, *_ = str(branch).split("\n")
     lines = [f"# Branch along {branch.parameter}", "", head, ""]
     if not branch.values.size:

@@ -1,4 +1,4 @@
-"""Scans as the command line runs them: planned by a config, verified, gone on with."""
+"""Scans of the command line: planned from a config, verified and computed."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     from vrw_jax.scans import Plan
 
 DAMAGED = 1
-"""Exit code where a store is damaged."""
+"""Exit code if a store is damaged."""
 
 
 def planned_scan(settings: "Config", chunk: int | None, also: tuple[str, ...] = ()) -> "Plan":
-    """What the config asks to scan, checked, and the measures `also` wanted."""
+    """Return the plan of the config's scan, with the additional measures."""
     from vrw_jax.scans import plan
 
     assert settings.design is not None
@@ -39,7 +39,7 @@ def planned_scan(settings: "Config", chunk: int | None, also: tuple[str, ...] = 
 
 
 def verify_store(planned: "Plan", store: Path) -> None:
-    """Tell whether a store is complete and sound; exit code 1 where it is damaged."""
+    """Print whether a store is complete and intact; exit with code 1 if it is damaged."""
     from vrw_jax.scans import found_store
 
     kept = found_store(planned, store)
@@ -54,7 +54,7 @@ def verify_store(planned: "Plan", store: Path) -> None:
 
 
 def compute_scan(planned: "Plan", store: Path, dask: str | None) -> "xr.Dataset":
-    """Run what the store lacks, with a bar, and open it."""
+    """Compute the chunks that the store lacks, with a progress bar, and return its dataset."""
     from vrw_jax.scans import carried, open_store, run
 
     stopped = f"stopped; what is done stays in {store}, run the same to go on."
