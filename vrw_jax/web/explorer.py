@@ -1,4 +1,4 @@
-"""The page docs/wheel.html at hand: its address, and a widget whose wheel Python reads and sets."""
+"""Access to the page docs/wheel.html: its address, and a widget that shows it in a notebook."""
 
 import functools
 import math
@@ -13,9 +13,9 @@ if TYPE_CHECKING:
     import xarray as xr
 
 RUNGS = "viscoelastic", "rigid", "unilateral"
-"""Of the ladder, those that the page walks on."""
+"""Names of the models that the page supports."""
 HEIGHT = 900
-"""Of the widget, in pixels of the screen."""
+"""Default height of the widget, in pixels."""
 
 FRAME = """
 function render({ model, el }) {
@@ -52,11 +52,11 @@ function render({ model, el }) {
 }
 export default { render };
 """
-"""What a notebook's page does: it holds the wheel's page in a frame and passes on what changes."""
+"""JavaScript of the widget: it shows the page in a frame and exchanges changed values with it."""
 
 
 def page_path() -> Path:
-    """The page's file: in an installed package inside it, else beside it."""
+    """Return the path of the page, inside an installed package or beside it."""
     package = Path(__file__).parents[1]
     return next(
         p for p in (package / "wheel.html", package.parent / "docs/wheel.html") if p.exists()
@@ -64,7 +64,7 @@ def page_path() -> Path:
 
 
 def page_address(params: WheelParams, rung: str = RUNGS[0]) -> str:
-    """Where a browser finds the page, opened at this wheel."""
+    """Return the address of the page, opened at this wheel."""
     usual = _values(WheelParams(), 1.0, RUNGS[0])
     given = _values(params, 1.0, chosen("rung", rung, RUNGS))
     values = {name: value for name, value in given.items() if value != usual[name]}
@@ -79,26 +79,28 @@ def explore(
     dataset: "xr.Dataset | None" = None,
     height: int = HEIGHT,
 ) -> Any:
-    """The wheel to play with, as a widget of Jupyter, JupyterLab, VS Code and marimo.
+    """Return an interactive widget of the wheel for Jupyter, JupyterLab, VS Code and marimo.
 
-    It is the page docs/wheel.html, which computes in the browser with this library's own step.
-    The widget's `params` are the wheel that is shown: read them after moving a slider, set them to
-    move it. `friction` and `rung` likewise; `told` holds what the page says of the step, by the
-    names of `vrw.MEASURES`. Needs anywidget: `pip install 'vrw-jax[explore]'`.
+    It is the page docs/wheel.html, which computes in the browser with the step of this library. The
+    property `params` of the widget is the wheel that is shown; setting it moves the sliders. The
+    properties `friction` and `model_name` work likewise. `measures` holds the measures of the step
+    by the names of `vrw.MEASURES`. The package anywidget is required:
+    `pip install 'vrw-jax[explore]'`.
 
     Args:
-        params: that it begins with; Table 1's by default.
-        friction: of real ground, and what margins refer to.
-        rung: "viscoelastic", "rigid" for legs without springs, or "unilateral" for real ground.
-        dataset: of a `vrw.scan` over a grid of two parameters: its map.
-        height: of the widget, in pixels.
+        params: the wheel at the start; by default that of Table 1.
+        friction: friction coefficient of the ground, for unilateral contact and for margins.
+        model_name: "viscoelastic", "rigid" for legs without springs, or "unilateral" for unilateral
+            contact.
+        dataset: dataset of `vrw.scan` over a grid of two parameters, shown as a map.
+        height: height of the widget, in pixels.
 
     Returns:
         The widget, to be shown in a cell of its own.
 
     Raises:
-        TypeError, ValueError: an argument that can't be meant, in one sentence.
-        ModuleNotFoundError: no anywidget.
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
+        ImportError: if anywidget is not installed.
 
     Examples:
         >>> wheel = vrw.explore(vrw.WheelParams(damping=150.0))
@@ -120,7 +122,7 @@ def explore(
 
 @functools.cache
 def _widget() -> type:
-    """The widget's class, made when the first is asked for: few have anywidget."""
+    """Return the class of the widget, created on first use because anywidget is optional."""
     try:
         import anywidget
         import traitlets
@@ -131,7 +133,7 @@ def _widget() -> type:
         ) from error
 
     class Explorer(anywidget.AnyWidget):
-        """The page in a frame, and its numbers in both directions."""
+        """Widget that shows the page in a frame and exchanges numbers with it."""
 
         _esm = FRAME
         page = traitlets.Unicode().tag(sync=True)
@@ -142,7 +144,7 @@ def _widget() -> type:
 
         @property
         def params(self) -> WheelParams:
-            """The wheel that is shown."""
+            """Return the wheel that is shown."""
             numbers = {name: float(self.values[name]) for name in DOMAINS}
             return WheelParams(**numbers, n_legs=int(self.values["n_legs"]))
 
@@ -152,7 +154,7 @@ def _widget() -> type:
 
         @property
         def friction(self) -> float:
-            """The coefficient that margins refer to."""
+            """Return the friction coefficient."""
             return float(self.values[FRICTION])
 
         @friction.setter
@@ -161,7 +163,7 @@ def _widget() -> type:
 
         @property
         def rung(self) -> str:
-            """Of the model that walks."""
+            """Return the name of the model."""
             return str(self.values["rung"])
 
         @rung.setter
@@ -172,12 +174,13 @@ def _widget() -> type:
 
 
 def _values(params: WheelParams, friction: float, rung: str) -> dict[str, float | str]:
+    """Return the values that the page exchanges."""
     numbers = {name: float(getattr(params, name)) for name in DOMAINS}
     return {**numbers, FRICTION: friction, "n_legs": params.n_legs, "rung": rung}
 
 
 def _map_of(dataset: "xr.Dataset") -> dict[str, Any]:
-    """A scan over a grid of two parameters as the page's map takes it; None for no number."""
+    """Return a scan over two parameters in the format of the page's map, with None for NaN."""
     import xarray
 
     instance("dataset", dataset, xarray.Dataset, "give a scan of vrw.grid over two parameters")
@@ -201,5 +204,6 @@ def _map_of(dataset: "xr.Dataset") -> dict[str, Any]:
 
 
 def _rows(values: Any) -> list[list[float | None]]:
+    """Return the values as nested lists, with None in place of a value that is not finite."""
     finite = lambda x: float(x) if math.isfinite(x) else None
     return [[finite(x) for x in row] for row in values.values.tolist()]
