@@ -117,9 +117,10 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
+    """Return the version, or the package of figures, which is imported on first use."""
     if name == "__version__":
         return importlib.metadata.version("vrw-jax")
-    if name == "plot":  # matplotlib is loaded by those who draw
+    if name == "plot":  # imports matplotlib only if figures are drawn
         return importlib.import_module("vrw_jax.figures")
     raise AttributeError(
         f"vrw_jax has no {name!r}{nearest(name, __all__)}: dir(vrw_jax) lists what it has."
@@ -127,4 +128,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
+    """Return the public names."""
     return [*__all__, "__version__"]

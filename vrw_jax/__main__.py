@@ -1,4 +1,4 @@
-"""`python -m vrw_jax` is `vrw`."""
+"""Entry point of `python -m vrw_jax`, which is the command `vrw`."""
 
 from vrw_jax.app import main
 
