@@ -8,16 +8,16 @@ import pytest
 from jaxtyping import install_import_hook
 
 ROOT = Path(__file__).parent.parent
-UNCHECKED = os.environ.get("VRW_TEST_UNCHECKED", "simd")
+UNCHECKED_PACKAGE = os.environ.get("VRW_TEST_UNCHECKED", "simd")
 """Writes code call by call, which takes eight times as long where each is checked; has no shapes in
 its signatures. `tests/simd/test_checked.py` runs it checked."""
-ROOMS = [
+PACKAGE_POSITIONS = [
     f"vrw_jax.{place.name}"
     for place in (ROOT / "vrw_jax").iterdir()
-    if place.is_dir() and place.name != UNCHECKED
+    if place.is_dir() and place.name != UNCHECKED_PACKAGE
 ]
 
-COMPILE_LONGEST = (
+LONGEST_COMPILATIONS = (
     "test_continuation", "test_limit_cycle", "test_unilateral", "test_any_system", "test_reaching",
     "test_web_digits", "test_answer", "test_step_accuracy", "test_bordering", "test_models_used",
     "test_rigid", "test_reference", "test_one_sided_stoppers", "test_scan", "test_engines",
@@ -32,16 +32,18 @@ COMPILE_LONGEST = (
 def pytest_configure(config: pytest.Config) -> None:
     """The library, imported here so that its annotations are checked; not where tests are only
     handed out to other processes, which takes as long."""
-    hands_out = config.getoption("numprocesses", None) and not hasattr(config, "workerinput")
-    if hands_out and not config.getoption("collectonly"):
+    distributes_tests = config.getoption("numprocesses", None) and not hasattr(
+        config, "workerinput"
+    )
+    if distributes_tests and not config.getoption("collectonly"):
         return
     gc.set_threshold(20_000, 10, 10)  # what JAX keeps of programs is looked through less often
-    with install_import_hook(ROOMS, "beartype.beartype"):
+    with install_import_hook(PACKAGE_POSITIONS, "beartype.beartype"):
         import vrw_jax
     vrw_jax.start_jax(os.environ.get("VRW_TEST_CACHE", ROOT / ".jax_cache"))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Long files first, so that two workers end together."""
-    place = {name: index for index, name in enumerate(COMPILE_LONGEST)}
-    items.sort(key=lambda item: place.get(item.path.stem, len(place)))
+    position = {name: index for index, name in enumerate(LONGEST_COMPILATIONS)}
+    items.sort(key=lambda item: position.get(item.path.stem, len(position)))

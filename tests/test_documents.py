@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
-from support.rooms import House
+from support.rooms import ImportGraph
 
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = sorted(
@@ -17,33 +17,36 @@ SOURCES = [
     for path in (ROOT / folder).rglob("*.py")
     if path != Path(__file__)
 ]
-FILE = re.compile(r"\b((?:tests|vrw_jax|experiments|configs)/[\w/]+(?:\.\w+)?)")
-SCRIPT = re.compile(r"\b(experiments(?:\.[a-z0-9_]+)+)(?<!\.py)")
-HOUSE = House(ROOT / "vrw_jax")
-PLACE = re.compile(rf"`((?:{'|'.join(HOUSE.rooms)})/[a-z_/]+)(?:\.(\w+))?[\w.]*`")
-MODULE = re.compile(r"(?:from|import|`)\s*(vrw_jax(?:\.[a-z_]+)+)")
+FILE_PATTERN = re.compile(r"\b((?:tests|vrw_jax|experiments|configs)/[\w/]+(?:\.\w+)?)")
+SCRIPT_PATTERN = re.compile(r"\b(experiments(?:\.[a-z0-9_]+)+)(?<!\.py)")
+IMPORT_GRAPH = ImportGraph(ROOT / "vrw_jax")
+PLACE_PATTERN = re.compile(rf"`((?:{'|'.join(IMPORT_GRAPH.packages)})/[a-z_/]+)(?:\.(\w+))?[\w.]*`")
+MODULE_PATTERN = re.compile(r"(?:from|import|`)\s*(vrw_jax(?:\.[a-z_]+)+)")
 
 
-def missing(text):
+def find_missing_paths(text):
     """Places that a text names and that are not there."""
-    modules = {name.replace(".", "/") for name in SCRIPT.findall(text) + MODULE.findall(text)}
-    for place in {*FILE.findall(text), *modules}:
+    modules = {
+        name.replace(".", "/")
+        for name in SCRIPT_PATTERN.findall(text) + MODULE_PATTERN.findall(text)
+    }
+    for place in {*FILE_PATTERN.findall(text), *modules}:
         path = ROOT / place
         if not (path.exists() or path.with_suffix(".py").exists()):
             yield place
 
 
-def unknown(text):
+def find_unknown_names(text):
     """Modules and names in them, `room/module.name`, that are not there."""
-    for module, name in PLACE.findall(text.replace(".py`", "`")):
+    for module, name in PLACE_PATTERN.findall(text.replace(".py`", "`")):
         dotted = "vrw_jax." + module.replace("/", ".")
-        if dotted not in HOUSE.paths:
+        if dotted not in IMPORT_GRAPH.paths:
             yield module
-        elif name and name not in bound(HOUSE.trees[dotted]):
+        elif name and name not in iterate_bound_names(IMPORT_GRAPH.trees[dotted]):
             yield f"{module}.{name}"
 
 
-def bound(tree):
+def iterate_bound_names(tree):
     """Names that a module binds, at any depth."""
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
@@ -53,35 +56,47 @@ def bound(tree):
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
-def test_a_document_names_what_is_there(path):
-    assert not sorted({*missing(path.read_text()), *unknown(path.read_text())})
+def test_a_document_names_only_existing_files(path):
+    assert not sorted(
+        {*find_missing_paths(path.read_text()), *find_unknown_names(path.read_text())}
+    )
 
 
-def test_sources_name_what_is_there():
-    found = {str(path.relative_to(ROOT)): sorted(missing(path.read_text())) for path in SOURCES}
-    assert not {path: places for path, places in found.items() if places}
+def test_sources_name_only_existing_files():
+    found_by_name = {
+        str(path.relative_to(ROOT)): sorted(find_missing_paths(path.read_text()))
+        for path in SOURCES
+    }
+    assert not {path: places for path, places in found_by_name.items() if places}
 
 
-def test_what_is_not_there_is_seen():
+def test_names_of_missing_files_are_found():
     text = "`tests/test_gone.py`, `python -m experiments.gone`, `from vrw_jax.gone import x`"
-    assert len(list(missing(text))) == 3
-    assert list(unknown("`wheel/gone`, `wheel/params.gone`")) == ["wheel/gone", "wheel/params.gone"]
-    assert not list(unknown("`wheel/params.WheelParams.symbols`, `wheel`, `wheel/params`"))
-    assert not list(missing("`tests/test_documents.py`, `from vrw_jax.wheel import x`, configs/"))
+    assert len(list(find_missing_paths(text))) == 3
+    assert list(find_unknown_names("`wheel/gone`, `wheel/params.gone`")) == [
+        "wheel/gone",
+        "wheel/params.gone",
+    ]
+    assert not list(
+        find_unknown_names("`wheel/params.WheelParams.symbols`, `wheel`, `wheel/params`")
+    )
+    assert not list(
+        find_missing_paths("`tests/test_documents.py`, `from vrw_jax.wheel import x`, configs/")
+    )
 
 
-def test_the_page_of_the_house_tells_every_room_in_the_flow_s_order():
+def test_the_architecture_page_lists_every_package_in_import_order():
     text = (ROOT / "docs" / "architecture.md").read_text()
-    assert tuple(re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE)) == HOUSE.rooms
+    assert tuple(re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE)) == IMPORT_GRAPH.packages
 
 
 def test_every_page_is_in_the_navigation():
-    told = (ROOT / "zensical.toml").read_text()
+    text_read = (ROOT / "zensical.toml").read_text()
     pages = [page.relative_to(ROOT / "docs").as_posix() for page in (ROOT / "docs").rglob("*.md")]
-    assert [page for page in pages if f'"{page}"' not in told] == []
+    assert [page for page in pages if f'"{page}"' not in text_read] == []
 
 
-def test_every_formula_of_the_measures_page_is_seen_as_one():
+def test_every_formula_of_the_measures_page_is_recognized():
     pytest.importorskip("latex2mathml", reason="formulas become MathML by it")
     from website.formulas import INLINE
     from website.reference import measures_page

@@ -15,7 +15,7 @@ MODULES = {
     for path in sorted((ROOT / "experiments").glob("*/**/*.py"))
     if path.name != "__init__.py"
 }
-STARTED = """
+START_SCRIPT = """
 import ast, contextlib, importlib, inspect, io, json, os, runpy, sys, types
 from jax._src import xla_bridge
 
@@ -48,30 +48,30 @@ it asks of other modules that they do not have."""
 
 
 @pytest.fixture(scope="module")
-def started():
+def experiment_outputs():
     """By module, one process for all."""
     outside = {k: v for k, v in os.environ.items() if k != "PYTHONSAFEPATH"}
-    command = [sys.executable, "-W", "ignore", "-c", STARTED, *MODULES]
+    command = [sys.executable, "-W", "ignore", "-c", START_SCRIPT, *MODULES]
     out = subprocess.run(command, cwd=ROOT, env=outside, capture_output=True, text=True)
     assert out.returncode == 0, out.stderr
     return json.loads(out.stdout)
 
 
 @pytest.mark.parametrize("module", MODULES)
-def test_an_experiment_starts_and_tells_its_command(module, started):
+def test_an_experiment_starts_and_prints_its_command(module, experiment_outputs):
     text = MODULES[module].read_text()
-    told, touched, absent = started[module]
-    if told.startswith("This experiment needs"):
-        assert 'pip install -e ".[experiments]"' in told
-        pytest.skip(told)
+    result, touched, absent = experiment_outputs[module]
+    if result.startswith("This experiment needs"):
+        assert 'pip install -e ".[experiments]"' in result
+        pytest.skip(result)
     assert not touched, f"by importing {module}"
     assert not absent
     assert ast.get_docstring(ast.parse(text))
     if '__name__ == "__main__"' in text:
-        assert told.startswith(f"usage: python -m {module}")
-        assert f"python -m {module}" in told.split("\n\n", 1)[1]
+        assert result.startswith(f"usage: python -m {module}")
+        assert f"python -m {module}" in result.split("\n\n", 1)[1]
 
 
-def test_folders_of_experiments_say_what_they_are_for():
+def test_folders_of_experiments_have_a_docstring():
     for folder in {path.parent for path in MODULES.values()}:
         assert ast.get_docstring(ast.parse((folder / "__init__.py").read_text())), folder

@@ -8,29 +8,29 @@ from pathlib import Path
 
 import pytest
 from support import rules
-from support.rooms import House
+from support.rooms import ImportGraph
 
 import vrw_jax
 
 ROOT = Path(__file__).parent.parent
-HOUSE = House(Path(vrw_jax.__file__).parent)
+IMPORT_GRAPH = ImportGraph(Path(vrw_jax.__file__).parent)
 
 
-@pytest.mark.parametrize("rule", rules.RULES, ids=lambda rule: rule.__name__)
-def test_the_house_keeps_the_rule(rule):
-    assert not rule(HOUSE), "\n" + "\n".join(rule(HOUSE))
+@pytest.mark.parametrize("rule", rules.IMPORT_RULES, ids=lambda rule: rule.__name__)
+def test_the_package_keeps_the_import_rule(rule):
+    assert not rule(IMPORT_GRAPH), "\n" + "\n".join(rule(IMPORT_GRAPH))
 
 
-def test_faces_hand_out_what_is_fetched_there():
+def test_exported_names_are_imported_elsewhere():
     folders = (ROOT / "tests", ROOT / "experiments")
     outside = [path.read_text() for folder in folders for path in folder.rglob("*.py")]
-    idle = rules.idle_names(HOUSE, outside)
+    idle = rules.find_unused_exports(IMPORT_GRAPH, outside)
     assert not idle, "\n" + "\n".join(idle)
 
 
 # Small packages made up for the rules: {file: source}. `house` has two rooms, wheel below walks,
 # and keeps every rule until a case adds or replaces files.
-SOUND = {
+VALID_PACKAGE = {
     "__init__.py": "from house.walks import step\n",
     "runtime/__init__.py": "from house.runtime.lazy import library\n",
     "runtime/lazy.py": "import importlib\n\nlibrary = lambda name: importlib.import_module(name)\n",
@@ -48,21 +48,21 @@ SOUND = {
 }
 
 
-def house(folder, changes):
+def make_import_graph(folder, changes):
     """The made-up package, read."""
-    for name, text in {**SOUND, **changes}.items():
+    for name, text in {**VALID_PACKAGE, **changes}.items():
         path = folder / "house" / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
-    return House(folder / "house")
+    return ImportGraph(folder / "house")
 
 
-def test_every_rule_is_silent_where_nothing_breaks_it(tmp_path):
-    sound = house(tmp_path, {})
-    assert [rule(sound) for rule in rules.RULES] == [[]] * len(rules.RULES)
+def test_every_rule_accepts_a_valid_package(tmp_path):
+    sound = make_import_graph(tmp_path, {})
+    assert [rule(sound) for rule in rules.IMPORT_RULES] == [[]] * len(rules.IMPORT_RULES)
 
 
-UPWARD = {
+UPWARD_IMPORTS = {
     "at the top": "from house.walks import step",
     "plain": "import house.walks",
     "under a name": "import house.walks.stepping as w",
@@ -80,59 +80,61 @@ UPWARD = {
 }
 
 
-@pytest.mark.parametrize("text", UPWARD.values(), ids=UPWARD)
-def test_an_upward_import_is_seen_however_it_is_written(text, tmp_path):
-    broken = house(tmp_path, {"wheel/params.py": f"{text}\n\n\nclass Params: ...\n"})
-    assert any("house.wheel.params" in line for line in rules.upward(broken)), broken.arrows
+@pytest.mark.parametrize("text", UPWARD_IMPORTS.values(), ids=UPWARD_IMPORTS)
+def test_an_upward_import_is_found_in_every_form(text, tmp_path):
+    broken = make_import_graph(tmp_path, {"wheel/params.py": f"{text}\n\n\nclass Params: ...\n"})
+    assert any("house.wheel.params" in line for line in rules.find_upward_imports(broken)), (
+        broken.edges
+    )
 
 
-def test_rooms_of_one_row_do_not_know_each_other(tmp_path):
+def test_packages_of_one_layer_do_not_import_each_other(tmp_path):
     files = {
         "batches/__init__.py": "", "batches/batch.py": "from house.cycles import find\n",
         "cycles/__init__.py": "from house.cycles.cycle import find\n",
         "cycles/cycle.py": "def find(): ...\n",
     }  # fmt: skip
-    assert rules.upward(house(tmp_path, files))
+    assert rules.find_upward_imports(make_import_graph(tmp_path, files))
 
 
-def test_a_room_that_the_flow_does_not_know_is_seen(tmp_path):
+def test_a_package_outside_the_layers_is_found(tmp_path):
     files = {"attic/__init__.py": "", "loose.py": ""}
-    found = rules.upward(house(tmp_path, files))
-    assert [line.split()[0] for line in found] == ["attic", "loose"]
+    solution = rules.find_upward_imports(make_import_graph(tmp_path, files))
+    assert [line.split()[0] for line in solution] == ["attic", "loose"]
 
 
-def test_a_circle_inside_a_room_is_seen_through_its_face(tmp_path):
+def test_an_import_cycle_through_an_init_file_is_found(tmp_path):
     inner = "def f():\n    from house.wheel import Params\n    return Params\n\n\n"
     files = {
         "wheel/__init__.py": "from house.wheel.params import Params\n"
         "from house.wheel.phase import g\n",
         "wheel/phase.py": inner + "def g(): ...\n",
     }
-    assert rules.circles(house(tmp_path, files)) == [
+    assert rules.find_import_cycles(make_import_graph(tmp_path, files)) == [
         "house.wheel -> house.wheel.phase -> house.wheel"
     ]
 
 
-def test_a_circle_of_two_modules_is_seen(tmp_path):
+def test_an_import_cycle_of_two_modules_is_found(tmp_path):
     files = {
         "wheel/params.py": "def f():\n    from house.wheel import phase\n\n\nclass Params: ...\n",
         "wheel/phase.py": "from house.wheel.params import Params\n",
     }
-    assert rules.circles(house(tmp_path, files)) == [
+    assert rules.find_import_cycles(make_import_graph(tmp_path, files)) == [
         "house.wheel.params -> house.wheel.phase -> house.wheel.params"
     ]
 
 
-def test_an_arrow_leads_to_where_a_name_is_defined(tmp_path):
-    read = house(tmp_path, {})
-    targets = {arrow.target for arrow in read.arrows if arrow.source == "house.walks.stepping"}
+def test_an_import_leads_to_the_module_that_defines_the_name(tmp_path):
+    read = make_import_graph(tmp_path, {})
+    targets = {arrow.target for arrow in read.edges if arrow.source == "house.walks.stepping"}
     assert targets == {
         "house.wheel", "house.wheel.params", "house.models", "house.models.base",
         "house.models.stiff",
     }  # fmt: skip
 
 
-PAST_FACES = {
+BYPASSED_INIT_FILES = {
     "deep": "from house.wheel.params import Params",
     "plain": "import house.wheel.params",
     "module not handed out": "from house.wheel import params",
@@ -143,21 +145,23 @@ PAST_FACES = {
 }
 
 
-@pytest.mark.parametrize("text", PAST_FACES.values(), ids=PAST_FACES)
-def test_entering_a_room_past_its_face_is_seen(text, tmp_path):
-    assert rules.past_faces(house(tmp_path, {"walks/deep.py": f"{text}\n"}))
+@pytest.mark.parametrize("text", BYPASSED_INIT_FILES.values(), ids=BYPASSED_INIT_FILES)
+def test_an_import_that_bypasses_an_init_file_is_found(text, tmp_path):
+    assert rules.find_bypassed_init_files(
+        make_import_graph(tmp_path, {"walks/deep.py": f"{text}\n"})
+    )
 
 
-def test_a_face_may_hand_out_a_module(tmp_path):
+def test_an_init_file_may_export_a_module(tmp_path):
     files = {
         "wheel/__init__.py": "from house.wheel import params\n",
         "walks/stepping.py": "from house.wheel import params\nPARAMS = params.Params\n",
         "walks/__init__.py": "", "__init__.py": "",
     }  # fmt: skip
-    assert not rules.past_faces(house(tmp_path, files))
+    assert not rules.find_bypassed_init_files(make_import_graph(tmp_path, files))
 
 
-LIBRARIES = {
+EXTERNAL_IMPORTS = {
     "plain": "import diffrax",
     "a part": "from matplotlib.figure import Figure",
     "inside a function": "def f():\n    import llvmlite.binding as llvm",
@@ -170,22 +174,24 @@ LIBRARIES = {
 }
 
 
-@pytest.mark.parametrize("text", LIBRARIES.values(), ids=LIBRARIES)
-def test_a_library_known_outside_its_room_is_seen(text, tmp_path):
+@pytest.mark.parametrize("text", EXTERNAL_IMPORTS.values(), ids=EXTERNAL_IMPORTS)
+def test_an_external_import_outside_its_package_is_found(text, tmp_path):
     files = {
         "numerics/__init__.py": "from house.numerics import events\n",
         "numerics/events.py": "import diffrax\n",
     }
-    assert not rules.strangers(house(tmp_path, files))
-    assert rules.strangers(house(tmp_path, {"walks/stranger.py": f"{text}\n"}))
+    assert not rules.find_misplaced_external_imports(make_import_graph(tmp_path, files))
+    assert rules.find_misplaced_external_imports(
+        make_import_graph(tmp_path, {"walks/stranger.py": f"{text}\n"})
+    )
 
 
-def test_simd_that_knows_a_room_is_seen(tmp_path):
+def test_an_import_in_simd_of_another_package_is_found(tmp_path):
     files = {"simd/__init__.py": "", "simd/program.py": "from house import wheel\n"}
-    assert rules.strangers(house(tmp_path, files))
+    assert rules.find_misplaced_external_imports(make_import_graph(tmp_path, files))
 
 
-QUESTIONS = {
+MODEL_TYPE_TESTS = {
     "isinstance": "isinstance(x, Stiff)",
     "one of two": "isinstance(x, AbstractRung | Stiff)",
     "one of a tuple": "isinstance(x, (int, Stiff))",
@@ -201,25 +207,27 @@ QUESTIONS = {
 }
 
 
-@pytest.mark.parametrize("text", QUESTIONS.values(), ids=QUESTIONS)
-def test_a_question_for_a_rung_is_seen(text, tmp_path):
+@pytest.mark.parametrize("text", MODEL_TYPE_TESTS.values(), ids=MODEL_TYPE_TESTS)
+def test_a_type_test_of_a_model_is_found(text, tmp_path):
     source = (
         "from house import models\nfrom house.models import AbstractRung, Stiff\n\n"
         f"RUNGS = (int, Stiff)\n\n\ndef ask(x):\n    return {text}\n"
     )
-    assert rules.asked_rungs(house(tmp_path, {"walks/ask.py": source}))
-    assert not rules.asked_rungs(house(tmp_path, {"walks/ask.py": "", "models/ask.py": source}))
+    assert rules.find_model_type_tests(make_import_graph(tmp_path, {"walks/ask.py": source}))
+    assert not rules.find_model_type_tests(
+        make_import_graph(tmp_path, {"walks/ask.py": "", "models/ask.py": source})
+    )
 
 
-def test_a_question_by_pattern_is_seen(tmp_path):
+def test_a_type_test_by_pattern_matching_is_found(tmp_path):
     source = (
         "from house.models import Stiff\n\n\n"
         "def ask(x):\n    match x:\n        case Stiff():\n            return 1\n"
     )
-    assert rules.asked_rungs(house(tmp_path, {"walks/ask.py": source}))
+    assert rules.find_model_type_tests(make_import_graph(tmp_path, {"walks/ask.py": source}))
 
 
-NAMESAKES = {
+HIDING_NAMES = {
     "a function": {"wheel/params.py": "def params(): ...\n\n\nclass Params: ...\n"},
     "a class": {"wheel/axle.py": "class axle: ...\n"},
     "in a face": {"wheel/__init__.py": "from house.wheel.hub import params\n", "wheel/hub.py": ""},
@@ -228,38 +236,42 @@ NAMESAKES = {
 }
 
 
-@pytest.mark.parametrize("files", NAMESAKES.values(), ids=NAMESAKES)
-def test_what_hides_a_module_is_seen(files, tmp_path):
-    assert rules.namesakes(house(tmp_path, files))
+@pytest.mark.parametrize("files", HIDING_NAMES.values(), ids=HIDING_NAMES)
+def test_a_name_that_hides_a_module_is_found(files, tmp_path):
+    assert rules.find_hidden_modules(make_import_graph(tmp_path, files))
 
 
 @pytest.mark.parametrize(("lines", "seen"), [(500, False), (501, True)])
-def test_a_long_module_is_seen(lines, seen, tmp_path):
+def test_a_long_module_is_found(lines, seen, tmp_path):
     files = {"wheel/long.py": "x = 1\n" * lines}
-    assert bool(rules.long_ones(house(tmp_path, files))) == seen
+    assert bool(rules.find_long_code(make_import_graph(tmp_path, files))) == seen
 
 
 @pytest.mark.parametrize(("lines", "seen"), [(60, False), (61, True)])
-def test_a_long_function_is_seen_wherever_it_stands(lines, seen, tmp_path):
+def test_a_long_function_is_found_at_any_depth(lines, seen, tmp_path):
     body = "        def f(self):\n" + "            x = 1\n" * (lines - 1)
     files = {"wheel/long.py": f"def outer():\n    class A:\n{body}\n    return A\n"}
-    found = rules.long_ones(house(tmp_path, files))
-    assert any(" f has " in line for line in found) == seen
+    solution = rules.find_long_code(make_import_graph(tmp_path, files))
+    assert any(" f has " in line for line in solution) == seen
 
 
 def test_a_docstring_does_not_make_a_function_long(tmp_path):
-    told = '    """Told.\n' + "\n" * 50 + '    """\n'
-    body = told + "    x = 1\n" * 30
-    assert not rules.long_ones(house(tmp_path, {"wheel/told.py": "def f():\n" + body}))
+    result = '    """Told.\n' + "\n" * 50 + '    """\n'
+    body = result + "    x = 1\n" * 30
+    assert not rules.find_long_code(
+        make_import_graph(tmp_path, {"wheel/told.py": "def f():\n" + body})
+    )
 
 
-def test_an_idle_or_private_name_in_a_face_is_seen(tmp_path):
+def test_an_unused_or_private_export_is_found(tmp_path):
     files = {
         "wheel/__init__.py": "from house.wheel.params import Params, _table, idle, tested\n",
         "wheel/params.py": "class Params: ...\n\n\n_table = idle = tested = 0\n",
     }
-    read, outside = house(tmp_path, files), ["code = 'from house.wheel import tested'"]
-    assert rules.idle_names(read, [*outside, "from house.models import Stiff, AbstractRung"]) == [
+    read, outside = make_import_graph(tmp_path, files), ["code = 'from house.wheel import tested'"]
+    assert rules.find_unused_exports(
+        read, [*outside, "from house.models import Stiff, AbstractRung"]
+    ) == [
         "house.runtime hands out library, which nobody fetches there",
         "house.wheel hands out _table, which nobody fetches there",
         "house.wheel hands out _table, which is private",
@@ -267,7 +279,7 @@ def test_an_idle_or_private_name_in_a_face_is_seen(tmp_path):
     ]
 
 
-def test_modules_are_reached_by_their_names():
+def test_no_module_is_hidden_by_a_name():
     for module in pkgutil.walk_packages(vrw_jax.__path__, "vrw_jax."):
         if module.name != "vrw_jax.__main__":
             importlib.import_module(module.name)
@@ -277,23 +289,25 @@ def test_modules_are_reached_by_their_names():
             assert reached is sys.modules[module.name], module.name
 
 
-HEAVY = {
+HEAVY_LIBRARIES = {
     "diffrax", "distributed", "matplotlib", "optax", "rich", "scipy.optimize", "scipy.stats",
     "typer", "xarray", "zarr",
 }  # fmt: skip
 
 
-def run(code):
+def run_code(code):
     """A fresh process; an assertion that fails there fails here."""
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_import_loads_nothing_that_only_some_need():
-    run(f"import vrw_jax, sys; loaded = {HEAVY} & set(sys.modules); assert not loaded, loaded")
+def test_import_loads_no_optional_library():
+    run_code(
+        f"import vrw_jax, sys; loaded = {HEAVY_LIBRARIES} & set(sys.modules); assert not loaded, loaded"
+    )
 
 
 def test_import_of_any_module_changes_no_setting_and_starts_no_plotting():
-    run(
+    run_code(
         "import importlib, pkgutil, sys, jax, matplotlib as mpl\n"
         "jax_before, mpl_before = jax.config.values.copy(), mpl.rcParams.copy()\n"
         "import vrw_jax\n"
@@ -306,7 +320,7 @@ def test_import_of_any_module_changes_no_setting_and_starts_no_plotting():
     )
 
 
-def test_the_map_is_drawn_from_the_imports(tmp_path):
+def test_the_architecture_figure_is_drawn_from_the_imports(tmp_path):
     command = [sys.executable, "-m", "experiments.shared.draw_rooms", str(tmp_path)]
     subprocess.run(command, cwd=ROOT, check=True)
     assert sum(path.stat().st_size > 10_000 for path in tmp_path.iterdir()) == 2

@@ -12,7 +12,7 @@ nbformat = pytest.importorskip("nbformat")
 
 FOLDER = Path(__file__).parents[1] / "docs" / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
-LARGEST = 400_000
+MAX_NOTEBOOK_BYTES = 400_000
 """Bytes of a stored notebook, pictures included."""
 
 
@@ -24,14 +24,14 @@ def test_there_are_notebooks():
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_is_stored_executed_and_small(path):
-    assert path.stat().st_size < LARGEST
+    assert path.stat().st_size < MAX_NOTEBOOK_BYTES
     cells = [c for c in nbformat.read(path, as_version=4).cells if c.cell_type == "code"]
     assert all(cell.execution_count for cell in cells)
     assert not re.search(r"/(home|root|work|tmp)/", path.read_text())
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_what_a_notebook_imports_is_there(path):
+def test_imports_of_a_notebook_exist(path):
     cells = [c.source for c in nbformat.read(path, as_version=4).cells if c.cell_type == "code"]
     lines = [line for cell in cells for line in cell.splitlines()]
     for line in (line for line in lines if re.match(r"(from|import) .*\bvrw_jax\b", line)):
@@ -40,7 +40,7 @@ def test_what_a_notebook_imports_is_there(path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_runs_and_prints_what_it_is_stored_with(path, monkeypatch):
+def test_a_notebook_runs_and_prints_its_stored_output(path, monkeypatch):
     cache = jax.config.jax_compilation_cache_dir
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", os.environ.get("VRW_TEST_CACHE", cache))
     stored = nbformat.read(path, as_version=4)
@@ -48,10 +48,10 @@ def test_a_notebook_runs_and_prints_what_it_is_stored_with(path, monkeypatch):
     nbclient.NotebookClient(run, timeout=900, kernel_name="python3").execute()
     for before, after in zip(stored.cells, run.cells, strict=True):
         if before.cell_type == "code":
-            assert printed(after) == printed(before)
+            assert collect_printed_text(after) == collect_printed_text(before)
 
 
-def printed(cell: object) -> str:
+def collect_printed_text(cell: object) -> str:
     """What a cell prints, numbers cut to three digits: pictures and reprs are not compared."""
     text = "".join(o.text for o in cell.outputs if o.output_type == "stream" and o.name == "stdout")
     return re.sub(r"-?\d+\.?\d*(e-?\d+)?", lambda m: f"{float(m[0]):.3g}", text)

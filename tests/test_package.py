@@ -14,7 +14,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
 
 @pytest.fixture
-def hook(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
+def build_hook(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
     """The hook, with a stand-in for hatchling, which only building needs."""
     interface = types.ModuleType("hatchling.metadata.plugin.interface")
     interface.MetadataHookInterface = object  # type: ignore[attr-defined]
@@ -27,24 +27,24 @@ def hook(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
     return module
 
 
-def test_images_and_links_lead_from_the_package_index_to_the_sources(
-    hook: types.ModuleType, monkeypatch: pytest.MonkeyPatch
+def test_images_and_links_of_the_package_index_point_to_the_sources(
+    build_hook: types.ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("VRW_SOURCE_URL", "https://example.org/one/two")
-    readme, told = hook.Readme(), {}
+    readme, result = build_hook.Readme(), {}
     readme.root, readme.config = str(ROOT), {}
-    readme.update(told)
-    text = told["readme"]["text"]
+    readme.update(result)
+    text = result["readme"]["text"]
     paths = re.findall(r"\]\(([^)]+)\)", text)
     assert "https://example.org/one/two/raw/HEAD/docs/figures/walk.gif" in paths
     for path in paths:
         assert path.startswith(("https://", "#")), path
         if path.startswith("https://example.org"):
             assert (ROOT / path.split("/HEAD/")[1].split("#")[0]).exists(), path
-    assert "](" not in hook.for_index("![a](b.png) [c](d.md)", "")
+    assert "](" not in build_hook.for_index("![a](b.png) [c](d.md)", "")
 
 
-def test_the_project_takes_its_readme_from_the_hook_and_brings_the_configs() -> None:
+def test_the_build_hook_provides_the_readme_and_the_configs() -> None:
     assert "readme" in PROJECT["project"]["dynamic"]
     assert "readme" not in PROJECT["project"]
     targets = PROJECT["tool"]["hatch"]["build"]["targets"]
@@ -52,9 +52,9 @@ def test_the_project_takes_its_readme_from_the_hook_and_brings_the_configs() -> 
     assert "configs" in targets["wheel"]["force-include"]
 
 
-def test_what_experiments_ask_for_comes_with_the_extra() -> None:
+def test_the_extra_installs_the_requirements_of_experiments() -> None:
     """But for torch, which is named with its own command."""
-    told = " ".join(PROJECT["project"]["optional-dependencies"]["experiments"])
+    result = " ".join(PROJECT["project"]["optional-dependencies"]["experiments"])
     for path in (ROOT / "experiments").rglob("*.py"):
         for name in re.findall(r'extra\("(\w+)"\)', path.read_text()):
-            assert name.replace("_", "-") in told, (path, name)
+            assert name.replace("_", "-") in result, (path, name)

@@ -15,17 +15,17 @@ import pytest
 import xarray as xr
 
 import vrw_jax as vrw
-from vrw_jax.numerics import Stop
-from vrw_jax.wheel import DOMAINS
+from vrw_jax.numerics import Termination
+from vrw_jax.wheel import PARAMETER_DOMAINS
 
 ROOT = Path(__file__).parent.parent
 NAMES = [name for name in vrw.__all__ if name not in ("MEASURES", "plot")]
-PICTURES = [
+FIGURE_FUNCTIONS = [
     f"plot.{name}"
     for name, thing in vars(vrw.plot).items()
     if inspect.isfunction(thing) and thing.__module__.startswith("vrw_jax.figures")
 ]
-SLOW = {
+SLOW_EXAMPLES = {
     "plot.branch_figure", "plot.scan_figures", "plot.map_figure", "plot.tuning_figure",
     "UnilateralWheel", "UnilateralStep", "LadderWheel", "LadderStep", "continue_branches",
     "border_curve", "BorderCurve",
@@ -34,17 +34,17 @@ SLOW = {
 """What compiles for a minute."""
 
 
-def told(name):
+def get_documentation(name):
     return inspect.getdoc(operator.attrgetter(name)(vrw)) or ""
 
 
-def marked(name):
-    return pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else [])
+def mark_if_slow(name):
+    return pytest.param(name, marks=[pytest.mark.slow] if name in SLOW_EXAMPLES else [])
 
 
-@pytest.mark.parametrize("name", [*map(marked, [*NAMES, *PICTURES])])
-def test_the_example_of_a_public_name_runs_as_it_stands(name, monkeypatch):
-    text = told(name)
+@pytest.mark.parametrize("name", [*map(mark_if_slow, [*NAMES, *FIGURE_FUNCTIONS])])
+def test_the_example_of_a_public_name_runs_unchanged(name, monkeypatch):
+    text = get_documentation(name)
     monkeypatch.setattr(vrw, "start_jax", lambda *_: None)  # it has started
     globs = {"jax": jax, "jnp": jnp, "np": np, "xr": xr, "vrw": vrw}
     globs |= {"tempfile": tempfile, "Path": Path}
@@ -58,33 +58,35 @@ def test_the_example_of_a_public_name_runs_as_it_stands(name, monkeypatch):
     assert not out, "".join(out)
 
 
-@pytest.mark.parametrize("name", [*NAMES, *PICTURES])
-def test_every_argument_and_field_of_a_public_name_is_told(name):
-    thing, text = operator.attrgetter(name)(vrw), told(name)
+@pytest.mark.parametrize("name", [*NAMES, *FIGURE_FUNCTIONS])
+def test_every_argument_and_field_of_a_public_name_is_documented(name):
+    thing, text = operator.attrgetter(name)(vrw), get_documentation(name)
     given = [] if name == "Outcome" else list(inspect.signature(thing).parameters)
     if inspect.isfunction(thing):
         section = text.partition("Args:")[2].partition("\n\n")[0]
         assert [n for n in given if not re.search(rf"^ +\*{{0,2}}{n}: ", section, re.M)] == []
         assert "Returns:\n" in text
-        assert not given or "Raises:\n" in text or name in PICTURES
+        assert not given or "Raises:\n" in text or name in FIGURE_FUNCTIONS
     else:
         assert [n for n in given if f"`{n}`" not in text] == []
 
 
-def test_every_public_name_has_a_place_in_the_reference():
+def test_every_public_name_is_in_the_reference():
     pages = "".join(path.read_text() for path in (ROOT / "docs" / "reference").glob("*.md"))
-    shown = set(re.findall(r"^::: vrw_jax\.(\w+)$", pages, re.M))
-    assert set(NAMES) | {"MEASURES"} == shown
-    drawn = set(re.findall(r"^::: vrw_jax\.figures\.(\w+)$", pages, re.M))
-    assert {name.removeprefix("plot.") for name in PICTURES} == drawn
+    shown_values = set(re.findall(r"^::: vrw_jax\.(\w+)$", pages, re.M))
+    assert set(NAMES) | {"MEASURES"} == shown_values
+    drawn_values = set(re.findall(r"^::: vrw_jax\.figures\.(\w+)$", pages, re.M))
+    assert {name.removeprefix("plot.") for name in FIGURE_FUNCTIONS} == drawn_values
 
 
-def test_fields_of_the_wheel_are_told_as_its_domains_are():
-    for name, d in DOMAINS.items():
-        assert f"- `{name}`: {d.symbol}, {d.description}, in {d};" in told("WheelParams")
+def test_documentation_of_wheel_fields_agrees_with_their_domains():
+    for name, d in PARAMETER_DOMAINS.items():
+        assert f"- `{name}`: {d.symbol}, {d.description}, in {d};" in get_documentation(
+            "WheelParams"
+        )
 
 
-@pytest.mark.parametrize("kind", [vrw.Outcome, Stop])
+@pytest.mark.parametrize("kind", [vrw.Outcome, Termination])
 def test_every_code_has_its_sentence_and_a_remedy(kind):
     page = (ROOT / "docs" / "sharp_bits.md").read_text()
     for code in kind:

@@ -8,7 +8,7 @@ import pytest
 import vrw_jax as vrw
 
 ROOT = Path(__file__).parent.parent
-ELSEWHERE = "<!-- runs elsewhere"
+ELSEWHERE_MARKER = "<!-- runs elsewhere"
 """Stands before a block that needs a cluster or an editor; it is compiled only."""
 BLOCK = re.compile(
     r"^(?P<note><!-- runs elsewhere[^\n]*\n)?```python\n(?P<code>.*?)^```"
@@ -20,7 +20,7 @@ PAGES = [
     for page in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
     if "```python" in page.read_text()
 ]
-SLOW = {
+SLOW_PAGES = {
     "README.md", "docs/any_system.md", "docs/own_loops.md", "docs/ladder.md", "docs/unilateral.md",
     "docs/engine.md", "docs/howto/add_a_measure.md", "docs/howto/cluster.md",
     "docs/answers.md", "docs/howto/numpyro.md", "docs/howto/own_constraint.md",
@@ -28,7 +28,7 @@ SLOW = {
 """Pages that compile for long, or that a test of their own runs in the quick suite."""
 
 
-def run(page, capsys, tmp_path, monkeypatch):
+def run_page(page, capsys, tmp_path, monkeypatch):
     """Runs a page from top to bottom in an empty folder."""
     monkeypatch.setattr(vrw, "start_jax", lambda: None)  # it has started
     monkeypatch.chdir(tmp_path)
@@ -45,28 +45,28 @@ def run(page, capsys, tmp_path, monkeypatch):
     return names
 
 
-def marked(page):
+def mark_if_slow(page):
     name = str(page.relative_to(ROOT))
-    return pytest.param(page, id=name, marks=[pytest.mark.slow] if name in SLOW else [])
+    return pytest.param(page, id=name, marks=[pytest.mark.slow] if name in SLOW_PAGES else [])
 
 
-@pytest.mark.parametrize("page", [*map(marked, PAGES)])
-def test_a_page_runs_as_it_stands(page, capsys, tmp_path, monkeypatch):
+@pytest.mark.parametrize("page", [*map(mark_if_slow, PAGES)])
+def test_the_code_of_a_page_runs_unchanged(page, capsys, tmp_path, monkeypatch):
     for stem, library in (("numpyro", "numpyro"), ("explore", "anywidget")):
         if page.stem == stem:
             pytest.importorskip(library)
-    run(page, capsys, tmp_path, monkeypatch)
+    run_page(page, capsys, tmp_path, monkeypatch)
 
 
-def test_what_a_page_says_it_prints_is_compared(capsys, tmp_path, monkeypatch):
+def test_the_printed_output_of_a_page_is_compared(capsys, tmp_path, monkeypatch):
     page = tmp_path / "page.md"
     page.write_text("```python\nprint(1)\n```\n\n```text\n2\n```\n")
     with pytest.raises(AssertionError):
-        run(page, capsys, tmp_path, monkeypatch)
+        run_page(page, capsys, tmp_path, monkeypatch)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_every_block_of_python_is_seen_and_is_python(page):
+def test_every_block_of_python_is_found_and_valid(page):
     blocks = list(BLOCK.finditer(page.read_text()))
     assert len(blocks) == page.read_text().count("```python")
     for block in blocks:

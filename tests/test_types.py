@@ -11,7 +11,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 
-MORE = """
+VALID_CODE = """
 import numpy as np
 
 tuned = vrw.tune(params, "dls_fraction", ["damping"], {"damping": (100.0, 200.0)})
@@ -22,7 +22,7 @@ print(vrw.Options(solver="Tsit5", rtol=1e-8).rtol, vrw.UnilateralWheel(friction=
 """
 """Lines of other pages."""
 
-BAD = """import vrw_jax as vrw
+INVALID_CODE = """import vrw_jax as vrw
 
 vrw.WheelParams(damping="fast")
 vrw.steps(vrw.WheelParams(), vrw.paper_start()[None], engine="lane")
@@ -38,27 +38,31 @@ vrw.step(vrw.WheelParams(), vrw.paper_start(), model="rigid")
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
+def checked_folder(tmp_path_factory) -> Path:
     place = tmp_path_factory.mktemp("typed")
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
-    (place / "good.py").write_text("\n".join(blocks) + MORE)
-    (place / "bad.py").write_text(BAD)
+    (place / "good.py").write_text("\n".join(blocks) + VALID_CODE)
+    (place / "bad.py").write_text(INVALID_CODE)
     settings = {"typeCheckingMode": "standard", "extraPaths": [str(ROOT)]}
     (place / "pyrightconfig.json").write_text(json.dumps(settings))
     return place
 
 
-def refused(folder: Path, command: list[str], line: str) -> dict[str, set[int]]:
+def is_line_refused(checked_folder: Path, command: list[str], line: str) -> dict[str, set[int]]:
     """Lines with an error by file."""
     env = os.environ | {"MYPYPATH": str(ROOT)}
     run = subprocess.run(
-        [sys.executable, "-m", *command], cwd=folder, env=env, capture_output=True, text=True
+        [sys.executable, "-m", *command],
+        cwd=checked_folder,
+        env=env,
+        capture_output=True,
+        text=True,
     )
-    told: dict[str, set[int]] = {"good.py": set(), "bad.py": set()}
+    result: dict[str, set[int]] = {"good.py": set(), "bad.py": set()}
     for name, number in re.findall(line, run.stdout, re.M):
-        told[name].add(int(number))
-    assert told["bad.py"], run.stdout + run.stderr
-    return told
+        result[name].add(int(number))
+    assert result["bad.py"], run.stdout + run.stderr
+    return result
 
 
 @pytest.mark.parametrize(
@@ -84,7 +88,7 @@ def refused(folder: Path, command: list[str], line: str) -> dict[str, set[int]]:
     ],
     ids=("mypy", "pyright"),
 )
-def test_a_checker_accepts_the_readme_and_refuses_each_bad_line(folder, command, line):
-    told = refused(folder, command, line)
-    assert not told["good.py"]
-    assert told["bad.py"] == set(range(3, 3 + len(BAD.splitlines()) - 2))
+def test_a_checker_accepts_the_readme_and_refuses_each_bad_line(checked_folder, command, line):
+    result = is_line_refused(checked_folder, command, line)
+    assert not result["good.py"]
+    assert result["bad.py"] == set(range(3, 3 + len(INVALID_CODE.splitlines()) - 2))

@@ -10,11 +10,11 @@ import pytest
 from support import wrong_calls
 
 ROOT = Path(__file__).parent.parent
-wrong_calls.make()
+wrong_calls.register_wrong_calls()
 
 
 @pytest.fixture(scope="module")
-def answers(tmp_path_factory) -> dict[str, tuple[str, str, str]]:
+def wrong_call_messages(tmp_path_factory) -> dict[str, tuple[str, str, str]]:
     """What came of each, in a process that starts as a user's does; it may write nothing."""
     folder = tmp_path_factory.mktemp("empty")
     cache = os.environ.get("VRW_TEST_CACHE", ROOT / ".jax_cache")
@@ -27,16 +27,16 @@ def answers(tmp_path_factory) -> dict[str, tuple[str, str, str]]:
     return json.loads(run.stdout)
 
 
-def test_there_are_many_of_them():
-    assert len(wrong_calls.USES) >= 250
+def test_there_are_many_wrong_calls():
+    assert len(wrong_calls.WRONG_CALLS) >= 250
 
 
-@pytest.mark.parametrize("name", wrong_calls.USES)
-def test_it_gets_one_sentence(answers, name):
-    kind, sentence, refused_in = answers[name]
-    expected = wrong_calls.USES[name]
-    assert kind == expected.kind, sentence
-    assert expected.words in sentence
+@pytest.mark.parametrize("name", wrong_calls.WRONG_CALLS)
+def test_a_wrong_call_is_refused_in_one_sentence(wrong_call_messages, name):
+    kind, sentence, refused_in = wrong_call_messages[name]
+    expected = wrong_calls.WRONG_CALLS[name]
+    assert kind == expected.error_type, sentence
+    assert expected.expected_words in sentence
     assert sentence.endswith(".")
     assert "\n" not in sentence
     assert ": " in sentence  # what to do stands behind it

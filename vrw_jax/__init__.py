@@ -4,29 +4,34 @@ import importlib
 import importlib.metadata
 from typing import TYPE_CHECKING, Any
 
-from vrw_jax.answers import Answer, Average, answer, average
-from vrw_jax.batches import Steps, steps
+from vrw_jax.answers import (
+    MeasureResult,
+    MultifidelityMean,
+    measure_to_tolerance,
+    multifidelity_mean,
+)
+from vrw_jax.batches import StepBatchResult, step_batch
 from vrw_jax.branches import (
-    Border,
-    BorderCurve,
     Branch,
-    border_curve,
+    SpecialPoint,
+    SpecialPointCurve,
     continue_branch,
     continue_branches,
     continue_map,
+    continue_special_point,
 )
 from vrw_jax.cycles import (
     CycleOptions,
     LimitCycle,
-    WalkedCycle,
+    ReturnMapCycle,
     default_margins,
     sensitivities,
 )
 from vrw_jax.gaits import limit_cycle, limit_cycles
 from vrw_jax.models import (
     AbstractWheel,
+    DoubleSupportIndicators,
     EnergyLoss,
-    Indicators,
     LadderStep,
     LadderWheel,
     Margins,
@@ -37,60 +42,59 @@ from vrw_jax.models import (
     UnilateralWheel,
     ViscoelasticWheel,
 )
-from vrw_jax.numerics import ArclengthOptions, Options, SectionCycle, newton_cycle
+from vrw_jax.numerics import ArclengthOptions, FixedPointResult, StepOptions, solve_fixed_point
 from vrw_jax.results import MEASURES
 from vrw_jax.runtime import start_jax
 from vrw_jax.scans import grid, open_scan, saltelli, samples, scan, sobol, sobol_indices, uniform
-from vrw_jax.tuning import Tuned, tune
+from vrw_jax.tuning import TuneResult, tune
 from vrw_jax.walks import Walk, basin, choose_model, paper_start, return_map, simulate, step, walk
 from vrw_jax.web import explore
 from vrw_jax.wheel import Outcome, WheelParams
-from vrw_jax.wording import nearest
+from vrw_jax.wording import suggest_name
 
 __all__ = (
     "MEASURES",
     "AbstractWheel",
-    "Answer",
     "ArclengthOptions",
-    "Average",
-    "Border",
-    "BorderCurve",
     "Branch",
     "CycleOptions",
+    "DoubleSupportIndicators",
     "EnergyLoss",
-    "Indicators",
+    "FixedPointResult",
     "LadderStep",
     "LadderWheel",
     "LimitCycle",
     "Margins",
+    "MeasureResult",
     "ModelChoice",
-    "Options",
+    "MultifidelityMean",
     "Outcome",
+    "ReturnMapCycle",
     "RigidWheel",
-    "SectionCycle",
+    "SpecialPoint",
+    "SpecialPointCurve",
+    "StepBatchResult",
+    "StepOptions",
     "StepResult",
-    "Steps",
-    "Tuned",
+    "TuneResult",
     "UnilateralStep",
     "UnilateralWheel",
     "ViscoelasticWheel",
     "Walk",
-    "WalkedCycle",
     "WheelParams",
-    "answer",
-    "average",
     "basin",
-    "border_curve",
     "choose_model",
     "continue_branch",
     "continue_branches",
     "continue_map",
+    "continue_special_point",
     "default_margins",
     "explore",
     "grid",
     "limit_cycle",
     "limit_cycles",
-    "newton_cycle",
+    "measure_to_tolerance",
+    "multifidelity_mean",
     "open_scan",
     "paper_start",
     "plot",
@@ -102,9 +106,10 @@ __all__ = (
     "simulate",
     "sobol",
     "sobol_indices",
+    "solve_fixed_point",
     "start_jax",
     "step",
-    "steps",
+    "step_batch",
     "tune",
     "uniform",
     "walk",
@@ -123,7 +128,7 @@ def __getattr__(name: str) -> Any:
     if name == "plot":  # imports matplotlib only if figures are drawn
         return importlib.import_module("vrw_jax.figures")
     raise AttributeError(
-        f"vrw_jax has no {name!r}{nearest(name, __all__)}: dir(vrw_jax) lists what it has."
+        f"vrw_jax has no {name!r}{suggest_name(name, __all__)}: dir(vrw_jax) lists what it has."
     )
 
 

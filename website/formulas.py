@@ -12,7 +12,7 @@ from markdown import Markdown
 from markdown.extensions import Extension
 from markdown.inlinepatterns import InlineProcessor
 
-from vrw_jax.wording import as_tex
+from vrw_jax.wording import format_mathtext
 
 DISPLAYED = r"(?s)\$\$(.+?)\$\$"
 INLINE = r"(?<![\\$\w])\$(?=[^\s$])([^$]+?)(?<=[^\s\\])\$(?![\w$])"
@@ -42,7 +42,7 @@ def mathml(tex: str, *, block: bool = False) -> str:
 def typeset(symbol: str) -> str:
     """TeX of a symbol that is written in Unicode, such as λ₄⁺."""
     indexed = _LOW.sub(lambda low: "_" + low[0].translate(_DIGITS), symbol)
-    return as_tex(unicodedata.normalize("NFD", indexed)).translate(_GREEK)
+    return format_mathtext(unicodedata.normalize("NFD", indexed)).translate(_GREEK)
 
 
 class _Formula(InlineProcessor):

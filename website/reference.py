@@ -6,21 +6,28 @@ import re
 from collections.abc import Iterable
 from typing import Any
 
-from vrw_jax.app.config import DRAWN, RUNGS, BranchConfig, GaitConfig, ScanConfig, TuneConfig
-from vrw_jax.numerics import Options
+from vrw_jax.app.config import (
+    MODEL_CLASSES,
+    RANDOM_DESIGNS,
+    BranchConfig,
+    GaitConfig,
+    ScanConfig,
+    TuneConfig,
+)
+from vrw_jax.numerics import StepOptions
 from vrw_jax.results.measures import (
-    CONTACTS,
-    CYCLE,
-    GROUND,
-    MARGINS,
-    PARAMETERS,
-    STEP,
-    TRAJECTORY,
+    CONTACT_MEASURES,
+    LIMIT_CYCLE_MEASURES,
+    MARGIN_MEASURES,
+    PARAMETER_MEASURES,
+    STEP_MEASURES,
+    TRAJECTORY_MEASURES,
+    UNILATERAL_STEP_MEASURES,
     Measure,
 )
 from vrw_jax.scans import design as designs
-from vrw_jax.wheel import DOMAINS, WheelParams
-from vrw_jax.wording import as_markdown
+from vrw_jax.wheel import PARAMETER_DOMAINS, WheelParams
+from vrw_jax.wording import format_markdown_table
 
 FIELD = re.compile(r"^ *- ((?:`\w+`(?:, )?)+): (.*(?:\n +[^ -].*)*)", re.MULTILINE)
 
@@ -38,21 +45,23 @@ def toml_page() -> str:
     lines = [_OPENING]
     lines += _section("wheel", "What is not swept; what is left out has the value of Table 1.")
     wheel = [(f"`{n}`", f"{_DEFAULTS[n]:g}", d.unit, str(d).split(")")[0] + ")", d.description)
-             for n, d in DOMAINS.items()]  # fmt: skip
+             for n, d in PARAMETER_DOMAINS.items()]  # fmt: skip
     wheel.append(("`n_legs`", "8", "", "5 and more", "number of legs, a whole number"))
-    lines += as_markdown(("key", "default", "unit", "allowed", "meaning"), wheel)
+    lines += format_markdown_table(("key", "default", "unit", "allowed", "meaning"), wheel)
     lines += _section("model", "Which rung of the ladder, and its settings.")
-    rungs = ", ".join(f'`"{rung}"`' for rung in RUNGS)
+    rungs = ", ".join(f'`"{rung}"`' for rung in MODEL_CLASSES)
     rows = [("`rung`", "", '`"viscoelastic"`', f"one of {rungs}")]
-    for rung, kind in RUNGS.items():
+    for rung, kind in MODEL_CLASSES.items():
         rows += [(f"`{n}`", f'`"{rung}"`', v, text) for n, v, text in _settings(kind)]
-    lines += as_markdown(("key", "of the rung", "default", "meaning"), rows)
+    lines += format_markdown_table(("key", "of the rung", "default", "meaning"), rows)
     for name, kind, what in _TABLES:
         lines += _section(name, what)
-        lines += as_markdown(_HEADER, [(f"`{n}`", v, text) for n, v, text in _settings(kind)])
+        lines += format_markdown_table(
+            _HEADER, [(f"`{n}`", v, text) for n, v, text in _settings(kind)]
+        )
     lines += _section("grid", _first_line(designs.grid), *_GRID)
     lines += _section("samples", _first_line(designs.samples), *_SAMPLES)
-    for name, design in DRAWN.items():
+    for name, design in RANDOM_DESIGNS.items():
         lines += _section(name, _first_line(design), *_DRAWN_KEYS)
     return "\n".join(lines) + "\n"
 
@@ -64,9 +73,9 @@ key that is none, or a value out of its domain, is refused in one sentence befor
 computed. This page is told by the sources.
 """
 _HEADER = ("key", "default", "meaning")
-_DEFAULTS = {name: float(getattr(WheelParams(), name)) for name in DOMAINS}
+_DEFAULTS = {name: float(getattr(WheelParams(), name)) for name in PARAMETER_DOMAINS}
 _TABLES = (
-    ("options", Options, "Numerical choices of a step."),
+    ("options", StepOptions, "Numerical choices of a step."),
     ("gait", GaitConfig, "How `vrw gait` walks."),
     ("scan", ScanConfig, "What `vrw scan` reports; the design stands in a table of its own."),
     ("branch", BranchConfig, "What `vrw continue` follows."),
@@ -113,10 +122,10 @@ def measures_page() -> str:
     for title, table, what in _GROUPS:
         lines += ["", f"## {title}", "", what, ""]
         rows = [
-            (f"`{m.name}`", f"${m.tex.strip()}$", m.unit, _meaning(m), m.equation)
+            (f"`{m.name}`", f"${m.mathtext.strip()}$", m.unit, _meaning(m), m.equation)
             for m in table.values()
         ]
-        lines += as_markdown(("name", "symbol", "unit", "meaning", "in the paper"), rows)
+        lines += format_markdown_table(("name", "symbol", "unit", "meaning", "in the paper"), rows)
     return "\n".join(lines) + "\n"
 
 
@@ -127,16 +136,16 @@ figures alike: `vrw.MEASURES["speed"].unit`. Scans and tuning take the names of 
 cycles, and scans derivatives too, as `"d speed / d damping"`. This page is told by the sources.
 """
 _GROUPS = (
-    ("Of a step", STEP, "What `vrw.step`, gaits and scans tell."),
-    ("Premises, as margins", MARGINS, "Positive where the premise holds: `step.monitors`, scans."),
-    ("Of a step on real ground", GROUND, "Beside those of a step that every rung tells."),
-    ("Of a gait", CYCLE, "Of a limit cycle."),
-    ("Of a trajectory", TRAJECTORY, "Coordinates and variables of `vrw.simulate`."),
-    ("Of a trajectory on real ground", CONTACTS, "Variables of each leg."),
-    ("Parameters", PARAMETERS, "Axes of scans and branches."),
+    ("Of a step", STEP_MEASURES, "What `vrw.step`, gaits and scans tell."),
+    ("Premises, as margins", MARGIN_MEASURES, "Positive where the premise holds: `step.monitors`, scans."),
+    ("Of a step on real ground", UNILATERAL_STEP_MEASURES, "Beside those of a step that every rung tells."),
+    ("Of a gait", LIMIT_CYCLE_MEASURES, "Of a limit cycle."),
+    ("Of a trajectory", TRAJECTORY_MEASURES, "Coordinates and variables of `vrw.simulate`."),
+    ("Of a trajectory on real ground", CONTACT_MEASURES, "Variables of each leg."),
+    ("Parameters", PARAMETER_MEASURES, "Axes of scans and branches."),
 )  # fmt: skip
 
 
 def _meaning(measure: Measure) -> str:
-    breaks = f" Below zero: {measure.breaks}." if measure.breaks else ""
+    breaks = f" Below zero: {measure.violation}." if measure.violation else ""
     return f"{measure.long_name[0].upper()}{measure.long_name[1:]}. {measure.description}{breaks}"

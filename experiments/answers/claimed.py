@@ -19,27 +19,36 @@ from matplotlib.colors import ListedColormap
 from matplotlib.patches import Patch
 
 import vrw_jax as vrw
-from experiments.shared.command import command, started
-from experiments.shared.tables import FIGURES, markdown, numbers, read, write
+from experiments.shared.command import make_parser, parse_and_start_jax
+from experiments.shared.tables import FIGURES, format_markdown, read_column, read_table, write_table
 from experiments.shared.wheels import WIDE_BOX
 from vrw_jax import figures as plots
-from vrw_jax.cycles import finder_of
+from vrw_jax.cycles import make_finder
 from vrw_jax.wheel import PARAMETER_NAMES
 
-BOX, HOSTILE, OF = 400, 100, 8
-CLOSE = 0.1
+N_BOX_WHEELS, N_HOSTILE_WHEELS, N_PARTS = 400, 100, 8
+SAME_GAIT_DISTANCE = 0.1
 """How near to an answer's section state its gait must be, rad, rad/s, m, m/s."""
 WALKS = (40, 200)
 """Steps of a walk to it, where Newton's method from there leads elsewhere."""
-TOLD = ("values", "errors", "model_errors", "rungs", "hows", "n_steps", "states", "outcomes")
-TRUE = (1e-12, 1e-11, 1e-10, 1e-9)
+RESULT_FIELDS = (
+    "values",
+    "errors",
+    "model_errors",
+    "rungs",
+    "hows",
+    "n_steps",
+    "states",
+    "outcomes",
+)
+REFERENCE_TOLERANCES = (1e-12, 1e-11, 1e-10, 1e-9)
 TOLERANCES = 10.0 ** -np.arange(2, 9)
-MAPPED = (1e-2, 1e-4, 1e-6)
+MAP_TOLERANCES = (1e-2, 1e-4, 1e-6)
 MEASURES = ("speed", "dls_fraction", "period")
 DAMPING, FRICTION = np.linspace(100.0, 210.0, 12), np.geomspace(1.0, 100.0, 11)
 CLOUD, MAP = FIGURES / "answers_cloud.npz", FIGURES / "answers_map.csv"
 COUNT = FIGURES / "answers_count.csv"
-SEEN = 1e-9
+MIN_MODEL_ERROR = 1e-9
 """True model error from which on its estimate counts."""
 KINDS = ("lower stands", "continued", "walked to", "from a start")
 COLOURS = ("#0072B2", "#56B4E9", "#E69F00", "#CC79A7", "#DDDDDD")
@@ -51,42 +60,50 @@ def wheels(part: int) -> tuple[Columns, np.ndarray, np.ndarray]:
     """The box first, then the hostile ones; friction and tolerance of each."""
     random = np.random.default_rng(part)
     draw = lambda n: {name: random.uniform(*ends, n) for name, ends in WIDE_BOX.items()}
-    box, many = draw(BOX), draw(OF * HOSTILE)
+    box, many = draw(N_BOX_WHEELS), draw(N_PARTS * N_HOSTILE_WHEELS)
     cycles = vrw.limit_cycles(vrw.WheelParams(**many))
     forces = cycles.indicators
-    fold = np.abs(np.linalg.det(np.eye(2) - np.asarray(cycles.matrix)))
+    fold = np.abs(np.linalg.det(np.eye(2) - np.asarray(cycles.monodromy_value)))
     near = np.minimum.reduce([
         fold, np.abs(forces.lambda_4) / 20.0, np.abs(forces.lambda_I4) / 5.0,
         np.asarray(cycles.dls_fraction),
     ])  # fmt: skip
-    hostile = np.argsort(np.where(np.asarray(cycles.found), near, np.inf))[:HOSTILE]
+    hostile = np.argsort(np.where(np.asarray(cycles.found), near, np.inf))[:N_HOSTILE_WHEELS]
     columns = {name: np.concatenate([box[name], many[name][hostile]]) for name in box}
-    n = BOX + HOSTILE
+    n = N_BOX_WHEELS + N_HOSTILE_WHEELS
     friction = np.exp(random.uniform(np.log(0.5), np.log(100.0), n))
     return columns, friction, random.choice(TOLERANCES, n)
 
 
-def computed(part: int) -> Columns:
+def compute_part(part: int) -> Columns:
     """What wheels of a part are told, and the truth; NaN where they have no gait."""
     columns, friction, tols = wheels(part)
-    told: Columns = {}
+    result: Columns = {}
     for tol in TOLERANCES:
-        some = np.flatnonzero(tols == tol)
-        answered = vrw.answer(MEASURES, of(columns, some), tol, friction=friction[some])
-        for name in TOLD:
-            own = getattr(answered, name)
-            told.setdefault(name, np.zeros((len(tols), *own.shape[1:])))[some] = own
-    exact = truth(columns, friction, told.pop("states"), told["outcomes"] == vrw.Outcome.STEPPED)
-    hostile = np.arange(len(tols)) >= BOX
-    return columns | told | {"exact": exact, "hostile": hostile, "friction": friction, "tol": tols}
+        selection = np.flatnonzero(tols == tol)
+        answered = vrw.measure_to_tolerance(
+            MEASURES, select_wheels(columns, selection), tol, friction=friction[selection]
+        )
+        for name in RESULT_FIELDS:
+            own_values = getattr(answered, name)
+            result.setdefault(name, np.zeros((len(tols), *own_values.shape[1:])))[selection] = (
+                own_values
+            )
+    exact = compute_reference(
+        columns, friction, result.pop("states"), result["outcomes"] == vrw.Outcome.STEPPED
+    )
+    hostile = np.arange(len(tols)) >= N_BOX_WHEELS
+    return (
+        columns | result | {"exact": exact, "hostile": hostile, "friction": friction, "tol": tols}
+    )
 
 
-def of(columns: Columns, some: np.ndarray) -> vrw.WheelParams:
-    return vrw.WheelParams(**{name: x[some] for name, x in columns.items()})
+def select_wheels(columns: Columns, selection: np.ndarray) -> vrw.WheelParams:
+    return vrw.WheelParams(**{name: x[selection] for name, x in columns.items()})
 
 
-def truth(
-    columns: Columns, friction: np.ndarray, near: np.ndarray, found: np.ndarray
+def compute_reference(
+    columns: Columns, friction: np.ndarray, near: np.ndarray, solution: np.ndarray
 ) -> np.ndarray:
     """Measures of the gaits next to the answers' section states.
 
@@ -95,21 +112,23 @@ def truth(
     but the step is shared with what `vrw.answer` does. NaN where there is none: then the answer
     is wrong.
     """
-    exact, open_ = np.full((len(friction), len(MEASURES)), np.nan), np.flatnonzero(found)
+    exact, open_ = np.full((len(friction), len(MEASURES)), np.nan), np.flatnonzero(solution)
     legs = vrw.WheelParams().n_legs
-    for n_steps, tol in [(n, TRUE[0]) for n in (0, *WALKS)] + [(0, tol) for tol in TRUE[1:]]:
-        options = vrw.Options(rtol=tol, atol=tol)
+    for n_steps, tol in [(n, REFERENCE_TOLERANCES[0]) for n in (0, *WALKS)] + [
+        (0, tol) for tol in REFERENCE_TOLERANCES[1:]
+    ]:
+        options = vrw.StepOptions(rtol=tol, atol=tol)
         if not len(open_):
             break
-        finder = finder_of(vrw.UnilateralWheel(), legs, step_options=options)
-        params, x = of(columns, open_), near[open_]
-        own = [np.broadcast_to(getattr(params, n), len(open_)) for n in PARAMETER_NAMES]
+        finder = make_finder(vrw.UnilateralWheel(), legs, step_options=options)
+        params, x = select_wheels(columns, open_), near[open_]
+        own_values = [np.broadcast_to(getattr(params, n), len(open_)) for n in PARAMETER_NAMES]
         if n_steps:
             ground = vrw.UnilateralWheel(friction[open_])
-            x = np.asarray(vrw.steps(params, x, n_steps, model=ground).section_state)
-        gait = finder.near(np.column_stack([*own, friction[open_]]), x)
+            x = np.asarray(vrw.step_batch(params, x, n_steps, model=ground).section_state)
+        gait = finder.near(np.column_stack([*own_values, friction[open_]]), x)
         missed = np.abs(np.asarray(gait.section_state) - near[open_]).max(1)
-        hit = np.asarray(gait.found) & (missed < CLOSE)
+        hit = np.asarray(gait.found) & (missed < SAME_GAIT_DISTANCE)
         exact[open_[hit]] = np.stack([np.asarray(getattr(gait, m)) for m in MEASURES], 1)[hit]
         open_ = open_[~hit]
     return exact
@@ -120,97 +139,113 @@ def compute(parts: int, folder: Path) -> None:
     for part in range(parts):
         path = folder / f"part_{part:03}.npz"
         if not path.exists():
-            told = computed(part)
-            np.savez_compressed(path.with_suffix(".tmp.npz"), **told)
+            result = compute_part(part)
+            np.savez_compressed(path.with_suffix(".tmp.npz"), **result)
             path.with_suffix(".tmp.npz").rename(path)
             print(path, flush=True)
 
 
-def gathered(folder: Path) -> None:
+def gather_parts(folder: Path) -> None:
     """All parts in one small file."""
     parts = [dict(np.load(path)) for path in sorted(folder.glob("part_???.npz"))]
-    told = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    lower = told["values"] + np.where(told["hows"] == 0, 0.0, told["model_errors"].T).T
+    result_by_name = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    lower = (
+        result_by_name["values"]
+        + np.where(result_by_name["hows"] == 0, 0.0, result_by_name["model_errors"].T).T
+    )
     small = {
-        "answered": np.isfinite(told["values"]).all(1),
-        "wrong": told["values"] - told["exact"],
-        "effectivity": _over(told["model_errors"], lower - told["exact"]),
-        "model_error": lower - told["exact"],
-        **{name: told[name] for name in (
+        "answered": np.isfinite(result_by_name["values"]).all(1),
+        "wrong": result_by_name["values"] - result_by_name["exact"],
+        "effectivity": _divide(result_by_name["model_errors"], lower - result_by_name["exact"]),
+        "model_error": lower - result_by_name["exact"],
+        **{name: result_by_name[name] for name in (
             "errors", "hows", "n_steps", "outcomes", "hostile", "friction", "tol", "damping",
         )},
     }  # fmt: skip
     np.savez_compressed(CLOUD, **{name: x.astype(np.float32) for name, x in small.items()})
 
 
-def _over(above: np.ndarray, below: np.ndarray) -> np.ndarray:
+def _divide(above: np.ndarray, below: np.ndarray) -> np.ndarray:
     return np.divide(above, below, out=np.full_like(above, np.nan), where=below != 0.0)
 
 
-def mapped() -> None:
+def compute_map() -> None:
     c, mu = (x.ravel() for x in np.meshgrid(DAMPING, FRICTION))
     rows = []
-    for tol in MAPPED:
-        told = vrw.answer("speed", vrw.WheelParams(damping=c), tol, friction=mu)
-        columns = c, mu, told.rungs, told.hows, told.n_steps
+    for tol in MAP_TOLERANCES:
+        measured = vrw.measure_to_tolerance("speed", vrw.WheelParams(damping=c), tol, friction=mu)
+        columns = c, mu, measured.models, measured.statuses, measured.n_steps
         rows += [(tol, *row) for row in zip(*columns, strict=True)]
-    write(MAP, ("tol", "damping", "friction", "rung", "how", "n_steps"), rows)
+    write_table(MAP, ("tol", "damping", "friction", "rung", "how", "n_steps"), rows)
 
 
-def best(cloud: Columns) -> np.ndarray:
+def find_best_model(cloud: Columns) -> np.ndarray:
     """Steps' worth of what would have sufficed: the paper's gait alone, which costs what one step
     does, where it is right to the tolerance; else real ground, as it was climbed to."""
     lower = np.all(np.abs(cloud["model_error"]) <= cloud["tol"][:, None], axis=1)
     return np.where(lower & (cloud["hows"] <= 1), 1.0, cloud["n_steps"])
 
 
-def counted() -> None:
+def count_results() -> None:
     """The page's numbers."""
     cloud, table = dict(np.load(CLOUD)), []
     hostile = cloud["hostile"] > 0
-    for name, some in (("box", ~hostile), ("hostile", hostile)):
-        own = {key: x[some] for key, x in cloud.items()}
-        answered = own["answered"] > 0
+    for name, selection in (("box", ~hostile), ("hostile", hostile)):
+        own_values = {key: x[selection] for key, x in cloud.items()}
+        answered = own_values["answered"] > 0
         # Infinite where there is no gait to be right about.
-        ratio = np.nan_to_num(np.abs(own["wrong"]) / own["errors"], nan=np.inf).max(1)
-        lower = answered & (own["hows"] <= 1) & np.isfinite(ratio)
-        for which, rows in (("all", lower), ("of one step", lower & (own["hows"] == 0))):
-            effect = own["effectivity"][rows][np.abs(own["model_error"][rows]) > SEEN]
+        ratio = np.nan_to_num(np.abs(own_values["wrong"]) / own_values["errors"], nan=np.inf).max(1)
+        lower = answered & (own_values["hows"] <= 1) & np.isfinite(ratio)
+        for which, rows in (("all", lower), ("of one step", lower & (own_values["hows"] == 0))):
+            effect = own_values["effectivity"][rows][
+                np.abs(own_values["model_error"][rows]) > MIN_MODEL_ERROR
+            ]
             within = np.sum((effect > 0.5) & (effect < 2.0))
             print(f"{name}: effectivity in 0.5 ... 2, {which}: {within} of {len(effect)}")
-        cost = np.sum((1.0 + own["n_steps"])[answered]) / np.sum(best(own)[answered])
+        cost = np.sum((1.0 + own_values["n_steps"])[answered]) / np.sum(
+            find_best_model(own_values)[answered]
+        )
         print(f"{name}: cost over that of the best rung {cost:.3f}")
-        lost = Counter(vrw.Outcome(int(code)).name for code in own["outcomes"][~answered])
-        print(f"{name}: {len(answered)} wheels, {answered.sum()} answered; no answer: {dict(lost)}")
+        lost_values = Counter(
+            vrw.Outcome(int(code)).name for code in own_values["outcomes"][~answered]
+        )
+        print(
+            f"{name}: {len(answered)} wheels, {answered.sum()} answered; no answer: {dict(lost_values)}"
+        )
         for tol in TOLERANCES:
-            here = answered & (np.abs(own["tol"] / tol - 1.0) < 1e-3)
-            hows = [np.sum(here & (own["hows"] == how)) for how in range(len(KINDS))]
-            outside = ratio[here & (ratio > 1.0)]
+            values_here = answered & (np.abs(own_values["tol"] / tol - 1.0) < 1e-3)
+            hows = [
+                np.sum(values_here & (own_values["hows"] == status)) for status in range(len(KINDS))
+            ]
+            outside = ratio[values_here & (ratio > 1.0)]
             finite = outside[np.isfinite(outside)]
             worst = f"{finite.max():.3g}" if len(finite) else ""
-            steps, without = f"{np.mean(own['n_steps'][here]):.1f}", len(outside) - len(finite)
+            steps, without = (
+                f"{np.mean(own_values['n_steps'][values_here]):.1f}",
+                len(outside) - len(finite),
+            )
             table.append(
-                [name, f"{tol:.0e}", np.sum(here), *hows, steps, len(finite), worst, without]
+                [name, f"{tol:.0e}", np.sum(values_here), *hows, steps, len(finite), worst, without]
             )
     header = "set", "tolerance", "answers", *KINDS, "steps", "outside", "worst", "gait unconfirmed"
-    write(COUNT, header, table)
-    print(markdown(header, table))
+    write_table(COUNT, header, table)
+    print(format_markdown(header, table))
 
 
 def draw() -> None:
     cloud = dict(np.load(CLOUD))
     with plots.figure_style():
-        page = plt.figure(figsize=(plots.PAGE, 5.6))
+        page = plt.figure(figsize=(plots.PAGE_WIDTH_INCHES, 5.6))
         top, below = page.subfigures(2, 1)
         axis, cost = top.subplots(1, 2)
         ends = np.array([1e-13, 1e0])
         wrong = np.maximum(np.abs(cloud["wrong"]), ends[0])
         outside = np.abs(cloud["wrong"]) > cloud["errors"]
-        for how, kind in enumerate(KINDS):
-            some = (cloud["hows"] == how)[:, None] & ~outside
-            axis.plot(cloud["errors"][some], wrong[some], ".", ms=1.5, color=COLOURS[how],
+        for status, kind in enumerate(KINDS):
+            selection = (cloud["hows"] == status)[:, None] & ~outside
+            axis.plot(cloud["errors"][selection], wrong[selection], ".", ms=1.5, color=COLOURS[status],
                       rasterized=True)  # fmt: skip
-            axis.plot([], [], "o", ms=3, color=COLOURS[how], label=kind)
+            axis.plot([], [], "o", ms=3, color=COLOURS[status], label=kind)
         axis.plot(cloud["errors"][outside], wrong[outside], "kx", ms=4, label="outside")
         axis.plot(ends, ends, "k", lw=0.6)
         axis.set(xscale="log", yscale="log", xlabel="claimed error", ylabel="true error",
@@ -222,23 +257,25 @@ def draw() -> None:
             ("walked to", (2, 3), COLOURS[2]),
         )
         for name, hows, colour in groups:
-            kept = np.isin(cloud["hows"], hows)
-            here = [kept & (np.abs(cloud["tol"] / tol - 1.0) < 1e-3) for tol in TOLERANCES]
-            cost.plot(TOLERANCES, [np.nanmean(cloud["n_steps"][i]) for i in here], "o-", ms=3,
+            retained = np.isin(cloud["hows"], hows)
+            values_here = [
+                retained & (np.abs(cloud["tol"] / tol - 1.0) < 1e-3) for tol in TOLERANCES
+            ]
+            cost.plot(TOLERANCES, [np.nanmean(cloud["n_steps"][i]) for i in values_here], "o-", ms=3,
                       color=colour, label=name)  # fmt: skip
-        cost.axhline(1.0, color=plots.GREY, lw=0.6)
+        cost.axhline(1.0, color=plots.DARK_GRAY, lw=0.6)
         cost.set(xscale="log", yscale="log", xlabel="tolerance", ylabel="steps on real ground")
         cost.invert_xaxis()
         cost.legend(fontsize=6, loc="lower right", bbox_to_anchor=(1.0, 0.06))
-        points = read(MAP)
+        points = read_table(MAP)
         names = (*KINDS, "no gait found")
         colours = ListedColormap(COLOURS)
-        for axis, tol in zip(below.subplots(1, 3, sharey=True), MAPPED, strict=True):
-            some = [r for r in points if float(r["tol"]) == tol]
-            how = numbers(some, "how").reshape(len(FRICTION), len(DAMPING))
-            axis.pcolormesh(DAMPING, FRICTION, how, vmin=-0.5, vmax=4.5, cmap=colours)
+        for axis, tol in zip(below.subplots(1, 3, sharey=True), MAP_TOLERANCES, strict=True):
+            selection = [r for r in points if float(r["tol"]) == tol]
+            status = read_column(selection, "how").reshape(len(FRICTION), len(DAMPING))
+            axis.pcolormesh(DAMPING, FRICTION, status, vmin=-0.5, vmax=4.5, cmap=colours)
             axis.set(yscale="log", xlabel="damping $c$ [N·s/m]", title=f"tolerance {tol:g}")
-            if tol == MAPPED[0]:
+            if tol == MAP_TOLERANCES[0]:
                 axis.set_ylabel("friction coefficient $\\mu$")
         patches = [Patch(color=colours(i), label=name) for i, name in enumerate(names)]
         below.legend(handles=patches, loc="outside lower center", ncols=len(names), fontsize=6)
@@ -246,16 +283,16 @@ def draw() -> None:
 
 
 def main() -> None:
-    parser = command(__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--parts", type=int, default=25)
     parser.add_argument("--folder", type=Path, default=Path("results/answers"))
     parser.add_argument("--redraw", action="store_true", help="compute nothing")
-    asked = started(parser)
-    if not asked.redraw:
-        compute(asked.parts, asked.folder)
-        gathered(asked.folder)
-        mapped()
-    counted()
+    arguments = parse_and_start_jax(parser)
+    if not arguments.redraw:
+        compute(arguments.parts, arguments.folder)
+        gather_parts(arguments.folder)
+        compute_map()
+    count_results()
     draw()
 
 

@@ -17,93 +17,101 @@ from typing import Any
 import numpy as np
 
 import vrw_jax as vrw
-from experiments.shared.command import command, started
-from experiments.shared.tables import FIGURES, markdown, write
+from experiments.shared.command import make_parser, parse_and_start_jax
+from experiments.shared.tables import FIGURES, format_markdown, write_table
 from experiments.shared.wheels import BOX
-from vrw_jax.answers.averages import DEVIATIONS
-from vrw_jax.answers.result import How
+from vrw_jax.answers.averages import N_STANDARD_ERRORS
+from vrw_jax.answers.result import MeasureStatus
 
 TOL, FRICTION = 1e-3, (15.0, 100.0)
 TABLE = FIGURES / "answers_means.csv"
 N_MEAN, N_SCAN = 1000, 128
-AROUND = {"damping": (140.0, 160.0), "stiffness": (480.0, 520.0), "slope": (0.29, 0.31)}
-DESIGNS = {"around Table 1": (AROUND, (2e-3, 2e-4)), "box": (BOX, (1e-2,))}
+NARROW_BOX = {"damping": (140.0, 160.0), "stiffness": (480.0, 520.0), "slope": (0.29, 0.31)}
+DESIGNS = {"around Table 1": (NARROW_BOX, (2e-3, 2e-4)), "box": (BOX, (1e-2,))}
 """With tolerances of means."""
 
 
-def drawn(box: dict[str, tuple[float, float]], n: int) -> dict[str, np.ndarray]:
+def draw_wheels(box: dict[str, tuple[float, float]], n: int) -> dict[str, np.ndarray]:
     random = np.random.default_rng(1)
     return {name: random.uniform(*ends, n) for name, ends in box.items()}
 
 
-def against_the_top_rung(n: int, repeats: int) -> None:
+def compare_with_unilateral_model(n: int, repeats: int) -> None:
     """Of all wheels, and of those that begin at a gait of the paper's and end near it."""
-    columns = drawn(BOX, n)
+    columns = draw_wheels(BOX, n)
     columns["friction"] = np.exp(np.random.default_rng(2).uniform(*np.log(FRICTION), n))
     design = vrw.samples(columns)
-    found = vrw.scan(design, ["speed"], model=vrw.UnilateralWheel(), tol=TOL)
+    scan_result = vrw.scan(design, ["speed"], model=vrw.UnilateralWheel(), tol=TOL)
     friction = columns.pop("friction")
-    told = vrw.answer("speed", vrw.WheelParams(**columns), TOL, friction=friction)
-    near = np.isin(told.hows, (How.CHECKED, How.CORRECTED))
-    print(f"{n} wheels: {int((found.outcome.values == 0).sum())} with an answer, {near.sum()} near")
-    some = {name: x[near] for name, x in (*columns.items(), ("friction", friction))}
-    for name, wheels in (("all", design), ("near the paper's gait", vrw.samples(some))):
+    measured = vrw.measure_to_tolerance("speed", vrw.WheelParams(**columns), TOL, friction=friction)
+    near = np.isin(
+        measured.statuses, (MeasureStatus.CHECKED_BY_ONE_STEP, MeasureStatus.CONTINUES_LOWER_GAIT)
+    )
+    print(
+        f"{n} wheels: {int((scan_result.outcome.values == 0).sum())} with an answer, {near.sum()} near"
+    )
+    selection = {name: x[near] for name, x in (*columns.items(), ("friction", friction))}
+    for name, wheels in (("all", design), ("near the paper's gait", vrw.samples(selection))):
         scan = functools.partial(vrw.scan, wheels, ["speed"], model=vrw.UnilateralWheel())
         best = {tol: _cpu(functools.partial(scan, tol=tol), repeats)[0] for tol in (None, TOL)}
         share = best[TOL] / best[None]
         print(f"{name}: {best[TOL]:.3f} s, top rung {best[None]:.3f} s, {share:.3f}", flush=True)
 
 
-def means() -> None:
+def measure_means() -> None:
     """What a mean costs, beside a scan on real ground of as many wheels as its error takes."""
     rows = []
     for name, (box, tolerances) in DESIGNS.items():
-        columns = drawn(box, N_MEAN)
+        columns = draw_wheels(box, N_MEAN)
         wheels = vrw.WheelParams(**columns)
         for friction in (5.0, 15.0, 50.0):
-            every = vrw.answer(("speed", "dls_fraction"), wheels, 1e-6, friction=friction)
-            some = {key: x[:N_SCAN] for key, x in columns.items()}
-            design = vrw.samples(some | {"friction": np.full(N_SCAN, friction)})
+            every = vrw.measure_to_tolerance(
+                ("speed", "dls_fraction"), wheels, 1e-6, friction=friction
+            )
+            selection = {key: x[:N_SCAN] for key, x in columns.items()}
+            design = vrw.samples(selection | {"friction": np.full(N_SCAN, friction)})
             scan = functools.partial(vrw.scan, design, ["speed"], model=vrw.UnilateralWheel())
-            one, found = _cpu(scan, 2)[0] / N_SCAN, np.mean(every.found)
+            one, solution = _cpu(scan, 2)[0] / N_SCAN, np.mean(every.found)
             for i, measure in enumerate(every.names):
                 values = every.values[every.found, i]
                 for tol in tolerances:
-                    take = functools.partial(vrw.average, measure, wheels, tol, friction=friction)
+                    take = functools.partial(
+                        vrw.multifidelity_mean, measure, wheels, tol, friction=friction
+                    )
                     cpu, mean = _cpu(take, 3)
-                    many = (DEVIATIONS * np.std(values) / mean.error) ** 2 / found
-                    alone = many / (1.0 + many / N_MEAN)
+                    many = (N_STANDARD_ERRORS * np.std(values) / mean.error) ** 2 / solution
+                    single_result = many / (1.0 + many / N_MEAN)
                     rows.append([
-                        name, friction, measure, tol, int(mean.n_top), mean.control,
+                        name, friction, measure, tol, int(mean.n_high_fidelity), mean.control,
                         f"{mean.error:.2g}", f"{mean.value - np.mean(values):.2g}", f"{cpu:.3f}",
-                        f"{alone:.0f}", f"{one * 1e3:.2f}", f"{cpu / (alone * one):.3f}",
+                        f"{single_result:.0f}", f"{one * 1e3:.2f}", f"{cpu / (single_result * one):.3f}",
                     ])  # fmt: skip
                     print(*rows[-1], flush=True)
     header = (
         "design", "friction", "measure", "tol", "asked", "control", "stated", "wrong by",
         "CPU time, s", "wheels alone", "ms each", "ratio",
     )  # fmt: skip
-    write(TABLE, header, rows)
-    print(markdown(header, rows))
+    write_table(TABLE, header, rows)
+    print(format_markdown(header, rows))
 
 
 def _cpu(take: Callable[[], Any], repeats: int) -> tuple[float, Any]:
     """Least CPU time of all threads, s, after a first call that compiles; and the last result."""
-    told, best = take(), np.inf
+    result, best = take(), np.inf
     for _ in range(repeats):
         began = time.process_time()
-        told = take()
+        result = take()
         best = min(best, time.process_time() - began)
-    return best, told
+    return best, result
 
 
 def main() -> None:
-    parser = command(__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--wheels", type=int, default=1024)
     parser.add_argument("--repeats", type=int, default=2)
-    asked = started(parser)
-    against_the_top_rung(asked.wheels, asked.repeats)
-    means()
+    arguments = parse_and_start_jax(parser)
+    compare_with_unilateral_model(arguments.wheels, arguments.repeats)
+    measure_means()
 
 
 if __name__ == "__main__":

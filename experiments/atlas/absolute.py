@@ -14,12 +14,12 @@ from typing import NamedTuple
 from mpmath import cos, mp, mpf, sin
 
 from experiments.atlas.cases import slider_crank as given
-from experiments.shared.command import command, started
+from experiments.shared.command import make_parser, parse_and_start_jax
 
 Row = list  # of mpf
 LEVELS, STEP = 11, mpf("2e-4")
 """Extrapolated steps of 2, 4, ... substeps; their length, s."""
-SMALL = mpf("1e-26")
+STEP_TOLERANCE = mpf("1e-26")
 
 
 def exact(*numbers: float) -> list:
@@ -38,10 +38,10 @@ def solve(matrix: list[Row], right: Row) -> Row:
             factor = rows[k][i] / rows[i][i]
             if factor:
                 rows[k] = [x - factor * y for x, y in zip(rows[k], rows[i], strict=True)]
-    told = [mpf(0)] * n
+    result = [mpf(0)] * n
     for i in reversed(range(n)):
-        told[i] = (rows[i][n] - sum(rows[i][k] * told[k] for k in range(i + 1, n))) / rows[i][i]
-    return told
+        result[i] = (rows[i][n] - sum(rows[i][k] * result[k] for k in range(i + 1, n))) / rows[i][i]
+    return result
 
 
 class Mechanism:
@@ -54,7 +54,9 @@ class Mechanism:
         masses = exact(given.CRANK_MASS, given.ROD_MASS, given.SLIDER_MASS)
         inertias = exact(given.CRANK_INERTIA, given.ROD_INERTIA, given.SLIDER_INERTIA)
         self.mass = [x for m, j in zip(masses, inertias, strict=True) for x in (m, m, j)]
-        self.gravity, self.kept, self.friction = exact(given.GRAVITY, given.KEPT, given.FRICTION)
+        self.gravity, self.kept, self.friction = exact(
+            given.GRAVITY, given.RESTITUTION_COEFFICIENT, given.FRICTION
+        )
         self.weight = [mpf(0)] * 9
         for i in (1, 4, 7):
             self.weight[i] = -self.gravity * self.mass[i]
@@ -87,10 +89,10 @@ class Mechanism:
                     angle, rate = y[3 * body + 2], y[3 * body + 11]
                     reach = lengths[body]  # of its end, or start, from its middle
                     row[3 * body + axis] += sign
-                    along = cos(angle) if axis == 0 else sin(angle)
-                    across = -sin(angle) if axis == 0 else cos(angle)
-                    row[3 * body + 2] += reach * across
-                    bend -= reach * along * rate * rate
+                    tangential_part = cos(angle) if axis == 0 else sin(angle)
+                    transverse_part = -sin(angle) if axis == 0 else cos(angle)
+                    row[3 * body + 2] += reach * transverse_part
+                    bend -= reach * tangential_part * rate * rate
                 rows.append(row)
                 bends.append(bend)
         return rows, bends
@@ -99,20 +101,22 @@ class Mechanism:
         """Gaps of a face's two corners, their changes, forces when sliding, and their bends."""
         angle, rate = y[8], y[17]
         gaps, normals, pushes, bends = [], [], [], []
-        for across in (-self.half, self.half):
+        for transverse_part in (-self.half, self.half):
             up = face * self.height
-            level = y[7] + across * sin(angle) + up * cos(angle)
-            turn = across * cos(angle) - up * sin(angle)
+            level = y[7] + transverse_part * sin(angle) + up * cos(angle)
+            turn = transverse_part * cos(angle) - up * sin(angle)
             gaps.append(self.height + self.play - face * level)
             normals.append([mpf(0)] * 7 + [mpf(-face), -face * turn])
-            ahead = -across * sin(angle) - up * cos(angle)
+            ahead = -transverse_part * sin(angle) - up * cos(angle)
             pushes.append(
                 [mpf(0)] * 6 + [self.friction, mpf(-face), -face * turn + self.friction * ahead]
             )
-            bends.append(-face * (-across * sin(angle) - up * cos(angle)) * rate * rate)
+            bends.append(-face * (-transverse_part * sin(angle) - up * cos(angle)) * rate * rate)
         return gaps, normals, pushes, bends
 
-    def answered(self, y: Row, face: int, bare: Row, joints: Row, corners: Row) -> tuple[Row, Row]:
+    def solve_constraints(
+        self, y: Row, face: int, bare: Row, joints: Row, corners: Row
+    ) -> tuple[Row, Row]:
         """Changes that obey the joints, and the corners of `face` (0: none), and their forces."""
         rows, _ = self.joints(y)
         forces = list(rows)
@@ -133,32 +137,35 @@ class Mechanism:
         """Rates of places and rates, and the normal forces of the face's corners."""
         bends = [-bend for bend in self.joints(y)[1]]
         open_ = [-bend for bend in self.corners(y, face)[3]] if face else []
-        rates, sizes = self.answered(y, face, self.weight, bends, open_)
+        rates, sizes = self.solve_constraints(y, face, self.weight, bends, open_)
         return y[9:] + rates, sizes
 
-    def hit(self, y: Row, face: int, kept: mpf) -> tuple[Row, Row]:
+    def apply_impact(self, y: Row, face: int, retained: mpf) -> tuple[Row, Row]:
         """Past an impact of both corners, and their impulses."""
         _, normals, _, _ = self.corners(y, face)
         rates = [sum(n * v for n, v in zip(normal, y[9:], strict=True)) for normal in normals]
-        jumps, sizes = self.answered(
-            y, face, [mpf(0)] * 9, [mpf(0)] * 6, [-(1 + kept) * rate for rate in rates]
+        jumps, sizes = self.solve_constraints(
+            y, face, [mpf(0)] * 9, [mpf(0)] * 6, [-(1 + retained) * rate for rate in rates]
         )
         return y[:9] + [v + jump for v, jump in zip(y[9:], jumps, strict=True)], sizes
 
 
-def stepped(field: Callable[[Row], Row], y: Row, length: mpf) -> Row:
+def extrapolate_step(field: Callable[[Row], Row], y: Row, length: mpf) -> Row:
     """The midpoint rule with 2, 4, ... substeps, extrapolated."""
     table: list[Row] = []
     first = field(y)
     for level in range(1, LEVELS + 1):
         n = 2 * level
         h = length / n
-        before, now = y, [a + h * b for a, b in zip(y, first, strict=True)]
+        before, current_value = y, [a + h * b for a, b in zip(y, first, strict=True)]
         for _ in range(n - 1):
-            rate = field(now)
-            before, now = now, [a + 2 * h * b for a, b in zip(before, rate, strict=True)]
-        rate = field(now)
-        entry = [(a + b + h * c) / 2 for a, b, c in zip(before, now, rate, strict=True)]
+            rate = field(current_value)
+            before, current_value = (
+                current_value,
+                [a + 2 * h * b for a, b in zip(before, rate, strict=True)],
+            )
+        rate = field(current_value)
+        entry = [(a + b + h * c) / 2 for a, b, c in zip(before, current_value, rate, strict=True)]
         line = [entry]
         for k in range(1, level):
             ratio = (mpf(level) / (level - k)) ** 2 - 1
@@ -166,74 +173,74 @@ def stepped(field: Callable[[Row], Row], y: Row, length: mpf) -> Row:
             line.append([a + (a - b) / ratio for a, b in pairs])
         gap = max(abs(a - b) for a, b in zip(line[-1], table[-1], strict=True)) if table else 1
         table = line
-        if gap < SMALL:
+        if gap < STEP_TOLERANCE:
             return table[-1]
     raise ArithmeticError(f"the step of {length} s is off by {gap}")
 
 
-class Met(NamedTuple):
+class EventState(NamedTuple):
     time: mpf
     state: Row
 
 
-def until(field: Callable, value: Callable, y: Row, length: mpf) -> Met:
+def integrate_until(field: Callable, value: Callable, y: Row, length: mpf) -> EventState:
     """To where `value` falls to zero: steps, then the secant rule, away from where a step began."""
     time = mpf(0)
     while True:
-        after = stepped(field, y, length)
+        after = extrapolate_step(field, y, length)
         if value(after) <= 0:
             break
         y, time = after, time + length
     near = mpf("0.9") * length
-    low, high = (near, value(stepped(field, y, near))), (length, value(after))
+    low, high = (near, value(extrapolate_step(field, y, near))), (length, value(after))
     for _ in range(60):
-        at = high[0] - high[1] * (high[0] - low[0]) / (high[1] - low[1])
-        if abs(at - high[0]) < SMALL * STEP:
+        value_at = high[0] - high[1] * (high[0] - low[0]) / (high[1] - low[1])
+        if abs(value_at - high[0]) < STEP_TOLERANCE * STEP:
             break
-        low, high = high, (at, value(stepped(field, y, at)))
+        low, high = high, (value_at, value(extrapolate_step(field, y, value_at)))
         if low[1] == high[1]:
             break
-    return Met(time + at, stepped(field, y, at))
+    return EventState(time + value_at, extrapolate_step(field, y, value_at))
 
 
-def march(bounces: int = 60) -> dict[str, mpf]:
+def simulate_bounces(bounces: int = 60) -> dict[str, mpf]:
     """Times of the events, s, the crank's rate and the two impulses of the first impact."""
-    mechanism, told = Mechanism(), {}
+    mechanism, result = Mechanism(), {}
     flight = lambda y: mechanism.field(y, 0)[0]
     above = lambda y: mechanism.corners(y, 1)[0][0]
-    met = until(flight, above, mechanism.start(), STEP)
-    time, y = met.time, met.state
-    told["first impact"] = time
-    y, sizes = mechanism.hit(y, 1, mechanism.kept)
-    told["crank's rate after it"] = y[11]
-    told["impulse behind"], told["impulse ahead"] = sizes
+    event_values = integrate_until(flight, above, mechanism.start(), STEP)
+    time, y = event_values.time, event_values.state
+    result["first impact"] = time
+    y, sizes = mechanism.apply_impact(y, 1, mechanism.kept)
+    result["crank's rate after it"] = y[11]
+    result["impulse behind"], result["impulse ahead"] = sizes
     for bounce in range(2, bounces + 1):
         rate, bend = -y[16], -flight(y)[16]  # of the gap: the slider does not turn
         length = -2 * rate / bend
-        met = until(flight, above, y, min(length * mpf("1.02"), STEP))
-        time, y = time + met.time, met.state
-        y, _ = mechanism.hit(y, 1, mechanism.kept)
+        event_values = integrate_until(flight, above, y, min(length * mpf("1.02"), STEP))
+        time, y = time + event_values.time, event_values.state
+        y, _ = mechanism.apply_impact(y, 1, mechanism.kept)
         if bounce == 2:
-            told["second impact"] = time
-        if met.time < mpf("1e-20"):
+            result["second impact"] = time
+        if event_values.time < mpf("1e-20"):
             break
-    told["end of the bounces"] = time
-    told["crank's rate there"] = y[11]
-    y, _ = mechanism.hit(y, 1, mpf(0))
+    result["end of the bounces"] = time
+    result["crank's rate there"] = y[11]
+    y, _ = mechanism.apply_impact(y, 1, mpf(0))
     slide = lambda y: mechanism.field(y, 1)[0]
-    met = until(slide, lambda y: min(mechanism.field(y, 1)[1]), y, STEP)
-    time, y = time + met.time, met.state
-    told["letting go"] = time
-    met = until(flight, lambda y: mechanism.corners(y, -1)[0][0], y, STEP)
-    told["touch of the other face"] = time + met.time
-    told["crank's rate at it"] = met.state[11]
-    return told
+    event_values = integrate_until(slide, lambda y: min(mechanism.field(y, 1)[1]), y, STEP)
+    time, y = time + event_values.time, event_values.state
+    result["letting go"] = time
+    event_values = integrate_until(flight, lambda y: mechanism.corners(y, -1)[0][0], y, STEP)
+    result["touch of the other face"] = time + event_values.time
+    result["crank's rate at it"] = event_values.state[11]
+    return result
 
 
 def main() -> None:
-    started(command(__doc__))
+    parse_and_start_jax(make_parser(__doc__))
     mp.dps = 40
-    for name, number in march().items():
+    for name, number in simulate_bounces().items():
         print(f"{name}: {mp.nstr(number, 22)}", flush=True)
 
 

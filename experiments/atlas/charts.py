@@ -9,9 +9,18 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from experiments.shared.tables import DOCS, FIGURES, Row, groups, markdown, numbers, read, replace
-from vrw_jax.figures import PAGE, figure_style, save
-from vrw_jax.figures.style import OUTCOMES
+from experiments.shared.tables import (
+    DOCS,
+    FIGURES,
+    Row,
+    format_markdown,
+    group_rows,
+    read_column,
+    read_table,
+    replace_block,
+)
+from vrw_jax.figures import PAGE_WIDTH_INCHES, figure_style, save
+from vrw_jax.figures.style import OUTCOME_STYLES
 from vrw_jax.wheel import Outcome
 
 STYLES = {  # of Okabe and Ito, a marker each
@@ -29,28 +38,32 @@ STYLES = {  # of Okabe and Ito, a marker each
 AXES = {"c/m": r"$c/m$ [s$^{-1}$] at $k$ = 500 N/m", "k/m": r"$k/m$ [s$^{-2}$] at $c/m$ = 100/s"}
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000", "0.5")
 SIGNS = re.compile("λ([24])⁺ → 0")
-FAST = 1.03  # rate of SLS-I's fast mode over c/m, docs/physics.md
+FAST_MODE_RATIO = 1.03  # rate of SLS-I's fast mode over c/m, docs/physics.md
 
 
 def stiffness(rows: list[Row], limit: Callable[[str], float]) -> Figure:
     """Time, work and error over stiffness; crosses where a method gave up or stepped otherwise."""
-    figure = Figure(figsize=(PAGE, 7.4))
+    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 7.4))
     grid = figure.subplots(3, 2, sharex="col", sharey="row")
     for column, axis in enumerate(AXES):
         for method, (colour, marker) in STYLES.items():
-            some = [row for row in rows if row["axis"] == axis and row["method"] == method]
-            good = [row for row in some if row["outcome"] == "STEPPED" and row["error"] != "nan"]
+            selection = [row for row in rows if row["axis"] == axis and row["method"] == method]
+            good = [
+                row for row in selection if row["outcome"] == "STEPPED" and row["error"] != "nan"
+            ]
             look = {"color": colour, "marker": marker, "ms": 3.5, "lw": 0.9}
             for axes, name in zip(grid[:, column], ("us_per_gait", "work", "error"), strict=True):
-                axes.loglog(numbers(good, "value"), numbers(good, name), label=method, **look)
-                failed = [row for row in some if row not in good]
-                y = np.nan_to_num(numbers(failed, name), nan=1.0)
-                axes.plot(numbers(failed, "value"), y, "x", color="black", ms=6, zorder=5)
+                axes.loglog(
+                    read_column(good, "value"), read_column(good, name), label=method, **look
+                )
+                failed = [row for row in selection if row not in good]
+                y = np.nan_to_num(read_column(failed, name), nan=1.0)
+                axes.plot(read_column(failed, "value"), y, "x", color="black", ms=6, zorder=5)
         grid[2, column].set_xlabel(AXES[axis])
     stiff = [row for row in rows if row["axis"] == "c/m" and row["method"] == "numba Dopri5"]
-    value, time = numbers(stiff, "value"), numbers(stiff, "duration_sls1")
+    value, time = read_column(stiff, "value"), read_column(stiff, "duration_sls1")
     for solver, line in (("Tsit5", "--"), ("Dopri8", ":")):
-        steps = time * FAST * value / limit(solver)
+        steps = time * FAST_MODE_RATIO * value / limit(solver)
         grid[1, 0].plot(value, steps, line, color="0.4", lw=1.0, label=f"stability, {solver}")
     for axes, name in zip(
         grid[:, 0], ("CPU time per gait [µs]", "tried steps or evaluations", "error"), strict=True
@@ -66,13 +79,13 @@ def stiffness(rows: list[Row], limit: Callable[[str], float]) -> Figure:
 def borders(rows: list[Row]) -> Figure:
     """Error of derivatives and values over the distance to a border."""
     names = list(dict.fromkeys(row["border"] for row in rows))
-    figure = Figure(figsize=(PAGE, 2.8))
+    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 2.8))
     grid = figure.subplots(1, len(names), sharey=True)
     for axes, name in zip(grid, names, strict=True):
-        some = [row for row in rows if row["border"] == name]
-        x = numbers(some, "distance")
-        axes.loglog(x, numbers(some, "derivative_error"), "o-", ms=4, label="derivative")
-        axes.loglog(x, numbers(some, "value_error"), "s--", ms=4, label="value")
+        selection = [row for row in rows if row["border"] == name]
+        x = read_column(selection, "distance")
+        axes.loglog(x, read_column(selection, "derivative_error"), "o-", ms=4, label="derivative")
+        axes.loglog(x, read_column(selection, "value_error"), "s--", ms=4, label="value")
         axes.set_title(SIGNS.sub(r"$\\lambda_\1^+ \\to 0$", name), fontsize=8)
         axes.grid(color="0.9", lw=0.4)
     figure.supxlabel("relative distance to the border", fontsize="medium")
@@ -81,28 +94,32 @@ def borders(rows: list[Row]) -> Figure:
     return figure
 
 
-def last_by(rows: list[Row], name: str) -> list[Row]:
+def select_last_rows(rows: list[Row], name: str) -> list[Row]:
     """The last row for each value of a column."""
-    return [some[-1] for some in groups(rows, name).values()]
+    return [selection[-1] for selection in group_rows(rows, name).values()]
 
 
-def curves(axes: Axes, rows: list[Row], by: str, x: str, y: str, label: str = "{}") -> None:
+def curves(axes: Axes, rows: list[Row], by_input: str, x: str, y: str, label: str = "{}") -> None:
     """One curve for each value of a column, each with its own colour and marker; zeros left out."""
     looks = zip(COLOURS, "os^Dv<>p", strict=True)
-    for (key, some), (colour, marker) in zip(groups(rows, by).items(), looks, strict=False):
-        xs, ys = numbers(some, x), np.abs(numbers(some, y))
-        shown = ys > 0.0
+    for (key, selection), (colour, marker) in zip(
+        group_rows(rows, by_input).items(), looks, strict=False
+    ):
+        xs, ys = read_column(selection, x), np.abs(read_column(selection, y))
+        shown_values = ys > 0.0
         look = {"color": colour, "marker": marker, "ms": 3.5, "lw": 0.9}
-        axes.loglog(xs[shown], ys[shown], label=label.format(key), **look)
+        axes.loglog(xs[shown_values], ys[shown_values], label=label.format(key), **look)
     axes.grid(color="0.9", lw=0.4)
 
 
-def over_steps(
-    rows: list[Row], key: str, label: str, shown: dict[str, str], height: float
+def draw_over_steps(
+    rows: list[Row], key: str, label: str, shown_values: dict[str, str], height: float
 ) -> tuple[Figure, Axes]:
     """A panel over the number of steps for each column shown; the last panel too."""
-    figure = Figure(figsize=(PAGE, height))
-    for axes, (y, name) in zip(figure.subplots(1, len(shown)), shown.items(), strict=True):
+    figure = Figure(figsize=(PAGE_WIDTH_INCHES, height))
+    for axes, (y, name) in zip(
+        figure.subplots(1, len(shown_values)), shown_values.items(), strict=True
+    ):
         curves(axes, rows, key, "steps", y, label)
         axes.set(xlabel="steps", ylabel=name)
     return figure, axes
@@ -110,17 +127,22 @@ def over_steps(
 
 def long_walk(rows: list[Row]) -> Figure:
     """Distance from the cycle, error of the clock and energy not accounted for, over steps."""
-    shown = {
+    shown_by_name = {
         "distance": "distance from the cycle",
         "clock_error_s": "error of the clock [s]",
         "not_accounted_J": "energy not accounted for [J]",
     }
     rows = sorted(rows, key=lambda row: -float(row["tolerance"]))
-    figure, axes = over_steps(rows, "tolerance", "tolerance {}", shown, 2.8)
-    work = groups(rows, "tolerance")["1e-06"]
-    lost = np.finfo(float).eps * numbers(work, "work_of_gravity_J")
+    figure, axes = draw_over_steps(rows, "tolerance", "tolerance {}", shown_by_name, 2.8)
+    work = group_rows(rows, "tolerance")["1e-06"]
+    lost_values = np.finfo(float).eps * read_column(work, "work_of_gravity_J")
     axes.loglog(
-        numbers(work, "steps"), lost, "--", color="0.4", lw=1.0, label="one rounding of the sum"
+        read_column(work, "steps"),
+        lost_values,
+        "--",
+        color="0.4",
+        lw=1.0,
+        label="one rounding of the sum",
     )
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=5)
     return figure
@@ -128,102 +150,108 @@ def long_walk(rows: list[Row]) -> Figure:
 
 def between(rows: list[Row]) -> Figure:
     """Share of other outcomes, and the times' largest difference, next to borders of outcomes."""
-    figure = Figure(figsize=(PAGE, 3.4))
-    left, right = figure.subplots(1, 2)
-    told = by_border(rows)
-    for row in told:
-        row["border"] = ", ".join(map(named, row["border"].split(" | ")))
-    curves(left, told, "border", "distance", "share")
-    curves(right, told, "border", "distance", "time_difference_s")
-    left.set(xlabel="relative distance to the border", ylabel="share with another outcome")
+    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 3.4))
+    left_part, right = figure.subplots(1, 2)
+    result = summarize_by_border(rows)
+    for row in result:
+        row["border"] = ", ".join(map(describe_outcome, row["border"].split(" | ")))
+    curves(left_part, result, "border", "distance", "share")
+    curves(right, result, "border", "distance", "time_difference_s")
+    left_part.set(xlabel="relative distance to the border", ylabel="share with another outcome")
     right.set(
         xlabel="relative distance to the border", ylabel="largest difference of durations [s]"
     )
-    handles = left.get_legend_handles_labels()
+    handles = left_part.get_legend_handles_labels()
     figure.legend(*handles, loc="outside lower center", ncols=2, fontsize=6)
     return figure
 
 
-def named(outcome: str) -> str:
+def describe_outcome(outcome: str) -> str:
     """How a step ended, in words."""
-    return "stepped" if outcome == "STEPPED" else OUTCOMES[Outcome[outcome]][0]
+    return "stepped" if outcome == "STEPPED" else OUTCOME_STYLES[Outcome[outcome]][0]
 
 
-def by_border(rows: list[Row]) -> list[Row]:
+def summarize_by_border(rows: list[Row]) -> list[Row]:
     """Both kinds of cases and both sides together; borders met fewer than five times left out."""
-    told = []
-    for border, some in groups(rows, "border").items():
-        for distance, here in groups(some, "distance").items():
+    result_list = []
+    for border, selection in group_rows(rows, "border").items():
+        for distance, values_here in group_rows(selection, "distance").items():
             names = ("cases", "other_outcome", "other_by_diffrax", "stepped")
-            cases, other, by_diffrax, stepped = (int(numbers(here, n).sum()) for n in names)
+            cases, other, by_diffrax, step_result = (
+                int(read_column(values_here, n).sum()) for n in names
+            )
             if cases >= 10:  # five borders, two sides each
-                told.append(
+                result_list.append(
                     {
                         "border": border,
                         "distance": distance,
                         "cases": str(cases),
                         "other_outcome": f"{other} ({by_diffrax})",
                         "share": str(other / cases),
-                        "stepped": str(stepped),
-                        "time_difference_s": f"{max(numbers(here, 'time_difference_s')):.1e}",
+                        "stepped": str(step_result),
+                        "time_difference_s": f"{max(read_column(values_here, 'time_difference_s')):.1e}",
                     }
                 )
-    return told
+    return result_list
 
 
 def corners(rows: list[Row]) -> str:
     """Other outcomes of the lane engine, and of the diffrax engine, by border and distance."""
-    told = by_border(rows)
-    distances = list(dict.fromkeys(row["distance"] for row in told))
+    result = summarize_by_border(rows)
+    distances = list(dict.fromkeys(row["distance"] for row in result))
     lines = [
-        (border.replace(" | ", " / "), some[0]["cases"], *(row["other_outcome"] for row in some))
-        for border, some in groups(told, "border").items()
+        (
+            border.replace(" | ", " / "),
+            selection[0]["cases"],
+            *(row["other_outcome"] for row in selection),
+        )
+        for border, selection in group_rows(result, "border").items()
     ]
-    return markdown(("border", "cases", *distances), lines)
+    return format_markdown(("border", "cases", *distances), lines)
 
 
 def limits(rows: list[Row]) -> str:
     """What happens towards each limit, value by value where it changes."""
     lines = []
-    for limit, some in groups(rows, "limit").items():
-        told: list[str] = []
-        for i, row in enumerate(some):
-            if i == 0 or row["outcome"] != some[i - 1]["outcome"]:
-                told.append(f"from {row['value']}: {row['outcome']}")
-        same = sum(row["outcome"] == row["isolated"] for row in some)
+    for limit, selection in group_rows(rows, "limit").items():
+        result: list[str] = []
+        for i, row in enumerate(selection):
+            if i == 0 or row["outcome"] != selection[i - 1]["outcome"]:
+                result.append(f"from {row['value']}: {row['outcome']}")
+        is_same = sum(row["outcome"] == row["isolated"] for row in selection)
         cells = (
             limit,
-            "; ".join(told),
-            f"{same} of {len(some)}",
-            f"{max(numbers(some, 'time_difference_s')):.0e} s",
-            str(int(max(numbers(some, "solver_steps")))),
+            "; ".join(result),
+            f"{is_same} of {len(selection)}",
+            f"{max(read_column(selection, 'time_difference_s')):.0e} s",
+            str(int(max(read_column(selection, "solver_steps")))),
         )
         lines.append(cells)
     header = ("limit", "outcomes by value", "as isolated", "times differ by", "most solver steps")
-    return markdown(header, lines)
+    return format_markdown(header, lines)
 
 
 def first_order(rows: list[Row]) -> Figure:
     """Error and cost of a leg of first order over c/m."""
-    figure = Figure(figsize=(PAGE, 2.8))
-    left, right = figure.subplots(1, 2)
-    curves(left, rows, "leg", "c_over_m", "error", "leg: {}")
+    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 2.8))
+    left_part, right = figure.subplots(1, 2)
+    curves(left_part, rows, "leg", "c_over_m", "error", "leg: {}")
     curves(right, rows, "leg", "c_over_m", "us_per_gait")
-    left.set(xlabel=r"$c/m$ [s$^{-1}$]", ylabel="error of state and durations")
+    left_part.set(xlabel=r"$c/m$ [s$^{-1}$]", ylabel="error of state and durations")
     right.set(xlabel=r"$c/m$ [s$^{-1}$]", ylabel="CPU time per gait [µs]")
-    left.legend()
+    left_part.legend()
     return figure
 
 
 def slowing(rows: list[Row]) -> Figure:
     """Period, and error of the period by each method, over the distance to the stop."""
-    figure = Figure(figsize=(PAGE, 2.8))
-    left, right = figure.subplots(1, 2)
-    x, period, rate = (numbers(rows, name) for name in ("distance", "period_s", "upright_rate"))
-    left.semilogx(x, period, "o", ms=3.5, color=COLOURS[0], label="gait, by isolated roots")
+    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 2.8))
+    left_part, right = figure.subplots(1, 2)
+    x, period, rate = (read_column(rows, name) for name in ("distance", "period_s", "upright_rate"))
+    left_part.semilogx(x, period, "o", ms=3.5, color=COLOURS[0], label="gait, by isolated roots")
     line = period[-1] - np.log(x / x[-1]) / rate[-1]
-    left.semilogx(x, line, "--", color="0.4", lw=1.0, label="slope −1/rate of falling upright")
-    for (name, told), colour, marker in zip(
+    left_part.semilogx(x, line, "--", color="0.4", lw=1.0, label="slope −1/rate of falling upright")
+    for (name, result), colour, marker in zip(
         {
             "default": "limit cycle, defaults",
             "tight": "limit cycle, tight",
@@ -233,12 +261,12 @@ def slowing(rows: list[Row]) -> Figure:
         "os^",
         strict=False,
     ):
-        error = numbers(rows, f"{name}_period_error")
+        error = read_column(rows, f"{name}_period_error")
         look = {"color": colour, "marker": marker, "ms": 3.5, "lw": 0.9}
-        right.loglog(x, error, label=told, **look)
-    left.set(xlabel="slope less that of the stop [rad]", ylabel="period [s]")
+        right.loglog(x, error, label=result, **look)
+    left_part.set(xlabel="slope less that of the stop [rad]", ylabel="period [s]")
     right.set(xlabel="slope less that of the stop [rad]", ylabel="relative error of the period")
-    for axes in (left, right):
+    for axes in (left_part, right):
         axes.grid(color="0.9", lw=0.4)
         axes.legend()
     return figure
@@ -246,7 +274,7 @@ def slowing(rows: list[Row]) -> Figure:
 
 def scuffing(rows: list[Row]) -> Figure:
     """Clearance and its derivative, and their errors, where scuffing begins."""
-    figure = Figure(figsize=(PAGE, 2.8))
+    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 2.8))
     for axes, (value, error, name) in zip(
         figure.subplots(1, 2),
         (
@@ -255,10 +283,12 @@ def scuffing(rows: list[Row]) -> Figure:
         ),
         strict=True,
     ):
-        x = numbers(rows, "distance")
+        x = read_column(rows, "distance")
         look = {"ms": 3.5, "lw": 0.9}
-        axes.loglog(x, np.abs(numbers(rows, value)), "o-", color=COLOURS[0], label="size", **look)
-        axes.loglog(x, numbers(rows, error), "s--", color=COLOURS[1], label="error", **look)
+        axes.loglog(
+            x, np.abs(read_column(rows, value)), "o-", color=COLOURS[0], label="size", **look
+        )
+        axes.loglog(x, read_column(rows, error), "s--", color=COLOURS[1], label="error", **look)
         axes.set(xlabel="relative distance in $c$ below the border", ylabel=name)
         axes.grid(color="0.9", lw=0.4)
         axes.legend()
@@ -267,12 +297,12 @@ def scuffing(rows: list[Row]) -> Figure:
 
 def growth(rows: list[Row]) -> Figure:
     """Derivatives through many steps and their error, over steps, by damping."""
-    shown = {
+    shown_by_name = {
         "by_start": "norm of derivative by the start",
         "by_damping": "derivative by $c$",
         "error": "error of the derivative by $c$",
     }
-    figure, axes = over_steps(rows, "damping", "$c$ = {} N·s/m", shown, 3.0)
+    figure, axes = draw_over_steps(rows, "damping", "$c$ = {} N·s/m", shown_by_name, 3.0)
     axes.set_ylim(1e-13, 1e-7)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return figure
@@ -280,10 +310,10 @@ def growth(rows: list[Row]) -> Figure:
 
 def meeting(rows: list[Row]) -> Figure:
     """Errors of derivatives of stability measures over the distance to where multipliers meet."""
-    figure = Figure(figsize=(PAGE, 2.8))
+    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 2.8))
     grid = figure.subplots(1, 2, sharey=True)
-    for axes, (kind, some) in zip(grid, groups(rows, "multipliers").items(), strict=True):
-        x = np.abs(numbers(some, "distance"))
+    for axes, (kind, selection) in zip(grid, group_rows(rows, "multipliers").items(), strict=True):
+        x = np.abs(read_column(selection, "distance"))
         for y, label, line, colour in (
             ("d_radius", "derivative of the spectral radius", "o-", COLOURS[0]),
             ("d_radius_error", "its error", "s--", COLOURS[1]),
@@ -291,7 +321,7 @@ def meeting(rows: list[Row]) -> Figure:
         ):
             axes.loglog(
                 x,
-                np.maximum(np.abs(numbers(some, y)), 1e-17),
+                np.maximum(np.abs(read_column(selection, y)), 1e-17),
                 line,
                 color=colour,
                 ms=3.5,
@@ -306,15 +336,17 @@ def meeting(rows: list[Row]) -> Figure:
 
 def modes(rows: list[Row]) -> Figure:
     """Error and cost of a gait's derivative, implicit and through n steps."""
-    figure = Figure(figsize=(PAGE, 2.8))
-    left, right = figure.subplots(1, 2)
-    walked = [row for row in rows if row["steps"] != "0"]
-    curves(left, walked, "way", "steps", "median_error")
-    curves(right, walked, "way", "steps", "ms")
+    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 2.8))
+    left_part, right = figure.subplots(1, 2)
+    walk_rows = [row for row in rows if row["steps"] != "0"]
+    curves(left_part, walk_rows, "way", "steps", "median_error")
+    curves(right, walk_rows, "way", "steps", "ms")
     for row, line in zip([row for row in rows if row["steps"] == "0"], ("--", ":"), strict=True):
-        for axes, name in ((left, "median_error"), (right, "ms")):
+        for axes, name in ((left_part, "median_error"), (right, "ms")):
             axes.axhline(float(row[name]), color=COLOURS[2], ls=line, lw=1.2, label=row["way"])
-    left.set(xlabel="steps of the walk", ylabel="relative error of the period's derivative, median")
+    left_part.set(
+        xlabel="steps of the walk", ylabel="relative error of the period's derivative, median"
+    )
     right.set(xlabel="steps of the walk", ylabel="CPU time per gait [ms]")
     right.legend(fontsize=6)
     return figure
@@ -322,24 +354,30 @@ def modes(rows: list[Row]) -> Figure:
 
 def formulations(drift: list[Row], penalty: list[Row]) -> Figure:
     """Constraint drift over steps, and a penalty ground's error over its work."""
-    figure = Figure(figsize=(PAGE, 2.9))
-    left, right = figure.subplots(1, 2)
+    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 2.9))
+    left_part, right = figure.subplots(1, 2)
     for marker, name in zip("os^", dict.fromkeys(row["stabilised"] for row in drift), strict=True):
-        some = [row for row in drift if row["stabilised"] == name]
-        gap = numbers(some, "gap_m")
-        left.loglog(numbers(some, "steps"), gap, f"{marker}-", ms=4, label=f"stabilised: {name}")
-    left.set(xlabel="integrator steps", ylabel="largest gap of a held foot [m]")
-    left.legend()
+        selection = [row for row in drift if row["stabilised"] == name]
+        gap = read_column(selection, "gap_m")
+        left_part.loglog(
+            read_column(selection, "steps"), gap, f"{marker}-", ms=4, label=f"stabilised: {name}"
+        )
+    left_part.set(xlabel="integrator steps", ylabel="largest gap of a held foot [m]")
+    left_part.legend()
     for marker, name in zip("os", dict.fromkeys(row["ground"] for row in penalty), strict=True):
-        some = [row for row in penalty if row["ground"] == name and row["outcome"] == "STEPPED"]
+        selection = [
+            row for row in penalty if row["ground"] == name and row["outcome"] == "STEPPED"
+        ]
         look = {"ms": 4, "label": f"penalty, {name}"}
         # Each of the two errors changes sign somewhere.
-        error = np.maximum(numbers(some, "dtheta_error"), numbers(some, "period_error"))
-        right.loglog(numbers(some, "evaluations"), error, f"{marker}-", **look)
+        error = np.maximum(
+            read_column(selection, "dtheta_error"), read_column(selection, "period_error")
+        )
+        right.loglog(read_column(selection, "evaluations"), error, f"{marker}-", **look)
     error_of = r"error of $\dot\theta$ [rad/s] and period [s], the larger"
     right.set(xlabel="evaluations per gait", ylabel=error_of)
     right.legend()
-    for axes in (left, right):
+    for axes in (left_part, right):
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.grid(color="0.9", lw=0.4)
     return figure
@@ -348,11 +386,11 @@ def formulations(drift: list[Row], penalty: list[Row]) -> Figure:
 def automatic(rows: list[Row]) -> str:
     """The fastest method with an error below 1e-4, and the automatic choice over it."""
     lines = []
-    fast = lambda some: min(some, key=lambda row: float(row["us_per_gait"]))
+    fast = lambda selection: min(selection, key=lambda row: float(row["us_per_gait"]))
     for axis in AXES:
-        for value, some in groups([r for r in rows if r["axis"] == axis], "value").items():
-            chosen = next(row for row in some if row["method"] == "automatic")
-            good = [r for r in some if r["outcome"] == "STEPPED" and float(r["error"]) < 1e-4]
+        for value, selection in group_rows([r for r in rows if r["axis"] == axis], "value").items():
+            chosen = next(row for row in selection if row["method"] == "automatic")
+            good = [r for r in selection if r["outcome"] == "STEPPED" and float(r["error"]) < 1e-4]
             assert chosen in good
             good.remove(chosen)
             ours = fast([r for r in good if r["method"].split()[0] in ("lanes", "diffrax")])
@@ -363,57 +401,61 @@ def automatic(rows: list[Row]) -> str:
             cells += [chosen["solver"], chosen["us_per_gait"]]
             lines.append([*cells, f"{ratio:.2f}"])
     header = ("axis", "value", "fastest of ours", "µs", "fastest of all", "µs", "automatic", "µs")
-    return markdown((*header, "ratio"), lines)
+    return format_markdown((*header, "ratio"), lines)
 
 
 def events(rows: list[Row]) -> list[Row]:
     """Counts by kind of case, over all chunks."""
-    told = []
-    for kind, some in groups(rows, "kind").items():
+    result_list = []
+    for kind, selection in group_rows(rows, "kind").items():
         pairs: dict[str, int] = {}
-        for part in filter(None, "; ".join(row["ours/isolated"] for row in some).split("; ")):
+        for part in filter(None, "; ".join(row["ours/isolated"] for row in selection).split("; ")):
             pair, count = part.split(": ")
             pairs[pair] = pairs.get(pair, 0) + int(count)
         counts = ("cases", "stepped", "other_outcome", "late")
-        told.append(
+        result_list.append(
             {"kind": kind}
-            | {name: str(sum(int(row[name]) for row in some)) for name in counts}
-            | {"largest_time_difference": f"{max(numbers(some, 'largest_time_difference')):.2e}"}
+            | {name: str(sum(int(row[name]) for row in selection)) for name in counts}
+            | {
+                "largest_time_difference": f"{max(read_column(selection, 'largest_time_difference')):.2e}"
+            }
             | {"ours/isolated": "; ".join(f"{pair}: {n}" for pair, n in sorted(pairs.items()))}
         )
-    return told
+    return result_list
 
 
 def dips(rows: list[Row]) -> list[Row]:
     """Counts by kind of case, over all chunks."""
     counts = ("cases", "stepped", "gave_up", "differ", "other_outcome", "other_by_tight")
     return [
-        {"kind": kind} | {name: str(sum(int(row[name]) for row in some)) for name in counts}
-        for kind, some in groups(rows, "kind").items()
+        {"kind": kind} | {name: str(sum(int(row[name]) for row in selection)) for name in counts}
+        for kind, selection in group_rows(rows, "kind").items()
     ]
 
 
 def as_table(rows: list[Row]) -> str:
     """All columns."""
-    return markdown([name.replace("_", " ") for name in rows[0]], [row.values() for row in rows])
+    return format_markdown(
+        [name.replace("_", " ") for name in rows[0]], [row.values() for row in rows]
+    )
 
 
 def draw(tables: dict[str, Path], limit: Callable[[str], float]) -> None:
     """Every chart and table of the page whose data exist."""
     page = DOCS / "stability_atlas.md"
-    known = {name: read(path) for name, path in tables.items() if path.exists()}
-    told = {
+    known_by_name = {name: read_table(path) for name, path in tables.items() if path.exists()}
+    result_by_name = {
         "switch": ("stiffness", automatic),
         "events": ("events", lambda rows: as_table(events(rows))),
         "dips": ("dips", lambda rows: as_table(dips(rows))),
         "between": ("between", corners),
         "limits": ("limits", limits),
-        "long_walk": ("long_walk", lambda rows: as_table(last_by(rows, "tolerance"))),
+        "long_walk": ("long_walk", lambda rows: as_table(select_last_rows(rows, "tolerance"))),
         "apart": ("apart", as_table),
     }
-    for mark, (name, text) in told.items():
-        if name in known:
-            replace(page, mark, text(known[name]))
+    for mark, (name, text) in result_by_name.items():
+        if name in known_by_name:
+            replace_block(page, mark, text(known_by_name[name]))
     charts: dict[str, Callable[[list[Row]], Figure]] = {
         "stiffness": lambda rows: stiffness(rows, limit),
         "between": between,
@@ -428,8 +470,8 @@ def draw(tables: dict[str, Path], limit: Callable[[str], float]) -> None:
     }
     with figure_style():
         for name, chart in charts.items():
-            if name in known:
-                save(chart(known[name]), FIGURES, f"atlas_{name}")
-        if {"drift", "formulations"} <= set(known):
-            figure = formulations(known["drift"], known["formulations"])
+            if name in known_by_name:
+                save(chart(known_by_name[name]), FIGURES, f"atlas_{name}")
+        if {"drift", "formulations"} <= set(known_by_name):
+            figure = formulations(known_by_name["drift"], known_by_name["formulations"])
             save(figure, FIGURES, "atlas_formulations")

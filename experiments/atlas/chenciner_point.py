@@ -27,16 +27,16 @@ def chenciner_point(returned: Callable, x: np.ndarray, parameters: np.ndarray) -
 
     def higher(x, k, a, b, c):
         """Second derivative along a, b, and third along a, b, c."""
-        along = lambda f, v: lambda x: jax.jvp(f, (x,), (v,))[1]
-        second = along(along(lambda x: returned(x, k), a), b)
+        evaluate_along = lambda f, v: lambda x: jax.jvp(f, (x,), (v,))[1]
+        second = evaluate_along(evaluate_along(lambda x: returned(x, k), a), b)
         return jax.jvp(second, (x,), (c,))
 
     higher = jax.jit(jax.vmap(higher, (None, None, 0, 0, 0)))
 
     def cycle(x: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         for _ in range(20):
-            there, matrix = map(np.asarray, first(x, k))
-            move = np.linalg.solve(np.eye(len(x)) - matrix, there - x)
+            values_there, matrix = map(np.asarray, first(x, k))
+            move = np.linalg.solve(np.eye(len(x)) - matrix, values_there - x)
             x = x + move
             if np.abs(move).max() < 1e-13:
                 break
@@ -48,26 +48,26 @@ def chenciner_point(returned: Callable, x: np.ndarray, parameters: np.ndarray) -
         for v in vectors:
             parts = [(*p, (w, u)) for p in parts for w, u in ((1.0, v.real), (1j, v.imag))]
         columns = [np.array([p[min(i, len(p) - 1)][1] for p in parts]) for i in range(3)]
-        told = np.asarray(higher(x, k, *columns)[len(vectors) - 2])
-        return np.array([np.prod([w for w, _ in p]) for p in parts]) @ told
+        values_array = np.asarray(higher(x, k, *columns)[len(vectors) - 2])
+        return np.array([np.prod([w for w, _ in p]) for p in parts]) @ values_array
 
     def conditions(k: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         """The pair's modulus less 1 and the cubic coefficient's real part; state and angle."""
-        at, matrix = cycle(x, k)
+        value_at_2, matrix = cycle(x, k)
         values, right = np.linalg.eig(matrix)
         place = np.argmax(values.imag)
         pair, q = values[place], right[:, place] / np.linalg.norm(right[:, place])
-        others, left = np.linalg.eig(matrix.T)
-        p = left[:, np.argmin(np.abs(others - pair.conj()))]
+        others, left_part = np.linalg.eig(matrix.T)
+        p = left_part[:, np.argmin(np.abs(others - pair.conj()))]
         p = p / np.vdot(p, q).conj()
-        angle, one = float(np.angle(pair)), np.eye(len(at))
-        turned = np.linalg.solve(np.exp(2j * angle) * one - matrix, form(at, k, q, q))
-        still = np.linalg.solve(one - matrix, form(at, k, q, q.conj()))
-        cubic = form(at, k, q, q, q.conj()) + 2.0 * form(at, k, q, still)
-        cubic = cubic + form(at, k, q.conj(), turned)
+        angle, one = float(np.angle(pair)), np.eye(len(value_at_2))
+        turned = np.linalg.solve(np.exp(2j * angle) * one - matrix, form(value_at_2, k, q, q))
+        is_unfinished = np.linalg.solve(one - matrix, form(value_at_2, k, q, q.conj()))
+        cubic = form(value_at_2, k, q, q, q.conj()) + 2.0 * form(value_at_2, k, q, is_unfinished)
+        cubic = cubic + form(value_at_2, k, q.conj(), turned)
         real = 0.5 * (np.exp(-1j * angle) * np.vdot(p, cubic)).real
-        return np.array([abs(pair) - 1.0, real]), at, angle
+        return np.array([abs(pair) - 1.0, real]), value_at_2, angle
 
-    found = root(lambda k: conditions(k)[0], parameters, tol=1e-14, options={"eps": 1e-12})
-    _, at, angle = conditions(found.x)
-    return Point(found.x, at, angle)
+    solution = root(lambda k: conditions(k)[0], parameters, tol=1e-14, options={"eps": 1e-12})
+    _, value_at, angle = conditions(solution.x)
+    return Point(solution.x, value_at, angle)

@@ -15,10 +15,10 @@ import numpy as np
 import vrw_jax as vrw
 from experiments.atlas import events
 from experiments.atlas.events import START, Rows
-from experiments.shared.timing import seconds
+from experiments.shared.timing import measure_cpu_seconds
 from experiments.speed import peers
 from experiments.speed.peers import hy
-from experiments.work_precision.truth import VARIED, load
+from experiments.work_precision.truth import VARIED_PARAMETERS, load
 from tests.oracle import multiprecision
 from tests.oracle.hub_form import HubForm
 from tests.oracle.multiprecision import Flow, Number, Vector
@@ -27,13 +27,13 @@ from vrw_jax.numerics import floquet
 from vrw_jax.wheel import transitions
 
 
-def oracle() -> HubForm:
+def make_reference_model() -> HubForm:
     """The formulation in the hub's coordinates, at 35 digits."""
     multiprecision.BITS, multiprecision.DIGITS, mp.mp.prec = 120, 35, 120
     return HubForm()
 
 
-def exact(params: vrw.WheelParams) -> Vector:
+def to_exact_parameters(params: vrw.WheelParams) -> Vector:
     """All nine parameters and the number of legs."""
     return [mp.mpf(float(getattr(params, n))) for n in multiprecision.NAMES] + [mp.mpf(8)]
 
@@ -41,7 +41,7 @@ def exact(params: vrw.WheelParams) -> Vector:
 # --- Near borders of the paper's sequence.
 
 DISTANCES = np.logspace(-1.0, -9.0, 9)
-BORDERS = {  # wheel, and the start's rate on the other side, rad/s
+BORDER_CASES = {  # wheel, and the start's rate on the other side, rad/s
     "double support vanishes": ({"damping": 100.0, "slope": 0.30}, 3.2),
     "λ4⁺ → 0": ({"damping": 150.0, "slope": 0.30}, 2.3),
     "λ2⁺ → 0": ({"damping": 10.0, "slope": 0.30}, 3.2),
@@ -53,13 +53,15 @@ def start_with(rate: float) -> np.ndarray:
     return np.array([START[0], rate, START[2]])
 
 
-def border(made: tuple, wheel: dict[str, float], beyond: float) -> float:
+def border(created: tuple, wheel: dict[str, float], outside_values: float) -> float:
     """The last rate from START's towards `beyond` with all three phases, by bisection."""
     params = vrw.WheelParams(**{name: np.full(1, value) for name, value in wheel.items()})
-    good, bad = START[1], beyond
+    good, bad = START[1], outside_values
     for _ in range(60):
         middle = 0.5 * (good + bad)
-        (code,), (durations,), _ = events.isolated(made, params, start_with(middle)[None])
+        (code,), (durations,), _ = events.step_by_isolated_roots(
+            created, params, start_with(middle)[None]
+        )
         if code == Outcome.STEPPED and np.all(durations > 0.0):
             good = middle
         else:
@@ -69,21 +71,21 @@ def border(made: tuple, wheel: dict[str, float], beyond: float) -> float:
 
 def borders() -> Rows:
     """Error of first derivatives by a start's rate over its distance to borders."""
-    hub, made = oracle(), events.phases()
+    hub, created = make_reference_model(), events.phases()
 
     def twice(x: jax.Array, params: vrw.WheelParams) -> tuple:
         image = vrw.return_map(params, x)
         return image, image
 
     derive = jax.jit(jax.jacfwd(twice, has_aux=True))
-    for name, (wheel, beyond) in BORDERS.items():
-        edge = border(made, wheel, beyond)
+    for name, (wheel, outside_values) in BORDER_CASES.items():
+        edge = border(created, wheel, outside_values)
         params = vrw.WheelParams(**wheel)
         batch = vrw.WheelParams(**{key: np.full(1, value) for key, value in wheel.items()})
-        p = exact(params)
+        p = to_exact_parameters(params)
         for distance in DISTANCES:
             start = start_with(edge * (1.0 + distance * np.sign(START[1] - edge)))
-            _, (about,), _ = events.isolated(made, batch, start[None])
+            _, (about,), _ = events.step_by_isolated_roots(created, batch, start[None])
             size, ends = mp.mpf(distance) * mp.mpf("1e-8"), []
             for sign in (1, -1):
                 x = [mp.mpf(float(v)) for v in start]
@@ -107,7 +109,9 @@ def borders() -> Rows:
 # --- Scuffing: the lowest clearance of the swing foot tends to zero.
 
 SCUFFS_BETWEEN = (80.0, 150.0)  # N s/m
-BELOW = np.logspace(-5.0, -4.0 / 3.0, 12)  # of the damping at which it begins; nearest first
+SCUFFING_DISTANCES = np.logspace(
+    -5.0, -4.0 / 3.0, 12
+)  # of the damping at which it begins; nearest first
 
 
 class Dip:
@@ -123,13 +127,17 @@ class Dip:
         x1, force, *_ = peers.double_support(sin, cos, w, hy.par[10], P)
         self.dls = Flow([th, w], [w, x1], force, 11)
         rates = [w, v1, v2, *peers.single_support_1(sin, cos, L1, L2, w, v1, v2, P)]
-        along = lambda g: sum(hy.diff(g, v) * rate for v, rate in zip(y, rates, strict=True))
+        evaluate_along = lambda g: sum(
+            hy.diff(g, v) * rate for v, rate in zip(y, rates, strict=True)
+        )
         height = L1 * cos - L2 * (cos * peers.CA - sin * peers.SA)
-        rise = along(height)
+        rise = evaluate_along(height)
         self.swing = Flow(list(y), rates, -1.0 * rise, 10)
-        self.told = multiprecision.compiled([height, along(rise), along(along(rise))], list(y))
+        self.told = multiprecision.compile_expressions(
+            [height, evaluate_along(rise), evaluate_along(evaluate_along(rise))], list(y)
+        )
 
-    def ask(self, state: Vector, P: Vector) -> Vector:
+    def evaluate(self, state: Vector, P: Vector) -> Vector:
         """Height of foot 2, and its second and third derivatives by time."""
         reals = ([multiprecision.to_real(v) for v in values] for values in (state, P))
         return [multiprecision.to_mpf(v) for v in self.told(*reals)]
@@ -150,31 +158,31 @@ class Dip:
         """Height at the first minimum after lift-off, and its time; about: of DLS, of it."""
         state, P = self.lift_off(y, p, about[0])
         state, time = self.swing.until_guard(state, P[:10], about[1])
-        return self.ask(state, P)[0], time
+        return self.evaluate(state, P)[0], time
 
     def first_guess(self, y: Vector, p: Vector, about: float) -> float:
         """Time of the first minimum, from the derivatives at lift-off."""
-        _, second, third = self.ask(*self.lift_off(y, p, about))
+        _, second, third = self.evaluate(*self.lift_off(y, p, about))
         return float(-2 * second / third)
 
 
 def scuffing() -> Rows:
     """Error of the clearance in SLS-I and of its derivative by damping, where scuffing begins."""
-    hub, dip, made = oracle(), Dip(), events.phases()
-    monitored = lambda c: vrw.step(vrw.WheelParams(damping=c), START).monitors.clearance_sls1
+    hub, dip, created = make_reference_model(), Dip(), events.phases()
+    monitored = lambda c: vrw.step(vrw.WheelParams(damping=c), START).margins.clearance_sls1
     derive = jax.jit(jax.value_and_grad(monitored))
 
     def at(damping: Number) -> tuple[Vector, Vector, float]:
-        p = exact(vrw.WheelParams())
+        p = to_exact_parameters(vrw.WheelParams())
         p[multiprecision.NAMES.index("damping")] = damping
         batch = vrw.WheelParams(damping=np.full(1, float(damping)))
-        _, (about,), _ = events.isolated(made, batch, START[None])
+        _, (about,), _ = events.step_by_isolated_roots(created, batch, START[None])
         return hub.land([mp.mpf(float(v)) for v in START], p)[0], p, about[0]
 
-    lifts = lambda damping: dip.ask(*dip.lift_off(*at(damping)))[1]
+    lifts = lambda damping: dip.evaluate(*dip.lift_off(*at(damping)))[1]
     edge = mp.findroot(lifts, SCUFFS_BETWEEN, solver="anderson", tol=1e-30)
     shares = np.array([[0.0, 0.0]])  # time over distance: nearly constant, and extrapolated
-    for distance in BELOW:
+    for distance in SCUFFING_DISTANCES:
         damping = mp.mpf(float(edge * (1 - mp.mpf(distance))))
         h = damping * mp.mpf(distance) * mp.mpf("1e-8")
         *given, dls = at(damping)
@@ -203,47 +211,50 @@ def scuffing() -> Rows:
 
 # --- Many steps: do derivatives grow?
 
-MANY = 100
+N_GROWTH_STEPS = 100
 DAMPINGS = (100.0, 200.0, 215.0, 219.8, 220.5, 222.0, 224.0)
-SHOWN = (1, 2, 3, 5, 7, 10, 20, 30, 50, 70, 100)
+SHOWN_STEP_COUNTS = (1, 2, 3, 5, 7, 10, 20, 30, 50, 70, 100)
 
 
-def walked(made: tuple, damping: float, x: np.ndarray, count: int) -> np.ndarray:
+def walk_by_isolated_roots(created: tuple, damping: float, x: np.ndarray, count: int) -> np.ndarray:
     """Section states after each of `count` steps by isolated roots."""
     params = vrw.WheelParams(damping=np.full(1, damping))
-    told = []
+    rows = []
     for _ in range(count):
-        (code,), _, (x,) = events.isolated(made, params, x[None])
+        (code,), _, (x,) = events.step_by_isolated_roots(created, params, x[None])
         assert code == Outcome.STEPPED
-        told.append(x)
-    return np.array(told)
+        rows.append(x)
+    return np.array(rows)
 
 
 def growth() -> Rows:
     """d(state after n steps)/d(damping) by the chain rule, and its error, near and beyond 220."""
-    made = events.phases()
+    created = events.phases()
     step = jax.jit(jax.jacfwd(vrw.return_map, (0, 1)))
     start = np.asarray(vrw.limit_cycle(vrw.WheelParams(damping=219.0)).section_state)
     for damping in DAMPINGS:
-        x = walked(made, damping, start, 300)[-1]  # on the attractor
+        x = walk_by_isolated_roots(created, damping, start, 300)[-1]  # on the attractor
         params = vrw.WheelParams(damping=damping)
-        at, by_damping, by_start, lowest = x, np.zeros(3), np.eye(3), []
+        values_array, by_damping, by_start, lowest = x, np.zeros(3), np.eye(3), []
         size = 1e-5
-        sides = {h: walked(made, damping + h * size, x, MANY) for h in (2, 1, -1, -2)}
+        sides = {
+            h: walk_by_isolated_roots(created, damping + h * size, x, N_GROWTH_STEPS)
+            for h in (2, 1, -1, -2)
+        }
         near = (sides[1] - sides[-1]) / (2.0 * size)
         far = (sides[2] - sides[-2]) / (4.0 * size)
         truth = (4.0 * near - far) / 3.0
-        for count in range(1, MANY + 1):
-            by_params, by_x = step(params, jnp.asarray(at))
+        for count in range(1, N_GROWTH_STEPS + 1):
+            by_params, by_x = step(params, jnp.asarray(values_array))
             by_x = np.asarray(by_x)
             by_damping = by_x @ by_damping + np.asarray(by_params.damping)
             by_start = by_x @ by_start
             _, rear = transitions.landing_forces(
-                params.symbols(), transitions.land(params.symbols(), *at)
+                params.symbols(), transitions.land(params.symbols(), *values_array)
             )
             lowest.append(float(rear.normal))
-            at = np.asarray(vrw.return_map(params, at))
-            if count in SHOWN:
+            values_array = np.asarray(vrw.return_map(params, values_array))
+            if count in SHOWN_STEP_COUNTS:
                 miss = np.max(np.abs(by_damping - truth[count - 1]))
                 yield {
                     "damping": f"{damping:g}",
@@ -258,7 +269,7 @@ def growth() -> Rows:
 
 # --- Two multipliers meet.
 
-APART, LIKELY = (
+N_RANDOM_GAITS, RANDOM_GAIT_BOX = (
     400,
     {  # random wheels: do their multipliers ever meet?
         "damping": (20.0, 215.0),
@@ -271,19 +282,19 @@ APART, LIKELY = (
 )
 
 
-def apart() -> Rows:
+def measure_multiplier_distances() -> Rows:
     """How near to each other the multipliers of random gaits come."""
     random = np.random.default_rng(3)
     ratios, n_complex = [], 0
-    for _ in range(APART):
-        wheel = {name: random.uniform(*limits) for name, limits in LIKELY.items()}
+    for _ in range(N_RANDOM_GAITS):
+        wheel = {name: random.uniform(*limits) for name, limits in RANDOM_GAIT_BOX.items()}
         cycle = vrw.limit_cycle(vrw.WheelParams(**wheel))
         if bool(cycle.found):
             first, second = np.asarray(cycle.multipliers)
             n_complex += int(first.imag != 0.0)
             ratios.append(abs(second) / abs(first))
     yield {
-        "wheels": APART,
+        "wheels": N_RANDOM_GAITS,
         "gaits": len(ratios),
         "complex_pairs": n_complex,
         "largest_ratio": f"{max(ratios):.2f}",
@@ -291,7 +302,7 @@ def apart() -> Rows:
     }
 
 
-DOUBLE = mp.mpf("0.3")  # the multiplier in which two meet
+DOUBLE_MULTIPLIER = mp.mpf("0.3")  # the multiplier in which two meet
 FRAME = mp.matrix([["1.1", "0.7"], ["-0.3", "0.9"]])
 FROM_MEETING = np.logspace(-1.5, -13.0, 24)
 
@@ -304,35 +315,42 @@ def meeting() -> Rows:
     """
     mp.mp.prec = 120
     turned = lambda rows: FRAME * mp.matrix(rows) * FRAME**-1
-    base, change = turned([[DOUBLE, 1], [0, DOUBLE]]), turned([[0, 0], [1, 0]])
+    base, change = (
+        turned([[DOUBLE_MULTIPLIER, 1], [0, DOUBLE_MULTIPLIER]]),
+        turned([[0, 0], [1, 0]]),
+    )
     as_array = lambda matrix: jnp.asarray(np.array(matrix.tolist(), float))
-    at = lambda s: as_array(base) + s * as_array(change)
+    value_at = lambda s: as_array(base) + s * as_array(change)
     measures = {
-        "radius": lambda s: floquet.spectral_radius(at(s)),
-        "jury": lambda s: floquet.jury_margins(at(s)),
+        "radius": lambda s: floquet.spectral_radius(value_at(s)),
+        "jury": lambda s: floquet.jury_margins(value_at(s)),
     }
     derive = {name: jax.jit(jax.jacfwd(measure)) for name, measure in measures.items()}
     for kind, sign in (("real", 1), ("complex", -1)):
         for distance in FROM_MEETING:
             s = sign * mp.mpf(float(distance))
-            radius = DOUBLE + mp.sqrt(s) if sign > 0 else mp.sqrt(DOUBLE**2 - s)
+            radius = (
+                DOUBLE_MULTIPLIER + mp.sqrt(s) if sign > 0 else mp.sqrt(DOUBLE_MULTIPLIER**2 - s)
+            )
             d_radius = 1 / (2 * mp.sqrt(s)) if sign > 0 else -1 / (2 * radius)
             jury = np.array([-1.0, -1.0, 1.0])  # det = DOUBLE^2 - s, trace = 2 DOUBLE
-            found = {name: np.asarray(f(jnp.asarray(float(s)))) for name, f in derive.items()}
+            found_by_name = {
+                name: np.asarray(f(jnp.asarray(float(s)))) for name, f in derive.items()
+            }
             value = float(measures["radius"](jnp.asarray(float(s))))
             yield {
                 "multipliers": kind,
                 "distance": f"{distance:.3e}",
                 "radius_error": f"{abs(value - float(radius)):.1e}",
                 "d_radius": f"{float(d_radius):.4g}",
-                "d_radius_error": f"{abs(found['radius'] - float(d_radius)):.1e}",
-                "d_jury_error": f"{np.max(np.abs(found['jury'] - jury)):.1e}",
+                "d_radius_error": f"{abs(found_by_name['radius'] - float(d_radius)):.1e}",
+                "d_jury_error": f"{np.max(np.abs(found_by_name['jury'] - jury)):.1e}",
             }
 
 
 # --- Reverse, forward, implicit: the same derivative of a gait's period.
 
-GAITS, UNROLLED = 8, (1, 2, 3, 5, 8, 12, 20, 30)
+GAITS, UNROLLED_STEP_COUNTS = 8, (1, 2, 3, 5, 8, 12, 20, 30)
 
 
 def modes() -> Rows:
@@ -344,8 +362,8 @@ def modes() -> Rows:
     rows, starts = truth["rows"][:GAITS], truth["start"][:GAITS]
     exactly = truth["d_cycle"][:GAITS, 2:].sum(1) * rows
     size = np.linalg.norm(exactly, axis=1)
-    wheel = lambda row: vrw.WheelParams(**dict(zip(VARIED, row, strict=True)))
-    model, options = vrw.ViscoelasticWheel(), vrw.Options()
+    wheel = lambda row: vrw.WheelParams(**dict(zip(VARIED_PARAMETERS, row, strict=True)))
+    model, options = vrw.ViscoelasticWheel(), vrw.StepOptions()
 
     def through(count: int, x: jax.Array, row: jax.Array) -> jax.Array:
         params = wheel(row)
@@ -355,22 +373,22 @@ def modes() -> Rows:
 
     period = lambda row: vrw.limit_cycle(wheel(row)).period
 
-    def told(way: str, count: int, derive: Callable) -> dict[str, object]:
+    def told(method_name: str, count: int, derive: Callable) -> dict[str, object]:
         run = lambda: np.array([derive(row, x) for row, x in zip(rows, starts, strict=True)])
-        found = run() * rows  # and compile
-        error = np.linalg.norm(found - exactly, axis=1) / size
+        solution = run() * rows  # and compile
+        error = np.linalg.norm(solution - exactly, axis=1) / size
         return {
-            "way": way,
+            "way": method_name,
             "steps": count,
             "median_error": f"{np.median(error):.1e}",
             "largest_error": f"{np.max(error):.1e}",
-            "ms": f"{seconds(run) / GAITS * 1e3:.4g}",
+            "ms": f"{measure_cpu_seconds(run) / GAITS * 1e3:.4g}",
         }
 
     for mode, derive in (("forward", jax.jacfwd), ("reverse", jax.jacrev)):
         implicit = jax.jit(derive(period))
         yield told(f"implicit, {mode}", 0, lambda row, x, f=implicit: f(row))
-        for count in UNROLLED:
+        for count in UNROLLED_STEP_COUNTS:
             unrolled = lambda row, x, d=derive, n=count: d(lambda r: through(n, x, r))(
                 jnp.asarray(row)
             )

@@ -16,13 +16,13 @@ import vrw_jax as vrw
 from experiments.speed import peers
 from experiments.speed.peers import hy
 from vrw_jax import Outcome
-from vrw_jax.numerics import taken
+from vrw_jax.numerics import take_rows
 from vrw_jax.wheel import Motion, Symbols, dynamics, geometry, transitions
 
 Rows = Iterator[dict[str, object]]
 START = np.array([0.1, 1.6, -0.1])  # near the gait of Table 1
-CHUNK, MANY = 10_000, 250_000
-LATE = 1e-8  # s: a hundred times the engine's error at its default tolerance
+CHUNK, N_STARTS = 10_000, 250_000
+LATE_EVENT_SECONDS = 1e-8  # s: a hundred times the engine's error at its default tolerance
 TOLERANCE = 1e-15
 LIMIT = 20.0  # s, of a phase, as in vrw.Options
 FALLS = (Outcome.FELL_BACK, Outcome.COLLAPSED, Outcome.COLLAPSED, Outcome.LEG_1_LIFTED_OFF)
@@ -72,8 +72,8 @@ class Phase:
 
     def run(self, y: np.ndarray, parameters: tuple) -> tuple[Outcome, np.ndarray, float]:
         """Outcome, state and duration."""
-        known = np.array(parameters[: self.guards.nparams])
-        values = self.guards(y, pars=known) if len(known) else self.guards(y)
+        values_array = np.array(parameters[: self.guards.nparams])
+        values = self.guards(y, pars=values_array) if len(values_array) else self.guards(y)
         if np.any(values < 0.0):
             return self.outcomes[int(np.argmax(values < 0.0))], y, 0.0
         flow = self.flow
@@ -84,7 +84,7 @@ class Phase:
         if code == int(hy.taylor_outcome.time_limit):
             return Outcome.NO_TOUCHDOWN_IN_TIME, flow.state, self.limit
         if not -len(self.outcomes) <= code < 0:
-            return Outcome.SOLVER_GAVE_UP, flow.state, flow.time
+            return Outcome.SOLVER_FAILED, flow.state, flow.time
         return self.outcomes[-code - 1], flow.state.copy(), flow.time
 
 
@@ -138,12 +138,12 @@ def phases() -> tuple[Phase, Phase, Phase]:
     return dls, sls1, sls2
 
 
-def isolated(made: tuple, params: vrw.WheelParams, starts: np.ndarray) -> tuple:
+def step_by_isolated_roots(created: tuple, params: vrw.WheelParams, starts: np.ndarray) -> tuple:
     """Outcome, durations and section state (zeros where it failed) of one step of each lane."""
-    dls, sls1, sls2 = made
+    dls, sls1, sls2 = created
     packed = peers.pack(params)
     landing = transitions.land(params.symbols(), *starts.T)
-    stays = np.asarray(landing.stays)
+    stays = np.asarray(landing.keeps_rear_foot)
     posture = np.stack([landing.theta, *landing.motion[2:]], 1)  # theta, L1, L2 and rates
     outcomes, durations, ends = np.zeros(len(starts), int), *np.zeros((2, len(starts), 3))
     for lane, values in enumerate(packed):
@@ -151,23 +151,23 @@ def isolated(made: tuple, params: vrw.WheelParams, starts: np.ndarray) -> tuple:
         y, code = posture[lane], Outcome.STEPPED
         if stays[lane]:
             D = P[2] * peers.SA / (math.cos(y[0]) * peers.CA - math.sin(y[0]) * peers.SA)
-            code, told, durations[lane, 0] = dls.run(y[[0, 3]], (*P, D))
-            sin, cos = math.sin(told[0]), math.cos(told[0])
-            _, _, L1, L2, v1, v2 = peers.n_dls(sin, cos, told[1], D, P)
-            y = np.array([told[0], L1, L2, told[1], v1, v2])
+            code, result, durations[lane, 0] = dls.run(y[[0, 3]], (*P, D))
+            sin, cos = math.sin(result[0]), math.cos(result[0])
+            _, _, L1, L2, v1, v2 = peers.n_dls(sin, cos, result[1], D, P)
+            y = np.array([result[0], L1, L2, result[1], v1, v2])
         if code == Outcome.STEPPED:
-            code, told, durations[lane, 1] = sls1.run(y, P)
-            y = told.copy()
+            code, result, durations[lane, 1] = sls1.run(y, P)
+            y = result.copy()
         if code == Outcome.STEPPED:
             peers.hit_numba(y, P)
-            code, told, durations[lane, 2] = sls2.run(y[:4], P)
+            code, result, durations[lane, 2] = sls2.run(y[:4], P)
         outcomes[lane] = code
         if code == Outcome.STEPPED:
-            ends[lane] = told[[0, 2, 3]]
+            ends[lane] = result[[0, 2, 3]]
     return outcomes, durations, ends
 
 
-def drawn(
+def draw_wheels(
     box: dict, random: np.random.Generator, count: int = CHUNK
 ) -> tuple[vrw.WheelParams, np.ndarray]:
     """Wheels and starts."""
@@ -178,17 +178,17 @@ def drawn(
 
 def compare(cases: int, done: int) -> Rows:
     """Counts of disagreement, chunk by chunk; the first `done` chunks are left out."""
-    made = phases()
+    created = phases()
     n_chunks = cases // len(KINDS) // CHUNK
     places = [(i, kind, chunk) for chunk in range(n_chunks) for i, kind in enumerate(KINDS)]
     for i, kind, chunk in track(places[done:], "events"):
-        params, starts = drawn(KINDS[kind], np.random.default_rng((7, i, chunk)))
-        found = vrw.steps(params, starts)
-        codes, durations, _ = isolated(made, params, starts)
-        mine = np.asarray(found.outcome)
+        params, starts = draw_wheels(KINDS[kind], np.random.default_rng((7, i, chunk)))
+        batch_result = vrw.step_batch(params, starts)
+        codes, durations, _ = step_by_isolated_roots(created, params, starts)
+        mine = np.asarray(batch_result.outcome)
         other = mine != codes
-        both = ~other & (mine == Outcome.STEPPED)
-        gap = np.max(np.abs(np.asarray(found.durations) - durations), 1)
+        both_values = ~other & (mine == Outcome.STEPPED)
+        gap = np.max(np.abs(np.asarray(batch_result.durations) - durations), 1)
         differing = zip(mine[other], codes[other], strict=True)
         pairs = [f"{Outcome(a).name}/{Outcome(b).name}" for a, b in differing]
         counts = [f"{pair}: {pairs.count(pair)}" for pair in sorted(set(pairs))]
@@ -196,43 +196,49 @@ def compare(cases: int, done: int) -> Rows:
             "kind": kind,
             "chunk": chunk,
             "cases": CHUNK,
-            "stepped": int(both.sum()),
+            "stepped": int(both_values.sum()),
             "other_outcome": int(other.sum()),
-            "late": int((both & (gap > LATE)).sum()),
-            "largest_time_difference": f"{np.max(gap[both], initial=0.0):.2e}",
+            "late": int((both_values & (gap > LATE_EVENT_SECONDS)).sum()),
+            "largest_time_difference": f"{np.max(gap[both_values], initial=0.0):.2e}",
             "ours/isolated": "; ".join(counts),
         }
 
 
-def dips(cases: int, done: int) -> Rows:
+def compare_dips(cases: int, done: int) -> Rows:
     """Steps at the defaults against `Options.tight()`, chunk by chunk; isolated roots decide.
 
     Where a rate or a height decays to rounding, "fell back" and "still there" can't be told apart,
     and either may give up: counted by themselves.
     """
-    made = phases()
-    n_chunks = cases // len(KINDS) // MANY
+    created = phases()
+    n_chunks = cases // len(KINDS) // N_STARTS
     places = [(i, kind, chunk) for chunk in range(n_chunks) for i, kind in enumerate(KINDS)]
     for i, kind, chunk in track(places[done:], "dips"):
-        params, starts = drawn(KINDS[kind], np.random.default_rng((11, i, chunk)), MANY)
+        params, starts = draw_wheels(KINDS[kind], np.random.default_rng((11, i, chunk)), N_STARTS)
         mine, tight = (
-            np.asarray(vrw.steps(params, starts, options=options).outcome)
-            for options in (vrw.Options(), vrw.Options.tight())
+            np.asarray(vrw.step_batch(params, starts, options=options).outcome)
+            for options in (vrw.StepOptions(), vrw.StepOptions.tight())
         )
-        gave_up = (mine == Outcome.SOLVER_GAVE_UP) | (tight == Outcome.SOLVER_GAVE_UP)
-        asked = np.flatnonzero((mine != tight) & ~gave_up)
-        few = taken(jax.tree.map(lambda x: np.broadcast_to(x, MANY), params), asked)
-        codes = isolated(made, few, starts[asked])[0] if len(asked) else mine[asked]
-        other = asked[mine[asked] != codes]
-        pairs = zip(mine[other], codes[mine[asked] != codes], strict=True)
+        gave_up = (mine == Outcome.SOLVER_FAILED) | (tight == Outcome.SOLVER_FAILED)
+        requested = np.flatnonzero((mine != tight) & ~gave_up)
+        few_items = take_rows(
+            jax.tree.map(lambda x: np.broadcast_to(x, N_STARTS), params), requested
+        )
+        codes = (
+            step_by_isolated_roots(created, few_items, starts[requested])[0]
+            if len(requested)
+            else mine[requested]
+        )
+        other = requested[mine[requested] != codes]
+        pairs = zip(mine[other], codes[mine[requested] != codes], strict=True)
         yield {
             "kind": kind,
             "chunk": chunk,
-            "cases": MANY,
+            "cases": N_STARTS,
             "stepped": int((mine == Outcome.STEPPED).sum()),
             "gave_up": int(gave_up.sum()),
-            "differ": len(asked),
+            "differ": len(requested),
             "other_outcome": len(other),
-            "other_by_tight": int((tight[asked] != codes).sum()),
+            "other_by_tight": int((tight[requested] != codes).sum()),
             "ours/isolated": "; ".join(f"{Outcome(a).name}/{Outcome(b).name}" for a, b in pairs),
         }

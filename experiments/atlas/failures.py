@@ -18,10 +18,18 @@ from matplotlib.figure import Figure
 
 from experiments.atlas import cases
 from experiments.atlas.told import Case, Row
-from experiments.shared.command import command
-from experiments.shared.tables import DOCS, FIGURES, groups, markdown, read, replace, write_named
-from experiments.shared.timing import on_one_core, start_cold
-from vrw_jax.figures import PAGE as WIDE
+from experiments.shared.command import make_parser
+from experiments.shared.tables import (
+    DOCS,
+    FIGURES,
+    format_markdown,
+    group_rows,
+    read_table,
+    replace_block,
+    write_named_rows,
+)
+from experiments.shared.timing import start_without_cache, use_one_core
+from vrw_jax.figures import PAGE_WIDTH_INCHES as WIDE
 from vrw_jax.figures import figure_style, save
 
 TABLE = FIGURES / "atlas_failures.csv"
@@ -34,7 +42,7 @@ NAMES = [name for name in ORDER if name in {m.name for m in pkgutil.iter_modules
 TEXT = DOCS / "stability_atlas.md"
 
 
-def case_of(name: str) -> Case:
+def import_case(name: str) -> Case:
     return importlib.import_module(f"experiments.atlas.cases.{name}").CASE
 
 
@@ -48,7 +56,7 @@ def as_text(name: str, row: Row) -> dict[str, str]:
         "found": f"{row.found:.15g}",
         "truth": f"{row.truth:.15g}",
         "error": "-" if math.isinf(row.error) else f"{row.error:.1e}",
-        "within": f"{row.within:.3g}",
+        "within": f"{row.is_within_request:.3g}",
         "condition": f"{row.condition:.3g}",
         "digits": "" if row.digits is None else str(row.digits),
         "says": row.says,
@@ -68,17 +76,17 @@ def anchor(title: str) -> str:
     return re.sub(r"[-\s]+", "-", re.sub(r"[^\w\s-]", "", plain).strip().lower())
 
 
-def by_method(rows: list[dict[str, str]]) -> list[list[str]]:
+def summarize_by_method(rows: list[dict[str, str]]) -> list[list[str]]:
     """A line for each method of a case: its worst answer, and what it cost."""
     lines = []
-    for method, own in groups(rows, "method").items():
+    for method, own_values in group_rows(rows, "method").items():
         size = lambda row: math.inf if row["error"] == "-" else float(row["error"])
-        worst = max(own, key=lambda row: (WORSE.index(row["verdict"]), size(row)))
-        good = sum(row["verdict"] == "right" for row in own)
-        says = next((row["says"] for row in [worst, *own] if row["says"]), "")
+        worst = max(own_values, key=lambda row: (WORSE.index(row["verdict"]), size(row)))
+        good = sum(row["verdict"] == "right" for row in own_values)
+        says = next((row["says"] for row in [worst, *own_values] if row["says"]), "")
         lines.append(
             [
-                method, worst["verdict"], f"{good} of {len(own)}", worst["quantity"],
+                method, worst["verdict"], f"{good} of {len(own_values)}", worst["quantity"],
                 worst["error"], says, worst["work"], worst["ms"],
                 f"{worst['options']}; {worst['version']}",
             ]
@@ -86,7 +94,7 @@ def by_method(rows: list[dict[str, str]]) -> list[list[str]]:
     return lines
 
 
-def exact(rows: list[dict[str, str]]) -> list[dict[str, str]]:
+def select_exact_rows(rows: list[dict[str, str]]) -> list[dict[str, str]]:
     """What this library answers rightly where the truth is a closed form, or has all digits."""
     return [
         row
@@ -98,57 +106,61 @@ def exact(rows: list[dict[str, str]]) -> list[dict[str, str]]:
     ]
 
 
-def tell(rows: list[dict[str, str]]) -> None:
+def format_page(rows: list[dict[str, str]]) -> None:
     """Tables of the page: one line for each case, and under each case one for each method."""
     lines = []
-    for name, some in groups(rows, "case").items():
-        case, methods = case_of(name), by_method(some)
-        errors = [float(row["error"]) / float(row["condition"]) for row in exact(some)]
-        told = ["; ".join(m for m, verdict, *_ in methods if verdict == word) for word in WORSE]
+    for name, selection in group_rows(rows, "case").items():
+        case, methods = import_case(name), summarize_by_method(selection)
+        errors = [
+            float(row["error"]) / float(row["condition"]) for row in select_exact_rows(selection)
+        ]
+        result_list = [
+            "; ".join(m for m, verdict, *_ in methods if verdict == word) for word in WORSE
+        ]
         lines.append(
             [
                 f"[{case.title}](#{anchor(case.title)})", case.breaks, case.truth,
-                f"{max(errors):.0e}" if errors else "-", *told, f"`--only {name}`",
+                f"{max(errors):.0e}" if errors else "-", *result_list, f"`--only {name}`",
             ]
         )  # fmt: skip
         header = ["method", "worst verdict", "right", "worst question", "error", "says", "work",
                   "ms", "options; version"]  # fmt: skip
-        table = markdown(header, methods)
-        replace(TEXT, f"failure {name}", f"{table}\n\nSource: {case.source}.")
+        table = format_markdown(header, methods)
+        replace_block(TEXT, f"failure {name}", f"{table}\n\nSource: {case.source}.")
     header = ["case", "what breaks", "truth", "our largest error over the condition", "right",
               "says so", "wrong silently", "`python -m experiments.atlas.failures`"]  # fmt: skip
-    replace(TEXT, "failures", markdown(header, lines))
+    replace_block(TEXT, "failures", format_markdown(header, lines))
 
 
 def draw(name: str, rows: list[dict[str, str]]) -> None:
     with figure_style():
         figure = Figure(figsize=(0.62 * WIDE, 0.42 * WIDE))
-        case_of(name).draw(figure, [row for row in rows if row["case"] == name])
+        import_case(name).draw(figure, [row for row in rows if row["case"] == name])
         save(figure, FIGURES, f"failure_{name}")
 
 
 def main() -> None:
-    parser = command(__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--only", choices=NAMES, nargs="+", help="some cases", metavar="CASE")
     parser.add_argument("--redraw", action="store_true", help="tables of the page alone")
     chosen = parser.parse_args()
     names = chosen.only or NAMES
     if chosen.redraw:
-        tell(read(TABLE))
+        format_page(read_table(TABLE))
         return
-    rows = read(TABLE) if chosen.only and TABLE.exists() else []
+    rows = read_table(TABLE) if chosen.only and TABLE.exists() else []
     began = time.strftime("%Y-%m-%dT%H:%MZ", time.gmtime())
-    with on_one_core():
-        start_cold()
+    with use_one_core():
+        start_without_cache()
         for name in names:
-            some = [as_text(name, row) | {"run": began} for row in case_of(name).rows()]
-            for row in some:
+            selection = [as_text(name, row) | {"run": began} for row in import_case(name).rows()]
+            for row in selection:
                 print(*(x for key, x in row.items() if key not in ("options", "run")), flush=True)
-            draw(name, some)
-            rows = [row for row in rows if row["case"] != name] + some
+            draw(name, selection)
+            rows = [row for row in rows if row["case"] != name] + selection
     rows.sort(key=lambda row: ORDER.index(row["case"]))
-    write_named(TABLE, rows)
-    tell(rows)
+    write_named_rows(TABLE, rows)
+    format_page(rows)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from tests.oracle.constrained_wheel import Wheel
 TRUTH = json.loads(Path(oracle.__file__).with_name("truth.json").read_text())["cases"][0]
 PARAMS = {name: float(value) for name, value in TRUTH["params"].items()}
 START = np.array([float(v) for v in TRUTH["step"]["start"]])
-EXACT = np.array([float(v) for v in TRUTH["step"]["section_state"]])
+EXACT_SECTION_STATE = np.array([float(v) for v in TRUTH["step"]["section_state"]])
 PERIOD = sum(float(v) for v in TRUTH["step"]["durations"])
 
 DRIFT_STEP = 5e-3  # s: the fast mode's rate times it is 1
@@ -28,7 +28,7 @@ DRIFT_AT = (100, 1000, 10_000, 100_000)  # steps
 BAUMGARTE = 50.0  # 1/s: both roots of the constraint's error
 
 
-class Constrained:
+class ConstrainedWheel:
     """The oracle's wheel, and what its phases are followed with."""
 
     def __init__(self, stabilised: str) -> None:
@@ -114,10 +114,10 @@ def exchange(q, v):
 def drift() -> Iterator[dict[str, object]]:
     """How far feet leave the ground and their places, over integrator steps, three treatments."""
     for stabilised in ("none", "Baumgarte", "projection"):
-        body = Constrained(stabilised)
+        body = ConstrainedWheel(stabilised)
         q, v = oracle.pre_impact(PARAMS, START)
-        count, lost, height, begin = 0, False, 0.0, time.process_time()
-        while not lost:
+        count, lost_values, height, begin = 0, False, 0.0, time.process_time()
+        while not lost_values:
             q, v = exchange(q, v)
             v, _ = body.wheel.impact(q, v, "DLS")
             # Feet are held where they landed, at the ground's own height.
@@ -130,7 +130,7 @@ def drift() -> Iterator[dict[str, object]]:
                     q, v = state
                     count += 1
                     height = max(height, abs(body.gaps(q, mode, anchor)).max())
-                    lost = not np.all(np.isfinite(q)) or count >= DRIFT_AT[-1]
+                    lost_values = not np.all(np.isfinite(q)) or count >= DRIFT_AT[-1]
                     if count in DRIFT_AT:
                         yield {
                             "stabilised": stabilised,
@@ -139,19 +139,19 @@ def drift() -> Iterator[dict[str, object]]:
                             "dtheta": f"{v[2]:.6g}",
                             "us_per_step": f"{(time.process_time() - begin) / count * 1e6:.3g}",
                         }
-                    if lost:
+                    if lost_values:
                         break
-                if lost:
+                if lost_values:
                     break
 
 
 RATIO = 0.3
 """Natural frequency of a contact times the step: what semi-implicit Euler bears with damping."""
-LIFTED = 1e-3
+LIFT_OFF_HEIGHT = 1e-3
 """Height at which the rear foot has left for good, m."""
 
 
-HELD = 0.3  # s, of the 0.43 s of double support
+FIT_START_SECONDS = 0.3  # s, of the 0.43 s of double support
 """The shock's transient lasts long: the wheel is heavier than the leg that the springs fit."""
 
 
@@ -164,11 +164,11 @@ def penalty() -> Iterator[dict[str, object]]:
     for ground in ("unilateral", "held"):
         for h in (5e-4, 2e-4, 1e-4, 5e-5, 2e-5):
             yield {"ground": ground, "step_s": h} | penalty_step(
-                h, HELD / h if ground == "held" else 0.0
+                h, FIT_START_SECONDS / h if ground == "held" else 0.0
             )
 
 
-def penalty_step(h: float, held: float) -> dict[str, object]:
+def penalty_step(h: float, held_values: float) -> dict[str, object]:
     """Semi-implicit Euler with springs and dampers at feet and stopper; `held` counts steps."""
     wheel, mass = Wheel(PARAMS), PARAMS["leg_mass"]
     k = mass * (RATIO / h) ** 2
@@ -182,8 +182,8 @@ def penalty_step(h: float, held: float) -> dict[str, object]:
         jacobian = np.array(equations.jacobian(q, wheel.pack))
         gap = np.array(equations.feet(q, wheel.pack)) - anchor
         force = -k * gap - c * jacobian @ v
-        lifted = lifted or (gap[3] > LIFTED and count >= held)
-        if lifted or (force[3] <= 0.0 and count >= held):
+        lifted = lifted or (gap[3] > LIFT_OFF_HEIGHT and count >= held_values)
+        if lifted or (force[3] <= 0.0 and count >= held_values):
             force[2:] = 0.0
         total = wheel.spring_damper(q, v) - np.array(equations.bias(q, v, wheel.pack))
         total = total + jacobian.T @ force
@@ -204,7 +204,7 @@ def penalty_step(h: float, held: float) -> dict[str, object]:
         "stiffness": f"{k:.3g}",
         "evaluations": count,
         "us_per_gait": f"{(time.process_time() - begin) * 1e6:.4g}",
-        "dtheta_error": f"{abs(v[2] - EXACT[1]):.2e}",
+        "dtheta_error": f"{abs(v[2] - EXACT_SECTION_STATE[1]):.2e}",
         "period_error": f"{abs((count - share) * h - PERIOD):.2e}",
         "outcome": "STEPPED" if good else "NO_TOUCHDOWN",
     }

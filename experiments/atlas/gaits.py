@@ -15,16 +15,16 @@ import numpy as np
 from scipy.optimize import fsolve
 
 import vrw_jax as vrw
-from experiments.atlas.hybrid import METHODS, Part, Walked, modes
-from experiments.atlas.told import timed
-from vrw_jax.numerics import newton_cycle, volume_change, walk
+from experiments.atlas.hybrid import METHODS, MethodRun, Part, modes
+from experiments.atlas.told import time_second_call
+from vrw_jax.numerics import flow_jacobian_determinant, simulate_hybrid, solve_fixed_point
 
 DIFFERENCE = 1e-5
 """Of a peer's central differences, of fourth order: those of second are off in the sixth digit
 where a foot grazes."""
 
 
-class Return(NamedTuple):
+class ReturnMap(NamedTuple):
     """A system seen from event to event."""
 
     system: Sequence[Part]
@@ -35,7 +35,7 @@ class Return(NamedTuple):
     limit: float = 20.0
 
 
-class Exact(NamedTuple):
+class ExactGait(NamedTuple):
     """A gait as many_digits.py finds it: section, time until it is back, multipliers by size."""
 
     x: tuple[float, ...]
@@ -46,7 +46,7 @@ class Exact(NamedTuple):
 class Gait(NamedTuple):
     """What a method found; `walked` is its last step."""
 
-    walked: Walked
+    simulation: MethodRun
     x: np.ndarray
     jacobian: np.ndarray
     product: float  # of its multipliers: ours by Liouville's formula, a peer's the determinant
@@ -58,49 +58,49 @@ class Gait(NamedTuple):
         return values[np.argsort(-np.abs(values), kind="stable")]
 
 
-def by_newton(told: Return) -> Gait:
+def find_by_newton(result: ReturnMap) -> Gait:
     """This library's own."""
-    parts = modes(told.system)
-    options = vrw.Options(rtol=1e-13, atol=1e-13, max_phase_time=told.limit)
+    parts = modes(result.system)
+    options = vrw.StepOptions(rtol=1e-13, atol=1e-13, max_phase_time=result.limit)
 
-    begin = lambda x: jnp.stack([jnp.asarray(v, float) for v in told.begin(x, jnp)])
-    once = functools.partial(walk, parts, events=told.events, options=options)
+    begin = lambda x: jnp.stack([jnp.asarray(v, float) for v in result.begin(x, jnp)])
+    once = functools.partial(simulate_hybrid, parts, events=result.events, options=options)
 
     def back(x: jax.Array) -> jax.Array:
-        return jnp.stack(told.read(once(begin(x)).state))
+        return jnp.stack(result.read(once(begin(x)).state))
 
     def product(x: jax.Array) -> jax.Array:
-        return volume_change(parts, begin(x), once(begin(x)), options)
+        return flow_jacobian_determinant(parts, begin(x), once(begin(x)), options)
 
-    found, seconds = timed(
+    solution, seconds = time_second_call(
         lambda: jax.block_until_ready(
-            jax.jit(lambda x: newton_cycle(back, x, tolerance=1e-11))(jnp.array(told.guess))
+            jax.jit(lambda x: solve_fixed_point(back, x, tolerance=1e-11))(jnp.array(result.guess))
         )
     )
-    x = np.asarray(found.x)
-    walked = METHODS[0](told.system, told.begin(x, math), told.events, told.limit)
-    says = walked.says if found.converged else "Newton did not converge"
-    walked = walked._replace(
-        says=says, admits=bool(~found.converged) or walked.admits, seconds=seconds,
-        work=int(found.iterations), options=f"{walked.options}; Newton 1e-11",
+    x = np.asarray(solution.x)
+    walk_result = METHODS[0](result.system, result.begin(x, math), result.events, result.limit)
+    says = walk_result.says if solution.converged else "Newton did not converge"
+    walk_result = walk_result._replace(
+        says=says, admits=bool(~solution.converged) or walk_result.admits, seconds=seconds,
+        work=int(solution.iterations), options=f"{walk_result.options}; Newton 1e-11",
     )  # fmt: skip
-    jacobian, around = np.asarray(found.jacobian), float(jax.jit(product)(found.x))
-    return Gait(walked, x, jacobian, around, _duration(walked, told))
+    jacobian, around_values = np.asarray(solution.jacobian), float(jax.jit(product)(solution.x))
+    return Gait(walk_result, x, jacobian, around_values, _duration(walk_result, result))
 
 
-def by_differences(method: Callable[..., Walked], told: Return) -> Gait:
+def find_by_differences(method: Callable[..., MethodRun], result: ReturnMap) -> Gait:
     """A peer's map under `fsolve`."""
 
-    def walked(x: np.ndarray) -> Walked:
-        return method(told.system, told.begin(x, math), told.events, told.limit)
+    def walked(x: np.ndarray) -> MethodRun:
+        return method(result.system, result.begin(x, math), result.events, result.limit)
 
     def back(x: np.ndarray) -> np.ndarray:
-        return np.array(told.read(walked(x).end), float)
+        return np.array(result.read(walked(x).end), float)
 
     def solve() -> tuple:
-        return fsolve(lambda x: back(x) - x, told.guess, xtol=1e-12, full_output=True)
+        return fsolve(lambda x: back(x) - x, result.guess, xtol=1e-12, full_output=True)
 
-    (x, info, flag, message), seconds = timed(solve)
+    (x, info, flag, message), seconds = time_second_call(solve)
     shifts = DIFFERENCE * np.eye(len(x))
     near = [back(x + shift) - back(x - shift) for shift in shifts]
     far = [back(x + 2.0 * shift) - back(x - 2.0 * shift) for shift in shifts]
@@ -112,13 +112,20 @@ def by_differences(method: Callable[..., Walked], told: Return) -> Gait:
         options=f"{last.options}; fsolve 1e-12, differences over {DIFFERENCE:g}",
     )  # fmt: skip
     jacobian = np.stack(columns, 1)
-    return Gait(last, x, jacobian, float(np.linalg.det(jacobian)), _duration(last, told))
+    return Gait(last, x, jacobian, float(np.linalg.det(jacobian)), _duration(last, result))
 
 
-def _duration(walked: Walked, told: Return) -> float:
-    return float(walked.times[told.events - 1]) if len(walked.times) >= told.events else math.nan
+def _duration(walk_result: MethodRun, result: ReturnMap) -> float:
+    return (
+        float(walk_result.times[result.events - 1])
+        if len(walk_result.times) >= result.events
+        else math.nan
+    )
 
 
-def gaits(told: Return) -> list[Gait]:
+def gaits(result: ReturnMap) -> list[Gait]:
     """By all methods, this library first."""
-    return [by_newton(told), *(by_differences(method, told) for method in METHODS[1:])]
+    return [
+        find_by_newton(result),
+        *(find_by_differences(method, result) for method in METHODS[1:]),
+    ]

@@ -20,33 +20,33 @@ import optimistix as optx
 from scipy.integrate import solve_ivp
 
 import vrw_jax as vrw
-from experiments.atlas.told import EXACT, Row, off, timed
-from experiments.shared.command import extra
-from vrw_jax.numerics import Guard, Mode, Stop, time_errors, walk
+from experiments.atlas.told import EXACT_ERROR, Row, compute_error, time_second_call
+from experiments.shared.command import require_extra
+from vrw_jax.numerics import Guard, Mode, Termination, simulate_hybrid, time_errors
 
-hy = extra("heyoka")
+hy = require_extra("heyoka")
 Numbers = Sequence[Any]
 NO_EVENT = "no event to the end of time"
-STILL = 5
+MAX_INSTANT_EVENTS = 5
 """Events in a row that take no time: a peer that has come to this is stopped here."""
 
 
-class Edge(NamedTuple):
+class GuardEdge(NamedTuple):
     """A guard, what it does, and where it leads."""
 
     value: Callable[[Numbers, Any], Any]
     reset: Callable[[Numbers, Any], Numbers] = lambda y, m: y
-    to: int = 0
+    target_part: int = 0
 
 
 class Part(NamedTuple):
     """A mode of a system."""
 
     field: Callable[[Numbers, Any], Numbers]
-    edges: tuple[Edge, ...]
+    edges: tuple[GuardEdge, ...]
 
 
-class Walked(NamedTuple):
+class MethodRun(NamedTuple):
     """Events as a method found them, and what it says of itself."""
 
     method: str
@@ -62,7 +62,7 @@ class Walked(NamedTuple):
     end: np.ndarray  # the last state, past the reset
     resolution: np.ndarray = np.zeros(0)  # of each time: what the tolerances are in it, if told
     rounding: np.ndarray = np.zeros(0)  # and one rounding of the state
-    stated: np.ndarray = np.zeros(0)  # and what it may be off by in all
+    stated_errors: np.ndarray = np.zeros(0)  # and what it may be off by in all
 
 
 JAX = types.SimpleNamespace(sin=jnp.sin, cos=jnp.cos, exp=jnp.exp, sqrt=jnp.sqrt, stack=jnp.stack)
@@ -72,8 +72,8 @@ def modes(system: Sequence[Part]) -> tuple[Mode, ...]:
     """The system as this library's face takes it."""
     row = lambda function: lambda y: jnp.stack([jnp.asarray(x, float) for x in function(y, JAX)])
 
-    def guard(edge: Edge) -> Guard:
-        return Guard(lambda y: jnp.asarray(edge.value(y, JAX)), row(edge.reset), edge.to)
+    def guard(edge: GuardEdge) -> Guard:
+        return Guard(lambda y: jnp.asarray(edge.value(y, JAX)), row(edge.reset), edge.target_part)
 
     return tuple(Mode(row(part.field), tuple(map(guard, part.edges))) for part in system)
 
@@ -81,41 +81,41 @@ def modes(system: Sequence[Part]) -> tuple[Mode, ...]:
 @functools.lru_cache
 def _our_run(system: tuple[Part, ...], events: int, options: tuple) -> tuple[Callable, Callable]:
     """The walk, and what its event times may be off by."""
-    parts, chosen = modes(system), vrw.Options(**dict(options))
+    parts, chosen = modes(system), vrw.StepOptions(**dict(options))
     return (
-        jax.jit(lambda y: walk(parts, y, events=events, options=chosen)),
+        jax.jit(lambda y: simulate_hybrid(parts, y, events=events, options=chosen)),
         jax.jit(lambda y, told: time_errors(parts, y, told, chosen)),
     )
 
 
-def ours(
+def run_library(
     system: Sequence[Part], start: Numbers, events: int, limit: float, solver: str = "Dopri8",
     tolerance: float = 1e-13, **changed: Any,
-) -> Walked:  # fmt: skip
+) -> MethodRun:  # fmt: skip
     chosen = {"rtol": tolerance, "atol": tolerance, "max_phase_time": limit, **changed}
     run, errors = _our_run(tuple(system), events, (("solver", solver), *chosen.items()))
     y = jnp.asarray(start, float)
-    told, seconds = timed(lambda: jax.block_until_ready(run(y)))
-    n, stop = int(told.n_events), Stop(int(told.stop))
-    return Walked(
+    result, seconds = time_second_call(lambda: jax.block_until_ready(run(y)))
+    n, stop = int(result.n_events), Termination(int(result.termination))
+    return MethodRun(
         "ours",
-        np.asarray(told.times[:n]),
-        np.asarray(told.before[:n]),
-        np.asarray(told.guards[:n]),
-        "" if stop == Stop.EVENTS_DONE else stop.name,
-        stop not in (Stop.EVENTS_DONE, Stop.TIME_OVER),
-        int(told.solver_steps),
+        np.asarray(result.times[:n]),
+        np.asarray(result.before[:n]),
+        np.asarray(result.guards[:n]),
+        "" if stop == Termination.MAX_EVENTS_REACHED else stop.name,
+        stop not in (Termination.MAX_EVENTS_REACHED, Termination.MAX_TIME_REACHED),
+        int(result.solver_steps),
         seconds,
         f"{solver} {tolerance:g}",
         version("vrw-jax"),
-        np.asarray(told.state),
-        np.asarray(told.resolution[:n]),
-        np.asarray(told.rounding[:n]),
-        np.asarray(errors(y, told)[:n]),
+        np.asarray(result.state),
+        np.asarray(result.resolution[:n]),
+        np.asarray(result.rounding[:n]),
+        np.asarray(errors(y, result)[:n]),
     )
 
 
-class _Found(NamedTuple):
+class _ModeExit(NamedTuple):
     """How a peer left one mode; `edge` is None where it met no event."""
 
     state: np.ndarray
@@ -125,43 +125,46 @@ class _Found(NamedTuple):
     says: str
 
 
-def _through(
-    leave: Callable[[int, np.ndarray], _Found], system: Sequence[Part], start: Numbers, events: int
+def _simulate_modes(
+    leave: Callable[[int, np.ndarray], _ModeExit],
+    system: Sequence[Part],
+    start: Numbers,
+    events: int,
 ) -> tuple:
     """A peer's modes one after the other, as its documents tell to restart."""
-    mode, time, still, work = 0, 0.0, 0, 0
+    mode, time, is_unfinished, work = 0, 0.0, 0, 0
     y, says = np.asarray(start, float), ""
     times, states, edges = [], [], []
     while len(times) < events and not says:
         try:
-            found = leave(mode, y)
+            solution = leave(mode, y)
         except Exception as failure:
             says = f"{type(failure).__name__}: {failure}".split("\n")[0][:120]
             break
-        work += found.work
-        if found.edge is None:
-            says = found.says or NO_EVENT
+        work += solution.work
+        if solution.edge is None:
+            says = solution.says or NO_EVENT
             break
-        still = 0 if time + found.duration > time else still + 1
-        if still > STILL:
+        is_unfinished = 0 if time + solution.duration > time else is_unfinished + 1
+        if is_unfinished > MAX_INSTANT_EVENTS:
             says = "stands still (stopped here)"
             break
-        edge = system[mode].edges[found.edge]
-        time += found.duration
+        edge = system[mode].edges[solution.edge]
+        time += solution.duration
         times.append(time)
-        states.append(found.state)
-        edges.append(found.edge)
-        y, mode = np.array(edge.reset(found.state, math), float), edge.to
+        states.append(solution.state)
+        edges.append(solution.edge)
+        y, mode = np.array(edge.reset(solution.state, math), float), edge.target_part
     return np.array(times), np.array(states).reshape(-1, len(start)), np.array(edges), says, work, y
 
 
-def _walked(
+def _run_method(
     method: str, leave: Callable, system: Sequence[Part], start: Numbers, events: int,
     options: str, package: str,
-) -> Walked:  # fmt: skip
-    told, seconds = timed(lambda: _through(leave, system, start, events))
-    times, states, edges, says, work, end = told
-    return Walked(
+) -> MethodRun:  # fmt: skip
+    result, seconds = time_second_call(lambda: _simulate_modes(leave, system, start, events))
+    times, states, edges, says, work, end = result
+    return MethodRun(
         method,
         times,
         states,
@@ -176,30 +179,32 @@ def _walked(
     )
 
 
-def by_scipy(
+def run_scipy(
     system: Sequence[Part], start: Numbers, events: int, limit: float, method: str = "DOP853",
     tolerance: float = 1e-13,
-) -> Walked:  # fmt: skip
-    def event(edge: Edge) -> Callable:
+) -> MethodRun:  # fmt: skip
+    def event(edge: GuardEdge) -> Callable:
         watched = lambda t, y: edge.value(y, math)
         watched.terminal, watched.direction = True, -1  # type: ignore[attr-defined]
         return watched
 
-    def leave(mode: int, y: np.ndarray) -> _Found:
+    def leave(mode: int, y: np.ndarray) -> _ModeExit:
         part = system[mode]
-        told = solve_ivp(
+        result = solve_ivp(
             lambda t, y: part.field(y, math), (0.0, limit), y, method=method, rtol=tolerance,
             atol=tolerance, events=[event(edge) for edge in part.edges],
         )  # fmt: skip
-        met = [i for i, times in enumerate(told.t_events) if len(times)]
-        says = "" if told.status >= 0 else told.message
-        if not met:
-            return _Found(told.y[:, -1], told.t[-1], None, told.nfev, says)
-        edge = min(met, key=lambda i: told.t_events[i][0])
-        return _Found(told.y_events[edge][0], told.t_events[edge][0], edge, told.nfev, says)
+        event_rows = [i for i, times in enumerate(result.t_events) if len(times)]
+        says = "" if result.status >= 0 else result.message
+        if not event_rows:
+            return _ModeExit(result.y[:, -1], result.t[-1], None, result.nfev, says)
+        edge = min(event_rows, key=lambda i: result.t_events[i][0])
+        return _ModeExit(
+            result.y_events[edge][0], result.t_events[edge][0], edge, result.nfev, says
+        )
 
     options = f"{method} {tolerance:g}"
-    return _walked("SciPy", leave, system, start, events, options, "scipy")
+    return _run_method("SciPy", leave, system, start, events, options, "scipy")
 
 
 @functools.lru_cache
@@ -230,25 +235,25 @@ def _diffrax_solves(
     return solves
 
 
-def by_diffrax(
+def run_diffrax(
     system: Sequence[Part], start: Numbers, events: int, limit: float, solver: str = "Dopri8",
     tolerance: float = 1e-13,
-) -> Walked:  # fmt: skip
+) -> MethodRun:  # fmt: skip
     solves = _diffrax_solves(tuple(system), limit, solver, tolerance)
 
-    def leave(mode: int, y: np.ndarray) -> _Found:
-        told = solves[mode](jnp.asarray(y))
-        state, time = np.asarray(told.ys[-1]), float(told.ts[-1])
-        work = int(told.stats["num_steps"])
-        met = np.flatnonzero([bool(x) for x in told.event_mask])
-        if told.result == diffrax.RESULTS.event_occurred and len(met):
-            return _Found(state, time, int(met[0]), work, "")
-        good = told.result == diffrax.RESULTS.successful
-        says = "" if good else str(told.result).split("<")[-1].split(".")[0][:90]
-        return _Found(state, time, None, work, says)
+    def leave(mode: int, y: np.ndarray) -> _ModeExit:
+        result = solves[mode](jnp.asarray(y))
+        state, time = np.asarray(result.ys[-1]), float(result.ts[-1])
+        work = int(result.stats["num_steps"])
+        event_values = np.flatnonzero([bool(x) for x in result.event_mask])
+        if result.result == diffrax.RESULTS.event_occurred and len(event_values):
+            return _ModeExit(state, time, int(event_values[0]), work, "")
+        good = result.result == diffrax.RESULTS.successful
+        says = "" if good else str(result.result).split("<")[-1].split(".")[0][:90]
+        return _ModeExit(state, time, None, work, says)
 
     options = f"{solver} {tolerance:g}, Newton 1e-14"
-    return _walked("diffrax", leave, system, start, events, options, "diffrax")
+    return _run_method("diffrax", leave, system, start, events, options, "diffrax")
 
 
 @functools.lru_cache
@@ -267,11 +272,11 @@ def _heyoka_flows(system: tuple[Part, ...], dim: int) -> list[Any]:
     return flows
 
 
-def by_heyoka(system: Sequence[Part], start: Numbers, events: int, limit: float) -> Walked:
+def run_heyoka(system: Sequence[Part], start: Numbers, events: int, limit: float) -> MethodRun:
     flows = _heyoka_flows(tuple(system), len(start))
     last = [-1]
 
-    def leave(mode: int, y: np.ndarray) -> _Found:
+    def leave(mode: int, y: np.ndarray) -> _ModeExit:
         flow = flows[mode]
         if last[0] != mode:  # else the cooldown keeps the event just met from firing again
             flow.reset_cooldowns()
@@ -281,20 +286,20 @@ def by_heyoka(system: Sequence[Part], start: Numbers, events: int, limit: float)
         code = int(outcome)
         state = flow.state.copy()
         if code < 0 and -code <= len(system[mode].edges):
-            return _Found(state, flow.time, -code - 1, steps, "")
+            return _ModeExit(state, flow.time, -code - 1, steps, "")
         says = "" if outcome == hy.taylor_outcome.time_limit else str(outcome).split(".")[-1]
-        return _Found(state, flow.time, None, steps, says)
+        return _ModeExit(state, flow.time, None, steps, says)
 
-    return _walked("heyoka", leave, system, start, events, "Taylor, 2.2e-16", "heyoka")
-
-
-METHODS = (ours, by_diffrax, by_scipy, by_heyoka)
+    return _run_method("heyoka", leave, system, start, events, "Taylor, 2.2e-16", "heyoka")
 
 
-def row(
-    walked: Walked,
+METHODS = (run_library, run_diffrax, run_scipy, run_heyoka)
+
+
+def make_row(
+    walk_result: MethodRun,
     quantity: str,
-    found: float,
+    solution: float,
     truth: float,
     *,
     relative: bool = False,
@@ -303,19 +308,19 @@ def row(
     event: int = 0,
 ) -> Row:
     """What a walk says of one quantity, of the last event or another: also a bad condition."""
-    of, says = slice(event or None), walked.says
-    stated, rounding = walked.stated[of], walked.rounding[of]
-    if not says and len(stated) and stated[-1] > EXACT:
+    of_values, says = slice(event or None), walk_result.says
+    stated, rounding = walk_result.stated_errors[of_values], walk_result.rounding[of_values]
+    if not says and len(stated) and stated[-1] > EXACT_ERROR:
         says = f"time to {stated[-1]:.0e}"
-        if rounding[-1] > EXACT:
+        if rounding[-1] > EXACT_ERROR:
             says += f", one rounding: {rounding[-1]:.1e}"
     return Row(
-        quantity, walked.method, found, truth, off(found, truth, relative=relative), says,
-        walked.admits, walked.work, walked.seconds, walked.options, walked.version,
+        quantity, walk_result.method, solution, truth, compute_error(solution, truth, relative=relative), says,
+        walk_result.admits, walk_result.work, walk_result.seconds, walk_result.options, walk_result.version,
         condition, digits,
     )  # fmt: skip
 
 
-def last_time(walked: Walked, events: int) -> float:
+def last_time(walk_result: MethodRun, events: int) -> float:
     """Time of the last of `events` events; not a number if there are fewer."""
-    return float(walked.times[events - 1]) if len(walked.times) >= events else math.nan
+    return float(walk_result.times[events - 1]) if len(walk_result.times) >= events else math.nan

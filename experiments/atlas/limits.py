@@ -14,17 +14,17 @@ import numpy as np
 import vrw_jax as vrw
 from experiments.atlas import events
 from experiments.atlas.events import START, Rows
-from experiments.shared.timing import seconds
+from experiments.shared.timing import measure_cpu_seconds
 from experiments.speed import peers
 from vrw_jax import Outcome
-from vrw_jax.models.viscoelastic import flow_of
-from vrw_jax.numerics import Watched, integrate_phase
+from vrw_jax.models.viscoelastic import make_diffrax_phase
+from vrw_jax.numerics import MonitoredFunctions, integrate_phase
 from vrw_jax.wheel import (
     Motion,
     Symbols,
     dynamics,
     landing_foot_height,
-    phases_of,
+    make_phases,
     transitions,
 )
 
@@ -52,10 +52,12 @@ def first_order_rates(s: Symbols, y: jax.Array, ddL2: jax.Array | float = 0.0) -
     Forces are linear in L2': with L2'' known the three rows of M q'' = f give theta'', L1'', L2'.
     """
     theta, L1, L2, dtheta, dL1 = y
-    at = lambda dL2: dynamics.terms(s, Motion.of(theta, L1, L2, dtheta, dL1, dL2))
+    value_at = lambda dL2: dynamics.equation_terms(
+        s, Motion.from_angle(theta, L1, L2, dtheta, dL1, dL2)
+    )
     zero = 0.0 * theta
-    M, *rest = at(zero)
-    slope = [a - b for a, b in zip(at(zero + 1.0)[1:], rest, strict=True)]
+    M, *rest = value_at(zero)
+    slope = [a - b for a, b in zip(value_at(zero + 1.0)[1:], rest, strict=True)]
     rows = [[M.M11, M.M12, -slope[0]], [M.M12, M.M22, -slope[1]], [M.M13, M.M23, -slope[2]]]
     rows = [[zero + entry for entry in row] for row in rows]
     column = jnp.stack([M.M13 + zero, M.M23 + zero, M.M33 + zero])
@@ -81,24 +83,26 @@ def after_the_layer(s: Symbols, state: jax.Array, rates: Callable) -> jax.Array:
     zero = 0.0 * state[0]
     matrix = [[M.M11, M.M12, M.M13], [M.M12, M.M22, M.M23], [M.M13, M.M23, M.M33]]
     matrix = jnp.array([[zero + entry for entry in row] for row in matrix])
-    along = jnp.linalg.solve(matrix, jnp.array([0.0, 0.0, 1.0]))
+    tangential_part = jnp.linalg.solve(matrix, jnp.array([0.0, 0.0, 1.0]))
     y = state[:5]
     for _ in range(3):  # the slow value is that of the state left behind
         excess = state[5] - rates(y)[2]
-        jump = along * excess / along[2]
-        moved = state[:3] + jump / (s.c * along[2])
-        y = jnp.concatenate([moved, state[3:5] - jump[:2]])
+        jump = tangential_part * excess / tangential_part[2]
+        shifted = state[:3] + jump / (s.c * tangential_part[2])
+        y = jnp.concatenate([shifted, state[3:5] - jump[:2]])
     return y
 
 
-def step_with_leg(leg: str, params: vrw.WheelParams, x: jax.Array, options: vrw.Options) -> tuple:
+def step_with_leg(
+    leg: str, params: vrw.WheelParams, x: jax.Array, options: vrw.StepOptions
+) -> tuple:
     """Section state and durations, and solver steps and outcome of SLS-I, of a step."""
     s = params.symbols()
     landing = transitions.land(s, *x)
-    on = jnp.asarray(True)
-    phases = phases_of(s, landing.distance, stop_at_lift_off=True)
-    dls, sls1, sls2 = (flow_of(phase, monitored=False) for phase in phases)
-    run = lambda phase, y: integrate_phase(phase.field, phase.watched, y, on, options)
+    values_array = jnp.asarray(True)
+    phases = make_phases(s, landing.distance, stop_at_lift_off=True)
+    dls, sls1, sls2 = (make_diffrax_phase(phase, records_margins=False) for phase in phases)
+    run = lambda phase, y: integrate_phase(phase.field, phase.watched, y, values_array, options)
     first = run(dls, jnp.stack([landing.theta, landing.motion.dtheta]))
     m = dls.motion(first.state)
     state = jnp.stack([first.state[0], m.L1, m.L2, m.dtheta, m.dL1, m.dL2])
@@ -107,25 +111,25 @@ def step_with_leg(leg: str, params: vrw.WheelParams, x: jax.Array, options: vrw.
         motion = sls1.motion(second.state)
     else:
         rates = lambda y: (corrected_rates if leg == "corrected" else first_order_rates)(s, y)
-        full = lambda y: Motion.of(y[0], y[1], y[2], y[3], y[4], rates(y)[2])
+        full = lambda y: Motion.from_angle(y[0], y[1], y[2], y[3], y[4], rates(y)[2])
         start = after_the_layer(s, state, rates) if leg == "corrected" else state[:5]
 
         def guards(y: jax.Array) -> jax.Array:
             return jnp.stack([s.L0 - y[2], landing_foot_height(s, full(y)), y[3]])
 
-        second = integrate_phase(rates, Watched(guards, 3), start, on, options)
+        second = integrate_phase(rates, MonitoredFunctions(guards, 3), start, values_array, options)
         motion = full(second.state)
     hit = transitions.hit_stopper(s, motion).motion
     third = run(sls2, jnp.stack([second.state[0], hit.L1, hit.dtheta, hit.dL1]))
     theta, _, dtheta, dL1 = third.state
     durations = jnp.stack([first.duration, second.duration, third.duration])
-    told = jnp.concatenate([jnp.stack([theta, dtheta, dL1]), durations])
-    return told, second.solver_steps, second.guard
+    joined_values = jnp.concatenate([jnp.stack([theta, dtheta, dL1]), durations])
+    return joined_values, second.solver_steps, second.guard
 
 
 def first_order() -> Rows:
     """Error and cost of legs of first order over c/m, Tsit5, against isolated roots."""
-    options = vrw.Options(solver="Tsit5", rtol=TOLERANCE, atol=TOLERANCE)
+    options = vrw.StepOptions(solver="Tsit5", rtol=TOLERANCE, atol=TOLERANCE)
     runs = {}
     for leg in LEGS:
         one = lambda params, x, leg=leg: step_with_leg(leg, params, x, options)
@@ -140,13 +144,13 @@ def first_order() -> Rows:
             call = lambda run=run, params=params: jax.block_until_ready(
                 run(params, jnp.tile(START, (LANES, 1)))
             )
-            told, steps, guard = call()
+            result, steps, guard = call()
             yield {
                 "c_over_m": f"{rate:.4g}",
                 "leg": leg,
-                "error": f"{np.max(np.abs(np.asarray(told[0]) - truth)):.2e}",
+                "error": f"{np.max(np.abs(np.asarray(result[0]) - truth)):.2e}",
                 "steps_sls1": int(steps[0]),
-                "us_per_gait": f"{seconds(call) / LANES * 1e6:.4g}",
+                "us_per_gait": f"{measure_cpu_seconds(call) / LANES * 1e6:.4g}",
                 "ended_on_stopper": bool(guard[0] == 0),
             }
 
@@ -188,40 +192,46 @@ SWEEPS: dict[str, tuple[Callable[[float], dict], tuple[float, ...]]] = {
 
 def limits() -> Rows:
     """Outcome and error of one step of `vrw.steps` towards each limit, against isolated roots."""
-    made = events.phases()
+    created = events.phases()
     for sweep, (given, values) in SWEEPS.items():
         for value in values:
             wheel = {"damping": 200.0} | given(value)
             start = np.array([wheel.pop("start", START)])
             params = vrw.WheelParams(**{key: np.full(1, v) for key, v in wheel.items()})
-            (code,), (durations,), _ = events.isolated(made, params, start)
-            found = vrw.steps(params, start)
+            (code,), (durations,), _ = events.step_by_isolated_roots(created, params, start)
+            batch_result = vrw.step_batch(params, start)
             yield {
                 "limit": sweep,
                 "value": f"{value:.4g}",
-                "outcome": Outcome(int(found.outcome[0])).name,
+                "outcome": Outcome(int(batch_result.outcome[0])).name,
                 "isolated": Outcome(code).name,
-                "time_difference_s": f"{np.max(np.abs(found.durations[0] - durations)):.1e}",
-                "solver_steps": int(found.solver_steps[0]),
-                "solver": found.solvers[int(found.solver[0])],
+                "time_difference_s": f"{np.max(np.abs(batch_result.durations[0] - durations)):.1e}",
+                "solver_steps": int(batch_result.solver_steps[0]),
+                "solver": batch_result.solver_names[int(batch_result.solver_index[0])],
                 "durations": " ".join(f"{d:.3g}" for d in durations),
             }
 
 
 # --- The gait slows down before it stops: step time to infinity.
 
-SLOW = {"damping": 100.0}
-WALKS, STANDS = 0.12, 0.02  # slopes, rad
+SLOW_WALK_PARAMETERS = {"damping": 100.0}
+WALKS, STANDING_SLOPE = 0.12, 0.02  # slopes, rad
 SETTLING = 12  # steps: neighbours' gaits are near, and multipliers small
-PATIENCE = 200.0  # s of double support
-BEYOND = np.logspace(-1.5, -11.0, 20)  # slope less the one at which the gait stops, rad
+MAX_DOUBLE_SUPPORT_SECONDS = 200.0  # s of double support
+SLOPE_DISTANCES = np.logspace(-1.5, -11.0, 20)  # slope less the one at which the gait stops, rad
 
 
-def settled(made: tuple, slope: float, start: np.ndarray) -> tuple[bool, np.ndarray, np.ndarray]:
+def settle_walk(
+    created: tuple, slope: float, start: np.ndarray
+) -> tuple[bool, np.ndarray, np.ndarray]:
     """Whether the wheel walks on from a start, then its section state and durations."""
-    params = vrw.WheelParams(damping=np.full(1, SLOW["damping"]), slope=np.full(1, slope))
+    params = vrw.WheelParams(
+        damping=np.full(1, SLOW_WALK_PARAMETERS["damping"]), slope=np.full(1, slope)
+    )
     for _ in range(SETTLING):
-        (code,), (durations,), (start,) = events.isolated(made, params, start[None])
+        (code,), (durations,), (start,) = events.step_by_isolated_roots(
+            created, params, start[None]
+        )
         if code != Outcome.STEPPED:
             return False, start, durations
     return True, start, durations
@@ -229,39 +239,39 @@ def settled(made: tuple, slope: float, start: np.ndarray) -> tuple[bool, np.ndar
 
 def upright_rate(slope: float, start: np.ndarray) -> float:
     """Rate at which double support leaves its upright equilibrium, 1/s; NaN without one."""
-    s = vrw.WheelParams(**SLOW, slope=slope).symbols()
+    s = vrw.WheelParams(**SLOW_WALK_PARAMETERS, slope=slope).symbols()
     landing = transitions.land(s, *start)
-    double_support = phases_of(s, landing.distance, stop_at_lift_off=True)[0]
-    field = flow_of(double_support, monitored=False).field
+    double_support = make_phases(s, landing.distance, stop_at_lift_off=True)[0]
+    field = make_diffrax_phase(double_support, records_margins=False).vector_field
     push = jax.jit(lambda theta: field(jnp.stack([theta, 0.0 * theta]))[1])
     places = float(landing.theta) + np.linspace(0.0, 1.0, 2001)
     rises = np.diff(np.sign(np.asarray(jax.vmap(push)(jnp.asarray(places))))) > 0
     if not np.any(rises):
         return np.nan
-    at = places[np.flatnonzero(rises)[0]]
+    value_at = places[np.flatnonzero(rises)[0]]
     for _ in range(5):
-        at = at - push(at) / jax.grad(push)(at)
-    matrix = np.asarray(jax.jacfwd(field)(jnp.stack([at, 0.0 * at])))
+        value_at = value_at - push(value_at) / jax.grad(push)(value_at)
+    matrix = np.asarray(jax.jacfwd(field)(jnp.stack([value_at, 0.0 * value_at])))
     return float(np.max(np.linalg.eigvals(matrix).real))
 
 
 def slowing() -> Rows:
     """Period of the gait towards the slope at which it stops, and who still finds the gait."""
-    made = events.phases()
-    made[0].limit = PATIENCE
-    walks, start, _ = settled(made, WALKS, START * [1.0, 0.6, 0.5])
+    created = events.phases()
+    created[0].limit = MAX_DOUBLE_SUPPORT_SECONDS
+    walks, start, _ = settle_walk(created, WALKS, START * [1.0, 0.6, 0.5])
     assert walks
-    low, high, near = STANDS, WALKS, start
+    low, high, near = STANDING_SLOPE, WALKS, start
     while high - low > 2.0 * np.spacing(high):
         middle = 0.5 * (low + high)
-        walks, end, _ = settled(made, middle, near)
+        walks, end, _ = settle_walk(created, middle, near)
         low, high, near = (low, middle, end) if walks else (middle, high, near)
-    at = lambda slope: vrw.WheelParams(**SLOW, slope=slope)
+    value_at = lambda slope: vrw.WheelParams(**SLOW_WALK_PARAMETERS, slope=slope)
     meshes = {"default": vrw.CycleOptions(), "tight": vrw.CycleOptions.tight()}
-    guess = {name: vrw.limit_cycle(at(WALKS), options=mesh) for name, mesh in meshes.items()}
-    for distance in BEYOND:
+    guess = {name: vrw.limit_cycle(value_at(WALKS), options=mesh) for name, mesh in meshes.items()}
+    for distance in SLOPE_DISTANCES:
         slope = high + distance
-        _, start, durations = settled(made, slope, start)
+        _, start, durations = settle_walk(created, slope, start)
         row: dict[str, object] = {
             "slope": f"{slope:.12g}",
             "distance": f"{distance:.2e}",
@@ -270,17 +280,21 @@ def slowing() -> Rows:
             "upright_rate": f"{upright_rate(slope, start):.9g}",
         }
         for name, options in meshes.items():
-            cycle = vrw.limit_cycle(at(slope), guess=guess[name], options=options)
-            found = bool(cycle.found)
-            guess[name] = cycle if found else guess[name]
+            cycle = vrw.limit_cycle(value_at(slope), guess=guess[name], options=options)
+            solution = bool(cycle.found)
+            guess[name] = cycle if solution else guess[name]
             gap = np.max(np.abs(np.asarray(cycle.section_state) - start))
             missed = abs(float(cycle.period) - durations.sum()) / durations.sum()
             row |= {
-                f"{name}_found": found,
-                f"{name}_state_error": f"{gap:.1e}" if found else "nan",
-                f"{name}_period_error": f"{missed:.1e}" if found else "nan",
+                f"{name}_found": solution,
+                f"{name}_state_error": f"{gap:.1e}" if solution else "nan",
+                f"{name}_period_error": f"{missed:.1e}" if solution else "nan",
             }
-        step = vrw.step(at(slope), start, options=vrw.Options(max_phase_time=PATIENCE))
+        step = vrw.step(
+            value_at(slope),
+            start,
+            options=vrw.StepOptions(max_phase_time=MAX_DOUBLE_SUPPORT_SECONDS),
+        )
         missed = abs(float(np.sum(step.durations)) - durations.sum()) / durations.sum()
         yield row | {"step": Outcome(int(step.outcome)).name, "step_period_error": f"{missed:.1e}"}
 
@@ -297,50 +311,50 @@ def between() -> Rows:
     Segments between random wheels and starts of other outcomes are halved by isolated roots until
     the border is known to the last digits; then both sides are asked at some distances.
     """
-    made = events.phases()
+    created = events.phases()
     names = [name for name in events.KINDS["anywhere"] if name != "start"]
 
     def asked(points: np.ndarray) -> tuple[vrw.WheelParams, np.ndarray]:
         return vrw.WheelParams(**dict(zip(names, points.T, strict=False))), points[:, len(names) :]
 
     for kind, box in events.KINDS.items():
-        params, starts = events.drawn(box, np.random.default_rng(11))
+        params, starts = events.draw_wheels(box, np.random.default_rng(11))
         points = np.column_stack([*(np.asarray(getattr(params, n)) for n in names), starts])
         points = points[: 2 * SEGMENTS]
         ends = points[::2].copy(), points[1::2].copy()
-        codes = tuple(events.isolated(made, *asked(side))[0] for side in ends)
+        codes = tuple(events.step_by_isolated_roots(created, *asked(side))[0] for side in ends)
         differ = codes[0] != codes[1]
         low, high = (side[differ] for side in ends)
         codes_low, codes_high = (code[differ].copy() for code in codes)
         segment = high - low
         for _ in range(HALVINGS):
             middle = 0.5 * (low + high)
-            told, *_ = events.isolated(made, *asked(middle))
-            same = told == codes_low
-            low[same], high[~same] = middle[same], middle[~same]
-            codes_high[~same] = told[~same]
+            result, *_ = events.step_by_isolated_roots(created, *asked(middle))
+            is_same = result == codes_low
+            low[is_same], high[~is_same] = middle[is_same], middle[~is_same]
+            codes_high[~is_same] = result[~is_same]
         for distance in CLOSER:
             for side, sign in ((low, -1.0), (high, 1.0)):
-                there = side + sign * distance * segment
-                told, durations, _ = events.isolated(made, *asked(there))
-                found = vrw.steps(*asked(there))
-                mine = np.asarray(found.outcome)
-                other = np.asarray(vrw.steps(*asked(there), engine="diffrax").outcome)
-                stepped = (mine == told) & (told == Outcome.STEPPED)
-                gap = np.max(np.abs(np.asarray(found.durations) - durations), 1)
+                values_there = side + sign * distance * segment
+                result, durations, _ = events.step_by_isolated_roots(created, *asked(values_there))
+                batch_result = vrw.step_batch(*asked(values_there))
+                mine = np.asarray(batch_result.outcome)
+                other = np.asarray(vrw.step_batch(*asked(values_there), engine="diffrax").outcome)
+                step_result = (mine == result) & (result == Outcome.STEPPED)
+                gap = np.max(np.abs(np.asarray(batch_result.durations) - durations), 1)
                 pairs = [
                     tuple(sorted(Outcome(code).name for code in pair))
                     for pair in zip(codes_low, codes_high, strict=True)
                 ]
                 for pair in sorted(set(pairs)):
-                    here = np.array([one == pair for one in pairs])
+                    values_array = np.array([one == pair for one in pairs])
                     yield {
                         "kind": kind,
                         "border": " | ".join(pair),
                         "distance": f"{distance:.0e}",
-                        "cases": int(here.sum()),
-                        "other_outcome": int((here & (mine != told)).sum()),
-                        "other_by_diffrax": int((here & (other != told)).sum()),
-                        "stepped": int((here & stepped).sum()),
-                        "time_difference_s": f"{np.max(gap[here & stepped], initial=0.0):.1e}",
+                        "cases": int(values_array.sum()),
+                        "other_outcome": int((values_array & (mine != result)).sum()),
+                        "other_by_diffrax": int((values_array & (other != result)).sum()),
+                        "stepped": int((values_array & step_result).sum()),
+                        "time_difference_s": f"{np.max(gap[values_array & step_result], initial=0.0):.1e}",
                     }

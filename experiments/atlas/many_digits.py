@@ -13,9 +13,9 @@ from importlib import import_module
 import mpmath
 from mpmath import mp, mpf
 
-from experiments.atlas.absolute import until
-from experiments.atlas.gaits import Exact, Return
-from experiments.shared.command import command, started
+from experiments.atlas.absolute import integrate_until
+from experiments.atlas.gaits import ExactGait, ReturnMap
+from experiments.shared.command import make_parser, parse_and_start_jax
 
 CASES = {
     "simplest_walker": ("WALKER", mpf("0.02")),
@@ -23,50 +23,55 @@ CASES = {
     "woodpecker": ("CYCLE", mpf("2e-4")),
 }
 """What each case calls its map, and a step in which no guard falls and rises again, s."""
-DIFFERENCE, NEAR = mpf("1e-8"), mpf("1e-21")
+DIFFERENCE, NEWTON_TOLERANCE = mpf("1e-8"), mpf("1e-21")
 
 
-def back(told: Return, x: Sequence[mpf], step: mpf) -> tuple[mpmath.matrix, mpf]:
+def compute_return_map(result: ReturnMap, x: Sequence[mpf], step: mpf) -> tuple[mpmath.matrix, mpf]:
     """The map, and how long it takes."""
-    y, mode, time = list(told.begin(x, mpmath)), 0, mpf(0)
-    for _ in range(told.events):
-        part = told.system[mode]
+    y, mode, time = list(result.begin(x, mpmath)), 0, mpf(0)
+    for _ in range(result.events):
+        part = result.system[mode]
         field = lambda y, part=part: part.field(y, mpmath)
-        met = [until(field, lambda y, e=e: e.value(y, mpmath), y, step) for e in part.edges[:1]]
-        time += met[0].time
+        event_rows = [
+            integrate_until(field, lambda y, e=e: e.value(y, mpmath), y, step)
+            for e in part.edges[:1]
+        ]
+        time += event_rows[0].time
         for other in part.edges[1:]:
-            assert other.value(met[0].state, mpmath) > 0
-        y, mode = list(part.edges[0].reset(met[0].state, mpmath)), part.edges[0].to
-    return mpmath.matrix(told.read(y)), time
+            assert other.value(event_rows[0].state, mpmath) > 0
+        y, mode = list(part.edges[0].reset(event_rows[0].state, mpmath)), part.edges[0].target_part
+    return mpmath.matrix(result.read(y)), time
 
 
-def slopes(told: Return, x: mpmath.matrix, step: mpf) -> mpmath.matrix:
+def compute_jacobian(result: ReturnMap, x: mpmath.matrix, step: mpf) -> mpmath.matrix:
     columns = []
     for k in range(len(x)):
         shift = mpmath.matrix([DIFFERENCE if i == k else 0 for i in range(len(x))])
-        at = lambda n, shift=shift: back(told, list(x + n * shift), step)[0]
-        columns.append((8 * (at(1) - at(-1)) - at(2) + at(-2)) / (12 * DIFFERENCE))
+        value_at = lambda n, shift=shift: compute_return_map(result, list(x + n * shift), step)[0]
+        columns.append(
+            (8 * (value_at(1) - value_at(-1)) - value_at(2) + value_at(-2)) / (12 * DIFFERENCE)
+        )
     return mpmath.matrix([[column[i] for column in columns] for i in range(len(x))])
 
 
-def gait(told: Return, step: mpf) -> Exact:
-    x = mpmath.matrix([mpf(v) for v in told.guess])
+def gait(result: ReturnMap, step: mpf) -> ExactGait:
+    x = mpmath.matrix([mpf(v) for v in result.guess])
     identity = mpmath.eye(len(x))
     while True:
-        jacobian = slopes(told, x, step)
-        there, period = back(told, list(x), step)
-        change = mpmath.lu_solve(jacobian - identity, x - there)
-        if mpmath.norm(change) < NEAR:
+        jacobian = compute_jacobian(result, x, step)
+        values_there, period = compute_return_map(result, list(x), step)
+        change = mpmath.lu_solve(jacobian - identity, x - values_there)
+        if mpmath.norm(change) < NEWTON_TOLERANCE:
             break
         x = x + change
     values = sorted(mpmath.eig(jacobian)[0], key=lambda v: (-abs(v), -v.imag))
-    return Exact(tuple(map(float, x)), float(period), tuple(map(complex, values)))
+    return ExactGait(tuple(map(float, x)), float(period), tuple(map(complex, values)))
 
 
 def main() -> None:
-    parser = command(__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--only", choices=CASES, nargs="*", default=list(CASES))
-    chosen = started(parser)
+    chosen = parse_and_start_jax(parser)
     mp.dps = 40
     for name in chosen.only:
         place, step = CASES[name]

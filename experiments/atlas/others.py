@@ -14,34 +14,34 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from experiments.atlas.told import Row, off
+from experiments.atlas.told import Row, compute_error
 
 ROOT = Path(__file__).parents[2]
 
 
 @functools.cache
-def _asked(name: str, *arguments: str) -> dict:
+def _run_peer(name: str, *arguments: str) -> dict:
     start = shlex.split(os.environ.get(f"VRW_{name.upper()}", sys.executable))
     command = [*start, "-m", f"experiments.atlas.elsewhere.{name}", *arguments]
-    own = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    run = subprocess.run(command, cwd=ROOT, env=own, capture_output=True, text=True)
+    own_values = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    run = subprocess.run(command, cwd=ROOT, env=own_values, capture_output=True, text=True)
     if run.returncode:
         return {"version": "none", "says": f"not here: {run.stderr.strip().splitlines()[-1]}"}
     return json.loads(run.stdout.splitlines()[-1])
 
 
-def rows_of(
+def make_rows(
     name: str, case: str, truths: dict[str, float], *arguments: str, relative: bool = False
 ) -> Iterator[Row]:
     """What `elsewhere/NAME` answers to a case's questions, beside their truths."""
-    told = _asked(name, *arguments)
-    answers = {a["name"]: a for a in told.get("answers", ()) if a["case"] == case}
+    result = _run_peer(name, *arguments)
+    answers = {a["name"]: a for a in result.get("answers", ()) if a["case"] == case}
     for question, truth in truths.items():
         answer = answers.get(question, {"value": math.nan, "work": 0, "seconds": 0.0})
-        found = float(answer["value"])
+        solution = float(answer["value"])
         yield Row(
-            question, name.capitalize(), found, truth, off(found, truth, relative=relative),
-            answer.get("says", told.get("says", "")), answer.get("admits", not answers),
-            answer["work"], answer["seconds"], answer.get("options", told.get("options", "none")),
-            told["version"],
+            question, name.capitalize(), solution, truth, compute_error(solution, truth, relative=relative),
+            answer.get("says", result.get("says", "")), answer.get("admits", not answers),
+            answer["work"], answer["seconds"], answer.get("options", result.get("options", "none")),
+            result["version"],
         )  # fmt: skip

@@ -21,15 +21,15 @@ from experiments.atlas import (
     walks,
 )
 from experiments.atlas.events import Rows
-from experiments.shared.command import command
-from experiments.shared.tables import FIGURES, read
-from experiments.shared.timing import on_one_core, start_cold
+from experiments.shared.command import make_parser
+from experiments.shared.tables import FIGURES, read_table
+from experiments.shared.timing import start_without_cache, use_one_core
 
 MAPS: dict[str, Callable[..., Rows]] = {
     "formulations": formulations.penalty,
     "drift": formulations.drift,
     "events": events.compare,
-    "dips": events.dips,
+    "dips": events.compare_dips,
     "between": limits.between,
     "limits": limits.limits,
     "first_order": limits.first_order,
@@ -37,11 +37,11 @@ MAPS: dict[str, Callable[..., Rows]] = {
     "borders": derivatives.borders,
     "scuffing": derivatives.scuffing,
     "growth": derivatives.growth,
-    "apart": derivatives.apart,
+    "apart": derivatives.measure_multiplier_distances,
     "meeting": derivatives.meeting,
     "modes": derivatives.modes,
     "long_walk": walks.long_walk,
-    "stiffness": stiffness.over_rates,
+    "stiffness": stiffness.measure_over_rates,
 }
 
 
@@ -49,13 +49,13 @@ GO_ON = {"events": 1, "dips": 20}
 """Maps that are filled chunk by chunk, and how many times the cases asked for they take."""
 
 
-def table_of(name: str) -> Path:
+def select_table(name: str) -> Path:
     return FIGURES / f"atlas_{name}.csv"
 
 
-def fill(name: str, rows: Rows, append: bool = False) -> None:
+def write_table(name: str, rows: Rows, append: bool = False) -> None:
     """Compute a map's table, or the rows that it lacks."""
-    with table_of(name).open("a" if append else "w", newline="") as file:
+    with select_table(name).open("a" if append else "w", newline="") as file:
         for row in rows:
             writer = csv.DictWriter(file, row)
             if not append:
@@ -67,7 +67,7 @@ def fill(name: str, rows: Rows, append: bool = False) -> None:
 
 
 def main() -> None:
-    parser = command(__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--only", choices=MAPS, help="one map")
     parser.add_argument(
         "--cases",
@@ -77,17 +77,17 @@ def main() -> None:
     )
     parser.add_argument("--redraw", action="store_true", help="compute nothing")
     chosen = parser.parse_args()
-    with on_one_core():
-        start_cold()
+    with use_one_core():
+        start_without_cache()
         for name, rows in MAPS.items():
             if chosen.redraw or chosen.only not in (None, name):
                 continue
-            kept = len(read(table_of(name))) if table_of(name).exists() else 0
+            retained = len(read_table(select_table(name))) if select_table(name).exists() else 0
             if name in GO_ON:
-                fill(name, rows(GO_ON[name] * chosen.cases, kept), append=kept > 0)
-            elif kept == 0:
-                fill(name, rows())
-    charts.draw({name: table_of(name) for name in MAPS}, stiffness.real_axis_limit)
+                write_table(name, rows(GO_ON[name] * chosen.cases, retained), append=retained > 0)
+            elif retained == 0:
+                write_table(name, rows())
+    charts.draw({name: select_table(name) for name in MAPS}, stiffness.real_axis_limit)
 
 
 if __name__ == "__main__":

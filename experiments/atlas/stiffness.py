@@ -10,7 +10,7 @@ from experiments.atlas.events import START, Rows
 from experiments.atlas.limits import light_wheel
 from experiments.speed import peers
 from vrw_jax import Outcome
-from vrw_jax.numerics import explicit_tableau, real_stability_limit
+from vrw_jax.numerics import load_explicit_tableau, real_stability_limit
 from vrw_jax.wheel import transitions
 
 STIFFNESS = np.logspace(2.0, 6.0, 9)  # c/m or k/m, 1/s or 1/s^2
@@ -36,17 +36,17 @@ def stiff_wheel(axis: str, value: float) -> dict[str, float]:
 
 def real_axis_limit(solver: str) -> float:
     """Largest z with |R(-z)| <= 1 of an explicit solver's stability polynomial."""
-    tableau = explicit_tableau(solver)
+    tableau = load_explicit_tableau(solver)
     assert tableau is not None
     return real_stability_limit(tableau)
 
 
-TURNS, SHORT, LONG = 7, 0.1, 3.0
+N_TIMING_ROUNDS, MIN_TIMING_SECONDS, MAX_TIMING_SECONDS = 7, 0.1, 3.0
 """Of timing: rounds; seconds for which a method is repeated in each (a process's clock may stand
 still for some ms); seconds of a call beyond which one is enough."""
 
 
-def over_rates() -> Rows:
+def measure_over_rates() -> Rows:
     """Cost, error and outcome of one step by every method over c/m and k/m."""
     places = [("c/m", value) for value in STIFFNESS]
     places += [("k/m", value) for value in STIFFNESS if value > HEAVIEST]
@@ -66,19 +66,19 @@ def over_rates() -> Rows:
             "numba Dopri5": peer(peers.numba_steps, TOLERANCE),
             "heyoka": peer(peers.Heyoka(TOLERANCE)),
             **{f"SciPy {name}": peer(peers.scipy_steps, TOLERANCE, name) for name in PEERS},
-            **{name: by_library(wheel, *how) for name, how in LIBRARY.items()},
+            **{name: run_library(wheel, *options_used) for name, options_used in LIBRARY.items()},
         }
         compiled = {name: read(run()) for name, (_, run, read) in runs.items()}
-        least = dict.fromkeys(runs, np.inf)
-        for _ in range(TURNS):  # in turn: a shared machine's clock changes within minutes
+        minimum = dict.fromkeys(runs, np.inf)
+        for _ in range(N_TIMING_ROUNDS):  # in turn: a shared machine's clock changes within minutes
             for name, (lanes, run, _) in runs.items():
-                if LONG < least[name] * lanes < np.inf:
+                if MAX_TIMING_SECONDS < minimum[name] * lanes < np.inf:
                     continue
-                begin, spent, calls = time.process_time(), 0.0, 0
-                while spent < SHORT:
+                begin, spent_seconds, calls = time.process_time(), 0.0, 0
+                while spent_seconds < MIN_TIMING_SECONDS:
                     run()
-                    spent, calls = time.process_time() - begin, calls + 1
-                least[name] = min(least[name], spent / calls / lanes)
+                    spent_seconds, calls = time.process_time() - begin, calls + 1
+                minimum[name] = min(minimum[name], spent_seconds / calls / lanes)
         for name, (values, work, outcome, solver) in compiled.items():
             good = np.all(np.isfinite(values))
             yield {
@@ -86,24 +86,27 @@ def over_rates() -> Rows:
                 "value": f"{value:.4g}",
                 "method": name,
                 "solver": solver,  # that `vrw.steps` took
-                "us_per_gait": f"{least[name] * 1e6:.4g}",
+                "us_per_gait": f"{minimum[name] * 1e6:.4g}",
                 "work": f"{work:.0f}",  # evaluations of peers, tried steps of the library
                 "error": f"{np.max(np.abs(values - truth)):.2e}",
-                "outcome": (outcome if good else Outcome.SOLVER_GAVE_UP).name,
+                "outcome": (outcome if good else Outcome.SOLVER_FAILED).name,
                 "duration_sls1": f"{truth[4]:.6g}",
             }
 
 
-def by_library(wheel: dict[str, float], engine: str, solver: str) -> tuple:
+def run_library(wheel: dict[str, float], engine: str, solver: str) -> tuple:
     """Lanes in a call, the call, and what it tells: values, tried steps, outcome, solver."""
-    options = vrw.Options(solver=solver, rtol=TOLERANCE, atol=TOLERANCE)
+    options = vrw.StepOptions(solver=solver, rtol=TOLERANCE, atol=TOLERANCE)
     lanes = 256 if engine == "diffrax" else 2048  # full blocks
     params, starts = vrw.WheelParams(**wheel), np.tile(START, (lanes, 1))
-    run = lambda: vrw.steps(params, starts, options=options, engine=engine)
+    run = lambda: vrw.step_batch(params, starts, options=options, engine=engine)
 
-    def read(told: vrw.Steps) -> tuple:
-        values = np.concatenate([told.section_state[0], told.durations[0]])
-        outcome, solver = Outcome(int(told.outcome[0])), told.solvers[int(told.solver[0])]
-        return values, int(told.solver_steps[0]), outcome, solver
+    def read(result: vrw.StepBatchResult) -> tuple:
+        values = np.concatenate([result.section_state[0], result.durations[0]])
+        outcome, solver = (
+            Outcome(int(result.outcome[0])),
+            result.solver_names[int(result.solver_index[0])],
+        )
+        return values, int(result.solver_steps[0]), outcome, solver
 
     return lanes, run, read

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from matplotlib.figure import Figure
 
-RIGHT, EXACT, OVER = 1e-9, 1e-12, 100.0
+ACCEPTED_ERROR, EXACT_ERROR, TOLERANCE_EXCESS_FACTOR = 1e-9, 1e-12, 100.0
 """An error that counts as right at all; what is asked of a closed form times the problem's own
 condition; over the tolerance that a method was asked for: see `Row.within`."""
 
@@ -31,20 +31,25 @@ class Row(NamedTuple):
     digits: int | None = None  # of a published truth; None: a closed form, or all digits
 
     @property
-    def asked(self) -> float:
+    def requested_tolerance(self) -> float:
         """The tolerance among the method's options, 0 without one."""
-        told = re.search(r"\d\S*e-\d+", self.options)
-        return float(told[0].rstrip(",")) if told else 0.0
+        result = re.search(r"\d\S*e-\d+", self.options)
+        return float(result[0].rstrip(",")) if result else 0.0
 
     @property
-    def within(self) -> float:
+    def is_within_request(self) -> float:
         """The error that counts as right, by one rule for all."""
         published = 0.0 if self.digits is None else 0.5 * 10.0**-self.digits
-        return max(RIGHT, EXACT * self.condition, OVER * self.asked, published)
+        return max(
+            ACCEPTED_ERROR,
+            EXACT_ERROR * self.condition,
+            TOLERANCE_EXCESS_FACTOR * self.requested_tolerance,
+            published,
+        )
 
     @property
     def verdict(self) -> str:
-        if self.error <= self.within:
+        if self.error <= self.is_within_request:
             return "right"
         return "says so" if self.admits else "WRONG, silently"
 
@@ -60,15 +65,15 @@ class Case(NamedTuple):
     draw: Callable[[Figure, list[dict[str, str]]], None]
 
 
-def off(found: float, truth: float, *, relative: bool = False) -> float:
+def compute_error(solution: float, truth: float, *, relative: bool = False) -> float:
     """Error; infinite where nothing was found."""
-    gap = abs(found - truth) / (abs(truth) if relative else 1.0)
+    gap = abs(solution - truth) / (abs(truth) if relative else 1.0)
     return gap if math.isfinite(gap) else math.inf
 
 
-def timed(call: Callable[[], Any]) -> tuple[Any, float]:
+def time_second_call(call: Callable[[], Any]) -> tuple[Any, float]:
     """What a second call gives, and its CPU seconds: compiling does not count."""
     call()
     began = time.process_time()
-    told = call()
-    return told, time.process_time() - began
+    result = call()
+    return result, time.process_time() - began

@@ -10,19 +10,19 @@ import numpy as np
 
 import vrw_jax as vrw
 from vrw_jax import Outcome
-from vrw_jax.models.viscoelastic import Flow, flow_of
-from vrw_jax.numerics import PhaseEnd, Watched, integrate_phase
-from vrw_jax.wheel import Motion, dynamics, phases_of, transitions
+from vrw_jax.models.viscoelastic import DiffraxPhase, make_diffrax_phase
+from vrw_jax.numerics import MonitoredFunctions, PhaseEnd, integrate_phase
+from vrw_jax.wheel import Motion, dynamics, make_phases, transitions
 
 ORACLE = Path(__file__).parents[2] / "tests" / "oracle"
 BLOCK = 1000
-WALKED = (1000, 2000, 5000, 10_000, 20_000, 50_000, 100_000)
+WALKED_STEP_COUNTS = (1000, 2000, 5000, 10_000, 20_000, 50_000, 100_000)
 WALKS = {(1e-6, 1e-8, 1e-13): 10_000, (1e-10,): 100_000}
 """Steps by tolerances that walk side by side; 1e-10 is the default, 1e-13 `Options.tight()`."""
 
 
 def with_damping(
-    phase: Flow, start: jax.Array, params: vrw.WheelParams, options: vrw.Options
+    phase: DiffraxPhase, start: jax.Array, params: vrw.WheelParams, options: vrw.StepOptions
 ) -> tuple[PhaseEnd, jax.Array, Motion]:
     """A phase of the library, the energy that its dampers take (J, eq. 29), and its last motion.
 
@@ -30,8 +30,8 @@ def with_damping(
     """
     s = params.symbols()
     power = lambda y: dynamics.damping_power(s, phase.motion(y))
-    field = lambda y: jnp.append(phase.field(y[:-1]), power(y[:-1]))
-    watched = Watched(lambda y: phase.watched.values(y[:-1]), phase.watched.n_guards)
+    field = lambda y: jnp.append(phase.vector_field(y[:-1]), power(y[:-1]))
+    watched = MonitoredFunctions(lambda y: phase.guards.values(y[:-1]), phase.guards.n_guards)
     zero = 0.0 * start[:1]
     end = integrate_phase(
         field, watched, jnp.concatenate([start, zero]), jnp.asarray(True), options
@@ -39,7 +39,7 @@ def with_damping(
     return end, end.state[-1], phase.motion(end.state[:-1])
 
 
-def accounted_step(params: vrw.WheelParams, x: jax.Array, options: vrw.Options) -> tuple:
+def accounted_step(params: vrw.WheelParams, x: jax.Array, options: vrw.StepOptions) -> tuple:
     """Next section state; whether it stepped; duration, gravity's work and energy not accounted.
 
     Energy before the landing + gravity's work from foot to foot - what both impacts and the
@@ -48,8 +48,8 @@ def accounted_step(params: vrw.WheelParams, x: jax.Array, options: vrw.Options) 
     s = params.symbols()
     before = transitions.motion_before_landing(s, *x)
     landing = transitions.land(s, *x)
-    phases = phases_of(s, landing.distance, stop_at_lift_off=True)
-    dls, sls1, sls2 = (flow_of(phase, monitored=False) for phase in phases)
+    phases = make_phases(s, landing.distance, stop_at_lift_off=True)
+    dls, sls1, sls2 = (make_diffrax_phase(phase, records_margins=False) for phase in phases)
     start = jnp.stack([landing.theta, landing.motion.dtheta])
     first, lost_1, m = with_damping(dls, start, params, options)
     start = jnp.stack([first.state[0], m.L1, m.L2, m.dtheta, m.dL1, m.dL2])
@@ -58,14 +58,14 @@ def accounted_step(params: vrw.WheelParams, x: jax.Array, options: vrw.Options) 
     start = jnp.stack([second.state[0], hit.motion.L1, hit.motion.dtheta, hit.motion.dL1])
     third, lost_3, m = with_damping(sls2, start, params, options)
     ends = first, second, third
-    outcomes = [p.outcome(e.guard, e.timed_out) for p, e in zip(phases, ends, strict=True)]
-    stepped = jnp.all(jnp.stack(outcomes) == Outcome.STEPPED)
+    outcomes = [p.outcome_of_guard(e.guard, e.timed_out) for p, e in zip(phases, ends, strict=True)]
+    step_result = jnp.all(jnp.stack(outcomes) == Outcome.STEPPED)
     theta, _, dtheta, dL1, _ = third.state
     work = (s.Mt) * s.g * landing.distance * s.sin_phi
-    lost = landing.energy_lost + hit.energy_lost + lost_1 + lost_2 + lost_3
-    change = dynamics.energy(s, m).total - dynamics.energy(s, before).total
+    lost_values = landing.energy_lost + hit.energy_lost + lost_1 + lost_2 + lost_3
+    change = dynamics.mechanical_energy(s, m).total - dynamics.mechanical_energy(s, before).total
     duration = first.duration + second.duration + third.duration
-    return jnp.stack([theta, dtheta, dL1]), stepped, duration, work, work - lost - change
+    return jnp.stack([theta, dtheta, dL1]), step_result, duration, work, work - lost_values - change
 
 
 def long_walk() -> Iterator[dict[str, object]]:
@@ -76,11 +76,11 @@ def long_walk() -> Iterator[dict[str, object]]:
     params = vrw.WheelParams()
 
     def walk(x: jax.Array, tolerance: jax.Array) -> tuple:
-        options = vrw.Options(rtol=tolerance, atol=tolerance)
+        options = vrw.StepOptions(rtol=tolerance, atol=tolerance)
 
         def one(x: jax.Array, _: None) -> tuple:
-            x, *told = accounted_step(params, x, options)
-            return x, told
+            x, *result = accounted_step(params, x, options)
+            return x, result
 
         return jax.lax.scan(one, x, None, length=BLOCK)
 
@@ -89,12 +89,12 @@ def long_walk() -> Iterator[dict[str, object]]:
         x = jnp.tile(first, (len(tolerances), 1))
         failed, largest, clock, work, rest = np.zeros((5, len(tolerances)))
         for count in range(BLOCK, length + 1, BLOCK):
-            x, (stepped, durations, works, rests) = block(x, jnp.asarray(tolerances))
-            failed += np.sum(~np.asarray(stepped), 1)
+            x, (step_result, durations, works, rests) = block(x, jnp.asarray(tolerances))
+            failed += np.sum(~np.asarray(step_result), 1)
             distance = np.max(np.abs(np.asarray(x) - first), 1)
             largest, clock = np.maximum(largest, distance), clock + np.sum(durations, 1)
             work, rest = work + np.sum(works, 1), rest + np.sum(rests, 1)
-            for i, tolerance in enumerate(tolerances if count in WALKED else ()):
+            for i, tolerance in enumerate(tolerances if count in WALKED_STEP_COUNTS else ()):
                 yield {
                     "tolerance": f"{tolerance:.0e}",
                     "steps": count,

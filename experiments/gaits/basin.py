@@ -9,10 +9,10 @@ Starts differ in θ̇⁻ and L̇1⁻ just before touchdown; θ⁻ is that of the
 import numpy as np
 
 import vrw_jax as vrw
-from experiments.shared.command import started_with_folder
+from experiments.shared.command import parse_folder_and_start_jax
 from vrw_jax import figures as plots
-from vrw_jax.figures.style import value_label
-from vrw_jax.walks.basins import share
+from vrw_jax.figures.style import format_value_label
+from vrw_jax.walks.basins import compute_end_shares
 
 DAMPINGS = (100.0, 200.0)  # N s/m
 RATES = np.linspace(0.4, 3.2, 57)  # rad/s
@@ -20,7 +20,7 @@ LEG_RATES = np.linspace(-1.0, 0.6, 49)  # m/s
 
 
 def main() -> None:
-    folder = started_with_folder(__doc__)
+    folder = parse_folder_and_start_jax(__doc__)
     results, titles = [], []
     for damping in DAMPINGS:
         params = vrw.WheelParams(damping=damping)
@@ -29,11 +29,14 @@ def main() -> None:
         grid = {
             "theta_touchdown": theta, "dtheta_touchdown": RATES, "dL1_touchdown": LEG_RATES,
         }  # fmt: skip
-        result = vrw.basin(params, grid, options=vrw.Options(rtol=1e-9, atol=1e-9))
+        result = vrw.basin(params, grid, options=vrw.StepOptions(rtol=1e-9, atol=1e-9))
         results.append(result)
-        shown = value_label("damping", damping), value_label("theta_touchdown", theta)
-        titles.append(", ".join(shown))
-        print(damping, share(result), "periods", result.orbit_period.values)
+        shown_values = (
+            format_value_label("damping", damping),
+            format_value_label("theta_touchdown", theta),
+        )
+        titles.append(", ".join(shown_values))
+        print(damping, compute_end_shares(result), "periods", result.orbit_period.values)
     plots.save(plots.basin_figure(results, titles), folder, "basin")
 
 

@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import vrw_jax as vrw
-from experiments.shared.command import command, started
+from experiments.shared.command import make_parser, parse_and_start_jax
 from vrw_jax.cycles import search, surface
-from vrw_jax.numerics import in_blocks
-from vrw_jax.wheel import PARAMETER_NAMES, parameters_of, wheel_of
+from vrw_jax.numerics import make_blockwise
+from vrw_jax.wheel import PARAMETER_NAMES, stack_parameters, wheel_from_parameters
 
 BOX = {
     "damping": (15.0, 219.0),
@@ -30,58 +30,62 @@ GAIT_OF_TABLE_1 = ((-0.6827, 1.0492), (0.4343, 0.3330, 0.0497))
 TARGET = Path(surface.__file__).with_name("surface.npz")
 
 
-def reached_by_continuation(problem: search.Problem, parameters: jax.Array) -> object:
+def reached_by_continuation(problem: search.CollocationSystem, parameters: jax.Array) -> object:
     """Gaits found by moving the parameters from Table 1 in small stages."""
 
-    def continued(parameters: jax.Array) -> search.Finding:
+    def continued(parameters: jax.Array) -> search.SearchResult:
         lanes = parameters.shape[-1:]
-        home = parameters_of(vrw.WheelParams())[:, None]
+        home = stack_parameters(vrw.WheelParams())[:, None]
         section, durations = (
             jnp.broadcast_to(jnp.asarray(x)[:, None], (len(x), *lanes)) for x in GAIT_OF_TABLE_1
         )
-        start = search.start_from(problem, section, durations, jnp.ones(lanes, bool))
+        start = search.make_start(problem, section, durations, jnp.ones(lanes, bool))
         home = jnp.broadcast_to(home, parameters.shape)
         stages = jnp.int32(N_STAGES)
         pending = jnp.ones(lanes, bool)
-        limit = problem.options.iterations
-        return search.newton(problem, parameters, start, home, stages, limit, pending)
+        limit = problem.options.max_newton_iterations
+        return search.run_newton(problem, parameters, start, home, stages, limit, pending)
 
-    return jax.jit(in_blocks(continued, 64))(parameters)
+    return jax.jit(make_blockwise(continued, 64))(parameters)
 
 
 def main() -> None:
-    started(command(__doc__))
-    steps = tuple(mesh.n_steps for mesh in surface.MESHES)
-    options = dataclasses.replace(vrw.CycleOptions(), iterations=20, steps=steps)
-    problem = search.Problem(8, 1, options)
+    parse_and_start_jax(make_parser(__doc__))
+    steps = tuple(mesh.n_intervals for mesh in surface.SURFACE_MESHES)
+    options = dataclasses.replace(
+        vrw.CycleOptions(), max_newton_iterations=20, mesh_intervals=steps
+    )
+    problem = search.CollocationSystem(8, 1, options)
     table_1 = vrw.WheelParams()
-    parameters = np.tile(np.asarray(parameters_of(table_1))[:, None], (1, N_WHEELS))
+    parameters = np.tile(np.asarray(stack_parameters(table_1))[:, None], (1, N_WHEELS))
     generator = np.random.default_rng(SEED)
     for name, (low, high) in BOX.items():
         parameters[PARAMETER_NAMES.index(name)] = generator.uniform(low, high, N_WHEELS)
     finding = reached_by_continuation(problem, jnp.asarray(parameters))
-    found = np.asarray(finding.located.found) > 0.5
+    solution_values = np.asarray(finding.located.found) > 0.5
     solution = finding.located.solution
-    unit = float(surface.pace(table_1))  # L0 is 1 m
+    unit = float(surface.time_unit(table_1))  # L0 is 1 m
     rows = [solution.section[0], solution.section[1] * unit, *(solution.durations[0] / unit)]
     for block in solution.accelerations:
         rows.extend(np.asarray(block).reshape(-1, N_WHEELS) * unit**2)
-    unknowns = np.stack([np.asarray(row) for row in rows])[:, found]
+    unknowns = np.stack([np.asarray(row) for row in rows])[:, solution_values]
 
-    wheels = wheel_of(jnp.asarray(parameters[:, found]), 8)
-    places = np.stack([np.asarray(x) for x in surface.coordinates(wheels)])
+    wheels = wheel_from_parameters(jnp.asarray(parameters[:, solution_values]), 8)
+    places = np.stack([np.asarray(x) for x in surface.surface_coordinates(wheels)])
     centre, spread = places.mean(1), places.std(1)
     features = np.stack(
         [
             np.asarray(x)
-            for x in surface.monomials(tuple((places - centre[:, None]) / spread[:, None]))
+            for x in surface.evaluate_monomials(tuple((places - centre[:, None]) / spread[:, None]))
         ]
     )
     fitted, checked = (np.arange(features.shape[1]) % 2 == k for k in (0, 1))
     fit = functools.partial(np.linalg.lstsq, rcond=None)
     half = fit(features[:, fitted].T, unknowns[:, fitted].T)[0]
     error = np.abs(half.T @ features[:, checked] - unknowns[:, checked])
-    print(f"{found.sum()} gaits of {N_WHEELS} wheels; errors on those left out, 99th percentile:")
+    print(
+        f"{solution_values.sum()} gaits of {N_WHEELS} wheels; errors on those left out, 99th percentile:"
+    )
     print("  theta+, dtheta+, durations:", np.quantile(error[:5], 0.99, axis=1).round(4))
     np.savez(
         TARGET,

@@ -14,11 +14,16 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 import vrw_jax as vrw
-from experiments.shared.command import command, started
+from experiments.shared.command import make_parser, parse_and_start_jax
 from vrw_jax import figures as plots
-from vrw_jax.figures.branch import BORDER, ENDS
-from vrw_jax.figures.style import axis_label, draw_marks
-from vrw_jax.walks.attractors import Settled, distinct, orbit_measures, settle
+from vrw_jax.figures.branch import BRANCH_END_COLOR, SPECIAL_POINT_LINE_STYLE
+from vrw_jax.figures.style import draw_marks, format_axis_label
+from vrw_jax.walks.attractors import (
+    WalkEnds,
+    find_distinct_orbits,
+    measure_orbits,
+    walk_until_periodic,
+)
 
 DAMPINGS = np.round(np.arange(215.0, 225.001, 0.1), 3)  # N s/m
 N_STARTS = 12
@@ -35,14 +40,14 @@ def starts() -> np.ndarray:
 
 
 def main() -> None:
-    parser = command(__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("folder", type=Path, nargs="?", default="results")
     parser.add_argument("--redraw", action="store_true", help="walk nothing: draw the table there")
-    chosen = started(parser)
+    chosen = parse_and_start_jax(parser)
     if not chosen.redraw:
-        compute().to_csv(made(chosen.folder) / TABLE, index=False, float_format="%.7g")
+        compute().to_csv(create_folder(chosen.folder) / TABLE, index=False, float_format="%.7g")
     table = pd.read_csv(chosen.folder / TABLE)
-    border = vrw.continue_branch(vrw.WheelParams(), "damping", (190.0, 230.0)).borders[-1]
+    border = vrw.continue_branch(vrw.WheelParams(), "damping", (190.0, 230.0)).special_points[-1]
     figure = orbit_figure(table.to_xarray(), border.value)
     plots.save(figure, chosen.folder, "orbit_diagram")
 
@@ -56,13 +61,19 @@ def orbit_figure(orbits: xr.Dataset, border: float) -> Figure:
     """
     value = orbits.damping.values
     lifts, scuffs = orbits.duration_dls.values == 0.0, orbits.clearance.values < 0.0
-    figure = Figure(figsize=(plots.PAGE, 3.9))
+    figure = Figure(figsize=(plots.PAGE_WIDTH_INCHES, 3.9))
     rates, periods = figure.subplots(2, 1, sharex=True, height_ratios=[2.2, 1.0])
     groups = (
-        (~lifts & ~scuffs, "o", plots.LEG_1, plots.LEG_1, "with DLS"),
-        (~lifts & scuffs, "o", plots.LEG_1, "white", "with DLS, foot 2 scuffs"),
-        (lifts, "x", plots.LEG_2, plots.LEG_2, "rear foot lifts at once ($\\lambda_4^+ < 0$)"),
-        (lifts & scuffs, "o", plots.LEG_2, "none", "the same, foot 2 scuffs"),
+        (~lifts & ~scuffs, "o", plots.LEG_1_COLOR, plots.LEG_1_COLOR, "with DLS"),
+        (~lifts & scuffs, "o", plots.LEG_1_COLOR, "white", "with DLS, foot 2 scuffs"),
+        (
+            lifts,
+            "x",
+            plots.LEG_2_COLOR,
+            plots.LEG_2_COLOR,
+            "rear foot lifts at once ($\\lambda_4^+ < 0$)",
+        ),
+        (lifts & scuffs, "o", plots.LEG_2_COLOR, "none", "the same, foot 2 scuffs"),
     )
     for chosen, marker, colour, fill, text in groups:
         if chosen.any():
@@ -71,20 +82,26 @@ def orbit_figure(orbits: xr.Dataset, border: float) -> Figure:
             draw_marks(rates, x, y, marker, colour, fill, markersize=size, label=text)
     periods.plot(value, orbits.period.values, "s", color="black", markersize=2.0)
     for axes in (rates, periods):
-        axes.axvline(border, color=ENDS, linewidth=0.7, linestyle=BORDER, zorder=0)
-        for left, right in _empty_stretches(orbits):
-            axes.axvspan(left, right, color=plots.LIGHT, linewidth=0.0, zorder=0)
-    for left, right in _empty_stretches(orbits)[-1:]:
-        rates.text(0.5 * (left + right), 0.5, "falls", rotation=90, ha="center", va="center",
-                   transform=rates.get_xaxis_transform(), color=plots.GREY)  # fmt: skip
-    rates.text(border, 0.4, " $\\lambda_4^+ = 0$", color=ENDS,
+        axes.axvline(
+            border,
+            color=BRANCH_END_COLOR,
+            linewidth=0.7,
+            linestyle=SPECIAL_POINT_LINE_STYLE,
+            zorder=0,
+        )
+        for left_part, right in _empty_stretches(orbits):
+            axes.axvspan(left_part, right, color=plots.LIGHT_GRAY, linewidth=0.0, zorder=0)
+    for left_part, right in _empty_stretches(orbits)[-1:]:
+        rates.text(0.5 * (left_part + right), 0.5, "falls", rotation=90, ha="center", va="center",
+                   transform=rates.get_xaxis_transform(), color=plots.DARK_GRAY)  # fmt: skip
+    rates.text(border, 0.4, " $\\lambda_4^+ = 0$", color=BRANCH_END_COLOR,
                transform=rates.get_xaxis_transform())  # fmt: skip
     rates.set_ylabel("rate after landing, $\\dot\\theta^+$ [rad/s]")
     rates.legend(loc="lower left", fontsize=7.5)
     periods.set_ylabel("period [steps]")
     periods.set_ylim(0.0, 1.0 + float(orbits.period.max()))
     periods.yaxis.get_major_locator().set_params(integer=True)
-    periods.set_xlabel(axis_label("damping"))
+    periods.set_xlabel(format_axis_label("damping"))
     return figure
 
 
@@ -97,7 +114,7 @@ def _empty_stretches(orbits: xr.Dataset) -> list[tuple[float, float]]:
     return [(DAMPINGS[part[0]] - half, DAMPINGS[part[-1]] + half) for part in parts]
 
 
-def made(folder: Path) -> Path:
+def create_folder(folder: Path) -> Path:
     """The folder, there at the latest now."""
     folder.mkdir(parents=True, exist_ok=True)
     return folder
@@ -106,9 +123,9 @@ def made(folder: Path) -> Path:
 def compute() -> pd.DataFrame:
     """Every step of every orbit that attracts, at each damping."""
     model = vrw.ViscoelasticWheel(stop_at_lift_off=False)  # λ2 < 0 is told, not a fall
-    options = vrw.Options(rtol=1e-9, atol=1e-9)
+    options = vrw.StepOptions(rtol=1e-9, atol=1e-9)
     dampings = np.repeat(DAMPINGS, N_STARTS)
-    walked = settle(
+    walk_result = walk_until_periodic(
         vrw.WheelParams(damping=dampings),
         np.tile(starts(), (len(DAMPINGS), 1)),
         model,
@@ -118,26 +135,26 @@ def compute() -> pd.DataFrame:
     )
     rows = []
     for damping in DAMPINGS:
-        here = Settled(*(part[dampings == damping] for part in walked))
-        fell = [vrw.Outcome(int(c)).name for c in here.outcome if c != vrw.Outcome.STEPPED]
-        orbits = distinct(here)
+        values_here = WalkEnds(*(part[dampings == damping] for part in walk_result))
+        fell = [vrw.Outcome(int(c)).name for c in values_here.outcome if c != vrw.Outcome.STEPPED]
+        orbits = find_distinct_orbits(values_here)
         for index, orbit in enumerate(orbits.orbits):
-            told = orbit_measures(vrw.WheelParams(damping=damping), orbit, model, options)
+            result = measure_orbits(vrw.WheelParams(damping=damping), orbit, model, options)
             for k in range(len(orbit)):
-                broken = [name for name in PREMISES if told[name][k].min() < 0.0]
+                broken = [name for name in PREMISES if result[name][k].min() < 0.0]
                 rows.append(
                     {
                         "damping": damping,
                         "orbit": index,
                         "period": len(orbit),
                         "step": k,
-                        "theta_post_impact": told["theta_post_impact"][k],
-                        "dtheta_post_impact": told["dtheta_post_impact"][k],
-                        "duration_dls": told["duration_dls"][k],
-                        "lambda_4_plus": told["lambda_4_plus"][k],
-                        "clearance": min(told[name][k] for name in PREMISES[:2]),
+                        "theta_post_impact": result["theta_post_impact"][k],
+                        "dtheta_post_impact": result["dtheta_post_impact"][k],
+                        "duration_dls": result["duration_dls"][k],
+                        "lambda_4_plus": result["lambda_4_plus"][k],
+                        "clearance": min(result[name][k] for name in PREMISES[:2]),
                         "broken": " ".join(broken),
-                        "share_of_starts": np.mean(orbits.of_start == index),
+                        "share_of_starts": np.mean(orbits.orbit_index == index),
                     }
                 )
         print(damping, sorted({len(o) for o in orbits.orbits}), {n: fell.count(n) for n in fell})

@@ -12,8 +12,8 @@ import math
 import numpy as np
 
 import vrw_jax as vrw
-from experiments.shared.command import command, started
-from experiments.shared.tables import FIGURES, write
+from experiments.shared.command import make_parser, parse_and_start_jax
+from experiments.shared.tables import FIGURES, write_table
 
 DAMPING, FRICTION = (1.0, 2.0, 4.0), (5.0, 8.0, 15.0, 100.0, 1e6, math.inf)
 STARTS = np.array(
@@ -25,27 +25,29 @@ HEADER = ("damping", "friction", "starts", "left", "period_s", "period_spread_s"
 
 
 def main() -> None:
-    started(command(__doc__))
-    rows, options = [], vrw.Options(**OPTIONS)
+    parse_and_start_jax(make_parser(__doc__))
+    rows, options = [], vrw.StepOptions(**OPTIONS)
     for damping, friction in itertools.product(DAMPING, FRICTION):
-        found = vrw.steps(
+        batch_result = vrw.step_batch(
             vrw.WheelParams(damping=np.full(len(STARTS), damping)),
             STARTS,
             N_STEPS,
-            model=vrw.UnilateralWheel(friction=friction, infinite="paper"),
+            model=vrw.UnilateralWheel(friction=friction, infinite_friction_rule="paper"),
             options=options,
         )
-        left = np.asarray(found.outcome) == vrw.Outcome.STEPPED
-        durations = np.asarray(found.durations)[left]
+        left_part = np.asarray(batch_result.outcome) == vrw.Outcome.STEPPED
+        durations = np.asarray(batch_result.durations)[left_part]
         period = durations.sum(-1)
-        told = [np.nan] * 4
-        if left.any():
+        result = [np.nan] * 4
+        if left_part.any():
             share = durations[:, 0] / period
-            told = [np.median(period), np.ptp(period), np.median(share), np.ptp(share)]
-        rows.append([damping, friction, len(STARTS), left.sum(), *told])
+            result = [np.median(period), np.ptp(period), np.median(share), np.ptp(share)]
+        rows.append([damping, friction, len(STARTS), left_part.sum(), *result])
         print([f"{value:.5g}" for value in rows[-1]], flush=True)
     header = (*HEADER, "dls_fraction", "dls_spread")
-    write(FIGURES / "bouncing.csv", header, [[f"{value:.5g}" for value in row] for row in rows])
+    write_table(
+        FIGURES / "bouncing.csv", header, [[f"{value:.5g}" for value in row] for row in rows]
+    )
 
 
 if __name__ == "__main__":

@@ -18,9 +18,9 @@ import numpy as np
 from matplotlib.lines import Line2D
 
 import vrw_jax as vrw
-from experiments.ground.friction_map import FIELDS, TOWARDS, told
-from experiments.shared.command import command, started
-from experiments.shared.tables import FIGURES, Row, numbers, read, write
+from experiments.ground.friction_map import FIELDS, SETTLING_OPTIONS, compute_fields
+from experiments.shared.command import make_parser, parse_and_start_jax
+from experiments.shared.tables import FIGURES, Row, read_column, read_table, write_table
 from vrw_jax import figures as plots
 
 FRICTION, DAMPING = 0.7, 200.0  # held while the other one moves
@@ -39,7 +39,7 @@ FIRST, LARGEST, LEAST = 0.01, 0.05, 1e-4  # steps along a branch, in ranges
 CLOSE, N_TRIES, N_POINTS = 3e-8, 6, 90
 GHOSTS, N_GHOST = (0.003, 0.01, 0.03), 500  # less friction than the fold's; steps
 SHOWN = {"dls_fraction": "DLS fraction", "period": "period [s]", "slip": "slip per step [m]"}
-COLOURS = {"slow": plots.LEG_1, "fast": plots.LEG_2}
+COLOURS = {"slow": plots.LEG_1_COLOR, "fast": plots.LEG_2_COLOR}
 NUMBERS = 20  # of a section state move continuously, the rest are codes
 TABLE, GHOST = FIGURES / "ground_branches.csv", FIGURES / "ground_ghost.csv"
 HEADER = ("along", "branch", "way", "ended", "value", "spectral_radius", "slope", *FIELDS)
@@ -76,11 +76,11 @@ def mapped(sides: list[Side], points: list[np.ndarray]) -> list[tuple]:
             own = side.value(point[-1] + moves[:, -1]) if name == side.along else side.held[name]
             column.append(np.broadcast_to(own, len(moves)))
     damping, friction = (np.concatenate(told[name]) for name in ("damping", "friction"))
-    found = vrw.steps(
+    found = vrw.step_batch(
         vrw.WheelParams(damping=damping),
         np.concatenate([y[:, :-1], codes], 1),
         model=vrw.UnilateralWheel(friction=friction),
-        options=vrw.Options(**STEP),
+        options=vrw.StepOptions(**STEP),
     )
     results = []
     for i in range(len(sides)):
@@ -121,12 +121,12 @@ def corrected(sides: list[Side], predicted: list[np.ndarray]) -> list[tuple | No
 def follow(branches: list[tuple]) -> list[Side]:
     """Branches, both ways."""
     columns = [np.array([b[k] for b in branches]) for k in (3, 4)]
-    begun = vrw.steps(
+    begun = vrw.step_batch(
         vrw.WheelParams(damping=columns[0]),
         np.array([b[2] for b in branches]),
         N_TOWARDS,
         model=vrw.UnilateralWheel(friction=columns[1]),
-        options=vrw.Options(**STEP),
+        options=vrw.StepOptions(**STEP),
     )
     sides = []
     for (along, label, _, c, mu), x in zip(branches, np.asarray(begun.section_state), strict=True):
@@ -163,7 +163,7 @@ def follow(branches: list[tuple]) -> list[Side]:
 
 def compute(names: list[str]) -> None:
     """Follow the branches that are asked for or missing, and tell their points."""
-    kept = read(TABLE) if TABLE.exists() else []
+    kept = read_table(TABLE) if TABLE.exists() else []
     asked = [b for b in BRANCHES if name_of(b) in names]
     done = {(row["along"], row["branch"]) for row in kept}
     branches = asked or [b for b in BRANCHES if b[:2] not in done]
@@ -178,12 +178,14 @@ def compute(names: list[str]) -> None:
         columns = held | {side.along: values}
         if not len(values):
             continue
-        fields = told(columns["friction"], columns["damping"], np.array([r[3] for r in side.rows]))
+        fields = compute_fields(
+            columns["friction"], columns["damping"], np.array([r[3] for r in side.rows])
+        )
         way = "up" if side.rows[0][2] > 0.0 else "down"
         for (value, radius, slope, _), row in zip(side.rows, fields, strict=True):
             head = [side.along, side.label, way, side.ended]
             lines.append([*head, *(f"{x:.8g}" for x in (value, radius, slope, *row))])
-    write(TABLE, HEADER, lines)
+    write_table(TABLE, HEADER, lines)
 
 
 def name_of(branch: tuple) -> str:
@@ -199,8 +201,8 @@ def one_way(rows: list[Row], along: str, branch: str, way: str) -> list[Row]:
 def fold(along: str) -> float:
     """Where the slow branch turns: a quartic through the seven gaits next to it, over the share of
     double support, which falls all along the branch."""
-    own = one_way(read(TABLE), along, "slow", "down")
-    value, share = (numbers(own, key) for key in ("value", "dls_fraction"))
+    own = one_way(read_table(TABLE), along, "slow", "down")
+    value, share = (read_column(own, key) for key in ("value", "dls_fraction"))
     least = int(np.argmin(value))
     near = slice(least - 3, least + 4)
     x = share[near] - share[least]
@@ -213,19 +215,19 @@ def ghosts() -> None:
     friction = fold("friction") - np.array(GHOSTS)
     params, model = vrw.WheelParams(damping=DAMPING), vrw.UnilateralWheel(friction=friction)
     x, lines = np.tile(SLOW, (len(GHOSTS), 1)), []
-    options = vrw.Options(**TOWARDS)
+    options = vrw.StepOptions(**SETTLING_OPTIONS)
     for step in range(N_GHOST):
-        found = vrw.steps(params, x, model=model, options=options)
+        found = vrw.step_batch(params, x, model=model, options=options)
         x = np.asarray(found.section_state)
         lines.append([step, *(f"{d:.8g}" for d in np.asarray(found.durations).sum(-1))])
-    write(GHOST, ["step", *(f"{mu:.5f}" for mu in friction)], lines)
+    write_table(GHOST, ["step", *(f"{mu:.5f}" for mu in friction)], lines)
 
 
 def draw() -> None:
     """Measures over damping and friction, stable gaits solid; walks beyond the fold."""
-    rows = read(TABLE)
+    rows = read_table(TABLE)
     figure, axes = plt.subplots(
-        2, 4, figsize=(1.5 * plots.PAGE, 4.6), width_ratios=(1.0, 1.0, 1.0, 1.1)
+        2, 4, figsize=(1.5 * plots.PAGE_WIDTH_INCHES, 4.6), width_ratios=(1.0, 1.0, 1.0, 1.1)
     )
     held = {"damping": f"friction $\\mu$ = {FRICTION}", "friction": f"$c$ = {DAMPING:g} N·s/m"}
     axis_names = {"damping": "damping $c$ [N·s/m]", "friction": "friction coefficient $\\mu$"}
@@ -235,7 +237,7 @@ def draw() -> None:
                 for way in ("up", "down"):
                     own = one_way(rows, along, branch, way)
                     x, y, radius, slope = (
-                        numbers(own, k) for k in ("value", key, "spectral_radius", "slope")
+                        read_column(own, k) for k in ("value", key, "spectral_radius", "slope")
                     )
                     stable = radius < 1.0
                     axis.plot(x, y, color=color, ls=":", lw=1.2)
@@ -269,10 +271,10 @@ def draw() -> None:
 
 
 def main() -> None:
-    parser = command(__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("branches", nargs="*", metavar="|".join(map(name_of, BRANCHES)), default=[])
     parser.add_argument("--redraw", action="store_true", help="compute nothing")
-    chosen = started(parser)
+    chosen = parse_and_start_jax(parser)
     if not chosen.redraw:
         compute(chosen.branches)
         if not GHOST.exists():

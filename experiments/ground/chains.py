@@ -14,23 +14,23 @@ import jax
 import numpy as np
 
 import vrw_jax as vrw
-from experiments.shared.command import command, started
-from experiments.shared.tables import FIGURES, write
+from experiments.shared.command import make_parser, parse_and_start_jax
+from experiments.shared.tables import FIGURES, write_table
 
 SEED = 5
 DAMPING, SLOPE = (20.0, 400.0), (0.1, 0.34)
 STARTS = (0.05, 0.15), (0.8, 2.2), (-0.3, 0.0)
 FRICTION = {"0.3 … 1": (0.3, 1.0), "1 … 3": (1.0, 3.0), "3 … 10,000": (3.0, 1e4)}
 TIGHT, TOLERANCES = 1e-13, (1e-13, 1e-10)
-WHOLE, BOUNDS = 40_000, (400, 1_000, 4_000)
+MAX_EVENTS, EVENT_LIMITS = 40_000, (400, 1_000, 4_000)
 TABLE = FIGURES / "ground_chains.csv"
 HEADER = ("friction", "tolerance", "max_events", "steps", "events_median", "events_most")
 HEADER += ("p90_s", "p99_s", "largest_s", "above_1e-9_s", "above_1e-6_s", "ends_otherwise")
 
 
-def told(tolerance: float, max_events: int, *wheels: np.ndarray) -> list[np.ndarray]:
+def compute_steps(tolerance: float, max_events: int, *wheels: np.ndarray) -> list[np.ndarray]:
     """Times, events and outcomes of a step."""
-    options = vrw.Options(rtol=tolerance, atol=tolerance)
+    options = vrw.StepOptions(rtol=tolerance, atol=tolerance)
 
     def one(damping: jax.Array, slope: jax.Array, x: jax.Array, friction: jax.Array) -> tuple:
         params = vrw.WheelParams(damping=damping, slope=slope)
@@ -42,26 +42,26 @@ def told(tolerance: float, max_events: int, *wheels: np.ndarray) -> list[np.ndar
 
 
 def main() -> None:
-    parser = command(__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--wheels", type=int, default=256)
-    n, draw, rows = started(parser).wheels, np.random.default_rng(SEED).uniform, []
-    starts = np.stack([draw(*some, n) for some in STARTS], 1)
+    n, draw, rows = parse_and_start_jax(parser).wheels, np.random.default_rng(SEED).uniform, []
+    starts = np.stack([draw(*selection, n) for selection in STARTS], 1)
     wheels = draw(*DAMPING, n), draw(*SLOPE, n), starts
     bands = {name: np.exp(draw(*np.log(limits), n)) for name, limits in FRICTION.items()}
     for name, friction in {**bands, "infinite": np.full(n, math.inf)}.items():
-        truth, _, whole = told(TIGHT, WHOLE, *wheels, friction)
-        for tolerance, bound in itertools.product(TOLERANCES, BOUNDS):
-            period, events, outcome = told(tolerance, bound, *wheels, friction)
-            kept = (outcome == vrw.Outcome.STEPPED) & (whole == outcome)
-            errors, events = np.abs(period - truth)[kept], events[kept]
-            row = [kept.sum(), np.median(events), events.max()]
+        truth, _, full_values = compute_steps(TIGHT, MAX_EVENTS, *wheels, friction)
+        for tolerance, bound in itertools.product(TOLERANCES, EVENT_LIMITS):
+            period, events, outcome = compute_steps(tolerance, bound, *wheels, friction)
+            retained = (outcome == vrw.Outcome.STEPPED) & (full_values == outcome)
+            errors, events = np.abs(period - truth)[retained], events[retained]
+            row = [retained.sum(), np.median(events), events.max()]
             row += [*np.percentile(errors, (90, 99, 100))]
-            row += [*(np.sum(errors > e) for e in (1e-9, 1e-6)), np.sum(outcome != whole)]
+            row += [*(np.sum(errors > e) for e in (1e-9, 1e-6)), np.sum(outcome != full_values)]
             rows.append(
                 [name, tolerance, bound, *(f"{x:.3g}" if x < 1.0 else round(x) for x in row)]
             )
             print(rows[-1], flush=True)
-    write(TABLE, HEADER, rows)
+    write_table(TABLE, HEADER, rows)
 
 
 if __name__ == "__main__":

@@ -12,8 +12,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import vrw_jax as vrw
-from experiments.shared.command import command, started
-from experiments.shared.tables import FIGURES, groups, numbers, read, write
+from experiments.shared.command import make_parser, parse_and_start_jax
+from experiments.shared.tables import FIGURES, group_rows, read_column, read_table, write_table
 from vrw_jax import figures as plots
 
 N_FIRST, SEED, SOLVER = 10, 0, "Tsit5"
@@ -21,7 +21,7 @@ DAMPING, FRICTION = (150.0, 350.0), (0.5, 1.2)
 START = (0.1, 1.6, -0.1)
 TOLERANCES = (3e-13, *(10.0**-power for power in range(12, 4, -1)))  # the first is the truth
 STOPPERS = {"bilateral": "that hold", "one-sided": "that only push"}
-SHARE, LEAST = 1e-2, 1e-13
+SHARE, MIN_DIP_DEPTH = 1e-2, 1e-13
 TABLE = FIGURES / "ground_cut.csv"
 HEADER = ("stoppers", "tolerance", "cut_m", "median_s", "p90_s", "largest_s", "tried_per_step")
 
@@ -33,50 +33,52 @@ def compute(wheels: int) -> None:
 
         def walked(
             states: np.ndarray, n_steps: int, tolerance: float, stoppers: str = stoppers
-        ) -> vrw.Steps:
-            return vrw.steps(
+        ) -> vrw.StepBatchResult:
+            return vrw.step_batch(
                 vrw.WheelParams(damping=damping),
                 states,
                 n_steps,
                 model=vrw.UnilateralWheel(friction=friction, stoppers=stoppers),
-                options=vrw.Options(solver=SOLVER, rtol=tolerance, atol=tolerance),
+                options=vrw.StepOptions(solver=SOLVER, rtol=tolerance, atol=tolerance),
             )
 
-        begun = walked(np.tile(START, (wheels, 1)), N_FIRST, 1e-9)
+        start_result = walked(np.tile(START, (wheels, 1)), N_FIRST, 1e-9)
         truth = None
         for tolerance in TOLERANCES:
-            found = walked(np.asarray(begun.section_state), 1, tolerance)
-            kept = (np.asarray(found.outcome) == 0) & (np.asarray(begun.outcome) == 0)
-            period = np.where(kept, np.asarray(found.durations).sum(-1), np.nan)
+            solution = walked(np.asarray(start_result.section_state), 1, tolerance)
+            retained = (np.asarray(solution.outcome) == 0) & (np.asarray(start_result.outcome) == 0)
+            period = np.where(retained, np.asarray(solution.durations).sum(-1), np.nan)
             truth = period if truth is None else truth
             errors = np.nanpercentile(np.abs(period - truth), (50, 90, 100))
-            tried = float(np.mean(np.asarray(found.solver_steps)[kept]))
-            row = stoppers, tolerance, max(SHARE * tolerance, LEAST), *errors, tried
+            tried = float(np.mean(np.asarray(solution.solver_steps)[retained]))
+            row = stoppers, tolerance, max(SHARE * tolerance, MIN_DIP_DEPTH), *errors, tried
             rows.append([row[0], *(f"{x:.3g}" for x in row[1:])])
             print(rows[-1], flush=True)
-    write(TABLE, HEADER, rows)
+    write_table(TABLE, HEADER, rows)
 
 
 def draw() -> None:
     """Errors over the cut, median and largest."""
-    figure, axis = plt.subplots(figsize=(0.6 * plots.PAGE, 2.8))
+    figure, axis = plt.subplots(figsize=(0.6 * plots.PAGE_WIDTH_INCHES, 2.8))
     for colour, (stoppers, rows) in zip(
-        ("#0072B2", "#D55E00"), groups(read(TABLE), "stoppers").items(), strict=True
+        ("#0072B2", "#D55E00"), group_rows(read_table(TABLE), "stoppers").items(), strict=True
     ):
-        cut = numbers(rows, "tolerance")[1:]
+        cut = read_column(rows, "tolerance")[1:]
         for name, line in (("median_s", "-"), ("p90_s", "--"), ("largest_s", ":")):
             label = f"{STOPPERS[stoppers]}: {name[:-2].replace('p90', '90 %')}"
-            axis.loglog(cut, numbers(rows, name)[1:], line, color=colour, marker=".", label=label)
+            axis.loglog(
+                cut, read_column(rows, name)[1:], line, color=colour, marker=".", label=label
+            )
     axis.set(xlabel="tolerance; a hundredth of it in m is cut", ylabel="error of a step's time [s]")
     axis.legend(fontsize="small")
     plots.save(figure, FIGURES, "ground_cut")
 
 
 def main() -> None:
-    parser = command(__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--wheels", type=int, default=256)
     parser.add_argument("--redraw", action="store_true", help="compute nothing")
-    chosen = started(parser)
+    chosen = parse_and_start_jax(parser)
     if not chosen.redraw:
         compute(chosen.wheels)
     with plots.figure_style():

@@ -12,56 +12,66 @@ import itertools
 import numpy as np
 
 import vrw_jax as vrw
-from experiments.shared.command import command, started
-from experiments.shared.tables import FIGURES, write
-from experiments.shared.timing import seconds
+from experiments.shared.command import make_parser, parse_and_start_jax
+from experiments.shared.tables import FIGURES, write_table
+from experiments.shared.timing import measure_cpu_seconds
 
 DAMPING, FRICTION = (200.0, 300.0), (0.4, 0.5, 0.6, 0.7, 1.0, 1.3, 1.7, 2.0, 3.0)
 START = (0.1, 1.6, -0.1)
 N_FIRST, N_STEPS = 300, 60
 LANES = {"solver": "Tsit5", "rtol": 1e-9, "atol": 1e-9}
-TIMED, WHEELS = 5, 1024  # steps and wheels
+N_TIMED_STEPS, N_TIMED_WHEELS = 5, 1024  # steps and wheels
 NAMES = ("period_s", "dls_fraction", "events", "tried", "last_change_s", "outcome")
 
 
 def main() -> None:
-    started(command(__doc__))
+    parse_and_start_jax(make_parser(__doc__))
     damping, friction = np.array(list(itertools.product(DAMPING, FRICTION))).T
     start = np.tile(START, (len(damping), 1))
-    begun = walked(damping, friction, start, N_FIRST, "bilateral")
-    told = {}
+    start_result = walk_batch(damping, friction, start, N_FIRST, "bilateral")
+    result_by_name = {}
     for stoppers in ("bilateral", "one-sided"):
-        found = walked(damping, friction, begun.section_state, N_STEPS, stoppers)
-        wheels = damping, friction, found.section_state, found.durations, found.outcome
-        told[stoppers] = [gait(*wheel, stoppers) for wheel in zip(*wheels, strict=True)]
-        some = np.resize(np.arange(len(damping)), WHEELS)
-        many = damping[some], friction[some], np.asarray(found.section_state)[some]
-        speed = WHEELS * TIMED / seconds(lambda m=many, s=stoppers: walked(*m, TIMED, s), 1)
+        solution = walk_batch(damping, friction, start_result.section_state, N_STEPS, stoppers)
+        wheels = damping, friction, solution.section_state, solution.durations, solution.outcome
+        result_by_name[stoppers] = [
+            measure_gait(*wheel, stoppers) for wheel in zip(*wheels, strict=True)
+        ]
+        selection = np.resize(np.arange(len(damping)), N_TIMED_WHEELS)
+        many = (
+            damping[selection],
+            friction[selection],
+            np.asarray(solution.section_state)[selection],
+        )
+        speed = (
+            N_TIMED_WHEELS
+            * N_TIMED_STEPS
+            / measure_cpu_seconds(lambda m=many, s=stoppers: walk_batch(*m, N_TIMED_STEPS, s), 1)
+        )
         print(f"{stoppers}: {speed:.0f} steps per second and core", flush=True)
     rows = []
-    for c, mu, a, b in zip(damping, friction, *told.values(), strict=True):
+    for c, mu, a, b in zip(damping, friction, *result_by_name.values(), strict=True):
         row = [c, mu, *a, *b, 100.0 * (b[0] / a[0] - 1.0)]
         print([f"{value:.4g}" for value in row], flush=True)
         rows.append([f"{value:.6g}" for value in row])
-    each = [f"{name}_{stoppers}" for stoppers in told for name in NAMES]
+    each = [f"{name}_{stoppers}" for stoppers in result_by_name for name in NAMES]
     header = ("damping", "friction", *each, "period_change_percent")
-    write(FIGURES / "one_sided_stoppers.csv", header, rows)
+    write_table(FIGURES / "one_sided_stoppers.csv", header, rows)
 
 
-def walked(damping, friction, states, n_steps: int, stoppers: str) -> vrw.Steps:
+def walk_batch(damping, friction, states, n_steps: int, stoppers: str) -> vrw.StepBatchResult:
     model = vrw.UnilateralWheel(friction=friction, stoppers=stoppers)
     params = vrw.WheelParams(damping=damping)
-    return vrw.steps(params, states, n_steps, model=model, options=vrw.Options(**LANES))
+    return vrw.step_batch(params, states, n_steps, model=model, options=vrw.StepOptions(**LANES))
 
 
-def gait(damping, friction, x, durations, outcome, stoppers: str) -> list[float]:
+def measure_gait(damping, friction, x, durations, outcome, stoppers: str) -> list[float]:
     """NAMES of one more step; its period less the last one's tells whether the gait repeats."""
     model = vrw.UnilateralWheel(friction=friction, stoppers=stoppers)
     step = vrw.step(vrw.WheelParams(damping=damping), x, model=model)
     change = step.period - durations.sum()
-    told = step.period, step.dls_fraction, step.events, step.solver_steps, change
+    result = step.period, step.dls_fraction, step.events, step.solver_steps, change
     code = int(outcome) or int(step.outcome)
-    return [*(np.nan if code else float(value) for value in told), float(code)]
+    return [*(np.nan if code else float(value) for value in result), float(code)]
 
 
 if __name__ == "__main__":

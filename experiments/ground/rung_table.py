@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import vrw_jax as vrw
-from experiments.ground.friction_map import FIELDS, TOWARDS, told
-from experiments.shared.command import command, started
-from experiments.shared.tables import FIGURES, write
-from experiments.shared.timing import seconds
+from experiments.ground.friction_map import FIELDS, SETTLING_OPTIONS, compute_fields
+from experiments.shared.command import make_parser, parse_and_start_jax
+from experiments.shared.tables import FIGURES, write_table
+from experiments.shared.timing import measure_cpu_seconds
 
 SCENES = {  # label: friction and what differs from Table 1
     "Table 1, feet can't slide": (math.inf, {}),
@@ -33,7 +33,7 @@ SCENES = {  # label: friction and what differs from Table 1
     "c = 300, μ = 0.7": (0.7, {"damping": 300.0}),
     "c = 400, μ = 0.7": (0.7, {"damping": 400.0}),
 }
-N_STEPS, N_TIMED, MANY = 300, 30, 2048
+N_STEPS, N_TIMED, BATCH_SIZE = 300, 30, 2048
 MEASURES = ("period", "dls_fraction", "speed")
 
 
@@ -52,27 +52,31 @@ def errors() -> None:
     damping = np.array([changes.get("damping", 200.0) for _, changes in SCENES.values()])
     x = [p.section_state if bool(p.found) else vrw.paper_start() for p in papers]
     params = vrw.WheelParams(damping=damping)
-    model = vrw.UnilateralWheel(friction=friction, infinite="paper")
-    walked = vrw.steps(
-        params, np.array(x), N_STEPS - 1, model=model, options=vrw.Options(**TOWARDS)
+    model = vrw.UnilateralWheel(friction=friction, infinite_friction_rule="paper")
+    batch_result = vrw.step_batch(
+        params, np.array(x), N_STEPS - 1, model=model, options=vrw.StepOptions(**SETTLING_OPTIONS)
     )
-    last = vrw.steps(params, walked.section_state, model=model, options=vrw.Options(**TOWARDS))
-    fields = dict(zip(FIELDS, told(friction, damping, walked.section_state).T, strict=True))
+    last = vrw.step_batch(
+        params, batch_result.section_state, model=model, options=vrw.StepOptions(**SETTLING_OPTIONS)
+    )
+    fields = dict(
+        zip(FIELDS, compute_fields(friction, damping, batch_result.section_state).T, strict=True)
+    )
     rows = []
     for i, (label, (mu, changes)) in enumerate(SCENES.items()):
-        again = float(jnp.sum(last.durations[i] - walked.durations[i]))
+        second_result = float(jnp.sum(last.durations[i] - batch_result.durations[i]))
         outcome = vrw.Outcome(int(last.outcome[i]))
         good = outcome == vrw.Outcome.STEPPED
         truth = [float(fields[name][i]) if good else math.nan for name in MEASURES]
-        row = [label, mu, outcome.name, f"{again:.1e}", *(f"{v:.6g}" for v in truth)]
+        row = [label, mu, outcome.name, f"{second_result:.1e}", *(f"{v:.6g}" for v in truth)]
         for cycle in (papers[i], vrw.limit_cycle(wheel(changes), model=vrw.RigidWheel())):
-            found = values(cycle) if bool(cycle.found) else [math.nan] * 3
-            row += [f"{t - v:.3g}" for t, v in zip(found, truth, strict=True)]
+            solution = values(cycle) if bool(cycle.found) else [math.nan] * 3
+            row += [f"{t - v:.3g}" for t, v in zip(solution, truth, strict=True)]
         rows.append(row)
         print(row, flush=True)
     header = ["scene", "friction", "outcome", "period_change_s", *MEASURES]
     header += [f"{rung}_{name}_error" for rung in ("paper", "rigid") for name in MEASURES]
-    write(FIGURES / "rung_table.csv", header, rows)
+    write_table(FIGURES / "rung_table.csv", header, rows)
 
 
 def costs() -> None:
@@ -85,21 +89,33 @@ def costs() -> None:
     }
     rows = []
     for name, (model, x) in rungs.items():
-        alone = partial(vrw.return_map, params, x, model=model, options=vrw.Options(**TOWARDS))
+        single_result = partial(
+            vrw.return_map, params, x, model=model, options=vrw.StepOptions(**SETTLING_OPTIONS)
+        )
         if name == "rigid":
             mapped = jax.jit(jax.vmap(partial(vrw.return_map, params, model=model)))
-            many = partial(mapped, jnp.tile(x, (MANY, 1)))
+            many = partial(mapped, jnp.tile(x, (BATCH_SIZE, 1)))
         else:
-            states = np.tile(x, (MANY, 1))
-            many = partial(vrw.steps, params, states, model=model, options=vrw.Options(**TOWARDS))
-        jax.block_until_ready((alone(), many()))  # compiled
-        row = [name, f"{1e3 * seconds(alone, N_TIMED):.3g}", f"{1e6 * seconds(many, 3) / MANY:.3g}"]
+            states = np.tile(x, (BATCH_SIZE, 1))
+            many = partial(
+                vrw.step_batch,
+                params,
+                states,
+                model=model,
+                options=vrw.StepOptions(**SETTLING_OPTIONS),
+            )
+        jax.block_until_ready((single_result(), many()))  # compiled
+        row = [
+            name,
+            f"{1e3 * measure_cpu_seconds(single_result, N_TIMED):.3g}",
+            f"{1e6 * measure_cpu_seconds(many, 3) / BATCH_SIZE:.3g}",
+        ]
         rows.append(row)
         print(row, flush=True)
-    write(FIGURES / "rung_costs.csv", ("rung", "ms_alone", "us_in_a_batch"), rows)
+    write_table(FIGURES / "rung_costs.csv", ("rung", "ms_alone", "us_in_a_batch"), rows)
 
 
 if __name__ == "__main__":
-    started(command(__doc__))
+    parse_and_start_jax(make_parser(__doc__))
     errors()
     costs()

@@ -16,22 +16,25 @@ import numpy as np
 from matplotlib.patches import Patch
 
 import vrw_jax as vrw
-from experiments.shared.command import command, started
-from experiments.shared.tables import FIGURES, numbers, read, write
+from experiments.shared.command import make_parser, parse_and_start_jax
+from experiments.shared.tables import FIGURES, read_column, read_table, write_table
 from vrw_jax import figures as plots
-from vrw_jax.models import directions, foot_heights, unpack
+from vrw_jax.models import foot_heights, leg_directions, unpack_state
 
-NO_SLIP, REAL = math.inf, 0.7
+NO_SLIP, FINITE_FRICTION = math.inf, 0.7
 GAIT_RANGE = (8.0, 215.0)  # dampings at which the paper's gait gives the start
-FAST = (0.1, 2.0, -0.1)
+FAST_START = (0.1, 2.0, -0.1)
 SCENES = [  # label, friction, damping, start (None: from the paper's gait at the nearest damping)
     *((f"bouncing, c = {c:g}", NO_SLIP, c, None) for c in (1.0, 2.0, 3.0, 4.0)),
     *((f"scuffing, c = {c:g}", NO_SLIP, c, None) for c in (50.0, 100.0)),
     *((f"lost gait, c = {c:g}", NO_SLIP, c, None) for c in (220.0, 225.0, 250.0, 280.0, 300.0)),
-    ("early touchdown, c = 200", NO_SLIP, 200.0, FAST),
-    *((f"real ground, c = {c:g}", REAL, c, None) for c in (4.0, 50.0, 100.0, 200.0, 250.0, 300.0)),
+    ("early touchdown, c = 200", NO_SLIP, 200.0, FAST_START),
+    *(
+        (f"real ground, c = {c:g}", FINITE_FRICTION, c, None)
+        for c in (4.0, 50.0, 100.0, 200.0, 250.0, 300.0)
+    ),
 ]
-SHOWN = ("bouncing, c = 4", "scuffing, c = 50", "lost gait, c = 225", "real ground, c = 250")
+SHOWN_SCENES = ("bouncing, c = 4", "scuffing, c = 50", "lost gait, c = 225", "real ground, c = 250")
 N_STEPS, N_SAMPLES = 60, 40
 OPTIONS = {"solver": "Tsit5", "rtol": 1e-9, "atol": 1e-9}
 MODES = ("air", "rest", "down", "up")
@@ -50,7 +53,9 @@ def starts() -> np.ndarray:
         start = vrw.limit_cycle(params).section_state if start is None else jnp.asarray(start)
         x.append(
             np.asarray(
-                vrw.UnilateralWheel(friction=mu, infinite="paper").full_section(params, start)
+                vrw.UnilateralWheel(friction=mu, infinite_friction_rule="paper").embed_section(
+                    params, start
+                )
             )
         )
     return np.stack(x)
@@ -58,35 +63,35 @@ def starts() -> np.ndarray:
 
 @jax.jit
 @jax.vmap
-def told(friction: jax.Array, damping: jax.Array, x: jax.Array) -> vrw.UnilateralStep:
+def compute_step(friction: jax.Array, damping: jax.Array, x: jax.Array) -> vrw.UnilateralStep:
     """The step from a section state."""
     params = vrw.WheelParams(damping=damping)
-    wheel = vrw.UnilateralWheel(friction=friction, infinite="paper")
-    return wheel.step(params, x, vrw.Options(**OPTIONS))
+    wheel = vrw.UnilateralWheel(friction=friction, infinite_friction_rule="paper")
+    return wheel.take_step(params, x, vrw.StepOptions(**OPTIONS))
 
 
-def walked(friction: np.ndarray, damping: np.ndarray, x: np.ndarray) -> tuple:
+def walk_scene(friction: np.ndarray, damping: np.ndarray, x: np.ndarray) -> tuple:
     """Outcome, the start of the last good step, that step, all periods, and how many steps."""
     params = vrw.WheelParams(damping=damping)
-    model = vrw.UnilateralWheel(friction=friction, infinite="paper")
+    model = vrw.UnilateralWheel(friction=friction, infinite_friction_rule="paper")
     outcome, last, periods = np.zeros(len(x), int), x, []
     count = np.zeros(len(x), int)
     for _ in range(N_STEPS):
-        found = vrw.steps(params, x, model=model, options=vrw.Options(**OPTIONS))
-        good = (outcome == 0) & (np.asarray(found.outcome) == 0)
-        outcome = np.where(outcome == 0, np.asarray(found.outcome), outcome)
+        batch_result = vrw.step_batch(params, x, model=model, options=vrw.StepOptions(**OPTIONS))
+        good = (outcome == 0) & (np.asarray(batch_result.outcome) == 0)
+        outcome = np.where(outcome == 0, np.asarray(batch_result.outcome), outcome)
         last = np.where(good[:, None], x, last)
-        x = np.asarray(found.section_state)
-        periods.append(np.asarray(found.durations).sum(-1))
+        x = np.asarray(batch_result.section_state)
+        periods.append(np.asarray(batch_result.durations).sum(-1))
         count += good
-    step = told(jnp.asarray(friction), jnp.asarray(damping), jnp.asarray(last))
+    step = compute_step(jnp.asarray(friction), jnp.asarray(damping), jnp.asarray(last))
     return outcome, last, step, np.stack(periods, 1), count
 
 
 def main() -> None:
-    parser = command(__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--redraw", action="store_true", help="walk nothing: draw the shares alone")
-    if not started(parser).redraw:
+    if not parse_and_start_jax(parser).redraw:
         compute()
     with plots.figure_style():
         draw_modes()
@@ -95,9 +100,11 @@ def main() -> None:
 def compute() -> None:
     """Walk the scenes, keep what they tell, and draw the last steps of some."""
     labels, friction, damping, _ = zip(*SCENES, strict=True)
-    outcome, last, step, periods, count = walked(np.array(friction), np.array(damping), starts())
+    outcome, last, step, periods, count = walk_scene(
+        np.array(friction), np.array(damping), starts()
+    )
     header = ("scene", "friction", "damping", "steps", "outcome", "period_s", "period_spread_s")
-    more = ("dls_fraction", "flight_fraction", "speed_m_s", "slip_m", "events", "solutions")
+    extra_values = ("dls_fraction", "flight_fraction", "speed_m_s", "slip_m", "events", "solutions")
     pairs, rows = [f"share_{a}_{b}" for a in MODES for b in MODES], []
     for i, label in enumerate(labels):
         n, period = int(count[i]), float(step.period[i])
@@ -114,9 +121,9 @@ def compute() -> None:
         ]
         row = [label, friction[i], damping[i], n, name, f"{period:.6f}", f"{spread:.1e}"]
         rows.append([*row, *(f"{float(v):.5g}" for v in numbers)])
-    write(TABLE, (*header, *more, *pairs), rows)
+    write_table(TABLE, (*header, *extra_values, *pairs), rows)
     with plots.figure_style():
-        draw([labels.index(name) for name in SHOWN], labels, friction, damping, last)
+        draw([labels.index(name) for name in SHOWN_SCENES], labels, friction, damping, last)
 
 
 def draw(chosen: list[int], labels: tuple, friction: tuple, damping: tuple, x: np.ndarray) -> None:
@@ -125,11 +132,15 @@ def draw(chosen: list[int], labels: tuple, friction: tuple, damping: tuple, x: n
     paper = vrw.ViscoelasticWheel(stop_at_lift_off=False)
     for column, i in enumerate(chosen):
         params = vrw.WheelParams(damping=damping[i])
-        wheel = vrw.UnilateralWheel(friction=friction[i], infinite="paper")
-        trace = wheel.trace(params, jnp.asarray(x[i]), vrw.Options(), N_SAMPLES)
+        wheel = vrw.UnilateralWheel(friction=friction[i], infinite_friction_rule="paper")
+        trace = wheel.sample_step(params, jnp.asarray(x[i]), vrw.StepOptions(), N_SAMPLES)
         s, top, low = params.symbols(), axes[0, column], axes[1, column]
         heights = jax.vmap(
-            jax.vmap(lambda y, s=s: foot_heights(unpack(y)[0], directions(s, unpack(y)[0].theta)))
+            jax.vmap(
+                lambda y, s=s: foot_heights(
+                    unpack_state(y)[0], leg_directions(s, unpack_state(y)[0].theta)
+                )
+            )
         )(trace.state)
         happened = np.flatnonzero(np.asarray(trace.duration) > 0.0)
         time = np.concatenate([np.asarray(trace.time[k]) for k in happened])
@@ -143,11 +154,11 @@ def draw(chosen: list[int], labels: tuple, friction: tuple, damping: tuple, x: n
             top.plot(time, joined(trace.tangential), color + "--", label=f"{name}, tangential")
             low.plot(time, 1e3 * joined(heights), color, label=name)
             grey = {"color": "0.6", "lw": 1.0, "zorder": 0, "ls": "-" if leg == 0 else "-."}
-            shown = f"{name}, paper's model"
-            top.plot(formal.time, formal[f"lambda_{2 * leg + 2}"], **grey, label=shown)
+            shown_values = f"{name}, paper's model"
+            top.plot(formal.time, formal[f"lambda_{2 * leg + 2}"], **grey, label=shown_values)
             if leg == 1:
-                low.plot(formal.time, 1e3 * formal.foot_2_z, **grey, label=shown)
-        top.set_title(with_unit(labels[i]).replace(", ", "\n"))
+                low.plot(formal.time, 1e3 * formal.foot_2_z, **grey, label=shown_values)
+        top.set_title(add_unit(labels[i]).replace(", ", "\n"))
         low.set(xlabel="time since landing [s]", ylim=(-25.0, 60.0))
     axes[0, 0].set_ylabel("ground force [N]")
     axes[1, 0].set_ylabel("foot height [mm]")
@@ -158,15 +169,15 @@ def draw(chosen: list[int], labels: tuple, friction: tuple, damping: tuple, x: n
 
 def draw_modes() -> None:
     """Time in each pair of contact modes by scene: colours are the fore foot, hatches the rear."""
-    rows = read(TABLE)
-    figure, axis = plt.subplots(figsize=(plots.PAGE, 4.4))
-    left = np.zeros(len(rows))
+    rows = read_table(TABLE)
+    figure, axis = plt.subplots(figsize=(plots.PAGE_WIDTH_INCHES, 4.4))
+    left_part = np.zeros(len(rows))
     for first, colour in COLOURS.items():
         for second, hatch in HATCHES.items():
-            share = 100.0 * numbers(rows, f"share_{first}_{second}")
+            share = 100.0 * read_column(rows, f"share_{first}_{second}")
             look = {"color": colour, "hatch": hatch, "edgecolor": "black", "linewidth": 0.4}
-            axis.barh([with_unit(row["scene"]) for row in rows], share, left=left, **look)
-            left += share
+            axis.barh([add_unit(row["scene"]) for row in rows], share, left=left_part, **look)
+            left_part += share
     axis.invert_yaxis()
     axis.set(xlabel="share of the step [%]", xlim=(0.0, 100.0))
     edge = {"edgecolor": "black", "linewidth": 0.4}
@@ -181,7 +192,7 @@ def draw_modes() -> None:
     plots.save(figure, FIGURES, "unilateral_modes")
 
 
-def with_unit(label: str) -> str:
+def add_unit(label: str) -> str:
     """A scene's label with its damping as all pictures write it."""
     name, _, damping = label.partition(", c = ")
     return f"{name}, $c$ = {damping} N·s/m"

@@ -13,8 +13,8 @@ from collections import Counter
 import numpy as np
 
 import vrw_jax as vrw
-from experiments.shared.command import command, started
-from experiments.shared.tables import FIGURES, write_named
+from experiments.shared.command import make_parser, parse_and_start_jax
+from experiments.shared.tables import FIGURES, write_named_rows
 
 SEED, SOLVER = 0, "Tsit5"
 DAMPING, SLOPE = (20.0, 400.0), (0.1, 0.34)
@@ -22,14 +22,16 @@ FRICTIONS = {"0.3-1": (0.3, 1.0), "1-3": (1.0, 3.0), "inf": (math.inf, math.inf)
 START = ((0.05, 0.15), (0.8, 2.2), (-0.3, 0.0))
 TOLERANCES = (1e-6, 1e-8, 1e-10, 1e-12)
 STOPPERS = ("bilateral", "one-sided")
-LOST = (
+FAILURE_OUTCOMES = (
     vrw.Outcome.NO_ADMISSIBLE_CONTACT,
-    vrw.Outcome.SOLVER_GAVE_UP,
+    vrw.Outcome.SOLVER_FAILED,
     vrw.Outcome.TOO_MANY_EVENTS,
 )
 
 
-def drawn(wheels: int, friction: tuple[float, float]) -> tuple[dict[str, np.ndarray], np.ndarray]:
+def draw_wheels(
+    wheels: int, friction: tuple[float, float]
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Parameters and friction by name, and starts: the paper's section numbers."""
     draw = np.random.default_rng(SEED).uniform
     box = {"damping": draw(*DAMPING, wheels), "slope": draw(*SLOPE, wheels)}
@@ -40,40 +42,44 @@ def drawn(wheels: int, friction: tuple[float, float]) -> tuple[dict[str, np.ndar
     return box, states
 
 
-def walked(
+def walk_batch(
     box: dict[str, np.ndarray], states: np.ndarray, n_steps: int, stoppers: str, tolerance: float
-) -> vrw.Steps:
+) -> vrw.StepBatchResult:
     """The last steps of all wheels."""
     wheel = vrw.UnilateralWheel(friction=box["friction"], stoppers=stoppers)
     params = vrw.WheelParams(damping=box["damping"], slope=box["slope"])
-    options = vrw.Options(solver=SOLVER, rtol=tolerance, atol=tolerance)
-    return vrw.steps(params, states, n_steps, model=wheel, options=options)
+    options = vrw.StepOptions(solver=SOLVER, rtol=tolerance, atol=tolerance)
+    return vrw.step_batch(params, states, n_steps, model=wheel, options=options)
 
 
 def main() -> None:
-    parser = command(__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--wheels", type=int, default=192, help="of each kind of friction")
     parser.add_argument("--steps", type=int, default=60)
     parser.add_argument("--tolerances", type=float, nargs="*", default=TOLERANCES)
     parser.add_argument("--stoppers", nargs="*", default=STOPPERS)
-    chosen = started(parser)
+    chosen = parse_and_start_jax(parser)
     rows = []
     for stoppers in chosen.stoppers:
         for tolerance in chosen.tolerances:
             for band, friction in FRICTIONS.items():
-                found = walked(*drawn(chosen.wheels, friction), chosen.steps, stoppers, tolerance)
-                ends = Counter(np.asarray(found.outcome).tolist())
-                told = {vrw.Outcome(code).name: count for code, count in sorted(ends.items())}
-                made = int(np.sum(found.n_stepped))
-                lost = sum(ends[code] for code in LOST)
+                solution = walk_batch(
+                    *draw_wheels(chosen.wheels, friction), chosen.steps, stoppers, tolerance
+                )
+                ends = Counter(np.asarray(solution.outcome).tolist())
+                result_by_name = {
+                    vrw.Outcome(code).name: count for code, count in sorted(ends.items())
+                }
+                created = int(np.sum(solution.n_stepped))
+                lost_values = sum(ends[code] for code in FAILURE_OUTCOMES)
                 row = {
                     "stoppers": stoppers, "tolerance": tolerance, "friction": band,
-                    "wheels": chosen.wheels, "steps": made, "lost": lost,
-                    "lost_per_step": f"{lost / max(made, 1):.1e}", **told,
+                    "wheels": chosen.wheels, "steps": created, "lost": lost_values,
+                    "lost_per_step": f"{lost_values / max(created, 1):.1e}", **result_by_name,
                 }  # fmt: skip
                 rows.append(row)
                 print(row, flush=True)
-    write_named(FIGURES / "ground_survey.csv", rows)
+    write_named_rows(FIGURES / "ground_survey.csv", rows)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@
 Writes `walk.gif` to `results/` or the folder given.
 """
 
-from experiments.shared.command import started_with_folder
+from experiments.shared.command import parse_folder_and_start_jax
 from vrw_jax import figures as plots
 from vrw_jax.paper import reproduction
 
@@ -14,8 +14,8 @@ SLOWER = 2.0  # times slower than life
 
 
 def main() -> None:
-    folder = started_with_folder(__doc__)
-    step = reproduction.gait_at_table_1(1)
+    folder = parse_folder_and_start_jax(__doc__)
+    step = reproduction.simulate_table_1_gait(1)
     frames, milliseconds = plots.walk_frames(step, FRAMES, SLOWER)
     plots.save_animation(frames, milliseconds, folder / "walk.gif")
 

@@ -5,7 +5,7 @@
 Writes `fig06_gait.svg` and `.png` to `results/` or the folder given.
 """
 
-from experiments.shared.command import started_with_folder
+from experiments.shared.command import parse_folder_and_start_jax
 from vrw_jax import figures as plots
 from vrw_jax.paper import reproduction
 
@@ -13,8 +13,8 @@ STEPS = 3
 
 
 def main() -> None:
-    folder = started_with_folder(__doc__)
-    plots.save(plots.gait_panels(reproduction.gait_at_table_1(STEPS)), folder, "fig06_gait")
+    folder = parse_folder_and_start_jax(__doc__)
+    plots.save(plots.gait_panels(reproduction.simulate_table_1_gait(STEPS)), folder, "fig06_gait")
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@
 Writes `fig07_sticks.svg` and `.png` to `results/` or the folder given.
 """
 
-from experiments.shared.command import started_with_folder
+from experiments.shared.command import parse_folder_and_start_jax
 from vrw_jax import figures as plots
 from vrw_jax.paper import reproduction
 
@@ -14,8 +14,10 @@ INTERVAL = 0.05  # s, between sticks
 
 
 def main() -> None:
-    folder = started_with_folder(__doc__)
-    plots.save(plots.sticks(reproduction.gait_at_table_1(STEPS), INTERVAL), folder, "fig07_sticks")
+    folder = parse_folder_and_start_jax(__doc__)
+    plots.save(
+        plots.sticks(reproduction.simulate_table_1_gait(STEPS), INTERVAL), folder, "fig07_sticks"
+    )
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@
 Writes `fig09_rear_force.svg` and `.png` to `results/` or the folder given.
 """
 
-from experiments.shared.command import started_with_folder
+from experiments.shared.command import parse_folder_and_start_jax
 from vrw_jax import figures as plots
 from vrw_jax.paper import reproduction
 
@@ -13,8 +13,12 @@ DAMPINGS = (50.0, 100.0, 200.0)  # N s/m
 
 
 def main() -> None:
-    folder = started_with_folder(__doc__)
-    plots.save(plots.rear_force(reproduction.gaits_at(DAMPINGS)), folder, "fig09_rear_force")
+    folder = parse_folder_and_start_jax(__doc__)
+    plots.save(
+        plots.rear_force(reproduction.simulate_gaits_at_dampings(DAMPINGS)),
+        folder,
+        "fig09_rear_force",
+    )
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@
 Writes `fig10_indicators.svg` and `.png` to `results/` or the folder given.
 """
 
-from experiments.shared.command import started_with_folder
+from experiments.shared.command import parse_folder_and_start_jax
 from vrw_jax import figures as plots
 from vrw_jax.paper import reproduction
 
@@ -13,9 +13,11 @@ EVERY = 4  # one symbol for so many gaits
 
 
 def main() -> None:
-    folder = started_with_folder(__doc__)
+    folder = parse_folder_and_start_jax(__doc__)
     plots.save(
-        plots.indicators(reproduction.gaits_along_damping(), EVERY), folder, "fig10_indicators"
+        plots.indicators(reproduction.measure_gaits_along_damping(), EVERY),
+        folder,
+        "fig10_indicators",
     )
 
 

@@ -11,7 +11,7 @@ import vrw_jax as vrw
 EXTRA = 'pip install -e ".[experiments]"'
 
 
-def command(doc: str | None) -> argparse.ArgumentParser:
+def make_parser(doc: str | None) -> argparse.ArgumentParser:
     """A parser that tells the script's own docstring."""
     spec = sys.modules["__main__"].__spec__
     return argparse.ArgumentParser(
@@ -21,21 +21,21 @@ def command(doc: str | None) -> argparse.ArgumentParser:
     )
 
 
-def started(parser: argparse.ArgumentParser) -> argparse.Namespace:
+def parse_and_start_jax(parser: argparse.ArgumentParser) -> argparse.Namespace:
     """What is asked for, and JAX as the library's users start it."""
     chosen = parser.parse_args()
     vrw.start_jax()
     return chosen
 
 
-def started_with_folder(doc: str | None) -> Path:
+def parse_folder_and_start_jax(doc: str | None) -> Path:
     """The folder that a script writes to: the one given, or `results`."""
-    parser = command(doc)
+    parser = make_parser(doc)
     parser.add_argument("folder", type=Path, nargs="?", default="results")
-    return started(parser).folder
+    return parse_and_start_jax(parser).folder
 
 
-def extra(name: str, install: str = EXTRA) -> ModuleType:
+def require_extra(name: str, install: str = EXTRA) -> ModuleType:
     """A package that the library does without, or one sentence that says how to get it."""
     try:
         return importlib.import_module(name)

@@ -18,19 +18,19 @@ import jax.numpy as jnp
 import numpy as np
 
 import vrw_jax as vrw
-from experiments.shared.command import command, started
+from experiments.shared.command import make_parser, parse_and_start_jax
 
 LANES, CYCLES = 4096, 1024
 Numbers = dict[str, np.ndarray]
 
 
-def numbers_of(tree: object) -> Numbers:
+def collect_numbers(tree: object) -> Numbers:
     """Every array of a result, by its place in it."""
     leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
     return {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in leaves}
 
 
-def drawn(n: int, seed: int) -> vrw.WheelParams:
+def draw_wheels(n: int, seed: int) -> vrw.WheelParams:
     draw = np.random.default_rng(seed).uniform
     return vrw.WheelParams(
         damping=draw(20.0, 215.0, n),
@@ -40,48 +40,58 @@ def drawn(n: int, seed: int) -> vrw.WheelParams:
     )
 
 
-def steps() -> Iterator[tuple[str, Numbers]]:
-    params = drawn(LANES, 1)
+def digest_steps() -> Iterator[tuple[str, Numbers]]:
+    params = draw_wheels(LANES, 1)
     draw = np.random.default_rng(2)
     states = np.asarray(vrw.limit_cycle(vrw.WheelParams()).section_state)
     states = states * draw.uniform(0.98, 1.02, (LANES, 3))
-    lanes = vrw.steps(params, states)
-    yield "steps by lanes", numbers_of(lanes)
-    yield "steps by diffrax", numbers_of(vrw.steps(params, states, engine="diffrax"))
+    lanes = vrw.step_batch(params, states)
+    yield "steps by lanes", collect_numbers(lanes)
+    yield "steps by diffrax", collect_numbers(vrw.step_batch(params, states, engine="diffrax"))
     expected = np.asarray(lanes.durations) * draw.uniform(0.98, 1.02, (LANES, 3))
-    by_collocation = vrw.steps(params, states, engine="collocation", durations=expected)
-    yield "steps by collocation", numbers_of(by_collocation)
+    by_collocation = vrw.step_batch(params, states, engine="collocation", durations=expected)
+    yield "steps by collocation", collect_numbers(by_collocation)
     ground = vrw.UnilateralWheel(friction=2.0)
-    few = jax.tree.map(lambda x: x[:64] if jnp.ndim(x) else x, params)
-    yield "steps on real ground", numbers_of(vrw.steps(few, states[:64], 3, model=ground))
+    few_items = jax.tree.map(lambda x: x[:64] if jnp.ndim(x) else x, params)
+    yield (
+        "steps on real ground",
+        collect_numbers(vrw.step_batch(few_items, states[:64], 3, model=ground)),
+    )
 
 
-def one_wheel() -> Iterator[tuple[str, Numbers]]:
+def digest_single_wheel() -> Iterator[tuple[str, Numbers]]:
     table_1 = vrw.WheelParams()
     x = vrw.limit_cycle(table_1).section_state
-    yield "step", numbers_of(vrw.step(table_1, x))
-    by = jax.jacfwd(vrw.return_map, argnums=(0, 1))(table_1, x)
-    yield "return map's Jacobian", numbers_of(by)
+    yield "step", collect_numbers(vrw.step(table_1, x))
+    by_input = jax.jacfwd(vrw.return_map, argnums=(0, 1))(table_1, x)
+    yield "return map's Jacobian", collect_numbers(by_input)
     walk = vrw.simulate(table_1, x, n_steps=2)
     yield "trajectory", {str(name): np.asarray(walk[name]) for name in walk.data_vars}
     ground = vrw.UnilateralWheel(friction=1.5)
-    yield "walk on real ground", numbers_of(vrw.walk(table_1, x, 5, model=ground))
+    yield "walk on real ground", collect_numbers(vrw.walk(table_1, x, 5, model=ground))
 
 
-def cycles() -> Iterator[tuple[str, Numbers]]:
+def digest_cycles() -> Iterator[tuple[str, Numbers]]:
     names = ("dls_fraction", "speed", "period", "lambda_I4", "lambda_4_plus")
     design = vrw.samples(
         {
-            name: np.asarray(getattr(drawn(CYCLES, 3), name))
+            name: np.asarray(getattr(draw_wheels(CYCLES, 3), name))
             for name in ("damping", "stiffness", "natural_length", "slope")
         }
     )
-    slopes = [f"d {name} / d {by}" for name in names for by in ("damping", "slope", "leg_mass")]
-    found = vrw.scan(design, [*names, *slopes])
-    yield "cycles with derivatives", {str(name): np.asarray(found[name]) for name in found}
+    slopes = [
+        f"d {name} / d {by_input}"
+        for name in names
+        for by_input in ("damping", "slope", "leg_mass")
+    ]
+    scan_result = vrw.scan(design, [*names, *slopes])
+    yield (
+        "cycles with derivatives",
+        {str(name): np.asarray(scan_result[name]) for name in scan_result},
+    )
 
 
-def quickstart() -> Iterator[tuple[str, Numbers]]:
+def digest_quickstart() -> Iterator[tuple[str, Numbers]]:
     text = (Path(__file__).parents[2] / "configs" / "quickstart.toml").read_text()
     config = tomllib.loads(text)
     with TemporaryDirectory() as folder:
@@ -91,43 +101,61 @@ def quickstart() -> Iterator[tuple[str, Numbers]]:
             else np.asarray(axis)
             for name, axis in config["grid"].items()
         }
-        found = vrw.scan(vrw.grid(**axes), config["scan"]["measures"], store=Path(folder) / "s")
-        yield "quickstart's store", {str(name): np.asarray(found[name]) for name in found}
+        scan_result = vrw.scan(
+            vrw.grid(**axes), config["scan"]["measures"], store=Path(folder) / "s"
+        )
+        yield (
+            "quickstart's store",
+            {str(name): np.asarray(scan_result[name]) for name in scan_result},
+        )
 
 
-def branch() -> Iterator[tuple[str, Numbers]]:
-    told = vrw.continue_branch(vrw.WheelParams(), "damping", (4.0, 230.0))
-    borders = {f"border {border.name}": np.asarray(border.value) for border in told.borders}
-    points = {str(name): np.asarray(told.dataset[name]) for name in told.dataset.variables}
+def digest_branch() -> Iterator[tuple[str, Numbers]]:
+    branch_result = vrw.continue_branch(vrw.WheelParams(), "damping", (4.0, 230.0))
+    borders = {
+        f"border {border.name}": np.asarray(border.value) for border in branch_result.special_points
+    }
+    points = {
+        str(name): np.asarray(branch_result.dataset[name])
+        for name in branch_result.dataset.variables
+    }
     yield "branch", borders | points
 
 
-def tuning() -> Iterator[tuple[str, Numbers]]:
+def digest_tuning() -> Iterator[tuple[str, Numbers]]:
     bounds = {"damping": (20.0, 215.0), "slope": (0.26, 0.34)}
     tuned = vrw.tune(vrw.WheelParams(), "dls_fraction", list(bounds), bounds)
     path = {f"path {name}": np.asarray(tuned.path[name]) for name in tuned.path.data_vars}
-    yield "tuning", numbers_of((tuned.params, tuned.value, tuned.kkt_residual)) | path
+    yield "tuning", collect_numbers((tuned.params, tuned.value, tuned.kkt_residual)) | path
 
 
 GROUPS: dict[str, Callable[[], Iterator[tuple[str, Numbers]]]] = {
-    group.__name__: group for group in (steps, one_wheel, cycles, quickstart, branch, tuning)
+    group.__name__: group
+    for group in (
+        digest_steps,
+        digest_single_wheel,
+        digest_cycles,
+        digest_quickstart,
+        digest_branch,
+        digest_tuning,
+    )
 }
 
 
-def digest(numbers: Numbers) -> str:
-    told = hashlib.sha256()
+def compute_digest(numbers: Numbers) -> str:
+    result = hashlib.sha256()
     for name in sorted(numbers):
         value = numbers[name]
         content = value.tobytes() if value.dtype.kind in "fiub" else repr(value.tolist()).encode()
-        told.update(f"{name} {value.shape} {value.dtype.kind}".encode() + content)
-    return told.hexdigest()[:16]
+        result.update(f"{name} {value.shape} {value.dtype.kind}".encode() + content)
+    return result.hexdigest()[:16]
 
 
-def distance(here: Numbers, there: Numbers) -> str:
+def compute_distance(values_here: Numbers, values_there: Numbers) -> str:
     """The largest relative difference, of which number; names that only one side has."""
     worst, where = 0.0, "none"
-    for name in here.keys() & there.keys():
-        x, y = here[name], there[name]
+    for name in values_here.keys() & values_there.keys():
+        x, y = values_here[name], values_there[name]
         if x.shape != y.shape:
             return f"{name} has shape {x.shape}, and had {y.shape}"
         if x.dtype.kind != "f":
@@ -138,29 +166,29 @@ def distance(here: Numbers, there: Numbers) -> str:
         away = np.where(np.isnan(x) & np.isnan(y), 0.0, np.abs(x - y)) / scale
         if away.size and not np.max(away) <= worst:
             worst, where = float(np.max(away)), name
-    alone = sorted(here.keys() ^ there.keys())
-    return f"largest relative difference {worst:.1e} ({where}){f'; alone: {alone}' * bool(alone)}"
+    sorted_items = sorted(values_here.keys() ^ values_there.keys())
+    return f"largest relative difference {worst:.1e} ({where}){f'; alone: {sorted_items}' * bool(sorted_items)}"
 
 
 def main() -> None:
-    parser = command(__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("file", type=Path)
     parser.add_argument("--only", choices=list(GROUPS), nargs="*", default=list(GROUPS))
     parser.add_argument("--numbers", type=Path)
     parser.add_argument("--against", type=Path)
-    arguments = started(parser)
+    arguments = parse_and_start_jax(parser)
     lines = []
     for group in arguments.only:
         for name, numbers in GROUPS[group]():
-            line = f"{digest(numbers)}  {name}"
+            line = f"{compute_digest(numbers)}  {name}"
             lines.append(line)
             place = f"{name.replace(' ', '_')}.npz"
             if arguments.numbers:
                 arguments.numbers.mkdir(parents=True, exist_ok=True)
                 np.savez(arguments.numbers / place, **numbers)
             if arguments.against:
-                with np.load(arguments.against / place) as there:
-                    line += f"  {distance(numbers, dict(there))}"
+                with np.load(arguments.against / place) as values_there:
+                    line += f"  {compute_distance(numbers, dict(values_there))}"
             print(line, flush=True)
     arguments.file.write_text("\n".join(lines) + "\n")
 

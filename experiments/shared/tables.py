@@ -12,35 +12,35 @@ FIGURES = DOCS / "figures"
 Row = dict[str, str]
 
 
-def read(path: Path) -> list[Row]:
+def read_table(path: Path) -> list[Row]:
     with path.open() as file:
         return list(csv.DictReader(file))
 
 
-def write(path: Path, header: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
+def write_table(path: Path, header: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="") as file:
         csv.writer(file).writerows([header, *rows])
 
 
-def write_named(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
+def write_named_rows(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
     """Rows by names of columns; a row may lack some."""
     header = dict.fromkeys(name for row in rows for name in row)
-    write(path, header, [[row.get(name, "") for name in header] for row in rows])
+    write_table(path, header, [[row.get(name, "") for name in header] for row in rows])
 
 
-def numbers(rows: Iterable[Row], name: str) -> np.ndarray:
+def read_column(rows: Iterable[Row], name: str) -> np.ndarray:
     """A column."""
     return np.array([float(row[name]) for row in rows])
 
 
-def groups(rows: Sequence[Row], name: str) -> dict[str, list[Row]]:
+def group_rows(rows: Sequence[Row], name: str) -> dict[str, list[Row]]:
     """Rows by one of their columns, in order."""
     keys = dict.fromkeys(map(itemgetter(name), rows))
     return {key: [row for row in rows if row[name] == key] for key in keys}
 
 
-def markdown(header: Iterable[object], rows: Iterable[Iterable[object]]) -> str:
+def format_markdown(header: Iterable[object], rows: Iterable[Iterable[object]]) -> str:
     """A table of a page."""
     names = list(header)
     lines = [" | ".join(map(str, cells)) for cells in (names, *rows)]
@@ -48,7 +48,7 @@ def markdown(header: Iterable[object], rows: Iterable[Iterable[object]]) -> str:
     return "\n".join(f"|{line}|" if k == 1 else f"| {line} |" for k, line in enumerate(lines))
 
 
-def replace(page: Path, name: str, text: str) -> None:
+def replace_block(page: Path, name: str, text: str) -> None:
     """Put a table between its two marks in a page."""
     begin, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
     head, rest = page.read_text().split(begin)

@@ -17,7 +17,7 @@ from vrw_jax.simd import code
 
 
 @contextlib.contextmanager
-def on_one_core() -> Iterator[None]:
+def use_one_core() -> Iterator[None]:
     """All threads on one core: two that wait for each other would both be counted."""
     if not hasattr(os, "sched_setaffinity"):  # Linux alone has it
         yield
@@ -35,37 +35,37 @@ def on_one_core() -> Iterator[None]:
                 os.sched_setaffinity(thread, cores)
 
 
-def start_cold() -> None:
+def start_without_cache() -> None:
     """JAX as users start it, on a CPU's one thread, its cache thrown away with what it held."""
     global _cache
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
     jax.config.update("jax_platforms", "cpu")
     jax.clear_caches()
-    code._made.clear()
+    code._code_by_name.clear()
     _cache = tempfile.TemporaryDirectory()
     vrw.start_jax(_cache.name)
     compilation_cache.reset_cache()  # it may have opened another folder
 
 
-def seconds(
+def measure_cpu_seconds(
     call: Callable[[], object],
     repeats: int = 5,
     enough: float = float("inf"),
-    told: Callable[[list[float]], float] = statistics.median,
+    result: Callable[[list[float]], float] = statistics.median,
 ) -> float:
     """CPU time of a call that has been made before: the median of repeats, or what else is told.
 
     Repeats end once they have taken `enough` seconds.
     """
-    taken: list[float] = []
-    while not taken or (len(taken) < repeats and sum(taken) < enough):
+    used_values: list[float] = []
+    while not used_values or (len(used_values) < repeats and sum(used_values) < enough):
         began = time.process_time()
         jax.block_until_ready(call())
-        taken.append(time.process_time() - began)
-    return told(taken)
+        used_values.append(time.process_time() - began)
+    return result(used_values)
 
 
-def processor() -> str:
+def describe_processor() -> str:
     """The CPU's own name, and how wide its vectors are."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()

@@ -10,30 +10,36 @@ with.
 import numpy as np
 
 import vrw_jax as vrw
-from experiments.shared.command import command, started
-from experiments.shared.timing import on_one_core, seconds
-from vrw_jax.branches.mapping import across
-from vrw_jax.branches.tracing import OF_CURVES, Tracer
+from experiments.shared.command import make_parser, parse_and_start_jax
+from experiments.shared.timing import measure_cpu_seconds, use_one_core
+from vrw_jax.branches.mapping import find_seeds_on_middle_lines
+from vrw_jax.branches.tracing import DEFAULT_CURVE_OPTIONS, CurveTracer
 
 BOX = {"damping": (4.0, 240.0), "stiffness": (350.0, 700.0)}
 
 
 def main() -> None:
-    parser = command(__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--repeats", type=int, default=10)
-    repeats = started(parser).repeats
+    repeats = parse_and_start_jax(parser).repeats
     first, second = BOX
     box, model = np.array(list(BOX.values())), vrw.ViscoelasticWheel()
-    tracer = Tracer((first, second), box, model, OF_CURVES, vrw.Options.tight())
-    begin = lambda: across(tracer, vrw.WheelParams())
+    tracer = CurveTracer(
+        (first, second), box, model, DEFAULT_CURVE_OPTIONS, vrw.StepOptions.tight()
+    )
+    begin = lambda: find_seeds_on_middle_lines(tracer, vrw.WheelParams())
     seeds = begin()
-    curves = [one.curve for one in tracer.followed(seeds, ())]
+    curves = [one.curve for one in tracer.trace_curves(seeds, ())]
     n = sum(len(curve.values) for curve in curves)
-    print(f"{len(curves)} curves, {n} points, {sum(len(c.meetings) for c in curves)} meetings")
-    with on_one_core():
-        alone = seconds(lambda: tracer.followed(seeds, ()), repeats, told=min)
-        both = alone + seconds(begin, repeats, told=min)
-    print(f"{alone:.2f} s, {n / alone:.0f} points a second; with the branches {n / both:.0f}")
+    print(f"{len(curves)} curves, {n} points, {sum(len(c.codim2_points) for c in curves)} meetings")
+    with use_one_core():
+        duration_seconds = measure_cpu_seconds(
+            lambda: tracer.trace_curves(seeds, ()), repeats, result=min
+        )
+        both_values = duration_seconds + measure_cpu_seconds(begin, repeats, result=min)
+    print(
+        f"{duration_seconds:.2f} s, {n / duration_seconds:.0f} points a second; with the branches {n / both_values:.0f}"
+    )
 
 
 if __name__ == "__main__":

@@ -15,17 +15,23 @@ import jax
 import jax.numpy as jnp
 
 import vrw_jax as vrw
-from experiments.shared.command import command
-from experiments.shared.tables import DOCS, FIGURES, markdown, replace, write_named
-from experiments.shared.timing import on_one_core, start_cold
-from vrw_jax.runtime.start import fusion_emitters
+from experiments.shared.command import make_parser
+from experiments.shared.tables import (
+    DOCS,
+    FIGURES,
+    format_markdown,
+    replace_block,
+    write_named_rows,
+)
+from experiments.shared.timing import start_without_cache, use_one_core
+from vrw_jax.runtime.start import fusion_emitter_options
 
 LANES, REPEATS = 256, 10
 Program = tuple[Callable, tuple]
 
 
 def programs() -> dict[str, Program]:
-    params, x, options = vrw.WheelParams(), jnp.array([0.1, 1.6, -0.1]), vrw.Options()
+    params, x, options = vrw.WheelParams(), jnp.array([0.1, 1.6, -0.1]), vrw.StepOptions()
     many = jax.tree.map(lambda value: jnp.full((LANES,), value), params)
     starts = jnp.tile(x, (LANES, 1))
 
@@ -34,7 +40,7 @@ def programs() -> dict[str, Program]:
         return cycle.period, cycle.dls_fraction, cycle.durations
 
     def monitors(params: vrw.WheelParams, x: jax.Array) -> vrw.Margins:
-        return vrw.step(params, x, options=options).monitors
+        return vrw.step(params, x, options=options).margins
 
     return {
         "a step": (lambda p, x: vrw.step(p, x, options=options), (params, x)),
@@ -48,26 +54,28 @@ def programs() -> dict[str, Program]:
     }  # fmt: skip
 
 
-def measured(function: Callable, arguments: tuple) -> dict[str, float]:
+def measure_program(function: Callable, arguments: tuple) -> dict[str, float]:
     """Seconds to trace, machine code included, and to compile, milliseconds to run, each way."""
     began = time.process_time()
     lowered = jax.jit(function).lower(*arguments)
     row, compiled = {"trace_s": time.process_time() - began}, {}
-    for way, on in (("with", True), ("without", False)):
+    for method_name, is_active in (("with", True), ("without", False)):
         began = time.process_time()
-        compiled[way] = lowered.compile(fusion_emitters(on))
-        row[f"compile_{way}_s"] = time.process_time() - began
-        jax.block_until_ready(compiled[way](*arguments))
-        row[f"run_{way}_ms"] = float("inf")
+        compiled[method_name] = lowered.compile(fusion_emitter_options(is_active))
+        row[f"compile_{method_name}_s"] = time.process_time() - began
+        jax.block_until_ready(compiled[method_name](*arguments))
+        row[f"run_{method_name}_ms"] = float("inf")
     for _ in range(REPEATS):
-        for way, program in compiled.items():
+        for method_name, program in compiled.items():
             began = time.process_time()
             jax.block_until_ready(program(*arguments))
-            row[f"run_{way}_ms"] = min(row[f"run_{way}_ms"], 1e3 * (time.process_time() - began))
+            row[f"run_{method_name}_ms"] = min(
+                row[f"run_{method_name}_ms"], 1e3 * (time.process_time() - began)
+            )
     return row
 
 
-SHOWN = {
+TABLE_COLUMNS = {
     "program": "program",
     "trace_s": "trace, s",
     "compile_with_s": "compile with, s",
@@ -78,16 +86,20 @@ SHOWN = {
 
 
 def main() -> None:
-    command(__doc__).parse_args()
+    make_parser(__doc__).parse_args()
     rows = []
-    with on_one_core():
-        start_cold()
+    with use_one_core():
+        start_without_cache()
         for name, program in programs().items():
-            rows.append({"program": name} | {k: f"{v:.3g}" for k, v in measured(*program).items()})
+            rows.append(
+                {"program": name} | {k: f"{v:.3g}" for k, v in measure_program(*program).items()}
+            )
             print(rows[-1], flush=True)
-    write_named(FIGURES / "compile_benchmark.csv", rows)
-    table = markdown(SHOWN.values(), [[row[name] for name in SHOWN] for row in rows])
-    replace(DOCS / "numerics.md", "compile times", table)
+    write_named_rows(FIGURES / "compile_benchmark.csv", rows)
+    table = format_markdown(
+        TABLE_COLUMNS.values(), [[row[name] for name in TABLE_COLUMNS] for row in rows]
+    )
+    replace_block(DOCS / "numerics.md", "compile times", table)
 
 
 if __name__ == "__main__":

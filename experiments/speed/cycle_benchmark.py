@@ -18,18 +18,18 @@ import jax.numpy as jnp
 import numpy as np
 
 import vrw_jax as vrw
-from experiments.shared.command import command, started
-from experiments.shared.tables import DOCS, markdown
-from experiments.shared.timing import on_one_core, processor, seconds
-from experiments.shared.wheels import WIDE_BOX, rows_of
-from experiments.shared.wheels import wheels as wheels_of_rows
-from vrw_jax.cycles import MEASURED
-from vrw_jax.wheel import parameters_of, wheel_of
+from experiments.shared.command import make_parser, parse_and_start_jax
+from experiments.shared.tables import DOCS, format_markdown
+from experiments.shared.timing import describe_processor, measure_cpu_seconds, use_one_core
+from experiments.shared.wheels import WIDE_BOX, draw_parameter_rows
+from experiments.shared.wheels import make_wheels as wheels_of_rows
+from vrw_jax.cycles import CYCLE_MEASURE_FUNCTIONS
+from vrw_jax.wheel import stack_parameters, wheel_from_parameters
 
 N_SETS, N_STAGES, LANES = 2048, 48, 1024
 ON_STABILITY = ("spectral_radius", "spectral_margin", "stability_margin")
 """Derivatives of these are second derivatives of the motion."""
-FIRST = """
+FIRST_GAIT_SCRIPT = """
 import time; began = time.time(), time.process_time()
 import jax
 import vrw_jax as vrw
@@ -42,15 +42,15 @@ print(time.time() - began[0], time.process_time() - began[1])
 
 def wheels(generator: np.random.Generator, n: int) -> vrw.WheelParams:
     """Random wheels, every parameter a lane of its own."""
-    drawn = wheels_of_rows(rows_of(WIDE_BOX, n, generator))
-    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n,)), drawn)
+    drawn_values = wheels_of_rows(draw_parameter_rows(WIDE_BOX, n, generator))
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n,)), drawn_values)
 
 
-def least(function: Callable, *arguments: object) -> float:
+def measure_least_seconds(function: Callable, *arguments: object) -> float:
     """CPU seconds of a call on one core."""
     jax.block_until_ready(function(*arguments))
-    with on_one_core():
-        return seconds(lambda: function(*arguments), told=min)
+    with use_one_core():
+        return measure_cpu_seconds(lambda: function(*arguments), result=min)
 
 
 STARTS = {
@@ -61,21 +61,21 @@ STARTS = {
 """How a process begins; the first two share a cache."""
 
 
-def first_answer(measure: str) -> list[tuple[float, float]]:
+def measure_first_gait(measure: str) -> list[tuple[float, float]]:
     """(wall, CPU) seconds of a process that asks for one gradient, for each of STARTS."""
-    told = []
+    rows = []
     with tempfile.TemporaryDirectory() as cache:
         for start in STARTS.values():
             environment = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
             if "start_jax" in start:
                 environment["JAX_COMPILATION_CACHE_DIR"] = cache
-            command = [sys.executable, "-c", FIRST.format(measure=measure, start=start)]
+            command = [sys.executable, "-c", FIRST_GAIT_SCRIPT.format(measure=measure, start=start)]
             out = subprocess.run(
                 command, env=environment, capture_output=True, text=True, check=True
             )
             wall, cpu = map(float, out.stdout.split()[-2:])
-            told.append((wall, cpu))
-    return told
+            rows.append((wall, cpu))
+    return rows
 
 
 def reference(params: vrw.WheelParams) -> np.ndarray:
@@ -83,17 +83,23 @@ def reference(params: vrw.WheelParams) -> np.ndarray:
 
     A lane whose gait is lost, or jumps, on the way is not reached.
     """
-    ends = parameters_of(params)
-    starts = jnp.broadcast_to(parameters_of(vrw.WheelParams())[:, None], ends.shape)
-    find = jax.jit(jax.vmap(lambda p, guess: vrw.limit_cycle(wheel_of(p, 8), guess=guess)))
-    here = jax.jit(jax.vmap(lambda p: vrw.limit_cycle(wheel_of(p, 8))))(starts.T)
+    ends = stack_parameters(params)
+    starts = jnp.broadcast_to(stack_parameters(vrw.WheelParams())[:, None], ends.shape)
+    find = jax.jit(
+        jax.vmap(lambda p, guess: vrw.limit_cycle(wheel_from_parameters(p, 8), guess=guess))
+    )
+    values_here = jax.jit(jax.vmap(lambda p: vrw.limit_cycle(wheel_from_parameters(p, 8))))(
+        starts.T
+    )
     reached = np.ones(ends.shape[1], bool)
     for share in np.linspace(0.0, 1.0, N_STAGES + 1)[1:]:
-        there = find((starts + share * (ends - starts)).T, here)
-        moved = np.max(np.abs(np.asarray(there.durations - here.durations)), axis=-1)
-        with_dls = np.asarray(there.durations)[:, 0] > 0.0
-        reached &= np.asarray(there.found) & (moved < 0.1) & with_dls
-        here = there
+        values_there = find((starts + share * (ends - starts)).T, values_here)
+        shifted = np.max(
+            np.abs(np.asarray(values_there.durations - values_here.durations)), axis=-1
+        )
+        with_dls = np.asarray(values_there.durations)[:, 0] > 0.0
+        reached &= np.asarray(values_there.found) & (shifted < 0.1) & with_dls
+        values_here = values_there
     return reached
 
 
@@ -101,18 +107,18 @@ def hit_rate() -> dict[str, int]:
     params = wheels(np.random.default_rng(7), N_SETS)
     reached = reference(params)
     cold = jax.jit(jax.vmap(vrw.limit_cycle))(params)
-    found = np.asarray(cold.found)
-    options = vrw.Options.tight()
+    values_array = np.asarray(cold.found)
+    options = vrw.StepOptions.tight()
     walk = jax.jit(jax.vmap(lambda p, x: vrw.return_map(p, x, options=options)))
     x = np.asarray(cold.section_state)
     away = np.max(np.abs(np.asarray(walk(params, cold.section_state)) - x), axis=-1)
     return {
         "sets": N_SETS,
         "reached by continuation": int(reached.sum()),
-        "of those found from a cold start": int((reached & found).sum()),
-        "found besides": int((found & ~reached).sum()),
+        "of those found from a cold start": int((reached & values_array).sum()),
+        "found besides": int((values_array & ~reached).sum()),
         "found, but not confirmed by the event-driven step to 1e-7": int(
-            (found & ~(away < 1e-7)).sum()
+            (values_array & ~(away < 1e-7)).sum()
         ),
     }
 
@@ -121,9 +127,9 @@ def throughput() -> dict[str, float]:
     """Microseconds of one core per cycle, in batches."""
     params = wheels(np.random.default_rng(3), 8 * LANES)
     every = jax.jit(jax.vmap(vrw.limit_cycle))
-    kept = np.flatnonzero(np.asarray(every(params).found))[:LANES]
-    params = jax.tree.map(lambda x: x[kept], params)
-    vectors = parameters_of(params).T
+    retained = np.flatnonzero(np.asarray(every(params).found))[:LANES]
+    params = jax.tree.map(lambda x: x[retained], params)
+    vectors = stack_parameters(params).T
     cold = jax.jit(jax.vmap(vrw.limit_cycle))
     near = cold(jax.tree.map(lambda x: x * (1.0 + 1e-3), params))
 
@@ -137,13 +143,13 @@ def throughput() -> dict[str, float]:
 
     def differentiated(v: jax.Array) -> tuple:
         def told(v: jax.Array) -> tuple:
-            cycle = vrw.limit_cycle(wheel_of(v, 8))
+            cycle = vrw.limit_cycle(wheel_from_parameters(v, 8))
             values = jnp.concatenate([cycle.post_impact, cycle.durations, cycle.dls_fraction[None]])
             return values, cycle.residual
 
         return jax.jacfwd(told, has_aux=True)(v)
 
-    measured = lambda name: lambda v: vrw.limit_cycle(wheel_of(v, 8)).measure(name)
+    measured = lambda name: lambda v: vrw.limit_cycle(wheel_from_parameters(v, 8)).measure(name)
     derived = {
         "gradient of `dls_fraction`": jax.grad(measured("dls_fraction")),
         "gradient of `spectral_radius`": jax.grad(measured("spectral_radius")),
@@ -158,24 +164,25 @@ def throughput() -> dict[str, float]:
         "with nine first derivatives of everything": (jax.jit(jax.vmap(differentiated)), vectors),
         **{name: (jax.jit(jax.vmap(function)), vectors) for name, function in derived.items()},
     }  # fmt: skip
-    return {name: 1e6 * least(*call) / LANES for name, call in table.items()}
+    return {name: 1e6 * measure_least_seconds(*call) / LANES for name, call in table.items()}
 
 
 def sensitivity_ratio() -> dict[str, float]:
     """Milliseconds of one gait alone: a return map, a cycle, and a full sensitivity."""
     params, x = vrw.WheelParams(), vrw.limit_cycle(vrw.WheelParams()).section_state
-    names = [name for name in MEASURED if name not in ON_STABILITY]
+    names = [name for name in CYCLE_MEASURE_FUNCTIONS if name not in ON_STABILITY]
 
     def told(v: jax.Array) -> jax.Array:
-        cycle = vrw.limit_cycle(wheel_of(v, 8))
+        cycle = vrw.limit_cycle(wheel_from_parameters(v, 8))
         return jnp.stack([cycle.measure(name) for name in names])
 
-    v = parameters_of(params)
+    v = stack_parameters(params)
     return {
-        "return map at the default options": 1e3 * least(jax.jit(vrw.return_map), params, x),
-        "limit cycle from the default guess": 1e3 * least(jax.jit(told), v),
+        "return map at the default options": 1e3
+        * measure_least_seconds(jax.jit(vrw.return_map), params, x),
+        "limit cycle from the default guess": 1e3 * measure_least_seconds(jax.jit(told), v),
         f"limit cycle with {len(names)} measures x 9 derivatives": 1e3
-        * least(jax.jit(jax.jacfwd(told)), v),
+        * measure_least_seconds(jax.jit(jax.jacfwd(told)), v),
     }
 
 
@@ -184,30 +191,30 @@ def compiling() -> str:
     answers = [
         (f"gradient of `{measure}`, {state}", f"{wall:.1f}", f"{cpu:.1f}")
         for measure in ("dls_fraction", "spectral_radius")
-        for state, (wall, cpu) in zip(STARTS, first_answer(measure), strict=True)
+        for state, (wall, cpu) in zip(STARTS, measure_first_gait(measure), strict=True)
     ]
-    return markdown(("to the first answer of a process", "wall, s", "CPU, s"), answers)
+    return format_markdown(("to the first answer of a process", "wall, s", "CPU, s"), answers)
 
 
-def batches() -> str:
+def measure_batches() -> str:
     """Cycles side by side."""
     header = (f"batches of {LANES}", "µs per cycle", "per second and core")
     costs = throughput().items()
-    return markdown(header, [(name, f"{us:.0f}", f"{1e6 / us:,.0f}") for name, us in costs])
+    return format_markdown(header, [(name, f"{us:.0f}", f"{1e6 / us:,.0f}") for name, us in costs])
 
 
-def alone() -> str:
+def measure_single_gait() -> str:
     """One gait by itself."""
     costs = sensitivity_ratio()
     unit = next(iter(costs.values()))
     cells = [(name, f"{ms:.2f}", f"{ms / unit:.2f}") for name, ms in costs.items()]
-    return markdown(("one gait alone", "ms", "return maps"), cells)
+    return format_markdown(("one gait alone", "ms", "return maps"), cells)
 
 
-def finding() -> str:
+def measure_hit_rates() -> str:
     """How often gaits are found."""
     box = ", ".join(f"{n} {low:g}…{high:g}" for n, (low, high) in WIDE_BOX.items())
-    table = markdown(("", "wheels"), [(name, f"{n:,}") for name, n in hit_rate().items()])
+    table = format_markdown(("", "wheels"), [(name, f"{n:,}") for name, n in hit_rate().items()])
     return (
         f"Random wheels of the box {box}. Reference: continuation from Table 1 in {N_STAGES} "
         f"steps.\n\n{table}"
@@ -215,16 +222,16 @@ def finding() -> str:
 
 
 def main() -> None:
-    parser = command(__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("file", type=Path, nargs="?", default=DOCS / "cycles.md")
-    file = started(parser).file
+    file = parse_and_start_jax(parser).file
     parts = [
         "# What limit cycles cost, and how often they are found",
-        f"`python -m experiments.speed.cycle_benchmark`; {processor()}, jax {jax.__version__}. CPU "
+        f"`python -m experiments.speed.cycle_benchmark`; {describe_processor()}, jax {jax.__version__}. CPU "
         "seconds, one core; wall times on two. On a shared machine the same code has taken up to "
         "1.5 times more or less.",
     ]
-    for section in (compiling, batches, alone, finding):
+    for section in (compiling, measure_batches, measure_single_gait, measure_hit_rates):
         parts.append(section())
         print(parts[-1], flush=True)
         file.write_text("\n\n".join(parts) + "\n")

@@ -22,10 +22,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import vrw_jax as vrw
-from experiments.shared.command import command, started
-from experiments.shared.tables import DOCS, FIGURES, markdown, replace
-from experiments.shared.timing import on_one_core, processor, seconds
-from experiments.shared.wheels import near_gaits, wheels
+from experiments.shared.command import make_parser, parse_and_start_jax
+from experiments.shared.tables import DOCS, FIGURES, format_markdown, replace_block
+from experiments.shared.timing import describe_processor, measure_cpu_seconds, use_one_core
+from experiments.shared.wheels import draw_wheels_near_gaits, make_wheels
 from experiments.speed.derivative_peers import HeyokaVariations, numba_differences
 from experiments.work_precision.charts import COLOURS
 from vrw_jax import figures as plots
@@ -42,9 +42,9 @@ LABELS = (
     "numba, central differences",
     "diffrax engine, forward mode",
 )
-CLAIMED = 1e-8
+COMPARED_ERROR = 1e-8
 """Error at which methods are compared."""
-FIRST = """
+FIRST_CALL_SCRIPT = """
 import time; began = time.perf_counter()
 import jax, vrw_jax as vrw
 vrw.start_jax()
@@ -52,7 +52,7 @@ params, x = vrw.WheelParams(), vrw.paper_start()
 jax.block_until_ready({call}(params, x))
 print(time.perf_counter() - began)
 """
-ALONE = {
+SINGLE_WHEEL_CALLS = {
     "return_map": "jax.jit(vrw.return_map)",
     "its Jacobian by the state": "jax.jit(jax.jacfwd(vrw.return_map, 1))",
     "its Jacobian by all twelve": "jax.jit(jax.jacfwd(vrw.return_map, (0, 1)))",
@@ -61,101 +61,119 @@ ALONE = {
 }
 
 
-def flat(by: dict, names: Sequence[str]) -> np.ndarray:
+def flatten_derivatives(by_input: dict, names: Sequence[str]) -> np.ndarray:
     """(lanes, 6, columns): of section state, then durations."""
-    whole = [np.concatenate([by[name].section_state, by[name].durations], 1) for name in names]
-    return np.concatenate([x.reshape(*x.shape[:2], -1) for x in whole], 2)
+    full_values = [
+        np.concatenate([by_input[name].section_state, by_input[name].durations], 1)
+        for name in names
+    ]
+    return np.concatenate([x.reshape(*x.shape[:2], -1) for x in full_values], 2)
 
 
 def in_batches(n: int, repeats: int) -> list[tuple]:
     """(tolerance, columns, microseconds a lane, of the values', errors of values and columns)."""
-    rows, states, truth = near_gaits(n)
-    params, some, every = wheels(rows), slice(min(n, 512)), COLUMNS["all twelve"]
-    tight = vrw.Options.tight()
-    exact = vrw.steps(
-        wheels(rows[some]), states[some], options=tight, engine="diffrax", derivatives=every
+    rows, states, truth = draw_wheels_near_gaits(n)
+    params, selection, every = make_wheels(rows), slice(min(n, 512)), COLUMNS["all twelve"]
+    tight = vrw.StepOptions.tight()
+    exact = vrw.step_batch(
+        make_wheels(rows[selection]),
+        states[selection],
+        options=tight,
+        engine="diffrax",
+        derivatives=every,
     )
     table = []
 
-    def timed(options: vrw.Options, asked: Sequence[str]) -> tuple[vrw.Steps, float]:
-        run = lambda: vrw.steps(params, states, options=options, derivatives=asked)
-        told = run()
-        with on_one_core():
-            return told, 1e6 * seconds(run, repeats, told=min) / n
+    def timed(
+        options: vrw.StepOptions, requested_2: Sequence[str]
+    ) -> tuple[vrw.StepBatchResult, float]:
+        run = lambda: vrw.step_batch(params, states, options=options, derivatives=requested_2)
+        result = run()
+        with use_one_core():
+            return result, 1e6 * measure_cpu_seconds(run, repeats, result=min) / n
 
     for tolerance in (1e-6, 1e-8, 1e-10):
-        choose = lambda factor, at=tolerance: vrw.Options(
+        choose = lambda factor, at=tolerance: vrw.StepOptions(
             rtol=at, atol=at, derivative_tightening=factor
         )
-        told, of_values = timed(choose(1.0), ())
-        values = np.concatenate([told.section_state, told.durations], 1)
+        run_result, of_values = timed(choose(1.0), ())
+        values = np.concatenate([run_result.section_state, run_result.durations], 1)
         error = np.quantile(np.max(np.abs(values - truth), 1), 0.99)
         row = (f"{tolerance:.0e}", "", "none", f"{of_values:.2f}", "1", f"{error:.1e}")
         table.append((*row, ""))
-        for factor, (name, asked) in itertools.product((1.0, 20.0), COLUMNS.items()):
-            told, taken = timed(choose(factor), asked)
-            away = np.abs(flat(told.derivatives, asked)[some] - flat(exact.derivatives, asked))
-            row = (f"{tolerance:.0e}", f"{factor:g}", name, f"{taken:.2f}")
+        for factor, (name, requested) in itertools.product((1.0, 20.0), COLUMNS.items()):
+            run_result, used_values = timed(choose(factor), requested)
+            away = np.abs(
+                flatten_derivatives(run_result.derivatives, requested)[selection]
+                - flatten_derivatives(exact.derivatives, requested)
+            )
+            row = (f"{tolerance:.0e}", f"{factor:g}", name, f"{used_values:.2f}")
             off = np.quantile(np.max(away, (1, 2)), 0.99)
-            table.append((*row, f"{taken / of_values:.1f}", "", f"{off:.1e}"))
+            table.append((*row, f"{used_values / of_values:.1f}", "", f"{off:.1e}"))
     return table
 
 
 def candidates(rows: np.ndarray, states: np.ndarray) -> Iterator[tuple[str, str, int, Callable]]:
     """(method, its tolerance, lanes, a run that tells seven columns of each)."""
-    asked = COLUMNS["state, c, k, L\\*, φ"]
+    requested = COLUMNS["state, c, k, L\\*, φ"]
 
     def by_library(engine: str, tolerance: float, n: int) -> Callable:
-        options = vrw.Options(rtol=tolerance, atol=tolerance)
-        params, some = wheels(rows[:n]), states[:n]
-        told = lambda: vrw.steps(params, some, options=options, engine=engine, derivatives=asked)
-        return lambda: flat(told().derivatives, asked)
+        options = vrw.StepOptions(rtol=tolerance, atol=tolerance)
+        params, selection = make_wheels(rows[:n]), states[:n]
+        evaluate = lambda: vrw.step_batch(
+            params, selection, options=options, engine=engine, derivatives=requested
+        )
+        return lambda: flatten_derivatives(evaluate().derivatives, requested)
 
-    few = len(rows) // 16
+    few_items = len(rows) // 16
     for tolerance in (1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10):
         yield LABELS[0], f"{tolerance:.0e}", len(rows), by_library("lanes", tolerance, len(rows))
     for tolerance in (1e-4, 1e-6, 1e-7, 1e-9, 1e-11):
-        run = HeyokaVariations(tolerance).of(rows[:few], states[:few])
-        yield LABELS[1], f"{tolerance:.0e}", few, run
+        run = HeyokaVariations(tolerance).make_run(rows[:few_items], states[:few_items])
+        yield LABELS[1], f"{tolerance:.0e}", few_items, run
     for tolerance, share in ((1e-8, 1e-4), (1e-10, 1e-5), (1e-12, 1e-6), (1e-13, 1e-6)):
-        run = numba_differences(rows[:few], states[:few], tolerance, share)
-        yield LABELS[2], f"{tolerance:.0e}, moved by {share:.0e}", few, run
+        run = numba_differences(rows[:few_items], states[:few_items], tolerance, share)
+        yield LABELS[2], f"{tolerance:.0e}, moved by {share:.0e}", few_items, run
     for tolerance in (1e-6, 1e-8, 3e-9, 1e-10):
-        yield LABELS[3], f"{tolerance:.0e}", few, by_library("diffrax", tolerance, few)
+        yield LABELS[3], f"{tolerance:.0e}", few_items, by_library("diffrax", tolerance, few_items)
 
 
-def beside_others(n: int, repeats: int) -> list[dict]:
+def compare_with_others(n: int, repeats: int) -> list[dict]:
     """Of each candidate its error and the steps with seven columns per second and core."""
-    rows, states, _ = near_gaits(n)
-    asked, some = COLUMNS["state, c, k, L\\*, φ"], slice(n // 16)
-    exact = flat(
-        vrw.steps(
-            wheels(rows[some]), states[some], options=vrw.Options.tight(), engine="diffrax",
-            derivatives=asked,
+    rows, states, _ = draw_wheels_near_gaits(n)
+    requested, selection = COLUMNS["state, c, k, L\\*, φ"], slice(n // 16)
+    exact = flatten_derivatives(
+        vrw.step_batch(
+            make_wheels(rows[selection]), states[selection], options=vrw.StepOptions.tight(), engine="diffrax",
+            derivatives=requested,
         ).derivatives,
-        asked,
+        requested,
     )  # fmt: skip
     table, runs = list[dict](), []
-    for method, at, lanes, run in candidates(rows, states):
-        error = np.quantile(np.max(np.abs(run()[some] - exact), (1, 2)), 0.99)
-        table.append({"method": method, "at": at, "error": error, "lanes": lanes, "taken": []})
+    for method, value_at, lanes, run in candidates(rows, states):
+        error = np.quantile(np.max(np.abs(run()[selection] - exact), (1, 2)), 0.99)
+        table.append(
+            {"method": method, "at": value_at, "error": error, "lanes": lanes, "taken": []}
+        )
         runs.append(run)
-    with on_one_core():
+    with use_one_core():
         for _ in range(repeats):  # in turns: a shared machine's clock changes
             for entry, run in zip(table, runs, strict=True):
-                entry["taken"].append(seconds(run, 1))
+                entry["taken"].append(measure_cpu_seconds(run, 1))
     return [x | {"speed": x["lanes"] / np.median(x["taken"])} for x in table]
 
 
-def drawn(table: list[dict]) -> None:
+def draw_chart(table: list[dict]) -> None:
     """Speed over error."""
     with plots.figure_style():
-        figure, axes = plt.subplots(figsize=(plots.PAGE, 3.6))
+        figure, axes = plt.subplots(figsize=(plots.PAGE_WIDTH_INCHES, 3.6))
         known_as = ("lane engine", "heyoka", "numba", "diffrax engine")
-        for label, known, marker in zip(LABELS, known_as, "osD^", strict=True):
-            some = sorted((x for x in table if x["method"] == label), key=lambda x: x["error"])
-            told = [x["error"] for x in some], [x["speed"] for x in some]
-            axes.loglog(*told, marker=marker, ms=4, color=COLOURS[known], label=label)
+        for label, known_values, marker in zip(LABELS, known_as, "osD^", strict=True):
+            sorted_items = sorted(
+                (x for x in table if x["method"] == label), key=lambda x: x["error"]
+            )
+            result = [x["error"] for x in sorted_items], [x["speed"] for x in sorted_items]
+            axes.loglog(*result, marker=marker, ms=4, color=COLOURS[known_values], label=label)
         axes.set(
             xlabel="error of derivatives, 99 % of lanes below it",
             ylabel="gait steps with seven columns\nper second and core",
@@ -164,20 +182,26 @@ def drawn(table: list[dict]) -> None:
         plots.save(figure, FIGURES, "derivatives")
 
 
-def fastest(table: list[dict]) -> list[tuple]:
+def find_fastest(table: list[dict]) -> list[tuple]:
     """Rows of each method's quickest entry whose error is at most CLAIMED."""
     best = {}
     for entry in sorted(table, key=lambda x: x["speed"]):
-        if entry["error"] <= CLAIMED:
+        if entry["error"] <= COMPARED_ERROR:
             best[entry["method"]] = entry
-    of = best[LABELS[0]]["speed"]
+    of_values = best[LABELS[0]]["speed"]
     return [
-        (x["method"], x["at"], f"{x['error']:.1e}", f"{x['speed']:,.0f}", f"{x['speed'] / of:.2g}")
+        (
+            x["method"],
+            x["at"],
+            f"{x['error']:.1e}",
+            f"{x['speed']:,.0f}",
+            f"{x['speed'] / of_values:.2g}",
+        )
         for x in (best[label] for label in LABELS if label in best)
     ]
 
 
-def alone() -> list[tuple]:
+def measure_single_calls() -> list[tuple]:
     """(call, microseconds, seconds to a first answer with an empty cache, the same cached).
 
     Python has its own bytecode of every module, as after any installation.
@@ -185,16 +209,16 @@ def alone() -> list[tuple]:
     params, x, table = vrw.WheelParams(), vrw.paper_start(), []
     installed = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
     subprocess.run([sys.executable, "-c", "import vrw_jax, xarray"], env=installed, check=True)
-    for name, call in ALONE.items():
+    for name, call in SINGLE_WHEEL_CALLS.items():
         with tempfile.TemporaryDirectory() as folder:
-            command = [sys.executable, "-c", FIRST.format(call=call)]
+            command = [sys.executable, "-c", FIRST_CALL_SCRIPT.format(call=call)]
             where = installed | {"JAX_COMPILATION_CACHE_DIR": folder}
-            told = lambda command=command, where=where: (
+            evaluate = lambda command=command, where=where: (
                 subprocess.run(
                     command, env=where, check=True, capture_output=True, text=True
                 ).stdout
             )
-            cold, warm = float(told()), float(told())
+            cold, warm = float(evaluate()), float(evaluate())
         function = eval(call, {"jax": jax, "vrw": vrw})  # this file's own text
         jax.block_until_ready(function(params, x))
         times = []
@@ -207,23 +231,29 @@ def alone() -> list[tuple]:
 
 
 def main() -> None:
-    parser = command(__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--lanes", type=int, default=2048)
     parser.add_argument("--repeats", type=int, default=9)
-    chosen = started(parser)
+    chosen = parse_and_start_jax(parser)
     header = (
         "tolerance", "tightened by", "columns", "µs a lane", "of the values'",
         "p99 error of values", "of derivatives",
     )  # fmt: skip
-    batches = markdown(header, in_batches(chosen.lanes, chosen.repeats))
-    one = markdown(("one wheel", "µs", "first answer, s", "the same, cached, s"), alone())
-    others = beside_others(chosen.lanes, chosen.repeats)
-    drawn(others)
+    batches = format_markdown(header, in_batches(chosen.lanes, chosen.repeats))
+    one = format_markdown(
+        ("one wheel", "µs", "first answer, s", "the same, cached, s"), measure_single_calls()
+    )
+    others = compare_with_others(chosen.lanes, chosen.repeats)
+    draw_chart(others)
     header = ("method", "tolerance", "p99 error", "steps with 7 columns per second and core",
               "of the lanes'")  # fmt: skip
-    compared = markdown(header, fastest(others))
-    told = f"{processor()}; load average {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores."
-    replace(DOCS / "engine.md", "derivatives", f"{batches}\n\n{one}\n\n{compared}\n\n{told}")
+    compared = format_markdown(header, find_fastest(others))
+    result = (
+        f"{describe_processor()}; load average {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores."
+    )
+    replace_block(
+        DOCS / "engine.md", "derivatives", f"{batches}\n\n{one}\n\n{compared}\n\n{result}"
+    )
 
 
 if __name__ == "__main__":

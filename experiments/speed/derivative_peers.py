@@ -11,32 +11,34 @@ from typing import Any
 import jax
 import numpy as np
 
-from experiments.shared.command import extra
-from experiments.shared.wheels import wheels
+from experiments.shared.command import require_extra
+from experiments.shared.wheels import make_wheels
 from experiments.speed import peers
 from vrw_jax.wheel import transitions
 
-hy = extra("heyoka")
+hy = require_extra("heyoka")
 
 COLUMNS = 7
 """Section state, then c, k, L*, phi: the order of `experiments.shared.wheels.BOX`."""
 
 
-def landed(rows: np.ndarray, states: np.ndarray) -> np.ndarray:
+def compute_landing(rows: np.ndarray, states: np.ndarray) -> np.ndarray:
     """(theta, its rate, distance of the feet) after the landing, of each lane."""
-    landing = transitions.land(wheels(rows).symbols(), *np.asarray(states).T)
+    landing = transitions.land(make_wheels(rows).symbols(), *np.asarray(states).T)
     return np.stack([landing.theta, landing.motion.dtheta, landing.distance], 1)
 
 
-def landed_and_columns(rows: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def compute_landing_with_tangents(
+    rows: np.ndarray, states: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """`landed`, and its derivatives (lanes, 3, COLUMNS)."""
 
     def one(given: jax.Array) -> jax.Array:
-        landing = transitions.land(wheels(given[3:]).symbols(), *given[:3])
+        landing = transitions.land(make_wheels(given[3:]).symbols(), *given[:3])
         return jax.numpy.stack([landing.theta, landing.motion.dtheta, landing.distance])
 
     columns = jax.jit(jax.vmap(jax.jacfwd(one)))(np.concatenate([states, rows], 1))
-    return landed(rows, states), np.asarray(columns)
+    return compute_landing(rows, states), np.asarray(columns)
 
 
 def numba_differences(
@@ -44,18 +46,18 @@ def numba_differences(
 ) -> Callable[[], np.ndarray]:
     """Central differences, each number moved by a `share` of its size in Table 1's gait."""
     size = share * np.array([0.3, 1.0, 1.0, 100.0, 500.0, 1.0, 0.3])
-    moved = []
+    shifted_rows = []
     for column, sign in np.ndindex(COLUMNS, 2):
         change = np.zeros(COLUMNS)
         change[column] = size[column] * (1 - 2 * sign)
         x, wheel = states + change[:3], rows + change[3:]
-        moved.append((landed(wheel, x)[:, :2], peers.pack(wheels(wheel))))
+        shifted_rows.append((compute_landing(wheel, x)[:, :2], peers.pack(make_wheels(wheel))))
 
     def run() -> np.ndarray:
-        told = [peers.numba_steps(*each, tolerance)[:, :6] for each in moved]
-        return np.stack([(a - b) for a, b in zip(told[::2], told[1::2], strict=True)], 2) / (
-            2.0 * size
-        )
+        result_list = [peers.numba_steps(*each, tolerance)[:, :6] for each in shifted_rows]
+        return np.stack(
+            [(a - b) for a, b in zip(result_list[::2], result_list[1::2], strict=True)], 2
+        ) / (2.0 * size)
 
     return run
 
@@ -78,10 +80,10 @@ class _Phase:
         start = [1.0] * self.n
         self.flow = hy.taylor_adaptive(equations, start, tol=tolerance, t_events=events)
         self.identity = self.flow.state[self.n :].copy()
-        by = [*self.state, *moving]
-        told = [*slopes, *(hy.diff(guard, x) for x in by), *after]
-        told += [hy.diff(y, x) for y in after for x in by]
-        self.told, self.n_after = hy.cfunc(told, self.state), len(after)
+        by_input = [*self.state, *moving]
+        rows = [*slopes, *(hy.diff(guard, x) for x in by_input), *after]
+        rows += [hy.diff(y, x) for y in after for x in by_input]
+        self.told, self.n_after = hy.cfunc(rows, self.state), len(after)
 
     def __call__(
         self, x: np.ndarray, dx: np.ndarray, numbers: np.ndarray, dnumbers: np.ndarray
@@ -92,14 +94,14 @@ class _Phase:
         flow.time, flow.pars[:] = 0.0, numbers[: len(flow.pars)]
         flow.state[:n], flow.state[n:] = x, self.identity
         flow.propagate_until(20.0)
-        moved = flow.state[n:].reshape(n, n + m) @ np.concatenate([dx, dnumbers])
-        told = self.told(flow.state[:n], pars=numbers[: self.told.nparams])
-        slopes, by_guard = told[:n], told[n : 2 * n + m]
-        after = told[2 * n + m : 2 * n + m + self.n_after]
-        by_after = told[2 * n + m + self.n_after :].reshape(self.n_after, n + m)
-        later = -(by_guard @ np.concatenate([moved, dnumbers])) / (by_guard[:n] @ slopes)
-        moved = moved + np.outer(slopes, later)
-        return after, by_after @ np.concatenate([moved, dnumbers]), flow.time, later
+        shifted = flow.state[n:].reshape(n, n + m) @ np.concatenate([dx, dnumbers])
+        result = self.told(flow.state[:n], pars=numbers[: self.told.nparams])
+        slopes, by_guard = result[:n], result[n : 2 * n + m]
+        after = result[2 * n + m : 2 * n + m + self.n_after]
+        by_after = result[2 * n + m + self.n_after :].reshape(self.n_after, n + m)
+        later_value = -(by_guard @ np.concatenate([shifted, dnumbers])) / (by_guard[:n] @ slopes)
+        shifted = shifted + np.outer(slopes, later_value)
+        return after, by_after @ np.concatenate([shifted, dnumbers]), flow.time, later_value
 
 
 class HeyokaVariations:
@@ -127,10 +129,10 @@ class HeyokaVariations:
             make([(th, w), (L1, v1), (w, z1), (v1, z2)], height, [th, w, v1], moving),
         )  # fmt: skip
 
-    def of(self, rows: np.ndarray, states: np.ndarray) -> Callable[[], np.ndarray]:
+    def make_run(self, rows: np.ndarray, states: np.ndarray) -> Callable[[], np.ndarray]:
         """A run over these lanes: columns (lanes, 6, COLUMNS)."""
-        x, dx = landed_and_columns(rows, states)
-        numbers = np.concatenate([peers.pack(wheels(rows)), x[:, 2:]], 1)
+        x, dx = compute_landing_with_tangents(rows, states)
+        numbers = np.concatenate([peers.pack(make_wheels(rows)), x[:, 2:]], 1)
         numbers[:, 7] = rows[:, 3]
         unit = np.eye(COLUMNS)[3:]
 

@@ -21,14 +21,20 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import vrw_jax as vrw
-from experiments.shared.command import command
-from experiments.shared.tables import DOCS, markdown, read, replace, write_named
-from experiments.shared.timing import on_one_core, processor, start_cold
-from experiments.shared.wheels import near_gaits, wheels
+from experiments.shared.command import make_parser
+from experiments.shared.tables import (
+    DOCS,
+    format_markdown,
+    read_table,
+    replace_block,
+    write_named_rows,
+)
+from experiments.shared.timing import describe_processor, start_without_cache, use_one_core
+from experiments.shared.wheels import draw_wheels_near_gaits, make_wheels
 from experiments.speed import peers
 from experiments.work_precision.charts import COLOURS
 from vrw_jax import figures as plots
-from vrw_jax.batches.batch import work_order
+from vrw_jax.batches.batch import sort_by_work
 from vrw_jax.wheel import PARAMETER_NAMES, transitions
 
 LABELS = {
@@ -44,20 +50,20 @@ KNOWN_AS = (
     "collocation", "lane engine", "diffrax by hand", "diffrax engine", "numba", "heyoka", "SciPy"
 )  # fmt: skip
 """Whose colour each has: those of work_precision/charts."""
-CLAIMED = 1e-8
+COMPARED_ERROR = 1e-8
 """Error at which engines are compared."""
 
 
 def by_library(engine, solver, tolerance):
     """Runs of the library's engine over rows and states: to states and durations."""
-    options = vrw.Options(solver=solver, rtol=tolerance, atol=tolerance)
+    options = vrw.StepOptions(solver=solver, rtol=tolerance, atol=tolerance)
 
     def prepare(rows, states):
-        params = wheels(rows)
+        params = make_wheels(rows)
 
         def run():
-            found = vrw.steps(params, states, options=options, engine=engine)
-            return np.concatenate([found.section_state, found.durations], 1)
+            batch_result = vrw.step_batch(params, states, options=options, engine=engine)
+            return np.concatenate([batch_result.section_state, batch_result.durations], 1)
 
         return run
 
@@ -68,11 +74,13 @@ def by_collocation(options, expected):
     """Runs in fixed work, lanes that fail their check by the lane engine."""
 
     def prepare(rows, states):
-        params, near = wheels(rows), expected[: len(rows)]
+        params, near = make_wheels(rows), expected[: len(rows)]
 
         def run():
-            found = vrw.steps(params, states, options=options, engine="collocation", durations=near)
-            return np.concatenate([found.section_state, found.durations], 1)
+            batch_result = vrw.step_batch(
+                params, states, options=options, engine="collocation", durations=near
+            )
+            return np.concatenate([batch_result.section_state, batch_result.durations], 1)
 
         return run
 
@@ -86,12 +94,12 @@ def by_peer(function, side_by_side=False):
     """
 
     def prepare(rows, states):
-        params = wheels(rows)
+        params = make_wheels(rows)
         back = slice(None)
         if side_by_side:
             columns = [np.asarray(getattr(params, name)) for name in PARAMETER_NAMES]
-            order = work_order(columns, states)
-            params, states, back = wheels(rows[order]), states[order], np.argsort(order)
+            order = sort_by_work(columns, states)
+            params, states, back = make_wheels(rows[order]), states[order], np.argsort(order)
         landing = transitions.land(params.symbols(), *np.asarray(states).T)
         starts = np.asarray(np.stack([landing.theta, landing.motion.dtheta], 1))
         packed = peers.pack(params)
@@ -103,7 +111,7 @@ def by_peer(function, side_by_side=False):
 def candidates(durations):
     """(engine, method, tolerance, lanes, prepare): one entry for each row of the table."""
     near = durations * np.random.default_rng(3).uniform(0.97, 1.03, durations.shape)
-    options = vrw.Options(rtol=6e-8, atol=6e-8)
+    options = vrw.StepOptions(rtol=6e-8, atol=6e-8)
     yield "collocation", "Gauss-4", 6e-8, 1.0, by_collocation(options, near)
     for solver in ("Tsit5", "Dopri5", "Dopri8"):
         for tolerance in (1e-6, 1e-7, 6e-8, 1.5e-8, 1e-9, 1e-10):
@@ -139,9 +147,9 @@ def compare(rows, states, truth, repeats):
         n = max(int(share * len(rows)), 16)
         run = make(rows[:n], states[:n])
         begin = time.perf_counter()
-        found = run()
+        run_result = run()
         first = time.perf_counter() - begin
-        error = np.quantile(np.max(np.abs(found - truth[:n]), 1), 0.99)
+        error = np.quantile(np.max(np.abs(run_result - truth[:n]), 1), 0.99)
         entry = {"engine": engine, "method": method, "tolerance": tolerance, "p99_error": error}
         table.append(entry | {"lanes": n, "first_call_s": first, "times": []})
         runs.append(run)
@@ -160,7 +168,7 @@ def at_claimed_error(table):
     """The fastest entry of each engine with an error of at most CLAIMED."""
     best = {}
     for entry in sorted(table, key=lambda e: e["steps_per_s"]):
-        if entry["p99_error"] <= CLAIMED:
+        if entry["p99_error"] <= COMPARED_ERROR:
             best[entry["engine"]] = entry
     return {name: best[name] for name in LABELS if name in best}
 
@@ -178,10 +186,10 @@ def cost_of_failures(rows, states, repeats):
     for repeat in range(repeats):
         for k, share in enumerate(shares):
             fails = random.permutation(len(rows)) < share * len(rows)
-            some = np.where(fails[:, None], failing_rows, rows)
+            selection = np.where(fails[:, None], failing_rows, rows)
             start = np.where(fails[:, None], failing, states)
             for name, (prepare, n) in runs.items():
-                run = prepare(some[:n], start[:n])
+                run = prepare(selection[:n], start[:n])
                 begin = time.process_time()
                 run()
                 cost[name][repeat, k] = (time.process_time() - begin) / n * 1e6
@@ -191,14 +199,16 @@ def cost_of_failures(rows, states, repeats):
 def write(table, shares, cost, out):
     """Table, page and charts."""
     figures = out / "figures"
-    shown = {"p99_error": ".2e", "steps_per_s": ".0f", "first_call_s": ".1f"}
-    rounded = [entry | {k: format(entry[k], form) for k, form in shown.items()} for entry in table]
-    write_named(figures / "engine.csv", rounded)
+    shown_by_name = {"p99_error": ".2e", "steps_per_s": ".0f", "first_call_s": ".1f"}
+    rounded = [
+        entry | {k: format(entry[k], form) for k, form in shown_by_name.items()} for entry in table
+    ]
+    write_named_rows(figures / "engine.csv", rounded)
     lines = [
         {"share": f"{share:g}"} | {name: f"{values[k]:.4g}" for name, values in cost.items()}
         for k, share in enumerate(shares)
     ]
-    write_named(figures / "engine_failures.csv", lines)
+    write_named_rows(figures / "engine_failures.csv", lines)
     best = at_claimed_error(table)
     fastest = best["lanes"]["steps_per_s"]
     header = ("engine", "method, tolerance", "p99 error", "gait steps per second and core")
@@ -217,12 +227,12 @@ def write(table, shares, cost, out):
     quiet = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
     versions = ", ".join(f"{name} {version(name)}" for name in packages)
     text = (
-        f"{markdown(header, cells)}\n\n"
-        f"{processor()}; Python {platform.python_version()}, {versions}; load average {quiet:.1f} "
+        f"{format_markdown(header, cells)}\n\n"
+        f"{describe_processor()}; Python {platform.python_version()}, {versions}; load average {quiet:.1f} "
         f"on {os.cpu_count()} cores."
     )
     print(text)
-    replace(out / "engine.md", "speeds", text)
+    replace_block(out / "engine.md", "speeds", text)
     draw(table, shares, cost, figures)
 
 
@@ -236,36 +246,38 @@ def redraw(figures):
     numbers = ("p99_error", "steps_per_s")
     table = [
         entry | {name: float(entry[name]) for name in numbers}
-        for entry in read(figures / "engine.csv")
+        for entry in read_table(figures / "engine.csv")
     ]
-    lines = read(figures / "engine_failures.csv")
-    kept = {name: [float(line[name]) for line in lines] for name in lines[0]}
-    shares = np.array(kept.pop("share"))
-    draw(table, shares, kept, figures)
+    lines = read_table(figures / "engine_failures.csv")
+    retained_by_name = {name: [float(line[name]) for line in lines] for name in lines[0]}
+    shares = np.array(retained_by_name.pop("share"))
+    draw(table, shares, retained_by_name, figures)
 
 
 def draw_charts(table, shares, cost):
     """Speed over error of every engine, and cost over the share of lanes that fall back."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(plots.PAGE, 3.9))
+    figure, (left_part, right) = plt.subplots(1, 2, figsize=(plots.PAGE_WIDTH_INCHES, 3.9))
     markers = dict(zip(("Tsit5", "Dopri5", "Dopri8"), "os^", strict=True))
-    colours = {name: COLOURS[known] for name, known in zip(LABELS, KNOWN_AS, strict=True)}
+    colours = {
+        name: COLOURS[known_values] for name, known_values in zip(LABELS, KNOWN_AS, strict=True)
+    }
     for name, label in LABELS.items():
         for method in dict.fromkeys(e["method"] for e in table if e["engine"] == name):
-            some = [e for e in table if (e["engine"], e["method"]) == (name, method)]
-            some.sort(key=lambda e: e["p99_error"])
+            selection = [e for e in table if (e["engine"], e["method"]) == (name, method)]
+            selection.sort(key=lambda e: e["p99_error"])
             several = name in ("lanes", "by hand", "diffrax")
-            left.loglog(
-                [e["p99_error"] for e in some],
-                [e["steps_per_s"] for e in some],
+            left_part.loglog(
+                [e["p99_error"] for e in selection],
+                [e["steps_per_s"] for e in selection],
                 ms=4,
                 marker=markers.get(method, "o") if several else "D",
                 linestyle="-" if name in ("lanes", "collocation") else "--",
                 color=colours[name],
                 label=f"{label}, {method}" if several else label,
             )
-    left.axvline(CLAIMED, color="0.7", lw=1)
-    left.set(xlabel="error, 99 % of lanes below it", ylabel="gait steps per second and core")
-    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    left_part.axvline(COMPARED_ERROR, color="0.7", lw=1)
+    left_part.set(xlabel="error, 99 % of lanes below it", ylabel="gait steps per second and core")
+    figure.legend(*left_part.get_legend_handles_labels(), loc="outside lower center", ncols=2)
     for name, values in cost.items():
         right.semilogy(100.0 * shares, values, "o-", ms=4, color=colours[name], label=LABELS[name])
     right.set(xlabel="lanes that fall back [%]", ylabel="CPU time per lane [µs]")
@@ -275,7 +287,7 @@ def draw_charts(table, shares, cost):
 
 
 def main():
-    parser = command(__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--lanes", type=int, default=4096)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--out", type=Path, default=DOCS)
@@ -284,9 +296,9 @@ def main():
     if chosen.redraw:
         redraw(chosen.out / "figures")
         return
-    with on_one_core():
-        start_cold()
-        rows, states, truth = near_gaits(chosen.lanes)
+    with use_one_core():
+        start_without_cache()
+        rows, states, truth = draw_wheels_near_gaits(chosen.lanes)
         table = compare(rows, states, truth, chosen.repeats)
         shares, cost = cost_of_failures(rows, states, chosen.repeats)
     write(table, shares, cost, chosen.out)

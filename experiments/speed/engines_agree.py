@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import vrw_jax as vrw
-from experiments.shared.command import command, started
-from experiments.shared.tables import DOCS, markdown, replace
-from vrw_jax.wheel import PARAMETER_NAMES, Outcome, wheel_of
+from experiments.shared.command import make_parser, parse_and_start_jax
+from experiments.shared.tables import DOCS, format_markdown, replace_block
+from vrw_jax.wheel import PARAMETER_NAMES, Outcome, wheel_from_parameters
 
 BOX = {
     "damping": (5.0, 400.0),
@@ -39,10 +39,10 @@ RESTS = 4.0
 """Duration of double support, s, from which a wheel that balances on two legs ends as its rounding
 will: that doubles every 0.2 s, twenty times by then."""
 
-Told = tuple[np.ndarray, np.ndarray]  # outcome; state and durations, (lanes, 6)
+StepValues = tuple[np.ndarray, np.ndarray]  # outcome; state and durations, (lanes, 6)
 
 
-def drawn(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def draw_wheels(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Parameters, (lanes, 9), and section states."""
     random = np.random.default_rng(seed)
     rows = np.tile([float(getattr(vrw.WheelParams(), name)) for name in PARAMETER_NAMES], (n, 1))
@@ -51,30 +51,32 @@ def drawn(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return rows, random.uniform(*STARTS, (n, 3))
 
 
-def stepped(
-    rows: np.ndarray, states: np.ndarray, engine: str, options: vrw.Options
-) -> tuple[Told, np.ndarray]:
+def compute_steps(
+    rows: np.ndarray, states: np.ndarray, engine: str, options: vrw.StepOptions
+) -> tuple[StepValues, np.ndarray]:
     """One step of each, and how many steps the solver tried."""
-    params = wheel_of(jnp.asarray(rows.T), 8)
-    found = vrw.steps(params, states, options=options, engine=engine)  # type: ignore[arg-type]
-    values = np.concatenate([found.section_state, found.durations], 1)
-    return (np.asarray(found.outcome), values), np.asarray(found.solver_steps)
+    params = wheel_from_parameters(jnp.asarray(rows.T), 8)
+    batch_result = vrw.step_batch(params, states, options=options, engine=engine)  # type: ignore[arg-type]
+    values = np.concatenate([batch_result.section_state, batch_result.durations], 1)
+    return (np.asarray(batch_result.outcome), values), np.asarray(batch_result.solver_steps)
 
 
 def by_diffrax(
-    rows: np.ndarray, states: np.ndarray, like: np.ndarray, options: vrw.Options
-) -> Told:
+    rows: np.ndarray, states: np.ndarray, like: np.ndarray, options: vrw.StepOptions
+) -> StepValues:
     """In batches of one size, each of lanes that take about as long: `like` tells how long."""
     n, order = len(rows), np.argsort(like)
     outcome, values = np.empty(n, int), np.empty((n, 6))
     for begin in range(0, n, BATCH):
-        some = order[np.minimum(np.arange(begin, begin + BATCH), n - 1)]
-        (outcome[some], values[some]), _ = stepped(rows[some], states[some], "diffrax", options)
+        selection = order[np.minimum(np.arange(begin, begin + BATCH), n - 1)]
+        (outcome[selection], values[selection]), _ = compute_steps(
+            rows[selection], states[selection], "diffrax", options
+        )
         print(f"{min(begin + BATCH, n):,} of {n:,} lanes by diffrax", flush=True)
     return outcome, values
 
 
-def apart(one: Told, other: Told) -> np.ndarray:
+def compute_difference(one: StepValues, other: StepValues) -> np.ndarray:
     """How far two engines' results differ; infinite where outcomes do."""
     away = np.max(np.abs(one[1] - other[1]) / (1.0 + np.abs(other[1])), axis=1)
     return np.where(one[0] == other[0], away, np.inf)
@@ -82,71 +84,83 @@ def apart(one: Told, other: Told) -> np.ndarray:
 
 def moved_by(by_lanes: Callable, rows: np.ndarray, states: np.ndarray, away: float) -> np.ndarray:
     """How far the lanes' own results move with a start that much away."""
-    here = by_lanes(rows, states)
+    values_here = by_lanes(rows, states)
     signs = np.concatenate([np.eye(3), -np.eye(3)])
-    return np.max([apart(by_lanes(rows, states * (1.0 + away * s)), here) for s in signs], axis=0)
+    return np.max(
+        [compute_difference(by_lanes(rows, states * (1.0 + away * s)), values_here) for s in signs],
+        axis=0,
+    )
 
 
 def reasons(n: int, seed: int) -> tuple[list[tuple[str, int, str]], np.ndarray, str]:
     """(reason, lanes, their largest difference), lanes without one, and how the rest differs."""
-    rows, states = drawn(n, seed)
-    default, tight = vrw.Options(), vrw.Options.tight()
-    lanes, tried = stepped(rows, states, "lanes", default)
-    difference = apart(lanes, by_diffrax(rows, states, tried, default))
+    rows, states = draw_wheels(n, seed)
+    default, tight = vrw.StepOptions(), vrw.StepOptions.tight()
+    lanes, tried = compute_steps(rows, states, "lanes", default)
+    difference = compute_difference(lanes, by_diffrax(rows, states, tried, default))
     agree = difference <= AGREE
     quantiles = np.quantile(difference[agree], (0.5, 0.99, 1.0))
-    told = [(f"the same outcome, and within {AGREE:g}", int(agree.sum()), f"{quantiles[2]:.1e}")]
+    result_list = [
+        (f"the same outcome, and within {AGREE:g}", int(agree.sum()), f"{quantiles[2]:.1e}")
+    ]
 
-    left = np.flatnonzero(~agree)
+    left_part = np.flatnonzero(~agree)
 
-    def explained(reason: str, by: np.ndarray) -> np.ndarray:
-        most = np.max(difference[left[by]], initial=0.0)
-        size = f"{most:.1e}" if np.isfinite(most) else "outcomes"
-        told.append((reason, int(by.sum()), size if by.any() else ""))
-        return left[~by]
+    def explained(reason: str, by_input: np.ndarray) -> np.ndarray:
+        maximum = np.max(difference[left_part[by_input]], initial=0.0)
+        size = f"{maximum:.1e}" if np.isfinite(maximum) else "outcomes"
+        result_list.append((reason, int(by_input.sum()), size if by_input.any() else ""))
+        return left_part[~by_input]
 
-    by_lanes = lambda rows, states: stepped(rows, states, "lanes", tight)[0]
-    again, tried = stepped(rows[left], states[left], "lanes", tight)
-    tightly = by_diffrax(rows[left], states[left], tried, tight)
-    closer = apart(again, tightly)
-    rests = np.minimum(again[1][:, 3], tightly[1][:, 3]) > RESTS
+    by_lanes = lambda rows, states: compute_steps(rows, states, "lanes", tight)[0]
+    second_result, tried = compute_steps(rows[left_part], states[left_part], "lanes", tight)
+    tightly = by_diffrax(rows[left_part], states[left_part], tried, tight)
+    closer = compute_difference(second_result, tightly)
+    rests = np.minimum(second_result[1][:, 3], tightly[1][:, 3]) > RESTS
     others = (closer > TIGHTLY) & ~rests
     at_rest = f"both come to rest upright: double support of more than {RESTS:g} s"
-    left, rests = (
+    left_part, rests = (
         explained(f"within {TIGHTLY:g} at tolerances of 1e-13", closer <= TIGHTLY),
         rests[closer > TIGHTLY],
     )
-    left, closer = explained(at_rest, rests), closer[others]
-    less = vrw.Options(rtol=LESS, atol=LESS)
-    again, tried = stepped(rows[left], states[left], "lanes", less)
-    near = apart(again, by_diffrax(rows[left], states[left], tried, less)) <= AGREE
+    left_part, closer = explained(at_rest, rests), closer[others]
+    less = vrw.StepOptions(rtol=LESS, atol=LESS)
+    second_result, tried = compute_steps(rows[left_part], states[left_part], "lanes", less)
+    near = (
+        compute_difference(
+            second_result, by_diffrax(rows[left_part], states[left_part], tried, less)
+        )
+        <= AGREE
+    )
     reason = f"within {AGREE:g} at tolerances of {LESS:g}; at 1e-13 an engine gives up"
-    left, closer = explained(reason, near), closer[~near]
+    left_part, closer = explained(reason, near), closer[~near]
     for away in AWAY:
-        if not len(left):
+        if not len(left_part):
             break
-        moves = moved_by(by_lanes, rows[left], states[left], away)
+        moves = moved_by(by_lanes, rows[left_part], states[left_part], away)
         which = moves >= closer
-        left = explained(f"a start {away:g} away differs as much, or ends otherwise", which)
+        left_part = explained(f"a start {away:g} away differs as much, or ends otherwise", which)
         closer = closer[~which]
-    told.append(("no reason found", len(left), ""))
+    result_list.append(("no reason found", len(left_part), ""))
     spread = "median {:.1e}, 99th percentile {:.1e}, largest {:.1e}".format(*quantiles)
     codes = np.unique(lanes[0], return_counts=True)
     each = zip(*codes, strict=True)
     names = ", ".join(f"{count:,} {Outcome(int(code)).name}" for code, count in each)
-    return told, left, f"Outcomes: {names}. Where they agree: {spread}."
+    return result_list, left_part, f"Outcomes: {names}. Where they agree: {spread}."
 
 
 def main() -> None:
-    parser = command(__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--lanes", type=int, default=1_000_000)
     parser.add_argument("--seed", type=int, default=0)
-    chosen = started(parser)
-    told, left, spread = reasons(chosen.lanes, chosen.seed)
+    chosen = parse_and_start_jax(parser)
+    result, left_part, spread = reasons(chosen.lanes, chosen.seed)
     header = f"of {chosen.lanes:,} random lanes, seed {chosen.seed}", "lanes", "largest difference"
-    table = markdown(header, [(reason, f"{n:,}", size) for reason, n, size in told])
-    unexplained = f"\n\nNo reason was found for lanes {left.tolist()}." if len(left) else ""
-    replace(DOCS / "engine.md", "agreement", f"{table}\n\n{spread}{unexplained}")
+    table = format_markdown(header, [(reason, f"{n:,}", size) for reason, n, size in result])
+    unexplained = (
+        f"\n\nNo reason was found for lanes {left_part.tolist()}." if len(left_part) else ""
+    )
+    replace_block(DOCS / "engine.md", "agreement", f"{table}\n\n{spread}{unexplained}")
     print(table, spread, unexplained)
 
 

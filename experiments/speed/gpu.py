@@ -21,9 +21,9 @@ import jax
 import numpy as np
 
 import vrw_jax as vrw
-from experiments.shared.command import command, started
-from experiments.shared.tables import DOCS, markdown, replace
-from experiments.shared.wheels import BOX, rows_of, wheels
+from experiments.shared.command import make_parser, parse_and_start_jax
+from experiments.shared.tables import DOCS, format_markdown, replace_block
+from experiments.shared.wheels import BOX, draw_parameter_rows, make_wheels
 
 COLUMNS = ("section_state", "damping", "stiffness", "natural_length", "slope")
 LARGEST_ERROR = 1e-8
@@ -32,35 +32,37 @@ LARGEST_ERROR = 1e-8
 
 def _steps(rows: np.ndarray) -> np.ndarray:
     starts = np.broadcast_to(np.asarray(vrw.paper_start()), (len(rows), 3))
-    told = vrw.steps(wheels(rows), starts)
-    return np.concatenate([told.section_state, told.durations, told.outcome[:, None]], 1)
+    batch_result = vrw.step_batch(make_wheels(rows), starts)
+    return np.concatenate(
+        [batch_result.section_state, batch_result.durations, batch_result.outcome[:, None]], 1
+    )
 
 
 def _jacobians(rows: np.ndarray) -> np.ndarray:
     starts = np.broadcast_to(np.asarray(vrw.paper_start()), (len(rows), 3))
-    told = vrw.steps(wheels(rows), starts, derivatives=COLUMNS)
-    parts = (told.derivatives[name].section_state for name in COLUMNS)
+    batch_result = vrw.step_batch(make_wheels(rows), starts, derivatives=COLUMNS)
+    parts = (batch_result.derivatives[name].section_state for name in COLUMNS)
     return np.concatenate([np.asarray(x).reshape(len(rows), -1) for x in parts], 1)
 
 
 @jax.jit
 @jax.vmap
 def _cycle(row: jax.Array) -> vrw.LimitCycle:
-    return vrw.limit_cycle(wheels(row))
+    return vrw.limit_cycle(make_wheels(row))
 
 
 def _cycles(rows: np.ndarray) -> np.ndarray:
-    told = _cycle(rows)
-    found = np.asarray(told.outcome == 0)[:, None]
-    numbers = np.concatenate([told.section_state, told.durations], 1)
-    return np.concatenate([np.where(found, numbers, 0.0), told.outcome[:, None]], 1)
+    result = _cycle(rows)
+    solution = np.asarray(result.outcome == 0)[:, None]
+    numbers = np.concatenate([result.section_state, result.durations], 1)
+    return np.concatenate([np.where(solution, numbers, 0.0), result.outcome[:, None]], 1)
 
 
 def _scan(rows: np.ndarray) -> np.ndarray:
     names = ("speed", "dls_fraction", "spectral_radius")
     design = vrw.samples(dict(zip(BOX, rows.T, strict=True)))
-    told = vrw.scan(design, names)
-    return np.stack([np.nan_to_num(told[name].values) for name in names], 1)
+    scan_result = vrw.scan(design, names)
+    return np.stack([np.nan_to_num(scan_result[name].values) for name in names], 1)
 
 
 JOBS: dict[str, tuple[Callable[[np.ndarray], np.ndarray], float]] = {
@@ -72,18 +74,18 @@ JOBS: dict[str, tuple[Callable[[np.ndarray], np.ndarray], float]] = {
 """What is computed, and for which share of the lanes."""
 
 
-def computed(lanes: int) -> list[tuple[str, np.ndarray, float, float]]:
+def measure_job(lanes: int) -> list[tuple[str, np.ndarray, float, float]]:
     """(job, numbers, lanes a second, seconds of compiling) on the default device."""
-    told = []
+    result_list = []
     for name, (job, share) in JOBS.items():
-        rows = rows_of(BOX, max(16, int(share * lanes)), np.random.default_rng(3))
+        rows = draw_parameter_rows(BOX, max(16, int(share * lanes)), np.random.default_rng(3))
         times = []
         for _ in range(2):
             began = time.perf_counter()
             numbers = job(rows)
             times.append(time.perf_counter() - began)
-        told.append((name, numbers, len(rows) / times[1], times[0] - times[1]))
-    return told
+        result_list.append((name, numbers, len(rows) / times[1], times[0] - times[1]))
+    return result_list
 
 
 def by_cpu(lanes: int) -> list[np.ndarray]:
@@ -92,37 +94,37 @@ def by_cpu(lanes: int) -> list[np.ndarray]:
         file = Path(folder) / "cpu.npz"
         call = [sys.executable, "-m", "experiments.speed.gpu", f"--lanes={lanes}", f"--to={file}"]
         subprocess.run(call, env=os.environ | {"JAX_PLATFORMS": "cpu"}, check=True)
-        with np.load(file) as kept:
-            return [kept[f"arr_{k}"] for k in range(len(JOBS))]
+        with np.load(file) as retained:
+            return [retained[f"arr_{k}"] for k in range(len(JOBS))]
 
 
 def main() -> None:
-    parser = command(__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--lanes", type=int, default=1_000_000)
     parser.add_argument("--rehearse", action="store_true", help="on a CPU, and write nothing")
     parser.add_argument("--to", type=Path, help="only compute, and keep the numbers in this file")
-    chosen = started(parser)
+    chosen = parse_and_start_jax(parser)
     if chosen.to is not None:
-        np.savez(chosen.to, *[numbers for _, numbers, _, _ in computed(chosen.lanes)])
+        np.savez(chosen.to, *[numbers for _, numbers, _, _ in measure_job(chosen.lanes)])
         return
     device = jax.devices()[0]
     if device.platform != "gpu" and not chosen.rehearse:
         print(f"JAX finds no GPU here, only {device.device_kind}: nothing is measured or written.")
         return
-    here, there = computed(chosen.lanes), by_cpu(chosen.lanes)
+    values_here, values_there = measure_job(chosen.lanes), by_cpu(chosen.lanes)
     rows = []
-    for (name, numbers, rate, compiling), others in zip(here, there, strict=True):
+    for (name, numbers, rate, compiling), others in zip(values_here, values_there, strict=True):
         away = np.max(np.abs(numbers - others) / np.maximum(1.0, np.abs(others)), 1)
-        apart = int(np.sum(away > LARGEST_ERROR))
-        agree = f"{np.quantile(away, 0.99):.1e}", f"{apart:,} of {len(away):,}"
+        separated_values = int(np.sum(away > LARGEST_ERROR))
+        agree = f"{np.quantile(away, 0.99):.1e}", f"{separated_values:,} of {len(away):,}"
         rows.append((name, f"{rate:,.0f}", f"{compiling:.0f}", *agree))
     header = "job", "a second", "compiling, s", "p99 difference from the CPU", "lanes beyond 1e-8"
-    table = markdown(header, rows)
-    told = f"{table}\n\n{device.device_kind}, float64, JAX {jax.__version__}."
+    table = format_markdown(header, rows)
+    result = f"{table}\n\n{device.device_kind}, float64, JAX {jax.__version__}."
     if chosen.rehearse:
-        print(told)
+        print(result)
     else:
-        replace(DOCS / "engine.md", "gpu", told)
+        replace_block(DOCS / "engine.md", "gpu", result)
 
 
 if __name__ == "__main__":

@@ -16,9 +16,9 @@ import sys
 import time
 from pathlib import Path
 
-from experiments.shared.command import command
-from experiments.shared.tables import markdown, write
-from experiments.shared.timing import on_one_core
+from experiments.shared.command import make_parser
+from experiments.shared.tables import format_markdown, write_table
+from experiments.shared.timing import use_one_core
 
 WORKER = Path(__file__).with_name("house_worker.py")
 TURN = f"import runpy; runpy.run_path({str(WORKER)!r})['turn']()"
@@ -28,73 +28,73 @@ HEADER = ("figure", "A", "B", "B / A", "lowest", "highest")
 
 def environment(checkout: Path, cache: Path) -> dict[str, str]:
     """Where a process finds its library, and keeps what it compiles."""
-    more = {
+    extra_values = {
         "PYTHONPATH": str(checkout),
         "JAX_COMPILATION_CACHE_DIR": str(cache),
         "JAX_PLATFORMS": "cpu",
         "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false",
     }
-    return dict(os.environ) | more
+    return dict(os.environ) | extra_values
 
 
-def asked(code: str, given: dict[str, str]) -> tuple[str, float]:
+def run_worker(code: str, given: dict[str, str]) -> tuple[str, float]:
     """What a process prints, and its CPU seconds; the folder it starts in is not on its path."""
     began = os.times()
     out = subprocess.run(
         [sys.executable, "-P", "-c", code], env=given, stdout=subprocess.PIPE, text=True, check=True
     )
     ended = os.times()
-    spent = ended.children_user - began.children_user
-    return out.stdout, spent + ended.children_system - began.children_system
+    spent_seconds = ended.children_user - began.children_user
+    return out.stdout, spent_seconds + ended.children_system - began.children_system
 
 
 def turn(checkout: Path, cache: Path) -> tuple[dict[str, float], dict[str, int]]:
     """Figures of one turn, and how many lanes of each kind came to an end."""
     given = environment(checkout, cache)
-    lines, _ = asked(TURN, given)
-    told = json.loads(lines.splitlines()[-1])
-    if not Path(told["where"]).is_relative_to(checkout):
-        raise SystemExit(f"{checkout} holds no vrw_jax: Python found {told['where']}.")
-    imports = [asked("import vrw_jax", given)[1] for _ in range(3)]
-    return told["told"] | {IMPORT: 1e3 * statistics.median(imports)}, told["ended"]
+    lines, _ = run_worker(TURN, given)
+    parsed = json.loads(lines.splitlines()[-1])
+    if not Path(parsed["where"]).is_relative_to(checkout):
+        raise SystemExit(f"{checkout} holds no vrw_jax: Python found {parsed['where']}.")
+    imports = [run_worker("import vrw_jax", given)[1] for _ in range(3)]
+    return parsed["told"] | {IMPORT: 1e3 * statistics.median(imports)}, parsed["ended"]
 
 
-def compared(checkouts: tuple[Path, Path], caches: Path, turns: int) -> list[tuple]:
+def compare_versions(checkouts: tuple[Path, Path], caches: Path, turns: int) -> list[tuple]:
     """A row of HEADER for each figure."""
     places = [(folder, caches / name) for folder, name in zip(checkouts, "ab", strict=True)]
     ended = [turn(*place)[1] for place in places]
     if ended[0] != ended[1]:
         print(f"A and B do not end alike: {ended[0]}, {ended[1]}", flush=True)
-    told: tuple[list, list] = ([], [])
+    result: tuple[list, list] = ([], [])
     for count in range(turns):
         began = time.time()
         for side in (0, 1) if count % 2 == 0 else (1, 0):
-            told[side].append(turn(*places[side])[0])
+            result[side].append(turn(*places[side])[0])
         print(f"turn {count + 1} of {turns}: {time.time() - began:.0f} s", flush=True)
     rows = []
-    for name in told[0][0]:
-        a, b = ([one[name] for one in side] for side in told)
+    for name in result[0][0]:
+        a, b = ([one[name] for one in side] for side in result)
         ratios = [y / x for x, y in zip(a, b, strict=True)]
-        shown = statistics.median(ratios), min(ratios), max(ratios)
+        shown_values = statistics.median(ratios), min(ratios), max(ratios)
         sizes = (f"{statistics.median(side):.4g}" for side in (a, b))
-        rows.append((name, *sizes, *(f"{ratio:.3f}" for ratio in shown)))
+        rows.append((name, *sizes, *(f"{ratio:.3f}" for ratio in shown_values)))
     return rows
 
 
 def main() -> None:
-    parser = command(__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("a", type=Path, help="folder of the checkout before")
     parser.add_argument("b", type=Path, help="folder of the checkout after")
     parser.add_argument("--turns", type=int, default=5)
     parser.add_argument("--csv", type=Path, help="keep the table there")
     parser.add_argument("--caches", type=Path, default="results/house_benchmark")
     chosen = parser.parse_args()
-    with on_one_core():
-        both = chosen.a.resolve(), chosen.b.resolve()
-        rows = compared(both, chosen.caches.resolve(), chosen.turns)
-    print(markdown(HEADER, rows))
+    with use_one_core():
+        both_values = chosen.a.resolve(), chosen.b.resolve()
+        rows = compare_versions(both_values, chosen.caches.resolve(), chosen.turns)
+    print(format_markdown(HEADER, rows))
     if chosen.csv:
-        write(chosen.csv, HEADER, rows)
+        write_table(chosen.csv, HEADER, rows)
 
 
 if __name__ == "__main__":

@@ -16,36 +16,40 @@ import jax.numpy as jnp
 import numpy as np
 
 import vrw_jax as vrw
-from experiments.shared.command import command, started
-from experiments.shared.tables import DOCS, markdown, replace
-from experiments.shared.wheels import near_gaits, wheels
-from experiments.speed.engines_agree import drawn
-from vrw_jax.batches.batch import work_order
-from vrw_jax.models.lane_step import walk
-from vrw_jax.numerics import explicit_tableau
-from vrw_jax.wheel import PARAMETER_NAMES, wheel_of
+from experiments.shared.command import make_parser, parse_and_start_jax
+from experiments.shared.tables import DOCS, format_markdown, replace_block
+from experiments.shared.wheels import draw_wheels_near_gaits, make_wheels
+from experiments.speed.engines_agree import draw_wheels
+from vrw_jax.batches.batch import sort_by_work
+from vrw_jax.models.lane_step import run_batch_phases
+from vrw_jax.numerics import load_explicit_tableau
+from vrw_jax.wheel import PARAMETER_NAMES, wheel_from_parameters
 
 GROUP, N_LEGS = 8, 8
 
 
 @functools.partial(jax.jit, static_argnums=2)
-def tried(rows: jax.Array, states: jax.Array, solver: str, options: vrw.Options) -> jax.Array:
+def count_tried_steps(
+    rows: jax.Array, states: jax.Array, solver: str, options: vrw.StepOptions
+) -> jax.Array:
     """Steps that each lane tries in each phase, (3, lanes)."""
-    tableau = explicit_tableau(solver)
+    tableau = load_explicit_tableau(solver)
     assert tableau is not None
-    walked = walk(wheel_of(rows.T, N_LEGS), tuple(states.T), options, tableau, True, False)
-    return jnp.stack([end.tried for end in walked.ends])
+    walk_result = run_batch_phases(
+        wheel_from_parameters(rows.T, N_LEGS), tuple(states.T), options, tableau, True, False
+    )
+    return jnp.stack([end.n_solver_steps for end in walk_result.ends])
 
 
 def scenes(n: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Parameters, (lanes, 9), and section states."""
-    some, states, _ = near_gaits(n)
-    params, random = wheels(some), np.random.default_rng(5)
+    selection, states, _ = draw_wheels_near_gaits(n)
+    params, random = make_wheels(selection), np.random.default_rng(5)
     rows = np.stack([np.broadcast_to(getattr(params, name), n) for name in PARAMETER_NAMES], 1)
     return {
         "1 % from their gaits": (rows, states),
         "15 % from them": (rows, states * random.uniform(0.85, 1.15, states.shape)),
-        "a wide box, of which a third steps": drawn(n, 0),
+        "a wide box, of which a third steps": draw_wheels(n, 0),
     }
 
 
@@ -54,45 +58,51 @@ def parameters(rows: np.ndarray) -> dict[str, np.ndarray]:
     return dict(zip(PARAMETER_NAMES, rows.T, strict=True))
 
 
-def waited(steps: np.ndarray, order: np.ndarray) -> float:
+def compute_group_steps(steps: np.ndarray, order: np.ndarray) -> float:
     groups = steps[:, order[: len(order) // GROUP * GROUP]].reshape(3, -1, GROUP)
     return float(groups.max(2).mean(1).sum() / steps.mean(1).sum())
 
 
 def powers(rows: np.ndarray, states: np.ndarray, steps: np.ndarray) -> np.ndarray:
     """Of c/m, dtheta and k/m, and what multiplies theta and Ls, in the log of SLS-I's steps."""
-    own = parameters(rows)
-    mass = own["leg_mass"]
-    logs = [np.log(own["damping"] / mass), np.log(states[:, 1]), np.log(own["stiffness"] / mass)]
-    columns = np.stack([*logs, states[:, 0], own["natural_length"], np.ones(len(rows))], 1)
+    own_values = parameters(rows)
+    mass = own_values["leg_mass"]
+    logs = [
+        np.log(own_values["damping"] / mass),
+        np.log(states[:, 1]),
+        np.log(own_values["stiffness"] / mass),
+    ]
+    columns = np.stack([*logs, states[:, 0], own_values["natural_length"], np.ones(len(rows))], 1)
     went = steps[1] > 0
     return np.linalg.lstsq(columns[went], np.log(steps[1][went]), rcond=None)[0][:5]
 
 
 def main() -> None:
-    parser = command(__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--lanes", type=int, default=4096)
     parser.add_argument("--tolerance", type=float, default=6e-8)
-    chosen = started(parser)
-    solver = vrw.Options().solver
-    options = vrw.Options(rtol=chosen.tolerance, atol=chosen.tolerance)
-    told, fits = [], []
+    chosen = parse_and_start_jax(parser)
+    solver = vrw.StepOptions().solver
+    options = vrw.StepOptions(rtol=chosen.tolerance, atol=chosen.tolerance)
+    result, fits = [], []
     for scene, (rows, states) in scenes(chosen.lanes).items():
-        steps = np.asarray(tried(jnp.asarray(rows), jnp.asarray(states), solver, options))
-        own = parameters(rows)
+        steps = np.asarray(
+            count_tried_steps(jnp.asarray(rows), jnp.asarray(states), solver, options)
+        )
+        own_values = parameters(rows)
         orders = (
             np.arange(len(rows)),
-            np.argsort(own["damping"] / own["leg_mass"]),
-            work_order(list(rows.T), states),
+            np.argsort(own_values["damping"] / own_values["leg_mass"]),
+            sort_by_work(list(rows.T), states),
             np.argsort(steps[1], kind="stable"),
         )
-        told.append((scene, *(f"{waited(steps, order):.2f}" for order in orders)))
+        result.append((scene, *(f"{compute_group_steps(steps, order):.2f}" for order in orders)))
         fit = powers(rows, states, steps)
         fits.append((scene, *(f"{x / fit[0]:.2f}" for x in fit)))
-    table = markdown(("wheels", "as given", "c/m", "`vrw.steps`", "SLS-I's steps"), told)
-    replace(DOCS / "engine.md", "waiting", table)
+    table = format_markdown(("wheels", "as given", "c/m", "`vrw.steps`", "SLS-I's steps"), result)
+    replace_block(DOCS / "engine.md", "waiting", table)
     print(table)
-    print(markdown(("wheels", "c/m", "dtheta", "k/m", "theta", "Ls"), fits))
+    print(format_markdown(("wheels", "c/m", "dtheta", "k/m", "theta", "Ls"), fits))
 
 
 if __name__ == "__main__":

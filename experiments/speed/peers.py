@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from experiments.shared.command import extra
-from vrw_jax.numerics import explicit_tableau
+from experiments.shared.command import require_extra
+from vrw_jax.numerics import load_explicit_tableau
 
-hy, numba = extra("heyoka"), extra("numba")
+hy, numba = require_extra("heyoka"), require_extra("numba")
 
 ALPHA = math.pi / 4.0
 SA, CA = math.sin(ALPHA), math.cos(ALPHA)
@@ -88,12 +88,14 @@ n_terms = _jit(terms)
 _names = {"terms": n_terms, "SA": SA, "CA": CA}
 
 
-def _compiled(function):
+def _compile_with_terms(function):
     """`function` with its call of `terms` compiled too."""
     return _jit(types.FunctionType(function.__code__, {**globals(), **_names}, function.__name__))
 
 
-n_dls, n_sls1, n_sls2 = map(_compiled, (double_support, single_support_1, single_support_2))
+n_dls, n_sls1, n_sls2 = map(
+    _compile_with_terms, (double_support, single_support_1, single_support_2)
+)
 
 
 @numba.njit
@@ -223,7 +225,7 @@ def hit(y, P):
     y[2], y[3] = dtheta, dL1
 
 
-hit_numba = _compiled(hit)
+hit_numba = _compile_with_terms(hit)
 
 
 def handed_on(phase, y, D, P):
@@ -256,13 +258,13 @@ def scipy_steps(starts, parameters, tol, method="DOP853"):
                 return slope(phase, y, D, P, np.empty_like(y))[0]
 
             guard.terminal, guard.direction = True, -1.0
-            found = solve_ivp(
+            solution = solve_ivp(
                 right, (0.0, 20.0), y, method=method, rtol=tol, atol=tol, events=guard
             )
-            if found.status != 1:
+            if solution.status != 1:
                 out[lane, :6] = np.nan
                 break
-            y, out[lane, 3 + phase] = found.y[:, -1].copy(), found.t[-1]
+            y, out[lane, 3 + phase] = solution.y[:, -1].copy(), solution.t[-1]
             if phase == 0:
                 _, _, L1, L2, dL1, dL2 = n_dls(math.sin(y[0]), math.cos(y[0]), y[1], D, P)
                 y = np.array([y[0], L1, L2, y[1], dL1, dL2])
@@ -304,10 +306,10 @@ def torch_steps(starts, parameters, tol, method="dopri5"):
         y = np.array([theta, w])
         for phase in range(3):
             with torch.no_grad():
-                end, found = odeint_event(
+                end, solution = odeint_event(
                     rates, torch.tensor(y), zero, event_fn=guard, rtol=tol, atol=tol, method=method
                 )
-            y, out[lane, 3 + phase] = found[-1].numpy().copy(), float(end)
+            y, out[lane, 3 + phase] = solution[-1].numpy().copy(), float(end)
             y = handed_on(phase, y, D, P)
         out[lane, :3] = y[0], y[2], y[3]
     return out
@@ -317,20 +319,20 @@ class ByHand:
     """`peer.cpp`, eight wheels side by side in C++, by a tableau of explicit Runge-Kutta."""
 
     def __init__(self, solver):
-        tableau, made = explicit_tableau(solver), Path(tempfile.mkdtemp())
+        tableau, created = load_explicit_tableau(solver), Path(tempfile.mkdtemp())
         parts = {
-            "PLACES": tableau.places, "ONCE": tableau.once, "TWICE": tableau.twice,
-            "ERROR_ONCE": tableau.error_once, "ERROR_TWICE": tableau.error_twice,
+            "PLACES": tableau.nodes, "ONCE": tableau.matrix, "TWICE": tableau.matrix_squared,
+            "ERROR_ONCE": tableau.b_error, "ERROR_TWICE": tableau.b_error_position,
         }  # fmt: skip
-        lines = [f"static constexpr int S = {len(tableau.places)};"]
+        lines = [f"static constexpr int S = {len(tableau.nodes)};"]
         lines.append(f"static constexpr float EXPONENT = {-0.5 / tableau.order};")
         for name, values in parts.items():
             shape = "".join(f"[{n}]" for n in values.shape)
             numbers = str(values.tolist()).replace("[", "{").replace("]", "}")
             lines.append(f"static constexpr double {name}{shape} = {numbers};")
-        (made / "method.h").write_text("\n".join(lines))
-        source, library = Path(__file__).with_name("peer.cpp"), made / "peer.so"
-        method = f'-DMETHOD="{made}/method.h"'
+        (created / "method.h").write_text("\n".join(lines))
+        source, library = Path(__file__).with_name("peer.cpp"), created / "peer.so"
+        method = f'-DMETHOD="{created}/method.h"'
         flags = ["-O3", "-march=native", "-ffast-math", "-fno-finite-math-only", "-shared", "-fPIC"]
         subprocess.run(["g++", *flags, method, str(source), "-o", str(library)], check=True)
         self.steps = ctypes.CDLL(str(library)).steps
@@ -340,9 +342,9 @@ class ByHand:
     def __call__(self, starts, parameters, tol):
         """Lanes: a multiple of eight."""
         given = [np.ascontiguousarray(x.T) for x in (parameters, starts)]
-        told = np.empty((6, len(starts)))
-        self.steps(*(x.ctypes.data for x in (*given, told)), len(starts), tol)
-        return told.T
+        result = np.empty((6, len(starts)))
+        self.steps(*(x.ctypes.data for x in (*given, result)), len(starts), tol)
+        return result.T
 
 
 class Heyoka:
@@ -375,8 +377,8 @@ class Heyoka:
             for phase, ta in enumerate(self.phases):
                 ta.reset_cooldowns()
                 ta.time, ta.pars[:], ta.state[:] = 0.0, (*P, D)[: len(ta.pars)], y
-                taken = ta.propagate_until(20.0)[3]
-                out[lane, 6] += taken * (ta.order + 1)  # a Taylor coefficient each
+                used_values = ta.propagate_until(20.0)[3]
+                out[lane, 6] += used_values * (ta.order + 1)  # a Taylor coefficient each
                 y, out[lane, 3 + phase] = ta.state.copy(), ta.time
                 y = handed_on(phase, y, D, P)
             out[lane, :3] = y[0], y[2], y[3]

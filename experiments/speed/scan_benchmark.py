@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 
 import vrw_jax as vrw
-from experiments.shared.command import command, started
-from experiments.shared.tables import FIGURES, read, write_named
-from vrw_jax.scans import Plan, Progress, plan, run
+from experiments.shared.command import make_parser, parse_and_start_jax
+from experiments.shared.tables import FIGURES, read_table, write_named_rows
+from vrw_jax.scans import ScanPlan, ScanProgress, plan_scan, run_scan
 
 ROOT = Path(__file__).parents[2]
 STORES = ROOT / "results" / "scan_benchmark"
@@ -36,11 +36,11 @@ COUNTS = {  # damping, stiffness, natural length, slope
 MEASURES = ("dls_fraction", "speed", "period", "step_length", "lambda_I4", "lambda_4_plus")
 KILLED_AT = (1 / 3, 2 / 3)
 ITSELF = (sys.executable, "-m", "experiments.speed.scan_benchmark")
-CHECKED = 3
+N_CHECKED_CHUNKS = 3
 """Chunks of the largest scan that are computed again and compared bit by bit."""
 
 
-def planned(size: int) -> Plan:
+def make_plan(size: int) -> ScanPlan:
     damping, stiffness, natural_length, slope = COUNTS[size]
     design = vrw.grid(
         damping=np.linspace(100.0, 200.0, damping),
@@ -48,7 +48,7 @@ def planned(size: int) -> Plan:
         natural_length=np.linspace(1.015, 1.035, natural_length),
         slope=np.linspace(0.27, 0.305, slope),
     )
-    return plan(design, MEASURES)
+    return plan_scan(design, MEASURES)
 
 
 def log(size: int) -> Path:
@@ -58,37 +58,37 @@ def log(size: int) -> Path:
 def scan(size: int, since: float) -> None:
     """In a process of its own: every chunk's progress goes to the log, kill or no kill."""
 
-    def report(progress: Progress) -> None:
-        told = {
+    def report(progress: ScanProgress) -> None:
+        result_by_name = {
             "session": os.getpid(),
-            "kept": progress.kept,
-            "done": progress.done,
-            "failed": progress.failed,
+            "kept": progress.n_reused,
+            "done": progress.n_done,
+            "failed": progress.n_failed,
             "wall": time.time() - since,
             "cpu": time.process_time(),
             "peak": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,  # MiB
         }
         with log(size).open("a") as file:
-            file.write(json.dumps(told) + "\n")
+            file.write(json.dumps(result_by_name) + "\n")
 
-    run(planned(size), STORES / f"{size}.zarr", report=report)
+    run_scan(make_plan(size), STORES / f"{size}.zarr", on_progress=report)
 
 
 def sessions(size: int) -> list[list[dict]]:
     """Reports of each process that worked on a scan, in order."""
     if not log(size).exists():
         return []
-    told: dict[int, list[dict]] = {}
+    result: dict[int, list[dict]] = {}
     for line in log(size).read_text().splitlines():
         entry = json.loads(line)
-        told.setdefault(entry["session"], []).append(entry)
-    return list(told.values())
+        result.setdefault(entry["session"], []).append(entry)
+    return list(result.values())
 
 
 def done(size: int) -> int:
     """Samples in the store, as far as told."""
-    told = sessions(size)
-    return told[-1][-1]["kept"] + told[-1][-1]["done"] if told else 0
+    result = sessions(size)
+    return result[-1][-1]["kept"] + result[-1][-1]["done"] if result else 0
 
 
 def supervise(size: int, killed_at: tuple[float, ...]) -> None:
@@ -111,15 +111,15 @@ def supervise(size: int, killed_at: tuple[float, ...]) -> None:
 
 
 def figures_of(size: int) -> dict[str, object]:
-    told = sessions(size)
-    last = [reports[-1] for reports in told]
-    scanning = sum(reports[-1]["wall"] - reports[0]["wall"] for reports in told)
+    result = sessions(size)
+    last = [reports[-1] for reports in result]
+    scanning = sum(reports[-1]["wall"] - reports[0]["wall"] for reports in result)
     return {
         "samples": size,
-        "processes": len(told),
+        "processes": len(result),
         "wall_s": round(sum(entry["wall"] for entry in last), 1),
         "cpu_s": round(sum(entry["cpu"] for entry in last), 1),
-        "to_first_chunk_s": round(told[0][0]["wall"], 1),
+        "to_first_chunk_s": round(result[0][0]["wall"], 1),
         "samples_per_s": round(sum(entry["done"] for entry in last) / max(scanning, 1e-9), 0),
         "failed_share": round(sum(entry["failed"] for entry in last) / size, 4),
         "peak_MiB": round(max(entry["peak"] for entry in last)),
@@ -134,48 +134,48 @@ def draw(rows: list[Any]) -> None:
 
     cold, warm = rows[:1], rows[1:]  # the first process compiles: what it takes is no trend
     with plots.figure_style():
-        figure = Figure(figsize=(plots.PAGE, 2.6))
-        left, right = figure.subplots(1, 2)
-        left.set(xscale="log", yscale="log", xlabel="samples", ylabel="time [s]")
+        figure = Figure(figsize=(plots.PAGE_WIDTH_INCHES, 2.6))
+        left_part, right = figure.subplots(1, 2)
+        left_part.set(xscale="log", yscale="log", xlabel="samples", ylabel="time [s]")
         right.set(xscale="log", xlabel="samples", ylabel="peak memory [MiB]", ylim=(0, 2300))
         series = (
-            (left, "wall_s", plots.LEG_1, "o", "-", "wall"),
-            (left, "cpu_s", plots.LEG_2, "s", "--", "CPU, both cores"),
-            (right, "peak_MiB", plots.LEG_1, "o", "-", "peak"),
+            (left_part, "wall_s", plots.LEG_1_COLOR, "o", "-", "wall"),
+            (left_part, "cpu_s", plots.LEG_2_COLOR, "s", "--", "CPU, both cores"),
+            (right, "peak_MiB", plots.LEG_1_COLOR, "o", "-", "peak"),
         )
         for axes, key, colour, mark, line, label in series:
-            some = [(float(r["samples"]), float(r[key])) for r in warm]
-            axes.plot(*zip(*some, strict=True), mark + line, color=colour, ms=4, label=label)
+            selection = [(float(r["samples"]), float(r[key])) for r in warm]
+            axes.plot(*zip(*selection, strict=True), mark + line, color=colour, ms=4, label=label)
             first = [(float(r["samples"]), float(r[key])) for r in cold]
             text = f"{label}, with compiling"
             axes.plot(*zip(*first, strict=True), mark, color=colour, mfc="white", ms=4, label=text)
-        right.axhline(2048, color=plots.GREY, linestyle=":", label="aimed at, at most")
-        for axes in (left, right):
+        right.axhline(2048, color=plots.DARK_GRAY, linestyle=":", label="aimed at, at most")
+        for axes in (left_part, right):
             axes.legend(fontsize=7)
     plots.save(figure, FIGURES, "scan_benchmark")
 
 
 def compare(size: int) -> None:
     """Some chunks computed again, by nobody's leave: they must be the stored ones, bit by bit."""
-    of = planned(size)
-    stored, engine = vrw.open_scan(STORES / f"{size}.zarr"), of.engine()
+    of_values = make_plan(size)
+    stored, engine = vrw.open_scan(STORES / f"{size}.zarr"), of_values.build_engine()
     assert np.all(stored.outcome.values >= 0), "samples are missing"
-    for index in np.linspace(0, of.layout.n_chunks - 1, CHECKED).astype(int):
-        region = of.layout.region(int(index))
-        for name, values in engine(of.design.block(region)).items():
-            there = stored[name][region].values
-            np.testing.assert_array_equal(values.reshape(there.shape), there, name)
-    print(f"{CHECKED} chunks of {size:,} samples computed again: bitwise the stored ones")
+    for index in np.linspace(0, of_values.layout.n_chunks - 1, N_CHECKED_CHUNKS).astype(int):
+        region = of_values.layout.chunk_region(int(index))
+        for name, values in engine(of_values.design.sample_block(region)).items():
+            values_there = stored[name][region].values
+            np.testing.assert_array_equal(values.reshape(values_there.shape), values_there, name)
+    print(f"{N_CHECKED_CHUNKS} chunks of {size:,} samples computed again: bitwise the stored ones")
 
 
 def main() -> None:
-    parser = command(__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("largest", type=int, choices=COUNTS, nargs="?", default=max(COUNTS))
     parser.add_argument("--since", type=float, help="that scan alone, in a process begun then")
     parser.add_argument("--redraw", action="store_true", help="scan nothing: draw the table")
-    chosen = started(parser)
+    chosen = parse_and_start_jax(parser)
     if chosen.redraw:
-        draw(read(FIGURES / "scan_benchmark.csv"))
+        draw(read_table(FIGURES / "scan_benchmark.csv"))
         return
     STORES.mkdir(parents=True, exist_ok=True)
     if chosen.since:
@@ -186,7 +186,7 @@ def main() -> None:
         supervise(size, KILLED_AT if size == max(COUNTS) else ())
         print(figures_of(size), flush=True)
     rows = [figures_of(size) for size in sizes]
-    write_named(FIGURES / "scan_benchmark.csv", rows)
+    write_named_rows(FIGURES / "scan_benchmark.csv", rows)
     draw(rows)
     compare(sizes[-1])
 

@@ -21,22 +21,22 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from experiments.shared.command import command, extra
-from experiments.shared.timing import on_one_core, start_cold
-from experiments.shared.wheels import BOX, rows_of, wheels
+from experiments.shared.command import make_parser, require_extra
+from experiments.shared.timing import start_without_cache, use_one_core
+from experiments.shared.wheels import BOX, draw_parameter_rows, make_wheels
 
 START = (0.1, 1.6, -0.1)
 RUNNING = {
     "one step": lambda: vrw.return_map(vrw.WheelParams(), START),
-    "4,096 steps": lambda: vrw.steps(wheels(rows(4096)), np.tile(START, (4096, 1))),
+    "4,096 steps": lambda: vrw.step_batch(make_wheels(rows(4096)), np.tile(START, (4096, 1))),
     "one limit cycle": lambda: vrw.limit_cycle(vrw.WheelParams()),
     "1,024 limit cycles": lambda: many_cycles(rows(1024)),
     "a gradient": lambda: gradient(vrw.WheelParams()),
-    "256 steps on real ground": lambda: vrw.steps(
-        wheels(rows(256)), np.tile(START, (256, 1)), model=vrw.UnilateralWheel()
+    "256 steps on real ground": lambda: vrw.step_batch(
+        make_wheels(rows(256)), np.tile(START, (256, 1)), model=vrw.UnilateralWheel()
     ),
 }
-FIRST = {
+FIRST_CALLS = {
     "step": "vrw.step(vrw.WheelParams(), (0.1, 1.6, -0.1))",
     "gradient": "jax.grad(lambda p: vrw.limit_cycle(p).dls_fraction)(vrw.WheelParams())",
     "scan": "vrw.scan(vrw.grid(damping=[100.0, 150.0], slope=[0.28, 0.3]), ['dls_fraction'])",
@@ -45,10 +45,10 @@ FIRST = {
 
 def rows(n: int) -> np.ndarray:
     """Parameters of some wheels, the same each time."""
-    return rows_of(BOX, n, np.random.default_rng(0))
+    return draw_parameter_rows(BOX, n, np.random.default_rng(0))
 
 
-many_cycles = jax.jit(jax.vmap(lambda row: vrw.limit_cycle(wheels(row)).period))
+many_cycles = jax.jit(jax.vmap(lambda row: vrw.limit_cycle(make_wheels(row)).period))
 gradient = jax.jit(jax.grad(lambda p: vrw.limit_cycle(p).dls_fraction))
 
 
@@ -57,24 +57,24 @@ gradient = jax.jit(jax.grad(lambda p: vrw.limit_cycle(p).dls_fraction))
 def test_running(name: str, benchmark: Callable) -> None:
     call = lambda: jax.block_until_ready(jax.tree.leaves(RUNNING[name]()))
     call()
-    told = benchmark(call)
-    assert all(np.all(np.isfinite(jnp.asarray(leaf))) for leaf in told)
+    result = benchmark(call)
+    assert all(np.all(np.isfinite(jnp.asarray(leaf))) for leaf in result)
 
 
-@pytest.mark.parametrize("name", FIRST)
+@pytest.mark.parametrize("name", FIRST_CALLS)
 def test_first_answer(name: str, benchmark: Callable, tmp_path: object) -> None:
-    code = f"import jax, vrw_jax as vrw; vrw.start_jax({str(tmp_path)!r}); {FIRST[name]}"
+    code = f"import jax, vrw_jax as vrw; vrw.start_jax({str(tmp_path)!r}); {FIRST_CALLS[name]}"
     start = [sys.executable, "-c", code]
     run = lambda: subprocess.run(start, check=True, env=dict(os.environ))
     benchmark.pedantic(run, rounds=1, iterations=1)
 
 
 def main() -> None:
-    _, more = command(__doc__).parse_known_args()
-    extra("pytest_benchmark")
-    with on_one_core():
-        start_cold()
-        raise SystemExit(pytest.main([__file__, "-n", "0", "--benchmark-autosave", *more]))
+    _, extra_values = make_parser(__doc__).parse_known_args()
+    require_extra("pytest_benchmark")
+    with use_one_core():
+        start_without_cache()
+        raise SystemExit(pytest.main([__file__, "-n", "0", "--benchmark-autosave", *extra_values]))
 
 
 if __name__ == "__main__":

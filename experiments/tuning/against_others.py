@@ -26,31 +26,35 @@ from matplotlib.figure import Figure
 from scipy.optimize import minimize
 
 import vrw_jax as vrw
-from experiments.shared.command import command, extra, started
-from experiments.shared.tables import FIGURES, markdown, replace, write_named
+from experiments.shared.command import make_parser, parse_and_start_jax, require_extra
+from experiments.shared.tables import FIGURES, format_markdown, replace_block, write_named_rows
 from vrw_jax import figures as plots
-from vrw_jax.app.config import load
-from vrw_jax.cycles import AGREEMENT
+from vrw_jax.app.config import load_config
+from vrw_jax.cycles import STATE_AGREEMENT_TOLERANCE
 from vrw_jax.tuning import tune
-from vrw_jax.tuning.objective import slack_scales
-from vrw_jax.tuning.problem import TuneProblem, tuning_problem
-from vrw_jax.wheel import wheel_of
+from vrw_jax.tuning.objective import scale_slacks
+from vrw_jax.tuning.problem import TuneProblem, make_tune_problem
+from vrw_jax.wheel import wheel_from_parameters
 
-cma = extra("cma")
+cma = require_extra("cma")
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 LABELS = {"tune": "this library"}
 DASHES = ("-", "--", "-.", ":")  # of the methods, in their order
 PROBLEMS = {"most double support": "tune_dls", "largest stability margin": "tune_stability"}
-ALLOWED = 400  # gaits per start and method
+MAX_EVALUATIONS = 400  # gaits per start and method
 SEED = 1
-KEPT = 1e-4  # breach of a constraint that still counts as none, in widths of the bounds
-NEAR = (1e-2, 1e-3, 1e-4)  # gaps to the best objective known, relative
+CONSTRAINT_TOLERANCE = (
+    1e-4  # breach of a constraint that still counts as none, in widths of the bounds
+)
+RELATIVE_GAPS = (1e-2, 1e-3, 1e-4)  # gaps to the best objective known, relative
 PENALTY = 1.0  # objective lost per width of breach; several times any constraint's price
-LOST = 10.0  # objective where there is no gait, for the methods that can't be told
+MISSING_GAIT_OBJECTIVE = (
+    10.0  # objective where there is no gait, for the methods that can't be told
+)
 
 
-class Seen(NamedTuple):
+class MethodHistory(NamedTuple):
     """What one method evaluated from one start, in order."""
 
     objective: np.ndarray  # NaN where there was no gait
@@ -69,55 +73,62 @@ class Counter:
         self._problem, self._values, self._scales = problem, values, scales
         self.objective: list[float] = []
         self.breach: list[float] = []
-        self.allowed = ALLOWED
+        self.allowed = MAX_EVALUATIONS
 
     def __call__(self, u: np.ndarray) -> tuple[float, np.ndarray]:
         """Objective and slack in widths of the bounds; NaN and -1 where there is no gait."""
         if len(self.objective) >= self.allowed:
             raise SpentError
         u = np.clip(u, 0.0, 1.0)
-        found, values = self._values(jnp.asarray(self._problem.parameters(u)))
+        solution, values = self._values(jnp.asarray(self._problem.denormalize(u)))
         values = np.asarray(values)
-        slack = (values[1:] - self._problem.least) / self._scales
-        if not bool(found):
+        slack = (values[1:] - self._problem.min_constraint_values) / self._scales
+        if not bool(solution):
             values, slack = np.full_like(values, np.nan), -np.ones_like(slack)
         self.objective.append(float(values[0]))
         self.breach.append(float(np.max(-slack, initial=0.0)))
         return float(values[0]), slack
 
-    def penalised(self, u: np.ndarray) -> float:
+    def compute_penalized(self, u: np.ndarray) -> float:
         """To be minimised: an exact penalty on every breach, and on leaving the box."""
         objective, slack = self(u)
         outside = float(np.sum(np.abs(u - np.clip(u, 0.0, 1.0))))
         if np.isnan(objective):
-            return LOST + outside
+            return MISSING_GAIT_OBJECTIVE + outside
         return -objective + PENALTY * (float(np.sum(np.maximum(-slack, 0.0))) + outside)
 
 
 def values_of(problem: TuneProblem) -> Callable:
     """Whether there is a gait, and objective and constraints, compiled without derivatives."""
-    sought, finder = problem.sought, problem.finder
+    target_values, finder = problem.objective_and_constraints, problem.finder
 
     def values(parameters: jax.Array) -> tuple[jax.Array, jax.Array]:
-        wheel = wheel_of(parameters, problem.params.n_legs)
-        cycle = finder.cycle(wheel)
-        step = finder.model.step(wheel, cycle.section_state, finder.step_options)
-        agrees = jnp.max(jnp.abs(step.section_state - cycle.section_state)) <= AGREEMENT
-        found = cycle.found & (step.outcome == vrw.Outcome.STEPPED) & agrees
-        return found, sought(cycle, step)
+        wheel = wheel_from_parameters(parameters, problem.params.n_legs)
+        cycle = finder.find_cycle(wheel)
+        step = finder.model.take_step(wheel, cycle.section_state, finder.step_options)
+        agrees = (
+            jnp.max(jnp.abs(step.section_state - cycle.section_state)) <= STATE_AGREEMENT_TOLERANCE
+        )
+        solution = cycle.found & (step.outcome == vrw.Outcome.STEPPED) & agrees
+        return solution, target_values(cycle, step)
 
     return jax.jit(values)
 
 
 def cma_es(count: Counter, u: np.ndarray, seed: int) -> None:
     options = {"bounds": [0.0, 1.0], "seed": seed + 1, "verbose": -9, "tolfun": 1e-12}
-    cma.fmin2(count.penalised, u, 0.25, options, restarts=9)
+    cma.fmin2(count.compute_penalized, u, 0.25, options, restarts=9)
 
 
 def nelder_mead(count: Counter, u: np.ndarray, seed: int) -> None:
     simplex = np.vstack([u, *(u + 0.15 * np.where(u < 0.5, 1, -1) * e for e in np.eye(u.size))])
-    options = {"initial_simplex": simplex, "maxfev": ALLOWED, "xatol": 1e-10, "fatol": 1e-12}
-    minimize(count.penalised, u, method="Nelder-Mead", options=options)
+    options = {
+        "initial_simplex": simplex,
+        "maxfev": MAX_EVALUATIONS,
+        "xatol": 1e-10,
+        "fatol": 1e-12,
+    }
+    minimize(count.compute_penalized, u, method="Nelder-Mead", options=options)
 
 
 def cobyla(count: Counter, u: np.ndarray, seed: int) -> None:
@@ -133,7 +144,7 @@ def cobyla(count: Counter, u: np.ndarray, seed: int) -> None:
 
     def objective(u: np.ndarray) -> float:
         value = told(u)[0]
-        return LOST if np.isnan(value) else -value
+        return MISSING_GAIT_OBJECTIVE if np.isnan(value) else -value
 
     minimize(
         objective,
@@ -141,39 +152,43 @@ def cobyla(count: Counter, u: np.ndarray, seed: int) -> None:
         method="COBYLA",
         bounds=[(0.0, 1.0)] * u.size,
         constraints={"type": "ineq", "fun": lambda u: told(u)[1]},
-        options={"rhobeg": 0.15, "tol": 1e-8, "maxiter": ALLOWED},
+        options={"rhobeg": 0.15, "tol": 1e-8, "maxiter": MAX_EVALUATIONS},
     )
 
 
 OTHERS = {"CMA-ES": cma_es, "Nelder-Mead": nelder_mead, "COBYLA": cobyla}
 
 
-def by_tune(problem: TuneProblem, u: np.ndarray, scales: np.ndarray) -> Seen:
+def by_tune(problem: TuneProblem, u: np.ndarray, scales: np.ndarray) -> MethodHistory:
     began = time.perf_counter()
     tuned = tune(
-        problem.wheel(u),
-        problem.sought.objective,
+        problem.make_wheel(u),
+        problem.objective_and_constraints.objective,
         problem.free,
         dict(zip(problem.free, zip(problem.lower, problem.upper, strict=True), strict=True)),
         problem.margins,
-        max_evaluations=ALLOWED,
+        max_evaluations=MAX_EVALUATIONS,
     )
-    slack = (tuned.path.constraint_value.values - problem.least) / scales
+    slack = (tuned.path.constraint_value.values - problem.min_constraint_values) / scales
     breach = np.nan_to_num(np.max(-slack, axis=1, initial=0.0), nan=1.0)
-    return Seen(tuned.path.objective.values, breach, time.perf_counter() - began)
+    return MethodHistory(tuned.path.objective.values, breach, time.perf_counter() - began)
 
 
-def by_other(method: Callable, count: Counter, u: np.ndarray, seed: int) -> Seen:
+def by_other(method: Callable, count: Counter, u: np.ndarray, seed: int) -> MethodHistory:
     began = time.perf_counter()
     with contextlib.suppress(SpentError):
         method(count, u, seed)
-    return Seen(np.array(count.objective), np.array(count.breach), time.perf_counter() - began)
+    return MethodHistory(
+        np.array(count.objective), np.array(count.breach), time.perf_counter() - began
+    )
 
 
-def best_so_far(seen: Seen) -> np.ndarray:
+def best_so_far(observed_values: MethodHistory) -> np.ndarray:
     """The best objective of a gait that keeps every constraint, after each evaluation."""
-    kept = np.isfinite(seen.objective) & (seen.breach <= KEPT)
-    return np.maximum.accumulate(np.where(kept, seen.objective, -np.inf))
+    retained = np.isfinite(observed_values.objective) & (
+        observed_values.breach <= CONSTRAINT_TOLERANCE
+    )
+    return np.maximum.accumulate(np.where(retained, observed_values.objective, -np.inf))
 
 
 def starts_of(problem: TuneProblem, values: Callable, n: int) -> list[np.ndarray]:
@@ -182,43 +197,48 @@ def starts_of(problem: TuneProblem, values: Callable, n: int) -> list[np.ndarray
     starts: list[np.ndarray] = []
     while len(starts) < n:
         u = generator.uniform(size=len(problem.free))
-        if bool(values(jnp.asarray(problem.parameters(u)))[0]):
+        if bool(values(jnp.asarray(problem.denormalize(u)))[0]):
             starts.append(u)
     return starts
 
 
 def grid_around(problem: TuneProblem, values: Callable, u: np.ndarray, best: float) -> dict:
     """Whether any wheel of a grid of 7 values per parameter around u is better, at two scales."""
-    checked = kept = better = 0
+    checked = retained = better = 0
     for reach in (0.05, 0.005):
         for offset in itertools.product(np.linspace(-reach, reach, 7), repeat=u.size):
             place = u + np.array(offset)
             if place.min() < 0.0 or place.max() > 1.0:
                 continue
-            found, told = values(jnp.asarray(problem.parameters(place)))
+            solution, result = values(jnp.asarray(problem.denormalize(place)))
             checked += 1
-            if bool(found) and np.all(np.asarray(told)[1:] >= problem.least):
-                kept += 1
-                better += float(told[0]) > best + 1e-9
-    return {"checked": checked, "keep the constraints": kept, "better": better}
+            if bool(solution) and np.all(np.asarray(result)[1:] >= problem.min_constraint_values):
+                retained += 1
+                better += float(result[0]) > best + 1e-9
+    return {"checked": checked, "keep the constraints": retained, "better": better}
 
 
-def compared(problem: TuneProblem, n_starts: int, rows: list[dict], name: str) -> dict:
+def compare_methods(problem: TuneProblem, n_starts: int, rows: list[dict], name: str) -> dict:
     values = values_of(problem)
     starts = starts_of(problem, values, n_starts)
     # What a constraint changes over the box makes breaches comparable; once, at the config's wheel.
-    first = problem.start()
-    scales = slack_scales(first.slack, first.slopes)
-    seen: dict[str, list[Seen]] = {"tune": [by_tune(problem, u, scales) for u in starts]}
+    first = problem.evaluate_start()
+    scales = scale_slacks(first.slack, first.slack_jacobian)
+    observed_values: dict[str, list[MethodHistory]] = {
+        "tune": [by_tune(problem, u, scales) for u in starts]
+    }
     for method, run in OTHERS.items():
-        seen[method] = [
+        observed_values[method] = [
             by_other(run, Counter(problem, values, scales), u, i) for i, u in enumerate(starts)
         ]
-        print(name, method, f"{sum(s.seconds for s in seen[method]):.0f} s", flush=True)
-    curves = {method: [best_so_far(one) for one in some] for method, some in seen.items()}
-    best = max(float(curve[-1]) for some in curves.values() for curve in some)
-    for method, some in curves.items():
-        for start, (curve, one) in enumerate(zip(some, seen[method], strict=True)):
+        print(name, method, f"{sum(s.seconds for s in observed_values[method]):.0f} s", flush=True)
+    curves = {
+        method: [best_so_far(one) for one in selection]
+        for method, selection in observed_values.items()
+    }
+    best = max(float(curve[-1]) for selection in curves.values() for curve in selection)
+    for method, selection in curves.items():
+        for start, (curve, one) in enumerate(zip(selection, observed_values[method], strict=True)):
             row = {
                 "problem": name,
                 "method": method,
@@ -228,23 +248,26 @@ def compared(problem: TuneProblem, n_starts: int, rows: list[dict], name: str) -
                 "gaits": len(curve),
                 "seconds": f"{one.seconds:.3f}",
             }
-            for gap in NEAR:
+            for gap in RELATIVE_GAPS:
                 reached = np.flatnonzero(curve >= best - gap * abs(best))
                 row[f"gaits to {gap:g}"] = int(reached[0]) + 1 if reached.size else ""
             rows.append(row)
     return {"curves": curves, "best": best, "starts": starts, "values": values}
 
 
-def drawn(results: dict[str, dict]) -> Figure:
+def draw_chart(results: dict[str, dict]) -> Figure:
     """Gap to the best known over gaits evaluated: median of the starts, and quartiles."""
     with plots.figure_style():
-        figure = Figure(figsize=(plots.PAGE, 2.9))
+        figure = Figure(figsize=(plots.PAGE_WIDTH_INCHES, 2.9))
         panels = figure.subplots(1, len(results), sharey=True)
         for axes, (name, result) in zip(panels, results.items(), strict=True):
             for (method, curves), dash in zip(result["curves"].items(), DASHES, strict=True):
-                gaits = np.arange(1, ALLOWED + 1)
+                gaits = np.arange(1, MAX_EVALUATIONS + 1)
                 table = np.array(
-                    [np.r_[c, np.full(ALLOWED - len(c), c[-1])][:ALLOWED] for c in curves]
+                    [
+                        np.r_[c, np.full(MAX_EVALUATIONS - len(c), c[-1])][:MAX_EVALUATIONS]
+                        for c in curves
+                    ]
                 )
                 gap = np.clip((result["best"] - table) / abs(result["best"]), 1e-9, 1.0)
                 low, middle, high = np.quantile(gap, (0.25, 0.5, 0.75), axis=0)
@@ -261,53 +284,57 @@ def drawn(results: dict[str, dict]) -> Figure:
 
 def summary(rows: list[dict]) -> str:
     """How many starts came near the best, by how many gaits and in what time: medians."""
-    near = [f"within {gap:g}: starts, gaits" for gap in NEAR]
+    near = [f"within {gap:g}: starts, gaits" for gap in RELATIVE_GAPS]
     lines = []
-    of = lambda row: (row["problem"], row["method"])
-    for (problem, method), some in itertools.groupby(rows, key=of):
-        mine = list(some)
-        told = []
-        for gap in NEAR:
+    select = lambda row: (row["problem"], row["method"])
+    for (problem, method), selection in itertools.groupby(rows, key=select):
+        mine = list(selection)
+        result_list = []
+        for gap in RELATIVE_GAPS:
             reached = [int(row[f"gaits to {gap:g}"]) for row in mine if row[f"gaits to {gap:g}"]]
             gaits = f", {np.median(reached):.0f}" if reached else ""
-            told.append(f"{len(reached)} of {len(mine)}{gaits}")
+            result_list.append(f"{len(reached)} of {len(mine)}{gaits}")
         seconds = [float(row["seconds"]) for row in mine]
         times = f"{np.median(seconds):.2f}", f"{max(seconds):.2f}"
-        lines.append((problem, method, *told, *times))
-    return markdown(("problem", "method", *near, "s", "longest, s"), lines)
+        lines.append((problem, method, *result_list, *times))
+    return format_markdown(("problem", "method", *near, "s", "longest, s"), lines)
 
 
 def main() -> None:
-    parser = command(__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("folder", type=Path, nargs="?", default=FIGURES)
     parser.add_argument("--starts", type=int, default=20, help="random starts of each problem")
-    chosen = started(parser)
+    chosen = parse_and_start_jax(parser)
     folder, n_starts = chosen.folder, chosen.starts
     rows: list[dict] = []
     results = {}
     for name, config in PROBLEMS.items():
-        settings = load(CONFIGS / f"{config}.toml")
-        sought = settings.tune
-        assert sought is not None
-        problem = tuning_problem(
-            settings.params(), sought.objective, tuple(sought.bounds), sought.bounds,
-            sought.constraints,
+        settings = load_config(CONFIGS / f"{config}.toml")
+        target_values = settings.tune
+        assert target_values is not None
+        problem = make_tune_problem(
+            settings.make_wheel(), target_values.objective, tuple(target_values.bounds), target_values.bounds,
+            target_values.constraints,
         )  # fmt: skip
-        result = results[name] = compared(problem, n_starts, rows, name)
+        result = results[name] = compare_methods(problem, n_starts, rows, name)
         tuned = tune(
-            problem.params, sought.objective, problem.free, sought.bounds, sought.constraints
+            problem.params,
+            target_values.objective,
+            problem.free,
+            target_values.bounds,
+            target_values.constraints,
         )
         u = np.array([float(getattr(tuned.params, n)) for n in problem.free]) - problem.lower
         u = u / problem.widths
         print(f"\n{name}: best known {result['best']:.9g}\n{tuned}")
         print("grid around it:", grid_around(problem, result["values"], u, tuned.value))
-    write_named(folder / "tuning_against_others.csv", rows)
+    write_named_rows(folder / "tuning_against_others.csv", rows)
     table = summary(rows)
     print(table)
     page = folder.parent / "tuning.md"
     if page.exists():
-        replace(page, "table", table)
-    plots.save(drawn(results), folder, "tuning_against_others")
+        replace_block(page, "table", table)
+    plots.save(draw_chart(results), folder, "tuning_against_others")
 
 
 if __name__ == "__main__":

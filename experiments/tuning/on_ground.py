@@ -8,24 +8,24 @@ the other rung.
 """
 
 import vrw_jax as vrw
-from experiments.shared.command import command, started
-from experiments.shared.tables import FIGURES, write
+from experiments.shared.command import make_parser, parse_and_start_jax
+from experiments.shared.tables import FIGURES, write_table
 from experiments.shared.wheels import WIDE_BOX
 
 FRICTION = 0.7
 ON_PAPER = WIDE_BOX  # beyond c = 215 the rear foot lifts off in the landing
 BOX = WIDE_BOX | {"damping": (20.0, 400.0)}
 DAMPING = 300.0  # of the second start on real ground, else Table 1; the first: the paper's optimum
-TOLERANCE, MOST = 1e-4, 30  # gaits of one climb
+TOLERANCE, MAX_EVALUATIONS = 1e-4, 30  # gaits of one climb
 OPTIONS = {"rtol": 1e-9, "atol": 1e-9}  # of steps
 FIELDS = ("scene", *BOX, "ending", "held_by", "dls_fraction", "period", "speed", "slip", "radius")
 
 
 def on_ground(wheel: vrw.WheelParams, start: object) -> tuple:
     """Measures of a gait on real ground near `start`, or where a walk from it ends."""
-    model, options = vrw.UnilateralWheel(friction=FRICTION), vrw.Options(**OPTIONS)
-    walked = vrw.walk(wheel, start, 300, model=model, options=options)
-    end = walked.steps.section_state[-1]
+    model, options = vrw.UnilateralWheel(friction=FRICTION), vrw.StepOptions(**OPTIONS)
+    walk = vrw.walk(wheel, start, 300, model=model, options=options)
+    end = walk.steps.section_state[-1]
     cycle = vrw.limit_cycle(wheel, guess=end, model=model, options=options)
     if not bool(cycle.found):
         return (vrw.Outcome(int(cycle.outcome)).name, "", "", "", "", "")
@@ -39,8 +39,8 @@ def on_paper(wheel: vrw.WheelParams) -> tuple:
     cycle = vrw.limit_cycle(wheel)
     if not bool(cycle.found):
         return (vrw.Outcome(int(cycle.outcome)).name, "", "", "", "", "")
-    told = (float(cycle.dls_fraction), float(cycle.period), float(cycle.speed), 0.0)
-    return ("", *told, float(cycle.spectral_radius))
+    result = (float(cycle.dls_fraction), float(cycle.period), float(cycle.speed), 0.0)
+    return ("", *result, float(cycle.spectral_radius))
 
 
 def numbers(wheel: vrw.WheelParams) -> list[str]:
@@ -48,22 +48,28 @@ def numbers(wheel: vrw.WheelParams) -> list[str]:
 
 
 def main() -> None:
-    started(command(__doc__))
+    parse_and_start_jax(make_parser(__doc__))
     model = vrw.UnilateralWheel(friction=FRICTION)
     rows: list[list] = []
 
-    def row(scene: str, wheel: vrw.WheelParams, told: tuple, ending: str = "", held: str = ""):
-        rows.append([scene, *numbers(wheel), ending or told[0], held, *told[1:]])
+    def row(
+        scene: str,
+        wheel: vrw.WheelParams,
+        results: tuple,
+        ending: str = "",
+        held_values_2: str = "",
+    ):
+        rows.append([scene, *numbers(wheel), ending or results[0], held_values_2, *results[1:]])
         print(rows[-1], flush=True)
 
     paper = vrw.tune(vrw.WheelParams(), "dls_fraction", list(BOX), ON_PAPER)
-    held = "; ".join(f"{a.name} at {a.limit:.4g}" for a in paper.active)
+    held_values = "; ".join(f"{a.name} at {a.limit:.4g}" for a in paper.active)
     row(
         "paper's optimum, paper's rung",
         paper.params,
         on_paper(paper.params),
-        paper.ending.name,
-        held,
+        paper.status.name,
+        held_values,
     )
     row(
         "paper's optimum, real ground",
@@ -77,17 +83,17 @@ def main() -> None:
     }
     for scene, start in starts.items():
         tuned = vrw.tune(
-            start, "dls_fraction", list(BOX), BOX, model=model, options=vrw.Options(**OPTIONS),
-            tolerance=TOLERANCE, max_evaluations=MOST,
+            start, "dls_fraction", list(BOX), BOX, model=model, options=vrw.StepOptions(**OPTIONS),
+            tolerance=TOLERANCE, max_evaluations=MAX_EVALUATIONS,
         )  # fmt: skip
-        held = "; ".join(f"{a.name} at {a.limit:.4g}" for a in tuned.active)
-        told = on_ground(tuned.params, tuned.cycle.section_state)
+        held_values = "; ".join(f"{a.name} at {a.limit:.4g}" for a in tuned.active)
+        result = on_ground(tuned.params, tuned.cycle.section_state)
         print(tuned, flush=True)
-        row(scene, tuned.params, told, tuned.ending.name, held)
+        row(scene, tuned.params, result, tuned.status.name, held_values)
         climbed.append(tuned)
     best = max(climbed, key=lambda tuned: tuned.value)
     row("optimum on real ground, paper's rung", best.params, on_paper(best.params))
-    write(FIGURES / "tuning_on_ground.csv", FIELDS, rows)
+    write_table(FIGURES / "tuning_on_ground.csv", FIELDS, rows)
 
 
 if __name__ == "__main__":

@@ -19,20 +19,26 @@ from pathlib import Path
 from typing import Any
 
 import vrw_jax as vrw
-from experiments.shared.command import command, started
+from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.web.programs import (
     GROUND_TOLD,
     LEGS,
+    PAGE_MARGINS,
     SAMPLES,
-    TOLD,
     Program,
     ground_rows,
+    make_shared_programs,
     programs,
-    shared,
 )
-from vrw_jax.models import PAPER_START, EnergyLoss, Indicators
-from vrw_jax.results import CYCLE, GROUND, MARGINS, STEP, STOPPERS
-from vrw_jax.wheel import DOMAINS
+from vrw_jax.models import PAPER_START, DoubleSupportIndicators, EnergyLoss
+from vrw_jax.results import (
+    LIMIT_CYCLE_MEASURES,
+    MARGIN_MEASURES,
+    STEP_MEASURES,
+    STOPPER_MARGIN_MEASURES,
+    UNILATERAL_STEP_MEASURES,
+)
+from vrw_jax.wheel import PARAMETER_DOMAINS
 
 ROOT = Path(__file__).parents[2]
 PAGE, SOURCES = ROOT / "docs" / "wheel.html", Path(__file__).parent / "page"
@@ -60,11 +66,11 @@ RUNGS = {
     "unilateral": "real ground",
 }
 """What is modelled, by the rungs' names."""
-SHARED = "shared"
+SHARED_MODULE_NAME = "shared"
 """Name of the code that is the same for any number of legs."""
 
 
-def linked(objects: dict[str, bytes]) -> bytes:
+def link_module(objects: dict[str, bytes]) -> bytes:
     """One module of functions by name, that imports `sin` and `cos`."""
     linker = [shutil.which("wasm-ld")]
     if linker == [None]:
@@ -84,40 +90,40 @@ def linked(objects: dict[str, bytes]) -> bytes:
         return out.read_bytes()
 
 
-def compiled(some: dict[str, Program]) -> str:
+def compile_page_code(selection: dict[str, Program]) -> str:
     """Programs' code, packed as the page holds it."""
-    code = linked({name: program.object(name) for name, program in some.items()})
-    return packed(gzip.compress(code, 9, mtime=0))
+    code = link_module({name: program.object(name) for name, program in selection.items()})
+    return pack_bytes(gzip.compress(code, 9, mtime=0))
 
 
-def packed(code: bytes) -> str:
+def pack_bytes(code: bytes) -> str:
     """As text that may stand in a page: how many zeros follow, and base 85, where `.` is `<`."""
     return f"{-len(code) % 4}{base64.b85encode(code, pad=True).decode().replace('<', '.')}"
 
 
-def unpacked(text: str) -> bytes:
+def unpack_bytes(text: str) -> bytes:
     """The inverse."""
     code = base64.b85decode(text[1:].replace(".", "<"))
     return code[: len(code) - int(text[0])]
 
 
-def told_rows(n_legs: int) -> list[str]:
+def list_output_rows(n_legs: int) -> list[str]:
     """Names of what `told` tells, row by row."""
     legs = range(3, n_legs + 1)
     margins = [
-        [f"{name}[{leg}]" for leg in legs] if measure.axis else [name]
-        for name, measure in TOLD.items()
+        [f"{name}[{leg}]" for leg in legs] if measure.dimension else [name]
+        for name, measure in PAGE_MARGINS.items()
     ]
     return [
         "theta_touchdown", "dtheta_touchdown", "dL1_touchdown",
         "theta_post_impact", "dtheta_post_impact",
         "duration_dls", "duration_sls1", "duration_sls2", "step_length",
-        *_named(Indicators), *(name for names in margins for name in names), *_named(EnergyLoss),
+        *_field_names(DoubleSupportIndicators), *(name for names in margins for name in names), *_field_names(EnergyLoss),
     ]  # fmt: skip
 
 
-def _named(told: Any) -> list[str]:
-    return [told.named.get(name, name) for name in told.__annotations__ if name != "named"]
+def _field_names(result: Any) -> list[str]:
+    return [result.named.get(name, name) for name in result.__annotations__ if name != "named"]
 
 
 def facts() -> dict[str, Any]:
@@ -125,8 +131,8 @@ def facts() -> dict[str, Any]:
     git = lambda *what: subprocess.run(
         ["git", *what], cwd=ROOT, check=True, capture_output=True, text=True
     ).stdout.strip()
-    told = lambda m: {
-        "label": m.long_name, "symbol": m.symbol, "unit": m.plain_unit,
+    evaluate = lambda m: {
+        "label": m.long_name, "symbol": m.symbol, "unit": m.display_unit,
         "meaning": m.description, "breaks": m.breaks,
     }  # fmt: skip
     default = vrw.WheelParams()
@@ -134,16 +140,16 @@ def facts() -> dict[str, Any]:
         "commit": git("rev-parse", "--short", "HEAD"),
         "version": vrw.__version__,
         "built": datetime.date.today().isoformat(),
-        "order": list(DOMAINS),
+        "order": list(PARAMETER_DOMAINS),
         "parameters": {
             name: {
-                "symbol": DOMAINS[name].symbol,
-                "unit": DOMAINS[name].unit,
-                "meaning": DOMAINS[name].description,
+                "symbol": PARAMETER_DOMAINS[name].symbol,
+                "unit": PARAMETER_DOMAINS[name].unit,
+                "meaning": PARAMETER_DOMAINS[name].description,
                 "value": float(getattr(default, name)),
                 "from": span[0],
                 "to": span[1],
-                "least": DOMAINS[name].lower,
+                "least": PARAMETER_DOMAINS[name].lower,
             }
             for name, span in SLIDERS.items()
         },
@@ -151,34 +157,41 @@ def facts() -> dict[str, Any]:
         "legs": list(LEGS),
         "rungs": RUNGS,
         "samples": SAMPLES,
-        "rows": {n: told_rows(n) for n in LEGS},
+        "rows": {n: list_output_rows(n) for n in LEGS},
         "ground": {n: ground_rows(n) for n in LEGS},
         "groundTold": GROUND_TOLD,
-        "stoppers": list(STOPPERS),
+        "stoppers": list(STOPPER_MARGIN_MEASURES),
         "measures": {
-            name: told(m) for name, m in (STEP | MARGINS | GROUND | STOPPERS | CYCLE).items()
+            name: evaluate(m)
+            for name, m in (
+                STEP_MEASURES
+                | MARGIN_MEASURES
+                | UNILATERAL_STEP_MEASURES
+                | STOPPER_MARGIN_MEASURES
+                | LIMIT_CYCLE_MEASURES
+            ).items()
         },
-        "margins": {name: bool(m.axis) for name, m in TOLD.items()},
+        "margins": {name: bool(m.dimension) for name, m in PAGE_MARGINS.items()},
         "outcomes": {int(o): {"name": o.name, "meaning": o.meaning} for o in vrw.Outcome},
     }
 
 
-def told_in(page: str, name: str) -> Any:
+def read_page_content(page: str, name: str) -> Any:
     """What a built page holds under a name."""
     _, _, rest = page.partition(f'<script type="application/json" id="{name}">')
     return json.loads(rest.partition("</script>")[0])
 
 
-def written(code: dict[str, str]) -> str:
+def write_page(code: dict[str, str]) -> str:
     """The page with all that it needs inside."""
     part = lambda name: (SOURCES / name).read_text(encoding="utf-8")
-    page, held = part("page.html"), {}
+    page, held_values = part("page.html"), {}
     for name in ("page.css", "engine.js", "ground.js", "worker.js", "pictures.js", "page.js"):
         lines = (line.strip() for line in part(name).splitlines())
-        held[f"/*{name}*/"] = "\n".join(x for x in lines if x and not x.startswith("// "))
-    held[f"/*{FACTS}*/"] = json.dumps(facts(), ensure_ascii=False)
-    held[f"/*{CODE}*/"] = json.dumps(code)
-    for mark, text in held.items():
+        held_values[f"/*{name}*/"] = "\n".join(x for x in lines if x and not x.startswith("// "))
+    held_values[f"/*{FACTS}*/"] = json.dumps(facts(), ensure_ascii=False)
+    held_values[f"/*{CODE}*/"] = json.dumps(code)
+    for mark, text in held_values.items():
         if page.count(mark) != 1:
             raise SystemExit(f"page.html says {mark} {page.count(mark)} times: once is needed.")
         page = page.replace(mark, text)
@@ -186,14 +199,16 @@ def written(code: dict[str, str]) -> str:
 
 
 def main() -> int:
-    parser = command(__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--page", action="store_true", help="keep the step's code as it is")
-    only_page = started(parser).page
+    only_page = parse_and_start_jax(parser).page
     if only_page:
-        code = told_in(PAGE.read_text(encoding="utf-8"), CODE)
+        code = read_page_content(PAGE.read_text(encoding="utf-8"), CODE)
     else:
-        code = {SHARED: compiled(shared())} | {str(n): compiled(programs(n)) for n in LEGS}
-    page = written(code)
+        code = {SHARED_MODULE_NAME: compile_page_code(make_shared_programs())} | {
+            str(n): compile_page_code(programs(n)) for n in LEGS
+        }
+    page = write_page(code)
     PAGE.write_text(page, encoding="utf-8")
     print(f"{PAGE}: {len(page.encode()):,} bytes, {sum(map(len, code.values())):,} of them code")
     return 0

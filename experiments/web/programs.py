@@ -14,36 +14,36 @@ from jaxtyping import Array
 
 from vrw_jax import simd
 from vrw_jax.models import (
-    DIRECTIONS,
+    N_STEP_INPUTS,
     RigidWheel,
     StepResult,
     UnilateralWheel,
-    along_units,
     gait_step,
+    jacobian_columns,
 )
-from vrw_jax.models.lane_step import lane_phase, walk
-from vrw_jax.models.paper_step import described, result_of
-from vrw_jax.models.rigid import Roll
-from vrw_jax.models.unilateral.lanes import Walk, started, turned
-from vrw_jax.models.unilateral.march import N_TALLIED, Place, motion_of
+from vrw_jax.models.lane_step import make_lane_phase, run_batch_phases
+from vrw_jax.models.paper_step import evaluate_states, make_step_result
+from vrw_jax.models.rigid import RollingMotion
+from vrw_jax.models.unilateral.lanes import BatchWalk, advance_round, init_lanes
+from vrw_jax.models.unilateral.march import N_ACCUMULATOR_ROWS, IntervalPoint, motion_from_point
 from vrw_jax.models.unilateral.mechanics import kinetic_energy, potential_energy
-from vrw_jax.models.unilateral.motion import Stance
-from vrw_jax.models.unilateral.section import embedded, section_size
-from vrw_jax.models.unilateral.single import samples
-from vrw_jax.numerics import Options, explicit_tableau, sample_lanes, sine_cosine
-from vrw_jax.results import MARGINS, STOPPERS
-from vrw_jax.wheel import PARAMETER_NAMES, Symbols, WheelParams, wheel_of
+from vrw_jax.models.unilateral.motion import ContactState
+from vrw_jax.models.unilateral.section import embed_section_state, full_section_size
+from vrw_jax.models.unilateral.single import sample_interval
+from vrw_jax.numerics import StepOptions, load_explicit_tableau, sample_batch_phase, sine_cosine
+from vrw_jax.results import MARGIN_MEASURES, STOPPER_MARGIN_MEASURES
+from vrw_jax.wheel import PARAMETER_NAMES, Symbols, WheelParams, wheel_from_parameters
 
 LEGS = (6, 8, 10)
 """Numbers of legs that the page offers: each is code of its own."""
 SAMPLES = 24
 """Times of each phase that the animation knows, ends included."""
 
-WHOLE = 64
+MAX_UNSPLIT_LENGTH = 64
 """Arrays so small are kept whole where a walk on real ground is taken apart: of ten legs the code
 is else five times as long."""
 
-SOLVER = Options.__dataclass_fields__["solver"].default
+SOLVER = StepOptions.__dataclass_fields__["solver"].default
 
 
 class Program(NamedTuple):
@@ -51,16 +51,16 @@ class Program(NamedTuple):
 
     function: Callable[..., tuple]
     numbers: int
-    small: int = simd.SMALL
+    max_unrolled: int = simd.MAX_UNROLLED
     section: int = 3
 
     def object(self, name: str) -> bytes:
         """As code for WebAssembly."""
         rows = len(PARAMETER_NAMES), self.section
-        return simd.web_object(self.function, self.numbers, rows, name, self.small)
+        return simd.compile_wasm_object(self.function, self.numbers, rows, name, self.max_unrolled)
 
 
-TOLD = {name: m for name, m in MARGINS.items() if name != "takeoff_acceleration"}
+PAGE_MARGINS = {name: m for name, m in MARGIN_MEASURES.items() if name != "takeoff_acceleration"}
 """Margins on the page: of scuffing the clearances tell there."""
 
 
@@ -91,7 +91,7 @@ class _OfAnyLegs(WheelParams):
         )
 
 
-def shared() -> dict[str, Program]:
+def make_shared_programs() -> dict[str, Program]:
     """By name: what is the same code for wheels with any number of legs."""
 
     def linearised(tolerance: Array, legs: Array, parameters: Array, x: Array) -> tuple:
@@ -99,31 +99,35 @@ def shared() -> dict[str, Program]:
         of the start's numbers."""
         given = dict(zip(PARAMETER_NAMES, tuple(parameters), strict=True))
         params, options = _OfAnyLegs(**given, legs=legs), _options(tolerance)
-        moved = lambda *start: _advance(params, start, options)
-        columns, numbers, codes = along_units(moved, tuple(x), range(3))
+        shift = lambda *start: _advance(params, start, options)
+        columns, numbers, codes = jacobian_columns(shift, tuple(x), range(3))
         return jnp.stack(numbers), jnp.stack(codes), jnp.stack(columns, 1)
 
-    return {"linearised": Program(linearised, 2, DIRECTIONS)}
+    return {"linearised": Program(linearised, 2, N_STEP_INPUTS)}
 
 
 def programs(n_legs: int) -> dict[str, Program]:
     """By name: what of a step is told, of wheels with so many legs."""
 
     def wheel(parameters: Array) -> WheelParams:
-        return wheel_of(tuple(parameters), n_legs)
+        return wheel_from_parameters(tuple(parameters), n_legs)
 
     def told(tolerance: Array, friction: Array, parameters: Array, x: Array) -> tuple:
         """All that the step tells, in `result_of`'s order, and its motion phase by phase."""
         params, options = wheel(parameters), _options(tolerance)
-        walked = walk(params, tuple(x), options, explicit_tableau(SOLVER), True, monitored=True)
-        step = result_of(walked, friction, "lanes")
+        walk_result = run_batch_phases(
+            params, tuple(x), options, load_explicit_tableau(SOLVER), True, records_margins=True
+        )
+        step = make_step_result(walk_result, friction, "lanes")
         motion = []
-        for phase, start, end in zip(walked.phases, walked.starts, walked.ends, strict=True):
-            flow = lane_phase(phase, monitored=False)
-            known = sample_lanes(
-                flow, explicit_tableau(SOLVER), *start, end.duration, SAMPLES, options
+        for phase, start, end in zip(
+            walk_result.phases, walk_result.starts, walk_result.ends, strict=True
+        ):
+            flow = make_lane_phase(phase, records_margins=False)
+            known_values = sample_batch_phase(
+                flow, load_explicit_tableau(SOLVER), *start, end.duration, SAMPLES, options
             )
-            motion.append(jnp.concatenate(described(phase, jnp.moveaxis(known, 1, 0))))
+            motion.append(jnp.concatenate(evaluate_states(phase, jnp.moveaxis(known_values, 1, 0))))
         codes = jnp.stack([step.outcome, step.solver_steps]).astype(jnp.int32)
         return _numbers_of(step), codes, *motion
 
@@ -133,7 +137,7 @@ def programs(n_legs: int) -> dict[str, Program]:
 GROUND_TOLD = (
     "duration_dls", "duration_single", "duration_flight", "step_length",
     "theta_post_impact", "dtheta_post_impact", "slip",
-    "energy_lost_impacts", "energy_lost_damping", "energy_lost_friction", *STOPPERS,
+    "energy_lost_impacts", "energy_lost_damping", "energy_lost_friction", *STOPPER_MARGIN_MEASURES,
 )  # fmt: skip
 """What of a step on real ground is told after its section state, by the measures' names."""
 
@@ -143,28 +147,34 @@ def _on_ground(wheel: Callable[[Array], WheelParams], n_legs: int) -> dict[str, 
 
     Where it stands is a column of numbers, flags and codes among them.
     """
-    model, tableau = UnilateralWheel(), explicit_tableau(SOLVER)
-    size, n = section_size(n_legs), 3 + n_legs
+    model, tableau = UnilateralWheel(), load_explicit_tableau(SOLVER)
+    size, n = full_section_size(n_legs), 3 + n_legs
 
-    def on(tolerance: Array) -> Walk:
-        rules = jnp.int32(1), model.max_events, model.one_sided, model.by_paper, True
-        return Walk(n_legs, *rules, _options(tolerance), tableau)
+    def on(tolerance: Array) -> BatchWalk:
+        rules = (
+            jnp.int32(1),
+            model.max_events,
+            model.has_one_sided_stoppers,
+            model.uses_paper_rule,
+            True,
+        )
+        return BatchWalk(n_legs, *rules, _options(tolerance), tableau)
 
     def columns(parameters: Array, friction: Array) -> Array:
         return jnp.concatenate([parameters, (friction + 0.0 * parameters[0])[None]])
 
     def begun(parameters: Array, x: Array) -> tuple:
         """The section state that a state of the paper's is."""
-        return (embedded(wheel(parameters).symbols(), x),)
+        return (embed_section_state(wheel(parameters).symbols(), x),)
 
     def opened(tolerance: Array, friction: Array, parameters: Array, x: Array) -> tuple:
         """Where a step from there stands before its first event."""
-        return (_flat(started(on(tolerance), columns(parameters, friction), x)[1]),)
+        return (_flat(init_lanes(on(tolerance), columns(parameters, friction), x)[1]),)
 
     lane = jax.ShapeDtypeStruct((size, 1), float)
     number, given = jax.ShapeDtypeStruct((), float), jax.ShapeDtypeStruct((9, 1), float)
     form = jax.eval_shape(
-        lambda t, mu, p, x: started(on(t), columns(p, mu), x)[1], number, number, given, lane
+        lambda t, mu, p, x: init_lanes(on(t), columns(p, mu), x)[1], number, number, given, lane
     )
 
     def onward(tolerance: Array, friction: Array, parameters: Array, lane: Array) -> tuple:
@@ -172,17 +182,19 @@ def _on_ground(wheel: Callable[[Array], WheelParams], n_legs: int) -> dict[str, 
         coordinates, rates, contacts and stoppers, and how long it lasted; what the step tells so
         far; and its outcome, -1 while it goes on."""
         walk = on(tolerance)
-        past, after = turned(walk, columns(parameters, friction), _formed(lane, form), waits=True)
-        (q, v, _), stance = past.now.here, past.now.stance
+        past, after = advance_round(
+            walk, columns(parameters, friction), _rebuild_tree(lane, form), waits_for_events=True
+        )
+        (q, v, _), stance = past.interval.point, past.interval.contact_state
         codes = [stance.contact.astype(float), stance.locked.astype(float)]
-        step = walk.told(after)
-        told = (
+        step = walk.compute_result(after)
+        result = (
             step.durations, step.step_length, step.post_impact, step.slip, step.energy_impacts,
             step.energy_damping, step.energy_friction,
-            *(getattr(step.monitors, name) for name in STOPPERS),
+            *(getattr(step.margins, name) for name in STOPPER_MARGIN_MEASURES),
         )  # fmt: skip
-        stretch = jnp.concatenate([q, v, *codes, after.now.time[None]])
-        return _flat(after), stretch, _flat((step.section_state, *told)), after.outcome
+        stretch = jnp.concatenate([q, v, *codes, after.interval.time[None]])
+        return _flat(after), stretch, _flat((step.section_state, *result)), after.outcome
 
     def between(tolerance: Array, friction: Array, parameters: Array, stretch: Array) -> tuple:
         """Of a stretch, sample by sample: coordinates, normal and tangential forces of the first
@@ -191,31 +203,39 @@ def _on_ground(wheel: Callable[[Array], WheelParams], n_legs: int) -> dict[str, 
         contact = stretch[2 * n : 2 * n + n_legs].astype(jnp.int32)
         locked = stretch[2 * n + n_legs : -1] > 0.5
         walk, none = on(tolerance), locked & False
-        stance = Stance(contact, locked, none, none, none)
-        flow = walk.flow(columns(parameters, friction), stance)
-        blank = jnp.zeros((N_TALLIED, *q.shape[1:]), q.dtype)
-        motion = motion_of(Place(q, v, q))
-        rows = samples(flow, motion, blank, stretch[-1], SAMPLES, walk.options, tableau)
+        stance = ContactState(contact, locked, none, none, none)
+        flow = walk.make_dynamics(columns(parameters, friction), stance)
+        blank = jnp.zeros((N_ACCUMULATOR_ROWS, *q.shape[1:]), q.dtype)
+        motion = motion_from_point(IntervalPoint(q, v, q))
+        rows = sample_interval(flow, motion, blank, stretch[-1], SAMPLES, walk.options, tableau)
 
-        def row(now: Array) -> Array:
-            motion = motion_of(Place(now[:n], now[n : 2 * n], now))
+        def row(current_value: Array) -> Array:
+            motion = motion_from_point(
+                IntervalPoint(current_value[:n], current_value[n : 2 * n], current_value)
+            )
             energies = kinetic_energy(flow.s, motion), *potential_energy(flow.s, motion)
-            return jnp.concatenate([now[:n], now[2 * n + N_TALLIED :], jnp.stack(energies)])
+            return jnp.concatenate(
+                [
+                    current_value[:n],
+                    current_value[2 * n + N_ACCUMULATOR_ROWS :],
+                    jnp.stack(energies),
+                ]
+            )
 
         return (jnp.moveaxis(jax.vmap(row)(rows), 1, 0),)
 
     return {
         "ground_begun": Program(begun, 0),
         "ground_opened": Program(opened, 2, section=size),
-        "ground_onward": Program(onward, 2, WHOLE, _size(form)),
+        "ground_onward": Program(onward, 2, MAX_UNSPLIT_LENGTH, _size(form)),
         "ground_between": Program(between, 2, section=2 * n + 2 * n_legs + 1),
     }
 
 
 def ground_rows(n_legs: int) -> dict[str, int]:
     """How many numbers there are: of a section state, and of where a walk stands."""
-    onward = _on_ground(lambda p: wheel_of(tuple(p), n_legs), n_legs)["ground_onward"]
-    return {"section": section_size(n_legs), "lane": onward.section}
+    onward = _on_ground(lambda p: wheel_from_parameters(tuple(p), n_legs), n_legs)["ground_onward"]
+    return {"section": full_section_size(n_legs), "lane": onward.section}
 
 
 def _size(form: Any) -> int:
@@ -228,43 +248,43 @@ def _flat(tree: Any) -> Array:
     return jnp.concatenate(rows)
 
 
-def _formed(rows: Array, form: Any) -> Any:
+def _rebuild_tree(rows: Array, form: Any) -> Any:
     """The inverse, by a tree of that form."""
     leaves, structure = jax.tree.flatten(form)
-    found, begin = [], 0
+    solution, begin = [], 0
     for leaf in leaves:
         end = begin + math.prod(leaf.shape[:-1])
-        own = rows[begin:end].reshape(*leaf.shape[:-1], rows.shape[-1])
-        found.append(own > 0.5 if leaf.dtype == bool else own.astype(leaf.dtype))
+        own_values = rows[begin:end].reshape(*leaf.shape[:-1], rows.shape[-1])
+        solution.append(own_values > 0.5 if leaf.dtype == bool else own_values.astype(leaf.dtype))
         begin = end
-    return jax.tree.unflatten(structure, found)
+    return jax.tree.unflatten(structure, solution)
 
 
 def _of_rigid_legs(wheel: Callable[[Array], WheelParams]) -> dict[str, Program]:
     """The same of the lowest rung, in whose formulas no tolerance stands."""
 
     def rolled(parameters: Array, x: tuple) -> tuple[tuple, tuple]:
-        step = RigidWheel().rolled(wheel(parameters), x, jnp.ones_like(x[0]))
+        step = RigidWheel().step_elementwise(wheel(parameters), x, jnp.ones_like(x[0]))
         return (*step.section_state, *step.durations), (step.outcome, step.solver_steps)
 
     def linearised(tolerance: Array, parameters: Array, x: Array) -> tuple:
-        moved = lambda *start: rolled(parameters, start)
-        columns, numbers, codes = along_units(moved, tuple(x), range(3))
+        shift = lambda *start: rolled(parameters, start)
+        columns, numbers, codes = jacobian_columns(shift, tuple(x), range(3))
         return jnp.stack(numbers), jnp.stack(codes), jnp.stack(columns, 1)
 
     def told(tolerance: Array, friction: Array, parameters: Array, x: Array) -> tuple:
         params = wheel(parameters)
-        step = RigidWheel().rolled(params, tuple(x), friction + 0.0 * x[0])
+        step = RigidWheel().step_elementwise(params, tuple(x), friction + 0.0 * x[0])
         half = 0.5 * params.leg_angle
         share = jnp.arange(SAMPLES)[:, None] * (1.0 / (SAMPLES - 1))
-        roll = Roll(params.symbols(), params.slope, step.post_impact[1])
+        roll = RollingMotion(params.symbols(), params.slope, step.post_impact[1])
         theta = half * (2.0 * share - 1.0) + 0.0 * x[0]
-        rows = jnp.concatenate([*roll.described(theta), roll.time(theta)[None]])
+        rows = jnp.concatenate([*roll.evaluate_states(theta), roll.time(theta)[None]])
         codes = jnp.stack([step.outcome, step.solver_steps])
         return _numbers_of(step), codes, rows
 
     return {
-        "rigid_linearised": Program(linearised, 1, DIRECTIONS),
+        "rigid_linearised": Program(linearised, 1, N_STEP_INPUTS),
         "rigid_told": Program(told, 2),
     }
 
@@ -273,17 +293,19 @@ def _numbers_of(step: StepResult) -> Array:
     """What a step tells, row by row."""
     parts = (
         step.section_state, step.post_impact, step.durations, step.step_length,
-        *vars(step.indicators).values(), *(getattr(step.monitors, name) for name in TOLD),
+        *vars(step.indicators).values(), *(getattr(step.margins, name) for name in PAGE_MARGINS),
         *vars(step.energy).values(),
     )  # fmt: skip
     return jnp.concatenate([jnp.atleast_2d(part) for part in parts])
 
 
-def _advance(params: WheelParams, x: tuple[Array, ...], options: Options) -> tuple[tuple, tuple]:
-    step = gait_step(params, x, options, explicit_tableau(SOLVER), stop_at_lift_off=True)
+def _advance(
+    params: WheelParams, x: tuple[Array, ...], options: StepOptions
+) -> tuple[tuple, tuple]:
+    step = gait_step(params, x, options, load_explicit_tableau(SOLVER), stop_at_lift_off=True)
     return (*step.section_state, *step.durations), (step.outcome, step.solver_steps)
 
 
-def _options(tolerance: Array) -> Options:
+def _options(tolerance: Array) -> StepOptions:
     """The library's own, but for the tolerance."""
-    return eqx.tree_at(lambda o: (o.rtol, o.atol), Options(), (tolerance, tolerance))
+    return eqx.tree_at(lambda o: (o.rtol, o.atol), StepOptions(), (tolerance, tolerance))

@@ -12,12 +12,20 @@ import subprocess
 import tempfile
 from typing import Any
 
-from experiments.shared.command import command, extra, started
-from experiments.shared.tables import markdown, replace
-from experiments.shared.timing import processor
-from experiments.web.build import CODE, FACTS, PAGE, ROOT, SHARED, SOURCES, told_in
+from experiments.shared.command import make_parser, parse_and_start_jax, require_extra
+from experiments.shared.tables import format_markdown, replace_block
+from experiments.shared.timing import describe_processor
+from experiments.web.build import (
+    CODE,
+    FACTS,
+    PAGE,
+    ROOT,
+    SHARED_MODULE_NAME,
+    SOURCES,
+    read_page_content,
+)
 
-MOVED = 80
+N_SLIDER_MOVES = 80
 """Places of the slider, after as many that warm up."""
 
 IN_NODE = """
@@ -90,23 +98,25 @@ def in_node() -> dict[str, Any]:
     source = "\n".join(
         (SOURCES / name).read_text() for name in ("engine.js", "ground.js", "worker.js")
     )
-    code = told_in(page, CODE)
+    code = read_page_content(page, CODE)
     given = {
-        "facts": told_in(page, FACTS), "packed": [code[SHARED], code["8"]], "moved": MOVED,
+        "facts": read_page_content(page, FACTS), "packed": [code[SHARED_MODULE_NAME], code["8"]], "moved": N_SLIDER_MOVES,
         "source": source.replace('"use strict";', ""),
     }  # fmt: skip
     node = ["node", "-e", IN_NODE]
-    told = subprocess.run(node, input=json.dumps(given), check=True, capture_output=True, text=True)
-    return json.loads(told.stdout)
+    run_result = subprocess.run(
+        node, input=json.dumps(given), check=True, capture_output=True, text=True
+    )
+    return json.loads(run_result.stdout)
 
 
 def in_chromium() -> dict[str, tuple[list[float], float, float]]:
     """By rung the wall time of an update with all that is drawn, median and 95 in 100, ms; of basin
     and map, s."""
-    found = {}
+    found_by_name = {}
     path = shutil.which("chromium")
     switches = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-sync"]
-    playwright = extra("playwright.sync_api", 'pip install -e ".[web]"')
+    playwright = require_extra("playwright.sync_api", 'pip install -e ".[web]"')
     with playwright.sync_playwright() as machine, tempfile.TemporaryDirectory() as folder:
         opened = machine.chromium.launch_persistent_context(
             folder, executable_path=path, args=switches
@@ -116,7 +126,7 @@ def in_chromium() -> dict[str, tuple[list[float], float, float]]:
         page.evaluate("vrw.ready")
         done = "vrw.state.map.done && vrw.state.basin.done"
         for rung, pace in (("viscoelastic", 1.0), ("unilateral", 0.1)):
-            times = page.evaluate(IN_CHROMIUM, [MOVED, rung, pace])
+            times = page.evaluate(IN_CHROMIUM, [N_SLIDER_MOVES, rung, pace])
             page.wait_for_timeout(1000)
             page.wait_for_function(done, timeout=300_000)
             # Once more, as it is when the code is warm.
@@ -124,31 +134,36 @@ def in_chromium() -> dict[str, tuple[list[float], float, float]]:
             page.wait_for_timeout(1000)
             page.wait_for_function(done, timeout=300_000)
             pictures = page.evaluate("[vrw.state.basin.seconds, vrw.state.map.seconds]")
-            found[rung] = times, *pictures
+            found_by_name[rung] = times, *pictures
         opened.close()
-    return found
+    return found_by_name
 
 
 def main() -> None:
-    started(command(__doc__))
+    parse_and_start_jax(make_parser(__doc__))
     node, chromium = in_node(), in_chromium()
-    (times, basin, whole), (real, slow, wide) = chromium["viscoelastic"], chromium["unilateral"]
+    (times, basin, full_values), (real, slow, wide) = (
+        chromium["viscoelastic"],
+        chromium["unilateral"],
+    )
     rows = [
         ("a slider moved: gait, multipliers, forces, margins", f"{node['update']:.1f} ms",
          f"{times[0]:.0f} ms, 95 in 100 below {times[1]:.0f}"),
         ("the same where there is no gait: searched, walked until lost",
          "{:.0f} ms, 95 in 100 below {:.0f}, none above {:.0f}".format(*node["lost"]), ""),
         ("a basin of 64 × 64 starts", f"{node['basin'] / 1000:.2f} s", f"{basin:.1f} s"),
-        ("a map of 65 × 65 gaits", "", f"{whole:.1f} s"),
+        ("a map of 65 × 65 gaits", "", f"{full_values:.1f} s"),
         ("real ground: a slider moved a little",
          "{:.0f} ms, 95 in 100 below {:.0f}".format(*node["real"]),
          f"{real[0]:.0f} ms, 95 in 100 below {real[1]:.0f}"),
         ("real ground: a basin of 32 × 32 starts", "", f"{slow:.0f} s"),
         ("real ground: a map of 33 × 33 gaits", "", f"{wide:.0f} s"),
     ]  # fmt: skip
-    table = markdown(("", "Node, CPU time", "Chromium, wall time, all drawn"), rows)
+    table = format_markdown(("", "Node, CPU time", "Chromium, wall time, all drawn"), rows)
     load = f"load average {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
-    replace(ROOT / "docs" / "explore.md", "speed", f"{table}\n\n{processor()}; {load}.")
+    replace_block(
+        ROOT / "docs" / "explore.md", "speed", f"{table}\n\n{describe_processor()}; {load}."
+    )
 
 
 if __name__ == "__main__":

@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from experiments.shared.tables import DOCS, FIGURES, Row, markdown, replace
-from vrw_jax.figures import PAGE, figure_style, save
+from experiments.shared.tables import DOCS, FIGURES, Row, format_markdown, replace_block
+from vrw_jax.figures import PAGE_WIDTH_INCHES, figure_style, save
 
 QUANTITIES = {  # group and title of each panel
     "post_impact": ("step", "state after the next landing"),
@@ -47,7 +47,7 @@ DEFAULTS = {  # what a user gets who chooses nothing, by group
     ("cycle", "collocation", "from nothing", "(10, 8, 3)"),
     ("gradient", "collocation", "forward", "(10, 8, 3)"),
 }
-WAYS = {  # of the table: group, one wheel or many
+TABLE_METHODS = {  # of the table: group, one wheel or many
     "one step": ("step", True),
     "a batch of steps": ("step", False),
     "one limit cycle": ("cycle", True),
@@ -87,11 +87,11 @@ def is_default(row: Row) -> bool:
 
 def curves(rows: list[Row], quantity: str) -> dict[str, list[Row]]:
     """Rows of many lanes that tell of a quantity, by label, loosest first."""
-    told: dict[str, list[Row]] = {}
+    result: dict[str, list[Row]] = {}
     for row in rows:
         if row.get(f"{quantity}_p99") and int(row["lanes"]) > 1:
-            told.setdefault(label_of(row), []).append(row)
-    return told
+            result.setdefault(label_of(row), []).append(row)
+    return result
 
 
 def style_of(rows: list[Row]) -> dict[str, dict]:
@@ -123,19 +123,21 @@ def of_lanes(row: Row) -> int:
 def draw_panel(axes: Axes, rows: list[Row], quantity: str, x_of) -> None:
     """p99 as a curve, p50 to worst as bars, failures as crosses with their share."""
     styles = style_of(rows)
-    for label, some in curves(rows, quantity).items():
-        shown = [row for row in some if x_of(row) > 0.0 and int(row["failed"]) < of_lanes(row)]
-        shown = [row for row in shown if float(row[f"{quantity}_p99"]) > 0.0]
-        if not shown:
+    for label, selection in curves(rows, quantity).items():
+        shown_rows = [
+            row for row in selection if x_of(row) > 0.0 and int(row["failed"]) < of_lanes(row)
+        ]
+        shown_rows = [row for row in shown_rows if float(row[f"{quantity}_p99"]) > 0.0]
+        if not shown_rows:
             continue
-        x = np.array([x_of(row) for row in shown])
+        x = np.array([x_of(row) for row in shown_rows])
         p50, p99, worst = (
-            np.array([max(float(row[f"{quantity}_{part}"]), 1e-17) for row in shown])
+            np.array([max(float(row[f"{quantity}_{part}"]), 1e-17) for row in shown_rows])
             for part in ("p50", "p99", "worst")
         )
         axes.vlines(x, p50, worst, color=styles[label]["color"], lw=0.5, alpha=0.6)
         axes.plot(x, p99, label=label, **styles[label])
-        for a, b, row in zip(x, p99, shown, strict=True):
+        for a, b, row in zip(x, p99, shown_rows, strict=True):
             if int(row["failed"]):
                 axes.plot(a, b, "x", color="black", ms=7, mew=1.2, zorder=5)
                 note = f"{row['failed']}/{of_lanes(row)}"
@@ -152,43 +154,43 @@ def draw_panel(axes: Axes, rows: list[Row], quantity: str, x_of) -> None:
 
 def panels(rows: list[Row], quantities: list[str], x_of, x_label: str) -> Figure:
     """One panel for each quantity, with one legend for all."""
-    figure = Figure(figsize=(PAGE, 4.2))
+    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 4.2))
     grid = figure.subplots(1, len(quantities), sharey=True)
     for quantity, axes in zip(quantities, grid, strict=True):
         draw_panel(axes, rows, quantity, x_of)
         axes.set_xlabel(x_label)
     grid[0].set_ylabel("error, 99 % of lanes below it;\nbar from the median to the worst")
-    found: dict[str, object] = {}
+    solution: dict[str, object] = {}
     for axes in grid:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-            found.setdefault(label, handle)
-    order = sorted(found, key=lambda label: [*COLOURS].index(label.split(":")[0]))
-    handles = [found[label] for label in order]
+            solution.setdefault(label, handle)
+    order = sorted(solution, key=lambda label: [*COLOURS].index(label.split(":")[0]))
+    handles = [solution[label] for label in order]
     figure.legend(handles, order, loc="outside lower center", ncols=3, fontsize=7)
     return figure
 
 
 def batch_chart(rows: list[Row], every: list[Row]) -> Figure:
     """Time per gait over the batch, and the first call beside a warm one."""
-    figure = Figure(figsize=(PAGE, 4.4))
-    left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.15))
+    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 4.4))
+    left_part, right = figure.subplots(1, 2, width_ratios=(1.0, 1.15))
     unit = unit_of(every)
-    told: dict[str, list[Row]] = {}
+    result: dict[str, list[Row]] = {}
     cycles = [row for row in every if is_default(row) and row["group"] == "cycle"]
     for row in (*rows, *cycles):
-        told.setdefault(f"{row['group']}, {row['family']}: {row['name']}", []).append(row)
-    for label, some in told.items():
-        some = sorted(some, key=lambda row: int(row["lanes"]))
-        marker = "s" if some[0]["group"] == "cycle" else "o"
-        ls = "--" if some[0]["group"] == "cycle" else "-"
-        left.loglog(
-            [int(row["lanes"]) for row in some],
-            [time_of(row, unit) for row in some],
-            ls=ls, marker=marker, ms=3.5, color=COLOURS[some[0]["family"]], label=label,
+        result.setdefault(f"{row['group']}, {row['family']}: {row['name']}", []).append(row)
+    for label, sorted_items in result.items():
+        sorted_items = sorted(sorted_items, key=lambda row: int(row["lanes"]))
+        marker = "s" if sorted_items[0]["group"] == "cycle" else "o"
+        ls = "--" if sorted_items[0]["group"] == "cycle" else "-"
+        left_part.loglog(
+            [int(row["lanes"]) for row in sorted_items],
+            [time_of(row, unit) for row in sorted_items],
+            ls=ls, marker=marker, ms=3.5, color=COLOURS[sorted_items[0]["family"]], label=label,
         )  # fmt: skip
-    left.set(xlabel="wheels in a call", ylabel="CPU time per gait [µs]")
-    left.grid(color="0.9", lw=0.4)
-    left.legend(fontsize=6, loc="upper center", bbox_to_anchor=(0.45, -0.14), ncols=2)
+    left_part.set(xlabel="wheels in a call", ylabel="CPU time per gait [µs]")
+    left_part.grid(color="0.9", lw=0.4)
+    left_part.legend(fontsize=6, loc="upper center", bbox_to_anchor=(0.45, -0.14), ncols=2)
     first: dict[str, tuple[float, float]] = {}
     for row in every:
         name = f"{row['group']}, {label_of(row)}" + (", one" if row["lanes"] == "1" else "")
@@ -206,24 +208,24 @@ def batch_chart(rows: list[Row], every: list[Row]) -> Figure:
     return figure
 
 
-def best(rows: list[Row], group: str, alone: bool, target: float) -> Row | None:
+def best(rows: list[Row], group: str, single_result: bool, target: float) -> Row | None:
     """The fastest row that keeps every quantity's p99 below the target, with no lane failed.
 
     One wheel alone is judged by the errors of many: its own might be lucky.
     """
-    quantities = [name for name, (of, _) in QUANTITIES.items() if of == group]
+    quantities = [name for name, (of_values, _) in QUANTITIES.items() if of_values == group]
     unit = unit_of(rows)
-    some = []
+    selection = []
     for row in rows:
         fits = row["group"] == group and int(row["failed"]) == 0
-        fits = fits and (row["lanes"] == "1" or not alone or row["family"] in SCALAR)
-        fits = fits and (alone or row["lanes"] != "1")
-        same = [r for r in rows if r["lanes"] != "1" and curve_of(r) == curve_of(row)]
-        judged = same[0] if same else row
+        fits = fits and (row["lanes"] == "1" or not single_result or row["family"] in SCALAR)
+        fits = fits and (single_result or row["lanes"] != "1")
+        is_same = [r for r in rows if r["lanes"] != "1" and curve_of(r) == curve_of(row)]
+        judged = is_same[0] if is_same else row
         fits = fits and int(judged["failed"]) == 0
         if fits and all(float(judged[f"{name}_p99"] or "nan") <= target for name in quantities):
-            some.append(row)
-    return min(some, key=lambda row: time_of(row, unit), default=None)
+            selection.append(row)
+    return min(selection, key=lambda row: time_of(row, unit), default=None)
 
 
 def curve_of(row: Row) -> tuple[str, ...]:
@@ -231,7 +233,7 @@ def curve_of(row: Row) -> tuple[str, ...]:
     return tuple(row[name] for name in ("group", "family", "name", "precision", "setting"))
 
 
-def told_time(us: float) -> str:
+def format_time(us: float) -> str:
     """Microseconds with a unit."""
     scale, unit = (1.0, "µs") if us < 1e3 else (1e-3, "ms") if us < 1e6 else (1e-6, "s")
     return f"{us * scale:.3g} {unit}"
@@ -242,19 +244,19 @@ def table(rows: list[Row]) -> str:
     unit = unit_of(rows)
     ours = [row for row in rows if row["family"] not in (*SCALAR, "diffrax by hand")]
     lines = []
-    for way, (group, alone) in WAYS.items():
+    for method_name, (group, single_result) in TABLE_METHODS.items():
         for target in TARGETS:
-            cells = [way, f"1e{round(math.log10(target))}"]
-            for some in (ours, rows):
-                row = best(some, group, alone, target)
+            cells = [method_name, f"1e{round(math.log10(target))}"]
+            for selection in (ours, rows):
+                row = best(selection, group, single_result, target)
                 if row is None:
-                    tried = best(some, group, alone, math.inf) is not None
+                    tried = best(selection, group, single_result, math.inf) is not None
                     cells += ["none" if tried else "not measured", "–"]
                 else:
-                    cells += [f"{label_of(row)}, {row['setting']}", told_time(time_of(row, unit))]
+                    cells += [f"{label_of(row)}, {row['setting']}", format_time(time_of(row, unit))]
             lines.append(cells)
     header = ("wanted", "p99 error", "ours", "per gait", "fastest of all", "per gait")
-    return markdown(header, lines)
+    return format_markdown(header, lines)
 
 
 def on_the_front(rows: list[Row]) -> str:
@@ -268,7 +270,7 @@ def on_the_front(rows: list[Row]) -> str:
             if group != row["group"]:
                 continue
             error = float(row[f"{quantity}_p99"])
-            some = [
+            selection = [
                 r
                 for r in rows
                 if r["family"] not in (*SCALAR, "diffrax by hand")
@@ -277,14 +279,14 @@ def on_the_front(rows: list[Row]) -> str:
                 and int(r["failed"]) == 0
                 and float(r[f"{quantity}_p99"] or "inf") <= error
             ]
-            quick = min(some, key=lambda r: time_of(r, unit))
+            quick = min(selection, key=lambda r: time_of(r, unit))
             ratio = time_of(row, unit) / time_of(quick, unit)
             default = f"{label_of(row)}, {row['setting']}"
             fastest = f"{label_of(quick)}, {quick['setting']}"
-            costs = f"{error:.1e}", told_time(time_of(row, unit)), fastest, f"{ratio:.2g}"
+            costs = f"{error:.1e}", format_time(time_of(row, unit)), fastest, f"{ratio:.2g}"
             lines.append((default, QUANTITIES[quantity][1], *costs))
     header = ("default", "quantity", "p99 error", "per gait", "fastest of ours as accurate")
-    return markdown((*header, "ratio"), lines)
+    return format_markdown((*header, "ratio"), lines)
 
 
 def floors(rows: list[Row]) -> str:
@@ -293,7 +295,7 @@ def floors(rows: list[Row]) -> str:
     for quantity, (_, title) in QUANTITIES.items():
         cells = [title]
         for precision in ("float32", "float64"):
-            some = [
+            selection = [
                 row
                 for row in rows
                 if row["precision"] == precision
@@ -302,16 +304,16 @@ def floors(rows: list[Row]) -> str:
                 and int(row["lanes"]) > 1
                 and "durations" not in row["name"]  # of a step, with wheels handed on
             ]
-            least = min(some, key=lambda row: float(row[f"{quantity}_p99"]), default=None)
-            if least is None:
+            minimum = min(selection, key=lambda row: float(row[f"{quantity}_p99"]), default=None)
+            if minimum is None:
                 cells += ["not measured", "–"]
             else:
-                error = float(least[f"{quantity}_p99"])
-                failed = int(least["failed"])
-                lost = f", {failed} of {of_lanes(least)} failed" if failed else ""
-                cells += [f"{error:.0e}", f"{least['family']}, {least['setting']}{lost}"]
+                error = float(minimum[f"{quantity}_p99"])
+                failed = int(minimum["failed"])
+                lost_values = f", {failed} of {of_lanes(minimum)} failed" if failed else ""
+                cells += [f"{error:.0e}", f"{minimum['family']}, {minimum['setting']}{lost_values}"]
         lines.append(cells)
-    return markdown(("quantity", "float32", "by", "float64", "by"), lines)
+    return format_markdown(("quantity", "float32", "by", "float64", "by"), lines)
 
 
 def failures(rows: list[Row]) -> str:
@@ -321,7 +323,7 @@ def failures(rows: list[Row]) -> str:
         for r in rows
         if int(r["failed"])
     ]
-    return markdown(("method", "setting", "wheels that failed"), lines)
+    return format_markdown(("method", "setting", "wheels that failed"), lines)
 
 
 STEPS, CYCLES = list(QUANTITIES)[:2], list(QUANTITIES)[2:]
@@ -352,7 +354,7 @@ def write_page(
     """All methods and quantities in one page, each to be shown or hidden."""
     curves_of = []
     for quantity, (_, title) in QUANTITIES.items():
-        for label, some in curves(rows, quantity).items():
+        for label, selection in curves(rows, quantity).items():
             parts = [f"{quantity}_{part}" for part in ("p50", "p99", "worst")]
             points = [
                 [
@@ -362,7 +364,7 @@ def write_page(
                     int(row["failed"]),
                     of_lanes(row),
                 ]
-                for row in some
+                for row in selection
                 if int(row["failed"]) < of_lanes(row)
             ]
             look = {"quantity": title, "label": label, "colour": COLOURS[label.split(":")[0]]}
@@ -377,15 +379,15 @@ def draw(rows: list[Row], batches: list[Row]) -> None:
     """All charts and the tables."""
     unit = unit_of(rows)
     with figure_style():
-        for name, (quantities, shown) in CHARTS.items():
-            some = [row for row in rows if shown(row)]
+        for name, (quantities, shown_values) in CHARTS.items():
+            selection = [row for row in rows if shown_values(row)]
             for work, (label, x_of) in works(unit).items():
-                chart = panels(some, quantities, x_of, label)
+                chart = panels(selection, quantities, x_of, label)
                 save(chart, FIGURES, f"work_precision_{name}_{work}")
         save(batch_chart(batches, rows), FIGURES, "work_precision_batch")
     write_page(rows, FIGURES / "work_precision.html", works(unit))
     page = DOCS / "work_precision.md"
-    replace(page, "what to use", table(rows))
-    replace(page, "defaults", on_the_front(rows))
-    replace(page, "floors", floors(rows))
-    replace(page, "failures", failures(rows))
+    replace_block(page, "what to use", table(rows))
+    replace_block(page, "defaults", on_the_front(rows))
+    replace_block(page, "floors", floors(rows))
+    replace_block(page, "failures", failures(rows))

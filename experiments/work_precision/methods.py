@@ -23,13 +23,13 @@ import numpy as np
 import optimistix as optx
 
 import vrw_jax as vrw
-from experiments.shared.wheels import BOX, wheels
+from experiments.shared.wheels import BOX, make_wheels
 from experiments.speed import peers
-from vrw_jax.models.viscoelastic import flow_of
-from vrw_jax.numerics import explicit_tableau
-from vrw_jax.wheel import phases_of, transitions
+from vrw_jax.models.viscoelastic import make_diffrax_phase
+from vrw_jax.numerics import load_explicit_tableau
+from vrw_jax.wheel import make_phases, transitions
 
-VARIED = tuple(BOX)
+VARIED_PARAMETERS = tuple(BOX)
 Run = Callable[[], np.ndarray]
 
 
@@ -50,8 +50,8 @@ class Method(NamedTuple):
 
 def stages(solver: str) -> int:
     """Evaluations of a tried step; 0 for an implicit solver, which does not tell."""
-    tableau = explicit_tableau(solver)
-    return 0 if tableau is None else len(tableau.places) - 1
+    tableau = load_explicit_tableau(solver)
+    return 0 if tableau is None else len(tableau.nodes) - 1
 
 
 def by_library(engine: str, solver: str, dtype: type = np.float64) -> Callable:
@@ -59,17 +59,21 @@ def by_library(engine: str, solver: str, dtype: type = np.float64) -> Callable:
 
     def make(tolerance: float, rows: np.ndarray, starts: np.ndarray) -> Run:
         as_given = functools.partial(np.asarray, dtype=dtype)
-        options = vrw.Options(solver=solver, rtol=as_given(tolerance), atol=as_given(tolerance))
-        params, x = wheels(as_given(rows)), as_given(starts)
+        options = vrw.StepOptions(solver=solver, rtol=as_given(tolerance), atol=as_given(tolerance))
+        params, x = make_wheels(as_given(rows)), as_given(starts)
         params = jax.tree.map(lambda leaf: leaf.astype(dtype), params)
 
         def run() -> np.ndarray:
-            found = vrw.steps(params, x, options=options, engine=engine)
-            parts = found.section_state, found.durations, found.solver_steps[:, None]
-            told = np.concatenate([np.asarray(part, float) for part in parts], 1)
-            told[:, 6] *= stages(solver)
-            told[np.asarray(found.outcome) != vrw.Outcome.STEPPED] = np.nan
-            return told
+            batch_result = vrw.step_batch(params, x, options=options, engine=engine)
+            parts = (
+                batch_result.section_state,
+                batch_result.durations,
+                batch_result.solver_steps[:, None],
+            )
+            joined_values = np.concatenate([np.asarray(part, float) for part in parts], 1)
+            joined_values[:, 6] *= stages(solver)
+            joined_values[np.asarray(batch_result.outcome) != vrw.Outcome.STEPPED] = np.nan
+            return joined_values
 
         return run
 
@@ -78,16 +82,20 @@ def by_library(engine: str, solver: str, dtype: type = np.float64) -> Callable:
 
 def by_fixed_work(spread: float, rows: np.ndarray, starts: np.ndarray) -> Run:
     """`vrw.steps` by collocation, durations known to a spread; lanes it does not trust failed."""
-    near = vrw.steps(wheels(rows), starts).durations
-    known = np.asarray(near) * np.random.default_rng(3).uniform(
+    near = vrw.step_batch(make_wheels(rows), starts).durations
+    known_values = np.asarray(near) * np.random.default_rng(3).uniform(
         1.0 - spread, 1.0 + spread, (len(rows), 3)
     )
 
     def run() -> np.ndarray:
-        found = vrw.steps(wheels(rows), starts, engine="collocation", durations=known)
-        told = np.concatenate([found.section_state, found.durations, 0.0 * known[:, :1]], 1)
-        told[~np.asarray(found.fixed)] = np.nan
-        return told
+        batch_result = vrw.step_batch(
+            make_wheels(rows), starts, engine="collocation", durations=known_values
+        )
+        joined_values = np.concatenate(
+            [batch_result.section_state, batch_result.durations, 0.0 * known_values[:, :1]], 1
+        )
+        joined_values[~np.asarray(batch_result.is_collocated)] = np.nan
+        return joined_values
 
     return run
 
@@ -97,16 +105,16 @@ def single_step(solver: str) -> Callable:
 
     @jax.jit
     def step(params: vrw.WheelParams, x: jax.Array, tolerance: jax.Array) -> Any:
-        options = vrw.Options(solver=solver, rtol=tolerance, atol=tolerance)
+        options = vrw.StepOptions(solver=solver, rtol=tolerance, atol=tolerance)
         return vrw.ViscoelasticWheel().advance(params, x, options)
 
     def make(tolerance: float, rows: np.ndarray, starts: np.ndarray) -> Run:
-        params, x = wheels(rows[0]), jnp.asarray(starts[0])
+        params, x = make_wheels(rows[0]), jnp.asarray(starts[0])
 
         def run() -> np.ndarray:
-            found = jax.block_until_ready(step(params, x, tolerance))
-            count = found.solver_steps * stages(solver)
-            return np.asarray([[*found.section_state, *found.durations, count]])
+            solution = jax.block_until_ready(step(params, x, tolerance))
+            count = solution.solver_steps * stages(solver)
+            return np.asarray([[*solution.section_state, *solution.durations, count]])
 
         return run
 
@@ -122,7 +130,7 @@ def by_diffeqsolve(solver: diffrax.AbstractAdaptiveSolver, fixed: bool) -> Calla
         controller: Any = diffrax.ConstantStepSize()
         if not fixed:
             controller = diffrax.PIDController(rtol=setting, atol=setting)
-        found = diffrax.diffeqsolve(
+        solution = diffrax.diffeqsolve(
             diffrax.ODETerm(lambda t, y, args: phase.field(y)),
             solver, 0.0, 20.0, setting if fixed else 5e-3, y,
             stepsize_controller=controller,
@@ -131,14 +139,18 @@ def by_diffeqsolve(solver: diffrax.AbstractAdaptiveSolver, fixed: bool) -> Calla
             ),
             max_steps=20_000, throw=False,
         )  # fmt: skip
-        ended = found.result == diffrax.RESULTS.event_occurred
-        return found.ys[0], jnp.where(ended, found.ts[0], jnp.nan), found.stats["num_steps"]
+        ended = solution.result == diffrax.RESULTS.event_occurred
+        return (
+            solution.ys[0],
+            jnp.where(ended, solution.ts[0], jnp.nan),
+            solution.stats["num_steps"],
+        )
 
     def one(row: jax.Array, x: jax.Array, setting: jax.Array) -> jax.Array:
-        s = wheels(row).symbols()
+        s = make_wheels(row).symbols()
         landing = transitions.land(s, *x)
-        phases = phases_of(s, landing.distance, stop_at_lift_off=True)
-        dls, sls1, sls2 = (flow_of(phase, monitored=False) for phase in phases)
+        phases = make_phases(s, landing.distance, stop_at_lift_off=True)
+        dls, sls1, sls2 = (make_diffrax_phase(phase, records_margins=False) for phase in phases)
         y, first_time, n1 = until(dls, jnp.stack([landing.theta, landing.motion.dtheta]), setting)
         m = dls.motion(y)
         start = jnp.stack([y[0], m.L1, m.L2, m.dtheta, m.dL1, m.dL2])
@@ -149,8 +161,8 @@ def by_diffeqsolve(solver: diffrax.AbstractAdaptiveSolver, fixed: bool) -> Calla
         times = first_time, second, third
         good = jnp.isfinite(sum(times))
         count = (n1 + n2 + n3) * float(stages(type(solver).__name__))
-        told = jnp.stack([y[0], y[2], y[3], *times, count])
-        return jnp.where(good, told, jnp.nan)
+        stacked_values = jnp.stack([y[0], y[2], y[3], *times, count])
+        return jnp.where(good, stacked_values, jnp.nan)
 
     steps = jax.jit(jax.vmap(one, (0, 0, None)))
     return lambda setting, rows, starts: lambda: np.asarray(steps(rows, starts, setting))
@@ -158,17 +170,17 @@ def by_diffeqsolve(solver: diffrax.AbstractAdaptiveSolver, fixed: bool) -> Calla
 
 def plane_starts(rows: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(theta+, dtheta+) after the landing, and parameters packed for the peers."""
-    params = wheels(rows)
-    return landed(params, starts), peers.pack(params)
+    params = make_wheels(rows)
+    return compute_landing(params, starts), peers.pack(params)
 
 
-def landed(params: vrw.WheelParams, states: np.ndarray) -> np.ndarray:
+def compute_landing(params: vrw.WheelParams, states: np.ndarray) -> np.ndarray:
     """(theta+, dtheta+) after the landing of section states."""
-    return np.asarray(_landed(params, states))
+    return np.asarray(_compute_landing_columns(params, states))
 
 
 @jax.jit
-def _landed(params: vrw.WheelParams, states: jax.Array) -> jax.Array:
+def _compute_landing_columns(params: vrw.WheelParams, states: jax.Array) -> jax.Array:
     landing = transitions.land(params.symbols(), *states.T)
     return jnp.stack([landing.theta, landing.motion.dtheta], 1)
 
@@ -202,55 +214,61 @@ def by_collocation(tolerance: float = 1e-10, dtype: type = np.float64) -> Callab
     """`vrw.limit_cycle` from nothing; settings are meshes."""
 
     def make(mesh: tuple[int, int, int], rows: np.ndarray, starts: np.ndarray) -> Run:
-        options = vrw.CycleOptions(steps=mesh, tolerance=tolerance)
+        options = vrw.CycleOptions(mesh_intervals=mesh, tolerance=tolerance)
         given = np.asarray(rows, dtype)
 
         def one(row: jax.Array) -> tuple:
-            params = jax.tree.map(lambda leaf: leaf.astype(dtype), wheels(row))
-            found = vrw.limit_cycle(params, options=options)
-            return found.post_impact, found.durations, found.matrix, found.passes, found.found
+            params = jax.tree.map(lambda leaf: leaf.astype(dtype), make_wheels(row))
+            cycle = vrw.limit_cycle(params, options=options)
+            return (
+                cycle.post_impact,
+                cycle.durations,
+                cycle.monodromy_value,
+                cycle.n_newton_iterations,
+                cycle.found,
+            )
 
         find = jax.jit(jax.vmap(one) if len(rows) > 1 else one)
 
         def run() -> np.ndarray:
             with jax.enable_x64(dtype is np.float64):  # with it, the mesh would be float64
-                found = jax.block_until_ready(find(given if len(rows) > 1 else given[0]))
-            y, durations, matrix, passes, good = (np.asarray(x, float) for x in found)
+                solution = jax.block_until_ready(find(given if len(rows) > 1 else given[0]))
+            y, durations, matrix, passes, good = (np.asarray(x, float) for x in solution)
             count = passes * 4.0 * sum(mesh)
             parts = y, durations, matrix.reshape(*matrix.shape[:-2], 4), count[..., None]
-            told = np.atleast_2d(np.concatenate(parts, -1))
-            told[np.atleast_1d(good) == 0.0] = np.nan
-            return told
+            result = np.atleast_2d(np.concatenate(parts, -1))
+            result[np.atleast_1d(good) == 0.0] = np.nan
+            return result
 
         return run
 
     return make
 
 
-def cycle_of_map(row: jax.Array, start: jax.Array, options: vrw.Options) -> tuple:
+def cycle_of_map(row: jax.Array, start: jax.Array, options: vrw.StepOptions) -> tuple:
     """Newton's method on the event-driven plane map: cycle, Jacobian, durations, solver steps."""
-    params, model = wheels(row), vrw.ViscoelasticWheel()
+    params, model = make_wheels(row), vrw.ViscoelasticWheel()
     s = params.symbols()
 
     def section(y: jax.Array) -> jax.Array:
         landing = transitions.land(s, *y)
         return jnp.stack([landing.theta, landing.motion.dtheta])
 
-    found = vrw.newton_cycle(
+    fixed_point = vrw.solve_fixed_point(
         lambda x: model.advance(params, x, options).section_state,
         start,
         tolerance=1e-11,
-        iterations=8,
+        max_iterations=8,
     )
-    last = model.advance(params, found.x, options)
-    return section(found.x), found.jacobian, last.durations, found.converged
+    last = model.advance(params, fixed_point.x, options)
+    return section(fixed_point.x), fixed_point.jacobian, last.durations, fixed_point.converged
 
 
 def by_newton(solver: str) -> Callable:
     """`vrw.newton_cycle` on the event-driven step from 1 % off; settings are tolerances."""
 
     def make(tolerance: float, rows: np.ndarray, starts: np.ndarray) -> Run:
-        options = vrw.Options(solver=solver, rtol=tolerance, atol=tolerance)
+        options = vrw.StepOptions(solver=solver, rtol=tolerance, atol=tolerance)
         options = jax.tree.map(np.asarray, options)
         find = eqx.filter_jit(eqx.filter_vmap(cycle_of_map, in_axes=(0, 0, None)))
 
@@ -259,9 +277,9 @@ def by_newton(solver: str) -> Callable:
             by_size = -np.sort(-np.abs(np.linalg.eigvals(jacobian)), 1)[:, :2]
             # A diagonal matrix of the same multipliers: this map's own has another frame.
             zero = np.zeros(len(rows))
-            told = np.column_stack([y, durations, by_size[:, 0], zero, zero, by_size[:, 1], zero])
-            told[~good] = np.nan
-            return told
+            result = np.column_stack([y, durations, by_size[:, 0], zero, zero, by_size[:, 1], zero])
+            result[~good] = np.nan
+            return result
 
         return run
 
@@ -285,15 +303,15 @@ def plane_map(steps: Callable) -> Callable:
     """(theta+, dtheta+, durations) one step later, and evaluations, by a peer."""
 
     def function(y: np.ndarray, packed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        told = steps(y, packed)
-        parameters = dict(zip(VARIED, unpacked(packed).T, strict=True))
-        after = landed(vrw.WheelParams(**parameters), told[:, :3])
-        return np.concatenate([after, told[:, 3:6]], 1), told[:, 6]
+        batch_result = steps(y, packed)
+        parameters = dict(zip(VARIED_PARAMETERS, unpack_parameters(packed).T, strict=True))
+        after = compute_landing(vrw.WheelParams(**parameters), batch_result[:, :3])
+        return np.concatenate([after, batch_result[:, 3:6]], 1), batch_result[:, 6]
 
     return function
 
 
-def unpacked(packed: np.ndarray) -> np.ndarray:
+def unpack_parameters(packed: np.ndarray) -> np.ndarray:
     """VARIED as they stand in the peers' parameters."""
     slope = np.arctan2(packed[:, 7], packed[:, 8])
     return np.stack([packed[:, 5], packed[:, 4], packed[:, 3], slope], 1)
@@ -348,13 +366,13 @@ def by_columns(mode: str, tolerance: float = 1e-10, dtype: type = np.float64) ->
     """`jax.jacfwd` or `jax.jacrev` of `vrw.limit_cycle`; settings are meshes."""
 
     def make(mesh: tuple[int, int, int], rows: np.ndarray, starts: np.ndarray) -> Run:
-        options = vrw.CycleOptions(steps=mesh, tolerance=tolerance)
+        options = vrw.CycleOptions(mesh_intervals=mesh, tolerance=tolerance)
         given = np.asarray(rows, dtype)
 
         def measures(row: jax.Array) -> tuple:
-            params = jax.tree.map(lambda leaf: leaf.astype(dtype), wheels(row))
-            found = vrw.limit_cycle(params, options=options)
-            return jnp.stack([found.dls_fraction, found.period]), found.found
+            params = jax.tree.map(lambda leaf: leaf.astype(dtype), make_wheels(row))
+            cycle = vrw.limit_cycle(params, options=options)
+            return jnp.stack([cycle.dls_fraction, cycle.period]), cycle.found
 
         derive = jax.jacfwd if mode == "forward" else jax.jacrev
         one = derive(measures, has_aux=True)
@@ -362,11 +380,11 @@ def by_columns(mode: str, tolerance: float = 1e-10, dtype: type = np.float64) ->
 
         def run() -> np.ndarray:
             with jax.enable_x64(dtype is np.float64):
-                found, good = jax.block_until_ready(find(given if len(rows) > 1 else given[0]))
-            told = np.asarray(found, float).reshape(-1, 8)
-            told = np.concatenate([told, np.zeros((len(told), 1))], 1)
-            told[~np.atleast_1d(good)] = np.nan
-            return told
+                solution, good = jax.block_until_ready(find(given if len(rows) > 1 else given[0]))
+            result = np.asarray(solution, float).reshape(-1, 8)
+            result = np.concatenate([result, np.zeros((len(result), 1))], 1)
+            result[~np.atleast_1d(good)] = np.nan
+            return result
 
         return run
 
@@ -378,34 +396,34 @@ def by_step_jacobian(solver: str) -> Callable:
 
     def make(tolerance: float, rows: np.ndarray, starts: np.ndarray) -> Run:
         options = jax.tree.map(
-            np.asarray, vrw.Options(solver=solver, rtol=tolerance, atol=tolerance)
+            np.asarray, vrw.StepOptions(solver=solver, rtol=tolerance, atol=tolerance)
         )
         model = vrw.ViscoelasticWheel()
 
-        def one(row: jax.Array, start: jax.Array, options: vrw.Options) -> tuple:
+        def one(row: jax.Array, start: jax.Array, options: vrw.StepOptions) -> tuple:
             def told(x: jax.Array, row: jax.Array) -> jax.Array:
-                found = model.advance(wheels(row), x, options)
-                return jnp.concatenate([found.section_state, found.durations])
+                solution = model.advance(make_wheels(row), x, options)
+                return jnp.concatenate([solution.section_state, solution.durations])
 
-            params = wheels(row)
-            found = vrw.newton_cycle(
+            params = make_wheels(row)
+            fixed_point = vrw.solve_fixed_point(
                 lambda x: model.advance(params, x, options).section_state,
                 start,
                 tolerance=1e-11,
-                iterations=8,
+                max_iterations=8,
             )
-            by_x, by_row = jax.jacfwd(told, (0, 1))(found.x, row)
+            by_x, by_row = jax.jacfwd(told, (0, 1))(fixed_point.x, row)
             dx = jnp.linalg.solve(jnp.eye(3) - by_x[:3], by_row[:3])
-            return by_row[3:] + by_x[3:] @ dx, told(found.x, row)[3:], found.converged
+            return by_row[3:] + by_x[3:] @ dx, told(fixed_point.x, row)[3:], fixed_point.converged
 
         find = eqx.filter_jit(eqx.filter_vmap(one, in_axes=(0, 0, None)))
 
         def run() -> np.ndarray:
             d_durations, durations, good = map(np.asarray, find(rows, starts, options))
-            told = gradient_rows(d_durations, durations)
-            told = np.concatenate([told, np.zeros((len(told), 1))], 1)
-            told[~good] = np.nan
-            return told
+            result = gradient_rows(d_durations, durations)
+            result = np.concatenate([result, np.zeros((len(result), 1))], 1)
+            result[~good] = np.nan
+            return result
 
         return run
 
@@ -421,12 +439,12 @@ def by_peer_gradient(name: str) -> Callable:
         def run() -> np.ndarray:
             y, durations, slope, count, function = peer_cycle(name, tolerance, rows, starts)
             columns = []
-            for i in range(len(VARIED)):
+            for i in range(len(VARIED_PARAMETERS)):
                 ends = []
                 for sign in (1.0, -1.0):
-                    moved = rows.copy()
-                    moved[:, i] *= 1.0 + sign * size
-                    image, n = function(y, peers.pack(wheels(moved)))
+                    shifted = rows.copy()
+                    shifted[:, i] *= 1.0 + sign * size
+                    image, n = function(y, peers.pack(make_wheels(shifted)))
                     count = count + n
                     ends.append(image)
                 columns.append((ends[0] - ends[1]) / (2.0 * size * rows[:, i : i + 1]))
@@ -443,15 +461,15 @@ def by_peer_gradient(name: str) -> Callable:
 LANES, ENGINE, COLLOCATION = "lane engine", "diffrax engine", "collocation"
 BY_HAND, NUMBA, HEYOKA, SCIPY = "diffrax by hand", "numba", "heyoka", "SciPy"
 TORCH = "torchdiffeq"
-DEFAULT_MESH = vrw.CycleOptions().steps
-MESHES = ((3, 5, 2), DEFAULT_MESH, vrw.CycleOptions.tight().steps)
-WIDE = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12, 1e-13)
+DEFAULT_MESH = vrw.CycleOptions().mesh_intervals
+MESHES = ((3, 5, 2), DEFAULT_MESH, vrw.CycleOptions.tight().mesh_intervals)
+TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12, 1e-13)
 EVERY_OTHER = (1e-3, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
 LOOSE = (1e-3, 1e-4, 2e-5)  # float32 resolves no less
 f32, f64 = "float32", "float64"
 
 METHODS = (
-    Method("step", NUMBA, "Dopri5", f64, WIDE, by_peer("numba")),
+    Method("step", NUMBA, "Dopri5", f64, TOLERANCES, by_peer("numba")),
     Method("step", HEYOKA, "Taylor", f64, (1e-3, 1e-6, 1e-9, 1e-12, 1e-15), by_peer("heyoka")),
     *(
         Method("step", SCIPY, name, f64, settings, by_peer(name))
@@ -474,14 +492,14 @@ METHODS = (
         )
     ),
     Method("cycle", COLLOCATION, "from nothing", f64, MESHES, by_collocation()),
-    Method("cycle", NUMBA, "Newton, differences", f64, WIDE, by_peer_cycle("numba")),
+    Method("cycle", NUMBA, "Newton, differences", f64, TOLERANCES, by_peer_cycle("numba")),
     Method(
         "cycle", HEYOKA, "Newton, differences", f64, (1e-6, 1e-9, 1e-12, 1e-15),
         by_peer_cycle("heyoka"),
     ),
     Method("cycle", ENGINE, "Newton, Dopri8", f64, (1e-6, 1e-8, 1e-10, 1e-12), by_newton("Dopri8")),
     Method("gradient", COLLOCATION, "forward", f64, MESHES, by_columns("forward")),
-    Method("gradient", NUMBA, "differences", f64, WIDE, by_peer_gradient("numba")),
+    Method("gradient", NUMBA, "differences", f64, TOLERANCES, by_peer_gradient("numba")),
     Method(
         "gradient", HEYOKA, "differences", f64, (1e-6, 1e-9, 1e-12, 1e-15),
         by_peer_gradient("heyoka"),
@@ -517,7 +535,7 @@ METHODS = (
     ),
     # Batches of steps.
     *(
-        Method("step", LANES, solver, f64, WIDE, by_library("lanes", solver), 2048)
+        Method("step", LANES, solver, f64, TOLERANCES, by_library("lanes", solver), 2048)
         for solver in ("Tsit5", "Dopri5", "Dopri8")
     ),
     Method("step", LANES, "Tsit5", f32, LOOSE, by_library("lanes", "Tsit5", np.float32), 2048),

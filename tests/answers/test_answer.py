@@ -10,70 +10,81 @@ import pytest
 import vrw_jax as vrw
 
 TABLE_1 = vrw.WheelParams(damping=150.0)
-NEAR = vrw.WheelParams(damping=jnp.linspace(120.0, 200.0, 24))
+WHEELS_NEAR_TABLE_1 = vrw.WheelParams(damping=jnp.linspace(120.0, 200.0, 24))
 FRICTIONS = np.geomspace(8.0, 80.0, 24)
 
 
 @pytest.fixture(scope="module")
-def exact():
+def exact_measures():
     """What the iteration on real ground converges to, as the truth of looser answers."""
-    return vrw.answer(["speed", "dls_fraction", "period"], NEAR, 1e-10, friction=FRICTIONS)
+    return vrw.measure_to_tolerance(
+        ["speed", "dls_fraction", "period"], WHEELS_NEAR_TABLE_1, 1e-10, friction=FRICTIONS
+    )
 
 
-def test_where_feet_can_not_slide_the_papers_value_stands():
-    told = vrw.answer("speed", TABLE_1, 1e-6, friction=math.inf)
-    assert told.rung == "viscoelastic"
-    assert abs(told.value - float(vrw.limit_cycle(TABLE_1).speed)) < 1e-8
-    assert told.error <= 1e-6
-    assert abs(told.model_error) < 1e-8
+def test_measures_equal_those_of_the_paper_if_feet_cannot_slip():
+    measured = vrw.measure_to_tolerance("speed", TABLE_1, 1e-6, friction=math.inf)
+    assert measured.model == "viscoelastic"
+    assert abs(measured.value - float(vrw.limit_cycle(TABLE_1).speed)) < 1e-8
+    assert measured.error <= 1e-6
+    assert abs(measured.model_error) < 1e-8
 
 
-def test_a_converged_answer_repeats_on_real_ground():
+def test_a_converged_measure_repeats_with_unilateral_contact():
     names = ["theta_touchdown", "dtheta_touchdown", "dL1_touchdown"]
-    told = vrw.answer(names, TABLE_1, 1e-9, friction=20.0)
-    assert told.rung == "unilateral"
-    x = np.array([[told.value[name] for name in names]])
-    step = vrw.steps(TABLE_1, x, model=vrw.UnilateralWheel(friction=20.0))
+    measured = vrw.measure_to_tolerance(names, TABLE_1, 1e-9, friction=20.0)
+    assert measured.model == "unilateral"
+    x = np.array([[measured.value[name] for name in names]])
+    step = vrw.step_batch(TABLE_1, x, model=vrw.UnilateralWheel(friction=20.0))
     assert np.max(np.abs(np.asarray(step.section_state)[0, [0, 1, 12]] - x[0])) < 1e-8
 
 
 @pytest.mark.parametrize("tol", [1e-2, 1e-3, 1e-5])
-def test_answers_keep_their_stated_errors(tol, exact):
-    told = vrw.answer(["speed", "dls_fraction", "period"], NEAR, tol, friction=FRICTIONS)
-    assert np.all(told.found)
-    assert np.all(exact.found)
-    assert np.all(told.errors <= tol)
-    wrong = np.abs(told.values - exact.values)
-    assert np.all(wrong <= told.errors + exact.errors)
+def test_measures_are_within_their_stated_errors(tol, exact_measures):
+    measured = vrw.measure_to_tolerance(
+        ["speed", "dls_fraction", "period"], WHEELS_NEAR_TABLE_1, tol, friction=FRICTIONS
+    )
+    assert np.all(measured.found)
+    assert np.all(exact_measures.found)
+    assert np.all(measured.errors <= tol)
+    wrong = np.abs(measured.values - exact_measures.values)
+    assert np.all(wrong <= measured.errors + exact_measures.errors)
 
 
-def test_one_step_tells_the_model_error_with_its_sign(exact):
-    told = vrw.answer(["speed", "dls_fraction", "period"], NEAR, 1.0, friction=FRICTIONS)
-    assert set(told.rung) == {"viscoelastic"}
-    assert np.all(told.n_steps == 1)
-    effectivity = told.model_errors / (told.values - exact.values)
+def test_one_step_gives_the_model_error_with_its_sign(exact_measures):
+    measured = vrw.measure_to_tolerance(
+        ["speed", "dls_fraction", "period"], WHEELS_NEAR_TABLE_1, 1.0, friction=FRICTIONS
+    )
+    assert set(measured.model) == {"viscoelastic"}
+    assert np.all(measured.n_steps == 1)
+    effectivity = measured.model_errors / (measured.values - exact_measures.values)
     assert np.mean((effectivity > 0.5) & (effectivity < 2.0)) > 0.9
 
 
-def test_looser_answers_cost_less():
-    steps = [vrw.answer("speed", NEAR, tol, friction=FRICTIONS).n_steps for tol in (1e-2, 1e-7)]
+def test_looser_tolerances_cost_less():
+    steps = [
+        vrw.measure_to_tolerance("speed", WHEELS_NEAR_TABLE_1, tol, friction=FRICTIONS).n_steps
+        for tol in (1e-2, 1e-7)
+    ]
     assert np.mean(steps[0]) < 0.5 * np.mean(steps[1])
 
 
-def test_a_lane_is_answered_as_it_is_alone(exact):
-    one = jax.tree.map(lambda x: x[5] if x.ndim else x, NEAR)
-    alone = vrw.answer(["speed", "dls_fraction", "period"], one, 1e-10, friction=FRICTIONS[5])
-    assert np.array_equal(alone.values, exact.values[5])
+def test_a_batch_element_has_the_result_of_a_single_wheel(exact_measures):
+    one = jax.tree.map(lambda x: x[5] if x.ndim else x, WHEELS_NEAR_TABLE_1)
+    measured = vrw.measure_to_tolerance(
+        ["speed", "dls_fraction", "period"], one, 1e-10, friction=FRICTIONS[5]
+    )
+    assert np.array_equal(measured.values, exact_measures.values[5])
 
 
-def test_at_low_friction_another_gait_is_walked_to():
-    told = vrw.answer("period", vrw.WheelParams(), 1e-3, friction=0.7)
-    assert told.rung == "unilateral"
-    assert abs(told.value - 0.360) < 2e-3  # docs/ladder.md
-    assert "another gait" in told.why
+def test_at_low_friction_walks_reach_another_gait():
+    measured = vrw.measure_to_tolerance("period", vrw.WheelParams(), 1e-3, friction=0.7)
+    assert measured.model == "unilateral"
+    assert abs(measured.value - 0.360) < 2e-3  # docs/ladder.md
+    assert "another gait" in measured.why
 
 
-HARD = {
+HARD_WHEELS = {
     "damping": [178.5877, 153.6807, 193.5374, 151.5455, 114.5147, 98.5177],
     "stiffness": [515.5376, 534.7467, 536.8101, 532.1883, 584.6127, 576.7884],
     "natural_length": [1.0197, 1.0133, 1.0228, 1.0248, 1.0297, 1.0195],
@@ -82,93 +93,104 @@ HARD = {
 """Three whose legs change what they do on the way, with a slow direction; three whose errors are
 the largest, of what was asked, in 10,152 answers: their feet dip for a microsecond."""
 HARD_FRICTION = np.array([2.3666, 0.9022, 25.7033, 15.3909, 1.7096, 1.1505])
-NONE = {1: vrw.Outcome.NO_CYCLE_FOUND, 2: vrw.Outcome.FRICTION_PARADOX}
+OUTCOMES_WITHOUT_GAIT = {1: vrw.Outcome.NO_CYCLE_FOUND, 2: vrw.Outcome.PAINLEVE_PARADOX}
 """A multiplier of 1.36, so that no walk leads to the gait; walks to Painlevé's singularity."""
 
 
-def test_errors_are_kept_where_motions_change_and_feet_hardly_leave_the_ground():
-    wheels = vrw.WheelParams(**{name: jnp.asarray(x) for name, x in HARD.items()})
+def test_errors_hold_if_contact_sequences_change_and_feet_barely_lift_off():
+    wheels = vrw.WheelParams(**{name: jnp.asarray(x) for name, x in HARD_WHEELS.items()})
     names = ["speed", "dls_fraction"]
-    exact = vrw.answer(names, wheels, 1e-8, friction=HARD_FRICTION)
+    exact = vrw.measure_to_tolerance(names, wheels, 1e-8, friction=HARD_FRICTION)
     for tol in (1e-2, 1e-4):
-        told = vrw.answer(names, wheels, tol, friction=HARD_FRICTION)
-        for each in (told, exact):
-            lost = np.flatnonzero(~each.found)
-            assert {int(i): each.outcomes[i] for i in lost} == NONE
-        wrong = np.abs(told.values - exact.values)
-        assert np.all((wrong <= told.errors + exact.errors)[told.found])
+        measured = vrw.measure_to_tolerance(names, wheels, tol, friction=HARD_FRICTION)
+        for each in (measured, exact):
+            lost_values = np.flatnonzero(~each.found)
+            assert {int(i): each.outcomes[i] for i in lost_values} == OUTCOMES_WITHOUT_GAIT
+        wrong = np.abs(measured.values - exact.values)
+        assert np.all((wrong <= measured.errors + exact.errors)[measured.found])
 
 
-def test_which_takes_one_of_the_gaits_that_attract():
-    slowest = vrw.answer("speed", TABLE_1, 1e-4, friction=20.0, which="slowest")
-    assert abs(slowest.value - vrw.answer("speed", TABLE_1, 1e-6, friction=20.0).value) < 1e-4
+def test_which_selects_one_of_the_attracting_gaits():
+    slowest = vrw.measure_to_tolerance("speed", TABLE_1, 1e-4, friction=20.0, which="slowest")
+    assert (
+        abs(slowest.value - vrw.measure_to_tolerance("speed", TABLE_1, 1e-6, friction=20.0).value)
+        < 1e-4
+    )
     assert slowest.why.endswith("one of those that attract, 1 in all")
-    none = vrw.answer("speed", TABLE_1, 1e-4, friction=20.0, which=1)
+    none = vrw.measure_to_tolerance("speed", TABLE_1, 1e-4, friction=20.0, which=1)
     assert not none.found
     assert none.why.endswith("gaits that attract: 1")
 
 
-def test_the_rigid_wheel_answers_for_stiff_damped_legs_and_loose_tolerances():
+def test_the_rigid_wheel_is_used_for_stiff_damped_legs_and_loose_tolerances():
     stiffness, mass, gravity = 1e6, 18.0, 9.81
     wheel = vrw.WheelParams(
         stiffness=stiffness, damping=4.0 * math.sqrt(stiffness * mass), slope=0.1,
         natural_length=1.0 + mass * gravity / stiffness,
     )  # fmt: skip
-    told = vrw.answer(["speed", "period"], wheel, 0.1, friction=50.0)
-    exact = vrw.answer(["speed", "period"], wheel, 1e-3, friction=50.0)
-    assert (told.rung, exact.rung) == ("rigid", "unilateral")
-    wrong = told.values - exact.values
-    assert np.all(np.abs(wrong) < told.errors)
-    assert np.all(np.abs(told.model_errors / wrong - 1.0) < 0.3)
+    measured = vrw.measure_to_tolerance(["speed", "period"], wheel, 0.1, friction=50.0)
+    exact = vrw.measure_to_tolerance(["speed", "period"], wheel, 1e-3, friction=50.0)
+    assert (measured.model, exact.model) == ("rigid", "unilateral")
+    wrong = measured.values - exact.values
+    assert np.all(np.abs(wrong) < measured.errors)
+    assert np.all(np.abs(measured.model_errors / wrong - 1.0) < 0.3)
 
 
-def test_no_gait_is_said_and_no_small_number():
-    told = vrw.answer("speed", vrw.WheelParams(slope=0.02), 1e-3, friction=0.7)
-    assert not told.found
-    assert math.isnan(told.value)
-    assert math.isinf(told.error)
-    assert told.why.startswith("no such gait on real ground: ")
+def test_a_missing_gait_is_reported_instead_of_a_small_number():
+    measured = vrw.measure_to_tolerance("speed", vrw.WheelParams(slope=0.02), 1e-3, friction=0.7)
+    assert not measured.found
+    assert math.isnan(measured.value)
+    assert math.isinf(measured.error)
+    assert measured.why.startswith("no such gait on real ground: ")
 
 
-def test_an_answer_prints_itself_in_one_line():
-    text = repr(vrw.answer(["speed", "dls_fraction"], TABLE_1, 1e-2, friction=50.0))
+def test_a_measure_result_prints_one_line():
+    text = repr(vrw.measure_to_tolerance(["speed", "dls_fraction"], TABLE_1, 1e-2, friction=50.0))
     assert "\n" not in text
     assert "m/s ± " in text
     assert "checked by one step on real ground" in text
     assert text.endswith(" ms")
 
 
-def test_what_can_not_be_answered_is_refused_in_one_sentence():
+def test_unsupported_requests_are_refused_in_one_sentence():
     with pytest.raises(ValueError, match="'spead' is no measure that every rung tells"):
-        vrw.answer("spead", TABLE_1, 1e-3)
+        vrw.measure_to_tolerance("spead", TABLE_1, 1e-3)
     with pytest.raises(ValueError, match="tol is 0, but it must be positive"):
-        vrw.answer("speed", TABLE_1, 0.0)
+        vrw.measure_to_tolerance("speed", TABLE_1, 0.0)
     with pytest.raises(ValueError, match="lanes have one axis"):
-        vrw.answer("speed", NEAR, 1e-3, friction=np.ones(3))
+        vrw.measure_to_tolerance("speed", WHEELS_NEAR_TABLE_1, 1e-3, friction=np.ones(3))
     with pytest.raises(TypeError, match="inside jit"):
-        jax.jit(lambda c: vrw.answer("speed", vrw.WheelParams(damping=c), 1e-3).value)(150.0)
+        jax.jit(
+            lambda c: vrw.measure_to_tolerance("speed", vrw.WheelParams(damping=c), 1e-3).value
+        )(150.0)
 
 
-def test_few_gaits_on_real_ground_and_all_of_the_papers_make_a_mean():
+def test_a_mean_combines_few_unilateral_gaits_with_all_gaits_of_the_paper():
     rng = np.random.default_rng(3)
     wheels = vrw.WheelParams(damping=jnp.asarray(rng.uniform(120.0, 200.0, 200)))
-    every = vrw.answer("speed", wheels, 1e-6, friction=15.0)
-    mean = vrw.average("speed", wheels, 1e-3, friction=15.0, pilot=12)
+    every = vrw.measure_to_tolerance("speed", wheels, 1e-6, friction=15.0)
+    mean = vrw.multifidelity_mean("speed", wheels, 1e-3, friction=15.0, pilot=12)
     assert abs(mean.value - np.mean(every.value)) < 1.5 * mean.error
     assert mean.error < 2e-3
-    assert mean.n_top < 60
-    assert mean.steps < mean.steps_alone
+    assert mean.n_high_fidelity < 60
+    assert mean.cost < mean.cost_high_fidelity_only
 
 
-def test_a_mean_is_of_the_wheels_that_have_a_gait():
+def test_a_mean_includes_only_wheels_with_a_gait():
     """Whether some are asked, or all: then it is theirs and nothing but theirs."""
     rng = np.random.default_rng(1)
-    drawn = (rng.uniform(*ends, 60) for ends in ((120.0, 200.0), (450.0, 550.0), (0.26, 0.34)))
-    wheels = vrw.WheelParams(**dict(zip(("damping", "stiffness", "slope"), drawn, strict=True)))
-    every = vrw.answer("speed", wheels, 1e-5, friction=30.0)
+    drawn_values = (
+        rng.uniform(*ends, 60) for ends in ((120.0, 200.0), (450.0, 550.0), (0.26, 0.34))
+    )
+    wheels = vrw.WheelParams(
+        **dict(zip(("damping", "stiffness", "slope"), drawn_values, strict=True))
+    )
+    every = vrw.measure_to_tolerance("speed", wheels, 1e-5, friction=30.0)
     assert 40 < np.sum(every.found) < 60
-    for tol, some in ((3e-2, True), (1e-4, False)):
-        mean = vrw.average("speed", wheels, tol, friction=30.0, pilot=16, seed=1)
-        assert (mean.n_top < 60) == some
+    for tol, selection in ((3e-2, True), (1e-4, False)):
+        mean = vrw.multifidelity_mean("speed", wheels, tol, friction=30.0, pilot=16, seed=1)
+        assert (mean.n_high_fidelity < 60) == selection
         wrong = abs(mean.value - np.mean(every.value[every.found]))
-        assert wrong < (mean.error if some else 1e-4 * tol)  # the same answers, summed otherwise
+        assert wrong < (
+            mean.error if selection else 1e-4 * tol
+        )  # the same answers, summed otherwise

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.answers.climbing import Chord, settled
-from vrw_jax.answers.top import Ground, Stepped
+from vrw_jax.answers.climbing import BroydenIteration, refine
+from vrw_jax.answers.top import GroundBatch, StepQuantities
 
 POINT, JUMP = 0.3, 0.016
 SLOPES = np.array([[0.67, 0.1], [0.0, 0.05]])
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
-def test_an_error_is_kept_where_differences_reach_across_a_jump(side):
+def test_the_error_bound_holds_if_differences_span_a_jump(side):
     """A map of two numbers and a code, whose point is known: 5e-6 beside it the first one jumps,
     and makes 1,600 of its slope. By that hardly anything is left to correct of it, and corrections
     come down as the second one does."""
@@ -24,17 +24,17 @@ def test_an_error_is_kept_where_differences_reach_across_a_jump(side):
         y = x.copy()
         y[:, :2] = off @ SLOPES.T + [POINT, 0.0]
         y[:, 0] += JUMP * (side * off[:, 0] > 5e-6)
-        told = np.column_stack([*np.ones((4, len(x))), y[:, 0], *np.zeros((2, len(x)))])
-        return Stepped(y, told, np.full(len(x), int(vrw.Outcome.STEPPED)))
+        result = np.column_stack([*np.ones((4, len(x))), y[:, 0], *np.zeros((2, len(x)))])
+        return StepQuantities(y, result, np.full(len(x), int(vrw.Outcome.STEPPED)))
 
     ground = Mock(
-        Ground, n=1, options=vrw.Options(rtol=1e-10, atol=1e-10), step=step, consistent=lambda x: x,
+        GroundBatch, n=1, options=vrw.StepOptions(rtol=1e-10, atol=1e-10), step=step, consistent=lambda x: x,
         free=lambda x: np.ones((len(x), 2), bool), shortest=lambda lanes: np.zeros(len(lanes)),
     )  # fmt: skip
     begin = np.array([[POINT + side * 2e-6, 4e-6, 0.0]])
-    chord = Chord.of(ground, np.arange(1), begin, None)
-    found = settled(chord, ("theta_touchdown",), lambda values: np.full_like(values, 1e-2), 1)
-    assert found.done[0]
-    error = found.left[0, 0] + found.numerical[0, 0]
-    assert abs(found.values[0, 0] - POINT) <= error <= 1e-2
-    assert chord.attract()[0]  # as slopes of 0.67 and 0.05 do
+    chord = BroydenIteration.from_states(ground, np.arange(1), begin, None)
+    solution = refine(chord, ("theta_touchdown",), lambda values: np.full_like(values, 1e-2), 1)
+    assert solution.is_done[0]
+    error = solution.remaining_error[0, 0] + solution.numerical_error[0, 0]
+    assert abs(solution.values[0, 0] - POINT) <= error <= 1e-2
+    assert chord.is_attracting()[0]  # as slopes of 0.67 and 0.05 do

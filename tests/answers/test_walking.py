@@ -5,49 +5,55 @@ from unittest.mock import Mock
 import numpy as np
 
 import vrw_jax as vrw
-from vrw_jax.answers.top import Ground, Stepped
-from vrw_jax.answers.walking import BETWEEN, RESTS, ROUNDS, STEPS, led
+from vrw_jax.answers.top import GroundBatch, StepQuantities
+from vrw_jax.answers.walking import (
+    MAX_LEAPS,
+    REST_DRIFT,
+    STEPS_PER_LEAP,
+    WARMUP_STEPS,
+    walk_until_settled,
+)
 
 
-def walked(one_step, start: float, hole: tuple[float, float] = (0.0, 0.0)):
+def walk_scalar_map(one_step, start: float, failing_interval: tuple[float, float] = (0.0, 0.0)):
     """Where a walk of one number and a code leads that no step may begin in the `hole`."""
 
     def step(lanes, x, n_steps=1):
         y = x.copy()
         for _ in range(n_steps):
             y[:, 0] = one_step(y[:, 0])
-        lost = (hole[0] < x[:, 0]) & (x[:, 0] < hole[1])
-        return Stepped(y, y, np.where(lost, int(vrw.Outcome.FELL_BACK), 0))
+        lost_values = (failing_interval[0] < x[:, 0]) & (x[:, 0] < failing_interval[1])
+        return StepQuantities(y, y, np.where(lost_values, int(vrw.Outcome.FELL_BACK), 0))
 
-    ground = Mock(Ground, n=1, step=step, consistent=lambda x: x)
-    ground.loosely.return_value = ground
-    return led(ground, np.arange(1), np.array([[start, 0.0]]))
-
-
-def test_a_walk_that_drifts_for_a_thousand_steps_comes_to_rest_in_ninety():
-    walk = walked(lambda x: 0.3 + 0.995 * (x - 0.3), 1.3)
-    assert walk.rests[0]
-    assert abs(walk.x[0, 0] - 0.3) < RESTS  # the map's fixed point
-    assert walk.n_steps[0] <= STEPS + ROUNDS * BETWEEN
+    map_on_ground = Mock(GroundBatch, n=1, step=step, consistent=lambda x: x)
+    map_on_ground.with_loose_steps.return_value = map_on_ground
+    return walk_until_settled(map_on_ground, np.arange(1), np.array([[start, 0.0]]))
 
 
-def test_what_runs_away_or_turns_round_at_each_step_never_rests():
-    assert not walked(lambda x: 1.003 * x, 1e-2).rests[0]
-    assert not walked(lambda x: -x, 1e-2).rests[0]
+def test_a_walk_that_drifts_for_a_thousand_steps_settles_in_ninety():
+    walk = walk_scalar_map(lambda x: 0.3 + 0.995 * (x - 0.3), 1.3)
+    assert walk.is_settled[0]
+    assert abs(walk.section_states[0, 0] - 0.3) < REST_DRIFT  # the map's fixed point
+    assert walk.n_steps[0] <= WARMUP_STEPS + MAX_LEAPS * STEPS_PER_LEAP
 
 
-def test_a_leap_to_where_no_step_begins_is_taken_back():
-    walk = walked(lambda x: x - 1e-3, 0.6, hole=(-9.0, 0.5))
+def test_divergent_and_alternating_walks_never_settle():
+    assert not walk_scalar_map(lambda x: 1.003 * x, 1e-2).is_settled[0]
+    assert not walk_scalar_map(lambda x: -x, 1e-2).is_settled[0]
+
+
+def test_a_leap_to_a_state_without_a_step_is_undone():
+    walk = walk_scalar_map(lambda x: x - 1e-3, 0.6, failing_interval=(-9.0, 0.5))
     assert walk.outcome[0] == vrw.Outcome.STEPPED
-    assert abs(walk.x[0, 0] - (0.6 - 1e-3 * walk.n_steps[0])) < 1e-12
+    assert abs(walk.section_states[0, 0] - (0.6 - 1e-3 * walk.n_steps[0])) < 1e-12
 
 
-def test_a_gait_that_plain_walks_come_to_after_hundreds_of_steps_is_told():
+def test_a_gait_that_plain_walks_reach_after_hundreds_of_steps_is_found():
     wheel = vrw.WheelParams(
         damping=211.6919, stiffness=594.5978, natural_length=1.0141, slope=0.3348
     )
-    told = vrw.answer("speed", wheel, 1e-3, friction=50.1)
+    measured = vrw.measure_to_tolerance("speed", wheel, 1e-3, friction=50.1)
     # Walks of 200 steps, and Newton's method from their ends.
-    alone = vrw.limit_cycle(wheel, model=vrw.UnilateralWheel(friction=50.1))
-    assert abs(told.value - float(alone.speed)) < told.error < 1e-3
-    assert told.n_steps < 120
+    cycle = vrw.limit_cycle(wheel, model=vrw.UnilateralWheel(friction=50.1))
+    assert abs(measured.value - float(cycle.speed)) < measured.error < 1e-3
+    assert measured.n_steps < 120

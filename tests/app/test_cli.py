@@ -12,21 +12,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from support.scanning import Counted, arithmetic
+from support.scanning import CountingEngine, evaluate_arithmetically
 from typer.testing import CliRunner, Result
 
 from vrw_jax.app import cli, scanning
 from vrw_jax.app.cli import app
-from vrw_jax.app.config import parse
-from vrw_jax.app.printing import scan_reporter
+from vrw_jax.app.config import parse_config
+from vrw_jax.app.printing import make_scan_reporter
 from vrw_jax.branches.branch import Branch
 from vrw_jax.scans import forecast
-from vrw_jax.scans.planning import Plan
-from vrw_jax.scans.running import Progress
+from vrw_jax.scans.planning import ScanPlan
+from vrw_jax.scans.running import ScanProgress
 from vrw_jax.scans.store import open_scan
 from vrw_jax.wheel.outcomes import Outcome
 
-SCAN = """
+SCAN_CONFIG = """
 [grid]
 damping = { from = 100.0, to = 200.0, count = 4 }
 slope = { from = 0.26, to = 0.32, count = 3 }
@@ -39,20 +39,20 @@ chunk = 6
 
 @pytest.fixture
 def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(Plan, "engine", lambda _: arithmetic)
+    monkeypatch.setattr(ScanPlan, "engine", lambda _: evaluate_arithmetically)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))  # leave the suite's own as it is
     path = tmp_path / "small.toml"
-    path.write_text(SCAN)
+    path.write_text(SCAN_CONFIG)
     return path
 
 
-def vrw(*arguments: object) -> Result:
+def run_command(*arguments: object) -> Result:
     return CliRunner().invoke(app, [str(a) for a in arguments])
 
 
-def test_help_teaches() -> None:
+def test_help_lists_commands_and_examples() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "vrw_jax", "--help"], capture_output=True, text=True, check=True
     )
@@ -62,15 +62,15 @@ def test_help_teaches() -> None:
 
 @pytest.mark.parametrize("command", ["gait", "reproduce", "scan"])
 def test_every_command_has_help(command: str) -> None:
-    told = vrw(command, "--help")
-    assert told.exit_code == 0
-    assert "--help" in told.output
+    result = run_command(command, "--help")
+    assert result.exit_code == 0
+    assert "--help" in result.output
 
 
-def test_the_version_is_told() -> None:
-    told = vrw("--version")
-    assert told.exit_code == 0
-    assert told.output.startswith("vrw ")
+def test_the_version_is_printed() -> None:
+    result = run_command("--version")
+    assert result.exit_code == 0
+    assert result.output.startswith("vrw ")
 
 
 def test_explain_measures_some_samples_and_writes_nothing(
@@ -78,73 +78,77 @@ def test_explain_measures_some_samples_and_writes_nothing(
 ) -> None:
     clock = iter([0.0, 10.0, 12.0])
     monkeypatch.setattr(forecast, "perf_counter", lambda: next(clock))
-    told = vrw("scan", config, "--explain")
-    assert told.exit_code == 0, told.output
-    said = " ".join(told.stdout.split())
-    assert "about 7 s: 24 samples at 12 per second" in said
-    assert "the code for it took 10 s and is kept" in said
+    result = run_command("scan", config, "--explain")
+    assert result.exit_code == 0, result.output
+    message = " ".join(result.stdout.split())
+    assert "about 7 s: 24 samples at 12 per second" in message
+    assert "the code for it took 10 s and is kept" in message
     for word in (
         "24 (4 damping x 3 slope x 2 stiffness)",
         "4 of up to 6 samples",
         "memory",
         "time",
     ):
-        assert word in said
+        assert word in message
     assert not (config.parent / "results").exists()
 
 
-def test_progress_tells_rate_failures_and_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_shows_rate_failures_and_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first chunk's time is compiling too, and counts for nothing."""
     clock = iter([0.0, 100.0, 110.0])
     monkeypatch.setattr("time.monotonic", lambda: next(clock))
-    told: list[dict] = []
-    report = scan_reporter(lambda _, **shown: told.append(shown), 0)
+    result: list[dict] = []
+    report = make_scan_reporter(lambda _, **shown_values: result.append(shown_values), 0)
     for done, failed in ((0, 0), (1000, 100), (3000, 300)):
-        report(Progress(samples=6_000, done=done, failed=failed, kept=0))
-    assert [shown["description"] for shown in told] == ["compiling", "scanning", "scanning"]
-    assert told[1]["note"] == "10 % without a gait"
-    assert told[2]["note"] == "200 per s, 10 % without a gait, 15 s left"
-    assert told[2]["completed"] == 3000
-    assert told[2]["total"] == 6_000
+        report(ScanProgress(n_samples=6_000, n_done=done, n_failed=failed, n_reused=0))
+    assert [shown_values["description"] for shown_values in result] == [
+        "compiling",
+        "scanning",
+        "scanning",
+    ]
+    assert result[1]["note"] == "10 % without a gait"
+    assert result[2]["note"] == "200 per s, 10 % without a gait, 15 s left"
+    assert result[2]["completed"] == 3000
+    assert result[2]["total"] == 6_000
 
 
-def test_a_scan_writes_data_and_pictures_where_it_says(config: Path) -> None:
-    told = vrw("scan", config)
-    assert told.exit_code == 0, told.output
+def test_a_scan_writes_data_and_figures_to_the_printed_paths(config: Path) -> None:
+    result = run_command("scan", config)
+    assert result.exit_code == 0, result.output
     folder = config.parent / "results" / "small"
     data = open_scan(folder / "scan.zarr")
     assert dict(data.sizes) == {"damping": 4, "slope": 3, "stiffness": 2, "leg": 6}
-    assert data.attrs["config"] == SCAN
+    assert data.attrs["config"] == SCAN_CONFIG
     pictures = sorted(path.name for path in folder.glob("*.png"))
     assert pictures == ["scan_over_stiffness.png"]
     for name in ("scan.zarr", *pictures):
-        assert name in told.stdout
-    assert "STEPPED" in told.stdout
+        assert name in result.stdout
+    assert "STEPPED" in result.stdout
 
 
-def test_a_stopped_scan_says_how_to_go_on_and_does(
+def test_a_stopped_scan_names_the_command_that_continues_it(
     config: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Plan, "engine", lambda _: Counted(fails_at=3))
-    stopped = vrw("scan", config)
+    monkeypatch.setattr(ScanPlan, "engine", lambda _: CountingEngine(failing_call=3))
+    stopped = run_command("scan", config)
     assert stopped.exit_code == 130
     assert "run the same to go on" in " ".join(stopped.stderr.split())
-    rest = Counted()
-    monkeypatch.setattr(Plan, "engine", lambda _: rest)
-    assert vrw("scan", config).exit_code == 0
-    assert rest.calls == 2
-    again = vrw("scan", config)
-    assert again.exit_code == 0
-    assert "nothing to compute" in again.stdout
-    assert rest.calls == 2
+    rest = CountingEngine()
+    monkeypatch.setattr(ScanPlan, "engine", lambda _: rest)
+    assert run_command("scan", config).exit_code == 0
+    assert rest.n_calls == 2
+    second_result = run_command("scan", config)
+    assert second_result.exit_code == 0
+    assert "nothing to compute" in second_result.stdout
+    assert rest.n_calls == 2
 
 
 def test_a_scan_with_other_settings_is_refused_in_the_same_place(config: Path) -> None:
-    assert vrw("scan", config, "--no-picture").exit_code == 0
-    config.write_text(SCAN + "[wheel]\nleg_com = 0.4\n")
-    told = vrw("scan", config)
-    assert told.exit_code == 2
-    assert "wheel.leg_com is 0.3 there and 0.4 here" in told.stderr
+    assert run_command("scan", config, "--no-picture").exit_code == 0
+    config.write_text(SCAN_CONFIG + "[wheel]\nleg_com = 0.4\n")
+    result = run_command("scan", config)
+    assert result.exit_code == 2
+    assert "wheel.leg_com is 0.3 there and 0.4 here" in result.stderr
 
 
 @pytest.mark.parametrize(
@@ -157,12 +161,12 @@ def test_a_scan_with_other_settings_is_refused_in_the_same_place(config: Path) -
         "[samples]\nleg_mass = [0.9, 1.0]\ngravity = [9.8, 9.9]",
     ],
 )
-def test_every_kind_of_design_gets_a_picture(design: str, config: Path) -> None:
+def test_every_kind_of_design_is_drawn(design: str, config: Path) -> None:
     config.write_text(design)
     measures = '\n[scan]\nmeasures = ["dls_fraction", "speed", "d dls_fraction / d damping"]\n'
     config.write_text(design + measures)
-    told = vrw("scan", config, "--out", "here")
-    assert told.exit_code == 0, told.output
+    result = run_command("scan", config, "--out", "here")
+    assert result.exit_code == 0, result.output
     assert (config.parent / "here" / "scan.png").stat().st_size > 5000
 
 
@@ -171,84 +175,84 @@ def test_many_parameters_at_once_are_drawn_in_pairs_with_their_sobol_indices(con
         "[saltelli]\nn = 256\ndamping = [100.0, 101.0]\nslope = [0.29, 0.3]\n"
         'stiffness = [500.0, 500.5]\n[scan]\nmeasures = ["dls_fraction", "speed"]\n'
     )
-    told = vrw("scan", config, "--out", "here")
-    assert told.exit_code == 0, told.output
+    result = run_command("scan", config, "--out", "here")
+    assert result.exit_code == 0, result.output
     for name in ("scan_pairs.png", "sobol_indices.png"):
         assert (config.parent / "here" / name).stat().st_size > 5000
 
 
-def test_a_gait_is_told_with_its_premises(config: Path) -> None:
-    told = vrw("gait", "--steps", 2)
-    assert told.exit_code == 0, told.output
+def test_a_gait_is_printed_with_its_margins(config: Path) -> None:
+    result = run_command("gait", "--steps", 2)
+    assert result.exit_code == 0, result.output
     for words in ("DLS fraction", "0.53", "stable: multipliers 0.3286", "6 are broken"):
-        assert words in told.stdout
+        assert words in result.stdout
 
 
 def test_help_shows_brackets_and_every_command(config: Path) -> None:
-    assert "[branch]" in vrw("continue", "--help").output
+    assert "[branch]" in run_command("continue", "--help").output
     for command in ("init", "tune", "continue"):
-        assert vrw(command, "--help").exit_code == 0
+        assert run_command(command, "--help").exit_code == 0
 
 
 def test_init_writes_the_example_configs_and_nothing_twice(config: Path) -> None:
     examples = Path(__file__).parents[2] / "configs"
-    told = vrw("init", "mine")
-    assert told.exit_code == 0, told.output
+    result = run_command("init", "mine")
+    assert result.exit_code == 0, result.output
     for path in examples.glob("*.toml"):
         assert (config.parent / "mine" / path.name).read_text() == path.read_text()
-        assert path.name in told.stdout
-    again = vrw("init", "mine")
-    assert again.exit_code == 0
-    assert "nothing to write" in again.stdout
+        assert path.name in result.stdout
+    second_result = run_command("init", "mine")
+    assert second_result.exit_code == 0
+    assert "nothing to write" in second_result.stdout
 
 
 def test_an_installed_wheel_brings_the_example_configs() -> None:
-    told = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
-    built = told["tool"]["hatch"]["build"]["targets"]["wheel"]
+    parsed = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
+    built = parsed["tool"]["hatch"]["build"]["targets"]["wheel"]
     package = Path(cli.__file__).parents[1].name
     assert built["force-include"]["configs"] == f"{package}/configs"
-    assert cli._examples().name == "configs"
+    assert cli._find_example_configs().name == "configs"
 
 
-def test_verify_tells_whether_a_store_is_complete_and_sound(
+def test_verify_reports_whether_a_store_is_complete_and_intact(
     config: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Plan, "engine", lambda _: Counted(fails_at=3))
-    assert vrw("scan", config, "--no-picture").exit_code == 130
-    told = vrw("scan", config, "--verify")
-    assert told.exit_code == 0
-    assert "lacks 2 of 4 chunks" in told.stdout
-    monkeypatch.setattr(Plan, "engine", lambda _: arithmetic)
-    assert vrw("scan", config, "--no-picture").exit_code == 0
-    assert "is complete and sound" in vrw("scan", config, "--verify").stdout
+    monkeypatch.setattr(ScanPlan, "engine", lambda _: CountingEngine(failing_call=3))
+    assert run_command("scan", config, "--no-picture").exit_code == 130
+    result = run_command("scan", config, "--verify")
+    assert result.exit_code == 0
+    assert "lacks 2 of 4 chunks" in result.stdout
+    monkeypatch.setattr(ScanPlan, "engine", lambda _: evaluate_arithmetically)
+    assert run_command("scan", config, "--no-picture").exit_code == 0
+    assert "is complete and sound" in run_command("scan", config, "--verify").stdout
     file = config.parent / "results" / "small" / "scan.zarr" / "speed" / "c" / "1" / "0" / "0"
     file.unlink()
-    told = vrw("scan", config, "--verify")
-    assert told.exit_code == 1
-    assert "1 damaged chunk (number 1): run the same without --verify" in told.stderr
+    result = run_command("scan", config, "--verify")
+    assert result.exit_code == 1
+    assert "1 damaged chunk (number 1): run the same without --verify" in result.stderr
     assert not file.exists()
-    rest = Counted()
-    monkeypatch.setattr(Plan, "engine", lambda _: rest)
-    again = vrw("scan", config, "--no-picture")
-    assert again.exit_code == 0
-    assert "1 damaged chunk (number 1): computed again" in again.stderr
-    assert rest.calls == 1
+    rest = CountingEngine()
+    monkeypatch.setattr(ScanPlan, "engine", lambda _: rest)
+    second_result = run_command("scan", config, "--no-picture")
+    assert second_result.exit_code == 0
+    assert "1 damaged chunk (number 1): computed again" in second_result.stderr
+    assert rest.n_calls == 1
 
 
-def test_a_branch_without_a_gait_says_so_and_writes_nothing(
+def test_a_branch_without_a_gait_is_reported_and_writes_nothing(
     config: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     none = Branch("damping", xr.Dataset(coords={"damping": ("point", np.zeros(0))}), (),
                   ("", ""), Outcome.NO_CYCLE_FOUND)  # fmt: skip
     monkeypatch.setattr("vrw_jax.branches.continue_branch", lambda *_, **__: none)
     config.write_text('[branch]\nparameter = "damping"\nbounds = [290.0, 300.0]\n')
-    told = vrw("continue", config)
-    assert told.exit_code == 1
-    assert "there is no gait to start from (NO_CYCLE_FOUND" in told.stderr
+    result = run_command("continue", config)
+    assert result.exit_code == 1
+    assert "there is no gait to start from (NO_CYCLE_FOUND" in result.stderr
     assert not (config.parent / "results").exists()
 
 
-RUNGS = {
+MODEL_CASES = {
     "viscoelastic": ("", 1.0),
     "unilateral": ("friction = 0.6\n", 0.6),
     "rigid": ("held_landing = true\n", 1.0),
@@ -256,51 +260,51 @@ RUNGS = {
 }
 
 
-@pytest.mark.parametrize("rung", RUNGS)
-def test_a_config_names_any_rung_and_its_ground(rung: str) -> None:
-    settings, friction = RUNGS[rung]
-    model = parse(f'[model]\nrung = "{rung}"\n{settings}').wheel_model()
-    assert model.rung == {"auto": "ladder"}.get(rung, rung)
+@pytest.mark.parametrize("rung", MODEL_CASES)
+def test_a_config_names_any_model_and_its_friction(rung: str) -> None:
+    settings, friction = MODEL_CASES[rung]
+    model = parse_config(f'[model]\nrung = "{rung}"\n{settings}').make_model()
+    assert model.model_name == {"auto": "ladder"}.get(rung, rung)
     assert float(model.friction) == friction
 
 
 @pytest.mark.parametrize("rung", ["unilateral", "auto"])
-def test_friction_is_swept_on_real_ground_and_on_the_ladder(rung: str) -> None:
-    told = parse(
+def test_friction_is_swept_for_the_unilateral_and_the_automatic_model(rung: str) -> None:
+    result = parse_config(
         f'[model]\nrung = "{rung}"\n[grid]\nfriction = [0.4, 0.8]\nslope = [0.3]\n'
         '[scan]\nmeasures = ["slip", "d speed / d damping"]'
     )
-    planned = scanning.planned_scan(told, None)
+    planned = scanning.plan_config_scan(result, None)
     assert planned.design.names == ("friction", "slope")
-    assert planned.asked == ("slip", "d speed / d damping")
-    assert planned.for_engine.model.rung == {"auto": "ladder"}.get(rung, rung)
+    assert planned.requested_measures == ("slip", "d speed / d damping")
+    assert planned.request.model.model_name == {"auto": "ladder"}.get(rung, rung)
 
 
-def test_a_gait_of_rigid_legs_is_told(config: Path) -> None:
+def test_a_gait_of_rigid_legs_is_printed(config: Path) -> None:
     config.write_text('[wheel]\nslope = 0.1\n[model]\nrung = "rigid"\n[gait]\nsteps = 3\n')
-    told = vrw("gait", config)
-    assert told.exit_code == 0, told.output
-    assert "Walked 3 steps" in told.stdout
-    assert "stable: multipliers" in told.stdout
+    result = run_command("gait", config)
+    assert result.exit_code == 0, result.output
+    assert "Walked 3 steps" in result.stdout
+    assert "stable: multipliers" in result.stdout
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("friction", "serves"), [(20.0, "paper's wheel serves"), (0.7, "break")])
-def test_a_gait_of_the_lowest_rung_says_which_and_why(
+def test_a_gait_of_the_simplest_model_names_the_model_and_the_reason(
     config: Path, friction: float, serves: str
 ) -> None:
     config.write_text(
         f'[wheel]\ndamping = 180.0\n[model]\nrung = "auto"\nfriction = {friction}\n'
         "[gait]\nsteps = 2\n"
     )
-    told = vrw("gait", config)
-    assert told.exit_code == 0, told.output
-    assert serves in told.stdout
-    assert "slip per step" in told.stdout
-    assert "0.0000," not in told.stdout  # of 28 multipliers 24 vanish: they are counted
+    result = run_command("gait", config)
+    assert result.exit_code == 0, result.output
+    assert serves in result.stdout
+    assert "slip per step" in result.stdout
+    assert "0.0000," not in result.stdout  # of 28 multipliers 24 vanish: they are counted
 
 
-STOPPED = """
+INTERRUPTED_SCAN_SCRIPT = """
 import sys, time
 sys.path.insert(0, {tests!r})
 from vrw_jax.scans.planning import Plan
@@ -320,14 +324,14 @@ main()
 
 
 def test_a_second_ctrl_c_ends_a_scan_at_once_with_one_sentence(config: Path) -> None:
-    code = STOPPED.format(tests=str(Path(__file__).parents[1]), config=str(config))
+    code = INTERRUPTED_SCAN_SCRIPT.format(tests=str(Path(__file__).parents[1]), config=str(config))
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen([sys.executable, "-c", code], text=True, **pipes) as process:  # type: ignore[call-overload]
         for line in ("at work", "stopping"):
-            while line not in (told := process.stdout.readline()):
-                assert told, process.stderr.read()
+            while line not in (result := process.stdout.readline()):
+                assert result, process.stderr.read()
             process.send_signal(signal.SIGINT)
         assert process.wait(60) == 130
-        told = process.stderr.read()
-    assert "vrw: stopped at once; run the same to go on." in told
-    assert "Traceback" not in told
+        result = process.stderr.read()
+    assert "vrw: stopped at once; run the same to go on." in result
+    assert "Traceback" not in result

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import jax
 import pytest
-from support.scanning import arithmetic
+from support.scanning import evaluate_arithmetically
 from typer.testing import CliRunner
 
 from vrw_jax.app.cli import app
-from vrw_jax.scans.planning import Plan
+from vrw_jax.scans.planning import ScanPlan
 
-CONFIGS: dict[str, tuple[str, str]] = {
+WRONG_CONFIGS: dict[str, tuple[str, str]] = {
     "not TOML": ("[wheel", "not valid TOML"),
     "unknown table": ("[whel]\nslope = 0.3", "did you mean 'wheel'"),
     "table as value": ("wheel = 3", "must be a table"),
@@ -184,12 +184,12 @@ CONFIGS: dict[str, tuple[str, str]] = {
     ),
 }
 
-GRID = "[grid]\ndamping = [100.0, 150.0]\n"
-TUNE = '[tune]\nobjective = "{}"\n[tune.bounds]\n{}\n'
-BRANCH = '[branch]\nparameter = "damping"\nbounds = [{}]\n'
-BOUNDS = "damping = [20.0, 215.0]"
+GRID_TABLE = "[grid]\ndamping = [100.0, 150.0]\n"
+TUNE_TABLE = '[tune]\nobjective = "{}"\n[tune.bounds]\n{}\n'
+BRANCH_TABLE = '[branch]\nparameter = "damping"\nbounds = [{}]\n'
+BOUNDS_LINE = "damping = [20.0, 215.0]"
 
-COMMANDS: dict[str, tuple[tuple[str, ...], str, str]] = {
+WRONG_COMMANDS: dict[str, tuple[tuple[str, ...], str, str]] = {
     # name: arguments, text of my.toml, what the sentence holds
     "missing config": (("scan", "nowhere.toml"), "", "no config file nowhere.toml"),
     "misspelt config": (("scan", "mi.toml"), "", "did you mean 'my.toml'"),
@@ -198,8 +198,8 @@ COMMANDS: dict[str, tuple[tuple[str, ...], str, str]] = {
     "a missing folder": (("tune", "nowhere/my.toml"), "", "no config file"),
     "no design": (("scan", "my.toml"), "[wheel]\nslope = 0.3", "a scan needs a design"),
     "an empty config to scan": (("scan", "my.toml"), "", "a scan needs a design"),
-    "nothing to tune": (("tune", "my.toml"), GRID, "tuning needs an objective"),
-    "nothing to follow": (("continue", "my.toml"), GRID, "continuation needs a parameter"),
+    "nothing to tune": (("tune", "my.toml"), GRID_TABLE, "tuning needs an objective"),
+    "nothing to follow": (("continue", "my.toml"), GRID_TABLE, "continuation needs a parameter"),
     "no assignment": (("gait", "--set", "damping"), "", "has no '='"),
     "an empty assignment": (("gait", "--set", "damping="), "", "must be a finite number"),
     "a nameless assignment": (("gait", "--set", "=3"), "", "unknown key ''"),
@@ -211,34 +211,38 @@ COMMANDS: dict[str, tuple[tuple[str, ...], str, str]] = {
     "mass beyond the hub": (("gait", "--set", "leg_com=1.5"), "", "leg_com < locked_length"),
     "half a leg": (("gait", "--set", "n_legs=8.5"), "", "whole number"),
     "three legs": (("gait", "--set", "n_legs=3"), "", "at least 5"),
-    "a file as folder": (("scan", "my.toml", "--out", "letter.txt"), GRID, "letter.txt"),
-    "a place of the system": (("scan", "my.toml", "--out", "/proc/x"), GRID, "/proc/x"),
-    "a place below a file": (("scan", "my.toml", "--out", "letter.txt/x"), GRID, "letter.txt/x"),
+    "a file as folder": (("scan", "my.toml", "--out", "letter.txt"), GRID_TABLE, "letter.txt"),
+    "a place of the system": (("scan", "my.toml", "--out", "/proc/x"), GRID_TABLE, "/proc/x"),
+    "a place below a file": (
+        ("scan", "my.toml", "--out", "letter.txt/x"),
+        GRID_TABLE,
+        "letter.txt/x",
+    ),
     "no place to tune": (
         ("tune", "my.toml", "--out", "/proc/x"),
-        TUNE.format("speed", BOUNDS),
+        TUNE_TABLE.format("speed", BOUNDS_LINE),
         "/proc/x",
     ),
     "no place to follow": (
         ("continue", "my.toml", "--out", "/proc/x"),
-        BRANCH.format("100.0, 200.0"),
+        BRANCH_TABLE.format("100.0, 200.0"),
         "/proc/x",
     ),
     "no place to reproduce": (("reproduce", "--out", "/proc/x"), "", "/proc/x"),
     "no place for examples": (("init", "/proc/x"), "", "/proc/x"),
     "examples that differ": (("init", "mine"), "", "is there already and differs"),
-    "no scan there": (("scan", "my.toml", "--out", "occupied"), GRID, "no scan's store"),
-    "another's store": (("scan", "my.toml", "--out", "other"), GRID, "but not a scan's"),
-    "a torn store": (("scan", "my.toml", "--out", "torn"), GRID, "no scan's store"),
-    "no store to verify": (("scan", "my.toml", "--verify"), GRID, "no store"),
+    "no scan there": (("scan", "my.toml", "--out", "occupied"), GRID_TABLE, "no scan's store"),
+    "another's store": (("scan", "my.toml", "--out", "other"), GRID_TABLE, "but not a scan's"),
+    "a torn store": (("scan", "my.toml", "--out", "torn"), GRID_TABLE, "no scan's store"),
+    "no store to verify": (("scan", "my.toml", "--verify"), GRID_TABLE, "no store"),
     "no scheduler": (
         ("scan", "my.toml", "--dask", "nowhere://"),
-        GRID,
+        GRID_TABLE,
         "no dask scheduler answers",
     ),
     "a solver misspelt": (
         ("scan", "my.toml"),
-        GRID + '[options]\nsolver = "Dopri9"',
+        GRID_TABLE + '[options]\nsolver = "Dopri9"',
         "solver is",
     ),
     "too large a grid": (
@@ -261,12 +265,12 @@ COMMANDS: dict[str, tuple[tuple[str, ...], str, str]] = {
     ),
     "rigid legs scanned": (
         ("scan", "my.toml"),
-        GRID + '[model]\nrung = "rigid"',
+        GRID_TABLE + '[model]\nrung = "rigid"',
         "this command takes viscoelastic",
     ),
     "a map of real ground": (
         ("map", "my.toml"),
-        GRID + '[model]\nrung = "unilateral"',
+        GRID_TABLE + '[model]\nrung = "unilateral"',
         "this command takes viscoelastic: write that",
     ),
     "a map over one parameter": (
@@ -281,61 +285,61 @@ COMMANDS: dict[str, tuple[tuple[str, ...], str, str]] = {
     ),
     "rigid legs tuned": (
         ("tune", "my.toml"),
-        TUNE.format("speed", BOUNDS) + '[model]\nrung = "rigid"',
+        TUNE_TABLE.format("speed", BOUNDS_LINE) + '[model]\nrung = "rigid"',
         "takes viscoelastic",
     ),
     "the ladder tuned": (
         ("tune", "my.toml"),
-        TUNE.format("speed", BOUNDS) + '[model]\nrung = "auto"',
+        TUNE_TABLE.format("speed", BOUNDS_LINE) + '[model]\nrung = "auto"',
         "takes viscoelastic",
     ),
     "the ladder followed": (
         ("continue", "my.toml"),
-        BRANCH.format("100.0, 300.0") + '[model]\nrung = "auto"',
+        BRANCH_TABLE.format("100.0, 300.0") + '[model]\nrung = "auto"',
         "takes viscoelastic",
     ),
     "an objective of nothing": (
         ("tune", "my.toml"),
-        TUNE.format("sped", BOUNDS),
+        TUNE_TABLE.format("sped", BOUNDS_LINE),
         "did you mean 'speed'",
     ),
     "an objective with legs": (
         ("tune", "my.toml"),
-        TUNE.format("locked_stopper_force", BOUNDS),
+        TUNE_TABLE.format("locked_stopper_force", BOUNDS_LINE),
         "one value for each locked leg",
     ),
     "an objective of another rung": (
         ("tune", "my.toml"),
-        TUNE.format("slip", BOUNDS),
+        TUNE_TABLE.format("slip", BOUNDS_LINE),
         "is no measure for objective",
     ),
     "bounds that hold nothing": (
         ("tune", "my.toml"),
-        TUNE.format("speed", "damping = [215.0, 20.0]"),
+        TUNE_TABLE.format("speed", "damping = [215.0, 20.0]"),
         "holds nothing",
     ),
     "a start outside its bounds": (
         ("tune", "my.toml"),
-        TUNE.format("speed", "damping = [20.0, 100.0]"),
+        TUNE_TABLE.format("speed", "damping = [20.0, 100.0]"),
         "outside its bounds",
     ),
     "a constraint on nothing": (
         ("tune", "my.toml"),
-        TUNE.format("speed", BOUNDS) + "[tune.constraints]\nclearence = 0.0",
+        TUNE_TABLE.format("speed", BOUNDS_LINE) + "[tune.constraints]\nclearence = 0.0",
         "no measure for a constraint",
     ),
     "a step beyond the range": (
         ("continue", "my.toml"),
-        BRANCH.format("4.0, 230.0") + "largest_step = 5.0",
+        BRANCH_TABLE.format("4.0, 230.0") + "largest_step = 5.0",
         "largest_step",
     ),
 }
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A place with a letter, and with what is no store; a second is enough for a scheduler."""
-    monkeypatch.setattr(Plan, "engine", lambda _: arithmetic)
+    monkeypatch.setattr(ScanPlan, "engine", lambda _: evaluate_arithmetically)
     monkeypatch.setattr("vrw_jax.scans.dask.ANSWER", "1s")
     monkeypatch.chdir(tmp_path)
     cache = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
@@ -353,43 +357,49 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def what_is_there(folder: Path) -> dict[Path, bytes]:
-    return {path: path.read_bytes() if path.is_file() else b"" for path in folder.rglob("*")}
+def list_files(working_folder: Path) -> dict[Path, bytes]:
+    return {
+        path: path.read_bytes() if path.is_file() else b"" for path in working_folder.rglob("*")
+    }
 
 
-def refused(arguments: tuple[str, ...], expected: str, folder: Path) -> str:
+def assert_refused(arguments: tuple[str, ...], expected: str, working_folder: Path) -> str:
     """The sentence, of a command that must be refused with nothing written."""
-    before = what_is_there(folder)
-    told = CliRunner().invoke(app, list(arguments))
-    assert told.exit_code == 2, told.output
-    assert expected in told.stderr
-    assert told.stdout == ""
-    assert told.stderr.startswith("vrw: ")
-    sentence = told.stderr.strip()
+    before = list_files(working_folder)
+    error_text = CliRunner().invoke(app, list(arguments))
+    assert error_text.exit_code == 2, error_text.output
+    assert expected in error_text.stderr
+    assert error_text.stdout == ""
+    assert error_text.stderr.startswith("vrw: ")
+    sentence = error_text.stderr.strip()
     assert sentence.endswith(".")
     assert "\n" not in sentence
     assert "Traceback" not in sentence
     assert "Errno" not in sentence
-    assert what_is_there(folder) == before
+    assert list_files(working_folder) == before
     return sentence
 
 
-@pytest.mark.parametrize("mistake", CONFIGS)
-def test_a_mistake_in_a_config_gets_one_sentence_that_helps(mistake: str, folder: Path) -> None:
-    text, expected = CONFIGS[mistake]
-    (folder / "my.toml").write_text(text)
-    sentence = refused(("gait", "my.toml"), expected, folder)
+@pytest.mark.parametrize("mistake", WRONG_CONFIGS)
+def test_a_mistake_in_a_config_gets_one_sentence_that_helps(
+    mistake: str, working_folder: Path
+) -> None:
+    text, expected = WRONG_CONFIGS[mistake]
+    (working_folder / "my.toml").write_text(text)
+    sentence = assert_refused(("gait", "my.toml"), expected, working_folder)
     assert sentence.startswith("vrw: my.toml: ")
 
 
-@pytest.mark.parametrize("mistake", COMMANDS)
-def test_a_mistake_in_a_command_gets_one_sentence_that_helps(mistake: str, folder: Path) -> None:
-    arguments, text, expected = COMMANDS[mistake]
-    (folder / "my.toml").write_text(text)
-    refused(arguments, expected, folder)
+@pytest.mark.parametrize("mistake", WRONG_COMMANDS)
+def test_a_mistake_in_a_command_gets_one_sentence_that_helps(
+    mistake: str, working_folder: Path
+) -> None:
+    arguments, text, expected = WRONG_COMMANDS[mistake]
+    (working_folder / "my.toml").write_text(text)
+    assert_refused(arguments, expected, working_folder)
 
 
-USAGE = {
+USAGE_ERRORS = {
     "no such command": ("scann",),
     "no config": ("scan",),
     "no such option": ("scan", "my.toml", "--chunks", "3"),
@@ -401,26 +411,26 @@ USAGE = {
 }
 
 
-@pytest.mark.parametrize("mistake", USAGE)
-def test_a_misspelt_command_shows_where_help_is(mistake: str, folder: Path) -> None:
-    (folder / "my.toml").write_text(GRID)
-    before = what_is_there(folder)
-    told = CliRunner().invoke(app, list(USAGE[mistake]))
-    assert told.exit_code == 2
-    assert "Error" in told.stderr
-    assert "Traceback" not in told.stderr
-    assert what_is_there(folder) == before
+@pytest.mark.parametrize("mistake", USAGE_ERRORS)
+def test_a_misspelled_command_points_to_the_help(mistake: str, working_folder: Path) -> None:
+    (working_folder / "my.toml").write_text(GRID_TABLE)
+    before = list_files(working_folder)
+    result = CliRunner().invoke(app, list(USAGE_ERRORS[mistake]))
+    assert result.exit_code == 2
+    assert "Error" in result.stderr
+    assert "Traceback" not in result.stderr
+    assert list_files(working_folder) == before
 
 
 @pytest.mark.parametrize("command", ["gait", "scan"])
-def test_a_device_that_is_not_there_gets_one_sentence(command: str, tmp_path: Path) -> None:
+def test_a_missing_device_is_reported_in_one_sentence(command: str, tmp_path: Path) -> None:
     path = Path(__file__).parents[2] / "configs" / "quickstart.toml"
-    told = subprocess.run(
+    run_result = subprocess.run(
         [sys.executable, "-m", "vrw_jax", command, str(path)],
         cwd=tmp_path, capture_output=True, text=True,
         env=os.environ | {"JAX_PLATFORMS": "cuda"},
     )  # fmt: skip
-    assert told.returncode == 2
-    assert told.stderr.startswith("vrw: JAX_PLATFORMS is 'cuda', but JAX finds no device")
-    assert told.stderr.count("\n") == 1
+    assert run_result.returncode == 2
+    assert run_result.stderr.startswith("vrw: JAX_PLATFORMS is 'cuda', but JAX finds no device")
+    assert run_result.stderr.count("\n") == 1
     assert not list(tmp_path.iterdir())

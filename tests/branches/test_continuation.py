@@ -5,81 +5,83 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.files import kept_by_netcdf
+from support.files import assert_netcdf_round_trip
 
 import vrw_jax as vrw
 from vrw_jax.app.reports import write_branch
-from vrw_jax.branches.continuation import MapRun
-from vrw_jax.branches.run import run_all
+from vrw_jax.branches.continuation import MapContinuation
+from vrw_jax.branches.run import continue_and_locate
 from vrw_jax.figures.branch import branch_figure
-from vrw_jax.numerics.arclength import AbstractFollowed, MapFollowed, follow
+from vrw_jax.numerics.arclength import AbstractContinuationProblem, FixedPointProblem, continue_from
 from vrw_jax.numerics.events import integrate_phase
-from vrw_jax.numerics.minima import Watched
-from vrw_jax.numerics.roots import locate
+from vrw_jax.numerics.minima import MonitoredFunctions
+from vrw_jax.numerics.roots import locate_zeros
 
 RADIUS_AT_200 = 0.32861954  # Table 1: published for orientation beside the physics
-WITHIN = 1e-9
+LOCATION_TOLERANCE = 1e-9
 
 
 # Maps with closed forms ---------------------------------------------------------------------------
 
 
-def henon(b, x, a):
+def evaluate_henon(b, x, a):
     """x -> 1 - a x^2 + y, y -> b x: fold at -(1-b)^2/4, period doubling at 3 (1-b)^2/4."""
     return jnp.stack([1.0 - a * x[0] ** 2 + x[1], b * x[0]])
 
 
-def logistic(_, x, r):
+def evaluate_logistic(_, x, r):
     """x -> r x (1 - x): period doubling at 3."""
     return r * x * (1.0 - x)
 
 
-def delayed_logistic(_, x, r):
+def evaluate_delayed_logistic(_, x, r):
     """x -> r x (1 - y), y -> x: Neimark-Sacker bifurcation at 2, multipliers exp(+-i pi/3)."""
     return jnp.stack([r * x[0] * (1.0 - x[1]), x[0]])
 
 
-def stretched(_, x, p):
+def evaluate_stretched_map(_, x, p):
     """Three numbers: a fold in the first at p = 0 beside two that contract."""
     return jnp.stack([x[0] + p - x[0] ** 2, 0.5 * x[1] + x[0], -0.3 * x[2]])
 
 
 @eqx.filter_jit
-def side_by_side(inside, *points):
-    return jax.vmap(inside.linearise)(*points)
+def linearize_together(inside, *points):
+    return jax.vmap(inside.linearize)(*points)
 
 
-class FromOutside(AbstractFollowed):
+class ExternallyLinearizedProblem(AbstractContinuationProblem):
     """The fold of `stretched`, linearised for many points at once outside of compiled code."""
 
-    inside: MapFollowed
-    traced = False
+    inner_problem: FixedPointProblem
+    is_traceable = False
 
-    def linearise(self, wheels, z, p):
-        return jax.tree.map(np.asarray, side_by_side(self.inside, wheels, z, p))
+    def linearize(self, wheels, z, p):
+        return jax.tree.map(np.asarray, linearize_together(self.inner_problem, wheels, z, p))
 
-    def section(self, z):
+    def section_state(self, z):
         return z
 
 
-def test_a_branch_linearised_from_outside_of_programs_is_the_same():
-    def followed(how):
+def test_a_branch_linearized_outside_of_compiled_programs_is_the_same():
+    def followed(options_used):
         given = jnp.zeros(1), np.array([-0.5, 1.0])
-        run = MapRun(how, vrw.ArclengthOptions(largest_step=0.1), *given)
+        run = MapContinuation(options_used, vrw.ArclengthOptions(max_ds=0.1), *given)
         begin = jnp.array([[-1.0, -2.0, 0.0]]), jnp.array([1.0])
-        (strand,) = run_all(run, *begin, np.array([True]), lambda owner, point: None)
+        (strand,) = continue_and_locate(run, *begin, np.array([True]), lambda owner, point: None)
         return strand
 
-    inside = MapFollowed(stretched)
-    one, other = followed(inside), followed(FromOutside(inside))
+    inside = FixedPointProblem(evaluate_stretched_map)
+    one, other = followed(inside), followed(ExternallyLinearizedProblem(inside))
     np.testing.assert_allclose(other.points.p, one.points.p, rtol=0, atol=1e-12)
-    assert [border.name for border in other.borders] == [border.name for border in one.borders]
-    (fold,) = (border.value for border in other.borders if border.kind == "fold")
+    assert [border.name for border in other.special_points] == [
+        border.name for border in one.special_points
+    ]
+    (fold,) = (border.value for border in other.special_points if border.kind == "fold")
     assert fold == pytest.approx(0.0, abs=1e-9)
     assert other.ends == one.ends
 
 
-def test_branches_that_wait_for_others_are_followed_as_if_alone_in_two_iterations_a_point():
+def test_branches_continued_together_equal_single_ones_with_two_iterations_per_point():
     """Eleven, of which the third is none: more than go side by side, and of each length.
 
     Newton's method ends with a correction of nothing: from the tangent alone three would be needed.
@@ -88,36 +90,41 @@ def test_branches_that_wait_for_others_are_followed_as_if_alone_in_two_iteration
     z = np.stack([0.6 + 0.0 * b, 0.6 * b], 1)
     options = vrw.ArclengthOptions()
 
-    def tracks(some, wanted):
-        given = map(jnp.asarray, (b[some], z[some], a[some], (-1.0, 2.0), 0.0 * a[some] + 1.0))
-        return follow(MapFollowed(henon), options, *given, jnp.asarray(wanted))
+    def tracks(selection, wanted):
+        given = map(
+            jnp.asarray,
+            (b[selection], z[selection], a[selection], (-1.0, 2.0), 0.0 * a[selection] + 1.0),
+        )
+        return continue_from(
+            FixedPointProblem(evaluate_henon), options, *given, jnp.asarray(wanted)
+        )
 
     every = tracks(np.arange(11), np.arange(11) != 2)
     assert every.n_points[2] == 0
     assert np.ptp(every.n_points[3:]) > 10
     for i in (0, 5, 10):
-        alone = tracks(np.array([i]), np.array([True]))
-        np.testing.assert_array_equal(every.n_points[i], alone.n_points[0])
+        single_result = tracks(np.array([i]), np.array([True]))
+        np.testing.assert_array_equal(every.n_points[i], single_result.n_points[0])
         # One program is for one branch, the other for eight: last digits may differ.
-        np.testing.assert_allclose(every.points.p[i], alone.points.p[0], rtol=0, atol=1e-10)
+        np.testing.assert_allclose(every.points.p[i], single_result.points.p[0], rtol=0, atol=1e-10)
     assert every.passes.sum() < 2.3 * every.n_points.sum()
 
 
-def borders_of(branch):
-    return {border.kind: border.value for border in branch.borders}
+def special_points_by_kind(branch):
+    return {border.kind: border.value for border in branch.special_points}
 
 
-def test_fold_and_period_doubling_of_henon_are_where_the_closed_form_puts_them():
+def test_fold_and_period_doubling_of_henon_agree_with_the_closed_form():
     for b in (0.3, -0.4):
-        branch = vrw.continue_map(henon, [0.6, 0.6 * b], 1.0, (-1.0, 2.0), constants=b)
-        found = borders_of(branch)
-        assert set(found) == {"fold", "period_doubling"}
-        assert abs(found["fold"] + (1.0 - b) ** 2 / 4.0) < WITHIN
-        assert abs(found["period_doubling"] - 3.0 * (1.0 - b) ** 2 / 4.0) < WITHIN
+        branch = vrw.continue_map(evaluate_henon, [0.6, 0.6 * b], 1.0, (-1.0, 2.0), constants=b)
+        solution = special_points_by_kind(branch)
+        assert set(solution) == {"fold", "period_doubling"}
+        assert abs(solution["fold"] + (1.0 - b) ** 2 / 4.0) < LOCATION_TOLERANCE
+        assert abs(solution["period_doubling"] - 3.0 * (1.0 - b) ** 2 / 4.0) < LOCATION_TOLERANCE
 
 
-def test_the_branch_turns_back_at_a_fold_and_goes_on_unstable():
-    branch = vrw.continue_map(henon, [0.6, 0.18], 1.0, (-1.0, 2.0), constants=0.3)
+def test_the_branch_turns_back_at_a_fold_and_continues_unstable():
+    branch = vrw.continue_map(evaluate_henon, [0.6, 0.18], 1.0, (-1.0, 2.0), constants=0.3)
     values, b = branch.values, 0.3
     turn = int(np.argmin(values))
     assert 0 < turn < values.size - 1
@@ -128,15 +135,15 @@ def test_the_branch_turns_back_at_a_fold_and_goes_on_unstable():
 
 
 def test_period_doubling_of_the_logistic_map_is_at_3():
-    branch = vrw.continue_map(logistic, [0.6], 2.5, (1.5, 4.0))
-    assert abs(borders_of(branch)["period_doubling"] - 3.0) < WITHIN
+    branch = vrw.continue_map(evaluate_logistic, [0.6], 2.5, (1.5, 4.0))
+    assert abs(special_points_by_kind(branch)["period_doubling"] - 3.0) < LOCATION_TOLERANCE
 
 
 def test_neimark_sacker_of_the_delayed_logistic_map_is_at_2():
-    branch = vrw.continue_map(delayed_logistic, [0.4, 0.4], 1.7, (1.4, 2.2))
-    (border,) = branch.borders
+    branch = vrw.continue_map(evaluate_delayed_logistic, [0.4, 0.4], 1.7, (1.4, 2.2))
+    (border,) = branch.special_points
     assert border.kind == "neimark_sacker"
-    assert abs(border.value - 2.0) < WITHIN
+    assert abs(border.value - 2.0) < LOCATION_TOLERANCE
     turn = np.exp(1j * np.pi / 3.0)
     np.testing.assert_allclose(sorted(border.cycle.multipliers.imag), [-turn.imag, turn.imag])
 
@@ -145,12 +152,12 @@ def test_real_reciprocal_multipliers_are_no_neimark_sacker_bifurcation():
     # Multipliers 2 p and 1/2: their product is 1 at p = 1, where nothing happens.
     saddle = lambda _, x, p: jnp.stack([2.0 * p * x[0], 0.5 * x[1]])
     branch = vrw.continue_map(saddle, [0.0, 0.0], 0.8, (0.6, 1.4))
-    assert "neimark_sacker" not in borders_of(branch)
+    assert "neimark_sacker" not in special_points_by_kind(branch)
 
 
 def test_a_fold_of_a_map_of_three_numbers_is_found():
-    branch = vrw.continue_map(stretched, [0.5, 1.0, 0.0], 0.25, (-1.0, 1.0))
-    assert abs(borders_of(branch)["fold"]) < WITHIN
+    branch = vrw.continue_map(evaluate_stretched_map, [0.5, 1.0, 0.0], 0.25, (-1.0, 1.0))
+    assert abs(special_points_by_kind(branch)["fold"]) < LOCATION_TOLERANCE
 
 
 def test_a_zero_is_located_to_its_width_even_at_a_jump():
@@ -162,11 +169,11 @@ def test_a_zero_is_located_to_its_width_even_at_a_jump():
     functions = lambda x, which: np.array([kinds[k](y) for k, y in zip(which, x, strict=True)])
     every = np.arange(3)
     ends = np.array([-0.3, -1.0, -19.0]), np.array([0.7, 1e-3, 128.4])
-    found = locate(functions, ends, np.full(3, 1e-12))
+    solution = locate_zeros(functions, ends, np.full(3, 1e-12))
     exact = np.array([0.3 ** (1 / 3), 0.777, np.log(20.0) / 5.0])
-    np.testing.assert_allclose(found.place, exact, atol=1e-12)
-    assert np.all(functions(found.left, every) <= 0.0)
-    assert not np.any(functions(found.right, every) < 0.0)
+    np.testing.assert_allclose(solution.best, exact, atol=1e-12)
+    assert np.all(functions(solution.left_end, every) <= 0.0)
+    assert not np.any(functions(solution.right_end, every) < 0.0)
 
 
 # A model that is not ours: the simplest walking model (Garcia et al. 1998) ------------------------
@@ -175,7 +182,7 @@ MIDSTANCE = -0.05
 """Stance angle past which the swing foot is looked at: before, its feet scuff at mid-stance."""
 
 
-def simplest_walker(options):
+def make_simplest_walker(options):
     """Map of (stance angle, its rate) just after heel strike; leg length and gravity are 1."""
 
     def field(slope):
@@ -191,57 +198,59 @@ def simplest_walker(options):
         theta, dtheta = x
         start = jnp.stack([theta, 2.0 * theta, dtheta, (1.0 - jnp.cos(2.0 * theta)) * dtheta])
         going = jnp.asarray(True)
-        past = Watched(lambda y: jnp.stack([y[0] - MIDSTANCE]), 1)
-        strike = Watched(lambda y: jnp.stack([2.0 * y[0] - y[1]]), 1)
+        past = MonitoredFunctions(lambda y: jnp.stack([y[0] - MIDSTANCE]), 1)
+        strike = MonitoredFunctions(lambda y: jnp.stack([2.0 * y[0] - y[1]]), 1)
         middle = integrate_phase(field(slope), past, start, going, options)
         end = integrate_phase(field(slope), strike, middle.state, middle.guard == 0, options)
         theta, _, dtheta, _ = end.state
         after = jnp.stack([-theta, jnp.cos(2.0 * theta) * dtheta])
-        walked = (end.guard == 0) & (end.duration > 0.0)
-        return jnp.where(walked, after, jnp.nan), middle.duration + end.duration
+        walk_result = (end.guard == 0) & (end.duration > 0.0)
+        return jnp.where(walk_result, after, jnp.nan), middle.duration + end.duration
 
     return walk
 
 
-WALK = simplest_walker(vrw.Options.tight())
+WALKER_STEP = make_simplest_walker(vrw.StepOptions.tight())
 
 
-def walker_map(_, x, slope):
-    return WALK(x, slope)[0]
+def evaluate_walker_map(_, x, slope):
+    return WALKER_STEP(x, slope)[0]
 
 
 # docs/physics.md: section state, period, multipliers at slope 0.009.
-STABLE = ((0.200310900544, -0.199832473005), 3.88246375285, -0.19009984107 + 0.55759877668j)
-UNSTABLE = ((0.193937369810, -0.203866927442), 3.09610586808, (4.00386435893, 0.45958958980))
+STABLE_CYCLE = ((0.200310900544, -0.199832473005), 3.88246375285, -0.19009984107 + 0.55759877668j)
+UNSTABLE_CYCLE = ((0.193937369810, -0.203866927442), 3.09610586808, (4.00386435893, 0.45958958980))
 
 
 @pytest.fixture(scope="module")
 def walker_branches():
-    step = vrw.ArclengthOptions(largest_step=0.05, first_step=0.02)
+    step = vrw.ArclengthOptions(max_ds=0.05, initial_ds=0.02)
     follow = lambda x: vrw.continue_map(
-        walker_map, x, 0.009, (0.004, 0.018), name="slope", options=step
+        evaluate_walker_map, x, 0.009, (0.004, 0.018), name="slope", options=step
     )
-    return follow(STABLE[0]), follow(UNSTABLE[0])
+    return follow(STABLE_CYCLE[0]), follow(UNSTABLE_CYCLE[0])
 
 
-def at_slope(branch, slope):
+def find_index_at_slope(branch, slope):
     return int(np.argmin(np.abs(branch.values - slope)))
 
 
 def test_simplest_walker_has_the_published_fixed_points_and_multipliers(walker_branches):
-    for branch, (x, period, _) in zip(walker_branches, (STABLE, UNSTABLE), strict=True):
-        i = at_slope(branch, 0.009)
+    for branch, (x, period, _) in zip(walker_branches, (STABLE_CYCLE, UNSTABLE_CYCLE), strict=True):
+        i = find_index_at_slope(branch, 0.009)
         assert branch.values[i] == 0.009
-        np.testing.assert_allclose(branch.dataset.x.values[i], x, atol=WITHIN)
-        assert abs(float(jax.jit(WALK)(jnp.asarray(x), 0.009)[1]) - period) < 1e-8
-    stable, unstable = (b.multipliers[at_slope(b, 0.009)] for b in walker_branches)
-    np.testing.assert_allclose(stable, [np.conj(STABLE[2]), STABLE[2]][::-1], atol=WITHIN)
-    np.testing.assert_allclose(unstable, UNSTABLE[2], atol=WITHIN)
+        np.testing.assert_allclose(branch.dataset.x.values[i], x, atol=LOCATION_TOLERANCE)
+        assert abs(float(jax.jit(WALKER_STEP)(jnp.asarray(x), 0.009)[1]) - period) < 1e-8
+    stable, unstable = (b.multipliers[find_index_at_slope(b, 0.009)] for b in walker_branches)
+    np.testing.assert_allclose(
+        stable, [np.conj(STABLE_CYCLE[2]), STABLE_CYCLE[2]][::-1], atol=LOCATION_TOLERANCE
+    )
+    np.testing.assert_allclose(unstable, UNSTABLE_CYCLE[2], atol=LOCATION_TOLERANCE)
 
 
 def test_simplest_walker_doubles_its_period_near_slope_0015(walker_branches):
     stable, unstable = walker_branches
-    doubling = borders_of(stable)["period_doubling"]
+    doubling = special_points_by_kind(stable)["period_doubling"]
     assert 0.0148 < doubling < 0.0154
     assert not unstable.stable.any()
     below = stable.values < doubling
@@ -252,7 +261,7 @@ def test_simplest_walker_doubles_its_period_near_slope_0015(walker_branches):
 # The wheel ----------------------------------------------------------------------------------------
 
 
-WHEELS = vrw.WheelParams(
+BRANCH_WHEELS = vrw.WheelParams(
     damping=jnp.asarray([200.0, 150.0, 100.0]),
     natural_length=jnp.asarray([1.02, 1.03, 1.02]),
     slope=jnp.asarray([0.30, 0.28, 0.02]),  # the last does not walk
@@ -261,7 +270,7 @@ WHEELS = vrw.WheelParams(
 
 @pytest.fixture(scope="module")
 def branches():
-    return vrw.continue_branches(WHEELS, "damping", (4.0, 230.0))
+    return vrw.continue_branches(BRANCH_WHEELS, "damping", (4.0, 230.0))
 
 
 @pytest.fixture(scope="module")
@@ -270,9 +279,9 @@ def branch(branches):
 
 
 @pytest.fixture(scope="module")
-def gait_at(branch):
+def find_gait_at_damping(branch):
     """The gait of Table 1's wheel at a damping, found again next to the branch."""
-    guess = branch.borders[-1].cycle
+    guess = branch.special_points[-1].cycle
 
     def find(damping):
         params = vrw.WheelParams(damping=damping)
@@ -281,78 +290,86 @@ def gait_at(branch):
     return find
 
 
-def by_name(branch):
-    return {border.name: border for border in branch.borders}
+def special_points_by_name(branch):
+    return {border.name: border for border in branch.special_points}
 
 
-def test_the_branch_along_damping_ends_where_an_indicator_vanishes(branch):
-    first, last = branch.borders[0], branch.borders[-1]
+def test_the_branch_along_damping_ends_at_a_zero_of_an_indicator(branch):
+    first, last = branch.special_points[0], branch.special_points[-1]
     assert (first.name, last.name) == ("lambda_2_plus", "lambda_4_plus")
     assert first.ends_branch
     assert last.ends_branch
     assert abs(first.value - 4.65) < 0.01
     assert abs(last.value - 219.85) < 0.01
-    assert branch.values[0] - first.value < WITHIN
-    assert last.value - branch.values[-1] < WITHIN
+    assert branch.values[0] - first.value < LOCATION_TOLERANCE
+    assert last.value - branch.values[-1] < LOCATION_TOLERANCE
     assert branch.stable.all()
 
 
-def test_every_gait_on_the_branch_repeats_when_walked(branch):
+def test_every_gait_on_the_branch_repeats_in_a_walk(branch):
     assert branch.dataset.closure.max() < 1e-11
 
 
-def test_scuffing_begins_between_100_and_120(branch, gait_at):
-    border = by_name(branch)["clearance_sls1"]
+def test_scuffing_begins_between_100_and_120(branch, find_gait_at_damping):
+    border = special_points_by_name(branch)["clearance_sls1"]
     assert 100.0 < border.value < 120.0
     for offset, scuffs in ((-1.0, True), (1.0, False)):
-        params, gait = gait_at(border.value + offset)
-        clearance = vrw.step(params, gait.section_state, options=vrw.Options.tight())
-        assert (float(clearance.monitors.clearance_sls1) < 0.0) == scuffs
+        params, gait = find_gait_at_damping(border.value + offset)
+        clearance = vrw.step(params, gait.section_state, options=vrw.StepOptions.tight())
+        assert (float(clearance.margins.clearance_sls1) < 0.0) == scuffs
 
 
-def assert_alike_in_random_bounds(branch, count):
+def assert_same_points_in_random_bounds(branch, count):
     # Just below the scuffing border the foot dips so little that no step of a solver shows it.
     random = np.random.default_rng(19)
     ends = random.uniform(20.0, 100.0, count), random.uniform(115.0, 215.0, count)
     wheel = vrw.WheelParams(damping=110.0)
     cycle = vrw.limit_cycle(wheel)
-    coarse = vrw.ArclengthOptions(first_step=0.011, largest_step=0.05)
+    coarse = vrw.ArclengthOptions(initial_ds=0.011, max_ds=0.05)
     for i, (low, high) in enumerate(zip(*ends, strict=True)):
         options = coarse if i < 3 else None
-        asked = vrw.continue_branch(wheel, "damping", (low, high), cycle=cycle, options=options)
-        known = {b.name: b.value for b in branch.borders if low < b.value < high}
-        assert {b.name for b in asked.borders} == set(known)
-        for border in asked.borders:
-            assert abs(border.value / known[border.name] - 1.0) < WITHIN, (low, high, border)
+        branch_result = vrw.continue_branch(
+            wheel, "damping", (low, high), cycle=cycle, options=options
+        )
+        known_by_name = {b.name: b.value for b in branch.special_points if low < b.value < high}
+        assert {b.name for b in branch_result.special_points} == set(known_by_name)
+        for border in branch_result.special_points:
+            assert abs(border.value / known_by_name[border.name] - 1.0) < LOCATION_TOLERANCE, (
+                low,
+                high,
+                border,
+            )
 
 
-def test_borders_do_not_depend_on_the_bounds_or_the_step_that_are_asked_for(branch):
-    assert_alike_in_random_bounds(branch, 8)
+def test_special_points_do_not_depend_on_bounds_or_continuation_step(branch):
+    assert_same_points_in_random_bounds(branch, 8)
 
 
 @pytest.mark.slow
-def test_borders_do_not_depend_on_any_of_a_hundred_bounds(branch):
-    assert_alike_in_random_bounds(branch, 100)
+def test_special_points_do_not_depend_on_any_of_a_hundred_bounds(branch):
+    assert_same_points_in_random_bounds(branch, 100)
 
 
-def test_each_border_is_located_to_1e_9(branch, gait_at):
+def test_each_special_point_is_located_to_1e_9(branch, find_gait_at_damping):
     def quantity(border, damping):
         """Indicator or monitor `border.name` at that damping; negative where the gait is lost."""
-        params, gait = gait_at(damping)
+        params, gait = find_gait_at_damping(damping)
         if not bool(gait.found):
             return -1.0
-        result = vrw.step(params, gait.section_state, options=vrw.Options.tight())
+        result = vrw.step(params, gait.section_state, options=vrw.StepOptions.tight())
         return float(result.measures()[border.name])
 
-    for border in branch.borders:
+    for border in branch.special_points:
         if border.name == "clearance_sls1":  # vanishes like a cube: see the test above
             continue
-        below, above = (quantity(border, border.value + d) for d in (-WITHIN, WITHIN))
+        below, above = (
+            quantity(border, border.value + d) for d in (-LOCATION_TOLERANCE, LOCATION_TOLERANCE)
+        )
         assert below * above < 0.0, border
 
 
-def test_the_cycle_at_a_border_is_a_limit_cycle_of_the_wheel(branch):
-    border = branch.borders[-1]
+def test_the_cycle_at_a_special_point_is_a_limit_cycle_of_the_wheel(branch):
+    border = branch.special_points[-1]
     assert bool(border.cycle.found)
     assert 0.0 < float(border.cycle.indicators.lambda_4) < 1e-8
     np.testing.assert_allclose(
@@ -360,9 +377,9 @@ def test_the_cycle_at_a_border_is_a_limit_cycle_of_the_wheel(branch):
     )
 
 
-def test_the_map_before_touchdown_and_after_impact_have_the_same_multipliers(gait_at):
-    options = vrw.Options.tight()
-    params, gait = gait_at(200.0)
+def test_the_map_before_touchdown_and_after_impact_have_the_same_multipliers(find_gait_at_damping):
+    options = vrw.StepOptions.tight()
+    params, gait = find_gait_at_damping(200.0)
     # By all arguments, for which other tests have the machine code.
     _, before = jax.jacfwd(vrw.return_map, (0, 1))(params, gait.section_state, options=options)
     values = np.linalg.eigvals(np.asarray(before))
@@ -372,30 +389,30 @@ def test_the_map_before_touchdown_and_after_impact_have_the_same_multipliers(gai
     assert abs(float(gait.spectral_radius) - RADIUS_AT_200) < 1e-8
 
 
-def test_wheels_side_by_side_have_each_their_own_branch(branches):
-    walks, lost = branches[1:]
+def test_each_wheel_of_a_batch_has_its_own_branch(branches):
+    walks, lost_values = branches[1:]
     i = int(np.argmin(np.abs(walks.values - 150.0)))
-    gait = vrw.limit_cycle(jax.tree.map(lambda x: jnp.broadcast_to(x, 3)[1], WHEELS))
+    gait = vrw.limit_cycle(jax.tree.map(lambda x: jnp.broadcast_to(x, 3)[1], BRANCH_WHEELS))
     assert walks.values[i] == 150.0
     assert abs(walks.dataset.dls_fraction[i] - gait.dls_fraction) < 1e-8
-    assert lost.outcome == vrw.Outcome.NO_CYCLE_FOUND
-    assert not lost.values.size
-    assert "none" in str(lost)
+    assert lost_values.outcome == vrw.Outcome.NO_CYCLE_FOUND
+    assert not lost_values.values.size
+    assert "none" in str(lost_values)
 
 
 @pytest.mark.slow
-def test_the_mesh_of_a_branch_is_as_fine_as_its_gaits_need_or_the_end_is_the_mesh_s():
+def test_the_mesh_of_a_branch_resolves_its_gaits_or_ends_the_branch():
     wheel = vrw.WheelParams(slope=0.13)  # towards the least slope double support lasts and lasts
     fixed = vrw.CycleOptions.tight()
     coarse = vrw.continue_branch(wheel, "slope", (0.11, 0.14), cycle_options=fixed)
-    assert coarse.borders[0].name == "mesh_too_coarse"
+    assert coarse.special_points[0].name == "mesh_too_coarse"
     assert coarse.ends[0].startswith("mesh too coarse at 0.1168")
     fine = vrw.continue_branch(wheel, "slope", (0.11, 0.14))
     assert fine.values[0] == 0.11
     assert "range" in fine.ends[0]
 
 
-def test_a_rigid_wheel_is_followed_by_its_own_step():
+def test_a_rigid_wheel_is_continued_with_its_own_step():
     branch = vrw.continue_branch(
         vrw.WheelParams(), "slope", (0.2, 0.35), model=vrw.RigidWheel(stop_at_lift_off=False)
     )
@@ -408,7 +425,7 @@ def test_a_rigid_wheel_is_followed_by_its_own_step():
     assert len(branch_figure(branch).axes) == 4  # without indicators
 
 
-def test_what_is_asked_wrongly_is_said_in_a_sentence():
+def test_invalid_arguments_of_a_continuation_are_refused_in_one_sentence():
     with pytest.raises(ValueError, match=r"no parameter \(did you mean 'damping'\?\): choose from"):
         vrw.continue_branch(vrw.WheelParams(), "damp", (50.0, 100.0))
     with pytest.raises(ValueError, match="which holds nothing"):
@@ -417,8 +434,8 @@ def test_what_is_asked_wrongly_is_said_in_a_sentence():
         vrw.continue_branch(vrw.WheelParams(damping=[1.0, 2.0]), "damping", (50.0, 100.0))
 
 
-def test_a_branch_is_written_drawn_and_told(branch, tmp_path):
-    kept_by_netcdf(branch.dataset, tmp_path)
+def test_a_branch_is_written_drawn_and_summarized(branch, tmp_path):
+    assert_netcdf_round_trip(branch.dataset, tmp_path)
     assert len(branch_figure(branch).axes) == 4
     names = {path.name for path in write_branch(branch, tmp_path)}
     assert names == {"branch.zarr", "borders.csv", "summary.md", "branch.svg", "branch.png"}

@@ -12,96 +12,120 @@ import pytest
 import vrw_jax as vrw
 from vrw_jax import simd
 from vrw_jax.cycles import on_ground
-from vrw_jax.models import as_full_states, step_lanes
-from vrw_jax.models.ladder import UNILATERAL, VISCOELASTIC
+from vrw_jax.models import embed_section_states, step_batch_with_jacobian
+from vrw_jax.models.ladder import UNILATERAL_MODEL, VISCOELASTIC_MODEL
 from vrw_jax.models.unilateral import queues as ground_lanes
 from vrw_jax.numerics.arclength import ArclengthOptions
-from vrw_jax.numerics.floquet import bifurcation_margins, jury_margins, multipliers
+from vrw_jax.numerics.floquet import bifurcation_margins, floquet_multipliers, jury_margins
 from vrw_jax.wheel import PARAMETER_NAMES
 
 START = (0.1, 1.6, -0.1)
-SLOW = vrw.WheelParams(damping=300.0)
-GROUND = vrw.UnilateralWheel(friction=0.7)
-OPTIONS = vrw.Options(rtol=1e-11, atol=1e-11)
+SLOW_WHEEL = vrw.WheelParams(damping=300.0)
+GROUND_MODEL = vrw.UnilateralWheel(friction=0.7)
+TIGHT_OPTIONS = vrw.StepOptions(rtol=1e-11, atol=1e-11)
 
 
 @pytest.fixture(scope="module")
-def near():
+def gait_near_slow_start():
     """A section state next to the slow gait at c = 300, μ = 0.7."""
-    return vrw.walk(SLOW, START, 40, model=GROUND, options=OPTIONS).steps.section_state[-1]
+    return vrw.walk(
+        SLOW_WHEEL, START, 40, model=GROUND_MODEL, options=TIGHT_OPTIONS
+    ).steps.section_state[-1]
 
 
 @pytest.mark.slow
-def test_sensitivities_on_real_ground_are_the_difference_quotients_friction_included(near):
+def test_unilateral_sensitivities_equal_difference_quotients_including_friction(
+    gait_near_slow_start,
+):
     names = ("dls_fraction", "period", "speed", "slip", "energy_lost_friction")
-    told = lambda params, model: vrw.sensitivities(
-        params, measures=names, guess=near, model=model, options=OPTIONS
+    evaluate = lambda params, model: vrw.sensitivities(
+        params, measures=names, guess=gait_near_slow_start, model=model, options=TIGHT_OPTIONS
     )
-    table = told(SLOW, GROUND)
+    table = evaluate(SLOW_WHEEL, GROUND_MODEL)
     assert "friction" in table.parameter
     step = 1e-4
     for name, ends in {
-        "damping": [told(vrw.WheelParams(damping=300.0 + d), GROUND) for d in (step, -step)],
-        "friction": [told(SLOW, vrw.UnilateralWheel(friction=0.7 + d)) for d in (step, -step)],
+        "damping": [
+            evaluate(vrw.WheelParams(damping=300.0 + d), GROUND_MODEL) for d in (step, -step)
+        ],
+        "friction": [
+            evaluate(SLOW_WHEEL, vrw.UnilateralWheel(friction=0.7 + d)) for d in (step, -step)
+        ],
     }.items():
         difference = (ends[0].value - ends[1].value) / (2.0 * step)
-        found = table.derivative.sel(parameter=name)
-        np.testing.assert_allclose(found, difference, rtol=2e-5, atol=1e-7)
+        solution = table.derivative.sel(parameter=name)
+        np.testing.assert_allclose(solution, difference, rtol=2e-5, atol=1e-7)
 
 
 @pytest.mark.slow
-def test_a_gait_within_a_callers_program_moves_as_sensitivities_say(near):
+def test_a_gait_within_a_compiled_program_has_the_derivatives_of_sensitivities(
+    gait_near_slow_start,
+):
     """By Newton's method within JAX's programs; sensitivities have it beside them."""
 
     def speed(params, friction):
         model = vrw.UnilateralWheel(friction=friction)
-        return vrw.limit_cycle(params, guess=near, model=model, options=OPTIONS).speed
+        return vrw.limit_cycle(
+            params, guess=gait_near_slow_start, model=model, options=TIGHT_OPTIONS
+        ).speed
 
     slopes = jax.jit(jax.value_and_grad(speed, argnums=(0, 1)))
-    value, (by_params, by_friction) = slopes(SLOW, 0.7)
+    value, (by_params, by_friction) = slopes(SLOW_WHEEL, 0.7)
     table = vrw.sensitivities(
-        SLOW, measures=("speed",), guess=near, model=GROUND, options=OPTIONS
+        SLOW_WHEEL,
+        measures=("speed",),
+        guess=gait_near_slow_start,
+        model=GROUND_MODEL,
+        options=TIGHT_OPTIONS,
     ).sel(measure="speed")
     assert float(value) == pytest.approx(float(table.value), abs=1e-11)
-    told = jax.tree.leaves(by_params), by_friction
-    np.testing.assert_allclose(jnp.stack([*told[0], told[1]]), table.derivative, rtol=1e-8)
+    result = jax.tree.leaves(by_params), by_friction
+    np.testing.assert_allclose(jnp.stack([*result[0], result[1]]), table.derivative, rtol=1e-8)
     matrix = lambda c: (
         vrw.limit_cycle(
-            vrw.WheelParams(damping=c), guess=near, model=GROUND, options=OPTIONS
-        ).matrix
+            vrw.WheelParams(damping=c),
+            guess=gait_near_slow_start,
+            model=GROUND_MODEL,
+            options=TIGHT_OPTIONS,
+        ).monodromy_value
     )
     unknown = jax.jacfwd(matrix)(300.0)
     assert np.isnan(unknown).all()  # told, and not by a zero
 
 
-def test_what_real_ground_does_not_measure_is_refused_in_one_sentence():
+def test_measures_that_unilateral_contact_lacks_are_refused_in_one_sentence():
     with pytest.raises(ValueError, match="choose among these"):
-        vrw.sensitivities(SLOW, measures=("lambda_4",), model=GROUND)
+        vrw.sensitivities(SLOW_WHEEL, measures=("lambda_4",), model=GROUND_MODEL)
     with pytest.raises(ValueError, match="does not feel"):
         vrw.scan(vrw.grid(friction=[0.5, 0.7]))
     with pytest.raises(ValueError, match="is no parameter"):
         vrw.continue_branch(vrw.WheelParams(), "friction", (0.5, 1.0))
     with pytest.raises(TypeError, match="compliant legs"):
-        vrw.tune(SLOW, "speed", ["damping"], {"damping": (250.0, 350.0)}, model=vrw.RigidWheel())
+        vrw.tune(
+            SLOW_WHEEL, "speed", ["damping"], {"damping": (250.0, 350.0)}, model=vrw.RigidWheel()
+        )
 
 
 def test_bifurcations_of_larger_maps_are_those_of_the_small_map_inside():
     small = np.array([[0.4, 0.9, 0.1], [-0.7, 0.3, 0.2], [0.1, 0.0, -0.6]])
     large = np.zeros((7, 7))
     large[2:5, 2:5] = small
-    found = bifurcation_margins(jnp.asarray(large))
-    np.testing.assert_allclose(found, jury_margins(jnp.asarray(small))[:3], atol=1e-12)
-    three = np.asarray(multipliers(jnp.asarray(large)))[:3]
-    exact = np.asarray(multipliers(jnp.asarray(small)))
+    solution = bifurcation_margins(jnp.asarray(large))
+    np.testing.assert_allclose(solution, jury_margins(jnp.asarray(small))[:3], atol=1e-12)
+    three = np.asarray(floquet_multipliers(jnp.asarray(large)))[:3]
+    exact = np.asarray(floquet_multipliers(jnp.asarray(small)))
     np.testing.assert_allclose(np.sort_complex(three), np.sort_complex(exact), atol=1e-12)
 
 
 @pytest.mark.slow
-def test_a_scan_puts_each_sample_on_its_lowest_rung():
+def test_a_scan_gives_each_sample_its_simplest_valid_model():
     design = vrw.grid(damping=[150.0, 300.0], friction=[0.7, math.inf])
     measures = ("dls_fraction", "period", "slip")
     scan = vrw.scan(design, measures, model="auto")
-    assert scan.rung.values.tolist() == [[UNILATERAL, VISCOELASTIC], [UNILATERAL, UNILATERAL]]
+    assert scan.rung.values.tolist() == [
+        [UNILATERAL_MODEL, VISCOELASTIC_MODEL],
+        [UNILATERAL_MODEL, UNILATERAL_MODEL],
+    ]
     paper = vrw.limit_cycle(vrw.WheelParams(damping=150.0))
     np.testing.assert_allclose(scan.period[0, 1], paper.period, atol=1e-9)
     assert float(scan.slip[0, 1]) == 0.0
@@ -117,7 +141,7 @@ def test_a_scan_puts_each_sample_on_its_lowest_rung():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("damping", "friction"), [(182.5, 1.2), (204.2, 0.6), (193.3, 2.4)])
-def test_whoever_asks_for_a_gait_from_nothing_is_told_the_same(damping, friction):
+def test_limit_cycle_scan_and_sensitivities_find_the_same_gait(damping, friction):
     """Walks from the rung's own start settle late here, or Newton's method goes elsewhere."""
     params, model = vrw.WheelParams(damping=damping), vrw.UnilateralWheel(friction=friction)
     slowest = vrw.limit_cycle(params, model=model)
@@ -126,17 +150,19 @@ def test_whoever_asks_for_a_gait_from_nothing_is_told_the_same(damping, friction
     assert np.all(every < 1.0)
     design = vrw.grid(damping=[damping], friction=[friction])
     scan = vrw.scan(design, ("period",), model=vrw.UnilateralWheel())
-    told = vrw.sensitivities(params, model=model, measures=("period",))
-    for period in (scan.period.values[0, 0], told.value.values[0]):
+    sensitivity_result = vrw.sensitivities(params, model=model, measures=("period",))
+    for period in (scan.period.values[0, 0], sensitivity_result.value.values[0]):
         assert period == pytest.approx(float(slowest.period), abs=1e-8)
 
 
 @pytest.mark.slow
-def test_a_branch_on_real_ground_holds_gaits_that_repeat(near):
-    cycle = vrw.limit_cycle(SLOW, guess=near, model=GROUND, options=OPTIONS)
+def test_a_unilateral_branch_consists_of_gaits_that_repeat(gait_near_slow_start):
+    cycle = vrw.limit_cycle(
+        SLOW_WHEEL, guess=gait_near_slow_start, model=GROUND_MODEL, options=TIGHT_OPTIONS
+    )
     branch = vrw.continue_branch(
-        SLOW, "friction", (0.65, 0.75), cycle=cycle, model=GROUND, step_options=OPTIONS,
-        options=ArclengthOptions(first_step=0.1, largest_step=0.1),
+        SLOW_WHEEL, "friction", (0.65, 0.75), cycle=cycle, model=GROUND_MODEL, step_options=TIGHT_OPTIONS,
+        options=ArclengthOptions(initial_ds=0.1, max_ds=0.1),
     )  # fmt: skip
     assert branch.outcome == vrw.Outcome.STEPPED
     assert branch.values.min() == pytest.approx(0.65)
@@ -147,23 +173,29 @@ def test_a_branch_on_real_ground_holds_gaits_that_repeat(near):
     slope = (branch.dataset.period[place + 1] - branch.dataset.period[place - 1]) / (
         branch.values[place + 1] - branch.values[place - 1]
     )
-    table = vrw.sensitivities(SLOW, measures=("period",), guess=near, model=GROUND, options=OPTIONS)
+    table = vrw.sensitivities(
+        SLOW_WHEEL,
+        measures=("period",),
+        guess=gait_near_slow_start,
+        model=GROUND_MODEL,
+        options=TIGHT_OPTIONS,
+    )
     exact = table.derivative.sel(parameter="friction", measure="period")
     np.testing.assert_allclose(slope, exact, rtol=0.05)
 
 
 @pytest.mark.slow
-def test_a_branch_on_real_ground_turns_at_its_fold_and_comes_back_unstable():
+def test_a_unilateral_branch_turns_at_its_fold_and_returns_unstable():
     """At Table 1 the slow gait needs friction: two gaits above that, one repelling, none below."""
     params, high = vrw.WheelParams(), vrw.UnilateralWheel(friction=1.0)
-    state = vrw.walk(params, START, 300, model=high, options=OPTIONS).steps.section_state[-1]
-    cycle = vrw.limit_cycle(params, guess=state, model=high, options=OPTIONS)
+    state = vrw.walk(params, START, 300, model=high, options=TIGHT_OPTIONS).steps.section_state[-1]
+    cycle = vrw.limit_cycle(params, guess=state, model=high, options=TIGHT_OPTIONS)
     branch = vrw.continue_branch(
-        params, "friction", (0.95, 1.0), cycle=cycle, model=high, step_options=OPTIONS,
-        options=ArclengthOptions(first_step=0.1, largest_step=0.2),
+        params, "friction", (0.95, 1.0), cycle=cycle, model=high, step_options=TIGHT_OPTIONS,
+        options=ArclengthOptions(initial_ds=0.1, max_ds=0.2),
     )  # fmt: skip
     assert float(branch.dataset.closure.max()) < 1e-8
-    (fold,) = (border.value for border in branch.borders if border.kind == "fold")
+    (fold,) = (border.value for border in branch.special_points if border.kind == "fold")
     # By lanes and central differences, which went past it in large steps: a quartic through the
     # seven gaits next to it, as experiments/ground/branches.py prints it.
     assert fold == pytest.approx(0.98186, abs=1e-4)
@@ -175,16 +207,18 @@ def test_a_branch_on_real_ground_turns_at_its_fold_and_comes_back_unstable():
     assert not (before if after.all() else after).any()
     # Just below the fold no walk stays: the slow gait is a ghost there.
     low = vrw.UnilateralWheel(friction=fold - 0.1)
-    walk = vrw.walk(params, START, 120, model=low, options=OPTIONS).steps
+    walk = vrw.walk(params, START, 120, model=low, options=TIGHT_OPTIONS).steps
     slow = branch.dataset.period.values.min()
     assert float(jnp.sum(walk.durations[-1])) < 0.9 * slow
 
 
 @pytest.mark.slow
-def test_without_slip_the_multipliers_are_those_of_the_papers_plane():
+def test_without_slip_the_multipliers_equal_those_of_the_paper():
     paper = vrw.limit_cycle(vrw.WheelParams())
-    held = vrw.UnilateralWheel(friction=math.inf, infinite="paper")
-    ground = vrw.limit_cycle(vrw.WheelParams(), guess=START, model=held, options=OPTIONS)
+    held_values = vrw.UnilateralWheel(friction=math.inf, infinite_friction_rule="paper")
+    ground = vrw.limit_cycle(
+        vrw.WheelParams(), guess=START, model=held_values, options=TIGHT_OPTIONS
+    )
     assert int(ground.outcome) == vrw.Outcome.STEPPED
     np.testing.assert_allclose(ground.period, paper.period, atol=1e-9)
     largest = lambda cycle: np.sort(np.abs(np.asarray(cycle.multipliers)))[::-1]
@@ -194,175 +228,209 @@ def test_without_slip_the_multipliers_are_those_of_the_papers_plane():
 
 
 @pytest.mark.slow
-def test_tuning_on_real_ground_climbs_along_the_gradient():
+def test_unilateral_tuning_increases_the_objective_along_the_gradient():
     # Up to here one order of events: next to a border (c = 311.2, slope 0.2944) climbing is slow.
     bounds = {"damping": (280.0, 310.0), "slope": (0.295, 0.31)}
     tuned = vrw.tune(
-        SLOW, "dls_fraction", list(bounds), bounds, model=GROUND, options=OPTIONS, tolerance=1e-4
+        SLOW_WHEEL,
+        "dls_fraction",
+        list(bounds),
+        bounds,
+        model=GROUND_MODEL,
+        options=TIGHT_OPTIONS,
+        tolerance=1e-4,
     )
     assert tuned.value > tuned.start_value
-    assert tuned.walked.outcome == vrw.Outcome.STEPPED
+    assert tuned.validation.outcome == vrw.Outcome.STEPPED
     for name, sign in (("damping", 1.0), ("slope", -1.0)):
-        moved = vrw.WheelParams(**({"damping": 300.0} | {name: getattr(SLOW, name) * 1.001}))
-        walk = vrw.walk(moved, START, 60, model=GROUND, options=OPTIONS).steps
+        shifted = vrw.WheelParams(
+            **({"damping": 300.0} | {name: getattr(SLOW_WHEEL, name) * 1.001})
+        )
+        walk = vrw.walk(shifted, START, 60, model=GROUND_MODEL, options=TIGHT_OPTIONS).steps
         share = walk.durations[-1, 0] / jnp.sum(walk.durations[-1])
         assert sign * float(share - tuned.start_value) > 0.0
     assert float(tuned.params.damping) == pytest.approx(310.0)
     assert float(tuned.params.slope) == pytest.approx(0.295)
 
 
-LANES = vrw.Options(solver="Tsit5", rtol=1e-8, atol=1e-8)
+BATCH_OPTIONS = vrw.StepOptions(solver="Tsit5", rtol=1e-8, atol=1e-8)
 
 
 @pytest.fixture(scope="module")
-def lanes():
+def unilateral_batch():
     """Three steps of several wheels side by side: damping, friction, start and what they did."""
     damping = np.array([200.0, 300.0, 250.0, 160.0, 60.0, 150.0, 200.0])
     friction = np.array([0.7, 0.7, 1.2, math.inf, math.inf, math.nan, 0.3])
     states = np.tile(START, (len(damping), 1))
     states[0, 1] = 2.0
 
-    def walked(some):
-        return vrw.steps(
-            vrw.WheelParams(damping=damping[some]),
-            states[some],
+    def walked(selection):
+        return vrw.step_batch(
+            vrw.WheelParams(damping=damping[selection]),
+            states[selection],
             3,
-            model=vrw.UnilateralWheel(friction=friction[some]),
-            options=LANES,
+            model=vrw.UnilateralWheel(friction=friction[selection]),
+            options=BATCH_OPTIONS,
         )
 
     return damping, friction, states, walked
 
 
-def test_lanes_walk_on_real_ground_as_single_wheels_do(lanes):
-    damping, friction, states, walked = lanes
-    found = walked(slice(None))
-    assert found.engine == "lanes"
+def test_unilateral_batches_equal_single_wheels(unilateral_batch):
+    damping, friction, states, walk_result = unilateral_batch
+    solution = walk_result(slice(None))
+    assert solution.engine == "lanes"
     for i in range(len(damping)):
         if math.isnan(friction[i]):
             continue  # a lone wheel of that friction is refused
         ground = vrw.UnilateralWheel(friction=friction[i])
         params, x, count = vrw.WheelParams(damping=damping[i]), states[i], 0
         while True:  # step by step: other tests have the program
-            step = vrw.step(params, x, model=ground, options=OPTIONS, engine="diffrax")
+            step = vrw.step(params, x, model=ground, options=TIGHT_OPTIONS, engine="diffrax")
             x, count = step.section_state, count + int(step.outcome == vrw.Outcome.STEPPED)
             if step.outcome != vrw.Outcome.STEPPED or count == 3:
                 break
-        assert int(found.outcome[i]) == int(step.outcome)
-        assert int(found.n_stepped[i]) == count
-        np.testing.assert_allclose(found.section_state[i], x, atol=2e-7)
-        np.testing.assert_allclose(found.durations[i], step.durations, atol=5e-8)
-    assert int(found.outcome[5]) == vrw.Outcome.BAD_INPUT
-    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(found))
+        assert int(solution.outcome[i]) == int(step.outcome)
+        assert int(solution.n_stepped[i]) == count
+        np.testing.assert_allclose(solution.section_state[i], x, atol=2e-7)
+        np.testing.assert_allclose(solution.durations[i], step.durations, atol=5e-8)
+    assert int(solution.outcome[5]) == vrw.Outcome.BAD_INPUT
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(solution))
 
 
 @pytest.mark.slow
-def test_lanes_at_the_tightest_tolerances_walk_as_single_wheels_do():
+def test_unilateral_batches_at_tight_tolerances_equal_single_wheels():
     params, ground = vrw.WheelParams(damping=100.0), vrw.UnilateralWheel(friction=1.0)
-    given = {"model": ground, "options": vrw.Options.tight()}
-    found = vrw.steps(params, np.asarray([START]), 10, **given)
+    given = {"model": ground, "options": vrw.StepOptions.tight()}
+    batch_result = vrw.step_batch(params, np.asarray([START]), 10, **given)
     walk = vrw.walk(params, START, 10, engine="diffrax", **given)
-    assert int(found.n_stepped[0]) == int(walk.n_stepped) == 10
-    np.testing.assert_allclose(found.durations[0], walk.steps.durations[-1], atol=1e-9)
-    np.testing.assert_allclose(found.section_state[0], walk.steps.section_state[-1], atol=1e-8)
+    assert int(batch_result.n_stepped[0]) == int(walk.n_stepped) == 10
+    np.testing.assert_allclose(batch_result.durations[0], walk.steps.durations[-1], atol=1e-9)
+    np.testing.assert_allclose(
+        batch_result.section_state[0], walk.steps.section_state[-1], atol=1e-8
+    )
 
 
-def test_a_start_that_no_wheel_can_have_is_refused_by_its_code():
+def test_an_impossible_start_has_the_outcome_bad_input():
     """By geometry: Leg 1 at an angle below 0 leaves the next foot in the ground, above half of that
     between legs Leg 1 would be longer than its stopper lets it be."""
     starts = [(0.1, 1.6, -0.1), (-0.05, 1.6, -0.1), (0.4, 1.6, -0.1)]
-    full = np.array([GROUND.full_section(SLOW, jnp.asarray(x)) for x in starts])
-    free, held, near = (full[0].copy() for _ in range(3))
+    full = np.array([GROUND_MODEL.embed_section(SLOW_WHEEL, jnp.asarray(x)) for x in starts])
+    free, held_values, near = (full[0].copy() for _ in range(3))
     free[4 + 2 * 8 + 2], free[4 + 2] = 0.0, 1.01  # a leg in the air off its stopper, too long
-    held[4 + 2 * 8] = 5.0  # the loaded leg on its stopper: its foot is in the ground
+    held_values[4 + 2 * 8] = 5.0  # the loaded leg on its stopper: its foot is in the ground
     near[4 + 2 * 8 + 2], near[4 + 2] = 0.0, 1.0005  # by no more than Newton's method may be wrong
-    found = vrw.steps(SLOW, np.stack([*full, free, held, near]), 1, model=GROUND, options=OPTIONS)
+    batch_result = vrw.step_batch(
+        SLOW_WHEEL,
+        np.stack([*full, free, held_values, near]),
+        1,
+        model=GROUND_MODEL,
+        options=TIGHT_OPTIONS,
+    )
     refused = [False, True, True, True, True, False]
-    assert np.array_equal(found.outcome == vrw.Outcome.BAD_INPUT, refused)
-    assert np.array_equal(found.outcome == vrw.Outcome.STEPPED, np.logical_not(refused))
+    assert np.array_equal(batch_result.outcome == vrw.Outcome.BAD_INPUT, refused)
+    assert np.array_equal(batch_result.outcome == vrw.Outcome.STEPPED, np.logical_not(refused))
 
 
-def test_what_a_lane_gives_does_not_depend_on_its_company(lanes):
-    *_, walked = lanes
-    together, alone = walked(slice(None)), walked(slice(1, 2))
-    for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
+def test_the_result_of_a_batch_element_does_not_depend_on_the_others(unilateral_batch):
+    *_, walk_result = unilateral_batch
+    joint_result, single_result = walk_result(slice(None)), walk_result(slice(1, 2))
+    for a, b in zip(jax.tree.leaves(joint_result), jax.tree.leaves(single_result), strict=True):
         np.testing.assert_array_equal(a[1], b[0])
 
 
-def test_which_rates_a_wheel_keeps_and_their_shares_do_not_depend_on_its_company():
+def test_independent_rates_and_their_shares_do_not_depend_on_other_batch_elements():
     """Of projections, which feet leave of other ranks: their columns are sums of the kept ones."""
-    ways = np.random.default_rng(0).normal(size=(12, 11, 11))
-    bases = [np.linalg.qr(way[:, : 4 + k % 6])[0] for k, way in enumerate(ways)]
-    settled, asked = np.stack([b @ b.T for b in bases]), np.ones((12, 11), bool)
-    together = ground_lanes._Rates.of(settled, asked)
+    method_names = np.random.default_rng(0).normal(size=(12, 11, 11))
+    bases = [
+        np.linalg.qr(method_name[:, : 4 + k % 6])[0] for k, method_name in enumerate(method_names)
+    ]
+    settled, requested = np.stack([b @ b.T for b in bases]), np.ones((12, 11), bool)
+    joint_result = ground_lanes._IndependentRates.from_projection(settled, requested)
     for k, basis in enumerate(bases):
-        alone, n = ground_lanes._Rates.of(settled[[k]], asked[[k]]), basis.shape[1]
-        np.testing.assert_array_equal(together.shares[k, :n], alone.shares[0])
-        kept = settled[k][:, together.places[k, :n]]
+        single_result, n = (
+            ground_lanes._IndependentRates.from_projection(settled[[k]], requested[[k]]),
+            basis.shape[1],
+        )
+        np.testing.assert_array_equal(joint_result.combination[k, :n], single_result.combination[0])
+        retained = settled[k][:, joint_result.indices[k, :n]]
         # Largest in thirty such sets: 4e-16.
-        np.testing.assert_allclose(kept @ alone.shares[0], settled[k], rtol=0, atol=1e-14)
+        np.testing.assert_allclose(
+            retained @ single_result.combination[0], settled[k], rtol=0, atol=1e-14
+        )
 
 
 @pytest.mark.slow
-def test_how_a_lane_moves_does_not_depend_on_its_company(lanes):
+def test_derivatives_of_a_batch_element_do_not_depend_on_the_others(unilateral_batch):
     """Beside wheels with other events, and with more directions than one lane carries."""
-    damping, friction, states, _ = lanes
-    some = [0, 1, 2, 4, 6]
+    damping, friction, states, _ = unilateral_batch
+    selection = [0, 1, 2, 4, 6]
 
-    values = np.tile(np.asarray(GROUND.values(SLOW))[:, None], len(damping))
+    values = np.tile(np.asarray(GROUND_MODEL.parameter_values(SLOW_WHEEL))[:, None], len(damping))
     values[PARAMETER_NAMES.index("damping")], values[-1] = damping, friction
-    x = as_full_states(values, states, 8)
+    x = embed_section_states(values, states, 8)
     x[:, 4 + 16 + 3 : 4 + 16 + 6] = 0.0  # legs off their stoppers
-    moved = lambda places: step_lanes(values[:, places], x[places], GROUND, LANES, 8)
-    together, alone = moved(some), moved([2])
-    assert (np.abs(together[1].section_state).sum(1) > 0.0).sum(1).max() > ground_lanes.DIRECTIONS
-    for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
+    shift = lambda places: step_batch_with_jacobian(
+        values[:, places], x[places], GROUND_MODEL, BATCH_OPTIONS, 8
+    )
+    joint_result, single_result = shift(selection), shift([2])
+    assert (np.abs(joint_result[1].section_state).sum(1) > 0.0).sum(
+        1
+    ).max() > ground_lanes.MAX_TANGENTS_PER_LANE
+    for a, b in zip(jax.tree.leaves(joint_result), jax.tree.leaves(single_result), strict=True):
         np.testing.assert_array_equal(a[2], b[0])
 
 
 @pytest.mark.slow
-def test_a_march_by_xla_as_on_a_gpu_goes_as_the_machine_code(lanes, monkeypatch):
-    *_, walked = lanes
-    found = walked(slice(None))
+def test_integration_by_xla_agrees_with_machine_code(unilateral_batch, monkeypatch):
+    *_, walk_result = unilateral_batch
+    solution = walk_result(slice(None))
     monkeypatch.setattr(simd, "serves", lambda: False)
-    ground_lanes._program.cache_clear()
-    by_xla = walked(slice(None))
-    ground_lanes._program.cache_clear()
-    np.testing.assert_array_equal(by_xla.outcome, found.outcome)
+    ground_lanes._compile_walk.cache_clear()
+    by_xla = walk_result(slice(None))
+    ground_lanes._compile_walk.cache_clear()
+    np.testing.assert_array_equal(by_xla.outcome, solution.outcome)
     # Rounding alone tells them apart, grown by the events of three steps.
-    np.testing.assert_allclose(by_xla.section_state, found.section_state, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(by_xla.durations, found.durations, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(by_xla.section_state, solution.section_state, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(by_xla.durations, solution.durations, rtol=0, atol=1e-9)
 
 
-def test_an_event_of_a_lane_on_real_ground_counts_within_the_time_allowed_alone(lanes):
-    damping, friction, states, _ = lanes
-    within = lambda seconds: vrw.steps(
+def test_an_event_of_a_batch_element_counts_only_within_the_time_limit(unilateral_batch):
+    damping, friction, states, _ = unilateral_batch
+    within = lambda seconds: vrw.step_batch(
         vrw.WheelParams(damping=damping[1:2]),
         states[1:2],
         model=vrw.UnilateralWheel(friction=friction[1:2]),
-        options=eqx.tree_at(lambda o: o.max_phase_time, LANES, jnp.asarray(seconds)),
+        options=eqx.tree_at(lambda o: o.max_phase_time, BATCH_OPTIONS, jnp.asarray(seconds)),
     )
     longest = np.max(within(20.0).durations)
     assert int(within(1.001 * longest).outcome[0]) == vrw.Outcome.STEPPED
     assert int(within(0.999 * longest).outcome[0]) == vrw.Outcome.NO_TOUCHDOWN_IN_TIME
 
 
-def test_an_implicit_solver_for_lanes_on_real_ground_is_refused_in_one_sentence():
+def test_an_implicit_solver_for_a_unilateral_batch_is_refused_in_one_sentence():
     with pytest.raises(ValueError, match="map vrw"):
-        vrw.steps(SLOW, np.asarray([START]), model=GROUND, options=vrw.Options(solver="Kvaerno5"))
+        vrw.step_batch(
+            SLOW_WHEEL,
+            np.asarray([START]),
+            model=GROUND_MODEL,
+            options=vrw.StepOptions(solver="Kvaerno5"),
+        )
 
 
 @pytest.mark.slow
-def test_infinite_friction_walks_as_large_friction_does():
+def test_walks_with_infinite_friction_equal_those_with_large_friction():
     """Where the rear foot scuffs, where the gait is the paper's, and where that has none."""
     damping, friction = np.array([50.0, 200.0, 300.0, 2.0]), np.array([math.inf, 1e6])
     wheels = vrw.WheelParams(damping=np.repeat(damping, 2))
     ground = vrw.UnilateralWheel(friction=np.tile(friction, 4))
-    found = vrw.steps(wheels, np.tile(START, (8, 1)), 100, model=ground, options=LANES)
-    assert np.all(np.asarray(found.outcome) == vrw.Outcome.STEPPED)
-    period = np.asarray(found.durations).sum(-1).reshape(4, 2)
+    batch_result = vrw.step_batch(
+        wheels, np.tile(START, (8, 1)), 100, model=ground, options=BATCH_OPTIONS
+    )
+    assert np.all(np.asarray(batch_result.outcome) == vrw.Outcome.STEPPED)
+    period = np.asarray(batch_result.durations).sum(-1).reshape(4, 2)
     np.testing.assert_allclose(period[:, 0], period[:, 1], rtol=2e-6)
-    share = np.asarray(found.durations)[0, 0] / period[0, 0]
+    share = np.asarray(batch_result.durations)[0, 0] / period[0, 0]
     # Of an independent simulator at frictions of 10,000 and a million.
     assert period[0, 0] == pytest.approx(0.52296, abs=2e-5)
     assert float(share) == pytest.approx(0.717, abs=5e-4)
@@ -370,79 +438,87 @@ def test_infinite_friction_walks_as_large_friction_does():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stoppers", ["bilateral", "one-sided"])
-def test_infinite_friction_is_the_limit_that_growing_friction_nears_as_its_inverse(stoppers):
+def test_results_approach_infinite_friction_as_the_inverse_of_the_friction(stoppers):
     """Ten steps, over all of which one combination of contacts is admissible."""
     damping, friction = np.array([20.0, 50.0, 100.0, 150.0, 400.0]), 10.0 ** np.arange(4, 7)
     wheels = vrw.WheelParams(damping=np.repeat(damping, 4))
     ground = vrw.UnilateralWheel(np.tile([*friction, math.inf], 5), 4000, stoppers)
-    starts, options = np.tile(START, (20, 1)), vrw.Options.tight()
-    found = vrw.steps(wheels, starts, 10, model=ground, options=options)
-    assert np.all(np.asarray(found.outcome) == vrw.Outcome.STEPPED)
-    period = np.asarray(found.durations).sum(-1).reshape(5, 4)
+    starts, options = np.tile(START, (20, 1)), vrw.StepOptions.tight()
+    batch_result = vrw.step_batch(wheels, starts, 10, model=ground, options=options)
+    assert np.all(np.asarray(batch_result.outcome) == vrw.Outcome.STEPPED)
+    period = np.asarray(batch_result.durations).sum(-1).reshape(5, 4)
     shares = friction * (period[:, :3] - period[:, 3:])  # s, of the first order in 1 / friction
     np.testing.assert_allclose(shares[:, 1:], shares[:, :2], rtol=0.03)
 
 
 @pytest.mark.slow
-def test_gaits_on_real_ground_are_found_cold_slow_and_fast_ones(near):
-    both = vrw.limit_cycles(SLOW, model=GROUND)
-    assert np.asarray(both.found).tolist() == [True, True]
-    assert np.all(np.asarray(both.spectral_radius) < 1.0)
-    slow, fast = (vrw.limit_cycle(SLOW, model=GROUND, which=end) for end in ("slowest", "fastest"))
-    np.testing.assert_allclose(both.period, [slow.period, fast.period], atol=1e-12)
+def test_slow_and_fast_unilateral_gaits_are_found_without_a_guess(gait_near_slow_start):
+    cycles = vrw.limit_cycles(SLOW_WHEEL, model=GROUND_MODEL)
+    assert np.asarray(cycles.found).tolist() == [True, True]
+    assert np.all(np.asarray(cycles.spectral_radius) < 1.0)
+    slow, fast = (
+        vrw.limit_cycle(SLOW_WHEEL, model=GROUND_MODEL, which=end) for end in ("slowest", "fastest")
+    )
+    np.testing.assert_allclose(cycles.period, [slow.period, fast.period], atol=1e-12)
     assert float(fast.speed) > 2.0 * float(slow.speed)
     with pytest.raises(ValueError, match="2 gaits of this wheel attract"):
-        vrw.limit_cycle(SLOW, model=GROUND, which=2)
+        vrw.limit_cycle(SLOW_WHEEL, model=GROUND_MODEL, which=2)
     # A gait of one step is none of two.
-    assert not bool(vrw.limit_cycle(SLOW, model=GROUND, period_n=2).found)
-    known = vrw.limit_cycle(SLOW, model=GROUND, guess=near)
-    np.testing.assert_allclose(slow.section_state, known.section_state, atol=1e-10)
+    assert not bool(vrw.limit_cycle(SLOW_WHEEL, model=GROUND_MODEL, period_n=2).found)
+    cycle = vrw.limit_cycle(SLOW_WHEEL, model=GROUND_MODEL, guess=gait_near_slow_start)
+    np.testing.assert_allclose(slow.section_state, cycle.section_state, atol=1e-10)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stoppers", ["bilateral", "one-sided"])
 @pytest.mark.parametrize("scene", [(0.7, 200.0, 1.6), (0.5, 100.0, 1.2), (0.5, 100.0, 2.2)])
-def test_a_step_of_lanes_tells_what_a_single_wheel_does_and_how_it_moves(scene, stoppers):
+def test_a_batched_step_has_measures_and_derivatives_of_a_single_wheel(scene, stoppers):
     friction, damping, rate = scene
     params = vrw.WheelParams(damping=damping)
     ground = vrw.UnilateralWheel(friction=friction, stoppers=stoppers)
-    x = np.asarray(ground.full_section(params, jnp.asarray([0.1, rate, -0.1])))
-    values = np.asarray(ground.values(params))
-    step, moved = step_lanes(values[:, None], x[None], ground, OPTIONS, 8)
-    same, only = step_lanes(values[:, None], x[None], ground, OPTIONS, 8, [0])  # by damping
-    np.testing.assert_array_equal(same.section_state, step.section_state)
-    np.testing.assert_array_equal(only.slip[:, 0], moved.slip[:, 0])
-    assert not only.slip[:, 1:].any()
-    definition = vrw.Options.tight().by("diffrax")
+    x = np.asarray(ground.embed_section(params, jnp.asarray([0.1, rate, -0.1])))
+    values = np.asarray(ground.parameter_values(params))
+    step, shifted = step_batch_with_jacobian(values[:, None], x[None], ground, TIGHT_OPTIONS, 8)
+    is_same, only_value = step_batch_with_jacobian(
+        values[:, None], x[None], ground, TIGHT_OPTIONS, 8, [0]
+    )  # by damping
+    np.testing.assert_array_equal(is_same.section_state, step.section_state)
+    np.testing.assert_array_equal(only_value.slip[:, 0], shifted.slip[:, 0])
+    assert not only_value.slip[:, 1:].any()
+    definition = vrw.StepOptions.tight().with_engine("diffrax")
     shared = stoppers == "one-sided"
     times = lambda durations: durations.sum(keepdims=True) if shared else durations
 
-    def told(c, mu, rate):
+    def result(c, mu, rate):
         wheel, model = vrw.WheelParams(damping=c), eqx.tree_at(lambda m: m.friction, ground, mu)
-        alone = model.step(wheel, jnp.asarray(x).at[1].set(rate), definition)
-        return jnp.concatenate([alone.section_state[:20], times(alone.durations)]), alone
+        single_result = model.step(wheel, jnp.asarray(x).at[1].set(rate), definition)
+        return jnp.concatenate(
+            [single_result.section_state[:20], times(single_result.durations)]
+        ), single_result
 
-    at = [jnp.asarray(v) for v in (damping, friction, x[1])]
-    exact, alone = jax.jacfwd(told, argnums=(0, 1, 2), has_aux=True)(*at)
+    value_at = [jnp.asarray(v) for v in (damping, friction, x[1])]
+    exact, step_result = jax.jacfwd(result, argnums=(0, 1, 2), has_aux=True)(*value_at)
     for name in ("section_state", "durations", "post_impact", "slip", "energy_impacts",
                  "energy_damping", "energy_friction", "step_length", "mode_durations"):  # fmt: skip
-        told = getattr(step, name)[0]
+        result = getattr(step, name)[0]
         # One-sided, shares of modes and losses: the least dip lasts 3e-7 s, and rounding says in
         # which mode. Where the step leads, and when, does not feel it.
         share = shared and name.startswith(("durations", "mode", "energy", "slip"))
         near = 5e-7 if share else 1e-8
-        np.testing.assert_allclose(told, getattr(alone, name), rtol=near, atol=near, err_msg=name)
-    assert abs(float(step.durations[0].sum()) - float(alone.period)) < 1e-10
-    assert int(step.events[0]) == int(alone.events)
+        np.testing.assert_allclose(
+            result, getattr(step_result, name), rtol=near, atol=near, err_msg=name
+        )
+    assert abs(float(step.durations[0].sum()) - float(step_result.period)) < 1e-10
+    assert int(step.events[0]) == int(step_result.events)
     names = (*ground.parameter_names, "theta", "dtheta")
     for name, column in zip(("damping", "friction", "dtheta"), exact, strict=True):
         place = names.index(name)
-        found = moved.section_state[0, :20, place], times(moved.durations[0, :, place])
-        found = np.concatenate(found)
-        np.testing.assert_allclose(found, column, rtol=1e-6, atol=1e-8, err_msg=name)
+        solution = shifted.section_state[0, :20, place], times(shifted.durations[0, :, place])
+        solution = np.concatenate(solution)
+        np.testing.assert_allclose(solution, column, rtol=1e-6, atol=1e-8, err_msg=name)
 
 
-def test_newtons_method_on_lanes_goes_back_where_no_step_ends(monkeypatch):
+def test_batched_newton_steps_back_from_states_without_a_complete_step(monkeypatch):
     """A map of one number, x to x^2 / 4 + 1 - a, that is none beyond 3: without wheels."""
     calls = []
 
@@ -451,22 +527,24 @@ def test_newtons_method_on_lanes_goes_back_where_no_step_ends(monkeypatch):
         calls.append(x.copy())
         image, good = 0.25 * x**2 + 1.0 - a, np.abs(x) < 3.0
         state = lambda value: np.stack([value, 0.0 * value], 1)
-        by = np.zeros((len(x), 2, 3))
-        by[:, 0, 0], by[:, 0, 1] = -1.0, 0.5 * x
+        by_input = np.zeros((len(x), 2, 3))
+        by_input[:, 0, 0], by_input[:, 0, 1] = -1.0, 0.5 * x
         outcome = np.where(good, int(vrw.Outcome.STEPPED), int(vrw.Outcome.FELL_BACK))
-        return _Told(np.where(good[:, None], state(image), 0.0), outcome), _Told(by, None)
+        return _StepOutput(np.where(good[:, None], state(image), 0.0), outcome), _StepOutput(
+            by_input, None
+        )
 
     monkeypatch.setattr(on_ground, "step_lanes", step)
     a, begin = np.array([[0.25], [0.75], [-9.0]]), np.array([[1.9, 0.0], [1.5, 0.0], [0.0, 0.0]])
-    found = on_ground._newton(None, 1, vrw.Options(), 1, a, begin, True)
-    assert found.converged.tolist() == [True, True, False]  # the last has no fixed point
+    solution = on_ground._find_fixed_points(None, 1, vrw.StepOptions(), 1, a, begin, True)
+    assert solution.converged.tolist() == [True, True, False]  # the last has no fixed point
     exact = 2.0 - 2.0 * np.sqrt(a[:2, 0])
-    np.testing.assert_allclose(found.x[:2, 0], exact, atol=1e-12)
-    np.testing.assert_allclose(found.residual[:2], 0.0, atol=1e-12)
+    np.testing.assert_allclose(solution.x[:2, 0], exact, atol=1e-12)
+    np.testing.assert_allclose(solution.residual[:2], 0.0, atol=1e-12)
     assert max(np.abs(x).max() for x in calls) > 3.0  # where it was sent back from
 
 
-def test_what_newtons_method_on_lanes_tells_repeats_where_the_map_jumps_next_to_it(monkeypatch):
+def test_batched_newton_finds_a_repeating_state_next_to_a_jump_of_the_map(monkeypatch):
     """A map of one number, x to x / 2, but below a jump to x / 2 - 1, whose one point is -2. What
     corrections come down to lies behind the jump and repeats nothing: without wheels."""
     jump, begin = 4e-11, 3.6e-9
@@ -474,27 +552,31 @@ def test_what_newtons_method_on_lanes_tells_repeats_where_the_map_jumps_next_to_
     def step(columns, states, *_):
         x = states[:, 0]
         behind = x < jump
-        by = np.zeros((len(x), 2, 3))
+        by_input = np.zeros((len(x), 2, 3))
         # Before it a wrong slope, by which each correction leaves a sixth: 1e-10 is left of two.
-        by[:, 0, 1] = np.where(behind, 0.5, 0.4)
+        by_input[:, 0, 1] = np.where(behind, 0.5, 0.4)
         outcome = np.full(len(x), int(vrw.Outcome.STEPPED))
-        return _Told(np.stack([0.5 * x - behind, 0.0 * x], 1), outcome), _Told(by, None)
+        return _StepOutput(np.stack([0.5 * x - behind, 0.0 * x], 1), outcome), _StepOutput(
+            by_input, None
+        )
 
     monkeypatch.setattr(on_ground, "step_lanes", step)
     given = np.zeros((1, 1)), np.array([[begin, 0.0]]), True
-    found = on_ground._newton(None, 1, vrw.Options(rtol=1e-10, atol=1e-10), 1, *given)
-    assert found.converged[0]
-    assert found.residual[0] < 1e-10
-    assert abs(found.x[0, 0] + 2.0) < 1e-10
+    solution = on_ground._find_fixed_points(
+        None, 1, vrw.StepOptions(rtol=1e-10, atol=1e-10), 1, *given
+    )
+    assert solution.converged[0]
+    assert solution.residual[0] < 1e-10
+    assert abs(solution.x[0, 0] + 2.0) < 1e-10
 
 
-def test_of_many_systems_one_that_is_singular_spoils_no_other():
+def test_a_singular_linear_system_does_not_affect_the_others():
     matrix = np.stack([np.eye(2), np.zeros((2, 2)), 2.0 * np.eye(2)])
-    found = on_ground.solved(matrix, np.ones((3, 2, 1)))[..., 0]
-    np.testing.assert_array_equal(found, [[1.0, 1.0], [np.nan, np.nan], [0.5, 0.5]])
+    solution = on_ground.solve_linear_systems(matrix, np.ones((3, 2, 1)))[..., 0]
+    np.testing.assert_array_equal(solution, [[1.0, 1.0], [np.nan, np.nan], [0.5, 0.5]])
 
 
-class _Told(NamedTuple):
+class _StepOutput(NamedTuple):
     """As much of a step as Newton's method looks at."""
 
     section_state: np.ndarray

@@ -9,169 +9,201 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import truth
-from support.files import kept_by_netcdf
+from support.files import assert_netcdf_round_trip
 
 import vrw_jax as vrw
 from vrw_jax import simd
-from vrw_jax.numerics import floquet, moved_cycle
+from vrw_jax.numerics import floquet, solve_fixed_point_implicit
 from vrw_jax.wheel.outcomes import Outcome
-from vrw_jax.wheel.params import PARAMETER_NAMES, wheel_of
+from vrw_jax.wheel.params import PARAMETER_NAMES, wheel_from_parameters
 
-TIGHT = vrw.CycleOptions.tight()
-MASSES = [PARAMETER_NAMES.index(name) for name in ("hub_mass", "leg_mass")]
+TIGHT_OPTIONS = vrw.CycleOptions.tight()
+MASS_NAMES = [PARAMETER_NAMES.index(name) for name in ("hub_mass", "leg_mass")]
 VALUES = ("section_state", "post_impact", "durations", "period", "dls_fraction", "speed")
-DIFFERENTIATED = ("post_impact", "durations", "period", "dls_fraction", "speed", "step_length")
+DIFFERENTIATED_MEASURES = (
+    "post_impact",
+    "durations",
+    "period",
+    "dls_fraction",
+    "speed",
+    "step_length",
+)
 
 
-def measures(cycle, names):
+def collect_measures(cycle, names):
     return {name: getattr(cycle, name) for name in names}
 
 
 @functools.cache
-def compiled(options, names, transform):
+def compile_cycle_measures(options, names, transform):
     """Cycles of a batch with the derivatives of some measures, compiled once for many tests."""
 
     def one(vector):
-        cycle = vrw.limit_cycle(truth.wheel(vector), options=options)
-        values = measures(cycle, names)
+        cycle = vrw.limit_cycle(truth.make_wheel(vector), options=options)
+        values = collect_measures(cycle, names)
         return (values[names[0]] if transform is jax.grad else values), cycle
 
     return jax.jit(jax.vmap(transform(one, has_aux=True)))
 
 
-def differentiated(rows, options=None, names=DIFFERENTIATED, transform=jax.jacfwd):
+def differentiate_measures(rows, options=None, names=DIFFERENTIATED_MEASURES, transform=jax.jacfwd):
     """(derivatives, cycles) of rows of parameters, in a batch of one size."""
     rows = np.atleast_2d(np.asarray(rows, float))
-    full = np.concatenate([rows, np.tile(rows[-1], (len(truth.CASES) - len(rows), 1))])
-    found = compiled(options, names, transform)(jnp.asarray(full))
-    return jax.tree.map(lambda x: x[: len(rows)], found)
+    full = np.concatenate([rows, np.tile(rows[-1], (len(truth.REFERENCE_CASES) - len(rows), 1))])
+    solution = compile_cycle_measures(options, names, transform)(jnp.asarray(full))
+    return jax.tree.map(lambda x: x[: len(rows)], solution)
 
 
 @functools.cache
-def of_the_truth(options=None, names=DIFFERENTIATED):
-    return differentiated(truth.PARAMETERS, options, names)
+def stack_reference_measures(options=None, names=DIFFERENTIATED_MEASURES):
+    return differentiate_measures(truth.REFERENCE_PARAMETERS, options, names)
 
 
-def cycles(options=None):
-    return of_the_truth(options)[1]
+def find_reference_cycles(options=None):
+    return stack_reference_measures(options)[1]
 
 
 def table_1(**changes):
-    row = truth.PARAMETERS[0].copy()
+    row = truth.REFERENCE_PARAMETERS[0].copy()
     for name, value in changes.items():
         row[PARAMETER_NAMES.index(name)] = value
     return row
 
 
-def relative_error(found, expected):
+def compute_relative_error(solution, expected):
     scale = np.max(np.abs(expected), axis=tuple(range(1, expected.ndim)), keepdims=True)
-    return np.max(np.abs(np.asarray(found) - expected) / scale)
+    return np.max(np.abs(np.asarray(solution) - expected) / scale)
 
 
-@pytest.mark.parametrize(("options", "allowed"), [(None, 1e-9), (TIGHT, 1e-12)])
-def test_cycles_agree_with_the_truth(options, allowed):
-    found = cycles(options)
-    assert np.all(np.asarray(found.outcome) == Outcome.STEPPED)
+@pytest.mark.parametrize(("options", "allowed"), [(None, 1e-9), (TIGHT_OPTIONS, 1e-12)])
+def test_cycles_agree_with_the_reference(options, allowed):
+    solution = find_reference_cycles(options)
+    assert np.all(np.asarray(solution.outcome) == Outcome.STEPPED)
     for name in VALUES:
-        assert relative_error(getattr(found, name), truth.table("cycle", name)) < allowed, name
-    for own, name in (("lambda_I4", "lambda_impulse_4"), ("lambda_2", "lambda2_plus")):
-        indicator = getattr(found.indicators, own)
-        assert truth.scaled_error(indicator, truth.table("cycle", name)) < 10 * allowed
+        assert (
+            compute_relative_error(getattr(solution, name), truth.stack_quantity("cycle", name))
+            < allowed
+        ), name
+    for own_values, name in (("lambda_I4", "lambda_impulse_4"), ("lambda_2", "lambda2_plus")):
+        indicator = getattr(solution.indicators, own_values)
+        assert (
+            truth.compute_scaled_error(indicator, truth.stack_quantity("cycle", name))
+            < 10 * allowed
+        )
 
 
-@pytest.mark.parametrize(("options", "allowed"), [(None, 1e-8), (TIGHT, 1e-11)])
-def test_multipliers_agree_with_the_truth(options, allowed):
-    expected = truth.table("cycle", "multipliers")
-    found = np.asarray(cycles(options).multipliers)
+@pytest.mark.parametrize(("options", "allowed"), [(None, 1e-8), (TIGHT_OPTIONS, 1e-11)])
+def test_multipliers_agree_with_the_reference(options, allowed):
+    expected = truth.stack_quantity("cycle", "multipliers")
+    values_array = np.asarray(find_reference_cycles(options).multipliers)
     expected = expected[..., 0] + 1j * expected[..., 1]
-    gap = np.abs(found[:, :, None] - expected[:, None, :])
+    gap = np.abs(values_array[:, :, None] - expected[:, None, :])
     assert gap.min(1).max() < allowed
 
 
-@pytest.mark.parametrize(("options", "allowed"), [(None, 1e-8), (TIGHT, 1e-10)])
-def test_first_derivatives_agree_with_the_truth(options, allowed):
-    found, _ = of_the_truth(options)
-    for name in DIFFERENTIATED:
-        expected = np.stack([truth.floats(case["cycle"]["d_params"][name]) for case in truth.CASES])
-        own = np.asarray(found[name]).reshape(expected.shape)
-        assert relative_error(own, expected) < allowed, name
+@pytest.mark.parametrize(("options", "allowed"), [(None, 1e-8), (TIGHT_OPTIONS, 1e-10)])
+def test_first_derivatives_agree_with_the_reference(options, allowed):
+    solution, _ = stack_reference_measures(options)
+    for name in DIFFERENTIATED_MEASURES:
+        expected = np.stack(
+            [truth.to_floats(case["cycle"]["d_params"][name]) for case in truth.REFERENCE_CASES]
+        )
+        own_values = np.asarray(solution[name]).reshape(expected.shape)
+        assert compute_relative_error(own_values, expected) < allowed, name
 
 
-@pytest.mark.skipif(not simd.serves(), reason="machine code is for CPUs")
-def test_gradients_of_multipliers_are_machine_code_from_search_to_slopes():
-    radius = lambda vector: vrw.limit_cycle(truth.wheel(vector)).spectral_radius
-    program = jax.jit(jax.vmap(jax.grad(radius))).lower(truth.PARAMETERS).as_text()
+@pytest.mark.skipif(not simd.is_available(), reason="machine code is for CPUs")
+def test_gradients_of_multipliers_use_machine_code_throughout():
+    radius = lambda vector: vrw.limit_cycle(truth.make_wheel(vector)).spectral_radius
+    program = jax.jit(jax.vmap(jax.grad(radius))).lower(truth.REFERENCE_PARAMETERS).as_text()
     called = set(re.findall(r"lanes_code_\w+", program))
     assert len(called) == 3  # the search, the columns, the monodromy's derivatives along them
     assert "while" not in program
 
 
-def test_derivatives_of_the_spectral_radius_agree_with_the_truth():
-    found = of_the_truth(None, ("spectral_radius",))[0]["spectral_radius"]
+def test_derivatives_of_the_spectral_radius_agree_with_the_reference():
+    solution = stack_reference_measures(None, ("spectral_radius",))[0]["spectral_radius"]
     rows = [table_1(), table_1(slope=0.02), table_1(damping=np.nan)]
-    failed = differentiated(rows, None, ("spectral_radius",))[0]["spectral_radius"]
+    failed = differentiate_measures(rows, None, ("spectral_radius",))[0]["spectral_radius"]
     assert np.all(np.asarray(failed)[1:] == 0.0)
     expected = np.stack(
-        [truth.floats(case["cycle"]["d_params"]["spectral_radius"]) for case in truth.CASES]
+        [
+            truth.to_floats(case["cycle"]["d_params"]["spectral_radius"])
+            for case in truth.REFERENCE_CASES
+        ]
     )
-    assert relative_error(found, expected) < 1e-8
+    assert compute_relative_error(solution, expected) < 1e-8
 
 
-def test_a_hub_lighter_than_a_leg_keeps_the_slopes_by_both_masses():
+def test_derivatives_by_both_masses_are_accurate_for_a_hub_lighter_than_a_leg():
     """Of the two, units tell that by which both grow: neither may be divided by alone."""
     row, step = table_1(hub_mass=1.8, leg_mass=2.025), 1e-5
-    ways = [step * np.eye(len(PARAMETER_NAMES))[i] for i in MASSES]
-    rows = [row, *(row + sign * way for way in ways for sign in (1.0, -1.0))]
-    slopes, found = differentiated(rows, None, ("spectral_radius",))
-    radius = np.abs(np.linalg.eigvals(found.matrix)).max(-1)
+    method_names = [step * np.eye(len(PARAMETER_NAMES))[i] for i in MASS_NAMES]
+    rows = [
+        row,
+        *(row + sign * method_name for method_name in method_names for sign in (1.0, -1.0)),
+    ]
+    slopes, solution = differentiate_measures(rows, None, ("spectral_radius",))
+    radius = np.abs(np.linalg.eigvals(solution.monodromy_value)).max(-1)
     differences = (radius[1::2] - radius[2::2]) / (2.0 * step)
     # Errors of differences: the step squared, and the search's 1e-13 over the step.
-    own = np.asarray(slopes["spectral_radius"])[0, MASSES]
-    np.testing.assert_allclose(own, differences, rtol=0, atol=1e-7 * np.abs(own).max())
-    assert np.all(np.abs(own) > 1e-3)
+    own_values = np.asarray(slopes["spectral_radius"])[0, MASS_NAMES]
+    np.testing.assert_allclose(
+        own_values, differences, rtol=0, atol=1e-7 * np.abs(own_values).max()
+    )
+    assert np.all(np.abs(own_values) > 1e-3)
 
 
 @pytest.mark.slow
-def test_second_derivatives_agree_with_differences_and_vanish_where_there_is_no_cycle():
+def test_second_derivatives_agree_with_differences_and_vanish_without_a_cycle():
     rows = jnp.asarray(np.stack([table_1(), table_1(slope=0.02), table_1(damping=np.nan)]))
     slope = PARAMETER_NAMES.index("slope")
 
     def fraction(vector):
-        return vrw.limit_cycle(truth.wheel(vector)).dls_fraction
+        return vrw.limit_cycle(truth.make_wheel(vector)).dls_fraction
 
     gradients = jax.jit(jax.vmap(jax.grad(fraction)))
-    found = jax.jit(jax.vmap(jax.jacfwd(jax.grad(fraction))))(rows)
-    assert np.all(np.asarray(found)[1:] == 0.0)
-    np.testing.assert_allclose(found[0], found[0].T, rtol=1e-9, atol=1e-12)
+    solution = jax.jit(jax.vmap(jax.jacfwd(jax.grad(fraction))))(rows)
+    assert np.all(np.asarray(solution)[1:] == 0.0)
+    np.testing.assert_allclose(solution[0], solution[0].T, rtol=1e-9, atol=1e-12)
     step = 1e-5 * np.eye(len(PARAMETER_NAMES))[slope]  # errors: 1e-10 of the step, 1e-15 over it
     ahead, behind = gradients(rows[:1] + step)[0], gradients(rows[:1] - step)[0]
-    np.testing.assert_allclose(found[0][slope], (ahead - behind) / 2e-5, rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(solution[0][slope], (ahead - behind) / 2e-5, rtol=1e-6, atol=1e-8)
 
 
 @pytest.mark.slow
 def test_reverse_mode_agrees_with_forward_mode():
-    reverse, _ = differentiated(truth.PARAMETERS, None, ("dls_fraction",), jax.grad)
-    np.testing.assert_allclose(reverse, of_the_truth()[0]["dls_fraction"], rtol=1e-10, atol=1e-13)
+    reverse, _ = differentiate_measures(
+        truth.REFERENCE_PARAMETERS, None, ("dls_fraction",), jax.grad
+    )
+    np.testing.assert_allclose(
+        reverse, stack_reference_measures()[0]["dls_fraction"], rtol=1e-10, atol=1e-13
+    )
 
 
 def test_cycle_is_a_fixed_point_of_the_event_driven_map():
-    wheels = truth.wheels(truth.PARAMETERS[:6])
-    state = cycles().section_state[:6]
-    options = vrw.Options.tight()
+    wheels = truth.make_wheels(truth.REFERENCE_PARAMETERS[:6])
+    state = find_reference_cycles().section_state[:6]
+    options = vrw.StepOptions.tight()
     walk = jax.jit(jax.vmap(lambda p, x: vrw.return_map(p, x, options=options)))
     np.testing.assert_allclose(walk(wheels, state), state, rtol=0, atol=3e-9)
 
 
-def test_a_gait_that_the_mesh_does_not_resolve_is_not_called_found():
+def test_a_gait_that_the_mesh_does_not_resolve_is_not_reported_as_found():
     # Towards the slope where walking stops, 0.0969184, double support lasts longer and longer.
     rows = np.stack([table_1(slope=slope) for slope in (0.3, 0.2, 0.15, 0.12, 0.105, 0.098)])
-    expected, found = differentiated(rows, TIGHT)[1], differentiated(rows)[1]
-    kept = np.asarray(found.found)
-    assert list(kept) == [True, True, True, False, False, False]
+    expected, solution = (
+        differentiate_measures(rows, TIGHT_OPTIONS)[1],
+        differentiate_measures(rows)[1],
+    )
+    values_array = np.asarray(solution.found)
+    assert list(values_array) == [True, True, True, False, False, False]
     assert np.asarray(expected.found)[3]
-    np.testing.assert_allclose(found.period[kept], expected.period[kept], rtol=1e-8)
-    error = np.abs(np.asarray(found.period / expected.period)[kept] - 1.0)
-    assert np.all(error <= found.mesh_error[kept])
+    np.testing.assert_allclose(
+        solution.period[values_array], expected.period[values_array], rtol=1e-8
+    )
+    error = np.abs(np.asarray(solution.period / expected.period)[values_array] - 1.0)
+    assert np.all(error <= solution.mesh_error[values_array])
 
 
 def test_every_measure_of_a_cycle_can_be_differentiated():
@@ -191,84 +223,89 @@ def test_a_wheel_in_float32_stays_in_float32_beside_64_bits():
     assert {x.dtype for x in floats} == {jnp.dtype(jnp.float32)}
 
 
-def test_vmap_gives_what_single_wheels_give():
-    batch = cycles()
+def test_vmap_agrees_with_single_wheels():
+    batch = find_reference_cycles()
     for index in (0, 3):
-        single = vrw.limit_cycle(truth.wheel(truth.PARAMETERS[index]))
+        single = vrw.limit_cycle(truth.make_wheel(truth.REFERENCE_PARAMETERS[index]))
         np.testing.assert_allclose(
             single.section_state, batch.section_state[index], rtol=1e-12, atol=1e-13
         )
 
 
-def test_no_cycle_is_an_outcome_with_zeros_and_disturbs_no_neighbour():
+def test_a_missing_cycle_is_an_outcome_with_zeros_and_leaves_the_batch_unchanged():
     rows = np.stack([table_1(), table_1(slope=0.02), table_1(damping=np.nan)])
     for transform in (jax.jacfwd, jax.grad):
-        names = DIFFERENTIATED if transform is jax.jacfwd else ("dls_fraction",)
-        derivatives, cycle = differentiated(rows, None, names, transform)
+        names = DIFFERENTIATED_MEASURES if transform is jax.jacfwd else ("dls_fraction",)
+        derivatives, cycle = differentiate_measures(rows, None, names, transform)
         expected = [Outcome.STEPPED, Outcome.NO_CYCLE_FOUND, Outcome.BAD_INPUT]
         assert list(np.asarray(cycle.outcome)) == expected
         assert np.all(np.asarray(cycle.section_state)[1:] == 0.0)
         assert all(np.all(np.asarray(leaf)[1:] == 0.0) for leaf in jax.tree.leaves(derivatives))
         assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(cycle))
-        np.testing.assert_allclose(cycle.durations[0], cycles().durations[0], rtol=1e-12)
+        np.testing.assert_allclose(
+            cycle.durations[0], find_reference_cycles().durations[0], rtol=1e-12
+        )
 
 
 @pytest.mark.parametrize(
     ("changes", "outcome", "words"),
     [
-        ({"damping": 240.0}, Outcome.ORDER_DIFFERS, "DLS ends only once"),
+        ({"damping": 240.0}, Outcome.EVENT_ORDER_MISMATCH, "DLS ends only once"),
         (
             {"damping": 15.0, "stiffness": 1117.9, "natural_length": 1.0302, "slope": 0.08},
-            Outcome.ORDER_DIFFERS,
+            Outcome.EVENT_ORDER_MISMATCH,
             "LEG_1_LIFTED_OFF in DLS",
         ),
         (
             {"damping": 40.0, "stiffness": 600.0, "natural_length": 1.04, "slope": 0.33},
-            Outcome.BORDER_ON_THE_WAY,
+            Outcome.BRANCH_ENDS_BEFORE_TARGET,
             "λ4⁺ says whether there is DLS",
         ),
-        ({"slope": 0.5}, Outcome.BORDER_ON_THE_WAY, "DLS ends only once"),
+        ({"slope": 0.5}, Outcome.BRANCH_ENDS_BEFORE_TARGET, "DLS ends only once"),
         ({"slope": 0.02}, Outcome.NO_CYCLE_FOUND, "did not converge"),
     ],
 )
-def test_why_there_is_no_gait_is_told_apart(changes, outcome, words):
+def test_causes_of_a_missing_gait_have_different_outcomes(changes, outcome, words):
     cycle = vrw.limit_cycle(vrw.WheelParams(**changes))
     assert int(cycle.outcome) == outcome
     assert words in cycle.why
     assert cycle.why in repr(cycle)
 
 
-def test_a_lost_gait_is_nan_in_value_and_derivative_where_asked_for():
+def test_a_missing_gait_is_nan_in_value_and_derivative_on_request():
     fraction = lambda c, **how: vrw.limit_cycle(vrw.WheelParams(damping=c), **how).dls_fraction
-    both = jax.value_and_grad(lambda c: fraction(c, lost="nan"))
-    assert all(map(np.isnan, both(240.0)))
-    np.testing.assert_array_equal(both(150.0), jax.value_and_grad(fraction)(150.0))
+    both_values = jax.value_and_grad(lambda c: fraction(c, lost="nan"))
+    assert all(map(np.isnan, both_values(240.0)))
+    np.testing.assert_array_equal(both_values(150.0), jax.value_and_grad(fraction)(150.0))
     assert [float(x) for x in jax.value_and_grad(fraction)(240.0)] == [0.0, 0.0]
-    margin = lambda c: vrw.limit_cycle(vrw.WheelParams(damping=c), lost="nan").spectral_margin
+    margin = lambda c: vrw.limit_cycle(vrw.WheelParams(damping=c), on_failure="nan").spectral_margin
     assert all(map(np.isnan, jax.value_and_grad(margin)(240.0)))
-    cycle = vrw.limit_cycle(vrw.WheelParams(damping=240.0), lost="nan")
-    told = cycle.measures(("spectral_margin", "stability_margin", "takeoff_acceleration", "speed"))
-    assert all(np.isnan(value) for value in told.values())
+    cycle = vrw.limit_cycle(vrw.WheelParams(damping=240.0), on_failure="nan")
+    result = cycle.measures(
+        ("spectral_margin", "stability_margin", "takeoff_acceleration", "speed")
+    )
+    assert all(np.isnan(value) for value in result.values())
 
 
-def test_the_step_tells_the_smooth_premise_that_the_cycle_does():
+def test_step_and_cycle_agree_on_the_smooth_margin():
     of_cycle = lambda params: vrw.limit_cycle(params).takeoff_acceleration
 
     def of_step(params):
         cycle = vrw.limit_cycle(params)
-        return vrw.step(params, cycle.section_state).monitors.takeoff_acceleration
+        return vrw.step(params, cycle.section_state).margins.takeoff_acceleration
 
-    at = vrw.WheelParams(damping=150.0)
-    ours, theirs = (jax.value_and_grad(of)(at) for of in (of_step, of_cycle))
+    value_at = vrw.WheelParams(damping=150.0)
+    ours, theirs = (jax.value_and_grad(of_values)(value_at) for of_values in (of_step, of_cycle))
     for one, other in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-7)
     assert ours[0] > 0.0 > of_step(vrw.WheelParams(damping=100.0))  # where foot 2 scuffs
 
 
-def test_a_mesh_too_coarse_says_so_and_more_of_it_finds_the_gait():
+def test_too_coarse_a_mesh_is_reported_and_a_finer_one_finds_the_gait():
     row = table_1(slope=0.12)
     coarse, fine = (
-        jax.tree.map(lambda x: x[0], differentiated(row, options)[1]) for options in (None, TIGHT)
+        jax.tree.map(lambda x: x[0], differentiate_measures(row, options)[1])
+        for options in (None, TIGHT_OPTIONS)
     )
     assert int(coarse.outcome) == Outcome.MESH_TOO_COARSE
     assert "more steps" in coarse.why
@@ -279,17 +316,17 @@ def test_gait_without_double_support_is_found_though_unstable():
     row = table_1(
         natural_length=1.03163159, stiffness=529.980645, damping=179.091443, slope=0.314288553
     )
-    _, cycle = differentiated(row)
+    _, cycle = differentiate_measures(row)
     assert int(cycle.outcome[0]) == Outcome.STEPPED
     assert float(cycle.durations[0, 0]) == 0.0
     assert float(cycle.indicators.lambda_4[0]) < 0.0
-    assert float(floquet.spectral_radius(cycle.matrix[0])) > 1.6
-    options = vrw.Options.tight()
-    back = vrw.return_map(truth.wheel(row), cycle.section_state[0], options=options)
+    assert float(floquet.spectral_radius(cycle.monodromy_value[0])) > 1.6
+    options = vrw.StepOptions.tight()
+    back = vrw.return_map(truth.make_wheel(row), cycle.section_state[0], options=options)
     np.testing.assert_allclose(back, cycle.section_state[0], atol=1e-8)
 
 
-def test_a_wheel_twice_as_large_takes_root_two_longer():
+def test_a_wheel_twice_as_large_has_a_period_longer_by_root_two():
     length = 2.0
     large = table_1(
         leg_com=0.3 * length,
@@ -298,31 +335,31 @@ def test_a_wheel_twice_as_large_takes_root_two_longer():
         stiffness=500.0 / length,
         damping=200.0 / np.sqrt(length),
     )
-    _, cycle = differentiated(np.stack([table_1(), large]))
+    _, cycle = differentiate_measures(np.stack([table_1(), large]))
     expected = np.sqrt(length) * cycle.durations[0]
     np.testing.assert_allclose(cycle.durations[1], expected, rtol=1e-9)
 
 
-def test_neighbours_cycle_is_a_quicker_start():
+def test_a_neighboring_cycle_is_a_faster_initial_guess():
     first = vrw.limit_cycle(vrw.WheelParams())
     second = vrw.limit_cycle(vrw.WheelParams(damping=202.0), guess=first)
     assert int(second.outcome) == Outcome.STEPPED
-    assert int(second.passes) <= 4
+    assert int(second.n_newton_iterations) <= 4
     cold = vrw.limit_cycle(vrw.WheelParams(damping=202.0))
     np.testing.assert_allclose(second.section_state, cold.section_state, rtol=1e-11)
 
 
 @pytest.mark.slow
-def test_long_double_support_is_found_where_rounding_exceeds_the_tolerance():
+def test_long_double_support_is_found_if_round_off_exceeds_the_tolerance():
     draw, n = np.random.default_rng(5).uniform, 64
     wheel = vrw.WheelParams(damping=draw(50.0, 130.0, n), stiffness=draw(203.0, 215.0, n))
     params = jax.tree.map(lambda x: jnp.broadcast_to(x, n), wheel)
-    known = vrw.limit_cycles(params)
-    assert np.max(known.durations[:, 0]) > 3.0
-    fine = vrw.CycleOptions.tight().finer().finer()
-    again = jax.vmap(lambda p, x: vrw.limit_cycle(p, guess=x, options=fine))
-    found = again(params, known.section_state).found
-    np.testing.assert_array_equal(found, known.found)
+    known_values = vrw.limit_cycles(params)
+    assert np.max(known_values.durations[:, 0]) > 3.0
+    fine = vrw.CycleOptions.tight().refine_mesh().refine_mesh()
+    second_result = jax.vmap(lambda p, x: vrw.limit_cycle(p, guess=x, options=fine))
+    solution = second_result(params, known_values.section_state).found
+    np.testing.assert_array_equal(solution, known_values.found)
 
 
 @pytest.mark.slow
@@ -339,28 +376,28 @@ def test_a_cycle_walked_twice_has_the_multipliers_squared():
 def test_beyond_the_discontinuity_a_cycle_of_five_steps_is_found_from_a_walk():
     # At c = 221 one step in five has no double support: found next to where a walk ends up.
     params = vrw.WheelParams(damping=221.0)
-    walked = vrw.walk(params, vrw.paper_start(), 60)
-    end = walked.steps.section_state[-1]
+    walk = vrw.walk(params, vrw.paper_start(), 60)
+    end = walk.steps.section_state[-1]
     five = vrw.limit_cycle(params, guess=end, period_n=5)
     assert int(five.outcome) == Outcome.STEPPED
     np.testing.assert_allclose(five.section_state, end, atol=1e-8)
     assert np.sum(np.asarray(five.durations)[:, 0] == 0.0) == 1
     x = five.section_state
     for _ in range(5):
-        x = vrw.return_map(params, x, options=vrw.Options.tight())
+        x = vrw.return_map(params, x, options=vrw.StepOptions.tight())
     np.testing.assert_allclose(x, five.section_state, atol=1e-9)
     assert float(five.spectral_radius) < 1.0
 
 
-def test_another_rung_is_solved_on_its_own_return_map():
+def test_another_model_is_solved_on_its_own_return_map():
     params, model = vrw.WheelParams(slope=0.1), vrw.RigidWheel()
     cycle = vrw.limit_cycle(params, model=model)
     assert int(cycle.outcome) == Outcome.STEPPED
     back = vrw.return_map(params, cycle.section_state, model=model)
     np.testing.assert_allclose(back, cycle.section_state, rtol=1e-12)
     # Energy gained over a step is what the landing takes: the kept rate squared is the multiplier.
-    kept = cycle.post_impact[1] / cycle.section_state[1]
-    np.testing.assert_allclose(cycle.spectral_radius, kept**2, rtol=1e-10)
+    retained = cycle.post_impact[1] / cycle.section_state[1]
+    np.testing.assert_allclose(cycle.spectral_radius, retained**2, rtol=1e-10)
     assert float(cycle.dls_fraction) == 0.0
     table = vrw.sensitivities(params, model=model, measures=("period", "speed"))
     above, below = (
@@ -368,23 +405,25 @@ def test_another_rung_is_solved_on_its_own_return_map():
     )
     for name in ("period", "speed"):
         difference = (getattr(above, name) - getattr(below, name)) / 2e-5
-        found = table.derivative.sel(measure=name, parameter="slope")
-        np.testing.assert_allclose(found, difference, rtol=1e-7)  # error of differences: h squared
-    lost = vrw.limit_cycle(vrw.WheelParams(slope=0.02), model=model)
-    assert int(lost.outcome) == Outcome.NO_CYCLE_FOUND
-    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(lost))
+        solution = table.derivative.sel(measure=name, parameter="slope")
+        np.testing.assert_allclose(
+            solution, difference, rtol=1e-7
+        )  # error of differences: h squared
+    lost_values = vrw.limit_cycle(vrw.WheelParams(slope=0.02), model=model)
+    assert int(lost_values.outcome) == Outcome.NO_CYCLE_FOUND
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(lost_values))
 
 
-def test_options_of_the_wrong_kind_are_answered_in_one_sentence():
+def test_options_of_the_wrong_type_are_refused_in_one_sentence():
     with pytest.raises(TypeError, match="CycleOptions"):
-        vrw.limit_cycle(vrw.WheelParams(), options=vrw.Options())
+        vrw.limit_cycle(vrw.WheelParams(), options=vrw.StepOptions())
     with pytest.raises(TypeError, match="return map"):
-        vrw.limit_cycle(vrw.WheelParams(), model=vrw.RigidWheel(), options=TIGHT)
+        vrw.limit_cycle(vrw.WheelParams(), model=vrw.RigidWheel(), options=TIGHT_OPTIONS)
     with pytest.raises(ValueError, match="at least 1"):
         vrw.limit_cycle(vrw.WheelParams(), period_n=0)
 
 
-def simplest_walker(slope):
+def make_simplest_walker(slope):
     """Garcia et al. 1998: the map just after heel strike, stance angle and rate."""
 
     def field(y):
@@ -429,21 +468,21 @@ def simplest_walker(slope):
     ],
 )
 def test_section_newton_finds_the_simplest_walkers_published_cycles(x, time, multipliers):
-    step = simplest_walker(0.009)
+    step = make_simplest_walker(0.009)
     start = jnp.asarray(x) * 1.002
-    cycle = jax.jit(lambda start: vrw.newton_cycle(lambda y: step(y, time), start))(start)
+    cycle = jax.jit(lambda start: vrw.solve_fixed_point(lambda y: step(y, time), start))(start)
     assert bool(cycle.converged)
     np.testing.assert_allclose(cycle.x, x, atol=1e-9)
-    found = np.sort_complex(np.asarray(floquet.multipliers(cycle.jacobian)))
-    np.testing.assert_allclose(found, np.sort_complex(np.asarray(multipliers)), atol=3e-9)
+    solution = np.sort_complex(np.asarray(floquet.floquet_multipliers(cycle.jacobian)))
+    np.testing.assert_allclose(solution, np.sort_complex(np.asarray(multipliers)), atol=3e-9)
 
 
 def test_section_newton_differentiates_fixed_point_and_multiplier():
     """x -> a - x^2 repeats x = (sqrt(1 + 4 a) - 1) / 2, with the multiplier -2 x."""
 
     def told(a, start=0.5):
-        found = vrw.newton_cycle(lambda x: a - x**2, jnp.asarray([start]))
-        return jnp.stack([found.x[0], found.jacobian[0, 0]])
+        fixed_point = vrw.solve_fixed_point(lambda x: a - x**2, jnp.asarray([start]))
+        return jnp.stack([fixed_point.x[0], fixed_point.jacobian[0, 0]])
 
     a = 0.7
     root = math.sqrt(1.0 + 4.0 * a)
@@ -460,21 +499,23 @@ def test_section_newton_differentiates_fixed_point_and_multiplier():
 
 def test_a_fixed_point_moves_without_second_derivatives_of_its_map():
     """Of the same map: its point to third order, its multiplier's derivative is told as unknown."""
-    found = lambda a: moved_cycle(lambda x: a - x**2, jnp.asarray([0.5]))
-    point, a = lambda a: found(a).x[0], 0.7
+    compute_found = lambda a: solve_fixed_point_implicit(lambda x: a - x**2, jnp.asarray([0.5]))
+    point, a = lambda a: compute_found(a).x[0], 0.7
     root = math.sqrt(1.0 + 4.0 * a)
     expected = [(root - 1.0) / 2.0, 1.0 / root, -2.0 / root**3, 12.0 / root**5]
     for value in expected:
         np.testing.assert_allclose(point(a), value, rtol=1e-12)
         point = jax.jacrev(point) if value > 0.7 else jax.jacfwd(point)
-    assert np.isnan(jax.jacfwd(lambda a: found(a).jacobian)(a)).all()
-    np.testing.assert_allclose(found(a).jacobian, [[1.0 - root]], rtol=1e-13)
+    assert np.isnan(jax.jacfwd(lambda a: compute_found(a).jacobian)(a)).all()
+    np.testing.assert_allclose(compute_found(a).jacobian, [[1.0 - root]], rtol=1e-13)
 
 
-def test_a_start_from_which_section_newton_does_not_converge_comes_back():
+def test_section_newton_returns_a_start_from_which_it_does_not_converge():
     def told(a):
-        found = vrw.newton_cycle(lambda x: x + jnp.exp(-a * x), jnp.asarray([2.0]))  # repeats none
-        return found.x[0], found.converged
+        fixed_point = vrw.solve_fixed_point(
+            lambda x: x + jnp.exp(-a * x), jnp.asarray([2.0])
+        )  # repeats none
+        return fixed_point.x[0], fixed_point.converged
 
     value, slope = jax.jvp(told, (1.0,), (1.0,))
     for x, converged in (told(1.0), value):
@@ -485,21 +526,21 @@ def test_a_start_from_which_section_newton_does_not_converge_comes_back():
 @pytest.mark.slow
 def test_section_newton_agrees_with_the_collocation():
     params = vrw.WheelParams()
-    exact = vrw.limit_cycle(params, options=TIGHT)
-    options = vrw.Options.tight()
+    exact = vrw.limit_cycle(params, options=TIGHT_OPTIONS)
+    options = vrw.StepOptions.tight()
     step = lambda x: vrw.return_map(params, x, options=options)
     start = exact.section_state * 1.01
-    cycle = jax.jit(lambda start: vrw.newton_cycle(step, start))(start)
+    cycle = jax.jit(lambda start: vrw.solve_fixed_point(step, start))(start)
     np.testing.assert_allclose(cycle.x, exact.section_state, rtol=3e-12)
-    found = floquet.multipliers(cycle.jacobian)
-    np.testing.assert_allclose(np.abs(found[:2]), np.abs(exact.multipliers), rtol=1e-9)
-    assert abs(found[2]) < 1e-9  # the section before touchdown adds a multiplier of zero
+    solution = floquet.floquet_multipliers(cycle.jacobian)
+    np.testing.assert_allclose(np.abs(solution[:2]), np.abs(exact.multipliers), rtol=1e-9)
+    assert abs(solution[2]) < 1e-9  # the section before touchdown adds a multiplier of zero
 
 
-def test_sensitivities_are_labelled_and_agree_with_the_truth(tmp_path):
+def test_sensitivities_are_labeled_and_agree_with_the_reference(tmp_path):
     table = vrw.sensitivities(vrw.WheelParams(), measures=("dls_fraction", "period"))
-    kept_by_netcdf(table, tmp_path)
-    expected = truth.floats(truth.CASES[0]["cycle"]["d_params"]["dls_fraction"])
+    assert_netcdf_round_trip(table, tmp_path)
+    expected = truth.to_floats(truth.REFERENCE_CASES[0]["cycle"]["d_params"]["dls_fraction"])
     order = [list(PARAMETER_NAMES).index(str(name)) for name in table.parameter.values]
     np.testing.assert_allclose(
         table.derivative.sel(measure="dls_fraction"), expected[order], rtol=1e-8, atol=1e-10
@@ -514,33 +555,40 @@ def test_unknown_measure_is_refused_in_one_sentence():
         vrw.sensitivities(vrw.WheelParams(), measures=("dls_fractoin",))
 
 
-def test_wheel_of_is_the_inverse_of_parameters_of():
-    wheel = wheel_of(jnp.asarray(truth.PARAMETERS[1]), 8)
+def test_wheels_and_parameter_vectors_convert_into_each_other():
+    wheel = wheel_from_parameters(jnp.asarray(truth.REFERENCE_PARAMETERS[1]), 8)
     assert float(wheel.damping) == 100.0
 
 
 @pytest.mark.slow
-def test_a_search_by_xla_as_on_a_gpu_goes_as_the_machine_code(monkeypatch):
+def test_a_search_by_xla_agrees_with_machine_code(monkeypatch):
     """Easy wheels, one that needs the homotopy, one without double support, one without a gait."""
-    rows = np.tile(truth.PARAMETERS[0], (70, 1))  # more than a block
+    rows = np.tile(truth.REFERENCE_PARAMETERS[0], (70, 1))  # more than a block
     column = PARAMETER_NAMES.index
     rows[:, column("damping")] = np.linspace(120.0, 215.0, 70)
     rows[3, [column("damping"), column("slope")]] = 40.0, 0.33
     rows[5, column("slope")] = 0.05
 
     def told(vectors):
-        one = lambda vector: vrw.limit_cycle(truth.wheel(vector))
+        one = lambda vector: vrw.limit_cycle(truth.make_wheel(vector))
         period = lambda vector: one(vector).period
         margin = lambda vector: one(vector).stability_margin
         cycle = jax.vmap(one)(vectors)
         slopes, second = (jax.vmap(jax.grad(f))(vectors) for f in (period, margin))
-        return cycle.durations, cycle.matrix, slopes, second, cycle.outcome, cycle.passes
+        return (
+            cycle.durations,
+            cycle.monodromy_value,
+            slopes,
+            second,
+            cycle.outcome,
+            cycle.n_newton_iterations,
+        )
 
-    *found, outcome, passes = jax.jit(told)(rows)
+    *solution, outcome, passes = jax.jit(told)(rows)
     monkeypatch.setattr(simd, "serves", lambda: False)
     *by_xla, code, n = jax.jit(lambda vectors: told(vectors))(rows)
     np.testing.assert_array_equal(code, outcome)
     np.testing.assert_array_equal(n, passes)
-    for a, b in zip(by_xla, found, strict=True):
+    for a, b in zip(by_xla, solution, strict=True):
         # Newton's last correction is some 1e-14; what derivatives make of rounding.
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)

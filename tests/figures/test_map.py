@@ -4,24 +4,24 @@ import numpy as np
 import xarray as xr
 
 import vrw_jax as vrw
-from vrw_jax.branches.branch import Meeting
+from vrw_jax.branches.branch import Codim2Point
 from vrw_jax.figures.scan import map_figure
 
 C, K = np.linspace(50.0, 150.0, 5), np.linspace(400.0, 600.0, 4)
 
 
-def test_borders_and_meetings_are_drawn_where_they_are():
+def test_special_point_curves_and_codimension_two_points_are_drawn_at_their_values():
     share = C[:, None] / K
     outcome = np.where(share > 0.3, vrw.Outcome.NO_CYCLE_FOUND, vrw.Outcome.STEPPED)
-    over = ("damping", "stiffness")
+    over_values = ("damping", "stiffness")
     scan = xr.Dataset(
-        {"dls_fraction": (over, share), "outcome": (over, outcome)},
+        {"dls_fraction": (over_values, share), "outcome": (over_values, outcome)},
         {"damping": C, "stiffness": K},
     )
     radius = {"spectral_radius": ("point", [0.5, 0.9, 1.1, 1.2])}
     line = xr.Dataset(radius, {"damping": ("point", 0.2 * K), "stiffness": ("point", K)})
-    met = Meeting("fold", (100.0, 500.0), False)
-    curve = vrw.BorderCurve("lambda_4_plus", over, line, (met,), ("", ""))
+    event_values = Codim2Point("fold", (100.0, 500.0), False)
+    curve = vrw.SpecialPointCurve("lambda_4_plus", over_values, line, (event_values,), ("", ""))
     figure = map_figure(scan, "dls_fraction", [curve])
     axes = figure.axes[0]
     stable, thin, points = axes.lines

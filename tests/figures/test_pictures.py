@@ -8,80 +8,87 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from experiments.shared.eyes import as_seen
+from experiments.shared.eyes import simulate_color_vision
 from vrw_jax.figures import branch, indicators, style
 from vrw_jax.figures.branch import basin_figure
 from vrw_jax.wheel import Outcome
 
 ROOT = Path(__file__).parents[2]
-APART = 0.12
+MIN_COLOR_DISTANCE = 0.12
 """Least distance of two colours, of sqrt(3) between black and white."""
 
 
-def seen(colour: str) -> np.ndarray:
-    return as_seen(np.array(mpl.colors.to_rgb(colour)))
+def perceive_color(colour: str) -> np.ndarray:
+    return simulate_color_vision(np.array(mpl.colors.to_rgb(colour)))
 
 
-def test_grey_stays_grey_and_the_colours_of_okabe_and_ito_stay_apart_without_green_cones():
-    np.testing.assert_allclose(seen("0.5"), 0.5, atol=1e-3)
+def test_colors_of_okabe_and_ito_stay_distinct_without_green_cones():
+    np.testing.assert_allclose(perceive_color("0.5"), 0.5, atol=1e-3)
     colours = [
         getattr(style, n) for n in ["BLUE", "ORANGE", "GREEN", "PINK", "SKY", "AMBER", "YELLOW"]
     ]
     for i, one in enumerate(colours):
         for other in colours[:i]:
-            assert np.linalg.norm(seen(one) - seen(other)) > APART, (one, other)
+            assert (
+                np.linalg.norm(perceive_color(one) - perceive_color(other)) > MIN_COLOR_DISTANCE
+            ), (one, other)
 
 
-def test_outcomes_have_colours_that_stay_apart_with_and_without_green_cones():
-    told = [colour for _, colour in style.OUTCOMES.values()]
-    told += [style.YELLOW, style.NOT_COMPUTED[1]]  # of unstable gaits, and of what is missing
-    for i, one in enumerate(told):
-        for other in told[:i]:
+def test_outcome_colors_stay_distinct_with_and_without_green_cones():
+    rows = [colour for _, colour in style.OUTCOME_STYLES.values()]
+    rows += [style.YELLOW, style.NOT_COMPUTED_STYLE[1]]  # of unstable gaits, and of what is missing
+    for i, one in enumerate(rows):
+        for other in rows[:i]:
             plain = np.array(mpl.colors.to_rgb(one)) - mpl.colors.to_rgb(other)
-            assert np.linalg.norm(plain) > APART, (one, other)
-            assert np.linalg.norm(seen(one) - seen(other)) > APART, (one, other)
+            assert np.linalg.norm(plain) > MIN_COLOR_DISTANCE, (one, other)
+            assert (
+                np.linalg.norm(perceive_color(one) - perceive_color(other)) > MIN_COLOR_DISTANCE
+            ), (one, other)
 
 
-NAMED = (
+NAMED_COLOR_PATTERN = (
     r"""["'](red|green|blue|[bgrcy](?:[.o*s^x]|--?|[.o]--?))["']|color=["'](?:[bgrcmy]["']|tab:)"""
 )
 
 
 @pytest.mark.parametrize("folder", ["experiments", "vrw_jax/figures"])
-def test_pictures_take_no_colours_but_those_of_the_set(folder: str):
+def test_figures_use_only_colors_of_the_palette(folder: str):
     """Okabe and Ito's, greys, black and white; matplotlib's own red, green and blue are others."""
     for path in (ROOT / folder).rglob("*.py"):
-        assert not re.search(NAMED, path.read_text()), path
+        assert not re.search(NAMED_COLOR_PATTERN, path.read_text()), path
 
 
-def test_shades_of_a_basin_are_apart_from_the_colours_of_its_falls():
-    over = ("dtheta_touchdown", "dL1_touchdown")
+def test_shades_of_a_basin_differ_from_the_colors_of_falls():
+    over_values = ("dtheta_touchdown", "dL1_touchdown")
     falls = [Outcome.FELL_BACK, Outcome.LEG_1_LIFTED_OFF, Outcome.TOUCHDOWN_BEFORE_STOPPER]
     outcome = np.array([[0, 0, 0], falls])
     result = xr.Dataset(
         {
-            "outcome": (over, outcome),
-            "steps": (over, np.array([[0.0, 10.0, 25.0], [1.0, 1.0, 1.0]])),
-            "attractor": (over, np.where(outcome == 0, 0, -1)),
+            "outcome": (over_values, outcome),
+            "steps": (over_values, np.array([[0.0, 10.0, 25.0], [1.0, 1.0, 1.0]])),
+            "attractor": (over_values, np.where(outcome == 0, 0, -1)),
             "orbit_state": (("n", "state"), np.zeros((1, 3))),
         },
-        {over[0]: [1.0, 2.0], over[1]: [0.0, 0.1, 0.2]},
+        {over_values[0]: [1.0, 2.0], over_values[1]: [0.0, 0.1, 0.2]},
     )
     figure = basin_figure([result], ["any"])
     mesh = figure.axes[0].collections[0]
     for steps in np.linspace(0.0, 25.0, 11):
-        shade = as_seen(np.array(mesh.cmap(mesh.norm(steps))[:3]))
+        shade = simulate_color_vision(np.array(mesh.cmap(mesh.norm(steps))[:3]))
         for code in falls:
-            assert np.linalg.norm(shade - seen(style.OUTCOMES[code][1])) > APART, (steps, code)
+            assert (
+                np.linalg.norm(shade - perceive_color(style.OUTCOME_STYLES[code][1]))
+                > MIN_COLOR_DISTANCE
+            ), (steps, code)
 
 
-def test_borders_of_a_branch_have_colours_and_dashes_of_their_own():
-    curves = {colour for _, series in branch.PANELS for colour in series.values()}
-    assert not curves & {branch.ENDS, *branch.COLOURS.values()}
-    assert branch.BORDER not in ("-", "--")
+def test_special_points_of_a_branch_have_their_own_colors_and_dashes():
+    curves = {colour for _, series in branch.PAPER_PANELS for colour in series.values()}
+    assert not curves & {branch.BRANCH_END_COLOR, *branch.SPECIAL_POINT_COLORS.values()}
+    assert branch.SPECIAL_POINT_LINE_STYLE not in ("-", "--")
 
 
-def test_the_indicators_tell_the_slope_that_they_are_of():
+def test_the_indicator_figure_shows_its_slope():
     gaits = xr.Dataset(
         {
             name: ("damping", np.array([1.0, 2.0]))
@@ -92,8 +99,8 @@ def test_the_indicators_tell_the_slope_that_they_are_of():
         {"damping": [4.0, 8.0]},
         {"parameter_slope": 0.3},
     )
-    told = [text.get_text() for text in indicators(gaits).axes[0].texts]
-    assert style.value_label("slope", 0.3) in told
+    rows = [text.get_text() for text in indicators(gaits).axes[0].texts]
+    assert style.format_value_label("slope", 0.3) in rows
 
 
 UNIT = r"(s|ms|µs|m|mm|N|J|%|rad|m/s|rad/s|N s/m|N·s/m)"
@@ -109,5 +116,5 @@ def test_labels_write_units_in_brackets(folder: str):
             for line in path.read_text().splitlines()
             if re.search(r"label|title|SHOWN|: \(\"", line)
         ]
-        found = [line for line in labels if wrong.search(line)]
-        assert not found, (path, found)
+        found_rows = [line for line in labels if wrong.search(line)]
+        assert not found_rows, (path, found_rows)

@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 
 from vrw_jax.figures import scan_figures
-from vrw_jax.figures.style import OUTCOMES, axis_label
+from vrw_jax.figures.style import OUTCOME_STYLES, format_axis_label
 from vrw_jax.wheel import Outcome
 
 
@@ -22,35 +22,36 @@ def test_a_scan_is_drawn_over_both_its_axes(second):
     )
     (figure,) = scan_figures(scan).values()
     speed, outcome, _ = figure.axes
-    assert outcome.get_ylabel() == axis_label(second, "{symbol}")
+    assert outcome.get_ylabel() == format_axis_label(second, "{symbol}")
     assert speed.collections[0].get_array().shape == (4, 3)
 
 
-def scan_of(outcome: np.ndarray, speed: np.ndarray, radius: np.ndarray) -> xr.Dataset:
-    over = ("damping", "slope")
+def make_scan(outcome: np.ndarray, speed: np.ndarray, radius: np.ndarray) -> xr.Dataset:
+    over_values = ("damping", "slope")
     values = {"damping": [100.0, 150.0, 200.0], "slope": [0.28, 0.3]}
     named = {"outcome": outcome, "speed": speed, "spectral_radius": radius}
-    return xr.Dataset({name: (over, array) for name, array in named.items()}, values)
+    return xr.Dataset({name: (over_values, array) for name, array in named.items()}, values)
 
 
-def test_a_few_unstable_gaits_do_not_stretch_the_colours_of_the_stable_ones():
+def test_a_few_unstable_gaits_do_not_widen_the_color_range():
     speed, radius = np.linspace(0.8, 0.9, 6).reshape(3, 2), np.full((3, 2), 0.5)
     speed[0, 0], radius[0, 0] = 40.0, 1.5
-    (figure,) = scan_figures(scan_of(np.zeros((3, 2), int), speed, radius)).values()
+    (figure,) = scan_figures(make_scan(np.zeros((3, 2), int), speed, radius)).values()
     mesh = figure.axes[0].collections[0]
     assert mesh.get_clim() == (speed[0, 1], speed[2, 1])
     assert mesh.colorbar.extend == "max"
     radius[:] = 1.5
-    (figure,) = scan_figures(scan_of(np.zeros((3, 2), int), speed, radius)).values()
+    (figure,) = scan_figures(make_scan(np.zeros((3, 2), int), speed, radius)).values()
     assert figure.axes[0].collections[0].get_clim() == (speed[0, 1], 40.0)
 
 
 @pytest.mark.parametrize(
-    "code", [Outcome.NO_CYCLE_FOUND, Outcome.ORDER_DIFFERS, Outcome.BORDER_ON_THE_WAY]
+    "code",
+    [Outcome.NO_CYCLE_FOUND, Outcome.EVENT_ORDER_MISMATCH, Outcome.BRANCH_ENDS_BEFORE_TARGET],
 )
-def test_why_there_is_no_gait_is_told_by_colour(code):
+def test_colors_show_why_there_is_no_gait(code):
     outcome = np.zeros((3, 2), int)
     outcome[0, 0] = code
-    (figure,) = scan_figures(scan_of(outcome, np.ones((3, 2)), np.full((3, 2), 0.5))).values()
+    (figure,) = scan_figures(make_scan(outcome, np.ones((3, 2)), np.full((3, 2), 0.5))).values()
     names = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert OUTCOMES[code][0] in names
+    assert OUTCOME_STYLES[code][0] in names

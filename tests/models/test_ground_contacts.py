@@ -10,33 +10,33 @@ from oracle import moreau_jean
 
 import vrw_jax as vrw
 from vrw_jax.models.unilateral.contacts import (
-    ANY_MODE,
-    OFF,
-    SLIP_DOWN,
-    SLIP_UP,
-    STICK,
-    Allowed,
-    Negligible,
-    answer,
-    choose,
+    ALL_MODES_MASK,
+    CONTACT_OFF,
+    CONTACT_SLIP_DOWN,
+    CONTACT_SLIP_UP,
+    CONTACT_STICK,
+    AllowedModes,
+    SignTolerances,
+    choose_combination,
+    solve_combination,
 )
 from vrw_jax.models.unilateral.mechanics import (
     WheelMotion,
+    find_slots,
     free_acceleration,
     free_velocity,
-    hub_of,
-    slots_of,
+    make_inverse_inertia,
 )
 
 N_CASES = 200
 RNG_SEED = 6
-RANK = {STICK: 0, SLIP_DOWN: 1, SLIP_UP: 1, OFF: 2}
+MODE_RANKS = {CONTACT_STICK: 0, CONTACT_SLIP_DOWN: 1, CONTACT_SLIP_UP: 1, CONTACT_OFF: 2}
 """Preferred are combinations with most feet at rest."""
-NUMBERS = {(0.7, False): {1}, (0.7, True): {1}, (3.0, False): {1, 3}, (3.0, True): {1, 3}}
+SOLUTION_COUNTS = {(0.7, False): {1}, (0.7, True): {1}, (3.0, False): {1, 3}, (3.0, True): {1, 3}}
 """How many are admissible, by friction and level: one where the law is well posed."""
 
 
-def cases():
+def draw_contact_cases():
     """Postures with two feet on the slope: coordinates, rates, stoppers reached (slots, others)."""
     rng = np.random.default_rng(RNG_SEED)
     for _ in range(N_CASES):
@@ -49,7 +49,7 @@ def cases():
         yield q, v, at_stopper, np.r_[False, False, rng.random(6) < 0.7]
 
 
-def admissible(wheel, q, v, at_stopper, locked, moving):
+def enumerate_admissible_contacts(wheel, q, v, at_stopper, locked, moving):
     """All admissible combinations: modes, held stoppers, velocities or accelerations they leave.
 
     `moving`: of forces, by the accelerations; else of impulses, by the velocities after them.
@@ -63,92 +63,106 @@ def admissible(wheel, q, v, at_stopper, locked, moving):
     feet, room = rows_at(q)[..., axes], -np.eye(11)[3:5][:, axes]
     h = 1e-5  # the feet's rows turn along the motion
     bias = (rows_at(q + h * v) - rows_at(q - h * v)) @ v / (2.0 * h) * moving
-    found = []
-    stoppers = itertools.product(*((False, True) if at else (False,) for at in at_stopper))
-    for modes, held in itertools.product(itertools.product(RANK, repeat=2), stoppers):
-        if modes == (STICK, STICK) and all(held):
+    found_rows = []
+    stoppers = itertools.product(
+        *((False, True) if value_at else (False,) for value_at in at_stopper)
+    )
+    for modes, held_values in itertools.product(itertools.product(MODE_RANKS, repeat=2), stoppers):
+        if modes == (CONTACT_STICK, CONTACT_STICK) and all(held_values):
             continue  # fixes the hub twice over
         closed = []  # row kept at rest, direction of its force, bias
         for i, mode in enumerate(modes):
-            along, off = feet[i]
-            drag = {SLIP_DOWN: -wheel.friction, SLIP_UP: wheel.friction}.get(mode, 0.0)
-            closed += [(off, off + drag * along, bias[i, 1])] if mode != OFF else []
-            closed += [(along, along, bias[i, 0])] if mode == STICK else []
-            closed += [(room[i], room[i], 0.0)] if held[i] else []
+            tangential_part, off = feet[i]
+            drag = {CONTACT_SLIP_DOWN: -wheel.friction, CONTACT_SLIP_UP: wheel.friction}.get(
+                mode, 0.0
+            )
+            closed += (
+                [(off, off + drag * tangential_part, bias[i, 1])] if mode != CONTACT_OFF else []
+            )
+            closed += (
+                [(tangential_part, tangential_part, bias[i, 0])] if mode == CONTACT_STICK else []
+            )
+            closed += [(room[i], room[i], 0.0)] if held_values[i] else []
         R, C = (np.reshape([c[k] for c in closed], (-1, len(axes))) for k in range(2))
         p = -np.linalg.solve(R @ inverse @ C.T, R @ free + [c[2] for c in closed])
         after, forces, good = free + inverse @ C.T @ p, iter(p), True
         for i, mode in enumerate(modes):
             x, z = feet[i] @ after + bias[i]
-            normal = next(forces) if mode != OFF else 0.0
+            normal = next(forces) if mode != CONTACT_OFF else 0.0
             good &= normal >= 0.0
-            good &= mode != OFF or z >= 0.0
-            good &= mode != STICK or abs(next(forces)) <= wheel.friction * normal
-            good &= mode != SLIP_DOWN or x >= 0.0
-            good &= mode != SLIP_UP or x <= 0.0
-            good &= next(forces) >= 0.0 if held[i] else not at_stopper[i] or room[i] @ after >= 0.0
+            good &= mode != CONTACT_OFF or z >= 0.0
+            good &= mode != CONTACT_STICK or abs(next(forces)) <= wheel.friction * normal
+            good &= mode != CONTACT_SLIP_DOWN or x >= 0.0
+            good &= mode != CONTACT_SLIP_UP or x <= 0.0
+            good &= (
+                next(forces) >= 0.0
+                if held_values[i]
+                else not at_stopper[i] or room[i] @ after >= 0.0
+            )
         if good:
-            found.append((modes, held, dict(zip(axes.tolist(), after, strict=True))))
-    return found
+            found_rows.append((modes, held_values, dict(zip(axes.tolist(), after, strict=True))))
+    return found_rows
 
 
 @jax.jit
-def chosen(q, v, at_stopper, locked, friction, moving):
+def select_contacts(q, v, at_stopper, locked, friction, moving):
     """The library's choice: modes, held stoppers, rates of hub and slots' lengths, solutions."""
     s = vrw.WheelParams().symbols()
-    slots = slots_of(jnp.arange(8) < 2)
+    slots = find_slots(jnp.arange(8) < 2)
     motion = WheelMotion(*q[:3], *v[:3], q[3:], v[3:])
     resting = motion._replace(dL=jnp.where(locked & moving, 0.0, motion.dL))
-    hub = hub_of(s, motion, slots, locked)
+    hub = make_inverse_inertia(s, motion, slots, locked)
     levels = free_acceleration(s, resting, slots, hub), free_velocity(s, motion, slots, hub)
     free = jax.tree.map(lambda a, b: jnp.where(moving, a, b), *levels)
     none = jnp.zeros(2, jnp.int32)
-    allowed = Allowed(
-        contact=none + ANY_MODE,
-        held=at_stopper,
-        stays=none > 0,
-        known_contact=none,
-        known_open=~at_stopper,
+    allowed = AllowedModes(
+        contact=none + ALL_MODES_MASK,
+        may_hold=at_stopper,
+        keeps_mode=none > 0,
+        untested_modes=none,
+        untested_open=~at_stopper,
     )
-    small = Negligible(jnp.asarray(1e-12), jnp.asarray(1e-12))  # no case is near a border
-    choice = choose(s, hub, free, allowed, friction, small, True)
-    found = answer(s, hub, free, choice.contact, choice.held, friction)
-    rates = jnp.stack([*found.hub, *found.length])
-    return choice.contact, choice.held, rates, choice.solutions
+    small = SignTolerances(jnp.asarray(1e-12), jnp.asarray(1e-12))  # no case is near a border
+    choice = choose_combination(s, hub, free, allowed, friction, small, True)
+    measured = solve_combination(s, hub, free, choice.contact, choice.held, friction)
+    rates = jnp.stack([*measured.hub, *measured.length])
+    return choice.contact, choice.held, rates, choice.n_solutions
 
 
 @pytest.mark.parametrize("moving", [False, True], ids=["impulses", "forces"])
 @pytest.mark.parametrize("friction", [0.7, 3.0])
-def test_the_combination_taken_is_admissible_and_their_number_is_told(friction, moving):
-    wheel = moreau_jean.Wheel(friction)
+def test_the_selected_contact_combination_is_admissible_and_solutions_are_counted(friction, moving):
+    wheel = moreau_jean.TimeSteppingWheel(friction)
     numbers = set()
-    for q, v, at_stopper, locked in cases():
-        expected = admissible(wheel, q, v, at_stopper, locked, moving)
-        contact, held, rates, solutions = chosen(q, v, at_stopper, locked, friction, moving)
+    for q, v, at_stopper, locked in draw_contact_cases():
+        expected = enumerate_admissible_contacts(wheel, q, v, at_stopper, locked, moving)
+        contact, held_values, rates, solutions = select_contacts(
+            q, v, at_stopper, locked, friction, moving
+        )
         assert int(solutions) == len(expected)
         numbers.add(len(expected))
         if not expected:
             continue
         modes = tuple(np.asarray(contact).tolist())
-        stoppers = tuple(np.asarray(held).tolist())
-        (same,) = (x for m, h, x in expected if m == modes and h == stoppers)
+        stoppers = tuple(np.asarray(held_values).tolist())
+        (is_same,) = (x for m, h, x in expected if m == modes and h == stoppers)
         # Differences of the feet's rows: rounding 1e-16 / 1e-5 and error 1e-10, times some 10.
-        np.testing.assert_allclose(rates, [same[i] for i in range(5)], rtol=1e-8, atol=1e-8)
-        rank = lambda modes: sum(RANK[mode] for mode in modes)
+        np.testing.assert_allclose(rates, [is_same[i] for i in range(5)], rtol=1e-8, atol=1e-8)
+        rank = lambda modes: sum(MODE_RANKS[mode] for mode in modes)
         assert rank(modes) == min(rank(m) for m, _, _ in expected)
-    assert numbers == NUMBERS[friction, moving]
+    assert numbers == SOLUTION_COUNTS[friction, moving]
 
 
 @pytest.mark.parametrize("moving", [False, True], ids=["impulses", "forces"])
 def test_infinite_friction_is_the_limit_of_large_friction(moving):
     """Where a foot slides friction alone carries it; what differs falls with the friction."""
     slid = 0
-    for q, v, at_stopper, locked in itertools.islice(cases(), 60):
+    for q, v, at_stopper, locked in itertools.islice(draw_contact_cases(), 60):
         given = q, v, at_stopper, locked
-        contact, held, rates, _ = chosen(*given, jnp.inf, moving)
-        large = chosen(*given, 1e8, moving)
+        contact, held_values, rates, _ = select_contacts(*given, jnp.inf, moving)
+        large = select_contacts(*given, 1e8, moving)
         np.testing.assert_array_equal(contact, large[0])
-        np.testing.assert_array_equal(held, large[1])
+        np.testing.assert_array_equal(held_values, large[1])
         np.testing.assert_allclose(rates, large[2], rtol=1e-4, atol=1e-4)
-        slid += bool(np.isin(contact, (SLIP_DOWN, SLIP_UP)).any())
+        slid += bool(np.isin(contact, (CONTACT_SLIP_DOWN, CONTACT_SLIP_UP)).any())
     assert slid > 5

@@ -6,11 +6,16 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.models.unilateral.contacts import OFF, SLIP_DOWN, SLIP_UP, STICK
+from vrw_jax.models.unilateral.contacts import (
+    CONTACT_OFF,
+    CONTACT_SLIP_DOWN,
+    CONTACT_SLIP_UP,
+    CONTACT_STICK,
+)
 
-TIGHT = vrw.Options.tight()
-SLIDES = (SLIP_DOWN, SLIP_UP)
-SCENES = {  # friction, damping, dtheta at the start, stoppers; events that happen among others
+TIGHT_OPTIONS = vrw.StepOptions.tight()
+SLIP_MODES = (CONTACT_SLIP_DOWN, CONTACT_SLIP_UP)
+STEP_SCENES = {  # friction, damping, dtheta at the start, stoppers; events that happen among others
     "lands sliding": (
         (0.7, 200.0, 1.6, "bilateral"),
         {"lands", "the fore leg leaves its stopper", "lifts off"},
@@ -27,39 +32,41 @@ SCENES = {  # friction, damping, dtheta at the start, stoppers; events that happ
 }
 
 
-def events_of(trace, first_locked):
+def classify_events(trace, first_locked):
     """What happened from phase to phase, in words."""
     rows = np.flatnonzero(np.asarray(trace.duration) > 0.0)
     contact, locked = np.asarray(trace.contact)[rows], np.asarray(trace.locked)[rows]
-    told = {"lands"}  # the opening landing
+    result = {"lands"}  # the opening landing
     if first_locked and not locked[0, 0]:
-        told.add("the fore leg leaves its stopper")
-    if np.any(np.all(contact == OFF, axis=1)):
-        told.add("flies")
+        result.add("the fore leg leaves its stopper")
+    if np.any(np.all(contact == CONTACT_OFF, axis=1)):
+        result.add("flies")
     for i in range(len(rows) - 1):
-        for before, after, was, on in zip(*contact[i : i + 2], *locked[i : i + 2], strict=True):
-            if before == STICK and after in SLIDES:
-                told.add("slips")
-            if before in SLIDES and after == STICK:
-                told.add("sticks")
-            if before in SLIDES and after in SLIDES and before != after:
-                told.add("reverses")
-            if before != OFF and after == OFF:
-                told.add("lifts off")
-            if before == OFF and after != OFF:
-                told.add("lands again")
-            if on and not was:
-                told.add("meets its stopper")
-            if was and not on and after == OFF:
-                told.add("leaves its stopper in the air")
-    return told
+        for before, after, was, is_active in zip(
+            *contact[i : i + 2], *locked[i : i + 2], strict=True
+        ):
+            if before == CONTACT_STICK and after in SLIP_MODES:
+                result.add("slips")
+            if before in SLIP_MODES and after == CONTACT_STICK:
+                result.add("sticks")
+            if before in SLIP_MODES and after in SLIP_MODES and before != after:
+                result.add("reverses")
+            if before != CONTACT_OFF and after == CONTACT_OFF:
+                result.add("lifts off")
+            if before == CONTACT_OFF and after != CONTACT_OFF:
+                result.add("lands again")
+            if is_active and not was:
+                result.add("meets its stopper")
+            if was and not is_active and after == CONTACT_OFF:
+                result.add("leaves its stopper in the air")
+    return result
 
 
-def told(mu, c, dtheta, stoppers):
+def compute_step(mu, c, dtheta, stoppers):
     params = vrw.WheelParams(damping=c)
     wheel = vrw.UnilateralWheel(friction=mu, stoppers=stoppers)
-    x = wheel.full_section(params, jnp.stack([jnp.asarray(0.1), dtheta, jnp.asarray(-0.1)]))
-    advance = wheel.advance(params, x, TIGHT)
+    x = wheel.embed_section(params, jnp.stack([jnp.asarray(0.1), dtheta, jnp.asarray(-0.1)]))
+    advance = wheel.advance(params, x, TIGHT_OPTIONS)
     times = advance.durations
     if stoppers == "one-sided":  # rounding says in which mode the least dips are spent
         times = times.sum(keepdims=True)
@@ -67,46 +74,49 @@ def told(mu, c, dtheta, stoppers):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", STEP_SCENES)
 def test_derivatives_through_the_events_of_a_step_match_differences(name):
-    (mu, c, dtheta, stoppers), kinds = SCENES[name]
+    (mu, c, dtheta, stoppers), kinds = STEP_SCENES[name]
     params = vrw.WheelParams(damping=c)
     wheel = vrw.UnilateralWheel(friction=mu, stoppers=stoppers)
-    x = wheel.full_section(params, jnp.asarray([0.1, dtheta, -0.1]))
-    trace = wheel.trace(params, x, vrw.Options(), 2)
-    assert kinds <= events_of(trace, bool(x[3 + 3 * params.n_legs] >= 4))
-    at = [jnp.asarray(v) for v in (mu, c, dtheta)]
-    jacobian = jax.jacfwd(told, argnums=(0, 1, 2))(*at, stoppers)
+    x = wheel.embed_section(params, jnp.asarray([0.1, dtheta, -0.1]))
+    trace = wheel.sample_step(params, x, vrw.StepOptions(), 2)
+    assert kinds <= classify_events(trace, bool(x[3 + 3 * params.n_legs] >= 4))
+    value_at = [jnp.asarray(v) for v in (mu, c, dtheta)]
+    jacobian = jax.jacfwd(compute_step, argnums=(0, 1, 2))(*value_at, stoppers)
     for i, column in enumerate(jacobian):
-        size = 1e-5 * max(1.0, float(at[i]))
-        ends = [told(*at[:i], at[i] + d, *at[i + 1 :], stoppers) for d in (size, -size)]
+        size = 1e-5 * max(1.0, float(value_at[i]))
+        ends = [
+            compute_step(*value_at[:i], value_at[i] + d, *value_at[i + 1 :], stoppers)
+            for d in (size, -size)
+        ]
         difference = (ends[0] - ends[1]) / (2.0 * size)
         np.testing.assert_allclose(column, difference, atol=2e-6, rtol=2e-6)
 
 
-def test_wheels_side_by_side_have_the_gradients_that_differences_have():
+def test_batched_gradients_equal_difference_quotients():
     """Machine code within `jit`, `vmap` and `grad`; each of these wheels has events of its own."""
-    wheels = [SCENES[name][0] for name in ("lands sliding", "reverses", "flies")]
-    at = [jnp.asarray(column) for column in list(zip(*wheels, strict=True))[:3]]
+    wheels = [STEP_SCENES[name][0] for name in ("lands sliding", "reverses", "flies")]
+    value_at = [jnp.asarray(column) for column in list(zip(*wheels, strict=True))[:3]]
 
     def told(mu, c, dtheta):
         wheel, params = vrw.UnilateralWheel(friction=mu), vrw.WheelParams(damping=c)
         start = jnp.stack([jnp.asarray(0.1), dtheta, jnp.asarray(-0.1)])
-        step = vrw.step(params, start, model=wheel, options=TIGHT)
-        return {"period": step.period, "slip": step.slip, "force": step.monitors.stopper_force}
+        step = vrw.step(params, start, model=wheel, options=TIGHT_OPTIONS)
+        return {"period": step.period, "slip": step.slip, "force": step.margins.stopper_force}
 
     values = jax.jit(jax.vmap(told))
-    slopes = jax.jit(jax.vmap(jax.jacrev(told, argnums=(0, 1, 2))))(*at)
-    for i in range(len(at)):
-        size = 1e-5 * jnp.maximum(1.0, at[i])
-        ends = [values(*at[:i], at[i] + d, *at[i + 1 :]) for d in (size, -size)]
+    slopes = jax.jit(jax.vmap(jax.jacrev(told, argnums=(0, 1, 2))))(*value_at)
+    for i in range(len(value_at)):
+        size = 1e-5 * jnp.maximum(1.0, value_at[i])
+        ends = [values(*value_at[:i], value_at[i] + d, *value_at[i + 1 :]) for d in (size, -size)]
         for name, slope in slopes.items():
             difference = (ends[0][name] - ends[1][name]) / (2.0 * size)
             np.testing.assert_allclose(slope[i], difference, rtol=1e-6, atol=1e-7, err_msg=name)
 
 
-def test_every_kind_of_event_is_differentiated_through():
-    kinds = set.union(*(kinds for _, kinds in SCENES.values()))
+def test_derivatives_through_every_kind_of_event_are_tested():
+    kinds = set.union(*(kinds for _, kinds in STEP_SCENES.values()))
     assert kinds == {
         "lands", "lifts off", "lands again", "flies", "slips", "sticks", "reverses",
         "meets its stopper", "the fore leg leaves its stopper", "leaves its stopper in the air",
@@ -114,24 +124,24 @@ def test_every_kind_of_event_is_differentiated_through():
 
 
 @pytest.mark.parametrize("solver", ["Tsit5", "Bosh3"])
-def test_derivatives_are_right_where_only_stability_limits_the_step(solver):
+def test_derivatives_are_accurate_if_only_stability_limits_the_solver_step(solver):
     """Oracle: the same by far shorter steps. 0.02 is a ten-thousandth of the rate, c / m = 200 to
     350 /s, at which a leg that swings decays (0.006 is found); where directions grew in it instead
     they were wrong by 0.65 (Tsit5) and 0.025."""
     damping = np.linspace(200.0, 350.0, 16)
     ground, params = vrw.UnilateralWheel(friction=0.7), vrw.WheelParams(damping=damping)
-    begun = vrw.steps(params, np.tile((0.1, 1.6, -0.1), (16, 1)), 10, model=ground)
-    assert not np.any(begun.outcome)
+    batch_result = vrw.step_batch(params, np.tile((0.1, 1.6, -0.1), (16, 1)), 10, model=ground)
+    assert not np.any(batch_result.outcome)
 
     def moved(tolerance):
-        options = vrw.Options(
+        options = vrw.StepOptions(
             solver=solver, rtol=tolerance, atol=tolerance, derivative_tightening=1.0
         )
-        given = params, begun.section_state
-        asked = ("section_state", "natural_length")
-        found = vrw.steps(*given, model=ground, options=options, derivatives=asked)
-        whole = [found.derivatives[name].section_state for name in asked]
-        return np.concatenate([whole[0], whole[1][:, :, None]], 2)
+        given = params, batch_result.section_state
+        requested = ("section_state", "natural_length")
+        solution = vrw.step_batch(*given, model=ground, options=options, derivatives=requested)
+        full_values = [solution.derivatives[name].section_state for name in requested]
+        return np.concatenate([full_values[0], full_values[1][:, :, None]], 2)
 
     truth = moved(1e-10 if solver == "Tsit5" else 1e-8)
     for tolerance in (5e-7, 3e-7, 2e-7):

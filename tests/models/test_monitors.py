@@ -7,22 +7,28 @@ import numpy as np
 import pytest
 from oracle import five_coordinates
 from support import truth
-from support.batched import NAMES, full_steps, wheels_like
+from support.batched import NAMES, compute_full_steps, make_parameter_rows
 
 import vrw_jax as vrw
 
-CASES = (0, 1, 5)  # Table 1; c = 100, where foot 2 scuffs; a heavy-legged, softly damped wheel
+CASE_INDICES = (
+    0,
+    1,
+    5,
+)  # Table 1; c = 100, where foot 2 scuffs; a heavy-legged, softly damped wheel
 
 
 @pytest.mark.parametrize("by_lanes", [False, True], ids=["wheel", "lanes"])
-@pytest.mark.parametrize("index", CASES, ids=lambda i: truth.CASES[i]["name"])
-def test_every_margin_is_that_of_the_oracle(index, by_lanes):
-    params = {k: float(v) for k, v in truth.CASES[index]["params"].items()}
+@pytest.mark.parametrize("index", CASE_INDICES, ids=lambda i: truth.REFERENCE_CASES[i]["name"])
+def test_every_margin_equals_the_reference(index, by_lanes):
+    params = {k: float(v) for k, v in truth.REFERENCE_CASES[index]["params"].items()}
     params["n_legs"] = int(params["n_legs"])
-    start = truth.table("step", "start")[index]
-    found = full_steps(truth.PARAMETERS[index], start, vrw.Options.tight(), by_lanes=by_lanes)
-    found = jax.tree.map(lambda leaf: np.asarray(leaf[0]), found)
-    m = found.monitors
+    start = truth.stack_quantity("step", "start")[index]
+    solution = compute_full_steps(
+        truth.REFERENCE_PARAMETERS[index], start, vrw.StepOptions.tight(), uses_lane_engine=by_lanes
+    )
+    solution = jax.tree.map(lambda leaf: np.asarray(leaf[0]), solution)
+    m = solution.margins
     oracle = five_coordinates.monitors(params, start)
     least_fore = min(oracle["lambda2"].values())
     # The oracle reads minima off a dense trajectory: a few 1e-7 of the largest term near a minimum.
@@ -51,61 +57,65 @@ def test_every_margin_is_that_of_the_oracle(index, by_lanes):
     )
 
 
-def test_energy_losses_are_those_of_the_oracle():
-    start = truth.table("step", "start")[0]
+def test_energy_losses_equal_the_reference():
+    start = truth.stack_quantity("step", "start")[0]
     oracle = five_coordinates.step(five_coordinates.TABLE_1, start)
-    found = full_steps(truth.PARAMETERS[0], start, vrw.Options.tight())
+    solution = compute_full_steps(truth.REFERENCE_PARAMETERS[0], start, vrw.StepOptions.tight())
     for ours, theirs in [
-        (found.energy.landing, "energy_lost_landing"),
-        (found.energy.stopper, "energy_lost_stopper"),
-        (found.energy.damping, "energy_lost_damping"),
+        (solution.energy.landing, "energy_lost_landing"),
+        (solution.energy.stopper, "energy_lost_stopper"),
+        (solution.energy.damping, "energy_lost_damping"),
     ]:
         np.testing.assert_allclose(ours[0], oracle[theirs], rtol=1e-9, atol=1e-10)
 
 
-def test_the_oracles_own_step_agrees():
-    for index in CASES:
-        params = {k: float(v) for k, v in truth.CASES[index]["params"].items()}
+def test_the_step_of_the_reference_code_agrees():
+    for index in CASE_INDICES:
+        params = {k: float(v) for k, v in truth.REFERENCE_CASES[index]["params"].items()}
         params["n_legs"] = int(params["n_legs"])
-        start = truth.table("step", "start")[index]
+        start = truth.stack_quantity("step", "start")[index]
         oracle = five_coordinates.step(params, start)
-        found = full_steps(truth.PARAMETERS[index], start, vrw.Options.tight())
-        np.testing.assert_allclose(found.section_state[0], oracle["section_state"], atol=1e-11)
-        np.testing.assert_allclose(found.durations[0], oracle["durations"], atol=1e-11)
+        solution = compute_full_steps(
+            truth.REFERENCE_PARAMETERS[index], start, vrw.StepOptions.tight()
+        )
+        np.testing.assert_allclose(solution.section_state[0], oracle["section_state"], atol=1e-11)
+        np.testing.assert_allclose(solution.durations[0], oracle["durations"], atol=1e-11)
 
 
-def agrees_with_oracle(vector, start):
+def assert_agrees_with_reference(vector, start):
     """Same outcome, durations and next state, whichever branch of Section 5.1 was taken."""
     params = dict(zip(NAMES, map(float, vector), strict=True)) | {"n_legs": 8}
     oracle = five_coordinates.step(params, start)
-    found = jax.tree.map(lambda leaf: leaf[0], full_steps(vector, start, vrw.Options.tight()))
+    solution = jax.tree.map(
+        lambda leaf: leaf[0], compute_full_steps(vector, start, vrw.StepOptions.tight())
+    )
     assert oracle["outcome"] == five_coordinates.STEPPED
-    assert int(found.outcome) == vrw.Outcome.STEPPED
-    np.testing.assert_allclose(found.durations, oracle["durations"], atol=1e-10)
-    np.testing.assert_allclose(found.section_state, oracle["section_state"], atol=1e-10)
-    return found
+    assert int(solution.outcome) == vrw.Outcome.STEPPED
+    np.testing.assert_allclose(solution.durations, oracle["durations"], atol=1e-10)
+    np.testing.assert_allclose(solution.section_state, oracle["section_state"], atol=1e-10)
+    return solution
 
 
 def test_a_landing_that_would_pull_the_rear_foot_frees_it():
     # (A3): Leg 1 extends before the landing.
-    vector = wheels_like(damping=60.0, slope=0.23)[0]
-    found = agrees_with_oracle(vector, np.array([0.34, 1.35, 1.14]))
-    assert float(found.indicators.lambda_I4) < 0.0
-    assert float(found.durations[0]) == 0.0
+    vector = make_parameter_rows(damping=60.0, slope=0.23)[0]
+    solution = assert_agrees_with_reference(vector, np.array([0.34, 1.35, 1.14]))
+    assert float(solution.indicators.lambda_I4) < 0.0
+    assert float(solution.durations[0]) == 0.0
 
 
 def test_a_rear_foot_without_load_after_the_landing_skips_double_support():
     # (B3): the impulse holds the rear foot, the damper then pulls it up.
-    vector = wheels_like(damping=225.0, slope=0.39)[0]
-    found = agrees_with_oracle(vector, np.array([0.34, 1.63, -0.43]))
-    assert float(found.indicators.lambda_I4) > 0.0
-    assert float(found.indicators.lambda_4) < 0.0
-    assert float(found.durations[0]) == 0.0
+    vector = make_parameter_rows(damping=225.0, slope=0.39)[0]
+    solution = assert_agrees_with_reference(vector, np.array([0.34, 1.63, -0.43]))
+    assert float(solution.indicators.lambda_I4) > 0.0
+    assert float(solution.indicators.lambda_4) < 0.0
+    assert float(solution.durations[0]) == 0.0
 
 
-def test_lanes_tell_all_of_a_step_that_the_wheel_does():
+def test_batches_have_all_measures_of_a_single_step():
     # Gaits, steps without double support (A3, B3), falls and a bad wheel, side by side.
-    vectors = wheels_like(
+    vectors = make_parameter_rows(
         damping=[200.0, 60.0, 225.0, 100.0, -1.0, 160.0],
         slope=[0.30, 0.23, 0.39, 0.09, 0.30, 0.30],
     )
@@ -113,7 +123,10 @@ def test_lanes_tell_all_of_a_step_that_the_wheel_does():
         [[0.1027, 2.0, -0.109], [0.34, 1.35, 1.14], [0.34, 1.63, -0.43], [0.1027, 1.2, -0.109],
          [0.1027, 2.0, -0.109], [0.1027, 1.8, -0.1]]
     )  # fmt: skip
-    wheel, lanes = (full_steps(vectors, starts, by_lanes=way) for way in (False, True))
+    wheel, lanes = (
+        compute_full_steps(vectors, starts, uses_lane_engine=method_name)
+        for method_name in (False, True)
+    )
     assert len(set(map(int, wheel.outcome))) == 3
     for place, one in jax.tree_util.tree_leaves_with_path(wheel):
         if "solver_steps" not in jax.tree_util.keystr(place):
@@ -122,13 +135,13 @@ def test_lanes_tell_all_of_a_step_that_the_wheel_does():
             np.testing.assert_allclose(other, one, rtol=1e-8, atol=1e-8, err_msg=str(place))
 
 
-def test_a_lane_s_monitors_are_bitwise_its_own_in_any_company_and_alone():
+def test_margins_of_a_batch_element_are_bitwise_those_of_the_single_wheel():
     rng = np.random.default_rng(1)
-    vectors = wheels_like(damping=rng.uniform(100.0, 215.0, 16))
+    vectors = make_parameter_rows(damping=rng.uniform(100.0, 215.0, 16))
     starts = np.array([0.1027, 2.0, -0.109]) * rng.uniform(0.95, 1.05, (16, 1))
-    whole = full_steps(vectors, starts, by_lanes=True)
+    full_values = compute_full_steps(vectors, starts, uses_lane_engine=True)
     order = rng.permutation(16)
-    for some in (order[:7], *order[7:, None]):
-        part = full_steps(vectors[some], starts[some], by_lanes=True)
-        for a, b in zip(jax.tree.leaves(part), jax.tree.leaves(whole), strict=True):
-            np.testing.assert_array_equal(a, np.asarray(b)[some])
+    for selection in (order[:7], *order[7:, None]):
+        part = compute_full_steps(vectors[selection], starts[selection], uses_lane_engine=True)
+        for a, b in zip(jax.tree.leaves(part), jax.tree.leaves(full_values), strict=True):
+            np.testing.assert_array_equal(a, np.asarray(b)[selection])

@@ -9,25 +9,27 @@ import pytest
 from oracle import moreau_jean
 
 import vrw_jax as vrw
-from vrw_jax.models.unilateral.contacts import OFF
-from vrw_jax.models.unilateral.events import Law, event_of, resolve
+from vrw_jax.models.unilateral.contacts import CONTACT_OFF
+from vrw_jax.models.unilateral.events import ContactLaw, classify_event, resolve_event
 from vrw_jax.models.unilateral.mechanics import WheelMotion, kinetic_energy, potential_energy
-from vrw_jax.models.unilateral.motion import Stance, guards_of
-from vrw_jax.models.unilateral.section import opened
+from vrw_jax.models.unilateral.motion import ContactState, make_guard_layout
+from vrw_jax.models.unilateral.section import unpack_section_state
 
 START = (0.1, 1.6, -0.1)
 SCENES = ((0.7, 200.0), (1.3, 200.0), (0.7, 300.0), (0.5, 100.0))  # friction, damping
-TIGHT = vrw.Options.tight()
-LANES = vrw.Options(solver="Tsit5", rtol=1e-10, atol=1e-10)
-STRUCK = 6  # the leg that meets its stopper, counted from 0
+TIGHT_OPTIONS = vrw.StepOptions.tight()
+BATCH_OPTIONS = vrw.StepOptions(solver="Tsit5", rtol=1e-10, atol=1e-10)
+STRUCK_LEG = 6  # the leg that meets its stopper, counted from 0
 
 
-def wheel_of(friction, stoppers="one-sided"):
+def make_model(friction, stoppers="one-sided"):
     return vrw.UnilateralWheel(friction=friction, stoppers=stoppers)
 
 
-def stepped(friction, damping, x=START, options=TIGHT):
-    return vrw.step(vrw.WheelParams(damping=damping), x, model=wheel_of(friction), options=options)
+def compute_step(friction, damping, x=START, options=TIGHT_OPTIONS):
+    return vrw.step(
+        vrw.WheelParams(damping=damping), x, model=make_model(friction), options=options
+    )
 
 
 def test_an_unknown_kind_of_stopper_is_refused_in_one_sentence():
@@ -36,129 +38,137 @@ def test_an_unknown_kind_of_stopper_is_refused_in_one_sentence():
 
 
 @pytest.fixture(scope="module")
-def struck():
+def stopper_impact():
     """A spinning wheel in the air of which one leg meets its stopper, by the speed of rest."""
     s, zero, none = vrw.WheelParams().symbols(), jnp.zeros(()), jnp.zeros(8, bool)
     motion = WheelMotion(
         zero, zero + 2.0, zero - 0.2, zero + 1.0, zero - 0.5, zero + 1.5, jnp.ones(8), jnp.zeros(8)
     )
-    motion = motion._replace(dL=motion.dL.at[STRUCK].set(0.5))
-    stance = Stance(jnp.full(8, OFF, jnp.int32), jnp.arange(8) != STRUCK, none, none, none)
-    law = lambda one_sided, rest: Law(s, jnp.asarray(0.7), one_sided, True, rest)
-    event = event_of(guards_of(8, True), jnp.int32(8 + STRUCK))
-    after = jax.jit(lambda rest: resolve(law(True, rest), motion, stance, event))
-    bilateral = jax.jit(lambda: resolve(law(False, 0.0), motion, stance, event))
+    motion = motion._replace(dL=motion.dL.at[STRUCK_LEG].set(0.5))
+    stance = ContactState(
+        jnp.full(8, CONTACT_OFF, jnp.int32), jnp.arange(8) != STRUCK_LEG, none, none, none
+    )
+    law = lambda one_sided, rest: ContactLaw(s, jnp.asarray(0.7), one_sided, True, rest)
+    event = classify_event(make_guard_layout(8, True), jnp.int32(8 + STRUCK_LEG))
+    after = jax.jit(lambda rest: resolve_event(law(True, rest), motion, stance, event))
+    bilateral = jax.jit(lambda: resolve_event(law(False, 0.0), motion, stance, event))
     return motion, after, bilateral
 
 
-def test_a_leg_at_its_stopper_throws_off_those_that_would_have_to_pull(struck):
-    motion, after, _ = struck
+def test_a_stopper_impact_releases_legs_whose_stoppers_would_have_to_pull(stopper_impact):
+    motion, after, _ = stopper_impact
     change = after(1e-6)
     # Another code: the dense mass matrix, and all stoppers at once by projected Gauss-Seidel.
-    wheel = moreau_jean.Wheel(0.7)
+    wheel = moreau_jean.TimeSteppingWheel(0.7)
     q = np.concatenate([[0.0, 2.0, -0.2], np.ones(8)])
     v = np.concatenate([[1.0, -0.5, 1.5], np.asarray(motion.dL)])
     mass, _ = moreau_jean._mass_and_force(wheel, q, v)
     J, inverse = -np.eye(11)[3:], np.linalg.inv(mass)
     p = moreau_jean._solve(wheel, J @ inverse @ J.T, J @ v, 0, np.zeros(8))
     expected = v + inverse @ (J.T @ p)
-    found = change.motion
-    told = jnp.concatenate([jnp.stack([found.vx, found.vz, found.dtheta]), found.dL])
-    np.testing.assert_allclose(told, expected, atol=1e-12)
-    thrown = np.asarray(found.dL) < -1e-3
-    assert thrown.any()
-    assert not np.any(thrown & np.asarray(change.stance.locked))
+    solution = change.motion
+    joined_values = jnp.concatenate(
+        [jnp.stack([solution.vx, solution.vz, solution.dtheta]), solution.dL]
+    )
+    np.testing.assert_allclose(joined_values, expected, atol=1e-12)
+    thrown_values = np.asarray(solution.dL) < -1e-3
+    assert thrown_values.any()
+    assert not np.any(thrown_values & np.asarray(change.contact_state.locked))
     assert float(change.stopper_impulse) >= -1e-12
     assert float(change.energy_lost) > 0.0
 
 
-def test_what_would_come_back_unseen_stays(struck):
-    _, after, bilateral = struck
+def test_at_a_high_rest_speed_one_sided_stoppers_act_as_two_sided_ones(stopper_impact):
+    _, after, bilateral = stopper_impact
     for a, b in zip(jax.tree.leaves(after(100.0)), jax.tree.leaves(bilateral()), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-13)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("friction", "damping"), SCENES)
-def test_no_stopper_pulls_and_energy_is_told_by_its_causes(friction, damping):
-    params, wheel = vrw.WheelParams(damping=damping), wheel_of(friction)
+def test_no_stopper_pulls_and_energy_losses_are_reported_by_cause(friction, damping):
+    params, wheel = vrw.WheelParams(damping=damping), make_model(friction)
     s = params.symbols()
     total = lambda motion: float(kinetic_energy(s, motion) + sum(potential_energy(s, motion)))
-    x = wheel.full_section(params, jnp.asarray(START))
+    x = wheel.embed_section(params, jnp.asarray(START))
     for _ in range(3):
-        step = vrw.step(params, x, model=wheel, options=TIGHT)
+        step = vrw.step(params, x, model=wheel, options=TIGHT_OPTIONS)
         assert int(step.outcome) == vrw.Outcome.STEPPED
-        assert float(step.monitors.stopper_force) >= -1e-9
+        assert float(step.margins.stopper_force) >= -1e-9
         # What stays though it would dip by 1e-10 m: 1 kg times the speed of that dip.
-        assert float(step.monitors.stopper_impulse) >= -2e-4
+        assert float(step.margins.stopper_impulse) >= -2e-4
         assert int(step.impacts) >= 10
         assert min(step.energy_impacts, step.energy_damping, step.energy_friction) >= 0.0
-        before, after = (opened(s, y)[0] for y in (x, step.section_state))
+        before, after = (unpack_section_state(s, y)[0] for y in (x, step.section_state))
         # The origin is each step's own landing.
         dropped = s.Mt * s.g * math.sin(0.30) * float(step.step_length)
-        lost = step.energy_impacts + step.energy_damping + step.energy_friction
-        assert abs(float(lost) - (total(before) - total(after) + float(dropped))) < 1e-7
+        lost_values = step.energy_impacts + step.energy_damping + step.energy_friction
+        assert abs(float(lost_values) - (total(before) - total(after) + float(dropped))) < 1e-7
         x = step.section_state
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("friction", [0.7, 1.3])
 def test_time_stepping_with_stoppers_that_only_push_converges_to_the_same_step(friction):
-    truth = stepped(friction, 200.0)
+    truth = compute_step(friction, 200.0)
     sizes = (4e-4, 2e-4, 1e-4)
-    wheel = moreau_jean.Wheel(friction, one_sided=True)
+    wheel = moreau_jean.TimeSteppingWheel(friction, one_sided=True)
     start = moreau_jean.paper_start(wheel, *START)
-    times = np.array([moreau_jean.one_step(wheel, start, h).time for h in sizes])
+    times = np.array([moreau_jean.compute_step(wheel, start, h).time for h in sizes])
     errors = times - float(truth.period)
     np.testing.assert_allclose(errors[:-1] / errors[1:], 2.0, atol=0.15)
     assert abs(2.0 * errors[-1] - errors[-2]) < 3e-6  # extrapolated, s
-    held = vrw.step(
-        vrw.WheelParams(), START, model=wheel_of(friction, "bilateral"), options=TIGHT
+    held_values = vrw.step(
+        vrw.WheelParams(), START, model=make_model(friction, "bilateral"), options=TIGHT_OPTIONS
     ).period
-    assert abs(float(held - truth.period)) > 1e-5  # which stoppers were meant can be told
+    assert abs(float(held_values - truth.period)) > 1e-5  # which stoppers were meant can be told
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("friction", "damping"), SCENES)
-def test_landings_with_one_sided_stoppers_repeat_but_for_what_the_tolerances_cut(friction, damping):
-    loose, tight = (stepped(friction, damping, options=o) for o in (vrw.Options(), TIGHT))
+def test_landings_with_one_sided_stoppers_repeat_up_to_tolerances(friction, damping):
+    loose, tight = (
+        compute_step(friction, damping, options=o) for o in (vrw.StepOptions(), TIGHT_OPTIONS)
+    )
     # Dips below 1e-12 and 1e-13 m stay: speeds of 4e-6 and 1e-6 m/s, in each event of a chain.
     np.testing.assert_allclose(loose.section_state[:4], tight.section_state[:4], atol=2e-6)
     assert abs(float(loose.period - tight.period)) < 3e-7
 
 
 @pytest.mark.slow
-def test_lanes_with_one_sided_stoppers_walk_as_single_wheels_do():
+def test_batches_with_one_sided_stoppers_equal_single_wheels():
     friction, damping = (np.array(column) for column in zip(*SCENES, strict=True))
-    found = vrw.steps(
+    batch_result = vrw.step_batch(
         vrw.WheelParams(damping=damping),
         np.tile(START, (len(SCENES), 1)),
         1,
-        model=wheel_of(friction),
-        options=TIGHT,
+        model=make_model(friction),
+        options=TIGHT_OPTIONS,
     )
     for i, scene in enumerate(SCENES):
-        single = stepped(*scene, options=TIGHT.by("diffrax"))
+        single = compute_step(*scene, options=TIGHT_OPTIONS.with_engine("diffrax"))
         # To what tolerances leave: dips that are cut hand their momentum on.
-        np.testing.assert_allclose(found.section_state[i, :4], single.section_state[:4], atol=1e-8)
-        np.testing.assert_allclose(found.durations[i].sum(), single.period, atol=1e-9)
+        np.testing.assert_allclose(
+            batch_result.section_state[i, :4], single.section_state[:4], atol=1e-8
+        )
+        np.testing.assert_allclose(batch_result.durations[i].sum(), single.period, atol=1e-9)
 
 
-def test_what_an_event_has_released_is_not_met_again_by_rounding():
+def test_round_off_does_not_repeat_the_event_of_a_released_contact():
     """Wheels apart by rounding alone: a leg let go from rest reads zero for 1e-8 s and longer."""
     wheels, friction = 64, 0.7
-    how = {"model": wheel_of(friction), "options": TIGHT, "engine": "diffrax"}
-    period = vrw.walk(vrw.WheelParams(), START, 1, **how).steps.durations.sum()
+    options_used = {"model": make_model(friction), "options": TIGHT_OPTIONS, "engine": "diffrax"}
+    period = vrw.walk(vrw.WheelParams(), START, 1, **options_used).steps.durations.sum()
     for tolerance in (5e-12, 5e-13, 1e-13):  # one cut on dips, its least
-        found = vrw.steps(
+        batch_result = vrw.step_batch(
             vrw.WheelParams(damping=200.0 * (1.0 + 1e-12 * np.arange(wheels))),
             np.tile(START, (wheels, 1)),
             1,
-            model=wheel_of(friction),
-            options=vrw.Options(rtol=tolerance, atol=tolerance),
+            model=make_model(friction),
+            options=vrw.StepOptions(rtol=tolerance, atol=tolerance),
         )
-        assert np.all(np.asarray(found.outcome) == vrw.Outcome.STEPPED)
-        np.testing.assert_allclose(found.durations.sum(1), period, rtol=0, atol=1e-10)
+        assert np.all(np.asarray(batch_result.outcome) == vrw.Outcome.STEPPED)
+        np.testing.assert_allclose(batch_result.durations.sum(1), period, rtol=0, atol=1e-10)
 
 
 @pytest.mark.slow
@@ -166,16 +176,16 @@ def test_high_friction_from_any_start_has_an_admissible_contact_at_every_impact(
     random, n = np.random.default_rng(0), 200
     damping, high = random.uniform(5.0, 400.0, n), random.uniform(2.0, 20.0, n)
     limits = ((0.0, 0.25), (0.3, 2.6), (-0.6, 0.2))
-    found = vrw.steps(
+    batch_result = vrw.step_batch(
         vrw.WheelParams(damping=damping),
         np.stack([random.uniform(*limit, n) for limit in limits], 1),
         1,
-        model=wheel_of(np.where(np.arange(n) % 2 == 0, math.inf, high)),
-        options=LANES,
+        model=make_model(np.where(np.arange(n) % 2 == 0, math.inf, high)),
+        options=BATCH_OPTIONS,
     )
-    outcome = np.asarray(found.outcome)
+    outcome = np.asarray(batch_result.outcome)
     assert not np.any(outcome == vrw.Outcome.NO_ADMISSIBLE_CONTACT)
-    lost = np.isin(outcome, [vrw.Outcome.SOLVER_GAVE_UP, vrw.Outcome.TOO_MANY_EVENTS])
-    assert lost.sum() <= n // 50
-    assert not np.any(np.asarray(found.section_state)[outcome != vrw.Outcome.STEPPED])
-    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(found))
+    lost_values = np.isin(outcome, [vrw.Outcome.SOLVER_FAILED, vrw.Outcome.TOO_MANY_EVENTS])
+    assert lost_values.sum() <= n // 50
+    assert not np.any(np.asarray(batch_result.section_state)[outcome != vrw.Outcome.STEPPED])
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(batch_result))

@@ -6,46 +6,52 @@ import numpy as np
 import pytest
 from support import truth
 from support.batched import (
-    GAIT,
-    IN_TIME,
-    PROVOKED,
-    TABLE_1,
-    full_steps,
-    jacobians,
-    lean_steps,
-    wheels_like,
+    OUTCOME_CASES,
+    TABLE_1_SECTION_STATE,
+    TABLE_1_VALUES,
+    TIME_LIMIT_CASES,
+    compute_full_steps,
+    compute_jacobians,
+    compute_states_and_work,
+    make_parameter_rows,
 )
 
 import vrw_jax as vrw
 from vrw_jax import Outcome
 
 
-@pytest.mark.parametrize("outcome", PROVOKED, ids=lambda o: o.name)
-def test_each_outcome_is_provoked(outcome):
-    vectors, start = PROVOKED[outcome]
-    result = full_steps(vectors, start)
+@pytest.mark.parametrize("outcome", OUTCOME_CASES, ids=lambda o: o.name)
+def test_each_outcome_occurs(outcome):
+    vectors, start = OUTCOME_CASES[outcome]
+    result = compute_full_steps(vectors, start)
     assert Outcome(int(result.outcome[0])) is outcome
 
 
 def test_no_touchdown_in_time_is_a_code():
-    longest = float(np.max(full_steps(wheels_like(), GAIT).durations))
-    for share, outcome in IN_TIME:  # within one solver step of the phase's end
-        result = full_steps(wheels_like(), GAIT, vrw.Options(max_phase_time=share * longest))
+    longest = float(
+        np.max(compute_full_steps(make_parameter_rows(), TABLE_1_SECTION_STATE).durations)
+    )
+    for share, outcome in TIME_LIMIT_CASES:  # within one solver step of the phase's end
+        result = compute_full_steps(
+            make_parameter_rows(),
+            TABLE_1_SECTION_STATE,
+            vrw.StepOptions(max_phase_time=share * longest),
+        )
         assert int(result.outcome[0]) == outcome
 
 
 def test_a_solver_that_runs_out_of_steps_is_a_code():
     stiff = vrw.WheelParams(damping=1e8)  # explicit steps of nanoseconds
-    result = vrw.step(stiff, GAIT)
-    assert int(result.outcome) == Outcome.SOLVER_GAVE_UP
-    assert int(result.solver_steps) >= vrw.Options().max_solver_steps
+    result = vrw.step(stiff, TABLE_1_SECTION_STATE)
+    assert int(result.outcome) == Outcome.SOLVER_FAILED
+    assert int(result.solver_steps) >= vrw.StepOptions().max_solver_steps
 
 
 @pytest.mark.parametrize(
     "start", [[np.nan, 1.6, -0.1], [0.1, np.inf, -0.1], [0.1, -1.0, -0.1], [2.0, 1.0, 0.0]], ids=str
 )
 def test_a_start_that_is_no_section_state_is_bad_input(start):
-    assert int(full_steps(wheels_like(), start).outcome[0]) == Outcome.BAD_INPUT
+    assert int(compute_full_steps(make_parameter_rows(), start).outcome[0]) == Outcome.BAD_INPUT
 
 
 def test_every_outcome_has_a_name_and_one_sentence():
@@ -54,52 +60,56 @@ def test_every_outcome_has_a_name_and_one_sentence():
         assert outcome.meaning.count(".") == 1
 
 
-def test_failing_lanes_do_not_disturb_their_neighbours():
-    bad = [vectors[0] for vectors, _ in PROVOKED.values()]
-    starts = [np.asarray(start) for _, start in PROVOKED.values()]
-    among = full_steps(np.stack(bad), np.stack(starts))
-    alone = full_steps(wheels_like(), GAIT)
-    for mixed, single in zip(jax.tree.leaves(among), jax.tree.leaves(alone), strict=True):
+def test_failing_batch_elements_do_not_change_the_others():
+    bad = [vectors[0] for vectors, _ in OUTCOME_CASES.values()]
+    starts = [np.asarray(start) for _, start in OUTCOME_CASES.values()]
+    among = compute_full_steps(np.stack(bad), np.stack(starts))
+    single_result = compute_full_steps(make_parameter_rows(), TABLE_1_SECTION_STATE)
+    for mixed, single in zip(jax.tree.leaves(among), jax.tree.leaves(single_result), strict=True):
         # A vmapped loop may fuse differently: round-off, a few 1e-14 relative.
         np.testing.assert_allclose(mixed[0], single[0], rtol=5e-14, atol=5e-14)
 
 
-def test_failing_lanes_yield_finite_values_and_derivatives():
-    vectors = jnp.asarray(np.stack([v[0] for v, _ in PROVOKED.values()]))
-    starts = jnp.asarray(np.stack([np.asarray(x) for _, x in PROVOKED.values()]))
-    pad = 16 - len(PROVOKED)
-    vectors = jnp.concatenate([vectors, jnp.tile(TABLE_1, (pad, 1))])
-    starts = jnp.concatenate([starts, jnp.tile(GAIT, (pad, 1))])
-    result = full_steps(vectors, starts)
+def test_failing_batch_elements_have_finite_values_and_derivatives():
+    vectors = jnp.asarray(np.stack([v[0] for v, _ in OUTCOME_CASES.values()]))
+    starts = jnp.asarray(np.stack([np.asarray(x) for _, x in OUTCOME_CASES.values()]))
+    pad = 16 - len(OUTCOME_CASES)
+    vectors = jnp.concatenate([vectors, jnp.tile(TABLE_1_VALUES, (pad, 1))])
+    starts = jnp.concatenate([starts, jnp.tile(TABLE_1_SECTION_STATE, (pad, 1))])
+    result = compute_full_steps(vectors, starts)
     for leaf in jax.tree.leaves(result):
         assert np.all(np.isfinite(leaf))
-    by_parameter, by_start = jacobians(vectors, starts, vrw.Options())
+    by_parameter, by_start = compute_jacobians(vectors, starts, vrw.StepOptions())
     assert np.all(np.isfinite(by_parameter))
     assert np.all(np.isfinite(by_start))
-    clean, _ = jacobians(jnp.tile(TABLE_1, (16, 1)), jnp.tile(GAIT, (16, 1)), vrw.Options())
+    clean, _ = compute_jacobians(
+        jnp.tile(TABLE_1_VALUES, (16, 1)),
+        jnp.tile(TABLE_1_SECTION_STATE, (16, 1)),
+        vrw.StepOptions(),
+    )
     np.testing.assert_allclose(by_parameter[0], clean[0], rtol=1e-12, atol=1e-12)
 
 
-def test_a_step_that_failed_leaves_zeros_which_are_no_section_state():
-    vectors, start = PROVOKED[Outcome.FELL_BACK]
-    result = full_steps(vectors, start)
+def test_a_failed_step_returns_zeros_instead_of_a_section_state():
+    vectors, start = OUTCOME_CASES[Outcome.FELL_BACK]
+    result = compute_full_steps(vectors, start)
     assert np.all(np.asarray(result.section_state) == 0.0)
 
 
 def test_a_walk_stops_at_its_first_failure():
     walk = vrw.walk(vrw.WheelParams(slope=0.09, damping=100.0), [0.1027, 2.0, -0.109], 12)
     assert int(walk.outcome) == Outcome.FELL_BACK
-    stepped = int(walk.n_stepped)
-    assert 0 < stepped < 12
+    step_result = int(walk.n_stepped)
+    assert 0 < step_result < 12
     outcomes = np.asarray(walk.steps.outcome)
-    assert np.all(outcomes[:stepped] == Outcome.STEPPED)
-    assert np.all(outcomes[stepped:] == Outcome.FELL_BACK)
+    assert np.all(outcomes[:step_result] == Outcome.STEPPED)
+    assert np.all(outcomes[step_result:] == Outcome.FELL_BACK)
 
 
-def test_a_lane_in_a_batch_equals_the_single_run():
-    starts = truth.table("step", "start")
-    batch, _ = lean_steps(truth.PARAMETERS, starts, vrw.Options())
+def test_a_batch_element_equals_the_single_run():
+    starts = truth.stack_quantity("step", "start")
+    batch, _ = compute_states_and_work(truth.REFERENCE_PARAMETERS, starts, vrw.StepOptions())
     for index in (0, 3, 9):
-        params = truth.wheel(truth.PARAMETERS[index])
+        params = truth.make_wheel(truth.REFERENCE_PARAMETERS[index])
         single = vrw.return_map(params, starts[index])
         np.testing.assert_allclose(batch[index, :3], single, rtol=5e-14, atol=5e-14)

@@ -7,23 +7,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import truth
-from support.batched import NAMES, full_steps, lean_steps
+from support.batched import NAMES, compute_full_steps, compute_states_and_work
 
 import vrw_jax as vrw
-from vrw_jax.wheel import Motion, dynamics, phases_of, rear_foot_height, transitions
+from vrw_jax.wheel import Motion, dynamics, make_phases, rear_foot_height, transitions
 
-STARTS = truth.table("step", "start")
+STARTS = truth.stack_quantity("step", "start")
 
 
 @pytest.fixture(scope="module")
-def steps():
-    return full_steps(truth.PARAMETERS, STARTS)
+def sample_steps():
+    return compute_full_steps(truth.REFERENCE_PARAMETERS, STARTS)
 
 
-def test_impacts_only_lose_energy(steps):
-    assert np.all(np.asarray(steps.energy.landing) > 0.0)
-    assert np.all(np.asarray(steps.energy.stopper) > 0.0)
-    assert np.all(np.asarray(steps.energy.damping) > 0.0)
+def test_impacts_only_lose_energy(sample_steps):
+    assert np.all(np.asarray(sample_steps.energy.landing) > 0.0)
+    assert np.all(np.asarray(sample_steps.energy.stopper) > 0.0)
+    assert np.all(np.asarray(sample_steps.energy.damping) > 0.0)
 
 
 @settings(max_examples=60, deadline=None)
@@ -52,8 +52,8 @@ def test_planted_feet_do_not_move_in_double_support(theta, dtheta, distance):
     s = vrw.WheelParams().symbols()
 
     def rear_foot(angle):
-        phase = phases_of(s, jnp.asarray(distance), True)[0]
-        m = phase.at((angle,), (jnp.asarray(dtheta),))
+        phase = make_phases(s, jnp.asarray(distance), True)[0]
+        m = phase.motion_at((angle,), (jnp.asarray(dtheta),))
         rear = jnp.stack([jnp.sin(angle + s.alpha), jnp.cos(angle + s.alpha)])
         return m.L1 * jnp.stack([m.sin, m.cos]) - m.L2 * rear
 
@@ -69,8 +69,10 @@ def test_both_feet_are_at_rest_after_a_landing_that_holds_them():
 
     def height(t):
         theta = landing.theta + t * m.dtheta
-        moved = Motion.of(theta, m.L1 + t * m.dL1, m.L2 + t * m.dL2, m.dtheta, m.dL1, m.dL2)
-        return rear_foot_height(s, moved)
+        shifted = Motion.from_angle(
+            theta, m.L1 + t * m.dL1, m.L2 + t * m.dL2, m.dtheta, m.dL1, m.dL2
+        )
+        return rear_foot_height(s, shifted)
 
     assert abs(float(height(0.0))) < 1e-15
     assert abs(float(jax.grad(height)(0.0))) < 1e-14
@@ -95,26 +97,28 @@ DURATION_DIMENSIONS = np.array([(0, 0, 1)] * 3)
 @pytest.mark.parametrize("scale", [(3.0, 1.0, 1.0), (1.0, 2.0, 1.0), (1.0, 1.0, 0.5)], ids=str)
 def test_mass_length_and_time_scale_out(scale):
     factor = lambda exponents: np.prod(np.asarray(scale) ** np.asarray(exponents), axis=-1)
-    by = np.array([factor(DIMENSIONS[name]) for name in NAMES])
-    options = vrw.Options.tight()
-    plain, _ = lean_steps(truth.PARAMETERS, STARTS, options)
-    scaled, _ = lean_steps(truth.PARAMETERS * by, STARTS * factor(START_DIMENSIONS), options)
+    values_array = np.array([factor(DIMENSIONS[name]) for name in NAMES])
+    options = vrw.StepOptions.tight()
+    plain, _ = compute_states_and_work(truth.REFERENCE_PARAMETERS, STARTS, options)
+    scaled, _ = compute_states_and_work(
+        truth.REFERENCE_PARAMETERS * values_array, STARTS * factor(START_DIMENSIONS), options
+    )
     expected = plain * factor(np.concatenate([START_DIMENSIONS, DURATION_DIMENSIONS]))
     # Absolute tolerances are not dimensionless, so two integrations differ within the claim.
-    assert truth.scaled_error(scaled, np.asarray(expected)) < 2e-12
+    assert truth.compute_scaled_error(scaled, np.asarray(expected)) < 2e-12
 
 
-def test_the_stopper_never_pulls_leg_2_and_the_landing_never_pulls_the_foot(steps):
-    assert np.all(np.asarray(steps.indicators.lambda_I4) > 0.0)
-    assert np.all(np.asarray(steps.monitors.fore_foot_force) > 0.0)
+def test_the_stopper_never_pulls_leg_2_and_the_landing_never_pulls_the_foot(sample_steps):
+    assert np.all(np.asarray(sample_steps.indicators.lambda_I4) > 0.0)
+    assert np.all(np.asarray(sample_steps.margins.fore_foot_force) > 0.0)
 
 
-def test_forces_carry_the_momentum_of_the_point_masses():
+def test_forces_equal_the_rate_of_momentum_of_the_point_masses():
     """lambda_1, lambda_2 from total momentum against Newton's law on every mass."""
     p = vrw.WheelParams()
     s = p.symbols()
     theta, L1, L2, dtheta, dL1, dL2 = -0.3, 0.93, 0.96, 1.2, -0.1, 0.2
-    m = Motion.of(*map(jnp.asarray, (theta, L1, L2, dtheta, dL1, dL2)))
+    m = Motion.from_angle(*map(jnp.asarray, (theta, L1, L2, dtheta, dL1, dL2)))
     a = dynamics.single_support_1_acceleration(s, m)
 
     def masses(t):

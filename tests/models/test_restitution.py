@@ -7,75 +7,82 @@ import pytest
 from oracle import complementarity
 
 import vrw_jax as vrw
-from vrw_jax.models.unilateral.contacts import OFF, STICK
-from vrw_jax.models.unilateral.events import Law, event_of, resolve, settled
-from vrw_jax.models.unilateral.mechanics import WheelMotion, directions, kinetic_energy
-from vrw_jax.models.unilateral.motion import Stance, guards_of
+from vrw_jax.models.unilateral.contacts import CONTACT_OFF, CONTACT_STICK
+from vrw_jax.models.unilateral.events import (
+    ContactLaw,
+    classify_event,
+    project_motion,
+    resolve_event,
+)
+from vrw_jax.models.unilateral.mechanics import WheelMotion, kinetic_energy, leg_directions
+from vrw_jax.models.unilateral.motion import ContactState, make_guard_layout
 
-CASES, SEED = 400, 3
+N_IMPACTS, RNG_SEED = 400, 3
 START = (0.1, 1.6, -0.1)
 
 
 @pytest.fixture(scope="module")
-def impacts():
+def random_impacts():
     """Foot 0 strikes while foot 1 is at rest, over random postures, rates and frictions up to the
     most, by restitution: normal speeds of foot 0 before and after, and energies."""
     s, none = vrw.WheelParams().symbols(), jnp.zeros(8, bool)
     locked = jnp.arange(8) > 1
-    stance = Stance(jnp.where(jnp.arange(8) == 1, STICK, OFF), locked, none, none, none)
-    event = event_of(guards_of(8, False), jnp.int32(0))
+    stance = ContactState(
+        jnp.where(jnp.arange(8) == 1, CONTACT_STICK, CONTACT_OFF), locked, none, none, none
+    )
+    event = classify_event(make_guard_layout(8, False), jnp.int32(0))
 
-    def strikes(seeds, restitution, most):
-        theta, friction = -0.7 + 0.5 * seeds[0], most * seeds[1] ** 2
+    def strikes(seeds, restitution, maximum):
+        theta, friction = -0.7 + 0.5 * seeds[0], maximum * seeds[1] ** 2
         rates, L = 2.0 * seeds[2:13] - 1.0, 0.85 + 0.15 * seeds[13:21]
         z = L[0] * jnp.cos(theta)
         motion = WheelMotion(jnp.zeros(()), z, theta, *rates[:3], L, rates[3:])
-        motion = settled(s, motion, stance.contact, locked)
-        law = Law(s, friction, False, False, jnp.asarray(1e-6), restitution)
-        change = resolve(law, motion, stance, event)
-        legs = directions(s, theta)
+        motion = project_motion(s, motion, stance.contact, locked)
+        law = ContactLaw(s, friction, False, False, jnp.asarray(1e-6), restitution)
+        change = resolve_event(law, motion, stance, event)
+        legs = leg_directions(s, theta)
         speed = lambda at: (at.vz - at.dL * legs.cos + at.L * at.dtheta * legs.sin)[0]
         energies = kinetic_energy(s, motion), kinetic_energy(s, change.motion)
         within = jnp.max(motion.L) <= s.L0  # no leg is longer than its stopper lets it be
-        return speed(motion), speed(change.motion), *energies, within & (change.solutions > 0)
+        return speed(motion), speed(change.motion), *energies, within & (change.n_solutions > 0)
 
-    seeds = jnp.asarray(np.random.default_rng(SEED).random((CASES, 21)))
+    seeds = jnp.asarray(np.random.default_rng(RNG_SEED).random((N_IMPACTS, 21)))
     return jax.jit(lambda *given: jax.vmap(lambda one: strikes(one, *given))(seeds))
 
 
 @pytest.mark.parametrize("most", [3.0, jnp.inf])
-def test_energy_never_grows_and_newtons_law_holds_where_it_may(impacts, most):
-    kept = []
+def test_energy_never_grows_and_newtons_law_of_restitution_holds_if_it_can(random_impacts, most):
+    retained_rows = []
     for restitution in (0.0, 0.5, 1.0):
-        before, after, had, has, sound = map(np.asarray, impacts(restitution, most))
+        before, after, had, has, sound = map(np.asarray, random_impacts(restitution, most))
         struck = (before < -1e-3) & sound
         assert struck.sum() > 40
         assert np.all(has[struck] <= had[struck] + 1e-9)
-        kept.append(after[struck] + restitution * before[struck])
+        retained_rows.append(after[struck] + restitution * before[struck])
         assert np.all(after[struck] >= -1e-6)
-    np.testing.assert_allclose(kept[0], np.maximum(kept[0], 0.0), atol=1e-6)
+    np.testing.assert_allclose(retained_rows[0], np.maximum(retained_rows[0], 0.0), atol=1e-6)
     # Coulomb's friction lets Newton's law create energy now and then: only then less comes back.
-    exact = [np.mean(np.abs(part) < 1e-9) for part in kept]
+    exact = [np.mean(np.abs(part) < 1e-9) for part in retained_rows]
     assert min(exact) > 0.5
     assert exact[2] < 1.0
 
 
-def test_restitution_outside_of_its_domain_is_refused_in_a_sentence():
+def test_restitution_outside_its_domain_is_refused_in_one_sentence():
     with pytest.raises(ValueError, match="0 to 1"):
         vrw.UnilateralWheel(restitution=1.5)
     assert vrw.UnilateralWheel(restitution=0.0).restitution is None
     model = vrw.UnilateralWheel(restitution=0.5)
     with pytest.raises(ValueError, match="in lanes"):
-        vrw.steps(vrw.WheelParams(), np.array([START]), model=model)
+        vrw.step_batch(vrw.WheelParams(), np.array([START]), model=model)
     with pytest.raises(ValueError, match="engine='auto' or 'diffrax'"):
         vrw.step(vrw.WheelParams(), START, model=model, engine="lanes")
 
 
 @pytest.mark.slow
-def test_a_step_with_restitution_is_that_of_another_code():
+def test_a_step_with_restitution_agrees_with_another_code():
     model = vrw.UnilateralWheel(friction=0.7, restitution=0.3)
-    step = vrw.step(vrw.WheelParams(), START, model=model, options=vrw.Options.tight())
-    wheel = complementarity.Wheel(0.7, restitution=0.3)
-    other = complementarity.one_step(wheel, complementarity.paper_start(wheel, *START))
+    step = vrw.step(vrw.WheelParams(), START, model=model, options=vrw.StepOptions.tight())
+    wheel = complementarity.ComplementarityWheel(0.7, restitution=0.3)
+    other = complementarity.compute_step(wheel, complementarity.paper_start(wheel, *START))
     assert int(step.outcome) == vrw.Outcome.STEPPED
     assert abs(float(step.period) - other.durations.sum()) < 1e-8

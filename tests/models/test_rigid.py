@@ -5,80 +5,90 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import integrate, special
-from support.batched import full_steps, wheels_like
+from support.batched import compute_full_steps, make_parameter_rows
 
 import vrw_jax as vrw
 from vrw_jax.models.rigid import carlson_rf
 
-HALF = np.pi / 8
+HALF_ANGLE = np.pi / 8
 # Point mass at the hub, l = 1, g = 9.8, slope 0.15: Tedrake, Underactuated Robotics.
-POINT_MASS = vrw.WheelParams(hub_mass=1.0, leg_mass=1e-15, gravity=9.8, slope=0.15)
+POINT_MASS_WHEEL = vrw.WheelParams(hub_mass=1.0, leg_mass=1e-15, gravity=9.8, slope=0.15)
 
 
-def walks(**changes):
+def rigid_walks(**changes):
     """A wheel that never lifts off on its own account, so that only the map is looked at."""
     return vrw.RigidWheel(stop_at_lift_off=False, **changes)
 
 
 def test_the_published_fixed_point_and_multiplier():
     model = vrw.RigidWheel()
-    x = model.start(POINT_MASS)
-    result = vrw.step(POINT_MASS, x, model=model)
+    x = model.default_start(POINT_MASS_WHEEL)
+    result = vrw.step(POINT_MASS_WHEEL, x, model=model)
     assert int(result.outcome) == vrw.Outcome.STEPPED
     assert abs(float(result.post_impact[1]) - 1.497247441300221) < 1e-12
     np.testing.assert_allclose(result.section_state, x, rtol=1e-13)
-    slope = jax.jacfwd(lambda x: vrw.return_map(POINT_MASS, x, model=model))(x)
+    slope = jax.jacfwd(lambda x: vrw.return_map(POINT_MASS_WHEEL, x, model=model))(x)
     assert abs(float(slope[1, 1]) - 0.5) < 1e-12
 
 
 def test_leg_masses_enter_by_their_inertia_about_the_hub():
     p = vrw.WheelParams(slope=0.15)
     mass, inertia = 10.0 + 8.0, 8.0 * 0.7**2
-    result = vrw.step(p, [HALF, 2.0, 0.0], model=walks())
-    kept = (mass * np.cos(np.pi / 4) + inertia) / (mass + inertia)
-    np.testing.assert_allclose(result.post_impact[1], 2.0 * kept, rtol=1e-14)
-    gained = 4.0 * mass * 9.81 * np.sin(HALF) * np.sin(0.15) / (mass + inertia)
-    np.testing.assert_allclose(result.section_state[1], np.sqrt((2.0 * kept) ** 2 + gained))
+    result = vrw.step(p, [HALF_ANGLE, 2.0, 0.0], model=rigid_walks())
+    retained = (mass * np.cos(np.pi / 4) + inertia) / (mass + inertia)
+    np.testing.assert_allclose(result.post_impact[1], 2.0 * retained, rtol=1e-14)
+    gained = 4.0 * mass * 9.81 * np.sin(HALF_ANGLE) * np.sin(0.15) / (mass + inertia)
+    np.testing.assert_allclose(result.section_state[1], np.sqrt((2.0 * retained) ** 2 + gained))
 
 
 @pytest.mark.parametrize("slope", [0.1, 0.3, 0.39, 0.45])
 @pytest.mark.parametrize("rate", [1.3, 2.0, 4.0])
-def test_the_period_is_that_of_quadrature(slope, rate):
-    result = vrw.step(vrw.WheelParams(slope=slope), [HALF, rate, 0.0], model=walks())
+def test_the_period_agrees_with_quadrature(slope, rate):
+    result = vrw.step(vrw.WheelParams(slope=slope), [HALF_ANGLE, rate, 0.0], model=rigid_walks())
     if int(result.outcome) == vrw.Outcome.FELL_BACK:
         assert rate * float(result.post_impact[1]) / rate < 1.1  # too slow for the apex
         return
     start = float(result.post_impact[1])
     g_over_l = 18.0 * 9.81 / (18.0 + 8.0 * 0.7**2)
     squared = lambda angle: (
-        start**2 + 2.0 * g_over_l * (np.cos(slope - HALF) - np.cos(angle + slope))
+        start**2 + 2.0 * g_over_l * (np.cos(slope - HALF_ANGLE) - np.cos(angle + slope))
     )
     truth_period, _ = integrate.quad(
-        lambda angle: 1.0 / np.sqrt(squared(angle)), -HALF, HALF, epsabs=1e-13, epsrel=1e-13
+        lambda angle: 1.0 / np.sqrt(squared(angle)),
+        -HALF_ANGLE,
+        HALF_ANGLE,
+        epsabs=1e-13,
+        epsrel=1e-13,
     )
     assert abs(float(result.period) - truth_period) < 1e-12
 
 
-def test_carlsons_integral_is_scipys():
+def test_carlsons_integral_agrees_with_scipy():
     rng = np.random.default_rng(3)
     x, y, z = rng.uniform(0.0, 5.0, (3, 50))
     np.testing.assert_allclose(jax.vmap(carlson_rf)(x, y, z), special.elliprf(x, y, z), rtol=1e-14)
 
 
 def test_too_slow_a_start_falls_back():
-    result = vrw.step(vrw.WheelParams(slope=0.1), [HALF, 0.5, 0.0], model=vrw.RigidWheel())
+    result = vrw.step(vrw.WheelParams(slope=0.1), [HALF_ANGLE, 0.5, 0.0], model=vrw.RigidWheel())
     assert int(result.outcome) == vrw.Outcome.FELL_BACK
 
 
 def test_too_fast_a_start_lifts_off():
-    result = vrw.step(vrw.WheelParams(slope=0.1), [HALF, 6.0, 0.0], model=vrw.RigidWheel())
+    result = vrw.step(vrw.WheelParams(slope=0.1), [HALF_ANGLE, 6.0, 0.0], model=vrw.RigidWheel())
     assert int(result.outcome) == vrw.Outcome.LEG_1_LIFTED_OFF
 
 
 def test_derivatives_agree_with_differences():
-    told = lambda slope: vrw.step(vrw.WheelParams(slope=slope), [HALF, 2.0, 0.0], model=walks())
+    evaluate = lambda slope: vrw.step(
+        vrw.WheelParams(slope=slope), [HALF_ANGLE, 2.0, 0.0], model=rigid_walks()
+    )
     value = lambda slope: jnp.stack(
-        [told(slope).section_state[1], told(slope).period, told(slope).monitors.fore_foot_force]
+        [
+            evaluate(slope).section_state[1],
+            evaluate(slope).period,
+            evaluate(slope).margins.fore_foot_force,
+        ]
     )
     h = 1e-4
     difference = (value(0.15 + h) - value(0.15 - h)) / (2 * h)
@@ -86,37 +96,42 @@ def test_derivatives_agree_with_differences():
     np.testing.assert_allclose(jax.jacrev(value)(0.15), jax.jacfwd(value)(0.15), rtol=1e-13)
 
 
-def test_it_is_the_limit_of_the_viscoelastic_wheel_at_second_order():
+def test_the_rigid_wheel_is_the_second_order_limit_of_the_viscoelastic_wheel():
     """k = k0/e^2, c = c0/e, L* - L0 = d e^2: preload and damping ratio stay, the leg stiffens.
 
     The limit keeps the paper's landing, whose rear foot is held during the impulse. The classic
     landing, whose rear foot takes none, is not its limit (docs/physics.md).
     """
-    start = np.array([HALF, 2.0, 0.0])
+    start = np.array([HALF_ANGLE, 2.0, 0.0])
     sizes = np.array([1 / 16, 1 / 32, 1 / 64])
-    vectors = wheels_like(
+    vectors = make_parameter_rows(
         slope=0.15,
         stiffness=500.0 / sizes**2,
         damping=200.0 / sizes,
         natural_length=1.0 + 0.02 * sizes**2,
     )
     model = vrw.ViscoelasticWheel(stop_at_lift_off=False)
-    soft = full_steps(vectors, np.tile(start, (3, 1)), model=model)
+    soft = compute_full_steps(vectors, np.tile(start, (3, 1)), model=model)
     assert np.all(np.asarray(soft.outcome) == vrw.Outcome.STEPPED)
     p = vrw.WheelParams(slope=0.15)
-    held = vrw.step(p, start, model=walks(held_landing=True))
-    classic = vrw.step(p, start, model=walks())
-    errors = np.abs(np.asarray(soft.period) - float(held.period))
+    step_result = vrw.step(p, start, model=rigid_walks(held_landing=True))
+    classic = vrw.step(p, start, model=rigid_walks())
+    errors = np.abs(np.asarray(soft.period) - float(step_result.period))
     rates = np.log2(errors[:-1] / errors[1:])
     np.testing.assert_allclose(rates, 2.0, atol=0.1)
     assert abs(float(classic.section_state[1]) - float(soft.section_state[-1, 1])) > 0.1
 
 
-def test_it_has_the_same_face():
+def test_the_rigid_wheel_has_the_interface_of_the_other_models():
     p = vrw.WheelParams(slope=0.15)
-    walk = vrw.walk(p, vrw.RigidWheel().start(p), 3, model=vrw.RigidWheel())
+    walk = vrw.walk(p, vrw.RigidWheel().default_start(p), 3, model=vrw.RigidWheel())
     assert int(walk.outcome) in list(vrw.Outcome)
-    data = vrw.simulate(POINT_MASS, vrw.RigidWheel().start(POINT_MASS), 2, model=vrw.RigidWheel())
+    data = vrw.simulate(
+        POINT_MASS_WHEEL,
+        vrw.RigidWheel().default_start(POINT_MASS_WHEEL),
+        2,
+        model=vrw.RigidWheel(),
+    )
     assert data.sizes["time"] > 10
     total = data["energy"] if "energy" in data else data["total_energy"]
     drops = np.diff(total.values)

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.batched import NAMES, SIZE, full_steps
+from support.batched import BATCH_SIZE, NAMES, compute_full_steps
 
 import vrw_jax as vrw
 
@@ -19,35 +19,35 @@ RANGES = {
     "slope": (-1.0, 1.0),
     "gravity": (0.1, 30.0),
 }
-anything = st.floats(allow_nan=True, allow_infinity=True, width=64)
-sensible = st.tuples(*(st.floats(*RANGES[name]) for name in NAMES))
-wild = st.tuples(*(anything for _ in NAMES))
+any_float = st.floats(allow_nan=True, allow_infinity=True, width=64)
+sensible_parameters = st.tuples(*(st.floats(*RANGES[name]) for name in NAMES))
+any_parameters = st.tuples(*(any_float for _ in NAMES))
 start = st.tuples(st.floats(-1.0, 1.0), st.floats(0.0, 10.0), st.floats(-5.0, 5.0))
-OPTIONS = vrw.Options(rtol=1e-6, atol=1e-6, max_solver_steps=2000)
+OPTIONS = vrw.StepOptions(rtol=1e-6, atol=1e-6, max_solver_steps=2000)
 
 
-def check(lanes):
-    result = full_steps(*map(np.asarray, zip(*lanes, strict=True)), OPTIONS)
+def assert_valid_outcomes(lanes):
+    result = compute_full_steps(*map(np.asarray, zip(*lanes, strict=True)), OPTIONS)
     assert np.all(np.isin(result.outcome, list(vrw.Outcome)))
     for leaf in jax.tree.leaves(result):
         assert np.all(np.isfinite(leaf))
-    stepped = np.asarray(result.outcome) == vrw.Outcome.STEPPED
+    step_result = np.asarray(result.outcome) == vrw.Outcome.STEPPED
     assert np.all(np.asarray(result.durations) >= 0.0)
-    assert np.all(np.asarray(result.section_state)[stepped, 1] > 0.0)
+    assert np.all(np.asarray(result.section_state)[step_result, 1] > 0.0)
 
 
-def batches(vector, x):
+def make_batch(vector, x):
     """Sixteen lanes at a time: neighbours of every kind."""
-    return st.lists(st.tuples(vector, x), min_size=SIZE, max_size=SIZE)
+    return st.lists(st.tuples(vector, x), min_size=BATCH_SIZE, max_size=BATCH_SIZE)
 
 
 @settings(max_examples=15, deadline=None)
-@given(lanes=batches(sensible, start))
+@given(lanes=make_batch(sensible_parameters, start))
 def test_every_wheel_gets_an_outcome(lanes):
-    check(lanes)
+    assert_valid_outcomes(lanes)
 
 
 @settings(max_examples=10, deadline=None)
-@given(lanes=batches(wild, st.tuples(anything, anything, anything)))
-def test_even_nonsense_gets_an_outcome(lanes):
-    check(lanes)
+@given(lanes=make_batch(any_parameters, st.tuples(any_float, any_float, any_float)))
+def test_every_invalid_input_gets_an_outcome(lanes):
+    assert_valid_outcomes(lanes)

@@ -6,37 +6,37 @@ from oracle import complementarity
 
 import vrw_jax as vrw
 
-TIGHT = vrw.Options.tight()
+TIGHT_OPTIONS = vrw.StepOptions.tight()
 START = (0.1, 1.6, -0.1)
-STEPS = [  # friction, damping, slope, start
+STEP_CASES = [  # friction, damping, slope, start
     (0.7, 200.0, 0.3, START),  # lands sliding
     (0.5, 100.0, 0.3, (0.1, 1.2, -0.1)),  # flies
     (0.5, 100.0, 0.3, (0.1, 2.2, -0.1)),  # reverses
     (1e4, 100.0, 0.3, START),  # drags the rear foot
 ]
-WIDE = (0.1, 0.3, 0.5, 0.7, 1.0, 1.3, 2.0, 5.0, 30.0, 1e4)
-CUT = 1e-10
+WIDE_BOX_FRICTIONS = (0.1, 0.3, 0.5, 0.7, 1.0, 1.3, 2.0, 5.0, 30.0, 1e4)
+DIP_PERIOD_TOLERANCE_SECONDS = 1e-10
 """s; what stays down below a dip of 1e-13 m, in chains of sixty to ninety events: stoppers only
 push. By 7e-12 in the first of these steps, if what comes to rest hands on its momentum with its
 friction, 6e-9 if without."""
-CHAINS = 1e-9
+EVENT_CHAIN_TOLERANCE_SECONDS = 1e-9
 """s; the same of ten steps, eight hundred events together, and of chains of up to two hundred."""
 
 
-def told(friction, damping, slope, x, stoppers, n_steps=1, max_events=400):
+def compare_codes(friction, damping, slope, x, stoppers, n_steps=1, max_events=400):
     """Durations over all steps and the last section state, by the library and by the oracle."""
     # Friction is finite: what infinite friction would be chooses the program of test_unilateral.
-    model = vrw.UnilateralWheel(friction, max_events, stoppers, infinite="paper")
+    model = vrw.UnilateralWheel(friction, max_events, stoppers, infinite_friction_rule="paper")
     params = vrw.WheelParams(damping=damping, slope=slope)
-    wheel = complementarity.Wheel(
+    wheel = complementarity.ComplementarityWheel(
         friction, c=damping, slope=slope, one_sided=stoppers == "one-sided"
     )
     place, durations, oracle = complementarity.paper_start(wheel, *x), 0.0, 0.0
     for _ in range(n_steps):
-        step = vrw.step(params, x, model=model, options=TIGHT)
+        step = vrw.step(params, x, model=model, options=TIGHT_OPTIONS)
         assert int(step.outcome) == vrw.Outcome.STEPPED
         assert int(step.fewest_solutions) == 1
-        other = complementarity.one_step(wheel, place)
+        other = complementarity.compute_step(wheel, place)
         x, place = step.section_state, other.end
         durations, oracle = durations + np.asarray(step.durations), oracle + other.durations
     q, v = other.end.q, other.end.v
@@ -44,9 +44,9 @@ def told(friction, damping, slope, x, stoppers, n_steps=1, max_events=400):
     return durations, np.asarray(x[:20]), oracle, ends
 
 
-@pytest.mark.parametrize(("friction", "damping", "slope", "x"), STEPS)
-def test_a_step_is_that_of_another_event_driven_code(friction, damping, slope, x):
-    durations, state, oracle, ends = told(friction, damping, slope, x, "bilateral")
+@pytest.mark.parametrize(("friction", "damping", "slope", "x"), STEP_CASES)
+def test_a_step_agrees_with_another_event_driven_code(friction, damping, slope, x):
+    durations, state, oracle, ends = compare_codes(friction, damping, slope, x, "bilateral")
     assert abs(durations.sum() - oracle.sum()) < 1e-12
     # A foot that lands at 2e-4 m/s reads no more than 32 roundings of its height for 3.5e-11 s.
     np.testing.assert_allclose(durations, oracle, atol=5e-11)
@@ -54,11 +54,11 @@ def test_a_step_is_that_of_another_event_driven_code(friction, damping, slope, x
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("friction", "damping", "slope", "x"), STEPS[:3])
-def test_a_step_with_stoppers_that_only_push_is_that_of_another_code(friction, damping, slope, x):
-    durations, state, oracle, ends = told(friction, damping, slope, x, "one-sided")
-    assert abs(durations.sum() - oracle.sum()) < CUT
-    np.testing.assert_allclose(state[:4], ends[:4], atol=10.0 * CUT)
+@pytest.mark.parametrize(("friction", "damping", "slope", "x"), STEP_CASES[:3])
+def test_a_step_with_one_sided_stoppers_agrees_with_another_code(friction, damping, slope, x):
+    durations, state, oracle, ends = compare_codes(friction, damping, slope, x, "one-sided")
+    assert abs(durations.sum() - oracle.sum()) < DIP_PERIOD_TOLERANCE_SECONDS
+    np.testing.assert_allclose(state[:4], ends[:4], atol=10.0 * DIP_PERIOD_TOLERANCE_SECONDS)
 
 
 @pytest.mark.slow
@@ -68,61 +68,71 @@ def test_a_step_with_stoppers_that_only_push_is_that_of_another_code(friction, d
         (0.7, 300.0, "bilateral", 1e-9),
         (1.3, 200.0, "bilateral", 1e-9),
         (1e4, 50.0, "bilateral", 1e-9),
-        (0.7, 300.0, "one-sided", CHAINS),  # some five hundred events
-        (1.3, 200.0, "one-sided", CHAINS),  # eight hundred
+        (0.7, 300.0, "one-sided", EVENT_CHAIN_TOLERANCE_SECONDS),  # some five hundred events
+        (1.3, 200.0, "one-sided", EVENT_CHAIN_TOLERANCE_SECONDS),  # eight hundred
     ],
 )
-def test_ten_steps_are_those_of_another_code(friction, damping, stoppers, error):
-    durations, state, oracle, ends = told(friction, damping, 0.3, START, stoppers, n_steps=10)
+def test_ten_steps_agree_with_another_code(friction, damping, stoppers, error):
+    durations, state, oracle, ends = compare_codes(
+        friction, damping, 0.3, START, stoppers, n_steps=10
+    )
     assert abs(durations.sum() - oracle.sum()) < error
     np.testing.assert_allclose(state[:4], ends[:4], atol=error)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("friction", WIDE)
-def test_steps_over_a_wide_box_are_those_of_another_code(friction):
+@pytest.mark.parametrize("friction", WIDE_BOX_FRICTIONS)
+def test_steps_over_a_wide_box_agree_with_another_code(friction):
     draw = np.random.default_rng(round(10 * friction)).uniform
     x = (draw(0.05, 0.15), draw(1.4, 2.2), draw(-0.3, 0.0))
-    durations, _, oracle, _ = told(friction, draw(20.0, 400.0), draw(0.2, 0.34), x, "bilateral")
+    durations, _, oracle, _ = compare_codes(
+        friction, draw(20.0, 400.0), draw(0.2, 0.34), x, "bilateral"
+    )
     assert abs(durations.sum() - oracle.sum()) < 1e-8
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("friction", WIDE)
-def test_steps_over_a_wide_box_with_stoppers_that_only_push(friction):
+@pytest.mark.parametrize("friction", WIDE_BOX_FRICTIONS)
+def test_steps_over_a_wide_box_with_one_sided_stoppers_agree_with_another_code(friction):
     draw = np.random.default_rng(round(10 * friction)).uniform
     x = (draw(0.05, 0.15), draw(1.4, 2.2), draw(-0.3, 0.0))
-    durations, _, oracle, _ = told(friction, draw(20.0, 400.0), draw(0.2, 0.34), x, "one-sided")
-    assert abs(durations.sum() - oracle.sum()) < CHAINS
+    durations, _, oracle, _ = compare_codes(
+        friction, draw(20.0, 400.0), draw(0.2, 0.34), x, "one-sided"
+    )
+    assert abs(durations.sum() - oracle.sum()) < EVENT_CHAIN_TOLERANCE_SECONDS
 
 
 @pytest.mark.slow
-def test_a_chain_of_five_hundred_events_is_cut_by_their_bound_alone():
+def test_only_the_event_limit_ends_a_chain_of_five_hundred_events():
     """At 0.2723 s and eight times more three combinations of forces are admissible: both codes take
     the one with most feet at rest."""
-    whole, _, oracle, _ = told(1e4, 200.0, 0.3, START, "one-sided", max_events=4000)
-    assert abs(whole.sum() - oracle.sum()) < CUT
-    model = vrw.UnilateralWheel(1e4, stoppers="one-sided", infinite="paper")
-    cut = vrw.step(vrw.WheelParams(damping=200.0, slope=0.3), START, model=model, options=TIGHT)
+    full_values, _, oracle, _ = compare_codes(1e4, 200.0, 0.3, START, "one-sided", max_events=4000)
+    assert abs(full_values.sum() - oracle.sum()) < DIP_PERIOD_TOLERANCE_SECONDS
+    model = vrw.UnilateralWheel(1e4, stoppers="one-sided", infinite_friction_rule="paper")
+    cut = vrw.step(
+        vrw.WheelParams(damping=200.0, slope=0.3), START, model=model, options=TIGHT_OPTIONS
+    )
     assert 1e-5 < abs(cut.period - oracle.sum()) < 1e-4  # 4.2e-5 s: 264 of 558 events are made
 
 
 @pytest.mark.parametrize("x", [START, (0.1, 4.0, -0.1)])
-def test_without_friction_a_wheel_falls_back_in_both_codes(x):
-    wheel = complementarity.Wheel(0.0)
-    with pytest.raises(complementarity.LostError, match="fell back"):
-        complementarity.one_step(wheel, complementarity.paper_start(wheel, *x))
-    model = vrw.UnilateralWheel(friction=0.0, infinite="paper")
-    step = vrw.step(vrw.WheelParams(), x, model=model, options=TIGHT)
+def test_a_wheel_without_friction_falls_back_in_both_codes(x):
+    wheel = complementarity.ComplementarityWheel(0.0)
+    with pytest.raises(complementarity.NoAdmissibleContactError, match="fell back"):
+        complementarity.compute_step(wheel, complementarity.paper_start(wheel, *x))
+    model = vrw.UnilateralWheel(friction=0.0, infinite_friction_rule="paper")
+    step = vrw.step(vrw.WheelParams(), x, model=model, options=TIGHT_OPTIONS)
     assert int(step.outcome) == vrw.Outcome.FELL_BACK
 
 
-def test_a_wheel_on_two_stiff_legs_slides_like_a_block_in_the_oracle_too():
-    wheel = complementarity.Wheel(0.2, slope=0.3)
+def test_a_wheel_on_two_stiff_legs_slides_like_a_block_in_the_reference_code():
+    wheel = complementarity.ComplementarityWheel(0.2, slope=0.3)
     q, v = np.r_[0.0, np.cos(np.pi / 8), -np.pi / 8, np.ones(8)], np.zeros(11)
     v[0] = 0.1
-    modes = (complementarity.DOWN,) * 2 + (complementarity.OFF,) * 6
-    acceleration, on_feet, _ = complementarity._carried(wheel, q, v, modes, (True,) * 8)
-    along = 9.81 * (np.sin(0.3) - 0.2 * np.cos(0.3))
-    np.testing.assert_allclose(acceleration[:3], [along, 0.0, 0.0], atol=1e-12)
+    modes = (complementarity.SLIP_DOWNHILL,) * 2 + (complementarity.CONTACT_OFF,) * 6
+    acceleration, on_feet, _ = complementarity._solve_contact_forces(
+        wheel, q, v, modes, (True,) * 8
+    )
+    tangential_part = 9.81 * (np.sin(0.3) - 0.2 * np.cos(0.3))
+    np.testing.assert_allclose(acceleration[:3], [tangential_part, 0.0, 0.0], atol=1e-12)
     assert abs(on_feet[:, 1].sum() - 18.0 * 9.81 * np.cos(0.3)) < 1e-10

@@ -3,84 +3,91 @@
 import numpy as np
 import pytest
 from support import truth
-from support.batched import full_steps, jacobians, lean_steps
+from support.batched import compute_full_steps, compute_jacobians, compute_states_and_work
 
 import vrw_jax as vrw
 
-STARTS = truth.table("step", "start")
+STARTS = truth.stack_quantity("step", "start")
 
 
-def values(options):
+def compute_reference_steps(options):
     """States and durations of all cases."""
-    return lean_steps(truth.PARAMETERS, STARTS, options)[0]
+    return compute_states_and_work(truth.REFERENCE_PARAMETERS, STARTS, options)[0]
 
 
-VALUES = np.concatenate([truth.table("step", "section_state"), truth.table("step", "durations")], 1)
+VALUES = np.concatenate(
+    [truth.stack_quantity("step", "section_state"), truth.stack_quantity("step", "durations")], 1
+)
 BY_PARAMETER = np.concatenate(
     [
-        truth.table("step", "d_section_state_d_params"),
-        truth.table("step", "d_durations_d_params"),
+        truth.stack_quantity("step", "d_section_state_d_params"),
+        truth.stack_quantity("step", "d_durations_d_params"),
     ],
     1,
 )
 BY_START = np.concatenate(
-    [truth.table("step", "d_section_state_d_start"), truth.table("step", "d_durations_d_start")], 1
+    [
+        truth.stack_quantity("step", "d_section_state_d_start"),
+        truth.stack_quantity("step", "d_durations_d_start"),
+    ],
+    1,
 )
 
 
 @pytest.mark.parametrize(
     ("options", "claimed"),
-    [(vrw.Options(), 1e-9), (vrw.Options.tight(), 1e-12)],
+    [(vrw.StepOptions(), 1e-9), (vrw.StepOptions.tight(), 1e-12)],
     ids=["default", "tight"],
 )
-def test_state_and_durations_are_right_to_the_claimed_error(options, claimed):
-    found = values(options)
-    assert truth.scaled_error(found, VALUES) < claimed
+def test_state_and_durations_are_accurate_to_the_claimed_error(options, claimed):
+    solution = compute_reference_steps(options)
+    assert truth.compute_scaled_error(solution, VALUES) < claimed
 
 
 @pytest.mark.parametrize(
     ("options", "claimed"),
-    [(vrw.Options(), 1e-9), (vrw.Options.tight(), 1e-12)],
+    [(vrw.StepOptions(), 1e-9), (vrw.StepOptions.tight(), 1e-12)],
     ids=["default", "tight"],
 )
-def test_first_derivatives_are_right_to_the_claimed_error(options, claimed):
-    by_parameter, by_start = jacobians(truth.PARAMETERS, STARTS, options)
-    assert truth.scaled_error(by_parameter, BY_PARAMETER) < claimed
-    assert truth.scaled_error(by_start, BY_START) < claimed
+def test_first_derivatives_are_accurate_to_the_claimed_error(options, claimed):
+    by_parameter, by_start = compute_jacobians(truth.REFERENCE_PARAMETERS, STARTS, options)
+    assert truth.compute_scaled_error(by_parameter, BY_PARAMETER) < claimed
+    assert truth.compute_scaled_error(by_start, BY_START) < claimed
 
 
 def test_derivative_error_is_at_most_ten_times_the_value_error():
     # At tolerances where rounding (1e-13 in derivatives) plays no part.
     for tolerance in (1e-8, 1e-10):
-        options = vrw.Options(rtol=tolerance, atol=tolerance)
-        of_values = truth.scaled_error(values(options), VALUES)
-        by_parameter, by_start = jacobians(truth.PARAMETERS, STARTS, options)
+        options = vrw.StepOptions(rtol=tolerance, atol=tolerance)
+        of_values = truth.compute_scaled_error(compute_reference_steps(options), VALUES)
+        by_parameter, by_start = compute_jacobians(truth.REFERENCE_PARAMETERS, STARTS, options)
         of_derivatives = max(
-            truth.scaled_error(by_parameter, BY_PARAMETER), truth.scaled_error(by_start, BY_START)
+            truth.compute_scaled_error(by_parameter, BY_PARAMETER),
+            truth.compute_scaled_error(by_start, BY_START),
         )
         assert of_derivatives < 10.0 * of_values
 
 
-def test_indicators_impact_and_step_length_are_right():
-    found = full_steps(truth.PARAMETERS, STARTS, vrw.Options.tight())
-    assert np.all(np.asarray(found.outcome) == vrw.Outcome.STEPPED)
+def test_indicators_impact_and_step_length_are_accurate():
+    solution = compute_full_steps(truth.REFERENCE_PARAMETERS, STARTS, vrw.StepOptions.tight())
+    assert np.all(np.asarray(solution.outcome) == vrw.Outcome.STEPPED)
     for quantity, key in [
-        (found.post_impact, "post_impact"),
-        (found.step_length, "step_length"),
-        (found.indicators.lambda_I4, "lambda_impulse_4"),
-        (found.indicators.lambda_2, "lambda2_plus"),
-        (found.indicators.lambda_4, "lambda4_plus"),
+        (solution.post_impact, "post_impact"),
+        (solution.step_length, "step_length"),
+        (solution.indicators.lambda_I4, "lambda_impulse_4"),
+        (solution.indicators.lambda_2, "lambda2_plus"),
+        (solution.indicators.lambda_4, "lambda4_plus"),
     ]:
         # Algebra, not integration: round-off of forces of some 100 N.
-        assert truth.scaled_error(quantity, truth.table("step", key)) < 1e-12, key
+        assert truth.compute_scaled_error(quantity, truth.stack_quantity("step", key)) < 1e-12, key
 
 
 @pytest.mark.parametrize("solver", ["Tsit5", "Dopri5", "Kvaerno5"])
-def test_any_solver_may_be_named_and_agrees(solver):
+def test_all_solvers_agree(solver):
     # Kvaerno5's implicit stages stop at their own tolerance: ten times the explicit bound.
-    options = vrw.Options(solver=solver, rtol=1e-9, atol=1e-9)
-    found = values(options)
-    assert truth.scaled_error(found, VALUES) < 1e-7
+    options = vrw.StepOptions(solver=solver, rtol=1e-9, atol=1e-9)
+    solution = compute_reference_steps(options)
+    assert truth.compute_scaled_error(solution, VALUES) < 1e-7
 
 
 @pytest.mark.parametrize(
@@ -95,13 +102,15 @@ def test_work_falls_with_the_order_of_the_solver(solver, order):
     tolerances = [1e-6, 1e-7, 1e-8, 1e-9]
     steps, errors, derivative_errors = [], [], []
     for tolerance in tolerances:
-        options = vrw.Options(
+        options = vrw.StepOptions(
             solver=solver, rtol=tolerance, atol=tolerance, derivative_tightening=1.0
         )
-        found, tried = map(np.asarray, lean_steps(truth.PARAMETERS, STARTS, options))
+        solution, tried = map(
+            np.asarray, compute_states_and_work(truth.REFERENCE_PARAMETERS, STARTS, options)
+        )
         steps.append(np.mean(tried))
-        errors.append(np.sqrt(np.mean((found - VALUES) ** 2)))
-        by_start = np.asarray(jacobians(truth.PARAMETERS, STARTS, options)[1])
+        errors.append(np.sqrt(np.mean((solution - VALUES) ** 2)))
+        by_start = np.asarray(compute_jacobians(truth.REFERENCE_PARAMETERS, STARTS, options)[1])
         derivative_errors.append(np.sqrt(np.mean((by_start - BY_START) ** 2)))
     slope = lambda error: -np.polyfit(np.log(steps), np.log(error), 1)[0]
     assert slope(errors) > order - 1.0

@@ -12,35 +12,40 @@ from oracle import moreau_jean
 from scipy.optimize import brentq
 
 import vrw_jax as vrw
-from vrw_jax.models.unilateral.contacts import OFF, SLIP_DOWN, SLIP_UP, STICK
-from vrw_jax.models.unilateral.events import Law, event_of, resolve
+from vrw_jax.models.unilateral.contacts import (
+    CONTACT_OFF,
+    CONTACT_SLIP_DOWN,
+    CONTACT_SLIP_UP,
+    CONTACT_STICK,
+)
+from vrw_jax.models.unilateral.events import ContactLaw, classify_event, resolve_event
 from vrw_jax.models.unilateral.mechanics import (
     WheelMotion,
-    directions,
     foot_heights,
     kinetic_energy,
+    leg_directions,
     potential_energy,
 )
 from vrw_jax.models.unilateral.motion import (
-    Stance,
-    Tally,
+    Accumulators,
+    ContactState,
     airborne_stopper_force,
-    field,
-    flow_of,
-    forces,
-    guards,
-    guards_of,
-    pack,
-    unpack,
+    compute_forces,
+    guard_values,
+    make_guard_layout,
+    make_mode_dynamics,
+    pack_state,
+    unpack_state,
+    vector_field,
 )
-from vrw_jax.models.unilateral.section import opened
+from vrw_jax.models.unilateral.section import unpack_section_state
 from vrw_jax.numerics.events import integrate_phase
-from vrw_jax.numerics.minima import Watched
+from vrw_jax.numerics.minima import MonitoredFunctions
 
 START = (0.1, 1.6, -0.1)
-TIGHT = vrw.Options.tight()
+TIGHT_OPTIONS = vrw.StepOptions.tight()
 TABLE_1 = vrw.WheelParams()
-SCENES = {  # friction, damping, dtheta at the start: what happens in the first step
+STEP_SCENES = {  # friction, damping, dtheta at the start: what happens in the first step
     "lands sliding": (0.7, 200.0, 1.6),
     "slips, sticks, slips again": (2.0, 200.0, 1.6),
     "sticks": (0.35, 300.0, 1.6),
@@ -51,41 +56,41 @@ SCENES = {  # friction, damping, dtheta at the start: what happens in the first 
 }
 
 
-def stepped(friction, damping=200.0, x=START, options=TIGHT):
+def compute_step(friction, damping=200.0, x=START, options=TIGHT_OPTIONS):
     """One full step; infinite friction is the paper's."""
     params = vrw.WheelParams(damping=damping)
-    model = vrw.UnilateralWheel(friction=friction, infinite="paper")
+    model = vrw.UnilateralWheel(friction=friction, infinite_friction_rule="paper")
     return vrw.step(params, x, model=model, options=options)
 
 
 @pytest.fixture(scope="module")
-def traces():
+def scene_traces():
     """The motion of each scene, phase by phase, with what it loses."""
-    told = {}
-    for name, (friction, damping, dtheta) in SCENES.items():
+    result_by_name = {}
+    for name, (friction, damping, dtheta) in STEP_SCENES.items():
         wheel, params = vrw.UnilateralWheel(friction=friction), vrw.WheelParams(damping=damping)
-        x = wheel.full_section(params, jnp.asarray([START[0], dtheta, START[2]]))
-        told[name] = (params, friction, wheel.trace(params, x, TIGHT, 12))
-    return told
+        x = wheel.embed_section(params, jnp.asarray([START[0], dtheta, START[2]]))
+        result_by_name[name] = (params, friction, wheel.sample_step(params, x, TIGHT_OPTIONS, 12))
+    return result_by_name
 
 
-def phases(params, trace):
+def iterate_phases(params, trace):
     """Motions and tallies (samples first) of the phases that happened."""
     for k in np.flatnonzero(np.asarray(trace.duration) > 0.0):
-        motion, tally = jax.vmap(unpack)(trace.state[k])
+        motion, tally = jax.vmap(unpack_state)(trace.state[k])
         yield k, motion, tally
 
 
-def total_energy(s, motion):
+def compute_total_energy(s, motion):
     return np.asarray(
         jax.vmap(lambda m: kinetic_energy(s, m) + sum(potential_energy(s, m)))(motion)
     )
 
 
-def test_without_slip_the_gait_is_the_papers():
-    paper = vrw.walk(TABLE_1, START, 40, options=TIGHT).steps
-    held = vrw.UnilateralWheel(math.inf, infinite="paper")
-    ground = vrw.walk(TABLE_1, START, 40, model=held, options=TIGHT).steps
+def test_without_slip_the_gait_equals_that_of_the_paper():
+    paper = vrw.walk(TABLE_1, START, 40, options=TIGHT_OPTIONS).steps
+    held_values = vrw.UnilateralWheel(math.inf, infinite_friction_rule="paper")
+    ground = vrw.walk(TABLE_1, START, 40, model=held_values, options=TIGHT_OPTIONS).steps
     assert float(jnp.max(jnp.abs(paper.section_state[-1] - paper.section_state[-2]))) < 1e-12
     theta_rates = ground.section_state[-1][jnp.asarray([0, 1, 12])]
     np.testing.assert_allclose(theta_rates, paper.section_state[-1], atol=1e-11)
@@ -93,71 +98,73 @@ def test_without_slip_the_gait_is_the_papers():
     assert abs(float(jnp.sum(ground.durations[-1] - paper.durations[-1]))) < 1e-11
 
 
-def test_without_slip_a_step_is_the_papers_to_round_off():
-    paper = vrw.step(TABLE_1, START, options=TIGHT)
-    step = stepped(math.inf)
+def test_without_slip_a_step_equals_that_of_the_paper_to_round_off():
+    paper = vrw.step(TABLE_1, START, options=TIGHT_OPTIONS)
+    step = compute_step(math.inf)
     np.testing.assert_allclose(step.section_state[:2], paper.section_state[:2], atol=1e-12)
     np.testing.assert_allclose(step.section_state[12], paper.section_state[2], atol=1e-12)
     np.testing.assert_allclose(step.landing_normal[1], paper.indicators.lambda_I4, atol=1e-11)
 
 
-def test_feet_stay_above_the_slope_and_are_only_pushed(traces):
-    for params, _, trace in traces.values():
+def test_feet_stay_above_the_slope_and_contacts_only_push(scene_traces):
+    for params, _, trace in scene_traces.values():
         s = params.symbols()
-        for k, motion, _ in phases(params, trace):
-            legs = jax.vmap(directions, (None, 0))(s, motion.theta)
+        for k, motion, _ in iterate_phases(params, trace):
+            legs = jax.vmap(leg_directions, (None, 0))(s, motion.theta)
             heights = jax.vmap(foot_heights)(motion, legs)
             assert float(jnp.min(heights)) >= -1e-9
             assert float(jnp.min(trace.normal[k])) >= -1e-9
 
 
-def test_friction_lies_in_coulombs_cone_and_against_the_slip(traces):
-    for params, friction, trace in traces.values():
-        for k, motion, _ in phases(params, trace):
-            legs = jax.vmap(directions, (None, 0))(params.symbols(), motion.theta)
+def test_friction_lies_in_coulombs_cone_and_opposes_slip(scene_traces):
+    for params, friction, trace in scene_traces.values():
+        for k, motion, _ in iterate_phases(params, trace):
+            legs = jax.vmap(leg_directions, (None, 0))(params.symbols(), motion.theta)
             speed = motion.vx[:, None] - motion.dL * legs.sin
             speed = speed - motion.L * motion.dtheta[:, None] * legs.cos
             tangential, normal = trace.tangential[k], trace.normal[k]
             if math.isfinite(friction):
                 assert float(jnp.max(jnp.abs(tangential) - friction * normal)) <= 1e-9
-            for mode, sign in ((SLIP_DOWN, 1.0), (SLIP_UP, -1.0)):
+            for mode, sign in ((CONTACT_SLIP_DOWN, 1.0), (CONTACT_SLIP_UP, -1.0)):
                 sliding = np.asarray(trace.contact[k] == mode)
                 assert np.all(np.asarray(sign * speed)[:, sliding] >= -1e-9)
                 assert np.all(np.asarray(sign * tangential)[:, sliding] <= 1e-9)
-            resting = np.asarray(trace.contact[k] == STICK)
+            resting = np.asarray(trace.contact[k] == CONTACT_STICK)
             assert np.all(np.abs(np.asarray(speed)[:, resting]) <= 1e-9)
 
 
-def test_energy_balances_between_impacts_and_never_grows_at_one(traces):
-    for params, _, trace in traces.values():
+def test_energy_balances_between_impacts_and_never_grows_at_an_impact(scene_traces):
+    for params, _, trace in scene_traces.values():
         s, last = params.symbols(), None
-        for _, motion, tally in phases(params, trace):
-            balance = total_energy(s, motion) + np.asarray(tally.damping + tally.friction)
+        for _, motion, tally in iterate_phases(params, trace):
+            balance = compute_total_energy(s, motion) + np.asarray(tally.damping + tally.friction)
             np.testing.assert_allclose(balance, balance[0], atol=1e-9)
             if last is not None:
                 assert balance[0] <= last + 1e-9
             last = balance[-1]
 
 
-def test_energy_lost_in_a_step_is_told_by_its_causes(traces):
-    params, friction, trace = traces["lands sliding"]
+def test_energy_lost_in_a_step_is_reported_by_cause(scene_traces):
+    params, friction, trace = scene_traces["lands sliding"]
     s = params.symbols()
     wheel = vrw.UnilateralWheel(friction=friction)
-    before, _ = opened(s, wheel.full_section(params, jnp.asarray(START)))
+    before, _ = unpack_section_state(s, wheel.embed_section(params, jnp.asarray(START)))
     begin = float(kinetic_energy(s, before) + sum(potential_energy(s, before)))
-    *_, (_, motion, _) = phases(params, trace)
-    step = stepped(friction)
-    lost = step.energy_impacts + step.energy_damping + step.energy_friction
-    assert abs(float(lost) - (begin - total_energy(s, motion)[-1])) < 1e-9
+    *_, (_, motion, _) = iterate_phases(params, trace)
+    step = compute_step(friction)
+    lost_values = step.energy_impacts + step.energy_damping + step.energy_friction
+    assert abs(float(lost_values) - (begin - compute_total_energy(s, motion)[-1])) < 1e-9
     assert float(step.energy_friction) > 0.0
 
 
 @pytest.mark.parametrize("friction", [0.7, 1.3])
 def test_time_stepping_converges_to_the_same_step_in_first_order(friction):
-    truth = stepped(friction)
+    truth = compute_step(friction)
     sizes = (16e-4, 8e-4, 4e-4, 2e-4)
-    wheel = moreau_jean.Wheel(friction)
-    walks = [moreau_jean.one_step(wheel, moreau_jean.paper_start(wheel, *START), h) for h in sizes]
+    wheel = moreau_jean.TimeSteppingWheel(friction)
+    walks = [
+        moreau_jean.compute_step(wheel, moreau_jean.paper_start(wheel, *START), h) for h in sizes
+    ]
     errors = np.array([w.time - float(truth.period) for w in walks])
     np.testing.assert_allclose(errors[:-1] / errors[1:], 2.0, atol=0.15)
     once = 2.0 * errors[1:] - errors[:-1]  # extrapolated, s
@@ -168,25 +175,30 @@ def test_time_stepping_converges_to_the_same_step_in_first_order(friction):
     assert abs(walks[3].loaded_twice - float(truth.durations[0])) < 2e-3
 
 
-def oracle_start(x):
+def make_reference_start(x):
     """A full section state as the time-stepping code wants it."""
     theta = float(x[0]) - moreau_jean.ALPHA
     L, dL, code = (np.roll(x[4 + 8 * i : 12 + 8 * i], 1) for i in range(3))
     hub = [L[0] * np.sin(theta), L[0] * np.cos(theta), theta]
     rates = [x[2], x[3], x[1]]
     code = np.round(code).astype(int)
-    return moreau_jean.Start(np.r_[hub, L], np.r_[rates, dL], code >= 4, code % 4 != OFF)
+    return moreau_jean.StepStart(
+        np.r_[hub, L], np.r_[rates, dL], code >= 4, code % 4 != CONTACT_OFF
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("friction", "damping"), [(0.7, 300.0), (1.3, 200.0)])
-def test_the_period_of_a_gait_is_that_of_time_stepping(friction, damping):
+def test_the_period_of_a_gait_agrees_with_time_stepping(friction, damping):
     model, params = vrw.UnilateralWheel(friction=friction), vrw.WheelParams(damping=damping)
-    walk = vrw.walk(params, START, 120, model=model, options=TIGHT)
+    walk = vrw.walk(params, START, 120, model=model, options=TIGHT_OPTIONS)
     x = np.asarray(walk.steps.section_state[-1])
     np.testing.assert_allclose(x, walk.steps.section_state[-2], atol=1e-9)  # a gait: it repeats
-    wheel = moreau_jean.Wheel(friction, c=damping)
-    steps = [moreau_jean.one_step(wheel, oracle_start(x), h) for h in (16e-4, 8e-4, 4e-4, 2e-4)]
+    wheel = moreau_jean.TimeSteppingWheel(friction, c=damping)
+    steps = [
+        moreau_jean.compute_step(wheel, make_reference_start(x), h)
+        for h in (16e-4, 8e-4, 4e-4, 2e-4)
+    ]
     once = lambda told: 2.0 * told[1:] - told[:-1]  # extrapolated; below once more
     twice = lambda told: (4.0 * once(told)[1:] - once(told)[:-1]) / 3.0
     periods = twice(np.array([step.time for step in steps]))
@@ -196,11 +208,13 @@ def test_the_period_of_a_gait_is_that_of_time_stepping(friction, damping):
     assert abs(thetas[1] - float(x[0])) < 2e-6  # and the step ends where it began
 
 
-@pytest.mark.parametrize("name", SCENES)
-def test_landings_repeat_between_tolerances(name):
-    friction, damping, dtheta = SCENES[name]
+@pytest.mark.parametrize("name", STEP_SCENES)
+def test_landings_agree_between_tolerances(name):
+    friction, damping, dtheta = STEP_SCENES[name]
     x = (START[0], dtheta, START[2])
-    loose, tight = (stepped(friction, damping, x, options=o) for o in (vrw.Options(), TIGHT))
+    loose, tight = (
+        compute_step(friction, damping, x, options=o) for o in (vrw.StepOptions(), TIGHT_OPTIONS)
+    )
     assert int(tight.outcome) == vrw.Outcome.STEPPED
     assert int(loose.events) == int(tight.events)
     np.testing.assert_allclose(loose.section_state, tight.section_state, atol=1e-8)
@@ -208,7 +222,7 @@ def test_landings_repeat_between_tolerances(name):
 
 
 @pytest.mark.slow
-def test_feet_that_throw_each_other_off_by_ever_less_stay_down():
+def test_feet_with_vanishing_alternating_impacts_come_to_rest():
     """Past c = 311 each foot's landing lifts the other, after 3e-5 s, 2e-5 s, 5e-8 s and so on."""
     params = vrw.WheelParams(damping=312.0, slope=0.294)
     wheel = vrw.UnilateralWheel(friction=0.7)
@@ -219,17 +233,19 @@ def test_feet_that_throw_each_other_off_by_ever_less_stay_down():
 
 
 @pytest.mark.parametrize("friction", [0.5, 0.7, 1.0])
-def test_below_one_every_event_has_exactly_one_solution(friction):
-    step = stepped(friction)
+def test_at_friction_below_one_every_event_has_exactly_one_solution(friction):
+    step = compute_step(friction)
     assert int(step.fewest_solutions) == 1
     assert int(step.most_solutions) == 1
 
 
-def law_of(s, friction):
-    return Law(s, jnp.asarray(friction), one_sided=False, counted=True, rest=1e-6)
+def make_contact_law(s, friction):
+    return ContactLaw(
+        s, jnp.asarray(friction), is_one_sided=False, counts_solutions=True, rest_speed=1e-6
+    )
 
 
-def at_rest(theta, **changes):
+def make_resting_motion(theta, **changes):
     """A wheel at rest on legs of length L0, the lower foot on the slope."""
     zero = jnp.zeros(())
     height = jnp.maximum(jnp.cos(theta), jnp.cos(theta + math.pi / 4))
@@ -239,45 +255,52 @@ def at_rest(theta, **changes):
     return motion._replace(**changes)
 
 
-def stance_of(contact, locked):
+def make_contact_state(contact, locked):
     none = jnp.zeros(8, bool)
-    codes = jnp.asarray(list(contact) + [OFF] * 6, jnp.int32)
-    return Stance(codes, jnp.asarray(locked), none, none, none)
+    codes = jnp.asarray(list(contact) + [CONTACT_OFF] * 6, jnp.int32)
+    return ContactState(codes, jnp.asarray(locked), none, none, none)
 
 
 def test_a_wheel_on_two_stiff_legs_slides_like_a_block():
     s, friction = TABLE_1.symbols(), 0.2
-    flow = flow_of(s, jnp.asarray(friction), False, stance_of((SLIP_DOWN, SLIP_DOWN), [True] * 8))
-    found = forces(flow, at_rest(-math.pi / 8, vx=jnp.asarray(0.1))).answer
+    flow = make_mode_dynamics(
+        s,
+        jnp.asarray(friction),
+        False,
+        make_contact_state((CONTACT_SLIP_DOWN, CONTACT_SLIP_DOWN), [True] * 8),
+    )
+    solution = compute_forces(flow, make_resting_motion(-math.pi / 8, vx=jnp.asarray(0.1))).solution
     g, slope = 9.81, 0.30
-    along = g * (math.sin(slope) - friction * math.cos(slope))
-    np.testing.assert_allclose(jnp.stack(found.hub), [along, 0.0, 0.0], atol=1e-12)
-    assert abs(float(sum(found.normal)) - 18.0 * g * math.cos(slope)) < 1e-10
+    tangential_part = g * (math.sin(slope) - friction * math.cos(slope))
+    np.testing.assert_allclose(jnp.stack(solution.hub), [tangential_part, 0.0, 0.0], atol=1e-12)
+    assert abs(float(sum(solution.normal)) - 18.0 * g * math.cos(slope)) < 1e-10
 
 
 def test_a_wheel_in_the_air_falls_freely():
     s = TABLE_1.symbols()
-    flow = flow_of(s, jnp.asarray(0.7), False, stance_of((OFF, OFF), [True] * 8))
-    motion = at_rest(-0.3, z=jnp.asarray(2.0), dtheta=jnp.asarray(3.0))
-    now = forces(flow, motion)
+    flow = make_mode_dynamics(
+        s, jnp.asarray(0.7), False, make_contact_state((CONTACT_OFF, CONTACT_OFF), [True] * 8)
+    )
+    motion = make_resting_motion(-0.3, z=jnp.asarray(2.0), dtheta=jnp.asarray(3.0))
+    current_value = compute_forces(flow, motion)
     expected = [9.81 * math.sin(0.3), -9.81 * math.cos(0.3), 0.0]
-    np.testing.assert_allclose(jnp.stack(now.answer.hub), expected, atol=1e-12)
+    np.testing.assert_allclose(jnp.stack(current_value.solution.hub), expected, atol=1e-12)
     # Preload and spin press each leg on its stopper: 500 * 0.02 + 0.7 * 3^2 N.
-    np.testing.assert_allclose(airborne_stopper_force(flow, now), 10.0 + 6.3, atol=1e-12)
+    np.testing.assert_allclose(airborne_stopper_force(flow, current_value), 10.0 + 6.3, atol=1e-12)
 
 
 def test_a_vertical_leg_lands_with_its_own_mass_alone():
     s, speed = TABLE_1.symbols(), 2.0
-    motion = at_rest(0.0, vz=jnp.asarray(-speed))
-    in_the_air = stance_of((OFF, OFF), [True] * 8)
-    event = event_of(guards_of(8, False), jnp.int32(0))
-    change = resolve(law_of(s, 0.7), motion, in_the_air, event)
+    motion = make_resting_motion(0.0, vz=jnp.asarray(-speed))
+    in_the_air = make_contact_state((CONTACT_OFF, CONTACT_OFF), [True] * 8)
+    event = classify_event(make_guard_layout(8, False), jnp.int32(0))
+    change = resolve_event(make_contact_law(s, 0.7), motion, in_the_air, event)
     # The leg's 1 kg stops, the other 17 kg go on; the spring then begins to work.
     assert abs(float(change.normal_impulse[0]) - 1.0 * speed) < 1e-12
     assert abs(float(change.energy_lost) - 0.5 * speed**2) < 1e-12
     assert abs(float(change.motion.vz) + speed) < 1e-12
     assert abs(float(change.motion.dL[0]) + speed) < 1e-12
-    assert not bool(change.stance.locked[0])
+    assert not bool(change.contact_state.locked[0])
 
 
 def test_a_single_leg_bounces_as_a_damped_oscillator():
@@ -298,40 +321,49 @@ def test_a_single_leg_bounces_as_a_damped_oscillator():
     first = next(t for t in np.linspace(0.01, 1.0, 100) if push(t) < 0.0)
     time = brentq(push, first - 0.01, first, xtol=1e-12)
     zero = jnp.zeros(())
-    motion = at_rest(0.0, vz=jnp.asarray(-speed))._replace(dL=jnp.zeros(8).at[0].set(-speed))
-    flow = flow_of(s, jnp.asarray(0.7), False, stance_of((STICK, OFF), [False] + [True] * 7))
-    lift = guards_of(8, False).lift
-    watched = Watched(lambda y: guards(flow, y)[lift : lift + 1], 1)
-    start = pack(motion, Tally(zero, zero, zero, zero))
-    end = integrate_phase(partial(field, flow), watched, start, jnp.asarray(True), TIGHT)
-    landed, tally = unpack(end.state)
+    motion = make_resting_motion(0.0, vz=jnp.asarray(-speed))._replace(
+        dL=jnp.zeros(8).at[0].set(-speed)
+    )
+    flow = make_mode_dynamics(
+        s,
+        jnp.asarray(0.7),
+        False,
+        make_contact_state((CONTACT_STICK, CONTACT_OFF), [False] + [True] * 7),
+    )
+    lift = make_guard_layout(8, False).liftoff
+    watched = MonitoredFunctions(lambda y: guard_values(flow, y)[lift : lift + 1], 1)
+    start = pack_state(motion, Accumulators(zero, zero, zero, zero))
+    end = integrate_phase(
+        partial(vector_field, flow), watched, start, jnp.asarray(True), TIGHT_OPTIONS
+    )
+    landed, tally = unpack_state(end.state)
     assert abs(float(end.duration) - time) < 1e-8
     assert abs(float(landed.L[0]) - length(time)) < 1e-9
     assert abs(float(landed.theta)) < 1e-12
-    lost = 0.5 * mass * speed**2 - 0.5 * mass * float(landed.vz) ** 2
-    lost += 0.5 * float(s.k) * float((s.Ls - s.L0) ** 2 - (s.Ls - landed.L[0]) ** 2)
-    lost += float(mass * s.g * (s.L0 - landed.L[0]))
-    assert abs(float(tally.damping) - lost) < 1e-9
+    lost_values = 0.5 * mass * speed**2 - 0.5 * mass * float(landed.vz) ** 2
+    lost_values += 0.5 * float(s.k) * float((s.Ls - s.L0) ** 2 - (s.Ls - landed.L[0]) ** 2)
+    lost_values += float(mass * s.g * (s.L0 - landed.L[0]))
+    assert abs(float(tally.damping) - lost_values) < 1e-9
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.1, 0.5])
 def test_a_foot_that_lands_sliding_takes_coulombs_impulse(friction):
     s = TABLE_1.symbols()
-    motion = at_rest(0.0, vz=jnp.asarray(-1.0), vx=jnp.asarray(5.0))
-    in_the_air = stance_of((OFF, OFF), [True] * 8)
-    event = event_of(guards_of(8, False), jnp.int32(0))
-    change = resolve(law_of(s, friction), motion, in_the_air, event)
+    motion = make_resting_motion(0.0, vz=jnp.asarray(-1.0), vx=jnp.asarray(5.0))
+    in_the_air = make_contact_state((CONTACT_OFF, CONTACT_OFF), [True] * 8)
+    event = classify_event(make_guard_layout(8, False), jnp.int32(0))
+    change = resolve_event(make_contact_law(s, friction), motion, in_the_air, event)
     normal, tangential = float(change.normal_impulse[0]), float(change.tangential_impulse[0])
-    assert int(change.stance.contact[0]) == SLIP_DOWN
+    assert int(change.contact_state.contact[0]) == CONTACT_SLIP_DOWN
     assert abs(tangential + friction * normal) < 1e-12
 
 
-def test_bad_input_is_a_code_and_never_nan():
+def test_bad_input_is_an_outcome_and_never_nan():
     # Friction is refused in a sentence as a plain number, and is a code where no one saw it.
-    model = vrw.UnilateralWheel(infinite="paper")
+    model = vrw.UnilateralWheel(infinite_friction_rule="paper")
     for friction, x in ((0.7, (math.nan, 1.0, 0.0)), (-1.0, START), (math.nan, START)):
         unseen = eqx.tree_at(lambda model: model.friction, model, jnp.asarray(friction))
-        step = vrw.step(TABLE_1, x, model=unseen, options=TIGHT)
+        step = vrw.step(TABLE_1, x, model=unseen, options=TIGHT_OPTIONS)
         assert int(step.outcome) == vrw.Outcome.BAD_INPUT
         assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(step))
         assert not np.any(np.asarray(step.section_state))
@@ -341,16 +373,16 @@ def test_bad_input_is_a_code_and_never_nan():
     ("friction", "damping", "x", "outcome"),
     [
         (1.5, 16.39, (0.001, 0.6, -0.4), vrw.Outcome.THREE_FEET_LOADED),  # Leg 3's foot is 1 mm up
-        (8.0, 183.0, (0.037, 2.31, -0.065), vrw.Outcome.FRICTION_PARADOX),  # Painlevé's singularity
+        (8.0, 183.0, (0.037, 2.31, -0.065), vrw.Outcome.PAINLEVE_PARADOX),  # Painlevé's singularity
     ],
 )
-def test_what_the_model_does_not_cover_ends_a_step_with_its_code(friction, damping, x, outcome):
+def test_situations_outside_the_model_end_a_step_with_an_outcome(friction, damping, x, outcome):
     """By both engines alike, in time too: to what is left of the singularity where lanes see it."""
     times = []
     for engine in ("lanes", "diffrax"):
         given = vrw.WheelParams(damping=damping), x
         model = vrw.UnilateralWheel(friction=friction)  # other tests have the program
-        step = vrw.step(*given, model=model, options=TIGHT, engine=engine)
+        step = vrw.step(*given, model=model, options=TIGHT_OPTIONS, engine=engine)
         assert int(step.outcome) == outcome
         assert not np.any(np.asarray(step.section_state))
         assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(step))
@@ -358,22 +390,22 @@ def test_what_the_model_does_not_cover_ends_a_step_with_its_code(friction, dampi
     assert times[0] == pytest.approx(times[1], abs=1e-7)
 
 
-def test_events_without_end_are_bounded_and_told():
-    enough = int(stepped(0.7).events)
+def test_infinite_event_sequences_end_with_an_outcome():
+    enough = int(compute_step(0.7).events)
     wheel = vrw.UnilateralWheel(friction=0.7, max_events=enough - 1)
-    x = wheel.full_section(TABLE_1, jnp.asarray(START))
-    cut_short = wheel.advance(TABLE_1, x, TIGHT)
+    x = wheel.embed_section(TABLE_1, jnp.asarray(START))
+    cut_short = wheel.advance(TABLE_1, x, TIGHT_OPTIONS)
     assert int(cut_short.outcome) == vrw.Outcome.TOO_MANY_EVENTS
     assert not np.any(np.asarray(cut_short.section_state))
 
 
-def test_a_slope_that_is_too_flat_ends_the_walk_with_a_code():
-    params, model = vrw.WheelParams(slope=0.0), vrw.UnilateralWheel(infinite="paper")
-    walk = vrw.walk(params, (0.1, 1.0, -0.1), 40, model=model, options=TIGHT)
+def test_too_flat_a_slope_ends_the_walk_with_an_outcome():
+    params, model = vrw.WheelParams(slope=0.0), vrw.UnilateralWheel(infinite_friction_rule="paper")
+    walk = vrw.walk(params, (0.1, 1.0, -0.1), 40, model=model, options=TIGHT_OPTIONS)
     assert int(walk.outcome) in (vrw.Outcome.FELL_BACK, vrw.Outcome.NO_TOUCHDOWN_IN_TIME)
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(walk.steps))
 
 
-def test_sliding_uphill_is_a_mode_of_its_own(traces):
-    modes = np.concatenate([np.unique(trace.contact) for _, _, trace in traces.values()])
-    assert {OFF, STICK, SLIP_DOWN, SLIP_UP} <= set(modes.tolist())
+def test_sliding_uphill_is_a_separate_contact_mode(scene_traces):
+    modes = np.concatenate([np.unique(trace.contact) for _, _, trace in scene_traces.values()])
+    assert {CONTACT_OFF, CONTACT_STICK, CONTACT_SLIP_DOWN, CONTACT_SLIP_UP} <= set(modes.tolist())

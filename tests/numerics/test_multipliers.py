@@ -7,15 +7,15 @@ import pytest
 
 from vrw_jax.numerics import floquet
 
-RANDOM = np.random.default_rng(3)
+RANDOM_GENERATOR = np.random.default_rng(3)
 
 
 @pytest.mark.parametrize("size", [1, 2, 3])
 def test_eigenvalues_agree_with_lapack(size):
-    matrices = RANDOM.normal(size=(400, size, size))
-    found = np.asarray(floquet.multipliers(jnp.asarray(matrices)))
-    for own, expected in zip(found, np.linalg.eigvals(matrices), strict=True):
-        gap = np.abs(own[:, None] - expected[None])
+    matrices = RANDOM_GENERATOR.normal(size=(400, size, size))
+    values_array = np.asarray(floquet.floquet_multipliers(jnp.asarray(matrices)))
+    for own_values, expected in zip(values_array, np.linalg.eigvals(matrices), strict=True):
+        gap = np.abs(own_values[:, None] - expected[None])
         assert gap.min(0).max() < 1e-10
         assert gap.min(1).max() < 1e-10
     radius = np.abs(np.linalg.eigvals(matrices)).max(1)
@@ -24,31 +24,31 @@ def test_eigenvalues_agree_with_lapack(size):
 
 @pytest.mark.parametrize("size", [2, 3])
 def test_radius_differentiates_like_left_and_right_eigenvectors(size):
-    for matrix in RANDOM.normal(size=(20, size, size)):
+    for matrix in RANDOM_GENERATOR.normal(size=(20, size, size)):
         values, right = np.linalg.eig(matrix)
-        left = np.linalg.inv(right)
+        left_part = np.linalg.inv(right)
         k = np.argmax(np.abs(values))
-        derivative = np.outer(left[k], right[:, k])  # d value / d matrix
+        derivative = np.outer(left_part[k], right[:, k])  # d value / d matrix
         expected = np.real(np.conj(values[k]) * derivative) / np.abs(values[k])
-        found = jax.grad(floquet.spectral_radius)(jnp.asarray(matrix))
-        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+        solution = jax.grad(floquet.spectral_radius)(jnp.asarray(matrix))
+        np.testing.assert_allclose(solution, expected, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("size", [1, 2, 3])
 def test_margins_are_positive_exactly_inside_the_circle(size):
-    matrices = RANDOM.normal(size=(2000, size, size)) * 0.8
+    matrices = RANDOM_GENERATOR.normal(size=(2000, size, size)) * 0.8
     stable = np.abs(np.linalg.eigvals(matrices)).max(1) < 1.0
     margins = np.asarray(floquet.jury_margins(jnp.asarray(matrices)))
     np.testing.assert_array_equal(np.all(margins > 0.0, axis=-1), stable)
     smooth = np.asarray(floquet.stability_margin(jnp.asarray(matrices)))
     assert np.all(smooth <= margins.min(-1) + 1e-14)
-    assert np.all(smooth >= margins.min(-1) - np.log(4.0) / floquet.SHARPNESS)
+    assert np.all(smooth >= margins.min(-1) - np.log(4.0) / floquet.SMOOTH_MIN_SHARPNESS)
 
 
-def test_margin_differentiates_where_eigenvalues_meet():
+def test_the_margin_is_differentiable_at_equal_eigenvalues():
     defective = jnp.array([[0.5, 1.0], [0.0, 0.5]])
-    assert bool(floquet.at_double_multiplier(defective))
-    assert not bool(floquet.at_double_multiplier(jnp.diag(jnp.array([0.5, 0.4]))))
+    assert bool(floquet.has_double_multiplier(defective))
+    assert not bool(floquet.has_double_multiplier(jnp.diag(jnp.array([0.5, 0.4]))))
     gradient = jax.grad(floquet.stability_margin)(defective)
     step = 1e-6
     direction = jnp.array([[0.3, -0.2], [0.7, 0.4]])
@@ -61,6 +61,6 @@ def test_margin_differentiates_where_eigenvalues_meet():
 
 
 def test_rotation_by_a_right_angle_has_multipliers_plus_and_minus_i():
-    found = floquet.multipliers(jnp.array([[0.0, -1.0], [1.0, 0.0]]))
-    np.testing.assert_allclose(sorted(np.asarray(found).imag), [-1.0, 1.0])
-    np.testing.assert_allclose(np.asarray(found).real, 0.0, atol=1e-15)
+    solution = floquet.floquet_multipliers(jnp.array([[0.0, -1.0], [1.0, 0.0]]))
+    np.testing.assert_allclose(sorted(np.asarray(solution).imag), [-1.0, 1.0])
+    np.testing.assert_allclose(np.asarray(solution).real, 0.0, atol=1e-15)

@@ -22,9 +22,11 @@ class Stencil:
         """Evaluate at the point and one step to either side along each argument."""
         self.function, self.point, self.sizes = function, list(point), list(sizes)
         self.value = function(point)
-        self._sides = {(i, s): self._at({i: s}) for i in range(len(point)) for s in (1, -1)}
+        self._sides = {
+            (i, s): self._evaluate_at({i: s}) for i in range(len(point)) for s in (1, -1)
+        }
 
-    def _at(self, moves: Mapping[int, int]) -> Vector:
+    def _evaluate_at(self, moves: Mapping[int, int]) -> Vector:
         point = list(self.point)
         for i, sign in moves.items():
             point[i] = point[i] + sign * self.sizes[i]
@@ -44,7 +46,7 @@ class Stencil:
                 for a, b, f in zip(*sides, self.value, strict=True)
             ]
         sides += [self._sides[j, 1], self._sides[j, -1]]
-        corners = [self._at({i: s, j: s}) for s in (1, -1)]
+        corners = [self._evaluate_at({i: s, j: s}) for s in (1, -1)]
         scale = 2 * self.sizes[i] * self.sizes[j]
         return [
             (a + b - mp.fsum(rest) + 2 * f) / scale
@@ -83,15 +85,15 @@ def solve_two(matrix: list[Vector], right: Vector) -> Vector:
     ]
 
 
-def minus_identity(matrix: list[Vector]) -> list[Vector]:
+def subtract_identity(matrix: list[Vector]) -> list[Vector]:
     """I - A for a 2 x 2 matrix."""
     return [[(1 if i == j else 0) - matrix[i][j] for j in range(2)] for i in range(2)]
 
 
-def gap(found: Sequence[Number], expected: Sequence[Number]) -> Number:
+def compute_gap(solution: Sequence[Number], expected: Sequence[Number]) -> Number:
     """Largest difference relative to the larger of the two vectors' greatest entry."""
     scale = max(abs(v) for v in expected)
-    return max(abs(a - b) for a, b in zip(found, expected, strict=True)) / scale
+    return max(abs(a - b) for a, b in zip(solution, expected, strict=True)) / scale
 
 
 def plane_jacobian(function: Function, y: Vector, p: Vector, size: Number) -> list[Vector]:
@@ -100,8 +102,8 @@ def plane_jacobian(function: Function, y: Vector, p: Vector, size: Number) -> li
     for i in range(2):
         ends = []
         for sign in (1, -1):
-            moved = list(y)
-            moved[i] = moved[i] + sign * size
-            ends.append(function([*moved, *p]))
+            shifted = list(y)
+            shifted[i] = shifted[i] + sign * size
+            ends.append(function([*shifted, *p]))
         columns.append([(a - b) / (2 * size) for a, b in zip(*ends, strict=True)])
     return [[columns[j][i] for j in range(2)] for i in range(2)]

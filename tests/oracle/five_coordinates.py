@@ -25,7 +25,7 @@ import numpy as np
 
 from . import five_coordinates_equations as equations
 from .constrained_wheel import NO_EVENT, Array, Guard, Params, Phase, Wheel, run_phase
-from .premises import margins
+from .premises import compute_margins
 
 TABLE_1: dict[str, float] = {
     "hub_mass": 10.0,
@@ -78,14 +78,14 @@ def exchange_labels(params: Params, q: Array, v: Array) -> tuple[Array, Array, f
     wheel = Wheel(params)
     length, theta, dtheta = params["locked_length"], q[2], v[2]
     new = theta - wheel.alpha
-    along = q[0] + q[3] * math.sin(theta) - length * math.sin(new)
+    tangential_part = q[0] + q[3] * math.sin(theta) - length * math.sin(new)
     dx = v[0] + (q[3] * math.cos(theta) - length * math.cos(new)) * dtheta
     dz = v[1] - (q[3] * math.sin(theta) - length * math.sin(new)) * dtheta
     dx, dz = dx + v[3] * math.sin(theta), dz + v[3] * math.cos(theta)
     return (
         np.array([0.0, 0.0, new, length, q[3]]),
         np.array([dx, dz, dtheta, 0.0, v[3]]),
-        along - q[0],
+        tangential_part - q[0],
     )
 
 
@@ -334,7 +334,7 @@ def jacobian(function: Callable[[Array], Array], x: Array, size: float = 1e-4) -
 
 
 def limit_cycle(
-    params: Params, guess: Any, *, tolerance: float = 1e-13, most: int = 12
+    params: Params, guess: Any, *, tolerance: float = 1e-13, maximum: int = 12
 ) -> dict[str, Any]:
     """Period-1 gait near a section state, by Newton's method on the return map.
 
@@ -344,7 +344,7 @@ def limit_cycle(
     """
     x = np.asarray(guess, dtype=float)
     slope = jacobian(lambda s: return_map(params, s), x)
-    for _ in range(most):
+    for _ in range(maximum):
         change = np.linalg.solve(slope - np.eye(3), x - return_map(params, x))
         if np.max(np.abs(change)) > 0.3:
             raise ArithmeticError("Newton's method left the neighbourhood of the guess")
@@ -394,4 +394,4 @@ def monitors(params: Params, x: Any) -> dict[str, Any]:
     result = step(params, x, max_step=2e-3)
     if result["outcome"] != STEPPED:
         raise ArithmeticError(result["outcome"])
-    return margins(Wheel(params), result)
+    return compute_margins(Wheel(params), result)

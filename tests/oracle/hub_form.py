@@ -17,10 +17,10 @@ import numpy as np
 
 from .multiprecision import (
     Flow,
-    Landed,
     Number,
+    StepEnd,
     Vector,
-    compiled,
+    compile_expressions,
     dot,
     plus,
     solve_positive,
@@ -82,14 +82,14 @@ class Bodies:
         return [u[0] * cosine + u[1] * sine, u[1] * cosine - u[0] * sine]
 
 
-def across(u: Vector) -> Vector:
+def direction_derivative(u: Vector) -> Vector:
     """Derivative of a leg's direction by its angle."""
     return [u[1], -u[0]]
 
 
-def split(total: Vector, axial: Vector, u1: Vector, u2: Vector) -> Vector:
+def split_forces(total: Vector, axial: Vector, u1: Vector, u2: Vector) -> Vector:
     """Forces of both feet, normal components, from their sum and their parts along the legs."""
-    t1, t2 = across(u1), across(u2)
+    t1, t2 = direction_derivative(u1), direction_derivative(u2)
     rest = plus(total, times(-1, plus(times(axial[0], u1), times(axial[1], u2))))
     determinant = t1[0] * t2[1] - t2[0] * t1[1]
     s1 = (rest[0] * t2[1] - t2[0] * rest[1]) / determinant
@@ -110,7 +110,7 @@ class HubForm:
         chord = hy.par[14]
         psi, rate = hy.make_vars("psi", "rate")
         spin, forces = self._double(b, chord, psi, rate, hy.sin, hy.cos)
-        self._forces = compiled(forces, [psi, rate])
+        self._forces = compile_expressions(forces, [psi, rate])
         self._dls = Flow([psi, rate], [rate, spin], forces[1], 15)
 
         X, Z, L2 = hy.make_vars("X", "Z", "L2")
@@ -142,8 +142,8 @@ class HubForm:
         """
         L1 = sqrt(dot(hub, hub))
         u = times(1 / L1, hub)
-        t, u2 = across(u), b.second(u)
-        t2 = across(u2)
+        t, u2 = direction_derivative(u), b.second(u)
+        t2 = direction_derivative(u2)
         dL1, omega = dot(u, velocity), dot(t, velocity) / L1
         turning = [t[0] / L1, t[1] / L1, 0]  # omega by w
         # omega' = turning . w' + drift
@@ -154,7 +154,7 @@ class HubForm:
             """Rows d(velocity) / dw, of a part in w and one in omega."""
             return [[direct[i][j] + arm[i] * turning[j] for j in range(3)] for i in range(2)]
 
-        both, both_t = plus(u, u2), plus(t, t2)
+        both_values, both_t = plus(u, u2), plus(t, t2)
         zero, one = [0, 0, 0], [[1, 0, 0], [0, 1, 0]]
         square = omega * omega
         # mass, velocity coefficients, acceleration at w' = 0
@@ -173,7 +173,7 @@ class HubForm:
             (
                 b.body,
                 field(one, times(b.reach, both_t)),
-                plus(times(b.reach * drift, both_t), times(-b.reach * square, both)),
+                plus(times(b.reach * drift, both_t), times(-b.reach * square, both_values)),
             ),
         ]
         matrix: list[Vector] = [
@@ -197,31 +197,31 @@ class HubForm:
     ) -> tuple[Vector, Vector, Vector, Number]:
         """Hub from either foot, its direction of travel, and the radius of its circle."""
         radius = chord / (2 * b.turn[1])
-        out, along = [sin(psi), cos(psi)], [cos(psi), -sin(psi)]
+        out, tangential_part = [sin(psi), cos(psi)], [cos(psi), -sin(psi)]
         height = radius * (b.turn[0] + out[1])
         from1 = [-chord / 2 + radius * out[0], height]
         from2 = [chord / 2 + radius * out[0], height]
-        return from1, from2, along, radius
+        return from1, from2, tangential_part, radius
 
     def _double(
         self, b: Bodies, chord: Number, psi: Number, rate: Number, sin: Any, cos: Any
     ) -> tuple[Number, Vector]:
         """psi'' and the normal forces (lambda2, lambda4) with both feet planted."""
         sqrt = hy.sqrt
-        from1, from2, along, radius = self._circle(b, chord, psi, sin, cos)
+        from1, from2, tangential_part, radius = self._circle(b, chord, psi, sin, cos)
         inward = [-sin(psi), -cos(psi)]
         lengths = [sqrt(dot(from1, from1)), sqrt(dot(from2, from2))]
         u = [times(1 / lengths[0], from1), times(1 / lengths[1], from2)]
-        t = [across(u[0]), across(u[1])]
-        velocity = times(radius * rate, along)
+        t = [direction_derivative(u[0]), direction_derivative(u[1])]
+        velocity = times(radius * rate, tangential_part)
         pushes = [b.push(lengths[i], dot(u[i], velocity)) for i in range(2)]
         omega = rate / 2
-        both, both_t = plus(u[0], u[1]), plus(t[0], t[1])
+        both_values, both_t = plus(u[0], u[1]), plus(t[0], t[1])
         # velocities per psi', and accelerations at psi'' = 0
-        hub_row = times(radius, along)
+        hub_row = times(radius, tangential_part)
         hub_rest = times(radius * rate * rate, inward)
         body_row = plus(hub_row, times(b.reach / 2, both_t))
-        body_rest = plus(hub_rest, times(-b.reach * omega * omega, both))
+        body_rest = plus(hub_rest, times(-b.reach * omega * omega, both_values))
         points = [(b.hub, hub_row, hub_rest), (b.body, body_row, body_rest)]
         for i in range(2):
             points.append((b.leg, times(b.com / 2, t[i]), times(-b.com * omega * omega, u[i])))
@@ -237,7 +237,7 @@ class HubForm:
         ]
         total = plus(plus(demands[0], demands[1]), plus(demands[2], demands[3]))
         axial = [dot(demands[2 + i], u[i]) + pushes[i] for i in range(2)]
-        return spin, split(total, axial, u[0], u[1])
+        return spin, split_forces(total, axial, u[0], u[1])
 
     def land(self, x: Sequence[Number], p: Sequence[Number]) -> tuple[Vector, Number]:
         """Momentum along the one admissible motion stays; the legs' balances give lambda_I4."""
@@ -246,7 +246,7 @@ class HubForm:
         theta, omega, dL1 = x
         new = theta - alpha
         u2, u1 = [mp.sin(theta), mp.cos(theta)], [mp.sin(new), mp.cos(new)]
-        t1, t2 = across(u1), across(u2)
+        t1, t2 = direction_derivative(u1), direction_derivative(u2)
         L1, L2 = p[3], p[3] * u1[1] / u2[1]
         both_t = plus(t1, t2)
         hub = plus(times(dL1, u2), times(L2 * omega, t2))
@@ -263,24 +263,24 @@ class HubForm:
         determinant = normal1[0] * normal2[1] - normal2[0] * normal1[1]
         reach = (foot2[0] * normal2[1] - normal2[0] * foot2[1]) / determinant
         centre = times(reach, normal1)
-        row = across(plus(times(L1, u1), times(-1, centre)))
+        row = direction_derivative(plus(times(L1, u1), times(-1, centre)))
         rows = [row, plus(row, times(b.reach, both_t)), times(b.com, t1), times(b.com, t2)]
-        kept = b.inertia * omega + mp.fsum(
+        retained = b.inertia * omega + mp.fsum(
             mass * dot(r, v) for (mass, v), r in zip(before, rows, strict=True)
         )
         resist = b.inertia + mp.fsum(
             mass * dot(r, r) for (mass, _), r in zip(before, rows, strict=True)
         )
-        after = kept / resist
+        after = retained / resist
         jumps = [
             times(mass, plus(times(after, r), times(-1, v)))
             for (mass, v), r in zip(before, rows, strict=True)
         ]
         total = plus(plus(jumps[0], jumps[1]), plus(jumps[2], jumps[3]))
         axial = [dot(jumps[2], u1), dot(jumps[3], u2)]
-        return [new, after], split(total, axial, u1, u2)[1]
+        return [new, after], split_forces(total, axial, u1, u2)[1]
 
-    def walk(self, y: Sequence[Number], p: Sequence[Number], about: Sequence[float]) -> Landed:
+    def walk(self, y: Sequence[Number], p: Sequence[Number], about: Sequence[float]) -> StepEnd:
         """Double support on the circle, then the hub's free path, collision II, SLS-II."""
         constants = Bodies.constants(p)
         b = Bodies.unpack(constants)
@@ -293,19 +293,23 @@ class HubForm:
         forces = self._forces(np.array([to_real(value) for value in state]), packed)
         state, double = self._dls.until_guard(state, [*constants, chord], about[0])
 
-        hub, from2, along, radius = self._circle(b, chord, state[0], mp.sin, mp.cos)
-        velocity = times(radius * state[1], along)
+        hub, from2, tangential_part, radius = self._circle(b, chord, state[0], mp.sin, mp.cos)
+        velocity = times(radius * state[1], tangential_part)
         L2 = mp.sqrt(dot(from2, from2))
         state = [*hub, L2, *velocity, dot(from2, velocity) / L2]
         state, swing = self._swing.until_guard(state, constants, about[1])
 
         # Collision II: momentum in the two motions that stay free.
         matrix, _, _ = self._single(b, state[:2], state[3:5], state[2], state[5], mp.sqrt)
-        kept = [dot(row, state[3:]) for row in matrix[:2]]
-        (after,) = solve_positive([row[:2] for row in matrix[:2]], kept)
+        retained_rows = [dot(row, state[3:]) for row in matrix[:2]]
+        (after,) = solve_positive([row[:2] for row in matrix[:2]], retained_rows)
         state, locked = self._locked.until_guard([*state[:2], *after], constants, about[2])
         hub, velocity = state[:2], state[2:]
         L1 = mp.sqrt(dot(hub, hub))
         u = times(1 / L1, hub)
-        section = [mp.atan2(u[0], u[1]), dot(across(u), velocity) / L1, dot(u, velocity)]
-        return Landed(section, [double, swing, locked], [to_mpf(f) for f in forces])
+        section = [
+            mp.atan2(u[0], u[1]),
+            dot(direction_derivative(u), velocity) / L1,
+            dot(u, velocity),
+        ]
+        return StepEnd(section, [double, swing, locked], [to_mpf(f) for f in forces])

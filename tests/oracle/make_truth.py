@@ -33,11 +33,11 @@ from .constrained_wheel import Params, Wheel
 from .differences import (
     Function,
     Stencil,
-    gap,
-    minus_identity,
+    compute_gap,
     plane_jacobian,
     solve_two,
     spectrum,
+    subtract_identity,
 )
 from .hub_form import HubForm
 from .multiplier_form import MultiplierForm
@@ -53,16 +53,16 @@ from .multiprecision import (
     step_length,
 )
 
-TARGET = Path(__file__).with_name("truth.json")
-STORED = 27  # significant digits written
-AGREED = mp.mpf("1e-22")
-SIZE = mp.mpf("1e-14")
+TARGET_PATH = Path(__file__).with_name("truth.json")
+STORED_DIGITS = 27  # significant digits written
+AGREEMENT_TOLERANCE = mp.mpf("1e-22")
+STENCIL_STEP = mp.mpf("1e-14")
 CHECK_SIZE = mp.mpf("3e-14")
 # Weights, relative to each parameter (or absolute for a start), of the checked direction.
 DIRECTION = [mp.mpf(w) / 7 for w in (3, -5, 2, 7, -4, 6, -3, 5, -2)]
 START_DIRECTION = [mp.mpf(w) / 11 for w in (4, -7, 9)]
 
-VARIED = ("damping", "stiffness", "natural_length", "slope", "leg_mass", "leg_com")
+VARIED_PARAMETERS = ("damping", "stiffness", "natural_length", "slope", "leg_mass", "leg_com")
 CASES: dict[str, tuple[str, ...]] = {
     "table_1": ("200", "500", "1.02", "0.3", "1", "0.3"),
     "damping_100": ("100", "500", "1.02", "0.3", "1", "0.3"),
@@ -84,9 +84,9 @@ CASES: dict[str, tuple[str, ...]] = {
 """Wheels on which a period-1 gait walks, reached from Table 1; values of ``VARIED`` as decimals."""
 
 
-def wheel(name: str) -> dict[str, float]:
+def make_wheel(name: str) -> dict[str, float]:
     """Parameters of a case as doubles; their shortest decimals are the exact truth's input."""
-    values = dict(zip(VARIED, map(float, CASES[name]), strict=True))
+    values = dict(zip(VARIED_PARAMETERS, map(float, CASES[name]), strict=True))
     return {**double.TABLE_1, **values}
 
 
@@ -106,12 +106,12 @@ def plane_map(params: Params, y: np.ndarray, rtol: float) -> tuple[np.ndarray, A
     return np.array([q[2], after[2]]), result
 
 
-def approach(target: Params) -> tuple[np.ndarray, Any]:
+def approach_gait(target: Params) -> tuple[np.ndarray, Any]:
     """Walk from Table 1's gait to the target's while the wheel changes; settle by Newton."""
     y = np.array([-0.68267, 1.04920])
     for share in np.linspace(0.0, 1.0, 9)[1:]:
         params = {
-            key: value + share * (target[key] - value) if key in VARIED else value
+            key: value + share * (target[key] - value) if key in VARIED_PARAMETERS else value
             for key, value in double.TABLE_1.items()
         }
         for _ in range(3):
@@ -129,7 +129,7 @@ def approach(target: Params) -> tuple[np.ndarray, Any]:
 # --- Multiprecision: steps and cycles.
 
 
-def around(model: Formulation, about: Sequence[float], n_legs: Number) -> Function:
+def evaluate_around(model: Formulation, about: Sequence[float], n_legs: Number) -> Function:
     """(y, p) -> (next y, durations) of the plane map after impact, as one flat function."""
 
     def function(point: Sequence[Number]) -> Vector:
@@ -155,13 +155,13 @@ def step_case(
 
     def flat(model: Formulation) -> Function:
         def function(point: Sequence[Number]) -> Vector:
-            found = step(model, point[:3], [*point[3:], p[9]], about)
-            return [*found.section_state, *found.durations]
+            step_result = step(model, point[:3], [*point[3:], p[9]], about)
+            return [*step_result.section_state, *step_result.durations]
 
         return function
 
     point = [*start, *p[:9]]
-    sizes = [SIZE] * 3 + [SIZE * v for v in p[:9]]
+    sizes = [STENCIL_STEP] * 3 + [STENCIL_STEP * v for v in p[:9]]
     stencil = Stencil(flat(hub), point, sizes)
     gradient = [stencil.first(i) for i in range(12)]
     truth = step(hub, start, p, about)
@@ -175,7 +175,7 @@ def step_case(
     expected = [mp.fsum(gradient[i][k] * move[i] for i in range(12)) for k in range(6)]
     names = ("section_state", "post_impact", "durations", "indicators")
     disagreements = {
-        "step_values": max(gap(getattr(other, n), getattr(truth, n)) for n in names),
+        "step_values": max(compute_gap(getattr(other, n), getattr(truth, n)) for n in names),
         "step_derivatives": max(
             abs(a - b) / max(abs(gradient[i][k] * move[i]) for i in range(12))
             for k, (a, b) in enumerate(zip(slope, expected, strict=True))
@@ -208,9 +208,9 @@ def cycle_case(
     hub, five = models
     p = parameters(params)
     about = [float(d) for d in about]
-    function = around(hub, about, p[9])
+    function = evaluate_around(hub, about, p[9])
     y = [mp.mpf(float(v)) for v in guess]
-    slope = minus_identity(plane_jacobian(function, y, p[:9], SIZE))
+    slope = subtract_identity(plane_jacobian(function, y, p[:9], STENCIL_STEP))
     for _ in range(12):
         image = function([*y, *p[:9]])
         change = solve_two(slope, [a - b for a, b in zip(image[:2], y, strict=True)])
@@ -220,11 +220,11 @@ def cycle_case(
     else:
         raise ArithmeticError("Newton's method did not settle")
 
-    sizes = [SIZE] * 2 + [SIZE * v for v in p[:9]]
+    sizes = [STENCIL_STEP] * 2 + [STENCIL_STEP * v for v in p[:9]]
     stencil = Stencil(function, [*y, *p[:9]], sizes)
     by_y = [stencil.first(i) for i in range(2)]
     matrix = [[by_y[j][i] for j in range(2)] for i in range(2)]
-    inverse = minus_identity(matrix)
+    inverse = subtract_identity(matrix)
     multipliers, radius, radius_rate = spectrum(matrix)
     durations = stencil.value[2:]
     period = mp.fsum(durations)
@@ -262,11 +262,11 @@ def cycle_case(
         ]
         ends = []
         for sign in (1, -1):
-            moved = list(p)
-            moved[i] = moved[i] + sign * sizes[2 + i]
+            shifted = list(p)
+            shifted[i] = shifted[i] + sign * sizes[2 + i]
             ends.append(
                 step_length(
-                    [v + sign * sizes[2 + i] * d for v, d in zip(y, dy, strict=True)], moved
+                    [v + sign * sizes[2 + i] * d for v, d in zip(y, dy, strict=True)], shifted
                 )
             )
         d_length = (ends[0] - ends[1]) / (2 * sizes[2 + i])
@@ -282,14 +282,20 @@ def cycle_case(
         derivatives["spectral_radius"].append(radius_rate(rate))
 
     disagreements = check_cycle(
-        around(five, about, p[9]), y, p[:9], stencil.value, matrix, multipliers, derivatives
+        evaluate_around(five, about, p[9]),
+        y,
+        p[:9],
+        stencil.value,
+        matrix,
+        multipliers,
+        derivatives,
     )
     other = five.walk(y, p, about)
-    found = [*other.section_state, *other.multipliers, five.land(other.section_state, p)[1]]
+    found_rows = [*other.section_state, *other.multipliers, five.land(other.section_state, p)[1]]
     indicators = [impulse, *landed.multipliers]
     disagreements["cycle_values"] = max(
         disagreements["cycle_values"],
-        gap(found, [*landed.section_state, *landed.multipliers, impulse]),
+        compute_gap(found_rows, [*landed.section_state, *landed.multipliers, impulse]),
     )
     for name in ("post_impact", "durations"):
         derivatives[name] = [list(row) for row in zip(*derivatives[name], strict=True)]
@@ -319,17 +325,17 @@ def check_cycle(
 ) -> dict[str, Number]:
     """Disagreements of another formulation's map about the cycle."""
     image = function([*y, *p])
-    values = max(gap(image[:2], y), gap(image[2:], expected[2:]))
+    values = max(compute_gap(image[:2], y), compute_gap(image[2:], expected[2:]))
     other = plane_jacobian(function, y, p, CHECK_SIZE)
-    rows = max(gap(a, b) for a, b in zip(other, matrix, strict=True))
-    found = gap(spectrum(other)[0], multipliers)
+    rows = max(compute_gap(a, b) for a, b in zip(other, matrix, strict=True))
+    solution = compute_gap(spectrum(other)[0], multipliers)
     move = [w * v for w, v in zip(DIRECTION, p, strict=True)]
-    along = [
+    tangential_part = [
         mp.fsum(derivatives["post_impact"][i][k] * move[i] for i in range(9)) for k in range(2)
     ]
     images, radii = [], []
     for sign in (1, -1):
-        y_moved = [v + sign * CHECK_SIZE * d for v, d in zip(y, along, strict=True)]
+        y_moved = [v + sign * CHECK_SIZE * d for v, d in zip(y, tangential_part, strict=True)]
         p_moved = [v + sign * CHECK_SIZE * d for v, d in zip(p, move, strict=True)]
         images.append(function([*y_moved, *p_moved]))
         radii.append(spectrum(plane_jacobian(function, y_moved, p_moved, CHECK_SIZE))[1])
@@ -347,7 +353,7 @@ def check_cycle(
     radius_slope = (radii[0] - radii[1]) / (2 * CHECK_SIZE)
     return {
         "cycle_values": values,
-        "multipliers": max(rows, found),
+        "multipliers": max(rows, solution),
         "cycle_derivatives": worst,
         "spectral_radius_derivatives": abs(radius_slope - mp.fsum(parts)) / max(map(abs, parts)),
     }
@@ -356,38 +362,38 @@ def check_cycle(
 # --- The file.
 
 
-def written(value: Any) -> Any:
+def to_strings(value: Any) -> Any:
     """Numbers as decimal strings, containers as they are."""
     if isinstance(value, mp.mpf):
-        return mp.nstr(value, STORED)
+        return mp.nstr(value, STORED_DIGITS)
     if isinstance(value, Mapping):
-        return {key: written(entry) for key, entry in value.items()}
+        return {key: to_strings(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [written(entry) for entry in value]
+        return [to_strings(entry) for entry in value]
     return value
 
 
-def compute(name: str, models: tuple[Formulation, Formulation]) -> dict[str, Any]:
+def compute_case(name: str, models: tuple[Formulation, Formulation]) -> dict[str, Any]:
     """One case of the file."""
-    params = wheel(name)
-    guess, result = approach(params)
+    params = make_wheel(name)
+    guess, result = approach_gait(params)
     section = result["section_state"]
     start = [f"{section[0]:.3f}", f"{section[1]:.2f}", f"{section[2]:.3f}"]
     one, step_gaps = step_case(models, params, start)
     cycle, cycle_gaps = cycle_case(models, params, guess, result["durations"])
     gaps = {**step_gaps, **cycle_gaps}
     for key, value in gaps.items():
-        if not value < AGREED:
+        if not value < AGREEMENT_TOLERANCE:
             raise ArithmeticError(
                 f"{name}: the formulations differ in {key} by {mp.nstr(value, 3)}"
             )
-    decimals = dict(zip(VARIED, CASES[name], strict=True))
+    decimals = dict(zip(VARIED_PARAMETERS, CASES[name], strict=True))
     exact = {key: decimals.get(key, str(params[key])) for key in NAMES}
     return {
         "name": name,
         "params": {**exact, "n_legs": int(params["n_legs"])},
-        "step": written(one),
-        "cycle": written(cycle),
+        "step": to_strings(one),
+        "cycle": to_strings(cycle),
         "disagreement": {key: mp.nstr(value, 2) for key, value in gaps.items()},
     }
 
@@ -400,9 +406,9 @@ def provenance(cases: Sequence[Mapping[str, Any]], seconds: float) -> dict[str, 
         "generator": "tests/oracle/make_truth.py",
         "units": "SI: m, s, rad, N, N s",
         "parameter_order": list(NAMES),
-        "numbers": f"{STORED} significant digits; parameters and starts are exact decimals",
+        "numbers": f"{STORED_DIGITS} significant digits; parameters and starts are exact decimals",
         "working_precision": f"{DIGITS} digits ({BITS} bits), Taylor series of heyoka",
-        "derivatives": f"central differences, relative step {mp.nstr(SIZE, 2)}",
+        "derivatives": f"central differences, relative step {mp.nstr(STENCIL_STEP, 2)}",
         "check": "MultiplierForm (multipliers) against HubForm (projected Newton's law): "
         "all values, multipliers, derivatives along one direction moving every argument, "
         f"differences of relative step {mp.nstr(CHECK_SIZE, 2)}",
@@ -422,7 +428,7 @@ def main() -> int:
     """Compute the cases and write the file after each."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", nargs="*", choices=list(CASES), help="recompute these cases")
-    parser.add_argument("--target", type=Path, default=TARGET)
+    parser.add_argument("--target", type=Path, default=TARGET_PATH)
     options = parser.parse_args()
     begin = time.perf_counter()
     done: dict[str, Any] = {}
@@ -432,7 +438,7 @@ def main() -> int:
         begin -= old["provenance"]["wall_seconds"]
     models = (HubForm(), MultiplierForm())
     for name in options.only or CASES:
-        done[name] = compute(name, models)
+        done[name] = compute_case(name, models)
         elapsed = time.perf_counter() - begin
         print(f"{name}: {elapsed:.0f} s, {done[name]['disagreement']}", flush=True)
         cases = [done[key] for key in CASES if key in done]

@@ -14,7 +14,7 @@ N = 8
 ALPHA = 2.0 * np.pi / N
 
 
-class Wheel(NamedTuple):
+class TimeSteppingWheel(NamedTuple):
     """Table 1, slope 0.30; SI units."""
 
     friction: float
@@ -30,23 +30,23 @@ class Wheel(NamedTuple):
     one_sided: bool = False
 
 
-class Start(NamedTuple):
+class StepStart(NamedTuple):
     """Just before a foot lands, in the labels of the step that begins: that foot is Leg 0's."""
 
     q: np.ndarray  # hub x, z, theta, lengths
     v: np.ndarray  # their rates
     locked: np.ndarray  # legs on their stoppers
-    carried: np.ndarray  # feet that carried load
+    loaded_feet: np.ndarray  # feet that carried load
 
 
-class Walked(NamedTuple):
+class StepEnd(NamedTuple):
     """Where the next foot ahead landed."""
 
     time: float
     theta: float
     dtheta: float
     loaded_twice: float  # time with two feet loaded, s
-    end: Start
+    end: StepStart
 
 
 def _legs(theta):
@@ -108,7 +108,7 @@ def _solve(w, W, free, feet, guess):
     return p
 
 
-def paper_start(w: Wheel, theta: float, dtheta: float, dL1: float) -> Start:
+def paper_start(w: TimeSteppingWheel, theta: float, dtheta: float, dL1: float) -> StepStart:
     """From the paper's section state, in the labels of the step that ends."""
     L1 = w.L0 * np.cos(theta - ALPHA) / np.cos(theta)
     q = np.zeros(3 + N)
@@ -119,22 +119,22 @@ def paper_start(w: Wheel, theta: float, dtheta: float, dL1: float) -> Start:
     q[1] = L1 * np.cos(theta)
     v[0] = dL1 * np.sin(theta) + L1 * dtheta * np.cos(theta)
     v[1] = dL1 * np.cos(theta) - L1 * dtheta * np.sin(theta)
-    return Start(q, v, np.arange(N) > 1, np.arange(N) == 1)
+    return StepStart(q, v, np.arange(N) > 1, np.arange(N) == 1)
 
 
-def _next_start(q: np.ndarray, v: np.ndarray, locked: np.ndarray, carried: np.ndarray) -> Start:
+def _next_start(q: np.ndarray, v: np.ndarray, locked: np.ndarray, carried: np.ndarray) -> StepStart:
     """The same wheel in the labels of the step that begins, the hub above its landing foot."""
     roll = lambda x: np.concatenate([x[:2], [x[2] - ALPHA], np.roll(x[3:], 1)])
     q = roll(q)
     q[0] = q[3] * np.sin(q[2])
     v = np.concatenate([v[:3], np.roll(v[3:], 1)])
-    return Start(q, v, np.roll(locked, 1), np.roll(carried, 1))
+    return StepStart(q, v, np.roll(locked, 1), np.roll(carried, 1))
 
 
-def one_step(w: Wheel, start: Start, h: float) -> Walked:
+def compute_step(w: TimeSteppingWheel, start: StepStart, h: float) -> StepEnd:
     """From a landing to the next one ahead."""
     q, v = start.q.copy(), start.v.copy()
-    locked, carried = start.locked & (not w.one_sided), start.carried.copy()
+    locked, carried = start.locked & (not w.one_sided), start.loaded_feet.copy()
     time, twice = 0.0, 0.0
     impulses = {}
     while time < 3.0:
@@ -155,10 +155,10 @@ def one_step(w: Wheel, start: Start, h: float) -> Walked:
         if rows:
             J = np.array(rows)[:, free_axes]
             W, free = J @ inverse @ J.T, J @ following[free_axes]
-            now = _gaps(q)
+            current_value = _gaps(q)
             for i, j in enumerate(feet):  # the gap counts for feet that carried load before
                 if carried[j]:
-                    free[2 * i + 1] += now[j] / h
+                    free[2 * i + 1] += current_value[j] / h
             guess = np.concatenate(
                 [impulses.get(j, np.zeros(2)) for j in feet] + [np.zeros(len(stops))]
             )
@@ -179,7 +179,7 @@ def one_step(w: Wheel, start: Start, h: float) -> Walked:
         twice += share * h * (np.sum(carried) >= 2)
         if share < 1.0:
             q = q - (1.0 - share) * h * v
-            return Walked(time, q[2], v[2], twice, _next_start(q, v, locked, carried))
+            return StepEnd(time, q[2], v[2], twice, _next_start(q, v, locked, carried))
         hits = ~locked & (q[3:] >= w.L0) & ~carried & (not w.one_sided)
         if np.any(hits):  # inelastic: the leg joins the rigid rest with its momentum
             locked |= hits

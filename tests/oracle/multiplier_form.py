@@ -11,10 +11,10 @@ import numpy as np
 from . import five_coordinates_equations as equations
 from .multiprecision import (
     Flow,
-    Landed,
     Number,
+    StepEnd,
     Vector,
-    compiled,
+    compile_expressions,
     dot,
     plus,
     solve_positive,
@@ -54,7 +54,7 @@ class MultiplierForm:
             acceleration, multipliers = self._solve(mass, rows, force, rates)
             guard = multipliers[3] if mode == "DLS" else guards[mode]
             if mode == "DLS":
-                self._forces = compiled(multipliers, [*q, *v])
+                self._forces = compile_expressions(multipliers, [*q, *v])
             self._flows[mode] = Flow([*q, *v], [*v, *acceleration], guard, 13)
 
     @staticmethod
@@ -62,13 +62,13 @@ class MultiplierForm:
         mass: list[Vector], rows: list[Vector], force: Vector, rates: Vector
     ) -> tuple[Vector, Vector]:
         """q'' and lambda of eqs (5)-(8)."""
-        free, *along = solve_positive(mass, force, *rows)
-        cross = [[dot(row, column) for column in along] for row in rows]
+        free, *tangential_part = solve_positive(mass, force, *rows)
+        cross = [[dot(row, column) for column in tangential_part] for row in rows]
         (multipliers,) = solve_positive(
             cross, [-rate - dot(row, free) for rate, row in zip(rates, rows, strict=True)]
         )
         acceleration = free
-        for multiplier, column in zip(multipliers, along, strict=True):
+        for multiplier, column in zip(multipliers, tangential_part, strict=True):
             acceleration = plus(acceleration, times(multiplier, column))
         return acceleration, multipliers
 
@@ -104,7 +104,7 @@ class MultiplierForm:
         after, impulse = self._impact(q, v, "DLS", constants)
         return [new, after[2]], impulse[3]
 
-    def walk(self, y: Sequence[Number], p: Sequence[Number], about: Sequence[float]) -> Landed:
+    def walk(self, y: Sequence[Number], p: Sequence[Number], about: Sequence[float]) -> StepEnd:
         """Double support, SLS-I, collision II, SLS-II."""
         constants = self._constants(p)
         alpha, length, zero = constants[6], p[3], mp.mpf(0)
@@ -127,4 +127,4 @@ class MultiplierForm:
             state, duration = self._flows[mode].until_guard(state, constants, guess)
             durations.append(duration)
         section = [state[2], state[7], state[8]]
-        return Landed(section, durations, [to_mpf(forces[1]), to_mpf(forces[3])])
+        return StepEnd(section, durations, [to_mpf(forces[1]), to_mpf(forces[3])])

@@ -38,7 +38,7 @@ Vector = list[Number]
 
 
 @dataclass(frozen=True)
-class StepTruth:
+class StepReference:
     """What one step yields; SI units, see ``five_coordinates.step`` for the meanings."""
 
     section_state: Vector
@@ -51,7 +51,7 @@ class StepTruth:
 class Formulation(Protocol):
     """A way to compute one step."""
 
-    def walk(self, y: Sequence[Number], p: Sequence[Number], about: Sequence[float]) -> Landed:
+    def walk(self, y: Sequence[Number], p: Sequence[Number], about: Sequence[float]) -> StepEnd:
         """From just after a landing to just before the next; ``about`` guesses the durations."""
 
     def land(self, x: Sequence[Number], p: Sequence[Number]) -> tuple[Vector, Number]:
@@ -59,7 +59,7 @@ class Formulation(Protocol):
 
 
 @dataclass(frozen=True)
-class Landed:
+class StepEnd:
     """Result of ``walk``: the section state, the durations, and lambda2+, lambda4+."""
 
     section_state: Vector
@@ -69,13 +69,13 @@ class Landed:
 
 def step(
     model: Formulation, x: Sequence[Number], p: Sequence[Number], about: Sequence[float]
-) -> StepTruth:
+) -> StepReference:
     """One step from a section state; p in the order of ``NAMES`` followed by n_legs."""
     y, impulse = model.land(x, p)
     landed = model.walk(y, p, about)
     length = step_length(y, p)
     indicators = [impulse, *landed.multipliers]
-    return StepTruth(landed.section_state, y, landed.durations, length, indicators)
+    return StepReference(landed.section_state, y, landed.durations, length, indicators)
 
 
 def step_length(y: Sequence[Number], p: Sequence[Number]) -> Number:
@@ -116,14 +116,14 @@ def solve_positive(matrix: list[Vector], *right: Vector) -> list[Vector]:
 def dot(a: Sequence[Number], b: Sequence[Number]) -> Number:
     """Scalar product."""
     total = a[0] * b[0]
-    for left, right in zip(a[1:], b[1:], strict=True):
-        total = total + left * right
+    for left_part, right in zip(a[1:], b[1:], strict=True):
+        total = total + left_part * right
     return total
 
 
 def plus(a: Sequence[Number], b: Sequence[Number]) -> Vector:
     """Sum of two vectors."""
-    return [left + right for left, right in zip(a, b, strict=True)]
+    return [left_part + right for left_part, right in zip(a, b, strict=True)]
 
 
 def times(scale: Number, a: Sequence[Number]) -> Vector:
@@ -144,7 +144,9 @@ def to_mpf(value: Any) -> Number:
     return mp.mpf(str(value))
 
 
-def compiled(expressions: list[Any], variables: Sequence[Any]) -> Callable[[Any, Any], Any]:
+def compile_expressions(
+    expressions: list[Any], variables: Sequence[Any]
+) -> Callable[[Any, Any], Any]:
     """Function of (values of the variables, constants) for these expressions."""
     function = hy.cfunc(expressions, list(variables), fp_type=hy.real, prec=BITS)
     return lambda values, constants: function(values, pars=constants[: function.nparams])
@@ -168,7 +170,7 @@ class Flow:
         speed: Any = 0
         for variable, rate in zip(variables, rates, strict=True):
             speed = speed + hy.diff(guard, variable) * rate
-        self._guard = compiled([guard, speed], variables)
+        self._guard = compile_expressions([guard, speed], variables)
 
     def until_guard(self, y: Vector, c: Vector, about: float) -> tuple[Vector, Number]:
         """State at the zero of the guard nearest to the time ``about``, and that time, s."""

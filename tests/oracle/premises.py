@@ -70,8 +70,10 @@ def _masses(wheel: Wheel) -> list[float]:
 def _split(total: Array, axial1: float, axial2: float, angle1: float, angle2: float) -> Array:
     """Contact forces (x1, z1, x2, z2) from their sum and from their parts along each leg."""
     u1, u2, t1, t2 = _radial(angle1), _radial(angle2), _tangent(angle1), _tangent(angle2)
-    across = np.linalg.solve(np.column_stack([t1, t2]), total - axial1 * u1 - axial2 * u2)
-    return np.concatenate([axial1 * u1 + across[0] * t1, axial2 * u2 + across[1] * t2])
+    transverse_part = np.linalg.solve(np.column_stack([t1, t2]), total - axial1 * u1 - axial2 * u2)
+    return np.concatenate(
+        [axial1 * u1 + transverse_part[0] * t1, axial2 * u2 + transverse_part[1] * t2]
+    )
 
 
 def contact_forces(wheel: Wheel, q: Array, v: Array, a: Array, mode: str) -> Array:
@@ -92,8 +94,8 @@ def contact_forces(wheel: Wheel, q: Array, v: Array, a: Array, mode: str) -> Arr
         return np.array([*total, 0.0, 0.0])
     push = params["stiffness"] * (params["natural_length"] - q[3:]) - params["damping"] * v[3:]
     angles = q[2], q[2] + wheel.alpha
-    along = [demands[i + 1] @ _radial(angles[i]) + push[i] for i in range(2)]
-    return _split(total, along[0], along[1], *angles)
+    tangential_part = [demands[i + 1] @ _radial(angles[i]) + push[i] for i in range(2)]
+    return _split(total, tangential_part[0], tangential_part[1], *angles)
 
 
 def stopper_forces(wheel: Wheel, q: Array, v: Array, a: Array) -> Array:
@@ -119,7 +121,7 @@ def stopper_forces(wheel: Wheel, q: Array, v: Array, a: Array) -> Array:
 def _velocity_jumps(wheel: Wheel, q: Array, before: Array, after: Array) -> list[Array]:
     """Jumps of the velocities of the hub and of the masses of legs 1..n, m/s."""
     old, new = mass_velocities(wheel, q, before), mass_velocities(wheel, q, after)
-    return [late - early for early, late in zip(old, new, strict=True)]
+    return [late_values - early for early, late_values in zip(old, new, strict=True)]
 
 
 def _landing_impulses(wheel: Wheel, q: Array, before: Array, after: Array) -> Array:
@@ -131,8 +133,8 @@ def _landing_impulses(wheel: Wheel, q: Array, before: Array, after: Array) -> Ar
     velocities = _velocity_jumps(wheel, q, before, after)
     jumps = [mass * dv for mass, dv in zip(_masses(wheel), velocities, strict=True)]
     angles = q[2], q[2] + wheel.alpha
-    along = [float(jumps[i + 1] @ _radial(angles[i])) for i in range(2)]
-    return _split(np.sum(jumps, axis=0), along[0], along[1], *angles)
+    tangential_part = [float(jumps[i + 1] @ _radial(angles[i])) for i in range(2)]
+    return _split(np.sum(jumps, axis=0), tangential_part[0], tangential_part[1], *angles)
 
 
 def _lowest(
@@ -151,17 +153,17 @@ def _lowest(
         if values[i] <= values[i - 1] and values[i] <= values[i + 1]:
             if skip_start and abs(values[i]) < 1e-12:
                 continue
-            found = minimize_scalar(
+            solution = minimize_scalar(
                 function,
                 bounds=(float(times[i - 1]), float(times[i + 1])),
                 method="bounded",
                 options={"xatol": 1e-10},
             )
-            candidates.append(min(float(values[i]), float(found.fun)))
+            candidates.append(min(float(values[i]), float(solution.fun)))
     return min(candidates)
 
 
-def margins(wheel: Wheel, result: Mapping[str, Any]) -> dict[str, Any]:
+def compute_margins(wheel: Wheel, result: Mapping[str, Any]) -> dict[str, Any]:
     """Signed premises over one completed step, as ``five_coordinates.monitors`` lists them."""
     phases: dict[str, Phase] = {phase.name: phase for phase in result["phases"]}
     length, legs = wheel.params["locked_length"], int(wheel.params["n_legs"])
@@ -195,9 +197,9 @@ def margins(wheel: Wheel, result: Mapping[str, Any]) -> dict[str, Any]:
     def stopper(leg: int, name: str) -> float:
         return lowest(lambda p, t: float(stopper_forces(wheel, *motion(p, t)[:3])[leg - 2]), name)
 
-    least = [np.nanmin([stopper(leg, name) for name in phases]) for leg in range(3, legs + 1)]
-    out["stopper_force_legs"] = np.array(least)
-    out["stopper_force"] = float(np.min(least))
+    minimum = [np.nanmin([stopper(leg, name) for name in phases]) for leg in range(3, legs + 1)]
+    out["stopper_force_legs"] = np.array(minimum)
+    out["stopper_force"] = float(np.min(minimum))
     out["stopper_force_leg2"] = stopper(2, "SLS-II")
     # One function over the whole step: only its very start is left out.
     ends = [
@@ -216,7 +218,7 @@ def margins(wheel: Wheel, result: Mapping[str, Any]) -> dict[str, Any]:
 
     q, before, after = result["landing"]
     jumps = _velocity_jumps(wheel, q, before, after)
-    out["stopper_impulse_landing"] = _along(wheel, q, jumps)
+    out["stopper_impulse_landing"] = _project_jumps(wheel, q, jumps)
     planted = result["lambda_impulse"][3] >= 0
     landing = _landing_impulses(wheel, q, before, after)
     if not planted:
@@ -232,7 +234,7 @@ def margins(wheel: Wheel, result: Mapping[str, Any]) -> dict[str, Any]:
 
     q, before, after = result["stopper"]
     jumps = _velocity_jumps(wheel, q, before, after)
-    out["stopper_impulse_stopper"] = _along(wheel, q, jumps)
+    out["stopper_impulse_stopper"] = _project_jumps(wheel, q, jumps)
     total = np.sum([m * dv for m, dv in zip(_masses(wheel), jumps, strict=True)], axis=0)
     out["normal_impulse_stopper"] = float(total[1])
 
@@ -246,7 +248,7 @@ def margins(wheel: Wheel, result: Mapping[str, Any]) -> dict[str, Any]:
     return out
 
 
-def _along(wheel: Wheel, q: Array, jumps: list[Array]) -> Array:
+def _project_jumps(wheel: Wheel, q: Array, jumps: list[Array]) -> Array:
     """m dv_j . u_j of legs 3..n, N s."""
     mass = wheel.params["leg_mass"]
     return np.array(

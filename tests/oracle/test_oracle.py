@@ -55,26 +55,26 @@ def test_contact_jacobian_is_the_derivative_of_the_feet(seed: int) -> None:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_step_meets_the_truth(name: str) -> None:
+def test_the_step_agrees_with_the_reference(name: str) -> None:
     case = CASES[name]
     truth = case["step"]
-    found = oracle.step(_params(case), _floats(truth["start"]))
-    assert found["outcome"] == oracle.STEPPED
+    step_result = oracle.step(_params(case), _floats(truth["start"]))
+    assert step_result["outcome"] == oracle.STEPPED
     for key in ("section_state", "post_impact", "durations", "step_length"):
-        np.testing.assert_allclose(found[key], _floats(truth[key]), rtol=0, atol=5e-13)
-    indicators = [found["lambda_impulse"][3], *found["lambda_plus"][[1, 3]]]
+        np.testing.assert_allclose(step_result[key], _floats(truth[key]), rtol=0, atol=5e-13)
+    indicators = [step_result["lambda_impulse"][3], *step_result["lambda_plus"][[1, 3]]]
     names = ("lambda_impulse_4", "lambda2_plus", "lambda4_plus")
     np.testing.assert_allclose(indicators, [float(truth[n]) for n in names], rtol=0, atol=1e-11)
-    assert abs(found["energy_residual"]) < 1e-11
-    assert found["constraint_residual"] < 1e-12
+    assert abs(step_result["energy_residual"]) < 1e-11
+    assert step_result["constraint_residual"] < 1e-12
 
 
-def test_limit_cycle_meets_the_truth() -> None:
+def test_the_limit_cycle_agrees_with_the_reference() -> None:
     truth = CASES["table_1"]["cycle"]
-    found = oracle.limit_cycle(oracle.TABLE_1, oracle.START)
+    cycle = oracle.limit_cycle(oracle.TABLE_1, oracle.START)
     for key in ("section_state", "post_impact", "durations", "period", "dls_fraction", "speed"):
-        np.testing.assert_allclose(found[key], _floats(truth[key]), rtol=0, atol=5e-13)
-    assert found["spectral_radius"] == pytest.approx(float(truth["spectral_radius"]), abs=1e-9)
+        np.testing.assert_allclose(cycle[key], _floats(truth[key]), rtol=0, atol=5e-13)
+    assert cycle["spectral_radius"] == pytest.approx(float(truth["spectral_radius"]), abs=1e-9)
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -109,7 +109,7 @@ def _assert_euler(
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_derivatives_of_the_truth_obey_the_scaling_laws_in_22_digits(name: str) -> None:
+def test_derivatives_of_the_reference_obey_the_scaling_laws_in_22_digits(name: str) -> None:
     case = CASES[name]
     arguments = [
         (case["params"][key], SCALES[key]) for key in TRUTH["provenance"]["parameter_order"]
@@ -139,9 +139,9 @@ def test_derivatives_of_the_truth_obey_the_scaling_laws_in_22_digits(name: str) 
 
 
 def test_newtons_law_on_the_point_masses_gives_the_multipliers() -> None:
-    found = oracle.monitors(oracle.TABLE_1, oracle.START)
-    assert found["newton_residual"] < 1e-9
-    assert found["lambda2"]["DLS"] == pytest.approx(103.898, abs=1e-2)
+    solution = oracle.monitors(oracle.TABLE_1, oracle.START)
+    assert solution["newton_residual"] < 1e-9
+    assert solution["lambda2"]["DLS"] == pytest.approx(103.898, abs=1e-2)
 
 
 @pytest.mark.parametrize(
@@ -154,26 +154,26 @@ def test_newtons_law_on_the_point_masses_gives_the_multipliers() -> None:
         ({}, (0.4, 1.6, -0.1), oracle.BAD_INPUT),  # Leg 1 would be longer than L0
     ],
 )
-def test_a_broken_step_says_why(
+def test_a_failed_step_reports_its_cause(
     changes: dict[str, float], x: tuple[float, float, float], outcome: str
 ) -> None:
-    found = oracle.step({**oracle.TABLE_1, **changes}, x)
-    assert found["outcome"] == outcome
-    assert np.all(np.isnan(found["section_state"]))
+    step_result = oracle.step({**oracle.TABLE_1, **changes}, x)
+    assert step_result["outcome"] == outcome
+    assert np.all(np.isnan(step_result["section_state"]))
 
 
-def test_a_landing_that_pulls_at_leg_2_frees_it() -> None:
-    found = oracle.step(oracle.TABLE_1, (-0.1, 1.6, -0.1))
-    assert found["lambda_impulse"][3] < 0  # (A3)
-    assert found["lambda_impulse_applied"][3] == 0
-    q, _, after = found["landing"]
+def test_a_landing_that_would_pull_leg_2_releases_it() -> None:
+    step_result = oracle.step(oracle.TABLE_1, (-0.1, 1.6, -0.1))
+    assert step_result["lambda_impulse"][3] < 0  # (A3)
+    assert step_result["lambda_impulse_applied"][3] == 0
+    q, _, after = step_result["landing"]
     pack = Wheel(oracle.TABLE_1).pack
     assert (np.array(equations.jacobian(q, pack)) @ after)[3] > 0
-    assert found["phases"][0].duration == 0
+    assert step_result["phases"][0].duration == 0
 
 
 def test_a_landing_without_load_on_leg_2_skips_double_support() -> None:
-    found = oracle.step(oracle.TABLE_1, (0.103, 2.0, -0.109))
-    assert found["lambda_impulse"][3] > 0 > found["lambda_plus"][3]  # (B3)
-    assert found["phases"][0].duration == 0
-    assert found["phases"][1].duration > 0
+    step_result = oracle.step(oracle.TABLE_1, (0.103, 2.0, -0.109))
+    assert step_result["lambda_impulse"][3] > 0 > step_result["lambda_plus"][3]  # (B3)
+    assert step_result["phases"][0].duration == 0
+    assert step_result["phases"][1].duration > 0

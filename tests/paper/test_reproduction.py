@@ -20,69 +20,77 @@ from vrw_jax.paper import reproduction as reproduce
 from vrw_jax.paper.facts.base import Evidence
 from vrw_jax.wheel.outcomes import Outcome
 
-FIGURES = ("fig06_gait", "fig07_sticks", "fig08_scuffing", "fig09_rear_force", "fig10_indicators")
+FIGURE_NAMES = (
+    "fig06_gait",
+    "fig07_sticks",
+    "fig08_scuffing",
+    "fig09_rear_force",
+    "fig10_indicators",
+)
 
 
 @pytest.fixture(scope="session")
 def evidence() -> Evidence:
-    return reproduce.collect()
+    return reproduce.collect_evidence()
 
 
 @pytest.fixture(scope="session")
-def reproduced(
+def reproduction_result(
     evidence: Evidence, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, bool, list[float]]:
-    folder, told = tmp_path_factory.mktemp("reproduced"), []
+    folder, result = tmp_path_factory.mktemp("reproduced"), []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(reproduce, "collect", lambda progress: evidence)
-        table = reproduce.reproduce(folder, lambda share, what: told.append(share))
-    return folder, all(fact.holds for fact in table), told
+        table = reproduce.reproduce(folder, lambda share, what: result.append(share))
+    return folder, all(fact.holds for fact in table), result
 
 
 def test_every_published_fact_holds(evidence: Evidence) -> None:
-    failing = [f"{f.claim}: found {f.found}" for f in facts.all_facts(evidence) if not f.holds]
+    failing = [
+        f"{f.claim}: found {f.computed}" for f in facts.compute_facts(evidence) if not f.holds
+    ]
     assert not failing
 
 
-def test_every_fact_says_where_it_stands_and_why_its_tolerance(evidence: Evidence) -> None:
-    for fact in facts.all_facts(evidence):
-        assert fact.where
-        assert fact.published
-        assert fact.found
-        assert fact.reason
+def test_every_fact_has_a_source_and_a_reason_for_its_tolerance(evidence: Evidence) -> None:
+    for fact in facts.compute_facts(evidence):
+        assert fact.source
+        assert fact.published_value
+        assert fact.computed
+        assert fact.tolerance_reason
 
 
-def test_the_table_speaks_of_every_figure_and_of_the_misprints(evidence: Evidence) -> None:
-    text = facts.as_page(facts.all_facts(evidence))
+def test_the_table_covers_every_figure_and_the_misprints(evidence: Evidence) -> None:
+    text = facts.format_facts_page(facts.compute_facts(evidence))
     for word in ("Fig. 6", "Fig. 8", "Fig. 9", "Fig. 10(a)", "Fig. 10(b)", "J43", "eq. (35)",
                  "eqs (16), (17)", "φ = 0.10", "friction", "stopper"):  # fmt: skip
         assert word in text
 
 
-def test_a_faithful_reproduction_is_true_and_writes_everything(
-    reproduced: tuple[Path, bool, list[float]],
+def test_a_successful_reproduction_writes_every_file(
+    reproduction_result: tuple[Path, bool, list[float]],
 ) -> None:
-    folder, holds, told = reproduced
+    folder, holds, result = reproduction_result
     assert holds
-    assert told == sorted(told)
-    assert told[-1] == 1.0
-    expected = {f"{name}.{kind}" for name in FIGURES for kind in ("svg", "png")}
+    assert result == sorted(result)
+    assert result[-1] == 1.0
+    expected = {f"{name}.{kind}" for name in FIGURE_NAMES for kind in ("svg", "png")}
     expected |= {"walk.gif", "facts.md", "facts.csv", "indicators.csv"}
     assert {path.name for path in folder.iterdir()} == expected
 
 
-def test_a_broken_fact_is_told_and_gives_an_exit_code(
+def test_a_failed_fact_is_printed_and_sets_the_exit_code(
     evidence: Evidence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    branch = evidence.branch.copy(deep=True)
+    branch = evidence.damping_branch.copy(deep=True)
     branch.lambda_4_plus.loc[{"damping": 219.0}] = -0.01
-    broken = dataclasses.replace(evidence, branch=branch)
+    broken = dataclasses.replace(evidence, damping_branch=branch)
     monkeypatch.setattr(reproduce, "collect", lambda progress: broken)
     monkeypatch.setattr(reproduce, "draw", lambda evidence, folder: [])
     monkeypatch.setattr("vrw_jax.runtime.start_jax", lambda: None)
     result = CliRunner().invoke(cli.app, ["reproduce", "--out", str(tmp_path)])
-    assert result.exit_code == cli.FACT_FAILED
-    table = facts.all_facts(broken)
+    assert result.exit_code == cli.FACT_FAILED_EXIT_CODE
+    table = facts.compute_facts(broken)
     assert f"{sum(fact.holds for fact in table)} of {len(table)} hold" in result.output
     assert "26 that the paper publishes, 28 by independent code" in " ".join(result.output.split())
     assert "does not" in result.output
@@ -95,80 +103,84 @@ def test_a_broken_fact_is_told_and_gives_an_exit_code(
     assert verdicts["λ2⁺ is gone at c = 4"] == "holds"
 
 
-def _scaled(results: xr.Dataset, factor: float) -> xr.Dataset:
+def _scale_results(results: xr.Dataset, factor: float) -> xr.Dataset:
     """All numbers but the coordinates times a factor."""
     return results.map(
         lambda v: v * factor if v.dtype.kind == "f" else v, keep_attrs=True
     ).assign_attrs(results.attrs)
 
 
-def _with_states(branch: xr.Dataset, factors: tuple[float, float, float]) -> xr.Dataset:
+def _scale_states(branch: xr.Dataset, factors: tuple[float, float, float]) -> xr.Dataset:
     return branch.assign(section_state=branch.section_state * np.array(factors))
 
 
-def _spoiled_gait(e: Evidence) -> Evidence:
+def _corrupt_gait(e: Evidence) -> Evidence:
     return dataclasses.replace(
         e,
-        gait=_scaled(e.gait, -1.3).assign_coords(time=1.1 * e.gait.time),
-        by_damping=[_scaled(g, -1.0) for g in e.by_damping],
+        table_1_trajectory=_scale_results(e.table_1_trajectory, -1.3).assign_coords(
+            time=1.1 * e.table_1_trajectory.time
+        ),
+        gaits_by_damping=[_scale_results(g, -1.0) for g in e.gaits_by_damping],
     )
 
 
-def _spoiled_branch(e: Evidence) -> Evidence:
-    flipped = _scaled(e.branch, -1.1)
-    return dataclasses.replace(e, branch=flipped.assign(settled=~flipped.settled))
+def _corrupt_branch(e: Evidence) -> Evidence:
+    flipped = _scale_results(e.damping_branch, -1.1)
+    return dataclasses.replace(e, damping_branch=flipped.assign(settled=~flipped.settled))
 
 
-def _spoiled_walks(e: Evidence) -> Evidence:
-    stepped = {"outcome": Outcome.STEPPED.name}
+def _corrupt_walks(e: Evidence) -> Evidence:
+    step_by_name = {"outcome": Outcome.STEPPED.name}
     return dataclasses.replace(
         e,
-        settling=e.settling.assign_attrs(settled=0),
-        too_fast=e.too_fast.assign_attrs(stepped),
-        gentler=_scaled(e.gentler, 1.1),
-        gentle=e.gentle.assign(settled=xr.ones_like(e.gentle.settled)),
-        gentle_low=_scaled(e.gentle_low, -1.0),
+        settling_walk=e.settling_walk.assign_attrs(settled=0),
+        fast_start_walk=e.fast_start_walk.assign_attrs(step_by_name),
+        slope_branch=_scale_results(e.slope_branch, 1.1),
+        gentle_slope_branch=e.gentle_slope_branch.assign(
+            settled=xr.ones_like(e.gentle_slope_branch.settled)
+        ),
+        gentle_slope_low_damping_branch=_scale_results(e.gentle_slope_low_damping_branch, -1.0),
     )
 
 
-def _spoiled_states(e: Evidence) -> Evidence:
-    return dataclasses.replace(e, branch=_with_states(e.branch, (1.0, -1.0, 0.0)))
+def _corrupt_states(e: Evidence) -> Evidence:
+    return dataclasses.replace(e, damping_branch=_scale_states(e.damping_branch, (1.0, -1.0, 0.0)))
 
 
-def _sinking_foot(e: Evidence) -> Evidence:
-    sinking = e.gait.assign(
-        foot_2_z=-e.gait.foot_2_z,
-        total_energy=-e.gait.total_energy,
-        lambda_2=e.gait.lambda_2 + 50.0 * np.sin(60.0 * e.gait.time),
-        lambda_3=-e.gait.lambda_3 * (e.gait.lambda_4 > 1.0),
-        lambda_4=100.0 * e.gait.lambda_4,
-        L1=e.gait.L1 + 0.05,
-        L2=e.gait.L2 + 0.05,
-        phase=2 - e.gait.phase,
+def _sink_foot(e: Evidence) -> Evidence:
+    sinking = e.table_1_trajectory.assign(
+        foot_2_z=-e.table_1_trajectory.foot_2_z,
+        total_energy=-e.table_1_trajectory.total_energy,
+        lambda_2=e.table_1_trajectory.lambda_2 + 50.0 * np.sin(60.0 * e.table_1_trajectory.time),
+        lambda_3=-e.table_1_trajectory.lambda_3 * (e.table_1_trajectory.lambda_4 > 1.0),
+        lambda_4=100.0 * e.table_1_trajectory.lambda_4,
+        L1=e.table_1_trajectory.L1 + 0.05,
+        L2=e.table_1_trajectory.L2 + 0.05,
+        phase=2 - e.table_1_trajectory.phase,
     )
-    return dataclasses.replace(e, gait=sinking)
+    return dataclasses.replace(e, table_1_trajectory=sinking)
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of numbers that were spoiled on purpose
 def test_every_fact_can_fail(evidence: Evidence) -> None:
     spoils: tuple[Callable[[Evidence], Evidence], ...] = (
-        _spoiled_gait,
-        _spoiled_branch,
-        _spoiled_walks,
-        _spoiled_states,
-        _sinking_foot,
+        _corrupt_gait,
+        _corrupt_branch,
+        _corrupt_walks,
+        _corrupt_states,
+        _sink_foot,
     )
-    unmoved = {fact.claim for fact in facts.all_facts(evidence)}
+    unmoved = {fact.claim for fact in facts.compute_facts(evidence)}
     for spoil in spoils:
-        unmoved &= {fact.claim for fact in facts.all_facts(spoil(evidence)) if fact.holds}
+        unmoved &= {fact.claim for fact in facts.compute_facts(spoil(evidence)) if fact.holds}
     assert not unmoved
 
 
-def test_figures_are_drawings_that_a_reader_can_open(
-    reproduced: tuple[Path, bool, list[float]],
+def test_figures_are_valid_image_files(
+    reproduction_result: tuple[Path, bool, list[float]],
 ) -> None:
-    folder = reproduced[0]
-    for name in FIGURES:
+    folder = reproduction_result[0]
+    for name in FIGURE_NAMES:
         root = ElementTree.parse(folder / f"{name}.svg").getroot()
         assert root.tag.endswith("svg")
         with Image.open(folder / f"{name}.png") as picture:
@@ -181,9 +193,11 @@ def test_figures_are_drawings_that_a_reader_can_open(
     assert sum(sizes.values()) < 2_000_000
 
 
-def test_the_same_results_give_the_same_drawing(evidence: Evidence, tmp_path: Path) -> None:
+def test_the_same_results_give_the_same_figure(evidence: Evidence, tmp_path: Path) -> None:
     first, second = (
-        plots.save(plots.indicators(evidence.branch), tmp_path / name, "figure")[0].read_bytes()
+        plots.save(plots.indicators(evidence.damping_branch), tmp_path / name, "figure")[
+            0
+        ].read_bytes()
         for name in ("first", "second")
     )
     assert first == second
@@ -191,12 +205,12 @@ def test_the_same_results_give_the_same_drawing(evidence: Evidence, tmp_path: Pa
 
 def test_drawing_leaves_matplotlib_as_it_was(evidence: Evidence, tmp_path: Path) -> None:
     before = dict(mpl.rcParams)
-    plots.save(plots.rear_force(evidence.by_damping), tmp_path, "figure")
+    plots.save(plots.rear_force(evidence.gaits_by_damping), tmp_path, "figure")
     assert dict(mpl.rcParams) == before
 
 
 def test_figure_10_shows_only_gaits_that_the_paper_shows(evidence: Evidence) -> None:
-    figure = plots.indicators(evidence.branch, every=1)
+    figure = plots.indicators(evidence.damping_branch, every=1)
     for axes in figure.axes:
         for line in axes.lines:
             values = np.asarray(line.get_xdata())

@@ -2,35 +2,35 @@
 
 import pytest
 
-from vrw_jax.models.ladder import PREMISES, told_why
-from vrw_jax.results import MARGINS, STEP, what_breaks
-from vrw_jax.wording import as_html, as_markdown, as_tex, as_text
+from vrw_jax.models.ladder import SELECTION_MARGINS, describe_reason
+from vrw_jax.results import MARGIN_MEASURES, STEP_MEASURES, describe_violation
+from vrw_jax.wording import format_html_table, format_markdown_table, format_mathtext, format_text
 
 INDICATORS = ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
 
 
-@pytest.mark.parametrize("name", [*MARGINS, *INDICATORS])
-def test_a_margin_or_an_indicator_says_what_breaks_below_zero(name):
-    breaks = (MARGINS | STEP)[name].breaks
+@pytest.mark.parametrize("name", [*MARGIN_MEASURES, *INDICATORS])
+def test_a_margin_or_an_indicator_describes_its_violation(name):
+    breaks = (MARGIN_MEASURES | STEP_MEASURES)[name].violation
     assert breaks
     assert not breaks.endswith(".")
-    assert breaks in what_breaks(name)
+    assert breaks in describe_violation(name)
 
 
-def test_no_two_margins_break_alike():
-    assert len({measure.breaks for measure in MARGINS.values()}) == len(MARGINS)
+def test_no_two_margins_describe_the_same_violation():
+    assert len({measure.violation for measure in MARGIN_MEASURES.values()}) == len(MARGIN_MEASURES)
 
 
-def test_what_is_no_margin_breaks_nothing():
-    assert {name for name, measure in STEP.items() if measure.breaks} == set(INDICATORS)
-    assert what_breaks("period_doubling") == "period doubling"
-    assert what_breaks("locked_stopper_force[5]").endswith(", leg 5")
-    assert what_breaks("lambda_4_plus") == "λ4⁺ = 0: rear foot lifts at once"
+def test_other_measures_describe_no_violation():
+    assert {name for name, measure in STEP_MEASURES.items() if measure.violation} == set(INDICATORS)
+    assert describe_violation("period_doubling") == "period doubling"
+    assert describe_violation("locked_stopper_force[5]").endswith(", leg 5")
+    assert describe_violation("lambda_4_plus") == "λ4⁺ = 0: rear foot lifts at once"
 
 
-def test_the_ladder_takes_its_reasons_from_the_table():
-    for reason, name in enumerate(PREMISES, start=1):
-        assert MARGINS[name].breaks in told_why(reason)
+def test_reasons_of_the_ladder_come_from_the_table():
+    for reason, name in enumerate(SELECTION_MARGINS, start=1):
+        assert MARGIN_MEASURES[name].violation in describe_reason(reason)
 
 
 @pytest.mark.parametrize(
@@ -49,16 +49,16 @@ def test_the_ladder_takes_its_reasons_from_the_table():
     ],
 )
 def test_a_symbol_becomes_mathtext(symbol, tex):
-    assert as_tex(symbol) == tex
+    assert format_mathtext(symbol) == tex
 
 
-def test_rows_are_shown_as_text_as_a_page_and_in_a_notebook():
+def test_rows_are_formatted_as_text_markdown_and_html():
     rows = [("a", "1 < 2"), ("b", "|x|")]
-    assert as_text("Title", rows) == "Title\n  a: 1 < 2\n  b: |x|"
-    assert as_markdown(("name", "value"), rows) == [
+    assert format_text("Title", rows) == "Title\n  a: 1 < 2\n  b: |x|"
+    assert format_markdown_table(("name", "value"), rows) == [
         "| name | value |", "|---|---|", "| a | 1 < 2 |", r"| b | \|x\| |",
     ]  # fmt: skip
-    html = as_html("Title", rows, ("name", "value"))
+    html = format_html_table("Title", rows, ("name", "value"))
     assert "<caption>Title</caption>" in html
     assert "1 &lt; 2" in html
     assert html.count("<tr>") == 3

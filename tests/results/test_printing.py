@@ -27,13 +27,16 @@ TABLE_1, START = vrw.WheelParams(), vrw.paper_start()
             lambda: jax.tree.map(jnp.negative, TABLE_1),
             ("a gradient or a difference", "by damping c, N s/m: -200"),
         ),
-        (vrw.Options, ("solver: Dopri8", "rtol: 1e-10", "first_step: 0.005 s")),
+        (vrw.StepOptions, ("solver: Dopri8", "rtol: 1e-10", "first_step: 0.005 s")),
         (lambda: vrw.step(TABLE_1, START), ("DLS fraction T_DLS/T: 0.53", "N s, broken")),
-        (lambda: vrw.step(TABLE_1, START).monitors, ("min λ2: 103.", " N")),
+        (lambda: vrw.step(TABLE_1, START).margins, ("min λ2: 103.", " N")),
         (lambda: vrw.step(TABLE_1, START).indicators, ("λ_I4: 1.96", "N s")),
         (lambda: vrw.step(TABLE_1, START).energy, ("ΔE_c: 29.5", " J")),
         (lambda: vrw.walk(TABLE_1, START, 3), ("steps: 3 of 3", "rad, rad/s, m/s")),
-        (lambda: vrw.steps(TABLE_1, np.stack([START, 0.0 * START])), ("1 STEPPED, 1 BAD_INPUT",)),
+        (
+            lambda: vrw.step_batch(TABLE_1, np.stack([START, 0.0 * START])),
+            ("1 STEPPED, 1 BAD_INPUT",),
+        ),
         (lambda: vrw.limit_cycle(TABLE_1).indicators, ("N s",)),
         (
             lambda: vrw.limit_cycle(vrw.WheelParams(slope=0.1), model=vrw.RigidWheel()),
@@ -57,23 +60,23 @@ def test_a_result_prints_numbers_and_units(make, words):
         (lambda: vrw.RigidWheel(), "RigidWheel(friction=1.0, stop_at_lift_off=True"),
         (lambda: vrw.grid(damping=np.linspace(1, 2, 1000)), "grid of 1,000: damping 1000 values"),
         (lambda: vrw.sobol({"slope": (0.2, 0.3)}, 64), "sobol of 64: slope 64 values from 0.2"),
-        (lambda: vrw.newton_cycle(lambda x: 0.5 * x + 1.0, jnp.zeros(1)), "multipliers: 0.5"),
+        (lambda: vrw.solve_fixed_point(lambda x: 0.5 * x + 1.0, jnp.zeros(1)), "multipliers: 0.5"),
     ],
 )
-def test_what_a_result_is_made_of_prints_numbers_in_a_line_or_a_few(make, line):
+def test_parts_of_a_result_print_numbers_in_few_lines(make, line):
     text = repr(make())
     assert line in text
     assert len(text) < 200
     assert "Array" not in text
 
 
-def test_a_lost_cycle_as_a_guess_is_no_guess():
-    lost = vrw.limit_cycle(vrw.WheelParams(damping=300.0), lost="nan")
-    found = jax.jit(lambda p: vrw.limit_cycle(p, guess=lost).speed)(TABLE_1)
-    np.testing.assert_allclose(found, vrw.limit_cycle(TABLE_1).speed, rtol=1e-12)
+def test_a_missing_cycle_is_ignored_as_a_guess():
+    cycle = vrw.limit_cycle(vrw.WheelParams(damping=300.0), on_failure="nan")
+    solution = jax.jit(lambda p: vrw.limit_cycle(p, guess=cycle).speed)(TABLE_1)
+    np.testing.assert_allclose(solution, vrw.limit_cycle(TABLE_1).speed, rtol=1e-12)
 
 
-def test_what_is_traced_prints_its_shapes():
+def test_traced_results_print_their_shapes():
     assert "float64" in repr(jax.eval_shape(lambda p: vrw.step(p, START), TABLE_1))
     assert "None" in repr(vrw.WheelParams(damping=np.ones(3)).in_axes)
 
@@ -82,17 +85,17 @@ def test_what_is_traced_prints_its_shapes():
     ("thing", "words"),
     [
         (vrw.WheelParams, "`damping`: c, viscous damping of each leg"),
-        (vrw.Options, "`first_step`: of each phase, s"),
+        (vrw.StepOptions, "`first_step`: of each phase, s"),
         (vrw.CycleOptions, "`stages`: of a homotopy"),
         (vrw.StepResult, "`step_length`: distance between the feet at the opening landing, m"),
         (vrw.Margins, "`contraction`:"),
-        (vrw.Steps, "`solver_steps`: tried by the integrator"),
+        (vrw.StepBatchResult, "`solver_steps`: tried by the integrator"),
         (vrw.LimitCycle, "`passes`: linearised passes"),
-        (vrw.Tuned, "`evaluations`: limit cycles"),
+        (vrw.TuneResult, "`evaluations`: limit cycles"),
         (vrw.UnilateralStep, "`slip`: path of sliding feet, m"),
     ],
 )
-def test_help_says_what_fields_mean(thing, words):
+def test_help_describes_the_fields(thing, words):
     assert words in pydoc.plain(pydoc.render_doc(thing))
 
 
@@ -103,7 +106,7 @@ def test_partly_batched_wheels_are_mapped_by_their_own_axes():
     np.testing.assert_allclose(cycles.period[0], one.period, rtol=1e-12)
 
 
-def test_the_face_shows_public_names_and_draws_only_when_asked():
+def test_dir_lists_public_names_and_imports_figures_only_on_use():
     code = (
         "import sys, vrw_jax as vrw\n"
         "assert 'matplotlib' not in sys.modules\n"
@@ -117,6 +120,6 @@ def test_the_face_shows_public_names_and_draws_only_when_asked():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_a_walk_can_begin_without_a_start():
-    walked = vrw.simulate(TABLE_1, n_steps=2)
-    np.testing.assert_array_equal(walked.attrs["start"], np.asarray(START))
+def test_a_walk_has_a_default_start():
+    trajectory = vrw.simulate(TABLE_1, n_steps=2)
+    np.testing.assert_array_equal(trajectory.attrs["start"], np.asarray(START))

@@ -5,17 +5,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
-from support.machine_code import Forgetful
+from support.machine_code import CodeRegistrySpy
 
 from vrw_jax import simd
-from vrw_jax.runtime import compiled, lane_function, lane_program, store
+from vrw_jax.runtime import cached_lane_function, cached_lane_program, compile_exported, store
 from vrw_jax.simd import code
 
 X = jnp.asarray(np.random.default_rng(0).normal(size=(2, 9)))
 
 
 @pytest.fixture
-def folder(tmp_path):
+def cache_folder(tmp_path):
     """A cache of the test's own, in which JAX too keeps whatever it compiles."""
     before = jax.config.jax_compilation_cache_dir
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
@@ -26,54 +26,54 @@ def folder(tmp_path):
 
 
 @pytest.fixture
-def process(monkeypatch):
-    return Forgetful(monkeypatch)
+def fresh_process(monkeypatch):
+    return CodeRegistrySpy(monkeypatch)
 
 
-def further(traced):
+def make_function(traced):
     """A program of JAX that calls machine code, and adds to a list when it is traced."""
-    double = lane_function(lambda x: 2.0 * x, lambda x: x, "double")
+    double = cached_lane_function(lambda x: 2.0 * x, lambda x: x, "double")
 
     def run(x):
         traced.append(1)
         return double(x) + 1.0
 
-    return compiled(run, (X,), "kept", jax.devices()[0])(X)
+    return compile_exported(run, (X,), "kept", jax.devices()[0])(X)
 
 
-def test_a_kept_program_finds_the_machine_code_that_it_calls(folder, process):
+def test_a_cached_program_finds_the_machine_code_that_it_calls(cache_folder, fresh_process):
     traced, expected = [], 2.0 * np.asarray(X) + 1.0
-    np.testing.assert_array_equal(further(traced), expected)
-    process.forget()
-    np.testing.assert_array_equal(further(traced), expected)
-    assert (len(process.names), len(traced)) == (2, 1)
-    for place in folder.glob("lanes_code_*"):
+    np.testing.assert_array_equal(make_function(traced), expected)
+    fresh_process.reset_registry()
+    np.testing.assert_array_equal(make_function(traced), expected)
+    assert (len(fresh_process.names), len(traced)) == (2, 1)
+    for place in cache_folder.glob("lanes_code_*"):
         place.unlink()
-    process.forget()
-    np.testing.assert_array_equal(further(traced), expected)  # traced and compiled anew
-    assert (len(set(process.names)), len(traced)) == (1, 2)
+    fresh_process.reset_registry()
+    np.testing.assert_array_equal(make_function(traced), expected)  # traced and compiled anew
+    assert (len(set(fresh_process.names)), len(traced)) == (1, 2)
 
 
-def test_an_edit_that_changes_no_trace_compiles_nothing(folder, process, monkeypatch):
+def test_an_edit_that_changes_no_trace_compiles_nothing(cache_folder, fresh_process, monkeypatch):
     """Neither the machine code, whose name stays, nor JAX's program that calls it by that name."""
     traced = []
     before = jax.config.jax_persistent_cache_min_compile_time_secs
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     try:
-        first = further(traced)
-        by_jax = set(folder.glob("*-cache"))
-        process.forget()
+        first = make_function(traced)
+        by_jax = set(cache_folder.glob("*-cache"))
+        fresh_process.reset_registry()
         monkeypatch.setattr(store, "code_digest", lambda: "of the library with another docstring")
         monkeypatch.setattr(code, "compiled", None)  # would fail
-        np.testing.assert_array_equal(further(traced), first)
+        np.testing.assert_array_equal(make_function(traced), first)
     finally:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", before)
     assert len(traced) == 2
-    assert len(set(process.names)) == 1
-    assert by_jax == set(folder.glob("*-cache")) != set()
+    assert len(set(fresh_process.names)) == 1
+    assert by_jax == set(cache_folder.glob("*-cache")) != set()
 
 
-def test_a_program_kept_by_another_processor_is_traced_anew(folder, monkeypatch):
+def test_a_program_cached_by_another_processor_is_traced_again(cache_folder, monkeypatch):
     """It calls machine code that may not run here."""
     traced = []
 
@@ -81,7 +81,7 @@ def test_a_program_kept_by_another_processor_is_traced_anew(folder, monkeypatch)
         traced.append(1)
         return 2.0 * x
 
-    run = lambda: compiled(double, (jnp.ones(2),), "kept", jax.devices()[0])(jnp.ones(2))
+    run = lambda: compile_exported(double, (jnp.ones(2),), "kept", jax.devices()[0])(jnp.ones(2))
     run(), run()
     assert len(traced) == 1
     monkeypatch.setattr(simd, "processor", lambda: ("x86_64", "another", ""))
@@ -89,7 +89,7 @@ def test_a_program_kept_by_another_processor_is_traced_anew(folder, monkeypatch)
     assert len(traced) == 2
 
 
-def test_damaged_files_are_compiled_anew(folder, process):
+def test_damaged_files_are_compiled_again(cache_folder, fresh_process):
     lanes, traced = [np.arange(4.0)], []
 
     def run():
@@ -97,13 +97,13 @@ def test_damaged_files_are_compiled_anew(folder, process):
             traced.append(1)
             return (2.0 * x[0],)
 
-        return lane_program(double, [], 1, lanes[0].dtype, "double")([], lanes)[0]
+        return cached_lane_program(double, [], 1, lanes[0].dtype, "double")([], lanes)[0]
 
     assert run()[3] == 6.0
-    for place in folder.glob("lanes_*"):
+    for place in cache_folder.glob("lanes_*"):
         content = bytearray(place.read_bytes())
         content[-10] ^= 1
         place.write_bytes(content)
-    process.forget()
+    fresh_process.reset_registry()
     assert run()[3] == 6.0
     assert len(traced) == 2

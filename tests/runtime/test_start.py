@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.runtime.programs import remembered
-from vrw_jax.runtime.start import fusion_emitters
+from vrw_jax.runtime.programs import cached_trace
+from vrw_jax.runtime.start import fusion_emitter_options
 
 
-def told_by(code, **environment):
+def read_output_lines(code, **environment):
     outside = {k: v for k, v in os.environ.items() if k not in ("XLA_FLAGS", "JAX_ENABLE_X64")}
     out = subprocess.run(
         [sys.executable, "-c", code], env=outside | environment, capture_output=True, text=True
@@ -24,14 +24,14 @@ def told_by(code, **environment):
 
 
 @pytest.fixture
-def cache(tmp_path):
+def cache_folder(tmp_path):
     before = jax.config.jax_compilation_cache_dir
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
     yield tmp_path
     jax.config.update("jax_compilation_cache_dir", before)
 
 
-def counted():
+def make_counted_function():
     """A function of two arrays, and the list to which each of its traces adds."""
     traces = []
 
@@ -42,59 +42,61 @@ def counted():
     return function, traces
 
 
-def test_started_processes_compute_in_64_bits_by_the_quick_compiler(tmp_path):
+def test_started_processes_compute_in_64_bits_with_the_fast_compiler(tmp_path):
     code = (
         "import os, jax, vrw_jax as vrw; vrw.start_jax(); x = jax.numpy.sin(1.0); "
         "print(x.dtype, jax.config.jax_compilation_cache_dir, os.environ['XLA_FLAGS'])"
     )
-    told = told_by(
+    result = read_output_lines(
         code, JAX_COMPILATION_CACHE_DIR=str(tmp_path), XLA_FLAGS="--xla_cpu_enable_fast_math=false"
     )
-    assert told[:2] == ["float64", str(tmp_path)]
-    quick = [f"--{name}=false" for name in fusion_emitters(True)]  # none where XLA lacks the flag
-    assert told[2:] == ["--xla_cpu_enable_fast_math=false", *quick]
+    assert result[:2] == ["float64", str(tmp_path)]
+    quick = [
+        f"--{name}=false" for name in fusion_emitter_options(True)
+    ]  # none where XLA lacks the flag
+    assert result[2:] == ["--xla_cpu_enable_fast_math=false", *quick]
 
 
-def test_the_folder_of_compiled_code_may_be_told_from_home(tmp_path):
+def test_the_cache_folder_may_be_relative_to_the_home_folder(tmp_path):
     code = (
         "import jax, vrw_jax as vrw; vrw.start_jax('~/code'); "
         "print(jax.config.jax_compilation_cache_dir)"
     )
-    assert told_by(code, HOME=str(tmp_path)) == [str(tmp_path / "code")]
+    assert read_output_lines(code, HOME=str(tmp_path)) == [str(tmp_path / "code")]
 
 
-def test_a_flag_that_the_user_set_stays():
+def test_a_flag_set_by_the_user_is_kept():
     flag = "--xla_cpu_use_fusion_emitters=true"
     code = "import os, vrw_jax as vrw; vrw.start_jax(); print(os.environ['XLA_FLAGS'])"
-    assert told_by(code, XLA_FLAGS=flag) == [flag]
+    assert read_output_lines(code, XLA_FLAGS=flag) == [flag]
 
 
-def test_a_kept_trace_is_not_traced_again_and_gives_the_same(cache):
-    function, traces = counted()
+def test_a_cached_trace_is_reused_and_gives_the_same_values(cache_folder):
+    function, traces = make_counted_function()
     x, y = jnp.arange(3.0), jnp.ones(3)
     expected = function(x, y)["sum"]
     traces.clear()
     for _ in range(2):  # each as another process would: nothing is remembered but on disk
-        told = jax.jit(lambda x, y: remembered(function, "ours")(x, y)["sum"])(x, y)
-        np.testing.assert_array_equal(told, expected)
+        result = jax.jit(lambda x, y: cached_trace(function, "ours")(x, y)["sum"])(x, y)
+        np.testing.assert_array_equal(result, expected)
     assert len(traces) == 1
-    jax.jit(lambda x, y: remembered(function, "other settings")(x, y)["sum"])(x, y)
-    jax.jit(lambda x, y: remembered(function, "ours")(x, y)["sum"])(x[:2], y[:2])
+    jax.jit(lambda x, y: cached_trace(function, "other settings")(x, y)["sum"])(x, y)
+    jax.jit(lambda x, y: cached_trace(function, "ours")(x, y)["sum"])(x[:2], y[:2])
     assert len(traces) == 3
 
 
-def test_a_damaged_trace_is_traced_again(cache):
-    function, traces = counted()
-    call = lambda x: remembered(function, "ours")(x, x)["sum"]
+def test_a_damaged_trace_is_traced_again(cache_folder):
+    function, traces = make_counted_function()
+    call = lambda x: cached_trace(function, "ours")(x, x)["sum"]
     expected = jax.jit(call)(jnp.ones(2))
-    (place,) = cache.glob("vrw_trace_*")
+    (place,) = cache_folder.glob("vrw_trace_*")
     place.write_bytes(place.read_bytes()[:-1] + b"?")
     np.testing.assert_array_equal(jax.jit(lambda x: call(x))(jnp.ones(2)), expected)
     assert len(traces) == 2
 
 
-@pytest.mark.skipif(not fusion_emitters(True), reason="this XLA has one way of compiling")
-def test_both_ways_of_compiling_give_the_same_gait():
+@pytest.mark.skipif(not fusion_emitter_options(True), reason="this XLA has one way of compiling")
+def test_both_compilers_give_the_same_gait():
     params = vrw.WheelParams()
     measured = lambda p: (lambda c: (c.section_state, c.multipliers.real))(vrw.limit_cycle(p))
     lowered = jax.jit(measured).lower(params)

@@ -10,36 +10,47 @@ import numpy as np
 import pytest
 import xarray as xr
 import zarr
-from support.scanning import GRID, MEASURES, Counted, arithmetic, planned, run
+from support.scanning import (
+    SCANNED_MEASURES,
+    SMALL_GRID,
+    CountingEngine,
+    evaluate_arithmetically,
+    make_plan,
+    run_plan,
+)
 
 import vrw_jax as vrw
 from vrw_jax.scans import design as designs
 from vrw_jax.scans import planning, soundness
 from vrw_jax.scans import store as scan_store
-from vrw_jax.scans.planning import plan
+from vrw_jax.scans.planning import plan_scan
 from vrw_jax.scans.store import open_scan
 
 
-def files(store: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(store)): p.read_bytes() for p in store.rglob("*") if p.is_file()}
+def list_files(complete_store: Path) -> dict[str, bytes]:
+    return {
+        str(p.relative_to(complete_store)): p.read_bytes()
+        for p in complete_store.rglob("*")
+        if p.is_file()
+    }
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Path:
-    run(planned(), tmp_path / "s.zarr", evaluate=arithmetic)
+def complete_store(tmp_path: Path) -> Path:
+    run_plan(make_plan(), tmp_path / "s.zarr", evaluate=evaluate_arithmetically)
     return tmp_path / "s.zarr"
 
 
-def of_version_0_1(store: Path) -> None:
+def make_legacy_store(complete_store: Path) -> None:
     """Makes a store what it would have been then: marks in sight, no digest, metadata apart."""
-    shutil.rmtree(store / "bookkeeping")
-    root = json.loads((store / "zarr.json").read_text())
+    shutil.rmtree(complete_store / "bookkeeping")
+    root = json.loads((complete_store / "zarr.json").read_text())
     del root["consolidated_metadata"], root["attributes"]["asked"]
     for name in ("scan", "provenance"):
         root["attributes"][name] = json.loads(root["attributes"][name])
-    (store / "zarr.json").write_text(json.dumps(root))
-    n = planned().layout.n_chunks
-    done = zarr.open_group(store, mode="r+").create_array(
+    (complete_store / "zarr.json").write_text(json.dumps(root))
+    n = make_plan().layout.n_chunks
+    done = zarr.open_group(complete_store, mode="r+").create_array(
         "chunk_done", shape=(n,), chunks=(1,), dtype="u1", fill_value=0, dimension_names=("chunk",)
     )
     done[:] = 1
@@ -47,45 +58,47 @@ def of_version_0_1(store: Path) -> None:
 
 # Damage
 
-DAMAGE = {
+DAMAGE_CASES = {
     "another byte": lambda file: file.write_bytes(file.read_bytes()[:-1] + b"?"),
     "truncated": lambda file: file.write_bytes(file.read_bytes()[:5]),
     "empty": lambda file: file.write_bytes(b""),
     "deleted": lambda file: file.unlink(),
 }
-CHUNK = "c/1/0"
+CHUNK_FILE = "c/1/0"
 """The file of the chunk of number 1: each holds one value of damping."""
 
 
-@pytest.mark.parametrize("what", DAMAGE)
+@pytest.mark.parametrize("what", DAMAGE_CASES)
 @pytest.mark.parametrize("variable", ["outcome", "speed", "clearance_sls1", "locked_stopper_force"])
-def test_a_damaged_chunk_is_computed_again_and_said(store: Path, what: str, variable: str) -> None:
-    whole, n = files(store), planned().layout.n_chunks
-    file = store / variable / (CHUNK + "/0" * (variable == "locked_stopper_force"))
-    DAMAGE[what](file)
+def test_a_damaged_chunk_is_computed_again_with_a_warning(
+    complete_store: Path, what: str, variable: str
+) -> None:
+    full_values, n = list_files(complete_store), make_plan().layout.n_chunks
+    file = complete_store / variable / (CHUNK_FILE + "/0" * (variable == "locked_stopper_force"))
+    DAMAGE_CASES[what](file)
     with pytest.raises(ValueError, match=r"1 damaged chunk \(number 1\): run the scan again"):
-        open_scan(store)
-    again = Counted()
+        open_scan(complete_store)
+    second_result = CountingEngine()
     with pytest.warns(UserWarning, match=r"1 damaged chunk \(number 1\): computed again"):
-        run(planned(), store, evaluate=again)
-    assert again.calls == 1 < n
-    assert files(store) == whole
+        run_plan(make_plan(), complete_store, evaluate=second_result)
+    assert second_result.n_calls == 1 < n
+    assert list_files(complete_store) == full_values
 
 
-def test_a_scan_at_work_may_be_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_running_scan_can_be_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What a scan writes between two looks at its store is no damage."""
     path, read = tmp_path / "s.zarr", zarr.Array.__getitem__
     with pytest.raises(KeyboardInterrupt):
-        run(planned(), path, evaluate=Counted(fails_at=3))
+        run_plan(make_plan(), path, evaluate=CountingEngine(failing_call=3))
 
     def and_meanwhile(array: zarr.Array, where: object) -> object:
-        told = read(array, where)
-        if array.path == soundness.DIGEST:
+        result = read(array, where)
+        if array.path == soundness.CHECKSUM_ARRAY_NAME:
             with monkeypatch.context() as as_before:
                 as_before.setattr(zarr.Array, "__getitem__", read)
                 with pytest.raises(KeyboardInterrupt):
-                    run(planned(), path, evaluate=Counted(fails_at=2))
-        return told
+                    run_plan(make_plan(), path, evaluate=CountingEngine(failing_call=2))
+        return result
 
     monkeypatch.setattr(zarr.Array, "__getitem__", and_meanwhile)
     open_scan(path)
@@ -93,84 +106,96 @@ def test_a_scan_at_work_may_be_looked_at(tmp_path: Path, monkeypatch: pytest.Mon
     assert np.sum(open_scan(path).outcome.values[:, 0] != -1) > 2  # it did go on
 
 
-def test_damage_beside_an_unfinished_scan_is_found_too(tmp_path: Path) -> None:
+def test_damage_in_an_unfinished_scan_is_found(tmp_path: Path) -> None:
     store = tmp_path / "s.zarr"
-    run(planned(), tmp_path / "whole.zarr", evaluate=arithmetic)
+    run_plan(make_plan(), tmp_path / "whole.zarr", evaluate=evaluate_arithmetically)
     with pytest.raises(KeyboardInterrupt):
-        run(planned(), store, evaluate=Counted(4))
-    (store / "speed" / CHUNK).unlink()
-    rest = Counted()
+        run_plan(make_plan(), store, evaluate=CountingEngine(4))
+    (store / "speed" / CHUNK_FILE).unlink()
+    rest = CountingEngine()
     with pytest.warns(UserWarning, match="damaged"):
-        run(planned(), store, evaluate=rest)
-    assert rest.calls == planned().layout.n_chunks - 3 + 1
-    assert files(store) == files(tmp_path / "whole.zarr")
+        run_plan(make_plan(), store, evaluate=rest)
+    assert rest.n_calls == make_plan().layout.n_chunks - 3 + 1
+    assert list_files(store) == list_files(tmp_path / "whole.zarr")
 
 
-def test_damaged_coordinates_are_written_again(store: Path) -> None:
-    whole = files(store)
-    (store / "damping" / "c" / "0").write_bytes(b"nonsense")
+def test_damaged_coordinates_are_written_again(complete_store: Path) -> None:
+    full_values = list_files(complete_store)
+    (complete_store / "damping" / "c" / "0").write_bytes(b"nonsense")
     with pytest.raises(ValueError, match="damaged coordinates"):
-        open_scan(store)
-    again = Counted()
+        open_scan(complete_store)
+    second_result = CountingEngine()
     with pytest.warns(UserWarning, match="damaged coordinates"):
-        run(planned(), store, evaluate=again)
-    assert again.calls == 0
-    assert files(store) == whole
+        run_plan(make_plan(), complete_store, evaluate=second_result)
+    assert second_result.n_calls == 0
+    assert list_files(complete_store) == full_values
 
 
-def test_what_is_left_of_a_damaged_store_can_be_read(store: Path) -> None:
-    (store / "speed" / CHUNK).unlink()
-    left = open_scan(store, verify=False)
-    assert np.isnan(left.speed.values[1]).all()
-    assert np.isfinite(left.speed.values[0]).all()
+def test_intact_parts_of_a_damaged_store_can_be_read(complete_store: Path) -> None:
+    (complete_store / "speed" / CHUNK_FILE).unlink()
+    left_part = open_scan(complete_store, verify=False)
+    assert np.isnan(left_part.speed.values[1]).all()
+    assert np.isfinite(left_part.speed.values[0]).all()
 
 
-def test_a_damaged_chunk_of_other_code_is_not_mixed_in(
-    store: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_damaged_chunk_is_not_recomputed_by_other_code(
+    complete_store: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (store / "speed" / CHUNK).unlink()
+    (complete_store / "speed" / CHUNK_FILE).unlink()
     monkeypatch.setattr(planning, "code_digest", lambda: "other")
     with pytest.raises(ValueError, match=r"lacks 1 of 5 chunks \(1 of them damaged\)"):
-        run(planned(), store, evaluate=arithmetic)
+        run_plan(make_plan(), complete_store, evaluate=evaluate_arithmetically)
 
 
-@pytest.mark.parametrize("what", [None, *DAMAGE])
-def test_a_store_of_version_0_1_opens_and_its_damage_is_seen(store: Path, what: str | None) -> None:
-    before = open_scan(store).load()
-    of_version_0_1(store)
+@pytest.mark.parametrize("what", [None, *DAMAGE_CASES])
+def test_a_store_of_version_0_1_opens_and_its_damage_is_found(
+    complete_store: Path, what: str | None
+) -> None:
+    before = open_scan(complete_store).load()
+    make_legacy_store(complete_store)
     if what is None:
-        after = open_scan(store).load()
+        after = open_scan(complete_store).load()
         xr.testing.assert_identical(
-            before.rename({MEASURES[2]: "d_dls_fraction_d_damping"}).drop_attrs(),
+            before.rename({SCANNED_MEASURES[2]: "d_dls_fraction_d_damping"}).drop_attrs(),
             after.drop_attrs(),
         )
-        assert run(planned(), store, evaluate=Counted(1)).attrs["scan"]
+        assert run_plan(make_plan(), complete_store, evaluate=CountingEngine(1)).attrs["scan"]
         return
-    DAMAGE[what](store / "speed" / CHUNK)
+    DAMAGE_CASES[what](complete_store / "speed" / CHUNK_FILE)
     with pytest.raises(ValueError, match=r"1 damaged chunk \(number 1\)"):
-        open_scan(store)
+        open_scan(complete_store)
 
 
 # Reading
 
 
-def test_xarray_opens_a_store_without_a_warning_and_sees_no_bookkeeping(store: Path) -> None:
+def test_xarray_opens_a_store_without_a_warning_and_sees_no_bookkeeping(
+    complete_store: Path,
+) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        alone = xr.open_zarr(store)
-    assert list(alone.data_vars)[:4] == [*MEASURES[:2], "d_dls_fraction_d_damping", "outcome"]
-    assert set(alone.sizes) == {"damping", "slope", "leg"}
+        single_result = xr.open_zarr(complete_store)
+    assert list(single_result.data_vars)[:4] == [
+        *SCANNED_MEASURES[:2],
+        "d_dls_fraction_d_damping",
+        "outcome",
+    ]
+    assert set(single_result.sizes) == {"damping", "slope", "leg"}
 
 
 @pytest.mark.parametrize("place", [None, "s.zarr"])
-def test_variables_come_in_the_order_and_by_the_names_asked_for(
-    tmp_path: Path, place: str | None
-) -> None:
-    asked = ("speed", "d dls_fraction / d damping", "outcome", "dls_fraction")
-    told = run(plan(GRID, asked), place and tmp_path / place, evaluate=arithmetic)
-    assert tuple(told.data_vars)[:4] == asked
-    assert told["d dls_fraction / d damping"].attrs["units"]
-    underscored = run(plan(GRID, ["d_dls_fraction_d_damping"]), evaluate=arithmetic)
+def test_variables_have_the_requested_order_and_names(tmp_path: Path, place: str | None) -> None:
+    requested = ("speed", "d dls_fraction / d damping", "outcome", "dls_fraction")
+    run_result = run_plan(
+        plan_scan(SMALL_GRID, requested),
+        place and tmp_path / place,
+        evaluate=evaluate_arithmetically,
+    )
+    assert tuple(run_result.data_vars)[:4] == requested
+    assert run_result["d dls_fraction / d damping"].attrs["units"]
+    underscored = run_plan(
+        plan_scan(SMALL_GRID, ["d_dls_fraction_d_damping"]), evaluate=evaluate_arithmetically
+    )
     assert next(iter(underscored.data_vars)) == "d_dls_fraction_d_damping"
 
 
@@ -180,12 +205,16 @@ def test_a_scan_goes_into_a_netcdf_file_and_back(
     tmp_path: Path, kind: str, place: str | None
 ) -> None:
     box = {"damping": (100.0, 101.0), "slope": (0.28, 0.281)}
-    design = GRID if kind == "grid" else designs.saltelli(box, 128)
-    told = run(plan(design, MEASURES), place and tmp_path / place, evaluate=arithmetic).load()
-    told.to_netcdf(tmp_path / "scan.nc")
+    design = SMALL_GRID if kind == "grid" else designs.saltelli(box, 128)
+    result = run_plan(
+        plan_scan(design, SCANNED_MEASURES),
+        place and tmp_path / place,
+        evaluate=evaluate_arithmetically,
+    ).load()
+    result.to_netcdf(tmp_path / "scan.nc")
     back = xr.open_dataset(tmp_path / "scan.nc")
-    for name in told.data_vars:
-        np.testing.assert_array_equal(back[name], told[name], str(name))
+    for name in result.data_vars:
+        np.testing.assert_array_equal(back[name], result[name], str(name))
     if kind == "saltelli":
         indices = vrw.sobol_indices(back, ["speed"])
         indices.to_netcdf(tmp_path / "indices.nc")
@@ -194,70 +223,70 @@ def test_a_scan_goes_into_a_netcdf_file_and_back(
 # Refusals, before anything is written
 
 
-def test_a_misspelt_solver_is_refused_before_there_is_a_store(tmp_path: Path) -> None:
+def test_a_misspelled_solver_is_refused_before_a_store_is_created(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="solver is 'Dopri9'"):
-        vrw.scan(GRID, options=vrw.Options(solver="Dopri9"), store=tmp_path / "s.zarr")
+        vrw.scan(SMALL_GRID, options=vrw.StepOptions(solver="Dopri9"), store=tmp_path / "s.zarr")
     assert not list(tmp_path.iterdir())
 
 
-def test_a_second_scan_at_work_on_the_same_store_is_refused(store: Path) -> None:
-    (store / "speed" / CHUNK).unlink()
+def test_a_second_scan_on_the_same_store_is_refused(complete_store: Path) -> None:
+    (complete_store / "speed" / CHUNK_FILE).unlink()
     with (
-        soundness.alone(store),
+        soundness.store_lock(complete_store),
         pytest.warns(UserWarning, match="damaged"),
         pytest.raises(ValueError, match="another scan is at work"),
     ):
-        run(planned(), store, evaluate=arithmetic)
+        run_plan(make_plan(), complete_store, evaluate=evaluate_arithmetically)
     with pytest.warns(UserWarning, match="damaged"):
-        run(planned(), store, evaluate=arithmetic)
+        run_plan(make_plan(), complete_store, evaluate=evaluate_arithmetically)
 
 
-def test_of_two_scans_that_start_at_one_instant_one_makes_the_store(
+def test_of_two_simultaneous_scans_one_creates_the_store(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Both find nothing there, and both build; one is the first to put its own in place."""
-    together, fill = threading.Barrier(2, timeout=60.0), scan_store._fill
+    joint_result, fill = threading.Barrier(2, timeout=60.0), scan_store._create_arrays
 
     def filled(*arguments: object) -> None:
         fill(*arguments)
-        together.wait()
+        joint_result.wait()
 
     monkeypatch.setattr(scan_store, "_fill", filled)
     ends: list[object] = []
 
     def scan() -> None:
         try:
-            ends.append(run(planned(), tmp_path / "s.zarr", evaluate=slowly))
+            ends.append(run_plan(make_plan(), tmp_path / "s.zarr", evaluate=slowly))
         except Exception as error:
             ends.append(error)
 
-    begun = threading.Event()
+    start_result = threading.Event()
 
     def slowly(columns: dict[str, np.ndarray]) -> object:
-        begun.wait(1.0)
-        return arithmetic(columns)
+        start_result.wait(1.0)
+        return evaluate_arithmetically(columns)
 
-    both = [threading.Thread(target=scan) for _ in range(2)]
-    for one in both:
+    both_values = [threading.Thread(target=scan) for _ in range(2)]
+    for one in both_values:
         one.start()
-    for one in both:
+    for one in both_values:
         one.join()
-    told = [end for end in ends if isinstance(end, Exception)]
-    assert len(told) == 1
-    assert "another scan is at work" in str(told[0])
+    rows = [end for end in ends if isinstance(end, Exception)]
+    assert len(rows) == 1
+    assert "another scan is at work" in str(rows[0])
     assert np.all(open_scan(tmp_path / "s.zarr").outcome.values != -1)
     assert [path.name for path in tmp_path.iterdir()] == ["s.zarr"]
 
 
-def test_a_place_that_can_t_be_written_gets_one_sentence() -> None:
+def test_an_unwritable_folder_is_refused_in_one_sentence() -> None:
     with pytest.raises(OSError, match="no store can be made at /proc/x"):
-        run(planned(), "/proc/x", evaluate=arithmetic)
+        run_plan(make_plan(), "/proc/x", evaluate=evaluate_arithmetically)
 
 
-def test_too_large_a_design_gets_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_large_a_design_is_refused_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     wide = np.linspace(100.0, 200.0, 100_000)
     with pytest.raises(ValueError, match="10,000,000,000 samples, but a scan takes"):
-        plan(designs.grid(damping=wide, stiffness=wide))
+        plan_scan(designs.grid(damping=wide, stiffness=wide))
     with pytest.raises(ValueError, match="a list takes 10,000,000 samples"):
         designs.sobol({"damping": (100.0, 200.0)}, 20_000_000_000)
 
@@ -266,4 +295,4 @@ def test_too_large_a_design_gets_one_sentence(monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr(scan_store.np, "full", full)
     with pytest.raises(ValueError, match="more than this memory holds: give a store"):
-        run(planned(), evaluate=arithmetic)
+        run_plan(make_plan(), evaluate=evaluate_arithmetically)

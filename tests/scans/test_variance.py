@@ -7,62 +7,65 @@ import xarray as xr
 import vrw_jax as vrw
 from vrw_jax.wheel.outcomes import Outcome
 
-RANGES = {"damping": (100.0, 200.0), "slope": (0.2, 0.3), "stiffness": (400.0, 500.0)}
+ISHIGAMI_RANGES = {"damping": (100.0, 200.0), "slope": (0.2, 0.3), "stiffness": (400.0, 500.0)}
 
 
-def scanned(n: int = 4096) -> tuple[xr.Dataset, np.ndarray]:
+def make_ishigami_scan(n: int = 4096) -> tuple[xr.Dataset, np.ndarray]:
     """A scan that computes Ishigami's function, and its unit coordinates."""
-    design = vrw.saltelli(RANGES, n)
-    low, high = np.array(list(RANGES.values())).T
+    design = vrw.saltelli(ISHIGAMI_RANGES, n)
+    low, high = np.array(list(ISHIGAMI_RANGES.values())).T
     unit = (np.stack(list(design.values.values()), 1) - low) / (high - low)
     x, y, z = np.pi * (2.0 * unit.T - 1.0)
     value = np.sin(x) + 7.0 * np.sin(y) ** 2 + 0.1 * z**4 * np.sin(x)
-    told = {"speed": ("sample", value), "period": ("sample", 2.0 * unit[:, 0] + unit[:, 1])}
+    result_by_name = {
+        "speed": ("sample", value),
+        "period": ("sample", 2.0 * unit[:, 0] + unit[:, 1]),
+    }
     outcome = np.full(design.size, int(Outcome.STEPPED))
-    attrs = {"scan": {"design": design.description()}}
-    return xr.Dataset(told | {"outcome": ("sample", outcome)}, attrs=attrs), unit
+    attrs = {"scan": {"design": design.describe_identity()}}
+    return xr.Dataset(result_by_name | {"outcome": ("sample", outcome)}, attrs=attrs), unit
 
 
-def test_indices_of_ishigami_s_function_are_the_published_ones() -> None:
+def test_indices_of_the_ishigami_function_equal_the_published_ones() -> None:
     """First order 0.3139, 0.4424, 0; total 0.5576, 0.4424, 0.2437 (Ishigami and Homma 1990)."""
-    told = vrw.sobol_indices(scanned()[0], ["speed"]).sel(measure="speed")
-    for name, known in (
+    result = vrw.sobol_indices(make_ishigami_scan()[0], ["speed"]).sel(measure="speed")
+    for name, known_values in (
         ("first_order", [0.3139, 0.4424, 0.0]),
         ("total", [0.5576, 0.4424, 0.2437]),
     ):
         # 4,096 rows of a Sobol' sequence: three times what other seeds were off by
-        np.testing.assert_allclose(told[name], known, atol=0.02)
-        assert np.all(told[f"{name}_lower"] <= known)
-        assert np.all(known <= told[f"{name}_upper"])
+        np.testing.assert_allclose(result[name], known_values, atol=0.02)
+        assert np.all(result[f"{name}_lower"] <= known_values)
+        assert np.all(known_values <= result[f"{name}_upper"])
 
 
 def test_shares_of_a_sum_are_the_variances_of_its_terms() -> None:
-    told = vrw.sobol_indices(scanned()[0], ["speed", "period"]).sel(measure="period")
+    result = vrw.sobol_indices(make_ishigami_scan()[0], ["speed", "period"]).sel(measure="period")
     for name in ("first_order", "total"):
-        np.testing.assert_allclose(told[name], [0.8, 0.2, 0.0], atol=0.01)
+        np.testing.assert_allclose(result[name], [0.8, 0.2, 0.0], atol=0.01)
 
 
-def test_rows_without_a_gait_are_left_out_and_counted() -> None:
-    scan, unit = scanned()
+def test_rows_without_a_gait_are_omitted_and_counted() -> None:
+    scan, unit = make_ishigami_scan()
     fails = unit[:, 2] > 0.9
     scan.outcome.values[fails] = Outcome.NO_CYCLE_FOUND
     for name in ("speed", "period"):
         scan[name].values[fails] = np.nan
-    told = vrw.sobol_indices(scan, ["period"])
-    assert told.attrs["left_out"] == pytest.approx(1.0 - 0.9**2, abs=0.01)  # z of A or of B
-    assert told.attrs["rows"] == 2048
-    np.testing.assert_allclose(told.total[0], [0.8, 0.2, 0.0], atol=0.02)
+    result = vrw.sobol_indices(scan, ["period"])
+    assert result.attrs["left_out"] == pytest.approx(1.0 - 0.9**2, abs=0.01)  # z of A or of B
+    assert result.attrs["rows"] == 2048
+    np.testing.assert_allclose(result.total[0], [0.8, 0.2, 0.0], atol=0.02)
 
 
 def test_the_same_scan_gives_the_same_intervals() -> None:
-    first, second = (vrw.sobol_indices(scanned(256)[0], ["speed"]) for _ in range(2))
+    first, second = (vrw.sobol_indices(make_ishigami_scan(256)[0], ["speed"]) for _ in range(2))
     xr.testing.assert_identical(first, second)
 
 
-def test_what_can_t_be_told_gets_one_sentence() -> None:
-    scan, _ = scanned(64)
+def test_invalid_requests_for_indices_are_refused_in_one_sentence() -> None:
+    scan, _ = make_ishigami_scan(64)
     with pytest.raises(ValueError, match="powers of two: give n = 128"):
-        vrw.saltelli(RANGES, 100)
+        vrw.saltelli(ISHIGAMI_RANGES, 100)
     with pytest.raises(ValueError, match="did you mean 'speed'"):
         vrw.sobol_indices(scan, ["sped"])
     with pytest.raises(ValueError, match=r"kind None.*saltelli"):

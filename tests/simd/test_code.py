@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
-from support.machine_code import Forgetful
+from support.machine_code import CodeRegistrySpy
 
 from vrw_jax import simd
 from vrw_jax.simd import code, kernel
@@ -18,19 +18,19 @@ from vrw_jax.simd import code, kernel
 LANES, X = [np.arange(4.0)], np.arange(4.0)
 
 
-class Folder(dict):
+class MemoryStore(dict):
     """A store in memory."""
 
-    kept = dict.get
-    keep = dict.__setitem__
+    load_content = dict.get
+    store_content = dict.__setitem__
 
 
 @pytest.fixture(autouse=True)
-def process(monkeypatch):
-    return Forgetful(monkeypatch)
+def fresh_process(monkeypatch):
+    return CodeRegistrySpy(monkeypatch)
 
 
-def counted(factor=2.0):
+def make_counted_function(factor=2.0):
     """A function of lanes, and the list to which each of its traces adds."""
     traces = []
 
@@ -41,58 +41,67 @@ def counted(factor=2.0):
     return times, traces
 
 
-def run(function, key, store):
-    again = lambda *arguments: function(*arguments)  # JAX knows the trace of the function itself
-    return list(simd.lane_program(again, [], 1, LANES[0].dtype, key, store)([], LANES)[0])
+def run_program(function, key, store):
+    compute_again = lambda *arguments: function(
+        *arguments
+    )  # JAX knows the trace of the function itself
+    return list(
+        simd.compile_lane_program(compute_again, [], 1, LANES[0].dtype, key, store)([], LANES)[0]
+    )
 
 
-def test_a_later_start_neither_traces_nor_compiles(monkeypatch, process):
-    double, traces = counted()
-    store = Folder()
-    assert run(double, "double", store) == [0.0, 2.0, 4.0, 6.0]
+def test_a_later_start_neither_traces_nor_compiles(monkeypatch, fresh_process):
+    double, traces = make_counted_function()
+    store = MemoryStore()
+    assert run_program(double, "double", store) == [0.0, 2.0, 4.0, 6.0]
     monkeypatch.setattr(code, "compiled", None)  # would fail
-    assert run(double, "double", store) == [0.0, 2.0, 4.0, 6.0]
-    process.forget()
-    assert run(double, "double", store) == [0.0, 2.0, 4.0, 6.0]
+    assert run_program(double, "double", store) == [0.0, 2.0, 4.0, 6.0]
+    fresh_process.reset_registry()
+    assert run_program(double, "double", store) == [0.0, 2.0, 4.0, 6.0]
     assert len(traces) == 1
 
 
 @pytest.mark.parametrize("elsewhere", [False, True])
-def test_the_same_trace_under_another_key_is_not_compiled(monkeypatch, process, elsewhere):
-    double, traces = counted()
-    store = Folder()
-    run(double, "double", store)
+def test_the_same_trace_under_another_key_is_not_compiled(monkeypatch, fresh_process, elsewhere):
+    double, traces = make_counted_function()
+    store = MemoryStore()
+    run_program(double, "double", store)
     if elsewhere:
-        process.forget()
+        fresh_process.reset_registry()
     else:
         store = None
     monkeypatch.setattr(code, "compiled", None)  # would fail
-    assert run(double, ("double", "after an edit of its docstring"), store) == [0.0, 2.0, 4.0, 6.0]
+    assert run_program(double, ("double", "after an edit of its docstring"), store) == [
+        0.0,
+        2.0,
+        4.0,
+        6.0,
+    ]
     assert len(traces) == 2
 
 
-def run_two(x, key, *functions):
-    calls = [simd.lane_function(f, f, (key, i), None) for i, f in enumerate(functions)]
+def run_two_programs(x, key, *functions):
+    calls = [simd.compile_lane_function(f, f, (key, i), None) for i, f in enumerate(functions)]
     return sum(call(x) for call in calls)
 
 
-def test_other_traces_and_other_ways_of_compiling_have_code_of_their_own(monkeypatch):
-    store = Folder()
-    assert run(counted(2.0)[0], 2, store)[3] == 6.0
-    assert run(counted(3.0)[0], 3, store)[3] == 9.0
+def test_other_traces_and_compiler_settings_have_separate_code(monkeypatch):
+    store = MemoryStore()
+    assert run_program(make_counted_function(2.0)[0], 2, store)[3] == 6.0
+    assert run_program(make_counted_function(3.0)[0], 3, store)[3] == 9.0
     monkeypatch.setattr(code, "how_compiled", lambda: "by another processor")
-    double, traces = counted()
-    assert run(double, 2, store)[3] == 6.0
+    double, traces = make_counted_function()
+    assert run_program(double, 2, store)[3] == 6.0
     assert len(traces) == 1
     names = [name.split("_")[1] for name in store]
     assert (names.count("code"), names.count("index")) == (3, 3)
 
 
-def test_python_traces_on_while_llvm_is_at_work_and_hears_of_its_failure(monkeypatch):
-    may, compiled = threading.Event(), code.compiled
+def test_tracing_continues_during_compilation_and_receives_its_errors(monkeypatch):
+    may, compiled = threading.Event(), code.compile_native
     monkeypatch.setattr(code, "compiled", lambda text: may.wait(60) and compiled(text))
-    both = lambda x: run_two(x, "at work", lambda x: 2.5 * x, lambda x: 3.5 * x)
-    traced = jax.jit(both).trace(X)
+    evaluate_both = lambda x: run_two_programs(x, "at work", lambda x: 2.5 * x, lambda x: 3.5 * x)
+    traced = jax.jit(evaluate_both).trace(X)
     may.set()
     np.testing.assert_array_equal(traced.lower().compile()(X), 6.0 * X)
 
@@ -100,20 +109,22 @@ def test_python_traces_on_while_llvm_is_at_work_and_hears_of_its_failure(monkeyp
         raise RuntimeError("no such instruction")
 
     monkeypatch.setattr(code, "compiled", refuse)
-    traced = jax.jit(lambda x: run_two(x, "refused", lambda x: 4.5 * x, lambda x: x / 7.0)).trace(X)
+    traced = jax.jit(
+        lambda x: run_two_programs(x, "refused", lambda x: 4.5 * x, lambda x: x / 7.0)
+    ).trace(X)
     with pytest.raises(RuntimeError, match="no such instruction"):
         traced.lower()
 
 
-def test_an_index_whose_code_is_gone_is_made_anew(process):
-    double, traces = counted()
-    store = Folder()
-    run(double, "double", store)
+def test_an_index_without_its_code_is_compiled_again(fresh_process):
+    double, traces = make_counted_function()
+    store = MemoryStore()
+    run_program(double, "double", store)
     del store[next(name for name in store if name.startswith("lanes_code_"))]
-    process.forget()
-    assert run(double, "double", store)[3] == 6.0
-    process.forget()
-    assert run(double, "double", store)[3] == 6.0
+    fresh_process.reset_registry()
+    assert run_program(double, "double", store)[3] == 6.0
+    fresh_process.reset_registry()
+    assert run_program(double, "double", store)[3] == 6.0
     assert len(traces) == 2
 
 
@@ -124,7 +135,7 @@ def test_another_batch_is_neither_traced_nor_compiled_again_without_a_store():
         traced.append(1)
         return 2.0 * x
 
-    call = simd.lane_function(double, lambda x: x, "batches", None)
+    call = simd.compile_lane_function(double, lambda x: x, "batches", None)
     for n in (5, 8, 11):
         np.testing.assert_array_equal(jax.jit(call)(jnp.arange(n) + 1.0), 2.0 * (np.arange(n) + 1))
     assert len(traced) == 1
@@ -132,20 +143,20 @@ def test_another_batch_is_neither_traced_nor_compiled_again_without_a_store():
     assert len(traced) == 2  # a lone lane has code of its own
 
 
-def test_code_is_at_hand_by_its_name_alone(process):
-    store = Folder()
-    double = simd.lane_function(lambda x: 2.0 * x, lambda x: x, "at hand", store)
+def test_code_is_loaded_by_its_name(fresh_process):
+    store = MemoryStore()
+    double = simd.compile_lane_function(lambda x: 2.0 * x, lambda x: x, "at hand", store)
     jax.jit(double)(jnp.ones(3))
-    (name,) = process.names
-    assert not simd.at_hand([name, "lanes_code_of_none"], store)
-    process.forget()
-    assert not simd.at_hand([name], None)
-    assert simd.at_hand([name], store)
-    assert process.names == [name, name]
+    (name,) = fresh_process.names
+    assert not simd.ensure_loaded([name, "lanes_code_of_none"], store)
+    fresh_process.reset_registry()
+    assert not simd.ensure_loaded([name], None)
+    assert simd.ensure_loaded([name], store)
+    assert fresh_process.names == [name, name]
 
 
 def test_the_text_that_llvm_compiles_is_the_same_in_every_process():
-    told = """
+    result = """
         import jax, jax.numpy as jnp
         from vrw_jax.simd import code, kernel
         def step(x, table):
@@ -157,24 +168,26 @@ def test_the_text_that_llvm_compiles_is_the_same_in_every_process():
         closed = code.traced(lambda x: step(x, jnp.arange(9.0)), shape)
         print(code._digest(kernel.module_text(closed, 8).encode()))
     """
-    lines = "\n".join(line[8:] for line in told.splitlines())
-    ways = [os.environ | {"PYTHONHASHSEED": seed} for seed in ("1", "2")]
+    lines = "\n".join(line[8:] for line in result.splitlines())
+    method_names = [os.environ | {"PYTHONHASHSEED": seed} for seed in ("1", "2")]
     first, second = (
-        subprocess.run([sys.executable, "-c", lines], env=way, capture_output=True, check=True)
-        for way in ways
+        subprocess.run(
+            [sys.executable, "-c", lines], env=method_name, capture_output=True, check=True
+        )
+        for method_name in method_names
     )
     assert first.stdout == second.stdout != b""
 
 
-def test_what_repeats_itself_along_an_axis_is_written_once():
+def test_repeated_operations_along_an_axis_are_emitted_once():
     def sampled(n, x):
-        alike = jnp.broadcast_to(jnp.sqrt(x), (n, *x.shape))
+        is_alike = jnp.broadcast_to(jnp.sqrt(x), (n, *x.shape))
         turns = lax.scan(lambda y, _: (0.5 * y, y), x, None, length=n)[1]
-        return jnp.stack([2.0 * alike + 1.0, turns])
+        return jnp.stack([2.0 * is_alike + 1.0, turns])
 
     def length(n):
         shape = jax.ShapeDtypeStruct((1021,), jnp.float64)
-        closed = code.traced(lambda x: sampled(n, x), shape)
-        return len(kernel.module_text(closed, 8))
+        closed = code.trace_for_machine_code(lambda x: sampled(n, x), shape)
+        return len(kernel.write_module(closed, 8))
 
     assert length(900) < 1.1 * length(100)

@@ -9,15 +9,15 @@ import pytest
 from jax import lax
 
 from vrw_jax import simd
-from vrw_jax.simd.arrays import LANES
+from vrw_jax.simd.arrays import LANE_AXIS_SENTINEL
 
 KEYS = itertools.count()
 X = np.random.default_rng(0).normal(size=(2, 9))
 
 
-def call(function, *arrays):
+def call_program(function, *arrays):
     """Its results as machine code."""
-    run = simd.lane_function(function, function, ("refusals", next(KEYS)), None)
+    run = simd.compile_lane_function(function, function, ("refusals", next(KEYS)), None)
     return jax.jit(run)(*map(jnp.asarray, arrays))
 
 
@@ -41,63 +41,65 @@ def call(function, *arrays):
         (lambda x: jnp.ones(3), "A result has the shape float64.3., the same for all lanes"),
     ],
 )
-def test_what_is_not_done_to_each_lane_by_itself_is_refused(function, sentence):
+def test_operations_across_lanes_are_refused(function, sentence):
     with pytest.raises(NotImplementedError, match=sentence):
-        call(function, X)
+        call_program(function, X)
 
 
 @pytest.mark.parametrize(
     ("function", "what"),
     [
-        (lambda x: x + jnp.asarray(np.zeros(LANES))[0], "A constant"),
-        (lambda x: x + jnp.sum(jnp.asarray(np.zeros((LANES, 3)))), "A constant"),
-        (lambda x: x + jnp.sum(lax.iota(float, LANES)), "The result of iota"),
-        (lambda x: x + jnp.sum(lax.broadcasted_iota(float, (LANES, 2), 1)), "The result of iota"),
-        (lambda x: x + jnp.sum(lax.iota(float, LANES + 1)[1:]), "The result of slice"),
-        (lambda x: x + lax.iota(float, 2 * LANES).reshape(2, -1), "The result of reshape"),
-        (lambda x: x + lax.iota(float, 2 * LANES).reshape(-1, 2)[0, 0], "The result of reshape"),
-        (lambda x: x + jnp.pad(lax.iota(float, LANES - 1), (0, 1))[0], "The result of pad"),
+        (lambda x: x + jnp.asarray(np.zeros(LANE_AXIS_SENTINEL))[0], "A constant"),
+        (lambda x: x + jnp.sum(jnp.asarray(np.zeros((LANE_AXIS_SENTINEL, 3)))), "A constant"),
+        (lambda x: x + jnp.sum(lax.iota(float, LANE_AXIS_SENTINEL)), "The result of iota"),
+        (lambda x: x + jnp.sum(lax.broadcasted_iota(float, (LANE_AXIS_SENTINEL, 2), 1)), "The result of iota"),
+        (lambda x: x + jnp.sum(lax.iota(float, LANE_AXIS_SENTINEL + 1)[1:]), "The result of slice"),
+        (lambda x: x + lax.iota(float, 2 * LANE_AXIS_SENTINEL).reshape(2, -1), "The result of reshape"),
+        (lambda x: x + lax.iota(float, 2 * LANE_AXIS_SENTINEL).reshape(-1, 2)[0, 0], "The result of reshape"),
+        (lambda x: x + jnp.pad(lax.iota(float, LANE_AXIS_SENTINEL - 1), (0, 1))[0], "The result of pad"),
         (lambda x: x + jnp.concatenate([lax.iota(float, 1000), lax.iota(float, 21)]),
          "The result of concatenate"),
         (lambda x: jnp.concatenate([jnp.repeat(x[:1], 1000, 0), jnp.repeat(x[:1], 21, 0)])[:2],
          "The result of .*"),
-        (lambda x: jnp.broadcast_to(x[:, None], (2, LANES, x.shape[-1])).sum(1),
+        (lambda x: jnp.broadcast_to(x[:, None], (2, LANE_AXIS_SENTINEL, x.shape[-1])).sum(1),
          "The result of broadcast_in_dim"),
         (lambda x: jnp.stack([x, x], -1)[..., 0], "The result of .*"),
         (lambda x: x.T.reshape(x.shape), "The result of transpose"),
     ],
 )  # fmt: skip
-def test_an_axis_as_long_as_the_lanes_is_refused_where_it_arises(function, what):
-    with pytest.raises(NotImplementedError, match=rf"{what} has the shape .*{LANES}"):
-        call(function, X)
+def test_an_axis_as_long_as_the_lane_axis_is_refused_at_its_origin(function, what):
+    with pytest.raises(NotImplementedError, match=rf"{what} has the shape .*{LANE_AXIS_SENTINEL}"):
+        call_program(function, X)
 
 
 def test_arguments_have_one_axis_of_lanes():
     with pytest.raises(NotImplementedError, match=r"An argument has .* float64\[1021,1021\]"):
-        call(lambda x: x[0] + x[1], np.zeros((LANES, 9)))
+        call_program(lambda x: x[0] + x[1], np.zeros((LANE_AXIS_SENTINEL, 9)))
     with pytest.raises(ValueError, match=r"shape \(3,\), but the first one 9 lanes"):
-        call(lambda x, table: x * table[0], X, np.zeros(3))
+        call_program(lambda x, table: x * table[0], X, np.zeros(3))
 
 
-def test_loops_do_not_run_along_the_lanes_but_as_often_as_they_are():
-    along = lambda x: x + lax.scan(lambda total, y: (total + y, None), 0.0, x[0])[0]
+def test_loops_over_lanes_are_refused_but_may_run_as_often():
+    evaluate_along = lambda x: x + lax.scan(lambda total, y: (total + y, None), 0.0, x[0])[0]
     with pytest.raises(NotImplementedError, match="scan reads or writes along an axis of 1021"):
-        call(along, X)
-    written = lambda x: x + lax.scan(lambda k, _: (k + 1.0, k), 0.0, None, length=LANES)[1][0]
+        call_program(evaluate_along, X)
+    compute_written = lambda x: (
+        x + lax.scan(lambda k, _: (k + 1.0, k), 0.0, None, length=LANE_AXIS_SENTINEL)[1][0]
+    )
     with pytest.raises(NotImplementedError, match="scan reads or writes along an axis of 1021"):
-        call(written, X)
-    often = lambda x: lax.fori_loop(0, LANES, lambda i, y: y + 1.0, x)
-    np.testing.assert_allclose(call(often, X), X + LANES, rtol=1e-12)
+        call_program(compute_written, X)
+    often = lambda x: lax.fori_loop(0, LANE_AXIS_SENTINEL, lambda i, y: y + 1.0, x)
+    np.testing.assert_allclose(call_program(often, X), X + LANE_AXIS_SENTINEL, rtol=1e-12)
 
 
-def test_one_number_for_all_lanes_is_theirs():
+def test_a_uniform_number_is_broadcast_to_all_lanes():
     """As many as lanes, and nothing to tell them from: what is broadcast is no misreading."""
-    told = call(lambda x: jnp.full(x.shape[-1], 2.0) * x + jnp.ones_like(x), X)
-    np.testing.assert_array_equal(told, 2.0 * X + 1.0)
+    result = call_program(lambda x: jnp.full(x.shape[-1], 2.0) * x + jnp.ones_like(x), X)
+    np.testing.assert_array_equal(result, 2.0 * X + 1.0)
 
 
-def test_calls_are_neither_mapped_nor_differentiated_from_outside():
-    double = simd.lane_function(lambda x: 2.0 * x, lambda x: x, "from outside", None)
+def test_vmap_and_derivatives_of_calls_are_refused():
+    double = simd.compile_lane_function(lambda x: 2.0 * x, lambda x: x, "from outside", None)
     with pytest.raises(NotImplementedError, match="vmap"):
         jax.vmap(double)(jnp.asarray(X))
     with pytest.raises(NotImplementedError, match="nor differentiated"):

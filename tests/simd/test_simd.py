@@ -9,30 +9,30 @@ import pytest
 from jax import lax
 
 from vrw_jax import simd
-from vrw_jax.simd.arithmetic import ELEMENTWISE
-from vrw_jax.simd.rules import RULES
+from vrw_jax.simd.arithmetic import ELEMENTWISE_RULES
+from vrw_jax.simd.rules import PRIMITIVE_RULES
 
 KEYS = itertools.count()
-DRAW = np.random.default_rng(0)
+RANDOM_GENERATOR = np.random.default_rng(0)
 
 
-def program(function, lanes, uniform=()):
+def make_program(function, lanes, uniform=()):
     """`function(uniform, lanes)` compiled for inputs like these."""
     kinds = [np.asarray(x).dtype for x in uniform]
-    return simd.lane_program(
+    return simd.compile_lane_program(
         function, kinds, len(lanes), lanes[0].dtype, ("simd", next(KEYS)), None
     )
 
 
-def both_ways(function, lanes, uniform=()):
+def run_both_backends(function, lanes, uniform=()):
     """Its results as machine code and by JAX, array by array."""
     uniform = [np.asarray(x, lanes[0].dtype) for x in uniform]
-    compiled = program(function, lanes, uniform)(uniform, lanes)
+    compiled = make_program(function, lanes, uniform)(uniform, lanes)
     expected = function(uniform, [jnp.asarray(x) for x in lanes])
     return list(zip(compiled, map(np.asarray, expected), strict=True))
 
 
-def arithmetic(uniform, lanes):
+def evaluate_arithmetic(uniform, lanes):
     (a,), (x, y) = uniform, lanes
     count = jnp.where(x > y, 3, 1).astype(jnp.int32)
     return (
@@ -48,19 +48,19 @@ def arithmetic(uniform, lanes):
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
-def test_elementwise_code_gives_what_jax_gives(dtype):
-    lanes = [DRAW.normal(size=1003).astype(dtype) for _ in range(2)]
+def test_elementwise_code_agrees_with_jax(dtype):
+    lanes = [RANDOM_GENERATOR.normal(size=1003).astype(dtype) for _ in range(2)]
     # Products and sums are rounded once where JAX may round twice; y^-2 magnifies that.
     close = 40.0 * np.finfo(dtype).eps
-    for found, expected in both_ways(arithmetic, lanes, (0.7,)):
-        assert found.dtype == expected.dtype
-        if found.dtype.kind == "f":
-            np.testing.assert_allclose(found, expected, rtol=close, atol=close)
+    for solution, expected in run_both_backends(evaluate_arithmetic, lanes, (0.7,)):
+        assert solution.dtype == expected.dtype
+        if solution.dtype.kind == "f":
+            np.testing.assert_allclose(solution, expected, rtol=close, atol=close)
         else:
-            np.testing.assert_array_equal(found, expected)
+            np.testing.assert_array_equal(solution, expected)
 
 
-def test_what_is_no_number_stays_none_and_is_compared_as_jax_does():
+def test_nan_propagates_and_compares_as_in_jax():
     odd = np.array([np.nan, np.inf, -np.inf, 0.0, -0.0, 1.0])
     x, y = (grid.ravel() for grid in np.meshgrid(odd, odd))
 
@@ -71,36 +71,36 @@ def test_what_is_no_number_stays_none_and_is_compared_as_jax_does():
             jnp.where(x > y, 1.0, 2.0),
         )  # fmt: skip
 
-    for found, expected in both_ways(compare, [x, y]):
-        np.testing.assert_array_equal(found, expected)
+    for solution, expected in run_both_backends(compare, [x, y]):
+        np.testing.assert_array_equal(solution, expected)
 
 
-def test_powers_of_step_control_are_as_right_as_said():
+def test_powers_of_step_size_control_have_the_stated_accuracy():
     x = np.geomspace(1e-20, 1e20, 10_001).astype(np.float32)
     powers = lambda _, lanes: (jnp.log(lanes[0]), jnp.exp(0.9 * jnp.log(lanes[0]) / 10.0))
-    (log, exact), (power, _) = both_ways(powers, [x])
+    (log, exact), (power, _) = run_both_backends(powers, [x])
     np.testing.assert_allclose(log, exact, atol=1e-5 + 1e-6 * 46)
     np.testing.assert_allclose(power, np.exp(0.09 * np.log(x.astype(float))), rtol=1e-5)
 
 
-def collatz(_, lanes):
+def count_collatz_steps(_, lanes):
     """Steps to 1: every lane ends when it likes."""
     start = lanes[0].astype(jnp.int32)
 
     def turn(state):
         number, count = state
         halved = jnp.where(number & 1 == 1, 3 * number + 1, number >> 1)
-        on = number != 1
-        return jnp.where(on, halved, number), count + on
+        is_active = number != 1
+        return jnp.where(is_active, halved, number), count + is_active
 
     return lax.while_loop(lambda s: jnp.any(s[0] != 1), turn, (start, jnp.zeros_like(start)))[1:]
 
 
-def test_loops_end_lane_by_lane_and_groups_wait_for_none():
+def test_loops_end_per_lane_and_groups_are_independent():
     start = np.arange(1.0, 1001.0)
-    ((found, expected),) = both_ways(collatz, [start])
-    np.testing.assert_array_equal(found, expected)
-    assert found[26] == 111  # of 27, the known one
+    ((solution, expected),) = run_both_backends(count_collatz_steps, [start])
+    np.testing.assert_array_equal(solution, expected)
+    assert solution[26] == 111  # of 27, the known one
 
 
 def test_scans_run_over_their_constants():
@@ -109,23 +109,25 @@ def test_scans_run_over_their_constants():
         start = jnp.zeros_like(lanes[0])
         return (lax.scan(lambda p, c: (p * lanes[0] + c, None), start, coefficients)[0],)
 
-    ((found, expected),) = both_ways(horner, [DRAW.normal(size=17)])
-    np.testing.assert_allclose(found, expected, rtol=1e-15, atol=1e-15)
+    ((solution, expected),) = run_both_backends(horner, [RANDOM_GENERATOR.normal(size=17)])
+    np.testing.assert_allclose(solution, expected, rtol=1e-15, atol=1e-15)
 
 
 @pytest.mark.parametrize("n", [1, 7, 8, 9, 5_003])
-def test_a_lane_gives_the_same_bits_in_any_company_on_any_number_of_cores(monkeypatch, n):
-    lanes = [DRAW.normal(size=5_003) for _ in range(2)]
-    run = program(arithmetic, lanes, [np.float64(0.7)])
+def test_a_lane_gives_the_same_bits_in_any_batch_and_on_any_number_of_cores(monkeypatch, n):
+    lanes = [RANDOM_GENERATOR.normal(size=5_003) for _ in range(2)]
+    run = make_program(evaluate_arithmetic, lanes, [np.float64(0.7)])
     monkeypatch.setattr(simd.program, "_cores", lambda: 1)
-    whole = run([np.float64(0.7)], lanes)
+    run_result = run([np.float64(0.7)], lanes)
     monkeypatch.setattr(simd.program, "_cores", lambda: 3)
-    some = DRAW.permutation(5_003)[:n]
-    for part, all_ in zip(run([np.float64(0.7)], [x[some] for x in lanes]), whole, strict=True):
-        np.testing.assert_array_equal(part, all_[some])
+    selection = RANDOM_GENERATOR.permutation(5_003)[:n]
+    for part, all_ in zip(
+        run([np.float64(0.7)], [x[selection] for x in lanes]), run_result, strict=True
+    ):
+        np.testing.assert_array_equal(part, all_[selection])
 
 
-def arrays_in_loops(x):
+def use_arrays_in_loops(x):
     """Small and large arrays; axes moved, cut, joined; sums; loops that carry and stack."""
     table = np.sin(np.arange(240.0)).reshape(12, 20)
     large = jnp.tensordot(jnp.asarray(table, x.dtype), x, 1)  # (12, 3, lanes)
@@ -136,37 +138,41 @@ def arrays_in_loops(x):
     first, *_, last = jnp.unstack(shifted[:, :4], axis=1)
 
     def turn(carry, given):
-        total, seen = carry
+        total, observed_values_2 = carry
         row, weight = given
         total = total + weight * row.reshape(4, 3, -1)[:, 1]
-        return (total, seen * 0.5 + jnp.sum(row, 0)), jnp.stack([total, total * row[:4]])
+        return (total, observed_values_2 * 0.5 + jnp.sum(row, 0)), jnp.stack(
+            [total, total * row[:4]]
+        )
 
     start = (jnp.zeros((4, x.shape[-1]), x.dtype), x[0, 0])
     rows = flat.reshape(4, 12, -1)
-    (total, seen), stacked = lax.scan(turn, start, (rows, jnp.arange(4.0)), reverse=True)
+    (total, observed_values), stacked = lax.scan(turn, start, (rows, jnp.arange(4.0)), reverse=True)
 
     def halve(state):
         field, count = state
-        on = jnp.max(jnp.abs(field), (0, 1)) > 4.0
-        smaller = jnp.where(on, field / 2.0, field)
-        return jnp.pad(jnp.where(on, field[:3], 0.0), ((0, 9), (0, 0), (0, 0))) + smaller, count + 1
+        is_active = jnp.max(jnp.abs(field), (0, 1)) > 4.0
+        smaller = jnp.where(is_active, field / 2.0, field)
+        return jnp.pad(
+            jnp.where(is_active, field[:3], 0.0), ((0, 9), (0, 0), (0, 0))
+        ) + smaller, count + 1
 
     going = lambda state: jnp.any(jnp.abs(state[0]) > 4.0) & (state[1] < 9)
     halved, _ = lax.while_loop(going, halve, (large, jnp.int32(0)))
     return {
         "stacked": stacked,
         "apart": first * last + sum(jnp.unstack(x[:3])),
-        "rest": (seen, jnp.min(flat, 0), jnp.min(stacked, (0, 2)), total),
+        "rest": (observed_values, jnp.min(flat, 0), jnp.min(stacked, (0, 2)), total),
         "halved": halved - jnp.max(large, 0),
         "found": jnp.any(large > 1.5, (0, 1)),
         "summed": (jnp.cumsum(flat[:5], 0), lax.cumsum(flat[:5], 0, reverse=True)),
-        "picked": picked(x, large),
-        "exchanged": exchanged(x),
+        "picked": pick_rows(x, large),
+        "exchanged": exchange_in_scan(x),
         "turned": large.reshape(4, 9, -1).transpose(1, 0, 2)[:, :, None],
     }
 
 
-def overwritten(x):
+def overwrite_in_loops(x):
     """Large arrays that loops within loops go on with, while others read what was there."""
     zero = jnp.zeros((), jnp.int32)
 
@@ -176,53 +182,57 @@ def overwritten(x):
         def turn(state):
             k, rows = state
             row = lax.dynamic_index_in_dim(rows, k, 0, False)
-            told = function(jnp.concatenate([row[6:], row[:6]]), k)
-            told = jnp.stack([told[i] for i in range(len(told))])
-            return k + 1, lax.dynamic_update_slice(rows, told[None], (k, zero, zero))
+            result = function(jnp.concatenate([row[6:], row[:6]]), k)
+            result = jnp.stack([result[i] for i in range(len(result))])
+            return k + 1, lax.dynamic_update_slice(rows, result[None], (k, zero, zero))
 
         return lax.while_loop(lambda s: jnp.any(s[0] < len(rows)), turn, (zero, rows))[1]
 
     def turn(state):
-        count, here, there, total = state
-        seen = here[1]  # read after `here` is overwritten
-        moved = each(each(here, lambda row, k: 0.5 * row + 0.1 * k), lambda row, _: row[:5] + 1.0)
-        fresh = each(still, lambda row, k: row - 0.2 * count)  # the same begin at each turn
-        part = lax.dynamic_update_index_in_dim(there, moved[0] + fresh[3], count & 1, 0)
-        late = part[1]  # likewise
-        gone = each(part, lambda row, k: 0.5 * row + count)
-        total = total + seen + moved[2] - fresh[1] + late
-        return count + 1, gone, moved, total
+        count, values_here_2, values_there_2, total = state
+        observed_values = values_here_2[1]  # read after `here` is overwritten
+        shifted = each(
+            each(values_here_2, lambda row, k: 0.5 * row + 0.1 * k), lambda row, _: row[:5] + 1.0
+        )
+        fresh = each(is_unfinished, lambda row, k: row - 0.2 * count)  # the same begin at each turn
+        part = lax.dynamic_update_index_in_dim(values_there_2, shifted[0] + fresh[3], count & 1, 0)
+        late_values = part[1]  # likewise
+        missing_values = each(part, lambda row, k: 0.5 * row + count)
+        total = total + observed_values + shifted[2] - fresh[1] + late_values
+        return count + 1, missing_values, shifted, total
 
-    whole = each(jnp.concatenate([x, 2.0 * x, x * x]), lambda row, _: row + 1.0)
-    still = each(whole, lambda row, _: row + 2.0)
-    begin = zero, each(whole, lambda row, _: row + 1.0), whole, 0.0 * x[0]
-    _, here, there, total = lax.while_loop(lambda s: s[0] < 5, turn, begin)
-    return here + whole, there, total
-
-
-def test_what_loops_overwrite_where_it_lies_is_read_by_others_as_it_was():
-    x = DRAW.uniform(0.0, 6.0, (2, 12, 37))
-    call = simd.lane_function(overwritten, overwritten, ("simd", next(KEYS)), None)
-    for found, expected in zip(jax.jit(call)(x), overwritten(x), strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+    full_values = each(jnp.concatenate([x, 2.0 * x, x * x]), lambda row, _: row + 1.0)
+    is_unfinished = each(full_values, lambda row, _: row + 2.0)
+    begin = zero, each(full_values, lambda row, _: row + 1.0), full_values, 0.0 * x[0]
+    _, values_here, values_there, total = lax.while_loop(lambda s: s[0] < 5, turn, begin)
+    return values_here + full_values, values_there, total
 
 
-def exchanged(x):
+def test_in_place_updates_of_loops_do_not_change_other_readers():
+    x = RANDOM_GENERATOR.uniform(0.0, 6.0, (2, 12, 37))
+    call = simd.compile_lane_function(
+        overwrite_in_loops, overwrite_in_loops, ("simd", next(KEYS)), None
+    )
+    for solution, expected in zip(jax.jit(call)(x), overwrite_in_loops(x), strict=True):
+        np.testing.assert_allclose(solution, expected, rtol=1e-12, atol=1e-12)
+
+
+def exchange_in_scan(x):
     """Loops that read, axes exchanged, what another wrote and what an outer one carries."""
     write = lambda c, row: (c + row[0], jnp.stack([row * c, row + 1.0, row - c, row * row]))
-    written = lax.scan(write, x[0, 0], x)[1]  # (20, 4, 3, lanes)
-    sums = lax.scan(lambda c, part: (c - part[1, 2], part), x[1, 1], written.swapaxes(0, 1))
+    written_text = lax.scan(write, x[0, 0], x)[1]  # (20, 4, 3, lanes)
+    sums = lax.scan(lambda c, part: (c - part[1, 2], part), x[1, 1], written_text.swapaxes(0, 1))
 
-    def turn(_, held):
-        field, other = held
+    def turn(_, held_values):
+        field, other = held_values
         rows = lax.scan(lambda c, row: (c + row[0], row * 0.5 + c), x[0, 0], field.swapaxes(0, 1))
         return jnp.sin(other) + rows[1].swapaxes(0, 1), field.swapaxes(0, 1)
 
-    square = written.reshape(20, 12, -1)[:7, :7]
+    square = written_text.reshape(20, 12, -1)[:7, :7]
     return sums, lax.fori_loop(0, 3, turn, (square, 2.0 * square))
 
 
-def picked(x, large):
+def pick_rows(x, large):
     """A table looked up turn by turn; rows of a large array overwritten by what stands there."""
     table = jnp.asarray(np.cos(np.arange(144.0)).reshape(12, 12))
 
@@ -234,38 +244,38 @@ def picked(x, large):
 
 
 @pytest.mark.parametrize("n", [1, 4, 1001])
-def test_functions_of_arrays_are_called_from_programs_of_jax(n):
-    x = jnp.asarray(DRAW.normal(size=(20, 3, n)))
-    call = simd.lane_function(arrays_in_loops, arrays_in_loops, "arrays", None)
+def test_array_functions_are_called_from_jax_programs(n):
+    x = jnp.asarray(RANDOM_GENERATOR.normal(size=(20, 3, n)))
+    call = simd.compile_lane_function(use_arrays_in_loops, use_arrays_in_loops, "arrays", None)
     # One lane after the other: no lane may see another.
     expected = jax.vmap(
-        lambda one: jax.tree.map(lambda y: y[..., 0], arrays_in_loops(one[..., None])), -1, -1
+        lambda one: jax.tree.map(lambda y: y[..., 0], use_arrays_in_loops(one[..., None])), -1, -1
     )(x)
-    found = jax.jit(call)(x)
-    assert jax.tree.structure(found) == jax.tree.structure(expected)
-    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+    solution = jax.jit(call)(x)
+    assert jax.tree.structure(solution) == jax.tree.structure(expected)
+    for a, b in zip(jax.tree.leaves(solution), jax.tree.leaves(expected), strict=True):
         assert a.dtype == b.dtype
         # Sums of terms of size some hundred in another order.
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
 
 
-def test_functions_set_apart_are_called_and_give_the_same():
-    def cubes(how):
+def test_noinline_functions_are_called_and_give_the_same():
+    def cubes(options_used):
         def run(_, lanes):
-            power = how(lambda x, y: (x * y * y, x + lanes[0]))
+            power = options_used(lambda x, y: (x * y * y, x + lanes[0]))
             a, b = power(*power(*lanes))
-            along = jax.jvp(power, (a, b), (b, a))[1]
-            return (a, b, *along)
+            tangential_part = jax.jvp(power, (a, b), (b, a))[1]
+            return (a, b, *tangential_part)
 
         return run
 
-    lanes = [DRAW.normal(size=11) for _ in range(2)]
-    called = program(cubes(simd.apart), lanes)([], lanes)
-    for found, expected in zip(called, cubes(jax.jit)((), lanes), strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-13)
+    lanes = [RANDOM_GENERATOR.normal(size=11) for _ in range(2)]
+    called = make_program(cubes(simd.noinline), lanes)([], lanes)
+    for solution, expected in zip(called, cubes(jax.jit)((), lanes), strict=True):
+        np.testing.assert_allclose(solution, expected, rtol=1e-13, atol=1e-13)
 
 
-def test_integers_and_truths_are_compared_and_multiplied_as_jax_does():
+def test_integers_and_booleans_compare_and_multiply_as_in_jax():
     def compare(_, lanes):
         x, y = (lane.astype(jnp.int32) for lane in lanes)
         a, b = x > 0, y > 0
@@ -274,21 +284,23 @@ def test_integers_and_truths_are_compared_and_multiplied_as_jax_does():
             a < b, a >= b, jnp.maximum(a, b), a ^ b, jnp.where(a, x, y), x.astype(bool), x != y,
         )  # fmt: skip
 
-    for found, expected in both_ways(compare, [10.0 * DRAW.normal(size=99) for _ in range(2)]):
-        np.testing.assert_array_equal(found, expected)
+    for solution, expected in run_both_backends(
+        compare, [10.0 * RANDOM_GENERATOR.normal(size=99) for _ in range(2)]
+    ):
+        np.testing.assert_array_equal(solution, expected)
 
 
-def test_a_primitive_takes_one_row_of_the_table(monkeypatch):
-    lanes = [DRAW.normal(size=9)]
+def test_a_new_primitive_needs_one_row_of_the_table(monkeypatch):
+    lanes = [RANDOM_GENERATOR.normal(size=9)]
     tangent = lambda _, lanes: (jnp.tan(lanes[0]),)
     with pytest.raises(NotImplementedError, match="tan has no machine code"):
-        program(tangent, lanes)
+        make_program(tangent, lanes)
     monkeypatch.setitem(
-        ELEMENTWISE, "tan",
+        ELEMENTWISE_RULES, "tan",
         lambda n, params, before, after, x: n.builder.fdiv(
-            *(ELEMENTWISE[name](n, params, before, after, x) for name in ("sin", "cos"))
+            *(ELEMENTWISE_RULES[name](n, params, before, after, x) for name in ("sin", "cos"))
         ),
     )  # fmt: skip
-    monkeypatch.setitem(RULES, "tan", RULES["sin"])
-    ((found, expected),) = both_ways(tangent, lanes)
-    np.testing.assert_allclose(found, expected, rtol=1e-14)
+    monkeypatch.setitem(PRIMITIVE_RULES, "tan", PRIMITIVE_RULES["sin"])
+    ((solution, expected),) = run_both_backends(tangent, lanes)
+    np.testing.assert_allclose(solution, expected, rtol=1e-14)

@@ -4,33 +4,33 @@ import jax
 
 from vrw_jax.simd import code, ffi, program
 
-_REGISTERED = ffi.registered  # XLA never lets go, and takes one code of a name: it is the same
+_REGISTERED = ffi.LOADED_BY_NAME  # XLA never lets go, and takes one code of a name: it is the same
 
 
-class Forgetful:
+class CodeRegistrySpy:
     """`names` of machine code as it is registered; `forget()`, and all is as in another process."""
 
     def __init__(self, monkeypatch):
-        self.names, self._patch = [], monkeypatch
-        self._once = jax.ffi.register_ffi_target
+        self.names, self._monkeypatch = [], monkeypatch
+        self._original_register = jax.ffi.register_ffi_target
         monkeypatch.setattr(jax.ffi, "register_ffi_target", self._register)
-        self.forget()
+        self.reset_registry()
 
-    def forget(self):
-        self._patch.setattr(code, "_made", {})
-        registered = Keeping()
+    def reset_registry(self):
+        self._monkeypatch.setattr(code, "_made", {})
+        registered = PersistentRegistry()
         for module in (ffi, program):
-            self._patch.setattr(module, "registered", registered)
+            self._monkeypatch.setattr(module, "registered", registered)
 
-    def _register(self, name, *rest, **named):
+    def _register(self, name, *rest, **options):
         self.names.append(name)
         if name not in _REGISTERED:
-            self._once(name, *rest, **named)
+            self._original_register(name, *rest, **options)
 
 
-class Keeping(dict):
+class PersistentRegistry(dict):
     """What is registered, which outlives the test."""
 
-    def __setitem__(self, name, loaded):
-        _REGISTERED.setdefault(name, loaded)
-        super().__setitem__(name, loaded)
+    def __setitem__(self, name, library):
+        _REGISTERED.setdefault(name, library)
+        super().__setitem__(name, library)

@@ -3,11 +3,11 @@
 import ast
 from collections.abc import Iterable, Iterator
 
-from support.rooms import FLOW, Arrow, House, loaded
+from support.rooms import PACKAGE_LAYERS, ImportEdge, ImportGraph, find_loaded_module
 
-LONGEST_MODULE, LONGEST_FUNCTION = 500, 60
+MAX_MODULE_LINES, MAX_FUNCTION_LINES = 500, 60
 
-ONLY = {
+ALLOWED_IMPORTERS = {
     "diffrax": ("numerics.events",), "llvmlite": ("simd",), "matplotlib": ("figures",),
     "PIL": ("figures",), "rich": ("app",), "typer": ("app",), "zarr": ("scans.store",),
     "anywidget": ("web",),
@@ -15,92 +15,112 @@ ONLY = {
 """Who may know a library: modules or rooms. Faces only hand on."""
 
 
-def circles(house: House) -> list[str]:
+def find_import_cycles(import_graph: ImportGraph) -> list[str]:
     """Modules that lead back to themselves; a face leads to what it hands out."""
-    graph: dict[str, list[str]] = {module: [] for module in house.paths}
-    for arrow in house.arrows:
-        if arrow.target in graph:
-            graph[arrow.source].append(arrow.target)
-    found, done = [], set()
+    graph: dict[str, list[str]] = {module: [] for module in import_graph.paths}
+    for edge in import_graph.edges:
+        if edge.target in graph:
+            graph[edge.source].append(edge.target)
+    cycles, visited = [], set()
 
     def visit(module: str, trail: tuple[str, ...]) -> None:
         if module in trail:
-            circle = trail[trail.index(module) :]
-            least = circle.index(min(circle))
-            circle = (*circle[least:], *circle[: least + 1])
-            found.append(" -> ".join(circle))
-        elif module not in done:
+            cycle = trail[trail.index(module) :]
+            minimum = cycle.index(min(cycle))
+            cycle = (*cycle[minimum:], *cycle[: minimum + 1])
+            cycles.append(" -> ".join(cycle))
+        elif module not in visited:
             for other in graph[module]:
                 visit(other, (*trail, module))
-            done.add(module)
+            visited.add(module)
 
     for module in graph:
         visit(module, ())
-    return sorted(set(found))
+    return sorted(set(cycles))
 
 
-def upward(house: House) -> list[str]:
+def find_upward_imports(import_graph: ImportGraph) -> list[str]:
     """Imports against the flow, and rooms that the flow does not know."""
-    floor = {room: index for index, row in enumerate(FLOW) for room in row}
-    found = [f"{room} stands nowhere in the flow" for room in house.rooms if room not in floor]
-    for arrow in house.arrows:
-        source, target = house.room(arrow.source), house.room(arrow.target)
-        if arrow.target not in house.paths or not source or source == target:
+    layer_index = {package: index for index, row in enumerate(PACKAGE_LAYERS) for package in row}
+    violations = [
+        f"{package} stands nowhere in the flow"
+        for package in import_graph.packages
+        if package not in layer_index
+    ]
+    for edge in import_graph.edges:
+        source, target = import_graph.package_of(edge.source), import_graph.package_of(edge.target)
+        if edge.target not in import_graph.paths or not source or source == target:
             continue
-        if floor.get(target, len(FLOW)) >= floor.get(source, len(FLOW)):
-            found.append(f"{_place(arrow)} knows {arrow.target}")
-    return sorted(set(found))
+        if layer_index.get(target, len(PACKAGE_LAYERS)) >= layer_index.get(
+            source, len(PACKAGE_LAYERS)
+        ):
+            violations.append(f"{_format_location(edge)} knows {edge.target}")
+    return sorted(set(violations))
 
 
-def past_faces(house: House) -> list[str]:
+def find_bypassed_init_files(import_graph: ImportGraph) -> list[str]:
     """Imports that enter another room past its face."""
     return sorted(
         {
-            f"{_place(a)} fetches {a.written.replace(':', '.')}"
-            for a in house.arrows
-            if _is_deep(house, a)
+            f"{_format_location(a)} fetches {a.imported_name.replace(':', '.')}"
+            for a in import_graph.edges
+            if _bypasses_init_file(import_graph, a)
         }
     )
 
 
-def _is_deep(house: House, arrow: Arrow) -> bool:
-    top, room, first, *_ = [*arrow.written.replace(":", ".").split("."), "", ""]
-    face = f"{top}.{room}"
-    if top != house.name or room == house.room(arrow.source) or not house.is_face(face):
+def _bypasses_init_file(import_graph: ImportGraph, edge: ImportEdge) -> bool:
+    top, package, first, *_ = [*edge.imported_name.replace(":", ".").split("."), "", ""]
+    init_module = f"{top}.{package}"
+    if (
+        top != import_graph.name
+        or package == import_graph.package_of(edge.source)
+        or not import_graph.is_init_module(init_module)
+    ):
         return False
-    handed_out = first in house.names[face] or f"{face}.{first}" not in house.paths
-    return arrow.stated not in ("", top, face) or not handed_out
+    exported = (
+        first in import_graph.names[init_module]
+        or f"{init_module}.{first}" not in import_graph.paths
+    )
+    return edge.stated_module not in ("", top, init_module) or not exported
 
 
-def strangers(house: House) -> list[str]:
+def find_misplaced_external_imports(import_graph: ImportGraph) -> list[str]:
     """Libraries known outside their room, and libraries loaded by names not written out."""
-    found, lazy = [], f"{house.name}.runtime.lazy"
-    for arrow in house.arrows:
-        places = [f"{house.name}.{place}" for place in ONLY.get(arrow.target.split(".")[0], ())]
-        hands_on = house.is_face(arrow.source)
-        at_home = any(f"{arrow.source}.".startswith(f"{place}.") for place in places)
+    violations, lazy = [], f"{import_graph.name}.runtime.lazy"
+    for edge in import_graph.edges:
+        places = [
+            f"{import_graph.name}.{place}"
+            for place in ALLOWED_IMPORTERS.get(edge.target.split(".")[0], ())
+        ]
+        hands_on = import_graph.is_init_module(edge.source)
+        at_home = any(f"{edge.source}.".startswith(f"{place}.") for place in places)
         if places and not hands_on and not at_home:
-            found.append(f"{_place(arrow)} knows {arrow.target.split('.')[0]}")
-        inner, outer = (house.room(module) == "simd" for module in (arrow.source, arrow.target))
-        if inner and not outer and arrow.target in house.paths:
-            found.append(f"{_place(arrow)} knows {arrow.target}: simd knows nothing of the rest")
-    for module, tree in house.trees.items():
+            violations.append(f"{_format_location(edge)} knows {edge.target.split('.')[0]}")
+        inner, outer = (
+            import_graph.package_of(module) == "simd" for module in (edge.source, edge.target)
+        )
+        if inner and not outer and edge.target in import_graph.paths:
+            violations.append(
+                f"{_format_location(edge)} knows {edge.target}: simd knows nothing of the rest"
+            )
+    for module, tree in import_graph.trees.items():
         if module != lazy and any(
-            loaded(node, house.names[module]) == "" for node in ast.walk(tree)
+            find_loaded_module(node, import_graph.names[module]) == "" for node in ast.walk(tree)
         ):
-            found.append(f"{module} loads a module by a name that is not written out")
-    return sorted(set(found))
+            violations.append(f"{module} loads a module by a name that is not written out")
+    return sorted(set(violations))
 
 
-def asked_rungs(house: House) -> list[str]:
+def find_model_type_tests(import_graph: ImportGraph) -> list[str]:
     """Questions above `models` which rung, or which rung's step, a thing is.
 
     A rung is a class of `models` that extends an abstract one; `AbstractWheel` itself may be
     asked for: whether a thing is a rung at all.
     """
-    rungs, found = _rungs(house), []
-    for module, tree in house.trees.items():
-        if house.room(module) in {"models", ""}:
+    model_classes, violations = _find_model_classes(import_graph), []
+    for module, tree in import_graph.trees.items():
+        if import_graph.package_of(module) in {"models", ""}:
             continue
         constants = {
             target.id: node.value
@@ -110,21 +130,23 @@ def asked_rungs(house: House) -> list[str]:
             if isinstance(target, ast.Name)
         }
         for node in ast.walk(tree):
-            if _asks_by_name(node):
-                found.append(f"{module}:{node.lineno} asks for {ast.unparse(node)}")
-            for asked in _asked(node):
-                for name in _named(asked, constants):
-                    if house.defined(module, name) in rungs:
-                        found.append(f"{module}:{node.lineno} asks for {ast.unparse(name)}")
-    return sorted(set(found))
+            if _tests_class_name(node):
+                violations.append(f"{module}:{node.lineno} asks for {ast.unparse(node)}")
+            for tested_names in _tested_expressions(node):
+                for name in _find_class_names(tested_names, constants):
+                    if import_graph.find_definition(module, name) in model_classes:
+                        violations.append(f"{module}:{node.lineno} asks for {ast.unparse(name)}")
+    return sorted(set(violations))
 
 
-def _rungs(house: House) -> set[str]:
+def _find_model_classes(import_graph: ImportGraph) -> set[str]:
     bases: dict[str, list[str]] = {}
-    for module in house.modules("models"):
-        for node in ast.walk(house.trees[module]):
+    for module in import_graph.modules_of("models"):
+        for node in ast.walk(import_graph.trees[module]):
             if isinstance(node, ast.ClassDef):
-                bases[f"{module}.{node.name}"] = [house.defined(module, b) for b in node.bases]
+                bases[f"{module}.{node.name}"] = [
+                    import_graph.find_definition(module, b) for b in node.bases
+                ]
     is_abstract = lambda name: name.split(".")[-1].startswith("Abstract")
     extends = lambda name: any(
         is_abstract(b) or extends(b) for b in bases.get(name, ()) if b in bases
@@ -132,7 +154,7 @@ def _rungs(house: House) -> set[str]:
     return {name for name in bases if not is_abstract(name) and extends(name)}
 
 
-def _asked(node: ast.AST) -> Iterator[ast.AST]:
+def _tested_expressions(node: ast.AST) -> Iterator[ast.AST]:
     """Parts of a node that ask of what class a thing is."""
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
         if node.func.id in {"isinstance", "issubclass"} and len(node.args) == 2:
@@ -148,82 +170,104 @@ def _asked(node: ast.AST) -> Iterator[ast.AST]:
         yield from (key for key in node.keys if key is not None)
 
 
-def _asks_by_name(node: ast.AST) -> bool:
+def _tests_class_name(node: ast.AST) -> bool:
     """Whether it compares the name that a rung bears with one written out."""
     if not isinstance(node, ast.Compare):
         return False
     sides = [node.left, *node.comparators]
-    written = any(isinstance(part, ast.Constant) and isinstance(part.value, str)
+    has_name_attribute = any(isinstance(part, ast.Constant) and isinstance(part.value, str)
                   for side in sides for part in ast.walk(side))  # fmt: skip
-    return written and any(isinstance(x, ast.Attribute) and x.attr == "rung" for x in sides)
+    return has_name_attribute and any(
+        isinstance(x, ast.Attribute) and x.attr == "rung" for x in sides
+    )
 
 
-def _named(node: ast.AST, constants: dict[str, ast.expr]) -> Iterator[ast.Name | ast.Attribute]:
+def _find_class_names(
+    node: ast.AST, constants: dict[str, ast.expr]
+) -> Iterator[ast.Name | ast.Attribute]:
     """Names in an expression; a module's constant counts as what it holds."""
     for inner in ast.walk(node):
         if isinstance(inner, ast.Name) and inner.id in constants:
-            held = {name: value for name, value in constants.items() if name != inner.id}
-            yield from _named(constants[inner.id], held)
+            value_node = {name: value for name, value in constants.items() if name != inner.id}
+            yield from _find_class_names(constants[inner.id], value_node)
         elif isinstance(inner, ast.Name | ast.Attribute):
             yield inner
 
 
-def namesakes(house: House) -> list[str]:
+def find_hidden_modules(import_graph: ImportGraph) -> list[str]:
     """Functions and classes that bear the name of their module, or hide a module in a face."""
-    found = []
-    for module, tree in house.trees.items():
+    violations = []
+    for module, tree in import_graph.trees.items():
         last = module.split(".")[-1]
         for node in tree.body:
             if isinstance(node, ast.FunctionDef | ast.ClassDef) and node.name == last:
-                found.append(f"{module}:{node.lineno} defines its own name")
-            defined = isinstance(node, ast.FunctionDef | ast.ClassDef) and house.is_face(module)
-            if defined and f"{module}.{node.name}" in house.paths:
-                found.append(f"{module}:{node.lineno} hides its module {node.name}")
-        for name, origin in house.names[module].items() if house.is_face(module) else ():
+                violations.append(f"{module}:{node.lineno} defines its own name")
+            defined = isinstance(
+                node, ast.FunctionDef | ast.ClassDef
+            ) and import_graph.is_init_module(module)
+            if defined and f"{module}.{node.name}" in import_graph.paths:
+                violations.append(f"{module}:{node.lineno} hides its module {node.name}")
+        for name, origin in (
+            import_graph.names[module].items() if import_graph.is_init_module(module) else ()
+        ):
             inner = f"{module}.{name}"
-            if inner in house.paths and house.way(origin)[-1] != inner:
-                found.append(f"{module} hides its module {name} by {origin}")
-    return sorted(set(found))
+            if inner in import_graph.paths and import_graph.resolve_path(origin)[-1] != inner:
+                violations.append(f"{module} hides its module {name} by {origin}")
+    return sorted(set(violations))
 
 
-def long_ones(house: House) -> list[str]:
+def find_long_code(import_graph: ImportGraph) -> list[str]:
     """Modules and functions past their number of lines; a function's docstring is not counted."""
-    found = []
-    for module, tree in house.trees.items():
-        if (lines := house.n_lines(module)) > LONGEST_MODULE:
-            found.append(f"{module} has {lines} lines")
+    violations = []
+    for module, tree in import_graph.trees.items():
+        if (lines := import_graph.count_lines(module)) > MAX_MODULE_LINES:
+            violations.append(f"{module} has {lines} lines")
         for node in ast.walk(tree):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-                told = ast.get_docstring(node, clean=False) or ""
-                lines = (node.end_lineno or 0) - node.lineno + 1 - told.count("\n")
-                if lines > LONGEST_FUNCTION:
-                    found.append(f"{module}:{node.lineno} {node.name} has {lines} lines")
-    return found
+                length_text = ast.get_docstring(node, clean=False) or ""
+                lines = (node.end_lineno or 0) - node.lineno + 1 - length_text.count("\n")
+                if lines > MAX_FUNCTION_LINES:
+                    violations.append(f"{module}:{node.lineno} {node.name} has {lines} lines")
+    return violations
 
 
-def idle_names(house: House, outside: Iterable[str] = ()) -> list[str]:
+def find_unused_exports(
+    import_graph: ImportGraph, outside_sources: Iterable[str] = ()
+) -> list[str]:
     """Names that a face hands out and nobody fetches there, or that are private.
 
     `outside` is source that uses the package: tests and experiments. The package's own face is for
     its users, who are not here.
     """
-    fetched = {written for text in outside for written in house.fetched_by(text)}
-    found = []
-    for face in house.paths:
-        if not house.is_face(face) or face == house.name:
+    imported_names = {
+        written_text
+        for text in outside_sources
+        for written_text in import_graph.find_imports_in(text)
+    }
+    violations = []
+    for face in import_graph.paths:
+        if not import_graph.is_init_module(face) or face == import_graph.name:
             continue
-        strangers = (a for a in house.arrows if not f"{a.source}.".startswith(f"{face}."))
-        used = fetched | {arrow.written for arrow in strangers}
-        for name in house.names[face]:
-            if not any(f"{written}.".startswith(f"{face}:{name}.") for written in used):
-                found.append(f"{face} hands out {name}, which nobody fetches there")
+        strangers = (a for a in import_graph.edges if not f"{a.source}.".startswith(f"{face}."))
+        used = imported_names | {arrow.imported_name for arrow in strangers}
+        for name in import_graph.names[face]:
+            if not any(f"{written_text}.".startswith(f"{face}:{name}.") for written_text in used):
+                violations.append(f"{face} hands out {name}, which nobody fetches there")
             if name.startswith("_"):
-                found.append(f"{face} hands out {name}, which is private")
-    return found
+                violations.append(f"{face} hands out {name}, which is private")
+    return violations
 
 
-def _place(arrow: Arrow) -> str:
-    return f"{arrow.source}:{arrow.line}"
+def _format_location(edge: ImportEdge) -> str:
+    return f"{edge.source}:{edge.line}"
 
 
-RULES = (circles, upward, past_faces, strangers, asked_rungs, namesakes, long_ones)
+IMPORT_RULES = (
+    find_import_cycles,
+    find_upward_imports,
+    find_bypassed_init_files,
+    find_misplaced_external_imports,
+    find_model_type_tests,
+    find_hidden_modules,
+    find_long_code,
+)

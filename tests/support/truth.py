@@ -9,35 +9,39 @@ import numpy as np
 
 from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams
 
-CASES: list[dict[str, Any]] = json.loads(
+REFERENCE_CASES: list[dict[str, Any]] = json.loads(
     (Path(__file__).parents[1] / "oracle" / "truth.json").read_text()
 )["cases"]
 
 
-def floats(value: Any) -> np.ndarray:
+def to_floats(value: Any) -> np.ndarray:
     """Nested lists of decimal strings as float64."""
     return np.asarray(value, dtype=float)
 
 
-def table(part: str, key: str) -> np.ndarray:
+def stack_quantity(part: str, key: str) -> np.ndarray:
     """One quantity of every case, cases first."""
-    return np.stack([floats(case[part][key]) for case in CASES])
+    return np.stack([to_floats(case[part][key]) for case in REFERENCE_CASES])
 
 
-PARAMETERS = np.stack([[float(case["params"][name]) for name in PARAMETER_NAMES] for case in CASES])
+REFERENCE_PARAMETERS = np.stack(
+    [[float(case["params"][name]) for name in PARAMETER_NAMES] for case in REFERENCE_CASES]
+)
 """Parameters of every case, in the order of `PARAMETER_NAMES`; all have eight legs."""
 
 
-def wheel(vector: Any) -> WheelParams:
+def make_wheel(vector: Any) -> WheelParams:
     """Parameters from a vector in the order of `PARAMETER_NAMES`."""
     return WheelParams(**dict(zip(PARAMETER_NAMES, vector, strict=True)))
 
 
-def wheels(matrix: Any) -> WheelParams:
+def make_wheels(matrix: Any) -> WheelParams:
     """A batch of parameters from rows."""
-    return wheel(jnp.asarray(matrix).T)
+    return make_wheel(jnp.asarray(matrix).T)
 
 
-def scaled_error(found: Any, truth: np.ndarray) -> float:
+def compute_scaled_error(values: Any, reference: np.ndarray) -> float:
     """Largest error, relative where the truth exceeds 1."""
-    return float(np.max(np.abs(np.asarray(found) - truth) / np.maximum(np.abs(truth), 1.0)))
+    return float(
+        np.max(np.abs(np.asarray(values) - reference) / np.maximum(np.abs(reference), 1.0))
+    )

@@ -12,26 +12,30 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 
-class Wrong(NamedTuple):
+class WrongCall(NamedTuple):
     call: Callable[[], Any]
-    kind: str
-    words: str
+    error_type: str
+    expected_words: str
 
 
-USES: dict[str, Wrong] = {}
+WRONG_CALLS: dict[str, WrongCall] = {}
 
 
-def use(name: str, call: Callable[[], Any], kind: str, words: str) -> None:
-    assert name not in USES, name
-    USES[name] = Wrong(call, kind, words)
+def add_wrong_call(
+    name: str, call: Callable[[], Any], error_type: str, expected_words: str
+) -> None:
+    assert name not in WRONG_CALLS, name
+    WRONG_CALLS[name] = WrongCall(call, error_type, expected_words)
 
 
-def family(name: str, call: Callable[[Any], Any], cases: dict[str, tuple[Any, str]], words: str):
+def add_wrong_calls(
+    name: str, call: Callable[[Any], Any], cases: dict[str, tuple[Any, str]], expected_words: str
+):
     for label, (value, kind) in cases.items():
-        use(f"{name}: {label}", lambda value=value: call(value), kind, words)
+        add_wrong_call(f"{name}: {label}", lambda value=value: call(value), kind, expected_words)
 
 
-def make() -> None:
+def register_wrong_calls() -> None:
     import diffrax
     import jax
     import jax.numpy as jnp
@@ -53,7 +57,7 @@ def make() -> None:
         "table": ({}, "TypeError"),
         "object": (object(), "TypeError"),
     }
-    whole = not_numbers | {
+    full_values = not_numbers | {
         "fraction": (2.5, "ValueError"),
         "float": (2.0, "ValueError"),
         "zero": (0, "ValueError"),
@@ -67,8 +71,10 @@ def make() -> None:
         "infinite": (float("inf"), "ValueError"),
     }
 
-    use("a number as the folder of compiled code", lambda: vrw.start_jax(3), "TypeError", "cache")
-    use(
+    add_wrong_call(
+        "a number as the folder of compiled code", lambda: vrw.start_jax(3), "TypeError", "cache"
+    )
+    add_wrong_call(
         "a file as the folder of compiled code",
         lambda: vrw.start_jax(__file__), "NotADirectoryError", "a file",
     )  # fmt: skip
@@ -79,10 +85,16 @@ def make() -> None:
             "nan": (float("nan"), "ValueError"), "negative": (-9.0, "ValueError"),
             "huge": (1e12, "ValueError"), "a list with text": ([1.0, "a"], "TypeError"),
         }  # fmt: skip
-        family(f"WheelParams {name}", lambda v, n=name: vrw.WheelParams(**{n: v}), bad, name)
-    family("WheelParams n_legs", lambda v: vrw.WheelParams(n_legs=v), whole, "n_legs")
-    use("a leg's mass above the hub", lambda: vrw.WheelParams(leg_com=1.5), "ValueError", "leg_com")
-    use(
+        add_wrong_calls(
+            f"WheelParams {name}", lambda v, n=name: vrw.WheelParams(**{n: v}), bad, name
+        )
+    add_wrong_calls(
+        "WheelParams n_legs", lambda v: vrw.WheelParams(n_legs=v), full_values, "n_legs"
+    )
+    add_wrong_call(
+        "a leg's mass above the hub", lambda: vrw.WheelParams(leg_com=1.5), "ValueError", "leg_com"
+    )
+    add_wrong_call(
         "batches of two lengths",
         lambda: vrw.WheelParams(damping=np.ones(3), slope=np.ones(4) / 9),
         "ValueError",
@@ -91,37 +103,47 @@ def make() -> None:
 
     # Options
     for name in ("rtol", "atol", "max_phase_time", "first_step"):
-        family(f"Options {name}", lambda v, n=name: vrw.Options(**{n: v}), positive, name)
+        add_wrong_calls(
+            f"Options {name}", lambda v, n=name: vrw.StepOptions(**{n: v}), positive, name
+        )
     for name in ("max_solver_steps", "event_steps"):
-        family(f"Options {name}", lambda v, n=name: vrw.Options(**{n: v}), whole, name)
+        add_wrong_calls(
+            f"Options {name}", lambda v, n=name: vrw.StepOptions(**{n: v}), full_values, name
+        )
     solvers = not_numbers | {
         "an object of diffrax": (diffrax.Tsit5(), "TypeError"), "typo": ("Tsit6", "ValueError"),
         "for noise": ("ShARK", "ValueError"),
     }  # fmt: skip
     del solvers["text"], solvers["digits"]
-    family("Options solver", lambda v: vrw.Options(solver=v), solvers, "solver")
+    add_wrong_calls("Options solver", lambda v: vrw.StepOptions(solver=v), solvers, "solver")
     for name in ("iterations", "block"):
-        family(f"CycleOptions {name}", lambda v, n=name: vrw.CycleOptions(**{n: v}), whole, name)
-    family("CycleOptions tolerance", lambda v: vrw.CycleOptions(tolerance=v), positive, "tolerance")
+        add_wrong_calls(
+            f"CycleOptions {name}", lambda v, n=name: vrw.CycleOptions(**{n: v}), full_values, name
+        )
+    add_wrong_calls(
+        "CycleOptions tolerance", lambda v: vrw.CycleOptions(tolerance=v), positive, "tolerance"
+    )
     for label, value in {
         "two": (1, 2), "fractions": (1.5, 2, 3), "text": "abcd", "one": 5, "zeros": (0, 1, 1)
     }.items():  # fmt: skip
-        use(
+        add_wrong_call(
             f"CycleOptions steps: {label}",
-            lambda v=value: vrw.CycleOptions(steps=v),
+            lambda v=value: vrw.CycleOptions(mesh_intervals=v),
             "ValueError",
             "steps",
         )
-    family(
+    add_wrong_calls(
         "ArclengthOptions max_points",
         lambda v: vrw.ArclengthOptions(max_points=v),
-        whole,
+        full_values,
         "max_points",
     )
-    family("ArclengthOptions turn", lambda v: vrw.ArclengthOptions(turn=v), positive, "turn")
-    use(
+    add_wrong_calls(
+        "ArclengthOptions turn", lambda v: vrw.ArclengthOptions(max_turn_angle=v), positive, "turn"
+    )
+    add_wrong_call(
         "steps of a branch out of order",
-        lambda: vrw.ArclengthOptions(first_step=1.0),
+        lambda: vrw.ArclengthOptions(initial_ds=1.0),
         "ValueError",
         "order",
     )
@@ -131,26 +153,28 @@ def make() -> None:
         "negative": (-1.0, "ValueError"), "nan": (float("nan"), "ValueError")
     }  # fmt: skip
     for rung in (vrw.UnilateralWheel, vrw.ViscoelasticWheel, vrw.RigidWheel, vrw.LadderWheel):
-        family(f"{rung.__name__} friction", lambda v, r=rung: r(friction=v), frictions, "friction")
-    family(
+        add_wrong_calls(
+            f"{rung.__name__} friction", lambda v, r=rung: r(friction=v), frictions, "friction"
+        )
+    add_wrong_calls(
         "UnilateralWheel max_events",
         lambda v: vrw.UnilateralWheel(max_events=v),
-        whole,
+        full_values,
         "max_events",
     )
-    use(
+    add_wrong_call(
         "stoppers misspelt",
         lambda: vrw.UnilateralWheel(stoppers="one sided"),
         "ValueError",
         "did you mean 'one-sided'",
     )
-    use(
+    add_wrong_call(
         "a choice that is no choice",
         lambda: vrw.ViscoelasticWheel(stop_at_lift_off="no"),
         "TypeError",
         "stop_at_lift_off",
     )
-    family(
+    add_wrong_calls(
         "choose_model friction",
         lambda v: vrw.choose_model(table_1, start, friction=v),
         frictions,
@@ -164,7 +188,7 @@ def make() -> None:
         "return_map": lambda: vrw.return_map(table_1, start, model=grounds),
         "walk of three steps": lambda: vrw.walk(table_1, start, 3, model=grounds),
         "simulate": lambda: vrw.simulate(table_1, start, model=grounds),
-        "steps of three lanes": lambda: vrw.steps(several, np.tile(start, (3, 1)), model=grounds),
+        "steps of three lanes": lambda: vrw.step_batch(several, np.tile(start, (3, 1)), model=grounds),
         "limit_cycle": lambda: vrw.limit_cycle(table_1, model=grounds),
         "limit_cycles": lambda: vrw.limit_cycles(several, model=grounds),
         "sensitivities": lambda: vrw.sensitivities(table_1, model=grounds),
@@ -182,8 +206,8 @@ def make() -> None:
             table_1, start, model=vrw.LadderWheel(friction=np.array([0.5, 0.7]))
         ),
     }.items():  # fmt: skip
-        use(f"{name} on two grounds", call, "ValueError", "friction has shape (2,)")
-    use(
+        add_wrong_call(f"{name} on two grounds", call, "ValueError", "friction has shape (2,)")
+    add_wrong_call(
         "explore on two grounds",
         lambda: vrw.explore(table_1, friction=np.array([0.5, 0.7])),
         "TypeError",
@@ -205,103 +229,123 @@ def make() -> None:
         "step": vrw.step, "return_map": vrw.return_map, "choose_model": vrw.choose_model,
         "walk": lambda p, x: vrw.walk(p, x, 2),
     }.items():  # fmt: skip
-        family(f"{name} state", lambda v, c=call: c(table_1, v), states, "section state")
-        use(
+        add_wrong_calls(f"{name} state", lambda v, c=call: c(table_1, v), states, "section state")
+        add_wrong_call(
             f"{name} of a table",
             lambda c=call: c({"damping": 200.0}, start),
             "TypeError",
             "WheelParams",
         )
-        use(f"{name} of a batch", lambda c=call: c(several, start), "ValueError", "jax.vmap")
-        use(
+        add_wrong_call(
+            f"{name} of a batch", lambda c=call: c(several, start), "ValueError", "jax.vmap"
+        )
+        add_wrong_call(
             f"{name} of single numbers",
             lambda c=call: c(single, start),
             "ValueError",
             "vrw.start_jax()",
         )
     given = {k: v for k, v in states.items() if k != "nothing"}
-    family("simulate state", lambda v: vrw.simulate(table_1, v), given, "section state")
+    add_wrong_calls("simulate state", lambda v: vrw.simulate(table_1, v), given, "section state")
     rows = given | {"three numbers": (np.ones(3), "ValueError"),
                     "four columns": (np.ones((2, 4)), "ValueError")}  # fmt: skip
     rows.pop("a row")
-    family("steps states", lambda v: vrw.steps(table_1, v), rows, "states")
-    use(
+    add_wrong_calls("steps states", lambda v: vrw.step_batch(table_1, v), rows, "states")
+    add_wrong_call(
         "step by options of a cycle",
         lambda: vrw.step(table_1, start, options=vrw.CycleOptions()),
         "TypeError",
         "must be an Options: give vrw.Options",
     )
-    use(
+    add_wrong_call(
         "a rung that is a class",
         lambda: vrw.step(table_1, start, model=vrw.RigidWheel),
         "TypeError",
         "model",
     )
-    use(
+    add_wrong_call(
         "a rung by another name",
         lambda: vrw.step(table_1, start, model="rigid"),
         "TypeError",
         "auto",
     )
-    use(
+    add_wrong_call(
         "a tolerance below rounding",
-        lambda: vrw.step(table_1, start, options=vrw.Options(rtol=1e-17)),
+        lambda: vrw.step(table_1, start, options=vrw.StepOptions(rtol=1e-17)),
         "ValueError",
         "resolve",
     )
-    use("walk on 2.5", lambda: vrw.walk(table_1, start, 2.5), "ValueError", "n_steps")
-    family("walk n_steps", lambda v: vrw.walk(table_1, start, v), whole, "n_steps")
-    family("simulate n_steps", lambda v: vrw.simulate(table_1, start, v), whole, "n_steps")
-    family(
+    add_wrong_call("walk on 2.5", lambda: vrw.walk(table_1, start, 2.5), "ValueError", "n_steps")
+    add_wrong_calls("walk n_steps", lambda v: vrw.walk(table_1, start, v), full_values, "n_steps")
+    add_wrong_calls(
+        "simulate n_steps", lambda v: vrw.simulate(table_1, start, v), full_values, "n_steps"
+    )
+    add_wrong_calls(
         "simulate n_samples",
         lambda v: vrw.simulate(table_1, n_samples=v),
-        whole | {"one": (1, "ValueError")},
+        full_values | {"one": (1, "ValueError")},
         "n_samples",
     )
-    use("simulate a batch", lambda: vrw.simulate(several), "ValueError", "one wheel")
+    add_wrong_call("simulate a batch", lambda: vrw.simulate(several), "ValueError", "one wheel")
 
     # Batches
     ones = np.asarray(start)[None]
-    family("steps n_steps", lambda v: vrw.steps(table_1, ones, v), whole, "n_steps")
-    use(
+    add_wrong_calls(
+        "steps n_steps", lambda v: vrw.step_batch(table_1, ones, v), full_values, "n_steps"
+    )
+    add_wrong_call(
         "steps engine",
-        lambda: vrw.steps(table_1, ones, engine="lane"),
+        lambda: vrw.step_batch(table_1, ones, engine="lane"),
         "ValueError",
         "did you mean 'lanes'",
     )
-    use("steps engine none", lambda: vrw.steps(table_1, ones, engine=None), "TypeError", "engine")
-    use(
+    add_wrong_call(
+        "steps engine none",
+        lambda: vrw.step_batch(table_1, ones, engine=None),
+        "TypeError",
+        "engine",
+    )
+    add_wrong_call(
         "steps of another number of wheels",
-        lambda: vrw.steps(several, ones),
+        lambda: vrw.step_batch(several, ones),
         "ValueError",
         "one for each",
     )
-    use("steps of a table", lambda: vrw.steps({}, ones), "TypeError", "WheelParams")
-    use(
+    add_wrong_call("steps of a table", lambda: vrw.step_batch({}, ones), "TypeError", "WheelParams")
+    add_wrong_call(
         "steps by options of a cycle",
-        lambda: vrw.steps(table_1, ones, options=vrw.CycleOptions()),
+        lambda: vrw.step_batch(table_1, ones, options=vrw.CycleOptions()),
         "TypeError",
         "vrw.Options",
     )
-    use(
+    add_wrong_call(
         "steps by collocation without durations",
-        lambda: vrw.steps(table_1, ones, engine="collocation"),
+        lambda: vrw.step_batch(table_1, ones, engine="collocation"),
         "ValueError",
         "durations",
     )
-    use("steps of single numbers", lambda: vrw.steps(single, ones), "ValueError", "vrw.start_jax()")
+    add_wrong_call(
+        "steps of single numbers",
+        lambda: vrw.step_batch(single, ones),
+        "ValueError",
+        "vrw.start_jax()",
+    )
 
     # Inside transformations
     for name, call in {
-        "steps": lambda p: vrw.steps(p, ones), "simulate": lambda p: vrw.simulate(p, start),
+        "steps": lambda p: vrw.step_batch(p, ones), "simulate": lambda p: vrw.simulate(p, start),
         "tune": lambda p: vrw.tune(p, "speed", ["damping"], {"damping": (100.0, 300.0)}),
         "sensitivities": lambda p: vrw.sensitivities(p),
         "continue_branch": lambda p: vrw.continue_branch(p, "damping", (100.0, 300.0)),
         "basin": lambda p: vrw.basin(p, {}),
     }.items():  # fmt: skip
-        use(f"{name} under jit", lambda c=call: jax.jit(c)(table_1), "TypeError", "outside")
-        use(f"{name} under grad", lambda c=call: jax.grad(c)(table_1), "TypeError", "outside")
-        use(
+        add_wrong_call(
+            f"{name} under jit", lambda c=call: jax.jit(c)(table_1), "TypeError", "outside"
+        )
+        add_wrong_call(
+            f"{name} under grad", lambda c=call: jax.grad(c)(table_1), "TypeError", "outside"
+        )
+        add_wrong_call(
             f"{name} under vmap",
             lambda c=call: jax.vmap(c, in_axes=(several.in_axes,))(several),
             "TypeError",
@@ -310,22 +354,35 @@ def make() -> None:
 
     # Cycles
     guesses = given | {"nan": ([0.1, float("nan"), 0.0], "ValueError")}
-    family("limit_cycle guess", lambda v: vrw.limit_cycle(table_1, guess=v), guesses, "")
-    family(
-        "limit_cycle period_n", lambda v: vrw.limit_cycle(table_1, period_n=v), whole, "period_n"
+    add_wrong_calls("limit_cycle guess", lambda v: vrw.limit_cycle(table_1, guess=v), guesses, "")
+    add_wrong_calls(
+        "limit_cycle period_n",
+        lambda v: vrw.limit_cycle(table_1, period_n=v),
+        full_values,
+        "period_n",
     )
-    use(
+    add_wrong_call(
         "two steps without a guess",
         lambda: vrw.limit_cycle(table_1, period_n=2),
         "ValueError",
         "guess",
     )
-    use("lost gaits as a number", lambda: vrw.limit_cycle(table_1, lost=0.0), "TypeError", "lost")
-    use("lost gaits misspelt", lambda: vrw.limit_cycle(table_1, lost="NaN"), "ValueError", "lost")
-    asks = lambda **given: vrw.answer(
+    add_wrong_call(
+        "lost gaits as a number",
+        lambda: vrw.limit_cycle(table_1, on_failure=0.0),
+        "TypeError",
+        "lost",
+    )
+    add_wrong_call(
+        "lost gaits misspelt",
+        lambda: vrw.limit_cycle(table_1, on_failure="NaN"),
+        "ValueError",
+        "lost",
+    )
+    asks = lambda **given: vrw.measure_to_tolerance(
         **{"measures": "speed", "params": table_1, "tol": 1e-3, "friction": 20.0} | given
     )
-    family("answer tol", lambda v: asks(tol=v), positive, "tol")
+    add_wrong_calls("answer tol", lambda v: asks(tol=v), positive, "tol")
     wrong = (
         ("measure misspelt", {"measures": "spead"}, "ValueError", "did you mean 'speed'"),
         ("measure of a step alone", {"measures": "slip"}, "ValueError", "every rung tells"),
@@ -341,121 +398,141 @@ def make() -> None:
         ("which between places", {"which": 0.5}, "ValueError", "which is 0.5"),
     )  # fmt: skip
     for label, given, kind, words in wrong:
-        use(f"answer: {label}", lambda given=given: asks(**given), kind, words)
-    mean = lambda params=several, **given: vrw.average(
+        add_wrong_call(f"answer: {label}", lambda given=given: asks(**given), kind, words)
+    mean = lambda params=several, **given: vrw.multifidelity_mean(
         given.pop("measure", "speed"), params, given.pop("tol", 1e-3), friction=20.0, **given
     )
-    use("average of one wheel", lambda: mean(table_1), "ValueError", "more wheels than its pilot")
-    use("average of few wheels", mean, "ValueError", "there are 3 wheels")
-    use("average: a small pilot", lambda: mean(pilot=2), "ValueError", "pilot")
-    use("average: tol negative", lambda: mean(tol=-1.0), "ValueError", "tol")
-    use("average: unknown measure", lambda: mean(measure="sped"), "ValueError", "every rung tells")
-    use("average: several", lambda: mean(measure=["speed"]), "TypeError", "measure")
-    use("average: a state", lambda: mean(start), "TypeError", "WheelParams")
-    use("average: stoppers", lambda: mean(stoppers="none"), "ValueError", "stoppers")
-    use("average: seed", lambda: mean(seed="one"), "TypeError", "seed")
+    add_wrong_call(
+        "average of one wheel", lambda: mean(table_1), "ValueError", "more wheels than its pilot"
+    )
+    add_wrong_call("average of few wheels", mean, "ValueError", "there are 3 wheels")
+    add_wrong_call("average: a small pilot", lambda: mean(pilot=2), "ValueError", "pilot")
+    add_wrong_call("average: tol negative", lambda: mean(tol=-1.0), "ValueError", "tol")
+    add_wrong_call(
+        "average: unknown measure", lambda: mean(measure="sped"), "ValueError", "every rung tells"
+    )
+    add_wrong_call("average: several", lambda: mean(measure=["speed"]), "TypeError", "measure")
+    add_wrong_call("average: a state", lambda: mean(start), "TypeError", "WheelParams")
+    add_wrong_call("average: stoppers", lambda: mean(stoppers="none"), "ValueError", "stoppers")
+    add_wrong_call("average: seed", lambda: mean(seed="one"), "TypeError", "seed")
 
-    use("limit_cycle of a batch", lambda: vrw.limit_cycle(several), "ValueError", "jax.vmap")
-    use("limit_cycle of a state", lambda: vrw.limit_cycle(start), "TypeError", "WheelParams")
-    use(
+    add_wrong_call(
+        "limit_cycle of a batch", lambda: vrw.limit_cycle(several), "ValueError", "jax.vmap"
+    )
+    add_wrong_call(
+        "limit_cycle of a state", lambda: vrw.limit_cycle(start), "TypeError", "WheelParams"
+    )
+    add_wrong_call(
         "limit_cycle of single numbers",
         lambda: vrw.limit_cycle(single),
         "ValueError",
         "vrw.start_jax()",
     )
-    use(
+    add_wrong_call(
         "limit_cycle by options of a step",
-        lambda: vrw.limit_cycle(table_1, options=vrw.Options()),
+        lambda: vrw.limit_cycle(table_1, options=vrw.StepOptions()),
         "TypeError",
         "CycleOptions",
     )
-    use(
+    add_wrong_call(
         "limit_cycle by a table of options",
         lambda: vrw.limit_cycle(table_1, options={}),
         "TypeError",
         "CycleOptions",
     )
-    use(
+    add_wrong_call(
         "a rigid cycle by options of a mesh",
         lambda: vrw.limit_cycle(table_1, model=vrw.RigidWheel(), options=vrw.CycleOptions()),
         "TypeError",
         "return map",
     )
-    use(
+    add_wrong_call(
         "sensitivities of nothing",
         lambda: vrw.sensitivities(table_1, measures=[]),
         "ValueError",
         "nothing",
     )
-    use(
+    add_wrong_call(
         "sensitivities misspelt",
         lambda: vrw.sensitivities(table_1, measures="spead"),
         "ValueError",
         "did you mean 'speed'",
     )
-    use(
+    add_wrong_call(
         "sensitivities of a number",
         lambda: vrw.sensitivities(table_1, measures=3),
         "TypeError",
         "measures",
     )
-    use("sensitivities of a batch", lambda: vrw.sensitivities(several), "ValueError", "one wheel")
-    use(
+    add_wrong_call(
+        "sensitivities of a batch", lambda: vrw.sensitivities(several), "ValueError", "one wheel"
+    )
+    add_wrong_call(
         "sensitivities of single numbers",
         lambda: vrw.sensitivities(single),
         "ValueError",
         "vrw.start_jax()",
     )
-    use(
+    add_wrong_call(
         "limit_cycle of a gait by another name",
         lambda: vrw.limit_cycle(table_1, which="slow"),
         "ValueError",
         "slowest",
     )
-    use(
+    add_wrong_call(
         "sensitivities of no gait",
         lambda: vrw.sensitivities(vrw.WheelParams(slope=0.02)),
         "ValueError",
         "no gait",
     )
-    use(
-        "newton_cycle of no function", lambda: vrw.newton_cycle(3.0, start), "TypeError", "function"
+    add_wrong_call(
+        "newton_cycle of no function",
+        lambda: vrw.solve_fixed_point(3.0, start),
+        "TypeError",
+        "function",
     )
-    family(
+    add_wrong_calls(
         "newton_cycle period_n",
-        lambda v: vrw.newton_cycle(lambda x: x, start, period_n=v),
-        whole,
+        lambda v: vrw.solve_fixed_point(lambda x: x, start, period_n=v),
+        full_values,
         "period_n",
     )
-    use(
-        "newton_cycle from text", lambda: vrw.newton_cycle(lambda x: x, "abc"), "TypeError", "start"
+    add_wrong_call(
+        "newton_cycle from text",
+        lambda: vrw.solve_fixed_point(lambda x: x, "abc"),
+        "TypeError",
+        "start",
     )
 
     # Any field, guards and resets
     fall = lambda y: jnp.stack([y[1], -9.81 + 0.0 * y[1]])
     floor = numerics.Guard(lambda y: y[0], lambda y: jnp.stack([0.0 * y[0], -0.8 * y[1]]))
     ball = numerics.Mode(fall, (floor,))
-    walked = lambda modes, **other: numerics.walk(modes, [1.0, 0.0], **{"events": 2} | other)
-    family("walk events", lambda v: walked([ball], events=v), whole, "events is")
+    compute_walked = lambda modes, **other: numerics.simulate_hybrid(
+        modes, [1.0, 0.0], **{"events": 2} | other
+    )
+    add_wrong_calls(
+        "walk events", lambda v: compute_walked([ball], events=v), full_values, "events is"
+    )
     for name, call, kind, words in (
-        ("more events than fit", lambda: walked([ball], events=10**12), "ValueError", "fewer"),
-        ("options of a cycle", lambda: walked([ball], options=vrw.CycleOptions()), "TypeError",
+        ("more events than fit", lambda: compute_walked([ball], events=10**12), "ValueError", "fewer"),
+        ("options of a cycle", lambda: compute_walked([ball], options=vrw.CycleOptions()), "TypeError",
          "vrw.Options()"),
-        ("a mode that there isn't", lambda: walked([ball], mode=3), "ValueError", "mode is 3"),
-        ("a mode in no list", lambda: walked(ball), "TypeError", "a mode is"),
-        ("a field as mode", lambda: walked([fall]), "TypeError", "give Mode(field, guards)"),
-        ("no field", lambda: walked([ball._replace(field=None)]), "TypeError", "a function"),
-        ("a guard in no tuple", lambda: walked([ball._replace(guards=floor)]), "TypeError",
+        ("a mode that there isn't", lambda: compute_walked([ball], mode=3), "ValueError", "mode is 3"),
+        ("a mode in no list", lambda: compute_walked(ball), "TypeError", "a mode is"),
+        ("a field as mode", lambda: compute_walked([fall]), "TypeError", "give Mode(field, guards)"),
+        ("no field", lambda: compute_walked([ball._replace(field=None)]), "TypeError", "a function"),
+        ("a guard in no tuple", lambda: compute_walked([ball._replace(guards=floor)]), "TypeError",
          "give Guard("),
-        ("a function as guard", lambda: walked([ball._replace(guards=(fall,))]), "TypeError",
+        ("a function as guard", lambda: compute_walked([ball._replace(guards=(fall,))]), "TypeError",
          "give Guard("),
-        ("a field of one row less", lambda: walked([ball._replace(field=lambda y: y[:1])]),
+        ("a field of one row less", lambda: compute_walked([ball._replace(field=lambda y: y[:1])]),
          "ValueError", "the field of mode 0"),
     ):  # fmt: skip
-        use(f"walk with {name}", call, kind, words)
-    use("newton_cycle of a map elsewhere", lambda: vrw.newton_cycle(lambda x: x[:1], start),
+        add_wrong_call(f"walk with {name}", call, kind, words)
+    add_wrong_call("newton_cycle of a map elsewhere", lambda: vrw.solve_fixed_point(lambda x: x[:1], start),
         "ValueError", "its like")  # fmt: skip
-    use("contacts that are no number", lambda: numerics.complementary([[np.nan]], [1.0]),
+    add_wrong_call("contacts that are no number", lambda: numerics.enumerate_lcp_solutions([[np.nan]], [1.0]),
         "ValueError", "not finite")  # fmt: skip
 
     # Branches
@@ -465,79 +542,90 @@ def make() -> None:
         "text": (("a", "b"), "TypeError"), "nan": ((100.0, float("nan")), "ValueError"),
         "infinite": ((100.0, float("inf")), "ValueError"), "nothing": (None, "TypeError"),
     }  # fmt: skip
-    along = lambda **changes: vrw.continue_branch(
+    evaluate_along = lambda **changes: vrw.continue_branch(
         **({"params": table_1, "name": "damping", "bounds": (100.0, 300.0)} | changes)
     )
-    family("continue_branch bounds", lambda v: along(bounds=v), bounds, "bounds")
-    family("continue_branch period_n", lambda v: along(period_n=v), whole, "period_n")
-    use(
+    add_wrong_calls("continue_branch bounds", lambda v: evaluate_along(bounds=v), bounds, "bounds")
+    add_wrong_calls(
+        "continue_branch period_n", lambda v: evaluate_along(period_n=v), full_values, "period_n"
+    )
+    add_wrong_call(
         "continue_branch misspelt",
-        lambda: along(name="dampin"),
+        lambda: evaluate_along(name="dampin"),
         "ValueError",
         "did you mean 'damping'",
     )
-    use("continue_branch along a number", lambda: along(name=3), "ValueError", "no parameter")
-    use(
-        "continue_branch along friction nobody feels",
-        lambda: along(name="friction"),
+    add_wrong_call(
+        "continue_branch along a number",
+        lambda: evaluate_along(name=3),
         "ValueError",
         "no parameter",
     )
-    use(
+    add_wrong_call(
+        "continue_branch along friction nobody feels",
+        lambda: evaluate_along(name="friction"),
+        "ValueError",
+        "no parameter",
+    )
+    add_wrong_call(
         "continue_branch of a batch",
-        lambda: along(params=several),
+        lambda: evaluate_along(params=several),
         "ValueError",
         "continue_branches",
     )
-    use("continue_branch of a table", lambda: along(params={}), "TypeError", "WheelParams")
-    use(
+    add_wrong_call(
+        "continue_branch of a table", lambda: evaluate_along(params={}), "TypeError", "WheelParams"
+    )
+    add_wrong_call(
         "continue_branch of single numbers",
-        lambda: along(params=single),
+        lambda: evaluate_along(params=single),
         "ValueError",
         "vrw.start_jax()",
     )
-    use(
+    add_wrong_call(
         "continue_branch of two steps from nothing",
-        lambda: along(period_n=2),
+        lambda: evaluate_along(period_n=2),
         "ValueError",
         "cycle=",
     )
-    use("continue_branch from a state", lambda: along(cycle=start), "TypeError", "cycle")
-    use(
+    add_wrong_call(
+        "continue_branch from a state", lambda: evaluate_along(cycle=start), "TypeError", "cycle"
+    )
+    add_wrong_call(
         "continue_branch by options of a step",
-        lambda: along(options=vrw.Options()),
+        lambda: evaluate_along(options=vrw.StepOptions()),
         "TypeError",
         "ArclengthOptions",
     )
-    use(
+    add_wrong_call(
         "continue_branch by options of a mesh in the step's place",
-        lambda: along(step_options=vrw.CycleOptions()),
+        lambda: evaluate_along(step_options=vrw.CycleOptions()),
         "TypeError",
         "vrw.Options",
     )
-    use(
+    add_wrong_call(
         "continue_branch by options of a step in the mesh's place",
-        lambda: along(cycle_options=vrw.Options()),
+        lambda: evaluate_along(cycle_options=vrw.StepOptions()),
         "TypeError",
         "CycleOptions",
     )
     a_map = lambda constants, x, p: p * x
-    family(
+    add_wrong_calls(
         "continue_map bounds", lambda v: vrw.continue_map(a_map, [0.1], 150.0, v), bounds, "bounds"
     )
-    use(
+    add_wrong_call(
         "continue_map from outside",
         lambda: vrw.continue_map(a_map, [0.1], 5.0, (0.0, 1.0)),
         "ValueError",
         "within",
     )
-    use(
+    add_wrong_call(
         "continue_map from text",
         lambda: vrw.continue_map(a_map, "a", 0.5, (0.0, 1.0)),
         "TypeError",
         "x is",
     )
-    use(
+    add_wrong_call(
         "continue_map of no map",
         lambda: vrw.continue_map(2.0, [0.1], 0.5, (0.0, 1.0)),
         "TypeError",
@@ -546,13 +634,13 @@ def make() -> None:
 
     # Basins
     grid = {"theta_touchdown": 0.09, "dtheta_touchdown": [1.0, 2.0], "dL1_touchdown": 0.0}
-    use(
+    add_wrong_call(
         "basin over a scan's grid",
         lambda: vrw.basin(table_1, vrw.grid(damping=[1.0, 2.0])),
         "TypeError",
         "theta_touchdown",
     )
-    use(
+    add_wrong_call(
         "basin over half a grid",
         lambda: vrw.basin(table_1, {"theta_touchdown": 0.1}),
         "ValueError",
@@ -562,23 +650,28 @@ def make() -> None:
         "text": ("a", "TypeError"), "nothing": (None, "TypeError"),
         "a table": (np.ones((2, 2)), "ValueError"), "no values": ([], "ValueError"),
     }.items():  # fmt: skip
-        use(
+        add_wrong_call(
             f"basin: {label}",
             lambda v=value: vrw.basin(table_1, grid | {"dtheta_touchdown": v}),
             kind,
             "dtheta_touchdown",
         )
-    family(
-        "basin most_steps", lambda v: vrw.basin(table_1, grid, most_steps=v), whole, "most_steps"
+    add_wrong_calls(
+        "basin most_steps",
+        lambda v: vrw.basin(table_1, grid, max_steps=v),
+        full_values,
+        "most_steps",
     )
-    use("basin of a batch", lambda: vrw.basin(several, grid), "ValueError", "one wheel")
-    use(
+    add_wrong_call("basin of a batch", lambda: vrw.basin(several, grid), "ValueError", "one wheel")
+    add_wrong_call(
         "basin by options of a cycle",
         lambda: vrw.basin(table_1, grid, options=vrw.CycleOptions()),
         "TypeError",
         "vrw.Options",
     )
-    use("basin of single numbers", lambda: vrw.basin(single, grid), "ValueError", "start_jax")
+    add_wrong_call(
+        "basin of single numbers", lambda: vrw.basin(single, grid), "ValueError", "start_jax"
+    )
 
     # Tuning
     tune = lambda **changes: vrw.tune(
@@ -586,50 +679,72 @@ def make() -> None:
             "bounds": {"damping": (100.0, 300.0)}} | changes)
     )  # fmt: skip
     for name in ("max_evaluations", "n_starts"):
-        family(f"tune {name}", lambda v, n=name: tune(**{n: v}), whole, name)
-    family("tune tolerance", lambda v: tune(tolerance=v), positive, "tolerance")
-    family("tune bounds of damping", lambda v: tune(bounds={"damping": v}), bounds, "damping")
-    use("tune bounds of no table", lambda: tune(bounds=(100.0, 300.0)), "TypeError", "bounds")
-    use(
+        add_wrong_calls(f"tune {name}", lambda v, n=name: tune(**{n: v}), full_values, name)
+    add_wrong_calls("tune tolerance", lambda v: tune(tolerance=v), positive, "tolerance")
+    add_wrong_calls(
+        "tune bounds of damping", lambda v: tune(bounds={"damping": v}), bounds, "damping"
+    )
+    add_wrong_call(
+        "tune bounds of no table", lambda: tune(bounds=(100.0, 300.0)), "TypeError", "bounds"
+    )
+    add_wrong_call(
         "tune bounds out of the domain",
         lambda: tune(bounds={"damping": (-5.0, 300.0)}),
         "ValueError",
         "inside",
     )
-    use("tune free misspelt", lambda: tune(free=["dampin"]), "ValueError", "did you mean")
-    use("tune free twice", lambda: tune(free=["damping", "damping"]), "ValueError", "twice")
-    use("tune nothing", lambda: tune(free=[]), "ValueError", "no parameter")
-    use("tune a number", lambda: tune(free=3), "TypeError", "free")
-    use("tune for a typo", lambda: tune(objective="spead"), "ValueError", "did you mean 'speed'")
-    use("tune for a number", lambda: tune(objective=3.0), "TypeError", "objective")
-    use("tune for nothing", lambda: tune(objective={}), "ValueError", "empty")
-    use("tune for a weight of text", lambda: tune(objective={"speed": "1"}), "TypeError", "weight")
-    use(
+    add_wrong_call(
+        "tune free misspelt", lambda: tune(free=["dampin"]), "ValueError", "did you mean"
+    )
+    add_wrong_call(
+        "tune free twice", lambda: tune(free=["damping", "damping"]), "ValueError", "twice"
+    )
+    add_wrong_call("tune nothing", lambda: tune(free=[]), "ValueError", "no parameter")
+    add_wrong_call("tune a number", lambda: tune(free=3), "TypeError", "free")
+    add_wrong_call(
+        "tune for a typo", lambda: tune(objective="spead"), "ValueError", "did you mean 'speed'"
+    )
+    add_wrong_call("tune for a number", lambda: tune(objective=3.0), "TypeError", "objective")
+    add_wrong_call("tune for nothing", lambda: tune(objective={}), "ValueError", "empty")
+    add_wrong_call(
+        "tune for a weight of text", lambda: tune(objective={"speed": "1"}), "TypeError", "weight"
+    )
+    add_wrong_call(
         "tune for several numbers",
         lambda: tune(objective=lambda cycle: cycle.durations),
         "ValueError",
         "one number",
     )
-    use("tune for a word", lambda: tune(objective=lambda cycle: "fast"), "TypeError", "objective")
-    use(
+    add_wrong_call(
+        "tune for a word", lambda: tune(objective=lambda cycle: "fast"), "TypeError", "objective"
+    )
+    add_wrong_call(
         "tune under nan",
         lambda: tune(constraints={"contraction": float("nan")}),
         "ValueError",
         "finite",
     )
-    use("tune under a typo", lambda: tune(constraints=["contractio"]), "ValueError", "did you mean")
-    use("tune under a number", lambda: tune(constraints=3), "TypeError", "constraints")
-    use("tune a batch", lambda: tune(params=several), "ValueError", "one wheel")
-    use("tune a table", lambda: tune(params={"damping": 200.0}), "TypeError", "WheelParams")
-    use("tune single numbers", lambda: tune(params=single), "ValueError", "vrw.start_jax()")
-    use("tune a rigid wheel", lambda: tune(model=vrw.RigidWheel()), "TypeError", "compliant")
-    use(
+    add_wrong_call(
+        "tune under a typo", lambda: tune(constraints=["contractio"]), "ValueError", "did you mean"
+    )
+    add_wrong_call("tune under a number", lambda: tune(constraints=3), "TypeError", "constraints")
+    add_wrong_call("tune a batch", lambda: tune(params=several), "ValueError", "one wheel")
+    add_wrong_call(
+        "tune a table", lambda: tune(params={"damping": 200.0}), "TypeError", "WheelParams"
+    )
+    add_wrong_call(
+        "tune single numbers", lambda: tune(params=single), "ValueError", "vrw.start_jax()"
+    )
+    add_wrong_call(
+        "tune a rigid wheel", lambda: tune(model=vrw.RigidWheel()), "TypeError", "compliant"
+    )
+    add_wrong_call(
         "tune from where nothing walks",
         lambda: tune(params=vrw.WheelParams(slope=0.02)),
         "ValueError",
         "no gait",
     )
-    use(
+    add_wrong_call(
         "tune by options of a mesh",
         lambda: tune(options=vrw.CycleOptions()),
         "TypeError",
@@ -643,29 +758,37 @@ def make() -> None:
         "nothing": (None, "TypeError"), "no values": ([], "ValueError"),
         "a table": (np.ones((2, 2)), "ValueError"),
     }  # fmt: skip
-    family("grid", lambda v: vrw.grid(damping=v), columns, "damping")
-    family("samples", lambda v: vrw.samples({"damping": v}), columns, "damping")
+    add_wrong_calls("grid", lambda v: vrw.grid(damping=v), columns, "damping")
+    add_wrong_calls("samples", lambda v: vrw.samples({"damping": v}), columns, "damping")
     for name in ("sobol", "uniform", "saltelli"):
         draw = getattr(vrw, name)
-        family(f"{name} n", lambda v, d=draw: d({"damping": (100.0, 200.0)}, v), whole, "n is")
-        use(
+        add_wrong_calls(
+            f"{name} n", lambda v, d=draw: d({"damping": (100.0, 200.0)}, v), full_values, "n is"
+        )
+        add_wrong_call(
             f"{name} seed",
             lambda d=draw: d({"damping": (1.0, 2.0)}, 4, seed=0.5),
             "ValueError",
             "seed",
         )
-        use(
+        add_wrong_call(
             f"{name} of too many",
             lambda d=draw: d({"damping": (1.0, 2.0)}, 2 * 10**10),
             "ValueError",
             "fewer",
         )
-    family("sobol range", lambda v: vrw.sobol({"damping": v}, 4), bounds, "damping")
-    use("a design of no table", lambda: vrw.sobol(["damping"], 4), "TypeError", "the design")
-    use("a design of nothing", lambda: vrw.grid(), "ValueError", "at least one")
-    use("a design misspelt", lambda: vrw.grid(dampin=[1.0]), "ValueError", "did you mean")
-    use("a grid with a value twice", lambda: vrw.grid(damping=[1.0, 1.0]), "ValueError", "twice")
-    use(
+    add_wrong_calls("sobol range", lambda v: vrw.sobol({"damping": v}, 4), bounds, "damping")
+    add_wrong_call(
+        "a design of no table", lambda: vrw.sobol(["damping"], 4), "TypeError", "the design"
+    )
+    add_wrong_call("a design of nothing", lambda: vrw.grid(), "ValueError", "at least one")
+    add_wrong_call(
+        "a design misspelt", lambda: vrw.grid(dampin=[1.0]), "ValueError", "did you mean"
+    )
+    add_wrong_call(
+        "a grid with a value twice", lambda: vrw.grid(damping=[1.0, 1.0]), "ValueError", "twice"
+    )
+    add_wrong_call(
         "columns of two lengths",
         lambda: vrw.samples({"damping": [1.0], "slope": [0.1, 0.2]}),
         "ValueError",
@@ -673,64 +796,74 @@ def make() -> None:
     )
     small = vrw.grid(damping=[150.0, 200.0])
     scan = lambda **changes: vrw.scan(**({"design": small} | changes))
-    family(
+    add_wrong_calls(
         "scan chunk",
         lambda v: scan(chunk=v),
-        {k: v for k, v in whole.items() if k != "nothing"},
+        {k: v for k, v in full_values.items() if k != "nothing"},
         "chunk",
     )
-    use("scan over a table", lambda: scan(design={"damping": [1.0]}), "TypeError", "vrw.grid")
-    use("scan for a typo", lambda: scan(measures="spead"), "ValueError", "did you mean 'speed'")
-    use("scan for a number", lambda: scan(measures=3), "TypeError", "measures")
-    use("scan for numbers", lambda: scan(measures=[3]), "TypeError", "measures")
-    use("scan of a batch", lambda: scan(base=several), "ValueError", "one wheel")
-    use("scan of a table", lambda: scan(base={"slope": 0.3}), "TypeError", "WheelParams")
-    use("scan of single numbers", lambda: scan(base=single), "ValueError", "vrw.start_jax()")
-    use("scan of rigid wheels", lambda: scan(model=vrw.RigidWheel()), "TypeError", "compliant")
-    use(
+    add_wrong_call(
+        "scan over a table", lambda: scan(design={"damping": [1.0]}), "TypeError", "vrw.grid"
+    )
+    add_wrong_call(
+        "scan for a typo", lambda: scan(measures="spead"), "ValueError", "did you mean 'speed'"
+    )
+    add_wrong_call("scan for a number", lambda: scan(measures=3), "TypeError", "measures")
+    add_wrong_call("scan for numbers", lambda: scan(measures=[3]), "TypeError", "measures")
+    add_wrong_call("scan of a batch", lambda: scan(base=several), "ValueError", "one wheel")
+    add_wrong_call("scan of a table", lambda: scan(base={"slope": 0.3}), "TypeError", "WheelParams")
+    add_wrong_call(
+        "scan of single numbers", lambda: scan(base=single), "ValueError", "vrw.start_jax()"
+    )
+    add_wrong_call(
+        "scan of rigid wheels", lambda: scan(model=vrw.RigidWheel()), "TypeError", "compliant"
+    )
+    add_wrong_call(
         "scan by options of a mesh",
         lambda: scan(options=vrw.CycleOptions()),
         "TypeError",
         "vrw.Options",
     )
-    use(
+    add_wrong_call(
         "scan by options of a step in the mesh's place",
-        lambda: scan(cycle_options=vrw.Options()),
+        lambda: scan(cycle_options=vrw.StepOptions()),
         "TypeError",
         "CycleOptions",
     )
-    use(
+    add_wrong_call(
         "scan over friction nobody feels",
         lambda: scan(design=vrw.grid(friction=[0.5, 0.7])),
         "ValueError",
         "friction",
     )
-    use(
+    add_wrong_call(
         "indices of what is no saltelli scan",
         lambda: vrw.sobol_indices(vrw.simulate(table_1, n_steps=1)),
         "ValueError",
         "saltelli",
     )
     many = {"table": ({}, "TypeError"), "nothing": (None, "TypeError")}
-    family("default_margins", lambda v: vrw.default_margins(v), many, "params")
-    use(
+    add_wrong_calls("default_margins", lambda v: vrw.default_margins(v), many, "params")
+    add_wrong_call(
         "default_margins of a batch",
         lambda: vrw.default_margins(several),
         "ValueError",
         "one wheel",
     )
-    family("open_scan", lambda v: vrw.open_scan(v), many | {"number": (3, "TypeError")}, "path")
-    use("explore a table", lambda: vrw.explore(dataset={}), "TypeError", "dataset is {}")
-    family(
+    add_wrong_calls(
+        "open_scan", lambda v: vrw.open_scan(v), many | {"number": (3, "TypeError")}, "path"
+    )
+    add_wrong_call("explore a table", lambda: vrw.explore(dataset={}), "TypeError", "dataset is {}")
+    add_wrong_calls(
         "newton_cycle tolerance",
-        lambda v: vrw.newton_cycle(lambda x: x, start, tolerance=v),
+        lambda v: vrw.solve_fixed_point(lambda x: x, start, tolerance=v),
         positive,
         "tolerance",
     )
 
     # Borders in two parameters: all but the gait itself is looked at first
     def curve(name="lambda_4_plus", parameters=("damping", "slope"), cycle=table_1, **given):
-        return vrw.border_curve(name, parameters, cycle, **given)
+        return vrw.continue_special_point(name, parameters, cycle, **given)
 
     pairs = {
         "one": ("damping", "ValueError"),
@@ -739,14 +872,14 @@ def make() -> None:
         "misspelt": (("dampin", "slope"), "ValueError"),
         "friction": (("slope", "friction"), "ValueError"),
     }  # fmt: skip
-    family("border_curve of", lambda v: curve(parameters=v), pairs, "parameter")
+    add_wrong_calls("border_curve of", lambda v: curve(parameters=v), pairs, "parameter")
     boxes = {
         "list": ([1.0, 2.0], "TypeError"), "one number": ({"slope": 0.3}, "TypeError"),
         "misspelt": ({"slop": (0.1, 0.2)}, "ValueError"),
         "empty": ({"slope": (0.3, 0.3)}, "ValueError"),
     }  # fmt: skip
-    family("border_curve bounds", lambda v: curve(bounds=v), boxes, "")
-    use("border_curve of a wheel", curve, "TypeError", "cycle is")
+    add_wrong_calls("border_curve bounds", lambda v: curve(bounds=v), boxes, "")
+    add_wrong_call("border_curve of a wheel", curve, "TypeError", "cycle is")
 
     # Pictures
     plot = vrw.plot
@@ -757,7 +890,7 @@ def make() -> None:
         "map_figure": lambda v: plot.map_figure(v, "speed", []),
     }  # fmt: skip
     for name, draw in pictures.items():
-        family(f"plot {name}", draw, nothing, "")
+        add_wrong_calls(f"plot {name}", draw, nothing, "")
     lists = many | {
         "one alone": (xr.Dataset(), "TypeError"),
         "none": ([], "ValueError"),
@@ -766,29 +899,31 @@ def make() -> None:
         "foot_height": plot.foot_height, "rear_force": plot.rear_force,
         "basin_figure": lambda v: plot.basin_figure(v, ["any"]),
     }.items():  # fmt: skip
-        family(f"plot {name}", draw, lists, "")
+        add_wrong_calls(f"plot {name}", draw, lists, "")
     for name, draw in {
         "branch_figure": plot.branch_figure,
         "tuning_figure": plot.tuning_figure,
     }.items():
-        family(f"plot {name}", draw, many, "")
+        add_wrong_calls(f"plot {name}", draw, many, "")
 
-    use("a name that is not there", lambda: vrw.limit_cycel, "AttributeError", "limit_cycle")
-    use("indices of a table", lambda: vrw.sobol_indices({}), "TypeError", "scan")
+    add_wrong_call(
+        "a name that is not there", lambda: vrw.limit_cycel, "AttributeError", "limit_cycle"
+    )
+    add_wrong_call("indices of a table", lambda: vrw.sobol_indices({}), "TypeError", "scan")
 
 
-def tried() -> dict[str, tuple[str, str, str]]:
-    make()
-    told = {}
-    for name, wrong in USES.items():
+def run_wrong_calls() -> dict[str, tuple[str, str, str]]:
+    register_wrong_calls()
+    messages = {}
+    for name, wrong_call in WRONG_CALLS.items():
         try:
-            wrong.call()
+            wrong_call.call()
         except Exception as error:
             last = traceback.extract_tb(error.__traceback__)[-1].filename
-            told[name] = (type(error).__name__, str(error), last)
+            messages[name] = (type(error).__name__, str(error), last)
         else:
-            told[name] = ("nothing", "", "")
-    return told
+            messages[name] = ("nothing", "", "")
+    return messages
 
 
 if __name__ == "__main__":
@@ -796,4 +931,4 @@ if __name__ == "__main__":
     import vrw_jax
 
     vrw_jax.start_jax(sys.argv[1])
-    print(json.dumps(tried()))
+    print(json.dumps(run_wrong_calls()))

@@ -2,23 +2,23 @@
 
 import numpy as np
 import pytest
-from support.files import kept_by_netcdf
+from support.files import assert_netcdf_round_trip
 
 import vrw_jax as vrw
 from vrw_jax.figures.branch import basin_figure
-from vrw_jax.walks.attractors import Settled, distinct
-from vrw_jax.walks.basins import AFTER, BEFORE, share
+from vrw_jax.walks.attractors import WalkEnds, find_distinct_orbits
+from vrw_jax.walks.basins import POST_LANDING_NAMES, PRE_TOUCHDOWN_NAMES, compute_end_shares
 
-OPTIONS = vrw.Options(rtol=1e-9, atol=1e-9)
+OPTIONS = vrw.StepOptions(rtol=1e-9, atol=1e-9)
 
 
-def basin_at(damping, **more):
+def basin_at(damping, **extra_values):
     grid = {
         "theta_touchdown": 0.1,
         "dtheta_touchdown": np.linspace(0.8, 2.8, 6),
         "dL1_touchdown": np.linspace(-0.6, 0.2, 4),
     }
-    return vrw.basin(vrw.WheelParams(damping=damping), grid, options=OPTIONS, **more)
+    return vrw.basin(vrw.WheelParams(damping=damping), grid, options=OPTIONS, **extra_values)
 
 
 @pytest.fixture(scope="module")
@@ -35,18 +35,20 @@ def test_the_attractor_is_the_limit_cycle(basins):
 
 
 def test_the_basin_at_200_is_far_smaller_than_at_100(basins):
-    assert share(basins[100.0])["attractor 0"] > 0.9
-    assert share(basins[200.0])["attractor 0"] < 0.6  # half of the 24 starts, one at its edge
+    assert compute_end_shares(basins[100.0])["attractor 0"] > 0.9
+    assert (
+        compute_end_shares(basins[200.0])["attractor 0"] < 0.6
+    )  # half of the 24 starts, one at its edge
 
 
-def test_a_fast_start_at_200_meets_touchdown_before_the_stopper(basins):
+def test_a_fast_start_at_200_touches_down_before_the_stopper(basins):
     fast = basins[200.0].sel(dtheta_touchdown=2.0, method="nearest").isel(dL1_touchdown=-1)
     assert int(fast.outcome) == vrw.Outcome.TOUCHDOWN_BEFORE_STOPPER
     assert int(fast.attractor) == -1
 
 
 def test_each_start_has_one_ending(basins, tmp_path):
-    kept_by_netcdf(basins[100.0], tmp_path)
+    assert_netcdf_round_trip(basins[100.0], tmp_path)
     for result in basins.values():
         walks = result.outcome.values == vrw.Outcome.STEPPED
         assert np.array_equal(walks, result.attractor.values >= 0)
@@ -63,7 +65,7 @@ def test_beyond_the_discontinuity_five_steps_attract_one_of_them_without_dls(bas
     assert sum(lifts) == 1
 
 
-def test_starts_after_the_landing_reach_what_starts_before_it_reach():
+def test_starts_after_a_landing_reach_the_attractors_of_the_starts_before_it():
     params = vrw.WheelParams(damping=200.0)
     gait = vrw.limit_cycle(params)
     theta, dtheta = (float(v) for v in gait.post_impact)
@@ -71,42 +73,42 @@ def test_starts_after_the_landing_reach_what_starts_before_it_reach():
     result = vrw.basin(params, grid, options=OPTIONS)
     assert result.attractor.values[0, 0] == 0
     assert result.steps.values[0, 0] <= 1
-    assert set(result.coords) >= set(AFTER)
-    assert not set(result.coords) & set(BEFORE)
+    assert set(result.coords) >= set(POST_LANDING_NAMES)
+    assert not set(result.coords) & set(PRE_TOUCHDOWN_NAMES)
 
 
-def test_orbits_are_the_same_whatever_step_they_were_entered_at():
+def test_orbits_do_not_depend_on_their_first_step():
     orbit = np.full((3, 4, 3), np.nan)
     orbit[0, :2] = [[0.1, 1.0, 0.0], [0.1, 1.5, 0.0]]
     orbit[1, :2] = orbit[0, :2] + 1e-6
     orbit[2, :1] = [[0.1, 1.2, 0.0]]
-    settled = Settled(np.zeros(3, int), np.array([2, 2, 1]), np.zeros(3, int), orbit)
-    found = distinct(settled)
-    assert found.of_start.tolist() == [0, 0, 1]
-    assert [len(o) for o in found.orbits] == [2, 1]
+    settled = WalkEnds(np.zeros(3, int), np.array([2, 2, 1]), np.zeros(3, int), orbit)
+    solution = find_distinct_orbits(settled)
+    assert solution.orbit_index.tolist() == [0, 0, 1]
+    assert [len(o) for o in solution.orbits] == [2, 1]
 
 
-def test_a_grid_that_names_no_plane_is_told_what_to_name():
+def test_an_incomplete_grid_is_refused_with_the_missing_names():
     with pytest.raises(ValueError, match="must name all of"):
         vrw.basin(vrw.WheelParams(), {"theta_touchdown": 0.1})
 
 
-def test_a_basin_draws_itself(basins):
+def test_a_basin_can_be_drawn(basins):
     figure = basin_figure([basins[100.0], basins[200.0]], ["a", "b"])
     assert len(figure.axes) == 3
 
 
 @pytest.mark.slow
-def test_starts_on_real_ground_are_sorted_onto_its_slow_and_its_fast_gait():
+def test_unilateral_starts_reach_the_slow_or_the_fast_gait():
     params, ground = vrw.WheelParams(damping=300.0), vrw.UnilateralWheel(friction=0.7)
     grid = {"theta_touchdown": 0.1, "dtheta_touchdown": [0.3, 1.6, 2.6], "dL1_touchdown": -0.1}
-    found = vrw.basin(params, grid, model=ground, options=OPTIONS)
+    solution = vrw.basin(params, grid, model=ground, options=OPTIONS)
     gaits = vrw.limit_cycles(params, model=ground)
     for start, gait in ((1, 0), (2, 1)):
-        orbit = found.orbit_state[int(found.attractor[start]), 0]
+        orbit = solution.orbit_state[int(solution.attractor[start]), 0]
         np.testing.assert_allclose(orbit, gaits.section_state[gait], atol=1e-5)
-    shares = found.orbit_dls_fraction.values[found.attractor.values[1:]]
+    shares = solution.orbit_dls_fraction.values[solution.attractor.values[1:]]
     np.testing.assert_allclose(shares, gaits.dls_fraction, atol=1e-6)
     # "auto" is real ground: its starts may lie anywhere.
-    again = vrw.basin(params, grid, model=vrw.LadderWheel(friction=0.7), options=OPTIONS)
-    np.testing.assert_array_equal(again.attractor, found.attractor)
+    second_result = vrw.basin(params, grid, model=vrw.LadderWheel(friction=0.7), options=OPTIONS)
+    np.testing.assert_array_equal(second_result.attractor, solution.attractor)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.batched import full_steps, wheels_like
+from support.batched import compute_full_steps, make_parameter_rows
 
 import vrw_jax as vrw
 
@@ -18,8 +18,8 @@ import vrw_jax as vrw
         (lambda: vrw.WheelParams(stiffness=float("nan")), ("stiffness is nan",)),
         (lambda: vrw.WheelParams(leg_com=1.5), ("leg_com is 1.5", "leg_com < locked_length")),
         (lambda: vrw.WheelParams(n_legs=3), ("n_legs is 3", "at least 5")),
-        (lambda: vrw.Options(rtol=0.0), ("rtol is 0", "positive")),
-        (lambda: vrw.Options(max_solver_steps=0), ("max_solver_steps is 0", "at least 1")),
+        (lambda: vrw.StepOptions(rtol=0.0), ("rtol is 0", "positive")),
+        (lambda: vrw.StepOptions(max_solver_steps=0), ("max_solver_steps is 0", "at least 1")),
         (lambda: vrw.step(vrw.WheelParams(), [0.1, 1.6]), ("shape (2,)", "jax.vmap")),
         (
             lambda: vrw.step(vrw.WheelParams(damping=jnp.ones(3)), vrw.paper_start()),
@@ -27,12 +27,14 @@ import vrw_jax as vrw
         ),
         (
             lambda: vrw.step(
-                vrw.WheelParams(), vrw.paper_start(), options=vrw.Options(solver="RK9")
+                vrw.WheelParams(), vrw.paper_start(), options=vrw.StepOptions(solver="RK9")
             ),
             ("solver is 'RK9'", "'Dopri8'"),
         ),
         (
-            lambda: vrw.step(vrw.WheelParams(), vrw.paper_start(), options=vrw.Options(rtol=1e-17)),
+            lambda: vrw.step(
+                vrw.WheelParams(), vrw.paper_start(), options=vrw.StepOptions(rtol=1e-17)
+            ),
             ("rtol is 1e-17", "float64", "Options("),
         ),
         (lambda: vrw.walk(vrw.WheelParams(), vrw.paper_start(), 0), ("n_steps is 0",)),
@@ -62,24 +64,24 @@ def test_float32_is_refused_at_tolerances_it_cannot_resolve():
     assert "vrw.start_jax()" in str(caught.value)
 
 
-def test_float32_works_where_it_is_asked_for():
+def test_float32_works_if_requested():
     params = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), vrw.WheelParams())
     start = vrw.paper_start().astype(jnp.float32)
-    options = vrw.Options(solver="Bosh3", rtol=2e-5, atol=2e-5)
+    options = vrw.StepOptions(solver="Bosh3", rtol=2e-5, atol=2e-5)
     single = vrw.return_map(params, start, options=options)
     assert single.dtype == jnp.float32
     double = vrw.return_map(vrw.WheelParams(), vrw.paper_start())
     # Tolerance times a dozen steps, and round-off of 1e-7 through event times.
     np.testing.assert_allclose(single, double, atol=1e-3)
     for engine in ("lanes", "diffrax"):
-        found = vrw.steps(params, start[None], options=options, engine=engine)
-        assert found.section_state.dtype == found.durations.dtype == jnp.float32
-        np.testing.assert_allclose(found.section_state[0], double, atol=1e-3)
+        batch_result = vrw.step_batch(params, start[None], options=options, engine=engine)
+        assert batch_result.section_state.dtype == batch_result.durations.dtype == jnp.float32
+        np.testing.assert_allclose(batch_result.section_state[0], double, atol=1e-3)
 
 
-def test_bad_numbers_inside_a_batch_become_codes():
-    vectors = wheels_like(damping=[200.0, -1.0, np.nan])
-    outcomes = full_steps(vectors, vrw.paper_start()).outcome
+def test_invalid_numbers_in_a_batch_have_outcomes():
+    vectors = make_parameter_rows(damping=[200.0, -1.0, np.nan])
+    outcomes = compute_full_steps(vectors, vrw.paper_start()).outcome
     assert outcomes.tolist() == [
         vrw.Outcome.STEPPED,
         vrw.Outcome.BAD_INPUT,

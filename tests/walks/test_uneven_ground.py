@@ -6,43 +6,46 @@ import pytest
 from oracle import complementarity
 
 import vrw_jax as vrw
-from vrw_jax.models.unilateral.mechanics import of_slots, slots_of
-from vrw_jax.models.unilateral.section import closed, opened
+from vrw_jax.models.unilateral.mechanics import find_slots, slot_friction
+from vrw_jax.models.unilateral.section import pack_section_state, unpack_section_state
 
 START = (0.1, 1.6, -0.1)
 SLOPES, FRICTIONS = (0.3, 0.33, 0.27, 0.31), (0.7, 0.5, 0.9, 0.6)
 
 
-def rough_floor(slopes=SLOPES, frictions=FRICTIONS):
+def make_uneven_ground(slopes=SLOPES, frictions=FRICTIONS):
     model = vrw.UnilateralWheel(friction=jnp.asarray(frictions))
     return vrw.WheelParams(slope=jnp.asarray(slopes)), model
 
 
-def test_each_foot_keeps_the_friction_of_its_own_landing():
-    params, model = rough_floor()
-    slope, friction, others, tilt = model.over_steps(params, 4)
+def test_each_foot_keeps_the_friction_of_its_landing():
+    params, model = make_uneven_ground()
+    slope, friction, others, tilt = model.split_ground(params, 4)
     np.testing.assert_allclose(slope, SLOPES)
     np.testing.assert_allclose(friction, FRICTIONS)
     np.testing.assert_allclose(others, (0.7, 0.7, 0.5, 0.9))
     np.testing.assert_allclose(tilt, (0.03, -0.06, 0.04, 0.0), atol=1e-15)
-    both, rear = slots_of(jnp.arange(8) < 2), slots_of(jnp.arange(8) == 1)
-    assert [float(x) for x in of_slots((0.7, 0.5), both)] == [0.7, 0.5]
-    assert [float(x) for x in of_slots((0.7, 0.5), rear)] == [0.5, 0.5]
+    both_values, rear = find_slots(jnp.arange(8) < 2), find_slots(jnp.arange(8) == 1)
+    assert [float(x) for x in slot_friction((0.7, 0.5), both_values)] == [0.7, 0.5]
+    assert [float(x) for x in slot_friction((0.7, 0.5), rear)] == [0.5, 0.5]
 
 
 def test_a_landing_on_a_steeper_line_is_the_same_motion_in_another_frame():
     s, model = vrw.WheelParams().symbols(), vrw.UnilateralWheel()
-    x = model.full_section(vrw.WheelParams(), jnp.asarray(START))
-    motion, stance = opened(s, x)
-    told, turned = closed(motion, stance), closed(motion, stance, jnp.asarray(0.05))
-    assert abs(float(told[0] - turned[0]) - 0.05) < 1e-15
-    np.testing.assert_allclose(turned[4:], told[4:])
+    x = model.embed_section(vrw.WheelParams(), jnp.asarray(START))
+    motion, stance = unpack_section_state(s, x)
+    result, turned = (
+        pack_section_state(motion, stance),
+        pack_section_state(motion, stance, jnp.asarray(0.05)),
+    )
+    assert abs(float(result[0] - turned[0]) - 0.05) < 1e-15
+    np.testing.assert_allclose(turned[4:], result[4:])
     frame = np.array([[np.cos(0.05), -np.sin(0.05)], [np.sin(0.05), np.cos(0.05)]])
-    np.testing.assert_allclose(turned[2:4], frame @ np.asarray(told[2:4]), atol=1e-15)
+    np.testing.assert_allclose(turned[2:4], frame @ np.asarray(result[2:4]), atol=1e-15)
 
 
-def test_arrays_that_are_not_over_the_steps_are_refused_as_batches_are():
-    params, model = rough_floor()
+def test_arrays_not_over_steps_are_refused_like_batches():
+    params, model = make_uneven_ground()
     with pytest.raises(ValueError, match="one wheel"):
         vrw.walk(params, START, 3, model=model)
     with pytest.raises(ValueError, match="one wheel"):
@@ -50,16 +53,16 @@ def test_arrays_that_are_not_over_the_steps_are_refused_as_batches_are():
 
 
 @pytest.mark.slow
-def test_a_walk_over_a_rough_floor_is_that_of_another_code():
-    params, model = rough_floor()
-    walk = vrw.walk(params, START, 4, model=model, options=vrw.Options.tight())
+def test_a_walk_over_uneven_ground_agrees_with_another_code():
+    params, model = make_uneven_ground()
+    walk = vrw.walk(params, START, 4, model=model, options=vrw.StepOptions.tight())
     place = None
     for k in range(4):
         rough = np.r_[FRICTIONS[k], np.full(7, FRICTIONS[max(k - 1, 0)])]
         tilt = SLOPES[min(k + 1, 3)] - SLOPES[k]
-        wheel = complementarity.Wheel(rough, slope=SLOPES[k], tilt=tilt)
+        wheel = complementarity.ComplementarityWheel(rough, slope=SLOPES[k], tilt=tilt)
         place = place or complementarity.paper_start(wheel, *START)
-        other = complementarity.one_step(wheel, place)
+        other = complementarity.compute_step(wheel, place)
         place = other.end
         assert int(walk.steps.outcome[k]) == vrw.Outcome.STEPPED
         np.testing.assert_allclose(walk.steps.durations[k], other.durations, atol=1e-9)
@@ -69,22 +72,24 @@ def test_a_walk_over_a_rough_floor_is_that_of_another_code():
     assert abs(float(jnp.sum(level.steps.durations - walk.steps.durations))) > 1e-3
 
 
-FLOORS = 0.3 + 0.02 * np.array([[0.0, 1.0, -1.0], [1.0, -1.0, 2.0], [-2.0, 0.5, 0.0]])
-GROUNDS = np.array([[0.7, 0.5, 0.9], [0.6, 0.8, 0.7], [1.0, 0.6, 0.6]])
-MANY = np.tile((0.1, 1.6, -0.1), (3, 1))
+UNEVEN_SLOPES = 0.3 + 0.02 * np.array([[0.0, 1.0, -1.0], [1.0, -1.0, 2.0], [-2.0, 0.5, 0.0]])
+UNEVEN_FRICTIONS = np.array([[0.7, 0.5, 0.9], [0.6, 0.8, 0.7], [1.0, 0.6, 0.6]])
+START_STATES = np.tile((0.1, 1.6, -0.1), (3, 1))
 
 
 @pytest.mark.slow
-def test_a_batch_walks_over_its_floors_as_wheels_do_one_by_one():
+def test_a_batch_on_uneven_ground_equals_single_wheels():
     damping = np.array([250.0, 270.0, 300.0])
-    params, ground = vrw.WheelParams(damping=damping, slope=FLOORS), vrw.UnilateralWheel
-    found = vrw.steps(params, MANY, 3, model=ground(friction=GROUNDS))
-    assert found.n_stepped.tolist() == [3, 3, 3]
-    for i, (c, slope, friction) in enumerate(zip(damping, FLOORS, GROUNDS, strict=True)):
+    params, ground = vrw.WheelParams(damping=damping, slope=UNEVEN_SLOPES), vrw.UnilateralWheel
+    batch_result = vrw.step_batch(params, START_STATES, 3, model=ground(friction=UNEVEN_FRICTIONS))
+    assert batch_result.n_stepped.tolist() == [3, 3, 3]
+    for i, (c, slope, friction) in enumerate(
+        zip(damping, UNEVEN_SLOPES, UNEVEN_FRICTIONS, strict=True)
+    ):
         one = vrw.WheelParams(damping=c, slope=slope)
-        walk = vrw.walk(one, MANY[i], 3, model=ground(friction=friction))
+        walk = vrw.walk(one, START_STATES[i], 3, model=ground(friction=friction))
         # The same program for many and for one; XLA sums in another order.
-        np.testing.assert_allclose(found.durations[i], walk.steps.durations[-1], atol=1e-11)
+        np.testing.assert_allclose(batch_result.durations[i], walk.steps.durations[-1], atol=1e-11)
 
 
 @pytest.mark.parametrize(
@@ -97,11 +102,11 @@ def test_a_batch_walks_over_its_floors_as_wheels_do_one_by_one():
         ({"model": None}, "is walked by vrw.UnilateralWheel and 'diffrax'"),
     ],
 )
-def test_floors_that_a_batch_can_not_walk_over_are_one_sentence(changes, sentence):
+def test_uneven_ground_unsupported_by_batches_is_refused_in_one_sentence(changes, sentence):
     given = {
-        "params": vrw.WheelParams(slope=FLOORS),
+        "params": vrw.WheelParams(slope=UNEVEN_SLOPES),
         "n_steps": 3,
-        "model": vrw.UnilateralWheel(friction=GROUNDS),
+        "model": vrw.UnilateralWheel(friction=UNEVEN_FRICTIONS),
     }
     with pytest.raises(ValueError, match=sentence):
-        vrw.steps(states=MANY, **given | changes)
+        vrw.step_batch(states=START_STATES, **given | changes)

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 import vrw_jax as vrw
 from vrw_jax.app.cli import app
-from vrw_jax.web import page_address
+from vrw_jax.web import make_page_address
 
 
 @pytest.fixture
@@ -40,7 +40,7 @@ def test_parameters_are_read_and_set(widget):
     assert widget.values["rung"] == "rigid"
 
 
-def test_the_page_is_inside(widget):
+def test_the_widget_contains_the_page(widget):
     assert widget.page.startswith("<!doctype html>")
     assert 'id="code"' in widget.page
 
@@ -63,10 +63,17 @@ def grid(**outside):
 
 def test_a_dataset_becomes_the_map():
     pytest.importorskip("anywidget", reason="widgets are anywidget's")
-    shown = vrw.explore(dataset=grid()).map
-    assert [axis["name"] for axis in shown["axes"]] == ["damping", "slope"]
-    assert shown["measures"]["speed"] == [[None, 2.0, 4.0], [1.0, 3.0, 5.0]]  # rows: of the slope
-    assert shown["measures"]["locked_stopper_force"][0] == [0.0, 12.0, 24.0]  # least of the legs
+    shown_values = vrw.explore(dataset=grid()).map
+    assert [axis["name"] for axis in shown_values["axes"]] == ["damping", "slope"]
+    assert shown_values["measures"]["speed"] == [
+        [None, 2.0, 4.0],
+        [1.0, 3.0, 5.0],
+    ]  # rows: of the slope
+    assert shown_values["measures"]["locked_stopper_force"][0] == [
+        0.0,
+        12.0,
+        24.0,
+    ]  # least of the legs
     with pytest.raises(ValueError, match="two parameters: give a scan"):
         vrw.explore(dataset=grid().isel(slope=0))
 
@@ -80,46 +87,46 @@ def test_a_dataset_becomes_the_map():
         ({"rung": "rigit"}, "did you mean 'rigid'|must be one of"),
     ],
 )
-def test_what_is_given_wrongly_gets_one_sentence(wrong, sentence):
+def test_invalid_arguments_of_explore_are_refused_in_one_sentence(wrong, sentence):
     with pytest.raises((TypeError, ValueError), match=sentence):
         vrw.explore(**wrong)
 
 
-def test_without_anywidget_it_says_what_to_install(monkeypatch):
+def test_a_missing_anywidget_is_reported_with_the_install_command(monkeypatch):
     from vrw_jax.web import explorer
 
     monkeypatch.setitem(sys.modules, "anywidget", None)
-    explorer._widget.cache_clear()
+    explorer._make_widget_class.cache_clear()
     with pytest.raises(ImportError, match=r"pip install 'vrw-jax\[explore\]'"):
         vrw.explore()
-    explorer._widget.cache_clear()
+    explorer._make_widget_class.cache_clear()
 
 
-def test_the_page_of_it_runs_as_it_is_written():
+def test_the_documentation_page_of_explore_runs_unchanged():
     pytest.importorskip("anywidget", reason="widgets are anywidget's")
     text = (Path(__file__).parents[2] / "docs" / "explore.md").read_text()
-    known = {}
-    exec(re.search(r"```python\n(.*?)```", text, re.DOTALL)[1], known)
-    assert float(known["wheel"].params.damping) == 160.0
-    assert int(known["cycle"].outcome) == vrw.Outcome.STEPPED
+    known_by_name = {}
+    exec(re.search(r"```python\n(.*?)```", text, re.DOTALL)[1], known_by_name)
+    assert float(known_by_name["wheel"].params.damping) == 160.0
+    assert int(known_by_name["cycle"].outcome) == vrw.Outcome.STEPPED
 
 
 def test_the_address_holds_the_wheel():
-    assert page_address(vrw.WheelParams()).endswith("wheel.html")
-    address = urlsplit(page_address(vrw.WheelParams(damping=150.0, n_legs=6)))
+    assert make_page_address(vrw.WheelParams()).endswith("wheel.html")
+    address = urlsplit(make_page_address(vrw.WheelParams(damping=150.0, n_legs=6)))
     assert parse_qs(address.fragment) == {"damping": ["150.0"], "n_legs": ["6"]}
-    assert page_address(vrw.WheelParams(), "rigid").endswith("wheel.html#rung=rigid")
+    assert make_page_address(vrw.WheelParams(), "rigid").endswith("wheel.html#rung=rigid")
 
 
 def test_the_command_opens_the_page(monkeypatch):
     opened = []
     monkeypatch.setattr("webbrowser.open", opened.append)
-    told = CliRunner().invoke(app, ["explore", "--set", "damping=150"])
-    assert told.exit_code == 0
-    assert opened == [told.output.strip()]
+    result = CliRunner().invoke(app, ["explore", "--set", "damping=150"])
+    assert result.exit_code == 0
+    assert opened == [result.output.strip()]
     assert opened[0].endswith("wheel.html#damping=150.0")
 
 
-def test_nobody_pays_for_it_on_import():
+def test_import_of_the_library_does_not_import_the_widget():
     code = "import sys, vrw_jax; assert not {'anywidget', 'ipywidgets'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)

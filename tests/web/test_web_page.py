@@ -7,17 +7,17 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.web_code import PAGE
+from support.web_code import PAGE_PATH
 
 import vrw_jax as vrw
 from vrw_jax.web import explorer
 
-SWITCHES = [
+BROWSER_SWITCHES = [
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
     "--disable-background-networking", "--disable-component-update", "--disable-sync",
 ]  # fmt: skip
-SIZES = {"desktop": (1280, 900), "phone": (390, 844)}
-PATIENCE = 120_000
+WINDOW_SIZES = {"desktop": (1280, 900), "phone": (390, 844)}
+TIMEOUT_MILLISECONDS = 120_000
 """For the map, ms: what it takes on a machine that does much else."""
 
 
@@ -33,14 +33,18 @@ def browser(tmp_path_factory):
     folder = tmp_path_factory.mktemp("browser")
     with playwright.sync_playwright() as machine:
         opened = machine.chromium.launch_persistent_context(
-            folder, executable_path=path, args=SWITCHES, headless=True, reduced_motion="reduce"
+            folder,
+            executable_path=path,
+            args=BROWSER_SWITCHES,
+            headless=True,
+            reduced_motion="reduce",
         )
-        opened.set_default_timeout(PATIENCE)
+        opened.set_default_timeout(TIMEOUT_MILLISECONDS)
         yield opened
         opened.close()
 
 
-def fetched(address, complaints):
+def record_requests(address, complaints):
     """The page has all that it needs inside."""
     if not address.startswith(("file:", "blob:", "data:")):
         complaints.append(address)
@@ -49,32 +53,34 @@ def fetched(address, complaints):
 @pytest.fixture
 def page(browser):
     """The page, opened from its file; what it complains of fails the test."""
-    shown, complaints = browser.new_page(), []
-    shown.on("pageerror", lambda error: complaints.append(str(error)))
-    shown.on("console", lambda said: complaints.append(said.text) if said.type == "error" else None)
-    shown.on(
+    shown_values, complaints = browser.new_page(), []
+    shown_values.on("pageerror", lambda error: complaints.append(str(error)))
+    shown_values.on(
+        "console", lambda said: complaints.append(said.text) if said.type == "error" else None
+    )
+    shown_values.on(
         "request", lambda asked: complaints.append(asked.url) if asked.url[:4] == "http" else None
     )
-    shown.goto(PAGE.as_uri())
-    shown.evaluate("vrw.ready")
-    yield shown
-    shown.close()
+    shown_values.goto(PAGE_PATH.as_uri())
+    shown_values.evaluate("vrw.ready")
+    yield shown_values
+    shown_values.close()
     assert not complaints
 
 
-def gait_of(page):
-    found = page.evaluate("vrw.state.result.gait")
-    values = [complex(m["re"], m["im"]) for m in found["multipliers"]]
-    return np.array(found["x"]), np.array(values)
+def read_gait(page):
+    solution = page.evaluate("vrw.state.result.gait")
+    values = [complex(m["re"], m["im"]) for m in solution["multipliers"]]
+    return np.array(solution["x"]), np.array(values)
 
 
-def test_a_gait_and_its_multipliers_are_the_librarys(page):
+def test_a_gait_and_its_multipliers_equal_the_librarys(page):
     for changed in ({}, {"damping": 150.0, "slope": 0.27}, {"stiffness": 560.0}):
         page.evaluate(
             "values => vrw.update(values)",
             {"damping": 200, "slope": 0.3, "stiffness": 500} | changed,
         )
-        x, multipliers = gait_of(page)
+        x, multipliers = read_gait(page)
         cycle = vrw.limit_cycle(vrw.WheelParams(**changed))
         assert np.max(np.abs(x - cycle.section_state)) < 1e-8
         expected = np.asarray(cycle.multipliers)
@@ -82,10 +88,10 @@ def test_a_gait_and_its_multipliers_are_the_librarys(page):
         assert np.max(np.abs(multipliers[: len(order)] - expected[order])) < 1e-7
         assert np.all(np.abs(multipliers[len(order) :]) < 1e-9)  # what a landing forgets
         step = vrw.step(vrw.WheelParams(**changed), jnp.asarray(x))
-        told = page.evaluate("vrw.state.result.measures")
+        result = page.evaluate("vrw.state.result.measures")
         for name, value in step.measures().items():
-            if np.ndim(value) == 0 and name in told:
-                assert abs(told[name] - float(value)) < 1e-8 * (1.0 + abs(float(value))), name
+            if np.ndim(value) == 0 and name in result:
+                assert abs(result[name] - float(value)) < 1e-8 * (1.0 + abs(float(value))), name
 
 
 def test_a_slider_moves_the_numbers(page):
@@ -105,7 +111,7 @@ def test_a_slider_moves_the_numbers(page):
 
 
 @pytest.mark.parametrize("held", [True, False])
-def test_rigid_legs_roll_as_the_librarys_do(page, held):
+def test_rigid_legs_move_as_in_the_library(page, held):
     """At a slope of 0.45 rad the ground would have to pull."""
     params = vrw.WheelParams(slope=0.2 if held else 0.45, n_legs=8)
     page.evaluate("s => vrw.update({ rung: 'rigid', slope: s })", float(params.slope))
@@ -116,7 +122,7 @@ def test_rigid_legs_roll_as_the_librarys_do(page, held):
         assert result["gait"] is None
         assert "lost" in page.inner_text("#verdict")
         return
-    x, multipliers = gait_of(page)
+    x, multipliers = read_gait(page)
     cycle = vrw.limit_cycle(params, model=model)
     assert np.max(np.abs(x - cycle.section_state)) < 1e-9
     assert abs(abs(multipliers[0]) - float(cycle.spectral_radius)) < 1e-9
@@ -124,36 +130,36 @@ def test_rigid_legs_roll_as_the_librarys_do(page, held):
         if np.ndim(value) == 0 and name in result["measures"]:
             assert abs(result["measures"][name] - float(value)) < 1e-9 * (1.0 + abs(value)), name
     trace = vrw.simulate(params, x, n_steps=1, n_samples=24, model=model)
-    [shown] = result["steps"]
+    [shown_values] = result["steps"]
     for row, name in (("times", "time"), (0, "theta"), (7, "lambda_2")):
-        found = np.array(shown[row] if row == "times" else shown["rows"][row])
-        assert np.max(np.abs(found - trace[name].values[-24:])) < 1e-8, name
+        values_array = np.array(shown_values[row] if row == "times" else shown_values["rows"][row])
+        assert np.max(np.abs(values_array - trace[name].values[-24:])) < 1e-8, name
 
 
-def test_on_real_ground_the_gait_its_multipliers_and_its_motion_are_the_librarys(page):
+def test_a_unilateral_gait_its_multipliers_and_motion_equal_the_librarys(page):
     """Feet slide there; multipliers are differences, right to five digits."""
     params, model = vrw.WheelParams(damping=150.0), vrw.UnilateralWheel(friction=0.5)
     page.evaluate("vrw.update({ rung: 'unilateral', damping: 150, friction: 0.5 })")
     assert "real ground" in page.inner_text("#verdict")
     assert "UnilateralWheel(friction=0.5)" in page.inner_text("#python")
     assert not page.is_visible("#ground-card")
-    x, multipliers = gait_of(page)
-    taken = vrw.steps(params, x[None], model=model, derivatives="section_state")
-    assert np.max(np.abs(taken.section_state[0] - x)) < 1e-8
-    expected = np.linalg.eigvals(taken.derivatives["section_state"].section_state[0])
+    x, multipliers = read_gait(page)
+    batch_result = vrw.step_batch(params, x[None], model=model, derivatives="section_state")
+    assert np.max(np.abs(batch_result.section_state[0] - x)) < 1e-8
+    expected = np.linalg.eigvals(batch_result.derivatives["section_state"].section_state[0])
     expected = expected[np.argsort(-np.abs(expected))][: len(multipliers)]
-    apart = np.stack(
+    stacked_values = np.stack(
         [multipliers.real - expected.real, np.abs(multipliers.imag) - np.abs(expected.imag)]
     )
-    assert np.max(np.abs(apart)) < 1e-5
-    told = page.evaluate("vrw.state.result.measures")
-    assert told["slip"] > 0.01
+    assert np.max(np.abs(stacked_values)) < 1e-5
+    result = page.evaluate("vrw.state.result.measures")
+    assert result["slip"] > 0.01
     for name, value in vrw.step(params, jnp.asarray(x), model=model).measures().items():
-        if np.ndim(value) == 0 and name in told:
-            assert abs(told[name] - float(value)) < 1e-8 * (1.0 + abs(float(value))), name
+        if np.ndim(value) == 0 and name in result:
+            assert abs(result[name] - float(value)) < 1e-8 * (1.0 + abs(float(value))), name
     [step] = page.evaluate("vrw.state.result.steps")
-    assert abs(step["length"] - told["step_length"]) < 1e-12
-    assert abs(sum(band["duration"] for band in step["bands"]) - told["period"]) < 1e-12
+    assert abs(step["length"] - result["step_length"]) < 1e-12
+    assert abs(sum(band["duration"] for band in step["bands"]) - result["period"]) < 1e-12
     assert any("slid" in band["texts"][0] for band in step["bands"])
     page.wait_for_function("vrw.state.basin.cells.size > 16 && vrw.state.map.cells.size > 16")
     assert "to the gait" in page.inner_text("#basin-legend")
@@ -164,7 +170,7 @@ def test_on_real_ground_the_gait_its_multipliers_and_its_motion_are_the_librarys
     assert page.is_visible("#ground-card")
 
 
-def test_a_walk_that_slides_to_a_halt_is_shown_until_it_does(page):
+def test_a_walk_that_slides_to_a_halt_is_shown_until_it_stops(page):
     page.evaluate("vrw.update({ rung: 'unilateral', friction: 0.05 })")
     result = page.evaluate("vrw.state.result")
     assert result["gait"] is None
@@ -172,37 +178,37 @@ def test_a_walk_that_slides_to_a_halt_is_shown_until_it_does(page):
     assert len(result["steps"][-1]["times"]) > 24
 
 
-def test_friction_that_would_not_do_is_told(page):
+def test_insufficient_friction_is_reported(page):
     params = vrw.WheelParams()
-    margins = vrw.step(params, vrw.limit_cycle(params).section_state).monitors
-    left = [margins.friction_fore, margins.landing_friction_fore]
-    needed = f"{1.0 - float(min(left)):.4g}"
-    told = lambda mu: (
+    margins = vrw.step(params, vrw.limit_cycle(params).section_state).margins
+    left_part = [margins.friction_fore, margins.landing_friction_fore]
+    needed = f"{1.0 - float(min(left_part)):.4g}"
+    evaluate = lambda mu: (
         page.evaluate("mu => vrw.update({ friction: mu })", mu) or page.inner_text("#verdict")
     )
-    assert f"The fore foot needs a friction of {needed}" in told(1.0)
-    assert "where it is 1.2 the rear foot would slide" in told(1.2)
+    assert f"The fore foot needs a friction of {needed}" in evaluate(1.0)
+    assert "where it is 1.2 the rear foot would slide" in evaluate(1.2)
     assert page.get_attribute("#verdict", "class") == "good"
-    assert "both feet would slide" in told(0.3)
+    assert "both feet would slide" in evaluate(0.3)
     assert page.get_attribute("#verdict", "class") == "warn"
-    assert "100 is enough" in told(100.0)
+    assert "100 is enough" in evaluate(100.0)
 
 
 def test_a_wheel_can_be_sent_as_an_address(browser):
-    shown = browser.new_page()
-    shown.goto(PAGE.as_uri() + "#damping=40&n_legs=8")
-    shown.evaluate("vrw.ready")
-    assert "scuffs" in shown.inner_text("#verdict")
-    shown.goto("about:blank")
-    shown.goto(PAGE.as_uri() + "#n_legs=10")
-    shown.evaluate("vrw.ready")
-    assert "ten legs" in shown.inner_text("header")
-    assert shown.evaluate("vrw.state.result.measures.locked_stopper_force === undefined")
-    assert shown.evaluate("'locked_stopper_force[10]' in vrw.state.result.measures")
-    shown.close()
+    shown_values = browser.new_page()
+    shown_values.goto(PAGE_PATH.as_uri() + "#damping=40&n_legs=8")
+    shown_values.evaluate("vrw.ready")
+    assert "scuffs" in shown_values.inner_text("#verdict")
+    shown_values.goto("about:blank")
+    shown_values.goto(PAGE_PATH.as_uri() + "#n_legs=10")
+    shown_values.evaluate("vrw.ready")
+    assert "ten legs" in shown_values.inner_text("header")
+    assert shown_values.evaluate("vrw.state.result.measures.locked_stopper_force === undefined")
+    assert shown_values.evaluate("'locked_stopper_force[10]' in vrw.state.result.measures")
+    shown_values.close()
 
 
-def test_map_and_basin_fill_and_the_dot_moves_the_wheel(page):
+def test_map_and_basin_are_drawn_and_the_marker_sets_the_wheel(page):
     page.wait_for_function("vrw.state.basin.done && vrw.state.map.done")
     assert page.evaluate("vrw.state.basin.cells.size") == 64 * 64
     assert page.evaluate("vrw.state.map.cells.size") == 65 * 65
@@ -223,11 +229,11 @@ def test_map_and_basin_fill_and_the_dot_moves_the_wheel(page):
     assert abs(speed - page.evaluate("vrw.state.result.measures.speed")) < 0.05
 
 
-@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("size", WINDOW_SIZES)
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_nothing_is_cut_off_and_everything_has_a_name(page, size, scheme, tmp_path):
+def test_nothing_is_clipped_and_every_element_has_a_name(page, size, scheme, tmp_path):
     page.emulate_media(color_scheme=scheme)
-    width, height = SIZES[size]
+    width, height = WINDOW_SIZES[size]
     page.set_viewport_size({"width": width, "height": height})
     page.wait_for_timeout(300)
     assert page.evaluate("document.documentElement.scrollWidth") <= width
@@ -240,21 +246,21 @@ def test_nothing_is_cut_off_and_everything_has_a_name(page, size, scheme, tmp_pa
     # A window as high as the page: to look at, and a picture of more than one colour.
     page.set_viewport_size({"width": width, "height": page.evaluate("document.body.scrollHeight")})
     folder = Path(os.environ.get("VRW_SCREENSHOTS", tmp_path))
-    page.screenshot(path=folder / f"wheel_{size}_{scheme}.png", timeout=PATIENCE)
-    drawn = page.evaluate("""() => ["walk", "strips", "circle"].map((id) => {
+    page.screenshot(path=folder / f"wheel_{size}_{scheme}.png", timeout=TIMEOUT_MILLISECONDS)
+    drawn_values = page.evaluate("""() => ["walk", "strips", "circle"].map((id) => {
       const canvas = document.getElementById(id), { width, height } = canvas;
       const dots = canvas.getContext("2d").getImageData(0, 0, width, height).data;
       return new Set(new Uint32Array(dots.buffer)).size;
     })""")
-    assert min(drawn) > 10
+    assert min(drawn_values) > 10
 
 
-def test_a_widgets_frame_passes_values_on_in_both_directions(browser):
-    shown = browser.new_page()
-    shown.set_content("<div id='cell'></div>")
-    traits = {"page": PAGE.read_text(encoding="utf-8"), "height": 800, "map": {}, "told": {}}
-    traits["values"] = explorer._values(vrw.WheelParams(damping=150.0), 0.9, "viscoelastic")
-    shown.evaluate(
+def test_the_frame_of_a_widget_exchanges_values_in_both_directions(browser):
+    shown_values = browser.new_page()
+    shown_values.set_content("<div id='cell'></div>")
+    traits = {"page": PAGE_PATH.read_text(encoding="utf-8"), "height": 800, "map": {}, "told": {}}
+    traits["values"] = explorer._page_values(vrw.WheelParams(damping=150.0), 0.9, "viscoelastic")
+    shown_values.evaluate(
         """traits => {
           const listeners = {};
           window.model = {
@@ -267,30 +273,32 @@ def test_a_widgets_frame_passes_values_on_in_both_directions(browser):
         }""",
         traits,
     )
-    render = explorer.FRAME.replace("export default { render };", "")
-    shown.evaluate(
+    render = explorer.WIDGET_JAVASCRIPT.replace("export default { render };", "")
+    shown_values.evaluate(
         f"() => {{ {render}; render({{ model, el: document.getElementById('cell') }}) }}"
     )
-    shown.wait_for_function("model.get('told').speed > 0 && model.get('values').damping === 150")
-    told = shown.evaluate("model.get('told')")
+    shown_values.wait_for_function(
+        "model.get('told').speed > 0 && model.get('values').damping === 150"
+    )
+    result = shown_values.evaluate("model.get('told')")
     cycle = vrw.limit_cycle(vrw.WheelParams(damping=150.0))
-    assert abs(told["speed"] - float(cycle.speed)) < 1e-8
-    shown.evaluate("model.fromPython('values', { ...model.get('values'), damping: 170 })")
-    shown.wait_for_function(f"Math.abs(model.get('told').speed - {told['speed']}) > 1e-4")
-    inside = shown.frames[1]
+    assert abs(result["speed"] - float(cycle.speed)) < 1e-8
+    shown_values.evaluate("model.fromPython('values', { ...model.get('values'), damping: 170 })")
+    shown_values.wait_for_function(f"Math.abs(model.get('told').speed - {result['speed']}) > 1e-4")
+    inside = shown_values.frames[1]
     assert inside.input_value("#number-damping") == "170"
     inside.fill("#number-damping", "180")
     inside.locator("#number-damping").press("Tab")
-    shown.wait_for_function("model.get('values').damping === 180")
+    shown_values.wait_for_function("model.get('values').damping === 180")
     axes = [{"name": "damping", "values": [100, 150, 200]}, {"name": "slope", "values": [0.2, 0.3]}]
     given = {
         "axes": axes,
         "measures": {"speed": [[1, 2, None], [3, 4, 5]]},
         "outcome": [[0, 0, 3]] * 2,
     }
-    shown.evaluate("given => model.fromPython('map', given)", given)
+    shown_values.evaluate("given => model.fromPython('map', given)", given)
     inside.wait_for_function(
         "document.getElementById('map-state').innerText === 'From your dataset.'"
     )
     assert "fell back" in inside.inner_text("#map-legend")
-    shown.close()
+    shown_values.close()

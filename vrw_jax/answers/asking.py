@@ -16,59 +16,59 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.answers.climbing import STRAY, Chord, Settled, settled
+from vrw_jax.answers.climbing import MAX_GAIT_DISTANCE, BroydenIteration, RefinementResult, refine
 from vrw_jax.answers.lower import (
-    GROUND,
-    NONE,
-    RIGID,
-    Lower,
-    contraction,
-    no_gaits,
-    paper_gaits,
-    put,
-    rigid_gaits,
+    NO_MODEL,
+    RIGID_MODEL_INDEX,
+    UNILATERAL_MODEL_INDEX,
+    LowerFidelityGait,
+    empty_gaits,
+    find_paper_gaits,
+    find_rigid_gaits,
+    replace_gaits,
+    static_contraction,
 )
-from vrw_jax.answers.quantities import MADE, measured
-from vrw_jax.answers.result import Answer, How
-from vrw_jax.answers.top import TIGHT, TIGHTER, Ground
-from vrw_jax.answers.walking import led
-from vrw_jax.cycles import starts_of
-from vrw_jax.gaits import Which, place_in_list
-from vrw_jax.numerics import Options, taken
-from vrw_jax.wheel import FRICTION, Outcome, WheelParams, friction_of
+from vrw_jax.answers.quantities import MEASURE_FUNCTIONS, evaluate_measures
+from vrw_jax.answers.result import MeasureResult, MeasureStatus
+from vrw_jax.answers.top import TIGHT_TOLERANCE, VERY_TIGHT_TOLERANCE, GroundBatch
+from vrw_jax.answers.walking import walk_until_settled
+from vrw_jax.cycles import compute_walk_starts
+from vrw_jax.gaits import GaitChoice, parse_gait_choice
+from vrw_jax.numerics import StepOptions, take_rows
+from vrw_jax.wheel import FRICTION_NAME, Outcome, WheelParams, convert_friction
 from vrw_jax.wording import (
-    chosen,
-    flag,
-    instance,
-    names_of,
-    positive,
-    require_known,
-    untraced,
+    check_bool,
+    check_choice,
+    check_known_name,
+    check_names,
+    check_not_traced,
+    check_positive,
+    check_type,
 )
 
-SAFETY = 4.0
+ERROR_SAFETY_FACTOR = 4.0
 """Factor from the error estimate of one step to its bound, valid as long as corrections contract by
 3/4."""
-FINE = 1e-7
+TIGHT_BELOW = 1e-7
 """Tolerance of a measure below which steps use VERY_TIGHT_TOLERANCE."""
-EXACT = 3
+N_EXACT_STEPS = 3
 """Number of steps after a loose walk, before corrections, because looser steps may end in other
 modes."""
-STAYING = 60
+N_STABILITY_STEPS = 60
 """Number of steps of a walk that must stay near a gait if the gait is far from the end of the
 previous walk."""
-COLD = 2
+N_COLD_STARTS = 2
 """Number of starts, slow ones first, for wheels without a lower gait. Of 232 wheels the first two
 starts led 100 to a gait, and the other starts led none of the rest."""
-BALL = 2.0
+MAX_DISTANCE_RATIO = 2.0
 """Largest distance of the gait with unilateral contact from the lower gait that it continues, in
 first corrections. It is chosen because a contraction by a half moves at most so far."""
-TRIES = 3
+N_STEPS_BEFORE_DIFFERENCES = 3
 """Number of steps from a lower gait with its own derivatives, before finite differences replace
 them."""
 
 
-def answer(
+def measure_to_tolerance(
     measures: str | Sequence[str],
     params: WheelParams,
     tol: float,
@@ -76,8 +76,8 @@ def answer(
     friction: Any = 0.7,
     relative: bool = False,
     stoppers: str = "bilateral",
-    which: Which | None = None,
-) -> Answer:
+    which: GaitChoice | None = None,
+) -> MeasureResult:
     """Return measures of the wheel's gait on ground of this friction, each to within `tol`.
 
     The reference is `UnilateralWheel(friction, stoppers=stoppers)`. Its gait is the one that
@@ -110,53 +110,60 @@ def answer(
         >>> print(f"{result.value:.2f} m/s", result.error <= 1e-3)
         1.02 m/s True
     """
-    began = time.perf_counter()
-    untraced("vrw.answer", "it on numbers, and give lanes as arrays", params, friction)
-    names = names_of("measures", measures)
+    start_seconds = time.perf_counter()
+    check_not_traced(
+        "vrw.measure_to_tolerance", "it on numbers, and give lanes as arrays", params, friction
+    )
+    names = check_names("measures", measures)
     for name in names:
-        require_known(name, tuple(MADE), "measure that every model has")
+        check_known_name(name, tuple(MEASURE_FUNCTIONS), "measure that every model has")
     if not names:
         raise ValueError("measures is empty, but at least one is needed: give 'speed', say.")
-    tol, relative = positive("tol", tol), flag("relative", relative)
-    chosen("stoppers", stoppers, ("bilateral", "one-sided"))
-    params, mu, shape = known_lanes(params, friction_of(friction))
-    place = None if which is None else place_in_list(which)
-    tolerance = TIGHT if tol >= FINE else TIGHTER
-    options = Options(rtol=tolerance, atol=tolerance)
-    asked = _Asked(names, tol, relative, Ground.of(params, mu, stoppers, options), params)
-    if place is None:
-        asked.by_rigid()
-        asked.by_paper()
-        asked.by_walks()
+    tol, relative = check_positive("tol", tol), check_bool("relative", relative)
+    check_choice("stoppers", stoppers, ("bilateral", "one-sided"))
+    params, mu, shape = check_batch(params, convert_friction(friction))
+    rank = None if which is None else parse_gait_choice(which)
+    tolerance = TIGHT_TOLERANCE if tol >= TIGHT_BELOW else VERY_TIGHT_TOLERANCE
+    options = StepOptions(rtol=tolerance, atol=tolerance)
+    request = _MeasureRequest(
+        names, tol, relative, GroundBatch.from_params(params, mu, stoppers, options), params
+    )
+    if rank is None:
+        request.try_rigid_model()
+        request.try_paper_model()
+        request.walk_to_gaits()
     else:
-        asked.by_list(place)
-    told = jax.tree.map(lambda x: x.reshape(shape + x.shape[1:]), asked.told)
-    del told["speeds"]
-    return Answer(
-        **told, names=names, single=isinstance(measures, str), cost=time.perf_counter() - began
+        request.select_by_rank(rank)
+    results = jax.tree.map(lambda x: x.reshape(shape + x.shape[1:]), request.results)
+    del results["speeds"]
+    return MeasureResult(
+        **results,
+        names=names,
+        is_single=isinstance(measures, str),
+        seconds=time.perf_counter() - start_seconds,
     )
 
 
-def known_lanes(
+def check_batch(
     params: WheelParams, friction: Any
 ) -> tuple[WheelParams, np.ndarray, tuple[int, ...]]:
     """Return wheels and friction broadcast to one batch axis, and the shape that they were given
     in."""
-    instance("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
+    check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
     shapes = {np.shape(x) for x in (*jax.tree.leaves(params), friction)}
     shape = max(shapes, key=len)
     if len(shape) > 1 or shapes - {(), shape}:
-        given = ", ".join(map(str, sorted(shapes - {()})))
+        shapes_text = ", ".join(map(str, sorted(shapes - {()})))
         raise ValueError(
-            f"parameters and {FRICTION} have shapes {given}, but lanes have one axis, the same for "
+            f"parameters and {FRICTION_NAME} have shapes {shapes_text}, but lanes have one axis, the same for "
             "all: give one value for all, or one for each lane."
         )
-    n = shape[0] if shape else 1
-    lanes = lambda x: np.broadcast_to(np.asarray(x, float), (n,))
-    return jax.tree.map(lambda x: jnp.asarray(lanes(x)), params), lanes(friction), shape
+    n_elements = shape[0] if shape else 1
+    broadcast = lambda x: np.broadcast_to(np.asarray(x, float), (n_elements,))
+    return jax.tree.map(lambda x: jnp.asarray(broadcast(x)), params), broadcast(friction), shape
 
 
-class _Asked:
+class _MeasureRequest:
     """Request for measures of a batch of wheels, with the results so far."""
 
     def __init__(
@@ -164,173 +171,246 @@ class _Asked:
         names: tuple[str, ...],
         tol: float,
         relative: bool,
-        ground: Ground,
+        ground: GroundBatch,
         params: WheelParams,
     ) -> None:
-        n, m = len(ground.columns.T), len(names)
+        n_elements, n_measures = len(ground.parameter_columns.T), len(names)
         self.names, self.tol, self.relative = names, tol, relative
-        self.ground, self.params, self.lower = ground, params, no_gaits(n)
-        many = lambda fill: np.full((n, m), fill)
-        self.told = {
-            "values": many(np.nan), "errors": many(np.inf), "model_errors": many(np.nan),
-            "numerical_errors": many(np.inf), "rungs": np.full(n, NONE),
-            "hows": np.full(n, int(How.NO_GAIT)), "n_steps": np.zeros(n, int),
-            "outcomes": np.full(n, int(Outcome.NO_CYCLE_FOUND)), "n_gaits": np.zeros(n, int),
-            "speeds": np.full(n, np.nan), "states": ground.embedded(np.arange(n), np.zeros((n, 3))),
+        self.ground, self.params, self.lower_gaits = ground, params, empty_gaits(n_elements)
+        full = lambda fill: np.full((n_elements, n_measures), fill)
+        self.results = {
+            "values": full(np.nan), "errors": full(np.inf), "model_errors": full(np.nan),
+            "numerical_errors": full(np.inf), "models": np.full(n_elements, NO_MODEL),
+            "statuses": np.full(n_elements, int(MeasureStatus.NO_GAIT)), "n_steps": np.zeros(n_elements, int),
+            "outcomes": np.full(n_elements, int(Outcome.NO_CYCLE_FOUND)), "n_gaits": np.zeros(n_elements, int),
+            "speeds": np.full(n_elements, np.nan), "states": ground.embed_states(np.arange(n_elements), np.zeros((n_elements, 3))),
         }  # fmt: skip
 
-    def goal(self, values: np.ndarray) -> np.ndarray:
+    def error_goal(self, values: np.ndarray) -> np.ndarray:
         """Return the absolute tolerance of measures with about these values."""
         return self.tol * (np.abs(values) if self.relative else np.ones_like(values))
 
     @property
-    def open(self) -> np.ndarray:
+    def unanswered_indices(self) -> np.ndarray:
         """Return the indices of the elements without a result."""
-        return np.flatnonzero(self.told["rungs"] == NONE)
+        return np.flatnonzero(self.results["models"] == NO_MODEL)
 
-    def by_rigid(self) -> None:
+    def try_rigid_model(self) -> None:
         """Try the rigid gait for wheels whose legs are stiff enough."""
         with np.errstate(all="ignore"):
-            lanes = np.flatnonzero(SAFETY * contraction(self.params) <= self.tol)
-        if not len(lanes):
+            indices = np.flatnonzero(
+                ERROR_SAFETY_FACTOR * static_contraction(self.params) <= self.tol
+            )
+        if not len(indices):
             return
-        put(self.lower, lanes, rigid_gaits(self._wheels(lanes)))
-        lanes = lanes[np.isfinite(self.lower.told[lanes]).all(1)]
-        self._from_gaits(lanes, corrected=False)
+        replace_gaits(self.lower_gaits, indices, find_rigid_gaits(self._take_wheels(indices)))
+        indices = indices[np.isfinite(self.lower_gaits.quantities[indices]).all(1)]
+        self._correct_from_gaits(indices, continues=False)
 
-    def by_paper(self) -> None:
+    def try_paper_model(self) -> None:
         """Try the paper's gaits, and the nearby gaits with unilateral contact if their values are
         not accurate enough."""
-        lanes = self.open
-        if not len(lanes):
+        indices = self.unanswered_indices
+        if not len(indices):
             return
-        put(self.lower, lanes, paper_gaits(self._wheels(lanes), self.ground.options))
-        self._from_gaits(lanes[self.lower.rung[lanes] != NONE], corrected=True)
+        replace_gaits(
+            self.lower_gaits,
+            indices,
+            find_paper_gaits(self._take_wheels(indices), self.ground.options),
+        )
+        self._correct_from_gaits(
+            indices[self.lower_gaits.model_index[indices] != NO_MODEL], continues=True
+        )
 
-    def by_walks(self) -> None:
+    def walk_to_gaits(self) -> None:
         """Walk to the gaits with unilateral contact that are far from the paper's gait, or where it
         has none."""
-        lanes = self.open
-        if not len(lanes):
+        indices = self.unanswered_indices
+        if not len(indices):
             return
-        has = self.lower.rung[lanes] != NONE
-        begin = self.ground.embedded(lanes[has], self.lower.x[lanes[has]])
-        self._walk(lanes[has], begin, How.WALKED)
-        lanes = lanes[~has]
-        if not len(lanes):
+        has_lower_gait = self.lower_gaits.model_index[indices] != NO_MODEL
+        start_states = self.ground.embed_states(
+            indices[has_lower_gait], self.lower_gaits.section_state[indices[has_lower_gait]]
+        )
+        self._walk_and_correct(
+            indices[has_lower_gait], start_states, MeasureStatus.REACHED_FROM_LOWER_GAIT
+        )
+        indices = indices[~has_lower_gait]
+        if not len(indices):
             return
-        for start in starts_of(self._wheels(lanes))[:COLD]:
-            still = self.told["rungs"][lanes] == NONE
-            begin = self.ground.embedded(lanes[still], start[still])
-            self._walk(lanes[still], begin, How.FROM_START)
+        for start in compute_walk_starts(self._take_wheels(indices))[:N_COLD_STARTS]:
+            is_unanswered = self.results["models"][indices] == NO_MODEL
+            start_states = self.ground.embed_states(indices[is_unanswered], start[is_unanswered])
+            self._walk_and_correct(
+                indices[is_unanswered], start_states, MeasureStatus.REACHED_FROM_START
+            )
 
-    def by_list(self, place: int) -> None:
+    def select_by_rank(self, rank: int) -> None:
         """Select the gait of this rank, slowest first, among those that walks from all starts
         reach."""
-        lanes, blank, each = self.open, self.told, []
-        for start in starts_of(self.params):
-            self.told = {name: x.copy() for name, x in blank.items()}
-            self._walk(lanes, self.ground.embedded(lanes, start), How.CHOSEN)
-            each.append(self.told)
-        self.told = blank
-        blank["n_steps"][:] = np.sum([told["n_steps"] for told in each], axis=0)
-        for lane in lanes:
-            gaits = _apart([{name: x[lane] for name, x in told.items()} for told in each])
-            blank["n_gaits"][lane] = len(gaits)
-            if -len(gaits) <= place < len(gaits):
-                for name in blank.keys() - {"n_steps", "n_gaits"}:
-                    blank[name][lane] = gaits[place][name]
+        indices, empty_results, results_of_starts = self.unanswered_indices, self.results, []
+        for start in compute_walk_starts(self.params):
+            self.results = {name: x.copy() for name, x in empty_results.items()}
+            self._walk_and_correct(
+                indices, self.ground.embed_states(indices, start), MeasureStatus.SELECTED_BY_RANK
+            )
+            results_of_starts.append(self.results)
+        self.results = empty_results
+        empty_results["n_steps"][:] = np.sum(
+            [results["n_steps"] for results in results_of_starts], axis=0
+        )
+        for index in indices:
+            distinct_gaits = _find_distinct_gaits(
+                [{name: x[index] for name, x in results.items()} for results in results_of_starts]
+            )
+            empty_results["n_gaits"][index] = len(distinct_gaits)
+            if -len(distinct_gaits) <= rank < len(distinct_gaits):
+                for name in empty_results.keys() - {"n_steps", "n_gaits"}:
+                    empty_results[name][index] = distinct_gaits[rank][name]
 
-    def _wheels(self, lanes: np.ndarray) -> WheelParams:
-        return jax.device_put(taken(self.params, lanes))
+    def _take_wheels(self, indices: np.ndarray) -> WheelParams:
+        return jax.device_put(take_rows(self.params, indices))
 
-    def _from_gaits(self, lanes: np.ndarray, corrected: bool) -> None:
+    def _correct_from_gaits(self, indices: np.ndarray, continues: bool) -> None:
         """Take one step with unilateral contact from the lower gaits, and more steps if one is not
         enough."""
-        if not len(lanes):
+        if not len(indices):
             return
-        lower = Lower(*(part[lanes] for part in self.lower))
-        x = self.ground.embedded(lanes, lower.x, lower.rung == RIGID)
-        chord = Chord.of(self.ground, lanes, x, lower)
-        every = np.arange(len(lanes))
-        first = chord.step(every)
-        seen = chord.see(every, first, self.names)
-        value = measured(self.names, lower.told)
-        with np.errstate(all="ignore"):
-            size = np.abs(measured(self.names, first.told) - value) + seen.size
-            error = value - seen.values
-            plane = self.ground.plane()
-            along = np.abs(seen.direct @ chord.moved[:, :, plane])
-            own = np.einsum("ijk,ik->ij", along, np.abs(lower.own))
-            numerical = own + seen.numerical + seen.brief
-            bound = np.abs(error) + (SAFETY - 1.0) * size + numerical
-            stands = seen.same & np.all(bound <= self.goal(value), axis=1)
-        self.told["n_steps"][lanes] += 1
-        self._tell(lanes[stands], lower.rung[stands], How.CHECKED, {
-            "values": value[stands], "errors": bound[stands], "model_errors": error[stands],
-            "numerical_errors": numerical[stands], "states": x[stands],
-        })  # fmt: skip
-        rest = np.flatnonzero(~stands & seen.same)
-        if not corrected or not len(rest):
-            return
-        reach = BALL * np.linalg.norm(chord.correction[rest][:, plane], axis=1)
-        begun = jax.tree.map(lambda part: part[rest], (first, seen))
-        found = settled(chord.some(rest), self.names, self.goal, TRIES, begun)
-        near = np.linalg.norm((found.x - x[rest])[:, plane], axis=1) <= reach
-        self._take(lanes[rest], found._replace(done=found.done & near), How.CORRECTED)
-
-    def _walk(self, lanes: np.ndarray, x: np.ndarray, how: How) -> None:
-        """Walk from the states, and correct the ends of the walks."""
-        walk = led(self.ground, lanes, x)
-        self.told["n_steps"][lanes] += walk.n_steps
-        # A step cannot begin if a wheel has turned more than once in flight.
-        walks = np.isin(walk.outcome, (Outcome.STEPPED, Outcome.BAD_INPUT))
-        self.told["outcomes"][lanes] = np.where(walks, Outcome.NO_CYCLE_FOUND, walk.outcome)
-        lanes, x = lanes[walk.rests], walk.x[walk.rests]
-        if not len(lanes):
-            return
-        step = self.ground.step(lanes, x, EXACT)
-        self.told["n_steps"][lanes] += EXACT
-        on = step.outcome == Outcome.STEPPED
-        lanes, x = lanes[on], step.x[on]
-        chord = Chord.of(self.ground, lanes, x, None)
-        found = settled(chord, self.names, self.goal, 0)
-        found.done[found.done] = chord.some(found.done).attract()
-        far = np.flatnonzero(found.done & (chord.away(x) > STRAY))
-        found.done[far] = chord.some(far).stay(STAYING)
-        found.n_steps[far] += STAYING
-        self._take(lanes, found, how)
-
-    def _take(self, lanes: np.ndarray, found: Settled, how: How) -> None:
-        """Record gaits with unilateral contact."""
-        self.told["n_steps"][lanes] += found.n_steps
-        lanes, found = lanes[found.done], Settled(*(part[found.done] for part in found))
-        has = (self.lower.rung[lanes] != NONE)[:, None]
-        value = measured(self.names, np.where(has, self.lower.told[lanes], np.nan))
-        self._tell(lanes, np.full(len(lanes), GROUND), how, {
-            "values": found.values, "errors": found.left + found.numerical,
-            "model_errors": value - found.values,
-            "numerical_errors": found.left + found.numerical, "speeds": found.speed,
-            "states": found.x,
-        })  # fmt: skip
-
-    def _tell(
-        self, lanes: np.ndarray, rung: np.ndarray, how: How, told: dict[str, np.ndarray]
-    ) -> None:
-        for name, values in told.items():
-            self.told[name][lanes] = values
-        self.told["rungs"][lanes], self.told["hows"][lanes] = rung, how
-        self.told["outcomes"][lanes] = Outcome.STEPPED
-
-
-def _apart(told: list[dict[str, np.ndarray]]) -> list[dict[str, np.ndarray]]:
-    """Return the gaits of one wheel that differ by more than their errors, slowest first."""
-    kept: list[dict[str, np.ndarray]] = []
-    for one in told:
-        apart = (
-            np.any(np.abs(one["values"] - other["values"]) > one["errors"] + other["errors"])
-            for other in kept
+        lower_gaits = LowerFidelityGait(*(part[indices] for part in self.lower_gaits))
+        section_states = self.ground.embed_states(
+            indices, lower_gaits.section_state, lower_gaits.model_index == RIGID_MODEL_INDEX
         )
-        if one["rungs"] != NONE and all(apart):
-            kept.append(one)
-    return sorted(kept, key=lambda one: one["speeds"])
+        iteration = BroydenIteration.from_states(self.ground, indices, section_states, lower_gaits)
+        all_positions = np.arange(len(indices))
+        first_step = iteration.step_elements(all_positions)
+        estimate = iteration.observe(all_positions, first_step, self.names)
+        values = evaluate_measures(self.names, lower_gaits.quantities)
+        with np.errstate(all="ignore"):
+            correction_effect = (
+                np.abs(evaluate_measures(self.names, first_step.quantities) - values)
+                + estimate.correction_effect
+            )
+            error = values - estimate.values
+            plane_indices = self.ground.plane_indices()
+            sensitivity = np.abs(
+                estimate.quantity_jacobian @ iteration.quantity_jacobian[:, :, plane_indices]
+            )
+            own_defect_effect = np.einsum("ijk,ik->ij", sensitivity, np.abs(lower_gaits.defect))
+            numerical = own_defect_effect + estimate.numerical_error + estimate.dip_error
+            bound = np.abs(error) + (ERROR_SAFETY_FACTOR - 1.0) * correction_effect + numerical
+            is_accepted = estimate.same_codes & np.all(bound <= self.error_goal(values), axis=1)
+        self.results["n_steps"][indices] += 1
+        self._record(indices[is_accepted], lower_gaits.model_index[is_accepted], MeasureStatus.CHECKED_BY_ONE_STEP, {
+            "values": values[is_accepted], "errors": bound[is_accepted], "model_errors": error[is_accepted],
+            "numerical_errors": numerical[is_accepted], "states": section_states[is_accepted],
+        })  # fmt: skip
+        rejected = np.flatnonzero(~is_accepted & estimate.same_codes)
+        if not continues or not len(rejected):
+            return
+        max_distance = MAX_DISTANCE_RATIO * np.linalg.norm(
+            iteration.correction[rejected][:, plane_indices], axis=1
+        )
+        first_step_and_estimate = jax.tree.map(lambda part: part[rejected], (first_step, estimate))
+        refinement = refine(
+            iteration.select(rejected),
+            self.names,
+            self.error_goal,
+            N_STEPS_BEFORE_DIFFERENCES,
+            first_step_and_estimate,
+        )
+        is_near = (
+            np.linalg.norm(
+                (refinement.section_states - section_states[rejected])[:, plane_indices], axis=1
+            )
+            <= max_distance
+        )
+        self._record_gaits(
+            indices[rejected],
+            refinement._replace(is_done=refinement.is_done & is_near),
+            MeasureStatus.CONTINUES_LOWER_GAIT,
+        )
+
+    def _walk_and_correct(
+        self, indices: np.ndarray, section_states: np.ndarray, status: MeasureStatus
+    ) -> None:
+        """Walk from the states, and correct the ends of the walks."""
+        walk_end = walk_until_settled(self.ground, indices, section_states)
+        self.results["n_steps"][indices] += walk_end.n_steps
+        # A step cannot begin if a wheel has turned more than once in flight.
+        is_walk_outcome = np.isin(walk_end.outcome, (Outcome.STEPPED, Outcome.BAD_INPUT))
+        self.results["outcomes"][indices] = np.where(
+            is_walk_outcome, Outcome.NO_CYCLE_FOUND, walk_end.outcome
+        )
+        indices, section_states = (
+            indices[walk_end.is_settled],
+            walk_end.section_states[walk_end.is_settled],
+        )
+        if not len(indices):
+            return
+        step = self.ground.take_steps(indices, section_states, N_EXACT_STEPS)
+        self.results["n_steps"][indices] += N_EXACT_STEPS
+        continues = step.outcome == Outcome.STEPPED
+        indices, section_states = indices[continues], step.section_states[continues]
+        iteration = BroydenIteration.from_states(self.ground, indices, section_states, None)
+        refinement = refine(iteration, self.names, self.error_goal, 0)
+        refinement.is_done[refinement.is_done] = iteration.select(
+            refinement.is_done
+        ).is_attracting()
+        far_positions = np.flatnonzero(
+            refinement.is_done & (iteration.distance_to(section_states) > MAX_GAIT_DISTANCE)
+        )
+        refinement.is_done[far_positions] = iteration.select(far_positions).stays_near(
+            N_STABILITY_STEPS
+        )
+        refinement.n_steps[far_positions] += N_STABILITY_STEPS
+        self._record_gaits(indices, refinement, status)
+
+    def _record_gaits(
+        self, indices: np.ndarray, refinement: RefinementResult, status: MeasureStatus
+    ) -> None:
+        """Record gaits with unilateral contact."""
+        self.results["n_steps"][indices] += refinement.n_steps
+        indices, refinement = (
+            indices[refinement.is_done],
+            RefinementResult(*(part[refinement.is_done] for part in refinement)),
+        )
+        has_lower_gait = (self.lower_gaits.model_index[indices] != NO_MODEL)[:, None]
+        values = evaluate_measures(
+            self.names, np.where(has_lower_gait, self.lower_gaits.quantities[indices], np.nan)
+        )
+        self._record(indices, np.full(len(indices), UNILATERAL_MODEL_INDEX), status, {
+            "values": refinement.values, "errors": refinement.remaining_error + refinement.numerical_error,
+            "model_errors": values - refinement.values,
+            "numerical_errors": refinement.remaining_error + refinement.numerical_error, "speeds": refinement.speed,
+            "states": refinement.section_states,
+        })  # fmt: skip
+
+    def _record(
+        self,
+        indices: np.ndarray,
+        model_index: np.ndarray,
+        status: MeasureStatus,
+        new_results: dict[str, np.ndarray],
+    ) -> None:
+        for name, values in new_results.items():
+            self.results[name][indices] = values
+        self.results["models"][indices], self.results["statuses"][indices] = model_index, status
+        self.results["outcomes"][indices] = Outcome.STEPPED
+
+
+def _find_distinct_gaits(
+    results_of_starts: list[dict[str, np.ndarray]],
+) -> list[dict[str, np.ndarray]]:
+    """Return the gaits of one wheel that differ by more than their errors, slowest first."""
+    distinct: list[dict[str, np.ndarray]] = []
+    for candidate in results_of_starts:
+        differs = (
+            np.any(
+                np.abs(candidate["values"] - other["values"])
+                > candidate["errors"] + other["errors"]
+            )
+            for other in distinct
+        )
+        if candidate["models"] != NO_MODEL and all(differs):
+            distinct.append(candidate)
+    return sorted(distinct, key=lambda candidate: candidate["speeds"])

@@ -18,41 +18,41 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from vrw_jax.answers.asking import answer, known_lanes
-from vrw_jax.answers.climbing import Chord
-from vrw_jax.answers.lower import Lower, paper_gaits
-from vrw_jax.answers.quantities import MADE, measured
-from vrw_jax.answers.result import Answer
-from vrw_jax.answers.top import Ground
-from vrw_jax.numerics import Options, taken
+from vrw_jax.answers.asking import check_batch, measure_to_tolerance
+from vrw_jax.answers.climbing import BroydenIteration
+from vrw_jax.answers.lower import LowerFidelityGait, find_paper_gaits
+from vrw_jax.answers.quantities import MEASURE_FUNCTIONS, evaluate_measures
+from vrw_jax.answers.result import MeasureResult
+from vrw_jax.answers.top import GroundBatch
+from vrw_jax.numerics import StepOptions, take_rows
 from vrw_jax.results import MEASURES
-from vrw_jax.wheel import WheelParams, friction_of
+from vrw_jax.wheel import WheelParams, convert_friction
 from vrw_jax.wording import (
-    AbstractTold,
-    Row,
-    chosen,
-    instance,
-    positive,
-    require_known,
-    untraced,
-    whole,
+    AbstractPrintable,
+    TextRow,
+    check_choice,
+    check_int,
+    check_known_name,
+    check_not_traced,
+    check_positive,
+    check_type,
 )
 
-DEVIATIONS = 2.0
+N_STANDARD_ERRORS = 2.0
 """Number of standard errors in the stated error of a mean."""
-SHARE = 0.1
+GAIT_ERROR_SHARE = 0.1
 """Share of the mean's error that is allowed for each gait."""
-FEWEST = 8
+MIN_PILOT_GAITS = 8
 """Smallest number of wheels with a gait for an estimate of the variance."""
-FLAT = 1e-12
+SINGULAR_VALUE_TOLERANCE = 1e-12
 """Share of the largest singular value below which the pilot does not determine a direction."""
-CONTROLS = ("no control", "the paper's gaits", "the paper's gaits with one contact step")
-LOWER_COST = (0.0, 1.0, 2.0)
+CONTROL_NAMES = ("no control", "the paper's gaits", "the paper's gaits with one contact step")
+CONTROL_COSTS = (0.0, 1.0, 2.0)
 """Cost of a control in steps with unilateral contact: in batches, the paper's gait costs as much as
 one step."""
 
 
-class Average(AbstractTold):
+class MultifidelityMean(AbstractPrintable):
     """Mean of a measure over wheels with unilateral contact.
 
     - `measure`: its name;
@@ -74,37 +74,37 @@ class Average(AbstractTold):
 
     value: float
     error: float
-    n: float
-    n_top: float
+    n_gaits: float
+    n_high_fidelity: float
     weight: float
-    steps: float
-    steps_alone: float
+    cost: float
+    cost_high_fidelity_only: float
     measure: str = eqx.field(static=True)
     control: str = eqx.field(static=True)
 
-    def rows(self) -> list[Row]:
-        unit = MEASURES[self.measure].plain_unit
+    def summary_rows(self) -> list[TextRow]:
+        unit = MEASURES[self.measure].display_unit
         return [
             (f"mean {self.measure}", f"{self.value:.6g} ± {self.error:.1g} {unit}".strip()),
             (
                 "with unilateral contact",
-                f"{self.n_top:.0f} wheels, {self.n:.0f} of them with a gait",
+                f"{self.n_high_fidelity:.0f} wheels, {self.n_gaits:.0f} of them with a gait",
             ),
             ("control", f"{self.control}, weight {self.weight:.3g}"),
-            ("contact steps", f"{self.steps:.3g}, alone {self.steps_alone:.3g}"),
+            ("contact steps", f"{self.cost:.3g}, alone {self.cost_high_fidelity_only:.3g}"),
         ]
 
 
-class _Plan(NamedTuple):
+class _SamplingPlan(NamedTuple):
     """Sampling plan for a mean with one of the controls."""
 
-    steps: float  # expected
-    n: int  # number of wheels to draw
+    expected_cost: float  # expected
+    n_wheels: int  # number of wheels to draw
     weights: np.ndarray  # of the control's value, and of the flag that it has one
-    control: int
+    control_index: int
 
 
-def average(
+def multifidelity_mean(
     measure: str,
     params: WheelParams,
     tol: float,
@@ -113,7 +113,7 @@ def average(
     pilot: int = 32,
     seed: int = 0,
     stoppers: str = "bilateral",
-) -> Average:
+) -> MultifidelityMean:
     """Return the mean of a measure over these wheels with unilateral contact, to within `tol`.
 
     Fields of `params` and `friction` have one axis, of wheels: a design, or draws from
@@ -140,142 +140,197 @@ def average(
         >>> bool(mean.error < 1.1e-2)
         True
     """
-    untraced("vrw.average", "it on numbers, and give wheels as arrays", params, friction)
-    instance("measure", measure, str, "give the name of one, 'speed', say")
-    require_known(measure, tuple(MADE), "measure that every model has")
-    chosen("stoppers", stoppers, ("bilateral", "one-sided"))
-    tol, pilot = positive("tol", tol), whole("pilot", pilot, FEWEST, ", to tell a spread")
-    seed = whole("seed", seed, 0)
-    params, mu, shape = known_lanes(params, friction_of(friction))
-    n = len(mu)
-    if not shape or n <= pilot:
+    check_not_traced(
+        "vrw.multifidelity_mean", "it on numbers, and give wheels as arrays", params, friction
+    )
+    check_type("measure", measure, str, "give the name of one, 'speed', say")
+    check_known_name(measure, tuple(MEASURE_FUNCTIONS), "measure that every model has")
+    check_choice("stoppers", stoppers, ("bilateral", "one-sided"))
+    tol, pilot = (
+        check_positive("tol", tol),
+        check_int("pilot", pilot, MIN_PILOT_GAITS, ", to tell a spread"),
+    )
+    seed = check_int("seed", seed, 0)
+    params, mu, shape = check_batch(params, convert_friction(friction))
+    n_wheels = len(mu)
+    if not shape or n_wheels <= pilot:
         raise ValueError(
-            f"there are {n} wheels and a pilot of {pilot}, but a mean needs more wheels than its "
+            f"there are {n_wheels} wheels and a pilot of {pilot}, but a mean needs more wheels than its "
             "pilot: give lanes, params.damping of shape (1000,), say."
         )
-    wheels = _Wheels(measure, params, mu, stoppers)
-    order = np.random.default_rng(seed).permutation(n)
-    first, rest = order[:pilot], order[pilot:]
-    exact = wheels.asked(first, SHARE * tol)
-    found = exact.found
-    if np.sum(found) < FEWEST:
+    wheels = _WheelSample(measure, params, mu, stoppers)
+    permutation = np.random.default_rng(seed).permutation(n_wheels)
+    pilot_indices, other_indices = permutation[:pilot], permutation[pilot:]
+    pilot_results = wheels.measure_wheels(pilot_indices, GAIT_ERROR_SHARE * tol)
+    is_found = pilot_results.found
+    if np.sum(is_found) < MIN_PILOT_GAITS:
         raise ValueError(
-            f"{np.sum(found)} of the pilot's {pilot} wheels have a gait with contact, but a mean "
-            f"needs {FEWEST}: give other wheels, or a larger pilot."
+            f"{np.sum(is_found)} of the pilot's {pilot} wheels have a gait with contact, but a mean "
+            f"needs {MIN_PILOT_GAITS}: give other wheels, or a larger pilot."
         )
-    pilots = _Asked.of(exact)
-    known = [_columns(wheels.known(first, control)) for control in range(len(CONTROLS))]
-    plans = [_planned(i, pilots, x, tol, len(rest)) for i, x in enumerate(known)]
-    plan = min(plans, key=lambda plan: plan.steps)
-    drawn = wheels.asked(rest[: plan.n], SHARE * tol)
-    value, deviation = _estimated(
-        plan, pilots, _Asked.of(drawn), _columns(wheels.known(rest, plan.control))
+    pilot_sample = _SampledMeasures.from_results(pilot_results)
+    control_columns = [
+        _control_columns(wheels.evaluate_control(pilot_indices, control))
+        for control in range(len(CONTROL_NAMES))
+    ]
+    plans = [
+        _plan_sampling(i, pilot_sample, x, tol, len(other_indices))
+        for i, x in enumerate(control_columns)
+    ]
+    plan = min(plans, key=lambda plan: plan.expected_cost)
+    drawn_results = wheels.measure_wheels(other_indices[: plan.n_wheels], GAIT_ERROR_SHARE * tol)
+    value, standard_error = _estimate_mean(
+        plan,
+        pilot_sample,
+        _SampledMeasures.from_results(drawn_results),
+        _control_columns(wheels.evaluate_control(other_indices, plan.control_index)),
     )
-    gaits = np.concatenate([exact.error[found], drawn.error[drawn.found]])
-    return Average(
+    gait_errors = np.concatenate(
+        [pilot_results.error[is_found], drawn_results.error[drawn_results.found]]
+    )
+    return MultifidelityMean(
         value=value,
-        error=DEVIATIONS * deviation + float(np.mean(gaits)),
-        n=float(len(gaits)),
-        n_top=float(pilot + plan.n),
+        error=N_STANDARD_ERRORS * standard_error + float(np.mean(gait_errors)),
+        n_gaits=float(len(gait_errors)),
+        n_high_fidelity=float(pilot + plan.n_wheels),
         weight=float(plan.weights[0]),
-        steps=float(np.sum(exact.n_steps) + np.sum(drawn.n_steps)) + LOWER_COST[plan.control] * n,
-        steps_alone=pilots.price * pilot + plans[0].steps,
+        cost=float(np.sum(pilot_results.n_steps) + np.sum(drawn_results.n_steps))
+        + CONTROL_COSTS[plan.control_index] * n_wheels,
+        cost_high_fidelity_only=pilot_sample.mean_cost * pilot + plans[0].expected_cost,
         measure=measure,
-        control=CONTROLS[plan.control],
+        control=CONTROL_NAMES[plan.control_index],
     )
 
 
-class _Asked(NamedTuple):
+class _SampledMeasures(NamedTuple):
     """Measures of sampled wheels."""
 
-    total: np.ndarray  # the measure, zero if there is no gait
-    has: np.ndarray  # whether there is a gait
-    price: float  # mean number of steps per wheel
+    values: np.ndarray  # the measure, zero if there is no gait
+    has_gait: np.ndarray  # whether there is a gait
+    mean_cost: float  # mean number of steps per wheel
 
     @classmethod
-    def of(cls, told: Answer) -> "_Asked":
-        has = told.found.astype(float)
-        return cls(np.where(told.found, told.value, 0.0), has, float(np.mean(told.n_steps)))
+    def from_results(cls, results: MeasureResult) -> "_SampledMeasures":
+        has_gait = results.found.astype(float)
+        return cls(
+            np.where(results.found, results.value, 0.0), has_gait, float(np.mean(results.n_steps))
+        )
 
 
-class _Wheels(NamedTuple):
+class _WheelSample(NamedTuple):
     """Wheels of a sample and the measure to evaluate."""
 
-    measure: str
+    measure_name: str
     params: WheelParams
     friction: np.ndarray
     stoppers: str
 
-    def some(self, lanes: np.ndarray) -> WheelParams:
-        return jax.device_put(taken(self.params, lanes))
+    def take_wheels(self, indices: np.ndarray) -> WheelParams:
+        return jax.device_put(take_rows(self.params, indices))
 
-    def asked(self, lanes: np.ndarray, tol: float) -> Answer:
+    def measure_wheels(self, indices: np.ndarray, tol: float) -> MeasureResult:
         """Return the measure with unilateral contact."""
-        given = self.measure, self.some(lanes), tol
-        return answer(*given, friction=self.friction[lanes], stoppers=self.stoppers)
+        arguments = self.measure_name, self.take_wheels(indices), tol
+        return measure_to_tolerance(
+            *arguments, friction=self.friction[indices], stoppers=self.stoppers
+        )
 
-    def known(self, lanes: np.ndarray, control: int) -> np.ndarray:
+    def evaluate_control(self, indices: np.ndarray, control_index: int) -> np.ndarray:
         """Return the values of a control; NaN where it has none."""
-        told = np.full(len(lanes), np.nan)
-        if not control:
-            return told
-        options = Options()
-        lower = paper_gaits(self.some(lanes), options)
-        (has,) = np.nonzero(lower.rung)
-        lower = Lower(*(part[has] for part in lower))
-        values = measured([self.measure], lower.told)[:, 0]
-        if control == len(CONTROLS) - 1:
-            of = lanes[has]
-            ground = Ground.of(self.some(of), self.friction[of], self.stoppers, options)
-            every = np.arange(len(of))
-            x = ground.embedded(every, lower.x)
-            chord = Chord.of(ground, every, x, lower)
-            seen = chord.see(every, ground.step(every, x), [self.measure])
-            values = np.where(seen.same, seen.values[:, 0], values)
-        told[has] = values
-        return told
+        control_values = np.full(len(indices), np.nan)
+        if not control_index:
+            return control_values
+        options = StepOptions()
+        lower_gaits = find_paper_gaits(self.take_wheels(indices), options)
+        (has_gait,) = np.nonzero(lower_gaits.model_index)
+        lower_gaits = LowerFidelityGait(*(part[has_gait] for part in lower_gaits))
+        values = evaluate_measures([self.measure_name], lower_gaits.quantities)[:, 0]
+        if control_index == len(CONTROL_NAMES) - 1:
+            gait_indices = indices[has_gait]
+            ground = GroundBatch.from_params(
+                self.take_wheels(gait_indices), self.friction[gait_indices], self.stoppers, options
+            )
+            all_positions = np.arange(len(gait_indices))
+            section_states = ground.embed_states(all_positions, lower_gaits.section_state)
+            iteration = BroydenIteration.from_states(
+                ground, all_positions, section_states, lower_gaits
+            )
+            estimate = iteration.observe(
+                all_positions, ground.take_steps(all_positions, section_states), [self.measure_name]
+            )
+            values = np.where(estimate.same_codes, estimate.values[:, 0], values)
+        control_values[has_gait] = values
+        return control_values
 
 
-def _columns(known: np.ndarray) -> np.ndarray:
+def _control_columns(control_values: np.ndarray) -> np.ndarray:
     """Return for each wheel the control's value, and whether it has one."""
-    has = np.isfinite(known)
-    return np.column_stack([np.where(has, known, 0.0), has])
+    has_value = np.isfinite(control_values)
+    return np.column_stack([np.where(has_value, control_values, 0.0), has_value])
 
 
-def _planned(control: int, pilot: _Asked, x: np.ndarray, tol: float, n_rest: int) -> _Plan:
+def _plan_sampling(
+    control_index: int,
+    pilot_sample: _SampledMeasures,
+    control_columns: np.ndarray,
+    tol: float,
+    n_other: int,
+) -> _SamplingPlan:
     """Return weights and number of wheels from the pilot, for a mean to within `tol`.
 
     The mean M is over the wheels with a gait, a ratio. The controlled quantity is each wheel's
     measure minus M, zero for a wheel without a gait; its sum is zero.
     """
-    share = float(np.mean(pilot.has))
-    z = pilot.total - np.mean(pilot.total) / share * pilot.has
-    centred = x - np.mean(x, axis=0)
-    weights, _, rank, _ = np.linalg.lstsq(centred, z, rcond=FLAT)
-    squares = float(np.sum((z - centred @ weights) ** 2)) + _unseen(pilot, z)
-    left = squares / (len(z) - 1 - int(rank))
-    wanted = left * (DEVIATIONS / ((1.0 - SHARE) * tol * share)) ** 2
-    n = min(n_rest, max(FEWEST, math.ceil(wanted / (1.0 + wanted / n_rest))))
-    return _Plan(n * pilot.price + LOWER_COST[control] * n_rest, n, weights, control)
+    gait_share = float(np.mean(pilot_sample.has_gait))
+    centered_values = (
+        pilot_sample.values - np.mean(pilot_sample.values) / gait_share * pilot_sample.has_gait
+    )
+    centered_columns = control_columns - np.mean(control_columns, axis=0)
+    weights, _, rank, _ = np.linalg.lstsq(
+        centered_columns, centered_values, rcond=SINGULAR_VALUE_TOLERANCE
+    )
+    squares = float(np.sum((centered_values - centered_columns @ weights) ** 2)) + _unseen_variance(
+        pilot_sample, centered_values
+    )
+    residual_variance = squares / (len(centered_values) - 1 - int(rank))
+    n_required = (
+        residual_variance * (N_STANDARD_ERRORS / ((1.0 - GAIT_ERROR_SHARE) * tol * gait_share)) ** 2
+    )
+    n_wheels = min(
+        n_other, max(MIN_PILOT_GAITS, math.ceil(n_required / (1.0 + n_required / n_other)))
+    )
+    return _SamplingPlan(
+        n_wheels * pilot_sample.mean_cost + CONTROL_COSTS[control_index] * n_other,
+        n_wheels,
+        weights,
+        control_index,
+    )
 
 
-def _estimated(plan: _Plan, pilot: _Asked, drawn: _Asked, x: np.ndarray) -> tuple[float, float]:
+def _estimate_mean(
+    plan: _SamplingPlan,
+    pilot_sample: _SampledMeasures,
+    drawn_sample: _SampledMeasures,
+    control_columns: np.ndarray,
+) -> tuple[float, float]:
     """Return the mean and its standard error. `control_columns` are of all wheels but the pilot;
     the first ones were drawn."""
-    n, known = len(x), x @ plan.weights
-    count = np.sum(pilot.has) + n * np.mean(drawn.has)
-    less = drawn.total - known[: plan.n]
-    mean = (np.sum(pilot.total) + n * (np.mean(known) + np.mean(less))) / count
-    squares = plan.n * np.var(less - mean * drawn.has)
-    squares += _unseen(pilot, pilot.total - mean * pilot.has)
-    variance = squares / (plan.n - 1) / plan.n * (1.0 - plan.n / n)
-    return float(mean), float(n / count * math.sqrt(variance))
+    n_wheels, control_values = len(control_columns), control_columns @ plan.weights
+    gait_count = np.sum(pilot_sample.has_gait) + n_wheels * np.mean(drawn_sample.has_gait)
+    differences = drawn_sample.values - control_values[: plan.n_wheels]
+    mean = (
+        np.sum(pilot_sample.values) + n_wheels * (np.mean(control_values) + np.mean(differences))
+    ) / gait_count
+    squares = plan.n_wheels * np.var(differences - mean * drawn_sample.has_gait)
+    squares += _unseen_variance(pilot_sample, pilot_sample.values - mean * pilot_sample.has_gait)
+    variance = squares / (plan.n_wheels - 1) / plan.n_wheels * (1.0 - plan.n_wheels / n_wheels)
+    return float(mean), float(n_wheels / gait_count * math.sqrt(variance))
 
 
-def _unseen(pilot: _Asked, z: np.ndarray) -> float:
+def _unseen_variance(pilot_sample: _SampledMeasures, centered_values: np.ndarray) -> float:
     """Return the variance of one extra wheel that the control predicts wrongly, if gaits are lost.
 
     A small sample may contain no wheel with a gait of the paper's model and without one of
     unilateral contact.
     """
-    return 0.0 if np.all(pilot.has) else float(np.var(z))
+    return 0.0 if np.all(pilot_sample.has_gait) else float(np.var(centered_values))

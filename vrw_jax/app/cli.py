@@ -16,19 +16,25 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from vrw_jax.app import printing, scanning
-from vrw_jax.app.printing import INTERRUPTED, complain, err, out, sentences
+from vrw_jax.app.printing import (
+    INTERRUPTED_EXIT_CODE,
+    print_error,
+    report_errors,
+    stderr_console,
+    stdout_console,
+)
 
 if TYPE_CHECKING:
     from vrw_jax.app.config import Config
 
-FACT_FAILED, NOT_CONVERGED = 1, 1
+FACT_FAILED_EXIT_CODE, NOT_CONVERGED_EXIT_CODE = 1, 1
 """Exit codes of a failed fact and of a run that did not converge."""
 
-Folder = Annotated[
+FolderOption = Annotated[
     Path | None,
     typer.Option("--out", help="Folder for the result; results/NAME of the config by default."),
 ]
-Picture = Annotated[bool, typer.Option(help="Draw the result.")]
+PictureOption = Annotated[bool, typer.Option(help="Draw the result.")]
 """Options that several commands share."""
 
 app = typer.Typer(
@@ -59,12 +65,12 @@ def _stop(_signal: int, _frame: object) -> None:
 def _stop_at_once(_signal: int, _frame: object) -> None:
     """Handle the second Ctrl-C: end the process at once."""
     os.write(2, b"vrw: stopped at once; run the same to go on.\n")
-    os._exit(INTERRUPTED)
+    os._exit(INTERRUPTED_EXIT_CODE)
 
 
-def _version(wanted: bool) -> None:
+def _print_version(is_wanted: bool) -> None:
     """Print the version and exit, if wanted."""
-    if wanted:
+    if is_wanted:
         try:
             number = importlib.metadata.version("vrw-jax")
         except importlib.metadata.PackageNotFoundError:
@@ -76,7 +82,8 @@ def _version(wanted: bool) -> None:
 @app.callback()
 def root(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
+        bool,
+        typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version."),
     ] = False,
 ) -> None:
     """The passive viscoelastic-legged rimless wheel: walk it, reproduce the paper, scan it.
@@ -131,38 +138,38 @@ def gait(
 
       vrw gait configs/table1.toml --steps 50
     """
-    with sentences():
-        settings = _settings(config)
-        from vrw_jax.app.config import assignment
+    with report_errors():
+        settings = _load_config(config)
+        from vrw_jax.app.config import parse_assignment
 
-        params = settings.params(dict(assignment(text) for text in changes or []))
+        params = settings.make_wheel(dict(parse_assignment(text) for text in changes or []))
         import jax.numpy as jnp
 
-        from vrw_jax.cycles import finder_of, serving_and_why
+        from vrw_jax.cycles import make_finder, resolve_model_with_reason
         from vrw_jax.gaits import limit_cycle
         from vrw_jax.walks import step
         from vrw_jax.wheel import Outcome
 
-        model: Any = settings.wheel_model()
-        options = settings.numerical_options()
+        model: Any = settings.make_model()
+        options = settings.make_options()
         start = settings.gait.start
-        state = model.start(params) if start is None else jnp.asarray(start)
-        state = model.full_section(params, state)
-        walked, n_steps = 0, steps or settings.gait.steps
-        with err.status("walking (the first time compiles for a while)"):
+        state = model.default_start(params) if start is None else jnp.asarray(start)
+        state = model.embed_section(params, state)
+        n_walked, n_steps = 0, steps or settings.gait.steps
+        with stderr_console.status("walking (the first time compiles for a while)"):
             while True:
                 result: Any = step(params, state, model=model, options=options)
-                stepped = int(result.outcome) == Outcome.STEPPED
-                walked += stepped
-                if not stepped or walked == n_steps:
+                has_stepped = int(result.outcome) == Outcome.STEPPED
+                n_walked += has_stepped
+                if not has_stepped or n_walked == n_steps:
                     break
                 state = result.section_state
-            model, why = serving_and_why(params, model)
-            cold = start is None or finder_of(model, params.n_legs).from_nothing
-            cycle: Any = limit_cycle(params, guess=None if cold else state, model=model)
-        printing.tell_gait(params, result, state, walked, cycle)
-        if why:
-            out.print(why)
+            model, reason = resolve_model_with_reason(params, model)
+            needs_no_guess = start is None or make_finder(model, params.n_legs).supports_cold_start
+            cycle: Any = limit_cycle(params, guess=None if needs_no_guess else state, model=model)
+        printing.print_gait(params, result, state, n_walked, cycle)
+        if reason:
+            stdout_console.print(reason)
 
 
 @app.command()
@@ -174,12 +181,12 @@ def explore(
     rung: Annotated[str, typer.Option(help="viscoelastic, rigid or unilateral.")] = "viscoelastic",
 ) -> None:
     """Open an interactive page of the wheel in your browser; the page computes by itself."""
-    with sentences():
-        from vrw_jax.app.config import assignment
-        from vrw_jax.web import page_address
+    with report_errors():
+        from vrw_jax.app.config import parse_assignment
+        from vrw_jax.web import make_page_address
 
-        params = _settings(None).params(dict(assignment(t) for t in changes or []))
-        address = page_address(params, rung)
+        params = _load_config(None).make_wheel(dict(parse_assignment(t) for t in changes or []))
+        address = make_page_address(params, rung)
         webbrowser.open(address)
         print(address)
 
@@ -192,36 +199,36 @@ def init(
 
     Existing files are kept. If an existing file differs, the command names it and writes nothing.
     """
-    with sentences():
-        source = _examples()
+    with report_errors():
+        source = _find_example_configs()
         texts = {path.name: path.read_text(encoding="utf-8") for path in source.glob("*.toml")}
-        there = [folder / name for name in sorted(texts) if (folder / name).exists()]
-        for path in there:
+        existing = [folder / name for name in sorted(texts) if (folder / name).exists()]
+        for path in existing:
             if path.read_text(encoding="utf-8", errors="replace") != texts[path.name]:
                 raise ValueError(f"{path} is there already and differs: give another folder.")
-        _require_place(folder)
+        _require_writable(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        new = [folder / name for name in sorted(texts) if folder / name not in there]
-        for path in new:
+        missing = [folder / name for name in sorted(texts) if folder / name not in existing]
+        for path in missing:
             path.write_text(texts[path.name], encoding="utf-8")
-        printing.tell_written(new)
-        if not new:
-            out.print(f"{folder} has them all: nothing to write.", highlight=False)
+        printing.print_written_paths(missing)
+        if not missing:
+            stdout_console.print(f"{folder} has them all: nothing to write.", highlight=False)
 
 
-def _examples() -> Path:
+def _find_example_configs() -> Path:
     """Return the folder of the example configs, inside an installed package or beside it."""
     package = Path(__file__).parents[1]
     return next(p for p in (package / "configs", package.parent / "configs") if p.is_dir())
 
 
-def _require_place(folder: Path) -> None:
+def _require_writable(folder: Path) -> None:
     """Raise if the folder cannot be written to, without creating it."""
-    there = folder
-    while not there.exists():
-        there = there.parent
+    existing = folder
+    while not existing.exists():
+        existing = existing.parent
     try:
-        with tempfile.TemporaryDirectory(dir=there):
+        with tempfile.TemporaryDirectory(dir=existing):
             pass
     except OSError as error:
         raise ValueError(
@@ -242,28 +249,29 @@ def reproduce(
     """
     from vrw_jax.runtime import start_jax
 
-    with sentences():
+    with report_errors():
         start_jax()
-        _require_place(folder)
+        _require_writable(folder)
     from vrw_jax.paper import reproduce as run
 
     with (
-        sentences(f"stopped; what is done stays in {folder}."),
-        printing.progress_bar("reproducing the paper") as bar,
+        report_errors(f"stopped; what is done stays in {folder}."),
+        printing.make_progress_bar("reproducing the paper") as bar,
     ):
         task = bar.add_task("starting", total=1.0)
         facts = run(
-            folder, progress=lambda share, what: bar.update(task, completed=share, description=what)
+            folder,
+            on_progress=lambda share, what: bar.update(task, completed=share, description=what),
         )
-    printing.tell_facts(facts, folder)
+    printing.print_facts(facts, folder)
     if not all(fact.holds for fact in facts):
-        raise typer.Exit(FACT_FAILED)
+        raise typer.Exit(FACT_FAILED_EXIT_CODE)
 
 
 @app.command()
 def scan(
     config: Annotated[Path, typer.Argument(help="TOML file with the samples and measures.")],
-    folder: Folder = None,
+    folder: FolderOption = None,
     explain: Annotated[
         bool,
         typer.Option(
@@ -283,7 +291,7 @@ def scan(
             help="Compute on the dask cluster at this address; 'local' starts one here.",
         ),
     ] = None,
-    picture: Picture = True,
+    picture: PictureOption = True,
 ) -> None:
     """Find the steady gait of every sample of a design, with its outcome and margins.
 
@@ -299,54 +307,59 @@ def scan(
 
       vrw scan configs/quickstart.toml --dask tcp://host:8786
     """
-    with sentences():
-        settings, folder = _asked(config, folder, "design")
-        planned, store = scanning.planned_scan(settings, chunk), folder / "scan.zarr"
-        from vrw_jax.scans import explained
+    with report_errors():
+        settings, folder = _load_config_for(config, folder, "design")
+        plan, store = scanning.plan_config_scan(settings, chunk), folder / "scan.zarr"
+        from vrw_jax.scans import forecast_scan
 
         if explain:
-            with err.status("measuring some samples (the first time compiles for a while)"):
-                told = explained(planned, store) | {"store": str(store)}
-            printing.tell_table("What this scan would do", told.items())
+            with stderr_console.status(
+                "measuring some samples (the first time compiles for a while)"
+            ):
+                forecast = forecast_scan(plan, store) | {"store": str(store)}
+            printing.print_table("What this scan would do", forecast.items())
             return
         if verify:
-            scanning.verify_store(planned, store)
+            scanning.verify_store(plan, store)
             return
-        _require_place(folder)
-    dataset = scanning.compute_scan(planned, store, dask)
-    printing.tell_outcomes(dataset)
-    out.print(f"data: {store}", highlight=False, soft_wrap=True)
+        _require_writable(folder)
+    dataset = scanning.compute_scan(plan, store, dask)
+    printing.print_outcomes(dataset)
+    stdout_console.print(f"data: {store}", highlight=False, soft_wrap=True)
     if picture:
         from vrw_jax.app.reports import write_scan
 
-        printing.tell_written(write_scan(dataset, folder))
+        printing.print_written_paths(write_scan(dataset, folder))
 
 
 @app.command("map")
-def map_borders(
+def map_special_points(
     config: Annotated[Path, typer.Argument(help="TOML file with a grid over two parameters.")],
-    folder: Folder = None,
+    folder: FolderOption = None,
 ) -> None:
     """Draw all special points of gaits over two parameters: `vrw map configs/map_c_k.toml`."""
-    with sentences():
-        settings, folder = _asked(config, folder, "design", "map")
+    with report_errors():
+        settings, folder = _load_config_for(config, folder, "design", "map")
         from vrw_jax.app.reports import require_map, write_map
-        from vrw_jax.branches import SCANNED
+        from vrw_jax.branches import SPECIAL_POINT_MEASURES
 
-        planned = scanning.planned_scan(settings, None, SCANNED)
-        require_map(planned.design)
-        _require_place(folder)
-    dataset = scanning.compute_scan(planned, folder / "scan.zarr", None)
+        plan = scanning.plan_config_scan(settings, None, SPECIAL_POINT_MEASURES)
+        require_map(plan.design)
+        _require_writable(folder)
+    dataset = scanning.compute_scan(plan, folder / "scan.zarr", None)
 
-    with sentences(), err.status("following borders (the first time compiles for minutes)"):
-        printing.tell_written(write_map(dataset, settings, folder))
+    with (
+        report_errors(),
+        stderr_console.status("following borders (the first time compiles for minutes)"),
+    ):
+        printing.print_written_paths(write_map(dataset, settings, folder))
 
 
 @app.command()
 def tune(
     config: Annotated[Path, typer.Argument(help="TOML file with objective, bounds, constraints.")],
-    folder: Folder = None,
-    picture: Picture = True,
+    folder: FolderOption = None,
+    picture: PictureOption = True,
 ) -> None:
     """Tune a wheel: find the best gait within bounds that satisfies its constraints.
 
@@ -363,37 +376,37 @@ def tune(
 
       vrw gait results/steady/wheel.toml
     """
-    with sentences():
-        settings, folder = _asked(config, folder, "tune")
-        sought = settings.tune
-        assert sought is not None
-        _require_place(folder)
-        from vrw_jax.app.reports import write_tuned
+    with report_errors():
+        settings, folder = _load_config_for(config, folder, "tune")
+        tune_config = settings.tune
+        assert tune_config is not None
+        _require_writable(folder)
+        from vrw_jax.app.reports import write_tuning
         from vrw_jax.tuning import tune as run
 
-        with err.status("tuning (the first time compiles for a while)"):
-            tuned = run(
-                settings.params(),
-                sought.objective,
-                tuple(sought.bounds),
-                sought.bounds,
-                sought.constraints,
-                model=settings.wheel_model(),
-                options=settings.numerical_options(),
-                max_evaluations=sought.evaluations,
+        with stderr_console.status("tuning (the first time compiles for a while)"):
+            result = run(
+                settings.make_wheel(),
+                tune_config.objective,
+                tuple(tune_config.bounds),
+                tune_config.bounds,
+                tune_config.constraints,
+                model=settings.make_model(),
+                options=settings.make_options(),
+                max_evaluations=tune_config.evaluations,
             )
-        printing.tell_table("Tuned gait", tuned.lines().items())
-        printing.tell_written(write_tuned(tuned, folder, picture))
-    if not tuned.converged:
-        complain(f"this is no optimum ({tuned.ending.name}): what was reached is written.")
-        raise typer.Exit(NOT_CONVERGED)
+        printing.print_table("Tuned gait", result.describe().items())
+        printing.print_written_paths(write_tuning(result, folder, picture))
+    if not result.converged:
+        print_error(f"this is no optimum ({result.status.name}): what was reached is written.")
+        raise typer.Exit(NOT_CONVERGED_EXIT_CODE)
 
 
 @app.command("continue")
 def continue_(
     config: Annotated[Path, typer.Argument(help=r"TOML file with a table \[branch].")],
-    folder: Folder = None,
-    picture: Picture = True,
+    folder: FolderOption = None,
+    picture: PictureOption = True,
 ) -> None:
     """Continue a branch of stable and unstable gaits along a parameter, with its special points.
 
@@ -407,49 +420,49 @@ def continue_(
 
       vrw continue configs/branch_damping.toml --out results/along_c --no-picture
     """
-    with sentences():
-        settings, folder = _asked(config, folder, "branch")
-        asked = settings.branch
-        assert asked is not None
-        _require_place(folder)
+    with report_errors():
+        settings, folder = _load_config_for(config, folder, "branch")
+        branch_config = settings.branch
+        assert branch_config is not None
+        _require_writable(folder)
         from vrw_jax.app.reports import write_branch
         from vrw_jax.branches import continue_branch
         from vrw_jax.numerics import ArclengthOptions
 
         options = ArclengthOptions()
-        if asked.largest_step is not None:
-            first = min(options.first_step, asked.largest_step)
-            options = ArclengthOptions(first_step=first, largest_step=asked.largest_step)
-        with err.status("following the branch (the first time compiles for a while)"):
+        if branch_config.max_ds is not None:
+            initial_ds = min(options.initial_ds, branch_config.max_ds)
+            options = ArclengthOptions(initial_ds=initial_ds, max_ds=branch_config.max_ds)
+        with stderr_console.status("following the branch (the first time compiles for a while)"):
             branch = continue_branch(
-                settings.params(),
-                asked.parameter,
-                asked.bounds,
-                period_n=asked.period,
-                model=settings.wheel_model(),
+                settings.make_wheel(),
+                branch_config.parameter,
+                branch_config.bounds,
+                period_n=branch_config.period,
+                model=settings.make_model(),
                 options=options,
             )
         if not branch.values.size:
-            complain(
+            print_error(
                 f"there is no gait to start from ({branch.outcome.name}: "
                 f"{branch.outcome.meaning[:-1]}): give a wheel that walks, such as that of Table 1."
             )
-            raise typer.Exit(NOT_CONVERGED)
-        out.print(str(branch), highlight=False, markup=False)
-        printing.tell_written(write_branch(branch, folder, picture))
+            raise typer.Exit(NOT_CONVERGED_EXIT_CODE)
+        stdout_console.print(str(branch), highlight=False, markup=False)
+        printing.print_written_paths(write_branch(branch, folder, picture))
 
 
-def _settings(path: Path | None) -> "Config":
+def _load_config(path: Path | None) -> "Config":
     """Start JAX, and return the config at `path` or the default config."""
     from vrw_jax.runtime import start_jax
 
     start_jax()
-    from vrw_jax.app.config import Config, load
+    from vrw_jax.app.config import Config, load_config
 
-    return Config() if path is None else load(path)
+    return Config() if path is None else load_config(path)
 
 
-NEEDED = {
+MISSING_TABLE_MESSAGES = {
     "design": "has no samples, but a scan needs a design: add a table [grid], [samples], [sobol], "
     "[uniform] or [saltelli], as in configs/quickstart.toml of `vrw init`.",
     "tune": "seeks nothing, but tuning needs an objective and bounds: add the tables [tune] and "
@@ -459,7 +472,7 @@ NEEDED = {
 }
 """Messages about a config that lacks the table that a command needs."""
 
-SERVES = {
+SUPPORTED_MODELS = {
     "design": ("viscoelastic", "unilateral", "auto"),
     "map": ("viscoelastic",),
     "tune": ("viscoelastic", "unilateral"),
@@ -468,18 +481,18 @@ SERVES = {
 """Models that each command supports."""
 
 
-def _asked(
-    path: Path, folder: Path | None, needed: str, command: str = ""
+def _load_config_for(
+    path: Path, folder: Path | None, table: str, command: str = ""
 ) -> tuple["Config", Path]:
     """Return the config and the folder of the result; raise if the needed table is missing."""
-    settings = _settings(path)
-    if getattr(settings, needed) is None:
-        raise ValueError(f"{settings.name} {NEEDED[needed]}")
-    serves = SERVES[command or needed]
-    if settings.rung not in serves:
+    settings = _load_config(path)
+    if getattr(settings, table) is None:
+        raise ValueError(f"{settings.file_name} {MISSING_TABLE_MESSAGES[table]}")
+    supported = SUPPORTED_MODELS[command or table]
+    if settings.model_name not in supported:
         raise ValueError(
-            f"{settings.name} names the rung {settings.rung}, but this command takes "
-            f"{', '.join(serves)}: write {'one of these' if len(serves) > 1 else 'that'} below "
+            f"{settings.file_name} names the rung {settings.model_name}, but this command takes "
+            f"{', '.join(supported)}: write {'one of these' if len(supported) > 1 else 'that'} below "
             "[model]."
         )
     return settings, Path("results") / path.stem if folder is None else folder

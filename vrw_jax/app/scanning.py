@@ -6,66 +6,72 @@ from typing import TYPE_CHECKING
 import typer
 
 from vrw_jax.app import printing
-from vrw_jax.app.printing import complain, out, sentences
+from vrw_jax.app.printing import print_error, report_errors, stdout_console
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from vrw_jax.app.config import Config
-    from vrw_jax.scans import Plan
+    from vrw_jax.scans import ScanPlan
 
-DAMAGED = 1
+DAMAGED_EXIT_CODE = 1
 """Exit code if a store is damaged."""
 
 
-def planned_scan(settings: "Config", chunk: int | None, also: tuple[str, ...] = ()) -> "Plan":
+def plan_config_scan(
+    settings: "Config", chunk: int | None, additional_measures: tuple[str, ...] = ()
+) -> "ScanPlan":
     """Return the plan of the config's scan, with the additional measures."""
-    from vrw_jax.scans import plan
+    from vrw_jax.scans import plan_scan
 
     assert settings.design is not None
     measures = settings.scan.measures
-    if also:
-        measures = tuple(dict.fromkeys((*(measures or ("dls_fraction",)), *also)))
-    return plan(
+    if additional_measures:
+        measures = tuple(dict.fromkeys((*(measures or ("dls_fraction",)), *additional_measures)))
+    return plan_scan(
         settings.design,
         measures,
-        base=settings.params(),
-        model=settings.wheel_model(),
-        options=settings.numerical_options(),
+        base=settings.make_wheel(),
+        model=settings.make_model(),
+        options=settings.make_options(),
         chunk=chunk or settings.scan.chunk,
-        text=settings.text,
+        config_text=settings.source_text,
         tol=settings.scan.tol,
     )
 
 
-def verify_store(planned: "Plan", store: Path) -> None:
+def verify_store(plan: "ScanPlan", store: Path) -> None:
     """Print whether a store is complete and intact; exit with code 1 if it is damaged."""
-    from vrw_jax.scans import found_store
+    from vrw_jax.scans import find_store
 
-    kept = found_store(planned, store)
-    if kept is None:
+    zarr_store = find_store(plan, store)
+    if zarr_store is None:
         raise ValueError(f"there is no store {store} to verify: run the same without --verify.")
-    if kept.damage:
-        complain(f"{kept.damage}: run the same without --verify, which computes these again.")
-        raise typer.Exit(DAMAGED)
-    n, missing = planned.layout.n_chunks, len(kept.missing())
-    told = f"lacks {missing:,} of {n:,} chunks, the others are" if missing else "is complete and"
-    out.print(f"{store} {told} sound.", highlight=False, soft_wrap=True)
+    if zarr_store.damage_description:
+        print_error(
+            f"{zarr_store.damage_description}: run the same without --verify, which computes these again."
+        )
+        raise typer.Exit(DAMAGED_EXIT_CODE)
+    n, missing = plan.layout.n_chunks, len(zarr_store.find_missing_chunks())
+    state_text = (
+        f"lacks {missing:,} of {n:,} chunks, the others are" if missing else "is complete and"
+    )
+    stdout_console.print(f"{store} {state_text} sound.", highlight=False, soft_wrap=True)
 
 
-def compute_scan(planned: "Plan", store: Path, dask: str | None) -> "xr.Dataset":
+def compute_scan(plan: "ScanPlan", store: Path, dask: str | None) -> "xr.Dataset":
     """Compute the chunks that the store lacks, with a progress bar, and return its dataset."""
-    from vrw_jax.scans import carried, open_store, run
+    from vrw_jax.scans import open_or_create_store, resolve_executor, run_scan
 
-    stopped = f"stopped; what is done stays in {store}, run the same to go on."
-    with sentences(stopped), carried(dask) as through:
-        kept = open_store(planned, store)
-        if kept.damage:
-            complain(f"{kept.damage}: computed again.")
-        elif not kept.missing():
-            out.print(f"{store} is complete: nothing to compute.", highlight=False)
-            return kept.dataset()
-        with printing.progress_bar("scan") as bar:
+    interruption_message = f"stopped; what is done stays in {store}, run the same to go on."
+    with report_errors(interruption_message), resolve_executor(dask) as executor:
+        zarr_store = open_or_create_store(plan, store)
+        if zarr_store.damage_description:
+            print_error(f"{zarr_store.damage_description}: computed again.")
+        elif not zarr_store.find_missing_chunks():
+            stdout_console.print(f"{store} is complete: nothing to compute.", highlight=False)
+            return zarr_store.load_dataset()
+        with printing.make_progress_bar("scan") as bar:
             task = bar.add_task("compiling", total=None, note="")
-            report = printing.scan_reporter(bar.update, task)
-            return run(planned, kept, report=report, through=through)
+            report = printing.make_scan_reporter(bar.update, task)
+            return run_scan(plan, zarr_store, on_progress=report, executor=executor)

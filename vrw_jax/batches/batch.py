@@ -18,60 +18,66 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from vrw_jax.batches.fixed_work import fixed_gait_step
-from vrw_jax.batches.floors import over_floors
-from vrw_jax.batches.ground import ON_GROUND, on_ground
-from vrw_jax.batches.programs import run_lanes
+from vrw_jax.batches.fixed_work import collocation_gait_step
+from vrw_jax.batches.floors import walk_uneven_ground
+from vrw_jax.batches.ground import CONTACT_STEP_INPUTS, step_batch_with_contact
+from vrw_jax.batches.programs import run_compiled
 from vrw_jax.batches.stiffness import (
-    IMPLICIT,
     IMPLICIT_SOLVER,
-    NAMED,
-    STABLE,
+    IMPLICIT_SOLVER_INDEX,
+    NAMED_SOLVER_INDEX,
     STABLE_SOLVER,
-    TIGHTER,
-    cheapest_solver,
+    STABLE_SOLVER_INDEX,
+    TSIT5_TOLERANCE_FACTOR,
+    select_solver,
 )
-from vrw_jax.batches.walked import START, Steps, Walked, only
+from vrw_jax.batches.walked import START_NAME, StepBatchResult, WalkBatch, lane_index
 from vrw_jax.models import (
-    DIRECTIONS,
+    N_STEP_INPUTS,
     AbstractWheel,
-    Advance,
-    along_all,
-    along_units,
+    AdvanceResult,
     gait_step,
+    jacobian_columns,
+    scaled_jacobian_columns,
 )
-from vrw_jax.numerics import Options, explicit_tableau, in_batches
-from vrw_jax.walks import options_of, rung_of, state_of
-from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, WheelParams, wheel_of
+from vrw_jax.numerics import StepOptions, load_explicit_tableau, map_in_batches
+from vrw_jax.walks import check_model, check_options, check_section_state
+from vrw_jax.wheel import (
+    FRICTION_NAME,
+    PARAMETER_NAMES,
+    Outcome,
+    WheelParams,
+    wheel_from_parameters,
+)
 from vrw_jax.wording import (
-    chosen,
-    instance,
-    known_reals,
-    untraced,
-    whole,
+    check_choice,
+    check_int,
+    check_not_traced,
+    check_numpy_reals,
+    check_type,
 )
 
 BatchEngine = Literal["auto", "lanes", "diffrax", "collocation"]
-ENGINES: tuple[str, ...] = get_args(BatchEngine)
+BATCH_ENGINE_NAMES: tuple[str, ...] = get_args(BatchEngine)
 
-BY_PHASES = (START, *PARAMETER_NAMES)
+PAPER_STEP_INPUTS = (START_NAME, *PARAMETER_NAMES)
 """Inputs with respect to which a step of the paper's model can be differentiated."""
 
-MAPPED = 256
+DIFFRAX_BATCH_SIZE = 256
 """Number of batch elements that the diffrax engine takes at a time."""
 
 
-def steps(
+def step_batch(
     params: WheelParams,
     states: Array | np.ndarray,
     n_steps: int = 1,
     *,
     model: AbstractWheel | None = None,
-    options: Options | None = None,
+    options: StepOptions | None = None,
     engine: BatchEngine = "auto",
     durations: Array | np.ndarray | None = None,
     derivatives: Sequence[str] = (),
-) -> Steps:
+) -> StepBatchResult:
     """Return the result of up to `n_steps` gait steps of many wheels, with derivatives if
     requested.
 
@@ -121,32 +127,44 @@ def steps(
         >>> result.durations.shape, result.n_stepped.tolist(), result.engine
         ((3, 3), [10, 10, 10], 'lanes')
     """
-    untraced("vrw.steps", "map vrw.return_map over the lanes", params, states, durations)
-    instance("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
-    rung, options = rung_of(model, many=True), options_of(options)
-    chosen("engine", engine, ENGINES)
-    n_steps = whole("n_steps", n_steps)
-    x: np.ndarray = state_of(states, "states", known_reals)
-    columns = _columns(params, x, rung, options, n_steps)
-    x = x.astype(columns[0].dtype, copy=False)
-    by_legs = rung.lanes == "legs"
-    given = rung, columns, x, n_steps, options, engine, params.n_legs
-    if any(np.ndim(column) == 2 for column in (*columns, getattr(rung, FRICTION, 0.0))):
-        return over_floors(*given, derivatives)
-    moved = _moved(derivatives, ON_GROUND if by_legs else BY_PHASES, engine)
-    return on_ground(*given, moved) if by_legs else _by_phases(*given, durations, moved)
+    check_not_traced(
+        "vrw.step_batch", "map vrw.return_map over the lanes", params, states, durations
+    )
+    check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
+    checked_model, options = check_model(model, allows_arrays=True), check_options(options)
+    check_choice("engine", engine, BATCH_ENGINE_NAMES)
+    n_steps = check_int("n_steps", n_steps)
+    checked_states: np.ndarray = check_section_state(states, "states", check_numpy_reals)
+    columns = _check_columns(params, checked_states, checked_model, options, n_steps)
+    checked_states = checked_states.astype(columns[0].dtype, copy=False)
+    has_contact_kernel = checked_model.batch_kernel == "legs"
+    arguments = checked_model, columns, checked_states, n_steps, options, engine, params.n_legs
+    if any(
+        np.ndim(column) == 2 for column in (*columns, getattr(checked_model, FRICTION_NAME, 0.0))
+    ):
+        return walk_uneven_ground(*arguments, derivatives)
+    derivative_names = _check_derivatives(
+        derivatives, CONTACT_STEP_INPUTS if has_contact_kernel else PAPER_STEP_INPUTS, engine
+    )
+    return (
+        step_batch_with_contact(*arguments, derivative_names)
+        if has_contact_kernel
+        else _step_paper_model(*arguments, durations, derivative_names)
+    )
 
 
-def _moved(derivatives: Sequence[str], known: tuple[str, ...], engine: str) -> list[str]:
+def _check_derivatives(
+    derivatives: Sequence[str], known_names: tuple[str, ...], engine: str
+) -> list[str]:
     """Return the names of the inputs to differentiate by.
 
     Raises: ValueError: a name is unknown, or the engine has no derivatives.
     """
     names = [derivatives] if isinstance(derivatives, str) else list(derivatives)
     for name in names:
-        if name not in known:
+        if name not in known_names:
             raise ValueError(
-                f"derivatives name {name!r}, but a step moves with one of {', '.join(known)}."
+                f"derivatives name {name!r}, but a step moves with one of {', '.join(known_names)}."
             )
     if names and engine == "collocation":
         raise ValueError(
@@ -156,8 +174,12 @@ def _moved(derivatives: Sequence[str], known: tuple[str, ...], engine: str) -> l
     return names
 
 
-def _columns(
-    params: WheelParams, states: np.ndarray, model: AbstractWheel, options: Options, n_steps: int
+def _check_columns(
+    params: WheelParams,
+    states: np.ndarray,
+    model: AbstractWheel,
+    options: StepOptions,
+    n_steps: int,
 ) -> list[np.ndarray]:
     """Return the parameters, one value for all or one per element, with slopes of each step too.
 
@@ -171,78 +193,92 @@ def _columns(
             f"states have shape {states.shape}, but they are section states, shape (lanes, "
             f"{' or '.join(map(str, sizes))}): write states[None] for a single one."
         )
-    n, columns = len(states), [getattr(params, name) for name in PARAMETER_NAMES]
-    held = np.result_type(*(column.dtype for column in columns))
-    Options.require_reachable(options, held)  # equinox takes 0.1 ms for a bound method
-    of_ground = getattr(model, FRICTION, np.zeros(()))
-    for name, column in zip((*PARAMETER_NAMES, FRICTION), (*columns, of_ground), strict=True):
-        of_steps = name in ("slope", FRICTION) and np.ndim(column) == 2
-        if np.shape(column) not in ((), (n,), *[(n, n_steps)] * of_steps):
+    n_states, columns = len(states), [getattr(params, name) for name in PARAMETER_NAMES]
+    parameter_dtype = np.result_type(*(column.dtype for column in columns))
+    StepOptions.check_tolerances(
+        options, parameter_dtype
+    )  # equinox takes 0.1 ms for a bound method
+    friction = getattr(model, FRICTION_NAME, np.zeros(()))
+    for name, column in zip((*PARAMETER_NAMES, FRICTION_NAME), (*columns, friction), strict=True):
+        varies_by_step = name in ("slope", FRICTION_NAME) and np.ndim(column) == 2
+        if np.shape(column) not in ((), (n_states,), *[(n_states, n_steps)] * varies_by_step):
             raise ValueError(
-                f"{name} has shape {np.shape(column)}, but there are {n} states"
-                f"{f' and {n_steps} steps' * of_steps}: give one value for all, or one for each"
-                f"{' and each of its steps' * of_steps}."
+                f"{name} has shape {np.shape(column)}, but there are {n_states} states"
+                f"{f' and {n_steps} steps' * varies_by_step}: give one value for all, or one for each"
+                f"{' and each of its steps' * varies_by_step}."
             )
-    dtype = np.promote_types(held, states.dtype)
+    dtype = np.promote_types(parameter_dtype, states.dtype)
     return [np.asarray(column, dtype) for column in columns]
 
 
-def _by_phases(
+def _step_paper_model(
     model: Any,
-    columns: list[np.ndarray],
+    parameter_columns: list[np.ndarray],
     states: np.ndarray,
     n_steps: int,
-    options: Options,
+    options: StepOptions,
     engine: str,
     n_legs: int,
     durations: Any,
-    asked: Sequence[str],
-) -> Steps:
-    order = work_order(columns, states)
-    wheels = np.empty((len(columns), len(states)), states.dtype)
-    for row, column in zip(wheels, columns, strict=True):
+    derivative_names: Sequence[str],
+) -> StepBatchResult:
+    order = sort_by_work(parameter_columns, states)
+    wheels = np.empty((len(parameter_columns), len(states)), states.dtype)
+    for row, column in zip(wheels, parameter_columns, strict=True):
         row[:] = column[order] if column.ndim else column
-    walked = Walked(states.T.take(order, -1), asked, PARAMETER_NAMES)
-    some = n_legs, walked.moved
-    runs = {NAMED: _chosen(engine, model, options, *some)}
-    solver = np.full(len(states), NAMED, np.int32)
-    solvers: tuple[str, ...] = (options.solver,)
-    name = runs[NAMED].name
-    if engine == "auto" and name == "lanes":
-        solvers, solver = (
+    walks = WalkBatch(states.T.take(order, -1), derivative_names, PARAMETER_NAMES)
+    settings = n_legs, walks.input_indices
+    engines = {NAMED_SOLVER_INDEX: _select_engine(engine, model, options, *settings)}
+    solver_index = np.full(len(states), NAMED_SOLVER_INDEX, np.int32)
+    solver_names: tuple[str, ...] = (options.solver,)
+    engine_name = engines[NAMED_SOLVER_INDEX].name
+    if engine == "auto" and engine_name == "lanes":
+        solver_names, solver_index = (
             (options.solver, STABLE_SOLVER, IMPLICIT_SOLVER),
-            cheapest_solver(wheels, options.for_derivatives() if asked else options),
+            select_solver(
+                wheels, options.with_derivative_tolerances() if derivative_names else options
+            ),
         )
-    if np.any(solver != NAMED):
-        by = lambda solver: dataclasses.replace(options, solver=solver)
-        stable = by(STABLE_SOLVER).tightened(TIGHTER)
-        runs[STABLE] = _chosen("lanes", model, stable, *some)
-        runs[IMPLICIT] = _chosen("diffrax", model, by(IMPLICIT_SOLVER), *some)
+    if np.any(solver_index != NAMED_SOLVER_INDEX):
+        with_solver = lambda solver_index: dataclasses.replace(options, solver=solver_index)
+        stable_options = with_solver(STABLE_SOLVER).with_tightened_tolerances(
+            TSIT5_TOLERANCE_FACTOR
+        )
+        engines[STABLE_SOLVER_INDEX] = _select_engine("lanes", model, stable_options, *settings)
+        engines[IMPLICIT_SOLVER_INDEX] = _select_engine(
+            "diffrax", model, with_solver(IMPLICIT_SOLVER), *settings
+        )
     if engine == "collocation":
-        name = engine
-        walked.durations[:] = _expected(durations, states, wheels.dtype).T.take(order, -1)
+        engine_name = engine
+        walks.durations[:] = _check_durations(durations, states, wheels.dtype).T.take(order, -1)
     for _ in range(n_steps):
-        open_ = walked.on()
-        if engine == "collocation" and len(open_):
-            all_ = only(open_, walked)
-            given = wheels[:, all_], walked.section_state[:, all_], walked.durations[:, all_]
-            walked.take(open_, *_by_collocation(runs[NAMED], model, n_legs, *given))
+        active = walks.active_lanes()
+        if engine == "collocation" and len(active):
+            index = lane_index(active, walks)
+            arguments = wheels[:, index], walks.section_state[:, index], walks.durations[:, index]
+            walks.record_step(
+                active,
+                *_step_by_collocation(engines[NAMED_SOLVER_INDEX], model, n_legs, *arguments),
+            )
             continue
-        for which, run in runs.items():
-            lanes = open_[solver[open_] == which]
-            if len(lanes) > 0:
-                all_ = only(lanes, walked)
-                told = run.step(wheels[:, all_], walked.section_state[:, all_])
-                if which == STABLE:
+        for engine_index, selected_engine in engines.items():
+            lane_indices = active[solver_index[active] == engine_index]
+            if len(lane_indices) > 0:
+                index = lane_index(lane_indices, walks)
+                result = selected_engine.take_step(wheels[:, index], walks.section_state[:, index])
+                if engine_index == STABLE_SOLVER_INDEX:
                     # A phase may last longer than `select_solver` assumes; the next is implicit.
-                    lost = told[2] == Outcome.SOLVER_GAVE_UP
-                    solver[lanes[lost]] = IMPLICIT
-                    lanes, told = lanes[~lost], tuple(part[..., ~lost] for part in told)
-                walked.take(lanes, told, np.zeros(len(lanes), bool))
-    return walked.told(order, solver, name, solvers)
+                    has_failed = result[2] == Outcome.SOLVER_FAILED
+                    solver_index[lane_indices[has_failed]] = IMPLICIT_SOLVER_INDEX
+                    lane_indices, result = (
+                        lane_indices[~has_failed],
+                        tuple(part[..., ~has_failed] for part in result),
+                    )
+                walks.record_step(lane_indices, result, np.zeros(len(lane_indices), bool))
+    return walks.to_result(order, solver_index, engine_name, solver_names)
 
 
-def work_order(columns: list[np.ndarray], states: np.ndarray) -> np.ndarray:
+def sort_by_work(columns: list[np.ndarray], states: np.ndarray) -> np.ndarray:
     """Return an order of the batch in which wheels of similar work are side by side.
 
     A group of lanes takes as long as its slowest lane. Most of a step's work is in SLS-I. There
@@ -250,90 +286,104 @@ def work_order(columns: list[np.ndarray], states: np.ndarray) -> np.ndarray:
     length at release. The exponents are rounded from a fit to the solver's steps of wheels near
     their gaits and away from them (`python -m experiments.speed.lanes_that_wait`).
     """
-    own = dict(zip(PARAMETER_NAMES, columns, strict=True))
-    single = lambda name: np.asarray(own[name], np.float32)
+    values_by_name = dict(zip(PARAMETER_NAMES, columns, strict=True))
+    single_precision = lambda name: np.asarray(values_by_name[name], np.float32)
     with np.errstate(all="ignore"):
         theta, dtheta = states.T[:2].astype(np.float32)
-        length, mass = single("locked_length"), single("leg_mass")
-        work = np.log(single("damping") / mass) - 0.25 * np.log(single("stiffness") / mass)
-        work = work + 0.8 * np.log(dtheta) + 0.65 * np.log(length / single("gravity"))
-        work = work + theta - 7.0 * single("natural_length") / length
+        length, mass = single_precision("locked_length"), single_precision("leg_mass")
+        work = np.log(single_precision("damping") / mass) - 0.25 * np.log(
+            single_precision("stiffness") / mass
+        )
+        work = work + 0.8 * np.log(dtheta) + 0.65 * np.log(length / single_precision("gravity"))
+        work = work + theta - 7.0 * single_precision("natural_length") / length
     return np.argsort(work)
 
 
-def _expected(durations: Any, states: np.ndarray, dtype: np.dtype) -> np.ndarray:
+def _check_durations(durations: Any, states: np.ndarray, dtype: np.dtype) -> np.ndarray:
     if durations is None or np.shape(durations) != states.shape:
         shape = None if durations is None else np.shape(durations)
         raise ValueError(
             f"durations have shape {shape}, but collocation needs those of DLS, SLS-I and SLS-II "
             "to some per cent, shape (lanes, 3): give those of a limit cycle, or take 'lanes'."
         )
-    return known_reals("durations", durations).astype(dtype, copy=False)
+    return check_numpy_reals("durations", durations).astype(dtype, copy=False)
 
 
-class _Engine(NamedTuple):
+class _BatchEngine(NamedTuple):
     """One gait step of any number of lanes, from numpy to numpy, lanes on the last axis."""
 
     name: str
-    step: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, ...]]
+    take_step: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, ...]]
 
 
-def _chosen(
-    engine: str, model: Any, options: Options, n_legs: int, moved: tuple[int, ...]
-) -> _Engine:
-    fits = model.lanes == "phases" and explicit_tableau(options.solver) is not None
-    if engine in ("lanes", "collocation") and not fits:
+def _select_engine(
+    engine: str, model: Any, options: StepOptions, n_legs: int, input_indices: tuple[int, ...]
+) -> _BatchEngine:
+    has_lane_kernel = (
+        model.batch_kernel == "phases" and load_explicit_tableau(options.solver) is not None
+    )
+    if engine in ("lanes", "collocation") and not has_lane_kernel:
         raise ValueError(
             f"the lane engine can't run {type(model).__name__} with {options.solver}: it supports "
             "the viscoelastic wheel and explicit Runge-Kutta solvers; take engine='diffrax'."
         )
-    if engine == "diffrax" or not fits:
-        by_diffrax = functools.partial(_by_diffrax, model, options.by("diffrax"), n_legs, moved)
-        return _Engine("diffrax", by_diffrax)
-    by_lanes = functools.partial(_by_lanes, model.stop_at_lift_off, options, n_legs, moved)
-    return _Engine("lanes", by_lanes)
+    if engine == "diffrax" or not has_lane_kernel:
+        take_diffrax_step = functools.partial(
+            _step_by_diffrax, model, options.with_engine("diffrax"), n_legs, input_indices
+        )
+        return _BatchEngine("diffrax", take_diffrax_step)
+    take_lane_step = functools.partial(
+        _step_by_lanes, model.stop_at_lift_off, options, n_legs, input_indices
+    )
+    return _BatchEngine("lanes", take_lane_step)
 
 
-def _by_lanes(
+def _step_by_lanes(
     stop_at_lift_off: bool,
-    options: Options,
+    options: StepOptions,
     n_legs: int,
-    moved: tuple[int, ...],
+    input_indices: tuple[int, ...],
     wheels: np.ndarray,
     states: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
     """Take one gait step by the lane engine."""
-    dynamic, structure = jax.tree.flatten(options)
-    uniform = [np.asarray(leaf, wheels.dtype) for leaf in dynamic]
-    tableau, n = explicit_tableau(options.solver), len(PARAMETER_NAMES)
+    option_leaves, structure = jax.tree.flatten(options)
+    uniform = [np.asarray(leaf, wheels.dtype) for leaf in option_leaves]
+    tableau, n_parameters = load_explicit_tableau(options.solver), len(PARAMETER_NAMES)
     assert tableau is not None  # checked by `_select_engine`
 
-    def step(uniform: Any, lanes: Any, few: Array | None = None) -> tuple:
-        known = jax.tree.unflatten(structure, uniform)
-        known = known.for_derivatives() if moved else known
+    def step(uniform: Any, lanes: Any, straggler_count: Array | None = None) -> tuple:
+        current_options = jax.tree.unflatten(structure, uniform)
+        current_options = (
+            current_options.with_derivative_tolerances() if input_indices else current_options
+        )
 
-        def told(*lanes: Array) -> tuple:
-            params, x = wheel_of(lanes[:n], n_legs), lanes[n:]
-            step = gait_step(params, x, known, tableau, stop_at_lift_off, few)
-            others = step.unfinished, step.outcome, step.solver_steps
-            return jnp.stack([*step.section_state, *step.durations]), others
+        def step_outputs(*lanes: Array) -> tuple:
+            params, x = wheel_from_parameters(lanes[:n_parameters], n_legs), lanes[n_parameters:]
+            result = gait_step(
+                params, x, current_options, tableau, stop_at_lift_off, straggler_count
+            )
+            diagnostics = result.is_unfinished, result.outcome, result.solver_steps
+            return jnp.stack([*result.section_state, *result.durations]), diagnostics
 
-        if not moved:
-            numbers, others = told(*lanes)
-            return (*others, numbers)
-        by_all = along_all if len(moved) == DIRECTIONS else along_units
-        columns, numbers, others = by_all(told, lanes, moved)
-        return (*others, numbers, columns)
+        if not input_indices:
+            values, diagnostics = step_outputs(*lanes)
+            return (*diagnostics, values)
+        jacobian_of_step = (
+            scaled_jacobian_columns if len(input_indices) == N_STEP_INPUTS else jacobian_columns
+        )
+        jacobian, values, diagnostics = jacobian_of_step(step_outputs, lanes, input_indices)
+        return (*diagnostics, values, jacobian)
 
-    settings = ("gait step", n_legs, stop_at_lift_off, structure, moved)
-    small = (DIRECTIONS,) if moved else ()
-    told = run_lanes(step, uniform, [*wheels, *states], settings, *small)
-    _, outcome, tried, numbers, *columns = told
-    return numbers[:3], numbers[3:], outcome, tried, *columns
+    settings = ("gait step", n_legs, stop_at_lift_off, structure, input_indices)
+    max_group_size = (N_STEP_INPUTS,) if input_indices else ()
+    results = run_compiled(step, uniform, [*wheels, *states], settings, *max_group_size)
+    _, outcome, n_solver_steps, values, *jacobian = results
+    return values[:3], values[3:], outcome, n_solver_steps, *jacobian
 
 
-def _by_collocation(
-    by_lanes: _Engine,
+def _step_by_collocation(
+    lane_engine: _BatchEngine,
     model: Any,
     n_legs: int,
     wheels: np.ndarray,
@@ -342,30 +392,41 @@ def _by_collocation(
 ) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
     """Take one step by collocation, and by the lane engine for lanes that fail the check; return
     which passed."""
-    stop_at_lift_off, n = model.stop_at_lift_off, len(PARAMETER_NAMES)
+    stop_at_lift_off, n_parameters = model.stop_at_lift_off, len(PARAMETER_NAMES)
 
-    def step(uniform: Any, lanes: Any, few: Array | None = None) -> tuple:
-        params, rest = wheel_of(lanes[:n], n_legs), tuple(lanes[n:])
-        told = fixed_gait_step(params, rest[:3], rest[3:], stop_at_lift_off)
-        never = jnp.zeros_like(told.trusted)
-        return never, told.trusted, jnp.stack([*told.section_state, *told.durations])
+    def step(uniform: Any, lanes: Any, straggler_count: Array | None = None) -> tuple:
+        params, states_and_durations = (
+            wheel_from_parameters(lanes[:n_parameters], n_legs),
+            tuple(lanes[n_parameters:]),
+        )
+        result = collocation_gait_step(
+            params, states_and_durations[:3], states_and_durations[3:], stop_at_lift_off
+        )
+        is_unfinished = jnp.zeros_like(result.is_trusted)
+        return (
+            is_unfinished,
+            result.is_trusted,
+            jnp.stack([*result.section_state, *result.durations]),
+        )
 
     settings = ("gait step by collocation", n_legs, stop_at_lift_off)
-    _, trusted, numbers = run_lanes(step, [], [*wheels, *states, *durations], settings)
-    outcome, tried = np.zeros((2, len(trusted)), np.int32)
-    told = numbers[:3], numbers[3:], outcome, tried
-    rest = np.flatnonzero(~trusted)
-    if len(rest) > 0:
-        for whole_, part in zip(told, by_lanes.step(wheels[:, rest], states[:, rest]), strict=True):
-            whole_[..., rest] = part
-    return told, trusted
+    _, is_trusted, values = run_compiled(step, [], [*wheels, *states, *durations], settings)
+    outcome, n_solver_steps = np.zeros((2, len(is_trusted)), np.int32)
+    result = values[:3], values[3:], outcome, n_solver_steps
+    untrusted = np.flatnonzero(~is_trusted)
+    if len(untrusted) > 0:
+        for all_values, new_values in zip(
+            result, lane_engine.take_step(wheels[:, untrusted], states[:, untrusted]), strict=True
+        ):
+            all_values[..., untrusted] = new_values
+    return result, is_trusted
 
 
-def _by_diffrax(
+def _step_by_diffrax(
     model: AbstractWheel,
-    options: Options,
+    options: StepOptions,
     n_legs: int,
-    moved: tuple[int, ...],
+    input_indices: tuple[int, ...],
     wheels: np.ndarray,
     states: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
@@ -373,28 +434,38 @@ def _by_diffrax(
     time."""
     options = jax.tree.map(lambda leaf: np.asarray(leaf, wheels.dtype), options)
     rows = np.concatenate([wheels, states]).T
-    mapped = functools.partial(_mapped, model, options, n_legs, moved)
-    return jax.tree.map(lambda x: np.array(x).T, in_batches(mapped, (MAPPED,), rows))
+    step_rows = functools.partial(_vmapped_step, model, options, n_legs, input_indices)
+    return jax.tree.map(
+        lambda x: np.array(x).T, map_in_batches(step_rows, (DIFFRAX_BATCH_SIZE,), rows)
+    )
 
 
 @eqx.filter_jit
-def _mapped(
-    model: AbstractWheel, options: Options, n_legs: int, moved: tuple[int, ...], rows: Array
+def _vmapped_step(
+    model: AbstractWheel,
+    options: StepOptions,
+    n_legs: int,
+    input_indices: tuple[int, ...],
+    rows: Array,
 ) -> tuple[Array, ...]:
-    n = len(PARAMETER_NAMES)
+    n_parameters = len(PARAMETER_NAMES)
 
-    def one(numbers: Array) -> tuple[Array, ...]:
-        def told(some: Array) -> tuple[Array, Advance]:
-            full = numbers.at[np.array(moved, int)].set(some)
-            taken = model.advance(wheel_of(full[:n], n_legs), full[n:], options)
-            return jnp.concatenate([taken.section_state, taken.durations]), taken
+    def step_one(inputs: Array) -> tuple[Array, ...]:
+        def step_from_inputs(varied_inputs: Array) -> tuple[Array, AdvanceResult]:
+            all_inputs = inputs.at[np.array(input_indices, int)].set(varied_inputs)
+            result = model.advance(
+                wheel_from_parameters(all_inputs[:n_parameters], n_legs),
+                all_inputs[n_parameters:],
+                options,
+            )
+            return jnp.concatenate([result.section_state, result.durations]), result
 
-        some = numbers[np.array(moved, int)]
-        if not moved:
-            _, taken = told(some)
-            return taken.section_state, taken.durations, taken.outcome, taken.solver_steps
-        jacobian, taken = jax.jacfwd(told, has_aux=True)(some)
-        values = taken.section_state, taken.durations, taken.outcome, taken.solver_steps
+        varied_inputs = inputs[np.array(input_indices, int)]
+        if not input_indices:
+            _, result = step_from_inputs(varied_inputs)
+            return result.section_state, result.durations, result.outcome, result.solver_steps
+        jacobian, result = jax.jacfwd(step_from_inputs, has_aux=True)(varied_inputs)
+        values = result.section_state, result.durations, result.outcome, result.solver_steps
         return *values, jacobian
 
-    return jax.vmap(one)(rows)
+    return jax.vmap(step_one)(rows)

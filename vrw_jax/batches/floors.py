@@ -8,52 +8,69 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.batches.walked import Steps
-from vrw_jax.numerics import Options, in_batches_of_numpy
+from vrw_jax.batches.walked import StepBatchResult
+from vrw_jax.numerics import StepOptions, map_in_numpy_batches
 from vrw_jax.walks import walk
-from vrw_jax.wheel import wheel_of
+from vrw_jax.wheel import wheel_from_parameters
 
-SIZES = 16, 256
+UNEVEN_GROUND_BATCH_SIZES = 16, 256
 """Numbers of batch elements that are compiled for."""
 
 
-def over_floors(
+def walk_uneven_ground(
     model: Any,
-    wheels: list[np.ndarray],
+    parameters: list[np.ndarray],
     states: np.ndarray,
     n_steps: int,
-    options: Options,
+    options: StepOptions,
     engine: str,
     n_legs: int,
-    asked: Sequence[str],
-) -> Steps:
+    derivative_names: Sequence[str],
+) -> StepBatchResult:
     """Return `step_batch` for slopes or friction that differ from step to step."""
-    if model.lanes != "legs" or engine not in ("auto", "diffrax") or len(asked):
+    if model.batch_kernel != "legs" or engine not in ("auto", "diffrax") or len(derivative_names):
         raise ValueError(
             "uneven ground needs vrw.UnilateralWheel and 'diffrax', "
             "without derivatives: leave engine and derivatives out, or map vrw.walk over lanes."
         )
-    n, given = len(states), (*wheels, np.asarray(model.friction, states.dtype))
-    columns = [np.broadcast_to(x, (n, *x.shape[1:])) for x in given]
-    walked = lambda x, *columns: _mapped(model, options, n_legs, n_steps, x, columns)
-    x, durations, outcome, n_stepped, tried = in_batches_of_numpy(walked, SIZES, states, *columns)
-    none = np.zeros(n, np.int32)
-    told = x, durations, outcome, n_stepped, tried, none > 0, none
-    return Steps(*told, engine="diffrax", solvers=(options.solver,))
+    n_states, parameter_columns = (
+        len(states),
+        (*parameters, np.asarray(model.friction, states.dtype)),
+    )
+    full_columns = [np.broadcast_to(x, (n_states, *x.shape[1:])) for x in parameter_columns]
+    walk_rows = lambda x, *full_columns: _vmapped_walk(
+        model, options, n_legs, n_steps, x, full_columns
+    )
+    x, durations, outcome, n_stepped, n_solver_steps = map_in_numpy_batches(
+        walk_rows, UNEVEN_GROUND_BATCH_SIZES, states, *full_columns
+    )
+    zeros = np.zeros(n_states, np.int32)
+    results = x, durations, outcome, n_stepped, n_solver_steps, zeros > 0, zeros
+    return StepBatchResult(*results, engine="diffrax", solver_names=(options.solver,))
 
 
 @eqx.filter_jit
-def _mapped(
-    model: Any, options: Options, n_legs: int, n_steps: int, states: Any, columns: Any
+def _vmapped_walk(
+    model: Any, options: StepOptions, n_legs: int, n_steps: int, states: Any, columns: Any
 ) -> tuple:
-    def one(x: Any, columns: Any) -> tuple:
-        *numbers, friction = columns
-        ground = eqx.tree_at(lambda model: model.friction, model, friction)
-        params = wheel_of(tuple(numbers), n_legs)
-        told = walk(params, x, n_steps, model=ground, options=options, engine="diffrax")
-        last = jax.tree.map(lambda x: x[jnp.minimum(told.n_stepped, n_steps - 1)], told.steps)
-        tried = jnp.sum(told.steps.solver_steps)
-        return last.section_state, last.durations, told.outcome, told.n_stepped, tried
+    def walk_one(x: Any, columns: Any) -> tuple:
+        *values, friction = columns
+        model_with_friction = eqx.tree_at(lambda model: model.friction, model, friction)
+        params = wheel_from_parameters(tuple(values), n_legs)
+        walk_result = walk(
+            params, x, n_steps, model=model_with_friction, options=options, engine="diffrax"
+        )
+        last_step = jax.tree.map(
+            lambda x: x[jnp.minimum(walk_result.n_stepped, n_steps - 1)], walk_result.steps
+        )
+        n_solver_steps = jnp.sum(walk_result.steps.solver_steps)
+        return (
+            last_step.section_state,
+            last_step.durations,
+            walk_result.outcome,
+            walk_result.n_stepped,
+            n_solver_steps,
+        )
 
-    codes = lambda x: x.astype(jnp.int32) if jnp.issubdtype(x.dtype, jnp.integer) else x
-    return jax.tree.map(codes, jax.vmap(one)(states, columns))
+    narrow_integers = lambda x: x.astype(jnp.int32) if jnp.issubdtype(x.dtype, jnp.integer) else x
+    return jax.tree.map(narrow_integers, jax.vmap(walk_one)(states, columns))

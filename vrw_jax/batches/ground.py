@@ -5,50 +5,61 @@ from typing import Any
 
 import numpy as np
 
-from vrw_jax.batches.walked import START, Steps, Walked
-from vrw_jax.models import as_full_states, step_lanes, walk_lanes
-from vrw_jax.numerics import Options, explicit_tableau
+from vrw_jax.batches.walked import START_NAME, StepBatchResult, WalkBatch
+from vrw_jax.models import embed_section_states, step_batch_with_jacobian, walk_batch
+from vrw_jax.numerics import StepOptions, load_explicit_tableau
 from vrw_jax.wheel import PARAMETER_NAMES
 
-VALUES = (*PARAMETER_NAMES, "friction")
-ON_GROUND = (START, *VALUES)
+CONTACT_PARAMETERS = (*PARAMETER_NAMES, "friction")
+CONTACT_STEP_INPUTS = (START_NAME, *CONTACT_PARAMETERS)
 """Inputs with respect to which a step can be differentiated."""
 
 
-def on_ground(
+def step_batch_with_contact(
     model: Any,
-    wheels: list[np.ndarray],
+    parameters: list[np.ndarray],
     states: np.ndarray,
     n_steps: int,
-    options: Options,
+    options: StepOptions,
     engine: str,
     n_legs: int,
-    asked: Sequence[str],
-) -> Steps:
+    derivative_names: Sequence[str],
+) -> StepBatchResult:
     """Return `step_batch` with unilateral contact. Without derivatives, all steps of an element are
     one walk."""
-    if engine not in ("auto", "lanes") or explicit_tableau(options.solver) is None:
+    if engine not in ("auto", "lanes") or load_explicit_tableau(options.solver) is None:
         raise ValueError(
             f"engine is {engine!r} and solver {options.solver}, but batches with contact need "
             "'lanes' and an explicit Runge-Kutta solver: map vrw.return_map over the wheels."
         )
     friction = np.asarray(model.friction, states.dtype)
-    columns = np.stack([np.broadcast_to(x, len(states)) for x in (*wheels, friction)])
-    states = as_full_states(columns, states, n_legs)
-    none = np.zeros(len(states), np.int32)
-    if not asked:
-        walk = walk_lanes(columns, states, n_steps, model, options, n_legs)
-        x, durations, outcome, n_stepped, tried, _ = map(np.asarray, walk)
-        told = x, durations, outcome, n_stepped, tried, none > 0, none
-        return Steps(*told, engine="lanes", solvers=(options.solver,))
-    walked = Walked(states.T.copy(), asked, VALUES)
+    columns = np.stack([np.broadcast_to(x, len(states)) for x in (*parameters, friction)])
+    states = embed_section_states(columns, states, n_legs)
+    zeros = np.zeros(len(states), np.int32)
+    if not derivative_names:
+        walk_result = walk_batch(columns, states, n_steps, model, options, n_legs)
+        x, durations, outcome, n_stepped, n_solver_steps, _ = map(np.asarray, walk_result)
+        results = x, durations, outcome, n_stepped, n_solver_steps, zeros > 0, zeros
+        return StepBatchResult(*results, engine="lanes", solver_names=(options.solver,))
+    walks = WalkBatch(states.T.copy(), derivative_names, CONTACT_PARAMETERS)
     for _ in range(n_steps):
-        lanes = walked.on()
-        if not len(lanes):
+        active = walks.active_lanes()
+        if not len(active):
             break
-        given = columns[:, lanes], walked.section_state[:, lanes].T, model, options, n_legs
-        step, moves = step_lanes(*given, walked.moved)
-        by = np.concatenate([moves.section_state, moves.durations], 1)[:, :, list(walked.moved)]
-        values = step.section_state, step.durations, step.outcome, step.solver_steps
-        walked.take(lanes, tuple(np.asarray(x).T for x in (*values, by)), none[lanes] > 0)
-    return walked.told(np.arange(len(states)), none, "lanes", (options.solver,))
+        arguments = columns[:, active], walks.section_state[:, active].T, model, options, n_legs
+        step_result, step_jacobian = step_batch_with_jacobian(*arguments, walks.input_indices)
+        input_jacobian = np.concatenate([step_jacobian.section_state, step_jacobian.durations], 1)[
+            :, :, list(walks.input_indices)
+        ]
+        step_values = (
+            step_result.section_state,
+            step_result.durations,
+            step_result.outcome,
+            step_result.solver_steps,
+        )
+        walks.record_step(
+            active,
+            tuple(np.asarray(x).T for x in (*step_values, input_jacobian)),
+            zeros[active] > 0,
+        )
+    return walks.to_result(np.arange(len(states)), zeros, "lanes", (options.solver,))

@@ -8,57 +8,68 @@ import jax
 import numpy as np
 
 from vrw_jax import simd
-from vrw_jax.runtime import lane_program
+from vrw_jax.runtime import cached_lane_program
 
-BLOCK = 32_768
+N_LANES_PER_BLOCK = 32_768
 """Number of lanes of a block that XLA runs side by side, as on a GPU."""
-FEW = 8
+STRAGGLER_DIVISOR = 8
 """A block stops early once less than one in `STRAGGLER_DIVISOR` of its lanes is running."""
 
-_programs: dict[Any, Callable] = {}
+_program_cache: dict[Any, Callable] = {}
 """Compiled steps by all that they depend on, see `run_compiled`."""
 
 
-def run_lanes(
+def run_compiled(
     step: Callable[..., tuple],
-    uniform: list[np.ndarray],
-    lanes: list[np.ndarray],
-    settings: Any,
-    small: int = simd.SMALL,
+    uniform_values: list[np.ndarray],
+    lane_arrays: list[np.ndarray],
+    cache_key: Any,
+    max_group_size: int = simd.MAX_UNROLLED,
 ) -> list[np.ndarray]:
     """Compile and run `step(uniform, lanes, few)`. Its first result marks the lanes that are
     unfinished.
 
     `cache_key` contains all that `step` depends on except its arguments.
     """
-    dtype, cpu = lanes[0].dtype, simd.serves()
-    key = (settings, dtype, cpu, BLOCK)
-    if key not in _programs:
-        if cpu:
-            kinds = [x.dtype for x in uniform]
-            _programs[key] = lane_program(step, kinds, len(lanes), dtype, settings, small)
+    dtype, uses_machine_code = lane_arrays[0].dtype, simd.is_available()
+    program_key = (cache_key, dtype, uses_machine_code, N_LANES_PER_BLOCK)
+    if program_key not in _program_cache:
+        if uses_machine_code:
+            uniform_dtypes = [x.dtype for x in uniform_values]
+            _program_cache[program_key] = cached_lane_program(
+                step, uniform_dtypes, len(lane_arrays), dtype, cache_key, max_group_size
+            )
         else:
-            _programs[key] = functools.partial(_by_xla, jax.jit(step))
-    return _programs[key](uniform, lanes)
+            _program_cache[program_key] = functools.partial(_run_xla_blocks, jax.jit(step))
+    return _program_cache[program_key](uniform_values, lane_arrays)
 
 
-def _by_xla(
-    program: Callable, uniform: list[np.ndarray], lanes: list[np.ndarray]
+def _run_xla_blocks(
+    program: Callable, uniform_values: list[np.ndarray], lane_arrays: list[np.ndarray]
 ) -> list[np.ndarray]:
     """Run the program block by block; stragglers are run again together."""
-    told: list[np.ndarray] = []
-    open_ = np.arange(len(lanes[0]))
-    while len(open_) > 0:
-        few = np.int32(BLOCK // FEW if len(open_) > BLOCK else 0)
-        late = []
-        for begin in range(0, len(open_), BLOCK):
-            some = open_[begin : begin + BLOCK]
-            filled = np.concatenate([some, np.repeat(some[-1:], BLOCK - len(some))])
-            given = tuple(x[filled] for x in lanes)
-            out = [np.asarray(x)[..., : len(some)] for x in program(tuple(uniform), given, few)]
-            told = told or [np.empty((*x.shape[:-1], len(lanes[0])), x.dtype) for x in out]
-            for told_whole, part in zip(told, out, strict=True):
-                told_whole[..., some[~out[0]]] = part[..., ~out[0]]
-            late.append(some[out[0]])
-        open_ = np.concatenate(late)
-    return told
+    results: list[np.ndarray] = []
+    unfinished = np.arange(len(lane_arrays[0]))
+    while len(unfinished) > 0:
+        straggler_count = np.int32(
+            N_LANES_PER_BLOCK // STRAGGLER_DIVISOR if len(unfinished) > N_LANES_PER_BLOCK else 0
+        )
+        stragglers = []
+        for block_start in range(0, len(unfinished), N_LANES_PER_BLOCK):
+            block = unfinished[block_start : block_start + N_LANES_PER_BLOCK]
+            padded_block = np.concatenate(
+                [block, np.repeat(block[-1:], N_LANES_PER_BLOCK - len(block))]
+            )
+            block_arrays = tuple(x[padded_block] for x in lane_arrays)
+            outputs = [
+                np.asarray(x)[..., : len(block)]
+                for x in program(tuple(uniform_values), block_arrays, straggler_count)
+            ]
+            results = results or [
+                np.empty((*x.shape[:-1], len(lane_arrays[0])), x.dtype) for x in outputs
+            ]
+            for result, block_result in zip(results, outputs, strict=True):
+                result[..., block[~outputs[0]]] = block_result[..., ~outputs[0]]
+            stragglers.append(block[outputs[0]])
+        unfinished = np.concatenate(stragglers)
+    return results

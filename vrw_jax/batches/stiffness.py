@@ -4,12 +4,12 @@ import functools
 
 import numpy as np
 
-from vrw_jax.numerics import Options, explicit_tableau, real_stability_limit
+from vrw_jax.numerics import StepOptions, load_explicit_tableau, real_stability_limit
 from vrw_jax.wheel import PARAMETER_NAMES
 
-NAMED, STABLE, IMPLICIT = range(3)
+NAMED_SOLVER_INDEX, STABLE_SOLVER_INDEX, IMPLICIT_SOLVER_INDEX = range(3)
 """Indices of the solvers: the one in the options, and two for stiff wheels."""
-STABLE_SOLVER, TIGHTER = "Tsit5", 4.0
+STABLE_SOLVER, TSIT5_TOLERANCE_FACTOR = "Tsit5", 4.0
 """Explicit solver of wheels whose steps are limited by stability, and the factor by which its
 tolerance is tightened.
 
@@ -19,14 +19,14 @@ tolerances of 1e-6 and below the error is then no larger than Dopri8's at the na
 """
 IMPLICIT_SOLVER = "Kvaerno5"
 """Solver of wheels that are too stiff for explicit ones."""
-WORTH = 6e4
+IMPLICIT_COST_EVALS = 6e4
 """Number of evaluations of an explicit solver with the same cost as IMPLICIT_SOLVER at a tolerance
 of 1e-6 (docs/stability_atlas.md). The cost of the implicit solver scales as the tolerance to the
 power of -0.17, from 1e-4 to 1e-10. At the limit of stability the cost of explicit solvers does not
 depend on it."""
 
 
-def cheapest_solver(wheels: np.ndarray, options: Options) -> np.ndarray:
+def select_solver(parameters: np.ndarray, options: StepOptions) -> np.ndarray:
     """Return the index of the cheapest solver for each lane.
 
     The airborne leg's fast mode decays at 1.03 c/m for some 0.67 sqrt(L0 / g), s, if legs are
@@ -36,23 +36,25 @@ def cheapest_solver(wheels: np.ndarray, options: Options) -> np.ndarray:
     `max_solver_steps` is excluded.
     """
     damping, mass, length, gravity = (
-        wheels[PARAMETER_NAMES.index(name)]
+        parameters[PARAMETER_NAMES.index(name)]
         for name in ("damping", "leg_mass", "locked_length", "gravity")
     )
     tolerance = float(options.rtol)
     with np.errstate(all="ignore"):
-        decays = 1.03 * damping / mass * 0.74 * np.sqrt(length / gravity)
+        decay_count = 1.03 * damping / mass * 0.74 * np.sqrt(length / gravity)
 
         def evaluations(solver: str) -> tuple[np.ndarray, np.ndarray]:
-            stages, bears = _stages_and_limit(solver)
-            steps = decays / bears
-            return steps, np.where(steps > options.max_solver_steps, np.inf, steps * stages)
+            n_stages, stability_limit = _stages_and_limit(solver)
+            n_solver_steps = decay_count / stability_limit
+            return n_solver_steps, np.where(
+                n_solver_steps > options.max_solver_steps, np.inf, n_solver_steps * n_stages
+            )
 
-        _, named = evaluations(options.solver)
-        steps, stable = evaluations(STABLE_SOLVER)
-        limited = steps > (tolerance / TIGHTER) ** -0.2
-        implicit = np.full_like(decays, WORTH * (1e-6 / tolerance) ** 0.17)
-        costs = named, np.where(limited, stable, np.inf), implicit
+        _, named_cost = evaluations(options.solver)
+        n_solver_steps, stable_cost = evaluations(STABLE_SOLVER)
+        is_stability_limited = n_solver_steps > (tolerance / TSIT5_TOLERANCE_FACTOR) ** -0.2
+        implicit_cost = np.full_like(decay_count, IMPLICIT_COST_EVALS * (1e-6 / tolerance) ** 0.17)
+        costs = named_cost, np.where(is_stability_limited, stable_cost, np.inf), implicit_cost
         return np.argmin(costs, axis=0).astype(np.int32)  # invalid wheels: the first
 
 
@@ -60,6 +62,6 @@ def cheapest_solver(wheels: np.ndarray, options: Options) -> np.ndarray:
 def _stages_and_limit(solver: str) -> tuple[int, float]:
     """Return an explicit solver's evaluations per step, and the limit of step length times decay
     rate."""
-    tableau = explicit_tableau(solver)
+    tableau = load_explicit_tableau(solver)
     assert tableau is not None  # the caller checked
-    return len(tableau.places) - 1, real_stability_limit(tableau)
+    return len(tableau.nodes) - 1, real_stability_limit(tableau)

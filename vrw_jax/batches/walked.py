@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from vrw_jax.wheel import Outcome
-from vrw_jax.wording import AbstractTold, Row, counted, told
+from vrw_jax.wording import AbstractPrintable, TextRow, format_outcome_counts, format_quantity
 
 
-class By(eqx.Module):
+class StepSensitivity(eqx.Module):
     """Derivative of the end of a walk with respect to a parameter, or to the start, which adds an
     axis."""
 
@@ -19,7 +19,7 @@ class By(eqx.Module):
     durations: Float[np.ndarray, "lanes 3 *start"]
 
 
-class Steps(AbstractTold):
+class StepBatchResult(AbstractPrintable):
     """Results of batches of walks for the last step of each element. The leading axis is the batch.
 
     Arrays are numpy arrays: the conversion of thousands of values to JAX takes as long as some
@@ -48,114 +48,145 @@ class Steps(AbstractTold):
     outcome: Int[np.ndarray, " lanes"]
     n_stepped: Int[np.ndarray, " lanes"]
     solver_steps: Int[np.ndarray, " lanes"]
-    fixed: Bool[np.ndarray, " lanes"]
-    solver: Int[np.ndarray, " lanes"]
+    is_collocated: Bool[np.ndarray, " lanes"]
+    solver_index: Int[np.ndarray, " lanes"]
     engine: str = eqx.field(static=True)
-    solvers: tuple[str, ...] = eqx.field(static=True)
-    derivatives: dict[str, By] = eqx.field(default_factory=dict)
+    solver_names: tuple[str, ...] = eqx.field(static=True)
+    derivatives: dict[str, StepSensitivity] = eqx.field(default_factory=dict)
 
-    def rows(self) -> list[Row]:
-        n = np.bincount(np.ravel(self.solver), minlength=len(self.solvers))
-        by = (f"{count:,} by {name}" for count, name in zip(n, self.solvers, strict=True) if count)
+    def summary_rows(self) -> list[TextRow]:
+        n_by_solver = np.bincount(np.ravel(self.solver_index), minlength=len(self.solver_names))
+        solver_texts = (
+            f"{count:,} by {name}"
+            for count, name in zip(n_by_solver, self.solver_names, strict=True)
+            if count
+        )
         return [
-            ("lanes", counted(self.outcome, Outcome)),
-            ("steps each", told(self.n_stepped, "")),
-            ("engine", f"{self.engine}; {', '.join(by)}"),
-            ("duration of the last step", told(self.durations.sum(-1), "s")),
+            ("lanes", format_outcome_counts(self.outcome, Outcome)),
+            ("steps each", format_quantity(self.n_stepped, "")),
+            ("engine", f"{self.engine}; {', '.join(solver_texts)}"),
+            ("duration of the last step", format_quantity(self.durations.sum(-1), "s")),
         ]
 
 
-START = "section_state"
+START_NAME = "section_state"
 
 
-class Walked:
+class WalkBatch:
     """Batch of walks in progress. Lanes are the last axis of every array."""
 
     def __init__(
-        self, states: np.ndarray, asked: Sequence[str], parameters: tuple[str, ...]
+        self, states: np.ndarray, derivative_names: Sequence[str], parameters: tuple[str, ...]
     ) -> None:
         """Start walks. `derivative_names` are START_NAME and names of these parameters, the first
         values of a lane."""
-        size, n = states.shape
-        self.section_state, self.durations = states, np.zeros((3, n), states.dtype)
-        self.outcome, self.n_stepped, self.solver_steps = np.zeros((3, n), np.int32)
-        self.fixed = np.zeros(n, bool)
+        state_size, n_lanes = states.shape
+        self.section_state, self.durations = states, np.zeros((3, n_lanes), states.dtype)
+        self.outcome, self.n_stepped, self.solver_steps = np.zeros((3, n_lanes), np.int32)
+        self.is_collocated = np.zeros(n_lanes, bool)
         # Inputs of the Jacobian: the requested parameters, then the start.
-        self.asked, self.names = asked, [name for name in asked if name != START]
-        state = range(len(parameters), len(parameters) + size)
-        self.moved = (*(parameters.index(x) for x in self.names), *state) if asked else ()
-        self.jacobian = np.zeros((len(self.moved), size + 3, n), states.dtype)
+        self.derivative_names, self.parameter_names = (
+            derivative_names,
+            [name for name in derivative_names if name != START_NAME],
+        )
+        state_inputs = range(len(parameters), len(parameters) + state_size)
+        self.input_indices = (
+            (*(parameters.index(x) for x in self.parameter_names), *state_inputs)
+            if derivative_names
+            else ()
+        )
+        self.jacobian = np.zeros((len(self.input_indices), state_size + 3, n_lanes), states.dtype)
 
-    def on(self) -> np.ndarray:
+    def active_lanes(self) -> np.ndarray:
         """Return the indices of the lanes that continue."""
         return np.flatnonzero(self.outcome == Outcome.STEPPED)
 
-    def told(
-        self, order: np.ndarray, solver: np.ndarray, engine: str, solvers: tuple[str, ...]
-    ) -> Steps:
+    def to_result(
+        self,
+        order: np.ndarray,
+        solver_index: np.ndarray,
+        engine: str,
+        solver_names: tuple[str, ...],
+    ) -> StepBatchResult:
         """Return the result, with each lane at its index before sorting by `order`."""
-        back = np.empty_like(order)
-        back[order] = np.arange(len(order))
-        there = lambda x: x.take(back, -1).T
-        return Steps(
-            there(self.section_state),
-            there(self.durations),
-            there(self.outcome),
-            there(self.n_stepped),
-            there(self.solver_steps),
-            there(self.fixed),
-            there(solver),
+        inverse_order = np.empty_like(order)
+        inverse_order[order] = np.arange(len(order))
+        reorder = lambda x: x.take(inverse_order, -1).T
+        return StepBatchResult(
+            reorder(self.section_state),
+            reorder(self.durations),
+            reorder(self.outcome),
+            reorder(self.n_stepped),
+            reorder(self.solver_steps),
+            reorder(self.is_collocated),
+            reorder(solver_index),
             engine,
-            solvers,
-            self.derivatives(back),
+            solver_names,
+            self.named_derivatives(inverse_order),
         )
 
-    def derivatives(self, back: np.ndarray) -> dict[str, By]:
+    def named_derivatives(self, inverse_order: np.ndarray) -> dict[str, StepSensitivity]:
         """Return the derivatives of the walk by name of the input; zero where it failed."""
-        if not self.asked:
+        if not self.derivative_names:
             return {}
         self.jacobian[..., self.outcome != Outcome.STEPPED] = 0.0
-        by, n, size = self.jacobian.take(back, -1).T, len(self.names), len(self.section_state)
-        columns: dict[str, Any] = {name: i for i, name in enumerate(self.names)}
-        columns[START] = slice(n, None)
-        told = {name: by[:, :, columns[name]] for name in self.asked}
-        return {name: By(x[:, :size], x[:, size:]) for name, x in told.items()}
+        jacobian, n_parameters, state_size = (
+            self.jacobian.take(inverse_order, -1).T,
+            len(self.parameter_names),
+            len(self.section_state),
+        )
+        columns_by_name: dict[str, Any] = {name: i for i, name in enumerate(self.parameter_names)}
+        columns_by_name[START_NAME] = slice(n_parameters, None)
+        jacobian_by_name = {
+            name: jacobian[:, :, columns_by_name[name]] for name in self.derivative_names
+        }
+        return {
+            name: StepSensitivity(x[:, :state_size], x[:, state_size:])
+            for name, x in jacobian_by_name.items()
+        }
 
-    def take(self, lanes: np.ndarray, told: tuple[np.ndarray, ...], fixed: np.ndarray) -> None:
+    def record_step(
+        self, lanes: np.ndarray, step_values: tuple[np.ndarray, ...], is_collocated: np.ndarray
+    ) -> None:
         """Record a step of these lanes: state, durations, outcome, solver steps and Jacobian."""
-        state, durations, outcome, tried, *by = told
-        some = only(lanes, self)
-        if by:
-            self.jacobian = _put(self.jacobian, some, self._after(some, *by))
-        self.section_state = _put(self.section_state, some, state)
-        self.durations = _put(self.durations, some, durations)
-        self.outcome = _put(self.outcome, some, outcome)
-        self.fixed = _put(self.fixed, some, fixed)
-        self.n_stepped[some] += outcome == Outcome.STEPPED
-        self.solver_steps[some] += tried
+        section_state, durations, outcome, n_solver_steps, *step_jacobian = step_values
+        index = lane_index(lanes, self)
+        if step_jacobian:
+            self.jacobian = _replace_lanes(
+                self.jacobian, index, self._chain_jacobian(index, *step_jacobian)
+            )
+        self.section_state = _replace_lanes(self.section_state, index, section_state)
+        self.durations = _replace_lanes(self.durations, index, durations)
+        self.outcome = _replace_lanes(self.outcome, index, outcome)
+        self.is_collocated = _replace_lanes(self.is_collocated, index, is_collocated)
+        self.n_stepped[index] += outcome == Outcome.STEPPED
+        self.solver_steps[index] += n_solver_steps
 
-    def _after(self, some: Any, by: np.ndarray) -> np.ndarray:
+    def _chain_jacobian(self, index: Any, step_jacobian: np.ndarray) -> np.ndarray:
         """Return the Jacobian of the walk from that of its last step, (columns, rows, lanes).
 
         Products are summed one by one, so that a lane's digits do not depend on the batch.
         """
-        n, size = len(self.names), len(self.section_state)
-        if not self.n_stepped[some].any():
-            return by
-        before = self.jacobian[:, :size, some]
-        moved = sum(by[n + i] * before[:, i, None] for i in range(size))
-        moved[:n] += by[:n]
-        return moved
+        n_parameters, state_size = len(self.parameter_names), len(self.section_state)
+        if not self.n_stepped[index].any():
+            return step_jacobian
+        previous_jacobian = self.jacobian[:, :state_size, index]
+        chained = sum(
+            step_jacobian[n_parameters + i] * previous_jacobian[:, i, None]
+            for i in range(state_size)
+        )
+        chained[:n_parameters] += step_jacobian[:n_parameters]
+        return chained
 
 
-def only(lanes: np.ndarray, walked: Walked) -> Any:
+def lane_index(lanes: np.ndarray, walks: WalkBatch) -> Any:
     """Return an index of these lanes, which copies nothing if they are all lanes."""
-    return slice(None) if len(lanes) == len(walked.outcome) else lanes
+    return slice(None) if len(lanes) == len(walks.outcome) else lanes
 
 
-def _put(values: np.ndarray, some: Any, part: np.ndarray) -> np.ndarray:
+def _replace_lanes(values: np.ndarray, index: Any, new_values: np.ndarray) -> np.ndarray:
     """Replace the values of some lanes and return the array."""
-    if isinstance(some, slice):
-        return part
-    values[..., some] = part
+    if isinstance(index, slice):
+        return new_values
+    values[..., index] = new_values
     return values

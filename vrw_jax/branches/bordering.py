@@ -6,16 +6,16 @@ from typing import Any
 import jax
 import numpy as np
 
-from vrw_jax.branches.branch import BorderCurve
-from vrw_jax.branches.tracing import OF_CURVES, Seed, Tracer
+from vrw_jax.branches.branch import SpecialPointCurve
+from vrw_jax.branches.tracing import DEFAULT_CURVE_OPTIONS, CurveSeed, CurveTracer
 from vrw_jax.cycles import LimitCycle
-from vrw_jax.numerics import ArclengthOptions, Options
-from vrw_jax.wheel import DOMAINS, wheel_of
-from vrw_jax.wording import instance, names_of, range_of, require_known
+from vrw_jax.numerics import ArclengthOptions, StepOptions
+from vrw_jax.wheel import PARAMETER_DOMAINS, wheel_from_parameters
+from vrw_jax.wording import check_known_name, check_names, check_range, check_type
 
-Box = Mapping[str, tuple[float, float]]
+ParameterBounds = Mapping[str, tuple[float, float]]
 
-BOX: Box = {
+DEFAULT_BOUNDS: ParameterBounds = {
     "damping": (1.0, 250.0),
     "stiffness": (200.0, 1200.0),
     "natural_length": (1.001, 1.06),
@@ -24,15 +24,15 @@ BOX: Box = {
 """Default bounds of the parameters for the continuation, for a wheel with legs of 1 m."""
 
 
-def border_curve(
+def continue_special_point(
     name: str,
     parameters: tuple[str, str],
     cycle: LimitCycle,
     *,
-    bounds: Box | None = None,
+    bounds: ParameterBounds | None = None,
     options: ArclengthOptions | None = None,
-    step_options: Options | None = None,
-) -> BorderCurve:
+    step_options: StepOptions | None = None,
+) -> SpecialPointCurve:
     """Return the curve of the special point `name` over two parameters, starting nearest to a gait
     of one step.
 
@@ -66,74 +66,79 @@ def border_curve(
         >>> [point.name for point in curve.codim2_points[-3:-1]]
         ['fold', 'hit_planted_impulse']
     """
-    (curve,) = border_curves(
+    (curve,) = continue_special_points(
         (name,), parameters, cycle, bounds=bounds, options=options, step_options=step_options
     )
     return curve
 
 
-def _plane(parameters: Any, bounds: Any) -> tuple[tuple[str, str], np.ndarray]:
+def _check_parameter_plane(parameters: Any, bounds: Any) -> tuple[tuple[str, str], np.ndarray]:
     """Return the two parameters and their ranges.
 
     Raises: TypeError, ValueError: the parameters or bounds are invalid.
     """
-    instance("bounds", bounds, (Mapping, type(None)), "write {'damping': (100.0, 200.0)}")
-    box = {**BOX, **(bounds or {})}
-    pair = names_of("parameters", parameters)
-    for name in box:
-        require_known(name, tuple(DOMAINS), "parameter that has bounds")
-    for name in pair:
-        require_known(name, tuple(box), "parameter with bounds")
-    if len(pair) != 2 or len(set(pair)) != 2:
+    check_type("bounds", bounds, (Mapping, type(None)), "write {'damping': (100.0, 200.0)}")
+    all_bounds = {**DEFAULT_BOUNDS, **(bounds or {})}
+    parameter_pair = check_names("parameters", parameters)
+    for name in all_bounds:
+        check_known_name(name, tuple(PARAMETER_DOMAINS), "parameter that has bounds")
+    for name in parameter_pair:
+        check_known_name(name, tuple(all_bounds), "parameter with bounds")
+    if len(parameter_pair) != 2 or len(set(parameter_pair)) != 2:
         raise ValueError(
-            f"parameters are {pair}, but a curve needs two different ones: write "
+            f"parameters are {parameter_pair}, but a curve needs two different ones: write "
             "('damping', 'slope')."
         )
-    ranges = {name: range_of(f"bounds[{name!r}]", ends) for name, ends in box.items()}
-    return (pair[0], pair[1]), np.array([ranges[name] for name in pair], float)
+    ranges = {name: check_range(f"bounds[{name!r}]", ends) for name, ends in all_bounds.items()}
+    return (parameter_pair[0], parameter_pair[1]), np.array(
+        [ranges[name] for name in parameter_pair], float
+    )
 
 
-def border_curves(
+def continue_special_points(
     names: tuple[str, ...],
     parameters: tuple[str, str],
     cycle: LimitCycle,
     *,
-    bounds: Box | None = None,
+    bounds: ParameterBounds | None = None,
     options: ArclengthOptions | None = None,
-    step_options: Options | None = None,
-) -> tuple[BorderCurve, ...]:
+    step_options: StepOptions | None = None,
+) -> tuple[SpecialPointCurve, ...]:
     """Return `continue_special_point` of several special points."""
-    parameters, box = _plane(parameters, bounds)
+    parameters, parameter_ranges = _check_parameter_plane(parameters, bounds)
     first, second = parameters
-    instance("cycle", cycle, LimitCycle, "give vrw.limit_cycle(params)")
+    check_type("cycle", cycle, LimitCycle, "give vrw.limit_cycle(params)")
     if cycle.period_n != 1:
         raise ValueError(
             f"the gait has {cycle.period_n} steps: a curve of special points takes one step."
         )
-    options = OF_CURVES if options is None else options
-    step_options = Options.tight() if step_options is None else step_options
-    instance("options", options, ArclengthOptions, "give vrw.ArclengthOptions()")
-    instance("step_options", step_options, Options, "give vrw.Options()")
-    tracer = Tracer(parameters, box, cycle.model, options, step_options)
-    params = wheel_of(cycle.parameters, cycle.problem.n_legs)
-    found: dict[str, Seed] = {}
+    options = DEFAULT_CURVE_OPTIONS if options is None else options
+    step_options = StepOptions.tight() if step_options is None else step_options
+    check_type("options", options, ArclengthOptions, "give vrw.ArclengthOptions()")
+    check_type("step_options", step_options, StepOptions, "give vrw.StepOptions()")
+    tracer = CurveTracer(parameters, parameter_ranges, cycle.model, options, step_options)
+    params = wheel_from_parameters(cycle.parameters, cycle.system.n_legs)
+    seeds_by_name: dict[str, CurveSeed] = {}
     for axis, parameter in enumerate(parameters):
-        if set(names) - set(found):
-            seeds = tracer.along(axis, jax.tree.map(lambda x: x[None], params))
-            at = float(getattr(params, parameter))
-            away = np.argsort([-abs(seed.at[axis] - at) for seed in seeds])
-            found = {seeds[i].name: seeds[i] for i in away} | found
-    missing = sorted(set(names) - set(found))
-    if missing:
+        if set(names) - set(seeds_by_name):
+            seeds = tracer.find_seeds(axis, jax.tree.map(lambda x: x[None], params))
+            start_value = float(getattr(params, parameter))
+            order = np.argsort([-abs(seed.parameter_values[axis] - start_value) for seed in seeds])
+            seeds_by_name = {seeds[i].name: seeds[i] for i in order} | seeds_by_name
+    missing_names = sorted(set(names) - set(seeds_by_name))
+    if missing_names:
         raise ValueError(
-            f"no special point {missing[0]!r} on branches along {first} and {second} within their "
-            f"bounds, but {', '.join(sorted(found)) or 'none'}: give a gait nearer to it, or wider "
+            f"no special point {missing_names[0]!r} on branches along {first} and {second} within their "
+            f"bounds, but {', '.join(sorted(seeds_by_name)) or 'none'}: give a gait nearer to it, or wider "
             "bounds."
         )
-    told = {one.curve.name: one.curve for one in tracer.followed([found[n] for n in names], ())}
-    lost = sorted(set(names) - set(told))
-    if lost:
+    curves_by_name = {
+        traced.curve.name: traced.curve
+        for traced in tracer.trace_curves([seeds_by_name[n] for n in names], ())
+    }
+    lost_names = sorted(set(names) - set(curves_by_name))
+    if lost_names:
         raise ValueError(
-            f"special point {lost[0]} at {found[lost[0]].at[0]:.9g} can't be followed from there."
+            f"special point {lost_names[0]} at {seeds_by_name[lost_names[0]].parameter_values[0]:.9g} can't be followed from there."
         )
-    return tuple(told[name] for name in names)
+    return tuple(curves_by_name[name] for name in names)

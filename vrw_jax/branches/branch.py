@@ -15,9 +15,9 @@ from vrw_jax.numerics import floquet
 from vrw_jax.results import MEASURES
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.wheel import Outcome
-from vrw_jax.wording import as_html
+from vrw_jax.wording import format_html_table
 
-MOST_SHOWN = 20
+MAX_PRINTED_POINTS = 20
 """Largest number of special points in the printed form of a branch."""
 
 
@@ -28,14 +28,14 @@ class FixedPoint(NamedTuple):
     - `jacobian`: of the map.
     """
 
-    section: np.ndarray
+    section_state: np.ndarray
     parameter: float
     jacobian: np.ndarray
 
     @property
     def multipliers(self) -> np.ndarray:
         """Return the eigenvalues of the Jacobian, the one of largest modulus first."""
-        return np.asarray(floquet.multipliers(jnp.asarray(self.jacobian)))
+        return np.asarray(floquet.floquet_multipliers(jnp.asarray(self.jacobian)))
 
     @property
     def spectral_radius(self) -> float:
@@ -44,7 +44,7 @@ class FixedPoint(NamedTuple):
 
 
 @dataclass(frozen=True, repr=False)
-class Border:
+class SpecialPoint:
     """Bifurcation, border collision or end of a branch.
 
     `kind` is "fold", "period_doubling", "neimark_sacker", "border_collision" (the indicator or
@@ -104,7 +104,7 @@ class Branch:
 
     parameter: str
     dataset: xr.Dataset
-    borders: tuple[Border, ...]
+    special_points: tuple[SpecialPoint, ...]
     ends: tuple[str, str]
     outcome: Outcome
 
@@ -126,35 +126,37 @@ class Branch:
     def __str__(self) -> str:
         if not self.values.size:
             return f"Branch along {self.parameter}: none. {self.outcome.meaning}"
-        known = self.parameter in MEASURES
-        unit = f" {MEASURES[self.parameter].plain_unit}".rstrip() if known else ""
-        stable = self.stable
+        has_unit = self.parameter in MEASURES
+        unit = f" {MEASURES[self.parameter].display_unit}".rstrip() if has_unit else ""
+        is_stable = self.stable
         lines = [
             f"Branch along {self.parameter}: {self.values.size} gaits from {self.values[0]:.6g} to "
-            f"{self.values[-1]:.6g}{unit}, {int(stable.sum())} stable, {int((~stable).sum())} not.",
+            f"{self.values[-1]:.6g}{unit}, {int(is_stable.sum())} stable, {int((~is_stable).sum())} not.",
             f"  at {self.values[0]:.6g}: {self.ends[0]}",
             f"  at {self.values[-1]:.6g}: {self.ends[1]}",
-            f"  {len(self.borders)} special points" + (":" if self.borders else "."),
-            *(f"    {border}" for border in self.borders[:MOST_SHOWN]),
+            f"  {len(self.special_points)} special points" + (":" if self.special_points else "."),
+            *(f"    {border}" for border in self.special_points[:MAX_PRINTED_POINTS]),
         ]
-        if len(self.borders) > MOST_SHOWN:
-            lines.append(f"    and {len(self.borders) - MOST_SHOWN} more, in .special_points")
+        if len(self.special_points) > MAX_PRINTED_POINTS:
+            lines.append(
+                f"    and {len(self.special_points) - MAX_PRINTED_POINTS} more, in .special_points"
+            )
         return "\n".join(lines)
 
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
         ends = ("", "ends the branch")
-        return as_html(
+        return format_html_table(
             str(self).split("\n  ")[0],
             ((f"{b.value:.9g}", b.kind.replace("_", " "), b.name, ends[b.ends_branch])
-             for b in self.borders),
+             for b in self.special_points),
             (self.parameter, "kind", "name", ""),
         )  # fmt: skip
 
 
 @dataclass(frozen=True)
-class Meeting:
+class Codim2Point:
     """Point of codimension two, where a curve of special points meets another special point."""
 
     name: str  # of the other special point
@@ -167,7 +169,7 @@ class Meeting:
 
 
 @dataclass(frozen=True, repr=False)
-class BorderCurve:
+class SpecialPointCurve:
     """Curve of a special point in two parameters, its points in order along the dimension `point`.
 
     - `name`: of the special point;
@@ -186,7 +188,7 @@ class BorderCurve:
     name: str
     parameters: tuple[str, str]
     dataset: xr.Dataset
-    meetings: tuple[Meeting, ...]
+    codim2_points: tuple[Codim2Point, ...]
     ends: tuple[str, str]
 
     @property
@@ -199,6 +201,6 @@ class BorderCurve:
         lines = [f"Curve of {self.name} over {first} and {second}: {len(self.values)} points."]
         for end, text in zip((0, -1), self.ends, strict=True):
             lines.append(f"  at ({self.values[end][0]:.6g}, {self.values[end][1]:.6g}): {text}")
-        return "\n".join([*lines, *(f"    {meeting}" for meeting in self.meetings)])
+        return "\n".join([*lines, *(f"    {meeting}" for meeting in self.codim2_points)])
 
     __repr__ = __str__

@@ -18,106 +18,117 @@ import numpy as np
 from jaxtyping import Array
 
 from vrw_jax.branches.branch import Branch
-from vrw_jax.branches.followed import Wheel
-from vrw_jax.branches.run import IN_SEQUENCE, READ, AbstractRun, Strand, Table, run_all
-from vrw_jax.branches.starts import STARTS, Wanted, start_by_walking
+from vrw_jax.branches.followed import BranchWheel
+from vrw_jax.branches.run import (
+    ADMISSIBLE_COLUMN,
+    READ_BATCH_SIZE,
+    AbstractContinuation,
+    BranchData,
+    QuantityTable,
+    continue_and_locate,
+)
+from vrw_jax.branches.starts import START_FUNCTIONS, BranchRequest, start_from_walks
 from vrw_jax.cycles import (
-    AGREEMENT,
+    STATE_AGREEMENT_TOLERANCE,
     AbstractCycle,
     CycleOptions,
     LimitCycle,
-    WalkedCycle,
-    finder_of,
-    serving,
+    ReturnMapCycle,
+    make_finder,
+    resolve_model,
 )
 from vrw_jax.models import AbstractWheel, refuse_ladder
 from vrw_jax.numerics import (
     ArclengthOptions,
-    MapFollowed,
-    Options,
-    PathPoint,
-    multipliers,
-    taken,
+    ContinuationPoint,
+    FixedPointProblem,
+    StepOptions,
+    floquet_multipliers,
+    take_rows,
 )
 from vrw_jax.results import (
-    CYCLE,
-    GROUND,
-    MARGINS,
-    STEP,
-    attrs_of,
-    locked_legs,
+    LIMIT_CYCLE_MEASURES,
+    MARGIN_MEASURES,
+    STEP_MEASURES,
+    UNILATERAL_STEP_MEASURES,
+    locked_leg_coordinate,
+    make_variables,
+    measure_attrs,
     provenance,
-    variables,
 )
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.walks import ModelLike, one_wheel, options_of, rung_of
-from vrw_jax.wheel import FRICTION, Outcome, WheelParams
+from vrw_jax.walks import ModelLike, check_model, check_options, check_single_wheel
+from vrw_jax.wheel import FRICTION_NAME, Outcome, WheelParams
 from vrw_jax.wording import (
-    function_of,
-    instance,
-    range_of,
-    real,
-    reals,
-    require_known,
-    untraced,
-    whole,
+    check_callable,
+    check_int,
+    check_known_name,
+    check_not_traced,
+    check_range,
+    check_real,
+    check_reals,
+    check_type,
 )
 
-INDICATORS = ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
-ENDING = (*INDICATORS, "duration_dls", "duration_sls1", "duration_sls2")
+INDICATOR_NAMES = ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
+BRANCH_ENDING_QUANTITIES = (*INDICATOR_NAMES, "duration_dls", "duration_sls1", "duration_sls2")
 """Quantities at whose zeros the order of events changes and the branch ends."""
 
-INSTEAD = "differentiate vrw.limit_cycle"
+DIFFERENTIATION_HINT = "differentiate vrw.limit_cycle"
 """Advice for a caller who differentiates."""
 
-COARSE = Outcome.MESH_TOO_COARSE.name.lower()
+COARSE_MESH_NAME = Outcome.MESH_TOO_COARSE.name.lower()
 """Name of an end where the mesh is too coarse: the gaits do not repeat in a walk."""
 
-MESH_ERROR, REFINEMENTS = 1e-8, 3
+REFINE_ABOVE_BRANCH_MESH_ERROR, MAX_BRANCH_REFINEMENTS = 1e-8, 3
 """Estimate of the mesh's error on a branch above which a finer mesh is used, and largest number of
 refinements."""
 
 
 @dataclass(frozen=True)
-class GaitRun(AbstractRun):
+class GaitContinuation(AbstractContinuation):
     """Continuation of gaits: event-driven steps evaluate them, and they are admissible if these
     repeat."""
 
     model: AbstractWheel
-    step_options: Options
+    step_options: StepOptions
     n_legs: int
 
-    ending: ClassVar[tuple[str, ...]] = ENDING
-    exact: ClassVar[Mapping[str, str]] = {"clearance_sls1": "takeoff_acceleration"}
+    ending_quantities: ClassVar[tuple[str, ...]] = BRANCH_ENDING_QUANTITIES
+    linear_substitutes: ClassVar[Mapping[str, str]] = {"clearance_sls1": "takeoff_acceleration"}
     """Margins that vanish as a cube, with the quantity that vanishes at the same point linearly. A
     foot that takes off less steeply dips less deeply, until it rises immediately. A solver cannot
     resolve the last of these dips, but the linear quantity changes its sign."""
 
-    def read(self, wheels: Wheel, points: PathPoint) -> Table:
+    def evaluate_points(self, wheels: BranchWheel, points: ContinuationPoint) -> QuantityTable:
         """Return the table, with one column more for each leg of a margin with several legs."""
-        followed: Any = self.followed
-        told = functools.partial(followed.told, self.model, self.step_options)
-        table = self.batched(told, READ, wheels, points)
-        for name, margin in MARGINS.items():
-            if margin.axis and name in table:
+        problem: Any = self.problem
+        measure_gaits = functools.partial(problem.measure_points, self.model, self.step_options)
+        table = self.map_batched(measure_gaits, READ_BATCH_SIZE, wheels, points)
+        for name, margin in MARGIN_MEASURES.items():
+            if margin.dimension and name in table:
                 legs = enumerate(range(3, self.n_legs + 1))
                 table |= {f"{name}[{leg}]": table[name][:, i] for i, leg in legs}
         return table
 
-    def kept(self, table: Table) -> np.ndarray:
-        return (table["outcome"] == Outcome.STEPPED) & (table["closure"] <= AGREEMENT)
+    def is_admissible(self, table: QuantityTable) -> np.ndarray:
+        return (table["outcome"] == Outcome.STEPPED) & (
+            table["closure"] <= STATE_AGREEMENT_TOLERANCE
+        )
 
     def is_margin(self, name: str) -> bool:
-        return name in INDICATORS or name.partition("[")[0] in MARGINS
+        return name in INDICATOR_NAMES or name.partition("[")[0] in MARGIN_MEASURES
 
-    def name_of_loss(self, table: Table, place: int) -> str:
-        outcome = Outcome(int(table["outcome"][place]))
+    def name_end(self, table: QuantityTable, row_index: int) -> str:
+        outcome = Outcome(int(table["outcome"][row_index]))
         if outcome != Outcome.STEPPED:
             return outcome.name.lower()
-        return COARSE if "mesh_error" in table else IN_SEQUENCE
+        return COARSE_MESH_NAME if "mesh_error" in table else ADMISSIBLE_COLUMN
 
-    def is_rough(self, table: Table, ends: tuple[str, ...]) -> bool:
-        return COARSE in ends or bool(np.max(table.get("mesh_error", 0.0)) > MESH_ERROR)
+    def is_mesh_limited(self, table: QuantityTable, ends: tuple[str, ...]) -> bool:
+        return COARSE_MESH_NAME in ends or bool(
+            np.max(table.get("mesh_error", 0.0)) > REFINE_ABOVE_BRANCH_MESH_ERROR
+        )
 
 
 def continue_branch(
@@ -125,12 +136,12 @@ def continue_branch(
     name: str,
     bounds: tuple[float, float],
     *,
-    cycle: LimitCycle | WalkedCycle | None = None,
+    cycle: LimitCycle | ReturnMapCycle | None = None,
     period_n: int = 1,
     model: ModelLike | None = None,
     options: ArclengthOptions | None = None,
     cycle_options: CycleOptions | None = None,
-    step_options: Options | None = None,
+    step_options: StepOptions | None = None,
 ) -> Branch:
     """Return the branch of limit cycles through `params` along the parameter `name` within
     `bounds`.
@@ -176,14 +187,14 @@ def continue_branch(
         >>> print(point.name, f"{point.value:.6f}", branch.ends[1])
         lambda_4_plus 219.847688 lambda 4 plus at 219.847688 ends it.
     """
-    one_wheel(params, "use vrw.continue_branches for a batch")
+    check_single_wheel(params, "use vrw.continue_branches for a batch")
     if cycle is not None:
-        instance("cycle", cycle, AbstractCycle, "give vrw.limit_cycle(params)")
-    untraced("vrw.continue_branch", INSTEAD, params, cycle)
-    batch, cycle = jax.device_put(taken((params, cycle), None))
+        check_type("cycle", cycle, AbstractCycle, "give vrw.limit_cycle(params)")
+    check_not_traced("vrw.continue_branch", DIFFERENTIATION_HINT, params, cycle)
+    batch, cycle = jax.device_put(take_rows((params, cycle), None))
     (branch,) = continue_branches(
         batch, name, bounds, cycle=cycle, period_n=period_n, options=options,
-        model=rung_of(serving(params, model)),
+        model=check_model(resolve_model(params, model)),
         cycle_options=cycle_options, step_options=step_options,
     )  # fmt: skip
     return branch
@@ -194,12 +205,12 @@ def continue_branches(
     name: str,
     bounds: tuple[float, float],
     *,
-    cycle: LimitCycle | WalkedCycle | None = None,
+    cycle: LimitCycle | ReturnMapCycle | None = None,
     period_n: int = 1,
     model: AbstractWheel | None = None,
     options: ArclengthOptions | None = None,
     cycle_options: CycleOptions | None = None,
-    step_options: Options | None = None,
+    step_options: StepOptions | None = None,
 ) -> tuple[Branch, ...]:
     """Return `continue_branch` of a batch of wheels; every parameter has one leading axis.
 
@@ -230,60 +241,86 @@ def continue_branches(
         >>> [round(branch.special_points[-1].value, 4) for branch in branches]
         [219.8477, 219.8477]
     """
-    untraced("vrw.continue_branch", INSTEAD, params, cycle)
-    instance("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
-    model, step_options = rung_of(model), options_of(step_options or Options.tight())
-    _check_followed(model, name, whole("period_n", period_n), cycle)
-    (low, high), options = range_of("bounds", bounds), _arclength(options)
-    finder = finder_of(model, params.n_legs, cycle_options=cycle_options, step_options=step_options)
-    finder.options_used.require_reachable(jnp.result_type(*jax.tree.leaves(params)))
+    check_not_traced("vrw.continue_branch", DIFFERENTIATION_HINT, params, cycle)
+    check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
+    model, step_options = check_model(model), check_options(step_options or StepOptions.tight())
+    _check_continuation(model, name, check_int("period_n", period_n), cycle)
+    (lower, upper), options = check_range("bounds", bounds), _check_arclength_options(options)
+    finder = make_finder(
+        model, params.n_legs, cycle_options=cycle_options, step_options=step_options
+    )
+    finder.search_options.check_tolerances(jnp.result_type(*jax.tree.leaves(params)))
     batch = np.broadcast_shapes(*(x.shape for x in jax.tree.leaves(params)))
     if len(batch) != 1:
         raise ValueError(f"the wheels' batch has shape {batch}, but it must have one axis.")
     params = jax.tree.map(lambda x: jnp.broadcast_to(x, batch), params)
-    given = jnp.broadcast_to(getattr(model if name == FRICTION else params, name), batch)
-    p = jnp.clip(given, low, high)
-    if name != FRICTION:
-        _, params = model.moved(params, name, p)
-    wanted = Wanted(params, model, name, p, period_n, cycle_options, step_options)
-    outcomes, strands = _followed(wanted, cycle, options, np.array([low, high]))
-    one = lambda owner: jax.tree.map(lambda x: x[owner], params)
+    start_values = jnp.broadcast_to(
+        getattr(model if name == FRICTION_NAME else params, name), batch
+    )
+    parameter_values = jnp.clip(start_values, lower, upper)
+    if name != FRICTION_NAME:
+        _, params = model.with_parameter(params, name, parameter_values)
+    request = BranchRequest(
+        params, model, name, parameter_values, period_n, cycle_options, step_options
+    )
+    outcomes, branch_data = _continue_from_starts(request, cycle, options, np.array([lower, upper]))
+    take_wheel = lambda wheel_index: jax.tree.map(lambda x: x[wheel_index], params)
     return tuple(
-        _branch_of_gaits(strand, one(owner), name, model, step_options, int(outcomes[owner]))
-        for owner, strand in enumerate(strands)
+        _label_branch(
+            strand, take_wheel(wheel_index), name, model, step_options, int(outcomes[wheel_index])
+        )
+        for wheel_index, strand in enumerate(branch_data)
     )
 
 
-def _followed(
-    wanted: Wanted, cycle: Any, options: ArclengthOptions, limits: np.ndarray
-) -> tuple[np.ndarray, list[Strand | None]]:
+def _continue_from_starts(
+    request: BranchRequest, cycle: Any, options: ArclengthOptions, limits: np.ndarray
+) -> tuple[np.ndarray, list[BranchData | None]]:
     """Return the outcomes of the starts, and the data of the branches from them.
 
     The mesh is that of the cycle options. Without options it is as fine as the branches need.
     """
-    adaptive = wanted.cycle_options is None
-    for refinement in range(1 + REFINEMENTS):
-        start = STARTS.get(wanted.model.rung, start_by_walking)(wanted, cycle)
-        run = GaitRun(
-            start.followed, options, start.wheels, limits, wanted.model, wanted.step_options,
-            wanted.params.n_legs,
+    refines_mesh = request.cycle_options is None
+    for refinement in range(1 + MAX_BRANCH_REFINEMENTS):
+        branch_start = START_FUNCTIONS.get(request.model.model_name, start_from_walks)(
+            request, cycle
+        )
+        run = GaitContinuation(
+            branch_start.problem, options, branch_start.wheels, limits, request.model, request.step_options,
+            request.params.n_legs,
         )  # fmt: skip
-        good = start.outcomes == Outcome.STEPPED
-        finest = not adaptive or start.finer is None or refinement == REFINEMENTS
-        strands = run_all(run, start.z, wanted.p, good, start.make_cycle, finest)
-        if finest or not any(strand is not None and strand.rough for strand in strands):
+        has_start = branch_start.outcomes == Outcome.STEPPED
+        is_finest = (
+            not refines_mesh
+            or branch_start.finer_options is None
+            or refinement == MAX_BRANCH_REFINEMENTS
+        )
+        branch_data = continue_and_locate(
+            run,
+            branch_start.unknowns,
+            request.parameter_values,
+            has_start,
+            branch_start.make_cycle,
+            is_finest,
+        )
+        if is_finest or not any(
+            strand is not None and strand.is_mesh_limited for strand in branch_data
+        ):
             break
-        wanted, cycle = wanted._replace(cycle_options=start.finer), start.cycle
-    return start.outcomes, strands
+        request, cycle = (
+            request._replace(cycle_options=branch_start.finer_options),
+            branch_start.cycle,
+        )
+    return branch_start.outcomes, branch_data
 
 
-UNTOLD = ("outcome", "solver_steps")
+OMITTED_MEASURES = ("outcome", "solver_steps")
 """Measures of the checking step that a branch omits."""
 
 
-def _check_followed(model: AbstractWheel, name: str, period_n: int, cycle: Any) -> None:
+def _check_continuation(model: AbstractWheel, name: str, period_n: int, cycle: Any) -> None:
     refuse_ladder(model, "followed")
-    require_known(name, model.parameter_names, "parameter")
+    check_known_name(name, model.parameter_names, "parameter")
     if period_n > 1 and cycle is None:
         raise ValueError(
             f"period_n is {period_n} and there is no cycle, but a gait of several steps is one of "
@@ -291,61 +328,71 @@ def _check_followed(model: AbstractWheel, name: str, period_n: int, cycle: Any) 
         )
 
 
-def _arclength(options: ArclengthOptions | None) -> ArclengthOptions:
+def _check_arclength_options(options: ArclengthOptions | None) -> ArclengthOptions:
     if options is not None:
-        instance("options", options, ArclengthOptions, "give vrw.ArclengthOptions()")
+        check_type("options", options, ArclengthOptions, "give vrw.ArclengthOptions()")
     return ArclengthOptions() if options is None else options
 
 
-def _branch_of_gaits(
-    strand: Strand | None,
+def _label_branch(
+    branch_data: BranchData | None,
     params: WheelParams,
     name: str,
     model: AbstractWheel,
-    options: Options,
+    options: StepOptions,
     outcome: int,
 ) -> Branch:
     origin = provenance(params, model, options)
     origin.pop(f"parameter_{name}", None)
     attrs = {"title": f"Branch of limit cycles along {name}"} | origin
-    if strand is None:
+    if branch_data is None:
         code = Outcome(outcome)
         code = Outcome.NO_CYCLE_FOUND if code == Outcome.STEPPED else code
         empty = xr.Dataset(coords={name: ("point", np.zeros(0))}, attrs=attrs)
         return Branch(name, empty, (), ("", ""), code)
-    asked = (name for name in STEP | MARGINS | GROUND if name not in UNTOLD)
-    data = variables({key: strand.table[key] for key in asked if key in strand.table}, "point")
+    measure_names = (
+        name
+        for name in STEP_MEASURES | MARGIN_MEASURES | UNILATERAL_STEP_MEASURES
+        if name not in OMITTED_MEASURES
+    )
+    data = make_variables(
+        {key: branch_data.table[key] for key in measure_names if key in branch_data.table}, "point"
+    )
     data["section_state"] = xr.Variable(
         ("point", "component"),
-        strand.table["section_state"],
+        branch_data.table["section_state"],
         {"long_name": "section state just before touchdown"},
     )
     data["closure"] = xr.Variable(
         "point",
-        strand.table["closure"],
+        branch_data.table["closure"],
         {"units": "1", "long_name": "miss of the section state after one event-driven period"},
     )
     labels = {
-        name: xr.Variable("point", strand.points.p, attrs_of(name)),
-        "component": _components(strand.table["section_state"].shape[-1], params.n_legs),
-        "leg": locked_legs(params.n_legs),
+        name: xr.Variable("point", branch_data.points.p, measure_attrs(name)),
+        "component": _section_component_names(
+            branch_data.table["section_state"].shape[-1], params.n_legs
+        ),
+        "leg": locked_leg_coordinate(params.n_legs),
     }
-    dataset = xr.Dataset(data | _stability(np.asarray(strand.points.jacobian)), labels, attrs)
-    return Branch(name, dataset, strand.borders, strand.ends, Outcome.STEPPED)
+    dataset = xr.Dataset(
+        data | _stability_variables(np.asarray(branch_data.points.jacobian)), labels, attrs
+    )
+    return Branch(name, dataset, branch_data.special_points, branch_data.ends, Outcome.STEPPED)
 
 
-def _components(size: int, n: int) -> list[str]:
+def _section_component_names(n_components: int, n_legs: int) -> list[str]:
     """Return names of a section state's components: the paper's, or
     `unilateral_section.FullState`."""
-    if size == 3:
+    if n_components == 3:
         return ["theta", "dtheta", "dL1"]
-    legs = [f"{name}{leg}" for name in ("L", "dL", "code") for leg in range(1, n + 1)]
+    legs = [f"{name}{leg}" for name in ("L", "dL", "code") for leg in range(1, n_legs + 1)]
     return ["theta", "dtheta", "vx", "vz", *legs]
 
 
-def _stability(jacobians: np.ndarray) -> dict[str, xr.Variable]:
+def _stability_variables(jacobians: np.ndarray) -> dict[str, xr.Variable]:
     """Return multipliers and stability measures along the branch."""
-    values = np.asarray(multipliers(jnp.asarray(jacobians)))
+    values = np.asarray(floquet_multipliers(jnp.asarray(jacobians)))
     radius = np.max(np.abs(values), -1)
     names = {"multiplier_real": values.real, "multiplier_imag": values.imag}
     return {
@@ -355,18 +402,24 @@ def _stability(jacobians: np.ndarray) -> dict[str, xr.Variable]:
                 names.items(), ("real part of a multiplier", "imaginary part"), strict=True
             )
         },
-        "spectral_radius": xr.Variable("point", radius, CYCLE["spectral_radius"].attrs),
-        "spectral_margin": xr.Variable("point", 1.0 - radius, CYCLE["spectral_margin"].attrs),
+        "spectral_radius": xr.Variable(
+            "point", radius, LIMIT_CYCLE_MEASURES["spectral_radius"].attrs
+        ),
+        "spectral_margin": xr.Variable(
+            "point", 1.0 - radius, LIMIT_CYCLE_MEASURES["spectral_margin"].attrs
+        ),
     }
 
 
-class MapRun(AbstractRun):
+class MapContinuation(AbstractContinuation):
     """Continuation of fixed points of any map."""
 
-    def read(self, wheels: Any, points: PathPoint) -> Table:
-        return {"x": self.batched(jax.vmap(self.followed.section), READ, points.z)}
+    def evaluate_points(self, wheels: Any, points: ContinuationPoint) -> QuantityTable:
+        return {
+            "x": self.map_batched(jax.vmap(self.problem.section_state), READ_BATCH_SIZE, points.z)
+        }
 
-    def kept(self, table: Table) -> np.ndarray:
+    def is_admissible(self, table: QuantityTable) -> np.ndarray:
         return np.asarray(np.isfinite(table["x"]).all(-1))
 
 
@@ -406,25 +459,33 @@ def continue_map(
         >>> [(point.kind, round(point.value, 6)) for point in branch.special_points]
         [('period_doubling', 3.0)]
     """
-    function_of("function", function, "of constants, x and p")
-    untraced("vrw.continue_map", "use vrw.newton_cycle", x, p, constants)
-    low, high = range_of("bounds", bounds)
-    if not low <= real("p", p) <= high:
+    check_callable("function", function, "of constants, x and p")
+    check_not_traced("vrw.continue_map", "use vrw.solve_fixed_point", x, p, constants)
+    lower, upper = check_range("bounds", bounds)
+    if not lower <= check_real("p", p) <= upper:
         raise ValueError(
-            f"p is {p:g}, but the branch must start within its bounds: give one in [{low:g}, "
-            f"{high:g}]."
+            f"p is {p:g}, but the branch must start within its bounds: give one in [{lower:g}, "
+            f"{upper:g}]."
         )
-    options, x = _arclength(options), reals("x", x)
-    lead = lambda tree: jax.tree.map(lambda a: jnp.asarray(a, float)[None], tree)
-    run = MapRun(MapFollowed(function), options, lead(constants), np.array([low, high]))
-    (strand,) = run_all(run, lead(x), lead(p), np.array([True]), lambda owner, point: None)
-    if strand is None:
+    options, x = _check_arclength_options(options), check_reals("x", x)
+    add_batch_axis = lambda tree: jax.tree.map(lambda a: jnp.asarray(a, float)[None], tree)
+    continuation = MapContinuation(
+        FixedPointProblem(function), options, add_batch_axis(constants), np.array([lower, upper])
+    )
+    (branch_data,) = continue_and_locate(
+        continuation,
+        add_batch_axis(x),
+        add_batch_axis(p),
+        np.array([True]),
+        lambda owner, point: None,
+    )
+    if branch_data is None:
         empty = xr.Dataset(coords={name: ("point", np.zeros(0))})
         return Branch(name, empty, (), ("", ""), Outcome.NO_CYCLE_FOUND)
     dataset = xr.Dataset(
-        {"x": (("point", "component"), strand.table["x"])}
-        | _stability(np.asarray(strand.points.jacobian)),
-        {name: ("point", strand.points.p)},
+        {"x": (("point", "component"), branch_data.table["x"])}
+        | _stability_variables(np.asarray(branch_data.points.jacobian)),
+        {name: ("point", branch_data.points.p)},
         {"title": f"Branch of fixed points along {name}"},
     )
-    return Branch(name, dataset, strand.borders, strand.ends, Outcome.STEPPED)
+    return Branch(name, dataset, branch_data.special_points, branch_data.ends, Outcome.STEPPED)

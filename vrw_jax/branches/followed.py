@@ -18,50 +18,50 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from vrw_jax.cycles import (
-    Located,
-    Periods,
-    Problem,
-    correction_size,
-    nothing_known,
-    over_lanes,
-    solved,
-    takeoff_acceleration,
+    CollocationState,
+    CollocationSystem,
+    PeriodMap,
+    collocation_correction_norm,
+    compile_batched,
+    gait_takeoff_acceleration,
+    init_search_flags,
+    solve_linear_systems,
 )
-from vrw_jax.models import AbstractStep, AbstractWheel, RungState, UnilateralWheel
+from vrw_jax.models import AbstractStep, AbstractWheel, AnySectionState, UnilateralWheel
 from vrw_jax.numerics import (
-    AbstractFollowed,
-    Linear,
-    Options,
-    PathPoint,
+    AbstractContinuationProblem,
+    CollocationSolution,
+    ContinuationPoint,
+    NewtonStep,
     Scalar,
-    Section,
-    Solution,
-    Unknown,
+    SectionVector,
+    StepOptions,
+    Unknowns,
     arclength,
-    mesh_error,
-    one_wheel,
+    estimate_mesh_error,
+    unbatch,
 )
-from vrw_jax.results import MARGINS, STOPPERS
+from vrw_jax.results import MARGIN_MEASURES, STOPPER_MARGIN_MEASURES
 from vrw_jax.wheel import (
     PARAMETER_NAMES,
     Outcome,
     WheelParams,
-    parameters_of,
-    wheel_of,
+    stack_parameters,
+    wheel_from_parameters,
 )
 
 
-class Wheel(NamedTuple):
+class BranchWheel(NamedTuple):
     """Wheel whose gaits are continued, at any value of the continued parameter."""
 
     params: WheelParams
-    happens: Float[Array, "n n_phases"]  # 1 if a phase of the cycle takes place, else 0
+    phase_active: Float[Array, "n n_phases"]  # 1 if a phase of the cycle takes place, else 0
 
 
-class AbstractFollowedWheel(AbstractFollowed):
+class AbstractGaitProblem(AbstractContinuationProblem):
     """Continuation problem of gaits of `n_steps` steps along the float parameter `name`."""
 
-    name: eqx.AbstractVar[str]
+    parameter_name: eqx.AbstractVar[str]
 
     @property
     @abc.abstractmethod
@@ -69,36 +69,42 @@ class AbstractFollowedWheel(AbstractFollowed):
         """Return the number of steps after which the gait repeats."""
 
     @abc.abstractmethod
-    def read(self, wheel: Wheel, z: Unknown, p: Scalar) -> tuple[RungState, dict[str, Array]]:
+    def read_state(
+        self, wheel: BranchWheel, z: Unknowns, p: Scalar
+    ) -> tuple[AnySectionState, dict[str, Array]]:
         """Return the section state before the first landing, and quantities that are defined beyond
         a special point."""
 
-    def told(
-        self, model: AbstractWheel, options: Options, wheels: Wheel, points: PathPoint
+    def measure_points(
+        self,
+        model: AbstractWheel,
+        options: StepOptions,
+        wheels: BranchWheel,
+        points: ContinuationPoint,
     ) -> dict[str, Array]:
         """Return all measures of the gaits at many points from event-driven steps, with those of
         `read_state`."""
-        return _told(self, model, options, wheels, points)
+        return _measure_points(self, model, options, wheels, points)
 
 
 @eqx.filter_jit
-def _told(
-    followed: AbstractFollowedWheel,
+def _measure_points(
+    problem: AbstractGaitProblem,
     model: AbstractWheel,
-    options: Options,
-    wheels: Wheel,
-    points: PathPoint,
+    options: StepOptions,
+    wheels: BranchWheel,
+    points: ContinuationPoint,
 ) -> dict[str, Array]:
-    def one(wheel: Wheel, z: Any, p: Array) -> dict[str, Array]:
-        x, beyond = followed.read(wheel, z, p)
-        rung, params = model.moved(wheel.params, followed.name, p)
-        measures = gait_measures(rung, params, x, options, followed.n_steps)
-        return measures | beyond | {"section_state": x}
+    def measure_point(wheel: BranchWheel, z: Any, p: Array) -> dict[str, Array]:
+        section_state, continued_quantities = problem.read_state(wheel, z, p)
+        model_at_point, params = model.with_parameter(wheel.params, problem.parameter_name, p)
+        measures = measure_gait(model_at_point, params, section_state, options, problem.n_steps)
+        return measures | continued_quantities | {"section_state": section_state}
 
-    return jax.vmap(one)(wheels, points.z, points.p)
+    return jax.vmap(measure_point)(wheels, points.z, points.p)
 
 
-class CycleFollowed(AbstractFollowedWheel):
+class CollocationProblem(AbstractGaitProblem):
     """Continuation problem of limit cycles by collocation. z is a `CollocationSolution` without the
     axis over lanes.
 
@@ -106,66 +112,80 @@ class CycleFollowed(AbstractFollowedWheel):
     gait.
     """
 
-    problem: Problem = eqx.field(static=True)
-    name: str = eqx.field(static=True)
-    more: Callable | None = eqx.field(static=True)  # of the first step's passages and z
+    system: CollocationSystem = eqx.field(static=True)
+    parameter_name: str = eqx.field(static=True)
+    additional_quantities: Callable | None = eqx.field(
+        static=True
+    )  # of the first step's passages and z
 
     @property
     def n_steps(self) -> int:
-        return self.problem.period_n
+        return self.system.period_n
 
-    def _moved(self, wheel: Wheel, p: Scalar) -> Array:
-        return parameters_of(eqx.tree_at(lambda w: getattr(w, self.name), wheel.params, p))
+    def _parameters_at(self, wheel: BranchWheel, p: Scalar) -> Array:
+        return stack_parameters(
+            eqx.tree_at(lambda w: getattr(w, self.parameter_name), wheel.params, p)
+        )
 
-    def linearise(self, wheel: Wheel, z: Unknown, p: Scalar) -> Linear:
-        linearised = linearised_along(self.problem, (PARAMETER_NAMES.index(self.name),))
-        correction, column, monodromy, *_ = linearised(self._moved(wheel, p), wheel.happens, z)
-        return Linear(correction, jax.tree.map(lambda x: x[0], column), monodromy)
+    def linearize(self, wheel: BranchWheel, z: Unknowns, p: Scalar) -> NewtonStep:
+        linearize = linearize_with_quantities(
+            self.system, (PARAMETER_NAMES.index(self.parameter_name),)
+        )
+        correction, tangents, monodromy, *_ = linearize(
+            self._parameters_at(wheel, p), wheel.phase_active, z
+        )
+        return NewtonStep(correction, jax.tree.map(lambda x: x[0], tangents), monodromy)
 
-    def _mesh_error(self, z: Solution) -> Array:
-        lanes = jax.tree.map(lambda x: x[..., None], z)
-        return mesh_error(self.problem.sequence, self.problem.meshes, lanes)[0]
+    def _mesh_error(self, z: CollocationSolution) -> Array:
+        solution_with_lane = jax.tree.map(lambda x: x[..., None], z)
+        return estimate_mesh_error(self.system.sequence, self.system.meshes, solution_with_lane)[0]
 
-    def section(self, z: Unknown) -> Section:
-        return z.section
+    def section_state(self, z: Unknowns) -> SectionVector:
+        return z.section_state
 
-    def size(self, z: Unknown, correction: Unknown) -> Scalar:
-        return one_wheel(correction_size)(z, correction)
+    def correction_norm(self, z: Unknowns, correction: Unknowns) -> Scalar:
+        return unbatch(collocation_correction_norm)(z, correction)
 
-    def valid(self, wheel: Wheel, z: Unknown, p: Scalar) -> Bool[Array, ""]:
+    def is_admissible(self, wheel: BranchWheel, z: Unknowns, p: Scalar) -> Bool[Array, ""]:
         """Return whether the durations are positive. The event-driven step checks everything
         else."""
-        return jnp.all((z.durations > 0.0) | (wheel.happens < 0.5))
+        return jnp.all((z.durations > 0.0) | (wheel.phase_active < 0.5))
 
-    def read(self, wheel: Wheel, z: Unknown, p: Scalar) -> tuple[RungState, dict[str, Array]]:
+    def read_state(
+        self, wheel: BranchWheel, z: Unknowns, p: Scalar
+    ) -> tuple[AnySectionState, dict[str, Array]]:
         """Return the section state, and quantities that continue beyond a special point.
 
         These are the shortest durations over the steps, and `takeoff_acceleration`, the rear foot's
         acceleration at take-off, m/s^2, least over the steps.
         """
-        parameters = self._moved(wheel, p)
-        s = wheel_of(parameters, self.problem.n_legs).symbols()
-        _, steps = self.problem.passages(parameters, z)
-        takeoffs = [takeoff_acceleration(s, sls1) for _, sls1, _ in steps]
-        end, shortest = steps[-1][-1].end, jnp.min(z.durations, 0)
-        formal = {
-            "duration_dls": jnp.where(wheel.happens[0, 0] > 0.5, shortest[0], jnp.nan),
-            "duration_sls1": shortest[1],
-            "duration_sls2": shortest[2],
-            "takeoff_acceleration": jnp.min(jnp.stack(takeoffs)),
+        parameters = self._parameters_at(wheel, p)
+        s = wheel_from_parameters(parameters, self.system.n_legs).symbols()
+        _, steps = self.system.evaluate_passages(parameters, z)
+        takeoff_accelerations = [gait_takeoff_acceleration(s, sls1) for _, sls1, _ in steps]
+        end, min_durations = steps[-1][-1].end, jnp.min(z.durations, 0)
+        continued_quantities = {
+            "duration_dls": jnp.where(wheel.phase_active[0, 0] > 0.5, min_durations[0], jnp.nan),
+            "duration_sls1": min_durations[1],
+            "duration_sls2": min_durations[2],
+            "takeoff_acceleration": jnp.min(jnp.stack(takeoff_accelerations)),
             "mesh_error": self._mesh_error(z),
         }
-        if self.more is not None:
-            formal |= self.more(s, steps[0], z)
-        return jnp.stack([end.q[0], *end.v]), formal
+        if self.additional_quantities is not None:
+            continued_quantities |= self.additional_quantities(s, steps[0], z)
+        return jnp.stack([end.q[0], *end.v]), continued_quantities
 
 
-Told = Callable[[Problem, Array, Array, Solution], Array]
+QuantityFunction = Callable[[CollocationSystem, Array, Array, CollocationSolution], Array]
 """Function of the system, parameters, `phase_active` and solution that returns quantities of
 collocated gaits over lanes."""
 
 
-def linearised_along(problem: Problem, wanted: tuple[int, ...], told: Told | None = None) -> Any:
+def linearize_with_quantities(
+    system: CollocationSystem,
+    parameter_indices: tuple[int, ...],
+    quantities_of: QuantityFunction | None = None,
+) -> Any:
     """Return a function for correction, tangents of the parameters and monodromy of one wheel's
     trial.
 
@@ -174,27 +194,47 @@ def linearised_along(problem: Problem, wanted: tuple[int, ...], told: Told | Non
     `jax.vmap` maps it over lanes.
     """
 
-    def linearised(parameters: Array, happens: Array, z: Solution) -> tuple:
-        located = Located(z, happens, *nothing_known(problem, z.section))
-        passed = problem.pass_at(parameters, located, wanted)
-        found = passed.correction, passed.columns, passed.monodromy
-        if told is None:
-            return found
-        rows = np.eye(parameters.shape[0], dtype=parameters.dtype)[list(wanted)]
-        units = np.concatenate([np.zeros_like(rows[:1]), rows])[:, :, None]
-        lead = lambda a, b: jnp.concatenate([a[None], b])
-        columns = jax.tree.map(lead, passed.correction, passed.columns)
-        ways = jnp.broadcast_to(units, (len(units), *parameters.shape)), columns
-        at = lambda parameters, z: told(problem, parameters, happens, z)
-        along = lambda way: jax.jvp(at, (parameters, z), way)[1]
-        return *found, at(parameters, z), lax.map(along, ways)
+    def linearize_trial(parameters: Array, phase_active: Array, z: CollocationSolution) -> tuple:
+        collocation_state = CollocationState(
+            z, phase_active, *init_search_flags(system, z.section_state)
+        )
+        linearized_pass = system.linearize_at(parameters, collocation_state, parameter_indices)
+        newton_data = (
+            linearized_pass.correction,
+            linearized_pass.tangents,
+            linearized_pass.monodromy,
+        )
+        if quantities_of is None:
+            return newton_data
+        identity_rows = np.eye(parameters.shape[0], dtype=parameters.dtype)[list(parameter_indices)]
+        parameter_tangents = np.concatenate([np.zeros_like(identity_rows[:1]), identity_rows])[
+            :, :, None
+        ]
+        prepend = lambda a, b: jnp.concatenate([a[None], b])
+        tangents = jax.tree.map(prepend, linearized_pass.correction, linearized_pass.tangents)
+        directions = (
+            jnp.broadcast_to(parameter_tangents, (len(parameter_tangents), *parameters.shape)),
+            tangents,
+        )
+        evaluate = lambda parameters, z: quantities_of(system, parameters, phase_active, z)
+        tangent_along = lambda direction: jax.jvp(evaluate, (parameters, z), direction)[1]
+        return *newton_data, evaluate(parameters, z), lax.map(tangent_along, directions)
 
-    like = lambda parameters, happens, z: (z, z, *(parameters,) * (1 if told is None else 3))
-    settings = "followed", problem, wanted, told.__name__ if told else ""
-    return one_wheel(over_lanes(linearised, like, settings, block=0))
+    make_output_template = lambda parameters, happens, z: (
+        z,
+        z,
+        *(parameters,) * (1 if quantities_of is None else 3),
+    )
+    cache_key = (
+        "followed",
+        system,
+        parameter_indices,
+        quantities_of.__name__ if quantities_of else "",
+    )
+    return unbatch(compile_batched(linearize_trial, make_output_template, cache_key, batch_size=0))
 
 
-class RungFollowed(AbstractFollowedWheel):
+class ReturnMapProblem(AbstractGaitProblem):
     """Continuation problem of fixed points of `period_n` steps of any model; z is the section
     state.
 
@@ -203,113 +243,143 @@ class RungFollowed(AbstractFollowedWheel):
     """
 
     model: AbstractWheel
-    options: Options
-    name: str = eqx.field(static=True)
+    options: StepOptions
+    parameter_name: str = eqx.field(static=True)
     period_n: int = eqx.field(static=True)
-    numbers: int = eqx.field(static=True)
+    n_coordinates: int = eqx.field(static=True)
 
     @property
     def n_steps(self) -> int:
         return self.period_n
 
-    def _image(self, wheel: Wheel, z: Array, p: Scalar) -> Array:
-        model, params = self.model.moved(wheel.params, self.name, p)
+    def _image(self, wheel: BranchWheel, z: Array, p: Scalar) -> Array:
+        model, params = self.model.with_parameter(wheel.params, self.parameter_name, p)
         for _ in range(self.period_n):
             advance = model.advance(params, z, self.options)
             z = jnp.where(advance.outcome == Outcome.STEPPED, advance.section_state, jnp.nan)
         return z
 
-    def linearise(self, wheel: Wheel, z: Unknown, p: Scalar) -> Linear:
-        image = lambda z, p: self._image(wheel, z, p)
-        return arclength.at_fixed_point(image, z, p, self.numbers)
+    def linearize(self, wheel: BranchWheel, z: Unknowns, p: Scalar) -> NewtonStep:
+        return_map = lambda z, p: self._image(wheel, z, p)
+        return arclength.fixed_point_newton_step(return_map, z, p, self.n_coordinates)
 
-    def section(self, z: Unknown) -> Section:
-        return z[: self.numbers]
+    def section_state(self, z: Unknowns) -> SectionVector:
+        return z[: self.n_coordinates]
 
-    def between(self, left: Unknown, right: Unknown, place: Scalar) -> Unknown:
-        return between_states(left, right, place, self.numbers)
+    def interpolate(self, left: Unknowns, right: Unknowns, fraction: Scalar) -> Unknowns:
+        return interpolate_states(left, right, fraction, self.n_coordinates)
 
-    def read(self, wheel: Wheel, z: Unknown, p: Scalar) -> tuple[RungState, dict[str, Array]]:
+    def read_state(
+        self, wheel: BranchWheel, z: Unknowns, p: Scalar
+    ) -> tuple[AnySectionState, dict[str, Array]]:
         """Return the section state. The step's measures contain all other quantities."""
         return z, {}
 
 
-class GroundFollowed(AbstractFollowedWheel):
+class GroundProblem(AbstractGaitProblem):
     """Continuation problem with unilateral contact, by batched steps; z as in
     `ReturnMapProblem`."""
 
     model: UnilateralWheel
-    options: Options
-    name: str = eqx.field(static=True)
+    options: StepOptions
+    parameter_name: str = eqx.field(static=True)
     period_n: int = eqx.field(static=True)
     n_legs: int = eqx.field(static=True)
 
-    traced: ClassVar[bool] = False
+    is_traceable: ClassVar[bool] = False
 
     @property
     def n_steps(self) -> int:
         return self.period_n
 
     @property
-    def numbers(self) -> int:
-        return self.model.section_numbers(WheelParams(n_legs=self.n_legs))
+    def n_coordinates(self) -> int:
+        return self.model.n_continuous(WheelParams(n_legs=self.n_legs))
 
-    def values(self, wheels: Wheel, p: Array) -> Array:
+    def parameter_values(self, wheels: BranchWheel, p: Array) -> Array:
         """Return the model's parameter values of many wheels with the continued parameter at p."""
 
-        def one(wheel: Wheel, p: Array) -> Array:
-            model, params = self.model.moved(wheel.params, self.name, p)
-            return model.values(params)
+        def values_of_wheel(wheel: BranchWheel, p: Array) -> Array:
+            model, params = self.model.with_parameter(wheel.params, self.parameter_name, p)
+            return model.parameter_values(params)
 
-        return jax.vmap(one)(wheels, p)
+        return jax.vmap(values_of_wheel)(wheels, p)
 
-    def _periods(self, wheels: Wheel, p: Array) -> Periods:
-        values = np.asarray(self.values(wheels, p))
-        return Periods(self.model, self.n_legs, self.period_n, values)
+    def _period_map(self, wheels: BranchWheel, p: Array) -> PeriodMap:
+        values = np.asarray(self.parameter_values(wheels, p))
+        return PeriodMap(self.model, self.n_legs, self.period_n, values)
 
-    def linearise(self, wheel: Wheel, z: Unknown, p: Array) -> Linear:
+    def linearize(self, wheel: BranchWheel, z: Unknowns, p: Array) -> NewtonStep:
         """Return the Newton steps of many wheels."""
-        x, n = np.asarray(z), self.numbers
-        own = np.asarray(self.model.parameter_names) == self.name
-        now = self._periods(wheel, p).around(self.options, x, own)
-        bad = np.where(now.good, 0.0, np.nan)[:, None]
-        miss, by_x = now.image - x + bad, now.by_start[:, :n, :n]
-        right = np.concatenate([miss[:, :n, None], now.by_values[:, :n, own]], -1)
-        found, codes = solved(np.eye(n) - by_x, right), miss[:, n:]
-        correction = np.concatenate([found[..., 0], codes], 1)
-        column = np.concatenate([found[..., 1], 0.0 * codes], 1)
-        return Linear(correction, column, jnp.asarray(by_x))
+        section_states, n_coordinates = np.asarray(z), self.n_coordinates
+        is_own_parameter = np.asarray(self.model.parameter_names) == self.parameter_name
+        period = self._period_map(wheel, p).evaluate_period(
+            self.options, section_states, is_own_parameter
+        )
+        nan_if_invalid = np.where(period.is_valid, 0.0, np.nan)[:, None]
+        defect, return_jacobian = (
+            period.end_state - section_states + nan_if_invalid,
+            period.return_jacobian[:, :n_coordinates, :n_coordinates],
+        )
+        right_sides = np.concatenate(
+            [
+                defect[:, :n_coordinates, None],
+                period.value_jacobian[:, :n_coordinates, is_own_parameter],
+            ],
+            -1,
+        )
+        solutions, codes = (
+            solve_linear_systems(np.eye(n_coordinates) - return_jacobian, right_sides),
+            defect[:, n_coordinates:],
+        )
+        correction = np.concatenate([solutions[..., 0], codes], 1)
+        tangent = np.concatenate([solutions[..., 1], 0.0 * codes], 1)
+        return NewtonStep(correction, tangent, jnp.asarray(return_jacobian))
 
-    def section(self, z: Unknown) -> Section:
-        return z[: self.numbers]
+    def section_state(self, z: Unknowns) -> SectionVector:
+        return z[: self.n_coordinates]
 
-    def between(self, left: Unknown, right: Unknown, place: Scalar) -> Unknown:
-        return between_states(left, right, place, self.numbers)
+    def interpolate(self, left: Unknowns, right: Unknowns, fraction: Scalar) -> Unknowns:
+        return interpolate_states(left, right, fraction, self.n_coordinates)
 
-    def read(self, wheel: Wheel, z: Unknown, p: Scalar) -> tuple[RungState, dict[str, Array]]:
+    def read_state(
+        self, wheel: BranchWheel, z: Unknowns, p: Scalar
+    ) -> tuple[AnySectionState, dict[str, Array]]:
         return z, {}
 
-    def told(
-        self, model: AbstractWheel, options: Options, wheels: Wheel, points: PathPoint
+    def measure_points(
+        self,
+        model: AbstractWheel,
+        options: StepOptions,
+        wheels: BranchWheel,
+        points: ContinuationPoint,
     ) -> dict[str, Array]:
-        now = self._periods(wheels, points.p).around(options, np.asarray(points.z), False, False)
-        return _of_period(now.steps, points.z) | {"section_state": jnp.asarray(points.z)}
+        period = self._period_map(wheels, points.p).evaluate_period(
+            options, np.asarray(points.z), False, False
+        )
+        return _measure_periods(period.steps, points.z) | {"section_state": jnp.asarray(points.z)}
 
 
 @jax.jit
 @jax.vmap
-def _of_period(steps: AbstractStep, x: RungState) -> dict[str, Array]:
-    return period_measures(steps.section_state[-1], jax.vmap(lambda s: s.measures())(steps), x)
+def _measure_periods(steps: AbstractStep, x: AnySectionState) -> dict[str, Array]:
+    return combine_step_measures(
+        steps.section_state[-1], jax.vmap(lambda s: s.measures())(steps), x
+    )
 
 
-def between_states(left: Array, right: Array, place: Scalar, numbers: int) -> Array:
+def interpolate_states(left: Array, right: Array, fraction: Scalar, n_coordinates: int) -> Array:
     """Interpolate section states. The codes are those of the nearer one."""
-    codes = jnp.where(place < 0.5, left, right)[numbers:]
-    return jnp.concatenate([(left + place * (right - left))[:numbers], codes])
+    codes = jnp.where(fraction < 0.5, left, right)[n_coordinates:]
+    return jnp.concatenate([(left + fraction * (right - left))[:n_coordinates], codes])
 
 
-def gait_measures(
-    model: AbstractWheel, params: WheelParams, x: RungState, options: Options, period_n: int
+def measure_gait(
+    model: AbstractWheel,
+    params: WheelParams,
+    section_state: AnySectionState,
+    options: StepOptions,
+    period_n: int,
 ) -> dict[str, Array]:
     """Return all measures of one period of a gait that passes the section at x, with `closure`.
 
@@ -318,29 +388,31 @@ def gait_measures(
     failed. `closure` is the distance of the section state from x after the period.
     """
 
-    def one(x: RungState, _: None) -> tuple[RungState, dict[str, Array]]:
-        result = model.step(params, x, options)
+    def measure_next_step(x: AnySectionState, _: None) -> tuple[AnySectionState, dict[str, Array]]:
+        result = model.take_step(params, x, options)
         return result.section_state, result.measures()
 
-    end, steps = lax.scan(one, x, None, length=period_n)
-    return period_measures(end, steps, x)
+    end_state, step_measures = lax.scan(measure_next_step, section_state, None, length=period_n)
+    return combine_step_measures(end_state, step_measures, section_state)
 
 
-def period_measures(end: RungState, steps: dict[str, Array], x: RungState) -> dict[str, Array]:
+def combine_step_measures(
+    end_state: AnySectionState, step_measures: dict[str, Array], section_state: AnySectionState
+) -> dict[str, Array]:
     """Return `measure_gait` from the measures of each step and the final section state."""
-    told = {}
-    for name, values in steps.items():
-        if name in MARGINS | STOPPERS or name.startswith("lambda_"):
-            told[name] = jnp.min(values, 0)
+    measures = {}
+    for name, values in step_measures.items():
+        if name in MARGIN_MEASURES | STOPPER_MARGIN_MEASURES or name.startswith("lambda_"):
+            measures[name] = jnp.min(values, 0)
         elif name.endswith("_touchdown"):
-            told[name] = values[-1]
+            measures[name] = values[-1]
         elif name.endswith("_post_impact"):
-            told[name] = values[0]
+            measures[name] = values[0]
         elif name == "outcome":
-            told[name] = values[jnp.argmax(values != Outcome.STEPPED)]
+            measures[name] = values[jnp.argmax(values != Outcome.STEPPED)]
         else:
-            told[name] = jnp.sum(values, 0)
-    period = jnp.where(told["period"] > 0.0, told["period"], 1.0)
-    told["dls_fraction"] = told["duration_dls"] / period
-    told["speed"] = told["step_length"] / period
-    return told | {"closure": jnp.max(jnp.abs(end - x))}
+            measures[name] = jnp.sum(values, 0)
+    period = jnp.where(measures["period"] > 0.0, measures["period"], 1.0)
+    measures["dls_fraction"] = measures["duration_dls"] / period
+    measures["speed"] = measures["step_length"] / period
+    return measures | {"closure": jnp.max(jnp.abs(end_state - section_state))}

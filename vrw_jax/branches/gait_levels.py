@@ -13,109 +13,152 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from vrw_jax.branches.continuation import INDICATORS, GaitRun
-from vrw_jax.branches.followed import CycleFollowed, Wheel, gait_measures, linearised_along
+from vrw_jax.branches.continuation import INDICATOR_NAMES, GaitContinuation
+from vrw_jax.branches.followed import (
+    BranchWheel,
+    CollocationProblem,
+    linearize_with_quantities,
+    measure_gait,
+)
 from vrw_jax.cycles import (
-    Located,
-    Problem,
-    correction_size,
-    nothing_known,
-    takeoff_acceleration,
+    CollocationState,
+    CollocationSystem,
+    collocation_correction_norm,
+    gait_takeoff_acceleration,
+    init_search_flags,
 )
 from vrw_jax.models import ViscoelasticWheel
 from vrw_jax.numerics import (
-    BIFURCATIONS,
-    AbstractLevel,
-    LevelLinear,
-    Options,
-    Passage,
+    BIFURCATION_NAMES,
+    AbstractTestFunction,
+    CollocationSolution,
+    PhasePassage,
     Scalar,
-    Section,
-    Solution,
-    margins_beside_fold,
-    one_wheel,
+    SectionVector,
+    StepOptions,
+    TestFunctionNewtonStep,
+    offset_bifurcation_margins,
+    unbatch,
 )
-from vrw_jax.results import MARGINS
+from vrw_jax.results import MARGIN_MEASURES
 from vrw_jax.wheel import (
     PARAMETER_NAMES,
-    Instant,
+    PhaseInstant,
     Symbols,
-    parameters_of,
-    phases_of,
+    make_phases,
+    stack_parameters,
     transitions,
-    wheel_of,
+    wheel_from_parameters,
 )
 
-EXACT: Mapping[str, str] = GaitRun.exact
-VOID = (*INDICATORS, "duration_sls1", "duration_sls2")
+LINEAR_SUBSTITUTES: Mapping[str, str] = GaitContinuation.linear_substitutes
+DISCONTINUOUS_QUANTITIES = (*INDICATOR_NAMES, "duration_sls1", "duration_sls2")
 """Quantities at whose zeros the step is discontinuous, so that its measures are not defined."""
 
-ROLLS_OFF = "duration_dls"
+DLS_VANISHES = "duration_dls"
 """Special point where the duration of double support reaches zero: the rear foot's force vanishes
 there and falls. If it vanishes and rises, at the zero of `lambda_4_plus`, the step jumps."""
 
-FALLS, JUMPS = "fall of the rear foot's force at first", "its mean fall in double support"
+FORCE_FALL_NAME, MEAN_FORCE_FALL_NAME = (
+    "fall of the rear foot's force at first",
+    "its mean fall in double support",
+)
 """Names of two rates, N/s. The first is positive on `DLS_VANISHES`, which ends at its zero. The
 second vanishes on the curve of `lambda_4_plus`, and not on `DLS_VANISHES`, which solves the same
 equations too."""
 
-FORMAL = (*VOID, *EXACT.values(), FALLS, JUMPS)
+CONTINUED_QUANTITIES = (
+    *DISCONTINUOUS_QUANTITIES,
+    *LINEAR_SUBSTITUTES.values(),
+    FORCE_FALL_NAME,
+    MEAN_FORCE_FALL_NAME,
+)
 """Quantities of the collocated gait itself, which continue beyond the special point."""
 
 
-def level_of(name: str, rolls: bool) -> str:
+def test_quantity_of(name: str, has_double_support: bool) -> str:
     """Return the quantity whose zero is the special point; `has_double_support` refers to the
     gaits."""
-    if name == "lambda_4_plus" and rolls:
-        return JUMPS
-    return "lambda_4_plus" if name == ROLLS_OFF else EXACT.get(name, name)
+    if name == "lambda_4_plus" and has_double_support:
+        return MEAN_FORCE_FALL_NAME
+    return "lambda_4_plus" if name == DLS_VANISHES else LINEAR_SUBSTITUTES.get(name, name)
 
 
-def quantities_of(name: str, n_legs: int) -> tuple[str, ...]:
+def quantity_group_of(name: str, n_legs: int) -> tuple[str, ...]:
     """Return the quantities that are evaluated together with the one that vanishes at a special
     point."""
-    legs = [f"[{leg}]" for leg in range(3, n_legs + 1)]
-    by_step = [n + leg for n, margin in MARGINS.items() for leg in (legs if margin.axis else [""])]
-    kinds = BIFURCATIONS, FORMAL, tuple(name for name in by_step if name not in FORMAL)
-    return next(kind for kind in kinds if level_of(name, True) in kind)
+    leg_suffixes = [f"[{leg}]" for leg in range(3, n_legs + 1)]
+    step_quantities = [
+        n + leg
+        for n, margin in MARGIN_MEASURES.items()
+        for leg in (leg_suffixes if margin.dimension else [""])
+    ]
+    quantity_groups = (
+        BIFURCATION_NAMES,
+        CONTINUED_QUANTITIES,
+        tuple(name for name in step_quantities if name not in CONTINUED_QUANTITIES),
+    )
+    return next(group for group in quantity_groups if test_quantity_of(name, True) in group)
 
 
-class GaitAt(NamedTuple):
+class TestFunctionArgs(NamedTuple):
     """Wheel on a curve of special points, and the index of the quantity that vanishes on it."""
 
-    gait: Wheel
-    place: Array
+    gait: BranchWheel
+    quantity_index: Array
 
 
-class GaitLevel(AbstractLevel):
+class GaitTestFunction(AbstractTestFunction):
     """One of `quantities` of collocated gaits as a test function over two parameters."""
 
-    problem: Problem = eqx.field(static=True)
-    names: tuple[str, str] = eqx.field(static=True)
+    system: CollocationSystem = eqx.field(static=True)
+    parameter_names: tuple[str, str] = eqx.field(static=True)
     quantities: tuple[str, ...] = eqx.field(static=True)  # of one quantity group
     model: ViscoelasticWheel
-    step_options: Options
+    step_options: StepOptions
 
-    def linearise(self, wheel: GaitAt, z: Solution, p: Array) -> LevelLinear:
+    def linearize(
+        self, wheel: TestFunctionArgs, z: CollocationSolution, p: Array
+    ) -> TestFunctionNewtonStep:
         gait = wheel.gait
-        wanted = tuple(PARAMETER_NAMES.index(name) for name in self.names)
-        linearised = linearised_along(self.problem, wanted, TOLD.get(self.quantities))
-        given = parameters_of(self.at(gait, p).params), gait.happens, z
-        correction, columns, monodromy, *told = linearised(*given)
-        first, second = (jax.tree.map(lambda x, i=i: x[i], columns) for i in range(2))
-        if told:
-            value, slopes = told
-            if self.quantities == BIFURCATIONS:
-                push = lambda d: jax.jvp(margins_beside_fold, (value,), (d,))
-                value, slopes = jax.vmap(push, out_axes=(None, 0))(slopes)
-            value, slopes = value + slopes[0], slopes[1:]
+        parameter_indices = tuple(PARAMETER_NAMES.index(name) for name in self.parameter_names)
+        linearize = linearize_with_quantities(
+            self.system, parameter_indices, QUANTITY_FUNCTIONS.get(self.quantities)
+        )
+        arguments = stack_parameters(self.with_parameters(gait, p).params), gait.phase_active, z
+        correction, tangents, monodromy, *quantity_data = linearize(*arguments)
+        first_tangent, second_tangent = (
+            jax.tree.map(lambda x, i=i: x[i], tangents) for i in range(2)
+        )
+        if quantity_data:
+            value, parameter_gradient = quantity_data
+            if self.quantities == BIFURCATION_NAMES:
+                apply_margin_jacobian = lambda d: jax.jvp(
+                    offset_bifurcation_margins, (value,), (d,)
+                )
+                value, parameter_gradient = jax.vmap(apply_margin_jacobian, out_axes=(None, 0))(
+                    parameter_gradient
+                )
+            value, parameter_gradient = value + parameter_gradient[0], parameter_gradient[1:]
         else:
-            value, slopes = self._by_steps(gait, z, p, correction, (first, second))
-        value, slopes = value[wheel.place], slopes[:, wheel.place]
-        return LevelLinear(correction, (first, second), monodromy, value, slopes)
+            value, parameter_gradient = self._differentiate_steps(
+                gait, z, p, correction, (first_tangent, second_tangent)
+            )
+        value, parameter_gradient = (
+            value[wheel.quantity_index],
+            parameter_gradient[:, wheel.quantity_index],
+        )
+        return TestFunctionNewtonStep(
+            correction, (first_tangent, second_tangent), monodromy, value, parameter_gradient
+        )
 
-    def _by_steps(
-        self, gait: Wheel, z: Solution, p: Array, correction: Solution, columns: tuple
+    def _differentiate_steps(
+        self,
+        gait: BranchWheel,
+        z: CollocationSolution,
+        p: Array,
+        correction: CollocationSolution,
+        tangents: tuple,
     ) -> tuple[Array, Array]:
         """Return the step's quantities of the corrected gait, and their derivatives with respect to
         both parameters.
@@ -126,53 +169,73 @@ class GaitLevel(AbstractLevel):
         therefore taken along an orthonormal basis, from the point of the tangents' plane that is
         nearest to the trial.
         """
-        ahead = jnp.stack([p[i] * self.section(column) for i, column in enumerate(columns)])
-        basis, triangle = jnp.linalg.qr(jnp.concatenate([ahead, jnp.eye(2, dtype=p.dtype)], 1).T)
-        mixed = p[:, None] * jnp.linalg.inv(triangle)
-        here = basis[:-2].T @ self.section(correction)
+        scaled_tangents = jnp.stack(
+            [p[i] * self.section_state(column) for i, column in enumerate(tangents)]
+        )
+        basis, triangular_factor = jnp.linalg.qr(
+            jnp.concatenate([scaled_tangents, jnp.eye(2, dtype=p.dtype)], 1).T
+        )
+        basis_coefficients = p[:, None] * jnp.linalg.inv(triangular_factor)
+        correction_coordinates = basis[:-2].T @ self.section_state(correction)
 
-        def beside(place: Array) -> Array:
-            by = mixed @ (place - here)
-            along = lambda x, dx, a, b: x + dx + by[0] * a + by[1] * b
-            return self.told(gait, jax.tree.map(along, z, correction, *columns), p + by)
+        def measure_at_offset(offset: Array) -> Array:
+            parameter_change = basis_coefficients @ (offset - correction_coordinates)
+            displace = lambda x, dx, first_tangent, second_tangent: (
+                x + dx + parameter_change[0] * first_tangent + parameter_change[1] * second_tangent
+            )
+            return self.measure_step(
+                gait, jax.tree.map(displace, z, correction, *tangents), p + parameter_change
+            )
 
-        places = DIFFERENCE * jnp.eye(3, 2, -1, p.dtype)
-        told = jax.vmap(beside)(places)
-        slopes = (told[1:] - told[0]) / DIFFERENCE
-        return told[0] + here @ slopes, triangle.T @ slopes / p[:, None]
+        offsets = RELATIVE_DIFFERENCE * jnp.eye(3, 2, -1, p.dtype)
+        values = jax.vmap(measure_at_offset)(offsets)
+        gradient = (values[1:] - values[0]) / RELATIVE_DIFFERENCE
+        return values[0] + correction_coordinates @ gradient, triangular_factor.T @ gradient / p[
+            :, None
+        ]
 
-    def at(self, gait: Wheel, p: Array) -> Wheel:
+    def with_parameters(self, gait: BranchWheel, p: Array) -> BranchWheel:
         """Return the wheel with both parameters at p."""
         params = gait.params
-        for name, value in zip(self.names, p, strict=True):
-            params = self.model.moved(params, name, value)[1]
+        for name, value in zip(self.parameter_names, p, strict=True):
+            params = self.model.with_parameter(params, name, value)[1]
         return gait._replace(params=params)
 
     @property
-    def gaits(self) -> CycleFollowed:
+    def gait_problem(self) -> CollocationProblem:
         """Return the continuation problem of the gaits along the first parameter alone."""
-        return CycleFollowed(problem=self.problem, name=self.names[0], more=_named)
+        return CollocationProblem(
+            system=self.system,
+            parameter_name=self.parameter_names[0],
+            additional_quantities=_continued_by_name,
+        )
 
-    def told(self, gait: Wheel, z: Solution, p: Array) -> Array:
+    def measure_step(self, gait: BranchWheel, z: CollocationSolution, p: Array) -> Array:
         """Return those quantities that come from the step, in order."""
-        params = self.at(gait, p).params
-        x = self.gaits.read(gait._replace(params=params), z, p[0])[0]
-        told = gait_measures(self.model, params, x, self.step_options, 1)
-        rows = [(told[name.partition("[")[0]], name.partition("[")[2]) for name in self.quantities]
-        return jnp.stack([row[int(leg[:-1]) - 3] if leg else row for row, leg in rows])
+        params = self.with_parameters(gait, p).params
+        section_state = self.gait_problem.read_state(gait._replace(params=params), z, p[0])[0]
+        measures = measure_gait(self.model, params, section_state, self.step_options, 1)
+        measures_and_legs = [
+            (measures[name.partition("[")[0]], name.partition("[")[2]) for name in self.quantities
+        ]
+        return jnp.stack(
+            [measure[int(leg[:-1]) - 3] if leg else measure for measure, leg in measures_and_legs]
+        )
 
-    def section(self, z: Solution) -> Section:
-        return z.section
+    def section_state(self, z: CollocationSolution) -> SectionVector:
+        return z.section_state
 
-    def size(self, z: Solution, correction: Solution) -> Scalar:
-        return one_wheel(correction_size)(z, correction)
+    def correction_norm(self, z: CollocationSolution, correction: CollocationSolution) -> Scalar:
+        return unbatch(collocation_correction_norm)(z, correction)
 
-    def valid(self, wheel: GaitAt, z: Solution, p: Array) -> Array:
-        return jnp.all((z.durations > -ROUNDING) | (wheel.gait.happens < 0.5))
+    def is_admissible(self, wheel: TestFunctionArgs, z: CollocationSolution, p: Array) -> Array:
+        return jnp.all((z.durations > -DURATION_ROUNDOFF) | (wheel.gait.phase_active < 0.5))
 
 
 @eqx.filter_jit
-def where_jumps_begin(level: GaitLevel, gait: Wheel, z: Solution, p: Array) -> tuple[Array, Array]:
+def locate_jump_onset(
+    test_function: GaitTestFunction, gait: BranchWheel, z: CollocationSolution, p: Array
+) -> tuple[Array, Array]:
     """Return both parameters where `DLS_VANISHES` meets the curve of `lambda_4_plus`, and the last
     relative change.
 
@@ -180,66 +243,92 @@ def where_jumps_begin(level: GaitLevel, gait: Wheel, z: Solution, p: Array) -> t
     double support has zero duration. The equations of the same gait without double support are
     regular, and the rear foot's force and its rate vanish there together.
     """
-    gait = gait._replace(happens=gait.happens.at[0, 0].set(0.0))
+    gait = gait._replace(phase_active=gait.phase_active.at[0, 0].set(0.0))
     z = z._replace(durations=z.durations.at[0, 0].set(0.0))
-    both = [jnp.asarray(FORMAL.index(name)) for name in ("lambda_4_plus", FALLS)]
+    quantity_indices = [
+        jnp.asarray(CONTINUED_QUANTITIES.index(name)) for name in ("lambda_4_plus", FORCE_FALL_NAME)
+    ]
 
-    def nearer(at: tuple, _: None) -> tuple[tuple, Array]:
-        z, p = at
-        force, falls = (level.linearise(GaitAt(gait, place), z, p) for place in both)
-        slopes = jnp.stack([force.slopes, falls.slopes])
-        by = -jnp.linalg.solve(slopes, jnp.stack([force.value, falls.value]))
-        along = lambda x, dx, a, b: x + dx + by[0] * a + by[1] * b
-        return (jax.tree.map(along, z, force.correction, *force.columns), p + by), by / p
+    def newton_step(solution_and_parameters: tuple, _: None) -> tuple[tuple, Array]:
+        z, p = solution_and_parameters
+        force, force_fall = (
+            test_function.linearize(TestFunctionArgs(gait, place), z, p)
+            for place in quantity_indices
+        )
+        gradients = jnp.stack([force.parameter_gradient, force_fall.parameter_gradient])
+        parameter_change = -jnp.linalg.solve(gradients, jnp.stack([force.value, force_fall.value]))
+        displace = lambda x, dx, first_tangent, second_tangent: (
+            x + dx + parameter_change[0] * first_tangent + parameter_change[1] * second_tangent
+        )
+        return (
+            jax.tree.map(displace, z, force.correction, *force.tangents),
+            p + parameter_change,
+        ), parameter_change / p
 
-    (_, p), changes = lax.scan(nearer, (z, p), None, length=ITERATIONS)
-    return p, jnp.max(jnp.abs(changes[-1]))
+    (_, p), relative_changes = lax.scan(newton_step, (z, p), None, length=N_POINT_ITERATIONS)
+    return p, jnp.max(jnp.abs(relative_changes[-1]))
 
 
-def _formal(problem: Problem, parameters: Array, happens: Array, z: Solution) -> Array:
-    s = wheel_of(parameters, problem.n_legs).symbols()
-    (passages,) = problem.passages(parameters, z)[1]
-    return jnp.stack(list(_named(s, passages, z).values()))
+def _continued_quantities(
+    system: CollocationSystem, parameters: Array, phase_active: Array, z: CollocationSolution
+) -> Array:
+    s = wheel_from_parameters(parameters, system.n_legs).symbols()
+    (passages,) = system.evaluate_passages(parameters, z)[1]
+    return jnp.stack(list(_continued_by_name(s, passages, z).values()))
 
 
-def _named(s: Symbols, passages: Any, z: Solution) -> dict[str, Array]:
+def _continued_by_name(s: Symbols, passages: Any, z: CollocationSolution) -> dict[str, Array]:
     dls, sls1, sls2 = passages
     landing = transitions.land(s, sls2.end.q[0], *sls2.end.v)
     fore, rear = transitions.landing_forces(s, landing)
-    lasts, *others = z.durations[0]
-    forces = landing.rear.normal, fore.normal, rear.normal
-    told = *forces, *others, takeoff_acceleration(s, sls1), *_falls(s, dls, lasts)
-    return dict(zip(FORMAL, told, strict=True))
+    dls_duration, *other_durations = z.durations[0]
+    forces = landing.rear_impulse.normal, fore.normal, rear.normal
+    values = (
+        *forces,
+        *other_durations,
+        gait_takeoff_acceleration(s, sls1),
+        *_force_falls(s, dls, dls_duration),
+    )
+    return dict(zip(CONTINUED_QUANTITIES, values, strict=True))
 
 
-def _falls(s: Symbols, dls: Passage, lasts: Array) -> tuple[Array, Array]:
-    phase = phases_of(s, dls.start.held[0], stop_at_lift_off=False)[0]
+def _force_falls(s: Symbols, dls: PhasePassage, dls_duration: Array) -> tuple[Array, Array]:
+    phase = make_phases(s, dls.start.held_constants[0], stop_at_lift_off=False)[0]
 
-    def instant(theta: Array, dtheta: Array) -> Instant:
-        return Instant(phase, phase.at((theta,), (dtheta,)), None)
+    def instant_at(theta: Array, dtheta: Array) -> PhaseInstant:
+        return PhaseInstant(phase, phase.motion_at((theta,), (dtheta,)), None)
 
-    force = lambda *at: phase.end(instant(*at))
-    begin, end = (*dls.start.q, *dls.start.v), (*dls.end.q, *dls.end.v)
-    rates = begin[1], instant(*begin).acceleration.ddtheta
-    at_first, rises = jax.jvp(force, begin, rates)
-    mean = (at_first - force(*end)) / jnp.where(lasts == 0.0, 1.0, lasts)
-    return -rises, mean
-
-
-def _monodromy(problem: Problem, parameters: Array, happens: Array, z: Solution) -> Array:
-    located = Located(z, happens, *nothing_known(problem, z.section))
-    return problem.pass_at(parameters, located).monodromy
+    force_at = lambda *at: phase.end_guard(instant_at(*at))
+    start_state, end_state = (*dls.start.q, *dls.start.v), (*dls.end.q, *dls.end.v)
+    rates = start_state[1], instant_at(*start_state).acceleration.ddtheta
+    first_force, force_rate = jax.jvp(force_at, start_state, rates)
+    mean_fall = (first_force - force_at(*end_state)) / jnp.where(
+        dls_duration == 0.0, 1.0, dls_duration
+    )
+    return -force_rate, mean_fall
 
 
-ITERATIONS = 8
+def _trial_monodromy(
+    system: CollocationSystem, parameters: Array, phase_active: Array, z: CollocationSolution
+) -> Array:
+    collocation_state = CollocationState(
+        z, phase_active, *init_search_flags(system, z.section_state)
+    )
+    return system.linearize_at(parameters, collocation_state).monodromy
+
+
+N_POINT_ITERATIONS = 8
 """Number of Newton iterations for one point."""
 
-ROUNDING = 1e-9
+DURATION_ROUNDOFF = 1e-9
 """Round-off of a duration that is zero along a whole curve, s."""
 
-DIFFERENCE = 1e-6
+RELATIVE_DIFFERENCE = 1e-6
 """Finite difference of section and relative parameters, for derivatives of quantities of the
 step."""
 
-TOLD = {FORMAL: _formal, BIFURCATIONS: _monodromy}
+QUANTITY_FUNCTIONS = {
+    CONTINUED_QUANTITIES: _continued_quantities,
+    BIFURCATION_NAMES: _trial_monodromy,
+}
 """Functions for the quantities of a test function that need no event-driven step."""

@@ -17,488 +17,622 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from vrw_jax.branches.branch import Border, FixedPoint
+from vrw_jax.branches.branch import FixedPoint, SpecialPoint
 from vrw_jax.numerics import (
-    BIFURCATIONS,
-    AbstractFollowed,
+    BIFURCATION_NAMES,
+    AbstractContinuationProblem,
     ArclengthOptions,
-    Ending,
-    PathPoint,
-    Plane,
+    ConstraintPlane,
+    ContinuationPoint,
+    ContinuationStatus,
     arclength,
-    bifurcation_functions,
-    brackets,
-    follow_many,
-    in_batches,
-    in_batches_of_numpy,
-    joined,
-    locate,
-    solve,
-    solve_many,
-    taken,
-    turns,
+    concat_rows,
+    continue_many_from,
+    evaluate_bifurcation_functions,
+    find_sign_changes,
+    has_unit_circle_pair,
+    locate_zeros,
+    map_in_batches,
+    map_in_numpy_batches,
+    solve_many_on_planes,
+    solve_on_plane,
+    take_rows,
 )
 
-ACCURACY = 1e-10
+LOCATION_ACCURACY = 1e-10
 """Accuracy of a special point in the parameter: the width of the bracket at which the search
 ends."""
 
-AT_FOLD = 1e-6
+FOLD_BRACKET_FRACTION = 1e-6
 """Final width of the bracket as a fraction of the initial one, used near a fold, where the
 parameter enters squared."""
 
-SHARES_WHERE_LOST = (0.99, 0.9)
+RETRY_FRACTIONS = (0.99, 0.9)
 """Fractions of the distance to an ill-conditioned zero at which a point beside it is tried
 again."""
 
-SHAPES = (1, 8)
+LOCATION_BATCH_SIZES = (1, 8)
 """Numbers of points that are located side by side; only one of them is compiled where compilation
 is expensive."""
 
-READ = 32
+READ_BATCH_SIZE = 32
 """Number of points that one program evaluates; fewer points take the same time."""
 
-IN_SEQUENCE = "sequence"
+ADMISSIBLE_COLUMN = "sequence"
 """Name of the column that is 1 where a point is admissible, else -1."""
 
-BRANCH_POINT = "branch_point"
+BRANCH_POINT_KIND = "branch_point"
 """Kind of a point where a multiplier crosses 1 but the branch does not turn back: another branch
 crosses it. The equations are singular there, so the location is only as accurate as the
 continuation steps are short."""
 
-Table = dict[str, np.ndarray]
+QuantityTable = dict[str, np.ndarray]
 """Named quantities over a batch of points, first axis."""
 
 
 @dataclass(frozen=True)
-class AbstractRun(abc.ABC):
+class AbstractContinuation(abc.ABC):
     """Continuation of several wheels side by side, with the quantities to evaluate at its
     points."""
 
-    followed: AbstractFollowed
+    problem: AbstractContinuationProblem
     options: ArclengthOptions
     wheels: Any  # with a leading axis over wheels
     bounds: np.ndarray
 
-    ending: ClassVar[tuple[str, ...]] = ()
+    ending_quantities: ClassVar[tuple[str, ...]] = ()
     """Names of columns at whose zeros a branch ends because the order of events changes."""
-    exact: ClassVar[Mapping[str, str]] = {}
+    linear_substitutes: ClassVar[Mapping[str, str]] = {}
     """Margins that vanish ill-conditioned, each with the column that vanishes at the same point."""
 
     @abc.abstractmethod
-    def read(self, wheels: Any, points: PathPoint) -> Table:
+    def evaluate_points(self, wheels: Any, points: ContinuationPoint) -> QuantityTable:
         """Return the quantities that the Jacobian does not give, of the wheels with the same
         axis."""
 
     @abc.abstractmethod
-    def kept(self, table: Table) -> np.ndarray:
+    def is_admissible(self, table: QuantityTable) -> np.ndarray:
         """Return which points are admissible, from their table."""
 
     def is_margin(self, name: str) -> bool:
         """Return whether a column's zero is a border collision."""
         return False
 
-    def known(self, table: Table, owners: np.ndarray) -> Table:
+    def mask_undefined(self, table: QuantityTable, wheel_indices: np.ndarray) -> QuantityTable:
         """Return the table with undefined quantities masked, which depend on the wheel of the
         point."""
         return table
 
-    def name_of_loss(self, table: Table, place: int) -> str:
+    def name_end(self, table: QuantityTable, row_index: int) -> str:
         """Return a name for the end of a branch from the first point beyond it."""
-        return IN_SEQUENCE
+        return ADMISSIBLE_COLUMN
 
-    def is_rough(self, table: Table, ends: tuple[str, ...]) -> bool:
+    def is_mesh_limited(self, table: QuantityTable, ends: tuple[str, ...]) -> bool:
         """Return whether the mesh limits the extent or the accuracy of a branch; `ends` are names
         of ends."""
         return False
 
-    def batched(self, function: Callable, size: int, *trees: Any) -> Any:
+    def map_batched(self, function: Callable, batch_size: int, *trees: Any) -> Any:
         """Map over many numpy rows, `size` at a time if the function is compiled."""
-        if self.followed.traced:
-            return in_batches_of_numpy(function, (size,), *trees)
-        return jax.tree.map(np.asarray, in_batches(function, SHAPES, *trees))
+        if self.problem.is_traceable:
+            return map_in_numpy_batches(function, (batch_size,), *trees)
+        return jax.tree.map(np.asarray, map_in_batches(function, LOCATION_BATCH_SIZES, *trees))
 
-    def table(self, points: PathPoint, owners: np.ndarray) -> Table:
+    def make_table(self, points: ContinuationPoint, wheel_indices: np.ndarray) -> QuantityTable:
         """Return every quantity at each point, with bifurcation functions and ADMISSIBLE_COLUMN."""
-        wheels = taken(self.wheels, owners)
-        found = self.read(wheels, points)
-        margins = in_batches_of_numpy(bifurcation_functions, (READ,), points.jacobian)
-        found |= {name: margins[:, i] for i, name in enumerate(BIFURCATIONS)}
-        found = self.known(found, owners)
-        for name, exact in self.exact.items():
-            if exact in found and name in found:
-                found[_both(name)] = both_hold(found[name], found[exact])
-        good = np.asarray(points.valid) & self.kept(found)
-        return found | {IN_SEQUENCE: np.where(good, 1.0, -1.0)}
+        wheels = take_rows(self.wheels, wheel_indices)
+        table = self.evaluate_points(wheels, points)
+        test_functions = map_in_numpy_batches(
+            evaluate_bifurcation_functions, (READ_BATCH_SIZE,), points.jacobian
+        )
+        table |= {name: test_functions[:, i] for i, name in enumerate(BIFURCATION_NAMES)}
+        table = self.mask_undefined(table, wheel_indices)
+        for name, substitute in self.linear_substitutes.items():
+            if substitute in table and name in table:
+                table[_combined_name(name)] = combined_margin(table[name], table[substitute])
+        is_valid = np.asarray(points.is_admissible) & self.is_admissible(table)
+        return table | {ADMISSIBLE_COLUMN: np.where(is_valid, 1.0, -1.0)}
 
 
-def _both(name: str) -> str:
+def _combined_name(name: str) -> str:
     """Return the name of the column that is positive where a margin and its substitute are."""
     return f"{name} for certain"
 
 
-def both_hold(margin: np.ndarray, exact: np.ndarray) -> np.ndarray:
+def combined_margin(margin: np.ndarray, substitute: np.ndarray) -> np.ndarray:
     """Return a quantity with the sign of both, and of `substitute` alone where that is negative.
 
     It crosses zero without a jump at the zeros of either.
     """
-    return np.where(exact < 0.0, exact, np.minimum(exact, margin))
+    return np.where(substitute < 0.0, substitute, np.minimum(substitute, margin))
 
 
-def _follow_both_ways(run: AbstractRun, z: Any, p: Array, wanted: np.ndarray) -> arclength.Track:
+def _continue_both_ways(
+    continuation: AbstractContinuation, z: Any, parameter_values: Array, is_wanted: np.ndarray
+) -> arclength.ContinuationResult:
     """Continue all wheels, axes (wheel, direction), the first direction towards smaller values."""
-    twice = lambda tree: jax.device_put(taken(tree, np.repeat(np.arange(len(p)), 2)))
-    bounds = jnp.asarray(run.bounds)
-    ways = jnp.tile(jnp.asarray([-1.0, 1.0], bounds.dtype), p.shape[0])
-    given = twice(run.wheels), twice(z), twice(p), bounds, ways, twice(wanted)
-    follow = arclength.follow if run.followed.traced else follow_many
-    tracks = follow(run.followed, run.options, *given)
-    return jax.tree.map(lambda x: np.asarray(x).reshape(-1, 2, *x.shape[1:]), tracks)
+    repeat_for_directions = lambda tree: jax.device_put(
+        take_rows(tree, np.repeat(np.arange(len(parameter_values)), 2))
+    )
+    bounds = jnp.asarray(continuation.bounds)
+    directions = jnp.tile(jnp.asarray([-1.0, 1.0], bounds.dtype), parameter_values.shape[0])
+    arguments = (
+        repeat_for_directions(continuation.wheels),
+        repeat_for_directions(z),
+        repeat_for_directions(parameter_values),
+        bounds,
+        directions,
+        repeat_for_directions(is_wanted),
+    )
+    continue_all = (
+        arclength.continue_from if continuation.problem.is_traceable else continue_many_from
+    )
+    results = continue_all(continuation.problem, continuation.options, *arguments)
+    return jax.tree.map(lambda x: np.asarray(x).reshape(-1, 2, *x.shape[1:]), results)
 
 
 @eqx.filter_jit
-def _solve_on(
-    followed: AbstractFollowed,
+def _solve_between(
+    problem: AbstractContinuationProblem,
     options: ArclengthOptions,
     bounds: Array,
     wheels: Any,
-    left: PathPoint,
-    right: PathPoint,
-    places: Array,
-) -> tuple[PathPoint, Array]:
+    left: ContinuationPoint,
+    right: ContinuationPoint,
+    fractions: Array,
+) -> tuple[ContinuationPoint, Array]:
     """Return points of the branch between neighbors, at `fractions` in [0, 1] of the chord."""
 
-    def one(wheel: Any, left: PathPoint, right: PathPoint, place: Array) -> tuple[PathPoint, Array]:
-        z, plane = _begin_on(followed, bounds, left, right, place)
-        return solve(followed, options, wheel, z, plane, bounds)
+    def solve_one(
+        wheel: Any, left: ContinuationPoint, right: ContinuationPoint, fraction: Array
+    ) -> tuple[ContinuationPoint, Array]:
+        z, plane = _make_start_between(problem, bounds, left, right, fraction)
+        return solve_on_plane(problem, options, wheel, z, plane, bounds)
 
-    return jax.vmap(one)(wheels, left, right, places)
+    return jax.vmap(solve_one)(wheels, left, right, fractions)
 
 
-def _begin_on(
-    followed: AbstractFollowed, bounds: Array, left: PathPoint, right: PathPoint, place: Array
-) -> tuple[Any, Plane]:
+def _make_start_between(
+    problem: AbstractContinuationProblem,
+    bounds: Array,
+    left: ContinuationPoint,
+    right: ContinuationPoint,
+    fraction: Array,
+) -> tuple[Any, ConstraintPlane]:
     """Return the start of a search between neighbors, and the plane that contains the solution."""
-    z = followed.between(left.z, right.z, place)
-    scale = bounds[1] - bounds[0]
-    row_x = followed.section(right.z) - followed.section(left.z)
-    row_share = (right.p - left.p) / scale
-    share = (left.p + place * (right.p - left.p) - bounds[0]) / scale
-    return z, Plane(followed.section(z), share, row_x, row_share)
+    z = problem.interpolate(left.z, right.z, fraction)
+    parameter_range = bounds[1] - bounds[0]
+    normal_section = problem.section_state(right.z) - problem.section_state(left.z)
+    normal_fraction = (right.p - left.p) / parameter_range
+    parameter_fraction = (left.p + fraction * (right.p - left.p) - bounds[0]) / parameter_range
+    return z, ConstraintPlane(
+        problem.section_state(z), parameter_fraction, normal_section, normal_fraction
+    )
 
 
-_begin_many = eqx.filter_jit(eqx.filter_vmap(_begin_on, in_axes=(None, None, 0, 0, 0)))
+_make_starts_between = eqx.filter_jit(
+    eqx.filter_vmap(_make_start_between, in_axes=(None, None, 0, 0, 0))
+)
 
 
-def _solve_many(
-    followed: AbstractFollowed,
+def _solve_many_between(
+    problem: AbstractContinuationProblem,
     options: ArclengthOptions,
     bounds: Array,
     wheels: Any,
-    left: PathPoint,
-    right: PathPoint,
-    places: Array,
-) -> tuple[PathPoint, Array]:
+    left: ContinuationPoint,
+    right: ContinuationPoint,
+    fractions: Array,
+) -> tuple[ContinuationPoint, Array]:
     """Return `_solve_between` outside of compiled code."""
-    z, planes = _begin_many(followed, bounds, left, right, places)
-    return solve_many(followed, options, wheels, z, planes, bounds)
+    z, planes = _make_starts_between(problem, bounds, left, right, fractions)
+    return solve_many_on_planes(problem, options, wheels, z, planes, bounds)
 
 
-class _Pieces(NamedTuple):
+class _PointTable(NamedTuple):
     """Points of all wheels in one array; each wheel's points are in the order of its branch."""
 
-    points: PathPoint
-    owners: np.ndarray  # of each point
-    table: Table
+    points: ContinuationPoint
+    wheel_indices: np.ndarray  # of each point
+    table: QuantityTable
 
 
-class _Zero(NamedTuple):
+class _LocatedZero(NamedTuple):
     bracket: tuple[int, int, str]  # left and right point, name of the quantity
     value: float
-    place: float
-    beside: PathPoint  # on the side of the left point, leading axis 1
-    table: Table  # at `point_beside`
+    fraction: float
+    point_beside: ContinuationPoint  # on the side of the left point, leading axis 1
+    table: QuantityTable  # at `point_beside`
 
 
-def _zeros(run: AbstractRun, pieces: _Pieces, asked: list[tuple[int, int, str]]) -> list[_Zero]:
+def _locate_zeros(
+    continuation: AbstractContinuation,
+    point_table: _PointTable,
+    requests: list[tuple[int, int, str]],
+) -> list[_LocatedZero]:
     """Locate the zero of each request (left, right, quantity) whose sign differs between two
     points."""
-    if not asked:
+    if not requests:
         return []
-    lefts, rights = (np.array([a[i] for a in asked]) for i in (0, 1))
-    names = [a[2] for a in asked]
-    left, right = taken(pieces.points, lefts), taken(pieces.points, rights)
-    owners = pieces.owners[lefts]
-    wheels = taken(run.wheels, owners)
-    on = _solve_on if run.followed.traced else _solve_many
-    search = functools.partial(on, run.followed, run.options, jnp.asarray(run.bounds))
+    lefts, rights = (np.array([request[i] for request in requests]) for i in (0, 1))
+    names = [request[2] for request in requests]
+    left, right = take_rows(point_table.points, lefts), take_rows(point_table.points, rights)
+    wheel_indices = point_table.wheel_indices[lefts]
+    wheels = take_rows(continuation.wheels, wheel_indices)
+    solve_points = _solve_between if continuation.problem.is_traceable else _solve_many_between
+    solve_between = functools.partial(
+        solve_points, continuation.problem, continuation.options, jnp.asarray(continuation.bounds)
+    )
 
-    parameter = {(i, 1.0 * end): side.p[i]
-                 for end, side in enumerate((left, right)) for i in range(len(asked))}  # fmt: skip
+    parameter_at = {(i, 1.0 * end): side.p[i]
+                 for end, side in enumerate((left, right)) for i in range(len(requests))}  # fmt: skip
 
-    def evaluated(places: np.ndarray, which: np.ndarray) -> tuple[PathPoint, Table]:
-        rows = taken((wheels, left, right), which)
-        points, found = run.batched(search, SHAPES[-1], *rows, places)
-        parameter.update(zip(zip(which, places, strict=True), points.p, strict=True))
-        points = points._replace(valid=points.valid & found)
-        table = run.table(points, owners[which])
-        return points, {k: np.where(_along(found, v), v, np.nan) for k, v in table.items()}
-
-    def asked_at(places: np.ndarray, which: np.ndarray) -> np.ndarray:
-        table = evaluated(places, which)[1]
-        return np.array([table[names[k]][i] for i, k in enumerate(which)])
-
-    known = lambda rows: np.array([pieces.table[n][i] for n, i in zip(names, rows, strict=True)])
-    reach = np.maximum(np.abs(right.p - left.p), ACCURACY)
-    width = np.minimum(ACCURACY / reach, AT_FOLD)
-    found = locate(asked_at, (known(lefts), known(rights)), width)
-    every = np.arange(len(asked))
-    # Slightly to the left even of an exact zero, where the point is still admissible.
-    beside, table = evaluated(np.maximum(found.left - width, 0.0), every)
-    for share in SHARES_WHERE_LOST:
-        lost, rows = np.flatnonzero(~(table[IN_SEQUENCE] > 0.0)), np.arange(len(asked))
-        if len(lost):
-            there = evaluated(share * found.left[lost], lost)
-            rows[lost] = len(rows) + np.arange(len(lost))
-            beside, table = taken(joined((beside, table), there), rows)
-    return [
-        _Zero(
-            asked[i],
-            float(parameter[i, found.place[i]]),
-            float(found.place[i]),
-            taken(beside, slice(i, i + 1)),
-            taken(table, slice(i, i + 1)),
+    def solve_at_fractions(
+        fractions: np.ndarray, bracket_indices: np.ndarray
+    ) -> tuple[ContinuationPoint, QuantityTable]:
+        bracket_rows = take_rows((wheels, left, right), bracket_indices)
+        points, is_found = continuation.map_batched(
+            solve_between, LOCATION_BATCH_SIZES[-1], *bracket_rows, fractions
         )
-        for i in range(len(asked))
+        parameter_at.update(
+            zip(zip(bracket_indices, fractions, strict=True), points.p, strict=True)
+        )
+        points = points._replace(is_admissible=points.is_admissible & is_found)
+        table = continuation.make_table(points, wheel_indices[bracket_indices])
+        return points, {
+            k: np.where(_broadcast_flags(is_found, v), v, np.nan) for k, v in table.items()
+        }
+
+    def quantity_at(fractions: np.ndarray, bracket_indices: np.ndarray) -> np.ndarray:
+        table = solve_at_fractions(fractions, bracket_indices)[1]
+        return np.array([table[names[k]][i] for i, k in enumerate(bracket_indices)])
+
+    values_at = lambda row_indices: np.array(
+        [point_table.table[n][i] for n, i in zip(names, row_indices, strict=True)]
+    )
+    parameter_distance = np.maximum(np.abs(right.p - left.p), LOCATION_ACCURACY)
+    tolerances = np.minimum(LOCATION_ACCURACY / parameter_distance, FOLD_BRACKET_FRACTION)
+    location = locate_zeros(quantity_at, (values_at(lefts), values_at(rights)), tolerances)
+    all_indices = np.arange(len(requests))
+    # Slightly to the left even of an exact zero, where the point is still admissible.
+    points_beside, table = solve_at_fractions(
+        np.maximum(location.left_end - tolerances, 0.0), all_indices
+    )
+    for retry_fraction in RETRY_FRACTIONS:
+        failed, row_indices = (
+            np.flatnonzero(~(table[ADMISSIBLE_COLUMN] > 0.0)),
+            np.arange(len(requests)),
+        )
+        if len(failed):
+            retries = solve_at_fractions(retry_fraction * location.left_end[failed], failed)
+            row_indices[failed] = len(row_indices) + np.arange(len(failed))
+            points_beside, table = take_rows(
+                concat_rows((points_beside, table), retries), row_indices
+            )
+    return [
+        _LocatedZero(
+            requests[i],
+            float(parameter_at[i, location.best[i]]),
+            float(location.best[i]),
+            take_rows(points_beside, slice(i, i + 1)),
+            take_rows(table, slice(i, i + 1)),
+        )
+        for i in range(len(requests))
     ]
 
 
-def _along(flags: np.ndarray, values: np.ndarray) -> np.ndarray:
+def _broadcast_flags(flags: np.ndarray, values: np.ndarray) -> np.ndarray:
     return flags.reshape(-1, *(1,) * (values.ndim - 1))
 
 
-def _collected(run: AbstractRun, tracks: arclength.Track) -> _Pieces:
+def _collect_points(
+    continuation: AbstractContinuation, results: arclength.ContinuationResult
+) -> _PointTable:
     """Collect all points of all results, each wheel's two directions joined at its start."""
-    parts, owners = [], []
-    for wheel in range(tracks.n_points.shape[0]):
-        down, up = (int(n) for n in tracks.n_points[wheel])
-        if down:
-            points = taken(tracks.points, (wheel, 0))
-            points = taken(points, np.arange(down)[::-1])
-            parts.append(points._replace(share_slope=-points.share_slope))
-        if up:
-            points = taken(tracks.points, (wheel, 1))
-            parts.append(taken(points, np.arange(1 if down else 0, up)))
-        owners += [wheel] * (down + max(up - (1 if down else 0), 0))
-    if not owners:
-        return _Pieces(taken(tracks.points, (0, 0, slice(0, 0))), np.zeros(0, int), {})
-    points = joined(*parts)
-    return _Pieces(points, np.array(owners), run.table(points, np.array(owners)))
+    point_parts, wheel_indices = [], []
+    for wheel_index in range(results.n_points.shape[0]):
+        n_down, n_up = (int(n) for n in results.n_points[wheel_index])
+        if n_down:
+            points = take_rows(results.points, (wheel_index, 0))
+            points = take_rows(points, np.arange(n_down)[::-1])
+            point_parts.append(points._replace(fraction_rate=-points.fraction_rate))
+        if n_up:
+            points = take_rows(results.points, (wheel_index, 1))
+            point_parts.append(take_rows(points, np.arange(1 if n_down else 0, n_up)))
+        wheel_indices += [wheel_index] * (n_down + max(n_up - (1 if n_down else 0), 0))
+    if not wheel_indices:
+        return _PointTable(take_rows(results.points, (0, 0, slice(0, 0))), np.zeros(0, int), {})
+    points = concat_rows(*point_parts)
+    return _PointTable(
+        points, np.array(wheel_indices), continuation.make_table(points, np.array(wheel_indices))
+    )
 
 
-class _Reach(NamedTuple):
+class _ValidRange(NamedTuple):
     """Admissible points of one wheel, and the first one beyond at either end (-1 if there is
     none)."""
 
-    owner: int
-    points: np.ndarray
-    beyond: tuple[int, int]
+    wheel_index: int
+    point_indices: np.ndarray
+    beyond_indices: tuple[int, int]
 
 
-def _reaches(pieces: _Pieces, starts: Mapping[int, int]) -> list[_Reach]:
+def _find_valid_ranges(point_table: _PointTable, starts: Mapping[int, int]) -> list[_ValidRange]:
     """Return the points of each wheel that are connected to its start through admissible points."""
-    reaches = []
-    for owner, start in starts.items():
-        own = np.flatnonzero(pieces.owners == owner)
-        good = pieces.table[IN_SEQUENCE][own] > 0.0
+    ranges = []
+    for wheel_index, start in starts.items():
+        point_indices = np.flatnonzero(point_table.wheel_indices == wheel_index)
+        is_valid = point_table.table[ADMISSIBLE_COLUMN][point_indices] > 0.0
         # A start on a special point may be beyond it: then it is next to the branch's end.
-        near = [i for i in (start, start + 1, start - 1) if 0 <= i < len(own) and good[i]]
-        if not near:
+        candidates = [
+            i for i in (start, start + 1, start - 1) if 0 <= i < len(point_indices) and is_valid[i]
+        ]
+        if not candidates:
             continue
-        start = near[0]
-        low = high = start
-        while low > 0 and good[low - 1]:
-            low -= 1
-        while high < len(own) - 1 and good[high + 1]:
-            high += 1
-        below = int(own[low - 1]) if low > 0 else -1
-        above = int(own[high + 1]) if high < len(own) - 1 else -1
-        reaches.append(_Reach(owner, own[low : high + 1], (below, above)))
-    return reaches
+        start = candidates[0]
+        first_index = last_index = start
+        while first_index > 0 and is_valid[first_index - 1]:
+            first_index -= 1
+        while last_index < len(point_indices) - 1 and is_valid[last_index + 1]:
+            last_index += 1
+        below_index = int(point_indices[first_index - 1]) if first_index > 0 else -1
+        above_index = (
+            int(point_indices[last_index + 1]) if last_index < len(point_indices) - 1 else -1
+        )
+        ranges.append(
+            _ValidRange(
+                wheel_index, point_indices[first_index : last_index + 1], (below_index, above_index)
+            )
+        )
+    return ranges
 
 
-def _is_rough(run: AbstractRun, pieces: _Pieces, reach: _Reach) -> bool:
+def _is_mesh_limited(
+    continuation: AbstractContinuation, point_table: _PointTable, valid_range: _ValidRange
+) -> bool:
     """Return `AbstractContinuation.is_mesh_limited` before special points are located."""
-    lost = [i for i in reach.beyond if i >= 0 and not _crossing(run, pieces, reach, i)]
-    names = tuple(run.name_of_loss(pieces.table, i) for i in lost)
-    return run.is_rough(taken(pieces.table, reach.points), names)
+    lost_indices = [
+        i
+        for i in valid_range.beyond_indices
+        if i >= 0 and not _find_crossings(continuation, point_table, valid_range, i)
+    ]
+    names = tuple(continuation.name_end(point_table.table, i) for i in lost_indices)
+    return continuation.is_mesh_limited(
+        take_rows(point_table.table, valid_range.point_indices), names
+    )
 
 
-def _crossing(run: AbstractRun, pieces: _Pieces, reach: _Reach, beyond: int) -> list[str]:
+def _find_crossings(
+    continuation: AbstractContinuation,
+    point_table: _PointTable,
+    valid_range: _ValidRange,
+    beyond_index: int,
+) -> list[str]:
     """Return the quantities that change sign from the last point to the first one beyond."""
-    last = reach.points[0 if beyond < reach.points[0] else -1]
-    known = [name for name in run.ending if name in pieces.table]
-    return [n for n in known if pieces.table[n][last] * pieces.table[n][beyond] < 0.0]
+    last_index = valid_range.point_indices[0 if beyond_index < valid_range.point_indices[0] else -1]
+    known_names = [name for name in continuation.ending_quantities if name in point_table.table]
+    return [
+        n
+        for n in known_names
+        if point_table.table[n][last_index] * point_table.table[n][beyond_index] < 0.0
+    ]
 
 
-def _located_ends(
-    run: AbstractRun, pieces: _Pieces, reaches: list[_Reach]
-) -> dict[tuple[int, int], _Zero]:
+def _locate_ends(
+    continuation: AbstractContinuation, point_table: _PointTable, ranges: list[_ValidRange]
+) -> dict[tuple[int, int], _LocatedZero]:
     """Locate where each branch stops being admissible, by (wheel, end: 0 or 1), at the nearest
     zero."""
-    asked, keys = [], []
-    for reach in reaches:
-        for end, beyond in enumerate(reach.beyond):
-            if beyond < 0:
+    requests, keys = [], []
+    for valid_range in ranges:
+        for end_index, beyond_index in enumerate(valid_range.beyond_indices):
+            if beyond_index < 0:
                 continue
-            last = int(reach.points[0 if end == 0 else -1])
-            for name in _crossing(run, pieces, reach, beyond) or [IN_SEQUENCE]:
-                asked.append((last, beyond, name))
-                keys.append((reach.owner, end))
-    nearest: dict[tuple[int, int], _Zero] = {}
-    for key, zero in zip(keys, _zeros(run, pieces, asked), strict=True):
-        if key not in nearest or zero.place < nearest[key].place:
+            last_index = int(valid_range.point_indices[0 if end_index == 0 else -1])
+            for name in _find_crossings(continuation, point_table, valid_range, beyond_index) or [
+                ADMISSIBLE_COLUMN
+            ]:
+                requests.append((last_index, beyond_index, name))
+                keys.append((valid_range.wheel_index, end_index))
+    nearest: dict[tuple[int, int], _LocatedZero] = {}
+    for key, zero in zip(keys, _locate_zeros(continuation, point_table, requests), strict=True):
+        if key not in nearest or zero.fraction < nearest[key].fraction:
             nearest[key] = zero
     return nearest
 
 
-def _with_ends(
-    pieces: _Pieces, reaches: list[_Reach], ends: Mapping[tuple[int, int], _Zero]
-) -> _Pieces:
+def _join_ends(
+    point_table: _PointTable,
+    ranges: list[_ValidRange],
+    located_ends: Mapping[tuple[int, int], _LocatedZero],
+) -> _PointTable:
     """Return the admissible points alone, joined with the points next to the located ends."""
-    points, owners, tables = [], [], []
+    points, wheel_indices, tables = [], [], []
 
-    def add(some: PathPoint, owner: int, table: Table) -> None:
-        points.append(some)
-        owners.append(np.full(len(some.p), owner))
+    def append_points(
+        new_points: ContinuationPoint, wheel_index: int, table: QuantityTable
+    ) -> None:
+        points.append(new_points)
+        wheel_indices.append(np.full(len(new_points.p), wheel_index))
         tables.append(table)
 
-    for reach in reaches:
-        low, high = (ends.get((reach.owner, end)) for end in (0, 1))
-        if low is not None and low.table[IN_SEQUENCE][0] > 0.0:
-            add(low.beside, reach.owner, low.table)
-        add(taken(pieces.points, reach.points), reach.owner, taken(pieces.table, reach.points))
-        if high is not None and high.table[IN_SEQUENCE][0] > 0.0:
-            add(high.beside, reach.owner, high.table)
-    return _Pieces(joined(*points), np.concatenate(owners), joined(*tables))
+    for valid_range in ranges:
+        lower_end, upper_end = (located_ends.get((valid_range.wheel_index, end)) for end in (0, 1))
+        if lower_end is not None and lower_end.table[ADMISSIBLE_COLUMN][0] > 0.0:
+            append_points(lower_end.point_beside, valid_range.wheel_index, lower_end.table)
+        append_points(
+            take_rows(point_table.points, valid_range.point_indices),
+            valid_range.wheel_index,
+            take_rows(point_table.table, valid_range.point_indices),
+        )
+        if upper_end is not None and upper_end.table[ADMISSIBLE_COLUMN][0] > 0.0:
+            append_points(upper_end.point_beside, valid_range.wheel_index, upper_end.table)
+    return _PointTable(concat_rows(*points), np.concatenate(wheel_indices), concat_rows(*tables))
 
 
-def _inner_zeros(run: AbstractRun, pieces: _Pieces) -> list[tuple[str, _Zero]]:
+def _locate_inner_zeros(
+    continuation: AbstractContinuation, point_table: _PointTable
+) -> list[tuple[str, _LocatedZero]]:
     """Locate every change of sign between neighbors on the same branch; return names and zeros."""
-    skipped = (IN_SEQUENCE, *run.exact.values())
+    skipped_names = (ADMISSIBLE_COLUMN, *continuation.linear_substitutes.values())
     names = [
-        name for name, values in pieces.table.items() if values.ndim == 1 and name not in skipped
+        name
+        for name, values in point_table.table.items()
+        if values.ndim == 1 and name not in skipped_names
     ]
-    names = [name for name in names if name in BIFURCATIONS or run.is_margin(name)]
-    columns = [_both(name) if _both(name) in pieces.table else name for name in names]
-    asked, told = [], []
-    for left, right, place in brackets(np.stack([pieces.table[name] for name in columns], 1)):
-        if pieces.owners[left] == pieces.owners[right]:
-            asked.append((left, right, columns[place]))
-            told.append(names[place])
-    for i, (left, right, _) in enumerate(asked):
-        slopes = pieces.points.share_slope
-        if told[i] == "fold" and slopes[left] * slopes[right] > 0.0:
-            told[i] = BRANCH_POINT
-    zeros = list(zip(told, _zeros(run, pieces, asked), strict=True))
+    names = [name for name in names if name in BIFURCATION_NAMES or continuation.is_margin(name)]
+    columns = [
+        _combined_name(name) if _combined_name(name) in point_table.table else name
+        for name in names
+    ]
+    requests, request_names = [], []
+    for left, right, column_index in find_sign_changes(
+        np.stack([point_table.table[name] for name in columns], 1)
+    ):
+        if point_table.wheel_indices[left] == point_table.wheel_indices[right]:
+            requests.append((left, right, columns[column_index]))
+            request_names.append(names[column_index])
+    for i, (left, right, _) in enumerate(requests):
+        fraction_rates = point_table.points.fraction_rate
+        if request_names[i] == "fold" and fraction_rates[left] * fraction_rates[right] > 0.0:
+            request_names[i] = BRANCH_POINT_KIND
+    named_zeros = list(
+        zip(request_names, _locate_zeros(continuation, point_table, requests), strict=True)
+    )
     return [
-        (n, z) for n, z in zeros if n != "neimark_sacker" or turns(np.asarray(z.beside.jacobian[0]))
+        (n, z)
+        for n, z in named_zeros
+        if n != "neimark_sacker" or has_unit_circle_pair(np.asarray(z.point_beside.jacobian[0]))
     ]
 
 
-def _kind(run: AbstractRun, name: str) -> str:
-    if name in (*BIFURCATIONS, BRANCH_POINT):
+def _classify(continuation: AbstractContinuation, name: str) -> str:
+    if name in (*BIFURCATION_NAMES, BRANCH_POINT_KIND):
         return name
-    return "border_collision" if run.is_margin(name) else "lost"
+    return "border_collision" if continuation.is_margin(name) else "lost"
 
 
-class Strand(NamedTuple):
+class BranchData(NamedTuple):
     """Finished branch of one wheel, before it is labeled."""
 
-    points: PathPoint
-    table: Table
-    borders: tuple[Border, ...]
+    points: ContinuationPoint
+    table: QuantityTable
+    special_points: tuple[SpecialPoint, ...]
     ends: tuple[str, str]
-    rough: bool  # `AbstractContinuation.is_mesh_limited`
+    is_mesh_limited: bool  # `AbstractContinuation.is_mesh_limited`
 
 
-MakeCycle = Callable[[int, PathPoint], Callable[[], Any] | None]
+CycleFactory = Callable[[int, ContinuationPoint], Callable[[], Any] | None]
 """Function of a wheel's index and a point that returns a function for its limit cycle."""
 
 
-def _left_rough(
-    run: AbstractRun, pieces: _Pieces, reaches: list[_Reach], n_wheels: int
-) -> list[Strand | None]:
-    strands: list[Strand | None] = [None] * n_wheels
-    for reach in reaches:
-        if _is_rough(run, pieces, reach):
-            points, table = taken((pieces.points, pieces.table), reach.points)
-            strands[reach.owner] = Strand(points, table, (), ("", ""), True)
-    return strands
+def _collect_mesh_limited(
+    continuation: AbstractContinuation,
+    point_table: _PointTable,
+    ranges: list[_ValidRange],
+    n_wheels: int,
+) -> list[BranchData | None]:
+    branches: list[BranchData | None] = [None] * n_wheels
+    for valid_range in ranges:
+        if _is_mesh_limited(continuation, point_table, valid_range):
+            points, table = take_rows(
+                (point_table.points, point_table.table), valid_range.point_indices
+            )
+            branches[valid_range.wheel_index] = BranchData(points, table, (), ("", ""), True)
+    return branches
 
 
-def run_all(
-    run: AbstractRun,
+def continue_and_locate(
+    continuation: AbstractContinuation,
     z: Any,
     p: Array,
-    found: np.ndarray,
-    make_cycle: MakeCycle,
-    finest: bool = True,
-) -> list[Strand | None]:
+    has_start: np.ndarray,
+    make_cycle: CycleFactory,
+    is_finest: bool = True,
+) -> list[BranchData | None]:
     """Continue the branches, locate special points, and return the branches by wheel; None without
     a start.
 
     Without `is_finest`, special points of mesh-limited branches are not located, because these are
     continued again.
     """
-    tracks = _follow_both_ways(run, z, p, found)
+    results = _continue_both_ways(continuation, z, p, has_start)
     # A closed curve has both directions in one result.
-    closed = (tracks.ending == int(Ending.CLOSED)).all(1, keepdims=True) & np.array([True, False])
-    counts: Any = np.where(closed, 0, tracks.n_points)
-    tracks = tracks._replace(n_points=counts)
-    pieces = _collected(run, tracks)
-    n_wheels, before = len(found), np.maximum(tracks.n_points[:, 0] - 1, 0)
-    starts = {w: int(before[w]) for w in range(n_wheels) if w in pieces.owners}
-    reaches = _reaches(pieces, starts)
-    strands: list[Strand | None] = [None] * n_wheels
-    if not finest:
-        strands = _left_rough(run, pieces, reaches, n_wheels)
-        reaches = [reach for reach in reaches if strands[reach.owner] is None]
-    if not reaches:
-        return strands
-    ends = _located_ends(run, pieces, reaches)
-    whole = _with_ends(pieces, reaches, ends)
-    inner = _inner_zeros(run, whole)
+    is_closed = (results.status == int(ContinuationStatus.CURVE_CLOSED)).all(
+        1, keepdims=True
+    ) & np.array([True, False])
+    counts: Any = np.where(is_closed, 0, results.n_points)
+    results = results._replace(n_points=counts)
+    point_table = _collect_points(continuation, results)
+    n_wheels, n_before = len(has_start), np.maximum(results.n_points[:, 0] - 1, 0)
+    start_indices = {w: int(n_before[w]) for w in range(n_wheels) if w in point_table.wheel_indices}
+    ranges = _find_valid_ranges(point_table, start_indices)
+    branches: list[BranchData | None] = [None] * n_wheels
+    if not is_finest:
+        branches = _collect_mesh_limited(continuation, point_table, ranges, n_wheels)
+        ranges = [
+            valid_range for valid_range in ranges if branches[valid_range.wheel_index] is None
+        ]
+    if not ranges:
+        return branches
+    located_ends = _locate_ends(continuation, point_table, ranges)
+    all_points = _join_ends(point_table, ranges, located_ends)
+    inner_zeros = _locate_inner_zeros(continuation, all_points)
 
-    def border(name: str, zero: _Zero, owner: int, ends_branch: bool) -> Border:
-        beside = taken(zero.beside, 0)
-        section = np.asarray(run.followed.section(jax.device_put(beside.z)))
-        point = FixedPoint(section, float(beside.p), beside.jacobian)
-        if name == IN_SEQUENCE:
-            name = run.name_of_loss(pieces.table, zero.bracket[1])
-        return Border(
-            _kind(run, name), name, zero.value, point, ends_branch, make_cycle(owner, beside)
+    def make_special_point(
+        name: str, zero: _LocatedZero, wheel_index: int, ends_branch: bool
+    ) -> SpecialPoint:
+        point_beside = take_rows(zero.point_beside, 0)
+        section = np.asarray(continuation.problem.section_state(jax.device_put(point_beside.z)))
+        point = FixedPoint(section, float(point_beside.p), point_beside.jacobian)
+        if name == ADMISSIBLE_COLUMN:
+            name = continuation.name_end(point_table.table, zero.bracket[1])
+        return SpecialPoint(
+            _classify(continuation, name),
+            name,
+            zero.value,
+            point,
+            ends_branch,
+            make_cycle(wheel_index, point_beside),
         )
 
-    for reach in reaches:
-        own = np.flatnonzero(whole.owners == reach.owner)
-        placed = [
-            (zero.bracket[0] + zero.place, border(name, zero, reach.owner, False))
-            for name, zero in inner
-            if zero.bracket[0] in own
+    for valid_range in ranges:
+        point_indices = np.flatnonzero(all_points.wheel_indices == valid_range.wheel_index)
+        positioned_points = [
+            (
+                located_zero.bracket[0] + located_zero.fraction,
+                make_special_point(name, located_zero, valid_range.wheel_index, False),
+            )
+            for name, located_zero in inner_zeros
+            if located_zero.bracket[0] in point_indices
         ]
-        endings = []
+        end_reasons = []
         for end in (0, 1):
-            zero = ends.get((reach.owner, end))
-            if zero is None:
-                endings.append(Ending(int(tracks.ending[reach.owner, end])).meaning)
+            located_zero = located_ends.get((valid_range.wheel_index, end))
+            if located_zero is None:
+                end_reasons.append(
+                    ContinuationStatus(int(results.status[valid_range.wheel_index, end])).meaning
+                )
                 continue
-            last = border(zero.bracket[2], zero, reach.owner, True)
-            placed.append((own[0] - 1.0 if end == 0 else own[-1] + 1.0, last))
-            endings.append(f"{last.name.replace('_', ' ')} at {last.value:.9g} ends it.")
-        borders = tuple(b for _, b in sorted(placed, key=lambda pair: pair[0]))
-        table = taken(whole.table, own)
-        lost = tuple(b.name for b in borders if b.ends_branch)
-        told = taken(whole.points, own), table, borders, (endings[0], endings[1])
-        strands[reach.owner] = Strand(*told, run.is_rough(table, lost))
-    return strands
+            end_point = make_special_point(
+                located_zero.bracket[2], located_zero, valid_range.wheel_index, True
+            )
+            positioned_points.append(
+                (point_indices[0] - 1.0 if end == 0 else point_indices[-1] + 1.0, end_point)
+            )
+            end_reasons.append(
+                f"{end_point.name.replace('_', ' ')} at {end_point.value:.9g} ends it."
+            )
+        special_points = tuple(b for _, b in sorted(positioned_points, key=lambda pair: pair[0]))
+        table = take_rows(all_points.table, point_indices)
+        end_names = tuple(b.name for b in special_points if b.ends_branch)
+        branch_fields = (
+            take_rows(all_points.points, point_indices),
+            table,
+            special_points,
+            (end_reasons[0], end_reasons[1]),
+        )
+        branches[valid_range.wheel_index] = BranchData(
+            *branch_fields, continuation.is_mesh_limited(table, end_names)
+        )
+    return branches

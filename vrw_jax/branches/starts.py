@@ -10,134 +10,148 @@ import numpy as np
 from jaxtyping import Array
 
 from vrw_jax.branches.followed import (
-    AbstractFollowedWheel,
-    CycleFollowed,
-    GroundFollowed,
-    RungFollowed,
-    Wheel,
+    AbstractGaitProblem,
+    BranchWheel,
+    CollocationProblem,
+    GroundProblem,
+    ReturnMapProblem,
 )
-from vrw_jax.branches.run import MakeCycle
-from vrw_jax.cycles import CycleOptions, LimitCycle, finder_of, on_mesh
+from vrw_jax.branches.run import CycleFactory
+from vrw_jax.cycles import CycleOptions, LimitCycle, make_finder, transfer_to_mesh
 from vrw_jax.gaits import limit_cycles
 from vrw_jax.models import AbstractWheel
-from vrw_jax.numerics import Options, PathPoint
-from vrw_jax.walks import walk_towards
+from vrw_jax.numerics import ContinuationPoint, StepOptions
+from vrw_jax.walks import walk_toward_gait
 from vrw_jax.wheel import WheelParams
 
 
-class Wanted(NamedTuple):
+class BranchRequest(NamedTuple):
     """Request for branches of a batch of wheels."""
 
     params: WheelParams  # one leading axis
     model: AbstractWheel
-    name: str  # of the parameter
-    p: Array  # at the starts of the branches
+    parameter_name: str  # of the parameter
+    parameter_values: Array  # at the starts of the branches
     period_n: int
     cycle_options: CycleOptions | None
-    step_options: Options
+    step_options: StepOptions
 
 
-class Start(NamedTuple):
+class BranchStart(NamedTuple):
     """Data that a continuation needs to start."""
 
-    followed: AbstractFollowedWheel
-    wheels: Wheel
-    z: Any
+    problem: AbstractGaitProblem
+    wheels: BranchWheel
+    unknowns: Any
     outcomes: np.ndarray  # of the first gaits
-    make_cycle: MakeCycle
+    make_cycle: CycleFactory
     cycle: Any = None  # the gaits themselves
-    finer: CycleOptions | None = None  # options with a finer mesh, None without a mesh
+    finer_options: CycleOptions | None = None  # options with a finer mesh, None without a mesh
 
 
-def start_by_collocation(wanted: Wanted, cycle: Any) -> Start:
+def start_from_collocation(request: BranchRequest, cycle: Any) -> BranchStart:
     """Return starts from limit cycles by collocation, given or found."""
-    params, name, period_n = wanted.params, wanted.name, wanted.period_n
-    options = CycleOptions.tight() if wanted.cycle_options is None else wanted.cycle_options
+    params, name, period_n = request.params, request.parameter_name, request.period_n
+    options = CycleOptions.tight() if request.cycle_options is None else request.cycle_options
     # The start does not need the mesh or the accuracy of the branch.
-    start = cycle
-    if start is None:
-        start = limit_cycles(params, period_n=period_n, model=wanted.model)
-    if not isinstance(start, LimitCycle):
+    start_cycle = cycle
+    if start_cycle is None:
+        start_cycle = limit_cycles(params, period_n=period_n, model=request.model)
+    if not isinstance(start_cycle, LimitCycle):
         raise TypeError(
-            f"cycle is a {type(start).__name__}, but the paper's branch starts from a "
+            f"cycle is a {type(start_cycle).__name__}, but the paper's branch starts from a "
             "LimitCycle: give vrw.limit_cycle(params)."
         )
-    finder: Any = finder_of(wanted.model, params.n_legs, period_n=period_n, cycle_options=options)
-    problem = finder.problem
+    finder: Any = make_finder(
+        request.model, params.n_legs, period_n=period_n, cycle_options=options
+    )
+    system = finder.system
 
-    def make_cycle(owner: int, point: PathPoint) -> Callable[[], LimitCycle]:
-        def find() -> LimitCycle:
-            guess = jax.tree.map(lambda x: x[owner], start)
-            located = guess.located._replace(solution=jax.tree.map(jnp.asarray, point.z))
-            guess = dataclasses.replace(guess, located=located, problem=problem)
-            wheel = jax.tree.map(lambda x: x[owner], params)
-            _, wheel = wanted.model.moved(wheel, name, jnp.asarray(point.p))
-            return finder.cycle(wheel, guess)
+    def make_cycle(wheel_index: int, point: ContinuationPoint) -> Callable[[], LimitCycle]:
+        def find_cycle_at_point() -> LimitCycle:
+            guess = jax.tree.map(lambda x: x[wheel_index], start_cycle)
+            collocation_state = guess.collocation_state._replace(
+                solution=jax.tree.map(jnp.asarray, point.z)
+            )
+            guess = dataclasses.replace(guess, collocation_state=collocation_state, system=system)
+            wheel = jax.tree.map(lambda x: x[wheel_index], params)
+            _, wheel = request.model.with_parameter(wheel, name, jnp.asarray(point.p))
+            return finder.find_cycle(wheel, guess)
 
-        return find
+        return find_cycle_at_point
 
-    return Start(
-        CycleFollowed(problem=problem, name=name, more=None),
-        Wheel(params, start.located.happens),
-        jax.vmap(lambda found: on_mesh(start.problem, problem, found))(start.located.solution),
-        np.asarray(start.outcome),
+    return BranchStart(
+        CollocationProblem(system=system, parameter_name=name, additional_quantities=None),
+        BranchWheel(params, start_cycle.collocation_state.phase_active),
+        jax.vmap(lambda solution: transfer_to_mesh(start_cycle.system, system, solution))(
+            start_cycle.collocation_state.solution
+        ),
+        np.asarray(start_cycle.outcome),
         make_cycle,
-        start,
-        options.finer(),
+        start_cycle,
+        options.refine_mesh(),
     )
 
 
-def start_by_walking(wanted: Wanted, cycle: Any) -> Start:
+def start_from_walks(request: BranchRequest, cycle: Any) -> BranchStart:
     """Return starts from fixed points of the model's step, given or at the ends of walks."""
-    params, model, options = wanted.params, wanted.model, wanted.step_options
+    params, model, options = request.params, request.model, request.step_options
 
-    def towards(params: WheelParams, p: Array) -> tuple[Array, Array]:
-        ground, wheel = model.moved(params, wanted.name, p)
-        walked = walk_towards(ground, wheel, options)
-        return walked.outcome, walked.steps.section_state[-1]
+    def walk_to_gait(params: WheelParams, p: Array) -> tuple[Array, Array]:
+        model_at_p, wheel = model.with_parameter(params, request.parameter_name, p)
+        walk = walk_toward_gait(model_at_p, wheel, options)
+        return walk.outcome, walk.steps.section_state[-1]
 
     if cycle is None:
-        outcomes, z = jax.vmap(towards)(params, wanted.p)
+        outcomes, section_states = jax.vmap(walk_to_gait)(params, request.parameter_values)
     else:
-        outcomes, z = cycle.outcome, cycle.section_state
-    followed = RungFollowed(
+        outcomes, section_states = cycle.outcome, cycle.section_state
+    problem = ReturnMapProblem(
         model=model,
         options=options,
-        name=wanted.name,
-        period_n=wanted.period_n,
-        numbers=model.section_numbers(params),
+        parameter_name=request.parameter_name,
+        period_n=request.period_n,
+        n_coordinates=model.n_continuous(params),
     )
-    happens = jnp.ones((*wanted.p.shape, 1, 1), wanted.p.dtype)
-    return Start(
-        followed, Wheel(params, happens), z, np.asarray(outcomes), lambda owner, point: None
+    phase_active = jnp.ones((*request.parameter_values.shape, 1, 1), request.parameter_values.dtype)
+    return BranchStart(
+        problem,
+        BranchWheel(params, phase_active),
+        section_states,
+        np.asarray(outcomes),
+        lambda wheel_index, point: None,
     )
 
 
-def start_by_lanes(wanted: Wanted, cycle: Any) -> Start:
+def start_from_unilateral_gaits(request: BranchRequest, cycle: Any) -> BranchStart:
     """Return starts from gaits with unilateral contact, given or the slowest attracting one."""
-    params, options = wanted.params, wanted.step_options
-    model: Any = wanted.model
-    finder: Any = finder_of(model, params.n_legs, step_options=options, period_n=wanted.period_n)
-    if not finder.coexisting:  # no batched engine: use the step
-        return start_by_walking(wanted, cycle)
-    wheels = Wheel(params, jnp.ones((*wanted.p.shape, 1, 1), wanted.p.dtype))
-    followed = GroundFollowed(
+    params, options = request.params, request.step_options
+    model: Any = request.model
+    finder: Any = make_finder(model, params.n_legs, step_options=options, period_n=request.period_n)
+    if not finder.is_multistable:  # no batched engine: use the step
+        return start_from_walks(request, cycle)
+    wheels = BranchWheel(
+        params, jnp.ones((*request.parameter_values.shape, 1, 1), request.parameter_values.dtype)
+    )
+    problem = GroundProblem(
         model=model,
         options=options,
-        name=wanted.name,
-        period_n=wanted.period_n,
+        parameter_name=request.parameter_name,
+        period_n=request.period_n,
         n_legs=params.n_legs,
     )
-    values = followed.values(wheels, wanted.p)
+    values = problem.parameter_values(wheels, request.parameter_values)
     if cycle is None:
-        cycle = finder.near(values, finder.first_guesses(values))
+        cycle = finder.find_cycles_near(values, finder.initial_guesses(values))
 
     outcomes = np.asarray(cycle.outcome)
-    return Start(followed, wheels, cycle.section_state, outcomes, lambda owner, point: None)
+    return BranchStart(
+        problem, wheels, cycle.section_state, outcomes, lambda wheel_index, point: None
+    )
 
 
-STARTS: dict[str, Callable[[Wanted, Any], Start]] = {
-    "viscoelastic": start_by_collocation,
-    "unilateral": start_by_lanes,
+START_FUNCTIONS: dict[str, Callable[[BranchRequest, Any], BranchStart]] = {
+    "viscoelastic": start_from_collocation,
+    "unilateral": start_from_unilateral_gaits,
 }
 """Start functions by name of the model; all other models use `start_from_walks`."""

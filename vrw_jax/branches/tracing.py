@@ -13,342 +13,469 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.branches.branch import Border, BorderCurve, Meeting
-from vrw_jax.branches.continuation import ENDING, REFINEMENTS, GaitRun, continue_branches
-from vrw_jax.branches.followed import Wheel
-from vrw_jax.branches.gait_levels import (
-    EXACT,
-    FALLS,
-    FORMAL,
-    ROLLS_OFF,
-    VOID,
-    GaitAt,
-    GaitLevel,
-    level_of,
-    quantities_of,
-    where_jumps_begin,
+from vrw_jax.branches.branch import Codim2Point, SpecialPoint, SpecialPointCurve
+from vrw_jax.branches.continuation import (
+    BRANCH_ENDING_QUANTITIES,
+    MAX_BRANCH_REFINEMENTS,
+    GaitContinuation,
+    continue_branches,
 )
-from vrw_jax.branches.run import BRANCH_POINT, AbstractRun, Strand, Table, run_all
-from vrw_jax.cycles import Problem, on_mesh
+from vrw_jax.branches.followed import BranchWheel
+from vrw_jax.branches.gait_levels import (
+    CONTINUED_QUANTITIES,
+    DISCONTINUOUS_QUANTITIES,
+    DLS_VANISHES,
+    FORCE_FALL_NAME,
+    LINEAR_SUBSTITUTES,
+    GaitTestFunction,
+    TestFunctionArgs,
+    locate_jump_onset,
+    quantity_group_of,
+    test_quantity_of,
+)
+from vrw_jax.branches.run import (
+    BRANCH_POINT_KIND,
+    AbstractContinuation,
+    BranchData,
+    QuantityTable,
+    continue_and_locate,
+)
+from vrw_jax.cycles import CollocationSystem, transfer_to_mesh
 from vrw_jax.models import ViscoelasticWheel
 from vrw_jax.numerics import (
-    BIFURCATIONS,
+    BIFURCATION_NAMES,
     ArclengthOptions,
-    LevelFollowed,
-    LevelPoint,
-    Options,
-    PathPoint,
-    Solution,
+    CollocationSolution,
+    ContinuationPoint,
+    StepOptions,
+    TestFunctionCurve,
+    TestFunctionPoint,
 )
-from vrw_jax.results import MARGINS, attrs_of, provenance
+from vrw_jax.results import MARGIN_MEASURES, measure_attrs, provenance
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.wheel import Outcome, WheelParams, wheel_of
+from vrw_jax.wheel import Outcome, WheelParams, wheel_from_parameters
 
-EDGE = "edge of the box"
+EDGE_NAME = "edge of the box"
 """Name of the column that is zero where the second parameter leaves its range."""
 
-OF_CURVES = ArclengthOptions(first_step=5e-4)
+DEFAULT_CURVE_OPTIONS = ArclengthOptions(initial_ds=5e-4)
 """Default options of curves. The first step is short because some curves are short."""
 
-AT_ONCE = 8
+CURVES_PER_BATCH = 8
 """Number of curves in a batch, so that one shape is compiled."""
 
-SAME = 2e-3
+SAME_CURVE_DISTANCE = 2e-3
 """Largest distance of a point on a curve from that curve, with lengths as along the curve."""
 
-BEYOND = 3e-3
+OVERRUN_DISTANCE = 3e-3
 """Distance from a point of codimension two at which the continuation of the other curve starts."""
 
-EXACTLY = 1e-9
+CODIM2_TOLERANCE = 1e-9
 """Newton's last step to a point of codimension two, relative to the values of the parameters."""
 
-BRIEF, LASTS = 1e-4, 0.1
+NEGLIGIBLE_DURATION, DURATION_GUESS = 1e-4, 0.1
 """Duration of double support that counts as zero despite ill-conditioning, and a first guess of a
 nonzero duration, s."""
 
 
 @dataclass(frozen=True)
-class BorderRun(AbstractRun):
+class CurveContinuation(AbstractContinuation):
     """Continuation of special points, evaluated as gaits are, except for the special point
     itself."""
 
-    followed: LevelFollowed
-    second: str  # of the two parameters
-    names: tuple[str, ...]  # one for each wheel
-    gaits: GaitRun  # along the first parameter
+    problem: TestFunctionCurve
+    second_parameter: str  # of the two parameters
+    special_point_names: tuple[str, ...]  # one for each wheel
+    gait_continuation: GaitContinuation  # along the first parameter
 
-    ending: ClassVar[tuple[str, ...]] = (*ENDING, EDGE, FALLS)
-    exact: ClassVar[Mapping[str, str]] = EXACT
+    ending_quantities: ClassVar[tuple[str, ...]] = (
+        *BRANCH_ENDING_QUANTITIES,
+        EDGE_NAME,
+        FORCE_FALL_NAME,
+    )
+    linear_substitutes: ClassVar[Mapping[str, str]] = LINEAR_SUBSTITUTES
 
-    def read(self, wheels: GaitAt, points: PathPoint) -> Table:
-        z, share = points.z
-        (low, high), share = self.followed.bounds, np.asarray(share)
-        second = low + (high - low) * share
-        here = lambda params: getattr(params, self.second)
-        gaits = wheels.gait._replace(params=eqx.tree_at(here, wheels.gait.params, second))
-        table = self.gaits.read(gaits, points._replace(z=z))
+    def evaluate_points(self, wheels: TestFunctionArgs, points: ContinuationPoint) -> QuantityTable:
+        z, fraction = points.z
+        (lower, upper), fraction = self.problem.bounds, np.asarray(fraction)
+        second_values = lower + (upper - lower) * fraction
+        get_second_parameter = lambda params: getattr(params, self.second_parameter)
+        gait_wheels = wheels.gait._replace(
+            params=eqx.tree_at(get_second_parameter, wheels.gait.params, second_values)
+        )
+        table = self.gait_continuation.evaluate_points(gait_wheels, points._replace(z=z))
         # Without double support the rear foot's force must not be positive.
-        rear = np.where(wheels.gait.happens[:, 0, 0] > 0.5, 1.0, -1.0)
-        told = {"lambda_4_plus": rear * table["lambda_4_plus"], "second": second}
-        return table | told | {EDGE: np.minimum(share, 1.0 - share)}
-
-    def known(self, table: Table, owners: np.ndarray) -> Table:
-        """Mask quantities that vanish along the whole curve, which have no isolated zeros on it."""
-        names = np.array(self.names)[owners]
-        void, rolls_off = np.isin(names, (*VOID, ROLLS_OFF)), names == ROLLS_OFF
-        by_step = {name for name in table if name.partition("[")[0] in MARGINS} - set(FORMAL)
-        blank = {name: names == name for name in {*self.names} & {*table}}
-        blank |= {exact: names == name for name, exact in EXACT.items()}
-        blank |= {name: void | blank.get(name, False) for name in by_step}
-        rear = blank.get("lambda_4_plus", False) | rolls_off
-        blank |= {"lambda_4_plus": rear, FALLS: ~rolls_off}
-        table = table | {
-            name: np.where(rows if table[name].ndim == 1 else rows[:, None], np.nan, table[name])
-            for name, rows in blank.items()
+        rear_force_sign = np.where(wheels.gait.phase_active[:, 0, 0] > 0.5, 1.0, -1.0)
+        curve_quantities = {
+            "lambda_4_plus": rear_force_sign * table["lambda_4_plus"],
+            "second": second_values,
         }
-        stepped = np.where(void, Outcome.STEPPED, table["outcome"])
-        return table | {"outcome": stepped, "closure": np.where(void, 0.0, table["closure"])}
+        return table | curve_quantities | {EDGE_NAME: np.minimum(fraction, 1.0 - fraction)}
 
-    def kept(self, table: Table) -> np.ndarray:
-        good = np.all([~(table[name] <= 0.0) for name in self.ending], axis=0)
-        return good & self.gaits.kept(table)
+    def mask_undefined(self, table: QuantityTable, wheel_indices: np.ndarray) -> QuantityTable:
+        """Mask quantities that vanish along the whole curve, which have no isolated zeros on it."""
+        names_of_points = np.array(self.special_point_names)[wheel_indices]
+        is_discontinuous, is_dls_vanishing = (
+            np.isin(names_of_points, (*DISCONTINUOUS_QUANTITIES, DLS_VANISHES)),
+            names_of_points == DLS_VANISHES,
+        )
+        step_names = {name for name in table if name.partition("[")[0] in MARGIN_MEASURES} - set(
+            CONTINUED_QUANTITIES
+        )
+        masks = {name: names_of_points == name for name in {*self.special_point_names} & {*table}}
+        masks |= {
+            substitute: names_of_points == name for name, substitute in LINEAR_SUBSTITUTES.items()
+        }
+        masks |= {name: is_discontinuous | masks.get(name, False) for name in step_names}
+        rear_force_mask = masks.get("lambda_4_plus", False) | is_dls_vanishing
+        masks |= {"lambda_4_plus": rear_force_mask, FORCE_FALL_NAME: ~is_dls_vanishing}
+        table = table | {
+            name: np.where(mask if table[name].ndim == 1 else mask[:, None], np.nan, table[name])
+            for name, mask in masks.items()
+        }
+        outcomes = np.where(is_discontinuous, Outcome.STEPPED, table["outcome"])
+        return table | {
+            "outcome": outcomes,
+            "closure": np.where(is_discontinuous, 0.0, table["closure"]),
+        }
+
+    def is_admissible(self, table: QuantityTable) -> np.ndarray:
+        is_positive = np.all([~(table[name] <= 0.0) for name in self.ending_quantities], axis=0)
+        return is_positive & self.gait_continuation.is_admissible(table)
 
     def is_margin(self, name: str) -> bool:
-        return self.gaits.is_margin(name)
+        return self.gait_continuation.is_margin(name)
 
-    def is_rough(self, table: Table, ends: tuple[str, ...]) -> bool:
-        return self.gaits.is_rough(table, ends)
+    def is_mesh_limited(self, table: QuantityTable, ends: tuple[str, ...]) -> bool:
+        return self.gait_continuation.is_mesh_limited(table, ends)
 
-    def name_of_loss(self, table: Table, place: int) -> str:
-        return self.gaits.name_of_loss(table, place)
+    def name_end(self, table: QuantityTable, row_index: int) -> str:
+        return self.gait_continuation.name_end(table, row_index)
 
 
-class Seed(NamedTuple):
+class CurveSeed(NamedTuple):
     """Point on or near a curve of special points, from which it is continued."""
 
     name: str
-    at: tuple[float, float]  # the two parameters
-    problem: Problem
-    gait: Wheel
-    z: Solution
+    parameter_values: tuple[float, float]  # the two parameters
+    system: CollocationSystem
+    gait: BranchWheel
+    z: CollocationSolution
 
 
-class Traced(NamedTuple):
+class TracedCurve(NamedTuple):
     """Traced curve, with the special points met on it."""
 
-    curve: BorderCurve
+    curve: SpecialPointCurve
     path: np.ndarray  # section state and both parameters' fractions, (point, coordinate)
-    met: tuple[Seed, ...]
+    new_seeds: tuple[CurveSeed, ...]
 
 
-class Tracer(NamedTuple):
+class CurveTracer(NamedTuple):
     """Tracer of curves of special points within two parameter ranges."""
 
     parameters: tuple[str, str]
-    box: np.ndarray  # (parameter, end)
+    parameter_ranges: np.ndarray  # (parameter, end)
     model: ViscoelasticWheel
     options: ArclengthOptions
-    step_options: Options
+    step_options: StepOptions
 
-    def moved(self, params: WheelParams, values: Mapping[str, float]) -> WheelParams:
+    def with_parameters(self, params: WheelParams, values: Mapping[str, float]) -> WheelParams:
         for name, value in values.items():
-            params = self.model.moved(params, name, jnp.asarray(value))[1]
+            params = self.model.with_parameter(params, name, jnp.asarray(value))[1]
         return params
 
-    def shares(self, values: np.ndarray) -> np.ndarray:
+    def parameter_fractions(self, values: np.ndarray) -> np.ndarray:
         """Return both parameters, on the last axis, as fractions of their ranges."""
-        return (values - self.box[:, 0]) / np.ptp(self.box, 1)
+        return (values - self.parameter_ranges[:, 0]) / np.ptp(self.parameter_ranges, 1)
 
-    def along(self, axis: int, params: WheelParams) -> list[Seed]:
+    def find_seeds(self, axis: int, params: WheelParams) -> list[CurveSeed]:
         """Return seeds at special points on the branches of these wheels along one of the
         parameters."""
         name, seeds = self.parameters[axis], []
-        low, high = self.box[axis]
-        for branch in continue_branches(params, name, (low, high), model=self.model):
-            for border in branch.borders:
-                if can_follow(border.name):
-                    seeds.append(self._seed(border))
+        lower, upper = self.parameter_ranges[axis]
+        for branch in continue_branches(params, name, (lower, upper), model=self.model):
+            for special_point in branch.special_points:
+                if can_continue(special_point.name):
+                    seeds.append(self._make_seed(special_point))
         return seeds
 
-    def _seed(self, border: Border) -> Seed:
-        start = border.cycle
-        params = wheel_of(start.parameters, start.problem.n_legs)
+    def _make_seed(self, special_point: SpecialPoint) -> CurveSeed:
+        start = special_point.cycle
+        params = wheel_from_parameters(start.parameters, start.system.n_legs)
         first, second = (float(getattr(params, name)) for name in self.parameters)
-        gait, z = Wheel(params, start.located.happens), start.located.solution
-        name = named(border.name, gait, z)
-        return Seed(name, (first, second), start.problem, gait, z)
+        gait, z = (
+            BranchWheel(params, start.collocation_state.phase_active),
+            start.collocation_state.solution,
+        )
+        name = special_point_name(special_point.name, gait, z)
+        return CurveSeed(name, (first, second), start.system, gait, z)
 
-    def followed(self, seeds: Sequence[Seed], known: Sequence[Traced]) -> list[Traced]:
+    def trace_curves(
+        self, seeds: Sequence[CurveSeed], known_curves: Sequence[TracedCurve]
+    ) -> list[TracedCurve]:
         """Return the curves through all seeds that are on none of the known curves."""
-        new: list[Traced] = []
-        fresh = [seed for seed in seeds if not any(self._on(seed, one) for one in known)]
-        kinds = {quantities_of(seed.name, seed.problem.n_legs) for seed in fresh}
-        for kind in sorted(kinds):
-            of_kind = [s for s in fresh if quantities_of(s.name, s.problem.n_legs) == kind]
-            while of_kind:
-                some: list[Seed] = []
-                for seed in of_kind:  # each name once: others may be on its curve
-                    if seed.name not in {s.name for s in some} and len(some) < AT_ONCE:
-                        some.append(seed)
-                told: list[Traced] = []
-                for one in self._batch(kind, some):  # a curve may be known already
-                    if not any(self.lies_on(one, other) for other in (*known, *new, *told)):
-                        told.append(one)
-                new += told
-                of_kind = [
-                    seed for seed in of_kind
-                    if not any(seed is s for s in some) and not any(self._on(seed, t) for t in told)
+        new_curves: list[TracedCurve] = []
+        new_seeds = [
+            seed
+            for seed in seeds
+            if not any(self._is_on_curve(seed, curve) for curve in known_curves)
+        ]
+        groups = {quantity_group_of(seed.name, seed.system.n_legs) for seed in new_seeds}
+        for group in sorted(groups):
+            remaining = [
+                s for s in new_seeds if quantity_group_of(s.name, s.system.n_legs) == group
+            ]
+            while remaining:
+                batch_seeds: list[CurveSeed] = []
+                for seed in remaining:  # each name once: others may be on its curve
+                    if (
+                        seed.name not in {s.name for s in batch_seeds}
+                        and len(batch_seeds) < CURVES_PER_BATCH
+                    ):
+                        batch_seeds.append(seed)
+                accepted: list[TracedCurve] = []
+                for curve in self._trace_batch(group, batch_seeds):  # a curve may be known already
+                    if not any(
+                        self.is_same_curve(curve, other_curve)
+                        for other_curve in (*known_curves, *new_curves, *accepted)
+                    ):
+                        accepted.append(curve)
+                new_curves += accepted
+                remaining = [
+                    seed for seed in remaining
+                    if not any(seed is s for s in batch_seeds) and not any(self._is_on_curve(seed, t) for t in accepted)
                 ]  # fmt: skip
-        return new
+        return new_curves
 
-    def _on(self, seed: Seed, traced: Traced) -> bool:
-        here = np.append(seed.z.section, self.shares(np.array(seed.at)))
-        alike = seed.name == traced.curve.name
-        return alike and bool(distance(here[None], traced.path)[0] < SAME)
+    def _is_on_curve(self, seed: CurveSeed, curve: TracedCurve) -> bool:
+        seed_point = np.append(
+            seed.z.section_state, self.parameter_fractions(np.array(seed.parameter_values))
+        )
+        same_name = seed.name == curve.curve.name
+        return same_name and bool(
+            distance_to_path(seed_point[None], curve.path)[0] < SAME_CURVE_DISTANCE
+        )
 
     @staticmethod
-    def lies_on(one: Traced, other: Traced) -> bool:
-        alike = one.curve.name == other.curve.name
-        return alike and bool(np.max(distance(one.path, other.path)) < SAME)
+    def is_same_curve(curve: TracedCurve, other_curve: TracedCurve) -> bool:
+        same_name = curve.curve.name == other_curve.curve.name
+        return same_name and bool(
+            np.max(distance_to_path(curve.path, other_curve.path)) < SAME_CURVE_DISTANCE
+        )
 
-    def _batch(self, kind: tuple[str, ...], seeds: list[Seed]) -> list[Traced]:
+    def _trace_batch(self, group: tuple[str, ...], seeds: list[CurveSeed]) -> list[TracedCurve]:
         """Return a curve through each seed that has one, on a sufficiently fine mesh."""
-        told: list[Traced] = []
-        for refinement in range(1 + REFINEMENTS):
-            finest = refinement == REFINEMENTS
-            strands = self._strands(kind, seeds, finest)
-            rough = []
-            for seed, (strand, problem) in zip(seeds, strands, strict=True):
-                if strand is not None and strand.rough and not finest:
-                    options = problem.options.finer()
-                    rough.append(self._on_mesh(seed, problem._replace(options=options)))
-                elif strand is not None:
-                    told.append(self._told(seed._replace(problem=problem), strand))
-            if not rough:
+        curves: list[TracedCurve] = []
+        for refinement in range(1 + MAX_BRANCH_REFINEMENTS):
+            is_finest = refinement == MAX_BRANCH_REFINEMENTS
+            branches = self._continue_batch(group, seeds, is_finest)
+            mesh_limited = []
+            for seed, (branch, system) in zip(seeds, branches, strict=True):
+                if branch is not None and branch.is_mesh_limited and not is_finest:
+                    options = system.options.refine_mesh()
+                    mesh_limited.append(self._transfer_seed(seed, system._replace(options=options)))
+                elif branch is not None:
+                    curves.append(self._label_traced(seed._replace(system=system), branch))
+            if not mesh_limited:
                 break
-            seeds = rough
-        return told
+            seeds = mesh_limited
+        return curves
 
     @staticmethod
-    def _on_mesh(seed: Seed, problem: Problem) -> Seed:
-        if seed.problem == problem:
+    def _transfer_seed(seed: CurveSeed, system: CollocationSystem) -> CurveSeed:
+        if seed.system == system:
             return seed
-        return seed._replace(problem=problem, z=on_mesh(seed.problem, problem, seed.z))
+        return seed._replace(system=system, z=transfer_to_mesh(seed.system, system, seed.z))
 
-    def _strands(
-        self, kind: tuple[str, ...], seeds: list[Seed], finest: bool
-    ) -> list[tuple[Strand | None, Problem]]:
-        problem = max((seed.problem for seed in seeds), key=lambda p: p.options.steps)
-        seeds = [self._on_mesh(seed, problem) for seed in seeds]
-        filled = [*seeds, *seeds[-1:] * (-len(seeds) % AT_ONCE)]
-        level = GaitLevel(problem, self.parameters, kind, self.model, self.step_options)
-        stack = lambda *trees: jax.tree.map(lambda *x: np.stack(x), *trees)
-        levels = [level_of(seed.name, bool(seed.gait.happens[0, 0] > 0.5)) for seed in filled]
-        places = [jnp.asarray(kind.index(name)) for name in levels]
-        wheels = stack(*(GaitAt(s.gait, place) for s, place in zip(filled, places, strict=True)))
-        low, high = map(float, self.box[1])
-        share = lambda seed: jnp.asarray((seed.at[1] - low) / (high - low))
-        z = stack(*(LevelPoint(seed.z, share(seed)) for seed in filled))
-        rest = self.model, self.step_options, problem.n_legs
-        gaits = GaitRun(level.gaits, self.options, wheels.gait, self.box[0], *rest)
-        names = tuple(seed.name for seed in filled)
-        run = BorderRun(
-            LevelFollowed(level, (low, high)),
+    def _continue_batch(
+        self, group: tuple[str, ...], seeds: list[CurveSeed], is_finest: bool
+    ) -> list[tuple[BranchData | None, CollocationSystem]]:
+        system = max(
+            (seed.system for seed in seeds),
+            key=lambda first_values: first_values.options.mesh_intervals,
+        )
+        seeds = [self._transfer_seed(seed, system) for seed in seeds]
+        padded_seeds = [*seeds, *seeds[-1:] * (-len(seeds) % CURVES_PER_BATCH)]
+        test_function = GaitTestFunction(
+            system, self.parameters, group, self.model, self.step_options
+        )
+        stack_trees = lambda *trees: jax.tree.map(lambda *x: np.stack(x), *trees)
+        quantity_names = [
+            test_quantity_of(seed.name, bool(seed.gait.phase_active[0, 0] > 0.5))
+            for seed in padded_seeds
+        ]
+        quantity_indices = [jnp.asarray(group.index(name)) for name in quantity_names]
+        wheels = stack_trees(
+            *(
+                TestFunctionArgs(one_seed.gait, quantity_index)
+                for one_seed, quantity_index in zip(padded_seeds, quantity_indices, strict=True)
+            )
+        )
+        lower, upper = map(float, self.parameter_ranges[1])
+        fraction_of = lambda seed: jnp.asarray((seed.at[1] - lower) / (upper - lower))
+        z = stack_trees(*(TestFunctionPoint(seed.z, fraction_of(seed)) for seed in padded_seeds))
+        continuation_options = self.model, self.step_options, system.n_legs
+        gait_continuation = GaitContinuation(
+            test_function.gait_problem,
+            self.options,
+            wheels.gait,
+            self.parameter_ranges[0],
+            *continuation_options,
+        )
+        special_point_names = tuple(seed.name for seed in padded_seeds)
+        continuation = CurveContinuation(
+            TestFunctionCurve(test_function, (lower, upper)),
             self.options,
             wheels,
-            self.box[0],
+            self.parameter_ranges[0],
             self.parameters[1],
-            names,
-            gaits,
+            special_point_names,
+            gait_continuation,
         )
-        p, wanted = jnp.asarray([s.at[0] for s in filled]), np.arange(len(filled)) < len(seeds)
-        strands = run_all(run, z, p, wanted, lambda owner, point: lambda: point, finest)
-        return [(strand, problem) for strand in strands[: len(seeds)]]
+        first_values, is_requested = (
+            jnp.asarray([one_seed.parameter_values[0] for one_seed in padded_seeds]),
+            np.arange(len(padded_seeds)) < len(seeds),
+        )
+        branches = continue_and_locate(
+            continuation,
+            z,
+            first_values,
+            is_requested,
+            lambda wheel_index, point: lambda: point,
+            is_finest,
+        )
+        return [(branch, system) for branch in branches[: len(seeds)]]
 
-    def _told(self, seed: Seed, strand: Strand) -> Traced:
-        values = np.stack([strand.points.p, strand.table["second"]], -1)
-        path = np.column_stack([strand.points.z.z.section, self.shares(values)])
-        meetings, met, ends = [], [], strand.ends
-        for border in strand.borders:
-            if border.name == EDGE:
+    def _label_traced(self, seed: CurveSeed, branch: BranchData) -> TracedCurve:
+        values = np.stack([branch.points.p, branch.table["second"]], -1)
+        path = np.column_stack([branch.points.z.z.section_state, self.parameter_fractions(values)])
+        codim2_points, new_seeds, ends = [], [], branch.ends
+        for special_point in branch.special_points:
+            if special_point.name == EDGE_NAME:
                 continue
-            beside = border.cycle
-            at = border.value, float(self.box[1, 0] + np.ptp(self.box[1]) * beside.z.share)
-            name = named(border.name, seed.gait, beside.z.z)
-            if {name, seed.name} == {"lambda_4_plus", ROLLS_OFF}:
-                at = self._where_jumps_begin(seed, beside.z.z, at)
-                met.append(self._beyond(name, seed, path, values, strand.points.z.z, at))
-                told = f"{border.value:.9g}", f"{at[0]:.9g}"
-                ends = ends[0].replace(*told), ends[1].replace(*told)
-            elif can_follow(name):
-                there = float(beside.p), at[1]
-                met.append(Seed(name, there, seed.problem, seed.gait, beside.z.z))
-            meetings.append(Meeting(name, at, border.ends_branch))
-        curve = self._labelled(seed, strand._replace(ends=ends), tuple(meetings))
-        return Traced(curve, path, tuple(met))
+            point_beside = special_point.cycle
+            meeting_values = (
+                special_point.value,
+                float(
+                    self.parameter_ranges[1, 0]
+                    + np.ptp(self.parameter_ranges[1]) * point_beside.z.fraction
+                ),
+            )
+            name = special_point_name(special_point.name, seed.gait, point_beside.z.z)
+            if {name, seed.name} == {"lambda_4_plus", DLS_VANISHES}:
+                meeting_values = self._locate_jump_onset(seed, point_beside.z.z, meeting_values)
+                new_seeds.append(
+                    self._seed_beyond_meeting(
+                        name, seed, path, values, branch.points.z.z, meeting_values
+                    )
+                )
+                replaced_text = f"{special_point.value:.9g}", f"{meeting_values[0]:.9g}"
+                ends = ends[0].replace(*replaced_text), ends[1].replace(*replaced_text)
+            elif can_continue(name):
+                seed_values = float(point_beside.p), meeting_values[1]
+                new_seeds.append(
+                    CurveSeed(name, seed_values, seed.system, seed.gait, point_beside.z.z)
+                )
+            codim2_points.append(Codim2Point(name, meeting_values, special_point.ends_branch))
+        curve = self._label_curve(seed, branch._replace(ends=ends), tuple(codim2_points))
+        return TracedCurve(curve, path, tuple(new_seeds))
 
-    def _where_jumps_begin(self, seed: Seed, z: Solution, at: Any) -> tuple[float, float]:
-        level = GaitLevel(seed.problem, self.parameters, FORMAL, self.model, self.step_options)
-        exact, settled = where_jumps_begin(level, seed.gait, jax.device_put(z), jnp.asarray(at))
-        first, second = exact if settled < EXACTLY else at
+    def _locate_jump_onset(
+        self, seed: CurveSeed, z: CollocationSolution, start_values: Any
+    ) -> tuple[float, float]:
+        test_function = GaitTestFunction(
+            seed.system, self.parameters, CONTINUED_QUANTITIES, self.model, self.step_options
+        )
+        located, last_change = locate_jump_onset(
+            test_function, seed.gait, jax.device_put(z), jnp.asarray(start_values)
+        )
+        first, second = located if last_change < CODIM2_TOLERANCE else start_values
         return float(first), float(second)
 
-    def _beyond(
-        self, name: str, seed: Seed, path: np.ndarray, values: np.ndarray, z: Solution, at: Any
-    ) -> Seed:
+    def _seed_beyond_meeting(
+        self,
+        name: str,
+        seed: CurveSeed,
+        path: np.ndarray,
+        values: np.ndarray,
+        z: CollocationSolution,
+        meeting_values: Any,
+    ) -> CurveSeed:
         """Return a seed beyond a point where the rear foot's force, zero along the curve, starts to
         rise or fall.
 
         Both curves cross there and continue in the same direction.
         """
-        way = 1 if abs(values[0] - at).max() < abs(values[-1] - at).max() else -1
-        path, values, z = path[::way], values[::way], jax.tree.map(lambda x: x[::way], z)
-        lengths = np.linalg.norm(path - path[0], axis=1)
-        other = int(np.argmax(lengths >= min(BEYOND, lengths[-1])))
-        on = lambda x: x[0] + BEYOND / lengths[other] * (x[0] - x[other])
-        z, (first, second) = jax.tree.map(lambda x: jnp.asarray(on(x)), z), on(values)
-        lasts = 0.0 if name == ROLLS_OFF else LASTS
-        z = z._replace(durations=z.durations.at[0, 0].set(lasts))
-        return Seed(name, (first, second), seed.problem, seed.gait, z)
+        direction = (
+            1
+            if abs(values[0] - meeting_values).max() < abs(values[-1] - meeting_values).max()
+            else -1
+        )
+        path, values, z = (
+            path[::direction],
+            values[::direction],
+            jax.tree.map(lambda x: x[::direction], z),
+        )
+        distances = np.linalg.norm(path - path[0], axis=1)
+        point_index = int(np.argmax(distances >= min(OVERRUN_DISTANCE, distances[-1])))
+        extrapolate = lambda x: (
+            x[0] + OVERRUN_DISTANCE / distances[point_index] * (x[0] - x[point_index])
+        )
+        z, (first, second) = (
+            jax.tree.map(lambda x: jnp.asarray(extrapolate(x)), z),
+            extrapolate(values),
+        )
+        dls_duration = 0.0 if name == DLS_VANISHES else DURATION_GUESS
+        z = z._replace(durations=z.durations.at[0, 0].set(dls_duration))
+        return CurveSeed(name, (first, second), seed.system, seed.gait, z)
 
-    def _labelled(self, seed: Seed, strand: Strand, meetings: tuple[Meeting, ...]) -> BorderCurve:
-        radius = np.abs(np.linalg.eigvals(np.asarray(strand.points.jacobian))).max(-1)
-        table = strand.table | {"spectral_radius": radius}
-        rows = ("duration_dls", "duration_sls1", "duration_sls2", "spectral_radius")
-        data: dict[str, Any] = {n: ("point", table[n], attrs_of(n)) for n in rows}
+    def _label_curve(
+        self, seed: CurveSeed, branch: BranchData, codim2_points: tuple[Codim2Point, ...]
+    ) -> SpecialPointCurve:
+        radius = np.abs(np.linalg.eigvals(np.asarray(branch.points.jacobian))).max(-1)
+        table = branch.table | {"spectral_radius": radius}
+        column_names = ("duration_dls", "duration_sls1", "duration_sls2", "spectral_radius")
+        data: dict[str, Any] = {n: ("point", table[n], measure_attrs(n)) for n in column_names}
         data["mesh_error"] = ("point", table["mesh_error"])
         data["section_state"] = (("point", "component"), table["section_state"])
-        values = np.asarray(strand.points.p), table["second"]
+        values = np.asarray(branch.points.p), table["second"]
         labels = {
-            parameter: ("point", value, attrs_of(parameter))
+            parameter: ("point", value, measure_attrs(parameter))
             for parameter, value in zip(self.parameters, values, strict=True)
         }
         origin = provenance(seed.gait.params, self.model, self.step_options)
         title = {"title": f"Border {seed.name} over {' and '.join(self.parameters)}"}
         dataset = xr.Dataset(data, labels, title | origin)
-        return BorderCurve(seed.name, self.parameters, dataset, meetings, strand.ends)
+        return SpecialPointCurve(seed.name, self.parameters, dataset, codim2_points, branch.ends)
 
 
-def distance(points: np.ndarray, path: np.ndarray) -> np.ndarray:
+def distance_to_path(points: np.ndarray, path: np.ndarray) -> np.ndarray:
     """Return the distances of points from a polyline, both along the first axis."""
-    begin, chord = path[:-1], np.diff(path, axis=0)
+    segment_starts, chord = path[:-1], np.diff(path, axis=0)
     squared = np.maximum(np.sum(chord**2, 1), 1e-300)
-    there = points[:, None] - begin
-    share = np.clip(np.sum(there * chord, 2) / squared, 0.0, 1.0)
-    off = np.linalg.norm(there - share[..., None] * chord, axis=2)
-    return np.min(off, axis=1, initial=np.inf)
+    offsets = points[:, None] - segment_starts
+    fractions = np.clip(np.sum(offsets * chord, 2) / squared, 0.0, 1.0)
+    distances = np.linalg.norm(offsets - fractions[..., None] * chord, axis=2)
+    return np.min(distances, axis=1, initial=np.inf)
 
 
-def named(name: str, gait: Wheel, z: Solution) -> str:
+def special_point_name(name: str, gait: BranchWheel, z: CollocationSolution) -> str:
     """Return the name of a special point of a curve or branch, given the gait there."""
-    if name == BRANCH_POINT:  # a curve of folds may not turn there
+    if name == BRANCH_POINT_KIND:  # a curve of folds may not turn there
         return "fold"
-    if name not in ("lambda_4_plus", ROLLS_OFF, FALLS) or gait.happens[0, 0] < 0.5:
+    if (
+        name not in ("lambda_4_plus", DLS_VANISHES, FORCE_FALL_NAME)
+        or gait.phase_active[0, 0] < 0.5
+    ):
         return name
-    rolls_off = name != FALLS and z.durations[0, 0] < BRIEF
-    return ROLLS_OFF if rolls_off else "lambda_4_plus"
+    dls_vanishes = name != FORCE_FALL_NAME and z.durations[0, 0] < NEGLIGIBLE_DURATION
+    return DLS_VANISHES if dls_vanishes else "lambda_4_plus"
 
 
-def can_follow(name: str) -> bool:
+def can_continue(name: str) -> bool:
     """Return whether a special point's quantity is one of `GaitTestFunction`."""
-    return name in (*BIFURCATIONS, *VOID, ROLLS_OFF) or name.partition("[")[0] in MARGINS
+    return (
+        name in (*BIFURCATION_NAMES, *DISCONTINUOUS_QUANTITIES, DLS_VANISHES)
+        or name.partition("[")[0] in MARGIN_MEASURES
+    )

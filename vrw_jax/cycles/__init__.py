@@ -1,38 +1,43 @@
 """Limit cycles: finders, checks and derivatives for each model."""
 
 from vrw_jax.cycles.attracting import (
-    NEAR,
-    further_starts_of,
-    gaits_attracting,
-    slow_gaits,
-    slowest,
-    starts_of,
+    START_DISTANCE,
+    compute_fallback_starts,
+    compute_walk_starts,
+    find_attracting_gaits,
+    find_slow_gaits,
+    find_slowest_indices,
 )
 from vrw_jax.cycles.by_collocation import CollocationFinder
-from vrw_jax.cycles.by_walking import WalkedCycle
-from vrw_jax.cycles.collocated import LimitCycle, on_mesh
-from vrw_jax.cycles.cycle import MEASURED, AbstractCycle, multipliers_told
-from vrw_jax.cycles.derivatives import over_lanes
+from vrw_jax.cycles.by_walking import ReturnMapCycle
+from vrw_jax.cycles.collocated import LimitCycle, transfer_to_mesh
+from vrw_jax.cycles.cycle import CYCLE_MEASURE_FUNCTIONS, AbstractCycle, format_multipliers
+from vrw_jax.cycles.derivatives import compile_batched
 from vrw_jax.cycles.finder import (
-    AGREEMENT,
+    STATE_AGREEMENT_TOLERANCE,
     AbstractGaitFinder,
     Gait,
-    Readings,
-    confirmed,
-    read_along,
-    read_along_lanes,
-    same_branch,
+    MeasureReader,
+    confirm_outcome,
+    evaluate_on_gait,
+    evaluate_on_gaits,
+    is_same_branch,
 )
 from vrw_jax.cycles.finding import (
     Guess,
-    finder_for,
-    finder_of,
-    near,
-    serving,
-    serving_and_why,
+    check_guess,
+    make_finder,
+    resolve_finder,
+    resolve_model,
+    resolve_model_with_reason,
 )
-from vrw_jax.cycles.on_ground import Periods, solved
+from vrw_jax.cycles.on_ground import PeriodMap, solve_linear_systems
 from vrw_jax.cycles.options import CycleOptions
-from vrw_jax.cycles.premises import default_margins, takeoff_acceleration
-from vrw_jax.cycles.search import Located, Problem, correction_size, nothing_known
+from vrw_jax.cycles.premises import default_margins, gait_takeoff_acceleration
+from vrw_jax.cycles.search import (
+    CollocationState,
+    CollocationSystem,
+    collocation_correction_norm,
+    init_search_flags,
+)
 from vrw_jax.cycles.sensitivity import sensitivities

@@ -12,29 +12,35 @@ from jaxtyping import Array
 
 from vrw_jax.cycles.collocated import (
     LimitCycle,
-    guess_along,
-    on_mesh,
-    sampled_walk,
-    solved,
+    find_limit_cycle,
+    guess_from_walk,
+    sample_walk,
+    transfer_to_mesh,
 )
-from vrw_jax.cycles.cycle import MEASURED, AbstractCycle
+from vrw_jax.cycles.cycle import CYCLE_MEASURE_FUNCTIONS, AbstractCycle
 from vrw_jax.cycles.finder import (
     AbstractGaitFinder,
+    BranchPoint,
     Gait,
-    Measured,
-    OnBranch,
+    GaitMeasures,
     Values,
-    leading,
-    measured_by_cycle,
-    measured_of,
+    measure_from_cycle,
+    measure_from_gait,
+    move_derivative_axis_first,
 )
 from vrw_jax.cycles.options import CycleOptions
-from vrw_jax.cycles.search import Located, Problem, surface_start
+from vrw_jax.cycles.search import CollocationState, CollocationSystem, surface_start
 from vrw_jax.models import AbstractStep, SectionState, StepResult, ViscoelasticWheel
-from vrw_jax.numerics import Options, with_jacobian
-from vrw_jax.results import MARGINS, MEASURES
-from vrw_jax.walks import checked
-from vrw_jax.wheel import PARAMETER_NAMES, WheelParams, parameters_of, transitions, wheel_of
+from vrw_jax.numerics import StepOptions, value_and_jacobian
+from vrw_jax.results import MARGIN_MEASURES, MEASURES
+from vrw_jax.walks import validate_arguments
+from vrw_jax.wheel import (
+    PARAMETER_NAMES,
+    WheelParams,
+    stack_parameters,
+    transitions,
+    wheel_from_parameters,
+)
 
 
 class CollocationFinder(AbstractGaitFinder):
@@ -42,136 +48,165 @@ class CollocationFinder(AbstractGaitFinder):
 
     model: ViscoelasticWheel
     n_legs: int = eqx.field(static=True)
-    step_options: Options
-    options: CycleOptions = eqx.field(static=True)
+    step_options: StepOptions
+    cycle_options: CycleOptions = eqx.field(static=True)
     period_n: int = eqx.field(static=True)
 
     options_type: ClassVar[type] = CycleOptions
-    of_cycle: ClassVar[tuple[str, ...]] = tuple(MEASURED)
-    readable: ClassVar[tuple[str, ...]] = (
-        *of_cycle, "energy_lost_landing", "energy_lost_stopper", "energy_lost_damping",
-        *(n for n in MARGINS if n not in MEASURED),
+    cycle_measures: ClassVar[tuple[str, ...]] = tuple(CYCLE_MEASURE_FUNCTIONS)
+    readable_measures: ClassVar[tuple[str, ...]] = (
+        *cycle_measures, "energy_lost_landing", "energy_lost_stopper", "energy_lost_damping",
+        *(n for n in MARGIN_MEASURES if n not in CYCLE_MEASURE_FUNCTIONS),
     )  # fmt: skip
-    differentiable: ClassVar[tuple[str, ...]] = tuple(n for n in readable if not MEASURES[n].axis)
-    from_nothing: ClassVar[bool] = True
-    usual: ClassVar[tuple[str, ...]] = tuple(n for n in of_cycle if n != "spectral_margin")
+    differentiable_measures: ClassVar[tuple[str, ...]] = tuple(
+        n for n in readable_measures if not MEASURES[n].dimension
+    )
+    supports_cold_start: ClassVar[bool] = True
+    default_measures: ClassVar[tuple[str, ...]] = tuple(
+        n for n in cycle_measures if n != "spectral_margin"
+    )
 
     @classmethod
-    def of(
-        cls, model: Any, n_legs: int, step: Options, period_n: int, cycle: CycleOptions
+    def from_options(
+        cls,
+        model: Any,
+        n_legs: int,
+        step_options: StepOptions,
+        period_n: int,
+        cycle_options: CycleOptions,
     ) -> "CollocationFinder":
-        return cls(model, n_legs, step, cycle, period_n)
+        return cls(model, n_legs, step_options, cycle_options, period_n)
 
     @property
-    def options_used(self) -> CycleOptions:
-        return self.options
+    def search_options(self) -> CycleOptions:
+        return self.cycle_options
 
     @property
-    def problem(self) -> Problem:
-        return Problem(self.n_legs, self.period_n, self.options, self.model.stop_at_lift_off)
+    def system(self) -> CollocationSystem:
+        return CollocationSystem(
+            self.n_legs, self.period_n, self.cycle_options, self.model.stop_at_lift_off
+        )
 
     def finer(self) -> "CollocationFinder":
-        return dataclasses.replace(self, options=self.options.finer())
+        return dataclasses.replace(self, cycle_options=self.cycle_options.refine_mesh())
 
     @classmethod
-    def read(cls, name: str, cycle: AbstractCycle, step: AbstractStep) -> Array:
+    def read_measure(cls, name: str, cycle: AbstractCycle, step: AbstractStep) -> Array:
         """Return a measure of a gait by name.
 
         If the foot scuffs at take-off, the clearance in SLS-I is that in SLS-II, because it would
         jump otherwise. Callers must check `takeoff_acceleration` too.
         """
-        value = cycle.measure(name) if name in cls.of_cycle else step.measures()[name]
+        value = cycle.measure(name) if name in cls.cycle_measures else step.measures()[name]
         if name == "clearance_sls1":
             scuffs = cycle.measure("takeoff_acceleration") < 0.0
             return jnp.where(scuffs, step.measures()["clearance_sls2"], value)
         return value
 
-    def cycle(self, params: WheelParams, guess: Any = None) -> LimitCycle:
-        if isinstance(guess, LimitCycle) and guess.problem == self.problem:
-            guess = guess.located
-        elif guess is not None and not isinstance(guess, Located):
-            x = guess.section_state if isinstance(guess, AbstractCycle) else guess
-            params, state, _, _ = checked(params, x, None, None)
-            guess = self.after(*lax.stop_gradient((params, state)))
-        return dataclasses.replace(solved(params, self.problem, guess), model=self.model)
+    def find_cycle(self, params: WheelParams, guess: Any = None) -> LimitCycle:
+        if isinstance(guess, LimitCycle) and guess.system == self.system:
+            guess = guess.collocation_state
+        elif guess is not None and not isinstance(guess, CollocationState):
+            section_state = guess.section_state if isinstance(guess, AbstractCycle) else guess
+            params, state, _, _ = validate_arguments(params, section_state, None, None)
+            guess = self.guess_from_state(*lax.stop_gradient((params, state)))
+        return dataclasses.replace(find_limit_cycle(params, self.system, guess), model=self.model)
 
-    def after(self, params: WheelParams, x: SectionState) -> Located:
+    def guess_from_state(self, params: WheelParams, x: SectionState) -> CollocationState:
         """Return a start of the search: the next `period_n` steps of a walk from section
         state `x`."""
-        walked = sampled_walk(self.model, params, x, self.period_n)
-        return guess_along(self.problem, params, walked)
+        walk = sample_walk(self.model, params, x, self.period_n)
+        return guess_from_walk(self.system, params, walk)
 
     @eqx.filter_jit
-    def counted_from(self, step: int, params: WheelParams, located: Located) -> Located:
+    def shift_first_step(
+        self, step_index: int, params: WheelParams, collocation_state: CollocationState
+    ) -> CollocationState:
         """Return the same cycle with another of its steps as the first one."""
-        before = located.ends[step - 1]
-        landing = transitions.land(params.symbols(), before[0], *before[2:])
-        solution, happens, ends = jax.tree.map(
-            lambda x: jnp.roll(x, -step, 0), (located.solution, located.happens, located.ends)
+        end_before = collocation_state.ends[step_index - 1]
+        landing = transitions.land(params.symbols(), end_before[0], *end_before[2:])
+        solution, is_active, ends = jax.tree.map(
+            lambda x: jnp.roll(x, -step_index, 0),
+            (collocation_state.solution, collocation_state.phase_active, collocation_state.ends),
         )
         section = jnp.stack([landing.theta, landing.motion.dtheta])
-        return located._replace(
-            solution=solution._replace(section=section), happens=happens, ends=ends
+        return collocation_state._replace(
+            solution=solution._replace(section_state=section), phase_active=is_active, ends=ends
         )
 
-    def on_mesh(self, problem: Problem, located: Located) -> Located:
+    def transfer_to_mesh(
+        self, system: CollocationSystem, collocation_state: CollocationState
+    ) -> CollocationState:
         """Return a start on the mesh of `system` from a solution on this finder's mesh."""
-        solution = on_mesh(problem, self.problem, located.solution)
-        return located._replace(solution=solution)
+        solution = transfer_to_mesh(system, self.system, collocation_state.solution)
+        return collocation_state._replace(solution=solution)
 
     @eqx.filter_jit
-    def first_guess(self, values: Values) -> Located:
-        lane = surface_start(self.problem, values[:, None], jnp.ones((1,), bool))
-        return jax.tree.map(lambda x: x[..., 0], lane)
+    def initial_guess(self, values: Values) -> CollocationState:
+        start = surface_start(self.system, values[:, None], jnp.ones((1,), bool))
+        return jax.tree.map(lambda x: x[..., 0], start)
 
-    def find(self, values: Values, guess: Located) -> Gait:
-        cycle, d_cycle = cycle_and_columns(self.problem, values, guess)
+    def find_gait(self, values: Values, guess: CollocationState) -> Gait:
+        cycle, d_cycle = cycle_with_jacobian(self.system, values, guess)
         x, dx = cycle.section_state, d_cycle.section_state
-        step, d_step = step_and_columns(self.model, self.n_legs, values, x, dx, self.step_options)
-        posture = lambda cycle: jnp.concatenate([cycle.section_state, cycle.durations], -1)
-        told = posture(cycle), posture(d_cycle), cycle.located.happens, cycle.matrix
-        return Gait(cycle, step, d_cycle, d_step, OnBranch(*told))
+        step, d_step = step_with_jacobian(self.model, self.n_legs, values, x, dx, self.step_options)
+        gait_coordinates = lambda cycle: jnp.concatenate([cycle.section_state, cycle.durations], -1)
+        branch_data = (
+            gait_coordinates(cycle),
+            gait_coordinates(d_cycle),
+            cycle.collocation_state.phase_active,
+            cycle.monodromy_value,
+        )
+        return Gait(cycle, step, d_cycle, d_step, BranchPoint(*branch_data))
 
-    def measured(self, values: Values, guess: Any, names: tuple[str, ...]) -> Measured:
-        if set(names) <= set(self.of_cycle):
-            return measured_by_cycle(self, values, guess, names)
-        cycle: Any = None if guess is None else self.cycle_of(values, guess)
-        near = self.first_guess(values) if cycle is None else cycle.located
-        return measured_of(self.find(values, near), type(self).read, names)
+    def measure_gait(self, values: Values, guess: Any, names: tuple[str, ...]) -> GaitMeasures:
+        if set(names) <= set(self.cycle_measures):
+            return measure_from_cycle(self, values, guess, names)
+        cycle: Any = None if guess is None else self.find_cycle_from_values(values, guess)
+        start = self.initial_guess(values) if cycle is None else cycle.collocation_state
+        return measure_from_gait(self.find_gait(values, start), type(self).read_measure, names)
 
-    def compile(self, params: WheelParams) -> None:
-        values = parameters_of(params)
-        x = jnp.asarray(self.model.start(params), values.dtype)
+    def precompile(self, params: WheelParams) -> None:
+        values = stack_parameters(params)
+        x = jnp.asarray(self.model.default_start(params), values.dtype)
         dx = jnp.zeros((len(PARAMETER_NAMES), x.shape[0]), x.dtype)
         with ThreadPoolExecutor(2) as pool:
-            cycle = pool.submit(cycle_and_columns, self.problem, values, self.first_guess(values))
+            cycle = pool.submit(
+                cycle_with_jacobian, self.system, values, self.initial_guess(values)
+            )
             step = pool.submit(
-                step_and_columns, self.model, self.n_legs, values, x, dx, self.step_options
+                step_with_jacobian, self.model, self.n_legs, values, x, dx, self.step_options
             )
             cycle.result(), step.result()
 
 
 @eqx.filter_jit
-def cycle_and_columns(
-    problem: Problem, values: Array, guess: Located
+def cycle_with_jacobian(
+    system: CollocationSystem, values: Array, guess: CollocationState
 ) -> tuple[LimitCycle, LimitCycle]:
     """Return the cycle near `guess`, and its derivatives with respect to all parameters as a
     leading axis."""
 
-    find = lambda values: solved(wheel_of(values, problem.n_legs), problem, guess)
-    cycle, columns = with_jacobian(find, values)
-    return cycle, leading(columns)
+    find_cycle = lambda values: find_limit_cycle(
+        wheel_from_parameters(values, system.n_legs), system, guess
+    )
+    cycle, jacobian = value_and_jacobian(find_cycle, values)
+    return cycle, move_derivative_axis_first(jacobian)
 
 
 @eqx.filter_jit
-def step_and_columns(
-    model: ViscoelasticWheel, n_legs: int, values: Array, x: Array, dx: Array, options: Options
+def step_with_jacobian(
+    model: ViscoelasticWheel, n_legs: int, values: Array, x: Array, dx: Array, options: StepOptions
 ) -> tuple[StepResult, StepResult]:
     """Return one step and its derivatives with respect to all parameters if its start moves by `dx`
     with them."""
 
-    n = values.shape[0]
-    take = lambda inputs: model.step(wheel_of(inputs[:n], n_legs), inputs[n:], options)
-    step, jacobian = with_jacobian(take, jnp.concatenate([values, x]))
-    moved = jnp.concatenate([jnp.eye(n, dtype=x.dtype), dx], axis=1)
-    return step, leading(jax.tree.map(lambda by_inputs: by_inputs @ moved.T, jacobian))
+    n_values = values.shape[0]
+    take_step = lambda inputs: model.take_step(
+        wheel_from_parameters(inputs[:n_values], n_legs), inputs[n_values:], options
+    )
+    step, jacobian = value_and_jacobian(take_step, jnp.concatenate([values, x]))
+    input_tangents = jnp.concatenate([jnp.eye(n_values, dtype=x.dtype), dx], axis=1)
+    return step, move_derivative_axis_first(
+        jax.tree.map(lambda derivative: derivative @ input_tangents.T, jacobian)
+    )

@@ -11,40 +11,40 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from vrw_jax.cycles.cycle import MEASURED, AbstractCycle
+from vrw_jax.cycles.cycle import CYCLE_MEASURE_FUNCTIONS, AbstractCycle
 from vrw_jax.cycles.finder import (
     AbstractGaitFinder,
+    BranchPoint,
     Gait,
-    OnBranch,
     Values,
-    along,
-    leading,
+    move_derivative_axis_first,
+    value_and_tangents,
 )
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import (
-    Options,
+    FixedPointResult,
     Scalar,
-    SectionCycle,
-    moved_cycle,
-    newton_cycle,
-    with_jacobian,
+    StepOptions,
+    solve_fixed_point,
+    solve_fixed_point_implicit,
+    value_and_jacobian,
 )
-from vrw_jax.walks import checked, walk_towards
+from vrw_jax.walks import validate_arguments, walk_toward_gait
 from vrw_jax.wheel import Outcome, WheelParams
-from vrw_jax.wording import Row, listed
+from vrw_jax.wording import TextRow, format_numbers
 
-FINEST = 1e-12
+MIN_NEWTON_TOLERANCE = 1e-12
 """Lower limit of the tolerance of Newton's last correction. The step's own tolerance is a limit
 too."""
 
 
-def finest(options: Options) -> Scalar:
+def newton_tolerance(options: StepOptions) -> Scalar:
     """Return the tolerance of Newton's last correction for these step options."""
-    return jnp.maximum(FINEST, options.rtol)
+    return jnp.maximum(MIN_NEWTON_TOLERANCE, options.rtol)
 
 
-class WalkedCycle(AbstractCycle):
+class ReturnMapCycle(AbstractCycle):
     """Gait that repeats after `period_n` steps, a fixed point of the return map. Batched under
     vmap.
 
@@ -73,81 +73,94 @@ class WalkedCycle(AbstractCycle):
     durations: Float[Array, "*n 3"]
     step_length: Float[Array, "*n"]
     steps: Any
-    matrix: Float[Array, "n_section n_section"]
+    monodromy_value: Float[Array, "n_section n_section"]
     outcome: Int[Array, ""]
     residual: Scalar
-    iterations: Int[Array, ""]
+    n_iterations: Int[Array, ""]
 
     @property
     def period_n(self) -> int:
         return self.steps.durations.shape[self.outcome.ndim]
 
-    def _of_steps(self, tree: Any) -> Any:
+    def _squeeze_steps(self, tree: Any) -> Any:
         """Remove the axis over steps if there is only one step."""
-        axis, once = self.outcome.ndim, self.period_n == 1
-        return jax.tree.map(lambda leaf: jnp.squeeze(leaf, axis) if once else leaf, tree)
+        axis, is_single_step = self.outcome.ndim, self.period_n == 1
+        return jax.tree.map(lambda leaf: jnp.squeeze(leaf, axis) if is_single_step else leaf, tree)
 
     @property
     def indicators(self) -> Any:
         """Return the indicators of each landing."""
-        return self._of_steps(self.steps.indicators)
+        return self._squeeze_steps(self.steps.indicators)
 
     @property
-    def monitors(self) -> Any:
+    def margins(self) -> Any:
         """Return the margins of each step."""
-        return self._of_steps(self.steps.monitors)
+        return self._squeeze_steps(self.steps.margins)
 
     @property
-    def near(self) -> Array:
+    def warm_start(self) -> Array:
         return self.section_state
 
     @property
     def monodromy(self) -> Array:
-        return self.matrix
+        return self.monodromy_value
 
-    def own_rows(self) -> list[Row]:
-        return [("durations of each kind of support", f"{listed(self.durations)} s")]
+    def model_rows(self) -> list[TextRow]:
+        return [("durations of each kind of support", f"{format_numbers(self.durations)} s")]
 
 
 @eqx.filter_jit
-def walked_cycle(
-    params: WheelParams, x: Array, model: AbstractWheel, options: Options, period_n: int, dear: bool
-) -> WalkedCycle:
+def find_return_map_cycle(
+    params: WheelParams,
+    section_state: Array,
+    model: AbstractWheel,
+    options: StepOptions,
+    period_n: int,
+    uses_jvp_rule: bool,
+) -> ReturnMapCycle:
     """Find a cycle by Newton's method on the model's return map.
 
     `uses_jvp_rule` selects `solve_fixed_point_implicit`, because second derivatives of a step are
     expensive with unilateral contact. The search then uses the same step as the result, so that
     only one program is compiled.
     """
-    take, search = (model.step, moved_cycle) if dear else (model.advance, newton_cycle)
-    image = lambda x: take(params, x, options).section_state
-    found = search(image, x, period_n=period_n, tolerance=finest(options))
-    x, results = found.x, []
+    take_step, solver = (
+        (model.take_step, solve_fixed_point_implicit)
+        if uses_jvp_rule
+        else (model.advance, solve_fixed_point)
+    )
+    return_map = lambda section_state: take_step(params, section_state, options).section_state
+    fixed_point = solver(
+        return_map, section_state, period_n=period_n, tolerance=newton_tolerance(options)
+    )
+    section_state, results = fixed_point.x, []
     for _ in range(period_n):
-        results.append(model.step(params, x, options))
-        x = results[-1].section_state
-    return cycle_from(params, found, jax.tree.map(lambda *leaves: jnp.stack(leaves), *results))
-
-
-def cycle_from(params: WheelParams, found: SectionCycle, steps: Any) -> WalkedCycle:
-    """Return the cycle of a fixed point whose steps have a leading axis."""
-    # A step that fails returns zeros, which Newton's method may take for a fixed point.
-    good = found.converged & jnp.all(steps.outcome == Outcome.STEPPED)
-    missing = jnp.where(params.in_domain(), Outcome.NO_CYCLE_FOUND, Outcome.BAD_INPUT)
-    masked = lambda leaf: jnp.where(good, leaf, jnp.zeros_like(leaf))
-    steps = jax.tree.map(masked, steps)
-    return WalkedCycle(
-        masked(found.x),
-        *of_steps(steps),
-        steps=steps,
-        matrix=masked(found.jacobian),
-        outcome=jnp.where(good, Outcome.STEPPED, missing).astype(jnp.int32),
-        residual=found.residual,
-        iterations=found.iterations,
+        results.append(model.take_step(params, section_state, options))
+        section_state = results[-1].section_state
+    return make_cycle(
+        params, fixed_point, jax.tree.map(lambda *leaves: jnp.stack(leaves), *results)
     )
 
 
-def of_steps(steps: Any) -> tuple[Array, Array, Array]:
+def make_cycle(params: WheelParams, fixed_point: FixedPointResult, steps: Any) -> ReturnMapCycle:
+    """Return the cycle of a fixed point whose steps have a leading axis."""
+    # A step that fails returns zeros, which Newton's method may take for a fixed point.
+    is_valid = fixed_point.converged & jnp.all(steps.outcome == Outcome.STEPPED)
+    failure = jnp.where(params.is_in_domain(), Outcome.NO_CYCLE_FOUND, Outcome.BAD_INPUT)
+    mask = lambda leaf: jnp.where(is_valid, leaf, jnp.zeros_like(leaf))
+    steps = jax.tree.map(mask, steps)
+    return ReturnMapCycle(
+        mask(fixed_point.x),
+        *summarize_steps(steps),
+        steps=steps,
+        monodromy_value=mask(fixed_point.jacobian),
+        outcome=jnp.where(is_valid, Outcome.STEPPED, failure).astype(jnp.int32),
+        residual=fixed_point.residual,
+        n_iterations=fixed_point.n_iterations,
+    )
+
+
+def summarize_steps(steps: Any) -> tuple[Array, Array, Array]:
     """Return post-impact state, durations and step lengths of a cycle from its steps, which have a
     leading axis."""
     durations, lengths = steps.durations, steps.step_length
@@ -156,69 +169,84 @@ def of_steps(steps: Any) -> tuple[Array, Array, Array]:
     return steps.post_impact[0], durations, lengths
 
 
-class AbstractWalkingFinder(AbstractGaitFinder):
+class AbstractReturnMapFinder(AbstractGaitFinder):
     """Finder of gaits as fixed points of `period_n` steps of the model."""
 
     model: AbstractWheel
     n_legs: int = eqx.field(static=True)
-    step_options: Options
+    step_options: StepOptions
     period_n: int = eqx.field(static=True, default=1)
 
-    options_type: ClassVar[type] = Options
-    from_nothing: ClassVar[bool] = False
+    options_type: ClassVar[type] = StepOptions
+    supports_cold_start: ClassVar[bool] = False
 
     @classmethod
-    def of(
-        cls, model: AbstractWheel, n_legs: int, step: Options, period_n: int, cycle: CycleOptions
-    ) -> "AbstractWalkingFinder":
-        return cls(model, n_legs, step, period_n)
+    def from_options(
+        cls,
+        model: AbstractWheel,
+        n_legs: int,
+        step_options: StepOptions,
+        period_n: int,
+        cycle_options: CycleOptions,
+    ) -> "AbstractReturnMapFinder":
+        return cls(model, n_legs, step_options, period_n)
 
-    def cycle(self, params: WheelParams, guess: Any = None) -> WalkedCycle:
-        given = where_walks_begin(self, params, guess)
-        return walked_cycle(*given, self.period_n, dear=False)
+    def find_cycle(self, params: WheelParams, guess: Any = None) -> ReturnMapCycle:
+        arguments = prepare_search(self, params, guess)
+        return find_return_map_cycle(*arguments, self.period_n, uses_jvp_rule=False)
 
-    def first_guess(self, values: Values) -> Array:
+    def initial_guess(self, values: Values) -> Array:
         """Return the last section state of a walk from the model's start."""
-        model, params = self.model.at(values, self.n_legs)
-        return walk_towards(model, params, self.step_options).steps.section_state[-1]
+        model, params = self.model.from_values(values, self.n_legs)
+        return walk_toward_gait(model, params, self.step_options).steps.section_state[-1]
 
-    def compile(self, params: WheelParams) -> None:
-        self.find(self.model.values(params), self.model.start(params))
+    def precompile(self, params: WheelParams) -> None:
+        self.find_gait(self.model.parameter_values(params), self.model.default_start(params))
 
 
-class SectionFinder(AbstractWalkingFinder):
+class ReturnMapFinder(AbstractReturnMapFinder):
     """Finder for any model, with the derivatives of Newton's method."""
 
-    of_cycle: ClassVar[tuple[str, ...]] = tuple(n for n in MEASURED if n != "takeoff_acceleration")
-    differentiable: ClassVar[tuple[str, ...]] = of_cycle
-    usual: ClassVar[tuple[str, ...]] = tuple(n for n in of_cycle if n != "spectral_margin")
-    readable: ClassVar[tuple[str, ...]] = of_cycle
+    cycle_measures: ClassVar[tuple[str, ...]] = tuple(
+        n for n in CYCLE_MEASURE_FUNCTIONS if n != "takeoff_acceleration"
+    )
+    differentiable_measures: ClassVar[tuple[str, ...]] = cycle_measures
+    default_measures: ClassVar[tuple[str, ...]] = tuple(
+        n for n in cycle_measures if n != "spectral_margin"
+    )
+    readable_measures: ClassVar[tuple[str, ...]] = cycle_measures
 
     @eqx.filter_jit
-    def find(self, values: Values, guess: Array) -> Gait:
-        cycle, jacobian = with_jacobian(lambda values: self.cycle_of(values, guess), values)
-        d_cycle: Any = leading(jacobian)
+    def find_gait(self, values: Values, guess: Array) -> Gait:
+        cycle, jacobian = value_and_jacobian(
+            lambda values: self.find_cycle_from_values(values, guess), values
+        )
+        d_cycle: Any = move_derivative_axis_first(jacobian)
         step = jax.tree.map(lambda x: x[0], cycle.steps)
         d_step = jax.tree.map(lambda x: x[:, 0], d_cycle.steps)
-        return gait_of(self.model, self.n_legs, cycle, step, d_cycle, d_step)
+        return make_gait(self.model, self.n_legs, cycle, step, d_cycle, d_step)
 
 
-def where_walks_begin(
-    finder: AbstractWalkingFinder, params: WheelParams, guess: Any
-) -> tuple[WheelParams, Array, AbstractWheel, Options]:
+def prepare_search(
+    finder: AbstractReturnMapFinder, params: WheelParams, guess: Any
+) -> tuple[WheelParams, Array, AbstractWheel, StepOptions]:
     """Return wheel, section state, model and options of a search near `guess`."""
     start = guess.section_state if isinstance(guess, AbstractCycle) else guess
-    begin = finder.model.start(params) if start is None else start
-    return checked(params, begin, finder.model, finder.step_options)
+    section_state = finder.model.default_start(params) if start is None else start
+    return validate_arguments(params, section_state, finder.model, finder.step_options)
 
 
-def gait_of(
+def make_gait(
     model: AbstractWheel, n_legs: int, cycle: Any, step: Any, d_cycle: Any, d_step: Any
 ) -> Gait:
     """Return a gait with the data that identify its branch. With unilateral contact the order of
     events may change along a branch."""
-    numbers = model.section_numbers(WheelParams(n_legs=n_legs))
-    posture = lambda cycle, step: jnp.concatenate([cycle.section_state[:numbers], step.durations])
-    told = along(posture, (cycle, step), (d_cycle, d_step))
-    returns = cycle.matrix[:numbers, :numbers]
-    return Gait(cycle, step, d_cycle, d_step, OnBranch(*told, jnp.ones(1), returns))
+    n_coordinates = model.n_continuous(WheelParams(n_legs=n_legs))
+    gait_coordinates = lambda cycle, step: jnp.concatenate(
+        [cycle.section_state[:n_coordinates], step.durations]
+    )
+    branch_data = value_and_tangents(gait_coordinates, (cycle, step), (d_cycle, d_step))
+    return_jacobian = cycle.monodromy_value[:n_coordinates, :n_coordinates]
+    return Gait(
+        cycle, step, d_cycle, d_step, BranchPoint(*branch_data, jnp.ones(1), return_jacobian)
+    )

@@ -16,20 +16,20 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.cycles.cycle import AbstractCycle
-from vrw_jax.cycles.derivatives import attach_monodromy, solve_cycle
-from vrw_jax.cycles.premises import takeoff_acceleration
-from vrw_jax.cycles.search import MESH, Located, Problem, nothing_known
-from vrw_jax.cycles.sequence import SIGNS
-from vrw_jax.models import Indicators, Margins, SectionState, ViscoelasticWheel
+from vrw_jax.cycles.derivatives import attach_monodromy, solve_cycle_with_derivatives
+from vrw_jax.cycles.premises import gait_takeoff_acceleration
+from vrw_jax.cycles.search import MESH_CHECK, CollocationState, CollocationSystem, init_search_flags
+from vrw_jax.cycles.sequence import ADMISSIBILITY_CHECKS
+from vrw_jax.models import DoubleSupportIndicators, Margins, SectionState, ViscoelasticWheel
 from vrw_jax.numerics import (
-    N_NODES,
-    Options,
+    N_GAUSS_NODES,
+    CollocationSolution,
     Scalar,
-    Solution,
-    compiled_by_caller,
+    StepOptions,
+    estimate_mesh_error,
     floquet,
-    mesh_error,
-    transfer_matrix,
+    is_inside_jit,
+    mesh_transfer_matrix,
 )
 from vrw_jax.walks import step
 from vrw_jax.wheel import (
@@ -37,12 +37,12 @@ from vrw_jax.wheel import (
     Outcome,
     Symbols,
     WheelParams,
-    parameters_of,
-    phases_of,
+    make_phases,
+    stack_parameters,
     transitions,
-    wheel_of,
+    wheel_from_parameters,
 )
-from vrw_jax.wording import Row, listed
+from vrw_jax.wording import TextRow, format_numbers
 
 
 class LimitCycle(AbstractCycle):
@@ -73,31 +73,31 @@ class LimitCycle(AbstractCycle):
     post_impact: Float[Array, "2"]
     durations: Float[Array, "*n 3"]
     step_length: Float[Array, "*n"]
-    indicators: Indicators
+    indicators: DoubleSupportIndicators
     outcome: Int[Array, ""]
     residual: Scalar
-    passes: Int[Array, ""]
+    n_newton_iterations: Int[Array, ""]
     parameters: Float[Array, " n_parameters"]
-    located: Located
-    matrix: Float[Array, "2 2"]
-    problem: Problem = eqx.field(static=True)
+    collocation_state: CollocationState
+    monodromy_value: Float[Array, "2 2"]
+    system: CollocationSystem = eqx.field(static=True)
     model: ViscoelasticWheel = eqx.field(
         default_factory=ViscoelasticWheel
     )  # whose ground `margins` uses
 
     @property
     def period_n(self) -> int:
-        return self.problem.period_n
+        return self.system.period_n
 
     @property
-    def near(self) -> Located:
-        return self.located
+    def warm_start(self) -> CollocationState:
+        return self.collocation_state
 
-    def _mapped(self, of_one: Callable) -> Callable:
+    def _map_over_batch(self, function: Callable) -> Callable:
         """Map a function of one cycle over the axes of this batch."""
         for _ in range(self.outcome.ndim):
-            of_one = jax.vmap(of_one)
-        return of_one
+            function = jax.vmap(function)
+        return function
 
     @property
     def monodromy(self) -> Float[Array, "... 2 2"]:
@@ -106,9 +106,9 @@ class LimitCycle(AbstractCycle):
 
         A third multiplier, on the section before the impact, is zero.
         """
-        attach_one = attach_monodromy if compiled_by_caller() else _compiled_attach
-        attach = self._mapped(functools.partial(attach_one, self.problem))
-        return attach(self.matrix, self.parameters, self.located)
+        attach_function = attach_monodromy if is_inside_jit() else _compiled_attach_monodromy
+        attach = self._map_over_batch(functools.partial(attach_function, self.system))
+        return attach(self.monodromy_value, self.parameters, self.collocation_state)
 
     @property
     def jury_margins(self) -> Array:
@@ -117,9 +117,9 @@ class LimitCycle(AbstractCycle):
         return floquet.jury_margins(self.monodromy)
 
     @property
-    def at_double_multiplier(self) -> Bool[Array, "..."]:
+    def has_double_multiplier(self) -> Bool[Array, "..."]:
         """Return whether the spectral radius has a kink because two multipliers are equal."""
-        return floquet.at_double_multiplier(self.matrix) & self.found
+        return floquet.has_double_multiplier(self.monodromy_value) & self.found
 
     @property
     def mesh_error(self) -> Array:
@@ -128,119 +128,143 @@ class LimitCycle(AbstractCycle):
 
         Above 1e-5 a gait does not count as found. More mesh intervals in `CycleOptions` reduce it.
         """
-        of_one = functools.partial(_mesh_error, self.problem)
-        return self._mapped(of_one)(self.found, self.located.solution)
+        error_of_cycle = functools.partial(_mesh_error_if_found, self.system)
+        return self._map_over_batch(error_of_cycle)(self.found, self.collocation_state.solution)
 
     @property
     def takeoff_acceleration(self) -> Array:
         """Return the rear foot's acceleration at take-off, m/s^2, least over the steps: see
         `margin_defaults`."""
-        of_one = functools.partial(_takeoff, self.problem)
-        return self._if_found(self._mapped(of_one)(self.parameters, self.located))
+        acceleration_of_cycle = functools.partial(_takeoff_acceleration, self.system)
+        return self._mask_missing(
+            self._map_over_batch(acceleration_of_cycle)(self.parameters, self.collocation_state)
+        )
 
     @property
-    def monitors(self) -> Margins:
+    def margins(self) -> Margins:
         """Return the margins over the (first) step, computed by one event-driven step."""
 
-        def walk(parameters: Array, section_state: Array) -> Margins:
-            wheel = wheel_of(parameters, self.problem.n_legs)
-            return step(wheel, section_state, model=self.model).monitors
+        def margins_of_step(parameters: Array, section_state: Array) -> Margins:
+            wheel = wheel_from_parameters(parameters, self.system.n_legs)
+            return step(wheel, section_state, model=self.model).margins
 
-        return self._mapped(walk)(self.parameters, self.section_state)
+        return self._map_over_batch(margins_of_step)(self.parameters, self.section_state)
 
     @property
     def why(self) -> str:
-        if self.outcome not in (Outcome.ORDER_DIFFERS, Outcome.BORDER_ON_THE_WAY):
+        if self.outcome not in (Outcome.EVENT_ORDER_MISMATCH, Outcome.BRANCH_ENDS_BEFORE_TARGET):
             return super().why
-        sign = SIGNS[int(self.located.broken - 1) % len(SIGNS)]
-        return f"{super().why} Broken: {sign}."
+        check = ADMISSIBILITY_CHECKS[
+            int(self.collocation_state.failed_check - 1) % len(ADMISSIBILITY_CHECKS)
+        ]
+        return f"{super().why} Broken: {check}."
 
-    def own_rows(self) -> list[Row]:
+    def model_rows(self) -> list[TextRow]:
         forces = self.indicators
-        told = f"{listed(forces.lambda_I4)} N s, {listed(forces.lambda_2)} N"
+        forces_text = f"{format_numbers(forces.lambda_I4)} N s, {format_numbers(forces.lambda_2)} N"
         return [
-            ("durations of DLS, SLS-I, SLS-II", f"{listed(self.durations)} s"),
-            ("indicators λ_I4, λ2⁺, λ4⁺", f"{told}, {listed(forces.lambda_4)} N"),
+            ("durations of DLS, SLS-I, SLS-II", f"{format_numbers(self.durations)} s"),
+            ("indicators λ_I4, λ2⁺, λ4⁺", f"{forces_text}, {format_numbers(forces.lambda_4)} N"),
         ]
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _mesh_error(problem: Problem, found: Array, solution: Solution) -> Array:
-    lanes = jax.tree.map(lambda x: x[..., None], solution)
-    return jnp.where(found, mesh_error(problem.sequence, problem.meshes, lanes)[0], 0.0)
+def _mesh_error_if_found(
+    system: CollocationSystem, is_found: Array, solution: CollocationSolution
+) -> Array:
+    solution_with_lane = jax.tree.map(lambda x: x[..., None], solution)
+    return jnp.where(
+        is_found, estimate_mesh_error(system.sequence, system.meshes, solution_with_lane)[0], 0.0
+    )
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _takeoff(problem: Problem, parameters: Array, located: Located) -> Array:
-    s = wheel_of(parameters, problem.n_legs).symbols()
-    _, steps = problem.passages(parameters, located.solution)
-    return jnp.min(jnp.stack([takeoff_acceleration(s, sls1) for _, sls1, _ in steps]))
+def _takeoff_acceleration(
+    system: CollocationSystem, parameters: Array, collocation_state: CollocationState
+) -> Array:
+    s = wheel_from_parameters(parameters, system.n_legs).symbols()
+    _, steps = system.evaluate_passages(parameters, collocation_state.solution)
+    return jnp.min(jnp.stack([gait_takeoff_acceleration(s, sls1) for _, sls1, _ in steps]))
 
 
-_compiled_attach = jax.jit(attach_monodromy, static_argnums=0)
+_compiled_attach_monodromy = jax.jit(attach_monodromy, static_argnums=0)
 
 
-def solved(params: WheelParams, problem: Problem, guess: Located | None) -> LimitCycle:
-    find = _find_cycle if compiled_by_caller() else _compiled_find_cycle
-    return find(params, problem, guess)
+def find_limit_cycle(
+    params: WheelParams, system: CollocationSystem, guess: CollocationState | None
+) -> LimitCycle:
+    find_cycle = _find_cycle if is_inside_jit() else _compiled_find_cycle
+    return find_cycle(params, system, guess)
 
 
-def _find_cycle(params: WheelParams, problem: Problem, guess: Located | None) -> LimitCycle:
-    usable = params.in_domain()
-    table_1 = WheelParams(n_legs=problem.n_legs)
-    safe = jax.tree.map(lambda x, d: jnp.where(usable, x, d.astype(x.dtype)), params, table_1)
-    parameters = parameters_of(safe)
-    located, (matrix, residual, passes) = solve_cycle(problem, parameters, guess)
-    found = usable & (located.found > 0.5)
+def _find_cycle(
+    params: WheelParams, system: CollocationSystem, guess: CollocationState | None
+) -> LimitCycle:
+    is_usable = params.is_in_domain()
+    table_1 = WheelParams(n_legs=system.n_legs)
+    safe_params = jax.tree.map(
+        lambda x, d: jnp.where(is_usable, x, d.astype(x.dtype)), params, table_1
+    )
+    parameters = stack_parameters(safe_params)
+    collocation_state, (monodromy_value, residual, n_newton_iterations) = (
+        solve_cycle_with_derivatives(system, parameters, guess)
+    )
+    is_found = is_usable & (collocation_state.found > 0.5)
     # Mask inputs and outputs: measures and derivatives are zero where there is no cycle.
-    masked = lambda x: jnp.where(found, x, 0.0)
-    stand_in = lambda x, d: jnp.where(found, x, d)
-    parameters = jax.tree.map(stand_in, parameters, parameters_of(table_1).astype(parameters.dtype))
+    mask = lambda x: jnp.where(is_found, x, 0.0)
+    stand_in = lambda x, d: jnp.where(is_found, x, d)
+    parameters = jax.tree.map(
+        stand_in, parameters, stack_parameters(table_1).astype(parameters.dtype)
+    )
 
-    s = wheel_of(parameters, problem.n_legs).symbols()
-    n = problem.period_n
+    s = wheel_from_parameters(parameters, system.n_legs).symbols()
+    period_n = system.period_n
     # theta, its rate and the rate of L1: L1 itself follows from theta at touchdown.
-    states = jnp.concatenate([located.ends[:, :1], located.ends[:, 2:]], 1)
+    states = jnp.concatenate([collocation_state.ends[:, :1], collocation_state.ends[:, 2:]], 1)
     # The landing at the start of a step follows the state at the end of the previous step.
     landings = jax.vmap(lambda x: transitions.land(s, *x))(jnp.roll(states, 1, 0))
     fore, rear = jax.vmap(lambda landing: transitions.landing_forces(s, landing))(landings)
 
     def over_steps(values: Array) -> Array:
-        return masked(values[0] if n == 1 else values)
+        return mask(values[0] if period_n == 1 else values)
 
-    durations = located.solution.durations
-    code = jnp.where(located.broken > 0.0, Outcome.ORDER_DIFFERS, Outcome.NO_CYCLE_FOUND)
-    code = jnp.where(located.broken == MESH, Outcome.MESH_TOO_COARSE, code)
-    code = jnp.where(located.broken > MESH, Outcome.BORDER_ON_THE_WAY, code)
-    code = jnp.where(found, Outcome.STEPPED, code)
+    durations = collocation_state.solution.durations
+    code = jnp.where(
+        collocation_state.failed_check > 0.0, Outcome.EVENT_ORDER_MISMATCH, Outcome.NO_CYCLE_FOUND
+    )
+    code = jnp.where(collocation_state.failed_check == MESH_CHECK, Outcome.MESH_TOO_COARSE, code)
+    code = jnp.where(
+        collocation_state.failed_check > MESH_CHECK, Outcome.BRANCH_ENDS_BEFORE_TARGET, code
+    )
+    code = jnp.where(is_found, Outcome.STEPPED, code)
     return LimitCycle(
-        section_state=masked(states[-1]),
-        post_impact=masked(located.solution.section),
+        section_state=mask(states[-1]),
+        post_impact=mask(collocation_state.solution.section_state),
         durations=over_steps(durations),
         step_length=over_steps(landings.distance),
-        indicators=Indicators(
-            lambda_I4=over_steps(landings.rear.normal),
+        indicators=DoubleSupportIndicators(
+            lambda_I4=over_steps(landings.rear_impulse.normal),
             lambda_2=over_steps(fore.normal),
             lambda_4=over_steps(rear.normal),
         ),
-        outcome=jnp.where(usable, code, Outcome.BAD_INPUT).astype(jnp.int32),
+        outcome=jnp.where(is_usable, code, Outcome.BAD_INPUT).astype(jnp.int32),
         residual=jnp.where(jnp.isfinite(residual), residual, 1.0),
-        passes=passes,
+        n_newton_iterations=n_newton_iterations,
         parameters=parameters,
-        located=located,
-        matrix=masked(matrix),
-        problem=problem,
+        collocation_state=collocation_state,
+        monodromy_value=mask(monodromy_value),
+        system=system,
     )
 
 
 _compiled_find_cycle = eqx.filter_jit(_find_cycle)
 
-N_SAMPLES = 1025
+N_PHASE_SAMPLES = 1025
 """Number of points of each phase between which a walked guess is interpolated. With too few (33 at
 c = 221), the fast start of a step without double support is lost and Newton's method fails."""
 
 
-class SampledWalk(NamedTuple):
+class WalkSamples(NamedTuple):
     """Event-driven walk, sampled as a start on any mesh."""
 
     post_impact: Float[Array, "2"]  # (theta, dtheta) after the first landing
@@ -250,56 +274,66 @@ class SampledWalk(NamedTuple):
 
 
 @eqx.filter_jit
-def sampled_walk(
-    model: ViscoelasticWheel, params: WheelParams, x: SectionState, n_steps: int
-) -> SampledWalk:
+def sample_walk(
+    model: ViscoelasticWheel, params: WheelParams, section_state: SectionState, n_steps: int
+) -> WalkSamples:
     """Return `n_steps` event-driven steps from a section state, sampled in time."""
-    options, s = Options(), params.symbols()
-    landing = transitions.land(s, *x)
+    options, s = StepOptions(), params.symbols()
+    landing = transitions.land(s, *section_state)
     section = jnp.stack([landing.theta, landing.motion.dtheta])
 
-    def one(x: Array, _: None) -> tuple[Array, tuple]:
-        walked = model.trace(params, x, options, N_SAMPLES)
-        told = transitions.land(s, *x).distance, walked.durations, walked.state
-        return walked.section_state, told
+    def sample_next_step(x: Array, _: None) -> tuple[Array, tuple]:
+        trajectory = model.sample_step(params, x, options, N_PHASE_SAMPLES)
+        step_samples = transitions.land(s, *x).distance, trajectory.durations, trajectory.state
+        return trajectory.section_state, step_samples
 
-    _, told = lax.scan(one, x, None, length=n_steps)
-    return SampledWalk(section, *told)
+    _, samples = lax.scan(sample_next_step, section_state, None, length=n_steps)
+    return WalkSamples(section, *samples)
 
 
 @eqx.filter_jit
-def guess_along(problem: Problem, params: WheelParams, walked: SampledWalk) -> Located:
+def guess_from_walk(
+    system: CollocationSystem, params: WheelParams, walk: WalkSamples
+) -> CollocationState:
     """Return the cycle's unknowns from a walk of `period_n` steps."""
-    accelerations = functools.partial(_accelerations_along, problem, params.symbols())
-    happens = (walked.durations > 0.0).astype(walked.durations.dtype)
-    by_phase = jax.vmap(accelerations)(walked.distances, walked.states)
-    solution = Solution(walked.post_impact, walked.durations, by_phase)
-    nothing = nothing_known(problem, walked.post_impact)
-    return lax.stop_gradient(Located(solution, happens, *nothing))
+    accelerations = functools.partial(_sample_accelerations, system, params.symbols())
+    is_active = (walk.durations > 0.0).astype(walk.durations.dtype)
+    by_phase = jax.vmap(accelerations)(walk.distances, walk.states)
+    solution = CollocationSolution(walk.post_impact, walk.durations, by_phase)
+    search_flags = init_search_flags(system, walk.post_impact)
+    return lax.stop_gradient(CollocationState(solution, is_active, *search_flags))
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
-def on_mesh(known: Problem, wanted: Problem, found: Solution) -> Solution:
+def transfer_to_mesh(
+    known_system: CollocationSystem, wanted_system: CollocationSystem, solution: CollocationSolution
+) -> CollocationSolution:
     """Return a solution transferred to another mesh. The accelerations in each mesh interval are a
     polynomial."""
     accelerations = []
-    for old, new, rows in zip(known.meshes, wanted.meshes, found.accelerations, strict=True):
-        matrix = jnp.asarray(transfer_matrix(old, new), found.section.dtype)
+    for known_mesh, wanted_mesh, rows in zip(
+        known_system.meshes, wanted_system.meshes, solution.accelerations, strict=True
+    ):
+        matrix = jnp.asarray(
+            mesh_transfer_matrix(known_mesh, wanted_mesh), solution.section_state.dtype
+        )
         n, _, _, dim = rows.shape
-        moved = jnp.einsum("ij,njd->nid", matrix, rows.reshape(n, -1, dim))
-        accelerations.append(moved.reshape(n, new.n_steps, N_NODES, dim))
-    return Solution(found.section, found.durations, tuple(accelerations))
+        resampled = jnp.einsum("ij,njd->nid", matrix, rows.reshape(n, -1, dim))
+        accelerations.append(resampled.reshape(n, wanted_mesh.n_intervals, N_GAUSS_NODES, dim))
+    return CollocationSolution(solution.section_state, solution.durations, tuple(accelerations))
 
 
-def _accelerations_along(
-    problem: Problem, s: Symbols, distance: Scalar, states: Float[Array, "3 n_samples 6"]
+def _sample_accelerations(
+    system: CollocationSystem, s: Symbols, distance: Scalar, states: Float[Array, "3 n_samples 6"]
 ) -> tuple[Array, ...]:
     """Return accelerations at the nodes of each phase, (step, node, coordinate), of a sampled
     step."""
-    told, phases = [], phases_of(s, distance, stop_at_lift_off=False)
-    known = jnp.linspace(0.0, 1.0, states.shape[1])
-    for phase, mesh, sampled in zip(phases, problem.meshes, states, strict=True):
-        rows = [jnp.interp(jnp.asarray(mesh.node_times), known, row) for row in sampled.T]
-        nodes = jnp.stack(phase.acceleration(Motion.of(*rows))[: phase.n], axis=-1)
-        told.append(nodes.reshape(mesh.n_steps, N_NODES, phase.n))
-    return tuple(told)
+    accelerations, phases = [], make_phases(s, distance, stop_at_lift_off=False)
+    sample_times = jnp.linspace(0.0, 1.0, states.shape[1])
+    for phase, mesh, samples in zip(phases, system.meshes, states, strict=True):
+        rows = [
+            jnp.interp(jnp.asarray(mesh.node_fractions), sample_times, row) for row in samples.T
+        ]
+        nodes = jnp.stack(phase.acceleration(Motion.from_angle(*rows))[: phase.n_dof], axis=-1)
+        accelerations.append(nodes.reshape(mesh.n_intervals, N_GAUSS_NODES, phase.n_dof))
+    return tuple(accelerations)

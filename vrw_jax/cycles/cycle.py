@@ -13,10 +13,16 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from vrw_jax.numerics import floquet
 from vrw_jax.wheel import Outcome, WheelParams
-from vrw_jax.wording import AbstractTold, Row, chosen, counted, listed
+from vrw_jax.wording import (
+    AbstractPrintable,
+    TextRow,
+    check_choice,
+    format_numbers,
+    format_outcome_counts,
+)
 
 
-class AbstractCycle(AbstractTold):
+class AbstractCycle(AbstractPrintable):
     """Gait that repeats after `period_n` steps. Batched under vmap: every field gains the batch
     axis.
 
@@ -28,7 +34,7 @@ class AbstractCycle(AbstractTold):
     post_impact: eqx.AbstractVar[Float[Array, "2"]]  # (theta, dtheta) after the first landing
     durations: eqx.AbstractVar[Float[Array, "*n 3"]]  # s, double support first
     step_length: eqx.AbstractVar[Float[Array, "*n"]]  # between the feet at the landing, m
-    matrix: eqx.AbstractVar[Array]  # monodromy matrix, without derivative
+    monodromy_value: eqx.AbstractVar[Array]  # monodromy matrix, without derivative
     outcome: eqx.AbstractVar[Int[Array, ""]]  # Outcome.STEPPED or the failure
 
     @property
@@ -43,30 +49,32 @@ class AbstractCycle(AbstractTold):
 
     @property
     @abc.abstractmethod
-    def near(self) -> Any:
+    def warm_start(self) -> Any:
         """Return the start of a search for a neighbor's gait."""
 
-    def or_nan(self, params: WheelParams) -> Any:
+    def replace_missing_by_nan(self, params: WheelParams) -> Any:
         """Return the cycle with NaN in place of zeros where there is none, also in derivatives with
         respect to params."""
-        lost = jnp.where(self.found, 0.0, jnp.nan)
-        weight = 1.0 + lost * sum(jax.tree.leaves(params))  # so that derivatives pass the masks
+        nan_if_missing = jnp.where(self.found, 0.0, jnp.nan)
+        weight = 1.0 + nan_if_missing * sum(
+            jax.tree.leaves(params)
+        )  # so that derivatives pass the masks
 
-        def told(x: Array) -> Array:
+        def scale(x: Array) -> Array:
             return x * weight.astype(x.dtype) if eqx.is_inexact_array(x) else x
 
-        names = [name for name in MASKED if name in vars(self)]
-        values = {name: jax.tree.map(told, getattr(self, name)) for name in names}
+        names = [name for name in MASKED_FIELDS if name in vars(self)]
+        values = {name: jax.tree.map(scale, getattr(self, name)) for name in names}
         return dataclasses.replace(self, **values)
 
-    def _if_found(self, value: Array) -> Array:
+    def _mask_missing(self, value: Array) -> Array:
         """Return `value`, or zero where there is no cycle. The result is NaN after
         `replace_missing_by_nan`, also in derivatives."""
         return jnp.where(
-            self.found, value, 0.0 * self.matrix[..., 0, 0]
+            self.found, value, 0.0 * self.monodromy_value[..., 0, 0]
         )  # whose derivative is zero
 
-    def over_steps(self, values: Array, combine: Callable[[Array, int], Array]) -> Array:
+    def combine_steps(self, values: Array, combine: Callable[[Array, int], Array]) -> Array:
         """Combine one value per step, on the last axis, into one value for the whole cycle."""
         return combine(values, -1) if self.period_n > 1 else values
 
@@ -88,20 +96,20 @@ class AbstractCycle(AbstractTold):
     @property
     def dls_fraction(self) -> Array:
         """Return the share of the period in double support."""
-        dls, period = self.over_steps(self.durations[..., 0], jnp.sum), self.period
+        dls, period = self.combine_steps(self.durations[..., 0], jnp.sum), self.period
         return dls / jnp.where(period > 0.0, period, 1.0)
 
     @property
     def speed(self) -> Array:
         """Return distance over period, m/s."""
-        distance, period = self.over_steps(self.step_length, jnp.sum), self.period
+        distance, period = self.combine_steps(self.step_length, jnp.sum), self.period
         return distance / jnp.where(period > 0.0, period, 1.0)
 
     @property
     def multipliers(self) -> Complex[Array, "... n"]:
         """Return the Floquet multipliers, largest first. They are differentiable for sections of at
         most three coordinates."""
-        return floquet.multipliers(self.monodromy)
+        return floquet.floquet_multipliers(self.monodromy)
 
     @property
     def spectral_radius(self) -> Array:
@@ -111,7 +119,7 @@ class AbstractCycle(AbstractTold):
     @property
     def spectral_margin(self) -> Array:
         """Return 1 - spectral radius, positive for stable gaits, for every model."""
-        return self._if_found(1.0 - self.spectral_radius)
+        return self._mask_missing(1.0 - self.spectral_radius)
 
     @property
     def stability_margin(self) -> Array:
@@ -120,14 +128,14 @@ class AbstractCycle(AbstractTold):
 
         It is defined for sections of at most three coordinates, which excludes unilateral contact.
         """
-        return self._if_found(floquet.stability_margin(self.monodromy))
+        return self._mask_missing(floquet.stability_margin(self.monodromy))
 
     @property
-    def condition(self) -> Array:
+    def condition_number(self) -> Array:
         """Return the condition number of I - monodromy: the amplification of a disturbance by the
         cycle."""
-        matrix = jnp.eye(self.matrix.shape[-1]) - self.matrix
-        return self._if_found(jnp.linalg.cond(matrix))
+        matrix = jnp.eye(self.monodromy_value.shape[-1]) - self.monodromy_value
+        return self._mask_missing(jnp.linalg.cond(matrix))
 
     def measure(self, name: str) -> Array:
         """Return one of `CYCLE_MEASURE_FUNCTIONS`, by its name in `results.ALL_MEASURES`. Batch
@@ -135,90 +143,96 @@ class AbstractCycle(AbstractTold):
 
         Durations are sums over the cycle's steps, and indicators are minima.
         """
-        return MEASURED[chosen("the measure", name, tuple(MEASURED))](self)
+        return CYCLE_MEASURE_FUNCTIONS[
+            check_choice("the measure", name, tuple(CYCLE_MEASURE_FUNCTIONS))
+        ](self)
 
     def measures(self, names: Iterable[str]) -> dict[str, Array]:
         """Return several measures by name. Measures that are not requested are not traced."""
         return {name: self.measure(name) for name in names}
 
-    def rows(self) -> list[Row]:
+    def summary_rows(self) -> list[TextRow]:
         """Return the printed rows of the cycle. A batch shows how many cycles are found."""
         outcome = np.asarray(self.outcome)
         if outcome.ndim:
-            return [("wheels", counted(outcome, Outcome))]
+            return [("wheels", format_outcome_counts(outcome, Outcome))]
         if outcome != Outcome.STEPPED:
             return [("outcome", f"{Outcome(int(outcome)).name}: {self.why}")]
-        radius, told = multipliers_told(np.asarray(self.matrix))
-        often = f"{self.period_n} steps" if self.period_n > 1 else "one step"
-        stable = "stable" if radius < 1.0 else "unstable"
+        spectral_radius, multipliers_text = format_multipliers(np.asarray(self.monodromy_value))
+        period_text = f"{self.period_n} steps" if self.period_n > 1 else "one step"
+        stability_text = "stable" if spectral_radius < 1.0 else "unstable"
         return [
-            ("gait", f"{stable}, repeats after {often}"),
+            ("gait", f"{stability_text}, repeats after {period_text}"),
             ("double support", f"{100 * float(self.dls_fraction):.3f} %"),
             ("period", f"{float(self.period):.6f} s"),
             ("speed", f"{float(self.speed):.6f} m/s"),
-            *self.own_rows(),
-            ("after landing: angle, rate", f"{listed(self.post_impact)} rad, rad/s"),
-            ("multipliers", f"{told}; spectral radius {radius:.6f}"),
+            *self.model_rows(),
+            ("after landing: angle, rate", f"{format_numbers(self.post_impact)} rad, rad/s"),
+            ("multipliers", f"{multipliers_text}; spectral radius {spectral_radius:.6f}"),
         ]
 
     @abc.abstractmethod
-    def own_rows(self) -> list[Row]:
+    def model_rows(self) -> list[TextRow]:
         """Return the rows that are specific to the model."""
 
 
-def multipliers_told(matrix: np.ndarray) -> tuple[float, str]:
+def format_multipliers(matrix: np.ndarray) -> tuple[float, str]:
     """Return the spectral radius, and the multipliers that five digits show, largest first."""
     multipliers = sorted(np.linalg.eigvals(matrix), key=abs, reverse=True)
-    shown = [z for z in multipliers if abs(z) >= 5e-6]
-    rest = f"{len(multipliers) - len(shown)} below 5e-6" if len(shown) < len(multipliers) else ""
-    told = [f"{z:.5f}" if z.imag else f"{z.real:.5f}" for z in shown]
-    return float(np.abs(multipliers[0])), ", ".join([*told, *([rest] if rest else [])])
+    shown_multipliers = [z for z in multipliers if abs(z) >= 5e-6]
+    remainder = (
+        f"{len(multipliers) - len(shown_multipliers)} below 5e-6"
+        if len(shown_multipliers) < len(multipliers)
+        else ""
+    )
+    texts = [f"{z:.5f}" if z.imag else f"{z.real:.5f}" for z in shown_multipliers]
+    return float(np.abs(multipliers[0])), ", ".join([*texts, *([remainder] if remainder else [])])
 
 
-MASKED = (
+MASKED_FIELDS = (
     "section_state",
     "post_impact",
     "durations",
     "step_length",
     "indicators",
     "steps",
-    "matrix",
+    "monodromy_value",
 )
 """Fields that are zero where there is no gait."""
 
 
-def _own(name: str) -> Callable[[AbstractCycle], Array]:
+def _read_property(name: str) -> Callable[[AbstractCycle], Array]:
     return lambda cycle: getattr(cycle, name)
 
 
-def _duration(place: int) -> Callable[[AbstractCycle], Array]:
-    return lambda cycle: cycle.over_steps(cycle.durations[..., place], jnp.sum)
+def _read_duration(phase_index: int) -> Callable[[AbstractCycle], Array]:
+    return lambda cycle: cycle.combine_steps(cycle.durations[..., phase_index], jnp.sum)
 
 
-def _indicator(name: str) -> Callable[[Any], Array]:
-    return lambda cycle: cycle.over_steps(getattr(cycle.indicators, name), jnp.min)
+def _read_indicator(name: str) -> Callable[[Any], Array]:
+    return lambda cycle: cycle.combine_steps(getattr(cycle.indicators, name), jnp.min)
 
 
-MEASURED: dict[str, Callable[[AbstractCycle], Array]] = {
-    "dls_fraction": _own("dls_fraction"),
-    "period": _own("period"),
-    "speed": _own("speed"),
-    "step_length": lambda cycle: cycle.over_steps(cycle.step_length, jnp.sum),
-    "duration_dls": _duration(0),
-    "duration_sls1": _duration(1),
-    "duration_sls2": _duration(2),
+CYCLE_MEASURE_FUNCTIONS: dict[str, Callable[[AbstractCycle], Array]] = {
+    "dls_fraction": _read_property("dls_fraction"),
+    "period": _read_property("period"),
+    "speed": _read_property("speed"),
+    "step_length": lambda cycle: cycle.combine_steps(cycle.step_length, jnp.sum),
+    "duration_dls": _read_duration(0),
+    "duration_sls1": _read_duration(1),
+    "duration_sls2": _read_duration(2),
     "theta_post_impact": lambda cycle: cycle.post_impact[..., 0],
     "dtheta_post_impact": lambda cycle: cycle.post_impact[..., 1],
     "theta_touchdown": lambda cycle: cycle.section_state[..., 0],
     "dtheta_touchdown": lambda cycle: cycle.section_state[..., 1],
     "dL1_touchdown": lambda cycle: cycle.section_state[..., 2],
-    "lambda_I4": _indicator("lambda_I4"),
-    "lambda_2_plus": _indicator("lambda_2"),
-    "lambda_4_plus": _indicator("lambda_4"),
-    "spectral_radius": _own("spectral_radius"),
-    "spectral_margin": _own("spectral_margin"),
-    "stability_margin": _own("stability_margin"),
-    "takeoff_acceleration": _own("takeoff_acceleration"),
+    "lambda_I4": _read_indicator("lambda_I4"),
+    "lambda_2_plus": _read_indicator("lambda_2"),
+    "lambda_4_plus": _read_indicator("lambda_4"),
+    "spectral_radius": _read_property("spectral_radius"),
+    "spectral_margin": _read_property("spectral_margin"),
+    "stability_margin": _read_property("stability_margin"),
+    "takeoff_acceleration": _read_property("takeoff_acceleration"),
 }
 """Functions of a cycle by name of the measure; the only such table. Derivatives of the stability
 measures are second derivatives of the motion. They need one more compiled program and take twice

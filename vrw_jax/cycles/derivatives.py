@@ -16,42 +16,52 @@ from jaxtyping import Array
 
 from vrw_jax import simd
 from vrw_jax.cycles.search import (
-    Located,
+    CollocationState,
+    CollocationSystem,
     Parameters,
-    Problem,
-    columns_of,
-    in_stages,
-    name_for_export,
+    register_export_names,
+    search_in_stages,
     search_lanes,
+    state_tangents,
 )
 from vrw_jax.models import scales
 from vrw_jax.numerics import (
-    InForm,
-    LaneFunction,
-    in_blocks,
-    on_branch,
-    one_wheel,
-    push,
-    slopes_on_branch,
-    without_derivative,
+    BatchFunction,
+    ExecutionWrapper,
+    apply_jacobian,
+    implicit_jacobian,
+    make_blockwise,
+    unbatch,
+    with_implicit_derivative,
+    zero_tangent,
 )
-from vrw_jax.runtime import lane_function, remembered
+from vrw_jax.runtime import cached_lane_function, cached_trace
 from vrw_jax.wheel import PARAMETER_NAMES
 
 
-def _tangent_space(problem: Problem, parameters: Parameters, located: Located) -> Located:
+def _collocation_tangents(
+    system: CollocationSystem, parameters: Parameters, collocation_state: CollocationState
+) -> CollocationState:
     """Return d(state) / d(parameters) over lanes, with a leading axis; zero where nothing was
     found."""
-    passed = problem.pass_at(parameters, located, tuple(range(parameters.shape[0])))
-    return _where_found(located, columns_of(passed, located))
+    linearized_pass = system.linearize_at(
+        parameters, collocation_state, tuple(range(parameters.shape[0]))
+    )
+    return _mask_not_found(collocation_state, state_tangents(linearized_pass, collocation_state))
 
 
-def _monodromy(problem: Problem, parameters: Parameters, located: Located) -> Array:
-    return _where_found(located, problem.pass_at(parameters, located).monodromy)
+def _masked_monodromy(
+    system: CollocationSystem, parameters: Parameters, collocation_state: CollocationState
+) -> Array:
+    return _mask_not_found(
+        collocation_state, system.linearize_at(parameters, collocation_state).monodromy
+    )
 
 
-def _slopes_of_monodromy(
-    problem: Problem, parameters: Parameters, known: tuple[Located, Located]
+def _monodromy_tangents(
+    system: CollocationSystem,
+    parameters: Parameters,
+    solution_and_tangents: tuple[CollocationState, CollocationState],
 ) -> Array:
     """Return d(monodromy) / d(parameters) along the branch, with a leading axis.
 
@@ -60,111 +70,175 @@ def _slopes_of_monodromy(
     of mass, both masses grow in this direction. The forces of the ground and of the legs do not
     contain it.
     """
-    located, columns = known
-    hub, leg = (PARAMETER_NAMES.index(name) for name in ("hub_mass", "leg_mass"))
-    whole = parameters[hub] + parameters[leg]
-    of_hub, of_leg = parameters[hub] / whole, parameters[leg] / whole
-    plain = [i for i in range(len(parameters)) if i not in (hub, leg, *scales.SCALES)]
-    one, none = jnp.ones_like(whole), jnp.zeros_like(whole)
-    first, second = jnp.asarray([*plain, leg]), jnp.asarray([*plain, hub])
-    shares = jnp.stack([one] * len(plain) + [of_hub]), jnp.stack([none] * len(plain) + [-of_leg])
-    unit = jnp.eye(len(parameters), dtype=parameters.dtype)[..., None]
-    units = jnp.broadcast_to(unit, (len(parameters), *parameters.shape))
+    collocation_state, tangents = solution_and_tangents
+    hub_index, leg_index = (PARAMETER_NAMES.index(name) for name in ("hub_mass", "leg_mass"))
+    total_mass = parameters[hub_index] + parameters[leg_index]
+    hub_share, leg_share = parameters[hub_index] / total_mass, parameters[leg_index] / total_mass
+    other_indices = [
+        i
+        for i in range(len(parameters))
+        if i not in (hub_index, leg_index, *scales.SCALING_BY_PARAMETER)
+    ]
+    ones, zeros = jnp.ones_like(total_mass), jnp.zeros_like(total_mass)
+    first_indices, second_indices = (
+        jnp.asarray([*other_indices, leg_index]),
+        jnp.asarray([*other_indices, hub_index]),
+    )
+    weights = (
+        jnp.stack([ones] * len(other_indices) + [hub_share]),
+        jnp.stack([zeros] * len(other_indices) + [-leg_share]),
+    )
+    identity = jnp.eye(len(parameters), dtype=parameters.dtype)[..., None]
+    parameter_tangents = jnp.broadcast_to(identity, (len(parameters), *parameters.shape))
 
-    def along(way: tuple) -> tuple[Array, Array]:
-        i, j, a, b = way
-        at = lambda x, i: lax.dynamic_index_in_dim(x, i, keepdims=False)
-        way = jax.tree.map(lambda x: a * at(x, i) + b * at(x, j), (units, columns))
-        return jax.jvp(functools.partial(_monodromy, problem), (parameters, located), way)
+    def monodromy_tangent(direction: tuple) -> tuple[Array, Array]:
+        first_index, second_index, first_weight, second_weight = direction
+        select_row = lambda x, first_index: lax.dynamic_index_in_dim(x, first_index, keepdims=False)
+        direction = jax.tree.map(
+            lambda x: (
+                first_weight * select_row(x, first_index)
+                + second_weight * select_row(x, second_index)
+            ),
+            (parameter_tangents, tangents),
+        )
+        return jax.jvp(
+            functools.partial(_masked_monodromy, system), (parameters, collocation_state), direction
+        )
 
-    matrices, turns = lax.map(along, (first, second, *shares))
-    by = dict(zip(plain, turns[:-1], strict=True))
-    grown = scales.MASS.left(jnp.zeros_like(turns[0]), tuple(parameters), by) / whole
-    length = of_hub * of_hub + of_leg * of_leg
-    by[hub] = (of_hub * grown - of_leg * turns[-1]) / length
-    by[leg] = (of_leg * grown + of_hub * turns[-1]) / length
-    rates = jnp.asarray([[0, 1], [-1, 0]])[..., None] * matrices[0]  # of angle and rate
-    told = {
-        i: rates if scale is scales.TIME else jnp.zeros_like(rates)
-        for i, scale in scales.SCALES.items()
+    matrices, monodromy_tangents = lax.map(
+        monodromy_tangent, (first_indices, second_indices, *weights)
+    )
+    tangent_by_parameter = dict(zip(other_indices, monodromy_tangents[:-1], strict=True))
+    mass_scale_tangent = (
+        scales.MASS_SCALING.subtract_columns(
+            jnp.zeros_like(monodromy_tangents[0]), tuple(parameters), tangent_by_parameter
+        )
+        / total_mass
+    )
+    squared_length = hub_share * hub_share + leg_share * leg_share
+    tangent_by_parameter[hub_index] = (
+        hub_share * mass_scale_tangent - leg_share * monodromy_tangents[-1]
+    ) / squared_length
+    tangent_by_parameter[leg_index] = (
+        leg_share * mass_scale_tangent + hub_share * monodromy_tangents[-1]
+    ) / squared_length
+    time_scale_tangent = (
+        jnp.asarray([[0, 1], [-1, 0]])[..., None] * matrices[0]
+    )  # of angle and rate
+    time_scale_tangents = {
+        i: time_scale_tangent
+        if unit_scale is scales.TIME_SCALING
+        else jnp.zeros_like(time_scale_tangent)
+        for i, unit_scale in scales.SCALING_BY_PARAMETER.items()
     }
-    by = scales.with_scales(tuple(parameters), by, told)
-    return jnp.stack([by[i] for i in range(len(parameters))])
+    tangent_by_parameter = scales.complete_by_scaling(
+        tuple(parameters), tangent_by_parameter, time_scale_tangents
+    )
+    return jnp.stack([tangent_by_parameter[i] for i in range(len(parameters))])
 
 
-def _where_found(located: Located, tree: Any) -> Any:
+def _mask_not_found(collocation_state: CollocationState, tree: Any) -> Any:
     """Return the tree with zeros in the lanes without a cycle."""
-    return jax.tree.map(lambda x: jnp.where(located.found > 0.5, x, 0.0), tree)
+    return jax.tree.map(lambda x: jnp.where(collocation_state.found > 0.5, x, 0.0), tree)
 
 
-def over_lanes(function: LaneFunction, like: Callable, settings: tuple, block: int) -> LaneFunction:
+def compile_batched(
+    function: BatchFunction, make_output_template: Callable, cache_key: tuple, batch_size: int
+) -> BatchFunction:
     """Return a batched function in its fastest form: machine code on a CPU, else XLA in blocks."""
-    if simd.serves():
-        return lane_function(function, like, settings)
-    name_for_export()
-    return remembered(in_blocks(function, block), settings)
+    if simd.is_available():
+        return cached_lane_function(function, make_output_template, cache_key)
+    register_export_names()
+    return cached_trace(make_blockwise(function, batch_size), cache_key)
 
 
-def _in_form(name: str, likes: tuple[Callable, ...], problem: Problem) -> InForm:
+def _make_compiler(
+    name: str, make_templates: tuple[Callable, ...], system: CollocationSystem
+) -> ExecutionWrapper:
     """Return a compiler for the first derivatives (`compile_batched`, one output template each).
     XLA compiles higher ones."""
-    block = problem.options.block
+    batch_size = system.options.batch_size
 
-    def in_form(function: LaneFunction, order: int) -> LaneFunction:
-        if order < len(likes):
-            return over_lanes(function, likes[order], (name, order, problem), block)
-        return in_blocks(function, block)
+    def compile_function(function: BatchFunction, order: int) -> BatchFunction:
+        if order < len(make_templates):
+            return compile_batched(
+                function, make_templates[order], (name, order, system), batch_size
+            )
+        return make_blockwise(function, batch_size)
 
-    return in_form
+    return compile_function
 
 
-def _columns_of(problem: Problem) -> Callable:
+def _make_tangent_function(system: CollocationSystem) -> Callable:
     """Return `_collocation_tangents` of one wheel as a differentiable function."""
-    likes = (lambda parameters, located: located), (lambda parameters, known: known[0])
-    form = _in_form("columns", likes, problem)
-    columns = on_branch(functools.partial(_tangent_space, problem), lambda *at: columns(*at), form)
-    return columns
+    make_templates = (
+        (lambda parameters, collocation_state: collocation_state),
+        (lambda parameters, solution_and_tangents: solution_and_tangents[0]),
+    )
+    compile_function = _make_compiler("columns", make_templates, system)
+    tangents = with_implicit_derivative(
+        functools.partial(_collocation_tangents, system),
+        lambda *at: tangents(*at),
+        compile_function,
+    )
+    return tangents
 
 
-def solve_cycle(
-    problem: Problem, parameters: Array, guess: Located | None
-) -> tuple[Located, tuple]:
+def solve_cycle_with_derivatives(
+    system: CollocationSystem, parameters: Array, guess: CollocationState | None
+) -> tuple[CollocationState, tuple]:
     """Search for the cycle of one wheel, differentiable in its parameters. The guess has no
     derivative."""
-    search = functools.partial(search_lanes, problem)
-    like = lambda parameters, now, *_: now
-    lanes = over_lanes(search, like, ("search", problem), problem.options.block)
-    find = one_wheel(functools.partial(in_stages, problem, lanes))
-    columns_of = _columns_of(problem)
+    search_problem = functools.partial(search_lanes, system)
+    make_template = lambda parameters, start, *_: start
+    batched_search = compile_batched(
+        search_problem, make_template, ("search", system), system.options.batch_size
+    )
+    search_one = unbatch(functools.partial(search_in_stages, system, batched_search))
+    tangents_of = _make_tangent_function(system)
 
     @jax.custom_jvp
-    def solve(parameters: Array, *guess: Located) -> tuple[Located, tuple]:
-        located, *other = find(parameters, *guess)
-        return located, tuple(other)
+    def solve_with_rule(
+        parameters: Array, *guess: CollocationState
+    ) -> tuple[CollocationState, tuple]:
+        collocation_state, *diagnostics = search_one(parameters, *guess)
+        return collocation_state, tuple(diagnostics)
 
-    @solve.defjvp
-    def rule(primals: tuple, tangents: tuple) -> tuple:
-        located, other = solve(*primals)
-        moved = push(columns_of(primals[0], located), tangents[0])
-        return (located, other), (moved, without_derivative(other))
+    @solve_with_rule.defjvp
+    def jvp_rule(primals: tuple, tangents: tuple) -> tuple:
+        collocation_state, diagnostics = solve_with_rule(*primals)
+        tangent = apply_jacobian(tangents_of(primals[0], collocation_state), tangents[0])
+        return (collocation_state, diagnostics), (tangent, zero_tangent(diagnostics))
 
-    return solve(parameters, *(() if guess is None else (guess,)))
+    return solve_with_rule(parameters, *(() if guess is None else (guess,)))
 
 
-def attach_monodromy(problem: Problem, matrix: Array, parameters: Array, located: Located) -> Array:
+def attach_monodromy(
+    system: CollocationSystem,
+    monodromy_value: Array,
+    parameters: Array,
+    collocation_state: CollocationState,
+) -> Array:
     """Return `monodromy_value` with the derivative of the monodromy matrix along the branch."""
-    alike = lambda parameters, known: parameters
-    form = _in_form("monodromy", (alike, alike), problem)
-    matrix_of = functools.partial(_monodromy, problem)
-    along = functools.partial(_slopes_of_monodromy, problem)
-    slopes_of = slopes_on_branch(matrix_of, _columns_of(problem), form, along=along)
+    make_template = lambda parameters, solution_and_tangents: parameters
+    compile_function = _make_compiler("monodromy", (make_template, make_template), system)
+    monodromy_of = functools.partial(_masked_monodromy, system)
+    tangents_of_monodromy = functools.partial(_monodromy_tangents, system)
+    jacobian_of = implicit_jacobian(
+        monodromy_of,
+        _make_tangent_function(system),
+        compile_function,
+        make_jacobian=tangents_of_monodromy,
+    )
 
     @jax.custom_jvp
-    def attach(matrix: Array, parameters: Array, located: Located) -> Array:
-        return matrix
+    def attach_with_rule(
+        monodromy_value: Array, parameters: Array, collocation_state: CollocationState
+    ) -> Array:
+        return monodromy_value
 
-    @attach.defjvp
-    def rule(primals: tuple, tangents: tuple) -> tuple:
-        return attach(*primals), push(slopes_of(*primals[1:]), tangents[1])
+    @attach_with_rule.defjvp
+    def jvp_rule(primals: tuple, tangents: tuple) -> tuple:
+        return attach_with_rule(*primals), apply_jacobian(jacobian_of(*primals[1:]), tangents[1])
 
-    return attach(matrix, parameters, located)
+    return attach_with_rule(monodromy_value, parameters, collocation_state)

@@ -14,155 +14,181 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from vrw_jax.cycles.attracting import slow_gaits
+from vrw_jax.cycles.attracting import find_slow_gaits
 from vrw_jax.cycles.by_walking import (
-    AbstractWalkingFinder,
-    SectionFinder,
-    WalkedCycle,
-    cycle_from,
-    finest,
-    gait_of,
-    of_steps,
-    walked_cycle,
-    where_walks_begin,
+    AbstractReturnMapFinder,
+    ReturnMapCycle,
+    ReturnMapFinder,
+    find_return_map_cycle,
+    make_cycle,
+    make_gait,
+    newton_tolerance,
+    prepare_search,
+    summarize_steps,
 )
 from vrw_jax.cycles.cycle import AbstractCycle
-from vrw_jax.cycles.finder import Gait, Measured, Values, leading, measured_of
+from vrw_jax.cycles.finder import (
+    Gait,
+    GaitMeasures,
+    Values,
+    measure_from_gait,
+    move_derivative_axis_first,
+)
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.models import (
     AbstractStep,
     AbstractWheel,
     UnilateralWheel,
-    step_lanes,
+    step_batch_with_jacobian,
 )
-from vrw_jax.numerics import Options, SectionCycle, in_batches, taken
-from vrw_jax.results import ON_GROUND
-from vrw_jax.walks import checked
+from vrw_jax.numerics import FixedPointResult, StepOptions, map_in_batches, take_rows
+from vrw_jax.results import UNILATERAL_DIFFERENTIABLE_NAMES
+from vrw_jax.walks import validate_arguments
 from vrw_jax.wheel import Outcome, WheelParams
-from vrw_jax.wording import traced
+from vrw_jax.wording import is_traced
 
-ITERATIONS, HALVINGS = 15, 6
+MAX_CONTACT_NEWTON_ITERATIONS, MAX_STEP_HALVINGS = 15, 6
 """Largest number of Newton iterations, and of halvings of a correction after which no step ends."""
 
-LOOSE, ROUGH = 1e-6, 1e-4
+FAR_STEP_TOLERANCE, NEAR_CORRECTION = 1e-6, 1e-4
 """Tolerance of the steps far from a gait, and the correction below which a state is near a gait."""
 
-CLEAR = 0.01
+CLEAR_CONVERGENCE_FACTOR = 0.01
 """Factor below the tolerance at which a correction is accepted without a second one."""
 
-SHAPES = (1, 8, 64, 512)
+GROUND_BATCH_SIZES = (1, 8, 64, 512)
 """Numbers of gaits that are read together. Each number is compiled once."""
 
 
-class GroundFinder(AbstractWalkingFinder):
+class UnilateralFinder(AbstractReturnMapFinder):
     """Finder with unilateral contact, with first derivatives, including those with respect to
     friction."""
 
     model: UnilateralWheel
-    shapes: tuple[int, ...] = eqx.field(static=True, default=SHAPES)
+    batch_sizes: tuple[int, ...] = eqx.field(static=True, default=GROUND_BATCH_SIZES)
 
-    of_cycle: ClassVar[tuple[str, ...]] = ("spectral_radius", "spectral_margin")
-    differentiable: ClassVar[tuple[str, ...]] = ON_GROUND
-    usual: ClassVar[tuple[str, ...]] = ON_GROUND
-    readable: ClassVar[tuple[str, ...]] = ON_GROUND
-    coexisting: ClassVar[bool] = True
+    cycle_measures: ClassVar[tuple[str, ...]] = ("spectral_radius", "spectral_margin")
+    differentiable_measures: ClassVar[tuple[str, ...]] = UNILATERAL_DIFFERENTIABLE_NAMES
+    default_measures: ClassVar[tuple[str, ...]] = UNILATERAL_DIFFERENTIABLE_NAMES
+    readable_measures: ClassVar[tuple[str, ...]] = UNILATERAL_DIFFERENTIABLE_NAMES
+    is_multistable: ClassVar[bool] = True
 
     @classmethod
-    def of(
-        cls, model: Any, n_legs: int, step: Options, period_n: int, cycle: CycleOptions
-    ) -> AbstractWalkingFinder:
+    def from_options(
+        cls,
+        model: Any,
+        n_legs: int,
+        step_options: StepOptions,
+        period_n: int,
+        cycle_options: CycleOptions,
+    ) -> AbstractReturnMapFinder:
         if model.restitution is not None:  # the batched engine has no restitution
-            return SectionFinder(model, n_legs, step, period_n)
-        return cls(model, n_legs, step, period_n)
+            return ReturnMapFinder(model, n_legs, step_options, period_n)
+        return cls(model, n_legs, step_options, period_n)
 
-    def cycle(self, params: WheelParams, guess: Any = None) -> WalkedCycle:
+    def find_cycle(self, params: WheelParams, guess: Any = None) -> ReturnMapCycle:
         """Return the cycle from the batched engine if all inputs are concrete, else from the step's
         own derivatives."""
-        params, x, model, options = where_walks_begin(self, params, guess)
-        if traced(params, x, model):
-            return walked_cycle(params, x, model, options, self.period_n, dear=True)
-        return jax.tree.map(lambda x: x[0], self.near(model.values(params)[None], x[None]))
+        params, x, model, options = prepare_search(self, params, guess)
+        if is_traced(params, x, model):
+            return find_return_map_cycle(
+                params, x, model, options, self.period_n, uses_jvp_rule=True
+            )
+        return jax.tree.map(
+            lambda x: x[0], self.find_cycles_near(model.parameter_values(params)[None], x[None])
+        )
 
-    def cycles(self, params: WheelParams, guess: Any = None) -> Any:
-        if traced(params, guess):
-            return eqx.filter_vmap(self.cycle)(params, guess)
-        values = jax.vmap(self.model.values)(params)
-        return self.near(values, _states(self.model, params, guess))
+    def find_cycles(self, params: WheelParams, guess: Any = None) -> Any:
+        if is_traced(params, guess):
+            return eqx.filter_vmap(self.find_cycle)(params, guess)
+        values = jax.vmap(self.model.parameter_values)(params)
+        return self.find_cycles_near(values, _full_section_states(self.model, params, guess))
 
-    def near(self, values: Any, states: Any) -> WalkedCycle:
+    def find_cycles_near(self, values: Any, states: Any) -> ReturnMapCycle:
         """Return the gaits near section states, one per wheel, without derivatives."""
-        return self._told(_cycle, values, states, by_values=False)
+        return self._solve_and_read(_make_cycle, values, states, with_parameter_derivatives=False)
 
-    def prepare(self, values: np.ndarray, states: np.ndarray) -> None:
+    def precompile_newton(self, values: np.ndarray, states: np.ndarray) -> None:
         """Compile the programs of Newton's method while another thread walks towards its start."""
-        maps = Periods(self.model, self.n_legs, self.period_n, values)
-        maps.around(self.step_options, states, False)
+        period_map = PeriodMap(self.model, self.n_legs, self.period_n, values)
+        period_map.evaluate_period(self.step_options, states, False)
 
-    def first_guess(self, values: Values) -> Array:
-        return _first(self.first_guesses(_alone(values)))
+    def initial_guess(self, values: Values) -> Array:
+        return _remove_batch_axis(self.initial_guesses(_add_batch_axis(values)))
 
-    def first_guesses(self, values: Array) -> Array:
+    def initial_guesses(self, values: Array) -> Array:
         """Return a slow attracting gait's section state for each wheel, NaN if there is none."""
-        gaits = slow_gaits(self, values)
-        found = np.asarray(gaits.outcome) == Outcome.STEPPED
-        return jax.device_put(np.where(found[:, None], gaits.section_state, np.nan))
+        gaits = find_slow_gaits(self, values)
+        is_found = np.asarray(gaits.outcome) == Outcome.STEPPED
+        return jax.device_put(np.where(is_found[:, None], gaits.section_state, np.nan))
 
-    def find(self, values: Values, guess: Array) -> Gait:
-        return _first(self.find_many(_alone(values), _alone(guess)))
+    def find_gait(self, values: Values, guess: Array) -> Gait:
+        return _remove_batch_axis(self.find_gaits(_add_batch_axis(values), _add_batch_axis(guess)))
 
-    def find_many(self, values: Array, guess: Any) -> Gait:
-        return self._told(_gait, values, getattr(guess, "section_state", guess), by_values=True)
+    def find_gaits(self, values: Array, guess: Any) -> Gait:
+        return self._solve_and_read(
+            _make_gait,
+            values,
+            getattr(guess, "section_state", guess),
+            with_parameter_derivatives=True,
+        )
 
-    def _told(self, one: Callable, values: Any, states: Any, by_values: bool) -> Any:
-        given = np.asarray(values), np.asarray(states), by_values
-        found = _newton(self.model, self.n_legs, self.step_options, self.period_n, *given)
-        told = functools.partial(_many, one, self.model, self.n_legs)
-        return in_batches(told, self.shapes, given[0], found)
+    def _solve_and_read(
+        self, read_wheel: Callable, values: Any, states: Any, with_parameter_derivatives: bool
+    ) -> Any:
+        arguments = np.asarray(values), np.asarray(states), with_parameter_derivatives
+        fixed_points = _find_fixed_points(
+            self.model, self.n_legs, self.step_options, self.period_n, *arguments
+        )
+        read_batch = functools.partial(_map_over_wheels, read_wheel, self.model, self.n_legs)
+        return map_in_batches(read_batch, self.batch_sizes, arguments[0], fixed_points)
 
-    def step(self, params: WheelParams, x: Array) -> AbstractStep:
-        columns, model = np.asarray(self.model.values(params))[:, None], self.model
-        given = columns, np.asarray(x)[None], model, self.step_options, self.n_legs
-        return _first(step_lanes(*given, ())[0])
+    def take_step(self, params: WheelParams, x: Array) -> AbstractStep:
+        value_columns, model = np.asarray(self.model.parameter_values(params))[:, None], self.model
+        arguments = value_columns, np.asarray(x)[None], model, self.step_options, self.n_legs
+        return _remove_batch_axis(step_batch_with_jacobian(*arguments, ())[0])
 
-    def measured(self, values: Values, guess: Any, names: tuple[str, ...]) -> Measured:
+    def measure_gait(self, values: Values, guess: Any, names: tuple[str, ...]) -> GaitMeasures:
         """Return measures and derivatives, as in the base class, from one Jacobian of the step."""
-        model, params = self.model.at(tuple(jax.device_put(list(np.asarray(values)))), self.n_legs)
+        model, params = self.model.from_values(
+            tuple(jax.device_put(list(np.asarray(values)))), self.n_legs
+        )
         start = guess.section_state if isinstance(guess, AbstractCycle) else guess
-        start = self.first_guess(values) if start is None else start
-        _, x, _, _ = checked(params, start, model, self.step_options)
-        return measured_of(self.find(values, x), type(self).read, names)
+        start = self.initial_guess(values) if start is None else start
+        _, x, _, _ = validate_arguments(params, start, model, self.step_options)
+        return measure_from_gait(self.find_gait(values, x), type(self).read_measure, names)
 
 
-def _alone(x: Array) -> Array:
+def _add_batch_axis(x: Array) -> Array:
     """Add a batch axis of length one, by numpy because JAX compiles a program for each shape."""
     return jax.device_put(np.asarray(x)[None])
 
 
-def _first(tree: Any) -> Any:
+def _remove_batch_axis(tree: Any) -> Any:
     """Return the first row of every leaf: the inverse of `_add_batch_axis`."""
-    return jax.device_put(taken(tree, 0))
+    return jax.device_put(take_rows(tree, 0))
 
 
-def _states(model: AbstractWheel, params: WheelParams, guess: Any) -> Array:
+def _full_section_states(model: AbstractWheel, params: WheelParams, guess: Any) -> Array:
     """Return full section states of each wheel from a user's guess."""
     x = getattr(guess, "section_state", guess)
     if x is None:
-        return jax.vmap(model.start)(params)
-    return jax.vmap(model.full_section)(params, jnp.asarray(x))
+        return jax.vmap(model.default_start)(params)
+    return jax.vmap(model.embed_section)(params, jnp.asarray(x))
 
 
-class _Found(NamedTuple):
+class _FixedPoints(NamedTuple):
     """Result of Newton's method; with a leading axis for many wheels."""
 
     x: Any  # section state
     steps: Any  # from that state, (period_n, ...)
-    moves: Any  # derivatives with respect to values and section state
+    step_jacobians: Any  # derivatives with respect to values and section state
     residual: Any
     converged: Any
-    iterations: Any
+    n_iterations: Any
 
 
-class Periods(NamedTuple):
+class PeriodMap(NamedTuple):
     """Map over one period of each wheel for Newton's method, evaluated by the batched engine
     outside jit."""
 
@@ -171,101 +197,133 @@ class Periods(NamedTuple):
     period_n: int
     values: np.ndarray  # (wheels, n_values)
 
-    def of(self, some: np.ndarray) -> "Periods":
-        return self._replace(values=self.values[some])
+    def select(self, indices: np.ndarray) -> "PeriodMap":
+        return self._replace(values=self.values[indices])
 
-    def around(
-        self, options: Options, x: np.ndarray, by_values: Any = True, by_start: bool = True
-    ) -> "Period":
+    def evaluate_period(
+        self, options: StepOptions, x: np.ndarray, value_mask: Any = True, start_mask: bool = True
+    ) -> "PeriodEvaluation":
         """Evaluate the period from `x`, with derivatives with respect to the masked values and the
         section state."""
-        told, (n, m) = [], (self.values.shape[1], x.shape[1])
-        along, good = np.concatenate([np.zeros((m, n)), np.eye(m)], 1)[None], np.ones(len(x), bool)
-        asked = np.concatenate([np.broadcast_to(by_values, n), np.broadcast_to(by_start, m)])
-        wanted = np.flatnonzero(asked).tolist()
-        for _ in range(self.period_n):
-            given = self.values.T, x, self.model, options, self.n_legs, wanted
-            told.append(step_lanes(*given))
-            step, moves = told[-1]
-            good &= np.asarray(step.outcome) == Outcome.STEPPED
-            x = np.asarray(step.section_state)
-            by = np.asarray(moves.section_state)
-            along = by[:, :, n:] @ along
-            along[:, :, :n] += by[:, :, :n]
-        steps, moved = (
-            jax.tree.map(lambda *leaves: np.stack(leaves, 1), *each)
-            for each in zip(*told, strict=True)
+        results, (n, m) = [], (self.values.shape[1], x.shape[1])
+        jacobian, is_valid = (
+            np.concatenate([np.zeros((m, n)), np.eye(m)], 1)[None],
+            np.ones(len(x), bool),
         )
-        return Period(steps, moved, x, along[:, :, :n], along[:, :, n:], good)
+        input_mask = np.concatenate(
+            [np.broadcast_to(value_mask, n), np.broadcast_to(start_mask, m)]
+        )
+        input_indices = np.flatnonzero(input_mask).tolist()
+        for _ in range(self.period_n):
+            arguments = self.values.T, x, self.model, options, self.n_legs, input_indices
+            results.append(step_batch_with_jacobian(*arguments))
+            step, step_jacobians = results[-1]
+            is_valid &= np.asarray(step.outcome) == Outcome.STEPPED
+            x = np.asarray(step.section_state)
+            step_jacobian = np.asarray(step_jacobians.section_state)
+            jacobian = step_jacobian[:, :, n:] @ jacobian
+            jacobian[:, :, :n] += step_jacobian[:, :, :n]
+        steps, stacked_jacobians = (
+            jax.tree.map(lambda *leaves: np.stack(leaves, 1), *pair)
+            for pair in zip(*results, strict=True)
+        )
+        return PeriodEvaluation(
+            steps, stacked_jacobians, x, jacobian[:, :, :n], jacobian[:, :, n:], is_valid
+        )
 
 
-class Period(NamedTuple):
+class PeriodEvaluation(NamedTuple):
     """Steps of one period, their Jacobians, the end state, its Jacobians, and which periods end."""
 
     steps: Any
-    moves: Any
-    image: np.ndarray
-    by_values: np.ndarray
-    by_start: np.ndarray
-    good: np.ndarray
+    step_jacobians: Any
+    end_state: np.ndarray
+    value_jacobian: np.ndarray
+    return_jacobian: np.ndarray
+    is_valid: np.ndarray
 
-    def change(self, x: np.ndarray, by_start: np.ndarray) -> np.ndarray:
+    def newton_correction(self, x: np.ndarray, return_jacobian: np.ndarray) -> np.ndarray:
         """Return Newton's correction of x; zeros where no period ends."""
-        change, good = np.zeros_like(x), self.good
-        matrix = np.eye(x.shape[1]) - by_start[good]
-        change[good] = solved(matrix, (self.image - x)[good][..., None])[..., 0]
-        return change
+        correction, is_valid = np.zeros_like(x), self.is_valid
+        matrix = np.eye(x.shape[1]) - return_jacobian[is_valid]
+        correction[is_valid] = solve_linear_systems(
+            matrix, (self.end_state - x)[is_valid][..., None]
+        )[..., 0]
+        return correction
 
 
-def solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+def solve_linear_systems(matrix: np.ndarray, right_sides: np.ndarray) -> np.ndarray:
     """Return `numpy.linalg.solve` of many systems. A singular one gives NaN instead of an error for
     all."""
     try:
-        return np.linalg.solve(matrix, right)
+        return np.linalg.solve(matrix, right_sides)
     except np.linalg.LinAlgError:
-        regular = np.abs(np.linalg.det(matrix)) > 0.0
-        one = np.where(regular[:, None, None], matrix, np.eye(matrix.shape[-1]))
-        return np.where(regular[:, None, None], np.linalg.solve(one, right), np.nan)
+        is_regular = np.abs(np.linalg.det(matrix)) > 0.0
+        regular_matrix = np.where(is_regular[:, None, None], matrix, np.eye(matrix.shape[-1]))
+        return np.where(
+            is_regular[:, None, None], np.linalg.solve(regular_matrix, right_sides), np.nan
+        )
 
 
-def _newton(
+def _find_fixed_points(
     model: Any,
     n_legs: int,
-    options: Options,
+    options: StepOptions,
     period_n: int,
     values: np.ndarray,
     start: np.ndarray,
-    by_values: bool,
-) -> _Found:
+    with_parameter_derivatives: bool,
+) -> _FixedPoints:
     """Return fixed points near `start`. Codes at the end of a section state are those of the image.
 
     The iteration uses loose steps until corrections are small. Then a step at the tolerance of
     `options` is taken with the same Jacobian. One more step, with all derivatives, yields the gait.
     If loose steps move away from a state that an exact one hardly changes, all steps are exact.
     """
-    maps = Periods(model, n_legs, period_n, values)
-    looser = [np.maximum(tolerance, LOOSE) for tolerance in (options.rtol, options.atol)]
-    loose = eqx.tree_at(lambda o: (o.rtol, o.atol), options, jax.device_put(looser))
-    tolerance, every = float(finest(options)), np.ones(len(values), bool)
-    rough, by_start = _corrected(maps, loose, start, False, ROUGH, every)
-    x, near = np.where(rough.converged[:, None], rough.x, start), rough.converged
-    exact = maps.around(options, x, False, False)
-    change = exact.change(x, by_start)
-    x[near] += change[near] * (np.abs(change[near]).max(-1, keepdims=True) < ROUGH)
-    near = near | (exact.good & (np.abs(exact.image - x).max(-1) < ROUGH))
-    told, _ = _corrected(maps, options, x, by_values, tolerance, near, ends=False)
-    return told._replace(iterations=rough.iterations + 1 + told.iterations)
+    period_map = PeriodMap(model, n_legs, period_n, values)
+    loose_tolerances = [
+        np.maximum(tolerance, FAR_STEP_TOLERANCE) for tolerance in (options.rtol, options.atol)
+    ]
+    loose_options = eqx.tree_at(
+        lambda o: (o.rtol, o.atol), options, jax.device_put(loose_tolerances)
+    )
+    tolerance, all_wheels = float(newton_tolerance(options)), np.ones(len(values), bool)
+    rough_solution, return_jacobian = _run_newton(
+        period_map, loose_options, start, False, NEAR_CORRECTION, all_wheels
+    )
+    x, is_near = (
+        np.where(rough_solution.converged[:, None], rough_solution.x, start),
+        rough_solution.converged,
+    )
+    exact_period = period_map.evaluate_period(options, x, False, False)
+    correction = exact_period.newton_correction(x, return_jacobian)
+    x[is_near] += correction[is_near] * (
+        np.abs(correction[is_near]).max(-1, keepdims=True) < NEAR_CORRECTION
+    )
+    is_near = is_near | (
+        exact_period.is_valid & (np.abs(exact_period.end_state - x).max(-1) < NEAR_CORRECTION)
+    )
+    solution, _ = _run_newton(
+        period_map,
+        options,
+        x,
+        with_parameter_derivatives,
+        tolerance,
+        is_near,
+        stops_at_small_correction=False,
+    )
+    return solution._replace(n_iterations=rough_solution.n_iterations + 1 + solution.n_iterations)
 
 
-def _corrected(
-    maps: Periods,
-    options: Options,
+def _run_newton(
+    period_map: PeriodMap,
+    options: StepOptions,
     start: np.ndarray,
-    by_values: bool,
+    with_parameter_derivatives: bool,
     tolerance: float,
-    wanted: np.ndarray,
-    ends: bool = True,
-) -> tuple[_Found, np.ndarray]:
+    is_wanted: np.ndarray,
+    stops_at_small_correction: bool = True,
+) -> tuple[_FixedPoints, np.ndarray]:
     """Run Newton's method on the `is_wanted` wheels until corrections are small; return the last
     Jacobians too.
 
@@ -274,85 +332,130 @@ def _corrected(
     at the corrected state. It also requires a period that repeats, because the map may jump between
     the two states where feet dip.
     """
-    wheels, n_legs = len(start), maps.n_legs
-    x, last = start.copy(), start.copy()
-    residual, count = np.full(wheels, np.inf), np.zeros(wheels, np.int32)
-    small, found, halved = (np.zeros(wheels, kind) for kind in (bool, bool, int))
-    by_start = np.zeros((wheels, start.shape[1], start.shape[1]))
-    open_, kept = np.arange(wheels), None
-    for _ in range(ITERATIONS + HALVINGS):
-        now = maps.of(open_).around(options, x[open_], by_values)
-        if kept is None:
-            kept = jax.tree.map(np.array, (now.steps, now.moves))
-        for old, new in zip(jax.tree.leaves(kept), jax.tree.leaves(now[:2]), strict=True):
-            old[open_] = new
-        change = now.change(x[open_], now.by_start)
-        size, good = np.abs(change).max(-1), now.good & np.isfinite(change).all(-1)
-        residual[open_] = np.abs(now.image - x[open_]).max(-1)
-        by_start[open_] = now.by_start
-        count[open_] += 1
-        fits = good & (size <= tolerance)
-        done = fits & (small[open_] | (size <= CLEAR * tolerance)) & (not ends)
-        small[open_] = fits
-        moving = open_[good & ~done]
-        last[moving], halved[moving] = x[moving], 0
-        x[moving] += change[good & ~done]
-        bad = open_[~good]
-        x[bad], halved[bad] = 0.5 * (x[bad] + last[bad]), halved[bad] + 1
-        x[bad, -n_legs:] = last[bad, -n_legs:]
-        found[open_] = wanted[open_] & (small[open_] if ends else done)
-        lost = (halved > HALVINGS) | (count > ITERATIONS) | ~wanted
-        open_ = open_[~found[open_] & ~lost[open_]]
-        if not len(open_):
+    n_wheels, n_legs = len(start), period_map.n_legs
+    x, last_x = start.copy(), start.copy()
+    residual, n_iterations = np.full(n_wheels, np.inf), np.zeros(n_wheels, np.int32)
+    is_small, is_found, n_halvings = (np.zeros(n_wheels, dtype) for dtype in (bool, bool, int))
+    return_jacobian = np.zeros((n_wheels, start.shape[1], start.shape[1]))
+    active, stored = np.arange(n_wheels), None
+    for _ in range(MAX_CONTACT_NEWTON_ITERATIONS + MAX_STEP_HALVINGS):
+        period = period_map.select(active).evaluate_period(
+            options, x[active], with_parameter_derivatives
+        )
+        if stored is None:
+            stored = jax.tree.map(np.array, (period.steps, period.step_jacobians))
+        for stored_leaf, new_leaf in zip(
+            jax.tree.leaves(stored), jax.tree.leaves(period[:2]), strict=True
+        ):
+            stored_leaf[active] = new_leaf
+        correction = period.newton_correction(x[active], period.return_jacobian)
+        correction_size, is_valid = (
+            np.abs(correction).max(-1),
+            period.is_valid & np.isfinite(correction).all(-1),
+        )
+        residual[active] = np.abs(period.end_state - x[active]).max(-1)
+        return_jacobian[active] = period.return_jacobian
+        n_iterations[active] += 1
+        is_small_now = is_valid & (correction_size <= tolerance)
+        is_done = (
+            is_small_now
+            & (is_small[active] | (correction_size <= CLEAR_CONVERGENCE_FACTOR * tolerance))
+            & (not stops_at_small_correction)
+        )
+        is_small[active] = is_small_now
+        moving_indices = active[is_valid & ~is_done]
+        last_x[moving_indices], n_halvings[moving_indices] = x[moving_indices], 0
+        x[moving_indices] += correction[is_valid & ~is_done]
+        bad_indices = active[~is_valid]
+        x[bad_indices], n_halvings[bad_indices] = (
+            0.5 * (x[bad_indices] + last_x[bad_indices]),
+            n_halvings[bad_indices] + 1,
+        )
+        x[bad_indices, -n_legs:] = last_x[bad_indices, -n_legs:]
+        is_found[active] = is_wanted[active] & (
+            is_small[active] if stops_at_small_correction else is_done
+        )
+        is_lost = (
+            (n_halvings > MAX_STEP_HALVINGS)
+            | (n_iterations > MAX_CONTACT_NEWTON_ITERATIONS)
+            | ~is_wanted
+        )
+        active = active[~is_found[active] & ~is_lost[active]]
+        if not len(active):
             break
-    assert kept is not None
-    return _Found(x, kept[0], kept[1], residual, found, count), by_start
+    assert stored is not None
+    return _FixedPoints(x, stored[0], stored[1], residual, is_found, n_iterations), return_jacobian
 
 
 @eqx.filter_jit
-def _many(one: Callable, model: AbstractWheel, n_legs: int, values: Array, found: _Found) -> Any:
-    return eqx.filter_vmap(lambda values, found: one(model, n_legs, values, found))(values, found)
+def _map_over_wheels(
+    read_wheel: Callable,
+    model: AbstractWheel,
+    n_legs: int,
+    values: Array,
+    fixed_points: _FixedPoints,
+) -> Any:
+    return eqx.filter_vmap(
+        lambda values, fixed_points: read_wheel(model, n_legs, values, fixed_points)
+    )(values, fixed_points)
 
 
-def _by_section(found: _Found, n: int) -> Array:
-    by_section = jnp.eye(found.x.shape[0], dtype=found.x.dtype)
-    for jacobian in found.moves.section_state:
-        by_section = jacobian[:, n:] @ by_section
-    return by_section
+def _return_jacobian(fixed_points: _FixedPoints, n_values: int) -> Array:
+    return_jacobian = jnp.eye(fixed_points.x.shape[0], dtype=fixed_points.x.dtype)
+    for jacobian in fixed_points.step_jacobians.section_state:
+        return_jacobian = jacobian[:, n_values:] @ return_jacobian
+    return return_jacobian
 
 
-def _cycle(model: AbstractWheel, n_legs: int, values: Array, found: _Found) -> WalkedCycle:
-    told = found.residual, found.converged, found.iterations
-    params = model.at(values, n_legs)[1]
-    located = SectionCycle(found.x, _by_section(found, len(values)), *told)
-    return cycle_from(params, located, found.steps)
+def _make_cycle(
+    model: AbstractWheel, n_legs: int, values: Array, fixed_points: _FixedPoints
+) -> ReturnMapCycle:
+    diagnostics = fixed_points.residual, fixed_points.converged, fixed_points.n_iterations
+    params = model.from_values(values, n_legs)[1]
+    fixed_point = FixedPointResult(
+        fixed_points.x, _return_jacobian(fixed_points, len(values)), *diagnostics
+    )
+    return make_cycle(params, fixed_point, fixed_points.steps)
 
 
-def _gait(model: AbstractWheel, n_legs: int, values: Array, found: _Found) -> Gait:
-    n, one = values.shape[0], jnp.eye(found.x.shape[0], dtype=found.x.dtype)
-    by_values, by_section = jnp.zeros((len(one), n), one.dtype), _by_section(found, n)
-    for jacobian in found.moves.section_state:
-        by_values = jacobian[:, :n] + jacobian[:, n:] @ by_values
-    regular = jnp.where(found.converged, one - by_section, one)
-    moved = jnp.linalg.solve(regular, by_values)
+def _make_gait(
+    model: AbstractWheel, n_legs: int, values: Array, fixed_points: _FixedPoints
+) -> Gait:
+    n_values, identity = (
+        values.shape[0],
+        jnp.eye(fixed_points.x.shape[0], dtype=fixed_points.x.dtype),
+    )
+    value_jacobian, return_jacobian = (
+        jnp.zeros((len(identity), n_values), identity.dtype),
+        _return_jacobian(fixed_points, n_values),
+    )
+    for jacobian in fixed_points.step_jacobians.section_state:
+        value_jacobian = jacobian[:, :n_values] + jacobian[:, n_values:] @ value_jacobian
+    newton_matrix = jnp.where(fixed_points.converged, identity - return_jacobian, identity)
+    d_section_state = jnp.linalg.solve(newton_matrix, value_jacobian)
 
-    here, d_steps = moved, []
-    for k in range(len(found.moves.section_state)):
-        follow = jnp.concatenate([jnp.eye(n, dtype=one.dtype), here])
-        along = jax.tree.map(lambda leaf, k=k, follow=follow: leaf[k] @ follow, found.moves)
-        d_steps.append(leading(along))
-        here = along.section_state
+    d_state, d_steps = d_section_state, []
+    for step_index in range(len(fixed_points.step_jacobians.section_state)):
+        input_tangents = jnp.concatenate([jnp.eye(n_values, dtype=identity.dtype), d_state])
+        step_tangents = jax.tree.map(
+            lambda leaf, step_index=step_index, input_tangents=input_tangents: (
+                leaf[step_index] @ input_tangents
+            ),
+            fixed_points.step_jacobians,
+        )
+        d_steps.append(move_derivative_axis_first(step_tangents))
+        d_state = step_tangents.section_state
     d_step = jax.tree.map(lambda *leaves: jnp.stack(leaves, 1), *d_steps)
 
-    cycle = _cycle(model, n_legs, values, found)
+    cycle = _make_cycle(model, n_legs, values, fixed_points)
     # The derivative of the Jacobian is unknown: measures of it are not in `differentiable`.
-    floating = eqx.filter(cycle, eqx.is_inexact_array)
-    still = jax.tree.map(lambda x: jnp.zeros((n, *x.shape), x.dtype), floating)
+    float_fields = eqx.filter(cycle, eqx.is_inexact_array)
+    zero_tangents = jax.tree.map(lambda x: jnp.zeros((n_values, *x.shape), x.dtype), float_fields)
     d_cycle = eqx.tree_at(
         lambda c: (c.section_state, c.steps, c.post_impact, c.durations, c.step_length),
-        still,
-        (moved.T, d_step, *jax.vmap(of_steps)(d_step)),
+        zero_tangents,
+        (d_section_state.T, d_step, *jax.vmap(summarize_steps)(d_step)),
     )
-    first = jax.tree.map(lambda leaf: leaf[0], found.steps)
-    d_first = jax.tree.map(lambda leaf: leaf[:, 0], d_step)
-    return gait_of(model, n_legs, cycle, first, d_cycle, d_first)
+    first_step = jax.tree.map(lambda leaf: leaf[0], fixed_points.steps)
+    d_first_step = jax.tree.map(lambda leaf: leaf[:, 0], d_step)
+    return make_gait(model, n_legs, cycle, first_step, d_cycle, d_first_step)

@@ -5,7 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.wording import positive, shown, whole
+from vrw_jax.wording import check_int, check_positive, format_value
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,28 +27,36 @@ class CycleOptions:
         (20, 16, 6)
     """
 
-    steps: tuple[int, int, int] = (10, 8, 3)
-    growth: float = 2.0
+    mesh_intervals: tuple[int, int, int] = (10, 8, 3)
+    mesh_grading: float = 2.0
     tolerance: float = 1e-10
-    iterations: int = 12
-    first_iterations: int = 4
-    stages: int = 12
-    block: int = 64
+    max_newton_iterations: int = 12
+    first_newton_iterations: int = 4
+    homotopy_steps: int = 12
+    batch_size: int = 64
 
     def __post_init__(self) -> None:
-        for name in ("iterations", "first_iterations", "stages", "block"):
-            whole(name, getattr(self, name))
-        for name in ("growth", "tolerance"):
-            positive(name, getattr(self, name))
-        if not isinstance(self.steps, tuple | list) or len(self.steps) != 3:
+        for name in (
+            "max_newton_iterations",
+            "first_newton_iterations",
+            "homotopy_steps",
+            "batch_size",
+        ):
+            check_int(name, getattr(self, name))
+        for name in ("mesh_grading", "tolerance"):
+            check_positive(name, getattr(self, name))
+        if not isinstance(self.mesh_intervals, tuple | list) or len(self.mesh_intervals) != 3:
             raise ValueError(
-                f"steps is {shown(self.steps)}, but it counts the steps in DLS, SLS-I and SLS-II: "
+                f"mesh_intervals is {format_value(self.mesh_intervals)}, but it counts the intervals in "
+                "DLS, SLS-I and SLS-II: "
                 "give three whole numbers of at least 1, as (10, 8, 3)."
             )
-        steps = tuple(whole(f"steps[{i}]", count) for i, count in enumerate(self.steps))
-        object.__setattr__(self, "steps", steps)
+        mesh_intervals = tuple(
+            check_int(f"mesh_intervals[{i}]", count) for i, count in enumerate(self.mesh_intervals)
+        )
+        object.__setattr__(self, "mesh_intervals", mesh_intervals)
 
-    def require_reachable(self, dtype: np.dtype) -> None:
+    def check_tolerances(self, dtype: np.dtype) -> None:
         """Raise a ValueError if the tolerance is below the resolution of the number format."""
         if self.tolerance < jnp.finfo(dtype).eps:
             raise ValueError(
@@ -56,13 +64,13 @@ class CycleOptions:
                 f"to {self.tolerance:g}: call vrw.start_jax() before WheelParams are made."
             )
 
-    def finer(self) -> "CycleOptions":
+    def refine_mesh(self) -> "CycleOptions":
         """Return the options with a mesh about twice as fine."""
-        dls, sls1, sls2 = self.steps
-        return dataclasses.replace(self, steps=(2 * dls, 2 * sls1, max(2 * sls2, sls1)))
+        dls, sls1, sls2 = self.mesh_intervals
+        return dataclasses.replace(self, mesh_intervals=(2 * dls, 2 * sls1, max(2 * sls2, sls1)))
 
     @classmethod
     def tight(cls) -> "CycleOptions":
         """Return options that are accurate to about 1e-12 in values and 1e-10 in first
         derivatives."""
-        return cls(steps=(16, 20, 4), tolerance=1e-13)
+        return cls(mesh_intervals=(16, 20, 4), tolerance=1e-13)

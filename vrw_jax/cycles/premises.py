@@ -2,19 +2,19 @@
 
 from collections.abc import Mapping
 
-from vrw_jax.numerics import Elementwise, Passage
+from vrw_jax.numerics import Elementwise, PhasePassage
 from vrw_jax.results import MEASURES
 from vrw_jax.wheel import Motion, Symbols, WheelParams, dynamics
-from vrw_jax.wording import instance
+from vrw_jax.wording import check_type
 
 
-def takeoff_acceleration(s: Symbols, sls1: Passage) -> Elementwise:
+def gait_takeoff_acceleration(s: Symbols, sls1: PhasePassage) -> Elementwise:
     """Return the rear foot's acceleration at the start of a gait's passage through SLS-I, m/s^2;
     see `dynamics`."""
-    return dynamics.takeoff_acceleration(s, Motion.of(*sls1.start.q, *sls1.start.v))
+    return dynamics.takeoff_acceleration(s, Motion.from_angle(*sls1.start.q, *sls1.start.v))
 
 
-PREMISES: tuple[str, ...] = (
+MARGIN_NAMES: tuple[str, ...] = (
     "fore_foot_force",
     "takeoff_acceleration",
     "clearance_sls1",
@@ -29,7 +29,7 @@ PREMISES: tuple[str, ...] = (
 )
 """Margins on forces, clearances and indicators that gaits of this model can keep."""
 
-SHARE = 1e-3
+DEFAULT_MARGIN_SHARE = 1e-3
 """Default least value of a margin, as a share of the wheel's weight, leg length or gravity."""
 
 
@@ -53,15 +53,15 @@ def default_margins(params: WheelParams) -> Mapping[str, float]:
         >>> round(vrw.default_margins(vrw.WheelParams())["lambda_4_plus"], 3)
         0.177
     """
-    instance("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
-    params.require_one("take one after the other")
+    check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
+    params.require_single("take one after the other")
     mass = float(params.hub_mass + params.n_legs * params.leg_mass)
     length, gravity = float(params.locked_length), float(params.gravity)
-    natural = {
+    unit_scales = {
         "N": mass * gravity,
         "m": length,
         "m/s^2": gravity,
         "N s": mass * (gravity * length) ** 0.5,
         "1": 1.0,
     }
-    return {name: SHARE * natural[MEASURES[name].unit] for name in PREMISES}
+    return {name: DEFAULT_MARGIN_SHARE * unit_scales[MEASURES[name].unit] for name in MARGIN_NAMES}

@@ -6,14 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vrw_jax.cycles.finding import Guess, finder_for, near, serving
+from vrw_jax.cycles.finding import Guess, check_guess, resolve_finder, resolve_model
 from vrw_jax.cycles.options import CycleOptions
-from vrw_jax.numerics import Options
+from vrw_jax.numerics import StepOptions
 from vrw_jax.results import MEASURES
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.walks import ModelLike
 from vrw_jax.wheel import Outcome, WheelParams
-from vrw_jax.wording import names_of, nearest, untraced
+from vrw_jax.wording import check_names, check_not_traced, suggest_name
 
 
 def sensitivities(
@@ -22,7 +22,7 @@ def sensitivities(
     measures: Sequence[str] | None = None,
     guess: Guess | None = None,
     model: ModelLike | None = None,
-    options: CycleOptions | Options | None = None,
+    options: CycleOptions | StepOptions | None = None,
 ) -> xr.Dataset:
     """Return d(measure)/d(parameter) of one gait, with elasticities and the values of the measures.
 
@@ -49,27 +49,27 @@ def sensitivities(
         >>> round(float(table.elasticity.sel(measure="speed", parameter="slope")), 3)
         1.887
     """
-    untraced("vrw.sensitivities", "differentiate vrw.limit_cycle", params, guess)
-    model = serving(params, model)
-    finder = finder_for(params, model, options)
-    names = finder.usual if measures is None else names_of("measures", measures)
-    unknown = sorted(set(names) - set(finder.differentiable))
-    if unknown or not names:
+    check_not_traced("vrw.sensitivities", "differentiate vrw.limit_cycle", params, guess)
+    model = resolve_model(params, model)
+    finder = resolve_finder(params, model, options)
+    names = finder.default_measures if measures is None else check_names("measures", measures)
+    unknown_names = sorted(set(names) - set(finder.differentiable_measures))
+    if unknown_names or not names:
         raise ValueError(
-            f"measures holds {', '.join(unknown) or 'nothing'}"
-            f"{nearest(unknown[0], finder.differentiable) if unknown else ''}, "
+            f"measures holds {', '.join(unknown_names) or 'nothing'}"
+            f"{suggest_name(unknown_names[0], finder.differentiable_measures) if unknown_names else ''}, "
             "but the measures of a cycle are "
-            f"{', '.join(finder.differentiable)}: choose among these."
+            f"{', '.join(finder.differentiable_measures)}: choose among these."
         )
-    vector = finder.model.values(params)
-    found = finder.measured(vector, near(guess), names)
-    if int(found.outcome) != Outcome.STEPPED:
-        outcome = Outcome(int(found.outcome))
+    values = finder.model.parameter_values(params)
+    result = finder.measure_gait(values, check_guess(guess), names)
+    if int(result.outcome) != Outcome.STEPPED:
+        outcome = Outcome(int(result.outcome))
         raise ValueError(f"there is no gait to differentiate: {outcome.meaning}")
-    derivative, value = np.asarray(found.slopes), np.asarray(found.values)
+    derivative, value = np.asarray(result.jacobian), np.asarray(result.values)
     with np.errstate(divide="ignore", invalid="ignore"):
-        elasticity = derivative * np.asarray(vector) / value[:, None]
-    axes, moved = ("measure", "parameter"), finder.model.parameter_names
+        elasticity = derivative * np.asarray(values) / value[:, None]
+    axes, parameter_names = ("measure", "parameter"), finder.model.parameter_names
     return xr.Dataset(
         {
             "value": ("measure", value),
@@ -80,9 +80,9 @@ def sensitivities(
                 {"long_name": "relative change of measure per relative change of parameter"},
             ),
             "measure_unit": ("measure", [MEASURES[name].unit for name in names]),
-            "parameter_unit": ("parameter", [MEASURES[name].unit for name in moved]),
-            "parameter_value": ("parameter", np.asarray(vector)),
+            "parameter_unit": ("parameter", [MEASURES[name].unit for name in parameter_names]),
+            "parameter_value": ("parameter", np.asarray(values)),
         },
-        coords={"measure": list(names), "parameter": list(moved)},
-        attrs={"rung": finder.model.rung},
+        coords={"measure": list(names), "parameter": list(parameter_names)},
+        attrs={"rung": finder.model.model_name},
     )

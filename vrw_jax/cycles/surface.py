@@ -18,16 +18,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from vrw_jax.numerics import N_NODES, Elementwise, Mesh, Solution, transfer_matrix
+from vrw_jax.numerics import (
+    N_GAUSS_NODES,
+    CollocationSolution,
+    Elementwise,
+    PhaseMesh,
+    mesh_transfer_matrix,
+)
 from vrw_jax.wheel import WheelParams
 
-MESHES = (Mesh(2, 1.0), Mesh(4, 2.0), Mesh(1, 1.0))
+SURFACE_MESHES = (PhaseMesh(2, 1.0), PhaseMesh(4, 2.0), PhaseMesh(1, 1.0))
 """Meshes of the surface's accelerations, for DLS, SLS-I and SLS-II."""
-DIMENSIONS = (1, 3, 2)
-DEGREE = 3
+PHASE_DIMENSIONS = (1, 3, 2)
+SURFACE_DEGREE = 3
 
 
-class Surface(NamedTuple):
+class GaitSurface(NamedTuple):
     """Coefficients (monomial, unknown) over centered coordinates, and the range of the
     coordinates."""
 
@@ -39,66 +45,72 @@ class Surface(NamedTuple):
 
 
 @functools.cache
-def stored_surface() -> Surface:
+def load_surface() -> GaitSurface:
     file = importlib.resources.files(__package__) / "surface.npz"
     with file.open("rb") as stream, np.load(stream) as arrays:
-        return Surface(**{name: arrays[name] for name in Surface._fields})
+        return GaitSurface(**{name: arrays[name] for name in GaitSurface._fields})
 
 
-def pace(params: WheelParams) -> Elementwise:
+def time_unit(params: WheelParams) -> Elementwise:
     """Return the wheel's unit of time, sqrt(L0 / g), s."""
     return jnp.sqrt(params.locked_length / params.gravity)
 
 
-def coordinates(params: WheelParams) -> tuple[Elementwise, ...]:
+def surface_coordinates(params: WheelParams) -> tuple[Elementwise, ...]:
     """Return the root of damping, stiffness, natural length and slope, unitless."""
     mass = params.hub_mass + params.n_legs * params.leg_mass
     length, gravity = params.locked_length, params.gravity
     return (
-        jnp.sqrt(params.damping * pace(params) / mass),
+        jnp.sqrt(params.damping * time_unit(params) / mass),
         params.stiffness * length / (mass * gravity),
         params.natural_length / length,
         params.slope,
     )
 
 
-def monomials(centred: tuple[Elementwise, ...]) -> list[Elementwise]:
-    one = jnp.ones_like(centred[0])
+def evaluate_monomials(centered: tuple[Elementwise, ...]) -> list[Elementwise]:
+    ones = jnp.ones_like(centered[0])
     return [
-        functools.reduce(operator.mul, factors, one)
-        for degree in range(DEGREE + 1)
-        for factors in itertools.combinations_with_replacement(centred, degree)
+        functools.reduce(operator.mul, factors, ones)
+        for degree in range(SURFACE_DEGREE + 1)
+        for factors in itertools.combinations_with_replacement(centered, degree)
     ]
 
 
-def gait_on_surface(params: WheelParams, meshes: tuple[Mesh, ...]) -> Solution:
+def predict_gait(params: WheelParams, meshes: tuple[PhaseMesh, ...]) -> CollocationSolution:
     """Return section, durations and accelerations on `meshes` of the surface's gait, with lanes
     last."""
-    fit = stored_surface()
-    numbers = (x.tolist() for x in fit[:4])  # Python floats preserve the dtype of the parameters
-    centred = tuple(
-        (jnp.clip(x, low, high) - centre) / spread
-        for x, centre, spread, low, high in zip(coordinates(params), *numbers, strict=True)
+    surface = load_surface()
+    ranges = (x.tolist() for x in surface[:4])  # Python floats preserve the dtype of the parameters
+    centered = tuple(
+        (jnp.clip(x, lower, upper) - center) / spread
+        for x, center, spread, lower, upper in zip(
+            surface_coordinates(params), *ranges, strict=True
+        )
     )
-    features = jnp.stack(monomials(centred))
-    values = jnp.tensordot(jnp.asarray(fit.coefficients.T, features.dtype), features, 1)
-    unit = pace(params)
-    section = jnp.stack([values[0], values[1] / unit])
-    durations = values[None, 2:5] * unit
-    accelerations, first = [], 5
-    for dim, own, mesh in zip(DIMENSIONS, MESHES, meshes, strict=True):
-        size = own.n_steps * N_NODES * dim
-        flat = values[first : first + size].reshape(-1, dim, *features.shape[1:])
-        first += size
-        matrix = jnp.asarray(transfer_matrix(own, mesh), features.dtype)
-        scale = _acceleration_scale(dim, params, unit)
-        moved = jnp.tensordot(matrix, flat, 1) * scale
-        accelerations.append(moved.reshape(1, mesh.n_steps, N_NODES, *moved.shape[1:]))
-    return Solution(section, durations, tuple(accelerations))
+    features = jnp.stack(evaluate_monomials(centered))
+    values = jnp.tensordot(jnp.asarray(surface.coefficients.T, features.dtype), features, 1)
+    time_scale = time_unit(params)
+    section = jnp.stack([values[0], values[1] / time_scale])
+    durations = values[None, 2:5] * time_scale
+    accelerations, start_index = [], 5
+    for dim, surface_mesh, mesh in zip(PHASE_DIMENSIONS, SURFACE_MESHES, meshes, strict=True):
+        size = surface_mesh.n_intervals * N_GAUSS_NODES * dim
+        flat = values[start_index : start_index + size].reshape(-1, dim, *features.shape[1:])
+        start_index += size
+        matrix = jnp.asarray(mesh_transfer_matrix(surface_mesh, mesh), features.dtype)
+        scale = _acceleration_scale(dim, params, time_scale)
+        phase_accelerations = jnp.tensordot(matrix, flat, 1) * scale
+        accelerations.append(
+            phase_accelerations.reshape(
+                1, mesh.n_intervals, N_GAUSS_NODES, *phase_accelerations.shape[1:]
+            )
+        )
+    return CollocationSolution(section, durations, tuple(accelerations))
 
 
-def _acceleration_scale(dim: int, params: WheelParams, unit: Elementwise) -> Array:
+def _acceleration_scale(dim: int, params: WheelParams, time_scale: Elementwise) -> Array:
     """Return the units of the accelerations of (theta, L1, L2)."""
-    angle = 1.0 / unit**2
-    length = params.locked_length / unit**2
-    return jnp.stack([angle, length, length][:dim])
+    angle_scale = 1.0 / time_scale**2
+    length_scale = params.locked_length / time_scale**2
+    return jnp.stack([angle_scale, length_scale, length_scale][:dim])

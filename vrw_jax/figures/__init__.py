@@ -2,7 +2,15 @@
 
 from vrw_jax.figures.branch import basin_figure, branch_figure
 from vrw_jax.figures.scan import map_figure, scan_figures
-from vrw_jax.figures.style import GREY, LEG_1, LEG_2, LIGHT, PAGE, figure_style, save
+from vrw_jax.figures.style import (
+    DARK_GRAY,
+    LEG_1_COLOR,
+    LEG_2_COLOR,
+    LIGHT_GRAY,
+    PAGE_WIDTH_INCHES,
+    figure_style,
+    save,
+)
 from vrw_jax.figures.tuning import tuning_figure
 from vrw_jax.figures.walk import (
     foot_height,

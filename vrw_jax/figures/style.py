@@ -21,16 +21,16 @@ from matplotlib.patches import Patch
 
 from vrw_jax.results import MEASURES
 from vrw_jax.wheel import Outcome
-from vrw_jax.wording import as_tex, instance
+from vrw_jax.wording import check_type, format_mathtext
 
 BLUE, ORANGE, GREEN, PINK, SKY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9"
 AMBER, YELLOW = "#E69F00", "#F0E442"
 """Colors of Okabe and Ito."""
 
-LEG_1, LEG_2, GREY, LIGHT = BLUE, ORANGE, "#555555", "#E9E9E9"
+LEG_1_COLOR, LEG_2_COLOR, DARK_GRAY, LIGHT_GRAY = BLUE, ORANGE, "#555555", "#E9E9E9"
 """Colors of the two legs, and two grays."""
 
-STYLE: dict[Any, Any] = {
+MATPLOTLIB_STYLE: dict[Any, Any] = {
     "font.family": "serif",
     "font.serif": ["STIXGeneral"],  # included in matplotlib
     "mathtext.fontset": "stix",
@@ -57,10 +57,10 @@ STYLE: dict[Any, Any] = {
 }
 """Settings of matplotlib: a serif font as in the journal, without fonts of the system."""
 
-COLUMN, PAGE = 3.4, 6.9
+COLUMN_WIDTH_INCHES, PAGE_WIDTH_INCHES = 3.4, 6.9
 """Widths of one column and of the page, in inches."""
 
-OUTCOMES: dict[Outcome, tuple[str, str]] = {
+OUTCOME_STYLES: dict[Outcome, tuple[str, str]] = {
     Outcome.STEPPED: ("stable limit cycle", BLUE),
     Outcome.TOUCHDOWN_BEFORE_STOPPER: ("touchdown before stopper", AMBER),
     Outcome.STOPPER_IN_DOUBLE_SUPPORT: ("stopper in DLS", GREEN),
@@ -68,21 +68,21 @@ OUTCOMES: dict[Outcome, tuple[str, str]] = {
     Outcome.COLLAPSED: ("collapsed", ORANGE),
     Outcome.LEG_1_LIFTED_OFF: ("Leg 1 lifted off", PINK),
     Outcome.NO_TOUCHDOWN_IN_TIME: ("no touchdown in time", "#999933"),
-    Outcome.SOLVER_GAVE_UP: ("solver gave up", "#7A1F7B"),
+    Outcome.SOLVER_FAILED: ("solver gave up", "#7A1F7B"),
     Outcome.BAD_INPUT: ("bad input", "#000000"),
     Outcome.NO_CYCLE_FOUND: ("no cycle found", "#DDDDDD"),
     Outcome.TOO_MANY_EVENTS: ("too many events", "#332288"),
     Outcome.NO_ADMISSIBLE_CONTACT: ("no admissible contact", "#661100"),
     Outcome.THREE_FEET_LOADED: ("three feet loaded", "#3B8FBB"),
     Outcome.MESH_TOO_COARSE: ("mesh too coarse", "#646464"),
-    Outcome.ORDER_DIFFERS: ("other order of events", "#BABABA"),
-    Outcome.BORDER_ON_THE_WAY: ("border on the way", "#454545"),
-    Outcome.FRICTION_PARADOX: ("friction paradox", "#862DB8"),
+    Outcome.EVENT_ORDER_MISMATCH: ("other order of events", "#BABABA"),
+    Outcome.BRANCH_ENDS_BEFORE_TARGET: ("border on the way", "#454545"),
+    Outcome.PAINLEVE_PARADOX: ("friction paradox", "#862DB8"),
 }
 """Label and color of each outcome."""
-DASHES = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 3)))
+LINE_STYLES = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 3)))
 """Line styles of special points, of which `BORDER_NAMES_BY_COLOR` gives the index."""
-KINDS = {
+BORDER_NAMES_BY_COLOR = {
     "black": ("fold", "period_doubling", "neimark_sacker", "branch_point"),
     BLUE: ("lambda_2_plus", "lambda_4_plus", "lambda_I4", "fore_foot_force"),
     GREEN: ("clearance_sls1", "clearance_sls2", "", "", "", "takeoff_acceleration"),
@@ -96,9 +96,9 @@ KINDS = {
 }  # fmt: skip
 """Names of special points by color; the index of a name gives its line style, the same in every
 figure. Green and pink, which some eyes cannot distinguish, share no line style."""
-NOT_COMPUTED = ("not computed", "#FFFFFF")
+NOT_COMPUTED_STYLE = ("not computed", "#FFFFFF")
 """Label and color of a sample that is not computed."""
-UNSTABLE = 100
+UNSTABLE_CODE = 100
 """Code of a cycle whose spectral radius is 1 or more, in addition to the codes of `Outcome`."""
 
 
@@ -114,7 +114,7 @@ def figure_style() -> Iterator[None]:
         >>> with vrw.plot.figure_style():
         ...     figure = vrw.plot.draw_sticks(gait)
     """
-    with mpl.rc_context(STYLE):
+    with mpl.rc_context(MATPLOTLIB_STYLE):
         yield
 
 
@@ -146,91 +146,111 @@ def save(figure: Figure, folder: Path, name: str) -> list[Path]:
     return paths
 
 
-def drawable(name: str, data: Any, needed: Sequence[str], advice: str) -> None:
+def require_variables(name: str, data: Any, needed_names: Sequence[str], advice: str) -> None:
     """Raise unless `data` is a dataset that holds the needed variables or attributes."""
-    instance(name, data, xr.Dataset, advice)
-    missing = [one for one in needed if one not in data.variables and one not in data.attrs]
+    check_type(name, data, xr.Dataset, advice)
+    missing = [
+        variable
+        for variable in needed_names
+        if variable not in data.variables and variable not in data.attrs
+    ]
     if missing:
         raise ValueError(f"{name} holds no {missing[0]!r}, which is to be drawn: {advice}.")
 
 
-def all_drawable(name: str, several: Any, needed: Sequence[str], advice: str) -> None:
+def require_variables_of_all(
+    name: str, datasets: Any, needed_names: Sequence[str], advice: str
+) -> None:
     """Raise unless `several` is a nonempty list of datasets that hold the needed variables."""
-    instance(name, several, (list, tuple), f"{advice}, several in a list")
-    if not several:
+    check_type(name, datasets, (list, tuple), f"{advice}, several in a list")
+    if not datasets:
         raise ValueError(f"{name} is empty, but something is to be drawn: {advice}.")
-    for i, data in enumerate(several):
-        drawable(f"{name}[{i}]", data, needed, advice)
+    for i, data in enumerate(datasets):
+        require_variables(f"{name}[{i}]", data, needed_names, advice)
 
 
-def typeset(text: str) -> str:
+def typeset_symbols(text: str) -> str:
     """Return text with symbols such as "λ2⁺" as formulas, because the font lacks some of them."""
-    return re.sub(r"[θλ]\S*", lambda found: f"${as_tex(found[0])}$", text)
+    return re.sub(r"[θλ]\S*", lambda match: f"${format_mathtext(match[0])}$", text)
 
 
-def _unit(name: str) -> str:
+def _format_unit(name: str) -> str:
     """Return the unit of a quantity as figures write it, such as "N·s/m"."""
-    return MEASURES[name].plain_unit.replace(" ", "·").replace("^2", "²")
+    return MEASURES[name].display_unit.replace(" ", "·").replace("^2", "²")
 
 
-def axis_label(name: str, form: str = "{name} {symbol}") -> str:
+def format_axis_label(name: str, form: str = "{name} {symbol}") -> str:
     """Return the label of a quantity, formatted by `form`, with its unit; keep an unknown name."""
     if name not in MEASURES:
         return name
     measure = MEASURES[name]
-    text = form.format(name=typeset(measure.long_name), symbol=f"${measure.tex}$")
-    return f"{text} [{_unit(name)}]" if _unit(name) else text
+    text = form.format(name=typeset_symbols(measure.long_name), symbol=f"${measure.mathtext}$")
+    return f"{text} [{_format_unit(name)}]" if _format_unit(name) else text
 
 
-def value_label(name: str, value: float, digits: int = 4) -> str:
+def format_value_label(name: str, value: float, digits: int = 4) -> str:
     """Return the text of a quantity with a value, as in "c = 50 N·s/m"."""
     if name not in MEASURES:
         return f"{name} = {value:.{digits}g}"
-    return f"${MEASURES[name].tex}$ = {value:.{digits}g} {_unit(name)}".rstrip()
+    return f"${MEASURES[name].mathtext}$ = {value:.{digits}g} {_format_unit(name)}".rstrip()
 
 
-def panel_letter(axes: Axes, letter: str) -> None:
+def label_panel(axes: Axes, letter: str) -> None:
     """Write the letter of a panel to the left of its top."""
     axes.text(-0.12, 1.02, f"({letter})", transform=axes.transAxes, ha="right", va="bottom")
 
 
 def draw_marks(
-    axes: Axes, x: np.ndarray, y: np.ndarray, marker: str, color: str, fill: str, **more: Any
+    axes: Axes, x: np.ndarray, y: np.ndarray, marker: str, color: str, fill: str, **overrides: Any
 ) -> None:
     """Draw markers without a line, filled with the color `fill`; "white" makes them open."""
-    look: dict[str, Any] = {"markersize": 3.2, "markeredgewidth": 0.7, "linestyle": "none"} | more
-    axes.plot(x, y, marker, color=color, markerfacecolor=fill, **look)
+    marker_style: dict[str, Any] = {
+        "markersize": 3.2,
+        "markeredgewidth": 0.7,
+        "linestyle": "none",
+    } | overrides
+    axes.plot(x, y, marker, color=color, markerfacecolor=fill, **marker_style)
 
 
-def border_style(name: str) -> tuple[str, Any]:
+def select_border_style(name: str) -> tuple[str, Any]:
     """Return color and line style of a special point; those of locked legs differ by leg."""
-    for color, names in KINDS.items():
+    for color, names in BORDER_NAMES_BY_COLOR.items():
         if name in names:
-            return color, DASHES[names.index(name)]
+            return color, LINE_STYLES[names.index(name)]
     leg = name.partition("[")[2]
-    return SKY, DASHES[(int(leg[:-1]) - 3 if leg else len(name)) % len(DASHES)]
+    return SKY, LINE_STYLES[(int(leg[:-1]) - 3 if leg else len(name)) % len(LINE_STYLES)]
 
 
-def outcome_style(code: int) -> tuple[str, str]:
+def select_outcome_style(code: int) -> tuple[str, str]:
     """Return label and color of an outcome, of an unstable cycle, or of a sample not computed."""
-    if code == UNSTABLE:
+    if code == UNSTABLE_CODE:
         return "unstable limit cycle", YELLOW
-    return OUTCOMES[Outcome(code)] if code >= 0 else NOT_COMPUTED
+    return OUTCOME_STYLES[Outcome(code)] if code >= 0 else NOT_COMPUTED_STYLE
 
 
-def outcome_cells(
-    axes: Axes, x: np.ndarray, y: np.ndarray, codes: np.ndarray, known: Sequence[int] | np.ndarray
+def draw_outcome_cells(
+    axes: Axes,
+    x: np.ndarray,
+    y: np.ndarray,
+    codes: np.ndarray,
+    known_codes: Sequence[int] | np.ndarray,
 ) -> None:
     """Draw cells over (x, y) in the colors of their outcomes, except codes not in `known_codes`."""
-    colors = ListedColormap([outcome_style(int(code))[1] for code in known])
-    places = np.ma.masked_where(~np.isin(codes, known), np.searchsorted(known, codes))
-    norm = BoundaryNorm(np.arange(len(known) + 1) - 0.5, len(known)) if len(known) > 1 else None
-    axes.pcolormesh(x, y, places, cmap=colors, norm=norm).set_rasterized(True)
+    colors = ListedColormap([select_outcome_style(int(code))[1] for code in known_codes])
+    code_indices = np.ma.masked_where(
+        ~np.isin(codes, known_codes), np.searchsorted(known_codes, codes)
+    )
+    norm = (
+        BoundaryNorm(np.arange(len(known_codes) + 1) - 0.5, len(known_codes))
+        if len(known_codes) > 1
+        else None
+    )
+    axes.pcolormesh(x, y, code_indices, cmap=colors, norm=norm).set_rasterized(True)
 
 
-def outcome_patches(codes: Iterable[int]) -> list[Patch]:
+def make_outcome_patches(codes: Iterable[int]) -> list[Patch]:
     """Return the legend entries of outcomes."""
     return [
         Patch(facecolor=color, edgecolor="#888888", linewidth=0.4, label=label)
-        for label, color in (outcome_style(int(code)) for code in codes)
+        for label, color in (select_outcome_style(int(code)) for code in codes)
     ]

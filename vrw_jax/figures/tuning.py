@@ -8,25 +8,25 @@ from matplotlib.ticker import MaxNLocator
 
 from vrw_jax.figures.style import (
     BLUE,
-    GREY,
-    LIGHT,
+    DARK_GRAY,
+    LIGHT_GRAY,
     ORANGE,
-    PAGE,
-    axis_label,
+    PAGE_WIDTH_INCHES,
     draw_marks,
     figure_style,
-    typeset,
+    format_axis_label,
+    typeset_symbols,
 )
 from vrw_jax.results import MEASURES
-from vrw_jax.tuning import ACTIVE, Kind, Tuned
-from vrw_jax.wording import instance
+from vrw_jax.tuning import ACTIVE_BOUND_TOLERANCE, TrialKind, TuneResult
+from vrw_jax.wording import check_type
 
-ROW = 0.19
+ROW_HEIGHT_INCHES = 0.19
 """Height of the row of a constraint, in inches."""
 
 
 @figure_style()
-def tuning_figure(tuned: Tuned) -> Figure:
+def tuning_figure(tuned: TuneResult) -> Figure:
     """Return a figure of a tuning run: objective, parameters, and slack of the constraints.
 
     Filled symbols satisfy every constraint, and open ones violate one. Dotted lines are trials that
@@ -43,42 +43,53 @@ def tuning_figure(tuned: Tuned) -> Figure:
         >>> tuned = vrw.tune(vrw.WheelParams(), "dls_fraction", ["damping"], bounds)
         >>> figure = vrw.plot.draw_tuning(tuned)
     """
-    instance("tuned", tuned, Tuned, "give vrw.tune(params, objective, free, bounds)")
+    check_type("tuned", tuned, TuneResult, "give vrw.tune(params, objective, free, bounds)")
     path = tuned.path
     n = path.sizes["constraint"]
-    figure = Figure(figsize=(PAGE, max(3.2, ROW * n + 1.0)))
+    figure = Figure(figsize=(PAGE_WIDTH_INCHES, max(3.2, ROW_HEIGHT_INCHES * n + 1.0)))
     panels = figure.subplot_mosaic(
         [["objective", "slack"], ["parameters", "slack"]], width_ratios=[1.0, 1.1]
     )
     panels["objective"].sharex(panels["parameters"])
-    _objective(panels["objective"], path)
-    _parameters(panels["parameters"], path)
-    _slack(panels["slack"], tuned)
+    _draw_objective(panels["objective"], path)
+    _draw_parameters(panels["parameters"], path)
+    _draw_slack(panels["slack"], tuned)
     return figure
 
 
-def _objective(axes: Axes, path: xr.Dataset) -> None:
+def _draw_objective(axes: Axes, path: xr.Dataset) -> None:
     """Draw the objective over the evaluated gaits."""
     number, value = path.evaluation.values, path.objective.values
-    lost = path.kind.values == Kind.LOST
-    axes.plot(number[~lost], value[~lost], color=GREY, linewidth=0.7, zorder=1)
-    for kept, fill, text in ((True, BLUE, "keeps the constraints"), (False, "white", "breaks one")):
-        chosen = ~lost & ((path.breach.values <= ACTIVE) == kept)
-        draw_marks(axes, number[chosen], value[chosen], "o", BLUE, fill, markersize=4.0, label=text)
-    if lost.any():
-        for i, place in enumerate(number[lost]):
-            first = "gait lost, step shortened" if i == 0 else None
-            axes.axvline(place, color=ORANGE, linewidth=0.8, linestyle=":", label=first)
-    axes.set_ylabel(axis_label(path.objective.attrs["long_name"], "{name}"))
+    is_gait_lost = path.kind.values == TrialKind.LOST
+    axes.plot(number[~is_gait_lost], value[~is_gait_lost], color=DARK_GRAY, linewidth=0.7, zorder=1)
+    for is_feasible, fill, text in (
+        (True, BLUE, "keeps the constraints"),
+        (False, "white", "breaks one"),
+    ):
+        is_drawn = ~is_gait_lost & ((path.breach.values <= ACTIVE_BOUND_TOLERANCE) == is_feasible)
+        draw_marks(
+            axes, number[is_drawn], value[is_drawn], "o", BLUE, fill, markersize=4.0, label=text
+        )
+    if is_gait_lost.any():
+        for i, evaluation in enumerate(number[is_gait_lost]):
+            legend_text = "gait lost, step shortened" if i == 0 else None
+            axes.axvline(evaluation, color=ORANGE, linewidth=0.8, linestyle=":", label=legend_text)
+    axes.set_ylabel(format_axis_label(path.objective.attrs["long_name"], "{name}"))
     axes.legend(loc="best", fontsize=7.0)
 
 
-def _parameters(axes: Axes, path: xr.Dataset) -> None:
+def _draw_parameters(axes: Axes, path: xr.Dataset) -> None:
     """Draw the parameters over the evaluated gaits, scaled to their bounds."""
     lower, upper = np.asarray(path.attrs["lower"]), np.asarray(path.attrs["upper"])
     for i, name in enumerate(path.attrs["free"].split()):
-        u = (path[name].values - lower[i]) / (upper[i] - lower[i])
-        axes.plot(path.evaluation, u, marker=".", markersize=4.0, label=f"${MEASURES[name].tex}$")
+        scaled_values = (path[name].values - lower[i]) / (upper[i] - lower[i])
+        axes.plot(
+            path.evaluation,
+            scaled_values,
+            marker=".",
+            markersize=4.0,
+            label=f"${MEASURES[name].mathtext}$",
+        )
     axes.set_ylim(-0.05, 1.05)
     axes.set_yticks([0.0, 1.0], ["lower\nbound", "upper\nbound"])
     axes.set_xlabel("gaits evaluated")
@@ -86,16 +97,16 @@ def _parameters(axes: Axes, path: xr.Dataset) -> None:
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
-def _slack(axes: Axes, tuned: Tuned) -> None:
+def _draw_slack(axes: Axes, result: TuneResult) -> None:
     """Draw the slack of each constraint at the start and at the tuned gait."""
-    path = tuned.path
+    path = result.path
     names = [str(name) for name in path.constraint.values]
     values = path.constraint_value.values
     margin = path.margin.values
-    last = np.nanargmin(
+    tuned_index = np.nanargmin(
         np.sum(
             [
-                np.abs(path[name].values / float(getattr(tuned.params, name)) - 1.0)
+                np.abs(path[name].values / float(getattr(result.params, name)) - 1.0)
                 for name in path.attrs["free"].split()
             ],
             axis=0,
@@ -103,23 +114,31 @@ def _slack(axes: Axes, tuned: Tuned) -> None:
     )
     with np.errstate(invalid="ignore"):
         scale = np.maximum(np.nanmax(np.abs(values - margin), axis=0), 1e-12)
-    places = np.arange(len(names))[::-1]
-    held = {active.name for active in tuned.active}
+    positions = np.arange(len(names))[::-1]
+    active_names = {active.name for active in result.active}
     for share, offset, tone, text in (
-        ((values[0] - margin) / scale, 0.19, LIGHT, "at the start"),
-        ((values[last] - margin) / scale, -0.19, BLUE, "tuned"),
+        ((values[0] - margin) / scale, 0.19, LIGHT_GRAY, "at the start"),
+        ((values[tuned_index] - margin) / scale, -0.19, BLUE, "tuned"),
     ):
         axes.barh(
-            places + offset, share, 0.36, color=tone, label=text, edgecolor=GREY, linewidth=0.3
+            positions + offset,
+            share,
+            0.36,
+            color=tone,
+            label=text,
+            edgecolor=DARK_GRAY,
+            linewidth=0.3,
         )
     axes.axvline(0.0, color="black", linewidth=0.6)
     texts = []
     for name in names:
-        plain, _, leg = name.partition("[")
-        texts.append(typeset(MEASURES[plain].long_name) + (f", {leg[:-1]}" if leg else ""))
-    axes.set_yticks(places, texts, fontsize=7.0)
+        measure_name, _, leg = name.partition("[")
+        texts.append(
+            typeset_symbols(MEASURES[measure_name].long_name) + (f", {leg[:-1]}" if leg else "")
+        )
+    axes.set_yticks(positions, texts, fontsize=7.0)
     for tick, name in zip(axes.get_yticklabels(), names, strict=True):
-        if name in held:
+        if name in active_names:
             tick.set_color(ORANGE)
             tick.set_fontweight("bold")
     axes.set_xlim(min(-0.05, axes.get_xlim()[0]), 1.05)

@@ -11,36 +11,36 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from vrw_jax.figures.style import (
-    COLUMN,
-    GREY,
-    LEG_1,
-    LEG_2,
-    LIGHT,
-    PAGE,
+    COLUMN_WIDTH_INCHES,
+    DARK_GRAY,
+    LEG_1_COLOR,
+    LEG_2_COLOR,
+    LIGHT_GRAY,
+    PAGE_WIDTH_INCHES,
     SKY,
-    all_drawable,
-    axis_label,
     draw_marks,
-    drawable,
     figure_style,
-    panel_letter,
-    value_label,
+    format_axis_label,
+    format_value_label,
+    label_panel,
+    require_variables,
+    require_variables_of_all,
 )
-from vrw_jax.results import MEASURES, PHASES
-from vrw_jax.wording import instance
+from vrw_jax.results import MEASURES, PHASE_NAMES
+from vrw_jax.wording import check_type
 
 Coordinate = float | np.ndarray
 """One coordinate of points, in m."""
 
-FORCES = ("lambda_1", "lambda_2", "lambda_3", "lambda_4")
+FORCE_NAMES = ("lambda_1", "lambda_2", "lambda_3", "lambda_4")
 """Names of the ground forces on the feet of Leg 1 and Leg 2, in N."""
 
 
-GAIT = "give vrw.simulate(params)"
+GAIT_REMEDY = "give vrw.simulate(params)"
 """Remedy that completes the message about a wrong dataset."""
 
 
-def phase_spans(gait: xr.Dataset) -> list[tuple[float, float, int]]:
+def find_phase_spans(gait: xr.Dataset) -> list[tuple[float, float, int]]:
     """Return (begin, end, phase) of every phase of a trajectory, times in s."""
     key = 3 * gait.step.values + gait.phase.values
     cuts = np.flatnonzero(np.diff(key)) + 1
@@ -49,7 +49,7 @@ def phase_spans(gait: xr.Dataset) -> list[tuple[float, float, int]]:
     return [(t[0], t[-1], int(p)) for t, p in zip(times, phases, strict=True)]
 
 
-def broken_at_events(gait: xr.Dataset, *names: str) -> list[np.ndarray]:
+def insert_landing_gaps(gait: xr.Dataset, *names: str) -> list[np.ndarray]:
     """Return time and variables with a gap at each landing, where the labels of the legs change."""
     cuts = np.flatnonzero(np.diff(gait.step.values)) + 1
     return [np.insert(gait[name].values.astype(float), cuts, np.nan) for name in ("time", *names)]
@@ -57,11 +57,11 @@ def broken_at_events(gait: xr.Dataset, *names: str) -> list[np.ndarray]:
 
 def _shade_double_support(axes: Axes, gait: xr.Dataset) -> None:
     """Draw gray bands over double support and dotted lines at collision II."""
-    for begin, end, phase in phase_spans(gait):
+    for begin, end, phase in find_phase_spans(gait):
         if phase == 0:
-            axes.axvspan(begin, end, color=LIGHT, linewidth=0.0, zorder=0)
+            axes.axvspan(begin, end, color=LIGHT_GRAY, linewidth=0.0, zorder=0)
         if phase == 2:
-            axes.axvline(begin, color=GREY, linewidth=0.5, linestyle=(0, (1, 2)), zorder=0)
+            axes.axvline(begin, color=DARK_GRAY, linewidth=0.5, linestyle=(0, (1, 2)), zorder=0)
 
 
 @figure_style()
@@ -80,21 +80,21 @@ def gait_panels(gait: xr.Dataset) -> Figure:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
         >>> figure = vrw.plot.draw_gait(gait)
     """
-    drawable("gait", gait, ("phase", *FORCES), GAIT)
-    time, theta, L1, L2, z2, *forces = broken_at_events(
-        gait, "theta", "L1", "L2", "foot_2_z", *FORCES
+    require_variables("gait", gait, ("phase", *FORCE_NAMES), GAIT_REMEDY)
+    time, theta, L1, L2, z2, *forces = insert_landing_gaps(
+        gait, "theta", "L1", "L2", "foot_2_z", *FORCE_NAMES
     )
-    share = 100.0 * forces[3] / (forces[1] + forces[3])
-    figure = Figure(figsize=(0.8 * PAGE, 7.4))
+    load_share = 100.0 * forces[3] / (forces[1] + forces[3])
+    figure = Figure(figsize=(0.8 * PAGE_WIDTH_INCHES, 7.4))
     panels = figure.subplots(5, 1, sharex=True, height_ratios=[1, 1, 1, 1, 1.5])
     for axes, letter in zip(panels, "abcde", strict=True):
         _shade_double_support(axes, gait)
-        panel_letter(axes, letter)
+        label_panel(axes, letter)
     panels[0].plot(time, theta, color="black")
-    panels[0].set_ylabel(axis_label("theta", "{symbol}"))
-    for begin, end, phase in phase_spans(gait)[:3]:
+    panels[0].set_ylabel(format_axis_label("theta", "{symbol}"))
+    for begin, end, phase in find_phase_spans(gait)[:3]:
         panels[0].annotate(
-            PHASES[phase],
+            PHASE_NAMES[phase],
             (0.5 * (begin + end), 1.0),
             xycoords=("data", "axes fraction"),
             ha="center",
@@ -102,19 +102,19 @@ def gait_panels(gait: xr.Dataset) -> Figure:
             fontsize=7.5,
             rotation=90 if phase == 2 else 0,
         )
-    panels[1].plot(time, L1, color=LEG_1, label="Leg 1, $L_1$")
-    panels[1].plot(time, L2, color=LEG_2, linestyle="--", label="Leg 2, $L_2$")
+    panels[1].plot(time, L1, color=LEG_1_COLOR, label="Leg 1, $L_1$")
+    panels[1].plot(time, L2, color=LEG_2_COLOR, linestyle="--", label="Leg 2, $L_2$")
     panels[1].set_ylabel("$L_1,\\ L_2$ [m]")
-    panels[2].plot(time, 100.0 - share, color=LEG_1, label="foot 1")
-    panels[2].plot(time, share, color=LEG_2, linestyle="--", label="foot 2")
+    panels[2].plot(time, 100.0 - load_share, color=LEG_1_COLOR, label="foot 1")
+    panels[2].plot(time, load_share, color=LEG_2_COLOR, linestyle="--", label="foot 2")
     panels[2].set_ylabel("share of the\nnormal force [%]")
-    panels[3].plot(time, z2, color=LEG_2, linestyle="--")
+    panels[3].plot(time, z2, color=LEG_2_COLOR, linestyle="--")
     panels[3].set_ylabel("$z_2$ [m]")
     for i, force in enumerate(forces):
-        color, line = (LEG_1, "-") if i < 2 else (LEG_2, "--")
-        name, width = f"${MEASURES[FORCES[i]].tex}$", (0.7, 1.4)[i % 2]
+        color, line = (LEG_1_COLOR, "-") if i < 2 else (LEG_2_COLOR, "--")
+        name, width = f"${MEASURES[FORCE_NAMES[i]].mathtext}$", (0.7, 1.4)[i % 2]
         panels[4].plot(time, force, color=color, linestyle=line, linewidth=width, label=name)
-    panels[4].axhline(0.0, color=GREY, linewidth=0.4)
+    panels[4].axhline(0.0, color=DARK_GRAY, linewidth=0.4)
     panels[4].set_ylabel("ground reaction\nforce [N]")
     panels[4].set_xlabel("time [s]")
     panels[4].set_xlim(time[0], time[-1])
@@ -139,22 +139,22 @@ def sticks(gait: xr.Dataset, interval: float = 0.05) -> Figure:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
         >>> figure = vrw.plot.draw_sticks(gait, interval=0.1)
     """
-    drawable("gait", gait, ("phase", "foot_1_x"), GAIT)
+    require_variables("gait", gait, ("phase", "foot_1_x"), GAIT_REMEDY)
     tones = ("#A0A0A0", SKY, "#000000")
     time = gait.time.values
-    figure = Figure(figsize=(PAGE, 2.8))
+    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 2.8))
     axes = figure.subplots()
     for i in np.searchsorted(time, np.arange(0.0, time[-1], interval)):
-        one = gait.isel(time=int(i))
+        instant = gait.isel(time=int(i))
         for foot, line in ((1, "-"), (2, ":")):
             axes.plot(
-                [float(one[f"foot_{foot}_x"]), float(one.hub_x)],
-                [float(one[f"foot_{foot}_z"]), float(one.hub_z)],
-                color=tones[int(one.phase)],
+                [float(instant[f"foot_{foot}_x"]), float(instant.hub_x)],
+                [float(instant[f"foot_{foot}_z"]), float(instant.hub_z)],
+                color=tones[int(instant.phase)],
                 linestyle=line,
                 linewidth=0.8,
             )
-    axes.plot(gait.hub_x, gait.hub_z, color=LEG_2, linewidth=1.0)
+    axes.plot(gait.hub_x, gait.hub_z, color=LEG_2_COLOR, linewidth=1.0)
     axes.axhline(0.0, color="black", linewidth=0.8)
     axes.annotate(
         "downhill",
@@ -170,20 +170,20 @@ def sticks(gait: xr.Dataset, interval: float = 0.05) -> Figure:
     axes.set_ylabel("$Z$ [m]")
     for line, name in (("-", "Leg 1"), (":", "Leg 2")):
         axes.plot([], [], color="black", linestyle=line, linewidth=0.8, label=name)
-    axes.plot([], [], color=LEG_2, label="hub")
-    for phase, tone in zip(PHASES, tones, strict=True):
+    axes.plot([], [], color=LEG_2_COLOR, label="hub")
+    for phase, tone in zip(PHASE_NAMES, tones, strict=True):
         axes.plot([], [], color=tone, linewidth=3.0, label=phase)
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
 
-LINES = ("-", "--", (0, (4, 1, 1, 1)), ":")
+GAIT_LINE_STYLES = ("-", "--", (0, (4, 1, 1, 1)), ":")
 """Line styles of the gaits of one figure."""
 
 
-def _name_of(gait: xr.Dataset, vary: str) -> str:
+def _format_gait_label(gait: xr.Dataset, varied: str) -> str:
     """Return the label of a gait by its varied parameter, as in "c = 50 N·s/m"."""
-    return value_label(vary, gait.attrs[f"parameter_{vary}"])
+    return format_value_label(varied, gait.attrs[f"parameter_{varied}"])
 
 
 @figure_style()
@@ -203,30 +203,37 @@ def foot_height(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
         >>> figure = vrw.plot.draw_foot_height([gait])
     """
-    all_drawable("gaits", gaits, ("phase", "foot_2_z"), GAIT)
-    figure = Figure(figsize=(PAGE, 2.6))
-    whole, near = figure.subplots(1, 2)
-    for gait, line in zip(gaits, LINES, strict=False):
-        name, lowest = _name_of(gait, vary), 1e3 * float(gait.foot_2_z.min())
-        reach = f"lowest −{-lowest:.1f} mm" if lowest < -1e-6 else "clear"
-        whole.plot(gait.time, gait.foot_2_z, linestyle=line, label=name)
-        near.plot(gait.time, 1e3 * gait.foot_2_z, linestyle=line, label=reach)
-    for letter, axes in zip("ab", (whole, near), strict=True):
-        panel_letter(axes, letter)
-        axes.axhspan(-1e3, 0.0, color=LIGHT, linewidth=0.0, zorder=0)
+    require_variables_of_all("gaits", gaits, ("phase", "foot_2_z"), GAIT_REMEDY)
+    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 2.6))
+    step_axes, takeoff_axes = figure.subplots(1, 2)
+    for gait, line in zip(gaits, GAIT_LINE_STYLES, strict=False):
+        name, lowest = _format_gait_label(gait, vary), 1e3 * float(gait.foot_2_z.min())
+        clearance_text = f"lowest −{-lowest:.1f} mm" if lowest < -1e-6 else "clear"
+        step_axes.plot(gait.time, gait.foot_2_z, linestyle=line, label=name)
+        takeoff_axes.plot(gait.time, 1e3 * gait.foot_2_z, linestyle=line, label=clearance_text)
+    for letter, axes in zip("ab", (step_axes, takeoff_axes), strict=True):
+        label_panel(axes, letter)
+        axes.axhspan(-1e3, 0.0, color=LIGHT_GRAY, linewidth=0.0, zorder=0)
         axes.axhline(0.0, color="black", linewidth=0.5, zorder=1)
         axes.set_xlabel("time since landing [s]")
         axes.legend(loc="upper left")
     lowest = min(float(gait.foot_2_z.min()) for gait in gaits)
     take_off = [float(gait.time[gait.phase == 1][0]) for gait in gaits]
     highest = max(float(gait.foot_2_z.max()) for gait in gaits)
-    whole.set_ylim(2.0 * lowest - 0.004, 1.05 * highest)
-    whole.set_xlim(0.0, max(float(gait.time.max()) for gait in gaits))
-    whole.set_ylabel("height of foot 2, $z_2$ [m]")
-    near.set_ylim(1.3e3 * lowest - 0.5, -1.8e3 * lowest + 0.5)
-    near.set_xlim(min(take_off) - 0.03, max(take_off) + 0.1)
-    near.set_ylabel("$z_2$ [mm]")
-    near.text(0.98, 0.03, "below the ground", transform=near.transAxes, ha="right", color=GREY)
+    step_axes.set_ylim(2.0 * lowest - 0.004, 1.05 * highest)
+    step_axes.set_xlim(0.0, max(float(gait.time.max()) for gait in gaits))
+    step_axes.set_ylabel("height of foot 2, $z_2$ [m]")
+    takeoff_axes.set_ylim(1.3e3 * lowest - 0.5, -1.8e3 * lowest + 0.5)
+    takeoff_axes.set_xlim(min(take_off) - 0.03, max(take_off) + 0.1)
+    takeoff_axes.set_ylabel("$z_2$ [mm]")
+    takeoff_axes.text(
+        0.98,
+        0.03,
+        "below the ground",
+        transform=takeoff_axes.transAxes,
+        ha="right",
+        color=DARK_GRAY,
+    )
     return figure
 
 
@@ -245,14 +252,24 @@ def rear_force(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
         >>> figure = vrw.plot.draw_rear_force([gait])
     """
-    all_drawable("gaits", gaits, ("phase", "lambda_4"), GAIT)
-    figure = Figure(figsize=(COLUMN, 2.5))
+    require_variables_of_all("gaits", gaits, ("phase", "lambda_4"), GAIT_REMEDY)
+    figure = Figure(figsize=(COLUMN_WIDTH_INCHES, 2.5))
     axes = figure.subplots()
-    for gait, line in zip(gaits, LINES, strict=False):
-        held = gait.isel(time=gait.phase.values == 0)
-        (drawn,) = axes.plot(held.time, held.lambda_4, linestyle=line, label=_name_of(gait, vary))
+    for gait, line in zip(gaits, GAIT_LINE_STYLES, strict=False):
+        double_support = gait.isel(time=gait.phase.values == 0)
+        (force_line,) = axes.plot(
+            double_support.time,
+            double_support.lambda_4,
+            linestyle=line,
+            label=_format_gait_label(gait, vary),
+        )
         axes.plot(
-            0.0, held.lambda_4[0], "o", color=drawn.get_color(), markersize=3.5, clip_on=False
+            0.0,
+            double_support.lambda_4[0],
+            "o",
+            color=force_line.get_color(),
+            markersize=3.5,
+            clip_on=False,
         )
     axes.set_xlim(0.0, None)
     axes.set_ylim(0.0, None)
@@ -286,41 +303,43 @@ def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
         >>> gaits = xr.Dataset(over, {"damping": [80.0, 120.0]}, {"parameter_slope": 0.3})
         >>> figure = vrw.plot.draw_indicators(gaits)
     """
-    drawable(
+    require_variables(
         "gaits", gaits, ("settled", "lambda_I4"), "give gaits over one parameter, as its page tells"
     )
     vary = str(gaits.settled.dims[0])
-    kept = gaits.where(gaits.settled & (gaits.lambda_2_plus >= 0.0), drop=True)
-    scuffs = np.minimum(kept.clearance_sls1, kept.clearance_sls2).values < 0.0
-    values = kept[vary].values
-    drawn = (values % every == 0) | (values == values.min()) | (values == values.max())
+    valid_gaits = gaits.where(gaits.settled & (gaits.lambda_2_plus >= 0.0), drop=True)
+    is_scuffing = np.minimum(valid_gaits.clearance_sls1, valid_gaits.clearance_sls2).values < 0.0
+    values = valid_gaits[vary].values
+    has_marker = (values % every == 0) | (values == values.min()) | (values == values.max())
     rows = (
-        ((("lambda_I4", LEG_1, "o"),), "impulse [N·s]"),
-        ((("lambda_2_plus", LEG_1, "s"), ("lambda_4_plus", LEG_2, "o")), "force [N]"),
+        ((("lambda_I4", LEG_1_COLOR, "o"),), "impulse [N·s]"),
+        ((("lambda_2_plus", LEG_1_COLOR, "s"), ("lambda_4_plus", LEG_2_COLOR, "o")), "force [N]"),
     )
-    figure = Figure(figsize=(PAGE, 2.7))
+    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 2.7))
     panels = figure.subplots(1, 2)
-    for axes, letter, (series, kind) in zip(panels, "ab", rows, strict=True):
-        panel_letter(axes, letter)
+    for axes, letter, (series, axis_text) in zip(panels, "ab", rows, strict=True):
+        label_panel(axes, letter)
         for name, color, marker in series:
-            data, symbol = kept[name].values, f"${MEASURES[name].tex}$"
+            data, symbol = valid_gaits[name].values, f"${MEASURES[name].mathtext}$"
             axes.plot(values, data, color=color, linewidth=0.7)
-            for scuffing, fill in ((False, color), (True, "white")):
-                chosen = drawn & (scuffs == scuffing)
-                text = symbol + (", scuffing" if scuffing else "")
-                x, y = values[chosen], data[chosen]
+            for draws_scuffing, fill in ((False, color), (True, "white")):
+                is_selected = has_marker & (is_scuffing == draws_scuffing)
+                text = symbol + (", scuffing" if draws_scuffing else "")
+                x, y = values[is_selected], data[is_selected]
                 draw_marks(axes, x, y, marker, color, fill, label=text, clip_on=False)
         axes.set_xlim(0.0, values.max() + 1.0)
-        axes.set_ylim(0.0, 1.18 * max(float(kept[name].max()) for name, *_ in series))
-        axes.set_xlabel(axis_label(vary, "{symbol}"))
-        axes.set_ylabel(kind)
+        axes.set_ylim(0.0, 1.18 * max(float(valid_gaits[name].max()) for name, *_ in series))
+        axes.set_xlabel(format_axis_label(vary, "{symbol}"))
+        axes.set_ylabel(axis_text)
         axes.legend(loc="lower right" if letter == "a" else "upper right", ncols=len(series))
     slope = gaits.attrs["parameter_slope"]  # the slope in the caption of the paper is a misprint
-    panels[0].text(0.02, 0.05, value_label("slope", slope), transform=panels[0].transAxes)
+    panels[0].text(0.02, 0.05, format_value_label("slope", slope), transform=panels[0].transAxes)
     return figure
 
 
-def _rotated(x: Coordinate, z: Coordinate, slope: float) -> tuple[Coordinate, Coordinate]:
+def _rotate_to_vertical(
+    x: Coordinate, z: Coordinate, slope: float
+) -> tuple[Coordinate, Coordinate]:
     """Return coordinates in a frame with vertical gravity, from those in the slope's frame."""
     return (
         x * np.cos(slope) + z * np.sin(slope),
@@ -350,7 +369,7 @@ def walk_frames(
         >>> len(frames)
         2
     """
-    drawable("step", step, ("parameter_slope", "phase", "foot_2_x"), GAIT)
+    require_variables("step", step, ("parameter_slope", "phase", "foot_2_x"), GAIT_REMEDY)
     slope, time = step.attrs["parameter_slope"], step.time.values
     period = time[-1]
     stride = float(step.hub_x[-1] - step.hub_x[0])
@@ -361,15 +380,21 @@ def walk_frames(
         canvas = FigureCanvasAgg(figure)
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
         axes.set_axis_off()
-        centre = float(step.hub_x[0]) + stride * t / period
-        _draw_ground(axes, slope, centre, stride)
+        center = float(step.hub_x[0]) + stride * t / period
+        _draw_ground(axes, slope, center, stride)
         _draw_wheel(axes, step, t)
-        last = min(int(np.searchsorted(time, t, side="right")), time.size - 1)
-        _draw_forces(axes, step.isel(time=last), np.interp(t, time, step.foot_2_x))
-        middle = [float(v) for v in _rotated(centre, 0.75, slope)]
-        axes.set_xlim(middle[0] - 1.35, middle[0] + 1.35)
-        axes.set_ylim(middle[1] - 1.25, middle[1] + 1.225)
-        axes.text(0.02, 0.03, PHASES[int(step.phase[last])], transform=axes.transAxes, fontsize=14)
+        time_index = min(int(np.searchsorted(time, t, side="right")), time.size - 1)
+        _draw_forces(axes, step.isel(time=time_index), np.interp(t, time, step.foot_2_x))
+        view_center = [float(v) for v in _rotate_to_vertical(center, 0.75, slope)]
+        axes.set_xlim(view_center[0] - 1.35, view_center[0] + 1.35)
+        axes.set_ylim(view_center[1] - 1.25, view_center[1] + 1.225)
+        axes.text(
+            0.02,
+            0.03,
+            PHASE_NAMES[int(step.phase[time_index])],
+            transform=axes.transAxes,
+            fontsize=14,
+        )
         canvas.draw()
         picture = Image.frombuffer("RGBA", canvas.get_width_height(), canvas.buffer_rgba())
         frames.append(picture.convert("RGB"))
@@ -383,45 +408,47 @@ def _draw_wheel(axes: Axes, step: xr.Dataset, t: float) -> None:
     theta, L1, L2, x, z = (float(np.interp(t, step.time, step[name])) for name in names)
     for j in range(1, n + 1):
         angle = theta + (j - 1) * 2.0 * np.pi / n
-        reach = {1: L1, 2: L2}.get(j, step.attrs["parameter_locked_length"])
-        colour, width = {1: (LEG_1, 3.0), 2: (LEG_2, 3.0)}.get(j, ("#999999", 1.5))
+        leg_length = {1: L1, 2: L2}.get(j, step.attrs["parameter_locked_length"])
+        color, width = {1: (LEG_1_COLOR, 3.0), 2: (LEG_2_COLOR, 3.0)}.get(j, ("#999999", 1.5))
         axes.plot(
-            *_rotated(
-                np.array([x, x - reach * np.sin(angle)]),
-                np.array([z, z - reach * np.cos(angle)]),
+            *_rotate_to_vertical(
+                np.array([x, x - leg_length * np.sin(angle)]),
+                np.array([z, z - leg_length * np.cos(angle)]),
                 slope,
             ),
-            color=colour,
+            color=color,
             linewidth=width,
             solid_capstyle="round",
             zorder=5 if j < 3 else 3,
         )
-    axes.plot(*_rotated(x, z, slope), "o", color="black", markersize=9, zorder=6)
+    axes.plot(*_rotate_to_vertical(x, z, slope), "o", color="black", markersize=9, zorder=6)
 
 
-def _draw_forces(axes: Axes, now: xr.Dataset, foot_2_x: float) -> None:
+def _draw_forces(axes: Axes, instant: xr.Dataset, foot_2_x: float) -> None:
     """Draw arrows of the ground forces on both feet."""
-    slope, push = now.attrs["parameter_slope"], [float(now[name]) for name in FORCES]
-    for foot, tangential, normal in ((0.0, *push[:2]), (foot_2_x, *push[2:])):
+    slope, forces = instant.attrs["parameter_slope"], [float(instant[name]) for name in FORCE_NAMES]
+    for foot, tangential, normal in ((0.0, *forces[:2]), (foot_2_x, *forces[2:])):
         if normal != 0.0:
             axes.annotate(
                 "",
-                _rotated(foot + tangential / 300.0, normal / 300.0, slope),
-                _rotated(foot, 0.0, slope),
+                _rotate_to_vertical(foot + tangential / 300.0, normal / 300.0, slope),
+                _rotate_to_vertical(foot, 0.0, slope),
                 zorder=7,
                 arrowprops={"arrowstyle": "-|>", "linewidth": 1.2, "color": "black"},
             )
 
 
-def _draw_ground(axes: Axes, slope: float, centre: float, stride: float) -> None:
+def _draw_ground(axes: Axes, slope: float, center: float, stride: float) -> None:
     """Draw the slope with marks that repeat every half stride, so that the animation loops."""
-    ends = np.array([centre - 3.0, centre + 3.0])
-    axes.plot(*_rotated(ends, 0.0 * ends, slope), color="black", linewidth=1.2)
+    ends = np.array([center - 3.0, center + 3.0])
+    axes.plot(*_rotate_to_vertical(ends, 0.0 * ends, slope), color="black", linewidth=1.2)
     spacing = 0.5 * stride
-    first = np.ceil((centre - 2.0) / spacing)
+    first_mark = np.ceil((center - 2.0) / spacing)
     for k in range(int(4.0 / spacing)):
-        x = np.array([0.0, -0.06]) + (first + k) * spacing
-        axes.plot(*_rotated(x, np.array([0.0, -0.06]), slope), color="black", linewidth=0.7)
+        x = np.array([0.0, -0.06]) + (first_mark + k) * spacing
+        axes.plot(
+            *_rotate_to_vertical(x, np.array([0.0, -0.06]), slope), color="black", linewidth=0.7
+        )
 
 
 def save_animation(frames: Sequence[Image.Image], milliseconds: int, path: Path) -> Path:
@@ -445,11 +472,18 @@ def save_animation(frames: Sequence[Image.Image], milliseconds: int, path: Path)
         >>> vrw.plot.save_animation(frames, milliseconds, path).name
         'walk.gif'
     """
-    instance("frames", frames, (list, tuple), "give those of vrw.plot.walk_frames")
+    check_type("frames", frames, (list, tuple), "give those of vrw.plot.walk_frames")
     path.parent.mkdir(parents=True, exist_ok=True)
     palette = frames[0].quantize(32)
-    reduced = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-    reduced[0].save(
-        path, save_all=True, append_images=reduced[1:], duration=milliseconds, loop=0, optimize=True
+    paletted_frames = [
+        frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames
+    ]
+    paletted_frames[0].save(
+        path,
+        save_all=True,
+        append_images=paletted_frames[1:],
+        duration=milliseconds,
+        loop=0,
+        optimize=True,
     )
     return path

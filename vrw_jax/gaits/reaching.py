@@ -15,52 +15,52 @@ import numpy as np
 from jax import lax
 
 from vrw_jax import cycles
-from vrw_jax.batches import steps
+from vrw_jax.batches import step_batch
 from vrw_jax.cycles import (
-    NEAR,
+    START_DISTANCE,
     AbstractGaitFinder,
     CollocationFinder,
+    CollocationState,
     CycleOptions,
     Guess,
     LimitCycle,
-    Located,
-    WalkedCycle,
-    further_starts_of,
-    gaits_attracting,
-    slowest,
-    starts_of,
+    ReturnMapCycle,
+    compute_fallback_starts,
+    compute_walk_starts,
+    find_attracting_gaits,
+    find_slowest_indices,
 )
-from vrw_jax.numerics import Options, in_batches, taken
+from vrw_jax.numerics import StepOptions, map_in_batches, take_rows
 from vrw_jax.walks import ModelLike
-from vrw_jax.wheel import Outcome, WheelParams, parameters_of
-from vrw_jax.wording import chosen, traced, untraced, whole
+from vrw_jax.wheel import Outcome, WheelParams, stack_parameters
+from vrw_jax.wording import check_choice, check_int, check_not_traced, is_traced
 
-LOST = (
+RETRY_OUTCOMES = (
     Outcome.NO_CYCLE_FOUND,
-    Outcome.ORDER_DIFFERS,
-    Outcome.BORDER_ON_THE_WAY,
+    Outcome.EVENT_ORDER_MISMATCH,
+    Outcome.BRANCH_ENDS_BEFORE_TARGET,
     Outcome.MESH_TOO_COARSE,
 )
 """Outcomes of a search that may have missed a gait."""
 
-MESH_ERROR = 1e-7
+REFINE_ABOVE_MESH_ERROR = 1e-7
 """Estimate of the mesh's error above which a finer mesh is used. The errors themselves are a
 hundredth of it, as the options promise."""
 
-N_STEPS = 80
+N_GAIT_WALK_STEPS = 80
 """Number of steps of a walk towards a gait of the paper's model."""
 
-REFINEMENTS = 3
+MAX_MESH_REFINEMENTS = 3
 """Largest number of times that a mesh is made twice as fine."""
 
-SHAPES = (8, 64, 512, 4096)
+GAIT_BATCH_SIZES = (8, 64, 512, 4096)
 """Batch sizes that programs are compiled for. A single wheel takes the time of eight."""
 
 
-Lost = Literal["zeros", "nan"]
-ZEROS_OR_NAN: tuple[str, ...] = get_args(Lost)
+FailureValue = Literal["zeros", "nan"]
+FAILURE_VALUES: tuple[str, ...] = get_args(FailureValue)
 
-Which = Literal["slowest", "fastest"] | int
+GaitChoice = Literal["slowest", "fastest"] | int
 """Choice among the attracting gaits of a wheel, by speed: the slowest, the fastest, or an index,
 slowest first."""
 
@@ -72,9 +72,9 @@ def limit_cycle(
     guess: Guess | None = None,
     period_n: int = 1,
     model: None = None,
-    options: CycleOptions | Options | None = None,
-    lost: Lost = "zeros",
-    which: Which = "slowest",
+    options: CycleOptions | StepOptions | None = None,
+    on_failure: FailureValue = "zeros",
+    which: GaitChoice = "slowest",
 ) -> LimitCycle: ...
 
 
@@ -85,10 +85,10 @@ def limit_cycle(
     guess: Guess | None = None,
     period_n: int = 1,
     model: ModelLike,
-    options: CycleOptions | Options | None = None,
-    lost: Lost = "zeros",
-    which: Which = "slowest",
-) -> LimitCycle | WalkedCycle: ...
+    options: CycleOptions | StepOptions | None = None,
+    on_failure: FailureValue = "zeros",
+    which: GaitChoice = "slowest",
+) -> LimitCycle | ReturnMapCycle: ...
 
 
 def limit_cycle(
@@ -97,10 +97,10 @@ def limit_cycle(
     guess: Guess | None = None,
     period_n: int = 1,
     model: ModelLike | None = None,
-    options: CycleOptions | Options | None = None,
-    lost: Lost = "zeros",
-    which: Which = "slowest",
-) -> LimitCycle | WalkedCycle:
+    options: CycleOptions | StepOptions | None = None,
+    on_failure: FailureValue = "zeros",
+    which: GaitChoice = "slowest",
+) -> LimitCycle | ReturnMapCycle:
     """Return the limit cycle of this wheel: the gait that repeats after `period_n` steps.
 
     For `period_n` 1 no start is needed. With a `guess`, a neighbor's cycle or a section state
@@ -149,17 +149,19 @@ def limit_cycle(
         >>> print(f"{gradient.damping:.6f} per N s/m")
         0.000115 per N s/m
     """
-    place_in_list(which)
-    model = cycles.serving(params, model)
-    finder = cycles.finder_for(params, model, options, whole("period_n", period_n))
-    or_nan = chosen("lost", lost, ZEROS_OR_NAN) == "nan"
-    if guess is None and period_n > 1 and not finder.coexisting:
+    parse_gait_choice(which)
+    model = cycles.resolve_model(params, model)
+    finder = cycles.resolve_finder(params, model, options, check_int("period_n", period_n))
+    uses_nan = check_choice("lost", on_failure, FAILURE_VALUES) == "nan"
+    if guess is None and period_n > 1 and not finder.is_multistable:
         raise ValueError(
             f"period_n is {period_n} and there is no guess, but a gait of several steps is one of "
             "many beside the gait of one step: give guess=, a section state near it."
         )
-    cycle: Any = _wherever(finder, params, cycles.near(guess), options is None, which)
-    return cycle.or_nan(params) if or_nan else cycle
+    cycle: Any = _search_with_fallbacks(
+        finder, params, cycles.check_guess(guess), options is None, which
+    )
+    return cycle.replace_missing_by_nan(params) if uses_nan else cycle
 
 
 def limit_cycles(
@@ -167,9 +169,9 @@ def limit_cycles(
     *,
     period_n: int = 1,
     model: ModelLike | None = None,
-    options: CycleOptions | Options | None = None,
-    which: Which = "slowest",
-) -> LimitCycle | WalkedCycle:
+    options: CycleOptions | StepOptions | None = None,
+    which: GaitChoice = "slowest",
+) -> LimitCycle | ReturnMapCycle:
     """Return `limit_cycle` of a batch of wheels. Fields of `params` and of the result have one
     leading axis.
 
@@ -194,24 +196,24 @@ def limit_cycles(
         >>> cycles.found.tolist(), cycles.period.round(3).tolist()
         ([True, True, False], [0.595, 0.6980000000000001, 0.0])
     """
-    place_in_list(which)
+    parse_gait_choice(which)
     shape = np.broadcast_shapes(*(np.shape(x) for x in jax.tree.leaves(params)))
     if not shape:
-        model = cycles.serving(params, model)
-        finder = cycles.finder_for(params, model, options, whole("period_n", period_n))
-        if finder.coexisting:
-            untraced("vrw.limit_cycles", "give vrw.limit_cycle a guess", params)
-            return gaits_attracting(finder, finder.model.values(params)[None])[1]
+        model = cycles.resolve_model(params, model)
+        finder = cycles.resolve_finder(params, model, options, check_int("period_n", period_n))
+        if finder.is_multistable:
+            check_not_traced("vrw.limit_cycles", "give vrw.limit_cycle a guess", params)
+            return find_attracting_gaits(finder, finder.model.parameter_values(params)[None])[1]
     if len(shape) != 1:
         raise ValueError(f"the wheels' batch has shape {shape}, but it must have one axis.")
     params = jax.tree.map(lambda x: jnp.broadcast_to(x, shape), params)
-    one = jax.tree.map(lambda x: x[0], params)
-    finder = cycles.finder_for(one, model, options, whole("period_n", period_n))
-    cycle: Any = _wherever(finder, params, None, options is None, which)
+    single_params = jax.tree.map(lambda x: x[0], params)
+    finder = cycles.resolve_finder(single_params, model, options, check_int("period_n", period_n))
+    cycle: Any = _search_with_fallbacks(finder, params, None, options is None, which)
     return cycle
 
 
-def place_in_list(which: Which) -> int:
+def parse_gait_choice(which: GaitChoice) -> int:
     """Return the index of a gait in a list sorted by speed, slowest first.
 
     Raises: ValueError: the choice is neither a name nor an integer.
@@ -226,218 +228,307 @@ def place_in_list(which: Which) -> int:
     return int(which)
 
 
-def _chosen(finder: Any, params: WheelParams, which: Which) -> Any:
-    wheels, place = params.damping.shape[0], place_in_list(which)
-    owner, gaits = gaits_attracting(finder, jax.vmap(finder.model.values)(params))
-    counts = np.bincount(owner, minlength=wheels)
-    few = counts[(place >= counts) | (place < -counts)]
-    if len(few):
-        n = int(few[0])
+def _select_gait(finder: Any, params: WheelParams, which: GaitChoice) -> Any:
+    n_wheels, rank = params.damping.shape[0], parse_gait_choice(which)
+    wheel_index, gaits = find_attracting_gaits(finder, jax.vmap(finder.model.values)(params))
+    n_gaits_per_wheel = np.bincount(wheel_index, minlength=n_wheels)
+    too_few = n_gaits_per_wheel[(rank >= n_gaits_per_wheel) | (rank < -n_gaits_per_wheel)]
+    if len(too_few):
+        n_gaits = int(too_few[0])
         raise ValueError(
-            f"which is {which}, but {n} gait{'s' * (n > 1)} of this wheel attract"
-            f"{'s' * (n == 1)}: vrw.limit_cycles(params, model=...) returns them."
+            f"which is {which}, but {n_gaits} gait{'s' * (n_gaits > 1)} of this wheel attract"
+            f"{'s' * (n_gaits == 1)}: vrw.limit_cycles(params, model=...) returns them."
         )
-    return _taken(gaits, slowest(owner, wheels) + place % counts)
+    return _take_rows_on_device(
+        gaits, find_slowest_indices(wheel_index, n_wheels) + rank % n_gaits_per_wheel
+    )
 
 
-def _wherever(finder: Any, params: WheelParams, guess: Any, adaptive: bool, which: Which) -> Any:
+def _search_with_fallbacks(
+    finder: Any, params: WheelParams, guess: Any, refines_mesh: bool, which: GaitChoice
+) -> Any:
     """Return the cycle of one wheel or of a batch, by the search and all fallbacks."""
-    many = params.damping.ndim > 0
-    still = lax.stop_gradient(params)
-    hidden, plain = traced(still), not traced(params)
-    if finder.coexisting and guess is None and not hidden:
-        cycle = _chosen(finder, still if many else _taken(still, None), which)
-        cycle = cycle if many else _taken(cycle, 0)
-        return cycle if plain else _searched(finder, params, cycle.section_state)
-    cycle = _searched(finder, params, guess)
-    known = lax.stop_gradient((params, cycle))  # differentiated arrays have values, too
-    if not finder.from_nothing or traced(known):
+    is_batch = params.damping.ndim > 0
+    params_without_tangents = lax.stop_gradient(params)
+    is_traced_value, is_concrete = is_traced(params_without_tangents), not is_traced(params)
+    if finder.is_multistable and guess is None and not is_traced_value:
+        cycle = _select_gait(
+            finder,
+            params_without_tangents
+            if is_batch
+            else _take_rows_on_device(params_without_tangents, None),
+            which,
+        )
+        cycle = cycle if is_batch else _take_rows_on_device(cycle, 0)
+        return cycle if is_concrete else _search(finder, params, cycle.section_state)
+    cycle = _search(finder, params, guess)
+    params_and_cycle = lax.stop_gradient((params, cycle))  # differentiated arrays have values, too
+    if not finder.supports_cold_start or is_traced(params_and_cycle):
         return cycle
-    if not many:
-        known = _taken(known, None)
-    reached = _reached(finder, *known, adaptive)
+    if not is_batch:
+        params_and_cycle = _take_rows_on_device(params_and_cycle, None)
+    fallback = _fallback_starts(finder, *params_and_cycle, refines_mesh)
     if finder.period_n > 1 and guess is not None:
-        x = np.asarray(_state(guess))[None]
-        if reached is None:
-            reached = _from_another_step(finder, *known, x)
-        reached = _counted_as(finder, *known, x, reached)
-    if reached is None:
+        section_state = np.asarray(_guess_section_state(guess))[None]
+        if fallback is None:
+            fallback = _retry_from_other_steps(finder, *params_and_cycle, section_state)
+        fallback = _align_first_step(finder, *params_and_cycle, section_state, fallback)
+    if fallback is None:
         return cycle
-    finder, located = reached
-    if plain:
-        cycle = in_batches(finder.cycles, SHAPES, known[0], located)  # a compiled program
-        return cycle if many else _taken(cycle, 0)
-    return _searched(finder, params, jax.device_put(located) if many else _taken(located, 0))
+    finder, collocation_state = fallback
+    if is_concrete:
+        cycle = map_in_batches(
+            finder.find_cycles, GAIT_BATCH_SIZES, params_and_cycle[0], collocation_state
+        )  # a compiled program
+        return cycle if is_batch else _take_rows_on_device(cycle, 0)
+    return _search(
+        finder,
+        params,
+        jax.device_put(collocation_state)
+        if is_batch
+        else _take_rows_on_device(collocation_state, 0),
+    )
 
 
-def _searched(finder: AbstractGaitFinder, params: WheelParams, guess: Any) -> Any:
-    return (finder.cycles if params.damping.ndim else finder.cycle)(params, guess)
+def _search(finder: AbstractGaitFinder, params: WheelParams, guess: Any) -> Any:
+    return (finder.find_cycles if params.damping.ndim else finder.find_cycle)(params, guess)
 
 
-def _taken(tree: Any, places: Any) -> Any:
+def _take_rows_on_device(tree: Any, row_indices: Any) -> Any:
     """Return rows of a tree by numpy, because JAX would compile a program for each shape."""
-    return jax.device_put(taken(tree, places))
+    return jax.device_put(take_rows(tree, row_indices))
 
 
-def _put(tree: Any, places: np.ndarray, values: Any) -> Any:
-    def put(x: Any, v: Any) -> np.ndarray:
-        x = np.array(x)
-        x[places] = v
-        return x
+def _replace_rows(tree: Any, row_indices: np.ndarray, values: Any) -> Any:
+    def replace(leaf: Any, new_rows: Any) -> np.ndarray:
+        leaf = np.array(leaf)
+        leaf[row_indices] = new_rows
+        return leaf
 
-    return jax.tree.map(put, tree, values)
+    return jax.tree.map(replace, tree, values)
 
 
-def _walked_from(
-    finder: CollocationFinder, params: WheelParams, x: np.ndarray
+def _walk_and_measure_defect(
+    finder: CollocationFinder, params: WheelParams, start_states: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Walk N_GAIT_WALK_STEPS from each state and measure the defect of one more period.
 
     The defect is infinite where a walk ended early.
     """
-    there = steps(params, x, N_STEPS, model=finder.model)
-    states, on = np.array(there.section_state), np.asarray(there.outcome) == Outcome.STEPPED
-    missed = np.full(len(states), np.inf)
-    if on.any():
-        later = steps(_taken(params, on), states[on], finder.period_n, model=finder.model)
-        away = np.abs(np.asarray(later.section_state) - states[on]).max(-1)
-        missed[on] = np.where(np.asarray(later.outcome) == Outcome.STEPPED, away, np.inf)
-    return states, missed
+    walk_result = step_batch(params, start_states, N_GAIT_WALK_STEPS, model=finder.model)
+    states, continues = (
+        np.array(walk_result.section_state),
+        np.asarray(walk_result.outcome) == Outcome.STEPPED,
+    )
+    period_defect = np.full(len(states), np.inf)
+    if continues.any():
+        next_period = step_batch(
+            _take_rows_on_device(params, continues),
+            states[continues],
+            finder.period_n,
+            model=finder.model,
+        )
+        distance = np.abs(np.asarray(next_period.section_state) - states[continues]).max(-1)
+        period_defect[continues] = np.where(
+            np.asarray(next_period.outcome) == Outcome.STEPPED, distance, np.inf
+        )
+    return states, period_defect
 
 
-class _Walks(NamedTuple):
+class _WalkResults(NamedTuple):
     """State of a batch of wheels after walks of N_GAIT_WALK_STEPS."""
 
-    reached: np.ndarray  # whether a walk continues, and repeats to START_DISTANCE
-    x: np.ndarray  # (wheels, 3): section state of the walk that repeats best
+    is_usable: np.ndarray  # whether a walk continues, and repeats to START_DISTANCE
+    section_states: np.ndarray  # (wheels, 3): section state of the walk that repeats best
 
 
-def _walked(finder: CollocationFinder, params: WheelParams, wanted: np.ndarray) -> _Walks:
-    n, places = len(wanted), np.flatnonzero(wanted)
-    best, x = np.full(n, np.inf), np.zeros((n, 3))
-    for begin in (starts_of, further_starts_of):
-        own = _taken(params, places)
-        for start in begin(own) if len(places) else ():
-            states, missed = _walked_from(finder, own, start)
-            nearer = missed < best[places]
-            lanes = places[nearer]
-            best[lanes], x[lanes] = missed[nearer], states[nearer]
-        places = np.flatnonzero(wanted & (best >= NEAR))
-    return _Walks(best < NEAR, x)
+def _walk_from_all_starts(
+    finder: CollocationFinder, params: WheelParams, is_wanted: np.ndarray
+) -> _WalkResults:
+    n_wheels, indices = len(is_wanted), np.flatnonzero(is_wanted)
+    smallest_defect, section_states = np.full(n_wheels, np.inf), np.zeros((n_wheels, 3))
+    for compute_starts in (compute_walk_starts, compute_fallback_starts):
+        own_params = _take_rows_on_device(params, indices)
+        for start in compute_starts(own_params) if len(indices) else ():
+            states, period_defect = _walk_and_measure_defect(finder, own_params, start)
+            is_better = period_defect < smallest_defect[indices]
+            better_indices = indices[is_better]
+            smallest_defect[better_indices], section_states[better_indices] = (
+                period_defect[is_better],
+                states[is_better],
+            )
+        indices = np.flatnonzero(is_wanted & (smallest_defect >= START_DISTANCE))
+    return _WalkResults(smallest_defect < START_DISTANCE, section_states)
 
 
-def _begun(
-    finder: CollocationFinder, params: WheelParams, located: Located, has: np.ndarray, walks: _Walks
-) -> Located:
+def _initial_guesses(
+    finder: CollocationFinder,
+    params: WheelParams,
+    collocation_state: CollocationState,
+    has_state: np.ndarray,
+    walk_results: _WalkResults,
+) -> CollocationState:
     """Return the starts of searches: the known states, else states from walks, else the surface of
     gaits."""
-    start = in_batches(lambda own: finder.first_guesses(parameters_of(own).T), SHAPES, params)
-    along = np.flatnonzero(walks.reached & ~has)
-    if len(along):
-        walk = jax.vmap(finder.after)
-        start = _put(start, along, in_batches(walk, SHAPES, _taken(params, along), walks.x[along]))
-    return _put(start, has, _taken(located, has))
+    guesses = map_in_batches(
+        lambda batch_params: finder.initial_guesses(stack_parameters(batch_params).T),
+        GAIT_BATCH_SIZES,
+        params,
+    )
+    from_walk = np.flatnonzero(walk_results.is_usable & ~has_state)
+    if len(from_walk):
+        guess_from_state = jax.vmap(finder.guess_from_state)
+        guesses = _replace_rows(
+            guesses,
+            from_walk,
+            map_in_batches(
+                guess_from_state,
+                GAIT_BATCH_SIZES,
+                _take_rows_on_device(params, from_walk),
+                walk_results.section_states[from_walk],
+            ),
+        )
+    return _replace_rows(guesses, has_state, _take_rows_on_device(collocation_state, has_state))
 
 
-def _reached(
-    finder: CollocationFinder, params: WheelParams, cycle: LimitCycle, adaptive: bool
-) -> tuple[CollocationFinder, Located] | None:
+def _fallback_starts(
+    finder: CollocationFinder, params: WheelParams, cycle: LimitCycle, refines_mesh: bool
+) -> tuple[CollocationFinder, CollocationState] | None:
     """Return a finder, and starts from which it finds more of a batch's gaits; None if there are
     none.
 
     `refines_mesh` allows a finer mesh.
     """
     outcome = np.asarray(cycle.outcome)
-    rough = adaptive & (np.asarray(cycle.mesh_error) > MESH_ERROR)
-    lost = np.isin(outcome, LOST)
-    open_ = lost | rough
-    if not open_.any():
+    is_rough = refines_mesh & (np.asarray(cycle.mesh_error) > REFINE_ABOVE_MESH_ERROR)
+    is_missing = np.isin(outcome, RETRY_OUTCOMES)
+    is_open = is_missing | is_rough
+    if not is_open.any():
         return None
-    walks = _walked(finder, params, lost)
+    walk_results = _walk_from_all_starts(finder, params, is_missing)
     # Best start of each wheel so far, found by a search, on the mesh of `finder`.
-    located, has = cycle.located, rough.copy()
-    coarse = outcome == Outcome.MESH_TOO_COARSE
-    best = None
-    for refinement in range(1 + REFINEMENTS * adaptive):
-        if refinement:
-            before, finder = finder, finder.finer()
-            moved = jax.vmap(functools.partial(finder.on_mesh, before.problem))
-            located = in_batches(moved, SHAPES, located)
+    collocation_state, has_state = cycle.collocation_state, is_rough.copy()
+    is_coarse = outcome == Outcome.MESH_TOO_COARSE
+    best_result = None
+    for refinement_index in range(1 + MAX_MESH_REFINEMENTS * refines_mesh):
+        if refinement_index:
+            coarser_finder, finder = finder, finder.finer()
+            transfer = jax.vmap(functools.partial(finder.transfer_to_mesh, coarser_finder.system))
+            collocation_state = map_in_batches(transfer, GAIT_BATCH_SIZES, collocation_state)
         # The search without walks has used this mesh already. One finer mesh is always tried.
-        promising = walks.reached | has | (coarse & (refinement > 0)) | (refinement == 1)
-        places = np.flatnonzero(open_ & promising)
-        if not len(places):
+        is_promising = (
+            walk_results.is_usable
+            | has_state
+            | (is_coarse & (refinement_index > 0))
+            | (refinement_index == 1)
+        )
+        indices = np.flatnonzero(is_open & is_promising)
+        if not len(indices):
             continue
-        some, own = _taken(params, places), _Walks(*(part[places] for part in walks))
-        begin = _begun(finder, some, _taken(located, places), has[places], own)
-        again = in_batches(finder.cycles, SHAPES, some, begin)
-        gait, error = np.asarray(again.found), np.asarray(again.mesh_error)
-        located = _put(located, places[gait], _taken(again.located, gait))
-        if gait.any():
-            best = finder, located
-        has[places[gait]] = True
-        coarse[places] = np.asarray(again.outcome) == Outcome.MESH_TOO_COARSE
-        open_[places[gait & ((error <= MESH_ERROR) | (not adaptive))]] = False
-    return best
+        subset_params, subset_walks = (
+            _take_rows_on_device(params, indices),
+            _WalkResults(*(part[indices] for part in walk_results)),
+        )
+        guesses = _initial_guesses(
+            finder,
+            subset_params,
+            _take_rows_on_device(collocation_state, indices),
+            has_state[indices],
+            subset_walks,
+        )
+        retry = map_in_batches(finder.find_cycles, GAIT_BATCH_SIZES, subset_params, guesses)
+        is_found, mesh_error = np.asarray(retry.found), np.asarray(retry.mesh_error)
+        collocation_state = _replace_rows(
+            collocation_state,
+            indices[is_found],
+            _take_rows_on_device(retry.collocation_state, is_found),
+        )
+        if is_found.any():
+            best_result = finder, collocation_state
+        has_state[indices[is_found]] = True
+        is_coarse[indices] = np.asarray(retry.outcome) == Outcome.MESH_TOO_COARSE
+        is_open[
+            indices[is_found & ((mesh_error <= REFINE_ABOVE_MESH_ERROR) | (not refines_mesh))]
+        ] = False
+    return best_result
 
 
-def reached(finder: Any, params: WheelParams, searched: LimitCycle) -> LimitCycle:
+def retry_from_walks(finder: Any, params: WheelParams, search_result: LimitCycle) -> LimitCycle:
     """Return the search's result, with cycles from walks where the search found none, on the same
     mesh."""
-    found = _reached(finder, params, searched, adaptive=False)
-    if found is None:
-        return searched
-    cycle: LimitCycle = in_batches(finder.cycles, SHAPES, params, found[1])
+    fallback = _fallback_starts(finder, params, search_result, refines_mesh=False)
+    if fallback is None:
+        return search_result
+    cycle: LimitCycle = map_in_batches(finder.find_cycles, GAIT_BATCH_SIZES, params, fallback[1])
     return cycle
 
 
-def _state(guess: Any) -> Any:
+def _guess_section_state(guess: Any) -> Any:
     """Return the section state of a guess, which is a cycle, a `CollocationState` or a section
     state."""
-    if isinstance(guess, Located):
+    if isinstance(guess, CollocationState):
         return guess.ends[-1][jnp.array([0, 2, 3])]
     return getattr(guess, "section_state", guess)
 
 
-def _from_another_step(
-    finder: CollocationFinder, params: WheelParams, cycle: LimitCycle, x: np.ndarray
-) -> tuple[CollocationFinder, Located] | None:
+def _retry_from_other_steps(
+    finder: CollocationFinder, params: WheelParams, cycle: LimitCycle, section_states: np.ndarray
+) -> tuple[CollocationFinder, CollocationState] | None:
     """Search for the same orbit with another of its steps as the first one.
 
     A guess contains the accelerations of all steps, whose errors accumulate. A step without double
     support is the most sensitive. As the first or last step it may make the guess fail.
     """
-    lost = np.flatnonzero(np.isin(np.asarray(cycle.outcome), LOST))
-    if not len(lost):
+    missing = np.flatnonzero(np.isin(np.asarray(cycle.outcome), RETRY_OUTCOMES))
+    if not len(missing):
         return None
-    some, x, best = _taken(params, lost), np.array(x[lost]), None
-    located = cycle.located
+    subset_params, section_states, best_result = (
+        _take_rows_on_device(params, missing),
+        np.array(section_states[missing]),
+        None,
+    )
+    collocation_state = cycle.collocation_state
     for _ in range(1, finder.period_n):
-        x = np.asarray(steps(some, x, model=finder.model).section_state)
-        found = in_batches(finder.cycles, SHAPES, some, x)
-        gait = np.flatnonzero(np.asarray(found.found) & (np.asarray(located.found)[lost] < 0.5))
-        if len(gait):
-            located = _put(located, lost[gait], _taken(found.located, gait))
-            best = finder, located
-    return best
+        section_states = np.asarray(
+            step_batch(subset_params, section_states, model=finder.model).section_state
+        )
+        retry = map_in_batches(finder.find_cycles, GAIT_BATCH_SIZES, subset_params, section_states)
+        found_indices = np.flatnonzero(
+            np.asarray(retry.found) & (np.asarray(collocation_state.found)[missing] < 0.5)
+        )
+        if len(found_indices):
+            collocation_state = _replace_rows(
+                collocation_state,
+                missing[found_indices],
+                _take_rows_on_device(retry.collocation_state, found_indices),
+            )
+            best_result = finder, collocation_state
+    return best_result
 
 
-def _counted_as(
+def _align_first_step(
     finder: CollocationFinder,
     params: WheelParams,
     cycle: LimitCycle,
-    x: np.ndarray,
-    reached: tuple[CollocationFinder, Located] | None,
-) -> tuple[CollocationFinder, Located] | None:
+    first_states: np.ndarray,
+    fallback: tuple[CollocationFinder, CollocationState] | None,
+) -> tuple[CollocationFinder, CollocationState] | None:
     """Return the same orbits with the step nearest to `first_states` as the first one."""
-    finder, located = reached or (finder, cycle.located)
-    ends = np.asarray(located.ends)[:, :, [0, 2, 3]]
-    missed = np.abs(np.roll(ends, 1, axis=1) - x[:, None]).max(-1)
-    missed = np.where(np.asarray(located.found)[:, None] > 0.5, missed, 0.0)
-    for step in range(1, finder.period_n):
-        lanes = np.flatnonzero(np.argmin(missed, 1) == step)
-        if len(lanes):
-            again = jax.vmap(functools.partial(finder.counted_from, step))
-            located = _put(located, lanes, again(_taken(params, lanes), _taken(located, lanes)))
-            reached = finder, located
-    return reached
+    finder, collocation_state = fallback or (finder, cycle.collocation_state)
+    ends = np.asarray(collocation_state.ends)[:, :, [0, 2, 3]]
+    distances = np.abs(np.roll(ends, 1, axis=1) - first_states[:, None]).max(-1)
+    distances = np.where(np.asarray(collocation_state.found)[:, None] > 0.5, distances, 0.0)
+    for step_index in range(1, finder.period_n):
+        indices = np.flatnonzero(np.argmin(distances, 1) == step_index)
+        if len(indices):
+            shift_step = jax.vmap(functools.partial(finder.shift_first_step, step_index))
+            collocation_state = _replace_rows(
+                collocation_state,
+                indices,
+                shift_step(
+                    _take_rows_on_device(params, indices),
+                    _take_rows_on_device(collocation_state, indices),
+                ),
+            )
+            fallback = finder, collocation_state
+    return fallback

@@ -4,44 +4,48 @@ from vrw_jax.models import scales
 from vrw_jax.models.base import (
     AbstractStep,
     AbstractWheel,
-    Advance,
+    AdvanceResult,
+    AnySectionState,
+    DoubleSupportIndicators,
     EnergyLoss,
-    GroundOfStep,
-    Indicators,
     Margins,
-    RungState,
     SectionState,
+    StepGround,
     StepResult,
     Trajectory,
-    replaced_where_bad,
-    usable,
+    is_valid_start,
+    replace_invalid,
 )
 from vrw_jax.models.ladder import (
-    PREMISES,
-    SERVED,
-    UNILATERAL,
-    VISCOELASTIC,
+    SELECTION_ATTRS,
+    SELECTION_MARGINS,
+    UNILATERAL_MODEL,
+    VISCOELASTIC_MODEL,
     LadderStep,
     LadderWheel,
     ModelChoice,
-    reason_of,
+    find_selection_reason,
     refuse_ladder,
 )
-from vrw_jax.models.lane_step import DIRECTIONS, along_units, gait_step
+from vrw_jax.models.lane_step import N_STEP_INPUTS, gait_step, jacobian_columns
 from vrw_jax.models.paper_step import PAPER_START
 from vrw_jax.models.rigid import RigidWheel
-from vrw_jax.models.scales import along_all
-from vrw_jax.models.unilateral.contacts import STICK
-from vrw_jax.models.unilateral.ledger import UnilateralStep, least_dip
+from vrw_jax.models.scales import scaled_jacobian_columns
+from vrw_jax.models.unilateral.contacts import CONTACT_STICK
+from vrw_jax.models.unilateral.ledger import UnilateralStep, min_dip_depth
 from vrw_jax.models.unilateral.mechanics import (
-    directions,
     foot_heights,
-    foot_places,
+    foot_positions,
     kinetic_energy,
+    leg_directions,
     potential_energy,
 )
-from vrw_jax.models.unilateral.motion import State, unpack
-from vrw_jax.models.unilateral.queues import as_full_states, step_lanes, walk_lanes
-from vrw_jax.models.unilateral.section import LOCKED
+from vrw_jax.models.unilateral.motion import PackedState, unpack_state
+from vrw_jax.models.unilateral.queues import (
+    embed_section_states,
+    step_batch_with_jacobian,
+    walk_batch,
+)
+from vrw_jax.models.unilateral.section import LOCKED_CODE_OFFSET
 from vrw_jax.models.unilateral.wheel import UnilateralTrajectory, UnilateralWheel
 from vrw_jax.models.viscoelastic import ViscoelasticWheel

@@ -12,43 +12,59 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from vrw_jax.numerics import Elementwise, Options
-from vrw_jax.results import MARGINS, MEASURES
-from vrw_jax.wheel import FRICTION, LARGEST, PARAMETER_NAMES, Outcome, WheelParams, wheel_of
-from vrw_jax.wording import AbstractTold, Row, counted, told, traced
+from vrw_jax.numerics import Elementwise, StepOptions
+from vrw_jax.results import MARGIN_MEASURES, MEASURES
+from vrw_jax.wheel import (
+    FRICTION_NAME,
+    MAX_SI_VALUE,
+    PARAMETER_NAMES,
+    Outcome,
+    WheelParams,
+    wheel_from_parameters,
+)
+from vrw_jax.wording import (
+    AbstractPrintable,
+    TextRow,
+    format_outcome_counts,
+    format_quantity,
+    is_traced,
+)
 
 SectionState = Float[Array, "3"]
 """(theta-, dtheta-, dL1-) just before touchdown, in the leg labels of the ending step: rad, rad/s,
 m/s. The length of Leg 1 follows from the touchdown condition; Leg 2 is on its stopper."""
-RungState = Float[Array, "section ..."]
+AnySectionState = Float[Array, "section ..."]
 """A `SectionState`, or the longer one of another model; in a batch, elements are on the last
 axis."""
-Measured = Float[Array, "..."]
+MeasureValue = Float[Array, "..."]
 """One number of a step; in a batch, one number per element."""
 
 
-GroundOfStep = tuple[Array, Array, Array, Array]
+StepGround = tuple[Array, Array, Array, Array]
 """Slope and friction of a landing, friction of the earlier footholds, and the tilt by which the
 ground ahead is steeper; or all of these over steps."""
 
 
-class AbstractMeasured(AbstractTold):
+class AbstractMeasures(AbstractPrintable):
     """Several measures; each field is one of `results.ALL_MEASURES`."""
 
-    named: eqx.AbstractClassVar[Mapping[str, str]]
+    measure_names: eqx.AbstractClassVar[Mapping[str, str]]
     """Names in `results.ALL_MEASURES` of the fields whose own names differ."""
 
     def measures(self) -> dict[str, Array]:
         """Return the fields by their names in `results.ALL_MEASURES`."""
-        return {self.named.get(name, name): value for name, value in vars(self).items()}
+        return {self.measure_names.get(name, name): value for name, value in vars(self).items()}
 
-    def rows(self) -> list[Row]:
+    def summary_rows(self) -> list[TextRow]:
         """Return label and printed value of each measure."""
         measures = self.measures().items()
-        return [(MEASURES[name].label, told(x, MEASURES[name].unit)) for name, x in measures]
+        return [
+            (MEASURES[name].label, format_quantity(value, MEASURES[name].unit))
+            for name, value in measures
+        ]
 
 
-class Indicators(AbstractMeasured):
+class DoubleSupportIndicators(AbstractMeasures):
     """The double-limb-support indicators of Section 5.1, for the landing that opens the step.
 
     - `lambda_I4`: normal impulse of the rear foot in the landing, both feet held, N s;
@@ -61,14 +77,14 @@ class Indicators(AbstractMeasured):
         9.47 N
     """
 
-    named: ClassVar = {"lambda_2": "lambda_2_plus", "lambda_4": "lambda_4_plus"}
+    measure_names: ClassVar = {"lambda_2": "lambda_2_plus", "lambda_4": "lambda_4_plus"}
 
-    lambda_I4: Measured
-    lambda_2: Measured
-    lambda_4: Measured
+    lambda_I4: MeasureValue
+    lambda_2: MeasureValue
+    lambda_4: MeasureValue
 
 
-class EnergyLoss(AbstractMeasured):
+class EnergyLoss(AbstractMeasures):
     """Mechanical energy lost in the step, J; each part is positive for a loss.
 
     - `landing`, `stopper`: in the two collisions;
@@ -80,14 +96,16 @@ class EnergyLoss(AbstractMeasured):
         7.4 J, 26.2 J
     """
 
-    named: ClassVar = {name: f"energy_lost_{name}" for name in ("landing", "stopper", "damping")}
+    measure_names: ClassVar = {
+        name: f"energy_lost_{name}" for name in ("landing", "stopper", "damping")
+    }
 
-    landing: Measured
-    stopper: Measured
-    damping: Measured
+    landing: MeasureValue
+    stopper: MeasureValue
+    damping: MeasureValue
 
 
-class Margins(AbstractMeasured):
+class Margins(AbstractMeasures):
     """Assumptions of the viscoelastic model as signed margins over one step: negative where
     violated.
 
@@ -121,31 +139,31 @@ class Margins(AbstractMeasured):
         -13.22
     """
 
-    named: ClassVar = {}
+    measure_names: ClassVar = {}
 
-    fore_foot_force: Measured
-    takeoff_acceleration: Measured
-    clearance_sls1: Measured
-    clearance_sls2: Measured
+    fore_foot_force: MeasureValue
+    takeoff_acceleration: MeasureValue
+    clearance_sls1: MeasureValue
+    clearance_sls2: MeasureValue
     locked_stopper_force: Float[Array, "n_locked ..."]
-    rear_stopper_force: Measured
-    contraction: Measured
-    friction_fore: Measured
-    friction_rear: Measured
+    rear_stopper_force: MeasureValue
+    contraction: MeasureValue
+    friction_fore: MeasureValue
+    friction_rear: MeasureValue
     landing_stopper_impulse: Float[Array, "n_locked ..."]
     hit_stopper_impulse: Float[Array, "n_locked ..."]
-    hit_planted_impulse: Measured
-    landing_friction_fore: Measured
-    landing_friction_rear: Measured
+    hit_planted_impulse: MeasureValue
+    landing_friction_fore: MeasureValue
+    landing_friction_rear: MeasureValue
 
 
-class AbstractStep(AbstractTold):
+class AbstractStep(AbstractPrintable):
     """Result of one step, as far as all models share it. Batched under vmap."""
 
     section_state: eqx.AbstractVar[Array]  # just before the next touchdown
     post_impact: eqx.AbstractVar[Float[Array, "2 ..."]]  # (theta, dtheta), rad, rad/s
     durations: eqx.AbstractVar[Float[Array, "3 ..."]]  # double support first, s
-    step_length: eqx.AbstractVar[Measured]  # m
+    step_length: eqx.AbstractVar[MeasureValue]  # m
     outcome: eqx.AbstractVar[Int[Array, "..."]]  # an Outcome
     solver_steps: eqx.AbstractVar[Int[Array, "..."]]  # attempted solver steps
 
@@ -184,28 +202,28 @@ class AbstractStep(AbstractTold):
             "outcome": self.outcome,
             "solver_steps": self.solver_steps,
         }
-        return shared | self.own_measures()
+        return shared | self.model_measures()
 
-    def rows(self) -> list[Row]:
+    def summary_rows(self) -> list[TextRow]:
         """Return the printable rows: measures, then margins and whether their assumptions hold."""
         outcome, values = np.asarray(self.outcome), self.measures()
         if outcome.ndim:
-            return [("steps", counted(outcome, Outcome))]
+            return [("steps", format_outcome_counts(outcome, Outcome))]
         code = Outcome(int(outcome))
         rows = [("outcome", f"{code.name}: {code.meaning}")]
         for name, value in values.items():
             if name == "outcome":
                 continue
-            measure, least = MEASURES[name], float(np.min(np.asarray(value)))
-            verdict = ", holds" if least >= 0.0 else ", broken"
-            text = measure.text(least)
-            if name in MARGINS:
+            measure, lowest = MEASURES[name], float(np.min(np.asarray(value)))
+            verdict = ", holds" if lowest >= 0.0 else ", broken"
+            text = measure.format_with_unit(lowest)
+            if name in MARGIN_MEASURES:
                 rows.append((f"premise: {measure.label}", text + verdict))
             else:
                 rows.append((measure.label, text))
         return rows
 
-    def served(self) -> dict[str, Array]:
+    def model_selection(self) -> dict[str, Array]:
         """Return the code of the model that took the step and the reason, by names of
         `SELECTION_ATTRS`.
 
@@ -214,19 +232,19 @@ class AbstractStep(AbstractTold):
         return {}
 
     @abc.abstractmethod
-    def own_measures(self) -> dict[str, Array]:
+    def model_measures(self) -> dict[str, Array]:
         """Return the measures that not every model reports."""
 
 
-class AbstractGroundStep(AbstractStep):
+class AbstractContactStep(AbstractStep):
     """A step with contacts in any order; `durations` are those with two, one and no loaded feet."""
 
-    energy_impacts: eqx.AbstractVar[Measured]  # lost in impacts, J
-    energy_damping: eqx.AbstractVar[Measured]  # lost in the dampers, J
-    energy_friction: eqx.AbstractVar[Measured]  # lost by sliding between impacts, J
-    slip: eqx.AbstractVar[Measured]  # path length of sliding feet, m
+    energy_impacts: eqx.AbstractVar[MeasureValue]  # lost in impacts, J
+    energy_damping: eqx.AbstractVar[MeasureValue]  # lost in the dampers, J
+    energy_friction: eqx.AbstractVar[MeasureValue]  # lost by sliding between impacts, J
+    slip: eqx.AbstractVar[MeasureValue]  # path length of sliding feet, m
 
-    def own_measures(self) -> dict[str, Array]:
+    def model_measures(self) -> dict[str, Array]:
         return {
             "energy_lost_damping": self.energy_damping,
             "duration_single": self.durations[..., 1],
@@ -261,34 +279,34 @@ class StepResult(AbstractStep):
     section_state: Float[Array, "3 ..."]
     post_impact: Float[Array, "2 ..."]
     durations: Float[Array, "3 ..."]
-    step_length: Measured
-    indicators: Indicators
-    monitors: Margins
+    step_length: MeasureValue
+    indicators: DoubleSupportIndicators
+    margins: Margins
     energy: EnergyLoss
     outcome: Int[Array, "..."]
     solver_steps: Int[Array, "..."]
     engine: str = eqx.field(static=True, default="")
 
-    def own_measures(self) -> dict[str, Array]:
+    def model_measures(self) -> dict[str, Array]:
         return {
             "duration_sls1": self.durations[..., 1],
             "duration_sls2": self.durations[..., 2],
             "dL1_touchdown": self.section_state[..., 2],
             **self.indicators.measures(),
             **self.energy.measures(),
-            **self.monitors.measures(),
+            **self.margins.measures(),
         }
 
 
-class Advance(eqx.Module):
+class AdvanceResult(eqx.Module):
     """Minimal result of a step: what the next step and a walk need."""
 
-    section_state: RungState
+    section_state: AnySectionState
     durations: Float[Array, "3 ..."]  # of DLS, SLS-I, SLS-II, s
     outcome: Int[Array, "..."]  # an Outcome
     solver_steps: Int[Array, "..."]  # attempted solver steps
-    rung: Int[Array, "..."] | None = None  # of the chosen model: see ladder
-    reason: Int[Array, "..."] | None = None  # of that choice
+    model_code: Int[Array, "..."] | None = None  # of the chosen model: see ladder
+    reason_code: Int[Array, "..."] | None = None  # of that choice
     engine: str = eqx.field(static=True, default="")  # see `StepOptions`
 
 
@@ -304,7 +322,7 @@ class Trajectory(eqx.Module):
     state: Float[Array, "3 n 6 ..."]  # theta, L1, L2 and their rates
     forces: Float[Array, "3 n 4 ..."]  # lambda_1 ... lambda_4, N
     energy: Float[Array, "3 n 3 ..."]  # kinetic, gravitational, elastic, J
-    section_state: RungState
+    section_state: AnySectionState
     durations: Float[Array, "3 ..."]  # s
     outcome: Int[Array, "..."]  # an Outcome
 
@@ -319,39 +337,40 @@ class AbstractWheel(eqx.Module):
         True
     """
 
-    rung: eqx.AbstractClassVar[str]
+    model_name: eqx.AbstractClassVar[str]
     """Name of the model, by which other packages look up what they hold for it."""
     parameter_names: eqx.AbstractClassVar[tuple[str, ...]]
     """Inputs of the motion: the wheel's parameters and, where the motion depends on it,
     friction."""
-    tells_contacts: eqx.AbstractClassVar[bool]
+    reports_contacts: eqx.AbstractClassVar[bool]
     """Whether trajectories report every leg's contact instead of the paper's phases."""
-    lanes: ClassVar[str] = ""
+    batch_kernel: ClassVar[str] = ""
     """Kind of the compiled batch kernel: the paper's "phases", "legs", or "" for none."""
-    legs_yield: ClassVar[bool] = True
+    is_compliant: ClassVar[bool] = True
     """Whether springs and dampers affect the motion; it selects what is tuned and scanned."""
 
     def __repr__(self) -> str:
-        if traced(self):
+        if is_traced(self):
             return eqx.tree_pformat(self)
-        number = lambda x: repr(float(x)) if x.ndim == 0 else told(x, "")
-        shown = lambda x: number(x) if eqx.is_array(x) else repr(x)
-        fields = ", ".join(f"{name}={shown(value)}" for name, value in vars(self).items())
+        format_number = lambda x: repr(float(x)) if x.ndim == 0 else format_quantity(x, "")
+        format_value = lambda x: format_number(x) if eqx.is_array(x) else repr(x)
+        fields = ", ".join(f"{name}={format_value(value)}" for name, value in vars(self).items())
         return f"{type(self).__name__}({fields})"
 
     @property
-    def upper(self) -> "AbstractWheel":
+    def fallback_model(self) -> "AbstractWheel":
         """Model that is valid for any start: itself, or the upper model of a ladder."""
         return self
 
-    def values(self, params: WheelParams) -> Float[Array, " n_values"]:
+    def parameter_values(self, params: WheelParams) -> Float[Array, " n_values"]:
         """Return the values of `parameter_names`, for one wheel on this ground."""
-        held = [
-            getattr(self if name == FRICTION else params, name) for name in self.parameter_names
+        numbers = [
+            getattr(self if name == FRICTION_NAME else params, name)
+            for name in self.parameter_names
         ]
-        return jnp.stack([jnp.asarray(value, params.damping.dtype) for value in held])
+        return jnp.stack([jnp.asarray(value, params.damping.dtype) for value in numbers])
 
-    def at(
+    def from_values(
         self, values: Array | tuple[Array, ...], n_legs: int
     ) -> tuple["AbstractWheel", WheelParams]:
         """Return model and wheel with other values: the inverse of `parameter_values`; works on
@@ -359,50 +378,52 @@ class AbstractWheel(eqx.Module):
         """
         n = len(PARAMETER_NAMES)
         model = self
-        if FRICTION in self.parameter_names:
+        if FRICTION_NAME in self.parameter_names:
             model = eqx.tree_at(lambda ground: ground.friction, self, values[n])
-        return model, wheel_of(values[:n], n_legs)
+        return model, wheel_from_parameters(values[:n], n_legs)
 
-    def moved(
+    def with_parameter(
         self, params: WheelParams, name: str, value: Elementwise
     ) -> tuple["AbstractWheel", WheelParams]:
         """Return model and wheel with another value of one of `parameter_names`; works on
         tracers.
         """
-        if name == FRICTION:
+        if name == FRICTION_NAME:
             return eqx.tree_at(lambda ground: ground.friction, self, value), params
         return self, eqx.tree_at(lambda wheel: getattr(wheel, name), params, value)
 
     @abc.abstractmethod
-    def advance(self, params: WheelParams, x: SectionState, options: Options) -> Advance:
+    def advance(self, params: WheelParams, x: SectionState, options: StepOptions) -> AdvanceResult:
         """Return one step in its minimal form. Differentiable in any mode, to any order."""
 
     @abc.abstractmethod
-    def step(self, params: WheelParams, x: SectionState, options: Options) -> Any:
+    def take_step(self, params: WheelParams, x: SectionState, options: StepOptions) -> Any:
         """Return one step with all indicators, margins and energies. Differentiable in any mode.
 
         The result is a `StepResult`, or the counterpart of the model.
         """
 
     @abc.abstractmethod
-    def trace(self, params: WheelParams, x: SectionState, options: Options, n_samples: int) -> Any:
+    def sample_step(
+        self, params: WheelParams, x: SectionState, options: StepOptions, n_samples: int
+    ) -> Any:
         """Return the motion of the step at `n_samples` times of each phase.
 
         The result is a `Trajectory`, or the counterpart of the model.
         """
 
     @abc.abstractmethod
-    def start(self, params: WheelParams) -> SectionState:
+    def default_start(self, params: WheelParams) -> SectionState:
         """Return a section state from which a walk may begin."""
 
-    def over_steps(self, params: WheelParams, n_steps: int) -> GroundOfStep | None:
+    def split_ground(self, params: WheelParams, n_steps: int) -> StepGround | None:
         """Return the ground of each of `n_steps` steps, if slope or friction are arrays over
         steps.
         """
         return None
 
-    def on_ground(
-        self, params: WheelParams, ground: GroundOfStep
+    def with_ground(
+        self, params: WheelParams, ground: StepGround
     ) -> tuple["AbstractWheel", WheelParams]:
         """Return model and wheel on the ground of one step."""
         raise NotImplementedError
@@ -411,42 +432,44 @@ class AbstractWheel(eqx.Module):
         """Return the length of a section state."""
         return 3
 
-    def section_numbers(self, params: WheelParams) -> int:
+    def n_continuous(self, params: WheelParams) -> int:
         """Return the number of leading entries of a section state that vary continuously; the rest
         are codes.
         """
         return self.section_size(params)
 
-    def full_section(self, params: WheelParams, x: Array) -> Array:
+    def embed_section(self, params: WheelParams, x: Array) -> Array:
         """Return the model's section state for a three-number one; others are returned
         unchanged.
         """
         return x
 
 
-Numbers = Float[Array, "section ..."] | tuple[Array, ...]
+StateValues = Float[Array, "section ..."] | tuple[Array, ...]
 """A section state, or its entries one by one, each of which may be an array over a batch."""
 
 
-def usable(params: WheelParams, x: Numbers) -> Array:
+def is_valid_start(params: WheelParams, x: StateValues) -> Array:
     """Return whether parameters and start are finite, in their domains and rolling forward."""
     theta, dtheta = x[0], x[1]
-    upright = (jnp.abs(theta) < 0.5 * jnp.pi) & (jnp.abs(theta - params.leg_angle) < 0.5 * jnp.pi)
-    in_reach = functools.reduce(operator.and_, [jnp.abs(value) < LARGEST for value in x])
-    return params.in_domain() & in_reach & upright & (dtheta > 0.0)  # False for NaN
+    is_upright = (jnp.abs(theta) < 0.5 * jnp.pi) & (
+        jnp.abs(theta - params.leg_angle) < 0.5 * jnp.pi
+    )
+    is_bounded = functools.reduce(operator.and_, [jnp.abs(value) < MAX_SI_VALUE for value in x])
+    return params.is_in_domain() & is_bounded & is_upright & (dtheta > 0.0)  # False for NaN
 
 
-def replaced_where_bad(
-    good: Array,
+def replace_invalid(
+    is_valid: Array,
     params: WheelParams,
-    x: Numbers,
-    safe_x: Any,
+    x: StateValues,
+    fallback_x: Any,
 ) -> tuple[WheelParams, Any]:
     """Return Table 1 and a safe start in place of invalid input, so that no NaN is ever
     computed.
     """
     return jax.tree.map(
-        lambda value, default: jnp.where(good, value, jnp.asarray(default, value.dtype)),
+        lambda value, default: jnp.where(is_valid, value, jnp.asarray(default, value.dtype)),
         (params, x),
-        (type(params)(n_legs=params.n_legs), safe_x),
+        (type(params)(n_legs=params.n_legs), fallback_x),
     )

@@ -17,28 +17,28 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.models.base import (
-    AbstractGroundStep,
+    AbstractContactStep,
     AbstractWheel,
-    Advance,
+    AdvanceResult,
     StepResult,
-    replaced_where_bad,
+    replace_invalid,
 )
 from vrw_jax.models.paper_step import PAPER_START
-from vrw_jax.models.unilateral.contacts import OFF, STICK
+from vrw_jax.models.unilateral.contacts import CONTACT_OFF, CONTACT_STICK
 from vrw_jax.models.unilateral.ledger import UnilateralStep
-from vrw_jax.models.unilateral.section import LOCKED, FullState, embedded
+from vrw_jax.models.unilateral.section import LOCKED_CODE_OFFSET, FullState, embed_section_state
 from vrw_jax.models.unilateral.wheel import UnilateralTrajectory, UnilateralWheel
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
-from vrw_jax.numerics import Number, Options, Scalar
-from vrw_jax.results import MARGINS
-from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, WheelParams, friction_of
-from vrw_jax.wording import AbstractTold, Row
+from vrw_jax.numerics import RealInput, Scalar, StepOptions
+from vrw_jax.results import MARGIN_MEASURES
+from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, Outcome, WheelParams, convert_friction
+from vrw_jax.wording import AbstractPrintable, TextRow
 
-RIGID, VISCOELASTIC, UNILATERAL = 0, 1, 2
+RIGID_MODEL, VISCOELASTIC_MODEL, UNILATERAL_MODEL = 0, 1, 2
 """Codes of the models; 0 is the rigid one."""
 
-PREMISES: dict[str, str] = {
-    name: MARGINS[name].breaks
+SELECTION_MARGINS: dict[str, str] = {
+    name: MARGIN_MEASURES[name].violation
     for name in (
         "fore_foot_force",
         "clearance_sls1",
@@ -53,27 +53,27 @@ PREMISES: dict[str, str] = {
 """Margins of the assumptions that only the viscoelastic model makes, with the text of a
 violation."""
 
-OFF_THE_PLANE = 1 + len(PREMISES)
+REASON_START_NOT_EMBEDDABLE = 1 + len(SELECTION_MARGINS)
 """Reason code of a start that is not a section state of the viscoelastic model."""
 
 
-SERVED: dict[str, dict[str, object]] = {
+SELECTION_ATTRS: dict[str, dict[str, object]] = {
     "rung": {
         "long_name": "rung that served",
-        "flag_values": [RIGID, VISCOELASTIC, UNILATERAL],
+        "flag_values": [RIGID_MODEL, VISCOELASTIC_MODEL, UNILATERAL_MODEL],
         "flag_meanings": "RigidWheel ViscoelasticWheel UnilateralWheel",
     },
     "reason": {
         "long_name": "why that rung served",
         "units": "1",
         "description": "0: all premises of the paper's wheel hold; above: the first that breaks, "
-        f"of {', '.join(PREMISES)}; below: minus that wheel's outcome.",
+        f"of {', '.join(SELECTION_MARGINS)}; below: minus that wheel's outcome.",
     },
 }
 """Attributes of the variables `model_selection` in data sets."""
 
 
-class ModelChoice(AbstractTold):
+class ModelChoice(AbstractPrintable):
     """Choice of the model, and its reason. Batched under vmap: every field gains the axis.
 
     `reason_code` is 0 if the viscoelastic model holds. If a margin is violated, it is 1 + the index
@@ -91,65 +91,76 @@ class ModelChoice(AbstractTold):
         (8,)
     """
 
-    rung: Int[Array, ""]
-    reason: Int[Array, ""]
+    model_code: Int[Array, ""]
+    reason_code: Int[Array, ""]
     margins: Float[Array, " n_premises"]
     friction: Scalar
 
-    def rows(self) -> list[Row]:
+    def summary_rows(self) -> list[TextRow]:
         """Return the printable rows: model, explanation and margins."""
-        reason = np.asarray(self.reason)
+        reason = np.asarray(self.reason_code)
         if reason.ndim:
-            served = int(np.sum(reason == 0))
+            n_paper_model = int(np.sum(reason == 0))
             return [
-                ("wheels", f"{reason.size} in shape {reason.shape}, {served} served by the paper's")
+                (
+                    "wheels",
+                    f"{reason.size} in shape {reason.shape}, {n_paper_model} served by the paper's",
+                )
             ]
-        told_margins = zip(PREMISES, np.asarray(self.margins), strict=True)
-        margins = [(MARGINS[n].label, MARGINS[n].text(value)) for n, value in told_margins]
+        named_margins = zip(SELECTION_MARGINS, np.asarray(self.margins), strict=True)
+        margins = [
+            (MARGIN_MEASURES[n].label, MARGIN_MEASURES[n].format_with_unit(value))
+            for n, value in named_margins
+        ]
         return [("rung", type(self.model).__name__), ("why", self.why), *margins]
 
-    def served(self) -> dict[str, Array]:
+    def model_selection(self) -> dict[str, Array]:
         """Return model and reason codes, see `AbstractStep.model_selection`."""
-        return {"rung": self.rung, "reason": self.reason}
+        return {"rung": self.model_code, "reason": self.reason_code}
 
     @property
     def model(self) -> AbstractWheel:
         """The chosen model itself, for one wheel."""
-        if int(self.rung) == VISCOELASTIC:
+        if int(self.model_code) == VISCOELASTIC_MODEL:
             return ViscoelasticWheel(friction=float(self.friction))
         return UnilateralWheel(friction=self.friction)
 
     @property
     def why(self) -> str:
         """Reason of the choice as one sentence, for one wheel."""
-        return told_why(int(self.reason))
+        return describe_reason(int(self.reason_code))
 
 
-def told_why(reason: int) -> str:
+def describe_reason(reason: int) -> str:
     """Return a reason code of `ModelChoice` as a sentence."""
     if reason == 0:
         return "The paper's wheel serves: all its premises hold over this step."
     if reason < 0:
         return f"The paper's wheel can't step: {Outcome(-reason).meaning}"
-    if reason == OFF_THE_PLANE:
+    if reason == REASON_START_NOT_EMBEDDABLE:
         return "The start is not the paper's: another leg is loaded or off its stopper."
-    return f"The paper's premises break: {list(PREMISES.values())[reason - 1]}."
+    return f"The paper's premises break: {list(SELECTION_MARGINS.values())[reason - 1]}."
 
 
-def reason_of(told: Mapping[str, Any], more_friction: Any) -> tuple[Array, Array]:
+def find_selection_reason(
+    measures: Mapping[str, Any], friction_difference: Any
+) -> tuple[Array, Array]:
     """Return `ModelChoice.reason_code` of viscoelastic steps, and their margins on the last axis.
 
     - `measures`: measures and outcome of these steps;
     - `friction_difference`: friction of the ground minus the friction behind `measures`.
     """
-    margins = [told[name] + (more_friction if "friction" in name else 0.0) for name in PREMISES]
-    broken = ~(jnp.stack(margins, -1) >= 0.0)
-    first = jnp.where(jnp.any(broken, -1), 1 + jnp.argmax(broken, -1), 0)
-    outcome = jnp.asarray(told["outcome"], first.dtype)
-    return jnp.where(outcome == Outcome.STEPPED, first, -outcome), jnp.stack(margins, -1)
+    margins = [
+        measures[name] + (friction_difference if "friction" in name else 0.0)
+        for name in SELECTION_MARGINS
+    ]
+    is_violated = ~(jnp.stack(margins, -1) >= 0.0)
+    first_violated = jnp.where(jnp.any(is_violated, -1), 1 + jnp.argmax(is_violated, -1), 0)
+    outcome = jnp.asarray(measures["outcome"], first_violated.dtype)
+    return jnp.where(outcome == Outcome.STEPPED, first_violated, -outcome), jnp.stack(margins, -1)
 
 
-class LadderStep(AbstractGroundStep):
+class LadderStep(AbstractContactStep):
     """One step by the lowest valid model, in the same form for both. Batched under vmap.
 
     - `choice`: the chosen model, and the reason;
@@ -183,8 +194,8 @@ class LadderStep(AbstractGroundStep):
     outcome: Int[Array, ""]
     solver_steps: Int[Array, ""]
 
-    def served(self) -> dict[str, Array]:
-        return self.choice.served()
+    def model_selection(self) -> dict[str, Array]:
+        return self.choice.model_selection()
 
 
 class LadderWheel(AbstractWheel):
@@ -203,129 +214,161 @@ class LadderWheel(AbstractWheel):
         "The paper's wheel serves: all its premises hold over this step."
     """
 
-    rung: ClassVar[str] = "ladder"
-    parameter_names: ClassVar[tuple[str, ...]] = (*PARAMETER_NAMES, FRICTION)
-    tells_contacts: ClassVar[bool] = True
+    model_name: ClassVar[str] = "ladder"
+    parameter_names: ClassVar[tuple[str, ...]] = (*PARAMETER_NAMES, FRICTION_NAME)
+    reports_contacts: ClassVar[bool] = True
 
-    friction: Scalar = eqx.field(converter=friction_of, default=0.7)
+    friction: Scalar = eqx.field(converter=convert_friction, default=0.7)
 
     if TYPE_CHECKING:
 
-        def __init__(self, friction: Number = 0.7) -> None: ...
+        def __init__(self, friction: RealInput = 0.7) -> None: ...
 
     @property
-    def ground(self) -> UnilateralWheel:
+    def unilateral_model(self) -> UnilateralWheel:
         """The upper model."""
         return UnilateralWheel(friction=self.friction)
 
     @property
-    def upper(self) -> UnilateralWheel:
-        return self.ground
+    def fallback_model(self) -> UnilateralWheel:
+        return self.unilateral_model
 
-    def start(self, params: WheelParams) -> FullState:
-        return self.ground.start(params)
+    def default_start(self, params: WheelParams) -> FullState:
+        return self.unilateral_model.default_start(params)
 
     def section_size(self, params: WheelParams) -> int:
-        return self.ground.section_size(params)
+        return self.unilateral_model.section_size(params)
 
-    def section_numbers(self, params: WheelParams) -> int:
-        return self.ground.section_numbers(params)
+    def n_continuous(self, params: WheelParams) -> int:
+        return self.unilateral_model.n_continuous(params)
 
-    def full_section(self, params: WheelParams, x: Array) -> FullState:
-        return self.ground.full_section(params, x)
+    def embed_section(self, params: WheelParams, x: Array) -> FullState:
+        return self.unilateral_model.embed_section(params, x)
 
-    def choose(
-        self, params: WheelParams, x: FullState, options: Options
+    def choose_model(
+        self, params: WheelParams, x: FullState, options: StepOptions
     ) -> tuple[ModelChoice, StepResult]:
         """Return the chosen model, and the step of the viscoelastic model."""
-        paper, ground = ViscoelasticWheel(), self.friction.astype(x.dtype)
-        on_plane = _on_the_papers_plane(x, params.n_legs)
-        result = paper.step(
-            params, jnp.where(on_plane, _of_plane(x, params.n_legs), jnp.nan), options
+        paper_model, friction = ViscoelasticWheel(), self.friction.astype(x.dtype)
+        is_embeddable = _is_embeddable(x, params.n_legs)
+        result = paper_model.take_step(
+            params,
+            jnp.where(is_embeddable, _paper_section_state(x, params.n_legs), jnp.nan),
+            options,
         )
-        reason, margins = reason_of(result.measures(), ground - paper.friction)
-        reason = jnp.where(on_plane, reason, OFF_THE_PLANE).astype(jnp.int32)
-        rung = jnp.where(reason == 0, VISCOELASTIC, UNILATERAL).astype(jnp.int32)
-        return ModelChoice(rung, reason, margins, ground), result
+        reason_code, margins = find_selection_reason(
+            result.measures(), friction - paper_model.friction
+        )
+        reason_code = jnp.where(is_embeddable, reason_code, REASON_START_NOT_EMBEDDABLE).astype(
+            jnp.int32
+        )
+        model_code = jnp.where(reason_code == 0, VISCOELASTIC_MODEL, UNILATERAL_MODEL).astype(
+            jnp.int32
+        )
+        return ModelChoice(model_code, reason_code, margins, friction), result
 
-    def advance(self, params: WheelParams, x: FullState, options: Options) -> Advance:
-        choice, paper = self.choose(params, x, options)
-        serves = choice.rung == VISCOELASTIC
-        ground = self.ground.advance(params, jnp.where(serves, jnp.nan, x), options)
-        return Advance(
-            section_state=jnp.where(serves, _embedded(serves, params, paper), ground.section_state),
-            durations=jnp.where(serves, _by_feet(paper), ground.durations),
-            outcome=jnp.where(serves, paper.outcome, ground.outcome),
-            solver_steps=paper.solver_steps + ground.solver_steps,
-            rung=choice.rung,
-            reason=choice.reason,
+    def advance(self, params: WheelParams, x: FullState, options: StepOptions) -> AdvanceResult:
+        choice, paper_result = self.choose_model(params, x, options)
+        uses_paper_model = choice.model_code == VISCOELASTIC_MODEL
+        contact_result = self.unilateral_model.advance(
+            params, jnp.where(uses_paper_model, jnp.nan, x), options
+        )
+        return AdvanceResult(
+            section_state=jnp.where(
+                uses_paper_model,
+                _embed_paper_result(uses_paper_model, params, paper_result),
+                contact_result.section_state,
+            ),
+            durations=jnp.where(
+                uses_paper_model, _durations_by_feet(paper_result), contact_result.durations
+            ),
+            outcome=jnp.where(uses_paper_model, paper_result.outcome, contact_result.outcome),
+            solver_steps=paper_result.solver_steps + contact_result.solver_steps,
+            model_code=choice.model_code,
+            reason_code=choice.reason_code,
         )
 
-    def step(self, params: WheelParams, x: FullState, options: Options) -> LadderStep:
-        choice, paper = self.choose(params, x, options)
-        serves = choice.rung == VISCOELASTIC
-        ground: UnilateralStep = self.ground.step(params, jnp.where(serves, jnp.nan, x), options)
-        either = lambda lower, upper: jnp.where(serves, lower, upper)
+    def take_step(self, params: WheelParams, x: FullState, options: StepOptions) -> LadderStep:
+        choice, paper_result = self.choose_model(params, x, options)
+        uses_paper_model = choice.model_code == VISCOELASTIC_MODEL
+        contact_result: UnilateralStep = self.unilateral_model.take_step(
+            params, jnp.where(uses_paper_model, jnp.nan, x), options
+        )
+        select_result = lambda paper_value, contact_value: jnp.where(
+            uses_paper_model, paper_value, contact_value
+        )
         return LadderStep(
             choice=choice,
-            section_state=either(_embedded(serves, params, paper), ground.section_state),
-            post_impact=either(paper.post_impact, ground.post_impact),
-            durations=either(_by_feet(paper), ground.durations),
-            step_length=either(paper.step_length, ground.step_length),
-            energy_impacts=either(
-                paper.energy.landing + paper.energy.stopper, ground.energy_impacts
+            section_state=select_result(
+                _embed_paper_result(uses_paper_model, params, paper_result),
+                contact_result.section_state,
             ),
-            energy_damping=either(paper.energy.damping, ground.energy_damping),
-            energy_friction=either(0.0, ground.energy_friction),
-            slip=either(0.0, ground.slip),
-            outcome=either(paper.outcome, ground.outcome),
-            solver_steps=paper.solver_steps + ground.solver_steps,
+            post_impact=select_result(paper_result.post_impact, contact_result.post_impact),
+            durations=select_result(_durations_by_feet(paper_result), contact_result.durations),
+            step_length=select_result(paper_result.step_length, contact_result.step_length),
+            energy_impacts=select_result(
+                paper_result.energy.landing + paper_result.energy.stopper,
+                contact_result.energy_impacts,
+            ),
+            energy_damping=select_result(
+                paper_result.energy.damping, contact_result.energy_damping
+            ),
+            energy_friction=select_result(0.0, contact_result.energy_friction),
+            slip=select_result(0.0, contact_result.slip),
+            outcome=select_result(paper_result.outcome, contact_result.outcome),
+            solver_steps=paper_result.solver_steps + contact_result.solver_steps,
         )
 
-    def trace(
-        self, params: WheelParams, x: FullState, options: Options, n_samples: int
+    def sample_step(
+        self, params: WheelParams, x: FullState, options: StepOptions, n_samples: int
     ) -> UnilateralTrajectory:
         """Return the motion in the form of the upper model: without slip it equals the paper's
         motion.
         """
-        choice, _ = self.choose(params, x, options)
-        friction = jnp.where(choice.rung == VISCOELASTIC, jnp.inf, self.friction)
-        wheel = UnilateralWheel(friction=friction, infinite="paper")
-        trace = wheel.trace(params, x, options, n_samples)
-        return dataclasses.replace(trace, served=choice.served())
+        choice, _ = self.choose_model(params, x, options)
+        friction = jnp.where(choice.model_code == VISCOELASTIC_MODEL, jnp.inf, self.friction)
+        wheel = UnilateralWheel(friction=friction, infinite_friction_rule="paper")
+        trajectory = wheel.sample_step(params, x, options, n_samples)
+        return dataclasses.replace(trajectory, model_selection=choice.model_selection())
 
 
-def _of_plane(x: FullState, n: int) -> Float[Array, "3"]:
+def _paper_section_state(x: FullState, n: int) -> Float[Array, "3"]:
     """Return (theta-, dtheta-, dL1-) of a full section state."""
     return jnp.stack([x[0], x[1], x[4 + n]])
 
 
-def _on_the_papers_plane(x: FullState, n: int) -> Bool[Array, ""]:
+def _is_embeddable(x: FullState, n: int) -> Bool[Array, ""]:
     """Return whether Leg 1 alone is loaded and at rest, with all other legs on their stoppers."""
-    papers = jnp.where(jnp.arange(n) == 0, float(STICK), float(LOCKED + OFF))
-    return jnp.all(jnp.round(x[4 + 2 * n :]) == papers)
+    paper_codes = jnp.where(
+        jnp.arange(n) == 0, float(CONTACT_STICK), float(LOCKED_CODE_OFFSET + CONTACT_OFF)
+    )
+    return jnp.all(jnp.round(x[4 + 2 * n :]) == paper_codes)
 
 
-def _embedded(serves: Array, params: WheelParams, paper: StepResult) -> FullState:
+def _embed_paper_result(
+    uses_paper_model: Array, params: WheelParams, paper_result: StepResult
+) -> FullState:
     """Return the full section state of a viscoelastic step.
 
     Where the viscoelastic model is not used, it is the state of Table 1's start.
     """
-    safe = jnp.asarray(PAPER_START, paper.section_state.dtype)
-    params, x = replaced_where_bad(serves, params, paper.section_state, safe)
-    return embedded(params.symbols(), x)
+    fallback_x = jnp.asarray(PAPER_START, paper_result.section_state.dtype)
+    params, x = replace_invalid(uses_paper_model, params, paper_result.section_state, fallback_x)
+    return embed_section_state(params.symbols(), x)
 
 
-def _by_feet(paper: StepResult) -> Float[Array, "3"]:
+def _durations_by_feet(paper_result: StepResult) -> Float[Array, "3"]:
     """Return the durations with two loaded feet, with one and with none, s."""
-    both, *single = paper.durations
-    return jnp.stack([both, single[0] + single[1], jnp.zeros_like(both)])
+    double_support, *single_support = paper_result.durations
+    return jnp.stack(
+        [double_support, single_support[0] + single_support[1], jnp.zeros_like(double_support)]
+    )
 
 
-def refuse_ladder(model: object, what: str) -> None:
+def refuse_ladder(model: object, role: str) -> None:
     """Raise `TypeError` for a ladder where a model with smoothly varying gaits is required."""
     if isinstance(model, LadderWheel | str):
         raise TypeError(
-            f"the ladder can't be {what}, since its gaits jump where the rung changes: give "
+            f"the ladder can't be {role}, since its gaits jump where the rung changes: give "
             "vrw.ViscoelasticWheel() or vrw.UnilateralWheel()."
         )

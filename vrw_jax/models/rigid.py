@@ -10,18 +10,18 @@ from jaxtyping import Array, Float
 
 from vrw_jax.models.base import (
     AbstractWheel,
-    Advance,
+    AdvanceResult,
+    DoubleSupportIndicators,
     EnergyLoss,
-    Indicators,
     Margins,
-    Numbers,
     SectionState,
+    StateValues,
     StepResult,
     Trajectory,
-    replaced_where_bad,
-    usable,
+    is_valid_start,
+    replace_invalid,
 )
-from vrw_jax.numerics import Elementwise, Options, select
+from vrw_jax.numerics import Elementwise, StepOptions, tree_where
 from vrw_jax.wheel import (
     PARAMETER_NAMES,
     Motion,
@@ -29,13 +29,13 @@ from vrw_jax.wheel import (
     Symbols,
     WheelParams,
     dynamics,
-    known_friction,
     rear_foot_height,
+    require_known_friction,
     transitions,
 )
-from vrw_jax.wording import flag
+from vrw_jax.wording import check_bool
 
-GRID = 33
+N_GRID_ANGLES = 33
 """Number of angles in each zoom on the minimum of a force, chosen because forces are smooth over
 the 45 degrees of a step."""
 
@@ -60,100 +60,113 @@ class RigidWheel(AbstractWheel):
         0.705 s
     """
 
-    rung: ClassVar[str] = "rigid"
+    model_name: ClassVar[str] = "rigid"
     parameter_names: ClassVar[tuple[str, ...]] = PARAMETER_NAMES
-    tells_contacts: ClassVar[bool] = False
-    legs_yield: ClassVar[bool] = False
+    reports_contacts: ClassVar[bool] = False
+    is_compliant: ClassVar[bool] = False
 
-    friction: float = eqx.field(static=True, converter=known_friction, default=1.0)
+    friction: float = eqx.field(static=True, converter=require_known_friction, default=1.0)
     stop_at_lift_off: bool = eqx.field(
-        static=True, converter=partial(flag, "stop_at_lift_off"), default=True
+        static=True, converter=partial(check_bool, "stop_at_lift_off"), default=True
     )
-    held_landing: bool = eqx.field(
-        static=True, converter=partial(flag, "held_landing"), default=False
+    holds_rear_foot: bool = eqx.field(
+        static=True, converter=partial(check_bool, "held_landing"), default=False
     )
 
-    def start(self, params: WheelParams) -> SectionState:
+    def default_start(self, params: WheelParams) -> SectionState:
         """Return the rate of the rolling fixed point, or a fast start where no fixed point
         exists.
         """
         s = params.symbols()
-        keep = self._kept(s)
-        gained = 4.0 * _stiffness_of_gravity(s) * jnp.sin(0.5 * s.alpha) * s.sin_phi
-        rate = jnp.sqrt(jnp.maximum(gained, 0.1) / (1.0 - keep * keep))
+        rate_ratio = self._rate_ratio(s)
+        rate_squared_gain = 4.0 * _gravity_stiffness(s) * jnp.sin(0.5 * s.alpha) * s.sin_phi
+        rate = jnp.sqrt(jnp.maximum(rate_squared_gain, 0.1) / (1.0 - rate_ratio * rate_ratio))
         return jnp.stack([0.5 * s.alpha + 0.0 * rate, rate, 0.0 * rate])
 
-    def advance(self, params: WheelParams, x: SectionState, options: Options) -> Advance:
-        result = self.step(params, x, options)
-        return Advance(result.section_state, result.durations, result.outcome, result.solver_steps)
+    def advance(self, params: WheelParams, x: SectionState, options: StepOptions) -> AdvanceResult:
+        result = self.take_step(params, x, options)
+        return AdvanceResult(
+            result.section_state, result.durations, result.outcome, result.solver_steps
+        )
 
-    def _kept(self, s: Symbols) -> Elementwise:
+    def _rate_ratio(self, s: Symbols) -> Elementwise:
         """Return the ratio of the rate after to the rate before the landing."""
         foot_inertia = _foot_inertia(s)
-        if not self.held_landing:
+        if not self.holds_rear_foot:
             return (s.Mt * s.L0**2 * s.cos_alpha + _hub_inertia(s)) / foot_inertia
-        half = jnp.asarray(0.5 * s.alpha, s.L0.dtype)
-        m = transitions.land(s, half, jnp.ones_like(half), jnp.zeros_like(half)).motion
-        M = dynamics.mass_matrix(s, m.L1, m.L2)
-        return M.times((m.dtheta, m.dL1, m.dL2))[0] / foot_inertia
+        half_angle = jnp.asarray(0.5 * s.alpha, s.L0.dtype)
+        motion = transitions.land(
+            s, half_angle, jnp.ones_like(half_angle), jnp.zeros_like(half_angle)
+        ).motion
+        M = dynamics.mass_matrix(s, motion.L1, motion.L2)
+        return M.multiply((motion.dtheta, motion.dL1, motion.dL2))[0] / foot_inertia
 
     @eqx.filter_jit
-    def step(self, params: WheelParams, x: SectionState, options: Options) -> StepResult:
-        return self.rolled(params, tuple(x), jnp.asarray(self.friction, x.dtype))
+    def take_step(self, params: WheelParams, x: SectionState, options: StepOptions) -> StepResult:
+        return self.step_elementwise(params, tuple(x), jnp.asarray(self.friction, x.dtype))
 
-    def rolled(self, params: WheelParams, x: Numbers, friction: Elementwise) -> StepResult:
+    def step_elementwise(
+        self, params: WheelParams, x: StateValues, friction: Elementwise
+    ) -> StepResult:
         """Return the step elementwise: for one wheel or for a batch."""
-        half = jnp.asarray(0.5 * params.leg_angle, x[1].dtype)
-        x = (half + 0.0 * x[0], x[1], 0.0 * x[2])
-        good = usable(params, x)
-        params, x = replaced_where_bad(good, params, x, (half, 1.0, 0.0))
+        half_angle = jnp.asarray(0.5 * params.leg_angle, x[1].dtype)
+        x = (half_angle + 0.0 * x[0], x[1], 0.0 * x[2])
+        is_valid = is_valid_start(params, x)
+        params, x = replace_invalid(is_valid, params, x, (half_angle, 1.0, 0.0))
         s = params.symbols()
-        before, rate = x[1], self._kept(s) * x[1]
-        roll = Roll(s, params.slope, rate)
+        rate_before, rate_after = x[1], self._rate_ratio(s) * x[1]
+        rolling = RollingMotion(s, params.slope, rate_after)
 
-        apex = jnp.where(s.sin_phi < jnp.sin(half), -params.slope, -half)
-        passes = roll.rate_squared(apex) > 0.0
-        lowest = roll.lowest_premises()
-        lifts = (lowest[0] <= 0.0) & passes & self.stop_at_lift_off
-        outcome = jnp.where(passes, Outcome.STEPPED, Outcome.FELL_BACK).astype(jnp.int32)
-        outcome = jnp.where(lifts, jnp.int32(Outcome.LEG_1_LIFTED_OFF), outcome)
-        outcome = jnp.where(good, outcome, jnp.int32(Outcome.BAD_INPUT))
-        stepped = outcome == Outcome.STEPPED
-        reach = Roll(s, params.slope, jnp.where(passes, rate, 10.0))
-        after, duration = jnp.sqrt(reach.rate_squared(half)), reach.time(half)
+        apex = jnp.where(s.sin_phi < jnp.sin(half_angle), -params.slope, -half_angle)
+        passes_apex = rolling.rate_squared(apex) > 0.0
+        margin_minima = rolling.margin_minima()
+        lifts_off = (margin_minima[0] <= 0.0) & passes_apex & self.stop_at_lift_off
+        outcome = jnp.where(passes_apex, Outcome.STEPPED, Outcome.FELL_BACK).astype(jnp.int32)
+        outcome = jnp.where(lifts_off, jnp.int32(Outcome.LEG_1_LIFTED_OFF), outcome)
+        outcome = jnp.where(is_valid, outcome, jnp.int32(Outcome.BAD_INPUT))
+        has_stepped = outcome == Outcome.STEPPED
+        safe_rolling = RollingMotion(s, params.slope, jnp.where(passes_apex, rate_after, 10.0))
+        rate_end, duration = (
+            jnp.sqrt(safe_rolling.rate_squared(half_angle)),
+            safe_rolling.time(half_angle),
+        )
 
-        zero = jnp.zeros_like(before)
-        tell = lambda value: jnp.where(good, value, jnp.zeros_like(value))
-        walked = lambda value: jnp.where(stepped, value, jnp.zeros_like(value))
-        rear, friction_left, stopper_impulse = self._landing(s, x, roll, friction)
+        zero = jnp.zeros_like(rate_before)
+        if_valid = lambda value: jnp.where(is_valid, value, jnp.zeros_like(value))
+        if_stepped = lambda value: jnp.where(has_stepped, value, jnp.zeros_like(value))
+        rear_impulse, friction_margins, stopper_impulse = self._landing_impulses(
+            s, x, rolling, friction
+        )
         return StepResult(
-            section_state=walked(jnp.stack([half + zero, after, zero])),
-            post_impact=tell(jnp.stack([-half + zero, rate])),
-            durations=walked(jnp.stack([zero, zero, duration])),
-            step_length=tell(2.0 * s.L0 * jnp.sin(half)),
-            indicators=Indicators(
-                lambda_I4=tell(rear.normal),
-                lambda_2=tell(roll.foot_force(-half + zero).normal),
+            section_state=if_stepped(jnp.stack([half_angle + zero, rate_end, zero])),
+            post_impact=if_valid(jnp.stack([-half_angle + zero, rate_after])),
+            durations=if_stepped(jnp.stack([zero, zero, duration])),
+            step_length=if_valid(2.0 * s.L0 * jnp.sin(half_angle)),
+            indicators=DoubleSupportIndicators(
+                lambda_I4=if_valid(rear_impulse.normal),
+                lambda_2=if_valid(rolling.foot_force(-half_angle + zero).normal),
                 lambda_4=zero,
             ),
-            monitors=Margins(
-                fore_foot_force=walked(lowest[0]),
+            margins=Margins(
+                fore_foot_force=if_stepped(margin_minima[0]),
                 takeoff_acceleration=zero,
                 clearance_sls1=zero,
-                clearance_sls2=walked(rear_foot_height(s, roll.motion(half + zero))),
-                locked_stopper_force=walked(lowest[3:]),
-                rear_stopper_force=walked(lowest[2]),
+                clearance_sls2=if_stepped(rear_foot_height(s, rolling.motion(half_angle + zero))),
+                locked_stopper_force=if_stepped(margin_minima[3:]),
+                rear_stopper_force=if_stepped(margin_minima[2]),
                 contraction=zero,
-                friction_fore=walked(friction + lowest[1]),
-                friction_rear=tell(friction + zero),
-                landing_stopper_impulse=tell(stopper_impulse),
+                friction_fore=if_stepped(friction + margin_minima[1]),
+                friction_rear=if_valid(friction + zero),
+                landing_stopper_impulse=if_valid(stopper_impulse),
                 hit_stopper_impulse=jnp.zeros_like(stopper_impulse),
                 hit_planted_impulse=zero,
-                landing_friction_fore=tell(friction_left[0]),
-                landing_friction_rear=tell(friction_left[1]),
+                landing_friction_fore=if_valid(friction_margins[0]),
+                landing_friction_rear=if_valid(friction_margins[1]),
             ),
             energy=EnergyLoss(
-                landing=tell(0.5 * _foot_inertia(s) * (before * before - rate * rate)),
+                landing=if_valid(
+                    0.5 * _foot_inertia(s) * (rate_before * rate_before - rate_after * rate_after)
+                ),
                 stopper=zero,
                 damping=zero,
             ),
@@ -161,55 +174,67 @@ class RigidWheel(AbstractWheel):
             solver_steps=jnp.zeros_like(outcome),
         )
 
-    def _landing(self, s: Symbols, x: Numbers, roll: "Roll", friction: Elementwise) -> tuple:
+    def _landing_impulses(
+        self, s: Symbols, x: StateValues, rolling: "RollingMotion", friction: Elementwise
+    ) -> tuple:
         """Return the landing impulses and friction margins.
 
         These are the impulse at the rear foot, the friction margins of both feet (fore, rear), and
         the impulses of the stoppers of legs 3..n.
         """
         zero = jnp.zeros_like(x[1])
-        first = roll.motion(-jnp.asarray(0.5 * s.alpha, zero.dtype) + zero)
-        jump = transitions.jump_of_hub(transitions.motion_before_landing(s, *x), first)
-        held = self.held_landing
-        rear = transitions.land(s, *x).rear if held else dynamics.FootForce(zero, zero)
+        motion_after = rolling.motion(-jnp.asarray(0.5 * s.alpha, zero.dtype) + zero)
+        hub_jump = transitions.hub_velocity_jump(
+            transitions.motion_before_landing(s, *x), motion_after
+        )
+        is_held = self.holds_rear_foot
+        rear_impulse = (
+            transitions.land(s, *x).rear_impulse if is_held else dynamics.FootForce(zero, zero)
+        )
         # Impulse at the fore foot: the jump of total momentum Mt v_hub (the mass centre).
-        fore = dynamics.FootForce(s.Mt * jump[0] - rear.tangential, s.Mt * jump[1] - rear.normal)
-        left = tuple(friction - dynamics.friction_needed(foot) for foot in (fore, rear))
-        impulse = transitions.locked_leg_impulses(s, first, jump, range(3, s.n + 1))
-        return rear, left, impulse
+        fore_impulse = dynamics.FootForce(
+            s.Mt * hub_jump[0] - rear_impulse.tangential, s.Mt * hub_jump[1] - rear_impulse.normal
+        )
+        friction_margins = tuple(
+            friction - dynamics.required_friction(foot) for foot in (fore_impulse, rear_impulse)
+        )
+        impulse = transitions.locked_leg_impulses(s, motion_after, hub_jump, range(3, s.n + 1))
+        return rear_impulse, friction_margins, impulse
 
-    def trace(
-        self, params: WheelParams, x: SectionState, options: Options, n_samples: int
+    def sample_step(
+        self, params: WheelParams, x: SectionState, options: StepOptions, n_samples: int
     ) -> Trajectory:
         """Return the motion at equal angles instead of equal times."""
-        result = self.step(params, x, options)
+        result = self.take_step(params, x, options)
         s = params.symbols()
-        roll = Roll(s, params.slope, result.post_impact[1])
-        stands = jnp.full((n_samples,), -0.5 * s.alpha)
-        rolls = jnp.where(
+        rolling = RollingMotion(s, params.slope, result.post_impact[1])
+        start_angles = jnp.full((n_samples,), -0.5 * s.alpha)
+        rolling_angles = jnp.where(
             result.outcome == Outcome.STEPPED,
             jnp.linspace(-0.5 * s.alpha, 0.5 * s.alpha, n_samples),
-            stands,
+            start_angles,
         )
-        angles = jnp.stack([stands, stands, rolls])
+        angles = jnp.stack([start_angles, start_angles, rolling_angles])
 
-        state, forces, energy = (jnp.moveaxis(rows, 0, -1) for rows in roll.described(angles))
-        ends = result.section_state, result.durations, result.outcome
-        return Trajectory(roll.time(angles), state, forces, energy, *ends)
+        state, forces, energy = (
+            jnp.moveaxis(rows, 0, -1) for rows in rolling.evaluate_states(angles)
+        )
+        end_state = result.section_state, result.durations, result.outcome
+        return Trajectory(rolling.time(angles), state, forces, energy, *end_state)
 
 
-class Roll(eqx.Module):
+class RollingMotion(eqx.Module):
     """Rolling over one foot from theta = -alpha/2 at the given rate, by conservation of energy."""
 
     s: Symbols
     phi: Elementwise  # slope, rad
-    rate: Elementwise  # at theta = -alpha/2, rad/s
+    initial_rate: Elementwise  # at theta = -alpha/2, rad/s
 
     def rate_squared(self, theta: Elementwise) -> Elementwise:
         """Return the square of dtheta at theta; negative where the wheel does not arrive."""
         s = self.s
-        fallen = _cos_sum(s, -0.5 * s.alpha) - _cos_sum(s, theta)
-        return self.rate**2 + 2.0 * _stiffness_of_gravity(s) * fallen
+        height_drop = _cos_of_sum(s, -0.5 * s.alpha) - _cos_of_sum(s, theta)
+        return self.initial_rate**2 + 2.0 * _gravity_stiffness(s) * height_drop
 
     def time(self, theta: Elementwise) -> Elementwise:
         """Return the time from theta = -alpha/2, s, by Carlson's R_F.
@@ -218,35 +243,37 @@ class Roll(eqx.Module):
         function of t. Time is then the complete cubic form of the elliptic integral.
         """
         s = self.s
-        kappa = 2.0 * _stiffness_of_gravity(s)
+        kappa = 2.0 * _gravity_stiffness(s)
         begin, end = 0.5 * (self.phi - 0.5 * s.alpha), 0.5 * (self.phi + theta)
         # Squared rate at the vertical.
-        least = self.rate**2 + kappa * (jnp.cos(2.0 * begin) - 1.0)
-        apart = begin * end < 0.0
+        min_rate_squared = self.initial_rate**2 + kappa * (jnp.cos(2.0 * begin) - 1.0)
+        is_across_vertical = begin * end < 0.0
         from_vertical = jnp.zeros_like(end)
-        direct = _cubic_time(
-            jnp.where(apart, from_vertical, jnp.minimum(begin**2, end**2)),
-            jnp.where(apart, end**2, jnp.maximum(begin**2, end**2)),
-            least,
+        main_time = _elliptic_time(
+            jnp.where(is_across_vertical, from_vertical, jnp.minimum(begin**2, end**2)),
+            jnp.where(is_across_vertical, end**2, jnp.maximum(begin**2, end**2)),
+            min_rate_squared,
             kappa,
         )
-        first = _cubic_time(from_vertical, jnp.where(apart, begin**2, 0.0), least, kappa)
-        return direct + first
+        extra_time = _elliptic_time(
+            from_vertical, jnp.where(is_across_vertical, begin**2, 0.0), min_rate_squared, kappa
+        )
+        return main_time + extra_time
 
     def motion(self, theta: Elementwise) -> Motion:
         """Return the motion at theta; its rate is zero where the wheel does not arrive."""
         zero = 0.0 * theta
         speed_squared = self.rate_squared(theta)
-        moving = speed_squared > 0.0
-        rate = jnp.where(moving, jnp.sqrt(jnp.where(moving, speed_squared, 1.0)), 0.0)
+        is_moving = speed_squared > 0.0
+        rate = jnp.where(is_moving, jnp.sqrt(jnp.where(is_moving, speed_squared, 1.0)), 0.0)
         length = self.s.L0 + zero
-        return Motion.of(theta, length, length, rate, zero, zero)
+        return Motion.from_angle(theta, length, length, rate, zero, zero)
 
     def acceleration(self, theta: Elementwise) -> dynamics.Acceleration:
         """Return the angular acceleration under gravity; the legs do not move."""
         zero = 0.0 * theta
         sin_p = jnp.sin(theta) * self.s.cos_phi + jnp.cos(theta) * self.s.sin_phi
-        return dynamics.Acceleration(_stiffness_of_gravity(self.s) * sin_p, zero, zero)
+        return dynamics.Acceleration(_gravity_stiffness(self.s) * sin_p, zero, zero)
 
     def foot_force(self, theta: Elementwise) -> dynamics.FootForce:
         """Return the force of the ground on the stance foot, N."""
@@ -256,14 +283,14 @@ class Roll(eqx.Module):
         """Return the force of the stoppers of `legs`, N."""
         return dynamics.stopper_force(self.s, self.motion(theta), self.acceleration(theta), legs)
 
-    def described(self, theta: Elementwise) -> tuple[Array, Array, Array]:
+    def evaluate_states(self, theta: Elementwise) -> tuple[Array, Array, Array]:
         """Return coordinates with rates, forces of both feet and energies at theta, as rows."""
-        m, force, zero = self.motion(theta), self.foot_force(theta), 0.0 * theta
-        state = jnp.stack([theta, m.L1, m.L2, m.dtheta, m.dL1, m.dL2])
-        forces = jnp.stack([force.tangential, force.normal, zero, zero])
-        return state, forces, jnp.stack(dynamics.energy(self.s, m))
+        motion, foot_force, zero = self.motion(theta), self.foot_force(theta), 0.0 * theta
+        state = jnp.stack([theta, motion.L1, motion.L2, motion.dtheta, motion.dL1, motion.dL2])
+        forces = jnp.stack([foot_force.tangential, foot_force.normal, zero, zero])
+        return state, forces, jnp.stack(dynamics.mechanical_energy(self.s, motion))
 
-    def premises(self, theta: Array) -> Array:
+    def margins(self, theta: Array) -> Array:
         """Return the margins, each at its own angle.
 
         They are the normal force, minus the required friction, and the stopper forces of legs 2..n.
@@ -271,30 +298,36 @@ class Roll(eqx.Module):
         stoppers = [
             self.stopper_force(theta[leg], range(leg, leg + 1))[0] for leg in range(2, self.s.n + 1)
         ]
-        needed = dynamics.friction_needed(self.foot_force(theta[1]))
-        return jnp.stack([self.foot_force(theta[0]).normal, -needed, *stoppers])
+        required = dynamics.required_friction(self.foot_force(theta[1]))
+        return jnp.stack([self.foot_force(theta[0]).normal, -required, *stoppers])
 
-    def lowest_premises(self) -> Array:
+    def margin_minima(self) -> Array:
         """Return the minima of `margins` from landing to landing, to round-off.
 
         Each minimum is found by repeated zooming; the remaining error of the angle enters squared.
         """
-        half = jnp.asarray(0.5 * self.s.alpha, self.rate.dtype)
+        half_angle = jnp.asarray(0.5 * self.s.alpha, self.initial_rate.dtype)
 
-        def zoom(_round: Array, around: tuple[Array, Array]) -> tuple[Array, Array]:
-            center, width = around
+        def zoom(_round: Array, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
+            center, width = bracket
 
-            def look(i: Array, best: tuple[Array, Array]) -> tuple[Array, Array]:
-                theta = jnp.clip(center + width * (i * (2.0 / (GRID - 1)) - 1.0), -half, half)
-                value = self.premises(theta)
-                return select(value < best[1], (theta, value), best)
+            def compare(i: Array, lowest: tuple[Array, Array]) -> tuple[Array, Array]:
+                theta = jnp.clip(
+                    center + width * (i * (2.0 / (N_GRID_ANGLES - 1)) - 1.0),
+                    -half_angle,
+                    half_angle,
+                )
+                value = self.margins(theta)
+                return tree_where(value < lowest[1], (theta, value), lowest)
 
-            nothing = center, jnp.full_like(center, jnp.inf)
-            return lax.fori_loop(0, GRID, look, nothing)[0], width * (2.5 / GRID)
+            initial = center, jnp.full_like(center, jnp.inf)
+            return lax.fori_loop(0, N_GRID_ANGLES, compare, initial)[0], width * (
+                2.5 / N_GRID_ANGLES
+            )
 
-        begin = jnp.stack([0.0 * self.rate] * (1 + self.s.n))
-        theta, _ = lax.fori_loop(0, 5, zoom, (begin, half))
-        return self.premises(lax.stop_gradient(theta))
+        start_angles = jnp.stack([0.0 * self.initial_rate] * (1 + self.s.n))
+        theta, _ = lax.fori_loop(0, 5, zoom, (start_angles, half_angle))
+        return self.margins(lax.stop_gradient(theta))
 
 
 def _hub_inertia(s: Symbols) -> Elementwise:
@@ -307,7 +340,7 @@ def _foot_inertia(s: Symbols) -> Elementwise:
     return s.Mt * s.L0**2 + _hub_inertia(s)
 
 
-def _stiffness_of_gravity(s: Symbols) -> Elementwise:
+def _gravity_stiffness(s: Symbols) -> Elementwise:
     """Return Mt g L0 over the inertia about the foot, 1/s^2.
 
     It equals g/l for a rimless wheel without leg masses.
@@ -315,13 +348,16 @@ def _stiffness_of_gravity(s: Symbols) -> Elementwise:
     return s.Mt * s.g * s.L0 / _foot_inertia(s)
 
 
-def _cos_sum(s: Symbols, theta: Elementwise | float) -> Elementwise:
+def _cos_of_sum(s: Symbols, theta: Elementwise | float) -> Elementwise:
     """Return cos(theta + phi)."""
     return jnp.cos(theta) * s.cos_phi - jnp.sin(theta) * s.sin_phi
 
 
-def _cubic_time(
-    begin_squared: Elementwise, end_squared: Elementwise, least: Elementwise, kappa: Elementwise
+def _elliptic_time(
+    begin_squared: Elementwise,
+    end_squared: Elementwise,
+    min_rate_squared: Elementwise,
+    kappa: Elementwise,
 ) -> Elementwise:
     """Return the time between two half-angles on one side of the vertical, given by their squares,
     s.
@@ -329,21 +365,21 @@ def _cubic_time(
     It is the integral of dt / sqrt(t (1 - t) (min_rate_squared + 2 kappa t)) over t = sin^2, as 2
     R_F (DLMF 19.29.4); zero if both ends coincide.
     """
-    apart = end_squared > begin_squared
-    low = jnp.where(apart, begin_squared, 0.0)
-    high = jnp.where(apart, end_squared, 1.0)
-    at_foot = low > 0.0  # sqrt has no derivative at the vertical, where Y1 = 0
-    angle_low = jnp.where(at_foot, jnp.sqrt(jnp.where(at_foot, low, 1.0)), 0.0)
+    is_nonempty = end_squared > begin_squared
+    low = jnp.where(is_nonempty, begin_squared, 0.0)
+    high = jnp.where(is_nonempty, end_squared, 1.0)
+    is_off_vertical = low > 0.0  # sqrt has no derivative at the vertical, where Y1 = 0
+    angle_low = jnp.where(is_off_vertical, jnp.sqrt(jnp.where(is_off_vertical, low, 1.0)), 0.0)
     angle_high = jnp.sqrt(high)
     y1, y2 = jnp.sin(angle_low), jnp.cos(angle_low)
     x1, x2 = jnp.sin(angle_high), jnp.cos(angle_high)
-    y3 = jnp.sqrt(jnp.maximum(least + 2.0 * kappa * y1**2, 1e-300))
-    x3 = jnp.sqrt(jnp.maximum(least + 2.0 * kappa * x1**2, 1e-300))
+    y3 = jnp.sqrt(jnp.maximum(min_rate_squared + 2.0 * kappa * y1**2, 1e-300))
+    x3 = jnp.sqrt(jnp.maximum(min_rate_squared + 2.0 * kappa * x1**2, 1e-300))
     gap = x1**2 - y1**2
     u12 = (x1 * x2 * y3 + y1 * y2 * x3) / gap
     u13 = (x1 * x3 * y2 + y1 * y3 * x2) / gap
     u23 = (x2 * x3 * y1 + y2 * y3 * x1) / gap
-    return jnp.where(apart, 2.0 * carlson_rf(u12**2, u13**2, u23**2), 0.0)
+    return jnp.where(is_nonempty, 2.0 * carlson_rf(u12**2, u13**2, u23**2), 0.0)
 
 
 def carlson_rf(x: Elementwise, y: Elementwise, z: Elementwise) -> Elementwise:

@@ -14,75 +14,88 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from vrw_jax.models.lane_step import DIRECTIONS, along_units
-from vrw_jax.numerics import LaneFunction
-from vrw_jax.wheel import DOMAINS, PARAMETER_NAMES
+from vrw_jax.models.lane_step import N_STEP_INPUTS, jacobian_columns
+from vrw_jax.numerics import BatchFunction
+from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES
 
-_POWERS = {
+_UNIT_POWERS = {
     "kg": (0, 0, 1), "m": (1, 0, 0), "N/m": (0, -2, 1), "N s/m": (0, -1, 1), "rad": (0, 0, 0),
     "m/s^2": (1, -2, 0), "rad/s": (0, -1, 0), "m/s": (1, -1, 0), "s": (0, 1, 0),
 }  # fmt: skip
 """Powers of length, time and mass in the units of the wheel's parameters and of a step's
 outputs."""
-_STATE = ("rad", "rad/s", "m/s")
-_GIVEN = (*(domain.unit for domain in DOMAINS.values()), *_STATE)
+_STATE_UNITS = ("rad", "rad/s", "m/s")
+_INPUT_UNITS = (*(domain.unit for domain in PARAMETER_DOMAINS.values()), *_STATE_UNITS)
 
 
-class Scale(NamedTuple):
+class UnitScaling(NamedTuple):
     """Powers of one unit in each input (parameters, start) and output (section state,
     durations).
     """
 
-    given: tuple[int, ...]
-    told: tuple[int, ...]
+    input_powers: tuple[int, ...]
+    output_powers: tuple[int, ...]
 
-    def left(self, told: Array, numbers: Sequence[Array], by: Mapping[int, Array]) -> Array:
+    def subtract_columns(
+        self, remainder: Array, inputs: Sequence[Array], columns: Mapping[int, Array]
+    ) -> Array:
         """Return `remainder` minus the given columns, each times its input and that input's power.
 
         The argument is the output times its power. By Euler's theorem, the result is the sum of the
         same products over the columns that are not given.
         """
-        for i, column in by.items():
-            if self.given[i]:
-                told = told - (self.given[i] * numbers[i]) * column
-        return told
+        for i, column in columns.items():
+            if self.input_powers[i]:
+                remainder = remainder - (self.input_powers[i] * inputs[i]) * column
+        return remainder
 
 
-def _scale(unit: int) -> Scale:
+def _make_unit_scaling(unit_index: int) -> UnitScaling:
     """Return the powers of one unit: 0 is length, 1 is time, 2 is mass."""
     powers = (
-        tuple(_POWERS[x][unit] for x in units) for units in (_GIVEN, (*_STATE, "s", "s", "s"))
+        tuple(_UNIT_POWERS[unit_name][unit_index] for unit_name in units)
+        for units in (_INPUT_UNITS, (*_STATE_UNITS, "s", "s", "s"))
     )
-    return Scale(*powers)
+    return UnitScaling(*powers)
 
 
-LENGTH, TIME, MASS = (_scale(unit) for unit in range(3))
-SCALES = {PARAMETER_NAMES.index("gravity"): TIME, PARAMETER_NAMES.index("locked_length"): LENGTH}
+LENGTH_SCALING, TIME_SCALING, MASS_SCALING = (_make_unit_scaling(unit) for unit in range(3))
+SCALING_BY_PARAMETER = {
+    PARAMETER_NAMES.index("gravity"): TIME_SCALING,
+    PARAMETER_NAMES.index("locked_length"): LENGTH_SCALING,
+}
 """Scaling that gives the column of a parameter, by the parameter's index. Gravity comes first,
 because its unit contains a length."""
 
 
-def with_scales(
-    numbers: Sequence[Array], by: Mapping[int, Array], told: Mapping[int, Array]
+def complete_by_scaling(
+    inputs: Sequence[Array], columns: Mapping[int, Array], scaled_outputs: Mapping[int, Array]
 ) -> dict[int, Array]:
     """Return all columns; those of `SCALING_BY_PARAMETER` follow from the outputs times their
     powers.
     """
-    by = dict(by)
-    for last, scale in SCALES.items():
-        left = scale.left(told[last], numbers, by)
-        by[last] = left / (scale.given[last] * numbers[last])
-    return by
+    columns = dict(columns)
+    for index, scaling in SCALING_BY_PARAMETER.items():
+        remainder = scaling.subtract_columns(scaled_outputs[index], inputs, columns)
+        columns[index] = remainder / (scaling.input_powers[index] * inputs[index])
+    return columns
 
 
-def along_all(function: LaneFunction, lanes: Sequence[Array], moved: Sequence[int]) -> tuple:
+def scaled_jacobian_columns(
+    function: BatchFunction, inputs: Sequence[Array], input_indices: Sequence[int]
+) -> tuple:
     """Return `jacobian_columns` of a step's section state and durations for all inputs.
 
     - `inputs`: parameters, then the start;
     - `input_indices`: all of them, in the order of the returned columns.
     """
-    own = [i for i in range(DIRECTIONS) if i not in SCALES]
-    columns, told, others = along_units(function, lanes, own)
-    powers = {i: jnp.asarray(s.told, told.dtype)[:, None] * told for i, s in SCALES.items()}
-    by = with_scales(lanes, dict(zip(own, columns, strict=True)), powers)
-    return jnp.stack([by[i] for i in moved]), told, others
+    computed_indices = [i for i in range(N_STEP_INPUTS) if i not in SCALING_BY_PARAMETER]
+    columns, outputs, aux = jacobian_columns(function, inputs, computed_indices)
+    scaled_outputs = {
+        i: jnp.asarray(scaling.output_powers, outputs.dtype)[:, None] * outputs
+        for i, scaling in SCALING_BY_PARAMETER.items()
+    }
+    columns_by_input = complete_by_scaling(
+        inputs, dict(zip(computed_indices, columns, strict=True)), scaled_outputs
+    )
+    return jnp.stack([columns_by_input[i] for i in input_indices]), outputs, aux

@@ -13,88 +13,101 @@ from jaxtyping import Array
 
 from vrw_jax.models.base import (
     AbstractWheel,
-    Advance,
+    AdvanceResult,
     SectionState,
     StepResult,
     Trajectory,
 )
-from vrw_jax.models.lane_step import lanes_can, moved_by_lanes, sampled_by_lanes, told_by_lanes
+from vrw_jax.models.lane_step import (
+    build_step_function,
+    build_step_jacobian,
+    build_step_sampler,
+    can_use_lanes,
+)
 from vrw_jax.models.paper_step import (
     PAPER_START,
-    End,
-    Walked,
-    advance_of,
-    result_of,
-    through_phases,
-    trajectory_of,
+    PhaseResult,
+    PhaseSequenceResult,
+    make_advance_result,
+    make_step_result,
+    make_trajectory,
+    run_phases,
 )
 from vrw_jax.numerics import (
-    Field,
-    Forward,
-    Options,
-    State,
+    ForwardFunction,
+    MonitoredFunctions,
+    StateVector,
+    StepOptions,
     Vector,
-    Watched,
-    any_mode,
+    VectorField,
+    enable_all_ad_modes,
     integrate_phase,
     sample_phase,
 )
 from vrw_jax.wheel import (
     PARAMETER_NAMES,
     AbstractPhase,
-    Instant,
     Motion,
+    PhaseInstant,
     WheelParams,
-    known_friction,
+    require_known_friction,
 )
-from vrw_jax.wording import flag
+from vrw_jax.wording import check_bool
 
 
-class Flow(NamedTuple):
+class DiffraxPhase(NamedTuple):
     """A phase for the diffrax integrator, over the state y = (q, v) as one vector."""
 
-    motion: Callable[[State], Motion]
-    field: Field
-    watched: Watched
+    motion: Callable[[StateVector], Motion]
+    vector_field: VectorField
+    guards: MonitoredFunctions
 
 
-def flow_of(phase: AbstractPhase, monitored: bool) -> Flow:
+def make_diffrax_phase(phase: AbstractPhase, records_margins: bool) -> DiffraxPhase:
     """Return the phase for the diffrax integrator.
 
     - `records_margins`: evaluate the phase's margins in addition to its guards.
     """
 
-    def motion(y: State) -> Motion:
-        numbers = tuple(y)
-        return phase.at(numbers[: phase.n], numbers[phase.n :])
+    def motion(y: StateVector) -> Motion:
+        coordinates = tuple(y)
+        return phase.motion_at(coordinates[: phase.n_dof], coordinates[phase.n_dof :])
 
-    def field(y: State) -> State:
-        return jnp.stack([*y[phase.n :], *phase.acceleration(motion(y))[: phase.n]])
+    def vector_field(y: StateVector) -> StateVector:
+        return jnp.stack([*y[phase.n_dof :], *phase.acceleration(motion(y))[: phase.n_dof]])
 
-    def values(y: State) -> Array:
-        at = Instant(phase, motion(y), None)
-        return jnp.stack([*phase.guards(at), *(phase.premises(at) if monitored else ())])
+    def monitored_values(y: StateVector) -> Array:
+        instant = PhaseInstant(phase, motion(y), None)
+        return jnp.stack(
+            [*phase.guards(instant), *(phase.margins(instant) if records_margins else ())]
+        )
 
-    counts = phase.counts_at_start if monitored else ()
-    return Flow(motion, field, Watched(values, len(phase.outcomes), counts))
+    margins_counted = phase.margins_counted_at_start if records_margins else ()
+    return DiffraxPhase(
+        motion,
+        vector_field,
+        MonitoredFunctions(monitored_values, len(phase.all_guard_outcomes), margins_counted),
+    )
 
 
-def _run(
-    options: Options,
-    monitored: bool,
+def _integrate_with_diffrax(
+    options: StepOptions,
+    records_margins: bool,
     phase: AbstractPhase,
     q: Vector,
     v: Vector,
     active: Array,
-    _before: End | None,
-) -> End:
+    _previous_end: PhaseResult | None,
+) -> PhaseResult:
     """Return the end of one phase, integrated by diffrax."""
-    flow = flow_of(phase, monitored)
-    end = integrate_phase(flow.field, flow.watched, jnp.stack([*q, *v]), active, options)
+    diffrax_phase = make_diffrax_phase(phase, records_margins)
+    end = integrate_phase(
+        diffrax_phase.vector_field, diffrax_phase.guards, jnp.stack([*q, *v]), active, options
+    )
     state = tuple(end.state)
-    return End(
-        state[: phase.n], state[phase.n :], end.duration, end.guard, end.timed_out,
-        end.solver_steps, end.minima if monitored else None,
+    return PhaseResult(
+        state[: phase.n_dof], state[phase.n_dof :], end.duration, end.guard, end.timed_out,
+        end.solver_steps, end.minima if records_margins else None,
     )  # fmt: skip
 
 
@@ -113,81 +126,94 @@ class ViscoelasticWheel(AbstractWheel):
         19.4
     """
 
-    rung: ClassVar[str] = "viscoelastic"
+    model_name: ClassVar[str] = "viscoelastic"
     parameter_names: ClassVar[tuple[str, ...]] = PARAMETER_NAMES
-    tells_contacts: ClassVar[bool] = False
-    lanes: ClassVar[str] = "phases"
+    reports_contacts: ClassVar[bool] = False
+    batch_kernel: ClassVar[str] = "phases"
 
-    friction: float = eqx.field(static=True, converter=known_friction, default=1.0)
+    friction: float = eqx.field(static=True, converter=require_known_friction, default=1.0)
     stop_at_lift_off: bool = eqx.field(
-        static=True, converter=functools.partial(flag, "stop_at_lift_off"), default=True
+        static=True, converter=functools.partial(check_bool, "stop_at_lift_off"), default=True
     )
 
-    def start(self, params: WheelParams) -> SectionState:
+    def default_start(self, params: WheelParams) -> SectionState:
         """Return a start close to the gait of Table 1, inside its basin."""
         return jnp.asarray(PAPER_START, params.damping.dtype)
 
-    def advance(self, params: WheelParams, x: SectionState, options: Options) -> Advance:
-        return self._told(params, x, options, detailed=False)
+    def advance(self, params: WheelParams, x: SectionState, options: StepOptions) -> AdvanceResult:
+        return self._compute_step(params, x, options, is_detailed=False)
 
-    def step(self, params: WheelParams, x: SectionState, options: Options) -> StepResult:
-        return self._told(params, x, options, detailed=True)
+    def take_step(self, params: WheelParams, x: SectionState, options: StepOptions) -> StepResult:
+        return self._compute_step(params, x, options, is_detailed=True)
 
-    def _told(self, params: WheelParams, x: SectionState, options: Options, detailed: bool) -> Any:
+    def _compute_step(
+        self, params: WheelParams, x: SectionState, options: StepOptions, is_detailed: bool
+    ) -> Any:
         """Return the outputs of the compiled step."""
         leaves, structure = jax.tree.flatten((params, x, options))
-        return eqx.combine(*_compiled(self, structure, detailed)(*leaves))
+        return eqx.combine(*_compile_step(self, structure, is_detailed)(*leaves))
 
-    def trace(
-        self, params: WheelParams, x: SectionState, options: Options, n_samples: int
+    def sample_step(
+        self, params: WheelParams, x: SectionState, options: StepOptions, n_samples: int
     ) -> Trajectory:
         leaves, structure = jax.tree.flatten((params, x, options))
-        if lanes_can(options):
-            sampled = sampled_by_lanes(structure, self.stop_at_lift_off, n_samples)
+        if can_use_lanes(options):
+            sample = build_step_sampler(structure, self.stop_at_lift_off, n_samples)
         else:
-            sampled = functools.partial(self._sampled_by_diffrax, structure, n_samples)
-        return sampled(*leaves)
+            sample = functools.partial(self._sample_with_diffrax, structure, n_samples)
+        return sample(*leaves)
 
-    def _sampled_by_diffrax(self, structure: Any, n_samples: int, *leaves: Array) -> Trajectory:
+    def _sample_with_diffrax(self, structure: Any, n_samples: int, *leaves: Array) -> Trajectory:
         """Return the sampled step, integrated by diffrax."""
         params, x, options = jax.tree.unflatten(structure, leaves)
-        walked, samples = self._walk(params, x, options, monitored=False), []
-        for phase, start, end in zip(walked.phases, walked.starts, walked.ends, strict=True):
-            field, y = flow_of(phase, monitored=False).field, jnp.stack([*start[0], *start[1]])
-            samples.append(sample_phase(field, y, end.duration, n_samples, options))
-        return trajectory_of(walked, samples)
+        sequence, samples = self._run_phases(params, x, options, records_margins=False), []
+        for phase, start, end in zip(sequence.phases, sequence.starts, sequence.ends, strict=True):
+            vector_field, y = (
+                make_diffrax_phase(phase, records_margins=False).vector_field,
+                jnp.stack([*start[0], *start[1]]),
+            )
+            samples.append(sample_phase(vector_field, y, end.duration, n_samples, options))
+        return make_trajectory(sequence, samples)
 
-    def _walk(
-        self, params: WheelParams, x: SectionState, options: Options, monitored: bool
-    ) -> Walked:
+    def _run_phases(
+        self, params: WheelParams, x: SectionState, options: StepOptions, records_margins: bool
+    ) -> PhaseSequenceResult:
         """Return all phases of the step, integrated by diffrax."""
-        run = functools.partial(_run, options, monitored)
-        return through_phases(run, params, tuple(x), self.stop_at_lift_off)
+        phase_runner = functools.partial(_integrate_with_diffrax, options, records_margins)
+        return run_phases(phase_runner, params, tuple(x), self.stop_at_lift_off)
 
 
 @functools.cache
-def _compiled(model: ViscoelasticWheel, structure: Any, detailed: bool) -> Forward:
+def _compile_step(model: ViscoelasticWheel, structure: Any, is_detailed: bool) -> ForwardFunction:
     """Return the step over the leaves of (params, x, options), differentiable in any mode."""
 
-    static = jax.tree.unflatten(structure, [0.0] * structure.num_leaves)[2]
-    engine = "lanes" if lanes_can(static) else "diffrax"
+    static_options = jax.tree.unflatten(structure, [0.0] * structure.num_leaves)[2]
+    engine = "lanes" if can_use_lanes(static_options) else "diffrax"
 
-    def by_diffrax(tighten: bool, *leaves: Array) -> tuple:
+    def step_with_diffrax(tightens: bool, *leaves: Array) -> tuple:
         """Return the outputs of the step by diffrax.
 
         With the batch kernel as engine, it serves only derivatives of derivatives, under that
         engine's name.
         """
         params, x, options = jax.tree.unflatten(structure, leaves)
-        options = options.for_derivatives() if tighten else options
-        walked = model._walk(params, x, options, monitored=detailed)
-        told: Advance | StepResult = (
-            result_of(walked, model.friction, engine) if detailed else advance_of(walked, engine)
+        options = options.with_derivative_tolerances() if tightens else options
+        sequence = model._run_phases(params, x, options, records_margins=is_detailed)
+        result: AdvanceResult | StepResult = (
+            make_step_result(sequence, model.friction, engine)
+            if is_detailed
+            else make_advance_result(sequence, engine)
         )
-        return eqx.partition(told, eqx.is_inexact_array)
+        return eqx.partition(result, eqx.is_inexact_array)
 
-    values, tighter = (functools.partial(by_diffrax, tighten) for tighten in (False, True))
+    evaluate, evaluate_tighter = (
+        functools.partial(step_with_diffrax, tighten) for tighten in (False, True)
+    )
     if engine == "diffrax":
-        return any_mode(values, tighter)
-    given = structure, model.stop_at_lift_off, model.friction if detailed else None
-    return any_mode(told_by_lanes(*given), tighter, functools.partial(moved_by_lanes, *given))
+        return enable_all_ad_modes(evaluate, evaluate_tighter)
+    static_config = structure, model.stop_at_lift_off, model.friction if is_detailed else None
+    return enable_all_ad_modes(
+        build_step_function(*static_config),
+        evaluate_tighter,
+        functools.partial(build_step_jacobian, *static_config),
+    )

@@ -7,103 +7,114 @@ The entry points for any vector field, guards and resets are `simulate_hybrid`, 
 
 from vrw_jax.numerics import arclength, floquet
 from vrw_jax.numerics.arclength import (
-    AbstractFollowed,
+    AbstractContinuationProblem,
     ArclengthOptions,
-    Ending,
-    Linear,
-    MapFollowed,
-    PathPoint,
-    Plane,
-    Section,
-    Unknown,
+    ConstraintPlane,
+    ContinuationPoint,
+    ContinuationStatus,
+    FixedPointProblem,
+    NewtonStep,
+    SectionVector,
+    Unknowns,
 )
-from vrw_jax.numerics.codes import Code
+from vrw_jax.numerics.codes import StatusCode
 from vrw_jax.numerics.collocation import (
-    Constants,
-    Linearised,
-    Passage,
-    Phase,
+    CollocationPhase,
+    CollocationSolution,
+    CycleLinearization,
+    PhaseConstants,
+    PhasePassage,
+    PhasePoint,
     PhaseSequence,
-    Point,
-    Solution,
-    linearised_pass,
-    mesh_error,
-    walk_through,
+    estimate_mesh_error,
+    linearize_cycle,
+    reconstruct_step,
 )
-from vrw_jax.numerics.complementarity import Answers, complementary
+from vrw_jax.numerics.complementarity import LCPStatus, enumerate_lcp_solutions
 from vrw_jax.numerics.derivatives import (
-    Forward,
-    InForm,
-    any_mode,
-    on_branch,
-    push,
-    slopes_on_branch,
-    with_jacobian,
-    without_derivative,
+    ExecutionWrapper,
+    ForwardFunction,
+    apply_jacobian,
+    enable_all_ad_modes,
+    implicit_jacobian,
+    value_and_jacobian,
+    with_implicit_derivative,
+    zero_tangent,
 )
 from vrw_jax.numerics.events import (
-    Field,
     PhaseEnd,
+    VectorField,
     integrate_phase,
+    make_solver,
     sample_phase,
-    solver_named,
 )
-from vrw_jax.numerics.floquet import multipliers
+from vrw_jax.numerics.floquet import floquet_multipliers
 from vrw_jax.numerics.gauss import (
-    ENDS_ONCE,
-    ENDS_TWICE,
-    N_NODES,
-    NODES,
-    ONCE,
-    TWICE,
-    Mesh,
-    differentiation,
-    integrated,
-    lagrange,
-    transfer_matrix,
+    DOUBLE_END_WEIGHTS,
+    DOUBLE_INTEGRATION_MATRIX,
+    END_WEIGHTS,
+    GAUSS_NODES,
+    INTEGRATION_MATRIX,
+    N_GAUSS_NODES,
+    PhaseMesh,
+    differentiation_matrix,
+    integration_weights,
+    lagrange_weights,
+    mesh_transfer_matrix,
 )
-from vrw_jax.numerics.hybrid import Guard, Mode, Stop, time_errors, walk
-from vrw_jax.numerics.lane_algebra import LaneArray, partials_of
-from vrw_jax.numerics.lane_minima import Monitors
+from vrw_jax.numerics.hybrid import Guard, Mode, Termination, simulate_hybrid, time_errors
+from vrw_jax.numerics.lane_algebra import LaneArray, value_and_partials
+from vrw_jax.numerics.lane_minima import MarginFunctions
 from vrw_jax.numerics.lanes import (
-    LaneFunction,
-    compiled_by_caller,
-    if_any,
-    in_batches,
-    in_batches_of_numpy,
-    in_blocks,
-    joined,
-    one_wheel,
-    select,
-    taken,
-    two_fold,
-    zeros_of,
+    BatchFunction,
+    concat_rows,
+    is_inside_jit,
+    make_blockwise,
+    map_in_batches,
+    map_in_numpy_batches,
+    opaque_condition,
+    run_if_any,
+    take_rows,
+    tree_where,
+    unbatch,
+    zeros_like_output,
 )
 from vrw_jax.numerics.levels import (
-    AbstractLevel,
-    LevelFollowed,
-    LevelLinear,
-    LevelPoint,
-    margins_beside_fold,
+    AbstractTestFunction,
+    TestFunctionCurve,
+    TestFunctionNewtonStep,
+    TestFunctionPoint,
+    offset_bifurcation_margins,
 )
-from vrw_jax.numerics.march import LanePhase, integrate_lanes, sample_lanes, sampled
-from vrw_jax.numerics.minima import ROUNDING, State, Watched
-from vrw_jax.numerics.newton import SectionCycle, moved_cycle, newton_cycle
-from vrw_jax.numerics.options import Engine, Options
-from vrw_jax.numerics.roots import BIFURCATIONS, bifurcation_functions, brackets, locate, turns
-from vrw_jax.numerics.saltation import volume_change
+from vrw_jax.numerics.march import (
+    BatchPhase,
+    integrate_batch_phase,
+    sample_at_equal_times,
+    sample_batch_phase,
+)
+from vrw_jax.numerics.minima import GUARD_ROUNDOFF_EPS, MonitoredFunctions, StateVector
+from vrw_jax.numerics.newton import FixedPointResult, solve_fixed_point, solve_fixed_point_implicit
+from vrw_jax.numerics.options import EngineName, StepOptions
+from vrw_jax.numerics.roots import (
+    BIFURCATION_NAMES,
+    evaluate_bifurcation_functions,
+    find_sign_changes,
+    has_unit_circle_pair,
+    locate_zeros,
+)
+from vrw_jax.numerics.saltation import flow_jacobian_determinant
 from vrw_jax.numerics.segments import product_multipliers, segment_maps
-from vrw_jax.numerics.side_by_side import follow_many, solve, solve_many
+from vrw_jax.numerics.side_by_side import continue_many_from, solve_many_on_planes, solve_on_plane
 from vrw_jax.numerics.tableaus import (
-    Place,
-    Slope,
-    Tableau,
-    below,
-    change_of_length,
-    explicit_tableau,
-    parabola,
+    ButcherTableau,
+    StageAcceleration,
+    StageState,
+    find_dip,
+    fit_guard_parabola,
+    load_explicit_tableau,
     real_stability_limit,
+    step_size_factor,
 )
-from vrw_jax.numerics.tangents import Balance, by_directions
+from vrw_jax.numerics.tangents import ImplicitDynamics, with_batched_jvp
 from vrw_jax.numerics.trig import sine_cosine
-from vrw_jax.numerics.types import Elementwise, Number, Scalar, Vector
+from vrw_jax.numerics.types import Elementwise, RealInput, Scalar, Vector

@@ -19,15 +19,15 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from vrw_jax.numerics.codes import Code
-from vrw_jax.numerics.derivatives import with_jacobian
-from vrw_jax.numerics.lanes import select
+from vrw_jax.numerics.codes import StatusCode
+from vrw_jax.numerics.derivatives import value_and_jacobian
+from vrw_jax.numerics.lanes import tree_where
 from vrw_jax.numerics.types import Scalar
-from vrw_jax.wording import positive, whole
+from vrw_jax.wording import check_int, check_positive
 
-Unknown = Any
+Unknowns = Any
 """A pytree of float arrays with everything that Newton's method corrects."""
-Section = Float[Array, " n"]
+SectionVector = Float[Array, " n"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,212 +46,222 @@ class ArclengthOptions:
         400
     """
 
-    first_step: float = 0.005
-    largest_step: float = 0.02
-    smallest_step: float = 1e-6
+    initial_ds: float = 0.005
+    max_ds: float = 0.02
+    min_ds: float = 1e-6
     max_points: int = 400
-    iterations: int = 10
+    max_newton_iterations: int = 10
     tolerance: float = 1e-10
-    turn: float = 0.2
+    max_turn_angle: float = 0.2
 
     def __post_init__(self) -> None:
-        for name in ("max_points", "iterations"):
-            whole(name, getattr(self, name))
-        for name in ("first_step", "largest_step", "smallest_step", "tolerance", "turn"):
-            positive(name, getattr(self, name))
-        if not self.smallest_step <= self.first_step <= self.largest_step:
+        for name in ("max_points", "max_newton_iterations"):
+            check_int(name, getattr(self, name))
+        for name in ("initial_ds", "max_ds", "min_ds", "tolerance", "max_turn_angle"):
+            check_positive(name, getattr(self, name))
+        if not self.min_ds <= self.initial_ds <= self.max_ds:
             raise ValueError(
-                f"the steps are {self.smallest_step:g} (smallest), {self.first_step:g} (first) and "
-                f"{self.largest_step:g} (largest), but they must not fall in this order: "
-                "give smallest_step <= first_step <= largest_step."
+                f"the steps are {self.min_ds:g} (smallest), {self.initial_ds:g} (first) and "
+                f"{self.max_ds:g} (largest), but they must not fall in this order: "
+                "give min_ds <= initial_ds <= max_ds."
             )
 
 
-class Linear(NamedTuple):
+class NewtonStep(NamedTuple):
     """Correction and tangent of Newton's method at a trial point (z, p)."""
 
-    correction: Unknown  # of z at fixed p
-    column: Unknown  # dz/dp, the tangent of the branch
+    correction: Unknowns  # of z at fixed p
+    tangent: Unknowns  # dz/dp, the tangent of the branch
     jacobian: Float[Array, "n n"]  # of the return map over the section's numbers
 
 
-class AbstractFollowed(eqx.Module):
+class AbstractContinuationProblem(eqx.Module):
     """Base class of continuation problems; `args` is a pytree with all other inputs of the
     equations.
     """
 
-    traced: ClassVar[bool] = True
+    is_traceable: ClassVar[bool] = True
     """Whether `linearize` can be compiled into a loop; otherwise it is called for many points at
     once from outside of compiled code."""
 
     @abc.abstractmethod
-    def linearise(self, wheel: Any, z: Unknown, p: Scalar) -> Linear:
+    def linearize(self, args: Any, z: Unknowns, p: Scalar) -> NewtonStep:
         """Return correction, tangent and Jacobian; they are not finite where the map
         is undefined.
         """
 
     @abc.abstractmethod
-    def section(self, z: Unknown) -> Section:
+    def section_state(self, z: Unknowns) -> SectionVector:
         """Return the section state, a part of z."""
 
-    def between(self, left: Unknown, right: Unknown, place: Scalar) -> Unknown:
+    def interpolate(self, left: Unknowns, right: Unknowns, fraction: Scalar) -> Unknowns:
         """Return the initial guess of Newton's method at a fraction in [0, 1] between
         two points.
         """
-        return jax.tree.map(lambda a, b: a + place * (b - a), left, right)
+        return jax.tree.map(lambda a, b: a + fraction * (b - a), left, right)
 
-    def size(self, z: Unknown, correction: Unknown) -> Scalar:
+    def correction_norm(self, z: Unknowns, correction: Unknowns) -> Scalar:
         """Return the norm of a correction, its largest entry, which is compared with
         the tolerance.
         """
         return jnp.max(jnp.abs(correction))
 
-    def valid(self, wheel: Any, z: Unknown, p: Scalar) -> Bool[Array, ""]:
+    def is_admissible(self, args: Any, z: Unknowns, p: Scalar) -> Bool[Array, ""]:
         """Return whether a converged z satisfies the conditions of its branch."""
         return jnp.all(jnp.isfinite(z))
 
 
-def at_fixed_point(
-    image: Callable[[Array, Scalar], Array], z: Array, p: Scalar, numbers: int
-) -> Linear:
+def fixed_point_newton_step(
+    return_map: Callable[[Array, Scalar], Array], z: Array, p: Scalar, n_continuous: int
+) -> NewtonStep:
     """Return the Newton step of `return_map(z, p)` = z, whose first `n_continuous` entries are
     continuous.
 
     The other entries are codes, which are copied from the image.
     """
-    beside = lambda x, p: image(jnp.concatenate([x, z[numbers:]]), p)
-    reached, slopes = with_jacobian(beside, z[:numbers], p)
-    by_x, by_p = (slope[:numbers] for slope in slopes)
-    miss = reached - z
-    right = jnp.stack([miss[:numbers], by_p], -1)
-    solved = jnp.linalg.solve(jnp.eye(numbers, dtype=z.dtype) - by_x, right)
-    codes = miss[numbers:]
-    column = jnp.concatenate([solved[:, 1], jnp.zeros_like(codes)])
-    return Linear(jnp.concatenate([solved[:, 0], codes]), column, by_x)
+    continuous_map = lambda x, p: return_map(jnp.concatenate([x, z[n_continuous:]]), p)
+    image_point, jacobians = value_and_jacobian(continuous_map, z[:n_continuous], p)
+    jacobian_z, jacobian_p = (jacobian[:n_continuous] for jacobian in jacobians)
+    defect = image_point - z
+    rhs = jnp.stack([defect[:n_continuous], jacobian_p], -1)
+    solutions = jnp.linalg.solve(jnp.eye(n_continuous, dtype=z.dtype) - jacobian_z, rhs)
+    code_changes = defect[n_continuous:]
+    tangent = jnp.concatenate([solutions[:, 1], jnp.zeros_like(code_changes)])
+    return NewtonStep(jnp.concatenate([solutions[:, 0], code_changes]), tangent, jacobian_z)
 
 
-class MapFollowed(AbstractFollowed):
+class FixedPointProblem(AbstractContinuationProblem):
     """Fixed points of a map x -> `function(args, x, p)` that JAX differentiates in forward mode.
 
     The map returns NaN where it is not defined.
     """
 
-    function: Callable[[Any, Section, Scalar], Section] = eqx.field(static=True)
+    function: Callable[[Any, SectionVector, Scalar], SectionVector] = eqx.field(static=True)
 
-    def linearise(self, wheel: Any, z: Unknown, p: Scalar) -> Linear:
-        return at_fixed_point(lambda x, p: self.function(wheel, x, p), z, p, z.shape[0])
+    def linearize(self, args: Any, z: Unknowns, p: Scalar) -> NewtonStep:
+        return fixed_point_newton_step(lambda x, p: self.function(args, x, p), z, p, z.shape[0])
 
-    def section(self, z: Unknown) -> Section:
+    def section_state(self, z: Unknowns) -> SectionVector:
         return z
 
 
-class Ending(Code):
+class ContinuationStatus(StatusCode):
     """Reason why the continuation of a branch ended in one direction."""
 
-    GOING = 0, "It was still being followed."
-    RANGE_ENDED = 1, "The parameter's range ended."
-    LEFT_SEQUENCE = 2, "Its points no longer are what they stand for."
-    STALLED = 3, "Newton's method found no next point, however short the step."
-    BUFFER_FULL = 4, "It has as many points as were allowed: raise max_points."
-    NO_START = 5, "No point was found to start from."
-    CLOSED = 6, "It came back to where it began."
+    RUNNING = 0, "It was still being followed."
+    RANGE_END_REACHED = 1, "The parameter's range ended."
+    POINT_NOT_ADMISSIBLE = 2, "Its points no longer are what they stand for."
+    STEP_SIZE_UNDERFLOW = 3, "Newton's method found no next point, however short the step."
+    MAX_POINTS_REACHED = 4, "It has as many points as were allowed: raise max_points."
+    START_NOT_FOUND = 5, "No point was found to start from."
+    CURVE_CLOSED = 6, "It came back to where it began."
 
 
-class PathPoint(NamedTuple):
+class ContinuationPoint(NamedTuple):
     """A point of a branch with the unit tangent to the branch."""
 
-    z: Unknown
+    z: Unknowns
     p: Scalar
-    slope: Unknown  # dz per length along the branch; () for stored points
-    share_slope: Scalar  # rate of the parameter, as a fraction of its range, per length
+    tangent: Unknowns  # dz per length along the branch; () for stored points
+    fraction_rate: Scalar  # rate of the parameter, as a fraction of its range, per length
     jacobian: Float[Array, "n n"]
-    valid: Bool[Array, ""]
+    is_admissible: Bool[Array, ""]
 
 
-class Track(NamedTuple):
+class ContinuationResult(NamedTuple):
     """Points of one or more branches in buffers of `max_points`, of which the first `n_points` are
     set.
     """
 
-    points: PathPoint
+    points: ContinuationPoint
     n_points: Int[Array, " branches"]
-    ending: Int[Array, " branches"]  # a ContinuationStatus
-    passes: Int[Array, " branches"]  # calls of `linearize`
+    status: Int[Array, " branches"]  # a ContinuationStatus
+    n_linearizations: Int[Array, " branches"]  # calls of `linearize`
 
 
-class Plane(NamedTuple):
+class ConstraintPlane(NamedTuple):
     """The condition that selects a point: the projection on the normal equals that of the given
     point.
     """
 
-    x: Section
-    share: Scalar
-    row_x: Section
-    row_share: Scalar
+    section_state: SectionVector
+    fraction: Scalar
+    normal_section: SectionVector
+    normal_fraction: Scalar
 
 
-class Corrected(NamedTuple):
+class CorrectorState(NamedTuple):
     """State of the corrector after one Newton iteration."""
 
-    z: Unknown
-    share: Scalar
-    size: Scalar
-    column: Unknown  # dz per fraction of the parameter's range
+    z: Unknowns
+    fraction: Scalar
+    correction_norm: Scalar
+    tangent: Unknowns  # dz per fraction of the parameter's range
     jacobian: Float[Array, "n n"]
 
 
-def linear_at(
-    followed: AbstractFollowed, wheel: Any, bounds: Array, z: Unknown, share: Scalar
-) -> Linear:
+def newton_step_at_fraction(
+    problem: AbstractContinuationProblem, args: Any, bounds: Array, z: Unknowns, fraction: Scalar
+) -> NewtonStep:
     """Return the Newton step at a fraction of the parameter's range."""
-    return followed.linearise(wheel, z, bounds[0] + (bounds[1] - bounds[0]) * share)
+    return problem.linearize(args, z, bounds[0] + (bounds[1] - bounds[0]) * fraction)
 
 
-def corrected(
-    followed: AbstractFollowed,
-    linear: Linear,
+def correct_point(
+    problem: AbstractContinuationProblem,
+    newton_step: NewtonStep,
     bounds: Array,
-    plane: Plane,
-    z: Unknown,
-    share: Scalar,
-) -> Corrected:
+    plane: ConstraintPlane,
+    z: Unknowns,
+    fraction: Scalar,
+) -> CorrectorState:
     """Apply one Newton iteration to the branch's equations and the constraint plane together."""
     scale = bounds[1] - bounds[0]
-    column = jax.tree.map(lambda x: scale * x, linear.column)
-    x = followed.section(z) + followed.section(linear.correction)
-    ahead = plane.row_x @ (x - plane.x) + plane.row_share * (share - plane.share)
-    d_share = -ahead / (plane.row_x @ followed.section(column) + plane.row_share)
-    dz = jax.tree.map(lambda a, b: a + d_share * b, linear.correction, column)
-    size = jnp.maximum(followed.size(z, dz), jnp.abs(d_share))
-    return Corrected(jax.tree.map(jnp.add, z, dz), share + d_share, size, column, linear.jacobian)
+    tangent = jax.tree.map(lambda section_state: scale * section_state, newton_step.tangent)
+    section_state = problem.section_state(z) + problem.section_state(newton_step.correction)
+    plane_residual = plane.normal_section @ (
+        section_state - plane.section_state
+    ) + plane.normal_fraction * (fraction - plane.fraction)
+    d_fraction = -plane_residual / (
+        plane.normal_section @ problem.section_state(tangent) + plane.normal_fraction
+    )
+    dz = jax.tree.map(lambda a, b: a + d_fraction * b, newton_step.correction, tangent)
+    correction_norm = jnp.maximum(problem.correction_norm(z, dz), jnp.abs(d_fraction))
+    return CorrectorState(
+        jax.tree.map(jnp.add, z, dz),
+        fraction + d_fraction,
+        correction_norm,
+        tangent,
+        newton_step.jacobian,
+    )
 
 
-def _share_of(p: Array, bounds: Array) -> Array:
+def _fraction_from_parameter(p: Array, bounds: Array) -> Array:
     return (p - bounds[0]) / (bounds[1] - bounds[0])
 
 
-def parameter_at(share: Array, bounds: Array) -> Array:
+def parameter_from_fraction(fraction: Array, bounds: Array) -> Array:
     """Return the parameter at a fraction of its range; it is exact at both ends."""
-    p = bounds[0] + (bounds[1] - bounds[0]) * share
-    return jnp.where(share == 1.0, bounds[1], p)
+    p = bounds[0] + (bounds[1] - bounds[0]) * fraction
+    return jnp.where(fraction == 1.0, bounds[1], p)
 
 
-class _Trial(NamedTuple):
-    plane: Plane
-    z: Unknown
-    share: Scalar
+class _TrialPoint(NamedTuple):
+    plane: ConstraintPlane
+    z: Unknowns
+    fraction: Scalar
     length: Scalar  # predicted arc length from the last point
-    final: Bool[Array, ""]  # whether it lies on the end of the range
+    is_final: Bool[Array, ""]  # whether it lies on the end of the range
 
 
-def _predicted(
-    followed: AbstractFollowed,
-    before: PathPoint,
-    base: PathPoint,
-    two: Bool[Array, ""],
-    step: Scalar,
+def _predict_point(
+    problem: AbstractContinuationProblem,
+    previous_point: ContinuationPoint,
+    current_point: ContinuationPoint,
+    has_two_points: Bool[Array, ""],
+    ds: Scalar,
     bounds: Array,
-) -> _Trial:
+) -> _TrialPoint:
     """Return the predicted point one step along the tangent, or on the end of the range if it is
     nearer.
 
@@ -259,250 +269,324 @@ def _predicted(
     their tangents. The cubic is nearer to the branch by two orders and saves one iteration of
     three.
     """
-    share, ahead = _share_of(base.p, bounds), base.share_slope
-    edge = jnp.where(ahead > 0.0, 1.0, 0.0)
-    still = ahead == 0.0
-    reach = jnp.where(still, jnp.inf, (edge - share) / jnp.where(still, 1.0, ahead))
-    final = reach <= step
-    length = jnp.where(final, reach, step)
-    along_x, here = followed.section(base.slope), followed.section(base.z)
-    at = jnp.where(final, edge, share + length * ahead)
-    plane = Plane(
-        here + length * along_x,
-        at,
-        jnp.where(final, 0.0, along_x),
-        jnp.where(final, 1.0, ahead),
+    fraction, fraction_rate = (
+        _fraction_from_parameter(current_point.p, bounds),
+        current_point.fraction_rate,
     )
-    passed = _share_of(before.p, bounds)
-    apart = jnp.append(here - followed.section(before.z), share - passed)
-    chord = jnp.where(two, jnp.sqrt(apart @ apart), 1.0)
+    bound = jnp.where(fraction_rate > 0.0, 1.0, 0.0)
+    is_stationary = fraction_rate == 0.0
+    bound_distance = jnp.where(
+        is_stationary, jnp.inf, (bound - fraction) / jnp.where(is_stationary, 1.0, fraction_rate)
+    )
+    is_final = bound_distance <= ds
+    length = jnp.where(is_final, bound_distance, ds)
+    section_tangent, section_state = (
+        problem.section_state(current_point.tangent),
+        problem.section_state(current_point.z),
+    )
+    target_fraction = jnp.where(is_final, bound, fraction + length * fraction_rate)
+    plane = ConstraintPlane(
+        section_state + length * section_tangent,
+        target_fraction,
+        jnp.where(is_final, 0.0, section_tangent),
+        jnp.where(is_final, 1.0, fraction_rate),
+    )
+    previous_fraction = _fraction_from_parameter(previous_point.p, bounds)
+    displacement = jnp.append(
+        section_state - problem.section_state(previous_point.z), fraction - previous_fraction
+    )
+    chord = jnp.where(has_two_points, jnp.sqrt(displacement @ displacement), 1.0)
 
-    def curved(a: Array, da: Array, b: Array, db: Array) -> Array:
-        mean = (b - a) / chord
-        bend = (db - mean) / chord + (length + chord) * (da + db - 2.0 * mean) / chord**2
-        return b + length * db + jnp.where(two, length**2 * bend, 0.0)
+    def extrapolate(a: Array, da: Array, b: Array, db: Array) -> Array:
+        mean_rate = (b - a) / chord
+        curvature = (db - mean_rate) / chord + (length + chord) * (
+            da + db - 2.0 * mean_rate
+        ) / chord**2
+        return b + length * db + jnp.where(has_two_points, length**2 * curvature, 0.0)
 
-    z = jax.tree.map(curved, before.z, before.slope, base.z, base.slope)
-    share = jnp.where(final, edge, curved(passed, before.share_slope, share, ahead))
-    return _Trial(plane, z, share, length, final)
+    z = jax.tree.map(
+        extrapolate,
+        previous_point.z,
+        previous_point.tangent,
+        current_point.z,
+        current_point.tangent,
+    )
+    fraction = jnp.where(
+        is_final,
+        bound,
+        extrapolate(previous_fraction, previous_point.fraction_rate, fraction, fraction_rate),
+    )
+    return _TrialPoint(plane, z, fraction, length, is_final)
 
 
-class State(NamedTuple):
+class ContinuationState(NamedTuple):
     """State of the continuation of one branch."""
 
-    before: PathPoint
-    base: PathPoint
-    first: PathPoint  # of the branch, if it exists
-    step: Scalar
-    trial: _Trial
+    previous_point: ContinuationPoint
+    current_point: ContinuationPoint
+    first_point: ContinuationPoint  # of the branch, if it exists
+    ds: Scalar
+    trial: _TrialPoint
     iteration: Int[Array, ""]
     n_points: Int[Array, ""]
-    ending: Int[Array, ""]
-    passes: Int[Array, ""]
+    status: Int[Array, ""]
+    n_linearizations: Int[Array, ""]
 
 
-class _Judged(NamedTuple):
+class _TrialAssessment(NamedTuple):
     """Assessment of a trial after one Newton iteration; if neither flag is set, the iteration goes
     on.
     """
 
-    accepted: Bool[Array, ""]
-    failed: Bool[Array, ""]
-    share_slope: Scalar  # along the branch, in the direction of the continuation
+    is_accepted: Bool[Array, ""]
+    has_failed: Bool[Array, ""]
+    fraction_rate: Scalar  # along the branch, in the direction of the continuation
 
 
-def _judged(
-    followed: AbstractFollowed,
+def _assess_trial(
+    problem: AbstractContinuationProblem,
     options: ArclengthOptions,
-    state: State,
-    now: Corrected,
+    state: ContinuationState,
+    corrector: CorrectorState,
     direction: Scalar,
-) -> _Judged:
+) -> _TrialAssessment:
     """Return whether a trial is accepted or has failed, and the parameter's rate along
     the branch.
     """
-    base, trial, starting = state.base, state.trial, state.n_points == 0
-    off = jnp.maximum(
-        jnp.max(jnp.abs(followed.section(now.z) - trial.plane.x)),
-        jnp.abs(now.share - trial.plane.share),
+    current_point, trial, is_first = state.current_point, state.trial, state.n_points == 0
+    distance = jnp.maximum(
+        jnp.max(jnp.abs(problem.section_state(corrector.z) - trial.plane.section_state)),
+        jnp.abs(corrector.fraction - trial.plane.fraction),
     )
-    sound = jnp.isfinite(now.size) & (starting | (off <= state.step))
-    converged = sound & (now.size < options.tolerance)
-    by_share = followed.section(now.column)
-    facing = followed.section(base.slope) @ by_share + base.share_slope
-    facing = jnp.where(starting, direction, facing)
-    norm = jnp.sqrt(1.0 + by_share @ by_share)
-    straight = starting | (jnp.abs(facing) >= norm * jnp.cos(options.turn))
-    accepted = converged & straight
-    failed = ~accepted & (~sound | converged | (state.iteration + 1 >= options.iterations))
-    return _Judged(accepted, failed, jnp.where(facing >= 0.0, 1.0, -1.0) / norm)
+    is_valid = jnp.isfinite(corrector.correction_norm) & (is_first | (distance <= state.ds))
+    is_converged = is_valid & (corrector.correction_norm < options.tolerance)
+    section_tangent = problem.section_state(corrector.tangent)
+    alignment = (
+        problem.section_state(current_point.tangent) @ section_tangent + current_point.fraction_rate
+    )
+    alignment = jnp.where(is_first, direction, alignment)
+    norm = jnp.sqrt(1.0 + section_tangent @ section_tangent)
+    is_straight = is_first | (jnp.abs(alignment) >= norm * jnp.cos(options.max_turn_angle))
+    is_accepted = is_converged & is_straight
+    has_failed = ~is_accepted & (
+        ~is_valid | is_converged | (state.iteration + 1 >= options.max_newton_iterations)
+    )
+    return _TrialAssessment(is_accepted, has_failed, jnp.where(alignment >= 0.0, 1.0, -1.0) / norm)
 
 
-def _next_step(options: ArclengthOptions, state: State, judged: _Judged) -> Scalar:
+def _choose_next_ds(
+    options: ArclengthOptions, state: ContinuationState, assessment: _TrialAssessment
+) -> Scalar:
     """Return the next continuation step.
 
     The step grows after few Newton iterations, shrinks after many, and halves after a failure.
     """
-    quick, slow = state.iteration < 4, state.iteration >= 6
-    growth = jnp.where(quick, 1.4, jnp.where(slow, 0.6, 1.0))
-    longer = jnp.minimum(state.step * growth, options.largest_step)
-    shorter = jnp.where(judged.failed, 0.5 * state.step, state.step)
-    step = jnp.where(judged.accepted, longer, shorter)
-    return jnp.where(state.n_points == 0, options.first_step, step)
+    is_quick, is_slow = state.iteration < 4, state.iteration >= 6
+    growth = jnp.where(is_quick, 1.4, jnp.where(is_slow, 0.6, 1.0))
+    longer_ds = jnp.minimum(state.ds * growth, options.max_ds)
+    shorter_ds = jnp.where(assessment.has_failed, 0.5 * state.ds, state.ds)
+    ds = jnp.where(assessment.is_accepted, longer_ds, shorter_ds)
+    return jnp.where(state.n_points == 0, options.initial_ds, ds)
 
 
-def _closes(
-    followed: AbstractFollowed, start: PathPoint, base: PathPoint, to: PathPoint, bounds: Array
+def _is_curve_closed(
+    problem: AbstractContinuationProblem,
+    start: ContinuationPoint,
+    current_point: ContinuationPoint,
+    next_point: ContinuationPoint,
+    bounds: Array,
 ) -> Bool[Array, ""]:
     """Return whether the segment from one point to the next passes over the branch's start."""
-    place = lambda at: jnp.append(followed.section(at.z), _share_of(at.p, bounds))
-    chord, there = place(to) - place(base), place(start) - place(base)
-    squared = chord @ chord
-    share = there @ chord / jnp.where(squared > 0.0, squared, 1.0)
-    off = there - share * chord
-    return (share >= 0.0) & (share <= 1.0) & (off @ off < 0.01 * squared)
+    coordinates_of = lambda point: jnp.append(
+        problem.section_state(point.z), _fraction_from_parameter(point.p, bounds)
+    )
+    chord, start_offset = (
+        coordinates_of(next_point) - coordinates_of(current_point),
+        coordinates_of(start) - coordinates_of(current_point),
+    )
+    chord_squared = chord @ chord
+    fraction = start_offset @ chord / jnp.where(chord_squared > 0.0, chord_squared, 1.0)
+    deviation = start_offset - fraction * chord
+    return (fraction >= 0.0) & (fraction <= 1.0) & (deviation @ deviation < 0.01 * chord_squared)
 
 
-def _ending(
+def _update_status(
     options: ArclengthOptions,
-    state: State,
-    judged: _Judged,
-    reached: PathPoint,
-    step: Scalar,
-    ahead: Scalar,
-    closes: Bool[Array, ""],
+    state: ContinuationState,
+    assessment: _TrialAssessment,
+    new_point: ContinuationPoint,
+    ds: Scalar,
+    next_length: Scalar,
+    is_closed: Bool[Array, ""],
 ) -> Int[Array, ""]:
     """Return whether and why the branch ends at this trial; `next_length` is the next step's
     length.
     """
-    accepted, failed, _ = judged
-    count, ending = state.n_points + accepted, state.ending
-    for happened, code in (
-        (step < options.smallest_step, Ending.STALLED),
-        (failed & (state.n_points == 0), Ending.NO_START),
-        (accepted & (count >= options.max_points), Ending.BUFFER_FULL),
-        (accepted & (state.trial.final | (ahead <= 1e-12)), Ending.RANGE_ENDED),
-        (accepted & ~reached.valid, Ending.LEFT_SEQUENCE),
-        (accepted & closes & (state.n_points > 2), Ending.CLOSED),
+    is_accepted, has_failed, _ = assessment
+    n_points, status = state.n_points + is_accepted, state.status
+    for has_occurred, code in (
+        (ds < options.min_ds, ContinuationStatus.STEP_SIZE_UNDERFLOW),
+        (has_failed & (state.n_points == 0), ContinuationStatus.START_NOT_FOUND),
+        (is_accepted & (n_points >= options.max_points), ContinuationStatus.MAX_POINTS_REACHED),
+        (
+            is_accepted & (state.trial.is_final | (next_length <= 1e-12)),
+            ContinuationStatus.RANGE_END_REACHED,
+        ),
+        (is_accepted & ~new_point.is_admissible, ContinuationStatus.POINT_NOT_ADMISSIBLE),
+        (is_accepted & is_closed & (state.n_points > 2), ContinuationStatus.CURVE_CLOSED),
     ):
-        ending = jnp.where(happened, int(code), ending)
-    return ending.astype(jnp.int32)
+        status = jnp.where(has_occurred, int(code), status)
+    return status.astype(jnp.int32)
 
 
-def _started(
-    followed: AbstractFollowed,
+def _init_branch(
+    problem: AbstractContinuationProblem,
     options: ArclengthOptions,
     bounds: Array,
-    z: Unknown,
+    z: Unknowns,
     p: Scalar,
     direction: Scalar,
-) -> State:
-    x = followed.section(z)
+) -> ContinuationState:
+    x = problem.section_state(z)
     n, dtype = x.shape[0], x.dtype
-    zero, none, no = jnp.zeros((), dtype), jnp.zeros((), jnp.int32), jnp.asarray(False)
-    flat, share = jax.tree.map(jnp.zeros_like, z), _share_of(p, bounds)
-    here = PathPoint(z, p, flat, zero + direction, jnp.zeros((n, n), dtype), no)
-    trial = _Trial(Plane(x, share, jnp.zeros_like(x), zero + 1.0), z, share, zero, no)
-    going = none + int(Ending.GOING)
-    return State(here, here, here, zero + options.first_step, trial, none, none, going, none)
+    zero, zero_count, false = jnp.zeros((), dtype), jnp.zeros((), jnp.int32), jnp.asarray(False)
+    zero_tangent, fraction = jax.tree.map(jnp.zeros_like, z), _fraction_from_parameter(p, bounds)
+    point = ContinuationPoint(z, p, zero_tangent, zero + direction, jnp.zeros((n, n), dtype), false)
+    trial = _TrialPoint(
+        ConstraintPlane(x, fraction, jnp.zeros_like(x), zero + 1.0), z, fraction, zero, false
+    )
+    running = zero_count + int(ContinuationStatus.RUNNING)
+    return ContinuationState(
+        point,
+        point,
+        point,
+        zero + options.initial_ds,
+        trial,
+        zero_count,
+        zero_count,
+        running,
+        zero_count,
+    )
 
 
-SIDE_BY_SIDE = 8
+MAX_CONCURRENT_BRANCHES = 8
 """Branches that are continued concurrently, chosen because they fill one group of lanes of machine
 code."""
 
-Followed = tuple[State, PathPoint]
+BranchBatch = tuple[ContinuationState, ContinuationPoint]
 """States of concurrent branches, and the buffers of points that they have reached."""
 
 
-def begun(
-    followed: AbstractFollowed,
+def init_branches(
+    problem: AbstractContinuationProblem,
     options: ArclengthOptions,
-    z: Unknown,
+    z: Unknowns,
     p: Array,
     bounds: Array,
     directions: Array,
-    wanted: Array,
-) -> Followed:
+    is_requested: Array,
+) -> BranchBatch:
     """Return the initial states of the branches and their empty buffers of points."""
-    states = jax.vmap(functools.partial(_started, followed, options, bounds))(z, p, directions)
-    ending = jnp.where(wanted, states.ending, int(Ending.NO_START))
-    states = states._replace(ending=ending.astype(jnp.int32))
-    room = lambda x: jnp.zeros((x.shape[0], options.max_points, *x.shape[1:]), x.dtype)
-    return states, jax.tree.map(room, states.base._replace(slope=()))
+    states = jax.vmap(functools.partial(_init_branch, problem, options, bounds))(z, p, directions)
+    status = jnp.where(is_requested, states.status, int(ContinuationStatus.START_NOT_FOUND))
+    states = states._replace(status=status.astype(jnp.int32))
+    allocate_buffer = lambda x: jnp.zeros((x.shape[0], options.max_points, *x.shape[1:]), x.dtype)
+    return states, jax.tree.map(allocate_buffer, states.current_point._replace(tangent=()))
 
 
-def going(on: Followed) -> Array:
+def is_active(branches: BranchBatch) -> Array:
     """Return which branches still run."""
-    return on[0].ending == int(Ending.GOING)
+    return branches[0].status == int(ContinuationStatus.RUNNING)
 
 
-def turned(
-    followed: AbstractFollowed,
+def iterate_branches(
+    problem: AbstractContinuationProblem,
     options: ArclengthOptions,
-    wheels: Any,
+    batch_args: Any,
     bounds: Array,
     directions: Array,
-    rows: Array,
-    on: Followed,
-    linears: Linear,
-) -> Followed:
+    buffer_rows: Array,
+    branches: BranchBatch,
+    newton_steps: NewtonStep,
+) -> BranchBatch:
     """Advance each branch by one linearization of its trial, and store the accepted points.
 
     The branches own the rows `buffer_rows` of the buffers.
     """
 
-    def iterate(
-        wheel: Any, direction: Scalar, state: State, linear: Linear
-    ) -> tuple[State, PathPoint, Bool[Array, ""]]:
+    def iterate_branch(
+        args: Any, direction: Scalar, state: ContinuationState, newton_step: NewtonStep
+    ) -> tuple[ContinuationState, ContinuationPoint, Bool[Array, ""]]:
         trial = state.trial
-        now = corrected(followed, linear, bounds, trial.plane, trial.z, trial.share)
-        judged = _judged(followed, options, state, now, direction)
-        p = parameter_at(jnp.where(trial.final, trial.plane.share, now.share), bounds)
-        valid = followed.valid(wheel, now.z, p)
-        slope = jax.tree.map(lambda x: judged.share_slope * x, now.column)
-        reached = PathPoint(now.z, p, slope, judged.share_slope, now.jacobian, valid)
-        base = select(judged.accepted, reached, state.base)
-        first = select(judged.accepted & (state.n_points == 0), reached, state.first)
-        before = select(judged.accepted, state.base, state.before)
-        count = state.n_points + judged.accepted
-        step = _next_step(options, state, judged)
-        following = _predicted(followed, before, base, count > 1, step, bounds)
-        done = judged.accepted | judged.failed
-        following = select(done, following, trial._replace(z=now.z, share=now.share))
-        closes = _closes(followed, first, state.base, reached, bounds)
-        ending = _ending(options, state, judged, reached, step, following.length, closes)
-        iteration = jnp.where(done, 0, state.iteration + 1)
-        counts = count, ending, state.passes + 1
-        later = State(before, base, first, step, following, iteration, *counts)
-        return later, reached, judged.accepted
+        corrector = correct_point(
+            problem, newton_step, bounds, trial.plane, trial.z, trial.fraction
+        )
+        assessment = _assess_trial(problem, options, state, corrector, direction)
+        p = parameter_from_fraction(
+            jnp.where(trial.is_final, trial.plane.fraction, corrector.fraction), bounds
+        )
+        is_admissible = problem.is_admissible(args, corrector.z, p)
+        tangent = jax.tree.map(lambda x: assessment.fraction_rate * x, corrector.tangent)
+        new_point = ContinuationPoint(
+            corrector.z, p, tangent, assessment.fraction_rate, corrector.jacobian, is_admissible
+        )
+        current_point = tree_where(assessment.is_accepted, new_point, state.current_point)
+        first_point = tree_where(
+            assessment.is_accepted & (state.n_points == 0), new_point, state.first_point
+        )
+        previous_point = tree_where(
+            assessment.is_accepted, state.current_point, state.previous_point
+        )
+        n_points = state.n_points + assessment.is_accepted
+        ds = _choose_next_ds(options, state, assessment)
+        next_trial = _predict_point(
+            problem, previous_point, current_point, n_points > 1, ds, bounds
+        )
+        is_finished = assessment.is_accepted | assessment.has_failed
+        next_trial = tree_where(
+            is_finished, next_trial, trial._replace(z=corrector.z, fraction=corrector.fraction)
+        )
+        is_closed = _is_curve_closed(problem, first_point, state.current_point, new_point, bounds)
+        status = _update_status(
+            options, state, assessment, new_point, ds, next_trial.length, is_closed
+        )
+        iteration = jnp.where(is_finished, 0, state.iteration + 1)
+        counters = n_points, status, state.n_linearizations + 1
+        next_state = ContinuationState(
+            previous_point, current_point, first_point, ds, next_trial, iteration, *counters
+        )
+        return next_state, new_point, assessment.is_accepted
 
     # Buffers are updated outside of `tree_where`, which would copy them at every iteration.
-    state, points = on
-    after, reached, accepted = jax.vmap(iterate)(wheels, directions, state, linears)
-    place = jnp.where(going(on) & accepted, state.n_points, options.max_points)
-    put = lambda buffer, reached: buffer.at[rows, place].set(reached, mode="drop")
-    points = jax.tree.map(put, points, reached._replace(slope=()))
-    return jax.vmap(select)(going(on), after, state), points
+    state, points = branches
+    next_states, new_points, is_accepted = jax.vmap(iterate_branch)(
+        batch_args, directions, state, newton_steps
+    )
+    buffer_index = jnp.where(is_active(branches) & is_accepted, state.n_points, options.max_points)
+    write_row = lambda buffer, new_points: buffer.at[buffer_rows, buffer_index].set(
+        new_points, mode="drop"
+    )
+    points = jax.tree.map(write_row, points, new_points._replace(tangent=()))
+    return jax.vmap(tree_where)(is_active(branches), next_states, state), points
 
 
-def track_of(on: Followed) -> Track:
+def to_continuation_result(branches: BranchBatch) -> ContinuationResult:
     """Return the result of a continuation from the states of its branches."""
-    last, points = on
-    return Track(points, last.n_points, last.ending, last.passes)
+    states, points = branches
+    return ContinuationResult(points, states.n_points, states.status, states.n_linearizations)
 
 
 @eqx.filter_jit
-def follow(
-    followed: AbstractFollowed,
+def continue_from(
+    problem: AbstractContinuationProblem,
     options: ArclengthOptions,
-    wheels: Any,
-    z: Unknown,
+    batch_args: Any,
+    z: Unknowns,
     p: Float[Array, "*branches"],
     bounds: Float[Array, "2"],
     directions: Float[Array, "*branches"],
-    wanted: Bool[Array, "*branches"] | None = None,
-) -> Track:
+    is_requested: Bool[Array, "*branches"] | None = None,
+) -> ContinuationResult:
     """Continue the branches from the points near (z, p) in the given directions.
 
     The parameter grows if the direction is 1 and shrinks if it is -1. The input is one branch, or
@@ -512,24 +596,36 @@ def follow(
     next one starts.
     """
     if p.ndim == 0:
-        one = lambda tree: jax.tree.map(lambda x: x[None], tree)
-        track = follow(followed, options, one(wheels), one(z), p[None], bounds, directions[None])
-        return jax.tree.map(lambda x: x[0], track)
-    wanted = jnp.ones(p.shape, bool) if wanted is None else wanted
+        add_axis = lambda tree: jax.tree.map(lambda x: x[None], tree)
+        result = continue_from(
+            problem, options, add_axis(batch_args), add_axis(z), p[None], bounds, directions[None]
+        )
+        return jax.tree.map(lambda x: x[0], result)
+    is_requested = jnp.ones(p.shape, bool) if is_requested is None else is_requested
 
-    def some_further(on: Followed) -> Followed:
-        rows = jnp.argsort(~going(on), stable=True)[:SIDE_BY_SIDE]
-        own, along, state = jax.tree.map(lambda x: x[rows], (wheels, directions, on[0]))
-        waiting = jnp.sum(going(on)) > len(rows)
+    def advance_group(branches: BranchBatch) -> BranchBatch:
+        rows = jnp.argsort(~is_active(branches), stable=True)[:MAX_CONCURRENT_BRANCHES]
+        group_args, group_directions, state = jax.tree.map(
+            lambda x: x[rows], (batch_args, directions, branches[0])
+        )
+        has_waiting = jnp.sum(is_active(branches)) > len(rows)
 
-        def turn(on: Followed) -> Followed:
-            one = lambda wheel, trial: linear_at(followed, wheel, bounds, trial.z, trial.share)
-            linears = jax.vmap(one)(own, on[0].trial)
-            return turned(followed, options, own, bounds, along, rows, on, linears)
+        def advance_once(branches: BranchBatch) -> BranchBatch:
+            linearize_trial = lambda args, trial: newton_step_at_fraction(
+                problem, args, bounds, trial.z, trial.fraction
+            )
+            newton_steps = jax.vmap(linearize_trial)(group_args, branches[0].trial)
+            return iterate_branches(
+                problem, options, group_args, bounds, group_directions, rows, branches, newton_steps
+            )
 
-        more = lambda on: jnp.where(waiting, jnp.all(going(on)), jnp.any(going(on)))
-        state, points = lax.while_loop(more, turn, (state, on[1]))
-        return jax.tree.map(lambda x, new: x.at[rows].set(new), on[0], state), points
+        has_active = lambda branches: jnp.where(
+            has_waiting, jnp.all(is_active(branches)), jnp.any(is_active(branches))
+        )
+        state, points = lax.while_loop(has_active, advance_once, (state, branches[1]))
+        return jax.tree.map(lambda x, new: x.at[rows].set(new), branches[0], state), points
 
-    on = begun(followed, options, z, p, bounds, directions, wanted)
-    return track_of(lax.while_loop(lambda on: jnp.any(going(on)), some_further, on))
+    branches = init_branches(problem, options, z, p, bounds, directions, is_requested)
+    return to_continuation_result(
+        lax.while_loop(lambda branches: jnp.any(is_active(branches)), advance_group, branches)
+    )

@@ -3,7 +3,7 @@
 import enum
 
 
-class Code(enum.IntEnum):
+class StatusCode(enum.IntEnum):
     """Base class of status codes, whose members are `NAME = number, "sentence"`.
 
     The number is the value of the member.
@@ -11,7 +11,7 @@ class Code(enum.IntEnum):
 
     meaning: str
 
-    def __new__(cls, value: int, meaning: str = "") -> "Code":
+    def __new__(cls, value: int, meaning: str = "") -> "StatusCode":
         code = int.__new__(cls, value)
         code._value_, code.meaning = value, meaning
         return code

@@ -23,43 +23,43 @@ from jax import lax
 from jaxtyping import Array, Bool
 
 from vrw_jax.numerics.gauss import (
-    ENDS_ONCE,
-    ENDS_TWICE,
-    N_NODES,
-    NODES,
-    ONCE,
-    TWICE,
-    Mesh,
-    lagrange,
-    node_weights,
+    DOUBLE_END_WEIGHTS,
+    DOUBLE_INTEGRATION_MATRIX,
+    END_WEIGHTS,
+    GAUSS_NODES,
+    INTEGRATION_MATRIX,
+    N_GAUSS_NODES,
+    PhaseMesh,
+    lagrange_weights,
+    phase_integration_matrices,
 )
 from vrw_jax.numerics.lane_algebra import (
-    Hold,
+    HoldFn,
     LaneArray,
-    contract,
-    eliminate,
+    apply_matrix,
+    contract_axes,
     fusion_barrier,
-    inverse,
-    mix,
-    partials_of,
-    push_columns,
-    weigh,
+    invert_small,
+    solve_node_equations,
+    value_and_jvps,
+    value_and_partials,
+    weighted_sum,
 )
 from vrw_jax.numerics.types import Elementwise, Vector
 
-Constants = tuple[Elementwise, ...]
+PhaseConstants = tuple[Elementwise, ...]
 """The constants of the phases' equations, one array for each."""
 
 
-class Point(NamedTuple):
+class PhasePoint(NamedTuple):
     """State within a phase: its held constants, coordinates and rates."""
 
-    held: Vector
+    held_constants: Vector
     q: Vector
     v: Vector
 
 
-class Phase(NamedTuple):
+class CollocationPhase(NamedTuple):
     """One phase as data, whose functions are elementwise over the batch.
 
     `residual` is the residual of the equations of motion at (constants, point, acceleration), which
@@ -70,12 +70,12 @@ class Phase(NamedTuple):
     """
 
     name: str
-    dim: int
-    residual: Callable[[Constants, Point, Vector], Vector]
-    event: Callable[[Constants, Point], Elementwise]
-    reset: Callable[[Constants, Point], Point]
-    guards: Callable[[Constants, Point], Vector]
-    smooth: bool = True  # False: the first interval leaves a fast decaying mode unresolved
+    n_coordinates: int
+    residual: Callable[[PhaseConstants, PhasePoint, Vector], Vector]
+    event: Callable[[PhaseConstants, PhasePoint], Elementwise]
+    reset: Callable[[PhaseConstants, PhasePoint], PhasePoint]
+    guards: Callable[[PhaseConstants, PhasePoint], Vector]
+    is_smooth: bool = True  # False: the first interval leaves a fast decaying mode unresolved
 
 
 class PhaseSequence(NamedTuple):
@@ -87,36 +87,40 @@ class PhaseSequence(NamedTuple):
     """
 
     section_size: int
-    start: Callable[[Constants, Vector], Point]
-    phases: tuple[Phase, ...]
-    border_checks: Callable[[Constants, "tuple[Passage, ...]", Array], Vector]
+    start: Callable[[PhaseConstants, Vector], PhasePoint]
+    phases: tuple[CollocationPhase, ...]
+    admissibility_margins: Callable[[PhaseConstants, "tuple[PhasePassage, ...]", Array], Vector]
 
 
-class Solution(NamedTuple):
+class CollocationSolution(NamedTuple):
     """The unknowns of a cycle of n gait steps, batch last; a gait step is one run of
     the sequence.
     """
 
-    section: LaneArray  # (section_size, batch), at the start of the first gait step
+    section_state: LaneArray  # (section_size, batch), at the start of the first gait step
     durations: LaneArray  # (n, n_phases, batch), s
     accelerations: tuple[
         LaneArray, ...
     ]  # by phase: (n, n_intervals, N_GAUSS_NODES, n_coordinates, batch)
 
 
-class Linearised(NamedTuple):
+class CycleLinearization(NamedTuple):
     """Results of one pass at a trial solution."""
 
-    correction: Solution  # of Newton's method
-    columns: Solution  # leading axis: derivatives with respect to each requested parameter
-    ends: (
+    correction: CollocationSolution  # of Newton's method
+    tangents: (
+        CollocationSolution  # leading axis: derivatives with respect to each requested parameter
+    )
+    step_ends: (
         LaneArray  # (n, 2 n_coordinates, batch): corrected coordinates and rates at each step's end
     )
-    d_ends: LaneArray  # leading axis: their derivatives with respect to each parameter requested
+    step_end_tangents: (
+        LaneArray  # leading axis: their derivatives with respect to each parameter requested
+    )
     monodromy: LaneArray  # (row, column, batch): Jacobian of the return map on the section
 
 
-class _Task(NamedTuple):
+class _PassContext(NamedTuple):
     """Inputs of a whole pass, and the layout of the tangents that it propagates.
 
     The order is: the correction; one tangent for each entry of the section state; one for each
@@ -124,117 +128,165 @@ class _Task(NamedTuple):
     """
 
     section_size: int
-    wanted: tuple[int, ...]
+    parameter_indices: tuple[int, ...]
     parameters: LaneArray
-    constants_of: Callable[..., Constants]
-    constants: Constants
-    d_constants: tuple[LaneArray, ...]  # the tangents of each, only with respect to the parameters
-    hold: Hold
+    constants_of: Callable[..., PhaseConstants]
+    constants: PhaseConstants
+    constants_tangents: tuple[
+        LaneArray, ...
+    ]  # the tangents of each, only with respect to the parameters
+    hold: HoldFn
 
     @property
-    def n_columns(self) -> int:
+    def n_tangents(self) -> int:
         """Number of tangents outside of a phase."""
-        return 1 + self.section_size + len(self.wanted)
+        return 1 + self.section_size + len(self.parameter_indices)
 
     @property
-    def of_section(self) -> slice:
+    def section_slice(self) -> slice:
         """Slice of the tangents with respect to the section state."""
         return slice(1, 1 + self.section_size)
 
-    def push(self, function: Callable, place: tuple, d_place: tuple) -> tuple:
+    def value_and_tangents(self, function: Callable, point: tuple, point_tangents: tuple) -> tuple:
         """Return the value and the tangents of `function(*point, *constants)`."""
-        if not self.wanted:
-            return push_columns(lambda *place: function(*place, *self.constants), place, d_place)
-        after = d_place[0].shape[0] - self.n_columns
-        around = ((self.of_section.stop, after), *((0, 0),) * (self.parameters.ndim - 1))
-        d_constants = (jnp.pad(x, around) for x in self.d_constants)
-        return push_columns(function, (*place, *self.constants), (*d_place, *d_constants))
+        if not self.parameter_indices:
+            return value_and_jvps(
+                lambda *point: function(*point, *self.constants), point, point_tangents
+            )
+        n_trailing = point_tangents[0].shape[0] - self.n_tangents
+        padding = ((self.section_slice.stop, n_trailing), *((0, 0),) * (self.parameters.ndim - 1))
+        constants_tangents = (jnp.pad(tangent, padding) for tangent in self.constants_tangents)
+        return value_and_jvps(
+            function, (*point, *self.constants), (*point_tangents, *constants_tangents)
+        )
 
 
-def _task(
+def _make_context(
     section_size: int,
-    wanted: tuple[int, ...],
+    parameter_indices: tuple[int, ...],
     parameters: LaneArray,
-    constants_of: Callable[..., Constants],
-) -> _Task:
+    constants_of: Callable[..., PhaseConstants],
+) -> _PassContext:
     """Return the context of a pass with the constants and their tangents."""
     hold = fusion_barrier(parameters)
     dtype, lanes = parameters.dtype, parameters.shape[1:]
-    units = np.eye(parameters.shape[0], dtype=dtype)[list(wanted)]
-    d_parameters = tuple(jnp.broadcast_to(x[:, None], (len(wanted), *lanes)) for x in units.T)
-    if wanted:
-        constants, d_constants = push_columns(constants_of, tuple(parameters), d_parameters)
+    units = np.eye(parameters.shape[0], dtype=dtype)[list(parameter_indices)]
+    parameter_tangents = tuple(
+        jnp.broadcast_to(x[:, None], (len(parameter_indices), *lanes)) for x in units.T
+    )
+    if parameter_indices:
+        constants, constants_tangents = value_and_jvps(
+            constants_of, tuple(parameters), parameter_tangents
+        )
     else:
-        constants, d_constants = constants_of(*parameters), ()
-    return _Task(section_size, wanted, parameters, constants_of, constants, d_constants, hold)
+        constants, constants_tangents = constants_of(*parameters), ()
+    return _PassContext(
+        section_size,
+        parameter_indices,
+        parameters,
+        constants_of,
+        constants,
+        constants_tangents,
+        hold,
+    )
 
 
-def _stacked(point: Point, like: Array) -> tuple[Array, ...]:
+def _stack_point(point: PhasePoint, template: Array) -> tuple[Array, ...]:
     """Return the parts of a point as arrays, some of which may be empty."""
-    empty = jnp.zeros((0, *like.shape[1:]), like.dtype)
-    return tuple(jnp.stack(x) if x else empty for x in point)
+    empty = jnp.zeros((0, *template.shape[1:]), template.dtype)
+    return tuple(jnp.stack(components) if components else empty for components in point)
 
 
-class _Front(NamedTuple):
+class _PassState(NamedTuple):
     """State of the pass with its tangents (leading axis: tangents)."""
 
-    held: LaneArray
+    held_constants: LaneArray
     q: LaneArray
     v: LaneArray
-    d_held: LaneArray
-    dq: LaneArray
-    dv: LaneArray
+    held_tangents: LaneArray
+    q_tangents: LaneArray
+    v_tangents: LaneArray
 
 
-def _with_column(front: _Front) -> _Front:
+def _append_duration_tangent(pass_state: _PassState) -> _PassState:
     """Append one zero tangent for the duration of the phase that begins."""
-    more = lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])])
-    return front._replace(d_held=more(front.d_held), dq=more(front.dq), dv=more(front.dv))
+    append_zero = lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])])
+    return pass_state._replace(
+        held_tangents=append_zero(pass_state.held_tangents),
+        q_tangents=append_zero(pass_state.q_tangents),
+        v_tangents=append_zero(pass_state.v_tangents),
+    )
 
 
-class _Interval(NamedTuple):
+class _MeshInterval(NamedTuple):
     """One mesh interval of a phase."""
 
-    fraction: Array  # of the phase's duration
+    duration_fraction: Array  # of the phase's duration
     h: LaneArray  # length, s
-    a: LaneArray  # accelerations, (node, coordinate, batch)
+    accelerations: LaneArray  # accelerations, (node, coordinate, batch)
 
 
-def _unit(n_columns: int, column: int, dtype: Any) -> np.ndarray:
+def _unit_tangent(n_tangents: int, index: int, dtype: Any) -> np.ndarray:
     """Return a unit vector over the tangents, with trailing axes for multiplication."""
-    return np.eye(n_columns, dtype=dtype)[column][:, None, None, None]
+    return np.eye(n_tangents, dtype=dtype)[index][:, None, None, None]
 
 
-def _to_nodes(front: _Front, step: _Interval) -> tuple[Array, ...]:
+def _evaluate_nodes(pass_state: _PassState, interval: _MeshInterval) -> tuple[Array, ...]:
     """Return coordinates and rates at the nodes of an interval, and their tangents."""
-    fraction, h, a = step
-    v, dq, dv = front.v, front.dq, front.dv
-    c = NODES.astype(h.dtype)[:, None, None]
-    duration = _unit(dq.shape[0], -1, h.dtype)
-    a_once, a_twice = mix(ONCE, a), mix(TWICE, a)
-    Q = front.q + h * (c * v + h * a_twice)
-    V = v + h * a_once
-    dQ = dq[:, None] + (h * c) * dv[:, None] + duration * (fraction * (c * v + 2.0 * h * a_twice))
-    dV = dv[:, None] + duration * (fraction * a_once)
-    return Q, V, dQ, dV
+    fraction, h, a = interval
+    v, q_tangents, v_tangents = pass_state.v, pass_state.q_tangents, pass_state.v_tangents
+    c = GAUSS_NODES.astype(h.dtype)[:, None, None]
+    duration_unit = _unit_tangent(q_tangents.shape[0], -1, h.dtype)
+    rate_increments, position_increments = (
+        apply_matrix(INTEGRATION_MATRIX, a),
+        apply_matrix(DOUBLE_INTEGRATION_MATRIX, a),
+    )
+    Q = pass_state.q + h * (c * v + h * position_increments)
+    V = v + h * rate_increments
+    node_q_tangents = (
+        q_tangents[:, None]
+        + (h * c) * v_tangents[:, None]
+        + duration_unit * (fraction * (c * v + 2.0 * h * position_increments))
+    )
+    node_v_tangents = v_tangents[:, None] + duration_unit * (fraction * rate_increments)
+    return Q, V, node_q_tangents, node_v_tangents
 
 
-def _to_end(front: _Front, step: _Interval, da: LaneArray) -> _Front:
+def _evaluate_end(
+    pass_state: _PassState, interval: _MeshInterval, acceleration_tangents: LaneArray
+) -> _PassState:
     """Return the state at the end of an interval from its accelerations and their tangents."""
-    fraction, h, a = step
-    _, q, v, _, dq, dv = front
-    duration = _unit(dq.shape[0], -1, h.dtype)[:, 0]
-    sum_once, sum_twice = weigh(ENDS_ONCE, a), weigh(ENDS_TWICE, a)
-    d_once = weigh(ENDS_ONCE, da).swapaxes(0, 1)
-    d_twice = weigh(ENDS_TWICE, da).swapaxes(0, 1)
-    dq = dq + h * dv + h * h * d_twice + duration * (fraction * (v + 2.0 * h * sum_twice))
-    dv = dv + h * d_once + duration * (fraction * sum_once)
-    q, v = q + h * v + h * h * sum_twice, v + h * sum_once
-    return front._replace(q=q, v=v, dq=dq, dv=dv)
+    fraction, h, a = interval
+    _, q, v, _, q_tangents, v_tangents = pass_state
+    duration_unit = _unit_tangent(q_tangents.shape[0], -1, h.dtype)[:, 0]
+    rate_increment, position_increment = (
+        weighted_sum(END_WEIGHTS, a),
+        weighted_sum(DOUBLE_END_WEIGHTS, a),
+    )
+    rate_increment_tangents = weighted_sum(END_WEIGHTS, acceleration_tangents).swapaxes(0, 1)
+    position_increment_tangents = weighted_sum(DOUBLE_END_WEIGHTS, acceleration_tangents).swapaxes(
+        0, 1
+    )
+    q_tangents = (
+        q_tangents
+        + h * v_tangents
+        + h * h * position_increment_tangents
+        + duration_unit * (fraction * (v + 2.0 * h * position_increment))
+    )
+    v_tangents = (
+        v_tangents + h * rate_increment_tangents + duration_unit * (fraction * rate_increment)
+    )
+    q, v = q + h * v + h * h * position_increment, v + h * rate_increment
+    return pass_state._replace(q=q, v=v, q_tangents=q_tangents, v_tangents=v_tangents)
 
 
-def _equations(
-    task: _Task, phase: Phase, front: _Front, Q: LaneArray, V: LaneArray, a: LaneArray
+def _linearize_residual(
+    context: _PassContext,
+    phase: CollocationPhase,
+    pass_state: _PassState,
+    Q: LaneArray,
+    V: LaneArray,
+    a: LaneArray,
 ) -> tuple[Array, Array, Any]:
     """Return the residual at the nodes and its partial derivatives.
 
@@ -242,89 +294,135 @@ def _equations(
     respect to the parameters are separate. Axes: node, equation, argument, batch; the axis of the
     parameters leads.
     """
-    dim, n_held = phase.dim, front.held.shape[0]
+    dim, n_held_constants = phase.n_coordinates, pass_state.held_constants.shape[0]
 
-    def left_over(*arguments: Array) -> Vector:
+    def evaluate_residual(*arguments: Array) -> Vector:
         q, v, a = (arguments[i * dim : (i + 1) * dim] for i in range(3))
-        held, parameters = arguments[3 * dim :][:n_held], arguments[3 * dim :][n_held:]
-        constants = task.constants_of(*parameters) if task.wanted else task.constants
-        return phase.residual(constants, Point(held, q, v), a)
+        held_constants, parameters = (
+            arguments[3 * dim :][:n_held_constants],
+            arguments[3 * dim :][n_held_constants:],
+        )
+        constants = (
+            context.constants_of(*parameters) if context.parameter_indices else context.constants
+        )
+        return phase.residual(constants, PhasePoint(held_constants, q, v), a)
 
     arguments = [x[:, i] for x in (Q, V, a) for i in range(dim)]
-    arguments += [jnp.broadcast_to(x, Q[:, 0].shape) for x in front.held]
-    n_moving = len(arguments)
-    if task.wanted:
-        arguments += [jnp.broadcast_to(x, Q[:, 0].shape) for x in task.parameters]
+    arguments += [jnp.broadcast_to(x, Q[:, 0].shape) for x in pass_state.held_constants]
+    n_state_arguments = len(arguments)
+    if context.parameter_indices:
+        arguments += [jnp.broadcast_to(x, Q[:, 0].shape) for x in context.parameters]
     # The partials stay separate arrays first: each is a small kernel; stacking them is a copy.
-    value, partials = task.hold(partials_of(left_over, arguments))
-    by_argument = list(zip(*partials, strict=True))
-    jacobian = jnp.stack([jnp.stack(p, 1) for p in by_argument[:n_moving]], 2)
-    forced = [jnp.stack(by_argument[n_moving + i], 1) for i in task.wanted]
-    return task.hold((jnp.stack(value, 1), jacobian, jnp.stack(forced) if forced else ()))
+    value, partials = context.hold(value_and_partials(evaluate_residual, arguments))
+    partials_by_argument = list(zip(*partials, strict=True))
+    jacobian = jnp.stack(
+        [
+            jnp.stack(partials_of_argument, 1)
+            for partials_of_argument in partials_by_argument[:n_state_arguments]
+        ],
+        2,
+    )
+    parameter_partials = [
+        jnp.stack(partials_by_argument[n_state_arguments + i], 1) for i in context.parameter_indices
+    ]
+    return context.hold(
+        (jnp.stack(value, 1), jacobian, jnp.stack(parameter_partials) if parameter_partials else ())
+    )
 
 
-def _node_system(
-    task: _Task, front: _Front, h: LaneArray, equations: tuple, d_moving: LaneArray
+def _assemble_node_system(
+    context: _PassContext,
+    pass_state: _PassState,
+    h: LaneArray,
+    linearization: tuple,
+    state_tangents: LaneArray,
 ) -> tuple[Array, Array]:
     """Return matrix and right-hand sides, one per tangent, for the corrections of the
     accelerations.
     """
-    value, jacobian, forced = equations
-    n_columns, dim, dtype = d_moving.shape[0], value.shape[1], h.dtype
-    terms = [jacobian[:, :, s] * d_moving[:, :, s, None] for s in range(2 * dim)]
+    value, jacobian, parameter_partials = linearization
+    n_tangents, dim, dtype = state_tangents.shape[0], value.shape[1], h.dtype
+    terms = [jacobian[:, :, s] * state_tangents[:, :, s, None] for s in range(2 * dim)]
     terms += [
-        jacobian[:, :, 3 * dim + s] * front.d_held[:, s, None, None]
-        for s in range(front.held.shape[0])
+        jacobian[:, :, 3 * dim + s] * pass_state.held_tangents[:, s, None, None]
+        for s in range(pass_state.held_constants.shape[0])
     ]
-    right = sum(terms, start=_unit(n_columns, 0, dtype) * value)
-    if task.wanted:
-        before = task.n_columns - len(task.wanted)
-        right = right + jnp.pad(forced, ((before, 1), *((0, 0),) * 3))
-    twice, once = (m.astype(dtype)[:, None, :, None, None] for m in (TWICE, ONCE))
-    by_q, by_v, by_a = (jacobian[:, :, None, i * dim : (i + 1) * dim] for i in range(3))
-    own_node = np.eye(N_NODES, dtype=dtype)[:, None, :, None, None]
-    matrix = own_node * by_a + h * (h * twice * by_q + once * by_v)
-    return matrix, -jnp.moveaxis(right, 0, 2)
+    rhs = sum(terms, start=_unit_tangent(n_tangents, 0, dtype) * value)
+    if context.parameter_indices:
+        n_leading = context.n_tangents - len(context.parameter_indices)
+        rhs = rhs + jnp.pad(parameter_partials, ((n_leading, 1), *((0, 0),) * 3))
+    double_matrix, single_matrix = (
+        matrix.astype(dtype)[:, None, :, None, None]
+        for matrix in (DOUBLE_INTEGRATION_MATRIX, INTEGRATION_MATRIX)
+    )
+    jacobian_q, jacobian_v, jacobian_a = (
+        jacobian[:, :, None, i * dim : (i + 1) * dim] for i in range(3)
+    )
+    same_node = np.eye(N_GAUSS_NODES, dtype=dtype)[:, None, :, None, None]
+    system_matrix = same_node * jacobian_a + h * (
+        h * double_matrix * jacobian_q + single_matrix * jacobian_v
+    )
+    return system_matrix, -jnp.moveaxis(rhs, 0, 2)
 
 
-def _pass_phase(
-    task: _Task,
-    phase: Phase,
-    mesh: Mesh,
-    front: _Front,
+def _linearize_phase(
+    context: _PassContext,
+    phase: CollocationPhase,
+    mesh: PhaseMesh,
+    pass_state: _PassState,
     duration: LaneArray,
     accelerations: LaneArray,
-) -> tuple[_Front, LaneArray]:
+) -> tuple[_PassState, LaneArray]:
     """Propagate the state through all intervals of a phase.
 
     Return the state at its end and the tangents of its accelerations.
     """
 
-    def step(moving: tuple, inputs: tuple) -> tuple[tuple, Array]:
+    def linearize_interval(interval_state: tuple, inputs: tuple) -> tuple[tuple, Array]:
         a, fraction = inputs
-        step = _Interval(fraction, fraction * duration, a)
-        here = front._replace(**dict(zip(MOVING, moving, strict=True)))
-        Q, V, dQ, dV = task.hold(_to_nodes(here, step))
-        equations = _equations(task, phase, here, Q, V, a)
-        d_moving = jnp.concatenate([dQ, dV], 2)  # (tangent, node, argument, batch)
-        system = task.hold(_node_system(task, here, step.h, equations, d_moving))
-        da = task.hold(eliminate(*system, task.parameters))  # (node, row, tangent, batch)
-        end = _to_end(here, step, da)
-        return tuple(getattr(end, name) for name in MOVING), jnp.moveaxis(da, 2, 0)
+        interval = _MeshInterval(fraction, fraction * duration, a)
+        start_state = pass_state._replace(
+            **dict(zip(INTERVAL_STATE_FIELDS, interval_state, strict=True))
+        )
+        Q, V, node_q_tangents, node_v_tangents = context.hold(
+            _evaluate_nodes(start_state, interval)
+        )
+        linearization = _linearize_residual(context, phase, start_state, Q, V, a)
+        state_tangents = jnp.concatenate(
+            [node_q_tangents, node_v_tangents], 2
+        )  # (tangent, node, argument, batch)
+        node_system = context.hold(
+            _assemble_node_system(context, start_state, interval.h, linearization, state_tangents)
+        )
+        acceleration_tangents = context.hold(
+            solve_node_equations(*node_system, context.parameters)
+        )  # (node, row, tangent, batch)
+        end_state = _evaluate_end(start_state, interval, acceleration_tangents)
+        return tuple(getattr(end_state, name) for name in INTERVAL_STATE_FIELDS), jnp.moveaxis(
+            acceleration_tangents, 2, 0
+        )
 
-    start = tuple(getattr(front, name) for name in MOVING)
-    fractions = jnp.asarray(mesh.fractions, duration.dtype)
-    last, columns = lax.scan(step, start, (accelerations, fractions))
-    return front._replace(**dict(zip(MOVING, last, strict=True))), columns
+    start_state = tuple(getattr(pass_state, name) for name in INTERVAL_STATE_FIELDS)
+    fractions = jnp.asarray(mesh.interval_fractions, duration.dtype)
+    end_state, acceleration_tangents = lax.scan(
+        linearize_interval, start_state, (accelerations, fractions)
+    )
+    return pass_state._replace(
+        **dict(zip(INTERVAL_STATE_FIELDS, end_state, strict=True))
+    ), acceleration_tangents
 
 
-MOVING = ("q", "v", "dq", "dv")
+INTERVAL_STATE_FIELDS = ("q", "v", "q_tangents", "v_tangents")
 """Fields of the pass state that change within a phase."""
 
 
-def _leave_phase(
-    task: _Task, phase: Phase, front: _Front, duration: LaneArray, happens: Bool[Array, " lanes"]
-) -> tuple[_Front, LaneArray, Callable[[Array], Array]]:
+def _eliminate_duration(
+    context: _PassContext,
+    phase: CollocationPhase,
+    pass_state: _PassState,
+    duration: LaneArray,
+    phase_active: Bool[Array, " lanes"],
+) -> tuple[_PassState, LaneArray, Callable[[Array], Array]]:
     """Eliminate the duration of a phase by its event, and apply the reset.
 
     Return the state of the next phase, the tangents of the duration, and the function that
@@ -332,147 +430,203 @@ def _leave_phase(
     zero.
     """
 
-    def end(held: Array, q: Array, v: Array, *constants: Array) -> tuple:
-        point = Point(tuple(held), tuple(q), tuple(v))
-        return phase.event(constants, point), _stacked(phase.reset(constants, point), q)
+    def evaluate_end(held_constants: Array, q: Array, v: Array, *constants: Array) -> tuple:
+        point = PhasePoint(tuple(held_constants), tuple(q), tuple(v))
+        return phase.event(constants, point), _stack_point(phase.reset(constants, point), q)
 
-    place, d_place = (front.held, front.q, front.v), (front.d_held, front.dq, front.dv)
-    (event, after), (d_event, d_after) = task.push(end, place, d_place)
-    correction, own = (_unit(d_event.shape[0], i, duration.dtype)[:, 0, 0] for i in (0, -1))
-    event = jnp.where(happens, event, duration)
-    d_event = jnp.where(happens, d_event, own)
-    d_duration = -(d_event[:-1] + correction[:-1] * event) / d_event[-1]
+    point, point_tangents = (
+        (pass_state.held_constants, pass_state.q, pass_state.v),
+        (pass_state.held_tangents, pass_state.q_tangents, pass_state.v_tangents),
+    )
+    (event_value, next_point), (event_tangents, next_point_tangents) = context.value_and_tangents(
+        evaluate_end, point, point_tangents
+    )
+    correction_unit, duration_unit = (
+        _unit_tangent(event_tangents.shape[0], i, duration.dtype)[:, 0, 0] for i in (0, -1)
+    )
+    event_value = jnp.where(phase_active, event_value, duration)
+    event_tangents = jnp.where(phase_active, event_tangents, duration_unit)
+    duration_tangents = (
+        -(event_tangents[:-1] + correction_unit[:-1] * event_value) / event_tangents[-1]
+    )
 
-    def eliminated(columns: Array) -> Array:
-        factor = d_duration.reshape(d_duration.shape[:1] + (1,) * (columns.ndim - 2) + (-1,))
-        return columns[:-1] + factor * columns[-1:]
+    def eliminate_duration(tangents: Array) -> Array:
+        factor = duration_tangents.reshape(
+            duration_tangents.shape[:1] + (1,) * (tangents.ndim - 2) + (-1,)
+        )
+        return tangents[:-1] + factor * tangents[-1:]
 
-    following = _Front(*after, *(eliminated(x) for x in d_after))
-    return following, d_duration, eliminated
+    next_state = _PassState(*next_point, *(eliminate_duration(x) for x in next_point_tangents))
+    return next_state, duration_tangents, eliminate_duration
 
 
-def _pass_step(
-    task: _Task, sequence: PhaseSequence, meshes: tuple[Mesh, ...], carry: tuple, inputs: tuple
+def _linearize_step(
+    context: _PassContext,
+    sequence: PhaseSequence,
+    meshes: tuple[PhaseMesh, ...],
+    carry: tuple,
+    inputs: tuple,
 ) -> tuple:
     """Propagate the section state and its tangents through one gait step."""
-    section, d_section = carry
-    durations, accelerations, happens = inputs
+    section_state, section_tangents = carry
+    durations, accelerations, phase_active = inputs
 
-    def start(section: Array, *constants: Array) -> tuple:
-        return _stacked(sequence.start(constants, tuple(section)), section)
+    def evaluate_start(section_state: Array, *constants: Array) -> tuple:
+        return _stack_point(sequence.start(constants, tuple(section_state)), section_state)
 
-    begin, d_begin = task.push(start, (section,), (d_section,))
-    front = _Front(*begin, *d_begin)
-    d_durations, d_accelerations = [], []
+    start_point, start_tangents = context.value_and_tangents(
+        evaluate_start, (section_state,), (section_tangents,)
+    )
+    pass_state = _PassState(*start_point, *start_tangents)
+    duration_tangents, acceleration_tangents = [], []
     for i, phase in enumerate(sequence.phases):
-        front, columns = _pass_phase(
-            task, phase, meshes[i], _with_column(front), durations[i], accelerations[i]
+        pass_state, phase_acceleration_tangents = _linearize_phase(
+            context,
+            phase,
+            meshes[i],
+            _append_duration_tangent(pass_state),
+            durations[i],
+            accelerations[i],
         )
-        end, d_end = (jnp.concatenate(x, -2) for x in ((front.q, front.v), (front.dq, front.dv)))
-        front, d_duration, eliminated = _leave_phase(task, phase, front, durations[i], happens[i])
-        d_durations.append(d_duration)
+        end_state, end_tangents = (
+            jnp.concatenate(x, -2)
+            for x in ((pass_state.q, pass_state.v), (pass_state.q_tangents, pass_state.v_tangents))
+        )
+        pass_state, phase_duration_tangents, eliminate_duration = _eliminate_duration(
+            context, phase, pass_state, durations[i], phase_active[i]
+        )
+        duration_tangents.append(phase_duration_tangents)
         # Axes: (tangent, interval, node, row, batch).
-        d_accelerations.append(eliminated(jnp.swapaxes(columns, 0, 1)))
-        front = task.hold(front)
+        acceleration_tangents.append(
+            eliminate_duration(jnp.swapaxes(phase_acceleration_tangents, 0, 1))
+        )
+        pass_state = context.hold(pass_state)
     # The end state and its tangents are those of the last phase.
-    traced = end, eliminated(d_end), jnp.stack(d_durations, 1), tuple(d_accelerations)
-    return (front.q, front.dq), traced
+    outputs = (
+        end_state,
+        eliminate_duration(end_tangents),
+        jnp.stack(duration_tangents, 1),
+        tuple(acceleration_tangents),
+    )
+    return (pass_state.q, pass_state.q_tangents), outputs
 
 
-def linearised_pass(
+def linearize_cycle(
     sequence: PhaseSequence,
-    meshes: tuple[Mesh, ...],
-    constants_of: Callable[..., Constants],
+    meshes: tuple[PhaseMesh, ...],
+    constants_of: Callable[..., PhaseConstants],
     parameters: LaneArray,
-    solution: Solution,
-    happens: Bool[Array, "n n_phases lanes"],
-    wanted: tuple[int, ...] = (),
-) -> Linearised:
+    solution: CollocationSolution,
+    phase_active: Bool[Array, "n n_phases lanes"],
+    parameter_indices: tuple[int, ...] = (),
+) -> CycleLinearization:
     """Return Newton's correction, the monodromy matrix and the requested tangents at `solution`.
 
     `phase_active` marks the phases that take place: an inactive phase has duration zero and only
     applies its reset.
     """
-    task = _task(sequence.section_size, wanted, parameters, constants_of)
-    section, dtype, n = solution.section, parameters.dtype, task.n_columns
-    unit = np.eye(n, dtype=dtype)[:, task.of_section, None]
-    carry = section, jnp.broadcast_to(unit, (n, *section.shape))
-    inputs = (solution.durations, solution.accelerations, happens)
-    step = functools.partial(_pass_step, task, sequence, meshes)
+    context = _make_context(sequence.section_size, parameter_indices, parameters, constants_of)
+    section_state, dtype, n_tangents = solution.section_state, parameters.dtype, context.n_tangents
+    section_units = np.eye(n_tangents, dtype=dtype)[:, context.section_slice, None]
+    carry = section_state, jnp.broadcast_to(section_units, (n_tangents, *section_state.shape))
+    inputs = (solution.durations, solution.accelerations, phase_active)
+    linearize_step = functools.partial(_linearize_step, context, sequence, meshes)
     if solution.durations.shape[0] == 1:
-        (back, d_back), traced = step(carry, jax.tree.map(lambda x: x[0], inputs))
-        traced = jax.tree.map(lambda x: x[None], traced)
+        (return_state, return_tangents), outputs = linearize_step(
+            carry, jax.tree.map(lambda x: x[0], inputs)
+        )
+        outputs = jax.tree.map(lambda x: x[None], outputs)
     else:
-        (back, d_back), traced = lax.scan(step, carry, inputs)
+        (return_state, return_tangents), outputs = lax.scan(linearize_step, carry, inputs)
 
-    monodromy = jnp.swapaxes(d_back[task.of_section], 0, 1)
-    others = lambda x: jnp.concatenate([x[:1], x[task.of_section.stop :]])
-    correction = np.eye(n - task.section_size, dtype=dtype)[0][:, None, None]
-    right = others(d_back) + correction * (back - section)
-    closing = inverse(jnp.eye(task.section_size, dtype=dtype)[:, :, None] - monodromy)
-    d_closed = jnp.swapaxes(contract(closing, jnp.swapaxes(right, 0, 1)), 0, 1)
+    monodromy = jnp.swapaxes(return_tangents[context.section_slice], 0, 1)
+    drop_section_tangents = lambda x: jnp.concatenate([x[:1], x[context.section_slice.stop :]])
+    correction_unit = np.eye(n_tangents - context.section_size, dtype=dtype)[0][:, None, None]
+    rhs = drop_section_tangents(return_tangents) + correction_unit * (return_state - section_state)
+    closing_matrix = invert_small(
+        jnp.eye(context.section_size, dtype=dtype)[:, :, None] - monodromy
+    )
+    closed_section_tangents = jnp.swapaxes(
+        contract_axes(closing_matrix, jnp.swapaxes(rhs, 0, 1)), 0, 1
+    )
 
-    def close(columns: Array) -> Array:
+    def close_cycle(tangents: Array) -> Array:
         """Return (tangent, n, ...) from (n, tangent, ...), without the tangents of the section
         state.
         """
-        columns = jnp.swapaxes(columns, 0, 1)
-        shape = (-1, *(1,) * (columns.ndim - 2), *section.shape[1:])
-        own = columns[task.of_section]
-        by_section = [d_closed[:, s].reshape(shape) * own[s] for s in range(len(section))]
-        return others(columns) + sum(by_section[1:], start=by_section[0])
+        tangents = jnp.swapaxes(tangents, 0, 1)
+        shape = (-1, *(1,) * (tangents.ndim - 2), *section_state.shape[1:])
+        section_tangents = tangents[context.section_slice]
+        section_terms = [
+            closed_section_tangents[:, s].reshape(shape) * section_tangents[s]
+            for s in range(len(section_state))
+        ]
+        return drop_section_tangents(tangents) + sum(section_terms[1:], start=section_terms[0])
 
-    ends, *d_others = task.hold(traced)
-    d_ends, d_durations, d_accelerations = jax.tree.map(close, tuple(d_others))
-    d_ends, changes = task.hold((d_ends, Solution(d_closed, d_durations, d_accelerations)))
-    return Linearised(
-        correction=jax.tree.map(lambda x: x[0], changes),
-        columns=jax.tree.map(lambda x: x[1:], changes),
-        ends=ends + d_ends[0],
-        d_ends=d_ends[1:],
+    step_ends, *open_tangents = context.hold(outputs)
+    step_end_tangents, duration_tangents, acceleration_tangents = jax.tree.map(
+        close_cycle, tuple(open_tangents)
+    )
+    step_end_tangents, solution_tangents = context.hold(
+        (
+            step_end_tangents,
+            CollocationSolution(closed_section_tangents, duration_tangents, acceleration_tangents),
+        )
+    )
+    return CycleLinearization(
+        correction=jax.tree.map(lambda x: x[0], solution_tangents),
+        tangents=jax.tree.map(lambda x: x[1:], solution_tangents),
+        step_ends=step_ends + step_end_tangents[0],
+        step_end_tangents=step_end_tangents[1:],
         monodromy=monodromy,
     )
 
 
-class Passage(NamedTuple):
+class PhasePassage(NamedTuple):
     """Points of one phase: its start, its end and all nodes (on a leading axis)."""
 
-    start: Point
-    nodes: Point
-    end: Point
+    start: PhasePoint
+    nodes: PhasePoint
+    end: PhasePoint
 
 
-def walk_through(
+def reconstruct_step(
     sequence: PhaseSequence,
-    meshes: tuple[Mesh, ...],
-    constants: Constants,
-    section: Vector,
+    meshes: tuple[PhaseMesh, ...],
+    constants: PhaseConstants,
+    section_state: Vector,
     durations: Array,
     accelerations: tuple[Array, ...],
-) -> tuple[Vector, tuple[Passage, ...]]:
+) -> tuple[Vector, tuple[PhasePassage, ...]]:
     """Reconstruct one gait step from known durations and accelerations.
 
     Return the section state after the step and the passages of its phases. No equation is solved;
     any trailing axes are allowed.
     """
-    point = sequence.start(constants, section)
+    point = sequence.start(constants, section_state)
     passages = []
     for i, phase in enumerate(sequence.phases):
-        times, rates, places = (w.astype(durations.dtype) for w in node_weights(meshes[i]))
+        times, rate_matrix, position_matrix = (
+            weights.astype(durations.dtype) for weights in phase_integration_matrices(meshes[i])
+        )
         a, T = accelerations[i], durations[i]
         a = a.reshape(-1, *a.shape[2:])
         q, v = jnp.stack(point.q), jnp.stack(point.v)
         times = times.reshape(-1, *(1,) * q.ndim)
-        Q = q + T * (times * v + T * jnp.tensordot(places, a, 1))
-        V = v + T * jnp.tensordot(rates, a, 1)
-        nodes = Point(point.held, tuple(Q[:-1].swapaxes(0, 1)), tuple(V[:-1].swapaxes(0, 1)))
-        end = Point(point.held, tuple(Q[-1]), tuple(V[-1]))
-        passages.append(Passage(point, nodes, end))
+        Q = q + T * (times * v + T * jnp.tensordot(position_matrix, a, 1))
+        V = v + T * jnp.tensordot(rate_matrix, a, 1)
+        nodes = PhasePoint(
+            point.held_constants, tuple(Q[:-1].swapaxes(0, 1)), tuple(V[:-1].swapaxes(0, 1))
+        )
+        end = PhasePoint(point.held_constants, tuple(Q[-1]), tuple(V[-1]))
+        passages.append(PhasePassage(point, nodes, end))
         point = phase.reset(constants, end)
     return point.q, tuple(passages)
 
 
-def mesh_error(sequence: PhaseSequence, meshes: tuple[Mesh, ...], solution: Solution) -> LaneArray:
+def estimate_mesh_error(
+    sequence: PhaseSequence, meshes: tuple[PhaseMesh, ...], solution: CollocationSolution
+) -> LaneArray:
     """Return an estimate of the discretization error of a cycle, in rad, m and fractions of the
     period.
 
@@ -482,23 +636,28 @@ def mesh_error(sequence: PhaseSequence, meshes: tuple[Mesh, ...], solution: Solu
     cases. This was found for 346 random gaits with periods to 10 s, on two meshes. Phases with
     `is_smooth` False do not count, because their error in one interval hardly reaches the next.
     """
-    largest = jnp.zeros(solution.section.shape[-1], solution.section.dtype)
+    max_jump = jnp.zeros(solution.section_state.shape[-1], solution.section_state.dtype)
     for i, mesh in enumerate(meshes):
-        if mesh.n_steps == 1 or not sequence.phases[i].smooth:
+        if mesh.n_intervals == 1 or not sequence.phases[i].is_smooth:
             continue
-        ends, begins = (
-            jnp.tensordot(jnp.asarray(lagrange(place), largest.dtype), nodes, (0, 2))
-            for place, nodes in (
+        left_limits, right_limits = (
+            jnp.tensordot(
+                jnp.asarray(lagrange_weights(location), max_jump.dtype), node_accelerations, (0, 2)
+            )
+            for location, node_accelerations in (
                 (1.0, solution.accelerations[i][:, :-1]),
                 (0.0, solution.accelerations[i][:, 1:]),
             )
         )
-        longer = np.maximum(mesh.fractions[1:], mesh.fractions[:-1])
-        length = longer[:, None, None].astype(largest.dtype) * solution.durations[:, None, None, i]
-        jump = jnp.abs(ends - begins) * length * length
-        largest = jnp.maximum(largest, jnp.max(jump, axis=(0, 1, 2)))
-    return JUMP_TO_ERROR * largest
+        max_fraction = np.maximum(mesh.interval_fractions[1:], mesh.interval_fractions[:-1])
+        length = (
+            max_fraction[:, None, None].astype(max_jump.dtype)
+            * solution.durations[:, None, None, i]
+        )
+        jump = jnp.abs(left_limits - right_limits) * length * length
+        max_jump = jnp.maximum(max_jump, jnp.max(jump, axis=(0, 1, 2)))
+    return ERROR_PER_JUMP * max_jump
 
 
-JUMP_TO_ERROR = 0.05
+ERROR_PER_JUMP = 0.05
 """Ratio of the estimated error to the displacement of a jump at an interval boundary."""

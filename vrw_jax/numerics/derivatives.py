@@ -18,17 +18,17 @@ from jax import lax
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, PyTree
 
-from vrw_jax.numerics.lanes import LaneFunction, one_wheel
+from vrw_jax.numerics.lanes import BatchFunction, unbatch
 
-Forward = Callable[..., tuple[PyTree[Array], PyTree[Array]]]
+ForwardFunction = Callable[..., tuple[PyTree[Array], PyTree[Array]]]
 """A map from float arrays to (float outputs, other outputs without derivative)."""
 
 
-def any_mode(
-    function: Forward,
-    to_differentiate: Forward | None = None,
-    jacobian_of: Callable[[tuple[int, ...]], Forward] | None = None,
-) -> Forward:
+def enable_all_ad_modes(
+    function: ForwardFunction,
+    function_to_differentiate: ForwardFunction | None = None,
+    make_jacobian: Callable[[tuple[int, ...]], ForwardFunction] | None = None,
+) -> ForwardFunction:
     """Return `function` with derivatives in forward and reverse mode, to any order.
 
     `function(*arrays)` must take only floating-point arrays, be differentiable by `jax.jvp` to the
@@ -38,76 +38,89 @@ def any_mode(
     outputs in another way. Function and Jacobians are compiled once each: outside of `jit`, forward
     mode, reverse mode and single directions all call the same compiled Jacobian.
     """
-    tighter = function if to_differentiate is None else to_differentiate
-    compiled = jax.jit(function)
-    wrapped = jax.custom_jvp(compiled)
+    differentiable = function if function_to_differentiate is None else function_to_differentiate
+    compiled_function = jax.jit(function)
+    wrapped_function = jax.custom_jvp(compiled_function)
 
     @functools.cache
-    def differentiated(moved: tuple[int, ...]) -> Forward:
-        forwards = _jacobian(tighter, moved)
-        return any_mode(forwards) if jacobian_of is None else any_mode(jacobian_of(moved), forwards)
-
-    def rule(primals: tuple, tangents: tuple) -> tuple:
-        moved = tuple(i for i, t in enumerate(tangents) if not isinstance(t, SymbolicZero))
-        if not moved:
-            told = wrapped(*primals)
-            return told, without_derivative(told)
-        (jacobian, out), other = differentiated(moved)(*primals)
-        tangent = _pushed(out, jacobian, tuple(tangents[i] for i in moved))
-        return (out, other), (tangent, without_derivative(other))
-
-    wrapped.defjvp(rule, symbolic_zeros=True)
-
-    def call(*arrays: Any) -> tuple:
-        traced = any(isinstance(x, jax.core.Tracer) for x in arrays)
+    def get_jacobian(argnums: tuple[int, ...]) -> ForwardFunction:
+        forward_jacobian = _jacobian_function(differentiable, argnums)
         return (
-            wrapped(*arrays) if traced else compiled(*arrays)
+            enable_all_ad_modes(forward_jacobian)
+            if make_jacobian is None
+            else enable_all_ad_modes(make_jacobian(argnums), forward_jacobian)
+        )
+
+    def wrapped_jvp(primals: tuple, tangents: tuple) -> tuple:
+        argnums = tuple(i for i, t in enumerate(tangents) if not isinstance(t, SymbolicZero))
+        if not argnums:
+            outputs = wrapped_function(*primals)
+            return outputs, zero_tangent(outputs)
+        (jacobian, float_outputs), other_outputs = get_jacobian(argnums)(*primals)
+        tangent = _apply_argument_jacobians(
+            float_outputs, jacobian, tuple(tangents[i] for i in argnums)
+        )
+        return (float_outputs, other_outputs), (tangent, zero_tangent(other_outputs))
+
+    wrapped_function.defjvp(wrapped_jvp, symbolic_zeros=True)
+
+    def call_function(*arrays: Any) -> tuple:
+        is_traced = any(isinstance(x, jax.core.Tracer) for x in arrays)
+        return (
+            wrapped_function(*arrays) if is_traced else compiled_function(*arrays)
         )  # the custom rule costs as much as a solver step
 
-    return call
+    return call_function
 
 
-def _jacobian(function: Forward, moved: tuple[int, ...]) -> Forward:
+def _jacobian_function(function: ForwardFunction, argnums: tuple[int, ...]) -> ForwardFunction:
     """Return a function with the float outputs (Jacobian by argument, value) in one evaluation."""
 
-    def both(*arrays: Any) -> tuple[PyTree, PyTree]:
-        out, other = function(*arrays)
-        return out, (out, other)
+    def evaluate_with_aux(*arrays: Any) -> tuple[PyTree, PyTree]:
+        float_outputs, other_outputs = function(*arrays)
+        return float_outputs, (float_outputs, other_outputs)
 
     def jacobian(*arrays: Any) -> tuple[PyTree, PyTree]:
-        parts, (out, other) = jax.jacfwd(both, argnums=moved, has_aux=True)(*arrays)
+        argument_jacobians, (float_outputs, other_outputs) = jax.jacfwd(
+            evaluate_with_aux, argnums=argnums, has_aux=True
+        )(*arrays)
         by_argument = tuple(
-            jax.tree.map(lambda _, part, k=k: part[k], out, parts) for k in range(len(moved))
+            jax.tree.map(
+                lambda _, argument_jacobian, k=k: argument_jacobian[k],
+                float_outputs,
+                argument_jacobians,
+            )
+            for k in range(len(argnums))
         )
-        return (by_argument, out), other
+        return (by_argument, float_outputs), other_outputs
 
     return jacobian
 
 
 @jax.jit
-def _pushed(out: PyTree, by_argument: PyTree, tangents: tuple) -> PyTree:
+def _apply_argument_jacobians(template: PyTree, jacobians: PyTree, tangents: tuple) -> PyTree:
     """Return Jacobians times tangents, leaf by leaf.
 
     The products are sums, because products of small arrays are library calls.
     """
 
-    def push(_: Array, *parts: Array) -> Array:
-        pushed = [
-            jnp.sum(part * tangent, axis=tuple(range(-jnp.ndim(tangent), 0)))
-            for part, tangent in zip(parts, tangents, strict=True)
+    def apply_leaf(_: Array, *leaf_jacobians: Array) -> Array:
+        terms = [
+            jnp.sum(jacobian * tangent, axis=tuple(range(-jnp.ndim(tangent), 0)))
+            for jacobian, tangent in zip(leaf_jacobians, tangents, strict=True)
         ]
-        return sum(pushed[1:], start=pushed[0])
+        return sum(terms[1:], start=terms[0])
 
-    return jax.tree.map(push, out, *by_argument)
+    return jax.tree.map(apply_leaf, template, *jacobians)
 
 
-InForm = Callable[[LaneFunction, int], LaneFunction]
+ExecutionWrapper = Callable[[BatchFunction, int], BatchFunction]
 """A wrapper that selects the execution of a batch function, given the order of the derivative it
 is."""
 
 
-def on_branch(
-    function: LaneFunction, tangents_of: Callable, in_form: InForm, order: int = 0
+def with_implicit_derivative(
+    function: BatchFunction, tangents_of: Callable, wrap_execution: ExecutionWrapper, order: int = 0
 ) -> Callable:
     """Return `function(p, z)` of one wheel, differentiable along z = z(p) to any order and in any
     mode.
@@ -117,23 +130,23 @@ def on_branch(
     tangent of z, which can only be dz/dp times that of p, and returns the total derivative times
     the tangent of p.
     """
-    of_one_wheel = one_wheel(in_form(function, order))
-    wrapped = jax.custom_jvp(lambda p, z: of_one_wheel(p, z))
+    unbatched_function = unbatch(wrap_execution(function, order))
+    wrapped_function = jax.custom_jvp(lambda p, z: unbatched_function(p, z))
 
-    @wrapped.defjvp
-    def rule(primals: tuple, tangents: tuple) -> tuple:
-        slopes = slopes_on_branch(function, tangents_of, in_form, order + 1)(*primals)
-        return wrapped(*primals), push(slopes, tangents[0])
+    @wrapped_function.defjvp
+    def wrapped_jvp(primals: tuple, tangents: tuple) -> tuple:
+        jacobian = implicit_jacobian(function, tangents_of, wrap_execution, order + 1)(*primals)
+        return wrapped_function(*primals), apply_jacobian(jacobian, tangents[0])
 
-    return wrapped
+    return wrapped_function
 
 
-def slopes_on_branch(
-    function: LaneFunction,
+def implicit_jacobian(
+    function: BatchFunction,
     tangents_of: Callable,
-    in_form: InForm,
+    wrap_execution: ExecutionWrapper,
     order: int = 1,
-    along: LaneFunction | None = None,
+    make_jacobian: BatchFunction | None = None,
 ) -> Callable:
     """Return d function(p, z(p)) / dp with a leading axis over p, differentiable as in
     `with_implicit_derivative`.
@@ -141,24 +154,26 @@ def slopes_on_branch(
     `make_jacobian(p, (z, dz/dp))` may be a faster evaluation of it.
     """
 
-    def in_turns(p: Array, known: tuple[PyTree, PyTree]) -> PyTree:
+    def jvp_sequentially(p: Array, z_and_jacobian: tuple[PyTree, PyTree]) -> PyTree:
         """Return the derivatives over a batch, one direction after another, which keeps the code
         short.
         """
-        n, (z, dz) = p.shape[0], known
+        n, (z, dz) = p.shape[0], z_and_jacobian
         units = jnp.broadcast_to(jnp.eye(n, dtype=p.dtype)[:, :, None], (n, *p.shape))
-        return lax.map(lambda way: jax.jvp(function, (p, z), way)[1], (units, dz))
+        return lax.map(lambda tangent: jax.jvp(function, (p, z), tangent)[1], (units, dz))
 
-    def known_moves(p: Array, known: tuple[PyTree, PyTree]) -> tuple[PyTree, PyTree]:
-        z, dz = known
-        by_p = jax.jacfwd(tangents_of)(p, z)
-        return dz, jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), by_p)
+    def tangents_of_known(p: Array, z_and_jacobian: tuple[PyTree, PyTree]) -> tuple[PyTree, PyTree]:
+        z, dz = z_and_jacobian
+        second_derivatives = jax.jacfwd(tangents_of)(p, z)
+        return dz, jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), second_derivatives)
 
-    slopes = on_branch(along or in_turns, known_moves, in_form, order)
-    return lambda p, z: slopes(p, lax.stop_gradient((z, tangents_of(p, z))))
+    jacobian_function = with_implicit_derivative(
+        make_jacobian or jvp_sequentially, tangents_of_known, wrap_execution, order
+    )
+    return lambda p, z: jacobian_function(p, lax.stop_gradient((z, tangents_of(p, z))))
 
 
-def with_jacobian(function: Callable, *arguments: Array) -> tuple[Any, Any]:
+def value_and_jacobian(function: Callable, *arguments: Array) -> tuple[Any, Any]:
     """Return the outputs of `function`, and the derivatives of its floats on last axes, in one
     program.
 
@@ -166,20 +181,20 @@ def with_jacobian(function: Callable, *arguments: Array) -> tuple[Any, Any]:
     """
 
     def floats_of(*arguments: Array) -> tuple:
-        floats, rest = eqx.partition(function(*arguments), eqx.is_inexact_array)
-        return floats, (floats, rest)
+        floats, other_outputs = eqx.partition(function(*arguments), eqx.is_inexact_array)
+        return floats, (floats, other_outputs)
 
-    moved = tuple(range(len(arguments))) if len(arguments) > 1 else 0
-    jacobian, (floats, rest) = jax.jacfwd(floats_of, moved, has_aux=True)(*arguments)
-    return eqx.combine(floats, rest), jacobian
+    argnums = tuple(range(len(arguments))) if len(arguments) > 1 else 0
+    jacobian, (floats, other_outputs) = jax.jacfwd(floats_of, argnums, has_aux=True)(*arguments)
+    return eqx.combine(floats, other_outputs), jacobian
 
 
-def push(jacobian: PyTree, tangent: Array) -> PyTree:
+def apply_jacobian(jacobian: PyTree, tangent: Array) -> PyTree:
     """Return the Jacobian (leading axis: inputs) times the tangent, leaf by leaf."""
-    return jax.tree.map(lambda part: jnp.tensordot(tangent, part, 1), jacobian)
+    return jax.tree.map(lambda leaf: jnp.tensordot(tangent, leaf, 1), jacobian)
 
 
-def without_derivative(tree: PyTree) -> PyTree:
+def zero_tangent(tree: PyTree) -> PyTree:
     """Return the zero tangent of any outputs."""
     zero = lambda x: (
         jnp.zeros_like(x)

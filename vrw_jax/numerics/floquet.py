@@ -15,17 +15,17 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Complex, Float
 
-Matrix = Float[Array, "... n n"]
+RealMatrix = Float[Array, "... n n"]
 
-LARGEST_CLOSED = 3
+MAX_CLOSED_FORM_SIZE = 3
 """Size of the largest matrix whose characteristic polynomial is solved in closed form."""
 
-SHARPNESS = 50.0
+SMOOTH_MIN_SHARPNESS = 50.0
 """Sharpness of the smooth minimum in `stability_margin`, which is at most
 log(4)/SMOOTH_MIN_SHARPNESS below the minimum."""
 
 
-def characteristic_polynomial(matrix: Matrix) -> tuple[Array, ...]:
+def characteristic_polynomial(matrix: RealMatrix) -> tuple[Array, ...]:
     """Return the coefficients (a_0, ..., a_{n-1}) of z^n + ... + a_1 z + a_0 = det(z - matrix)."""
     m = lambda i, j: matrix[..., i, j]
     n = matrix.shape[-1]
@@ -47,35 +47,35 @@ def characteristic_polynomial(matrix: Matrix) -> tuple[Array, ...]:
     return -determinant, minors[0] + minors[1] + minors[2], -(m(0, 0) + m(1, 1) + m(2, 2))
 
 
-def _root(x: Array) -> Array:
+def _safe_sqrt(x: Array) -> Array:
     """Return the square root of max(x, 0), with derivative zero where x <= 0."""
-    positive = x > 0.0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
+    is_positive = x > 0.0
+    return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, x, 1.0)), 0.0)
 
 
-class _Pair(NamedTuple):
+class _EigenvaluePair(NamedTuple):
     """Two eigenvalues: mean +- real_offset if they are real, otherwise mean +-
     i imaginary_offset.
     """
 
     mean: Array
-    split: Array
-    turn: Array
+    real_offset: Array
+    imaginary_offset: Array
 
     @property
     def modulus(self) -> Array:
         """Modulus of both eigenvalues if they are complex."""
-        return _root(self.mean * self.mean + self.turn * self.turn)
+        return _safe_sqrt(self.mean * self.mean + self.imaginary_offset * self.imaginary_offset)
 
 
-def _quadratic(a0: Array, a1: Array) -> _Pair:
+def _solve_quadratic(a0: Array, a1: Array) -> _EigenvaluePair:
     """Return the roots of z^2 + a1 z + a0."""
     mean = -0.5 * a1
     discriminant = mean * mean - a0
-    return _Pair(mean, _root(discriminant), _root(-discriminant))
+    return _EigenvaluePair(mean, _safe_sqrt(discriminant), _safe_sqrt(-discriminant))
 
 
-def _real_root_of_cubic(a0: Array, a1: Array, a2: Array) -> Array:
+def _solve_cubic_real_root(a0: Array, a1: Array, a2: Array) -> Array:
     """Return the real root of z^3 + a2 z^2 + a1 z + a0 that is farthest from the others.
 
     The root is found without derivative; then Newton's method makes it exact, including derivatives
@@ -86,49 +86,57 @@ def _real_root_of_cubic(a0: Array, a1: Array, a2: Array) -> Array:
     p = b1 - b2 * b2 / 3.0  # z = shift + y with y^3 + p y + q = 0
     q = b0 + shift * (b1 + shift * (b2 + shift))
     discriminant = 0.25 * q * q + p * p * p / 27.0
-    three = discriminant < 0.0
+    has_three_real_roots = discriminant < 0.0
     # One real root: the sum of cube roots without cancellation.
-    larger = jnp.cbrt(-0.5 * q - jnp.where(q >= 0.0, 1.0, -1.0) * _root(discriminant))
+    larger = jnp.cbrt(-0.5 * q - jnp.where(q >= 0.0, 1.0, -1.0) * _safe_sqrt(discriminant))
     one_root = larger - jnp.where(larger == 0.0, 0.0, p / (3.0 * jnp.where(larger == 0, 1, larger)))
     # Three real roots: the extreme one on the side where it is isolated.
-    radius = 2.0 * _root(-p / 3.0)
+    radius = 2.0 * _safe_sqrt(-p / 3.0)
     cosine = -4.0 * q / jnp.where(radius == 0.0, 1.0, radius**3)
     extreme = radius * jnp.cos(jnp.arccos(jnp.clip(jnp.abs(cosine), 0.0, 1.0)) / 3.0)
-    z = shift + jnp.where(three, jnp.where(cosine >= 0.0, extreme, -extreme), one_root)
+    z = shift + jnp.where(
+        has_three_real_roots, jnp.where(cosine >= 0.0, extreme, -extreme), one_root
+    )
     for _ in range(3):
         value = a0 + z * (a1 + z * (a2 + z))
-        slope = a1 + z * (2.0 * a2 + 3.0 * z)
-        z = z - jnp.where(slope == 0.0, 0.0, value / jnp.where(slope == 0.0, 1.0, slope))
+        derivative = a1 + z * (2.0 * a2 + 3.0 * z)
+        z = z - jnp.where(
+            derivative == 0.0, 0.0, value / jnp.where(derivative == 0.0, 1.0, derivative)
+        )
     return z
 
 
-def _parts(matrix: Matrix) -> tuple[list[Array], _Pair | None]:
+def _split_eigenvalues(matrix: RealMatrix) -> tuple[list[Array], _EigenvaluePair | None]:
     """Return the isolated real eigenvalues, and the remaining pair."""
     coefficients = characteristic_polynomial(matrix)
     if len(coefficients) == 1:
         return [-coefficients[0]], None
     if len(coefficients) == 2:
-        return [], _quadratic(*coefficients)
+        return [], _solve_quadratic(*coefficients)
     a0, a1, a2 = coefficients
-    alone = _real_root_of_cubic(a0, a1, a2)
-    slope = a2 + alone
-    return [alone], _quadratic(a1 + alone * slope, slope)
+    isolated_root = _solve_cubic_real_root(a0, a1, a2)
+    linear_coefficient = a2 + isolated_root
+    return [isolated_root], _solve_quadratic(
+        a1 + isolated_root * linear_coefficient, linear_coefficient
+    )
 
 
 @jax.jit
-def multipliers(matrix: Matrix) -> Complex[Array, "... n"]:
+def floquet_multipliers(matrix: RealMatrix) -> Complex[Array, "... n"]:
     """Return all eigenvalues, the one of largest modulus first."""
-    if matrix.shape[-1] > LARGEST_CLOSED:
-        return _by_modulus(jnp.linalg.eigvals(matrix))
-    alone, pair = _parts(matrix)
-    values = [lax.complex(x, jnp.zeros_like(x)) for x in alone]
+    if matrix.shape[-1] > MAX_CLOSED_FORM_SIZE:
+        return _sort_by_modulus(jnp.linalg.eigvals(matrix))
+    isolated_values, pair = _split_eigenvalues(matrix)
+    values = [lax.complex(x, jnp.zeros_like(x)) for x in isolated_values]
     if pair is not None:
-        mean, split, turn = pair
-        values += [lax.complex(mean + sign * split, sign * turn) for sign in (1.0, -1.0)]
-    return _by_modulus(jnp.stack(values, -1))
+        mean, real_offset, imaginary_offset = pair
+        values += [
+            lax.complex(mean + sign * real_offset, sign * imaginary_offset) for sign in (1.0, -1.0)
+        ]
+    return _sort_by_modulus(jnp.stack(values, -1))
 
 
-def _by_modulus(values: Array) -> Array:
+def _sort_by_modulus(values: Array) -> Array:
     """Return the eigenvalues sorted by modulus, the largest first."""
     modulus = jnp.square(values.real) + jnp.square(values.imag)
     order = jnp.argsort(-lax.stop_gradient(modulus), axis=-1)
@@ -136,23 +144,23 @@ def _by_modulus(values: Array) -> Array:
 
 
 @jax.jit
-def spectral_radius(matrix: Matrix) -> Float[Array, "..."]:
+def spectral_radius(matrix: RealMatrix) -> Float[Array, "..."]:
     """Return the largest modulus of an eigenvalue.
 
     Where two eigenvalues meet, its derivative is one-sided or zero.
     """
-    if matrix.shape[-1] > LARGEST_CLOSED:
-        return jnp.abs(multipliers(matrix)[..., 0])
-    alone, pair = _parts(matrix)
-    moduli = [jnp.abs(x) for x in alone]
+    if matrix.shape[-1] > MAX_CLOSED_FORM_SIZE:
+        return jnp.abs(floquet_multipliers(matrix)[..., 0])
+    isolated_values, pair = _split_eigenvalues(matrix)
+    moduli = [jnp.abs(x) for x in isolated_values]
     if pair is not None:
-        real = jnp.abs(pair.mean) + pair.split
-        moduli.append(jnp.where(pair.turn > 0.0, pair.modulus, real))
+        max_real_modulus = jnp.abs(pair.mean) + pair.real_offset
+        moduli.append(jnp.where(pair.imaginary_offset > 0.0, pair.modulus, max_real_modulus))
     return functools.reduce(jnp.maximum, moduli)
 
 
 @jax.jit
-def jury_margins(matrix: Matrix) -> Float[Array, "... n_margins"]:
+def jury_margins(matrix: RealMatrix) -> Float[Array, "... n_margins"]:
     """Return polynomials of the matrix, all positive exactly if all multipliers are inside the
     circle.
 
@@ -172,49 +180,51 @@ def jury_margins(matrix: Matrix) -> Float[Array, "... n_margins"]:
 
 
 @jax.jit
-def bifurcation_margins(matrix: Matrix) -> Float[Array, "... n_margins"]:
+def bifurcation_margins(matrix: RealMatrix) -> Float[Array, "... n_margins"]:
     """Return the first three Jury margins (two for n = 1) of a matrix of any size.
 
     Beyond closed forms they are det(1 - matrix), det(1 + matrix), and the product of 1 - z_i z_j
     over all pairs of eigenvalues.
     """
     n = matrix.shape[-1]
-    if n <= LARGEST_CLOSED:
+    if n <= MAX_CLOSED_FORM_SIZE:
         return jury_margins(matrix)[..., :3]
-    one, values = jnp.eye(n, dtype=matrix.dtype), multipliers(matrix)
-    first, second = np.triu_indices(n, 1)
-    pairs = jnp.prod(1.0 - values[..., first] * values[..., second], axis=-1).real
-    return jnp.stack([jnp.linalg.det(one - matrix), jnp.linalg.det(one + matrix), pairs], -1)
+    identity, values = jnp.eye(n, dtype=matrix.dtype), floquet_multipliers(matrix)
+    first_indices, second_indices = np.triu_indices(n, 1)
+    pairs = jnp.prod(1.0 - values[..., first_indices] * values[..., second_indices], axis=-1).real
+    return jnp.stack(
+        [jnp.linalg.det(identity - matrix), jnp.linalg.det(identity + matrix), pairs], -1
+    )
 
 
 @jax.jit
-def stability_margin(matrix: Matrix) -> Float[Array, "..."]:
+def stability_margin(matrix: RealMatrix) -> Float[Array, "..."]:
     """Return a smooth minimum of the Jury margins, never above the smallest: positive
     means stable.
     """
-    margins = SHARPNESS * jury_margins(matrix)
+    margins = SMOOTH_MIN_SHARPNESS * jury_margins(matrix)
     lowest = lax.stop_gradient(jnp.min(margins, -1))
     excess = jnp.sum(jnp.exp(lowest[..., None] - margins), -1)
-    return (lowest - jnp.log(excess)) / SHARPNESS
+    return (lowest - jnp.log(excess)) / SMOOTH_MIN_SHARPNESS
 
 
 @jax.jit
-def at_double_multiplier(matrix: Matrix, tolerance: float = 1e-6) -> Bool[Array, "..."]:
+def has_double_multiplier(matrix: RealMatrix, tolerance: float = 1e-6) -> Bool[Array, "..."]:
     """Return whether the two largest moduli agree to `tolerance`: the spectral radius has a kink
     there.
 
     The moduli of a complex pair always agree and are smooth; the pair counts only where it is about
     to become real.
     """
-    alone, pair = _parts(matrix)
+    isolated_values, pair = _split_eigenvalues(matrix)
     if pair is None:
         return jnp.zeros(matrix.shape[:-2], bool)
-    mean, split, turn = pair
-    real = [*alone, mean + split, mean - split]
-    complex_pair = turn > 0.0
-    moduli = jnp.sort(jnp.abs(jnp.stack(real, -1)), -1)
-    tie_of_real = moduli[..., -1] - moduli[..., -2] <= tolerance
-    tie = jnp.where(complex_pair, turn <= tolerance, tie_of_real)
-    for x in alone:
-        tie = tie | (complex_pair & (jnp.abs(jnp.abs(x) - pair.modulus) <= tolerance))
-    return tie
+    mean, real_offset, imaginary_offset = pair
+    real_values = [*isolated_values, mean + real_offset, mean - real_offset]
+    is_complex_pair = imaginary_offset > 0.0
+    moduli = jnp.sort(jnp.abs(jnp.stack(real_values, -1)), -1)
+    is_real_tied = moduli[..., -1] - moduli[..., -2] <= tolerance
+    is_tied = jnp.where(is_complex_pair, imaginary_offset <= tolerance, is_real_tied)
+    for x in isolated_values:
+        is_tied = is_tied | (is_complex_pair & (jnp.abs(jnp.abs(x) - pair.modulus) <= tolerance))
+    return is_tied

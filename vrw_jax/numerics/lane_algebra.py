@@ -19,55 +19,60 @@ from vrw_jax.numerics.types import Vector
 
 LaneArray = Float[Array, "... lanes"]
 
-Hold = Callable[[Any], Any]
+HoldFn = Callable[[Any], Any]
 
 
-def fusion_barrier(lanes: Float[Array, "... lanes"]) -> Hold:
+def fusion_barrier(lanes: Float[Array, "... lanes"]) -> HoldFn:
     """Return an identity function that XLA can't fuse across.
 
     `lanes` must not hold NaN, which XLA can't prove.
     """
-    if simd.tracing():
+    if simd.targets_machine_code():
         return lax.optimization_barrier
-    always = ~jnp.isnan(jnp.max(lanes))
+    is_always_true = ~jnp.isnan(jnp.max(lanes))
 
-    def hold(tree: Any) -> Any:
-        return lax.cond(always, lambda t: t, lambda t: jax.tree.map(jnp.zeros_like, t), tree)
+    def hide_from_fusion(tree: Any) -> Any:
+        return lax.cond(
+            is_always_true, lambda t: t, lambda t: jax.tree.map(jnp.zeros_like, t), tree
+        )
 
-    return hold
+    return hide_from_fusion
 
 
-def mix(matrix: np.ndarray, x: Array) -> Array:
+def apply_matrix(matrix: np.ndarray, x: Array) -> Array:
     """Return a matrix product over the leading axis as a sum of elementwise products."""
     shape = (-1,) + (1,) * (x.ndim - 1)
     terms = [x[j] * matrix[:, j].astype(x.dtype).reshape(shape) for j in range(matrix.shape[1])]
     return sum(terms[1:], start=terms[0])
 
 
-def weigh(weights: np.ndarray, x: Array) -> Array:
+def weighted_sum(weights: np.ndarray, x: Array) -> Array:
     """Return the weighted sum over the leading axis."""
     terms = [float(weights[j]) * x[j] for j in range(len(weights))]
     return sum(terms[1:], start=terms[0])
 
 
-def contract(left: Array, right: Array) -> Array:
+def contract_axes(left_array: Array, right_array: Array) -> Array:
     """Return the sum over s of left[..., s, lanes] * right[s, ..., lanes], elementwise over the
     batch.
     """
-    gap = (slice(None),) * (left.ndim - 2) + (None,) * (right.ndim - 2)
-    terms = [left[..., s, :][(*gap, slice(None))] * right[s] for s in range(right.shape[0])]
+    new_axes = (slice(None),) * (left_array.ndim - 2) + (None,) * (right_array.ndim - 2)
+    terms = [
+        left_array[..., s, :][(*new_axes, slice(None))] * right_array[s]
+        for s in range(right_array.shape[0])
+    ]
     return sum(terms[1:], start=terms[0])
 
 
-def inverse(matrix: Float[Array, "n n lanes"]) -> Float[Array, "n n lanes"]:
+def invert_small(matrix: Float[Array, "n n lanes"]) -> Float[Array, "n n lanes"]:
     """Return the inverse of a 1x1, 2x2 or 3x3 matrix by cofactors."""
     m = matrix
     if m.shape[0] == 1:
         return 1.0 / m
     if m.shape[0] == 2:
         determinant = m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]
-        swapped = jnp.stack([jnp.stack([m[1, 1], -m[0, 1]]), jnp.stack([-m[1, 0], m[0, 0]])])
-        return swapped / determinant
+        adjugate_2x2 = jnp.stack([jnp.stack([m[1, 1], -m[0, 1]]), jnp.stack([-m[1, 0], m[0, 0]])])
+        return adjugate_2x2 / determinant
     if m.shape[0] != 3:
         raise ValueError(f"the matrix has {m.shape[0]} rows, but only 1, 2 or 3 are built.")
 
@@ -81,63 +86,65 @@ def inverse(matrix: Float[Array, "n n lanes"]) -> Float[Array, "n n lanes"]:
 
 
 @jax.custom_jvp
-def eliminate(
+def solve_node_equations(
     matrix: Float[Array, "nodes dim nodes dim lanes"],
-    right: Float[Array, "nodes dim columns lanes"],
+    rhs: Float[Array, "nodes dim columns lanes"],
     for_barrier: LaneArray,
 ) -> Float[Array, "nodes dim columns lanes"]:
     """Solve the node equations of one mesh interval, block by block without pivoting.
 
     The matrix is the mass matrix plus terms of order h; its diagonal blocks stay regular.
     """
-    hold = fusion_barrier(for_barrier)
+    hide_from_fusion = fusion_barrier(for_barrier)
     n, dim = matrix.shape[:2]
-    rest = jnp.concatenate([matrix.reshape(n, dim, n * dim, -1), right], axis=2)
+    remaining = jnp.concatenate([matrix.reshape(n, dim, n * dim, -1), rhs], axis=2)
     rows: list[Array] = []
     for _ in range(n):
-        pivot = rest[0]
-        row = contract(inverse(pivot[:, :dim]), pivot[:, dim:])
+        pivot = remaining[0]
+        row = contract_axes(invert_small(pivot[:, :dim]), pivot[:, dim:])
         if len(rows) < n - 1:
-            row = hold(row)
-            rest = hold(rest[1:, :, dim:] - contract(rest[1:, :, :dim], row))
+            row = hide_from_fusion(row)
+            remaining = hide_from_fusion(
+                remaining[1:, :, dim:] - contract_axes(remaining[1:, :, :dim], row)
+            )
         rows.append(row)
-    solved = rows[-1]
+    solution = rows[-1]
     for row in rows[-2::-1]:
-        n_known = solved.shape[0]
-        known = row[:, n_known:] - contract(row[:, :n_known], solved)
-        solved = jnp.concatenate([known, solved])
-    return solved.reshape(n, dim, *solved.shape[1:])
+        n_solved = solution.shape[0]
+        block_solution = row[:, n_solved:] - contract_axes(row[:, :n_solved], solution)
+        solution = jnp.concatenate([block_solution, solution])
+    return solution.reshape(n, dim, *solution.shape[1:])
 
 
-@eliminate.defjvp
+@solve_node_equations.defjvp
 def _eliminate_jvp(primals: tuple, tangents: tuple) -> tuple:
     """Return the tangent by a second solve; differentiating the elimination would double
     its work.
     """
     (matrix, _, for_barrier), (d_matrix, d_right, _) = primals, tangents
-    solved = eliminate(*primals)
+    solution = solve_node_equations(*primals)
     n, dim = matrix.shape[:2]
-    flat = d_matrix.reshape(n, dim, n * dim, -1)
-    moved = contract(flat, solved.reshape(n * dim, *solved.shape[2:]))
-    return solved, eliminate(matrix, d_right - moved, for_barrier)
+    flat_tangent = d_matrix.reshape(n, dim, n * dim, -1)
+    matrix_term = contract_axes(flat_tangent, solution.reshape(n * dim, *solution.shape[2:]))
+    return solution, solve_node_equations(matrix, d_right - matrix_term, for_barrier)
 
 
-def push_columns(function: Callable, primals: tuple, tangents: tuple) -> tuple:
+def value_and_jvps(function: Callable, primals: tuple, tangents: tuple) -> tuple:
     """Return value and JVPs of `function` along tangents with a leading axis of directions."""
-    columns = lambda *t: jax.jvp(function, primals, t)
-    return jax.vmap(columns, in_axes=0, out_axes=(None, 0))(*tangents)
+    jvp_along = lambda *t: jax.jvp(function, primals, t)
+    return jax.vmap(jvp_along, in_axes=0, out_axes=(None, 0))(*tangents)
 
 
-def partials_of(
+def value_and_partials(
     function: Callable[..., Vector], arguments: Sequence[Array]
 ) -> tuple[Vector, list[Vector]]:
     """Return the value of an elementwise function, and each output's derivatives by all arguments.
 
     The derivatives use reverse mode, because a phase has fewer equations than arguments.
     """
-    value, forward = jax.linearize(function, *arguments)
-    by_output = []
+    value, apply_jvp = jax.linearize(function, *arguments)
+    partials_by_output = []
     for i, output in enumerate(value):
-        backward = jax.linear_transpose(lambda *t, i=i: forward(*t)[i], *arguments)
-        by_output.append(backward(jnp.ones_like(output)))
-    return value, by_output
+        apply_transpose = jax.linear_transpose(lambda *t, i=i: apply_jvp(*t)[i], *arguments)
+        partials_by_output.append(apply_transpose(jnp.ones_like(output)))
+    return value, partials_by_output

@@ -15,71 +15,78 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, PyTree
 
-LaneFunction = Callable[..., PyTree[Array]]
+BatchFunction = Callable[..., PyTree[Array]]
 """A function of arrays that all have the batch on their last axis."""
 
 
-def one_wheel(function: LaneFunction) -> LaneFunction:
+def unbatch(function: BatchFunction) -> BatchFunction:
     """Return `function` for arrays without the batch axis; its `vmap` is `function` over
     the batch.
     """
-    over_lanes = custom_vmap(function)
+    batched_function = custom_vmap(function)
 
-    @over_lanes.def_vmap
-    def merge_axis(axis_size: int, in_batched: PyTree, *arrays: PyTree) -> tuple:
-        def merge(x: Array, batched: bool) -> Array:
-            x = x if batched else jnp.broadcast_to(x, (axis_size, *x.shape))
-            moved = jnp.moveaxis(x, 0, -2)
-            return moved.reshape(*moved.shape[:-2], -1)
+    @batched_function.def_vmap
+    def merge_axis(axis_size: int, is_batched_tree: PyTree, *arrays: PyTree) -> tuple:
+        def merge(x: Array, is_batched: bool) -> Array:
+            x = x if is_batched else jnp.broadcast_to(x, (axis_size, *x.shape))
+            transposed = jnp.moveaxis(x, 0, -2)
+            return transposed.reshape(*transposed.shape[:-2], -1)
 
         def split(x: Array) -> Array:
             return jnp.moveaxis(x.reshape(*x.shape[:-1], axis_size, -1), -2, 0)
 
-        out = over_lanes(*jax.tree.map(merge, arrays, tuple(in_batched)))
-        return jax.tree.map(split, out), jax.tree.map(lambda _: True, out)
+        outputs = batched_function(*jax.tree.map(merge, arrays, tuple(is_batched_tree)))
+        return jax.tree.map(split, outputs), jax.tree.map(lambda _: True, outputs)
 
-    def single(*arrays: PyTree) -> PyTree:
-        out = over_lanes(*jax.tree.map(lambda x: jnp.asarray(x)[..., None], arrays))
-        return jax.tree.map(lambda x: x[..., 0], out)
+    def evaluate_single(*arrays: PyTree) -> PyTree:
+        outputs = batched_function(*jax.tree.map(lambda x: jnp.asarray(x)[..., None], arrays))
+        return jax.tree.map(lambda x: x[..., 0], outputs)
 
-    return single
+    return evaluate_single
 
 
-def in_blocks(function: LaneFunction, block: int) -> LaneFunction:
+def make_blockwise(function: BatchFunction, block_size: int) -> BatchFunction:
     """Return `function` applied to `block_size` batch elements at a time, so that its arrays stay
     in cache.
 
     The first array has the batch axis; scalars are the same for all elements.
     """
 
-    def blocked(*arrays: PyTree) -> PyTree:
+    def evaluate_blockwise(*arrays: PyTree) -> PyTree:
         leaves, structure = jax.tree.flatten(arrays)
         n_lanes = leaves[0].shape[-1]
-        if n_lanes <= block:
+        if n_lanes <= block_size:
             return function(*arrays)
         has_lanes = [jnp.ndim(x) > 0 for x in leaves]
 
-        def cut(x: Array) -> Array:  # the last element pads the last block
-            missing = -n_lanes % block
-            filled = jnp.concatenate([x, jnp.repeat(x[..., -1:], missing, -1)], -1)
-            return jnp.moveaxis(filled.reshape(*x.shape[:-1], -1, block), -2, 0)
+        def split_blocks(x: Array) -> Array:  # the last element pads the last block
+            n_missing = -n_lanes % block_size
+            padded = jnp.concatenate([x, jnp.repeat(x[..., -1:], n_missing, -1)], -1)
+            return jnp.moveaxis(padded.reshape(*x.shape[:-1], -1, block_size), -2, 0)
 
-        def of_block(some: list[Array]) -> PyTree:
-            parts = iter(some)
-            own = [next(parts) if has else x for x, has in zip(leaves, has_lanes, strict=True)]
-            return function(*jax.tree.unflatten(structure, own))
+        def evaluate_block(batched_leaves: list[Array]) -> PyTree:
+            remaining_leaves = iter(batched_leaves)
+            block_leaves = [
+                next(remaining_leaves) if has_lanes_axis else x
+                for x, has_lanes_axis in zip(leaves, has_lanes, strict=True)
+            ]
+            return function(*jax.tree.unflatten(structure, block_leaves))
 
-        def join(x: Array) -> Array:
-            moved = jnp.moveaxis(x, 0, -2)
-            return moved.reshape(*moved.shape[:-2], -1)[..., :n_lanes]
+        def merge_blocks(x: Array) -> Array:
+            transposed = jnp.moveaxis(x, 0, -2)
+            return transposed.reshape(*transposed.shape[:-2], -1)[..., :n_lanes]
 
-        cuts = [cut(x) for x, has in zip(leaves, has_lanes, strict=True) if has]
-        return jax.tree.map(join, lax.map(of_block, cuts))
+        blocks = [
+            split_blocks(x)
+            for x, has_lanes_axis in zip(leaves, has_lanes, strict=True)
+            if has_lanes_axis
+        ]
+        return jax.tree.map(merge_blocks, lax.map(evaluate_block, blocks))
 
-    return blocked
+    return evaluate_blockwise
 
 
-def compiled_by_caller() -> bool:
+def is_inside_jit() -> bool:
     """Return whether an enclosing `jit` compiles the calls made here.
 
     A nested jit would only trace the function once more, which is wasted under a derivative.
@@ -87,64 +94,64 @@ def compiled_by_caller() -> bool:
     return isinstance(jnp.zeros(()), jax.core.Tracer)
 
 
-def if_any(flag: Array, function: Callable[[PyTree], PyTree], otherwise: PyTree) -> PyTree:
+def run_if_any(flag: Array, function: Callable[[PyTree], PyTree], fallback: PyTree) -> PyTree:
     """Return `function(fallback)` if the flag, one for the whole batch, is set, otherwise
     `fallback`.
 
     It is a loop of at most one iteration, which machine code skips if the flag is not set.
     """
-    turn = lambda now: (jnp.zeros((), bool), function(now[1]))
-    return lax.while_loop(lambda now: now[0], turn, (flag, otherwise))[1]
+    run_once = lambda carry: (jnp.zeros((), bool), function(carry[1]))
+    return lax.while_loop(lambda carry: carry[0], run_once, (flag, fallback))[1]
 
 
-def two_fold(goes_on: Array, count: Array) -> Array:
+def opaque_condition(condition: Array, count: Array) -> Array:
     """Return `condition` as a loop condition that also reads a count, which is never negative.
 
     In a condition that reads only one number, XLA looks for an iteration counter with a copy of the
     loop's body. That takes a fifth of the compile time of a step with unilateral contact.
     """
-    return goes_on & (count >= 0)
+    return condition & (count >= 0)
 
 
-def select(condition: Array, yes: PyTree, no: PyTree) -> PyTree:
+def tree_where(condition: Array, if_true: PyTree, if_false: PyTree) -> PyTree:
     """Return `jnp.where`, leaf by leaf."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), if_true, if_false)
 
 
-def zeros_of(function: Callable[..., PyTree], *arguments: PyTree) -> PyTree:
+def zeros_like_output(function: Callable[..., PyTree], *arguments: PyTree) -> PyTree:
     """Return zeros in the structure of the output of `function`, without calling it."""
-    blank = lambda leaf: jnp.zeros(leaf.shape, leaf.dtype)
-    return jax.tree.map(blank, jax.eval_shape(function, *arguments))
+    make_zeros = lambda leaf: jnp.zeros(leaf.shape, leaf.dtype)
+    return jax.tree.map(make_zeros, jax.eval_shape(function, *arguments))
 
 
-def taken(tree: PyTree, places: Any) -> PyTree:
+def take_rows(tree: PyTree, row_indices: Any) -> PyTree:
     """Return the selected rows of arrays with a leading axis, as numpy arrays."""
-    return jax.tree.map(lambda x: np.asarray(x)[places], tree)
+    return jax.tree.map(lambda x: np.asarray(x)[row_indices], tree)
 
 
-def joined(*trees: PyTree) -> PyTree:
+def concat_rows(*trees: PyTree) -> PyTree:
     """Return the trees concatenated along the leading axis, as numpy arrays."""
     return jax.tree.map(lambda *parts: np.concatenate([np.asarray(p) for p in parts]), *trees)
 
 
-def in_batches(function: Callable, sizes: tuple[int, ...], *trees: PyTree) -> PyTree:
+def map_in_batches(function: Callable, sizes: tuple[int, ...], *trees: PyTree) -> PyTree:
     """Apply `function` to trees with a leading axis, padded to one of `sizes` rows at a time.
 
     It is therefore compiled for few shapes. Inputs and outputs are JAX arrays.
     """
-    of_jax = lambda *rows: function(*jax.device_put(rows))
-    return jax.device_put(in_batches_of_numpy(of_jax, sizes, *trees))
+    call_on_device = lambda *rows: function(*jax.device_put(rows))
+    return jax.device_put(map_in_numpy_batches(call_on_device, sizes, *trees))
 
 
-def in_batches_of_numpy(function: Callable, sizes: tuple[int, ...], *trees: PyTree) -> PyTree:
+def map_in_numpy_batches(function: Callable, sizes: tuple[int, ...], *trees: PyTree) -> PyTree:
     """Apply a compiled function as `map_in_batches` does; inputs and outputs are numpy arrays.
 
     For small batches this takes a fraction of the time.
     """
-    n, parts = len(jax.tree.leaves(trees)[0]), []
-    for begin in range(0, n, sizes[-1]):
-        wanted = min(n - begin, sizes[-1])
-        wide = next(size for size in sizes if size >= wanted)
-        rows = taken(trees, np.minimum(np.arange(begin, begin + wide), n - 1))
-        parts.append(taken(function(*rows), slice(0, wanted)))
-    return joined(*parts) if len(parts) > 1 else parts[0]
+    n, results = len(jax.tree.leaves(trees)[0]), []
+    for first_row in range(0, n, sizes[-1]):
+        n_rows = min(n - first_row, sizes[-1])
+        batch_size = next(size for size in sizes if size >= n_rows)
+        rows = take_rows(trees, np.minimum(np.arange(first_row, first_row + batch_size), n - 1))
+        results.append(take_rows(function(*rows), slice(0, n_rows)))
+    return concat_rows(*results) if len(results) > 1 else results[0]

@@ -13,97 +13,120 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from vrw_jax.numerics.arclength import AbstractFollowed, Linear, Section, Unknown
+from vrw_jax.numerics.arclength import (
+    AbstractContinuationProblem,
+    NewtonStep,
+    SectionVector,
+    Unknowns,
+)
 from vrw_jax.numerics.floquet import bifurcation_margins
 from vrw_jax.numerics.types import Elementwise, Scalar
 
-Pair = Float[Array, "2"]
+ParameterPair = Float[Array, "2"]
 """Values of the two parameters."""
 
 
-class LevelLinear(NamedTuple):
+class TestFunctionNewtonStep(NamedTuple):
     """Newton step at a trial (z, p), and the test function whose zero is continued."""
 
-    correction: Unknown  # of z at fixed p
-    columns: tuple[Unknown, Unknown]  # dz/dp along the curve of fixed points
+    correction: Unknowns  # of z at fixed p
+    tangents: tuple[Unknowns, Unknowns]  # dz/dp along the curve of fixed points
     jacobian: Float[Array, "n n"]  # of the return map
     value: Scalar  # of the test function at the corrected z
-    slopes: Pair  # derivatives of the value by p along the fixed points
+    parameter_gradient: ParameterPair  # derivatives of the value by p along the fixed points
 
 
-class AbstractLevel(eqx.Module):
+class AbstractTestFunction(eqx.Module):
     """Base class of test functions of fixed points in two parameters.
 
     `args` is a pytree with all other inputs.
     """
 
     @abc.abstractmethod
-    def linearise(self, wheel: Any, z: Unknown, p: Pair) -> LevelLinear:
+    def linearize(self, args: Any, z: Unknowns, p: ParameterPair) -> TestFunctionNewtonStep:
         """Return all that one iteration needs; it is not finite where the map is undefined."""
 
     @abc.abstractmethod
-    def section(self, z: Unknown) -> Section:
+    def section_state(self, z: Unknowns) -> SectionVector:
         """Return the section state, a part of z."""
 
-    def size(self, z: Unknown, correction: Unknown) -> Scalar:
+    def correction_norm(self, z: Unknowns, correction: Unknowns) -> Scalar:
         """Return the norm of a correction, its largest entry, which is compared with
         the tolerance.
         """
         return jnp.max(jnp.abs(correction))
 
-    def valid(self, wheel: Any, z: Unknown, p: Pair) -> Bool[Array, ""]:
+    def is_admissible(self, args: Any, z: Unknowns, p: ParameterPair) -> Bool[Array, ""]:
         """Return whether a converged z satisfies the conditions of its branch."""
-        return jnp.all(jnp.isfinite(self.section(z)))
+        return jnp.all(jnp.isfinite(self.section_state(z)))
 
 
-class LevelPoint(NamedTuple):
+class TestFunctionPoint(NamedTuple):
     """Unknowns of a point of the curve: those of the fixed point, and the second parameter."""
 
-    z: Unknown
-    share: Elementwise  # of the second parameter's range
+    z: Unknowns
+    fraction: Elementwise  # of the second parameter's range
 
 
-class LevelFollowed(AbstractFollowed):
+class TestFunctionCurve(AbstractContinuationProblem):
     """The curve on which a test function is zero, along the first of its parameters.
 
     Lengths along it include the second parameter as a fraction of its range, which it must not
     leave.
     """
 
-    level: AbstractLevel
+    test_function: AbstractTestFunction
     bounds: tuple[float, float] = eqx.field(static=True)  # of the second parameter
 
-    def second(self, z: LevelPoint) -> Elementwise:
+    def second_parameter(self, z: TestFunctionPoint) -> Elementwise:
         """Return the second parameter at a point of the curve."""
         low, high = self.bounds
-        return low + (high - low) * z.share
+        return low + (high - low) * z.fraction
 
-    def linearise(self, wheel: Any, z: LevelPoint, p: Scalar) -> Linear:
+    def linearize(self, args: Any, z: TestFunctionPoint, p: Scalar) -> NewtonStep:
         scale = self.bounds[1] - self.bounds[0]
-        told = self.level.linearise(wheel, z.z, jnp.stack([p, self.second(z)]))
-        by_first, by_share = told.slopes[0], scale * told.slopes[1]
-        share, along = -told.value / by_share, -by_first / by_share
-        first, second = told.columns
-        beside = lambda change: lambda a, b: a + scale * change * b
-        correction = jax.tree.map(beside(share), told.correction, second)
-        column = jax.tree.map(beside(along), first, second)
+        newton_step = self.test_function.linearize(
+            args, z.z, jnp.stack([p, self.second_parameter(z)])
+        )
+        derivative_first, derivative_fraction = (
+            newton_step.parameter_gradient[0],
+            scale * newton_step.parameter_gradient[1],
+        )
+        fraction_change, fraction_tangent = (
+            -newton_step.value / derivative_fraction,
+            -derivative_first / derivative_fraction,
+        )
+        first_tangent, second_tangent = newton_step.tangents
+        add_second = lambda change: lambda a, b: a + scale * change * b
+        correction = jax.tree.map(
+            add_second(fraction_change), newton_step.correction, second_tangent
+        )
+        tangent = jax.tree.map(add_second(fraction_tangent), first_tangent, second_tangent)
         jacobian = jnp.pad(
-            told.jacobian, (0, 1)
+            newton_step.jacobian, (0, 1)
         )  # a zero multiplier for the fraction has no effect
-        return Linear(LevelPoint(correction, share), LevelPoint(column, along), jacobian)
+        return NewtonStep(
+            TestFunctionPoint(correction, fraction_change),
+            TestFunctionPoint(tangent, fraction_tangent),
+            jacobian,
+        )
 
-    def section(self, z: LevelPoint) -> Section:
-        return jnp.append(self.level.section(z.z), z.share)
+    def section_state(self, z: TestFunctionPoint) -> SectionVector:
+        return jnp.append(self.test_function.section_state(z.z), z.fraction)
 
-    def size(self, z: LevelPoint, correction: LevelPoint) -> Scalar:
-        return jnp.maximum(self.level.size(z.z, correction.z), jnp.abs(correction.share))
+    def correction_norm(self, z: TestFunctionPoint, correction: TestFunctionPoint) -> Scalar:
+        return jnp.maximum(
+            self.test_function.correction_norm(z.z, correction.z), jnp.abs(correction.fraction)
+        )
 
-    def valid(self, wheel: Any, z: LevelPoint, p: Scalar) -> Bool[Array, ""]:
-        inside = (z.share >= 0.0) & (z.share <= 1.0)
-        return inside & self.level.valid(wheel, z.z, jnp.stack([p, self.second(z)]))
+    def is_admissible(self, args: Any, z: TestFunctionPoint, p: Scalar) -> Bool[Array, ""]:
+        is_inside = (z.fraction >= 0.0) & (z.fraction <= 1.0)
+        return is_inside & self.test_function.is_admissible(
+            args, z.z, jnp.stack([p, self.second_parameter(z)])
+        )
 
 
-BESIDE_FOLD = 1e-6
+FOLD_MARGIN_OFFSET = 1e-6
 """Value of the fold's margin on the curve that represents the fold.
 
 It is chosen because the equations are singular at the fold itself. The parameters turn at the fold
@@ -111,6 +134,6 @@ and are wrong by the square of this value.
 """
 
 
-def margins_beside_fold(jacobian: Float[Array, "n n"]) -> Array:
+def offset_bifurcation_margins(jacobian: Float[Array, "n n"]) -> Array:
     """Return the bifurcation margins, each zero where one of `BIFURCATION_NAMES` occurs."""
-    return bifurcation_margins(jacobian).at[0].add(-BESIDE_FOLD)
+    return bifurcation_margins(jacobian).at[0].add(-FOLD_MARGIN_OFFSET)

@@ -14,12 +14,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.numerics.types import Scalar
 
-State = Float[Array, " dim"]
-Watch = Callable[[State], Float[Array, " n_watched"]]
+StateVector = Float[Array, " dim"]
+MonitorFn = Callable[[StateVector], Float[Array, " n_watched"]]
 """Guards and margins as functions of the state."""
 
 
-class Watched(NamedTuple):
+class MonitoredFunctions(NamedTuple):
     """Functions monitored along a phase: guards that end it, then margins whose minimum is
     searched.
 
@@ -31,63 +31,69 @@ class Watched(NamedTuple):
     time brings it closer.
     """
 
-    values: Watch
+    values: MonitorFn
     n_guards: int
-    count_start: tuple[bool, ...] = ()
-    sizes: Array | None = None
+    includes_start: tuple[bool, ...] = ()
+    guard_scales: Array | None = None
 
 
-ROUNDING = 32.0
+GUARD_ROUNDOFF_EPS = 32.0
 """Round-off of a guard's value, in units of round-off of its scale."""
 
 
-def at_rounding(
-    watched: Watched, crossing: Bool[Array, " n_guards"], guards: Float[Array, " n_guards"]
+def is_at_roundoff(
+    monitored_functions: MonitoredFunctions,
+    is_crossing: Bool[Array, " n_guards"],
+    guards: Float[Array, " n_guards"],
 ) -> tuple[Bool[Array, ""], Int[Array, ""]]:
     """Return whether the lowest crossing guard is only round-off, and the index of that guard."""
-    sizes = jnp.ones_like(guards) if watched.sizes is None else watched.sizes
-    lowest = jnp.where(crossing, guards / sizes, jnp.inf)
-    near = jnp.abs(jnp.min(lowest)) <= ROUNDING * jnp.finfo(lowest.dtype).eps
-    known = watched.sizes is not None
-    return near & known, jnp.argmin(lowest).astype(jnp.int32)
+    scales = (
+        jnp.ones_like(guards)
+        if monitored_functions.guard_scales is None
+        else monitored_functions.guard_scales
+    )
+    lowest = jnp.where(is_crossing, guards / scales, jnp.inf)
+    is_near_zero = jnp.abs(jnp.min(lowest)) <= GUARD_ROUNDOFF_EPS * jnp.finfo(lowest.dtype).eps
+    has_scales = monitored_functions.guard_scales is not None
+    return is_near_zero & has_scales, jnp.argmin(lowest).astype(jnp.int32)
 
 
-class Step(NamedTuple):
+class AcceptedPhaseStep(NamedTuple):
     """The end of the last accepted step, which a rejected step does not change."""
 
     time: Scalar
-    state: State
+    state: StateVector
     solver_state: Any
     values: Float[Array, " n_watched"]
     rates: Float[Array, " n_watched"]
 
 
-class Minimum(NamedTuple):
+class InteriorMinimum(NamedTuple):
     """Lowest interior minimum so far of each margin, and the step that holds it."""
 
     value: Float[Array, " n"]
-    left: Float[Array, "n dim"]
-    length: Float[Array, " n"]  # of the step from its start, s
-    offset: Float[Array, " n"]  # of the minimum from the step's start, s
-    rate_left: Float[Array, " n"]
+    start_state: Float[Array, "n dim"]
+    step_length: Float[Array, " n"]  # of the step from its start, s
+    minimum_offset: Float[Array, " n"]  # of the minimum from the step's start, s
+    start_rate: Float[Array, " n"]
 
     @property
-    def found(self) -> Bool[Array, " n"]:
+    def is_found(self) -> Bool[Array, " n"]:
         """Whether each margin has an interior minimum."""
         return jnp.isfinite(self.value)
 
 
-class Settling(NamedTuple):
+class MinimumRefinement(NamedTuple):
     """State of the secant steps on a margin's rate after the integration, one margin at a time."""
 
     monitor: Int[Array, ""]
-    tries: Int[Array, ""]
-    at: Scalar  # time with the smallest rate so far, from the step's start, s
-    rate_at: Scalar
-    lowest: Float[Array, " n"]  # refined minima, and the values at the phase's start
+    n_iterations: Int[Array, ""]
+    best_length: Scalar  # time with the smallest rate so far, from the step's start, s
+    best_rate: Scalar
+    lowest_values: Float[Array, " n"]  # refined minima, and the values at the phase's start
 
 
-def cubic(x: Array, v0: Array, r0: Array, v1: Array, r1: Array) -> Array:
+def evaluate_cubic(x: Array, v0: Array, r0: Array, v1: Array, r1: Array) -> Array:
     """Return the cubic Hermite interpolant on [0, 1]; the rates are multiplied by the length."""
     return (
         (1 + 2 * x) * (1 - x) ** 2 * v0
@@ -98,7 +104,7 @@ def cubic(x: Array, v0: Array, r0: Array, v1: Array, r1: Array) -> Array:
 
 
 @jax.jit  # traced once for all margins
-def cubic_minimum(v0: Array, r0: Array, v1: Array, r1: Array) -> tuple[Array, Array]:
+def find_cubic_minimum(v0: Array, r0: Array, v1: Array, r1: Array) -> tuple[Array, Array]:
     """Return location in (0, 1) and value of the cubic's interior minimum; the value is inf if none
     exists.
     """
@@ -109,72 +115,72 @@ def cubic_minimum(v0: Array, r0: Array, v1: Array, r1: Array) -> tuple[Array, Ar
     # The minimum is the root with positive curvature, written without cancellation.
     denominator = jnp.where(b >= 0.0, -(b + root), 2.0 * a)
     numerator = jnp.where(b >= 0.0, 2.0 * r0, root - b)
-    safe = jnp.where(denominator == 0.0, 1.0, denominator)
-    x = jnp.where(denominator == 0.0, -1.0, numerator / safe)
+    safe_denominator = jnp.where(denominator == 0.0, 1.0, denominator)
+    x = jnp.where(denominator == 0.0, -1.0, numerator / safe_denominator)
     exists = (discriminant > 0.0) & (x > 0.0) & (x < 1.0)
     x = jnp.where(exists, x, 0.5)
-    return x, jnp.where(exists, cubic(x, v0, r0, v1, r1), jnp.inf)
+    return x, jnp.where(exists, evaluate_cubic(x, v0, r0, v1, r1), jnp.inf)
 
 
-def no_minimum(watched: Watched, start: State) -> Minimum:
+def empty_minimum(monitored_functions: MonitoredFunctions, start: StateVector) -> InteriorMinimum:
     """Return the state without interior minima."""
-    n = len(watched.count_start)
+    n = len(monitored_functions.includes_start)
     zeros = jnp.zeros((n,), start.dtype)
-    return Minimum(zeros + jnp.inf, jnp.tile(start, (n, 1)), zeros, zeros, zeros)
+    return InteriorMinimum(zeros + jnp.inf, jnp.tile(start, (n, 1)), zeros, zeros, zeros)
 
 
-def lower(
-    watched: Watched,
-    minimum: Minimum,
-    left: Step,
-    right: Step,
+def update_minimum(
+    monitored_functions: MonitoredFunctions,
+    minimum: InteriorMinimum,
+    step_start: AcceptedPhaseStep,
+    step_end: AcceptedPhaseStep,
     length: Scalar,
-    counts: Bool[Array, ""],
-) -> Minimum:
+    is_counted: Bool[Array, ""],
+) -> InteriorMinimum:
     """Return the minima, with the step in which a margin turns from falling to rising if it is the
     lowest.
 
     A margin that is zero at the phase's start by construction is at rest there: a negative rate is
     round-off and counts as zero.
     """
-    if not watched.count_start:
+    if not monitored_functions.includes_start:
         return minimum
     v0, r0, v1, r1 = (
-        lax.stop_gradient(v)[watched.n_guards :]
-        for v in (left.values, left.rates, right.values, right.rates)
+        lax.stop_gradient(v)[monitored_functions.n_guards :]
+        for v in (step_start.values, step_start.rates, step_end.values, step_end.rates)
     )
-    at_rest = (left.time == 0.0) & ~jnp.asarray(watched.count_start)
-    r0 = jnp.where(at_rest, jnp.maximum(r0, 0.0), r0)
+    is_at_rest = (step_start.time == 0.0) & ~jnp.asarray(monitored_functions.includes_start)
+    r0 = jnp.where(is_at_rest, jnp.maximum(r0, 0.0), r0)
     length = lax.stop_gradient(length)
-    x, value = cubic_minimum(v0, r0 * length, v1, r1 * length)
+    x, value = find_cubic_minimum(v0, r0 * length, v1, r1 * length)
     value = jnp.where(jnp.isfinite(value), value, jnp.minimum(v0, v1))
-    better = counts & (r0 < 0.0) & (r1 >= 0.0) & (value < minimum.value)
-    return Minimum(
-        jnp.where(better, value, minimum.value),
-        jnp.where(better[:, None], left.state, minimum.left),
-        jnp.where(better, length, minimum.length),
-        jnp.where(better, x * length, minimum.offset),
-        jnp.where(better, r0, minimum.rate_left),
+    is_lower = is_counted & (r0 < 0.0) & (r1 >= 0.0) & (value < minimum.value)
+    return InteriorMinimum(
+        jnp.where(is_lower, value, minimum.value),
+        jnp.where(is_lower[:, None], step_start.state, minimum.start_state),
+        jnp.where(is_lower, length, minimum.step_length),
+        jnp.where(is_lower, x * length, minimum.minimum_offset),
+        jnp.where(is_lower, r0, minimum.start_rate),
     )
 
 
-def row_of(index: Int[Array, ""], rows: Array) -> Array:
+def select_row(index: Int[Array, ""], rows: Array) -> Array:
     """Return the row with this index; a gather would cost more in a batch."""
-    chosen = jnp.arange(rows.shape[0]) == index
-    return jnp.sum(jnp.where(chosen.reshape(-1, *(1,) * (rows.ndim - 1)), rows, 0.0), axis=0)
+    is_selected = jnp.arange(rows.shape[0]) == index
+    return jnp.sum(jnp.where(is_selected.reshape(-1, *(1,) * (rows.ndim - 1)), rows, 0.0), axis=0)
 
 
-def settle(
-    settling: Settling,
-    watched: Watched,
-    minimum: Minimum,
-    step: Step,
+def refine_minimum(
+    refinement: MinimumRefinement,
+    monitored_functions: MonitoredFunctions,
+    minimum: InteriorMinimum,
+    step: AcceptedPhaseStep,
     length: Scalar,
-    on: Bool[Array, ""],
-    starting: Bool[Array, ""],
-    ends: Bool[Array, ""],
-    n_steps: int,
-) -> tuple[Settling, Bool[Array, ""], Scalar]:
+    is_refining: Bool[Array, ""],
+    is_starting: Bool[Array, ""],
+    is_phase_end: Bool[Array, ""],
+    max_iterations: int,
+) -> tuple[MinimumRefinement, Bool[Array, ""], Scalar]:
     """Locate each margin's minimum at the integrator's accuracy, by steps after the integration
     ends.
 
@@ -182,43 +188,62 @@ def settle(
     start of the step that holds the minimum. Return the state of the refinement, whether another
     step is needed (this one was a refinement if `is_refining`), and its length.
     """
-    values, rates = step.values[watched.n_guards :], step.rates[watched.n_guards :]
-    monitor, tries = settling.monitor, settling.tries + on
-    value, rate, room = (row_of(monitor, x) for x in (values, rates, minimum.length))
-    fixed_rate, fixed_length = lax.stop_gradient((rate, length))
-    gap = fixed_length - settling.at
-    slope = (fixed_rate - settling.rate_at) / jnp.where(gap == 0.0, 1.0, gap)
-    usable = (gap != 0.0) & (slope > 0.0)
-    secant = length - jnp.where(usable, rate / jnp.where(usable, slope, 1.0), 0.0)
-    secant = jnp.clip(secant, 0.0, lax.stop_gradient(room))
-    still = jnp.abs(secant - length) <= AT_MINIMUM * room
-    done = on & ((tries == n_steps) | (still & (tries >= FEWEST)))
-    nearer = jnp.abs(fixed_rate) < jnp.abs(settling.rate_at)
+    values, rates = (
+        step.values[monitored_functions.n_guards :],
+        step.rates[monitored_functions.n_guards :],
+    )
+    monitor, n_iterations = refinement.monitor, refinement.n_iterations + is_refining
+    value, rate, step_length = (
+        select_row(monitor, x) for x in (values, rates, minimum.step_length)
+    )
+    constant_rate, constant_length = lax.stop_gradient((rate, length))
+    length_change = constant_length - refinement.best_length
+    rate_derivative = (constant_rate - refinement.best_rate) / jnp.where(
+        length_change == 0.0, 1.0, length_change
+    )
+    is_usable = (length_change != 0.0) & (rate_derivative > 0.0)
+    secant = length - jnp.where(is_usable, rate / jnp.where(is_usable, rate_derivative, 1.0), 0.0)
+    secant = jnp.clip(secant, 0.0, lax.stop_gradient(step_length))
+    has_converged = jnp.abs(secant - length) <= MINIMUM_LOCATION_TOLERANCE * step_length
+    is_done = is_refining & (
+        (n_iterations == max_iterations) | (has_converged & (n_iterations >= MIN_REFINEMENT_TRIES))
+    )
+    is_better = jnp.abs(constant_rate) < jnp.abs(refinement.best_rate)
 
     monitors = jnp.arange(values.shape[0])
     lowest = jnp.where(
-        done & (monitors == monitor), jnp.minimum(value, settling.lowest), settling.lowest
+        is_done & (monitors == monitor),
+        jnp.minimum(value, refinement.lowest_values),
+        refinement.lowest_values,
     )
-    at_start = jnp.where(jnp.asarray(watched.count_start), values, jnp.inf)
-    left = minimum.found & (ends | (monitors > monitor))
-    turns = ends | done
-    monitor = jnp.where(turns, jnp.argmax(left).astype(jnp.int32), monitor)
-    offset, rate_left = lax.stop_gradient(
-        (row_of(monitor, minimum.offset), row_of(monitor, minimum.rate_left))
+    start_values = jnp.where(jnp.asarray(monitored_functions.includes_start), values, jnp.inf)
+    is_remaining = minimum.is_found & (is_phase_end | (monitors > monitor))
+    takes_next = is_phase_end | is_done
+    monitor = jnp.where(takes_next, jnp.argmax(is_remaining).astype(jnp.int32), monitor)
+    offset, start_rate = lax.stop_gradient(
+        (select_row(monitor, minimum.minimum_offset), select_row(monitor, minimum.start_rate))
     )
-    told = Settling(
+    next_refinement = MinimumRefinement(
         monitor=monitor,
-        tries=jnp.where(turns, 0, tries),
-        at=jnp.where(turns, 0.0, jnp.where(nearer, fixed_length, settling.at)),
-        rate_at=jnp.where(turns, rate_left, jnp.where(nearer, fixed_rate, settling.rate_at)),
-        lowest=jnp.where(starting, at_start, lowest),
+        n_iterations=jnp.where(takes_next, 0, n_iterations),
+        best_length=jnp.where(
+            takes_next, 0.0, jnp.where(is_better, constant_length, refinement.best_length)
+        ),
+        best_rate=jnp.where(
+            takes_next, start_rate, jnp.where(is_better, constant_rate, refinement.best_rate)
+        ),
+        lowest_values=jnp.where(is_starting, start_values, lowest),
     )
-    return told, jnp.where(turns, jnp.any(left), on), jnp.where(turns, offset, secant)
+    return (
+        next_refinement,
+        jnp.where(takes_next, jnp.any(is_remaining), is_refining),
+        jnp.where(takes_next, offset, secant),
+    )
 
 
-FEWEST = 3
+MIN_REFINEMENT_TRIES = 3
 """Least number of tries at a minimum, chosen because each makes the location's derivatives accurate
 to more digits."""
-AT_MINIMUM = 1e-6
+MINIMUM_LOCATION_TOLERANCE = 1e-6
 """Accuracy of a minimum's location, in lengths of the step that holds it, chosen because the error
 of the value is the square of it."""

@@ -10,12 +10,20 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from vrw_jax.numerics.derivatives import with_jacobian, without_derivative
+from vrw_jax.numerics.derivatives import value_and_jacobian, zero_tangent
 from vrw_jax.numerics.types import Scalar
-from vrw_jax.wording import as_text, function_of, listed, positive, reals, told, whole
+from vrw_jax.wording import (
+    check_callable,
+    check_int,
+    check_positive,
+    check_reals,
+    format_numbers,
+    format_quantity,
+    format_text,
+)
 
 
-class SectionCycle(NamedTuple):
+class FixedPointResult(NamedTuple):
     """A fixed point of a map, and the map's Jacobian there.
 
     - `x`: the point, shape (n,);
@@ -33,32 +41,32 @@ class SectionCycle(NamedTuple):
     jacobian: Float[Array, "n n"]
     residual: Scalar
     converged: Bool[Array, ""]
-    iterations: Int[Array, ""]
+    n_iterations: Int[Array, ""]
 
     def __repr__(self) -> str:
         if isinstance(self.x, jax.core.Tracer) or np.ndim(self.x) != 1:
             return f"SectionCycle{tuple(self)}"
         rows = (
-            ("converged", f"{bool(self.converged)}, after {int(self.iterations)} iterations"),
-            ("x", listed(self.x)),
-            ("residual", told(self.residual, "")),
-            ("multipliers", listed(np.linalg.eigvals(self.jacobian))),
+            ("converged", f"{bool(self.converged)}, after {int(self.n_iterations)} iterations"),
+            ("x", format_numbers(self.x)),
+            ("residual", format_quantity(self.residual, "")),
+            ("multipliers", format_numbers(np.linalg.eigvals(self.jacobian))),
         )
-        return as_text("SectionCycle", rows)
+        return format_text("FixedPointResult", rows)
 
 
-ITERATIONS = 30
+MAX_NEWTON_ITERATIONS = 30
 """Default limit of Newton's iterations."""
 
 
-def newton_cycle(
+def solve_fixed_point(
     function: Callable[[Array], Array],
     start: Float[Array, " n"],
     *,
     period_n: int = 1,
     tolerance: float | Scalar = 1e-12,
-    iterations: int = ITERATIONS,
-) -> SectionCycle:
+    max_iterations: int = MAX_NEWTON_ITERATIONS,
+) -> FixedPointResult:
     """Solve for a fixed point of `function` applied `period_n` times, by Newton's method from
     `start`.
 
@@ -85,38 +93,40 @@ def newton_cycle(
         0.739085 True
     """
 
-    return _cycle_of(_found, function, start, period_n, tolerance, iterations)
+    return _solve_checked(_run_newton, function, start, period_n, tolerance, max_iterations)
 
 
-def moved_cycle(
+def solve_fixed_point_implicit(
     function: Callable[[Array], Array],
     start: Float[Array, " n"],
     *,
     period_n: int = 1,
     tolerance: float | Scalar = 1e-12,
-) -> SectionCycle:
+) -> FixedPointResult:
     """Solve for a fixed point of a map whose second derivatives are expensive.
 
     The point's first derivatives require only first derivatives of `function`, and its second
     derivatives second ones. Derivatives of the Jacobian are NaN.
     """
-    return _cycle_of(_found_apart, function, start, period_n, tolerance, ITERATIONS)
+    return _solve_checked(
+        _run_newton_implicit, function, start, period_n, tolerance, MAX_NEWTON_ITERATIONS
+    )
 
 
-def _cycle_of(
-    found: Callable[..., SectionCycle],
+def _solve_checked(
+    run_newton: Callable[..., FixedPointResult],
     function: Callable[[Array], Array],
     start: Any,
     period_n: int,
     tolerance: float | Scalar,
     iterations: int,
-) -> SectionCycle:
+) -> FixedPointResult:
     """Validate the arguments, and solve with one of the two methods below."""
-    function_of("function", function, "that maps a state to the next")
-    start, period_n = reals("start", start), whole("period_n", period_n)
-    iterations = whole("iterations", iterations)
+    check_callable("function", function, "that maps a state to the next")
+    start, period_n = check_reals("start", start), check_int("period_n", period_n)
+    iterations = check_int("iterations", iterations)
     if not isinstance(tolerance, jax.Array):
-        positive("tolerance", tolerance)
+        check_positive("tolerance", tolerance)
 
     def iterate(x: Array) -> Array:
         for _ in range(period_n):
@@ -124,105 +134,138 @@ def _cycle_of(
         return x
 
     start = lax.stop_gradient(start)
-    told = jax.eval_shape(function, start)
-    if getattr(told, "shape", None) != start.shape:
-        what = getattr(told, "shape", type(told).__name__)
+    output = jax.eval_shape(function, start)
+    if getattr(output, "shape", None) != start.shape:
+        description = getattr(output, "shape", type(output).__name__)
         raise ValueError(
-            f"the map gives {what} for a start of shape {start.shape}, but it must give its like: "
+            f"the map gives {description} for a start of shape {start.shape}, but it must give its like: "
             "take a map of a state to the next."
         )
-    image, closed_over = jax.closure_convert(iterate, start)
+    converted_map, closed_over = jax.closure_convert(iterate, start)
     tolerance = lax.stop_gradient(jnp.asarray(tolerance, start.dtype))
-    return found(image, iterations, start, tolerance, *closed_over)
+    return run_newton(converted_map, iterations, start, tolerance, *closed_over)
 
 
-Map = Callable[..., Array]
+ConvertedMap = Callable[..., Array]
 
 
-def _correction(image: Map, x: Array, closed_over: tuple) -> tuple[Array, Array, Array]:
+def _newton_correction(
+    converted_map: ConvertedMap, x: Array, closed_over: tuple
+) -> tuple[Array, Array, Array]:
     """Return Newton's correction, the map's Jacobian, and the defect of the map."""
-    reached, jacobian = with_jacobian(lambda y: image(y, *closed_over), x)
-    miss = reached - x
-    return jnp.linalg.solve(jnp.eye(x.size, dtype=x.dtype) - jacobian, miss), jacobian, miss
+    image_point, jacobian = value_and_jacobian(lambda y: converted_map(y, *closed_over), x)
+    defect = image_point - x
+    return jnp.linalg.solve(jnp.eye(x.size, dtype=x.dtype) - jacobian, defect), jacobian, defect
 
 
-POLISHED = 2
+N_DERIVATIVE_ITERATIONS = 2
 """Number of iterations with derivatives, chosen because one from a point without derivatives yields
 only its first."""
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _found(
-    image: Map, iterations: int, start: Array, tolerance: Array, *closed_over: Any
-) -> SectionCycle:
+def _run_newton(
+    converted_map: ConvertedMap, iterations: int, start: Array, tolerance: Array, *closed_over: Any
+) -> FixedPointResult:
     """Run Newton's method in one loop, so that the map, often a large program, is compiled once."""
 
-    def searches(size: Array, count: Array) -> Array:
-        return (size > tolerance) & (count < iterations) & jnp.isfinite(size)
+    def is_searching(correction_norm: Array, n_iterations: Array) -> Array:
+        return (
+            (correction_norm > tolerance)
+            & (n_iterations < iterations)
+            & jnp.isfinite(correction_norm)
+        )
 
-    def going(state: tuple) -> Array:
-        _, size, count, followed, *_ = state
-        return searches(size, count) | ((size <= tolerance) & (followed < POLISHED))
+    def needs_iteration(state: tuple) -> Array:
+        _, correction_norm, n_iterations, n_derivative_iterations, *_ = state
+        return is_searching(correction_norm, n_iterations) | (
+            (correction_norm <= tolerance) & (n_derivative_iterations < N_DERIVATIVE_ITERATIONS)
+        )
 
-    def step(state: tuple) -> tuple:
-        x, size, count, followed, *_ = state
-        searching = searches(size, count)
-        change, jacobian, miss = _correction(image, x, closed_over)
-        size = jnp.max(
-            jnp.abs(change)
+    def iterate_newton(state: tuple) -> tuple:
+        x, correction_norm, n_iterations, n_derivative_iterations, *_ = state
+        is_searching_now = is_searching(correction_norm, n_iterations)
+        correction, jacobian, defect = _newton_correction(converted_map, x, closed_over)
+        correction_norm = jnp.max(
+            jnp.abs(correction)
         )  # checked in the last iterations too: the map may jump next to the point
-        moved = jnp.where(jnp.all(jnp.isfinite(change)), x + change, x)
-        told = jacobian, jnp.max(jnp.abs(miss))
-        return moved, size, count + searching, followed + ~searching, *told
+        next_x = jnp.where(jnp.all(jnp.isfinite(correction)), x + correction, x)
+        jacobian_and_residual = jacobian, jnp.max(jnp.abs(defect))
+        return (
+            next_x,
+            correction_norm,
+            n_iterations + is_searching_now,
+            n_derivative_iterations + ~is_searching_now,
+            *jacobian_and_residual,
+        )
 
-    zero, one = jnp.zeros((), jnp.int32), jnp.ones((), start.dtype)
-    begin = start, one, zero, zero, jnp.zeros((start.size,) * 2, start.dtype), one
-    x, size, count, _, jacobian, residual = lax.while_loop(going, step, begin)
-    converged = size <= tolerance
-    return SectionCycle(jnp.where(converged, x, start), jacobian, residual, converged, count)
+    zero, unit_norm = jnp.zeros((), jnp.int32), jnp.ones((), start.dtype)
+    initial_state = (
+        start,
+        unit_norm,
+        zero,
+        zero,
+        jnp.zeros((start.size,) * 2, start.dtype),
+        unit_norm,
+    )
+    x, correction_norm, n_iterations, _, jacobian, residual = lax.while_loop(
+        needs_iteration, iterate_newton, initial_state
+    )
+    is_converged = correction_norm <= tolerance
+    return FixedPointResult(
+        jnp.where(is_converged, x, start), jacobian, residual, is_converged, n_iterations
+    )
 
 
-@_found.defjvp
-def _found_and_moved(
-    image: Map, iterations: int, primals: tuple, tangents: tuple
-) -> tuple[SectionCycle, SectionCycle]:
+@_run_newton.defjvp
+def _run_newton_jvp(
+    converted_map: ConvertedMap, iterations: int, primals: tuple, tangents: tuple
+) -> tuple[FixedPointResult, FixedPointResult]:
     """Return the tangent, by iterations from the fixed point that carry derivatives."""
     start, _, *closed_over = primals
-    found = _found(image, iterations, *lax.stop_gradient(primals))
+    result = _run_newton(converted_map, iterations, *lax.stop_gradient(primals))
 
-    def polished(*closed_over: Any) -> SectionCycle:
-        def polish(point: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
-            change, jacobian, miss = _correction(image, point, closed_over)
-            moved = point + jnp.where(found.converged, change, 0.0)
-            return moved, (jacobian, jnp.max(jnp.abs(miss)))
+    def solve_from_fixed_point(*closed_over: Any) -> FixedPointResult:
+        def iterate_with_derivatives(point: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
+            correction, jacobian, defect = _newton_correction(converted_map, point, closed_over)
+            next_point = point + jnp.where(result.converged, correction, 0.0)
+            return next_point, (jacobian, jnp.max(jnp.abs(defect)))
 
-        point, (jacobians, residuals) = lax.scan(polish, found.x, None, length=POLISHED)
-        x = jnp.where(found.converged, point, start)
-        return SectionCycle(x, jacobians[-1], residuals[-1], found.converged, found.iterations)
+        point, (jacobians, residuals) = lax.scan(
+            iterate_with_derivatives, result.x, None, length=N_DERIVATIVE_ITERATIONS
+        )
+        x = jnp.where(result.converged, point, start)
+        return FixedPointResult(
+            x, jacobians[-1], residuals[-1], result.converged, result.n_iterations
+        )
 
-    return jax.jvp(polished, tuple(closed_over), tuple(tangents[2:]))
+    return jax.jvp(solve_from_fixed_point, tuple(closed_over), tuple(tangents[2:]))
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _found_apart(
-    image: Map, iterations: int, start: Array, tolerance: Array, *closed_over: Any
-) -> SectionCycle:
-    return _found(image, iterations, start, tolerance, *closed_over)
+def _run_newton_implicit(
+    converted_map: ConvertedMap, iterations: int, start: Array, tolerance: Array, *closed_over: Any
+) -> FixedPointResult:
+    return _run_newton(converted_map, iterations, start, tolerance, *closed_over)
 
 
-@_found_apart.defjvp
-def _point_moved(
-    image: Map, iterations: int, primals: tuple, tangents: tuple
-) -> tuple[SectionCycle, SectionCycle]:
+@_run_newton_implicit.defjvp
+def _run_newton_implicit_jvp(
+    converted_map: ConvertedMap, iterations: int, primals: tuple, tangents: tuple
+) -> tuple[FixedPointResult, FixedPointResult]:
     """Return the tangent by the implicit function theorem, at a point that is differentiated by
     this rule.
     """
-    found = _found_apart(image, iterations, *primals)
-    closed_over, moves = tuple(primals[2:]), tuple(tangents[2:])
-    _, by_map = jax.jvp(lambda *some: image(found.x, *some), closed_over, moves)
-    _, jacobian = with_jacobian(lambda x: image(x, *closed_over), found.x)
-    moved = jnp.linalg.solve(jnp.eye(found.x.size, dtype=found.x.dtype) - jacobian, by_map)
-    moved = jnp.where(found.converged, moved, 0.0)
-    unknown = jnp.full_like(jacobian, jnp.nan) * jnp.sum(moved)
-    nothing = without_derivative(found)
-    return found, nothing._replace(x=moved, jacobian=unknown)
+    result = _run_newton_implicit(converted_map, iterations, *primals)
+    closed_over, closed_over_tangents = tuple(primals[2:]), tuple(tangents[2:])
+    _, map_tangent = jax.jvp(
+        lambda *arguments: converted_map(result.x, *arguments), closed_over, closed_over_tangents
+    )
+    _, jacobian = value_and_jacobian(lambda x: converted_map(x, *closed_over), result.x)
+    point_tangent = jnp.linalg.solve(
+        jnp.eye(result.x.size, dtype=result.x.dtype) - jacobian, map_tangent
+    )
+    point_tangent = jnp.where(result.converged, point_tangent, 0.0)
+    unknown_jacobian = jnp.full_like(jacobian, jnp.nan) * jnp.sum(point_tangent)
+    zero_result = zero_tangent(result)
+    return result, zero_result._replace(x=point_tangent, jacobian=unknown_jacobian)

@@ -9,8 +9,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.numerics.types import Number, Scalar
-from vrw_jax.wording import AbstractTold, Row, chosen, positive, reals, told, whole
+from vrw_jax.numerics.types import RealInput, Scalar
+from vrw_jax.wording import (
+    AbstractPrintable,
+    TextRow,
+    check_choice,
+    check_int,
+    check_positive,
+    check_reals,
+    format_quantity,
+)
 
 SolverName = Literal[
     "Dopri8", "Tsit5", "Dopri5", "Bosh3", "Heun", "Midpoint", "Ralston",
@@ -18,28 +26,28 @@ SolverName = Literal[
 ]  # fmt: skip
 """Names of diffrax's Runge-Kutta solvers with an error estimate: explicit ones, then implicit
 ones."""
-SOLVERS: tuple[str, ...] = get_args(SolverName)
+SOLVER_NAMES: tuple[str, ...] = get_args(SolverName)
 
-Engine = Literal["auto", "lanes", "diffrax"]
+EngineName = Literal["auto", "lanes", "diffrax"]
 """Names of the engines that integrate the steps of wheels with compliant legs."""
 
-FLOOR = 90.0
+TIGHTENING_FLOOR_EPS = 90.0
 """Units of round-off below which tolerances are not tightened (2e-14 in float64).
 
 It is chosen because a walk of many steps gains nothing below it.
 """
-LEAST = 4.5
+MIN_TOLERANCE_EPS = 4.5
 """Least tolerance allowed in float64, in units of round-off.
 
 It is chosen because a walk of few steps that grazes a guard gains accuracy down to it.
 """
 
 
-def _positive(name: str, default: float) -> Any:
-    return eqx.field(converter=functools.partial(reals, name), default=default)
+def _positive_field(name: str, default: float) -> Any:
+    return eqx.field(converter=functools.partial(check_reals, name), default=default)
 
 
-class Options(AbstractTold):
+class StepOptions(AbstractPrintable):
     """Numerical options of an event-driven step; the tolerances may change without recompiling.
 
     - `solver`: one of `SOLVER_NAMES`, diffrax's Runge-Kutta solvers with an error estimate;
@@ -62,88 +70,98 @@ class Options(AbstractTold):
     """
 
     solver: str = eqx.field(static=True, default="Dopri8")
-    engine: Engine = eqx.field(static=True, default="auto")
-    rtol: Scalar = _positive("rtol", 1e-10)
-    atol: Scalar = _positive("atol", 1e-10)
-    derivative_tightening: Scalar = _positive("derivative_tightening", 20.0)
-    max_phase_time: Scalar = _positive("max_phase_time", 20.0)
+    engine: EngineName = eqx.field(static=True, default="auto")
+    rtol: Scalar = _positive_field("rtol", 1e-10)
+    atol: Scalar = _positive_field("atol", 1e-10)
+    derivative_tightening: Scalar = _positive_field("derivative_tightening", 20.0)
+    max_phase_time: Scalar = _positive_field("max_phase_time", 20.0)
     max_solver_steps: int = eqx.field(static=True, default=20_000)
-    first_step: Scalar = _positive("first_step", 5e-3)
-    event_steps: int = eqx.field(static=True, default=100)
-    monitor_steps: int = eqx.field(static=True, default=5)
+    dt0: Scalar = _positive_field("dt0", 5e-3)
+    max_event_iterations: int = eqx.field(static=True, default=100)
+    max_margin_search_iterations: int = eqx.field(static=True, default=5)
 
     if TYPE_CHECKING:
 
         def __init__(
             self,
             solver: SolverName = "Dopri8",
-            engine: Engine = "auto",
-            rtol: Number = 1e-10,
-            atol: Number = 1e-10,
-            derivative_tightening: Number = 20.0,
-            max_phase_time: Number = 20.0,
+            engine: EngineName = "auto",
+            rtol: RealInput = 1e-10,
+            atol: RealInput = 1e-10,
+            derivative_tightening: RealInput = 20.0,
+            max_phase_time: RealInput = 20.0,
             max_solver_steps: int = 20_000,
-            first_step: Number = 5e-3,
-            event_steps: int = 100,
-            monitor_steps: int = 5,
+            dt0: RealInput = 5e-3,
+            max_event_iterations: int = 100,
+            max_margin_search_iterations: int = 5,
         ) -> None: ...
 
     def __check_init__(self) -> None:
-        chosen("solver", self.solver, SOLVERS)
-        chosen("engine", self.engine, get_args(Engine))
-        for name in ("rtol", "atol", "derivative_tightening", "max_phase_time", "first_step"):
+        check_choice("solver", self.solver, SOLVER_NAMES)
+        check_choice("engine", self.engine, get_args(EngineName))
+        for name in ("rtol", "atol", "derivative_tightening", "max_phase_time", "dt0"):
             value = getattr(self, name)
             if not isinstance(value, jax.core.Tracer) and jnp.ndim(value) == 0:
-                positive(name, value)
-        for name in ("max_solver_steps", "event_steps", "monitor_steps"):
-            whole(name, getattr(self, name))
+                check_positive(name, value)
+        for name in ("max_solver_steps", "max_event_iterations", "max_margin_search_iterations"):
+            check_int(name, getattr(self, name))
 
-    def rows(self) -> list[Row]:
-        units = {"max_phase_time": "s", "first_step": "s"}
+    def summary_rows(self) -> list[TextRow]:
+        units = {"max_phase_time": "s", "dt0": "s"}
         return [
-            (name, value if isinstance(value, str) else told(value, units.get(name, "")))
+            (name, value if isinstance(value, str) else format_quantity(value, units.get(name, "")))
             for name, value in vars(self).items()
         ]
 
-    def by(self, engine: Engine) -> "Options":
+    def with_engine(self, engine: EngineName) -> "StepOptions":
         """Return these options with another engine; "auto" leaves the engine as it is."""
-        chosen("engine", engine, get_args(Engine))
+        check_choice("engine", engine, get_args(EngineName))
         return self if engine == "auto" else dataclasses.replace(self, engine=engine)
 
     @classmethod
-    def tight(cls) -> "Options":
+    def tight(cls) -> "StepOptions":
         """Return options with the tightest useful tolerances in float64: steps accurate to about
         1e-12.
         """
         return cls(rtol=1e-13, atol=1e-13)
 
-    def for_derivatives(self) -> "Options":
+    def with_derivative_tolerances(self) -> "StepOptions":
         """Return these options with tolerances tightened for derivatives, down to round-off."""
-        return self.tightened(self.derivative_tightening)
+        return self.with_tightened_tolerances(self.derivative_tightening)
 
-    def tightened(self, factor: Scalar | float) -> "Options":
+    def with_tightened_tolerances(self, factor: Scalar | float) -> "StepOptions":
         """Return these options with tolerances divided by `factor`, down to round-off."""
-        both = self.rtol, self.atol
-        return eqx.tree_at(lambda o: (o.rtol, o.atol), self, _tightened(both, factor))
+        tolerances = self.rtol, self.atol
+        return eqx.tree_at(
+            lambda o: (o.rtol, o.atol), self, _tighten_tolerances(tolerances, factor)
+        )
 
-    def require_reachable(self, dtype: np.dtype) -> None:
+    def check_tolerances(self, dtype: np.dtype) -> None:
         """Raise a ValueError for a tolerance below the resolution of the number format."""
-        floor = (LEAST if dtype == np.float64 else FLOOR) * float(jnp.finfo(dtype).eps)
+        min_tolerance = (
+            MIN_TOLERANCE_EPS if dtype == np.float64 else TIGHTENING_FLOOR_EPS
+        ) * float(jnp.finfo(dtype).eps)
         for name in ("rtol", "atol"):
             value = getattr(self, name)
-            if isinstance(value, jax.core.Tracer) or np.ndim(value) or np.asarray(value) >= floor:
+            if (
+                isinstance(value, jax.core.Tracer)
+                or np.ndim(value)
+                or np.asarray(value) >= min_tolerance
+            ):
                 continue
-            enough = 1e2 * floor
-            hint = f"ask for no less, as with Options(rtol={enough:.0e}, atol={enough:.0e})"
+            suggested_tolerance = 1e2 * min_tolerance
+            hint = f"ask for no less, as with StepOptions(rtol={suggested_tolerance:.0e}, atol={suggested_tolerance:.0e})"
             if dtype == np.float32:
                 hint = "call vrw.start_jax() before anything else, or " + hint
             raise ValueError(
                 f"{name} is {float(value):g}, but {np.dtype(dtype).name} numbers can't resolve "
-                f"less than {floor:.0e}: {hint}."
+                f"less than {min_tolerance:.0e}: {hint}."
             )
 
 
 @jax.jit
-def _tightened(tolerances: tuple[Scalar, ...], factor: Scalar | float) -> tuple[Scalar, ...]:
-    floor = FLOOR * jnp.finfo(tolerances[0].dtype).eps
-    return tuple(jnp.maximum(x / factor, jnp.minimum(floor, x)) for x in tolerances)
+def _tighten_tolerances(
+    tolerances: tuple[Scalar, ...], factor: Scalar | float
+) -> tuple[Scalar, ...]:
+    min_tolerance = TIGHTENING_FLOOR_EPS * jnp.finfo(tolerances[0].dtype).eps
+    return tuple(jnp.maximum(x / factor, jnp.minimum(min_tolerance, x)) for x in tolerances)

@@ -11,14 +11,17 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from vrw_jax.numerics.events import sample_phase
-from vrw_jax.numerics.hybrid import Guard, Mode, Walk
-from vrw_jax.numerics.options import Options
+from vrw_jax.numerics.hybrid import Guard, HybridSolution, Mode
+from vrw_jax.numerics.options import StepOptions
 from vrw_jax.numerics.types import Scalar
-from vrw_jax.wording import reals
+from vrw_jax.wording import check_reals
 
 
-def volume_change(
-    modes: Sequence[Mode], start: ArrayLike | Sequence, told: Walk, options: Options | None = None
+def flow_jacobian_determinant(
+    modes: Sequence[Mode],
+    start: ArrayLike | Sequence,
+    solution: HybridSolution,
+    options: StepOptions | None = None,
 ) -> Scalar:
     """Return the determinant of the final state's Jacobian with respect to `start`, past the last
     event.
@@ -32,46 +35,55 @@ def volume_change(
 
     The result is NaN if the solver steps are spent. Transforms apply.
     """
-    options = Options() if options is None else options
-    start = reals("start", start)
-    pairs = [_factor(mode, guard, options) for mode in modes for guard in mode.guards]
-    firsts = jnp.cumsum(jnp.asarray([0, *(len(mode.guards) for mode in modes)]))[:-1]
-    begin = jnp.concatenate([start[None], told.after[:-1]])
-    durations = jnp.diff(told.times, prepend=0.0)
-    following = jnp.append(told.modes[1:], told.mode)
-    count = jnp.arange(len(told.times))
-    following = jnp.where(count == told.n_events - 1, told.mode, following)
+    options = StepOptions() if options is None else options
+    start = check_reals("start", start)
+    event_factors = [_event_factor(mode, guard, options) for mode in modes for guard in mode.guards]
+    first_guards = jnp.cumsum(jnp.asarray([0, *(len(mode.guards) for mode in modes)]))[:-1]
+    phase_starts = jnp.concatenate([start[None], solution.states_after[:-1]])
+    durations = jnp.diff(solution.times, prepend=0.0)
+    next_modes = jnp.append(solution.modes[1:], solution.mode)
+    count = jnp.arange(len(solution.times))
+    next_modes = jnp.where(count == solution.n_events - 1, solution.mode, next_modes)
     fields = [mode.field for mode in modes]
 
-    def event(product: Array, own: tuple) -> tuple[Array, None]:
-        k, state, before, after, duration, pair, next_mode = own
-        flow = lax.switch(next_mode, fields, after)
-        factor = lax.switch(pair, pairs, state, before, flow, duration)
-        return product * jnp.where(k < told.n_events, factor, 1.0), None
+    def multiply_event(product: Array, event_data: tuple) -> tuple[Array, None]:
+        k, state, state_before, state_after, duration, factor_index, next_mode = event_data
+        next_flow = lax.switch(next_mode, fields, state_after)
+        factor = lax.switch(factor_index, event_factors, state, state_before, next_flow, duration)
+        return product * jnp.where(k < solution.n_events, factor, 1.0), None
 
-    each = (
-        count, begin, told.before, told.after, durations, firsts[told.modes] + told.guards,
-        following,
+    event_table = (
+        count, phase_starts, solution.states_before, solution.states_after, durations, first_guards[solution.modes] + solution.guards,
+        next_modes,
     )  # fmt: skip
-    return lax.scan(event, jnp.ones((), start.dtype), each)[0]
+    return lax.scan(multiply_event, jnp.ones((), start.dtype), event_table)[0]
 
 
-def _factor(mode: Mode, guard: Guard, options: Options) -> Callable:
+def _event_factor(mode: Mode, guard: Guard, options: StepOptions) -> Callable:
     """Return the factor of one mode that this guard ends."""
 
-    def along(z: Array) -> Array:
+    def flow_with_divergence(z: Array) -> Array:
         y = z[:-2]
-        own = jnp.trace(jax.jacfwd(mode.field)(y))
-        return jnp.concatenate([mode.field(y), jnp.stack([own, jnp.ones_like(own)])])
+        divergence = jnp.trace(jax.jacfwd(mode.field)(y))
+        return jnp.concatenate([mode.field(y), jnp.stack([divergence, jnp.ones_like(divergence)])])
 
-    def factor(begin: Array, before: Array, flow: Array, duration: Array) -> Array:
-        end = sample_phase(along, jnp.append(begin, jnp.zeros(2)), duration, 2, options)[-1]
-        reached = (
+    def evaluate_factor(
+        start: Array, state_before: Array, next_flow: Array, duration: Array
+    ) -> Array:
+        end = sample_phase(
+            flow_with_divergence, jnp.append(start, jnp.zeros(2)), duration, 2, options
+        )[-1]
+        is_reached = (
             jnp.abs(end[-1] - duration) <= 1e-9 * duration
         )  # otherwise the solver steps were spent
-        reset, across = jax.jacfwd(guard.reset)(before), jax.jacfwd(guard.value)(before)
-        moves = mode.field(before)
-        saltation = reset + jnp.outer(flow - reset @ moves, across) / (across @ moves)
-        return jnp.where(reached, jnp.exp(end[-2]) * jnp.linalg.det(saltation), jnp.nan)
+        reset_jacobian, guard_gradient = (
+            jax.jacfwd(guard.reset)(state_before),
+            jax.jacfwd(guard.value)(state_before),
+        )
+        flow_before = mode.field(state_before)
+        saltation = reset_jacobian + jnp.outer(
+            next_flow - reset_jacobian @ flow_before, guard_gradient
+        ) / (guard_gradient @ flow_before)
+        return jnp.where(is_reached, jnp.exp(end[-2]) * jnp.linalg.det(saltation), jnp.nan)
 
-    return factor
+    return evaluate_factor

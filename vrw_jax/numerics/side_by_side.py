@@ -15,89 +15,109 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.numerics.arclength import (
-    AbstractFollowed,
+    AbstractContinuationProblem,
     ArclengthOptions,
-    Corrected,
-    Linear,
-    PathPoint,
-    Plane,
-    Track,
-    Unknown,
-    begun,
-    corrected,
-    going,
-    linear_at,
-    parameter_at,
-    track_of,
-    turned,
+    ConstraintPlane,
+    ContinuationPoint,
+    ContinuationResult,
+    CorrectorState,
+    NewtonStep,
+    Unknowns,
+    correct_point,
+    init_branches,
+    is_active,
+    iterate_branches,
+    newton_step_at_fraction,
+    parameter_from_fraction,
+    to_continuation_result,
 )
-from vrw_jax.numerics.lanes import select, taken
+from vrw_jax.numerics.lanes import take_rows, tree_where
 
-AT_ONCE = 1e-2
+JACOBIAN_REUSE_FRACTION = 1e-2
 """Fraction of the tolerance below which the last Jacobian is reused.
 
 It is chosen because after a correction this small, the Jacobian of the trial before it is exact.
 """
 
 
-class Solving(NamedTuple):
+class PlaneSolveState(NamedTuple):
     """State of Newton's method for a point on a plane."""
 
-    now: Corrected
-    tries: Int[Array, ""]
-    settled: Int[Array, ""]
+    corrector: CorrectorState
+    n_iterations: Int[Array, ""]
+    n_converged: Int[Array, ""]
 
 
-def to_solve(z: Unknown, plane: Plane) -> Solving:
+def init_plane_solve(z: Unknowns, plane: ConstraintPlane) -> PlaneSolveState:
     """Return the initial state of Newton's method on a plane."""
-    n, flat, none = plane.x.shape[0], jax.tree.map(jnp.zeros_like, z), jnp.zeros((), jnp.int32)
-    nothing = jnp.zeros((n, n), plane.x.dtype)
-    first = Corrected(z, plane.share, jnp.ones_like(plane.share), flat, nothing)
-    return Solving(first, none, none)
+    n_section, zero_tangent, zero_count = (
+        plane.section_state.shape[0],
+        jax.tree.map(jnp.zeros_like, z),
+        jnp.zeros((), jnp.int32),
+    )
+    zero_jacobian = jnp.zeros((n_section, n_section), plane.section_state.dtype)
+    initial_corrector = CorrectorState(
+        z, plane.fraction, jnp.ones_like(plane.fraction), zero_tangent, zero_jacobian
+    )
+    return PlaneSolveState(initial_corrector, zero_count, zero_count)
 
 
-def unsolved(options: ArclengthOptions, on: Solving) -> Array:
+def needs_iteration(options: ArclengthOptions, state: PlaneSolveState) -> Array:
     """Return whether Newton's method needs another iteration."""
-    return (on.settled < 2) & (on.tries < options.iterations) & jnp.isfinite(on.now.size)
+    return (
+        (state.n_converged < 2)
+        & (state.n_iterations < options.max_newton_iterations)
+        & jnp.isfinite(state.corrector.correction_norm)
+    )
 
 
-def nearer(
-    followed: AbstractFollowed,
+def iterate_plane_solve(
+    problem: AbstractContinuationProblem,
     options: ArclengthOptions,
     bounds: Array,
-    plane: Plane,
-    on: Solving,
-    linear: Linear,
-) -> Solving:
+    plane: ConstraintPlane,
+    state: PlaneSolveState,
+    newton_step: NewtonStep,
+) -> PlaneSolveState:
     """Return the state after one Newton iteration."""
-    now = on.now
-    following = corrected(followed, linear, bounds, plane, now.z, now.share)
+    corrector = state.corrector
+    next_corrector = correct_point(
+        problem, newton_step, bounds, plane, corrector.z, corrector.fraction
+    )
     # A trial that is not finite keeps its state, so that no NaN reaches other batch elements.
-    sound = jnp.isfinite(following.size)
-    following = select(sound, following, now)._replace(size=following.size)
-    counts = jnp.where(following.size < AT_ONCE * options.tolerance, 2, 1)
-    settled = jnp.where(following.size < options.tolerance, on.settled + counts, 0)
-    return Solving(following, on.tries + 1, settled)
+    is_valid = jnp.isfinite(next_corrector.correction_norm)
+    next_corrector = tree_where(is_valid, next_corrector, corrector)._replace(
+        correction_norm=next_corrector.correction_norm
+    )
+    n_counted = jnp.where(
+        next_corrector.correction_norm < JACOBIAN_REUSE_FRACTION * options.tolerance, 2, 1
+    )
+    n_converged = jnp.where(
+        next_corrector.correction_norm < options.tolerance, state.n_converged + n_counted, 0
+    )
+    return PlaneSolveState(next_corrector, state.n_iterations + 1, n_converged)
 
 
-def solution(
-    followed: AbstractFollowed, wheel: Any, bounds: Array, on: Solving
-) -> tuple[PathPoint, Bool[Array, ""]]:
+def finish_plane_solve(
+    problem: AbstractContinuationProblem, args: Any, bounds: Array, state: PlaneSolveState
+) -> tuple[ContinuationPoint, Bool[Array, ""]]:
     """Return the point of a finished solve, and whether it converged."""
-    now, p = on.now, parameter_at(on.now.share, bounds)
-    valid = followed.valid(wheel, now.z, p)
-    return PathPoint(now.z, p, (), jnp.ones_like(p), now.jacobian, valid), on.settled >= 1
+    corrector, p = state.corrector, parameter_from_fraction(state.corrector.fraction, bounds)
+    is_admissible = problem.is_admissible(args, corrector.z, p)
+    return ContinuationPoint(
+        corrector.z, p, (), jnp.ones_like(p), corrector.jacobian, is_admissible
+    ), state.n_converged >= 1
 
 
 @eqx.filter_jit
-def solve(
-    followed: AbstractFollowed,
+def solve_on_plane(
+    problem: AbstractContinuationProblem,
     options: ArclengthOptions,
-    wheel: Any,
-    z: Unknown,
-    plane: Plane,
+    args: Any,
+    z: Unknowns,
+    plane: ConstraintPlane,
     bounds: Float[Array, "2"],
-) -> tuple[PathPoint, Bool[Array, ""]]:
+) -> tuple[ContinuationPoint, Bool[Array, ""]]:
     """Solve for the point of the branch on a plane, from z near it; return it and whether it
     converged.
 
@@ -105,80 +125,108 @@ def solve(
     the Jacobian is then as exact as the point.
     """
 
-    def iterate(on: Solving) -> Solving:
-        linear = linear_at(followed, wheel, bounds, on.now.z, on.now.share)
-        return nearer(followed, options, bounds, plane, on, linear)
+    def iterate_once(state: PlaneSolveState) -> PlaneSolveState:
+        newton_step = newton_step_at_fraction(
+            problem, args, bounds, state.corrector.z, state.corrector.fraction
+        )
+        return iterate_plane_solve(problem, options, bounds, plane, state, newton_step)
 
-    open_ = functools.partial(unsolved, options)
-    return solution(followed, wheel, bounds, lax.while_loop(open_, iterate, to_solve(z, plane)))
+    needs_more = functools.partial(needs_iteration, options)
+    return finish_plane_solve(
+        problem, args, bounds, lax.while_loop(needs_more, iterate_once, init_plane_solve(z, plane))
+    )
 
 
-def follow_many(
-    followed: AbstractFollowed,
+def continue_many_from(
+    problem: AbstractContinuationProblem,
     options: ArclengthOptions,
-    wheels: Any,
-    z: Unknown,
+    batch_args: Any,
+    z: Unknowns,
     p: Float[Array, " branches"],
     bounds: Float[Array, "2"],
     directions: Float[Array, " branches"],
-    wanted: Bool[Array, " branches"],
-) -> Track:
+    is_requested: Bool[Array, " branches"],
+) -> ContinuationResult:
     """Continue branches as `arclength.continue_from` does, outside of compiled code."""
-    on, rows = begun(followed, options, z, p, bounds, directions, wanted), jnp.arange(len(p))
-    while np.any(open_ := np.asarray(_going(on))):
-        trial = on[0].trial
-        linears = _linear_of(followed, wheels, bounds, trial.z, trial.share, open_)
-        on = _turned(followed, options, wheels, bounds, directions, rows, on, linears)
-    return track_of(on)
+    state, row_indices = (
+        init_branches(problem, options, z, p, bounds, directions, is_requested),
+        jnp.arange(len(p)),
+    )
+    while np.any(is_open := np.asarray(_is_active_jit(state))):
+        trial = state[0].trial
+        newton_steps = _linearize_selected(
+            problem, batch_args, bounds, trial.z, trial.fraction, is_open
+        )
+        state = _iterate_branches_jit(
+            problem, options, batch_args, bounds, directions, row_indices, state, newton_steps
+        )
+    return to_continuation_result(state)
 
 
-def _linear_of(
-    followed: AbstractFollowed, wheels: Any, bounds: Array, z: Unknown, share: Array, some: Any
-) -> Linear:
+def _linearize_selected(
+    problem: AbstractContinuationProblem,
+    batch_args: Any,
+    bounds: Array,
+    z: Unknowns,
+    fraction: Array,
+    is_selected: Any,
+) -> NewtonStep:
     """Return the Newton steps of the selected branches; those of the others are NaN."""
-    low, high = np.asarray(bounds)
-    p = low + (high - low) * np.asarray(share)
-    there = followed.linearise(*jax.device_put(taken((wheels, z, p), some)))
-    blank = lambda x: np.full((len(some), *x.shape[1:]), np.nan)
-    whole = jax.tree.map(blank, there)
-    for to, x in zip(jax.tree.leaves(whole), jax.tree.leaves(there), strict=True):
-        to[some] = x
-    return jax.device_put(whole)
+    lower_bound, upper_bound = np.asarray(bounds)
+    p = lower_bound + (upper_bound - lower_bound) * np.asarray(fraction)
+    selected_steps = problem.linearize(*jax.device_put(take_rows((batch_args, z, p), is_selected)))
+    make_nan_rows = lambda x: np.full((len(is_selected), *x.shape[1:]), np.nan)
+    all_steps = jax.tree.map(make_nan_rows, selected_steps)
+    for target, x in zip(jax.tree.leaves(all_steps), jax.tree.leaves(selected_steps), strict=True):
+        target[is_selected] = x
+    return jax.device_put(all_steps)
 
 
-def solve_many(
-    followed: AbstractFollowed,
+def solve_many_on_planes(
+    problem: AbstractContinuationProblem,
     options: ArclengthOptions,
-    wheels: Any,
-    z: Unknown,
-    planes: Plane,
+    batch_args: Any,
+    z: Unknowns,
+    planes: ConstraintPlane,
     bounds: Float[Array, "2"],
-) -> tuple[PathPoint, Bool[Array, " many"]]:
+) -> tuple[ContinuationPoint, Bool[Array, " many"]]:
     """Solve for many points as `solve_on_plane` does; all arrays have a leading axis."""
-    on = _to_solve_many(z, planes)
-    while np.any(open_ := np.asarray(_unsolved(options, on))):
-        linear = _linear_of(followed, wheels, bounds, on.now.z, on.now.share, open_)
-        on = _nearer_many(followed, options, bounds, planes, on, linear)
-    return _solutions(followed, wheels, bounds, on)
+    state = _init_plane_solves(z, planes)
+    while np.any(is_open := np.asarray(_needs_iteration_jit(options, state))):
+        newton_step = _linearize_selected(
+            problem, batch_args, bounds, state.corrector.z, state.corrector.fraction, is_open
+        )
+        state = _iterate_plane_solves(problem, options, bounds, planes, state, newton_step)
+    return _finish_plane_solves(problem, batch_args, bounds, state)
 
 
-_going: Any = eqx.filter_jit(going)
-_turned: Any = eqx.filter_jit(turned)
-_to_solve_many: Any = eqx.filter_jit(jax.vmap(to_solve))
-_unsolved: Any = eqx.filter_jit(unsolved)
-
-
-@eqx.filter_jit
-def _solutions(followed: AbstractFollowed, wheels: Any, bounds: Array, on: Solving) -> Any:
-    return jax.vmap(lambda wheel, on: solution(followed, wheel, bounds, on))(wheels, on)
+_is_active_jit: Any = eqx.filter_jit(is_active)
+_iterate_branches_jit: Any = eqx.filter_jit(iterate_branches)
+_init_plane_solves: Any = eqx.filter_jit(jax.vmap(init_plane_solve))
+_needs_iteration_jit: Any = eqx.filter_jit(needs_iteration)
 
 
 @eqx.filter_jit
-def _nearer_many(
-    followed: AbstractFollowed, options: Any, bounds: Array, planes: Plane, *of: Any
-) -> Solving:
-    def one(plane: Plane, on: Solving, linear: Linear) -> Solving:
-        later = nearer(followed, options, bounds, plane, on, linear)
-        return select(unsolved(options, on), later, on)
+def _finish_plane_solves(
+    problem: AbstractContinuationProblem, batch_args: Any, bounds: Array, state: PlaneSolveState
+) -> Any:
+    return jax.vmap(lambda args, state: finish_plane_solve(problem, args, bounds, state))(
+        batch_args, state
+    )
 
-    return jax.vmap(one)(planes, *of)
+
+@eqx.filter_jit
+def _iterate_plane_solves(
+    problem: AbstractContinuationProblem,
+    options: Any,
+    bounds: Array,
+    planes: ConstraintPlane,
+    *states_and_steps: Any,
+) -> PlaneSolveState:
+    def iterate_one(
+        plane: ConstraintPlane, state: PlaneSolveState, newton_step: NewtonStep
+    ) -> PlaneSolveState:
+        next_state = iterate_plane_solve(problem, options, bounds, plane, state, newton_step)
+        return tree_where(needs_iteration(options, state), next_state, state)
+
+    return jax.vmap(iterate_one)(planes, *states_and_steps)

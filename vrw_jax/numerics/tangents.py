@@ -24,29 +24,29 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching
 from jaxtyping import Array
 
-from vrw_jax.numerics.derivatives import without_derivative
-from vrw_jax.numerics.lanes import if_any
-from vrw_jax.numerics.tableaus import Place, Slope, Tableau, stage_at
+from vrw_jax.numerics.derivatives import zero_tangent
+from vrw_jax.numerics.lanes import run_if_any
+from vrw_jax.numerics.tableaus import ButcherTableau, StageAcceleration, StageState, evaluate_stage
 from vrw_jax.numerics.types import Vector
 
 
-class Balance(NamedTuple):
+class ImplicitDynamics(NamedTuple):
     """The equations of motion near a state whose accelerations are known."""
 
-    residual: Callable[[Place], Vector]
+    residual: Callable[[StageState], Vector]
     """Residual of the equations of motion: left side at the state's accelerations less the right
     side."""
-    solve: Callable[[Place, Vector], Vector]
+    solve: Callable[[StageState, Vector], Vector]
     """Accelerations for which the left side equals these rows."""
 
 
-BalanceOf = Callable[[Any, Vector], Balance]
+ImplicitDynamicsFn = Callable[[Any, Vector], ImplicitDynamics]
 """A function of the constants of the equations: a tree of arrays with few tangent directions, and
 numbers with any tangent, like the start of a phase."""
 
 
-def in_directions(
-    function: Callable[[Any, Any], tuple[Any, Any]], at: Any, way: Any
+def batched_jvp_rule(
+    function: Callable[[Any, Any], tuple[Any, Any]], primals: Any, tangents: Any
 ) -> tuple[Any, Any]:
     """Return (values, tangents) of a JVP rule from a `function` that takes all directions together.
 
@@ -54,226 +54,296 @@ def in_directions(
     of directions first, of length 1 where all directions agree, and returns tangents in the same
     form.
     """
-    leaves, structure = jax.tree.flatten((at, way))
-    n_at, size = len(jax.tree.leaves(at)), len(_around(way))
+    leaves, structure = jax.tree.flatten((primals, tangents))
+    n_primals, size = len(jax.tree.leaves(primals)), len(_vmap_size(tangents))
     if size == 0:
-        values, tangents = function(at, jax.tree.map(lambda x: x[None], way))
-        return values, jax.tree.map(lambda x: x[0], tangents)
-    told: Any = None
+        values, output_tangents = function(primals, jax.tree.map(lambda x: x[None], tangents))
+        return values, jax.tree.map(lambda x: x[0], output_tangents)
+    output_structure: Any = None
 
-    def mapped(leaves: Any, axes: Any) -> tuple[list, list]:
-        nonlocal told
-        if any(axis is not None for axis in axes[:n_at]):
+    def evaluate_batched(leaves: Any, axes: Any) -> tuple[list, list]:
+        nonlocal output_structure
+        if any(axis is not None for axis in axes[:n_primals]):
             raise NotImplementedError(
                 "jax.vmap around a derivative of lanes is for its directions: what has many values "
                 "has them on the lanes' axis, the last."
             )
-        pairs = zip(leaves[n_at:], axes[n_at:], strict=True)
-        ways = [x[None] if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in pairs]
-        values, tangents = function(*jax.tree.unflatten(structure, [*leaves[:n_at], *ways]))
-        tangents = jax.tree.map(lambda x: jnp.broadcast_to(x, (size, *x.shape[1:])), tangents)
-        found, told = jax.tree.flatten((values, tangents))
+        pairs = zip(leaves[n_primals:], axes[n_primals:], strict=True)
+        direction_leaves = [
+            x[None] if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in pairs
+        ]
+        values, output_tangents = function(
+            *jax.tree.unflatten(structure, [*leaves[:n_primals], *direction_leaves])
+        )
+        output_tangents = jax.tree.map(
+            lambda x: jnp.broadcast_to(x, (size, *x.shape[1:])), output_tangents
+        )
+        results, output_structure = jax.tree.flatten((values, output_tangents))
         n = len(jax.tree.leaves(values))
-        return found, [None] * n + [0] * (len(found) - n)
+        return results, [None] * n + [0] * (len(results) - n)
 
-    found = _BEYOND.bind(*leaves, mapped=mapped)
-    return jax.tree.unflatten(told, found)
+    results = _HOIST_PRIMITIVE.bind(*leaves, mapped=evaluate_batched)
+    return jax.tree.unflatten(output_structure, results)
 
 
 @custom_vmap
-def _around(_: Any) -> Array:
+def _vmap_size(_: Any) -> Array:
     """Return as many zeros as an enclosing `jax.vmap` has directions, none without one."""
     return jnp.zeros(0)
 
 
-@_around.def_vmap
-def _around_mapped(size: int, _: list, _way: Any) -> tuple[Array, bool]:
+@_vmap_size.def_vmap
+def _vmap_size_rule(size: int, _: list, _tangent: Any) -> tuple[Array, bool]:
     return jnp.zeros(size), False
 
 
-_BEYOND = Primitive("beyond")
+_HOIST_PRIMITIVE = Primitive("beyond")
 """What is traced outside of the `jax.vmap` around: within, its loops would be traced again."""
-_BEYOND.multiple_results = True
-batching.primitive_batchers[_BEYOND] = lambda values, axes, mapped: mapped(values, axes)
+_HOIST_PRIMITIVE.multiple_results = True
+batching.primitive_batchers[_HOIST_PRIMITIVE] = lambda values, axes, mapped: mapped(values, axes)
 """Primitive whose function is traced outside of the enclosing `jax.vmap`, which would trace its
 loops again."""
 
 
-def _one_by_one(function: Callable[[Any], Any], ways: Any) -> Any:
+def _map_sequentially(function: Callable[[Any], Any], directions: Any) -> Any:
     """Return `function` of each direction, in a loop, so that each direction stays in registers."""
-    leaves, structure = jax.tree.flatten(ways)
-    several = [len(x) > 1 for x in leaves]
+    leaves, structure = jax.tree.flatten(directions)
+    has_many = [len(x) > 1 for x in leaves]
 
-    def of_one(some: list[Array]) -> Any:
-        own = iter(some)
-        pairs = zip(leaves, several, strict=True)
-        return function(jax.tree.unflatten(structure, [next(own) if n else x[0] for x, n in pairs]))
+    def evaluate_one(varying_leaves: list[Array]) -> Any:
+        remaining_leaves = iter(varying_leaves)
+        pairs = zip(leaves, has_many, strict=True)
+        return function(
+            jax.tree.unflatten(structure, [next(remaining_leaves) if n else x[0] for x, n in pairs])
+        )
 
-    if not any(several):
-        return jax.tree.map(lambda x: x[None], of_one([]))
-    return lax.map(of_one, [x for x, n in zip(leaves, several, strict=True) if n])
+    if not any(has_many):
+        return jax.tree.map(lambda x: x[None], evaluate_one([]))
+    return lax.map(evaluate_one, [x for x, n in zip(leaves, has_many, strict=True) if n])
 
 
-def stacked(ways: Vector) -> Array:
+def stack_directions(directions: Vector) -> Array:
     """Return tangents of several numbers stacked as (directions, numbers, batch)."""
-    return jnp.stack(jnp.broadcast_arrays(*ways), 1)
+    return jnp.stack(jnp.broadcast_arrays(*directions), 1)
 
 
-class Slopes(NamedTuple):
+class StageJacobians(NamedTuple):
     """Jacobians of the accelerations at the stages of a step."""
 
-    by_state: Array  # (stages, n, ., batch): by positions, rates, then held constants
-    by_constants: Array  # (stages, directions, n, batch)
+    state_jacobian: Array  # (stages, n, ., batch): by positions, rates, then held constants
+    constants_tangents: Array  # (stages, directions, n, batch)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _slopes_of(
-    of: BalanceOf, constants: Any, moved: Any, held: Vector, stages: list[Place]
-) -> Slopes:
-    def at(row: Array) -> tuple[Array, Array]:
-        place, balance = _unpacked(row), _traced_once(of(constants, held))
-        residual = lambda constants, held: of(constants, held).residual(place)
-        along = lambda *way: _accelerated(balance, place, jax.jvp(residual, *way)[1])
-        still = jax.tree.map(jnp.zeros_like, constants)
-        by_state = [jnp.stack(_moved(balance, place, *unit)) for unit in _units(place)]
-        by_state += [along((constants, held), (still, unit)) for unit in _unit_rows(held)]
-        unmoved = tuple(jnp.zeros_like(x) for x in held)
-        by_constants = lambda moved: along((constants, held), (moved, unmoved))
-        return jnp.stack(by_state, 1), _side_by_side(by_constants, moved)
+def _stage_jacobians(
+    dynamics_of: ImplicitDynamicsFn,
+    constants: Any,
+    constants_directions: Any,
+    held_constants: Vector,
+    stages: list[StageState],
+) -> StageJacobians:
+    def linearize_stage(row: Array) -> tuple[Array, Array]:
+        state, dynamics = _unpack_state(row), _jit_dynamics(dynamics_of(constants, held_constants))
+        residual = lambda constants, held_constants: dynamics_of(
+            constants, held_constants
+        ).residual(state)
+        acceleration_along = lambda *tangent: _solve_acceleration(
+            dynamics, state, jax.jvp(residual, *tangent)[1]
+        )
+        zero_constants = jax.tree.map(jnp.zeros_like, constants)
+        state_columns = [
+            jnp.stack(_acceleration_tangent(dynamics, state, *unit))
+            for unit in _unit_directions(state)
+        ]
+        state_columns += [
+            acceleration_along((constants, held_constants), (zero_constants, unit))
+            for unit in _unit_rows(held_constants)
+        ]
+        zero_held = tuple(jnp.zeros_like(x) for x in held_constants)
+        acceleration_by_constants = lambda constants_direction: acceleration_along(
+            (constants, held_constants), (constants_direction, zero_held)
+        )
+        return jnp.stack(state_columns, 1), _map_unrolled(
+            acceleration_by_constants, constants_directions
+        )
 
-    return Slopes(*lax.map(at, jnp.stack([_packed(place) for place in stages[:-1]])))
+    return StageJacobians(
+        *lax.map(linearize_stage, jnp.stack([_pack_state(state) for state in stages[:-1]]))
+    )
 
 
-def _side_by_side(function: Callable[[Any], Array], ways: Any) -> Array:
+def _map_unrolled(function: Callable[[Any], Array], directions: Any) -> Array:
     """Return `function` of each direction without a loop, so that known zeros are dropped."""
-    leaves, structure = jax.tree.flatten(ways)
+    leaves, structure = jax.tree.flatten(directions)
     if all(len(x) == 1 for x in leaves):
         return function(jax.tree.unflatten(structure, [x[0] for x in leaves]))[None]
     axes = [0 if len(x) > 1 else None for x in leaves]
-    given = [x if len(x) > 1 else x[0] for x in leaves]
-    return jax.vmap(lambda *x: function(jax.tree.unflatten(structure, x)), axes)(*given)
+    inputs = [x if len(x) > 1 else x[0] for x in leaves]
+    return jax.vmap(lambda *x: function(jax.tree.unflatten(structure, x)), axes)(*inputs)
 
 
-def _traced_once(balance: Balance) -> Balance:
-    return Balance(jax.jit(balance.residual), jax.jit(balance.solve))
+def _jit_dynamics(dynamics: ImplicitDynamics) -> ImplicitDynamics:
+    return ImplicitDynamics(jax.jit(dynamics.residual), jax.jit(dynamics.solve))
 
 
-def _packed(place: Place) -> Array:
-    n = len(place.q)
-    sin, cos, acceleration = place.slope
-    return jnp.stack([*place.q, *place.v, sin, cos, *acceleration[:n]])
+def _pack_state(state: StageState) -> Array:
+    n = len(state.q)
+    sin, cos, acceleration = state.acceleration
+    return jnp.stack([*state.q, *state.v, sin, cos, *acceleration[:n]])
 
 
-def _unpacked(row: Array) -> Place:
+def _unpack_state(row: Array) -> StageState:
     n = (len(row) - 2) // 3
     numbers = tuple(row)
-    slope = Slope(numbers[2 * n], numbers[2 * n + 1], numbers[2 * n + 2 :])
-    return Place(numbers[:n], numbers[n : 2 * n], slope)
+    acceleration = StageAcceleration(numbers[2 * n], numbers[2 * n + 1], numbers[2 * n + 2 :])
+    return StageState(numbers[:n], numbers[n : 2 * n], acceleration)
 
 
-def _unit_rows(like: Vector) -> list[Vector]:
-    n = len(like)
-    return [tuple(jnp.full_like(like[j], float(i == j)) for j in range(n)) for i in range(n)]
+def _unit_rows(template: Vector) -> list[Vector]:
+    n = len(template)
+    return [tuple(jnp.full_like(template[j], float(i == j)) for j in range(n)) for i in range(n)]
 
 
-def _units(place: Place) -> list[tuple[Vector, Vector]]:
-    rows, n = _unit_rows((*place.q, *place.v)), len(place.q)
+def _unit_directions(state: StageState) -> list[tuple[Vector, Vector]]:
+    rows, n = _unit_rows((*state.q, *state.v)), len(state.q)
     return [(row[:n], row[n:]) for row in rows]
 
 
-def _moved(balance: Balance, place: Place, dq: Vector, dv: Vector) -> Vector:
+def _acceleration_tangent(
+    dynamics: ImplicitDynamics, state: StageState, dq: Vector, dv: Vector
+) -> Vector:
     """Return the tangent of the accelerations along a direction of positions and rates."""
-    sin, cos, acceleration = place.slope
-    still = tuple(jnp.zeros_like(x) for x in acceleration)
-    change = Place(dq, dv, Slope(cos * dq[0], -sin * dq[0], still))
-    return tuple(_accelerated(balance, place, jax.jvp(balance.residual, (place,), (change,))[1]))
+    sin, cos, acceleration = state.acceleration
+    zero_accelerations = tuple(jnp.zeros_like(x) for x in acceleration)
+    state_tangent = StageState(
+        dq, dv, StageAcceleration(cos * dq[0], -sin * dq[0], zero_accelerations)
+    )
+    return tuple(
+        _solve_acceleration(
+            dynamics, state, jax.jvp(dynamics.residual, (state,), (state_tangent,))[1]
+        )
+    )
 
 
-def _accelerated(balance: Balance, place: Place, rows: Vector) -> Array:
-    return -jnp.stack(balance.solve(place, rows))
+def _solve_acceleration(dynamics: ImplicitDynamics, state: StageState, rows: Vector) -> Array:
+    return -jnp.stack(dynamics.solve(state, rows))
 
 
 @functools.partial(jax.jit, static_argnums=0)  # traced once, wherever it is called
-def _carried(tableau: Tableau, slopes: Slopes, starts: Array, h: Array) -> Array:
+def _propagate_tangents(
+    tableau: ButcherTableau, stage_jacobians: StageJacobians, start_tangents: Array, h: Array
+) -> Array:
     """Propagate tangents (positions, rates, held constants) from a step's start to its end."""
-    by_state, n = slopes.by_state, slopes.by_state.shape[1]
+    state_jacobian, n = stage_jacobians.state_jacobian, stage_jacobians.state_jacobian.shape[1]
 
-    def carried(way: tuple[Array, Array]) -> Array:
-        by_constants, start = way
-        q0, v0, held = tuple(start[:n]), tuple(start[n : 2 * n]), tuple(start[2 * n :])
-        known: list[Vector] = []
-        for i in range(len(tableau.places) - 1):
-            q, v = stage_at(tableau, i, q0, v0, known, h) if i else (q0, v0)
-            moved = (*q, *v, *held)
-            rows = [[by_constants[i, d], *map(lax.mul, by_state[i, d], moved)] for d in range(n)]
-            known.append(tuple(functools.reduce(lax.add, row) for row in rows))
-        q, v = stage_at(tableau, len(tableau.places) - 1, q0, v0, known, h)
-        return jnp.stack([*q, *v, *held])
+    def propagate_one(direction: tuple[Array, Array]) -> Array:
+        constants_tangent, start = direction
+        q0, v0, held_tangents = tuple(start[:n]), tuple(start[n : 2 * n]), tuple(start[2 * n :])
+        stage_tangents: list[Vector] = []
+        for i in range(len(tableau.nodes) - 1):
+            q, v = evaluate_stage(tableau, i, q0, v0, stage_tangents, h) if i else (q0, v0)
+            state_tangents = (*q, *v, *held_tangents)
+            rows = [
+                [constants_tangent[i, d], *map(lax.mul, state_jacobian[i, d], state_tangents)]
+                for d in range(n)
+            ]
+            stage_tangents.append(tuple(functools.reduce(lax.add, row) for row in rows))
+        q, v = evaluate_stage(tableau, len(tableau.nodes) - 1, q0, v0, stage_tangents, h)
+        return jnp.stack([*q, *v, *held_tangents])
 
-    return _one_by_one(carried, (jnp.moveaxis(slopes.by_constants, 1, 0), starts))
+    return _map_sequentially(
+        propagate_one, (jnp.moveaxis(stage_jacobians.constants_tangents, 1, 0), start_tangents)
+    )
 
 
-def pushed(function: Callable[..., Any], at: tuple, directions: tuple) -> Any:
+def jvp_each(function: Callable[..., Any], primals: tuple, directions: tuple) -> Any:
     """Return `jax.jvp` along each of the directions, without the value.
 
     The code is as short as for one direction.
     """
-    return _one_by_one(lambda way: jax.jvp(function, at, way)[1], directions)
+    return _map_sequentially(lambda direction: jax.jvp(function, primals, direction)[1], directions)
 
 
-def by_directions(function: Callable[..., Any]) -> Callable[..., Any]:
+def with_batched_jvp(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return `function` of trees, whose derivative with respect to their floats is `jvp_each`."""
 
-    def call(*arguments: Any) -> Any:
-        floats, others = eqx.partition(arguments, eqx.is_inexact_array)
-        whole = lambda *floats: function(*eqx.combine(floats, others))
-        only_floats = lambda *floats: eqx.filter(whole(*floats), eqx.is_inexact_array)
-        called = jax.custom_jvp(whole)
+    def call_with_batched_jvp(*arguments: Any) -> Any:
+        floats, other_arguments = eqx.partition(arguments, eqx.is_inexact_array)
+        evaluate_combined = lambda *floats: function(*eqx.combine(floats, other_arguments))
+        evaluate_floats = lambda *floats: eqx.filter(
+            evaluate_combined(*floats), eqx.is_inexact_array
+        )
+        differentiable_function = jax.custom_jvp(evaluate_combined)
 
-        @called.defjvp
-        def rule(at: tuple, direction: tuple) -> tuple:
-            both = lambda at, ways: (whole(*at), pushed(only_floats, at, ways))
-            out, moved = in_directions(both, at, direction)
-            return out, eqx.combine(moved, without_derivative(out))
+        @differentiable_function.defjvp
+        def batched_jvp(primals: tuple, tangent: tuple) -> tuple:
+            evaluate_with_tangents = lambda primals, directions: (
+                evaluate_combined(*primals),
+                jvp_each(evaluate_floats, primals, directions),
+            )
+            outputs, float_tangents = batched_jvp_rule(evaluate_with_tangents, primals, tangent)
+            return outputs, eqx.combine(float_tangents, zero_tangent(outputs))
 
-        return called(*floats)
+        return differentiable_function(*floats)
 
-    return call
+    return call_with_batched_jvp
 
 
-class Moving(NamedTuple):
+class PhaseTangents(NamedTuple):
     """Tangent directions of a phase: of its constants, its start and the constants held
     since then.
     """
 
-    of: BalanceOf
+    dynamics_of: ImplicitDynamicsFn
     constants: Any
-    held: Vector
-    moved: Any  # structure of the constants, directions first
-    start: Array  # of positions, rates, held constants, (directions, ., batch)
+    held_constants: Vector
+    constants_tangents: Any  # structure of the constants, directions first
+    start_tangents: Array  # of positions, rates, held constants, (directions, ., batch)
 
-    def along(self, tableau: Tableau, stages: list[Place], starts: Array, h: Array) -> Array:
+    def propagate(
+        self, tableau: ButcherTableau, stages: list[StageState], start_tangents: Array, h: Array
+    ) -> Array:
         """Return the tangents at a step's start, propagated to its end."""
-        slopes = _slopes_of(self.of, self.constants, self.moved, self.held, stages)
-        return _carried(tableau, slopes, starts, h)
+        stage_jacobians = _stage_jacobians(
+            self.dynamics_of, self.constants, self.constants_tangents, self.held_constants, stages
+        )
+        return _propagate_tangents(tableau, stage_jacobians, start_tangents, h)
 
-    def onward(
-        self, tableau: Tableau, stages: list[Place], starts: Array, h: Array, accepted: Array
+    def propagate_if_accepted(
+        self,
+        tableau: ButcherTableau,
+        stages: list[StageState],
+        start_tangents: Array,
+        h: Array,
+        is_accepted: Array,
     ) -> Array:
         """Return the tangents propagated where the step is accepted; otherwise they are unchanged.
 
         A group without accepted steps skips the computation.
         """
 
-        def carried(starts: Array) -> Array:
-            return jnp.where(accepted, self.along(tableau, stages, starts, h), starts)
+        def propagate_accepted(start_tangents: Array) -> Array:
+            return jnp.where(
+                is_accepted, self.propagate(tableau, stages, start_tangents, h), start_tangents
+            )
 
-        return if_any(jnp.any(accepted), carried, starts)
+        return run_if_any(jnp.any(is_accepted), propagate_accepted, start_tangents)
 
-    def of_values(self, values: Callable[..., Any], place: Place, directions: Array) -> Any:
+    def value_tangents(
+        self, evaluate: Callable[..., Any], state: StageState, directions: Array
+    ) -> Any:
         """Return the tangents of `evaluate(constants, held_constants, q, v)` for the directions at
         a state.
         """
-        n, numbers = len(place.q), tuple(jnp.moveaxis(directions, 1, 0))
-        at = self.constants, self.held, place.q, place.v
-        return pushed(values, at, (self.moved, numbers[2 * n :], numbers[:n], numbers[n : 2 * n]))
+        n, direction_rows = len(state.q), tuple(jnp.moveaxis(directions, 1, 0))
+        primals = self.constants, self.held_constants, state.q, state.v
+        return jvp_each(
+            evaluate,
+            primals,
+            (
+                self.constants_tangents,
+                direction_rows[2 * n :],
+                direction_rows[:n],
+                direction_rows[n : 2 * n],
+            ),
+        )

@@ -10,27 +10,29 @@ import numpy as np
 
 from vrw_jax.numerics.types import Elementwise
 
-LARGEST = 1.6
+MAX_EXACT_ANGLE = 1.6
 """Angle up to which the polynomials are accurate to round-off, rad."""
 
 
-def _economised(offset: int) -> tuple[float, ...]:
+def _economize_series(offset: int) -> tuple[float, ...]:
     """Return nine coefficients in the angle's square: of its cosine, or of its sine over the angle.
 
     They are Taylor's series from its second term on, with the last terms exchanged for Chebyshev
     polynomials of lower degree: three terms fewer at the same error.
     """
-    factorial, square = math.factorial, LARGEST * LARGEST
-    series = [(-1) ** k / factorial(2 * k + offset) for k in range(1, 14)]
-    while len(series) > 8:
-        n, last = len(series) - 1, series.pop()
+    factorial, square = math.factorial, MAX_EXACT_ANGLE * MAX_EXACT_ANGLE
+    coefficients = [(-1) ** k / factorial(2 * k + offset) for k in range(1, 14)]
+    while len(coefficients) > 8:
+        n, last_coefficient = len(coefficients) - 1, coefficients.pop()
         for k in range(n):  # of the polynomial of degree n over [0, square], scaled to end with 1
             chebyshev = n * factorial(n + k - 1) / (factorial(n - k) * factorial(2 * k))
-            series[k] -= last * (-1) ** (n - k) * chebyshev * (square / 4.0) ** (n - k) * 2.0
-    return 1.0, *series
+            coefficients[k] -= (
+                last_coefficient * (-1) ** (n - k) * chebyshev * (square / 4.0) ** (n - k) * 2.0
+            )
+    return 1.0, *coefficients
 
 
-_SINE, _COSINE = _economised(1), _economised(0)
+_SINE_COEFFICIENTS, _COSINE_COEFFICIENTS = _economize_series(1), _economize_series(0)
 
 
 def sine_cosine(angle: Elementwise) -> tuple[Elementwise, Elementwise]:
@@ -41,28 +43,32 @@ def sine_cosine(angle: Elementwise) -> tuple[Elementwise, Elementwise]:
     numpy arrays and plain numbers the results are numpy, in a tenth of the time of single JAX
     calls.
     """
-    known = isinstance(angle, (float, np.ndarray))
-    return _by_series(np, angle) if known else _moving(angle)
+    is_concrete = isinstance(angle, (float, np.ndarray))
+    return _evaluate_series(np, angle) if is_concrete else _differentiable_sine_cosine(angle)
 
 
-def _by_series(numbers: ModuleType, angle: Any) -> tuple[Any, Any]:
+def _evaluate_series(array_module: ModuleType, angle: Any) -> tuple[Any, Any]:
     """Evaluate both polynomials with numpy or JAX."""
     square = angle * angle
 
-    def series(coefficients: tuple[float, ...]) -> Any:
-        value = numbers.full_like(square, coefficients[-1])
+    def evaluate_polynomial(coefficients: tuple[float, ...]) -> Any:
+        value = array_module.full_like(square, coefficients[-1])
         for coefficient in coefficients[-2::-1]:
             value = value * square + coefficient
         return value
 
-    return angle * series(_SINE), series(_COSINE)
+    return angle * evaluate_polynomial(_SINE_COEFFICIENTS), evaluate_polynomial(
+        _COSINE_COEFFICIENTS
+    )
 
 
-_moving = jax.custom_jvp(jax.jit(lambda angle: _by_series(jnp, angle)))  # traced once
+_differentiable_sine_cosine = jax.custom_jvp(
+    jax.jit(lambda angle: _evaluate_series(jnp, angle))
+)  # traced once
 
 
-@_moving.defjvp
+@_differentiable_sine_cosine.defjvp
 def _sine_cosine_jvp(primals: tuple, tangents: tuple) -> tuple:
-    sin, cos = _moving(*primals)
-    (moved,) = tangents
-    return (sin, cos), (cos * moved, -sin * moved)
+    sin, cos = _differentiable_sine_cosine(*primals)
+    (angle_tangent,) = tangents
+    return (sin, cos), (cos * angle_tangent, -sin * angle_tangent)

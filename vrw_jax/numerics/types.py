@@ -18,5 +18,5 @@ Vector = tuple[Elementwise, ...]
 """A tuple with one array for each component."""
 
 
-Number = float | Array | np.ndarray
+RealInput = float | Array | np.ndarray
 """A number as a caller gives it, or an array of numbers."""

@@ -17,48 +17,57 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.models import SectionState, ViscoelasticWheel
-from vrw_jax.numerics import Options
-from vrw_jax.results import MARGINS, STEP, attrs_of, locked_legs, provenance, variables
+from vrw_jax.numerics import StepOptions
+from vrw_jax.results import (
+    MARGIN_MEASURES,
+    STEP_MEASURES,
+    locked_leg_coordinate,
+    make_variables,
+    measure_attrs,
+    provenance,
+)
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.walks import step, walk
 from vrw_jax.wheel import Outcome, WheelParams
 
-N_STEPS = 30
+N_WALK_STEPS = 30
 """Number of steps per walk, chosen because the slowest gait, c = 70, converges to round-off."""
 
-SETTLED = 1e-8
+SETTLED_TOLERANCE = 1e-8
 """Largest change of the section state per step in a settled gait, chosen as ten times the error of
 a step at the default options."""
 
-LAST = 5
+N_SETTLED_STEPS = 5
 """Number of steps below the tolerance, because a longer period may repeat once by chance."""
 
 
-def paper_wheel() -> ViscoelasticWheel:
+def make_paper_model() -> ViscoelasticWheel:
     """Return the paper's model, which continues after Leg 1 lifts off."""
     return ViscoelasticWheel(stop_at_lift_off=False)
 
 
-def changed(params: WheelParams, name: str, value: float) -> WheelParams:
+def replace_parameter(params: WheelParams, name: str, value: float) -> WheelParams:
     """Return the wheel with another value of one parameter."""
     change: dict[str, Any] = {name: value}
     return dataclasses.replace(params, **change)
 
 
-def approach(params: WheelParams, x: SectionState) -> xr.Dataset:
+def walk_into_gait(params: WheelParams, x: SectionState) -> xr.Dataset:
     """Return the section states of a walk and their change per step.
 
     `change` is the Euclidean distance to the previous section state in (rad, rad/s, m/s). The walk
     is `settled` in a period-1 gait if each of the last five changes is below `SETTLED_TOLERANCE`.
     """
-    walked = walk(params, x, N_STEPS, model=paper_wheel())
-    stepped = int(walked.n_stepped)
-    states = np.concatenate([walked.start[None], walked.steps.section_state[:stepped]])
-    change = np.full(stepped + 1, np.nan)
+    gait_walk = walk(params, x, N_WALK_STEPS, model=make_paper_model())
+    n_stepped = int(gait_walk.n_stepped)
+    states = np.concatenate([gait_walk.start[None], gait_walk.steps.section_state[:n_stepped]])
+    change = np.full(n_stepped + 1, np.nan)
     change[1:] = np.linalg.norm(np.diff(states, axis=0), axis=1)
-    outcome = Outcome(int(walked.outcome))
-    last = float(change[-LAST:].max()) if stepped >= LAST else math.inf
-    settled = outcome == Outcome.STEPPED and last < SETTLED
+    outcome = Outcome(int(gait_walk.outcome))
+    last_change = (
+        float(change[-N_SETTLED_STEPS:].max()) if n_stepped >= N_SETTLED_STEPS else math.inf
+    )
+    is_settled = outcome == Outcome.STEPPED and last_change < SETTLED_TOLERANCE
     return xr.Dataset(
         {
             "section_state": (("step", "component"), states),
@@ -68,14 +77,14 @@ def approach(params: WheelParams, x: SectionState) -> xr.Dataset:
         {
             "outcome": outcome.name,
             "outcome_meaning": outcome.meaning,
-            "last_change": last,
-            "settled": int(settled),
+            "last_change": last_change,
+            "settled": int(is_settled),
         }
-        | provenance(params, paper_wheel(), Options()),
+        | provenance(params, make_paper_model(), StepOptions()),
     )
 
 
-def states_along(
+def walk_along_parameter(
     params: WheelParams, name: str, values: Sequence[float], x: SectionState
 ) -> Iterator[xr.Dataset]:
     """Yield the walks at each of `values` of the parameter `name`, each from the previous gait.
@@ -86,20 +95,20 @@ def states_along(
     settled_values: list[float] = []
     settled_states: list[np.ndarray] = []
     for value in values:
-        start = _extrapolated(settled_values, settled_states, value, x)
-        walked = approach(changed(params, name, value), start)
-        if walked.settled:
+        start = _extrapolate_start(settled_values, settled_states, value, x)
+        gait_walk = walk_into_gait(replace_parameter(params, name, value), start)
+        if gait_walk.settled:
             settled_values.append(value)
-            settled_states.append(walked.section_state.values[-1])
-        yield walked
+            settled_states.append(gait_walk.section_state.values[-1])
+        yield gait_walk
 
 
-def along(
+def measure_gaits_along(
     params: WheelParams,
     name: str,
     values: Sequence[float],
     x: SectionState,
-    progress: Callable[[float], None] | None = None,
+    on_progress: Callable[[float], None] | None = None,
 ) -> xr.Dataset:
     """Return the gaits of `walk_along_parameter` with all measures, over the parameter `name`.
 
@@ -108,22 +117,26 @@ def along(
     share.
     """
     rows: list[dict[str, np.ndarray]] = []
-    for value, walked in zip(values, states_along(params, name, values, x), strict=True):
-        state = walked.section_state.values[-1]
-        result = step(changed(params, name, value), jnp.asarray(state), model=paper_wheel())
+    for value, gait_walk in zip(values, walk_along_parameter(params, name, values, x), strict=True):
+        state = gait_walk.section_state.values[-1]
+        result = step(
+            replace_parameter(params, name, value), jnp.asarray(state), model=make_paper_model()
+        )
         row = {key: np.asarray(values) for key, values in result.measures().items()}
-        if walked.outcome != Outcome.STEPPED.name:
-            row["outcome"] = np.asarray(int(Outcome[walked.outcome]))
+        if gait_walk.outcome != Outcome.STEPPED.name:
+            row["outcome"] = np.asarray(int(Outcome[gait_walk.outcome]))
         row["section_state"] = state
-        row["change"] = np.asarray(walked.attrs["last_change"])
-        row["settled"] = np.asarray(bool(walked.settled))
+        row["change"] = np.asarray(gait_walk.attrs["last_change"])
+        row["settled"] = np.asarray(bool(gait_walk.settled))
         rows.append(row)
-        if progress is not None:
-            progress(len(rows) / len(values))
-    return _table(params, name, values, {key: np.stack([r[key] for r in rows]) for key in rows[0]})
+        if on_progress is not None:
+            on_progress(len(rows) / len(values))
+    return _make_dataset(
+        params, name, values, {key: np.stack([r[key] for r in rows]) for key in rows[0]}
+    )
 
 
-def _extrapolated(
+def _extrapolate_start(
     values: list[float], states: list[np.ndarray], value: float, x: SectionState
 ) -> SectionState:
     """Return a start at `value` on the line through the last two settled gaits."""
@@ -135,27 +148,27 @@ def _extrapolated(
     return jnp.asarray(states[-1] + ratio * (states[-1] - states[-2]))
 
 
-def _table(
+def _make_dataset(
     params: WheelParams, name: str, values: Sequence[float], columns: dict[str, np.ndarray]
 ) -> xr.Dataset:
     """Return the labelled dataset of columns over the parameter `name`."""
-    data = variables({key: columns[key] for key in STEP | MARGINS}, name)
-    told = {"units": "1", "long_name": "largest change of the last five steps"}
+    data = make_variables({key: columns[key] for key in STEP_MEASURES | MARGIN_MEASURES}, name)
+    change_attrs = {"units": "1", "long_name": "largest change of the last five steps"}
     data |= {
         "section_state": xr.Variable(
             (name, "component"), columns["section_state"], {"long_name": "section state"}
         ),
-        "change": xr.Variable(name, columns["change"], told),
+        "change": xr.Variable(name, columns["change"], change_attrs),
         "settled": xr.Variable(
             name, columns["settled"], {"long_name": "whether the walk settled into a period-1 gait"}
         ),
     }
-    labels = {
-        name: xr.Variable(name, np.asarray(values, float), attrs_of(name)),
+    coordinates = {
+        name: xr.Variable(name, np.asarray(values, float), measure_attrs(name)),
         "component": ["theta", "dtheta", "dL1"],
-        "leg": locked_legs(params.n_legs),
+        "leg": locked_leg_coordinate(params.n_legs),
     }
-    origin = provenance(params, paper_wheel(), Options())
-    origin.pop(f"parameter_{name}")
-    attrs = {"title": f"Gaits walked to along {name}"} | origin
-    return xr.Dataset(data, labels, attrs).sortby(name)
+    provenance_attrs = provenance(params, make_paper_model(), StepOptions())
+    provenance_attrs.pop(f"parameter_{name}")
+    attrs = {"title": f"Gaits walked to along {name}"} | provenance_attrs
+    return xr.Dataset(data, coordinates, attrs).sortby(name)

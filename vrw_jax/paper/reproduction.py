@@ -14,123 +14,144 @@ import xarray as xr
 from vrw_jax import figures as plots
 from vrw_jax.paper import facts
 from vrw_jax.paper.facts.base import Evidence, Fact
-from vrw_jax.paper.gaits import along, approach, changed, paper_wheel, states_along
+from vrw_jax.paper.gaits import (
+    make_paper_model,
+    measure_gaits_along,
+    replace_parameter,
+    walk_along_parameter,
+    walk_into_gait,
+)
 from vrw_jax.walks import paper_start, simulate
 from vrw_jax.wheel import WheelParams
 
-Progress = Callable[[float, str], None]
+ReproductionProgress = Callable[[float, str], None]
 """Function that is called with the completed share, 0 to 1, and the present task."""
 
-DAMPINGS = (50.0, 100.0, 200.0)
+FIGURE_DAMPINGS = (50.0, 100.0, 200.0)
 """Damping values of figures 8 and 9, in N s/m."""
 
 
-def silent(share: float, what: str) -> None:
+def ignore_progress(share: float, task: str) -> None:
     """Ignore the progress."""
 
 
-def settle_at_table_1() -> xr.Dataset:
+def walk_into_table_1_gait() -> xr.Dataset:
     """Return the walk from the start for Table 1 into its gait."""
-    return approach(WheelParams(), paper_start())
+    return walk_into_gait(WheelParams(), paper_start())
 
 
-def gait_at_table_1(n_steps: int = 3) -> xr.Dataset:
+def simulate_table_1_gait(n_steps: int = 3) -> xr.Dataset:
     """Return the trajectory of the gait of Table 1 at slope 0.30, for figures 6 and 7."""
-    state = jnp.asarray(settle_at_table_1().section_state.values[-1])
-    return simulate(WheelParams(), state, n_steps, model=paper_wheel())
+    state = jnp.asarray(walk_into_table_1_gait().section_state.values[-1])
+    return simulate(WheelParams(), state, n_steps, model=make_paper_model())
 
 
-def gaits_at(dampings: Sequence[float]) -> list[xr.Dataset]:
+def simulate_gaits_at_dampings(dampings: Sequence[float]) -> list[xr.Dataset]:
     """Return one step of the gait at each of `dampings`, 1 to 219 N s/m, for figures 8 and 9.
 
     Walks lead there from Table 1 with changes of at most 10 N s/m.
     """
-    start = jnp.asarray(settle_at_table_1().section_state.values[-1])
+    start = jnp.asarray(walk_into_table_1_gait().section_state.values[-1])
     table_1, gaits = WheelParams(), []
     for damping in dampings:
-        begin = float(table_1.damping)
-        n = 1 + math.ceil(abs(damping - begin) / 10.0)
-        path = np.linspace(begin, damping, n).tolist()
-        *_, walked = states_along(table_1, "damping", path, start)
-        if not walked.settled:
+        start_damping = float(table_1.damping)
+        n = 1 + math.ceil(abs(damping - start_damping) / 10.0)
+        damping_path = np.linspace(start_damping, damping, n).tolist()
+        *_, gait_walk = walk_along_parameter(table_1, "damping", damping_path, start)
+        if not gait_walk.settled:
             raise ValueError(f"No period-1 gait was met at damping {damping:g}: choose 1 to 219.")
-        state = jnp.asarray(walked.section_state.values[-1])
-        gaits.append(simulate(changed(table_1, "damping", damping), state, 1, model=paper_wheel()))
+        state = jnp.asarray(gait_walk.section_state.values[-1])
+        gaits.append(
+            simulate(
+                replace_parameter(table_1, "damping", damping), state, 1, model=make_paper_model()
+            )
+        )
     return gaits
 
 
-def gaits_along_damping(progress: Callable[[float], None] | None = None) -> xr.Dataset:
+def measure_gaits_along_damping(on_progress: Callable[[float], None] | None = None) -> xr.Dataset:
     """Return the gaits at every integer c from 1 to 219, and the walks up to 224, for figure 10."""
     params = WheelParams()
-    start = jnp.asarray(settle_at_table_1().section_state.values[-1])
-    down = along(params, "damping", range(200, 0, -1), start, progress)
-    up = along(params, "damping", range(201, 225), start)
-    return xr.concat([down, up], "damping", data_vars="minimal", combine_attrs="override")
-
-
-def collect(progress: Progress = silent) -> Evidence:
-    """Compute all walks that the facts and figures use, and return them."""
-    table_1 = WheelParams()
-    progress(0.0, "walk from the start for Table 1")
-    settling = settle_at_table_1()
-    too_fast = approach(table_1, jnp.asarray((0.1, 2.0, -0.1)))
-
-    what = "gaits along c from 1 to 224"
-    progress(0.1, what)
-    branch = gaits_along_damping(lambda share: progress(0.1 + 0.5 * share, what))
-
-    progress(0.65, "gaits at slope 0.10")
-    start = jnp.asarray(branch.section_state.sel(damping=100.0).values)
-    slopes = [0.01 * i for i in range(30, 9, -1)]
-    medium, flat = changed(table_1, "damping", 100.0), changed(table_1, "slope", 0.10)
-    gentler = along(medium, "slope", slopes, start)
-    start = jnp.asarray(gentler.section_state.sel(slope=0.10, method="nearest").values)
-    gentle = along(flat, "damping", range(100, 221, 10), start)
-    falling = [*range(100, 0, -10), 5, 4]
-    gentle_low = along(flat, "damping", falling, start)
-
-    progress(0.7, "trajectories")
-    return Evidence(
-        params=table_1,
-        settling=settling,
-        gait=gait_at_table_1(),
-        by_damping=gaits_at(DAMPINGS),
-        branch=branch,
-        gentler=gentler,
-        gentle=gentle,
-        gentle_low=gentle_low,
-        too_fast=too_fast,
+    start = jnp.asarray(walk_into_table_1_gait().section_state.values[-1])
+    lower_gaits = measure_gaits_along(params, "damping", range(200, 0, -1), start, on_progress)
+    upper_gaits = measure_gaits_along(params, "damping", range(201, 225), start)
+    return xr.concat(
+        [lower_gaits, upper_gaits], "damping", data_vars="minimal", combine_attrs="override"
     )
 
 
-def draw(evidence: Evidence, folder: Path) -> list[Path]:
+def collect_evidence(on_progress: ReproductionProgress = ignore_progress) -> Evidence:
+    """Compute all walks that the facts and figures use, and return them."""
+    table_1 = WheelParams()
+    on_progress(0.0, "walk from the start for Table 1")
+    settling_walk = walk_into_table_1_gait()
+    fast_start_walk = walk_into_gait(table_1, jnp.asarray((0.1, 2.0, -0.1)))
+
+    task = "gaits along c from 1 to 224"
+    on_progress(0.1, task)
+    damping_branch = measure_gaits_along_damping(lambda share: on_progress(0.1 + 0.5 * share, task))
+
+    on_progress(0.65, "gaits at slope 0.10")
+    start = jnp.asarray(damping_branch.section_state.sel(damping=100.0).values)
+    slopes = [0.01 * i for i in range(30, 9, -1)]
+    medium_damping_wheel, gentle_slope_wheel = (
+        replace_parameter(table_1, "damping", 100.0),
+        replace_parameter(table_1, "slope", 0.10),
+    )
+    slope_branch = measure_gaits_along(medium_damping_wheel, "slope", slopes, start)
+    start = jnp.asarray(slope_branch.section_state.sel(slope=0.10, method="nearest").values)
+    gentle_slope_branch = measure_gaits_along(
+        gentle_slope_wheel, "damping", range(100, 221, 10), start
+    )
+    low_dampings = [*range(100, 0, -10), 5, 4]
+    gentle_slope_low_damping_branch = measure_gaits_along(
+        gentle_slope_wheel, "damping", low_dampings, start
+    )
+
+    on_progress(0.7, "trajectories")
+    return Evidence(
+        params=table_1,
+        settling_walk=settling_walk,
+        table_1_trajectory=simulate_table_1_gait(),
+        gaits_by_damping=simulate_gaits_at_dampings(FIGURE_DAMPINGS),
+        damping_branch=damping_branch,
+        slope_branch=slope_branch,
+        gentle_slope_branch=gentle_slope_branch,
+        gentle_slope_low_damping_branch=gentle_slope_low_damping_branch,
+        fast_start_walk=fast_start_walk,
+    )
+
+
+def draw_figures(evidence: Evidence, folder: Path) -> list[Path]:
     """Write figures 6 to 10 as SVG and PNG, and the walk as a GIF, and return the paths."""
-    two_steps = evidence.gait.isel(time=evidence.gait.step.values < 2)
+    two_steps = evidence.table_1_trajectory.isel(time=evidence.table_1_trajectory.step.values < 2)
     figures = {
-        "fig06_gait": plots.gait_panels(evidence.gait),
+        "fig06_gait": plots.gait_panels(evidence.table_1_trajectory),
         "fig07_sticks": plots.sticks(two_steps),
-        "fig08_scuffing": plots.foot_height(evidence.by_damping),
-        "fig09_rear_force": plots.rear_force(evidence.by_damping),
-        "fig10_indicators": plots.indicators(evidence.branch),
+        "fig08_scuffing": plots.foot_height(evidence.gaits_by_damping),
+        "fig09_rear_force": plots.rear_force(evidence.gaits_by_damping),
+        "fig10_indicators": plots.indicators(evidence.damping_branch),
     }
     paths = [path for name, figure in figures.items() for path in plots.save(figure, folder, name)]
-    frames, milliseconds = plots.walk_frames(evidence.by_damping[-1])
+    frames, milliseconds = plots.walk_frames(evidence.gaits_by_damping[-1])
     return [*paths, plots.save_animation(frames, milliseconds, folder / "walk.gif")]
 
 
-def reproduce(folder: str | Path, progress: Progress = silent) -> list[Fact]:
+def reproduce(
+    folder: str | Path, on_progress: ReproductionProgress = ignore_progress
+) -> list[Fact]:
     """Write all figures and the table of facts into `folder`, and return the facts.
 
     `facts.md` and `facts.csv` hold the table, and `indicators.csv` the numbers of Figure 10.
     """
     folder = Path(folder)
-    evidence = collect(progress)
-    progress(0.8, "figures")
-    draw(evidence, folder)
-    progress(0.98, "table of facts")
-    table = facts.all_facts(evidence)
-    facts.write(table, folder)
-    flat = evidence.branch.drop_dims(["leg", "component"]).to_dataframe()
-    flat.to_csv(folder / "indicators.csv", float_format="%.10g")
-    progress(1.0, "done")
-    return table
+    evidence = collect_evidence(on_progress)
+    on_progress(0.8, "figures")
+    draw_figures(evidence, folder)
+    on_progress(0.98, "table of facts")
+    facts_table = facts.compute_facts(evidence)
+    facts.write_facts(facts_table, folder)
+    indicator_table = evidence.damping_branch.drop_dims(["leg", "component"]).to_dataframe()
+    indicator_table.to_csv(folder / "indicators.csv", float_format="%.10g")
+    on_progress(1.0, "done")
+    return facts_table

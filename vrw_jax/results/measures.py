@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.wheel import DOMAINS, Outcome
-from vrw_jax.wheel import PHASES as OF_STEP
-from vrw_jax.wording import as_tex
+from vrw_jax.wheel import PAPER_PHASES as OF_STEP
+from vrw_jax.wheel import PARAMETER_DOMAINS, Outcome
+from vrw_jax.wording import format_mathtext
 
 
 @dataclass(frozen=True)
@@ -31,22 +31,24 @@ class Measure:
     long_name: str
     description: str
     equation: str = ""
-    axis: str = ""  # "leg": one value for each of the locked legs 3..n, of `CONTACTS` for each leg
-    breaks: str = ""
+    dimension: str = (
+        ""  # "leg": one value for each of the locked legs 3..n, of `CONTACTS` for each leg
+    )
+    violation: str = ""
 
     @property
-    def tex(self) -> str:
+    def mathtext(self) -> str:
         """Symbol as mathtext, without dollar signs."""
-        return as_tex(self.symbol)
+        return format_mathtext(self.symbol)
 
     @property
     def label(self) -> str:
         """Name and symbol."""
-        known = self.symbol in self.long_name
-        return self.long_name if known else f"{self.long_name} {self.symbol}"
+        has_symbol = self.symbol in self.long_name
+        return self.long_name if has_symbol else f"{self.long_name} {self.symbol}"
 
     @property
-    def plain_unit(self) -> str:
+    def display_unit(self) -> str:
         """Unit for a reader, "" for a pure number."""
         return "" if self.unit == "1" else self.unit
 
@@ -61,12 +63,12 @@ class Measure:
         }
         return attrs | ({"equation": self.equation} if self.equation else {})
 
-    def text(self, value: object) -> str:
+    def format_with_unit(self, value: object) -> str:
         """Return a number with its unit, for a reader."""
-        return f"{float(np.asarray(value)):.6g} {self.plain_unit}".strip()
+        return f"{float(np.asarray(value)):.6g} {self.display_unit}".strip()
 
 
-def _table(*measures: Measure) -> dict[str, Measure]:
+def _make_table(*measures: Measure) -> dict[str, Measure]:
     table = {measure.name: measure for measure in measures}
     if len(table) != len(measures):
         raise ValueError("Two measures share one name: give each its own.")
@@ -74,7 +76,7 @@ def _table(*measures: Measure) -> dict[str, Measure]:
 
 
 # fmt: off
-STEP = _table(
+STEP_MEASURES = _make_table(
     Measure("dls_fraction", "1", "T_DLS/T", "DLS fraction",
             "Share of the step spent in double-limb support."),
     Measure("period", "s", "T", "step period", "Duration of the step, touchdown to touchdown."),
@@ -99,13 +101,13 @@ STEP = _table(
             "Rate of the length of Leg 1 then: section state, third number."),
     Measure("lambda_I4", "N s", "λ_I4", "DLS indicator λ_I4",
             "Normal impulse of the rear foot in the landing with both feet held.", "(35)",
-            breaks="landing frees the rear foot"),
+            violation="landing frees the rear foot"),
     Measure("lambda_2_plus", "N", "λ2⁺", "DLS indicator λ2⁺",
             "Normal force of the fore foot just after landing, both feet held.", "(38)",
-            breaks="fore foot pulls at once"),
+            violation="fore foot pulls at once"),
     Measure("lambda_4_plus", "N", "λ4⁺", "DLS indicator λ4⁺",
             "Normal force of the rear foot just after landing, both feet held.", "(38)",
-            breaks="rear foot lifts at once"),
+            violation="rear foot lifts at once"),
     Measure("energy_lost_landing", "J", "ΔE_I", "energy lost in the landing",
             "Mechanical energy lost in collision I, positive when lost.", "(18)"),
     Measure("energy_lost_stopper", "J", "ΔE_II", "energy lost at the stopper",
@@ -117,55 +119,55 @@ STEP = _table(
 )
 """Measures of one step."""
 
-MARGINS = _table(
+MARGIN_MEASURES = _make_table(
     Measure("fore_foot_force", "N", "min λ2", "least normal force on the fore foot",
             "Negative where the ground would have to pull on Leg 1.",
-            breaks="fore foot pulls"),
+            violation="fore foot pulls"),
     Measure("takeoff_acceleration", "m/s^2", "z̈2⁺", "normal acceleration of foot 2 at take-off",
             "Just after the rear foot is let go, at rest on the ground; negative where it scuffs "
-            "at once.", breaks="rear foot scuffs at take-off"),
+            "at once.", violation="rear foot scuffs at take-off"),
     Measure("clearance_sls1", "m", "min z2, SLS-I", "foot clearance in SLS-I",
             "Least height of foot 2 in SLS-I; negative when it scuffs.",
-            breaks="rear foot scuffs in SLS-I"),
+            violation="rear foot scuffs in SLS-I"),
     Measure("clearance_sls2", "m", "min z2, SLS-II", "foot clearance in SLS-II",
             "Least height of foot 2 in SLS-II; negative when it scuffs.",
-            breaks="rear foot scuffs in SLS-II"),
+            violation="rear foot scuffs in SLS-II"),
     Measure("locked_stopper_force", "N", "min F_stop", "stopper force of the locked legs",
             "Least force of the stopper on each of the legs 3..n; negative where one comes off.",
-            axis="leg", breaks="locked leg leaves its stopper"),
+            dimension="leg", violation="locked leg leaves its stopper"),
     Measure("rear_stopper_force", "N", "min F_stop,2", "stopper force of Leg 2 in SLS-II",
             "Least force of the stopper on Leg 2 in SLS-II; negative where it comes off.",
-            breaks="Leg 2 leaves its stopper"),
+            violation="Leg 2 leaves its stopper"),
     Measure("contraction", "m", "min(L0 - L1)", "contraction of Leg 1",
             "Least contraction after the landing; negative where Leg 1 passes its stopper.",
-            breaks="Leg 1 passes its stopper"),
+            violation="Leg 1 passes its stopper"),
     Measure("friction_fore", "1", "μ - |λ1|/λ2", "friction left at the fore foot",
             "Friction coefficient of the model less the coefficient needed at the fore foot.",
-            breaks="fore foot slides"),
+            violation="fore foot slides"),
     Measure("friction_rear", "1", "μ - |λ3⁺|/λ4⁺", "friction left at the rear foot after landing",
             "Friction coefficient less the one needed at the rear foot just after landing.",
-            breaks="rear foot slides just after landing"),
+            violation="rear foot slides just after landing"),
     Measure("landing_stopper_impulse", "N s", "I_stop, I", "stopper impulse at the landing",
             "Impulse on each of the legs 3..n; negative where the landing throws one off.",
-            axis="leg", breaks="landing throws a locked leg off"),
+            dimension="leg", violation="landing throws a locked leg off"),
     Measure("hit_stopper_impulse", "N s", "I_stop, II", "stopper impulse at collision II",
             "Impulse on each of the legs 3..n; negative where the collision throws one off.",
-            axis="leg", breaks="collision II throws a locked leg off"),
+            dimension="leg", violation="collision II throws a locked leg off"),
     Measure("hit_planted_impulse", "N s", "λ_s2", "normal impulse of the planted foot",
             "Of collision II; negative where the ground would have to pull.", "(22)",
-            breaks="foot pulls in collision II"),
+            violation="foot pulls in collision II"),
     Measure("landing_friction_fore", "1", "μ - |λ_I1|/λ_I2",
             "friction left at the fore foot in the landing",
             "Friction coefficient less the one needed at the fore foot in the landing impulse.",
-            breaks="fore foot slides in the landing"),
+            violation="fore foot slides in the landing"),
     Measure("landing_friction_rear", "1", "μ - |λ_I3|/λ_I4",
             "friction left at the rear foot in the landing",
             "Friction coefficient less the one needed at the rear foot in the landing impulse.",
-            breaks="rear foot slides in the landing"),
+            violation="rear foot slides in the landing"),
 )
 """Margins of the model over one step, signed, negative where violated: `Margins`."""
 
-GROUND = _table(
+UNILATERAL_STEP_MEASURES = _make_table(
     Measure("duration_single", "s", "t₁", "time on one foot", "Time with one loaded foot."),
     Measure("duration_flight", "s", "t₀", "time of flight", "Time with no loaded foot."),
     Measure("slip", "m", "s", "slip per step", "Path of all sliding feet."),
@@ -177,19 +179,19 @@ GROUND = _table(
 )
 """Measures of a step with unilateral contact, beside those of `STEP_MEASURES` that it shares."""
 
-STOPPERS = _table(
+STOPPER_MARGIN_MEASURES = _make_table(
     Measure("stopper_force", "N", "min F_stop", "least force of a stopper on a leg in the air",
             "Negative where a stopper that only pushes would let a leg go.",
-            breaks="a leg in the air leaves its stopper"),
+            violation="a leg in the air leaves its stopper"),
     Measure("stopper_impulse", "N s", "min I_stop",
             "least impulse of a stopper on a leg in the air",
             "Negative where a stopper that only pushes would let an impact throw a leg off.",
-            breaks="an impact throws a leg off its stopper"),
+            violation="an impact throws a leg off its stopper"),
 )
 """Margins of a step with unilateral contact whose stoppers hold legs in the air, negative where
 violated."""
 
-SHARED = (
+SHARED_STEP_MEASURE_NAMES = (
     "dls_fraction",
     "period",
     "speed",
@@ -205,12 +207,12 @@ SHARED = (
 )
 """Measures of `STEP_MEASURES` that every model reports."""
 
-ON_GROUND = tuple(
-    name for name in (*SHARED, *GROUND) if name not in ("outcome", "solver_steps", "friction")
+UNILATERAL_DIFFERENTIABLE_NAMES = tuple(
+    name for name in (*SHARED_STEP_MEASURE_NAMES, *UNILATERAL_STEP_MEASURES) if name not in ("outcome", "solver_steps", "friction")
 )
 """Measures of a step with unilateral contact that have derivatives."""
 
-CYCLE = _table(
+LIMIT_CYCLE_MEASURES = _make_table(
     Measure("spectral_radius", "1", "ρ", "spectral radius",
             "Largest magnitude of a multiplier of the limit cycle; the gait is stable below 1."),
     Measure("spectral_margin", "1", "1 - ρ", "spectral margin",
@@ -221,7 +223,7 @@ CYCLE = _table(
 )
 """Measures of a limit cycle."""
 
-TRAJECTORY = _table(
+TRAJECTORY_MEASURES = _make_table(
     Measure("time", "s", "t", "time", "Time since the landing that opens the first step."),
     Measure("step", "1", "step", "step", "Number of the step, from 0."),
     Measure("phase", "1", "phase", "phase", "Phase of the step."),
@@ -259,46 +261,53 @@ TRAJECTORY = _table(
 )
 """Coordinates and variables of a trajectory."""
 
-CONTACTS = _table(
-    Measure("length", "m", "L", "length of the leg", "Of each leg.", axis="leg"),
-    Measure("length_rate", "m/s", "L̇", "rate of the leg's length", "Of each leg.", axis="leg"),
-    Measure("foot_x", "m", "x", "foot along the slope", "Downhill position.", axis="leg"),
-    Measure("foot_z", "m", "z", "foot above the slope", "Height.", axis="leg"),
+CONTACT_MEASURES = _make_table(
+    Measure("length", "m", "L", "length of the leg", "Of each leg.", dimension="leg"),
+    Measure("length_rate", "m/s", "L̇", "rate of the leg's length", "Of each leg.", dimension="leg"),
+    Measure("foot_x", "m", "x", "foot along the slope", "Downhill position.", dimension="leg"),
+    Measure("foot_z", "m", "z", "foot above the slope", "Height.", dimension="leg"),
     Measure("tangential", "N", "λ_t", "tangential force on the foot", "Downhill positive.",
-            axis="leg"),
+            dimension="leg"),
     Measure("normal", "N", "λ_n", "normal force on the foot", "Positive when it pushes.",
-            axis="leg"),
-    Measure("contact", "1", "contact", "contact mode of the foot", "Of each leg.", axis="leg"),
+            dimension="leg"),
+    Measure("contact", "1", "contact", "contact mode of the foot", "Of each leg.", dimension="leg"),
     Measure("on_stopper", "1", "on stopper", "whether the leg is on its stopper", "Of each leg.",
-            axis="leg"),
+            dimension="leg"),
 )
 """Variables of a trajectory with unilateral contact, of each leg 1..n."""
 
 # fmt: on
-PARAMETERS = _table(
+PARAMETER_MEASURES = _make_table(
     *(
         Measure(name, domain.unit or "1", domain.symbol, name.replace("_", " "), domain.description)
-        for name, domain in DOMAINS.items()
+        for name, domain in PARAMETER_DOMAINS.items()
     )
 )
 """Parameters of the wheel, for the axes of a scan."""
 
 MEASURES: dict[str, Measure] = (
-    STEP | MARGINS | GROUND | STOPPERS | CYCLE | TRAJECTORY | CONTACTS | PARAMETERS
+    STEP_MEASURES
+    | MARGIN_MEASURES
+    | UNILATERAL_STEP_MEASURES
+    | STOPPER_MARGIN_MEASURES
+    | LIMIT_CYCLE_MEASURES
+    | TRAJECTORY_MEASURES
+    | CONTACT_MEASURES
+    | PARAMETER_MEASURES
 )
 """All quantities by name."""
 
-PHASES = tuple(phase.name for phase in OF_STEP)
+PHASE_NAMES = tuple(phase.name for phase in OF_STEP)
 """Names of the phases of a step, in order: values 0, 1, 2 of `phase`."""
 
 
-def flags(names: Iterable[str]) -> dict[str, object]:
+def flag_attrs(names: Iterable[str]) -> dict[str, object]:
     """Return CF attributes of an integer variable whose values 0, 1, ... have names."""
     names = [name.replace(" ", "_") for name in names]
     return {"flag_values": list(range(len(names))), "flag_meanings": " ".join(names)}
 
 
-def measure_of(name: str) -> Measure:
+def get_measure(name: str) -> Measure:
     """Return the measure that a number belongs to.
 
     The name may end in its leg, as "[5]", and begin with the minus of an upper bound.
@@ -306,40 +315,42 @@ def measure_of(name: str) -> Measure:
     return MEASURES[name.removeprefix("-").partition("[")[0]]
 
 
-def variables(columns: Mapping[str, np.ndarray], along: str) -> dict[str, xr.Variable]:
+def make_variables(columns: Mapping[str, np.ndarray], dimension: str) -> dict[str, xr.Variable]:
     """Return labeled measures over one dimension; those of the locked legs have the dimension `leg`
     too.
     """
-    dims = lambda name: (along, MEASURES[name].axis) if MEASURES[name].axis else along
-    return {name: xr.Variable(dims(name), x, attrs_of(name)) for name, x in columns.items()}
+    dims_of = lambda name: (
+        (dimension, MEASURES[name].dimension) if MEASURES[name].dimension else dimension
+    )
+    return {name: xr.Variable(dims_of(name), x, measure_attrs(name)) for name, x in columns.items()}
 
 
-def locked_legs(n_legs: int) -> xr.Variable:
+def locked_leg_coordinate(n_legs: int) -> xr.Variable:
     """Return the coordinate `leg` of margins of legs 3..n."""
     attrs = {"long_name": "locked leg", "units": "1"}
     return xr.Variable("leg", np.arange(3, n_legs + 1), attrs)
 
 
-def what_breaks(name: str) -> str:
+def describe_violation(name: str) -> str:
     """Return the event at which a margin or indicator is zero; `name` may end in its leg, "[5]"."""
     base, _, leg = name.partition("[")
-    if base in STEP and not MEASURES[base].breaks:
+    if base in STEP_MEASURES and not MEASURES[base].violation:
         return f"{MEASURES[base].long_name} is zero"
-    if base not in MEASURES or not MEASURES[base].breaks:
+    if base not in MEASURES or not MEASURES[base].violation:
         return name.replace("_", " ")
-    symbol = f"{MEASURES[base].symbol} = 0: " if base in STEP else ""
-    return symbol + MEASURES[base].breaks + (f", leg {leg[:-1]}" if leg else "")
+    symbol = f"{MEASURES[base].symbol} = 0: " if base in STEP_MEASURES else ""
+    return symbol + MEASURES[base].violation + (f", leg {leg[:-1]}" if leg else "")
 
 
-def attrs_of(name: str) -> dict[str, object]:
+def measure_attrs(name: str) -> dict[str, object]:
     """Return the attributes of the variable `name`; phase, contact and outcome include their flag
     names.
     """
     attrs: dict[str, object] = dict(MEASURES[name].attrs)
     if name == "phase":
-        attrs |= flags(PHASES)
+        attrs |= flag_attrs(PHASE_NAMES)
     if name == "contact":
-        attrs |= flags(("in the air", "at rest", "sliding downhill", "sliding uphill"))
+        attrs |= flag_attrs(("in the air", "at rest", "sliding downhill", "sliding uphill"))
     if name == "outcome":
-        attrs |= flags(outcome.name for outcome in Outcome)
+        attrs |= flag_attrs(outcome.name for outcome in Outcome)
     return attrs

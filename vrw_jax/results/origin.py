@@ -6,12 +6,12 @@ import platform
 
 import jax
 
-from vrw_jax.numerics import Options
+from vrw_jax.numerics import StepOptions
 from vrw_jax.wheel import PARAMETER_NAMES, WheelParams
 
 
 def provenance(
-    params: WheelParams, model: object, options: Options
+    params: WheelParams, model: object, options: StepOptions
 ) -> dict[str, str | float | int]:
     """Return the provenance of a result: versions, device, number format,
     tolerances, parameters.

@@ -4,7 +4,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 
-class _Library:
+class _LazyLibrary:
     def __init__(self, name: str) -> None:
         self._name = name
 
@@ -12,12 +12,12 @@ class _Library:
         return getattr(importlib.import_module(self._name), attribute)
 
 
-def library(name: str) -> Any:
+def lazy_import(name: str) -> Any:
     """Return that library, imported on the first access to an attribute."""
-    return _Library(name)
+    return _LazyLibrary(name)
 
 
 if TYPE_CHECKING:
     import xarray as xarray
 else:
-    xarray = library("xarray")  # the container of all labeled results
+    xarray = lazy_import("xarray")  # the container of all labeled results

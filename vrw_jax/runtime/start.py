@@ -6,7 +6,7 @@ from pathlib import Path
 
 import jax
 
-from vrw_jax.wording import instance
+from vrw_jax.wording import check_type
 
 
 def start_jax(cache: str | Path | None = None) -> None:
@@ -31,7 +31,7 @@ def start_jax(cache: str | Path | None = None) -> None:
         >>> vrw.start_jax("~/.cache/vrw_jax")  # doctest: +SKIP
     """
     if cache is not None:
-        instance("cache", cache, (str, Path), "give a folder, or nothing for the user's own")
+        check_type("cache", cache, (str, Path), "give a folder, or nothing for the user's own")
         cache = Path(cache).expanduser()
         if cache.is_file():
             raise NotADirectoryError(
@@ -39,15 +39,15 @@ def start_jax(cache: str | Path | None = None) -> None:
             )
     jax.config.update("jax_enable_x64", True)
     if cache is not None or "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        folder = _cache_folder() / "vrw_jax" if cache is None else cache
+        folder = _user_cache_folder() / "vrw_jax" if cache is None else cache
         jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
     flags = os.environ.get("XLA_FLAGS", "")
-    if _KNOWN and _EMITTERS not in flags:  # read when the first array is created
-        os.environ["XLA_FLAGS"] = f"{flags} --{_EMITTERS}=false".strip()
+    if _IS_FLAG_KNOWN and _EMITTERS_FLAG not in flags:  # read when the first array is created
+        os.environ["XLA_FLAGS"] = f"{flags} --{_EMITTERS_FLAG}=false".strip()
 
 
-def fusion_emitters(on: bool) -> dict[str, str | bool]:
+def fusion_emitter_options(is_enabled: bool) -> dict[str, str | bool]:
     """Return options for `jax.jit` that select XLA's fusion emitters on or off for a program on a
     CPU.
 
@@ -55,16 +55,16 @@ def fusion_emitters(on: bool) -> dict[str, str | bool]:
     with unilateral contact, slower by a seventh. Programs whose digits must not depend on the
     process always set the option.
     """
-    return {_EMITTERS: on} if _KNOWN and jax.default_backend() == "cpu" else {}
+    return {_EMITTERS_FLAG: is_enabled} if _IS_FLAG_KNOWN and jax.default_backend() == "cpu" else {}
 
 
-_EMITTERS = "xla_cpu_use_fusion_emitters"
+_EMITTERS_FLAG = "xla_cpu_use_fusion_emitters"
 
-_KNOWN = jax.__version_info__[:2] in ((0, 9), (0, 10))
+_IS_FLAG_KNOWN = jax.__version_info__[:2] in ((0, 9), (0, 10))
 """Whether this version of XLA is known to accept the flag: others may abort the process."""
 
 
-def _cache_folder() -> Path:
+def _user_cache_folder() -> Path:
     if sys.platform == "win32":
         return Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
     if sys.platform == "darwin":

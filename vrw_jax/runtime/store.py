@@ -11,7 +11,7 @@ import jax
 
 
 @functools.cache
-def code_digest() -> str:
+def source_digest() -> str:
     """Return a digest of the library's source and tableaus: a change of either may
     change digits.
     """
@@ -23,33 +23,33 @@ def code_digest() -> str:
     return digest.hexdigest()
 
 
-def folder() -> Any:
+def cache_folder() -> Any:
     """Return the folder of JAX's compilation cache; None if there is none."""
     return jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
 
 
-def kept(name: str) -> bytes | None:
+def load_bytes(name: str) -> bytes | None:
     """Return the content saved under that name beside JAX's compiled code; None if absent or
     damaged.
     """
-    place = folder() and Path(folder()) / name
-    if not place or not place.exists():
+    path = cache_folder() and Path(cache_folder()) / name
+    if not path or not path.exists():
         return None
-    stored = place.read_bytes()
-    digest, content = stored[:32], stored[32:]
+    file_content = path.read_bytes()
+    digest, content = file_content[:32], file_content[32:]
     return content if hashlib.sha256(content).digest() == digest else None
 
 
-def keep(name: str, content: bytes) -> None:
+def save_bytes(name: str, content: bytes) -> None:
     """Save `content` under that name, in a temporary file that is renamed; failures are ignored."""
-    if not folder():
+    if not cache_folder():
         return
-    place = Path(folder()) / name
+    path = Path(cache_folder()) / name
     try:
-        place.parent.mkdir(parents=True, exist_ok=True)
-        handle, unfinished = tempfile.mkstemp(dir=place.parent)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary_path = tempfile.mkstemp(dir=path.parent)
         with os.fdopen(handle, "wb") as file:
             file.write(hashlib.sha256(content).digest() + content)
-        os.replace(unfinished, place)
+        os.replace(temporary_path, path)
     except OSError:
         return

@@ -1,19 +1,28 @@
 """Scans: the steady gait of every sample of a design, as one labelled dataset."""
 
 from vrw_jax.scans import design
-from vrw_jax.scans.design import LONGEST, SALTELLI, SWEPT, grid, saltelli, samples, sobol, uniform
-from vrw_jax.scans.forecast import explained, in_words
+from vrw_jax.scans.design import (
+    MAX_LISTED_SAMPLES,
+    SALTELLI_KIND,
+    SWEEPABLE_PARAMETERS,
+    grid,
+    saltelli,
+    samples,
+    sobol,
+    uniform,
+)
+from vrw_jax.scans.forecast import forecast_scan, format_seconds
 from vrw_jax.scans.indices import sobol_indices
-from vrw_jax.scans.offer import OF_CYCLE, OFFERS, TO_TOLERANCE, check_measures
+from vrw_jax.scans.offer import CATALOGS, DIFFERENTIABLE_MEASURES, TOLERANCE_CATALOG, check_measures
 from vrw_jax.scans.running import (
-    Plan,
-    Progress,
-    carried,
-    found_store,
-    open_store,
-    plan,
-    run,
+    ScanPlan,
+    ScanProgress,
+    find_store,
+    open_or_create_store,
+    plan_scan,
+    resolve_executor,
+    run_scan,
     scan,
 )
-from vrw_jax.scans.soundness import manifest_of
+from vrw_jax.scans.soundness import read_manifest
 from vrw_jax.scans.store import open_scan

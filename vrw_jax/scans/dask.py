@@ -15,23 +15,30 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vrw_jax.runtime import start_jax
-from vrw_jax.scans.design import Columns
-from vrw_jax.scans.evaluate import n_cores
-from vrw_jax.scans.ground import engine_for
-from vrw_jax.scans.planning import Chunk, Evaluate, Plan, Through, difference, origin
+from vrw_jax.scans.design import SampleColumns
+from vrw_jax.scans.evaluate import count_cores
+from vrw_jax.scans.ground import make_engine
+from vrw_jax.scans.planning import (
+    ChunkExecutor,
+    ChunkResult,
+    EvaluateSamples,
+    ScanPlan,
+    describe_difference,
+    describe_environment,
+)
 
 if TYPE_CHECKING:
     from distributed import Client
 
-AHEAD = 2
+QUEUED_CHUNKS_PER_THREAD = 2
 """Number of submitted chunks per thread, chosen to keep a thread busy with little memory."""
 
-ANSWER = "10s"
+SCHEDULER_TIMEOUT = "10s"
 """Longest time in which a scheduler must respond."""
 
 
 @contextlib.contextmanager
-def workers(address: str) -> Iterator[Through]:
+def connect_workers(address: str) -> Iterator[ChunkExecutor]:
     """Yield an executor on the cluster at `address`; "local" starts one process per core."""
     try:
         from distributed import Client, LocalCluster
@@ -43,73 +50,77 @@ def workers(address: str) -> Iterator[Through]:
     with contextlib.ExitStack() as stack:
         if address == "local":
             cluster = LocalCluster(
-                n_workers=n_cores(), threads_per_worker=1, dashboard_address=None
+                n_workers=count_cores(), threads_per_worker=1, dashboard_address=None
             )
             client = Client(stack.enter_context(cluster), set_as_default=False)
         else:
             try:
-                client = Client(address, timeout=ANSWER, set_as_default=False)
+                client = Client(address, timeout=SCHEDULER_TIMEOUT, set_as_default=False)
             except (OSError, ValueError) as error:  # no response, or an invalid address
                 raise ValueError(
                     f"no dask scheduler answers at {address!r}: give the address that it printed "
                     "when it started, such as tcp://host:8786, or 'local'."
                 ) from error
         stack.enter_context(client)
-        yield functools.partial(_chunks, client)
+        yield functools.partial(_compute_chunks, client)
 
 
-def _chunks(client: "Client", planned: Plan, missing: Sequence[int]) -> Iterator[Chunk]:
+def _compute_chunks(
+    client: "Client", plan: ScanPlan, missing: Sequence[int]
+) -> Iterator[ChunkResult]:
     """Yield the results of the missing chunks in the order of completion."""
     from distributed import Future, KilledWorker, as_completed
 
-    recipe = pickle.dumps(planned.for_engine)
-    here, waiting = origin(), iter(missing)
-    held: dict[Future, int] = {}
-    coming = as_completed(loop=client.loop)
+    pickled_request = pickle.dumps(plan.request)
+    local_environment, remaining_chunks = describe_environment(), iter(missing)
+    chunk_of_future: dict[Future, int] = {}
+    completed_futures = as_completed(loop=client.loop)
 
-    def fill() -> None:
+    def submit_chunks() -> None:
         """Submit chunks until every thread of the cluster has enough."""
-        room = AHEAD * max(1, sum(client.nthreads().values())) - len(held)
-        for index in itertools.islice(waiting, max(room, 0)):
-            columns = planned.design.block(planned.layout.region(index))
-            future = client.submit(_computed, recipe, columns, pure=False)
-            held[future] = index
-            coming.add(future)
+        n_free = QUEUED_CHUNKS_PER_THREAD * max(1, sum(client.nthreads().values())) - len(
+            chunk_of_future
+        )
+        for index in itertools.islice(remaining_chunks, max(n_free, 0)):
+            columns = plan.design.sample_block(plan.layout.chunk_region(index))
+            future = client.submit(_compute_in_worker, pickled_request, columns, pure=False)
+            chunk_of_future[future] = index
+            completed_futures.add(future)
 
     try:
-        fill()
-        for future in coming:
+        submit_chunks()
+        for future in completed_futures:
             try:
-                there, results = future.result()
+                worker_environment, results = future.result()
             except KilledWorker as error:
                 raise ValueError(
                     "a chunk was given up because each worker that had it died: see to the "
                     "workers (their memory, say) and run the same again, it goes on from there."
                 ) from error
-            told = difference(here, there)
-            if told:
+            environment_difference = describe_difference(local_environment, worker_environment)
+            if environment_difference:
                 raise ValueError(
-                    f"a worker computes by other means than this process: {told}. "
+                    f"a worker computes by other means than this process: {environment_difference}. "
                     "Start the workers from the same installation on machines of one kind."
                 )
-            yield held.pop(future), results
+            yield chunk_of_future.pop(future), results
             del future  # lets the cluster release its result
-            fill()
+            submit_chunks()
     finally:
-        client.cancel(list(held))
+        client.cancel(list(chunk_of_future))
 
 
-def _computed(
-    recipe: bytes, columns: Columns
+def _compute_in_worker(
+    pickled_request: bytes, columns: SampleColumns
 ) -> tuple[dict[str, object], Mapping[str, np.ndarray]]:
     """Return the environment of the worker and the results of a chunk."""
     start_jax()
-    return origin(), _engine(recipe)(columns)
+    return describe_environment(), _make_engine_once(pickled_request)(columns)
 
 
 @functools.cache
-def _engine(recipe: bytes) -> Evaluate:
+def _make_engine_once(pickled_request: bytes) -> EvaluateSamples:
     """Return the engine of a pickled request, which a worker creates once."""
     from distributed import get_worker
 
-    return engine_for(pickle.loads(recipe), get_worker().state.nthreads)
+    return make_engine(pickle.loads(pickled_request), get_worker().state.nthreads)

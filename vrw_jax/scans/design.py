@@ -8,18 +8,26 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vrw_jax.wheel import FRICTION, PARAMETER_NAMES
-from vrw_jax.wording import instance, range_of, require_known, shown, told, untraced, whole
+from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES
+from vrw_jax.wording import (
+    check_int,
+    check_known_name,
+    check_not_traced,
+    check_range,
+    check_type,
+    format_quantity,
+    format_value,
+)
 
-Columns = dict[str, np.ndarray]
+SampleColumns = dict[str, np.ndarray]
 """Swept parameters by name, with one value per sample."""
-SWEPT = (*PARAMETER_NAMES, FRICTION)
+SWEEPABLE_PARAMETERS = (*PARAMETER_NAMES, FRICTION_NAME)
 """Parameters that a design may sweep: those of the wheel, and the ground's friction."""
-Range = tuple[float, float]
+ParameterRange = tuple[float, float]
 """Lower and upper bound of a parameter, in its unit."""
-LONGEST = 10_000_000
+MAX_LISTED_SAMPLES = 10_000_000
 """Largest number of values of an axis or samples of a list, chosen because memory holds them."""
-SALTELLI = "saltelli"
+SALTELLI_KIND = "saltelli"
 """Kind of the designs from which Sobol' indices are computed."""
 
 
@@ -30,7 +38,7 @@ class AbstractDesign(abc.ABC):
     values: Mapping[str, np.ndarray]
 
     def __repr__(self) -> str:
-        columns = (f"{name} {told(values, '')}" for name, values in self.values.items())
+        columns = (f"{name} {format_quantity(values, '')}" for name, values in self.values.items())
         return f"{self.kind} of {self.size:,}: {', '.join(columns)}"
 
     @property
@@ -54,24 +62,24 @@ class AbstractDesign(abc.ABC):
         """Return the lengths of the axes."""
 
     @abc.abstractmethod
-    def block(self, region: tuple[slice, ...]) -> Columns:
+    def sample_block(self, region: tuple[slice, ...]) -> SampleColumns:
         """Return the samples of a rectangular region, flattened with the last axis fastest."""
 
     @abc.abstractmethod
-    def coordinates(self) -> dict[str, tuple[str, np.ndarray]]:
+    def result_coordinates(self) -> dict[str, tuple[str, np.ndarray]]:
         """Return the coordinates of a labelled result: name -> (axis, values)."""
 
-    def description(self) -> dict[str, object]:
+    def describe_identity(self) -> dict[str, object]:
         """Return the identity of the design: kind, names, shape and a digest of every number."""
         return {
             "kind": self.kind,
             "swept": list(self.names),
             "shape": list(self.shape),
-            "digest": digest_of(self.kind, self.values),
+            "digest": digest_columns(self.kind, self.values),
         }
 
 
-def digest_of(kind: str, values: Mapping[str, np.ndarray]) -> str:
+def digest_columns(kind: str, values: Mapping[str, np.ndarray]) -> str:
     """Return the SHA-256 digest of a kind, and of the names and values of the columns."""
     digest = hashlib.sha256(json.dumps([kind, *values]).encode())
     for column in values.values():
@@ -94,12 +102,15 @@ class Grid(AbstractDesign):
     def shape(self) -> tuple[int, ...]:
         return tuple(len(column) for column in self.values.values())
 
-    def block(self, region: tuple[slice, ...]) -> Columns:
-        pieces = [column[part] for column, part in zip(self.values.values(), region, strict=True)]
+    def sample_block(self, region: tuple[slice, ...]) -> SampleColumns:
+        pieces = [
+            column[axis_region]
+            for column, axis_region in zip(self.values.values(), region, strict=True)
+        ]
         mesh = np.meshgrid(*pieces, indexing="ij")
         return {name: axis.ravel() for name, axis in zip(self.names, mesh, strict=True)}
 
-    def coordinates(self) -> dict[str, tuple[str, np.ndarray]]:
+    def result_coordinates(self) -> dict[str, tuple[str, np.ndarray]]:
         return {name: (name, column) for name, column in self.values.items()}
 
 
@@ -118,10 +129,10 @@ class Samples(AbstractDesign):
     def shape(self) -> tuple[int, ...]:
         return (len(next(iter(self.values.values()))),)
 
-    def block(self, region: tuple[slice, ...]) -> Columns:
+    def sample_block(self, region: tuple[slice, ...]) -> SampleColumns:
         return {name: column[region[0]] for name, column in self.values.items()}
 
-    def coordinates(self) -> dict[str, tuple[str, np.ndarray]]:
+    def result_coordinates(self) -> dict[str, tuple[str, np.ndarray]]:
         index = {"sample": ("sample", np.arange(self.size))}
         return index | {name: ("sample", column) for name, column in self.values.items()}
 
@@ -142,7 +153,7 @@ def grid(**values: Sequence[float] | np.ndarray) -> Grid:
         >>> vrw.grid(damping=[100.0, 150.0], slope=np.linspace(0.28, 0.32, 5)).shape
         (2, 5)
     """
-    columns = {name: _column(name, value) for name, value in _known(values).items()}
+    columns = {name: _to_column(name, value) for name, value in _require_sweepable(values).items()}
     for name, column in columns.items():
         if len(np.unique(column)) != len(column):
             raise ValueError(
@@ -170,7 +181,7 @@ def samples(values: Mapping[str, Sequence[float] | np.ndarray]) -> Samples:
         >>> vrw.samples({"damping": [100.0, 150.0], "slope": [0.29, 0.30]}).shape
         (2,)
     """
-    columns = {name: _column(name, value) for name, value in _known(values).items()}
+    columns = {name: _to_column(name, value) for name, value in _require_sweepable(values).items()}
     lengths = {name: len(column) for name, column in columns.items()}
     if len(set(lengths.values())) > 1:
         raise ValueError(
@@ -180,7 +191,7 @@ def samples(values: Mapping[str, Sequence[float] | np.ndarray]) -> Samples:
     return Samples(columns)
 
 
-def sobol(ranges: Mapping[str, Range], n: int, seed: int = 0) -> Samples:
+def sobol(ranges: Mapping[str, ParameterRange], n: int, seed: int = 0) -> Samples:
     """Return `n` samples of a scrambled Sobol' sequence.
 
     The samples are spread most evenly if n is a power of 2.
@@ -202,13 +213,13 @@ def sobol(ranges: Mapping[str, Range], n: int, seed: int = 0) -> Samples:
     """
     from scipy.stats import qmc  # imported here because the import is slow
 
-    names, lower, upper = _box(ranges, n)
+    names, lower, upper = _parse_box(ranges, n)
     exponent = max(int(n - 1).bit_length(), 0)
-    points = qmc.Sobol(len(names), rng=_generator(seed)).random_base2(exponent)[:n]
-    return _spread(names, lower, upper, points, "sobol")
+    points = qmc.Sobol(len(names), rng=_make_generator(seed)).random_base2(exponent)[:n]
+    return _scale_to_box(names, lower, upper, points, "sobol")
 
 
-def uniform(ranges: Mapping[str, Range], n: int, seed: int = 0) -> Samples:
+def uniform(ranges: Mapping[str, ParameterRange], n: int, seed: int = 0) -> Samples:
     """Return `n` independent samples, uniformly distributed over the box.
 
     Args:
@@ -226,12 +237,12 @@ def uniform(ranges: Mapping[str, Range], n: int, seed: int = 0) -> Samples:
         >>> vrw.uniform({"damping": (100.0, 200.0), "slope": (0.28, 0.32)}, 8).shape
         (8,)
     """
-    names, lower, upper = _box(ranges, n)
-    points = _generator(seed).random((n, len(names)))
-    return _spread(names, lower, upper, points, "uniform")
+    names, lower, upper = _parse_box(ranges, n)
+    points = _make_generator(seed).random((n, len(names)))
+    return _scale_to_box(names, lower, upper, points, "uniform")
 
 
-def saltelli(ranges: Mapping[str, Range], n: int, seed: int = 0) -> Samples:
+def saltelli(ranges: Mapping[str, ParameterRange], n: int, seed: int = 0) -> Samples:
     """Return samples for `sobol_indices`: `n` rows of 2 + d samples for d parameters.
 
     A row holds two independent points of the box, A and B, and copies of A in which one coordinate
@@ -254,20 +265,26 @@ def saltelli(ranges: Mapping[str, Range], n: int, seed: int = 0) -> Samples:
     """
     from scipy.stats import qmc  # imported here because the import is slow
 
-    names, lower, upper = _box(ranges, n)
+    names, lower, upper = _parse_box(ranges, n)
     if n & (n - 1):
         raise ValueError(
             f"n is {n}, but the rows of a Sobol' sequence are balanced for powers of two: "
             f"give n = {1 << n.bit_length()}, say."
         )
     d = len(names)
-    points = qmc.Sobol(2 * d, rng=_generator(seed)).random_base2(n.bit_length() - 1)
-    a, b = points[:, :d], points[:, d:]
-    mixed = [np.where(np.arange(d) == i, b, a) for i in range(d)]
-    return _spread(names, lower, upper, np.concatenate([a, b, *mixed]), SALTELLI)
+    points = qmc.Sobol(2 * d, rng=_make_generator(seed)).random_base2(n.bit_length() - 1)
+    first_points, second_points = points[:, :d], points[:, d:]
+    mixed_points = [np.where(np.arange(d) == i, second_points, first_points) for i in range(d)]
+    return _scale_to_box(
+        names,
+        lower,
+        upper,
+        np.concatenate([first_points, second_points, *mixed_points]),
+        SALTELLI_KIND,
+    )
 
 
-def _spread(
+def _scale_to_box(
     names: list[str], lower: np.ndarray, upper: np.ndarray, points: np.ndarray, kind: str
 ) -> Samples:
     """Return the design of points of the unit cube, shape (n, d), scaled to the box."""
@@ -275,42 +292,47 @@ def _spread(
     return Samples(dict(zip(names, np.ascontiguousarray(values.T), strict=True)), kind)
 
 
-def _generator(seed: int) -> np.random.Generator:
+def _make_generator(seed: int) -> np.random.Generator:
     """Return a generator of random numbers; raise if the seed is not a whole number."""
-    return np.random.default_rng(whole("seed", seed, 0))
+    return np.random.default_rng(check_int("seed", seed, 0))
 
 
-def _box(ranges: Mapping[str, Range], n: int) -> tuple[list[str], np.ndarray, np.ndarray]:
+def _parse_box(
+    ranges: Mapping[str, ParameterRange], n: int
+) -> tuple[list[str], np.ndarray, np.ndarray]:
     """Return the names, lower bounds and upper bounds of a box; check the number of samples."""
-    if whole("n", n) > LONGEST:
+    if check_int("n", n) > MAX_LISTED_SAMPLES:
         raise ValueError(
-            f"n is {n:,}, but a list takes {LONGEST:,} samples at most: give fewer, or a grid."
+            f"n is {n:,}, but a list takes {MAX_LISTED_SAMPLES:,} samples at most: give fewer, or a grid."
         )
-    pairs = [range_of(f"the range of {name}", pair) for name, pair in _known(ranges).items()]
+    pairs = [
+        check_range(f"the range of {name}", pair)
+        for name, pair in _require_sweepable(ranges).items()
+    ]
     bounds = np.asarray(pairs)
     return list(ranges), bounds[:, 0], bounds[:, 1]
 
 
-def _known(values: Mapping[str, object]) -> Mapping:
+def _require_sweepable(values: Mapping[str, object]) -> Mapping:
     """Return `values`; raise if a name is not a sweepable parameter or there is none."""
-    instance("the design", values, Mapping, "write {'damping': (100.0, 200.0)}")
+    check_type("the design", values, Mapping, "write {'damping': (100.0, 200.0)}")
     if not values:
         raise ValueError(
             "the design sweeps no parameter, but a scan needs at least one: "
-            f"choose from {', '.join(SWEPT)}."
+            f"choose from {', '.join(SWEEPABLE_PARAMETERS)}."
         )
     for name in values:
-        require_known(name, SWEPT, "parameter that can be swept")
+        check_known_name(name, SWEEPABLE_PARAMETERS, "parameter that can be swept")
     return values
 
 
-def _column(name: str, value: object) -> np.ndarray:
+def _to_column(name: str, value: object) -> np.ndarray:
     """Return the values of one parameter as an array of one axis; raise if they are not numbers."""
-    untraced("a design", "use jax.vmap", value)
+    check_not_traced("a design", "use jax.vmap", value)
     column = np.atleast_1d(np.asarray(value))
     if column.dtype.kind not in "fiu" and column.size:
         raise TypeError(
-            f"{name} is {shown(value)}, but it must be a list of numbers: write [100.0]."
+            f"{name} is {format_value(value)}, but it must be a list of numbers: write [100.0]."
         )
     column = column.astype(float)
     if column.ndim != 1:

@@ -18,33 +18,33 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
-from vrw_jax.cycles import AbstractCycle, CycleOptions, confirmed, finder_of
+from vrw_jax.cycles import AbstractCycle, CycleOptions, confirm_outcome, make_finder
 from vrw_jax.models import AbstractWheel
-from vrw_jax.numerics import Options
-from vrw_jax.results import MARGINS
-from vrw_jax.runtime import compiled
-from vrw_jax.scans.offer import OF_CYCLE, derivative
-from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, wheel_of
+from vrw_jax.numerics import StepOptions
+from vrw_jax.results import MARGIN_MEASURES
+from vrw_jax.runtime import compile_exported
+from vrw_jax.scans.offer import DIFFERENTIABLE_MEASURES, parse_derivative
+from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, wheel_from_parameters
 
-LANES = 512
+WHEELS_PER_BATCH = 512
 """Number of wheels that one call of the compiled function evaluates."""
 
-Told = tuple[Array, Array, dict[str, Array]]
+GaitOutputs = tuple[Array, Array, dict[str, Array]]
 """Outcome, section state, and measures by name."""
 
 
-class Asked(NamedTuple):
+class EvaluationRequest(NamedTuple):
     """Measures to compute for each sample, with the wheel, the model and the options."""
 
     measures: tuple[str, ...]
     base: WheelParams
     model: Any
-    options: Options
+    options: StepOptions
     cycle_options: CycleOptions
     tol: float | None  # permitted error of the measures, in their units
 
 
-class Engine:
+class CollocationEngine:
     """Engine for the paper's model and a fixed set of measures, compiled at the first call.
 
     It finds the limit cycle with the requested derivatives by collocation. It then takes one
@@ -52,98 +52,122 @@ class Engine:
     parallel.
     """
 
-    def __init__(self, asked: Asked, threads: int | None = None) -> None:
+    def __init__(self, request: EvaluationRequest, threads: int | None = None) -> None:
         """Initialize; `threads` is the number of CPU threads, by default one per core."""
-        measures, base, model, options, cycle_options, _ = asked
-        self._threads = n_cores() if threads is None else threads
+        measures, base, model, options, cycle_options, _ = request
+        self._threads = count_cores() if threads is None else threads
         self._base, self._model, self._options = base, model, options
-        wanted = tuple(d for name in measures if (d := derivative(name)) is not None)
-        plain = tuple(name for name in measures if derivative(name) is None)
-        moved = tuple(dict.fromkeys(d.parameter for d in wanted))
-        indices = np.asarray([PARAMETER_NAMES.index(name) for name in moved], int)
+        requested_derivatives = tuple(
+            d for name in measures if (d := parse_derivative(name)) is not None
+        )
+        measure_names = tuple(name for name in measures if parse_derivative(name) is None)
+        parameters = tuple(dict.fromkeys(d.parameter for d in requested_derivatives))
+        indices = np.asarray([PARAMETER_NAMES.index(name) for name in parameters], int)
 
-        finder = finder_of(model, base.n_legs, cycle_options=cycle_options, step_options=options)
+        finder = make_finder(model, base.n_legs, cycle_options=cycle_options, step_options=options)
 
-        def gait(values: Array) -> tuple[AbstractCycle, dict[str, Array]]:
+        def find_cycle_with_derivatives(values: Array) -> tuple[AbstractCycle, dict[str, Array]]:
             """Return the limit cycle of one wheel and the requested derivatives."""
 
-            def along(some: Array) -> tuple[dict[str, Array], AbstractCycle]:
-                cycle = finder.cycle_of(values.at[indices].set(some))
-                return cycle.measures(d.measure for d in wanted), cycle
+            def find_measures_and_cycle(
+                swept_values: Array,
+            ) -> tuple[dict[str, Array], AbstractCycle]:
+                cycle = finder.find_cycle_from_values(values.at[indices].set(swept_values))
+                return cycle.measures(d.measure for d in requested_derivatives), cycle
 
-            if not wanted:
-                return along(values[indices])[1], {}
-            jacobian, cycle = jax.jacfwd(along, has_aux=True)(values[indices])
-            return cycle, {d.name: jacobian[d.measure][moved.index(d.parameter)] for d in wanted}
+            if not requested_derivatives:
+                return find_measures_and_cycle(values[indices])[1], {}
+            jacobian, cycle = jax.jacfwd(find_measures_and_cycle, has_aux=True)(values[indices])
+            return cycle, {
+                d.name: jacobian[d.measure][parameters.index(d.parameter)]
+                for d in requested_derivatives
+            }
 
-        def told_by_cycle(values: Array) -> Told:
+        def evaluate_cycle(values: Array) -> GaitOutputs:
             """Return outcome, section state and measures that the limit cycle gives."""
-            cycle, derivatives = gait(values)
-            names = (*(name for name in plain if name in OF_CYCLE), "spectral_radius")
-            return cycle.outcome, cycle.section_state, cycle.measures(names) | derivatives
+            cycle, derivative_values = find_cycle_with_derivatives(values)
+            names = (
+                *(name for name in measure_names if name in DIFFERENTIABLE_MEASURES),
+                "spectral_radius",
+            )
+            return cycle.outcome, cycle.section_state, cycle.measures(names) | derivative_values
 
-        def told_by_step(values: Array, state: Array, options: Options) -> Told:
+        def evaluate_step(values: Array, state: Array, options: StepOptions) -> GaitOutputs:
             """Return outcome, section state and measures that a step from the cycle gives."""
-            result = model.step(wheel_of(values, base.n_legs), state, options)
+            result = model.take_step(wheel_from_parameters(values, base.n_legs), state, options)
             measures = result.measures()
-            names = (*(name for name in plain if name not in OF_CYCLE), *MARGINS)
+            names = (
+                *(name for name in measure_names if name not in DIFFERENTIABLE_MEASURES),
+                *MARGIN_MEASURES,
+            )
             return result.outcome, result.section_state, {name: measures[name] for name in names}
 
-        self._cycle: Callable = jax.vmap(told_by_cycle)
-        self._step: Callable = jax.vmap(told_by_step, in_axes=(0, 0, None))
+        self._evaluate_cycle: Callable = jax.vmap(evaluate_cycle)
+        self._evaluate_step: Callable = jax.vmap(evaluate_step, in_axes=(0, 0, None))
         # The repr of a model omits defaults by identity, and pickling does not preserve identity.
-        told = (type(model).__name__, *vars(model).items())
-        self._settings = (measures, base.n_legs, told, cycle_options)
-        self._free: SimpleQueue[_Programs] = SimpleQueue()
-        self._workers, self._compiling = 0, Lock()
+        model_identity = (type(model).__name__, *vars(model).items())
+        self._cache_key = (measures, base.n_legs, model_identity, cycle_options)
+        self._free_programs: SimpleQueue[_CompiledPrograms] = SimpleQueue()
+        self._n_workers, self._compilation_lock = 0, Lock()
 
     def __call__(self, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return the results by variable; `columns` has one value per sample of each parameter."""
-        rows = numbers(columns, self._model, self._base)
-        with self._compiling:
-            if not self._workers:
+        rows = stack_parameters(columns, self._model, self._base)
+        with self._compilation_lock:
+            if not self._n_workers:
                 self._compile()
-        batches = (rows[begin : begin + LANES] for begin in range(0, len(rows), LANES))
-        with ThreadPoolExecutor(self._workers) as pool:
-            parts = list(pool.map(self._batch, batches))
+        batches = (
+            rows[begin : begin + WHEELS_PER_BATCH]
+            for begin in range(0, len(rows), WHEELS_PER_BATCH)
+        )
+        with ThreadPoolExecutor(self._n_workers) as pool:
+            parts = list(pool.map(self._evaluate_batch, batches))
         return {n: np.concatenate([part[n] for part in parts])[: len(rows)] for n in parts[0]}
 
-    def _batch(self, rows: np.ndarray) -> dict[str, np.ndarray]:
+    def _evaluate_batch(self, rows: np.ndarray) -> dict[str, np.ndarray]:
         """Return the results of a batch, which is padded with copies of its first wheel."""
-        filled = np.concatenate([rows, np.repeat(rows[:1], LANES - len(rows), 0)])
-        programs = self._free.get()
+        padded_rows = np.concatenate([rows, np.repeat(rows[:1], WHEELS_PER_BATCH - len(rows), 0)])
+        programs = self._free_programs.get()
         try:
-            values = jax.device_put(filled, programs.device)
-            outcome, state, by_cycle = programs.cycle(values)
+            values = jax.device_put(padded_rows, programs.device)
+            outcome, state, cycle_measures = programs.evaluate_cycle(values)
             options = jax.device_put(self._options, programs.device)
-            walked, reached, by_step = programs.step(values, state, options)
-            checked = confirmed(outcome, state, walked, reached)
-            told = by_cycle | by_step
+            step_outcome, step_state, step_measures = programs.evaluate_step(values, state, options)
+            confirmed_outcome = confirm_outcome(outcome, state, step_outcome, step_state)
+            measures = cycle_measures | step_measures
         finally:
-            self._free.put(programs)
-        return masked(checked, told)
+            self._free_programs.put(programs)
+        return mask_failures(confirmed_outcome, measures)
 
     def _compile(self) -> None:
         """Compile both functions in parallel for each device; all cores of a CPU share them."""
         devices = jax.local_devices()
-        values = jax.ShapeDtypeStruct((LANES, len(PARAMETER_NAMES)), self._dtype)
-        state = jax.ShapeDtypeStruct((LANES, 3), self._dtype)
-        settings = self._settings
+        values = jax.ShapeDtypeStruct((WHEELS_PER_BATCH, len(PARAMETER_NAMES)), self._dtype)
+        state = jax.ShapeDtypeStruct((WHEELS_PER_BATCH, 3), self._dtype)
+        cache_key = self._cache_key
         with ThreadPoolExecutor(2) as pool:
-            given = (values, state, self._options)
+            step_arguments = (values, state, self._options)
             steps = [
-                pool.submit(compiled, self._step, given, ("step", *settings), device)
+                pool.submit(
+                    compile_exported,
+                    self._evaluate_step,
+                    step_arguments,
+                    ("step", *cache_key),
+                    device,
+                )
                 for device in devices
             ]
             cycles = [
-                pool.submit(compiled, self._cycle, (values,), ("cycle", *settings), device)
+                pool.submit(
+                    compile_exported, self._evaluate_cycle, (values,), ("cycle", *cache_key), device
+                )
                 for device in devices
             ]
         for device, cycle, step in zip(devices, cycles, steps, strict=True):
             n = self._threads if device.platform == "cpu" and len(devices) == 1 else 1
             for _ in range(n):
-                self._free.put(_Programs(device, cycle.result(), step.result()))
-            self._workers += n
+                self._free_programs.put(_CompiledPrograms(device, cycle.result(), step.result()))
+            self._n_workers += n
 
     @property
     def _dtype(self) -> np.dtype:
@@ -151,40 +175,40 @@ class Engine:
         return np.dtype(self._base.damping.dtype)
 
 
-class _Programs(NamedTuple):
+class _CompiledPrograms(NamedTuple):
     """Compiled functions of one device."""
 
     device: jax.Device
-    cycle: Callable
-    step: Callable
+    evaluate_cycle: Callable
+    evaluate_step: Callable
 
 
-def n_cores() -> int:
+def count_cores() -> int:
     """Return the number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
-def numbers(
+def stack_parameters(
     columns: Mapping[str, np.ndarray], model: AbstractWheel, base: WheelParams
 ) -> np.ndarray:
     """Return the model's parameters of each sample, shape (samples, parameters)."""
     n = len(next(iter(columns.values())))
-    own = np.asarray(model.values(base))
+    base_values = np.asarray(model.parameter_values(base))
     return np.stack(
         [
-            np.asarray(columns.get(name, np.broadcast_to(value, n)), own.dtype)
-            for name, value in zip(model.parameter_names, own, strict=True)
+            np.asarray(columns.get(name, np.broadcast_to(value, n)), base_values.dtype)
+            for name, value in zip(model.parameter_names, base_values, strict=True)
         ],
         axis=-1,
     )
 
 
-def masked(outcome: np.ndarray, told: Mapping[str, Any]) -> dict[str, np.ndarray]:
+def mask_failures(outcome: np.ndarray, values_by_name: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """Return outcome and measures; a sample without a gait gets NaN, or -1 in an integer."""
-    measures = {name: np.array(value) for name, value in told.items()}
+    measures = {name: np.array(value) for name, value in values_by_name.items()}
     for value in measures.values():
-        absent = np.nan if np.issubdtype(value.dtype, np.floating) else -1
-        value[outcome != Outcome.STEPPED] = absent
+        missing_value = np.nan if np.issubdtype(value.dtype, np.floating) else -1
+        value[outcome != Outcome.STEPPED] = missing_value
     return {"outcome": outcome.astype(np.int8)} | measures

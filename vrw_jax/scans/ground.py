@@ -16,96 +16,114 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from vrw_jax.answers import RIGID, answer
+from vrw_jax.answers import RIGID_MODEL_INDEX, measure_to_tolerance
 from vrw_jax.cycles import (
-    Readings,
-    WalkedCycle,
-    finder_of,
-    read_along_lanes,
-    slow_gaits,
+    MeasureReader,
+    ReturnMapCycle,
+    evaluate_on_gaits,
+    find_slow_gaits,
+    make_finder,
 )
 from vrw_jax.models import (
-    UNILATERAL,
-    VISCOELASTIC,
+    UNILATERAL_MODEL,
+    VISCOELASTIC_MODEL,
     ViscoelasticWheel,
-    reason_of,
+    find_selection_reason,
 )
-from vrw_jax.numerics import in_batches
-from vrw_jax.scans.evaluate import Asked, Engine, masked, n_cores, numbers
-from vrw_jax.scans.offer import derivative, error_of
-from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, wheel_of
+from vrw_jax.numerics import map_in_batches
+from vrw_jax.scans.evaluate import (
+    CollocationEngine,
+    EvaluationRequest,
+    count_cores,
+    mask_failures,
+    stack_parameters,
+)
+from vrw_jax.scans.offer import error_variable_name, parse_derivative
+from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, Outcome, wheel_from_parameters
 
-SHARE, LANES = 512, 64
+SAMPLES_PER_TASK, GAITS_PER_READ = 512, 64
 """Number of samples per task of a thread, and number of gaits whose measures are read in one call;
 fixed, so that the result of a sample does not depend on the other samples."""
 
-Columns = Mapping[str, np.ndarray]
+SampleMapping = Mapping[str, np.ndarray]
 """Swept parameters by name, with one value per sample."""
-Told = dict[str, np.ndarray]
+ResultColumns = dict[str, np.ndarray]
 """Results by variable, with one value per sample."""
 
 
-class GroundEngine:
+class UnilateralEngine:
     """Engine for unilateral contact and a fixed set of measures."""
 
-    def __init__(self, asked: Asked, threads: int | None = None) -> None:
-        measures, base, model, options, *_ = asked  # walks find these gaits
+    def __init__(self, request: EvaluationRequest, threads: int | None = None) -> None:
+        measures, base, model, options, *_ = request  # walks find these gaits
         self._base, self._model = base, model
-        self._threads = n_cores() if threads is None else threads
-        wanted = tuple(d for name in measures if (d := derivative(name)) is not None)
-        plain = (*(n for n in measures if derivative(n) is None), "spectral_radius")
+        self._threads = count_cores() if threads is None else threads
+        derivatives = tuple(d for name in measures if (d := parse_derivative(name)) is not None)
+        measure_names = (*(n for n in measures if parse_derivative(n) is None), "spectral_radius")
 
-        finder: Any = finder_of(model, base.n_legs, step_options=options)
-        self._finder = dataclasses.replace(finder, shapes=(LANES,))
+        finder: Any = make_finder(model, base.n_legs, step_options=options)
+        self._finder = dataclasses.replace(finder, batch_sizes=(GAITS_PER_READ,))
         read = type(finder).read
-        self._plain, self._wanted = Readings(read, plain), wanted
-        self._moved = Readings(read, tuple(dict.fromkeys(d.measure for d in wanted)))
+        self._measure_reader, self._derivatives = MeasureReader(read, measure_names), derivatives
+        self._derivative_reader = MeasureReader(
+            read, tuple(dict.fromkeys(d.measure for d in derivatives))
+        )
 
-    def __call__(self, columns: Columns) -> Told:
+    def __call__(self, columns: SampleMapping) -> ResultColumns:
         """Return the results by variable; `columns` has one value per sample of each parameter."""
-        values = numbers(columns, self._model, self._base)
-        parts = np.array_split(values, max(self._threads, -(-len(values) // SHARE)))
-        alone, *others = (part for part in parts if len(part))
-        told = [self._part(alone)]  # the first call compiles for all threads
+        values = stack_parameters(columns, self._model, self._base)
+        parts = np.array_split(values, max(self._threads, -(-len(values) // SAMPLES_PER_TASK)))
+        first_part, *other_parts = (part for part in parts if len(part))
+        results = [self._evaluate_part(first_part)]  # the first call compiles for all threads
         with ThreadPoolExecutor(self._threads) as pool:
-            told += pool.map(self._part, others)
-        return {name: np.concatenate([part[name] for part in told]) for name in told[0]}
+            results += pool.map(self._evaluate_part, other_parts)
+        return {name: np.concatenate([part[name] for part in results]) for name in results[0]}
 
-    def _part(self, values: np.ndarray) -> Told:
+    def _evaluate_part(self, values: np.ndarray) -> ResultColumns:
         """Return the results of the gait to which slow starts of each sample converge."""
         # Friction balances the weight along the slope over a period; with less there is no gait.
         friction, slope = values[:, -1], values[:, PARAMETER_NAMES.index("slope")]
-        holds = friction >= np.tan(slope)
-        told = self._gaits(values[holds] if holds.any() else values[:1])
-        place = np.maximum(np.cumsum(holds) - 1, 0)  # any row if there is no gait
-        whole = {name: leaf[place] for name, leaf in told.items()}
-        outcome = np.where(holds, whole.pop("outcome"), Outcome.NO_CYCLE_FOUND)
-        return masked(outcome, whole)
+        has_enough_friction = friction >= np.tan(slope)
+        results = self._evaluate_gaits(
+            values[has_enough_friction] if has_enough_friction.any() else values[:1]
+        )
+        row = np.maximum(np.cumsum(has_enough_friction) - 1, 0)  # any row if there is no gait
+        results_of_all = {name: leaf[row] for name, leaf in results.items()}
+        outcome = np.where(
+            has_enough_friction, results_of_all.pop("outcome"), Outcome.NO_CYCLE_FOUND
+        )
+        return mask_failures(outcome, results_of_all)
 
-    def _gaits(self, values: np.ndarray) -> Told:
+    def _evaluate_gaits(self, values: np.ndarray) -> ResultColumns:
         """Return outcome, measures and derivatives of the gaits of wheels, shape (wheels,)."""
-        cycle = slow_gaits(self._finder, values)
-        told = in_batches(lambda some: _read_lanes(self._plain, some), (LANES,), cycle)
-        if self._wanted:
-            found = self._finder.find_many(jnp.asarray(values), cycle.section_state)
-            _, slopes = in_batches(
-                lambda some: read_along_lanes(self._moved, some), (LANES,), found
+        cycle = find_slow_gaits(self._finder, values)
+        results = map_in_batches(
+            lambda cycles: _read_measures(self._measure_reader, cycles), (GAITS_PER_READ,), cycle
+        )
+        if self._derivatives:
+            differentiable_cycles = self._finder.find_gaits(
+                jnp.asarray(values), cycle.section_state
+            )
+            _, jacobians = map_in_batches(
+                lambda cycles: evaluate_on_gaits(self._derivative_reader, cycles),
+                (GAITS_PER_READ,),
+                differentiable_cycles,
             )
             names = self._model.parameter_names
-            for d in self._wanted:
-                told[d.name] = slopes[d.measure][:, names.index(d.parameter)]
-        told["outcome"] = cycle.outcome
-        return {name: np.asarray(leaf) for name, leaf in told.items()}
+            for d in self._derivatives:
+                results[d.name] = jacobians[d.measure][:, names.index(d.parameter)]
+        results["outcome"] = cycle.outcome
+        return {name: np.asarray(leaf) for name, leaf in results.items()}
 
 
 @eqx.filter_jit
-def _read_lanes(readings: Readings, cycle: WalkedCycle) -> dict[str, Array]:
+def _read_measures(reader: MeasureReader, cycle: ReturnMapCycle) -> dict[str, Array]:
     """Return the measures of a batch of gaits."""
-    first = jax.tree.map(lambda leaf: leaf[:, 0], cycle.steps)
-    return eqx.filter_vmap(readings)(cycle, first)
+    first_step = jax.tree.map(lambda leaf: leaf[:, 0], cycle.steps)
+    return eqx.filter_vmap(reader)(cycle, first_step)
 
 
-OF_PAPER: dict[str, tuple[str, ...]] = {
+PAPER_MEASURE_SUMS: dict[str, tuple[str, ...]] = {
     "duration_single": ("duration_sls1", "duration_sls2"),
     "duration_flight": (),
     "slip": (),
@@ -118,73 +136,90 @@ OF_PAPER: dict[str, tuple[str, ...]] = {
 class LadderEngine:
     """Engine that evaluates each sample with the simplest valid model."""
 
-    def __init__(self, asked: Asked, threads: int | None = None) -> None:
-        self._measures, self._base, self._model, *_ = asked
-        self._paper = ViscoelasticWheel()
-        parts = (part for name in asked.measures for part in OF_PAPER.get(name, (name,)))
-        of_paper = asked._replace(measures=tuple(dict.fromkeys(parts)), model=self._paper)
-        self._lower = Engine(of_paper, threads)
-        self._upper = GroundEngine(asked._replace(model=asked.model.upper), threads)
+    def __init__(self, request: EvaluationRequest, threads: int | None = None) -> None:
+        self._measures, self._base, self._model, *_ = request
+        self._paper_model = ViscoelasticWheel()
+        parts = (
+            part for name in request.measures for part in PAPER_MEASURE_SUMS.get(name, (name,))
+        )
+        paper_request = request._replace(
+            measures=tuple(dict.fromkeys(parts)), model=self._paper_model
+        )
+        self._paper_engine = CollocationEngine(paper_request, threads)
+        self._unilateral_engine = UnilateralEngine(
+            request._replace(model=request.model.fallback_model), threads
+        )
 
-    def __call__(self, columns: Columns) -> Told:
+    def __call__(self, columns: SampleMapping) -> ResultColumns:
         """Return the results by variable, with `rung` and `reason` of each sample."""
         n = len(next(iter(columns.values())))
-        friction = columns.get(FRICTION, np.full(n, float(self._model.friction)))
-        lower = self._lower(
+        friction = columns.get(FRICTION_NAME, np.full(n, float(self._model.friction)))
+        paper_results = self._paper_engine(
             {"damping": np.full(n, float(self._base.damping))}
-            | {name: column for name, column in columns.items() if name != FRICTION}
+            | {name: column for name, column in columns.items() if name != FRICTION_NAME}
         )
-        reason = self.reasons(lower, friction)
-        rung = np.where(reason == 0, VISCOELASTIC, UNILATERAL).astype(np.int8)
+        reason = self.find_reasons(paper_results, friction)
+        rung = np.where(reason == 0, VISCOELASTIC_MODEL, UNILATERAL_MODEL).astype(np.int8)
         names = (*self._measures, "outcome", "spectral_radius")
         results = {
-            name: sum((lower[part] for part in OF_PAPER[name]), start=np.zeros(n))
-            if name in OF_PAPER
-            else lower[name]
+            name: sum((paper_results[part] for part in PAPER_MEASURE_SUMS[name]), start=np.zeros(n))
+            if name in PAPER_MEASURE_SUMS
+            else paper_results[name]
             for name in names
         }
-        up = np.flatnonzero(rung == UNILATERAL)
-        if up.size:
-            upper = self._upper({name: column[up] for name, column in columns.items()})
+        unilateral_samples = np.flatnonzero(rung == UNILATERAL_MODEL)
+        if unilateral_samples.size:
+            unilateral_results = self._unilateral_engine(
+                {name: column[unilateral_samples] for name, column in columns.items()}
+            )
             for name in names:
-                results[name][up] = upper[name]
+                results[name][unilateral_samples] = unilateral_results[name]
         return results | {"rung": rung, "reason": reason}
 
-    def reasons(self, lower: Told, friction: np.ndarray) -> np.ndarray:
+    def find_reasons(self, paper_results: ResultColumns, friction: np.ndarray) -> np.ndarray:
         """Return `ModelChoice.reason` of each gait of the paper's model, over its repeated step."""
-        reason, _ = reason_of(lower, friction - self._paper.friction)
+        reason, _ = find_selection_reason(paper_results, friction - self._paper_model.friction)
         return np.asarray(reason, np.int8)
 
 
-class AnswerEngine:
+class ToleranceEngine:
     """Engine of measures to a tolerance; see `vrw.measure_to_tolerance`."""
 
-    def __init__(self, asked: Asked) -> None:
-        self._measures, self._base, self._model, *_, tol = asked
+    def __init__(self, request: EvaluationRequest) -> None:
+        self._measures, self._base, self._model, *_, tol = request
         assert tol is not None  # the caller has checked it
         self._tol = tol
 
     def __call__(self, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return the results by variable; `columns` has one value per sample of each parameter."""
-        *own, friction = numbers(columns, self._model, self._base).T
-        params = wheel_of(tuple(map(jnp.asarray, own)), self._base.n_legs)
+        *wheel_columns, friction = stack_parameters(columns, self._model, self._base).T
+        params = wheel_from_parameters(tuple(map(jnp.asarray, wheel_columns)), self._base.n_legs)
         stoppers = self._model.stoppers
-        told = answer(self._measures, params, self._tol, friction=friction, stoppers=stoppers)
-        results = {name: told.values[:, i] for i, name in enumerate(self._measures)}
-        results |= {error_of(name): told.errors[:, i] for i, name in enumerate(self._measures)}
-        rung = np.maximum(told.rungs - RIGID, 0).astype(np.int8)
-        return masked(told.outcomes, results | {"rung": rung})
+        measured = measure_to_tolerance(
+            self._measures, params, self._tol, friction=friction, stoppers=stoppers
+        )
+        results = {name: measured.values[:, i] for i, name in enumerate(self._measures)}
+        results |= {
+            error_variable_name(name): measured.errors[:, i]
+            for i, name in enumerate(self._measures)
+        }
+        rung = np.maximum(measured.models - RIGID_MODEL_INDEX, 0).astype(np.int8)
+        return mask_failures(measured.outcomes, results | {"rung": rung})
 
 
-def engine_for(
-    asked: Asked, threads: int | None = None
-) -> Engine | GroundEngine | LadderEngine | AnswerEngine:
+def make_engine(
+    request: EvaluationRequest, threads: int | None = None
+) -> CollocationEngine | UnilateralEngine | LadderEngine | ToleranceEngine:
     """Return the engine for the samples of a scan of this model, or to a tolerance."""
-    if asked.tol is not None:
-        return AnswerEngine(asked)
-    make: Any = ENGINES[asked.model.rung]
-    return make(asked, threads)
+    if request.tol is not None:
+        return ToleranceEngine(request)
+    engine_class: Any = ENGINE_CLASSES[request.model.model_name]
+    return engine_class(request, threads)
 
 
-ENGINES = {"viscoelastic": Engine, "unilateral": GroundEngine, "ladder": LadderEngine}
+ENGINE_CLASSES = {
+    "viscoelastic": CollocationEngine,
+    "unilateral": UnilateralEngine,
+    "ladder": LadderEngine,
+}
 """Engine classes by model, for the models that a scan supports."""

@@ -11,15 +11,15 @@ from collections.abc import Iterable
 import numpy as np
 
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.scans.design import SALTELLI
-from vrw_jax.scans.soundness import manifest_of
+from vrw_jax.scans.design import SALTELLI_KIND
+from vrw_jax.scans.soundness import read_manifest
 from vrw_jax.wheel import Outcome
-from vrw_jax.wording import instance, names_of, nearest
+from vrw_jax.wording import check_names, check_type, suggest_name
 
-FEWEST = 64
+MIN_SOBOL_ROWS = 64
 """Least number of rows, chosen because indices of fewer rows are noise."""
 
-RESAMPLES, QUANTILES = 200, (0.025, 0.975)
+N_RESAMPLES, INTERVAL_QUANTILES = 200, (0.025, 0.975)
 """Number of bootstrap resamples of the rows, and quantiles that bound the interval."""
 
 
@@ -54,50 +54,57 @@ def sobol_indices(
     """
     from scipy.stats import sobol_indices as indices_of
 
-    instance("scan", scan, xr.Dataset, "give what vrw.scan or vrw.open_scan returned")
-    design = manifest_of(scan.attrs).get("design", {})
-    if design.get("kind") != SALTELLI:
+    check_type("scan", scan, xr.Dataset, "give what vrw.scan or vrw.open_scan returned")
+    design = read_manifest(scan.attrs).get("design", {})
+    if design.get("kind") != SALTELLI_KIND:
         raise ValueError(
             f"the scan's samples are of kind {design.get('kind')!r}, but Sobol' indices need those "
             "of vrw.saltelli({...}, n), or of a table [saltelli]: scan these."
         )
-    parameters, wanted = list(design["swept"]), list(names_of("measures", measures))
-    for name in wanted:
+    parameters, measure_names = list(design["swept"]), list(check_names("measures", measures))
+    for name in measure_names:
         if name not in scan or scan[name].dims != ("sample",):
             raise ValueError(
-                f"{name!r} is no measure of this scan{nearest(name, map(str, scan))}: "
+                f"{name!r} is no measure of this scan{suggest_name(name, map(str, scan))}: "
                 "ask for one that was scanned."
             )
-    blocks = 2 + len(parameters)
-    walks = (scan.outcome.values == Outcome.STEPPED).reshape(blocks, -1).all(axis=0)
-    kept = np.flatnonzero(walks)
-    n = 1 << (len(kept).bit_length() - 1) if len(kept) else 0
-    if n < FEWEST:
+    n_blocks = 2 + len(parameters)
+    has_gaits = (scan.outcome.values == Outcome.STEPPED).reshape(n_blocks, -1).all(axis=0)
+    rows_with_gaits = np.flatnonzero(has_gaits)
+    n = 1 << (len(rows_with_gaits).bit_length() - 1) if len(rows_with_gaits) else 0
+    if n < MIN_SOBOL_ROWS:
         raise ValueError(
-            f"only {len(kept)} of {len(walks)} rows walk throughout, but indices need {FEWEST}: "
+            f"only {len(rows_with_gaits)} of {len(has_gaits)} rows walk throughout, but indices need {MIN_SOBOL_ROWS}: "
             "narrow the ranges to where there are gaits, or take more rows."
         )
-    rows = kept[:n]
-    told = np.stack([scan[name].values.reshape(blocks, -1)[:, rows] for name in wanted], axis=1)
+    rows = rows_with_gaits[:n]
+    measure_values = np.stack(
+        [scan[name].values.reshape(n_blocks, -1)[:, rows] for name in measure_names], axis=1
+    )
 
-    def indices(some: np.ndarray) -> np.ndarray:
+    def compute_indices(row_indices: np.ndarray) -> np.ndarray:
         """Return both indices from some rows, shape (2, measures, parameters)."""
-        drawn = told[..., some]
-        found = indices_of(func={"f_A": drawn[0], "f_B": drawn[1], "f_AB": drawn[2:]}, n=n)
-        both, shape = (found.first_order, found.total_order), (len(wanted), len(parameters))
-        return np.stack([np.reshape(some, shape) for some in both])
+        drawn_values = measure_values[..., row_indices]
+        scipy_indices = indices_of(
+            func={"f_A": drawn_values[0], "f_B": drawn_values[1], "f_AB": drawn_values[2:]}, n=n
+        )
+        index_kinds, shape = (
+            (scipy_indices.first_order, scipy_indices.total_order),
+            (len(measure_names), len(parameters)),
+        )
+        return np.stack([np.reshape(row_indices, shape) for row_indices in index_kinds])
 
     generator = np.random.default_rng(0)  # seeded, so that the same scan gives the same intervals
-    found = indices(np.arange(n))
-    spread = [indices(generator.integers(0, n, n)) for _ in range(RESAMPLES)]
-    lower, upper = np.quantile(spread, QUANTILES, axis=0)
-    named = {}
+    estimates = compute_indices(np.arange(n))
+    resampled_estimates = [compute_indices(generator.integers(0, n, n)) for _ in range(N_RESAMPLES)]
+    lower, upper = np.quantile(resampled_estimates, INTERVAL_QUANTILES, axis=0)
+    data = {}
     for i, (name, label) in enumerate((("first_order", "first-order"), ("total", "total"))):
         attrs = {"units": "1", "long_name": f"{label} Sobol' index"}
-        for part, values in (("", found), ("_lower", lower), ("_upper", upper)):
-            named[name + part] = (("measure", "parameter"), values[i], attrs)
+        for suffix, bounds in (("", estimates), ("_lower", lower), ("_upper", upper)):
+            data[name + suffix] = (("measure", "parameter"), bounds[i], attrs)
     return xr.Dataset(
-        named,
-        coords={"measure": wanted, "parameter": parameters},
-        attrs={"rows": n, "left_out": 1.0 - len(kept) / len(walks)},
+        data,
+        coords={"measure": measure_names, "parameter": parameters},
+        attrs={"rows": n, "left_out": 1.0 - len(rows_with_gaits) / len(has_gaits)},
     )

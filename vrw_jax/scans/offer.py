@@ -4,20 +4,29 @@ import re
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from vrw_jax.answers import MADE
+from vrw_jax.answers import MEASURE_FUNCTIONS
 from vrw_jax.cycles import CollocationFinder
-from vrw_jax.models import SERVED, AbstractWheel
-from vrw_jax.results import MARGINS, MEASURES, ON_GROUND, STEP, attrs_of
-from vrw_jax.wheel import FRICTION, PARAMETER_NAMES
-from vrw_jax.wording import nearest
+from vrw_jax.models import SELECTION_ATTRS, AbstractWheel
+from vrw_jax.results import (
+    MARGIN_MEASURES,
+    MEASURES,
+    STEP_MEASURES,
+    UNILATERAL_DIFFERENTIABLE_NAMES,
+    measure_attrs,
+)
+from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES
+from vrw_jax.wording import suggest_name
 
-ALWAYS = ("outcome", "spectral_radius", *MARGINS)
+ALWAYS_INCLUDED = ("outcome", "spectral_radius", *MARGIN_MEASURES)
 """Variables of every scan, requested or not: outcome, stability and margins of the gait."""
 
-OF_CYCLE = CollocationFinder.of_cycle
+DIFFERENTIABLE_MEASURES = CollocationFinder.cycle_measures
 """Measures that are computed from the limit cycle itself; these have derivatives."""
 
-ON_REQUEST = (*OF_CYCLE, *(name for name in STEP if name not in (*OF_CYCLE, "outcome")))
+REQUESTABLE_MEASURES = (
+    *DIFFERENTIABLE_MEASURES,
+    *(name for name in STEP_MEASURES if name not in (*DIFFERENTIABLE_MEASURES, "outcome")),
+)
 
 DEFAULT_MEASURES = (
     "dls_fraction",
@@ -33,59 +42,79 @@ DEFAULT_MEASURES = (
 )
 
 
-class Offer(NamedTuple):
+class MeasureCatalog(NamedTuple):
     """Names of the variables that a scan of one model can compute."""
 
-    on_request: tuple[str, ...]
-    always: tuple[str, ...]  # in every scan, requested or not
+    requestable: tuple[str, ...]
+    always_included: tuple[str, ...]  # in every scan, requested or not
     differentiable: tuple[str, ...]
-    by: tuple[str, ...]  # parameters with respect to which derivatives are taken
-    default: tuple[str, ...]
-    tried: int  # samples per core that a forecast computes
+    differentiation_parameters: tuple[
+        str, ...
+    ]  # parameters with respect to which derivatives are taken
+    default_measures: tuple[str, ...]
+    forecast_samples_per_core: int  # samples per core that a forecast computes
 
 
-_DEFAULT = ("dls_fraction", "speed", "period", "step_length", "slip", "energy_lost_impacts")
-PAPER = Offer(ON_REQUEST, ALWAYS, OF_CYCLE, PARAMETER_NAMES, DEFAULT_MEASURES, 1024)
-REAL_GROUND = Offer(
-    (*ON_GROUND, "spectral_margin"),
+_CONTACT_DEFAULT_MEASURES = (
+    "dls_fraction",
+    "speed",
+    "period",
+    "step_length",
+    "slip",
+    "energy_lost_impacts",
+)
+PAPER_CATALOG = MeasureCatalog(
+    REQUESTABLE_MEASURES,
+    ALWAYS_INCLUDED,
+    DIFFERENTIABLE_MEASURES,
+    PARAMETER_NAMES,
+    DEFAULT_MEASURES,
+    1024,
+)
+UNILATERAL_CATALOG = MeasureCatalog(
+    (*UNILATERAL_DIFFERENTIABLE_NAMES, "spectral_margin"),
     ("outcome", "spectral_radius"),
-    ON_GROUND,
-    (*PARAMETER_NAMES, FRICTION),
-    _DEFAULT,
+    UNILATERAL_DIFFERENTIABLE_NAMES,
+    (*PARAMETER_NAMES, FRICTION_NAME),
+    _CONTACT_DEFAULT_MEASURES,
     16,
 )
-LADDER = Offer(
-    (*ON_GROUND, "spectral_margin"),
-    ("outcome", "spectral_radius", *SERVED),
-    tuple(name for name in ON_GROUND if name in OF_CYCLE),
+LADDER_CATALOG = MeasureCatalog(
+    (*UNILATERAL_DIFFERENTIABLE_NAMES, "spectral_margin"),
+    ("outcome", "spectral_radius", *SELECTION_ATTRS),
+    tuple(name for name in UNILATERAL_DIFFERENTIABLE_NAMES if name in DIFFERENTIABLE_MEASURES),
     PARAMETER_NAMES,
-    _DEFAULT,
+    _CONTACT_DEFAULT_MEASURES,
     64,
 )
-OFFERS = {"viscoelastic": PAPER, "unilateral": REAL_GROUND, "ladder": LADDER}
+CATALOGS = {
+    "viscoelastic": PAPER_CATALOG,
+    "unilateral": UNILATERAL_CATALOG,
+    "ladder": LADDER_CATALOG,
+}
 """Catalogs by model, for the models with compliant legs."""
-TO_TOLERANCE = Offer(
-    tuple(MADE), ("outcome", "rung"), (), (), ("dls_fraction", "speed", "period"), 16
+TOLERANCE_CATALOG = MeasureCatalog(
+    tuple(MEASURE_FUNCTIONS), ("outcome", "rung"), (), (), ("dls_fraction", "speed", "period"), 16
 )
 """Catalog of scans to a tolerance, in which each measure has an error."""
-ERROR = "_error"
+ERROR_SUFFIX = "_error"
 """Suffix of the variable that holds the error of a measure."""
 
 
-def offer_of(model: AbstractWheel, tol: float | None = None) -> Offer:
+def select_catalog(model: AbstractWheel, tol: float | None = None) -> MeasureCatalog:
     """Return the catalog of a model, or that of scans to a tolerance if `tol` is given."""
-    return OFFERS[model.rung] if tol is None else TO_TOLERANCE
+    return CATALOGS[model.model_name] if tol is None else TOLERANCE_CATALOG
 
 
-def error_of(measure: str) -> str:
+def error_variable_name(measure: str) -> str:
     """Return the name of the variable that holds the error of a measure."""
-    return measure + ERROR
+    return measure + ERROR_SUFFIX
 
 
-_DERIVATIVE = re.compile(r"d[ _](\w+?)(?: */ *d |_d_)(\w+)")
+_DERIVATIVE_PATTERN = re.compile(r"d[ _](\w+?)(?: */ *d |_d_)(\w+)")
 
 
-class Derivative(NamedTuple):
+class MeasureDerivative(NamedTuple):
     """Derivative of a measure with respect to a parameter, along the branch of limit cycles."""
 
     measure: str
@@ -110,61 +139,61 @@ class Derivative(NamedTuple):
         }
 
 
-def derivative(name: str) -> Derivative | None:
+def parse_derivative(name: str) -> MeasureDerivative | None:
     """Return the derivative named as in 'd dls_fraction / d damping', or None for a measure."""
-    found = _DERIVATIVE.fullmatch(name.strip())
-    return Derivative(*found.groups()) if found else None
+    match = _DERIVATIVE_PATTERN.fullmatch(name.strip())
+    return MeasureDerivative(*match.groups()) if match else None
 
 
-def canonical(name: str) -> str:
+def canonicalize_name(name: str) -> str:
     """Return the name of the variable that holds `name`, as a name that a file system accepts."""
-    wanted = derivative(name)
-    return name.strip() if wanted is None else wanted.name
+    requested_derivative = parse_derivative(name)
+    return name.strip() if requested_derivative is None else requested_derivative.name
 
 
-def check_measures(names: Iterable[str], offer: Offer) -> tuple[str, ...]:
+def check_measures(names: Iterable[str], catalog: MeasureCatalog) -> tuple[str, ...]:
     """Return the variables' names, each once and without those in every scan; raise if unknown."""
-    checked: dict[str, None] = {}
-    known = (*offer.on_request, *offer.always)
+    checked_names: dict[str, None] = {}
+    known_names = (*catalog.requestable, *catalog.always_included)
     for name in names:
-        wanted = derivative(name)
-        if wanted is None:
-            if name not in known:
+        requested_derivative = parse_derivative(name)
+        if requested_derivative is None:
+            if name not in known_names:
                 raise ValueError(
-                    f"{name!r} is no measure of a scan{nearest(name, known)}: "
-                    f"choose from {', '.join(offer.on_request)}, or a derivative such as "
+                    f"{name!r} is no measure of a scan{suggest_name(name, known_names)}: "
+                    f"choose from {', '.join(catalog.requestable)}, or a derivative such as "
                     "'d dls_fraction / d damping'."
                 )
-            if name not in offer.always:
-                checked[name] = None
+            if name not in catalog.always_included:
+                checked_names[name] = None
             continue
-        if not offer.differentiable:
+        if not catalog.differentiable:
             raise ValueError(
                 f"{name!r} is a derivative, but a scan to a tolerance computes only measures: "
                 "drop it, or scan without tol."
             )
-        if wanted.measure not in offer.differentiable:
+        if requested_derivative.measure not in catalog.differentiable:
             raise ValueError(
-                f"{name!r} asks for a derivative of {wanted.measure!r}"
-                f"{nearest(wanted.measure, offer.differentiable)}, but a scan differentiates only "
-                f"{', '.join(offer.differentiable)}: choose one of these."
+                f"{name!r} asks for a derivative of {requested_derivative.measure!r}"
+                f"{suggest_name(requested_derivative.measure, catalog.differentiable)}, but a scan differentiates only "
+                f"{', '.join(catalog.differentiable)}: choose one of these."
             )
-        if wanted.parameter not in offer.by:
+        if requested_derivative.parameter not in catalog.differentiation_parameters:
             raise ValueError(
-                f"{name!r} asks for a derivative by {wanted.parameter!r}"
-                f"{nearest(wanted.parameter, offer.by)}, but it must be by a parameter: "
-                f"choose from {', '.join(offer.by)}."
+                f"{name!r} asks for a derivative by {requested_derivative.parameter!r}"
+                f"{suggest_name(requested_derivative.parameter, catalog.differentiation_parameters)}, but it must be by a parameter: "
+                f"choose from {', '.join(catalog.differentiation_parameters)}."
             )
-        checked[wanted.name] = None
-    return tuple(checked)
+        checked_names[requested_derivative.name] = None
+    return tuple(checked_names)
 
 
-def variable_attrs(name: str) -> dict[str, object]:
+def get_variable_attrs(name: str) -> dict[str, object]:
     """Return unit, name and description of the variable `name` of a scan."""
-    if name in SERVED:
-        return dict(SERVED[name])
-    if name.removesuffix(ERROR) in MADE and name.endswith(ERROR):
-        of = MEASURES[name.removesuffix(ERROR)]
-        return {"units": of.unit, "long_name": f"bound of the error of {of.long_name}"}
-    wanted = derivative(name)
-    return attrs_of(name) if wanted is None else wanted.attrs
+    if name in SELECTION_ATTRS:
+        return dict(SELECTION_ATTRS[name])
+    if name.removesuffix(ERROR_SUFFIX) in MEASURE_FUNCTIONS and name.endswith(ERROR_SUFFIX):
+        measure = MEASURES[name.removesuffix(ERROR_SUFFIX)]
+        return {"units": measure.unit, "long_name": f"bound of the error of {measure.long_name}"}
+    requested_derivative = parse_derivative(name)
+    return measure_attrs(name) if requested_derivative is None else requested_derivative.attrs

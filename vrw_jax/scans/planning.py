@@ -12,69 +12,100 @@ import jax
 import numpy as np
 
 from vrw_jax import simd
-from vrw_jax.cycles import CycleOptions, finder_of
+from vrw_jax.cycles import CycleOptions, make_finder
 from vrw_jax.models import AbstractWheel, ViscoelasticWheel
-from vrw_jax.numerics import Options
-from vrw_jax.results import MARGINS, attrs_of, locked_legs, provenance
-from vrw_jax.runtime import code_digest
-from vrw_jax.scans.design import AbstractDesign, Columns
-from vrw_jax.scans.evaluate import Asked
-from vrw_jax.scans.ground import engine_for
-from vrw_jax.scans.offer import canonical, check_measures, error_of, offer_of, variable_attrs
-from vrw_jax.scans.store import (
-    ASKED,
-    MANIFEST,
-    PROVENANCE,
-    Layout,
-    Variable,
-    chunk_shape,
-    first_difference,
+from vrw_jax.numerics import StepOptions
+from vrw_jax.results import MARGIN_MEASURES, locked_leg_coordinate, measure_attrs, provenance
+from vrw_jax.runtime import source_digest
+from vrw_jax.scans.design import AbstractDesign, SampleColumns
+from vrw_jax.scans.evaluate import EvaluationRequest
+from vrw_jax.scans.ground import make_engine
+from vrw_jax.scans.offer import (
+    canonicalize_name,
+    check_measures,
+    error_variable_name,
+    get_variable_attrs,
+    select_catalog,
 )
-from vrw_jax.walks import ModelLike, options_of, rung_of
-from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, WheelParams
-from vrw_jax.wording import instance, names_of, positive, whole
+from vrw_jax.scans.store import (
+    MANIFEST_ATTRIBUTE,
+    PROVENANCE_ATTRIBUTE,
+    REQUESTED_ATTRIBUTE,
+    ResultLayout,
+    VariableLayout,
+    choose_chunk_shape,
+    find_first_difference,
+)
+from vrw_jax.walks import ModelLike, check_model, check_options
+from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, WheelParams
+from vrw_jax.wording import check_int, check_names, check_positive, check_type
 
-MOST_SAMPLES = 1_000_000_000
+MAX_SCAN_SAMPLES = 1_000_000_000
 """Largest number of samples, chosen because it takes over a day and some hundred GB."""
 
-CHUNK = 4096
+DEFAULT_CHUNK_SIZE = 4096
 """Default number of samples per chunk; a killed scan can lose so many."""
 
-ANSWERABLE = {"unilateral": ("restitution", "infinite", "uneven", "max_events")}
+TOLERANCE_REFERENCE_SETTINGS = {
+    "unilateral": ("restitution", "infinite_friction_rule", "uneven", "max_events")
+}
 """Models that a tolerance can refer to, and their fields that must have the default value."""
 
-Evaluate = Callable[[Columns], Mapping[str, np.ndarray]]
+STORED_KINDS = {"StepOptions": "Options"}
+"""Names of classes in stores, where they differ from the names in Python: stores of version 0.1
+keep opening."""
+STORED_FIELD_NAMES = {
+    "StepOptions": {
+        "dt0": "first_step",
+        "max_event_iterations": "event_steps",
+        "max_margin_search_iterations": "monitor_steps",
+    },
+    "CycleOptions": {
+        "mesh_intervals": "steps",
+        "mesh_grading": "growth",
+        "max_newton_iterations": "iterations",
+        "first_newton_iterations": "first_iterations",
+        "homotopy_steps": "stages",
+        "batch_size": "block",
+    },
+    "UnilateralWheel": {"infinite_friction_rule": "infinite"},
+    "RigidWheel": {"holds_rear_foot": "held_landing"},
+}
+"""Names of fields in stores, where they differ from the names in Python, by class."""
+
+EvaluateSamples = Callable[[SampleColumns], Mapping[str, np.ndarray]]
 """Function that returns the results of samples by variable, with the axis of samples first."""
-Chunk = tuple[int, Mapping[str, np.ndarray]]
+ChunkResult = tuple[int, Mapping[str, np.ndarray]]
 """Index of a chunk and its results."""
-Through = Callable[["Plan", Sequence[int]], Iterator[Chunk]]
+ChunkExecutor = Callable[["ScanPlan", Sequence[int]], Iterator[ChunkResult]]
 """Function that computes chunks of a plan, given by index, and yields them in any order."""
 
 
 @dataclass(frozen=True)
-class Plan:
+class ScanPlan:
     """Checked arguments and layout of a scan."""
 
     design: AbstractDesign
-    for_engine: Asked
-    layout: Layout
-    asked: tuple[str, ...]  # measures by the names that the caller gave
-    text: str
+    request: EvaluationRequest
+    layout: ResultLayout
+    requested_measures: tuple[str, ...]  # measures by the names that the caller gave
+    config_text: str
 
     @property
     def settings(self) -> dict[str, object]:
         """Return the settings that a store must share so that the scan can continue in it."""
-        measures, base, model, options, cycle_options, tol = self.for_engine
-        fixed = (name for name in PARAMETER_NAMES if name not in self.design.names)
+        measures, base, model, options, cycle_options, tol = self.request
+        fixed_names = (name for name in PARAMETER_NAMES if name not in self.design.names)
         return {
-            "design": self.design.description(),
-            "wheel": {name: float(getattr(base, name)) for name in fixed} | {"n_legs": base.n_legs},
+            "design": self.design.describe_identity(),
+            "wheel": {name: float(getattr(base, name)) for name in fixed_names}
+            | {"n_legs": base.n_legs},
             "measures": list(measures),
-            "model": _fields(model),
-            "options": _fields(options),
-            "cycle_options": _fields(cycle_options),
+            "model": _record_fields(model),
+            "options": _record_fields(options),
+            "cycle_options": _record_fields(cycle_options),
             "dtype": str(base.damping.dtype),
-            "chunk": list(self.layout.chunk),
+            "chunk": list(self.layout.chunk_shape),
         } | ({} if tol is None else {"tol": tol})
 
     @property
@@ -84,29 +115,29 @@ class Plan:
             "title": f"Steady gaits of the viscoelastic-legged rimless wheel over "
             f"{', '.join(self.design.names)}",
             "rule": "NaN, or -1 in an integer, where the outcome is not STEPPED.",
-            MANIFEST: json.dumps(self.settings),  # text: other formats take no tables
-            PROVENANCE: json.dumps(origin()),
-            ASKED: ", ".join(self.asked),
-            "config": self.text,
+            MANIFEST_ATTRIBUTE: json.dumps(self.settings),  # text: other formats take no tables
+            PROVENANCE_ATTRIBUTE: json.dumps(describe_environment()),
+            REQUESTED_ATTRIBUTE: ", ".join(self.requested_measures),
+            "config": self.config_text,
         }
 
-    def engine(self) -> Evaluate:
+    def build_engine(self) -> EvaluateSamples:
         """Return the engine that computes the samples."""
-        return engine_for(self.for_engine)
+        return make_engine(self.request)
 
 
-def plan(
+def plan_scan(
     design: AbstractDesign,
     measures: Iterable[str] | None = None,
     *,
     base: WheelParams | None = None,
     model: ModelLike | None = None,
-    options: Options | None = None,
+    options: StepOptions | None = None,
     cycle_options: CycleOptions | None = None,
     chunk: int | None = None,
-    text: str = "",
+    config_text: str = "",
     tol: float | None = None,
-) -> Plan:
+) -> ScanPlan:
     """Return the checked plan of a scan, with the layout of its result, without computing it."""
     if not isinstance(design, AbstractDesign):
         raise TypeError(
@@ -114,45 +145,53 @@ def plan(
             "vrw.grid(damping=[...]), vrw.samples({...}), vrw.sobol({...}, n) or vrw.uniform."
         )
     base = WheelParams() if base is None else base
-    instance("base", base, WheelParams, "write vrw.WheelParams(slope=...)")
-    base.require_one("give numbers, and what varies in the design")
-    options, model = options_of(options), rung_of(model)
-    options.require_reachable(np.dtype(base.damping.dtype))
-    finder = finder_of(model, base.n_legs, cycle_options=cycle_options, step_options=options)
-    finder.options_used.require_reachable(np.dtype(base.damping.dtype))
-    chunk = CHUNK if chunk is None else whole("chunk", chunk)
-    if design.size > MOST_SAMPLES:
+    check_type("base", base, WheelParams, "write vrw.WheelParams(slope=...)")
+    base.require_single("give numbers, and what varies in the design")
+    options, model = check_options(options), check_model(model)
+    options.check_tolerances(np.dtype(base.damping.dtype))
+    finder = make_finder(model, base.n_legs, cycle_options=cycle_options, step_options=options)
+    finder.search_options.check_tolerances(np.dtype(base.damping.dtype))
+    chunk = DEFAULT_CHUNK_SIZE if chunk is None else check_int("chunk", chunk)
+    if design.size > MAX_SCAN_SAMPLES:
         raise ValueError(
-            f"the design has {design.size:,} samples, but a scan takes {MOST_SAMPLES:,} at most: "
+            f"the design has {design.size:,} samples, but a scan takes {MAX_SCAN_SAMPLES:,} at most: "
             "give its axes fewer values, or draw samples with vrw.sobol."
         )
-    if not model.legs_yield:
+    if not model.is_compliant:
         raise TypeError(
             f"model is {model!r}, but a scan is of gaits with compliant legs: give "
             'vrw.ViscoelasticWheel(), vrw.UnilateralWheel() or "auto".'
         )
-    if FRICTION in design.names and FRICTION not in model.parameter_names:
+    if FRICTION_NAME in design.names and FRICTION_NAME not in model.parameter_names:
         raise ValueError(
             "the design sweeps friction, which does not affect the paper's wheel: give "
             'model=vrw.UnilateralWheel() or "auto".'
         )
-    tol = None if tol is None else _towards(model, positive("tol", tol))
-    offer = offer_of(model, tol)
-    asked = offer.default if measures is None else names_of("measures", measures)
-    names = check_measures(asked, offer)
-    own = (canonical(name) for name in asked)
-    first = dict.fromkeys(x for name in own for x in (name, error_of(name))[: 1 + bool(tol)])
+    tol = None if tol is None else _check_tolerance(model, check_positive("tol", tol))
+    catalog = select_catalog(model, tol)
+    requested_measures = (
+        catalog.default_measures if measures is None else check_names("measures", measures)
+    )
+    names = check_measures(requested_measures, catalog)
+    canonical_names = (canonicalize_name(name) for name in requested_measures)
+    variable_names = dict.fromkeys(
+        x for name in canonical_names for x in (name, error_variable_name(name))[: 1 + bool(tol)]
+    )
     cycle_options = CycleOptions() if cycle_options is None else cycle_options
-    sought = Asked(names, base, model, options, cycle_options, tol)
-    layout = _layout(design, tuple(first | dict.fromkeys(offer.always)), base, chunk)
-    return Plan(design, sought, layout, asked, text)
+    request = EvaluationRequest(names, base, model, options, cycle_options, tol)
+    layout = _make_layout(
+        design, tuple(variable_names | dict.fromkeys(catalog.always_included)), base, chunk
+    )
+    return ScanPlan(design, request, layout, requested_measures, config_text)
 
 
-def _towards(model: AbstractWheel, tol: float) -> float:
+def _check_tolerance(model: AbstractWheel, tol: float) -> float:
     """Return the tolerance; raise if no tolerance can refer to the model."""
-    usual: dict[str, Any] = type(model).__dataclass_fields__
-    own = ANSWERABLE.get(model.rung)
-    if own is None or any(getattr(model, name) != usual[name].default for name in own):
+    fields: dict[str, Any] = type(model).__dataclass_fields__
+    default_only_fields = TOLERANCE_REFERENCE_SETTINGS.get(model.model_name)
+    if default_only_fields is None or any(
+        getattr(model, name) != fields[name].default_measures for name in default_only_fields
+    ):
         raise ValueError(
             f"tol is given and model is {model!r}, but a tolerance refers to unilateral contact "
             "with no settings other than friction and stoppers: give "
@@ -161,29 +200,31 @@ def _towards(model: AbstractWheel, tol: float) -> float:
     return tol
 
 
-def origin() -> dict[str, object]:
+def describe_environment() -> dict[str, object]:
     """Return the code digest, the versions and the device of this process."""
-    told = provenance(WheelParams(), ViscoelasticWheel(), Options())
+    environment = provenance(WheelParams(), ViscoelasticWheel(), StepOptions())
     return {
-        "code": code_digest(),
-        "versions": told["versions"],
-        "device": f"{jax.default_backend()}: {told['device']}, {_processor()}",
+        "code": source_digest(),
+        "versions": environment["versions"],
+        "device": f"{jax.default_backend()}: {environment['device']}, {_describe_processor()}",
     }
 
 
-VECTOR_SETS = ("avx", "fma", "avx2", "avx512f", "avx512dq", "neon", "sve")
+VECTOR_INSTRUCTION_SETS = ("avx", "fma", "avx2", "avx512f", "avx512dq", "neon", "sve")
 """Instruction sets that decide which sums the compiler fuses, and thus the last digits."""
 
 
-def _processor() -> str:
+def _describe_processor() -> str:
     """Return the kind of processor, as far as the last digits depend on it."""
-    able = simd.processor()[2].split(",")
-    return " ".join([platform.machine(), *(name for name in VECTOR_SETS if f"+{name}" in able)])
+    supported = simd.describe_processor()[2].split(",")
+    return " ".join(
+        [platform.machine(), *(name for name in VECTOR_INSTRUCTION_SETS if f"+{name}" in supported)]
+    )
 
 
-def difference(there: object, here: object) -> str:
+def describe_difference(stored: object, current: object) -> str:
     """Return a description of the first setting that differs, or an empty string."""
-    name, old, new = first_difference(there, here)
+    name, old, new = find_first_difference(stored, current)
     if not name:
         return ""
     if name == "design.digest":
@@ -193,49 +234,55 @@ def difference(there: object, here: object) -> str:
     return f"{name} is {old!r} there and {new!r} here"
 
 
-def _layout(
+def _make_layout(
     design: AbstractDesign, names: tuple[str, ...], base: WheelParams, chunk: int
-) -> Layout:
+) -> ResultLayout:
     """Return the layout of the variables `names` over a design, in chunks of at most `chunk`."""
     dtype = str(base.damping.dtype)
-    legs = locked_legs(base.n_legs)
+    legs = locked_leg_coordinate(base.n_legs)
 
-    def variable(name: str) -> Variable:
+    def make_variable(name: str) -> VariableLayout:
         """Return type, missing value and attributes of one variable."""
-        attrs = variable_attrs(name)
+        attributes = get_variable_attrs(name)
         if name in ("outcome", "rung", "reason"):
-            return Variable(name, "int8", -1, attrs)
+            return VariableLayout(name, "int8", -1, attributes)
         if name == "solver_steps":
-            return Variable(name, "int32", -1, attrs)
-        if name in MARGINS and MARGINS[name].axis:
-            return Variable(name, dtype, np.nan, attrs, ("leg",), legs.shape)
-        return Variable(name, dtype, np.nan, attrs)
+            return VariableLayout(name, "int32", -1, attributes)
+        if name in MARGIN_MEASURES and MARGIN_MEASURES[name].dimension:
+            return VariableLayout(name, dtype, np.nan, attributes, ("leg",), legs.shape)
+        return VariableLayout(name, dtype, np.nan, attributes)
 
     coordinates = {
-        name: (dim, values, attrs_of(name) if name in (*PARAMETER_NAMES, FRICTION) else {})
-        for name, (dim, values) in design.coordinates().items()
+        name: (
+            dim,
+            values,
+            measure_attrs(name) if name in (*PARAMETER_NAMES, FRICTION_NAME) else {},
+        )
+        for name, (dim, values) in design.result_coordinates().items()
     }
     coordinates["leg"] = ("leg", legs.values, legs.attrs)
-    return Layout(
+    return ResultLayout(
         dims=design.dims,
         shape=design.shape,
-        chunk=chunk_shape(design.shape, chunk),
-        variables=tuple(variable(name) for name in names),
+        chunk_shape=choose_chunk_shape(design.shape, chunk),
+        variables=tuple(make_variable(name) for name in names),
         coordinates=coordinates,
     )
 
 
-def _fields(settings: object) -> dict[str, object]:
+def _record_fields(settings: object) -> dict[str, object]:
     """Return the class name and the fields of settings, as values of JSON."""
-    told: dict[str, object] = {"kind": type(settings).__name__}
+    kind = type(settings).__name__
+    record: dict[str, object] = {"kind": STORED_KINDS.get(kind, kind)}
+    stored_names = STORED_FIELD_NAMES.get(kind, {})
     for name in type(settings).__dataclass_fields__:  # type: ignore[attr-defined]
         value = getattr(settings, name)
-        if isinstance(value, Options):
+        if isinstance(value, StepOptions):
             continue  # recorded separately
         if value is None or isinstance(value, bool | int | str):
-            told[name] = value
+            record[stored_names.get(name, name)] = value
         elif isinstance(value, tuple):
-            told[name] = list(value)
+            record[stored_names.get(name, name)] = list(value)
         else:
-            told[name] = float(value)
-    return told
+            record[stored_names.get(name, name)] = float(value)
+    return record

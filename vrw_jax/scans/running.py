@@ -17,34 +17,41 @@ from pathlib import Path
 import numpy as np
 
 from vrw_jax.cycles import CycleOptions
-from vrw_jax.numerics import Options
+from vrw_jax.numerics import StepOptions
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.scans.design import AbstractDesign
-from vrw_jax.scans.planning import Chunk, Plan, Through, difference, origin, plan
+from vrw_jax.scans.planning import (
+    ChunkExecutor,
+    ChunkResult,
+    ScanPlan,
+    describe_difference,
+    describe_environment,
+    plan_scan,
+)
 from vrw_jax.scans.store import (
-    MANIFEST,
-    PROVENANCE,
+    MANIFEST_ATTRIBUTE,
+    PROVENANCE_ATTRIBUTE,
     AbstractStore,
     MemoryStore,
     ZarrStore,
-    create,
-    stored_manifest,
+    create_store,
+    read_stored_manifest,
 )
 from vrw_jax.walks import ModelLike
 from vrw_jax.wheel import Outcome, WheelParams
 
-Report = Callable[["Progress"], None]
+ProgressCallback = Callable[["ScanProgress"], None]
 """Function that is called with the progress after each chunk."""
 
 
 @dataclass(frozen=True)
-class Progress:
+class ScanProgress:
     """Progress of a scan, as numbers of samples."""
 
-    samples: int  # samples to compute in this run
-    done: int  # samples computed in this run
-    failed: int  # computed samples without a steady gait
-    kept: int  # samples that an earlier run computed
+    n_samples: int  # samples to compute in this run
+    n_done: int  # samples computed in this run
+    n_failed: int  # computed samples without a steady gait
+    n_reused: int  # samples that an earlier run computed
 
 
 def scan(
@@ -53,11 +60,11 @@ def scan(
     *,
     base: WheelParams | None = None,
     model: ModelLike | None = None,
-    options: Options | None = None,
+    options: StepOptions | None = None,
     cycle_options: CycleOptions | None = None,
     store: str | Path | None = None,
     chunk: int | None = None,
-    report: Report | None = None,
+    report: ProgressCallback | None = None,
     dask: str | None = None,
     tol: float | None = None,
 ) -> xr.Dataset:
@@ -103,7 +110,7 @@ def scan(
         >>> gaits.speed.round(3).values.tolist(), gaits.outcome.values.tolist()
         ([1.018, nan], [0, 14])
     """
-    planned = plan(
+    scan_plan = plan_scan(
         design,
         measures,
         base=base,
@@ -113,120 +120,126 @@ def scan(
         chunk=chunk,
         tol=tol,
     )
-    with carried(dask) as through:
-        return run(planned, store, report=report, through=through)
+    with resolve_executor(dask) as executor:
+        return run_scan(scan_plan, store, on_progress=report, executor=executor)
 
 
-def carried(dask: str | None) -> contextlib.AbstractContextManager[Through | None]:
+def resolve_executor(dask: str | None) -> contextlib.AbstractContextManager[ChunkExecutor | None]:
     """Return the context of a dask cluster's workers, or of None if this process computes."""
     if dask is None:
         return contextlib.nullcontext()
-    from vrw_jax.scans.dask import workers
+    from vrw_jax.scans.dask import connect_workers
 
-    return workers(dask)
+    return connect_workers(dask)
 
 
-def run(
-    planned: Plan,
+def run_scan(
+    scan_plan: ScanPlan,
     store: str | Path | AbstractStore | None = None,
     *,
-    report: Report | None = None,
-    through: Through | None = None,
+    on_progress: ProgressCallback | None = None,
+    executor: ChunkExecutor | None = None,
 ) -> xr.Dataset:
     """Return the dataset of a plan, computed in this process or by `executor`."""
-    kept = store if isinstance(store, AbstractStore) else _kept(planned, store)
-    missing = kept.missing()
-    if missing or kept.damage:
-        with kept.at_work():
-            _compute(planned, kept, missing, report, through or _in_turn)
-    return kept.dataset()
+    storage = store if isinstance(store, AbstractStore) else _open_storage(scan_plan, store)
+    missing = storage.find_missing_chunks()
+    if missing or storage.damage_description:
+        with storage.open_for_writing():
+            _compute_chunks(
+                scan_plan, storage, missing, on_progress, executor or _compute_in_process
+            )
+    return storage.load_dataset()
 
 
-def _kept(planned: Plan, store: str | Path | None) -> AbstractStore:
+def _open_storage(scan_plan: ScanPlan, store: str | Path | None) -> AbstractStore:
     """Return the storage of a scan; warn if some of its chunks are damaged."""
     if store is None:
-        return MemoryStore(planned.layout, planned.attrs)
-    kept = open_store(planned, Path(store))
-    if kept.damage:
-        warnings.warn(f"{kept.damage}: computed again.", stacklevel=4)
-    return kept
+        return MemoryStore(scan_plan.layout, scan_plan.attrs)
+    storage = open_or_create_store(scan_plan, Path(store))
+    if storage.damage_description:
+        warnings.warn(f"{storage.damage_description}: computed again.", stacklevel=4)
+    return storage
 
 
-def _compute(
-    planned: Plan,
-    kept: AbstractStore,
+def _compute_chunks(
+    scan_plan: ScanPlan,
+    storage: AbstractStore,
     missing: list[int],
-    report: Report | None,
-    through: Through,
+    on_progress: ProgressCallback | None,
+    executor: ChunkExecutor,
 ) -> None:
     """Compute the missing chunks and write them, with a report after each."""
-    shapes = {index: planned.layout.shape_of(index) for index in missing}
-    total, done, failed = sum(map(math.prod, shapes.values())), 0, 0
-    if report is not None:
-        report(Progress(total, 0, 0, planned.design.size - total))
-    for index, results in through(planned, missing):
+    shapes = {index: scan_plan.layout.shape_of_chunk(index) for index in missing}
+    n_samples, n_done, n_failed = sum(map(math.prod, shapes.values())), 0, 0
+    if on_progress is not None:
+        on_progress(ScanProgress(n_samples, 0, 0, scan_plan.design.size - n_samples))
+    for index, results in executor(scan_plan, missing):
         shape = shapes[index]
         block = {name: x.reshape(*shape, *x.shape[1:]) for name, x in results.items()}
-        with _disk_full_explained(kept, planned.layout.n_chunks):
-            kept.write(index, block)
-        done += math.prod(shape)
-        failed += int(np.count_nonzero(results["outcome"] != Outcome.STEPPED))
-        if report is not None:
-            report(Progress(total, done, failed, planned.design.size - total))
+        with _explain_full_disk(storage, scan_plan.layout.n_chunks):
+            storage.write_chunk(index, block)
+        n_done += math.prod(shape)
+        n_failed += int(np.count_nonzero(results["outcome"] != Outcome.STEPPED))
+        if on_progress is not None:
+            on_progress(
+                ScanProgress(n_samples, n_done, n_failed, scan_plan.design.size - n_samples)
+            )
 
 
-def _in_turn(planned: Plan, missing: Sequence[int]) -> Iterator[Chunk]:
+def _compute_in_process(scan_plan: ScanPlan, missing: Sequence[int]) -> Iterator[ChunkResult]:
     """Yield the missing chunks, computed one after another in this process."""
-    engine = planned.engine()
+    engine = scan_plan.build_engine()
     for index in missing:
-        yield index, engine(planned.design.block(planned.layout.region(index)))
+        yield index, engine(scan_plan.design.sample_block(scan_plan.layout.chunk_region(index)))
 
 
-def open_store(planned: Plan, path: Path) -> ZarrStore:
+def open_or_create_store(scan_plan: ScanPlan, path: Path) -> ZarrStore:
     """Return the store at `path`, created if there is none; raise if it holds another scan."""
-    kept = found_store(planned, path)
-    if kept is None:
-        create(path, planned.layout, planned.attrs)
-        kept = found_store(planned, path)
-        assert kept is not None
-    there = stored_manifest(path) or {}
-    other = difference(there[PROVENANCE], origin())
-    missing = len(kept.missing())
-    if other and missing:
-        damaged = f" ({len(kept.damaged)} of them damaged)" if kept.damaged else ""
+    storage = find_store(scan_plan, path)
+    if storage is None:
+        create_store(path, scan_plan.layout, scan_plan.attrs)
+        storage = find_store(scan_plan, path)
+        assert storage is not None
+    manifest = read_stored_manifest(path) or {}
+    setting_difference = describe_difference(manifest[PROVENANCE_ATTRIBUTE], describe_environment())
+    missing = len(storage.find_missing_chunks())
+    if setting_difference and missing:
+        damaged_text = (
+            f" ({len(storage.damaged_chunks)} of them damaged)" if storage.damaged_chunks else ""
+        )
         raise ValueError(
-            f"{path} lacks {missing} of {planned.layout.n_chunks} chunks{damaged} and "
-            f"was begun by other means, so that its last digits might not fit: {other}. "
+            f"{path} lacks {missing} of {scan_plan.layout.n_chunks} chunks{damaged_text} and "
+            f"was begun by other means, so that its last digits might not fit: {setting_difference}. "
             "Go on with what it was begun with, or begin anew in another place."
         )
-    return kept
+    return storage
 
 
-def found_store(planned: Plan, path: Path, verify: bool = True) -> ZarrStore | None:
+def find_store(scan_plan: ScanPlan, path: Path, verify: bool = True) -> ZarrStore | None:
     """Return the store at `path`, or None if there is none; raise if it holds another scan."""
-    there = stored_manifest(path)
-    if there is None:
+    manifest = read_stored_manifest(path)
+    if manifest is None:
         return None
-    other = difference(there[MANIFEST], planned.settings)
-    if other:
+    setting_difference = describe_difference(manifest[MANIFEST_ATTRIBUTE], scan_plan.settings)
+    if setting_difference:
         raise ValueError(
-            f"{path} holds a scan made with other settings: {other}. "
+            f"{path} holds a scan made with other settings: {setting_difference}. "
             "Give another place for this scan, or go back to those settings, or delete the store."
         )
-    return ZarrStore(path, planned.layout, verify)
+    return ZarrStore(path, scan_plan.layout, verify)
 
 
 @contextlib.contextmanager
-def _disk_full_explained(kept: AbstractStore, n_chunks: int) -> Iterator[None]:
+def _explain_full_disk(storage: AbstractStore, n_chunks: int) -> Iterator[None]:
     """Replace the error of a full disk by one that names the number of complete chunks."""
     try:
         yield
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise
-        n_done = n_chunks - len(kept.missing())
+        n_done = n_chunks - len(storage.find_missing_chunks())
         raise OSError(
             error.errno,
-            f"no space is left for {kept.place}, where {n_done} chunks are complete: make room and "
+            f"no space is left for {storage.location}, where {n_done} chunks are complete: make room and "
             "run the same again, it goes on from there",
         ) from error

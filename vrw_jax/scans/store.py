@@ -22,45 +22,45 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vrw_jax.models import VISCOELASTIC
+from vrw_jax.models import VISCOELASTIC_MODEL
 from vrw_jax.results import MEASURES
-from vrw_jax.runtime import library
+from vrw_jax.runtime import lazy_import
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.scans.offer import canonical
+from vrw_jax.scans.offer import canonicalize_name
 from vrw_jax.scans.soundness import (
-    BOOKS,
-    DIGEST,
-    DONE,
-    MANIFEST,
-    SIZE,
-    Books,
-    alone,
-    manifest_of,
-    told_damage,
+    CHECKSUM_ARRAY_NAME,
+    CHECKSUM_GROUP_NAME,
+    DIGEST_SIZE_BYTES,
+    LEGACY_MARKS_NAME,
+    MANIFEST_ATTRIBUTE,
+    ChunkChecksums,
+    describe_damage,
+    read_manifest,
+    store_lock,
 )
-from vrw_jax.wording import instance
+from vrw_jax.wording import check_type
 
 if TYPE_CHECKING:
     import zarr
 else:
-    zarr = library("zarr")
+    zarr = lazy_import("zarr")
 
-PROVENANCE, ASKED = "provenance", "asked"
+PROVENANCE_ATTRIBUTE, REQUESTED_ATTRIBUTE = "provenance", "asked"
 """Names of the attributes that hold the origin of the numbers and the requested measures."""
 
-Region = tuple[slice, ...]
+ChunkRegion = tuple[slice, ...]
 """Slices of a chunk along the axes of the samples."""
-Block = Mapping[str, np.ndarray]
+ChunkBlock = Mapping[str, np.ndarray]
 """Results of one chunk by variable; the axes of the samples come first."""
 
 
 @dataclass(frozen=True)
-class Variable:
+class VariableLayout:
     """Description of one variable; `dims` and `shape` leave out the axes of the samples."""
 
     name: str
     dtype: str
-    missing: float | int
+    fill_value: float | int
     attrs: Mapping[str, Any]
     dims: tuple[str, ...] = ()
     shape: tuple[int, ...] = ()
@@ -72,36 +72,36 @@ class Variable:
 
 
 @dataclass(frozen=True)
-class Layout:
+class ResultLayout:
     """Description of a result: its axes, chunks, variables and coordinates."""
 
     dims: tuple[str, ...]
     shape: tuple[int, ...]
-    chunk: tuple[int, ...]
-    variables: tuple[Variable, ...]
+    chunk_shape: tuple[int, ...]
+    variables: tuple[VariableLayout, ...]
     coordinates: Mapping[str, tuple[str, np.ndarray, Mapping[str, Any]]]
 
     @property
     def n_chunks(self) -> int:
         """Return the number of chunks."""
-        return math.prod(self._counts)
+        return math.prod(self._chunks_per_axis)
 
     @property
-    def _counts(self) -> tuple[int, ...]:
+    def _chunks_per_axis(self) -> tuple[int, ...]:
         """Return the number of chunks along each axis."""
-        return tuple(-(-n // c) for n, c in zip(self.shape, self.chunk, strict=True))
+        return tuple(-(-n // c) for n, c in zip(self.shape, self.chunk_shape, strict=True))
 
-    def region(self, index: int) -> Region:
+    def chunk_region(self, index: int) -> ChunkRegion:
         """Return the slices of a chunk along the axes of the samples."""
-        places = np.unravel_index(index, self._counts)
+        chunk_indices = np.unravel_index(index, self._chunks_per_axis)
         return tuple(
             slice(int(i) * c, min((int(i) + 1) * c, n))
-            for i, c, n in zip(places, self.chunk, self.shape, strict=True)
+            for i, c, n in zip(chunk_indices, self.chunk_shape, self.shape, strict=True)
         )
 
-    def shape_of(self, index: int) -> tuple[int, ...]:
+    def shape_of_chunk(self, index: int) -> tuple[int, ...]:
         """Return the shape of a chunk, which is smaller at the end of an axis."""
-        return tuple(part.stop - part.start for part in self.region(index))
+        return tuple(part.stop - part.start for part in self.chunk_region(index))
 
     @property
     def bytes_per_sample(self) -> int:
@@ -109,12 +109,12 @@ class Layout:
         return sum(variable.bytes_per_sample for variable in self.variables)
 
 
-def chunk_shape(shape: tuple[int, ...], most: int) -> tuple[int, ...]:
+def choose_chunk_shape(shape: tuple[int, ...], max_samples: int) -> tuple[int, ...]:
     """Return the shape of a slab of at most `max_samples` samples with whole last axes."""
-    chunk, room = [1] * len(shape), most
+    chunk, samples_left = [1] * len(shape), max_samples
     for axis in range(len(shape) - 1, -1, -1):
-        chunk[axis] = min(shape[axis], max(room, 1))
-        room //= chunk[axis]
+        chunk[axis] = min(shape[axis], max(samples_left, 1))
+        samples_left //= chunk[axis]
         if chunk[axis] < shape[axis]:
             break
     return tuple(chunk)
@@ -123,36 +123,36 @@ def chunk_shape(shape: tuple[int, ...], most: int) -> tuple[int, ...]:
 class AbstractStore(abc.ABC):
     """Storage that accepts chunks, lists the missing ones and returns the labelled result."""
 
-    place: str = "memory"
-    damage: str = ""
+    location: str = "memory"
+    damage_description: str = ""
     """Description of the damage; an empty string if there is none."""
 
     @abc.abstractmethod
-    def missing(self) -> list[int]:
+    def find_missing_chunks(self) -> list[int]:
         """Return the chunks that are still to be computed, in ascending order."""
 
     @abc.abstractmethod
-    def write(self, index: int, block: Block) -> None:
+    def write_chunk(self, index: int, block: ChunkBlock) -> None:
         """Write the results of a chunk and mark it as done."""
 
     @abc.abstractmethod
-    def dataset(self) -> xr.Dataset:
+    def load_dataset(self) -> xr.Dataset:
         """Return the labelled result."""
 
     @abc.abstractmethod
-    def at_work(self) -> contextlib.AbstractContextManager[None]:
+    def open_for_writing(self) -> contextlib.AbstractContextManager[None]:
         """Return the context of all writing, which removes unfinished files and holds the lock."""
 
 
 class MemoryStore(AbstractStore):
     """Storage of a scan's results in memory."""
 
-    def __init__(self, layout: Layout, attrs: Mapping[str, object]) -> None:
+    def __init__(self, layout: ResultLayout, attrs: Mapping[str, object]) -> None:
         self._layout, self._attrs = layout, attrs
-        self._done = np.zeros(layout.n_chunks, bool)
+        self._is_chunk_done = np.zeros(layout.n_chunks, bool)
         try:
             self._arrays = {
-                v.name: np.full((*layout.shape, *v.shape), v.missing, v.dtype)
+                v.name: np.full((*layout.shape, *v.shape), v.fill_value, v.dtype)
                 for v in layout.variables
             }
         except MemoryError as error:
@@ -162,19 +162,19 @@ class MemoryStore(AbstractStore):
                 "GB, more than this memory holds: give a store, whose chunks go to the disk."
             ) from error
 
-    def missing(self) -> list[int]:
-        return [int(i) for i in np.flatnonzero(~self._done)]
+    def find_missing_chunks(self) -> list[int]:
+        return [int(i) for i in np.flatnonzero(~self._is_chunk_done)]
 
-    def write(self, index: int, block: Block) -> None:
-        region = self._layout.region(index)
+    def write_chunk(self, index: int, block: ChunkBlock) -> None:
+        region = self._layout.chunk_region(index)
         for name, array in self._arrays.items():
             array[region] = block[name]
-        self._done[index] = True
+        self._is_chunk_done[index] = True
 
-    def at_work(self) -> contextlib.AbstractContextManager[None]:
+    def open_for_writing(self) -> contextlib.AbstractContextManager[None]:
         return contextlib.nullcontext()
 
-    def dataset(self) -> xr.Dataset:
+    def load_dataset(self) -> xr.Dataset:
         layout = self._layout
         dataset = xr.Dataset(
             {
@@ -187,47 +187,49 @@ class MemoryStore(AbstractStore):
             },
             attrs=dict(self._attrs),
         )
-        return _as_asked(dataset)
+        return _arrange_as_requested(dataset)
 
 
 class ZarrStore(AbstractStore):
     """Storage of a scan's results in a folder; `verify` finds damaged chunks."""
 
-    def __init__(self, path: Path, layout: Layout, verify: bool = True) -> None:
-        self._path, self._layout, self.place = path, layout, str(path)
+    def __init__(self, path: Path, layout: ResultLayout, verify: bool = True) -> None:
+        self._path, self._layout, self.location = path, layout, str(path)
         self._group = zarr.open_group(path, mode="r+", zarr_format=3)
-        self._books = Books(path, self._group)
-        self.damaged = self._books.damaged() if verify else []
-        self._coordinates = self._books.damaged_coordinates() if verify else []
-        self.damage = told_damage(path, self.damaged, self._coordinates)
+        self._checksums = ChunkChecksums(path, self._group)
+        self.damaged_chunks = self._checksums.find_damaged_chunks() if verify else []
+        self._damaged_coordinates = self._checksums.find_damaged_coordinates() if verify else []
+        self.damage_description = describe_damage(
+            path, self.damaged_chunks, self._damaged_coordinates
+        )
 
-    def missing(self) -> list[int]:
-        done = self._books.done()
-        done[np.asarray(self.damaged, int)] = False
-        return [int(i) for i in np.flatnonzero(~done)]
+    def find_missing_chunks(self) -> list[int]:
+        is_done = self._checksums.is_chunk_marked()
+        is_done[np.asarray(self.damaged_chunks, int)] = False
+        return [int(i) for i in np.flatnonzero(~is_done)]
 
-    def write(self, index: int, block: Block) -> None:
-        region = self._layout.region(index)
+    def write_chunk(self, index: int, block: ChunkBlock) -> None:
+        region = self._layout.chunk_region(index)
         for variable in self._layout.variables:
-            _array(self._group, variable.name)[region] = block[variable.name]
-        self._books.mark(index)
-        self.damaged = [chunk for chunk in self.damaged if chunk != index]
+            _get_array(self._group, variable.name)[region] = block[variable.name]
+        self._checksums.mark_chunk(index)
+        self.damaged_chunks = [chunk for chunk in self.damaged_chunks if chunk != index]
 
-    def dataset(self) -> xr.Dataset:
+    def load_dataset(self) -> xr.Dataset:
         return open_scan(self._path, verify=False)
 
     @contextlib.contextmanager
-    def at_work(self) -> Iterator[None]:
-        with alone(self._path):
+    def open_for_writing(self) -> Iterator[None]:
+        with store_lock(self._path):
             for path in self._path.rglob("*.partial"):
                 path.unlink(missing_ok=True)
-            for name in self._coordinates:
-                _array(self._group, name)[:] = self._layout.coordinates[name][1]
-            self._coordinates = []
+            for name in self._damaged_coordinates:
+                _get_array(self._group, name)[:] = self._layout.coordinates[name][1]
+            self._damaged_coordinates = []
             yield
 
 
-def _array(group: zarr.Group, name: str) -> zarr.Array:
+def _get_array(group: zarr.Group, name: str) -> zarr.Array:
     """Return the array `name` of a Zarr group."""
     array = group[name]
     assert isinstance(array, zarr.Array)
@@ -258,14 +260,16 @@ def open_scan(path: str | Path, *, verify: bool = True) -> xr.Dataset:
         ...     gaits = vrw.scan(design, ["speed"], store=path).load()
         ...     xr.testing.assert_identical(vrw.open_scan(path).speed.load(), gaits.speed)
     """
-    instance("path", path, (str, Path), "give the folder that a scan wrote")
-    group = _require_scan(Path(path))
-    books = Books(Path(path), group)
+    check_type("path", path, (str, Path), "give the folder that a scan wrote")
+    group = _open_scan_group(Path(path))
+    checksums = ChunkChecksums(Path(path), group)
     if verify:
-        damage = told_damage(path, books.damaged(), books.damaged_coordinates())
-        if damage:
+        damage_description = describe_damage(
+            path, checksums.find_damaged_chunks(), checksums.find_damaged_coordinates()
+        )
+        if damage_description:
             raise ValueError(
-                f"{damage}: run the scan again, which computes these anew, or read the rest with "
+                f"{damage_description}: run the scan again, which computes these anew, or read the rest with "
                 "open_scan(path, verify=False)."
             )
     dataset = xr.open_zarr(
@@ -275,44 +279,63 @@ def open_scan(path: str | Path, *, verify: bool = True) -> xr.Dataset:
         mask_and_scale=False,
         decode_times=False,
     )
-    return _as_asked(_told_apart(dataset.drop_vars(DONE, errors="ignore")))
+    return _arrange_as_requested(
+        _split_legacy_stability_margin(dataset.drop_vars(LEGACY_MARKS_NAME, errors="ignore"))
+    )
 
 
-def _as_asked(dataset: xr.Dataset) -> xr.Dataset:
+def _arrange_as_requested(dataset: xr.Dataset) -> xr.Dataset:
     """Return the dataset with the requested variables first, in their order and by their names.
 
     A file name cannot be "d speed / d damping", so in a store the array of it has another name.
     """
-    asked = dataset.attrs.get(ASKED)
-    names = str(asked).split(", ") if asked else manifest_of(dataset.attrs).get("measures", [])
-    told = {canonical(name): name for name in reversed(names) if canonical(name) in dataset}
-    first = list(dict.fromkeys(map(canonical, names)))
-    order = dict.fromkeys([*(n for n in first if n in told), *map(str, dataset.data_vars)])
-    return dataset[list(order)].rename({n: told[n] for n in told if n != told[n]})
+    requested = dataset.attrs.get(REQUESTED_ATTRIBUTE)
+    names = (
+        str(requested).split(", ")
+        if requested
+        else read_manifest(dataset.attrs).get("measures", [])
+    )
+    requested_names = {
+        canonicalize_name(name): name
+        for name in reversed(names)
+        if canonicalize_name(name) in dataset
+    }
+    names_in_order = list(dict.fromkeys(map(canonicalize_name, names)))
+    order = dict.fromkeys(
+        [*(n for n in names_in_order if n in requested_names), *map(str, dataset.data_vars)]
+    )
+    return dataset[list(order)].rename(
+        {n: requested_names[n] for n in requested_names if n != requested_names[n]}
+    )
 
 
-def _told_apart(dataset: xr.Dataset) -> xr.Dataset:
+def _split_legacy_stability_margin(dataset: xr.Dataset) -> xr.Dataset:
     """Return the dataset of a store of version 0.1 with its two stability margins named apart.
 
     The name `stability_margin` meant the smooth Jury margin for the paper's wheel, and 1 - spectral
     radius with unilateral contact.
     """
-    old = dataset.get("stability_margin")
-    if old is None or old.attrs.get("symbol") != MEASURES["spectral_margin"].symbol:
+    legacy_margin = dataset.get("stability_margin")
+    if (
+        legacy_margin is None
+        or legacy_margin.attrs.get("symbol") != MEASURES["spectral_margin"].symbol
+    ):
         return dataset
-    smooth, plain = (MEASURES[n].attrs for n in ("stability_margin", "spectral_margin"))
-    kind = manifest_of(dataset.attrs)["model"]["kind"]
+    smooth_attrs, plain_attrs = (MEASURES[n].attrs for n in ("stability_margin", "spectral_margin"))
+    kind = read_manifest(dataset.attrs)["model"]["kind"]
     if kind == "ViscoelasticWheel":
-        return dataset.assign(stability_margin=old.assign_attrs(smooth))
-    radius = dataset["spectral_radius"].astype(old.dtype)
-    dataset = dataset.assign(spectral_margin=(1.0 - radius).assign_attrs(plain))
+        return dataset.assign(stability_margin=legacy_margin.assign_attrs(smooth_attrs))
+    radius = dataset["spectral_radius"].astype(legacy_margin.dtype)
+    dataset = dataset.assign(spectral_margin=(1.0 - radius).assign_attrs(plain_attrs))
     if kind == "UnilateralWheel":
         return dataset.drop_vars("stability_margin")
-    of_paper = old.where(dataset["rung"] == VISCOELASTIC).assign_attrs(smooth)
-    return dataset.assign(stability_margin=of_paper)
+    paper_margin = legacy_margin.where(dataset["rung"] == VISCOELASTIC_MODEL).assign_attrs(
+        smooth_attrs
+    )
+    return dataset.assign(stability_margin=paper_margin)
 
 
-def _require_scan(path: Path) -> zarr.Group:
+def _open_scan_group(path: Path) -> zarr.Group:
     """Return the Zarr group of the scan at `path`; raise if there is none."""
     try:
         group = zarr.open_group(path, mode="r", zarr_format=3)
@@ -321,63 +344,65 @@ def _require_scan(path: Path) -> zarr.Group:
         raise ValueError(
             f"{path} is no scan's store: give the folder that `vrw scan` wrote, or a new place."
         ) from error
-    if MANIFEST not in attrs:
+    if MANIFEST_ATTRIBUTE not in attrs:
         raise ValueError(
             f"{path} is a Zarr store, but not a scan's: give the folder that `vrw scan` wrote."
         )
     return group
 
 
-def stored_manifest(path: Path) -> dict | None:
+def read_stored_manifest(path: Path) -> dict | None:
     """Return the settings and provenance of the store at `path`, or None if there is no store."""
     if not path.exists() or (path.is_dir() and not any(path.iterdir())):
         return None
-    attrs = dict(_require_scan(path).attrs)
-    origin = attrs.get(PROVENANCE, {})
+    attrs = dict(_open_scan_group(path).attrs)
+    origin = attrs.get(PROVENANCE_ATTRIBUTE, {})
     origin = json.loads(origin) if isinstance(origin, str) else origin
-    return {MANIFEST: manifest_of(attrs), PROVENANCE: origin}
+    return {MANIFEST_ATTRIBUTE: read_manifest(attrs), PROVENANCE_ATTRIBUTE: origin}
 
 
-def first_difference(there: object, here: object, name: str = "") -> tuple[str, object, object]:
+def find_first_difference(
+    stored: object, current: object, name: str = ""
+) -> tuple[str, object, object]:
     """Return the name and both values of the first setting that differs, or ("", None, None)."""
-    if isinstance(there, dict) and isinstance(here, dict):
-        for key in [*there, *(k for k in here if k not in there)]:
-            below = first_difference(
-                there.get(key), here.get(key), f"{name}.{key}" if name else str(key)
+    if isinstance(stored, dict) and isinstance(current, dict):
+        for key in [*stored, *(k for k in current if k not in stored)]:
+            nested_difference = find_first_difference(
+                stored.get(key), current.get(key), f"{name}.{key}" if name else str(key)
             )
-            if below[0]:
-                return below
+            if nested_difference[0]:
+                return nested_difference
         return "", None, None
-    return ("", None, None) if there == here else (name, there, here)
+    return ("", None, None) if stored == current else (name, stored, current)
 
 
-def create(path: Path, layout: Layout, attrs: Mapping[str, object]) -> None:
+def create_store(path: Path, layout: ResultLayout, attrs: Mapping[str, object]) -> None:
     """Create an empty store at `path` atomically; keep a store that appears in the meantime."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        building = path.parent / f".{path.name}.{os.urandom(8).hex()}"
-        building.mkdir()
+        temporary_path = path.parent / f".{path.name}.{os.urandom(8).hex()}"
+        temporary_path.mkdir()
     except OSError as error:
         reason = error.strerror or "no folder can be made there"
         raise OSError(
             error.errno, f"no store can be made at {path} ({reason}): give a place of your own"
         ) from error
     try:
-        _fill(building, layout, attrs)
-        building.rename(path)
+        _create_arrays(temporary_path, layout, attrs)
+        temporary_path.rename(path)
     except BaseException as error:
-        shutil.rmtree(building, ignore_errors=True)
-        if not (isinstance(error, OSError) and stored_manifest(path) is not None):
+        shutil.rmtree(temporary_path, ignore_errors=True)
+        if not (isinstance(error, OSError) and read_stored_manifest(path) is not None):
             raise
 
 
-def _fill(path: Path, layout: Layout, attrs: Mapping[str, object]) -> None:
+def _create_arrays(path: Path, layout: ResultLayout, attrs: Mapping[str, object]) -> None:
     """Create the Zarr group at `path` with its coordinates, empty variables and marks."""
     from zarr.codecs import Crc32cCodec, ZstdCodec
 
     # xarray reads from this attribute which arrays are coordinates, and removes it on opening.
-    told = {**attrs, "coordinates": " ".join(layout.coordinates)}
-    group = zarr.create_group(path, zarr_format=3, attributes=told)
+    group_attrs = {**attrs, "coordinates": " ".join(layout.coordinates)}
+    group = zarr.create_group(path, zarr_format=3, attributes=group_attrs)
     compressors = [ZstdCodec(level=3), Crc32cCodec()]  # the checksum reveals damage
     for name, (dim, values, coordinate_attrs) in layout.coordinates.items():
         array = group.create_array(
@@ -394,24 +419,34 @@ def _fill(path: Path, layout: Layout, attrs: Mapping[str, object]) -> None:
         group.create_array(
             variable.name,
             shape=(*layout.shape, *variable.shape),
-            chunks=(*layout.chunk, *variable.shape),
+            chunks=(*layout.chunk_shape, *variable.shape),
             dtype=variable.dtype,
-            fill_value=variable.missing,
+            fill_value=variable.fill_value,
             dimension_names=(*layout.dims, *variable.dims),
             compressors=compressors,
             attributes=dict(variable.attrs),
         )
-    chunks = (layout.n_chunks, SIZE)
-    group.create_group(BOOKS).create_array(
-        "digest", shape=chunks, chunks=(1, SIZE), dtype="u1", fill_value=0
+    chunks = (layout.n_chunks, DIGEST_SIZE_BYTES)
+    group.create_group(CHECKSUM_GROUP_NAME).create_array(
+        "digest", shape=chunks, chunks=(1, DIGEST_SIZE_BYTES), dtype="u1", fill_value=0
     )
-    _consolidate(path, [*layout.coordinates, *(v.name for v in layout.variables), BOOKS, DIGEST])
+    _consolidate_metadata(
+        path,
+        [
+            *layout.coordinates,
+            *(v.name for v in layout.variables),
+            CHECKSUM_GROUP_NAME,
+            CHECKSUM_ARRAY_NAME,
+        ],
+    )
 
 
-def _consolidate(path: Path, names: list[str]) -> None:
+def _consolidate_metadata(path: Path, names: list[str]) -> None:
     """Write all metadata into one file in the given order; zarr's own function sorts and warns."""
-    place = path / "zarr.json"
-    told = json.loads(place.read_text())
+    metadata_path = path / "zarr.json"
+    metadata = json.loads(metadata_path.read_text())
     parts = {name: json.loads((path / name / "zarr.json").read_text()) for name in names}
-    whole = {"kind": "inline", "must_understand": False, "metadata": parts}
-    place.write_text(json.dumps(told | {"consolidated_metadata": whole}, indent=2))
+    consolidated = {"kind": "inline", "must_understand": False, "metadata": parts}
+    metadata_path.write_text(
+        json.dumps(metadata | {"consolidated_metadata": consolidated}, indent=2)
+    )

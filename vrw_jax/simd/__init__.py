@@ -1,9 +1,15 @@
 """Compilation of JAX traces to machine code with LLVM, for a few lanes per vector."""
 
-from vrw_jax.simd.arrays import SMALL
-from vrw_jax.simd.code import tracing
-from vrw_jax.simd.ffi import CALLED
-from vrw_jax.simd.machine import processor
-from vrw_jax.simd.program import at_hand, lane_function, lane_program, serves, web_object
-from vrw_jax.simd.rules import primitives
-from vrw_jax.simd.trace import apart
+from vrw_jax.simd.arrays import MAX_UNROLLED
+from vrw_jax.simd.code import targets_machine_code
+from vrw_jax.simd.ffi import MACHINE_CODE_PRIMITIVE
+from vrw_jax.simd.machine import describe_processor
+from vrw_jax.simd.program import (
+    compile_lane_function,
+    compile_lane_program,
+    compile_wasm_object,
+    ensure_loaded,
+    is_available,
+)
+from vrw_jax.simd.rules import list_primitives
+from vrw_jax.simd.trace import noinline

@@ -10,294 +10,354 @@ from typing import Any
 import llvmlite.ir as ir
 import numpy as np
 
-from vrw_jax.simd.numbers import INT, NUMBERS, Numbers, Value
+from vrw_jax.simd.numbers import I32, NUMBER_TYPES, Value, ValueEmitter
 
-FUSED = ("contract",)
+FUSED_FLAGS = ("contract",)
 """Flags that let products and sums be rounded once instead of twice; nothing else may be
 reordered."""
-RECIPROCAL = (*FUSED, "arcp")
+RECIPROCAL_FLAGS = (*FUSED_FLAGS, "arcp")
 """Flags that let repeated divisors be inverted once, only in float64: in float32 processors
 approximate the inverse."""
 
-Rule = Callable[..., Value]
+ElementwiseRule = Callable[..., Value]
 
 
-def elementwise(
-    numbers: Numbers, name: str, params: Any, before: Any, after: Any, values: Sequence[Value]
+def emit_elementwise(
+    emitter: ValueEmitter,
+    name: str,
+    params: Any,
+    in_dtype: Any,
+    out_dtype: Any,
+    values: Sequence[Value],
 ) -> Value:
     """Emit a JAX primitive on numbers of `in_dtype` with a result of `out_dtype`, once per
     operands.
     """
-    key = (name, after.num, params.get("y"), *map(id, values))
-    rule = ELEMENTWISE[name]
-    return numbers.once(key, lambda: rule(numbers, params, before, after, *values))
+    key = (name, out_dtype.num, params.get("y"), *map(id, values))
+    rule = ELEMENTWISE_RULES[name]
+    return emitter.emit_once(key, lambda: rule(emitter, params, in_dtype, out_dtype, *values))
 
 
 # Sums and products are simplified: terms known as zero and factors known as one are dropped.
 
 
-def _add(n: Numbers, params: Any, before: Any, after: Any, x: Value, y: Value) -> Value:
-    if _is(y, 0):
+def _add(
+    emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value, y: Value
+) -> Value:
+    if _is_constant(y, 0):
         return x
-    return y if _is(x, 0) else _both(n, before, ("fadd", "add"), x, y)
+    return y if _is_constant(x, 0) else _emit_binary(emitter, in_dtype, ("fadd", "add"), x, y)
 
 
-def _sub(n: Numbers, params: Any, before: Any, after: Any, x: Value, y: Value) -> Value:
-    return x if _is(y, 0) else _both(n, before, ("fsub", "sub"), x, y)
+def _sub(
+    emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value, y: Value
+) -> Value:
+    return x if _is_constant(y, 0) else _emit_binary(emitter, in_dtype, ("fsub", "sub"), x, y)
 
 
-def _mul(n: Numbers, params: Any, before: Any, after: Any, x: Value, y: Value) -> Value:
-    if _is(y, 1) or _is(x, 0):
+def _mul(
+    emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value, y: Value
+) -> Value:
+    if _is_constant(y, 1) or _is_constant(x, 0):
         return x
-    return y if _is(x, 1) or _is(y, 0) else _both(n, before, ("fmul", "mul"), x, y)
+    return (
+        y
+        if _is_constant(x, 1) or _is_constant(y, 0)
+        else _emit_binary(emitter, in_dtype, ("fmul", "mul"), x, y)
+    )
 
 
-def _div(n: Numbers, params: Any, before: Any, after: Any, x: Value, y: Value) -> Value:
-    _floats("div", before)  # an integer division by zero would stop the process
-    if _is(y, 1):
+def _div(
+    emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value, y: Value
+) -> Value:
+    _require_float("div", in_dtype)  # an integer division by zero would stop the process
+    if _is_constant(y, 1):
         return x
-    x, y = n.alike(x, y)
-    return n.builder.fdiv(x, y, flags=RECIPROCAL if before == np.float64 else FUSED)
+    x, y = emitter.to_same_shape(x, y)
+    return emitter.builder.fdiv(
+        x, y, flags=RECIPROCAL_FLAGS if in_dtype == np.float64 else FUSED_FLAGS
+    )
 
 
-def _square(n: Numbers, params: Any, before: Any, after: Any, x: Value) -> Value:
-    return _both(n, before, ("fmul", "mul"), x, x)
+def _square(emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value) -> Value:
+    return _emit_binary(emitter, in_dtype, ("fmul", "mul"), x, x)
 
 
-def _integer_pow(n: Numbers, params: Any, before: Any, after: Any, x: Value) -> Value:
+def _integer_pow(
+    emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value
+) -> Value:
     """Emit a power by repeated squares."""
-    times = lambda x, y: _both(n, before, ("fmul", "mul"), x, y)
-    result, square, left = None, x, abs(params["y"])
-    while left:
-        if left & 1:
-            result = square if result is None else times(result, square)
-        left >>= 1
-        square = times(square, square) if left else square
-    one = n.constant(x.type, 1)
-    result = one if result is None else result
-    return n.builder.fdiv(one, result, flags=FUSED) if params["y"] < 0 else result
+    multiply = lambda x, y: _emit_binary(emitter, in_dtype, ("fmul", "mul"), x, y)
+    result, square, remaining_exponent = None, x, abs(params["y"])
+    while remaining_exponent:
+        if remaining_exponent & 1:
+            result = square if result is None else multiply(result, square)
+        remaining_exponent >>= 1
+        square = multiply(square, square) if remaining_exponent else square
+    unit_value = emitter.constant(x.type, 1)
+    result = unit_value if result is None else result
+    return (
+        emitter.builder.fdiv(unit_value, result, flags=FUSED_FLAGS) if params["y"] < 0 else result
+    )
 
 
-def _neg(n: Numbers, params: Any, before: Any, after: Any, x: Value) -> Value:
-    return n.builder.fneg(x) if before.kind == "f" else n.builder.neg(x)
+def _neg(emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value) -> Value:
+    return emitter.builder.fneg(x) if in_dtype.kind == "f" else emitter.builder.neg(x)
 
 
-def _abs(n: Numbers, params: Any, before: Any, after: Any, x: Value) -> Value:
-    if before.kind == "f":
-        return _intrinsic(n, "fabs", x)
-    negative = _compare(n, "<", before, x, n.constant(x.type, 0))
-    return n.builder.select(negative, n.builder.neg(x), x)
+def _abs(emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value) -> Value:
+    if in_dtype.kind == "f":
+        return _emit_intrinsic(emitter, "fabs", x)
+    negative = _emit_comparison(emitter, "<", in_dtype, x, emitter.constant(x.type, 0))
+    return emitter.builder.select(negative, emitter.builder.neg(x), x)
 
 
-def _not(n: Numbers, params: Any, before: Any, after: Any, x: Value) -> Value:
-    return n.builder.not_(x)
+def _not(emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value) -> Value:
+    return emitter.builder.not_(x)
 
 
-def _same(n: Numbers, params: Any, before: Any, after: Any, x: Value) -> Value:
+def _identity(emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value) -> Value:
     return x
 
 
-def _bits(method: str) -> Rule:
-    def write(n: Numbers, params: Any, before: Any, after: Any, x: Value, y: Value) -> Value:
-        return getattr(n.builder, method)(*n.alike(x, y))
+def _bitwise_rule(method: str) -> ElementwiseRule:
+    def write(
+        emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value, y: Value
+    ) -> Value:
+        return getattr(emitter.builder, method)(*emitter.to_same_shape(x, y))
 
     return write
 
 
-def _comparison(how: str) -> Rule:
-    def write(n: Numbers, params: Any, before: Any, after: Any, x: Value, y: Value) -> Value:
-        return _compare(n, how, before, *n.alike(x, y))
+def _comparison_rule(operator: str) -> ElementwiseRule:
+    def write(
+        emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value, y: Value
+    ) -> Value:
+        return _emit_comparison(emitter, operator, in_dtype, *emitter.to_same_shape(x, y))
 
     return write
 
 
-def _extreme(how: str) -> Rule:
-    def write(n: Numbers, params: Any, before: Any, after: Any, x: Value, y: Value) -> Value:
-        x, y = n.alike(x, y)
-        chosen = n.builder.select(_compare(n, how, before, x, y), x, y)
-        if before.kind != "f":
-            return chosen
+def _extremum_rule(operator: str) -> ElementwiseRule:
+    def write(
+        emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value, y: Value
+    ) -> Value:
+        x, y = emitter.to_same_shape(x, y)
+        selected_value = emitter.builder.select(
+            _emit_comparison(emitter, operator, in_dtype, x, y), x, y
+        )
+        if in_dtype.kind != "f":
+            return selected_value
         # A NaN on either side is the result.
-        return n.builder.select(n.builder.fcmp_unordered("uno", x, x), x, chosen)
+        return emitter.builder.select(
+            emitter.builder.fcmp_unordered("uno", x, x), x, selected_value
+        )
 
     return write
 
 
-def _select_n(n: Numbers, params: Any, before: Any, after: Any, *values: Value) -> Value:
-    where, *cases = values
-    if all(_is(case, 0) for case in cases) or cases[0] is cases[1]:
+def _select_n(
+    emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, *values: Value
+) -> Value:
+    condition, *cases = values
+    if all(_is_constant(case, 0) for case in cases) or cases[0] is cases[1]:
         return cases[0]
-    if isinstance(where.type, ir.VectorType):
-        cases = [n.spread(case) for case in cases]
-    no, yes = n.alike(*cases)
-    return n.builder.select(where, yes, no)
+    if isinstance(condition.type, ir.VectorType):
+        cases = [emitter.splat(case) for case in cases]
+    false_case, true_case = emitter.to_same_shape(*cases)
+    return emitter.builder.select(condition, true_case, false_case)
 
 
-def _convert(n: Numbers, params: Any, before: Any, after: Any, x: Value) -> Value:
-    return converted(n, x, before, after)
+def _convert(emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value) -> Value:
+    return convert_value(emitter, x, in_dtype, out_dtype)
 
 
-def _is_finite(n: Numbers, params: Any, before: Any, after: Any, x: Value) -> Value:
-    size = _intrinsic(n, "fabs", x)
-    return n.builder.fcmp_ordered("<", size, n.constant(size.type, np.inf))
+def _is_finite(
+    emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value
+) -> Value:
+    size = _emit_intrinsic(emitter, "fabs", x)
+    return emitter.builder.fcmp_ordered("<", size, emitter.constant(size.type, np.inf))
 
 
-def _function(name: str, single: Callable[[Numbers, Value], Value] | None = None) -> Rule:
+def _intrinsic_rule(
+    name: str, emit_single: Callable[[ValueEmitter, Value], Value] | None = None
+) -> ElementwiseRule:
     """Return the rule of an LLVM intrinsic; in float32 `emit_single` replaces it, if given."""
 
-    def write(n: Numbers, params: Any, before: Any, after: Any, x: Value) -> Value:
-        _floats(name, before)
-        return single(n, x) if single and before == np.float32 else _intrinsic(n, name, x)
+    def write(emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value) -> Value:
+        _require_float(name, in_dtype)
+        return (
+            emit_single(emitter, x)
+            if emit_single and in_dtype == np.float32
+            else _emit_intrinsic(emitter, name, x)
+        )
 
     return write
 
 
-def _floats(name: str, dtype: Any) -> None:
+def _require_float(name: str, dtype: Any) -> None:
     if dtype.kind != "f":
         raise NotImplementedError(f"{name} of {dtype} has no machine code: convert to floats.")
 
 
-def _both(n: Numbers, dtype: Any, methods: tuple[str, str], x: Value, y: Value) -> Value:
+def _emit_binary(
+    emitter: ValueEmitter, dtype: Any, opcodes: tuple[str, str], x: Value, y: Value
+) -> Value:
     """Emit an instruction for floats, or the one for integers."""
-    x, y = n.alike(x, y)
-    return n.operation(f"{methods[0]} {' '.join(FUSED)}" if dtype.kind == "f" else methods[1], x, y)
+    x, y = emitter.to_same_shape(x, y)
+    return emitter.emit_binary(
+        f"{opcodes[0]} {' '.join(FUSED_FLAGS)}" if dtype.kind == "f" else opcodes[1], x, y
+    )
 
 
-def _compare(n: Numbers, how: str, dtype: Any, x: Value, y: Value) -> Value:
+def _emit_comparison(emitter: ValueEmitter, operator: str, dtype: Any, x: Value, y: Value) -> Value:
     if dtype.kind == "b":  # as a signed number, true is -1
-        return n.builder.icmp_unsigned(how, x, y)
+        return emitter.builder.icmp_unsigned(operator, x, y)
     if dtype.kind != "f":
-        return n.builder.icmp_signed(how, x, y)
-    ordered = n.builder.fcmp_unordered if how == "!=" else n.builder.fcmp_ordered
-    return ordered(how, x, y)
+        return emitter.builder.icmp_signed(operator, x, y)
+    compare_floats = (
+        emitter.builder.fcmp_unordered if operator == "!=" else emitter.builder.fcmp_ordered
+    )
+    return compare_floats(operator, x, y)
 
 
-def converted(n: Numbers, value: Value, before: Any, after: Any) -> Value:
+def convert_value(emitter: ValueEmitter, value: Value, in_dtype: Any, out_dtype: Any) -> Value:
     """Convert a number of `in_dtype` to `out_dtype`."""
-    build, kind = n.builder, NUMBERS[after.name]
-    kind = n.vector(kind) if isinstance(value.type, ir.VectorType) else kind
-    if before == after:
+    build, target_type = emitter.builder, NUMBER_TYPES[out_dtype.name]
+    target_type = (
+        emitter.vector_type(target_type) if isinstance(value.type, ir.VectorType) else target_type
+    )
+    if in_dtype == out_dtype:
         return value
-    if after.kind == "b":
-        return _compare(n, "!=", before, value, n.constant(value.type, 0))
-    if before.kind == after.kind == "f":
-        return (build.fptrunc if after.itemsize < before.itemsize else build.fpext)(value, kind)
-    if after.kind == "f":
-        return (build.uitofp if before.kind == "b" else build.sitofp)(value, kind)
-    if before.kind == "f":
-        return build.fptosi(value, kind)
-    if before.kind == "b":
-        return build.zext(value, kind)
-    return (build.trunc if after.itemsize < before.itemsize else build.sext)(value, kind)
+    if out_dtype.kind == "b":
+        return _emit_comparison(emitter, "!=", in_dtype, value, emitter.constant(value.type, 0))
+    if in_dtype.kind == out_dtype.kind == "f":
+        return (build.fptrunc if out_dtype.itemsize < in_dtype.itemsize else build.fpext)(
+            value, target_type
+        )
+    if out_dtype.kind == "f":
+        return (build.uitofp if in_dtype.kind == "b" else build.sitofp)(value, target_type)
+    if in_dtype.kind == "f":
+        return build.fptosi(value, target_type)
+    if in_dtype.kind == "b":
+        return build.zext(value, target_type)
+    return (build.trunc if out_dtype.itemsize < in_dtype.itemsize else build.sext)(
+        value, target_type
+    )
 
 
-def _intrinsic(n: Numbers, name: str, value: Value) -> Value:
+def _emit_intrinsic(emitter: ValueEmitter, name: str, value: Value) -> Value:
     kind = value.type
     vector = isinstance(kind, ir.VectorType)
     number = kind.element if vector else kind
-    bits = 64 if number == NUMBERS["float64"] else 32
-    whole = f"llvm.{name}.{f'v{kind.count}' if vector else ''}f{bits}"
-    module = n.builder.module
-    if whole not in module.globals:
-        ir.Function(module, ir.FunctionType(kind, [kind]), whole)
-    return n.builder.call(module.globals[whole], [value])
+    bits = 64 if number == NUMBER_TYPES["float64"] else 32
+    intrinsic_name = f"llvm.{name}.{f'v{kind.count}' if vector else ''}f{bits}"
+    module = emitter.builder.module
+    if intrinsic_name not in module.globals:
+        ir.Function(module, ir.FunctionType(kind, [kind]), intrinsic_name)
+    return emitter.builder.call(module.globals[intrinsic_name], [value])
 
 
-def _series(n: Numbers, x: Value, coefficients: Sequence[float]) -> Value:
+def _emit_polynomial(emitter: ValueEmitter, x: Value, coefficients: Sequence[float]) -> Value:
     """Emit a polynomial, lowest coefficient first."""
-    build, value = n.builder, n.constant(x.type, coefficients[-1])
+    build, value = emitter.builder, emitter.constant(x.type, coefficients[-1])
     for coefficient in coefficients[-2::-1]:
-        product = build.fmul(value, x, flags=FUSED)
-        value = build.fadd(product, n.constant(x.type, coefficient), flags=FUSED)
+        product = build.fmul(value, x, flags=FUSED_FLAGS)
+        value = build.fadd(product, emitter.constant(x.type, coefficient), flags=FUSED_FLAGS)
     return value
 
 
-def _logarithm(n: Numbers, value: Value) -> Value:
+def _emit_logarithm(emitter: ValueEmitter, value: Value) -> Value:
     """Emit the logarithm of positive normal float32 numbers, accurate to 1e-5.
 
     The library's logarithm is one call per lane.
     """
-    build, kind = n.builder, value.type
-    whole = ir.VectorType(INT, kind.count) if isinstance(kind, ir.VectorType) else INT
-    bits = build.bitcast(value, whole)
-    number = lambda x: n.constant(whole, x)
-    exponent = build.sub(build.ashr(bits, number(23)), number(127))
-    mantissa = build.or_(build.and_(bits, number(0x7FFFFF)), number(0x3F800000))
-    beyond = build.fsub(build.bitcast(mantissa, kind), n.constant(kind, 1.0))
+    build, kind = emitter.builder, value.type
+    integer_type = ir.VectorType(I32, kind.count) if isinstance(kind, ir.VectorType) else I32
+    bits = build.bitcast(value, integer_type)
+    integer_constant = lambda x: emitter.constant(integer_type, x)
+    exponent = build.sub(build.ashr(bits, integer_constant(23)), integer_constant(127))
+    mantissa = build.or_(build.and_(bits, integer_constant(0x7FFFFF)), integer_constant(0x3F800000))
+    fractional_part = build.fsub(build.bitcast(mantissa, kind), emitter.constant(kind, 1.0))
     return build.fadd(
-        build.fmul(build.sitofp(exponent, kind), n.constant(kind, np.log(2.0))),
-        _series(n, beyond, LOGARITHM),
+        build.fmul(build.sitofp(exponent, kind), emitter.constant(kind, np.log(2.0))),
+        _emit_polynomial(emitter, fractional_part, LOGARITHM_COEFFICIENTS),
     )
 
 
-def _exponential(n: Numbers, value: Value) -> Value:
+def _emit_exponential(emitter: ValueEmitter, value: Value) -> Value:
     """Emit the exponential of float32 numbers between -87 and 88, accurate to 1e-6 of
     the result.
     """
-    build, kind = n.builder, value.type
-    whole = ir.VectorType(INT, kind.count) if isinstance(kind, ir.VectorType) else INT
-    doublings = build.fmul(value, n.constant(kind, 1.0 / np.log(2.0)))
-    floor = _intrinsic(n, "floor", doublings)
-    part = _series(n, build.fsub(doublings, floor), POWER_OF_TWO)
-    number = lambda x: n.constant(whole, x)
-    scale = build.shl(build.add(build.fptosi(floor, whole), number(127)), number(23))
-    return build.fmul(part, build.bitcast(scale, kind))
+    build, kind = emitter.builder, value.type
+    integer_type = ir.VectorType(I32, kind.count) if isinstance(kind, ir.VectorType) else I32
+    doublings = build.fmul(value, emitter.constant(kind, 1.0 / np.log(2.0)))
+    whole_part = _emit_intrinsic(emitter, "floor", doublings)
+    fractional_power = _emit_polynomial(
+        emitter, build.fsub(doublings, whole_part), POWER_OF_TWO_COEFFICIENTS
+    )
+    integer_constant = lambda x: emitter.constant(integer_type, x)
+    scale = build.shl(
+        build.add(build.fptosi(whole_part, integer_type), integer_constant(127)),
+        integer_constant(23),
+    )
+    return build.fmul(fractional_power, build.bitcast(scale, kind))
 
 
-def _is(value: Value, number: int) -> bool:
+def _is_constant(value: Value, number: int) -> bool:
     """Return whether a value is that constant in every lane."""
-    return isinstance(value, ir.Constant) and _all(value.constant, number)
+    return isinstance(value, ir.Constant) and _is_constant_everywhere(value.constant, number)
 
 
-def _all(constant: Any, number: int) -> bool:
+def _is_constant_everywhere(constant: Any, number: int) -> bool:
     if isinstance(constant, (list, tuple)):
-        return all(_all(entry.constant, number) for entry in constant)
+        return all(_is_constant_everywhere(entry.constant, number) for entry in constant)
     return isinstance(constant, (int, float)) and constant == number
 
 
-def _fitted(function: Callable[[np.ndarray], np.ndarray], degree: int) -> list[float]:
+def _fit_polynomial(function: Callable[[np.ndarray], np.ndarray], degree: int) -> list[float]:
     """Fit a polynomial on [0, 1] through Chebyshev's points, exact at neither end."""
     x = 0.5 - 0.5 * np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
     return list(map(float, np.polynomial.polynomial.polyfit(x, function(x), degree)))
 
 
-LOGARITHM = _fitted(np.log1p, 5)
-POWER_OF_TWO = _fitted(np.exp2, 5)
+LOGARITHM_COEFFICIENTS = _fit_polynomial(np.log1p, 5)
+POWER_OF_TWO_COEFFICIENTS = _fit_polynomial(np.exp2, 5)
 
-ELEMENTWISE: dict[str, Rule] = {
+ELEMENTWISE_RULES: dict[str, ElementwiseRule] = {
     "abs": _abs,
     "add": _add,
     "add_any": _add,
-    "and": _bits("and_"),
+    "and": _bitwise_rule("and_"),
     "convert_element_type": _convert,
-    "copy": _same,
-    "cos": _function("cos"),
+    "copy": _identity,
+    "cos": _intrinsic_rule("cos"),
     "div": _div,
-    "eq": _comparison("=="),
-    "exp": _function("exp", _exponential),
-    "floor": _function("floor"),
-    "ge": _comparison(">="),
-    "gt": _comparison(">"),
+    "eq": _comparison_rule("=="),
+    "exp": _intrinsic_rule("exp", _emit_exponential),
+    "floor": _intrinsic_rule("floor"),
+    "ge": _comparison_rule(">="),
+    "gt": _comparison_rule(">"),
     "integer_pow": _integer_pow,
     "is_finite": _is_finite,
-    "le": _comparison("<="),
-    "log": _function("log", _logarithm),
-    "lt": _comparison("<"),
-    "max": _extreme(">"),
-    "min": _extreme("<"),
+    "le": _comparison_rule("<="),
+    "log": _intrinsic_rule("log", _emit_logarithm),
+    "lt": _comparison_rule("<"),
+    "max": _extremum_rule(">"),
+    "min": _extremum_rule("<"),
     "mul": _mul,
-    "ne": _comparison("!="),
+    "ne": _comparison_rule("!="),
     "neg": _neg,
     "not": _not,
-    "or": _bits("or_"),
+    "or": _bitwise_rule("or_"),
     "select_n": _select_n,
-    "shift_left": _bits("shl"),
-    "shift_right_arithmetic": _bits("ashr"),
-    "shift_right_logical": _bits("lshr"),
-    "sin": _function("sin"),
-    "sqrt": _function("sqrt"),
+    "shift_left": _bitwise_rule("shl"),
+    "shift_right_arithmetic": _bitwise_rule("ashr"),
+    "shift_right_logical": _bitwise_rule("lshr"),
+    "sin": _intrinsic_rule("sin"),
+    "sqrt": _intrinsic_rule("sqrt"),
     "square": _square,
-    "stop_gradient": _same,
+    "stop_gradient": _identity,
     "sub": _sub,
-    "xor": _bits("xor"),
+    "xor": _bitwise_rule("xor"),
 }

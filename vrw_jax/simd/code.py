@@ -20,134 +20,154 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
-from vrw_jax.simd.kernel import module_text
-from vrw_jax.simd.machine import compiled, how_compiled
+from vrw_jax.simd.kernel import write_module
+from vrw_jax.simd.machine import compilation_key, compile_native
 
 
 @runtime_checkable
-class Store(Protocol):
+class CodeStore(Protocol):
     """Storage of code between processes; a module with these two functions is one."""
 
-    def kept(self, name: str) -> bytes | None:
+    def load_bytes(self, name: str) -> bytes | None:
         """Return the content saved under that name; None if there is none, or it is damaged."""
 
-    def keep(self, name: str, content: bytes) -> None:
+    def save_bytes(self, name: str, content: bytes) -> None:
         """Save `content` under that name."""
 
 
-class Code(NamedTuple):
+class MachineCode(NamedTuple):
     """A function of lanes as machine code."""
 
     name: str  # a digest of the text that LLVM compiles, used by calls in JAX programs
-    out: tuple[
+    result_types: tuple[
         tuple[tuple[int, ...], np.dtype], ...
     ]  # of each result: axes before lanes, number type
-    made: Future[bytes]
+    object_code: Future[bytes]
 
-    def ready(self) -> bytes:
+    def wait_for_code(self) -> bytes:
         """Return the code; this blocks until LLVM has compiled it."""
-        return self.made.result()
+        return self.object_code.result()
 
 
-def code_of(
-    function: Callable, shapes: Any, key: object, width: int, store: Store | None, small: int
-) -> Code:
+def get_machine_code(
+    function: Callable,
+    shapes: Any,
+    key: object,
+    width: int,
+    store: CodeStore | None,
+    max_unrolled: int,
+) -> MachineCode:
     """Return the machine code of a function, from the cache or newly compiled."""
-    asked = (key, shapes, width, small, jax.__version__, how_compiled())
-    index = f"lanes_index_{_digest(repr(asked).encode())}"
-    if index not in _made:
-        name = store.kept(index) if store is not None else None
-        code = kept_code(name.decode(), store) if name else None
-        _made[index] = code or _written(function, shapes, width, index, store, small)
-    return _made[index]
+    key_parts = (key, shapes, width, max_unrolled, jax.__version__, compilation_key())
+    index = f"lanes_index_{_digest(repr(key_parts).encode())}"
+    if index not in _code_by_name:
+        name = store.load_bytes(index) if store is not None else None
+        code = load_machine_code(name.decode(), store) if name else None
+        _code_by_name[index] = code or _trace_and_compile(
+            function, shapes, width, index, store, max_unrolled
+        )
+    return _code_by_name[index]
 
 
-def _written(
-    function: Callable, shapes: Any, width: int, index: str, store: Store | None, small: int
-) -> Code:
+def _trace_and_compile(
+    function: Callable,
+    shapes: Any,
+    width: int,
+    index: str,
+    store: CodeStore | None,
+    max_unrolled: int,
+) -> MachineCode:
     """Trace a function; compile it in the background unless code of the same text exists."""
-    with _python, _uncollected():
-        closed = traced(function, *shapes)
-        text = module_text(closed, width, small)
-    out = json.dumps([(aval.shape[:-1], aval.dtype.name) for aval in closed.out_avals])
-    name = f"lanes_code_{_digest(f'{out}{how_compiled()}{text}'.encode())}"
-    code = kept_code(name, store)
+    with _tracing_lock, _pause_garbage_collection():
+        closed_jaxpr = trace_for_machine_code(function, *shapes)
+        text = write_module(closed_jaxpr, width, max_unrolled)
+    result_types = json.dumps(
+        [(aval.shape[:-1], aval.dtype.name) for aval in closed_jaxpr.out_avals]
+    )
+    name = f"lanes_code_{_digest(f'{result_types}{compilation_key()}{text}'.encode())}"
+    code = load_machine_code(name, store)
     if code is None:
-        made = _llvm.submit(_made_of, text, out, name, index, store)
-        code = _made[name] = Code(name, _results(out), made)
+        object_code = _compiler_pool.submit(
+            _compile_and_save, text, result_types, name, index, store
+        )
+        code = _code_by_name[name] = MachineCode(
+            name, _parse_result_types(result_types), object_code
+        )
     elif store is not None:
-        store.keep(index, name.encode())
+        store.save_bytes(index, name.encode())
     return code
 
 
-def _made_of(text: str, out: str, name: str, index: str, store: Store | None) -> bytes:
+def _compile_and_save(
+    text: str, result_types: str, name: str, index: str, store: CodeStore | None
+) -> bytes:
     """Compile LLVM text, and save the code and its index entry."""
-    code = compiled(text)
+    code = compile_native(text)
     if store is not None:
-        store.keep(name, out.encode() + b"\n" + code)
-        store.keep(index, name.encode())
+        store.save_bytes(name, result_types.encode() + b"\n" + code)
+        store.save_bytes(index, name.encode())
     return code
 
 
-def kept_code(name: str, store: Store | None) -> Code | None:
+def load_machine_code(name: str, store: CodeStore | None) -> MachineCode | None:
     """Return the code of that name, None if there is none."""
-    if name not in _made:
-        content = store.kept(name) if store is not None else None
+    if name not in _code_by_name:
+        content = store.load_bytes(name) if store is not None else None
         if content is None:
             return None
-        out, _, code = content.partition(b"\n")
-        made: Future[bytes] = Future()
-        made.set_result(code)
-        _made[name] = Code(name, _results(out), made)
-    return _made[name]
+        result_types, _, code = content.partition(b"\n")
+        object_code: Future[bytes] = Future()
+        object_code.set_result(code)
+        _code_by_name[name] = MachineCode(name, _parse_result_types(result_types), object_code)
+    return _code_by_name[name]
 
 
 def _digest(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-_made: dict[str, Code] = {}
+_code_by_name: dict[str, MachineCode] = {}
 """Code of this process by index and by name, shared by programs traced for other batches."""
 
 
 @contextlib.contextmanager
-def _uncollected() -> Iterator[None]:
+def _pause_garbage_collection() -> Iterator[None]:
     """Disable garbage collection, which takes a sixth of the time for many persistent objects."""
-    before = gc.isenabled()
+    was_enabled = gc.isenabled()
     gc.disable()
     try:
         yield
     finally:
-        if before:
+        if was_enabled:
             gc.enable()
 
 
-_python = RLock()
+_tracing_lock = RLock()
 """Lock under which threads trace one after the other: the first soon proceeds to LLVM, which needs
 no lock."""
 
 
-_llvm = ThreadPoolExecutor(1, "llvm")
+_compiler_pool = ThreadPoolExecutor(1, "llvm")
 """Background thread that compiles while Python traces; LLVM's own lock allows no second one."""
 
 
-def _results(told: str | bytes) -> tuple[tuple[tuple[int, ...], np.dtype], ...]:
-    return tuple((tuple(n), np.dtype(kind)) for n, kind in json.loads(told))
+def _parse_result_types(encoded: str | bytes) -> tuple[tuple[tuple[int, ...], np.dtype], ...]:
+    return tuple((tuple(n), np.dtype(kind)) for n, kind in json.loads(encoded))
 
 
-def traced(function: Callable, *shapes: Any) -> ClosedJaxpr:
+def trace_for_machine_code(function: Callable, *shapes: Any) -> ClosedJaxpr:
     """Return the trace of a function that becomes machine code."""
-    outside = _tracing.set(True)
+    token = _is_tracing.set(True)
     try:  # the mesh in which JAX traces loops, so that its trace cache finds them again
         with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
             return jax.make_jaxpr(function)(*shapes)
     finally:
-        _tracing.reset(outside)
+        _is_tracing.reset(token)
 
 
-_tracing: ContextVar[bool] = ContextVar("_tracing", default=False)
+_is_tracing: ContextVar[bool] = ContextVar("_tracing", default=False)
 
 
-def tracing() -> bool:
+def targets_machine_code() -> bool:
     """Return whether the present trace becomes machine code."""
-    return _tracing.get()
+    return _is_tracing.get()

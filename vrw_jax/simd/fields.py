@@ -11,106 +11,130 @@ import numpy as np
 
 from vrw_jax.simd.numbers import Value
 
-Index = tuple[Any, ...]
+EntryIndex = tuple[Any, ...]
 """For each axis an integer, or an LLVM value of type I64."""
 
 
-class Field:
+class LazyArray:
     """A large array whose entries, values of type `entry_type`, are computed or loaded by
     `entry_at`.
 
     If `entry_type` is a vector, an entry may also be a scalar, the same for all lanes.
     """
 
-    def __init__(self, shape: Sequence[int], kind: ir.Type, at: Callable[[Index], Value]) -> None:
-        self.shape, self.kind, self.at = tuple(shape), kind, at
+    def __init__(
+        self, shape: Sequence[int], entry_type: ir.Type, entry_at: Callable[[EntryIndex], Value]
+    ) -> None:
+        self.shape, self.entry_type, self.entry_at = tuple(shape), entry_type, entry_at
 
 
-class Unset(Field):
+class Uninitialized(LazyArray):
     """A large array whose entries are never read before they are overwritten."""
 
 
-class Updated(Field):
+class PendingUpdate(LazyArray):
     """An array in memory, or of one number, with one part replaced."""
 
-    def __init__(self, arrays: Any, whole: "Entries", part: "Entries", begin: Index) -> None:
-        kind = part.kind if isinstance(part, Field) else part.ravel()[0].type
-        super().__init__(whole.shape, kind, self.load)
-        self.arrays, self.whole, self.part, self.begin = arrays, whole, part, begin
+    def __init__(
+        self, emitter: Any, base_array: "ArrayValue", update: "ArrayValue", begin: EntryIndex
+    ) -> None:
+        entry_type = update.entry_type if isinstance(update, LazyArray) else update.ravel()[0].type
+        super().__init__(base_array.shape, entry_type, self.load)
+        self.emitter, self.base_array, self.update, self.begin = emitter, base_array, update, begin
 
-    def load(self, index: Index) -> Value:
+    def load(self, index: EntryIndex) -> Value:
         """Return the entry at an index."""
-        return self.arrays.entry(self.arrays.in_memory(self), index)
+        return self.emitter.get_entry(self.emitter.materialize(self), index)
 
-    def ready(self) -> "Updated":
+    def materialize_update(self) -> "PendingUpdate":
         """Return the update with its part computed, which may depend on the entries it replaces."""
-        if isinstance(self.part, np.ndarray):
+        if isinstance(self.update, np.ndarray):
             return self
-        return Updated(self.arrays, self.whole, self.arrays.in_memory(self.part), self.begin)
+        return PendingUpdate(
+            self.emitter, self.base_array, self.emitter.materialize(self.update), self.begin
+        )
 
-    def store_into(self, memory: "Memory") -> None:
+    def store_into(self, memory: "MemoryArray") -> None:
         """Overwrite the part in memory; the update must be materialized."""
-        arrays = self.arrays
+        emitter = self.emitter
 
-        def store(index: Index, _: Any = None) -> list[Value]:
-            memory.store(arrays.further(index, self.begin), arrays.entry(self.part, index))
+        def store_entry(index: EntryIndex, _: Any = None) -> list[Value]:
+            memory.store(
+                emitter.add_indices(index, self.begin), emitter.get_entry(self.update, index)
+            )
             return []
 
-        if isinstance(self.part, np.ndarray) and any(self.part.strides):
-            for index in np.ndindex(self.part.shape):
-                store(index)
+        if isinstance(self.update, np.ndarray) and any(self.update.strides):
+            for index in np.ndindex(self.update.shape):
+                store_entry(index)
         else:
-            arrays.each(self.part.shape, store)
+            emitter.loop_over_indices(self.update.shape, store_entry)
 
 
-class Memory(Field):
+class MemoryArray(LazyArray):
     """A large array stored in memory, entry after entry.
 
     It is `is_overwritable` if no other array uses its memory: the consumer may overwrite it.
     """
 
     def __init__(
-        self, arrays: Any, shape: Sequence[int], kind: ir.Type, base: Value, free: bool = False
+        self,
+        emitter: Any,
+        shape: Sequence[int],
+        entry_type: ir.Type,
+        base: Value,
+        is_overwritable: bool = False,
     ) -> None:
-        super().__init__(shape, kind, self.load)
-        self.arrays, self.base, self.free = arrays, base, free
+        super().__init__(shape, entry_type, self.load)
+        self.emitter, self.base, self.is_overwritable = emitter, base, is_overwritable
 
-    def place(self, index: Index) -> Value:
+    def address_of(self, index: EntryIndex) -> Value:
         """Return the address of an entry."""
-        where = self.arrays.linear(index, self.shape)
-        return self.arrays.builder.gep(self.base, [where], source_etype=self.kind)
+        offset = self.emitter.linear_index(index, self.shape)
+        return self.emitter.builder.gep(self.base, [offset], source_etype=self.entry_type)
 
-    def load(self, index: Index) -> Value:
+    def load(self, index: EntryIndex) -> Value:
         """Return the entry at an index."""
-        return self.arrays.builder.load(self.place(index), typ=self.kind)
+        return self.emitter.builder.load(self.address_of(index), typ=self.entry_type)
 
-    def store(self, index: Index, value: Value) -> None:
+    def store(self, index: EntryIndex, value: Value) -> None:
         """Overwrite an entry."""
-        value = self.arrays.numbers.spread(value) if isinstance(self.kind, ir.VectorType) else value
-        self.arrays.builder.store(value, self.place(index))
+        value = (
+            self.emitter.emitter.splat(value)
+            if isinstance(self.entry_type, ir.VectorType)
+            else value
+        )
+        self.emitter.builder.store(value, self.address_of(index))
 
-    def part(self, first: Value) -> "Memory":
+    def get_row(self, row_index: Value) -> "MemoryArray":
         """Return the part at an index of the first axis."""
-        rest = (0,) * (len(self.shape) - 1)
-        return Memory(self.arrays, self.shape[1:], self.kind, self.place((first, *rest)))
+        trailing_index = (0,) * (len(self.shape) - 1)
+        return MemoryArray(
+            self.emitter,
+            self.shape[1:],
+            self.entry_type,
+            self.address_of((row_index, *trailing_index)),
+        )
 
 
-class Turned(Field):
+class TransposedView(LazyArray):
     """A view of an array in memory with its axes in another order."""
 
-    def part(self, first: Value) -> Field:
+    def get_row(self, row_index: Value) -> LazyArray:
         """Return the part at an index of the first axis."""
-        return Field(self.shape[1:], self.kind, lambda index: self.at((first, *index)))
+        return LazyArray(
+            self.shape[1:], self.entry_type, lambda index: self.entry_at((row_index, *index))
+        )
 
 
-Entries = np.ndarray | Field
+ArrayValue = np.ndarray | LazyArray
 """LLVM values in an array, without the axis of lanes."""
 
 
-def shared(array: Entries) -> Entries:
+def as_shared(array: ArrayValue) -> ArrayValue:
     """Return the array as one that other consumers read too, so that it is not overwritten."""
-    if isinstance(array, Updated):
-        return Updated(array.arrays, shared(array.whole), array.part, array.begin)
-    if isinstance(array, Memory) and array.free:
-        return Memory(array.arrays, array.shape, array.kind, array.base)
+    if isinstance(array, PendingUpdate):
+        return PendingUpdate(array.emitter, as_shared(array.base_array), array.update, array.begin)
+    if isinstance(array, MemoryArray) and array.is_overwritable:
+        return MemoryArray(array.emitter, array.shape, array.entry_type, array.base)
     return array

@@ -4,9 +4,9 @@ from typing import Any
 
 import llvmlite.ir as ir
 
-from vrw_jax.simd.numbers import BYTE, INT, LONG
+from vrw_jax.simd.numbers import I8, I32, I64
 
-HANDLER = "handler"
+HANDLER_NAME = "handler"
 
 
 def add_handler(module: ir.Module, kernel: ir.Function, n_in: int, n_out: int, width: int) -> None:
@@ -15,45 +15,50 @@ def add_handler(module: ir.Module, kernel: ir.Function, n_in: int, n_out: int, w
     Offsets are in bytes, from XLA's xla/ffi/api/c_api.h, whose structs only grow at their ends.
     """
     pointer = ir.PointerType()
-    handler = ir.Function(module, ir.FunctionType(pointer, [pointer]), HANDLER)
+    handler = ir.Function(module, ir.FunctionType(pointer, [pointer]), HANDLER_NAME)
     handler.attributes.add("nounwind")
     build = ir.IRBuilder(handler.append_basic_block("entry"))
-    asked, called = (handler.append_basic_block(name) for name in ("asked", "called"))
-    frame, none = handler.args[0], ir.Constant(pointer, None)
+    metadata_block, execute_block = (
+        handler.append_basic_block(name) for name in ("asked", "called")
+    )
+    frame, null = handler.args[0], ir.Constant(pointer, None)
 
-    def at(base: Any, offset: int) -> Any:
-        return build.gep(base, [ir.Constant(LONG, offset)], source_etype=BYTE)
+    def field_address(base: Any, offset: int) -> Any:
+        return build.gep(base, [ir.Constant(I64, offset)], source_etype=I8)
 
-    def read(base: Any, offset: int, kind: ir.Type = pointer) -> Any:
-        return build.load(at(base, offset), typ=kind)
+    def load_field(base: Any, offset: int, kind: ir.Type = pointer) -> Any:
+        return build.load(field_address(base, offset), typ=kind)
 
-    extension = read(frame, 8)
-    build.cbranch(build.icmp_unsigned("==", extension, none), called, asked)
+    extension = load_field(frame, 8)
+    build.cbranch(build.icmp_unsigned("==", extension, null), execute_block, metadata_block)
     build.position_at_end(
-        asked
+        metadata_block
     )  # XLA requests the version of the interface: return the caller's version
-    metadata, version = read(extension, 24), at(read(frame, 16), 16)
+    metadata, version = load_field(extension, 24), field_address(load_field(frame, 16), 16)
     for field in (16, 20):
-        build.store(read(version, field, INT), at(metadata, 8 + field))
-    build.ret(none)
-    build.position_at_end(called)
+        build.store(load_field(version, field, I32), field_address(metadata, 8 + field))
+    build.ret(null)
+    build.position_at_end(execute_block)
 
     def buffers(offset: int, count: int) -> tuple[Any, Any]:
         """Return pointers to the data of a list of buffers, and the last buffer."""
-        listed, buffer = read(frame, offset), None
-        pointers = build.alloca(pointer, ir.Constant(LONG, count))
+        buffer_list, buffer = load_field(frame, offset), None
+        pointers = build.alloca(pointer, ir.Constant(I64, count))
         for i in range(count):
-            buffer = read(listed, 8 * i)
+            buffer = load_field(buffer_list, 8 * i)
             build.store(
-                read(buffer, 24), build.gep(pointers, [ir.Constant(LONG, i)], source_etype=pointer)
+                load_field(buffer, 24),
+                build.gep(pointers, [ir.Constant(I64, i)], source_etype=pointer),
             )
         return pointers, buffer
 
-    given, _ = buffers(72, n_in)
-    told, first = buffers(112, n_out)
-    rank = read(first, 32, LONG)
-    last = build.sub(rank, ir.Constant(LONG, 1))
-    n_lanes = build.load(build.gep(read(first, 40), [last], source_etype=LONG), typ=LONG)
-    groups = build.sdiv(n_lanes, ir.Constant(LONG, width))
-    build.call(kernel, [given, told, n_lanes, ir.Constant(LONG, 0), groups])
-    build.ret(none)
+    input_table, _ = buffers(72, n_in)
+    output_table, last_output = buffers(112, n_out)
+    rank = load_field(last_output, 32, I64)
+    last_axis = build.sub(rank, ir.Constant(I64, 1))
+    n_lanes = build.load(
+        build.gep(load_field(last_output, 40), [last_axis], source_etype=I64), typ=I64
+    )
+    groups = build.sdiv(n_lanes, ir.Constant(I64, width))
+    build.call(kernel, [input_table, output_table, n_lanes, ir.Constant(I64, 0), groups])
+    build.ret(null)

@@ -6,65 +6,77 @@ from typing import Any
 import llvmlite.ir as ir
 from jax.extend.core import ClosedJaxpr
 
-from vrw_jax.simd.arrays import HELD, LANES, SMALL, Arrays, has_lanes, taken_for_lanes
-from vrw_jax.simd.fields import Entries, Field, Index
+from vrw_jax.simd.arrays import (
+    LANE_AXIS_SENTINEL,
+    MAX_REGISTERS,
+    MAX_UNROLLED,
+    ArrayEmitter,
+    has_lanes,
+    lane_axis_error,
+)
+from vrw_jax.simd.fields import ArrayValue, EntryIndex, LazyArray
 from vrw_jax.simd.handler import add_handler
-from vrw_jax.simd.numbers import BYTE, LONG, NUMBERS, TRUTH, Numbers, Value
-from vrw_jax.simd.rules import RULES
-from vrw_jax.simd.trace import Traces
+from vrw_jax.simd.numbers import I1, I8, I64, NUMBER_TYPES, Value, ValueEmitter
+from vrw_jax.simd.rules import PRIMITIVE_RULES
+from vrw_jax.simd.trace import JaxprLowering
 
-NAME = "lanes"
+KERNEL_NAME = "lanes"
 
 
-def module_text(closed: ClosedJaxpr, width: int, small: int = SMALL) -> str:
+def write_module(closed_jaxpr: ClosedJaxpr, width: int, max_unrolled: int = MAX_UNROLLED) -> str:
     """Return the LLVM text of the kernel, which computes a range of groups of lanes.
 
     Its signature is `void lanes(const void **inputs, void **outputs, int64 lanes, int64 begin,
     int64 end)`. The function loops over groups of `width` lanes. A single lane is computed twice,
     as a vector, because LLVM's code for scalars differs in the last digits.
     """
-    _check(closed)
-    module = ir.Module(NAME)
+    _check_lane_axes(closed_jaxpr)
+    module = ir.Module(KERNEL_NAME)
     pointer = ir.PointerType()
     kernel = ir.Function(
-        module, ir.FunctionType(ir.VoidType(), [pointer, pointer, LONG, LONG, LONG]), NAME
+        module, ir.FunctionType(ir.VoidType(), [pointer, pointer, I64, I64, I64]), KERNEL_NAME
     )
     kernel.attributes.add("nounwind")
     build = ir.IRBuilder(kernel.append_basic_block("entry"))
-    arrays = Arrays(Numbers(build, max(width, 2)), small=small)
-    given, told, n_lanes, begin, end = kernel.args
-    inputs, outputs = closed.in_avals, closed.out_avals
+    arrays = ArrayEmitter(ValueEmitter(build, max(width, 2)), max_unrolled=max_unrolled)
+    input_table, output_table, n_lanes, begin, end = kernel.args
+    inputs, outputs = closed_jaxpr.in_avals, closed_jaxpr.out_avals
 
-    def entry(base: Value, index: int) -> Value:
-        place = build.gep(base, [ir.Constant(LONG, index)], source_etype=pointer)
-        return build.load(place, typ=pointer)
+    def load_pointer(base: Value, index: int) -> Value:
+        slot = build.gep(base, [ir.Constant(I64, index)], source_etype=pointer)
+        return build.load(slot, typ=pointer)
 
-    sources = [entry(given, i) for i in range(len(inputs))]
-    targets = [entry(told, i) for i in range(len(outputs))]
+    sources = [load_pointer(input_table, i) for i in range(len(inputs))]
+    targets = [load_pointer(output_table, i) for i in range(len(outputs))]
 
-    def group(first: Value, _: Any) -> list[Value]:
-        rows = _Rows(arrays, width == 1, n_lanes, build.mul(first, ir.Constant(LONG, width)))
-        values = [rows.read(*pair) for pair in zip(sources, inputs, strict=True)]
-        results = Traces(arrays, RULES).closed(closed, values)
+    def emit_group(group_index: Value, _: Any) -> list[Value]:
+        row_access = _RowAccess(
+            arrays, width == 1, n_lanes, build.mul(group_index, ir.Constant(I64, width))
+        )
+        values = [row_access.read_argument(*pair) for pair in zip(sources, inputs, strict=True)]
+        results = JaxprLowering(arrays, PRIMITIVE_RULES).lower_jaxpr(closed_jaxpr, values)
         for target, aval, value in zip(targets, outputs, results, strict=True):
-            rows.write(target, aval, value)
+            row_access.write_result(target, aval, value)
         return []
 
-    arrays.range(begin, end, group)
+    arrays.loop_over_range(begin, end, emit_group)
     build.ret_void()
     add_handler(module, kernel, len(inputs), len(outputs), width)
     return str(module)
 
 
-def _check(closed: ClosedJaxpr) -> None:
+def _check_lane_axes(closed_jaxpr: ClosedJaxpr) -> None:
     """Raise an error unless the lanes are the last axis of every argument and result, and
     no other.
     """
-    for what, avals in (("An argument", closed.in_avals), ("A result", closed.out_avals)):
+    for description, avals in (
+        ("An argument", closed_jaxpr.in_avals),
+        ("A result", closed_jaxpr.out_avals),
+    ):
         for aval in avals:
-            if LANES in aval.shape[:-1]:
-                raise taken_for_lanes(what, aval)
-    for aval in closed.out_avals:
+            if LANE_AXIS_SENTINEL in aval.shape[:-1]:
+                raise lane_axis_error(description, aval)
+    for aval in closed_jaxpr.out_avals:
         if not has_lanes(aval):
             raise NotImplementedError(
                 f"A result has the shape {aval.str_short()}, the same for all lanes: compute it "
@@ -72,47 +84,62 @@ def _check(closed: ClosedJaxpr) -> None:
             )
 
 
-class _Rows:
+class _RowAccess:
     """Access to arrays outside for a group of lanes: they are stored row after row, lanes last."""
 
-    def __init__(self, arrays: Arrays, alone: bool, n_lanes: Value, lane: Value) -> None:
-        self.arrays, self.alone, self.n_lanes, self.lane = arrays, alone, n_lanes, lane
+    def __init__(
+        self, emitter: ArrayEmitter, is_single_lane: bool, n_lanes: Value, lane: Value
+    ) -> None:
+        self.emitter, self.is_single_lane, self.n_lanes, self.lane = (
+            emitter,
+            is_single_lane,
+            n_lanes,
+            lane,
+        )
 
-    def read(self, base: Value, aval: Any) -> Entries:
+    def read_argument(self, base: Value, aval: Any) -> ArrayValue:
         """Return an argument; a number without axes is the same for all lanes."""
-        build = self.arrays.builder
+        build = self.emitter.builder
 
-        def at(index: Index) -> Value:
-            where, kind = self._place(base, aval, index)
-            value = build.load(where, typ=kind, align=aval.dtype.itemsize)
+        def load_entry(index: EntryIndex) -> Value:
+            address, kind = self.row_address(base, aval, index)
+            value = build.load(address, typ=kind, align=aval.dtype.itemsize)
             if aval.dtype.kind == "b":
-                value = build.icmp_signed("!=", value, self.arrays.numbers.constant(kind, 0))
-            return self.arrays.numbers.spread(value) if self.alone and aval.shape else value
+                value = build.icmp_signed("!=", value, self.emitter.emitter.constant(kind, 0))
+            return (
+                self.emitter.emitter.splat(value) if self.is_single_lane and aval.shape else value
+            )
 
-        field = Field(aval.shape[:-1], self.arrays.kind_of(aval), at)
-        return self.arrays.entries(field) if math.prod(field.shape) <= HELD else field
+        field = LazyArray(aval.shape[:-1], self.emitter.entry_type_of(aval), load_entry)
+        return self.emitter.get_entries(field) if math.prod(field.shape) <= MAX_REGISTERS else field
 
-    def write(self, base: Value, aval: Any, value: Entries) -> None:
+    def write_result(self, base: Value, aval: Any, value: ArrayValue) -> None:
         """Store a result."""
-        build = self.arrays.builder
+        build = self.emitter.builder
 
-        def store(index: Index, _: Any) -> list[Value]:
-            where, kind = self._place(base, aval, index)
-            whole = self.arrays.numbers.spread(self.arrays.entry(value, index))
-            whole = build.extract_element(whole, ir.Constant(LONG, 0)) if self.alone else whole
-            whole = build.zext(whole, kind) if aval.dtype.kind == "b" else whole
-            build.store(whole, where, align=aval.dtype.itemsize)
+        def store_entry(index: EntryIndex, _: Any) -> list[Value]:
+            address, kind = self.row_address(base, aval, index)
+            stored_value = self.emitter.emitter.splat(self.emitter.get_entry(value, index))
+            stored_value = (
+                build.extract_element(stored_value, ir.Constant(I64, 0))
+                if self.is_single_lane
+                else stored_value
+            )
+            stored_value = (
+                build.zext(stored_value, kind) if aval.dtype.kind == "b" else stored_value
+            )
+            build.store(stored_value, address, align=aval.dtype.itemsize)
             return []
 
-        self.arrays.each(aval.shape[:-1], store)
+        self.emitter.loop_over_indices(aval.shape[:-1], store_entry)
 
-    def _place(self, base: Value, aval: Any, index: Index) -> tuple[Value, ir.Type]:
+    def row_address(self, base: Value, aval: Any, index: EntryIndex) -> tuple[Value, ir.Type]:
         """Return the address of a row's lanes, and the type in which they are stored."""
-        build, number = self.arrays.builder, NUMBERS[aval.dtype.name]
-        number = BYTE if number == TRUTH else number
+        build, number = self.emitter.builder, NUMBER_TYPES[aval.dtype.name]
+        number = I8 if number == I1 else number
         if aval.shape == ():
             return base, number
-        row = self.arrays.linear(index, aval.shape[:-1])
-        where = build.add(build.mul(row, self.n_lanes), self.lane)
-        kind = number if self.alone else self.arrays.numbers.vector(number)
-        return build.gep(base, [where], source_etype=number), kind
+        row = self.emitter.linear_index(index, aval.shape[:-1])
+        offset = build.add(build.mul(row, self.n_lanes), self.lane)
+        kind = number if self.is_single_lane else self.emitter.emitter.vector_type(number)
+        return build.gep(base, [offset], source_etype=number), kind

@@ -6,81 +6,105 @@ from typing import Any
 
 import llvmlite.ir as ir
 
-from vrw_jax.simd.arrays import HELD, HELD_INSIDE, LANES, Arrays, arrays_of, shape_of
-from vrw_jax.simd.fields import Entries, Memory, Turned, Updated, shared
-from vrw_jax.simd.numbers import LONG, Value
-from vrw_jax.simd.trace import CALLS, Traces
+from vrw_jax.simd.arrays import (
+    LANE_AXIS_SENTINEL,
+    MAX_REGISTERS,
+    MAX_REGISTERS_INNER,
+    ArrayEmitter,
+    shape_without_lanes,
+    split_arrays,
+)
+from vrw_jax.simd.fields import ArrayValue, MemoryArray, PendingUpdate, TransposedView, as_shared
+from vrw_jax.simd.numbers import I64, Value
+from vrw_jax.simd.trace import JAXPR_PARAMETERS, JaxprLowering
 
 
-def while_(traces: Traces, equation: Any, values: list[Entries]) -> list[Entries]:
+def emit_while(traces: JaxprLowering, equation: Any, values: list[ArrayValue]) -> list[ArrayValue]:
     """Emit a loop with a condition, of which each group of lanes has its own."""
-    arrays, params = traces.arrays, equation.params
-    n_goes, n_body = params["cond_nconsts"], params["body_nconsts"]
-    read = list(map(shared, values[: n_goes + n_body]))  # in each iteration
-    fixed, own = read[:n_goes], read[n_goes:]
-    begin = values[n_goes + n_body :]
-    carry = _Carry(arrays, params["body_jaxpr"].out_avals, HELD, begin)
+    arrays, params = traces.emitter, equation.params
+    n_condition_constants, n_body_constants = params["cond_nconsts"], params["body_nconsts"]
+    constants = list(
+        map(as_shared, values[: n_condition_constants + n_body_constants])
+    )  # in each iteration
+    condition_constants, body_constants = (
+        constants[:n_condition_constants],
+        constants[n_condition_constants:],
+    )
+    initial_values = values[n_condition_constants + n_body_constants :]
+    carry = _LoopCarry(arrays, params["body_jaxpr"].out_avals, MAX_REGISTERS, initial_values)
 
-    def goes_on(flat: list[Value]) -> Value:
-        told = traces.closed(params["cond_jaxpr"], [*fixed, *map(shared, carry.arrays(flat))])
-        return arrays.entries(told[0]).item()
+    def emit_condition(flat: list[Value]) -> Value:
+        results = traces.lower_jaxpr(
+            params["cond_jaxpr"], [*condition_constants, *map(as_shared, carry.to_arrays(flat))]
+        )
+        return arrays.get_entries(results[0]).item()
 
     def body(flat: list[Value]) -> list[Value]:
-        told = traces.closed(params["body_jaxpr"], [*own, *carry.arrays(flat)])
-        return carry.on(told)
+        results = traces.lower_jaxpr(
+            params["body_jaxpr"], [*body_constants, *carry.to_arrays(flat)]
+        )
+        return carry.get_next_registers(results)
 
-    start = carry.start(begin)
-    return carry.arrays(arrays.numbers.loop(start, goes_on, body))
+    initial_registers = carry.store_initial(initial_values)
+    return carry.to_arrays(arrays.emitter.emit_loop(initial_registers, emit_condition, body))
 
 
-def scan(traces: Traces, equation: Any, values: list[Entries]) -> list[Entries]:
+def emit_scan(traces: JaxprLowering, equation: Any, values: list[ArrayValue]) -> list[ArrayValue]:
     """Emit a loop of known length, whose scanned inputs and stacked outputs are in memory."""
-    arrays, params = traces.arrays, equation.params
-    n_fixed, n_carried = _fixed_and_carried(params)
-    inner, length = params["jaxpr"], params["length"]
-    told = [variable.aval for variable in equation.outvars[n_carried:]]
-    if length == LANES and (told or len(values) > n_fixed + n_carried):
+    arrays, params = traces.emitter, equation.params
+    n_constants, n_carry = _split_scan_counts(params)
+    body_jaxpr, length = params["jaxpr"], params["length"]
+    stacked_avals = [variable.aval for variable in equation.outvars[n_carry:]]
+    if length == LANE_AXIS_SENTINEL and (stacked_avals or len(values) > n_constants + n_carry):
         raise NotImplementedError(
-            f"scan reads or writes along an axis of {LANES}, which is the lanes': do the same to "
+            f"scan reads or writes along an axis of {LANE_AXIS_SENTINEL}, which is the lanes': do the same to "
             "each by itself, and give other axes another length."
         )
-    given = values[n_fixed + n_carried :]
-    read = [x if isinstance(x, Turned) else arrays.in_memory(x) for x in given]
-    written = [arrays.room(shape_of(aval), arrays.kind_of(aval)) for aval in told]
-    outside, arrays.written_out = arrays.written_out, not _has_loops(inner.jaxpr)
-    fixed, begin = list(map(shared, values[:n_fixed])), values[n_fixed : n_fixed + n_carried]
-    limit = HELD_INSIDE if arrays.written_out else HELD
-    carry = _Carry(arrays, inner.out_avals[:n_carried], limit, begin)
+    scanned = values[n_constants + n_carry :]
+    scanned_arrays = [
+        x if isinstance(x, TransposedView) else arrays.materialize(x) for x in scanned
+    ]
+    stacked_arrays = [
+        arrays.allocate(shape_without_lanes(aval), arrays.entry_type_of(aval))
+        for aval in stacked_avals
+    ]
+    was_unrolled, arrays.is_unrolled = arrays.is_unrolled, not _contains_loop(body_jaxpr.jaxpr)
+    constants, initial_values = (
+        list(map(as_shared, values[:n_constants])),
+        values[n_constants : n_constants + n_carry],
+    )
+    max_registers = MAX_REGISTERS_INNER if arrays.is_unrolled else MAX_REGISTERS
+    carry = _LoopCarry(arrays, body_jaxpr.out_avals[:n_carry], max_registers, initial_values)
 
-    def part(memory: Memory | Turned, turn: Value) -> Entries:
-        some = memory.part(turn)
-        inside = arrays.written_out or math.prod(some.shape) <= HELD
-        return arrays.entries(some) if inside else some
+    def get_slice(memory: MemoryArray | TransposedView, iteration: Value) -> ArrayValue:
+        row = memory.get_row(iteration)
+        fits_registers = arrays.is_unrolled or math.prod(row.shape) <= MAX_REGISTERS
+        return arrays.get_entries(row) if fits_registers else row
 
-    def body(turn: Value, flat: list[Value]) -> list[Value]:
+    def body(iteration: Value, flat: list[Value]) -> list[Value]:
         if params["reverse"]:
-            turn = arrays.builder.sub(ir.Constant(LONG, length - 1), turn)
-        some = [part(memory, turn) for memory in read]
-        results = traces.closed(inner, [*fixed, *carry.arrays(flat), *some])
-        for memory, value in zip(written, results[n_carried:], strict=True):
-            arrays.fill(memory.part(turn), value)
-        return carry.on(results[:n_carried])
+            iteration = arrays.builder.sub(ir.Constant(I64, length - 1), iteration)
+        slices = [get_slice(memory, iteration) for memory in scanned_arrays]
+        results = traces.lower_jaxpr(body_jaxpr, [*constants, *carry.to_arrays(flat), *slices])
+        for memory, value in zip(stacked_arrays, results[n_carry:], strict=True):
+            arrays.fill_memory(memory.get_row(iteration), value)
+        return carry.get_next_registers(results[:n_carry])
 
-    start = carry.start(begin)
-    last = carry.arrays(arrays.counted(length, body, start))
-    arrays.written_out = outside
-    return [*last, *written]
+    initial_registers = carry.store_initial(initial_values)
+    final_values = carry.to_arrays(arrays.loop_n_times(length, body, initial_registers))
+    arrays.is_unrolled = was_unrolled
+    return [*final_values, *stacked_arrays]
 
 
-def _fixed_and_carried(params: dict[str, Any]) -> tuple[int, int]:
+def _split_scan_counts(params: dict[str, Any]) -> tuple[int, int]:
     """Return the number of constants of a scan, and the number of values that it carries."""
     if "ft_in" in params:  # JAX from 0.11 or 0.12 on
-        fixed, carried, _ = params["ft_in"].unpack()
-        return len(fixed), len(carried)
+        constants, carry, _ = params["ft_in"].unpack()
+        return len(constants), len(carry)
     return params["num_consts"], params["num_carry"]
 
 
-class _Carry:
+class _LoopCarry:
     """Arrays carried from one iteration of a loop to the next.
 
     They are in registers up to `max_registers` entries, otherwise in memory. The memory is
@@ -88,86 +112,107 @@ class _Carry:
     """
 
     def __init__(
-        self, arrays: Arrays, avals: Sequence[Any], limit: int | float, begin: Sequence[Entries]
+        self,
+        emitter: ArrayEmitter,
+        avals: Sequence[Any],
+        max_registers: int | float,
+        initial_values: Sequence[ArrayValue],
     ) -> None:
-        self.owner, self.avals = arrays, avals
-        self.places = [
-            self._place(aval, array) if math.prod(shape_of(aval)) > limit else None
-            for aval, array in zip(avals, begin, strict=True)
+        self.emitter, self.avals = emitter, avals
+        self.memory_slots = [
+            self.choose_memory(aval, initial_value)
+            if math.prod(shape_without_lanes(aval)) > max_registers
+            else None
+            for aval, initial_value in zip(avals, initial_values, strict=True)
         ]
 
-    def _place(self, aval: Any, begin: Entries) -> Memory:
-        kind = self.owner.kind_of(aval)
-        begin = begin.whole if isinstance(begin, Updated) else begin
-        if isinstance(begin, Memory) and begin.free and begin.kind == kind:
-            return begin
-        return self.owner.room(shape_of(aval), kind)
+    def choose_memory(self, aval: Any, initial_value: ArrayValue) -> MemoryArray:
+        kind = self.emitter.entry_type_of(aval)
+        initial_value = (
+            initial_value.base_array if isinstance(initial_value, PendingUpdate) else initial_value
+        )
+        if (
+            isinstance(initial_value, MemoryArray)
+            and initial_value.is_overwritable
+            and initial_value.entry_type == kind
+        ):
+            return initial_value
+        return self.emitter.allocate(shape_without_lanes(aval), kind)
 
-    def arrays(self, flat: Sequence[Value]) -> list[Entries]:
+    def to_arrays(self, flat: Sequence[Value]) -> list[ArrayValue]:
         """Return the carried arrays, in an iteration or after the last one."""
-        held = [aval for aval, place in zip(self.avals, self.places, strict=True) if place is None]
-        left = iter(arrays_of(flat, held))
+        register_avals = [
+            aval for aval, slot in zip(self.avals, self.memory_slots, strict=True) if slot is None
+        ]
+        register_arrays = iter(split_arrays(flat, register_avals))
         # A new object each time, because values cached for the old one are outdated.
         return [
-            next(left)
-            if place is None
-            else Memory(self.owner, place.shape, place.kind, place.base, free=True)
-            for place in self.places
+            next(register_arrays)
+            if slot is None
+            else MemoryArray(
+                self.emitter, slot.shape, slot.entry_type, slot.base, is_overwritable=True
+            )
+            for slot in self.memory_slots
         ]
 
-    def start(self, arrays: Sequence[Entries]) -> list[Value]:
+    def store_initial(self, arrays: Sequence[ArrayValue]) -> list[Value]:
         """Return the initial values of registers, and store the others."""
-        for array, place in zip(arrays, self.places, strict=True):
-            if place is None or array is place:
+        for array, slot in zip(arrays, self.memory_slots, strict=True):
+            if slot is None or array is slot:
                 continue
-            if isinstance(array, Updated) and array.whole is place:
-                array.ready().store_into(place)
+            if isinstance(array, PendingUpdate) and array.base_array is slot:
+                array.materialize_update().store_into(slot)
             else:
-                self.owner.fill(place, array)
-        return self._in_registers(arrays)
+                self.emitter.fill_memory(slot, array)
+        return self._flatten_registers(arrays)
 
-    def on(self, arrays: Sequence[Entries]) -> list[Value]:
+    def get_next_registers(self, arrays: Sequence[ArrayValue]) -> list[Value]:
         """Return the registers of the next iteration, and store the others.
 
         New values may depend on any of the old ones.
         """
-        flat = self._in_registers(arrays)
-        moves: list[tuple[Memory, Memory | Updated]] = []
-        for array, place in zip(arrays, self.places, strict=True):
-            if place is None or (isinstance(array, Memory) and array.base is place.base):
+        flat = self._flatten_registers(arrays)
+        moves: list[tuple[MemoryArray, MemoryArray | PendingUpdate]] = []
+        for array, slot in zip(arrays, self.memory_slots, strict=True):
+            if slot is None or (isinstance(array, MemoryArray) and array.base is slot.base):
                 continue
-            if isinstance(array, Updated) and getattr(array.whole, "base", None) is place.base:
-                moves.append((place, array.ready()))
-            elif isinstance(array, Memory) and self._apart(array):
-                moves.append((place, array))
+            if (
+                isinstance(array, PendingUpdate)
+                and getattr(array.base_array, "base", None) is slot.base
+            ):
+                moves.append((slot, array.materialize_update()))
+            elif isinstance(array, MemoryArray) and self._has_own_memory(array):
+                moves.append((slot, array))
             else:
-                copy = self.owner.room(place.shape, place.kind)
-                self.owner.fill(copy, array)
-                moves.append((place, copy))
-        for place, fresh in moves:
-            if isinstance(fresh, Updated):
-                fresh.store_into(place)
+                copy = self.emitter.allocate(slot.shape, slot.entry_type)
+                self.emitter.fill_memory(copy, array)
+                moves.append((slot, copy))
+        for slot, new_value in moves:
+            if isinstance(new_value, PendingUpdate):
+                new_value.store_into(slot)
             else:
-                self.owner.fill(place, fresh)
+                self.emitter.fill_memory(slot, new_value)
         return flat
 
-    def _apart(self, array: Memory) -> bool:
+    def _has_own_memory(self, array: MemoryArray) -> bool:
         """Return whether the array has memory that no carried array uses."""
-        rooms = [place.base for place in self.places if place is not None]
-        return isinstance(array.base, ir.AllocaInstr) and array.base not in rooms
+        memory_bases = [slot.base for slot in self.memory_slots if slot is not None]
+        return isinstance(array.base, ir.AllocaInstr) and array.base not in memory_bases
 
-    def _in_registers(self, arrays: Sequence[Entries]) -> list[Value]:
-        triples = zip(arrays, self.avals, self.places, strict=True)
-        held = [(array, aval) for array, aval, place in triples if place is None]
-        return self.owner.flat([array for array, _ in held], [aval for _, aval in held])
+    def _flatten_registers(self, arrays: Sequence[ArrayValue]) -> list[Value]:
+        triples = zip(arrays, self.avals, self.memory_slots, strict=True)
+        register_pairs = [(array, aval) for array, aval, slot in triples if slot is None]
+        return self.emitter.flatten_entries(
+            [array for array, _ in register_pairs], [aval for _, aval in register_pairs]
+        )
 
 
-def _has_loops(jaxpr: Any) -> bool:
+def _contains_loop(jaxpr: Any) -> bool:
     """Return whether a trace contains a loop at any level."""
     for equation in jaxpr.eqns:
         if equation.primitive.name in ("while", "scan"):
             return True
-        inner = equation.params.get(CALLS.get(equation.primitive.name, ""))
-        if inner is not None and _has_loops(inner.jaxpr):
+        inner_jaxpr = equation.params.get(JAXPR_PARAMETERS.get(equation.primitive.name, ""))
+        if inner_jaxpr is not None and _contains_loop(inner_jaxpr.jaxpr):
             return True
     return False

@@ -6,9 +6,9 @@ from typing import Any
 
 import llvmlite.binding as llvm
 
-LEVEL = 2
+OPTIMIZATION_LEVEL = 2
 """LLVM's optimization level for register allocation and instruction scheduling."""
-PASSES = (
+LLVM_PASSES = (
     "global_dead_code_eliminate",
     "instruction_combine",
     "simplify_cfg",
@@ -23,28 +23,28 @@ takes as long as all the rest, for code that is at most a twentieth faster.
 
 
 @functools.cache
-def processor() -> tuple[str, str, str]:
+def describe_processor() -> tuple[str, str, str]:
     """Return the target of machine code: target triple, processor, and its features."""
     features = llvm.get_host_cpu_features().flatten()
     return llvm.get_process_triple(), llvm.get_host_cpu_name(), features
 
 
-def how_compiled() -> str:
+def compilation_key() -> str:
     """Return everything that object code depends on besides LLVM's text."""
-    return repr((llvm.llvm_version_info, processor(), LEVEL, PASSES))
+    return repr((llvm.llvm_version_info, describe_processor(), OPTIMIZATION_LEVEL, LLVM_PASSES))
 
 
-def wide() -> bool:
+def has_512_bit_vectors() -> bool:
     """Return whether vectors have 512 bits."""
-    return "+avx512f" in processor()[2]
+    return "+avx512f" in describe_processor()[2]
 
 
-def compiled(text: str) -> bytes:
+def compile_native(text: str) -> bytes:
     """Return object code for this processor."""
-    return _emitted(llvm.parse_assembly(text), _machine())
+    return _emit_object(llvm.parse_assembly(text), _make_target_machine())
 
 
-def compiled_for_web(text: str, begins: str, name: str) -> bytes:
+def compile_wasm(text: str, entry_point: str, name: str) -> bytes:
     """Return object code for WebAssembly, a 32-bit machine with vectors of 128 bits.
 
     The object is to be linked with others. Its one exported function is `entry_point`, renamed to
@@ -52,32 +52,36 @@ def compiled_for_web(text: str, begins: str, name: str) -> bytes:
     """
     module = llvm.parse_assembly(text)
     for symbol in (*module.functions, *module.global_variables):
-        if not symbol.is_declaration and symbol.name != begins:
+        if not symbol.is_declaration and symbol.name != entry_point:
             symbol.linkage = "internal"
-    module.get_function(begins).name = name
+    module.get_function(entry_point).name = name
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()
     target = llvm.Target.from_triple("wasm32-unknown-unknown")
     machine = target.create_target_machine(
-        cpu="generic", features="+simd128", opt=LEVEL, reloc="static", codemodel="default"
+        cpu="generic",
+        features="+simd128",
+        opt=OPTIMIZATION_LEVEL,
+        reloc="static",
+        codemodel="default",
     )
-    return _emitted(module, machine)
+    return _emit_object(module, machine)
 
 
-def _emitted(module: llvm.ModuleRef, machine: llvm.TargetMachine) -> bytes:
+def _emit_object(module: llvm.ModuleRef, machine: llvm.TargetMachine) -> bytes:
     module.triple, module.data_layout = machine.triple, str(machine.target_data)
     passes = llvm.create_new_module_pass_manager()
-    for name in PASSES:
+    for name in LLVM_PASSES:
         getattr(passes, f"add_{name}_pass")()
     passes.run(module, llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options()))
     return machine.emit_object(module)
 
 
-class Loaded:
+class LoadedCode:
     """Machine code loaded into memory."""
 
     def __init__(self, code: bytes) -> None:
-        self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
+        self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _make_target_machine())
         self._engine.add_object_file(llvm.ObjectFileRef.from_data(code))
         self._engine.finalize_object()
 
@@ -95,9 +99,11 @@ class Loaded:
         return make(self.address(name), None, None)
 
 
-def _machine() -> llvm.TargetMachine:
+def _make_target_machine() -> llvm.TargetMachine:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
-    triple, name, features = processor()
+    triple, name, features = describe_processor()
     target = llvm.Target.from_triple(triple)
-    return target.create_target_machine(cpu=name, features=features, opt=LEVEL, jit=True)
+    return target.create_target_machine(
+        cpu=name, features=features, opt=OPTIMIZATION_LEVEL, jit=True
+    )

@@ -12,17 +12,17 @@ import llvmlite.ir as ir
 Value = Any
 """An LLVM value: a scalar or a vector of lanes."""
 
-TRUTH, BYTE, INT, LONG = (ir.IntType(bits) for bits in (1, 8, 32, 64))
-NUMBERS = {
-    "bool": TRUTH,
-    "int32": INT,
-    "int64": LONG,
+I1, I8, I32, I64 = (ir.IntType(bits) for bits in (1, 8, 32, 64))
+NUMBER_TYPES = {
+    "bool": I1,
+    "int32": I32,
+    "int64": I64,
     "float32": ir.FloatType(),
     "float64": ir.DoubleType(),
 }
 
 
-class Operation:
+class BinaryInstruction:
     """An instruction on two values of one type.
 
     Most of a program consists of these; llvmlite's own instructions, which can be changed later,
@@ -42,110 +42,114 @@ class Operation:
         return self.text
 
 
-class _Repeated(ir.Constant):
+class _SplatConstant(ir.Constant):
     """A constant that is the same for all lanes, written once."""
 
     def _get_reference(self) -> str:
         return f"splat ({self.constant[0]})"
 
 
-class Numbers:
+class ValueEmitter:
     """Emitter of values into a function of `builder`'s module."""
 
     def __init__(self, builder: ir.IRBuilder, width: int) -> None:
         self.builder, self.width = builder, width
         # Values computed so far, by operation and operands: traces contain many repetitions.
-        self.known: dict[tuple, Any] = {}
-        self.lately: list[tuple] = []  # keys of the values emitted within the present inner context
-        self.operations = 0
+        self.known_values: dict[tuple, Any] = {}
+        self.recent_keys: list[
+            tuple
+        ] = []  # keys of the values emitted within the present inner context
+        self.n_operations = 0
         self.constants: dict[tuple[str, str], ir.Constant] = {}
 
-    def vector(self, number: ir.Type) -> ir.VectorType:
+    def vector_type(self, number: ir.Type) -> ir.VectorType:
         """Return the type of a vector with a number of that type for each lane."""
         return ir.VectorType(number, self.width)
 
     def constant(self, kind: ir.Type, value: Any) -> ir.Constant:
         """Return `value` as a constant of that type, the same for all lanes."""
         if isinstance(kind, ir.VectorType):
-            return self.spread(self.constant(kind.element, value))
+            return self.splat(self.constant(kind.element, value))
         number = int(value) if isinstance(kind, ir.IntType) else float(value)
         return self.constants.setdefault((str(kind), repr(number)), ir.Constant(kind, number))
 
-    def spread(self, value: Value) -> Value:
+    def splat(self, value: Value) -> Value:
         """Return a scalar as a vector with equal entries."""
         if isinstance(value.type, ir.VectorType):
             return value
-        kind = self.vector(value.type)
+        kind = self.vector_type(value.type)
         if isinstance(value, ir.Constant):
             key = (str(kind), str(value))
             if key not in self.constants:
-                self.constants[key] = _Repeated(kind, [value] * kind.count)
+                self.constants[key] = _SplatConstant(kind, [value] * kind.count)
             return self.constants[key]
-        return self.once(("spread", id(value)), lambda: self._spread(value, kind))
+        return self.emit_once(("spread", id(value)), lambda: self._emit_splat(value, kind))
 
-    def _spread(self, value: Value, kind: ir.VectorType) -> Value:
+    def _emit_splat(self, value: Value, kind: ir.VectorType) -> Value:
         empty = ir.Constant(kind, ir.Undefined)
-        first = self.builder.insert_element(empty, value, ir.Constant(INT, 0))
-        order = ir.Constant(ir.VectorType(INT, kind.count), [0] * kind.count)
-        return self.builder.shuffle_vector(first, empty, order)
+        first_lane_set = self.builder.insert_element(empty, value, ir.Constant(I32, 0))
+        order = ir.Constant(ir.VectorType(I32, kind.count), [0] * kind.count)
+        return self.builder.shuffle_vector(first_lane_set, empty, order)
 
-    def once(self, key: tuple, make: Callable[[], Any]) -> Any:
+    def emit_once(self, key: tuple, make: Callable[[], Any]) -> Any:
         """Return the value under this key, which `make` creates on the first call.
 
         An object that a key identifies by `id` must live as long as this emitter.
         """
-        if key not in self.known:
-            self.known[key] = make()
-            self.lately.append(key)
-        return self.known[key]
+        if key not in self.known_values:
+            self.known_values[key] = make()
+            self.recent_keys.append(key)
+        return self.known_values[key]
 
-    def operation(self, what: str, x: Value, y: Value) -> Operation:
+    def emit_binary(self, opcode: str, x: Value, y: Value) -> BinaryInstruction:
         """Emit an instruction on two values of the same type, with a result of that type."""
-        self.operations += 1
-        name, kind = f"%o{self.operations}", x.type
-        text = f"{name} = {what} {kind} {x.get_reference()}, {y.get_reference()}"
-        made = Operation(name, kind, text)
-        self.builder._insert(made)
-        return made
+        self.n_operations += 1
+        name, kind = f"%o{self.n_operations}", x.type
+        text = f"{name} = {opcode} {kind} {x.get_reference()}, {y.get_reference()}"
+        instruction = BinaryInstruction(name, kind, text)
+        self.builder._insert(instruction)
+        return instruction
 
-    def alike(self, *values: Value) -> list[Value]:
+    def to_same_shape(self, *values: Value) -> list[Value]:
         """Return the values as vectors if one of them is a vector."""
         if any(isinstance(value.type, ir.VectorType) for value in values):
-            return [self.spread(value) for value in values]
+            return [self.splat(value) for value in values]
         return list(values)
 
     @contextlib.contextmanager
-    def inner(self) -> Iterator[None]:
+    def discard_inner_values(self) -> Iterator[None]:
         """Discard the values computed within the context, at its end."""
-        before, self.lately = self.lately, []
+        outer_keys, self.recent_keys = self.recent_keys, []
         yield
-        for key in self.lately:
-            del self.known[key]
-        self.lately = before
+        for key in self.recent_keys:
+            del self.known_values[key]
+        self.recent_keys = outer_keys
 
-    def loop(
+    def emit_loop(
         self,
-        carried: Sequence[Value],
-        goes_on: Callable[[list[Value]], Value],
-        body: Callable[[list[Value]], Sequence[Value]],
+        initial_values: Sequence[Value],
+        emit_condition: Callable[[list[Value]], Value],
+        emit_body: Callable[[list[Value]], Sequence[Value]],
     ) -> list[Value]:
         """Emit a loop, `while emit_condition(values): values = emit_body(values)`."""
-        build, before = self.builder, self.builder.block
-        head, within, after = (build.append_basic_block(name) for name in ("head", "body", "after"))
-        build.branch(head)
-        build.position_at_end(head)
+        build, entry_block = self.builder, self.builder.block
+        head_block, body_block, exit_block = (
+            build.append_basic_block(name) for name in ("head", "body", "after")
+        )
+        build.branch(head_block)
+        build.position_at_end(head_block)
         values: list[Value] = []
-        for value in carried:
+        for value in initial_values:
             phi = build.phi(value.type)
-            phi.add_incoming(value, before)
+            phi.add_incoming(value, entry_block)
             values.append(phi)
-        with self.inner():
-            build.cbranch(goes_on(values), within, after)
-            build.position_at_end(within)
-            following = body(values)
-            for phi, value in zip(values, following, strict=True):
-                alike = self.spread(value) if isinstance(phi.type, ir.VectorType) else value
-                phi.add_incoming(alike, build.block)
-            build.branch(head)
-        build.position_at_end(after)
+        with self.discard_inner_values():
+            build.cbranch(emit_condition(values), body_block, exit_block)
+            build.position_at_end(body_block)
+            next_values = emit_body(values)
+            for phi, value in zip(values, next_values, strict=True):
+                next_value = self.splat(value) if isinstance(phi.type, ir.VectorType) else value
+                phi.add_incoming(next_value, build.block)
+            build.branch(head_block)
+        build.position_at_end(exit_block)
         return values

@@ -17,31 +17,37 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.simd.arrays import LANES, SMALL
-from vrw_jax.simd.code import Code, Store, code_of, kept_code, traced
-from vrw_jax.simd.ffi import CALLED, register, registered
-from vrw_jax.simd.kernel import NAME, module_text
-from vrw_jax.simd.machine import Loaded, compiled_for_web, wide
+from vrw_jax.simd.arrays import LANE_AXIS_SENTINEL, MAX_UNROLLED
+from vrw_jax.simd.code import (
+    CodeStore,
+    MachineCode,
+    get_machine_code,
+    load_machine_code,
+    trace_for_machine_code,
+)
+from vrw_jax.simd.ffi import LOADED_BY_NAME, MACHINE_CODE_PRIMITIVE, register_code
+from vrw_jax.simd.kernel import KERNEL_NAME, write_module
+from vrw_jax.simd.machine import LoadedCode, compile_wasm, has_512_bit_vectors
 
-VECTOR = {np.dtype(np.float64): 4, np.dtype(np.float32): 8}
+LANES_PER_256_BITS = {np.dtype(np.float64): 4, np.dtype(np.float32): 8}
 """Number of lanes in 256 bits, which is a vector, or half of one on processors with 512 bits."""
-TOGETHER = 64
+GROUPS_PER_TASK = 64
 """Number of groups in one task of a thread."""
 
 
-def serves() -> bool:
+def is_available() -> bool:
     """Return whether machine code is available for JAX's backend, which must be the CPU."""
     return jax.default_backend() == "cpu"
 
 
-def lane_program(
+def compile_lane_program(
     function: Callable[..., tuple],
-    uniform: Sequence[np.dtype],
+    scalar_dtypes: Sequence[np.dtype],
     n_lanes_in: int,
     dtype: np.dtype,
     key: object,
-    store: Store | None,
-    small: int = SMALL,
+    store: CodeStore | None,
+    max_unrolled: int = MAX_UNROLLED,
 ) -> Callable[[Sequence[Any], Sequence[np.ndarray]], list[np.ndarray]]:
     """Compile `function(scalars, lanes)`: scalars of `scalar_dtypes`, and arrays of the float
     `dtype`.
@@ -54,17 +60,21 @@ def lane_program(
     for a lane whatever the other lanes are; it uses all cores available to the process.
     """
     width = (
-        2 * VECTOR[dtype]
+        2 * LANES_PER_256_BITS[dtype]
     )  # of two vectors of 256 bits, one computes during the latency of the other
     shapes = (
-        tuple(jax.ShapeDtypeStruct((), kind) for kind in uniform),
-        (jax.ShapeDtypeStruct((LANES,), dtype),) * n_lanes_in,
+        tuple(jax.ShapeDtypeStruct((), kind) for kind in scalar_dtypes),
+        (jax.ShapeDtypeStruct((LANE_AXIS_SENTINEL,), dtype),) * n_lanes_in,
     )
-    return _Program(code_of(function, shapes, key, width, store, small), width)
+    return _LaneProgram(get_machine_code(function, shapes, key, width, store, max_unrolled), width)
 
 
-def web_object(
-    function: Callable[..., Any], numbers: int, rows: Sequence[int], name: str, small: int = SMALL
+def compile_wasm_object(
+    function: Callable[..., Any],
+    n_scalars: int,
+    n_rows_by_array: Sequence[int],
+    name: str,
+    max_unrolled: int = MAX_UNROLLED,
 ) -> bytes:
     """Return `function(*scalars, *arrays)` as object code for WebAssembly, two lanes at a time.
 
@@ -73,17 +83,19 @@ def web_object(
     of pointers to arguments and results, the number of lanes, and the range of pairs of lanes to
     compute. The caller provides `sin` and `cos` if the trace uses them.
     """
-    lanes = [jax.ShapeDtypeStruct((n, LANES), np.float64) for n in rows]
-    shapes = [jax.ShapeDtypeStruct((), np.float64)] * numbers + lanes
-    return compiled_for_web(module_text(traced(function, *shapes), 2, small), NAME, name)
+    lanes = [jax.ShapeDtypeStruct((n, LANE_AXIS_SENTINEL), np.float64) for n in n_rows_by_array]
+    shapes = [jax.ShapeDtypeStruct((), np.float64)] * n_scalars + lanes
+    return compile_wasm(
+        write_module(trace_for_machine_code(function, *shapes), 2, max_unrolled), KERNEL_NAME, name
+    )
 
 
-def lane_function(
+def compile_lane_function(
     function: Callable[..., Any],
-    like: Callable[..., Any],
+    shape_function: Callable[..., Any],
     key: object,
-    store: Store | None,
-    small: int = SMALL,
+    store: CodeStore | None,
+    max_unrolled: int = MAX_UNROLLED,
 ) -> Callable[..., Any]:
     """Return `function` of trees of arrays, lanes on their last axis, as one call within JAX
     programs.
@@ -95,7 +107,7 @@ def lane_function(
     the program.
     """
 
-    def call(*arrays: Any) -> Any:
+    def call_machine_code(*arrays: Any) -> Any:
         leaves, structure = jax.tree.flatten(arrays)
         n_lanes = leaves[0].shape[-1]
         for shape in (jnp.shape(x) for x in leaves):
@@ -104,81 +116,100 @@ def lane_function(
                     f"An argument has the shape {shape}, but the first one {n_lanes} lanes: they "
                     "are the last axis of every array; what has no axis is the same for all."
                 )
-        several = VECTOR[np.dtype(leaves[0].dtype)] * (2 if wide() else 1)
+        group_width = LANES_PER_256_BITS[np.dtype(leaves[0].dtype)] * (
+            2 if has_512_bit_vectors() else 1
+        )
         width = (
-            1 if n_lanes == 1 else several
+            1 if n_lanes == 1 else group_width
         )  # a full group would compute lanes that are not needed
-        missing = -n_lanes % width
+        n_missing = -n_lanes % width
         shapes = [
-            jax.ShapeDtypeStruct((*x.shape[:-1], LANES) if jnp.ndim(x) else (), jnp.result_type(x))
+            jax.ShapeDtypeStruct(
+                (*x.shape[:-1], LANE_AXIS_SENTINEL) if jnp.ndim(x) else (), jnp.result_type(x)
+            )
             for x in leaves
         ]
-        flat = lambda *leaves: jax.tree.leaves(function(*jax.tree.unflatten(structure, leaves)))
-        code = code_of(flat, shapes, (key, str(structure)), width, store, small)
-        if missing:
-            fill = lambda x: jnp.concatenate([x, jnp.repeat(x[..., -1:], missing, -1)], -1)
-            leaves = [fill(x) if jnp.ndim(x) else x for x in leaves]
-        out = [jax.ShapeDtypeStruct((*n, n_lanes + missing), kind) for n, kind in code.out]
-        results = CALLED.bind(*leaves, code=code, out=tuple(out))
-        told = jax.tree.structure(jax.eval_shape(like, *arrays))
-        return jax.tree.unflatten(told, [x[..., :n_lanes] for x in results])
+        flat_function = lambda *leaves: jax.tree.leaves(
+            function(*jax.tree.unflatten(structure, leaves))
+        )
+        code = get_machine_code(
+            flat_function, shapes, (key, str(structure)), width, store, max_unrolled
+        )
+        if n_missing:
+            pad_with_last = lambda x: jnp.concatenate(
+                [x, jnp.repeat(x[..., -1:], n_missing, -1)], -1
+            )
+            leaves = [pad_with_last(x) if jnp.ndim(x) else x for x in leaves]
+        out = [
+            jax.ShapeDtypeStruct((*n, n_lanes + n_missing), kind) for n, kind in code.result_types
+        ]
+        results = MACHINE_CODE_PRIMITIVE.bind(*leaves, code=code, result_shapes=tuple(out))
+        result_structure = jax.tree.structure(jax.eval_shape(shape_function, *arrays))
+        return jax.tree.unflatten(result_structure, [x[..., :n_lanes] for x in results])
 
-    return call
+    return call_machine_code
 
 
-def at_hand(names: Sequence[str], store: Store | None) -> bool:
+def ensure_loaded(names: Sequence[str], store: CodeStore | None) -> bool:
     """Register saved machine code of these names, and return whether all of it is available."""
     for name in names:
-        code = None if name in registered else kept_code(name, store)
+        code = None if name in LOADED_BY_NAME else load_machine_code(name, store)
         if code is not None:
-            register(code)
-    return all(name in registered for name in names)
+            register_code(code)
+    return all(name in LOADED_BY_NAME for name in names)
 
 
-class _Program:
+class _LaneProgram:
     """Machine code for numpy arrays."""
 
-    def __init__(self, code: Code, width: int) -> None:
-        self.out, self.width = code.out, width
-        self._loaded = Loaded(code.ready())
+    def __init__(self, code: MachineCode, width: int) -> None:
+        self.result_types, self.width = code.result_types, width
+        self._loaded_code = LoadedCode(code.wait_for_code())
         pointer, count = ctypes.c_void_p, ctypes.c_int64
         signature = ctypes.CFUNCTYPE(None, pointer, pointer, count, count, count)
-        self._run = signature(self._loaded.address(NAME))
+        self._run = signature(self._loaded_code.address(KERNEL_NAME))
 
-    def __call__(self, uniform: Sequence[Any], lanes: Sequence[np.ndarray]) -> list[np.ndarray]:
+    def __call__(self, scalars: Sequence[Any], lanes: Sequence[np.ndarray]) -> list[np.ndarray]:
         n = len(lanes[0])
         groups = -(-n // self.width)
-        filled = [_filled(x, groups * self.width) for x in lanes]
-        numbers = [np.asarray(x) for x in uniform]
-        out = [np.empty((*shape, groups * self.width), kind) for shape, kind in self.out]
-        given, told = _pointers([*numbers, *filled]), _pointers(out)
+        padded_lanes = [_pad_lanes(x, groups * self.width) for x in lanes]
+        numbers = [np.asarray(x) for x in scalars]
+        results = [
+            np.empty((*shape, groups * self.width), kind) for shape, kind in self.result_types
+        ]
+        input_table, output_table = (
+            _pointer_table([*numbers, *padded_lanes]),
+            _pointer_table(results),
+        )
         length = groups * self.width
-        run = lambda begin: self._run(given, told, length, begin, min(begin + TOGETHER, groups))
-        pieces = range(0, groups, TOGETHER)
-        if len(pieces) > 1 and _cores() > 1:
-            with ThreadPoolExecutor(_cores()) as pool:
-                list(pool.map(run, pieces))
+        run_groups = lambda begin: self._run(
+            input_table, output_table, length, begin, min(begin + GROUPS_PER_TASK, groups)
+        )
+        group_starts = range(0, groups, GROUPS_PER_TASK)
+        if len(group_starts) > 1 and _count_cores() > 1:
+            with ThreadPoolExecutor(_count_cores()) as pool:
+                list(pool.map(run_groups, group_starts))
         else:
-            for begin in pieces:
-                run(begin)
-        return [x[..., :n] for x in out]
+            for begin in group_starts:
+                run_groups(begin)
+        return [x[..., :n] for x in results]
 
 
-def _filled(x: np.ndarray, length: int) -> np.ndarray:
+def _pad_lanes(x: np.ndarray, length: int) -> np.ndarray:
     """Return a contiguous array, padded with its last number."""
     if len(x) == length:
         return np.ascontiguousarray(x)
-    filled = np.full(length, x[-1])
-    filled[: len(x)] = x
-    return filled
+    padded = np.full(length, x[-1])
+    padded[: len(x)] = x
+    return padded
 
 
-def _pointers(arrays: Sequence[np.ndarray]) -> Any:
+def _pointer_table(arrays: Sequence[np.ndarray]) -> Any:
     """Return a table of pointers to the arrays' data."""
     return (ctypes.c_void_p * len(arrays))(*(x.ctypes.data for x in arrays))
 
 
-def _cores() -> int:
+def _count_cores() -> int:
     """Return the number of cores available to the process."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))

@@ -5,73 +5,88 @@ from collections.abc import Callable
 from typing import Any
 
 from vrw_jax.simd import loops, movement, sums
-from vrw_jax.simd.arithmetic import ELEMENTWISE
-from vrw_jax.simd.arrays import Asked, has_lanes, moved, number_of, taken_for_lanes
-from vrw_jax.simd.fields import Entries, Field
-from vrw_jax.simd.trace import CALLS, Rule, Traces, called
+from vrw_jax.simd.arithmetic import ELEMENTWISE_RULES
+from vrw_jax.simd.arrays import (
+    PrimitiveCall,
+    has_lanes,
+    lane_axis_error,
+    lane_mixing_error,
+    number_type,
+)
+from vrw_jax.simd.fields import ArrayValue, LazyArray
+from vrw_jax.simd.trace import JAXPR_PARAMETERS, JaxprLowering, PrimitiveRule, call_rule
 
 
-def _single(write: Callable[..., Entries]) -> Rule:
+def _single_result_rule(emit: Callable[..., ArrayValue]) -> PrimitiveRule:
     """Return a rule with one result: `emit(emitter, call, *values)`."""
 
-    def rule(traces: Traces, equation: Any, values: list[Entries]) -> list[Entries]:
-        name, out = equation.primitive.name, equation.outvars[0].aval
-        given = [atom.aval for atom in equation.invars]
-        lanes, before = has_lanes(out), any(map(has_lanes, given))
-        if before and not lanes and name not in ("reduce_and", "reduce_or"):
-            raise moved(name)
-        if lanes and not before and name not in ("broadcast_in_dim", "empty"):
-            raise taken_for_lanes(f"The result of {name}", out)
-        number_of(out)  # raises an error for unsupported number types
-        result = write(traces.arrays, Asked(name, equation.params, given, out), *values)
-        if isinstance(result, Field) and math.prod(result.shape) <= traces.arrays.small:
-            result = traces.arrays.entries(result)
+    def emit_result(
+        lowering: JaxprLowering, equation: Any, values: list[ArrayValue]
+    ) -> list[ArrayValue]:
+        name, out_aval = equation.primitive.name, equation.outvars[0].aval
+        in_avals = [atom.aval for atom in equation.invars]
+        result_has_lanes, operand_has_lanes = has_lanes(out_aval), any(map(has_lanes, in_avals))
+        if operand_has_lanes and not result_has_lanes and name not in ("reduce_and", "reduce_or"):
+            raise lane_mixing_error(name)
+        if result_has_lanes and not operand_has_lanes and name not in ("broadcast_in_dim", "empty"):
+            raise lane_axis_error(f"The result of {name}", out_aval)
+        number_type(out_aval)  # raises an error for unsupported number types
+        result = emit(
+            lowering.emitter, PrimitiveCall(name, equation.params, in_avals, out_aval), *values
+        )
+        if (
+            isinstance(result, LazyArray)
+            and math.prod(result.shape) <= lowering.emitter.max_unrolled
+        ):
+            result = lowering.emitter.get_entries(result)
         return [result]
 
-    rule.__doc__ = write.__doc__
-    return rule
+    emit_result.__doc__ = emit.__doc__
+    return emit_result
 
 
-def _mapped(arrays: Any, asked: Asked, *values: Entries) -> Entries:
+def _emit_elementwise_call(emitter: Any, call: PrimitiveCall, *values: ArrayValue) -> ArrayValue:
     """Apply the primitive to each number separately."""
-    return arrays.mapped(asked, values)
+    return emitter.emit_elementwise(call, values)
 
 
-def _stored(traces: Traces, equation: Any, values: list[Entries]) -> list[Entries]:
+def _emit_barrier(
+    lowering: JaxprLowering, equation: Any, values: list[ArrayValue]
+) -> list[ArrayValue]:
     """Compute large arrays here, into memory."""
-    return [traces.arrays.in_memory(x) if isinstance(x, Field) else x for x in values]
+    return [lowering.emitter.materialize(x) if isinstance(x, LazyArray) else x for x in values]
 
 
-RULES: dict[str, Rule] = {
-    **{name: _single(_mapped) for name in ELEMENTWISE},
-    "broadcast_in_dim": _single(movement.broadcast_in_dim),
-    "concatenate": _single(movement.concatenate),
-    "dynamic_slice": _single(movement.dynamic_slice),
-    "dynamic_update_slice": _single(movement.dynamic_update_slice),
-    "empty": _single(movement.empty),
-    "expand_dims": _single(movement.reshape),
-    "iota": _single(movement.iota),
-    "pad": _single(movement.pad),
-    "reshape": _single(movement.reshape),
-    "slice": _single(movement.slice_),
-    "squeeze": _single(movement.reshape),
-    "stack": _single(movement.stack),
-    "unstack": movement.unstack,
-    "transpose": _single(movement.transpose),
-    "cumsum": _single(sums.cumsum),
-    "dot_general": _single(sums.dot_general),
-    "reduce_and": _single(sums.reduction("and")),
-    "reduce_max": _single(sums.reduction("max")),
-    "reduce_min": _single(sums.reduction("min")),
-    "reduce_or": _single(sums.reduction("or")),
-    "reduce_sum": _single(sums.reduction("add")),
-    **{name: called(parameter) for name, parameter in CALLS.items()},
-    "optimization_barrier": _stored,
-    "scan": loops.scan,
-    "while": loops.while_,
+PRIMITIVE_RULES: dict[str, PrimitiveRule] = {
+    **{name: _single_result_rule(_emit_elementwise_call) for name in ELEMENTWISE_RULES},
+    "broadcast_in_dim": _single_result_rule(movement.emit_broadcast),
+    "concatenate": _single_result_rule(movement.emit_concatenate),
+    "dynamic_slice": _single_result_rule(movement.emit_dynamic_slice),
+    "dynamic_update_slice": _single_result_rule(movement.emit_dynamic_update),
+    "empty": _single_result_rule(movement.emit_empty),
+    "expand_dims": _single_result_rule(movement.emit_reshape),
+    "iota": _single_result_rule(movement.emit_iota),
+    "pad": _single_result_rule(movement.emit_pad),
+    "reshape": _single_result_rule(movement.emit_reshape),
+    "slice": _single_result_rule(movement.emit_slice),
+    "squeeze": _single_result_rule(movement.emit_reshape),
+    "stack": _single_result_rule(movement.emit_stack),
+    "unstack": movement.emit_unstack,
+    "transpose": _single_result_rule(movement.emit_transpose),
+    "cumsum": _single_result_rule(sums.emit_cumsum),
+    "dot_general": _single_result_rule(sums.emit_dot_general),
+    "reduce_and": _single_result_rule(sums.reduction_rule("and")),
+    "reduce_max": _single_result_rule(sums.reduction_rule("max")),
+    "reduce_min": _single_result_rule(sums.reduction_rule("min")),
+    "reduce_or": _single_result_rule(sums.reduction_rule("or")),
+    "reduce_sum": _single_result_rule(sums.reduction_rule("add")),
+    **{name: call_rule(parameter) for name, parameter in JAXPR_PARAMETERS.items()},
+    "optimization_barrier": _emit_barrier,
+    "scan": loops.emit_scan,
+    "while": loops.emit_while,
 }
 
 
-def primitives() -> dict[str, str]:
+def list_primitives() -> dict[str, str]:
     """Return the JAX primitives that have machine code, and descriptions of their rules."""
-    return {name: rule.__doc__ or "" for name, rule in RULES.items()}
+    return {name: rule.__doc__ or "" for name, rule in PRIMITIVE_RULES.items()}

@@ -8,104 +8,125 @@ from typing import Any
 import llvmlite.ir as ir
 import numpy as np
 
-from vrw_jax.simd.arithmetic import elementwise
-from vrw_jax.simd.arrays import SMALL, Arrays, Asked, array_of, has_lanes, moved, shape_of
-from vrw_jax.simd.fields import Entries, Field, Index
+from vrw_jax.simd.arithmetic import emit_elementwise
+from vrw_jax.simd.arrays import (
+    MAX_UNROLLED,
+    ArrayEmitter,
+    PrimitiveCall,
+    has_lanes,
+    lane_mixing_error,
+    make_array,
+    shape_without_lanes,
+)
+from vrw_jax.simd.fields import ArrayValue, EntryIndex, LazyArray
 from vrw_jax.simd.numbers import Value
 
 
-def cumsum(arrays: Arrays, asked: Asked, array: Entries) -> Entries:
+def emit_cumsum(emitter: ArrayEmitter, call: PrimitiveCall, array: ArrayValue) -> ArrayValue:
     """Return cumulative sums along an axis, from either end."""
-    if asked.params["axis"] == len(array.shape):
-        raise moved(asked.name)
-    rows, dtype = np.moveaxis(arrays.entries(array), asked.params["axis"], 0), asked.out.dtype
-    order = range(len(rows))[:: -1 if asked.params["reverse"] else 1]
-    plus = lambda x, y: elementwise(arrays.numbers, "add", {}, dtype, dtype, (x, y))
+    if call.params["axis"] == len(array.shape):
+        raise lane_mixing_error(call.name)
+    rows, dtype = (
+        np.moveaxis(emitter.get_entries(array), call.params["axis"], 0),
+        call.out_aval.dtype,
+    )
+    order = range(len(rows))[:: -1 if call.params["reverse"] else 1]
+    add_values = lambda x, y: emit_elementwise(emitter.emitter, "add", {}, dtype, dtype, (x, y))
     sums = np.empty_like(rows)
     for k, i in enumerate(order):
         pairs = zip(sums[order[k - 1], ...].ravel(), rows[i, ...].ravel(), strict=True)
-        told = [plus(*pair) if k else pair[1] for pair in pairs]
-        sums[i, ...] = array_of(rows.shape[1:], told)
-    return np.moveaxis(sums, 0, asked.params["axis"])
+        row_sums = [add_values(*pair) if k else pair[1] for pair in pairs]
+        sums[i, ...] = make_array(rows.shape[1:], row_sums)
+    return np.moveaxis(sums, 0, call.params["axis"])
 
 
-def dot_general(arrays: Arrays, asked: Asked, left: Entries, right: Entries) -> Entries:
+def emit_dot_general(
+    emitter: ArrayEmitter, call: PrimitiveCall, left: ArrayValue, right: ArrayValue
+) -> ArrayValue:
     """Return a product of arrays, summed over one pair of axes."""
-    (over_left, over_right), (both, _) = asked.params["dimension_numbers"]
-    if both or len(over_left) != 1:
+    (contracted_left, contracted_right), (batch_axes, _) = call.params["dimension_numbers"]
+    if batch_axes or len(contracted_left) != 1:
         raise NotImplementedError(
             "dot_general sums over one pair of axes only, without a batch: multiply and sum."
         )
-    (a,), (b,), dtype = over_left, over_right, asked.out.dtype
+    (a,), (b,), dtype = contracted_left, contracted_right, call.out_aval.dtype
     length, n_left = left.shape[a], len(left.shape) - 1
 
-    def product(index: Index, k: Any) -> Value:
-        own, other = index[:n_left], index[n_left:]
-        x = arrays.entry(left, (*own[:a], k, *own[a:]))
-        y = arrays.entry(right, (*other[:b], k, *other[b:]))
-        return elementwise(arrays.numbers, "mul", {}, dtype, dtype, (x, y))
+    def product(index: EntryIndex, k: Any) -> Value:
+        left_index, right_index = index[:n_left], index[n_left:]
+        x = emitter.get_entry(left, (*left_index[:a], k, *left_index[a:]))
+        y = emitter.get_entry(right, (*right_index[:b], k, *right_index[b:]))
+        return emit_elementwise(emitter.emitter, "mul", {}, dtype, dtype, (x, y))
 
-    plus = lambda x, y: elementwise(arrays.numbers, "add", {}, dtype, dtype, (x, y))
-    shape, kind = shape_of(asked.out), arrays.kind_of(asked.out)
-    if length <= SMALL or arrays.written_out:
-        at = lambda index: functools.reduce(plus, [product(index, k) for k in range(length)])
-        if isinstance(left, Field) or isinstance(right, Field):
-            return Field(shape, kind, at)
-        return array_of(shape, [at(index) for index in np.ndindex(shape)])
-    left, right = arrays.in_memory(left), arrays.in_memory(right)
-    memory = arrays.room(shape, kind)
+    add_values = lambda x, y: emit_elementwise(emitter.emitter, "add", {}, dtype, dtype, (x, y))
+    shape, kind = shape_without_lanes(call.out_aval), emitter.entry_type_of(call.out_aval)
+    if length <= MAX_UNROLLED or emitter.is_unrolled:
+        entry_at = lambda index: functools.reduce(
+            add_values, [product(index, k) for k in range(length)]
+        )
+        if isinstance(left, LazyArray) or isinstance(right, LazyArray):
+            return LazyArray(shape, kind, entry_at)
+        return make_array(shape, [entry_at(index) for index in np.ndindex(shape)])
+    left, right = emitter.materialize(left), emitter.materialize(right)
+    memory = emitter.allocate(shape, kind)
 
-    def total(index: Index, _: Any) -> list[Value]:
-        turn = lambda k, sums: [plus(sums[0], product(index, k))]
-        memory.store(index, arrays.counted(length, turn, [arrays.zero(kind)])[0])
+    def store_total(index: EntryIndex, _: Any) -> list[Value]:
+        add_term = lambda k, sums: [add_values(sums[0], product(index, k))]
+        memory.store(index, emitter.loop_n_times(length, add_term, [emitter.make_zero(kind)])[0])
         return []
 
-    arrays.each(shape, total)
+    emitter.loop_over_indices(shape, store_total)
     return memory
 
 
-def reduction(name: str) -> Callable[..., Entries]:
+def reduction_rule(name: str) -> Callable[..., ArrayValue]:
     """Return the rule of a reduction by the elementwise primitive `name`."""
 
-    def reduce_(arrays: Arrays, asked: Asked, array: Entries) -> Entries:
+    def reduce_(emitter: ArrayEmitter, call: PrimitiveCall, array: ArrayValue) -> ArrayValue:
         """Reduce along axes; `any` and `all` also over lanes."""
-        over_lanes = has_lanes(asked.given[0]) and not has_lanes(asked.out)
-        dtype = asked.given[0].dtype
-        if over_lanes and (name not in ("and", "or") or dtype.kind != "b"):
-            raise moved(asked.name)
-        axes = tuple(axis for axis in asked.params["axes"] if axis < len(array.shape))
-        combine = lambda x, y: elementwise(arrays.numbers, name, {}, dtype, dtype, (x, y))
-        left_over = [n for axis, n in enumerate(array.shape) if axis not in axes]
+        reduces_lanes = has_lanes(call.in_avals[0]) and not has_lanes(call.out_aval)
+        dtype = call.in_avals[0].dtype
+        if reduces_lanes and (name not in ("and", "or") or dtype.kind != "b"):
+            raise lane_mixing_error(call.name)
+        axes = tuple(axis for axis in call.params["axes"] if axis < len(array.shape))
+        combine = lambda x, y: emit_elementwise(emitter.emitter, name, {}, dtype, dtype, (x, y))
+        kept_lengths = [n for axis, n in enumerate(array.shape) if axis not in axes]
         lengths = [array.shape[axis] for axis in axes]
 
-        def index_of(outer: Index, inner: Index) -> Index:
-            some, others = iter(inner), iter(outer)
-            return tuple(next(some if i in axes else others) for i in range(len(array.shape)))
+        def index_of(outer: EntryIndex, inner: EntryIndex) -> EntryIndex:
+            inner_indices, outer_indices = iter(inner), iter(outer)
+            return tuple(
+                next(inner_indices if i in axes else outer_indices) for i in range(len(array.shape))
+            )
 
-        def reduced(outer: Index) -> Value:
-            at = lambda inner: arrays.entry(array, index_of(outer, inner))
-            if isinstance(array, np.ndarray) or math.prod(lengths) <= SMALL:
-                return functools.reduce(combine, map(at, np.ndindex(*lengths)))
-            first = at((0,) * len(lengths))  # counted twice, which does not change these reductions
+        def reduce_entry(outer: EntryIndex) -> Value:
+            entry_at = lambda inner: emitter.get_entry(array, index_of(outer, inner))
+            if isinstance(array, np.ndarray) or math.prod(lengths) <= MAX_UNROLLED:
+                return functools.reduce(combine, map(entry_at, np.ndindex(*lengths)))
+            initial_value = entry_at(
+                (0,) * len(lengths)
+            )  # counted twice, which does not change these reductions
             if name == "add":
-                first = arrays.zero(array.kind)
-            elif isinstance(array.kind, ir.VectorType):
-                first = arrays.numbers.spread(first)
-            return arrays.each(lengths, lambda i, so_far: [combine(so_far[0], at(i))], [first])[0]
+                initial_value = emitter.make_zero(array.entry_type)
+            elif isinstance(array.entry_type, ir.VectorType):
+                initial_value = emitter.emitter.splat(initial_value)
+            return emitter.loop_over_indices(
+                lengths, lambda i, partial: [combine(partial[0], entry_at(i))], [initial_value]
+            )[0]
 
-        values = [reduced(outer) for outer in np.ndindex(*left_over)]
-        if over_lanes:
-            values = [_over_lanes(arrays, name, value) for value in values]
-        return array_of(tuple(left_over), values)
+        values = [reduce_entry(outer) for outer in np.ndindex(*kept_lengths)]
+        if reduces_lanes:
+            values = [_reduce_over_lanes(emitter, name, value) for value in values]
+        return make_array(tuple(kept_lengths), values)
 
     return reduce_
 
 
-def _over_lanes(arrays: Arrays, name: str, value: Value) -> Value:
-    build = arrays.builder
+def _reduce_over_lanes(emitter: ArrayEmitter, name: str, value: Value) -> Value:
+    build = emitter.builder
     if not isinstance(value.type, ir.VectorType):
         return value
-    bits = build.bitcast(value, ir.IntType(arrays.numbers.width))
+    bits = build.bitcast(value, ir.IntType(emitter.emitter.width))
     if name == "or":
         return build.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
     return build.icmp_unsigned("==", bits, ir.Constant(bits.type, -1))

@@ -9,16 +9,22 @@ import llvmlite.ir as ir
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 
-from vrw_jax.simd.arrays import LANES, Arrays, arrays_of, shape_of, taken_for_lanes
-from vrw_jax.simd.fields import Entries, shared
-from vrw_jax.simd.numbers import Numbers, Value
+from vrw_jax.simd.arrays import (
+    LANE_AXIS_SENTINEL,
+    ArrayEmitter,
+    lane_axis_error,
+    shape_without_lanes,
+    split_arrays,
+)
+from vrw_jax.simd.fields import ArrayValue, as_shared
+from vrw_jax.simd.numbers import Value, ValueEmitter
 
-Rule = Callable[["Traces", Any, list[Entries]], list[Entries]]
+PrimitiveRule = Callable[["JaxprLowering", Any, list[ArrayValue]], list[ArrayValue]]
 """A function that emits an equation with these operands, and returns its results."""
 
-APART = "apart"
+NOINLINE_NAME = "noinline"
 
-CALLS = {  # primitive: the parameter that is the trace it calls
+JAXPR_PARAMETERS = {  # primitive: the parameter that is the trace it calls
     "jit": "jaxpr",
     "pjit": "jaxpr",
     "closed_call": "call_jaxpr",
@@ -28,127 +34,157 @@ CALLS = {  # primitive: the parameter that is the trace it calls
 }
 
 
-LOOPS = "while", "scan"
+LOOP_PRIMITIVES = "while", "scan"
 
 
-def apart(function: Callable) -> Callable:
+def noinline(function: Callable) -> Callable:
     """Return `function` compiled as a separate function of the machine code, which is called, not
     inlined.
     """
 
-    def apart(*arguments: Any) -> Any:
+    def noinline(*arguments: Any) -> Any:
         return function(*arguments)
 
-    return jax.jit(apart)
+    return jax.jit(noinline)
 
 
-class Traces:
+class JaxprLowering:
     """Lowering of traces, by `rules` of their primitives, into the function of `emitter`."""
 
     def __init__(
-        self, arrays: Arrays, rules: Mapping[str, Rule], functions: dict[int, Any] | None = None
+        self,
+        emitter: ArrayEmitter,
+        rules: Mapping[str, PrimitiveRule],
+        functions: dict[int, Any] | None = None,
     ) -> None:
-        self.arrays, self.rules = arrays, rules
+        self.emitter, self.rules = emitter, rules
         # Separate functions by the trace's `id`, with the trace, which must stay alive.
         self.functions = {} if functions is None else functions
 
-    def closed(self, closed: ClosedJaxpr, values: Sequence[Entries]) -> list[Entries]:
+    def lower_jaxpr(
+        self, closed_jaxpr: ClosedJaxpr, values: Sequence[ArrayValue]
+    ) -> list[ArrayValue]:
         """Return the results of a trace for these values."""
-        jaxpr, constants_of = closed.jaxpr, self.arrays.constants_of
-        takers, places = _takers(jaxpr), dict[Any, Entries]()
+        jaxpr, emit_constants = closed_jaxpr.jaxpr, self.emitter.emit_constants
+        last_uses, value_by_variable = _last_uses(jaxpr), dict[Any, ArrayValue]()
 
-        def put(variables: Sequence[Any], values: Sequence[Entries]) -> None:
+        def bind(variables: Sequence[Any], values: Sequence[ArrayValue]) -> None:
             for variable, value in zip(variables, values, strict=True):
-                places[variable] = shared(value) if takers.get(variable) is None else value
+                value_by_variable[variable] = (
+                    as_shared(value) if last_uses.get(variable) is None else value
+                )
 
-        put(jaxpr.invars, values)
-        for variable, value in zip(jaxpr.constvars, closed.consts, strict=True):
-            places[variable] = constants_of(np.asarray(value), variable.aval)
+        bind(jaxpr.invars, values)
+        for variable, value in zip(jaxpr.constvars, closed_jaxpr.consts, strict=True):
+            value_by_variable[variable] = emit_constants(np.asarray(value), variable.aval)
 
-        def read(atom: Any, place: int) -> Entries:
+        def read_atom(atom: Any, position: int) -> ArrayValue:
             if isinstance(atom, Literal):
-                return constants_of(np.asarray(atom.val), atom.aval)
-            return places[atom] if takers[atom] == place else shared(places[atom])
+                return emit_constants(np.asarray(atom.val), atom.aval)
+            return (
+                value_by_variable[atom]
+                if last_uses[atom] == position
+                else as_shared(value_by_variable[atom])
+            )
 
-        for place, equation in enumerate(jaxpr.eqns):
+        for position, equation in enumerate(jaxpr.eqns):
             if all(variable.aval.dtype == jax.dtypes.float0 for variable in equation.outvars):
                 continue  # the derivative of an integer, which no equation reads
-            results = self._results(equation, [read(x, place) for x in equation.invars])
-            put(equation.outvars, results)
-        return [read(atom, len(jaxpr.eqns)) for atom in jaxpr.outvars]
+            results = self._lower_equation(
+                equation, [read_atom(x, position) for x in equation.invars]
+            )
+            bind(equation.outvars, results)
+        return [read_atom(atom, len(jaxpr.eqns)) for atom in jaxpr.outvars]
 
-    def _results(self, equation: Any, values: list[Entries]) -> list[Entries]:
+    def _lower_equation(self, equation: Any, values: list[ArrayValue]) -> list[ArrayValue]:
         name = equation.primitive.name
         if name not in self.rules:
             raise NotImplementedError(
-                f"{name} has no machine code: write it by primitives that `simd.primitives()` "
+                f"{name} has no machine code: write it by primitives that `simd.list_primitives()` "
                 "lists, or give it a rule in RULES."
             )
         for variable in equation.outvars:
-            if LANES in variable.aval.shape[:-1]:
-                raise taken_for_lanes(f"The result of {name}", variable.aval)
+            if LANE_AXIS_SENTINEL in variable.aval.shape[:-1]:
+                raise lane_axis_error(f"The result of {name}", variable.aval)
         return self.rules[name](self, equation, values)
 
-    def call(self, closed: ClosedJaxpr, values: Sequence[Entries]) -> list[Entries]:
+    def call_function(
+        self, closed_jaxpr: ClosedJaxpr, values: Sequence[ArrayValue]
+    ) -> list[ArrayValue]:
         """Emit a call of a separate function, which is defined once."""
-        build = self.arrays.builder
-        if id(closed) not in self.functions:
-            self.functions[id(closed)] = (self._function(closed), closed)
-        function, _ = self.functions[id(closed)]
-        told = build.call(function, self.arrays.flat(values, closed.in_avals))
-        results = [build.extract_value(told, i) for i in range(len(told.type.elements))]
-        return arrays_of(results, closed.out_avals)
-
-    def _function(self, closed: ClosedJaxpr) -> ir.Function:
-        """Define a function from the entries of all arguments to those of all results."""
-        kinds = lambda avals: [
-            self.arrays.kind_of(x) for x in avals for _ in range(math.prod(shape_of(x)))
+        build = self.emitter.builder
+        if id(closed_jaxpr) not in self.functions:
+            self.functions[id(closed_jaxpr)] = (self._define_function(closed_jaxpr), closed_jaxpr)
+        function, _ = self.functions[id(closed_jaxpr)]
+        returned_struct = build.call(
+            function, self.emitter.flatten_entries(values, closed_jaxpr.in_avals)
+        )
+        results = [
+            build.extract_value(returned_struct, i)
+            for i in range(len(returned_struct.type.elements))
         ]
-        told = ir.LiteralStructType(kinds(closed.out_avals))
-        module = self.arrays.builder.module
-        kind = ir.FunctionType(told, kinds(closed.in_avals))
-        function = ir.Function(module, kind, module.get_unique_name(APART))
+        return split_arrays(results, closed_jaxpr.out_avals)
+
+    def _define_function(self, closed_jaxpr: ClosedJaxpr) -> ir.Function:
+        """Define a function from the entries of all arguments to those of all results."""
+        entry_types = lambda avals: [
+            self.emitter.entry_type_of(x)
+            for x in avals
+            for _ in range(math.prod(shape_without_lanes(x)))
+        ]
+        result_type = ir.LiteralStructType(entry_types(closed_jaxpr.out_avals))
+        module = self.emitter.builder.module
+        kind = ir.FunctionType(result_type, entry_types(closed_jaxpr.in_avals))
+        function = ir.Function(module, kind, module.get_unique_name(NOINLINE_NAME))
         function.linkage = "internal"
         for attribute in ("noinline", "nounwind"):
             function.attributes.add(attribute)
         build = ir.IRBuilder(function.append_basic_block("entry"))
-        outer = self.arrays
-        arrays = Arrays(Numbers(build, outer.numbers.width), outer.written_out, outer.small)
-        results = Traces(arrays, self.rules, self.functions).closed(
-            closed, arrays_of(function.args, closed.in_avals)
+        caller = self.emitter
+        emitter = ArrayEmitter(
+            ValueEmitter(build, caller.emitter.width), caller.is_unrolled, caller.max_unrolled
         )
-        whole: Value = ir.Constant(told, ir.Undefined)
-        for i, value in enumerate(arrays.flat(results, closed.out_avals)):
-            whole = build.insert_value(whole, value, i)
-        build.ret(whole)
+        results = JaxprLowering(emitter, self.rules, self.functions).lower_jaxpr(
+            closed_jaxpr, split_arrays(function.args, closed_jaxpr.in_avals)
+        )
+        result_struct: Value = ir.Constant(result_type, ir.Undefined)
+        for i, value in enumerate(emitter.flatten_entries(results, closed_jaxpr.out_avals)):
+            result_struct = build.insert_value(result_struct, value, i)
+        build.ret(result_struct)
         return function
 
 
-def _takers(jaxpr: Any) -> dict[Any, int | None]:
+def _last_uses(jaxpr: Any) -> dict[Any, int | None]:
     """Return, for each variable, the position of the equation that may overwrite it.
 
     It is the last equation that reads the variable, if all earlier ones are loops, which read
     nothing after they end.
     """
-    takers: dict[Any, int | None] = {}
-    loops = [equation.primitive.name in LOOPS for equation in jaxpr.eqns]
-    for place, atoms in enumerate([*(equation.invars for equation in jaxpr.eqns), jaxpr.outvars]):
+    last_uses: dict[Any, int | None] = {}
+    is_loop = [equation.primitive.name in LOOP_PRIMITIVES for equation in jaxpr.eqns]
+    for position, atoms in enumerate(
+        [*(equation.invars for equation in jaxpr.eqns), jaxpr.outvars]
+    ):
         for atom in atoms:
             if not isinstance(atom, Literal):
-                before = takers.get(atom, -1)
-                ends = before == -1 or (before not in (None, place) and loops[before])
-                takers[atom] = place if ends else None
-    return takers
+                previous = last_uses.get(atom, -1)
+                is_last_use = previous == -1 or (
+                    previous not in (None, position) and is_loop[previous]
+                )
+                last_uses[atom] = position if is_last_use else None
+    return last_uses
 
 
-def called(parameter: str) -> Rule:
+def call_rule(parameter: str) -> PrimitiveRule:
     """Return the rule of a primitive that calls the trace in this parameter."""
 
-    def write(traces: Traces, equation: Any, values: list[Entries]) -> list[Entries]:
+    def emit_call(
+        lowering: JaxprLowering, equation: Any, values: list[ArrayValue]
+    ) -> list[ArrayValue]:
         """Lower another trace: inline or, if marked by `noinline`, as a function."""
-        closed = equation.params[parameter]
-        if equation.params.get("name") == APART:
-            return traces.call(closed, values)
-        return traces.closed(closed, values)
+        closed_jaxpr = equation.params[parameter]
+        if equation.params.get("name") == NOINLINE_NAME:
+            return lowering.call_function(closed_jaxpr, values)
+        return lowering.lower_jaxpr(closed_jaxpr, values)
 
-    return write
+    return emit_call

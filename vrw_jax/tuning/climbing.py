@@ -13,21 +13,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vrw_jax.numerics import Code
-from vrw_jax.tuning.objective import Evaluated, breach, slack_scales
+from vrw_jax.numerics import StatusCode
+from vrw_jax.tuning.objective import GaitEvaluation, max_breach, scale_slacks
 from vrw_jax.wheel import Outcome
 
 
-class Ending(Code):
+class TuneStatus(StatusCode):
     """Status of a maximization at its end."""
 
     CONVERGED = 0, "The gait can't be improved nearby without breaking a constraint."
-    AT_A_BORDER = 1, "The branch ends here: no smaller step finds a gait."
-    OUT_OF_EVALUATIONS = 2, "The allowed number of gaits was spent before it converged."
+    BRANCH_ENDED = 1, "The branch ends here: no smaller step finds a gait."
+    MAX_EVALUATIONS_REACHED = 2, "The allowed number of gaits was spent before it converged."
     NO_FEASIBLE_GAIT = 3, "No gait that keeps every constraint was found from this start."
 
 
-class Kind(enum.IntEnum):
+class TrialKind(enum.IntEnum):
     """Role of an evaluated gait in the maximization."""
 
     START = 0
@@ -36,198 +36,249 @@ class Kind(enum.IntEnum):
     LOST = 3
 
 
-class Trial(NamedTuple):
+class EvaluatedTrial(NamedTuple):
     """Evaluated wheel. If its gait is lost, the numbers are NaN."""
 
-    u: np.ndarray  # free parameters in widths of their bounds
+    normalized_parameters: np.ndarray  # free parameters in widths of their bounds
     outcome: Outcome
-    on_branch: bool
+    is_on_branch: bool
     objective: float
     gradient: np.ndarray  # with respect to u
     slack: np.ndarray  # constraint values minus their margins, in their own units
-    slopes: np.ndarray  # (n_constraints, n_free)
-    told: Evaluated | None
+    slack_jacobian: np.ndarray  # (n_constraints, n_free)
+    evaluation: GaitEvaluation | None
 
     @property
-    def found(self) -> bool:
+    def is_found(self) -> bool:
         """Return whether there is a gait, on the same branch."""
-        return self.outcome == Outcome.STEPPED and self.on_branch
+        return self.outcome == Outcome.STEPPED and self.is_on_branch
 
 
-class Climb(NamedTuple):
-    best: Trial
-    ending: Ending
-    trials: list[Trial]
-    kinds: list[Kind]
+class ClimbResult(NamedTuple):
+    best: EvaluatedTrial
+    status: TuneStatus
+    trials: list[EvaluatedTrial]
+    kinds: list[TrialKind]
 
 
-class _LostError(Exception):
-    def __init__(self, trial: Trial) -> None:
+class _LostBranchError(Exception):
+    def __init__(self, trial: EvaluatedTrial) -> None:
         self.trial = trial
 
 
-class _SpentError(Exception):
+class _BudgetSpentError(Exception):
     pass
 
 
-class _ArrivedError(Exception):
-    def __init__(self, trial: Trial) -> None:
+class _OptimumReachedError(Exception):
+    def __init__(self, trial: EvaluatedTrial) -> None:
         self.trial = trial
 
 
-WHOLE, SMALLEST_RADIUS = 1.0, 1e-7
+FULL_RADIUS, MIN_RADIUS = 1.0, 1e-7
 """Half the side of a box that contains all bounds, and of a box at which the end of a branch counts
 as reached."""
 
-LOOSE, STALLED = 1e-3, 1e-10
+COARSE_OBJECTIVE_TOLERANCE, FINE_OBJECTIVE_TOLERANCE = 1e-3, 1e-10
 """Relative change of the objective at which SLSQP stops. The first value is for a smaller box,
 whose optimum is only a point to continue from. The second is for the whole box, and the gaits are
 not more accurate than that."""
 
-ACTIVE = 1e-6
+ACTIVE_BOUND_TOLERANCE = 1e-6
 """Slack of an active constraint, in widths of the bounds."""
 
-Evaluate = Callable[[np.ndarray, Trial | None], Trial]
+EvaluateTrial = Callable[[np.ndarray, EvaluatedTrial | None], EvaluatedTrial]
 """Function that returns the gait at u, searched for from a neighbor's gait."""
 
 
-class _Record:
+class _TrialRecord:
     """All trials in order; each point is evaluated once."""
 
-    def __init__(self, evaluate: Evaluate, start: Trial, allowed: int) -> None:
-        self.trials, self.kinds = [start], [Kind.START]
-        self._evaluate, self._allowed = evaluate, allowed
-        self._places = {start.u.tobytes(): 0}
+    def __init__(
+        self, evaluate: EvaluateTrial, start: EvaluatedTrial, max_evaluations: int
+    ) -> None:
+        self.trials, self.kinds = [start], [TrialKind.START]
+        self._evaluate, self._max_evaluations = evaluate, max_evaluations
+        self._indices = {start.normalized_parameters.tobytes(): 0}
 
-    def at(self, u: np.ndarray) -> Trial:
-        place = self._places.get(u.tobytes())
-        if place is None:
-            if len(self.trials) >= self._allowed:
-                raise _SpentError
-            place = len(self.trials)
-            self.trials.append(self._evaluate(np.array(u), self._nearest(u)))
-            self.kinds.append(Kind.TRIAL)
-            self._places[u.tobytes()] = place
-        trial = self.trials[place]
-        if not trial.found:
-            self.kinds[place] = Kind.LOST
-            raise _LostError(trial)
+    def evaluate_once(self, normalized_parameters: np.ndarray) -> EvaluatedTrial:
+        trial_index = self._indices.get(normalized_parameters.tobytes())
+        if trial_index is None:
+            if len(self.trials) >= self._max_evaluations:
+                raise _BudgetSpentError
+            trial_index = len(self.trials)
+            self.trials.append(
+                self._evaluate(
+                    np.array(normalized_parameters), self._nearest_gait(normalized_parameters)
+                )
+            )
+            self.kinds.append(TrialKind.TRIAL)
+            self._indices[normalized_parameters.tobytes()] = trial_index
+        trial = self.trials[trial_index]
+        if not trial.is_found:
+            self.kinds[trial_index] = TrialKind.LOST
+            raise _LostBranchError(trial)
         return trial
 
-    def iterate(self, u: np.ndarray) -> Trial:
-        trial = self.at(u)
-        place = self._places[u.tobytes()]
-        if place:
-            self.kinds[place] = Kind.ITERATE
+    def evaluate_iterate(self, normalized_parameters: np.ndarray) -> EvaluatedTrial:
+        trial = self.evaluate_once(normalized_parameters)
+        trial_index = self._indices[normalized_parameters.tobytes()]
+        if trial_index:
+            self.kinds[trial_index] = TrialKind.ITERATE
         return trial
 
-    def _nearest(self, u: np.ndarray) -> Trial:
-        found = [trial for trial in self.trials if trial.found]
-        return min(found, key=lambda trial: float(np.linalg.norm(trial.u - u)))
+    def _nearest_gait(self, normalized_parameters: np.ndarray) -> EvaluatedTrial:
+        gaits = [trial for trial in self.trials if trial.is_found]
+        return min(
+            gaits,
+            key=lambda trial: float(
+                np.linalg.norm(trial.normalized_parameters - normalized_parameters)
+            ),
+        )
 
 
-def climb(evaluate: Evaluate, start: Trial, *, tolerance: float, max_evaluations: int) -> Climb:
+def maximize_objective(
+    evaluate: EvaluateTrial, start: EvaluatedTrial, *, tolerance: float, max_evaluations: int
+) -> ClimbResult:
     """Maximize the objective locally from `start`, with every slack at least zero."""
     from scipy.optimize import minimize  # imported here because it is slow
 
-    record = _Record(evaluate, start, max_evaluations)
-    size = max(float(np.linalg.norm(start.gradient)), 1e-12)
-    scales = slack_scales(start.slack, start.slopes)
+    record = _TrialRecord(evaluate, start, max_evaluations)
+    gradient_norm = max(float(np.linalg.norm(start.gradient)), 1e-12)
+    scales = scale_slacks(start.slack, start.slack_jacobian)
 
-    def arrive(trial: Trial) -> Trial:
-        if breach(trial.slack, scales) <= ACTIVE and optimality(trial).residual <= tolerance:
-            raise _ArrivedError(trial)
+    def stop_at_optimum(trial: EvaluatedTrial) -> EvaluatedTrial:
+        if (
+            max_breach(trial.slack, scales) <= ACTIVE_BOUND_TOLERANCE
+            and compute_optimality(trial).residual <= tolerance
+        ):
+            raise _OptimumReachedError(trial)
         return trial
 
-    centre, radius, widest = start, WHOLE, WHOLE
-    ending, known = Ending.CONVERGED, 0
+    center, radius, max_radius = start, FULL_RADIUS, FULL_RADIUS
+    status, n_known_trials = TuneStatus.CONVERGED, 0
     while True:
         # A round without a new evaluation would only be repeated, so the next box is smaller.
-        widest = widest if len(record.trials) > known else 0.5 * widest
-        known, radius = len(record.trials), min(radius, widest)
-        if radius < SMALLEST_RADIUS:
-            ending = Ending.AT_A_BORDER
+        max_radius = max_radius if len(record.trials) > n_known_trials else 0.5 * max_radius
+        n_known_trials, radius = len(record.trials), min(radius, max_radius)
+        if radius < MIN_RADIUS:
+            status = TuneStatus.BRANCH_ENDED
             break
-        low, high = np.maximum(centre.u - radius, 0.0), np.minimum(centre.u + radius, 1.0)
-        iterates = [centre]
+        lower, upper = (
+            np.maximum(center.normalized_parameters - radius, 0.0),
+            np.minimum(center.normalized_parameters + radius, 1.0),
+        )
+        iterates = [center]
         try:
             result = minimize(
-                lambda u: -record.at(u).objective / size,
-                centre.u,
-                jac=lambda u: -record.at(u).gradient / size,
-                bounds=list(zip(low, high, strict=True)),
+                lambda u: -record.evaluate_once(u).objective / gradient_norm,
+                center.normalized_parameters,
+                jac=lambda u: -record.evaluate_once(u).gradient / gradient_norm,
+                bounds=list(zip(lower, upper, strict=True)),
                 constraints={
                     "type": "ineq",
-                    "fun": lambda u: record.at(u).slack / scales,
-                    "jac": lambda u: record.at(u).slopes / scales[:, None],
+                    "fun": lambda u: record.evaluate_once(u).slack / scales,
+                    "jac": lambda u: record.evaluate_once(u).slack_jacobian / scales[:, None],
                 },
                 method="SLSQP",
-                options={"ftol": STALLED if radius >= widest else LOOSE, "maxiter": 100},
-                callback=lambda u, seen=iterates: seen.append(arrive(record.iterate(u))),
+                options={
+                    "ftol": FINE_OBJECTIVE_TOLERANCE
+                    if radius >= max_radius
+                    else COARSE_OBJECTIVE_TOLERANCE,
+                    "maxiter": 100,
+                },
+                callback=lambda u, visited=iterates: visited.append(
+                    stop_at_optimum(record.evaluate_iterate(u))
+                ),
             )
-            reached = record.iterate(np.clip(result.x, low, high))
-        except _LostError as lost:
-            centre = iterates[-1]
-            radius = 0.5 * float(np.max(np.abs(lost.trial.u - centre.u)))
+            end_trial = record.evaluate_iterate(np.clip(result.x, lower, upper))
+        except _LostBranchError as lost:
+            center = iterates[-1]
+            radius = 0.5 * float(
+                np.max(np.abs(lost.trial.normalized_parameters - center.normalized_parameters))
+            )
             continue
-        except _ArrivedError as arrived:
-            centre = arrived.trial
+        except _OptimumReachedError as arrived:
+            center = arrived.trial
             break
-        except _SpentError:
-            ending = Ending.OUT_OF_EVALUATIONS
+        except _BudgetSpentError:
+            status = TuneStatus.MAX_EVALUATIONS_REACHED
             break
-        at_wall = (reached.u <= low + 1e-9) & (low > 0.0)
-        at_wall |= (reached.u >= high - 1e-9) & (high < 1.0)
-        centre = reached
-        if radius >= WHOLE:
+        is_at_wall = (end_trial.normalized_parameters <= lower + 1e-9) & (lower > 0.0)
+        is_at_wall |= (end_trial.normalized_parameters >= upper - 1e-9) & (upper < 1.0)
+        center = end_trial
+        if radius >= FULL_RADIUS:
             break
-        radius = min(2.0 * radius, WHOLE) if at_wall.any() else WHOLE
-    best = centre if ending == Ending.CONVERGED else _best(record, scales, centre)
-    if ending == Ending.CONVERGED and breach(best.slack, scales) > 10.0 * ACTIVE:
-        best, ending = _best(record, scales, centre), Ending.NO_FEASIBLE_GAIT
-    return Climb(best, ending, record.trials, record.kinds)
+        radius = min(2.0 * radius, FULL_RADIUS) if is_at_wall.any() else FULL_RADIUS
+    best_trial = center if status == TuneStatus.CONVERGED else _best_trial(record, scales, center)
+    if (
+        status == TuneStatus.CONVERGED
+        and max_breach(best_trial.slack, scales) > 10.0 * ACTIVE_BOUND_TOLERANCE
+    ):
+        best_trial, status = _best_trial(record, scales, center), TuneStatus.NO_FEASIBLE_GAIT
+    return ClimbResult(best_trial, status, record.trials, record.kinds)
 
 
-def _best(record: _Record, scales: np.ndarray, last: Trial) -> Trial:
+def _best_trial(
+    record: _TrialRecord, scales: np.ndarray, last_trial: EvaluatedTrial
+) -> EvaluatedTrial:
     """Return the best gait that satisfies all constraints, else the one with the smallest
     breach."""
-    found = [trial for trial in record.trials if trial.found]
-    kept = [trial for trial in found if breach(trial.slack, scales) <= ACTIVE]
-    if not kept:
-        return min(found, key=lambda trial: breach(trial.slack, scales))
-    if breach(last.slack, scales) <= ACTIVE:
-        kept.append(last)
-    return max(kept, key=lambda trial: trial.objective)
+    gaits = [trial for trial in record.trials if trial.is_found]
+    feasible = [
+        trial for trial in gaits if max_breach(trial.slack, scales) <= ACTIVE_BOUND_TOLERANCE
+    ]
+    if not feasible:
+        return min(gaits, key=lambda trial: max_breach(trial.slack, scales))
+    if max_breach(last_trial.slack, scales) <= ACTIVE_BOUND_TOLERANCE:
+        feasible.append(last_trial)
+    return max(feasible, key=lambda trial: trial.objective)
 
 
-class Optimality(NamedTuple):
+class OptimalityConditions(NamedTuple):
     """Multipliers of the constraints and bounds that hold a gait in place."""
 
     prices: np.ndarray  # gain of the objective per unit of a relaxed margin
-    low: np.ndarray  # loss of the objective per width of a relaxed lower bound, < 0: gain
-    high: np.ndarray
+    lower_bound_prices: (
+        np.ndarray
+    )  # loss of the objective per width of a relaxed lower bound, < 0: gain
+    upper_bound_prices: np.ndarray
     residual: float  # of the first-order condition, relative to the objective's gradient
 
 
-def optimality(trial: Trial) -> Optimality:
+def compute_optimality(trial: EvaluatedTrial) -> OptimalityConditions:
     """Return the first-order (Karush-Kuhn-Tucker) condition at a gait, by non-negative least
     squares."""
     from scipy.optimize import nnls  # slow to import
 
-    n = trial.u.size
-    scales = slack_scales(trial.slack, trial.slopes)
-    active = np.flatnonzero(np.abs(trial.slack) <= 10.0 * ACTIVE * scales)
-    low, high = np.flatnonzero(trial.u <= ACTIVE), np.flatnonzero(trial.u >= 1.0 - ACTIVE)
-    unit = np.eye(n)
+    n_free = trial.normalized_parameters.size
+    scales = scale_slacks(trial.slack, trial.slack_jacobian)
+    active_indices = np.flatnonzero(np.abs(trial.slack) <= 10.0 * ACTIVE_BOUND_TOLERANCE * scales)
+    lower_indices, upper_indices = (
+        np.flatnonzero(trial.normalized_parameters <= ACTIVE_BOUND_TOLERANCE),
+        np.flatnonzero(trial.normalized_parameters >= 1.0 - ACTIVE_BOUND_TOLERANCE),
+    )
+    identity = np.eye(n_free)
     columns = np.concatenate(
-        [trial.slopes[active] / scales[active, None], unit[low], -unit[high]]
+        [
+            trial.slack_jacobian[active_indices] / scales[active_indices, None],
+            identity[lower_indices],
+            -identity[upper_indices],
+        ]
     ).T
-    size = max(float(np.linalg.norm(trial.gradient)), 1e-300)
-    prices, at_low, at_high = np.zeros(trial.slack.size), np.zeros(n), np.zeros(n)
+    gradient_norm = max(float(np.linalg.norm(trial.gradient)), 1e-300)
+    prices, lower_prices, upper_prices = (
+        np.zeros(trial.slack.size),
+        np.zeros(n_free),
+        np.zeros(n_free),
+    )
     if not columns.shape[1]:
-        return Optimality(prices, at_low, at_high, 1.0)
+        return OptimalityConditions(prices, lower_prices, upper_prices, 1.0)
     weights, residual = nnls(columns, -trial.gradient)
-    first, second = len(active), len(active) + len(low)
-    prices[active] = weights[:first] / scales[active]
-    at_low[low], at_high[high] = weights[first:second], weights[second:]
-    return Optimality(prices, at_low, at_high, float(residual) / size)
+    lower_start, upper_start = len(active_indices), len(active_indices) + len(lower_indices)
+    prices[active_indices] = weights[:lower_start] / scales[active_indices]
+    lower_prices[lower_indices], upper_prices[upper_indices] = (
+        weights[lower_start:upper_start],
+        weights[upper_start:],
+    )
+    return OptimalityConditions(prices, lower_prices, upper_prices, float(residual) / gradient_norm)

@@ -16,21 +16,21 @@ from vrw_jax.cycles import (
 )
 from vrw_jax.models import AbstractStep
 from vrw_jax.wheel import WheelParams
-from vrw_jax.wording import names_of, range_of, real, reals, require_known
+from vrw_jax.wording import check_known_name, check_names, check_range, check_real, check_reals
 
-Reader = Callable[[AbstractCycle, AbstractStep], Array]
-Margins = Mapping[str, float | tuple[float, float]] | Sequence[str]
-Read = Callable[[str, AbstractCycle, AbstractStep], Array]
+MeasureFunction = Callable[[AbstractCycle, AbstractStep], Array]
+MarginSpec = Mapping[str, float | tuple[float, float]] | Sequence[str]
+ReadMeasure = Callable[[str, AbstractCycle, AbstractStep], Array]
 
-MOST = "-"
+UPPER_BOUND_PREFIX = "-"
 """Prefix of a measure that is bounded from above: its negative is bounded from below."""
 
 
 @dataclass(frozen=True)
-class Weighted:
+class WeightedSum:
     """Weighted sum of measures, as an objective."""
 
-    read: Read
+    read: ReadMeasure
     weights: tuple[tuple[str, float], ...]
 
     def __call__(self, cycle: AbstractCycle, step: AbstractStep) -> Array:
@@ -39,7 +39,7 @@ class Weighted:
 
 
 @dataclass(frozen=True)
-class OfCycle:
+class CycleObjective:
     """A user's function of the cycle alone, as an objective."""
 
     function: Callable[[Any], Array]
@@ -49,76 +49,82 @@ class OfCycle:
 
 
 @dataclass(frozen=True)
-class Sought:
+class ObjectiveAndConstraints:
     """Objective and constraints of a gait as one array.
 
     A constraint is a measure with a lower bound, or with the prefix a measure with an upper bound.
     """
 
-    objective: Reader
-    read: Read
+    objective: MeasureFunction
+    read: ReadMeasure
     constraints: tuple[str, ...]
 
     def __call__(self, cycle: AbstractCycle, step: AbstractStep) -> Array:
-        told = self.objective(cycle, step)
-        if jnp.shape(reals("objective", told, "return one number")):
+        objective_value = self.objective(cycle, step)
+        if jnp.shape(check_reals("objective", objective_value, "return one number")):
             raise ValueError(
-                f"objective returns an array of shape {jnp.shape(told)}, but what is maximised is "
+                f"objective returns an array of shape {jnp.shape(objective_value)}, but what is maximised is "
                 "one number: reduce it, as by jnp.min or jnp.sum."
             )
-        kept = [self._kept(name, cycle, step) for name in self.constraints]
-        return jnp.concatenate([jnp.ravel(told), *kept])
+        constraint_values = [
+            self._evaluate_constraint(name, cycle, step) for name in self.constraints
+        ]
+        return jnp.concatenate([jnp.ravel(objective_value), *constraint_values])
 
-    def _kept(self, name: str, cycle: AbstractCycle, step: AbstractStep) -> Array:
-        measure = name.removeprefix(MOST)
+    def _evaluate_constraint(self, name: str, cycle: AbstractCycle, step: AbstractStep) -> Array:
+        measure = name.removeprefix(UPPER_BOUND_PREFIX)
         value = jnp.ravel(self.read(measure, cycle, step))
         return value if measure == name else -value
 
 
-class Evaluated(NamedTuple):
+class GaitEvaluation(NamedTuple):
     """Gait with its objective and constraints. A batch has its axis before all others."""
 
     gait: Gait
     values: Array  # (1 + n_constraints,): the objective, then the constraints
-    columns: Array  # (n_parameters, 1 + n_constraints)
+    jacobian: Array  # (n_parameters, 1 + n_constraints)
 
 
-def margins_of(
-    params: WheelParams, constraints: Margins | None, finder: AbstractGaitFinder
+def parse_margins(
+    params: WheelParams, constraints: MarginSpec | None, finder: AbstractGaitFinder
 ) -> dict[str, float]:
     """Return least values by name of the measure, or by `UPPER_BOUND_PREFIX` and name for its
     negative."""
     if constraints is None:
-        premises = default_margins(params)
-        return {name: least for name, least in premises.items() if finder.from_nothing}
+        defaults = default_margins(params)
+        return {name: lower for name, lower in defaults.items() if finder.supports_cold_start}
     margins: dict[str, float] = {}
     if isinstance(constraints, Mapping):
-        for name, least in constraints.items():
-            if isinstance(least, tuple):
-                least, most = range_of(f"the range of {name}", least)
-                margins[MOST + name] = -most
-            margins[name] = real(f"the margin of {name}", least)
+        for name, lower in constraints.items():
+            if isinstance(lower, tuple):
+                lower, upper = check_range(f"the range of {name}", lower)
+                margins[UPPER_BOUND_PREFIX + name] = -upper
+            margins[name] = check_real(f"the margin of {name}", lower)
     else:
-        margins = dict.fromkeys(names_of("constraints", constraints), 0.0)
+        margins = dict.fromkeys(check_names("constraints", constraints), 0.0)
     if "clearance_sls1" in margins:
         # It has a nonzero derivative where the clearance has none.
         margins.setdefault("takeoff_acceleration", 0.0)
     for name in margins:
-        require_known(name.removeprefix(MOST), finder.readable, "measure for a constraint")
+        check_known_name(
+            name.removeprefix(UPPER_BOUND_PREFIX),
+            finder.readable_measures,
+            "measure for a constraint",
+        )
     return margins
 
 
-def bound_of(name: str, least: float) -> float:
-    return float(-least if name.startswith(MOST) else least)
+def signed_bound(name: str, lower: float) -> float:
+    return float(-lower if name.startswith(UPPER_BOUND_PREFIX) else lower)
 
 
-def slack_scales(slack: np.ndarray, slopes: np.ndarray) -> np.ndarray:
+def scale_slacks(slack: np.ndarray, slack_jacobian: np.ndarray) -> np.ndarray:
     """Return the change of slack over one width of the bounds, which makes constraints
     comparable."""
-    return np.maximum(np.linalg.norm(slopes, axis=-1), 1e-3 * np.abs(slack) + 1e-12)
+    return np.maximum(np.linalg.norm(slack_jacobian, axis=-1), 1e-3 * np.abs(slack) + 1e-12)
 
 
-def breach(slack: np.ndarray, scales: np.ndarray) -> Any:
+def max_breach(slack: np.ndarray, scales: np.ndarray) -> Any:
     """Return the largest breach of a constraint in widths of the bounds: 0 if none, NaN if the gait
     is lost."""
     return np.max(-slack / scales, axis=-1, initial=0.0)

@@ -21,65 +21,80 @@ from vrw_jax.cycles import (
     CycleOptions,
     Gait,
     default_margins,
-    finder_of,
-    read_along,
-    read_along_lanes,
-    same_branch,
-    serving,
+    evaluate_on_gait,
+    evaluate_on_gaits,
+    is_same_branch,
+    make_finder,
+    resolve_model,
 )
-from vrw_jax.models import PREMISES
-from vrw_jax.numerics import Options
-from vrw_jax.results import MARGINS, MEASURES, attrs_of, flags, measure_of, provenance
+from vrw_jax.models import SELECTION_MARGINS
+from vrw_jax.numerics import StepOptions
+from vrw_jax.results import (
+    MARGIN_MEASURES,
+    MEASURES,
+    flag_attrs,
+    get_measure,
+    measure_attrs,
+    provenance,
+)
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.tuning.climbing import Climb, Kind, Trial, breach, climb, optimality, slack_scales
+from vrw_jax.tuning.climbing import (
+    ClimbResult,
+    EvaluatedTrial,
+    TrialKind,
+    compute_optimality,
+    max_breach,
+    maximize_objective,
+    scale_slacks,
+)
 from vrw_jax.tuning.objective import (
-    MOST,
-    Evaluated,
-    Margins,
-    OfCycle,
-    Reader,
-    Sought,
-    Weighted,
-    bound_of,
-    margins_of,
+    UPPER_BOUND_PREFIX,
+    CycleObjective,
+    GaitEvaluation,
+    MarginSpec,
+    MeasureFunction,
+    ObjectiveAndConstraints,
+    WeightedSum,
+    parse_margins,
+    signed_bound,
 )
-from vrw_jax.tuning.result import Active, Tuned, Walked
-from vrw_jax.tuning.starts import Lanes, explore
-from vrw_jax.walks import ModelLike, one_wheel, rung_of
-from vrw_jax.wheel import DOMAINS, PARAMETER_NAMES, Outcome, WheelParams
+from vrw_jax.tuning.result import ActiveConstraint, TuneResult, WalkValidation
+from vrw_jax.tuning.starts import Exploration, explore_starts
+from vrw_jax.walks import ModelLike, check_model, check_single_wheel
+from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES, Outcome, WheelParams
 from vrw_jax.wording import (
-    instance,
-    names_of,
-    positive,
-    range_of,
-    real,
-    require_known,
-    shown,
-    untraced,
-    whole,
+    check_int,
+    check_known_name,
+    check_names,
+    check_not_traced,
+    check_positive,
+    check_range,
+    check_real,
+    check_type,
+    format_value,
 )
 
-Objective = str | Mapping[str, float] | Callable[..., Array]
+ObjectiveSpec = str | Mapping[str, float] | Callable[..., Array]
 
 
-DISPLACED, N_WALKED, N_EXPLORED = 1e-5, 10, 25
+START_DISPLACEMENT, N_VALIDATION_STEPS, N_EXPLORATION_STEPS = 1e-5, 10, 25
 
 
 def tune(
     params: WheelParams,
-    objective: Objective,
+    objective: ObjectiveSpec,
     free: Sequence[str],
     bounds: Mapping[str, tuple[float, float]],
-    constraints: Margins | None = None,
+    constraints: MarginSpec | None = None,
     *,
     model: ModelLike | None = None,
-    options: Options | None = None,
+    options: StepOptions | None = None,
     cycle_options: CycleOptions | None = None,
     tolerance: float = 1e-6,
     max_evaluations: int = 200,
     n_starts: int = 1,
     seed: int = 0,
-) -> Tuned:
+) -> TuneResult:
     """Return the wheel near `params` whose gait maximizes the objective and satisfies its
     constraints.
 
@@ -123,14 +138,14 @@ def tune(
         >>> print(result.status.name, f"{result.value:.3f}", [c.name for c in result.active])
         CONVERGED 0.534 ['damping']
     """
-    untraced("vrw.tune", "climb by your own loop over vrw.limit_cycle", params)
+    check_not_traced("vrw.tune", "climb by your own loop over vrw.limit_cycle", params)
     max_evaluations, n_starts = (
-        whole("max_evaluations", max_evaluations),
-        whole("n_starts", n_starts),
+        check_int("max_evaluations", max_evaluations),
+        check_int("n_starts", n_starts),
     )
-    tolerance, seed = positive("tolerance", tolerance), whole("seed", seed, 0)
-    began = time.perf_counter()
-    problem = tuning_problem(
+    tolerance, seed = check_positive("tolerance", tolerance), check_int("seed", seed, 0)
+    start_seconds = time.perf_counter()
+    problem = make_tune_problem(
         params,
         objective,
         free,
@@ -140,12 +155,18 @@ def tune(
         options=options,
         cycle_options=cycle_options,
     )
-    lanes = problem.explore(n_starts, seed) if n_starts > 1 else None
-    problem.finder.compile(params)
-    start = problem.start() if lanes is None else problem.evaluate(lanes.u[lanes.best], None)
-    compiled = time.perf_counter()
-    done = climb(problem.evaluate, start, tolerance=tolerance, max_evaluations=max_evaluations)
-    return problem.result(done, began, compiled, lanes)
+    exploration = problem.explore_starts(n_starts, seed) if n_starts > 1 else None
+    problem.finder.precompile(params)
+    start_trial = (
+        problem.evaluate_start()
+        if exploration is None
+        else problem.evaluate_trial(exploration.normalized_parameters[exploration.best_index], None)
+    )
+    compiled_seconds = time.perf_counter()
+    climb_result = maximize_objective(
+        problem.evaluate_trial, start_trial, tolerance=tolerance, max_evaluations=max_evaluations
+    )
+    return problem.make_result(climb_result, start_seconds, compiled_seconds, exploration)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,8 +178,8 @@ class TuneProblem:
     lower: np.ndarray
     upper: np.ndarray
     margins: dict[str, float]
-    label: str
-    sought: Sought
+    objective_label: str
+    objective_and_constraints: ObjectiveAndConstraints
     finder: AbstractGaitFinder
 
     @property
@@ -166,7 +187,7 @@ class TuneProblem:
         return self.upper - self.lower
 
     @property
-    def moved(self) -> list[int]:
+    def free_indices(self) -> list[int]:
         return [PARAMETER_NAMES.index(name) for name in self.free]
 
     @property
@@ -174,271 +195,344 @@ class TuneProblem:
         """Return one name for each constrained number: margins of the locked legs have six."""
         names: list[str] = []
         for name in self.margins:
-            if measure_of(name).axis:
+            if get_measure(name).dimension:
                 names += [f"{name}[leg {leg}]" for leg in range(3, self.params.n_legs + 1)]
             else:
                 names.append(name)
         return tuple(names)
 
     @property
-    def least(self) -> np.ndarray:
+    def min_constraint_values(self) -> np.ndarray:
         """Return the margins, one for each of `constraint_names`."""
         return np.array([self.margins[name.partition("[")[0]] for name in self.constraint_names])
 
-    def parameters(self, u: np.ndarray) -> np.ndarray:
+    def denormalize(self, normalized_parameters: np.ndarray) -> np.ndarray:
         """Return all float parameters for free ones `u` widths above their lower bounds."""
-        values = np.array(self.finder.model.values(self.params))
-        values[self.moved] = self.lower + u * self.widths
+        values = np.array(self.finder.model.parameter_values(self.params))
+        values[self.free_indices] = self.lower + normalized_parameters * self.widths
         return values
 
-    def wheel(self, u: np.ndarray) -> WheelParams:
-        return self.finder.model.at(jnp.asarray(self.parameters(u)), self.params.n_legs)[1]
+    def make_wheel(self, normalized_parameters: np.ndarray) -> WheelParams:
+        return self.finder.model.from_values(
+            jnp.asarray(self.denormalize(normalized_parameters)), self.params.n_legs
+        )[1]
 
     @property
-    def start_u(self) -> np.ndarray:
+    def normalized_start(self) -> np.ndarray:
         values = np.array([float(getattr(self.params, name)) for name in self.free])
         return np.clip((values - self.lower) / self.widths, 0.0, 1.0)
 
-    def start(self) -> Trial:
+    def evaluate_start(self) -> EvaluatedTrial:
         """Return the trial at the start.
 
         Raises: ValueError: the start has no gait.
         """
-        trial = self.evaluate(self.start_u, None)
-        if not trial.found:
+        trial = self.evaluate_trial(self.normalized_start, None)
+        if not trial.is_found:
             raise ValueError(
                 f"the start has no gait to tune ({trial.outcome.name}: {trial.outcome.meaning[:-1]}"
                 "): start from a wheel that walks, such as WheelParams()."
             )
         return trial
 
-    def evaluate(self, u: np.ndarray, near: Trial | None) -> Trial:
+    def evaluate_trial(
+        self, normalized_parameters: np.ndarray, neighbor: EvaluatedTrial | None
+    ) -> EvaluatedTrial:
         """Return the trial at `u`, searched for from a neighbor's gait if one is given."""
-        parameters = jnp.asarray(self.parameters(u))
-        before = None if near is None else near.told
-        guess = self.finder.first_guess(parameters) if before is None else before.gait.cycle.near
-        gait = self.finder.find(parameters, guess)
-        told = Evaluated(gait, *read_along(self.sought, gait))
-        outcome, on_branch = Outcome(int(told.gait.outcome)), True
-        if outcome == Outcome.STEPPED and near is not None and before is not None:
-            change = self.parameters(u) - self.parameters(near.u)
-            on_branch = same_branch(before.gait.on_branch, told.gait.on_branch, change)
-        return self.trial(u, told, outcome, on_branch)
+        parameters = jnp.asarray(self.denormalize(normalized_parameters))
+        neighbor_evaluation = None if neighbor is None else neighbor.evaluation
+        guess = (
+            self.finder.initial_guess(parameters)
+            if neighbor_evaluation is None
+            else neighbor_evaluation.gait.cycle.warm_start
+        )
+        gait = self.finder.find_gait(parameters, guess)
+        evaluation = GaitEvaluation(gait, *evaluate_on_gait(self.objective_and_constraints, gait))
+        outcome, is_on_branch = Outcome(int(evaluation.gait.outcome)), True
+        if outcome == Outcome.STEPPED and neighbor is not None and neighbor_evaluation is not None:
+            parameter_change = self.denormalize(normalized_parameters) - self.denormalize(
+                neighbor.normalized_parameters
+            )
+            is_on_branch = is_same_branch(
+                neighbor_evaluation.gait.branch_point,
+                evaluation.gait.branch_point,
+                parameter_change,
+            )
+        return self.make_trial(normalized_parameters, evaluation, outcome, is_on_branch)
 
-    def trial(self, u: np.ndarray, told: Evaluated, outcome: Outcome, on_branch: bool) -> Trial:
+    def make_trial(
+        self,
+        normalized_parameters: np.ndarray,
+        evaluation: GaitEvaluation,
+        outcome: Outcome,
+        is_on_branch: bool,
+    ) -> EvaluatedTrial:
         """Return a trial with objective and constraints of a gait."""
-        values = np.array(told.values)
-        slopes = np.array(told.columns)[self.moved].T * self.widths
+        values = np.array(evaluation.values)
+        jacobian = np.array(evaluation.jacobian)[self.free_indices].T * self.widths
         if outcome != Outcome.STEPPED:
-            values, slopes = np.full_like(values, np.nan), np.full_like(slopes, np.nan)
-        return Trial(
-            u, outcome, on_branch, float(values[0]), slopes[0], values[1:] - self.least,
-            slopes[1:], told,
+            values, jacobian = np.full_like(values, np.nan), np.full_like(jacobian, np.nan)
+        return EvaluatedTrial(
+            normalized_parameters, outcome, is_on_branch, float(values[0]), jacobian[0], values[1:] - self.min_constraint_values,
+            jacobian[1:], evaluation,
         )  # fmt: skip
 
-    def explore(self, n_starts: int, seed: int) -> Lanes:
+    def explore_starts(self, n_starts: int, seed: int) -> Exploration:
         """Take first-order steps from many starts side by side: this wheel, and random ones."""
-        others = np.random.default_rng(seed).uniform(size=(n_starts - 1, len(self.free)))
-        lanes = explore(
-            self._batch,
-            np.vstack([self.start_u, others]),
-            self._change,
-            self.moved,
+        random_starts = np.random.default_rng(seed).uniform(size=(n_starts - 1, len(self.free)))
+        exploration = explore_starts(
+            self._evaluate_batch,
+            np.vstack([self.normalized_start, random_starts]),
+            self._parameter_change,
+            self.free_indices,
             self.widths,
-            self.least,
-            N_EXPLORED,
+            self.min_constraint_values,
+            N_EXPLORATION_STEPS,
         )
-        if not np.isfinite(lanes.objective).any():
+        if not np.isfinite(exploration.objective).any():
             raise ValueError(
                 f"none of {n_starts} starts within the bounds has a gait: narrow the bounds around "
                 "wheels that walk, such as WheelParams()."
             )
-        return lanes
+        return exploration
 
-    def _batch(self, u: np.ndarray, near: Evaluated | None) -> Evaluated:
-        parameters = jnp.asarray([self.parameters(row) for row in u])
-        first = self.finder.first_guesses(parameters)
-        guess = first if near is None else near.gait.cycle.near
-        gait = self.finder.find_many(parameters, guess)
-        return Evaluated(gait, *read_along_lanes(self.sought, gait))
+    def _evaluate_batch(
+        self, normalized_parameters: np.ndarray, neighbors: GaitEvaluation | None
+    ) -> GaitEvaluation:
+        parameters = jnp.asarray([self.denormalize(row) for row in normalized_parameters])
+        guesses = self.finder.initial_guesses(parameters)
+        guess = guesses if neighbors is None else neighbors.gait.cycle.warm_start
+        gait = self.finder.find_gaits(parameters, guess)
+        return GaitEvaluation(gait, *evaluate_on_gaits(self.objective_and_constraints, gait))
 
-    def _change(self, difference: np.ndarray) -> np.ndarray:
+    def _parameter_change(self, difference: np.ndarray) -> np.ndarray:
         """Return changes of all parameters from changes of u, row by row."""
-        change = np.zeros((difference.shape[0], len(self.finder.model.parameter_names)))
-        change[:, self.moved] = difference * self.widths
-        return change
+        parameter_change = np.zeros((difference.shape[0], len(self.finder.model.parameter_names)))
+        parameter_change[:, self.free_indices] = difference * self.widths
+        return parameter_change
 
-    def result(
-        self, done: Climb, began: float, compiled: float, lanes: Lanes | None = None
-    ) -> Tuned:
-        best = done.best
-        assert best.told is not None
-        gait = best.told.gait
-        params = self.wheel(best.u)
-        conditions = optimality(best)
+    def make_result(
+        self,
+        climb_result: ClimbResult,
+        start_seconds: float,
+        compiled_seconds: float,
+        exploration: Exploration | None = None,
+    ) -> TuneResult:
+        best_trial = climb_result.best
+        assert best_trial.evaluation is not None
+        gait = best_trial.evaluation.gait
+        params = self.make_wheel(best_trial.normalized_parameters)
+        conditions = compute_optimality(best_trial)
         active = [
-            Active(name.removeprefix(MOST), bound_of(name, limit), measure_of(name).unit, price)
+            ActiveConstraint(
+                name.removeprefix(UPPER_BOUND_PREFIX),
+                signed_bound(name, limit),
+                get_measure(name).unit,
+                price,
+            )
             for name, limit, price in zip(
-                self.constraint_names, self.least, map(float, conditions.prices), strict=True
+                self.constraint_names,
+                self.min_constraint_values,
+                map(float, conditions.prices),
+                strict=True,
             )
             if price > 0.0
         ]
-        sides = ((self.lower, conditions.low), (self.upper, conditions.high))
+        sides = (
+            (self.lower, conditions.lower_bound_prices),
+            (self.upper, conditions.upper_bound_prices),
+        )
         for limits, prices in sides:
             for name, limit, price, width in zip(
                 self.free, limits, prices, self.widths, strict=True
             ):
                 if price > 0.0:
-                    unit, cost = measure_of(name).unit, float(price / width)
-                    active.append(Active(name, float(limit), unit, cost))
-        climbed = time.perf_counter()
-        walked = self._walk(params, gait)
-        told = gait.step.measures()
-        broken = [name for name in MARGINS if name in told and np.min(told[name]) < 0.0]
-        return Tuned(
+                    unit, cost = get_measure(name).unit, float(price / width)
+                    active.append(ActiveConstraint(name, float(limit), unit, cost))
+        end_seconds = time.perf_counter()
+        validation = self._validate_by_walking(params, gait)
+        measures = gait.step.measures()
+        violated = [
+            name for name in MARGIN_MEASURES if name in measures and np.min(measures[name]) < 0.0
+        ]
+        return TuneResult(
             params=params,
-            ending=done.ending,
-            objective=self.label,
-            value=best.objective,
-            start_value=done.trials[0].objective,
+            status=climb_result.status,
+            objective=self.objective_label,
+            value=best_trial.objective,
+            start_value=climb_result.trials[0].objective,
             cycle=gait.cycle,
             step=gait.step,
             active=tuple(active),
             kkt_residual=conditions.residual,
-            unkept=tuple(name for name in broken if name not in self.margins),
-            walked=walked,
-            path=self._path(done),
-            evaluations=len(done.trials) + (0 if lanes is None else lanes.gaits),
-            shortened=sum(kind == Kind.LOST for kind in done.kinds),
-            seconds=climbed - began,
-            compile_seconds=compiled - began,
-            lanes=lanes,
+            violated_margins=tuple(name for name in violated if name not in self.margins),
+            validation=validation,
+            path=self._make_path(climb_result),
+            n_evaluations=len(climb_result.trials)
+            + (0 if exploration is None else exploration.n_evaluations),
+            n_backtracks=sum(kind == TrialKind.LOST for kind in climb_result.kinds),
+            seconds=end_seconds - start_seconds,
+            compile_seconds=compiled_seconds - start_seconds,
+            exploration=exploration,
         )
 
-    def _walk(self, params: WheelParams, gait: Gait) -> Walked:
-        cycle = np.array(gait.cycle.section_state)
+    def _validate_by_walking(self, params: WheelParams, gait: Gait) -> WalkValidation:
+        cycle_state = np.array(gait.cycle.section_state)
         # The state is scaled down, not up: no leg may be beyond its stopper.
-        x, kept, outcome, walked = cycle * (1.0 - DISPLACED), True, Outcome.STEPPED, 0
-        default = default_margins(params)
-        for _ in range(N_WALKED):
-            one = self.finder.step(params, jnp.asarray(x))
-            outcome = Outcome(int(one.outcome))
+        section_state, is_feasible, outcome, n_walked = (
+            cycle_state * (1.0 - START_DISPLACEMENT),
+            True,
+            Outcome.STEPPED,
+            0,
+        )
+        default_least = default_margins(params)
+        for _ in range(N_VALIDATION_STEPS):
+            step_result = self.finder.take_step(params, jnp.asarray(section_state))
+            outcome = Outcome(int(step_result.outcome))
             if outcome != Outcome.STEPPED:
                 break
-            walked, x = walked + 1, np.array(one.section_state)
-            monitored = {name: np.asarray(value) for name, value in one.measures().items()}
-            for name, least in self.margins.items():
-                if (measure := name.removeprefix(MOST)) in monitored:
-                    value = monitored[measure] if measure == name else -monitored[measure]
+            n_walked, section_state = n_walked + 1, np.array(step_result.section_state)
+            measures = {name: np.asarray(value) for name, value in step_result.measures().items()}
+            for name, lower in self.margins.items():
+                if (measure := name.removeprefix(UPPER_BOUND_PREFIX)) in measures:
+                    value = measures[measure] if measure == name else -measures[measure]
                     # The optimum satisfies it within 1e-6 of its change over the bounds, and the
                     # start is displaced: each is some thousandths of a take-off margin.
-                    scale = 1e-3 * np.max(np.abs(value)) + 1e-2 * abs(default.get(name, 0.0))
-                    kept &= bool(np.all(value >= least - scale - 1e-9))
-        distance = float(np.max(np.abs(x - cycle)))
-        return Walked(walked, outcome, distance, kept and outcome == Outcome.STEPPED)
+                    tolerance = 1e-3 * np.max(np.abs(value)) + 1e-2 * abs(
+                        default_least.get(name, 0.0)
+                    )
+                    is_feasible &= bool(np.all(value >= lower - tolerance - 1e-9))
+        distance = float(np.max(np.abs(section_state - cycle_state)))
+        return WalkValidation(
+            n_walked, outcome, distance, is_feasible and outcome == Outcome.STEPPED
+        )
 
-    def _path(self, done: Climb) -> xr.Dataset:
-        along = "evaluation"
-        u = np.array([trial.u for trial in done.trials])
-        values = self.lower + u * self.widths
-        least = self.least
-        constraints = np.array([trial.slack + least for trial in done.trials])
-        start = done.trials[0]
-        scales = slack_scales(start.slack, start.slopes)
+    def _make_path(self, climb_result: ClimbResult) -> xr.Dataset:
+        dimension = "evaluation"
+        normalized_parameters = np.array(
+            [trial.normalized_parameters for trial in climb_result.trials]
+        )
+        values = self.lower + normalized_parameters * self.widths
+        lower = self.min_constraint_values
+        constraints = np.array([trial.slack + lower for trial in climb_result.trials])
+        start = climb_result.trials[0]
+        scales = scale_slacks(start.slack, start.slack_jacobian)
         outcomes = [
-            trial.outcome if trial.on_branch else Outcome.NO_CYCLE_FOUND for trial in done.trials
+            trial.outcome if trial.is_on_branch else Outcome.NO_CYCLE_FOUND
+            for trial in climb_result.trials
         ]
         data: dict[str, Any] = {
-            name: (along, values[:, i], attrs_of(name)) for i, name in enumerate(self.free)
+            name: (dimension, values[:, i], measure_attrs(name)) for i, name in enumerate(self.free)
         }
         data |= {
-            "objective": (along, [t.objective for t in done.trials], {"long_name": self.label}),
-            "constraint_value": ((along, "constraint"), constraints.reshape(len(u), least.size)),
-            "margin": ("constraint", least, {"long_name": "least value allowed"}),
+            "objective": (
+                dimension,
+                [t.objective for t in climb_result.trials],
+                {"long_name": self.objective_label},
+            ),
+            "constraint_value": (
+                (dimension, "constraint"),
+                constraints.reshape(len(normalized_parameters), lower.size),
+            ),
+            "margin": ("constraint", lower, {"long_name": "least value allowed"}),
             "breach": (
-                along,
-                np.array([breach(trial.slack, scales) for trial in done.trials]),
+                dimension,
+                np.array([max_breach(trial.slack, scales) for trial in climb_result.trials]),
                 {"long_name": "largest breach of a constraint, in widths of the bounds"},
             ),
-            "kind": (along, np.array(done.kinds, int), flags(kind.name for kind in Kind)),
-            "outcome": (along, np.array(outcomes, int), attrs_of("outcome")),
-            "on_branch": (along, np.array([t.on_branch for t in done.trials])),
+            "kind": (
+                dimension,
+                np.array(climb_result.kinds, int),
+                flag_attrs(kind.name for kind in TrialKind),
+            ),
+            "outcome": (dimension, np.array(outcomes, int), measure_attrs("outcome")),
+            "on_branch": (dimension, np.array([t.is_on_branch for t in climb_result.trials])),
         }
-        units = [measure_of(name).unit for name in self.constraint_names]
+        units = [get_measure(name).unit for name in self.constraint_names]
         labels = {
-            along: np.arange(len(u)),
+            dimension: np.arange(len(normalized_parameters)),
             "constraint": list(self.constraint_names),
             "constraint_unit": ("constraint", units),
         }
         attrs = {
-            "title": f"Path of tuning {self.label} over {', '.join(self.free)}",
+            "title": f"Path of tuning {self.objective_label} over {', '.join(self.free)}",
             "free": " ".join(self.free),  # as text: netCDF has no lists of names
             "lower": [float(v) for v in self.lower],
             "upper": [float(v) for v in self.upper],
-            "ending": done.ending.name,
+            "ending": climb_result.status.name,
         }
         origin = provenance(self.params, self.finder.model, self.finder.step_options)
         return xr.Dataset(data, labels, attrs | origin)
 
 
-def tuning_problem(
+def make_tune_problem(
     params: WheelParams,
-    objective: Objective,
+    objective: ObjectiveSpec,
     free: Sequence[str],
     bounds: Mapping[str, tuple[float, float]],
-    constraints: Margins | None = None,
+    constraints: MarginSpec | None = None,
     *,
     model: ModelLike | None = None,
-    options: Options | None = None,
+    options: StepOptions | None = None,
     cycle_options: CycleOptions | None = None,
 ) -> TuneProblem:
     """Return the validated problem that `tune` solves, for single gaits or another method.
 
     Raises: TypeError, ValueError: an invalid argument, described in one sentence.
     """
-    one_wheel(params, "tune one after the other")
-    names, lower, upper = _bounds(params, free, bounds)
-    asked = rung_of(model)
-    finder = finder_of(
-        rung_of(serving(params, asked)),
+    check_single_wheel(params, "tune one after the other")
+    names, lower, upper = _check_bounds(params, free, bounds)
+    checked_model = check_model(model)
+    finder = make_finder(
+        check_model(resolve_model(params, checked_model)),
         params.n_legs,
         cycle_options=cycle_options,
         step_options=options,
     )
-    if not finder.model.legs_yield:
+    if not finder.model.is_compliant:
         raise TypeError(
             f"model is {model!r}, but what is tuned has compliant legs: give "
             "vrw.ViscoelasticWheel() or vrw.UnilateralWheel()."
         )
-    finder.options_used.require_reachable(jnp.result_type(*jax.tree.leaves(params)))
-    reader, label = _objective(objective, finder)
-    if constraints is None and asked.upper is not asked and finder.from_nothing:
-        constraints = tuple(PREMISES)
-    margins = margins_of(params, constraints, finder)
-    sought = Sought(reader, type(finder).read, tuple(margins))
+    finder.search_options.check_tolerances(jnp.result_type(*jax.tree.leaves(params)))
+    reader, label = _parse_objective(objective, finder)
+    if (
+        constraints is None
+        and checked_model.fallback_model is not checked_model
+        and finder.supports_cold_start
+    ):
+        constraints = tuple(SELECTION_MARGINS)
+    margins = parse_margins(params, constraints, finder)
+    objective_and_constraints = ObjectiveAndConstraints(
+        reader, type(finder).read_measure, tuple(margins)
+    )
     if callable(objective):  # checked before compilation
-        cycle = jax.eval_shape(finder.cycle, params)
+        cycle = jax.eval_shape(finder.find_cycle, params)
         x = jax.ShapeDtypeStruct((finder.model.section_size(params),), params.damping.dtype)
-        step = jax.eval_shape(finder.model.step, params, x, finder.step_options)
-        jax.eval_shape(sought, cycle, step)
-    return TuneProblem(params, names, lower, upper, margins, label, sought, finder)
+        step = jax.eval_shape(finder.model.take_step, params, x, finder.step_options)
+        jax.eval_shape(objective_and_constraints, cycle, step)
+    return TuneProblem(
+        params, names, lower, upper, margins, label, objective_and_constraints, finder
+    )
 
 
-def _objective(objective: Objective, finder: AbstractGaitFinder) -> tuple[Reader, str]:
+def _parse_objective(
+    objective: ObjectiveSpec, finder: AbstractGaitFinder
+) -> tuple[MeasureFunction, str]:
     if not (callable(objective) or isinstance(objective, str | Mapping)):
         raise TypeError(
-            f"objective is {shown(objective)}, but it is a measure's name, weights of several or a "
+            f"objective is {format_value(objective)}, but it is a measure's name, weights of several or a "
             'function of the cycle: give "dls_fraction", say.'
         )
     if callable(objective):
-        if not finder.from_nothing:
+        if not finder.supports_cold_start:
             raise TypeError(
                 "objective is a function, but with contact it must be a measure's name or "
-                f"weights of several: choose from {', '.join(finder.differentiable)}."
+                f"weights of several: choose from {', '.join(finder.differentiable_measures)}."
             )
         label = getattr(objective, "__name__", "objective")
-        takes = inspect.signature(objective).parameters
-        return (objective if len(takes) >= 2 else OfCycle(objective)), label
+        arguments = inspect.signature(objective).parameters
+        return (objective if len(arguments) >= 2 else CycleObjective(objective)), label
     weights = {objective: 1.0} if isinstance(objective, str) else dict(objective)
     if not weights:
         raise ValueError(
@@ -446,22 +540,24 @@ def _objective(objective: Objective, finder: AbstractGaitFinder) -> tuple[Reader
             'give a measure such as "dls_fraction".'
         )
     for name, weight in weights.items():
-        require_known(name, finder.readable, "measure for objective")
-        real(f"the weight of {name}", weight)
-        if MEASURES[name].axis:
+        check_known_name(name, finder.readable_measures, "measure for objective")
+        check_real(f"the weight of {name}", weight)
+        if MEASURES[name].dimension:
             raise ValueError(
                 f"{name} has one value for each locked leg, but an objective is one number: "
                 "give a function of the cycle and the step that reduces it."
             )
     label = " + ".join(n if w == 1.0 else f"{w:g} {n}" for n, w in weights.items())
-    return Weighted(type(finder).read, tuple(weights.items())), label.replace("+ -", "- ")
+    return WeightedSum(type(finder).read_measure, tuple(weights.items())), label.replace(
+        "+ -", "- "
+    )
 
 
-def _bounds(
+def _check_bounds(
     params: WheelParams, free: Sequence[str], bounds: Mapping[str, tuple[float, float]]
 ) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
-    names = names_of("free", free)
-    instance("bounds", bounds, Mapping, "write {'damping': (100.0, 200.0)}")
+    names = check_names("free", free)
+    check_type("bounds", bounds, Mapping, "write {'damping': (100.0, 200.0)}")
     if len(set(names)) < len(names):
         raise ValueError(f"free is {names}, which names one twice: name each once.")
     if not names:
@@ -470,19 +566,19 @@ def _bounds(
             f"{', '.join(PARAMETER_NAMES)}."
         )
     for name in (*names, *bounds):
-        require_known(name, PARAMETER_NAMES, "parameter of the wheel")
+        check_known_name(name, PARAMETER_NAMES, "parameter of the wheel")
     for name in bounds:
         if name not in names:
             raise ValueError(f"bounds holds {name!r}, but it is not free: add it to free.")
     for name in names:
         if name not in bounds:
             raise ValueError(f"{name} is free but has no bounds: give bounds[{name!r}].")
-        low, high = range_of(f"the range of {name}", bounds[name])
+        low, high = check_range(f"the range of {name}", bounds[name])
         for end in (low, high):
-            if not DOMAINS[name].contains(end):
+            if not PARAMETER_DOMAINS[name].contains(end):
                 raise ValueError(
-                    f"the bounds of {name} reach {end:g}, but {DOMAINS[name].description} must lie "
-                    f"in {DOMAINS[name]}: keep them inside."
+                    f"the bounds of {name} reach {end:g}, but {PARAMETER_DOMAINS[name].description} must lie "
+                    f"in {PARAMETER_DOMAINS[name]}: keep them inside."
                 )
         value = float(getattr(params, name))
         if not low <= value <= high:

@@ -5,15 +5,15 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, NamedTuple
 
-from vrw_jax.results import MEASURES, measure_of
+from vrw_jax.results import MEASURES, get_measure
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.tuning.climbing import Ending
-from vrw_jax.tuning.starts import Lanes
+from vrw_jax.tuning.climbing import TuneStatus
+from vrw_jax.tuning.starts import Exploration
 from vrw_jax.wheel import Outcome, WheelParams
-from vrw_jax.wording import as_html, as_text
+from vrw_jax.wording import format_html_table, format_text
 
 
-class Active(NamedTuple):
+class ActiveConstraint(NamedTuple):
     """Active constraint or bound at the optimum.
 
     - `name`: of the constraint (with the leg, if it has one), or of the parameter;
@@ -27,7 +27,7 @@ class Active(NamedTuple):
     price: float
 
 
-class Walked(NamedTuple):
+class WalkValidation(NamedTuple):
     """Validation of the tuned wheel by a walk from a slightly displaced start.
 
     - `distance`: from the limit cycle after the last step, rad, rad/s and m/s;
@@ -35,14 +35,14 @@ class Walked(NamedTuple):
       value and 1e-2 of its default margin.
     """
 
-    steps: int
+    n_steps: int
     outcome: Outcome
     distance: float
-    kept: bool
+    is_feasible: bool
 
 
 @dataclasses.dataclass(frozen=True)
-class Tuned:
+class TuneResult:
     """Result of tuning: the gait, how it was found, and the constraints that are active.
 
     - `params`: the wheel;
@@ -69,50 +69,57 @@ class Tuned:
     """
 
     params: WheelParams
-    ending: Ending
+    status: TuneStatus
     objective: str
     value: float
     start_value: float
     cycle: Any
     step: Any
-    active: tuple[Active, ...]
+    active: tuple[ActiveConstraint, ...]
     kkt_residual: float
-    unkept: tuple[str, ...]
-    walked: Walked
+    violated_margins: tuple[str, ...]
+    validation: WalkValidation
     path: xr.Dataset
-    evaluations: int
-    shortened: int
+    n_evaluations: int
+    n_backtracks: int
     seconds: float
     compile_seconds: float
-    lanes: Lanes | None = None
+    exploration: Exploration | None = None
 
     @property
     def converged(self) -> bool:
         """Return whether the maximization ended at an optimum."""
-        return self.ending == Ending.CONVERGED
+        return self.status == TuneStatus.CONVERGED
 
-    def lines(self) -> dict[str, str]:
+    def describe(self) -> dict[str, str]:
         """Return the printed lines of the result by label."""
-        free = self.path.attrs["free"].split()
-        wheel = [f"{n} {MEASURES[n].text(getattr(self.params, n))}" for n in free]
-        kept = "every constraint kept" if self.walked.kept else "a constraint broken"
-        kept = kept if self.path.sizes["constraint"] else "no constraint to keep"
-        held = [f"{a.name} at {measure_of(a.name).text(a.limit)}" for a in self.active]
+        free_names = self.path.attrs["free"].split()
+        parameter_texts = [
+            f"{n} {MEASURES[n].format_with_unit(getattr(self.params, n))}" for n in free_names
+        ]
+        feasibility = (
+            "every constraint kept" if self.validation.is_feasible else "a constraint broken"
+        )
+        feasibility = feasibility if self.path.sizes["constraint"] else "no constraint to keep"
+        active_texts = [
+            f"{a.name} at {get_measure(a.name).format_with_unit(a.limit)}" for a in self.active
+        ]
         return {
             "objective": f"{self.objective}: {self.start_value:.6g} at the start, {self.value:.6g}",
-            "wheel": ", ".join(wheel),
-            "ending": f"{self.ending.name}: {self.ending.meaning}",
-            "held by": ", ".join(held) or "nothing: a maximum inside all bounds and constraints",
-            "not asked for, and broken": ", ".join(self.unkept) or "none",
-            "walked": f"{self.walked.steps} steps, {self.walked.outcome.name}, "
-            f"{self.walked.distance:.1e} from the cycle at last; {kept}",
-            "cost": f"{self.evaluations} gaits, {self.shortened} steps shortened, "
+            "wheel": ", ".join(parameter_texts),
+            "ending": f"{self.status.name}: {self.status.meaning}",
+            "held by": ", ".join(active_texts)
+            or "nothing: a maximum inside all bounds and constraints",
+            "not asked for, and broken": ", ".join(self.violated_margins) or "none",
+            "walked": f"{self.validation.n_steps} steps, {self.validation.outcome.name}, "
+            f"{self.validation.distance:.1e} from the cycle at last; {feasibility}",
+            "cost": f"{self.n_evaluations} gaits, {self.n_backtracks} steps shortened, "
             f"{self.seconds - self.compile_seconds:.2f} s and {self.compile_seconds:.1f} s to "
             "compile",
         }
 
     def __repr__(self) -> str:
-        return as_text("Tuned", self.lines().items())
+        return format_text("TuneResult", self.describe().items())
 
     def _repr_html_(self) -> str:
-        return as_html("Tuned gait", self.lines().items())
+        return format_html_table("TuneResult gait", self.describe().items())

@@ -12,111 +12,148 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.cycles import same_branch
-from vrw_jax.numerics import taken
-from vrw_jax.runtime import library
-from vrw_jax.tuning.objective import Evaluated, breach, slack_scales
+from vrw_jax.cycles import is_same_branch
+from vrw_jax.numerics import take_rows
+from vrw_jax.runtime import lazy_import
+from vrw_jax.tuning.objective import GaitEvaluation, max_breach, scale_slacks
 from vrw_jax.wheel import Outcome
 
-optax = library("optax")
+optax = lazy_import("optax")
 
-RATE, STIFFNESS = 0.06, 4.0
+LEARNING_RATE, PENALTY_WEIGHT = 0.06, 4.0
 """Adam's first step in widths of the bounds, and the penalty on a breach of one width, in
 objectives."""
 
-BatchEvaluate = Callable[[np.ndarray, Evaluated | None], Evaluated]
+EvaluateBatch = Callable[[np.ndarray, GaitEvaluation | None], GaitEvaluation]
 """Function that returns gaits at u, one row per start, searched for from neighbors' gaits."""
 
 
-class Lanes(NamedTuple):
+class Exploration(NamedTuple):
     """Results of the exploration, one row per start."""
 
-    start: np.ndarray  # (n_starts, n_free), in widths of the bounds
-    u: np.ndarray
+    normalized_starts: np.ndarray  # (n_starts, n_free), in widths of the bounds
+    normalized_parameters: np.ndarray
     objective: np.ndarray  # NaN if no gait was found
-    breach: np.ndarray  # in widths of the bounds
-    lost: np.ndarray  # number of trials that lost the gait or its branch
-    gaits: int  # number of evaluated gaits
+    max_breach: np.ndarray  # in widths of the bounds
+    n_lost: np.ndarray  # number of trials that lost the gait or its branch
+    n_evaluations: int  # number of evaluated gaits
 
     @property
-    def best(self) -> int:
+    def best_index(self) -> int:
         """Return the index of the start to continue from: the highest objective minus penalties."""
-        merit = self.objective - STIFFNESS * np.abs(self.objective) * self.breach
+        merit = self.objective - PENALTY_WEIGHT * np.abs(self.objective) * self.max_breach
         return int(np.nanargmax(merit))
 
 
-def explore(
-    evaluate: BatchEvaluate,
+def explore_starts(
+    evaluate: EvaluateBatch,
     starts: np.ndarray,
-    change: Callable[[np.ndarray], np.ndarray],
-    free: list[int],
+    parameter_change: Callable[[np.ndarray], np.ndarray],
+    free_indices: list[int],
     widths: np.ndarray,
-    least: np.ndarray,
+    min_constraint_values: np.ndarray,
     n_steps: int,
-) -> Lanes:
+) -> Exploration:
     """Take `n_steps` first-order steps of every start.
 
     `parameter_change` converts changes of u to changes of the parameters. Jacobians of a gait are
     with respect to all parameters; `free_indices` select the free ones.
     """
-    n_lanes = starts.shape[0]
-    gait = evaluate(starts, None)
-    good = found(gait)
-    slack, slopes = _constraints(gait, free, widths, least)
-    scales = slack_scales(slack, slopes)[good]
-    scales = np.median(scales, axis=0) if good.any() else np.ones(least.size)
-    size = _gradient(gait, free, widths)[good]
-    size = np.median(np.linalg.norm(size, axis=1)) if good.any() else 1.0
-    rates = np.full((n_lanes, 1), RATE)
-    optimiser = optax.scale_by_adam(b1=0.7, b2=0.9)
-    memory = optimiser.init(jnp.asarray(starts))
-    prices = np.zeros((n_lanes, least.size))
-    u, kept, lost = starts.copy(), gait, np.zeros(n_lanes, int)
-    for i in range(n_steps):
-        slack, slopes = _constraints(kept, free, widths, least)
-        weights = np.maximum(0.0, prices - STIFFNESS * slack / scales)
-        prices = np.where(good[:, None], weights, prices)
-        pull = np.einsum("lc,lcf->lf", weights / scales, slopes)
-        uphill = _gradient(kept, free, widths) / size + pull
-        uphill = np.where(good[:, None], uphill, 0.0)
-        step, memory = optimiser.update(jnp.asarray(uphill), memory)
-        shrink = rates * 0.5 * (1.0 + np.cos(np.pi * i / n_steps))
-        trial = np.clip(u + shrink * np.asarray(step), 0.0, 1.0)
-        gait = evaluate(trial, kept)
-        holds = found(gait) & good & _on_branch(kept, gait, change(trial - u))
-        lost += good & ~holds
-        rates = np.where(holds[:, None], rates, 0.5 * rates)
-        u = np.where(holds[:, None], trial, u)
-        kept = jax.tree.map(lambda new, old, h=holds: _chosen(h, new, old), gait, kept)
-    slack, _ = _constraints(kept, free, widths, least)
-    objective = np.where(good, np.asarray(kept.values)[:, 0], np.nan)
-    evaluated = n_lanes * (n_steps + 1)
-    return Lanes(starts, u, objective, breach(slack, scales), lost, evaluated)
+    n_starts = starts.shape[0]
+    trial_evaluation = evaluate(starts, None)
+    is_active = has_gait(trial_evaluation)
+    slacks, slack_jacobian = _slack_and_jacobian(
+        trial_evaluation, free_indices, widths, min_constraint_values
+    )
+    scales = scale_slacks(slacks, slack_jacobian)[is_active]
+    scales = np.median(scales, axis=0) if is_active.any() else np.ones(min_constraint_values.size)
+    objective_scale = _objective_gradient(trial_evaluation, free_indices, widths)[is_active]
+    objective_scale = np.median(np.linalg.norm(objective_scale, axis=1)) if is_active.any() else 1.0
+    learning_rates = np.full((n_starts, 1), LEARNING_RATE)
+    optimizer = optax.scale_by_adam(b1=0.7, b2=0.9)
+    optimizer_state = optimizer.init(jnp.asarray(starts))
+    multipliers = np.zeros((n_starts, min_constraint_values.size))
+    normalized_parameters, evaluation, n_lost = (
+        starts.copy(),
+        trial_evaluation,
+        np.zeros(n_starts, int),
+    )
+    for step_index in range(n_steps):
+        slacks, slack_jacobian = _slack_and_jacobian(
+            evaluation, free_indices, widths, min_constraint_values
+        )
+        weights = np.maximum(0.0, multipliers - PENALTY_WEIGHT * slacks / scales)
+        multipliers = np.where(is_active[:, None], weights, multipliers)
+        penalty_gradient = np.einsum("lc,lcf->lf", weights / scales, slack_jacobian)
+        ascent_direction = (
+            _objective_gradient(evaluation, free_indices, widths) / objective_scale
+            + penalty_gradient
+        )
+        ascent_direction = np.where(is_active[:, None], ascent_direction, 0.0)
+        update, optimizer_state = optimizer.update(jnp.asarray(ascent_direction), optimizer_state)
+        step_sizes = learning_rates * 0.5 * (1.0 + np.cos(np.pi * step_index / n_steps))
+        trial_parameters = np.clip(
+            normalized_parameters + step_sizes * np.asarray(update), 0.0, 1.0
+        )
+        trial_evaluation = evaluate(trial_parameters, evaluation)
+        is_accepted = (
+            has_gait(trial_evaluation)
+            & is_active
+            & _stays_on_branch(
+                evaluation,
+                trial_evaluation,
+                parameter_change(trial_parameters - normalized_parameters),
+            )
+        )
+        n_lost += is_active & ~is_accepted
+        learning_rates = np.where(is_accepted[:, None], learning_rates, 0.5 * learning_rates)
+        normalized_parameters = np.where(
+            is_accepted[:, None], trial_parameters, normalized_parameters
+        )
+        evaluation = jax.tree.map(
+            lambda new, old, h=is_accepted: _select(h, new, old), trial_evaluation, evaluation
+        )
+    slacks, _ = _slack_and_jacobian(evaluation, free_indices, widths, min_constraint_values)
+    objective = np.where(is_active, np.asarray(evaluation.values)[:, 0], np.nan)
+    n_evaluations = n_starts * (n_steps + 1)
+    return Exploration(
+        starts, normalized_parameters, objective, max_breach(slacks, scales), n_lost, n_evaluations
+    )
 
 
-def found(told: Evaluated) -> np.ndarray:
+def has_gait(evaluation: GaitEvaluation) -> np.ndarray:
     """Return whether each start has a gait that the event-driven step confirms."""
-    return told.gait.outcome == Outcome.STEPPED
+    return evaluation.gait.outcome == Outcome.STEPPED
 
 
-def _chosen(holds: np.ndarray, new: jax.Array, old: jax.Array) -> jax.Array:
-    return jnp.where(holds.reshape(-1, *(1,) * (jnp.ndim(new) - 1)), new, old)
+def _select(is_accepted: np.ndarray, new_leaf: jax.Array, old_leaf: jax.Array) -> jax.Array:
+    return jnp.where(is_accepted.reshape(-1, *(1,) * (jnp.ndim(new_leaf) - 1)), new_leaf, old_leaf)
 
 
-def _gradient(gait: Evaluated, free: list[int], widths: np.ndarray) -> np.ndarray:
-    return np.asarray(gait.columns)[:, free, 0] * widths
+def _objective_gradient(
+    evaluation: GaitEvaluation, free_indices: list[int], widths: np.ndarray
+) -> np.ndarray:
+    return np.asarray(evaluation.jacobian)[:, free_indices, 0] * widths
 
 
-def _constraints(
-    gait: Evaluated, free: list[int], widths: np.ndarray, least: np.ndarray
+def _slack_and_jacobian(
+    evaluation: GaitEvaluation,
+    free_indices: list[int],
+    widths: np.ndarray,
+    min_constraint_values: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return slack, and its derivatives with respect to u: (start, constraint) and (start,
     constraint, free)."""
-    slopes = np.swapaxes(np.asarray(gait.columns)[:, free, 1:], 1, 2) * widths
-    return np.asarray(gait.values)[:, 1:] - least, slopes
+    jacobian = np.swapaxes(np.asarray(evaluation.jacobian)[:, free_indices, 1:], 1, 2) * widths
+    return np.asarray(evaluation.values)[:, 1:] - min_constraint_values, jacobian
 
 
-def _on_branch(here: Evaluated, there: Evaluated, change: np.ndarray) -> np.ndarray:
-    first, second = here.gait.on_branch, there.gait.on_branch
-    pairs = ((*taken((first, second), i), row) for i, row in enumerate(change))
-    return np.array([same_branch(*pair) for pair in pairs])
+def _stays_on_branch(
+    previous: GaitEvaluation, trial: GaitEvaluation, parameter_changes: np.ndarray
+) -> np.ndarray:
+    previous_points, trial_points = previous.gait.branch_point, trial.gait.branch_point
+    pairs = (
+        (*take_rows((previous_points, trial_points), i), row)
+        for i, row in enumerate(parameter_changes)
+    )
+    return np.array([is_same_branch(*pair) for pair in pairs])

@@ -1,19 +1,19 @@
 """Steps, walks, trajectories, and the attractors that walks reach."""
 
-from vrw_jax.walks.basins import BEFORE, basin
+from vrw_jax.walks.basins import PRE_TOUCHDOWN_NAMES, basin
 from vrw_jax.walks.stepping import (
     ModelLike,
     Walk,
-    checked,
+    check_model,
+    check_options,
+    check_section_state,
+    check_single_wheel,
     choose_model,
-    one_wheel,
-    options_of,
     paper_start,
     return_map,
-    rung_of,
-    state_of,
     step,
+    validate_arguments,
     walk,
-    walk_towards,
+    walk_toward_gait,
 )
 from vrw_jax.walks.trajectory import simulate

@@ -10,36 +10,36 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.models import AbstractWheel
-from vrw_jax.numerics import Engine, Options
-from vrw_jax.results import MARGINS, MEASURES, attrs_of, provenance
+from vrw_jax.numerics import EngineName, StepOptions
+from vrw_jax.results import MARGIN_MEASURES, MEASURES, measure_attrs, provenance
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.walks.attractors import distinct, orbit_measures, settle
-from vrw_jax.walks.stepping import ModelLike, one_wheel, options_of, rung_of
+from vrw_jax.walks.attractors import find_distinct_orbits, measure_orbits, walk_until_periodic
+from vrw_jax.walks.stepping import ModelLike, check_model, check_options, check_single_wheel
 from vrw_jax.wheel import Outcome, WheelParams, transitions
-from vrw_jax.wording import instance, reals, untraced, whole
+from vrw_jax.wording import check_int, check_not_traced, check_reals, check_type
 
-BEFORE = ("theta_touchdown", "dtheta_touchdown", "dL1_touchdown")
+PRE_TOUCHDOWN_NAMES = ("theta_touchdown", "dtheta_touchdown", "dL1_touchdown")
 """Names of the components of a section state just before touchdown, in rad, rad/s, m/s."""
 
-AFTER = ("theta_post_impact", "dtheta_post_impact")
+POST_LANDING_NAMES = ("theta_post_impact", "dtheta_post_impact")
 """Names of the components of a state just after a landing on both feet, in rad, rad/s."""
 
-Grid = Mapping[str, float | Sequence[float] | np.ndarray]
+StartGrid = Mapping[str, float | Sequence[float] | np.ndarray]
 """Values of each component of a start, by name; a single number is not an axis."""
 
-NONE = -1
+NO_ATTRACTOR = -1
 """Index of a start that reaches no attractor."""
 
 
 def basin(
     params: WheelParams,
-    grid: Grid,
+    grid: StartGrid,
     *,
     model: ModelLike | None = None,
-    options: Options | None = None,
-    engine: Engine = "auto",
-    most_steps: int = 200,
-    longest_period: int = 16,
+    options: StepOptions | None = None,
+    engine: EngineName = "auto",
+    max_steps: int = 200,
+    max_period: int = 16,
 ) -> xr.Dataset:
     """Return where a walk from each start of `grid` ends, as a labelled dataset.
 
@@ -79,67 +79,72 @@ def basin(
         >>> basins.attractor.values.tolist()
         [0, 0]
     """
-    model, options = _checked(params, model, options)
-    options = options.by(engine)
-    most_steps = whole("most_steps", most_steps)
-    longest_period = whole("longest_period", longest_period)
-    values = _values(grid)
+    model, options = _validate_arguments(params, model, options)
+    options = options.with_engine(engine)
+    max_steps = check_int("most_steps", max_steps)
+    max_period = check_int("longest_period", max_period)
+    values = _parse_grid_values(grid)
     names = tuple(values)
     axes = [name for name in names if np.ndim(grid[name]) > 0]
     shape = tuple(len(values[name]) for name in axes)
     mesh = np.meshgrid(*values.values(), indexing="ij")
-    places = np.stack([m.ravel() for m in mesh], -1)
-    starts = places if names == BEFORE else _before_landing(params, places)
-    reachable = np.isfinite(starts).all(-1)
-    starts = np.where(reachable[:, None], starts, np.nan)
-    full = functools.partial(model.full_section, params)
-    starts = np.asarray(jax.vmap(full)(jnp.asarray(starts)))
-    settled = settle(params, starts, model, options, most_steps, longest_period)
-    attractors = distinct(settled)
+    points = np.stack([m.ravel() for m in mesh], -1)
+    starts = points if names == PRE_TOUCHDOWN_NAMES else _invert_landing(params, points)
+    is_reachable = np.isfinite(starts).all(-1)
+    starts = np.where(is_reachable[:, None], starts, np.nan)
+    to_full_state = functools.partial(model.embed_section, params)
+    starts = np.asarray(jax.vmap(to_full_state)(jnp.asarray(starts)))
+    walk_ends = walk_until_periodic(params, starts, model, options, max_steps, max_period)
+    attractors = find_distinct_orbits(walk_ends)
 
     data = {
         "attractor": xr.Variable(
             axes,
-            attractors.of_start.reshape(shape),
-            {"long_name": "orbit that the walk settles on", "flag_none": NONE},
+            attractors.orbit_index.reshape(shape),
+            {"long_name": "orbit that the walk settles on", "flag_none": NO_ATTRACTOR},
         ),
-        "outcome": xr.Variable(axes, settled.outcome.reshape(shape), attrs_of("outcome")),
+        "outcome": xr.Variable(axes, walk_ends.outcome.reshape(shape), measure_attrs("outcome")),
         "steps": xr.Variable(
             axes,
-            settled.steps.reshape(shape),
+            walk_ends.n_steps.reshape(shape),
             {"units": "1", "long_name": "steps until the orbit is reached, or the fall"},
         ),
     }
-    labels = {name: _label(name, values[name], name in axes) for name in names}
-    orbits = _orbits(params, attractors.orbits, longest_period, model, options)
+    labels = {name: _make_coordinate(name, values[name], name in axes) for name in names}
+    orbits = _make_orbit_variables(params, attractors.orbits, max_period, model, options)
     attrs = {
         "title": "Basins of attraction",
-        "most_steps": most_steps,
-        "starts": "before touchdown" if names == BEFORE else "after landing",
+        "most_steps": max_steps,
+        "starts": "before touchdown" if names == PRE_TOUCHDOWN_NAMES else "after landing",
     }
     return xr.Dataset(data | orbits, labels, attrs | provenance(params, model, options))
 
 
-def _label(name: str, values: np.ndarray, is_axis: bool) -> xr.Variable:
+def _make_coordinate(name: str, values: np.ndarray, is_axis: bool) -> xr.Variable:
     """Return the coordinate of a component of the starts."""
-    dims, told = (name, values) if is_axis else ((), values[0])
-    return xr.Variable(dims, told, dict(MEASURES[name].attrs))
+    dims, coordinate_values = (name, values) if is_axis else ((), values[0])
+    return xr.Variable(dims, coordinate_values, dict(MEASURES[name].attrs))
 
 
-def _checked(
-    params: WheelParams, model: ModelLike | None, options: Options | None
-) -> tuple[AbstractWheel, Options]:
+def _validate_arguments(
+    params: WheelParams, model: ModelLike | None, options: StepOptions | None
+) -> tuple[AbstractWheel, StepOptions]:
     """Return model and options with their defaults; raise if an argument is invalid."""
-    untraced("vrw.basin", "map vrw.walk over the starts", params, options)
-    one_wheel(params, "ask for one basin after the other")
-    rung, options = rung_of(model).upper, options_of(options)  # valid for any start
-    options.require_reachable(np.dtype(params.damping.dtype))
-    return rung, options
+    check_not_traced("vrw.basin", "map vrw.walk over the starts", params, options)
+    check_single_wheel(params, "ask for one basin after the other")
+    checked_model, options = (
+        check_model(model).fallback_model,
+        check_options(options),
+    )  # valid for any start
+    options.check_tolerances(np.dtype(params.damping.dtype))
+    return checked_model, options
 
 
-def _values(grid: Grid) -> dict[str, np.ndarray]:
+def _parse_grid_values(grid: StartGrid) -> dict[str, np.ndarray]:
     """Return the values of each component as an array of one axis; raise for other shapes."""
-    values = {name: np.asarray(reals(name, grid[name]), float) for name in _names(grid)}
+    values = {
+        name: np.asarray(check_reals(name, grid[name]), float) for name in _find_grid_names(grid)
+    }
     for name, value in values.items():
         if value.ndim > 1 or not value.size:
             raise ValueError(
@@ -149,53 +154,55 @@ def _values(grid: Grid) -> dict[str, np.ndarray]:
     return {name: np.atleast_1d(value) for name, value in values.items()}
 
 
-def _names(grid: Grid) -> tuple[str, ...]:
+def _find_grid_names(grid: StartGrid) -> tuple[str, ...]:
     """Return the names of the components; raise unless the grid names all of one kind."""
-    instance("grid", grid, Mapping, "write {'theta_touchdown': 0.09, 'dtheta_touchdown': ...}")
-    for names in (BEFORE, AFTER):
+    check_type("grid", grid, Mapping, "write {'theta_touchdown': 0.09, 'dtheta_touchdown': ...}")
+    for names in (PRE_TOUCHDOWN_NAMES, POST_LANDING_NAMES):
         if set(grid) == set(names):
             return names
     raise ValueError(
         f"the grid names {', '.join(grid) or 'nothing'}, but it must name all of "
-        f"{', '.join(BEFORE)}, or all of {', '.join(AFTER)}: give each a number or an axis."
+        f"{', '.join(PRE_TOUCHDOWN_NAMES)}, or all of {', '.join(POST_LANDING_NAMES)}: give each a number or an axis."
     )
 
 
-def _before_landing(params: WheelParams, places: np.ndarray) -> np.ndarray:
+def _invert_landing(params: WheelParams, points: np.ndarray) -> np.ndarray:
     """Return section states with dL1- = 0 whose landing leads to (theta+, dtheta+), or NaN.
 
     The angular rate after the landing is proportional to that before the landing.
     """
     s = params.symbols()
 
-    def one(place: jax.Array) -> jax.Array:
-        theta, wanted = place[0] + s.alpha, place[1]
-        landing = transitions.land(s, theta, jnp.ones_like(wanted), jnp.zeros_like(wanted))
-        dtheta = wanted / landing.motion.dtheta
-        good = landing.stays & (dtheta > 0.0)
-        return jnp.where(good, jnp.stack([theta, dtheta, 0.0 * dtheta]), jnp.nan)
+    def invert_at_point(point: jax.Array) -> jax.Array:
+        theta, target_rate = point[0] + s.alpha, point[1]
+        landing = transitions.land(
+            s, theta, jnp.ones_like(target_rate), jnp.zeros_like(target_rate)
+        )
+        dtheta = target_rate / landing.motion.dtheta
+        is_admissible = landing.keeps_rear_foot & (dtheta > 0.0)
+        return jnp.where(is_admissible, jnp.stack([theta, dtheta, 0.0 * dtheta]), jnp.nan)
 
-    return np.asarray(jax.vmap(one)(jnp.asarray(places)))
+    return np.asarray(jax.vmap(invert_at_point)(jnp.asarray(points)))
 
 
-def _orbits(
+def _make_orbit_variables(
     params: WheelParams,
     orbits: list[np.ndarray],
-    longest: int,
+    max_period: int,
     model: AbstractWheel,
-    options: Options,
+    options: StepOptions,
 ) -> dict[str, xr.Variable]:
     """Return states, periods, DLS fractions and least margins of the orbits."""
     n = len(orbits)
-    states = np.full((n, longest, model.section_size(params)), np.nan)
-    margins = MARGINS if model.section_size(params) == 3 else ()
-    fractions, least = np.zeros(n), {name: np.zeros(n) for name in margins}
+    states = np.full((n, max_period, model.section_size(params)), np.nan)
+    margins = MARGIN_MEASURES if model.section_size(params) == 3 else ()
+    fractions, least_margins = np.zeros(n), {name: np.zeros(n) for name in margins}
     for i, orbit in enumerate(orbits):
         states[i, : len(orbit)] = orbit
-        told = orbit_measures(params, orbit, model, options)
-        fractions[i] = told["duration_dls"].sum() / told["period"].sum()
+        measures = measure_orbits(params, orbit, model, options)
+        fractions[i] = measures["duration_dls"].sum() / measures["period"].sum()
         for name in margins:
-            least[name][i] = told[name].min()
+            least_margins[name][i] = measures[name].min()
     return {
         "orbit_state": xr.Variable(
             ("attractor_index", "orbit_step", "component"),
@@ -211,20 +218,22 @@ def _orbits(
             "attractor_index", fractions, dict(MEASURES["dls_fraction"].attrs)
         ),
         **{
-            f"orbit_{name}": xr.Variable("attractor_index", values, dict(MARGINS[name].attrs))
-            for name, values in least.items()
+            f"orbit_{name}": xr.Variable(
+                "attractor_index", values, dict(MARGIN_MEASURES[name].attrs)
+            )
+            for name, values in least_margins.items()
         },
     }
 
 
-def share(result: xr.Dataset) -> dict[str, float]:
+def compute_end_shares(basins: xr.Dataset) -> dict[str, float]:
     """Return the share of starts by end: "attractor 0", ..., or the name of the outcome."""
-    told = result.attractor.values.ravel()
-    codes = result.outcome.values.ravel()
+    attractors = basins.attractor.values.ravel()
+    codes = basins.outcome.values.ravel()
     names = [
         f"attractor {a}"
         if a >= 0
         else ("unsettled" if c == Outcome.STEPPED else Outcome(int(c)).name)
-        for a, c in zip(told, codes, strict=True)
+        for a, c in zip(attractors, codes, strict=True)
     ]
     return {name: names.count(name) / len(names) for name in sorted(set(names))}

@@ -18,20 +18,29 @@ from jaxtyping import Array, Int
 
 from vrw_jax.models import (
     AbstractWheel,
-    Advance,
-    GroundOfStep,
+    AdvanceResult,
     LadderStep,
     LadderWheel,
     ModelChoice,
     SectionState,
+    StepGround,
     StepResult,
     UnilateralStep,
     UnilateralWheel,
     ViscoelasticWheel,
 )
-from vrw_jax.numerics import Engine, Options
+from vrw_jax.numerics import EngineName, StepOptions
 from vrw_jax.wheel import Outcome, WheelParams
-from vrw_jax.wording import AbstractTold, Row, counted, instance, listed, reals, told, whole
+from vrw_jax.wording import (
+    AbstractPrintable,
+    TextRow,
+    check_int,
+    check_reals,
+    check_type,
+    format_numbers,
+    format_outcome_counts,
+    format_quantity,
+)
 
 SectionLike = Array | np.ndarray | Sequence[float]
 """Section state as a caller gives it; `validate_arguments` converts it to an array."""
@@ -49,16 +58,16 @@ def paper_start() -> SectionState:
         >>> vrw.paper_start().round(4).tolist()
         [0.1, 1.6, -0.1]
     """
-    return ViscoelasticWheel().start(WheelParams())
+    return ViscoelasticWheel().default_start(WheelParams())
 
 
-def rung_of(model: ModelLike | None, many: bool = False) -> AbstractWheel:
+def check_model(model: ModelLike | None, allows_arrays: bool = False) -> AbstractWheel:
     """Return the model of an argument: by default the paper's, for "auto" a `LadderWheel`.
 
     Raise if the argument is no model, or if its friction is an array although that is not allowed.
     """
     if model is None:
-        return _paper_wheel()
+        return _make_default_model()
     if isinstance(model, str) and model == "auto":
         return LadderWheel()
     if not isinstance(model, AbstractWheel):
@@ -66,62 +75,66 @@ def rung_of(model: ModelLike | None, many: bool = False) -> AbstractWheel:
             f"model is {model!r}, but a rung of the ladder is needed: give "
             'vrw.ViscoelasticWheel(), vrw.RigidWheel(), vrw.UnilateralWheel() or "auto".'
         )
-    if not many and (shape := jnp.shape(getattr(model, "friction", 0.0))):
+    if not allows_arrays and (shape := jnp.shape(getattr(model, "friction", 0.0))):
         raise ValueError(
             f"friction has shape {shape}, but this is about one ground: give one number, or vary "
-            "it in a design of vrw.scan; vrw.steps takes one for each lane, vrw.walk one for each "
+            "it in a design of vrw.scan; vrw.step_batch takes one for each lane, vrw.walk one for each "
             "of its steps."
         )
     return model
 
 
-_paper_wheel = functools.cache(ViscoelasticWheel)
+_make_default_model = functools.cache(ViscoelasticWheel)
 
 
-def one_wheel(params: Any, instead: str) -> None:
+def check_single_wheel(params: Any, remedy: str) -> None:
     """Raise unless `params` is a single wheel; `remedy` completes the message."""
-    instance("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
-    WheelParams.require_one(params, instead)  # binding it takes as long as a step
+    check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
+    WheelParams.require_single(params, remedy)  # binding it takes as long as a step
 
 
-def options_of(options: Options | None) -> Options:
+def check_options(options: StepOptions | None) -> StepOptions:
     """Return the options, by default `StepOptions()`; raise if they are of another type."""
     if options is not None:
-        instance("options", options, Options, "give vrw.Options(), or vrw.Options.tight()")
-    return _usual(jnp.result_type(float)) if options is None else options
+        check_type(
+            "options", options, StepOptions, "give vrw.StepOptions(), or vrw.StepOptions.tight()"
+        )
+    return _make_default_options(jnp.result_type(float)) if options is None else options
 
 
 @functools.cache
-def _usual(dtype: np.dtype) -> Options:
+def _make_default_options(dtype: np.dtype) -> StepOptions:
     """Return the default options, made once per type and concrete even under a trace."""
     with jax.ensure_compile_time_eval():
-        return Options()
+        return StepOptions()
 
 
-def state_of(x: Any, what: str = "the section state", read: Callable = reals) -> Any:
+def check_section_state(
+    x: Any, description: str = "the section state", converter: Callable = check_reals
+) -> Any:
     """Return the section state that `converter` makes of an argument; raise if it is invalid."""
-    return read(
-        what,
+    return converter(
+        description,
         x,
         "give (theta-, dtheta-, dL1-), as vrw.paper_start(), or that of a cycle, "
         "cycle.section_state",
     )
 
 
-def checked(
+def validate_arguments(
     params: WheelParams,
     x: object,
     model: ModelLike | None,
-    options: Options | None,
-    engine: Engine = "auto",
-) -> tuple[WheelParams, Array, AbstractWheel, Options]:
+    options: StepOptions | None,
+    engine: EngineName = "auto",
+) -> tuple[WheelParams, Array, AbstractWheel, StepOptions]:
     """Return wheel, section state, model and options of one type; raise if one is invalid."""
-    one_wheel(params, "map over batches of parameters with jax.vmap, or use vrw.scan")
-    model, options = rung_of(model), Options.by(options_of(options), engine)
-    state = state_of(x)
+    check_single_wheel(params, "map over batches of parameters with jax.vmap, or use vrw.scan")
+    model, options = check_model(model), StepOptions.with_engine(check_options(options), engine)
+    state = check_section_state(x)
     size = model.section_size(params)
     if state.shape == (3,) and size != 3:
-        state = model.full_section(params, state)
+        state = model.embed_section(params, state)
     if state.shape != (size,):
         raise ValueError(
             f"the section state has shape {state.shape}, but it is (theta-, dtheta-, dL1-), shape "
@@ -129,9 +142,9 @@ def checked(
             "for batches map over it with jax.vmap."
         )
     # Parameters made in single precision stay inaccurate after a conversion to double precision.
-    Options.require_reachable(options, jnp.result_type(*jax.tree.leaves(params)))
+    StepOptions.check_tolerances(options, jnp.result_type(*jax.tree.leaves(params)))
     dtype = jnp.result_type(state, params.damping)
-    Options.require_reachable(options, dtype)
+    StepOptions.check_tolerances(options, dtype)
 
     def convert(tree: Any) -> Any:
         """Return the tree with all leaves of the common type."""
@@ -148,8 +161,8 @@ def step(  # type: ignore[overload-overlap]
     x: SectionLike,
     *,
     model: UnilateralWheel,
-    options: Options | None = None,
-    engine: Engine = "auto",
+    options: StepOptions | None = None,
+    engine: EngineName = "auto",
 ) -> UnilateralStep: ...
 
 
@@ -159,8 +172,8 @@ def step(  # type: ignore[overload-overlap]
     x: SectionLike,
     *,
     model: LadderWheel | Literal["auto"],
-    options: Options | None = None,
-    engine: Engine = "auto",
+    options: StepOptions | None = None,
+    engine: EngineName = "auto",
 ) -> LadderStep: ...
 
 
@@ -170,8 +183,8 @@ def step(
     x: SectionLike,
     *,
     model: AbstractWheel | None = None,
-    options: Options | None = None,
-    engine: Engine = "auto",
+    options: StepOptions | None = None,
+    engine: EngineName = "auto",
 ) -> StepResult: ...
 
 
@@ -180,8 +193,8 @@ def step(
     x: SectionLike,
     *,
     model: ModelLike | None = None,
-    options: Options | None = None,
-    engine: Engine = "auto",
+    options: StepOptions | None = None,
+    engine: EngineName = "auto",
 ) -> StepResult | UnilateralStep | LadderStep:
     """Return one step from touchdown to touchdown, with indicators, margins and energies.
 
@@ -208,8 +221,8 @@ def step(
         >>> print(f"{step.period:.3f} s, {vrw.Outcome(int(step.outcome)).name}")
         0.714 s, STEPPED
     """
-    params, state, model, options = checked(params, x, model, options, engine)
-    return model.step(params, state, options)
+    params, state, model, options = validate_arguments(params, x, model, options, engine)
+    return model.take_step(params, state, options)
 
 
 def return_map(
@@ -217,8 +230,8 @@ def return_map(
     x: SectionLike,
     *,
     model: ModelLike | None = None,
-    options: Options | None = None,
-    engine: Engine = "auto",
+    options: StepOptions | None = None,
+    engine: EngineName = "auto",
 ) -> Array:
     """Return the section state one step later; all zeros (no section state) if the step failed.
 
@@ -245,11 +258,11 @@ def return_map(
         >>> jax.jacfwd(vrw.return_map, argnums=1)(params, x).shape
         (3, 3)
     """
-    params, state, model, options = checked(params, x, model, options, engine)
+    params, state, model, options = validate_arguments(params, x, model, options, engine)
     return model.advance(params, state, options).section_state
 
 
-class Walk(AbstractTold):
+class Walk(AbstractPrintable):
     """Results of consecutive steps without margins, with a leading axis over steps.
 
     - `start`: section state at the start;
@@ -263,61 +276,63 @@ class Walk(AbstractTold):
     """
 
     start: Array
-    steps: Advance
+    steps: AdvanceResult
     n_stepped: Int[Array, ""]
 
     @property
     def outcome(self) -> Array:
         """Return the outcome of the walk: that of the first failed step, or STEPPED."""
-        last = self.steps.outcome.shape[-1] - 1
+        last_index = self.steps.outcome.shape[-1] - 1
         return jnp.take_along_axis(
-            self.steps.outcome, jnp.minimum(self.n_stepped, last)[..., None], axis=-1
+            self.steps.outcome, jnp.minimum(self.n_stepped, last_index)[..., None], axis=-1
         )[..., 0]
 
-    def rows(self) -> list[Row]:
+    def summary_rows(self) -> list[TextRow]:
         """Return names and texts of outcome, steps, start, last state and time."""
         outcome = np.asarray(self.outcome)
         if outcome.ndim:
-            return [("walks", counted(outcome, Outcome))]
-        last = max(int(self.n_stepped) - 1, 0)
+            return [("walks", format_outcome_counts(outcome, Outcome))]
+        last_index = max(int(self.n_stepped) - 1, 0)
         return [
             ("outcome", Outcome(int(outcome)).meaning),
             ("steps", f"{int(self.n_stepped)} of {self.steps.outcome.shape[-1]}"),
-            ("start", f"{listed(self.start)} (rad, rad/s, m/s)"),
-            ("last section state", listed(self.steps.section_state[last])),
-            ("time", told(np.sum(self.steps.durations), "s")),
+            ("start", f"{format_numbers(self.start)} (rad, rad/s, m/s)"),
+            ("last section state", format_numbers(self.steps.section_state[last_index])),
+            ("time", format_quantity(np.sum(self.steps.durations), "s")),
         ]
 
 
 @eqx.filter_jit
-def _walk(
+def _scan_steps(
     model: AbstractWheel,
     params: WheelParams,
     x: Array,
-    options: Options,
+    options: StepOptions,
     n_steps: int,
-    over_steps: GroundOfStep | None,
+    ground_per_step: StepGround | None,
 ) -> Walk:
     """Return a walk of `n_steps` steps; the steps after a failure repeat its outcome."""
 
-    def one(carry: tuple, ground: GroundOfStep | None) -> tuple:
+    def take_gait_step(carry: tuple, ground: StepGround | None) -> tuple:
         """Return the next carry and one step, which is not taken after a failure."""
         x, outcome = carry
-        walking = outcome == Outcome.STEPPED
-        here = (model, params) if ground is None else model.on_ground(params, ground)
-        advance = here[0].advance(here[1], jnp.where(walking, x, jnp.nan), options)
-        outcome = jnp.where(walking, advance.outcome, outcome)
+        is_walking = outcome == Outcome.STEPPED
+        model_and_params = (model, params) if ground is None else model.with_ground(params, ground)
+        advance = model_and_params[0].advance(
+            model_and_params[1], jnp.where(is_walking, x, jnp.nan), options
+        )
+        outcome = jnp.where(is_walking, advance.outcome, outcome)
         advance = dataclasses.replace(
             advance,
-            durations=jnp.where(walking, advance.durations, 0.0),
+            durations=jnp.where(is_walking, advance.durations, 0.0),
             outcome=outcome,
-            solver_steps=jnp.where(walking, advance.solver_steps, 0),
+            solver_steps=jnp.where(is_walking, advance.solver_steps, 0),
         )
         return (advance.section_state, outcome), advance
 
     carry = (x, jnp.int32(Outcome.STEPPED))
-    steps: Advance
-    _, steps = lax.scan(one, carry, over_steps, length=n_steps)
+    steps: AdvanceResult
+    _, steps = lax.scan(take_gait_step, carry, ground_per_step, length=n_steps)
     return Walk(x, steps, jnp.sum(steps.outcome == Outcome.STEPPED))
 
 
@@ -327,8 +342,8 @@ def walk(
     n_steps: int,
     *,
     model: ModelLike | None = None,
-    options: Options | None = None,
-    engine: Engine = "auto",
+    options: StepOptions | None = None,
+    engine: EngineName = "auto",
 ) -> Walk:
     """Return a walk of `n_steps` steps; the steps after a failure repeat its outcome.
 
@@ -358,23 +373,27 @@ def walk(
         >>> int(walk.n_stepped), walk.steps.durations.shape
         (5, (5, 3))
     """
-    n_steps = whole("n_steps", n_steps)
-    rung, over_steps = rung_of(model, many=True), None
+    n_steps = check_int("n_steps", n_steps)
+    checked_model, ground_per_step = check_model(model, allows_arrays=True), None
     if isinstance(params, WheelParams):
-        over_steps = rung.over_steps(params, n_steps)
-    if over_steps is not None:
-        rung, params = rung.on_ground(params, jax.tree.map(lambda row: row[0], over_steps))
-    params, state, rung, options = checked(params, x, rung, options, engine)
-    return _walk(rung, params, state, options, n_steps, over_steps)
+        ground_per_step = checked_model.split_ground(params, n_steps)
+    if ground_per_step is not None:
+        checked_model, params = checked_model.with_ground(
+            params, jax.tree.map(lambda row: row[0], ground_per_step)
+        )
+    params, state, checked_model, options = validate_arguments(
+        params, x, checked_model, options, engine
+    )
+    return _scan_steps(checked_model, params, state, options, n_steps, ground_per_step)
 
 
-N_TOWARDS = 100
+N_APPROACH_STEPS = 100
 """Number of steps toward a gait, for a search that needs a state near the gait."""
 
 
-def walk_towards(model: AbstractWheel, params: WheelParams, options: Options) -> Walk:
+def walk_toward_gait(model: AbstractWheel, params: WheelParams, options: StepOptions) -> Walk:
     """Return a walk toward an attracting gait from the default start of the model."""
-    return walk(params, model.start(params), N_TOWARDS, model=model, options=options)
+    return walk(params, model.default_start(params), N_APPROACH_STEPS, model=model, options=options)
 
 
 def choose_model(
@@ -382,7 +401,7 @@ def choose_model(
     start: SectionLike,
     *,
     friction: float | Array = 0.7,
-    options: Options | None = None,
+    options: StepOptions | None = None,
 ) -> ModelChoice:
     """Return the simplest model whose margins hold over one step from `start`.
 
@@ -407,5 +426,5 @@ def choose_model(
         'UnilateralWheel'
     """
     model = LadderWheel(friction=friction)
-    params, x, _, options = checked(params, start, model, options)
-    return model.choose(params, x, options)[0]
+    params, x, _, options = validate_arguments(params, start, model, options)
+    return model.choose_model(params, x, options)[0]

@@ -6,18 +6,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlencode
 
-from vrw_jax.wheel import DOMAINS, FRICTION, WheelParams, known_friction
-from vrw_jax.wording import chosen, instance, untraced, whole
+from vrw_jax.wheel import FRICTION_NAME, PARAMETER_DOMAINS, WheelParams, require_known_friction
+from vrw_jax.wording import check_choice, check_int, check_not_traced, check_type
 
 if TYPE_CHECKING:
     import xarray as xr
 
-RUNGS = "viscoelastic", "rigid", "unilateral"
+PAGE_MODEL_NAMES = "viscoelastic", "rigid", "unilateral"
 """Names of the models that the page supports."""
-HEIGHT = 900
+DEFAULT_HEIGHT_PIXELS = 900
 """Default height of the widget, in pixels."""
 
-FRAME = """
+WIDGET_JAVASCRIPT = """
 function render({ model, el }) {
   const frame = document.createElement("iframe");
   frame.title = "A wheel that walks on springs";
@@ -55,7 +55,7 @@ export default { render };
 """JavaScript of the widget: it shows the page in a frame and exchanges changed values with it."""
 
 
-def page_path() -> Path:
+def find_page() -> Path:
     """Return the path of the page, inside an installed package or beside it."""
     package = Path(__file__).parents[1]
     return next(
@@ -63,21 +63,23 @@ def page_path() -> Path:
     )
 
 
-def page_address(params: WheelParams, rung: str = RUNGS[0]) -> str:
+def make_page_address(params: WheelParams, model_name: str = PAGE_MODEL_NAMES[0]) -> str:
     """Return the address of the page, opened at this wheel."""
-    usual = _values(WheelParams(), 1.0, RUNGS[0])
-    given = _values(params, 1.0, chosen("rung", rung, RUNGS))
-    values = {name: value for name, value in given.items() if value != usual[name]}
-    return page_path().as_uri() + (f"#{urlencode(values)}" if values else "")
+    default_values = _page_values(WheelParams(), 1.0, PAGE_MODEL_NAMES[0])
+    values_of_wheel = _page_values(params, 1.0, check_choice("rung", model_name, PAGE_MODEL_NAMES))
+    values = {
+        name: value for name, value in values_of_wheel.items() if value != default_values[name]
+    }
+    return find_page().as_uri() + (f"#{urlencode(values)}" if values else "")
 
 
 def explore(
     params: WheelParams | None = None,
     *,
     friction: float = 1.0,
-    rung: str = "viscoelastic",
+    model_name: str = "viscoelastic",
     dataset: "xr.Dataset | None" = None,
-    height: int = HEIGHT,
+    height: int = DEFAULT_HEIGHT_PIXELS,
 ) -> Any:
     """Return an interactive widget of the wheel for Jupyter, JupyterLab, VS Code and marimo.
 
@@ -108,20 +110,24 @@ def explore(
         150.0
     """
     params = WheelParams() if params is None else params
-    instance("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
-    untraced("vrw.explore", "it shows one known wheel", params)
-    params.require_one("show one after the other")
-    given = {} if dataset is None else _map_of(dataset)
-    return _widget()(
-        page=page_path().read_text(encoding="utf-8"),
-        values=_values(params, known_friction(friction), chosen("rung", rung, RUNGS)),
-        map=given,
-        height=whole("height", height),
+    check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
+    check_not_traced("vrw.explore", "it shows one known wheel", params)
+    params.require_single("show one after the other")
+    map_data = {} if dataset is None else _make_map(dataset)
+    return _make_widget_class()(
+        page=find_page().read_text(encoding="utf-8"),
+        values=_page_values(
+            params,
+            require_known_friction(friction),
+            check_choice("rung", model_name, PAGE_MODEL_NAMES),
+        ),
+        map=map_data,
+        height=check_int("height", height),
     )
 
 
 @functools.cache
-def _widget() -> type:
+def _make_widget_class() -> type:
     """Return the class of the widget, created on first use because anywidget is optional."""
     try:
         import anywidget
@@ -135,75 +141,79 @@ def _widget() -> type:
     class Explorer(anywidget.AnyWidget):
         """Widget that shows the page in a frame and exchanges numbers with it."""
 
-        _esm = FRAME
+        _esm = WIDGET_JAVASCRIPT
         page = traitlets.Unicode().tag(sync=True)
         values = traitlets.Dict().tag(sync=True)
-        told = traitlets.Dict().tag(sync=True)
+        measures = traitlets.Dict().tag(sync=True)
         map = traitlets.Dict().tag(sync=True)
-        height = traitlets.Int(HEIGHT).tag(sync=True)
+        height = traitlets.Int(DEFAULT_HEIGHT_PIXELS).tag(sync=True)
 
         @property
         def params(self) -> WheelParams:
             """Return the wheel that is shown."""
-            numbers = {name: float(self.values[name]) for name in DOMAINS}
+            numbers = {name: float(self.values[name]) for name in PARAMETER_DOMAINS}
             return WheelParams(**numbers, n_legs=int(self.values["n_legs"]))
 
         @params.setter
         def params(self, params: WheelParams) -> None:
-            self.values = _values(params, self.friction, self.rung)
+            self.values = _page_values(params, self.friction, self.model_name)
 
         @property
         def friction(self) -> float:
             """Return the friction coefficient."""
-            return float(self.values[FRICTION])
+            return float(self.values[FRICTION_NAME])
 
         @friction.setter
         def friction(self, value: float) -> None:
-            self.values = {**self.values, FRICTION: known_friction(value)}
+            self.values = {**self.values, FRICTION_NAME: require_known_friction(value)}
 
         @property
-        def rung(self) -> str:
+        def model_name(self) -> str:
             """Return the name of the model."""
             return str(self.values["rung"])
 
-        @rung.setter
-        def rung(self, value: str) -> None:
-            self.values = {**self.values, "rung": chosen("rung", value, RUNGS)}
+        @model_name.setter
+        def model_name(self, value: str) -> None:
+            self.values = {**self.values, "rung": check_choice("rung", value, PAGE_MODEL_NAMES)}
 
     return Explorer
 
 
-def _values(params: WheelParams, friction: float, rung: str) -> dict[str, float | str]:
+def _page_values(params: WheelParams, friction: float, model_name: str) -> dict[str, float | str]:
     """Return the values that the page exchanges."""
-    numbers = {name: float(getattr(params, name)) for name in DOMAINS}
-    return {**numbers, FRICTION: friction, "n_legs": params.n_legs, "rung": rung}
+    numbers = {name: float(getattr(params, name)) for name in PARAMETER_DOMAINS}
+    return {**numbers, FRICTION_NAME: friction, "n_legs": params.n_legs, "rung": model_name}
 
 
-def _map_of(dataset: "xr.Dataset") -> dict[str, Any]:
+def _make_map(dataset: "xr.Dataset") -> dict[str, Any]:
     """Return a scan over two parameters in the format of the page's map, with None for NaN."""
     import xarray
 
-    instance("dataset", dataset, xarray.Dataset, "give a scan of vrw.grid over two parameters")
-    axes = [str(name) for name in dataset.sizes if name in DOMAINS and dataset.sizes[name] > 1]
+    check_type("dataset", dataset, xarray.Dataset, "give a scan of vrw.grid over two parameters")
+    axes = [
+        str(name) for name in dataset.sizes if name in PARAMETER_DOMAINS and dataset.sizes[name] > 1
+    ]
     if len(axes) != 2:
         raise ValueError(
             f"the dataset has the axes {', '.join(map(str, dataset.sizes))}, but a map has two "
             "parameters: give a scan of vrw.grid over two of them."
         )
-    flat = dataset.isel({name: 0 for name in dataset.sizes if name in DOMAINS and name not in axes})
+    plane = dataset.isel(
+        {name: 0 for name in dataset.sizes if name in PARAMETER_DOMAINS and name not in axes}
+    )
     measures: dict[str, Any] = {}
-    for name, column in flat.data_vars.items():
-        rest = [dim for dim in column.dims if dim not in axes]
+    for name, column in plane.data_vars.items():
+        other_dims = [dim for dim in column.dims if dim not in axes]
         if column.dtype.kind == "f" and set(axes) <= set(column.dims):
-            measures[str(name)] = _rows(column.min(rest).transpose(*axes[::-1]))
+            measures[str(name)] = _to_nested_lists(column.min(other_dims).transpose(*axes[::-1]))
     return {
-        "axes": [{"name": name, "values": flat[name].values.tolist()} for name in axes],
+        "axes": [{"name": name, "values": plane[name].values.tolist()} for name in axes],
         "measures": measures,
-        "outcome": flat["outcome"].transpose(*axes[::-1]).values.tolist(),
+        "outcome": plane["outcome"].transpose(*axes[::-1]).values.tolist(),
     }
 
 
-def _rows(values: Any) -> list[list[float | None]]:
+def _to_nested_lists(values: Any) -> list[list[float | None]]:
     """Return the values as nested lists, with None in place of a value that is not finite."""
-    finite = lambda x: float(x) if math.isfinite(x) else None
-    return [[finite(x) for x in row] for row in values.values.tolist()]
+    finite_or_none = lambda x: float(x) if math.isfinite(x) else None
+    return [[finite_or_none(x) for x in row] for row in values.values.tolist()]

@@ -12,17 +12,24 @@ from vrw_jax.wheel.geometry import (
 )
 from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import (
-    DOMAINS,
-    FRICTION,
-    LARGEST,
+    FRICTION_NAME,
+    MAX_SI_VALUE,
+    PARAMETER_DOMAINS,
     PARAMETER_NAMES,
     Symbols,
     WheelParams,
-    friction_of,
-    known_friction,
-    parameters_of,
-    symbols_of,
-    wheel_of,
+    compute_symbols,
+    convert_friction,
+    require_known_friction,
+    stack_parameters,
+    wheel_from_parameters,
 )
-from vrw_jax.wheel.phases import FALLS, PHASES, AbstractPhase, Instant, Premises, phases_of
+from vrw_jax.wheel.phases import (
+    PAPER_PHASES,
+    SHARED_FAILURES,
+    AbstractPhase,
+    PhaseInstant,
+    PhaseMargins,
+    make_phases,
+)
 from vrw_jax.wheel.transitions import Landing

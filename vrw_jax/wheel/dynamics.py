@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from vrw_jax.numerics import Elementwise, Vector
 from vrw_jax.wheel.geometry import (
-    CircleOfDoubleSupport,
+    DoubleSupportCircle,
     Motion,
     double_support_circle,
     rear_direction,
@@ -42,7 +42,7 @@ class MassMatrix(NamedTuple):
     M23: Elementwise  # kg
     M33: Elementwise  # kg
 
-    def times(self, x: tuple[Elementwise, Elementwise, Elementwise]) -> Vector:
+    def multiply(self, x: tuple[Elementwise, Elementwise, Elementwise]) -> Vector:
         """Return the product of the mass matrix and the vector x."""
         return (
             self.M11 * x[0] + self.M12 * x[1] + self.M13 * x[2],
@@ -51,7 +51,7 @@ class MassMatrix(NamedTuple):
         )
 
 
-class Terms(NamedTuple):
+class EquationTerms(NamedTuple):
     """Mass matrix and the applied forces f of M q'' = f + constraint forces (eq. 1)."""
 
     mass: MassMatrix
@@ -62,11 +62,11 @@ class Terms(NamedTuple):
 
 def mass_matrix(s: Symbols, L1: Elementwise, L2: Elementwise) -> MassMatrix:
     """Return M(q) of eq. (1) restricted to a planted Leg 1."""
-    b, coupling = L2 - s.a, _coupling(s, L2)
+    b, coupling = L2 - s.a, _coupling_moment(s, L2)
     # Grouped first, because it depends on parameters only.
-    still = s.m * (s.a * s.a + (s.n - 2) * s.c0 * s.c0)
+    constant_inertia = s.m * (s.a * s.a + (s.n - 2) * s.c0 * s.c0)
     return MassMatrix(
-        M11=L1 * (s.Mh * L1 + 2.0 * coupling) + (still + s.m * b * b),
+        M11=L1 * (s.Mh * L1 + 2.0 * coupling) + (constant_inertia + s.m * b * b),
         M12=s.m * s.sin_alpha * (L2 - s.L0),
         M13=-s.m * s.sin_alpha * L1,
         M22=s.Mh,
@@ -75,12 +75,12 @@ def mass_matrix(s: Symbols, L1: Elementwise, L2: Elementwise) -> MassMatrix:
     )
 
 
-def _coupling(s: Symbols, L2: Elementwise) -> Elementwise:
+def _coupling_moment(s: Symbols, L2: Elementwise) -> Elementwise:
     """Return the moment of mass that turns with the hub, kg m."""
     return s.m * (s.c0 + s.cos_alpha * s.L0) - s.m * s.cos_alpha * L2
 
 
-def terms(s: Symbols, motion: Motion) -> Terms:
+def equation_terms(s: Symbols, motion: Motion) -> EquationTerms:
     """Return the mass matrix and the applied forces.
 
     The forces are gravity, springs and dampers (eq. 3) and the inertial forces.
@@ -91,20 +91,20 @@ def terms(s: Symbols, motion: Motion) -> Terms:
     cos_p = cos * s.cos_phi - sin * s.sin_phi
     rear_sin_p = sin_p * s.cos_alpha + cos_p * s.sin_alpha  # of theta + alpha + phi
     rear_cos_p = cos_p * s.cos_alpha - sin_p * s.sin_alpha
-    P1 = s.Mh * L1 + _coupling(s, L2)  # half dM11/dL1
+    P1 = s.Mh * L1 + _coupling_moment(s, L2)  # half dM11/dL1
     P2 = s.m * (L2 - s.a) - s.m * s.cos_alpha * L1  # half dM11/dL2
     coriolis = 2.0 * s.m * s.sin_alpha * dtheta
-    fore, rear = s.g * s.m * s.L0 + s.g * s.Mh * L1, s.g * s.m * s.L0 - s.g * s.m * L2
-    tense = s.k * s.Ls
-    return Terms(
+    fore_moment, rear_moment = s.g * s.m * s.L0 + s.g * s.Mh * L1, s.g * s.m * s.L0 - s.g * s.m * L2
+    spring_preload = s.k * s.Ls
+    return EquationTerms(
         mass=mass,
-        f1=fore * sin_p + rear * rear_sin_p - 2.0 * (P1 * dL1 + P2 * dL2) * dtheta,
-        f2=(tense - s.k * L1)
+        f1=fore_moment * sin_p + rear_moment * rear_sin_p - 2.0 * (P1 * dL1 + P2 * dL2) * dtheta,
+        f2=(spring_preload - s.k * L1)
         - s.c * dL1
         + P1 * dtheta * dtheta
         - coriolis * dL2
         - s.g * s.Mh * cos_p,
-        f3=(tense - s.k * L2)
+        f3=(spring_preload - s.k * L2)
         - s.c * dL2
         + P2 * dtheta * dtheta
         + coriolis * dL1
@@ -117,12 +117,12 @@ def single_support_1_acceleration(s: Symbols, motion: Motion) -> Acceleration:
 
     Leg 2 swings and telescopes freely.
     """
-    return free_acceleration(s, motion.L1, terms(s, motion))
+    return free_acceleration(s, motion.L1, equation_terms(s, motion))
 
 
-def free_acceleration(s: Symbols, L1: Elementwise, free: Terms) -> Acceleration:
+def free_acceleration(s: Symbols, L1: Elementwise, terms: EquationTerms) -> Acceleration:
     """Return the accelerations of the applied forces alone: M q'' = f, with foot 1 at rest."""
-    M, f1, f2, f3 = free
+    M, f1, f2, f3 = terms
     q = s.sin_alpha * L1  # eliminates L2: its row of M is m (-q, -cos alpha, 1)
     A11 = M.M11 + M.M13 * q
     A12 = M.M12 + M.M13 * s.cos_alpha
@@ -147,11 +147,13 @@ def takeoff_acceleration(s: Symbols, motion: Motion) -> Elementwise:
     """
     L1, L2, dtheta = motion.L1, motion.L2, motion.dtheta
     ddtheta, ddL1, ddL2 = single_support_1_acceleration(s, motion)
-    rear = rear_direction(s, motion.sin, motion.cos)
-    inwards = (ddL1 - L1 * dtheta**2) * motion.cos - (ddL2 - L2 * dtheta**2) * rear.cos
+    rear_leg = rear_direction(s, motion.sin, motion.cos)
+    radial_difference = (ddL1 - L1 * dtheta**2) * motion.cos - (
+        ddL2 - L2 * dtheta**2
+    ) * rear_leg.cos
     across_1 = 2.0 * motion.dL1 * dtheta + L1 * ddtheta
     across_2 = 2.0 * motion.dL2 * dtheta + L2 * ddtheta
-    return inwards - across_1 * motion.sin + across_2 * rear.sin
+    return radial_difference - across_1 * motion.sin + across_2 * rear_leg.sin
 
 
 def single_support_2_acceleration(s: Symbols, motion: Motion) -> Acceleration:
@@ -159,19 +161,19 @@ def single_support_2_acceleration(s: Symbols, motion: Motion) -> Acceleration:
 
     Leg 2 is on its stopper, where M12 = 0.
     """
-    M, f1, f2, _ = terms(s, motion)
+    M, f1, f2, _ = equation_terms(s, motion)
     per_mass = 1.0 / M.M22
     return Acceleration(f1 / M.M11, f2 * per_mass, 0.0 * f1)
 
 
-class OneDegree(NamedTuple):
+class SingleDofEquation(NamedTuple):
     """Equation of motion of a single degree of freedom: inertia * ddtheta = force."""
 
     inertia: Elementwise  # kg m^2
     force: Elementwise  # N m
 
 
-def double_support(s: Symbols, distance: Elementwise, motion: Motion) -> OneDegree:
+def double_support_equation(s: Symbols, distance: Elementwise, motion: Motion) -> SingleDofEquation:
     """Return the equation of motion in DLS, where the hub moves on a circle (Section 3.3.1).
 
     It is `equation_terms` restricted to that circle. The bisector of both legs has a sine and
@@ -179,31 +181,43 @@ def double_support(s: Symbols, distance: Elementwise, motion: Motion) -> OneDegr
     whose coefficients depend on the wheel only, which halves the work of the restriction.
     """
     # `diameter` is that of the circle.
-    size, per = distance / s.sin_alpha, 1.0 / (1.0 + s.cos_alpha)
-    light, swing = s.g * (s.Mh - s.m) * size, s.m * s.c0 * size
-    leg, spring, damper = s.g * s.m * s.L0, s.k * size, s.c * size * size
-    at_rest = size * size * (s.Mh - s.m) + s.m * (2.0 * s.a * s.a + (s.n - 2) * s.c0 * s.c0)
-    by_sin = leg * s.cos_phi - s.Ls * spring
-    by_product = per * (s.cos_alpha * size * spring + light * s.cos_phi)
-    by_square = -per * light * s.sin_phi
+    diameter, bisector_factor = distance / s.sin_alpha, 1.0 / (1.0 + s.cos_alpha)
+    weight_factor, swing_inertia = s.g * (s.Mh - s.m) * diameter, s.m * s.c0 * diameter
+    leg_weight_moment, spring, damper = s.g * s.m * s.L0, s.k * diameter, s.c * diameter * diameter
+    constant_inertia = diameter * diameter * (s.Mh - s.m) + s.m * (
+        2.0 * s.a * s.a + (s.n - 2) * s.c0 * s.c0
+    )
+    sin_coefficient = leg_weight_moment * s.cos_phi - s.Ls * spring
+    sin_cos_coefficient = bisector_factor * (
+        s.cos_alpha * diameter * spring + weight_factor * s.cos_phi
+    )
+    sin_squared_coefficient = -bisector_factor * weight_factor * s.sin_phi
 
-    rear, dtheta = rear_direction(s, motion.sin, motion.cos), motion.dtheta
-    sin, cos = motion.sin + rear.sin, motion.cos + rear.cos
-    turning = by_sin + by_product * cos + by_square * sin + swing * dtheta * dtheta
-    held = light * s.sin_phi + leg * s.sin_phi * cos
-    damping = (1.0 - s.cos_alpha) * damper + per * s.cos_alpha * damper * (sin * sin)
-    return OneDegree(at_rest + 2.0 * swing * cos, held + sin * turning - damping * dtheta)
+    rear_leg, dtheta = rear_direction(s, motion.sin, motion.cos), motion.dtheta
+    sin, cos = motion.sin + rear_leg.sin, motion.cos + rear_leg.cos
+    sin_torque = (
+        sin_coefficient
+        + sin_cos_coefficient * cos
+        + sin_squared_coefficient * sin
+        + swing_inertia * dtheta * dtheta
+    )
+    slope_torque = weight_factor * s.sin_phi + leg_weight_moment * s.sin_phi * cos
+    damping = (1.0 - s.cos_alpha) * damper + bisector_factor * s.cos_alpha * damper * (sin * sin)
+    return SingleDofEquation(
+        constant_inertia + 2.0 * swing_inertia * cos,
+        slope_torque + sin * sin_torque - damping * dtheta,
+    )
 
 
 def double_support_acceleration(s: Symbols, distance: Elementwise, motion: Motion) -> Acceleration:
     """Return all accelerations in DLS, from `double_support_equation`."""
-    inertia, force = double_support(s, distance, motion)
+    inertia, force = double_support_equation(s, distance, motion)
     circle = double_support_circle(s, distance, motion.sin, motion.cos)
-    return along_circle(circle, motion.dtheta, force / inertia)
+    return accelerations_on_circle(circle, motion.dtheta, force / inertia)
 
 
-def along_circle(
-    circle: CircleOfDoubleSupport, dtheta: Elementwise, ddtheta: Elementwise
+def accelerations_on_circle(
+    circle: DoubleSupportCircle, dtheta: Elementwise, ddtheta: Elementwise
 ) -> Acceleration:
     """Return all accelerations in double support, where the hub's circle leaves only theta free."""
     centripetal = dtheta * dtheta
@@ -221,23 +235,23 @@ class FootForce(NamedTuple):
     normal: Elementwise  # pushing positive: lambda_2 (fore) or lambda_4 (rear)
 
 
-def friction_needed(force: FootForce) -> Elementwise:
+def required_friction(force: FootForce) -> Elementwise:
     """Return the ratio of tangential to normal force; 0 for a foot without a positive normal
     force.
     """
-    pressed = force.normal > 0.0
-    ratio = jnp.abs(force.tangential) / jnp.where(pressed, force.normal, 1.0)
-    return jnp.where(pressed, ratio, 0.0)
+    is_loaded = force.normal > 0.0
+    ratio = jnp.abs(force.tangential) / jnp.where(is_loaded, force.normal, 1.0)
+    return jnp.where(is_loaded, ratio, 0.0)
 
 
 def foot_force_from_residual(
-    s: Symbols, motion: Motion, along_L1: Elementwise, along_L2: Elementwise
+    s: Symbols, motion: Motion, residual_L1: Elementwise, residual_L2: Elementwise
 ) -> FootForce:
     """Return the rear-foot force that supplies these generalized forces along L1 and L2 (eq. 1)."""
-    rear = rear_direction(s, motion.sin, motion.cos)
+    rear_leg = rear_direction(s, motion.sin, motion.cos)
     return FootForce(
-        -(rear.cos * along_L1 + motion.cos * along_L2) / s.sin_alpha,
-        (rear.sin * along_L1 + motion.sin * along_L2) / s.sin_alpha,
+        -(rear_leg.cos * residual_L1 + motion.cos * residual_L2) / s.sin_alpha,
+        (rear_leg.sin * residual_L1 + motion.sin * residual_L2) / s.sin_alpha,
     )
 
 
@@ -245,9 +259,9 @@ def rear_foot_force(s: Symbols, motion: Motion, acceleration: Acceleration) -> F
     """Return (lambda_3, lambda_4) in double support, N: the part of M q'' beyond the applied
     forces.
     """
-    M, _, f2, f3 = terms(s, motion)
-    needed = M.times(acceleration)
-    return foot_force_from_residual(s, motion, needed[1] - f2, needed[2] - f3)
+    M, _, f2, f3 = equation_terms(s, motion)
+    required = M.multiply(acceleration)
+    return foot_force_from_residual(s, motion, required[1] - f2, required[2] - f3)
 
 
 def fore_foot_force(
@@ -292,15 +306,15 @@ def stopper_force(
     It is negative where the leg would come off its stopper. The spring presses with k (L* - L0);
     weight and acceleration of the leg's mass relieve it.
     """
-    turn = s.alpha * (np.asarray(legs).reshape(-1, *(1,) * jnp.ndim(motion.L1)) - 1)
+    leg_angles = s.alpha * (np.asarray(legs).reshape(-1, *(1,) * jnp.ndim(motion.L1)) - 1)
     radial = acceleration.ddL1 - motion.L1 * motion.dtheta * motion.dtheta
     across = 2.0 * motion.dL1 * motion.dtheta + motion.L1 * acceleration.ddtheta
     # Acceleration of the hub minus gravity, in the frame of Leg 1.
     radial = radial + s.g * (motion.cos * s.cos_phi - motion.sin * s.sin_phi)
     across = across - s.g * (motion.sin * s.cos_phi + motion.cos * s.sin_phi)
-    along = radial * np.cos(turn) + across * np.sin(turn)
+    leg_acceleration = radial * np.cos(leg_angles) + across * np.sin(leg_angles)
     spin = s.c0 * motion.dtheta * motion.dtheta
-    return s.k * (s.Ls - s.L0) + s.m * spin + s.m * along
+    return s.k * (s.Ls - s.L0) + s.m * spin + s.m * leg_acceleration
 
 
 class Energy(NamedTuple):
@@ -321,18 +335,18 @@ class Energy(NamedTuple):
 def kinetic_energy(s: Symbols, motion: Motion) -> Elementwise:
     """Return half of q' M q', J."""
     rates = (motion.dtheta, motion.dL1, motion.dL2)
-    p = mass_matrix(s, motion.L1, motion.L2).times(rates)
+    p = mass_matrix(s, motion.L1, motion.L2).multiply(rates)
     return 0.5 * (p[0] * rates[0] + p[1] * rates[1] + p[2] * rates[2])
 
 
-def energy(s: Symbols, motion: Motion) -> Energy:
+def mechanical_energy(s: Symbols, motion: Motion) -> Energy:
     """Return the kinetic, gravitational and elastic energy (eqs 26, 27), J."""
     sin_p = motion.sin * s.cos_phi + motion.cos * s.sin_phi
     cos_p = motion.cos * s.cos_phi - motion.sin * s.sin_phi
     rear_cos_p = cos_p * s.cos_alpha - sin_p * s.sin_alpha
     moment = (s.Mh * motion.L1 + s.m * s.L0) * cos_p + s.m * (s.L0 - motion.L2) * rear_cos_p
-    stretch_1, stretch_2, locked = motion.L1 - s.Ls, motion.L2 - s.Ls, s.L0 - s.Ls
-    elastic = 0.5 * s.k * (stretch_1**2 + stretch_2**2 + (s.n - 2) * locked**2)
+    stretch_1, stretch_2, locked_stretch = motion.L1 - s.Ls, motion.L2 - s.Ls, s.L0 - s.Ls
+    elastic = 0.5 * s.k * (stretch_1**2 + stretch_2**2 + (s.n - 2) * locked_stretch**2)
     return Energy(kinetic_energy(s, motion), s.g * moment, elastic)
 
 

@@ -25,7 +25,7 @@ class Motion(NamedTuple):
     dL2: Elementwise  # m/s
 
     @classmethod
-    def of(
+    def from_angle(
         cls,
         theta: Elementwise,
         L1: Elementwise,
@@ -38,21 +38,21 @@ class Motion(NamedTuple):
         return cls(*sine_cosine(theta), L1, L2, dtheta, dL1, dL2)
 
 
-class Trig(NamedTuple):
+class SineCosine(NamedTuple):
     """Sine and cosine of an angle."""
 
     sin: Elementwise
     cos: Elementwise
 
 
-def rear_direction(s: Symbols, sin: Elementwise, cos: Elementwise) -> Trig:
+def rear_direction(s: Symbols, sin: Elementwise, cos: Elementwise) -> SineCosine:
     """Return the sine and cosine of theta + alpha, the angle of Leg 2."""
-    return Trig(sin * s.cos_alpha + cos * s.sin_alpha, cos * s.cos_alpha - sin * s.sin_alpha)
+    return SineCosine(sin * s.cos_alpha + cos * s.sin_alpha, cos * s.cos_alpha - sin * s.sin_alpha)
 
 
-def landing_direction(s: Symbols, sin: Elementwise, cos: Elementwise) -> Trig:
+def landing_direction(s: Symbols, sin: Elementwise, cos: Elementwise) -> SineCosine:
     """Return the sine and cosine of theta - alpha, the angle of the leg that lands next."""
-    return Trig(sin * s.cos_alpha - cos * s.sin_alpha, cos * s.cos_alpha + sin * s.sin_alpha)
+    return SineCosine(sin * s.cos_alpha - cos * s.sin_alpha, cos * s.cos_alpha + sin * s.sin_alpha)
 
 
 def rear_foot_height(s: Symbols, motion: Motion) -> Elementwise:
@@ -71,7 +71,7 @@ def length_at_touchdown(s: Symbols, theta: Elementwise) -> Elementwise:
     return s.L0 * landing_direction(s, sin, cos).cos / cos
 
 
-class CircleOfDoubleSupport(NamedTuple):
+class DoubleSupportCircle(NamedTuple):
     """Leg lengths and their derivatives with respect to theta on the hub's double-support
     circle.
     """
@@ -84,11 +84,13 @@ class CircleOfDoubleSupport(NamedTuple):
 
 def double_support_circle(
     s: Symbols, distance: Elementwise, sin: Elementwise, cos: Elementwise
-) -> CircleOfDoubleSupport:
+) -> DoubleSupportCircle:
     """Return the leg lengths with both feet planted `distance` m apart.
 
     The hub moves on a circle with the inscribed angle alpha (Section 2).
     """
-    scale = distance / s.sin_alpha
+    diameter = distance / s.sin_alpha
     rear = rear_direction(s, sin, cos)
-    return CircleOfDoubleSupport(scale * rear.cos, scale * cos, -scale * rear.sin, -scale * sin)
+    return DoubleSupportCircle(
+        diameter * rear.cos, diameter * cos, -diameter * rear.sin, -diameter * sin
+    )

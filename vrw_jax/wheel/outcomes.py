@@ -1,9 +1,9 @@
 """Outcomes of a step: one integer code per batch element, with a name and a sentence."""
 
-from vrw_jax.numerics import Code
+from vrw_jax.numerics import StatusCode
 
 
-class Outcome(Code):
+class Outcome(StatusCode):
     """Outcome of a step. Only STEPPED leaves a section state; every other code ends the walk.
 
     Examples:
@@ -24,7 +24,7 @@ class Outcome(Code):
     COLLAPSED = 4, "A loaded leg collapsed to where its mass meets the hub: the wheel fell."
     LEG_1_LIFTED_OFF = 5, "The ground would have to pull on Leg 1's foot: it lifts off."
     NO_TOUCHDOWN_IN_TIME = 6, "No touchdown came within the allowed time of one phase."
-    SOLVER_GAVE_UP = 7, "The integrator ran out of steps or could not locate an event."
+    SOLVER_FAILED = 7, "The integrator ran out of steps or could not locate an event."
     BAD_INPUT = 8, "A parameter or the start is not finite, or outside its domain."
     NO_CYCLE_FOUND = (
         9, "The search for a limit cycle did not converge: there may be one that it missed."
@@ -37,12 +37,12 @@ class Outcome(Code):
     MESH_TOO_COARSE = (
         13, "A cycle solves the equations, but the mesh is too coarse for it: give more steps."
     )  # fmt: skip
-    ORDER_DIFFERS = (
+    EVENT_ORDER_MISMATCH = (
         14, "A cycle solves the equations, but its events do not come in the paper's order."
     )  # fmt: skip
-    BORDER_ON_THE_WAY = (
+    BRANCH_ENDS_BEFORE_TARGET = (
         16, "No cycle was found; followed from Table 1 to this wheel, the gait ends on the way."
     )  # fmt: skip
-    FRICTION_PARADOX = (
+    PAINLEVE_PARADOX = (
         15, "Friction is so high that no forces can carry the motion on (Painlevé's paradox)."
     )  # fmt: skip

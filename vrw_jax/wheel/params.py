@@ -10,11 +10,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from vrw_jax.numerics import Elementwise, Number, Scalar, sine_cosine
-from vrw_jax.wording import AbstractTold, Row, reals, shown, told, whole
+from vrw_jax.numerics import Elementwise, RealInput, Scalar, sine_cosine
+from vrw_jax.wording import (
+    AbstractPrintable,
+    TextRow,
+    check_int,
+    check_reals,
+    format_quantity,
+    format_value,
+)
 
 
-class Domain(NamedTuple):
+class ParameterDomain(NamedTuple):
     """Unit, symbol and allowed open or closed range of one parameter."""
 
     symbol: str
@@ -26,10 +33,10 @@ class Domain(NamedTuple):
 
     def contains(self, value: Any) -> Any:
         """Return whether the value lies in the range; False for NaN."""
-        above = value >= self.lower if self.lower_is_allowed else value > self.lower
-        return above & (value < self.upper)
+        is_above_lower = value >= self.lower if self.lower_is_allowed else value > self.lower
+        return is_above_lower & (value < self.upper)
 
-    def require(self, name: str, value: float) -> None:
+    def require_inside(self, name: str, value: float) -> None:
         """Raise `ValueError` if the value lies outside the range."""
         if not self.contains(value):
             raise ValueError(
@@ -43,19 +50,33 @@ class Domain(NamedTuple):
         return f"{bracket}{self.lower:g}, {self.upper:g}){unit}"
 
 
-SMALLEST, LARGEST = 1e-15, 1e9
+MIN_SI_VALUE, MAX_SI_VALUE = 1e-15, 1e9
 """Bounds on the SI numbers of a wheel, chosen because products overflow beyond them."""
 
-DOMAINS: dict[str, Domain] = {
-    "hub_mass": Domain("m_H", "kg", 0.0, LARGEST, True, "mass of the body frame"),
-    "leg_mass": Domain("m", "kg", SMALLEST, LARGEST, True, "mass of one leg frame, a point"),
-    "leg_com": Domain("a", "m", 0.0, LARGEST, True, "distance from foot to the leg's mass"),
-    "locked_length": Domain("L_0", "m", SMALLEST, LARGEST, True, "length of a leg on its stopper"),
-    "natural_length": Domain("L*", "m", SMALLEST, LARGEST, True, "length of the unloaded spring"),
-    "stiffness": Domain("k", "N/m", 0.0, LARGEST, True, "spring constant of each leg"),
-    "damping": Domain("c", "N s/m", 0.0, LARGEST, True, "viscous damping of each leg"),
-    "slope": Domain("phi", "rad", -math.pi / 2, math.pi / 2, False, "downhill slope"),
-    "gravity": Domain("g", "m/s^2", SMALLEST, LARGEST, True, "gravitational acceleration"),
+PARAMETER_DOMAINS: dict[str, ParameterDomain] = {
+    "hub_mass": ParameterDomain("m_H", "kg", 0.0, MAX_SI_VALUE, True, "mass of the body frame"),
+    "leg_mass": ParameterDomain(
+        "m", "kg", MIN_SI_VALUE, MAX_SI_VALUE, True, "mass of one leg frame, a point"
+    ),
+    "leg_com": ParameterDomain(
+        "a", "m", 0.0, MAX_SI_VALUE, True, "distance from foot to the leg's mass"
+    ),
+    "locked_length": ParameterDomain(
+        "L_0", "m", MIN_SI_VALUE, MAX_SI_VALUE, True, "length of a leg on its stopper"
+    ),
+    "natural_length": ParameterDomain(
+        "L*", "m", MIN_SI_VALUE, MAX_SI_VALUE, True, "length of the unloaded spring"
+    ),
+    "stiffness": ParameterDomain(
+        "k", "N/m", 0.0, MAX_SI_VALUE, True, "spring constant of each leg"
+    ),
+    "damping": ParameterDomain(
+        "c", "N s/m", 0.0, MAX_SI_VALUE, True, "viscous damping of each leg"
+    ),
+    "slope": ParameterDomain("phi", "rad", -math.pi / 2, math.pi / 2, False, "downhill slope"),
+    "gravity": ParameterDomain(
+        "g", "m/s^2", MIN_SI_VALUE, MAX_SI_VALUE, True, "gravitational acceleration"
+    ),
 }
 """Domain of every float parameter of `WheelParams`, in the order of its fields."""
 
@@ -84,19 +105,19 @@ class Symbols(NamedTuple):
     alpha: float
 
 
-def _quantity(name: str, default: float) -> Any:
-    return eqx.field(converter=functools.partial(reals, name), default=default)
+def _parameter_field(name: str, default: float) -> Any:
+    return eqx.field(converter=functools.partial(check_reals, name), default=default)
 
 
-_n_legs = functools.partial(
-    whole,
+_convert_n_legs = functools.partial(
+    check_int,
     "n_legs",
-    least=5,
-    why=" (with fewer the angle between legs is 90 degrees or more)",
+    min_value=5,
+    reason=" (with fewer the angle between legs is 90 degrees or more)",
 )
 
 
-class WheelParams(AbstractTold):
+class WheelParams(AbstractPrintable):
     """Parameters of the viscoelastic-legged rimless wheel; the defaults are Table 1 with slope
     0.30.
 
@@ -123,48 +144,50 @@ class WheelParams(AbstractTold):
         (3,)
     """
 
-    hub_mass: Scalar = _quantity("hub_mass", 10.0)
-    leg_mass: Scalar = _quantity("leg_mass", 1.0)
-    leg_com: Scalar = _quantity("leg_com", 0.3)
-    locked_length: Scalar = _quantity("locked_length", 1.0)
-    natural_length: Scalar = _quantity("natural_length", 1.02)
-    stiffness: Scalar = _quantity("stiffness", 500.0)
-    damping: Scalar = _quantity("damping", 200.0)
-    slope: Scalar = _quantity("slope", 0.30)
-    gravity: Scalar = _quantity("gravity", 9.81)
-    n_legs: int = eqx.field(static=True, converter=_n_legs, default=8)
+    hub_mass: Scalar = _parameter_field("hub_mass", 10.0)
+    leg_mass: Scalar = _parameter_field("leg_mass", 1.0)
+    leg_com: Scalar = _parameter_field("leg_com", 0.3)
+    locked_length: Scalar = _parameter_field("locked_length", 1.0)
+    natural_length: Scalar = _parameter_field("natural_length", 1.02)
+    stiffness: Scalar = _parameter_field("stiffness", 500.0)
+    damping: Scalar = _parameter_field("damping", 200.0)
+    slope: Scalar = _parameter_field("slope", 0.30)
+    gravity: Scalar = _parameter_field("gravity", 9.81)
+    n_legs: int = eqx.field(static=True, converter=_convert_n_legs, default=8)
 
     if TYPE_CHECKING:
 
         def __init__(
             self,
-            hub_mass: Number = 10.0,
-            leg_mass: Number = 1.0,
-            leg_com: Number = 0.3,
-            locked_length: Number = 1.0,
-            natural_length: Number = 1.02,
-            stiffness: Number = 500.0,
-            damping: Number = 200.0,
-            slope: Number = 0.30,
-            gravity: Number = 9.81,
+            hub_mass: RealInput = 10.0,
+            leg_mass: RealInput = 1.0,
+            leg_com: RealInput = 0.3,
+            locked_length: RealInput = 1.0,
+            natural_length: RealInput = 1.02,
+            stiffness: RealInput = 500.0,
+            damping: RealInput = 200.0,
+            slope: RealInput = 0.30,
+            gravity: RealInput = 9.81,
             n_legs: int = 8,
         ) -> None: ...
 
     def __check_init__(self) -> None:
-        plain = {
+        concrete_values = {
             name: float(value)
-            for name in DOMAINS
+            for name in PARAMETER_DOMAINS
             if not isinstance(value := getattr(self, name), jax.core.Tracer) and value.ndim == 0
         }
-        for name, value in plain.items():
-            DOMAINS[name].require(name, value)
-        com, length = (plain.get(name) for name in ("leg_com", "locked_length"))
-        if com is not None and length is not None and not com < length:
+        for name, value in concrete_values.items():
+            PARAMETER_DOMAINS[name].require_inside(name, value)
+        leg_com, locked_length = (
+            concrete_values.get(name) for name in ("leg_com", "locked_length")
+        )
+        if leg_com is not None and locked_length is not None and not leg_com < locked_length:
             raise ValueError(
-                f"leg_com is {com:g} m and locked_length {length:g} m, but a leg's mass sits "
+                f"leg_com is {leg_com:g} m and locked_length {locked_length:g} m, but a leg's mass sits "
                 "between foot and hub: give leg_com < locked_length."
             )
-        shapes = {name: shape for name in DOMAINS if (shape := getattr(self, name).shape)}
+        shapes = {name: shape for name in PARAMETER_DOMAINS if (shape := getattr(self, name).shape)}
         if len({shape[0] for shape in shapes.values()}) > 1:
             raise ValueError(
                 f"the parameters have shapes {shapes}, but a batch has one wheel for each place of "
@@ -177,49 +200,59 @@ class WheelParams(AbstractTold):
 
         For example `jax.vmap(vrw.limit_cycle, in_axes=(params.in_axes,))(params)`.
         """
-        return jax.tree.map(lambda x: 0 if jnp.ndim(x) else None, self)
+        return jax.tree.map(lambda leaf: 0 if jnp.ndim(leaf) else None, self)
 
-    def require_one(self, instead: str) -> None:
+    def require_single(self, remedy: str) -> None:
         """Raise `ValueError` if any parameter has an axis, with `remedy` in the message."""
-        for name in DOMAINS:
+        for name in PARAMETER_DOMAINS:
             if shape := getattr(self, name).shape:
                 raise ValueError(
-                    f"{name} has shape {shape}, but this is about one wheel: {instead}."
+                    f"{name} has shape {shape}, but this is about one wheel: {remedy}."
                 )
 
     @property
     def title(self) -> str:
-        other = "" if np.all(self.in_domain()) else " out of its domain: a gradient or a difference"
-        return "WheelParams" + other
+        suffix = (
+            "" if np.all(self.is_in_domain()) else " out of its domain: a gradient or a difference"
+        )
+        return "WheelParams" + suffix
 
-    def rows(self) -> list[Row]:
+    def summary_rows(self) -> list[TextRow]:
         """Return symbol, value and unit of each parameter; for a gradient, its denominators."""
-        values = {name: getattr(self, name) for name in DOMAINS}
-        if not np.all(self.in_domain()):
-            by = lambda d: f"{d.symbol}, {d.unit}" if d.unit else d.symbol
-            return [(f"by {n} {by(DOMAINS[n])}", told(value, "")) for n, value in values.items()]
-        named = [(f"{n} {DOMAINS[n].symbol}", told(x, DOMAINS[n].unit)) for n, x in values.items()]
-        return [*named, ("n_legs", str(self.n_legs))]
+        values = {name: getattr(self, name) for name in PARAMETER_DOMAINS}
+        if not np.all(self.is_in_domain()):
+            denominator = lambda domain: (
+                f"{domain.symbol}, {domain.unit}" if domain.unit else domain.symbol
+            )
+            return [
+                (f"by {n} {denominator(PARAMETER_DOMAINS[n])}", format_quantity(value, ""))
+                for n, value in values.items()
+            ]
+        parameter_rows = [
+            (f"{n} {PARAMETER_DOMAINS[n].symbol}", format_quantity(x, PARAMETER_DOMAINS[n].unit))
+            for n, x in values.items()
+        ]
+        return [*parameter_rows, ("n_legs", str(self.n_legs))]
 
     @property
     def leg_angle(self) -> float:
         """Angle between neighboring legs, alpha = 2 pi / n_legs, rad."""
         return 2.0 * math.pi / self.n_legs
 
-    def in_domain(self) -> Bool[Array, "..."]:
+    def is_in_domain(self) -> Bool[Array, "..."]:
         """Return whether every parameter is finite and in its domain, elementwise."""
-        inside = self.leg_com < self.locked_length
-        for name, domain in DOMAINS.items():
+        is_inside = self.leg_com < self.locked_length
+        for name, domain in PARAMETER_DOMAINS.items():
             value = getattr(self, name)
-            inside = inside & domain.contains(value) & jnp.isfinite(value)
-        return inside
+            is_inside = is_inside & domain.contains(value) & jnp.isfinite(value)
+        return is_inside
 
     def symbols(self) -> Symbols:
         """Return the symbols of the paper with the combinations shared by the formulas."""
-        return symbols_of(self.n_legs, *(getattr(self, name) for name in DOMAINS))
+        return compute_symbols(self.n_legs, *(getattr(self, name) for name in PARAMETER_DOMAINS))
 
 
-def symbols_of(
+def compute_symbols(
     n_legs: int,
     hub_mass: Elementwise,
     leg_mass: Elementwise,
@@ -254,19 +287,19 @@ def symbols_of(
     )
 
 
-PARAMETER_NAMES: tuple[str, ...] = tuple(DOMAINS)
-FRICTION = "friction"
+PARAMETER_NAMES: tuple[str, ...] = tuple(PARAMETER_DOMAINS)
+FRICTION_NAME = "friction"
 """Name of the ground's coefficient of friction, which designs and branches may vary as well."""
 
 
-def friction_of(value: object) -> Array:
+def convert_friction(value: object) -> Array:
     """Return a coefficient of friction, or an array of them, as a JAX array.
 
     Raises `ValueError` for a negative number or NaN.
     """
-    friction = reals(FRICTION, value)
-    plain = not isinstance(friction, jax.core.Tracer) and friction.ndim == 0
-    if plain and not float(friction) >= 0.0:
+    friction = check_reals(FRICTION_NAME, value)
+    is_concrete = not isinstance(friction, jax.core.Tracer) and friction.ndim == 0
+    if is_concrete and not float(friction) >= 0.0:
         raise ValueError(
             f"friction is {float(friction):g}, but a coefficient of friction is at least 0: give "
             "0.7, say, or math.inf for feet that never slide."
@@ -274,24 +307,24 @@ def friction_of(value: object) -> Array:
     return friction
 
 
-def known_friction(value: Any) -> float:
+def require_known_friction(value: Any) -> float:
     """Return the coefficient of friction as a float, for models whose motion is independent of it.
 
     Raises `TypeError` for an array with an axis or a traced value.
     """
-    if friction_of(value).ndim or isinstance(value, jax.core.Tracer):
+    if convert_friction(value).ndim or isinstance(value, jax.core.Tracer):
         raise TypeError(
-            f"friction is {shown(value)}, but one known number is needed here: give a float; "
+            f"friction is {format_value(value)}, but one known number is needed here: give a float; "
             "several grounds, or a traced one, vrw.UnilateralWheel takes."
         )
     return float(value)
 
 
-def parameters_of(params: WheelParams) -> Array:
+def stack_parameters(params: WheelParams) -> Array:
     """Return the float parameters as one array; the first axis follows `PARAMETER_NAMES`."""
     return jnp.stack([getattr(params, name) for name in PARAMETER_NAMES])
 
 
-def wheel_of(parameters: Array | tuple[Array, ...], n_legs: int) -> WheelParams:
+def wheel_from_parameters(parameters: Array | tuple[Array, ...], n_legs: int) -> WheelParams:
     """Return the wheel with these parameters: the inverse of `stack_parameters`."""
     return WheelParams(**dict(zip(PARAMETER_NAMES, parameters, strict=True)), n_legs=n_legs)

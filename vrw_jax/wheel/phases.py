@@ -19,7 +19,7 @@ from vrw_jax.numerics import Elementwise, Vector, sine_cosine
 from vrw_jax.wheel import dynamics, transitions
 from vrw_jax.wheel.dynamics import Acceleration, FootForce
 from vrw_jax.wheel.geometry import (
-    CircleOfDoubleSupport,
+    DoubleSupportCircle,
     Motion,
     double_support_circle,
     landing_foot_height,
@@ -28,11 +28,11 @@ from vrw_jax.wheel.geometry import (
 from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import Symbols
 
-FALLS = (Outcome.FELL_BACK, Outcome.COLLAPSED, Outcome.LEG_1_LIFTED_OFF)
+SHARED_FAILURES = (Outcome.FELL_BACK, Outcome.COLLAPSED, Outcome.LEG_1_LIFTED_OFF)
 """Outcomes by which every phase may leave the paper's sequence."""
 
 
-class Premises(NamedTuple):
+class PhaseMargins(NamedTuple):
     """Margins of a phase, which do not affect its motion: negative where violated."""
 
     fore_foot_force: Elementwise  # N
@@ -43,12 +43,12 @@ class Premises(NamedTuple):
     rear_stopper_force: Elementwise | None = None  # of Leg 2 in single support II, N
 
     @classmethod
-    def named(cls, row: Vector, n_legs: int) -> "Premises":
+    def from_values(cls, values: Vector, n_legs: int) -> "PhaseMargins":
         """Return the margins from one sequence of all values."""
         n_locked = n_legs - 2
-        fore, contraction, friction, *rest = row
-        locked, own = tuple(rest[:n_locked]), rest[n_locked:]
-        return cls(fore, contraction, friction, locked, *own)
+        fore, contraction, friction, *rest = values
+        locked_force, optional = tuple(rest[:n_locked]), rest[n_locked:]
+        return cls(fore, contraction, friction, locked_force, *optional)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,26 +56,26 @@ class AbstractPhase(abc.ABC):
     """A phase of the wheel `s`."""
 
     s: Symbols
-    held: Vector  # constants of the phase: in double support the distance of the feet, m
+    constants: Vector  # constants of the phase: in double support the distance of the feet, m
     stop_at_lift_off: bool  # whether a negative normal force on foot 1 ends the phase
 
     name: ClassVar[str]
-    n: ClassVar[int]
+    n_dof: ClassVar[int]
     """Number of degrees of freedom."""
-    own_outcomes: ClassVar[tuple[Outcome, ...]]
+    guard_outcomes: ClassVar[tuple[Outcome, ...]]
     """Outcomes of `end_guard` (STEPPED) and of `own_guards`."""
-    contraction_counts: ClassVar[bool] = False
-    own_premises_count: ClassVar[tuple[bool, ...]] = ()
+    counts_contraction_at_start: ClassVar[bool] = False
+    counts_own_margins_at_start: ClassVar[tuple[bool, ...]] = ()
     """Whether Leg 1's contraction and the phase's own margins count at the start of the phase.
 
     A margin that is zero there by construction does not count.
     """
-    stiff_start: ClassVar[bool] = False
+    has_stiff_start: ClassVar[bool] = False
     """Whether the phase starts with the fast mode of the airborne leg, near c/m, which decays at
     once."""
 
     @abc.abstractmethod
-    def motion(self, sin: Elementwise, cos: Elementwise, q: Vector, v: Vector) -> Motion:
+    def complete_motion(self, sin: Elementwise, cos: Elementwise, q: Vector, v: Vector) -> Motion:
         """Return the full motion from the phase's own coordinates and rates, and theta's sine and
         cosine.
         """
@@ -85,7 +85,7 @@ class AbstractPhase(abc.ABC):
         """Return all accelerations by the equations of motion."""
 
     @abc.abstractmethod
-    def residual(self, motion: Motion, own: Vector) -> Vector:
+    def dynamics_residual(self, motion: Motion, own_acceleration: Vector) -> Vector:
         """Return the residual of the equations of motion at `own_acceleration`, in which it is
         linear.
 
@@ -93,153 +93,176 @@ class AbstractPhase(abc.ABC):
         """
 
     @abc.abstractmethod
-    def solve(self, motion: Motion, rows: Vector) -> Vector:
+    def solve_dynamics(self, motion: Motion, rows: Vector) -> Vector:
         """Return the phase's own accelerations for which the linear part of the residual equals
         `rows`.
         """
 
     @abc.abstractmethod
-    def complete(self, motion: Motion, own: Vector) -> Acceleration:
+    def complete_acceleration(self, motion: Motion, own_acceleration: Vector) -> Acceleration:
         """Return all three accelerations from the phase's own ones."""
 
     @abc.abstractmethod
-    def end(self, at: "Instant") -> Elementwise:
+    def end_guard(self, instant: "PhaseInstant") -> Elementwise:
         """Return the guard of the phase's regular end."""
 
     @abc.abstractmethod
-    def own_guards(self, at: "Instant") -> Vector:
+    def own_guards(self, instant: "PhaseInstant") -> Vector:
         """Return the guards that other phases do not have."""
 
     @abc.abstractmethod
-    def own_premises(self, at: "Instant") -> Vector:
+    def own_margins(self, instant: "PhaseInstant") -> Vector:
         """Return the margins beyond those shared by every phase."""
 
     @abc.abstractmethod
-    def after(self, motion: Motion) -> Motion:
+    def reset_map(self, motion: Motion) -> Motion:
         """Return the motion just after the phase's regular end."""
 
-    def at(self, q: Vector, v: Vector) -> Motion:
+    def motion_at(self, q: Vector, v: Vector) -> Motion:
         """Return the full motion at the phase's own coordinates q and rates v."""
-        return self.motion(*sine_cosine(q[0]), q, v)
+        return self.complete_motion(*sine_cosine(q[0]), q, v)
 
-    def rear(self, motion: Motion, acceleration: Acceleration) -> FootForce | None:
+    def rear_force(self, motion: Motion, acceleration: Acceleration) -> FootForce | None:
         """Return the force of the ground on the rear foot, N; None if it is in the air."""
         return None
 
-    def guards(self, at: "Instant") -> Vector:
+    def guards(self, instant: "PhaseInstant") -> Vector:
         """Return all guards: those of the phase first, then those of `SHARED_FAILURES`."""
-        m = at.motion
-        own = (self.end(at), *self.own_guards(at), m.dtheta, jnp.minimum(m.L1, m.L2) - self.s.a)
-        return (*own, at.fore.normal) if self.stop_at_lift_off else own
+        m = instant.motion
+        values = (
+            self.end_guard(instant),
+            *self.own_guards(instant),
+            m.dtheta,
+            jnp.minimum(m.L1, m.L2) - self.s.a,
+        )
+        return (*values, instant.fore_force.normal) if self.stop_at_lift_off else values
 
     @property
-    def outcomes(self) -> tuple[Outcome, ...]:
+    def all_guard_outcomes(self) -> tuple[Outcome, ...]:
         """Outcomes of all guards, in their order."""
-        return self.own_outcomes + (FALLS if self.stop_at_lift_off else FALLS[:-1])
+        return self.guard_outcomes + (
+            SHARED_FAILURES if self.stop_at_lift_off else SHARED_FAILURES[:-1]
+        )
 
-    def premises(self, at: "Instant") -> Vector:
+    def margins(self, instant: "PhaseInstant") -> Vector:
         """Return all margins, in the order of `PhaseMargins`."""
-        s, m = self.s, at.motion
-        locked = dynamics.stopper_force(s, m, at.acceleration, range(3, s.n + 1))
-        shared = (at.fore.normal, s.L0 - m.L1, -dynamics.friction_needed(at.fore))
-        return (*shared, *locked, *self.own_premises(at))
+        s, m = self.s, instant.motion
+        locked_force = dynamics.stopper_force(s, m, instant.acceleration, range(3, s.n + 1))
+        shared = (
+            instant.fore_force.normal,
+            s.L0 - m.L1,
+            -dynamics.required_friction(instant.fore_force),
+        )
+        return (*shared, *locked_force, *self.own_margins(instant))
 
     @property
-    def counts_at_start(self) -> tuple[bool, ...]:
+    def margins_counted_at_start(self) -> tuple[bool, ...]:
         """Whether each margin counts at the start of the phase."""
-        locked = (True,) * (self.s.n - 2)
-        return (True, self.contraction_counts, True, *locked, *self.own_premises_count)
+        locked_flags = (True,) * (self.s.n - 2)
+        return (
+            True,
+            self.counts_contraction_at_start,
+            True,
+            *locked_flags,
+            *self.counts_own_margins_at_start,
+        )
 
-    def outcome(self, guard: Int[Array, "..."], timed_out: Bool[Array, "..."]) -> Array:
+    def outcome_of_guard(self, guard: Int[Array, "..."], timed_out: Bool[Array, "..."]) -> Array:
         """Return the `Outcome` of a phase that ended at this guard (-1: none); STEPPED is
         regular.
         """
-        code = jnp.full_like(guard, Outcome.SOLVER_GAVE_UP)
-        for index, meaning in enumerate(self.outcomes):
+        code = jnp.full_like(guard, Outcome.SOLVER_FAILED)
+        for index, meaning in enumerate(self.all_guard_outcomes):
             code = jnp.where(guard == index, jnp.int32(meaning), code)
         return jnp.where(timed_out, jnp.int32(Outcome.NO_TOUCHDOWN_IN_TIME), code)
 
     @classmethod
-    def own(cls, theta: Elementwise, motion: Motion) -> tuple[Vector, Vector]:
+    def own_coordinates(cls, theta: Elementwise, motion: Motion) -> tuple[Vector, Vector]:
         """Return the phase's own coordinates and rates of a motion."""
         q, v = (theta, motion.L1, motion.L2), (motion.dtheta, motion.dL1, motion.dL2)
-        return q[: cls.n], v[: cls.n]
+        return q[: cls.n_dof], v[: cls.n_dof]
 
 
-class Instant:
+class PhaseInstant:
     """State of a phase at one time; the forces that guards and margins use are computed on demand.
 
     - `own_acceleration`: accelerations of the phase's own coordinates; None: those of the equations
       of motion.
     """
 
-    def __init__(self, phase: AbstractPhase, motion: Motion, own: Vector | None) -> None:
-        self.phase, self.motion, self._own = phase, motion, own
+    def __init__(
+        self, phase: AbstractPhase, motion: Motion, own_acceleration: Vector | None
+    ) -> None:
+        self.phase, self.motion, self._own_acceleration = phase, motion, own_acceleration
 
     @functools.cached_property
     def acceleration(self) -> Acceleration:
         """All accelerations."""
-        if self._own is None:
+        if self._own_acceleration is None:
             return self.phase.acceleration(self.motion)
-        return self.phase.complete(self.motion, self._own)
+        return self.phase.complete_acceleration(self.motion, self._own_acceleration)
 
     @functools.cached_property
-    def rear(self) -> FootForce | None:
+    def rear_force(self) -> FootForce | None:
         """Force of the ground on the rear foot, N; None if it is in the air."""
-        return self.phase.rear(self.motion, self.acceleration)
+        return self.phase.rear_force(self.motion, self.acceleration)
 
     @functools.cached_property
-    def fore(self) -> FootForce:
+    def fore_force(self) -> FootForce:
         """Force of the ground on the fore foot, N."""
-        return dynamics.fore_foot_force(self.phase.s, self.motion, self.acceleration, self.rear)
+        return dynamics.fore_foot_force(
+            self.phase.s, self.motion, self.acceleration, self.rear_force
+        )
 
 
 class DoubleSupport(AbstractPhase):
     """DLS, over theta: the hub moves on a circle until the rear foot lifts off (Section 3.3.1)."""
 
-    name, n = "DLS", 1
-    own_outcomes = (
+    name, n_dof = "DLS", 1
+    guard_outcomes = (
         Outcome.STEPPED, Outcome.STOPPER_IN_DOUBLE_SUPPORT, Outcome.TOUCHDOWN_BEFORE_STOPPER
     )  # fmt: skip
 
-    def _circle(self, sin: Elementwise, cos: Elementwise) -> CircleOfDoubleSupport:
-        return double_support_circle(self.s, self.held[0], sin, cos)
+    def _circle(self, sin: Elementwise, cos: Elementwise) -> DoubleSupportCircle:
+        return double_support_circle(self.s, self.constants[0], sin, cos)
 
-    def _own(self, motion: Motion) -> dynamics.OneDegree:
-        return dynamics.double_support(self.s, self.held[0], motion)
+    def _equation(self, motion: Motion) -> dynamics.SingleDofEquation:
+        return dynamics.double_support_equation(self.s, self.constants[0], motion)
 
-    def motion(self, sin: Elementwise, cos: Elementwise, q: Vector, v: Vector) -> Motion:
+    def complete_motion(self, sin: Elementwise, cos: Elementwise, q: Vector, v: Vector) -> Motion:
         circle, (dtheta,) = self._circle(sin, cos), v
         rates = (dtheta, circle.G1 * dtheta, circle.G2 * dtheta)
         return Motion(sin, cos, circle.L1, circle.L2, *rates)
 
     def acceleration(self, motion: Motion) -> Acceleration:
-        return dynamics.double_support_acceleration(self.s, self.held[0], motion)
+        return dynamics.double_support_acceleration(self.s, self.constants[0], motion)
 
-    def complete(self, motion: Motion, own: Vector) -> Acceleration:
-        return dynamics.along_circle(self._circle(motion.sin, motion.cos), motion.dtheta, own[0])
+    def complete_acceleration(self, motion: Motion, own_acceleration: Vector) -> Acceleration:
+        return dynamics.accelerations_on_circle(
+            self._circle(motion.sin, motion.cos), motion.dtheta, own_acceleration[0]
+        )
 
-    def residual(self, motion: Motion, own: Vector) -> Vector:
-        inertia, force = self._own(motion)
-        return (inertia * own[0] - force,)
+    def dynamics_residual(self, motion: Motion, own_acceleration: Vector) -> Vector:
+        inertia, force = self._equation(motion)
+        return (inertia * own_acceleration[0] - force,)
 
-    def solve(self, motion: Motion, rows: Vector) -> Vector:
-        return (rows[0] / self._own(motion).inertia,)
+    def solve_dynamics(self, motion: Motion, rows: Vector) -> Vector:
+        return (rows[0] / self._equation(motion).inertia,)
 
-    def rear(self, motion: Motion, acceleration: Acceleration) -> FootForce:
+    def rear_force(self, motion: Motion, acceleration: Acceleration) -> FootForce:
         return dynamics.rear_foot_force(self.s, motion, acceleration)
 
-    def end(self, at: Instant) -> Elementwise:
-        assert at.rear is not None
-        return at.rear.normal
+    def end_guard(self, instant: PhaseInstant) -> Elementwise:
+        assert instant.rear_force is not None
+        return instant.rear_force.normal
 
-    def own_guards(self, at: Instant) -> Vector:
-        return self.s.L0 - at.motion.L2, landing_foot_height(self.s, at.motion)
+    def own_guards(self, instant: PhaseInstant) -> Vector:
+        return self.s.L0 - instant.motion.L2, landing_foot_height(self.s, instant.motion)
 
-    def own_premises(self, at: Instant) -> Vector:
+    def own_margins(self, instant: PhaseInstant) -> Vector:
         return ()
 
-    def after(self, motion: Motion) -> Motion:
+    def reset_map(self, motion: Motion) -> Motion:
         """Return the motion unchanged: the rear foot is released at rest."""
         return motion
 
@@ -249,99 +272,102 @@ class SingleSupport1(AbstractPhase):
     3.3.2).
     """
 
-    name, n = "SLS-I", 3
-    own_outcomes = Outcome.STEPPED, Outcome.TOUCHDOWN_BEFORE_STOPPER
-    own_premises_count = (False,)
-    stiff_start = True
+    name, n_dof = "SLS-I", 3
+    guard_outcomes = Outcome.STEPPED, Outcome.TOUCHDOWN_BEFORE_STOPPER
+    counts_own_margins_at_start = (False,)
+    has_stiff_start = True
 
-    def motion(self, sin: Elementwise, cos: Elementwise, q: Vector, v: Vector) -> Motion:
+    def complete_motion(self, sin: Elementwise, cos: Elementwise, q: Vector, v: Vector) -> Motion:
         return Motion(sin, cos, q[1], q[2], *v)
 
     def acceleration(self, motion: Motion) -> Acceleration:
         return dynamics.single_support_1_acceleration(self.s, motion)
 
-    def complete(self, motion: Motion, own: Vector) -> Acceleration:
-        return Acceleration(*own)
+    def complete_acceleration(self, motion: Motion, own_acceleration: Vector) -> Acceleration:
+        return Acceleration(*own_acceleration)
 
-    def residual(self, motion: Motion, own: Vector) -> Vector:
-        return _left_over(self.s, motion, Acceleration(*own))
+    def dynamics_residual(self, motion: Motion, own_acceleration: Vector) -> Vector:
+        return _residual(self.s, motion, Acceleration(*own_acceleration))
 
-    def solve(self, motion: Motion, rows: Vector) -> Vector:
+    def solve_dynamics(self, motion: Motion, rows: Vector) -> Vector:
         M = dynamics.mass_matrix(self.s, motion.L1, motion.L2)
-        return dynamics.free_acceleration(self.s, motion.L1, dynamics.Terms(M, *rows))
+        return dynamics.free_acceleration(self.s, motion.L1, dynamics.EquationTerms(M, *rows))
 
-    def end(self, at: Instant) -> Elementwise:
-        return self.s.L0 - at.motion.L2
+    def end_guard(self, instant: PhaseInstant) -> Elementwise:
+        return self.s.L0 - instant.motion.L2
 
-    def own_guards(self, at: Instant) -> Vector:
-        return (landing_foot_height(self.s, at.motion),)
+    def own_guards(self, instant: PhaseInstant) -> Vector:
+        return (landing_foot_height(self.s, instant.motion),)
 
-    def own_premises(self, at: Instant) -> Vector:
-        return (rear_foot_height(self.s, at.motion),)
+    def own_margins(self, instant: PhaseInstant) -> Vector:
+        return (rear_foot_height(self.s, instant.motion),)
 
-    def after(self, motion: Motion) -> Motion:
+    def reset_map(self, motion: Motion) -> Motion:
         """Return the motion after the collision of Leg 2 with its stopper, with L2 = L0 exactly."""
-        return transitions.stopped(self.s, motion._replace(L2=self.s.L0 + 0.0 * motion.L2))
+        return transitions.stop_leg_2(self.s, motion._replace(L2=self.s.L0 + 0.0 * motion.L2))
 
 
 class SingleSupport2(AbstractPhase):
     """SLS-II, over (theta, L1): Leg 2 is on its stopper until touchdown (Section 3.3.3)."""
 
-    name, n = "SLS-II", 2
-    own_outcomes = (Outcome.STEPPED,)
-    contraction_counts, own_premises_count = True, (True, True)
+    name, n_dof = "SLS-II", 2
+    guard_outcomes = (Outcome.STEPPED,)
+    counts_contraction_at_start, counts_own_margins_at_start = True, (True, True)
 
-    def motion(self, sin: Elementwise, cos: Elementwise, q: Vector, v: Vector) -> Motion:
+    def complete_motion(self, sin: Elementwise, cos: Elementwise, q: Vector, v: Vector) -> Motion:
         zero = jnp.zeros_like(q[1])
         return Motion(sin, cos, q[1], self.s.L0 + zero, v[0], v[1], zero)
 
     def acceleration(self, motion: Motion) -> Acceleration:
         return dynamics.single_support_2_acceleration(self.s, motion)
 
-    def complete(self, motion: Motion, own: Vector) -> Acceleration:
-        return Acceleration(own[0], own[1], motion.dL2)
+    def complete_acceleration(self, motion: Motion, own_acceleration: Vector) -> Acceleration:
+        return Acceleration(own_acceleration[0], own_acceleration[1], motion.dL2)
 
-    def residual(self, motion: Motion, own: Vector) -> Vector:
-        M, f1, f2, _ = dynamics.terms(self.s, motion)
-        return M.M11 * own[0] - f1, M.M22 * own[1] - f2  # M12 is zero at L2 = L0
+    def dynamics_residual(self, motion: Motion, own_acceleration: Vector) -> Vector:
+        M, f1, f2, _ = dynamics.equation_terms(self.s, motion)
+        return M.M11 * own_acceleration[0] - f1, M.M22 * own_acceleration[
+            1
+        ] - f2  # M12 is zero at L2 = L0
 
-    def solve(self, motion: Motion, rows: Vector) -> Vector:
+    def solve_dynamics(self, motion: Motion, rows: Vector) -> Vector:
         M = dynamics.mass_matrix(self.s, motion.L1, motion.L2)
         return (1.0 / M.M11) * rows[0], (1.0 / M.M22) * rows[1]
 
-    def end(self, at: Instant) -> Elementwise:
-        return landing_foot_height(self.s, at.motion)
+    def end_guard(self, instant: PhaseInstant) -> Elementwise:
+        return landing_foot_height(self.s, instant.motion)
 
-    def own_guards(self, at: Instant) -> Vector:
+    def own_guards(self, instant: PhaseInstant) -> Vector:
         return ()
 
-    def own_premises(self, at: Instant) -> Vector:
-        s, m = self.s, at.motion
-        stopper = dynamics.stopper_force(s, m, at.acceleration, range(2, 3))
+    def own_margins(self, instant: PhaseInstant) -> Vector:
+        s, m = self.s, instant.motion
+        stopper = dynamics.stopper_force(s, m, instant.acceleration, range(2, 3))
         return rear_foot_height(s, m), *stopper
 
-    def after(self, motion: Motion) -> Motion:
+    def reset_map(self, motion: Motion) -> Motion:
         """Return the motion unchanged: `transitions.land` of the next step resolves the
         touchdown.
         """
         return motion
 
 
-def _left_over(s: Symbols, motion: Motion, acceleration: Acceleration) -> Vector:
+def _residual(s: Symbols, motion: Motion, acceleration: Acceleration) -> Vector:
     """Return M q'' - f over (theta, L1, L2)."""
-    M, *forces = dynamics.terms(s, motion)
-    return tuple(n - f for n, f in zip(M.times(acceleration), forces, strict=True))
+    M, *forces = dynamics.equation_terms(s, motion)
+    return tuple(n - f for n, f in zip(M.multiply(acceleration), forces, strict=True))
 
 
-PHASES: tuple[type[AbstractPhase], ...] = (DoubleSupport, SingleSupport1, SingleSupport2)
+PAPER_PHASES: tuple[type[AbstractPhase], ...] = (DoubleSupport, SingleSupport1, SingleSupport2)
 """Phases of the paper's step, in order."""
 
 
-def phases_of(
+def make_phases(
     s: Symbols, distance: Elementwise, stop_at_lift_off: bool
 ) -> tuple[AbstractPhase, ...]:
     """Return the phases of a step that starts with the feet `distance` m apart."""
-    helds = ((distance,), (), ())
+    phase_constants = ((distance,), (), ())
     return tuple(
-        phase(s, held, stop_at_lift_off) for phase, held in zip(PHASES, helds, strict=True)
+        phase(s, constants, stop_at_lift_off)
+        for phase, constants in zip(PAPER_PHASES, phase_constants, strict=True)
     )

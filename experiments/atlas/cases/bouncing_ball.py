@@ -10,15 +10,17 @@ from collections.abc import Iterator
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.atlas.hybrid import METHODS, Edge, Part, last_time, row
-from experiments.atlas.others import rows_of
+from experiments.atlas.hybrid import METHODS, GuardEdge, Part, last_time, make_row
+from experiments.atlas.others import make_rows
 from experiments.atlas.told import Case, Row
 
 G, R = 9.81, 0.8
 FALL = math.sqrt(2.0 / G)
-LAST = FALL * (1.0 + R) / (1.0 - R)
+ACCUMULATION_TIME = FALL * (1.0 + R) / (1.0 - R)
 EVENTS = 250
-BALL = (Part(lambda y, m: (y[1], -G), (Edge(lambda y, m: y[0], lambda y, m: (0.0, -R * y[1])),)),)
+BALL = (
+    Part(lambda y, m: (y[1], -G), (GuardEdge(lambda y, m: y[0], lambda y, m: (0.0, -R * y[1])),)),
+)
 
 
 def times(n: int) -> np.ndarray:
@@ -28,25 +30,30 @@ def times(n: int) -> np.ndarray:
 
 def rows() -> Iterator[Row]:
     for method in METHODS:
-        walked = method(BALL, (1.0, 0.0), EVENTS, 10.0)
-        early = walked._replace(says="", admits=False)
+        walk_result = method(BALL, (1.0, 0.0), EVENTS, 10.0)
+        early = walk_result._replace(says="", admits=False)
         truth = float(times(20)[-1])
-        yield row(early, "time of bounce 20", last_time(walked, 20), truth, event=20)
-        end = float(walked.times[-1]) if len(walked.times) else math.nan
-        told = walked._replace(says=walked.says or f"goes on: {len(walked.times)} bounces")
-        yield row(told, "time of the last bounce", end, LAST)
-    truths = {"time of bounce 20": float(times(20)[-1]), "time of the last bounce": LAST}
-    yield from rows_of("siconos", "bouncing_ball", truths)
+        yield make_row(early, "time of bounce 20", last_time(walk_result, 20), truth, event=20)
+        end = float(walk_result.times[-1]) if len(walk_result.times) else math.nan
+        result = walk_result._replace(
+            says=walk_result.says or f"goes on: {len(walk_result.times)} bounces"
+        )
+        yield make_row(result, "time of the last bounce", end, ACCUMULATION_TIME)
+    truths = {
+        "time of bounce 20": float(times(20)[-1]),
+        "time of the last bounce": ACCUMULATION_TIME,
+    }
+    yield from make_rows("siconos", "bouncing_ball", truths)
 
 
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
     axes = figure.subplots()
     truth = times(EVENTS)
     for method, marker in zip(METHODS, "o^sD", strict=True):
-        walked = method(BALL, (1.0, 0.0), EVENTS, 10.0)
-        n = len(walked.times)
-        error = np.abs(walked.times - truth[:n]) + 1e-17
-        axes.semilogy(np.arange(1, n + 1), error, marker, ms=3, label=f"{walked.method}: {n}")
+        walk_result = method(BALL, (1.0, 0.0), EVENTS, 10.0)
+        n = len(walk_result.times)
+        error = np.abs(walk_result.times - truth[:n]) + 1e-17
+        axes.semilogy(np.arange(1, n + 1), error, marker, ms=3, label=f"{walk_result.method}: {n}")
     axes.set_xlabel("bounce")
     axes.set_ylabel("error of its time [s]")
     axes.legend(title="bounces found")

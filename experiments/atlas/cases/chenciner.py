@@ -23,21 +23,28 @@ from scipy.optimize import brentq
 
 import vrw_jax as vrw
 from experiments.atlas.chenciner_point import Point, chenciner_point
-from experiments.atlas.gaits import Return, gaits
-from experiments.atlas.hybrid import JAX, METHODS, Edge, Part, row
-from experiments.atlas.told import Case, Row, off, timed
-from vrw_jax.numerics import Guard, Mode, newton_cycle, product_multipliers, segment_maps, walk
+from experiments.atlas.gaits import ReturnMap, gaits
+from experiments.atlas.hybrid import JAX, METHODS, GuardEdge, Part, make_row
+from experiments.atlas.told import Case, Row, compute_error, time_second_call
+from vrw_jax.numerics import (
+    Guard,
+    Mode,
+    product_multipliers,
+    segment_maps,
+    simulate_hybrid,
+    solve_fixed_point,
+)
 
 K1, K2, K3, K4, K5, K6, K9 = 0.1631021, 1250.0, 0.046875, 20.0, 1.104, 0.001, 0.1175
 K7, K8 = 1.5163129, 0.83200664
 LEVEL = 9.1855407
-PUBLISHED = (6.1231735, 5.4271408e-3, 2.4602951e-2)  # of A, X, Y where B rises through LEVEL
+PUBLISHED_CYCLE = (6.1231735, 5.4271408e-3, 2.4602951e-2)  # of A, X, Y where B rises through LEVEL
 SEGMENTS = 600
-TOLD, NEAR = (1.752, 0.9113), (9.2149, 1.9652e-3, 2.4941e-3)
+PUBLISHED_CHENCINER_POINT, NEARBY_CYCLE = (1.752, 0.9113), (9.2149, 1.9652e-3, 2.4941e-3)
 """The Chenciner point's k7 as told and k8 on the curve there, and A, X, Y on the cycle."""
 OTHER_LEVEL = 11.0
 FIRST_K, FIRST_LEVEL = (0.71643356, 0.5), 25.678306
-FIRST = (1.8609653, 1.0838258e-2, 9.4707061e-2)
+MANUAL_FIRST_POINT = (1.8609653, 1.0838258e-2, 9.4707061e-2)
 """The manual's first point: k7 and k8, B, and A, X, Y on the cycle."""
 AT_K7, STABLE, PAGES_K8 = 1.5, 1e-3, 0.82521357
 """BifurcationKit's point: k7, the exponent that it takes for zero, and k8 by its page of 0.3.2."""
@@ -55,15 +62,15 @@ def field(y, m, k7=K7, k8=K8):
 
 
 SYSTEM = (
-    Part(field, (Edge(lambda y, m: y[1] - LEVEL, lambda y, m: (y[0], LEVEL, y[2], y[3]), 1),)),
-    Part(field, (Edge(lambda y, m: LEVEL - y[1], lambda y, m: (y[0], LEVEL, y[2], y[3]), 0),)),
+    Part(field, (GuardEdge(lambda y, m: y[1] - LEVEL, lambda y, m: (y[0], LEVEL, y[2], y[3]), 1),)),
+    Part(field, (GuardEdge(lambda y, m: LEVEL - y[1], lambda y, m: (y[0], LEVEL, y[2], y[3]), 0),)),
 )
-CYCLE = Return(
+CYCLE = ReturnMap(
     SYSTEM,
     lambda x, m: (x[0], LEVEL + 0.0 * x[0], x[1], x[2]),
     lambda y: (y[0], y[2], y[3]),
     events=2,
-    guess=PUBLISHED,
+    guess=PUBLISHED_CYCLE,
     limit=60.0,
 )
 
@@ -78,104 +85,120 @@ def modes(k: jnp.ndarray, level: float) -> tuple[Mode, Mode]:
     )
 
 
-def long() -> vrw.Options:
-    return vrw.Options(rtol=1e-13, atol=1e-13, max_phase_time=60.0)
+def simulate_long_run() -> vrw.StepOptions:
+    return vrw.StepOptions(rtol=1e-13, atol=1e-13, max_phase_time=60.0)
 
 
-def returned(level: float) -> Callable:
+def make_return_map(level: float) -> Callable:
     """From where B rises through a level to where it does next, (A, X, Y) by (k7, k8)."""
 
     def there(x, k):
         start = jnp.stack([x[0], level + 0.0 * x[0], x[1], x[2]])
-        return walk(modes(k, level), start, events=2, options=long()).state[jnp.array([0, 2, 3])]
+        return simulate_hybrid(modes(k, level), start, events=2, options=simulate_long_run()).state[
+            jnp.array([0, 2, 3])
+        ]
 
     return there
 
 
-def found_on(level: float) -> tuple[Point, float]:
+def find_cycle_on_level(level: float) -> tuple[Point, float]:
     """The Chenciner point by the section at a level, and CPU seconds, compiling among them."""
-    k, begin = jnp.array(TOLD), jnp.array([NEAR[0], LEVEL, *NEAR[1:]])
+    k, begin = (
+        jnp.array(PUBLISHED_CHENCINER_POINT),
+        jnp.array([NEARBY_CYCLE[0], LEVEL, *NEARBY_CYCLE[1:]]),
+    )
     began = time.process_time()
     if level > LEVEL:
         rising = (Guard(lambda y: level - y[1]),)
-        begin = walk([modes(k, level)[0]._replace(guards=rising)], begin, events=1, options=long())
+        begin = simulate_hybrid(
+            [modes(k, level)[0]._replace(guards=rising)],
+            begin,
+            events=1,
+            options=simulate_long_run(),
+        )
         begin = begin.state
-    point = chenciner_point(returned(level), np.asarray(begin)[[0, 2, 3]], np.asarray(k))
+    point = chenciner_point(make_return_map(level), np.asarray(begin)[[0, 2, 3]], np.asarray(k))
     return point, time.process_time() - began
 
 
 @jax.jit
 def cycle_at(x, k, level):
-    return newton_cycle(lambda x: returned(level)(x, k), x, tolerance=1e-11)
+    return solve_fixed_point(lambda x: make_return_map(level)(x, k), x, tolerance=1e-11)
 
 
 def torus_points() -> Iterator[Row]:
     """Two more published points with a pair on the circle."""
     largest = lambda cycle: float(np.abs(np.linalg.eigvals(cycle.jacobian)).max())
     options = "Dopri8 1e-13; Newton 1e-11"
-    first, seconds = timed(
-        lambda: jax.block_until_ready(cycle_at(jnp.array(FIRST), jnp.array(FIRST_K), FIRST_LEVEL))
+    first, seconds = time_second_call(
+        lambda: jax.block_until_ready(
+            cycle_at(jnp.array(MANUAL_FIRST_POINT), jnp.array(FIRST_K), FIRST_LEVEL)
+        )
     )
-    x, guess = float(first.x[0]), jnp.array(PUBLISHED)
+    x, guess = float(first.x[0]), jnp.array(PUBLISHED_CYCLE)
     began = time.process_time()
     guess = cycle_at(guess, jnp.array([AT_K7, PAGES_K8]), LEVEL).x
     exponent = lambda k8: math.log(largest(cycle_at(guess, jnp.array([AT_K7, k8]), LEVEL)))
     k8 = brentq(lambda k8: exponent(k8) - STABLE, PAGES_K8 - 1e-4, PAGES_K8 + 1e-4, xtol=1e-12)
-    for name, found, truth, digits, took in (
+    for name, solution, truth, digits, took in (
         ("modulus at the first point, as published", largest(first), 1.0, 6, seconds),
-        ("A at the first point, as published", x, FIRST[0], 6, seconds),
+        ("A at the first point, as published", x, MANUAL_FIRST_POINT[0], 6, seconds),
         ("k8 of exponent 1e-3, as published", k8, PAGES_K8, 8, time.process_time() - began),
     ):
         yield Row(
-            name, "ours", found, truth, off(found, truth), "", not bool(first.converged),
+            name, "ours", solution, truth, compute_error(solution, truth), "", not bool(first.converged),
             int(first.iterations), took, options, version("vrw-jax"), digits=digits,
         )  # fmt: skip
 
 
 def rows() -> Iterator[Row]:
-    told = gaits(CYCLE)
-    other = told[-1]
-    for gait in told:
+    result = gaits(CYCLE)
+    other = result[-1]
+    for gait in result:
         modulus = float(np.abs(gait.multipliers[0]))
-        yield row(gait.walked, "modulus of the pair, as published", modulus, 1.0, digits=5)
-        yield row(gait.walked, "A, as published", float(gait.x[0]), PUBLISHED[0], digits=6)
+        yield make_row(gait.simulation, "modulus of the pair, as published", modulus, 1.0, digits=5)
+        yield make_row(
+            gait.simulation, "A, as published", float(gait.x[0]), PUBLISHED_CYCLE[0], digits=6
+        )
         if gait is not other:
-            yield row(gait.walked, "period, as heyoka's", gait.duration, other.duration)
-    start = jnp.array(CYCLE.begin(told[0].x, np), float)
+            yield make_row(gait.simulation, "period, as heyoka's", gait.duration, other.duration)
+    start = jnp.array(CYCLE.begin(result[0].x, np), float)
 
     def whole():
         cut = segment_maps(
-            lambda y: jnp.stack(field(y, JAX)), start, told[0].duration, SEGMENTS,
-            vrw.Options.tight(),
+            lambda y: jnp.stack(field(y, JAX)), start, result[0].duration, SEGMENTS,
+            vrw.StepOptions.tight(),
         )  # fmt: skip
-        return product_multipliers(cut.maps), float(cut.divergence)
+        return product_multipliers(cut.jacobians), float(cut.divergence)
 
-    (found, divergence), seconds = timed(whole)
-    trivial = float(found.values[np.nanargmin(np.abs(found.values - 1.0))].real)
-    sums = float(np.sum(found.logarithms))
+    (solution, divergence), seconds = time_second_call(whole)
+    trivial = float(solution.values[np.nanargmin(np.abs(solution.values - 1.0))].real)
+    sums = float(np.sum(solution.logarithms))
     for name, value, truth in (
         ("trivial multiplier", trivial, 1.0),
         ("logarithm of their product", sums, divergence),
     ):
         yield Row(
-            name, "ours", value, truth, off(value, truth, relative=True), "", False, SEGMENTS,
+            name, "ours", value, truth, compute_error(value, truth, relative=True), "", False, SEGMENTS,
             seconds, f"Dopri8 1e-13, {SEGMENTS} segments", version("vrw-jax"),
         )  # fmt: skip
 
     yield from torus_points()
-    (point, seconds), (other, _) = found_on(LEVEL), found_on(OTHER_LEVEL)
+    (point, seconds), (other, _) = find_cycle_on_level(LEVEL), find_cycle_on_level(OTHER_LEVEL)
     for name, value, truth in zip(("k7", "k8"), point.parameters, other.parameters, strict=True):
         yield Row(
             f"{name} of the Chenciner point, by another section", "ours", value, truth,
-            off(value, truth), "", False, 1, seconds,
+            compute_error(value, truth), "", False, 1, seconds,
             "Dopri8 1e-13, three derivatives, compiling counted", version("vrw-jax"),
         )  # fmt: skip
 
 
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
     axes = figure.subplots()
-    walked = METHODS[3](SYSTEM, CYCLE.begin(np.array(PUBLISHED) * (1.01, 1.0, 1.0), np), 400, 60.0)
-    rising = walked.states[1::2]
+    walk_result = METHODS[3](
+        SYSTEM, CYCLE.begin(np.array(PUBLISHED_CYCLE) * (1.01, 1.0, 1.0), np), 400, 60.0
+    )
+    rising = walk_result.states[1::2]
     axes.plot(rising[:, 0], rising[:, 2], ".-", ms=3, lw=0.3, label="returns of a walk")
     cycle = gaits(CYCLE._replace(limit=60.0))[0].x
     axes.plot(cycle[0], cycle[1], "*", color="C1", ms=9, label="the cycle, by Newton")

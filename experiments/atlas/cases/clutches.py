@@ -14,11 +14,19 @@ import mpmath
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.atlas.hybrid import METHODS, Edge, Numbers, Part, last_time, ours, row
+from experiments.atlas.hybrid import (
+    METHODS,
+    GuardEdge,
+    Numbers,
+    Part,
+    last_time,
+    make_row,
+    run_library,
+)
 from experiments.atlas.told import Case, Row
 
-SLIDING, HELD = 10.0, 1.1
-FAST, SLOW = 10.0 * mpmath.pi, 0.4 * mpmath.pi
+SLIDING, STATIC_RATIO = 10.0, 1.1
+FAST_FREQUENCY, SLOW_FREQUENCY = 10.0 * mpmath.pi, 0.4 * mpmath.pi
 TIMES = (0.4, 0.9, 1.25)
 """When the second and third clutch are pressed, and the first no longer is, s."""
 START = (10.0, 0.0, 0.0, 0.0, 0.0)
@@ -26,12 +34,12 @@ START = (10.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def drive(t: Any, m: Any) -> Any:
-    return 10.0 * m.sin(float(FAST) * t)
+    return 10.0 * m.sin(float(FAST_FREQUENCY) * t)
 
 
-def passed(t: Any, m: Any) -> Any:
+def first_clutch_torque(t: Any, m: Any) -> Any:
     """By the first clutch while it slides, N m."""
-    return SLIDING * m.cos(float(SLOW) * t)
+    return SLIDING * m.cos(float(SLOW_FREQUENCY) * t)
 
 
 SHARES = (  # of the drive, of the first clutch, and a constant, in each wheel's acceleration
@@ -60,7 +68,7 @@ def gap(first: int, second: int) -> Callable:
 def grip(mode: int) -> Callable:
     """What the first clutch holds beyond what it passes while it is locked."""
     a, _, c = SHARES[mode][0]
-    return lambda y, m: HELD * passed(y[4], m) - ((1 - a) * drive(y[4], m) - c)
+    return lambda y, m: STATIC_RATIO * first_clutch_torque(y[4], m) - ((1 - a) * drive(y[4], m) - c)
 
 
 ENDS = (
@@ -71,7 +79,7 @@ NAMES = {
     2: "clutch 2 locks", 3: "clutch 1 locks", 4: "clutch 1 breaks loose", 6: "clutch 1 locks again",
     7: "clutch 1 breaks loose again", 8: "clutch 3 locks",
 }  # fmt: skip
-PUBLISHED = {
+PUBLISHED_TIMES = {
     2: 0.70962146383288, 3: 0.79165828432025, 4: 0.83110850627034, 6: 0.90684913754438,
     7: 1.00029586011387, 8: 1.14396963043371,
 }  # fmt: skip
@@ -82,10 +90,10 @@ RATE = 3.2470345652406571
 
 def part(mode: int) -> Part:
     def field(y: Numbers, m: Any) -> tuple:
-        pushes = drive(y[4], m), passed(y[4], m)
+        pushes = drive(y[4], m), first_clutch_torque(y[4], m)
         return (*(a * pushes[0] + b * pushes[1] + c for a, b, c in SHARES[mode]), 1.0 + 0.0 * y[4])
 
-    return Part(field, (Edge(ENDS[mode], to=(mode + 1) % len(ENDS)),))
+    return Part(field, (GuardEdge(ENDS[mode], target_part=(mode + 1) % len(ENDS)),))
 
 
 SYSTEM = tuple(part(mode) for mode in range(len(ENDS)))
@@ -94,8 +102,8 @@ SYSTEM = tuple(part(mode) for mode in range(len(ENDS)))
 def truth() -> tuple[np.ndarray, float]:
     """Times of the events, and the rate of the first wheel at the last."""
     with mpmath.workdps(30):
-        fast, slow = mpmath.mpf(float(FAST)), mpmath.mpf(float(SLOW))
-        y, begin, told = [mpmath.mpf(x) for x in START], mpmath.mpf(0), []
+        fast, slow = mpmath.mpf(float(FAST_FREQUENCY)), mpmath.mpf(float(SLOW_FREQUENCY))
+        y, begin, result = [mpmath.mpf(x) for x in START], mpmath.mpf(0), []
         for mode, end in enumerate(ENDS):
 
             def at(t, y=y, begin=begin, mode=mode):
@@ -106,7 +114,8 @@ def truth() -> tuple[np.ndarray, float]:
                 )
                 shares = zip(y, SHARES[mode], strict=False)
                 rates = [
-                    w + sum(a * s for a, s in zip(own, sums, strict=True)) for w, own in shares
+                    w + sum(a * s for a, s in zip(own_values, sums, strict=True))
+                    for w, own_values in shares
                 ]
                 return [*rates, t]
 
@@ -116,46 +125,54 @@ def truth() -> tuple[np.ndarray, float]:
                 t += step
             t = mpmath.findroot(value, (t, t + step), solver="anderson", tol=1e-50)
             y, begin = at(t), t
-            told.append(float(t))
-        return np.array(told), float(y[0])
+            result.append(float(t))
+        return np.array(result), float(y[0])
 
 
 def rows() -> Iterator[Row]:
     times, rate = truth()
     for method in METHODS:
-        walked = method(SYSTEM, START, len(ENDS), 2.0)
+        walk_result = method(SYSTEM, START, len(ENDS), 2.0)
         for event in (3, 7, 8):
-            found = last_time(walked, event)
-            yield row(walked, NAMES[event], found, times[event - 1], event=event)
-        whole = len(walked.times) == len(ENDS)
-        yield row(walked, "rate at 1.5 s", float(walked.end[0]) if whole else np.nan, rate)
-        if method is ours:
-            for event, told in PUBLISHED.items():
-                found, name = last_time(walked, event), f"{NAMES[event]}, as published"
-                yield row(walked, name, found, told, digits=4, event=event)
-            yield row(walked, "rate, as published", float(walked.end[0]), RATE, digits=4)
+            solution = last_time(walk_result, event)
+            yield make_row(walk_result, NAMES[event], solution, times[event - 1], event=event)
+        full_values = len(walk_result.times) == len(ENDS)
+        yield make_row(
+            walk_result, "rate at 1.5 s", float(walk_result.end[0]) if full_values else np.nan, rate
+        )
+        if method is run_library:
+            for event, result in PUBLISHED_TIMES.items():
+                solution, name = last_time(walk_result, event), f"{NAMES[event]}, as published"
+                yield make_row(walk_result, name, solution, result, digits=4, event=event)
+            yield make_row(
+                walk_result, "rate, as published", float(walk_result.end[0]), RATE, digits=4
+            )
 
 
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
     axes = figure.subplots()
-    walked = ours(SYSTEM, START, len(ENDS), 2.0)
+    walk_result = run_library(SYSTEM, START, len(ENDS), 2.0)
     begin, y = 0.0, np.array(START[:4])
     for wheel, style in enumerate(("-", "--", "-.", ":")):
         axes.plot([], [], style, color=f"C{wheel}", label=f"wheel {wheel + 1}")
-    for mode, (end, after) in enumerate(zip(walked.times, walked.states, strict=True)):
+    for mode, (end, after) in enumerate(zip(walk_result.times, walk_result.states, strict=True)):
         t = np.linspace(begin, end, 60)
         sums = np.stack(
             [
-                10 * (np.cos(float(FAST) * begin) - np.cos(float(FAST) * t)) / float(FAST),
-                SLIDING * (np.sin(float(SLOW) * t) - np.sin(float(SLOW) * begin)) / float(SLOW),
+                10
+                * (np.cos(float(FAST_FREQUENCY) * begin) - np.cos(float(FAST_FREQUENCY) * t))
+                / float(FAST_FREQUENCY),
+                SLIDING
+                * (np.sin(float(SLOW_FREQUENCY) * t) - np.sin(float(SLOW_FREQUENCY) * begin))
+                / float(SLOW_FREQUENCY),
                 t - begin,
             ]
         )
         for wheel, style in enumerate(("-", "--", "-.", ":")):
             axes.plot(t, y[wheel] + np.array(SHARES[mode][wheel]) @ sums, style, color=f"C{wheel}")
         begin, y = end, after[:4]
-    for event, time in PUBLISHED.items():
-        axes.plot(time, walked.states[event - 1, 1], "ko", ms=4, mfc="w")
+    for event, time in PUBLISHED_TIMES.items():
+        axes.plot(time, walk_result.states[event - 1, 1], "ko", ms=4, mfc="w")
     axes.plot([], [], "ko", ms=4, mfc="w", label="published times")
     axes.set_xlabel("time [s]")
     axes.set_ylabel("rate [rad/s]")

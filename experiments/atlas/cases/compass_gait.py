@@ -13,14 +13,14 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.integrate import solve_ivp
 
-from experiments.atlas.gaits import Exact, Return, gaits
-from experiments.atlas.hybrid import METHODS, Edge, Part, row
-from experiments.atlas.others import rows_of
+from experiments.atlas.gaits import ExactGait, ReturnMap, gaits
+from experiments.atlas.hybrid import METHODS, GuardEdge, Part, make_row
+from experiments.atlas.others import make_rows
 from experiments.atlas.told import Case, Row
 
 G, LEG, HALF, MASS, HIP = 9.8, 1.0, 0.5, 5.0, 10.0
 SLOPE = math.radians(3.0)
-PUBLISHED = (0.2187, -1.0918, -0.3772)  # stance angle, its rate, the swing leg's
+PUBLISHED_STATE = (0.2187, -1.0918, -0.3772)  # stance angle, its rate, the swing leg's
 
 
 def field(y, m):
@@ -59,20 +59,24 @@ NAMES = ("stance angle", "its rate", "swing rate")
 SYSTEM = (
     Part(
         field,
-        (Edge(lambda y, m: -depth(y, m), lambda y, m: (y[0], y[1], -2 * SLOPE - y[0], y[3]), 1),),
+        (
+            GuardEdge(
+                lambda y, m: -depth(y, m), lambda y, m: (y[0], y[1], -2 * SLOPE - y[0], y[3]), 1
+            ),
+        ),
     ),
-    Part(field, (Edge(depth, impact, 0),)),
+    Part(field, (GuardEdge(depth, impact, 0),)),
 )
-COMPASS = Return(
+COMPASS = ReturnMap(
     SYSTEM,
     lambda x, m: (x[0], x[1], -2.0 * SLOPE - x[0], x[2]),
     lambda y: (y[0], y[1], y[3]),
     events=2,
-    guess=PUBLISHED,
+    guess=PUBLISHED_STATE,
 )
 
 
-EXACT = Exact(
+EXACT_GAIT = ExactGait(
     (0.21866880293899055, -1.0918266774895748, -0.37718155840327655),
     0.7347209621553588,
     (
@@ -85,28 +89,39 @@ EXACT = Exact(
 
 def rows() -> Iterator[Row]:
     for gait in gaits(COMPASS):
-        for name, found, own, told in zip(NAMES, gait.x, EXACT.x, PUBLISHED, strict=True):
-            yield row(gait.walked, name, float(found), own)
-            yield row(gait.walked, f"{name}, as published", float(found), told, digits=4)
-        yield row(gait.walked, "period", gait.duration, EXACT.period)
-        radius = abs(EXACT.multipliers[0])
-        yield row(gait.walked, "spectral radius", float(np.abs(gait.multipliers[0])), radius)
-    truths = {"stance angle": EXACT.x[0], "period": EXACT.period}
-    yield from rows_of("drake", "compass_gait", truths)
+        for name, solution, own_values, result in zip(
+            NAMES, gait.x, EXACT_GAIT.x, PUBLISHED_STATE, strict=True
+        ):
+            yield make_row(gait.simulation, name, float(solution), own_values)
+            yield make_row(
+                gait.simulation, f"{name}, as published", float(solution), result, digits=4
+            )
+        yield make_row(gait.simulation, "period", gait.duration, EXACT_GAIT.period)
+        radius = abs(EXACT_GAIT.multipliers[0])
+        yield make_row(
+            gait.simulation, "spectral radius", float(np.abs(gait.multipliers[0])), radius
+        )
+    truths = {"stance angle": EXACT_GAIT.x[0], "period": EXACT_GAIT.period}
+    yield from make_rows("drake", "compass_gait", truths)
 
 
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
     axes = figure.subplots()
-    step = METHODS[0](SYSTEM, COMPASS.begin(PUBLISHED, math), 2, 20.0)
-    begin = COMPASS.begin(PUBLISHED, math)
+    step = METHODS[0](SYSTEM, COMPASS.begin(PUBLISHED_STATE, math), 2, 20.0)
+    begin = COMPASS.begin(PUBLISHED_STATE, math)
     for leg, style in ((0, "-"), (2, "--")):
-        told = solve_ivp(
+        result = solve_ivp(
             lambda t, y: field(y, math), (0.0, float(step.times[1])), begin,
             rtol=1e-8, atol=1e-8, max_step=0.01,
         )  # fmt: skip
         name = "stance leg" if leg == 0 else "swing leg"
-        axes.plot(told.y[leg], told.y[leg + 1], style, label=name)
-    axes.plot([PUBLISHED[0], -2 * SLOPE - PUBLISHED[0]], PUBLISHED[1:], "ko", label="published")
+        axes.plot(result.y[leg], result.y[leg + 1], style, label=name)
+    axes.plot(
+        [PUBLISHED_STATE[0], -2 * SLOPE - PUBLISHED_STATE[0]],
+        PUBLISHED_STATE[1:],
+        "ko",
+        label="published",
+    )
     axes.set_xlabel("angle from the vertical [rad]")
     axes.set_ylabel("its rate [rad/s]")
     axes.legend()

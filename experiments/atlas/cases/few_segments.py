@@ -21,8 +21,14 @@ from scipy.integrate import solve_ivp
 
 import vrw_jax as vrw
 from experiments.atlas.hybrid import JAX, hy
-from experiments.atlas.told import Case, Row, off, timed
-from vrw_jax.numerics import ENDS_ONCE, NODES, ONCE, product_multipliers, segment_maps
+from experiments.atlas.told import Case, Row, compute_error, time_second_call
+from vrw_jax.numerics import (
+    END_WEIGHTS,
+    GAUSS_NODES,
+    INTEGRATION_MATRIX,
+    product_multipliers,
+    segment_maps,
+)
 
 Q = 0.97
 TRUTH = math.exp(-2.0 * math.pi)
@@ -43,45 +49,51 @@ def field(y, m):
     return 0.5 * growth(theta, m) * (r * r - 1.0) / r, 1.0 + 0.0 * theta
 
 
-def collocated(n: int) -> float:
+def compute_collocation_multiplier(n: int) -> float:
     """The multiplier of `n` equal segments of Gauss collocation with four nodes."""
-    told, h = 1.0, PERIOD / n
+    result, h = 1.0, PERIOD / n
     for i in range(n):
-        rates = np.array([growth(h * (i + node), np) for node in NODES])
-        slopes = np.linalg.solve(np.eye(len(NODES)) - h * rates[:, None] * ONCE, rates)
-        told *= 1.0 + h * ENDS_ONCE @ slopes
-    return float(told)
+        rates = np.array([growth(h * (i + node), np) for node in GAUSS_NODES])
+        slopes = np.linalg.solve(
+            np.eye(len(GAUSS_NODES)) - h * rates[:, None] * INTEGRATION_MATRIX, rates
+        )
+        result *= 1.0 + h * END_WEIGHTS @ slopes
+    return float(result)
 
 
-def ours(n: int) -> tuple[float, bool, float]:
+def compute_library_multiplier(n: int) -> tuple[float, bool, float]:
     flow = lambda y: jnp.stack(field(y, JAX))
-    cut = segment_maps(flow, jnp.array([1.0, 0.0]), PERIOD, n, vrw.Options.tight(), directions=1)
-    told = product_multipliers(cut.maps)
-    return float(told.values[0].real), bool(told.known[0]), float(cut.divergence)
+    cut = segment_maps(
+        flow, jnp.array([1.0, 0.0]), PERIOD, n, vrw.StepOptions.tight(), n_directions=1
+    )
+    result = product_multipliers(cut.jacobians)
+    return float(result.values[0].real), bool(result.is_known[0]), float(cut.divergence)
 
 
-def varied(z, m):
+def variational_field(z, m):
     return growth(z[1], m) * z[0], 1.0 + 0.0 * z[1]
 
 
 def rows() -> Iterator[Row]:
     for n in (1, 100):
-        (found, known, _), seconds = timed(lambda n=n: ours(n))
+        (solution, known_values, _), seconds = time_second_call(
+            lambda n=n: compute_library_multiplier(n)
+        )
         name = f"ours, {n} segment{'s' * (n > 1)}"
         yield Row(
-            "multiplier", name, found, TRUTH, off(found, TRUTH, relative=True), "",
-            not known, n, seconds, "Dopri8 1e-13", version("vrw-jax"), STEEP,
+            "multiplier", name, solution, TRUTH, compute_error(solution, TRUTH, relative=True), "",
+            not known_values, n, seconds, "Dopri8 1e-13", version("vrw-jax"), STEEP,
         )  # fmt: skip
     for n in (10, 40, 400):
-        found, seconds = timed(lambda n=n: collocated(n))
+        solution, seconds = time_second_call(lambda n=n: compute_collocation_multiplier(n))
         yield Row(
-            "multiplier", f"collocation, {n} segments", found, TRUTH,
-            off(found, TRUTH, relative=True), "", False, n, seconds, "4 Gauss nodes, equal",
+            "multiplier", f"collocation, {n} segments", solution, TRUTH,
+            compute_error(solution, TRUTH, relative=True), "", False, n, seconds, "4 Gauss nodes, equal",
             version("vrw-jax"), STEEP,
         )  # fmt: skip
-    told, seconds = timed(
+    result, seconds = time_second_call(
         lambda: solve_ivp(
-            lambda t, z: varied(z, math),
+            lambda t, z: variational_field(z, math),
             (0.0, PERIOD),
             (1.0, 0.0),
             "DOP853",
@@ -89,34 +101,36 @@ def rows() -> Iterator[Row]:
             atol=1e-20,
         )
     )
-    found = float(told.y[0, -1])
+    solution = float(result.y[0, -1])
     yield Row(
-        "multiplier", "SciPy", found, TRUTH, off(found, TRUTH, relative=True), "", False, told.nfev,
+        "multiplier", "SciPy", solution, TRUTH, compute_error(solution, TRUTH, relative=True), "", False, result.nfev,
         seconds, "DOP853 1e-13", version("scipy"), STEEP,
     )  # fmt: skip
     solve = eqx.filter_jit(
         lambda z: diffrax.diffeqsolve(
-            diffrax.ODETerm(lambda t, z, _: jnp.stack(varied(z, JAX))), diffrax.Dopri8(), 0.0,
+            diffrax.ODETerm(lambda t, z, _: jnp.stack(variational_field(z, JAX))), diffrax.Dopri8(), 0.0,
             PERIOD, 1e-3, z, stepsize_controller=diffrax.PIDController(rtol=1e-13, atol=1e-20),
         )
     )  # fmt: skip
-    solved, seconds = timed(lambda: jax.block_until_ready(solve(jnp.array([1.0, 0.0]))))
+    solved, seconds = time_second_call(lambda: jax.block_until_ready(solve(jnp.array([1.0, 0.0]))))
     answer, work = float(solved.ys[-1, 0]), int(solved.stats["num_steps"])
     yield Row(
-        "multiplier", "diffrax", answer, TRUTH, off(answer, TRUTH, relative=True), "", False, work,
+        "multiplier", "diffrax", answer, TRUTH, compute_error(answer, TRUTH, relative=True), "", False, work,
         seconds, "Dopri8 1e-13", version("diffrax"), STEEP,
     )  # fmt: skip
     names = hy.make_vars("u", "theta")
-    flow = hy.taylor_adaptive(list(zip(names, varied(names, hy), strict=True)), [1.0, 0.0])
+    flow = hy.taylor_adaptive(
+        list(zip(names, variational_field(names, hy), strict=True)), [1.0, 0.0]
+    )
 
     def by_taylor() -> tuple[float, int]:
         flow.time, flow.state[:] = 0.0, (1.0, 0.0)
         steps = flow.propagate_until(PERIOD)[3]
         return float(flow.state[0]), int(steps)
 
-    (found, work), seconds = timed(by_taylor)
+    (solution, work), seconds = time_second_call(by_taylor)
     yield Row(
-        "multiplier", "heyoka", found, TRUTH, off(found, TRUTH, relative=True), "", False, work,
+        "multiplier", "heyoka", solution, TRUTH, compute_error(solution, TRUTH, relative=True), "", False, work,
         seconds, "Taylor 2.2e-16", version("heyoka"), STEEP,
     )  # fmt: skip
 
@@ -124,11 +138,11 @@ def rows() -> Iterator[Row]:
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
     axes = figure.subplots()
     counts = np.unique(np.round(np.geomspace(4, 1000, 60)).astype(int))
-    found = np.abs([collocated(int(n)) for n in counts])
-    axes.loglog(counts, found, ".-", label="collocation, equal segments")
+    solution = np.abs([compute_collocation_multiplier(int(n)) for n in counts])
+    axes.loglog(counts, solution, ".-", label="collocation, equal segments")
     axes.axhline(TRUTH, color="k", lw=0.8, label="truth, exp(−2π)")
     axes.axhline(1.0, color="0.6", ls=":", label="border of stability")
-    mine = [ours(n)[0] for n in (1, 10, 100)]
+    mine = [compute_library_multiplier(n)[0] for n in (1, 10, 100)]
     axes.loglog((1, 10, 100), mine, "s", mfc="w", label="ours")
     axes.set_xlabel("segments")
     axes.set_ylabel("|multiplier|")

@@ -17,15 +17,23 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import vrw_jax as vrw
-from experiments.atlas.gaits import Return, by_differences, by_newton, gaits
-from experiments.atlas.hybrid import METHODS, Edge, Part, last_time, modes, ours, row
-from experiments.atlas.told import Case, Row, off, timed
-from vrw_jax.numerics import walk
+from experiments.atlas.gaits import ReturnMap, find_by_differences, find_by_newton, gaits
+from experiments.atlas.hybrid import (
+    METHODS,
+    GuardEdge,
+    Part,
+    last_time,
+    make_row,
+    modes,
+    run_library,
+)
+from experiments.atlas.told import Case, Row, compute_error, time_second_call
+from vrw_jax.numerics import simulate_hybrid
 
-KEPT = 0.8
+RESTITUTION_COEFFICIENT = 0.8
 
 
-def stopped(w: float) -> tuple[Part, ...]:
+def make_stopped_oscillator(w: float) -> tuple[Part, ...]:
     """State: x, rate, clock, c."""
     force = 1.0 - w * w  # over -c: the particular motion is -c cos(w t)
     field = lambda y, m: (
@@ -34,42 +42,48 @@ def stopped(w: float) -> tuple[Part, ...]:
         1.0 + 0.0 * y[0],
         0.0 * y[0],
     )
-    stop = Edge(lambda y, m: 1.0 - y[0], lambda y, m: (1.0 + 0.0 * y[0], -KEPT * y[1], y[2], y[3]))
+    stop = GuardEdge(
+        lambda y, m: 1.0 - y[0],
+        lambda y, m: (1.0 + 0.0 * y[0], -RESTITUTION_COEFFICIENT * y[1], y[2], y[3]),
+    )
     return (Part(field, (stop,)),)
 
 
-def touches(w: float, depth: float) -> float:
+def compute_touch_time(w: float, depth: float) -> float:
     """Time of the first touch from x = -c at rest; arccos(1/c) without cancellation."""
     return (math.pi - math.atan(math.sqrt(depth * (2.0 + depth)))) / w
 
 
-def repeating(w: float, depth: float) -> tuple[float, float]:
+def compute_repeating_motion(w: float, depth: float) -> tuple[float, float]:
     """Motion with one impact each period: the clock at impact, and the rate after it.
 
     From x = A cos t + B sin t - c cos(w t + p) with x(0) = x(T) = 1 and v(0) = -r v(T).
     """
     c, period = -(1.0 + depth), 2.0 * math.pi / w
-    cot, ratio = 1.0 / math.tan(period / 2.0), (1.0 - KEPT) / (1.0 + KEPT)
+    cot, ratio = (
+        1.0 / math.tan(period / 2.0),
+        (1.0 - RESTITUTION_COEFFICIENT) / (1.0 + RESTITUTION_COEFFICIENT),
+    )
     a, b, e = cot**2 + (ratio / w) ** 2, -2.0 * cot, 1.0 - c * c
     roots = [(-b + sign * math.sqrt(b * b - 4.0 * a * e)) / (2.0 * a) for sign in (1.0, -1.0)]
     B = min(roots)  # it must push into the stop: B < 0
     phase = math.atan2(B * ratio / w / c, (1.0 - B * cot) / c)
-    return (phase / w) % period, KEPT * 2.0 * B / (1.0 + KEPT)
+    return (phase / w) % period, RESTITUTION_COEFFICIENT * 2.0 * B / (1.0 + RESTITUTION_COEFFICIENT)
 
 
 W, DEPTH = 2.6, 0.05
-NEAR = 1e-6
+GRAZING_DEPTH = 1e-6
 """By how much the stop is touched."""
-NORDMARK = (1.0 + KEPT) * math.sqrt(1.0 + 0.5 * NEAR)
+NORDMARK = (1.0 + RESTITUTION_COEFFICIENT) * math.sqrt(1.0 + 0.5 * GRAZING_DEPTH)
 """1 + r, the coefficient of the map's square root over sqrt(2 a), where the touch is shallow."""
 
 
-def of_impact(w: float, depth: float) -> Return:
+def compute_impact_derivative(w: float, depth: float) -> ReturnMap:
     """From just after one impact to just after the next: clock and rate."""
     c, period = 1.0 + depth, 2.0 * math.pi / w
-    system = stopped(w)
-    clock, rate = repeating(w, depth)
-    return Return(
+    system = make_stopped_oscillator(w)
+    clock, rate = compute_repeating_motion(w, depth)
+    return ReturnMap(
         system,
         lambda x, m: (1.0 + 0.0 * x[0], x[1], x[0], c + 0.0 * x[0]),
         lambda y: (y[2] - period, y[1]),
@@ -80,56 +94,79 @@ def of_impact(w: float, depth: float) -> Return:
 
 def derivative() -> Iterator[Row]:
     """Of the time of touching by the depth, where it grows as 1/sqrt(depth)."""
-    c = 1.0 + NEAR
+    c = 1.0 + GRAZING_DEPTH
     truth = -1.0 / (W * c * math.sqrt(c * c - 1.0))
-    parts, options = modes(stopped(W)), vrw.Options.tight()
+    parts, options = modes(make_stopped_oscillator(W)), vrw.StepOptions.tight()
     start = lambda c: jnp.stack([-c, 0.0 * c, 0.0 * c, c])
-    slope = jax.jit(jax.jacfwd(lambda c: walk(parts, start(c), events=1, options=options).times[0]))
-    found, seconds = timed(lambda: float(slope(c)))
+    slope = jax.jit(
+        jax.jacfwd(lambda c: simulate_hybrid(parts, start(c), events=1, options=options).times[0])
+    )
+    solution, seconds = time_second_call(lambda: float(slope(c)))
     yield Row(
-        "derivative of that time", "ours", found, truth, off(found, truth, relative=True), "",
-        False, 1, seconds, "Dopri8 1e-13", version("vrw-jax"), 0.5 / NEAR,
+        "derivative of that time", "ours", solution, truth, compute_error(solution, truth, relative=True), "",
+        False, 1, seconds, "Dopri8 1e-13", version("vrw-jax"), 0.5 / GRAZING_DEPTH,
     )  # fmt: skip
     h = 1e-8
     for method in METHODS[1:]:
-        ends = [method(stopped(W), (-(c + s), 0.0, 0.0, c + s), 1, 20.0) for s in (h, -h)]
-        found = (last_time(ends[0], 1) - last_time(ends[1], 1)) / (2.0 * h)
-        walked = ends[0]._replace(method=f"{ends[0].method}, differences")
-        yield row(
-            walked, "derivative of that time", found, truth, relative=True, condition=0.5 / NEAR
+        ends = [
+            method(make_stopped_oscillator(W), (-(c + s), 0.0, 0.0, c + s), 1, 20.0)
+            for s in (h, -h)
+        ]
+        solution = (last_time(ends[0], 1) - last_time(ends[1], 1)) / (2.0 * h)
+        walk_result = ends[0]._replace(method=f"{ends[0].method}, differences")
+        yield make_row(
+            walk_result,
+            "derivative of that time",
+            solution,
+            truth,
+            relative=True,
+            condition=0.5 / GRAZING_DEPTH,
         )
 
 
 def rows() -> Iterator[Row]:
     for method in METHODS:
-        walked = method(stopped(W), (-(1.0 + NEAR), 0.0, 0.0, 1.0 + NEAR), 1, 20.0)
-        found = last_time(walked, 1)
-        yield row(
-            walked, "time of touching by 1e-6", found, touches(W, NEAR),
-            condition=1.0 / (W * math.sqrt(2.0 * NEAR)),
+        walk_result = method(
+            make_stopped_oscillator(W),
+            (-(1.0 + GRAZING_DEPTH), 0.0, 0.0, 1.0 + GRAZING_DEPTH),
+            1,
+            20.0,
+        )
+        solution = last_time(walk_result, 1)
+        yield make_row(
+            walk_result, "time of touching by 1e-6", solution, compute_touch_time(W, GRAZING_DEPTH),
+            condition=1.0 / (W * math.sqrt(2.0 * GRAZING_DEPTH)),
         )  # fmt: skip
-        last = walked.states[-1][1] if len(walked.times) else math.nan
-        jump = walked.end[1] - last  # of the rate; over the square root of twice a = w^2 and d
-        yield row(
-            walked, "jump over √(2 a d)", -jump / (W * math.sqrt(2.0 * NEAR)), NORDMARK,
-            condition=0.5 / NEAR,
+        last = walk_result.states[-1][1] if len(walk_result.times) else math.nan
+        jump = walk_result.end[1] - last  # of the rate; over the square root of twice a = w^2 and d
+        yield make_row(
+            walk_result, "jump over √(2 a d)", -jump / (W * math.sqrt(2.0 * GRAZING_DEPTH)), NORDMARK,
+            condition=0.5 / GRAZING_DEPTH,
         )  # fmt: skip
-    fine = ours(stopped(W), (-(1.0 + NEAR), 0.0, 0.0, 1.0 + NEAR), 1, 20.0, tolerance=1e-15)
+    fine = run_library(
+        make_stopped_oscillator(W),
+        (-(1.0 + GRAZING_DEPTH), 0.0, 0.0, 1.0 + GRAZING_DEPTH),
+        1,
+        20.0,
+        tolerance=1e-15,
+    )
     fine = fine._replace(method="ours, 1e-15")
-    yield row(
-        fine, "time of touching by 1e-6", last_time(fine, 1), touches(W, NEAR),
-        condition=1.0 / (W * math.sqrt(2.0 * NEAR)),
+    yield make_row(
+        fine, "time of touching by 1e-6", last_time(fine, 1), compute_touch_time(W, GRAZING_DEPTH),
+        condition=1.0 / (W * math.sqrt(2.0 * GRAZING_DEPTH)),
     )  # fmt: skip
     yield from derivative()
-    _, rate = repeating(W, DEPTH)
-    for gait in gaits(of_impact(W, DEPTH)):
-        yield row(gait.walked, "rate after impact", float(gait.x[1]), rate)
-        yield row(gait.walked, "product of multipliers", gait.product, KEPT**2)
-    graze = of_impact(W, 1e-9)._replace(guess=(math.pi / W, -1e-4))
-    truth = repeating(W, 1e-9)[1]
-    for gait in (by_newton(graze), by_differences(METHODS[3], graze)):
-        found = float(gait.x[1])
-        yield row(gait.walked, "rate, Newton from the graze", found, truth)
+    _, rate = compute_repeating_motion(W, DEPTH)
+    for gait in gaits(compute_impact_derivative(W, DEPTH)):
+        yield make_row(gait.simulation, "rate after impact", float(gait.x[1]), rate)
+        yield make_row(
+            gait.simulation, "product of multipliers", gait.product, RESTITUTION_COEFFICIENT**2
+        )
+    graze = compute_impact_derivative(W, 1e-9)._replace(guess=(math.pi / W, -1e-4))
+    truth = compute_repeating_motion(W, 1e-9)[1]
+    for gait in (find_by_newton(graze), find_by_differences(METHODS[3], graze)):
+        solution = float(gait.x[1])
+        yield make_row(gait.simulation, "rate, Newton from the graze", solution, truth)
 
 
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
@@ -138,11 +175,13 @@ def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
     for k, (method, marker) in enumerate(zip(METHODS, "o^sD", strict=True)):
         errors = []
         for depth in depths:
-            walked = method(stopped(W), (-(1.0 + depth), 0.0, 0.0, 1.0 + depth), 1, 4.0)
-            errors.append(abs(last_time(walked, 1) - touches(W, depth)) + 1e-17)
+            walk_result = method(
+                make_stopped_oscillator(W), (-(1.0 + depth), 0.0, 0.0, 1.0 + depth), 1, 4.0
+            )
+            errors.append(abs(last_time(walk_result, 1) - compute_touch_time(W, depth)) + 1e-17)
         missed = np.array([not error < 0.5 for error in errors])
-        found = np.array(errors)[~missed]
-        line = axes.loglog(depths[~missed], found, marker + "-", ms=4, label=walked.method)
+        solution = np.array(errors)[~missed]
+        line = axes.loglog(depths[~missed], solution, marker + "-", ms=4, label=walk_result.method)
         axes.loglog(depths[missed], np.full(missed.sum(), 30.0**k), "x", color=line[0].get_color())
     axes.loglog(depths, 1e-16 / (W * np.sqrt(2.0 * depths)), "k-", lw=0.7, label="rounding")
     axes.set_xlabel("depth of touching")

@@ -20,10 +20,10 @@ from scipy.integrate import solve_ivp
 
 import vrw_jax as vrw
 from experiments.atlas.hybrid import JAX, hy
-from experiments.atlas.told import Case, Row, off, timed
+from experiments.atlas.told import Case, Row, compute_error, time_second_call
 from vrw_jax.numerics import product_multipliers, segment_maps
 
-SMALL = math.exp(-48.0 * math.pi)
+SMALL_MULTIPLIER = math.exp(-48.0 * math.pi)
 PERIOD = 2.0 * math.pi
 SEGMENTS = 200
 
@@ -42,32 +42,32 @@ def columns(z: Any, m: Any) -> tuple:
 BEGIN = (1.0, 0.0, 0.0, 1.0, 0.0)
 
 
-def by_segments(n: int) -> Any:
+def compute_by_segments(n: int) -> Any:
     """This library's multipliers, with `n` segments."""
     flow = lambda y: jnp.stack(field(y, JAX))
-    cut = segment_maps(flow, jnp.zeros(3), PERIOD, n, vrw.Options.tight(), directions=2)
-    return product_multipliers(cut.maps), np.asarray(cut.maps)
+    cut = segment_maps(flow, jnp.zeros(3), PERIOD, n, vrw.StepOptions.tight(), n_directions=2)
+    return product_multipliers(cut.jacobians), np.asarray(cut.jacobians)
 
 
-def of_product(matrix: np.ndarray) -> np.ndarray:
+def multiply_segments(matrix: np.ndarray) -> np.ndarray:
     values = np.linalg.eigvals(matrix)
     return values[np.argsort(-np.abs(values))]
 
 
 def with_scipy() -> tuple[np.ndarray, int]:
-    told = solve_ivp(
+    result = solve_ivp(
         lambda t, z: columns(z, np), (0.0, PERIOD), BEGIN, method="DOP853", rtol=1e-13, atol=1e-30
     )
-    return told.y[:4, -1].reshape(2, 2).T, told.nfev
+    return result.y[:4, -1].reshape(2, 2).T, result.nfev
 
 
 def with_diffrax() -> tuple[np.ndarray, int]:
-    told = _solved(jnp.array(BEGIN))
-    return np.asarray(told.ys[-1][:4]).reshape(2, 2).T, int(told.stats["num_steps"])
+    result = _solve_with_diffrax(jnp.array(BEGIN))
+    return np.asarray(result.ys[-1][:4]).reshape(2, 2).T, int(result.stats["num_steps"])
 
 
 @eqx.filter_jit
-def _solved(z: Any) -> Any:
+def _solve_with_diffrax(z: Any) -> Any:
     return diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, z, _: jnp.stack(columns(z, JAX))), diffrax.Dopri8(), 0.0, PERIOD,
         1e-3, z, stepsize_controller=diffrax.PIDController(rtol=1e-13, atol=1e-30),
@@ -91,20 +91,22 @@ PEERS: tuple[tuple[str, Callable, str, str], ...] = (
 
 def rows() -> Iterator[Row]:
     for name, n in (("ours", SEGMENTS), ("ours, one segment", 1)):
-        (told, _), seconds = timed(lambda n=n: by_segments(n))
-        for i, truth in enumerate((1.0, SMALL)):
-            found, known = float(told.values[i].real), bool(told.known[i])
-            says = "" if known else f"not known: uncertainty {told.uncertainty[i]:.0e}"
+        (result, _), seconds = time_second_call(lambda n=n: compute_by_segments(n))
+        for i, truth in enumerate((1.0, SMALL_MULTIPLIER)):
+            solution, known_values = float(result.values[i].real), bool(result.known[i])
+            says = "" if known_values else f"not known: uncertainty {result.relative_error[i]:.0e}"
             yield Row(
-                f"multiplier {truth:.1e}", name, found, truth, off(found, truth, relative=True),
-                says, not known, n, seconds, f"Dopri8 1e-13, {n} segments", version("vrw-jax"),
+                f"multiplier {truth:.1e}", name, solution, truth, compute_error(solution, truth, relative=True),
+                says, not known_values, n, seconds, f"Dopri8 1e-13, {n} segments", version("vrw-jax"),
             )  # fmt: skip
     for name, call, options, package in PEERS:
-        (matrix, work), seconds = timed(call)
-        for found, truth in zip(of_product(matrix).real, (1.0, SMALL), strict=True):
-            error = off(float(found), truth, relative=True)
+        (matrix, work), seconds = time_second_call(call)
+        for solution, truth in zip(
+            multiply_segments(matrix).real, (1.0, SMALL_MULTIPLIER), strict=True
+        ):
+            error = compute_error(float(solution), truth, relative=True)
             yield Row(
-                f"multiplier {truth:.1e}", name, float(found), truth, error, "", False, work,
+                f"multiplier {truth:.1e}", name, float(solution), truth, error, "", False, work,
                 seconds, options, version(package),
             )  # fmt: skip
 
@@ -112,13 +114,20 @@ def rows() -> Iterator[Row]:
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
     axes = figure.subplots()
     counts = (4, 8, 16, 30, 60, 120, 250, 500)
-    told = [by_segments(n) for n in counts]
-    gap = [max(abs(t.logarithms[1] + 48.0 * math.pi), 1e-16) for t, _ in told]
+    result_list = [compute_by_segments(n) for n in counts]
+    gap = [max(abs(t.logarithms[1] + 48.0 * math.pi), 1e-16) for t, _ in result_list]
     axes.loglog(counts, gap, "o-", label="triangular factors")
     axes.loglog(
-        counts, [t.uncertainty[1] for t, _ in told], "o--", mfc="w", label="its own estimate"
+        counts,
+        [t.relative_error[1] for t, _ in result_list],
+        "o--",
+        mfc="w",
+        label="its own estimate",
     )
-    naive = [abs(of_product(np.linalg.multi_dot(maps[::-1]))[1] / SMALL - 1.0) for _, maps in told]
+    naive = [
+        abs(multiply_segments(np.linalg.multi_dot(maps[::-1]))[1] / SMALL_MULTIPLIER - 1.0)
+        for _, maps in result_list
+    ]
     axes.loglog(counts, naive, "s:", label="their product")
     axes.set_xlabel("segments")
     axes.set_ylabel("relative error of $\\exp(-48\\pi)$")

@@ -20,9 +20,9 @@ from matplotlib.figure import Figure
 from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve, nnls
 
-from experiments.atlas.others import rows_of
-from experiments.atlas.told import Case, Row, off, timed
-from vrw_jax.numerics import Answers, complementary, newton_cycle
+from experiments.atlas.others import make_rows
+from experiments.atlas.told import Case, Row, compute_error, time_second_call
+from vrw_jax.numerics import LCPStatus, enumerate_lcp_solutions, solve_fixed_point
 
 G, FRICTION = 9.81, 1.6
 STATES = {"one answer": (0.4, 0.0, 1), "two answers": (1.1, 5.0, 2), "no answer": (1.1, 0.0, 0)}
@@ -40,57 +40,61 @@ def penalty(angle: float, rate: float) -> tuple[float, int]:
     """Force after 0.01 s on a stiff ground without the rod's turning, and evaluations."""
     a, b = contact(angle, rate, FRICTION)
     force = lambda z, v: STIFF * max(-z, 0.0) - (2.0 * math.sqrt(STIFF) * v if z < 0.0 else 0.0)
-    told = solve_ivp(
+    result = solve_ivp(
         lambda t, y: (y[1], a * force(*y) + b), (0.0, 0.01), (-1e-7, 0.0), "Radau", rtol=1e-8,
         atol=1e-14,
     )  # fmt: skip
-    return force(*told.y[:, -1]), told.nfev
+    return force(*result.y[:, -1]), result.nfev
 
 
 def rows() -> Iterator[Row]:
     for name, (angle, rate, count) in STATES.items():
         a, b = contact(angle, rate, FRICTION)
-        told, seconds = timed(lambda a=a, b=b: complementary([[a]], [b]))
-        found, code = int(np.sum(told.fits)), Answers(int(told.answers))
+        result, seconds = time_second_call(lambda a=a, b=b: enumerate_lcp_solutions([[a]], [b]))
+        solution, code = int(np.sum(result.is_solution)), LCPStatus(int(result.status))
         yield Row(
-            name, "ours", found, count, off(found, count), "" if count == 1 else code.name,
+            name, "ours", solution, count, compute_error(solution, count), "" if count == 1 else code.name,
             count != 1, 2, seconds, "all combinations", version("vrw-jax"),
         )  # fmt: skip
-        (force, residual), seconds = timed(lambda a=a, b=b: nnls(np.array([[a]]), np.array([-b])))
+        (force, residual), seconds = time_second_call(
+            lambda a=a, b=b: nnls(np.array([[a]]), np.array([-b]))
+        )
         says = "" if residual < 1e-9 else f"residual {residual:.1e}"
         yield Row(
-            name, "SciPy, nnls", 1, count, off(1, count), says, bool(says), 1, seconds,
+            name, "SciPy, nnls", 1, count, compute_error(1, count), says, bool(says), 1, seconds,
             f"force {force[0]:.3g}", version("scipy"),
         )  # fmt: skip
-        (force, work), seconds = timed(lambda angle=angle, rate=rate: penalty(angle, rate))
+        (force, work), seconds = time_second_call(
+            lambda angle=angle, rate=rate: penalty(angle, rate)
+        )
         yield Row(
-            name, "SciPy, penalty ground", 1, count, off(1, count), f"force {force:.3g}", False,
+            name, "SciPy, penalty ground", 1, count, compute_error(1, count), f"force {force:.3g}", False,
             work, seconds, f"Radau 1e-8, stiffness {STIFF:g}", version("scipy"),
         )  # fmt: skip
 
     rod = json.dumps({name: contact(*state[:2], FRICTION) for name, state in STATES.items()})
     counts = {name: float(count) for name, (_, _, count) in STATES.items()}
-    yield from rows_of("siconos", "painleve", counts, "--rod", rod)
+    yield from make_rows("siconos", "painleve", counts, "--rod", rod)
 
     def border(x: jax.Array) -> jax.Array:
         value, slope = jax.value_and_grad(lambda a: contact(a, 0.0, x[1], jnp)[0])(x[0])
         return jnp.stack([value, slope])
 
     start = jnp.array([1.0, 1.5])
-    found, seconds = timed(lambda: newton_cycle(lambda x: x + border(x), start))
-    friction = float(found.x[1])
+    solution, seconds = time_second_call(lambda: solve_fixed_point(lambda x: x + border(x), start))
+    friction = float(solution.x[1])
     yield Row(
-        "least friction", "ours", friction, 4.0 / 3.0, off(friction, 4.0 / 3.0),
-        "" if found.converged else "not converged", not found.converged, int(found.iterations),
+        "least friction", "ours", friction, 4.0 / 3.0, compute_error(friction, 4.0 / 3.0),
+        "" if solution.converged else "not converged", not solution.converged, int(solution.iterations),
         seconds, "Newton", version("vrw-jax"),
     )  # fmt: skip
-    (other, info, _, _), seconds = timed(
+    (other, info, _, _), seconds = time_second_call(
         lambda: fsolve(
             lambda x: np.asarray(border(jnp.asarray(x))), np.asarray(start), full_output=True
         )
     )
     yield Row(
-        "least friction", "SciPy", float(other[1]), 4.0 / 3.0, off(float(other[1]), 4.0 / 3.0), "",
+        "least friction", "SciPy", float(other[1]), 4.0 / 3.0, compute_error(float(other[1]), 4.0 / 3.0), "",
         False, int(info["nfev"]), seconds, "fsolve 1.5e-8", version("scipy"),
     )  # fmt: skip
 
@@ -102,7 +106,7 @@ def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
 
     def count(x: jax.Array) -> jax.Array:
         a, b = contact(x[0], x[1], FRICTION, jnp)
-        return complementary(a[None, None], b[None]).answers
+        return enumerate_lcp_solutions(a[None, None], b[None]).status
 
     counts = np.asarray(jax.vmap(count)(grid)).reshape(len(rates), len(angles))
     colours = ListedColormap(["#D55E00", "#E8E8E8", "#56B4E9"])

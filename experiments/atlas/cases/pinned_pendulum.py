@@ -12,23 +12,32 @@ import mpmath
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.atlas.hybrid import METHODS, Edge, Part, last_time, row
+from experiments.atlas.hybrid import METHODS, GuardEdge, Part, last_time, make_row
 from experiments.atlas.told import Case, Row
 
-G, LONG, SHORT = 9.81, 1.0, 0.3
-HIGH, PIN = math.pi / 6, -math.pi / 12
+G, LONG_LENGTH, SHORT_LENGTH = 9.81, 1.0, 0.3
+START_ANGLE, PIN_ANGLE = math.pi / 6, -math.pi / 12
 EVENTS = 12
 
 
-def swing(length: float, gain: float, sign: float, to: int) -> Part:
+def swing(length: float, gain: float, sign: float, target: int) -> Part:
     return Part(
         lambda y, m: (y[1], -G / length * m.sin(y[0])),
-        (Edge(lambda y, m: sign * (y[0] - PIN), lambda y, m: (PIN, gain * y[1]), to),),
+        (
+            GuardEdge(
+                lambda y, m: sign * (y[0] - PIN_ANGLE),
+                lambda y, m: (PIN_ANGLE, gain * y[1]),
+                target,
+            ),
+        ),
     )
 
 
-SYSTEM = (swing(LONG, LONG / SHORT, 1.0, 1), swing(SHORT, SHORT / LONG, -1.0, 0))
-START = (HIGH, 0.0)
+SYSTEM = (
+    swing(LONG_LENGTH, LONG_LENGTH / SHORT_LENGTH, 1.0, 1),
+    swing(SHORT_LENGTH, SHORT_LENGTH / LONG_LENGTH, -1.0, 0),
+)
+START = (START_ANGLE, 0.0)
 
 
 def truth(events: int) -> np.ndarray:
@@ -42,11 +51,13 @@ def truth(events: int) -> np.ndarray:
             part = mpmath.ellipk(m) - mpmath.ellipf(mpmath.asin(half(high, angle)), m)
             return part * mpmath.sqrt(mpmath.mpf(length) / mpmath.mpf(G))
 
-        high, pin = mpmath.mpf(HIGH), mpmath.mpf(PIN)
-        rise = mpmath.mpf(LONG) * (mpmath.cos(pin) - mpmath.cos(high))  # of energy at the pin
-        other = mpmath.acos(mpmath.cos(pin) - rise / mpmath.mpf(SHORT))
-        on_long = passage(LONG, high, pin)
-        on_short = 2 * passage(SHORT, other, -pin)
+        high, pin = mpmath.mpf(START_ANGLE), mpmath.mpf(PIN_ANGLE)
+        rise = mpmath.mpf(LONG_LENGTH) * (
+            mpmath.cos(pin) - mpmath.cos(high)
+        )  # of energy at the pin
+        other = mpmath.acos(mpmath.cos(pin) - rise / mpmath.mpf(SHORT_LENGTH))
+        on_long = passage(LONG_LENGTH, high, pin)
+        on_short = 2 * passage(SHORT_LENGTH, other, -pin)
         parts = [on_long] + [on_short, 2 * on_long] * events
         return np.array([float(x) for x in np.cumsum(parts[:events])])
 
@@ -54,20 +65,25 @@ def truth(events: int) -> np.ndarray:
 def rows() -> Iterator[Row]:
     times = truth(EVENTS)
     for method in METHODS:
-        walked = method(SYSTEM, START, EVENTS, 10.0)
+        walk_result = method(SYSTEM, START, EVENTS, 10.0)
         for n in (1, 2, EVENTS):
             truth_n = float(times[n - 1])
-            yield row(walked, f"time of event {n}", last_time(walked, n), truth_n, event=n)
+            yield make_row(
+                walk_result, f"time of event {n}", last_time(walk_result, n), truth_n, event=n
+            )
 
 
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
     axes = figure.subplots()
     times = truth(EVENTS)
     for method, marker in zip(METHODS, "o^sD", strict=True):
-        walked = method(SYSTEM, START, EVENTS, 10.0)
-        n = len(walked.times)
+        walk_result = method(SYSTEM, START, EVENTS, 10.0)
+        n = len(walk_result.times)
         axes.semilogy(
-            range(1, n + 1), np.abs(walked.times - times[:n]) + 1e-17, marker, label=walked.method
+            range(1, n + 1),
+            np.abs(walk_result.times - times[:n]) + 1e-17,
+            marker,
+            label=walk_result.method,
         )
     axes.set_xlabel("event: on the pin, off the pin, ...")
     axes.set_ylabel("error of its time [s]")

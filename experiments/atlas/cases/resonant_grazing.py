@@ -12,9 +12,13 @@ from collections.abc import Iterator
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.atlas.cases.grazing import KEPT, of_impact, repeating
+from experiments.atlas.cases.grazing import (
+    RESTITUTION_COEFFICIENT,
+    compute_impact_derivative,
+    compute_repeating_motion,
+)
 from experiments.atlas.gaits import gaits
-from experiments.atlas.hybrid import row
+from experiments.atlas.hybrid import make_row
 from experiments.atlas.told import Case, Row
 
 W, DEPTHS = 2.0, (1e-2, 1e-6)
@@ -23,15 +27,21 @@ W, DEPTHS = 2.0, (1e-2, 1e-6)
 def rate(depth: float) -> float:
     """After the impact, in resonance."""
     c = 1.0 + depth
-    return -KEPT * 2.0 * W * math.sqrt(c * c - 1.0) / (1.0 - KEPT)
+    return (
+        -RESTITUTION_COEFFICIENT
+        * 2.0
+        * W
+        * math.sqrt(c * c - 1.0)
+        / (1.0 - RESTITUTION_COEFFICIENT)
+    )
 
 
 def resonant(depth: float):
-    told = of_impact(W, depth)
+    result = compute_impact_derivative(W, depth)
     c = 1.0 + depth
     phase = math.atan2(-math.sqrt(c * c - 1.0) / -c, 1.0 / -c)
     clock = (phase / W) % (2.0 * math.pi / W)
-    return told._replace(guess=(clock * (1.0 + 1e-4), rate(depth) * 1.001))
+    return result._replace(guess=(clock * (1.0 + 1e-4), rate(depth) * 1.001))
 
 
 def rows() -> Iterator[Row]:
@@ -39,21 +49,23 @@ def rows() -> Iterator[Row]:
         for gait in gaits(resonant(depth)):
             name = f"rate after impact, depth {depth:g}"
             steep = abs(rate(depth)) / (2.0 * depth)  # of the rate over the depth
-            yield row(gait.walked, name, float(gait.x[1]), rate(depth), condition=steep)
+            yield make_row(gait.simulation, name, float(gait.x[1]), rate(depth), condition=steep)
             name = f"product of multipliers, {depth:g}"
-            yield row(gait.walked, name, gait.product, KEPT**2, condition=steep)
+            yield make_row(
+                gait.simulation, name, gait.product, RESTITUTION_COEFFICIENT**2, condition=steep
+            )
 
 
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
     axes = figure.subplots()
     depths = np.geomspace(1e-6, 0.1, 40)
     for w in (2.6, 2.2, 2.02):
-        rates = [-repeating(w, d)[1] for d in depths]
+        rates = [-compute_repeating_motion(w, d)[1] for d in depths]
         axes.loglog(depths, rates, label=f"$w = {w}$")
     axes.loglog(depths, [-rate(d) for d in depths], "k-", label="$w = 2$, resonance")
-    found = {(r["quantity"], r["found"]) for r in rows if r["method"] == "ours"}
+    solution = {(r["quantity"], r["found"]) for r in rows if r["method"] == "ours"}
     for depth in DEPTHS:
-        for quantity, value in found:
+        for quantity, value in solution:
             if quantity == f"rate after impact, depth {depth:g}":
                 axes.loglog(depth, -float(value), "o", color="k")
     axes.set_xlabel("depth of grazing")

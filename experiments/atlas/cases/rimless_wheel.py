@@ -13,26 +13,28 @@ import mpmath
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.atlas.gaits import Return, gaits
-from experiments.atlas.hybrid import METHODS, Edge, Part, row
-from experiments.atlas.others import rows_of
+from experiments.atlas.gaits import ReturnMap, gaits
+from experiments.atlas.hybrid import METHODS, GuardEdge, Part, make_row
+from experiments.atlas.others import make_rows
 from experiments.atlas.told import Case, Row
 
 G, SLOPE, ALPHA = 9.81, 0.08, math.pi / 8
-KEPT = math.cos(2.0 * ALPHA)
+RATE_RATIO = math.cos(2.0 * ALPHA)
 STEP = Part(
     lambda y, m: (y[1], G * m.sin(y[0])),
     (
-        Edge(
+        GuardEdge(
             lambda y, m: SLOPE + ALPHA - y[0],
-            lambda y, m: (SLOPE - ALPHA + 0.0 * y[0], KEPT * y[1]),
+            lambda y, m: (SLOPE - ALPHA + 0.0 * y[0], RATE_RATIO * y[1]),
         ),
     ),
 )
-WHEEL = Return(
+WHEEL = ReturnMap(
     (STEP,), lambda x, m: (SLOPE - ALPHA, x[0]), lambda y: (y[1],), events=1, guess=(1.3,)
 )
-RATE = math.sqrt(4.0 * G * math.sin(ALPHA) * math.sin(SLOPE) * KEPT**2 / (1.0 - KEPT**2))
+RATE = math.sqrt(
+    4.0 * G * math.sin(ALPHA) * math.sin(SLOPE) * RATE_RATIO**2 / (1.0 - RATE_RATIO**2)
+)
 
 
 def period() -> float:
@@ -47,23 +49,23 @@ def period() -> float:
 
 def rows() -> Iterator[Row]:
     for gait in gaits(WHEEL):
-        yield row(gait.walked, "rate after impact", float(gait.x[0]), RATE)
-        yield row(gait.walked, "period", gait.duration, period())
-        yield row(gait.walked, "multiplier", float(gait.jacobian[0, 0]), KEPT**2)
-    truths = {"rate after impact": RATE, "period": period(), "multiplier": KEPT**2}
-    yield from rows_of("drake", "rimless_wheel", truths)
+        yield make_row(gait.simulation, "rate after impact", float(gait.x[0]), RATE)
+        yield make_row(gait.simulation, "period", gait.duration, period())
+        yield make_row(gait.simulation, "multiplier", float(gait.jacobian[0, 0]), RATE_RATIO**2)
+    truths = {"rate after impact": RATE, "period": period(), "multiplier": RATE_RATIO**2}
+    yield from make_rows("drake", "rimless_wheel", truths)
 
 
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
     axes = figure.subplots()
     start = (SLOPE - ALPHA, 1.7)
     for method, marker in zip(METHODS, "o^sD", strict=True):
-        walked = method((STEP,), start, 40, 20.0)
-        rates = KEPT * walked.states[:, 1]
+        walk_result = method((STEP,), start, 40, 20.0)
+        rates = RATE_RATIO * walk_result.states[:, 1]
         gap = np.abs(rates - RATE) + 1e-17
-        axes.semilogy(range(1, len(gap) + 1), gap, marker, ms=3, label=walked.method)
+        axes.semilogy(range(1, len(gap) + 1), gap, marker, ms=3, label=walk_result.method)
     steps = np.arange(1, 41)
-    energy = KEPT ** (2 * steps) * (1.7**2 - RATE**2)
+    energy = RATE_RATIO ** (2 * steps) * (1.7**2 - RATE**2)
     axes.semilogy(
         steps, energy / (RATE + np.sqrt(RATE**2 + energy)), "k-", lw=0.7, label="closed form"
     )

@@ -13,12 +13,12 @@ from collections.abc import Iterator
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.atlas.gaits import Exact, Return, gaits
-from experiments.atlas.hybrid import METHODS, Edge, Part, row
+from experiments.atlas.gaits import ExactGait, ReturnMap, gaits
+from experiments.atlas.hybrid import METHODS, GuardEdge, Part, make_row
 from experiments.atlas.told import Case, Row
 
 SLOPE = 0.009
-LONG = (0.200310900544287, -0.199832473004977)
+LONG_PERIOD_GAIT = (0.200310900544287, -0.199832473004977)
 PAIR = (-0.190099639402167, 0.557599274284362)  # real and imaginary part of the multipliers
 
 
@@ -30,8 +30,8 @@ def field(y, m):
 
 def heelstrike(y, m):
     theta, rate = y[0], y[1]
-    kept = m.cos(2.0 * theta)
-    return -theta, kept * rate, -2.0 * theta, kept * (1.0 - kept) * rate
+    retained = m.cos(2.0 * theta)
+    return -theta, retained * rate, -2.0 * theta, retained * (1.0 - retained) * rate
 
 
 def height(y, m):
@@ -40,20 +40,20 @@ def height(y, m):
 
 
 SYSTEM = (
-    Part(field, (Edge(height, lambda y, m: (y[0], y[1], 2.0 * y[0], y[3]), 1),)),
-    Part(field, (Edge(lambda y, m: -height(y, m), heelstrike, 0),)),
+    Part(field, (GuardEdge(height, lambda y, m: (y[0], y[1], 2.0 * y[0], y[3]), 1),)),
+    Part(field, (GuardEdge(lambda y, m: -height(y, m), heelstrike, 0),)),
 )
 
 
 def begin(x, m):
-    kept = (m if hasattr(m, "cos") else math).cos(2.0 * x[0])
-    return x[0], x[1], 2.0 * x[0], x[1] * (1.0 - kept)
+    retained = (m if hasattr(m, "cos") else math).cos(2.0 * x[0])
+    return x[0], x[1], 2.0 * x[0], x[1] * (1.0 - retained)
 
 
-WALKER = Return(SYSTEM, begin, lambda y: (y[0], y[1]), events=2, guess=(0.2, -0.2))
+WALKER = ReturnMap(SYSTEM, begin, lambda y: (y[0], y[1]), events=2, guess=(0.2, -0.2))
 
 
-EXACT = Exact(
+EXACT_GAIT = ExactGait(
     (0.20031090054424708, -0.19983247300495235),
     3.882463752851374,
     (-0.1900998410658881 + 0.5575987766820683j, -0.1900998410658881 - 0.5575987766820683j),
@@ -61,34 +61,34 @@ EXACT = Exact(
 
 
 def rows() -> Iterator[Row]:
-    truth = EXACT.multipliers[0]
+    truth = EXACT_GAIT.multipliers[0]
     for gait in gaits(WALKER):
-        walked, first = gait.walked, gait.multipliers[0]
+        walk_result, first = gait.simulation, gait.multipliers[0]
         parts = (("real", first.real, truth.real), ("imaginary", abs(first.imag), truth.imag))
-        for name, found, own, told in zip(
-            ("stance angle", "its rate"), gait.x, EXACT.x, LONG, strict=True
+        for name, solution, own_values, result in zip(
+            ("stance angle", "its rate"), gait.x, EXACT_GAIT.x, LONG_PERIOD_GAIT, strict=True
         ):
-            yield row(walked, name, float(found), own)
-            yield row(walked, f"{name}, as published", float(found), told, digits=13)
-        yield row(walked, "period", gait.duration, EXACT.period)
-        for (name, found, own), told in zip(parts, PAIR, strict=True):
+            yield make_row(walk_result, name, float(solution), own_values)
+            yield make_row(walk_result, f"{name}, as published", float(solution), result, digits=13)
+        yield make_row(walk_result, "period", gait.duration, EXACT_GAIT.period)
+        for (name, solution, own_values), result in zip(parts, PAIR, strict=True):
             name = f"multipliers, {name} part"
-            yield row(walked, name, float(found), own)
-            yield row(walked, f"{name}, as published", float(found), told, digits=6)
+            yield make_row(walk_result, name, float(solution), own_values)
+            yield make_row(walk_result, f"{name}, as published", float(solution), result, digits=6)
 
 
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
     axes = figure.subplots()
     for method, marker in zip(METHODS, "o^sD", strict=True):
-        x = np.array(LONG) * 1.01
+        x = np.array(LONG_PERIOD_GAIT) * 1.01
         gaps = []
         for _ in range(25):
-            walked = method(SYSTEM, begin(x, math), 2, 20.0)
-            if len(walked.times) < 2:
+            walk_result = method(SYSTEM, begin(x, math), 2, 20.0)
+            if len(walk_result.times) < 2:
                 break
-            x = walked.end[:2]
-            gaps.append(float(np.hypot(*(x - LONG))) + 1e-17)
-        axes.semilogy(range(1, len(gaps) + 1), gaps, marker, ms=3, label=walked.method)
+            x = walk_result.end[:2]
+            gaps.append(float(np.hypot(*(x - LONG_PERIOD_GAIT))) + 1e-17)
+        axes.semilogy(range(1, len(gaps) + 1), gaps, marker, ms=3, label=walk_result.method)
     steps = np.arange(1, 26)
     axes.semilogy(steps, 3e-3 * np.hypot(*PAIR) ** steps, "k-", lw=0.7, label="|multiplier|ⁿ")
     axes.set_xlabel("step")

@@ -11,18 +11,18 @@ from collections.abc import Iterator
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.atlas.hybrid import METHODS, Edge, Part, Walked, last_time, row
+from experiments.atlas.hybrid import METHODS, GuardEdge, MethodRun, Part, last_time, make_row
 from experiments.atlas.told import Case, Row
 
 LEVELS = (1e-4, 1e-8)
 
 
 def root(level: float) -> tuple[Part, ...]:
-    return (Part(lambda y, m: (-0.5 / y[0],), (Edge(lambda y, m: y[0] - level),)),)
+    return (Part(lambda y, m: (-0.5 / y[0],), (GuardEdge(lambda y, m: y[0] - level),)),)
 
 
 def tank(level: float) -> tuple[Part, ...]:
-    return (Part(lambda y, m: (-2.0 * m.sqrt(y[0]),), (Edge(lambda y, m: y[0] - level),)),)
+    return (Part(lambda y, m: (-2.0 * m.sqrt(y[0]),), (GuardEdge(lambda y, m: y[0] - level),)),)
 
 
 QUESTIONS = (("pole", root(1e-4), 1.0 - 1e-8), ("empty tank", tank(1e-4), 1.0 - 1e-2))
@@ -31,24 +31,26 @@ QUESTIONS = (("pole", root(1e-4), 1.0 - 1e-8), ("empty tank", tank(1e-4), 1.0 - 
 def rows() -> Iterator[Row]:
     for name, system, truth in QUESTIONS:
         for method in METHODS:
-            walked = method(system, (1.0,), 1, 1.5)
-            yield row(walked, f"event before the {name}", last_time(walked, 1), truth)
+            walk_result = method(system, (1.0,), 1, 1.5)
+            yield make_row(
+                walk_result, f"event before the {name}", last_time(walk_result, 1), truth
+            )
 
 
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
     axes = figure.subplots()
     levels = 10.0 ** -np.arange(1.0, 8.0)
 
-    def error(walked: Walked, level: float) -> float:
-        found = last_time(walked, 1)
-        return abs(found - (1.0 - level**2)) + 1e-17 if np.isfinite(found) else np.nan
+    def error(walk_result: MethodRun, level: float) -> float:
+        solution = last_time(walk_result, 1)
+        return abs(solution - (1.0 - level**2)) + 1e-17 if np.isfinite(solution) else np.nan
 
     for method, marker in zip(METHODS, "o^sD", strict=True):
         walks = [method(root(level), (1.0,), 1, 1.5) for level in levels]
         errors = [error(w, level) for w, level in zip(walks, levels, strict=True)]
         line = axes.loglog(levels, errors, marker + "-", ms=4, label=walks[0].method)
-        lost = levels[np.isnan(errors)]
-        axes.loglog(lost, np.full(len(lost), 1.0), "x", color=line[0].get_color())
+        lost_values = levels[np.isnan(errors)]
+        axes.loglog(lost_values, np.full(len(lost_values), 1.0), "x", color=line[0].get_color())
     axes.set_xlabel("guard's distance from the pole")
     axes.set_ylabel("error of the time (×: no event)")
     axes.legend()

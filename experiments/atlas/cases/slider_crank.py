@@ -17,57 +17,67 @@ from typing import Any
 from matplotlib.figure import Figure
 from scipy.integrate import solve_ivp
 
-from experiments.atlas.hybrid import METHODS, Edge, Numbers, Part, last_time, ours, row
-from experiments.atlas.others import rows_of
-from experiments.atlas.told import Case, Row, off, timed
-from vrw_jax.numerics import Answers, complementary
+from experiments.atlas.hybrid import (
+    METHODS,
+    GuardEdge,
+    Numbers,
+    Part,
+    last_time,
+    make_row,
+    run_library,
+)
+from experiments.atlas.others import make_rows
+from experiments.atlas.told import Case, Row, compute_error, time_second_call
+from vrw_jax.numerics import LCPStatus, enumerate_lcp_solutions
 
 CRANK, ROD, HALF, HEIGHT, PLAY = 0.153, 0.306, 0.05, 0.025, 0.001  # m; of the slider: halves
 CRANK_MASS, ROD_MASS, SLIDER_MASS = 0.038, 0.038, 0.076  # kg
 CRANK_INERTIA, ROD_INERTIA, SLIDER_INERTIA = 7.4e-5, 5.9e-4, 2.7e-6  # kg m^2, about the middles
-GRAVITY, KEPT, FRICTION = 9.81, 0.4, 0.01
+GRAVITY, RESTITUTION_COEFFICIENT, FRICTION = 9.81, 0.4, 0.01
 RATES = (150.0, -75.0)  # of crank and rod at the start, rad/s
 
 BEHIND, AHEAD = -HALF, HALF
 ABOVE, BELOW = 1.0, -1.0
 """Where a corner is: along the slider, and at which face of the guide."""
-COUPLED = (0.5 * ROD_MASS + SLIDER_MASS) * CRANK * ROD
+COUPLING_INERTIA = (0.5 * ROD_MASS + SLIDER_MASS) * CRANK * ROD
 ROD_SELF = ROD_INERTIA + (0.25 * ROD_MASS + SLIDER_MASS) * ROD**2
 CRANK_SELF = CRANK_INERTIA + (0.25 * CRANK_MASS + ROD_MASS + SLIDER_MASS) * CRANK**2
 
 
-def gap(y: Numbers, m: Any, across: float, face: float) -> Any:
+def gap(y: Numbers, m: Any, transverse_part: float, face: float) -> Any:
     """Between a corner and its face, m."""
-    height = CRANK * m.sin(y[0]) + ROD * m.sin(y[1]) + across * m.sin(y[2])
+    height = CRANK * m.sin(y[0]) + ROD * m.sin(y[1]) + transverse_part * m.sin(y[2])
     return HEIGHT + PLAY - face * height - HEIGHT * m.cos(y[2])
 
 
-def opening(y: Numbers, m: Any, across: float, face: float) -> tuple:
+def opening(y: Numbers, m: Any, transverse_part: float, face: float) -> tuple:
     """How the gap changes with each angle."""
     return (
         -face * CRANK * m.cos(y[0]),
         -face * ROD * m.cos(y[1]),
-        -face * across * m.cos(y[2]) + HEIGHT * m.sin(y[2]),
+        -face * transverse_part * m.cos(y[2]) + HEIGHT * m.sin(y[2]),
     )
 
 
-def pushed(y: Numbers, m: Any, across: float, face: float) -> tuple:
+def generalized_contact_force(y: Numbers, m: Any, transverse_part: float, face: float) -> tuple:
     """Generalised force of a corner that slides backwards, for each newton of its normal one."""
     ahead = (
         -CRANK * m.sin(y[0]),
         -ROD * m.sin(y[1]),
-        -across * m.sin(y[2]) - face * HEIGHT * m.cos(y[2]),
+        -transverse_part * m.sin(y[2]) - face * HEIGHT * m.cos(y[2]),
     )
-    return tuple(w + FRICTION * h for w, h in zip(opening(y, m, across, face), ahead, strict=True))
+    return tuple(
+        w + FRICTION * h for w, h in zip(opening(y, m, transverse_part, face), ahead, strict=True)
+    )
 
 
-def moved(y: Numbers, m: Any, force: Numbers) -> tuple:
+def solve_mass_matrix(y: Numbers, m: Any, force: Numbers) -> tuple:
     """The accelerations, or jumps, that forces, or impulses, make."""
-    both = COUPLED * m.cos(y[1] - y[0])
-    scale = 1.0 / (CRANK_SELF * ROD_SELF - both * both)
+    both_values = COUPLING_INERTIA * m.cos(y[1] - y[0])
+    scale = 1.0 / (CRANK_SELF * ROD_SELF - both_values * both_values)
     return (
-        scale * (ROD_SELF * force[0] - both * force[1]),
-        scale * (CRANK_SELF * force[1] - both * force[0]),
+        scale * (ROD_SELF * force[0] - both_values * force[1]),
+        scale * (CRANK_SELF * force[1] - both_values * force[0]),
         force[2] / SLIDER_INERTIA,
     )
 
@@ -78,7 +88,7 @@ def dot(a: Numbers, b: Numbers) -> Any:
 
 def forces(y: Numbers, m: Any) -> tuple:
     """Of gravity, and what the turning of crank and rod adds."""
-    turning = COUPLED * m.sin(y[1] - y[0])
+    turning = COUPLING_INERTIA * m.sin(y[1] - y[0])
     crank = (0.5 * CRANK_MASS + ROD_MASS + SLIDER_MASS) * GRAVITY * CRANK * m.cos(y[0])
     rod = (0.5 * ROD_MASS + SLIDER_MASS) * GRAVITY * ROD * m.cos(y[1])
     return turning * y[4] * y[4] - crank, -turning * y[3] * y[3] - rod, 0.0 * y[0]
@@ -86,8 +96,11 @@ def forces(y: Numbers, m: Any) -> tuple:
 
 def impulses(y: Numbers, m: Any, face: float, free: tuple) -> tuple:
     """Of two corners that slide and shall open with rates, or accelerations, opposite to `free`."""
-    openings = [opening(y, m, across, face) for across in (BEHIND, AHEAD)]
-    jumps = [moved(y, m, pushed(y, m, across, face)) for across in (BEHIND, AHEAD)]
+    openings = [opening(y, m, transverse_part, face) for transverse_part in (BEHIND, AHEAD)]
+    jumps = [
+        solve_mass_matrix(y, m, generalized_contact_force(y, m, transverse_part, face))
+        for transverse_part in (BEHIND, AHEAD)
+    ]
     (a, b), (c, d) = [[dot(w, jump) for jump in jumps] for w in openings]
     scale = 1.0 / (a * d - b * c)
     return scale * (b * free[1] - d * free[0]), scale * (c * free[0] - a * free[1])
@@ -95,7 +108,10 @@ def impulses(y: Numbers, m: Any, face: float, free: tuple) -> tuple:
 
 def total(y: Numbers, m: Any, face: float, sizes: tuple) -> list:
     """Generalised force of both corners of a face."""
-    behind, ahead = (pushed(y, m, across, face) for across in (BEHIND, AHEAD))
+    behind, ahead = (
+        generalized_contact_force(y, m, transverse_part, face)
+        for transverse_part in (BEHIND, AHEAD)
+    )
     return [sizes[0] * p + sizes[1] * q for p, q in zip(behind, ahead, strict=True)]
 
 
@@ -110,28 +126,34 @@ def plain(y: Numbers, m: Any) -> tuple:
     return (*y[:3], y[3], middle / (ROD * m.cos(y[1])), slider)
 
 
-def bends(q: Numbers, m: Any) -> list:
+def compute_curvature(q: Numbers, m: Any) -> list:
     """What the turning adds to the second derivatives of the upper gaps."""
     turns = CRANK * m.sin(q[0]) * q[3] * q[3] + ROD * m.sin(q[1]) * q[4] * q[4]
     return [turns + (x * m.sin(q[2]) + HEIGHT * m.cos(q[2])) * q[5] * q[5] for x in (BEHIND, AHEAD)]
 
 
-def upwards(q: Numbers, m: Any, changes: tuple) -> list:
+def lift_to_coordinates(q: Numbers, m: Any, changes: tuple) -> list:
     """How the upper gaps' rates change with those of the angles."""
-    return [dot(opening(q, m, across, ABOVE), changes) for across in (BEHIND, AHEAD)]
+    return [
+        dot(opening(q, m, transverse_part, ABOVE), changes) for transverse_part in (BEHIND, AHEAD)
+    ]
 
 
 def flying(y: Numbers, m: Any) -> tuple:
     q = plain(y, m)
-    changes = moved(q, m, forces(q, m))
-    pairs = zip(upwards(q, m, changes), bends(q, m), strict=True)
+    changes = solve_mass_matrix(q, m, forces(q, m))
+    pairs = zip(lift_to_coordinates(q, m, changes), compute_curvature(q, m), strict=True)
     return (*q[3:], changes[0], *(rate + bend for rate, bend in pairs), y[4], y[5])
 
 
 def contact_forces(y: Numbers, m: Any) -> tuple:
     """Of the two upper corners while they slide, N."""
     q = plain(y, m)
-    pairs = zip(upwards(q, m, moved(q, m, forces(q, m))), bends(q, m), strict=True)
+    pairs = zip(
+        lift_to_coordinates(q, m, solve_mass_matrix(q, m, forces(q, m))),
+        compute_curvature(q, m),
+        strict=True,
+    )
     return impulses(q, m, ABOVE, tuple(rate + bend for rate, bend in pairs))
 
 
@@ -139,56 +161,66 @@ def sliding(y: Numbers, m: Any) -> tuple:
     q = plain(y, m)
     push = total(q, m, ABOVE, contact_forces(y, m))
     force = [f + p for f, p in zip(forces(q, m), push, strict=True)]
-    return (*q[3:], moved(q, m, force)[0], *(0.0 * x for x in y[4:]))
+    return (*q[3:], solve_mass_matrix(q, m, force)[0], *(0.0 * x for x in y[4:]))
 
 
-def hit(kept: float) -> Callable:
+def make_impact(retained: float) -> Callable:
     """Both upper corners at once."""
 
     def reset(y: Numbers, m: Any) -> tuple:
         q = plain(y, m)
-        free = ((1.0 + kept) * y[4], (1.0 + kept) * y[5])
-        jumps = moved(q, m, total(q, m, ABOVE, impulses(q, m, ABOVE, free)))
-        return (*y[:3], y[3] + jumps[0], -kept * y[4], -kept * y[5], 0.0 * y[6], 0.0 * y[7])
+        free = ((1.0 + retained) * y[4], (1.0 + retained) * y[5])
+        jumps = solve_mass_matrix(q, m, total(q, m, ABOVE, impulses(q, m, ABOVE, free)))
+        return (*y[:3], y[3] + jumps[0], -retained * y[4], -retained * y[5], 0.0 * y[6], 0.0 * y[7])
 
     return reset
 
 
-def hit_alone(corner: int) -> Callable:
+def make_single_impact(corner: int) -> Callable:
     """One corner, as if the other were not there."""
-    across = (BEHIND, AHEAD)[corner]
+    transverse_part = (BEHIND, AHEAD)[corner]
 
     def reset(y: Numbers, m: Any) -> tuple:
         q = plain(y, m)
-        push = moved(q, m, pushed(q, m, across, ABOVE))
-        size = -(1.0 + KEPT) * y[4 + corner] / dot(opening(q, m, across, ABOVE), push)
-        jumps = upwards(q, m, tuple(size * p for p in push))
+        push = solve_mass_matrix(q, m, generalized_contact_force(q, m, transverse_part, ABOVE))
+        size = (
+            -(1.0 + RESTITUTION_COEFFICIENT)
+            * y[4 + corner]
+            / dot(opening(q, m, transverse_part, ABOVE), push)
+        )
+        jumps = lift_to_coordinates(q, m, tuple(size * p for p in push))
         rates = [y[4] + jumps[0], y[5] + jumps[1]]
         gaps = [y[6], y[7]]
-        rates[corner], gaps[corner] = -KEPT * y[4 + corner], 0.0 * y[6]
+        rates[corner], gaps[corner] = -RESTITUTION_COEFFICIENT * y[4 + corner], 0.0 * y[6]
         return (*y[:3], y[3] + size * push[0], *rates, *gaps)
 
     return reset
 
 
-def over(resets: Sequence[Callable]) -> tuple[Part, ...]:
+def make_flight_part(resets: Sequence[Callable]) -> tuple[Part, ...]:
     """In flight below the upper face."""
-    edges = tuple(Edge(lambda y, m, i=i: y[6 + i], resets[i]) for i in (0, 1))
+    edges = tuple(GuardEdge(lambda y, m, i=i: y[6 + i], resets[i]) for i in (0, 1))
     return (Part(flying, edges),)
 
 
-def begun(rates: Numbers = RATES) -> tuple:
+def make_start_state(rates: Numbers = RATES) -> tuple:
     """The state with all angles zero."""
     upper = -CRANK * rates[0] - ROD * rates[1]
     return (0.0, 0.0, 0.0, rates[0], upper, upper, PLAY, PLAY)
 
 
-TOGETHER, ONE_BY_ONE = over((hit(KEPT), hit(KEPT))), over((hit_alone(0), hit_alone(1)))
-CLOSED = (
-    Part(sliding, tuple(Edge(lambda y, m, i=i: contact_forces(y, m)[i], to=1) for i in (0, 1))),
+SIMULTANEOUS_IMPACTS, SUCCESSIVE_IMPACTS = (
+    make_flight_part((make_impact(RESTITUTION_COEFFICIENT), make_impact(RESTITUTION_COEFFICIENT))),
+    make_flight_part((make_single_impact(0), make_single_impact(1))),
+)
+CLOSED_GAP_MODE = (
+    Part(
+        sliding,
+        tuple(GuardEdge(lambda y, m, i=i: contact_forces(y, m)[i], target_part=1) for i in (0, 1)),
+    ),
     Part(
         flying,
-        tuple(Edge(lambda y, m, x=x: gap(plain(y, m), m, x, BELOW)) for x in (BEHIND, AHEAD)),
+        tuple(GuardEdge(lambda y, m, x=x: gap(plain(y, m), m, x, BELOW)) for x in (BEHIND, AHEAD)),
     ),
 )
 BOUNCES, LIMIT = 100, 0.05
@@ -203,25 +235,28 @@ TRUTH = {
     "touch of the other face": 0.02588956287578905805098,
 }
 """As `python -m experiments.atlas.absolute` prints them: s, rad/s, N s."""
-STORED = {"first impact": 0.0028, "touch of the other face": 0.0259}
+SICONOS_EVENT_TIMES = {"first impact": 0.0028, "touch of the other face": 0.0259}
 """Steps at whose end Siconos' example stores them (combined projection), of 0.1 ms, first order."""
 
 
 def first_impulses() -> Iterator[Row]:
     """By this library's contact solver: how many answers, and which."""
-    walked = ours(TOGETHER, begun(), 1, LIMIT)
-    y = walked.states[0]
+    walk_result = run_library(SIMULTANEOUS_IMPACTS, make_start_state(), 1, LIMIT)
+    y = walk_result.states[0]
     q = plain(y, math)
     normals = [opening(q, math, x, ABOVE) for x in (BEHIND, AHEAD)]
-    jumps = [moved(q, math, pushed(q, math, x, ABOVE)) for x in (BEHIND, AHEAD)]
+    jumps = [
+        solve_mass_matrix(q, math, generalized_contact_force(q, math, x, ABOVE))
+        for x in (BEHIND, AHEAD)
+    ]
     matrix = [[float(dot(w, jump)) for jump in jumps] for w in normals]
-    free = [(1.0 + KEPT) * float(rate) for rate in y[4:6]]
-    told, seconds = timed(lambda: complementary(matrix, free))
-    says = "" if told.answers == Answers.ONE else Answers(int(told.answers)).name
-    for name, found in zip(("impulse behind", "impulse ahead"), told.force, strict=True):
+    free = [(1.0 + RESTITUTION_COEFFICIENT) * float(rate) for rate in y[4:6]]
+    result, seconds = time_second_call(lambda: enumerate_lcp_solutions(matrix, free))
+    says = "" if result.status == LCPStatus.UNIQUE_SOLUTION else LCPStatus(int(result.status)).name
+    for name, solution in zip(("impulse behind", "impulse ahead"), result.force, strict=True):
         yield Row(
-            name, "ours", float(found), TRUTH[name], off(float(found), TRUTH[name]), says,
-            bool(says), len(told.fits), seconds, "complementary", version("vrw-jax"),
+            name, "ours", float(solution), TRUTH[name], compute_error(float(solution), TRUTH[name]), says,
+            bool(says), len(result.is_solution), seconds, "complementary", version("vrw-jax"),
         )  # fmt: skip
 
 
@@ -236,35 +271,47 @@ def siconos() -> Iterator[Row]:
     }  # fmt: skip
     numbers |= {"BEGINS": RATES[0], "ROD_BEGINS": RATES[1]}
     truths = {name: truth for name, truth in TRUTH.items() if name != "crank's rate after it"}
-    yield from rows_of("siconos", "slider_crank", truths, "--crank", json.dumps(numbers))
+    yield from make_rows("siconos", "slider_crank", truths, "--crank", json.dumps(numbers))
 
 
 def rows() -> Iterator[Row]:
     for method in METHODS:
-        walked = method(TOGETHER, begun(), BOUNCES, LIMIT)
-        early = walked._replace(says="", admits=False)
+        walk_result = method(SIMULTANEOUS_IMPACTS, make_start_state(), BOUNCES, LIMIT)
+        early = walk_result._replace(says="", admits=False)
         for name, event in (("first impact", 1), ("second impact", 2)):
-            yield row(early, name, last_time(walked, event), TRUTH[name], event=event)
-        once = method(TOGETHER, begun(), 1, LIMIT)
+            yield make_row(early, name, last_time(walk_result, event), TRUTH[name], event=event)
+        once = method(SIMULTANEOUS_IMPACTS, make_start_state(), 1, LIMIT)
         name = "crank's rate after it"
-        yield row(once, name, float(once.end[3]), TRUTH[name])
-        end = float(walked.times[-1]) if len(walked.times) else math.nan
-        yield row(walked, "end of the bounces", end, TRUTH["end of the bounces"])
-        left = method(CLOSED, hit(0.0)(walked.end, math), 2, LIMIT)
+        yield make_row(once, name, float(once.end[3]), TRUTH[name])
+        end = float(walk_result.times[-1]) if len(walk_result.times) else math.nan
+        yield make_row(walk_result, "end of the bounces", end, TRUTH["end of the bounces"])
+        left_part = method(CLOSED_GAP_MODE, make_impact(0.0)(walk_result.end, math), 2, LIMIT)
         for event, name in enumerate(("letting go", "touch of the other face"), 1):
-            yield row(left, name, end + last_time(left, event), TRUTH[name])
-            if method is ours and name in STORED:
-                found = end + last_time(left, event)
-                yield row(left, f"{name}, as Siconos stored", found, STORED[name], digits=3)
-        apart = method(ONE_BY_ONE, begun(), 20, LIMIT)
-        later = [t for t in apart.times if t > TRUTH["first impact"] + 1e-6]
-        apart = apart._replace(method=f"{apart.method}, corner by corner")
-        second = float(later[0]) if later else math.nan
-        yield row(apart, "second impact", second, TRUTH["second impact"])
-        if method is ours:
+            yield make_row(left_part, name, end + last_time(left_part, event), TRUTH[name])
+            if method is run_library and name in SICONOS_EVENT_TIMES:
+                solution = end + last_time(left_part, event)
+                yield make_row(
+                    left_part,
+                    f"{name}, as Siconos stored",
+                    solution,
+                    SICONOS_EVENT_TIMES[name],
+                    digits=3,
+                )
+        separated_values = method(SUCCESSIVE_IMPACTS, make_start_state(), 20, LIMIT)
+        later_value = [t for t in separated_values.times if t > TRUTH["first impact"] + 1e-6]
+        separated_values = separated_values._replace(
+            method=f"{separated_values.method}, corner by corner"
+        )
+        second = float(later_value[0]) if later_value else math.nan
+        yield make_row(separated_values, "second impact", second, TRUTH["second impact"])
+        if method is run_library:
             name = "first impact"
-            yield row(
-                once, f"{name}, as Siconos stored", last_time(once, 1), STORED[name], digits=3
+            yield make_row(
+                once,
+                f"{name}, as Siconos stored",
+                last_time(once, 1),
+                SICONOS_EVENT_TIMES[name],
+                digits=3,
             )
             yield from first_impulses()
     yield from siconos()
@@ -272,26 +319,26 @@ def rows() -> Iterator[Row]:
 
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
     axes = figure.subplots()
-    walked = ours(TOGETHER, begun(), BOUNCES, LIMIT)
-    closed = hit(0.0)(walked.end, math)
-    left = ours(CLOSED, closed, 2, LIMIT)
-    begin, y = 0.0, begun()
-    for time, state in zip(walked.times[:12], walked.states, strict=False):
-        told = solve_ivp(
+    walk_result = run_library(SIMULTANEOUS_IMPACTS, make_start_state(), BOUNCES, LIMIT)
+    closed = make_impact(0.0)(walk_result.end, math)
+    left_part = run_library(CLOSED_GAP_MODE, closed, 2, LIMIT)
+    begin, y = 0.0, make_start_state()
+    for time, state in zip(walk_result.times[:12], walk_result.states, strict=False):
+        result = solve_ivp(
             lambda t, y: flying(y, math), (begin, time), y, rtol=1e-8, atol=1e-10, max_step=1e-4
         )
-        axes.plot(1e3 * told.t, 1e3 * told.y[6], color="C0")
-        begin, y = time, hit(KEPT)(state, math)
-    lets_go, end = walked.times[-1] + left.times
+        axes.plot(1e3 * result.t, 1e3 * result.y[6], color="C0")
+        begin, y = time, make_impact(RESTITUTION_COEFFICIENT)(state, math)
+    lets_go, end = walk_result.times[-1] + left_part.times
     axes.plot([1e3 * begin, 1e3 * lets_go], [0.0, 0.0], color="C1", lw=2.0, label="both slide")
-    told = solve_ivp(
-        lambda t, y: flying(y, math), (lets_go, end), left.states[0], rtol=1e-8, atol=1e-10,
+    result = solve_ivp(
+        lambda t, y: flying(y, math), (lets_go, end), left_part.states[0], rtol=1e-8, atol=1e-10,
         max_step=1e-4,
     )  # fmt: skip
-    axes.plot(1e3 * told.t, 1e3 * told.y[6], color="C0", label="flies")
-    axes.plot(1e3 * walked.times, 0.0 * walked.times, "k.", label="both hit")
+    axes.plot(1e3 * result.t, 1e3 * result.y[6], color="C0", label="flies")
+    axes.plot(1e3 * walk_result.times, 0.0 * walk_result.times, "k.", label="both hit")
     axes.plot(1e3 * end, 2e3 * PLAY, "k.")
-    for step in STORED.values():
+    for step in SICONOS_EVENT_TIMES.values():
         axes.axvspan(1e3 * step - 0.1, 1e3 * step, color="0.8")
     axes.plot([], [], color="0.8", lw=4.0, label="as Siconos stored")
     axes.set_xlabel("time [ms]")

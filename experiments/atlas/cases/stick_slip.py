@@ -18,9 +18,9 @@ from matplotlib.figure import Figure
 from scipy.integrate import solve_ivp
 
 import vrw_jax as vrw
-from experiments.atlas.hybrid import METHODS, Edge, Part, Walked, modes, row
-from experiments.atlas.told import Case, Row, off
-from vrw_jax.numerics import walk
+from experiments.atlas.hybrid import METHODS, GuardEdge, MethodRun, Part, make_row, modes
+from experiments.atlas.told import Case, Row, compute_error
+from vrw_jax.numerics import simulate_hybrid
 
 BELT, STATIC, KINETIC = 0.2, 1.0, 0.5
 DROP = STATIC - KINETIC
@@ -28,22 +28,26 @@ SLIP = 2.0 * math.pi - 2.0 * math.atan(DROP / BELT)
 PERIOD = SLIP + 2.0 * DROP / BELT
 STICKS = Part(
     lambda y, m: (BELT + 0.0 * y[0], 0.0 * y[1]),
-    (Edge(lambda y, m: STATIC - y[0], lambda y, m: (STATIC, BELT), 1),),
+    (GuardEdge(lambda y, m: STATIC - y[0], lambda y, m: (STATIC, BELT), 1),),
 )
 SLIPS = Part(
     lambda y, m: (y[1], KINETIC - y[0]),
-    (Edge(lambda y, m: BELT - y[1], lambda y, m: (y[0], BELT), 0),),
+    (GuardEdge(lambda y, m: BELT - y[1], lambda y, m: (y[0], BELT), 0),),
 )
 SYSTEM, START = (STICKS, SLIPS), (0.3, BELT)
 EVENTS = 9
 
 
-def period(walked: Walked) -> float:
+def period(walk_result: MethodRun) -> float:
     """Between the last two beginnings of slip."""
-    return float(walked.times[8] - walked.times[6]) if len(walked.times) > 8 else math.nan
+    return (
+        float(walk_result.times[8] - walk_result.times[6])
+        if len(walk_result.times) > 8
+        else math.nan
+    )
 
 
-def regularised(width: float) -> tuple[float, int, float]:
+def integrate_regularized(width: float) -> tuple[float, int, float]:
     """Period, evaluations and seconds of SciPy on friction smoothed over `width`."""
 
     def field(t: float, y: np.ndarray) -> tuple:
@@ -54,26 +58,28 @@ def regularised(width: float) -> tuple[float, int, float]:
     up = lambda t, y: y[0] - KINETIC
     up.direction = 1.0  # type: ignore[attr-defined]
     began = time.process_time()
-    told = solve_ivp(field, (0.0, 60.0), START, "Radau", events=up, rtol=1e-8, atol=1e-10)
-    ends = told.t_events[0]
+    result = solve_ivp(field, (0.0, 60.0), START, "Radau", events=up, rtol=1e-8, atol=1e-10)
+    ends = result.t_events[0]
     took = time.process_time() - began
-    return float(ends[-1] - ends[-2]), told.nfev, took
+    return float(ends[-1] - ends[-2]), result.nfev, took
 
 
 def rows() -> Iterator[Row]:
     for method in METHODS:
-        walked = method(SYSTEM, START, EVENTS, 20.0)
-        yield row(walked, "period", period(walked), PERIOD)
-    found, work, seconds = regularised(1e-3)
+        walk_result = method(SYSTEM, START, EVENTS, 20.0)
+        yield make_row(walk_result, "period", period(walk_result), PERIOD)
+    solution, work, seconds = integrate_regularized(1e-3)
     yield Row(
-        "period", "SciPy, smoothed", found, PERIOD, off(found, PERIOD), "", False, work, seconds,
+        "period", "SciPy, smoothed", solution, PERIOD, compute_error(solution, PERIOD), "", False, work, seconds,
         "Radau 1e-8, tanh over 1e-3", version("scipy"),
     )  # fmt: skip
-    options = vrw.Options.tight()
-    once = lambda x: walk(modes(SYSTEM), jnp.stack([x, BELT]), events=2, options=options).state[0]
-    told = float(jax.jit(jax.jacfwd(once))(0.3))
+    options = vrw.StepOptions.tight()
+    once = lambda x: simulate_hybrid(
+        modes(SYSTEM), jnp.stack([x, BELT]), events=2, options=options
+    ).state[0]
+    result = float(jax.jit(jax.jacfwd(once))(0.3))
     mine = METHODS[0](SYSTEM, START, 2, 20.0)
-    yield row(mine, "multiplier", told, 0.0)
+    yield make_row(mine, "multiplier", result, 0.0)
 
 
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
@@ -83,8 +89,8 @@ def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
     v = -DROP * np.sin(t) + BELT * np.cos(t)
     axes.plot(x, v, label="slip")
     axes.plot([KINETIC - DROP, STATIC], [BELT, BELT], lw=2, label="stick")
-    walked = METHODS[0](SYSTEM, START, EVENTS, 20.0)
-    axes.plot(*walked.states.T, "k.", label="events found")
+    walk_result = METHODS[0](SYSTEM, START, EVENTS, 20.0)
+    axes.plot(*walk_result.states.T, "k.", label="events found")
     axes.set_xlabel("position")
     axes.set_ylabel("rate")
     axes.legend()

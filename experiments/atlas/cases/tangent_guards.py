@@ -12,7 +12,7 @@ import mpmath
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.atlas.hybrid import METHODS, Edge, Part, last_time, ours, row
+from experiments.atlas.hybrid import METHODS, GuardEdge, Part, last_time, make_row, run_library
 from experiments.atlas.told import Case, Row
 
 DEPTH = 1e-8
@@ -21,12 +21,12 @@ DEPTH = 1e-8
 def tangents(height: float) -> tuple[tuple[Part, ...], tuple[float, ...]]:
     """System and start; the run at rate cos, so that steps are not exact."""
     run = lambda y, m: (m.cos(y[2]), 0.0 * y[1], 1.0 + 0.0 * y[2])
-    edges = (Edge(lambda y, m: 0.5 + y[1] * y[1] - y[0]), Edge(lambda y, m: 0.5 - y[0]))
+    edges = (GuardEdge(lambda y, m: 0.5 + y[1] * y[1] - y[0]), GuardEdge(lambda y, m: 0.5 - y[0]))
     return (Part(run, edges),), (0.0, height, 0.0)
 
 
 def circle(depth: float) -> tuple[Part, ...]:
-    edges = (Edge(lambda y, m: y[1] + (1.0 - depth)), Edge(lambda y, m: 8.0 - y[2]))
+    edges = (GuardEdge(lambda y, m: y[1] + (1.0 - depth)), GuardEdge(lambda y, m: 8.0 - y[2]))
     return (Part(lambda y, m: (-y[1], y[0], 1.0 + 0.0 * y[2]), edges),)
 
 
@@ -38,15 +38,17 @@ def entry(depth: float) -> float:
 def rows() -> Iterator[Row]:
     system, start = tangents(1e-5)
     for method in METHODS:
-        walked = method(system, start, 1, 1.5)
-        yield row(walked, "time of the first guard", last_time(walked, 1), math.pi / 6)
-        which = float(walked.edges[0]) if len(walked.edges) else math.nan
-        yield row(walked, "which guard (0, 1)", which, 1.0)
+        walk_result = method(system, start, 1, 1.5)
+        yield make_row(
+            walk_result, "time of the first guard", last_time(walk_result, 1), math.pi / 6
+        )
+        which = float(walk_result.edges[0]) if len(walk_result.edges) else math.nan
+        yield make_row(walk_result, "which guard (0, 1)", which, 1.0)
     walks = [method(circle(DEPTH), (1.0, 0.0, 0.0), 1, 9.0) for method in METHODS]
-    fine = ours(circle(DEPTH), (1.0, 0.0, 0.0), 1, 9.0, tolerance=1e-15)
-    for walked in (*walks, fine._replace(method="ours, 1e-15")):
-        yield row(
-            walked, "dip of 1e-8", last_time(walked, 1), entry(DEPTH),
+    fine = run_library(circle(DEPTH), (1.0, 0.0, 0.0), 1, 9.0, tolerance=1e-15)
+    for walk_result in (*walks, fine._replace(method="ours, 1e-15")):
+        yield make_row(
+            walk_result, "dip of 1e-8", last_time(walk_result, 1), entry(DEPTH),
             condition=1.0 / math.sqrt(2.0 * DEPTH),
         )  # fmt: skip
 
@@ -57,11 +59,11 @@ def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
     for k, (method, marker) in enumerate(zip(METHODS, "o^sD", strict=True)):
         errors = []
         for depth in depths:
-            walked = method(circle(depth), (1.0, 0.0, 0.0), 1, 9.0)
-            errors.append(abs(last_time(walked, 1) - entry(depth)) + 1e-17)
+            walk_result = method(circle(depth), (1.0, 0.0, 0.0), 1, 9.0)
+            errors.append(abs(last_time(walk_result, 1) - entry(depth)) + 1e-17)
         missed = np.array(errors) > 0.5
         line = axes.loglog(
-            depths[~missed], np.array(errors)[~missed], marker + "-", ms=4, label=walked.method
+            depths[~missed], np.array(errors)[~missed], marker + "-", ms=4, label=walk_result.method
         )
         axes.loglog(
             depths[missed], np.full(missed.sum(), 3.0 ** (1 + k)), "x", color=line[0].get_color()

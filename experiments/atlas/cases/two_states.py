@@ -13,19 +13,19 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.atlas.hybrid import (
-    Edge,
+    GuardEdge,
+    MethodRun,
     Part,
-    Walked,
-    by_diffrax,
-    by_heyoka,
-    by_scipy,
     last_time,
-    ours,
-    row,
+    make_row,
+    run_diffrax,
+    run_heyoka,
+    run_library,
+    run_scipy,
 )
 from experiments.atlas.told import Case, Row
 
-FAST, SLOW = 2.7e6, 3.5651205
+FAST_RATE, SLOW_RATE = 2.7e6, 3.5651205
 LEVELS = ((0.4, 5.5, 5.8), (-0.3, 2.73, 2.5))  # c2, c4, and where y1 switches
 START = (4.2, 0.3)
 EVENTS = 5
@@ -35,8 +35,8 @@ def part(index: int) -> Part:
     c2, c4, level = LEVELS[index]
     sign = 1.0 if index == 0 else -1.0
     return Part(
-        lambda y, m: (FAST * (y[1] + c2 - y[0]), SLOW * (c4 - y[1])),
-        (Edge(lambda y, m: sign * (level - y[0]), to=1 - index),),
+        lambda y, m: (FAST_RATE * (y[1] + c2 - y[0]), SLOW_RATE * (c4 - y[1])),
+        (GuardEdge(lambda y, m: sign * (level - y[0]), target_part=1 - index),),
     )
 
 
@@ -46,41 +46,45 @@ SYSTEM = (part(0), part(1))
 def truth() -> np.ndarray:
     """Switching times."""
     with mpmath.workdps(40):
-        fast, slow = mpmath.mpf(FAST), mpmath.mpf(SLOW)
-        y1, y2, time, told = mpmath.mpf(START[0]), mpmath.mpf(START[1]), mpmath.mpf(0), []
+        fast, slow = mpmath.mpf(FAST_RATE), mpmath.mpf(SLOW_RATE)
+        y1, y2, time, result = mpmath.mpf(START[0]), mpmath.mpf(START[1]), mpmath.mpf(0), []
         for (c2, c4, level), _ in zip(itertools.cycle(LEVELS), range(EVENTS), strict=False):
             c2, c4, level = map(mpmath.mpf, (c2, c4, level))
-            own = fast / (fast - slow) * (y2 - c4)  # of the slow exponential in y1
-            at = lambda t, y1=y1, own=own, c2=c2, c4=c4: (
-                c4 + c2 + own * mpmath.exp(-slow * t)
-                + (y1 - c4 - c2 - own) * mpmath.exp(-fast * t)
+            own_values = fast / (fast - slow) * (y2 - c4)  # of the slow exponential in y1
+            value_at = lambda t, y1=y1, own_values=own_values, c2=c2, c4=c4: (
+                c4 + c2 + own_values * mpmath.exp(-slow * t)
+                + (y1 - c4 - c2 - own_values) * mpmath.exp(-fast * t)
             )  # fmt: skip
-            first = -mpmath.log((level - c4 - c2) / own) / slow
-            t = mpmath.findroot(lambda t, at=at, level=level: at(t) - level, first)
+            first = -mpmath.log((level - c4 - c2) / own_values) / slow
+            t = mpmath.findroot(
+                lambda t, value_at=value_at, level=level: value_at(t) - level, first
+            )
             y1, y2 = level, c4 + (y2 - c4) * mpmath.exp(-slow * t)
             time += t
-            told.append(float(time))
-        return np.array(told)
+            result.append(float(time))
+        return np.array(result)
 
 
-def walks() -> Iterator[Walked]:
+def walks() -> Iterator[MethodRun]:
     many = {"first_step": 1e-7, "max_solver_steps": 4_000_000}
-    yield ours(SYSTEM, START, EVENTS, 5.0, **many)
-    few = ours(SYSTEM, START, EVENTS, 5.0, first_step=1e-7)
-    yield few._replace(method="ours, 20,000 steps")
-    implicit = ours(SYSTEM, START, EVENTS, 5.0, solver="Kvaerno5", tolerance=1e-10)
+    yield run_library(SYSTEM, START, EVENTS, 5.0, **many)
+    few_items = run_library(SYSTEM, START, EVENTS, 5.0, first_step=1e-7)
+    yield few_items._replace(method="ours, 20,000 steps")
+    implicit = run_library(SYSTEM, START, EVENTS, 5.0, solver="Kvaerno5", tolerance=1e-10)
     yield implicit._replace(method="ours, implicit")
-    yield by_diffrax(SYSTEM, START, EVENTS, 5.0, solver="Kvaerno5", tolerance=1e-10)
-    yield by_scipy(SYSTEM, START, EVENTS, 5.0, method="Radau", tolerance=1e-10)
-    yield by_heyoka(SYSTEM, START, EVENTS, 5.0)
+    yield run_diffrax(SYSTEM, START, EVENTS, 5.0, solver="Kvaerno5", tolerance=1e-10)
+    yield run_scipy(SYSTEM, START, EVENTS, 5.0, method="Radau", tolerance=1e-10)
+    yield run_heyoka(SYSTEM, START, EVENTS, 5.0)
 
 
 def rows() -> Iterator[Row]:
     times = truth()
-    for walked in walks():
+    for walk_result in walks():
         for n in (1, EVENTS):
-            found = last_time(walked, n)
-            yield row(walked, f"switching time {n}", found, float(times[n - 1]), event=n)
+            solution = last_time(walk_result, n)
+            yield make_row(
+                walk_result, f"switching time {n}", solution, float(times[n - 1]), event=n
+            )
 
 
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
@@ -88,7 +92,7 @@ def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
     times, begin, states = truth(), 0.0, START[1]
     for (c2, c4, _), end in zip(itertools.cycle(LEVELS), times, strict=False):
         t = np.linspace(begin, end, 100)
-        y2 = c4 + (states - c4) * np.exp(-SLOW * (t - begin))
+        y2 = c4 + (states - c4) * np.exp(-SLOW_RATE * (t - begin))
         axes.plot(t, y2 + c2, color="C0")
         axes.plot(t, y2, "--", color="C1")
         begin, states = end, y2[-1]

@@ -16,16 +16,16 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.integrate import solve_ivp
 
-from experiments.atlas.gaits import Exact, Return, gaits
-from experiments.atlas.hybrid import Edge, Part, row
+from experiments.atlas.gaits import ExactGait, ReturnMap, gaits
+from experiments.atlas.hybrid import GuardEdge, Part, make_row
 from experiments.atlas.told import Case, Row
 
 SLEEVE, BIRD, SLEEVE_INERTIA, BIRD_INERTIA = 3e-4, 4.5e-3, 5e-9, 7e-7  # kg, kg m^2
-STIFFNESS, GRAVITY, FRICTION, KEPT = 5.6e-3, 9.81, 0.3, 0.5  # N m/rad, m/s^2
+STIFFNESS, GRAVITY, FRICTION, RESTITUTION_COEFFICIENT = 5.6e-3, 9.81, 0.3, 0.5  # N m/rad, m/s^2
 POLE, HOLE, HALF, SPRING_ARM, BEAK_X, BIRD_ARM, BEAK_Y = (  # m
     2.5e-3, 3.1e-3, 5.8e-3, 1e-2, 2e-2, 1.5e-2, 2.01e-2,
 )  # fmt: skip
-SECTION, PUBLISHED = -0.2788, (-0.3411, -7.4583)
+SECTION, PUBLISHED_RATES = -0.2788, (-0.3411, -7.4583)
 """The bird's angle at which Glocker tells the cycle, rad; there rates of sleeve and bird."""
 
 TILT = (HOLE - POLE) / HALF
@@ -46,12 +46,12 @@ def dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def moved(force):
+def solve_mass_matrix(force):
     """The accelerations, or jumps, that forces, or impulses, make."""
     return tuple(dot(line, force) for line in INVERSE)
 
 
-def pushed(contact: int, sign: float) -> tuple[float, ...]:
+def generalized_contact_force(contact: int, sign: float) -> tuple[float, ...]:
     """Force of a contact that slides, for each newton of its normal one; friction along `sign`."""
     pairs = zip(NORMAL[contact], TANGENT[contact], strict=True)
     return tuple(n + sign * FRICTION * t for n, t in pairs)
@@ -69,21 +69,26 @@ def forces(y):
 
 def normal_force(y, contact, sign):
     """Of a contact that slides."""
-    across = NORMAL[contact]
-    return -dot(across, moved(forces(y))) / dot(across, moved(pushed(contact, sign)))
+    transverse_part = NORMAL[contact]
+    return -dot(transverse_part, solve_mass_matrix(forces(y))) / dot(
+        transverse_part, solve_mass_matrix(generalized_contact_force(contact, sign))
+    )
 
 
 def flying(y, m):
-    along, sleeve, bird = moved(forces(y))
-    return along, y[2], sleeve, y[4], bird
+    tangential_part, sleeve, bird = solve_mass_matrix(forces(y))
+    return tangential_part, y[2], sleeve, y[4], bird
 
 
 def sliding(contact, sign):
     def field(y, m):
         push = normal_force(y, contact, sign)
-        total = [f + push * p for f, p in zip(forces(y), pushed(contact, sign), strict=True)]
-        along, _, bird = moved(total)
-        return along, 0.0 * y[1], 0.0 * y[2], y[4], bird
+        total = [
+            f + push * p
+            for f, p in zip(forces(y), generalized_contact_force(contact, sign), strict=True)
+        ]
+        tangential_part, _, bird = solve_mass_matrix(total)
+        return tangential_part, 0.0 * y[1], 0.0 * y[2], y[4], bird
 
     return field
 
@@ -92,7 +97,7 @@ def jammed_bird(y):
     return forces(y)[2] / MASS[2, 2]
 
 
-def jammed(y, m):
+def jammed_field(y, m):
     return 0.0 * y[0], 0.0 * y[1], 0.0 * y[2], y[4], jammed_bird(y)
 
 
@@ -100,88 +105,106 @@ def grip(y, m):
     """Friction left while jammed, N."""
     turning = jammed_bird(y)
     first, second, _ = forces(y)
-    along = MASS[0, 2] * turning - first
-    normal = (MASS[1, 2] * turning - second - HOLE * along) / HALF
-    return FRICTION * normal - along
+    tangential_part = MASS[0, 2] * turning - first
+    normal = (MASS[1, 2] * turning - second - HOLE * tangential_part) / HALF
+    return FRICTION * normal - tangential_part
 
 
-def hit(contact, sign):
+def make_impact(contact, sign):
     """The state after an impact that slides; the sleeve doesn't bounce, and is put on the pole."""
 
     def reset(y, m):
-        before, push = (y[0], y[2], y[4]), pushed(contact, sign)
-        kept = KEPT if contact == 1 else 0.0
-        size = -(1.0 + kept) * dot(NORMAL[contact], before)
-        size = size / dot(NORMAL[contact], moved(push))
-        along, sleeve, bird = (v + size * j for v, j in zip(before, moved(push), strict=True))
+        before, push = (y[0], y[2], y[4]), generalized_contact_force(contact, sign)
+        retained = RESTITUTION_COEFFICIENT if contact == 1 else 0.0
+        size = -(1.0 + retained) * dot(NORMAL[contact], before)
+        size = size / dot(NORMAL[contact], solve_mass_matrix(push))
+        tangential_part, sleeve, bird = (
+            v + size * j for v, j in zip(before, solve_mass_matrix(push), strict=True)
+        )
         if contact == 1:
-            return along, y[1], sleeve, y[3], bird
-        return along, (TILT if contact == 3 else -TILT) + 0.0 * y[1], 0.0 * y[2], y[3], bird
+            return tangential_part, y[1], sleeve, y[3], bird
+        return (
+            tangential_part,
+            (TILT if contact == 3 else -TILT) + 0.0 * y[1],
+            0.0 * y[2],
+            y[3],
+            bird,
+        )
 
     return reset
 
 
 lower, upper = (lambda y, m: HALF * (TILT + y[1])), (lambda y, m: HALF * (TILT - y[1]))
 beak = lambda y, m: SPRING_ARM + BIRD_ARM - BEAK_Y - POLE - BEAK_X * y[3]
-stopped = lambda y, m: (0.0 * y[0], *y[1:])
+stop_first_coordinate = lambda y, m: (0.0 * y[0], *y[1:])
 SYSTEM = (
-    Part(sliding(2, 1.0), (Edge(lambda y, m: -y[0], stopped, 1),)),
-    Part(jammed, (Edge(grip, to=2),)),
-    Part(sliding(2, 1.0), (Edge(lambda y, m: normal_force(y, 2, 1.0), to=3),)),
-    Part(flying, (Edge(upper, hit(3, 1.0), 4),)),
-    Part(flying, (Edge(beak, hit(1, -1.0), 5), Edge(upper, hit(3, 1.0), 4))),
-    Part(flying, (Edge(upper, hit(3, -1.0), 6),)),
-    Part(sliding(3, -1.0), (Edge(lambda y, m: normal_force(y, 3, -1.0), to=7),)),
-    Part(flying, (Edge(lower, hit(2, 1.0), 8),)),
-    Part(flying, (Edge(lower, hit(2, 1.0), 9),)),
-    Part(sliding(2, 1.0), (Edge(lambda y, m: y[3] - SECTION, to=0),)),
+    Part(sliding(2, 1.0), (GuardEdge(lambda y, m: -y[0], stop_first_coordinate, 1),)),
+    Part(jammed_field, (GuardEdge(grip, target_part=2),)),
+    Part(sliding(2, 1.0), (GuardEdge(lambda y, m: normal_force(y, 2, 1.0), target_part=3),)),
+    Part(flying, (GuardEdge(upper, make_impact(3, 1.0), 4),)),
+    Part(
+        flying, (GuardEdge(beak, make_impact(1, -1.0), 5), GuardEdge(upper, make_impact(3, 1.0), 4))
+    ),
+    Part(flying, (GuardEdge(upper, make_impact(3, -1.0), 6),)),
+    Part(sliding(3, -1.0), (GuardEdge(lambda y, m: normal_force(y, 3, -1.0), target_part=7),)),
+    Part(flying, (GuardEdge(lower, make_impact(2, 1.0), 8),)),
+    Part(flying, (GuardEdge(lower, make_impact(2, 1.0), 9),)),
+    Part(sliding(2, 1.0), (GuardEdge(lambda y, m: y[3] - SECTION, target_part=0),)),
 )
-CYCLE = Return(
+CYCLE = ReturnMap(
     SYSTEM,
     lambda x, m: (x[0], -TILT + 0.0 * x[0], 0.0 * x[0], SECTION + 0.0 * x[0], x[1]),
     lambda y: (y[0], y[4]),
     events=len(SYSTEM),
-    guess=PUBLISHED,
+    guess=PUBLISHED_RATES,
     limit=1.0,
 )
 
 
-EXACT = Exact(
+EXACT_GAIT = ExactGait(
     (-0.3394786223552639, -7.462094642627962), 0.14597606514375208, (-0.8391556530475852, 0.0)
 )
 
 
 def rows() -> Iterator[Row]:
     for gait in gaits(CYCLE):
-        for name, found, own, told in zip(
-            ("rate of the sleeve", "rate of the bird"), gait.x, EXACT.x, PUBLISHED, strict=True
+        for name, solution, own_values, result in zip(
+            ("rate of the sleeve", "rate of the bird"),
+            gait.x,
+            EXACT_GAIT.x,
+            PUBLISHED_RATES,
+            strict=True,
         ):
-            yield row(gait.walked, name, float(found), own)
-            yield row(gait.walked, f"{name}, as published", float(found), told, digits=2)
-        yield row(gait.walked, "period", gait.duration, EXACT.period)
-        radius = abs(EXACT.multipliers[0])
-        yield row(gait.walked, "spectral radius", float(np.abs(gait.multipliers[0])), radius)
+            yield make_row(gait.simulation, name, float(solution), own_values)
+            yield make_row(
+                gait.simulation, f"{name}, as published", float(solution), result, digits=2
+            )
+        yield make_row(gait.simulation, "period", gait.duration, EXACT_GAIT.period)
+        radius = abs(EXACT_GAIT.multipliers[0])
+        yield make_row(
+            gait.simulation, "spectral radius", float(np.abs(gait.multipliers[0])), radius
+        )
 
 
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
-    from experiments.atlas.hybrid import ours
+    from experiments.atlas.hybrid import run_library
 
     axes = figure.subplots()
-    start = CYCLE.begin(PUBLISHED, np)
-    walked = ours(SYSTEM, start, 3 * CYCLE.events, CYCLE.limit)
-    begins = np.append(0.0, walked.times[:-1])
-    for k, (begin, end) in enumerate(zip(begins, walked.times, strict=True)):
+    start = CYCLE.begin(PUBLISHED_RATES, np)
+    walk_result = run_library(SYSTEM, start, 3 * CYCLE.events, CYCLE.limit)
+    begins = np.append(0.0, walk_result.times[:-1])
+    for k, (begin, end) in enumerate(zip(begins, walk_result.times, strict=True)):
         part = SYSTEM[k % CYCLE.events]
         if k:
             before = SYSTEM[(k - 1) % CYCLE.events].edges[0]
-            start = before.reset(walked.states[k - 1], np)
-        told = solve_ivp(
+            start = before.reset(walk_result.states[k - 1], np)
+        result = solve_ivp(
             lambda t, y, part=part: part.field(y, np), (begin, end), start, rtol=1e-8, atol=1e-10,
             max_step=1e-3,
         )  # fmt: skip
-        axes.plot(told.y[3], told.y[4], color="C0", lw=0.8, label="motion" if not k else None)
-    axes.plot(walked.states[:, 3], walked.states[:, 4], "k.", label="events")
-    axes.plot(SECTION, PUBLISHED[1], "*", color="C1", ms=9, label="published")
+        axes.plot(result.y[3], result.y[4], color="C0", lw=0.8, label="motion" if not k else None)
+    axes.plot(walk_result.states[:, 3], walk_result.states[:, 4], "k.", label="events")
+    axes.plot(SECTION, PUBLISHED_RATES[1], "*", color="C1", ms=9, label="published")
     axes.set_xlabel("angle of the bird [rad]")
     axes.set_ylabel("its rate [rad/s]")
     axes.legend()

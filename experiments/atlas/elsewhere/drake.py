@@ -33,47 +33,49 @@ def ends_of_steps(plant: Any, state: list[float], accuracy: float, **changed: fl
     context.get_mutable_continuous_state_vector().SetFromVector(state)
     context.SetAccuracy(accuracy)  # of where a witness is isolated
     simulator.get_mutable_integrator().set_target_accuracy(accuracy)
-    seen: list = []
+    observed_values: list = []
 
-    def look(context: Any) -> Any:
+    def record_event(context: Any) -> Any:
         toe = context.get_discrete_state(0).GetAtIndex(0)
         numbers = context.get_continuous_state_vector().CopyToVector()
-        seen.append((toe, context.get_time(), [float(x) for x in numbers]))
+        observed_values.append((toe, context.get_time(), [float(x) for x in numbers]))
         return EventStatus.DidNothing()
 
-    simulator.set_monitor(look)
+    simulator.set_monitor(record_event)
     simulator.Initialize()
     began = time.process_time()
     simulator.AdvanceTo(0.9 * STEPS)
     seconds = time.process_time() - began
-    ends = [a[1:] for a, b in itertools.pairwise(seen) if a[0] != b[0]]
-    return [ends, len(seen), seconds]
+    ends = [a[1:] for a, b in itertools.pairwise(observed_values) if a[0] != b[0]]
+    return [ends, len(observed_values), seconds]
 
 
-def answers(accuracy: float) -> list[dict]:
+def compute_drake_values(accuracy: float) -> list[dict]:
     from pydrake.examples import CompassGait, RimlessWheel, RimlessWheelParams
 
     wheel = RimlessWheelParams()
     alpha = math.pi / wheel.number_of_spokes()
-    kept, low = math.cos(2.0 * alpha), wheel.slope() - alpha
+    retained, low = math.cos(2.0 * alpha), wheel.slope() - alpha
     ends, work, seconds = ends_of_steps(RimlessWheel(), [low + 1e-9, 1.7], accuracy)
-    squares = [(kept * rate) ** 2 for _, (_, rate) in ends]
+    squares = [(retained * rate) ** 2 for _, (_, rate) in ends]
     far = [square - squares[-1] for square in squares]
-    told = {
-        "rate after impact": kept * ends[-1][1][1],
+    result_by_name = {
+        "rate after impact": retained * ends[-1][1][1],
         "period": ends[-1][0] - ends[-2][0],
         "multiplier": far[3] / far[2],
     }
     slope = math.radians(3.0)
     start = [-0.2187, 2.0 * slope + 0.2187, 1.0918, 0.3772]
-    ends, more, longer = ends_of_steps(CompassGait(), start, accuracy, gravity=9.8, slope=slope)
+    ends, extra_values, longer = ends_of_steps(
+        CompassGait(), start, accuracy, gravity=9.8, slope=slope
+    )
     other = {"stance angle": -ends[-1][1][1], "period": ends[-1][0] - ends[-2][0]}
     return [
         {"case": case, "name": name, "value": value, "work": n, "seconds": t}
-        for case, found, n, t in (
-            ("rimless_wheel", told, work, seconds), ("compass_gait", other, more, longer)
+        for case, solution, n, t in (
+            ("rimless_wheel", result_by_name, work, seconds), ("compass_gait", other, extra_values, longer)
         )
-        for name, value in found.items()
+        for name, value in solution.items()
     ]  # fmt: skip
 
 
@@ -84,9 +86,14 @@ def main() -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     parser.add_argument("--accuracy", type=float, default=1e-10)
-    accuracy = parser.parse_args().accuracy
-    told = {"options": f"its default integrator, accuracy {accuracy:g}"}
-    print(json.dumps(told | {"answers": answers(accuracy), "version": version("drake")}))
+    accuracy = parser.parse_args().time_tolerance
+    result_by_name = {"options": f"its default integrator, accuracy {accuracy:g}"}
+    print(
+        json.dumps(
+            result_by_name
+            | {"answers": compute_drake_values(accuracy), "version": version("drake")}
+        )
+    )
 
 
 if __name__ == "__main__":

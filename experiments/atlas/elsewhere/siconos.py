@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 
-def bounces(step: float) -> tuple[list[float], float, int]:
+def simulate_bounces(step: float) -> tuple[list[float], float, int]:
     """Times of bounces, CPU seconds, and steps."""
     import numpy as np
     from siconos import kernel as sk
@@ -31,22 +31,22 @@ def bounces(step: float) -> tuple[list[float], float, int]:
     system.link(floor, ball)
     clock = sk.TimeDiscretisation(0.0, step)
     stepping = sk.TimeStepping(system, clock, sk.MoreauJeanOSI(0.5), sk.LCP())
-    pushes, seconds = pushed(stepping, [floor])
-    firsts = begun([bool(push[0] > 0.0) for push in pushes])
+    pushes, seconds = compute_normal_impulses(stepping, [floor])
+    firsts = find_contact_onsets([bool(push[0] > 0.0) for push in pushes])
     return [(k + 1) * step for k in firsts], seconds, len(pushes)
 
 
-def pushed(stepping: Any, contacts: list) -> tuple[list[list[float]], float]:
+def compute_normal_impulses(stepping: Any, contacts: list) -> tuple[list[list[float]], float]:
     """Normal impulses of the contacts in each step, and CPU seconds."""
-    told, began = [], time.process_time()
+    result, began = [], time.process_time()
     while stepping.hasNextEvent():
         stepping.computeOneStep()
-        told.append([float(contact.lambda_(1)[0]) for contact in contacts])
+        result.append([float(contact.lambda_(1)[0]) for contact in contacts])
         stepping.nextStep()
-    return told, time.process_time() - began
+    return result, time.process_time() - began
 
 
-def begun(pushes: list[bool]) -> list[int]:
+def find_contact_onsets(pushes: list[bool]) -> list[int]:
     """Steps that push and follow one that does not."""
     return [k for k, push in enumerate(pushes) if push and not (k and pushes[k - 1])]
 
@@ -80,17 +80,17 @@ def crank(numbers: dict[str, float], step: float) -> tuple[dict[str, float], flo
         contact_law.numericsSolverOptions().dparam[0] = 1e-12
         stepping = sk.TimeStepping(system, clock, sk.MoreauJeanOSI(0.5), contact_law)
         stepping.setNewtonTolerance(1e-10)
-        pushes, seconds = pushed(stepping, contacts)
-    above = begun([max(push[:2]) > 0.0 for push in pushes])
+        pushes, seconds = compute_normal_impulses(stepping, contacts)
+    above = find_contact_onsets([max(push[:2]) > 0.0 for push in pushes])
     last = max(k for k, push in enumerate(pushes) if max(push[:2]) > 0.0)
-    below = begun([max(push[2:]) > 0.0 for push in pushes])
+    below = find_contact_onsets([max(push[2:]) > 0.0 for push in pushes])
     steps = {
         "first impact": above[0], "second impact": above[1], "end of the bounces": above[-1],
         "letting go": last, "touch of the other face": below[0],
     }  # fmt: skip
-    told = {name: (k + 1) * step for name, k in steps.items()}
-    told |= dict(zip(("impulse behind", "impulse ahead"), pushes[above[0]], strict=False))
-    return told, seconds, len(pushes)
+    result_by_name = {name: (k + 1) * step for name, k in steps.items()}
+    result_by_name |= dict(zip(("impulse behind", "impulse ahead"), pushes[above[0]], strict=False))
+    return result_by_name, seconds, len(pushes)
 
 
 def forces(rod: dict) -> dict:
@@ -98,14 +98,19 @@ def forces(rod: dict) -> dict:
     import numpy as np
     from siconos import numerics as sn
 
-    told = {}
+    result_by_name = {}
     for name, (matrix, free) in rod.items():
         problem = sn.LCP(np.array([[matrix]]), np.array([free]))
         force, gap, began = np.zeros(1), np.zeros(1), time.process_time()
         code = sn.lcp_lexicolemke(problem, force, gap, sn.SolverOptions(sn.SICONOS_LCP_LEMKE))
         seconds = time.process_time() - began
-        told[name] = 1 - int(code != 0), f"code {code}, force {force[0]:.3g}", bool(code), seconds
-    return told
+        result_by_name[name] = (
+            1 - int(code != 0),
+            f"code {code}, force {force[0]:.3g}",
+            bool(code),
+            seconds,
+        )
+    return result_by_name
 
 
 def main() -> None:
@@ -117,34 +122,34 @@ def main() -> None:
     parser.add_argument("--step", type=float, default=1e-5)
     parser.add_argument("--rod", type=json.loads, help="matrix and free rate by name")
     parser.add_argument("--crank", type=json.loads, help="numbers by name")
-    asked = parser.parse_args()
-    stepped = {"admits": False, "options": f"Moreau-Jean, step {asked.step:g}"}
-    if asked.rod:
-        told = [
+    arguments = parser.parse_args()
+    step_by_name = {"admits": False, "options": f"Moreau-Jean, step {arguments.step:g}"}
+    if arguments.rod:
+        rows = [
             {"case": "painleve", "name": name, "value": count, "work": 1, "seconds": seconds,
              "says": says, "admits": admits, "options": "lexicographic Lemke"}
-            for name, (count, says, admits, seconds) in forces(asked.rod).items()
+            for name, (count, says, admits, seconds) in forces(arguments.rod).items()
         ]  # fmt: skip
-    elif asked.crank:
-        found, seconds, work = crank(asked.crank, asked.step)
-        told = [
+    elif arguments.crank:
+        solution, seconds, work = crank(arguments.crank, arguments.step)
+        rows = [
             {"case": "slider_crank", "name": name, "value": value, "work": work, "says": "",
              "seconds": seconds, "admits": False,
-             "options": f"{stepped['options']}, contacts to 1e-12, Newton to 1e-10"}
-            for name, value in found.items()
+             "options": f"{step_by_name['options']}, contacts to 1e-12, Newton to 1e-10"}
+            for name, value in solution.items()
         ]  # fmt: skip
     else:
-        times, seconds, work = bounces(asked.step)
-        told = [
+        times, seconds, work = simulate_bounces(arguments.step)
+        rows = [
             {"case": "bouncing_ball", "name": name, "value": value, "work": work,
-             "seconds": seconds, "says": f"{len(times)} bounces"} | stepped
+             "seconds": seconds, "says": f"{len(times)} bounces"} | step_by_name
             for name, value in (
                 ("time of bounce 20", times[19]), ("time of the last bounce", times[-1])
             )
         ]  # fmt: skip
     from importlib.metadata import version
 
-    print(json.dumps({"answers": told, "version": version("siconos")}))
+    print(json.dumps({"answers": rows, "version": version("siconos")}))
 
 
 if __name__ == "__main__":

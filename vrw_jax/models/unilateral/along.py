@@ -17,348 +17,460 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from vrw_jax.models.unilateral.contacts import OFF
-from vrw_jax.models.unilateral.lanes import UNDER_WAY, Lane, Moves, Walk, Walked
-from vrw_jax.models.unilateral.march import (
-    EVENT,
-    MARCHING,
-    N_TALLIED,
-    FlowAt,
-    March,
-    Place,
-    advanced,
-    guards_at,
-    motion_of,
-    slope_at,
-    stage_at,
-    tried_by,
-    until_none_marches,
+from vrw_jax.models.unilateral.contacts import CONTACT_OFF
+from vrw_jax.models.unilateral.lanes import (
+    STATUS_UNFINISHED,
+    BatchWalk,
+    BatchWalkResult,
+    LaneState,
+    LaneTangents,
 )
-from vrw_jax.models.unilateral.motion import Flow, Stance, guard_sizes
-from vrw_jax.models.unilateral.shares import FEW, Shares
-from vrw_jax.numerics import Options, Tableau, if_any, real_stability_limit, select
+from vrw_jax.models.unilateral.march import (
+    N_ACCUMULATOR_ROWS,
+    STATUS_EVENT,
+    STATUS_RUNNING,
+    DynamicsFn,
+    IntervalPoint,
+    IntervalState,
+    evaluate_dynamics,
+    finish_attempt,
+    guards_at_point,
+    integrator_step,
+    motion_from_point,
+    run_until_done,
+    stage_state,
+)
+from vrw_jax.models.unilateral.motion import ContactState, ModeDynamics, guard_scales
+from vrw_jax.models.unilateral.shares import N_MOVING_LEGS, TangentBasis
+from vrw_jax.numerics import (
+    ButcherTableau,
+    StepOptions,
+    real_stability_limit,
+    run_if_any,
+    tree_where,
+)
 
 
-class _March(NamedTuple):
+class _IntervalTangent(NamedTuple):
     """Tangent of a lane's state during an interval."""
 
     q: Array
     v: Array
-    told: Array | None
-    slope: Array  # of accelerations and, if requested, accumulators
-    later: Array  # tangent of the time, s
+    accumulated: Array | None
+    dynamics_rows: Array  # of accelerations and, if requested, accumulators
+    time: Array  # tangent of the time, s
 
 
-class _Way(NamedTuple):
+class _Tangent(NamedTuple):
     """Tangent of all of a lane's state."""
 
-    march: _March
-    rest: Moves  # those not in the interval
+    interval: _IntervalTangent
+    others: LaneTangents  # those not in the interval
 
     @classmethod
-    def of(cls, moves: Moves, slope: Array) -> "_Way":
+    def from_lane_tangents(cls, lane_tangents: LaneTangents, dynamics_rows: Array) -> "_Tangent":
         """Return the tangent of these lane tangents and dynamics rows."""
-        tally, told = moves.told
-        rest: Any = moves._asdict() | {"q": None, "v": None, "told": (tally, None), "time": None}
-        return cls(_March(moves.q, moves.v, told, slope, moves.time), Moves(**rest))
+        accumulators, accumulated = lane_tangents.accumulated
+        others: Any = lane_tangents._asdict() | {
+            "q": None,
+            "v": None,
+            "accumulated": (accumulators, None),
+            "time": None,
+        }
+        return cls(
+            _IntervalTangent(
+                lane_tangents.q, lane_tangents.v, accumulated, dynamics_rows, lane_tangents.time
+            ),
+            LaneTangents(**others),
+        )
 
-    def moves(self) -> Moves:
+    def lane_tangents(self) -> LaneTangents:
         """Return the lane tangents."""
-        q, v, told, _, later = self.march
-        return self.rest._replace(q=q, v=v, told=(self.rest.told[0], told), time=later)
+        q, v, accumulated, _, time = self.interval
+        return self.others._replace(
+            q=q, v=v, accumulated=(self.others.accumulated[0], accumulated), time=time
+        )
 
 
-class Ways(NamedTuple):
+class TangentBatch(NamedTuple):
     """Tangents of each lane: arrays have them on the first axis, lanes on the last."""
 
-    many: Array  # number of tangents of a lane
-    by_columns: Array  # number of leading ones that may have column parts
+    n_tangents: Array  # number of tangents of a lane
+    n_column_tangents: Array  # number of leading ones that may have column parts
     columns: Array
     rows: Array  # all numbers of a `_Tangent` in one array, for few loops and short compilation
 
-    def blank(self, size: int) -> Array:
+    def allocate(self, size: int) -> Array:
         """Return uninitialized rows of each tangent, to be written."""
-        return lax.empty((len(self.columns), size, *self.many.shape), self.columns.dtype)
+        return lax.empty((len(self.columns), size, *self.n_tangents.shape), self.columns.dtype)
 
-    def each(
-        self, function: Callable[[Array, Array], Any], rows: Array, begin: Array | int = 0
+    def map_tangents(
+        self, function: Callable[[Array, Array], Any], rows: Array, first_row: Array | int = 0
     ) -> Array:
         """Return the rows of each tangent, overwritten from row `first_row` on by `function(k,
         rows)`.
         """
-        goes_on = lambda state: jnp.any(state[0] < self.many)
+        should_continue = lambda state: jnp.any(state[0] < self.n_tangents)
 
-        def turn(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        def update_one(state: tuple[Array, Array]) -> tuple[Array, Array]:
             k, rows = state
-            told = _packed(function(k, lax.dynamic_index_in_dim(rows, k, 0, False)))
+            new_rows = _pack_rows(function(k, lax.dynamic_index_in_dim(rows, k, 0, False)))
             # Stacking row by row keeps the rows in registers.
-            told = jnp.stack([told[i] for i in range(len(told))])
-            place = k, jnp.int32(begin), jnp.int32(0)
-            return k + 1, lax.dynamic_update_slice(rows, told[None], place)
+            new_rows = jnp.stack([new_rows[i] for i in range(len(new_rows))])
+            position = k, jnp.int32(first_row), jnp.int32(0)
+            return k + 1, lax.dynamic_update_slice(rows, new_rows[None], position)
 
-        return lax.while_loop(goes_on, turn, (jnp.zeros((), jnp.int32), rows))[1]
+        return lax.while_loop(should_continue, update_one, (jnp.zeros((), jnp.int32), rows))[1]
 
 
-def _packed(tree: Any) -> Array:
+def _pack_rows(tree: Any) -> Array:
     """Return all numbers of a tree in one array of rows."""
     return jnp.concatenate([x.reshape(-1, x.shape[-1]) for x in jax.tree.leaves(tree)])
 
 
-def _unpacked(rows: Array, like: Any) -> Any:
+def _unpack_rows(rows: Array, template: Any) -> Any:
     """Return the rows as a tree of the template's structure: the inverse of `_pack_rows`."""
-    leaves, structure = jax.tree.flatten(like)
-    found, begin = [], 0
+    leaves, structure = jax.tree.flatten(template)
+    arrays, offset = [], 0
     for leaf in leaves:
         size = math.prod(leaf.shape[:-1])
-        own = rows[..., begin : begin + size, :]
-        found.append(own.reshape(*rows.shape[:-2], *leaf.shape))
-        begin += size
-    return jax.tree.unflatten(structure, found)
+        leaf_rows = rows[..., offset : offset + size, :]
+        arrays.append(leaf_rows.reshape(*rows.shape[:-2], *leaf.shape))
+        offset += size
+    return jax.tree.unflatten(structure, arrays)
 
 
-def _at(rows: Array, k: Array, like: Any) -> Any:
+def _unpack_at(rows: Array, k: Array, template: Any) -> Any:
     """Return tangent k as a tree of the template's structure."""
-    return _unpacked(lax.dynamic_index_in_dim(rows, k, 0, False), like)
+    return _unpack_rows(lax.dynamic_index_in_dim(rows, k, 0, False), template)
 
 
-def walked_along(
-    on: Walk, columns: Array, x: Array, d_columns: Array, d_x: Array, many: Array
-) -> tuple[Walked, Any]:
+def walk_with_tangents(
+    walk: BatchWalk, columns: Array, x: Array, d_columns: Array, d_x: Array, n_tangents: Array
+) -> tuple[BatchWalkResult, Any]:
     """Return the result of `run_walks`, and the tangents of its floats for each lane.
 
     Tangents are the first axis of `d_columns`, `d_x` and the returned tangents; a lane has
     `n_tangents` of them.
     """
-    columns, x, good = on.sound(columns, x)
-    n_rows = lambda tree: len(_packed(tree))
+    columns, x, is_valid = walk.replace_invalid(columns, x)
+    n_rows = lambda tree: len(_pack_rows(tree))
 
-    def begun(columns: Array, x: Array) -> tuple[Moves, Lane]:
-        lane = on.barred(on.begun(columns, x), good)
-        return lane.moves(), lane
+    def begin_walk(columns: Array, x: Array) -> tuple[LaneTangents, LaneState]:
+        lane = walk.deactivate(walk.begin_walk(columns, x), is_valid)
+        return lane.get_tangents(), lane
 
-    moves, push, lane = jax.linearize(begun, columns, x, has_aux=True)
-    slope = jnp.zeros((len(moves.q) + N_TALLIED * on.detailed, *many.shape), x.dtype)
-    like = _Way.of(moves, slope)
-    by_columns = jnp.zeros_like(many)
+    lane_tangents, push, lane = jax.linearize(begin_walk, columns, x, has_aux=True)
+    dynamics_rows = jnp.zeros(
+        (len(lane_tangents.q) + N_ACCUMULATOR_ROWS * walk.is_detailed, *n_tangents.shape), x.dtype
+    )
+    template = _Tangent.from_lane_tangents(lane_tangents, dynamics_rows)
+    n_column_tangents = jnp.zeros_like(n_tangents)
     for k in range(len(d_columns)):
-        by_columns = jnp.where(jnp.any(d_columns[k] != 0.0, axis=0), k + 1, by_columns)
-    ways = Ways(many, by_columns, d_columns, d_columns)
-    start = lambda k, _: _Way.of(push(_at(d_columns, k, columns), _at(d_x, k, x)), slope)
-    ways = ways._replace(rows=ways.each(start, ways.blank(n_rows(like))))
-
-    def turn(state: tuple[Lane, Ways]) -> tuple[Lane, Ways]:
-        lane, ways = state
-
-        def past_events(columns: Array, moves: Moves) -> tuple[Moves, Lane]:
-            after = on.past_events(columns, lane.moved(moves))
-            return after.moves(), after
-
-        _, push, after = jax.linearize(past_events, columns, lane.moves(), has_aux=True)
-
-        def passed(k: Array, row: Array) -> _Way:
-            way = _unpacked(row, like)
-            return _Way.of(push(_at(d_columns, k, columns), way.moves()), way.march.slope)
-
-        ways = ways._replace(rows=ways.each(passed, ways.rows))
-        under_way, flow_at = after.outcome == UNDER_WAY, lambda c: on.flow(c, after.now.stance)
-        given = flow_at, columns, after.now, ways, like.march, under_way, on.options, on.tableau
-        now, rows = _marched(*given)
-        return after._replace(now=now), ways._replace(rows=rows)
-
-    goes_on = lambda state: jnp.any(state[0].outcome == UNDER_WAY)
-    lane, ways = lax.while_loop(goes_on, turn, (lane, ways))
-
-    def told(moves: Moves) -> tuple[Any, Any]:
-        return eqx.partition(on.told(lane.moved(moves)), eqx.is_inexact_array)
-
-    floats, push, rest = jax.linearize(told, lane.moves(), has_aux=True)
-    push_at = lambda k, _: push(_at(ways.rows, k, like).moves())
-    moved = ways.each(push_at, ways.blank(n_rows(floats)))
-    step = eqx.combine(floats, rest)
-    walk = Walked(step, lane.outcome, lane.n_stepped, lane.ledger.tried)
-    return walk, _unpacked(moved, floats)
-
-
-def _marched(
-    flow_at: FlowAt,
-    columns: Array,
-    begin: March,
-    ways: Ways,
-    like: _March,
-    walks: Array,
-    options: Options,
-    tableau: Tableau,
-) -> tuple[March, Array]:
-    """Return the result of `integrate_interval`, with the tangents propagated to the event."""
-    flow = flow_at(columns)
-    sizes, last = guard_sizes(flow), len(tableau.places) - 1
-    more, longest = _more(ways, like, begin.stance), _longest(flow, tableau)
-
-    def advance(state: tuple[March, Array]) -> tuple[March, Array]:
-        now, rows = state
-        h = jnp.where(now.search.on, now.h, jnp.minimum(now.h, longest))
-        now = now._replace(h=h)
-        slopes, moved = _stages(
-            flow_at, columns, now, ways._replace(rows=rows), like, tableau, more
+        n_column_tangents = jnp.where(
+            jnp.any(d_columns[k] != 0.0, axis=0), k + 1, n_column_tangents
         )
-        tried = tried_by(flow, tableau, options, now, slopes)
-        after = advanced(now, tried, sizes, tableau, options)
-        taken, n = after.time != now.time, len(now.here.q)
+    tangents = TangentBatch(n_tangents, n_column_tangents, d_columns, d_columns)
+    start_tangent = lambda k, _: _Tangent.from_lane_tangents(
+        push(_unpack_at(d_columns, k, columns), _unpack_at(d_x, k, x)), dynamics_rows
+    )
+    tangents = tangents._replace(
+        rows=tangents.map_tangents(start_tangent, tangents.allocate(n_rows(template)))
+    )
 
-        def end(k: Array, row: Array) -> _March:
-            here = _unpacked(row, like)
-            known = lax.dynamic_index_in_dim(moved, k, 0, False).reshape(-1, *like.slope.shape)
-            at = lambda some: stage_at(
-                tableau, last, here.q[some], here.v[some], known[:, :n][:, some], now.h
+    def advance_round(state: tuple[LaneState, TangentBatch]) -> tuple[LaneState, TangentBatch]:
+        lane, tangents = state
+
+        def past_events(
+            columns: Array, lane_tangents: LaneTangents
+        ) -> tuple[LaneTangents, LaneState]:
+            next_lane = walk.process_events(columns, lane.replace_tangents(lane_tangents))
+            return next_lane.get_tangents(), next_lane
+
+        _, push, next_lane = jax.linearize(past_events, columns, lane.get_tangents(), has_aux=True)
+
+        def pass_event(k: Array, row: Array) -> _Tangent:
+            tangent = _unpack_rows(row, template)
+            return _Tangent.from_lane_tangents(
+                push(_unpack_at(d_columns, k, columns), tangent.lane_tangents()),
+                tangent.interval.dynamics_rows,
             )
-            few, others = slice(0, 3 + FEW), slice(3 + FEW, None)
-            still = here.q[others], here.v[others]
-            ends = zip(at(few), if_any(more, lambda _: at(others), still), strict=True)
-            q, v = map(jnp.concatenate, ends)
-            told = here.told
-            if told is not None:
-                once = tableau.once[last]
-                told = told + now.h * sum(once[j] * known[j, n:] for j in range(last))
-            there = _March(q, v, told, known[last], here.later)
-            return select(taken, there, here._replace(slope=known[0]))
 
-        return after, ways.each(end, rows)
+        tangents = tangents._replace(rows=tangents.map_tangents(pass_event, tangents.rows))
+        is_unfinished, dynamics_at = (
+            next_lane.outcome == STATUS_UNFINISHED,
+            lambda c: walk.make_dynamics(c, next_lane.interval.contact_state),
+        )
+        arguments = (
+            dynamics_at,
+            columns,
+            next_lane.interval,
+            tangents,
+            template.interval,
+            is_unfinished,
+            walk.options,
+            walk.tableau,
+        )
+        interval, rows = _integrate_with_tangents(*arguments)
+        return next_lane._replace(interval=interval), tangents._replace(rows=rows)
 
-    marching = lambda state: state[0].verdict == MARCHING
-    now, rows = until_none_marches(marching, walks, advance, (begin, ways.rows))
-    return now, ways.each(_met(flow_at, columns, begin, now, ways, like), rows)
+    should_continue = lambda state: jnp.any(state[0].outcome == STATUS_UNFINISHED)
+    lane, tangents = lax.while_loop(should_continue, advance_round, (lane, tangents))
+
+    def partition_result(lane_tangents: LaneTangents) -> tuple[Any, Any]:
+        return eqx.partition(
+            walk.compute_result(lane.replace_tangents(lane_tangents)), eqx.is_inexact_array
+        )
+
+    floats, push, others = jax.linearize(partition_result, lane.get_tangents(), has_aux=True)
+    push_tangent = lambda k, _: push(_unpack_at(tangents.rows, k, template).lane_tangents())
+    result_tangents = tangents.map_tangents(push_tangent, tangents.allocate(n_rows(floats)))
+    step_result = eqx.combine(floats, others)
+    walk_result = BatchWalkResult(
+        step_result, lane.outcome, lane.n_stepped, lane.counters.n_solver_steps
+    )
+    return walk_result, _unpack_rows(result_tangents, floats)
 
 
-def _stages(
-    flow_at: FlowAt,
+def _integrate_with_tangents(
+    dynamics_at: DynamicsFn,
     columns: Array,
-    now: March,
-    ways: Ways,
-    like: _March,
-    tableau: Tableau,
-    more: Array,
+    initial: IntervalState,
+    tangents: TangentBatch,
+    template: _IntervalTangent,
+    is_walking: Array,
+    options: StepOptions,
+    tableau: ButcherTableau,
+) -> tuple[IntervalState, Array]:
+    """Return the result of `integrate_interval`, with the tangents propagated to the event."""
+    dynamics = dynamics_at(columns)
+    scales, last_stage = guard_scales(dynamics), len(tableau.nodes) - 1
+    has_more_moving, max_h = (
+        _has_more_moving(tangents, template, initial.contact_state),
+        _max_stable_step(dynamics, tableau),
+    )
+
+    def try_step(state: tuple[IntervalState, Array]) -> tuple[IntervalState, Array]:
+        interval, rows = state
+        h = jnp.where(interval.search.is_active, interval.h, jnp.minimum(interval.h, max_h))
+        interval = interval._replace(h=h)
+        stage_rows, row_tangents = _evaluate_stages(
+            dynamics_at,
+            columns,
+            interval,
+            tangents._replace(rows=rows),
+            template,
+            tableau,
+            has_more_moving,
+        )
+        attempt = finish_attempt(dynamics, tableau, options, interval, stage_rows)
+        next_interval = integrator_step(interval, attempt, scales, tableau, options)
+        is_taken, n = next_interval.time != interval.time, len(interval.point.q)
+
+        def end_tangent(k: Array, row: Array) -> _IntervalTangent:
+            point = _unpack_rows(row, template)
+            stage_tangents = lax.dynamic_index_in_dim(row_tangents, k, 0, False).reshape(
+                -1, *template.dynamics_rows.shape
+            )
+            stage_of = lambda leg_slice: stage_state(
+                tableau,
+                last_stage,
+                point.q[leg_slice],
+                point.v[leg_slice],
+                stage_tangents[:, :n][:, leg_slice],
+                interval.h,
+            )
+            first_coordinates, other_coordinates = (
+                slice(0, 3 + N_MOVING_LEGS),
+                slice(3 + N_MOVING_LEGS, None),
+            )
+            unchanged = point.q[other_coordinates], point.v[other_coordinates]
+            ends = zip(
+                stage_of(first_coordinates),
+                run_if_any(has_more_moving, lambda _: stage_of(other_coordinates), unchanged),
+                strict=True,
+            )
+            q, v = map(jnp.concatenate, ends)
+            accumulated = point.accumulated
+            if accumulated is not None:
+                weights = tableau.matrix[last_stage]
+                accumulated = accumulated + interval.h * sum(
+                    weights[j] * stage_tangents[j, n:] for j in range(last_stage)
+                )
+            end_point = _IntervalTangent(q, v, accumulated, stage_tangents[last_stage], point.time)
+            return tree_where(is_taken, end_point, point._replace(dynamics_rows=stage_tangents[0]))
+
+        return next_interval, tangents.map_tangents(end_tangent, rows)
+
+    is_running = lambda state: state[0].status == STATUS_RUNNING
+    interval, rows = run_until_done(is_running, is_walking, try_step, (initial, tangents.rows))
+    return interval, tangents.map_tangents(
+        _shift_to_event(dynamics_at, columns, initial, interval, tangents, template), rows
+    )
+
+
+def _evaluate_stages(
+    dynamics_at: DynamicsFn,
+    columns: Array,
+    interval: IntervalState,
+    tangents: TangentBatch,
+    template: _IntervalTangent,
+    tableau: ButcherTableau,
+    has_more_moving: Array,
 ) -> tuple[Array, Array]:
     """Return the dynamics rows at the stages of a step, and the tangents of these rows.
 
     The tangents are processed one after another.
     """
-    here, h = now.here, now.h
-    size, last = len(like.slope), len(tableau.places) - 1
-    fresh = (now.verdict == MARCHING) & (now.time == 0.0)
+    point, h = interval.point, interval.h
+    size, last_stage = len(template.dynamics_rows), len(tableau.nodes) - 1
+    is_fresh = (interval.status == STATUS_RUNNING) & (interval.time == 0.0)
 
-    def stage(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        i, slopes, moved = state
+    def evaluate_stage(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        i, stage_rows, row_tangents = state
 
-        place = stage_at(tableau, i, here.q, here.v, slopes, h)
-        flow = flow_at(columns)
-        shares = Shares.at(flow, motion_of(Place(*place, place[0])), more)
-        none = shares.nothing()
-        by = lambda k, _: shares.by_columns(flow_at, columns, _at(ways.columns, k, columns))
-        own = ways._replace(many=ways.by_columns).each(by, ways.blank(len(_packed(none))))
+        stage_coordinates = stage_state(tableau, i, point.q, point.v, stage_rows, h)
+        dynamics = dynamics_at(columns)
+        basis = TangentBasis.from_motion(
+            dynamics,
+            motion_from_point(IntervalPoint(*stage_coordinates, stage_coordinates[0])),
+            has_more_moving,
+        )
+        zero_response = basis.make_zero()
+        respond = lambda k, _: basis.respond_to_columns(
+            dynamics_at, columns, _unpack_at(tangents.columns, k, columns)
+        )
+        column_responses = tangents._replace(n_tangents=tangents.n_column_tangents).map_tangents(
+            respond, tangents.allocate(len(_pack_rows(zero_response)))
+        )
 
-        def along(k: Array, known: Array) -> Array:
-            way = _at(ways.rows, k, like)
-            before = known.reshape(-1, *like.slope.shape)
-            ends = lambda some: _ends(tableau, i, way, before, h, some)
-            column = if_any(jnp.any(k < ways.by_columns), lambda _: _at(own, k, none), none)
-            row = shares.along(ends, column, more)
-            return jnp.where((i > 0) | fresh, row, known[:size])
+        def propagate_one(k: Array, known_rows: Array) -> Array:
+            tangent = _unpack_at(tangents.rows, k, template)
+            previous_rows = known_rows.reshape(-1, *template.dynamics_rows.shape)
+            coordinates = lambda leg_slice: _stage_tangent(
+                tableau, i, tangent, previous_rows, h, leg_slice
+            )
+            column_response = run_if_any(
+                jnp.any(k < tangents.n_column_tangents),
+                lambda _: _unpack_at(column_responses, k, zero_response),
+                zero_response,
+            )
+            new_row = basis.propagate_tangent(coordinates, column_response, has_more_moving)
+            return jnp.where((i > 0) | is_fresh, new_row, known_rows[:size])
 
-        slope = jnp.where(i > 0, slope_at(flow, *place), here.slope)
-        slopes = lax.dynamic_update_index_in_dim(slopes, slope, i, 0)
-        return i + 1, slopes, ways.each(along, moved, i * size)
+        row = jnp.where(i > 0, evaluate_dynamics(dynamics, *stage_coordinates), point.dynamics_rows)
+        stage_rows = lax.dynamic_update_index_in_dim(stage_rows, row, i, 0)
+        return i + 1, stage_rows, tangents.map_tangents(propagate_one, row_tangents, i * size)
 
-    others = jnp.zeros((last, *here.slope.shape), h.dtype)
-    slopes = jnp.concatenate([here.slope[None], others])
-    moved = ways.each(lambda k, _: _at(ways.rows, k, like).slope, ways.blank((last + 1) * size))
+    other_rows = jnp.zeros((last_stage, *point.dynamics_rows.shape), h.dtype)
+    stage_rows = jnp.concatenate([point.dynamics_rows[None], other_rows])
+    row_tangents = tangents.map_tangents(
+        lambda k, _: _unpack_at(tangents.rows, k, template).slope,
+        tangents.allocate((last_stage + 1) * size),
+    )
     # The first stage is the last one of the previous step, except after an event.
-    first = jnp.where(jnp.any(fresh), 0, 1).astype(jnp.int32)
-    goes_on = lambda state: state[0] <= last
-    return lax.while_loop(goes_on, stage, (first, slopes, moved))[1:]
+    first_stage = jnp.where(jnp.any(is_fresh), 0, 1).astype(jnp.int32)
+    should_continue = lambda state: state[0] <= last_stage
+    return lax.while_loop(should_continue, evaluate_stage, (first_stage, stage_rows, row_tangents))[
+        1:
+    ]
 
 
-def _ends(
-    tableau: Tableau, i: Array, way: _March, known: Array, h: Array, some: slice
+def _stage_tangent(
+    tableau: ButcherTableau,
+    i: Array,
+    tangent: _IntervalTangent,
+    known_rows: Array,
+    h: Array,
+    leg_slice: slice,
 ) -> tuple[Array, Array]:
     """Return the tangent of `stage_state` for some coordinates, from the earlier stages."""
-    rows = [jnp.asarray(np.reshape(x, -1)) for x in (tableau.once, tableau.twice)]
-    width, place = len(tableau.once[0]), jnp.asarray(tableau.places)[i]
+    rows = [jnp.asarray(np.reshape(x, -1)) for x in (tableau.matrix, tableau.matrix_squared)]
+    width, node = len(tableau.matrix[0]), jnp.asarray(tableau.nodes)[i]
 
-    def turn(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        j, first, second = state
-        a, b = (lax.dynamic_index_in_dim(row, i * width + j, 0, False) for row in rows)
-        slope = lax.dynamic_index_in_dim(known, j, 0, False)[: len(way.q)][some]
-        return j + 1, first + a * slope, second + b * slope
+    def add_stage(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        j, first_sum, second_sum = state
+        a, b = (lax.dynamic_index_in_dim(weights, i * width + j, 0, False) for weights in rows)
+        row = lax.dynamic_index_in_dim(known_rows, j, 0, False)[: len(tangent.q)][leg_slice]
+        return j + 1, first_sum + a * row, second_sum + b * row
 
-    q, v = way.q[some], way.v[some]
-    begin = jnp.zeros((), jnp.int32), jnp.zeros_like(q), jnp.zeros_like(q)
-    _, first, second = lax.while_loop(lambda state: state[0] < i, turn, begin)
-    return q + h * (place * v + h * second), v + h * first
+    q, v = tangent.q[leg_slice], tangent.v[leg_slice]
+    initial = jnp.zeros((), jnp.int32), jnp.zeros_like(q), jnp.zeros_like(q)
+    _, first_sum, second_sum = lax.while_loop(lambda state: state[0] < i, add_stage, initial)
+    return q + h * (node * v + h * second_sum), v + h * first_sum
 
 
-CALM = 0.85
+TANGENT_STABILITY_SHARE = 0.85
 """Fraction of the longest stable step size that is used for tangents of a swinging leg."""
 
 
-def _longest(flow: Flow, tableau: Tableau) -> Array:
+def _max_stable_step(dynamics: ModeDynamics, tableau: ButcherTableau) -> Array:
     """Return the step size above which tangents of a swinging leg grow.
 
     The damper of such a leg stops it within m / c. Step-size control is based on the motion alone,
     in which such a leg may be almost at rest.
     """
-    swings = jnp.any(~flow.stance.locked & (flow.stance.contact == OFF), axis=0)
-    steps = CALM * real_stability_limit(tableau)
-    return jnp.where(swings, steps * flow.s.m / flow.s.c, jnp.inf)
+    has_swing_leg = jnp.any(
+        ~dynamics.contact_state.locked & (dynamics.contact_state.contact == CONTACT_OFF), axis=0
+    )
+    step_factor = TANGENT_STABILITY_SHARE * real_stability_limit(tableau)
+    return jnp.where(has_swing_leg, step_factor * dynamics.s.m / dynamics.s.c, jnp.inf)
 
 
-def _more(ways: Ways, like: _March, stance: Stance) -> Array:
+def _has_more_moving(
+    tangents: TangentBatch, template: _IntervalTangent, contact_state: ContactState
+) -> Array:
     """Return whether any leg after the first ones moves, in any lane and along any tangent."""
 
-    def turn(state: tuple[Array, Array]) -> tuple[Array, Array]:
-        k, moves = state
-        way = _at(ways.rows, k, like)
-        lengths = jnp.concatenate([way.q[3 + FEW :], way.v[3 + FEW :]])
-        return k + 1, moves | jnp.any(lengths != 0.0, axis=0)
+    def check_one(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        k, has_moving = state
+        tangent = _unpack_at(tangents.rows, k, template)
+        lengths = jnp.concatenate([tangent.q[3 + N_MOVING_LEGS :], tangent.v[3 + N_MOVING_LEGS :]])
+        return k + 1, has_moving | jnp.any(lengths != 0.0, axis=0)
 
-    begin = jnp.zeros((), jnp.int32), jnp.any(~stance.locked[FEW:], axis=0)
-    goes_on = lambda state: jnp.any(state[0] < ways.many)
-    return jnp.any(lax.while_loop(goes_on, turn, begin)[1])
+    initial = jnp.zeros((), jnp.int32), jnp.any(~contact_state.locked[N_MOVING_LEGS:], axis=0)
+    should_continue = lambda state: jnp.any(state[0] < tangents.n_tangents)
+    return jnp.any(lax.while_loop(should_continue, check_one, initial)[1])
 
 
-def _met(
-    flow_at: FlowAt,
+def _shift_to_event(
+    dynamics_at: DynamicsFn,
     columns: Array,
-    begin: March,
-    now: March,
-    ways: Ways,
-    like: _March,
-) -> Callable[[Array, Array], _March]:
+    initial: IntervalState,
+    interval: IntervalState,
+    tangents: TangentBatch,
+    template: _IntervalTangent,
+) -> Callable[[Array, Array], _IntervalTangent]:
     """Return the function that shifts tangents by the tangent of the event time."""
-    here, n = now.here, len(now.here.q)
+    point, n = interval.point, len(interval.point.q)
 
-    def guards(columns: Array, q: Array, v: Array) -> Array:
-        flow = flow_at(columns)
-        return guards_at(flow, Place(q, v, slope_at(flow, q, v)))
+    def compute_guards(columns: Array, q: Array, v: Array) -> Array:
+        dynamics = dynamics_at(columns)
+        return guards_at_point(dynamics, IntervalPoint(q, v, evaluate_dynamics(dynamics, q, v)))
 
-    _, push = jax.linearize(guards, columns, here.q, here.v)
-    rates = push(jnp.zeros_like(columns), here.v, here.slope[:n])
-    arrived = (begin.verdict == MARCHING) & (now.verdict == EVENT)
+    _, push_guards = jax.linearize(compute_guards, columns, point.q, point.v)
+    rates = push_guards(jnp.zeros_like(columns), point.v, point.dynamics_rows[:n])
+    has_arrived = (initial.status == STATUS_RUNNING) & (interval.status == STATUS_EVENT)
 
-    def met(k: Array, row: Array) -> _March:
-        way, later = _unpacked(row, like), jnp.zeros_like(now.time)
-        moves = push(_at(ways.columns, k, columns), way.q, way.v)
-        for index in range(len(moves)):
-            at = arrived & (now.guard == index) & (rates[index] < 0.0)
-            later = jnp.where(at, -moves[index] / jnp.where(at, rates[index], -1.0), later)
-        told = way.told
-        if told is not None:
-            told = told + later * here.slope[-N_TALLIED:]
-        return _March(
-            q=way.q + later * here.v,
-            v=way.v + later * here.slope[:n],
-            told=told,
-            slope=way.slope,
-            later=later,
+    def shift_tangent(k: Array, row: Array) -> _IntervalTangent:
+        tangent, time_tangent = _unpack_rows(row, template), jnp.zeros_like(interval.time)
+        guard_tangents = push_guards(_unpack_at(tangents.columns, k, columns), tangent.q, tangent.v)
+        for index in range(len(guard_tangents)):
+            is_at_guard = has_arrived & (interval.guard == index) & (rates[index] < 0.0)
+            time_tangent = jnp.where(
+                is_at_guard,
+                -guard_tangents[index] / jnp.where(is_at_guard, rates[index], -1.0),
+                time_tangent,
+            )
+        accumulated = tangent.accumulated
+        if accumulated is not None:
+            accumulated = accumulated + time_tangent * point.dynamics_rows[-N_ACCUMULATOR_ROWS:]
+        return _IntervalTangent(
+            q=tangent.q + time_tangent * point.v,
+            v=tangent.v + time_tangent * point.dynamics_rows[:n],
+            accumulated=accumulated,
+            dynamics_rows=tangent.dynamics_rows,
+            time=time_tangent,
         )
 
-    return met
+    return shift_tangent

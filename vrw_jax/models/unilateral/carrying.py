@@ -13,242 +13,347 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from vrw_jax.models.unilateral.contacts import SLIP_DOWN, SLIP_UP, Roughness, answer, rough_of
+from vrw_jax.models.unilateral.contacts import (
+    CONTACT_SLIP_DOWN,
+    CONTACT_SLIP_UP,
+    Friction,
+    finite_friction,
+    solve_combination,
+)
 from vrw_jax.models.unilateral.mechanics import (
-    Free,
-    Hub,
-    Legs,
-    Pair,
+    ContactInverseInertia,
+    FreeMotion,
+    HubVector,
+    LegArray,
+    SlotPair,
     Slots,
-    Vector3,
     WheelMotion,
+    apply_inverse,
     free_acceleration,
     free_velocity,
-    hub_of,
-    kept,
-    one_of,
-    over_legs,
-    times,
+    make_inverse_inertia,
+    opaque_one,
+    prevent_fusion,
+    sum_over_legs,
 )
 from vrw_jax.wheel import Symbols
 
 
-class Stand(NamedTuple):
+class ContactConfiguration(NamedTuple):
     """A wheel with known contact modes and stopper states."""
 
     s: Symbols
     motion: WheelMotion
-    friction: Roughness  # of the slots' feet
+    friction: Friction  # of the slots' feet
     slots: Slots
     contact: Array  # of the slots
     held: Array  # the slots' legs on their stoppers
     airborne: Array  # other legs on their stoppers
 
     @property
-    def stays(self) -> Array:
+    def has_fixed_length(self) -> Array:
         """Whether the length of a leg is fixed."""
-        return self.airborne | (self.slots.spread(self.held) > 0)
+        return self.airborne | (self.slots.scatter(self.held) > 0)
 
 
-class Carried(NamedTuple):
+class ForceSolution(NamedTuple):
     """Forces of ground and slots' stoppers and the hub's motion: see `contacts.ContactSolution`."""
 
-    tangential: Pair
-    normal: Pair
-    stopper: Pair
-    pull: Pair
-    hub: Vector3
-    regular: Array
-    lengths: Legs  # accelerations of the legs' lengths, or rates after an impact
+    tangential: SlotPair
+    normal: SlotPair
+    stopper: SlotPair
+    pull: SlotPair
+    hub: HubVector
+    painleve_determinant: Array
+    lengths: LegArray  # accelerations of the legs' lengths, or rates after an impact
 
 
-def sliding(contact: Array) -> Pair:
+def slip_sign(contact: Array) -> SlotPair:
     """Return 1 for a slot's foot that slides downhill, -1 for uphill and 0 otherwise."""
-    sign = lambda mode: jnp.where(mode == SLIP_DOWN, 1.0, jnp.where(mode == SLIP_UP, -1.0, 0.0))
+    sign = lambda mode: jnp.where(
+        mode == CONTACT_SLIP_DOWN, 1.0, jnp.where(mode == CONTACT_SLIP_UP, -1.0, 0.0)
+    )
     return sign(contact[0]), sign(contact[1])
 
 
-class _Stays(NamedTuple):
+class _FrozenTerms(NamedTuple):
     """Quantities that are frozen for a tangent of the residual: accelerations, or velocity
     jumps.
     """
 
-    along: Legs  # of leg masses, beyond the hub's: along the legs
-    across: Legs  # and transverse to them
-    hub: Pair  # beyond gravity's
+    radial: LegArray  # of leg masses, beyond the hub's: along the legs
+    transverse: LegArray  # and transverse to them
+    hub: SlotPair  # beyond gravity's
 
 
-class _Moves(NamedTuple):
+class _RowTangents(NamedTuple):
     """Tangents of the equations' rows with the frozen terms fixed."""
 
-    along: Legs
-    across: Legs
-    hub: Pair
-    springs: Legs | float  # N
-    foot_e: Pair
-    foot_u: Pair
+    radial: LegArray
+    transverse: LegArray
+    hub: SlotPair
+    springs: LegArray | float  # N
+    foot_e: SlotPair
+    foot_u: SlotPair
 
 
-_Rows = Callable[[Stand, Stand, Hub, Carried], tuple[_Stays, _Moves]]
+_RowTangentFn = Callable[
+    [ContactConfiguration, ContactConfiguration, ContactInverseInertia, ForceSolution],
+    tuple[_FrozenTerms, _RowTangents],
+]
 
 
 @eqx.filter_jit  # traced once for all call sites
-def in_motion(stand: Stand) -> Carried:
+def solve_motion(configuration: ContactConfiguration) -> ForceSolution:
     """Return the forces, and the resulting accelerations."""
-    return _carried(free_acceleration, rows_of_motion, stand)
+    return _differentiable_solution(free_acceleration, motion_row_tangents, configuration)
 
 
 @eqx.filter_jit
-def in_impact(stand: Stand) -> Carried:
+def solve_impact(configuration: ContactConfiguration) -> ForceSolution:
     """Return the impulses, and the velocities after them."""
-    return _carried(free_velocity, _rows_of_impact, stand)
+    return _differentiable_solution(free_velocity, _impact_row_tangents, configuration)
 
 
-def told_by(stand: Stand, hub: Hub, free: Free) -> Carried:
+def solve_configuration(
+    configuration: ContactConfiguration, inertia: ContactInverseInertia, free: FreeMotion
+) -> ForceSolution:
     """Return the forces of a configuration for this free motion."""
-    s, _, friction, slots, contact, held, _ = stand
-    found = answer(s, hub, free, contact, held, friction)
-    out = free.legs + hub.legs.sin * found.hub[0] + hub.legs.cos * found.hub[1]
-    lengths = jnp.where(stand.stays, 0.0, out - slots.spread(found.pull) / s.m)
-    forces = found.tangential, found.normal, found.stopper, found.pull
-    return Carried(*forces, found.hub, found.regular, lengths)
+    s, _, friction, slots, contact, held, _ = configuration
+    solution = solve_combination(s, inertia, free, contact, held, friction)
+    outward = free.legs + inertia.legs.sin * solution.hub[0] + inertia.legs.cos * solution.hub[1]
+    lengths = jnp.where(
+        configuration.has_fixed_length, 0.0, outward - slots.scatter(solution.pull) / s.m
+    )
+    forces = solution.tangential, solution.normal, solution.stopper, solution.pull
+    return ForceSolution(*forces, solution.hub, solution.painleve_determinant, lengths)
 
 
-def _solved(free_of: Callable[..., Free], stand: Stand) -> tuple[Hub, Free, Carried]:
+def _solve_with_free_motion(
+    free_motion_fn: Callable[..., FreeMotion], configuration: ContactConfiguration
+) -> tuple[ContactInverseInertia, FreeMotion, ForceSolution]:
     """Return inertia, free motion and forces of a configuration."""
-    s, motion, one = stand.s, stand.motion, one_of(stand.motion)
-    hub = kept(hub_of(s, motion, stand.slots, stand.airborne), one)
-    free = kept(free_of(s, motion, stand.slots, hub), one)
-    return hub, free, kept(told_by(stand, hub, free), one)
+    s, motion, unit = configuration.s, configuration.motion, opaque_one(configuration.motion)
+    inertia = prevent_fusion(
+        make_inverse_inertia(s, motion, configuration.slots, configuration.airborne), unit
+    )
+    free = prevent_fusion(free_motion_fn(s, motion, configuration.slots, inertia), unit)
+    return inertia, free, prevent_fusion(solve_configuration(configuration, inertia, free), unit)
 
 
-def solved_motion(stand: Stand) -> tuple[Hub, Free, Carried]:
+def solve_motion_with_free(
+    configuration: ContactConfiguration,
+) -> tuple[ContactInverseInertia, FreeMotion, ForceSolution]:
     """Return the inertia, the motion free of contact forces, and the forces."""
-    return _solved(free_acceleration, stand)
+    return _solve_with_free_motion(free_acceleration, configuration)
 
 
-def _carried(free_of: Callable[..., Free], rows: _Rows, stand: Stand) -> Carried:
+def _differentiable_solution(
+    free_motion_fn: Callable[..., FreeMotion],
+    row_tangent_fn: _RowTangentFn,
+    configuration: ContactConfiguration,
+) -> ForceSolution:
     """Return the forces, with a derivative rule by the tangent of the residual."""
-    floats, rest = eqx.partition(stand, eqx.is_inexact_array)
+    floats, rest = eqx.partition(configuration, eqx.is_inexact_array)
     arrays, rest = eqx.partition(rest, eqx.is_array)
-    whole = lambda floats, arrays: eqx.combine(floats, arrays, rest)
-    found = jax.custom_jvp(lambda *given: _solved(free_of, whole(*given))[2])
+    assemble = lambda floats, arrays: eqx.combine(floats, arrays, rest)
+    solve = jax.custom_jvp(
+        lambda *arguments: _solve_with_free_motion(free_motion_fn, assemble(*arguments))[2]
+    )
 
-    @found.defjvp
-    def rule(at: tuple, ways: tuple) -> tuple[Carried, Carried]:
-        stand, way = whole(*at), whole(ways[0], at[1])
-        hub, free, told = _solved(free_of, stand)
-        left = left_over(stand, way, hub, told, *rows(stand, way, hub, told))
-        given = asked(hub, left.legs, in_all(stand.slots, left))
-        _, moved = jax.jvp(lambda free: told_by(stand, hub, free), (free,), (given,))
-        sum_of = lambda one, other: (one[0] + other[0], one[1] + other[1])
-        return told, moved._replace(
-            tangential=sum_of(moved.tangential, left.grip), pull=sum_of(moved.pull, left.pull)
+    @solve.defjvp
+    def rule(primals: tuple, tangents: tuple) -> tuple[ForceSolution, ForceSolution]:
+        configuration, tangent = assemble(*primals), assemble(tangents[0], primals[1])
+        inertia, free, solution = _solve_with_free_motion(free_motion_fn, configuration)
+        residual = residual_jvp(
+            configuration,
+            tangent,
+            inertia,
+            solution,
+            *row_tangent_fn(configuration, tangent, inertia, solution),
+        )
+        free_tangent = free_motion_tangent(
+            inertia, residual.legs, sum_residual(configuration.slots, residual)
+        )
+        _, solution_tangent = jax.jvp(
+            lambda free: solve_configuration(configuration, inertia, free), (free,), (free_tangent,)
+        )
+        add_pairs = lambda first, second: (first[0] + second[0], first[1] + second[1])
+        return solution, solution_tangent._replace(
+            tangential=add_pairs(solution_tangent.tangential, residual.friction_tangent),
+            pull=add_pairs(solution_tangent.pull, residual.pull),
         )
 
-    return found(floats, arrays)
+    return solve(floats, arrays)
 
 
-class Left(NamedTuple):
+class ResidualTangent(NamedTuple):
     """Tangent of the residual, in the form of its effect on the unknowns."""
 
-    legs: Legs  # their lengths
-    hub: tuple[Legs, Legs, Legs]  # each leg's part of the forces there
-    rest: Vector3  # the forces there without the legs' part
-    foot_e: Pair
-    foot_u: Pair
-    grip: Pair  # tangent of friction by its coefficient
-    pull: Pair  # tangent of the slots' pulls by that, and by their legs' rotation
+    legs: LegArray  # their lengths
+    hub: tuple[LegArray, LegArray, LegArray]  # each leg's part of the forces there
+    hub_extra: HubVector  # the forces there without the legs' part
+    foot_e: SlotPair
+    foot_u: SlotPair
+    friction_tangent: SlotPair  # tangent of friction by its coefficient
+    pull: SlotPair  # tangent of the slots' pulls by that, and by their legs' rotation
 
 
-def left_over(
-    stand: Stand, way: Stand, hub: Hub, told: Carried, stays: _Stays, moves: _Moves
-) -> Left:
+def residual_jvp(
+    configuration: ContactConfiguration,
+    tangent: ContactConfiguration,
+    inertia: ContactInverseInertia,
+    solution: ForceSolution,
+    frozen: _FrozenTerms,
+    row_tangents: _RowTangents,
+) -> ResidualTangent:
     """Return the tangent of the residual along a tangent of the configuration."""
-    s, ds, slots, (sin, cos), two = stand.s, way.s, stand.slots, hub.legs, range(2)
-    b, db, dtheta = stand.motion.L - s.a, way.motion.L - ds.a, way.motion.theta
-    slides, rough = sliding(stand.contact), jax.jvp(rough_of, (stand.friction,), (way.friction,))[1]
-    rough = rough if isinstance(rough, tuple) else (rough, rough)
-    t, n, L, dL = told.tangential, told.normal, hub.L, slots.of(way.motion.L)
-    grip = [-slides[i] * rough[i] * n[i] for i in two]
-    across = [t[i] * hub.cos[i] - n[i] * hub.sin[i] for i in two]
-    along = [t[i] * hub.sin[i] + n[i] * hub.cos[i] for i in two]
-    pull = [grip[i] * hub.sin[i] + across[i] * dtheta for i in two]
-    drag = [dL[i] * across[i] + L[i] * (grip[i] * hub.cos[i] - along[i] * dtheta) for i in two]
+    s, ds, slots, (sin, cos), slot_range = (
+        configuration.s,
+        tangent.s,
+        configuration.slots,
+        inertia.legs,
+        range(2),
+    )
+    b, db, dtheta = configuration.motion.L - s.a, tangent.motion.L - ds.a, tangent.motion.theta
+    slip_signs, coefficient_tangent = (
+        slip_sign(configuration.contact),
+        jax.jvp(finite_friction, (configuration.friction,), (tangent.friction,))[1],
+    )
+    coefficient_tangent = (
+        coefficient_tangent
+        if isinstance(coefficient_tangent, tuple)
+        else (coefficient_tangent, coefficient_tangent)
+    )
+    t, n, L, dL = solution.tangential, solution.normal, inertia.L, slots.gather(tangent.motion.L)
+    friction_tangent = [-slip_signs[i] * coefficient_tangent[i] * n[i] for i in slot_range]
+    transverse = [t[i] * inertia.cos[i] - n[i] * inertia.sin[i] for i in slot_range]
+    radial = [t[i] * inertia.sin[i] + n[i] * inertia.cos[i] for i in slot_range]
+    pull = [friction_tangent[i] * inertia.sin[i] + transverse[i] * dtheta for i in slot_range]
+    moment = [
+        dL[i] * transverse[i] + L[i] * (friction_tangent[i] * inertia.cos[i] - radial[i] * dtheta)
+        for i in slot_range
+    ]
 
-    (ax, az), (dx, dz) = stays.hub, moves.hub
-    outward, lever = sin * ax + cos * az, stays.across - cos * ax + sin * az
-    legs = (cos * ax - sin * az) * dtheta - moves.along + sin * dx + cos * dz
-    legs = legs + (moves.springs - slots.spread(pull) + (outward - stays.along) * ds.m) / s.m
-    legs = jnp.where(hub.released, legs, 0.0)
-    net = legs + moves.along
-    x, z = stays.along * sin + stays.across * cos, stays.along * cos - stays.across * sin
-    torque = db * lever + b * (moves.across + outward * dtheta - cos * dx + sin * dz)
-    return Left(
+    (ax, az), (dx, dz) = frozen.hub, row_tangents.hub
+    outward, lever = sin * ax + cos * az, frozen.transverse - cos * ax + sin * az
+    legs = (cos * ax - sin * az) * dtheta - row_tangents.radial + sin * dx + cos * dz
+    legs = (
+        legs + (row_tangents.springs - slots.scatter(pull) + (outward - frozen.radial) * ds.m) / s.m
+    )
+    legs = jnp.where(inertia.is_released, legs, 0.0)
+    net_legs = legs + row_tangents.radial
+    x, z = (
+        frozen.radial * sin + frozen.transverse * cos,
+        frozen.radial * cos - frozen.transverse * sin,
+    )
+    torque = db * lever + b * (row_tangents.transverse + outward * dtheta - cos * dx + sin * dz)
+    return ResidualTangent(
         legs=legs,
         hub=(
-            s.m * (net * sin + moves.across * cos + z * dtheta) + ds.m * x,
-            s.m * (net * cos - moves.across * sin - x * dtheta) + ds.m * z,
-            -s.m * torque - ds.m * (b * lever) - slots.spread(drag),
+            s.m * (net_legs * sin + row_tangents.transverse * cos + z * dtheta) + ds.m * x,
+            s.m * (net_legs * cos - row_tangents.transverse * sin - x * dtheta) + ds.m * z,
+            -s.m * torque - ds.m * (b * lever) - slots.scatter(moment),
         ),
-        rest=(grip[0] + grip[1] - ds.Mt * ax - s.Mt * dx, -ds.Mt * az - s.Mt * dz, 0.0),
-        foot_e=moves.foot_e,
-        foot_u=moves.foot_u,
-        grip=(grip[0], grip[1]),
+        hub_extra=(
+            friction_tangent[0] + friction_tangent[1] - ds.Mt * ax - s.Mt * dx,
+            -ds.Mt * az - s.Mt * dz,
+            0.0,
+        ),
+        foot_e=row_tangents.foot_e,
+        foot_u=row_tangents.foot_u,
+        friction_tangent=(friction_tangent[0], friction_tangent[1]),
         pull=(pull[0], pull[1]),
     )
 
 
-class Acts(NamedTuple):
+class TotalTangent(NamedTuple):
     """Tangent of the residual, summed over all legs and gathered for the slots."""
 
-    hub: Vector3
-    own: Pair
-    foot_e: Pair
-    foot_u: Pair
-    grip: Pair
+    hub: HubVector
+    slot_legs: SlotPair
+    foot_e: SlotPair
+    foot_u: SlotPair
+    friction_tangent: SlotPair
 
 
-def in_all(slots: Slots, left: Left) -> Acts:
+def sum_residual(slots: Slots, residual: ResidualTangent) -> TotalTangent:
     """Return the residual tangent summed over the legs."""
-    x, z, turn = (over_legs(legs) + rest for legs, rest in zip(left.hub, left.rest, strict=True))
-    return Acts((x, z, turn), slots.of(left.legs), left.foot_e, left.foot_u, left.grip)
-
-
-def asked(hub: Hub, legs: Legs, left: Acts) -> Free:
-    """Return the tangent of the free motion that the residual tangent is equivalent to."""
-    to, own, (u, v) = times(hub.inverse, left.hub), left.own, left.foot_u
-    e = [hub.cos[i] * to[0] - hub.sin[i] * to[1] - hub.L[i] * to[2] for i in range(2)]
-    e = [e[i] + left.foot_e[i] for i in range(2)]
-    return Free(to, legs, own, (e[0], e[1]), (u - own[0], v - own[1]))
-
-
-def rows_of_motion(stand: Stand, way: Stand, hub: Hub, told: Carried) -> tuple[_Stays, _Moves]:
-    """Return the frozen terms and the tangents of the rows of the equations of motion."""
-    s, motion, slots = stand.s, stand.motion, stand.slots
-    ds, moved, dtheta = way.s, way.motion, way.motion.theta
-    b, db, turn = motion.L - s.a, moved.L - ds.a, told.hub[2]
-    spin, twice = motion.dtheta * motion.dtheta, 2.0 * motion.dtheta
-    dspin, dtwice = twice * moved.dtheta, 2.0 * moved.dtheta
-    springs = ds.k * (s.Ls - motion.L) - ds.c * motion.dL
-    springs = springs + s.k * (ds.Ls - moved.L) - s.c * moved.dL
-    stays = _Stays(
-        along=told.lengths - b * spin,
-        across=twice * motion.dL + b * turn,
-        hub=(told.hub[0] - s.g * s.sin_phi, told.hub[1] + s.g * s.cos_phi),
+    x, z, rotation = (
+        sum_over_legs(legs) + extra
+        for legs, extra in zip(residual.hub, residual.hub_extra, strict=True)
     )
-    L, dL, back, dback = hub.L, *map(slots.of, (moved.L, motion.dL, moved.dL))
-    own = slots.of(told.lengths)
+    return TotalTangent(
+        (x, z, rotation),
+        slots.gather(residual.legs),
+        residual.foot_e,
+        residual.foot_u,
+        residual.friction_tangent,
+    )
+
+
+def free_motion_tangent(
+    inertia: ContactInverseInertia, legs: LegArray, total: TotalTangent
+) -> FreeMotion:
+    """Return the tangent of the free motion that the residual tangent is equivalent to."""
+    hub_tangent, slot_legs, (u, v) = (
+        apply_inverse(inertia.inverse_inertia, total.hub),
+        total.slot_legs,
+        total.foot_u,
+    )
+    e = [
+        inertia.cos[i] * hub_tangent[0]
+        - inertia.sin[i] * hub_tangent[1]
+        - inertia.L[i] * hub_tangent[2]
+        for i in range(2)
+    ]
+    e = [e[i] + total.foot_e[i] for i in range(2)]
+    return FreeMotion(
+        hub_tangent, legs, slot_legs, (e[0], e[1]), (u - slot_legs[0], v - slot_legs[1])
+    )
+
+
+def motion_row_tangents(
+    configuration: ContactConfiguration,
+    tangent: ContactConfiguration,
+    inertia: ContactInverseInertia,
+    solution: ForceSolution,
+) -> tuple[_FrozenTerms, _RowTangents]:
+    """Return the frozen terms and the tangents of the rows of the equations of motion."""
+    s, motion, slots = configuration.s, configuration.motion, configuration.slots
+    ds, motion_tangent, dtheta = tangent.s, tangent.motion, tangent.motion.theta
+    b, db, ddtheta = motion.L - s.a, motion_tangent.L - ds.a, solution.hub[2]
+    spin, double_rate = motion.dtheta * motion.dtheta, 2.0 * motion.dtheta
+    spin_tangent, double_rate_tangent = (
+        double_rate * motion_tangent.dtheta,
+        2.0 * motion_tangent.dtheta,
+    )
+    springs = ds.k * (s.Ls - motion.L) - ds.c * motion.dL
+    springs = springs + s.k * (ds.Ls - motion_tangent.L) - s.c * motion_tangent.dL
+    frozen = _FrozenTerms(
+        radial=solution.lengths - b * spin,
+        transverse=double_rate * motion.dL + b * ddtheta,
+        hub=(solution.hub[0] - s.g * s.sin_phi, solution.hub[1] + s.g * s.cos_phi),
+    )
+    L, dL, slot_rates, slot_rate_tangents = (
+        inertia.L,
+        *map(slots.gather, (motion_tangent.L, motion.dL, motion_tangent.dL)),
+    )
+    slot_accelerations = slots.gather(solution.lengths)
     foot_e = [
-        (L[i] * spin - own[i]) * dtheta - twice * dback[i] - back[i] * dtwice - turn * dL[i]
+        (L[i] * spin - slot_accelerations[i]) * dtheta
+        - double_rate * slot_rate_tangents[i]
+        - slot_rates[i] * double_rate_tangent
+        - ddtheta * dL[i]
         for i in range(2)
     ]
     foot_u = [
-        (twice * back[i] + turn * L[i]) * dtheta + spin * dL[i] + L[i] * dspin for i in range(2)
+        (double_rate * slot_rates[i] + ddtheta * L[i]) * dtheta + spin * dL[i] + L[i] * spin_tangent
+        for i in range(2)
     ]
-    return stays, _Moves(
-        along=-(db * spin + b * dspin),
-        across=twice * moved.dL + motion.dL * dtwice + turn * db,
+    return frozen, _RowTangents(
+        radial=-(db * spin + b * spin_tangent),
+        transverse=double_rate * motion_tangent.dL + motion.dL * double_rate_tangent + ddtheta * db,
         hub=(-ds.g * s.sin_phi - s.g * ds.sin_phi, ds.g * s.cos_phi + s.g * ds.cos_phi),
         springs=springs,
         foot_e=(foot_e[0], foot_e[1]),
@@ -256,23 +361,36 @@ def rows_of_motion(stand: Stand, way: Stand, hub: Hub, told: Carried) -> tuple[_
     )
 
 
-def _rows_of_impact(stand: Stand, way: Stand, hub: Hub, told: Carried) -> tuple[_Stays, _Moves]:
+def _impact_row_tangents(
+    configuration: ContactConfiguration,
+    tangent: ContactConfiguration,
+    inertia: ContactInverseInertia,
+    solution: ForceSolution,
+) -> tuple[_FrozenTerms, _RowTangents]:
     """Return the frozen terms and the tangents of the rows of the impact equations."""
-    s, motion, moved, slots = stand.s, stand.motion, way.motion, stand.slots
-    turn = told.hub[2]
-    jump, b = turn - motion.dtheta, motion.L - s.a
-    stays = _Stays(
-        along=told.lengths - motion.dL,
-        across=b * jump,
-        hub=(told.hub[0] - motion.vx, told.hub[1] - motion.vz),
+    s, motion, motion_tangent, slots = (
+        configuration.s,
+        configuration.motion,
+        tangent.motion,
+        configuration.slots,
     )
-    own, dL = slots.of(told.lengths), slots.of(moved.L)
-    foot_e = [-turn * dL[i] - own[i] * moved.theta for i in range(2)]
-    return stays, _Moves(
-        along=-moved.dL,
-        across=(moved.L - way.s.a) * jump - b * moved.dtheta,
-        hub=(-moved.vx, -moved.vz),
+    dtheta_after = solution.hub[2]
+    rate_jump, b = dtheta_after - motion.dtheta, motion.L - s.a
+    frozen = _FrozenTerms(
+        radial=solution.lengths - motion.dL,
+        transverse=b * rate_jump,
+        hub=(solution.hub[0] - motion.vx, solution.hub[1] - motion.vz),
+    )
+    slot_rates, dL = slots.gather(solution.lengths), slots.gather(motion_tangent.L)
+    foot_e = [-dtheta_after * dL[i] - slot_rates[i] * motion_tangent.theta for i in range(2)]
+    return frozen, _RowTangents(
+        radial=-motion_tangent.dL,
+        transverse=(motion_tangent.L - tangent.s.a) * rate_jump - b * motion_tangent.dtheta,
+        hub=(-motion_tangent.vx, -motion_tangent.vz),
         springs=0.0,
         foot_e=(foot_e[0], foot_e[1]),
-        foot_u=(hub.L[0] * turn * moved.theta, hub.L[1] * turn * moved.theta),
+        foot_u=(
+            inertia.L[0] * dtheta_after * motion_tangent.theta,
+            inertia.L[1] * dtheta_after * motion_tangent.theta,
+        ),
     )

@@ -25,39 +25,45 @@ from jax import lax
 from jaxtyping import Array, Bool, Int
 
 from vrw_jax import simd
-from vrw_jax.models.unilateral.mechanics import Free, Hub, Pair, Vector3, kept
-from vrw_jax.numerics import Elementwise, select
+from vrw_jax.models.unilateral.mechanics import (
+    ContactInverseInertia,
+    FreeMotion,
+    HubVector,
+    SlotPair,
+    prevent_fusion,
+)
+from vrw_jax.numerics import Elementwise, tree_where
 from vrw_jax.wheel import Symbols
 
-Roughness = Elementwise | Pair
+Friction = Elementwise | SlotPair
 """Friction of all feet, or of each slot's foot."""
-OFF, STICK, SLIP_DOWN, SLIP_UP = 0, 1, 2, 3
+CONTACT_OFF, CONTACT_STICK, CONTACT_SLIP_DOWN, CONTACT_SLIP_UP = 0, 1, 2, 3
 """Contact modes of a foot: in the air, at rest, sliding downhill, sliding uphill."""
 
 
-THE_PAPERS = -np.inf
+PAPER_RULE_SENTINEL = -np.inf
 """Friction that selects the paper's rule instead of the limit of large friction."""
 
 
-class Answer(NamedTuple):
+class ContactSolution(NamedTuple):
     """Forces (N) and resulting accelerations, or impulses (N s) and the velocities after them."""
 
-    tangential: Pair  # on each slot's foot, downhill positive
-    normal: Pair  # pushing positive
-    stopper: Pair  # of each slot's leg, pushing positive
-    pull: Pair  # sum of stopper and foot force along u, acting on the leg's mass
-    hub: Vector3
-    length: Pair  # of each slot's leg
-    foot_x: Pair  # of each slot's foot
-    foot_z: Pair
-    regular: Any  # zero if no force holds a sliding foot: Painlevé's singularity
+    tangential: SlotPair  # on each slot's foot, downhill positive
+    normal: SlotPair  # pushing positive
+    stopper: SlotPair  # of each slot's leg, pushing positive
+    pull: SlotPair  # sum of stopper and foot force along u, acting on the leg's mass
+    hub: HubVector
+    length: SlotPair  # of each slot's leg
+    foot_x: SlotPair  # of each slot's foot
+    foot_z: SlotPair
+    painleve_determinant: Any  # zero if no force holds a sliding foot: Painlevé's singularity
 
 
-Matrix = tuple[tuple[Any, Any], tuple[Any, Any]]
+Matrix2 = tuple[tuple[Any, Any], tuple[Any, Any]]
 """Matrix of two rows and two columns."""
 
 
-def _solved(A: Matrix, b: Pair) -> Pair:
+def _solve_2x2(A: Matrix2, b: SlotPair) -> SlotPair:
     """Return the solution of a 2 x 2 system; NaN if the matrix is singular."""
     determinant = A[0][0] * A[1][1] - A[0][1] * A[1][0]
     scale = 1.0 / jnp.where(determinant == 0.0, jnp.nan, determinant)
@@ -67,320 +73,440 @@ def _solved(A: Matrix, b: Pair) -> Pair:
     )
 
 
-def _matrix(entry: Any) -> Matrix:
+def _make_matrix(entry: Any) -> Matrix2:
     """Return the 2 x 2 matrix of the entries `entry(i, j)`."""
     return ((entry(0, 0), entry(0, 1)), (entry(1, 0), entry(1, 1)))
 
 
-def _pair(entry: Any) -> Pair:
+def _make_pair(entry: Any) -> SlotPair:
     """Return the entries `entry(0)` and `entry(1)`."""
     return entry(0), entry(1)
 
 
-def each(function: Callable[[Any], Any], friction: Roughness) -> Any:
+def map_friction(function: Callable[[Any], Any], friction: Friction) -> Any:
     """Return the function of the friction of all feet, or of each slot's."""
-    pair = isinstance(friction, tuple)
-    return (function(friction[0]), function(friction[1])) if pair else function(friction)
+    is_pair = isinstance(friction, tuple)
+    return (function(friction[0]), function(friction[1])) if is_pair else function(friction)
 
 
-def _at(i: int, friction: Any) -> Any:
+def _friction_of_slot(i: int, friction: Any) -> Any:
     """Return the friction of slot i."""
     return friction[i] if isinstance(friction, tuple) else friction
 
 
-def rough_of(friction: Roughness) -> Any:
+def finite_friction(friction: Friction) -> Any:
     """Return Coulomb's coefficient; 0 for infinite friction, which exerts none on a sliding
     foot.
     """
-    return each(lambda value: jnp.where(jnp.isfinite(value), value, 0.0), friction)
+    return map_friction(lambda value: jnp.where(jnp.isfinite(value), value, 0.0), friction)
 
 
-class _Feet(NamedTuple):
+class _FootEquations(NamedTuple):
     """Conditions of a combination at each slot's foot.
 
     The unknown c is the force along e for a sticking foot. For a sliding foot it is the normal
     force, or the friction force in the limit of infinite friction. An unloaded foot has c = 0.
     """
 
-    stick: Pair
-    loaded: Pair
-    to_e: Pair  # force along e for c = 1
-    to_u: Pair  # along u, except for the own leg's part of a sticking foot
-    row_e: Pair  # weight of the foot's motion along e in the zero condition
-    row_u: Pair  # weight of the foot's force on the leg's mass in it
+    is_sticking: SlotPair
+    is_loaded: SlotPair
+    force_e: SlotPair  # force along e for c = 1
+    force_u: SlotPair  # along u, except for the own leg's part of a sticking foot
+    row_e: SlotPair  # weight of the foot's motion along e in the zero condition
+    row_u: SlotPair  # weight of the foot's force on the leg's mass in it
 
 
-def _feet(s: Symbols, hub: Hub, contact: Array, friction: Roughness) -> _Feet:
+def _make_foot_equations(
+    s: Symbols, inertia: ContactInverseInertia, contact: Array, friction: Friction
+) -> _FootEquations:
     """Return the conditions of these contact modes."""
-    sin, cos = hub.sin, hub.cos
-    rough = each(
+    sin, cos = inertia.sin, inertia.cos
+    coefficient = map_friction(
         lambda value: jnp.where(value == jnp.inf, 1.0, jnp.where(jnp.isfinite(value), value, 0.0)),
         friction,
     )
-    press = each(lambda value: jnp.where(value == jnp.inf, 0.0, 1.0), friction)
-    stick = _pair(lambda i: contact[i] == STICK)
-    slip = _pair(lambda i: (contact[i] == SLIP_DOWN) | (contact[i] == SLIP_UP))
-    drag = _pair(lambda i: jnp.where(contact[i] == SLIP_DOWN, -_at(i, rough), _at(i, rough)))
-    chosen = lambda i, sticks, slides: jnp.where(stick[i], sticks, jnp.where(slip[i], slides, 0.0))
-    return _Feet(
-        stick=stick,
-        loaded=_pair(lambda i: stick[i] | slip[i]),
-        to_e=_pair(lambda i: chosen(i, 1.0, drag[i] * cos[i] - _at(i, press) * sin[i])),
-        to_u=_pair(lambda i: chosen(i, 0.0, drag[i] * sin[i] + _at(i, press) * cos[i])),
-        row_e=_pair(lambda i: chosen(i, 1.0, -sin[i])),
-        row_u=_pair(lambda i: chosen(i, 0.0, cos[i] * (1.0 / s.m))),
+    normal_share = map_friction(lambda value: jnp.where(value == jnp.inf, 0.0, 1.0), friction)
+    is_sticking = _make_pair(lambda i: contact[i] == CONTACT_STICK)
+    is_sliding = _make_pair(
+        lambda i: (contact[i] == CONTACT_SLIP_DOWN) | (contact[i] == CONTACT_SLIP_UP)
+    )
+    drag = _make_pair(
+        lambda i: jnp.where(
+            contact[i] == CONTACT_SLIP_DOWN,
+            -_friction_of_slot(i, coefficient),
+            _friction_of_slot(i, coefficient),
+        )
+    )
+    select_by_mode = lambda i, if_sticking, if_sliding: jnp.where(
+        is_sticking[i], if_sticking, jnp.where(is_sliding[i], if_sliding, 0.0)
+    )
+    return _FootEquations(
+        is_sticking=is_sticking,
+        is_loaded=_make_pair(lambda i: is_sticking[i] | is_sliding[i]),
+        force_e=_make_pair(
+            lambda i: select_by_mode(
+                i, 1.0, drag[i] * cos[i] - _friction_of_slot(i, normal_share) * sin[i]
+            )
+        ),
+        force_u=_make_pair(
+            lambda i: select_by_mode(
+                i, 0.0, drag[i] * sin[i] + _friction_of_slot(i, normal_share) * cos[i]
+            )
+        ),
+        row_e=_make_pair(lambda i: select_by_mode(i, 1.0, -sin[i])),
+        row_u=_make_pair(lambda i: select_by_mode(i, 0.0, cos[i] * (1.0 / s.m))),
     )
 
 
-def _same(i: int, j: int) -> float:
+def _identity_entry(i: int, j: int) -> float:
     """Return an entry of the identity matrix."""
     return 1.0 if i == j else 0.0
 
 
-def _stoppers(
-    s: Symbols, hub: Hub, free: Free, held: Array, feet: _Feet, one: Array
-) -> tuple[Pair, Matrix]:
+def _eliminate_stoppers(
+    s: Symbols,
+    inertia: ContactInverseInertia,
+    free: FreeMotion,
+    held: Array,
+    foot_equations: _FootEquations,
+    unit: Array,
+) -> tuple[SlotPair, Matrix2]:
     """Return the stopper forces without the feet, and the effect of each foot's c, [foot][stopper].
 
     They solve N s = p + P c, where the row of an open stopper is s = 0: the system is always
     regular.
     """
-    sin, cos, m_inv = hub.sin, hub.cos, 1.0 / s.m
-    H, K = ((hub.H[0], hub.H[1]), (hub.H[2], hub.H[3])), ((hub.K[0], hub.K[1]), hub.K[1:])
-    loose = _pair(lambda i: jnp.where(feet.stick[i], 0.0, m_inv))
-    N = _matrix(lambda i, j: jnp.where(held[i], K[i][j] + _same(i, j) * loose[i], _same(i, j)))
-    across = _pair(lambda i: sin[i] * free.hub[0] + cos[i] * free.hub[1] + free.own[i])
-    grows = _pair(lambda i: across[i] + jnp.where(feet.stick[i], free.u[i], 0.0))
-    p = _pair(lambda i: jnp.where(held[i], grows[i], 0.0))
-    added = lambda i, j: H[i][j] * feet.to_e[j] - _same(i, j) * feet.to_u[i] * m_inv
-    P = _matrix(lambda i, j: jnp.where(held[i], added(i, j), 0.0))
-    p, P, N = kept((p, P, N), one)
-    return kept((_solved(N, p), _pair(lambda j: _solved(N, (P[0][j], P[1][j])))), one)
+    sin, cos, m_inv = inertia.sin, inertia.cos, 1.0 / s.m
+    H, K = (
+        ((inertia.H[0], inertia.H[1]), (inertia.H[2], inertia.H[3])),
+        ((inertia.K[0], inertia.K[1]), inertia.K[1:]),
+    )
+    compliance = _make_pair(lambda i: jnp.where(foot_equations.is_sticking[i], 0.0, m_inv))
+    N = _make_matrix(
+        lambda i, j: jnp.where(
+            held[i], K[i][j] + _identity_entry(i, j) * compliance[i], _identity_entry(i, j)
+        )
+    )
+    outward = _make_pair(lambda i: sin[i] * free.hub[0] + cos[i] * free.hub[1] + free.slot_legs[i])
+    free_growth = _make_pair(
+        lambda i: outward[i] + jnp.where(foot_equations.is_sticking[i], free.foot_u[i], 0.0)
+    )
+    p = _make_pair(lambda i: jnp.where(held[i], free_growth[i], 0.0))
+    foot_effect = lambda i, j: (
+        H[i][j] * foot_equations.force_e[j]
+        - _identity_entry(i, j) * foot_equations.force_u[i] * m_inv
+    )
+    P = _make_matrix(lambda i, j: jnp.where(held[i], foot_effect(i, j), 0.0))
+    p, P, N = prevent_fusion((p, P, N), unit)
+    return prevent_fusion(
+        (_solve_2x2(N, p), _make_pair(lambda j: _solve_2x2(N, (P[0][j], P[1][j])))), unit
+    )
 
 
-def _carried(
-    s: Symbols, hub: Hub, free: Free, feet: _Feet, alone: Pair, columns: Matrix, one: Array
-) -> tuple[Pair, Pair, Pair, Any]:
+def _solve_feet(
+    s: Symbols,
+    inertia: ContactInverseInertia,
+    free: FreeMotion,
+    foot_equations: _FootEquations,
+    stopper_alone: SlotPair,
+    stopper_columns: Matrix2,
+    unit: Array,
+) -> tuple[SlotPair, SlotPair, SlotPair, Any]:
     """Return the forces of the stoppers, of the feet along e and along u, and the determinant.
 
     The feet's equations are solved with the stoppers of `_eliminate_stoppers` inserted.
     """
-    row_e, row_u, to_e, to_u = feet.row_e, feet.row_u, feet.to_e, feet.to_u
-    G, H = ((hub.G[0], hub.G[1]), hub.G[1:]), ((hub.H[0], hub.H[1]), (hub.H[2], hub.H[3]))
-    R = _matrix(lambda i, k: _same(i, k) * row_u[i] - row_e[i] * H[k][i])
-    C = _matrix(
+    row_e, row_u, to_e, to_u = (
+        foot_equations.row_e,
+        foot_equations.row_u,
+        foot_equations.force_e,
+        foot_equations.force_u,
+    )
+    G, H = (
+        ((inertia.G[0], inertia.G[1]), inertia.G[1:]),
+        ((inertia.H[0], inertia.H[1]), (inertia.H[2], inertia.H[3])),
+    )
+    R = _make_matrix(lambda i, k: _identity_entry(i, k) * row_u[i] - row_e[i] * H[k][i])
+    C = _make_matrix(
         lambda i, j: (
             row_e[i] * G[i][j] * to_e[j]
-            + _same(i, j) * row_u[i] * to_u[i]
-            + R[i][0] * columns[j][0]
-            + R[i][1] * columns[j][1]
-            + _same(i, j) * jnp.where(feet.loaded[i], 0.0, 1.0)
+            + _identity_entry(i, j) * row_u[i] * to_u[i]
+            + R[i][0] * stopper_columns[j][0]
+            + R[i][1] * stopper_columns[j][1]
+            + _identity_entry(i, j) * jnp.where(foot_equations.is_loaded[i], 0.0, 1.0)
         )
     )
-    moves = _pair(lambda i: -row_e[i] * free.e[i] - row_u[i] * s.m * free.u[i])
-    c = _solved(C, _pair(lambda i: moves[i] - R[i][0] * alone[0] - R[i][1] * alone[1]))
-    stopper = _pair(lambda k: alone[k] + columns[0][k] * c[0] + columns[1][k] * c[1])
-    along_e = _pair(lambda i: to_e[i] * c[i])
-    sticks = _pair(lambda i: -s.m * free.u[i] - stopper[i])
-    along_u = _pair(lambda i: jnp.where(feet.stick[i], sticks[i], to_u[i] * c[i]))
-    regular = s.m * s.m * (C[0][0] * C[1][1] - C[0][1] * C[1][0])
-    return kept((stopper, along_e, along_u, regular), one)
+    right_hand_side = _make_pair(
+        lambda i: -row_e[i] * free.foot_e[i] - row_u[i] * s.m * free.foot_u[i]
+    )
+    c = _solve_2x2(
+        C,
+        _make_pair(
+            lambda i: right_hand_side[i] - R[i][0] * stopper_alone[0] - R[i][1] * stopper_alone[1]
+        ),
+    )
+    stopper = _make_pair(
+        lambda k: stopper_alone[k] + stopper_columns[0][k] * c[0] + stopper_columns[1][k] * c[1]
+    )
+    along_e = _make_pair(lambda i: to_e[i] * c[i])
+    if_sticking = _make_pair(lambda i: -s.m * free.foot_u[i] - stopper[i])
+    along_u = _make_pair(
+        lambda i: jnp.where(foot_equations.is_sticking[i], if_sticking[i], to_u[i] * c[i])
+    )
+    painleve_determinant = s.m * s.m * (C[0][0] * C[1][1] - C[0][1] * C[1][0])
+    return prevent_fusion((stopper, along_e, along_u, painleve_determinant), unit)
 
 
 @eqx.filter_jit  # traced once for all call sites
-def answer(
-    s: Symbols, hub: Hub, free: Free, contact: Array, held: Array, friction: Roughness
-) -> Answer:
+def solve_combination(
+    s: Symbols,
+    inertia: ContactInverseInertia,
+    free: FreeMotion,
+    contact: Array,
+    held: Array,
+    friction: Friction,
+) -> ContactSolution:
     """Return the solution of one combination of contact modes and stoppers of the two slots, shape
     (2,).
 
     A sticking foot is at rest, a sliding foot keeps its height with friction against the slip, and
     a held leg keeps its length. The stoppers are eliminated first.
     """
-    sin, cos, m_inv = hub.sin, hub.cos, 1.0 / s.m
-    one = 1.0 + 0.0 * lax.stop_gradient(free.hub[2])
-    feet = _feet(s, hub, contact, friction)
-    stoppers = _stoppers(s, hub, free, held, feet, one)
-    stopper, along_e, along_u, regular = _carried(s, hub, free, feet, *stoppers, one)
-    pull = _pair(lambda i: along_u[i] + stopper[i])
-    z, y = hub.along_e, hub.along_u
-    by_feet = [free.hub[k] + z[0][k] * along_e[0] + z[1][k] * along_e[1] for k in range(3)]
-    vx, vz, turn = (by_feet[k] - y[0][k] * stopper[0] - y[1][k] * stopper[1] for k in range(3))
-    dx, dz, dturn = vx - free.hub[0], vz - free.hub[1], turn - free.hub[2]
-    foot_e = _pair(lambda i: cos[i] * dx - sin[i] * dz - hub.L[i] * dturn + free.e[i])
-    foot_u = _pair(lambda i: free.u[i] + pull[i] * m_inv)
-    grows = _pair(lambda i: sin[i] * vx + cos[i] * vz + free.own[i] - pull[i] * m_inv)
-    return Answer(
-        tangential=_pair(lambda i: along_e[i] * cos[i] + along_u[i] * sin[i]),
-        normal=_pair(lambda i: along_u[i] * cos[i] - along_e[i] * sin[i]),
+    sin, cos, m_inv = inertia.sin, inertia.cos, 1.0 / s.m
+    unit = 1.0 + 0.0 * lax.stop_gradient(free.hub[2])
+    foot_equations = _make_foot_equations(s, inertia, contact, friction)
+    stopper_system = _eliminate_stoppers(s, inertia, free, held, foot_equations, unit)
+    stopper, along_e, along_u, painleve_determinant = _solve_feet(
+        s, inertia, free, foot_equations, *stopper_system, unit
+    )
+    pull = _make_pair(lambda i: along_u[i] + stopper[i])
+    z, y = inertia.response_e, inertia.response_u
+    hub_with_feet = [free.hub[k] + z[0][k] * along_e[0] + z[1][k] * along_e[1] for k in range(3)]
+    vx, vz, omega = (
+        hub_with_feet[k] - y[0][k] * stopper[0] - y[1][k] * stopper[1] for k in range(3)
+    )
+    dx, dz, domega = vx - free.hub[0], vz - free.hub[1], omega - free.hub[2]
+    foot_e = _make_pair(
+        lambda i: cos[i] * dx - sin[i] * dz - inertia.L[i] * domega + free.foot_e[i]
+    )
+    foot_u = _make_pair(lambda i: free.foot_u[i] + pull[i] * m_inv)
+    free_growth = _make_pair(
+        lambda i: sin[i] * vx + cos[i] * vz + free.slot_legs[i] - pull[i] * m_inv
+    )
+    return ContactSolution(
+        tangential=_make_pair(lambda i: along_e[i] * cos[i] + along_u[i] * sin[i]),
+        normal=_make_pair(lambda i: along_u[i] * cos[i] - along_e[i] * sin[i]),
         stopper=stopper,
         pull=pull,
-        hub=(vx, vz, turn),
-        length=_pair(lambda i: jnp.where(held[i], 0.0, grows[i])),
-        foot_x=_pair(lambda i: foot_e[i] * cos[i] + foot_u[i] * sin[i]),
-        foot_z=_pair(lambda i: foot_u[i] * cos[i] - foot_e[i] * sin[i]),
-        regular=regular,
+        hub=(vx, vz, omega),
+        length=_make_pair(lambda i: jnp.where(held[i], 0.0, free_growth[i])),
+        foot_x=_make_pair(lambda i: foot_e[i] * cos[i] + foot_u[i] * sin[i]),
+        foot_z=_make_pair(lambda i: foot_u[i] * cos[i] - foot_e[i] * sin[i]),
+        painleve_determinant=painleve_determinant,
     )
 
 
-def _table() -> tuple[np.ndarray, np.ndarray]:
+def _enumerate_combinations() -> tuple[np.ndarray, np.ndarray]:
     """Return all combinations of modes and stoppers, most sticking feet first, then most sliding
     ones.
 
     Two sticking feet on two held legs are excluded: they constrain the hub twice, so that their
     forces are not determined.
     """
-    rank = {STICK: 0, SLIP_DOWN: 1, SLIP_UP: 1, OFF: 2}
+    rank = {CONTACT_STICK: 0, CONTACT_SLIP_DOWN: 1, CONTACT_SLIP_UP: 1, CONTACT_OFF: 2}
     rows = [
         (modes, held)
-        for modes in itertools.product((STICK, SLIP_DOWN, SLIP_UP, OFF), repeat=2)
+        for modes in itertools.product(
+            (CONTACT_STICK, CONTACT_SLIP_DOWN, CONTACT_SLIP_UP, CONTACT_OFF), repeat=2
+        )
         for held in itertools.product((False, True), repeat=2)
-        if not (modes == (STICK, STICK) and all(held))
+        if not (modes == (CONTACT_STICK, CONTACT_STICK) and all(held))
     ]
-    rows.sort(key=lambda row: (sum(rank[m] for m in row[0]), sum(row[1])))
+    rows.sort(key=lambda row: (sum(rank[mode] for mode in row[0]), sum(row[1])))
     return np.array([r[0] for r in rows], np.int32), np.array([r[1] for r in rows])
 
 
-MODES, HELD = _table()
+MODE_TABLE, HELD_TABLE = _enumerate_combinations()
 """Combinations in order of preference: contact modes and held stoppers, shape (63, 2) each."""
-ORDER_WITHOUT_SLIP = np.argsort(
-    [sum({STICK: 0, OFF: 2}.get(int(m), 5) for m in row) for row in MODES], kind="stable"
+PAPER_RULE_ORDER = np.argsort(
+    [sum({CONTACT_STICK: 0, CONTACT_OFF: 2}.get(int(m), 5) for m in row) for row in MODE_TABLE],
+    kind="stable",
 )
 """Order of the combinations by the paper's rule: sliding comes last."""
-AT_ONCE = 8
+N_CONCURRENT_COMBINATIONS = 8
 """Number of combinations that XLA solves together, chosen because most events allow no more.
 Machine code solves them one after the other."""
-ANY_MODE = (1 << 4) - 1
+ALL_MODES_MASK = (1 << 4) - 1
 """Set of all modes, one bit per mode."""
 
-Rows = tuple[Any, Any]
+RowSet = tuple[Any, Any]
 """A set of rows of the table: the bits of two words."""
 
 
-class _Order(NamedTuple):
+class _TableOrder(NamedTuple):
     """The table in one order, as sets of rows with a property in common."""
 
-    contact: list[list[Rows]]  # by slot and mode
-    held: list[Rows]  # by slot
+    contact: list[list[RowSet]]  # by slot and mode
+    held: list[RowSet]  # by slot
 
     @classmethod
-    def of(cls, rows: np.ndarray) -> "_Order":
+    def from_rows(cls, rows: np.ndarray) -> "_TableOrder":
         """Return the table with its rows in this order."""
 
-        def packed(flags: np.ndarray) -> Rows:
+        def pack_bits(flags: np.ndarray) -> RowSet:
             words = np.packbits(np.append(flags, False), bitorder="little").view("<i4")
             return words[0], words[1]
 
-        modes, held = MODES[rows].T, HELD[rows].T
-        contact = [[packed(own == mode) for mode in range(4)] for own in modes]
-        return cls(contact, [packed(own) for own in held])
+        modes, held = MODE_TABLE[rows].T, HELD_TABLE[rows].T
+        contact = [[pack_bits(slot_column == mode) for mode in range(4)] for slot_column in modes]
+        return cls(contact, [pack_bits(slot_column) for slot_column in held])
 
 
-_ORDERS = _Order.of(ORDER_WITHOUT_SLIP), _Order.of(np.arange(len(MODES)))
+_TABLE_ORDERS = (
+    _TableOrder.from_rows(PAPER_RULE_ORDER),
+    _TableOrder.from_rows(np.arange(len(MODE_TABLE))),
+)
 
 
-def _order(by_paper: Array) -> _Order:
+def _select_order(uses_paper_rule: Array) -> _TableOrder:
     """Return the paper's order or the usual one, per batch element."""
-    return jax.tree.map(lambda yes, no: jnp.where(by_paper, yes, no), *_ORDERS)
+    return jax.tree.map(
+        lambda paper_words, limit_words: jnp.where(uses_paper_rule, paper_words, limit_words),
+        *_TABLE_ORDERS,
+    )
 
 
-class Allowed(NamedTuple):
+class AllowedModes(NamedTuple):
     """Allowed combinations, and conditions that need no test. Sets of modes are bits."""
 
     contact: Int[Array, "2 ..."]  # modes of each slot's foot
-    held: Bool[Array, "2 ..."]  # the stopper may hold; it may always be open
-    stays: Bool[Array, "2 ..."]  # the foot keeps its mode whatever the force
-    known_contact: Int[Array, "2 ..."]  # modes that need no test
-    known_open: Bool[Array, "2 ..."]  # an open stopper needs no test: the leg is away from it
+    may_hold: Bool[Array, "2 ..."]  # the stopper may hold; it may always be open
+    keeps_mode: Bool[Array, "2 ..."]  # the foot keeps its mode whatever the force
+    untested_modes: Int[Array, "2 ..."]  # modes that need no test
+    untested_open: Bool[Array, "2 ..."]  # an open stopper needs no test: the leg is away from it
 
-    def rows(self, order: _Order) -> Rows:
+    def allowed_rows(self, order: _TableOrder) -> RowSet:
         """Return the allowed rows of the table."""
 
-        def word(w: int) -> Array:
-            left = jnp.full_like(self.contact[0], -1, jnp.int32)
+        def select_word(word_index: int) -> Array:
+            remaining = jnp.full_like(self.contact[0], -1, jnp.int32)
             for i in range(2):
-                by_mode = enumerate(order.contact[i])
-                mine = [jnp.where(has(self.contact[i], m), rows[w], 0) for m, rows in by_mode]
-                may_hold = jnp.where(self.held[i], -1, ~order.held[i][w])
-                left = left & (mine[0] | mine[1] | mine[2] | mine[3]) & may_hold
-            return left
+                rows_by_mode = enumerate(order.contact[i])
+                mode_rows = [
+                    jnp.where(contains_mode(self.contact[i], mode), rows[word_index], 0)
+                    for mode, rows in rows_by_mode
+                ]
+                held_rows = jnp.where(self.may_hold[i], -1, ~order.held[i][word_index])
+                remaining = (
+                    remaining
+                    & (mode_rows[0] | mode_rows[1] | mode_rows[2] | mode_rows[3])
+                    & held_rows
+                )
+            return remaining
 
-        return word(0), word(1)
+        return select_word(0), select_word(1)
 
 
-def has(modes: Array, mode: Array | int) -> Bool[Array, "..."]:
+def contains_mode(modes: Array, mode: Array | int) -> Bool[Array, "..."]:
     """Return whether the set contains the mode."""
     return ((modes >> mode) & 1) > 0
 
 
-class Chosen(NamedTuple):
+class ChosenCombination(NamedTuple):
     """The chosen combination."""
 
     contact: Int[Array, "2 ..."]
     held: Bool[Array, "2 ..."]
-    wrong: Elementwise  # worst sign violation, see `SignTolerances`; 0 if admissible
-    solutions: Int[Array, "..."]  # admissible ones; at least 1 if the violation is small
+    violation: Elementwise  # worst sign violation, see `SignTolerances`; 0 if admissible
+    n_solutions: Int[Array, "..."]  # admissible ones; at least 1 if the violation is small
 
 
-class Negligible(NamedTuple):
+class SignTolerances(NamedTuple):
     """Units in which sign violations are measured where rounding decides."""
 
     force: Elementwise  # N, or N s in an impact
     motion: Elementwise  # m/s^2, or m/s
 
 
-ACCEPTED = 1e3
+MAX_VIOLATION = 1e3
 """Largest accepted violation, in units of `SignTolerances`, if no combination has all signs
 correct."""
 
 
-class _Looked(NamedTuple):
+class _EnumerationState(NamedTuple):
     """State of the enumeration of the table."""
 
-    left: Rows  # allowed rows not yet examined
-    best: Rows  # first admissible row, else the least violating one
-    wrong: Elementwise
-    solutions: Int[Array, "..."]
+    remaining: RowSet  # allowed rows not yet examined
+    best_row: RowSet  # first admissible row, else the least violating one
+    violation: Elementwise
+    n_solutions: Int[Array, "..."]
 
 
-def _wrong(
+def _violation(
     s: Symbols,
-    hub: Hub,
-    free: Free,
-    friction: Roughness,
-    allowed: Allowed,
-    small: Negligible,
+    inertia: ContactInverseInertia,
+    free: FreeMotion,
+    friction: Friction,
+    allowed: AllowedModes,
+    tolerances: SignTolerances,
     contact: Array,
-    on: Array,
+    held: Array,
 ) -> Array:
     """Return the largest sign violation of a combination, in units of the tolerances."""
-    infinite = each(lambda value: ~jnp.isfinite(value), friction)
-    limit = each(lambda value: value == jnp.inf, friction)
-    rough = rough_of(friction)
-    found = answer(s, hub, free, contact, on, friction)
-    worst, along_slope = jnp.zeros_like(found.hub[0]), []
+    is_infinite = map_friction(lambda value: ~jnp.isfinite(value), friction)
+    is_limit = map_friction(lambda value: value == jnp.inf, friction)
+    coefficient = finite_friction(friction)
+    solution = solve_combination(s, inertia, free, contact, held, friction)
+    max_violation, holds_along_slope = jnp.zeros_like(solution.hub[0]), []
     for i in range(2):
         mode = contact[i]
-        along_slope.append(on[i] & (mode != OFF) & ((mode == STICK) | _at(i, limit)))
-        unless = lambda known, value: jnp.where(known, 0.0, value)
-        known = has(allowed.known_contact[i], mode)
-        t, n, x, z = (v[i] for v in (found.tangential, found.normal, found.foot_x, found.foot_z))
-        pulls, outside = -n / small.force, unless(_at(i, infinite), jnp.abs(t) - _at(i, rough) * n)
-        rests = unless(known, jnp.maximum(pulls, outside / small.force))
-        against = jnp.where(mode == SLIP_DOWN, -x, x) / small.motion
-        along = jnp.where(mode == SLIP_DOWN, t, -t) / small.force
-        slides = jnp.maximum(jnp.where(_at(i, limit), along, pulls), unless(known, against))
-        loaded = jnp.where(mode == STICK, rests, slides)
-        foot = jnp.where(mode == OFF, unless(known, -z / small.motion), loaded)
-        opens = unless(allowed.known_open[i], found.length[i] / small.motion)
-        stopper = jnp.where(on[i], -found.stopper[i] / small.force, opens)
-        worst = jnp.maximum(worst, jnp.maximum(unless(allowed.stays[i], foot), stopper))
-        worst = jnp.where(jnp.isfinite(n) & jnp.isfinite(t), worst, jnp.inf)
+        holds_along_slope.append(
+            held[i]
+            & (mode != CONTACT_OFF)
+            & ((mode == CONTACT_STICK) | _friction_of_slot(i, is_limit))
+        )
+        zero_if = lambda is_untested, value: jnp.where(is_untested, 0.0, value)
+        is_untested = contains_mode(allowed.untested_modes[i], mode)
+        t, n, x, z = (
+            pair[i]
+            for pair in (solution.tangential, solution.normal, solution.foot_x, solution.foot_z)
+        )
+        pull_violation, cone_violation = (
+            -n / tolerances.force,
+            zero_if(
+                _friction_of_slot(i, is_infinite),
+                jnp.abs(t) - _friction_of_slot(i, coefficient) * n,
+            ),
+        )
+        stick_violation = zero_if(
+            is_untested, jnp.maximum(pull_violation, cone_violation / tolerances.force)
+        )
+        slip_violation = jnp.where(mode == CONTACT_SLIP_DOWN, -x, x) / tolerances.motion
+        friction_violation = jnp.where(mode == CONTACT_SLIP_DOWN, t, -t) / tolerances.force
+        slide_violation = jnp.maximum(
+            jnp.where(_friction_of_slot(i, is_limit), friction_violation, pull_violation),
+            zero_if(is_untested, slip_violation),
+        )
+        loaded_violation = jnp.where(mode == CONTACT_STICK, stick_violation, slide_violation)
+        foot_violation = jnp.where(
+            mode == CONTACT_OFF, zero_if(is_untested, -z / tolerances.motion), loaded_violation
+        )
+        open_violation = zero_if(allowed.untested_open[i], solution.length[i] / tolerances.motion)
+        stopper_violation = jnp.where(
+            held[i], -solution.stopper[i] / tolerances.force, open_violation
+        )
+        max_violation = jnp.maximum(
+            max_violation,
+            jnp.maximum(zero_if(allowed.keeps_mode[i], foot_violation), stopper_violation),
+        )
+        max_violation = jnp.where(jnp.isfinite(n) & jnp.isfinite(t), max_violation, jnp.inf)
     # The tangential forces of both feet are not separately determined on a rigid wheel.
-    return jnp.where(along_slope[0] & along_slope[1], jnp.inf, worst)
+    return jnp.where(holds_along_slope[0] & holds_along_slope[1], jnp.inf, max_violation)
 
 
-def _foremost(off_of: Callable[[Rows], Array], rows: list[Rows]) -> tuple[Rows, Array, Array]:
+def _least_violating(
+    violation_of: Callable[[RowSet], Array], rows: list[RowSet]
+) -> tuple[RowSet, Array, Array]:
     """Return the first of the least violating rows, its violation, and the number of admissible
     rows.
 
@@ -388,80 +514,104 @@ def _foremost(off_of: Callable[[Rows], Array], rows: list[Rows]) -> tuple[Rows, 
     code of `violation_of` for each use, eightfold.
     """
     if len(rows) == 1:
-        off = off_of(rows[0])
-        return rows[0], off, off == 0.0
-    first, second = (jnp.stack(words) for words in zip(*rows, strict=True))
-    offs = jax.vmap(off_of)((first, second))
-    places = lax.broadcasted_iota(jnp.int32, offs.shape, 0)
+        violation = violation_of(rows[0])
+        return rows[0], violation, violation == 0.0
+    first_words, second_words = (jnp.stack(words) for words in zip(*rows, strict=True))
+    violations = jax.vmap(violation_of)((first_words, second_words))
+    indices = lax.broadcasted_iota(jnp.int32, violations.shape, 0)
 
-    def better(a: tuple, b: tuple) -> tuple:
-        before = (a[0] < b[0]) | ((a[0] == b[0]) & (a[1] < b[1]))
-        return jnp.where(before, a[0], b[0]), jnp.where(before, a[1], b[1]), a[2] + b[2]
+    def pick_better(a: tuple, b: tuple) -> tuple:
+        a_is_better = (a[0] < b[0]) | ((a[0] == b[0]) & (a[1] < b[1]))
+        return jnp.where(a_is_better, a[0], b[0]), jnp.where(a_is_better, a[1], b[1]), a[2] + b[2]
 
-    none = np.array(np.inf, offs.dtype), np.int32(len(rows)), np.int32(0)
-    told = offs, places, (offs == 0.0).astype(jnp.int32)
-    off, place, right = lax.reduce(told, none, better, (0,))
-    word = lambda words: jnp.sum(jnp.where(place == places, words, 0), axis=0, dtype=jnp.int32)
-    return (word(first), word(second)), off, right
+    initial = np.array(np.inf, violations.dtype), np.int32(len(rows)), np.int32(0)
+    operands = violations, indices, (violations == 0.0).astype(jnp.int32)
+    violation, index, n_admissible = lax.reduce(operands, initial, pick_better, (0,))
+    select_word = lambda words: jnp.sum(
+        jnp.where(index == indices, words, 0), axis=0, dtype=jnp.int32
+    )
+    return (select_word(first_words), select_word(second_words)), violation, n_admissible
 
 
-def choose(
+def choose_combination(
     s: Symbols,
-    hub: Hub,
-    free: Free,
-    allowed: Allowed,
-    friction: Roughness,
-    small: Negligible,
-    counted: bool,
-) -> Chosen:
+    inertia: ContactInverseInertia,
+    free: FreeMotion,
+    allowed: AllowedModes,
+    friction: Friction,
+    tolerances: SignTolerances,
+    counts_all: bool,
+) -> ChosenCombination:
     """Return the first admissible combination of the table; `n_solutions` is 0 if there is none.
 
     With `counts_all` all admissible combinations are counted; otherwise the search ends at the
     first. If there is none, the least violating combination is taken, provided that its violation
     is small: two contacts close by rounding, or open by it.
     """
-    wrong = functools.partial(_wrong, *lax.stop_gradient((s, hub, free, friction)), allowed, small)
-    by_paper = each(lambda value: value == THE_PAPERS, friction)
-    order = _order(by_paper[0] & by_paper[1] if isinstance(by_paper, tuple) else by_paper)
+    violation_of_modes = functools.partial(
+        _violation, *lax.stop_gradient((s, inertia, free, friction)), allowed, tolerances
+    )
+    uses_paper_rule = map_friction(lambda value: value == PAPER_RULE_SENTINEL, friction)
+    order = _select_order(
+        uses_paper_rule[0] & uses_paper_rule[1]
+        if isinstance(uses_paper_rule, tuple)
+        else uses_paper_rule
+    )
 
-    def told(row: Rows) -> tuple[Array, Array]:
-        within = lambda rows: ((row[0] & rows[0]) | (row[1] & rows[1])) != 0
-        modes = [sum(jnp.where(within(own[m]), m, 0) for m in range(1, 4)) for own in order.contact]
-        return jnp.stack(modes).astype(jnp.int32), jnp.stack([within(own) for own in order.held])
+    def decode_row(row: RowSet) -> tuple[Array, Array]:
+        is_member = lambda rows: ((row[0] & rows[0]) | (row[1] & rows[1])) != 0
+        modes = [
+            sum(jnp.where(is_member(slot_rows[mode]), mode, 0) for mode in range(1, 4))
+            for slot_rows in order.contact
+        ]
+        return jnp.stack(modes).astype(jnp.int32), jnp.stack(
+            [is_member(slot_rows) for slot_rows in order.held]
+        )
 
-    def off_of(row: Rows) -> Array:
-        return jnp.where((row[0] | row[1]) != 0, wrong(*told(row)), jnp.inf)
+    def violation_of(row: RowSet) -> Array:
+        return jnp.where((row[0] | row[1]) != 0, violation_of_modes(*decode_row(row)), jnp.inf)
 
-    def goes_on(looked: _Looked) -> Array:
-        return ((looked.left[0] | looked.left[1]) != 0) & (counted | (looked.solutions == 0))
+    def is_unfinished(state: _EnumerationState) -> Array:
+        return ((state.remaining[0] | state.remaining[1]) != 0) & (
+            counts_all | (state.n_solutions == 0)
+        )
 
-    def look(looked: _Looked) -> _Looked:
+    def examine_next(state: _EnumerationState) -> _EnumerationState:
         """Return the state after the next few allowed combinations."""
-        (left, best, least, solutions), rows = looked, []
-        for _ in range(1 if simd.tracing() else AT_ONCE):
-            row = left[0] & -left[0], jnp.where(left[0] == 0, left[1] & -left[1], 0)
-            left = left[0] ^ row[0], left[1] ^ row[1]
+        (remaining, best_row, lowest, n_solutions), rows = state, []
+        for _ in range(1 if simd.targets_machine_code() else N_CONCURRENT_COMBINATIONS):
+            row = (
+                remaining[0] & -remaining[0],
+                jnp.where(remaining[0] == 0, remaining[1] & -remaining[1], 0),
+            )
+            remaining = remaining[0] ^ row[0], remaining[1] ^ row[1]
             rows.append(row)
-        row, off, right = _foremost(off_of, rows)
-        best, least = select(off < least, (row, off), (best, least))
-        solutions = solutions + right
-        return select(goes_on(looked), _Looked(left, best, least, solutions), looked)
+        row, row_violation, n_admissible = _least_violating(violation_of, rows)
+        best_row, lowest = tree_where(
+            row_violation < lowest, (row, row_violation), (best_row, lowest)
+        )
+        n_solutions = n_solutions + n_admissible
+        return tree_where(
+            is_unfinished(state), _EnumerationState(remaining, best_row, lowest, n_solutions), state
+        )
 
-    left = allowed.rows(order)
-    far = jnp.full_like(lax.stop_gradient(free.hub[2]), jnp.inf)
-    begin = _Looked(left, (0 * left[0] + 1, 0 * left[1]), far, 0 * left[0])
-    looked = lax.while_loop(lambda looked: jnp.any(goes_on(looked)), look, begin)
-    solutions = jnp.maximum(looked.solutions, (looked.wrong <= ACCEPTED).astype(jnp.int32))
-    return Chosen(*told(looked.best), looked.wrong, solutions)
+    remaining = allowed.allowed_rows(order)
+    infinite = jnp.full_like(lax.stop_gradient(free.hub[2]), jnp.inf)
+    initial = _EnumerationState(
+        remaining, (0 * remaining[0] + 1, 0 * remaining[1]), infinite, 0 * remaining[0]
+    )
+    state = lax.while_loop(lambda state: jnp.any(is_unfinished(state)), examine_next, initial)
+    solutions = jnp.maximum(state.n_solutions, (state.violation <= MAX_VIOLATION).astype(jnp.int32))
+    return ChosenCombination(*decode_row(state.best_row), state.violation, solutions)
 
 
-def leaves(
+def is_release_consistent(
     s: Symbols,
-    hub: Hub,
-    free: Free,
-    stance: tuple[Array, Array],
-    friction: Roughness,
-    second: Bool[Array, "..."],
+    inertia: ContactInverseInertia,
+    free: FreeMotion,
+    slot_state: tuple[Array, Array],
+    friction: Friction,
+    is_second: Bool[Array, "..."],
     direction: Int[Array, "..."],
 ) -> Bool[Array, "..."]:
     """Return whether a slot's foot, just released by its mode, would move in the direction of
@@ -473,24 +623,35 @@ def leaves(
     The margin of the mode must grow with the acceleration in that direction. If it shrinks, the
     following mode would end before it begins, and the forces jump instead (Painlevé).
     """
-    contact, held = stance
-    here = jnp.stack([~second, second]).astype(hub.sin[0].dtype)
-    sin, cos = (here[0] * pair[0] + here[1] * pair[1] for pair in (hub.sin, hub.cos))
-    off = direction == 0
-    e, u = jnp.where(off, -sin, direction * cos), jnp.where(off, cos, direction * sin)
-    shift = lambda pair, by: (pair[0] - by * here[0], pair[1] - by * here[1])
-    asked = free._replace(e=shift(free.e, e), u=shift(free.u, u))
-    mine = jnp.where(second, friction[1], friction[0]) if isinstance(friction, tuple) else friction
-    rough = rough_of(mine)
-    limit, mode = mine == jnp.inf, jnp.where(second, contact[1], contact[0])
-    down = mode == SLIP_DOWN
-    slides = down | (mode == SLIP_UP)
+    contact, held = slot_state
+    slot_weights = jnp.stack([~is_second, is_second]).astype(inertia.sin[0].dtype)
+    sin, cos = (
+        slot_weights[0] * pair[0] + slot_weights[1] * pair[1] for pair in (inertia.sin, inertia.cos)
+    )
+    is_liftoff = direction == 0
+    e, u = jnp.where(is_liftoff, -sin, direction * cos), jnp.where(is_liftoff, cos, direction * sin)
+    shift_pair = lambda pair, delta: (
+        pair[0] - delta * slot_weights[0],
+        pair[1] - delta * slot_weights[1],
+    )
+    displaced = free._replace(foot_e=shift_pair(free.foot_e, e), foot_u=shift_pair(free.foot_u, u))
+    slot_friction = (
+        jnp.where(is_second, friction[1], friction[0]) if isinstance(friction, tuple) else friction
+    )
+    coefficient = finite_friction(slot_friction)
+    is_limit, mode = slot_friction == jnp.inf, jnp.where(is_second, contact[1], contact[0])
+    slides_down = mode == CONTACT_SLIP_DOWN
+    is_sliding = slides_down | (mode == CONTACT_SLIP_UP)
 
-    def margin(given: Free) -> Array:
-        found = answer(s, hub, given, contact, held, friction)
-        normal = jnp.where(second, found.normal[1], found.normal[0])
-        tangential = jnp.where(second, found.tangential[1], found.tangential[0])
-        pressed = jnp.where(limit & slides, jnp.where(down, -tangential, tangential), normal)
-        return jnp.where(off | limit, pressed, rough * normal + direction * tangential)
+    def mode_margin(free_motion: FreeMotion) -> Array:
+        solution = solve_combination(s, inertia, free_motion, contact, held, friction)
+        normal = jnp.where(is_second, solution.normal[1], solution.normal[0])
+        tangential = jnp.where(is_second, solution.tangential[1], solution.tangential[0])
+        pressure = jnp.where(
+            is_limit & is_sliding, jnp.where(slides_down, -tangential, tangential), normal
+        )
+        return jnp.where(
+            is_liftoff | is_limit, pressure, coefficient * normal + direction * tangential
+        )
 
-    return margin(asked) > margin(free)
+    return mode_margin(displaced) > mode_margin(free)

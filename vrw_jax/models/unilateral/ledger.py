@@ -12,61 +12,74 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from vrw_jax.models.base import AbstractGroundStep
-from vrw_jax.models.unilateral.contacts import OFF, THE_PAPERS, Roughness
-from vrw_jax.models.unilateral.events import Change, Event, Law, event_of, resolve, settled
-from vrw_jax.models.unilateral.mechanics import WheelMotion, place_of_landing
-from vrw_jax.models.unilateral.motion import Guards, Stance, Tally
-from vrw_jax.models.unilateral.section import FullState, closed
-from vrw_jax.numerics import Elementwise, Options, select
-from vrw_jax.results import STOPPERS
+from vrw_jax.models.base import AbstractContactStep
+from vrw_jax.models.unilateral.contacts import CONTACT_OFF, PAPER_RULE_SENTINEL, Friction
+from vrw_jax.models.unilateral.events import (
+    ContactLaw,
+    Event,
+    EventResult,
+    classify_event,
+    project_motion,
+    resolve_event,
+)
+from vrw_jax.models.unilateral.mechanics import WheelMotion, landing_position
+from vrw_jax.models.unilateral.motion import Accumulators, ContactState, GuardLayout
+from vrw_jax.models.unilateral.section import FullState, pack_section_state
+from vrw_jax.numerics import Elementwise, StepOptions, tree_where
+from vrw_jax.results import STOPPER_MARGIN_MEASURES
 from vrw_jax.wheel import Outcome, Symbols
 
-SHARE, SEEN = 1e-2, 4e2
+DIP_DEPTH_PER_ATOL, MIN_DIP_EPS = 1e-2, 4e2
 """Smallest depth of a followed dip: the first as a fraction of the tolerance, the second in
 rounding units of a leg's length, 1e-13 m in float64."""
-PATIENCE = 100
+REST_SPEED_RAMP_START = 100
 """Number of events of a step after which each further event raises the rest speed by its initial
 value; a quarter of the allowed events if that is more. Walks make 4 to 60 events, and chains of
 ever smaller dips make hundreds, which this ends where a tolerance would continue them. Of 400
 events, the last dip is as large as a tolerance of 1e-6 leaves from the first."""
 
 
-def least_dip(L0: Elementwise, options: Options) -> Array:
+def min_dip_depth(L0: Elementwise, options: StepOptions) -> Array:
     """Return the smallest depth of a dip that a step follows, m."""
-    return jnp.maximum(SHARE * options.atol, SEEN * jnp.finfo(L0.dtype).eps * L0)
+    return jnp.maximum(
+        DIP_DEPTH_PER_ATOL * options.atol, MIN_DIP_EPS * jnp.finfo(L0.dtype).eps * L0
+    )
 
 
-def as_ruled(friction: Elementwise, by_paper: bool) -> Elementwise:
+def apply_friction_rule(friction: Elementwise, uses_paper_rule: bool) -> Elementwise:
     """Return friction with `PAPER_RULE_SENTINEL` in place of infinity under the paper's rule."""
-    return jnp.where(friction == jnp.inf, THE_PAPERS, friction) if by_paper else friction
+    return (
+        jnp.where(friction == jnp.inf, PAPER_RULE_SENTINEL, friction)
+        if uses_paper_rule
+        else friction
+    )
 
 
-def law_of(
+def make_contact_law(
     s: Symbols,
-    friction: Roughness,
-    options: Options,
-    one_sided: bool,
-    counted: bool,
+    friction: Friction,
+    options: StepOptions,
+    is_one_sided: bool,
+    counts_solutions: bool,
     restitution: Elementwise | None = None,
     tilt: Elementwise | None = None,
-) -> Law:
+) -> ContactLaw:
     """Return the contact law of a walk; the rest speed is that of the smallest dip under
     gravity.
     """
-    rest = jnp.sqrt(2.0 * s.g * least_dip(s.L0, options))
-    return Law(s, friction, one_sided, counted, rest, restitution, tilt)
+    rest_speed = jnp.sqrt(2.0 * s.g * min_dip_depth(s.L0, options))
+    return ContactLaw(s, friction, is_one_sided, counts_solutions, rest_speed, restitution, tilt)
 
 
-def past(
-    law: Law,
-    place: Guards,
+def process_event(
+    law: ContactLaw,
+    layout: GuardLayout,
     motion: WheelMotion,
-    stance: Stance,
+    contact_state: ContactState,
     guard: Int[Array, "..."],
-    events: Int[Array, "..."],
+    n_events: Int[Array, "..."],
     max_events: int,
-) -> tuple[Change, Event, Int[Array, "..."]]:
+) -> tuple[EventResult, Event, Int[Array, "..."]]:
     """Return the result of a guard's event, the event, and STEPPED if it was resolved.
 
     - `n_events`: number of earlier events in this step, of at most `max_events`.
@@ -75,14 +88,17 @@ def past(
     A foot that lifts off rises like the third power of time, from the slope and from rest; without
     the projection it would land again at once.
     """
-    patience = max(PATIENCE, max_events // 4)
-    law = law._replace(rest=law.rest * (1 + jnp.maximum(events - patience, 0)))
-    motion, event = settled(law.s, motion, stance.contact, stance.locked), event_of(place, guard)
-    change = resolve(law, motion, stance, event)
-    outcome = jnp.where(change.solutions > 0, Outcome.STEPPED, Outcome.NO_ADMISSIBLE_CONTACT)
-    outcome = jnp.where(change.paradox, Outcome.FRICTION_PARADOX, outcome)
-    outcome = jnp.where(change.third_foot, Outcome.THREE_FEET_LOADED, outcome)
-    return change, event, outcome.astype(jnp.int32)
+    ramp_start = max(REST_SPEED_RAMP_START, max_events // 4)
+    law = law._replace(rest_speed=law.rest_speed * (1 + jnp.maximum(n_events - ramp_start, 0)))
+    motion, event = (
+        project_motion(law.s, motion, contact_state.contact, contact_state.locked),
+        classify_event(layout, guard),
+    )
+    result = resolve_event(law, motion, contact_state, event)
+    outcome = jnp.where(result.n_solutions > 0, Outcome.STEPPED, Outcome.NO_ADMISSIBLE_CONTACT)
+    outcome = jnp.where(result.is_paradox, Outcome.PAINLEVE_PARADOX, outcome)
+    outcome = jnp.where(result.has_third_foot, Outcome.THREE_FEET_LOADED, outcome)
+    return result, event, outcome.astype(jnp.int32)
 
 
 class UnilateralMargins(eqx.Module):
@@ -95,50 +111,57 @@ class UnilateralMargins(eqx.Module):
     stopper_impulse: Elementwise  # minimum over locked legs in the air, N s
 
 
-class Ledger(NamedTuple):
+class StepCounters(NamedTuple):
     """Counters and durations of a step."""
 
-    events: Int[Array, "..."]  # contacts and stoppers that changed
+    n_events: Int[Array, "..."]  # contacts and stoppers that changed
     durations: Float[Array, "3 ..."]  # with two loaded feet, one, none, s
-    tried: Int[Array, "..."]  # attempted
+    n_solver_steps: Int[Array, "..."]  # attempted
 
 
-def blank(like: Array) -> Ledger:
+def init_counters(reference: Array) -> StepCounters:
     """Return the counters at the start of a step, for wheels of the shape and dtype of the
     argument.
     """
-    none = jnp.zeros(like.shape, jnp.int32)
-    return Ledger(none, jnp.zeros((3, *like.shape), like.dtype), none)
+    zero_count = jnp.zeros(reference.shape, jnp.int32)
+    return StepCounters(zero_count, jnp.zeros((3, *reference.shape), reference.dtype), zero_count)
 
 
-def passed(ledger: Ledger, stance: Stance, duration: Elementwise, tried: Array) -> Ledger:
+def add_interval(
+    counters: StepCounters,
+    contact_state: ContactState,
+    duration: Elementwise,
+    n_solver_steps: Array,
+) -> StepCounters:
     """Return the counters after one more interval in this contact state."""
-    loaded = jnp.sum(stance.contact != OFF, axis=0)
-    share = jnp.stack([loaded == feet for feet in (2, 1, 0)])
-    durations = ledger.durations + jnp.where(share, duration, 0.0)
-    return ledger._replace(durations=durations, tried=ledger.tried + tried)
+    n_loaded = jnp.sum(contact_state.contact != CONTACT_OFF, axis=0)
+    has_n_feet = jnp.stack([n_loaded == n_feet for n_feet in (2, 1, 0)])
+    durations = counters.durations + jnp.where(has_n_feet, duration, 0.0)
+    return counters._replace(
+        durations=durations, n_solver_steps=counters.n_solver_steps + n_solver_steps
+    )
 
 
-def outcome_at(
-    ledger: Ledger,
-    place: Guards,
-    at_event: Array,
+def interval_outcome(
+    counters: StepCounters,
+    layout: GuardLayout,
+    is_at_event: Array,
     guard: Array,
-    landed: Array,
-    lost: Array,
+    has_landed: Array,
+    failure: Array,
     max_events: int,
 ) -> Int[Array, "..."]:
     """Return STEPPED if the walk continues from the guard or the foremost foot `has_landed`.
 
     If the interval ended at no event, the result is `failure`.
     """
-    code = jnp.where(ledger.events >= max_events, Outcome.TOO_MANY_EVENTS, Outcome.STEPPED)
-    code = jnp.where(guard == place.rate, Outcome.FELL_BACK, code)
-    code = jnp.where(guard == place.length, Outcome.COLLAPSED, code)
-    return jnp.where(at_event, jnp.where(landed, Outcome.STEPPED, code), lost)
+    code = jnp.where(counters.n_events >= max_events, Outcome.TOO_MANY_EVENTS, Outcome.STEPPED)
+    code = jnp.where(guard == layout.rolling_rate, Outcome.FELL_BACK, code)
+    code = jnp.where(guard == layout.collapse, Outcome.COLLAPSED, code)
+    return jnp.where(is_at_event, jnp.where(has_landed, Outcome.STEPPED, code), failure)
 
 
-class Details(NamedTuple):
+class StepDetails(NamedTuple):
     """Further results of a step, named as in `UnilateralStep`."""
 
     post_impact: Float[Array, "2 ..."]
@@ -146,72 +169,80 @@ class Details(NamedTuple):
     landing_normal: Float[Array, "2 ..."]
     landing_tangential: Float[Array, "2 ..."]
     energy_impacts: Elementwise
-    monitors: UnilateralMargins
+    margins: UnilateralMargins
     impacts: Int[Array, "..."]
     fewest_solutions: Int[Array, "..."]
     most_solutions: Int[Array, "..."]
 
 
-def no_details(dtype: jnp.dtype) -> Details:
+def init_details(dtype: jnp.dtype) -> StepDetails:
     """Return the details of one wheel at the start of a step."""
-    zero, none = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
-    two = jnp.zeros((2,), dtype)
-    return Details(
-        post_impact=two,
+    zero, zero_count = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
+    pair = jnp.zeros((2,), dtype)
+    return StepDetails(
+        post_impact=pair,
         mode_durations=jnp.zeros((4, 4), dtype),
-        landing_normal=two,
-        landing_tangential=two,
+        landing_normal=pair,
+        landing_tangential=pair,
         energy_impacts=zero,
-        monitors=UnilateralMargins(zero + jnp.inf, zero + jnp.inf),
-        impacts=none,
-        fewest_solutions=none + jnp.iinfo(jnp.int32).max,
-        most_solutions=none,
+        margins=UnilateralMargins(zero + jnp.inf, zero + jnp.inf),
+        impacts=zero_count,
+        fewest_solutions=zero_count + jnp.iinfo(jnp.int32).max,
+        most_solutions=zero_count,
     )
 
 
-def event_noted(details: Details, first: Array, change: Change, event: Event) -> Details:
+def record_event(
+    details: StepDetails, is_first: Array, result: EventResult, event: Event
+) -> StepDetails:
     """Return the details after one more event.
 
     - `is_first`: whether the event is the first of the step.
     """
     opening = (
-        jnp.stack([change.motion.theta, change.motion.dtheta]),
-        jnp.stack(change.normal_impulse),
-        jnp.stack(change.tangential_impulse),
+        jnp.stack([result.motion.theta, result.motion.dtheta]),
+        jnp.stack(result.normal_impulse),
+        jnp.stack(result.tangential_impulse),
     )
-    known = details.post_impact, details.landing_normal, details.landing_tangential
-    post_impact, normal, tangential = select(first, opening, known)
-    impulse = jnp.minimum(details.monitors.stopper_impulse, change.stopper_impulse)
+    previous = details.post_impact, details.landing_normal, details.landing_tangential
+    post_impact, normal, tangential = tree_where(is_first, opening, previous)
+    impulse = jnp.minimum(details.margins.stopper_impulse, result.stopper_impulse)
     return details._replace(
         post_impact=post_impact,
         landing_normal=normal,
         landing_tangential=tangential,
-        energy_impacts=details.energy_impacts + change.energy_lost,
-        monitors=UnilateralMargins(details.monitors.stopper_force, impulse),
-        impacts=details.impacts + event.impact,
-        fewest_solutions=jnp.minimum(details.fewest_solutions, change.solutions),
-        most_solutions=jnp.maximum(details.most_solutions, change.most_solutions),
+        energy_impacts=details.energy_impacts + result.energy_lost,
+        margins=UnilateralMargins(details.margins.stopper_force, impulse),
+        impacts=details.impacts + event.is_impact,
+        fewest_solutions=jnp.minimum(details.fewest_solutions, result.n_solutions),
+        most_solutions=jnp.maximum(details.most_solutions, result.most_solutions),
     )
 
 
-def stretch_noted(
-    details: Details, contact: Int[Array, "2 ..."], duration: Elementwise, force: Elementwise
-) -> Details:
+def record_interval(
+    details: StepDetails,
+    contact: Int[Array, "2 ..."],
+    duration: Elementwise,
+    stopper_force: Elementwise,
+) -> StepDetails:
     """Return the details after one more interval.
 
     They gain the durations of the slots' modes, and the minimum stopper force of legs in the air at
     the ends of the interval.
     """
-    places = np.arange(4).reshape(-1, *(1,) * jnp.ndim(force))
-    first, second = ((places == contact[i]).astype(jnp.result_type(force)) for i in range(2))
-    force = jnp.minimum(details.monitors.stopper_force, force)
+    modes = np.arange(4).reshape(-1, *(1,) * jnp.ndim(stopper_force))
+    first_mode, second_mode = (
+        (modes == contact[i]).astype(jnp.result_type(stopper_force)) for i in range(2)
+    )
+    stopper_force = jnp.minimum(details.margins.stopper_force, stopper_force)
     return details._replace(
-        mode_durations=details.mode_durations + first[:, None] * second[None, :] * duration,
-        monitors=UnilateralMargins(force, details.monitors.stopper_impulse),
+        mode_durations=details.mode_durations
+        + first_mode[:, None] * second_mode[None, :] * duration,
+        margins=UnilateralMargins(stopper_force, details.margins.stopper_impulse),
     )
 
 
-class UnilateralStep(AbstractGroundStep):
+class UnilateralStep(AbstractContactStep):
     """One step, from the landing of the foremost foot to the next. Batched under vmap.
 
     Fields of a step whose outcome is not STEPPED are finite and describe the partial motion; its
@@ -255,7 +286,7 @@ class UnilateralStep(AbstractGroundStep):
     energy_damping: Elementwise
     energy_friction: Elementwise
     slip: Elementwise
-    monitors: UnilateralMargins
+    margins: UnilateralMargins
     events: Int[Array, "..."]
     impacts: Int[Array, "..."]
     fewest_solutions: Int[Array, "..."]
@@ -264,47 +295,50 @@ class UnilateralStep(AbstractGroundStep):
     solver_steps: Int[Array, "..."]
     engine: str = eqx.field(static=True, default="")
 
-    def own_measures(self) -> dict[str, Array]:
-        return AbstractGroundStep.own_measures(self) | {
-            name: getattr(self.monitors, name) for name in STOPPERS
+    def model_measures(self) -> dict[str, Array]:
+        return AbstractContactStep.model_measures(self) | {
+            name: getattr(self.margins, name) for name in STOPPER_MARGIN_MEASURES
         }
 
 
-def section_reached(
-    motion: WheelMotion, stance: Stance, outcome: Array, tilt: Elementwise | None = None
+def final_section_state(
+    motion: WheelMotion,
+    contact_state: ContactState,
+    outcome: Array,
+    tilt: Elementwise | None = None,
 ) -> FullState:
     """Return the section state at the end of a step; zeros if it failed."""
-    x = closed(motion, stance, tilt)
+    x = pack_section_state(motion, contact_state, tilt)
     return jnp.where(outcome == Outcome.STEPPED, x, jnp.zeros_like(x))
 
 
-def step_told(
+def make_unilateral_step(
     motion: WheelMotion,
-    stance: Stance,
-    tally: Tally,
-    ledger: Ledger,
-    details: Details,
+    contact_state: ContactState,
+    accumulators: Accumulators,
+    counters: StepCounters,
+    details: StepDetails,
     outcome: Array,
     engine: str,
     tilt: Elementwise | None = None,
 ) -> UnilateralStep:
     """Return the step of this final state and these records."""
-    landing = place_of_landing(motion.L.shape[0], motion)
+    landing = landing_position(motion.L.shape[0], motion)
     finite = lambda value: jnp.where(jnp.isfinite(value), value, 0.0)
     details = details._replace(
-        monitors=jax.tree.map(finite, details.monitors),
-        fewest_solutions=jnp.where(ledger.events > 0, details.fewest_solutions, 0),
+        margins=jax.tree.map(finite, details.margins),
+        fewest_solutions=jnp.where(counters.n_events > 0, details.fewest_solutions, 0),
     )
     return UnilateralStep(
-        section_state=section_reached(motion, stance, outcome, tilt),
-        durations=ledger.durations,
+        section_state=final_section_state(motion, contact_state, outcome, tilt),
+        durations=counters.durations,
         step_length=jnp.where(outcome == Outcome.STEPPED, landing, 0.0),
-        energy_damping=tally.damping,
-        energy_friction=tally.friction,
-        slip=tally.slip,
-        events=ledger.events,
+        energy_damping=accumulators.damping,
+        energy_friction=accumulators.friction,
+        slip=accumulators.slip,
+        events=counters.n_events,
         outcome=outcome,
-        solver_steps=ledger.tried,
+        solver_steps=counters.n_solver_steps,
         engine=engine,
         **details._asdict(),
     )

@@ -14,446 +14,565 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from vrw_jax.models.unilateral.mechanics import WheelMotion, directions, kept, one_of
+from vrw_jax.models.unilateral.mechanics import (
+    WheelMotion,
+    leg_directions,
+    opaque_one,
+    prevent_fusion,
+)
 from vrw_jax.models.unilateral.motion import (
-    Felt,
-    Flow,
-    Stance,
-    felt,
-    forces,
-    guard_sizes,
-    stance_guards,
-    tally_rates,
+    ContactQuantities,
+    ContactState,
+    ModeDynamics,
+    accumulator_rates,
+    compute_forces,
+    contact_quantities,
+    evaluate_guards,
+    guard_scales,
 )
 from vrw_jax.numerics import (
-    ROUNDING,
-    Options,
-    Tableau,
-    below,
-    change_of_length,
-    parabola,
-    select,
+    GUARD_ROUNDOFF_EPS,
+    ButcherTableau,
+    StepOptions,
+    find_dip,
+    fit_guard_parabola,
+    step_size_factor,
+    tree_where,
 )
 from vrw_jax.wheel import Outcome
 
-N_FELT = 9
+N_CONTACT_ROWS = 9
 """Number of rows after the accelerations that hold the contact quantities of the guards. They are
 followed by those of legs in the air, if stoppers are one-sided, and by `N_ACCUMULATOR_ROWS` rows
 if these are requested."""
-N_TALLIED = 3
+N_ACCUMULATOR_ROWS = 3
 """Number of accumulated rows: energy lost in dampers and by sliding, slip."""
-MARCHING, EVENT = -1, -2
+STATUS_RUNNING, STATUS_EVENT = -1, -2
 """Status codes of a lane that is integrating or at an event; every other status is its
 `Outcome`."""
-BURST = 8
+MAX_WAIT_TRIES = 8
 """Number of solver-step attempts after which a lane at an event ends the loop for all lanes."""
-SINGULAR = 1e-8, 1e2
+PAINLEVE_TOLERANCES = 1e-8, 1e2
 """Absolute tolerance, and factor of the relative tolerance, below which the determinant counts as
 zero at Painlevé's singularity. Forces there are a ratio of two vanishing numbers, resolved
 neither by rounding nor by integration. Chosen because with 18 tolerances one singularity was
 missed."""
-PARABOLAS = 3
+MAX_PARABOLA_ITERATIONS = 3
 """Number of event iterations by parabolas; the later ones use secants, which converge better in
 stiff dips."""
-PATIENT = 15
+OWN_GUARD_AFTER_ITERATIONS = 15
 """Number of event iterations after which a guard that starts at its own event may be the event
 found."""
-STILL = 1e-3
+MAX_ROUNDOFF_FALL_SECONDS = 1e-3
 """Time (s) within which a guard must fall by its own rounding to count as falling."""
-CLOSE = 30.0
+EVENT_TIME_TOLERANCE_FACTOR = 30.0
 """Largest last correction to the time of an event, in tolerances of the step. Chosen because the
 proposal is a parabola's, whose own error is about a hundredth of the correction."""
 
 
-class Place(NamedTuple):
+class IntervalPoint(NamedTuple):
     """Coordinates (hub x, z, theta, lengths), their rates, and the rows of the dynamics at a
     point.
     """
 
     q: Array  # (3 + n, lanes)
     v: Array
-    slope: Array  # accelerations, then contact rows: (3 + n + N_CONTACT_ROWS [+ n], lanes)
+    dynamics_rows: Array  # accelerations, then contact rows: (3 + n + N_CONTACT_ROWS [+ n], lanes)
 
 
-class Search(NamedTuple):
+class EventBracket(NamedTuple):
     """Bracket of the earliest event inside a step."""
 
-    on: Array
-    crossing: Array  # (guards, lanes)
+    is_active: Array
+    is_crossing: Array  # (guards, lanes)
     low: Array  # bracket of the event, s from the start of the step
     high: Array
-    accuracy: Array  # s
-    tries: Array
-    last: Array  # previously attempted step, s
-    values: Array  # guards at its end, (guards, lanes)
+    time_tolerance: Array  # s
+    n_iterations: Array
+    previous_h: Array  # previously attempted step, s
+    guard_values: Array  # guards at its end, (guards, lanes)
 
 
-class March(NamedTuple):
+class IntervalState(NamedTuple):
     """State of all lanes between two of their events."""
 
-    here: Place
-    stance: Stance
-    values: Array  # guards at the point, (guards, lanes)
-    offset: Array  # value at the own event of a guard that starts there, minus rounding
-    told: Array | None  # integrals since the last event, (N_ACCUMULATOR_ROWS, lanes)
+    point: IntervalPoint
+    contact_state: ContactState
+    guard_values: Array  # guards at the point, (guards, lanes)
+    guard_offset: Array  # value at the own event of a guard that starts there, minus rounding
+    accumulated: Array | None  # integrals since the last event, (N_ACCUMULATOR_ROWS, lanes)
     h: Array  # of the next attempt, s
     time: Array  # since the last event, s
-    search: Search
-    verdict: Array  # MARCHING, EVENT or an Outcome
+    search: EventBracket
+    status: Array  # MARCHING, EVENT or an Outcome
     guard: Array  # that has triggered
-    tried: Array  # attempted since the last event
+    n_solver_steps: Array  # attempted since the last event
 
 
-def motion_of(place: Place) -> WheelMotion:
+def motion_from_point(point: IntervalPoint) -> WheelMotion:
     """Return the motion at a point."""
-    x, z, theta, L = place.q[0], place.q[1], place.q[2], place.q[3:]
-    return WheelMotion(x, z, theta, place.v[0], place.v[1], place.v[2], L, place.v[3:])
+    x, z, theta, L = point.q[0], point.q[1], point.q[2], point.q[3:]
+    return WheelMotion(x, z, theta, point.v[0], point.v[1], point.v[2], L, point.v[3:])
 
 
-def place_of(flow: Flow, motion: WheelMotion) -> Place:
+def make_point(dynamics: ModeDynamics, motion: WheelMotion) -> IntervalPoint:
     """Return the point of a motion, with its dynamics: the inverse of `motion_from_point`."""
-    q, v = coordinates(motion)
-    return Place(q, v, slope_at(flow, q, v))
+    q, v = pack_coordinates(motion)
+    return IntervalPoint(q, v, evaluate_dynamics(dynamics, q, v))
 
 
-def coordinates(motion: WheelMotion) -> tuple[Array, Array]:
+def pack_coordinates(motion: WheelMotion) -> tuple[Array, Array]:
     """Return the coordinates of a motion, and their rates, as two arrays."""
     q = jnp.concatenate([jnp.stack([motion.x, motion.z, motion.theta]), motion.L])
     return q, jnp.concatenate([jnp.stack([motion.vx, motion.vz, motion.dtheta]), motion.dL])
 
 
-def slope_at(flow: Flow, q: Array, v: Array) -> Array:
+def evaluate_dynamics(dynamics: ModeDynamics, q: Array, v: Array) -> Array:
     """Return the accelerations of all coordinates, then `ContactQuantities` without the
     directions.
     """
-    motion = motion_of(Place(q, v, q))
-    now = forces(flow, motion)
-    told = felt(flow, now)
-    feet = [*told.normal, *told.tangential, *told.stopper, *told.speed, told.regular]
-    more = [] if told.in_air is None else [told.in_air]
-    if flow.tallied:
-        tally = tally_rates(flow, motion, now)
-        rows = tally.damping, tally.friction, tally.slip
-        more.append(jnp.stack(kept(rows, one_of(motion))))
-    return jnp.concatenate([jnp.stack(now.answer.hub), now.answer.lengths, jnp.stack(feet), *more])
+    motion = motion_from_point(IntervalPoint(q, v, q))
+    current_forces = compute_forces(dynamics, motion)
+    quantities = contact_quantities(dynamics, current_forces)
+    contact_rows = [
+        *quantities.normal,
+        *quantities.tangential,
+        *quantities.stopper,
+        *quantities.slip_speed,
+        quantities.painleve_determinant,
+    ]
+    extra_rows = [] if quantities.airborne_stopper is None else [quantities.airborne_stopper]
+    if dynamics.accumulates:
+        accumulators = accumulator_rates(dynamics, motion, current_forces)
+        rows = accumulators.damping, accumulators.friction, accumulators.slip
+        extra_rows.append(jnp.stack(prevent_fusion(rows, opaque_one(motion))))
+    return jnp.concatenate(
+        [
+            jnp.stack(current_forces.solution.hub),
+            current_forces.solution.lengths,
+            jnp.stack(contact_rows),
+            *extra_rows,
+        ]
+    )
 
 
-def guards_at(flow: Flow, place: Place) -> Array:
+def guards_at_point(dynamics: ModeDynamics, point: IntervalPoint) -> Array:
     """Return all guards in the order of `GuardLayout`, as long after the start of the contact
     state.
     """
-    motion = motion_of(place)
-    of_felt = place.slope[len(place.q) :]
-    n1, n2, t1, t2, s1, s2, x1, x2, regular = of_felt[:N_FELT]
-    in_air = of_felt[N_FELT : N_FELT + flow.s.n] if flow.one_sided else None
-    legs, pairs = directions(flow.s, motion.theta), ((n1, n2), (t1, t2), (s1, s2), (x1, x2))
-    now = Felt(legs, *pairs, regular, in_air)
-    begun = jnp.ones(place.q.shape[-1:], bool)
-    return jnp.concatenate(stance_guards(flow, motion, now, begun))
+    motion = motion_from_point(point)
+    contact_rows = point.dynamics_rows[len(point.q) :]
+    n1, n2, t1, t2, s1, s2, x1, x2, painleve_determinant = contact_rows[:N_CONTACT_ROWS]
+    airborne_stopper = (
+        contact_rows[N_CONTACT_ROWS : N_CONTACT_ROWS + dynamics.s.n]
+        if dynamics.is_one_sided
+        else None
+    )
+    legs, pairs = leg_directions(dynamics.s, motion.theta), ((n1, n2), (t1, t2), (s1, s2), (x1, x2))
+    quantities = ContactQuantities(legs, *pairs, painleve_determinant, airborne_stopper)
+    has_begun = jnp.ones(point.q.shape[-1:], bool)
+    return jnp.concatenate(evaluate_guards(dynamics, motion, quantities, has_begun))
 
 
-def guard_rates(flow: Flow, place: Place) -> Array:
+def guard_rates(dynamics: ModeDynamics, point: IntervalPoint) -> Array:
     """Return the time derivatives of the guards along the motion."""
 
-    def along(q: Array, v: Array) -> Array:
-        return guards_at(flow, Place(q, v, slope_at(flow, q, v)))
+    def guards_of_state(q: Array, v: Array) -> Array:
+        return guards_at_point(dynamics, IntervalPoint(q, v, evaluate_dynamics(dynamics, q, v)))
 
-    return jax.jvp(along, (place.q, place.v), (place.v, place.slope[: len(place.q)]))[1]
+    return jax.jvp(
+        guards_of_state, (point.q, point.v), (point.v, point.dynamics_rows[: len(point.q)])
+    )[1]
 
 
-def begun_guards(flow: Flow) -> Array:
+def find_own_guards(dynamics: ModeDynamics) -> Array:
     """Return which guards are at the event that has just started the contact state."""
-    stance = flow.stance
-    slid = flow.slots.flags(stance.new_slip)
-    no = jnp.zeros((2, stance.contact.shape[-1]), bool)
-    in_air = [stance.locked & False] if flow.one_sided else []
-    return jnp.concatenate([stance.new_foot, stance.new_leg, no, no, no, slid, no, no, *in_air])
+    contact_state = dynamics.contact_state
+    has_just_slid = dynamics.slots.gather_flags(contact_state.has_just_slid)
+    no_guard = jnp.zeros((2, contact_state.contact.shape[-1]), bool)
+    airborne = [contact_state.locked & False] if dynamics.is_one_sided else []
+    return jnp.concatenate(
+        [
+            contact_state.has_just_lifted,
+            contact_state.has_just_unlocked,
+            no_guard,
+            no_guard,
+            no_guard,
+            has_just_slid,
+            no_guard,
+            no_guard,
+            *airborne,
+        ]
+    )
 
 
 @eqx.filter_jit  # traced once for all call sites
-def set_off(flow: Flow, motion: WheelMotion, h: Array) -> March:
+def init_interval(dynamics: ModeDynamics, motion: WheelMotion, h: Array) -> IntervalState:
     """Return the lanes at the start of a contact state.
 
     A lane is at an event again if one of its guards falls at once.
     """
-    here, begun = place_of(flow, motion), begun_guards(flow)
-    values, rates = guards_at(flow, here), guard_rates(flow, here)
+    point, is_own = make_point(dynamics, motion), find_own_guards(dynamics)
+    values, rates = guards_at_point(dynamics, point), guard_rates(dynamics, point)
     # A contact released from rest has a guard within rounding for 1e-8 s and longer. One that
     # rises from below has no event before it falls; events without duration leave several such.
-    unread = guard_sizes(flow) * (ROUNDING * jnp.finfo(values.dtype).eps)
-    begun = begun | ((values <= unread) & (rates > -unread / STILL))
-    past = ~begun & ((values < 0.0) | ((values == 0.0) & (rates <= 0.0)))
-    offset = jnp.where(begun, values - 2.0 * unread, 0.0)
-    zero, none = jnp.zeros_like(motion.x), jnp.zeros(motion.x.shape, jnp.int32)
-    return March(
-        here=here,
-        stance=flow.stance,
-        values=values - offset,
-        offset=offset,
-        told=jnp.zeros((N_TALLIED, *zero.shape), zero.dtype) if flow.tallied else None,
+    roundoff = guard_scales(dynamics) * (GUARD_ROUNDOFF_EPS * jnp.finfo(values.dtype).eps)
+    is_own = is_own | ((values <= roundoff) & (rates > -roundoff / MAX_ROUNDOFF_FALL_SECONDS))
+    has_passed = ~is_own & ((values < 0.0) | ((values == 0.0) & (rates <= 0.0)))
+    offset = jnp.where(is_own, values - 2.0 * roundoff, 0.0)
+    zero, zero_count = jnp.zeros_like(motion.x), jnp.zeros(motion.x.shape, jnp.int32)
+    return IntervalState(
+        point=point,
+        contact_state=dynamics.contact_state,
+        guard_values=values - offset,
+        guard_offset=offset,
+        accumulated=jnp.zeros((N_ACCUMULATOR_ROWS, *zero.shape), zero.dtype)
+        if dynamics.accumulates
+        else None,
         h=zero + h,
         time=zero,
-        search=Search(none > 0, jnp.zeros_like(begun), zero, zero, zero, none, zero, values),
-        verdict=jnp.where(jnp.any(past, axis=0), EVENT, MARCHING).astype(jnp.int32),
-        guard=_first(past),
-        tried=none,
+        search=EventBracket(
+            zero_count > 0, jnp.zeros_like(is_own), zero, zero, zero, zero_count, zero, values
+        ),
+        status=jnp.where(jnp.any(has_passed, axis=0), STATUS_EVENT, STATUS_RUNNING).astype(
+            jnp.int32
+        ),
+        guard=_first_set(has_passed),
+        n_solver_steps=zero_count,
     )
 
 
-def _first(flags: Array) -> Array:
+def _first_set(flags: Array) -> Array:
     """Return the index of the first row whose flag is set; 0 if none is."""
-    first = jnp.zeros(flags.shape[1:], jnp.int32)
+    index = jnp.zeros(flags.shape[1:], jnp.int32)
     for row in reversed(range(len(flags))):
-        first = jnp.where(flags[row], row, first)
-    return first
+        index = jnp.where(flags[row], row, index)
+    return index
 
 
-FlowAt = Callable[[Array], Flow]
+DynamicsFn = Callable[[Array], ModeDynamics]
 """Function of the lanes' columns: parameters and friction."""
 
 
-def marched(
-    flow_at: FlowAt,
+def integrate_interval(
+    dynamics_at: DynamicsFn,
     columns: Array,
-    begin: March,
-    walks: Array,
-    options: Options,
-    tableau: Tableau,
-) -> March:
+    initial: IntervalState,
+    is_walking: Array,
+    options: StepOptions,
+    tableau: ButcherTableau,
+) -> IntervalState:
     """Return the lanes integrated until none is running.
 
     After `MAX_WAIT_TRIES` attempts, the loop ends as soon as a lane with `is_walking` is at an
     event.
     """
-    flow = flow_at(columns)
-    sizes = guard_sizes(flow)
+    dynamics = dynamics_at(columns)
+    scales = guard_scales(dynamics)
 
-    def advance(now: March) -> March:
-        return advanced(now, tried_step(flow, tableau, options, now), sizes, tableau, options)
+    def try_step(state: IntervalState) -> IntervalState:
+        return integrator_step(
+            state, attempt_step(dynamics, tableau, options, state), scales, tableau, options
+        )
 
-    return until_none_marches(lambda now: now.verdict == MARCHING, walks, advance, begin)
+    return run_until_done(
+        lambda state: state.status == STATUS_RUNNING, is_walking, try_step, initial
+    )
 
 
-def until_none_marches(
-    marching: Callable[[Any], Array], walks: Array, advance: Callable, begin: Any
+def run_until_done(
+    is_running: Callable[[Any], Array], is_walking: Array, iterate: Callable, initial: Any
 ) -> Any:
     """Return the state after repeated `iterate`, until no lane is running.
 
     After `MAX_WAIT_TRIES` attempts, the loop ends as soon as a lane with `is_walking` has stopped.
     """
 
-    def goes_on(state: tuple) -> Array:
-        now, tries = state
-        still = marching(now)
-        return jnp.any(still) & ((tries < BURST) | ~jnp.any(walks & ~still))
+    def should_continue(loop_state: tuple) -> Array:
+        state, n_tries = loop_state
+        is_active = is_running(state)
+        return jnp.any(is_active) & ((n_tries < MAX_WAIT_TRIES) | ~jnp.any(is_walking & ~is_active))
 
-    none = jnp.zeros((), jnp.int32)
-    turn = lambda state: (advance(state[0]), state[1] + 1)
-    return lax.while_loop(goes_on, turn, (begin, none))[0]
+    zero = jnp.zeros((), jnp.int32)
+    iterate_once = lambda loop_state: (iterate(loop_state[0]), loop_state[1] + 1)
+    return lax.while_loop(should_continue, iterate_once, (initial, zero))[0]
 
 
-class Try(NamedTuple):
+class AttemptedStep(NamedTuple):
     """An attempted solver step."""
 
-    end: Place
-    squared: Array  # of the error over the tolerance
-    values: Array  # at the end
-    bend: Array  # of the guards' parabolas
-    slope: Array
-    to_dip: Array  # fraction of the step to a possible guard dip below zero, else 1
-    told: Array | None  # increment of `IntervalState.accumulated`
+    end: IntervalPoint
+    squared_error: Array  # of the error over the tolerance
+    guard_values: Array  # at the end
+    curvature: Array  # of the guards' parabolas
+    linear_term: Array
+    dip_fraction: Array  # fraction of the step to a possible guard dip below zero, else 1
+    accumulated: Array | None  # increment of `IntervalState.accumulated`
 
 
-def stage_at(
-    tableau: Tableau, i: Array | int, q: Array, v: Array, slopes: Array, h: Array
+def stage_state(
+    tableau: ButcherTableau, i: Array | int, q: Array, v: Array, stage_rows: Array, h: Array
 ) -> tuple[Array, Array]:
     """Return coordinates and rates at a stage, from the accelerations of the stages before it."""
-    a, b, place = (jnp.asarray(x)[i] for x in (tableau.once, tableau.twice, tableau.places))
-    n, last = len(q), len(tableau.places) - 1
-    first = sum(a[j] * slopes[j, :n] for j in range(last))
-    second = sum(b[j] * slopes[j, :n] for j in range(last))
-    return q + h * (place * v + h * second), v + h * first
+    a, b, node = (
+        jnp.asarray(x)[i] for x in (tableau.matrix, tableau.matrix_squared, tableau.nodes)
+    )
+    n, n_previous = len(q), len(tableau.nodes) - 1
+    first_sum = sum(a[j] * stage_rows[j, :n] for j in range(n_previous))
+    second_sum = sum(b[j] * stage_rows[j, :n] for j in range(n_previous))
+    return q + h * (node * v + h * second_sum), v + h * first_sum
 
 
-def tried_step(flow: Flow, tableau: Tableau, options: Options, now: March) -> Try:
+def attempt_step(
+    dynamics: ModeDynamics, tableau: ButcherTableau, options: StepOptions, state: IntervalState
+) -> AttemptedStep:
     """Return an attempted step of every lane."""
-    h, here, last = now.h, now.here, len(tableau.places) - 1
+    h, point, last_stage = state.h, state.point, len(tableau.nodes) - 1
 
-    def stage(i: Array, slopes: Array) -> Array:
-        slope = slope_at(flow, *stage_at(tableau, i, here.q, here.v, slopes, h))
-        return lax.dynamic_update_index_in_dim(slopes, slope, i, 0)
+    def stage(i: Array, stage_rows: Array) -> Array:
+        row = evaluate_dynamics(dynamics, *stage_state(tableau, i, point.q, point.v, stage_rows, h))
+        return lax.dynamic_update_index_in_dim(stage_rows, row, i, 0)
 
-    others = jnp.zeros((last, *here.slope.shape), h.dtype)
-    slopes = jnp.concatenate([here.slope[None], others])
-    slopes = lax.fori_loop(1, last + 1, stage, slopes)
-    return tried_by(flow, tableau, options, now, slopes)
+    other_rows = jnp.zeros((last_stage, *point.dynamics_rows.shape), h.dtype)
+    stage_rows = jnp.concatenate([point.dynamics_rows[None], other_rows])
+    stage_rows = lax.fori_loop(1, last_stage + 1, stage, stage_rows)
+    return finish_attempt(dynamics, tableau, options, state, stage_rows)
 
 
-def tried_by(flow: Flow, tableau: Tableau, options: Options, now: March, slopes: Array) -> Try:
+def finish_attempt(
+    dynamics: ModeDynamics,
+    tableau: ButcherTableau,
+    options: StepOptions,
+    state: IntervalState,
+    stage_rows: Array,
+) -> AttemptedStep:
     """Return the attempted step with these rows of the dynamics at its stages."""
-    h, here, last = now.h, now.here, len(tableau.places) - 1
-    n = len(here.q)
-    end = Place(*stage_at(tableau, last, here.q, here.v, slopes, h), slopes[last])
-    told = None
-    if flow.tallied:
-        told = h * sum(tableau.once[last][j] * slopes[j, -N_TALLIED:] for j in range(last))
-    inside = {
-        i: Place(*stage_at(tableau, i, here.q, here.v, slopes, h), slopes[i])
-        for i in tableau.inside
+    h, point, last_stage = state.h, state.point, len(tableau.nodes) - 1
+    n = len(point.q)
+    end = IntervalPoint(
+        *stage_state(tableau, last_stage, point.q, point.v, stage_rows, h), stage_rows[last_stage]
+    )
+    accumulated = None
+    if dynamics.accumulates:
+        accumulated = h * sum(
+            tableau.matrix[last_stage][j] * stage_rows[j, -N_ACCUMULATOR_ROWS:]
+            for j in range(last_stage)
+        )
+    inner_points = {
+        i: IntervalPoint(*stage_state(tableau, i, point.q, point.v, stage_rows, h), stage_rows[i])
+        for i in tableau.guard_stages
     }
-    looked = *inside.values(), end
-    *within, values = (guards_at(flow, place) - now.offset for place in looked)
-    weigh = lambda weights: sum(float(w) * slopes[j, :n] for j, w in enumerate(weights) if w != 0.0)
-    errors = h * h * weigh(tableau.error_twice), h * weigh(tableau.error_once)
-    squared = _squared_error(options, errors, here, looked[-1], values)
-    middle = within[tableau.inside.index(tableau.middle)] if within else now.values
-    bent = parabola(tableau, now.values, middle, values)
-    to_dip = _to_earliest_dip(tableau, [now.values, *within, values], _stands(now))
-    return Try(end, squared, values, *bent, to_dip, told)
+    points = *inner_points.values(), end
+    *inner_values, values = (
+        guards_at_point(dynamics, stage_point) - state.guard_offset for stage_point in points
+    )
+    weighted_sum = lambda weights: sum(
+        float(w) * stage_rows[j, :n] for j, w in enumerate(weights) if w != 0.0
+    )
+    errors = h * h * weighted_sum(tableau.b_error_position), h * weighted_sum(tableau.b_error)
+    squared_error = _squared_error(options, errors, point, points[-1], values)
+    middle_values = (
+        inner_values[tableau.guard_stages.index(tableau.middle_stage)]
+        if inner_values
+        else state.guard_values
+    )
+    parabola_terms = fit_guard_parabola(tableau, state.guard_values, middle_values, values)
+    dip_fraction = _earliest_dip_fraction(
+        tableau, [state.guard_values, *inner_values, values], _is_at_own_event(state)
+    )
+    return AttemptedStep(end, squared_error, values, *parabola_terms, dip_fraction, accumulated)
 
 
-def at_singularity(before: Array, after: Array, options: Options) -> Array:
+def is_at_singularity(value_before: Array, value_after: Array, options: StepOptions) -> Array:
     """Return whether the determinant has vanished at Painlevé's singularity, from its values at
     both ends.
     """
-    return (before * after <= 0.0) | (jnp.abs(after) <= SINGULAR[0] + SINGULAR[1] * options.rtol)
-
-
-def advanced(now: March, tried: Try, sizes: Array, tableau: Tableau, options: Options) -> March:
-    """Return the lanes after one attempt: accepted, repeated with another step size, or at an
-    event.
-    """
-    here, h, search, end = now.here, now.h, now.search, tried.end
-    running = now.verdict == MARCHING
-    keep = running & ~search.on & (tried.squared <= 1.0)
-    retry = keep & (tried.to_dip < 1.0) & (now.time + h * tried.to_dip > now.time)
-    crossed = keep & ~retry & jnp.any(tried.values <= 0.0, axis=0)
-    accepted = keep & ~retry & ~crossed
-    searched, found = _searched(now, tried, crossed, sizes, options)
-    arrived = found.arrived
-    change = jnp.where(retry, tried.to_dip, change_of_length(tableau, tried.squared, h.dtype))
-    following = jnp.where(search.on | crossed, found.following, h * change)
-
-    moved = jnp.where(arrived, found.shift, 0.0)
-    end = Place(end.q + moved * end.v, end.v + moved * end.slope[: len(end.q)], end.slope)
-    taken = accepted | arrived
-    told = now.told
-    if told is not None and tried.told is not None:
-        told = told + jnp.where(taken, tried.told, 0.0)
-    time = jnp.where(taken, now.time + h + moved, now.time)
-    late = accepted & (time >= options.max_phase_time)
-    late = late | (arrived & (time > options.max_phase_time))
-    stuck = (searched.tries >= options.event_steps) | (now.tried + 1 >= options.max_solver_steps)
-    stuck = stuck | (~search.on & (now.time + following == now.time))
-    regular = len(here.q) + N_FELT - 1
-    before, after = here.slope[regular], end.slope[regular]
-    verdict = jnp.where(stuck, Outcome.SOLVER_GAVE_UP, MARCHING)
-    verdict = jnp.where(arrived, EVENT, verdict)
-    verdict = jnp.where(late, Outcome.NO_TOUCHDOWN_IN_TIME, verdict)
-    singular = taken & at_singularity(before, after, options)
-    verdict = jnp.where(singular, Outcome.FRICTION_PARADOX, verdict)
-    return now._replace(
-        here=select(taken, end, here),
-        values=jnp.where(accepted, tried.values, now.values),
-        told=told,
-        h=jnp.where(running, following, h),
-        time=time,
-        search=select(running, searched, search),
-        verdict=jnp.where(running, verdict, now.verdict).astype(jnp.int32),
-        guard=jnp.where(arrived, found.guard, now.guard),
-        tried=now.tried + running,
+    return (value_before * value_after <= 0.0) | (
+        jnp.abs(value_after) <= PAINLEVE_TOLERANCES[0] + PAINLEVE_TOLERANCES[1] * options.rtol
     )
 
 
-class _Found(NamedTuple):
+def integrator_step(
+    state: IntervalState,
+    attempt: AttemptedStep,
+    scales: Array,
+    tableau: ButcherTableau,
+    options: StepOptions,
+) -> IntervalState:
+    """Return the lanes after one attempt: accepted, repeated with another step size, or at an
+    event.
+    """
+    point, h, search, end = state.point, state.h, state.search, attempt.end
+    is_running = state.status == STATUS_RUNNING
+    is_accurate = is_running & ~search.is_active & (attempt.squared_error <= 1.0)
+    needs_retry = (
+        is_accurate
+        & (attempt.dip_fraction < 1.0)
+        & (state.time + h * attempt.dip_fraction > state.time)
+    )
+    has_crossed = is_accurate & ~needs_retry & jnp.any(attempt.guard_values <= 0.0, axis=0)
+    is_accepted = is_accurate & ~needs_retry & ~has_crossed
+    next_search, event = _search_event(state, attempt, has_crossed, scales, options)
+    has_arrived = event.has_arrived
+    length_factor = jnp.where(
+        needs_retry, attempt.dip_fraction, step_size_factor(tableau, attempt.squared_error, h.dtype)
+    )
+    next_h = jnp.where(search.is_active | has_crossed, event.next_h, h * length_factor)
+
+    time_shift = jnp.where(has_arrived, event.time_shift, 0.0)
+    end = IntervalPoint(
+        end.q + time_shift * end.v,
+        end.v + time_shift * end.dynamics_rows[: len(end.q)],
+        end.dynamics_rows,
+    )
+    is_taken = is_accepted | has_arrived
+    accumulated = state.accumulated
+    if accumulated is not None and attempt.accumulated is not None:
+        accumulated = accumulated + jnp.where(is_taken, attempt.accumulated, 0.0)
+    time = jnp.where(is_taken, state.time + h + time_shift, state.time)
+    is_late = is_accepted & (time >= options.max_phase_time)
+    is_late = is_late | (has_arrived & (time > options.max_phase_time))
+    is_stuck = (next_search.n_iterations >= options.max_event_iterations) | (
+        state.n_solver_steps + 1 >= options.max_solver_steps
+    )
+    is_stuck = is_stuck | (~search.is_active & (state.time + next_h == state.time))
+    determinant_row = len(point.q) + N_CONTACT_ROWS - 1
+    determinant_before, determinant_after = (
+        point.dynamics_rows[determinant_row],
+        end.dynamics_rows[determinant_row],
+    )
+    status = jnp.where(is_stuck, Outcome.SOLVER_FAILED, STATUS_RUNNING)
+    status = jnp.where(has_arrived, STATUS_EVENT, status)
+    status = jnp.where(is_late, Outcome.NO_TOUCHDOWN_IN_TIME, status)
+    is_singular = is_taken & is_at_singularity(determinant_before, determinant_after, options)
+    status = jnp.where(is_singular, Outcome.PAINLEVE_PARADOX, status)
+    return state._replace(
+        point=tree_where(is_taken, end, point),
+        guard_values=jnp.where(is_accepted, attempt.guard_values, state.guard_values),
+        accumulated=accumulated,
+        h=jnp.where(is_running, next_h, h),
+        time=time,
+        search=tree_where(is_running, next_search, search),
+        status=jnp.where(is_running, status, state.status).astype(jnp.int32),
+        guard=jnp.where(has_arrived, event.guard, state.guard),
+        n_solver_steps=state.n_solver_steps + is_running,
+    )
+
+
+class _LocatedEvent(NamedTuple):
     """Result of one iteration of the search for the earliest event inside a step."""
 
-    following: Array  # step size of the next attempt, s
-    shift: Array  # from this step size to the event's, s
-    arrived: Array  # whether the event is within tolerance
+    next_h: Array  # step size of the next attempt, s
+    time_shift: Array  # from this step size to the event's, s
+    has_arrived: Array  # whether the event is within tolerance
     guard: Array
 
 
-def _searched(
-    now: March, tried: Try, crossed: Array, sizes: Array, options: Options
-) -> tuple[Search, _Found]:
+def _search_event(
+    state: IntervalState,
+    attempt: AttemptedStep,
+    has_crossed: Array,
+    scales: Array,
+    options: StepOptions,
+) -> tuple[EventBracket, _LocatedEvent]:
     """Return one more iteration of the search, from the zeros of the guards' parabolas or
     secants.
     """
-    h, search = now.h, now.search
-    crosses = tried.values <= 0.0
-    crossing = jnp.where(search.on, search.crossing | crosses, crosses)
-    parabolas = now.values, tried.slope, tried.bend
-    first, guard = _earliest_root(*parabolas, crossing, _stands(now))
-    by_ends, guard_by_ends = _earliest_secant(search, tried.values, h, crossing)
-    slow = search.on & (search.tries >= PARABOLAS)
-    proposal, guard = jnp.where(slow, by_ends, h * first), jnp.where(slow, guard_by_ends, guard)
-    past = jnp.any(crossing & crosses, axis=0)
-    low = jnp.where(search.on & ~past, h, search.low)
-    high = jnp.where(search.on & past, h, search.high)
-    low, high = jnp.where(crossed, 0.0, low), jnp.where(crossed, h, high)
-    resolution = 1e3 * jnp.finfo(h.dtype).eps * (now.time + h)
-    accuracy = jnp.maximum(CLOSE * options.rtol * h, resolution)
-    accuracy = jnp.where(search.on, search.accuracy, accuracy)
-    within = (proposal >= low - accuracy) & (proposal <= high + accuracy)
+    h, search = state.h, state.search
+    is_below_zero = attempt.guard_values <= 0.0
+    is_crossing = jnp.where(search.is_active, search.is_crossing | is_below_zero, is_below_zero)
+    parabolas = state.guard_values, attempt.linear_term, attempt.curvature
+    root_fraction, guard = _earliest_root(*parabolas, is_crossing, _is_at_own_event(state))
+    secant_h, secant_guard = _earliest_secant(search, attempt.guard_values, h, is_crossing)
+    uses_secant = search.is_active & (search.n_iterations >= MAX_PARABOLA_ITERATIONS)
+    proposal, guard = (
+        jnp.where(uses_secant, secant_h, h * root_fraction),
+        jnp.where(uses_secant, secant_guard, guard),
+    )
+    has_passed = jnp.any(is_crossing & is_below_zero, axis=0)
+    low = jnp.where(search.is_active & ~has_passed, h, search.low)
+    high = jnp.where(search.is_active & has_passed, h, search.high)
+    low, high = jnp.where(has_crossed, 0.0, low), jnp.where(has_crossed, h, high)
+    resolution = 1e3 * jnp.finfo(h.dtype).eps * (state.time + h)
+    time_tolerance = jnp.maximum(EVENT_TIME_TOLERANCE_FACTOR * options.rtol * h, resolution)
+    time_tolerance = jnp.where(search.is_active, search.time_tolerance, time_tolerance)
+    is_in_bracket = (proposal >= low - time_tolerance) & (proposal <= high + time_tolerance)
     # In a dip of microseconds, rounding moves proposals out of the bracket: bisect it instead.
-    halve = ~within | (slow & ((search.tries & 3) == 3))
+    bisects = ~is_in_bracket | (uses_secant & ((search.n_iterations & 3) == 3))
     # A guard that starts at its own event falls again soon, or not at all.
     middle = jnp.where((low == 0.0) & jnp.isinf(proposal), 0.125 * high, 0.5 * (low + high))
-    following = jnp.where(halve, middle, proposal)
-    shift = following - h
+    next_h = jnp.where(bisects, middle, proposal)
+    time_shift = next_h - h
     # If a guard is within its rounding, no other step size is better than this one.
-    beside, lowest = _lowest(tried.values / sizes, crossing)
+    lowest_guard, lowest = _lowest_guard(attempt.guard_values / scales, is_crossing)
     # A guard at its own event is within twice its rounding; without another event, it is the event.
-    reads = ROUNDING * jnp.where(search.tries < PATIENT, 1.0, 3.0) * jnp.finfo(h.dtype).eps
-    at_rest = search.on & (jnp.abs(lowest) <= reads)
-    shift, guard = jnp.where(at_rest, 0.0, shift), jnp.where(at_rest, beside, guard)
-    close = search.on & (jnp.abs(shift) <= accuracy)
-    tries = jnp.where(search.on, search.tries + 1, 0)
-    on = (search.on | crossed) & ~close
-    searched = Search(on, crossing, low, high, accuracy, tries, h, tried.values)
-    return searched, _Found(following, shift, close & (now.verdict == MARCHING), guard)
+    roundoff = (
+        GUARD_ROUNDOFF_EPS
+        * jnp.where(search.n_iterations < OWN_GUARD_AFTER_ITERATIONS, 1.0, 3.0)
+        * jnp.finfo(h.dtype).eps
+    )
+    is_roundoff = search.is_active & (jnp.abs(lowest) <= roundoff)
+    time_shift, guard = (
+        jnp.where(is_roundoff, 0.0, time_shift),
+        jnp.where(is_roundoff, lowest_guard, guard),
+    )
+    is_close = search.is_active & (jnp.abs(time_shift) <= time_tolerance)
+    n_iterations = jnp.where(search.is_active, search.n_iterations + 1, 0)
+    is_active = (search.is_active | has_crossed) & ~is_close
+    next_search = EventBracket(
+        is_active, is_crossing, low, high, time_tolerance, n_iterations, h, attempt.guard_values
+    )
+    return next_search, _LocatedEvent(
+        next_h, time_shift, is_close & (state.status == STATUS_RUNNING), guard
+    )
 
 
 def _squared_error(
-    options: Options, errors: tuple[Array, Array], here: Place, end: Place, guards: Array
+    options: StepOptions,
+    errors: tuple[Array, Array],
+    point: IntervalPoint,
+    end: IntervalPoint,
+    guards: Array,
 ) -> Array:
     """Return the mean square of the error over its tolerance; infinite for a step that is not
     finite.
     """
     total = 0.0 * jnp.sum(guards, axis=0)
-    for error, a, b in zip(errors, here[:2], end[:2], strict=True):
-        allowed = options.atol + options.rtol * jnp.maximum(jnp.abs(a), jnp.abs(b))
-        total = total + jnp.sum(jnp.square(error / allowed), axis=0)
-    return jnp.where(jnp.isfinite(total), total / (2 * here.q.shape[0]), jnp.inf)
+    for error, a, b in zip(errors, point[:2], end[:2], strict=True):
+        tolerance = options.atol + options.rtol * jnp.maximum(jnp.abs(a), jnp.abs(b))
+        total = total + jnp.sum(jnp.square(error / tolerance), axis=0)
+    return jnp.where(jnp.isfinite(total), total / (2 * point.q.shape[0]), jnp.inf)
 
 
-def _stands(now: March) -> Array:
+def _is_at_own_event(state: IntervalState) -> Array:
     """Return the guards at their own event, for lanes at the start of the contact state."""
-    return (now.time == 0.0) & (now.offset != 0.0)
+    return (state.time == 0.0) & (state.guard_offset != 0.0)
 
 
-def _to_earliest_dip(tableau: Tableau, values: list[Array], stands: Array) -> Array:
+def _earliest_dip_fraction(tableau: ButcherTableau, values: list[Array], is_own: Array) -> Array:
     """Return the fraction of the step before a guard that may dip below zero in it; 1 if there is
     none.
 
     See `numerics.find_dip`. A guard that starts at its own event is not considered.
     """
-    looks, at = below(tableau, values)
-    return jnp.min(jnp.where(looks & (values[0] > 0.0) & ~stands, at, 1.0), axis=0)
+    has_dip, fraction = find_dip(tableau, values)
+    return jnp.min(jnp.where(has_dip & (values[0] > 0.0) & ~is_own, fraction, 1.0), axis=0)
 
 
-def _lowest(values: Array, crossing: Array) -> tuple[Array, Array]:
+def _lowest_guard(values: Array, is_crossing: Array) -> tuple[Array, Array]:
     """Return the lowest of the crossing guards, and its value; infinite if none crosses."""
-    least, guard = jnp.full_like(values[0], jnp.inf), jnp.zeros(values.shape[1:], jnp.int32)
+    lowest, guard = jnp.full_like(values[0], jnp.inf), jnp.zeros(values.shape[1:], jnp.int32)
     for index in range(len(values)):
-        lower = crossing[index] & (values[index] < least)
-        least, guard = jnp.where(lower, values[index], least), jnp.where(lower, index, guard)
-    return guard, least
+        is_lower = is_crossing[index] & (values[index] < lowest)
+        lowest, guard = (
+            jnp.where(is_lower, values[index], lowest),
+            jnp.where(is_lower, index, guard),
+        )
+    return guard, lowest
 
 
 def _earliest_secant(
-    search: Search, values: Array, h: Array, crossing: Array
+    search: EventBracket, values: Array, h: Array, is_crossing: Array
 ) -> tuple[Array, Array]:
     """Return the earliest zero of the crossing guards' secants through the last two attempts.
 
@@ -461,20 +580,25 @@ def _earliest_secant(
     is below zero and no longer falls, because it fell before. The ends of attempts are as accurate
     as the integration; the inner stage is not.
     """
-    rate = (values - search.values) / jnp.where(h == search.last, jnp.inf, h - search.last)
-    first, guard = jnp.full_like(h, jnp.inf), jnp.zeros(h.shape, jnp.int32)
+    rate = (values - search.guard_values) / jnp.where(
+        h == search.previous_h, jnp.inf, h - search.previous_h
+    )
+    earliest, guard = jnp.full_like(h, jnp.inf), jnp.zeros(h.shape, jnp.int32)
     for index in range(len(values)):
-        falls = crossing[index] & (rate[index] < 0.0)
-        place = h - values[index] / jnp.where(falls, rate[index], 1.0)
-        fell = crossing[index] & ~falls & (values[index] < 0.0)
-        place = jnp.where(fell, -jnp.inf, place)
-        earlier = (falls | fell) & (place < first)
-        first, guard = jnp.where(earlier, place, first), jnp.where(earlier, index, guard)
-    return first, guard
+        is_falling = is_crossing[index] & (rate[index] < 0.0)
+        root_h = h - values[index] / jnp.where(is_falling, rate[index], 1.0)
+        has_fallen = is_crossing[index] & ~is_falling & (values[index] < 0.0)
+        root_h = jnp.where(has_fallen, -jnp.inf, root_h)
+        is_earlier = (is_falling | has_fallen) & (root_h < earliest)
+        earliest, guard = (
+            jnp.where(is_earlier, root_h, earliest),
+            jnp.where(is_earlier, index, guard),
+        )
+    return earliest, guard
 
 
 def _earliest_root(
-    g0: Array, slope: Array, bend: Array, crossing: Array, stands: Array
+    g0: Array, linear_term: Array, curvature: Array, is_crossing: Array, is_own: Array
 ) -> tuple[Array, Array]:
     """Return the earliest zero of the crossing guards' parabolas, in step lengths, and the guard.
 
@@ -482,21 +606,24 @@ def _earliest_root(
     its parabola falls at once, the step is too long for parabolas. The zero is minus infinity if
     such a parabola ends below zero.
     """
-    discriminant = slope * slope - 4.0 * bend * g0
+    discriminant = linear_term * linear_term - 4.0 * curvature * g0
     root = jnp.sqrt(jnp.maximum(discriminant, 0.0))
-    falling = slope < 0.0
-    over = jnp.where(falling, 2.0 * g0, -slope - root)
-    under = jnp.where(falling, root - slope, 2.0 * bend)
-    place = over / jnp.where(under == 0.0, 1.0, under)
-    exists = crossing & (discriminant >= 0.0) & (under != 0.0) & (place > 0.0)
-    exists = exists & ~(stands & falling)
-    fell = crossing & ~exists & (g0 + slope + bend < 0.0)
-    place, exists = jnp.where(fell, -jnp.inf, place), exists | fell
-    first, guard = jnp.full_like(place[0], jnp.inf), jnp.zeros(place.shape[-1:], jnp.int32)
-    for index in reversed(range(len(place))):
-        guard = jnp.where(crossing[index], index, guard)
-    for index in range(len(place)):
-        earlier = exists[index] & (place[index] < first)
-        first = jnp.where(earlier, place[index], first)
-        guard = jnp.where(earlier, index, guard)
-    return first, guard
+    is_falling = linear_term < 0.0
+    numerator = jnp.where(is_falling, 2.0 * g0, -linear_term - root)
+    denominator = jnp.where(is_falling, root - linear_term, 2.0 * curvature)
+    root_fraction = numerator / jnp.where(denominator == 0.0, 1.0, denominator)
+    has_root = is_crossing & (discriminant >= 0.0) & (denominator != 0.0) & (root_fraction > 0.0)
+    has_root = has_root & ~(is_own & is_falling)
+    has_fallen = is_crossing & ~has_root & (g0 + linear_term + curvature < 0.0)
+    root_fraction, has_root = jnp.where(has_fallen, -jnp.inf, root_fraction), has_root | has_fallen
+    earliest, guard = (
+        jnp.full_like(root_fraction[0], jnp.inf),
+        jnp.zeros(root_fraction.shape[-1:], jnp.int32),
+    )
+    for index in reversed(range(len(root_fraction))):
+        guard = jnp.where(is_crossing[index], index, guard)
+    for index in range(len(root_fraction)):
+        is_earlier = has_root[index] & (root_fraction[index] < earliest)
+        earliest = jnp.where(is_earlier, root_fraction[index], earliest)
+        guard = jnp.where(is_earlier, index, guard)
+    return earliest, guard

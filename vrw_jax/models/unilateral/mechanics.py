@@ -21,11 +21,11 @@ from jaxtyping import Array, Bool, Float, Int
 from vrw_jax.numerics import Elementwise, Scalar, sine_cosine
 from vrw_jax.wheel import Symbols
 
-Legs = Float[Array, "n_legs ..."]
+LegArray = Float[Array, "n_legs ..."]
 """One quantity of every leg."""
-Vector3 = tuple[Any, Any, Any]
+HubVector = tuple[Any, Any, Any]
 """Components along hub x, hub z and theta."""
-Pair = tuple[Any, Any]
+SlotPair = tuple[Any, Any]
 """One quantity of each slot."""
 
 
@@ -38,52 +38,52 @@ class WheelMotion(NamedTuple):
     vx: Scalar  # of the hub, m/s
     vz: Scalar
     dtheta: Scalar  # rad/s
-    L: Legs  # m
-    dL: Legs  # m/s
+    L: LegArray  # m
+    dL: LegArray  # m/s
 
 
-class Legwise(NamedTuple):
+class LegDirections(NamedTuple):
     """Directions of all legs, u = (sin, cos) and e = (cos, -sin)."""
 
-    sin: Legs
-    cos: Legs
+    sin: LegArray
+    cos: LegArray
 
 
-def directions(s: Symbols, theta: Elementwise) -> Legwise:
+def leg_directions(s: Symbols, theta: Elementwise) -> LegDirections:
     """Return the directions of all legs, for any number of turns of the wheel."""
-    turn = (s.alpha * np.arange(s.n)).reshape(-1, *(1,) * jnp.ndim(theta))
-    halves = lax.stop_gradient(jnp.floor(theta / math.pi + 0.5))
-    odd = halves - 2.0 * jnp.floor(0.5 * halves)
-    sin, cos = (x - 2.0 * odd * x for x in sine_cosine(theta - math.pi * halves))
-    sin_turn, cos_turn = np.sin(turn), np.cos(turn)
-    return Legwise(sin * cos_turn + cos * sin_turn, cos * cos_turn - sin * sin_turn)
+    leg_angles = (s.alpha * np.arange(s.n)).reshape(-1, *(1,) * jnp.ndim(theta))
+    half_turns = lax.stop_gradient(jnp.floor(theta / math.pi + 0.5))
+    is_odd = half_turns - 2.0 * jnp.floor(0.5 * half_turns)
+    sin, cos = (x - 2.0 * is_odd * x for x in sine_cosine(theta - math.pi * half_turns))
+    sin_leg, cos_leg = np.sin(leg_angles), np.cos(leg_angles)
+    return LegDirections(sin * cos_leg + cos * sin_leg, cos * cos_leg - sin * sin_leg)
 
 
-def over_legs(values: Array) -> Array:
+def sum_over_legs(values: Array) -> Array:
     """Return the sum over the legs, the first axis."""
     return jnp.sum(values, axis=0)
 
 
-def kept(tree: Any, one: Array) -> Any:
+def prevent_fusion(tree: Any, unit: Array) -> Any:
     """Return the same numbers, each divided by a `unit` that equals 1 but is known only at run
     time.
 
     XLA's fusions on a CPU repeat chains of cheap operations for each use, which multiplies their
     number by a hundred here. A division is computed only once.
     """
-    floats = lambda x: jnp.issubdtype(jnp.result_type(x), jnp.floating)
-    return jax.tree.map(lambda x: x / one if floats(x) else x, tree)
+    is_float = lambda leaf: jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
+    return jax.tree.map(lambda leaf: leaf / unit if is_float(leaf) else leaf, tree)
 
 
-def one_of(motion: "WheelMotion") -> Array:
+def opaque_one(motion: "WheelMotion") -> Array:
     """Return 1 in a form that no compiler can simplify."""
     return lax.stop_gradient(1.0 + 0.0 * motion.theta)
 
 
-def stilled(tree: Any) -> Any:
+def stop_gradients(tree: Any) -> Any:
     """Return the same tree without its derivatives."""
-    moving, rest = eqx.partition(tree, eqx.is_inexact_array)
-    return eqx.combine(lax.stop_gradient(moving), rest)
+    floats, rest = eqx.partition(tree, eqx.is_inexact_array)
+    return eqx.combine(lax.stop_gradient(floats), rest)
 
 
 class Slots(NamedTuple):
@@ -93,38 +93,38 @@ class Slots(NamedTuple):
     second: Bool[Array, "n_legs ..."]
 
     @property
-    def filled(self) -> Bool[Array, "n_legs ..."]:
+    def is_filled(self) -> Bool[Array, "n_legs ..."]:
         """Whether a leg is in a slot."""
         return self.first | self.second
 
-    def codes(self, values: Array) -> Int[Array, "2 ..."]:
+    def gather_codes(self, values: Array) -> Int[Array, "2 ..."]:
         """Return the slots' entries of an integer per leg, as one array."""
-        return jnp.stack(self.of(values))
+        return jnp.stack(self.gather(values))
 
-    def flags(self, values: Array) -> Bool[Array, "2 ..."]:
+    def gather_flags(self, values: Array) -> Bool[Array, "2 ..."]:
         """Return the slots' entries of a flag per leg; False for an empty slot."""
-        return self.codes(values.astype(jnp.int32)) > 0
+        return self.gather_codes(values.astype(jnp.int32)) > 0
 
-    def of(self, values: Array) -> Pair:
+    def gather(self, values: Array) -> SlotPair:
         """Return the slots' entries of a quantity per leg; 0 for an empty slot."""
         zero = jnp.zeros_like(values)
         return (
-            over_legs(jnp.where(self.first, values, zero)),
-            over_legs(jnp.where(self.second, values, zero)),
+            sum_over_legs(jnp.where(self.first, values, zero)),
+            sum_over_legs(jnp.where(self.second, values, zero)),
         )
 
-    def spread(self, pair: Any) -> Legs:
+    def scatter(self, pair: Any) -> LegArray:
         """Return the quantity per leg, zero for legs in no slot: the inverse of `gather`."""
         return jnp.where(self.first, pair[0], 0.0) + jnp.where(self.second, pair[1], 0.0)
 
 
-def slots_of(touching: Bool[Array, "n_legs ..."]) -> Slots:
+def find_slots(is_touching: Bool[Array, "n_legs ..."]) -> Slots:
     """Return the slots of the first two touching legs."""
-    rank = jnp.cumsum(touching.astype(jnp.int32), axis=0)
-    return Slots(touching & (rank == 1), touching & (rank == 2))
+    rank = jnp.cumsum(is_touching.astype(jnp.int32), axis=0)
+    return Slots(is_touching & (rank == 1), is_touching & (rank == 2))
 
 
-def of_slots(friction: Elementwise | Pair, slots: Slots) -> Elementwise | Pair:
+def slot_friction(friction: Elementwise | SlotPair, slots: Slots) -> Elementwise | SlotPair:
     """Return the friction of each slot's foot.
 
     A pair holds the friction of the foot that landed last, Leg 1's, and that of all others; a
@@ -132,48 +132,50 @@ def of_slots(friction: Elementwise | Pair, slots: Slots) -> Elementwise | Pair:
     """
     if not isinstance(friction, tuple):
         return friction
-    last, others = friction
-    return jnp.where(slots.first[0], last, others), others
+    last_friction, other_friction = friction
+    return jnp.where(slots.first[0], last_friction, other_friction), other_friction
 
 
-class Hub(NamedTuple):
+class ContactInverseInertia(NamedTuple):
     """Inverse inertia at the slots' forces, and their mutual responses."""
 
-    legs: Legwise
-    released: Bool[Array, " n_legs"]  # legs eliminated: free in length, or in a slot
-    inverse: tuple[Any, ...]  # xx, xz, x theta, zz, z theta, theta theta
-    sin: Pair
-    cos: Pair
-    L: Pair
-    along_e: tuple[Vector3, Vector3]  # hub's response to a unit force along e of each foot
-    along_u: tuple[Vector3, Vector3]  # to a unit pull of each stopper
+    legs: LegDirections
+    is_released: Bool[Array, " n_legs"]  # legs eliminated: free in length, or in a slot
+    inverse_inertia: tuple[Any, ...]  # xx, xz, x theta, zz, z theta, theta theta
+    sin: SlotPair
+    cos: SlotPair
+    L: SlotPair
+    response_e: tuple[HubVector, HubVector]  # hub's response to a unit force along e of each foot
+    response_u: tuple[HubVector, HubVector]  # to a unit pull of each stopper
     G: tuple[Any, Any, Any]  # 11, 12, 22: e to e
     H: tuple[Any, Any, Any, Any]  # 11, 12, 21, 22: stopper to e
     K: tuple[Any, Any, Any]  # 11, 12, 22: stopper to stopper
 
 
-def times(inverse: tuple[Any, ...], f: Vector3) -> Vector3:
+def apply_inverse(inverse_inertia: tuple[Any, ...], force: HubVector) -> HubVector:
     """Return the product of the symmetric inverse inertia and a vector."""
-    xx, xz, xt, zz, zt, tt = inverse
+    xx, xz, xt, zz, zt, tt = inverse_inertia
     return (
-        xx * f[0] + xz * f[1] + xt * f[2],
-        xz * f[0] + zz * f[1] + zt * f[2],
-        xt * f[0] + zt * f[1] + tt * f[2],
+        xx * force[0] + xz * force[1] + xt * force[2],
+        xz * force[0] + zz * force[1] + zt * force[2],
+        xt * force[0] + zt * force[1] + tt * force[2],
     )
 
 
-def _inverse_inertia(s: Symbols, legs: Legwise, b: Legs, released: Array) -> tuple[Any, ...]:
+def _invert_inertia(
+    s: Symbols, legs: LegDirections, b: LegArray, is_released: Array
+) -> tuple[Any, ...]:
     """Return the inverse of the 3 x 3 inertia that is left after the elimination of the released
     legs.
     """
-    sin = jnp.where(released, legs.sin, 0.0)
-    cos = jnp.where(released, legs.cos, 0.0)
-    xx = s.Mt - s.m * over_legs(sin * sin)
-    xz = -s.m * over_legs(sin * cos)
-    zz = s.Mt - s.m * over_legs(cos * cos)
-    xt = -s.m * over_legs(b * legs.cos)
-    zt = s.m * over_legs(b * legs.sin)
-    tt = s.m * over_legs(b * b)
+    sin = jnp.where(is_released, legs.sin, 0.0)
+    cos = jnp.where(is_released, legs.cos, 0.0)
+    xx = s.Mt - s.m * sum_over_legs(sin * sin)
+    xz = -s.m * sum_over_legs(sin * cos)
+    zz = s.Mt - s.m * sum_over_legs(cos * cos)
+    xt = -s.m * sum_over_legs(b * legs.cos)
+    zt = s.m * sum_over_legs(b * legs.sin)
+    tt = s.m * sum_over_legs(b * b)
     c_xx, c_xz, c_xt = zz * tt - zt * zt, xt * zt - xz * tt, xz * zt - zz * xt
     scale = 1.0 / (xx * c_xx + xz * c_xz + xt * c_xt)
     return (
@@ -189,58 +191,65 @@ def _inverse_inertia(s: Symbols, legs: Legwise, b: Legs, released: Array) -> tup
 class Posture(NamedTuple):
     """Directions of all legs, and directions and lengths of the slots' legs."""
 
-    legs: Legwise
-    sin: Pair
-    cos: Pair
-    L: Pair
+    legs: LegDirections
+    sin: SlotPair
+    cos: SlotPair
+    L: SlotPair
 
 
-def posture_of(s: Symbols, motion: WheelMotion, slots: Slots) -> Posture:
+def make_posture(s: Symbols, motion: WheelMotion, slots: Slots) -> Posture:
     """Return the directions of all legs, and the slots' directions and lengths."""
-    legs = directions(s, motion.theta)
-    return Posture(legs, slots.of(legs.sin), slots.of(legs.cos), slots.of(motion.L))
+    legs = leg_directions(s, motion.theta)
+    return Posture(legs, slots.gather(legs.sin), slots.gather(legs.cos), slots.gather(motion.L))
 
 
-def hub_of(s: Symbols, motion: WheelMotion, slots: Slots, locked: Array) -> Hub:
+def make_inverse_inertia(
+    s: Symbols, motion: WheelMotion, slots: Slots, airborne: Array
+) -> ContactInverseInertia:
     """Return the response of hub and slots to forces at this posture.
 
     - `airborne`: legs in the air on their stoppers.
     """
-    legs, sin, cos, L = posture_of(s, motion, slots)
-    released = slots.filled | ~locked
-    inverse = _inverse_inertia(s, legs, motion.L - s.a, released)
+    legs, sin, cos, L = make_posture(s, motion, slots)
+    is_released = slots.is_filled | ~airborne
+    inverse_inertia = _invert_inertia(s, legs, motion.L - s.a, is_released)
     e = [(cos[i], -sin[i], -L[i]) for i in range(2)]
     u = [(sin[i], cos[i], jnp.zeros_like(sin[i])) for i in range(2)]
-    z = (times(inverse, e[0]), times(inverse, e[1]))
-    y = (times(inverse, u[0]), times(inverse, u[1]))
+    z = (apply_inverse(inverse_inertia, e[0]), apply_inverse(inverse_inertia, e[1]))
+    y = (apply_inverse(inverse_inertia, u[0]), apply_inverse(inverse_inertia, u[1]))
     dot = lambda a, b: a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-    plane = lambda a, b: a[0] * b[0] + a[1] * b[1]
-    return Hub(
+    plane_dot = lambda a, b: a[0] * b[0] + a[1] * b[1]
+    return ContactInverseInertia(
         legs,
-        released,
-        inverse,
+        is_released,
+        inverse_inertia,
         sin,
         cos,
         L,
-        along_e=z,
-        along_u=y,
+        response_e=z,
+        response_u=y,
         G=(dot(e[0], z[0]), dot(e[0], z[1]), dot(e[1], z[1])),
-        H=(plane(u[0], z[0]), plane(u[0], z[1]), plane(u[1], z[0]), plane(u[1], z[1])),
-        K=(plane(u[0], y[0]), plane(u[0], y[1]), plane(u[1], y[1])),
+        H=(
+            plane_dot(u[0], z[0]),
+            plane_dot(u[0], z[1]),
+            plane_dot(u[1], z[0]),
+            plane_dot(u[1], z[1]),
+        ),
+        K=(plane_dot(u[0], y[0]), plane_dot(u[0], y[1]), plane_dot(u[1], y[1])),
     )
 
 
-class Free(NamedTuple):
+class FreeMotion(NamedTuple):
     """Motion without the slots' forces: accelerations, or velocities in an impact."""
 
-    hub: Vector3
-    legs: Legs  # of a released leg's length, minus the hub's share u . hub
-    own: Pair  # the same for the slots' legs
-    e: Pair  # of the slots' feet along e
-    u: Pair  # along u
+    hub: HubVector
+    legs: LegArray  # of a released leg's length, minus the hub's share u . hub
+    slot_legs: SlotPair  # the same for the slots' legs
+    foot_e: SlotPair  # of the slots' feet along e
+    foot_u: SlotPair  # along u
 
 
-def free_legs(s: Symbols, motion: WheelMotion, legs: Legwise) -> Legs:
+def free_leg_motion(s: Symbols, motion: WheelMotion, legs: LegDirections) -> LegArray:
     """Return the acceleration of a leg's length without a holding force, minus the hub's share,
     m/s^2.
     """
@@ -250,105 +259,129 @@ def free_legs(s: Symbols, motion: WheelMotion, legs: Legwise) -> Legs:
     return spin - (legs.sin * gx + legs.cos * gz) + spring / s.m
 
 
-def free_acceleration(s: Symbols, motion: WheelMotion, slots: Slots, hub: Hub) -> Free:
+def free_acceleration(
+    s: Symbols, motion: WheelMotion, slots: Slots, inertia: ContactInverseInertia
+) -> FreeMotion:
     """Return the accelerations by gravity, springs, dampers and rotation alone.
 
     The slots' feet and stoppers exert no force.
     """
-    sin, cos = hub.legs
+    sin, cos = inertia.legs
     b, dtheta = motion.L - s.a, motion.dtheta
     gx, gz = s.g * s.sin_phi, -s.g * s.cos_phi
-    spin, legs = b * dtheta * dtheta, free_legs(s, motion, hub.legs)
+    spin, legs = b * dtheta * dtheta, free_leg_motion(s, motion, inertia.legs)
     coriolis = 2.0 * motion.dL * dtheta
-    radial = jnp.where(hub.released, legs, 0.0) - spin
-    force_x = s.Mt * gx + s.m * over_legs(radial * sin + coriolis * cos)
-    force_z = s.Mt * gz + s.m * over_legs(radial * cos - coriolis * sin)
-    torque = -s.m * over_legs(b * (coriolis + cos * gx - sin * gz))
-    at_hub = times(hub.inverse, (force_x, force_z, torque))
-    across, own = slots.of(coriolis), slots.of(legs)
-    e = [
-        hub.cos[i] * at_hub[0] - hub.sin[i] * at_hub[1] - hub.L[i] * at_hub[2] - across[i]
+    radial = jnp.where(inertia.is_released, legs, 0.0) - spin
+    force_x = s.Mt * gx + s.m * sum_over_legs(radial * sin + coriolis * cos)
+    force_z = s.Mt * gz + s.m * sum_over_legs(radial * cos - coriolis * sin)
+    torque = -s.m * sum_over_legs(b * (coriolis + cos * gx - sin * gz))
+    hub_acceleration = apply_inverse(inertia.inverse_inertia, (force_x, force_z, torque))
+    slot_coriolis, slot_legs = slots.gather(coriolis), slots.gather(legs)
+    foot_e = [
+        inertia.cos[i] * hub_acceleration[0]
+        - inertia.sin[i] * hub_acceleration[1]
+        - inertia.L[i] * hub_acceleration[2]
+        - slot_coriolis[i]
         for i in range(2)
     ]
-    u = [hub.L[i] * dtheta * dtheta - own[i] for i in range(2)]
-    return Free(at_hub, legs, own, (e[0], e[1]), (u[0], u[1]))
+    foot_u = [inertia.L[i] * dtheta * dtheta - slot_legs[i] for i in range(2)]
+    return FreeMotion(
+        hub_acceleration, legs, slot_legs, (foot_e[0], foot_e[1]), (foot_u[0], foot_u[1])
+    )
 
 
-def free_velocity(s: Symbols, motion: WheelMotion, slots: Slots, hub: Hub) -> Free:
+def free_velocity(
+    s: Symbols, motion: WheelMotion, slots: Slots, inertia: ContactInverseInertia
+) -> FreeMotion:
     """Return the velocities by the wheel's momentum alone, with no impulse at feet or slots'
     stoppers.
 
     An airborne leg on its stopper whose length still changes meets the stopper, inelastically.
     """
-    sin, cos = hub.legs
+    sin, cos = inertia.legs
     b, dtheta = motion.L - s.a, motion.dtheta
-    along = sin * motion.vx + cos * motion.vz
-    legs = jnp.where(hub.released, motion.dL - along, 0.0)
+    hub_outward = sin * motion.vx + cos * motion.vz
+    legs = jnp.where(inertia.is_released, motion.dL - hub_outward, 0.0)
     radial = legs - motion.dL
-    across = b * dtheta
-    px = s.Mt * motion.vx + s.m * over_legs(radial * sin - across * cos)
-    pz = s.Mt * motion.vz + s.m * over_legs(radial * cos + across * sin)
-    turning = -s.m * over_legs(b * (cos * motion.vx - sin * motion.vz - across))
-    at_hub = times(hub.inverse, (px, pz, turning))
-    own = slots.of(legs)
-    e = [hub.cos[i] * at_hub[0] - hub.sin[i] * at_hub[1] - hub.L[i] * at_hub[2] for i in range(2)]
-    return Free(at_hub, legs, own, (e[0], e[1]), (-own[0], -own[1]))
+    transverse = b * dtheta
+    px = s.Mt * motion.vx + s.m * sum_over_legs(radial * sin - transverse * cos)
+    pz = s.Mt * motion.vz + s.m * sum_over_legs(radial * cos + transverse * sin)
+    angular_momentum = -s.m * sum_over_legs(b * (cos * motion.vx - sin * motion.vz - transverse))
+    hub_velocity = apply_inverse(inertia.inverse_inertia, (px, pz, angular_momentum))
+    slot_legs = slots.gather(legs)
+    foot_e = [
+        inertia.cos[i] * hub_velocity[0]
+        - inertia.sin[i] * hub_velocity[1]
+        - inertia.L[i] * hub_velocity[2]
+        for i in range(2)
+    ]
+    return FreeMotion(
+        hub_velocity, legs, slot_legs, (foot_e[0], foot_e[1]), (-slot_legs[0], -slot_legs[1])
+    )
 
 
 class FootVelocity(NamedTuple):
     """Velocity of the slots' feet, m/s."""
 
-    x: Pair
-    z: Pair
+    x: SlotPair
+    z: SlotPair
 
 
-def foot_velocity(motion: WheelMotion, slots: Slots, hub: Hub | Posture) -> FootVelocity:
+def foot_velocity(
+    motion: WheelMotion, slots: Slots, posture: ContactInverseInertia | Posture
+) -> FootVelocity:
     """Return the velocity of the slots' feet along the slope and normal to it."""
-    dL = slots.of(motion.dL)
-    x = [motion.vx - dL[i] * hub.sin[i] - hub.L[i] * motion.dtheta * hub.cos[i] for i in range(2)]
-    z = [motion.vz - dL[i] * hub.cos[i] + hub.L[i] * motion.dtheta * hub.sin[i] for i in range(2)]
+    dL = slots.gather(motion.dL)
+    x = [
+        motion.vx - dL[i] * posture.sin[i] - posture.L[i] * motion.dtheta * posture.cos[i]
+        for i in range(2)
+    ]
+    z = [
+        motion.vz - dL[i] * posture.cos[i] + posture.L[i] * motion.dtheta * posture.sin[i]
+        for i in range(2)
+    ]
     return FootVelocity((x[0], x[1]), (z[0], z[1]))
 
 
-def foot_heights(motion: WheelMotion, legs: Legwise) -> Legs:
+def foot_heights(motion: WheelMotion, legs: LegDirections) -> LegArray:
     """Return the height of every foot above the slope, m."""
     return motion.z - motion.L * legs.cos
 
 
-def foot_speeds(motion: WheelMotion, legs: Legwise) -> tuple[Legs, Legs]:
+def foot_speeds(motion: WheelMotion, legs: LegDirections) -> tuple[LegArray, LegArray]:
     """Return the velocity of every foot along the slope and normal to it, m/s."""
-    turn = motion.L * motion.dtheta
-    along = motion.vx - motion.dL * legs.sin - turn * legs.cos
-    return along, motion.vz - motion.dL * legs.cos + turn * legs.sin
+    transverse = motion.L * motion.dtheta
+    tangential = motion.vx - motion.dL * legs.sin - transverse * legs.cos
+    return tangential, motion.vz - motion.dL * legs.cos + transverse * legs.sin
 
 
-def foot_places(motion: WheelMotion, legs: Legwise) -> Legs:
+def foot_positions(motion: WheelMotion, legs: LegDirections) -> LegArray:
     """Return the downhill position of every foot, m."""
     return motion.x - motion.L * legs.sin
 
 
-def place_of_landing(n: int, motion: WheelMotion) -> Elementwise:
+def landing_position(n: int, motion: WheelMotion) -> Elementwise:
     """Return the downhill position of the foremost of `n` feet, m."""
-    turned = motion.theta + (n - 1) * 2.0 * math.pi / n
-    return motion.x - motion.L[n - 1] * jnp.sin(turned)
+    leg_angle = motion.theta + (n - 1) * 2.0 * math.pi / n
+    return motion.x - motion.L[n - 1] * jnp.sin(leg_angle)
 
 
 def kinetic_energy(s: Symbols, motion: WheelMotion) -> Elementwise:
     """Return the kinetic energy of the hub and all leg masses, J."""
-    legs = directions(s, motion.theta)
-    across = (motion.L - s.a) * motion.dtheta
-    x = motion.vx - motion.dL * legs.sin - across * legs.cos
-    z = motion.vz - motion.dL * legs.cos + across * legs.sin
+    legs = leg_directions(s, motion.theta)
+    transverse = (motion.L - s.a) * motion.dtheta
+    x = motion.vx - motion.dL * legs.sin - transverse * legs.cos
+    z = motion.vz - motion.dL * legs.cos + transverse * legs.sin
     hub_mass = s.Mt - s.n * s.m
-    return 0.5 * (hub_mass * (motion.vx**2 + motion.vz**2) + s.m * over_legs(x * x + z * z))
+    return 0.5 * (hub_mass * (motion.vx**2 + motion.vz**2) + s.m * sum_over_legs(x * x + z * z))
 
 
-def potential_energy(s: Symbols, motion: WheelMotion) -> Pair:
+def potential_energy(s: Symbols, motion: WheelMotion) -> SlotPair:
     """Return the gravitational energy from the slope's origin and the elastic energy of all
     springs, J.
     """
-    legs = directions(s, motion.theta)
-    x = s.Mt * motion.x - s.m * over_legs((motion.L - s.a) * legs.sin)
-    z = s.Mt * motion.z - s.m * over_legs((motion.L - s.a) * legs.cos)
-    elastic = 0.5 * s.k * over_legs((motion.L - s.Ls) ** 2)
+    legs = leg_directions(s, motion.theta)
+    x = s.Mt * motion.x - s.m * sum_over_legs((motion.L - s.a) * legs.sin)
+    z = s.Mt * motion.z - s.m * sum_over_legs((motion.L - s.a) * legs.cos)
+    elastic = 0.5 * s.k * sum_over_legs((motion.L - s.Ls) ** 2)
     return s.g * (z * s.cos_phi - x * s.sin_phi), elastic

@@ -17,116 +17,149 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from vrw_jax.models.lane_step import by_argument
-from vrw_jax.models.unilateral.along import walked_along
-from vrw_jax.models.unilateral.contacts import OFF
+from vrw_jax.models.lane_step import split_jacobian
+from vrw_jax.models.unilateral.along import walk_with_tangents
+from vrw_jax.models.unilateral.contacts import CONTACT_OFF
 from vrw_jax.models.unilateral.lanes import (
-    UNDER_WAY,
-    Lean,
-    Walk,
-    Walked,
-    started,
-    told_like,
-    turned,
-    walked,
+    STATUS_UNFINISHED,
+    BatchWalk,
+    BatchWalkResult,
+    StepSummary,
+    advance_round,
+    init_lanes,
+    make_result_template,
+    run_walks,
 )
-from vrw_jax.models.unilateral.march import Place, motion_of, set_off, tried_step
-from vrw_jax.models.unilateral.mechanics import WheelMotion, slots_of
-from vrw_jax.models.unilateral.motion import Flow, Stance, Tally, pack, unpack
-from vrw_jax.numerics import Forward, Options, Tableau, explicit_tableau, one_wheel, sampled
-from vrw_jax.runtime import lane_function
-from vrw_jax.wheel import parameters_of
+from vrw_jax.models.unilateral.march import (
+    IntervalPoint,
+    attempt_step,
+    init_interval,
+    motion_from_point,
+)
+from vrw_jax.models.unilateral.mechanics import WheelMotion, find_slots
+from vrw_jax.models.unilateral.motion import (
+    Accumulators,
+    ContactState,
+    ModeDynamics,
+    pack_state,
+    unpack_state,
+)
+from vrw_jax.numerics import (
+    ButcherTableau,
+    ForwardFunction,
+    StepOptions,
+    load_explicit_tableau,
+    sample_at_equal_times,
+    unbatch,
+)
+from vrw_jax.runtime import cached_lane_function
+from vrw_jax.wheel import stack_parameters
 
 
-class Setting(NamedTuple):
+class ContactStepConfig(NamedTuple):
     """Static configuration of a step."""
 
     structure: Any  # of (wheel, params, x, options), whose leaves are the arrays
-    detailed: bool
+    is_detailed: bool
 
-    def given(self, leaves: tuple[Array, ...]) -> tuple[Array, Array, Any]:
+    def unpack(self, leaves: tuple[Array, ...]) -> tuple[Array, Array, Any]:
         """Return columns and section states of lanes, and the other settings."""
         wheel, params, x, options = jax.tree.unflatten(self.structure, leaves)
-        return jnp.stack([*parameters_of(params), wheel.friction]), x, (wheel, params, options)
+        return jnp.stack([*stack_parameters(params), wheel.friction]), x, (wheel, params, options)
 
-    def walk(self, others: Any) -> Walk:
+    def make_walk(self, settings: Any) -> BatchWalk:
         """Return the batch settings of a walk of one step."""
-        wheel, params, options = others
-        tableau = explicit_tableau(options.solver)
+        wheel, params, options = settings
+        tableau = load_explicit_tableau(options.solver)
         assert tableau is not None  # checked by the caller
-        rules = wheel.max_events, wheel.one_sided, wheel.by_paper, self.detailed
-        return Walk(params.n_legs, 1, *rules, options, tableau)
+        rules = (
+            wheel.max_events,
+            wheel.has_one_sided_stoppers,
+            wheel.uses_paper_rule,
+            self.is_detailed,
+        )
+        return BatchWalk(params.n_legs, 1, *rules, options, tableau)
 
-    def like(self, *leaves: Array) -> tuple:
+    def make_template(self, *leaves: Array) -> tuple:
         """Return arrays in the structure of `compute_outputs`."""
-        params = self.given(leaves)[2][1]
-        return _parted(told_like(params.n_legs, leaves[0].dtype, self.detailed))
+        params = self.unpack(leaves)[2][1]
+        return _partition_result(
+            make_result_template(params.n_legs, leaves[0].dtype, self.is_detailed)
+        )
 
-    def told(self, *leaves: Array) -> tuple:
+    def compute_outputs(self, *leaves: Array) -> tuple:
         """Return the result over lanes, which the leaves have on their last axis."""
-        columns, x, others = self.given(leaves)
-        return _parted(walked(self.walk(others), columns, x))
+        columns, x, settings = self.unpack(leaves)
+        return _partition_result(run_walks(self.make_walk(settings), columns, x))
 
-    def told_along(self, leaves: tuple[Array, ...], ways: tuple[Array, ...]) -> tuple:
+    def compute_tangents(self, leaves: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple:
         """Return the tangents of the result's floats for one tangent of each lane, the floats, and
         the rest.
         """
-        columns, x, others = self.given(leaves)
-        d_columns, d_x = (rows[None] for rows in self.given(ways)[:2])
-        one = jnp.ones_like(columns[0], jnp.int32)
-        walk, moves = walked_along(self.walk(others), columns, x, d_columns, d_x, one)
-        moves = jax.tree.map(lambda leaf: leaf[0], moves)
-        return _parted(walk._replace(told=moves))[0], *_parted(walk)
+        columns, x, settings = self.unpack(leaves)
+        d_columns, d_x = (rows[None] for rows in self.unpack(tangents)[:2])
+        n_tangents = jnp.ones_like(columns[0], jnp.int32)
+        walk, result_tangents = walk_with_tangents(
+            self.make_walk(settings), columns, x, d_columns, d_x, n_tangents
+        )
+        result_tangents = jax.tree.map(lambda leaf: leaf[0], result_tangents)
+        return _partition_result(walk._replace(step_result=result_tangents))[0], *_partition_result(
+            walk
+        )
 
 
-def _parted(walk: Walked) -> tuple[Any, Any]:
+def _partition_result(walk: BatchWalkResult) -> tuple[Any, Any]:
     """Return floats and other parts of a step: of the full result, or of the four minimal ones."""
-    step = walk.told
-    if isinstance(step, Lean):
-        step = step.section_state, step.durations, walk.outcome, walk.tried
+    step = walk.step_result
+    if isinstance(step, StepSummary):
+        step = step.section_state, step.durations, walk.outcome, walk.n_solver_steps
     return eqx.partition(step, eqx.is_inexact_array)
 
 
-def told_by_lanes(structure: Any, detailed: bool) -> Forward:
+def build_contact_step_function(structure: Any, is_detailed: bool) -> ForwardFunction:
     """Return the step over the leaves of (wheel, params, x, options), as a forward rule for any AD
     mode.
     """
-    setting = Setting(structure, detailed)
-    key = "step on real ground", str(structure), detailed
-    return one_wheel(lane_function(setting.told, setting.like, key))
+    config = ContactStepConfig(structure, is_detailed)
+    cache_key = "step on real ground", str(structure), is_detailed
+    return unbatch(cached_lane_function(config.compute_outputs, config.make_template, cache_key))
 
 
-def moved_by_lanes(structure: Any, detailed: bool, moved: tuple[int, ...]) -> Forward:
+def build_contact_step_jacobian(
+    structure: Any, is_detailed: bool, input_indices: tuple[int, ...]
+) -> ForwardFunction:
     """Return the Jacobian of `build_contact_step_function`.
 
     It gives (Jacobian with respect to the leaves at `input_indices`, floats) and the other outputs.
     """
-    setting = Setting(structure, detailed)
+    config = ContactStepConfig(structure, is_detailed)
 
-    def like(leaves: tuple[Array, ...], _ways: tuple[Array, ...]) -> tuple:
-        value, other = setting.like(*leaves)
-        return value, value, other
+    def make_template(leaves: tuple[Array, ...], _tangents: tuple[Array, ...]) -> tuple:
+        value, aux = config.make_template(*leaves)
+        return value, value, aux
 
-    key = "step on real ground along directions", str(structure), detailed
-    along = one_wheel(lane_function(setting.told_along, like, key))
+    cache_key = "step on real ground along directions", str(structure), is_detailed
+    compute_tangents = unbatch(
+        cached_lane_function(config.compute_tangents, make_template, cache_key)
+    )
 
     def jacobian(*leaves: Array) -> tuple:
-        *others, options = jax.tree.unflatten(structure, leaves)
-        leaves = tuple(jax.tree.leaves((*others, options.for_derivatives())))
-        units = np.eye(sum(np.size(leaves[i]) for i in moved))
-        ways, begin = [jnp.zeros_like(leaf) for leaf in leaves], 0
-        for i in moved:
-            rows = units[:, begin : (begin := begin + np.size(leaves[i]))]
-            ways[i] = jnp.asarray(rows.reshape(-1, *jnp.shape(leaves[i])), leaves[i].dtype)
-        axes = tuple(0 if i in moved else None for i in range(len(leaves)))
-        columns, value, other = jax.vmap(along, (None, axes))(leaves, tuple(ways))
-        value, other = jax.tree.map(lambda x: x[0], (value, other))
-        return (by_argument(columns, leaves, moved), value), other
+        *settings, options = jax.tree.unflatten(structure, leaves)
+        leaves = tuple(jax.tree.leaves((*settings, options.with_derivative_tolerances())))
+        units = np.eye(sum(np.size(leaves[i]) for i in input_indices))
+        tangents, offset = [jnp.zeros_like(leaf) for leaf in leaves], 0
+        for i in input_indices:
+            rows = units[:, offset : (offset := offset + np.size(leaves[i]))]
+            tangents[i] = jnp.asarray(rows.reshape(-1, *jnp.shape(leaves[i])), leaves[i].dtype)
+        axes = tuple(0 if i in input_indices else None for i in range(len(leaves)))
+        columns, value, aux = jax.vmap(compute_tangents, (None, axes))(leaves, tuple(tangents))
+        value, aux = jax.tree.map(lambda x: x[0], (value, aux))
+        return (split_jacobian(columns, leaves, input_indices), value), aux
 
     return jacobian
 
 
-class Log(NamedTuple):
+class IntervalLog(NamedTuple):
     """Start and duration of each interval of a step between two events."""
 
     state: Array  # (intervals, dim), see `motion.PackedState`
@@ -135,121 +168,142 @@ class Log(NamedTuple):
     duration: Array  # s
 
 
-class Sampled(NamedTuple):
+class SampledIntervals(NamedTuple):
     """Intervals at equal times, both ends included."""
 
-    log: Log
-    ends: Lean
+    log: IntervalLog
+    ends: StepSummary
     outcome: Array
     state: Array  # (intervals, samples, dim)
     tangential: Array  # on every foot, N, (intervals, samples, legs)
     normal: Array
 
 
-def samples(
-    flow: Flow,
+def sample_interval(
+    dynamics: ModeDynamics,
     motion: WheelMotion,
-    told: Array,
+    accumulated: Array,
     duration: Array,
     n_samples: int,
-    options: Options,
-    tableau: Tableau,
+    options: StepOptions,
+    tableau: ButcherTableau,
 ) -> Array:
     """Return one interval at equal times, ends included, with axes (sample, ., lanes).
 
     The rows are coordinates, rates, accumulators starting at `accumulated`, and normal and
     tangential forces of the slots.
     """
-    begin = set_off(flow, motion, options.first_step)
+    initial = init_interval(dynamics, motion, options.dt0)
 
-    def take(now: tuple[Place, Array], length: Array) -> tuple[tuple[Place, Array], Array]:
-        here, told = now
-        tried = tried_step(flow, tableau, options, begin._replace(here=here, h=length))
-        assert tried.told is not None
-        return (tried.end, told + tried.told), tried.squared
+    def take_sample_step(
+        sample: tuple[IntervalPoint, Array], length: Array
+    ) -> tuple[tuple[IntervalPoint, Array], Array]:
+        point, accumulated = sample
+        attempt = attempt_step(dynamics, tableau, options, initial._replace(point=point, h=length))
+        assert attempt.accumulated is not None
+        return (attempt.end, accumulated + attempt.accumulated), attempt.squared_error
 
-    def rows(now: tuple[Place, Array]) -> Array:
-        (q, v, slope), told = now
-        return jnp.concatenate([q, v, told, slope[len(q) : len(q) + 4]])
+    def rows(sample: tuple[IntervalPoint, Array]) -> Array:
+        (q, v, dynamics_rows), accumulated = sample
+        return jnp.concatenate([q, v, accumulated, dynamics_rows[len(q) : len(q) + 4]])
 
-    return sampled(take, rows, (begin.here, told), tableau, duration, n_samples, options)
+    return sample_at_equal_times(
+        take_sample_step, rows, (initial.point, accumulated), tableau, duration, n_samples, options
+    )
 
 
 @functools.cache
-def sampled_by_lanes(structure: Any, n_samples: int) -> Callable[..., Sampled]:
+def build_contact_step_sampler(structure: Any, n_samples: int) -> Callable[..., SampledIntervals]:
     """Return the sampled motion of a step over the leaves of (wheel, params, x, options).
 
     It has no derivatives.
     """
-    setting = Setting(structure, True)
-    key = str(structure)
+    config = ContactStepConfig(structure, True)
+    cache_key = str(structure)
 
-    def first(*leaves: Array) -> Any:
-        columns, x, others = setting.given(leaves)
-        return started(setting.walk(others), columns, x)[1]
+    def begin_lane(*leaves: Array) -> Any:
+        columns, x, settings = config.unpack(leaves)
+        return init_lanes(config.make_walk(settings), columns, x)[1]
 
-    def following(leaves: tuple[Array, ...], lane: Any) -> tuple[Any, Log]:
-        columns, x, others = setting.given(leaves)
-        on = setting.walk(others)
-        past, lane = turned(on, on.sound(columns, x)[0], lane, waits=True)
-        assert past.tally is not None
-        (here, stance), zero = (past.now.here, past.now.stance), jnp.zeros_like(lane.now.time)
-        state = pack(motion_of(here), Tally(zero, *past.tally))
-        return lane, Log(state, stance.contact, stance.locked, lane.now.time)
-
-    def between(leaves: tuple[Array, ...], log: Log) -> Array:
-        columns, x, others = setting.given(leaves)
-        on, none = setting.walk(others), log.locked & False
-        stance = Stance(log.contact, log.locked, none, none, none)
-        motion, tally = unpack(log.state)
-        flow = on.flow(on.sound(columns, x)[0], stance)
-        given = jnp.stack(tally[1:]), log.duration, n_samples, on.options, on.tableau
-        return samples(flow, motion, *given)
-
-    def run(*leaves: Array) -> Sampled:
-        wheel, params, *_ = jax.tree.unflatten(structure, leaves)
-        begin = lane_at_first(*leaves)
-        form = jax.eval_shape(to_next, leaves, begin)[1]
-        many = lambda leaf: jnp.zeros((wheel.max_events, *leaf.shape), leaf.dtype)
-
-        def go_on(state: tuple) -> tuple:
-            before, log = state
-            lane, row = to_next(leaves, before)
-            place = before.ledger.events
-            place = jnp.where(lane.ledger.events > place, place, wheel.max_events)
-            noted = lambda old, new: old.at[place].set(new, mode="drop")
-            return lane, jax.tree.map(noted, log, row)
-
-        goes_on = lambda state: state[0].outcome == UNDER_WAY
-        lane, log = lax.while_loop(goes_on, go_on, (begin, jax.tree.map(many, form)))
-        stands, on = (
-            (motion_of(lane.now.here), lane.now.stance),
-            setting.walk(setting.given(leaves)[2]),
+    def advance_to_event(leaves: tuple[Array, ...], lane: Any) -> tuple[Any, IntervalLog]:
+        columns, x, settings = config.unpack(leaves)
+        walk = config.make_walk(settings)
+        processed, lane = advance_round(
+            walk, walk.replace_invalid(columns, x)[0], lane, waits_for_events=True
         )
-        ends = on.lean(stands, lane.ledger, lane.outcome)
-        rows = jax.vmap(lambda log: within(leaves, log))(log)
-        return Sampled(log, ends, lane.outcome, *_spread(params.n_legs, log, rows))
+        assert processed.accumulators is not None
+        (point, contact_state), zero = (
+            (processed.interval.point, processed.interval.contact_state),
+            jnp.zeros_like(lane.interval.time),
+        )
+        state = pack_state(motion_from_point(point), Accumulators(zero, *processed.accumulators))
+        return lane, IntervalLog(
+            state, contact_state.contact, contact_state.locked, lane.interval.time
+        )
 
-    lane_at_first = one_wheel(lane_function(first, first, ("start on real ground", key)))
-    like = lambda leaves, lane: (lane, Log(*(lane.now.time,) * 4))
-    to_next = one_wheel(lane_function(following, like, ("to the next event", key)))
-    within = one_wheel(
-        lane_function(
-            between, lambda leaves, log: log.duration, ("samples on real ground", key, n_samples)
+    def sample_intervals(leaves: tuple[Array, ...], log: IntervalLog) -> Array:
+        columns, x, settings = config.unpack(leaves)
+        walk, no_legs = config.make_walk(settings), log.locked & False
+        contact_state = ContactState(log.contact, log.locked, no_legs, no_legs, no_legs)
+        motion, accumulators = unpack_state(log.state)
+        dynamics = walk.make_dynamics(walk.replace_invalid(columns, x)[0], contact_state)
+        arguments = jnp.stack(accumulators[1:]), log.duration, n_samples, walk.options, walk.tableau
+        return sample_interval(dynamics, motion, *arguments)
+
+    def run(*leaves: Array) -> SampledIntervals:
+        wheel, params, *_ = jax.tree.unflatten(structure, leaves)
+        initial = begin_compiled(*leaves)
+        log_template = jax.eval_shape(advance_compiled, leaves, initial)[1]
+        allocate = lambda leaf: jnp.zeros((wheel.max_events, *leaf.shape), leaf.dtype)
+
+        def record_interval_end(state: tuple) -> tuple:
+            previous, log = state
+            lane, row = advance_compiled(leaves, previous)
+            index = previous.counters.events
+            index = jnp.where(lane.counters.n_events > index, index, wheel.max_events)
+            write_row = lambda old, new: old.at[index].set(new, mode="drop")
+            return lane, jax.tree.map(write_row, log, row)
+
+        should_continue = lambda state: state[0].outcome == STATUS_UNFINISHED
+        lane, log = lax.while_loop(
+            should_continue, record_interval_end, (initial, jax.tree.map(allocate, log_template))
+        )
+        final_state, walk = (
+            (motion_from_point(lane.interval.point), lane.interval.contact_state),
+            config.make_walk(config.unpack(leaves)[2]),
+        )
+        summary = walk.summarize(final_state, lane.counters, lane.outcome)
+        rows = jax.vmap(lambda log: sample_compiled(leaves, log))(log)
+        return SampledIntervals(
+            log, summary, lane.outcome, *_unpack_samples(params.n_legs, log, rows)
+        )
+
+    begin_compiled = unbatch(
+        cached_lane_function(begin_lane, begin_lane, ("start on real ground", cache_key))
+    )
+    make_template = lambda leaves, lane: (lane, IntervalLog(*(lane.interval.time,) * 4))
+    advance_compiled = unbatch(
+        cached_lane_function(advance_to_event, make_template, ("to the next event", cache_key))
+    )
+    sample_compiled = unbatch(
+        cached_lane_function(
+            sample_intervals,
+            lambda leaves, log: log.duration,
+            ("samples on real ground", cache_key, n_samples),
         )
     )
     return jax.jit(run)
 
 
-def _spread(n: int, log: Log, rows: Array) -> tuple[Array, Array, Array]:
+def _unpack_samples(n: int, log: IntervalLog, rows: Array) -> tuple[Array, Array, Array]:
     """Return rows of `sample_interval` as packed states, and tangential and normal forces of all
     legs.
     """
     n_samples, size = rows.shape[1], 3 + n
     clock = jnp.linspace(0.0, 1.0, n_samples) * log.duration[:, None]
-    q, v, tally, forces = jnp.split(rows, (size, 2 * size, 2 * size + 3), -1)
-    state = [q[..., :3], v[..., :3], q[..., 3:], v[..., 3:], clock[..., None], tally]
-    slots = jax.vmap(lambda contact: slots_of(contact != OFF))(log.contact)
-    of_legs = jax.vmap(jax.vmap(lambda slots, pair: slots.spread(pair), (None, 0)))
-    normal, tangential = (of_legs(slots, forces[..., i : i + 2]) for i in (0, 2))
+    q, v, accumulators, forces = jnp.split(rows, (size, 2 * size, 2 * size + 3), -1)
+    state = [q[..., :3], v[..., :3], q[..., 3:], v[..., 3:], clock[..., None], accumulators]
+    slots = jax.vmap(lambda contact: find_slots(contact != CONTACT_OFF))(log.contact)
+    scatter_to_legs = jax.vmap(jax.vmap(lambda slots, pair: slots.spread(pair), (None, 0)))
+    normal, tangential = (scatter_to_legs(slots, forces[..., i : i + 2]) for i in (0, 2))
     return jnp.concatenate(state, -1), tangential, normal

@@ -11,77 +11,77 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from vrw_jax.models.base import AbstractWheel, Advance, GroundOfStep
-from vrw_jax.models.lane_step import lanes_can
+from vrw_jax.models.base import AbstractWheel, AdvanceResult, StepGround
+from vrw_jax.models.lane_step import can_use_lanes
 from vrw_jax.models.paper_step import PAPER_START
-from vrw_jax.models.unilateral.contacts import Roughness
-from vrw_jax.models.unilateral.events import Law
-from vrw_jax.models.unilateral.lanes import Lean
+from vrw_jax.models.unilateral.contacts import Friction
+from vrw_jax.models.unilateral.events import ContactLaw
+from vrw_jax.models.unilateral.lanes import StepSummary
 from vrw_jax.models.unilateral.ledger import (
-    Details,
-    Ledger,
+    StepCounters,
+    StepDetails,
     UnilateralStep,
-    as_ruled,
-    blank,
-    event_noted,
-    law_of,
-    no_details,
-    outcome_at,
-    passed,
-    past,
-    section_reached,
-    step_told,
-    stretch_noted,
+    add_interval,
+    apply_friction_rule,
+    final_section_state,
+    init_counters,
+    init_details,
+    interval_outcome,
+    make_contact_law,
+    make_unilateral_step,
+    process_event,
+    record_event,
+    record_interval,
 )
-from vrw_jax.models.unilateral.march import at_singularity
-from vrw_jax.models.unilateral.mechanics import place_of_landing
+from vrw_jax.models.unilateral.march import is_at_singularity
+from vrw_jax.models.unilateral.mechanics import landing_position
 from vrw_jax.models.unilateral.motion import (
-    Guards,
-    Stance,
-    State,
-    Tally,
-    field,
-    flow_of,
-    forces,
-    guard_sizes,
-    guards,
-    guards_of,
-    least_stopper_force,
-    pack,
-    unpack,
+    Accumulators,
+    ContactState,
+    GuardLayout,
+    PackedState,
+    compute_forces,
+    guard_scales,
+    guard_values,
+    make_guard_layout,
+    make_mode_dynamics,
+    min_stopper_force,
+    pack_state,
+    unpack_state,
+    vector_field,
 )
 from vrw_jax.models.unilateral.section import (
     FullState,
-    embedded,
-    made_sound,
-    opened,
-    section_size,
+    embed_section_state,
+    full_section_size,
+    replace_invalid_start,
+    unpack_section_state,
 )
 from vrw_jax.models.unilateral.single import (
-    Log,
-    Sampled,
-    moved_by_lanes,
-    sampled_by_lanes,
-    told_by_lanes,
+    IntervalLog,
+    SampledIntervals,
+    build_contact_step_function,
+    build_contact_step_jacobian,
+    build_contact_step_sampler,
 )
 from vrw_jax.numerics import (
     Elementwise,
-    Forward,
-    Number,
-    Options,
+    ForwardFunction,
+    MonitoredFunctions,
+    RealInput,
     Scalar,
-    Watched,
-    any_mode,
+    StepOptions,
+    enable_all_ad_modes,
     integrate_phase,
+    opaque_condition,
     sample_phase,
-    two_fold,
 )
-from vrw_jax.wheel import FRICTION, PARAMETER_NAMES, Outcome, WheelParams, friction_of
-from vrw_jax.wording import chosen, reals, whole
+from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, Outcome, WheelParams, convert_friction
+from vrw_jax.wording import check_choice, check_int, check_reals
 
-BILATERAL, ONE_SIDED = "bilateral", "one-sided"
+STOPPERS_BILATERAL, STOPPERS_ONE_SIDED = "bilateral", "one-sided"
 """Effect of stoppers on legs in the air: they hold with any force, or only push."""
-LIMIT, PAPER = "limit", "paper"
+FRICTION_LIMIT, FRICTION_PAPER_RULE = "limit", "paper"
 """Meaning of infinite friction: the limit of large friction, or the paper's rule (A1)-(A4)."""
 
 
@@ -101,37 +101,37 @@ class UnilateralTrajectory(eqx.Module):
     section_state: FullState  # after the step
     step_length: Scalar
     outcome: Int[Array, ""]
-    served: dict[str, Array] = eqx.field(default_factory=dict)  # see `AbstractStep`
+    model_selection: dict[str, Array] = eqx.field(default_factory=dict)  # see `AbstractStep`
 
 
-class _Walked(NamedTuple):
+class _EventLoopState(NamedTuple):
     """State of the event loop between two events of a step."""
 
-    state: State
-    stance: Stance
+    state: PackedState
+    contact_state: ContactState
     guard: Int[Array, ""]  # of the last event
     outcome: Int[Array, ""]
-    running: Bool[Array, ""]
-    ledger: Ledger
-    details: Details | None
-    log: Log | None
+    is_running: Bool[Array, ""]
+    counters: StepCounters
+    details: StepDetails | None
+    log: IntervalLog | None
 
 
-class Uneven(NamedTuple):
+class UnevenGround(NamedTuple):
     """Uneven ground: quantities of a step besides the ground of its own landing."""
 
     friction: Scalar  # of the feet that landed before
     tilt: Scalar  # by which the ground ahead is steeper, rad
 
 
-def _restitution_of(value: Any) -> Array | None:
+def _convert_restitution(value: Any) -> Array | None:
     """Return Newton's coefficient of restitution; None means 0.
 
     Raises `ValueError` for a number outside [0, 1].
     """
     if value is None or (isinstance(value, float | int) and value == 0):
         return None
-    restitution = reals("restitution", value)
+    restitution = check_reals("restitution", value)
     if not isinstance(restitution, jax.core.Tracer) and not jnp.all(
         (restitution >= 0.0) & (restitution <= 1.0)
     ):
@@ -161,285 +161,349 @@ class UnilateralWheel(AbstractWheel):
         0.04 m of slip, STEPPED
     """
 
-    rung: ClassVar[str] = "unilateral"
-    parameter_names: ClassVar[tuple[str, ...]] = (*PARAMETER_NAMES, FRICTION)
-    tells_contacts: ClassVar[bool] = True
-    lanes: ClassVar[str] = "legs"
+    model_name: ClassVar[str] = "unilateral"
+    parameter_names: ClassVar[tuple[str, ...]] = (*PARAMETER_NAMES, FRICTION_NAME)
+    reports_contacts: ClassVar[bool] = True
+    batch_kernel: ClassVar[str] = "legs"
 
-    friction: Scalar = eqx.field(converter=friction_of, default=0.7)
-    max_events: int = eqx.field(static=True, converter=partial(whole, "max_events"), default=400)
-    stoppers: str = eqx.field(static=True, default=BILATERAL)
-    restitution: Scalar | None = eqx.field(converter=_restitution_of, default=None)
-    infinite: str = eqx.field(static=True, default=LIMIT)
-    uneven: Uneven | None = None
+    friction: Scalar = eqx.field(converter=convert_friction, default=0.7)
+    max_events: int = eqx.field(
+        static=True, converter=partial(check_int, "max_events"), default=400
+    )
+    stoppers: str = eqx.field(static=True, default=STOPPERS_BILATERAL)
+    restitution: Scalar | None = eqx.field(converter=_convert_restitution, default=None)
+    infinite_friction_rule: str = eqx.field(static=True, default=FRICTION_LIMIT)
+    uneven: UnevenGround | None = None
 
     if TYPE_CHECKING:
 
         def __init__(
             self,
-            friction: Number = 0.7,
+            friction: RealInput = 0.7,
             max_events: int = 400,
             stoppers: Literal["bilateral", "one-sided"] = "bilateral",
-            restitution: Number | None = None,
-            infinite: Literal["limit", "paper"] = "limit",
-            uneven: Uneven | None = None,
+            restitution: RealInput | None = None,
+            infinite_friction_rule: Literal["limit", "paper"] = "limit",
+            uneven: UnevenGround | None = None,
         ) -> None: ...
 
     def __check_init__(self) -> None:
-        chosen("stoppers", self.stoppers, (BILATERAL, ONE_SIDED))
-        chosen("infinite", self.infinite, (LIMIT, PAPER))
+        check_choice("stoppers", self.stoppers, (STOPPERS_BILATERAL, STOPPERS_ONE_SIDED))
+        check_choice(
+            "infinite_friction_rule",
+            self.infinite_friction_rule,
+            (FRICTION_LIMIT, FRICTION_PAPER_RULE),
+        )
 
     @property
-    def one_sided(self) -> bool:
+    def has_one_sided_stoppers(self) -> bool:
         """Whether stoppers of legs in the air may release them."""
-        return self.stoppers == ONE_SIDED
+        return self.stoppers == STOPPERS_ONE_SIDED
 
     @property
-    def by_paper(self) -> bool:
+    def uses_paper_rule(self) -> bool:
         """Whether infinite friction means the paper's rule."""
-        return self.infinite == PAPER
+        return self.infinite_friction_rule == FRICTION_PAPER_RULE
 
-    def start(self, params: WheelParams) -> FullState:
+    def default_start(self, params: WheelParams) -> FullState:
         """Return a start close to the paper's gait of Table 1."""
-        return embedded(params.symbols(), jnp.asarray(PAPER_START, params.damping.dtype))
+        return embed_section_state(params.symbols(), jnp.asarray(PAPER_START, params.damping.dtype))
 
     def section_size(self, params: WheelParams) -> int:
-        return section_size(params.n_legs)
+        return full_section_size(params.n_legs)
 
-    def section_numbers(self, params: WheelParams) -> int:
-        return section_size(params.n_legs) - params.n_legs
+    def n_continuous(self, params: WheelParams) -> int:
+        return full_section_size(params.n_legs) - params.n_legs
 
-    def full_section(self, params: WheelParams, x: Array) -> FullState:
+    def embed_section(self, params: WheelParams, x: Array) -> FullState:
         """Return the full section state of the paper's (theta-, dtheta-, dL1-): Leg 1 planted."""
         return _embedded(params, x) if x.shape == (3,) else x
 
-    def over_steps(self, params: WheelParams, n_steps: int) -> GroundOfStep | None:
-        over, given = (n_steps,), (params.slope, self.friction)
-        if not any(value.shape == over for value in given):
+    def split_ground(self, params: WheelParams, n_steps: int) -> StepGround | None:
+        step_shape, inputs = (n_steps,), (params.slope, self.friction)
+        if not any(value.shape == step_shape for value in inputs):
             return None
-        slope, friction = (jnp.broadcast_to(value, over) for value in given)
-        ahead = jnp.append(slope[1:], slope[-1:])
-        behind = jnp.append(friction[:1], friction[:-1])
-        return slope, friction, behind, ahead - slope
+        slope, friction = (jnp.broadcast_to(value, step_shape) for value in inputs)
+        next_slope = jnp.append(slope[1:], slope[-1:])
+        previous_friction = jnp.append(friction[:1], friction[:-1])
+        return slope, friction, previous_friction, next_slope - slope
 
-    def on_ground(
-        self, params: WheelParams, ground: GroundOfStep
+    def with_ground(
+        self, params: WheelParams, ground: StepGround
     ) -> tuple["UnilateralWheel", WheelParams]:
-        slope, friction, behind, tilt = ground
-        model = dataclasses.replace(self, friction=friction, uneven=Uneven(behind, tilt))
+        slope, friction, previous_friction, tilt = ground
+        model = dataclasses.replace(
+            self, friction=friction, uneven=UnevenGround(previous_friction, tilt)
+        )
         return model, eqx.tree_at(lambda wheel: wheel.slope, params, slope)
 
-    def advance(self, params: WheelParams, x: FullState, options: Options) -> Advance:
-        told, engine = self._taken(params, x, options, detailed=False)
-        section_state, durations, outcome, tried = told
-        return Advance(section_state, durations, outcome, tried, engine=engine)
+    def advance(self, params: WheelParams, x: FullState, options: StepOptions) -> AdvanceResult:
+        outputs, engine = self._compute_step(params, x, options, is_detailed=False)
+        section_state, durations, outcome, solver_steps = outputs
+        return AdvanceResult(section_state, durations, outcome, solver_steps, engine=engine)
 
-    def step(self, params: WheelParams, x: FullState, options: Options) -> UnilateralStep:
-        return self._taken(params, x, options, detailed=True)[0]
+    def take_step(self, params: WheelParams, x: FullState, options: StepOptions) -> UnilateralStep:
+        return self._compute_step(params, x, options, is_detailed=True)[0]
 
-    def _taken(
-        self, params: WheelParams, x: FullState, options: Options, detailed: bool
+    def _compute_step(
+        self, params: WheelParams, x: FullState, options: StepOptions, is_detailed: bool
     ) -> tuple[Any, str]:
         """Return the outputs of a step, and the engine that took it."""
         (leaves, structure), engine = self._leaves(params, x, options), self._engine(options)
-        return eqx.combine(*_compiled(structure, detailed, engine)(*leaves)), engine
+        return eqx.combine(*_compile_step(structure, is_detailed, engine)(*leaves)), engine
 
-    def _leaves(self, params: WheelParams, x: FullState, options: Options) -> tuple[list, Any]:
+    def _leaves(self, params: WheelParams, x: FullState, options: StepOptions) -> tuple[list, Any]:
         """Return the leaves and the tree structure of (wheel, params, x, options)."""
         # Not by `replace`: friction is already validated and may be traced.
         model = eqx.tree_at(lambda wheel: wheel.friction, self, self.friction.astype(x.dtype))
         return jax.tree.flatten((model, params, x, options))
 
-    def _engine(self, options: Options) -> str:
+    def _engine(self, options: StepOptions) -> str:
         """Return the name of the engine for these options."""
-        return "lanes" if self._like_lanes(options) and lanes_can(options) else "diffrax"
+        return (
+            "lanes"
+            if self._is_supported_by_lanes(options) and can_use_lanes(options)
+            else "diffrax"
+        )
 
-    def _like_lanes(self, options: Options) -> bool:
+    def _is_supported_by_lanes(self, options: StepOptions) -> bool:
         """Return whether the batch kernel supports this ground.
 
         Raises `ValueError` if the options require that engine and it does not.
         """
-        plain = self.restitution is None and self.uneven is None
-        if options.engine == "lanes" and not plain:
+        is_supported = self.restitution is None and self.uneven is None
+        if options.engine == "lanes" and not is_supported:
             raise ValueError(
                 "engine is 'lanes', but lanes know neither feet that come back nor ground that "
                 "varies from step to step: take engine='auto' or 'diffrax'."
             )
-        return plain
+        return is_supported
 
-    def trace(
-        self, params: WheelParams, x: FullState, options: Options, n_samples: int
+    def sample_step(
+        self, params: WheelParams, x: FullState, options: StepOptions, n_samples: int
     ) -> UnilateralTrajectory:
         if self._engine(options) == "lanes":
             leaves, structure = self._leaves(params, x, options)
-            found = sampled_by_lanes(structure, n_samples)(*leaves)
+            samples = build_contact_step_sampler(structure, n_samples)(*leaves)
         else:
-            found = self._sampled_by_diffrax(params, x, options, n_samples)
-        log, ends = found.log, found.ends
-        begins = jnp.concatenate([jnp.zeros((1,)), jnp.cumsum(log.duration)[:-1]])
+            samples = self._sample_with_diffrax(params, x, options, n_samples)
+        log, summary = samples.log, samples.ends
+        start_times = jnp.concatenate([jnp.zeros((1,)), jnp.cumsum(log.duration)[:-1]])
         return UnilateralTrajectory(
-            time=begins[:, None] + jnp.linspace(0.0, 1.0, n_samples) * log.duration[:, None],
-            state=found.state,
+            time=start_times[:, None] + jnp.linspace(0.0, 1.0, n_samples) * log.duration[:, None],
+            state=samples.state,
             contact=log.contact,
             locked=log.locked,
-            tangential=found.tangential,
-            normal=found.normal,
+            tangential=samples.tangential,
+            normal=samples.normal,
             duration=log.duration,
-            section_state=ends.section_state,
-            step_length=ends.step_length,
-            outcome=found.outcome,
+            section_state=summary.section_state,
+            step_length=summary.step_length,
+            outcome=samples.outcome,
         )
 
-    def _sampled_by_diffrax(
-        self, params: WheelParams, x: FullState, options: Options, n_samples: int
-    ) -> Sampled:
+    def _sample_with_diffrax(
+        self, params: WheelParams, x: FullState, options: StepOptions, n_samples: int
+    ) -> SampledIntervals:
         """Return the sampled step, integrated by diffrax."""
-        walked = _walk(self, params, x, options, detailed=False, logged=True)
-        log, outcome = walked.log, walked.outcome
+        loop_state = _run_event_loop(self, params, x, options, is_detailed=False, has_log=True)
+        log, outcome = loop_state.log, loop_state.outcome
         assert log is not None
         tilt = None if self.uneven is None else self.uneven.tilt
-        s, friction = params.symbols(), _rough(self, self.friction)
+        s, friction = params.symbols(), _foot_friction(self, self.friction)
 
-        def phase(log: Log) -> tuple:
-            none = jnp.zeros((s.n,), bool)
-            flow = flow_of(s, friction, False, Stance(log.contact, log.locked, none, none, none))
-            given = partial(field, flow), log.state, log.duration, n_samples, options
+        def sample_phase_of_log(log: IntervalLog) -> tuple:
+            no_legs = jnp.zeros((s.n,), bool)
+            dynamics = make_mode_dynamics(
+                s, friction, False, ContactState(log.contact, log.locked, no_legs, no_legs, no_legs)
+            )
+            arguments = partial(vector_field, dynamics), log.state, log.duration, n_samples, options
 
-            def feet(y: State) -> tuple:
-                found = forces(flow, unpack(y)[0]).answer
-                return flow.slots.spread(found.tangential), flow.slots.spread(found.normal)
+            def foot_forces(state: PackedState) -> tuple:
+                solution = compute_forces(dynamics, unpack_state(state)[0]).solution
+                return dynamics.slots.scatter(solution.tangential), dynamics.slots.scatter(
+                    solution.normal
+                )
 
-            states = sample_phase(*given)
-            return states, *jax.vmap(feet)(states)
+            states = sample_phase(*arguments)
+            return states, *jax.vmap(foot_forces)(states)
 
-        section_state, durations, *_ = _lean(walked, tilt)
-        landing = place_of_landing(s.n, unpack(walked.state)[0])
-        landed = jnp.where(outcome == Outcome.STEPPED, landing, 0.0)
-        ends = Lean(section_state, durations, landed)
-        return Sampled(log, ends, outcome, *lax.map(phase, log))
+        section_state, durations, *_ = _minimal_result(loop_state, tilt)
+        position = landing_position(s.n, unpack_state(loop_state.state)[0])
+        step_length = jnp.where(outcome == Outcome.STEPPED, position, 0.0)
+        summary = StepSummary(section_state, durations, step_length)
+        return SampledIntervals(log, summary, outcome, *lax.map(sample_phase_of_log, log))
 
 
-def _rough(wheel: UnilateralWheel, friction: Elementwise) -> Roughness:
+def _foot_friction(wheel: UnilateralWheel, friction: Elementwise) -> Friction:
     """Return the friction of all feet, or that of the foot that landed last and of the others."""
-    friction = as_ruled(friction, wheel.by_paper)
+    friction = apply_friction_rule(friction, wheel.uses_paper_rule)
     if wheel.uneven is None:
         return friction
-    return friction, as_ruled(wheel.uneven.friction, wheel.by_paper)
+    return friction, apply_friction_rule(wheel.uneven.friction, wheel.uses_paper_rule)
 
 
-def _walk(
+def _run_event_loop(
     wheel: UnilateralWheel,
     params: WheelParams,
     x: FullState,
-    options: Options,
-    detailed: bool,
-    logged: bool = False,
-) -> _Walked:
+    options: StepOptions,
+    is_detailed: bool,
+    has_log: bool = False,
+) -> _EventLoopState:
     """Return the event loop's state at the end of a step, integrated by diffrax."""
-    even = wheel.uneven is None
-    good, params, friction, x = made_sound(params, wheel.friction, x, even)
+    is_even_ground = wheel.uneven is None
+    is_valid, params, friction, x = replace_invalid_start(params, wheel.friction, x, is_even_ground)
     s, n = params.symbols(), params.n_legs
     tilt = None if wheel.uneven is None else wheel.uneven.tilt
-    given = s, _rough(wheel, friction), options, wheel.one_sided
-    law = law_of(*given, True, wheel.restitution, tilt)
-    place = guards_of(n, wheel.one_sided)
-    motion, stance = opened(s, x)
+    law_arguments = s, _foot_friction(wheel, friction), options, wheel.has_one_sided_stoppers
+    law = make_contact_law(*law_arguments, True, wheel.restitution, tilt)
+    layout = make_guard_layout(n, wheel.has_one_sided_stoppers)
+    motion, contact_state = unpack_section_state(s, x)
     zero = jnp.zeros_like(motion.theta)
-    state = pack(motion, Tally(zero, zero, zero, zero))
-    rows = lambda leaf: jnp.broadcast_to(leaf, (wheel.max_events, *leaf.shape))
-    first = Log(state, jnp.zeros((n,), jnp.int32), jnp.zeros((n,), bool), jnp.zeros_like(x[0]))
-    begin = _Walked(
-        state=state,
-        stance=stance,
-        guard=jnp.int32(place.foot),
-        outcome=jnp.where(good, Outcome.STEPPED, Outcome.BAD_INPUT).astype(jnp.int32),
-        running=good,
-        ledger=blank(x[0]),
-        details=no_details(x.dtype) if detailed else None,
-        log=jax.tree.map(rows, first) if logged else None,
+    state = pack_state(motion, Accumulators(zero, zero, zero, zero))
+    allocate = lambda leaf: jnp.broadcast_to(leaf, (wheel.max_events, *leaf.shape))
+    first_log = IntervalLog(
+        state, jnp.zeros((n,), jnp.int32), jnp.zeros((n,), bool), jnp.zeros_like(x[0])
     )
-    go_on = partial(_go_on, law, place, wheel.max_events, options)
-    return lax.while_loop(lambda now: two_fold(now.running, now.ledger.events), go_on, begin)
+    initial = _EventLoopState(
+        state=state,
+        contact_state=contact_state,
+        guard=jnp.int32(layout.landing),
+        outcome=jnp.where(is_valid, Outcome.STEPPED, Outcome.BAD_INPUT).astype(jnp.int32),
+        is_running=is_valid,
+        counters=init_counters(x[0]),
+        details=init_details(x.dtype) if is_detailed else None,
+        log=jax.tree.map(allocate, first_log) if has_log else None,
+    )
+    advance = partial(_advance_to_event, law, layout, wheel.max_events, options)
+    return lax.while_loop(
+        lambda loop_state: opaque_condition(loop_state.is_running, loop_state.counters.n_events),
+        advance,
+        initial,
+    )
 
 
-def _go_on(law: Law, place: Guards, max_events: int, options: Options, now: _Walked) -> _Walked:
+def _advance_to_event(
+    law: ContactLaw,
+    layout: GuardLayout,
+    max_events: int,
+    options: StepOptions,
+    loop_state: _EventLoopState,
+) -> _EventLoopState:
     """Return the state at the next event."""
-    motion, tally = unpack(now.state)
-    at = now.guard, now.ledger.events, max_events
-    change, event, outcome = past(law, place, motion, now.stance, *at)
-    flow = flow_of(law.s, law.friction, law.one_sided, change.stance, tilt=law.tilt)
-    sound = outcome == Outcome.STEPPED
-    start = pack(change.motion, tally._replace(clock=jnp.zeros_like(tally.clock)))
-    start = jnp.where(sound, start, now.state)
-    guarded = Watched(partial(guards, flow), place.total, sizes=guard_sizes(flow))
-    end = integrate_phase(partial(field, flow), guarded, start, sound, options)
+    motion, accumulators = unpack_state(loop_state.state)
+    event_arguments = loop_state.guard, loop_state.counters.n_events, max_events
+    result, event, outcome = process_event(
+        law, layout, motion, loop_state.contact_state, *event_arguments
+    )
+    dynamics = make_mode_dynamics(
+        law.s, law.friction, law.is_one_sided, result.contact_state, tilt=law.tilt
+    )
+    is_valid = outcome == Outcome.STEPPED
+    start = pack_state(
+        result.motion, accumulators._replace(clock=jnp.zeros_like(accumulators.clock))
+    )
+    start = jnp.where(is_valid, start, loop_state.state)
+    guard_spec = MonitoredFunctions(
+        partial(guard_values, dynamics), layout.total, guard_scales=guard_scales(dynamics)
+    )
+    end = integrate_phase(partial(vector_field, dynamics), guard_spec, start, is_valid, options)
 
-    ledger = now.ledger._replace(events=now.ledger.events + 1)
-    ledger = passed(ledger, change.stance, end.duration, end.solver_steps)
-    at_ends = forces(flow, change.motion), forces(flow, unpack(end.state)[0])
-    before, after = (lax.stop_gradient(at.answer.regular) for at in at_ends)
+    counters = loop_state.counters._replace(n_events=loop_state.counters.n_events + 1)
+    counters = add_interval(counters, result.contact_state, end.duration, end.solver_steps)
+    end_forces = (
+        compute_forces(dynamics, result.motion),
+        compute_forces(dynamics, unpack_state(end.state)[0]),
+    )
+    determinant_before, determinant_after = (
+        lax.stop_gradient(event_arguments.solution.painleve_determinant)
+        for event_arguments in end_forces
+    )
     # Forces change sign at the singularity without passing through zero.
-    drawn = at_singularity(before, after, options)
-    lost = jnp.where(end.timed_out, Outcome.NO_TOUCHDOWN_IN_TIME, Outcome.SOLVER_GAVE_UP)
-    lost = jnp.where(sound, jnp.where(drawn, Outcome.FRICTION_PARADOX, lost), outcome)
-    found = sound & (end.guard >= 0) & ~drawn
-    lands = found & (end.guard == place.foremost)
-    outcome = outcome_at(ledger, place, found, end.guard, lands, lost, max_events)
-    details, log = now.details, now.log
+    is_singular = is_at_singularity(determinant_before, determinant_after, options)
+    failure = jnp.where(end.timed_out, Outcome.NO_TOUCHDOWN_IN_TIME, Outcome.SOLVER_FAILED)
+    failure = jnp.where(
+        is_valid, jnp.where(is_singular, Outcome.PAINLEVE_PARADOX, failure), outcome
+    )
+    has_event = is_valid & (end.guard >= 0) & ~is_singular
+    has_landed = has_event & (end.guard == layout.foremost_landing)
+    outcome = interval_outcome(
+        counters, layout, has_event, end.guard, has_landed, failure, max_events
+    )
+    details, log = loop_state.details, loop_state.log
     if details is not None:
-        details = event_noted(details, now.ledger.events == 0, change, event)
-        force = [least_stopper_force(flow, at) for at in at_ends]
-        details = stretch_noted(details, flow.contact, end.duration, jnp.minimum(*force))
+        details = record_event(details, loop_state.counters.n_events == 0, result, event)
+        stopper_forces = [
+            min_stopper_force(dynamics, event_arguments) for event_arguments in end_forces
+        ]
+        details = record_interval(
+            details, dynamics.contact, end.duration, jnp.minimum(*stopper_forces)
+        )
     if log is not None:
-        row = Log(start, change.stance.contact, change.stance.locked, end.duration)
-        log = jax.tree.map(lambda old, new: old.at[now.ledger.events].set(new), log, row)
-    return _Walked(
+        row = IntervalLog(
+            start, result.contact_state.contact, result.contact_state.locked, end.duration
+        )
+        log = jax.tree.map(lambda old, new: old.at[loop_state.counters.n_events].set(new), log, row)
+    return _EventLoopState(
         state=end.state,
-        stance=change.stance,
+        contact_state=result.contact_state,
         guard=end.guard,
         outcome=outcome.astype(jnp.int32),
-        running=(outcome == Outcome.STEPPED) & ~lands,
-        ledger=ledger,
+        is_running=(outcome == Outcome.STEPPED) & ~has_landed,
+        counters=counters,
         details=details,
         log=log,
     )
 
 
-_embedded = jax.jit(lambda params, x: embedded(params.symbols(), x))
+_embedded = jax.jit(lambda params, x: embed_section_state(params.symbols(), x))
 
 
 @functools.cache
-def _compiled(structure: Any, detailed: bool, engine: str) -> Forward:
+def _compile_step(structure: Any, is_detailed: bool, engine: str) -> ForwardFunction:
     """Return the step over the leaves of (wheel, params, x, options), differentiable in any
     mode.
     """
 
-    def walk(tighten: bool, *leaves: Array) -> tuple:
+    def compute_step(tightens: bool, *leaves: Array) -> tuple:
         wheel, params, x, options = jax.tree.unflatten(structure, leaves)
-        options = options.for_derivatives() if tighten else options
-        walked = _walk(wheel, params, x, options, detailed)
+        options = options.with_derivative_tolerances() if tightens else options
+        loop_state = _run_event_loop(wheel, params, x, options, is_detailed)
         tilt = None if wheel.uneven is None else wheel.uneven.tilt
-        told = _full(walked, engine, tilt) if detailed else _lean(walked, tilt)
-        return eqx.partition(told, eqx.is_inexact_array)
+        outputs = (
+            _full_result(loop_state, engine, tilt)
+            if is_detailed
+            else _minimal_result(loop_state, tilt)
+        )
+        return eqx.partition(outputs, eqx.is_inexact_array)
 
-    values, tighter = partial(walk, False), partial(walk, True)
+    evaluate, evaluate_tighter = partial(compute_step, False), partial(compute_step, True)
     if engine == "diffrax":
-        return any_mode(values, tighter)
-    given = structure, detailed
-    return any_mode(told_by_lanes(*given), tighter, partial(moved_by_lanes, *given))
+        return enable_all_ad_modes(evaluate, evaluate_tighter)
+    static_config = structure, is_detailed
+    return enable_all_ad_modes(
+        build_contact_step_function(*static_config),
+        evaluate_tighter,
+        partial(build_contact_step_jacobian, *static_config),
+    )
 
 
-def _lean(walked: _Walked, tilt: Elementwise | None) -> tuple:
+def _minimal_result(loop_state: _EventLoopState, tilt: Elementwise | None) -> tuple:
     """Return the minimal result: section state, durations, outcome, solver steps."""
-    ledger = walked.ledger
-    stands = unpack(walked.state)[0], walked.stance
-    section = section_reached(*stands, walked.outcome, tilt)
-    return section, ledger.durations, walked.outcome, ledger.tried
+    counters = loop_state.counters
+    final_state = unpack_state(loop_state.state)[0], loop_state.contact_state
+    section_state = final_section_state(*final_state, loop_state.outcome, tilt)
+    return section_state, counters.durations, loop_state.outcome, counters.n_solver_steps
 
 
-def _full(walked: _Walked, engine: str, tilt: Elementwise | None) -> UnilateralStep:
+def _full_result(
+    loop_state: _EventLoopState, engine: str, tilt: Elementwise | None
+) -> UnilateralStep:
     """Return the full result."""
-    motion, tally = unpack(walked.state)
-    assert walked.details is not None
-    told = walked.ledger, walked.details, walked.outcome
-    return step_told(motion, walked.stance, tally, *told, engine, tilt)
+    motion, accumulators = unpack_state(loop_state.state)
+    assert loop_state.details is not None
+    records = loop_state.counters, loop_state.details, loop_state.outcome
+    return make_unilateral_step(
+        motion, loop_state.contact_state, accumulators, *records, engine, tilt
+    )

@@ -1,3 +1,3 @@
 """Facts of the paper, published and computed."""
 
-from vrw_jax.paper.facts.table import all_facts, as_page, write
+from vrw_jax.paper.facts.table import compute_facts, format_facts_page, write_facts

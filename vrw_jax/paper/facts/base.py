@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from vrw_jax.results import PHASES
+from vrw_jax.results import PHASE_NAMES
 from vrw_jax.wheel import WheelParams
 
 
@@ -18,16 +18,16 @@ class Fact:
 
     group: str
     claim: str
-    where: str
-    published: str
-    found: str
+    source: str
+    published_value: str
+    computed: str
     holds: bool
-    reason: str  # reason for the tolerance, or what makes the fact fail
+    tolerance_reason: str  # reason for the tolerance, or what makes the fact fail
 
     @property
-    def by_code(self) -> bool:
+    def is_from_reference_code(self) -> bool:
         """Return whether an independent code gives the reference number, not the paper."""
-        return CODE in self.where or CODE in self.published
+        return REFERENCE_CODE_LABEL in self.source or REFERENCE_CODE_LABEL in self.published_value
 
     @property
     def verdict(self) -> str:
@@ -40,31 +40,33 @@ class Evidence:
     """Labelled results from which all facts are computed."""
 
     params: WheelParams  # of Table 1
-    settling: xr.Dataset  # `gaits.walk_into_gait` from the start for Table 1
-    gait: xr.Dataset  # three steps of the gait of Table 1, `simulate`
-    by_damping: Sequence[xr.Dataset]  # one step at c = 50, 100, 200
-    branch: xr.Dataset  # `gaits.measure_gaits_along` damping 1, 2, ..., 224 at slope 0.30
-    gentler: xr.Dataset  # `gaits.measure_gaits_along` slope down to 0.10 at c = 100
-    gentle: xr.Dataset  # `gaits.measure_gaits_along` damping up to 220 at slope 0.10
-    gentle_low: xr.Dataset  # `gaits.measure_gaits_along` damping down to 4 at slope 0.10
-    too_fast: xr.Dataset  # `gaits.walk_into_gait` from a start with 2 rad/s at Table 1
+    settling_walk: xr.Dataset  # `gaits.walk_into_gait` from the start for Table 1
+    table_1_trajectory: xr.Dataset  # three steps of the gait of Table 1, `simulate`
+    gaits_by_damping: Sequence[xr.Dataset]  # one step at c = 50, 100, 200
+    damping_branch: xr.Dataset  # `gaits.measure_gaits_along` damping 1, 2, ..., 224 at slope 0.30
+    slope_branch: xr.Dataset  # `gaits.measure_gaits_along` slope down to 0.10 at c = 100
+    gentle_slope_branch: xr.Dataset  # `gaits.measure_gaits_along` damping up to 220 at slope 0.10
+    gentle_slope_low_damping_branch: (
+        xr.Dataset
+    )  # `gaits.measure_gaits_along` damping down to 4 at slope 0.10
+    fast_start_walk: xr.Dataset  # `gaits.walk_into_gait` from a start with 2 rad/s at Table 1
 
     @property
-    def table_1(self) -> xr.Dataset:
+    def table_1_gait(self) -> xr.Dataset:
         """Return the gait of Table 1."""
-        return self.branch.sel(damping=200.0)
+        return self.damping_branch.sel(damping=200.0)
 
 
-CODE = "independent code"
+REFERENCE_CODE_LABEL = "independent code"
 """Source of a number that the paper does not print."""
-DIGIT = "half a unit of the last digit published"
+LAST_DIGIT_REASON = "half a unit of the last digit published"
 """Reason for the usual tolerance."""
-SIGN = "a sign: no tolerance"
+SIGN_REASON = "a sign: no tolerance"
 """Reason for a comparison without a tolerance."""
-ROUND_OFF = 1e-9
+STEP_ERROR_TOLERANCE = 1e-9
 """Tolerance of numbers that differ by the error of a step, in SI units."""
 
-Numbers = Mapping[str, Any]
+NumbersByName = Mapping[str, Any]
 """Numbers of a group of claims by name, computed from the evidence."""
 
 
@@ -73,52 +75,54 @@ class Claim:
     """Published statement, text of the computed value, and condition of their agreement."""
 
     claim: str
-    where: str
-    published: str
-    found: str  # format string of the numbers of the group
+    source: str
+    published_value: str
+    computed: str  # format string of the numbers of the group
     holds: Callable[[Any], bool]  # takes the numbers of the group as attributes
-    reason: str = DIGIT
+    tolerance_reason: str = LAST_DIGIT_REASON
 
 
 @dataclass(frozen=True)
-class Group:
+class ClaimGroup:
     """Claims under one heading that use the same numbers."""
 
     title: str
-    numbers: Callable[[Evidence], Numbers]
+    compute_numbers: Callable[[Evidence], NumbersByName]
     claims: tuple[Claim, ...]
 
-    def facts(self, evidence: Evidence) -> list[Fact]:
+    def make_facts(self, evidence: Evidence) -> list[Fact]:
         """Return the facts of the claims."""
-        numbers = self.numbers(evidence)
-        told = SimpleNamespace(**numbers)
+        numbers = self.compute_numbers(evidence)
+        namespace = SimpleNamespace(**numbers)
         return [
             Fact(
                 group=self.title,
                 claim=c.claim,
-                where=c.where,
-                published=c.published,
-                found=c.found.format(**numbers),
-                holds=bool(c.holds(told)),
-                reason=c.reason,
+                source=c.source,
+                published_value=c.published_value,
+                computed=c.computed.format(**numbers),
+                holds=bool(c.holds(namespace)),
+                tolerance_reason=c.tolerance_reason,
             )
             for c in self.claims
         ]
 
 
-def near(**published: tuple[float | tuple[float, ...], float]) -> Callable[[Any], bool]:
+def agrees_within(
+    **published_numbers: tuple[float | tuple[float, ...], float],
+) -> Callable[[Any], bool]:
     """Return the condition that each named number is within a tolerance of its published value."""
     return lambda n: all(
         bool(np.all(np.abs(np.asarray(getattr(n, name)) - value) <= tolerance))
-        for name, (value, tolerance) in published.items()
+        for name, (value, tolerance) in published_numbers.items()
     )
 
 
-def first_step(gait: xr.Dataset) -> xr.Dataset:
+def select_first_step(gait: xr.Dataset) -> xr.Dataset:
     """Return the first step of a trajectory."""
     return gait.isel(time=gait.step.values == 0)
 
 
-def by_phase(gait: xr.Dataset) -> list[xr.Dataset]:
+def split_by_phase(gait: xr.Dataset) -> list[xr.Dataset]:
     """Return the DLS, SLS-I and SLS-II of a trajectory."""
-    return [gait.isel(time=gait.phase.values == phase) for phase in range(len(PHASES))]
+    return [gait.isel(time=gait.phase.values == phase) for phase in range(len(PHASE_NAMES))]

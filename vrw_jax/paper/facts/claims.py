@@ -6,27 +6,27 @@ import numpy as np
 
 from vrw_jax.paper.facts import printed
 from vrw_jax.paper.facts.base import (
-    CODE,
-    ROUND_OFF,
-    SIGN,
+    REFERENCE_CODE_LABEL,
+    SIGN_REASON,
+    STEP_ERROR_TOLERANCE,
     Claim,
+    ClaimGroup,
     Evidence,
-    Group,
-    Numbers,
-    by_phase,
-    first_step,
-    near,
+    NumbersByName,
+    agrees_within,
+    select_first_step,
+    split_by_phase,
 )
-from vrw_jax.paper.gaits import SETTLED
-from vrw_jax.results import PHASES
+from vrw_jax.paper.gaits import SETTLED_TOLERANCE
+from vrw_jax.results import PHASE_NAMES
 from vrw_jax.wheel import Outcome
 
 
-def _of_table_1(e: Evidence) -> Numbers:
+def _compute_typical_gait_numbers(e: Evidence) -> NumbersByName:
     """Return numbers of the gait of Table 1."""
-    step = first_step(e.gait)
-    phases = dls, sls1, sls2 = by_phase(step)
-    change = e.settling.change.values[1:]
+    step = select_first_step(e.table_1_trajectory)
+    phases = dls, sls1, sls2 = split_by_phase(step)
+    change = e.settling_walk.newton_correction.values[1:]
     shrink = float((change[12] / change[4]) ** (1.0 / 8.0))
     rear_share = dls.lambda_4.values / (dls.lambda_2.values + dls.lambda_4.values)
     period = float(step.time[-1] - step.time[0])
@@ -34,12 +34,12 @@ def _of_table_1(e: Evidence) -> Numbers:
     return {
         "shrink": shrink,
         "change": change[-1],
-        "settled": bool(e.settling.settled and shrink < 1.0),
+        "settled": bool(e.settling_walk.settled and shrink < 1.0),
         "theta": float(step.theta[0]),
         "dtheta": float(step.dtheta[0]),
         "period": period,
-        "speed": float(e.gait.x[-1] - e.gait.x[0]) / (2.0 * period),
-        "share": 100 * float(e.table_1.dls_fraction),
+        "speed": float(e.table_1_trajectory.x[-1] - e.table_1_trajectory.x[0]) / (2.0 * period),
+        "share": 100 * float(e.table_1_gait.dls_fraction),
         "durations": [float(phase.time[-1] - phase.time[0]) for phase in phases],
         "least_rate": float(step.dtheta.min()),
         "fore_rate": float(step.dL1.max()),
@@ -53,7 +53,7 @@ def _of_table_1(e: Evidence) -> Numbers:
         "load_grows": bool((np.diff(dls.lambda_2.values) > 0.0).all()),
         "jump": (float(dls.lambda_2[-1]), float(sls1.lambda_2[0])),
         "tangential": (float(dls.lambda_3[-1]), float(sls1.lambda_3[0])),
-        "peaks": sum(_n_maxima(phase.lambda_2.values) for phase in phases),
+        "peaks": sum(_count_maxima(phase.lambda_2.values) for phase in phases),
         "peak": float(step.lambda_2.max()),
         "rise": 1e3 * float(np.diff(sls2.foot_2_z.values).min()),
         "energy_rise": np.diff(energy).max(),
@@ -61,54 +61,56 @@ def _of_table_1(e: Evidence) -> Numbers:
     }
 
 
-def _n_maxima(values: np.ndarray) -> int:
+def _count_maxima(values: np.ndarray) -> int:
     """Return the number of samples that are larger than both neighbors."""
     return int(np.sum((values[1:-1] > values[:-2]) & (values[1:-1] >= values[2:])))
 
 
-def _of_three_dampings(e: Evidence) -> Numbers:
+def _compute_damping_numbers(e: Evidence) -> NumbersByName:
     """Return numbers of foot height and rear force at three dampings."""
-    gaits = {g.attrs["parameter_damping"]: g for g in e.by_damping}
-    lowest = {c: float(gaits[c].foot_2_z.min()) for c in sorted(gaits)}
-    first = {c: float(gaits[c].lambda_4[0]) for c in sorted(gaits)}
-    clearance = np.minimum(e.branch.clearance_sls1, e.branch.clearance_sls2)
-    kept = e.branch.settled.values & (clearance.values < 0.0)
+    gaits = {g.attrs["parameter_damping"]: g for g in e.gaits_by_damping}
+    lowest_heights = {c: float(gaits[c].foot_2_z.min()) for c in sorted(gaits)}
+    first_forces = {c: float(gaits[c].lambda_4[0]) for c in sorted(gaits)}
+    clearance = np.minimum(e.damping_branch.clearance_sls1, e.damping_branch.clearance_sls2)
+    is_scuffing = e.damping_branch.settled.values & (clearance.values < 0.0)
     return {
-        "lowest": ", ".join(f"{round(1e3 * z, 2) + 0.0:.2f} mm" for z in lowest.values()),
-        "below": {c: z < -ROUND_OFF for c, z in lowest.items()},
-        "last": float(e.branch.damping.values[kept].max()) if kept.any() else math.nan,
-        "all_below": bool(kept[e.branch.damping.values <= 100.0].all()),
-        "first": " > ".join(f"{force:.1f}" for force in first.values()),
-        "falls": first[50.0] > first[100.0] > first[200.0] > 0.0,
+        "lowest": ", ".join(f"{round(1e3 * z, 2) + 0.0:.2f} mm" for z in lowest_heights.values()),
+        "below": {c: z < -STEP_ERROR_TOLERANCE for c, z in lowest_heights.items()},
+        "last": float(e.damping_branch.damping.values[is_scuffing].max())
+        if is_scuffing.any()
+        else math.nan,
+        "all_below": bool(is_scuffing[e.damping_branch.damping.values <= 100.0].all()),
+        "first": " > ".join(f"{force:.1f}" for force in first_forces.values()),
+        "falls": first_forces[50.0] > first_forces[100.0] > first_forces[200.0] > 0.0,
     }
 
 
 # fmt: off
-TYPICAL_GAIT = Group("Typical gait, Table 1, slope 0.30 rad", _of_table_1, (
+TYPICAL_GAIT_CLAIMS = ClaimGroup("Typical gait, Table 1, slope 0.30 rad", _compute_typical_gait_numbers, (
     Claim("the gait is stable and of period 1", "§4, Fig. 6", "stable, period 1",
           "changes shrink by {shrink:.3f} a step, to {change:.0e}",
-          lambda n: n.settled, f"settled: below {SETTLED:g}, ten times a step's error"),
-    Claim("angle just after landing", CODE, "θ⁺ = −0.68267 rad",
-          "{theta:.5f} rad", near(theta=(-0.68267, 5e-6))),
-    Claim("angular rate just after landing", CODE, "1.04920 rad/s",
-          "{dtheta:.5f} rad/s", near(dtheta=(1.04920, 5e-6))),
-    Claim("step period", CODE, "0.8170 s", "{period:.4f} s", near(period=(0.8170, 5e-5))),
-    Claim("walking speed", CODE, "0.8700 m/s", "{speed:.4f} m/s", near(speed=(0.8700, 5.001e-5))),
+          lambda n: n.settled, f"settled: below {SETTLED_TOLERANCE:g}, ten times a step's error"),
+    Claim("angle just after landing", REFERENCE_CODE_LABEL, "θ⁺ = −0.68267 rad",
+          "{theta:.5f} rad", agrees_within(theta=(-0.68267, 5e-6))),
+    Claim("angular rate just after landing", REFERENCE_CODE_LABEL, "1.04920 rad/s",
+          "{dtheta:.5f} rad/s", agrees_within(dtheta=(1.04920, 5e-6))),
+    Claim("step period", REFERENCE_CODE_LABEL, "0.8170 s", "{period:.4f} s", agrees_within(period=(0.8170, 5e-5))),
+    Claim("walking speed", REFERENCE_CODE_LABEL, "0.8700 m/s", "{speed:.4f} m/s", agrees_within(speed=(0.8700, 5.001e-5))),
     Claim("DLS takes about 53 % of the cycle", "§4 (c)", "about 53 %",
-          "{share:.2f} %", near(share=(53.0, 0.5)),
+          "{share:.2f} %", agrees_within(share=(53.0, 0.5)),
           "half a per cent: published as a whole number"),
-    Claim("DLS share to four digits", CODE, "53.15 %", "{share:.2f} %", near(share=(53.15, 5e-3))),
-    Claim("durations of DLS, SLS-I, SLS-II", CODE, "0.4343, 0.3330, 0.0497 s",
+    Claim("DLS share to four digits", REFERENCE_CODE_LABEL, "53.15 %", "{share:.2f} %", agrees_within(share=(53.15, 5e-3))),
+    Claim("durations of DLS, SLS-I, SLS-II", REFERENCE_CODE_LABEL, "0.4343, 0.3330, 0.0497 s",
           "{durations[0]:.4f}, {durations[1]:.4f}, {durations[2]:.4f} s",
-          near(durations=((0.4343, 0.3330, 0.0497), 5e-5))),
+          agrees_within(durations=((0.4343, 0.3330, 0.0497), 5e-5))),
     Claim("θ grows throughout the stance phases", "§4 (a), Fig. 6(a)", "θ̇ > 0",
-          "least θ̇ = {least_rate:.3f} rad/s", lambda n: n.least_rate > 0.0, SIGN),
+          "least θ̇ = {least_rate:.3f} rad/s", lambda n: n.least_rate > 0.0, SIGN_REASON),
     Claim("Leg 1 only contracts after landing", "§4 (b), Fig. 6(b)", "L̇1 < 0",
-          "largest L̇1 = {fore_rate:.3f} m/s", lambda n: n.fore_rate < 0.0, SIGN),
+          "largest L̇1 = {fore_rate:.3f} m/s", lambda n: n.fore_rate < 0.0, SIGN_REASON),
     Claim("Leg 2 only extends, then meets its stopper", "§4 (b), Fig. 6(b)",
           "L̇2 > 0, then L2 = L0",
           "least L̇2 = {rear_rate:.3f} m/s, then L2 = {rear_length:.6f} m",
-          lambda n: n.rear_rate > 0.0 and n.off_stopper <= ROUND_OFF,
+          lambda n: n.rear_rate > 0.0 and n.off_stopper <= STEP_ERROR_TOLERANCE,
           "a sign; L2 to the error of a step, 1e-9 m"),
     Claim("the load shifts from Leg 2 to Leg 1 soon after the landing", "§4 (c), Fig. 6(e)",
           "rear to fore",
@@ -117,7 +119,7 @@ TYPICAL_GAIT = Group("Typical gait, Table 1, slope 0.30 rad", _of_table_1, (
           lambda n: n.most_rear < 50.0 and abs(n.last_rear) < 1e-6 and n.load_grows,
           "Leg 1 carries more than half throughout, λ2 grows; 1e-6: the event's accuracy"),
     Claim("λ2 jumps from DLS to SLS-I", "Fig. 6(e); numbers: independent code", "145.1 → 137.7 N",
-          "{jump[0]:.1f} → {jump[1]:.1f} N", near(jump=((145.1, 137.7), 0.05))),
+          "{jump[0]:.1f} → {jump[1]:.1f} N", agrees_within(jump=((145.1, 137.7), 0.05))),
     Claim("because λ3 jumps from nonzero to zero", "§4, Fig. 6(e)", "nonzero → 0",
           "{tangential[0]:.1f} → {tangential[1]:.1f} N",
           lambda n: abs(n.tangential[0]) > 1.0 and n.tangential[1] == 0.0,
@@ -126,181 +128,185 @@ TYPICAL_GAIT = Group("Typical gait, Table 1, slope 0.30 rad", _of_table_1, (
           "{peaks}, of {peak:.1f} N", lambda n: n.peaks == 1,
           "smooth maxima of λ2 inside phases; jumps are no peaks"),
     Claim("foot 2 only rises after collision II", "§4 (d), Fig. 8", "ż2 > 0",
-          "least rise between samples {rise:.2f} mm", lambda n: n.rise > 0.0, SIGN),
+          "least rise between samples {rise:.2f} mm", lambda n: n.rise > 0.0, SIGN_REASON),
     Claim("mechanical energy falls monotonically", "§3.5, eq. (29)", "Ė ≤ 0",
           "largest change between samples {energy_rise:.0e} J, "
           "{energy_lost:.1f} J lost between landings",
-          lambda n: n.energy_rise < ROUND_OFF, "1e-9 J of rounding on some 100 J"),
+          lambda n: n.energy_rise < STEP_ERROR_TOLERANCE, "1e-9 J of rounding on some 100 J"),
 ))
 
-THREE_DAMPINGS = Group("Foot 2 and rear force for three dampings", _of_three_dampings, (
+DAMPING_CLAIMS = ClaimGroup("Foot 2 and rear force for three dampings", _compute_damping_numbers, (
     Claim("foot 2 scuffs in SLS-I at c = 50 and 100, not at 200", "§4, Fig. 8",
           "scuffs, scuffs, clear", "{lowest}",
           lambda n: n.below == {50.0: True, 100.0: True, 200.0: False},
           "lowest point of foot 2; the foot on the ground is 0 to 1e-9 m"),
-    Claim("scuffs up to c = 100, clear from 120 on", CODE, "100 < limit < 120",
-          "scuffs up to c = {last:.0f}", lambda n: n.all_below and 100.0 <= n.last < 120.0,
+    Claim("scuffs up to c = 100, clear from 120 on", REFERENCE_CODE_LABEL, "100 < limit < 120",
+          "scuffs up to c = {last:.0f}", lambda n: n.all_below and 100.0 <= n.previous_h < 120.0,
           "whole numbers of c"),
     Claim("λ4 just after landing falls as c grows", "§4, Fig. 9", "nearer to zero with c",
-          "{first} N", lambda n: n.falls, SIGN),
+          "{first} N", lambda n: n.falls, SIGN_REASON),
 ))
 # fmt: on
 
 
-def _along_damping(e: Evidence) -> Numbers:
+def _compute_indicator_numbers(e: Evidence) -> NumbersByName:
     """Return numbers of the indicators along the damping."""
-    branch = e.branch
-    regular = branch.sel(damping=slice(1.0, 219.0))
-    beyond = branch.sel(damping=slice(220.0, None))
-    at = lambda c, name: float(branch[name].sel(damping=c))
-    impulse = regular.lambda_I4.values
-    both = np.array([printed.landing(e.params, x).impulse for x in regular.section_state.values])
-    rear = {c: at(c, "lambda_4_plus") for c in (1.0, 218.0, 219.0)}
-    walks_on = bool((beyond.outcome == Outcome.STEPPED).all())
+    branch = e.damping_branch
+    lower_branch = branch.sel(damping=slice(1.0, 219.0))
+    upper_branch = branch.sel(damping=slice(220.0, None))
+    value_at = lambda c, name: float(branch[name].sel(damping=c))
+    impulse = lower_branch.lambda_I4.values
+    impulses = np.array(
+        [printed.compute_landing(e.params, x).impulse for x in lower_branch.section_state.values]
+    )
+    rear = {c: value_at(c, "lambda_4_plus") for c in (1.0, 218.0, 219.0)}
+    walks_on = bool((upper_branch.outcome == Outcome.STEPPED).all())
     return {
-        "n_settled": int(regular.settled.sum()),
-        "n": regular.sizes["damping"],
+        "n_settled": int(lower_branch.settled.sum()),
+        "n": lower_branch.sizes["damping"],
         "rear": (rear[1.0], rear[219.0], 2 * rear[219.0] - rear[218.0]),
         "last_rear": rear[219.0],
-        "rear_falls": bool((np.diff(regular.lambda_4_plus) < 0.0).all()),
-        "fore": (at(219.0, "lambda_2_plus"), at(1.0, "lambda_2_plus")),
-        "fore_5": at(5.0, "lambda_2_plus"),
-        "fore_4": at(4.0, "lambda_2_plus"),
-        "fore_grows": bool((np.diff(regular.lambda_2_plus) > 0.0).all()),
+        "rear_falls": bool((np.diff(lower_branch.lambda_4_plus) < 0.0).all()),
+        "fore": (value_at(219.0, "lambda_2_plus"), value_at(1.0, "lambda_2_plus")),
+        "fore_5": value_at(5.0, "lambda_2_plus"),
+        "fore_4": value_at(4.0, "lambda_2_plus"),
+        "fore_grows": bool((np.diff(lower_branch.lambda_2_plus) > 0.0).all()),
         "least": impulse.min(),
         "most": impulse.max(),
-        "fore_impulse": (both[:, 1].min(), both[:, 1].max()),
+        "fore_impulse": (impulses[:, 1].min(), impulses[:, 1].max()),
         "smallest": [
-            min(at(c, name) for name in ("lambda_I4", "lambda_2_plus", "lambda_4_plus"))
+            min(value_at(c, name) for name in ("lambda_I4", "lambda_2_plus", "lambda_4_plus"))
             for c in (50.0, 100.0, 200.0)
         ],
         "walks_on": walks_on,
         "yes_or_no": "yes" if walks_on else "no",
-        "never_settles": not bool(beyond.settled.any()),
-        "change": float(beyond.change.min()),
-        "end": float(beyond.damping.max()),
-        "share": 100 * at(219.0, "dls_fraction"),
-        "too_fast": e.too_fast.outcome,
-        "too_fast_ends": str(e.too_fast.outcome).lower().replace("_", " "),
+        "never_settles": not bool(upper_branch.settled.any()),
+        "change": float(upper_branch.change.min()),
+        "end": float(upper_branch.damping.max()),
+        "share": 100 * value_at(219.0, "dls_fraction"),
+        "too_fast": e.fast_start_walk.outcome,
+        "too_fast_ends": str(e.fast_start_walk.outcome).lower().replace("_", " "),
     }
 
 
 # fmt: off
-INDICATORS = Group("DLS indicators over c, slope 0.30 rad", _along_damping, (
+INDICATOR_CLAIMS = ClaimGroup("DLS indicators over c, slope 0.30 rad", _compute_indicator_numbers, (
     Claim("a period-1 gait stands at every whole c up to 219", "§5.2, Fig. 10",
           "1 … 219 (from 5 on with λ2⁺ ≥ 0)", "{n_settled} of {n} settled",
-          lambda n: n.n_settled == n.n, f"change per step below {SETTLED:g}"),
+          lambda n: n.n_settled == n.n, f"change per step below {SETTLED_TOLERANCE:g}"),
     Claim("λ4⁺ falls monotonically with c", "§5.2, Fig. 10(b)", "monotone",
-          "{rear[0]:.1f} … {rear[1]:.2f} N", lambda n: n.rear_falls, SIGN),
+          "{rear[0]:.1f} … {rear[1]:.2f} N", lambda n: n.rear_falls, SIGN_REASON),
     Claim("λ4⁺ is gone at c = 220", "§5.2, Fig. 10(b)", "0 at 220",
           "{rear[1]:+.2f} N at 219, on the line through the last two {rear[2]:+.2f} N at 220",
           lambda n: n.rear[1] > 0.0 > n.rear[2], "a sign on the integer grid of c"),
-    Claim("λ4⁺ at c = 219", CODE, "+0.40 N", "{last_rear:+.3f} N", near(last_rear=(0.40, 5e-3))),
+    Claim("λ4⁺ at c = 219", REFERENCE_CODE_LABEL, "+0.40 N", "{last_rear:+.3f} N", agrees_within(last_rear=(0.40, 5e-3))),
     Claim("λ2⁺ falls monotonically as c falls", "§5.2, Fig. 10(b)", "monotone",
-          "{fore[0]:.1f} … {fore[1]:.2f} N", lambda n: n.fore_grows, SIGN),
+          "{fore[0]:.1f} … {fore[1]:.2f} N", lambda n: n.fore_grows, SIGN_REASON),
     Claim("λ2⁺ is gone at c = 4", "§5.2, Fig. 10(b)", "0 at 4",
           "{fore_5:+.2f} N at 5, {fore_4:+.2f} N at 4",
           lambda n: n.fore_5 > 0.0 >= n.fore_4, "a sign on the integer grid of c"),
-    Claim("λ2⁺ at c = 5 and 4", CODE, "+0.19, −0.36 N", "{fore_5:+.3f}, {fore_4:+.3f} N",
-          near(fore_5=(0.19, 5e-3), fore_4=(-0.36, 5e-3))),
+    Claim("λ2⁺ at c = 5 and 4", REFERENCE_CODE_LABEL, "+0.19, −0.36 N", "{fore_5:+.3f}, {fore_4:+.3f} N",
+          agrees_within(fore_5=(0.19, 5e-3), fore_4=(-0.36, 5e-3))),
     Claim("λ_I4 is always positive", "§5.2, Fig. 10(a)", "> 0",
-          "{least:.2f} … {most:.2f} N·s", lambda n: n.least > 0.0, SIGN),
-    Claim("range of λ_I4", CODE, "1.82 … 2.14 N·s", "{least:.2f} … {most:.2f} N·s",
-          near(least=(1.82, 0.02), most=(2.14, 5e-3)),
+          "{least:.2f} … {most:.2f} N·s", lambda n: n.least > 0.0, SIGN_REASON),
+    Claim("range of λ_I4", REFERENCE_CODE_LABEL, "1.82 … 2.14 N·s", "{least:.2f} … {most:.2f} N·s",
+          agrees_within(least=(1.82, 0.02), most=(2.14, 5e-3)),
           "0.02 at the lower end, which depends on the least c (1.81 at 1, 1.84 at 5)"),
     Claim("λ_I2 > 0 always", "§5.1 (A2)", "> 0",
           "{fore_impulse[0]:.1f} … {fore_impulse[1]:.1f} N·s",
-          lambda n: n.fore_impulse[0] > 0.0, SIGN),
+          lambda n: n.fore_impulse[0] > 0.0, SIGN_REASON),
     Claim("all indicators are positive at c = 50, 100, 200", "§5.2", "> 0",
           "least of λ_I4, λ2⁺, λ4⁺: {smallest[0]:.2f}, {smallest[1]:.2f}, {smallest[2]:.2f}",
-          lambda n: min(n.smallest) > 0.0, SIGN),
+          lambda n: min(n.smallest) > 0.0, SIGN_REASON),
     Claim("from c = 220 on it walks, but not with period 1", "§5.2", "stable, not 1-period",
           "walks on: {yes_or_no}; change per step {change:.1g} or more, at c = 220 … {end:.0f}",
-          lambda n: n.walks_on and n.never_settles and n.change > 1e-4,
+          lambda n: n.walks_on and n.never_settles and n.newton_correction > 1e-4,
           "1e-4: ten thousand times the change that counts as settled"),
-    Claim("the loss is abrupt: DLS does not shrink to nothing as λ4⁺ → 0", CODE, "53 %",
-          "{share:.1f} % at c = 219", near(share=(53.0, 0.5)),
+    Claim("the loss is abrupt: DLS does not shrink to nothing as λ4⁺ → 0", REFERENCE_CODE_LABEL, "53 %",
+          "{share:.1f} % at c = 219", agrees_within(share=(53.0, 0.5)),
           "half a per cent: published as a whole number"),
-    Claim("at c = 200 the basin is small: a start with 2 rad/s falls out of the sequence", CODE,
+    Claim("at c = 200 the basin is small: a start with 2 rad/s falls out of the sequence", REFERENCE_CODE_LABEL,
           "touchdown before Leg 2 is back", "{too_fast_ends}",
-          lambda n: n.too_fast == Outcome.TOUCHDOWN_BEFORE_STOPPER.name, "an outcome"),
+          lambda n: n.fast_start_walk == Outcome.TOUCHDOWN_BEFORE_STOPPER.name, "an outcome"),
 ))
 # fmt: on
 
 
-def _premises_of_table_1(e: Evidence) -> Numbers:
+def _compute_assumption_numbers(e: Evidence) -> NumbersByName:
     """Return numbers of the assumptions of the model at Table 1."""
-    one, step = e.table_1, first_step(e.gait)
-    dls, *_ = by_phase(step)
-    natural, locked = float(e.params.natural_length), float(e.params.locked_length)
-    impulses = one.landing_stopper_impulse.values / float(e.params.leg_mass)
-    thrown = np.sort(impulses[impulses < 0.0])
-    impulse = printed.landing(e.params, one.section_state.values).impulse
-    needed = np.abs(dls.lambda_3.values[:-1] / dls.lambda_4.values[:-1])
+    gait, step = e.table_1_gait, select_first_step(e.table_1_trajectory)
+    dls, *_ = split_by_phase(step)
+    natural_length, locked_length = float(e.params.natural_length), float(e.params.locked_length)
+    impulses = gait.landing_stopper_impulse.values / float(e.params.leg_mass)
+    separation_speeds = np.sort(impulses[impulses < 0.0])
+    impulse = printed.compute_landing(e.params, gait.section_state.values).impulse
+    needed_friction = np.abs(dls.lambda_3.values[:-1] / dls.lambda_4.values[:-1])
     phases = step.phase.values
-    order = [PHASES[int(p)] for p in phases[np.r_[0, np.flatnonzero(np.diff(phases)) + 1]]]
+    order = [PHASE_NAMES[int(p)] for p in phases[np.r_[0, np.flatnonzero(np.diff(phases)) + 1]]]
     names = ("fore_foot_force", "rear_stopper_force", "energy_lost_landing", "hit_planted_impulse")
-    return {name: float(one[name]) for name in names} | {
+    return {name: float(gait[name]) for name in names} | {
         "rear_force": float(dls.lambda_4[:-1].min()),
         "last_rear_force": abs(float(dls.lambda_4[-1])),
-        "clearance": min(float(one.clearance_sls1), float(one.clearance_sls2)),
-        "locked_force": float(one.locked_stopper_force.min()),
-        "preload": float(e.params.stiffness) * (natural - locked),
-        "contraction": locked - float(step.L1[1:].max()),
+        "clearance": min(float(gait.clearance_sls1), float(gait.clearance_sls2)),
+        "locked_force": float(gait.locked_stopper_force.min()),
+        "preload": float(e.params.stiffness) * (natural_length - locked_length),
+        "contraction": locked_length - float(step.L1[1:].max()),
         "order": " → ".join(order),
-        "back_in_time": order == list(PHASES) and float(dls.L2.max()) < locked,
+        "back_in_time": order == list(PHASE_NAMES) and float(dls.L2.max()) < locked_length,
         "friction_fore": float(np.abs(step.lambda_1 / step.lambda_2).max()),
-        "friction_rear": needed[0],
-        "friction_last": needed[-1],
+        "friction_rear": needed_friction[0],
+        "friction_last": needed_friction[-1],
         "last_tangential": float(dls.lambda_3[-1]),
         "in_landing_rear": abs(impulse[2]) / impulse[3],
         "in_landing_fore": abs(impulse[0]) / impulse[1],
-        "thrown": (thrown[-1], thrown[0]) if thrown.size else (np.nan, np.nan),
-        "n_thrown": thrown.size,
-        "thrown_off": f"{thrown.size} of {impulses.size}, {thrown[-1]:.2f} … {thrown[0]:.2f} m/s"
-        if thrown.size
+        "thrown": (separation_speeds[-1], separation_speeds[0])
+        if separation_speeds.size
+        else (np.nan, np.nan),
+        "n_thrown": separation_speeds.size,
+        "thrown_off": f"{separation_speeds.size} of {impulses.size}, {separation_speeds[-1]:.2f} … {separation_speeds[0]:.2f} m/s"
+        if separation_speeds.size
         else "none",
     }
 
 
 # fmt: off
-PREMISES = Group(
-    "Premises of the model at Table 1 (what it assumes without saying)", _premises_of_table_1, (
-    Claim("Leg 1 pushes on the ground: least λ2", CODE, "103.9 N",
-          "{fore_foot_force:.1f} N", near(fore_foot_force=(103.9, 0.05))),
-    Claim("Leg 2 pushes in DLS: least λ4", CODE, "≥ 0, 0 at its end",
+ASSUMPTION_CLAIMS = ClaimGroup(
+    "Premises of the model at Table 1 (what it assumes without saying)", _compute_assumption_numbers, (
+    Claim("Leg 1 pushes on the ground: least λ2", REFERENCE_CODE_LABEL, "103.9 N",
+          "{fore_foot_force:.1f} N", agrees_within(fore_foot_force=(103.9, 0.05))),
+    Claim("Leg 2 pushes in DLS: least λ4", REFERENCE_CODE_LABEL, "≥ 0, 0 at its end",
           "{rear_force:.2f} N before the end, {last_rear_force:.0e} N there",
           lambda n: n.rear_force > 0.0 and n.last_rear_force < 1e-6,
           "1e-6 N: the event's accuracy"),
-    Claim("the swinging foot stays clear", CODE, "≥ 0",
-          "{clearance:.3f} m at its first minimum", lambda n: n.clearance >= 0.0, SIGN),
-    Claim("stopper force of the six locked legs, of 10 N preload", CODE,
+    Claim("the swinging foot stays clear", REFERENCE_CODE_LABEL, "≥ 0",
+          "{clearance:.3f} m at its first minimum", lambda n: n.clearance >= 0.0, SIGN_REASON),
+    Claim("stopper force of the six locked legs, of 10 N preload", REFERENCE_CODE_LABEL,
           "0.95 N: near the edge", "{locked_force:.3f} N of {preload:.0f} N",
-          near(locked_force=(0.95, 0.02), preload=(10.0, ROUND_OFF)),
+          agrees_within(locked_force=(0.95, 0.02), preload=(10.0, STEP_ERROR_TOLERANCE)),
           "0.02 N: a least value read off samples lies above the one located here"),
-    Claim("stopper force of Leg 2 in SLS-II", CODE, "17 N",
-          "{rear_stopper_force:.2f} N", near(rear_stopper_force=(17.0, 0.5))),
-    Claim("Leg 1 stays below L0 after landing", CODE, "L0 − L1 ≥ 0",
-          "{contraction:.4f} m after the first sample", lambda n: n.contraction > 0.0, SIGN),
-    Claim("Leg 2 is back at L0 before touchdown, and not yet there in DLS", CODE, "holds",
+    Claim("stopper force of Leg 2 in SLS-II", REFERENCE_CODE_LABEL, "17 N",
+          "{rear_stopper_force:.2f} N", agrees_within(rear_stopper_force=(17.0, 0.5))),
+    Claim("Leg 1 stays below L0 after landing", REFERENCE_CODE_LABEL, "L0 − L1 ≥ 0",
+          "{contraction:.4f} m after the first sample", lambda n: n.contraction > 0.0, SIGN_REASON),
+    Claim("Leg 2 is back at L0 before touchdown, and not yet there in DLS", REFERENCE_CODE_LABEL, "holds",
           "{order}", lambda n: n.back_in_time, "the order of events"),
-    Claim("friction that Leg 1 needs", CODE, "0.61",
-          "{friction_fore:.3f}", near(friction_fore=(0.61, 5e-3))),
-    Claim("friction that Leg 2 needs just after landing", CODE, "14.2",
-          "{friction_rear:.2f}", near(friction_rear=(14.2, 0.05))),
-    Claim("and without bound as λ4 → 0", CODE, "λ3 does not vanish with λ4",
+    Claim("friction that Leg 1 needs", REFERENCE_CODE_LABEL, "0.61",
+          "{friction_fore:.3f}", agrees_within(friction_fore=(0.61, 5e-3))),
+    Claim("friction that Leg 2 needs just after landing", REFERENCE_CODE_LABEL, "14.2",
+          "{friction_rear:.2f}", agrees_within(friction_rear=(14.2, 0.05))),
+    Claim("and without bound as λ4 → 0", REFERENCE_CODE_LABEL, "λ3 does not vanish with λ4",
           "λ3 = {last_tangential:.1f} N at the end of DLS; {friction_last:.0f} one sample before",
           lambda n: abs(n.last_tangential) > 1.0 and n.friction_last > 14.2,
           "λ3 above 1 N where λ4 is 0"),
-    Claim("friction needed in the landing impulse, rear and fore foot", CODE, "9.7 and 1.10",
+    Claim("friction needed in the landing impulse, rear and fore foot", REFERENCE_CODE_LABEL, "9.7 and 1.10",
           "{in_landing_rear:.2f} and {in_landing_fore:.3f}",
-          near(in_landing_rear=(9.7, 0.05), in_landing_fore=(1.10, 5e-3))),
-    Claim("energy lost in the landing", CODE, "7.58 J",
-          "{energy_lost_landing:.3f} J", near(energy_lost_landing=(7.58, 5e-3))),
-    Claim("the landing throws four of the six locked legs off their stoppers", CODE,
+          agrees_within(in_landing_rear=(9.7, 0.05), in_landing_fore=(1.10, 5e-3))),
+    Claim("energy lost in the landing", REFERENCE_CODE_LABEL, "7.58 J",
+          "{energy_lost_landing:.3f} J", agrees_within(energy_lost_landing=(7.58, 5e-3))),
+    Claim("the landing throws four of the six locked legs off their stoppers", REFERENCE_CODE_LABEL,
           "−0.24 … −0.86 m/s", "{thrown_off}",
-          near(n_thrown=(4, 0), thrown=((-0.24, -0.86), 5e-3))),
-    Claim("collision II asks the planted foot for a slightly negative impulse", CODE,
-          "−4e-4 N·s", "{hit_planted_impulse:.1e} N·s", near(hit_planted_impulse=(-4e-4, 5e-5))),
+          agrees_within(n_thrown=(4, 0), thrown=((-0.24, -0.86), 5e-3))),
+    Claim("collision II asks the planted foot for a slightly negative impulse", REFERENCE_CODE_LABEL,
+          "−4e-4 N·s", "{hit_planted_impulse:.1e} N·s", agrees_within(hit_planted_impulse=(-4e-4, 5e-5))),
 ))
 # fmt: on

@@ -5,53 +5,66 @@ import math
 import numpy as np
 
 from vrw_jax.paper.facts import printed
-from vrw_jax.paper.facts.base import ROUND_OFF, Claim, Evidence, Group, Numbers, near
+from vrw_jax.paper.facts.base import (
+    STEP_ERROR_TOLERANCE,
+    Claim,
+    ClaimGroup,
+    Evidence,
+    NumbersByName,
+    agrees_within,
+)
 from vrw_jax.wheel import Outcome
 
 
-def _printed_and_mended(e: Evidence) -> Numbers:
+def _compute_misprint_numbers(e: Evidence) -> NumbersByName:
     """Return numbers of the equations as printed and as corrected."""
-    state, here = e.table_1.section_state.values, float(e.table_1.lambda_I4)
-    landing = printed.landing(e.params, state)
-    reference = printed.landing_foot_velocity_by_differences(e.params, state)
-    off = lambda rate: float(
-        np.abs(printed.landing_foot_velocity(e.params, state, rate) - reference).max()
+    state, library_impulse = e.table_1_gait.section_state.values, float(e.table_1_gait.lambda_I4)
+    landing = printed.compute_landing(e.params, state)
+    reference = printed.differentiate_landing_foot_position(e.params, state)
+    velocity_error = lambda rate: float(
+        np.abs(printed.compute_landing_foot_velocity(e.params, state, rate) - reference).max()
     )
-    slow = e.gentler.sel(slope=0.10, method="nearest")
-    walking = e.gentle.settled.values
+    gentle_gait = e.slope_branch.sel(slope=0.10, method="nearest")
+    is_settled = e.gentle_slope_branch.settled.values
     return {
-        "wrong": printed.constraint_violation(e.gait, as_printed=True),
-        "right": printed.constraint_violation(e.gait, as_printed=False),
-        "residual": landing.residual,
-        "velocities": bool(np.array_equal(landing.printed, landing.after)),
+        "wrong": printed.compute_constraint_violation(e.table_1_trajectory, is_as_printed=True),
+        "right": printed.compute_constraint_violation(e.table_1_trajectory, is_as_printed=False),
+        "residual": landing.momentum_residual,
+        "velocities": bool(np.array_equal(landing.printed_impulse, landing.velocity_after)),
         "impulse": landing.impulse[3],
-        "here": here,
-        "off": abs(landing.impulse[3] - here),
-        "off_new": off(0.0),
-        "off_old": off(float(state[2])),
-        "slow_settled": bool(slow.settled),
-        "share": 100.0 * float(slow.dls_fraction),
-        "period": float(slow.period),
-        "rear": float(e.gentle.lambda_4_plus.values[walking].min()) if walking.any() else math.nan,
-        "last": float(e.gentle.damping.values[walking].max()) if walking.any() else math.nan,
-        "end": float(e.gentle.damping.max()),
-        "end_walks": walking[-1],
-        "end_outcome": Outcome(int(e.gentle.outcome.values[-1])).name.lower().replace("_", " "),
-        "low": float(e.gentle_low.lambda_2_plus.sel(damping=4.0)),
-        "low_settled": bool(e.gentle_low.settled.sel(damping=4.0)),
+        "here": library_impulse,
+        "off": abs(landing.impulse[3] - library_impulse),
+        "off_new": velocity_error(0.0),
+        "off_old": velocity_error(float(state[2])),
+        "slow_settled": bool(gentle_gait.settled),
+        "share": 100.0 * float(gentle_gait.dls_fraction),
+        "period": float(gentle_gait.period),
+        "rear": float(e.gentle_slope_branch.lambda_4_plus.values[is_settled].min())
+        if is_settled.any()
+        else math.nan,
+        "last": float(e.gentle_slope_branch.damping.values[is_settled].max())
+        if is_settled.any()
+        else math.nan,
+        "end": float(e.gentle_slope_branch.damping.max()),
+        "end_walks": is_settled[-1],
+        "end_outcome": Outcome(int(e.gentle_slope_branch.outcome.values[-1]))
+        .name.lower()
+        .replace("_", " "),
+        "low": float(e.gentle_slope_low_damping_branch.lambda_2_plus.sel(damping=4.0)),
+        "low_settled": bool(e.gentle_slope_low_damping_branch.settled.sel(damping=4.0)),
     }
 
 
 # fmt: off
-MISPRINTS = Group("Misprints of the paper, with the evidence", _printed_and_mended, (
+MISPRINT_CLAIMS = ClaimGroup("Misprints of the paper, with the evidence", _compute_misprint_numbers, (
     Claim("eq. (11): J43 must be −L1 sin θ + L2 sin(θ+α)", "eq. (11)", "−L1 sin θ − L2 sin(θ+α)",
           "J q̇ reaches {wrong:.2f} m/s as printed, {right:.0e} mended (must be 0)",
-          lambda n: n.wrong > 0.1 and n.right < 1e-12,
+          lambda n: n.violation > 0.1 and n.right < 1e-12,
           "1e-12 m/s: rounding; as printed far from it"),
     Claim("eq. (35): the impulse is −X⁻¹ J q̇†", "eq. (35)", "the projector of eq. (20)",
           "as printed five numbers, eq. (20)'s velocities; mended M Δq̇ = Jᵀ λ_I to "
           "{residual:.0e} N·s, λ_I4 = {impulse:.4f}, here {here:.4f} N·s",
-          lambda n: n.velocities and n.residual < 1e-10 and n.off <= ROUND_OFF,
+          lambda n: n.velocities and n.residual < 1e-10 and n.off <= STEP_ERROR_TOLERANCE,
           "1e-10 N·s: rounding; λ_I4 to the error of a step"),
     Claim("eqs (16), (17): the bare L̇1 is L̇1⁻", "eqs (16), (17)", "L̇1",
           "landing foot's velocity off by {off_old:.0e} m/s with L̇1⁻, "
@@ -61,7 +74,7 @@ MISPRINTS = Group("Misprints of the paper, with the evidence", _printed_and_mend
     Claim("§5.2 prints φ = 0.10 for Fig. 10: there gaits are nearly at rest", "§5.2",
           "c = 100: 96 % DLS, T ≈ 4.5 s (independent code)",
           "{share:.1f} % DLS, T = {period:.2f} s",
-          lambda n: n.slow_settled and near(share=(96.0, 0.5), period=(4.5, 0.05))(n)),
+          lambda n: n.slow_settled and agrees_within(share=(96.0, 0.5), period=(4.5, 0.05))(n)),
     Claim("and λ4⁺ does not vanish at c = 220 at φ = 0.10", "§5.2",
           "0 at 220 (at φ = 0.30 it is)",
           "λ4⁺ ≥ {rear:.0f} N up to c = {last:.0f}; at c = {end:.0f}: {end_outcome}",

@@ -8,9 +8,14 @@ from dataclasses import asdict
 from pathlib import Path
 
 from vrw_jax.paper.facts.base import Evidence, Fact
-from vrw_jax.paper.facts.claims import INDICATORS, PREMISES, THREE_DAMPINGS, TYPICAL_GAIT
-from vrw_jax.paper.facts.misprints import MISPRINTS
-from vrw_jax.wording import as_markdown
+from vrw_jax.paper.facts.claims import (
+    ASSUMPTION_CLAIMS,
+    DAMPING_CLAIMS,
+    INDICATOR_CLAIMS,
+    TYPICAL_GAIT_CLAIMS,
+)
+from vrw_jax.paper.facts.misprints import MISPRINT_CLAIMS
+from vrw_jax.wording import format_markdown_table
 
 INTRODUCTION = (
     "“independent code” is a solver in the paper's own five constrained coordinates: where the "
@@ -18,34 +23,44 @@ INTRODUCTION = (
     "half a unit of the last digit published unless the row gives another reason."
 )
 
-GROUPS = (TYPICAL_GAIT, THREE_DAMPINGS, INDICATORS, PREMISES, MISPRINTS)
+CLAIM_GROUPS = (
+    TYPICAL_GAIT_CLAIMS,
+    DAMPING_CLAIMS,
+    INDICATOR_CLAIMS,
+    ASSUMPTION_CLAIMS,
+    MISPRINT_CLAIMS,
+)
 
 
-def all_facts(evidence: Evidence) -> list[Fact]:
+def compute_facts(evidence: Evidence) -> list[Fact]:
     """Return the facts of all groups."""
-    return [fact for group in GROUPS for fact in group.facts(evidence)]
+    return [fact for group in CLAIM_GROUPS for fact in group.make_facts(evidence)]
 
 
-def _cell(text: str) -> str:
+def _format_cell(text: str) -> str:
     """Return text with minus signs in place of hyphens before numbers."""
     return re.sub(r"(?<![\w.])-(?=\d)", "−", text)
 
 
-def held(table: Sequence[Fact]) -> str:
+def summarize_facts(facts: Sequence[Fact]) -> str:
     """Return a sentence on how many facts hold and where their numbers come from."""
-    n, by_code = len(table), sum(fact.by_code for fact in table)
-    by_whom = f"{n - by_code} that the paper publishes, {by_code} by independent code"
-    return f"{sum(fact.holds for fact in table)} of {n} hold: {by_whom}"
+    n, n_by_code = len(facts), sum(fact.is_from_reference_code for fact in facts)
+    sources_text = f"{n - n_by_code} that the paper publishes, {n_by_code} by independent code"
+    return f"{sum(fact.holds for fact in facts)} of {n} hold: {sources_text}"
 
 
-def as_page(table: Sequence[Fact]) -> str:
+def format_facts_page(facts: Sequence[Fact]) -> str:
     """Return the table as a page of Markdown."""
-    missing = [fact for fact in table if not fact.holds]
+    failed_facts = [fact for fact in facts if not fact.holds]
     lines = [
         "# The paper's facts, published against found",
         "",
-        f"{held(table)}."
-        + ("" if not missing else " Not: " + "; ".join(fact.claim for fact in missing) + "."),
+        f"{summarize_facts(facts)}."
+        + (
+            ""
+            if not failed_facts
+            else " Not: " + "; ".join(fact.claim for fact in failed_facts) + "."
+        ),
         "",
         INTRODUCTION,
         "",
@@ -53,24 +68,31 @@ def as_page(table: Sequence[Fact]) -> str:
         "its numbers (last group). With Coulomb friction the rear foot would slip in the landing; "
         "this rung of the model holds it, as the paper does.",
     ]
-    for title, group in itertools.groupby(table, lambda fact: fact.group):
+    for title, group in itertools.groupby(facts, lambda fact: fact.group):
         rows = []
         for fact in group:
             verdict = fact.verdict if fact.holds else f"**{fact.verdict}**"
-            told = (fact.claim, fact.where, fact.published, fact.found, verdict, fact.reason)
-            rows.append([_cell(text) for text in told])
+            cells = (
+                fact.claim,
+                fact.source,
+                fact.published_value,
+                fact.computed,
+                verdict,
+                fact.tolerance_reason,
+            )
+            rows.append([_format_cell(text) for text in cells])
         header = ("fact", "where", "published", "found", "", "tolerance")
-        lines += ["", f"## {title}", "", *as_markdown(header, rows)]
+        lines += ["", f"## {title}", "", *format_markdown_table(header, rows)]
     return "\n".join(lines) + "\n"
 
 
-def write(table: Sequence[Fact], folder: Path) -> list[Path]:
+def write_facts(facts: Sequence[Fact], folder: Path) -> list[Path]:
     """Write the table as facts.md and facts.csv, and return the paths."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / "facts.md", folder / "facts.csv"]
-    paths[0].write_text(as_page(table), encoding="utf-8")
+    paths[0].write_text(format_facts_page(facts), encoding="utf-8")
     with paths[1].open("w", newline="", encoding="utf-8") as file:
-        rows = [asdict(fact) | {"holds": fact.verdict} for fact in table]
+        rows = [asdict(fact) | {"holds": fact.verdict} for fact in facts]
         writer = csv.DictWriter(file, rows[0].keys())
         writer.writeheader()
         writer.writerows(rows)
