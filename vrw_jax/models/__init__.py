@@ -1,21 +1,7 @@
 """The models of the wheel, one per file, with one interface."""
 
 from vrw_jax.models import scales
-from vrw_jax.models.base import (
-    AbstractStep,
-    AbstractWheel,
-    AdvanceResult,
-    AnySectionState,
-    DoubleSupportIndicators,
-    EnergyLoss,
-    Margins,
-    SectionState,
-    StepGround,
-    StepResult,
-    Trajectory,
-    is_valid_start,
-    replace_invalid,
-)
+from vrw_jax.models.interface import AbstractWheel, StepGround
 from vrw_jax.models.ladder import (
     SELECTION_ATTRS,
     SELECTION_MARGINS,
@@ -28,9 +14,24 @@ from vrw_jax.models.ladder import (
     refuse_ladder,
 )
 from vrw_jax.models.lane_step import N_STEP_INPUTS, gait_step, jacobian_columns
-from vrw_jax.models.paper_step import PAPER_START
 from vrw_jax.models.rigid import RigidWheel
 from vrw_jax.models.scales import scaled_jacobian_columns
+from vrw_jax.models.section_states import (
+    PAPER_START,
+    AnySectionState,
+    SectionState,
+    is_valid_start,
+    replace_invalid,
+)
+from vrw_jax.models.step_results import (
+    AbstractStep,
+    AdvanceResult,
+    DoubleSupportIndicators,
+    EnergyLoss,
+    Margins,
+    StepResult,
+    Trajectory,
+)
 from vrw_jax.models.unilateral.contacts import CONTACT_STICK
 from vrw_jax.models.unilateral.ledger import UnilateralStep, min_dip_depth
 from vrw_jax.models.unilateral.mechanics import (

@@ -16,14 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from vrw_jax.models.base import (
-    AbstractContactStep,
-    AbstractWheel,
-    AdvanceResult,
-    StepResult,
-    replace_invalid,
-)
-from vrw_jax.models.paper_step import PAPER_START
+from vrw_jax.models.interface import AbstractWheel
+from vrw_jax.models.section_states import PAPER_START, replace_invalid
+from vrw_jax.models.step_results import AbstractContactStep, AdvanceResult, StepResult
 from vrw_jax.models.unilateral.contacts import CONTACT_OFF, CONTACT_STICK
 from vrw_jax.models.unilateral.ledger import UnilateralStep
 from vrw_jax.models.unilateral.section import LOCKED_CODE_OFFSET, FullState, embed_section_state

@@ -16,14 +16,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from vrw_jax import simd
-from vrw_jax.models.base import (
-    AdvanceResult,
-    DoubleSupportIndicators,
-    EnergyLoss,
-    Margins,
-    StepResult,
-    Trajectory,
-)
 from vrw_jax.models.paper_step import (
     PhaseResult,
     PhaseSequenceResult,
@@ -31,6 +23,14 @@ from vrw_jax.models.paper_step import (
     make_step_result,
     make_trajectory,
     run_phases,
+)
+from vrw_jax.models.step_results import (
+    AdvanceResult,
+    DoubleSupportIndicators,
+    EnergyLoss,
+    Margins,
+    StepResult,
+    Trajectory,
 )
 from vrw_jax.numerics import (
     BatchFunction,

@@ -11,16 +11,14 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from vrw_jax.models.base import (
+from vrw_jax.models.section_states import PAPER_START, StateValues, is_valid_start, replace_invalid
+from vrw_jax.models.step_results import (
     AdvanceResult,
     DoubleSupportIndicators,
     EnergyLoss,
     Margins,
-    StateValues,
     StepResult,
     Trajectory,
-    is_valid_start,
-    replace_invalid,
 )
 from vrw_jax.numerics import Elementwise, Vector, sine_cosine, tree_where
 from vrw_jax.wheel import (
@@ -36,9 +34,6 @@ from vrw_jax.wheel import (
     make_phases,
     transitions,
 )
-
-PAPER_START = (0.1, 1.6, -0.1)
-"""A start near the gait of Table 1, inside its basin: rad, rad/s, m/s."""
 
 SAFE_SINGLE_SUPPORT = (-0.3, 0.9, 0.95, 1.0, 0.0, 0.0)
 """A regular posture (theta, L1, L2 and rates) in place of a wheel whose step has already failed; it

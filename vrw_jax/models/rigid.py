@@ -8,18 +8,15 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from vrw_jax.models.base import (
-    AbstractWheel,
+from vrw_jax.models.interface import AbstractWheel
+from vrw_jax.models.section_states import SectionState, StateValues, is_valid_start, replace_invalid
+from vrw_jax.models.step_results import (
     AdvanceResult,
     DoubleSupportIndicators,
     EnergyLoss,
     Margins,
-    SectionState,
-    StateValues,
     StepResult,
     Trajectory,
-    is_valid_start,
-    replace_invalid,
 )
 from vrw_jax.numerics import Elementwise, StepOptions, tree_where
 from vrw_jax.wheel import (

@@ -11,13 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from vrw_jax.models.base import (
-    AbstractWheel,
-    AdvanceResult,
-    SectionState,
-    StepResult,
-    Trajectory,
-)
+from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.lane_step import (
     build_step_function,
     build_step_jacobian,
@@ -25,7 +19,6 @@ from vrw_jax.models.lane_step import (
     can_use_lanes,
 )
 from vrw_jax.models.paper_step import (
-    PAPER_START,
     PhaseResult,
     PhaseSequenceResult,
     make_advance_result,
@@ -33,6 +26,8 @@ from vrw_jax.models.paper_step import (
     make_trajectory,
     run_phases,
 )
+from vrw_jax.models.section_states import PAPER_START, SectionState
+from vrw_jax.models.step_results import AdvanceResult, StepResult, Trajectory
 from vrw_jax.numerics import (
     ForwardFunction,
     MonitoredFunctions,

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from vrw_jax.models.base import AbstractContactStep
+from vrw_jax.models.step_results import AbstractContactStep
 from vrw_jax.models.unilateral.contacts import CONTACT_OFF, PAPER_RULE_SENTINEL, Friction
 from vrw_jax.models.unilateral.events import (
     ContactLaw,

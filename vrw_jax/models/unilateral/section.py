@@ -5,8 +5,7 @@ state.
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from vrw_jax.models.base import is_valid_start, replace_invalid
-from vrw_jax.models.paper_step import PAPER_START
+from vrw_jax.models.section_states import PAPER_START, is_valid_start, replace_invalid
 from vrw_jax.models.unilateral.contacts import CONTACT_OFF, CONTACT_STICK
 from vrw_jax.models.unilateral.mechanics import WheelMotion, leg_directions
 from vrw_jax.models.unilateral.motion import ContactState

@@ -11,9 +11,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from vrw_jax.models.base import AbstractWheel, AdvanceResult, StepGround
+from vrw_jax.models.interface import AbstractWheel, StepGround
 from vrw_jax.models.lane_step import can_use_lanes
-from vrw_jax.models.paper_step import PAPER_START
+from vrw_jax.models.section_states import PAPER_START
+from vrw_jax.models.step_results import AdvanceResult
 from vrw_jax.models.unilateral.contacts import Friction
 from vrw_jax.models.unilateral.events import ContactLaw
 from vrw_jax.models.unilateral.lanes import StepSummary

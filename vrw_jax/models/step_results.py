@@ -1,48 +1,28 @@
-"""Interface of every model: what a step takes and what it returns."""
+"""Results of one step: measures, margins, energies, and what every model returns."""
 
 import abc
-import functools
-import operator
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from vrw_jax.numerics import Elementwise, StepOptions
+from vrw_jax.models.section_states import AnySectionState
 from vrw_jax.results import MARGIN_MEASURES, MEASURES
 from vrw_jax.wheel import (
-    FRICTION_NAME,
-    MAX_SI_VALUE,
-    PARAMETER_NAMES,
     Outcome,
-    WheelParams,
-    wheel_from_parameters,
 )
 from vrw_jax.wording import (
     AbstractPrintable,
     TextRow,
     format_outcome_counts,
     format_quantity,
-    is_traced,
 )
 
-SectionState = Float[Array, "3"]
-"""(theta-, dtheta-, dL1-) just before touchdown, in the leg labels of the ending step: rad, rad/s,
-m/s. The length of Leg 1 follows from the touchdown condition; Leg 2 is on its stopper."""
-AnySectionState = Float[Array, "section ..."]
-"""A `SectionState`, or the longer one of another model; in a batch, elements are on the last
-axis."""
 MeasureValue = Float[Array, "..."]
 """One number of a step; in a batch, one number per element."""
-
-
-StepGround = tuple[Array, Array, Array, Array]
-"""Slope and friction of a landing, friction of the earlier footholds, and the tilt by which the
-ground ahead is steeper; or all of these over steps."""
 
 
 class AbstractMeasures(AbstractPrintable):
@@ -325,151 +305,3 @@ class Trajectory(eqx.Module):
     section_state: AnySectionState
     durations: Float[Array, "3 ..."]  # s
     outcome: Int[Array, "..."]  # an Outcome
-
-
-class AbstractWheel(eqx.Module):
-    """A model of the wheel. Models are final; the rest of the library uses only this interface.
-
-    `advance` and `step` compile themselves, once for each structure of their arguments.
-
-    Examples:
-        >>> isinstance(vrw.RigidWheel(), vrw.AbstractWheel)
-        True
-    """
-
-    model_name: eqx.AbstractClassVar[str]
-    """Name of the model, by which other packages look up what they hold for it."""
-    parameter_names: eqx.AbstractClassVar[tuple[str, ...]]
-    """Inputs of the motion: the wheel's parameters and, where the motion depends on it,
-    friction."""
-    reports_contacts: eqx.AbstractClassVar[bool]
-    """Whether trajectories report every leg's contact instead of the paper's phases."""
-    batch_kernel: ClassVar[str] = ""
-    """Kind of the compiled batch kernel: the paper's "phases", "legs", or "" for none."""
-    is_compliant: ClassVar[bool] = True
-    """Whether springs and dampers affect the motion; it selects what is tuned and scanned."""
-
-    def __repr__(self) -> str:
-        if is_traced(self):
-            return eqx.tree_pformat(self)
-        format_number = lambda x: repr(float(x)) if x.ndim == 0 else format_quantity(x, "")
-        format_value = lambda x: format_number(x) if eqx.is_array(x) else repr(x)
-        fields = ", ".join(f"{name}={format_value(value)}" for name, value in vars(self).items())
-        return f"{type(self).__name__}({fields})"
-
-    @property
-    def fallback_model(self) -> "AbstractWheel":
-        """Model that is valid for any start: itself, or the upper model of a ladder."""
-        return self
-
-    def parameter_values(self, params: WheelParams) -> Float[Array, " n_values"]:
-        """Return the values of `parameter_names`, for one wheel on this ground."""
-        numbers = [
-            getattr(self if name == FRICTION_NAME else params, name)
-            for name in self.parameter_names
-        ]
-        return jnp.stack([jnp.asarray(value, params.damping.dtype) for value in numbers])
-
-    def from_values(
-        self, values: Array | tuple[Array, ...], n_legs: int
-    ) -> tuple["AbstractWheel", WheelParams]:
-        """Return model and wheel with other values: the inverse of `parameter_values`; works on
-        tracers.
-        """
-        n = len(PARAMETER_NAMES)
-        model = self
-        if FRICTION_NAME in self.parameter_names:
-            model = eqx.tree_at(lambda ground: ground.friction, self, values[n])
-        return model, wheel_from_parameters(values[:n], n_legs)
-
-    def with_parameter(
-        self, params: WheelParams, name: str, value: Elementwise
-    ) -> tuple["AbstractWheel", WheelParams]:
-        """Return model and wheel with another value of one of `parameter_names`; works on
-        tracers.
-        """
-        if name == FRICTION_NAME:
-            return eqx.tree_at(lambda ground: ground.friction, self, value), params
-        return self, eqx.tree_at(lambda wheel: getattr(wheel, name), params, value)
-
-    @abc.abstractmethod
-    def advance(self, params: WheelParams, x: SectionState, options: StepOptions) -> AdvanceResult:
-        """Return one step in its minimal form. Differentiable in any mode, to any order."""
-
-    @abc.abstractmethod
-    def take_step(self, params: WheelParams, x: SectionState, options: StepOptions) -> Any:
-        """Return one step with all indicators, margins and energies. Differentiable in any mode.
-
-        The result is a `StepResult`, or the counterpart of the model.
-        """
-
-    @abc.abstractmethod
-    def sample_step(
-        self, params: WheelParams, x: SectionState, options: StepOptions, n_samples: int
-    ) -> Any:
-        """Return the motion of the step at `n_samples` times of each phase.
-
-        The result is a `Trajectory`, or the counterpart of the model.
-        """
-
-    @abc.abstractmethod
-    def default_start(self, params: WheelParams) -> SectionState:
-        """Return a section state from which a walk may begin."""
-
-    def split_ground(self, params: WheelParams, n_steps: int) -> StepGround | None:
-        """Return the ground of each of `n_steps` steps, if slope or friction are arrays over
-        steps.
-        """
-        return None
-
-    def with_ground(
-        self, params: WheelParams, ground: StepGround
-    ) -> tuple["AbstractWheel", WheelParams]:
-        """Return model and wheel on the ground of one step."""
-        raise NotImplementedError
-
-    def section_size(self, params: WheelParams) -> int:
-        """Return the length of a section state."""
-        return 3
-
-    def n_continuous(self, params: WheelParams) -> int:
-        """Return the number of leading entries of a section state that vary continuously; the rest
-        are codes.
-        """
-        return self.section_size(params)
-
-    def embed_section(self, params: WheelParams, x: Array) -> Array:
-        """Return the model's section state for a three-number one; others are returned
-        unchanged.
-        """
-        return x
-
-
-StateValues = Float[Array, "section ..."] | tuple[Array, ...]
-"""A section state, or its entries one by one, each of which may be an array over a batch."""
-
-
-def is_valid_start(params: WheelParams, x: StateValues) -> Array:
-    """Return whether parameters and start are finite, in their domains and rolling forward."""
-    theta, dtheta = x[0], x[1]
-    is_upright = (jnp.abs(theta) < 0.5 * jnp.pi) & (
-        jnp.abs(theta - params.leg_angle) < 0.5 * jnp.pi
-    )
-    is_bounded = functools.reduce(operator.and_, [jnp.abs(value) < MAX_SI_VALUE for value in x])
-    return params.is_in_domain() & is_bounded & is_upright & (dtheta > 0.0)  # False for NaN
-
-
-def replace_invalid(
-    is_valid: Array,
-    params: WheelParams,
-    x: StateValues,
-    fallback_x: Any,
-) -> tuple[WheelParams, Any]:
-    """Return Table 1 and a safe start in place of invalid input, so that no NaN is ever
-    computed.
-    """
-    return jax.tree.map(
-        lambda value, default: jnp.where(is_valid, value, jnp.asarray(default, value.dtype)),
-        (params, x),
-        (type(params)(n_legs=params.n_legs), fallback_x),
-    )
